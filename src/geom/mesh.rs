@@ -1,0 +1,95 @@
+//! A triangle mesh with what the pipeline attaches to its vertices.
+
+use super::{Aabb, Similarity};
+use glam::Vec3;
+use std::collections::HashMap;
+
+/// Triangles over shared vertices, counter-clockwise seen from outside.
+///
+/// `normals` and `colors` are either empty or as long as `positions`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Mesh {
+    /// Vertex positions.
+    pub positions: Vec<Vec3>,
+    /// Unit vertex normals, pointing out.
+    pub normals: Vec<Vec3>,
+    /// Vertex colours, sRGB-coded, 0..=1.
+    pub colors: Vec<[f32; 3]>,
+    /// Vertex indices, three a triangle.
+    pub triangles: Vec<[u32; 3]>,
+}
+
+impl Mesh {
+    /// The box around all vertices.
+    pub fn bounds(&self) -> Aabb {
+        Aabb::around(self.positions.iter().copied())
+    }
+
+    /// The three corners of a triangle.
+    pub fn corners(&self, triangle: u32) -> [Vec3; 3] {
+        self.triangles[triangle as usize].map(|i| self.positions[i as usize])
+    }
+
+    /// Watertight: every edge shared by exactly two triangles, oppositely wound.
+    pub fn is_closed(&self) -> bool {
+        let mut edges: HashMap<(u32, u32), u32> = HashMap::with_capacity(self.triangles.len() * 3);
+        for t in &self.triangles {
+            for k in 0..3 {
+                *edges.entry((t[k], t[(k + 1) % 3])).or_default() += 1;
+            }
+        }
+        !self.triangles.is_empty()
+            && edges.iter().all(|(&(a, b), &n)| a != b && n == 1 && edges.get(&(b, a)) == Some(&1))
+    }
+
+    /// Enclosed volume, signed: positive when triangles are wound outward. f64 sum.
+    pub fn signed_volume(&self) -> f64 {
+        let sum: f64 = (0..self.triangles.len() as u32)
+            .map(|t| {
+                let [a, b, c] = self.corners(t).map(|p| p.as_dvec3());
+                a.dot(b.cross(c))
+            })
+            .sum();
+        sum / 6.0
+    }
+
+    /// The same mesh in another coordinate system.
+    pub fn transformed(&self, b_from_a: &Similarity) -> Mesh {
+        Mesh {
+            positions: self.positions.iter().map(|&p| b_from_a.point(p)).collect(),
+            normals: self.normals.iter().map(|&n| b_from_a.direction(n).normalize_or_zero()).collect(),
+            colors: self.colors.clone(),
+            triangles: self.triangles.clone(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tetrahedron() -> Mesh {
+        Mesh {
+            positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z],
+            triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+            ..Mesh::default()
+        }
+    }
+
+    #[test]
+    fn a_tetrahedron_is_closed_and_has_a_sixth_of_the_cube() {
+        let m = tetrahedron();
+        assert!(m.is_closed());
+        assert!((m.signed_volume() - 1.0 / 6.0).abs() < 1e-7);
+    }
+
+    #[test]
+    fn a_missing_or_turned_face_opens_it() {
+        let mut m = tetrahedron();
+        m.triangles[0].swap(0, 1);
+        assert!(!m.is_closed());
+        m.triangles.remove(0);
+        assert!(!m.is_closed());
+        assert!(!Mesh::default().is_closed());
+    }
+}

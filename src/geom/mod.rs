@@ -1,0 +1,13 @@
+//! The vocabulary: plain f32 geometry on glam; no files, no tensors.
+
+mod aabb;
+mod camera;
+mod mesh;
+mod ray;
+mod similarity;
+
+pub use aabb::Aabb;
+pub use camera::{Camera, Distortion};
+pub use mesh::Mesh;
+pub use ray::{Hit, Ray};
+pub use similarity::Similarity;

@@ -1,0 +1,72 @@
+//! Uniform scale, rotation and translation: how the scene sits in the world.
+
+use glam::{DMat3, DVec3, Mat3, Vec3};
+use serde::{Deserialize, Serialize};
+
+/// `b = scale · rotation · a + translation`, kept in f64 so that mapping back loses nothing visible
+/// even when the dataset lies far from its origin. `rotation` is a proper rotation: no mirror.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Similarity {
+    /// Uniform scale, > 0.
+    pub scale: f64,
+    /// Orthonormal, determinant +1.
+    pub rotation: DMat3,
+    /// Where the origin goes.
+    pub translation: DVec3,
+}
+
+impl Similarity {
+    /// Changes nothing.
+    pub const IDENTITY: Similarity =
+        Similarity { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
+
+    /// Scale about the origin, then move: no rotation.
+    pub fn scale_translate(scale: f64, translation: DVec3) -> Similarity {
+        Similarity { scale, rotation: DMat3::IDENTITY, translation }
+    }
+
+    /// Where a point goes.
+    pub fn point(&self, p: Vec3) -> Vec3 {
+        (self.scale * (self.rotation * p.as_dvec3()) + self.translation).as_vec3()
+    }
+
+    /// Where a point goes, in f64.
+    pub fn point_f64(&self, p: DVec3) -> DVec3 {
+        self.scale * (self.rotation * p) + self.translation
+    }
+
+    /// Where a direction goes; its length is kept, so unit stays unit (also right for normals).
+    pub fn direction(&self, d: Vec3) -> Vec3 {
+        self.rotation.as_mat3() * d
+    }
+
+    /// The rotation in f32.
+    pub fn rotation_f32(&self) -> Mat3 {
+        self.rotation.as_mat3()
+    }
+
+    /// The way back.
+    pub fn inverse(&self) -> Similarity {
+        let rotation = self.rotation.transpose();
+        let scale = 1.0 / self.scale;
+        Similarity { scale, rotation, translation: -scale * (rotation * self.translation) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_and_back_is_where_we_started() {
+        let s = Similarity {
+            scale: 3.5,
+            rotation: DMat3::from_rotation_y(0.7) * DMat3::from_rotation_x(-0.2),
+            translation: DVec3::new(10.0, -4.0, 2.5),
+        };
+        let p = Vec3::new(0.3, -0.8, 0.1);
+        assert!(s.inverse().point(s.point(p)).distance(p) < 1e-6);
+        let d = Vec3::new(0.6, 0.0, 0.8);
+        assert!((s.direction(d).length() - 1.0).abs() < 1e-6);
+    }
+}

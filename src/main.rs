@@ -1,0 +1,2 @@
+//! The `tiface` binary: parse, run, exit code; nothing else.
+fn main() {}
