@@ -6,6 +6,8 @@
 //!
 //! Modules are declared in the order of that line; what they share stands first.
 
+#[cfg(feature = "cpu")]
+pub mod field;
 pub mod geom;
 pub mod image;
 pub mod kernel;

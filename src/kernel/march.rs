@@ -65,9 +65,16 @@ pub struct Samples {
 }
 
 /// Marches one ray, calling `emit` with the midpoint of every step whose cell is occupied, until
-/// `emit` returns false.
+/// `emit` returns false or the ray reaches a cell of `solid`: deep inside, where nothing behind is seen.
 #[inline]
-pub fn march_one(mask: &Bitmask, radius: f32, step: f32, ray: &MarchRay, mut emit: impl FnMut(f32) -> bool) {
+pub fn march_one(
+    mask: &Bitmask,
+    solid: Option<&Bitmask>,
+    radius: f32,
+    step: f32,
+    ray: &MarchRay,
+    mut emit: impl FnMut(f32) -> bool,
+) {
     let (mut enter, mut leave) = (0f32, f32::INFINITY);
     for a in 0..3 {
         let (o, d) = (ray.origin[a], ray.direction[a]);
@@ -106,6 +113,9 @@ pub fn march_one(mask: &Bitmask, radius: f32, step: f32, ray: &MarchRay, mut emi
             k += 1;
             continue;
         }
+        if solid.is_some_and(|solid| solid.get(cell)) {
+            return;
+        }
         // distance to the border of this cell, then on by whole steps
         let mut border = f32::INFINITY;
         for a in 0..3 {
@@ -119,8 +129,17 @@ pub fn march_one(mask: &Bitmask, radius: f32, step: f32, ray: &MarchRay, mut emi
     }
 }
 
-/// Marches many rays. Each ray keeps at most `limit` samples (the nearest).
-pub fn march(mask: &Bitmask, radius: f32, step: f32, rays: &[MarchRay], limit: usize) -> Samples {
+/// Marches many rays. Each ray keeps at most `limit` samples (the nearest). `solid` has the resolution
+/// of `mask`.
+pub fn march(
+    mask: &Bitmask,
+    solid: Option<&Bitmask>,
+    radius: f32,
+    step: f32,
+    rays: &[MarchRay],
+    limit: usize,
+) -> Samples {
+    assert!(solid.is_none_or(|s| s.resolution == mask.resolution));
     let per_chunk: Vec<(Vec<i32>, Vec<f32>)> = rays
         .par_chunks(256)
         .map(|rays| {
@@ -128,7 +147,7 @@ pub fn march(mask: &Bitmask, radius: f32, step: f32, rays: &[MarchRay], limit: u
             let mut t = Vec::with_capacity(rays.len() * 32);
             for ray in rays {
                 let before = t.len();
-                march_one(mask, radius, step, ray, |m| {
+                march_one(mask, solid, radius, step, ray, |m| {
                     t.push(m);
                     t.len() - before < limit
                 });
@@ -158,7 +177,7 @@ mod tests {
     #[test]
     fn a_full_box_of_edge_two_holds_twenty_steps_of_a_tenth() {
         let mask = Bitmask::filled(8, true);
-        let s = march(&mask, 1.0, 0.1, &[RAY], 1000);
+        let s = march(&mask, None, 1.0, 0.1, &[RAY], 1000);
         assert_eq!(s.offsets, [0, 20]);
         assert!((s.t[0] - 1.05).abs() < 1e-5 && (s.t[19] - 2.95).abs() < 1e-5);
     }
@@ -173,8 +192,8 @@ mod tests {
             }
         }
         let ray = MarchRay { origin: [2.0, 1.7, 1.9], direction: [-0.6, -0.48, -0.64], jitter: 0.3 };
-        let all = march(&full, 1.0, 0.02, &[ray], 1000).t;
-        let some = march(&holes, 1.0, 0.02, &[ray], 1000).t;
+        let all = march(&full, None, 1.0, 0.02, &[ray], 1000).t;
+        let some = march(&holes, None, 1.0, 0.02, &[ray], 1000).t;
         assert!(some.len() < all.len() && !some.is_empty());
         for t in &some {
             assert!(all.iter().any(|u| u == t));
@@ -190,10 +209,22 @@ mod tests {
     }
 
     #[test]
+    fn a_ray_ends_at_the_first_solid_cell() {
+        // the ray comes down along z through cell column (4, 4): z cells 7, 6, 5 kept, 4 solid
+        let mut mask = Bitmask::filled(8, true);
+        let mut solid = Bitmask::filled(8, false);
+        mask.set((4 * 8 + 4) * 8 + 4, false);
+        solid.set((4 * 8 + 4) * 8 + 4, true);
+        let s = march(&mask, Some(&solid), 1.0, 0.1, &[RAY], 1000);
+        // z from 1 down to 0.25 in steps of 0.1, midpoints 0.95 … 0.25: eight of them
+        assert_eq!(s.offsets, [0, 8]);
+    }
+
+    #[test]
     fn rays_that_miss_own_nothing() {
         let mask = Bitmask::filled(8, true);
         let miss = MarchRay { origin: [0.0, 0.0, 2.0], direction: [0.0, 0.0, 1.0], jitter: 0.0 };
         let beside = MarchRay { origin: [1.5, 0.0, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
-        assert_eq!(march(&mask, 1.0, 0.1, &[miss, RAY, beside], 5).offsets, [0, 0, 5, 5]);
+        assert_eq!(march(&mask, None, 1.0, 0.1, &[miss, RAY, beside], 5).offsets, [0, 0, 5, 5]);
     }
 }

@@ -62,6 +62,7 @@ impl Layout {
 
 /// Network weights in both orders, padded for the matrix blocks. About ten thousand floats, rebuilt
 /// once a step. Geometry columns are turned to `[hash, x]` so that hash features start aligned.
+#[derive(Debug)]
 pub struct Weights {
     pub(super) layout: Layout,
     pub(super) w1: Vec<f32>,  // [64, kp]

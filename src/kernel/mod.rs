@@ -9,6 +9,7 @@ pub mod march;
 pub mod mlp;
 pub mod neus;
 pub mod pool;
+pub mod rng;
 pub mod sdf;
 pub mod simd;
 pub mod sphharm;

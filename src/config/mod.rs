@@ -1,0 +1,3 @@
+//! Every knob: defaults, presets, validation.
+
+pub mod iface;
