@@ -6,9 +6,14 @@
 //!
 //! Modules are declared in the order of that line; what they share stands first.
 
-#[cfg(feature = "cpu")]
-pub mod field;
+pub mod config;
 pub mod geom;
 pub mod image;
+pub mod io;
 pub mod kernel;
 pub mod run;
+
+#[cfg(feature = "cpu")]
+pub mod field;
+#[cfg(feature = "cpu")]
+pub mod iface;

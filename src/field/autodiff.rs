@@ -85,9 +85,7 @@ impl<B: FieldKernels, C: CheckpointStrategy> FieldOps for Autodiff<B, C> {
                 let (out, saved) = B::neus_forward(field, inv_s, direction, t, dt, offsets, anneal);
                 prep.finish(saved, out)
             }
-            OpsKind::UnTracked(prep) => {
-                prep.finish(B::neus(field, inv_s, direction, t, dt, offsets, anneal))
-            }
+            OpsKind::UnTracked(prep) => prep.finish(B::neus(field, inv_s, direction, t, dt, offsets, anneal)),
         }
     }
 

@@ -5,8 +5,8 @@
 //! implements [`ops::FieldKernels`] and nothing else changes.
 
 pub mod autodiff;
-pub mod optimizer;
 pub mod ops;
+pub mod optimizer;
 
 use burn::tensor::{Device, Tensor, TensorData};
 
