@@ -10,3 +10,5 @@ pub mod geom;
 pub mod image;
 pub mod io;
 pub mod run;
+
+pub mod capture;
