@@ -1,0 +1,3 @@
+//! What a dataset means.
+
+pub mod synthetic;
