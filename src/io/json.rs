@@ -1,0 +1,191 @@
+//! JSON as untrusted input: bounded in bytes, depth and values, every key once, every number finite.
+
+use super::{Limits, ReadError};
+use serde::de::{DeserializeSeed, Error, MapAccess, SeqAccess, Visitor};
+use serde_json::{Map, Value};
+use std::cell::Cell;
+use std::fmt;
+use std::path::Path;
+
+/// The value in `bytes`; `path` is only for messages.
+///
+/// A byte order mark and CRLF are accepted. Refused with line and column: duplicate keys (a second
+/// `frames` would silently hide the first), `NaN` and `Infinity` literals, numbers that overflow f64,
+/// nesting or counts over the limits, anything after the value.
+pub fn parse_json(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Value, ReadError> {
+    if bytes.len() as u64 > limits.json_bytes {
+        return Err(ReadError::TooLarge {
+            path: path.into(),
+            what: "the JSON text's size in bytes",
+            found: bytes.len() as u64,
+            limit: limits.json_bytes,
+        });
+    }
+    if bytes.starts_with(&[0xFF, 0xFE]) || bytes.starts_with(&[0xFE, 0xFF]) {
+        return Err(ReadError::Unsupported {
+            path: path.into(),
+            what: "JSON in UTF-16".into(),
+            hint: "save the file as UTF-8".into(),
+        });
+    }
+    let bytes = bytes.strip_prefix(&[0xEF, 0xBB, 0xBF]).unwrap_or(bytes);
+    let left = Cell::new(limits.json_values);
+    let mut reader = serde_json::Deserializer::from_slice(bytes);
+    let seed = Node { depth: limits.json_depth, left: &left };
+    seed.deserialize(&mut reader).and_then(|value| reader.end().map(|()| value)).map_err(|e| {
+        let problem = literal_at(bytes, e.line(), e.column()).unwrap_or_else(|| {
+            let text = e.to_string();
+            match text.rfind(" at line ") {
+                Some(cut) => text[..cut].to_string(),
+                None => text,
+            }
+        });
+        ReadError::Json { path: path.into(), line: e.line(), column: e.column(), problem }
+    })
+}
+
+/// The message for a Python-style literal near the place where parsing stopped.
+fn literal_at(bytes: &[u8], line: usize, column: usize) -> Option<String> {
+    let text = bytes.split(|&b| b == b'\n').nth(line.checked_sub(1)?)?;
+    let near = &text[column.saturating_sub(2).min(text.len())..];
+    for literal in ["NaN", "Infinity"] {
+        if near.windows(literal.len()).take(3).any(|w| w == literal.as_bytes()) {
+            return Some(format!("`{literal}` is not a number in JSON, and not one that can be used"));
+        }
+    }
+    None
+}
+
+#[derive(Clone, Copy)]
+struct Node<'a> {
+    depth: usize,
+    left: &'a Cell<usize>,
+}
+
+impl Node<'_> {
+    fn inner<E: Error>(self) -> Result<Self, E> {
+        match self.depth.checked_sub(1) {
+            Some(depth) => Ok(Node { depth, ..self }),
+            None => Err(E::custom("nested too deeply")),
+        }
+    }
+}
+
+impl<'de> DeserializeSeed<'de> for Node<'_> {
+    type Value = Value;
+
+    fn deserialize<D: serde::Deserializer<'de>>(self, reader: D) -> Result<Value, D::Error> {
+        match self.left.get().checked_sub(1) {
+            Some(left) => self.left.set(left),
+            None => return Err(D::Error::custom("too many values in one file")),
+        }
+        reader.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Node<'_> {
+    type Value = Value;
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("a JSON value")
+    }
+
+    fn visit_bool<E: Error>(self, v: bool) -> Result<Value, E> {
+        Ok(v.into())
+    }
+
+    fn visit_i64<E: Error>(self, v: i64) -> Result<Value, E> {
+        Ok(v.into())
+    }
+
+    fn visit_u64<E: Error>(self, v: u64) -> Result<Value, E> {
+        Ok(v.into())
+    }
+
+    fn visit_f64<E: Error>(self, v: f64) -> Result<Value, E> {
+        serde_json::Number::from_f64(v).map(Value::Number).ok_or_else(|| E::custom("number out of range"))
+    }
+
+    fn visit_str<E: Error>(self, v: &str) -> Result<Value, E> {
+        Ok(v.into())
+    }
+
+    fn visit_string<E: Error>(self, v: String) -> Result<Value, E> {
+        Ok(v.into())
+    }
+
+    fn visit_unit<E: Error>(self) -> Result<Value, E> {
+        Ok(Value::Null)
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Value, A::Error> {
+        let inner = self.inner()?;
+        let mut list = Vec::new();
+        while let Some(item) = items.next_element_seed(inner)? {
+            list.push(item);
+        }
+        Ok(list.into())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut entries: A) -> Result<Value, A::Error> {
+        let inner = self.inner()?;
+        let mut map = Map::new();
+        while let Some(key) = entries.next_key::<String>()? {
+            if map.contains_key(&key) {
+                return Err(A::Error::custom(format!("the key `{key}` appears twice")));
+            }
+            let value = entries.next_value_seed(inner)?;
+            map.insert(key, value);
+        }
+        Ok(map.into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> Result<Value, ReadError> {
+        parse_json(Path::new("t.json"), text.as_bytes(), &Limits::default())
+    }
+
+    #[test]
+    fn a_byte_order_mark_and_crlf_change_nothing() {
+        let plain = parse("{\"a\": [1, 2.5, null],\n \"b\": \"x\"}").unwrap();
+        let other = parse("\u{FEFF}{\"a\": [1, 2.5, null],\r\n \"b\": \"x\"}").unwrap();
+        assert_eq!(plain, other);
+    }
+
+    #[test]
+    fn a_duplicate_key_is_named_with_its_place() {
+        let error = parse("{\n  \"w\": 1,\n  \"w\": 2}").unwrap_err();
+        assert!(matches!(error, ReadError::Json { line: 3, .. }), "{error}");
+        assert!(error.to_string().contains("`w` appears twice"), "{error}");
+    }
+
+    #[test]
+    fn literals_that_are_no_numbers_are_named_with_their_place() {
+        for (text, literal) in [("[1,\n NaN]", "NaN"), ("[1,\n -Infinity]", "Infinity")] {
+            let error = parse(text).unwrap_err();
+            assert!(matches!(error, ReadError::Json { line: 2, .. }), "{error}");
+            assert!(error.to_string().contains(literal), "{error}");
+        }
+        assert!(parse("[1e999]").is_err());
+    }
+
+    #[test]
+    fn nesting_is_allowed_to_the_limit_and_no_further() {
+        let nested = |n: usize| "[".repeat(n) + &"]".repeat(n);
+        assert!(parse(&nested(64)).is_ok());
+        let error = parse(&nested(65)).unwrap_err();
+        assert!(error.to_string().contains("nested too deeply"), "{error}");
+        assert!(parse(&nested(1_000_000)).is_err());
+    }
+
+    #[test]
+    fn the_number_of_values_is_bounded() {
+        let limits = Limits { json_values: 4, ..Limits::default() };
+        assert!(parse_json(Path::new("t"), b"[1,2,3]", &limits).is_ok()); // the array itself is the fourth
+        assert!(parse_json(Path::new("t"), b"[1,2,3,4]", &limits).is_err());
+    }
+}

@@ -1,0 +1,325 @@
+//! The only module that opens files: every limit and every hostile input is handled here.
+//!
+//! Readers take a path or bytes together with [`Limits`]. Sizes are multiplied with `checked_mul` and
+//! compared with the bytes that are there before anything is reserved; content, not the ending of the
+//! name, decides the format; only regular files are opened. Writers go through [`write_atomic`].
+
+mod exr;
+mod json;
+mod npy;
+mod pictures;
+mod tensors;
+mod write;
+
+pub use self::exr::{ExrImage, read_exr_channels, read_exr_depth, read_exr_normals, write_exr};
+pub use self::json::parse_json;
+pub use self::npy::{Npy, NpyValues, parse_npy, read_npy};
+pub use self::pictures::{
+    Picture, PictureInfo, Turn, picture_info, read_gray, read_photo, write_png_gray, write_png_gray16,
+    write_png_rgb, write_png_rgba,
+};
+pub use self::tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
+pub use self::write::{WriteError, remove_leftovers, write_atomic};
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// What a reader refuses to exceed, whatever a file says about itself.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// Longest side of a picture, pixels.
+    pub side_px: u32,
+    /// Bytes of one decoded picture or array.
+    pub decoded_bytes: u64,
+    /// Bytes of any file.
+    pub file_bytes: u64,
+    /// Bytes of a JSON file.
+    pub json_bytes: u64,
+    /// Nesting of arrays and objects in JSON.
+    pub json_depth: usize,
+    /// Numbers, strings, arrays and objects in one JSON file; bounds the memory of the parsed tree.
+    pub json_values: usize,
+    /// Views of one capture.
+    pub views: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits {
+            side_px: 16_384,
+            decoded_bytes: 4 << 30,
+            file_bytes: 4 << 30,
+            json_bytes: 64 << 20,
+            json_depth: 64,
+            json_values: 8 << 20,
+            views: 100_000,
+        }
+    }
+}
+
+/// Why a file could not be read.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReadError {
+    /// The operating system refused.
+    #[error("`{}` cannot be read: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A folder, a pipe, a device: nothing that holds a file's bytes.
+    #[error("`{}` is {kind}, not a regular file", path.display())]
+    NotAFile {
+        /// The file.
+        path: PathBuf,
+        /// What it is, with its article.
+        kind: &'static str,
+    },
+    /// No bytes at all.
+    #[error("`{}` is empty (0 bytes)", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A size over a limit.
+    #[error("`{}`: {what} is {found}, the limit is {limit}", path.display())]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// What was measured, with its unit.
+        what: &'static str,
+        /// Its size.
+        found: u64,
+        /// The limit.
+        limit: u64,
+    },
+    /// The bytes are not what the format demands.
+    #[error("`{}` is not a sound {format} file: {problem}{}", path.display(), at(*offset))]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// The format found or expected.
+        format: &'static str,
+        /// Byte offset of the damage, where known.
+        offset: Option<u64>,
+        /// What is wrong there.
+        problem: String,
+    },
+    /// A sound file of a kind that is not read.
+    #[error("`{}`: {what} cannot be used", path.display())]
+    Unsupported {
+        /// The file.
+        path: PathBuf,
+        /// What was found.
+        what: String,
+        /// The way out.
+        hint: String,
+    },
+    /// JSON text that does not hold.
+    #[error("`{}`, line {line}, column {column}: {problem}", path.display())]
+    Json {
+        /// The file.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// Column, from 1.
+        column: usize,
+        /// What is wrong there.
+        problem: String,
+    },
+}
+
+fn at(offset: Option<u64>) -> String {
+    offset.map(|o| format!(" (at byte {o})")).unwrap_or_default()
+}
+
+impl ReadError {
+    /// The file the error is about.
+    pub fn path(&self) -> &Path {
+        match self {
+            ReadError::Io { path, .. }
+            | ReadError::NotAFile { path, .. }
+            | ReadError::Empty { path }
+            | ReadError::TooLarge { path, .. }
+            | ReadError::Damaged { path, .. }
+            | ReadError::Unsupported { path, .. }
+            | ReadError::Json { path, .. } => path,
+        }
+    }
+
+    /// The way out.
+    pub fn hint(&self) -> String {
+        match self {
+            ReadError::Io { source, .. } => match source.kind() {
+                std::io::ErrorKind::NotFound => "check the path; was the file moved or renamed?".into(),
+                std::io::ErrorKind::PermissionDenied => "allow reading it: `chmod u+r FILE`".into(),
+                _ => "check the disk and the links on the way to the file".into(),
+            },
+            ReadError::NotAFile { .. } => "give the path of a file".into(),
+            ReadError::Empty { .. } => "copy it again; an interrupted copy leaves such a file".into(),
+            ReadError::TooLarge { .. } => "make it smaller, or check that it is the file you meant".into(),
+            ReadError::Damaged { .. } => "copy or export it again from its source".into(),
+            ReadError::Unsupported { hint, .. } => hint.clone(),
+            ReadError::Json { .. } => "correct the file at that place".into(),
+        }
+    }
+
+    pub(crate) fn io(path: &Path, source: std::io::Error) -> ReadError {
+        ReadError::Io { path: path.into(), source }
+    }
+
+    pub(crate) fn damaged(
+        path: &Path,
+        format: &'static str,
+        offset: impl Into<Option<u64>>,
+        problem: impl Into<String>,
+    ) -> ReadError {
+        ReadError::Damaged { path: path.into(), format, offset: offset.into(), problem: problem.into() }
+    }
+}
+
+/// Opens a regular file; looks before opening, since opening a pipe would wait for its writer.
+pub(crate) fn open(path: &Path) -> Result<(File, u64), ReadError> {
+    let about = fs::metadata(path).map_err(|e| ReadError::io(path, e))?;
+    regular(path, &about)?;
+    let file = File::open(path).map_err(|e| ReadError::io(path, e))?;
+    // once more on what was really opened: the name may have been given to something else meanwhile
+    let about = file.metadata().map_err(|e| ReadError::io(path, e))?;
+    regular(path, &about)?;
+    Ok((file, about.len()))
+}
+
+fn regular(path: &Path, about: &fs::Metadata) -> Result<(), ReadError> {
+    if about.is_file() {
+        return Ok(());
+    }
+    let kind = if about.is_dir() { "a folder" } else { kind_of_special(about) };
+    Err(ReadError::NotAFile { path: path.into(), kind })
+}
+
+#[cfg(unix)]
+fn kind_of_special(about: &fs::Metadata) -> &'static str {
+    use std::os::unix::fs::FileTypeExt;
+    let t = about.file_type();
+    if t.is_fifo() {
+        "a named pipe"
+    } else if t.is_socket() {
+        "a socket"
+    } else {
+        "a device"
+    }
+}
+
+#[cfg(not(unix))]
+fn kind_of_special(_: &fs::Metadata) -> &'static str {
+    "a special file"
+}
+
+/// All bytes of a regular file that is not empty and not over [`Limits::file_bytes`].
+pub fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>, ReadError> {
+    read_capped(path, limits.file_bytes, "the file's size in bytes")
+}
+
+/// As [`read_bytes`], under [`Limits::json_bytes`], parsed.
+pub fn read_json(path: &Path, limits: &Limits) -> Result<serde_json::Value, ReadError> {
+    let bytes = read_capped(path, limits.json_bytes, "the JSON text's size in bytes")?;
+    parse_json(path, &bytes, limits)
+}
+
+fn read_capped(path: &Path, limit: u64, what: &'static str) -> Result<Vec<u8>, ReadError> {
+    let (file, length) = open(path)?;
+    let too_large = |found| ReadError::TooLarge { path: path.into(), what, found, limit };
+    if length > limit {
+        return Err(too_large(length));
+    }
+    // the length may be wrong (a growing file, /proc), so it sizes the buffer but does not end the read
+    let mut bytes = Vec::with_capacity(length as usize);
+    let read = file.take(limit + 1).read_to_end(&mut bytes).map_err(|e| ReadError::io(path, e))?;
+    if read as u64 > limit {
+        return Err(too_large(read as u64));
+    }
+    if read == 0 {
+        return Err(ReadError::Empty { path: path.into() });
+    }
+    Ok(bytes)
+}
+
+/// Is there a regular file (through links)?
+pub fn is_file(path: &Path) -> bool {
+    fs::metadata(path).is_ok_and(|m| m.is_file())
+}
+
+/// Is there a folder (through links)?
+pub fn is_folder(path: &Path) -> bool {
+    fs::metadata(path).is_ok_and(|m| m.is_dir())
+}
+
+/// Names of the regular files directly in a folder, sorted by bytes; hidden ones left out. A name that
+/// is not UTF-8 is an error that shows it as well as it can.
+pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
+    let mut names = Vec::new();
+    for entry in fs::read_dir(folder).map_err(|e| ReadError::io(folder, e))? {
+        let entry = entry.map_err(|e| ReadError::io(folder, e))?;
+        let path = entry.path();
+        if !is_file(&path) {
+            continue;
+        }
+        let Ok(name) = entry.file_name().into_string() else {
+            return Err(ReadError::Unsupported {
+                path,
+                what: "a file name that is not UTF-8".into(),
+                hint: "rename the file".into(),
+            });
+        };
+        if !name.starts_with('.') {
+            names.push(name);
+        }
+    }
+    names.sort();
+    Ok(names)
+}
+
+/// The same path without links, `.` and `..`; the file must exist.
+pub fn real_path(path: &Path) -> Result<PathBuf, ReadError> {
+    fs::canonicalize(path).map_err(|e| ReadError::io(path, e))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_a_missing_file_and_an_empty_file_are_told_apart() {
+        let dir = tempfile::tempdir().unwrap();
+        let limits = Limits::default();
+        let at = |name: &str| dir.path().join(name);
+        assert!(matches!(read_bytes(dir.path(), &limits), Err(ReadError::NotAFile { kind: "a folder", .. })));
+        assert!(matches!(read_bytes(&at("none"), &limits), Err(ReadError::Io { .. })));
+        fs::write(at("empty"), b"").unwrap();
+        assert!(matches!(read_bytes(&at("empty"), &limits), Err(ReadError::Empty { .. })));
+    }
+
+    #[test]
+    fn a_file_over_the_limit_is_refused_before_it_is_read() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("five");
+        fs::write(&path, b"12345").unwrap();
+        let limits = Limits { file_bytes: 4, ..Limits::default() };
+        let error = read_bytes(&path, &limits).unwrap_err();
+        assert!(matches!(error, ReadError::TooLarge { found: 5, limit: 4, .. }), "{error}");
+        assert_eq!(read_bytes(&path, &Limits { file_bytes: 5, ..Limits::default() }).unwrap(), b"12345");
+    }
+
+    #[test]
+    fn files_are_listed_in_order_without_folders_and_hidden_ones() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["b.png", "a.png", ".a.png.77.tmp"] {
+            fs::write(dir.path().join(name), b"x").unwrap();
+        }
+        fs::create_dir(dir.path().join("c")).unwrap();
+        assert_eq!(list_files(dir.path()).unwrap(), ["a.png", "b.png"]);
+    }
+}
