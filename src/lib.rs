@@ -7,6 +7,7 @@
 //! Modules are declared in the order of that line; what they share stands first.
 
 pub mod capture;
+pub mod config;
 pub mod geom;
 pub mod image;
 pub mod io;
