@@ -8,7 +8,10 @@
 
 pub mod capture;
 pub mod config;
+#[cfg(feature = "cpu")]
+pub mod field;
 pub mod geom;
 pub mod image;
 pub mod io;
+pub mod kernel;
 pub mod run;

@@ -8,7 +8,8 @@
 //! of [`Key`]s with documentation and ranges. Everything here works on what serde says about them.
 
 mod capture;
-mod iface;
+pub mod iface;
+mod iface_keys;
 mod mask;
 mod mesh;
 mod metrics;
@@ -119,7 +120,7 @@ const TABLES: &[(&str, &[Key])] = &[
     ("", ROOT_KEYS),
     ("capture", capture::KEYS),
     ("mask", mask::KEYS),
-    ("iface", iface::KEYS),
+    ("iface", iface_keys::KEYS),
     ("mesh", mesh::KEYS),
     ("render", render::KEYS),
     ("metrics", metrics::KEYS),

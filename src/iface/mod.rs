@@ -1,0 +1,89 @@
+//! Stage `iface`: a signed-distance field learned from masked photographs.
+//!
+//! Instant-NGP's hash grid (Müller et al. 2022) under a small network gives a signed distance; NeuS
+//! (Wang et al. 2021) renders it; colour, mask, eikonal and sparsity losses train it (I-Face of
+//! TI-Face, ICCV 2023 View Synthesis Challenge for Human Heads). The `paper` preset follows the
+//! published system; the others start from the masks' visual hull and sample only a band around the
+//! surface.
+
+mod checkpoint;
+mod hull_start;
+mod infer;
+mod model;
+mod occupancy;
+mod pixels;
+mod schedule;
+mod train;
+
+pub use infer::{IFace, VolumeRay};
+pub use pixels::TrainView;
+pub use schedule::{learning_rate, next_rays};
+pub use train::{TrainReport, train};
+
+use crate::field::DeviceError;
+use crate::io::ReadError;
+use crate::io::write::WriteError;
+use std::path::PathBuf;
+
+/// Why training ended without a field.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum IfaceError {
+    /// The device cannot train.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    /// Nothing to learn from.
+    #[error("no training view has a pixel to learn from (masks empty, or everything marked invalid)")]
+    NoPixels,
+    /// A loss became NaN or infinite again after the last checkpoint was restored.
+    #[error(
+        "the {term} loss is {value} at step {step} (learning rate {lr:.2e}), and was again after \
+         restoring the last checkpoint"
+    )]
+    Diverged {
+        /// Which term.
+        term: &'static str,
+        /// Its value.
+        value: f32,
+        /// At which step.
+        step: u64,
+        /// Learning rate of the networks there.
+        lr: f64,
+    },
+    /// A stop was asked for; a checkpoint was saved.
+    #[error("stopped at step {step} of {steps}; a checkpoint is saved, repeat the command to continue")]
+    Stopped {
+        /// Steps done.
+        step: u64,
+        /// Steps wanted.
+        steps: u64,
+    },
+    /// A checkpoint does not belong to this model.
+    #[error("`{}`: {reason}", path.display())]
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// What does not fit.
+        reason: String,
+    },
+    /// A checkpoint cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// A checkpoint cannot be written.
+    #[error(transparent)]
+    Write(#[from] WriteError),
+}
+
+impl IfaceError {
+    /// The way out, if there is one to name.
+    pub fn hint(&self) -> Option<String> {
+        Some(match self {
+            IfaceError::NoPixels => "look at the masks with `tiface inspect`".into(),
+            IfaceError::Diverged { .. } => {
+                "lower iface.lr_network and iface.lr_table, or start again with another --seed".into()
+            }
+            IfaceError::Checkpoint { .. } => "start the stage afresh with `--fresh iface`".into(),
+            _ => return None,
+        })
+    }
+}

@@ -1,0 +1,185 @@
+//! Which cells of the box may hold surface.
+
+use crate::config::iface::{IfaceConfig, OccupancyRule};
+use crate::kernel::march::Bitmask;
+use crate::kernel::{neus, rng};
+use rayon::prelude::*;
+
+/// Cells to march through, cells known to be deep inside, and the history the nerfacc rule keeps.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Occupancy {
+    /// March here.
+    pub occupied: Bitmask,
+    /// Deep inside: nothing behind is seen (`band` rule only; empty under `nerfacc`).
+    pub solid: Bitmask,
+    /// Never outside these: the visual hull, or everything.
+    allowed: Bitmask,
+    /// Decaying maximum of the opacity (`nerfacc` rule), `[cells]`.
+    pub history: Vec<f32>,
+}
+
+/// `hull` seen at another resolution: a cell is kept when it overlaps a kept cell.
+fn resampled(hull: &Bitmask, resolution: usize) -> Bitmask {
+    let mut out = Bitmask::filled(resolution, false);
+    let n = hull.resolution;
+    // the range of hull cells that overlap cell i of the new grid
+    let span = |i: usize| (i * n / resolution)..=(((i + 1) * n).div_ceil(resolution) - 1).min(n - 1);
+    for x in 0..resolution {
+        for y in 0..resolution {
+            for z in 0..resolution {
+                let any = span(x)
+                    .any(|a| span(y).any(|b| span(z).any(|c| hull.get((a * n + b) * n + c))));
+                out.set((x * resolution + y) * resolution + z, any);
+            }
+        }
+    }
+    out
+}
+
+impl Occupancy {
+    /// Starts with all cells of the hull; all cells where there is none.
+    pub fn new(config: &IfaceConfig, hull: Option<&Bitmask>) -> Occupancy {
+        let r = config.occupancy_resolution;
+        let allowed = match hull {
+            Some(hull) if hull.resolution == r => hull.clone(),
+            Some(hull) => resampled(hull, r),
+            None => Bitmask::filled(r, true),
+        };
+        let history = match config.occupancy {
+            OccupancyRule::Band => Vec::new(),
+            OccupancyRule::Nerfacc => vec![0.0; r * r * r],
+        };
+        Occupancy { occupied: allowed.clone(), solid: Bitmask::filled(r, false), allowed, history }
+    }
+
+    /// Looks at the field again. `sdf` evaluates points in field coordinates; `step` is the march step.
+    pub fn update(
+        &mut self,
+        config: &IfaceConfig,
+        (seed, n): (u64, u64),
+        inv_s: f32,
+        step: f32,
+        sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
+    ) {
+        match config.occupancy {
+            OccupancyRule::Band => self.update_band(config, inv_s, sdf),
+            OccupancyRule::Nerfacc => self.update_nerfacc(config, (seed, n), inv_s, step, sdf),
+        }
+    }
+
+    /// A cell stays when the zero set's band (`band / inv_s`) may reach it, for gradients up to about
+    /// one; beyond the band on the inside it is solid.
+    fn update_band(&mut self, config: &IfaceConfig, inv_s: f32, sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>) {
+        let r = config.occupancy_resolution;
+        let cell = 2.0 * config.radius / r as f32;
+        let half_diagonal = 0.5 * 3f32.sqrt() * cell;
+        let band = config.band / inv_s + half_diagonal;
+        let cells: Vec<usize> = (0..r * r * r).filter(|&i| self.allowed.get(i)).collect();
+        let center = |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - config.radius);
+        self.occupied.bits.fill(0);
+        self.solid.bits.fill(0);
+        for cells in cells.chunks(1 << 17) {
+            let points: Vec<[f32; 3]> = cells.par_iter().map(|&i| center(i)).collect();
+            for (&i, f) in cells.iter().zip(sdf(&points)) {
+                if f.abs() < band {
+                    self.occupied.set(i, true);
+                } else if f < 0.0 {
+                    self.solid.set(i, true);
+                }
+            }
+        }
+    }
+
+    /// nerfacc 0.3.3: all cells below step 256, later a quarter of them at random plus the occupied ones.
+    fn update_nerfacc(
+        &mut self,
+        config: &IfaceConfig,
+        (seed, n): (u64, u64),
+        inv_s: f32,
+        step: f32,
+        sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
+    ) {
+        let r = config.occupancy_resolution;
+        let total = r * r * r;
+        let cells: Vec<usize> = if n < 256 {
+            (0..total).collect()
+        } else {
+            let quarter = total as u64 / 4;
+            let random = (0..quarter).map(|k| rng::below(seed, n << 4 | 5, k, total as u64) as usize);
+            let occupied: Vec<usize> = (0..total).filter(|&i| self.occupied.get(i)).collect();
+            let kept = occupied.len() as u64;
+            let some: Vec<usize> = if kept > quarter {
+                (0..quarter).map(|k| occupied[rng::below(seed, n << 4 | 6, k, kept) as usize]).collect()
+            } else {
+                occupied
+            };
+            random.chain(some).collect()
+        };
+        let cell = 2.0 * config.radius / r as f32;
+        let points: Vec<[f32; 3]> = cells
+            .par_iter()
+            .enumerate()
+            .map(|(k, &i)| {
+                let corner = [i / (r * r), i / r % r, i % r];
+                std::array::from_fn(|a| {
+                    let jitter = rng::uniform(seed, n << 4 | 7, (3 * k + a) as u64);
+                    (corner[a] as f32 + jitter) * cell - config.radius
+                })
+            })
+            .collect();
+        let opacity: Vec<f32> =
+            sdf(&points).into_par_iter().map(|f| neus::occupancy(f, 0.5 * step, inv_s)).collect();
+        let decayed: Vec<(usize, f32)> =
+            cells.iter().zip(&opacity).map(|(&i, &o)| (i, (0.95 * self.history[i]).max(o))).collect();
+        for (i, o) in decayed {
+            self.history[i] = o;
+        }
+        let mean = self.history.iter().map(|&v| v as f64).sum::<f64>() / total as f64;
+        let threshold = (mean as f32).min(1e-3);
+        for i in 0..total {
+            self.occupied.set(i, self.allowed.get(i) && self.history[i] > threshold);
+        }
+    }
+
+    /// Share of all cells that are marched through.
+    pub fn share(&self) -> f64 {
+        self.occupied.count() as f64 / self.occupied.resolution.pow(3) as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sphere(points: &[[f32; 3]]) -> Vec<f32> {
+        points.iter().map(|p| (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt() - 0.5).collect()
+    }
+
+    #[test]
+    fn the_band_keeps_every_cell_the_sphere_crosses_and_nothing_far() {
+        let config = IfaceConfig { occupancy_resolution: 32, ..IfaceConfig::draft() };
+        let mut o = Occupancy::new(&config, None);
+        o.update(&config, (1, 0), 600.0, 0.0, sphere);
+        let center = |i: usize| [i / 1024, i / 32 % 32, i % 32].map(|c| (c as f32 + 0.5) / 16.0 - 1.0);
+        for i in 0..32 * 32 * 32 {
+            let f = sphere(&[center(i)])[0];
+            // half diagonal of a cell is 0.054, band 6 / 600 = 0.01
+            assert_eq!(o.occupied.get(i), f.abs() < 0.06413);
+            assert_eq!(o.solid.get(i), f <= -0.06413);
+        }
+    }
+
+    #[test]
+    fn cells_outside_the_hull_never_come_back() {
+        let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::draft() };
+        let mut hull = Bitmask::filled(8, true);
+        (0..512).filter(|i| i / 64 < 4).for_each(|i| hull.set(i, false));
+        for rule in [OccupancyRule::Band, OccupancyRule::Nerfacc] {
+            let config = IfaceConfig { occupancy: rule, ..config.clone() };
+            let mut o = Occupancy::new(&config, Some(&hull));
+            assert_eq!(o.occupied.count(), 16 * 16 * 8);
+            o.update(&config, (1, 0), 20.0, 0.01, sphere);
+            assert!((0..16 * 16 * 8).all(|i| !o.occupied.get(i)) && o.occupied.count() > 0);
+        }
+    }
+}

@@ -1,0 +1,221 @@
+//! Where training rays come from: random pixels that can tell something about the head.
+//!
+//! A pixel farther from the mask than the visual hull's cells reach meets no sample and teaches
+//! nothing, so only the mask and a margin around it are drawn. Photographs stay 8 bit.
+
+use crate::geom::Camera;
+use crate::image::{Gray, Photo};
+use crate::kernel::march::MarchRay;
+use crate::kernel::rng;
+use glam::Vec2;
+use rayon::prelude::*;
+
+/// One photograph to learn from.
+pub struct TrainView {
+    /// Its camera, in scene coordinates (the head's box in [-1, 1]³).
+    pub camera: Camera,
+    /// What it saw.
+    pub photo: Photo,
+    /// Soft alpha of the head, same size; `None` where there are no masks.
+    pub mask: Option<Gray>,
+    /// Usable pixels (non-zero), same size.
+    pub valid: Option<Gray>,
+}
+
+/// Pixels drawn for one step.
+pub struct Batch {
+    /// Rays in field coordinates.
+    pub rays: Vec<MarchRay>,
+    /// `[rays, 3]` photograph, sRGB-coded 0..=1.
+    pub color: Vec<[f32; 3]>,
+    /// `[rays]` soft alpha; 1 where the view has no mask.
+    pub alpha: Vec<f32>,
+}
+
+/// The drawable pixels of all views.
+pub struct Pixels<'a> {
+    views: &'a [TrainView],
+    /// Per view: inclusive box of drawable pixels and one bit per pixel.
+    drawable: Vec<(u32, u32, u32, u32, Vec<u64>)>,
+    /// Running count of drawable pixels.
+    cumulative: Vec<u64>,
+    radius: f32,
+}
+
+impl<'a> Pixels<'a> {
+    /// `reach` is how far outside the mask, in scene units, a ray may still meet an occupied cell.
+    pub fn new(views: &'a [TrainView], reach: f32, radius: f32) -> Pixels<'a> {
+        let drawable: Vec<_> = views.par_iter().map(|v| drawable(v, reach)).collect();
+        let mut sum = 0;
+        let cumulative = drawable
+            .iter()
+            .map(|(.., bits)| {
+                sum += bits.iter().map(|b| b.count_ones() as u64).sum::<u64>();
+                sum
+            })
+            .collect();
+        Pixels { views, drawable, cumulative, radius }
+    }
+
+    /// Drawable pixels of all views.
+    pub fn count(&self) -> u64 {
+        self.cumulative.last().copied().unwrap_or(0)
+    }
+
+    /// `count` random rays of a step: a function of seed and step alone.
+    pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool) -> Batch {
+        let drawn: Vec<(MarchRay, [f32; 3], f32)> = (0..count)
+            .into_par_iter()
+            .with_min_len(256)
+            .filter_map(|i| self.draw_one(seed, step, i as u64, jitter))
+            .collect();
+        let mut batch = Batch {
+            rays: Vec::with_capacity(drawn.len()),
+            color: Vec::with_capacity(drawn.len()),
+            alpha: Vec::with_capacity(drawn.len()),
+        };
+        for (ray, color, alpha) in drawn {
+            batch.rays.push(ray);
+            batch.color.push(color);
+            batch.alpha.push(alpha);
+        }
+        batch
+    }
+
+    fn draw_one(&self, seed: u64, step: u64, i: u64, jitter: bool) -> Option<(MarchRay, [f32; 3], f32)> {
+        let stream = step << 4;
+        let which = rng::below(seed, stream, i, self.count());
+        let v = self.cumulative.partition_point(|&c| c <= which);
+        let (x0, y0, x1, y1, bits) = &self.drawable[v];
+        let view = &self.views[v];
+        let width = view.photo.width;
+        // rejection inside the box of drawable pixels: a head fills most of its box
+        for attempt in 0..256 {
+            let k = i << 9 | attempt << 1;
+            let x = x0 + rng::below(seed, stream + 1, k, (x1 - x0 + 1) as u64) as u32;
+            let y = y0 + rng::below(seed, stream + 1, k | 1, (y1 - y0 + 1) as u64) as u32;
+            let p = y as usize * width as usize + x as usize;
+            if bits[p >> 6] >> (p & 63) & 1 == 0 {
+                continue;
+            }
+            let ray = view.camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
+            let shift = if jitter { rng::uniform(seed, stream + 2, i) } else { 0.0 };
+            let march = MarchRay {
+                origin: (ray.origin * self.radius).to_array(),
+                direction: ray.direction.to_array(),
+                jitter: shift,
+            };
+            let color = view.photo.rgb[p].map(|c| c as f32 / 255.0);
+            let alpha = view.mask.as_ref().map_or(1.0, |m| m.values[p] as f32 / 255.0);
+            return Some((march, color, alpha));
+        }
+        None
+    }
+}
+
+/// Box and bits of the pixels worth drawing in one view.
+fn drawable(view: &TrainView, reach: f32) -> (u32, u32, u32, u32, Vec<u64>) {
+    let (w, h) = (view.photo.width as usize, view.photo.height as usize);
+    let mut near = vec![true; w * h];
+    if let Some(mask) = &view.mask {
+        // reach in pixels at the box's distance; the nearest part of the box is at most one unit closer
+        let distance = (view.camera.position.length() - 1.0).max(0.2);
+        let margin = (reach as f64 * view.camera.fx.max(view.camera.fy) / distance).ceil() as usize + 1;
+        near = dilated(&mask.values, w, h, margin);
+    }
+    if let Some(valid) = &view.valid {
+        near.iter_mut().zip(&valid.values).for_each(|(n, &v)| *n &= v != 0);
+    }
+    let mut bits = vec![0u64; (w * h).div_ceil(64)];
+    let (mut x0, mut y0, mut x1, mut y1) = (u32::MAX, u32::MAX, 0, 0);
+    for (p, _) in near.iter().enumerate().filter(|(_, n)| **n) {
+        bits[p >> 6] |= 1 << (p & 63);
+        let (x, y) = ((p % w) as u32, (p / w) as u32);
+        (x0, y0, x1, y1) = (x0.min(x), y0.min(y), x1.max(x), y1.max(y));
+    }
+    (x0, y0, x1, y1, bits)
+}
+
+/// Pixels with a non-zero value within a square of half edge `margin`: two one-dimensional passes.
+fn dilated(values: &[u8], w: usize, h: usize, margin: usize) -> Vec<bool> {
+    let spread = |line: &mut dyn FnMut(usize) -> bool, n: usize| -> Vec<bool> {
+        let mut out = vec![false; n];
+        let mut last: Option<usize> = None;
+        let source: Vec<bool> = (0..n).map(&mut *line).collect();
+        for i in 0..n {
+            if source[i] {
+                last = Some(i);
+            }
+            out[i] |= last.is_some_and(|l| i - l <= margin);
+        }
+        let mut next: Option<usize> = None;
+        for i in (0..n).rev() {
+            if source[i] {
+                next = Some(i);
+            }
+            out[i] |= next.is_some_and(|l| l - i <= margin);
+        }
+        out
+    };
+    let mut rows = Vec::with_capacity(w * h);
+    for y in 0..h {
+        rows.extend(spread(&mut |x| values[y * w + x] > 0, w));
+    }
+    let mut out = vec![false; w * h];
+    for x in 0..w {
+        for (y, v) in spread(&mut |y| rows[y * w + x], h).into_iter().enumerate() {
+            out[y * w + x] = v;
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::Distortion;
+    use glam::{DMat3, DVec3};
+
+    fn view() -> TrainView {
+        let camera = Camera {
+            width: 20,
+            height: 10,
+            fx: 20.0,
+            fy: 20.0,
+            cx: 10.0,
+            cy: 5.0,
+            distortion: Distortion::default(),
+            rotation: DMat3::IDENTITY,
+            position: DVec3::new(0.0, 0.0, 4.0),
+        };
+        let rgb = (0..200).map(|i| [i as u8, 0, 255]).collect();
+        let mut values = vec![0; 200];
+        values[5 * 20 + 8] = 128;
+        TrainView {
+            camera,
+            photo: Photo { width: 20, height: 10, rgb, alpha: None },
+            mask: Some(Gray { width: 20, height: 10, values }),
+            valid: None,
+        }
+    }
+
+    #[test]
+    fn only_pixels_near_the_mask_are_drawn_and_carry_their_own_color() {
+        // margin = ceil(0.1 · 20 / 3) + 1 = 2: a square of 5 × 5 around (8, 5)
+        let views = [view()];
+        let pixels = Pixels::new(&views, 0.1, 1.0);
+        assert_eq!(pixels.count(), 25);
+        let batch = pixels.draw(1, 2, 400, true);
+        assert_eq!(batch.rays.len(), 400);
+        for (ray, color) in batch.rays.iter().zip(&batch.color) {
+            let p = (color[0] * 255.0).round() as i32;
+            let (x, y) = (p % 20, p / 20);
+            assert!((x - 8).abs() <= 2 && (y - 5).abs() <= 2, "{x} {y}");
+            let d = ray.direction;
+            assert!((d[0] / -d[2] * 20.0 + 10.0 - (x as f32 + 0.5)).abs() < 1e-3);
+        }
+        assert_eq!(batch.alpha.iter().filter(|&&a| a > 0.0).count(), {
+            batch.color.iter().filter(|c| (c[0] * 255.0).round() as i32 == 108).count()
+        });
+    }
+}

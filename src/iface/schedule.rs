@@ -1,0 +1,80 @@
+//! What changes with the step: learning rate, rays per step, active levels.
+
+use crate::config::iface::IfaceConfig;
+
+/// Learning-rate factor at optimiser step `n`: linear from 1 % over `warmup`, then exponential down to
+/// `lr_final` at `steps`.
+pub fn learning_rate(config: &IfaceConfig, n: u64) -> f64 {
+    let (n, warmup, steps) = (n as f64, config.warmup as f64, config.steps as f64);
+    if n < warmup {
+        0.01 + 0.99 * n / warmup
+    } else {
+        config.lr_final.powf((n - warmup) / (steps - warmup).max(1.0))
+    }
+}
+
+/// Rays of the next step: nine tenths of this step's count plus a tenth of the count that would have met
+/// the sample budget, at most `max`. The published code has no floor and divides by zero when no ray
+/// met a sample; here a step without samples keeps its count, and at least `min` are drawn.
+pub fn next_rays(rays: usize, samples: usize, budget: usize, min: usize, max: usize) -> usize {
+    if samples == 0 {
+        return rays;
+    }
+    let fitting = (rays as f64 * (budget as f64 / samples as f64)) as usize;
+    ((rays as f64 * 0.9 + fitting as f64 * 0.1) as usize).clamp(min, max)
+}
+
+/// Hash levels that take part at a step.
+pub fn active_levels(config: &IfaceConfig, step: u64) -> usize {
+    if config.level_every == 0 {
+        return config.levels;
+    }
+    (config.start_levels + (step / config.level_every) as usize).min(config.levels)
+}
+
+/// Share of the hard cosine in the alpha at a step: 0 → 1 over `anneal_end`.
+pub fn anneal(config: &IfaceConfig, step: u64) -> f32 {
+    if config.anneal_end == 0 { 1.0 } else { (step as f32 / config.anneal_end as f32).min(1.0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn learning_rates_match_the_published_schedule() {
+        let config = IfaceConfig::paper();
+        for (n, want) in [
+            (0, 1e-4),
+            (1, 1.198e-4),
+            (250, 0.00505),
+            (499, 0.0099802),
+            (500, 0.01),
+            (501, 0.0099988193),
+            (10_000, 0.0032570207),
+            (19_999, 0.0010001181),
+        ] {
+            let got = config.lr_network * learning_rate(&config, n);
+            assert!((got - want).abs() < 1e-7 * want.max(1e-3), "{n}: {got} {want}");
+        }
+    }
+
+    #[test]
+    fn the_ray_count_follows_the_published_sequence_and_stalls_where_it_does() {
+        // 100 samples per ray from 256 rays, budget 262,144
+        let mut rays = 256;
+        let mut seen = Vec::new();
+        for _ in 0..200 {
+            rays = next_rays(rays, rays * 100, 262_144, 1, 8192);
+            seen.push(rays);
+        }
+        assert_eq!(&seen[..6], [492, 704, 895, 1067, 1222, 1361]);
+        assert_eq!(seen[199], 2612);
+    }
+
+    #[test]
+    fn a_step_without_samples_changes_nothing() {
+        assert_eq!(next_rays(300, 0, 1000, 64, 8192), 300);
+        assert_eq!(next_rays(64, 1_000_000, 1000, 64, 8192), 64);
+    }
+}

@@ -1,0 +1,15 @@
+//! The arithmetic: slices in, slices out; rayon and autovectorised SIMD; knows no tensors.
+//!
+//! Every kernel gives the same bytes for any number of threads: work is cut into pieces of fixed
+//! size, each piece owns what it writes, and sums over pieces are taken in a fixed order.
+
+pub mod adam;
+pub mod hash;
+pub mod march;
+pub mod mlp;
+pub mod neus;
+pub mod pool;
+pub mod rng;
+pub mod sdf;
+pub mod simd;
+pub mod sphharm;

@@ -1,0 +1,92 @@
+//! Buffers that are used again.
+//!
+//! A training step needs tens of megabytes of scratch. Fresh memory from the system is paged in
+//! again each time, which costs more than the arithmetic; a buffer that comes back does not.
+
+use std::ops::{Deref, DerefMut};
+use std::sync::Mutex;
+
+static FREE: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
+
+/// Most buffers kept for later.
+const KEPT: usize = 64;
+
+/// A float buffer that returns to the pool when dropped.
+#[derive(Debug, Default)]
+pub struct Buffer(Vec<f32>);
+
+impl Buffer {
+    /// A buffer of `len` floats with **arbitrary contents**: the caller writes before it reads.
+    pub fn scratch(len: usize) -> Buffer {
+        let mut free = FREE.lock().expect("no panic while the pool is locked");
+        // the smallest one that fits and is not wastefully large
+        let best = (0..free.len())
+            .filter(|&i| free[i].capacity() >= len && free[i].capacity() <= 4 * len.max(1024))
+            .min_by_key(|&i| free[i].capacity());
+        let mut v = match best {
+            Some(i) => free.swap_remove(i),
+            None => {
+                drop(free);
+                Vec::with_capacity(len)
+            }
+        };
+        v.resize(len, 0.0);
+        Buffer(v)
+    }
+
+    /// A buffer of `len` zeros.
+    pub fn zeros(len: usize) -> Buffer {
+        let mut b = Buffer::scratch(len);
+        b.fill(0.0);
+        b
+    }
+}
+
+impl Drop for Buffer {
+    fn drop(&mut self) {
+        let v = std::mem::take(&mut self.0);
+        if v.capacity() == 0 {
+            return;
+        }
+        if let Ok(mut free) = FREE.lock()
+            && free.len() < KEPT
+        {
+            free.push(v);
+        }
+    }
+}
+
+impl Clone for Buffer {
+    fn clone(&self) -> Buffer {
+        let mut b = Buffer::scratch(self.len());
+        b.copy_from_slice(self);
+        b
+    }
+}
+
+impl Deref for Buffer {
+    type Target = [f32];
+    fn deref(&self) -> &[f32] {
+        &self.0
+    }
+}
+
+impl DerefMut for Buffer {
+    fn deref_mut(&mut self) -> &mut [f32] {
+        &mut self.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn zeros_are_zero_even_when_the_memory_was_used_before() {
+        let mut b = Buffer::scratch(5000);
+        b.fill(7.0);
+        drop(b);
+        assert!(Buffer::zeros(5000).iter().all(|&v| v == 0.0));
+        assert_eq!(Buffer::scratch(4999).len(), 4999);
+    }
+}

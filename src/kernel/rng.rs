@@ -1,0 +1,57 @@
+//! Random numbers without state: a hash of (seed, stream, index).
+//!
+//! A step's draws depend on the step's number alone, so resuming needs no generator state and any
+//! number of threads draws the same numbers. SplitMix64's finaliser (Steele, Lea, Flood 2014).
+
+/// 64 random bits for a draw.
+#[inline]
+pub fn bits(seed: u64, stream: u64, index: u64) -> u64 {
+    mix(mix(mix(seed ^ 0x9e37_79b9_7f4a_7c15) ^ stream)
+        .wrapping_add(index.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
+}
+
+#[inline]
+fn mix(mut z: u64) -> u64 {
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
+/// A uniform number in [0, 1).
+#[inline]
+pub fn uniform(seed: u64, stream: u64, index: u64) -> f32 {
+    (bits(seed, stream, index) >> 40) as f32 / (1u64 << 24) as f32
+}
+
+/// A uniform integer in `0..n`, n > 0.
+#[inline]
+pub fn below(seed: u64, stream: u64, index: u64, n: u64) -> u64 {
+    ((bits(seed, stream, index) as u128 * n as u128) >> 64) as u64
+}
+
+/// A normal number (Box, Muller 1958).
+pub fn normal(seed: u64, stream: u64, index: u64) -> f32 {
+    let (u, v) = (uniform(seed, stream, 2 * index), uniform(seed, stream, 2 * index + 1));
+    (-2.0 * (1.0 - u as f64).ln()).sqrt() as f32 * (std::f32::consts::TAU * v).cos()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn moments_are_those_of_the_distributions() {
+        let n = 100_000;
+        let mean: f64 = (0..n).map(|i| uniform(1, 2, i) as f64).sum::<f64>() / n as f64;
+        assert!((mean - 0.5).abs() < 0.005);
+        let (mut sum, mut square) = (0f64, 0f64);
+        for i in 0..n {
+            let x = normal(1, 3, i) as f64;
+            sum += x;
+            square += x * x;
+        }
+        assert!((sum / n as f64).abs() < 0.02 && (square / n as f64 - 1.0).abs() < 0.03);
+        assert!((0..1000).all(|i| below(5, 6, i, 7) < 7));
+        assert_ne!(bits(1, 2, 3), bits(1, 3, 2));
+    }
+}

@@ -1,0 +1,206 @@
+//! The fused field against an independent f64 model and its finite differences.
+
+use super::*;
+
+/// A small field with lively weights.
+fn field() -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
+    let levels = hash::levels(5, 4, 1.8, 9);
+    let shape = FieldShape { levels, radius: 1.3, active: 5 };
+    let table = (0..hash::entries(&shape.levels))
+        .map(|i| [(i as f32 * 0.731).sin() * 0.4, (i as f32 * 0.317).cos() * 0.4])
+        .collect();
+    let flat = (0..shape.layout().len())
+        .map(|i| ((i as f32 * 0.619).sin() + (i as f32 * 0.137).cos()) * 0.13)
+        .collect();
+    (shape, table, flat)
+}
+
+fn points(n: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
+    let at = |i: usize, k: f32| ((i as f32 + 0.37) * k).sin();
+    let x = (0..n).map(|i| [at(i, 1.7), at(i, 2.9), at(i, 0.83)]).collect();
+    let d = (0..n).map(|i| unit([at(i, 0.7), at(i, 1.1) + 0.2, at(i, 2.3)])).collect();
+    (x, d)
+}
+
+/// Independent model in f64: loops, no tiles, gradient of the sdf by the chain rule written out.
+fn model(shape: &FieldShape, table: &[[f64; 2]], flat: &[f64], x: [f32; 3], d: [f32; 3]) -> [f64; 7] {
+    let layout = shape.layout();
+    let mut start = 0;
+    let mats = layout.shapes().map(|(o, i)| {
+        start += o * i;
+        &flat[start - o * i..start]
+    });
+    let k = layout.inputs;
+    let r = shape.radius as f64;
+    let mut u = vec![0f64; k];
+    let mut du = vec![[0f64; 3]; k];
+    for a in 0..3 {
+        u[a] = x[a] as f64 / r;
+        du[a][a] = 1.0 / r;
+    }
+    for (l, level) in shape.levels.iter().enumerate() {
+        // cell and fraction from the f32 path (the same cell), weights in f64
+        let x01: [f32; 3] = std::array::from_fn(|a| x[a] * (0.5 / shape.radius) + 0.5);
+        let (index, _) = hash::cell::<true>(level, x01);
+        let f: [f64; 3] = std::array::from_fn(|a| {
+            let p = level.scale as f64 * (x[a] as f64 * (0.5 / r) + 0.5) + 0.5;
+            p - p.floor()
+        });
+        let slope = level.scale as f64 * 0.5 / r;
+        for c in 0..8 {
+            let bit = |a: usize| c >> a & 1 == 1;
+            let w: [f64; 3] = std::array::from_fn(|a| if bit(a) { f[a] } else { 1.0 - f[a] });
+            let e = table[level.offset + index[c] as usize];
+            for j in 0..2 {
+                u[3 + 2 * l + j] += w[0] * w[1] * w[2] * e[j];
+                for a in 0..3 {
+                    let sign = if bit(a) { 1.0 } else { -1.0 };
+                    du[3 + 2 * l + j][a] += sign * slope * w[(a + 1) % 3] * w[(a + 2) % 3] * e[j];
+                }
+            }
+        }
+    }
+    let mut o = [0f64; 13];
+    let mut n = [0f64; 3];
+    o.copy_from_slice(mats[3]);
+    for j in 0..64 {
+        let z: f64 = mats[1][j] + (0..k).map(|i| mats[0][j * k + i] * u[i]).sum::<f64>();
+        let h = if 100.0 * z > 40.0 { z } else { (100.0 * z).exp().ln_1p() / 100.0 };
+        let s = 1.0 / (1.0 + (-100.0 * z).exp());
+        for (c, o) in o.iter_mut().enumerate() {
+            *o += mats[2][c * 64 + j] * h;
+        }
+        for a in 0..3 {
+            n[a] += mats[2][j] * s * (0..k).map(|i| mats[0][j * k + i] * du[i][a]).sum::<f64>();
+        }
+    }
+    let len = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
+    let mut c0 = o.to_vec();
+    c0.extend(sh16(d).map(|v| v as f64));
+    c0.extend(n.map(|v| v / len));
+    let dense = |m: &[f64], v: &[f64]| -> Vec<f64> {
+        m.chunks(v.len()).map(|row| row.iter().zip(v).map(|(a, b)| a * b).sum()).collect()
+    };
+    let relu = |v: Vec<f64>| v.into_iter().map(|x: f64| x.max(0.0)).collect::<Vec<_>>();
+    let rgb = dense(mats[6], &relu(dense(mats[5], &relu(dense(mats[4], &c0)))));
+    let sigmoid = |v: f64| 1.0 / (1.0 + (-v).exp());
+    [o[0], n[0], n[1], n[2], sigmoid(rgb[0]), sigmoid(rgb[1]), sigmoid(rgb[2])]
+}
+
+fn wide(flat: &[f32]) -> Vec<f64> {
+    flat.iter().map(|&v| v as f64).collect()
+}
+
+#[test]
+fn the_forward_agrees_with_an_f64_model() {
+    let (shape, table, flat) = field();
+    let (x, d) = points(150); // two full tiles and a part
+    let w = Weights::new(shape.layout(), &flat);
+    let a = forward(&shape, &table, &w, &x, &d);
+    let table64: Vec<[f64; 2]> = table.iter().map(|e| [e[0] as f64, e[1] as f64]).collect();
+    let flat64 = wide(&flat);
+    let sdf = values(&shape, &table, &w, &x);
+    let normals = gradients(&shape, &table, &w, &x);
+    for i in 0..x.len() {
+        let want = model(&shape, &table64, &flat64, x[i], d[i]);
+        for k in 0..7 {
+            let got = a.output()[i * WIDTH + k] as f64;
+            assert!((got - want[k]).abs() < 2e-4 * want[k].abs().max(1.0), "{i} {k}: {got} {}", want[k]);
+        }
+        assert!((sdf[i] - a.output()[i * WIDTH]).abs() < 1e-5);
+        assert_eq!(normals[i].1, [1, 2, 3].map(|k| a.output()[i * WIDTH + k]));
+    }
+}
+
+#[test]
+fn levels_that_are_not_active_read_as_zero() {
+    let (shape, mut table, flat) = field();
+    let (x, d) = points(70);
+    let w = Weights::new(shape.layout(), &flat);
+    let part = FieldShape { active: 3, ..shape.clone() };
+    let got = forward(&part, &table, &w, &x, &d);
+    table[shape.levels[3].offset..].fill([0.0; 2]);
+    let want = forward(&shape, &table, &w, &x, &d);
+    for (a, b) in got.output().iter().zip(want.output()) {
+        assert!((a - b).abs() < 1e-6);
+    }
+}
+
+/// Worst and median relative error of the gradients by a selection of parameters.
+#[test]
+fn the_backward_agrees_with_f64_finite_differences_second_order_included() {
+    let (shape, table, flat) = field();
+    let (x, d) = points(90);
+    let w = Weights::new(shape.layout(), &flat);
+    let a = forward(&shape, &table, &w, &x, &d);
+    // loss = Σ g·out + 0.1 Σ (‖n‖ − 1)²: every output and the eikonal path
+    let g: Vec<f64> = (0..x.len() * 7).map(|i| (i as f64 * 0.77).sin()).collect();
+    let mut g_out = vec![0f32; x.len() * WIDTH];
+    for i in 0..x.len() {
+        let o = &a.output()[i * WIDTH..][..WIDTH];
+        let len = (o[1] * o[1] + o[2] * o[2] + o[3] * o[3]).sqrt();
+        for k in 0..7 {
+            g_out[i * WIDTH + k] = g[i * 7 + k] as f32;
+            if (1..4).contains(&k) {
+                g_out[i * WIDTH + k] += 0.2 * (len - 1.0) / len * o[k];
+            }
+        }
+    }
+    let mut g_table = vec![[0f32; 2]; table.len()];
+    let g_flat = backward(&a, &w, &g_out, &mut g_table);
+
+    let table64: Vec<[f64; 2]> = table.iter().map(|e| [e[0] as f64, e[1] as f64]).collect();
+    let flat64 = wide(&flat);
+    let loss = |table: &[[f64; 2]], flat: &[f64]| -> f64 {
+        (0..x.len())
+            .map(|i| {
+                let o = model(&shape, table, flat, x[i], d[i]);
+                let len = (o[1] * o[1] + o[2] * o[2] + o[3] * o[3]).sqrt();
+                (0..7).map(|k| o[k] * g[i * 7 + k]).sum::<f64>() + 0.1 * (len - 1.0).powi(2)
+            })
+            .sum()
+    };
+    let mut errors = Vec::new();
+    let scale = g_flat.iter().fold(0f32, |m, v| m.max(v.abs())) as f64;
+    for i in (0..flat.len()).step_by(31) {
+        let mut f = flat64.clone();
+        f[i] += 1e-5;
+        let up = loss(&table64, &f);
+        f[i] -= 2e-5;
+        let slope = (up - loss(&table64, &f)) / 2e-5;
+        errors.push((slope - g_flat[i] as f64).abs() / slope.abs().max(1e-3 * scale));
+    }
+    let touched: Vec<usize> = (0..table.len()).filter(|&i| g_table[i] != [0.0; 2]).collect();
+    let scale = g_table.iter().flatten().fold(0f32, |m, v| m.max(v.abs())) as f64;
+    for &i in touched.iter().step_by(touched.len() / 120) {
+        for j in 0..2 {
+            let mut t = table64.clone();
+            t[i][j] += 1e-5;
+            let up = loss(&t, &flat64);
+            t[i][j] -= 2e-5;
+            let slope = (up - loss(&t, &flat64)) / 2e-5;
+            errors.push((slope - g_table[i][j] as f64).abs() / slope.abs().max(1e-3 * scale));
+        }
+    }
+    errors.sort_by(f64::total_cmp);
+    let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
+    println!("{} gradients: median {median:.1e}, worst {worst:.1e}", errors.len());
+    assert!(median < 1e-4 && worst < 1e-3, "median {median:.1e}, worst {worst:.1e}");
+}
+
+#[test]
+fn one_thread_and_many_give_the_same_bytes() {
+    let (shape, table, flat) = field();
+    let (x, d) = points(5000);
+    let w = Weights::new(shape.layout(), &flat);
+    let once = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let a = forward(&shape, &table, &w, &x, &d);
+            let g_out = a.output().to_vec();
+            let mut g = vec![[0f32; 2]; table.len()];
+            (backward(&a, &w, &g_out, &mut g), g, g_out)
+        })
+    };
+    assert_eq!(once(1), once(3));
+}

@@ -1,0 +1,45 @@
+//! Real spherical harmonics up to degree 3 (16 values): the view-direction encoding of Instant-NGP.
+
+/// The 16 basis functions at the unit direction `d`, in the order and with the signs of
+/// tiny-cuda-nn's degree-4 encoding.
+#[inline(always)]
+pub fn sh16([x, y, z]: [f32; 3]) -> [f32; 16] {
+    let (xy, yz, xz) = (x * y, y * z, x * z);
+    let (x2, y2, z2) = (x * x, y * y, z * z);
+    [
+        0.282_094_79,
+        -0.488_602_51 * y,
+        0.488_602_51 * z,
+        -0.488_602_51 * x,
+        1.092_548_4 * xy,
+        -1.092_548_4 * yz,
+        0.946_174_7 * z2 - 0.315_391_57,
+        -1.092_548_4 * xz,
+        0.546_274_2 * (x2 - y2),
+        0.590_043_6 * y * (y2 - 3.0 * x2),
+        2.890_611_4 * xy * z,
+        0.457_045_8 * y * (1.0 - 5.0 * z2),
+        0.373_176_34 * z * (5.0 * z2 - 3.0),
+        0.457_045_8 * x * (1.0 - 5.0 * z2),
+        1.445_305_7 * z * (x2 - y2),
+        0.590_043_6 * x * (3.0 * y2 - x2),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_published_values_at_one_two_three() {
+        let n = 14f32.sqrt();
+        let got = sh16([1.0 / n, 2.0 / n, 3.0 / n]);
+        let golden = [
+            0.2820948, -0.2611690, 0.3917535, -0.1305845, 0.1560783, -0.4682350, 0.2928636, -0.2341175,
+            -0.1170588, 0.0225280, 0.3310922, -0.5409528, 0.0641157, -0.2704764, -0.2483191, 0.1239038,
+        ];
+        for (g, w) in got.iter().zip(golden) {
+            assert!((g - w as f32).abs() < 2e-7, "{g} {w}");
+        }
+    }
+}
