@@ -1,0 +1,108 @@
+//! What the camera files say, before any photograph is looked at.
+
+use super::{CaptureError, Split};
+use crate::geom::{Camera, Distortion};
+use glam::{DMat3, DVec3};
+use std::path::PathBuf;
+
+/// Everything a format's reader found.
+#[derive(Debug, Default)]
+pub(super) struct Listing {
+    pub frames: Vec<Frame>,
+    pub reasons: Vec<String>,
+    pub warnings: Vec<String>,
+    pub problems: Vec<CaptureError>,
+    /// The world's up, where the dataset names it.
+    pub up: Option<DVec3>,
+}
+
+/// One camera as its file describes it.
+#[derive(Clone, Debug)]
+pub(super) struct Frame {
+    /// The camera file.
+    pub file: String,
+    /// The photograph as written there.
+    pub name: String,
+    /// The photograph, if there is one.
+    pub photo: Option<PathBuf>,
+    /// Its path relative to the capture.
+    pub relative: PathBuf,
+    pub split: Option<Split>,
+    pub lens: Lens,
+    pub rotation: DMat3,
+    pub position: DVec3,
+    pub mask: Option<PathBuf>,
+    pub region: Option<PathBuf>,
+}
+
+/// Intrinsics as declared; complete only together with the photograph's size.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Lens {
+    pub size: Option<(u32, u32)>,
+    /// Focal lengths in pixels.
+    pub focal: [Option<f64>; 2],
+    /// Full opening angles in radians, used where the focal length is absent.
+    pub angle: [Option<f64>; 2],
+    /// Principal point from the top-left corner, pixels; the middle where absent.
+    pub center: [Option<f64>; 2],
+    pub distortion: Distortion,
+}
+
+impl Lens {
+    /// The camera of a picture of `size`. One focal length stands for both.
+    pub fn camera(&self, size: (u32, u32), rotation: DMat3, position: DVec3) -> Result<Camera, String> {
+        let side = [size.0 as f64, size.1 as f64];
+        let focal =
+            |k: usize| self.focal[k].or_else(|| self.angle[k].map(|a| 0.5 * side[k] / (0.5 * a).tan()));
+        let (fx, fy) = match (focal(0), focal(1)) {
+            (Some(fx), Some(fy)) => (fx, fy),
+            (Some(f), None) | (None, Some(f)) => (f, f),
+            (None, None) => {
+                return Err("it has neither `fl_x` nor `camera_angle_x`, nor has the whole file".into());
+            }
+        };
+        for (name, f) in [("fl_x", fx), ("fl_y", fy)] {
+            if !(f.is_finite() && f > 0.0) {
+                return Err(format!("the focal length `{name}` is {f}, it must be positive"));
+            }
+        }
+        let center = |k: usize| self.center[k].unwrap_or(0.5 * side[k]);
+        let camera = Camera {
+            width: size.0,
+            height: size.1,
+            fx,
+            fy,
+            cx: center(0),
+            cy: center(1),
+            distortion: self.distortion,
+            rotation,
+            position,
+        };
+        // beyond a whole picture beside it, the intrinsics belong to another size
+        if (0..2).any(|k| !(center(k) > -side[k] && center(k) < 2.0 * side[k])) {
+            return Err(format!(
+                "the principal point ({}, {}) is far outside its {} × {} pixels",
+                center(0),
+                center(1),
+                size.0,
+                size.1
+            ));
+        }
+        Ok(camera)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_opening_angle_becomes_a_focal_length() {
+        // 90° over 200 pixels: f = 100 / tan 45° = 100
+        let lens = Lens { angle: [Some(90f64.to_radians()), None], ..Lens::default() };
+        let c = lens.camera((200, 100), DMat3::IDENTITY, DVec3::ZERO).unwrap();
+        assert!((c.fx - 100.0).abs() < 1e-9 && c.fy == c.fx);
+        assert_eq!((c.cx, c.cy), (100.0, 50.0));
+        assert!(Lens::default().camera((2, 2), DMat3::IDENTITY, DVec3::ZERO).is_err());
+    }
+}

@@ -1,0 +1,168 @@
+//! Names in camera files: only what lies inside the capture is ever opened.
+
+use super::CaptureError;
+use super::listing::Frame;
+use crate::io;
+use std::path::{Component, Path, PathBuf};
+
+const ENDINGS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
+
+/// The capture's folder, as given and without links.
+pub(super) struct Place {
+    root: PathBuf,
+    real: PathBuf,
+}
+
+impl Place {
+    pub fn new(root: &Path) -> Result<Place, CaptureError> {
+        Ok(Place { root: root.into(), real: io::real_path(root)? })
+    }
+
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// A path relative to the capture, for messages.
+    pub fn shown(&self, path: &Path) -> String {
+        path.strip_prefix(&self.root).unwrap_or(path).to_string_lossy().into_owned()
+    }
+
+    /// The path below the capture that `name` means. `\` counts as a separator, since tools on Windows
+    /// write it; an absolute name is taken if it points into the capture.
+    pub fn relative(&self, file: &str, name: &str) -> Result<PathBuf, CaptureError> {
+        let outside = || CaptureError::Outside { file: file.into(), name: name.into() };
+        if name.is_empty() || name.contains('\0') {
+            return Err(outside());
+        }
+        let text = name.replace('\\', "/");
+        let mut path = Path::new(&text);
+        if path.is_absolute() {
+            path = path
+                .strip_prefix(&self.root)
+                .or_else(|_| path.strip_prefix(&self.real))
+                .map_err(|_| outside())?;
+        } else if text.as_bytes().get(1) == Some(&b':') {
+            return Err(outside()); // a Windows drive
+        }
+        let mut relative = PathBuf::new();
+        for part in path.components() {
+            match part {
+                Component::Normal(p) => relative.push(p),
+                Component::CurDir => {}
+                Component::ParentDir if relative.pop() => {}
+                _ => return Err(outside()),
+            }
+        }
+        Ok(relative)
+    }
+
+    /// The regular file at a relative path, if there is one; a link that leads out is an error.
+    pub fn file(&self, file: &str, relative: &Path) -> Result<Option<PathBuf>, CaptureError> {
+        let path = self.root.join(relative);
+        if !io::is_file(&path) {
+            return Ok(None);
+        }
+        if !io::real_path(&path)?.starts_with(&self.real) {
+            let name = relative.to_string_lossy().into_owned();
+            return Err(CaptureError::Outside { file: file.into(), name });
+        }
+        Ok(Some(path))
+    }
+
+    /// The photograph that `name` means, with its path below the capture: the very name, else with a
+    /// usual ending, else in the folder of pictures already reduced by `downscale`
+    /// (`images_4/`, `images_4x/`).
+    pub fn photo(
+        &self,
+        file: &str,
+        name: &str,
+        downscale: u32,
+    ) -> Result<(PathBuf, Option<PathBuf>), CaptureError> {
+        let wanted = self.relative(file, name)?;
+        let mut folders = vec![wanted.clone()];
+        let mut parts = wanted.components();
+        if let Some(first) = parts.next()
+            && downscale > 1
+            && !parts.as_path().as_os_str().is_empty()
+        {
+            for suffix in [format!("_{downscale}"), format!("_{downscale}x")] {
+                let mut folder = first.as_os_str().to_owned();
+                folder.push(suffix);
+                folders.push(Path::new(&folder).join(parts.as_path()));
+            }
+        }
+        for candidate in folders {
+            if let Some(path) = self.file(file, &candidate)? {
+                return Ok((candidate, Some(path)));
+            }
+            for ending in ENDINGS {
+                let mut with = candidate.clone().into_os_string();
+                with.push(".");
+                with.push(ending);
+                if let Some(path) = self.file(file, Path::new(&with))? {
+                    return Ok((with.into(), Some(path)));
+                }
+            }
+        }
+        Ok((wanted, None))
+    }
+}
+
+/// The folder common to all photographs, and each one's path below it without ending, `/` between.
+pub(super) fn view_names(frames: &[Frame]) -> (PathBuf, Vec<String>) {
+    let mut folder: Option<PathBuf> = None;
+    for frame in frames {
+        let parent = frame.relative.parent().unwrap_or(Path::new(""));
+        folder = Some(match folder {
+            None => parent.into(),
+            Some(f) => {
+                f.components().zip(parent.components()).take_while(|(a, b)| a == b).map(|(a, _)| a).collect()
+            }
+        });
+    }
+    let folder = folder.unwrap_or_default();
+    let names = frames
+        .iter()
+        .map(|frame| {
+            let below = frame.relative.strip_prefix(&folder).unwrap_or(&frame.relative).with_extension("");
+            let parts: Vec<_> = below.components().map(|c| c.as_os_str().to_string_lossy()).collect();
+            parts.join("/")
+        })
+        .collect();
+    (folder, names)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_stay_inside_the_capture_however_they_are_written() {
+        let dir = tempfile::tempdir().unwrap();
+        let place = Place::new(dir.path()).unwrap();
+        let good = [
+            ("./images/a.png", "images/a.png"),
+            ("images/../b/./c", "b/c"),
+            ("images\\a.png", "images/a.png"),
+            ("a b/ü.png", "a b/ü.png"),
+        ];
+        for (name, path) in good {
+            assert_eq!(place.relative("t.json", name).unwrap(), Path::new(path));
+        }
+        let inside = dir.path().join("x/y.png");
+        assert_eq!(place.relative("t.json", inside.to_str().unwrap()).unwrap(), Path::new("x/y.png"));
+        for name in ["../a.png", "a/../../b", "/etc/passwd", "", "C:\\a.png", "a\0b", "..\\a"] {
+            assert!(matches!(place.relative("t.json", name), Err(CaptureError::Outside { .. })), "{name:?}");
+        }
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn a_link_that_leads_out_is_not_followed() {
+        let (dir, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        std::fs::write(other.path().join("a.png"), b"x").unwrap();
+        std::os::unix::fs::symlink(other.path().join("a.png"), dir.path().join("a.png")).unwrap();
+        let place = Place::new(dir.path()).unwrap();
+        assert!(matches!(place.photo("t.json", "a.png", 1), Err(CaptureError::Outside { .. })));
+    }
+}

@@ -1,0 +1,537 @@
+//! Where the head is: a box from cameras and masks, so that nobody guesses near, far or radius.
+//!
+//! With masks: the rays through the masks' middles meet near the head; a cube around that point, wide
+//! enough for every frame, is carved by the silhouettes at a coarse resolution, the cube is drawn tight
+//! around what is left, and carved again until it no longer shrinks. What lies outside a frame, beyond a border
+//! that the mask touches, is undecided for that view. So two rules say where a body ends that the frames cut:
+//!
+//! - the *box* is drawn around the cells that touch the masks of a third of the views (three at least):
+//!   farther out too few cameras look for anything to be reconstructed;
+//! - the *hull* is everything inside that box that touches three masks: what one still may find there.
+//!
+//! Without masks: the box of the region that 40 % of the cameras have in their frame, no farther from the
+//! meeting point of the viewing axes than 0.6 of the cameras' median distance to it.
+
+use super::carve::{self, Cube, Projector, Silhouette};
+use crate::geom::{Aabb, Camera, Similarity};
+use crate::image::Gray;
+use glam::{DVec3, Vec3};
+use serde::{Deserialize, Serialize};
+
+/// The head's box and how it sits in the world.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
+    /// Scale and translation, no rotation: the box's longest side fills [-1, 1], to within a tenth.
+    pub scene_from_world: Similarity,
+    /// The tight box in scene coordinates, within [-1, 1]³.
+    pub aabb: Aabb,
+    /// What the silhouettes leave; `None` without masks.
+    pub hull: Option<Hull>,
+}
+
+/// The visual hull as cells over [-1, 1]³ of the scene; it holds the head, and never less.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Hull {
+    /// Cells per axis.
+    pub resolution: usize,
+    /// One bit a cell, cell `(x · R + y) · R + z`, lowest bit first.
+    pub bits: Vec<u64>,
+}
+
+impl Hull {
+    fn new(resolution: usize, kept: &[bool]) -> Hull {
+        let mut bits = vec![0u64; kept.len().div_ceil(64)];
+        for (i, _) in kept.iter().enumerate().filter(|(_, k)| **k) {
+            bits[i / 64] |= 1 << (i % 64);
+        }
+        Hull { resolution, bits }
+    }
+
+    /// Is cell `i = (x · R + y) · R + z` part of the hull?
+    pub fn get(&self, i: usize) -> bool {
+        self.bits[i / 64] >> (i % 64) & 1 == 1
+    }
+
+    /// How many cells it has.
+    pub fn count(&self) -> usize {
+        self.bits.iter().map(|b| b.count_ones() as usize).sum()
+    }
+
+    /// Is a point in scene coordinates in a cell of the hull?
+    pub fn contains(&self, point: Vec3) -> bool {
+        if !Aabb::SCENE.contains(point) {
+            return false;
+        }
+        let r = self.resolution;
+        let cell = (point + 1.0) * 0.5 * r as f32;
+        let [x, y, z] = cell.to_array().map(|c| (c as usize).min(r - 1));
+        self.get((x * r + y) * r + z)
+    }
+}
+
+/// How the box is found.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SceneOptions {
+    /// Cells per axis of the hull.
+    pub resolution: usize,
+    /// Mask values over this may be head; low, so that soft hair is not carved away.
+    pub threshold: u8,
+    /// Masks that a cell must touch; no more than there are.
+    pub least_views: usize,
+    /// Cells of air around the hull.
+    pub margin_cells: usize,
+    /// Names of the views for messages; numbers where absent.
+    pub names: Vec<String>,
+}
+
+impl Default for SceneOptions {
+    fn default() -> SceneOptions {
+        SceneOptions { resolution: 128, threshold: 12, least_views: 3, margin_cells: 2, names: Vec::new() }
+    }
+}
+
+/// Why no box can be found.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SceneError {
+    /// No cameras at all, or one.
+    #[error("{found} cameras cannot place a head, two are needed at least")]
+    TooFewCameras {
+        /// How many there are.
+        found: usize,
+    },
+    /// Cameras and masks do not match.
+    #[error("there are {cameras} cameras but {masks} masks")]
+    Unpaired {
+        /// How many cameras.
+        cameras: usize,
+        /// How many entries for masks.
+        masks: usize,
+    },
+    /// One place, or one direction.
+    #[error("all {cameras} cameras {how}, so nothing says how far away the head is")]
+    CamerasAlike {
+        /// How many cameras.
+        cameras: usize,
+        /// What they share.
+        how: &'static str,
+    },
+    /// The cameras do not look at one thing.
+    #[error("the point all views aim at is inside the frame of only {seen} of {cameras} cameras")]
+    HeadOutside {
+        /// Frames that hold it.
+        seen: usize,
+        /// How many cameras.
+        cameras: usize,
+    },
+    /// Masks that keep everything.
+    #[error("all {masks} masks are white everywhere, so they say nothing about where the head is")]
+    AllWhite {
+        /// How many masks.
+        masks: usize,
+    },
+    /// Masks that keep nothing.
+    #[error("all {masks} masks are empty")]
+    AllEmpty {
+        /// How many masks.
+        masks: usize,
+    },
+    /// Silhouettes that contradict each other everywhere.
+    #[error("no point in space is inside all {masks} masks{}", suspect(culprit))]
+    EmptyHull {
+        /// How many masks.
+        masks: usize,
+        /// The view that removes most of what all others keep, if one stands out.
+        culprit: Option<String>,
+    },
+}
+
+fn suspect(culprit: &Option<String>) -> String {
+    culprit
+        .as_ref()
+        .map(|c| format!("; the mask of view `{c}` contradicts the others most"))
+        .unwrap_or_default()
+}
+
+impl SceneError {
+    /// The way out.
+    pub fn hint(&self) -> &'static str {
+        match self {
+            SceneError::TooFewCameras { .. } => "photograph the head from more sides",
+            SceneError::Unpaired { .. } => "give one mask, or none, per camera",
+            SceneError::CamerasAlike { .. } => {
+                "check that each frame has its own pose; cameras must look from different sides"
+            }
+            SceneError::HeadOutside { .. } => {
+                "check the axis convention of the poses: cameras must look along their -Z axis (OpenGL)"
+            }
+            SceneError::AllWhite { .. } => "make head masks, or go on without: `mask.source = \"none\"`",
+            SceneError::AllEmpty { .. } => "white must keep the head: were the masks saved as 0 and 1?",
+            SceneError::EmptyHull { .. } => {
+                "look at that view's mask and pose; are masks inverted, or poses of another capture?"
+            }
+        }
+    }
+}
+
+/// Finds the box, and the hull where there are masks; warnings name views that look wrong.
+///
+/// `masks[i]` belongs to `cameras[i]`; a view without one does not carve. Masks may have another size than
+/// their camera. Empty and all-white masks are left out with a warning.
+pub fn fit(
+    cameras: &[Camera],
+    masks: &[Option<Gray>],
+    options: &SceneOptions,
+) -> Result<(Scene, Vec<String>), SceneError> {
+    if cameras.len() != masks.len() {
+        return Err(SceneError::Unpaired { cameras: cameras.len(), masks: masks.len() });
+    }
+    if cameras.len() < 2 {
+        return Err(SceneError::TooFewCameras { found: cameras.len() });
+    }
+    let name = |i: usize| options.names.get(i).cloned().unwrap_or_else(|| i.to_string());
+    let mut warnings = Vec::new();
+    let (mut white, mut empty, mut used) = (0, 0, Vec::new());
+    for (i, mask) in masks.iter().enumerate() {
+        let Some(mask) = mask else { continue };
+        if mask.values.iter().all(|&v| v <= options.threshold) {
+            empty += 1;
+            warnings.push(format!("the mask of view `{}` is empty; it does not place the head", name(i)));
+        } else if mask.values.iter().all(|&v| v > options.threshold) {
+            white += 1;
+            warnings.push(format!(
+                "the mask of view `{}` is white everywhere; it does not place the head",
+                name(i)
+            ));
+        } else {
+            used.push(i);
+        }
+    }
+    if used.is_empty() && white > 0 {
+        return Err(SceneError::AllWhite { masks: white });
+    }
+    if used.is_empty() && empty > 0 {
+        return Err(SceneError::AllEmpty { masks: empty });
+    }
+    if used.len() < 2 {
+        // one silhouette alone bounds nothing in depth
+        let scene = from_frusta(cameras)?;
+        return Ok((scene, warnings));
+    }
+
+    let aims: Vec<_> = used.iter().map(|&i| carve::ray_to(&cameras[i], masks[i].as_ref())).collect();
+    let some: Vec<&Camera> = used.iter().map(|&i| &cameras[i]).collect();
+    let center = aim(&some, &aims)?;
+    let silhouettes: Vec<Silhouette> = used
+        .iter()
+        .filter_map(|&i| Some(Silhouette::new(i, &cameras[i], masks[i].as_ref()?, options.threshold)))
+        .collect();
+    let least = options.least_views.min(used.len());
+    let core = used.len().div_ceil(3).max(least);
+    let margin = options.margin_cells as f64;
+
+    let mut cube = Cube { center, half: first_half(&some, center), n: 64.min(options.resolution) };
+    let mut grown = 0;
+    let mut shrunk = 0;
+    // how much each view removes alone, and what all keep: from the coarse cube, which holds everything
+    let mut word: (Vec<u64>, u64) = Default::default();
+    let (extent, mut kept) = loop {
+        let carved = carve::carve(&cube, &silhouettes);
+        let mut kept = carved.touching(core);
+        let dropped = carve::drop_dust(&mut kept, cube.n, 0.02);
+        let total = kept.iter().filter(|k| **k).count() as u64;
+        if shrunk == 0 {
+            word = (carved.alone.clone(), total);
+        }
+        let Some(extent) = carve::extent(&kept, cube.n) else {
+            let most = (0..silhouettes.len()).max_by_key(|&i| word.0[i]);
+            let culprit = most.filter(|&i| word.0[i] > 0).map(|i| name(silhouettes[i].view));
+            return Err(SceneError::EmptyHull { masks: used.len(), culprit });
+        };
+        let (first, last) = (cube.n == options.resolution, shrunk == 4);
+        let cut = extent.iter().any(|&(lo, hi)| lo == 0 || hi == cube.n - 1);
+        if cut && shrunk == 0 && grown < 2 {
+            cube.half *= 1.6;
+            grown += 1;
+            continue;
+        }
+        if cut && shrunk == 0 {
+            warnings
+                .push("the cameras hardly bound the head in depth; the box ends where it was cut off".into());
+        }
+        // the middle and half side of what is left, with its air
+        let lo = DVec3::from(extent.map(|(lo, _)| lo as f64));
+        let hi = DVec3::from(extent.map(|(_, hi)| hi as f64 + 1.0));
+        let middle = cube.center - cube.half + 0.5 * (lo + hi) * cube.cell();
+        let cells = (hi - lo).max_element();
+        // the margin is counted in cells of the next cube, of which `resolution` make its side
+        let share = 1.0 - 2.0 * margin / options.resolution as f64;
+        let half = 0.5 * cells * cube.cell() / share.max(0.5);
+        if first && (half > 0.93 * cube.half || last) {
+            if dropped as u64 * 20 > total {
+                let share = 100.0 * dropped as f64 / total as f64;
+                warnings.push(format!("pieces apart from the head, {share:.0} % of its size, were left out"));
+            }
+            break (extent, carved.touching(least));
+        }
+        cube = Cube { center: middle, half, n: options.resolution };
+        shrunk += 1;
+    };
+
+    let (alone, total) = word;
+    let mut sorted = alone.clone();
+    sorted.sort_unstable();
+    let median = sorted[sorted.len() / 2];
+    for (s, &count) in silhouettes.iter().zip(&alone) {
+        // with few views each one rightly removes a lot; a wrong one stands out from the others too
+        if 4 * count > total && count > 4 * median {
+            warnings.push(format!(
+                "the mask of view `{}` alone removes {:.0} % as much space as all masks together keep; look at \
+                 its mask and pose",
+                name(s.view),
+                100.0 * count as f64 / total as f64
+            ));
+        }
+    }
+    // nothing of the hull outside the box, air included
+    let air = options.margin_cells;
+    for (i, cell) in kept.iter_mut().enumerate() {
+        let at = [i / (cube.n * cube.n), i / cube.n % cube.n, i % cube.n];
+        *cell &= at.iter().zip(&extent).all(|(&v, &(lo, hi))| v + air >= lo && v <= hi + air);
+    }
+    let hull = Hull::new(cube.n, &kept);
+    let scene_coordinate = |cells: f64| (2.0 * cells / cube.n as f64 - 1.0).clamp(-1.0, 1.0) as f32;
+    let aabb = Aabb {
+        min: Vec3::from(extent.map(|(lo, _)| scene_coordinate(lo as f64 - margin))),
+        max: Vec3::from(extent.map(|(_, hi)| scene_coordinate(hi as f64 + 1.0 + margin))),
+    };
+    Ok((Scene { scene_from_world: scene_from(cube.center, cube.half), aabb, hull: Some(hull) }, warnings))
+}
+
+fn scene_from(center: DVec3, half: f64) -> Similarity {
+    Similarity::scale_translate(1.0 / half, -center / half)
+}
+
+/// Where the rays meet, once it is clear that they do.
+fn aim(cameras: &[&Camera], rays: &[(DVec3, DVec3)]) -> Result<DVec3, SceneError> {
+    let n = cameras.len();
+    let alike = |how| SceneError::CamerasAlike { cameras: n, how };
+    let mean = cameras.iter().map(|c| c.position).sum::<DVec3>() / n as f64;
+    let spread = cameras.iter().map(|c| c.position.distance(mean)).fold(0.0, f64::max);
+    if !(spread > 1e-9 * (1.0 + mean.length())) {
+        return Err(alike("stand at one place"));
+    }
+    let center = carve::meeting_point(rays).ok_or_else(|| alike("look in one direction"))?;
+    let distance = cameras.iter().map(|c| c.position.distance(center)).fold(0.0, f64::max);
+    if spread < 1e-4 * distance {
+        return Err(alike("stand at one place"));
+    }
+    let seen = cameras.iter().filter(|c| Projector::new(c).sees(center)).count();
+    if seen < n.min(3) {
+        return Err(SceneError::HeadOutside { seen, cameras: n });
+    }
+    Ok(center)
+}
+
+/// Half the side of a cube around `center` that no frame's picture of it leaves, short of the cameras.
+fn first_half(cameras: &[&Camera], center: DVec3) -> f64 {
+    let wide = cameras.iter().map(|c| {
+        let (x, y) = (0.5 * c.width as f64 / c.fx, 0.5 * c.height as f64 / c.fy);
+        c.position.distance(center) * x.hypot(y)
+    });
+    let nearest = cameras.iter().map(|c| c.position.distance(center)).fold(f64::INFINITY, f64::min);
+    (1.2 * wide.fold(0.0, f64::max)).min(0.95 * nearest)
+}
+
+/// The box without masks: see the module's text.
+fn from_frusta(cameras: &[Camera]) -> Result<Scene, SceneError> {
+    let some: Vec<&Camera> = cameras.iter().collect();
+    let axes: Vec<_> = cameras.iter().map(|c| carve::ray_to(c, None)).collect();
+    let center = aim(&some, &axes)?;
+    let mut distances: Vec<f64> = cameras.iter().map(|c| c.position.distance(center)).collect();
+    distances.sort_by(f64::total_cmp);
+    let half = 0.6 * distances[distances.len() / 2];
+    let cube = Cube { center, half, n: 48 };
+    let projectors: Vec<Projector> = cameras.iter().map(Projector::new).collect();
+    let least = (2 * cameras.len()).div_ceil(5).max(2);
+    let mut kept = vec![false; cube.n.pow(3)];
+    for (i, cell) in kept.iter_mut().enumerate() {
+        let p = cube.cell_center(i / (cube.n * cube.n), i / cube.n % cube.n, i % cube.n);
+        *cell = p.distance(center) <= half && projectors.iter().filter(|c| c.sees(p)).count() >= least;
+    }
+    carve::drop_dust(&mut kept, cube.n, 1.0);
+    let Some(extent) = carve::extent(&kept, cube.n) else {
+        let seen = projectors.iter().filter(|c| c.sees(center)).count();
+        return Err(SceneError::HeadOutside { seen, cameras: cameras.len() });
+    };
+    let lo = DVec3::from(extent.map(|(lo, _)| lo as f64));
+    let hi = DVec3::from(extent.map(|(_, hi)| hi as f64 + 1.0));
+    let middle = center - half + 0.5 * (lo + hi) * cube.cell();
+    let size = (hi - lo) * cube.cell();
+    let half = 0.5 * size.max_element();
+    let reach = (0.5 * size / half).as_vec3();
+    Ok(Scene {
+        scene_from_world: scene_from(middle, half),
+        aabb: Aabb { min: -reach, max: reach },
+        hull: None,
+    })
+}
+
+/// The box in world coordinates.
+pub fn world_box(scene: &Scene) -> Aabb {
+    let world_from_scene = scene.scene_from_world.inverse();
+    Aabb { min: world_from_scene.point(scene.aabb.min), max: world_from_scene.point(scene.aabb.max) }
+}
+
+/// One line about a scene, for people: its box in world units and how much of it the hull fills.
+pub fn describe(scene: &Scene) -> String {
+    let b = world_box(scene);
+    let size = b.size();
+    let hull = scene.hull.as_ref().map_or("no hull, no masks".into(), |h| {
+        format!("hull fills {:.1} % of the cube", 100.0 * h.count() as f64 / h.resolution.pow(3) as f64)
+    });
+    format!(
+        "[{:.4}, {:.4}, {:.4}] .. [{:.4}, {:.4}, {:.4}], {:.4} × {:.4} × {:.4} units; {hull}",
+        b.min.x, b.min.y, b.min.z, b.max.x, b.max.y, b.max.z, size.x, size.y, size.z
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DMat3;
+
+    /// A camera at `position` looking at `target`, 60 × 60 pixels, focal length 80.
+    fn camera(position: DVec3, target: DVec3) -> Camera {
+        let back = (position - target).normalize();
+        let right = DVec3::Z.cross(back).normalize();
+        Camera {
+            width: 60,
+            height: 60,
+            fx: 80.0,
+            fy: 80.0,
+            cx: 30.0,
+            cy: 30.0,
+            distortion: Default::default(),
+            rotation: DMat3::from_cols(right, back.cross(right), back),
+            position,
+        }
+    }
+
+    const CENTER: DVec3 = DVec3::new(10.0, -5.0, 2.0);
+    const RADIUS: f64 = 0.4;
+
+    /// `n` cameras on a ring of radius 2 around [`CENTER`], alternately above and below.
+    fn ring(n: usize) -> Vec<Camera> {
+        (0..n)
+            .map(|i| {
+                let a = i as f64 / n as f64 * std::f64::consts::TAU;
+                let up = if i % 2 == 0 { 0.8 } else { -0.5 };
+                camera(CENTER + DVec3::new(2.0 * a.cos(), 2.0 * a.sin(), up), CENTER)
+            })
+            .collect()
+    }
+
+    /// The silhouette of the ball of [`RADIUS`] around [`CENTER`].
+    fn ball(camera: &Camera) -> Option<Gray> {
+        let values = (0..3600)
+            .map(|i| {
+                let pixel = glam::Vec2::new((i % 60) as f32 + 0.5, (i / 60) as f32 + 0.5);
+                let ray = camera.ray(pixel).unwrap();
+                let to = CENTER - camera.position;
+                let along = to.dot(ray.direction.as_dvec3());
+                if to.length_squared() - along * along < RADIUS * RADIUS { 255 } else { 0 }
+            })
+            .collect();
+        Some(Gray { width: 60, height: 60, values })
+    }
+
+    fn small() -> SceneOptions {
+        SceneOptions { resolution: 64, ..SceneOptions::default() }
+    }
+
+    #[test]
+    fn the_hull_of_a_ball_holds_the_ball_and_little_more() {
+        let cameras = ring(12);
+        let masks: Vec<_> = cameras.iter().map(ball).collect();
+        let (scene, warnings) = fit(&cameras, &masks, &small()).unwrap();
+        assert!(warnings.is_empty(), "{warnings:?}");
+        let hull = scene.hull.as_ref().unwrap();
+        let mut inside = 0;
+        for i in 0..2000 {
+            // points of a spiral on the sphere
+            let z = 1.0 - 2.0 * (i as f64 + 0.5) / 2000.0;
+            let (r, a) = ((1.0 - z * z).sqrt(), i as f64 * 2.399_963);
+            let p = CENTER + 0.99 * RADIUS * DVec3::new(r * a.cos(), r * a.sin(), z);
+            inside += hull.contains(scene.scene_from_world.point(p.as_vec3())) as usize;
+        }
+        assert_eq!(inside, 2000);
+        let size = world_box(&scene).size();
+        // the ball is 0.8 wide; pixel footprints, cells and two cells of margin may add a fifth
+        assert!(size.max_element() < 1.05 && size.min_element() > 0.8, "{size}");
+        let longest = scene.aabb.size().max_element();
+        assert!(longest > 1.8 && longest <= 2.0, "{longest}");
+    }
+
+    #[test]
+    fn a_moved_world_moves_the_box_with_it() {
+        let cameras = ring(8);
+        let masks: Vec<_> = cameras.iter().map(ball).collect();
+        let shift = DVec3::new(-30.0, 4.0, 100.0);
+        let moved: Vec<_> =
+            cameras.iter().map(|c| Camera { position: c.position + shift, ..c.clone() }).collect();
+        let (a, _) = fit(&cameras, &masks, &small()).unwrap();
+        let (b, _) = fit(&moved, &masks, &small()).unwrap();
+        assert!((world_box(&b).center() - world_box(&a).center() - shift.as_vec3()).length() < 0.03);
+    }
+
+    #[test]
+    fn cameras_that_are_all_alike_are_an_error() {
+        let one = ring(1)[0].clone();
+        let cameras = vec![one.clone(); 5];
+        let error = fit(&cameras, &vec![None; 5], &small()).unwrap_err();
+        assert!(matches!(error, SceneError::CamerasAlike { how: "stand at one place", .. }), "{error}");
+        let side = one.rotation.x_axis;
+        let beside = vec![one.clone(), Camera { position: one.position + side, ..one }];
+        let error = fit(&beside, &[None, None], &small()).unwrap_err();
+        assert!(matches!(error, SceneError::CamerasAlike { how: "look in one direction", .. }), "{error}");
+    }
+
+    #[test]
+    fn cameras_that_look_away_are_an_error() {
+        let cameras: Vec<_> =
+            ring(6).into_iter().map(|c| camera(c.position, c.position + (c.position - CENTER))).collect();
+        let error = fit(&cameras, &vec![None; 6], &small()).unwrap_err();
+        assert!(matches!(error, SceneError::HeadOutside { seen: 0, cameras: 6 }), "{error}");
+    }
+
+    #[test]
+    fn white_empty_and_contradicting_masks_are_named_errors() {
+        let cameras = ring(6);
+        let flat = |v: u8| vec![Some(Gray { width: 60, height: 60, values: vec![v; 3600] }); 6];
+        assert!(matches!(fit(&cameras, &flat(255), &small()), Err(SceneError::AllWhite { masks: 6 })));
+        assert!(matches!(fit(&cameras, &flat(0), &small()), Err(SceneError::AllEmpty { masks: 6 })));
+        let mut masks: Vec<_> = cameras.iter().map(ball).collect();
+        let mut corner = vec![0; 3600];
+        corner[..5].fill(255);
+        masks[2] = Some(Gray { width: 60, height: 60, values: corner });
+        let options = SceneOptions { names: (0..6).map(|i| format!("cam{i}")).collect(), ..small() };
+        let error = fit(&cameras, &masks, &options).unwrap_err();
+        assert!(matches!(&error, SceneError::EmptyHull { culprit: Some(c), .. } if c == "cam2"), "{error}");
+    }
+
+    #[test]
+    fn an_empty_and_a_halved_mask_are_named_in_warnings() {
+        let cameras = ring(12);
+        let mut masks: Vec<_> = cameras.iter().map(ball).collect();
+        masks[3] = Some(Gray { width: 60, height: 60, values: vec![0; 3600] });
+        let half = masks[7].as_mut().unwrap();
+        for (i, v) in half.values.iter_mut().enumerate() {
+            *v *= (i % 60 < 30) as u8;
+        }
+        let (_, warnings) = fit(&cameras, &masks, &small()).unwrap();
+        assert!(warnings.iter().any(|w| w.contains("view `3` is empty")), "{warnings:?}");
+        assert!(warnings.iter().any(|w| w.contains("view `7` alone removes")), "{warnings:?}");
+        assert_eq!(warnings.len(), 2, "{warnings:?}");
+    }
+}
