@@ -9,3 +9,7 @@
 pub mod geom;
 pub mod image;
 pub mod run;
+
+pub mod mesh;
+pub mod metrics;
+pub mod render;
