@@ -15,3 +15,7 @@ pub mod image;
 pub mod io;
 pub mod kernel;
 pub mod run;
+
+pub mod mesh;
+pub mod metrics;
+pub mod render;

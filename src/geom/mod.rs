@@ -1,12 +1,14 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
 mod aabb;
+mod bvh;
 mod camera;
 mod mesh;
 mod ray;
 mod similarity;
 
 pub use aabb::Aabb;
+pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion};
 pub use mesh::Mesh;
 pub use ray::{Hit, Ray};
