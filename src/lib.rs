@@ -8,4 +8,5 @@
 
 pub mod geom;
 pub mod image;
+pub mod mesh;
 pub mod run;
