@@ -7,6 +7,9 @@ mod error;
 mod marching;
 mod marching_bits;
 mod marching_cell;
+mod sparse;
+mod sparse_blocks;
 
 pub use error::MeshError;
 pub use marching::{Surface, Volume, marching};
+pub use sparse::{Asking, Grid, Sparse, sparse};
