@@ -6,16 +6,18 @@
 //!
 //! Modules are declared in the order of that line; what they share stands first.
 
-pub mod capture;
-pub mod config;
-#[cfg(feature = "cpu")]
-pub mod field;
 pub mod geom;
 pub mod image;
 pub mod io;
 pub mod kernel;
+
+pub mod config;
 pub mod run;
 
+#[cfg(feature = "cpu")]
+pub mod field;
+
+pub mod capture;
 pub mod mesh;
 pub mod metrics;
 pub mod render;

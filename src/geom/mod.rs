@@ -6,6 +6,7 @@ mod camera;
 mod mesh;
 mod ray;
 mod similarity;
+mod topology;
 
 pub use aabb::Aabb;
 pub use bvh::{Bvh, Closest};
@@ -13,3 +14,5 @@ pub use camera::{Camera, Distortion};
 pub use mesh::Mesh;
 pub use ray::{Hit, Ray};
 pub use similarity::Similarity;
+pub(crate) use topology::{Sets, fans, has_no_area, sorted_sides};
+pub use topology::{Topology, topology};
