@@ -12,6 +12,9 @@ pub mod geom;
 pub mod image;
 pub mod io;
 pub mod kernel;
+pub mod mesh;
+pub mod metrics;
+pub mod render;
 pub mod run;
 
 #[cfg(feature = "cpu")]

@@ -14,6 +14,7 @@ mod masks;
 mod names;
 mod pose;
 pub mod scene;
+pub mod synthetic;
 mod transforms;
 
 pub use error::CaptureError;

@@ -1,3 +1,301 @@
-//! Every knob: defaults, presets, validation.
+//! Every knob: defaults, presets, files, `--set`; checked before anything is computed.
+//!
+//! Later wins: defaults, then the preset, then each file, then `--set`. A key that is not known, of
+//! the wrong type or out of range is an error that names the line, the key and the way out. The
+//! complete result ([`Config::to_toml`]) passed back as a file gives the same configuration.
+//!
+//! Each stage owns its table: a serde struct with `fn preset(Preset) -> Self` and one constant list
+//! of [`Key`]s with documentation and ranges. Everything here works on what serde says about them.
 
+mod capture;
 pub mod iface;
+mod iface_keys;
+mod mask;
+mod mesh;
+mod metrics;
+mod render;
+mod source;
+
+pub use capture::CaptureConfig;
+pub use iface::IfaceConfig;
+pub use mask::{MaskConfig, MaskMeaning, MaskSource};
+pub use mesh::{MeshConfig, MeshFormat, MeshFrame};
+pub use metrics::MetricsConfig;
+pub use render::{Background, PictureFormat, RenderConfig};
+pub use source::{ConfigError, Place, Sources};
+
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use toml::{Table, Value};
+
+/// A key of the configuration: what it means and what a number may be.
+#[derive(Clone, Copy, Debug)]
+pub struct Key {
+    /// Name inside its table.
+    pub name: &'static str,
+    /// What it means, with its unit.
+    pub doc: &'static str,
+    /// Least number allowed; `f64::NEG_INFINITY` where any is, and for what is no number.
+    pub min: f64,
+    /// Largest number allowed; `f64::INFINITY` where any is, and for what is no number.
+    pub max: f64,
+}
+
+impl Key {
+    /// A number between `min` and `max`, both allowed.
+    pub const fn number(name: &'static str, doc: &'static str, min: f64, max: f64) -> Key {
+        Key { name, doc, min, max }
+    }
+
+    /// A word, text, switch or list.
+    pub const fn word(name: &'static str, doc: &'static str) -> Key {
+        Key { name, doc, min: f64::NEG_INFINITY, max: f64::INFINITY }
+    }
+
+    /// `1 to 64`, `at least 1`; empty where every value is allowed.
+    pub fn range(&self) -> String {
+        match (self.min.is_finite(), self.max.is_finite()) {
+            (true, true) => format!("{} to {}", self.min, self.max),
+            (true, false) => format!("at least {}", self.min),
+            (false, true) => format!("at most {}", self.max),
+            (false, false) => String::new(),
+        }
+    }
+}
+
+/// How much effort: the starting values of every table.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// A first look in minutes.
+    Draft,
+    /// What to use.
+    #[default]
+    Standard,
+    /// The published recipe; changes only to be corrected.
+    Paper,
+}
+
+/// The whole configuration, complete and valid.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// The preset it started from.
+    pub preset: Preset,
+    /// Start of every random sequence.
+    pub seed: u64,
+    /// `auto`, `cpu`, `wgpu:N` or `cuda:N`.
+    pub device: String,
+    /// What was photographed.
+    pub capture: CaptureConfig,
+    /// Which pixels are the head.
+    pub mask: MaskConfig,
+    /// The learned signed-distance field.
+    pub iface: IfaceConfig,
+    /// The extracted surface.
+    pub mesh: MeshConfig,
+    /// The views made of it.
+    pub render: RenderConfig,
+    /// How they are judged.
+    pub metrics: MetricsConfig,
+}
+
+const ROOT_KEYS: &[Key] = &[
+    Key::word(
+        "preset",
+        "Starting values of every other key: draft (a first look), standard, paper (the published recipe).",
+    ),
+    Key::number(
+        "seed",
+        "Start of every random sequence; same seed and device, same result.",
+        0.0,
+        i64::MAX as f64,
+    ),
+    Key::word("device", "Where fields are learned: auto, cpu, wgpu:N or cuda:N."),
+];
+
+/// Every table with its keys, in the order of the line; the first has no name.
+const TABLES: &[(&str, &[Key])] = &[
+    ("", ROOT_KEYS),
+    ("capture", capture::KEYS),
+    ("mask", mask::KEYS),
+    ("iface", iface_keys::KEYS),
+    ("mesh", mesh::KEYS),
+    ("render", render::KEYS),
+    ("metrics", metrics::KEYS),
+];
+
+/// Every key with its full, dotted name.
+fn all_keys() -> impl Iterator<Item = (String, &'static Key)> {
+    TABLES.iter().flat_map(|(table, keys)| keys.iter().map(|k| (dotted(table, k.name), k)))
+}
+
+fn dotted(table: &str, name: &str) -> String {
+    if table.is_empty() { name.into() } else { format!("{table}.{name}") }
+}
+
+impl Config {
+    /// The values a preset starts with.
+    pub fn preset(preset: Preset) -> Config {
+        Config {
+            preset,
+            seed: 42,
+            device: "auto".into(),
+            capture: CaptureConfig::preset(preset),
+            mask: MaskConfig::preset(preset),
+            iface: IfaceConfig::preset(preset),
+            mesh: MeshConfig::preset(preset),
+            render: RenderConfig::preset(preset),
+            metrics: MetricsConfig::preset(preset),
+        }
+    }
+
+    /// The configuration that `sources` describe, or the first thing wrong with them.
+    pub fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
+        source::resolve(sources)
+    }
+
+    /// As TOML, complete, every key with its documentation above it.
+    pub fn to_toml(&self) -> String {
+        let root = self.to_table();
+        let mut out =
+            String::from("# tiface configuration: `tiface run CAPTURE --config THIS` repeats the run\n");
+        for (table, keys) in TABLES {
+            if !table.is_empty() {
+                let _ = writeln!(out, "\n[{table}]");
+            }
+            for key in *keys {
+                if let Some(value) = lookup(&root, &dotted(table, key.name)) {
+                    let _ = writeln!(out, "# {}\n{} = {}", key.doc, key.name, show(value));
+                }
+            }
+        }
+        out
+    }
+
+    /// The values of one table (`iface`), by full name (`iface.steps`), as they are written in TOML:
+    /// what a stage's fingerprint is made of.
+    pub fn values(&self, table: &str) -> BTreeMap<String, String> {
+        let root = self.to_table();
+        all_keys()
+            .filter(|(name, _)| name.split('.').next() == Some(table) && name.contains('.'))
+            .filter_map(|(name, _)| lookup(&root, &name).map(|v| (name, show(v))))
+            .collect()
+    }
+
+    fn to_table(&self) -> Table {
+        match Value::try_from(self) {
+            Ok(Value::Table(table)) => table,
+            // a struct of numbers, words and lists always is a table; a test serialises every preset
+            _ => Table::new(),
+        }
+    }
+}
+
+/// What a key or a whole table means, its range and its value in every preset; an unknown name is an
+/// error that knows the nearest one.
+pub fn explain(name: &str) -> Result<String, ConfigError> {
+    let wanted: Vec<_> =
+        all_keys().filter(|(full, _)| full == name || full.starts_with(&format!("{name}."))).collect();
+    if wanted.is_empty() {
+        return Err(ConfigError::unknown(Place::Option("--explain".into()), name));
+    }
+    let presets = [Preset::Draft, Preset::Standard, Preset::Paper];
+    let tables = presets.map(|p| Config::preset(p).to_table());
+    let mut out = String::new();
+    for (i, (full, key)) in wanted.into_iter().enumerate() {
+        if i > 0 {
+            out.push('\n');
+        }
+        let _ = writeln!(out, "{full}\n  {}", key.doc);
+        if !key.range().is_empty() {
+            let _ = writeln!(out, "  allowed: {}", key.range());
+        }
+        let [draft, standard, paper] =
+            tables.each_ref().map(|t| lookup(t, &full).map(show).unwrap_or_default());
+        if full == "preset" || (draft == standard && standard == paper) {
+            let _ = writeln!(out, "  default: {standard}");
+        } else {
+            let _ = writeln!(out, "  draft: {draft}   standard: {standard}   paper: {paper}");
+        }
+    }
+    Ok(out)
+}
+
+fn lookup<'a>(root: &'a Table, dotted: &str) -> Option<&'a Value> {
+    let mut parts = dotted.split('.');
+    let mut value = root.get(parts.next()?)?;
+    for part in parts {
+        value = value.as_table()?.get(part)?;
+    }
+    Some(value)
+}
+
+/// A value as it is written in TOML. A number that came from an f32 is written with an f32's digits
+/// (0.1, not 0.10000000149011612): read back, it is the same f32.
+fn show(value: &Value) -> String {
+    match value {
+        Value::Float(f) if f.is_finite() && (*f as f32) as f64 == *f => {
+            format!("{:?}", *f as f32) // `1e-5` and `2.0` are TOML as they stand
+        }
+        other => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_field_has_a_documented_key_and_every_key_a_field() {
+        for preset in [Preset::Draft, Preset::Standard, Preset::Paper] {
+            let root = Config::preset(preset).to_table();
+            let mut fields = Vec::new();
+            for (name, value) in &root {
+                match value {
+                    Value::Table(t) => fields.extend(t.keys().map(|k| format!("{name}.{k}"))),
+                    _ => fields.push(name.clone()),
+                }
+            }
+            let mut keys: Vec<String> = all_keys().map(|(name, _)| name).collect();
+            keys.sort();
+            fields.sort();
+            assert_eq!(fields, keys);
+        }
+        for (name, key) in all_keys() {
+            assert!(key.doc.ends_with('.') && key.min <= key.max, "{name}");
+        }
+    }
+
+    #[test]
+    fn every_preset_lies_in_its_own_ranges_and_comes_back_from_its_own_file() {
+        for preset in [Preset::Draft, Preset::Standard, Preset::Paper] {
+            let config = Config::preset(preset);
+            let text = config.to_toml();
+            let sources = Sources { files: vec![("saved.toml".into(), text.clone())], ..Sources::default() };
+            let back = Config::resolve(&sources).unwrap_or_else(|e| panic!("{e}\n{text}"));
+            assert_eq!(back, config);
+        }
+    }
+
+    #[test]
+    fn explaining_a_key_gives_its_range_and_its_value_in_every_preset() {
+        let text = explain("mesh.resolution").unwrap();
+        assert!(
+            text.contains("allowed: 16 to 4096") && text.contains("draft: 256   standard: 512"),
+            "{text}"
+        );
+        assert!(explain("mesh").unwrap().matches("mesh.").count() > 3);
+        assert!(explain("mesh.resolutoin").unwrap_err().hint().contains("mesh.resolution"));
+    }
+
+    #[test]
+    fn a_number_from_an_f32_is_written_with_the_digits_of_an_f32() {
+        assert_eq!(show(&Value::Float(0.1f32 as f64)), "0.1");
+        assert_eq!(show(&Value::Float(0.1)), "0.1");
+        assert_eq!(show(&Value::Float(2.0)), "2.0");
+        let tiny = show(&Value::Float(1e-12f32 as f64));
+        assert_eq!(tiny.parse::<f32>().unwrap(), 1e-12f32);
+    }
+}

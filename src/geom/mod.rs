@@ -1,13 +1,18 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
 mod aabb;
+mod bvh;
 mod camera;
 mod mesh;
 mod ray;
 mod similarity;
+mod topology;
 
 pub use aabb::Aabb;
+pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion};
 pub use mesh::Mesh;
 pub use ray::{Hit, Ray};
 pub use similarity::Similarity;
+pub(crate) use topology::{Sets, fans, has_no_area, sorted_sides};
+pub use topology::{Topology, topology};

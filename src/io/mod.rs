@@ -5,6 +5,7 @@
 //! name, decides the format; only regular files are opened. Writers go through [`write_atomic`].
 
 mod exr;
+mod folder;
 mod json;
 mod npy;
 mod pictures;
@@ -12,6 +13,9 @@ mod tensors;
 mod write;
 
 pub use self::exr::{ExrImage, read_exr_channels, read_exr_depth, read_exr_normals, write_exr};
+pub use self::folder::{
+    Lock, LockError, append, clear_folder, create_folder, free_bytes, list_folders, modified, remove_file,
+};
 pub use self::json::parse_json;
 pub use self::npy::{Npy, NpyValues, parse_npy, read_npy};
 pub use self::pictures::{

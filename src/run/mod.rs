@@ -1,4 +1,36 @@
-//! A run directory and how a stage reports from inside it.
+//! A run directory: one folder per stage, and how a stage reports from inside it.
+//!
+//! ```text
+//! runs/002_00/iface/.lock        held while a process works on the stage
+//!                   status.json  live: state, step, rate, time left, error
+//!                   log.jsonl    one object per logged step
+//!                   …            the stage's own files
+//!                   done.json    last: what shaped the result, and its figures
+//! ```
+//!
+//! A stage whose `done.json` has the same fingerprint is skipped without touching a file; one with
+//! another fingerprint is an error that prints the difference, since neither retraining nor reusing
+//! should happen in silence.
+//!
+//! Repeating a command after any accident gives the same bytes in the stage's own files (on one
+//! device and for one seed). `status.json`, `log.jsonl` and `done.json` tell when and how fast
+//! things happened, and so differ from run to run.
+
+mod failure;
+mod fingerprint;
+mod progress;
+mod stage;
+mod status;
+
+pub use failure::{Exit, Failure, RunError, Stop};
+pub use fingerprint::Fingerprint;
+pub use progress::{Event, Observer};
+pub use stage::{Done, Plan, Stage};
+pub use status::{Record, State, Status, read_record, read_status};
+
+use crate::io::{self, Lock, LockError};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// How a long computation reports progress and learns that it should stop.
 ///
@@ -19,5 +51,80 @@ impl Monitor for Quiet {
     fn step(&self, _: u64, _: u64, _: &[(&str, f64)]) {}
     fn stop(&self) -> bool {
         false
+    }
+}
+
+impl Observer for Quiet {
+    fn event(&self, _: &Event) {}
+}
+
+/// A run directory.
+pub struct Run {
+    dir: PathBuf,
+    stop: Stop,
+    observer: Arc<dyn Observer>,
+}
+
+const LOCK: &str = ".lock";
+
+impl Run {
+    /// Opens the run `dir`, making the folder if needed. Events go to `observer`; every stage
+    /// stops when `stop` says so.
+    pub fn open(dir: &Path, stop: Stop, observer: Arc<dyn Observer>) -> Result<Run, RunError> {
+        io::create_folder(dir)?;
+        Ok(Run { dir: dir.into(), stop, observer })
+    }
+
+    /// The folder of the run.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// A file or folder of the run.
+    pub fn path(&self, name: impl AsRef<Path>) -> PathBuf {
+        self.dir.join(name)
+    }
+
+    /// Writes a file of the run itself (`config.toml`, `cameras.json`, `report.html`); one that
+    /// holds the same bytes already is left alone, so that its time of modification stays honest.
+    pub fn write(&self, name: &str, bytes: &[u8]) -> Result<(), RunError> {
+        let path = self.path(name);
+        if io::is_file(&path) && io::read_bytes(&path, &io::Limits::default()).is_ok_and(|old| old == bytes) {
+            return Ok(());
+        }
+        Ok(io::write_atomic(&path, bytes)?)
+    }
+
+    /// Removes what a stage and those after it in `order` have made, so that they start anew. All
+    /// their locks are held meanwhile.
+    pub fn fresh(&self, stage: &str, order: &[&str]) -> Result<(), RunError> {
+        let from = order.iter().position(|s| *s == stage).unwrap_or(order.len());
+        let mut locks = Vec::new();
+        for name in order[from..].iter().filter(|n| io::is_folder(&self.path(n))) {
+            locks.push((self.path(name), self.lock(name)?));
+        }
+        // the last stage first: stopped halfway, no stage is left whose input is gone
+        for (folder, _lock) in locks.iter().rev() {
+            io::remove_file(&folder.join("done.json"))?;
+            io::clear_folder(folder, LOCK)?;
+        }
+        Ok(())
+    }
+
+    /// Tells the observer something that went differently than hoped.
+    pub fn warn(&self, stage: &str, text: &str) {
+        self.observer.event(&Event::Warning { stage, text });
+    }
+
+    /// The stop request this run listens to.
+    pub fn stop(&self) -> &Stop {
+        &self.stop
+    }
+
+    fn lock(&self, stage: &str) -> Result<Lock, RunError> {
+        Lock::take(&self.path(stage).join(LOCK)).map_err(|e| match e {
+            LockError::Held { .. } => RunError::Held { stage: stage.into(), run: self.dir.clone() },
+            other => RunError::Lock(other),
+        })
     }
 }

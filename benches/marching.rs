@@ -1,0 +1,69 @@
+//! Milliseconds of dense extraction: the head and a gyroid, one thread and two.
+//!
+//! ```text
+//! cargo bench --bench marching                       128³, 256³, 512³
+//! cargo bench --bench marching -- 256                one size
+//! cargo bench --bench marching -- --write head 256 volume.f32
+//! ```
+//! `--write` leaves a raw little-endian f32 volume (x fastest) for `tools/reference/flying_edges.py`,
+//! and `--read 256 volume.f32` times one, a line a run, so that a script can interleave the two.
+
+#[path = "../tests/fields/mod.rs"]
+mod fields;
+
+use glam::Vec3;
+use std::time::Instant;
+use tiface::mesh::{Volume, marching};
+
+fn best_ms(values: &[f32], n: usize, threads: usize, runs: usize) -> (f64, usize) {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
+    let h = 2.0 / (n - 1) as f32;
+    let volume = Volume { dims: [n; 3], values, origin: Vec3::NEG_ONE, spacing: Vec3::splat(h) };
+    pool.install(|| {
+        let mut best = f64::INFINITY;
+        let mut triangles = 0;
+        for _ in 0..runs {
+            let start = Instant::now();
+            let surface = marching(&volume, false).expect("a valid volume");
+            best = best.min(start.elapsed().as_secs_f64() * 1e3);
+            triangles = surface.triangles.len();
+        }
+        (best, triangles)
+    })
+}
+
+fn main() {
+    let args: Vec<String> = std::env::args().skip(1).filter(|a| a != "--bench").collect();
+    let words: Vec<&str> = args.iter().map(String::as_str).collect();
+    let shapes: [(&str, fn(Vec3) -> f32); 2] = [("head", fields::head), ("gyroid", fields::gyroid)];
+    match words[..] {
+        ["--write", shape, n, path] => {
+            let n = n.parse().expect("a size");
+            let field = shapes.iter().find(|s| s.0 == shape).expect("head or gyroid").1;
+            let (values, _) = fields::grid(field, n);
+            std::fs::write(path, bytemuck::cast_slice(&values)).expect("a writable path");
+        }
+        ["--read", n, path] => {
+            let n = n.parse().expect("a size");
+            let bytes = std::fs::read(path).expect("a readable path");
+            let values: Vec<f32> = bytemuck::pod_collect_to_vec(&bytes);
+            let (ms, triangles) = best_ms(&values, n, 1, 7);
+            println!("tiface {ms:.2} ms, {triangles} triangles");
+        }
+        _ => {
+            let sizes: Vec<usize> = match words[..] {
+                [] => vec![128, 256, 512],
+                _ => words.iter().map(|w| w.parse().expect("a size")).collect(),
+            };
+            for (name, field) in shapes {
+                for &n in &sizes {
+                    let (values, _) = fields::grid(field, n);
+                    let runs = if n > 300 { 3 } else { 7 };
+                    let (one, triangles) = best_ms(&values, n, 1, runs);
+                    let (two, _) = best_ms(&values, n, 2, runs);
+                    println!("{name} {n}³: {one:.2} ms, two threads {two:.2} ms, {triangles} triangles");
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,285 @@
+//! Takes one picture of the demo head: sphere tracing, light, supersampled coverage.
+//!
+//! A grid of distances sampled once lets rays and shadows stride through empty air for the price
+//! of a lookup; the exact function is only asked close to the surface.
+
+use super::look::{Lamp, lamps, stage, surface};
+use super::noise::{noise, unit};
+use super::shape::{OFFSET, SyntheticHead, parts};
+use crate::geom::{Aabb, Camera};
+use crate::image::{Gray, Photo, quantise, srgb_from_linear};
+use glam::{UVec3, Vec2, Vec3};
+use rayon::prelude::*;
+
+/// One picture with its masks.
+pub(super) struct Picture {
+    pub photo: Photo,
+    /// Share of each pixel that the bust covers.
+    pub mask: Gray,
+    /// 255 where mostly head (hair, face, ears), without neck and garment.
+    pub region: Gray,
+}
+
+/// Everything that does not change from picture to picture.
+pub(super) struct Studio {
+    head: SyntheticHead,
+    coarse: Coarse,
+    lamps: [Lamp; 4],
+}
+
+/// What one ray brings back.
+#[derive(Clone, Copy, Default)]
+struct Seen {
+    /// Linear light, multiplied by `alpha`.
+    color: Vec3,
+    alpha: f32,
+    head: f32,
+}
+
+/// Rays that miss the hair by less than this may meet loose hairs: scaled distance, so about 2 mm.
+const FUZZ: f32 = 0.0013;
+/// Standard deviation of the sensor's grain, coded 0..=1.
+const GRAIN: f32 = 0.004;
+
+impl Studio {
+    pub fn new() -> Studio {
+        Studio { head: SyntheticHead, coarse: Coarse::new(&SyntheticHead), lamps: lamps() }
+    }
+
+    /// Photographs the head. `seed` makes the grain; everything else follows from the camera.
+    pub fn photograph(&self, camera: &Camera, seed: u64) -> Picture {
+        let (w, h) = (camera.width, camera.height);
+        let pixels: Vec<([u8; 3], u8, u8)> =
+            (0..w * h).into_par_iter().map(|i| self.pixel(camera, i % w, i / w, seed)).collect();
+        Picture {
+            photo: Photo { width: w, height: h, rgb: pixels.iter().map(|p| p.0).collect(), alpha: None },
+            mask: Gray { width: w, height: h, values: pixels.iter().map(|p| p.1).collect() },
+            region: Gray { width: w, height: h, values: pixels.iter().map(|p| p.2).collect() },
+        }
+    }
+
+    /// Colour, mask and region of one pixel: 2 × 2 rays, 4 × 4 more where the outline crosses it.
+    fn pixel(&self, camera: &Camera, x: u32, y: u32, seed: u64) -> ([u8; 3], u8, u8) {
+        let average = |side: u32| {
+            let mut sum = Seen::default();
+            for k in 0..side * side {
+                let inside = Vec2::new((k % side) as f32 + 0.5, (k / side) as f32 + 0.5) / side as f32;
+                let Some(ray) = camera.ray(Vec2::new(x as f32, y as f32) + inside) else { continue };
+                let seen = self.look(ray.origin, ray.direction);
+                sum.color += seen.color;
+                if seen.alpha < 1.0 {
+                    sum.color += (1.0 - seen.alpha) * stage(ray.origin, ray.direction);
+                }
+                sum.alpha += seen.alpha;
+                sum.head += seen.head;
+            }
+            let n = (side * side) as f32;
+            Seen { color: sum.color / n, alpha: sum.alpha / n, head: sum.head / n }
+        };
+        let mut seen = average(2);
+        if seen.alpha > 0.0 && seen.alpha < 1.0 {
+            seen = average(4);
+        }
+        let color = [0, 1, 2].map(|k| {
+            let draw = |n| unit(seed, y * camera.width + x, 4 * k as u32 + n) - 0.5;
+            // four uniform numbers of variance 1/12 each: nearly normal with variance 1/3
+            let grain = (draw(0) + draw(1) + draw(2) + draw(3)) * 3f32.sqrt() * GRAIN;
+            quantise(srgb_from_linear(seen.color[k]) + grain)
+        });
+        (color, quantise(seen.alpha), if seen.alpha > 0.5 && seen.head > 0.5 { 255 } else { 0 })
+    }
+
+    /// Follows one ray to the head.
+    fn look(&self, origin: Vec3, direction: Vec3) -> Seen {
+        let Some((enter, leave)) = self.coarse.bounds.intersect(origin, direction) else {
+            return Seen::default();
+        };
+        let mut t = enter.max(0.0);
+        let mut closest = (f32::INFINITY, t); // nearest miss, for loose hairs
+        let mut before: Option<(f32, f32)> = None; // the exact distance one step ago
+        while t < leave {
+            let p = origin + t * direction;
+            let air = self.coarse.air(p);
+            if air > 0.002 {
+                before = None;
+                t += air;
+                continue;
+            }
+            let d = self.head.sdf(p);
+            if d < 3e-5 {
+                let t = match before {
+                    Some(outside) if d < 0.0 => self.cross(origin, direction, outside.0, t),
+                    _ => t,
+                };
+                let p = origin + t * direction;
+                let head = if self.head.is_head(p) { 1.0 } else { 0.0 };
+                return Seen { color: self.shade(p, direction), alpha: 1.0, head };
+            }
+            if d < closest.0 {
+                closest = (d, t);
+            }
+            // the distance is scaled down to be safe: where it falls slowly along this ray, stride
+            // nearly as far as its own slope promises
+            let slope = before.map_or(1.0, |(t0, d0)| (d0 - d) / (t - t0));
+            before = Some((t, d));
+            t += if slope > 0.1 { (0.95 * d / slope).clamp(d, 3.0 * d) } else { d };
+        }
+        self.loose_hair(origin + closest.1 * direction, closest.0, direction)
+    }
+
+    /// The crossing between `outside` and `inside` by halving, to some micrometres.
+    fn cross(&self, origin: Vec3, direction: Vec3, mut outside: f32, mut inside: f32) -> f32 {
+        for _ in 0..8 {
+            let middle = 0.5 * (outside + inside);
+            if self.head.sdf(origin + middle * direction) < 0.0 { inside = middle } else { outside = middle }
+        }
+        0.5 * (outside + inside)
+    }
+
+    /// A ray that just missed the hair meets some of its fringe of single hairs.
+    fn loose_hair(&self, p: Vec3, miss: f32, direction: Vec3) -> Seen {
+        if miss > FUZZ {
+            return Seen::default();
+        }
+        let q = p - OFFSET;
+        let parts = parts(q);
+        if parts.hair > parts.skin.min(parts.garment) {
+            return Seen::default();
+        }
+        let fade = 1.0 - miss / FUZZ;
+        let alpha = 0.75 * fade * fade * (0.25 + 0.75 * noise(q * 900.0));
+        Seen { color: alpha * self.shade(p, direction), alpha, head: alpha }
+    }
+
+    /// Light leaving `p` against `direction`.
+    fn shade(&self, p: Vec3, direction: Vec3) -> Vec3 {
+        let (normal, material) = self.head.normal_and_material(p);
+        let surface = surface(p - OFFSET, material);
+        let open = self.openness(p, normal);
+        // the even light of the stage, a little stronger from above
+        let mut light = Vec3::new(0.30, 0.30, 0.31) * open * (0.85 + 0.15 * normal.z);
+        let mut shine = 0.0;
+        for lamp in &self.lamps {
+            let facing = normal.dot(lamp.towards);
+            // light wraps a little round skin and hair
+            let lit = ((facing + 0.12) / 1.12).max(0.0);
+            if lit <= 0.0 {
+                continue;
+            }
+            let clear = if lamp.shadow { self.clearance(p + 0.004 * normal, lamp.towards) } else { open };
+            light += lamp.light * (lit * clear);
+            let half = (lamp.towards - direction).normalize_or_zero();
+            shine += lamp.light.y
+                * clear
+                * normal.dot(half).max(0.0).powf(surface.shine.1)
+                * facing.max(0.0).sqrt();
+        }
+        surface.albedo * light + Vec3::splat(surface.shine.0 * shine)
+    }
+
+    /// How open the surface lies to the air around it: distances along the normal, compared with
+    /// those over flat ground (Evans 2006).
+    fn openness(&self, p: Vec3, normal: Vec3) -> f32 {
+        let mut closed = 0.0;
+        let mut weight = 1.0;
+        for step in [0.004, 0.009, 0.018, 0.034] {
+            closed += weight * (step - self.coarse.distance(p + step * normal)).max(0.0) / step;
+            weight *= 0.7;
+        }
+        (1.0 - 0.42 * closed).clamp(0.15, 1.0)
+    }
+
+    /// Share of a lamp seen from `p`: 0 behind something, soft beside it.
+    fn clearance(&self, p: Vec3, towards: Vec3) -> f32 {
+        let Some((_, leave)) = self.coarse.bounds.intersect(p, towards) else { return 1.0 };
+        let (mut t, mut open) = (0.006f32, 1.0f32);
+        while t < leave {
+            let d = self.coarse.distance(p + t * towards);
+            open = open.min(10.0 * d / t + 0.25);
+            if open <= 0.0 {
+                return 0.0;
+            }
+            t += d.max(0.003);
+        }
+        let open = open.clamp(0.0, 1.0);
+        open * open * (3.0 - 2.0 * open)
+    }
+}
+
+/// Distances on a lattice of 3 mm cells.
+struct Coarse {
+    bounds: Aabb,
+    size: UVec3,
+    values: Vec<f32>,
+}
+
+const CELL: f32 = 0.003;
+
+impl Coarse {
+    fn new(head: &SyntheticHead) -> Coarse {
+        let bounds = head.bounds().grown(2.0 * CELL);
+        let size = (bounds.size() / CELL).ceil().as_uvec3() + 2;
+        let values = (0..size.x * size.y * size.z)
+            .into_par_iter()
+            .map(|i| {
+                let at = UVec3::new(i % size.x, i / size.x % size.y, i / (size.x * size.y));
+                head.sdf(bounds.min + CELL * at.as_vec3())
+            })
+            .collect();
+        Coarse { bounds, size, values }
+    }
+
+    /// Trilinear distance; outside the lattice that of its border.
+    fn distance(&self, p: Vec3) -> f32 {
+        let g = ((p - self.bounds.min) / CELL).clamp(Vec3::ZERO, self.size.as_vec3() - 1.001);
+        let i = g.as_uvec3();
+        let f = g - i.as_vec3();
+        let row = |y: u32, z: u32| {
+            let k = ((i.z + z) * self.size.y + i.y + y) * self.size.x + i.x;
+            let (a, b) = (self.values[k as usize], self.values[k as usize + 1]);
+            a + (b - a) * f.x
+        };
+        let face = |z: u32| {
+            let (a, b) = (row(0, z), row(1, z));
+            a + (b - a) * f.y
+        };
+        let (a, b) = (face(0), face(1));
+        a + (b - a) * f.z
+    }
+
+    /// A stride that surely meets nothing: the slope is at most 1, so the trilinear value errs by
+    /// less than a cell's diagonal.
+    fn air(&self, p: Vec3) -> f32 {
+        self.distance(p) - 1.75 * CELL
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::shape::Material;
+    use super::*;
+
+    #[test]
+    fn strides_through_the_air_stop_short_of_the_surface() {
+        let studio = Studio::new();
+        let bounds = studio.coarse.bounds;
+        let surface = SyntheticHead.surface_points(3000, 8);
+        for i in 0..3000 {
+            let p = bounds.min + Vec3::from_array([0, 1, 2].map(|k| unit(3, i, k))) * bounds.size();
+            let nearest = surface.iter().map(|s| s.distance(p)).fold(f32::INFINITY, f32::min);
+            assert!(studio.coarse.air(p) < nearest, "{p}: {} over {nearest}", studio.coarse.air(p));
+        }
+    }
+
+    #[test]
+    fn the_eye_is_a_material_seen_from_the_front() {
+        let studio = Studio::new();
+        let eye = OFFSET + super::super::shape::EYE;
+        let seen = studio.look(eye - Vec3::Y, Vec3::Y);
+        assert_eq!((seen.alpha, seen.head), (1.0, 1.0));
+        let t =
+            (0..1000).map(|i| i as f32 * 1e-3).find(|&t| studio.head.sdf(eye - Vec3::Y + t * Vec3::Y) < 1e-4);
+        let p = eye - Vec3::Y + t.unwrap() * Vec3::Y;
+        assert_eq!(studio.head.material(p), Material::Eye);
+    }
+}

@@ -1,0 +1,198 @@
+//! Folders: making, clearing, listing and locking them, and how much room is left.
+
+use super::{ReadError, WriteError};
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::{ErrorKind, Write};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+fn failed(path: &Path) -> impl Fn(std::io::Error) -> WriteError + '_ {
+    move |source| WriteError::Io { path: path.into(), source }
+}
+
+/// Makes a folder and those above it; an existing one is fine.
+pub fn create_folder(path: &Path) -> Result<(), WriteError> {
+    fs::create_dir_all(path).map_err(failed(path))
+}
+
+/// Removes everything inside `path` except files directly in it called `keep`; a folder that does
+/// not exist is empty. Links are removed, never followed.
+pub fn clear_folder(path: &Path, keep: &str) -> Result<(), WriteError> {
+    let entries = match fs::read_dir(path) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
+        other => other.map_err(failed(path))?,
+    };
+    for entry in entries {
+        let entry = entry.map_err(failed(path))?;
+        let inside = entry.path();
+        if entry.file_name() == keep {
+            continue;
+        }
+        let kind = entry.file_type().map_err(failed(&inside))?;
+        let gone = if kind.is_dir() { fs::remove_dir_all(&inside) } else { fs::remove_file(&inside) };
+        gone.map_err(failed(&inside))?;
+    }
+    Ok(())
+}
+
+/// Removes a file; one that is not there is fine.
+pub fn remove_file(path: &Path) -> Result<(), WriteError> {
+    match fs::remove_file(path) {
+        Err(e) if e.kind() == ErrorKind::NotFound => Ok(()),
+        other => other.map_err(failed(path)),
+    }
+}
+
+/// Folders directly inside `path`, sorted by name, hidden ones left out; none if it does not exist.
+pub fn list_folders(path: &Path) -> Result<Vec<PathBuf>, ReadError> {
+    let entries = match fs::read_dir(path) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+        other => other.map_err(|e| ReadError::io(path, e))?,
+    };
+    let mut folders = Vec::new();
+    for entry in entries {
+        let entry = entry.map_err(|e| ReadError::io(path, e))?;
+        if entry.path().is_dir() && !entry.file_name().as_encoded_bytes().starts_with(b".") {
+            folders.push(entry.path());
+        }
+    }
+    folders.sort();
+    Ok(folders)
+}
+
+/// When a file was last changed; `None` if it is not there or the system does not say.
+pub fn modified(path: &Path) -> Option<SystemTime> {
+    fs::metadata(path).and_then(|m| m.modified()).ok()
+}
+
+/// Appends a line to a log. If the last writer was stopped in the middle of a line, that line is
+/// ended first, so that it spoils only itself.
+pub fn append(path: &Path, line: &str) -> Result<(), WriteError> {
+    let mut file =
+        OpenOptions::new().read(true).append(true).create(true).open(path).map_err(failed(path))?;
+    let mut bytes = Vec::with_capacity(line.len() + 2);
+    if !ends_with_newline(&mut file).map_err(failed(path))? {
+        bytes.push(b'\n');
+    }
+    bytes.extend_from_slice(line.as_bytes());
+    bytes.push(b'\n');
+    // one call, so that lines of two processes cannot interleave
+    file.write_all(&bytes).map_err(failed(path))
+}
+
+fn ends_with_newline(file: &mut File) -> std::io::Result<bool> {
+    use std::io::{Read, Seek, SeekFrom};
+    if file.metadata()?.len() == 0 {
+        return Ok(true);
+    }
+    file.seek(SeekFrom::End(-1))?;
+    let mut last = [0];
+    file.read_exact(&mut last)?;
+    Ok(last[0] == b'\n')
+}
+
+/// Bytes an ordinary user may still write on the disk that holds `path`; `None` where the system
+/// does not tell.
+#[cfg(unix)]
+pub fn free_bytes(path: &Path) -> Option<u64> {
+    let disk = rustix::fs::statvfs(path).ok()?;
+    disk.f_bavail.checked_mul(disk.f_frsize)
+}
+
+/// Bytes an ordinary user may still write on the disk that holds `path`; `None` where the system
+/// does not tell.
+#[cfg(not(unix))]
+pub fn free_bytes(_: &Path) -> Option<u64> {
+    None
+}
+
+/// An exclusive lock on a folder, freed when dropped, and by the kernel when the process dies.
+#[derive(Debug)]
+pub struct Lock {
+    _file: File,
+}
+
+/// Why a lock was not taken.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LockError {
+    /// Another process holds it.
+    #[error("`{}` is locked by another process", path.display())]
+    Held {
+        /// The lock file.
+        path: PathBuf,
+    },
+    /// The lock file could not be made or locked.
+    #[error("`{}` cannot be locked: {source}", path.display())]
+    Io {
+        /// The lock file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+}
+
+impl Lock {
+    /// Takes the lock `path` without waiting. The file stays when the lock is freed: removing it
+    /// would let two processes lock two files of the same name.
+    pub fn take(path: &Path) -> Result<Lock, LockError> {
+        let fail = |source| LockError::Io { path: path.into(), source };
+        let file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .open(path)
+            .map_err(fail)?;
+        match file.try_lock() {
+            Ok(()) => Ok(Lock { _file: file }),
+            Err(TryLockError::WouldBlock) => Err(LockError::Held { path: path.into() }),
+            Err(TryLockError::Error(e)) => Err(fail(e)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lock_is_exclusive_until_dropped() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(".lock");
+        let first = Lock::take(&path).unwrap();
+        assert!(matches!(Lock::take(&path), Err(LockError::Held { .. })));
+        drop(first);
+        assert!(Lock::take(&path).is_ok());
+    }
+
+    #[test]
+    fn clearing_keeps_the_lock_and_nothing_else() {
+        let dir = tempfile::tempdir().unwrap();
+        fs::create_dir(dir.path().join("views")).unwrap();
+        for name in [".lock", "a.png", "views/b.png"] {
+            fs::write(dir.path().join(name), b"x").unwrap();
+        }
+        clear_folder(dir.path(), ".lock").unwrap();
+        let left: Vec<_> = fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+        assert_eq!(left, [".lock"]);
+        clear_folder(&dir.path().join("absent"), ".lock").unwrap();
+    }
+
+    #[test]
+    fn a_torn_line_spoils_only_itself() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("log.jsonl");
+        append(&path, "{\"step\":1}").unwrap();
+        OpenOptions::new().append(true).open(&path).unwrap().write_all(b"{\"st").unwrap();
+        append(&path, "{\"step\":2}").unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "{\"step\":1}\n{\"st\n{\"step\":2}\n");
+    }
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn the_disk_says_how_much_room_is_left() {
+        assert!(free_bytes(Path::new("/")).is_some());
+        assert!(free_bytes(Path::new("/no/such/folder")).is_none());
+    }
+}

@@ -1,0 +1,573 @@
+//! Is this mesh sound? Counted on vertices welded by equal position, so texture seams do not matter.
+//!
+//! - closed: every edge in exactly two triangles, oppositely wound;
+//! - manifold: no edge in more than two triangles, no vertex with more than one fan;
+//! - Euler number `V − E + F`; genus = pieces − Euler/2 for a closed manifold;
+//! - self-intersection: an edge that runs from one side of another triangle to the other, through it
+//!   or its border, or two triangles of one plane that share area. Sharing a corner or an edge is not
+//!   one, nor is resting on another triangle. Signs come from the determinant in f64 with
+//!   Shewchuk's error bound (1997); what the bound cannot tell from zero counts as touching.
+//! - sliver: quality `4 √3 · area / Σ edge²` below 0.05 (1 for an equilateral triangle).
+
+use crate::geom::{Aabb, Bvh, Mesh};
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+use serde::Serialize;
+use std::collections::HashMap;
+use std::fmt;
+
+/// Triangles worse than this are slivers; an equilateral one has 1.
+const SLIVER: f64 = 0.05;
+
+/// How far from 1 a normal's length may be; the Khronos validator's own bound.
+const UNIT: f32 = 5e-4;
+
+/// What [`check`] found. Counts of triangles are of the mesh as given; topology is after welding.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct CheckReport {
+    /// Vertices as stored.
+    pub vertices: usize,
+    /// Triangles as stored.
+    pub triangles: usize,
+    /// Different positions.
+    pub welded_vertices: usize,
+    /// Triangles with an index out of range or a corner that is not finite; ignored below.
+    pub invalid: usize,
+    /// Every edge in exactly two triangles, oppositely wound, and nothing invalid.
+    pub closed: bool,
+    /// Edges with one triangle.
+    pub boundary_edges: usize,
+    /// Edges with two triangles wound alike.
+    pub flipped_edges: usize,
+    /// Edges with more than two triangles.
+    pub nonmanifold_edges: usize,
+    /// Vertices where several fans meet.
+    pub nonmanifold_vertices: usize,
+    /// No edge with more than two triangles and no vertex with several fans.
+    pub manifold: bool,
+    /// Connected parts.
+    pub pieces: usize,
+    /// `V − E + F` of the welded mesh.
+    pub euler: i64,
+    /// Handles of all pieces together; only for closed manifolds.
+    pub genus: Option<i64>,
+    /// Triangles that pass through or lie on another.
+    pub self_intersections: usize,
+    /// Long thin triangles.
+    pub slivers: usize,
+    /// Triangles without area.
+    pub degenerate: usize,
+    /// Lowest corner, in the file's units.
+    pub min: [f32; 3],
+    /// Highest corner.
+    pub max: [f32; 3],
+    /// Size of the box in metres.
+    pub size_m: [f64; 3],
+    /// Enclosed volume in litres; negative when wound inward, meaningless when open.
+    pub volume_l: f64,
+    /// Does every vertex have a colour?
+    pub has_colors: bool,
+    /// Does every vertex have a normal?
+    pub has_normals: bool,
+    /// Normals whose length is not 1 within 5e-4.
+    pub bad_normals: usize,
+}
+
+/// A bar that was not reached, or that does not exist.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum RequireError {
+    /// Below the bar.
+    #[error("not {bar}: {found}")]
+    Below {
+        /// What was required.
+        bar: String,
+        /// What was found instead.
+        found: String,
+    },
+    /// No such bar.
+    #[error("there is no requirement `{bar}`")]
+    Unknown {
+        /// What was asked for.
+        bar: String,
+    },
+}
+
+impl RequireError {
+    /// The way out.
+    pub fn hint(&self) -> String {
+        match self {
+            RequireError::Below { .. } => "`tiface check` without `--require` prints the whole report".into(),
+            RequireError::Unknown { .. } => format!("known are {}", BARS.join(", ")),
+        }
+    }
+}
+
+/// What [`CheckReport::require`] understands.
+pub const BARS: [&str; 4] = ["watertight", "manifold", "one-piece", "no-self-intersections"];
+
+impl CheckReport {
+    /// Checks the named bars; the first one missed is the error. See [`BARS`].
+    pub fn require(&self, bars: &[&str]) -> Result<(), RequireError> {
+        for &bar in bars {
+            let missed = match bar {
+                "watertight" => (!self.closed).then(|| {
+                    format!(
+                        "{} open edges, {} wound alike, {} in more than two triangles, {} invalid triangles",
+                        self.boundary_edges, self.flipped_edges, self.nonmanifold_edges, self.invalid
+                    )
+                }),
+                "manifold" => (!self.manifold).then(|| {
+                    format!(
+                        "{} edges in more than two triangles, {} vertices with several fans",
+                        self.nonmanifold_edges, self.nonmanifold_vertices
+                    )
+                }),
+                "one-piece" => (self.pieces != 1).then(|| format!("{} pieces", self.pieces)),
+                "no-self-intersections" => (self.self_intersections > 0)
+                    .then(|| format!("{} triangles intersect others", self.self_intersections)),
+                _ => return Err(RequireError::Unknown { bar: bar.into() }),
+            };
+            if let Some(found) = missed {
+                return Err(RequireError::Below { bar: bar.into(), found });
+            }
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Display for CheckReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let yes = |b: bool| if b { "yes" } else { "NO" };
+        let mut row = |name: &str, value: String| writeln!(f, "{name:<20} {value}");
+        row("vertices", format!("{} ({} after welding)", self.vertices, self.welded_vertices))?;
+        row("triangles", self.triangles.to_string())?;
+        row(
+            "watertight",
+            format!(
+                "{} ({} open edges, {} wound alike)",
+                yes(self.closed),
+                self.boundary_edges,
+                self.flipped_edges
+            ),
+        )?;
+        row(
+            "manifold",
+            format!(
+                "{} ({} edges, {} vertices)",
+                yes(self.manifold),
+                self.nonmanifold_edges,
+                self.nonmanifold_vertices
+            ),
+        )?;
+        let genus = self.genus.map_or("undefined".into(), |g| g.to_string());
+        row("pieces", format!("{} (Euler {}, genus {genus})", self.pieces, self.euler))?;
+        row("self-intersecting", format!("{} triangles", self.self_intersections))?;
+        row(
+            "slivers",
+            format!("{} triangles, {} without area, {} invalid", self.slivers, self.degenerate, self.invalid),
+        )?;
+        let [x, y, z] = self.size_m;
+        row("size", format!("{x:.4} × {y:.4} × {z:.4} m"))?;
+        row("box", format!("{:?} to {:?}", self.min, self.max))?;
+        row("volume", format!("{:.4} litres", self.volume_l))?;
+        row("colours", yes(self.has_colors).into())?;
+        row("normals", format!("{} ({} not of unit length)", yes(self.has_normals), self.bad_normals))
+    }
+}
+
+/// Examines a mesh whose coordinates are `unit_m` metres each. Never panics, whatever the mesh.
+pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
+    let (weld, welded_vertices) = weld(mesh);
+    let valid =
+        |t: &[u32; 3]| t.iter().all(|&i| mesh.positions.get(i as usize).is_some_and(|p| p.is_finite()));
+    // Triangles that are still triangles after welding, by their welded corners.
+    let mut faces: Vec<([u32; 3], u32)> = Vec::with_capacity(mesh.triangles.len());
+    let (mut invalid, mut degenerate, mut slivers, mut volume) = (0, 0, 0, 0.0);
+    let mut bounds = Aabb::EMPTY;
+    for (i, t) in mesh.triangles.iter().enumerate() {
+        if !valid(t) {
+            invalid += 1;
+            continue;
+        }
+        let corners = mesh.corners(i as u32);
+        bounds = corners.into_iter().fold(bounds, Aabb::with);
+        let [a, b, c] = corners.map(|p| p.as_dvec3());
+        volume += a.dot(b.cross(c)) / 6.0;
+        let area = 0.5 * (b - a).cross(c - a).length();
+        let edges = (b - a).length_squared() + (c - b).length_squared() + (a - c).length_squared();
+        let quality = 4.0 * 3f64.sqrt() * area / edges;
+        if !(quality > 1e-9) {
+            degenerate += 1;
+        } else if quality < SLIVER {
+            slivers += 1;
+        }
+        let w = t.map(|i| weld[i as usize]);
+        if w[0] != w[1] && w[1] != w[2] && w[2] != w[0] {
+            faces.push((w, i as u32));
+        }
+    }
+    let topology = Topology::of(&faces, welded_vertices);
+    let closed = !faces.is_empty()
+        && invalid == 0
+        && topology.boundary_edges + topology.flipped_edges + topology.nonmanifold_edges == 0;
+    let manifold = topology.nonmanifold_edges + topology.nonmanifold_vertices == 0;
+    let bad_normal = |n: &&glam::Vec3| !((n.length() - 1.0).abs() <= UNIT);
+    let size = if bounds.is_empty() { DVec3::ZERO } else { bounds.max.as_dvec3() - bounds.min.as_dvec3() };
+    let count = mesh.positions.len();
+    CheckReport {
+        vertices: count,
+        triangles: mesh.triangles.len(),
+        welded_vertices,
+        invalid,
+        closed,
+        boundary_edges: topology.boundary_edges,
+        flipped_edges: topology.flipped_edges,
+        nonmanifold_edges: topology.nonmanifold_edges,
+        nonmanifold_vertices: topology.nonmanifold_vertices,
+        manifold,
+        pieces: topology.pieces,
+        euler: topology.euler,
+        genus: (closed && manifold).then_some(topology.pieces as i64 - topology.euler / 2),
+        self_intersections: self_intersections(mesh, &weld, &faces),
+        slivers,
+        degenerate,
+        min: if bounds.is_empty() { [0.0; 3] } else { bounds.min.to_array() },
+        max: if bounds.is_empty() { [0.0; 3] } else { bounds.max.to_array() },
+        size_m: (size * unit_m).to_array(),
+        volume_l: volume * unit_m.powi(3) * 1000.0,
+        has_colors: count > 0 && mesh.colors.len() == count,
+        has_normals: count > 0 && mesh.normals.len() == count,
+        bad_normals: mesh.normals.iter().filter(bad_normal).count(),
+    }
+}
+
+/// For each vertex the number of its position, and how many positions there are.
+fn weld(mesh: &Mesh) -> (Vec<u32>, usize) {
+    let mut numbers = HashMap::with_capacity(mesh.positions.len());
+    let weld = mesh
+        .positions
+        .iter()
+        .map(|p| {
+            let next = numbers.len() as u32;
+            // + 0 makes −0 and 0 equal
+            *numbers.entry(p.to_array().map(|v| (v + 0.0).to_bits())).or_insert(next)
+        })
+        .collect();
+    (weld, numbers.len())
+}
+
+#[derive(Default)]
+struct Topology {
+    boundary_edges: usize,
+    flipped_edges: usize,
+    nonmanifold_edges: usize,
+    nonmanifold_vertices: usize,
+    pieces: usize,
+    euler: i64,
+}
+
+impl Topology {
+    fn of(faces: &[([u32; 3], u32)], vertices: usize) -> Topology {
+        // (lower vertex, higher vertex, face, corner of the lower, corner of the higher)
+        let mut edges: Vec<(u32, u32, u32, u8, u8)> = Vec::with_capacity(3 * faces.len());
+        for (f, (t, _)) in faces.iter().enumerate() {
+            for k in 0..3u8 {
+                let n = (k + 1) % 3;
+                let (a, b) = (t[k as usize], t[n as usize]);
+                edges.push(if a < b { (a, b, f as u32, k, n) } else { (b, a, f as u32, n, k) });
+            }
+        }
+        edges.par_sort_unstable();
+        let mut found = Topology::default();
+        // Corners of one fan, joined across edges.
+        let mut fans = Sets::new(3 * faces.len());
+        let mut parts = Sets::new(vertices);
+        let mut count = 0i64;
+        for group in edges.chunk_by(|a, b| (a.0, a.1) == (b.0, b.1)) {
+            count += 1;
+            parts.join(group[0].0, group[0].1);
+            for pair in group.windows(2) {
+                fans.join(3 * pair[0].2 + pair[0].3 as u32, 3 * pair[1].2 + pair[1].3 as u32);
+                fans.join(3 * pair[0].2 + pair[0].4 as u32, 3 * pair[1].2 + pair[1].4 as u32);
+            }
+            // the edge runs from its lower vertex when the higher corner follows the lower
+            let rising = |e: &(u32, u32, u32, u8, u8)| (e.3 + 1) % 3 == e.4;
+            match group {
+                [_] => found.boundary_edges += 1,
+                [a, b] => found.flipped_edges += (rising(a) == rising(b)) as usize,
+                _ => found.nonmanifold_edges += 1,
+            }
+        }
+        // fans per vertex: corners that are their own representative
+        let mut fan_count = vec![0u32; vertices];
+        for (f, (t, _)) in faces.iter().enumerate() {
+            for k in 0..3 {
+                let corner = 3 * f as u32 + k as u32;
+                fan_count[t[k] as usize] += (fans.find(corner) == corner) as u32;
+            }
+        }
+        found.nonmanifold_vertices = fan_count.iter().filter(|&&n| n > 1).count();
+        let used: Vec<u32> = (0..vertices as u32).filter(|&v| fan_count[v as usize] > 0).collect();
+        found.pieces = used.iter().filter(|&&v| parts.find(v) == v).count();
+        found.euler = used.len() as i64 - count + faces.len() as i64;
+        found
+    }
+}
+
+/// Disjoint sets with path halving; the smallest member represents.
+struct Sets(Vec<u32>);
+
+impl Sets {
+    fn new(n: usize) -> Sets {
+        Sets((0..n as u32).collect())
+    }
+
+    fn find(&mut self, mut x: u32) -> u32 {
+        while self.0[x as usize] != x {
+            self.0[x as usize] = self.0[self.0[x as usize] as usize];
+            x = self.0[x as usize];
+        }
+        x
+    }
+
+    fn join(&mut self, a: u32, b: u32) {
+        let (a, b) = (self.find(a), self.find(b));
+        self.0[a.max(b) as usize] = a.min(b);
+    }
+}
+
+/// How many triangles pass through or lie on another one.
+fn self_intersections(mesh: &Mesh, weld: &[u32], faces: &[([u32; 3], u32)]) -> usize {
+    let bvh = Bvh::new(mesh);
+    let has_area = |t: [DVec3; 3]| (t[1] - t[0]).cross(t[2] - t[0]) != DVec3::ZERO;
+    let corners = |t: u32| mesh.corners(t).map(|p| p.as_dvec3());
+    faces
+        .par_iter()
+        .filter(|&&(ids, t)| {
+            let (p, mut meets) = (corners(t), false);
+            if has_area(p) {
+                bvh.overlapping(Aabb::around(mesh.corners(t)), |other| {
+                    let q = corners(other);
+                    let other_ids = mesh.triangles[other as usize].map(|i| weld[i as usize]);
+                    meets = other != t && has_area(q) && intersect(p, ids, q, other_ids);
+                    !meets
+                });
+            }
+            meets
+        })
+        .count()
+}
+
+/// Do two triangles meet in more than the corners they share?
+fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u32; 3]) -> bool {
+    let shared = |ids: [u32; 3], others: [u32; 3]| ids.map(|i| others.contains(&i));
+    let (in_p, in_q) = (shared(p_ids, q_ids), shared(q_ids, p_ids));
+    let count = in_p.iter().filter(|&&s| s).count();
+    if count == 3 {
+        return true;
+    }
+    let sides = q.map(|v| orient(p[0], p[1], p[2], v));
+    if sides == [0, 0, 0] {
+        return overlap_in_plane(p, q);
+    }
+    // The edge opposite a shared corner, or every edge without one; with a shared edge, none.
+    let crosses = |a: [DVec3; 3], touching: [bool; 3], b: [DVec3; 3]| {
+        (0..3).any(|k| {
+            let next = (k + 1) % 3;
+            !touching[k] && !touching[next] && pierces(a[k], a[next], b)
+        })
+    };
+    count < 2 && (crosses(p, in_p, q) || crosses(q, in_q, p))
+}
+
+/// Does the segment go from one side of the triangle to the other, through it or its border?
+fn pierces(from: DVec3, to: DVec3, [a, b, c]: [DVec3; 3]) -> bool {
+    if orient(a, b, c, from) * orient(a, b, c, to) >= 0 {
+        return false;
+    }
+    let turns = [orient(from, to, a, b), orient(from, to, b, c), orient(from, to, c, a)];
+    turns.iter().all(|&s| s >= 0) || turns.iter().all(|&s| s <= 0)
+}
+
+/// Sign of the determinant of `(a − d, b − d, c − d)`; 0 where rounding could decide it.
+fn orient(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> i32 {
+    let (a, b, c) = (a - d, b - d, c - d);
+    let det = a.dot(b.cross(c));
+    let (x, y, z) = (a.abs(), b.abs(), c.abs());
+    let permanent =
+        x.x * (y.y * z.z + y.z * z.y) + x.y * (y.z * z.x + y.x * z.z) + x.z * (y.x * z.y + y.y * z.x);
+    // (7 + 56 u) u with u = 2⁻⁵³ (Shewchuk 1997), and a little for the differences
+    if det.abs() <= 1e-15 * permanent { 0 } else { det.signum() as i32 }
+}
+
+/// Do two triangles of one plane share area? Not if a side of either separates them.
+fn overlap_in_plane(p: [DVec3; 3], q: [DVec3; 3]) -> bool {
+    let normal = (p[1] - p[0]).cross(p[2] - p[0]).abs();
+    let flat = |v: DVec3| {
+        if normal.x >= normal.y && normal.x >= normal.z {
+            DVec2::new(v.y, v.z)
+        } else if normal.y >= normal.z {
+            DVec2::new(v.z, v.x)
+        } else {
+            DVec2::new(v.x, v.y)
+        }
+    };
+    let turn = |a: DVec2, b: DVec2, c: DVec2| {
+        let (x, y) = ((b.x - a.x) * (c.y - a.y), (b.y - a.y) * (c.x - a.x));
+        if (x - y).abs() <= 1e-15 * (x.abs() + y.abs()) { 0.0 } else { x - y }
+    };
+    let separates = |a: [DVec2; 3], b: [DVec2; 3]| {
+        let winding = turn(a[0], a[1], a[2]);
+        (0..3).any(|k| b.iter().all(|&v| turn(a[k], a[(k + 1) % 3], v) * winding <= 0.0))
+    };
+    let (p, q) = (p.map(flat), q.map(flat));
+    !separates(p, q) && !separates(q, p)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    /// A box from `low` to `high`, wound outward.
+    fn cuboid(low: Vec3, high: Vec3) -> Mesh {
+        let at = |i: u32| Vec3::from([0, 1, 2].map(|k| if i >> k & 1 == 1 { high[k] } else { low[k] }));
+        let quads = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+        Mesh {
+            positions: (0..8).map(at).collect(),
+            triangles: quads.iter().flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]]).collect(),
+            ..Mesh::default()
+        }
+    }
+
+    fn both(mut a: Mesh, b: Mesh) -> Mesh {
+        let first = a.positions.len() as u32;
+        a.positions.extend(b.positions);
+        a.triangles.extend(b.triangles.iter().map(|t| t.map(|i| i + first)));
+        a
+    }
+
+    #[test]
+    fn a_box_is_sound() {
+        // 2 × 3 × 4 dm: 24 litres; V − E + F = 8 − 18 + 12 = 2
+        let r = check(&cuboid(Vec3::ZERO, Vec3::new(2.0, 3.0, 4.0)), 0.1);
+        assert!(r.closed && r.manifold);
+        assert_eq!((r.pieces, r.euler, r.genus), (1, 2, Some(0)));
+        assert!((r.volume_l - 24.0).abs() < 1e-9);
+        assert!((r.size_m[2] - 0.4).abs() < 1e-12);
+        assert_eq!((r.self_intersections, r.slivers, r.degenerate), (0, 0, 0));
+        assert_eq!(r.require(&BARS), Ok(()));
+        assert!(r.to_string().contains("watertight           yes"));
+    }
+
+    #[test]
+    fn a_texture_seam_does_not_open_a_mesh() {
+        let whole = cuboid(Vec3::ZERO, Vec3::ONE);
+        let split = Mesh {
+            positions: whole.triangles.iter().flat_map(|t| t.map(|i| whole.positions[i as usize])).collect(),
+            triangles: (0..12).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect(),
+            ..Mesh::default()
+        };
+        let r = check(&split, 1.0);
+        assert_eq!((r.vertices, r.welded_vertices, r.closed, r.euler), (36, 8, true, 2));
+    }
+
+    #[test]
+    fn holes_turned_faces_and_third_faces_are_told_apart() {
+        let mut m = cuboid(Vec3::ZERO, Vec3::ONE);
+        m.triangles.pop();
+        let r = check(&m, 1.0);
+        assert_eq!((r.boundary_edges, r.closed, r.manifold, r.genus), (3, false, true, None));
+        assert!(
+            matches!(r.require(&["manifold", "watertight"]), Err(RequireError::Below { bar, .. }) if bar == "watertight")
+        );
+        let mut m = cuboid(Vec3::ZERO, Vec3::ONE);
+        m.triangles[0].swap(0, 1);
+        let r = check(&m, 1.0);
+        assert_eq!((r.flipped_edges, r.closed), (3, false));
+        let mut m = cuboid(Vec3::ZERO, Vec3::ONE);
+        m.positions.push(Vec3::new(3.0, -1.0, 0.5));
+        m.triangles.push([0, 1, 8]);
+        let r = check(&m, 1.0);
+        assert_eq!((r.nonmanifold_edges, r.boundary_edges, r.manifold), (1, 2, false));
+    }
+
+    #[test]
+    fn two_boxes_touching_at_a_corner_are_closed_but_not_manifold() {
+        let m = both(cuboid(Vec3::ZERO, Vec3::ONE), cuboid(Vec3::ONE, Vec3::splat(2.0)));
+        let r = check(&m, 1.0);
+        assert_eq!((r.closed, r.nonmanifold_vertices, r.pieces, r.self_intersections), (true, 1, 1, 0));
+    }
+
+    #[test]
+    fn boxes_side_by_side_do_not_intersect_and_overlapping_ones_do() {
+        let first = cuboid(Vec3::ZERO, Vec3::ONE);
+        let apart = both(first.clone(), cuboid(Vec3::new(2.0, 0.0, 0.0), Vec3::new(3.0, 1.0, 1.0)));
+        let r = check(&apart, 1.0);
+        assert_eq!((r.pieces, r.self_intersections, r.genus), (2, 0, Some(0)));
+        assert!(r.require(&["one-piece"]).is_err());
+        // a corner at (0.7, 0.6, 0.4) inside the first box
+        let through = both(first.clone(), cuboid(Vec3::new(0.7, 0.6, 0.4), Vec3::new(1.9, 1.8, 1.7)));
+        assert!(check(&through, 1.0).self_intersections >= 6);
+        // a common wall with other diagonals and corners: the walls overlap in one plane
+        let flush = both(first, cuboid(Vec3::new(1.0, 0.2, 0.2), Vec3::new(2.0, 0.8, 0.8)));
+        assert!(check(&flush, 1.0).self_intersections >= 4);
+    }
+
+    #[test]
+    fn folded_and_repeated_triangles_lie_on_each_other() {
+        let mut m = Mesh {
+            positions: vec![Vec3::ZERO, Vec3::X, Vec3::new(0.5, 1.0, 0.0), Vec3::new(0.5, 0.5, 0.0)],
+            triangles: vec![[0, 1, 2], [1, 0, 3]], // both on the same side of their edge
+            ..Mesh::default()
+        };
+        assert_eq!(check(&m, 1.0).self_intersections, 2);
+        m.positions[3].z = 0.1; // a sharp fold, but a fold
+        assert_eq!(check(&m, 1.0).self_intersections, 0);
+        m.triangles[1] = [2, 0, 1];
+        assert_eq!(check(&m, 1.0).self_intersections, 2);
+    }
+
+    #[test]
+    fn triangles_sharing_one_corner_may_pierce_each_other() {
+        let m = Mesh {
+            positions: vec![
+                Vec3::ZERO,
+                Vec3::new(2.0, -1.0, 0.0),
+                Vec3::new(2.0, 1.0, 0.0),
+                Vec3::new(1.0, 0.0, -1.0),
+                Vec3::new(1.0, 0.0, 1.0),
+            ],
+            triangles: vec![[0, 1, 2], [0, 3, 4]],
+            ..Mesh::default()
+        };
+        assert_eq!(check(&m, 1.0).self_intersections, 2);
+    }
+
+    #[test]
+    fn slivers_and_flat_triangles_are_counted() {
+        let m = Mesh {
+            positions: vec![Vec3::ZERO, Vec3::X, Vec3::new(0.5, 0.01, 0.0), Vec3::new(2.0, 0.0, 0.0)],
+            // quality 4√3·0.005/1.5 = 0.023; then three points on a line; then one point twice
+            triangles: vec![[0, 1, 2], [0, 1, 3], [0, 0, 1]],
+            ..Mesh::default()
+        };
+        let r = check(&m, 1.0);
+        assert_eq!((r.slivers, r.degenerate), (1, 2));
+    }
+
+    #[test]
+    fn rubbish_is_reported_not_followed() {
+        let m = Mesh {
+            positions: vec![Vec3::NAN, Vec3::splat(3e38), Vec3::splat(-3e38), Vec3::X],
+            normals: vec![Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::NAN],
+            triangles: vec![[0, 1, 2], [7, 8, 9], [1, 2, 3]],
+            ..Mesh::default()
+        };
+        let r = check(&m, 1.0);
+        assert_eq!((r.invalid, r.closed, r.bad_normals), (2, false, 2));
+        assert_eq!(check(&Mesh::default(), 1.0).pieces, 0);
+        assert!(matches!(r.require(&["shiny"]), Err(RequireError::Unknown { .. })));
+    }
+}

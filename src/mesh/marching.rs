@@ -1,0 +1,356 @@
+//! Marching cubes over a dense volume: closed, manifold, finite, with the trilinear topology.
+//!
+//! Passes over rows as in flying edges (Schroeder, Maynard, Geveci 2015): inside bits, 64 nodes to a
+//! word; crossings counted per row by comparing words; prefix sums; vertices and triangles written at
+//! fixed offsets. Cells without a crossing cost a sixty-fourth of a few word operations. A vertex's
+//! index is arithmetic: running counters per row, never a hash. What happens inside a cell is in
+//! `marching_cell`. The bytes are the same for any number of threads.
+//!
+//! An exact zero is outside, `-0.0` too.
+
+use super::MeshError;
+use super::marching_bits::{Bits, crossings, for_each_active};
+use super::marching_cell::{CASES, CellSurface, INNER, crossing, resolve};
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+use std::borrow::Cow;
+
+/// A dense grid of field values, negative inside.
+#[derive(Clone, Copy, Debug)]
+pub struct Volume<'a> {
+    /// Nodes along x, y, z; at least 2 each.
+    pub dims: [usize; 3],
+    /// `[z, y, x]`: x runs fastest.
+    pub values: &'a [f32],
+    /// Where node (0, 0, 0) lies.
+    pub origin: Vec3,
+    /// Distance between nodes along each axis, > 0.
+    pub spacing: Vec3,
+}
+
+/// A level set as triangles, counter-clockwise seen from outside.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Surface {
+    /// Vertices: first one for each crossed grid edge, then those inside cells.
+    pub positions: Vec<Vec3>,
+    /// Three vertex indices each.
+    pub triangles: Vec<[u32; 3]>,
+    /// How many values were not finite (`+inf`, `NaN` count as outside, `-inf` as inside).
+    pub non_finite: usize,
+    /// The first of them, as a node.
+    pub first_non_finite: Option<[usize; 3]>,
+    /// Inside nodes on the outer faces that were taken as outside to close the surface.
+    pub capped: usize,
+}
+
+/// The zero level set of a volume.
+///
+/// With `closed`, nodes on the outer faces count as outside, so that what runs off the box is capped
+/// within a thousandth of a cell of its faces; without, the surface is open there.
+///
+/// # Errors
+///
+/// [`MeshError::Volume`] when `dims` and `values` disagree or an axis has fewer than two nodes;
+/// [`MeshError::TooLarge`] when vertices or triangles do not fit 32-bit indices.
+pub fn marching(volume: &Volume, closed: bool) -> Result<Surface, MeshError> {
+    let nodes = volume.dims.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
+    if volume.dims.iter().any(|&d| d < 2) || nodes != Some(volume.values.len()) {
+        return Err(MeshError::Volume { dims: volume.dims, values: volume.values.len() });
+    }
+    let (mut bits, all_finite) = Bits::scan(volume.values, volume.dims);
+    let mut out = Surface::default();
+    let mut values = Cow::Borrowed(volume.values);
+    if !all_finite {
+        values = Cow::Owned(repair(volume, &mut out));
+        (bits, _) = Bits::scan(&values, volume.dims);
+    }
+    if closed {
+        out.capped = bits.clear_border();
+    }
+    Passes { dims: volume.dims, values: &values, origin: volume.origin, spacing: volume.spacing, bits }
+        .run(&mut out)?;
+    Ok(out)
+}
+
+/// Where the vertex of a crossed edge lies: on the edge that leaves `node` along `axis`, at `t` cells.
+pub(super) fn edge_point(origin: Vec3, spacing: Vec3, node: [usize; 3], axis: usize, t: f64) -> Vec3 {
+    let mut cell = DVec3::new(node[0] as f64, node[1] as f64, node[2] as f64);
+    cell[axis] += t;
+    (origin.as_dvec3() + cell * spacing.as_dvec3()).as_vec3()
+}
+
+/// Where an inner vertex of a cell lies.
+pub(super) fn cell_point(origin: Vec3, spacing: Vec3, cell: [usize; 3], at: [f64; 3]) -> Vec3 {
+    let p = DVec3::new(cell[0] as f64, cell[1] as f64, cell[2] as f64) + DVec3::from_array(at);
+    (origin.as_dvec3() + p * spacing.as_dvec3()).as_vec3()
+}
+
+/// A value as the interpolation may see it: a node counted as outside is never below zero.
+pub(super) fn sided(value: f32, inside: bool) -> f32 {
+    if inside { value } else { value.max(0.0) }
+}
+
+/// Finite stand-ins: the sign as documented, the size that of the largest finite neighbour (1 without
+/// any). One value per node, not per cell, so that cells agree on their common edges.
+fn repair(volume: &Volume, out: &mut Surface) -> Vec<f32> {
+    let [nx, ny, nz] = volume.dims;
+    let mut values = volume.values.to_vec();
+    for (i, &v) in volume.values.iter().enumerate().filter(|(_, v)| !v.is_finite()) {
+        let node = [i % nx, i / nx % ny, i / nx / ny];
+        out.non_finite += 1;
+        out.first_non_finite.get_or_insert(node);
+        let around = |at: usize, n: usize| at.saturating_sub(1)..(at + 2).min(n);
+        let mut size = 0.0f32;
+        for z in around(node[2], nz) {
+            for y in around(node[1], ny) {
+                for x in around(node[0], nx) {
+                    let near = volume.values[(z * ny + y) * nx + x].abs();
+                    size = if near.is_finite() { size.max(near) } else { size };
+                }
+            }
+        }
+        let size = if size > 0.0 { size } else { 1.0 };
+        values[i] = if v == f32::NEG_INFINITY { -size } else { size };
+    }
+    values
+}
+
+struct Passes<'a> {
+    dims: [usize; 3],
+    values: &'a [f32],
+    origin: Vec3,
+    spacing: Vec3,
+    bits: Bits,
+}
+
+/// What one plane of nodes and the layer of cells above it hold.
+#[derive(Clone, Copy, Default)]
+struct Plane {
+    vertices: u64,
+    inner: u64,
+    triangles: u64,
+}
+
+impl Passes<'_> {
+    fn run(&self, out: &mut Surface) -> Result<(), MeshError> {
+        let [_, ny, nz] = self.dims;
+        // Vertices before each row's x, y and z edges, counted from the start of its plane.
+        let mut rows = vec![[0u32; 3]; ny * nz];
+        let planes: Vec<Plane> =
+            rows.par_chunks_mut(ny).enumerate().map(|(k, rows)| self.count(k, rows)).collect();
+
+        let mut starts = Vec::with_capacity(nz);
+        let mut total = Plane::default();
+        for p in &planes {
+            starts.push(total);
+            total.vertices += p.vertices;
+            total.inner += p.inner;
+            total.triangles += p.triangles;
+        }
+        if total.vertices + total.inner > u64::from(u32::MAX) || total.triangles > u64::from(u32::MAX) {
+            return Err(MeshError::TooLarge { vertices: total.vertices + total.inner });
+        }
+        rows.par_chunks_mut(ny).zip(&starts).for_each(|(rows, start)| {
+            rows.iter_mut().flatten().for_each(|r| *r += start.vertices as u32);
+        });
+
+        out.positions = vec![Vec3::ZERO; (total.vertices + total.inner) as usize];
+        out.triangles = vec![[0; 3]; total.triangles as usize];
+        let (mut on_edges, mut inner) = out.positions.split_at_mut(total.vertices as usize);
+        let mut triangles = out.triangles.as_mut_slice();
+        let mut jobs = Vec::with_capacity(nz);
+        for (k, p) in planes.iter().enumerate() {
+            let (v, rest) = on_edges.split_at_mut(p.vertices as usize);
+            on_edges = rest;
+            let (c, rest) = inner.split_at_mut(p.inner as usize);
+            inner = rest;
+            let (t, rest) = triangles.split_at_mut(p.triangles as usize);
+            triangles = rest;
+            jobs.push((k, v, c, t));
+        }
+        let inner_start = total.vertices as u32;
+        jobs.into_par_iter().for_each(|(k, v, c, t)| {
+            self.place(k, v);
+            self.connect(k, &rows, inner_start + starts[k].inner as u32, c, t);
+        });
+        Ok(())
+    }
+
+    fn count(&self, k: usize, rows: &mut [[u32; 3]]) -> Plane {
+        let mut vertices = 0u32;
+        for (j, row) in rows.iter_mut().enumerate() {
+            for axis in 0..3 {
+                row[axis] = vertices;
+                crossings(&self.bits, j, k, axis, |_, word| vertices += word.count_ones());
+            }
+        }
+        let mut plane = Plane { vertices: u64::from(vertices), ..Plane::default() };
+        let cases = &*CASES;
+        if k + 1 < self.dims[2] {
+            for j in 0..self.dims[1] - 1 {
+                for_each_active(&self.bits, j, k, |i, index| {
+                    let case = &cases[index as usize];
+                    if case.ambiguous {
+                        let cell = self.cell(index, i, j, k);
+                        plane.inner += cell.inner.len() as u64;
+                        plane.triangles += cell.triangles.len() as u64;
+                    } else {
+                        plane.triangles += u64::from(case.count);
+                    }
+                });
+            }
+        }
+        plane
+    }
+
+    fn cell(&self, case: u8, i: usize, j: usize, k: usize) -> CellSurface {
+        let [nx, ny, _] = self.dims;
+        let values = std::array::from_fn(|c| {
+            let node = ((k + (c >> 2)) * ny + j + (c >> 1 & 1)) * nx + i + (c & 1);
+            sided(self.values[node], case >> c & 1 == 1)
+        });
+        resolve(case, &values)
+    }
+
+    /// The vertices of one plane's rows, in the order `count` counted them.
+    fn place(&self, k: usize, mut vertices: &mut [Vec3]) {
+        let [nx, ny, _] = self.dims;
+        let step = [1, nx, nx * ny];
+        for j in 0..ny {
+            for axis in 0..3 {
+                crossings(&self.bits, j, k, axis, |base, mut word| {
+                    let (now, later) = std::mem::take(&mut vertices).split_at_mut(word.count_ones() as usize);
+                    vertices = later;
+                    for vertex in now {
+                        let i = base + word.trailing_zeros() as usize;
+                        word &= word - 1;
+                        let node = (k * ny + j) * nx + i;
+                        let (a, b) = (self.values[node], self.values[node + step[axis]]);
+                        // Exactly one end is inside; in a closed domain the other may be a node
+                        // below zero on the border, which counts as zero.
+                        let inside = self.bits.get(i, j, k);
+                        let t = crossing(sided(a, inside), sided(b, !inside));
+                        *vertex = edge_point(self.origin, self.spacing, [i, j, k], axis, t);
+                    }
+                });
+            }
+        }
+    }
+
+    /// The triangles of one layer of cells, and their inner vertices.
+    fn connect(
+        &self,
+        k: usize,
+        rows: &[[u32; 3]],
+        mut next_inner: u32,
+        mut inner: &mut [Vec3],
+        triangles: &mut [[u32; 3]],
+    ) {
+        let [_, ny, nz] = self.dims;
+        if k + 1 == nz {
+            return;
+        }
+        let cases = &*CASES;
+        let mut at = 0;
+        for j in 0..ny - 1 {
+            let (r00, r10) = (rows[k * ny + j], rows[k * ny + j + 1]);
+            let (r01, r11) = (rows[(k + 1) * ny + j], rows[(k + 1) * ny + j + 1]);
+            // Running indices: x edges of four rows, y edges of two, z edges of two.
+            let mut next = [r00[0], r10[0], r01[0], r11[0], r00[1], r01[1], r00[2], r10[2]];
+            for_each_active(&self.bits, j, k, |i, index| {
+                let case = &cases[index as usize];
+                let step = &case.advance;
+                // A crossed y or z edge at the near side of the cell comes before the one at its far
+                // side; the x edges have one each.
+                let ids = [
+                    next[0],
+                    next[1],
+                    next[2],
+                    next[3],
+                    next[4],
+                    next[4] + step[4],
+                    next[5],
+                    next[5] + step[5],
+                    next[6],
+                    next[6] + step[6],
+                    next[7],
+                    next[7] + step[7],
+                ];
+                if case.ambiguous {
+                    let cell = self.cell(index, i, j, k);
+                    let id = |code: u8| match code {
+                        0..INNER => ids[code as usize],
+                        _ => next_inner + u32::from(code - INNER),
+                    };
+                    for t in &cell.triangles {
+                        triangles[at] = t.map(id);
+                        at += 1;
+                    }
+                    let (now, later) = std::mem::take(&mut inner).split_at_mut(cell.inner.len());
+                    inner = later;
+                    next_inner += now.len() as u32;
+                    for (vertex, &p) in now.iter_mut().zip(&cell.inner) {
+                        *vertex = cell_point(self.origin, self.spacing, [i, j, k], p);
+                    }
+                } else {
+                    let n = case.count as usize;
+                    for (out, t) in triangles[at..at + n].iter_mut().zip(&case.triangles) {
+                        *out = [ids[t[0] as usize], ids[t[1] as usize], ids[t[2] as usize]];
+                    }
+                    at += n;
+                }
+                next.iter_mut().zip(step).for_each(|(n, s)| *n += s);
+            });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cube<'a>(n: usize, values: &'a [f32]) -> Volume<'a> {
+        Volume { dims: [n; 3], values, origin: Vec3::ZERO, spacing: Vec3::ONE }
+    }
+
+    #[test]
+    fn a_lone_inside_node_is_an_octahedron() {
+        // Node (1, 1, 1) at -1 among +1: six crossings half way along its edges. The octahedron with
+        // half axes ½ has volume 4/3 · (1/2)³ = 1/6, eight faces.
+        let mut v = vec![1.0; 27];
+        v[13] = -1.0;
+        let s = marching(&cube(3, &v), false).unwrap();
+        assert_eq!((s.positions.len(), s.triangles.len()), (6, 8));
+        let mesh = crate::geom::Mesh { positions: s.positions, triangles: s.triangles, ..Default::default() };
+        assert!(mesh.is_closed());
+        assert!((mesh.signed_volume() - 1.0 / 6.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_volume_without_a_surface_is_empty_and_a_full_one_is_capped() {
+        assert!(marching(&cube(4, &[1.0; 64]), true).unwrap().triangles.is_empty());
+        assert!(marching(&cube(4, &[-1.0; 64]), false).unwrap().triangles.is_empty());
+        let full = marching(&cube(4, &[-1.0; 64]), true).unwrap();
+        // 64 nodes, 8 of them inside the outer faces.
+        assert_eq!(full.capped, 56);
+        assert!(!full.triangles.is_empty());
+    }
+
+    #[test]
+    fn sizes_that_disagree_are_an_error_that_says_both() {
+        let e = marching(&cube(4, &[1.0; 63]), true).unwrap_err().to_string();
+        assert!(e.contains("64") && e.contains("63"), "{e}");
+        assert!(marching(&cube(1, &[1.0]), true).is_err());
+    }
+
+    #[test]
+    fn what_is_not_finite_is_counted_and_takes_the_size_of_its_neighbours() {
+        let mut v = vec![2.0; 27];
+        v[13] = f32::NEG_INFINITY;
+        v[4] = f32::NAN;
+        let s = marching(&cube(3, &v), false).unwrap();
+        assert_eq!((s.non_finite, s.first_non_finite), (2, Some([1, 1, 0])));
+        // -2 against +2: half way.
+        assert!(s.positions.iter().all(|p| p.is_finite() && (*p - Vec3::ONE).length() == 0.5));
+    }
+}

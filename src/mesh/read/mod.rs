@@ -1,0 +1,155 @@
+//! Meshes from files others wrote: GLB, PLY and OBJ, from bytes.
+//!
+//! What the bytes are decides, not the name. Every count is compared with the bytes that remain
+//! before anything is reserved, no other file is opened, and numbers that are not finite are refused.
+
+mod glb;
+mod obj;
+mod ply;
+
+use crate::geom::Mesh;
+use std::path::{Path, PathBuf};
+
+/// How much a file may ask for. GLB can show one buffer many times, so bytes alone do not bound it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// Most vertices.
+    pub vertices: usize,
+    /// Most triangles, after polygons are fanned.
+    pub triangles: usize,
+    /// Most bytes of JSON in a GLB.
+    pub json: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits { vertices: 30_000_000, triangles: 30_000_000, json: 64 << 20 }
+    }
+}
+
+/// Why bytes are not a mesh.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReadMeshError {
+    /// None of the formats.
+    #[error("`{}` is neither GLB, PLY nor OBJ", path.display())]
+    Unknown {
+        /// Which file.
+        path: PathBuf,
+    },
+    /// A file that breaks its own rules.
+    #[error("`{}`, {at}: {what}", path.display())]
+    Broken {
+        /// Which file.
+        path: PathBuf,
+        /// Where in it.
+        at: String,
+        /// What is wrong: expected and found.
+        what: String,
+    },
+    /// A file that is right, but beyond this reader.
+    #[error("`{}`, {at}: {feature} is not supported", path.display())]
+    Unsupported {
+        /// Which file.
+        path: PathBuf,
+        /// Where in it.
+        at: String,
+        /// What it uses.
+        feature: String,
+    },
+    /// More than [`Limits`] allow.
+    #[error("`{}` has more than {limit} {what}", path.display())]
+    TooMany {
+        /// Which file.
+        path: PathBuf,
+        /// Of what.
+        what: &'static str,
+        /// How many are allowed.
+        limit: usize,
+    },
+    /// No triangles.
+    #[error("`{}` holds no triangles", path.display())]
+    Empty {
+        /// Which file.
+        path: PathBuf,
+    },
+}
+
+impl ReadMeshError {
+    /// The way out.
+    pub fn hint(&self) -> &'static str {
+        match self {
+            ReadMeshError::Unknown { .. } => {
+                "export it as .glb, .ply or .obj; a .gltf beside a .bin is not read"
+            }
+            ReadMeshError::Broken { .. } => "export it again; the Khronos validator explains a GLB in detail",
+            ReadMeshError::Unsupported { .. } => "export it as a plain .glb without compression",
+            ReadMeshError::TooMany { .. } => "simplify it first",
+            ReadMeshError::Empty { .. } => "export a surface, not points or curves",
+        }
+    }
+}
+
+/// A mesh from the bytes of a `.glb`, `.ply` or `.obj` file, in the file's own coordinates.
+///
+/// `path` is for messages only. Colours come back sRGB-coded; normals only when every vertex has
+/// one. Polygons are fanned. Nothing is welded or repaired.
+pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh, ReadMeshError> {
+    read_limited(bytes, path, &Limits::default())
+}
+
+/// [`read`] with limits of one's own.
+pub fn read_limited(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Mesh, ReadMeshError> {
+    let source = Source { path, limits };
+    let mesh = if bytes.starts_with(b"glTF") {
+        glb::read(bytes, source)?
+    } else if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
+        ply::read(bytes, source)?
+    } else if looks_like_obj(bytes) {
+        obj::read(bytes, source)?
+    } else {
+        return Err(ReadMeshError::Unknown { path: path.into() });
+    };
+    if mesh.triangles.is_empty() {
+        return Err(ReadMeshError::Empty { path: path.into() });
+    }
+    Ok(mesh)
+}
+
+/// Does some early line start with a word of OBJ?
+fn looks_like_obj(bytes: &[u8]) -> bool {
+    let start = &bytes[..bytes.len().min(1 << 16)];
+    !start.contains(&0)
+        && start.split(|&b| b == b'\n').any(|line| {
+            let word = line.trim_ascii().split(|b| b.is_ascii_whitespace()).next().unwrap_or(b"");
+            [&b"v"[..], b"f", b"o", b"g", b"vn", b"vt", b"mtllib"].contains(&word)
+        })
+}
+
+/// Which file is read, and how much it may ask for.
+#[derive(Clone, Copy)]
+struct Source<'a> {
+    path: &'a Path,
+    limits: &'a Limits,
+}
+
+impl Source<'_> {
+    fn broken(&self, at: impl Into<String>, what: impl Into<String>) -> ReadMeshError {
+        ReadMeshError::Broken { path: self.path.into(), at: at.into(), what: what.into() }
+    }
+
+    fn unsupported(&self, at: impl Into<String>, feature: impl Into<String>) -> ReadMeshError {
+        ReadMeshError::Unsupported { path: self.path.into(), at: at.into(), feature: feature.into() }
+    }
+
+    /// Are this many vertices and triangles allowed?
+    fn allow(&self, vertices: usize, triangles: usize) -> Result<(), ReadMeshError> {
+        let Limits { vertices: v, triangles: t, .. } = *self.limits;
+        for (what, found, limit) in [("vertices", vertices, v), ("triangles", triangles, t)] {
+            if found > limit {
+                return Err(ReadMeshError::TooMany { path: self.path.into(), what, limit });
+            }
+        }
+        Ok(())
+    }
+}

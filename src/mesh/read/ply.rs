@@ -1,0 +1,323 @@
+//! PLY → mesh: text and both binary orders, any scalar types, polygons fanned.
+
+use super::{ReadMeshError, Source};
+use crate::geom::Mesh;
+use glam::Vec3;
+
+/// A header is a few lines; more is an attack or another format.
+const HEADER_BYTES: usize = 1 << 20;
+
+#[derive(Clone, Copy, PartialEq)]
+enum Order {
+    Text,
+    Little,
+    Big,
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    fn named(name: &str) -> Option<Scalar> {
+        Some(match name {
+            "char" | "int8" => Scalar::I8,
+            "uchar" | "uint8" => Scalar::U8,
+            "short" | "int16" => Scalar::I16,
+            "ushort" | "uint16" => Scalar::U16,
+            "int" | "int32" => Scalar::I32,
+            "uint" | "uint32" => Scalar::U32,
+            "float" | "float32" => Scalar::F32,
+            "double" | "float64" => Scalar::F64,
+            _ => return None,
+        })
+    }
+
+    fn size(self) -> usize {
+        match self {
+            Scalar::I8 | Scalar::U8 => 1,
+            Scalar::I16 | Scalar::U16 => 2,
+            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
+            Scalar::F64 => 8,
+        }
+    }
+
+    /// What white is, for colours.
+    fn white(self) -> f64 {
+        match self {
+            Scalar::U8 => 255.0,
+            Scalar::U16 => 65535.0,
+            _ => 1.0,
+        }
+    }
+}
+
+struct Property {
+    name: String,
+    item: Scalar,
+    /// Of a list: the type of its length.
+    length: Option<Scalar>,
+}
+
+struct Element {
+    name: String,
+    count: usize,
+    properties: Vec<Property>,
+}
+
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> {
+    let (order, elements, start) = header(bytes, source)?;
+    let mut body = Body { bytes, at: start, order, source };
+    let mut mesh = Mesh::default();
+    for element in &elements {
+        body.check(element)?;
+        match element.name.as_str() {
+            "vertex" => vertices(&mut body, element, &mut mesh)?,
+            "face" => faces(&mut body, element, &mut mesh)?,
+            "tristrips" => return Err(source.unsupported("element `tristrips`", "a triangle strip")),
+            _ => {
+                for _ in 0..element.count {
+                    for property in &element.properties {
+                        body.each(property, |_| Ok(()))?;
+                    }
+                }
+            }
+        }
+    }
+    let count = mesh.positions.len();
+    for (i, t) in mesh.triangles.iter().enumerate() {
+        if let Some(v) = t.iter().find(|&&v| v as usize >= count) {
+            return Err(
+                source.broken(format!("triangle {i}"), format!("index {v}, but there are {count} vertices"))
+            );
+        }
+    }
+    Ok(mesh)
+}
+
+fn header(bytes: &[u8], source: Source) -> Result<(Order, Vec<Element>, usize), ReadMeshError> {
+    let (mut order, mut elements, mut at) = (None, Vec::<Element>::new(), 0);
+    for number in 1.. {
+        let rest = &bytes[at..bytes.len().min(HEADER_BYTES).max(at)];
+        let broken = |what: String| source.broken(format!("header line {number}"), what);
+        let Some(length) = rest.iter().position(|&b| b == b'\n') else {
+            return Err(broken("the header has no end".into()));
+        };
+        let line = String::from_utf8_lossy(rest[..length].trim_ascii()).into_owned();
+        at += length + 1;
+        let words: Vec<&str> = line.split_ascii_whitespace().collect();
+        match words[..] {
+            ["ply"] | ["comment" | "obj_info", ..] | [] => {}
+            ["format", kind, _] => {
+                order = match kind {
+                    "ascii" => Some(Order::Text),
+                    "binary_little_endian" => Some(Order::Little),
+                    "binary_big_endian" => Some(Order::Big),
+                    _ => return Err(broken(format!("format `{kind}` is unknown"))),
+                }
+            }
+            ["element", name, count] => {
+                let count = count.parse().map_err(|_| broken(format!("`{count}` is not a count")))?;
+                elements.push(Element { name: name.into(), count, properties: Vec::new() });
+            }
+            ["property", ref kind @ .., name] => {
+                let scalar =
+                    |k: &str| Scalar::named(k).ok_or_else(|| broken(format!("type `{k}` is unknown")));
+                let (item, length) = match *kind {
+                    ["list", length, item] => {
+                        let length = scalar(length)?;
+                        if matches!(length, Scalar::F32 | Scalar::F64) {
+                            return Err(broken("a list length that is not an integer".into()));
+                        }
+                        (scalar(item)?, Some(length))
+                    }
+                    [item] => (scalar(item)?, None),
+                    _ => return Err(broken(format!("`{line}` is no property"))),
+                };
+                let element =
+                    elements.last_mut().ok_or_else(|| broken("a property before any element".into()))?;
+                element.properties.push(Property { name: name.into(), item, length });
+            }
+            ["end_header"] => {
+                let order = order.ok_or_else(|| broken("there was no `format`".into()))?;
+                return Ok((order, elements, at));
+            }
+            _ => {
+                return Err(broken(format!(
+                    "`{}` is not understood",
+                    line.chars().take(60).collect::<String>()
+                )));
+            }
+        }
+    }
+    unreachable!("the loop over line numbers only returns")
+}
+
+/// What follows the header, and how far it was read.
+struct Body<'a> {
+    bytes: &'a [u8],
+    at: usize,
+    order: Order,
+    source: Source<'a>,
+}
+
+impl Body<'_> {
+    /// Can the bytes that remain hold this element at all? Asked before anything is reserved.
+    fn check(&self, element: &Element) -> Result<(), ReadMeshError> {
+        let sizes = element.properties.iter().map(|p| match self.order {
+            Order::Text => 1, // one digit; the spaces are extra
+            _ => p.length.unwrap_or(p.item).size(),
+        });
+        let row: usize = sizes.sum();
+        let remain = self.bytes.len() - self.at;
+        if element.count > 0 && row == 0 {
+            return Err(self.source.broken(format!("element `{}`", element.name), "has no properties"));
+        }
+        if element.count.checked_mul(row).is_none_or(|n| n > remain) {
+            let what = format!("{} of at least {row} bytes each, but {remain} remain", element.count);
+            return Err(self.source.broken(format!("element `{}`", element.name), what));
+        }
+        Ok(())
+    }
+
+    fn next(&mut self, scalar: Scalar) -> Result<f64, ReadMeshError> {
+        let at = self.at;
+        let broken = |what: String| self.source.broken(format!("byte {at}"), what);
+        if self.order == Order::Text {
+            let rest = &self.bytes[self.at..];
+            let start = rest.iter().position(|b| !b.is_ascii_whitespace()).unwrap_or(rest.len());
+            let length =
+                rest[start..].iter().position(|b| b.is_ascii_whitespace()).unwrap_or(rest.len() - start);
+            let word = String::from_utf8_lossy(&rest[start..start + length.min(64)]);
+            self.at += start + length;
+            return word.parse().map_err(|_| broken(format!("expected a number, found `{word}`")));
+        }
+        let size = scalar.size();
+        let Some(slice) = self.bytes.get(at..at + size) else {
+            return Err(broken("the file ends here".into()));
+        };
+        self.at += size;
+        let mut b = [0u8; 8];
+        b[..size].copy_from_slice(slice);
+        if self.order == Order::Big {
+            b[..size].reverse();
+        }
+        let [b0, b1, b2, b3, ..] = b;
+        Ok(match scalar {
+            Scalar::I8 => b0 as i8 as f64,
+            Scalar::U8 => b0 as f64,
+            Scalar::I16 => i16::from_le_bytes([b0, b1]) as f64,
+            Scalar::U16 => u16::from_le_bytes([b0, b1]) as f64,
+            Scalar::I32 => i32::from_le_bytes([b0, b1, b2, b3]) as f64,
+            Scalar::U32 => u32::from_le_bytes([b0, b1, b2, b3]) as f64,
+            Scalar::F32 => f32::from_le_bytes([b0, b1, b2, b3]) as f64,
+            Scalar::F64 => f64::from_le_bytes(b),
+        })
+    }
+
+    /// Calls `take` with the value, or with each value of a list.
+    fn each(
+        &mut self,
+        property: &Property,
+        mut take: impl FnMut(f64) -> Result<(), ReadMeshError>,
+    ) -> Result<(), ReadMeshError> {
+        let Some(length) = property.length else {
+            let value = self.next(property.item)?;
+            return take(value);
+        };
+        let at = self.at;
+        let length = self.next(length)?;
+        let size = if self.order == Order::Text { 1 } else { property.item.size() };
+        // negative and fractional lengths fail here too
+        if length.fract() != 0.0 || !(0.0..=((self.bytes.len() - self.at) / size) as f64).contains(&length) {
+            return Err(self
+                .source
+                .broken(format!("byte {at}"), format!("a list of {length} values does not fit")));
+        }
+        for _ in 0..length as usize {
+            let value = self.next(property.item)?;
+            take(value)?;
+        }
+        Ok(())
+    }
+}
+
+fn vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<(), ReadMeshError> {
+    let source = body.source;
+    source.allow(element.count, 0)?;
+    let slot = |name: &str| element.properties.iter().position(|p| p.name == name && p.length.is_none());
+    let triple = |names: [&str; 3]| match names.map(slot) {
+        [Some(a), Some(b), Some(c)] => Some([a, b, c]),
+        _ => None,
+    };
+    let Some(xyz) = triple(["x", "y", "z"]) else {
+        return Err(source.broken("element `vertex`", "has no x, y, z"));
+    };
+    let (normal, color) = (triple(["nx", "ny", "nz"]), triple(["red", "green", "blue"]));
+    let mut row = vec![0.0; element.properties.len()];
+    for i in 0..element.count {
+        for (k, property) in element.properties.iter().enumerate() {
+            body.each(property, |v| {
+                row[k] = v;
+                Ok(())
+            })?;
+        }
+        let vector = |at: [usize; 3]| Vec3::from(at.map(|k| row[k] as f32));
+        let position = vector(xyz);
+        let direction = normal.map(vector).unwrap_or(Vec3::ZERO);
+        if !position.is_finite() || !direction.is_finite() {
+            return Err(source.broken(format!("vertex {i}"), format!("{position} {direction} is not finite")));
+        }
+        mesh.positions.push(position);
+        if normal.is_some() {
+            mesh.normals.push(direction.normalize_or_zero());
+        }
+        if let Some(color) = color {
+            let coded = color.map(|k| ((row[k] / element.properties[k].item.white()) as f32).clamp(0.0, 1.0));
+            if coded.iter().any(|c| c.is_nan()) {
+                return Err(source.broken(format!("vertex {i}"), "its colour is not a number"));
+            }
+            mesh.colors.push(coded);
+        }
+    }
+    Ok(())
+}
+
+fn faces(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<(), ReadMeshError> {
+    let source = body.source;
+    source.allow(0, element.count)?;
+    let is_list =
+        |p: &Property| p.length.is_some() && ["vertex_indices", "vertex_index"].contains(&p.name.as_str());
+    if !element.properties.iter().any(is_list) {
+        return Err(source.broken("element `face`", "has no list `vertex_indices`"));
+    }
+    let mut corners: Vec<u32> = Vec::new();
+    for i in 0..element.count {
+        for property in &element.properties {
+            if !is_list(property) {
+                body.each(property, |_| Ok(()))?;
+                continue;
+            }
+            corners.clear();
+            body.each(property, |v| {
+                if v.fract() != 0.0 || !(0.0..4294967295.0).contains(&v) {
+                    return Err(source
+                        .broken(format!("face {i}"), format!("index {v}, expected a whole number from 0")));
+                }
+                corners.push(v as u32);
+                Ok(())
+            })?;
+            source.allow(0, mesh.triangles.len() + corners.len().saturating_sub(2))?;
+            mesh.triangles.extend(corners.windows(2).skip(1).map(|w| [corners[0], w[0], w[1]]));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,412 @@
+//! Which cameras a novel view is seen through: an orbit around the head, or a file.
+//!
+//! Two kinds of JSON are read: nerfstudio's camera path (`camera_path`, made in its viewer) and
+//! `transforms.json` (`frames`). Both give camera-to-world matrices with OpenGL axes, as ours are, and
+//! must be in the dataset's own world. A path from nerfstudio's viewer is only if training there ran
+//! with `--orientation-method none --center-method none --auto-scale-poses False`.
+
+use crate::geom::{Camera, Distortion};
+use glam::{DMat3, DVec3, Vec3};
+use serde::Deserialize;
+
+/// Most cameras in one file.
+const MAX_CAMERAS: usize = 100_000;
+
+/// Largest side of a picture.
+const MAX_SIDE: u32 = 16_384;
+
+/// A camera and what its picture is called.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NamedCamera {
+    /// File name without folder and ending.
+    pub name: String,
+    /// Where it is and how it looks.
+    pub camera: Camera,
+}
+
+/// Why text is not a camera path.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum PathError {
+    /// Not JSON, or not of these kinds.
+    #[error("not a camera path: {what}")]
+    Format {
+        /// What the parser said.
+        what: String,
+    },
+    /// No cameras, or too many.
+    #[error("{found} cameras, expected 1 to {MAX_CAMERAS}")]
+    Count {
+        /// How many there are.
+        found: usize,
+    },
+    /// One camera is wrong.
+    #[error("camera {index}: {what}")]
+    Camera {
+        /// Which one, from 0.
+        index: usize,
+        /// Expected and found.
+        what: String,
+    },
+    /// An orbit needs cameras to copy, and an up direction.
+    #[error("no orbit: {what}")]
+    Orbit {
+        /// What is missing.
+        what: &'static str,
+    },
+}
+
+impl PathError {
+    /// The way out.
+    pub fn hint(&self) -> &'static str {
+        match self {
+            PathError::Orbit { .. } => "give a capture with at least one camera and an `up` direction",
+            _ => "export a camera path from nerfstudio's viewer, or give a transforms.json",
+        }
+    }
+}
+
+/// `count` cameras on a circle around `center`, evenly spaced, all looking at it.
+///
+/// The circle lies across `up` at the mean height and mean distance of the capture's cameras, and
+/// begins where their mean direction is. Lens and picture size are those of the first camera, without
+/// distortion and with the middle of the picture as principal point.
+pub fn orbit(
+    cameras: &[Camera],
+    center: Vec3,
+    up: Vec3,
+    count: usize,
+) -> Result<Vec<NamedCamera>, PathError> {
+    let like = cameras.first().ok_or(PathError::Orbit { what: "there are no cameras" })?;
+    let up = up.as_dvec3().try_normalize().ok_or(PathError::Orbit { what: "`up` has no direction" })?;
+    if count == 0 || count > MAX_CAMERAS {
+        return Err(PathError::Count { found: count });
+    }
+    let center = center.as_dvec3();
+    let (mut height, mut radius, mut toward) = (0.0, 0.0, DVec3::ZERO);
+    for camera in cameras {
+        let arm = camera.position - center;
+        let flat = arm - arm.dot(up) * up;
+        height += arm.dot(up) / cameras.len() as f64;
+        radius += flat.length() / cameras.len() as f64;
+        toward += flat.normalize_or_zero();
+    }
+    if !(radius.is_finite() && height.is_finite() && radius > 0.0) {
+        return Err(PathError::Orbit { what: "the cameras stand on the axis of the circle" });
+    }
+    // cameras all around have no mean direction: any will do
+    let start = if toward.length() > 1e-6 { toward.normalize() } else { up.any_orthonormal_vector() };
+    let side = up.cross(start);
+    let digits = count.to_string().len().max(4);
+    let made = (0..count).map(|i| {
+        let angle = std::f64::consts::TAU * i as f64 / count as f64;
+        let position = center + height * up + radius * (angle.cos() * start + angle.sin() * side);
+        let back = (position - center).normalize();
+        let right = up.cross(back).normalize();
+        let camera = Camera {
+            cx: like.width as f64 / 2.0,
+            cy: like.height as f64 / 2.0,
+            distortion: Distortion::default(),
+            rotation: DMat3::from_cols(right, back.cross(right), back),
+            position,
+            ..like.clone()
+        };
+        NamedCamera { name: format!("{:0digits$}", i + 1), camera }
+    });
+    Ok(made.collect())
+}
+
+#[derive(Deserialize)]
+struct File {
+    camera_path: Option<Vec<Key>>,
+    render_width: Option<f64>,
+    render_height: Option<f64>,
+    camera_type: Option<String>,
+    frames: Option<Vec<Frame>>,
+    #[serde(flatten)]
+    lens: Lens,
+}
+
+#[derive(Deserialize)]
+struct Key {
+    camera_to_world: Vec<f64>,
+    /// Vertical, degrees.
+    fov: Option<f64>,
+}
+
+#[derive(Deserialize)]
+struct Frame {
+    transform_matrix: Vec<Vec<f64>>,
+    file_path: Option<String>,
+    #[serde(flatten)]
+    lens: Lens,
+}
+
+/// Intrinsics as `transforms.json` has them, for all frames or for one.
+#[derive(Deserialize, Clone, Copy)]
+struct Lens {
+    w: Option<f64>,
+    h: Option<f64>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    k1: Option<f64>,
+    k2: Option<f64>,
+    k3: Option<f64>,
+    p1: Option<f64>,
+    p2: Option<f64>,
+    camera_angle_x: Option<f64>,
+    camera_angle_y: Option<f64>,
+}
+
+/// Cameras from the text of a nerfstudio camera path or a `transforms.json`. What the file does not
+/// say about the lens is taken from `like`.
+pub fn from_json(text: &str, like: &Camera) -> Result<Vec<NamedCamera>, PathError> {
+    let text = text.trim_start_matches('\u{feff}');
+    let file: File = serde_json::from_str(text).map_err(|e| PathError::Format { what: e.to_string() })?;
+    let found = match (&file.camera_path, &file.frames) {
+        (Some(path), _) => path.len(),
+        (None, Some(frames)) => frames.len(),
+        (None, None) => {
+            return Err(PathError::Format { what: "there is neither `camera_path` nor `frames`".into() });
+        }
+    };
+    if found == 0 || found > MAX_CAMERAS {
+        return Err(PathError::Count { found });
+    }
+    let digits = found.to_string().len().max(4);
+    let cameras = (0..found).map(|index| {
+        let wrong = |what: String| PathError::Camera { index, what };
+        let (camera, name) = match (&file.camera_path, &file.frames) {
+            (Some(path), _) => (from_key(&file, &path[index], like), None),
+            (None, Some(frames)) => (from_frame(&file.lens, &frames[index], like), stem(&frames[index])),
+            (None, None) => (Err("is missing".into()), None),
+        };
+        let name = name.unwrap_or_else(|| format!("{:0digits$}", index + 1));
+        Ok(NamedCamera { name, camera: camera.map_err(wrong)? })
+    });
+    cameras.collect()
+}
+
+/// The photograph's name; nothing that could lead out of a folder.
+fn stem(frame: &Frame) -> Option<String> {
+    let last = frame.file_path.as_deref()?.rsplit(['/', '\\']).next()?;
+    let stem = match last.rsplit_once('.') {
+        Some((stem, _)) if !stem.is_empty() => stem,
+        _ => last,
+    };
+    (!["", ".", ".."].contains(&stem)).then(|| stem.to_string())
+}
+
+fn from_key(file: &File, key: &Key, like: &Camera) -> Result<Camera, String> {
+    if let Some(kind) = file.camera_type.as_deref().filter(|k| *k != "perspective") {
+        return Err(format!("is of type `{kind}`, expected `perspective`"));
+    }
+    let width = side("render_width", file.render_width, like.width)?;
+    let height = side("render_height", file.render_height, like.height)?;
+    let m = &key.camera_to_world;
+    if m.len() != 16 && m.len() != 12 {
+        return Err(format!("`camera_to_world` has {} numbers, expected 16", m.len()));
+    }
+    let rows: Vec<Vec<f64>> = m.chunks_exact(4).map(<[f64]>::to_vec).collect();
+    let focal = match key.fov {
+        Some(fov) if fov > 0.0 && fov < 179.0 => height as f64 / 2.0 / (fov.to_radians() / 2.0).tan(),
+        Some(fov) => return Err(format!("`fov` is {fov}, expected degrees between 0 and 179")),
+        None => like.fy * height as f64 / like.height as f64,
+    };
+    let (rotation, position) = pose(&rows)?;
+    Ok(Camera {
+        width,
+        height,
+        fx: focal,
+        fy: focal,
+        cx: width as f64 / 2.0,
+        cy: height as f64 / 2.0,
+        distortion: Distortion::default(),
+        rotation,
+        position,
+    })
+}
+
+fn from_frame(shared: &Lens, frame: &Frame, like: &Camera) -> Result<Camera, String> {
+    let own = &frame.lens;
+    let value = |name: &str, of: fn(&Lens) -> Option<f64>| match of(own).or(of(shared)) {
+        Some(v) if !v.is_finite() => Err(format!("`{name}` is {v}, expected a finite number")),
+        other => Ok(other),
+    };
+    let width = side("w", value("w", |l| l.w)?, like.width)?;
+    let height = side("h", value("h", |l| l.h)?, like.height)?;
+    let angle = |name: &str, a: Option<f64>, size: u32| match a {
+        Some(a) if a > 0.0 && a < 3.1 => Ok(Some(size as f64 / 2.0 / (a / 2.0).tan())),
+        Some(a) => Err(format!("`{name}` is {a}, expected radians between 0 and π")),
+        None => Ok(None),
+    };
+    let focal_x = value("fl_x", |l| l.fl_x)?;
+    let focal_x = focal_x.or(angle("camera_angle_x", value("camera_angle_x", |l| l.camera_angle_x)?, width)?);
+    let focal_y = value("fl_y", |l| l.fl_y)?;
+    let focal_y =
+        focal_y.or(angle("camera_angle_y", value("camera_angle_y", |l| l.camera_angle_y)?, height)?);
+    let copied = like.resized(width, height);
+    let fx = focal_x.or(focal_y).unwrap_or(copied.fx);
+    let fy = focal_y.or(focal_x).unwrap_or(copied.fy);
+    if !(fx > 0.0 && fy > 0.0) {
+        return Err(format!("focal lengths {fx} and {fy}, expected pixels above 0"));
+    }
+    let known = focal_x.or(focal_y).is_some();
+    let center = |given: Option<f64>, size: u32, other: f64| {
+        given.unwrap_or(if known { size as f64 / 2.0 } else { other })
+    };
+    let coefficient = |name: &str, of: fn(&Lens) -> Option<f64>, other: f64| -> Result<f64, String> {
+        Ok(value(name, of)?.unwrap_or(if known { 0.0 } else { other }))
+    };
+    let bend = like.distortion;
+    let (rotation, position) = pose(&frame.transform_matrix)?;
+    Ok(Camera {
+        width,
+        height,
+        fx,
+        fy,
+        cx: center(value("cx", |l| l.cx)?, width, copied.cx),
+        cy: center(value("cy", |l| l.cy)?, height, copied.cy),
+        distortion: Distortion {
+            k1: coefficient("k1", |l| l.k1, bend.k1)?,
+            k2: coefficient("k2", |l| l.k2, bend.k2)?,
+            k3: coefficient("k3", |l| l.k3, bend.k3)?,
+            p1: coefficient("p1", |l| l.p1, bend.p1)?,
+            p2: coefficient("p2", |l| l.p2, bend.p2)?,
+        },
+        rotation,
+        position,
+    })
+}
+
+fn side(name: &str, given: Option<f64>, other: u32) -> Result<u32, String> {
+    match given {
+        None => Ok(other),
+        Some(v) if v.fract() == 0.0 && (1.0..=MAX_SIDE as f64).contains(&v) => Ok(v as u32),
+        Some(v) => Err(format!("`{name}` is {v}, expected 1 to {MAX_SIDE} pixels")),
+    }
+}
+
+/// Rotation and position of a camera-to-world matrix of 3 or 4 rows. A uniform scale, which viewers
+/// leave in, is taken out.
+fn pose(rows: &[Vec<f64>]) -> Result<(DMat3, DVec3), String> {
+    if !(3..=4).contains(&rows.len()) || rows.iter().any(|r| r.len() != 4) {
+        return Err("its matrix is not 4 × 4".into());
+    }
+    if rows.iter().flatten().any(|v| !v.is_finite()) {
+        return Err("its matrix is not finite".into());
+    }
+    let column = |k: usize| DVec3::new(rows[0][k], rows[1][k], rows[2][k]);
+    let matrix = DMat3::from_cols(column(0), column(1), column(2));
+    let scale = matrix.determinant().cbrt();
+    let rotation = matrix * (1.0 / scale);
+    let off = rotation.transpose() * rotation - DMat3::IDENTITY;
+    let is_rotation = scale > 1e-9 && off.to_cols_array().iter().all(|v| v.abs() < 1e-3);
+    if !is_rotation {
+        return Err("its matrix is not a rotation: mirrored, sheared or flat".into());
+    }
+    Ok((rotation, column(3)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn like() -> Camera {
+        Camera {
+            width: 400,
+            height: 200,
+            fx: 500.0,
+            fy: 500.0,
+            cx: 190.0,
+            cy: 110.0,
+            distortion: Distortion { k1: 0.1, ..Default::default() },
+            rotation: DMat3::IDENTITY,
+            position: DVec3::new(0.0, 3.0, 4.0),
+        }
+    }
+
+    #[test]
+    fn an_orbit_keeps_mean_height_and_distance_and_looks_at_the_middle() {
+        let mut other = like();
+        other.position = DVec3::new(0.0, 1.0, 6.0);
+        // around (0, 1, 0): heights 2 and 0, distances 4 and 6: mean 1 and 5
+        let center = Vec3::new(0.0, 1.0, 0.0);
+        let path = orbit(&[like(), other], center, Vec3::Y, 4).unwrap();
+        assert_eq!(path.len(), 4);
+        assert!(path[0].camera.position.distance(DVec3::new(0.0, 2.0, 5.0)) < 1e-12);
+        assert!(path[1].camera.position.distance(DVec3::new(5.0, 2.0, 0.0)) < 1e-12);
+        for c in &path {
+            let (pixel, depth) = c.camera.project(center).unwrap();
+            assert!(pixel.distance(glam::Vec2::new(200.0, 100.0)) < 1e-3);
+            assert!((depth - 26f32.sqrt()).abs() < 1e-5);
+            // up is up in the picture, and the pose is a rotation
+            assert!(c.camera.project(center + Vec3::Y).unwrap().0.y < 100.0);
+            assert!((c.camera.rotation.determinant() - 1.0).abs() < 1e-12);
+        }
+        assert_eq!(path[3].name, "0004");
+        assert!(orbit(&[], center, Vec3::Y, 4).is_err());
+        assert!(orbit(&[like()], center, Vec3::ZERO, 4).is_err());
+        assert!(orbit(&[like()], center, Vec3::Y, 0).is_err());
+    }
+
+    #[test]
+    fn a_nerfstudio_path_gives_its_cameras() {
+        let text = r#"{"camera_type": "perspective", "render_height": 1080, "render_width": 1920, "fps": 24,
+            "camera_path": [{"camera_to_world": [0,0,1,5, 1,0,0,6, 0,1,0,7, 0,0,0,1], "fov": 90, "aspect": 1}]}"#;
+        let path = from_json(text, &like()).unwrap();
+        let c = &path[0].camera;
+        assert_eq!((c.width, c.height, path[0].name.as_str()), (1920, 1080, "0001"));
+        // half the height over tan 45°
+        assert!((c.fx - 540.0).abs() < 1e-9 && c.fx == c.fy && c.cx == 960.0);
+        assert_eq!(c.position, DVec3::new(5.0, 6.0, 7.0));
+        assert!(c.rotation.x_axis.distance(DVec3::Y) < 1e-12);
+        let sphere = text.replace("perspective", "equirectangular");
+        assert_eq!(
+            from_json(&sphere, &like()).unwrap_err().to_string(),
+            "camera 0: is of type `equirectangular`, expected `perspective`"
+        );
+    }
+
+    #[test]
+    fn transforms_json_gives_names_and_each_frames_own_lens() {
+        let eye = "[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]";
+        let text = format!(
+            r#"{{"w": 100, "h": 50, "camera_angle_x": 1.5707963267948966, "k1": 0.2, "frames": [
+            {{"file_path": "./images/cam_01.jpg", "transform_matrix": {eye}}},
+            {{"file_path": "b", "fl_x": 70, "fl_y": 80, "cx": 40.5, "transform_matrix": {eye}}}]}}"#
+        );
+        let path = from_json(&text, &like()).unwrap();
+        assert_eq!((path[0].name.as_str(), path[1].name.as_str()), ("cam_01", "b"));
+        let (a, b) = (&path[0].camera, &path[1].camera);
+        assert!((a.fx - 50.0).abs() < 1e-9 && a.fy == a.fx && a.cx == 50.0 && a.distortion.k1 == 0.2);
+        assert_eq!((b.fx, b.fy, b.cx, b.cy), (70.0, 80.0, 40.5, 25.0));
+        // a file without a lens takes ours
+        let bare = format!(r#"{{"frames": [{{"transform_matrix": {eye}}}]}}"#);
+        let c = &from_json(&bare, &like()).unwrap()[0].camera;
+        assert_eq!((c.fx, c.cx, c.distortion.k1, c.width), (500.0, 190.0, 0.1, 400));
+    }
+
+    #[test]
+    fn crooked_files_are_named_errors() {
+        let frames = |m: &str| format!(r#"{{"frames": [{{"transform_matrix": {m}}}]}}"#);
+        for (text, part) in [
+            ("[1, 2".to_string(), "not a camera path"),
+            ("{}".to_string(), "neither"),
+            (r#"{"frames": []}"#.to_string(), "0 cameras"),
+            (frames("[[1,0],[0,1]]"), "not 4 × 4"),
+            (frames("[[1,0,0,0],[0,1,0,0],[0,0,-1,0]]"), "not a rotation"),
+            (frames("[[0,0,0,0],[0,0,0,0],[0,0,0,0]]"), "not a rotation"),
+            (r#"{"camera_path": [{"camera_to_world": [1, 2]}]}"#.to_string(), "2 numbers"),
+            (
+                r#"{"render_width": 1e9, "camera_path": [{"camera_to_world": []}]}"#.to_string(),
+                "render_width",
+            ),
+        ] {
+            let message = from_json(&text, &like()).unwrap_err().to_string();
+            assert!(message.contains(part), "{message}");
+        }
+    }
+}

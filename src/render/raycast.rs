@@ -1,0 +1,370 @@
+//! A view of a mesh: one ray through each pixel's centre, the learned colour where it hits.
+//!
+//! Hard edges would leave stairs, so pixels on an edge are looked at again. Rays through the pixel
+//! corners tell which: some hit and some miss, or depth jumps by more than a surface seen at 84°
+//! would within one pixel. Such a pixel becomes the mean of `samples × samples` rays; what misses
+//! counts as transparent black. The mean is of sRGB-coded values, as everywhere in a render here:
+//! the fields composite coded colour, so alpha does too.
+
+use crate::geom::{Bvh, Camera, Hit, Mesh, Ray, Similarity};
+use crate::image::Image;
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+
+/// Pixels worked on at once by one thread: bounds memory, and feeds the colour network well.
+const BATCH: usize = 8192;
+
+/// Depth change over one pixel, in pixel footprints, from which on it is an edge: tan 84°.
+const JUMP: f32 = 10.0;
+
+/// How to look.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RaycastOptions {
+    /// sRGB-coded colour behind the mesh; `None` leaves alpha.
+    pub background: Option<[f32; 3]>,
+    /// Rays along each side of a pixel on an edge; 1 leaves edges hard.
+    pub samples: u32,
+    /// From the mesh's coordinates (in which the camera stands too) to those of depth and normals.
+    pub world_from_scene: Similarity,
+}
+
+impl Default for RaycastOptions {
+    fn default() -> RaycastOptions {
+        RaycastOptions { background: None, samples: 2, world_from_scene: Similarity::IDENTITY }
+    }
+}
+
+/// What one camera sees.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RenderedView {
+    /// RGBA: sRGB-coded colour premultiplied over black, and coverage.
+    pub color: Image,
+    /// One channel: distance along the viewing axis in world units at the pixel's centre; 0 = nothing.
+    pub depth: Image,
+    /// Three channels: unit normal in the world at the pixel's centre; 0 = nothing.
+    pub normal: Image,
+}
+
+/// Casts the rays of a camera at a mesh.
+///
+/// `color` is asked for batches of hit points and answers sRGB-coded colours in 0..=1, one a point;
+/// what it does not answer is black. It runs on several threads at once.
+///
+/// # Shapes
+///
+/// - `color`: points `[n, 3]` in the mesh's coordinates, unit normals `[n, 3]` (vertex normals
+///   interpolated, the triangle's own where there are none), unit view directions `[n, 3]`, away from
+///   the camera; gives `[n, 3]`.
+pub fn raycast(
+    bvh: &Bvh,
+    mesh: &Mesh,
+    camera: &Camera,
+    options: &RaycastOptions,
+    color: impl Fn(&[Vec3], &[Vec3], &[Vec3]) -> Vec<[f32; 3]> + Sync,
+) -> RenderedView {
+    let (width, height) = (camera.width, camera.height);
+    let mut view = RenderedView {
+        color: Image::new(width, height, 4),
+        depth: Image::new(width, height, 1),
+        normal: Image::new(width, height, 3),
+    };
+    if width == 0 || height == 0 {
+        return view;
+    }
+    let w = width as usize;
+    let rows = (BATCH / w).max(1);
+    let bands = view
+        .color
+        .data
+        .par_chunks_mut(rows * w * 4)
+        .zip(view.depth.data.par_chunks_mut(rows * w))
+        .zip(view.normal.data.par_chunks_mut(rows * w * 3));
+    bands.enumerate().for_each(|(band, ((rgba, depth), normal))| {
+        let look = Look { bvh, mesh, camera, options };
+        look.band(band * rows, rgba.as_chunks_mut().0, depth, normal.as_chunks_mut().0, &color);
+    });
+    view
+}
+
+/// Everything a band of rows needs.
+struct Look<'a> {
+    bvh: &'a Bvh,
+    mesh: &'a Mesh,
+    camera: &'a Camera,
+    options: &'a RaycastOptions,
+}
+
+/// Points to be coloured, and the pixel each belongs to.
+#[derive(Default)]
+struct Queue {
+    points: Vec<Vec3>,
+    normals: Vec<Vec3>,
+    directions: Vec<Vec3>,
+    pixel: Vec<usize>,
+}
+
+impl Look<'_> {
+    /// Fills the rows from `top` on, as many as the slices hold.
+    fn band(
+        &self,
+        top: usize,
+        rgba: &mut [[f32; 4]],
+        depth: &mut [f32],
+        normal: &mut [[f32; 3]],
+        color: &(impl Fn(&[Vec3], &[Vec3], &[Vec3]) -> Vec<[f32; 3]> + Sync),
+    ) {
+        let w = self.camera.width as usize;
+        let rows = rgba.len() / w;
+        let n = self.options.samples.max(1) as usize;
+        let centers: Vec<Option<(Ray, Hit)>> =
+            (0..rgba.len()).map(|i| self.cast((i % w) as f32 + 0.5, (top + i / w) as f32 + 0.5)).collect();
+        let corners: Vec<f32> = if n > 1 {
+            (0..(w + 1) * (rows + 1))
+                .map(|i| {
+                    let found = self.cast((i % (w + 1)) as f32, (top + i / (w + 1)) as f32);
+                    found.map_or(0.0, |(ray, hit)| self.depth(&ray, &hit))
+                })
+                .collect()
+        } else {
+            Vec::new()
+        };
+        let mut queue = Queue::default();
+        for i in 0..rgba.len() {
+            let (x, y) = (i % w, i / w);
+            if let Some((ray, hit)) = &centers[i] {
+                depth[i] = self.depth(ray, hit) * self.options.world_from_scene.scale as f32;
+                let n = self.options.world_from_scene.direction(self.normal(hit));
+                normal[i] = n.normalize_or_zero().to_array();
+            }
+            let at = y * (w + 1) + x;
+            let on_edge = n > 1 && {
+                let around = [at, at + 1, at + w + 1, at + w + 2].map(|k| corners[k]);
+                let center = centers[i].as_ref().map_or(0.0, |(ray, hit)| self.depth(ray, hit));
+                self.is_edge(around, center)
+            };
+            if on_edge {
+                for k in 0..n * n {
+                    let sub = |k: usize| (k as f32 + 0.5) / n as f32;
+                    let found = self.cast(x as f32 + sub(k % n), (top + y) as f32 + sub(k / n));
+                    self.enqueue(&mut queue, i, &found, 1.0 / (n * n) as f32, rgba);
+                }
+            } else {
+                self.enqueue(&mut queue, i, &centers[i], 1.0, rgba);
+            }
+            if queue.pixel.len() >= BATCH {
+                self.shade(&mut queue, n, rgba, color);
+            }
+        }
+        self.shade(&mut queue, n, rgba, color);
+        if let Some(background) = self.options.background {
+            for pixel in rgba {
+                let through = 1.0 - pixel[3];
+                for c in 0..3 {
+                    pixel[c] += through * background[c];
+                }
+                pixel[3] = 1.0;
+            }
+        }
+    }
+
+    /// The first hit through a picture position, with its ray.
+    fn cast(&self, x: f32, y: f32) -> Option<(Ray, Hit)> {
+        let ray = self.camera.ray(Vec2::new(x, y))?;
+        Some((ray, self.bvh.closest_hit(&ray)?))
+    }
+
+    /// Distance along the viewing axis, in the mesh's units.
+    fn depth(&self, ray: &Ray, hit: &Hit) -> f32 {
+        hit.t * ray.direction.dot(self.camera.forward())
+    }
+
+    fn is_edge(&self, corners: [f32; 4], center: f32) -> bool {
+        let (mut low, mut high) = (center, center);
+        for d in corners {
+            (low, high) = (low.min(d), high.max(d));
+        }
+        // 0 is a miss; a pixel's footprint is depth / focal length
+        (low == 0.0) != (high == 0.0) || high - low > JUMP * low / self.camera.fx.abs() as f32
+    }
+
+    /// The shading normal of a hit.
+    fn normal(&self, hit: &Hit) -> Vec3 {
+        let t = self.mesh.triangles[hit.triangle as usize];
+        if self.mesh.normals.len() == self.mesh.positions.len() {
+            let [a, b, c] = t.map(|i| self.mesh.normals[i as usize]);
+            let n = ((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c).try_normalize();
+            if let Some(n) = n {
+                return n;
+            }
+        }
+        let [a, b, c] = self.mesh.corners(hit.triangle);
+        (b - a).cross(c - a).normalize_or_zero()
+    }
+
+    /// Counts the hit into the pixel's alpha and queues it for its colour.
+    fn enqueue(
+        &self,
+        queue: &mut Queue,
+        pixel: usize,
+        found: &Option<(Ray, Hit)>,
+        weight: f32,
+        rgba: &mut [[f32; 4]],
+    ) {
+        let Some((ray, hit)) = found else { return };
+        rgba[pixel][3] += weight;
+        let [a, b, c] = self.mesh.corners(hit.triangle);
+        queue.points.push((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c);
+        queue.normals.push(self.normal(hit));
+        queue.directions.push(ray.direction);
+        queue.pixel.push(pixel);
+    }
+
+    /// Colours everything queued. A pixel's samples are in one queue, and share its alpha evenly.
+    fn shade(
+        &self,
+        queue: &mut Queue,
+        n: usize,
+        rgba: &mut [[f32; 4]],
+        color: &(impl Fn(&[Vec3], &[Vec3], &[Vec3]) -> Vec<[f32; 3]> + Sync),
+    ) {
+        if queue.pixel.is_empty() {
+            return;
+        }
+        let colors = color(&queue.points, &queue.normals, &queue.directions);
+        for group in
+            (0..queue.pixel.len()).collect::<Vec<_>>().chunk_by(|&a, &b| queue.pixel[a] == queue.pixel[b])
+        {
+            let out = &mut rgba[queue.pixel[group[0]]];
+            let weight = out[3] / group.len() as f32;
+            debug_assert!(group.len() <= n * n);
+            for c in group.iter().filter_map(|&k| colors.get(k)) {
+                for channel in 0..3 {
+                    out[channel] += weight * c[channel].clamp(0.0, 1.0);
+                }
+            }
+        }
+        *queue = Queue::default();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::Distortion;
+    use glam::{DMat3, DVec3};
+
+    /// Looks along −z from z = 4 with a focal length of 100 pixels.
+    fn camera(width: u32, height: u32) -> Camera {
+        Camera {
+            width,
+            height,
+            fx: 100.0,
+            fy: 100.0,
+            cx: width as f64 / 2.0,
+            cy: height as f64 / 2.0,
+            distortion: Distortion::default(),
+            rotation: DMat3::IDENTITY,
+            position: DVec3::new(0.0, 0.0, 4.0),
+        }
+    }
+
+    /// Wound towards +z.
+    fn half_plane(right_of: f32) -> Mesh {
+        Mesh {
+            positions: vec![
+                Vec3::new(right_of, -50.0, 0.0),
+                Vec3::new(right_of + 50.0, 0.0, 0.0),
+                Vec3::new(right_of, 50.0, 0.0),
+            ],
+            triangles: vec![[0, 1, 2]],
+            ..Mesh::default()
+        }
+    }
+
+    fn red(points: &[Vec3], _: &[Vec3], _: &[Vec3]) -> Vec<[f32; 3]> {
+        vec![[1.0, 0.5, 0.0]; points.len()]
+    }
+
+    #[test]
+    fn an_edge_through_a_pixel_covers_half_of_it() {
+        // pixel 10 spans x = 0..1 pixel right of the axis: 0..0.04 at distance 4. The edge is at 0.02.
+        let mesh = half_plane(0.02);
+        let bvh = Bvh::new(&mesh);
+        let view = raycast(&bvh, &mesh, &camera(20, 8), &RaycastOptions::default(), red);
+        assert_eq!(view.color.pixel(9, 4), [0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(view.color.pixel(10, 4), [0.5, 0.25, 0.0, 0.5]);
+        assert_eq!(view.color.pixel(11, 4), [1.0, 0.5, 0.0, 1.0]);
+        let hard = RaycastOptions { samples: 1, ..Default::default() };
+        let hard = raycast(&bvh, &mesh, &camera(20, 8), &hard, red);
+        assert!(hard.color.data.as_chunks::<4>().0.iter().all(|p| p[3] == 0.0 || p[3] == 1.0));
+        let white = RaycastOptions { background: Some([1.0; 3]), ..Default::default() };
+        let white = raycast(&bvh, &mesh, &camera(20, 8), &white, red);
+        assert_eq!(white.color.pixel(9, 4), [1.0, 1.0, 1.0, 1.0]);
+        assert_eq!(white.color.pixel(10, 4), [1.0, 0.75, 0.5, 1.0]);
+    }
+
+    #[test]
+    fn depth_is_along_the_axis_in_world_units_and_normals_turn_with_the_world() {
+        let mesh = half_plane(-10.0);
+        let options = RaycastOptions {
+            world_from_scene: Similarity {
+                scale: 2.5,
+                rotation: DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X), // z → x
+                translation: DVec3::ONE,
+            },
+            ..Default::default()
+        };
+        let view = raycast(&Bvh::new(&mesh), &mesh, &camera(20, 8), &options, red);
+        // the plane is 4 away along the axis for every pixel, 10 in the world
+        for (d, n) in view.depth.data.iter().zip(view.normal.data.as_chunks::<3>().0) {
+            assert!((d - 10.0).abs() < 1e-4);
+            assert!(Vec3::from(*n).distance(Vec3::X) < 1e-6);
+        }
+        assert!(view.color.data.as_chunks::<4>().0.iter().all(|p| *p == [1.0, 0.5, 0.0, 1.0]));
+    }
+
+    #[test]
+    fn one_surface_before_another_is_smoothed_too() {
+        let mut mesh = half_plane(-10.0); // far, green
+        let near = half_plane(0.015);
+        mesh.positions.extend(near.positions.iter().map(|p| *p + Vec3::Z));
+        mesh.triangles.push([3, 4, 5]);
+        // the near edge, at 3 away, crosses pixel 10 (0..0.03) in its middle
+        let color = |p: &[Vec3], _: &[Vec3], _: &[Vec3]| -> Vec<[f32; 3]> {
+            p.iter().map(|p| if p.z > 0.5 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] }).collect()
+        };
+        let view = raycast(&Bvh::new(&mesh), &mesh, &camera(20, 8), &RaycastOptions::default(), color);
+        assert_eq!(view.color.pixel(10, 4), [0.5, 0.5, 0.0, 1.0]);
+        assert_eq!(view.color.pixel(9, 4), [0.0, 1.0, 0.0, 1.0]);
+    }
+
+    #[test]
+    fn vertex_normals_are_interpolated_and_directions_are_unit() {
+        let mut mesh = half_plane(-10.0);
+        mesh.normals = vec![Vec3::X; 3];
+        let color = |_: &[Vec3], n: &[Vec3], d: &[Vec3]| -> Vec<[f32; 3]> {
+            assert!(d.iter().all(|d| (d.length() - 1.0).abs() < 1e-5 && d.z < 0.0));
+            n.iter().map(|n| n.to_array()).collect()
+        };
+        let view = raycast(&Bvh::new(&mesh), &mesh, &camera(6, 6), &RaycastOptions::default(), color);
+        assert!((view.color.pixel(3, 3)[0] - 1.0).abs() < 1e-6 && view.color.pixel(3, 3)[2] < 1e-6);
+    }
+
+    #[test]
+    fn batches_and_bands_leave_no_trace() {
+        // taller than one band of 8192 pixels
+        let mesh = half_plane(0.02);
+        let bvh = Bvh::new(&mesh);
+        let color = |p: &[Vec3], _: &[Vec3], _: &[Vec3]| -> Vec<[f32; 3]> {
+            p.iter().map(|p| [p.x.abs() % 1.0, p.y.abs() % 1.0, 0.3]).collect()
+        };
+        let look = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| raycast(&bvh, &mesh, &camera(150, 200), &RaycastOptions::default(), color))
+        };
+        assert_eq!(look(1), look(3));
+        let nothing =
+            raycast(&Bvh::new(&Mesh::default()), &mesh, &camera(10, 10), &RaycastOptions::default(), red);
+        assert!(nothing.color.data.iter().chain(&nothing.depth.data).all(|v| *v == 0.0));
+    }
+}

@@ -1,0 +1,123 @@
+//! What shaped a stage's result: settings, inputs, format version; and how two of them differ.
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Everything that shapes the result of a stage. Kept whole, not only hashed, so that a difference
+/// can be told key by key.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Fingerprint {
+    /// Version of the stage's files; raised when their meaning changes.
+    pub format: u32,
+    /// Full name of a setting to its value as written in TOML.
+    pub settings: BTreeMap<String, String>,
+    /// Name of an input to its own digest.
+    pub inputs: BTreeMap<String, String>,
+}
+
+impl Fingerprint {
+    /// Settings alone.
+    pub fn new(format: u32, settings: BTreeMap<String, String>) -> Fingerprint {
+        Fingerprint { format, settings, inputs: BTreeMap::new() }
+    }
+
+    /// With one more setting.
+    pub fn setting(mut self, name: &str, value: impl ToString) -> Fingerprint {
+        self.settings.insert(name.into(), value.to_string());
+        self
+    }
+
+    /// With one more input: the digest of the stage or file it comes from.
+    pub fn input(mut self, name: &str, digest: impl Into<String>) -> Fingerprint {
+        self.inputs.insert(name.into(), digest.into());
+        self
+    }
+
+    /// SHA-256 over all of it, hexadecimal.
+    pub fn digest(&self) -> String {
+        let mut hash = Sha256::new();
+        let mut part = |text: &str| {
+            // lengths between the texts: no two different lists run together into the same bytes
+            hash.update((text.len() as u64).to_le_bytes());
+            hash.update(text);
+        };
+        part(&self.format.to_string());
+        for (kind, map) in [("settings", &self.settings), ("inputs", &self.inputs)] {
+            part(kind);
+            part(&map.len().to_string());
+            for (name, value) in map {
+                part(name);
+                part(value);
+            }
+        }
+        hex(&hash.finalize())
+    }
+
+    /// SHA-256 of bytes, hexadecimal: the digest of a file.
+    pub fn of_bytes(bytes: &[u8]) -> String {
+        hex(&Sha256::digest(bytes))
+    }
+
+    /// What differs from an `older` fingerprint, one line each; empty when nothing does.
+    pub fn differences(&self, older: &Fingerprint) -> Vec<String> {
+        let mut lines = Vec::new();
+        if self.format != older.format {
+            lines.push(format!("format version: was {}, is {}", older.format, self.format));
+        }
+        let names: BTreeSet<_> = self.settings.keys().chain(older.settings.keys()).collect();
+        for name in names {
+            let (was, is) = (older.settings.get(name), self.settings.get(name));
+            if was != is {
+                let show = |v: Option<&String>| v.cloned().unwrap_or_else(|| "not set".into());
+                lines.push(format!("{name}: was {}, is {}", show(was), show(is)));
+            }
+        }
+        let names: BTreeSet<_> = self.inputs.keys().chain(older.inputs.keys()).collect();
+        for name in names.into_iter().filter(|n| self.inputs.get(*n) != older.inputs.get(*n)) {
+            lines.push(format!("{name}: has changed since"));
+        }
+        lines
+    }
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn differences_name_every_setting_and_input() {
+        let old = Fingerprint::default().setting("iface.steps", 20000).input("mask", "aa");
+        let new =
+            Fingerprint::default().setting("iface.steps", 5000).setting("iface.rays", 8).input("mask", "bb");
+        assert_eq!(
+            new.differences(&old),
+            ["iface.rays: was not set, is 8", "iface.steps: was 20000, is 5000", "mask: has changed since"]
+        );
+        assert_ne!(new.digest(), old.digest());
+        assert_eq!(old.digest(), old.clone().digest());
+        assert!(old.differences(&old).is_empty());
+    }
+
+    #[test]
+    fn a_value_that_moves_between_neighbours_changes_the_digest() {
+        let a = Fingerprint::default().setting("ab", "c");
+        let b = Fingerprint::default().setting("a", "bc");
+        assert_ne!(a.digest(), b.digest());
+        assert_ne!(
+            Fingerprint::default().setting("x", "y").digest(),
+            Fingerprint::default().input("x", "y").digest()
+        );
+    }
+
+    #[test]
+    fn the_digest_of_bytes_is_sha_256() {
+        // FIPS 180-2, appendix B.1
+        let abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+        assert_eq!(Fingerprint::of_bytes(b"abc"), abc);
+    }
+}

@@ -1,0 +1,199 @@
+//! From a stage's steps to status, log and screen, each at its own pace.
+//!
+//! All pacing is by the monotonic clock: setting the machine's time does not disturb it.
+
+use super::status::now;
+use super::{Monitor, Status, Stop};
+use crate::io;
+use serde_json::{Map, Value};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// What happens in a run, for whoever shows it.
+#[derive(Clone, Debug)]
+pub enum Event<'a> {
+    /// A stage begins, or goes on after an interruption.
+    Started {
+        /// Which.
+        stage: &'a str,
+    },
+    /// A stage's steps.
+    Progress {
+        /// Which.
+        stage: &'a str,
+        /// Steps done.
+        step: u64,
+        /// Steps in all.
+        steps: u64,
+        /// Steps per second, of late.
+        rate: Option<f64>,
+        /// Seconds left.
+        eta_s: Option<f64>,
+        /// Named figures of this step.
+        values: &'a [(&'a str, f64)],
+    },
+    /// A stage is complete.
+    Done {
+        /// Which.
+        stage: &'a str,
+        /// Seconds of work.
+        elapsed_s: f64,
+        /// Its figures.
+        summary: &'a Value,
+    },
+    /// A stage was complete already.
+    Skipped {
+        /// Which.
+        stage: &'a str,
+    },
+    /// Something went differently than hoped.
+    Warning {
+        /// Where.
+        stage: &'a str,
+        /// What.
+        text: &'a str,
+    },
+}
+
+/// Shows or records events. Called from computing threads; must be quick.
+pub trait Observer: Send + Sync {
+    /// Something happened.
+    fn event(&self, event: &Event);
+}
+
+/// A stage's [`Monitor`].
+pub(super) struct Progress {
+    stage: String,
+    folder: PathBuf,
+    stop: Stop,
+    observer: Arc<dyn Observer>,
+    start: Instant,
+    /// Seconds that earlier processes worked.
+    before_s: f64,
+    state: Mutex<Pace>,
+}
+
+struct Pace {
+    status: Status,
+    /// The step and moment the rate is measured from.
+    mark: Option<(u64, Instant)>,
+    shown: Option<Instant>,
+    logged: Option<Instant>,
+    saved: Option<Instant>,
+    /// A status that cannot be written is told once, not once a second.
+    complained: bool,
+}
+
+const SHOW: Duration = Duration::from_millis(100);
+const LOG: Duration = Duration::from_secs(1);
+const SAVE: Duration = Duration::from_secs(2);
+/// The rate is renewed over windows of this length.
+const WINDOW: Duration = Duration::from_secs(3);
+
+fn due(last: Option<Instant>, every: Duration) -> bool {
+    last.is_none_or(|t| t.elapsed() >= every)
+}
+
+impl Progress {
+    pub fn new(
+        stage: &str,
+        folder: PathBuf,
+        stop: Stop,
+        observer: Arc<dyn Observer>,
+        status: Status,
+    ) -> Progress {
+        let before_s = status.elapsed_s;
+        let pace = Pace { status, mark: None, shown: None, logged: None, saved: None, complained: false };
+        Progress {
+            stage: stage.into(),
+            folder,
+            stop,
+            observer,
+            start: Instant::now(),
+            before_s,
+            state: Mutex::new(pace),
+        }
+    }
+
+    pub fn elapsed_s(&self) -> f64 {
+        self.before_s + self.start.elapsed().as_secs_f64()
+    }
+
+    /// Changes the status and writes it now.
+    pub fn save(&self, change: impl FnOnce(&mut Status)) -> Result<(), io::WriteError> {
+        let mut pace = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        change(&mut pace.status);
+        self.write(&mut pace)
+    }
+
+    pub fn warn(&self, text: &str) {
+        self.observer.event(&Event::Warning { stage: &self.stage, text });
+    }
+
+    fn write(&self, pace: &mut Pace) -> Result<(), io::WriteError> {
+        pace.saved = Some(Instant::now());
+        pace.status.elapsed_s = self.elapsed_s();
+        pace.status.updated = now();
+        let text = serde_json::to_string_pretty(&pace.status).unwrap_or_default();
+        io::write_atomic(&self.folder.join("status.json"), format!("{text}\n").as_bytes())
+    }
+
+    fn log(&self, step: u64, steps: u64, values: &[(&str, f64)]) -> Result<(), io::WriteError> {
+        let mut line = Map::new();
+        line.insert("step".into(), step.into());
+        line.insert("steps".into(), steps.into());
+        let elapsed = (self.elapsed_s() * 1e3).round() / 1e3;
+        line.insert("elapsed_s".into(), elapsed.into());
+        for (name, value) in values {
+            line.insert((*name).into(), Value::from(*value)); // NaN and Inf become null
+        }
+        io::append(&self.folder.join("log.jsonl"), &Value::Object(line).to_string())
+    }
+}
+
+impl Monitor for Progress {
+    fn step(&self, step: u64, steps: u64, values: &[(&str, f64)]) {
+        let mut pace = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let now = Instant::now();
+        let (from, since) = *pace.mark.get_or_insert((step, now));
+        let seconds = now.duration_since(since).as_secs_f64();
+        if seconds > 0.2 && step > from {
+            let fresh = (step - from) as f64 / seconds;
+            if pace.status.rate.is_none() || now.duration_since(since) >= WINDOW {
+                pace.status.rate = Some(pace.status.rate.map_or(fresh, |old| 0.5 * old + 0.5 * fresh));
+                pace.mark = Some((step, now));
+            }
+        }
+        pace.status.step = step;
+        pace.status.steps = steps;
+        pace.status.eta_s =
+            pace.status.rate.filter(|r| *r > 0.0).map(|r| steps.saturating_sub(step) as f64 / r);
+
+        let last = step >= steps;
+        let mut trouble = None;
+        if last || due(pace.logged, LOG) {
+            pace.logged = Some(now);
+            trouble = self.log(step, steps, values).err();
+        }
+        if due(pace.saved, SAVE) {
+            trouble = self.write(&mut pace).err().or(trouble);
+        }
+        if let Some(e) = trouble
+            && !pace.complained
+        {
+            pace.complained = true;
+            self.warn(&e.to_string());
+        }
+        if last || due(pace.shown, SHOW) {
+            pace.shown = Some(now);
+            let (rate, eta_s) = (pace.status.rate, pace.status.eta_s);
+            let stage = self.stage.as_str();
+            self.observer.event(&Event::Progress { stage, step, steps, rate, eta_s, values });
+        }
+    }
+
+    fn stop(&self) -> bool {
+        self.stop.requested().is_some()
+    }
+}

@@ -1,0 +1,341 @@
+//! One stage of a run: skipped, refused, or worked on under its lock.
+
+use super::progress::Progress;
+use super::status::{host, now};
+use super::{Event, Failure, Fingerprint, Monitor, Record, Run, RunError, State, Status};
+use super::{read_record, read_status};
+use crate::io;
+use serde_json::Value;
+use std::path::Path;
+
+/// What a stage is about to do.
+#[derive(Clone, Debug)]
+pub struct Plan<'a> {
+    /// Its name: a word of the line.
+    pub name: &'a str,
+    /// Everything that shapes its result.
+    pub fingerprint: Fingerprint,
+    /// The device asked for, for `status.json`.
+    pub device: &'a str,
+    /// Bytes it will need on the disk, roughly.
+    pub needs_bytes: u64,
+}
+
+/// A stage at work: where to put files, how to report.
+pub struct Stage {
+    folder: std::path::PathBuf,
+    progress: Progress,
+}
+
+impl Stage {
+    /// The stage's folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Progress out, stop request in.
+    pub fn monitor(&self) -> &dyn Monitor {
+        &self.progress
+    }
+
+    /// Tells something that went differently than hoped.
+    pub fn warn(&self, text: &str) {
+        self.progress.warn(text);
+    }
+}
+
+/// A complete stage.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Done {
+    /// Digest of its fingerprint: an input of the stages that build on it.
+    pub digest: String,
+    /// Figures of the result.
+    pub summary: Value,
+    /// It was complete already.
+    pub skipped: bool,
+}
+
+impl Run {
+    /// Sees to it that a stage is complete: skips it if it is, else lets `work` do it and records
+    /// the figures it returns.
+    ///
+    /// Exit code 75 if another process holds the stage, 1 if it was done or begun with another
+    /// fingerprint or if the disk has too little room. `work` leaves the stage's files in
+    /// [`Stage::folder`], complete and durable, before it returns.
+    pub fn stage(
+        &self,
+        plan: Plan,
+        work: impl FnOnce(&Stage) -> Result<Value, Failure>,
+    ) -> Result<Done, RunError> {
+        let name = plan.name;
+        if let Some(exit) = self.stop.requested() {
+            return Err(RunError::Stopped { stage: name.into(), exit });
+        }
+        let folder = self.path(name);
+        if let Some(done) = self.complete(&plan)? {
+            return Ok(done);
+        }
+        io::create_folder(&folder)?;
+        let _lock = self.lock(name)?;
+        // another process may have finished between the look and the lock
+        if let Some(done) = self.complete(&plan)? {
+            return Ok(done);
+        }
+        let before_s = self.begun(&plan)?;
+        let removed = sweep(&folder)?;
+        if removed > 0 {
+            self.warn(name, &format!("removed {removed} half-written files of an interrupted process"));
+        }
+        if let Some(free) = io::free_bytes(&folder).filter(|free| *free < plan.needs_bytes) {
+            let needed = plan.needs_bytes;
+            return Err(RunError::NoSpace { stage: name.into(), needed, free, run: self.dir.clone() });
+        }
+
+        let status = Status {
+            state: State::Running,
+            step: 0,
+            steps: 0,
+            rate: None,
+            eta_s: None,
+            elapsed_s: before_s,
+            device: plan.device.into(),
+            pid: std::process::id(),
+            host: host(),
+            error: None,
+            updated: now(),
+            fingerprint: plan.fingerprint.clone(),
+        };
+        let progress = Progress::new(name, folder.clone(), self.stop.clone(), self.observer.clone(), status);
+        progress.save(|_| {})?;
+        self.observer.event(&Event::Started { stage: name });
+        let stage = Stage { folder, progress };
+        match work(&stage) {
+            Ok(summary) => self.record(&plan, &stage, summary),
+            Err(failure) => {
+                let stopped = self.stop.requested() == Some(failure.exit);
+                // the failure is the thing to tell, whether or not it can be written down
+                let _ = stage.progress.save(|s| {
+                    s.state = if stopped { State::Stopped } else { State::Failed };
+                    s.error = (!stopped).then(|| failure.error.to_string());
+                    s.eta_s = None;
+                });
+                Err(RunError::Stage { stage: name.into(), failure })
+            }
+        }
+    }
+
+    /// The finished stage, if its record is there and fits.
+    fn complete(&self, plan: &Plan) -> Result<Option<Done>, RunError> {
+        let record = match read_record(&self.path(plan.name)) {
+            Ok(record) => record,
+            Err(e) => {
+                self.warn(plan.name, &format!("{e}; the stage counts as not done"));
+                None
+            }
+        };
+        let Some(Record { fingerprint, digest, summary, .. }) = record else { return Ok(None) };
+        let differences = plan.fingerprint.differences(&fingerprint);
+        if !differences.is_empty() {
+            return Err(RunError::Changed { stage: plan.name.into(), done: true, differences });
+        }
+        self.observer.event(&Event::Skipped { stage: plan.name });
+        Ok(Some(Done { digest, summary, skipped: true }))
+    }
+
+    /// Seconds of work an earlier process left in the folder; an error if it had other settings.
+    fn begun(&self, plan: &Plan) -> Result<f64, RunError> {
+        let Ok(Some(status)) = read_status(&self.path(plan.name)) else { return Ok(0.0) };
+        let differences = plan.fingerprint.differences(&status.fingerprint);
+        if !differences.is_empty() {
+            return Err(RunError::Changed { stage: plan.name.into(), done: false, differences });
+        }
+        Ok(status.elapsed_s)
+    }
+
+    fn record(&self, plan: &Plan, stage: &Stage, summary: Value) -> Result<Done, RunError> {
+        let elapsed_s = stage.progress.elapsed_s();
+        stage.progress.save(|s| {
+            s.state = State::Done;
+            s.eta_s = None;
+        })?;
+        let digest = plan.fingerprint.digest();
+        let record = Record {
+            stage: plan.name.into(),
+            fingerprint: plan.fingerprint.clone(),
+            digest: digest.clone(),
+            summary: summary.clone(),
+            elapsed_s,
+            finished: now(),
+            version: env!("CARGO_PKG_VERSION").into(),
+        };
+        let text = serde_json::to_string_pretty(&record).unwrap_or_default();
+        io::write_atomic(&stage.folder.join("done.json"), format!("{text}\n").as_bytes())?;
+        self.observer.event(&Event::Done { stage: plan.name, elapsed_s, summary: &summary });
+        Ok(Done { digest, summary, skipped: false })
+    }
+}
+
+/// Removes half-written files in a stage's folder and the folders directly in it.
+fn sweep(folder: &Path) -> Result<usize, RunError> {
+    let mut removed = io::remove_leftovers(folder)?;
+    for inner in io::list_folders(folder)? {
+        removed += sweep(&inner)?;
+    }
+    Ok(removed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run::{Exit, Observer, Quiet, Stop};
+    use serde_json::json;
+    use std::fs;
+    use std::sync::{Arc, Mutex};
+
+    fn plan(steps: u32) -> Plan<'static> {
+        let fingerprint = Fingerprint::default().setting("iface.steps", steps);
+        Plan { name: "iface", fingerprint, device: "cpu", needs_bytes: 1 }
+    }
+
+    fn open(dir: &Path) -> Run {
+        Run::open(dir, Stop::new(), Arc::new(Quiet)).unwrap()
+    }
+
+    fn work(stage: &Stage) -> Result<Value, Failure> {
+        io::write_atomic(&stage.folder().join("checkpoint"), b"weights")?;
+        stage.monitor().step(5, 5, &[("loss", 0.5), ("bad", f64::NAN)]);
+        Ok(json!({"loss": 0.5}))
+    }
+
+    fn never(_: &Stage) -> Result<Value, Failure> {
+        panic!("the stage should have been skipped")
+    }
+
+    #[test]
+    fn a_finished_stage_is_skipped_and_no_file_is_touched() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        let first = run.stage(plan(5), work).unwrap();
+        assert!(!first.skipped);
+        let times = || -> Vec<_> {
+            fs::read_dir(dir.path().join("iface"))
+                .unwrap()
+                .map(|e| e.unwrap())
+                .map(|e| (e.file_name(), e.metadata().unwrap().modified().unwrap()))
+                .collect()
+        };
+        let before = times();
+        let second = open(dir.path()).stage(plan(5), never).unwrap();
+        assert_eq!((second.skipped, &second.summary), (true, &json!({"loss": 0.5})));
+        assert_eq!(second.digest, first.digest);
+        assert_eq!(times(), before);
+        let status = read_status(&dir.path().join("iface")).unwrap().unwrap();
+        assert_eq!((status.state, status.step), (State::Done, 5));
+        let log = fs::read_to_string(dir.path().join("iface/log.jsonl")).unwrap();
+        let line: Value = serde_json::from_str(log.trim()).unwrap();
+        assert_eq!((&line["step"], &line["bad"]), (&json!(5), &Value::Null));
+    }
+
+    #[test]
+    fn other_settings_stop_with_the_difference_and_fresh_goes_on() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        run.stage(plan(5), work).unwrap();
+        let error = run.stage(plan(7), never).unwrap_err();
+        assert_eq!(error.exit(), Exit::Cannot);
+        assert!(error.to_string().contains("iface.steps: was 5, is 7"), "{error}");
+        assert!(error.hint().contains("--fresh iface"));
+        fs::create_dir(dir.path().join("mesh")).unwrap();
+        fs::write(dir.path().join("mesh/head.glb"), b"old").unwrap();
+        fs::create_dir(dir.path().join("mask")).unwrap();
+        fs::write(dir.path().join("mask/a.png"), b"kept").unwrap();
+        run.fresh("iface", &["mask", "iface", "mesh"]).unwrap();
+        assert!(dir.path().join("mask/a.png").is_file());
+        assert!(!dir.path().join("mesh/head.glb").exists() && !dir.path().join("iface/checkpoint").exists());
+        assert!(!run.stage(plan(7), work).unwrap().skipped);
+    }
+
+    #[test]
+    fn a_stage_begun_with_other_settings_is_not_continued_in_silence() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        let fails = |_: &Stage| Err(Failure::cannot("no surface", "more steps"));
+        let error = run.stage(plan(5), fails).unwrap_err();
+        assert_eq!(error.to_string(), "stage `iface`: no surface");
+        let status = read_status(&dir.path().join("iface")).unwrap().unwrap();
+        assert_eq!((status.state, status.error.as_deref()), (State::Failed, Some("no surface")));
+        let error = run.stage(plan(6), never).unwrap_err();
+        assert!(error.to_string().contains("was begun with other settings"), "{error}");
+        assert!(run.stage(plan(5), work).is_ok());
+    }
+
+    #[test]
+    fn a_stage_that_another_holds_is_refused_with_75() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        let inner = open(dir.path());
+        run.stage(plan(5), |stage| {
+            let error = inner.stage(plan(5), never).unwrap_err();
+            assert_eq!(error.exit().code(), 75);
+            assert_eq!(inner.fresh("iface", &["iface"]).unwrap_err().exit().code(), 75);
+            // other stages are free meanwhile
+            inner.stage(Plan { name: "tface", ..plan(5) }, work).unwrap();
+            work(stage)
+        })
+        .unwrap();
+    }
+
+    #[test]
+    fn a_stop_request_ends_the_stage_as_stopped_and_begins_no_other() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        let stop = run.stop().clone();
+        let error = run
+            .stage(plan(5), |stage| {
+                assert!(!stage.monitor().stop());
+                stop.request(Exit::Terminated);
+                assert!(stage.monitor().stop());
+                Err(Failure::stopped(&stop))
+            })
+            .unwrap_err();
+        assert_eq!(error.exit().code(), 143);
+        let status = read_status(&dir.path().join("iface")).unwrap().unwrap();
+        assert_eq!((status.state, status.error), (State::Stopped, None));
+        assert!(matches!(run.stage(plan(5), never), Err(RunError::Stopped { .. })));
+    }
+
+    #[test]
+    fn leftovers_are_removed_under_the_lock_and_told() {
+        struct Warnings(Mutex<Vec<String>>);
+        impl Observer for Warnings {
+            fn event(&self, event: &Event) {
+                if let Event::Warning { text, .. } = event {
+                    self.0.lock().unwrap().push(text.to_string());
+                }
+            }
+        }
+        let dir = tempfile::tempdir().unwrap();
+        fs::create_dir_all(dir.path().join("iface/views")).unwrap();
+        fs::write(dir.path().join("iface/views/.a.png.99.tmp"), b"half").unwrap();
+        fs::write(dir.path().join("iface/done.json"), b"").unwrap(); // a crash before any sync
+        let seen = Arc::new(Warnings(Mutex::new(Vec::new())));
+        let run = Run::open(dir.path(), Stop::new(), seen.clone()).unwrap();
+        run.stage(plan(5), work).unwrap();
+        assert!(!dir.path().join("iface/views/.a.png.99.tmp").exists());
+        let told = seen.0.lock().unwrap();
+        assert!(told.iter().any(|t| t.contains("1 half-written")), "{told:?}");
+        assert!(told.iter().any(|t| t.contains("done.json")), "{told:?}");
+    }
+
+    #[test]
+    fn a_disk_without_room_is_refused_before_the_work() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        if io::free_bytes(dir.path()).is_none() {
+            eprintln!("skipped: this system does not tell how much room is left");
+            return;
+        }
+        let error = run.stage(Plan { needs_bytes: u64::MAX, ..plan(5) }, never).unwrap_err();
+        assert!(matches!(error, RunError::NoSpace { .. }) && error.exit() == Exit::Cannot, "{error}");
+    }
+}

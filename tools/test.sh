@@ -1,0 +1,81 @@
+#!/usr/bin/env bash
+# The whole check, as the README gives it: format, lints, documentation, tests, and what independent
+# readers say about our files. Nothing is skipped in silence; any failure fails the whole.
+#
+#     tools/test.sh            everything
+#     tools/test.sh --no-demo  without training the demo head (the readers then see the sphere alone)
+set -u -o pipefail
+cd "$(dirname "$0")/.."
+
+demo=yes
+for option in "$@"; do
+  case "$option" in
+    --no-demo) demo=no ;;
+    *) echo "unknown option $option" >&2; exit 2 ;;
+  esac
+done
+
+target=${CARGO_TARGET_DIR:-target}
+scratch=$(mktemp -d)
+trap 'rm -rf "$scratch"' EXIT
+results=()
+failed=0
+
+# step NAME COMMAND...: runs it, shows it, remembers how it ended
+step() {
+  local name=$1 begin=$SECONDS
+  shift
+  printf '\n== %s\n   %s\n' "$name" "$*"
+  if "$@"; then
+    results+=("ok      $name ($((SECONDS - begin)) s)")
+  else
+    results+=("FAILED  $name ($((SECONDS - begin)) s)")
+    failed=1
+  fi
+}
+
+readers() {
+  [ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv || return
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements.txt &&
+    npm ci --silent --no-audit --no-fund --prefix tools/readers
+}
+
+# Tests skip aloud what a machine cannot give; here those lines are shown again, so that nobody
+# takes a skipped test for a passed one.
+tests() {
+  cargo test --release -- --nocapture 2>&1 | tee "$scratch/tests.log"
+  local ended=${PIPESTATUS[0]}
+  grep -h '^skipped:' "$scratch/tests.log" | sort -u > "$scratch/skipped"
+  return "$ended"
+}
+
+sphere() { cargo run --release --quiet --example sphere_to_glb -- "$scratch/sphere"; }
+
+train_demo() {
+  "$target/release/tiface" demo --run "$scratch/demo" --preset draft --set iface.steps=600 \
+    --set mesh.resolution=128 --set mesh.format=glb,obj,ply
+}
+
+step "independent readers are here" readers
+step "format" cargo fmt --all -- --check
+step "lints" cargo clippy --release --all-targets -- -D warnings
+step "lints, with wgpu" cargo clippy --release --features wgpu --all-targets -- -D warnings
+step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --no-deps
+step "build" cargo build --release --all-targets
+step "tests" tests
+step "a sphere is written" sphere
+step "readers agree on the sphere" .venv/bin/python tools/readers/check_export.py "$scratch/sphere/sphere.glb"
+step "the Khronos validator accepts the sphere" node tools/readers/validate.mjs "$scratch/sphere/sphere.glb"
+if [ $demo = yes ]; then
+  step "the demo head is reconstructed" train_demo
+  step "readers agree on the demo head" \
+    .venv/bin/python tools/readers/check_export.py "$scratch/demo/mesh/head.glb" --up 0 0 1
+  step "the Khronos validator accepts the demo head" node tools/readers/validate.mjs "$scratch/demo/mesh/head.glb"
+else
+  results+=("SKIPPED the demo head, as asked by --no-demo")
+fi
+
+printf '\n== summary\n'
+printf '%s\n' "${results[@]}"
+[ -s "$scratch/skipped" ] && { printf 'tests that this machine could not run:\n'; cat "$scratch/skipped"; }
+exit $failed
