@@ -14,10 +14,15 @@ pub mod kernel;
 pub mod config;
 pub mod run;
 
+pub mod capture;
 #[cfg(feature = "cpu")]
 pub mod field;
+pub mod report;
 
-pub mod capture;
+#[cfg(feature = "cpu")]
+pub mod iface;
 pub mod mesh;
 pub mod metrics;
 pub mod render;
+
+pub mod pipeline;

@@ -22,7 +22,7 @@ pub use train::{TrainReport, train};
 
 use crate::field::DeviceError;
 use crate::io::ReadError;
-use crate::io::write::WriteError;
+use crate::io::WriteError;
 use std::path::PathBuf;
 
 /// Why training ended without a field.

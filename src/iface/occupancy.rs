@@ -27,8 +27,7 @@ fn resampled(hull: &Bitmask, resolution: usize) -> Bitmask {
     for x in 0..resolution {
         for y in 0..resolution {
             for z in 0..resolution {
-                let any = span(x)
-                    .any(|a| span(y).any(|b| span(z).any(|c| hull.get((a * n + b) * n + c))));
+                let any = span(x).any(|a| span(y).any(|b| span(z).any(|c| hull.get((a * n + b) * n + c))));
                 out.set((x * resolution + y) * resolution + z, any);
             }
         }
@@ -75,7 +74,8 @@ impl Occupancy {
         let half_diagonal = 0.5 * 3f32.sqrt() * cell;
         let band = config.band / inv_s + half_diagonal;
         let cells: Vec<usize> = (0..r * r * r).filter(|&i| self.allowed.get(i)).collect();
-        let center = |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - config.radius);
+        let center =
+            |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - config.radius);
         self.occupied.bits.fill(0);
         self.solid.bits.fill(0);
         for cells in cells.chunks(1 << 17) {

@@ -23,7 +23,7 @@ pub use self::pictures::{
     write_png_rgb, write_png_rgba,
 };
 pub use self::tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
-pub use self::write::{WriteError, remove_leftovers, write_atomic};
+pub use self::write::{WriteError, remove, remove_leftovers, rename, write_atomic};
 
 use std::fs::{self, File};
 use std::io::Read;

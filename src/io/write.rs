@@ -66,6 +66,24 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     write_with(path, bytes, |file, bytes| file.write_all(bytes))
 }
 
+/// Gives a file another name in the same folder, replacing what had it, and syncs the folder.
+pub fn rename(from: &Path, to: &Path) -> Result<(), WriteError> {
+    let fail = |source| WriteError::Io { path: from.into(), source };
+    fs::rename(from, to).map_err(fail)?;
+    match to.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => sync_folder(folder).map_err(fail),
+        _ => Ok(()),
+    }
+}
+
+/// Removes a file; one that is not there is fine.
+pub fn remove(path: &Path) -> Result<(), WriteError> {
+    match fs::remove_file(path) {
+        Err(e) if e.kind() != ErrorKind::NotFound => Err(WriteError::Io { path: path.into(), source: e }),
+        _ => Ok(()),
+    }
+}
+
 /// [`write_atomic`] with the writing itself given, so that tests can let it fail.
 fn write_with(
     path: &Path,

@@ -1,0 +1,158 @@
+//! A trained field, asked from outside: distances, normals, colours, volume renders.
+
+use super::checkpoint::{self, State};
+use super::model::shape;
+use super::train::march_step;
+use super::{IfaceError, occupancy::Occupancy};
+use crate::config::iface::{IfaceConfig, OccupancyRule};
+use crate::field;
+use crate::geom::Ray;
+use crate::kernel::march::{self, Bitmask, MarchRay};
+use crate::kernel::mlp::Weights;
+use crate::kernel::neus::{self, Rays};
+use crate::kernel::sdf::{self, FieldShape};
+use glam::Vec3;
+use std::path::Path;
+
+/// What a volume-rendered ray saw; colour is premultiplied by opacity (over black).
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct VolumeRay {
+    /// sRGB-coded colour, premultiplied.
+    pub color: [f32; 3],
+    /// Sum of weights, 0..=1.
+    pub opacity: f32,
+    /// Expected distance along the ray, scene units; 0 where nothing was met.
+    pub depth: f32,
+    /// Expected normal, unit length or zero.
+    pub normal: Vec3,
+}
+
+/// The trained field on the host. All positions and distances are in scene units, the box is [-1, 1]³.
+pub struct IFace {
+    config: IfaceConfig,
+    shape: FieldShape,
+    table: Vec<f32>,
+    weights: Weights,
+    inv_s: f32,
+    occupancy: Occupancy,
+}
+
+impl IFace {
+    pub(super) fn new(config: &IfaceConfig, state: &State) -> IFace {
+        let shape = shape(config);
+        let weights = Weights::new(shape.layout(), &field::values(state.model.weights().inner()));
+        let mut face = IFace {
+            config: config.clone(),
+            table: field::values(state.model.table.val().inner()),
+            weights,
+            inv_s: field::values(state.model.inv_s().inner())[0].clamp(1e-6, 1e6),
+            occupancy: state.occupancy.clone(),
+            shape,
+        };
+        if config.occupancy == OccupancyRule::Band {
+            // the surface moved since the last update
+            let mut occupancy = face.occupancy.clone();
+            occupancy.update(config, (0, 0), face.inv_s, 0.0, |x| face.raw_sdf(x));
+            face.occupancy = occupancy;
+        }
+        face
+    }
+
+    /// From the checkpoint in a stage folder. `config` and `hull` are those it was trained with.
+    pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&Bitmask>) -> Result<IFace, IfaceError> {
+        let device = field::device("cpu")?;
+        let state = checkpoint::read(&checkpoint::newest(dir), config, hull, None, &device)?;
+        Ok(IFace::new(config, &state))
+    }
+
+    /// Sharpness of the trained surface, per scene unit.
+    pub fn inv_s(&self) -> f32 {
+        self.inv_s * self.config.radius
+    }
+
+    fn table(&self) -> &[[f32; 2]] {
+        bytemuck::cast_slice(&self.table)
+    }
+
+    fn raw_sdf(&self, x: &[[f32; 3]]) -> Vec<f32> {
+        sdf::values(&self.shape, self.table(), &self.weights, x)
+    }
+
+    fn scaled(&self, points: &[Vec3]) -> Vec<[f32; 3]> {
+        points.iter().map(|p| (*p * self.config.radius).to_array()).collect()
+    }
+
+    /// Signed distance, negative inside. `[n]` points → `[n]`.
+    pub fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+        let mut f = self.raw_sdf(&self.scaled(points));
+        if self.config.radius != 1.0 {
+            f.iter_mut().for_each(|f| *f /= self.config.radius);
+        }
+        f
+    }
+
+    /// Signed distance and its gradient (not normalised).
+    pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        let all = sdf::gradients(&self.shape, self.table(), &self.weights, &self.scaled(points));
+        all.into_iter().map(|(f, n)| (f / self.config.radius, Vec3::from(n))).unzip()
+    }
+
+    /// sRGB-coded colour of surface points seen along unit `directions` (away from the camera).
+    pub fn color(&self, points: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        /// Bounds the scratch memory.
+        const PASS: usize = 1 << 15;
+        let mut out = Vec::with_capacity(points.len());
+        for (p, d) in points.chunks(PASS).zip(directions.chunks(PASS)) {
+            let d: Vec<[f32; 3]> = d.iter().map(|d| d.to_array()).collect();
+            let a = sdf::forward(&self.shape, self.table(), &self.weights, &self.scaled(p), &d);
+            out.extend(a.output().chunks_exact(sdf::WIDTH).map(|o| [o[4], o[5], o[6]]));
+        }
+        out
+    }
+
+    /// Volume render of rays in scene coordinates: the reference every faster view is compared with.
+    pub fn render(&self, rays: &[Ray]) -> Vec<VolumeRay> {
+        /// Rays per pass: bounds the samples in memory.
+        const PASS: usize = 1 << 13;
+        rays.chunks(PASS).flat_map(|rays| self.render_pass(rays)).collect()
+    }
+
+    fn render_pass(&self, rays: &[Ray]) -> Vec<VolumeRay> {
+        let config = &self.config;
+        let radius = config.radius;
+        let dt = march_step(config, self.inv_s);
+        let marched: Vec<MarchRay> = rays
+            .iter()
+            .map(|r| MarchRay {
+                origin: (r.origin * radius).to_array(),
+                direction: r.direction.to_array(),
+                jitter: 0.0,
+            })
+            .collect();
+        let solid = (config.occupancy == OccupancyRule::Band).then_some(&self.occupancy.solid);
+        let limit = (3.6 * radius / dt) as usize + 2;
+        let samples = march::march(&self.occupancy.occupied, solid, radius, dt, &marched, limit);
+        let n = samples.t.len();
+        let mut x = Vec::with_capacity(n);
+        let mut d = Vec::with_capacity(n);
+        for (r, ray) in marched.iter().enumerate() {
+            for &t in &samples.t[samples.offsets[r] as usize..samples.offsets[r + 1] as usize] {
+                x.push(std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]));
+                d.push(ray.direction);
+            }
+        }
+        let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
+        let direction: Vec<[f32; 3]> = marched.iter().map(|r| r.direction).collect();
+        let steps = vec![dt; n];
+        let bundle = Rays { offsets: &samples.offsets, direction: &direction, t: &samples.t, dt: &steps };
+        neus::forward(bundle, field.output(), self.inv_s, 1.0)
+            .chunks_exact(neus::RAY_WIDTH)
+            .map(|o| VolumeRay {
+                color: [o[0], o[1], o[2]],
+                opacity: o[3],
+                depth: if o[3] > 0.0 { o[4] / o[3] / radius } else { 0.0 },
+                normal: Vec3::new(o[5], o[6], o[7]).normalize_or_zero(),
+            })
+            .collect()
+    }
+}

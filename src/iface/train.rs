@@ -1,0 +1,431 @@
+//! The training loop of the `iface` stage.
+
+use super::checkpoint::{self, State};
+use super::hull_start::HullDistance;
+use super::infer::IFace;
+use super::model::shape;
+use super::pixels::{Batch, Pixels, TrainView};
+use super::{IfaceError, schedule};
+use crate::config::iface::{Background, IfaceConfig, OccupancyRule, Start};
+use crate::field::optimizer::update;
+use crate::field::{self, ops};
+use crate::kernel::adam::AdamStep;
+use crate::kernel::march::{self, Bitmask};
+use crate::kernel::mlp::Weights;
+use crate::kernel::rng;
+use crate::kernel::sdf::{self, FieldShape};
+use crate::run::Monitor;
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use serde::Serialize;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// What training did.
+#[derive(Clone, Debug, Serialize)]
+pub struct TrainReport {
+    /// Optimiser steps.
+    pub steps: u64,
+    /// Seconds in this process (less than the whole when resumed).
+    pub seconds: f64,
+    /// Final sharpness.
+    pub inv_s: f32,
+    /// PSNR of the last training batches, dB.
+    pub train_psnr: f64,
+    /// Share of the occupancy grid that was marched at the end.
+    pub occupied: f64,
+    /// Oddities on the way: a damaged checkpoint, a restored step.
+    pub warnings: Vec<String>,
+}
+
+/// Named losses of one step, for the log and for naming the one that broke.
+struct Losses {
+    total: Tensor<1>,
+    rgb: Tensor<1>,
+    mask: Option<Tensor<1>>,
+    eikonal: Tensor<1>,
+    sparsity: Option<Tensor<1>>,
+}
+
+/// Figures of one step on the host.
+struct Figures {
+    rgb: f32,
+    mask: f32,
+    eikonal: f32,
+    sparsity: f32,
+    samples: usize,
+}
+
+struct Trainer<'a> {
+    config: &'a IfaceConfig,
+    seed: u64,
+    device: Device,
+    shape: FieldShape,
+    pixels: Pixels<'a>,
+    masked: bool,
+    state: State,
+}
+
+/// Trains until `config.steps`, saving checkpoints into `dir` and continuing from the one that lies there.
+///
+/// `views` have their cameras in scene coordinates; `hull` is the masks' visual hull over the scene's box.
+/// `identity` names settings and inputs: a checkpoint of another identity is refused.
+pub fn train(
+    views: &[TrainView],
+    hull: Option<&Bitmask>,
+    config: &IfaceConfig,
+    seed: u64,
+    device: &str,
+    dir: &Path,
+    identity: &str,
+    monitor: &dyn Monitor,
+) -> Result<(IFace, TrainReport), IfaceError> {
+    let device = field::device(device)?;
+    let began = Instant::now();
+    // a ray may graze cells up to about two cells beyond the mask's outline
+    let reach = 4.0 * 2.0 / config.occupancy_resolution.min(128) as f32;
+    let pixels = Pixels::new(views, reach, config.radius);
+    if pixels.count() == 0 {
+        return Err(IfaceError::NoPixels);
+    }
+    let mut warnings = Vec::new();
+    let restored = checkpoint::restore(dir, config, hull, identity, &device)?;
+    let fresh = restored.is_none();
+    let state = match restored {
+        Some((state, notes)) => {
+            warnings.extend(notes);
+            state
+        }
+        None => State::new(config, seed, hull, &device),
+    };
+    let masked = views.iter().any(|v| v.mask.is_some());
+    let mut trainer = Trainer { config, seed, device, shape: shape(config), pixels, masked, state };
+    if fresh && let (Start::Hull, Some(hull)) = (config.start, hull) {
+        trainer.fit_hull(hull, monitor)?;
+    }
+    let mut saved = Instant::now();
+    let mut mean_square = 0.0f64;
+    let mut diverged_before = trainer.state.salt > 0;
+    while trainer.state.step < config.steps {
+        let step = trainer.state.step;
+        match trainer.step()? {
+            Ok(figures) => {
+                let keep = if step == 0 { 0.0 } else { 0.98 };
+                mean_square = keep * mean_square + (1.0 - keep) * figures.rgb as f64;
+                monitor.step(
+                    step + 1,
+                    config.steps,
+                    &[
+                        ("rgb", figures.rgb as f64),
+                        ("mask", figures.mask as f64),
+                        ("eikonal", figures.eikonal as f64),
+                        ("sparsity", figures.sparsity as f64),
+                        ("psnr", -10.0 * mean_square.max(1e-12).log10()),
+                        ("inv_s", trainer.inv_s() as f64),
+                        ("rays", trainer.state.rays as f64),
+                        ("samples", figures.samples as f64),
+                    ],
+                );
+            }
+            Err((term, value)) => {
+                let lr = config.lr_network * schedule::learning_rate(config, step);
+                if diverged_before {
+                    return Err(IfaceError::Diverged { term, value, step, lr });
+                }
+                diverged_before = true;
+                warnings.push(format!(
+                    "the {term} loss became {value} at step {step}; went back to the last checkpoint once"
+                ));
+                let again = checkpoint::restore(dir, config, hull, identity, &trainer.device)?;
+                trainer.state = match again {
+                    Some((state, _)) => state,
+                    None => State::new(config, seed, hull, &trainer.device),
+                };
+                // other rays, or the same step would break in the same way
+                trainer.state.salt = 1;
+            }
+        }
+        if monitor.stop() {
+            checkpoint::save(dir, &trainer.state, identity)?;
+            return Err(IfaceError::Stopped { step: trainer.state.step, steps: config.steps });
+        }
+        if saved.elapsed() > Duration::from_secs_f64(config.checkpoint_s) {
+            checkpoint::save(dir, &trainer.state, identity)?;
+            saved = Instant::now();
+        }
+    }
+    checkpoint::save(dir, &trainer.state, identity)?;
+    checkpoint::finish(dir)?;
+    let report = TrainReport {
+        steps: config.steps,
+        seconds: began.elapsed().as_secs_f64(),
+        inv_s: trainer.inv_s(),
+        train_psnr: -10.0 * mean_square.max(1e-12).log10(),
+        occupied: trainer.state.occupancy.share(),
+        warnings,
+    };
+    Ok((IFace::new(config, &trainer.state), report))
+}
+
+impl Trainer<'_> {
+    fn inv_s(&self) -> f32 {
+        field::values(self.state.model.inv_s().inner())[0].clamp(1e-6, 1e6)
+    }
+
+    /// The field's shape at a step (levels come in one by one).
+    fn shape_at(&self, step: u64) -> Arc<FieldShape> {
+        Arc::new(FieldShape { active: schedule::active_levels(self.config, step), ..self.shape.clone() })
+    }
+
+    fn march_step(&self, inv_s: f32) -> f32 {
+        march_step(self.config, inv_s)
+    }
+
+    /// One optimiser step. The inner error names a loss that is not finite; nothing was updated then.
+    fn step(&mut self) -> Result<Result<Figures, (&'static str, f32)>, IfaceError> {
+        let config = self.config;
+        let step = self.state.step;
+        let seed = self.seed ^ self.state.salt << 32;
+        let shape = self.shape_at(step);
+        let inv_s = self.inv_s();
+        let dt = self.march_step(inv_s);
+        // a new level, and the end of the hull's fit, move the surface: look again at once
+        let level_came = config.level_every > 0 && step % config.level_every == 0;
+        if step % config.occupancy_every == 0 || (config.occupancy == OccupancyRule::Band && level_came) {
+            self.update_occupancy(&shape, seed, inv_s, dt);
+        }
+        let batch = self.pixels.draw(seed, step, self.state.rays, config.jitter);
+        let o = &self.state.occupancy;
+        let solid = (config.occupancy == OccupancyRule::Band).then_some(&o.solid);
+        let limit = (3.6 * config.radius / dt) as usize + 2;
+        let samples = march::march(&o.occupied, solid, config.radius, dt, &batch.rays, limit);
+        let n = samples.t.len();
+        let rays = batch.rays.len();
+        let floor = if config.occupancy == OccupancyRule::Band { 64 } else { 1 };
+        self.state.rays = schedule::next_rays(rays, n, config.samples, floor, config.max_rays);
+        if n == 0 {
+            // nothing in sight of these rays: no gradient, but the schedule goes on
+            self.state.step += 1;
+            return Ok(Ok(Figures { rgb: 0.0, mask: 0.0, eikonal: 0.0, sparsity: 0.0, samples: 0 }));
+        }
+        let losses = self.losses(&shape, &batch, samples, dt, step, seed);
+        let read = |t: &Tensor<1>| field::values(t.clone().inner())[0];
+        let figures = Figures {
+            rgb: read(&losses.rgb),
+            mask: losses.mask.as_ref().map_or(0.0, read),
+            eikonal: read(&losses.eikonal),
+            sparsity: losses.sparsity.as_ref().map_or(0.0, read),
+            samples: n,
+        };
+        for (term, value) in [
+            ("rgb", figures.rgb),
+            ("mask", figures.mask),
+            ("eikonal", figures.eikonal),
+            ("sparsity", figures.sparsity),
+        ] {
+            if !value.is_finite() {
+                return Ok(Err((term, value)));
+            }
+        }
+        self.apply(losses.total, step);
+        self.state.step += 1;
+        Ok(Ok(figures))
+    }
+
+    fn update_occupancy(&mut self, shape: &FieldShape, seed: u64, inv_s: f32, dt: f32) {
+        let weights = Weights::new(shape.layout(), &field::values(self.state.model.weights().inner()));
+        let table = field::values(self.state.model.table.val().inner());
+        let table: &[[f32; 2]] = bytemuck::cast_slice(&table);
+        let step = self.state.step;
+        self.state
+            .occupancy
+            .update(self.config, (seed, step), inv_s, dt, |x| sdf::values(shape, table, &weights, x));
+    }
+
+    fn losses(
+        &self,
+        shape: &Arc<FieldShape>,
+        batch: &Batch,
+        samples: march::Samples,
+        dt: f32,
+        step: u64,
+        seed: u64,
+    ) -> Losses {
+        let config = self.config;
+        let device = &self.device;
+        let (n, rays) = (samples.t.len(), batch.rays.len());
+        let mut x = vec![0f32; 3 * n];
+        let mut d = vec![0f32; 3 * n];
+        for (r, ray) in batch.rays.iter().enumerate() {
+            for s in samples.offsets[r] as usize..samples.offsets[r + 1] as usize {
+                for a in 0..3 {
+                    x[3 * s + a] = ray.origin[a] + samples.t[s] * ray.direction[a];
+                    d[3 * s + a] = ray.direction[a];
+                }
+            }
+        }
+        let directions: Vec<f32> = batch.rays.iter().flat_map(|r| r.direction).collect();
+        // target and render over the same background, whatever it is
+        let background: Vec<[f32; 3]> = match config.background {
+            Background::Black => vec![[0.0; 3]; rays],
+            Background::Random => (0..rays as u64)
+                .map(|r| std::array::from_fn(|c| rng::uniform(seed, step << 4 | 3, 3 * r + c as u64)))
+                .collect(),
+        };
+        let mut target = Vec::with_capacity(3 * rays);
+        for r in 0..rays {
+            let a = batch.alpha[r];
+            for c in 0..3 {
+                target.push(a * batch.color[r][c] + (1.0 - a) * background[r][c]);
+            }
+        }
+        let has_samples: Vec<f32> = samples.offsets.windows(2).map(|w| f32::from(w[1] > w[0])).collect();
+        let alpha: Tensor<2> = field::tensor(batch.alpha.clone(), [rays, 1], device).autodiff();
+        let background: Tensor<2> =
+            field::tensor(background.into_iter().flatten().collect(), [rays, 3], device).autodiff();
+        let target: Tensor<2> = field::tensor(target, [rays, 3], device).autodiff();
+
+        let out =
+            self.state.model.field(shape, field::tensor(x, [n, 3], device), field::tensor(d, [n, 3], device)); // [n, 8]
+        let bundle = ops::RaySamples {
+            direction: field::tensor(directions, [rays, 3], device).autodiff(),
+            dt: field::tensor(vec![dt; n], [n], device).autodiff(),
+            t: field::tensor(samples.t, [n], device).autodiff(),
+            offsets: Tensor::<1, Int>::from_data(TensorData::new(samples.offsets, [rays + 1]), device)
+                .autodiff(),
+        };
+        let anneal = schedule::anneal(config, step);
+        let composed = ops::neus(out.clone(), self.state.model.inv_s(), bundle, anneal); // [rays, 8]
+        let opacity = composed.clone().narrow(1, 3, 1); // [rays, 1]
+        let color = composed.narrow(1, 0, 3) + background * (opacity.clone().neg() + 1.0);
+
+        // colour over the rays that met something; the others are constant
+        let counted: f32 = has_samples.iter().sum();
+        let met: Tensor<2> = field::tensor(has_samples, [rays, 1], device).autodiff();
+        let error = (color - target) * met;
+        let denominator = 3.0 * counted.max(1.0) as f64;
+        let rgb = error.clone().square().sum() / denominator;
+        let mut total = rgb.clone() * config.rgb_mse;
+        if config.rgb_l1 > 0.0 {
+            total = total + error.abs().sum() / denominator * config.rgb_l1;
+        }
+        let mask = (self.masked && config.mask > 0.0).then(|| {
+            let p = opacity.clamp(1e-3, 1.0 - 1e-3);
+            let cross = alpha.clone() * p.clone().log() + (alpha.neg() + 1.0) * (p.neg() + 1.0).log();
+            cross.mean().neg()
+        });
+        if let Some(mask) = &mask {
+            total = total + mask.clone() * config.mask;
+        }
+        let gradient = out.clone().narrow(1, 1, 3); // [n, 3]
+        let length = (gradient.square().sum_dim(1) + 1e-12).sqrt();
+        let eikonal = (length - 1.0).square().mean();
+        total = total + eikonal.clone() * config.eikonal;
+        let sparsity = (config.sparsity > 0.0)
+            .then(|| (out.narrow(1, 0, 1).abs() * -config.sparsity_scale).exp().mean());
+        if let Some(sparsity) = &sparsity {
+            total = total + sparsity.clone() * config.sparsity;
+        }
+        Losses { total, rgb, mask, eikonal, sparsity }
+    }
+
+    /// Backward and AdamW, each group at its own rate.
+    fn apply(&mut self, loss: Tensor<1>, step: u64) {
+        let config = self.config;
+        let factor = schedule::learning_rate(config, step);
+        self.descend(loss, factor, step + 1, true);
+    }
+
+    fn descend(&mut self, loss: Tensor<1>, factor: f64, adam_step: u64, color: bool) {
+        let config = self.config;
+        let mut gradients = loss.backward();
+        drop(loss);
+        let network = AdamStep {
+            lr: (config.lr_network * factor) as f32,
+            beta1: 0.9,
+            beta2: 0.99,
+            epsilon: 1e-15,
+            weight_decay: config.weight_decay as f32,
+            step: adam_step,
+            skip_zero: false,
+        };
+        let table = AdamStep {
+            lr: (config.lr_table * factor) as f32,
+            weight_decay: config.table_decay as f32,
+            skip_zero: config.touched_rows,
+            ..network
+        };
+        let variance = AdamStep { lr: (config.lr_variance * factor) as f32, ..network };
+        let (m, o, g) = (&mut self.state.model, &mut self.state.moments, &mut gradients);
+        update(&mut m.table, &mut o.table, g, table);
+        update(&mut m.v1, &mut o.v1, g, network);
+        update(&mut m.g1, &mut o.g1, g, network);
+        update(&mut m.b1, &mut o.b1, g, network);
+        update(&mut m.v2, &mut o.v2, g, network);
+        update(&mut m.g2, &mut o.g2, g, network);
+        update(&mut m.b2, &mut o.b2, g, network);
+        if color {
+            update(&mut m.c1, &mut o.c1, g, network);
+            update(&mut m.c2, &mut o.c2, g, network);
+            update(&mut m.c3, &mut o.c3, g, network);
+            update(&mut m.variance, &mut o.variance, g, variance);
+        }
+    }
+
+    /// Fits the field to the hull's distance: half of the points in a band around its boundary.
+    fn fit_hull(&mut self, hull: &Bitmask, monitor: &dyn Monitor) -> Result<(), IfaceError> {
+        /// Enough for errors well below a cell of the hull with the coarse levels.
+        const STEPS: u64 = 250;
+        const POINTS: usize = 8192;
+        let distance = HullDistance::new(hull);
+        let config = self.config;
+        let shape = self.shape_at(0);
+        for step in 0..STEPS {
+            let mut x = Vec::with_capacity(3 * POINTS);
+            let mut target = Vec::with_capacity(POINTS);
+            let mut k = 0;
+            while target.len() < POINTS {
+                let u = |a: u64| 2.0 * rng::uniform(self.seed, 201 + (step << 10), 4 * k + a) - 1.0;
+                let p = [u(0), u(1), u(2)];
+                k += 1;
+                let f = distance.at(p);
+                // every second point anywhere, the others near the boundary
+                if k % 2 == 0 && f.abs() > 0.1 {
+                    continue;
+                }
+                x.extend(p.map(|c| c * config.radius));
+                target.push(f * config.radius);
+            }
+            let n = target.len();
+            let device = &self.device;
+            let directions = field::tensor([0.0, 0.0, 1.0].repeat(n), [n, 3], device);
+            let out = self.state.model.field(&shape, field::tensor(x, [n, 3], device), directions);
+            let target: Tensor<2> = field::tensor(target, [n, 1], device).autodiff();
+            let error = (out.clone().narrow(1, 0, 1) - target).abs().mean();
+            let length = (out.narrow(1, 1, 3).square().sum_dim(1) + 1e-12).sqrt();
+            let loss = error * 10.0 + (length - 1.0).square().mean() * 0.1;
+            let factor = 0.1f64.powf(step as f64 / STEPS as f64) * ((step + 1) as f64 / 20.0).min(1.0);
+            self.descend(loss, factor, step + 1, false);
+            if monitor.stop() {
+                return Err(IfaceError::Stopped { step: 0, steps: config.steps });
+            }
+        }
+        // training starts with its own moments
+        let fresh = State::new(config, self.seed, Some(hull), &self.device);
+        self.state.moments = fresh.moments;
+        Ok(())
+    }
+}
+
+/// March step at a sharpness.
+pub fn march_step(config: &IfaceConfig, inv_s: f32) -> f32 {
+    match config.occupancy {
+        // nerfacc's constant 1.732 where √3 is meant, kept for the published step length
+        OccupancyRule::Nerfacc => 1.732 * 2.0 * config.radius / config.samples_per_ray as f32,
+        OccupancyRule::Band => (config.march / inv_s).clamp(config.min_step, config.max_step),
+    }
+}
+
+#[cfg(test)]
+#[path = "train_tests.rs"]
+mod tests;

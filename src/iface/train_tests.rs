@@ -1,0 +1,206 @@
+//! Training on an analytic ball: does it learn, resume, guard and stop?
+
+use super::*;
+use crate::geom::{Camera, Distortion};
+use crate::image::{Gray, Photo};
+use crate::run::Quiet;
+use glam::{DMat3, DVec3, Vec2, Vec3};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+const SIZE: u32 = 40;
+const BALL: f32 = 0.6;
+
+/// A red and green ball in front of a blue wall, seen from eight sides.
+fn views() -> Vec<TrainView> {
+    (0..8)
+        .map(|i| view(i as f64 * std::f64::consts::TAU / 8.0, if i % 2 == 0 { 0.4 } else { -0.4 }))
+        .collect()
+}
+
+fn view(azimuth: f64, elevation: f64) -> TrainView {
+    let rotation = DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-elevation);
+    let camera = Camera {
+        width: SIZE,
+        height: SIZE,
+        fx: 60.0,
+        fy: 60.0,
+        cx: 20.0,
+        cy: 20.0,
+        distortion: Distortion::default(),
+        rotation,
+        position: rotation * DVec3::new(0.0, 0.0, 3.0),
+    };
+    let mut rgb = Vec::new();
+    let mut alpha = Vec::new();
+    for y in 0..SIZE {
+        for x in 0..SIZE {
+            let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).unwrap();
+            let b = ray.origin.dot(ray.direction);
+            let discriminant = b * b - ray.origin.length_squared() + BALL * BALL;
+            if discriminant > 0.0 {
+                let p = ray.at(-b - discriminant.sqrt());
+                rgb.push(if p.y > 0.0 { [200, 40, 30] } else { [40, 180, 60] });
+                alpha.push(255);
+            } else {
+                rgb.push([30, 30, 220]);
+                alpha.push(0);
+            }
+        }
+    }
+    TrainView {
+        camera,
+        photo: Photo { width: SIZE, height: SIZE, rgb, alpha: None },
+        mask: Some(Gray { width: SIZE, height: SIZE, values: alpha }),
+        valid: None,
+    }
+}
+
+fn hull() -> Bitmask {
+    let r = 32;
+    let mut hull = Bitmask::filled(r, false);
+    for i in 0..r * r * r {
+        let c = Vec3::from_array([i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) / 16.0 - 1.0));
+        hull.set(i, c.length() < BALL + 0.1);
+    }
+    hull
+}
+
+fn config() -> IfaceConfig {
+    IfaceConfig {
+        steps: 240,
+        rays: 256,
+        max_rays: 512,
+        samples: 4096,
+        levels: 6,
+        log2_table: 12,
+        occupancy_resolution: 32,
+        level_every: 30,
+        anneal_end: 50,
+        warmup: 20,
+        min_step: 0.02,
+        ..IfaceConfig::draft()
+    }
+}
+
+fn temporary() -> tempfile::TempDir {
+    tempfile::tempdir().expect("a temporary folder")
+}
+
+#[test]
+fn a_ball_is_learned_from_eight_views() {
+    let dir = temporary();
+    let (views, hull) = (views(), hull());
+    let (face, report) = train(&views, Some(&hull), &config(), 3, "cpu", dir.path(), "ball", &Quiet).unwrap();
+    assert!(report.train_psnr > 18.0, "{report:?}");
+    // the surface along three axes, off by less than a pixel (3 / 60 = 0.05)
+    for direction in [Vec3::X, Vec3::new(0.0, 0.8, 0.6), Vec3::new(-0.6, 0.0, -0.8)] {
+        let along: Vec<Vec3> = (0..400).map(|i| direction * (i as f32 * 0.0025)).collect();
+        let sdf = face.sdf(&along);
+        let radius = sdf.iter().position(|&f| f > 0.0).map(|i| i as f32 * 0.0025).unwrap_or(1.0);
+        assert!((radius - BALL).abs() < 0.05, "{direction}: {radius}");
+    }
+    let ray = views[0].camera.ray(Vec2::new(20.0, 12.0)).unwrap();
+    let seen = face.render(&[ray])[0];
+    assert!(seen.opacity > 0.9 && seen.color[0] > seen.color[1], "{seen:?}");
+    // the same field comes back from its checkpoint
+    let loaded = IFace::load(dir.path(), &config(), Some(&hull)).unwrap();
+    assert_eq!(loaded.render(&[ray])[0], seen);
+}
+
+/// Asks to stop after so many steps.
+struct StopAfter(AtomicU64);
+
+impl Monitor for StopAfter {
+    fn step(&self, _: u64, _: u64, _: &[(&str, f64)]) {
+        self.0.fetch_sub(1, Ordering::SeqCst);
+    }
+    fn stop(&self) -> bool {
+        self.0.load(Ordering::SeqCst) == 0
+    }
+}
+
+fn bytes(dir: &Path) -> Vec<u8> {
+    std::fs::read(checkpoint::newest(dir)).unwrap()
+}
+
+#[test]
+fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
+    let (views, hull) = (views(), hull());
+    let config = IfaceConfig { steps: 40, ..config() };
+    let run = |dir: &Path, monitor: &dyn Monitor| {
+        train(&views, Some(&hull), &config, 3, "cpu", dir, "ball", monitor).map(|(_, report)| report.steps)
+    };
+    let undisturbed = temporary();
+    run(undisturbed.path(), &Quiet).unwrap();
+    let stopped = temporary();
+    for _ in 0..3 {
+        let end = run(stopped.path(), &StopAfter(AtomicU64::new(11)));
+        assert!(matches!(end, Err(IfaceError::Stopped { steps: 40, .. })));
+    }
+    // a checkpoint cut short by a crash: the one before it is taken
+    let newest = checkpoint::newest(stopped.path());
+    let whole = bytes(stopped.path());
+    std::fs::write(&newest, &whole[..whole.len() / 2]).unwrap();
+    run(stopped.path(), &Quiet).unwrap();
+    assert_eq!(bytes(undisturbed.path()), bytes(stopped.path()));
+    assert!(!stopped.path().join("checkpoint.previous.safetensors").exists());
+}
+
+#[test]
+fn a_checkpoint_of_other_settings_is_refused() {
+    let (views, hull) = (views(), hull());
+    let dir = temporary();
+    let config = IfaceConfig { steps: 2, ..config() };
+    train(&views, Some(&hull), &config, 3, "cpu", dir.path(), "one", &Quiet).unwrap();
+    let again = train(&views, Some(&hull), &config, 3, "cpu", dir.path(), "two", &Quiet);
+    let message = again.err().unwrap().to_string();
+    assert!(message.contains("checkpoint.safetensors") && message.contains("other settings"), "{message}");
+}
+
+#[test]
+fn a_diverging_run_restores_once_and_then_names_step_term_and_rate() {
+    let (views, hull) = (views(), hull());
+    let dir = temporary();
+    let config = IfaceConfig { lr_table: 1e38, warmup: 0, ..config() };
+    let end = train(&views, Some(&hull), &config, 3, "cpu", dir.path(), "ball", &Quiet);
+    match end.err() {
+        Some(IfaceError::Diverged { term, value, lr, .. }) => {
+            assert!(!value.is_finite() && lr > 0.0 && !term.is_empty());
+        }
+        other => panic!("expected divergence, got {other:?}"),
+    }
+}
+
+#[test]
+fn empty_masks_and_unseen_boxes_do_not_crash() {
+    let hull = hull();
+    let dir = temporary();
+    let mut empty = views();
+    empty.iter_mut().for_each(|v| v.mask.as_mut().unwrap().values.fill(0));
+    let end = train(&empty, Some(&hull), &config(), 3, "cpu", dir.path(), "empty", &Quiet);
+    assert!(matches!(end, Err(IfaceError::NoPixels)));
+    // a hull without a cell: every step meets no sample, training ends all the same
+    let nothing = Bitmask::filled(32, false);
+    let config = IfaceConfig { steps: 5, start: Start::Sphere, ..config() };
+    let views = views();
+    train(&views, Some(&nothing), &config, 3, "cpu", dir.path(), "nothing", &Quiet).unwrap();
+}
+
+#[test]
+fn the_paper_preset_trains_too() {
+    let dir = temporary();
+    let views = views();
+    let config = IfaceConfig {
+        steps: 12,
+        levels: 4,
+        start_levels: 4,
+        log2_table: 10,
+        samples: 8192,
+        occupancy_resolution: 16,
+        samples_per_ray: 64,
+        radius: 1.0,
+        ..IfaceConfig::paper()
+    };
+    let (face, report) = train(&views, None, &config, 3, "cpu", dir.path(), "p", &Quiet).unwrap();
+    assert!(report.train_psnr.is_finite() && face.sdf(&[Vec3::ZERO])[0] < 0.0);
+}
