@@ -26,3 +26,5 @@ pub mod metrics;
 pub mod render;
 
 pub mod pipeline;
+
+pub mod cli;

@@ -35,7 +35,7 @@ use crate::metrics::{Metrics, MetricsError, compare};
 use crate::render::path::{NamedCamera, PathError, from_json, orbit};
 use crate::render::{RaycastOptions, raycast};
 use crate::report::{self, Pair, Report};
-use crate::run::{Done, Exit, Failure, Fingerprint, Plan, Run, RunError, Stage};
+use crate::run::{Done, Exit, Failure, Fingerprint, Plan, Run, RunError, Stage, read_record};
 use glam::Vec3;
 use rayon::prelude::*;
 use serde_json::{Map, Value, json};
@@ -139,6 +139,17 @@ impl<'a> Line<'a> {
     /// The capture.
     pub fn capture(&self) -> &Capture {
         &self.capture
+    }
+
+    /// What would be done: each stage with `None` if it has to be worked on, else what differs from
+    /// the result that lies there (nothing, if it is done). Nothing is written.
+    pub fn outlook(&self) -> Result<Vec<(&'static str, Option<Vec<String>>)>, PipelineError> {
+        let look = |name: &'static str| {
+            let record = read_record(&self.run.path(name))?;
+            let now = self.plan(name).fingerprint;
+            Ok((name, record.map(|r| now.differences(&r.fingerprint))))
+        };
+        STAGES.iter().map(|name| look(name)).collect()
     }
 
     /// Writes the complete configuration into the run: what repeats it.
@@ -673,7 +684,7 @@ mod tests {
         config.mesh.format = vec![MeshFormat::Glb];
         config.metrics.surface_points = 4000;
         config.render.background = Background::None;
-        let run = Run::open(&dir.path().join("run"), Stop::new(), Arc::new(Quiet)).unwrap();
+        let run = Run::open(&dir.path().join("run"), Stop::new(), Arc::new(Quiet));
         let line = Line::open(&config, &run, true).unwrap();
         line.remember().unwrap();
         assert_eq!(line.mask().unwrap().summary["masks"], 14);
@@ -717,7 +728,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let options = SyntheticOptions { width: 32, height: 40, train: 3, test: 1, seed: 1 };
         write_capture(dir.path(), &options).unwrap();
-        let run = Run::open(&dir.path().join("run"), Stop::new(), Arc::new(Quiet)).unwrap();
+        let run = Run::open(&dir.path().join("run"), Stop::new(), Arc::new(Quiet));
         let digests = |change: fn(&mut Config)| {
             let mut config = Config::preset(Preset::Draft);
             config.capture.path = dir.path().to_str().unwrap().into();

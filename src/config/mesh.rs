@@ -59,6 +59,18 @@ pub(super) const KEYS: &[Key] = &[
         0.0,
         16.0,
     ),
+    Key::number(
+        "coarse_step",
+        "Every how many cells the field is asked first: 2, 4 or 8; smaller finds smaller loose pieces.",
+        2.0,
+        8.0,
+    ),
+    Key::number(
+        "relax",
+        "How far vertices slide towards the middle of their neighbours with the first step.",
+        0.0,
+        1.0,
+    ),
     Key::word("format", "Files to write, a list of glb, obj, ply."),
     Key::word("frame", "Coordinates of the files: dataset, or head (+Y up, face towards +Z, centred)."),
 ];
