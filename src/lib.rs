@@ -6,18 +6,25 @@
 //!
 //! Modules are declared in the order of that line; what they share stands first.
 
-pub mod capture;
-pub mod config;
 pub mod geom;
 pub mod image;
 pub mod io;
 pub mod kernel;
+
+pub mod config;
+pub mod run;
+
+pub mod capture;
+#[cfg(feature = "cpu")]
+pub mod field;
+pub mod report;
+
+#[cfg(feature = "cpu")]
+pub mod iface;
 pub mod mesh;
 pub mod metrics;
 pub mod render;
-pub mod run;
 
-#[cfg(feature = "cpu")]
-pub mod field;
-#[cfg(feature = "cpu")]
-pub mod iface;
+pub mod pipeline;
+
+pub mod cli;

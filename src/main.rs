@@ -1,2 +1,9 @@
 //! The `tiface` binary: parse, run, exit code; nothing else.
-fn main() {}
+
+/// Training allocates and frees the same large blocks every step; this keeps them.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+fn main() -> std::process::ExitCode {
+    tiface::cli::main()
+}

@@ -33,8 +33,12 @@ pub struct MeshConfig {
     pub resolution: u32,
     /// Components with less than this share of the largest one's area are dropped.
     pub keep_share: f64,
+    /// Every how many cells the field is asked first.
+    pub coarse_step: u32,
     /// Newton steps that pull vertices onto the zero level.
     pub newton_steps: u32,
+    /// How far vertices slide towards the middle of their neighbours with the first step.
+    pub relax: f32,
     /// Files to write.
     pub format: Vec<MeshFormat>,
     /// Coordinates to write them in.
@@ -55,6 +59,18 @@ pub(super) const KEYS: &[Key] = &[
         0.0,
         16.0,
     ),
+    Key::number(
+        "coarse_step",
+        "Every how many cells the field is asked first: 2, 4 or 8; smaller finds smaller loose pieces.",
+        2.0,
+        8.0,
+    ),
+    Key::number(
+        "relax",
+        "How far vertices slide towards the middle of their neighbours with the first step.",
+        0.0,
+        1.0,
+    ),
     Key::word("format", "Files to write, a list of glb, obj, ply."),
     Key::word("frame", "Coordinates of the files: dataset, or head (+Y up, face towards +Z, centred)."),
 ];
@@ -65,7 +81,9 @@ impl MeshConfig {
         MeshConfig {
             resolution: if preset == Preset::Draft { 256 } else { 512 },
             keep_share: 1.0,
+            coarse_step: 8,
             newton_steps: 2,
+            relax: 0.5,
             format: vec![MeshFormat::Glb],
             frame: MeshFrame::Dataset,
         }

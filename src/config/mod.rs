@@ -21,7 +21,7 @@ pub use iface::IfaceConfig;
 pub use mask::{MaskConfig, MaskMeaning, MaskSource};
 pub use mesh::{MeshConfig, MeshFormat, MeshFrame};
 pub use metrics::MetricsConfig;
-pub use render::{Background, PictureFormat, RenderConfig};
+pub use render::{Background, Method, PictureFormat, RenderConfig};
 pub use source::{ConfigError, Place, Sources};
 
 use serde::{Deserialize, Serialize};

@@ -3,6 +3,26 @@
 use super::{Key, Preset};
 use serde::{Deserialize, Serialize};
 
+/// A way to make a view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Method {
+    /// Rays cast at the mesh, learned colour where they hit.
+    Raycast,
+    /// The learned field, marched and composited.
+    Volume,
+}
+
+impl Method {
+    /// The folder of its pictures below `render/`.
+    pub fn folder(self) -> &'static str {
+        match self {
+            Method::Raycast => "raycast",
+            Method::Volume => "volume",
+        }
+    }
+}
+
 /// A picture file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -31,7 +51,11 @@ pub enum Background {
 pub struct RenderConfig {
     /// `test`, `train`, `orbit`, or a file of cameras.
     pub cameras: String,
-    /// Samples along each side of a pixel.
+    /// Which ways to make them.
+    pub method: Vec<Method>,
+    /// Views of an orbit.
+    pub orbit_views: u32,
+    /// Samples along each side of a pixel on an edge.
     pub samples: u32,
     /// Files to write.
     pub format: PictureFormat,
@@ -44,7 +68,12 @@ pub(super) const KEYS: &[Key] = &[
         "cameras",
         "Which cameras: test, train, orbit, or a file (transforms.json or a nerfstudio camera path).",
     ),
-    Key::number("samples", "Rays along each side of a pixel.", 1.0, 8.0),
+    Key::word(
+        "method",
+        "A list of raycast (rays at the mesh, learned colour) and volume (the field itself, slower).",
+    ),
+    Key::number("orbit_views", "Views of an orbit around the head.", 1.0, 10_000.0),
+    Key::number("samples", "Rays along each side of a pixel on an edge of the mesh.", 1.0, 8.0),
     Key::word("format", "png (8-bit sRGB) or exr (float, with depth and normals)."),
     Key::word("background", "Behind the head: black, white or none (real alpha)."),
 ];
@@ -54,6 +83,8 @@ impl RenderConfig {
     pub fn preset(preset: Preset) -> RenderConfig {
         RenderConfig {
             cameras: "test".into(),
+            method: vec![Method::Raycast, Method::Volume],
+            orbit_views: 36,
             samples: if preset == Preset::Draft { 1 } else { 2 },
             format: PictureFormat::Png,
             background: Background::None,

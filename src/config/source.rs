@@ -15,6 +15,8 @@ pub struct Sources {
     pub files: Vec<(String, String)>,
     /// `--set`: each `key=value`.
     pub set: Vec<String>,
+    /// Options with a name of their own: as typed, the key they set, its value. Strongest.
+    pub options: Vec<(String, String, String)>,
 }
 
 /// Where a value was given.
@@ -140,6 +142,9 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
             return Err(ConfigError::Syntax { place, problem: "expected KEY=VALUE".into() });
         };
         given.push((key.trim().into(), Given::Text(value.trim().into()), place));
+    }
+    for (typed, key, value) in &sources.options {
+        given.push((key.clone(), Given::Text(value.clone()), Place::Option(typed.clone())));
     }
 
     // the preset comes first whatever line it stands on; what it means is checked by `assign` below
@@ -352,7 +357,11 @@ mod tests {
 
     fn from(file: &str, set: &[&str]) -> Result<Config, ConfigError> {
         let files = vec![("tiface.toml".to_string(), file.to_string())];
-        Config::resolve(&Sources { files, set: set.iter().map(|s| s.to_string()).collect(), preset: None })
+        Config::resolve(&Sources {
+            files,
+            set: set.iter().map(|s| s.to_string()).collect(),
+            ..Sources::default()
+        })
     }
 
     #[test]

@@ -68,11 +68,10 @@ pub struct Run {
 const LOCK: &str = ".lock";
 
 impl Run {
-    /// Opens the run `dir`, making the folder if needed. Events go to `observer`; every stage
-    /// stops when `stop` says so.
-    pub fn open(dir: &Path, stop: Stop, observer: Arc<dyn Observer>) -> Result<Run, RunError> {
-        io::create_folder(dir)?;
-        Ok(Run { dir: dir.into(), stop, observer })
+    /// The run in `dir`; the folder is made with the first file that is written. Events go to
+    /// `observer`; every stage stops when `stop` says so.
+    pub fn open(dir: &Path, stop: Stop, observer: Arc<dyn Observer>) -> Run {
+        Run { dir: dir.into(), stop, observer }
     }
 
     /// The folder of the run.
@@ -92,6 +91,7 @@ impl Run {
         if io::is_file(&path) && io::read_bytes(&path, &io::Limits::default()).is_ok_and(|old| old == bytes) {
             return Ok(());
         }
+        io::create_folder(&self.dir)?;
         Ok(io::write_atomic(&path, bytes)?)
     }
 

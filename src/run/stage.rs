@@ -198,7 +198,7 @@ mod tests {
     }
 
     fn open(dir: &Path) -> Run {
-        Run::open(dir, Stop::new(), Arc::new(Quiet)).unwrap()
+        Run::open(dir, Stop::new(), Arc::new(Quiet))
     }
 
     fn work(stage: &Stage) -> Result<Value, Failure> {
@@ -319,7 +319,7 @@ mod tests {
         fs::write(dir.path().join("iface/views/.a.png.99.tmp"), b"half").unwrap();
         fs::write(dir.path().join("iface/done.json"), b"").unwrap(); // a crash before any sync
         let seen = Arc::new(Warnings(Mutex::new(Vec::new())));
-        let run = Run::open(dir.path(), Stop::new(), seen.clone()).unwrap();
+        let run = Run::open(dir.path(), Stop::new(), seen.clone());
         run.stage(plan(5), work).unwrap();
         assert!(!dir.path().join("iface/views/.a.png.99.tmp").exists());
         let told = seen.0.lock().unwrap();

@@ -1,0 +1,46 @@
+//! `tiface demo`: the line on a synthetic head made on the spot.
+
+use super::ending::Ending;
+use super::line::Work;
+use super::options::Common;
+use super::screen::{Screen, duration};
+use super::target::Target;
+use crate::capture::synthetic::{SyntheticOptions, write_capture};
+use crate::config::Preset;
+use crate::io;
+use crate::run::{Exit, Stop};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// Where in its run the demo keeps its photographs.
+pub(super) const CAPTURE: &str = "capture";
+
+pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, Ending> {
+    let run = common.run.clone().unwrap_or_else(|| PathBuf::from("runs/demo"));
+    let capture = run.join(CAPTURE);
+    // the cameras are written last: where they are, everything is
+    if !io::is_file(&capture.join("transforms.json")) {
+        if common.dry_run {
+            screen.note(&format!("would photograph a synthetic head into `{}`", capture.display()));
+            return Ok(Exit::Done);
+        }
+        make(&capture, screen)?;
+    }
+    let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
+    // repeated without options, the demo goes on as it was begun
+    let target = Target { capture: Some(io::real_path(&capture)?), saved, run, guessed: false };
+    let fallback = Some(Preset::Draft);
+    let work = Work { common, until: "metrics", require: &[], synthetic: true, fallback, screen, stop };
+    work.on(&target, &[])
+}
+
+fn make(capture: &Path, screen: &Screen) -> Result<(), Ending> {
+    let options = SyntheticOptions::default();
+    let views = options.train + options.test;
+    screen.note(&format!("capture: photographing a synthetic head from {views} sides"));
+    let start = Instant::now();
+    io::create_folder(capture)?;
+    write_capture(capture, &options).map_err(|e| Ending::cannot(e.to_string(), e.hint()))?;
+    screen.note(&format!("capture: done in {}", duration(start.elapsed().as_secs_f64())));
+    Ok(())
+}

@@ -1,0 +1,329 @@
+//! `tiface run` and the stage commands: the line, up to a stage.
+
+use super::ending::{Ending, say};
+use super::options::Common;
+use super::screen::{Screen, figure};
+use super::target::Target;
+use crate::config::{Config, MeshFormat, Preset};
+use crate::io;
+use crate::pipeline::{Line, STAGES, mesh_bytes};
+use crate::run::{Done, Exit, Run, Stop};
+use serde_json::{Value, json};
+use std::path::Path;
+
+/// Works on the run that `path` and the options mean, up to the stage `until`.
+pub(super) fn go(
+    common: &Common,
+    path: Option<&Path>,
+    until: &str,
+    require: &[String],
+    extra: &[(String, String, String)],
+    screen: &Screen,
+    stop: &Stop,
+) -> Result<Exit, Ending> {
+    let target = Target::find(common, path)?;
+    if target.guessed {
+        screen.note(&format!("using the run `{}`", target.run.display()));
+    }
+    let work = Work { common, until, require, synthetic: false, fallback: None, screen, stop };
+    work.on(&target, extra)
+}
+
+/// A command on the line.
+pub(super) struct Work<'a> {
+    pub common: &'a Common,
+    pub until: &'a str,
+    pub require: &'a [String],
+    /// Is it the demo head, whose surface is known?
+    pub synthetic: bool,
+    /// The preset where nothing names one.
+    pub fallback: Option<Preset>,
+    pub screen: &'a Screen,
+    pub stop: &'a Stop,
+}
+
+impl Work<'_> {
+    pub fn on(&self, target: &Target, extra: &[(String, String, String)]) -> Result<Exit, Ending> {
+        let config = configure(self.common, target, self.fallback, extra)?;
+        let bars = self.require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>, _>>()?;
+        if let Some(fresh) = &self.common.fresh
+            && !STAGES.contains(&fresh.as_str())
+        {
+            let known = STAGES.join(", ");
+            return Err(Ending::usage(format!("there is no stage `{fresh}`"), format!("stages are {known}")));
+        }
+        let run = Run::open(&target.run, self.stop.clone(), self.screen.observer());
+        // the demo's own runs are recognised when their stages are run one by one, too
+        let synthetic = self.synthetic || is_demo(&config, &run);
+        let line = Line::open(&config, &run, synthetic)?;
+        if self.common.dry_run {
+            return self.outlook(&line);
+        }
+        if let Some(fresh) = &self.common.fresh {
+            run.fresh(fresh, STAGES)?;
+        }
+        line.remember()?;
+        let done = reconstruct(&line, self.until)?;
+        if let Some(out) = &self.common.out {
+            self.copy(&line, &run, out)?;
+        }
+        self.closing(&run, &done)?;
+        bars.iter().try_for_each(|bar| bar.check(&done))?;
+        Ok(Exit::Done)
+    }
+
+    fn outlook(&self, line: &Line) -> Result<Exit, Ending> {
+        let last = STAGES.iter().position(|s| *s == self.until).unwrap_or(STAGES.len() - 1);
+        let fresh = self.common.fresh.as_deref().and_then(|f| STAGES.iter().position(|s| *s == f));
+        let mut text = String::new();
+        for (i, (stage, found)) in line.outlook()?.into_iter().enumerate().take(last + 1) {
+            let anew = fresh.is_some_and(|f| i >= f);
+            let (word, differences) = match found {
+                _ if anew => ("to do, afresh", Vec::new()),
+                None => ("to do", Vec::new()),
+                Some(d) if d.is_empty() => ("done", d),
+                Some(d) => ("would stop: done with other settings", d),
+            };
+            if self.common.json {
+                text +=
+                    &format!("{}\n", json!({"stage": stage, "outlook": word, "differences": differences}));
+            } else {
+                text += &format!("{stage:<8} {word}\n");
+                text.extend(differences.iter().map(|d| format!("           {d}\n")));
+            }
+        }
+        say(&text)?;
+        Ok(Exit::Done)
+    }
+
+    /// Puts the command's product where `--out` says.
+    fn copy(&self, line: &Line, run: &Run, out: &Path) -> Result<(), Ending> {
+        let ending = out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
+        let format = match ending.as_str() {
+            "glb" => Some(MeshFormat::Glb),
+            "obj" => Some(MeshFormat::Obj),
+            "ply" => Some(MeshFormat::Ply),
+            _ => None,
+        };
+        match (self.until, format) {
+            ("mesh" | "metrics" | "render", Some(format)) => {
+                let bytes = mesh_bytes(&line.read_mesh()?, format, &line.export())?;
+                if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
+                    io::create_folder(folder)?;
+                }
+                Ok(io::write_atomic(out, &bytes)?)
+            }
+            ("mesh", None) => Err(Ending::usage(
+                format!("`{}`: the ending picks the format, and this is none", out.display()),
+                "end it in .glb, .obj or .ply",
+            )),
+            (stage, None) => {
+                let from = if stage == "metrics" { run.dir().to_path_buf() } else { run.path(stage) };
+                Ok(copy_folder(&from, out)?)
+            }
+            (stage, Some(_)) => Err(Ending::usage(
+                format!("the product of `{stage}` is no mesh"),
+                "use `tiface mesh --out head.glb`",
+            )),
+        }
+    }
+
+    /// Where everything is, and how good it is.
+    fn closing(&self, run: &Run, done: &[(&'static str, Done)]) -> Result<(), Ending> {
+        let of = |name: &str| done.iter().find(|(n, _)| *n == name).map(|(_, d)| &d.summary);
+        if self.common.json {
+            let stages: serde_json::Map<String, Value> =
+                done.iter().map(|(n, d)| (n.to_string(), d.summary.clone())).collect();
+            return say(&format!("{}\n", json!({"event": "result", "run": run.dir(), "stages": stages})));
+        }
+        if self.common.quiet {
+            return Ok(());
+        }
+        let mut text = String::new();
+        let mut row = |name: &str, value: String| text += &format!("{name:<9} {value}\n");
+        if let Some(mesh) = of("mesh") {
+            let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
+            let files = ["glb", "obj", "ply"].map(|e| run.path(format!("mesh/head.{e}")));
+            let first = files.iter().find(|f| io::is_file(f)).unwrap_or(&files[0]);
+            row("mesh", format!("{} ({} triangles, {state})", first.display(), mesh["triangles"]));
+        }
+        if of("render").is_some() {
+            row("pictures", format!("{}", run.path("render").display()));
+        }
+        if let Some(metrics) = of("metrics") {
+            row("report", format!("{}", run.path("report.html").display()));
+            for line in judgement(metrics) {
+                row("quality", line);
+            }
+        } else if of("mesh").is_none() {
+            row("run", format!("{}", run.dir().display()));
+        }
+        say(&text)
+    }
+}
+
+/// How good the result is, one sentence per thing known.
+fn judgement(metrics: &Value) -> Vec<String> {
+    let mut lines = Vec::new();
+    for (method, words) in [("raycast", "views of the mesh"), ("volume", "views of the field")] {
+        let mean = &metrics[method]["head"]["mean"];
+        if let Some(psnr) = mean["psnr_masked"].as_f64().or(mean["psnr"].as_f64()) {
+            let ssim = mean["ssim_masked"].as_f64().or(mean["ssim"].as_f64());
+            let ssim = ssim.map(|s| format!(", SSIM {s:.4}")).unwrap_or_default();
+            lines.push(format!(
+                "{words} against held-out photographs: PSNR {psnr:.2} dB{ssim}, inside the mask"
+            ));
+        }
+    }
+    let truth = &metrics["truth_percent_of_head"];
+    if let (Some(mean), Some(p90)) = (truth["accuracy_mean"].as_f64(), truth["accuracy_p90"].as_f64()) {
+        lines.push(format!(
+            "mesh against the exact surface: {} % of head height off on average, 90 % within {} %",
+            figure(mean),
+            figure(p90)
+        ));
+    }
+    lines
+}
+
+/// The configuration a target and the options amount to; it remembers its capture.
+pub(super) fn configure(
+    common: &Common,
+    target: &Target,
+    fallback: Option<Preset>,
+    extra: &[(String, String, String)],
+) -> Result<Config, Ending> {
+    let mut extra = extra.to_vec();
+    let mut remember = |path: &str| {
+        extra.push((format!("CAPTURE {path}"), "capture.path".into(), path.into()));
+    };
+    if let Some(capture) = &target.capture {
+        let path = capture.to_str().ok_or_else(|| {
+            let shown = capture.display();
+            Ending::cannot(format!("the path of the capture is not UTF-8: `{shown}`"), "rename the folder")
+        })?;
+        remember(path);
+    } else if let Some(saved) = target.saved.as_deref().filter(|_| common.preset.is_some()) {
+        // a new preset starts over, but on the same photographs
+        let bare = Common { color: common.color, ..Common::default() };
+        remember(&bare.resolve(Some(saved), None, &[])?.capture.path);
+    }
+    let config = common.resolve(target.saved.as_deref(), fallback, &extra)?;
+    if config.capture.path.is_empty() {
+        return Err(Ending::usage("no capture is named", "name one: `tiface run CAPTURE`"));
+    }
+    Ok(config)
+}
+
+/// Was this run made by `tiface demo`?
+fn is_demo(config: &Config, run: &Run) -> bool {
+    let made = run.path(super::demo::CAPTURE);
+    io::real_path(&made).is_ok_and(|made| made == Path::new(&config.capture.path))
+}
+
+fn copy_folder(from: &Path, to: &Path) -> Result<(), Ending> {
+    io::create_folder(to)?;
+    for name in io::list_files(from)? {
+        if !["done.json", "status.json", "log.jsonl"].contains(&name.as_str()) {
+            let bytes = io::read_bytes(&from.join(&name), &io::Limits::default())?;
+            io::write_atomic(&to.join(&name), &bytes)?;
+        }
+    }
+    for folder in io::list_folders(from)? {
+        if let Some(name) = folder.file_name().filter(|n| !["iface", "capture"].iter().any(|k| n == k)) {
+            copy_folder(&folder, &to.join(name))?;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(feature = "cpu")]
+fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, Ending> {
+    Ok(crate::pipeline::reconstruct(line, until)?)
+}
+
+#[cfg(not(feature = "cpu"))]
+fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, Ending> {
+    if until == "mask" {
+        return Ok(vec![("mask", line.mask()?)]);
+    }
+    Err(Ending::cannot(
+        "this build cannot learn fields",
+        "build with the feature `cpu`, which is the default",
+    ))
+}
+
+/// A bar set by `--require`.
+#[derive(Debug, PartialEq)]
+enum Bar {
+    Watertight,
+    Psnr(f64),
+}
+
+impl Bar {
+    fn parse(text: &str) -> Result<Bar, Ending> {
+        let bar = match text.split_once('=') {
+            Some(("psnr", db)) => db.parse().ok().filter(|v: &f64| v.is_finite()).map(Bar::Psnr),
+            None if text == "watertight" => Some(Bar::Watertight),
+            _ => None,
+        };
+        bar.ok_or_else(|| {
+            Ending::usage(format!("there is no requirement `{text}`"), "known are watertight and psnr=DB")
+        })
+    }
+
+    fn check(&self, done: &[(&'static str, Done)]) -> Result<(), Ending> {
+        let of = |name: &str| done.iter().find(|(n, _)| *n == name).map(|(_, d)| &d.summary);
+        match self {
+            Bar::Watertight if of("mesh").is_some_and(|m| m["closed"] == true) => Ok(()),
+            Bar::Watertight => Err(Ending::below("the mesh is not watertight", "`tiface check` says where")),
+            Bar::Psnr(bar) => {
+                let metrics = of("metrics").unwrap_or(&Value::Null);
+                let best = ["raycast", "volume"]
+                    .iter()
+                    .filter_map(|m| metrics[m]["head"]["mean"]["psnr_masked"].as_f64())
+                    .fold(f64::NEG_INFINITY, f64::max);
+                if best >= *bar {
+                    return Ok(());
+                }
+                let found = if best.is_finite() { format!("{best:.2} dB") } else { "unknown".into() };
+                Err(Ending::below(
+                    format!("PSNR is {found}, required are {bar} dB"),
+                    "train longer, or lower the bar",
+                ))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn done(summary: Value) -> Done {
+        Done { digest: String::new(), summary, skipped: false }
+    }
+
+    #[test]
+    fn bars_are_parsed_and_missed_with_exit_code_3() {
+        assert_eq!(Bar::parse("psnr=28").unwrap(), Bar::Psnr(28.0));
+        assert_eq!(Bar::parse("psnr=nan").unwrap_err().exit.code(), 2);
+        assert_eq!(Bar::parse("beauty").unwrap_err().exit.code(), 2);
+        let metrics = json!({"raycast": {"head": {"mean": {"psnr_masked": 27.5}}}});
+        let stages = [("mesh", done(json!({"closed": true}))), ("metrics", done(metrics))];
+        assert!(Bar::Watertight.check(&stages).is_ok() && Bar::Psnr(27.0).check(&stages).is_ok());
+        assert_eq!(Bar::Psnr(28.0).check(&stages).unwrap_err().exit.code(), 3);
+        assert_eq!(Bar::Psnr(1.0).check(&[]).unwrap_err().exit.code(), 3);
+    }
+
+    #[test]
+    fn the_judgement_names_what_was_measured() {
+        let lines = judgement(&json!({
+            "raycast": {"head": {"mean": {"psnr_masked": 28.123, "ssim_masked": 0.91}}},
+            "truth_percent_of_head": {"accuracy_mean": 0.312, "accuracy_p90": 0.7},
+        }));
+        assert_eq!(lines.len(), 2);
+        assert!(lines[0].contains("PSNR 28.12 dB, SSIM 0.9100"), "{}", lines[0]);
+        assert!(lines[1].contains("0.312 % of head height"), "{}", lines[1]);
+    }
+}

@@ -1,0 +1,303 @@
+//! The command line: one file per command, named as it is typed. The only module that prints.
+//!
+//! Data goes to stdout, everything else to stderr; the exit code says whether to try again
+//! ([`crate::run::Exit`]).
+
+mod check;
+mod completions;
+mod config;
+mod demo;
+mod ending;
+mod inspect;
+mod line;
+mod options;
+mod screen;
+mod status;
+mod target;
+
+use crate::run::{Exit, Stop};
+use clap::{Args, CommandFactory, Parser, Subcommand};
+use ending::Ending;
+use options::Common;
+use screen::Screen;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+const EXAMPLES: &str = "\
+Examples:
+  tiface demo                                   a head made on the spot, from pictures to mesh
+  tiface inspect captures/002_00                what is in a folder of photographs, and what is wrong
+  tiface run captures/002_00 --preset draft     a first look at your own head, into runs/002_00
+  tiface mesh --format glb,ply --out head.glb   the mesh of the newest run, once more, as a file
+
+Exit codes: 0 done · 1 cannot be done as asked · 2 wrong command line or configuration · 3 below a bar
+you set · 75 not now, try again · 101 a bug · 130, 143 stopped after saving: repeat to continue";
+
+/// Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel views.
+#[derive(Parser, Debug)]
+#[command(name = "tiface", version, max_term_width = 100, after_long_help = EXAMPLES)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    common: Common,
+}
+
+/// What a stage command works on.
+#[derive(Args, Debug)]
+struct Place {
+    /// A capture (a folder of photographs with cameras) or a run; without one, the run in this
+    /// folder, else the newest under runs/
+    #[arg(value_name = "CAPTURE|RUN")]
+    path: Option<PathBuf>,
+}
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Every stage in order, going on where the last command stopped
+    #[command(after_long_help = "Examples:
+  tiface run captures/002_00
+  tiface run captures/002_00 --run /data/002_00 --preset paper --seed 7
+  tiface run runs/002_00 --fresh mesh --set mesh.resolution=1024
+  tiface run captures/002_00 --require psnr=28      exit code 3 if the views are worse than that")]
+    Run {
+        #[command(flatten)]
+        place: Place,
+        /// Exit with 3 below this bar: watertight, psnr=DB (masked, best method); repeatable
+        #[arg(long, value_name = "BAR")]
+        require: Vec<String>,
+    },
+    /// The same on a synthetic head made on the spot: no data, weights or network needed
+    #[command(after_long_help = "Examples:
+  tiface demo
+  tiface demo --set iface.steps=500             a rougher head, sooner
+  tiface demo --run /tmp/demo --out head.glb    somewhere else, and the mesh beside it")]
+    Demo,
+    /// What was found: format, cameras, masks, splits, problems; writes nothing
+    #[command(after_long_help = "Examples:
+  tiface inspect captures/002_00
+  tiface inspect captures/002_00 --set capture.mask_dir=vit_mask
+  tiface inspect captures/002_00 --json | jq .problems")]
+    Inspect {
+        /// A folder of photographs with cameras
+        capture: PathBuf,
+    },
+    /// Stage: which pixels are the head, and where that puts it
+    Mask {
+        #[command(flatten)]
+        place: Place,
+    },
+    /// Stage: learn the signed-distance field
+    #[command(after_long_help = "Examples:
+  tiface iface captures/002_00
+  tiface iface runs/002_00                      go on after a stop
+  tiface iface runs/002_00 --fresh iface --set iface.steps=30000")]
+    Iface {
+        #[command(flatten)]
+        place: Place,
+    },
+    /// Stage: extract the watertight mesh
+    #[command(after_long_help = "Examples:
+  tiface mesh runs/002_00
+  tiface mesh runs/002_00 --out head.glb        the ending picks the format
+  tiface mesh runs/002_00 --fresh mesh --format glb,obj,ply --frame head")]
+    Mesh {
+        #[command(flatten)]
+        place: Place,
+        /// Files to write: glb, obj, ply
+        #[arg(long, value_name = "LIST")]
+        format: Option<String>,
+        /// Coordinates: dataset, or head (+Y up, face towards +Z)
+        #[arg(long, value_name = "FRAME")]
+        frame: Option<String>,
+    },
+    /// Stage: make views by ray casting and by volume rendering
+    #[command(after_long_help = "Examples:
+  tiface render runs/002_00
+  tiface render runs/002_00 --fresh render --cameras orbit --background white --out turn/
+  tiface render runs/002_00 --fresh render --cameras path.json --format exr")]
+    Render {
+        #[command(flatten)]
+        place: Place,
+        /// test, train, orbit, or a file: a nerfstudio camera path or a transforms.json
+        #[arg(long, value_name = "WHICH")]
+        cameras: Option<String>,
+        /// raycast, volume, or both with a comma
+        #[arg(long = "with", value_name = "METHOD")]
+        method: Option<String>,
+        /// png or exr
+        #[arg(long)]
+        format: Option<String>,
+        /// black, white or none
+        #[arg(long)]
+        background: Option<String>,
+    },
+    /// Stage: compare the views with held-out photographs
+    Metrics {
+        #[command(flatten)]
+        place: Place,
+        /// Exit with 3 below this bar: watertight, psnr=DB (masked, best method); repeatable
+        #[arg(long, value_name = "BAR")]
+        require: Vec<String>,
+    },
+    /// Is this mesh sound: watertight, manifold, self-intersections, size
+    #[command(after_long_help = "Examples:
+  tiface check head.glb
+  tiface check scan.obj --require watertight --require one-piece
+  tiface check head.ply --json")]
+    Check {
+        /// A .glb, .obj or .ply file
+        mesh: PathBuf,
+        /// Exit with 3 if it is not: watertight, manifold, one-piece, no-self-intersections; repeatable
+        #[arg(long, value_name = "BAR")]
+        require: Vec<String>,
+    },
+    /// Stages, progress, time left and last error of one or many runs
+    #[command(after_long_help = "Examples:
+  tiface status
+  tiface status runs/002_00
+  tiface status runs/* --json")]
+    Status {
+        /// Run folders; without any, all under runs/
+        runs: Vec<PathBuf>,
+    },
+    /// Print the effective configuration, or explain a key
+    #[command(after_long_help = "Examples:
+  tiface config --preset paper
+  tiface config runs/002_00 --set mesh.resolution=1024
+  tiface config --explain iface.steps           a whole table: --explain mesh")]
+    Config {
+        #[command(flatten)]
+        place: Place,
+        /// Say what a key or a table means, its range and its value in every preset
+        #[arg(long, value_name = "KEY")]
+        explain: Option<String>,
+    },
+    /// Completions for a shell, on stdout
+    Completions {
+        /// bash, zsh, fish, powershell or elvish
+        shell: clap_complete::Shell,
+    },
+}
+
+/// Parses the command line, does what it says, and gives the exit code.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => {
+            // help and version end here too, with 0; a closed stdout is no error
+            let _ = e.print();
+            return ExitCode::from(e.exit_code() as u8);
+        }
+    };
+    let screen = Screen::new(&cli.common);
+    cli.common.log();
+    let stop = Stop::new();
+    let ended = listen(&stop).and_then(|()| cli.run(&screen, &stop));
+    ExitCode::from(match ended {
+        Ok(exit) => exit.code(),
+        Err(ending) => {
+            screen.ending(&ending);
+            ending.exit.code()
+        }
+    })
+}
+
+/// The first Ctrl-C or SIGTERM asks to stop, the second stops at once with the same code.
+fn listen(stop: &Stop) -> Result<(), Ending> {
+    use signal_hook::consts::{SIGINT, SIGTERM};
+    use signal_hook::flag;
+    use std::sync::Arc;
+    use std::sync::atomic::AtomicBool;
+    let asked = Arc::new(AtomicBool::new(false));
+    for (signal, exit) in [(SIGINT, Exit::Interrupted), (SIGTERM, Exit::Terminated)] {
+        let code = exit.code();
+        // handlers run in this order: the first signal finds `asked` still false
+        flag::register_conditional_shutdown(signal, code.into(), asked.clone())
+            .and_then(|_| flag::register(signal, asked.clone()))
+            .and_then(|_| flag::register_usize(signal, stop.cell(), code.into()))
+            .map_err(|e| Ending::cannot(format!("signals cannot be handled: {e}"), ""))?;
+    }
+    Ok(())
+}
+
+impl Cli {
+    fn run(&self, screen: &Screen, stop: &Stop) -> Result<Exit, Ending> {
+        let common = &self.common;
+        // options of one command are keys of the configuration under a shorter name
+        let keys = |pairs: &[(&str, &str, &Option<String>)]| -> Vec<(String, String, String)> {
+            let given = pairs.iter().filter_map(|(option, key, value)| {
+                value.as_ref().map(|v| (format!("{option} {v}"), key.to_string(), v.clone()))
+            });
+            given.collect()
+        };
+        let line = |place: &Place, until: &str, require: &[String], extra: &[_]| {
+            line::go(common, place.path.as_deref(), until, require, extra, screen, stop)
+        };
+        match &self.command {
+            Command::Run { place, require } => line(place, "metrics", require, &[]),
+            Command::Demo => demo::go(common, screen, stop),
+            Command::Inspect { capture } => inspect::go(common, capture),
+            Command::Mask { place } => line(place, "mask", &[], &[]),
+            Command::Iface { place } => line(place, "iface", &[], &[]),
+            Command::Mesh { place, format, frame } => {
+                let extra = keys(&[("--format", "mesh.format", format), ("--frame", "mesh.frame", frame)]);
+                line(place, "mesh", &[], &extra)
+            }
+            Command::Render { place, cameras, method, format, background } => {
+                let extra = keys(&[
+                    ("--cameras", "render.cameras", cameras),
+                    ("--with", "render.method", method),
+                    ("--format", "render.format", format),
+                    ("--background", "render.background", background),
+                ]);
+                line(place, "render", &[], &extra)
+            }
+            Command::Metrics { place, require } => line(place, "metrics", require, &[]),
+            Command::Check { mesh, require } => check::go(common, mesh, require),
+            Command::Status { runs } => status::go(common, runs),
+            Command::Config { place, explain } => {
+                config::go(common, place.path.as_deref(), explain.as_deref())
+            }
+            Command::Completions { shell } => completions::go(*shell, &mut Cli::command()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn options_may_stand_before_and_after_paths() {
+        for words in [
+            ["tiface", "--seed", "7", "run", "captures/a"],
+            ["tiface", "run", "--seed", "7", "captures/a"],
+            ["tiface", "run", "captures/a", "--seed", "7"],
+        ] {
+            let cli = Cli::try_parse_from(words).unwrap();
+            assert_eq!(cli.common.seed, Some(7));
+            assert!(matches!(cli.command, Command::Run { place, .. } if place.path.is_some()));
+        }
+    }
+
+    #[test]
+    fn short_help_fits_one_screen() {
+        let help = Cli::command().render_help().to_string();
+        assert!(help.lines().count() <= 50, "{} lines", help.lines().count());
+    }
+
+    #[test]
+    fn every_command_with_something_to_choose_shows_worked_examples() {
+        for command in Cli::command().get_subcommands() {
+            let shown = command.get_after_long_help().map(|h| h.to_string()).unwrap_or_default();
+            let plain = ["mask", "metrics", "completions"].contains(&command.get_name());
+            assert!(plain || shown.matches("tiface ").count() >= 3, "{}", command.get_name());
+        }
+    }
+}

@@ -1,0 +1,154 @@
+//! The options that every command shares, and the configuration they amount to.
+
+use super::ending::Ending;
+use crate::config::{Config, Preset, Sources};
+use crate::io::{self, Limits};
+use clap::{Args, ValueEnum};
+use std::path::{Path, PathBuf};
+
+/// When to colour messages.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub(super) enum When {
+    #[default]
+    Auto,
+    Always,
+    Never,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(super) enum PresetName {
+    Draft,
+    Standard,
+    Paper,
+}
+
+#[derive(Args, Debug, Default)]
+#[command(next_help_heading = "Options of all commands")]
+pub(super) struct Common {
+    /// The run folder [default: runs/<capture name>]
+    #[arg(short, long, global = true, value_name = "DIR", env = "TIFACE_RUN", hide_env = true)]
+    pub run: Option<PathBuf>,
+    /// Where the product of this command goes as well
+    #[arg(short, long, global = true, value_name = "PATH")]
+    pub out: Option<PathBuf>,
+    /// A configuration file; later ones win
+    #[arg(short, long, global = true, value_name = "FILE", env = "TIFACE_CONFIG", hide_env = true)]
+    pub config: Vec<PathBuf>,
+    /// Starting values
+    #[arg(long, global = true, value_enum, env = "TIFACE_PRESET", hide_env = true)]
+    pub preset: Option<PresetName>,
+    /// Set a key of the configuration; repeatable
+    #[arg(long, global = true, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// auto, cpu, wgpu:N or cuda:N
+    #[arg(long, global = true, env = "TIFACE_DEVICE", hide_env = true)]
+    pub device: Option<String>,
+    /// Start of every random sequence
+    #[arg(long, global = true, env = "TIFACE_SEED", hide_env = true)]
+    pub seed: Option<u64>,
+    /// Recompute a stage and what follows
+    #[arg(long, global = true, value_name = "STAGE")]
+    pub fresh: Option<String>,
+    /// Say what would be done, and do nothing
+    #[arg(long, global = true)]
+    pub dry_run: bool,
+    /// One JSON object per event on stdout
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// Only errors
+    #[arg(short, long, global = true)]
+    pub quiet: bool,
+    /// More about what happens; twice for all
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub verbose: u8,
+    /// Colour in messages
+    #[arg(long, global = true, value_enum, default_value_t, value_name = "WHEN")]
+    pub color: When,
+}
+
+impl Common {
+    /// Sends the library's log to stderr: by `RUST_LOG`, else by `-v`.
+    pub fn log(&self) {
+        use tracing_subscriber::EnvFilter;
+        let level = match (self.quiet, self.verbose) {
+            (true, _) => "error",
+            (_, 0) => "warn",
+            (_, 1) => "info",
+            _ => "debug",
+        };
+        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+        // a second subscriber cannot be set, as in tests; the first one stays
+        let _ = tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_writer(std::io::stderr)
+            .with_ansi(self.colored())
+            .try_init();
+    }
+
+    /// Should messages on stderr be coloured?
+    pub fn colored(&self) -> bool {
+        use std::io::IsTerminal;
+        match self.color {
+            When::Always => true,
+            When::Never => false,
+            When::Auto => {
+                std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()) && std::io::stderr().is_terminal()
+            }
+        }
+    }
+
+    /// `--preset`.
+    pub fn preset(&self) -> Option<Preset> {
+        self.preset.map(|p| match p {
+            PresetName::Draft => Preset::Draft,
+            PresetName::Standard => Preset::Standard,
+            PresetName::Paper => Preset::Paper,
+        })
+    }
+
+    /// The configuration: the user's own file, the run's (`saved`), `--config`, `--set`, options.
+    ///
+    /// `fallback` is the preset where nothing names one. `extra` are options of one command: as
+    /// typed, key, value.
+    pub fn resolve(
+        &self,
+        saved: Option<&Path>,
+        fallback: Option<Preset>,
+        extra: &[(String, String, String)],
+    ) -> Result<Config, Ending> {
+        let mut files = Vec::new();
+        if let Some(own) = own_file().filter(|f| io::is_file(f)) {
+            files.push(own);
+        }
+        // another preset starts over: the values a run remembers would all win against it
+        files.extend(saved.filter(|_| self.preset.is_none()).map(Path::to_path_buf));
+        files.extend(self.config.iter().cloned());
+        let nothing_names_one = files.is_empty() && !self.set.iter().any(|s| s.starts_with("preset"));
+        let mut sources = Sources { set: self.set.clone(), ..Sources::default() };
+        sources.preset = self.preset().or(fallback.filter(|_| nothing_names_one));
+        for file in files {
+            let limits = Limits { file_bytes: 1 << 20, ..Limits::default() };
+            let bytes = io::read_bytes(&file, &limits)
+                .map_err(|e| Ending { exit: crate::run::Exit::Usage, ..e.into() })?;
+            let name = file.display().to_string();
+            let text = String::from_utf8(bytes)
+                .map_err(|_| Ending::usage(format!("`{name}` is not UTF-8"), "save it as UTF-8"))?;
+            sources.files.push((name, text));
+        }
+        if let Some(device) = &self.device {
+            sources.options.push((format!("--device {device}"), "device".into(), device.clone()));
+        }
+        if let Some(seed) = self.seed {
+            sources.options.push((format!("--seed {seed}"), "seed".into(), seed.to_string()));
+        }
+        sources.options.extend_from_slice(extra);
+        Ok(Config::resolve(&sources)?)
+    }
+}
+
+/// `$XDG_CONFIG_HOME/tiface/config.toml`.
+fn own_file() -> Option<PathBuf> {
+    let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let base = set("XDG_CONFIG_HOME").or_else(|| set("HOME").map(|h| h.join(".config")))?;
+    Some(base.join("tiface/config.toml"))
+}

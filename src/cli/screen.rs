@@ -1,0 +1,242 @@
+//! What a person (or a program) sees while stages run.
+
+use super::ending::Ending;
+use super::options::Common;
+use crate::run::{Event, Observer};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde_json::{Map, Value, json};
+use std::io::{IsTerminal, Write};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Shows events: a line that moves on a terminal, else one plain line every 30 s; with `--json` one
+/// object per event on stdout.
+#[derive(Clone)]
+pub(super) struct Screen(Arc<Inner>);
+
+struct Inner {
+    json: bool,
+    quiet: bool,
+    colored: bool,
+    terminal: bool,
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    bar: Option<ProgressBar>,
+    told: Option<Instant>,
+}
+
+const PLAIN: Duration = Duration::from_secs(30);
+const OBJECTS: Duration = Duration::from_secs(1);
+
+impl Screen {
+    pub fn new(common: &Common) -> Screen {
+        Screen(Arc::new(Inner {
+            json: common.json,
+            quiet: common.quiet,
+            colored: common.colored(),
+            terminal: std::io::stderr().is_terminal(),
+            state: Mutex::default(),
+        }))
+    }
+
+    pub fn observer(&self) -> Arc<dyn Observer> {
+        self.0.clone()
+    }
+
+    /// A remark for people.
+    pub fn note(&self, text: &str) {
+        if !self.0.quiet {
+            self.0.line(text);
+        }
+    }
+
+    /// The error and the way out, once.
+    pub fn ending(&self, ending: &Ending) {
+        if self.0.json {
+            let (message, hint) = (&ending.message, &ending.hint);
+            self.0.object(
+                json!({"event": "error", "exit": ending.exit.code(), "message": message, "hint": hint}),
+            );
+        }
+        let paint = |code: &str, word: &str| {
+            if self.0.colored { format!("\x1b[{code}m{word}\x1b[0m") } else { word.to_string() }
+        };
+        let mut text = format!("{}: {}", paint("1;31", "error"), ending.message);
+        if !ending.hint.is_empty() {
+            text += &format!("\n\n{}: {}", paint("1;36", "hint"), ending.hint);
+        }
+        self.0.line(&text);
+    }
+}
+
+impl Inner {
+    /// Above the moving line, if there is one. A closed stderr is nothing to complain about.
+    fn line(&self, text: &str) {
+        let bar = self.state.lock().unwrap_or_else(PoisonError::into_inner).bar.clone();
+        let print = || {
+            let _ = writeln!(std::io::stderr(), "{text}");
+        };
+        match bar {
+            Some(bar) => bar.suspend(print),
+            None => print(),
+        }
+    }
+
+    fn object(&self, value: Value) {
+        // a reader that has gone away does not stop the work
+        let _ = super::ending::say(&format!("{value}\n"));
+    }
+
+    fn begin(&self, stage: &str) {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        state.told = None;
+        if self.terminal && !self.quiet {
+            let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+            let style = ProgressStyle::with_template("{prefix:>8} {spinner} {wide_msg}");
+            bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()));
+            bar.set_prefix(stage.to_string());
+            bar.enable_steady_tick(Duration::from_millis(200));
+            state.bar = Some(bar);
+        }
+    }
+
+    fn end(&self) {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(bar) = state.bar.take() {
+            bar.finish_and_clear();
+        }
+    }
+
+    /// Is it time for the next plain line or object?
+    fn due(&self, every: Duration, last: bool) -> bool {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let due = last || state.told.is_none_or(|t| t.elapsed() >= every);
+        if due {
+            state.told = Some(Instant::now());
+        }
+        due
+    }
+}
+
+impl Observer for Inner {
+    fn event(&self, event: &Event) {
+        match *event {
+            Event::Started { stage } => {
+                self.begin(stage);
+                if self.json {
+                    self.object(json!({"event": "started", "stage": stage}));
+                }
+            }
+            Event::Progress { stage, step, steps, rate, eta_s, values } => {
+                let last = step >= steps;
+                if self.json && self.due(OBJECTS, last) {
+                    let values: Map<String, Value> =
+                        values.iter().map(|(k, v)| (k.to_string(), Value::from(*v))).collect();
+                    self.object(json!({"event": "progress", "stage": stage, "step": step, "steps": steps,
+                        "rate": rate, "eta_s": eta_s, "values": values}));
+                }
+                if self.quiet {
+                    return;
+                }
+                let text = progress(step, steps, rate, eta_s, values);
+                let bar = self.state.lock().unwrap_or_else(PoisonError::into_inner).bar.clone();
+                match bar {
+                    Some(bar) => bar.set_message(text),
+                    None if !self.json && self.due(PLAIN, false) => self.line(&format!("{stage}: {text}")),
+                    None => {}
+                }
+            }
+            Event::Done { stage, elapsed_s, summary } => {
+                self.end();
+                if self.json {
+                    self.object(
+                        json!({"event": "done", "stage": stage, "elapsed_s": elapsed_s, "summary": summary}),
+                    );
+                } else if !self.quiet {
+                    self.line(&format!("{stage}: done in {}", duration(elapsed_s)));
+                }
+            }
+            Event::Skipped { stage } => {
+                if self.json {
+                    self.object(json!({"event": "skipped", "stage": stage}));
+                } else if !self.quiet {
+                    self.line(&format!("{stage}: already done"));
+                }
+            }
+            Event::Warning { stage, text } => {
+                if self.json {
+                    self.object(json!({"event": "warning", "stage": stage, "text": text}));
+                }
+                if !self.quiet {
+                    self.line(&format!("{stage}: warning: {text}"));
+                }
+            }
+        }
+    }
+}
+
+impl Drop for Inner {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+/// `1200/3000  12.4/s  2 min 25 s left  psnr 27.31  inv_s 412`
+fn progress(step: u64, steps: u64, rate: Option<f64>, eta_s: Option<f64>, values: &[(&str, f64)]) -> String {
+    let mut text = format!("{step}/{steps}");
+    if let Some(rate) = rate {
+        text += &format!("  {}/s", figure(rate));
+    }
+    if let Some(eta) = eta_s.filter(|_| step < steps) {
+        text += &format!("  {} left", duration(eta));
+    }
+    for (name, value) in values {
+        text += &format!("  {name} {}", figure(*value));
+    }
+    text
+}
+
+/// Four significant digits.
+pub(super) fn figure(value: f64) -> String {
+    let size = value.abs();
+    if size != 0.0 && size < 1e-3 {
+        format!("{value:.2e}")
+    } else if size < 10.0 {
+        format!("{value:.3}")
+    } else if size < 1000.0 {
+        format!("{value:.1}")
+    } else {
+        format!("{value:.0}")
+    }
+}
+
+/// `8.2 s`, `2 min 25 s`, `3 h 07 min`.
+pub(super) fn duration(seconds: f64) -> String {
+    let s = seconds.max(0.0);
+    let whole = s.round() as u64;
+    match whole {
+        0..10 => format!("{s:.1} s"),
+        10..60 => format!("{whole} s"),
+        60..3600 => format!("{} min {:02} s", whole / 60, whole % 60),
+        _ => format!("{} h {:02} min", whole / 3600, whole % 3600 / 60),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_and_figures_are_short() {
+        assert_eq!(
+            [8.24, 59.6, 145.0, 11_220.0].map(duration),
+            ["8.2 s", "1 min 00 s", "2 min 25 s", "3 h 07 min"]
+        );
+        assert_eq!([0.000123, 0.5, 27.31, 41234.0].map(figure), ["1.23e-4", "0.500", "27.3", "41234"]);
+        let line = progress(1200, 3000, Some(12.4), Some(145.0), &[("psnr", 27.31)]);
+        assert_eq!(line, "1200/3000  12.4/s  2 min 25 s left  psnr 27.3");
+    }
+}

@@ -1,0 +1,122 @@
+//! Which capture and which run a command means.
+
+use super::ending::Ending;
+use super::options::Common;
+use crate::io;
+use std::path::{Path, PathBuf};
+
+/// What a command works on.
+#[derive(Debug, PartialEq)]
+pub(super) struct Target {
+    /// The run folder; need not exist.
+    pub run: PathBuf,
+    /// The capture, absolute; `None` if the run remembers it.
+    pub capture: Option<PathBuf>,
+    /// The run's own configuration, if the command takes it from there.
+    pub saved: Option<PathBuf>,
+    /// Was the run chosen without being named?
+    pub guessed: bool,
+}
+
+const CAPTURE_FILES: [&str; 4] =
+    ["transforms.json", "transforms_train.json", "poses_bounds.npy", "poses_bounds_train.npy"];
+
+impl Target {
+    /// From the path on the command line and `--run`.
+    pub fn find(common: &Common, path: Option<&Path>) -> Result<Target, Ending> {
+        match path {
+            Some(path) if is_run(path) => Ok(Target::run(path.into(), false)),
+            Some(path) => {
+                let capture = io::real_path(path)?;
+                let run = match &common.run {
+                    Some(run) => run.clone(),
+                    None => {
+                        let name = capture.file_name().ok_or_else(|| {
+                            Ending::usage("this capture has no name", "place the run with `--run DIR`")
+                        })?;
+                        Path::new("runs").join(name)
+                    }
+                };
+                Ok(Target { run, capture: Some(capture), saved: None, guessed: false })
+            }
+            None => match &common.run {
+                Some(run) if is_run(run) => Ok(Target::run(run.clone(), false)),
+                Some(run) => Err(Ending::usage(
+                    format!("`{}` is not a run yet, and no capture is named", run.display()),
+                    "name the capture: `tiface run CAPTURE --run DIR`",
+                )),
+                None => guess(Path::new(".")),
+            },
+        }
+    }
+
+    fn run(run: PathBuf, guessed: bool) -> Target {
+        Target { saved: Some(run.join("config.toml")), run, capture: None, guessed }
+    }
+}
+
+/// A run has its configuration; a capture has cameras. A folder with both is a capture.
+fn is_run(path: &Path) -> bool {
+    io::is_file(&path.join("config.toml")) && !CAPTURE_FILES.iter().any(|f| io::is_file(&path.join(f)))
+}
+
+/// The run in `here`, else the one under `here/runs` that was configured last.
+fn guess(here: &Path) -> Result<Target, Ending> {
+    if is_run(here) {
+        return Ok(Target::run(here.into(), true));
+    }
+    let runs = io::list_folders(&here.join("runs"))?;
+    let newest =
+        runs.into_iter().filter(|run| is_run(run)).max_by_key(|run| io::modified(&run.join("config.toml")));
+    match newest {
+        Some(run) => Ok(Target::run(run, true)),
+        None => Err(Ending::usage(
+            "no capture or run is named, this folder is no run, and there is none under `runs/`",
+            "name a capture: `tiface run CAPTURE`, or try `tiface demo`",
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    #[test]
+    fn a_capture_gets_its_run_under_runs_and_a_run_remembers_its_capture() {
+        let dir = tempfile::tempdir().unwrap();
+        let capture = dir.path().join("002_00");
+        fs::create_dir(&capture).unwrap();
+        let t = Target::find(&Common::default(), Some(&capture)).unwrap();
+        assert_eq!((t.run, t.saved), (PathBuf::from("runs/002_00"), None));
+        assert_eq!(t.capture, Some(fs::canonicalize(&capture).unwrap()));
+        fs::write(capture.join("config.toml"), "").unwrap();
+        let t = Target::find(&Common::default(), Some(&capture)).unwrap();
+        assert_eq!((t.run.clone(), t.capture), (capture.clone(), None));
+        assert!(t.saved.is_some());
+        // a capture in which someone keeps a config.toml stays a capture
+        fs::write(capture.join("transforms.json"), "{}").unwrap();
+        assert!(Target::find(&Common::default(), Some(&capture)).unwrap().capture.is_some());
+    }
+
+    #[test]
+    fn the_newest_run_is_guessed_and_none_is_a_usage_error() {
+        let dir = tempfile::tempdir().unwrap();
+        assert_eq!(guess(dir.path()).unwrap_err().exit.code(), 2);
+        for name in ["a", "b"] {
+            let run = dir.path().join("runs").join(name);
+            fs::create_dir_all(&run).unwrap();
+            fs::write(run.join("config.toml"), "").unwrap();
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+        fs::write(dir.path().join("runs/a/config.toml"), "x").unwrap();
+        let t = guess(dir.path()).unwrap();
+        assert_eq!((t.run, t.guessed), (dir.path().join("runs/a"), true));
+    }
+
+    #[test]
+    fn a_missing_capture_is_named() {
+        let e = Target::find(&Common::default(), Some(Path::new("no/such/capture"))).unwrap_err();
+        assert!(e.message.contains("no/such/capture") && e.exit.code() == 1, "{e:?}");
+    }
+}

@@ -1,0 +1,172 @@
+//! Rendered views as files, and back.
+
+use crate::config::{Background, PictureFormat};
+use crate::image::{Gray, Image, Photo, linear_from_srgb, quantise, srgb_from_linear};
+use crate::io::{self, Limits, ReadError, WriteError};
+use crate::render::RenderedView;
+use std::path::{Path, PathBuf};
+
+/// Colour behind the head, sRGB-coded; `None` leaves alpha.
+pub(super) fn behind(background: Background) -> Option<[f32; 3]> {
+    match background {
+        Background::Black => Some([0.0; 3]),
+        Background::White => Some([1.0; 3]),
+        Background::None => None,
+    }
+}
+
+/// The file of a view: `folder/NAME.png` or `.exr`.
+pub(super) fn path(folder: &Path, name: &str, format: PictureFormat) -> PathBuf {
+    let ending = match format {
+        PictureFormat::Png => "png",
+        PictureFormat::Exr => "exr",
+    };
+    folder.join(format!("{name}.{ending}"))
+}
+
+/// Puts coded colour over a background: the result is opaque.
+pub(super) fn over(view: &mut RenderedView, background: [f32; 3]) {
+    for p in view.color.data.as_chunks_mut::<4>().0 {
+        let open = 1.0 - p[3];
+        *p = [p[0] + open * background[0], p[1] + open * background[1], p[2] + open * background[2], 1.0];
+    }
+}
+
+/// Writes a view. PNG: 8-bit sRGB with straight alpha, and depth beside it in `depth/`, 16-bit
+/// millimetres, 0 = nothing. EXR: scene-linear, premultiplied, with `Z` and `N.X N.Y N.Z`.
+pub(super) fn write(
+    folder: &Path,
+    name: &str,
+    view: &RenderedView,
+    format: PictureFormat,
+    unit_m: f64,
+) -> Result<(), WriteError> {
+    let file = path(folder, name, format);
+    io::create_folder(file.parent().unwrap_or(folder))?;
+    let (w, h) = (view.color.width, view.color.height);
+    let pixels = view.color.data.as_chunks::<4>().0;
+    match format {
+        PictureFormat::Png => {
+            let rgba: Vec<[u8; 4]> = pixels.iter().map(|&p| straight(p).map(quantise)).collect();
+            io::write_png_rgba(&file, w, h, &rgba)?;
+            let depth = path(&folder.join("depth"), name, format);
+            io::create_folder(depth.parent().unwrap_or(folder))?;
+            let mm = |z: &f32| (*z as f64 * unit_m * 1000.0).round().clamp(0.0, 65_535.0) as u16;
+            let mm: Vec<u16> = view.depth.data.iter().map(mm).collect();
+            io::write_png_gray16(&depth, w, h, &mm)
+        }
+        PictureFormat::Exr => {
+            let linear: Vec<[f32; 4]> = pixels
+                .iter()
+                .map(|&p| {
+                    let [r, g, b, a] = straight(p);
+                    [linear_from_srgb(r) * a, linear_from_srgb(g) * a, linear_from_srgb(b) * a, a]
+                })
+                .collect();
+            let of = |k: usize| linear.iter().map(|p| p[k]).collect::<Vec<f32>>();
+            let normal = |k: usize| view.normal.data.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>();
+            let (r, g, b, a) = (of(0), of(1), of(2), of(3));
+            let (x, y, z) = (normal(0), normal(1), normal(2));
+            let channels: [(&str, &[f32]); 8] = [
+                ("R", &r),
+                ("G", &g),
+                ("B", &b),
+                ("A", &a),
+                ("Z", &view.depth.data),
+                ("N.X", &x),
+                ("N.Y", &y),
+                ("N.Z", &z),
+            ];
+            io::write_exr(&file, w, h, &channels)
+        }
+    }
+}
+
+/// Coded colour no longer multiplied by alpha.
+fn straight([r, g, b, a]: [f32; 4]) -> [f32; 4] {
+    let k = if a > 0.0 { 1.0 / a } else { 0.0 };
+    [r * k, g * k, b * k, a]
+}
+
+/// Reads a view as it was written: RGBA, coded colour premultiplied over black.
+pub(super) fn read(file: &Path, format: PictureFormat) -> Result<Image, ReadError> {
+    let limits = Limits::default();
+    match format {
+        PictureFormat::Png => {
+            let photo = io::read_photo(file, None, &limits)?.photo;
+            let mut image = Image::new(photo.width, photo.height, 4);
+            for (i, p) in image.data.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+                let a = photo.alpha.as_ref().map_or(1.0, |a| a[i] as f32 / 255.0);
+                let [r, g, b] = photo.rgb[i].map(|v| v as f32 / 255.0 * a);
+                *p = [r, g, b, a];
+            }
+            Ok(image)
+        }
+        PictureFormat::Exr => {
+            let mut image = io::read_exr_channels(file, &[&["R", "G", "B", "A"]], &limits)?.image;
+            for p in image.data.as_chunks_mut::<4>().0 {
+                let [r, g, b, a] = straight(*p);
+                let coded = [r, g, b].map(|v| srgb_from_linear(v) * a);
+                *p = [coded[0], coded[1], coded[2], a];
+            }
+            Ok(image)
+        }
+    }
+}
+
+/// The photograph as the render should look: cut out by its mask and laid over the same
+/// background. Without a mask it stays as it is.
+pub(super) fn expected(photo: &Photo, mask: Option<&Gray>, background: Background) -> Photo {
+    let Some(mask) = mask else { return photo.clone() };
+    let behind = behind(background).unwrap_or([0.0; 3]);
+    let mix = |c: u8, b: f32, m: u8| {
+        let a = m as f32 / 255.0;
+        quantise(a * c as f32 / 255.0 + (1.0 - a) * b)
+    };
+    let rgb = photo
+        .rgb
+        .iter()
+        .zip(&mask.values)
+        .map(|(p, &m)| [mix(p[0], behind[0], m), mix(p[1], behind[1], m), mix(p[2], behind[2], m)])
+        .collect();
+    Photo { rgb, alpha: None, ..photo.clone() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_view_comes_back_from_png_and_exr_to_within_a_byte() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut view = RenderedView {
+            color: Image::new(2, 1, 4),
+            depth: Image::new(2, 1, 1),
+            normal: Image::new(2, 1, 3),
+        };
+        // half covered, straight colour (0.8, 0.4, 0.2); the other pixel empty
+        view.color.pixel_mut(0, 0).copy_from_slice(&[0.4, 0.2, 0.1, 0.5]);
+        view.depth.pixel_mut(0, 0)[0] = 1.234;
+        for format in [PictureFormat::Png, PictureFormat::Exr] {
+            write(dir.path(), "left/a", &view, format, 1.0).unwrap();
+            let back = read(&path(dir.path(), "left/a", format), format).unwrap();
+            for (a, b) in back.data.iter().zip(&view.color.data) {
+                assert!((a - b).abs() < 1.0 / 255.0, "{:?}", back.data);
+            }
+        }
+        // EXR: linear and premultiplied, 0.5 · linear(0.8) = 0.5 · 0.6038
+        let file = path(dir.path(), "left/a", PictureFormat::Exr);
+        let red = io::read_exr_channels(&file, &[&["R", "Z"]], &Limits::default()).unwrap().image;
+        assert!((red.data[0] - 0.3019).abs() < 1e-3 && (red.data[1] - 1.234).abs() < 1e-6);
+        assert!(dir.path().join("depth/left/a.png").is_file());
+    }
+
+    #[test]
+    fn a_photograph_is_laid_over_the_background_by_its_mask() {
+        let photo = Photo { width: 2, height: 1, rgb: vec![[200; 3], [200; 3]], alpha: None };
+        let mask = Gray { width: 2, height: 1, values: vec![255, 51] };
+        // 51/255 = 0.2: 0.2 · 200 = 40 over black, 40 + 0.8 · 255 = 244 over white
+        assert_eq!(expected(&photo, Some(&mask), Background::None).rgb, [[200; 3], [40; 3]]);
+        assert_eq!(expected(&photo, Some(&mask), Background::White).rgb, [[200; 3], [244; 3]]);
+    }
+}
