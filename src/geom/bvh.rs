@@ -245,8 +245,26 @@ impl Bvh {
         }
     }
 
-    /// Traversal, nearest child first. `ANY` stops at the first hit.
+    /// Traversal with the best instructions this machine has. The arithmetic is the same, without
+    /// fused multiply-add, so the answers are too.
     fn cast<const ANY: bool>(&self, ray: &Ray) -> Option<Hit> {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("bmi1") {
+            // SAFETY: the machine has both features, asked just above.
+            return unsafe { self.cast_avx2::<ANY>(ray) };
+        }
+        self.walk::<ANY>(ray)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2,bmi1")]
+    fn cast_avx2<const ANY: bool>(&self, ray: &Ray) -> Option<Hit> {
+        self.walk::<ANY>(ray)
+    }
+
+    /// Nearest child first. `ANY` stops at the first hit.
+    #[inline(always)]
+    fn walk<const ANY: bool>(&self, ray: &Ray) -> Option<Hit> {
         let sane = ray.origin.is_finite() && ray.direction.is_finite() && ray.direction != Vec3::ZERO;
         if self.is_empty() || !sane {
             return None;
