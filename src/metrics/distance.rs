@@ -82,7 +82,7 @@ pub fn sample(mesh: &Mesh, count: usize) -> Vec<Vec3> {
             total
         })
         .collect();
-    if !(total > 0.0) {
+    if total <= 0.0 {
         return Vec::new();
     }
     let point = |i: usize| {
