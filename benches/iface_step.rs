@@ -273,7 +273,7 @@ fn main() {
         [t(i.table.clone()), t(vec![0.0; 2 * entries]), t(vec![0.0; 2 * entries])]
     };
     let flat: Tensor<1> = field::tensor(i.flat.clone(), [i.flat.len()], &device).autodiff().require_grad();
-    let mut time = |name: &str, repeat: usize, run: &mut dyn FnMut()| -> f64 {
+    let time = |name: &str, repeat: usize, run: &mut dyn FnMut()| -> f64 {
         run();
         let start = cpu_s();
         (0..repeat).for_each(|_| run());
