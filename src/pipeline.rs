@@ -152,8 +152,13 @@ impl<'a> Line<'a> {
         STAGES.iter().map(|name| look(name)).collect()
     }
 
-    /// Writes the complete configuration into the run: what repeats it.
-    pub fn remember(&self) -> Result<(), PipelineError> {
+    /// Writes the complete configuration into the run: what repeats it. Refused, before anything is
+    /// changed, if a stage up to `until` was made or begun with other settings.
+    pub fn remember(&self, until: &str) -> Result<(), PipelineError> {
+        let last = STAGES.iter().position(|s| *s == until).unwrap_or(STAGES.len() - 1);
+        for name in &STAGES[..=last] {
+            self.run.agrees(&self.plan(name))?;
+        }
         Ok(self.run.write("config.toml", self.config.to_toml().as_bytes())?)
     }
 
@@ -689,7 +694,7 @@ mod tests {
         config.render.background = Background::None;
         let run = Run::open(&dir.path().join("run"), Stop::new(), Arc::new(Quiet));
         let line = Line::open(&config, &run, true).unwrap();
-        line.remember().unwrap();
+        line.remember("metrics").unwrap();
         assert_eq!(line.mask().unwrap().summary["masks"], 14);
         let scene = line.scene().unwrap();
         let exact = Exact { world_from_scene: scene.scene_from_world.inverse() };

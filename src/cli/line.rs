@@ -62,7 +62,7 @@ impl Work<'_> {
         if let Some(fresh) = &self.common.fresh {
             run.fresh(fresh, STAGES)?;
         }
-        line.remember()?;
+        line.remember(self.until)?;
         let done = reconstruct(&line, self.until)?;
         if let Some(out) = &self.common.out {
             self.copy(&line, &run, out)?;

@@ -124,6 +124,16 @@ impl Run {
         }
     }
 
+    /// Was what lies in the stage's folder made, or begun, with this plan? An error that prints the
+    /// differences if not; an empty folder agrees with everything.
+    pub fn agrees(&self, plan: &Plan) -> Result<(), RunError> {
+        // a record that cannot be read counts as none, and is told when the stage is worked on
+        if let Ok(Some(record)) = read_record(&self.path(plan.name)) {
+            return same(plan, &record.fingerprint, true);
+        }
+        self.begun(plan).map(|_| ())
+    }
+
     /// The finished stage, if its record is there and fits.
     fn complete(&self, plan: &Plan) -> Result<Option<Done>, RunError> {
         let record = match read_record(&self.path(plan.name)) {
@@ -134,10 +144,7 @@ impl Run {
             }
         };
         let Some(Record { fingerprint, digest, summary, .. }) = record else { return Ok(None) };
-        let differences = plan.fingerprint.differences(&fingerprint);
-        if !differences.is_empty() {
-            return Err(RunError::Changed { stage: plan.name.into(), done: true, differences });
-        }
+        same(plan, &fingerprint, true)?;
         self.observer.event(&Event::Skipped { stage: plan.name });
         Ok(Some(Done { digest, summary, skipped: true }))
     }
@@ -145,10 +152,7 @@ impl Run {
     /// Seconds of work an earlier process left in the folder; an error if it had other settings.
     fn begun(&self, plan: &Plan) -> Result<f64, RunError> {
         let Ok(Some(status)) = read_status(&self.path(plan.name)) else { return Ok(0.0) };
-        let differences = plan.fingerprint.differences(&status.fingerprint);
-        if !differences.is_empty() {
-            return Err(RunError::Changed { stage: plan.name.into(), done: false, differences });
-        }
+        same(plan, &status.fingerprint, false)?;
         Ok(status.elapsed_s)
     }
 
@@ -173,6 +177,14 @@ impl Run {
         self.observer.event(&Event::Done { stage: plan.name, elapsed_s, summary: &summary });
         Ok(Done { digest, summary, skipped: false })
     }
+}
+
+fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<(), RunError> {
+    let differences = plan.fingerprint.differences(found);
+    if differences.is_empty() {
+        return Ok(());
+    }
+    Err(RunError::Changed { stage: plan.name.into(), done, differences })
 }
 
 /// Removes half-written files in a stage's folder and the folders directly in it.
@@ -244,6 +256,8 @@ mod tests {
         let error = run.stage(plan(7), never).unwrap_err();
         assert_eq!(error.exit(), Exit::Cannot);
         assert!(error.to_string().contains("iface.steps: was 5, is 7"), "{error}");
+        assert_eq!(run.agrees(&plan(7)).unwrap_err().to_string(), error.to_string());
+        assert!(run.agrees(&plan(5)).is_ok());
         assert!(error.hint().contains("--fresh iface"));
         fs::create_dir(dir.path().join("mesh")).unwrap();
         fs::write(dir.path().join("mesh/head.glb"), b"old").unwrap();

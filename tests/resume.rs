@@ -1,0 +1,153 @@
+//! Stop and kill at any moment, repeat the command: the result is the one of an undisturbed run.
+#![cfg(all(feature = "cpu", unix))]
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+
+/// Small enough for seconds, large enough that every stage can be hit.
+const SETTINGS: [&str; 12] = [
+    "iface.steps=150",
+    "iface.rays=256",
+    "iface.max_rays=512",
+    "iface.samples=4096",
+    "iface.levels=6",
+    "iface.log2_table=12",
+    "iface.occupancy_resolution=32",
+    "iface.checkpoint_s=1",
+    "mesh.resolution=64",
+    "mesh.format=glb,obj",
+    "render.samples=1",
+    "device=cpu",
+];
+
+fn capture(folder: &Path) -> PathBuf {
+    let path = folder.join("head");
+    let options = SyntheticOptions { width: 64, height: 80, train: 8, test: 2, seed: 3 };
+    write_capture(&path, &options).unwrap();
+    path
+}
+
+fn start(capture: &Path, run: &Path) -> Child {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tiface"));
+    command.arg("run").arg(capture).arg("--run").arg(run).args(["--preset", "draft", "--quiet"]);
+    for setting in SETTINGS {
+        command.args(["--set", setting]);
+    }
+    command.env("XDG_CONFIG_HOME", run).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
+}
+
+fn finish(child: Child) -> (i32, String) {
+    let output = child.wait_with_output().unwrap();
+    (output.status.code().unwrap_or(-1), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+/// The stages' own files with their bytes; what tells when things happened is left out.
+fn products(run: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    fn walk(folder: &Path, found: &mut Vec<PathBuf>) {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() { walk(&path, found) } else { found.push(path) }
+        }
+    }
+    let mut files = Vec::new();
+    for stage in ["mask", "mesh", "render", "metrics"] {
+        walk(&run.join(stage), &mut files);
+    }
+    files.push(run.join("config.toml"));
+    files.push(run.join("cameras.json"));
+    let timed = ["done.json", "status.json", "log.jsonl", ".lock"];
+    files.retain(|f| !timed.contains(&f.file_name().unwrap().to_str().unwrap()));
+    files.sort();
+    files.into_iter().map(|f| (f.strip_prefix(run).unwrap().into(), std::fs::read(&f).unwrap())).collect()
+}
+
+fn assert_same(a: &Path, b: &Path) {
+    let (a, b) = (products(a), products(b));
+    let names = |p: &[(PathBuf, Vec<u8>)]| p.iter().map(|(n, _)| n.clone()).collect::<Vec<_>>();
+    assert_eq!(names(&a), names(&b));
+    for ((name, ours), (_, theirs)) in a.iter().zip(&b) {
+        assert!(ours == theirs, "{} differs", name.display());
+    }
+}
+
+#[test]
+fn killed_again_and_again_the_run_ends_with_the_same_bytes() {
+    let dir = tempfile::tempdir().unwrap();
+    let capture = capture(dir.path());
+    let (calm, hunted) = (dir.path().join("calm"), dir.path().join("hunted"));
+    let begin = Instant::now();
+    let (code, text) = finish(start(&capture, &calm));
+    assert_eq!(code, 0, "{text}");
+    let whole = begin.elapsed();
+
+    // moments spread over the run, by a fixed sequence; each attempt gets a little farther in the
+    // end, since the time allowed grows
+    let (mut attempts, mut killed) = (0u32, 0);
+    loop {
+        let mut child = start(&capture, &hunted);
+        let share = (attempts as f64 * 0.618_034).fract() * 0.8 + 0.05 * attempts as f64;
+        let until = Instant::now() + whole.mul_f64(share).max(Duration::from_millis(20));
+        let ended = loop {
+            if let Some(status) = child.try_wait().unwrap() {
+                break Some(status);
+            }
+            if Instant::now() >= until {
+                child.kill().unwrap(); // SIGKILL: nothing is saved, nothing is cleaned up
+                break None;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        };
+        let (_, text) = finish(child);
+        attempts += 1;
+        match ended {
+            None => killed += 1,
+            Some(status) if status.success() => break,
+            Some(status) => panic!("attempt {attempts} ended with {status}: {text}"),
+        }
+        assert!(attempts < 60, "the run never ends");
+    }
+    eprintln!("killed {killed} times in a run of {:.1} s", whole.as_secs_f64());
+    assert!(killed >= 2, "the test killed nothing");
+    assert_same(&calm, &hunted);
+
+    // done is done: nothing is touched, and it is quick
+    let begin = Instant::now();
+    assert_eq!(finish(start(&capture, &hunted)).0, 0);
+    assert!(begin.elapsed() < whole.max(Duration::from_secs(2)));
+    assert_same(&calm, &hunted);
+}
+
+#[test]
+fn a_signal_saves_and_names_itself_in_the_exit_code_and_two_processes_do_not_share_a_stage() {
+    let dir = tempfile::tempdir().unwrap();
+    let capture = capture(dir.path());
+    let run = dir.path().join("run");
+    let mut signalled = 0;
+    for (signal, expected) in [("TERM", 143), ("INT", 130)] {
+        let child = start(&capture, &run);
+        // wait until training is under way
+        let status = run.join("iface/status.json");
+        let begin = Instant::now();
+        while !status.is_file() && begin.elapsed() < Duration::from_secs(60) {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let (second, text) = finish(start(&capture, &run));
+        assert!(second == 75 || second == 0, "{second}: {text}");
+        let pid = child.id().to_string();
+        Command::new("kill").args([&format!("-{signal}"), &pid]).status().unwrap();
+        let asked = Instant::now();
+        let (code, text) = finish(child);
+        assert!(asked.elapsed() < Duration::from_secs(10), "stopping took too long");
+        if code == 0 {
+            continue; // it was faster than the signal
+        }
+        assert_eq!(code, expected, "{text}");
+        assert!(!run.join("metrics/done.json").exists());
+        signalled += 1;
+    }
+    assert!(signalled >= 1, "both runs ended before the signal");
+    assert_eq!(finish(start(&capture, &run)).0, 0);
+    assert!(run.join("metrics/done.json").is_file());
+}
