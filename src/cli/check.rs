@@ -1,29 +1,121 @@
-//! `tiface check`: is a mesh sound?
+//! `tiface check`: is a mesh sound, and how far is it from another?
 
 use super::ending::{Ending, say};
 use super::options::Common;
+use crate::capture::{self, CaptureOptions, Split};
+use crate::geom::{Bvh, Camera, Mesh};
 use crate::io::{self, Limits};
-use crate::mesh::check::{RequireError, check};
+use crate::mesh::check::{CheckReport, RequireError, check};
 use crate::mesh::read::read;
+use crate::metrics::distance::{Distances, one_way, seen_one_way};
 use crate::run::Exit;
+use serde::Serialize;
+use std::fmt::{self, Display};
 use std::path::Path;
 
-pub(super) fn go(common: &Common, path: &Path, require: &[String]) -> Result<Exit, Ending> {
-    let config = common.resolve(None, None, &[])?;
+/// Points spread over each surface.
+const POINTS: usize = 200_000;
+
+/// How far the mesh is from another surface, millimetres.
+#[derive(Serialize)]
+struct Against {
+    /// From every part of the mesh, caps included.
+    whole: Millimetres,
+    /// From what three or more training cameras see, and that part's share of the area.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    seen: Option<(Millimetres, f64)>,
+    /// From the other surface to the mesh: what is missed.
+    back: Millimetres,
+}
+
+#[derive(Serialize)]
+struct Millimetres {
+    mean: f64,
+    median: f64,
+    p90: f64,
+    max: f64,
+}
+
+impl Millimetres {
+    fn new(d: Distances, unit_m: f64) -> Millimetres {
+        let mm = |v: f64| 1e3 * unit_m * v;
+        Millimetres { mean: mm(d.mean), median: mm(d.median), p90: mm(d.p90), max: mm(d.max) }
+    }
+}
+
+impl Display for Millimetres {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Millimetres { mean, median, p90, max } = self;
+        write!(f, "mean {mean:.3}, median {median:.3}, 90 % below {p90:.3}, worst {max:.2} mm")
+    }
+}
+
+impl Display for Against {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "distance to the other   {}", self.whole)?;
+        if let Some((seen, share)) = &self.seen {
+            writeln!(f, "  where 3 cameras look  {seen} ({:.0} % of the area)", 100.0 * share)?;
+        }
+        writeln!(f, "distance back           {}", self.back)
+    }
+}
+
+#[derive(Serialize)]
+struct Whole<'a> {
+    #[serde(flatten)]
+    report: &'a CheckReport,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    against: Option<&'a Against>,
+}
+
+fn load(path: &Path) -> Result<Mesh, Ending> {
     let bytes = io::read_bytes(path, &Limits::default())?;
-    let mesh = read(&bytes, path).map_err(|e| Ending::cannot(e.to_string(), e.hint()))?;
-    let report = check(&mesh, config.capture.unit_m);
+    read(&bytes, path).map_err(|e| Ending::cannot(e.to_string(), e.hint()))
+}
+
+pub(super) fn go(
+    common: &Common,
+    path: &Path,
+    require: &[String],
+    against: Option<&Path>,
+    seen_by: Option<&Path>,
+) -> Result<Exit, Ending> {
+    let config = common.resolve(None, None, &[])?;
+    let mesh = load(path)?;
+    let unit_m = config.capture.unit_m;
+    let report = check(&mesh, unit_m);
     let bars: Vec<&str> = require.iter().map(String::as_str).collect();
     let passed = report.require(&bars);
     if let Err(e @ RequireError::Unknown { .. }) = &passed {
         return Err(Ending::usage(e.to_string(), e.hint()));
     }
+    let against = against.map(|other| compare(&mesh, other, seen_by, unit_m)).transpose()?;
     let text = if common.json {
-        format!("{}\n", serde_json::to_string(&report).unwrap_or_default())
+        let whole = Whole { report: &report, against: against.as_ref() };
+        format!("{}\n", serde_json::to_string(&whole).unwrap_or_default())
     } else {
-        format!("{report}\n")
+        format!("{report}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
     };
     say(&text)?;
     passed.map_err(|e| Ending::below(e.to_string(), e.hint()))?;
     Ok(Exit::Done)
+}
+
+fn compare(mesh: &Mesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Result<Against, Ending> {
+    let truth = load(other)?;
+    let empty = |e: &Path| Ending::cannot(format!("`{}` has no surface to measure", e.display()), "");
+    let bvh = Bvh::new(&truth);
+    let mm = |d| Millimetres::new(d, unit_m);
+    let whole = one_way(mesh, &bvh, POINTS, |_| true).ok_or_else(|| empty(other))?;
+    let back = one_way(&truth, &Bvh::new(mesh), POINTS, |_| true).ok_or_else(|| empty(other))?;
+    let seen = match seen_by {
+        None => None,
+        Some(root) => {
+            let capture = capture::open(root, &CaptureOptions::default())
+                .map_err(|e| Ending::cannot(e.to_string(), e.hint()))?;
+            let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
+            seen_one_way(mesh, &bvh, POINTS, &cameras, 3).map(|(d, share)| (mm(d), share))
+        }
+    };
+    Ok(Against { whole: mm(whole), seen, back: mm(back) })
 }

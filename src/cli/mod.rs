@@ -144,13 +144,20 @@ enum Command {
     #[command(after_long_help = "Examples:
   tiface check head.glb
   tiface check scan.obj --require watertight --require one-piece
-  tiface check head.ply --json")]
+  tiface check head.ply --json
+  tiface check runs/lps/mesh/head.ply --against captures/lps/gt.ply --seen-by captures/lps")]
     Check {
         /// A .glb, .obj or .ply file
         mesh: PathBuf,
         /// Exit with 3 if it is not: watertight, manifold, one-piece, no-self-intersections; repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
+        /// Also the distance to this surface, in the same coordinates (so a PLY: a GLB is turned +Y up)
+        #[arg(long, value_name = "MESH")]
+        against: Option<PathBuf>,
+        /// ... and the distance over the part that three or more of this capture's training cameras see
+        #[arg(long, value_name = "CAPTURE", requires = "against")]
+        seen_by: Option<PathBuf>,
     },
     /// Stages, progress, time left and last error of one or many runs
     #[command(after_long_help = "Examples:
@@ -254,7 +261,9 @@ impl Cli {
                 line(place, "render", &[], &extra)
             }
             Command::Metrics { place, require } => line(place, "metrics", require, &[]),
-            Command::Check { mesh, require } => check::go(common, mesh, require),
+            Command::Check { mesh, require, against, seen_by } => {
+                check::go(common, mesh, require, against.as_deref(), seen_by.as_deref())
+            }
             Command::Status { runs } => status::go(common, runs),
             Command::Config { place, explain } => {
                 config::go(common, place.path.as_deref(), explain.as_deref())
