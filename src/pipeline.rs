@@ -352,11 +352,14 @@ impl<'a> Line<'a> {
                 let directions: Vec<Vec3> = normals.iter().map(|n| -*n).collect();
                 field.color(points, &directions)
             };
+            // below the frames' border the surface is a guess: close the mesh where enough cameras look
+            let cameras: Vec<Camera> = self.capture.split(Split::Train).map(|v| v.camera.clone()).collect();
+            let kept = capture::well_seen(&scene, &cameras);
             let extracted = mesh::extract(
                 |p: &[Vec3]| field.sdf(p),
                 |p: &[Vec3]| field.sdf_gradient(p),
                 color,
-                scene.aabb,
+                kept,
                 inside_hull,
                 &config,
                 stage.monitor(),

@@ -16,10 +16,12 @@ mod pose;
 pub mod scene;
 pub mod synthetic;
 mod transforms;
+mod well_seen;
 
 pub use error::CaptureError;
 pub use load::LoadedView;
 pub use masks::{coverage, findings};
+pub use well_seen::well_seen;
 
 use crate::geom::Camera;
 use crate::io::{self, Limits, PictureInfo, Turn};

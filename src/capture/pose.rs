@@ -21,7 +21,7 @@ pub(super) fn orthonormal(m: DMat3) -> Result<DMat3, String> {
     let lengths = [m.x_axis.length(), m.y_axis.length(), m.z_axis.length()];
     let determinant = m.determinant();
     let volume = lengths[0] * lengths[1] * lengths[2];
-    if !(volume > 1e-30) || determinant.abs() < 1e-6 * volume {
+    if volume <= 1e-30 || determinant.abs() < 1e-6 * volume {
         return Err("its rotation is singular: it flattens space".into());
     }
     if determinant < 0.0 {

@@ -318,7 +318,7 @@ fn aim(cameras: &[&Camera], rays: &[(DVec3, DVec3)]) -> Result<DVec3, SceneError
     let alike = |how| SceneError::CamerasAlike { cameras: n, how };
     let mean = cameras.iter().map(|c| c.position).sum::<DVec3>() / n as f64;
     let spread = cameras.iter().map(|c| c.position.distance(mean)).fold(0.0, f64::max);
-    if !(spread > 1e-9 * (1.0 + mean.length())) {
+    if spread <= 1e-9 * (1.0 + mean.length()) {
         return Err(alike("stand at one place"));
     }
     let center = carve::meeting_point(rays).ok_or_else(|| alike("look in one direction"))?;

@@ -227,7 +227,7 @@ fn lens(top: &Object, entry: &Object, ignored: &mut Vec<String>) -> Result<Lens,
     let either = |key: &str| Ok::<_, String>(number(entry, key)?.or(number(top, key)?));
     let side = |key: &str| match either(key)? {
         None => Ok(None),
-        Some(v) if v.fract() == 0.0 && v >= 1.0 && v <= 1e6 => Ok(Some(v as u32)),
+        Some(v) if v.fract() == 0.0 && (1.0..=1e6).contains(&v) => Ok(Some(v as u32)),
         Some(v) => Err(format!("`{key}` is {v}, not a whole number of pixels")),
     };
     let fisheye = [entry, top].iter().any(|o| o.get("is_fisheye").and_then(Value::as_bool) == Some(true));

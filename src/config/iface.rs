@@ -22,6 +22,16 @@ pub enum Background {
     Random,
 }
 
+/// What a pixel with a soft mask should look like over black.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Foreground {
+    /// Alpha times the photograph, stage light included (published).
+    Photo,
+    /// The photograph less the stage's light, estimated from pixels nearby.
+    Estimated,
+}
+
 /// Where the surface starts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -112,6 +122,8 @@ pub struct IfaceConfig {
     pub jitter: bool,
     /// What is behind the head while training.
     pub background: Background,
+    /// What a pixel with a soft mask should look like.
+    pub foreground: Foreground,
     /// Seconds between checkpoints.
     pub checkpoint_s: f64,
 }
@@ -158,6 +170,7 @@ impl IfaceConfig {
             samples_per_ray: 1024,
             jitter: true,
             background: Background::Random,
+            foreground: Foreground::Estimated,
             checkpoint_s: 60.0,
         }
     }
@@ -216,6 +229,7 @@ impl IfaceConfig {
             samples_per_ray: 1024,
             jitter: false,
             background: Background::Black,
+            foreground: Foreground::Photo,
             checkpoint_s: 120.0,
         }
     }

@@ -50,6 +50,10 @@ pub(super) const KEYS: &[Key] = &[
     Key::number("samples_per_ray", "Steps across the box's diagonal (nerfacc rule).", 1.0, 65_536.0),
     Key::word("jitter", "Shift each ray's samples by a random part of a step: true or false."),
     Key::word("background", "Behind the head while training: black, or random (one colour per ray)."),
+    Key::word(
+        "foreground",
+        "Soft pixels over black: photo (alpha times it), or estimated (stage light taken out).",
+    ),
     Key::number("checkpoint_s", "Seconds between checkpoints.", 1.0, 86_400.0),
 ];
 

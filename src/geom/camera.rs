@@ -55,7 +55,7 @@ impl Distortion {
             let xy = x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y;
             let yy = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x;
             let det = xx * yy - xy * xy;
-            if !(det > 1e-6) {
+            if det.is_nan() || det <= 1e-6 {
                 return None; // past the fold: the mapping is no longer one to one
             }
             let (dx, dy) = ((yy * ex - xy * ey) / det, (xx * ey - xy * ex) / det);

@@ -14,5 +14,5 @@ pub use camera::{Camera, Distortion};
 pub use mesh::Mesh;
 pub use ray::{Hit, Ray};
 pub use similarity::Similarity;
-pub(crate) use topology::{Sets, fans, has_no_area, sorted_sides};
+pub(crate) use topology::{Sets, fans, sorted_sides};
 pub use topology::{Topology, topology};

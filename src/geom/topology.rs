@@ -176,7 +176,7 @@ pub fn topology(positions: &[Vec3], triangles: &[[u32; 3]]) -> Topology {
 }
 
 /// A repeated index, or corners on one line (in f64 from the f32 positions).
-pub(crate) fn has_no_area(positions: &[Vec3], t: &[u32; 3]) -> bool {
+fn has_no_area(positions: &[Vec3], t: &[u32; 3]) -> bool {
     if t[0] == t[1] || t[1] == t[2] || t[2] == t[0] {
         return true;
     }

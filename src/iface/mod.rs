@@ -7,6 +7,7 @@
 //! surface.
 
 mod checkpoint;
+mod dark_stage;
 mod hull_start;
 mod infer;
 mod model;

@@ -3,6 +3,8 @@
 //! A pixel farther from the mask than the visual hull's cells reach meets no sample and teaches
 //! nothing, so only the mask and a margin around it are drawn. Photographs stay 8 bit.
 
+use super::dark_stage;
+use crate::config::iface::Foreground;
 use crate::geom::Camera;
 use crate::image::{Gray, Photo};
 use crate::kernel::march::MarchRay;
@@ -26,7 +28,7 @@ pub struct TrainView {
 pub struct Batch {
     /// Rays in field coordinates.
     pub rays: Vec<MarchRay>,
-    /// `[rays, 3]` photograph, sRGB-coded 0..=1.
+    /// `[rays, 3]` head over black, sRGB-coded 0..=1: premultiplied by `alpha`.
     pub color: Vec<[f32; 3]>,
     /// `[rays]` soft alpha; 1 where the view has no mask.
     pub alpha: Vec<f32>,
@@ -35,6 +37,8 @@ pub struct Batch {
 /// The drawable pixels of all views.
 pub struct Pixels<'a> {
     views: &'a [TrainView],
+    /// Per view: what a render over black should show; empty for views without a mask.
+    over_black: Vec<Vec<[u8; 3]>>,
     /// Per view: inclusive box of drawable pixels and one bit per pixel.
     drawable: Vec<(u32, u32, u32, u32, Vec<u64>)>,
     /// Running count of drawable pixels.
@@ -44,7 +48,16 @@ pub struct Pixels<'a> {
 
 impl<'a> Pixels<'a> {
     /// `reach` is how far outside the mask, in scene units, a ray may still meet an occupied cell.
-    pub fn new(views: &'a [TrainView], reach: f32, radius: f32) -> Pixels<'a> {
+    ///
+    /// `foreground` says what a soft pixel's target is.
+    pub fn new(views: &'a [TrainView], reach: f32, radius: f32, foreground: Foreground) -> Pixels<'a> {
+        let over_black = views
+            .par_iter()
+            .map(|v| match (&v.mask, foreground) {
+                (Some(mask), Foreground::Estimated) => dark_stage::over_black(&v.photo, mask),
+                _ => Vec::new(),
+            })
+            .collect();
         let drawable: Vec<_> = views.par_iter().map(|v| drawable(v, reach)).collect();
         let mut sum = 0;
         let cumulative = drawable
@@ -54,7 +67,7 @@ impl<'a> Pixels<'a> {
                 sum
             })
             .collect();
-        Pixels { views, drawable, cumulative, radius }
+        Pixels { views, over_black, drawable, cumulative, radius }
     }
 
     /// Drawable pixels of all views.
@@ -105,8 +118,11 @@ impl<'a> Pixels<'a> {
                 direction: ray.direction.to_array(),
                 jitter: shift,
             };
-            let color = view.photo.rgb[p].map(|c| c as f32 / 255.0);
             let alpha = view.mask.as_ref().map_or(1.0, |m| m.values[p] as f32 / 255.0);
+            let color = match self.over_black[v].get(p) {
+                Some(head) => head.map(|c| c as f32 / 255.0),
+                None => view.photo.rgb[p].map(|c| alpha * c as f32 / 255.0),
+            };
             return Some((march, color, alpha));
         }
         None
@@ -190,7 +206,7 @@ mod tests {
         };
         let rgb = (0..200).map(|i| [i as u8, 0, 255]).collect();
         let mut values = vec![0; 200];
-        values[5 * 20 + 8] = 128;
+        values[5 * 20 + 8] = 255;
         TrainView {
             camera,
             photo: Photo { width: 20, height: 10, rgb, alpha: None },
@@ -203,19 +219,24 @@ mod tests {
     fn only_pixels_near_the_mask_are_drawn_and_carry_their_own_color() {
         // margin = ceil(0.1 · 20 / 3) + 1 = 2: a square of 5 × 5 around (8, 5)
         let views = [view()];
-        let pixels = Pixels::new(&views, 0.1, 1.0);
+        let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo);
         assert_eq!(pixels.count(), 25);
         let batch = pixels.draw(1, 2, 400, true);
         assert_eq!(batch.rays.len(), 400);
-        for (ray, color) in batch.rays.iter().zip(&batch.color) {
-            let p = (color[0] * 255.0).round() as i32;
-            let (x, y) = (p % 20, p / 20);
-            assert!((x - 8).abs() <= 2 && (y - 5).abs() <= 2, "{x} {y}");
+        let mut head = 0;
+        for (ray, (color, alpha)) in batch.rays.iter().zip(batch.color.iter().zip(&batch.alpha)) {
             let d = ray.direction;
-            assert!((d[0] / -d[2] * 20.0 + 10.0 - (x as f32 + 0.5)).abs() < 1e-3);
+            let (x, y) = (d[0] / -d[2] * 20.0 + 10.0, d[1] / d[2] * 20.0 + 5.0);
+            assert!((x - 8.5).abs() < 2.01 && (y - 5.5).abs() < 2.01, "{x} {y}");
+            if *alpha > 0.0 {
+                // pixel (8, 5) is number 108 and has red 108
+                assert!((x - 8.5).abs() < 1e-3 && (y - 5.5).abs() < 1e-3);
+                assert!((color[0] * 255.0 - 108.0).abs() < 1e-3);
+                head += 1;
+            } else {
+                assert_eq!(*color, [0.0; 3]);
+            }
         }
-        assert_eq!(batch.alpha.iter().filter(|&&a| a > 0.0).count(), {
-            batch.color.iter().filter(|c| (c[0] * 255.0).round() as i32 == 108).count()
-        });
+        assert!(head > 4 && head < 40, "{head} of 400 should be about 16");
     }
 }

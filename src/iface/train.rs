@@ -84,7 +84,7 @@ pub fn train(
     let began = Instant::now();
     // a ray may graze cells up to about two cells beyond the mask's outline
     let reach = 4.0 * 2.0 / config.occupancy_resolution.min(128) as f32;
-    let pixels = Pixels::new(views, reach, config.radius);
+    let pixels = Pixels::new(views, reach, config.radius, config.foreground);
     if pixels.count() == 0 {
         return Err(IfaceError::NoPixels);
     }
@@ -276,7 +276,7 @@ impl Trainer<'_> {
         for r in 0..rays {
             let a = batch.alpha[r];
             for c in 0..3 {
-                target.push(a * batch.color[r][c] + (1.0 - a) * background[r][c]);
+                target.push(batch.color[r][c] + (1.0 - a) * background[r][c]);
             }
         }
         let has_samples: Vec<f32> = samples.offsets.windows(2).map(|w| f32::from(w[1] > w[0])).collect();

@@ -90,7 +90,7 @@ pub fn read_exr_channels(path: &Path, sets: &[&[&str]], limits: &Limits) -> Resu
         for layer in &read.layer_data {
             let list = &layer.channel_data.list;
             let found: Option<Vec<_>> =
-                names.iter().map(|name| list.iter().find(|c| c.name.to_string() == **name)).collect();
+                names.iter().map(|name| list.iter().find(|c| c.name == **name)).collect();
             if let Some(channels) = found {
                 let left = layer.attributes.layer_position.0 as i64 - display.position.0 as i64;
                 let top = layer.attributes.layer_position.1 as i64 - display.position.1 as i64;

@@ -2,7 +2,8 @@
 //!
 //! The content decides the format. Sizes are checked before anything is decoded, and the frame of the
 //! file (PNG chunks, JPEG segments) is walked to its end first: decoders forgive a missing tail and
-//! fill it with grey, which would then be learned as a face.
+//! fill it with grey, which would then be learned as a face. One damage passes: a baseline JPEG whose scan was
+//! cut and closed again with a proper end marker, since only decoding each code could tell.
 
 use super::{Limits, ReadError, WriteError, open, read_bytes, write_atomic};
 use crate::image::{Gray, Photo};

@@ -197,7 +197,7 @@ pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
         let area = 0.5 * (b - a).cross(c - a).length();
         let edges = (b - a).length_squared() + (c - b).length_squared() + (a - c).length_squared();
         let quality = 4.0 * 3f64.sqrt() * area / edges;
-        if !(quality > 1e-9) {
+        if quality <= 1e-9 || quality.is_nan() {
             degenerate += 1;
         } else if quality < SLIVER {
             slivers += 1;
@@ -212,7 +212,7 @@ pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
         && invalid == 0
         && topology.boundary_edges + topology.flipped_edges + topology.nonmanifold_edges == 0;
     let manifold = topology.nonmanifold_edges + topology.nonmanifold_vertices == 0;
-    let bad_normal = |n: &&glam::Vec3| !((n.length() - 1.0).abs() <= UNIT);
+    let bad_normal = |n: &&glam::Vec3| (n.length() - 1.0).abs() > UNIT || n.is_nan();
     let size = if bounds.is_empty() { DVec3::ZERO } else { bounds.max.as_dvec3() - bounds.min.as_dvec3() };
     let count = mesh.positions.len();
     CheckReport {

@@ -220,10 +220,8 @@ fn is_within(point: Vec3, mesh: &Mesh, piece_of: &[u32], keep: &[bool]) -> bool 
 fn compact(mesh: &mut Mesh) {
     let mut to = vec![u32::MAX; mesh.positions.len()];
     mesh.triangles.iter().flatten().for_each(|&v| to[v as usize] = 0);
-    let mut next = 0;
-    for slot in to.iter_mut().filter(|s| **s == 0) {
-        *slot = next;
-        next += 1;
+    for (next, slot) in to.iter_mut().filter(|s| **s == 0).enumerate() {
+        *slot = next as u32;
     }
     mesh.triangles.iter_mut().flatten().for_each(|v| *v = to[*v as usize]);
     fn pick<T>(of: &mut Vec<T>, to: &[u32]) {

@@ -158,7 +158,8 @@ pub(super) fn ready(mesh: &Mesh, turn: DMat3, unit_m: f64, recentre: bool) -> Re
 
 /// Gives every normal that is zero or not finite the area-weighted mean of its faces, or +Y.
 fn mend_normals(normals: &mut [Vec3], positions: &[Vec3], triangles: &[[u32; 3]]) {
-    let bad: Vec<bool> = normals.iter().map(|n| !((n.length() - 1.0).abs() < 1e-3)).collect();
+    // turned and normalised above: unit or zero, or NaN
+    let bad: Vec<bool> = normals.iter().map(|n| *n == Vec3::ZERO || n.is_nan()).collect();
     if !bad.contains(&true) {
         return;
     }

@@ -99,7 +99,7 @@ pub fn to_glb(mesh: &Mesh, options: &ExportOptions) -> Result<Vec<u8>, ExportErr
 }
 
 fn material(options: &ExportOptions) -> gltf_json::Material {
-    let unlit = options.unlit.then(|| gltf_json::extensions::material::Material {
+    let unlit = options.unlit.then_some(gltf_json::extensions::material::Material {
         unlit: Some(gltf_json::extensions::material::Unlit {}),
     });
     gltf_json::Material {

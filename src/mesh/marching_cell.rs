@@ -252,7 +252,10 @@ fn join(case: u8, v: &[f64; 8], loops: &Loops) -> [u8; 4] {
         match end {
             [Some(ab), Some(bc), Some(cd), Some(da)] => {
                 let corner: [f64; 4] = std::array::from_fn(|i| low[i] + rise[i] * w);
-                if corner[0] * corner[2] > corner[1] * corner[3] {
+                let (ac, bd) = (corner[0] * corner[2], corner[1] * corner[3]);
+                // As on a face, a tie joins the outside.
+                let joined = if inside[0] { ac > bd } else { bd > ac };
+                if joined == inside[0] {
                     // A and C meet: the arcs cut off B and D.
                     union(ab, bc);
                     union(cd, da);

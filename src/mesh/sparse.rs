@@ -320,7 +320,7 @@ impl Flood<'_> {
     }
 
     /// The lattice's value of a node, where it has been asked.
-    fn from_lattice(&self, node: [usize; 3]) -> Option<f32> {
+    fn lattice_value(&self, node: [usize; 3]) -> Option<f32> {
         let step = self.asking.coarse_step;
         (node.iter().all(|c| c % step == 0) && !self.grid.on_border(node))
             .then(|| self.coarse[self.lattice_index(node.map(|c| c / step))])
@@ -336,9 +336,9 @@ impl Flood<'_> {
     /// Evaluates what is wanted and queues the cells around every edge found crossed.
     fn settle(&mut self) -> Result<(), MeshError> {
         let nodes = std::mem::take(&mut self.wanted);
-        let (old, new): (Vec<_>, Vec<_>) = nodes.iter().partition(|&&n| self.from_lattice(n).is_some());
+        let (old, new): (Vec<_>, Vec<_>) = nodes.iter().partition(|&&n| self.lattice_value(n).is_some());
         for &n in &old {
-            let value = self.from_lattice(n).unwrap_or(f32::NAN);
+            let value = self.lattice_value(n).unwrap_or(f32::NAN);
             self.blocks.set(n, value, true);
         }
         let values = self.ask(&new)?;
@@ -360,7 +360,7 @@ impl Flood<'_> {
                     } else {
                         m[axis] -= 1;
                     }
-                    let other = self.blocks.known(m).or_else(|| Some(self.from_lattice(m)? < 0.0));
+                    let other = self.blocks.known(m).or_else(|| Some(self.lattice_value(m)? < 0.0));
                     if other.is_some_and(|o| o != inside) {
                         self.queue_around(if forward { n } else { m }, axis);
                     }

@@ -39,6 +39,8 @@ pub(super) struct Blocks {
     dims: [usize; 3],
     per_axis: [usize; 3],
     directory: Vec<u32>,
+    /// Boxed: two kilobytes each, and a growing list would copy them all.
+    #[allow(clippy::vec_box)]
     blocks: Vec<Box<Block>>,
     non_finite: Vec<[usize; 3]>,
 }

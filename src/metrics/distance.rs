@@ -4,7 +4,7 @@
 //! points on the other are found. Both directions are needed: what is missing shows in one, what is
 //! too much in the other. Chamfer distance here is the mean of the two mean distances (not squared).
 
-use crate::geom::{Bvh, Mesh};
+use crate::geom::{Bvh, Camera, Mesh, Ray};
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -55,11 +55,12 @@ pub fn one_way(
     samples: usize,
     keep: impl Fn(Vec3) -> bool + Sync,
 ) -> Option<Distances> {
-    let mut distances: Vec<f32> = sample(from, samples)
-        .into_par_iter()
-        .filter(|p| keep(*p))
-        .filter_map(|p| to.closest_point(p).map(|c| c.distance))
-        .collect();
+    distances(sample(from, samples).into_par_iter().filter(|p| keep(*p)).collect(), to)
+}
+
+fn distances(points: Vec<Vec3>, to: &Bvh) -> Option<Distances> {
+    let mut distances: Vec<f32> =
+        points.into_par_iter().filter_map(|p| to.closest_point(p).map(|c| c.distance)).collect();
     if distances.is_empty() {
         return None;
     }
@@ -73,6 +74,11 @@ pub fn one_way(
 /// `count` points spread evenly by area: equal steps through the summed areas choose the triangle,
 /// the R2 sequence (Roberts 2018) the place in it. Without area, no points.
 pub fn sample(mesh: &Mesh, count: usize) -> Vec<Vec3> {
+    sample_triangles(mesh, count).into_iter().map(|(p, _)| p).collect()
+}
+
+/// [`sample`] with the triangle each point lies on.
+pub fn sample_triangles(mesh: &Mesh, count: usize) -> Vec<(Vec3, u32)> {
     let mut total = 0.0f64;
     let areas: Vec<f64> = (0..mesh.triangles.len() as u32)
         .map(|t| {
@@ -82,7 +88,7 @@ pub fn sample(mesh: &Mesh, count: usize) -> Vec<Vec3> {
             total
         })
         .collect();
-    if !(total > 0.0) {
+    if total <= 0.0 {
         return Vec::new();
     }
     let point = |i: usize| {
@@ -93,14 +99,64 @@ pub fn sample(mesh: &Mesh, count: usize) -> Vec<Vec3> {
         let v = (0.5 + 0.569_840_290_998_053_3 * i as f64).fract() as f32;
         let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
         let [a, b, c] = mesh.corners(t as u32);
-        a + u * (b - a) + v * (c - a)
+        (a + u * (b - a) + v * (c - a), t as u32)
     };
     (0..count).into_par_iter().map(point).collect()
+}
+
+/// Least cosine between a surface's normal and the way to a camera that counts as seeing it (75°, the
+/// limit of texture baking too): flatter views tell little.
+const LEAST_COSINE: f32 = 0.26;
+
+/// How many cameras see each point of a mesh: inside the frame, not steeper than 75°, nothing in between.
+///
+/// Where fewer than three do (a cap below the frames' border, the inside of a nostril, the underside of a
+/// bust) photographs do not determine the surface, and its distance to the truth says nothing about a method.
+pub fn seen_by(mesh: &Mesh, bvh: &Bvh, cameras: &[Camera], points: &[(Vec3, u32)]) -> Vec<u32> {
+    let lift = 1e-4 * mesh.bounds().size().max_element();
+    let sees = |camera: &Camera, p: Vec3, normal: Vec3| {
+        let inside = camera.project(p).is_some_and(|(q, _)| {
+            q.x >= 0.0 && q.y >= 0.0 && q.x <= camera.width as f32 && q.y <= camera.height as f32
+        });
+        let way = camera.position.as_vec3() - p;
+        let distance = way.length();
+        let direction = way / distance;
+        inside
+            && direction.dot(normal) > LEAST_COSINE
+            && !bvh.any_hit(&Ray { origin: p + lift * normal, direction, t_min: 0.0, t_max: distance })
+    };
+    points
+        .par_iter()
+        .map(|&(p, t)| {
+            let [a, b, c] = mesh.corners(t);
+            let normal = (b - a).cross(c - a).normalize_or_zero();
+            cameras.iter().filter(|camera| sees(camera, p, normal)).count() as u32
+        })
+        .collect()
+}
+
+/// Distances from `from` to `to` over the part that at least `least` cameras see, and that part's share of
+/// the area. `None` where nothing is seen.
+pub fn seen_one_way(
+    from: &Mesh,
+    to: &Bvh,
+    samples: usize,
+    cameras: &[Camera],
+    least: u32,
+) -> Option<(Distances, f64)> {
+    let points = sample_triangles(from, samples);
+    let seen = seen_by(from, &Bvh::new(from), cameras, &points);
+    let kept: Vec<Vec3> =
+        points.iter().zip(seen).filter(|(_, s)| *s >= least).map(|((p, _), _)| *p).collect();
+    let share = kept.len() as f64 / points.len().max(1) as f64;
+    Some((distances(kept, to)?, share))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geom::Distortion;
+    use glam::{DMat3, DVec3};
 
     /// A 2 × 1 rectangle at height z, of two triangles.
     fn sheet(z: f32) -> Mesh {
@@ -160,5 +216,31 @@ mod tests {
         assert!(between(&Mesh::default(), &sheet(0.0), 10, |_| true).is_none());
         assert!(between(&sheet(0.0), &Mesh::default(), 10, |_| true).is_none());
         assert!(between(&sheet(0.0), &sheet(0.0), 10, |_| false).is_none());
+    }
+
+    #[test]
+    fn a_sheet_under_another_is_not_seen_from_above() {
+        // two sheets, the lower one twice as long: only its free half and the upper sheet are seen
+        let mut mesh = sheet(0.0);
+        mesh.positions.iter_mut().for_each(|p| p.x *= 2.0);
+        let upper = sheet(1.0);
+        mesh.positions.extend(&upper.positions);
+        mesh.triangles.extend(upper.triangles.iter().map(|t| t.map(|i| i + 4)));
+        let camera = Camera {
+            width: 100,
+            height: 100,
+            fx: 1000.0,
+            fy: 1000.0,
+            cx: 50.0,
+            cy: 50.0,
+            distortion: Distortion::default(),
+            rotation: DMat3::IDENTITY,
+            position: DVec3::new(2.0, 0.5, 100.0),
+        };
+        let (d, share) = seen_one_way(&mesh, &Bvh::new(&sheet(0.0)), 6000, &[camera], 1).unwrap();
+        // area 2 · 2 + 2 = 6 … the lower sheet is 4 × 1, the upper 2 × 1: seen 2 + 2 of 6
+        assert!((share - 4.0 / 6.0).abs() < 0.01, "{share}");
+        // the upper sheet lies 1 above, the free half up to 2 beyond the end at x = 2: mean (1 + 1) / 2
+        assert!((d.mean - 1.0).abs() < 0.02 && (d.max - 2.0).abs() < 0.05, "{d:?}");
     }
 }

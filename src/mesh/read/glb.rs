@@ -267,7 +267,7 @@ impl Document<'_> {
             }
             None => (0..count as u32).collect(),
         };
-        if indices.len() % 3 != 0 {
+        if !indices.len().is_multiple_of(3) {
             return Err(source.broken(at, format!("{} indices are not whole triangles", indices.len())));
         }
         if let Some(i) = indices.iter().find(|&&i| i as usize >= count) {

@@ -1,0 +1,114 @@
+//! Where the surface is seen well enough to be kept.
+//!
+//! A body that the frames cut goes on where hardly a camera looks; what a field learns there is a guess.
+//! Training still needs that part (rays of good pixels pass through it), the mesh does not: it is closed by
+//! a flat cap where too few cameras see the body.
+
+use super::carve::Projector;
+use super::scene::Scene;
+use crate::geom::{Aabb, Camera};
+use glam::{DVec3, Vec3};
+
+/// Share of the cameras whose frame a slab's middle cell must be in.
+const SHARE: f64 = 0.2;
+
+/// The part of the scene's box, in scene coordinates, whose outermost slabs of hull cells are, in the
+/// median, inside the frames of a fifth of the cameras (three at least). `cameras` are in the world.
+///
+/// Without a hull, and where every slab is seen, the whole box.
+pub fn well_seen(scene: &Scene, cameras: &[Camera]) -> Aabb {
+    let Some(hull) = &scene.hull else { return scene.aabb };
+    let least = ((SHARE * cameras.len() as f64).ceil() as usize).max(3).min(cameras.len());
+    let projectors: Vec<Projector> = cameras.iter().map(Projector::new).collect();
+    let world_from_scene = scene.scene_from_world.inverse();
+    let r = hull.resolution;
+    let cell = 2.0 / r as f64;
+    let middle = |i: usize| (i as f64 + 0.5) * cell - 1.0;
+    // how many cameras see each cell of a slab across an axis; the median decides
+    let seen_enough = |axis: usize, slab: usize| -> Option<bool> {
+        let mut seen: Vec<usize> = Vec::new();
+        for a in 0..r {
+            for b in 0..r {
+                let mut c = [a, b, slab];
+                c.rotate_left(2 - axis); // the slab's index goes to its axis, (a, b) to the others in turn
+                if hull.get((c[0] * r + c[1]) * r + c[2]) {
+                    let p = world_from_scene.point_f64(DVec3::from_array(c.map(middle)));
+                    seen.push(projectors.iter().filter(|q| q.sees(p)).count());
+                }
+            }
+        }
+        if seen.is_empty() {
+            return None;
+        }
+        let half = seen.len() / 2;
+        Some(*seen.select_nth_unstable(half).1 >= least)
+    };
+    let mut low = scene.aabb.min;
+    let mut high = scene.aabb.max;
+    for axis in 0..3 {
+        let good: Vec<usize> = (0..r).filter(|&s| seen_enough(axis, s) == Some(true)).collect();
+        let poor: Vec<usize> = (0..r).filter(|&s| seen_enough(axis, s) == Some(false)).collect();
+        let (Some(&first), Some(&last)) = (good.first(), good.last()) else { return scene.aabb };
+        // a face moves only where a poorly seen slab lies beyond the last good one
+        if let Some(&edge) = poor.iter().filter(|&&s| s < first).max() {
+            low[axis] = low[axis].max(((edge + 1) as f64 * cell - 1.0) as f32);
+        }
+        if let Some(&edge) = poor.iter().filter(|&&s| s > last).min() {
+            high[axis] = high[axis].min((edge as f64 * cell - 1.0) as f32);
+        }
+    }
+    Aabb { min: low, max: high.max(low + Vec3::splat(cell as f32)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::scene::Hull;
+    use crate::geom::{Distortion, Similarity};
+    use glam::DMat3;
+
+    /// Eight cameras around the y axis at distance 4, looking at the middle from `height` above.
+    fn cameras(height: f64) -> Vec<Camera> {
+        (0..8)
+            .map(|i| {
+                let turn = DMat3::from_rotation_y(i as f64 * std::f64::consts::TAU / 8.0);
+                Camera {
+                    width: 100,
+                    height: 100,
+                    fx: 200.0,
+                    fy: 200.0,
+                    cx: 50.0,
+                    cy: 50.0,
+                    distortion: Distortion::default(),
+                    rotation: turn,
+                    position: turn * DVec3::new(0.0, height, 4.0),
+                }
+            })
+            .collect()
+    }
+
+    fn scene() -> Scene {
+        let bits = vec![u64::MAX; 16 * 16 * 16 / 64];
+        Scene {
+            scene_from_world: Similarity::IDENTITY,
+            aabb: Aabb::SCENE,
+            hull: Some(Hull { resolution: 16, bits }),
+        }
+    }
+
+    #[test]
+    fn what_every_frame_holds_is_kept_whole() {
+        // half the frame at distance 3, the nearest: 50 / 200 · 3 = 0.75; at 4: 1.0; median cells are in
+        let wide: Vec<Camera> =
+            cameras(0.0).into_iter().map(|c| Camera { fx: 80.0, fy: 80.0, ..c }).collect();
+        assert_eq!(well_seen(&scene(), &wide), Aabb::SCENE);
+    }
+
+    #[test]
+    fn a_body_that_the_frames_cut_below_ends_where_they_end() {
+        // one unit up: the frame reaches from about 0 to 2 on the axis, so the lower half is not seen
+        let part = well_seen(&scene(), &cameras(1.0));
+        assert_eq!((part.max, part.min.x, part.min.z), (Vec3::ONE, -1.0, -1.0));
+        assert!(part.min.y > -0.3 && part.min.y < 0.3, "{part:?}");
+    }
+}

@@ -1,0 +1,81 @@
+//! The ray caster against depth and normals that other software rendered from the same scans.
+
+use exr::prelude::*;
+use glam::{DMat3, DVec3};
+use std::path::{Path, PathBuf};
+use tiface::geom::{Bvh, Camera, Distortion};
+use tiface::mesh::read::read;
+use tiface::render::path::from_json;
+use tiface::render::{RaycastOptions, raycast};
+
+/// Channels of a flat EXR by name, each row-major from the top.
+fn channels(path: &Path, names: &[&str]) -> Vec<Vec<f32>> {
+    let image = exr::image::read::read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .all_channels()
+        .first_valid_layer()
+        .all_attributes()
+        .from_file(path)
+        .unwrap();
+    let list = image.layer_data.channel_data.list;
+    let find = |name: &&str| list.iter().find(|c| c.name == **name).unwrap();
+    names.iter().map(|n| find(n).sample_data.values_as_f32().collect()).collect()
+}
+
+#[test]
+fn depth_and_normals_of_the_scans_are_those_of_the_captures() {
+    let shared = std::env::var_os("TIFACE_SHARED")
+        .map_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared")), PathBuf::from);
+    for capture in ["lps", "nefertiti"] {
+        let folder = shared.join("data/captures").join(capture);
+        let (Ok(ply), Ok(json)) = (
+            std::fs::read(folder.join("gt.ply")),
+            std::fs::read_to_string(folder.join("transforms_test.json")),
+        ) else {
+            eprintln!("skipped: there is no capture {}", folder.display());
+            continue;
+        };
+        let mesh = read(&ply, Path::new("gt.ply")).unwrap();
+        let bvh = Bvh::new(&mesh);
+        // every frame states its own lens; this one only fills gaps
+        let like = Camera {
+            width: 1,
+            height: 1,
+            fx: 1.0,
+            fy: 1.0,
+            cx: 0.5,
+            cy: 0.5,
+            distortion: Distortion::default(),
+            rotation: DMat3::IDENTITY,
+            position: DVec3::ZERO,
+        };
+        for view in from_json(&json, &like).unwrap().iter().take(3) {
+            let hard = RaycastOptions { samples: 1, ..RaycastOptions::default() };
+            let ours = raycast(&bvh, &mesh, &view.camera, &hard, |p, _, _| vec![[1.0; 3]; p.len()]);
+            let depth = channels(&folder.join("depth").join(format!("{}.exr", view.name)), &["Z"]);
+            let normal =
+                channels(&folder.join("normals").join(format!("{}.exr", view.name)), &["R", "G", "B"]);
+            let (mut both, mut one, mut far, mut turned) = (0, 0, 0, 0);
+            for i in 0..depth[0].len() {
+                let (a, b) = (ours.depth.data[i], depth[0][i]);
+                if (a > 0.0) != (b > 0.0) {
+                    one += 1;
+                } else if a > 0.0 {
+                    both += 1;
+                    far += ((a - b).abs() > 1e-4) as usize;
+                    let n = &ours.normal.data[3 * i..3 * i + 3];
+                    let dot: f32 = (0..3).map(|k| n[k] * normal[k][i]).sum();
+                    turned += (dot < 0.999) as usize;
+                }
+            }
+            eprintln!(
+                "{capture} {}: {both} pixels, {one} in one only, {far} off by 0.1 mm, {turned} normals by 2.6°",
+                view.name
+            );
+            assert!(both > 30_000, "the head fills the picture");
+            // silhouette pixels may fall either way where rays graze
+            assert!([one, far, turned].iter().all(|n| n * 10_000 < both));
+        }
+    }
+}
