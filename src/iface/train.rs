@@ -190,8 +190,10 @@ impl Trainer<'_> {
         let inv_s = self.inv_s();
         let dt = self.march_step(inv_s);
         // a new level, and the end of the hull's fit, move the surface: look again at once
-        let level_came = config.level_every > 0 && step % config.level_every == 0;
-        if step % config.occupancy_every == 0 || (config.occupancy == OccupancyRule::Band && level_came) {
+        let level_came = config.level_every > 0 && step.is_multiple_of(config.level_every);
+        if step.is_multiple_of(config.occupancy_every)
+            || (config.occupancy == OccupancyRule::Band && level_came)
+        {
             self.update_occupancy(&shape, seed, inv_s, dt);
         }
         let batch = self.pixels.draw(seed, step, self.state.rays, config.jitter);
