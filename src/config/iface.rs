@@ -122,6 +122,9 @@ pub struct IfaceConfig {
     pub jitter: bool,
     /// What is behind the head while training.
     pub background: Background,
+    /// Start the features that go to the colour network apart from each other. The published start gives
+    /// all thirteen the sdf's own weights, and colour is learned late.
+    pub spread_features: bool,
     /// What a pixel with a soft mask should look like.
     pub foreground: Foreground,
     /// Seconds between checkpoints.
@@ -170,6 +173,7 @@ impl IfaceConfig {
             samples_per_ray: 1024,
             jitter: true,
             background: Background::Random,
+            spread_features: true,
             foreground: Foreground::Estimated,
             checkpoint_s: 60.0,
         }
@@ -229,6 +233,7 @@ impl IfaceConfig {
             samples_per_ray: 1024,
             jitter: false,
             background: Background::Black,
+            spread_features: false,
             foreground: Foreground::Photo,
             checkpoint_s: 120.0,
         }

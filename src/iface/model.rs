@@ -63,8 +63,15 @@ pub fn initial(config: &IfaceConfig, seed: u64) -> Vec<(&'static str, Vec<usize>
         .collect();
     let mean = std::f32::consts::PI.sqrt() / (HIDDEN as f32).sqrt();
     let scale = if config.start == Start::Sphere && config.weight_decay > 0.0 { 1.0 } else { config.radius };
-    let v2: Vec<f32> =
-        (0..OUTPUTS * HIDDEN).map(|i| scale * (mean + 1e-4 * rng::normal(seed, 103, i as u64))).collect();
+    // row 0 is the sdf; the others are features of the colour network
+    let apart = |i: usize| i >= HIDDEN && config.spread_features;
+    let v2: Vec<f32> = (0..OUTPUTS * HIDDEN)
+        .map(|i| {
+            let n = rng::normal(seed, 103, i as u64);
+            if apart(i) { first * n } else { scale * (mean + 1e-4 * n) }
+        })
+        .collect();
+    let b2: Vec<f32> = (0..OUTPUTS).map(|o| if apart(o * HIDDEN) { 0.0 } else { -0.5 * scale }).collect();
     let lengths = |v: &[f32], n: usize| -> Vec<f32> {
         v.chunks(n).map(|row| row.iter().map(|x| x * x).sum::<f32>().sqrt()).collect()
     };
@@ -80,7 +87,7 @@ pub fn initial(config: &IfaceConfig, seed: u64) -> Vec<(&'static str, Vec<usize>
         ("b1", vec![HIDDEN], vec![0.0; HIDDEN]),
         ("v2", vec![OUTPUTS, HIDDEN], v2),
         ("g2", vec![OUTPUTS, 1], g2),
-        ("b2", vec![OUTPUTS], vec![-0.5 * scale; OUTPUTS]),
+        ("b2", vec![OUTPUTS], b2),
         ("c1", vec![HIDDEN, COLOR_INPUTS], xavier(104, HIDDEN, HIDDEN, COLOR_INPUTS)),
         ("c2", vec![HIDDEN, HIDDEN], xavier(105, HIDDEN, HIDDEN, HIDDEN)),
         ("c3", vec![3, HIDDEN], xavier(106, 3, 16, HIDDEN)),

@@ -35,14 +35,37 @@ fn resampled(hull: &Bitmask, resolution: usize) -> Bitmask {
     out
 }
 
+/// `mask` and every cell that touches one of its cells.
+fn grown(mask: &Bitmask) -> Bitmask {
+    let n = mask.resolution;
+    let mut out = mask.clone();
+    // one axis after the other: together all 26 neighbours
+    for stride in [1, n, n * n] {
+        let before = out.clone();
+        for i in 0..n * n * n {
+            let at = i / stride % n;
+            if (at > 0 && before.get(i - stride)) || (at + 1 < n && before.get(i + stride)) {
+                out.set(i, true);
+            }
+        }
+    }
+    out
+}
+
 impl Occupancy {
-    /// Starts with all cells of the hull; all cells where there is none.
+    /// Starts with all cells of the hull; all cells where there is none. The `band` rule adds one layer of
+    /// cells: a surface learned a hair outside the hull would otherwise be entered from behind, and show as
+    /// a hole.
     pub fn new(config: &IfaceConfig, hull: Option<&Bitmask>) -> Occupancy {
         let r = config.occupancy_resolution;
         let allowed = match hull {
             Some(hull) if hull.resolution == r => hull.clone(),
             Some(hull) => resampled(hull, r),
             None => Bitmask::filled(r, true),
+        };
+        let allowed = match config.occupancy {
+            OccupancyRule::Band => grown(&allowed),
+            OccupancyRule::Nerfacc => allowed,
         };
         let history = match config.occupancy {
             OccupancyRule::Band => Vec::new(),
@@ -67,7 +90,8 @@ impl Occupancy {
     }
 
     /// A cell stays when the zero set's band (`band / inv_s`) may reach it, for gradients up to about
-    /// one; beyond the band on the inside it is solid.
+    /// one, or when a neighbour's centre lies on the other side, however steep the field is there; what is
+    /// left of the inside is solid.
     fn update_band(&mut self, config: &IfaceConfig, inv_s: f32, sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>) {
         let r = config.occupancy_resolution;
         let cell = 2.0 * config.radius / r as f32;
@@ -76,16 +100,26 @@ impl Occupancy {
         let cells: Vec<usize> = (0..r * r * r).filter(|&i| self.allowed.get(i)).collect();
         let center =
             |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - config.radius);
-        self.occupied.bits.fill(0);
-        self.solid.bits.fill(0);
+        // NaN where nothing was asked: no sign, no neighbour
+        let mut f = vec![f32::NAN; r * r * r];
         for cells in cells.chunks(1 << 17) {
             let points: Vec<[f32; 3]> = cells.par_iter().map(|&i| center(i)).collect();
-            for (&i, f) in cells.iter().zip(sdf(&points)) {
-                if f.abs() < band {
-                    self.occupied.set(i, true);
-                } else if f < 0.0 {
-                    self.solid.set(i, true);
-                }
+            for (&i, value) in cells.iter().zip(sdf(&points)) {
+                f[i] = value;
+            }
+        }
+        self.occupied.bits.fill(0);
+        self.solid.bits.fill(0);
+        for &i in &cells {
+            let crossed = [1, r, r * r].into_iter().any(|stride| {
+                let at = i / stride % r;
+                let other = |j: usize| f[j] * f[i] < 0.0;
+                (at > 0 && other(i - stride)) || (at + 1 < r && other(i + stride))
+            });
+            if f[i].abs() < band || crossed {
+                self.occupied.set(i, true);
+            } else if f[i] < 0.0 {
+                self.solid.set(i, true);
             }
         }
     }
@@ -177,9 +211,23 @@ mod tests {
         for rule in [OccupancyRule::Band, OccupancyRule::Nerfacc] {
             let config = IfaceConfig { occupancy: rule, ..config.clone() };
             let mut o = Occupancy::new(&config, Some(&hull));
-            assert_eq!(o.occupied.count(), 16 * 16 * 8);
+            // the band rule keeps one layer more
+            let empty = if rule == OccupancyRule::Band { 7 } else { 8 };
+            assert_eq!(o.occupied.count(), 16 * 16 * (16 - empty));
             o.update(&config, (1, 0), 20.0, 0.01, sphere);
-            assert!((0..16 * 16 * 8).all(|i| !o.occupied.get(i)) && o.occupied.count() > 0);
+            assert!((0..16 * 16 * empty).all(|i| !o.occupied.get(i)) && o.occupied.count() > 0);
+        }
+    }
+
+    #[test]
+    fn a_steep_wall_is_kept_although_its_values_are_large() {
+        // slope 40: every centre is far from zero in value, the wall at x = 0.01 is crossed all the same
+        let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::draft() };
+        let mut o = Occupancy::new(&config, None);
+        o.update(&config, (1, 0), 600.0, 0.0, |p| p.iter().map(|p| 40.0 * (p[0] - 0.01)).collect());
+        for x in 0..16 {
+            assert_eq!(o.occupied.get((x * 16 + 5) * 16 + 5), x == 7 || x == 8, "{x}");
+            assert_eq!(o.solid.get((x * 16 + 5) * 16 + 5), x < 7, "{x}");
         }
     }
 }
