@@ -148,7 +148,7 @@ impl IfaceConfig {
             radius: 1.0,
             start: Start::Hull,
             lr_table: 1e-2,
-            lr_network: 2e-3,
+            lr_network: 5e-3,
             lr_variance: 1e-3,
             warmup: 100,
             lr_final: 0.05,
@@ -164,9 +164,9 @@ impl IfaceConfig {
             variance: 0.3,
             anneal_end: 1000,
             occupancy: OccupancyRule::Band,
-            occupancy_resolution: 128,
+            occupancy_resolution: 160,
             occupancy_every: 50,
-            band: 6.0,
+            band: 4.0,
             march: 1.0,
             min_step: 0.004,
             max_step: 0.05,
@@ -182,7 +182,7 @@ impl IfaceConfig {
     /// The default: better and slower.
     pub fn standard() -> IfaceConfig {
         IfaceConfig {
-            steps: 15_000,
+            steps: 16_000,
             log2_table: 19,
             level_every: 400,
             anneal_end: 5000,
