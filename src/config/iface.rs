@@ -182,10 +182,10 @@ impl IfaceConfig {
     /// The default: better and slower.
     pub fn standard() -> IfaceConfig {
         IfaceConfig {
-            steps: 16_000,
+            steps: 12_000,
             log2_table: 19,
-            level_every: 400,
-            anneal_end: 5000,
+            level_every: 300,
+            anneal_end: 4000,
             lr_final: 0.02,
             min_step: 0.003,
             ..IfaceConfig::draft()
