@@ -1,6 +1,6 @@
 //! The `tiface` binary: parse, run, exit code; nothing else.
 
-/// Training allocates and frees the same large blocks every step; this keeps them.
+/// Training allocates and frees the same large blocks every step; this returns them to the system late.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 

@@ -343,6 +343,7 @@ impl<'a> Line<'a> {
                 keep_share: c.keep_share,
                 newton_steps: c.newton_steps as usize,
                 relax: c.relax,
+                verify: c.verify,
                 ..mesh::MeshConfig::default()
             };
             let hull = scene.hull.as_ref().map(|hull| |p: Vec3| hull.contains(p));

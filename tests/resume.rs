@@ -56,7 +56,7 @@ fn products(run: &Path) -> Vec<(PathBuf, Vec<u8>)> {
         }
     }
     let mut files = Vec::new();
-    for stage in ["mask", "mesh", "render", "metrics"] {
+    for stage in ["mask", "iface", "mesh", "render", "metrics"] {
         walk(&run.join(stage), &mut files);
     }
     files.push(run.join("config.toml"));

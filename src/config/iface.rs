@@ -122,6 +122,9 @@ pub struct IfaceConfig {
     pub jitter: bool,
     /// What is behind the head while training.
     pub background: Background,
+    /// Start with a gradient of length one. The published start is a unit sphere of the networks' own
+    /// coordinates, and so has gradients of 1 / radius.
+    pub unit_start: bool,
     /// Start the features that go to the colour network apart from each other. The published start gives
     /// all thirteen the sdf's own weights, and colour is learned late.
     pub spread_features: bool,
@@ -173,6 +176,7 @@ impl IfaceConfig {
             samples_per_ray: 1024,
             jitter: true,
             background: Background::Random,
+            unit_start: true,
             spread_features: true,
             foreground: Foreground::Estimated,
             checkpoint_s: 60.0,
@@ -233,6 +237,7 @@ impl IfaceConfig {
             samples_per_ray: 1024,
             jitter: false,
             background: Background::Black,
+            unit_start: false,
             spread_features: false,
             foreground: Foreground::Photo,
             checkpoint_s: 120.0,

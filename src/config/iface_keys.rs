@@ -49,6 +49,8 @@ pub(super) const KEYS: &[Key] = &[
     Key::number("max_step", "Longest march step of the band rule.", 1e-6, 10.0),
     Key::number("samples_per_ray", "Steps across the box's diagonal (nerfacc rule).", 1.0, 65_536.0),
     Key::word("jitter", "Shift each ray's samples by a random part of a step: true or false."),
+    Key::word("unit_start", "Start with gradients of length one (published: 1 / radius)."),
+    Key::word("spread_features", "Start the colour features apart from each other (published: all alike)."),
     Key::word("background", "Behind the head while training: black, or random (one colour per ray)."),
     Key::word(
         "foreground",

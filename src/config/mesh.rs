@@ -39,6 +39,8 @@ pub struct MeshConfig {
     pub newton_steps: u32,
     /// How far vertices slide towards the middle of their neighbours with the first step.
     pub relax: f32,
+    /// Also evaluate the whole grid and report what the sparse extraction lost.
+    pub verify: bool,
     /// Files to write.
     pub format: Vec<MeshFormat>,
     /// Coordinates to write them in.
@@ -57,7 +59,7 @@ pub(super) const KEYS: &[Key] = &[
         "newton_steps",
         "Newton steps that pull vertices onto the zero level of the field.",
         0.0,
-        16.0,
+        8.0,
     ),
     Key::number(
         "coarse_step",
@@ -71,6 +73,7 @@ pub(super) const KEYS: &[Key] = &[
         0.0,
         1.0,
     ),
+    Key::word("verify", "Also evaluate the whole grid and report what the sparse extraction lost: slow."),
     Key::word("format", "Files to write, a list of glb, obj, ply."),
     Key::word("frame", "Coordinates of the files: dataset, or head (+Y up, face towards +Z, centred)."),
 ];
@@ -84,6 +87,7 @@ impl MeshConfig {
             coarse_step: 8,
             newton_steps: 2,
             relax: 0.5,
+            verify: false,
             format: vec![MeshFormat::Glb],
             frame: MeshFrame::Dataset,
         }

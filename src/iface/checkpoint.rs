@@ -11,7 +11,7 @@ use crate::config::iface::IfaceConfig;
 use crate::field;
 use crate::field::optimizer::Moments;
 use crate::io::Limits;
-use crate::io::{TensorValues, read_tensors, remove, rename, write_tensors};
+use crate::io::{TensorValues, is_file, read_tensors, remove, rename, write_tensors};
 use crate::kernel::march::Bitmask;
 use burn::tensor::{Device, Tensor};
 use std::collections::BTreeMap;
@@ -96,6 +96,8 @@ pub struct State {
     pub step: u64,
     /// Rays of the next step.
     pub rays: usize,
+    /// Running mean of the squared colour error, for the PSNR that is shown.
+    pub mean_square: f64,
     /// Mixed into the seed: 1 after a restore from a diverged step, so that other rays are drawn.
     pub salt: u64,
 }
@@ -114,6 +116,7 @@ impl State {
             occupancy: Occupancy::new(config, hull),
             step: 0,
             rays: config.rays,
+            mean_square: 0.0,
             salt: 0,
         }
     }
@@ -154,14 +157,16 @@ pub fn save(dir: &Path, state: &State, identity: &str) -> Result<(), IfaceError>
         ("identity".to_owned(), identity.to_owned()),
         ("step".to_owned(), state.step.to_string()),
         ("rays".to_owned(), state.rays.to_string()),
+        ("mean_square".to_owned(), state.mean_square.to_bits().to_string()),
         ("salt".to_owned(), state.salt.to_string()),
     ]);
     let path = newest(dir);
-    if path.is_file() {
+    let next = dir.join("checkpoint.next.safetensors");
+    write_tensors(&next, &tensors, &metadata)?;
+    if is_file(&path) {
         rename(&path, &previous(dir))?;
     }
-    write_tensors(&path, &tensors, &metadata)?;
-    Ok(())
+    Ok(rename(&next, &path)?)
 }
 
 /// Removes the older checkpoint: training is complete, the newest is all anyone needs.
@@ -181,13 +186,17 @@ pub fn restore(
     let mut warnings = Vec::new();
     let mut failure = None;
     for path in [newest(dir), previous(dir)] {
-        if !path.exists() {
+        if !is_file(&path) {
             continue;
         }
         match read(&path, config, hull, Some(identity), device) {
             Ok(state) => return Ok(Some((state, warnings))),
             Err(e) => {
                 warnings.push(format!("{e}; falling back to the checkpoint before it"));
+                // it must not take the good one's place at the next save
+                if matches!(e, IfaceError::Read(_)) && path == newest(dir) && is_file(&previous(dir)) {
+                    remove(&path)?;
+                }
                 failure.get_or_insert(e);
             }
         }
@@ -257,6 +266,7 @@ pub fn read(
         occupancy,
         step: number("step")?,
         rays: number("rays")? as usize,
+        mean_square: f64::from_bits(number("mean_square")?),
         salt: number("salt")?,
     })
 }

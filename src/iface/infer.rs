@@ -27,6 +27,9 @@ pub struct VolumeRay {
     pub normal: Vec3,
 }
 
+/// Samples evaluated together in a volume render.
+const SAMPLES: usize = 1 << 16;
+
 /// The trained field on the host. All positions and distances are in scene units, the box is [-1, 1]³.
 pub struct IFace {
     config: IfaceConfig,
@@ -112,7 +115,7 @@ impl IFace {
 
     /// Volume render of rays in scene coordinates: the reference every faster view is compared with.
     pub fn render(&self, rays: &[Ray]) -> Vec<VolumeRay> {
-        /// Rays per pass: bounds the samples in memory.
+        /// Rays marched together.
         const PASS: usize = 1 << 13;
         rays.chunks(PASS).flat_map(|rays| self.render_pass(rays)).collect()
     }
@@ -132,19 +135,45 @@ impl IFace {
         let solid = (config.occupancy == OccupancyRule::Band).then_some(&self.occupancy.solid);
         let limit = (3.6 * radius / dt) as usize + 2;
         let samples = march::march(&self.occupancy.occupied, solid, radius, dt, &marched, limit);
-        let n = samples.t.len();
+        // pieces of whole rays with a bounded number of samples: a sample costs some two kilobytes
+        let mut out = Vec::with_capacity(rays.len());
+        let mut first = 0;
+        while first < marched.len() {
+            let most = samples.offsets[first] as usize + SAMPLES;
+            let fits = samples.offsets.partition_point(|&o| o as usize <= most) - 1;
+            let last = fits.clamp(first + 1, marched.len());
+            out.extend(self.composite(&marched[first..last], &samples, first, dt));
+            first = last;
+        }
+        out
+    }
+
+    /// Composites rays `first..first + rays.len()` of a march.
+    fn composite(
+        &self,
+        rays: &[MarchRay],
+        samples: &march::Samples,
+        first: usize,
+        dt: f32,
+    ) -> Vec<VolumeRay> {
+        let radius = self.config.radius;
+        let offsets = &samples.offsets[first..=first + rays.len()];
+        let start = offsets[0] as usize;
+        let t = &samples.t[start..offsets[rays.len()] as usize];
+        let offsets: Vec<i32> = offsets.iter().map(|&o| o - start as i32).collect();
+        let n = t.len();
         let mut x = Vec::with_capacity(n);
         let mut d = Vec::with_capacity(n);
-        for (r, ray) in marched.iter().enumerate() {
-            for &t in &samples.t[samples.offsets[r] as usize..samples.offsets[r + 1] as usize] {
+        for (r, ray) in rays.iter().enumerate() {
+            for &t in &t[offsets[r] as usize..offsets[r + 1] as usize] {
                 x.push(std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]));
                 d.push(ray.direction);
             }
         }
         let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
-        let direction: Vec<[f32; 3]> = marched.iter().map(|r| r.direction).collect();
+        let direction: Vec<[f32; 3]> = rays.iter().map(|r| r.direction).collect();
         let steps = vec![dt; n];
-        let bundle = Rays { offsets: &samples.offsets, direction: &direction, t: &samples.t, dt: &steps };
+        let bundle = Rays { offsets: &offsets, direction: &direction, t, dt: &steps };
         neus::forward(bundle, field.output(), self.inv_s, 1.0)
             .chunks_exact(neus::RAY_WIDTH)
             .map(|o| VolumeRay {

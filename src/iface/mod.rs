@@ -51,8 +51,16 @@ pub enum IfaceError {
         /// Learning rate of the networks there.
         lr: f64,
     },
-    /// A stop was asked for; a checkpoint was saved.
-    #[error("stopped at step {step} of {steps}; a checkpoint is saved, repeat the command to continue")]
+    /// No ray meets a cell that may hold surface any more: nothing could be learned from here on.
+    #[error("the surface is lost at step {step}: no ray of {steps_without} steps met a sample")]
+    SurfaceLost {
+        /// At which step.
+        step: u64,
+        /// How many steps in a row saw nothing.
+        steps_without: u64,
+    },
+    /// A stop was asked for. A checkpoint was saved, unless there was no step to save.
+    #[error("stopped at step {step} of {steps}; repeat the command to continue")]
     Stopped {
         /// Steps done.
         step: u64,
@@ -84,6 +92,11 @@ impl IfaceError {
                 "lower iface.lr_network and iface.lr_table, or start again with another --seed".into()
             }
             IfaceError::Checkpoint { .. } => "start the stage afresh with `--fresh iface`".into(),
+            IfaceError::Read(e) => e.hint(),
+            IfaceError::Write(e) => e.hint(),
+            IfaceError::SurfaceLost { .. } => {
+                "look at the masks and poses with `tiface inspect`; lower iface.lr_network".into()
+            }
             _ => return None,
         })
     }

@@ -1,6 +1,6 @@
 //! The trainable parameters, as a burn module.
 
-use crate::config::iface::{IfaceConfig, Start};
+use crate::config::iface::IfaceConfig;
 use crate::field::{self, ops};
 use crate::kernel::hash;
 use crate::kernel::mlp::{COLOR_INPUTS, HIDDEN, Layout, OUTPUTS};
@@ -62,7 +62,7 @@ pub fn initial(config: &IfaceConfig, seed: u64) -> Vec<(&'static str, Vec<usize>
         .map(|i| if i % inputs < 3 { first * rng::normal(seed, 102, i as u64) } else { 0.0 })
         .collect();
     let mean = std::f32::consts::PI.sqrt() / (HIDDEN as f32).sqrt();
-    let scale = if config.start == Start::Sphere && config.weight_decay > 0.0 { 1.0 } else { config.radius };
+    let scale = if config.unit_start { config.radius } else { 1.0 };
     // row 0 is the sdf; the others are features of the colour network
     let apart = |i: usize| i >= HIDDEN && config.spread_features;
     let v2: Vec<f32> = (0..OUTPUTS * HIDDEN)

@@ -44,13 +44,28 @@ pub struct Pixels<'a> {
     /// Running count of drawable pixels.
     cumulative: Vec<u64>,
     radius: f32,
+    /// Has any view a mask that says something?
+    pub masked: bool,
+    published: bool,
 }
 
 impl<'a> Pixels<'a> {
     /// `reach` is how far outside the mask, in scene units, a ray may still meet an occupied cell.
     ///
-    /// `foreground` says what a soft pixel's target is.
-    pub fn new(views: &'a [TrainView], reach: f32, radius: f32, foreground: Foreground) -> Pixels<'a> {
+    /// `foreground` says what a soft pixel's target is. Where some views have a mask, those without one
+    /// (or with one that is white all over) are not drawn from: they would teach that all of it is head.
+    ///
+    /// `published` draws as the published code does: every view as often, any pixel of its frame.
+    pub fn new(
+        views: &'a [TrainView],
+        reach: f32,
+        radius: f32,
+        foreground: Foreground,
+        published: bool,
+    ) -> Pixels<'a> {
+        let usable = |v: &TrainView| v.mask.as_ref().is_some_and(|m| m.values.iter().any(|&a| a < 255));
+        let masked = views.iter().any(usable);
+        let reach = if published { f32::INFINITY } else { reach };
         let over_black = views
             .par_iter()
             .map(|v| match (&v.mask, foreground) {
@@ -58,7 +73,10 @@ impl<'a> Pixels<'a> {
                 _ => Vec::new(),
             })
             .collect();
-        let drawable: Vec<_> = views.par_iter().map(|v| drawable(v, reach)).collect();
+        let drawable: Vec<_> = views
+            .par_iter()
+            .map(|v| drawable(v, if masked && !usable(v) { Reach::Nothing } else { Reach::Within(reach) }))
+            .collect();
         let mut sum = 0;
         let cumulative = drawable
             .iter()
@@ -67,7 +85,7 @@ impl<'a> Pixels<'a> {
                 sum
             })
             .collect();
-        Pixels { views, over_black, drawable, cumulative, radius }
+        Pixels { views, over_black, drawable, cumulative, radius, masked, published }
     }
 
     /// Drawable pixels of all views.
@@ -97,13 +115,21 @@ impl<'a> Pixels<'a> {
 
     fn draw_one(&self, seed: u64, step: u64, i: u64, jitter: bool) -> Option<(MarchRay, [f32; 3], f32)> {
         let stream = step << 4;
-        let which = rng::below(seed, stream, i, self.count());
-        let v = self.cumulative.partition_point(|&c| c <= which);
+        let v = if self.published {
+            rng::below(seed, stream, i, self.views.len() as u64) as usize
+        } else {
+            let which = rng::below(seed, stream, i, self.count());
+            self.cumulative.partition_point(|&c| c <= which)
+        };
         let (x0, y0, x1, y1, bits) = &self.drawable[v];
+        if x0 > x1 {
+            return None; // a view without a drawable pixel
+        }
         let view = &self.views[v];
         let width = view.photo.width;
         // rejection inside the box of drawable pixels: a head fills most of its box
-        for attempt in 0..256 {
+        // (published: a pixel that is not valid is dropped, and the batch shrinks)
+        for attempt in 0..if self.published { 1 } else { 256 } {
             let k = i << 9 | attempt << 1;
             let x = x0 + rng::below(seed, stream + 1, k, (x1 - x0 + 1) as u64) as u32;
             let y = y0 + rng::below(seed, stream + 1, k | 1, (y1 - y0 + 1) as u64) as u32;
@@ -111,7 +137,7 @@ impl<'a> Pixels<'a> {
             if bits[p >> 6] >> (p & 63) & 1 == 0 {
                 continue;
             }
-            let ray = view.camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
+            let Some(ray) = view.camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)) else { continue };
             let shift = if jitter { rng::uniform(seed, stream + 2, i) } else { 0.0 };
             let march = MarchRay {
                 origin: (ray.origin * self.radius).to_array(),
@@ -129,11 +155,22 @@ impl<'a> Pixels<'a> {
     }
 }
 
+/// Which pixels of a view are drawn.
+#[derive(Clone, Copy)]
+enum Reach {
+    /// None.
+    Nothing,
+    /// Those within so many scene units of the mask; all where there is no mask.
+    Within(f32),
+}
+
 /// Box and bits of the pixels worth drawing in one view.
-fn drawable(view: &TrainView, reach: f32) -> (u32, u32, u32, u32, Vec<u64>) {
+fn drawable(view: &TrainView, reach: Reach) -> (u32, u32, u32, u32, Vec<u64>) {
     let (w, h) = (view.photo.width as usize, view.photo.height as usize);
-    let mut near = vec![true; w * h];
-    if let Some(mask) = &view.mask {
+    let mut near = vec![!matches!(reach, Reach::Nothing); w * h];
+    if let (Some(mask), Reach::Within(reach)) = (&view.mask, reach)
+        && reach.is_finite()
+    {
         // reach in pixels at the box's distance; the nearest part of the box is at most one unit closer
         let distance = (view.camera.position.length() - 1.0).max(0.2);
         let margin = (reach as f64 * view.camera.fx.max(view.camera.fy) / distance).ceil() as usize + 1;
@@ -219,7 +256,7 @@ mod tests {
     fn only_pixels_near_the_mask_are_drawn_and_carry_their_own_color() {
         // margin = ceil(0.1 · 20 / 3) + 1 = 2: a square of 5 × 5 around (8, 5)
         let views = [view()];
-        let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo);
+        let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false);
         assert_eq!(pixels.count(), 25);
         let batch = pixels.draw(1, 2, 400, true);
         assert_eq!(batch.rays.len(), 400);
@@ -238,5 +275,30 @@ mod tests {
             }
         }
         assert!(head > 4 && head < 40, "{head} of 400 should be about 16");
+    }
+
+    #[test]
+    fn a_view_without_a_mask_teaches_nothing_beside_views_with_one() {
+        let mut white = view();
+        white.mask.as_mut().unwrap().values.fill(255);
+        let views = [view(), TrainView { mask: None, ..view() }, white];
+        let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false);
+        assert_eq!(pixels.count(), 25);
+        // alone it is drawn from everywhere
+        let alone = [TrainView { mask: None, ..view() }];
+        assert_eq!(Pixels::new(&alone, 0.1, 1.0, Foreground::Photo, false).count(), 200);
+    }
+
+    #[test]
+    fn published_sampling_draws_the_whole_frame_of_every_view_as_often() {
+        let views = [view(), view()];
+        let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, true);
+        let batch = pixels.draw(1, 2, 2000, false);
+        assert_eq!(batch.rays.len(), 2000);
+        let left = batch.rays.iter().filter(|r| r.direction[0] < 0.0).count();
+        assert!((900..1100).contains(&left), "{left}");
+        // one pixel of 200 is head
+        let head = batch.alpha.iter().filter(|&&a| a > 0.0).count();
+        assert!((2..25).contains(&head), "{head}");
     }
 }

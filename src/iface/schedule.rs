@@ -21,7 +21,7 @@ pub fn next_rays(rays: usize, samples: usize, budget: usize, min: usize, max: us
         return rays;
     }
     let fitting = (rays as f64 * (budget as f64 / samples as f64)) as usize;
-    ((rays as f64 * 0.9 + fitting as f64 * 0.1) as usize).clamp(min, max)
+    ((rays as f64 * 0.9 + fitting as f64 * 0.1) as usize).clamp(min.min(max), max)
 }
 
 /// Hash levels that take part at a step.

@@ -47,6 +47,25 @@ struct Losses {
     sparsity: Option<Tensor<1>>,
 }
 
+/// Steps in a row without a single sample after which nothing can bring the surface back.
+const LOST_AFTER: u64 = 20;
+
+/// A batch keeps at most so many times the sample budget: the ray count lags behind when cells come back.
+const MOST_BUDGETS: usize = 4;
+
+/// Drops the last rays of a batch until at most `most` samples are left (one ray always stays).
+fn shorten(batch: &mut Batch, samples: &mut march::Samples, most: usize) {
+    if samples.t.len() <= most {
+        return;
+    }
+    let kept = samples.offsets.iter().rposition(|&o| o as usize <= most).unwrap_or(0).max(1);
+    samples.offsets.truncate(kept + 1);
+    samples.t.truncate(samples.offsets[kept] as usize);
+    batch.rays.truncate(kept);
+    batch.color.truncate(kept);
+    batch.alpha.truncate(kept);
+}
+
 /// Figures of one step on the host.
 struct Figures {
     rgb: f32,
@@ -62,7 +81,6 @@ struct Trainer<'a> {
     device: Device,
     shape: FieldShape,
     pixels: Pixels<'a>,
-    masked: bool,
     state: State,
 }
 
@@ -82,9 +100,13 @@ pub fn train(
 ) -> Result<(IFace, TrainReport), IfaceError> {
     let device = field::device(device)?;
     let began = Instant::now();
-    // a ray may graze cells up to about two cells beyond the mask's outline
-    let reach = 4.0 * 2.0 / config.occupancy_resolution.min(128) as f32;
-    let pixels = Pixels::new(views, reach, config.radius, config.foreground);
+    // without a hull every ray may meet a sample; with one, cells reach some four beyond the outline
+    let reach = match hull {
+        Some(_) => 4.0 * 2.0 / config.occupancy_resolution.min(128) as f32,
+        None => f32::INFINITY,
+    };
+    let published = config.occupancy == OccupancyRule::Nerfacc;
+    let pixels = Pixels::new(views, reach, config.radius, config.foreground, published);
     if pixels.count() == 0 {
         return Err(IfaceError::NoPixels);
     }
@@ -98,20 +120,31 @@ pub fn train(
         }
         None => State::new(config, seed, hull, &device),
     };
-    let masked = views.iter().any(|v| v.mask.is_some());
-    let mut trainer = Trainer { config, seed, device, shape: shape(config), pixels, masked, state };
-    if fresh && let (Start::Hull, Some(hull)) = (config.start, hull) {
-        trainer.fit_hull(hull, monitor)?;
+    let mut trainer = Trainer { config, seed, device, shape: shape(config), pixels, state };
+    if fresh {
+        if let (Start::Hull, Some(hull)) = (config.start, hull) {
+            trainer.fit_hull(hull, monitor)?;
+        }
+        // a run that breaks early goes back to here, not to a start without the hull
+        checkpoint::save(dir, &trainer.state, identity)?;
     }
     let mut saved = Instant::now();
-    let mut mean_square = 0.0f64;
+    let mut nothing_seen = 0;
     let mut diverged_before = trainer.state.salt > 0;
     while trainer.state.step < config.steps {
         let step = trainer.state.step;
         match trainer.step()? {
             Ok(figures) => {
-                let keep = if step == 0 { 0.0 } else { 0.98 };
-                mean_square = keep * mean_square + (1.0 - keep) * figures.rgb as f64;
+                nothing_seen = if figures.samples == 0 { nothing_seen + 1 } else { 0 };
+                if nothing_seen == LOST_AFTER {
+                    return Err(IfaceError::SurfaceLost { step, steps_without: LOST_AFTER });
+                }
+                if figures.samples > 0 {
+                    let old = trainer.state.mean_square;
+                    let keep = if old == 0.0 { 0.0 } else { 0.98 };
+                    trainer.state.mean_square = keep * old + (1.0 - keep) * figures.rgb as f64;
+                }
+                let mean_square = trainer.state.mean_square;
                 monitor.step(
                     step + 1,
                     config.steps,
@@ -160,7 +193,7 @@ pub fn train(
         steps: config.steps,
         seconds: began.elapsed().as_secs_f64(),
         inv_s: trainer.inv_s(),
-        train_psnr: -10.0 * mean_square.max(1e-12).log10(),
+        train_psnr: -10.0 * trainer.state.mean_square.max(1e-12).log10(),
         occupied: trainer.state.occupancy.share(),
         warnings,
     };
@@ -196,15 +229,16 @@ impl Trainer<'_> {
         {
             self.update_occupancy(&shape, seed, inv_s, dt);
         }
-        let batch = self.pixels.draw(seed, step, self.state.rays, config.jitter);
+        let mut batch = self.pixels.draw(seed, step, self.state.rays, config.jitter);
         let o = &self.state.occupancy;
         let solid = (config.occupancy == OccupancyRule::Band).then_some(&o.solid);
         let limit = (3.6 * config.radius / dt) as usize + 2;
-        let samples = march::march(&o.occupied, solid, config.radius, dt, &batch.rays, limit);
+        let mut samples = march::march(&o.occupied, solid, config.radius, dt, &batch.rays, limit);
         let n = samples.t.len();
-        let rays = batch.rays.len();
         let floor = if config.occupancy == OccupancyRule::Band { 64 } else { 1 };
-        self.state.rays = schedule::next_rays(rays, n, config.samples, floor, config.max_rays);
+        self.state.rays = schedule::next_rays(self.state.rays, n, config.samples, floor, config.max_rays);
+        shorten(&mut batch, &mut samples, MOST_BUDGETS * config.samples);
+        let n = samples.t.len();
         if n == 0 {
             // nothing in sight of these rays: no gradient, but the schedule goes on
             self.state.step += 1;
@@ -229,7 +263,9 @@ impl Trainer<'_> {
                 return Ok(Err((term, value)));
             }
         }
-        self.apply(losses.total, step);
+        if !self.apply(losses.total, step) {
+            return Ok(Err(("gradient of the", f32::NAN)));
+        }
         self.state.step += 1;
         Ok(Ok(figures))
     }
@@ -311,7 +347,7 @@ impl Trainer<'_> {
         if config.rgb_l1 > 0.0 {
             total = total + error.abs().sum() / denominator * config.rgb_l1;
         }
-        let mask = (self.masked && config.mask > 0.0).then(|| {
+        let mask = (self.pixels.masked && config.mask > 0.0).then(|| {
             let p = opacity.clamp(1e-3, 1.0 - 1e-3);
             let cross = alpha.clone() * p.clone().log() + (alpha.neg() + 1.0) * (p.neg() + 1.0).log();
             cross.mean().neg()
@@ -332,16 +368,27 @@ impl Trainer<'_> {
     }
 
     /// Backward and AdamW, each group at its own rate.
-    fn apply(&mut self, loss: Tensor<1>, step: u64) {
+    fn apply(&mut self, loss: Tensor<1>, step: u64) -> bool {
         let config = self.config;
         let factor = schedule::learning_rate(config, step);
-        self.descend(loss, factor, step + 1, true);
+        self.descend(loss, factor, step + 1, true)
     }
 
-    fn descend(&mut self, loss: Tensor<1>, factor: f64, adam_step: u64, color: bool) {
+    /// False, and nothing updated, where a gradient is not finite: a finite loss does not promise one.
+    fn descend(&mut self, loss: Tensor<1>, factor: f64, adam_step: u64, color: bool) -> bool {
         let config = self.config;
         let mut gradients = loss.backward();
         drop(loss);
+        let model = &self.state.model;
+        let finite = |t: Option<Tensor<2>>| t.is_none_or(|t| field::values(t).iter().all(|g| g.is_finite()));
+        // what breaks the table's gradient passes through the layers above it
+        let sound = [&model.v1, &model.v2, &model.c1, &model.c2, &model.c3]
+            .iter()
+            .all(|p| finite(p.val().grad(&gradients)))
+            && model.variance.val().grad(&gradients).is_none_or(|t| field::values(t)[0].is_finite());
+        if !sound {
+            return false;
+        }
         let network = AdamStep {
             lr: (config.lr_network * factor) as f32,
             beta1: 0.9,
@@ -372,6 +419,7 @@ impl Trainer<'_> {
             update(&mut m.c3, &mut o.c3, g, network);
             update(&mut m.variance, &mut o.variance, g, variance);
         }
+        true
     }
 
     /// Fits the field to the hull's distance: half of the points in a band around its boundary.
@@ -407,7 +455,10 @@ impl Trainer<'_> {
             let length = (out.narrow(1, 1, 3).square().sum_dim(1) + 1e-12).sqrt();
             let loss = error * 10.0 + (length - 1.0).square().mean() * 0.1;
             let factor = 0.1f64.powf(step as f64 / STEPS as f64) * ((step + 1) as f64 / 20.0).min(1.0);
-            self.descend(loss, factor, step + 1, false);
+            if !self.descend(loss, factor, step + 1, false) {
+                let (term, value, lr) = ("hull", f32::NAN, config.lr_network * factor);
+                return Err(IfaceError::Diverged { term, value, step: 0, lr });
+            }
             if monitor.stop() {
                 return Err(IfaceError::Stopped { step: 0, steps: config.steps });
             }
@@ -424,7 +475,7 @@ pub fn march_step(config: &IfaceConfig, inv_s: f32) -> f32 {
     match config.occupancy {
         // nerfacc's constant 1.732 where √3 is meant, kept for the published step length
         OccupancyRule::Nerfacc => 1.732 * 2.0 * config.radius / config.samples_per_ray as f32,
-        OccupancyRule::Band => (config.march / inv_s).clamp(config.min_step, config.max_step),
+        OccupancyRule::Band => (config.march / inv_s).min(config.max_step).max(config.min_step),
     }
 }
 

@@ -179,11 +179,12 @@ fn empty_masks_and_unseen_boxes_do_not_crash() {
     empty.iter_mut().for_each(|v| v.mask.as_mut().unwrap().values.fill(0));
     let end = train(&empty, Some(&hull), &config(), 3, "cpu", dir.path(), "empty", &Quiet);
     assert!(matches!(end, Err(IfaceError::NoPixels)));
-    // a hull without a cell: every step meets no sample, training ends all the same
+    // a hull without a cell: no step meets a sample, and training says so instead of ending well
     let nothing = Bitmask::filled(32, false);
-    let config = IfaceConfig { steps: 5, start: Start::Sphere, ..config() };
+    let config = IfaceConfig { start: Start::Sphere, ..config() };
     let views = views();
-    train(&views, Some(&nothing), &config, 3, "cpu", dir.path(), "nothing", &Quiet).unwrap();
+    let end = train(&views, Some(&nothing), &config, 3, "cpu", dir.path(), "nothing", &Quiet);
+    assert!(matches!(end, Err(IfaceError::SurfaceLost { step: 19, steps_without: 20 })));
 }
 
 #[test]
@@ -198,7 +199,6 @@ fn the_paper_preset_trains_too() {
         samples: 8192,
         occupancy_resolution: 16,
         samples_per_ray: 64,
-        radius: 1.0,
         ..IfaceConfig::paper()
     };
     let (face, report) = train(&views, None, &config, 3, "cpu", dir.path(), "p", &Quiet).unwrap();

@@ -31,7 +31,7 @@ pub struct Level {
 impl Level {
     /// Are vertices hashed, rather than stored one by one?
     pub fn is_hashed(&self) -> bool {
-        (self.resolution as u64).pow(3) > self.entries as u64
+        (self.resolution as u64).saturating_pow(3) > self.entries as u64
     }
 }
 
@@ -43,8 +43,8 @@ pub fn levels(count: usize, base: u32, growth: f64, log2_entries: u32) -> Vec<Le
     (0..count)
         .map(|l| {
             let scale = (l as f32 * log2_growth).exp2() * base as f32 - 1.0;
-            let resolution = scale.ceil() as u32 + 1;
-            let dense = (resolution as u64).pow(3).div_ceil(8) * 8;
+            let resolution = (scale.ceil() as u32).saturating_add(1);
+            let dense = (resolution as u64).saturating_pow(3).div_ceil(8).saturating_mul(8);
             let entries = dense.min(1 << log2_entries) as u32;
             let level = Level { scale, resolution, entries, offset };
             offset += entries as usize;

@@ -88,7 +88,7 @@ pub fn march_one(
         enter = enter.max(p.min(q));
         leave = leave.min(p.max(q));
     }
-    if enter >= leave {
+    if enter.is_nan() || leave.is_nan() || enter >= leave || !step.is_finite() || step <= 0.0 {
         return;
     }
     let r = mask.resolution as f32;

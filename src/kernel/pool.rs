@@ -27,7 +27,9 @@ impl Buffer {
             Some(i) => free.swap_remove(i),
             None => {
                 drop(free);
-                Vec::with_capacity(len)
+                // rounded up, so that a batch a little larger finds it fitting
+                let grain = (len.next_power_of_two() / 8).max(1024);
+                Vec::with_capacity(len.next_multiple_of(grain))
             }
         };
         v.resize(len, 0.0);
@@ -48,10 +50,14 @@ impl Drop for Buffer {
         if v.capacity() == 0 {
             return;
         }
-        if let Ok(mut free) = FREE.lock()
-            && free.len() < KEPT
-        {
-            free.push(v);
+        if let Ok(mut free) = FREE.lock() {
+            if free.len() < KEPT {
+                free.push(v);
+            } else if let Some(smallest) = free.iter_mut().min_by_key(|v| v.capacity())
+                && smallest.capacity() < v.capacity()
+            {
+                *smallest = v;
+            }
         }
     }
 }

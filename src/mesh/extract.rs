@@ -2,6 +2,7 @@
 
 use super::polish::{Polish, angle_weighted_normals};
 use super::sparse::{Asking, Grid, Sparse, sparse};
+use super::verify::{Verified, dense_triangles};
 use super::{CleanReport, MeshConfig, MeshError, clean};
 use crate::geom::{Aabb, Mesh, Topology, topology};
 use crate::run::Monitor;
@@ -28,6 +29,8 @@ pub struct MeshReport {
     pub non_finite: usize,
     /// Inside nodes on the faces of the box, where the surface was capped.
     pub capped: usize,
+    /// The dense extraction beside this one, if `verify` was asked.
+    pub verified: Option<Verified>,
     /// What cleaning removed.
     pub clean: CleanReport,
     /// Mean |f| / |∇f| over vertices before they moved, in cells.
@@ -108,6 +111,13 @@ pub fn extract(
     let asking = Asking { coarse_step: config.coarse_step, batch: config.batch };
     let found = sparse(&sdf, outside, &grid, asking, &|| monitor.stop())?;
     has_surface(&found)?;
+    let verified = match config.verify {
+        true => Some(Verified {
+            dense_triangles: dense_triangles(&sdf, outside, &grid, config.batch, &|| monitor.stop())?,
+            sparse_triangles: found.surface.triangles.len(),
+        }),
+        false => None,
+    };
     let mut report = MeshReport {
         cells: grid.dims.map(|d| d - 1),
         cell_size: grid.spacing,
@@ -117,6 +127,7 @@ pub fn extract(
         gradient_norm: found.gradient_norm,
         non_finite: found.surface.non_finite,
         capped: found.surface.capped,
+        verified,
         ..MeshReport::default()
     };
     let mut mesh =

@@ -18,12 +18,14 @@ mod polish;
 pub mod read;
 mod sparse;
 mod sparse_blocks;
+mod verify;
 
 pub use clean::{CleanReport, clean};
 pub use error::MeshError;
 pub use extract::{MeshReport, extract};
 pub use marching::{Surface, Volume, marching};
 pub use sparse::{Asking, Grid, Sparse, sparse};
+pub use verify::Verified;
 
 use serde::{Deserialize, Serialize};
 
@@ -44,6 +46,8 @@ pub struct MeshConfig {
     pub newton_steps: usize,
     /// How far vertices slide towards the middle of their neighbours with the first step; 0..=1.
     pub relax: f32,
+    /// Also evaluate the whole grid and report what the sparse extraction lost: slow, for checking.
+    pub verify: bool,
 }
 
 impl Default for MeshConfig {
@@ -55,6 +59,7 @@ impl Default for MeshConfig {
             keep_share: 1.0,
             newton_steps: 2,
             relax: 0.5,
+            verify: false,
         }
     }
 }
