@@ -36,7 +36,15 @@ step() {
 
 readers() {
   [ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv || return
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements.txt &&
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements.txt || return
+  # open3d's wheel leaves four shared libraries to the system
+  if ! .venv/bin/python -c 'import open3d' 2> /dev/null && command -v apt-get > /dev/null; then
+    local sudo=
+    [ "$(id -u)" = 0 ] || sudo=sudo
+    $sudo apt-get update -qq && $sudo apt-get install -y -qq --no-install-recommends \
+      libusb-1.0-0 libgl1 libgomp1 libx11-6 > /dev/null || return
+  fi
+  .venv/bin/python -c 'import open3d, trimesh' &&
     npm ci --silent --no-audit --no-fund --prefix tools/readers
 }
 
@@ -75,6 +83,7 @@ else
   results+=("SKIPPED the demo head, as asked by --no-demo")
 fi
 
+# how long which step took, and what could not run
 printf '\n== summary\n'
 printf '%s\n' "${results[@]}"
 [ -s "$scratch/skipped" ] && { printf 'tests that this machine could not run:\n'; cat "$scratch/skipped"; }
