@@ -40,6 +40,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 /// The stages in order.
 pub const STAGES: &[&str] = &["mask", "iface", "mesh", "render", "metrics"];
@@ -351,7 +352,7 @@ impl<'a> Line<'a> {
             // the colour of a vertex is what is seen looking straight at it
             let color = |points: &[Vec3], normals: &[Vec3]| {
                 let directions: Vec<Vec3> = normals.iter().map(|n| -*n).collect();
-                field.color(points, &directions)
+                field.color(points, normals, &directions)
             };
             // below the frames' border the surface is a guess: close the mesh where enough cameras look
             let cameras: Vec<Camera> = self.capture.split(Split::Train).map(|v| v.camera.clone()).collect();
@@ -427,13 +428,16 @@ impl<'a> Line<'a> {
             let options = RaycastOptions { background, samples: c.samples, world_from_scene };
             let total = (cameras.len() * c.method.len()) as u64;
             let mut made = 0;
+            let mut seconds = Map::new();
             for &method in &c.method {
+                let mut spent = Duration::ZERO;
                 let folder = stage.folder().join(method.folder());
                 for NamedCamera { name, camera } in &cameras {
                     let camera = camera.transformed(&scene.scene_from_world);
+                    let begin = Instant::now();
                     let view = match method {
                         Method::Raycast => {
-                            let color = |p: &[Vec3], _: &[Vec3], d: &[Vec3]| field.color(p, d);
+                            let color = |p: &[Vec3], n: &[Vec3], d: &[Vec3]| field.color(p, n, d);
                             Some(raycast(&bvh, &mesh, &camera, &options, color))
                         }
                         Method::Volume => field.volume(&camera, &world_from_scene).map(|mut view| {
@@ -443,6 +447,7 @@ impl<'a> Line<'a> {
                             view
                         }),
                     };
+                    spent += begin.elapsed();
                     if let Some(view) = view {
                         pictures::write(&folder, name, &view, c.format, self.config.capture.unit_m)?;
                     }
@@ -450,9 +455,11 @@ impl<'a> Line<'a> {
                     stage.monitor().step(made, total, &[]);
                     self.stop_here()?;
                 }
+                let per_view = spent.as_secs_f64() / cameras.len().max(1) as f64;
+                seconds.insert(method.folder().to_owned(), json!(per_view));
             }
             let methods: Vec<_> = c.method.iter().map(|m| m.folder()).collect();
-            Ok(json!({"cameras": cameras.len(), "methods": methods}))
+            Ok(json!({"cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds}))
         })?)
     }
 

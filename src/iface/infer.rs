@@ -100,17 +100,12 @@ impl IFace {
         all.into_iter().map(|(f, n)| (f / self.config.radius, Vec3::from(n))).unzip()
     }
 
-    /// sRGB-coded colour of surface points seen along unit `directions` (away from the camera).
-    pub fn color(&self, points: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
-        /// Bounds the scratch memory.
-        const PASS: usize = 1 << 15;
-        let mut out = Vec::with_capacity(points.len());
-        for (p, d) in points.chunks(PASS).zip(directions.chunks(PASS)) {
-            let d: Vec<[f32; 3]> = d.iter().map(|d| d.to_array()).collect();
-            let a = sdf::forward(&self.shape, self.table(), &self.weights, &self.scaled(p), &d);
-            out.extend(a.output().chunks_exact(sdf::WIDTH).map(|o| [o[4], o[5], o[6]]));
-        }
-        out
+    /// sRGB-coded colour of surface points with unit `normals`, seen along unit `directions` (away from the
+    /// camera).
+    pub fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        let arrays = |v: &[Vec3]| -> Vec<[f32; 3]> { v.iter().map(|v| v.to_array()).collect() };
+        let (x, normals, directions) = (self.scaled(points), arrays(normals), arrays(directions));
+        sdf::colors(&self.shape, self.table(), &self.weights, &x, &normals, &directions)
     }
 
     /// Volume render of rays in scene coordinates: the reference every faster view is compared with.

@@ -573,7 +573,115 @@ pub fn values(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f
     sdf
 }
 
-/// Signed distance and gradient, no colour: `[n, 3]` → `[n, 8]`, colour columns undefined.
+struct ColorTask<'a> {
+    value: ValueTask<'a>,
+    normal: &'a [[f32; 3]],
+    direction: &'a [[f32; 3]],
+    rgb: &'a mut [[f32; 3]],
+}
+
+#[inline(always)]
+fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
+    let kp = w.layout.padded();
+    let t = &task.value;
+    let first = 2 * t.levels;
+    let mut u = vec![0f32; TILE * kp];
+    let mut h = [0f32; TILE * HIDDEN];
+    let mut o = [0f32; TILE * OUTPUTS_PADDED];
+    let mut c0 = [0f32; TILE * COLOR_INPUTS];
+    let mut c1 = [0f32; TILE * HIDDEN];
+    let mut rgb = [0f32; TILE * RGB_PADDED];
+    for tile in 0..t.x.len().div_ceil(TILE) {
+        let base = tile * TILE;
+        let rows = TILE.min(t.x.len() - base);
+        for l in 0..t.active {
+            let v = &t.value[(l * t.total + t.start + base) * 2..][..rows * 2];
+            for r in 0..rows {
+                u[r * kp + 2 * l] = v[2 * r];
+                u[r * kp + 2 * l + 1] = v[2 * r + 1];
+            }
+        }
+        for r in 0..rows {
+            for a in 0..3 {
+                u[r * kp + first + a] = t.x[base + r][a] * t.inv_radius;
+            }
+        }
+        gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1t, HIDDEN, &mut h, HIDDEN, false);
+        for row in h.chunks_exact_mut(HIDDEN) {
+            for j in 0..HIDDEN {
+                let v = row[j] + w.b1[j];
+                row[j] = v.max(0.0) + 0.01 * ln_1p::<F>(exp::<F>(-(100.0 * v).abs()));
+            }
+        }
+        let op = OUTPUTS_PADDED;
+        gemm::<F>((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2t, op, &mut o, op, false);
+        for r in 0..rows {
+            let row = &mut c0[r * COLOR_INPUTS..][..COLOR_INPUTS];
+            (0..OUTPUTS).for_each(|j| row[j] = o[r * op + j] + w.b2[j]);
+            row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(task.direction[base + r]));
+            row[OUTPUTS + 16..].copy_from_slice(&task.normal[base + r]);
+        }
+        let ci = COLOR_INPUTS;
+        gemm::<F>((TILE, HIDDEN, ci), &c0, (ci, 1), &w.c1t, HIDDEN, &mut c1, HIDDEN, false);
+        c1.iter_mut().for_each(|v| *v = v.max(0.0));
+        gemm::<F>((TILE, HIDDEN, HIDDEN), &c1, (HIDDEN, 1), &w.c2t, HIDDEN, &mut h, HIDDEN, false);
+        h.iter_mut().for_each(|v| *v = v.max(0.0));
+        let last = (TILE, RGB_PADDED, HIDDEN);
+        gemm::<F>(last, &h, (HIDDEN, 1), &w.c3t, RGB_PADDED, &mut rgb, RGB_PADDED, false);
+        for r in 0..rows {
+            task.rgb[base + r] = std::array::from_fn(|c| sigmoid::<F>(rgb[r * RGB_PADDED + c]));
+        }
+    }
+}
+
+dispatch! { fn color_task / color_body(task: &mut ColorTask, w: &Weights) }
+
+/// Colour of points whose unit normals are known (of a mesh's surface): no gradient is computed, a third
+/// of the work of [`forward`]. All `[n, 3]`.
+pub fn colors(
+    shape: &FieldShape,
+    table: &[[f32; 2]],
+    weights: &Weights,
+    x: &[[f32; 3]],
+    normal: &[[f32; 3]],
+    direction: &[[f32; 3]],
+) -> Vec<[f32; 3]> {
+    const PASS: usize = 1 << 15;
+    assert!(normal.len() == x.len() && direction.len() == x.len());
+    let mut rgb = vec![[0f32; 3]; x.len()];
+    let active = &shape.levels[..shape.active];
+    for (pass, rgb) in rgb.chunks_mut(PASS).enumerate() {
+        let n = rgb.len();
+        let span = pass * PASS..pass * PASS + n;
+        let (x, normal, direction) = (&x[span.clone()], &normal[span.clone()], &direction[span]);
+        let mut value = Buffer::scratch(active.len() * n * 2);
+        hash::gather(active, table, &shape.x01(x), 1.0, bytemuck::cast_slice_mut(&mut value), None);
+        let value = &value[..];
+        rgb.par_chunks_mut(CHUNK).enumerate().for_each(|(i, rgb)| {
+            let start = i * CHUNK;
+            let own = start..start + rgb.len();
+            let mut task = ColorTask {
+                value: ValueTask {
+                    start,
+                    total: n,
+                    active: shape.active,
+                    levels: shape.levels.len(),
+                    inv_radius: 1.0 / shape.radius,
+                    x: &x[own.clone()],
+                    value,
+                    sdf: &mut [],
+                },
+                normal: &normal[own.clone()],
+                direction: &direction[own],
+                rgb,
+            };
+            color_task(&mut task, weights);
+        });
+    }
+    rgb
+}
+
+/// Signed distance and gradient, no colour: `[n, 3]` → `[n]` pairs.
 pub fn gradients(
     shape: &FieldShape,
     table: &[[f32; 2]],

@@ -101,12 +101,15 @@ fn the_forward_agrees_with_an_f64_model() {
     let flat64 = wide(&flat);
     let sdf = values(&shape, &table, &w, &x);
     let normals = gradients(&shape, &table, &w, &x);
+    let units: Vec<[f32; 3]> = normals.iter().map(|n| unit(n.1)).collect();
+    let colors = colors(&shape, &table, &w, &x, &units, &d);
     for i in 0..x.len() {
         let want = model(&shape, &table64, &flat64, x[i], d[i]);
         for k in 0..7 {
             let got = a.output()[i * WIDTH + k] as f64;
             assert!((got - want[k]).abs() < 2e-4 * want[k].abs().max(1.0), "{i} {k}: {got} {}", want[k]);
         }
+        assert!(colors[i].iter().zip(&a.output()[i * WIDTH + 4..]).all(|(c, o)| (c - o).abs() < 1e-5));
         assert!((sdf[i] - a.output()[i * WIDTH]).abs() < 1e-5);
         assert_eq!(normals[i].1, [1, 2, 3].map(|k| a.output()[i * WIDTH + k]));
     }

@@ -13,8 +13,9 @@ pub trait Surface: Sync {
     /// Signed distance and its gradient. `[n, 3]` → `[n]`, `[n, 3]`.
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>);
 
-    /// sRGB-coded colour of surface points seen along unit directions, away from the camera.
-    fn color(&self, points: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]>;
+    /// sRGB-coded colour of surface points with unit normals, seen along unit directions, away from the
+    /// camera. All `[n, 3]`.
+    fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]>;
 
     /// The view of a camera in scene coordinates by marching through the field itself; depth and
     /// normals in the world. `None` for what is only a surface.
@@ -31,8 +32,8 @@ impl Surface for crate::iface::IFace {
         self.sdf_gradient(points)
     }
 
-    fn color(&self, points: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
-        self.color(points, directions)
+    fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        self.color(points, normals, directions)
     }
 
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView> {
@@ -85,7 +86,7 @@ impl Surface for Exact {
         (self.sdf(points), points.iter().map(gradient).collect())
     }
 
-    fn color(&self, points: &[Vec3], _: &[Vec3]) -> Vec<[f32; 3]> {
+    fn color(&self, points: &[Vec3], _: &[Vec3], _: &[Vec3]) -> Vec<[f32; 3]> {
         vec![[0.6, 0.5, 0.4]; points.len()]
     }
 
