@@ -356,7 +356,7 @@ impl<'a> Line<'a> {
             };
             // below the frames' border the surface is a guess: close the mesh where enough cameras look
             let cameras: Vec<Camera> = self.capture.split(Split::Train).map(|v| v.camera.clone()).collect();
-            let kept = capture::well_seen(&scene, &cameras);
+            let kept = capture::well_seen(&scene, &cameras, self.capture.up);
             let extracted = mesh::extract(
                 |p: &[Vec3]| field.sdf(p),
                 |p: &[Vec3]| field.sdf_gradient(p),

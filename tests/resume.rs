@@ -16,7 +16,7 @@ const SETTINGS: [&str; 12] = [
     "iface.levels=6",
     "iface.log2_table=12",
     "iface.occupancy_resolution=32",
-    "iface.checkpoint_s=1",
+    "iface.checkpoint_s=0.1",
     "mesh.resolution=64",
     "mesh.format=glb,obj",
     "render.samples=1",
@@ -87,12 +87,12 @@ fn killed_again_and_again_the_run_ends_with_the_same_bytes() {
     assert_eq!(code, 0, "{text}");
     let whole = begin.elapsed();
 
-    // moments spread over the first third of a run, by a fixed sequence, and a little later each
-    // time, so that it ends
+    // moments spread over the first sixth of a run, by a fixed sequence, and a little later each
+    // time, so that it ends on a busy machine too
     let (mut attempts, mut killed) = (0u32, 0);
     loop {
         let mut child = start(&capture, &hunted);
-        let share = 0.06 + 0.25 * (attempts as f64 * 0.618_034).fract() + 0.01 * attempts as f64;
+        let share = 0.04 + 0.12 * (attempts as f64 * 0.618_034).fract() + 0.008 * attempts as f64;
         let until = Instant::now() + whole.mul_f64(share).max(Duration::from_millis(20));
         let ended = loop {
             if let Some(status) = child.try_wait().unwrap() {
@@ -111,7 +111,7 @@ fn killed_again_and_again_the_run_ends_with_the_same_bytes() {
             Some(status) if status.success() => break,
             Some(status) => panic!("attempt {attempts} ended with {status}: {text}"),
         }
-        assert!(attempts < 60, "the run never ends");
+        assert!(attempts < 300, "the run never ends");
     }
     eprintln!("killed {killed} times in a run of {:.1} s", whole.as_secs_f64());
     assert!(killed >= 2, "the test killed nothing");

@@ -14,10 +14,12 @@ use glam::{DVec3, Vec3};
 const SHARE: f64 = 1.0 / 3.0;
 
 /// The part of the scene's box, in scene coordinates, whose outermost slabs of hull cells are, in the
-/// median, inside the frames of a third of the cameras (three at least). `cameras` are in the world.
+/// median, inside the frames of a third of the cameras (three at least). `cameras` are in the world; only the
+/// face that looks most downward moves (`up` is a world direction): frames cut heads below, and a body whose
+/// shoulders end in walls left and right looks like a box.
 ///
 /// Without a hull, and where every slab is seen, the whole box.
-pub fn well_seen(scene: &Scene, cameras: &[Camera]) -> Aabb {
+pub fn well_seen(scene: &Scene, cameras: &[Camera], up: Vec3) -> Aabb {
     let Some(hull) = &scene.hull else { return scene.aabb };
     let least = ((SHARE * cameras.len() as f64).ceil() as usize).max(3).min(cameras.len());
     let projectors: Vec<Projector> = cameras.iter().map(Projector::new).collect();
@@ -46,17 +48,18 @@ pub fn well_seen(scene: &Scene, cameras: &[Camera]) -> Aabb {
     };
     let mut low = scene.aabb.min;
     let mut high = scene.aabb.max;
-    for axis in 0..3 {
-        let good: Vec<usize> = (0..r).filter(|&s| seen_enough(axis, s) == Some(true)).collect();
-        let poor: Vec<usize> = (0..r).filter(|&s| seen_enough(axis, s) == Some(false)).collect();
-        let (Some(&first), Some(&last)) = (good.first(), good.last()) else { return scene.aabb };
-        // a face moves only where a poorly seen slab lies beyond the last good one
-        if let Some(&edge) = poor.iter().filter(|&&s| s < first).max() {
-            low[axis] = low[axis].max(((edge + 1) as f64 * cell - 1.0) as f32);
-        }
-        if let Some(&edge) = poor.iter().filter(|&&s| s > last).min() {
-            high[axis] = high[axis].min((edge as f64 * cell - 1.0) as f32);
-        }
+    let up = scene.scene_from_world.direction(up);
+    let axis = up.abs().max_position();
+    let good: Vec<usize> = (0..r).filter(|&s| seen_enough(axis, s) == Some(true)).collect();
+    let poor: Vec<usize> = (0..r).filter(|&s| seen_enough(axis, s) == Some(false)).collect();
+    let (Some(&first), Some(&last)) = (good.first(), good.last()) else { return scene.aabb };
+    // it moves only where a poorly seen slab lies beyond the last good one
+    let below = poor.iter().filter(|&&s| s < first).max();
+    let above = poor.iter().filter(|&&s| s > last).min();
+    match (up[axis] > 0.0, below, above) {
+        (true, Some(&edge), _) => low[axis] = low[axis].max(((edge + 1) as f64 * cell - 1.0) as f32),
+        (false, _, Some(&edge)) => high[axis] = high[axis].min((edge as f64 * cell - 1.0) as f32),
+        _ => {}
     }
     Aabb { min: low, max: high.max(low + Vec3::splat(cell as f32)) }
 }
@@ -102,13 +105,13 @@ mod tests {
         // half the frame at distance 3, the nearest: 50 / 200 · 3 = 0.75; at 4: 1.0; median cells are in
         let wide: Vec<Camera> =
             cameras(0.0).into_iter().map(|c| Camera { fx: 80.0, fy: 80.0, ..c }).collect();
-        assert_eq!(well_seen(&scene(), &wide), Aabb::SCENE);
+        assert_eq!(well_seen(&scene(), &wide, Vec3::Y), Aabb::SCENE);
     }
 
     #[test]
     fn a_body_that_the_frames_cut_below_ends_where_they_end() {
         // one unit up: the frame reaches from about 0 to 2 on the axis, so the lower half is not seen
-        let part = well_seen(&scene(), &cameras(1.0));
+        let part = well_seen(&scene(), &cameras(1.0), Vec3::Y);
         assert_eq!((part.max, part.min.x, part.min.z), (Vec3::ONE, -1.0, -1.0));
         assert!(part.min.y > -0.3 && part.min.y < 0.3, "{part:?}");
     }

@@ -90,6 +90,9 @@ pub struct IfaceConfig {
     pub rgb_mse: f64,
     /// Weight of the absolute colour error.
     pub rgb_l1: f64,
+    /// Weight of the squared colour error of single samples, Σ w ‖c − target‖² on rays that are all head. The
+    /// blend alone leaves each sample's colour free, and a mesh shows a single one.
+    pub rgb_sample: f64,
     /// Weight of the mask's binary cross entropy.
     pub mask: f64,
     /// Weight of (‖∇sdf‖ − 1)².
@@ -160,6 +163,7 @@ impl IfaceConfig {
             touched_rows: true,
             rgb_mse: 10.0,
             rgb_l1: 0.0,
+            rgb_sample: 3.0,
             mask: 0.1,
             eikonal: 0.1,
             sparsity: 0.0,
@@ -221,6 +225,7 @@ impl IfaceConfig {
             touched_rows: false,
             rgb_mse: 10.0,
             rgb_l1: 0.0,
+            rgb_sample: 0.0,
             mask: 0.1,
             eikonal: 0.1,
             sparsity: 0.5,

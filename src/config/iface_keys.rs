@@ -30,6 +30,12 @@ pub(super) const KEYS: &[Key] = &[
     Key::number("table_decay", "Decoupled weight decay of the hash table.", 0.0, 1.0),
     Key::word("touched_rows", "Update only rows of the table that a sample touched: true or false."),
     Key::number("rgb_mse", "Weight of the squared colour error.", 0.0, 1e6),
+    Key::number(
+        "rgb_sample",
+        "Weight of the squared colour error of single samples (published: 0).",
+        0.0,
+        1e6,
+    ),
     Key::number("rgb_l1", "Weight of the absolute colour error.", 0.0, 1e6),
     Key::number("mask", "Weight of the mask's binary cross entropy.", 0.0, 1e6),
     Key::number("eikonal", "Weight of the loss that keeps the gradient's length at 1.", 0.0, 1e6),

@@ -322,6 +322,12 @@ impl Trainer<'_> {
         let background: Tensor<2> =
             field::tensor(background.into_iter().flatten().collect(), [rays, 3], device).autodiff();
         let target: Tensor<2> = field::tensor(target, [rays, 3], device).autodiff();
+        // rays that are all head, and their colour: background plays no part
+        let full: Vec<f32> = batch.alpha.iter().map(|&a| f32::from(a > 0.999)).collect();
+        let all_head = full.iter().sum::<f32>();
+        let full: Tensor<2> = field::tensor(full, [rays, 1], device).autodiff();
+        let head: Tensor<2> =
+            field::tensor(batch.color.iter().flatten().copied().collect(), [rays, 3], device).autodiff();
 
         let out =
             self.state.model.field(shape, field::tensor(x, [n, 3], device), field::tensor(d, [n, 3], device)); // [n, 8]
@@ -333,8 +339,19 @@ impl Trainer<'_> {
                 .autodiff(),
         };
         let anneal = schedule::anneal(config, step);
-        let composed = ops::neus(out.clone(), self.state.model.inv_s(), bundle, anneal); // [rays, 8]
+        let inv_s = self.state.model.inv_s();
+        let composed = ops::neus(out.clone(), inv_s.clone(), bundle.clone(), anneal); // [rays, 8]
         let opacity = composed.clone().narrow(1, 3, 1); // [rays, 1]
+        // Σ w ‖c − h‖² = Σ w c² − 2 h Σ w c + h² Σ w, so compositing c² beside c gives it
+        let single = (config.rgb_sample > 0.0 && all_head > 0.0).then(|| {
+            let rgb = out.clone().narrow(1, 4, 3);
+            let squared =
+                Tensor::cat(vec![out.clone().narrow(1, 0, 4), rgb.square(), out.clone().narrow(1, 7, 1)], 1);
+            let second = ops::neus(squared, inv_s, bundle, anneal).narrow(1, 0, 3); // [rays, 3]
+            let first = composed.clone().narrow(1, 0, 3);
+            let error = second - first * head.clone() * 2.0 + head.square() * opacity.clone();
+            (error * full).sum() / (3.0 * all_head as f64)
+        });
         let color = composed.narrow(1, 0, 3) + background * (opacity.clone().neg() + 1.0);
 
         // colour over the rays that met something; the others are constant
@@ -344,6 +361,9 @@ impl Trainer<'_> {
         let denominator = 3.0 * counted.max(1.0) as f64;
         let rgb = error.clone().square().sum() / denominator;
         let mut total = rgb.clone() * config.rgb_mse;
+        if let Some(single) = single {
+            total = total + single * config.rgb_sample;
+        }
         if config.rgb_l1 > 0.0 {
             total = total + error.abs().sum() / denominator * config.rgb_l1;
         }
