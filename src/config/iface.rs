@@ -190,10 +190,10 @@ impl IfaceConfig {
     /// The default: better and slower.
     pub fn standard() -> IfaceConfig {
         IfaceConfig {
-            steps: 12_000,
+            steps: 8000,
             log2_table: 19,
-            level_every: 300,
-            anneal_end: 4000,
+            level_every: 250,
+            anneal_end: 3000,
             lr_final: 0.02,
             min_step: 0.003,
             ..IfaceConfig::draft()

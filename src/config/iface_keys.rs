@@ -62,7 +62,7 @@ pub(super) const KEYS: &[Key] = &[
         "foreground",
         "Soft pixels over black: photo (alpha times it), or estimated (stage light taken out).",
     ),
-    Key::number("checkpoint_s", "Seconds between checkpoints.", 1.0, 86_400.0),
+    Key::number("checkpoint_s", "Seconds between checkpoints.", 0.05, 86_400.0),
 ];
 
 impl IfaceConfig {
