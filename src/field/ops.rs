@@ -26,7 +26,7 @@ pub trait FieldOps: Backend {
         shape: Arc<FieldShape>,
     ) -> FloatTensor<Self>;
 
-    /// See [`neus`].
+    /// See [`neus()`].
     fn neus(
         field: FloatTensor<Self>,
         inv_s: FloatTensor<Self>,
@@ -69,7 +69,7 @@ pub trait FieldKernels: FieldOps {
         g: FloatTensor<Self>,
     ) -> (FloatTensor<Self>, FloatTensor<Self>);
 
-    /// [`neus`] that remembers.
+    /// [`neus()`] that remembers.
     fn neus_forward(
         field: FloatTensor<Self>,
         inv_s: FloatTensor<Self>,
