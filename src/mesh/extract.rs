@@ -53,7 +53,7 @@ impl MeshReport {
         let mut out = Vec::new();
         if self.capped > 0 {
             out.push(format!(
-                "the surface leaves the box at {} nodes and was capped there; enlarge the scene box if that is not the neck",
+                "the surface was closed by a cap where the kept region ends ({} nodes): the frames cut the body there, or the box is too small",
                 self.capped
             ));
         }
