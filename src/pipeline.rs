@@ -228,6 +228,12 @@ impl<'a> Line<'a> {
                 stage.monitor().step((8 * (i + 1)).min(total) as u64, total as u64, &[]);
                 self.stop_here()?;
             }
+            if coverage.is_empty() {
+                stage.warn(
+                    "no view has a head mask: there is no visual hull to start from, nothing says which pixels \
+                     are background, and the box learns whatever it holds; give masks for a head on its own",
+                );
+            }
             let scene = self.place(stage, masks)?;
             scene_file::write_scene(&stage.folder().join("scene.json"), &scene)?;
             let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;

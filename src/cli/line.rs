@@ -170,9 +170,9 @@ fn judgement(metrics: &Value) -> Vec<String> {
         if let Some(psnr) = mean["psnr_masked"].as_f64().or(mean["psnr"].as_f64()) {
             let ssim = mean["ssim_masked"].as_f64().or(mean["ssim"].as_f64());
             let ssim = ssim.map(|s| format!(", SSIM {s:.4}")).unwrap_or_default();
-            lines.push(format!(
-                "{words} against held-out photographs: PSNR {psnr:.2} dB{ssim}, inside the mask"
-            ));
+            let masked = mean["psnr_masked"].is_f64();
+            let region = if masked { "inside the mask" } else { "whole frame (no masks)" };
+            lines.push(format!("{words} against held-out photographs: PSNR {psnr:.2} dB{ssim}, {region}"));
         }
     }
     let truth = &metrics["truth_percent_of_head"];
