@@ -20,6 +20,9 @@ pub mod field;
 pub mod report;
 
 #[cfg(feature = "cpu")]
+pub mod tface;
+
+#[cfg(feature = "cpu")]
 pub mod iface;
 pub mod mesh;
 pub mod metrics;

@@ -276,7 +276,8 @@ impl<'a> Line<'a> {
     /// Stage `iface`: learns the field; goes on from its last checkpoint.
     #[cfg(feature = "cpu")]
     pub fn iface(&self) -> Result<Done, PipelineError> {
-        use crate::iface::{self, TrainView};
+        use crate::field::pixels::TrainView;
+        use crate::iface;
         let plan = self.plan("iface");
         let identity = plan.fingerprint.digest();
         Ok(self.run.stage(plan, |stage| {

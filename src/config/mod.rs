@@ -15,6 +15,8 @@ mod mesh;
 mod metrics;
 mod render;
 mod source;
+mod vm;
+mod vm_keys;
 
 pub use capture::CaptureConfig;
 pub use iface::IfaceConfig;
@@ -23,6 +25,7 @@ pub use mesh::{MeshConfig, MeshFormat, MeshFrame};
 pub use metrics::MetricsConfig;
 pub use render::{Background, Method, PictureFormat, RenderConfig};
 pub use source::{ConfigError, Place, Sources};
+pub use vm::{Ablation, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -91,6 +94,10 @@ pub struct Config {
     pub capture: CaptureConfig,
     /// Which pixels are the head.
     pub mask: MaskConfig,
+    /// The radiance field without masks that T-Face is compared with.
+    pub baseline: VmConfig,
+    /// T-Face.
+    pub tface: VmConfig,
     /// The learned signed-distance field.
     pub iface: IfaceConfig,
     /// The extracted surface.
@@ -120,6 +127,8 @@ const TABLES: &[(&str, &[Key])] = &[
     ("", ROOT_KEYS),
     ("capture", capture::KEYS),
     ("mask", mask::KEYS),
+    ("baseline", vm_keys::KEYS),
+    ("tface", vm_keys::KEYS),
     ("iface", iface_keys::KEYS),
     ("mesh", mesh::KEYS),
     ("render", render::KEYS),
@@ -144,6 +153,8 @@ impl Config {
             device: "auto".into(),
             capture: CaptureConfig::preset(preset),
             mask: MaskConfig::preset(preset),
+            baseline: VmConfig::baseline(preset),
+            tface: VmConfig::tface(preset),
             iface: IfaceConfig::preset(preset),
             mesh: MeshConfig::preset(preset),
             render: RenderConfig::preset(preset),

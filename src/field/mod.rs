@@ -5,8 +5,10 @@
 //! implements [`ops::FieldKernels`] and nothing else changes.
 
 pub mod autodiff;
+mod dark_stage;
 pub mod ops;
 pub mod optimizer;
+pub mod pixels;
 
 use burn::tensor::{Device, Tensor, TensorData};
 

@@ -7,17 +7,14 @@
 //! surface.
 
 mod checkpoint;
-mod dark_stage;
 mod hull_start;
 mod infer;
 mod model;
 mod occupancy;
-mod pixels;
 mod schedule;
 mod train;
 
 pub use infer::{IFace, VolumeRay};
-pub use pixels::TrainView;
 pub use schedule::{learning_rate, next_rays};
 pub use train::{TrainReport, train};
 

@@ -1,6 +1,7 @@
 //! Training on an analytic ball: does it learn, resume, guard and stop?
 
 use super::*;
+use crate::field::pixels::TrainView;
 use crate::geom::{Camera, Distortion};
 use crate::image::{Gray, Photo};
 use crate::run::Quiet;

@@ -13,3 +13,4 @@ pub mod rng;
 pub mod sdf;
 pub mod simd;
 pub mod sphharm;
+pub mod vm;

@@ -1,0 +1,267 @@
+//! Which cells of a box may hold anything, and marching through them on a fixed lattice of steps.
+//!
+//! TensoRF's alpha mask (Chen et al. 2022, §4.3; `alphaMask` of the published code) marks vertices and is
+//! looked up trilinearly: a point is kept if any vertex around it is. That is the same as cells whose
+//! corners are asked once, so here cells are stored, and a ray steps over empty ones *before* the field is
+//! touched. Sample positions `t = entry + step · (k + jitter)` do not depend on the mask.
+
+/// Cells of a box, one bit each, cell `(x · ny + y) · nz + z`; and blocks of cells that are all empty.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BoxMask {
+    min: [f32; 3],
+    max: [f32; 3],
+    size: [usize; 3],
+    bits: Vec<u64>,
+    /// Bits of blocks of `BLOCK`³ cells that hold an occupied cell.
+    blocks: Vec<u64>,
+}
+
+/// Cells along the edge of a block.
+const BLOCK: usize = 8;
+
+fn bit(bits: &[u64], i: usize) -> bool {
+    bits[i >> 6] >> (i & 63) & 1 == 1
+}
+
+impl BoxMask {
+    /// From cells asked one by one.
+    pub fn new(
+        min: [f32; 3],
+        max: [f32; 3],
+        size: [usize; 3],
+        occupied: impl Fn([usize; 3]) -> bool,
+    ) -> BoxMask {
+        let cells: usize = size.iter().product();
+        let mut mask = BoxMask { min, max, size, bits: vec![0; cells.div_ceil(64)], blocks: Vec::new() };
+        for x in 0..size[0] {
+            for y in 0..size[1] {
+                for z in 0..size[2] {
+                    if occupied([x, y, z]) {
+                        let i = mask.cell([x, y, z]);
+                        mask.bits[i >> 6] |= 1 << (i & 63);
+                    }
+                }
+            }
+        }
+        mask.group();
+        mask
+    }
+
+    /// From its bits, as [`BoxMask::bits`] gives them; `None` if they are not as many as the cells need.
+    pub fn from_bits(min: [f32; 3], max: [f32; 3], size: [usize; 3], bits: Vec<u64>) -> Option<BoxMask> {
+        let cells = size.iter().try_fold(1usize, |n, &s| n.checked_mul(s))?;
+        if bits.len() != cells.div_ceil(64) {
+            return None;
+        }
+        let mut mask = BoxMask { min, max, size, bits, blocks: Vec::new() };
+        mask.group();
+        Some(mask)
+    }
+
+    /// Cells between vertices: a cell is occupied if one of its eight corners is. `vertices` are
+    /// `(x · ny + y) · nz + z`, at least 2 along each axis, the outer ones on the box's border.
+    pub fn from_vertices(min: [f32; 3], max: [f32; 3], size: [usize; 3], vertices: &[bool]) -> BoxMask {
+        assert_eq!(vertices.len(), size.iter().product::<usize>());
+        let at = |x: usize, y: usize, z: usize| vertices[(x * size[1] + y) * size[2] + z];
+        BoxMask::new(min, max, size.map(|n| n - 1), |[x, y, z]| {
+            (0..8).any(|k| at(x + (k & 1), y + (k >> 1 & 1), z + (k >> 2)))
+        })
+    }
+
+    fn group(&mut self) {
+        let b = self.size.map(|n| n.div_ceil(BLOCK));
+        self.blocks = vec![0; (b[0] * b[1] * b[2]).div_ceil(64)];
+        for x in 0..self.size[0] {
+            for y in 0..self.size[1] {
+                for z in 0..self.size[2] {
+                    if bit(&self.bits, self.cell([x, y, z])) {
+                        let i = ((x / BLOCK) * b[1] + y / BLOCK) * b[2] + z / BLOCK;
+                        self.blocks[i >> 6] |= 1 << (i & 63);
+                    }
+                }
+            }
+        }
+    }
+
+    fn cell(&self, c: [usize; 3]) -> usize {
+        (c[0] * self.size[1] + c[1]) * self.size[2] + c[2]
+    }
+
+    /// Lower and upper corner.
+    pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
+        (self.min, self.max)
+    }
+
+    /// Cells along each axis.
+    pub fn size(&self) -> [usize; 3] {
+        self.size
+    }
+
+    /// The cells' bits.
+    pub fn bits(&self) -> &[u64] {
+        &self.bits
+    }
+
+    /// Share of cells that are occupied, 0..=1.
+    pub fn share(&self) -> f64 {
+        let cells: usize = self.size.iter().product();
+        let set: u64 = self.bits.iter().map(|b| b.count_ones() as u64).sum();
+        set as f64 / cells.max(1) as f64
+    }
+
+    /// Is a point in an occupied cell? Outside the box nothing is.
+    pub fn contains(&self, p: [f32; 3]) -> bool {
+        let mut c = [0; 3];
+        for a in 0..3 {
+            // also refuses NaN
+            if !(p[a] >= self.min[a] && p[a] <= self.max[a]) {
+                return false;
+            }
+            let g = (p[a] - self.min[a]) / (self.max[a] - self.min[a]) * self.size[a] as f32;
+            c[a] = (g as usize).min(self.size[a] - 1);
+        }
+        bit(&self.bits, self.cell(c))
+    }
+
+    /// The box around all occupied cells: lowest cell and one past the highest, per axis. `None` if there
+    /// are none.
+    pub fn extent(&self) -> Option<([usize; 3], [usize; 3])> {
+        let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
+        for x in 0..self.size[0] {
+            for y in 0..self.size[1] {
+                for z in 0..self.size[2] {
+                    if bit(&self.bits, self.cell([x, y, z])) {
+                        for (a, c) in [x, y, z].into_iter().enumerate() {
+                            low[a] = low[a].min(c);
+                            high[a] = high[a].max(c + 1);
+                        }
+                    }
+                }
+            }
+        }
+        (high[0] > 0).then_some((low, high))
+    }
+}
+
+/// A ray to be rendered, in the field's coordinates.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VmRay {
+    /// Start.
+    pub origin: [f32; 3],
+    /// Direction; the decoder sees it as it is, and `t` counts in its lengths.
+    pub direction: [f32; 3],
+    /// Offset of the lattice in 0..1 steps (0 outside training).
+    pub jitter: f32,
+}
+
+/// The lattice of a box: entry, step and how many samples a ray has.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lattice {
+    /// Lower corner of the field's box.
+    pub min: [f32; 3],
+    /// Upper corner.
+    pub max: [f32; 3],
+    /// Distance of samples, in units of `t`.
+    pub step: f32,
+    /// Samples of a ray; the last has no length and so no weight.
+    pub samples: usize,
+    /// The entry is kept within these.
+    pub near: f32,
+    /// See `near`.
+    pub far: f32,
+}
+
+/// Calls `emit` with every `t` of the ray's lattice inside the box and inside `mask`, until it says false.
+/// Returns how many lattice points lay in the box (or would have, beyond the stop none is counted).
+#[inline(always)]
+pub fn march(lattice: &Lattice, mask: Option<&BoxMask>, ray: &VmRay, mut emit: impl FnMut(f32) -> bool) {
+    let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
+    // the slab test replaces zero components by 1e-6, as published
+    for a in 0..3 {
+        let d = if ray.direction[a] == 0.0 { 1e-6 } else { ray.direction[a] };
+        let (p, q) = ((lattice.min[a] - ray.origin[a]) / d, (lattice.max[a] - ray.origin[a]) / d);
+        enter = enter.max(p.min(q));
+        leave = leave.min(p.max(q));
+    }
+    if enter.is_nan() || leave.is_nan() || lattice.step <= 0.0 || enter > leave {
+        return;
+    }
+    let start = enter.clamp(lattice.near, lattice.far) + ray.jitter * lattice.step;
+    if !start.is_finite() {
+        return;
+    }
+    let point = |t: f32| -> [f32; 3] { std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]) };
+    let slack = 1e-6;
+    let inside = |p: &[f32; 3]| {
+        (0..3).all(|a| {
+            let e = slack * (lattice.max[a] - lattice.min[a]);
+            p[a] >= lattice.min[a] - e && p[a] <= lattice.max[a] + e
+        })
+    };
+    let end = lattice.samples.saturating_sub(1) as i64;
+    let Some(mask) = mask else {
+        for k in 0..end {
+            let t = start + lattice.step * k as f32;
+            let p = point(t);
+            if inside(&p) {
+                if !emit(t) {
+                    return;
+                }
+            } else if t > leave {
+                return;
+            }
+        }
+        return;
+    };
+    let scale: [f32; 3] = std::array::from_fn(|a| mask.size[a] as f32 / (mask.max[a] - mask.min[a]));
+    let blocks = mask.size.map(|n| n.div_ceil(BLOCK));
+    let inverse: [f32; 3] = std::array::from_fn(|a| 1.0 / (ray.direction[a] * scale[a]));
+    let mut k = 0i64;
+    while k < end {
+        let t = start + lattice.step * k as f32;
+        if t > leave {
+            // the border itself belongs to the box, and rounding may put a sample just outside
+            if t > leave + lattice.step {
+                return;
+            }
+        }
+        let p = point(t);
+        let mut g = [0f32; 3];
+        let mut c = [0usize; 3];
+        let mut outside = !inside(&p);
+        for a in 0..3 {
+            g[a] = (p[a] - mask.min[a]) * scale[a];
+            let top = mask.size[a] as f32;
+            outside |= !(g[a] >= -1e-3 && g[a] <= top + 1e-3);
+            c[a] = (g[a].max(0.0) as usize).min(mask.size[a] - 1);
+        }
+        if outside {
+            k += 1;
+            continue;
+        }
+        if bit(&mask.bits, (c[0] * mask.size[1] + c[1]) * mask.size[2] + c[2]) {
+            if !emit(t) {
+                return;
+            }
+            k += 1;
+            continue;
+        }
+        // on to the border of the empty cell, or of its block if that is empty too; by whole steps
+        let block = c.map(|c| c / BLOCK);
+        let empty = !bit(&mask.blocks, (block[0] * blocks[1] + block[1]) * blocks[2] + block[2]);
+        let mut border = f32::INFINITY;
+        for a in 0..3 {
+            let ahead = ray.direction[a] > 0.0;
+            if ray.direction[a] != 0.0 {
+                let wall = if empty {
+                    ((block[a] + usize::from(ahead)) * BLOCK).min(mask.size[a])
+                } else {
+                    c[a] + usize::from(ahead)
+                };
+                border = border.min((wall as f32 - g[a]) * inverse[a]);
+            }
+        }
+        // a hair less, so that rounding cannot jump over a sample in the next cell
+        k += ((border.max(0.0) / lattice.step - 1e-3).ceil() as i64).max(1);
+    }
+}

@@ -1,0 +1,377 @@
+use super::fixture::{color, decoder, density, field, grid, network};
+use super::mask::{BoxMask, Lattice, VmRay, march};
+use super::*;
+use crate::kernel::rng;
+
+/// A point given as -1..=1 along each axis of the fixture's box.
+fn at(u: [f32; 3]) -> [f32; 3] {
+    [u[0] * 1.5, u[1] * 1.67, u[2]]
+}
+
+#[test]
+fn density_features_have_the_published_values() {
+    let points = [[0.0; 3], [0.25, -0.5, 0.75], [-0.9, 0.3, -0.1], [1.0; 3]].map(at);
+    let want = [0.1918000, 0.1737500, 0.2303020, 0.1112000];
+    for (got, want) in density_at(&field(), &density(), &points).iter().zip(want) {
+        assert!((got - want).abs() < 2e-7, "{got} {want}");
+    }
+}
+
+#[test]
+fn rendered_rays_have_the_published_values() {
+    let f = field();
+    assert!((f.lattice.step - 0.2918889).abs() < 1e-7);
+    let weights = DecoderWeights::new(decoder(), &network());
+    let rays = [
+        VmRay { origin: [0.1, -0.2, 4.5], direction: [0.02, 0.05, -1.0], jitter: 0.0 },
+        VmRay { origin: [0.3, 0.4, 4.2], direction: [-0.1, 0.02, -1.0], jitter: 0.0 },
+    ];
+    let out = render(&f, &density(), &color(), &weights, &rays).out;
+    // rgb over black, over white, depth with the published code's extra (1 − opacity) d_z
+    let golden = [
+        ([0.5031043, 0.5020230, 0.4993656], [0.5031812, 0.5020999, 0.4994425], 3.6129913),
+        ([0.5033032, 0.5021623, 0.4993564], [0.5034794, 0.5023384, 0.4995325], 3.6014051),
+    ];
+    for (got, (black, white, depth)) in out.chunks_exact(RAY_WIDTH).zip(golden) {
+        for c in 0..3 {
+            assert!((got[c] - black[c]).abs() < 3e-7, "{got:?}");
+            assert!((got[c] + 1.0 - got[3] - white[c]).abs() < 3e-7, "{got:?}");
+        }
+        assert!((got[4] - (1.0 - got[3]) - depth).abs() < 1e-6, "{got:?}");
+    }
+}
+
+#[test]
+fn dense_alpha_has_the_published_values() {
+    let f = field();
+    let vertex = |v: [usize; 3]| -> [f32; 3] {
+        std::array::from_fn(|a| {
+            let (l, h) = (f.lattice.min[a], f.lattice.max[a]);
+            l + (h - l) * v[a] as f32 / (f.density.size[a] - 1) as f32
+        })
+    };
+    let points = [[0, 0, 0], [4, 5, 6], [2, 3, 4]].map(vertex);
+    for (sigma, want) in density_at(&f, &density(), &points).iter().zip([0.0567065f32, 0.0319369, 0.0532861])
+    {
+        let alpha = 1.0 - (-sigma * f.lattice.step).exp();
+        assert!((alpha - want).abs() < 2e-7, "{alpha} {want}");
+    }
+}
+
+#[test]
+fn penalties_have_the_published_values() {
+    assert!((total_variation(&grid(), &density()) * 1e-2 - 6.0e-5).abs() < 1e-9);
+    assert!((ortho(&grid(), &density(), 0) - 0.3444).abs() < 1e-5);
+    let (g, x) = (grid(), density());
+    let l1: f64 = (0..3)
+        .flat_map(|i| [g.plane(i), g.line(i)])
+        .map(|f| x[f.range()].iter().map(|v| v.abs() as f64).sum::<f64>() / f.len() as f64)
+        .sum();
+    assert!((l1 - 1.4060).abs() < 1e-4, "{l1}");
+    // arange(24) as [1, 2, 3, 4]: TV 34.0, here channel last in a plane of its own
+    let one = Grid { size: [4, 3, 2], rank: [2, 0, 0] };
+    let mut values = vec![0.0; one.len()];
+    for c in 0..2 {
+        for h in 0..3 {
+            for w in 0..4 {
+                values[(h * 4 + w) * 2 + c] = (c * 12 + h * 4 + w) as f32;
+            }
+        }
+    }
+    assert!((total_variation(&one, &values) - 34.0).abs() < 1e-9);
+}
+
+#[test]
+fn voxel_counts_and_sizes_are_the_published_ones() {
+    let counts = voxel_schedule(2_097_156, 27_000_000, 5);
+    assert_eq!(counts, [3_496_047, 5_828_060, 9_715_614, 16_196_343, 26_999_994]);
+    let extent = [3.0, 3.34, 2.0];
+    assert_eq!(size_for(extent, 2_097_156), [141, 157, 94]);
+    let want = [[167, 186, 111], [198, 221, 132], [235, 262, 157], [279, 311, 186], [331, 368, 220]];
+    for (count, want) in counts.into_iter().zip(want) {
+        assert_eq!(size_for(extent, count), want);
+    }
+    assert!((step_size(extent, [141, 157, 94], 0.5) - 0.010724).abs() < 1e-6);
+    assert!((step_size(extent, [331, 368, 220], 0.5) - 0.004554).abs() < 1e-6);
+}
+
+/// The same field written plainly in f64, from the formulas: loss = Σ g · out.
+fn plain(f: &VmField, x: &[f64], rays: &[VmRay], g: &[f32]) -> f64 {
+    let (nd, nc) = (f.density.len(), f.color.len());
+    let (density, rest) = x.split_at(nd);
+    let (color, network) = rest.split_at(nc);
+    let factors = |grid: &Grid, values: &[f64], p: [f64; 3]| -> Vec<f64> {
+        let l = &f.lattice;
+        let place = |a: usize| {
+            let u =
+                (p[a] - l.min[a] as f64) / (l.max[a] as f64 - l.min[a] as f64) * (grid.size[a] - 1) as f64;
+            let i = (u as usize).min(grid.size[a] - 2);
+            (i, u - i as f64)
+        };
+        let mut out = Vec::new();
+        for i in 0..3 {
+            let (pl, li) = (grid.plane(i), grid.line(i));
+            let ((x0, fx), (y0, fy)) = (place(PLANE_AXES[i].0), place(PLANE_AXES[i].1));
+            let (z0, fz) = place(LINE_AXIS[i]);
+            for c in 0..grid.rank[i] {
+                let at = |y: usize, x: usize| values[pl.start + (y * pl.width + x) * pl.channels + c];
+                let plane = (1.0 - fy) * ((1.0 - fx) * at(y0, x0) + fx * at(y0, x0 + 1))
+                    + fy * ((1.0 - fx) * at(y0 + 1, x0) + fx * at(y0 + 1, x0 + 1));
+                let line = (1.0 - fz) * values[li.start + z0 * li.channels + c]
+                    + fz * values[li.start + (z0 + 1) * li.channels + c];
+                out.push(plane * line);
+            }
+        }
+        out
+    };
+    let s = &f.decoder;
+    let mut m = Vec::new();
+    let mut rest = network;
+    for (o, i) in s.shapes() {
+        let (own, tail) = rest.split_at(o * i);
+        rest = tail;
+        m.push((own, o, i));
+    }
+    let times = |k: usize, v: &[f64]| -> Vec<f64> {
+        let (w, o, i) = m[k];
+        (0..o).map(|r| (0..i).map(|c| w[r * i + c] * v[c]).sum()).collect()
+    };
+    let decode = |products: &[f64], d: [f32; 3]| -> Vec<f64> {
+        let a = times(0, products);
+        let d = d.map(|v| v as f64);
+        let mut input = [a.clone(), d.to_vec()].concat();
+        for (v, n) in [(&a[..], s.feature_frequencies), (&d[..], s.view_frequencies)] {
+            for trig in [f64::sin, f64::cos] {
+                input.extend(v.iter().flat_map(|v| (0..n).map(move |k| trig(v * (1 << k) as f64))));
+            }
+        }
+        let layer = |k: usize, v: &[f64]| -> Vec<f64> {
+            times(k, v).iter().zip(m[k + 1].0).map(|(y, b)| y + b).collect()
+        };
+        let relu = |v: Vec<f64>| -> Vec<f64> { v.into_iter().map(|v| v.max(0.0)).collect() };
+        let h = relu(layer(3, &relu(layer(1, &input))));
+        layer(5, &h).into_iter().map(|y| 1.0 / (1.0 + (-y).exp())).collect()
+    };
+    let mut loss = 0.0;
+    for (r, ray) in rays.iter().enumerate() {
+        let mut light = 1.0;
+        let mut out = [0f64; RAY_WIDTH];
+        march(&f.lattice, f.mask.as_ref(), ray, |t| {
+            let p = std::array::from_fn(|a| ray.origin[a] as f64 + t as f64 * ray.direction[a] as f64);
+            let feature: f64 = factors(&f.density, density, p).iter().sum();
+            let sigma = if f.shading.softplus {
+                (1.0 + (feature + f.shading.shift as f64).exp()).ln()
+            } else {
+                feature.max(0.0)
+            };
+            let alpha = 1.0 - (-sigma * f.lattice.step as f64 * f.shading.distance_scale as f64).exp();
+            let w = light * alpha;
+            light *= 1.0 - alpha + 1e-10;
+            if w > f.shading.weight_threshold as f64 {
+                let c = decode(&factors(&f.color, color, p), ray.direction);
+                (0..3).for_each(|k| out[k] += w * c[k]);
+            }
+            out[3] += w;
+            out[4] += w * t as f64;
+            true
+        });
+        loss += (0..RAY_WIDTH).map(|k| g[r * RAY_WIDTH + k] as f64 * out[k]).sum::<f64>();
+    }
+    loss
+}
+
+fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
+    let mut f = field();
+    let size = [6, 5, 7];
+    f.density = Grid { size, rank: [5, 4, 1] };
+    f.color = Grid { size, rank: [9, 0, 6] };
+    f.decoder = DecoderShape {
+        channels: 15,
+        features: 7,
+        hidden: 16,
+        view_frequencies: encodings,
+        feature_frequencies: encodings,
+    };
+    f.shading.softplus = softplus;
+    f.shading.shift = -1.0;
+    f.shading.distance_scale = 3.0;
+    f.shading.weight_threshold = 0.0;
+    f.lattice.step = 0.11;
+    f.lattice.samples = 60;
+    let normal = |stream: u64, n: usize, scale: f32| -> Vec<f32> {
+        (0..n).map(|i| scale * rng::normal(seed, stream, i as u64)).collect()
+    };
+    let density: Vec<f32> = normal(1, f.density.len(), 0.4).iter().map(|v| v + 0.2).collect();
+    let color = normal(2, f.color.len(), 0.7);
+    let network = normal(3, f.decoder.len(), 0.5);
+    let rays: Vec<VmRay> = (0..24)
+        .map(|i| {
+            let u = |k: u64| rng::uniform(seed, 4, 8 * i + k) - 0.5;
+            VmRay {
+                origin: [2.0 * u(0), 2.0 * u(1), 4.6],
+                direction: [0.3 * u(2), 0.3 * u(3), -1.0],
+                jitter: u(4) + 0.5,
+            }
+        })
+        .collect();
+    let g = normal(5, rays.len() * RAY_WIDTH, 1.0);
+    let weights = DecoderWeights::new(f.decoder, &network);
+    let rendered = render(&f, &density, &color, &weights, &rays);
+    assert!(rendered.color_samples > 200, "{}", rendered.color_samples);
+    let (mut gd, mut gc) = (vec![0.0; density.len()], vec![0.0; color.len()]);
+    let gn = backward(&f, &density, &weights, rendered, &g, &mut gd, &mut gc);
+    let analytic: Vec<f32> = [gd, gc, gn].concat();
+    let mut x: Vec<f64> = [density, color, network].concat().iter().map(|&v| v as f64).collect();
+    let largest = analytic.iter().fold(0f32, |m, g| m.max(g.abs())) as f64;
+    let mut errors = Vec::new();
+    for k in 0..300u64 {
+        let i = rng::below(seed, 6, k, x.len() as u64) as usize;
+        let (old, h) = (x[i], 1e-6);
+        x[i] = old + h;
+        let up = plain(&f, &x, &rays, &g);
+        x[i] = old - h;
+        let down = plain(&f, &x, &rays, &g);
+        x[i] = old;
+        let want = (up - down) / (2.0 * h);
+        let error = (analytic[i] as f64 - want).abs() / want.abs().max(1e-2 * largest);
+        // a kink of relu inside the difference is no error of the gradient
+        errors.push(error);
+    }
+    errors
+}
+
+#[test]
+fn gradients_agree_with_finite_differences_of_the_plain_formulas() {
+    let mut all = Vec::new();
+    for (softplus, encodings, seed) in [(false, 0, 1), (false, 2, 2), (true, 0, 3), (true, 2, 4)] {
+        all.extend(check_gradients(softplus, encodings, seed));
+    }
+    all.sort_by(f64::total_cmp);
+    let (median, worst) = (all[all.len() / 2], all[all.len() - 1]);
+    println!("{} gradients: worst {worst:.2e}, median {median:.2e}", all.len());
+    assert!(worst <= 1e-3 && median <= 1e-4, "worst {worst:.2e}, median {median:.2e}");
+}
+
+#[test]
+fn penalty_gradients_agree_with_finite_differences() {
+    let grid = Grid { size: [5, 4, 6], rank: [3, 2, 1] };
+    let x: Vec<f32> = (0..grid.len()).map(|i| rng::normal(7, 1, i as u64)).collect();
+    let penalty = Penalty { tv: 0.7, l1: 0.3, ortho: 0.2 };
+    let mut g = vec![0.0; grid.len()];
+    penalise(&grid, &penalty, &x, &mut g);
+    let value = |x: &[f32]| -> f64 {
+        let l1: f64 = (0..3)
+            .flat_map(|i| [grid.plane(i), grid.line(i)])
+            .map(|f| x[f.range()].iter().map(|v| v.abs() as f64).sum::<f64>() / f.len() as f64)
+            .sum();
+        let o: f64 = (0..3).map(|i| ortho(&grid, x, i)).sum();
+        0.7 * total_variation(&grid, x) + 0.3 * l1 + 0.2 * o
+    };
+    for i in (0..grid.len()).step_by(3) {
+        let h = 1e-3f32;
+        let (mut up, mut down) = (x.clone(), x.clone());
+        up[i] += h;
+        down[i] -= h;
+        let want = (value(&up) - value(&down)) / (up[i] - down[i]) as f64;
+        assert!((g[i] as f64 - want).abs() < 1e-4 * want.abs().max(0.1), "{i}: {} {want}", g[i]);
+    }
+    // alone, too
+    let mut only = vec![0.0; grid.len()];
+    penalise(&grid, &Penalty { ortho: 0.2, ..Penalty::default() }, &x, &mut only);
+    let f = grid.line(0);
+    assert!(only[..f.start].iter().all(|&g| g == 0.0) && only[f.range()].iter().any(|&g| g != 0.0));
+}
+
+#[test]
+fn a_mask_removes_samples_and_moves_none() {
+    let lattice = Lattice {
+        min: [-1.0, -0.8, -1.2],
+        max: [1.0, 0.8, 1.2],
+        step: 0.013,
+        samples: 400,
+        near: 0.0,
+        far: 9.0,
+    };
+    // the mask's box is smaller than the field's, as after an update before the box shrinks again
+    let hit = |c: [usize; 3]| (c[0] * 7 + c[1] * 3 + c[2]) % 11 == 0 && c[0] < 30;
+    let mask = BoxMask::new([-0.9, -0.8, -1.2], [1.0, 0.7, 1.1], [37, 20, 29], hit);
+    let mut met = 0;
+    for i in 0..50 {
+        let u = |k: u64| rng::uniform(9, 1, 8 * i + k) - 0.5;
+        let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(0), 0.8 * u(1), -1.0] };
+        let ray = VmRay { origin: [u(2), u(3), 3.0], direction, jitter: u(4) + 0.5 };
+        let (mut all, mut some) = (Vec::new(), Vec::new());
+        march(&lattice, None, &ray, |t| {
+            all.push(t);
+            true
+        });
+        march(&lattice, Some(&mask), &ray, |t| {
+            some.push(t);
+            true
+        });
+        let want: Vec<f32> = all
+            .iter()
+            .copied()
+            .filter(|t| mask.contains(std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a])))
+            .collect();
+        met += usize::from(!all.is_empty());
+        // a sample on the very border of a cell may fall on either side
+        let odd = want.iter().filter(|t| !some.contains(t)).count()
+            + some.iter().filter(|t| !want.contains(t)).count();
+        assert!(odd <= 1, "ray {i}: {odd} of {}", want.len());
+    }
+    assert!(met > 30, "{met}");
+}
+
+#[test]
+fn vertices_occupy_the_cells_around_them() {
+    let mut vertices = vec![false; 4 * 5 * 6];
+    vertices[(2 * 5 + 1) * 6 + 5] = true;
+    let mask = BoxMask::from_vertices([0.0; 3], [3.0, 4.0, 5.0], [4, 5, 6], &vertices);
+    // vertex (2, 1, 5) touches cells 1..3 × 0..2 × 4
+    assert_eq!(mask.extent(), Some(([1, 0, 4], [3, 2, 5])));
+    assert!(
+        mask.contains([1.5, 0.5, 4.5]) && !mask.contains([0.5, 0.5, 4.5]) && !mask.contains([1.5, 0.5, 3.5])
+    );
+    assert_eq!(BoxMask::new([0.0; 3], [1.0; 3], [3, 3, 3], |_| false).extent(), None);
+}
+
+#[test]
+fn finer_grids_keep_corners_and_straight_lines() {
+    let a = grid();
+    let b = Grid { size: [9, 11, 13], rank: a.rank };
+    let (x, fine) = (density(), resized(&grid(), &density(), &b));
+    // the fixture is linear in the vertex indices, so interpolation is exact: halves in between
+    let (p, q) = (a.plane(0), b.plane(0));
+    let at =
+        |f: &Factor, x: &[f32], h: usize, w: usize, c: usize| x[f.start + (h * f.width + w) * f.channels + c];
+    for c in 0..2 {
+        for (h, w) in [(0, 0), (3, 2), (5, 4)] {
+            assert!((at(&q, &fine, 2 * h, 2 * w, c) - at(&p, &x, h, w, c)).abs() < 1e-6);
+        }
+        let mid = 0.5 * (at(&p, &x, 1, 1, c) + at(&p, &x, 2, 2, c));
+        assert!((at(&q, &fine, 3, 3, c) - mid).abs() < 1e-6);
+    }
+    let (small, kept) = cropped(&a, &x, [1, 0, 2], [4, 6, 7]);
+    assert_eq!((small.size, kept.len()), ([3, 6, 5], small.len()));
+    // plane 1 is x × z: its corner was at x = 1, z = 2
+    let (f, o) = (small.plane(1), a.plane(1));
+    assert_eq!(at(&f, &kept, 0, 0, 0), at(&o, &x, 2, 1, 0));
+    assert_eq!(kept[small.line(0).start], x[a.line(0).start + 2 * 2]);
+}
+
+#[test]
+fn hidden_samples_change_a_ray_by_less_than_what_is_left_of_its_light() {
+    let mut f = field();
+    f.lattice.step = 0.02;
+    f.lattice.samples = 300;
+    let weights = DecoderWeights::new(decoder(), &network());
+    let ray = [VmRay { origin: [0.1, -0.2, 4.5], direction: [0.02, 0.05, -1.0], jitter: 0.0 }];
+    let all = render(&f, &density(), &color(), &weights, &ray);
+    f.shading.stop = 1e-3;
+    let some = render(&f, &density(), &color(), &weights, &ray);
+    assert!(some.density_samples < all.density_samples);
+    for (a, b) in all.out.iter().zip(&some.out).take(4) {
+        assert!((a - b).abs() < 1e-3, "{:?} {:?}", all.out, some.out);
+    }
+}
