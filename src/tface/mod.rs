@@ -4,7 +4,10 @@
 //! Human Heads): the opacity that background rays collect is pushed to zero. The baseline is the same code
 //! without masks.
 
+mod checkpoint;
+mod grow;
 mod infer;
+mod state;
 mod train;
 
 pub use infer::{TFace, VmPixel};
