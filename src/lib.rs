@@ -19,6 +19,8 @@ pub mod capture;
 pub mod field;
 pub mod report;
 
+pub mod tface;
+
 #[cfg(feature = "cpu")]
 pub mod iface;
 pub mod mesh;

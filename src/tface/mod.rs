@@ -1,0 +1,3 @@
+//! **tface**: the TensoRF vector–matrix radiance field.
+
+pub mod th;
