@@ -102,7 +102,7 @@ fn density_feature(vm: &VmCheckpoint, u: [f64; 3]) -> f64 {
 #[test]
 fn planes_and_lines_lie_along_the_axes_the_published_code_gives_them() {
     let vm = fixture();
-    // printed by the published code
+    // golden values of the published arithmetic, computed apart from this crate
     for (u, golden) in [
         ([0.0, 0.0, 0.0], 0.1918000),
         ([0.25, -0.5, 0.75], 0.1737500),

@@ -42,7 +42,7 @@ impl Entry {
     }
 }
 
-/// An archive of these entries; `offset(i, true)` is where the list says entry i is.
+/// An archive of these entries; `offset(i, at)` is where its list says that entry i is, which is at `at`.
 pub fn archive(entries: &[Entry], offset: impl Fn(usize, u32) -> u32) -> Vec<u8> {
     let mut out = Vec::new();
     let mut list = Vec::new();

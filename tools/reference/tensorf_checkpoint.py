@@ -7,7 +7,7 @@
 The field is a fixture given by formulas: every parameter is a sine or a line of its indices, so that a test
 can work it out again. The features, colors and rays are computed here in float64 from the formulas of
 TensoRF (Chen et al. 2022) in plain numpy; torch only holds and saves the parameters. Printed values are
-compared with digits that were computed elsewhere with the published code.
+compared with digits of the published arithmetic in float32 that were computed apart from this script.
 
 Needs torch (2.4 was used) and numpy.
 """
@@ -186,7 +186,7 @@ def regularizers(values):
     return tv, l1, numpy.abs(products[~numpy.eye(len(products), dtype=bool)]).mean()
 
 
-# digits printed by the published code on its own arithmetic, float32
+# digits of the published arithmetic, float32
 GOLDEN = {
     "density feature A": 0.1918000, "density feature B": 0.1737500, "density feature C": 0.2303020,
     "density feature D": 0.1112000,
