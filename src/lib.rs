@@ -1,7 +1,7 @@
 //! Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel views.
 //!
 //! The line, one word per stage: **capture** (what was photographed, from where) → **mask** (which
-//! pixels are the head) → **iface** (a learned signed-distance field) → **mesh** (its zero level
+//! pixels are the head) → **baseline**, **tface** (radiance fields) → **iface** (a learned signed distance) → **mesh** (its zero level
 //! set, closed) → **render** (views by ray casting and by volume rendering) → **metrics**.
 //!
 //! Modules are declared in the order of that line; what they share stands first.
@@ -19,7 +19,6 @@ pub mod capture;
 pub mod field;
 pub mod report;
 
-#[cfg(feature = "cpu")]
 pub mod tface;
 
 #[cfg(feature = "cpu")]

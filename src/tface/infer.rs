@@ -6,6 +6,8 @@ use crate::config::VmConfig;
 use crate::geom::Ray;
 use crate::kernel::vm::mask::VmRay;
 use crate::kernel::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -21,12 +23,15 @@ pub struct VmPixel {
 }
 
 /// Where a field's coordinates are not the scene's: `field = scale · scene + offset`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Placement {
     /// Field units in a scene unit.
     pub scale: f32,
     /// Where the scene's origin is in the field.
     pub offset: [f32; 3],
+    /// Ray directions are scaled to depth 1 along the optical axis before the decoder sees them, and steps are
+    /// so much longer off the axis: what the published ILSH loader does.
+    pub depth_directions: bool,
 }
 
 /// The trained field on the host. Positions and distances are in scene units.
@@ -60,34 +65,38 @@ impl TFace {
     }
 
     /// From the checkpoint in a stage folder.
-    pub fn load(dir: &Path, config: &VmConfig) -> Result<TFace, TfaceError> {
-        let device = crate::field::device("cpu")?;
-        let state = checkpoint::read(&checkpoint::newest(dir), config, None, &device)?;
-        Ok(TFace::new(config, &state))
+    pub fn load(dir: &Path) -> Result<TFace, TfaceError> {
+        Ok(checkpoint::load(&checkpoint::newest(dir))?.0)
     }
 
-    /// Volume render of rays in scene coordinates, with unit directions.
-    pub fn render(&self, rays: &[Ray]) -> Vec<VmPixel> {
-        rays.chunks(PASS).flat_map(|rays| self.pass(rays)).collect()
+    /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
+    /// vector `forward`.
+    pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<VmPixel> {
+        rays.chunks(PASS).flat_map(|rays| self.pass(rays, forward)).collect()
     }
 
-    fn pass(&self, rays: &[Ray]) -> Vec<VmPixel> {
-        let (scale, offset) = self.placement.map_or((1.0, [0.0; 3]), |p| (p.scale, p.offset));
+    fn pass(&self, rays: &[Ray], forward: Vec3) -> Vec<VmPixel> {
+        let p = self.placement.unwrap_or(Placement { scale: 1.0, offset: [0.0; 3], depth_directions: false });
+        // length of each direction in the field's units of t
+        let stretch = |r: &Ray| {
+            if p.depth_directions { 1.0 / r.direction.dot(forward).max(1e-3) } else { 1.0 }
+        };
         let placed: Vec<VmRay> = rays
             .iter()
             .map(|r| VmRay {
-                origin: std::array::from_fn(|a| scale * r.origin[a] + offset[a]),
-                direction: r.direction.to_array(),
+                origin: std::array::from_fn(|a| p.scale * r.origin[a] + p.offset[a]),
+                direction: (r.direction * stretch(r)).to_array(),
                 jitter: 0.0,
             })
             .collect();
         vm::render(&self.field, &self.density, &self.color, &self.weights, &placed)
             .out
             .chunks_exact(RAY_WIDTH)
-            .map(|o| VmPixel {
+            .zip(rays)
+            .map(|(o, r)| VmPixel {
                 color: [o[0], o[1], o[2]].map(|c| c.clamp(0.0, 1.0)),
                 opacity: o[3].clamp(0.0, 1.0),
-                depth: if o[3] > 0.0 { o[4] / o[3] / scale } else { 0.0 },
+                depth: if o[3] > 0.0 { o[4] / o[3] * stretch(r) / p.scale } else { 0.0 },
             })
             .collect()
     }

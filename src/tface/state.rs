@@ -6,7 +6,9 @@ use crate::field::optimizer::Moments;
 use crate::kernel::march::Bitmask;
 use crate::kernel::rng;
 use crate::kernel::vm::mask::{BoxMask, Lattice};
-use crate::kernel::vm::{DecoderShape, Grid, Shading, VmField, size_for, step_size, voxel_schedule};
+use crate::kernel::vm::{
+    DecoderShape, Grid, Shading, VmField, samples_across, size_for, step_size, voxel_schedule,
+};
 use burn::module::Param;
 use burn::tensor::{Device, Tensor};
 use std::sync::Arc;
@@ -140,9 +142,8 @@ impl State {
         let extent: [f32; 3] = std::array::from_fn(|a| self.bounds[1][a] - self.bounds[0][a]);
         let ratio = config.step_ratio as f32;
         let step = step_size(extent, self.size, ratio);
-        let diagonal = extent.iter().map(|e| e * e).sum::<f32>().sqrt();
         let vertices = self.size.iter().map(|&n| (n * n) as f32).sum::<f32>().sqrt();
-        let samples = if training { (vertices / ratio) as usize } else { (diagonal / step) as usize + 1 };
+        let samples = if training { (vertices / ratio) as usize } else { samples_across(extent, step) };
         Arc::new(VmField {
             density,
             color,

@@ -156,15 +156,15 @@ pub fn train(
             }
         }
         if monitor.stop() {
-            checkpoint::save(dir, &trainer.state, identity, false)?;
+            checkpoint::save(dir, &trainer.state, config, identity, false)?;
             return Err(TfaceError::Stopped { step: trainer.state.step, steps: config.steps });
         }
         if saved.elapsed() > Duration::from_secs_f64(config.checkpoint_s) {
-            checkpoint::save(dir, &trainer.state, identity, false)?;
+            checkpoint::save(dir, &trainer.state, config, identity, false)?;
             saved = Instant::now();
         }
     }
-    checkpoint::save(dir, &trainer.state, identity, true)?;
+    checkpoint::save(dir, &trainer.state, config, identity, true)?;
     checkpoint::finish(dir)?;
     let (state, counts) = (&trainer.state, trainer.counts);
     let report = TrainReport {

@@ -87,6 +87,11 @@ impl BoxMask {
         (c[0] * self.size[1] + c[1]) * self.size[2] + c[2]
     }
 
+    /// Is a cell occupied?
+    pub fn get(&self, cell: [usize; 3]) -> bool {
+        bit(&self.bits, self.cell(cell))
+    }
+
     /// Lower and upper corner.
     pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
         (self.min, self.max)
