@@ -5,6 +5,8 @@
 //! implements [`ops::FieldKernels`] and nothing else changes.
 
 pub mod autodiff;
+#[cfg(test)]
+pub(crate) mod ball;
 mod dark_stage;
 pub mod ops;
 pub mod optimizer;

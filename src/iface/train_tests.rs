@@ -1,70 +1,9 @@
 //! Training on an analytic ball: does it learn, resume, guard and stop?
 
 use super::*;
-use crate::field::pixels::TrainView;
-use crate::geom::{Camera, Distortion};
-use crate::image::{Gray, Photo};
+use crate::field::ball::{BALL, StopAfter, hull, temporary, views};
 use crate::run::Quiet;
-use glam::{DMat3, DVec3, Vec2, Vec3};
-use std::sync::atomic::{AtomicU64, Ordering};
-
-const SIZE: u32 = 40;
-const BALL: f32 = 0.6;
-
-/// A red and green ball in front of a blue wall, seen from eight sides.
-fn views() -> Vec<TrainView> {
-    (0..8)
-        .map(|i| view(i as f64 * std::f64::consts::TAU / 8.0, if i % 2 == 0 { 0.4 } else { -0.4 }))
-        .collect()
-}
-
-fn view(azimuth: f64, elevation: f64) -> TrainView {
-    let rotation = DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-elevation);
-    let camera = Camera {
-        width: SIZE,
-        height: SIZE,
-        fx: 60.0,
-        fy: 60.0,
-        cx: 20.0,
-        cy: 20.0,
-        distortion: Distortion::default(),
-        rotation,
-        position: rotation * DVec3::new(0.0, 0.0, 3.0),
-    };
-    let mut rgb = Vec::new();
-    let mut alpha = Vec::new();
-    for y in 0..SIZE {
-        for x in 0..SIZE {
-            let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).unwrap();
-            let b = ray.origin.dot(ray.direction);
-            let discriminant = b * b - ray.origin.length_squared() + BALL * BALL;
-            if discriminant > 0.0 {
-                let p = ray.at(-b - discriminant.sqrt());
-                rgb.push(if p.y > 0.0 { [200, 40, 30] } else { [40, 180, 60] });
-                alpha.push(255);
-            } else {
-                rgb.push([30, 30, 220]);
-                alpha.push(0);
-            }
-        }
-    }
-    TrainView {
-        camera,
-        photo: Photo { width: SIZE, height: SIZE, rgb, alpha: None },
-        mask: Some(Gray { width: SIZE, height: SIZE, values: alpha }),
-        valid: None,
-    }
-}
-
-fn hull() -> Bitmask {
-    let r = 32;
-    let mut hull = Bitmask::filled(r, false);
-    for i in 0..r * r * r {
-        let c = Vec3::from_array([i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) / 16.0 - 1.0));
-        hull.set(i, c.length() < BALL + 0.1);
-    }
-    hull
-}
+use glam::{Vec2, Vec3};
 
 fn config() -> IfaceConfig {
     IfaceConfig {
@@ -81,10 +20,6 @@ fn config() -> IfaceConfig {
         min_step: 0.02,
         ..IfaceConfig::draft()
     }
-}
-
-fn temporary() -> tempfile::TempDir {
-    tempfile::tempdir().expect("a temporary folder")
 }
 
 #[test]
@@ -108,18 +43,6 @@ fn a_ball_is_learned_from_eight_views() {
     assert_eq!(loaded.render(&[ray])[0], seen);
 }
 
-/// Asks to stop after so many steps.
-struct StopAfter(AtomicU64);
-
-impl Monitor for StopAfter {
-    fn step(&self, _: u64, _: u64, _: &[(&str, f64)]) {
-        self.0.fetch_sub(1, Ordering::SeqCst);
-    }
-    fn stop(&self) -> bool {
-        self.0.load(Ordering::SeqCst) == 0
-    }
-}
-
 fn bytes(dir: &Path) -> Vec<u8> {
     std::fs::read(checkpoint::newest(dir)).unwrap()
 }
@@ -135,7 +58,7 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
     run(undisturbed.path(), &Quiet).unwrap();
     let stopped = temporary();
     for _ in 0..3 {
-        let end = run(stopped.path(), &StopAfter(AtomicU64::new(11)));
+        let end = run(stopped.path(), &StopAfter::new(11));
         assert!(matches!(end, Err(IfaceError::Stopped { steps: 40, .. })));
     }
     // a checkpoint cut short by a crash: the one before it is taken

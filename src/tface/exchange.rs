@@ -153,23 +153,18 @@ pub fn export_th(dir: &Path, scale: f64, scene_from_world: &Similarity) -> Resul
         color_lines: lines(&f.color, &face.color),
         basis,
         mlp: [(w1, b1), (w2, b2), (w3, b3)],
-        mask: f.mask.as_ref().map(|m| {
-            let (low, high) = m.bounds();
-            vertices(m, [place(low), place(high)])
-        }),
+        mask: f.mask.as_ref().and_then(|m| vertices(m, place)),
     }))
 }
 
-/// Vertices whose cells are all occupied: marking the cells around them gives back every cell that was marked
-/// because of a vertex.
-fn vertices(mask: &BoxMask, aabb: [[f32; 3]; 2]) -> VmMask {
-    let [nx, ny, nz] = mask.size().map(|n| n + 1);
-    let around = |v: usize, n: usize| v.saturating_sub(1)..(v + 1).min(n - 1);
-    let occupied = (0..nx * ny * nz)
-        .map(|i| {
-            let (x, y, z) = (i % nx, i / nx % ny, i / (nx * ny));
-            around(x, nx).all(|x| around(y, ny).all(|y| around(z, nz).all(|z| mask.get([x, y, z]))))
-        })
-        .collect();
-    VmMask { shape: [nz, ny, nx], occupied, aabb }
+/// The mask as vertices, z slowest as published; its corners go through `place`.
+fn vertices(mask: &BoxMask, place: impl Fn([f32; 3]) -> [f32; 3]) -> Option<VmMask> {
+    let ([low, high], [nx, ny, nz], vertices) = mask.vertices()?;
+    let occupied =
+        (0..nx * ny * nz).map(|i| vertices[(i % nx * ny + i / nx % ny) * nz + i / (nx * ny)]).collect();
+    Some(VmMask { shape: [nz, ny, nx], occupied, aabb: [place(low), place(high)] })
 }
+
+#[cfg(test)]
+#[path = "exchange_tests.rs"]
+mod tests;

@@ -17,7 +17,7 @@ const MASK_VERTICES: usize = 256 * 256 * 256;
 pub fn update_mask(state: &mut State, config: &VmConfig, device: &Device) -> bool {
     let size = match &state.mask {
         Some(mask) if state.masked && state.size.iter().product::<usize>() >= MASK_VERTICES => {
-            mask.size().map(|n| n + 1)
+            mask.size().map(|n| n - 1)
         }
         _ => state.size,
     };

@@ -204,6 +204,17 @@ fn check(stage: &'static str, config: &VmConfig) -> Result<(), TfaceError> {
     Ok(())
 }
 
+/// Learning rate as a share of its first value, `since` steps after it last started.
+fn learning_rate(config: &VmConfig, since: u64) -> f64 {
+    config.lr_final.powf(since as f64 / config.steps as f64)
+}
+
+/// What is left of the TV weights at a step: they fade by the published 0.1 over the whole training and,
+/// unlike the learning rate, never start again.
+fn tv_fade(config: &VmConfig, step: u64) -> f64 {
+    0.1f64.powf((step + 1) as f64 / config.steps as f64)
+}
+
 /// The views with their masks as the setting wants them.
 fn masked_as_configured(views: &[TrainView], masks: MaskUse) -> Vec<TrainView> {
     let change = |mask: &Gray| match masks {
@@ -263,8 +274,7 @@ impl Trainer<'_> {
     /// Both grids with their regularisers attached.
     fn penalised(&self, field: &Arc<crate::kernel::vm::VmField>, step: u64) -> (Tensor<1>, Tensor<1>) {
         let config = self.config;
-        // TV fades by the factor of the learning rate, and unlike that never starts again
-        let faded = 0.1f64.powf((step + 1) as f64 / config.steps as f64);
+        let faded = tv_fade(config, step);
         let tv = |weight: f64| (0.01 * weight * faded) as f32;
         let l1 = if self.state.masked { config.l1_rest } else { config.l1_start } as f32;
         let ortho = config.ortho as f32;
@@ -358,7 +368,7 @@ impl Trainer<'_> {
             return Err(("gradient of the", f32::NAN));
         }
         let since = step - state.reset;
-        let factor = config.lr_final.powf(since as f64 / config.steps as f64);
+        let factor = learning_rate(config, since);
         let grid = AdamStep {
             lr: (config.lr_grid * factor) as f32,
             beta1: 0.9,
@@ -388,3 +398,7 @@ impl Trainer<'_> {
         true
     }
 }
+
+#[cfg(test)]
+#[path = "train_tests.rs"]
+mod tests;

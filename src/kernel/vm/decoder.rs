@@ -232,7 +232,9 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &DecoderWeights, lookup: 
         relu(h2, &w.b2);
         gemm::<F>((TILE, RGB, h), h2, (h, 1), &w.w3t, RGB, &mut out, RGB, false);
         for r in 0..rows {
-            t.rgb[base + r] = std::array::from_fn(|c| sigmoid::<F>(out[r * RGB + c] + w.b3[c]));
+            for c in 0..3 {
+                t.rgb[base + r][c] = sigmoid::<F>(out[r * RGB + c] + w.b3[c]);
+            }
         }
     }
 }

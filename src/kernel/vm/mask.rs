@@ -58,14 +58,42 @@ impl BoxMask {
         Some(mask)
     }
 
-    /// Cells between vertices: a cell is occupied if one of its eight corners is. `vertices` are
-    /// `(x · ny + y) · nz + z`, at least 2 along each axis, the outer ones on the box's border.
+    /// Cells around vertices: a cell is occupied if one of its eight corners is. `vertices` are
+    /// `(x · ny + y) · nz + z`, at least 2 along each axis, the outer ones on the border of `min..max`.
+    ///
+    /// The cells go one further than the vertices on every side, as the published lookup does: it pads with
+    /// zeros, and a point less than a cell outside still has some of the vertex on the border.
     pub fn from_vertices(min: [f32; 3], max: [f32; 3], size: [usize; 3], vertices: &[bool]) -> BoxMask {
         assert_eq!(vertices.len(), size.iter().product::<usize>());
-        let at = |x: usize, y: usize, z: usize| vertices[(x * size[1] + y) * size[2] + z];
-        BoxMask::new(min, max, size.map(|n| n - 1), |[x, y, z]| {
-            (0..8).any(|k| at(x + (k & 1), y + (k >> 1 & 1), z + (k >> 2)))
+        let unit: [f32; 3] = std::array::from_fn(|a| (max[a] - min[a]) / (size[a] - 1) as f32);
+        let grown = |corner: [f32; 3], sign: f32| std::array::from_fn(|a| corner[a] + sign * unit[a]);
+        BoxMask::new(grown(min, -1.0), grown(max, 1.0), size.map(|n| n + 1), |[x, y, z]| {
+            (0..8).any(|k| {
+                // cell 0 lies before vertex 0: its upper corner
+                let v = [x + (k & 1), y + (k >> 1 & 1), z + (k >> 2)];
+                (0..3).all(|a| v[a] > 0 && v[a] <= size[a])
+                    && vertices[((v[0] - 1) * size[1] + v[1] - 1) * size[2] + v[2] - 1]
+            })
         })
+    }
+
+    /// The vertices between cells: their box, how many there are along each axis, and those whose cells are
+    /// all occupied. The way back from [`BoxMask::from_vertices`], up to vertices that make no difference;
+    /// cells that no vertex explains are lost. `None` for a mask of single cells.
+    pub fn vertices(&self) -> Option<([[f32; 3]; 2], [usize; 3], Vec<bool>)> {
+        if self.size.iter().any(|&n| n < 3) {
+            return None;
+        }
+        let n = self.size.map(|n| n - 1);
+        let unit: [f32; 3] = std::array::from_fn(|a| (self.max[a] - self.min[a]) / self.size[a] as f32);
+        let bounds =
+            [std::array::from_fn(|a| self.min[a] + unit[a]), std::array::from_fn(|a| self.max[a] - unit[a])];
+        let all = |x: usize, y: usize, z: usize| {
+            (0..8).all(|k| bit(&self.bits, self.cell([x + (k & 1), y + (k >> 1 & 1), z + (k >> 2)])))
+        };
+        let vertices =
+            (0..n[0] * n[1] * n[2]).map(|i| all(i / (n[1] * n[2]), i / n[2] % n[1], i % n[2])).collect();
+        Some((bounds, n, vertices))
     }
 
     fn group(&mut self) {
@@ -85,11 +113,6 @@ impl BoxMask {
 
     fn cell(&self, c: [usize; 3]) -> usize {
         (c[0] * self.size[1] + c[1]) * self.size[2] + c[2]
-    }
-
-    /// Is a cell occupied?
-    pub fn get(&self, cell: [usize; 3]) -> bool {
-        bit(&self.bits, self.cell(cell))
     }
 
     /// Lower and upper corner.
@@ -126,25 +149,6 @@ impl BoxMask {
             c[a] = (g as usize).min(self.size[a] - 1);
         }
         bit(&self.bits, self.cell(c))
-    }
-
-    /// The box around all occupied cells: lowest cell and one past the highest, per axis. `None` if there
-    /// are none.
-    pub fn extent(&self) -> Option<([usize; 3], [usize; 3])> {
-        let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
-        for x in 0..self.size[0] {
-            for y in 0..self.size[1] {
-                for z in 0..self.size[2] {
-                    if bit(&self.bits, self.cell([x, y, z])) {
-                        for (a, c) in [x, y, z].into_iter().enumerate() {
-                            low[a] = low[a].min(c);
-                            high[a] = high[a].max(c + 1);
-                        }
-                    }
-                }
-            }
-        }
-        (high[0] > 0).then_some((low, high))
     }
 }
 
@@ -203,86 +207,104 @@ impl Lattice {
     }
 }
 
-/// Calls `emit` with every `t` of the ray's lattice inside the box and inside `mask`, until it says false.
-#[inline(always)]
-pub fn march(lattice: &Lattice, mask: Option<&BoxMask>, ray: &VmRay, mut emit: impl FnMut(f32) -> bool) {
-    let Some((enter, leave)) = lattice.crossing(ray).filter(|_| lattice.step > 0.0) else { return };
-    let start = enter.clamp(lattice.near, lattice.far) + ray.jitter * lattice.step;
-    if !start.is_finite() {
-        return;
+/// The lattice points of a ray inside the box and inside a mask, one after the other.
+///
+/// A state and not a closure: a closure handed down would be compiled without the vector instructions of the
+/// kernel that calls it.
+pub struct Walk<'a> {
+    lattice: &'a Lattice,
+    mask: Option<&'a BoxMask>,
+    ray: VmRay,
+    start: f32,
+    leave: f32,
+    /// Next point.
+    k: i64,
+    end: i64,
+    /// Mask cells in a unit of length, and the inverse of how many a ray crosses in a unit of t.
+    scale: [f32; 3],
+    inverse: [f32; 3],
+    blocks: [usize; 3],
+}
+
+impl<'a> Walk<'a> {
+    /// Before the first point; without any for a ray that misses.
+    #[inline(always)]
+    pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &VmRay) -> Walk<'a> {
+        let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
+        let (enter, leave) = crossing.unwrap_or((0.0, 0.0));
+        let start = enter.clamp(lattice.near, lattice.far) + ray.jitter * lattice.step;
+        let any = crossing.is_some() && start.is_finite();
+        let mut scale = [0f32; 3];
+        let mut inverse = [0f32; 3];
+        let mut blocks = [0; 3];
+        if let Some(m) = mask {
+            for a in 0..3 {
+                scale[a] = m.size[a] as f32 / (m.max[a] - m.min[a]);
+                inverse[a] = 1.0 / (ray.direction[a] * scale[a]);
+                blocks[a] = m.size[a].div_ceil(BLOCK);
+            }
+        }
+        let end = if any { lattice.samples.saturating_sub(1) as i64 } else { 0 };
+        Walk { lattice, mask, ray: *ray, start, leave, k: 0, end, scale, inverse, blocks }
     }
-    let point = |t: f32| -> [f32; 3] { std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]) };
-    let slack = 1e-6;
-    let inside = |p: &[f32; 3]| {
-        (0..3).all(|a| {
-            let e = slack * (lattice.max[a] - lattice.min[a]);
-            p[a] >= lattice.min[a] - e && p[a] <= lattice.max[a] + e
-        })
-    };
-    let end = lattice.samples.saturating_sub(1) as i64;
-    let Some(mask) = mask else {
-        for k in 0..end {
-            let t = start + lattice.step * k as f32;
-            let p = point(t);
-            if inside(&p) {
-                if !emit(t) {
-                    return;
-                }
-            } else if t > leave {
-                return;
-            }
-        }
-        return;
-    };
-    let scale: [f32; 3] = std::array::from_fn(|a| mask.size[a] as f32 / (mask.max[a] - mask.min[a]));
-    let blocks = mask.size.map(|n| n.div_ceil(BLOCK));
-    let inverse: [f32; 3] = std::array::from_fn(|a| 1.0 / (ray.direction[a] * scale[a]));
-    let mut k = 0i64;
-    while k < end {
-        let t = start + lattice.step * k as f32;
-        if t > leave {
+
+    /// The next `t`.
+    #[inline(always)]
+    pub fn next(&mut self) -> Option<f32> {
+        let l = self.lattice;
+        while self.k < self.end {
+            let t = self.start + l.step * self.k as f32;
             // the border itself belongs to the box, and rounding may put a sample just outside
-            if t > leave + lattice.step {
-                return;
+            if t > self.leave + l.step {
+                return None;
             }
-        }
-        let p = point(t);
-        let mut g = [0f32; 3];
-        let mut c = [0usize; 3];
-        let mut outside = !inside(&p);
-        for a in 0..3 {
-            g[a] = (p[a] - mask.min[a]) * scale[a];
-            let top = mask.size[a] as f32;
-            outside |= !(g[a] >= -1e-3 && g[a] <= top + 1e-3);
-            c[a] = (g[a].max(0.0) as usize).min(mask.size[a] - 1);
-        }
-        if outside {
-            k += 1;
-            continue;
-        }
-        if bit(&mask.bits, (c[0] * mask.size[1] + c[1]) * mask.size[2] + c[2]) {
-            if !emit(t) {
-                return;
+            let mut p = [0f32; 3];
+            let mut outside = false;
+            for a in 0..3 {
+                p[a] = self.ray.origin[a] + t * self.ray.direction[a];
+                let slack = 1e-6 * (l.max[a] - l.min[a]);
+                // written so that NaN is outside, too
+                outside |= !(p[a] >= l.min[a] - slack && p[a] <= l.max[a] + slack);
             }
-            k += 1;
-            continue;
-        }
-        // on to the border of the empty cell, or of its block if that is empty too; by whole steps
-        let block = c.map(|c| c / BLOCK);
-        let empty = !bit(&mask.blocks, (block[0] * blocks[1] + block[1]) * blocks[2] + block[2]);
-        let mut border = f32::INFINITY;
-        for a in 0..3 {
-            let ahead = ray.direction[a] > 0.0;
-            if ray.direction[a] != 0.0 {
-                let wall = if empty {
-                    ((block[a] + usize::from(ahead)) * BLOCK).min(mask.size[a])
-                } else {
-                    c[a] + usize::from(ahead)
-                };
-                border = border.min((wall as f32 - g[a]) * inverse[a]);
+            let Some(mask) = self.mask else {
+                self.k += 1;
+                if outside {
+                    continue;
+                }
+                return Some(t);
+            };
+            let mut g = [0f32; 3];
+            let mut c = [0usize; 3];
+            for a in 0..3 {
+                g[a] = (p[a] - mask.min[a]) * self.scale[a];
+                let top = mask.size[a] as f32;
+                outside |= !(g[a] >= -1e-3 && g[a] <= top + 1e-3);
+                c[a] = (g[a].max(0.0) as usize).min(mask.size[a] - 1);
             }
+            if outside {
+                self.k += 1;
+                continue;
+            }
+            if bit(&mask.bits, (c[0] * mask.size[1] + c[1]) * mask.size[2] + c[2]) {
+                self.k += 1;
+                return Some(t);
+            }
+            // on to the border of the empty cell, or of its block if that is empty too; by whole steps
+            let block = [c[0] / BLOCK, c[1] / BLOCK, c[2] / BLOCK];
+            let at = (block[0] * self.blocks[1] + block[1]) * self.blocks[2] + block[2];
+            let empty = !bit(&mask.blocks, at);
+            let mut border = f32::INFINITY;
+            for a in 0..3 {
+                let ahead = usize::from(self.ray.direction[a] > 0.0);
+                if self.ray.direction[a] != 0.0 {
+                    let wall =
+                        if empty { ((block[a] + ahead) * BLOCK).min(mask.size[a]) } else { c[a] + ahead };
+                    border = border.min((wall as f32 - g[a]) * self.inverse[a]);
+                }
+            }
+            // a hair less, so that rounding cannot jump over a sample in the next cell
+            self.k += ((border.max(0.0) / l.step - 1e-3).ceil() as i64).max(1);
         }
-        // a hair less, so that rounding cannot jump over a sample in the next cell
-        k += ((border.max(0.0) / lattice.step - 1e-3).ceil() as i64).max(1);
+        None
     }
 }

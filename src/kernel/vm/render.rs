@@ -10,7 +10,7 @@
 
 use super::decoder::{self, Decoded, DecoderWeights};
 use super::gather::{self, Cell, Lookup, Spread};
-use super::mask::{BoxMask, Lattice, VmRay, march};
+use super::mask::{BoxMask, Lattice, VmRay, Walk};
 use super::{DecoderShape, Grid};
 use crate::dispatch;
 use crate::kernel::pool::Buffer;
@@ -78,12 +78,11 @@ impl VmField {
     #[inline(always)]
     fn cell(&self, ray: &VmRay, t: f32) -> Cell {
         let l = &self.lattice;
-        Cell::new(
-            self.density.size,
-            std::array::from_fn(|a| {
-                (ray.origin[a] + t * ray.direction[a] - l.min[a]) / (l.max[a] - l.min[a])
-            }),
-        )
+        let mut unit = [0f32; 3];
+        for a in 0..3 {
+            unit[a] = (ray.origin[a] + t * ray.direction[a] - l.min[a]) / (l.max[a] - l.min[a]);
+        }
+        Cell::new(self.density.size, unit)
     }
 }
 
@@ -135,20 +134,23 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
     for ray in task.rays {
         let before = task.kept.len();
         let mut transmittance = 1f32;
-        march(&field.lattice, field.mask.as_ref(), ray, |t| {
+        let mut walk = Walk::new(&field.lattice, field.mask.as_ref(), ray);
+        while let Some(t) = walk.next() {
             let cell = field.cell(ray, t);
             let feature = lookup.sum::<F>(&cell);
             task.looked_up += 1;
             if !s.softplus && feature <= 0.0 {
                 transmittance *= 1.0 + 1e-10;
-                return true; // neither weight nor gradient
+                continue; // neither weight nor gradient
             }
             let alpha = 1.0 - exp::<F>(-s.density::<F>(feature) * length);
             task.kept.push(Kept { t, feature, alpha, transmittance });
             task.cells.push(cell);
             transmittance *= 1.0 - alpha + 1e-10;
-            transmittance > s.stop
-        });
+            if transmittance <= s.stop {
+                break;
+            }
+        }
         task.counts.push((task.kept.len() - before) as u32);
     }
 }
@@ -324,7 +326,10 @@ struct DensityTask<'a> {
 fn density_body<const F: bool>(task: &mut DensityTask, field: &VmField, lookup: &Lookup) {
     let l = &field.lattice;
     for (p, out) in task.points.iter().zip(task.out.iter_mut()) {
-        let unit = std::array::from_fn(|a| (p[a] - l.min[a]) / (l.max[a] - l.min[a]));
+        let mut unit = [0f32; 3];
+        for a in 0..3 {
+            unit[a] = (p[a] - l.min[a]) / (l.max[a] - l.min[a]);
+        }
         *out = field.shading.density::<F>(lookup.sum::<F>(&Cell::new(field.density.size, unit)));
     }
 }

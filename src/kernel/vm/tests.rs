@@ -1,5 +1,5 @@
 use super::fixture::{color, decoder, density, field, grid, network};
-use super::mask::{BoxMask, Lattice, VmRay, march};
+use super::mask::{BoxMask, Lattice, VmRay, Walk};
 use super::*;
 use crate::kernel::rng;
 
@@ -156,7 +156,8 @@ fn plain(f: &VmField, x: &[f64], rays: &[VmRay], g: &[f32]) -> f64 {
     for (r, ray) in rays.iter().enumerate() {
         let mut light = 1.0;
         let mut out = [0f64; RAY_WIDTH];
-        march(&f.lattice, f.mask.as_ref(), ray, |t| {
+        let mut walk = Walk::new(&f.lattice, f.mask.as_ref(), ray);
+        while let Some(t) = walk.next() {
             let p = std::array::from_fn(|a| ray.origin[a] as f64 + t as f64 * ray.direction[a] as f64);
             let feature: f64 = factors(&f.density, density, p).iter().sum();
             let sigma = if f.shading.softplus {
@@ -173,8 +174,7 @@ fn plain(f: &VmField, x: &[f64], rays: &[VmRay], g: &[f32]) -> f64 {
             }
             out[3] += w;
             out[4] += w * t as f64;
-            true
-        });
+        }
         loss += (0..RAY_WIDTH).map(|k| g[r * RAY_WIDTH + k] as f64 * out[k]).sum::<f64>();
     }
     loss
@@ -300,15 +300,11 @@ fn a_mask_removes_samples_and_moves_none() {
         let u = |k: u64| rng::uniform(9, 1, 8 * i + k) - 0.5;
         let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(0), 0.8 * u(1), -1.0] };
         let ray = VmRay { origin: [u(2), u(3), 3.0], direction, jitter: u(4) + 0.5 };
-        let (mut all, mut some) = (Vec::new(), Vec::new());
-        march(&lattice, None, &ray, |t| {
-            all.push(t);
-            true
-        });
-        march(&lattice, Some(&mask), &ray, |t| {
-            some.push(t);
-            true
-        });
+        let points = |mask: Option<&BoxMask>| {
+            let mut walk = Walk::new(&lattice, mask, &ray);
+            std::iter::from_fn(|| walk.next()).collect::<Vec<f32>>()
+        };
+        let (all, some) = (points(None), points(Some(&mask)));
         let want: Vec<f32> = all
             .iter()
             .copied()
@@ -328,12 +324,16 @@ fn vertices_occupy_the_cells_around_them() {
     let mut vertices = vec![false; 4 * 5 * 6];
     vertices[(2 * 5 + 1) * 6 + 5] = true;
     let mask = BoxMask::from_vertices([0.0; 3], [3.0, 4.0, 5.0], [4, 5, 6], &vertices);
-    // vertex (2, 1, 5) touches cells 1..3 × 0..2 × 4
-    assert_eq!(mask.extent(), Some(([1, 0, 4], [3, 2, 5])));
-    assert!(
-        mask.contains([1.5, 0.5, 4.5]) && !mask.contains([0.5, 0.5, 4.5]) && !mask.contains([1.5, 0.5, 3.5])
-    );
-    assert_eq!(BoxMask::new([0.0; 3], [1.0; 3], [3, 3, 3], |_| false).extent(), None);
+    // vertex (2, 1, 5) touches what is less than one away along every axis, the border's outside too
+    for (p, inside) in
+        [([1.5, 0.5, 4.5], true), ([2.9, 1.9, 5.9], true), ([0.9, 1.0, 5.0], false), ([2.0, 1.0, 3.9], false)]
+    {
+        assert_eq!(mask.contains(p), inside, "{p:?}");
+    }
+    assert_eq!(mask.size(), [5, 6, 7]);
+    let ([low, high], size, back) = mask.vertices().unwrap();
+    assert!((0..3).all(|a| low[a].abs() < 1e-6 && (high[a] - [3.0, 4.0, 5.0][a]).abs() < 1e-5));
+    assert_eq!((size, back), ([4, 5, 6], vertices));
 }
 
 #[test]

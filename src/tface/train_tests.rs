@@ -1,0 +1,173 @@
+//! Training on an analytic ball: does it learn, resume, guard and stop?
+
+use super::*;
+use crate::config::{Ablation, DensityActivation, Preset};
+use crate::field::ball::{BALL, StopAfter, hull, temporary, views};
+use crate::kernel::vm::size_for;
+use crate::run::Quiet;
+use glam::{Vec2, Vec3};
+
+const BOX: Aabb = Aabb { min: Vec3::splat(-0.8), max: Vec3::splat(0.8) };
+
+fn config() -> VmConfig {
+    VmConfig {
+        steps: 150,
+        rays: 512,
+        voxels_start: 16 * 16 * 16,
+        voxels_final: 28 * 28 * 28,
+        upsample_steps: vec![40, 70],
+        mask_steps: vec![40, 90],
+        density_rank: vec![8, 8, 8],
+        color_rank: vec![8, 4, 9],
+        hidden: 32,
+        ..VmConfig::tface(Preset::Draft)
+    }
+}
+
+fn run(config: &VmConfig, dir: &Path, monitor: &dyn Monitor) -> Result<(TFace, TrainReport), TfaceError> {
+    train("tface", &views(), BOX, Some(&hull()), config, 3, "cpu", dir, "ball", monitor)
+}
+
+#[test]
+fn a_ball_is_learned_from_eight_views() {
+    let dir = temporary();
+    let (face, report) = run(&config(), dir.path(), &Quiet).unwrap();
+    assert!(report.train_psnr > 20.0, "{report:?}");
+    // colour is asked of a part of the densities, and those of a part of the lattice
+    assert!(report.color_samples < report.density_samples && report.density_samples < report.lattice_samples);
+    // the box has shrunk around a ball of 0.6 and its first guesses are finer now
+    assert!(report.size.iter().all(|n| (24..40).contains(n)), "{report:?}");
+    let camera = views().remove(0).camera;
+    let ray = camera.ray(Vec2::new(20.0, 12.0)).unwrap();
+    let seen = face.render(&[ray], camera.forward())[0];
+    assert!(seen.opacity > 0.9 && seen.color[0] > seen.color[1], "{seen:?}");
+    // the ray of the middle meets the ball at 3 − 0.6
+    let middle = face.render(&[camera.ray(Vec2::new(20.0, 21.0)).unwrap()], camera.forward())[0];
+    assert!((middle.depth - (3.0 - BALL)).abs() < 0.1, "{middle:?}");
+    // nothing beside it
+    let beside = face.render(&[camera.ray(Vec2::new(2.0, 20.0)).unwrap()], camera.forward())[0];
+    assert!(beside.opacity < 0.05, "{beside:?}");
+    // the same field comes back from its checkpoint
+    let loaded = TFace::load(dir.path()).unwrap();
+    assert_eq!(loaded.render(&[ray], camera.forward())[0], seen);
+}
+
+#[test]
+fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
+    // two upsamplings, two masks and the shrinking box lie before, between and after the stops
+    let config = VmConfig { steps: 60, upsample_steps: vec![10, 25], mask_steps: vec![10, 30], ..config() };
+    let undisturbed = temporary();
+    run(&config, undisturbed.path(), &Quiet).unwrap();
+    let stopped = temporary();
+    for _ in 0..5 {
+        let end = run(&config, stopped.path(), &StopAfter::new(11));
+        assert!(matches!(end, Err(TfaceError::Stopped { steps: 60, .. })));
+    }
+    // a checkpoint cut short by a crash: the one before it is taken
+    let bytes = |dir: &Path| std::fs::read(checkpoint::newest(dir)).unwrap();
+    let whole = bytes(stopped.path());
+    std::fs::write(checkpoint::newest(stopped.path()), &whole[..whole.len() / 2]).unwrap();
+    run(&config, stopped.path(), &Quiet).unwrap();
+    assert_eq!(bytes(undisturbed.path()), bytes(stopped.path()));
+    assert!(!stopped.path().join("checkpoint.previous.safetensors").exists());
+}
+
+#[test]
+fn every_row_of_the_ablation_and_both_activations_train() {
+    for row in
+        [Ablation::Baseline, Ablation::MaskBinary, Ablation::MaskSoft, Ablation::MaskCe, Ablation::MaskL2]
+    {
+        for (background, activation) in [
+            (VmBackground::Reference, DensityActivation::Relu),
+            (VmBackground::Black, DensityActivation::Softplus),
+        ] {
+            let dir = temporary();
+            let config = VmConfig {
+                steps: 14,
+                upsample_steps: vec![5],
+                mask_steps: vec![5],
+                background,
+                activation,
+                start: VmStart::Box,
+                whole_frame: true,
+                l1_start: 1e-4,
+                ortho: 1e-3,
+                feature_frequencies: 1,
+                view_frequencies: 2,
+                density_shift: -1.0,
+                ..config().with(row)
+            };
+            let (_, report) = run(&config, dir.path(), &Quiet).unwrap();
+            assert!(report.train_psnr > 1.0, "{row:?} {background:?} {report:?}");
+        }
+    }
+}
+
+#[test]
+fn published_rates_are_reproduced() {
+    let p = VmConfig::tface(Preset::Paper);
+    // decay per step, then rates used at steps 1999, 2001 (just started again) and 49999 (7001 was the last start)
+    assert!((learning_rate(&p, 1) - 0.99995395).abs() < 1e-8);
+    assert!((0.02 * learning_rate(&p, 1999) - 0.0182411).abs() < 1e-7);
+    assert_eq!(0.02 * learning_rate(&p, 0), 0.02);
+    assert!((0.02 * learning_rate(&p, 49_999 - 7001) - 0.00276102).abs() < 1e-8);
+    assert!((0.001 * learning_rate(&p, 49_999 - 7001) - 0.000138051).abs() < 1e-9);
+    assert!((tv_fade(&p, 0) - 0.99995395).abs() < 1e-8 && (tv_fade(&p, 49_999) - 0.1).abs() < 1e-12);
+}
+
+#[test]
+fn upsampling_starts_the_rates_again_from_the_next_step() {
+    let device = crate::field::device("cpu").unwrap();
+    let config = config();
+    let mut state = State::new(&config, 1, [[-1.0; 3], [1.0; 3]], None, &device);
+    assert_eq!(state.size, [16; 3]);
+    state.step = 2001;
+    upsample(&mut state, &config, 1, &device);
+    assert_eq!((state.size, state.reset), (size_for([2.0; 3], 28 * 28 * 28), 2001));
+}
+
+#[test]
+fn a_diverging_run_restores_once_and_then_names_term_and_step() {
+    let dir = temporary();
+    // softplus, or every density would die before a colour breaks
+    let activation = DensityActivation::Softplus;
+    let config = VmConfig { lr_grid: 1e38, lr_network: 1e38, activation, mask_steps: vec![], ..config() };
+    match run(&config, dir.path(), &Quiet).err() {
+        Some(TfaceError::Diverged { term, value, .. }) => assert!(!value.is_finite() && !term.is_empty()),
+        other => panic!("expected divergence, got {other:?}"),
+    }
+}
+
+#[test]
+fn impossible_settings_and_empty_masks_are_named() {
+    let dir = temporary();
+    let message = |config: &VmConfig| run(config, dir.path(), &Quiet).err().unwrap().to_string();
+    let cases = [
+        (VmConfig { density_rank: vec![4, 4], ..config() }, "`tface.density_rank` needs three numbers"),
+        (VmConfig { upsample_steps: vec![9, 5], ..config() }, "`tface.upsample_steps` must rise"),
+        (VmConfig { hidden: 30, ..config() }, "`tface.hidden` must be a multiple of 8"),
+        (VmConfig { voxels_final: 100, ..config() }, "`tface.voxels_final` is less"),
+    ];
+    for (config, want) in cases {
+        assert!(message(&config).starts_with(want), "{}", message(&config));
+    }
+    let mut empty = views();
+    empty.iter_mut().for_each(|v| v.mask.as_mut().unwrap().values.fill(0));
+    let end = train("tface", &empty, BOX, Some(&hull()), &config(), 3, "cpu", dir.path(), "e", &Quiet);
+    assert!(matches!(end, Err(TfaceError::NoPixels)));
+    // a hull without a cell: the first alpha mask has nothing to keep
+    let nothing = Bitmask::filled(32, false);
+    let end = train("tface", &views(), BOX, Some(&nothing), &config(), 3, "cpu", dir.path(), "n", &Quiet);
+    assert!(matches!(end, Err(TfaceError::Empty { step: 40, .. })));
+}
+
+#[test]
+fn a_checkpoint_of_other_settings_is_refused() {
+    let dir = temporary();
+    let config = VmConfig { steps: 2, ..config() };
+    run(&config, dir.path(), &Quiet).unwrap();
+    let views = views();
+    let again = train("tface", &views, BOX, Some(&hull()), &config, 3, "cpu", dir.path(), "other", &Quiet);
+    let message = again.err().unwrap().to_string();
+    assert!(message.contains("checkpoint.safetensors") && message.contains("other settings"), "{message}");
+}
