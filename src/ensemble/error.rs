@@ -82,6 +82,12 @@ pub enum EnsembleError {
     /// No pixel to fit on.
     #[error("no pixel counts: the weight maps of all views are empty")]
     NoPixels,
+    /// Too few views to leave one out.
+    #[error("{found} views cannot judge each other, at least 2 can")]
+    Views {
+        /// How many were given.
+        found: usize,
+    },
     /// A grid of regions that cannot be.
     #[error("a grid of {found} nodes along an axis cannot be used, expected 2 to {MAX_NODES}")]
     Nodes {
@@ -132,6 +138,7 @@ impl EnsembleError {
             }
             EnsembleError::WeightSum { .. } => "give at least one member a weight above 0".into(),
             EnsembleError::NoPixels => "hold out views in which the head is seen and masked".into(),
+            EnsembleError::Views { .. } => "hold out two views or more for the blend".into(),
             EnsembleError::Nodes { .. } => "5 suits a head".into(),
             EnsembleError::NodeCount { .. } => "the file is not whole: fit the regions again".into(),
             EnsembleError::Stiffness { .. } => "0.1 suits most captures".into(),

@@ -236,6 +236,30 @@ fn little_data_and_great_stiffness_leave_the_global_weights() {
 }
 
 #[test]
+fn views_left_out_tell_whether_regions_are_worth_it() {
+    let judge = |views: &[RegionFit], stiffness| RegionFit::leave_one_out(views, stiffness).unwrap().unwrap();
+    let views: Vec<RegionFit> = (1..4).map(|seed| region_fit(seed, &everywhere())).collect();
+    assert!(judge(&views, Some(Stiffness::default())) > judge(&views, None) + 2.0);
+    // six pixels a view, hardly held back: worse than the global weights on the others
+    let mut few = everywhere();
+    few.values.fill(0);
+    (0..6).for_each(|i| few.values[650 * i + 30] = 255);
+    let same = |seed: u64| {
+        let views = [1, 2].map(|k| view(|i, j| color(seed, i, j) + noise(seed * 10 + k, 0.05, i, j)));
+        let photo = photo(|i, j| color(seed, i, j));
+        let mut fit = RegionFit::new(2, NODES).unwrap();
+        fit.add(&members(&views), &points(1), &Target { photo: &photo, weight: &few }).unwrap();
+        fit
+    };
+    let views: Vec<RegionFit> = (1..9).map(same).collect();
+    let loose = Stiffness { to_global: 1e-6, to_neighbours: 0.0 };
+    let (loose, global) = (judge(&views, Some(loose)), judge(&views, None));
+    let held = judge(&views, Some(Stiffness::default()));
+    assert!(loose < global - 0.2 && (held - global).abs() < 0.1, "{loose} {held} {global}");
+    assert_eq!(RegionFit::leave_one_out(&views[..1], None), Err(EnsembleError::Views { found: 1 }));
+}
+
+#[test]
 fn pixels_without_any_point_leave_every_node_at_the_global_weights() {
     let (views, photo) = split(6);
     let mut nowhere = Image::new(SIZE, SIZE, 3);

@@ -20,9 +20,9 @@ use super::{EnsembleError, Fit, Members, RegionWeights, Target, simplex};
 use crate::image::Image;
 
 /// A node weighs at least as if it had this many pixels, so that a handful of them in an almost
-/// empty capture still gives the global weights. Errors of neighbouring pixels are alike; this many
-/// are worth a few dozen independent ones.
-const LEAST_PIXELS: f64 = 1024.0;
+/// empty capture still gives the global weights. Errors of neighbouring pixels are alike: this many
+/// are worth perhaps ten that are not.
+const LEAST_PIXELS: f64 = 256.0;
 
 /// Sweeps over the grid; tens are enough.
 const SWEEPS: usize = 400;
@@ -38,7 +38,7 @@ pub struct Stiffness {
 
 impl Default for Stiffness {
     fn default() -> Stiffness {
-        Stiffness { to_global: 0.1, to_neighbours: 0.1 }
+        Stiffness { to_global: 0.1, to_neighbours: 0.03 }
     }
 }
 
@@ -139,6 +139,35 @@ impl RegionFit {
         if found != expected {
             return Err(EnsembleError::NodeCount { found, expected });
         }
+        Ok(decibels(self.error(regions), self.all.pixels()))
+    }
+
+    /// PSNR over the pixels of all views together, each view blended with weights that were fitted
+    /// on the others: what the stiffness (`None`: global weights everywhere) gains on fresh views.
+    pub fn leave_one_out(
+        views: &[RegionFit],
+        stiffness: Option<Stiffness>,
+    ) -> Result<Option<f64>, EnsembleError> {
+        if views.len() < 2 {
+            return Err(EnsembleError::Views { found: views.len() });
+        }
+        let (mut error, mut pixels) = (0.0, 0.0);
+        for (i, view) in views.iter().enumerate() {
+            let mut rest = RegionFit::new(view.all.members(), view.grid.nodes())?;
+            for other in views.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| v) {
+                rest.merge(other)?;
+            }
+            let global = rest.all.solve()?;
+            error += match stiffness {
+                None => view.all.error(&global),
+                Some(stiffness) => view.error(&rest.solve(&global, stiffness)?),
+            };
+            pixels += view.all.pixels();
+        }
+        Ok(decibels(error, pixels))
+    }
+
+    fn error(&self, regions: &RegionWeights) -> f64 {
         let m = self.all.members();
         let mut error = self.pointless.error(regions.global());
         for (cell, products) in self.products.chunks_exact(36 * pairs(m)).enumerate() {
@@ -153,7 +182,7 @@ impl RegionFit {
                 }
             }
         }
-        Ok(decibels(error, self.all.pixels()))
+        error
     }
 
     #[inline]

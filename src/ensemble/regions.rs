@@ -200,7 +200,7 @@ mod tests {
         assert_eq!(cell, 5); // 1 + 2 · 0 + 4 · 1
         assert_eq!(tents, [0.0, 0.0, 0.0, 0.0, 0.25, 0.25, 0.25, 0.25]);
         assert_eq!(grid.node(cell, 0), grid.at(1, 0, 1));
-        assert_eq!(grid.node(cell, 7), 26);
+        assert_eq!(grid.node(cell, 7), 23); // (2, 1, 2)
         assert_eq!(grid.beside(0).collect::<Vec<_>>(), [1, 3, 9]);
         assert_eq!(grid.beside(13).count(), 6);
     }
