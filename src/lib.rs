@@ -19,6 +19,7 @@ pub mod capture;
 pub mod field;
 pub mod report;
 
+pub mod ensemble;
 #[cfg(feature = "cpu")]
 pub mod tface;
 
