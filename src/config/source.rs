@@ -1,6 +1,6 @@
 //! From files and `--set` to a [`Config`]: which value wins, and what is wrong with one.
 
-use super::{Config, Key, Preset, all_keys, lookup, show};
+use super::{Ablation, Config, Key, Preset, all_keys, lookup, show};
 use serde::Deserialize;
 use std::fmt;
 use toml::de::{DeTable, DeValue};
@@ -13,6 +13,9 @@ pub struct Sources {
     pub preset: Option<Preset>,
     /// Configuration files: name for messages, text.
     pub files: Vec<(String, String)>,
+    /// Which of the files is what a run remembers: a row of the ablation that is named elsewhere beats
+    /// what this one says of the keys it decides.
+    pub remembered: Option<usize>,
     /// `--set`: each `key=value`.
     pub set: Vec<String>,
     /// Options with a name of their own: as typed, the key they set, its value. Strongest.
@@ -133,8 +136,13 @@ type Assignment = (String, Given, Place);
 
 pub(super) fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
     let mut given: Vec<Assignment> = Vec::new();
-    for (name, text) in &sources.files {
+    let mut remembered = 0..0;
+    for (i, (name, text)) in sources.files.iter().enumerate() {
+        let before = given.len();
         read_file(name, text, &mut given)?;
+        if sources.remembered == Some(i) {
+            remembered = before..given.len();
+        }
     }
     for set in &sources.set {
         let place = Place::Option(format!("--set {set}"));
@@ -148,20 +156,37 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
     }
 
     // the preset comes first whatever line it stands on; what it means is checked by `assign` below
-    let named = given.iter().rev().find(|(key, ..)| key == "preset").and_then(|(_, value, _)| {
-        let word = match value {
+    let word = |key: &str| {
+        let at = given.iter().rposition(|(k, ..)| k == key)?;
+        let word = match &given[at].1 {
             Given::Toml(v) => v.as_str()?.to_owned(),
             Given::Text(t) => t.trim_matches('"').to_owned(),
         };
-        Preset::deserialize(Value::String(word)).ok()
-    });
+        Some((at, Value::String(word)))
+    };
+    let named = word("preset").and_then(|(_, word)| Preset::deserialize(word).ok());
     let preset = sources.preset.or(named).unwrap_or_default();
     let mut config = Config::preset(preset);
-    for (key, value, place) in given {
+    // as does the row of the ablation, right after it
+    let mut decided = false;
+    if let Some((at, word)) = word("ablation") {
+        config.tface = match Ablation::deserialize(word) {
+            Ok(row) => config.tface.with(row),
+            Err(_) => config.tface,
+        };
+        decided = !remembered.contains(&at);
+    }
+    for (i, (key, value, place)) in given.into_iter().enumerate() {
+        if decided && remembered.contains(&i) && ABLATED.contains(&key.as_str()) {
+            continue;
+        }
         config = assign(&config, &key, value, place)?;
     }
     Ok(Config { preset, ..config })
 }
+
+/// What a row of the ablation decides.
+const ABLATED: [&str; 2] = ["tface.masks", "tface.mask_loss"];
 
 fn read_file(name: &str, text: &str, given: &mut Vec<Assignment>) -> Result<(), ConfigError> {
     let text = text.strip_prefix('\u{FEFF}').unwrap_or(text);
@@ -236,6 +261,14 @@ fn assign(config: &Config, key: &str, given: Given, place: Place) -> Result<Conf
     {
         let problem = format!("unknown device `{word}`, expected auto, cpu, wgpu:N or cuda:N");
         return Err(ConfigError::Word { place, key: key.into(), problem });
+    }
+    if key == "ablation"
+        && let Some(word) = value.as_str().filter(|w| !w.is_empty())
+    {
+        Ablation::deserialize(Value::String(word.into())).map_err(|e| {
+            let problem = e.message().lines().next().unwrap_or_default().to_string();
+            ConfigError::Word { place: place.clone(), key: key.into(), problem }
+        })?;
     }
     put(&mut root, key, value);
     Config::deserialize(Value::Table(root)).map_err(|e| {
@@ -429,6 +462,32 @@ mod tests {
         assert_eq!((c.iface.steps, c.capture.unit_m, c.capture.path.as_str()), (20_000, 1.0, "a b"));
         let c = from("", &["mesh.format=[\"ply\"]", "mask.source=\"none\""]).unwrap();
         assert_eq!(c.mesh.format, [MeshFormat::Ply]);
+    }
+
+    #[test]
+    fn a_row_of_the_ablation_comes_after_the_preset_and_before_files_and_set() {
+        use crate::config::{MaskLoss, MaskUse};
+        let masks = |c: &Config| (c.tface.masks, c.tface.mask_loss);
+        let c = from("", &["ablation=mask-ce"]).unwrap();
+        assert_eq!(masks(&c), (MaskUse::Soft, MaskLoss::Ce));
+        assert_eq!(c.baseline, Config::preset(Preset::Standard).baseline); // tface's alone
+        let c = from("tface.mask_loss = \"none\"", &["ablation=mask-ce"]).unwrap();
+        assert_eq!(masks(&c), (MaskUse::Soft, MaskLoss::None));
+        // what a run remembers is complete, and would win against any other row
+        let saved = from("", &["ablation=mask-binary"]).unwrap().to_toml();
+        let again = |set: &[&str]| {
+            let set = set.iter().map(|s| s.to_string()).collect();
+            let files = vec![("saved".into(), saved.clone())];
+            Config::resolve(&Sources { files, set, remembered: Some(0), ..Sources::default() }).unwrap()
+        };
+        assert_eq!(masks(&again(&[])), (MaskUse::Binary, MaskLoss::None));
+        assert_eq!(masks(&again(&["ablation=mask-l2"])), (MaskUse::Soft, MaskLoss::L2));
+        let e = from("", &["ablation=mask-hard"]).unwrap_err();
+        assert_eq!(
+            e.to_string(),
+            "`--set ablation=mask-hard`: `ablation`: unknown variant `mask-hard`, expected one of `baseline`, \
+             `mask-binary`, `mask-soft`, `mask-ce`, `mask-l2`"
+        );
     }
 
     #[test]
