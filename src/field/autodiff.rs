@@ -1,6 +1,6 @@
 //! One backward per operation, shared by every device.
 
-use super::ops::{FieldKernels, FieldOps};
+use super::ops::{FieldKernels, FieldOps, GridPenalty, VmBatch};
 use crate::kernel::adam::AdamStep;
 use crate::kernel::sdf::FieldShape;
 use burn::backend::Autodiff;
@@ -48,7 +48,67 @@ impl<B: FieldKernels> Backward<B, 2> for NeusBackward {
     }
 }
 
+#[derive(Debug)]
+struct VmRenderBackward;
+
+impl<B: FieldKernels> Backward<B, 3> for VmRenderBackward {
+    type State = B::SavedVm;
+
+    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let g = grads.consume::<B>(&ops.node);
+        let (g_density, g_color, g_network) = B::vm_render_backward(ops.state, g);
+        for (node, g) in ops.parents.into_iter().zip([g_density, g_color, g_network]) {
+            if let Some(node) = node {
+                grads.register::<B>(node.id, g);
+            }
+        }
+    }
+}
+
+#[derive(Debug)]
+struct PenalisedBackward;
+
+impl<B: FieldKernels> Backward<B, 1> for PenalisedBackward {
+    type State = (FloatTensor<B>, Arc<GridPenalty>);
+
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let g = grads.consume::<B>(&ops.node);
+        let (x, penalty) = ops.state;
+        let [parent] = ops.parents;
+        if let Some(node) = parent {
+            grads.register::<B>(node.id, B::penalise(x, g, &penalty));
+        }
+    }
+}
+
 impl<B: FieldKernels, C: CheckpointStrategy> FieldOps for Autodiff<B, C> {
+    fn vm_render(
+        density: FloatTensor<Self>,
+        color: FloatTensor<Self>,
+        network: FloatTensor<Self>,
+        batch: Arc<VmBatch>,
+    ) -> FloatTensor<Self> {
+        let (density, density_node) = density.into_parts();
+        let (color, color_node) = color.into_parts();
+        let (network, network_node) = network.into_parts();
+        let nodes = [density_node, color_node, network_node];
+        match VmRenderBackward.prepare::<C>(nodes).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let (out, saved) = B::vm_render_forward(density, color, network, batch);
+                prep.finish(saved, out)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::vm_render(density, color, network, batch)),
+        }
+    }
+
+    fn penalised(x: FloatTensor<Self>, penalty: Arc<GridPenalty>) -> FloatTensor<Self> {
+        let (x, node) = x.into_parts();
+        match PenalisedBackward.prepare::<C>([node]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => prep.finish((x.clone(), penalty), x),
+            OpsKind::UnTracked(prep) => prep.finish(x),
+        }
+    }
+
     fn sdf_field(
         table: FloatTensor<Self>,
         weights: FloatTensor<Self>,

@@ -8,10 +8,13 @@ use crate::kernel::adam::{self, AdamStep};
 use crate::kernel::mlp::Weights;
 use crate::kernel::neus::{self, Rays};
 use crate::kernel::sdf::{self, Activations, FieldShape};
+use crate::kernel::vm::mask::VmRay;
+use crate::kernel::vm::{self, DecoderWeights, Grid, Penalty, Rendered, VmField};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Dispatch, Flex, TensorMetadata, backend_extension};
 use burn::tensor::{DType, Int, Tensor, TensorData};
 use std::fmt::Debug;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 /// Operations that models call through the free functions of this module.
@@ -37,6 +40,17 @@ pub trait FieldOps: Backend {
         anneal: f32,
     ) -> FloatTensor<Self>;
 
+    /// See [`vm_render`].
+    fn vm_render(
+        density: FloatTensor<Self>,
+        color: FloatTensor<Self>,
+        network: FloatTensor<Self>,
+        batch: Arc<VmBatch>,
+    ) -> FloatTensor<Self>;
+
+    /// See [`penalised`].
+    fn penalised(x: FloatTensor<Self>, penalty: Arc<GridPenalty>) -> FloatTensor<Self>;
+
     /// See [`adam_step`].
     fn adam_step(
         p: FloatTensor<Self>,
@@ -53,6 +67,25 @@ pub trait FieldKernels: FieldOps {
     type SavedField: Clone + Send + Debug + 'static;
     /// Kept by [`FieldKernels::neus_forward`].
     type SavedRays: Clone + Send + Debug + 'static;
+    /// Kept by [`FieldKernels::vm_render_forward`].
+    type SavedVm: Clone + Send + Debug + 'static;
+
+    /// [`vm_render`] that remembers.
+    fn vm_render_forward(
+        density: FloatTensor<Self>,
+        color: FloatTensor<Self>,
+        network: FloatTensor<Self>,
+        batch: Arc<VmBatch>,
+    ) -> (FloatTensor<Self>, Self::SavedVm);
+
+    /// Gradients by density, appearance and network.
+    fn vm_render_backward(
+        saved: Self::SavedVm,
+        g: FloatTensor<Self>,
+    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
+
+    /// The gradient `g` of the values `x` with the penalty's own added.
+    fn penalise(x: FloatTensor<Self>, g: FloatTensor<Self>, penalty: &GridPenalty) -> FloatTensor<Self>;
 
     /// [`sdf_field`] that remembers.
     fn sdf_field_forward(
@@ -138,6 +171,59 @@ pub fn neus(field: Tensor<2>, inv_s: Tensor<1>, rays: RaySamples, anneal: f32) -
     ))
 }
 
+/// A batch of rays and the field they go through, for [`vm_render`].
+#[derive(Debug)]
+pub struct VmBatch {
+    /// Grids, box, lattice and mask.
+    pub field: Arc<VmField>,
+    /// `[rays]`
+    pub rays: Vec<VmRay>,
+    /// Filled by the forward: densities looked up.
+    pub density_samples: AtomicU64,
+    /// Filled by the forward: colours decoded.
+    pub color_samples: AtomicU64,
+}
+
+impl VmBatch {
+    /// A batch that nothing is known about yet.
+    pub fn new(field: Arc<VmField>, rays: Vec<VmRay>) -> VmBatch {
+        VmBatch { field, rays, density_samples: AtomicU64::new(0), color_samples: AtomicU64::new(0) }
+    }
+}
+
+/// A regulariser of one grid.
+#[derive(Clone, Copy, Debug)]
+pub struct GridPenalty {
+    /// Layout of the values.
+    pub grid: Grid,
+    /// Weights of its terms.
+    pub penalty: Penalty,
+}
+
+/// Rays through a vector-matrix field: see [`crate::kernel::vm`].
+///
+/// # Shapes
+///
+/// - density, color: flat planes and lines of the field's two grids; network: flat decoder weights
+/// - output: `[rays, 5]` = rgb over black (3), opacity, Σ w t; differentiable by all three
+pub fn vm_render(density: Tensor<1>, color: Tensor<1>, network: Tensor<1>, batch: Arc<VmBatch>) -> Tensor<2> {
+    Tensor::from_dispatch(<Dispatch as FieldOps>::vm_render(
+        density.into_dispatch(),
+        color.into_dispatch(),
+        network.into_dispatch(),
+        batch,
+    ))
+}
+
+/// The same values; whoever asks for their gradient gets the penalty's added to it.
+///
+/// That is the loss with the penalty in it, without a second gradient of the size of the grid to be made
+/// and summed. The penalty's value is not part of any loss tensor: see
+/// [`crate::kernel::vm::total_variation`].
+pub fn penalised(x: Tensor<1>, penalty: Arc<GridPenalty>) -> Tensor<1> {
+    Tensor::from_dispatch(<Dispatch as FieldOps>::penalised(x.into_dispatch(), penalty))
+}
+
 /// One fused AdamW step: weights, first and second moments after it. In place where the tensors are
 /// not shared; `g` is consumed.
 pub fn adam_step<const D: usize>(
@@ -193,7 +279,10 @@ fn give_back_zeroed(t: FlexTensor) {
     const WORTH: usize = 1 << 16;
     const KEPT: usize = 4;
     let mut free = ZEROED.lock().expect("no panic while the pool is locked");
-    if t.is_unique() && t.is_contiguous() && t.shape().num_elements() >= WORTH && free.len() < KEPT {
+    if t.is_unique() && t.is_contiguous() && t.shape().num_elements() >= WORTH {
+        if free.len() == KEPT {
+            free.remove(0); // of a grid that has become finer since
+        }
         free.push(t);
     }
 }
@@ -219,6 +308,19 @@ impl FieldOps for Flex {
         anneal: f32,
     ) -> FlexTensor {
         Self::neus_forward(field, inv_s, direction, t, dt, offsets, anneal).0
+    }
+
+    fn vm_render(
+        density: FlexTensor,
+        color: FlexTensor,
+        network: FlexTensor,
+        batch: Arc<VmBatch>,
+    ) -> FlexTensor {
+        Self::vm_render_forward(density, color, network, batch).0
+    }
+
+    fn penalised(x: FlexTensor, _: Arc<GridPenalty>) -> FlexTensor {
+        x
     }
 
     fn adam_step(
@@ -266,6 +368,17 @@ impl SavedRays {
     }
 }
 
+/// What the CPU keeps of rays through a vector-matrix field.
+#[derive(Debug)]
+pub struct SavedVm {
+    density: FlexTensor,
+    color_len: usize,
+    weights: DecoderWeights,
+    batch: Arc<VmBatch>,
+    /// Taken by the backward, which works in its buffers.
+    rendered: Mutex<Option<Rendered>>,
+}
+
 fn integers(t: IntTensor<Flex>) -> Vec<i32> {
     let t = if t.is_contiguous() { t } else { t.to_contiguous() };
     match t.dtype() {
@@ -277,6 +390,49 @@ fn integers(t: IntTensor<Flex>) -> Vec<i32> {
 impl FieldKernels for Flex {
     type SavedField = Arc<SavedField>;
     type SavedRays = SavedRays;
+    type SavedVm = Arc<SavedVm>;
+
+    fn vm_render_forward(
+        density: FlexTensor,
+        color: FlexTensor,
+        network: FlexTensor,
+        batch: Arc<VmBatch>,
+    ) -> (FlexTensor, Self::SavedVm) {
+        let [density, color, network] = [density, color, network].map(contiguous);
+        let weights = DecoderWeights::new(batch.field.decoder, slice(&network));
+        let mut rendered = vm::render(&batch.field, slice(&density), slice(&color), &weights, &batch.rays);
+        batch.density_samples.store(rendered.density_samples, Ordering::Relaxed);
+        batch.color_samples.store(rendered.color_samples, Ordering::Relaxed);
+        let out = flex(std::mem::take(&mut rendered.out), [batch.rays.len(), vm::RAY_WIDTH]);
+        let color_len = color.shape().num_elements();
+        let rendered = Mutex::new(Some(rendered));
+        (out, Arc::new(SavedVm { density, color_len, weights, batch, rendered }))
+    }
+
+    fn vm_render_backward(saved: Self::SavedVm, g: FlexTensor) -> (FlexTensor, FlexTensor, FlexTensor) {
+        let g = contiguous(g);
+        let rendered = saved.rendered.lock().expect("no panic while it is locked").take();
+        let rendered = rendered.expect("a graph is walked back once");
+        let mut g_density = take_zeroed(&[saved.density.shape().num_elements()]);
+        let mut g_color = take_zeroed(&[saved.color_len]);
+        let flat = vm::backward(
+            &saved.batch.field,
+            slice(&saved.density),
+            &saved.weights,
+            rendered,
+            slice(&g),
+            g_density.storage_mut::<f32>(),
+            g_color.storage_mut::<f32>(),
+        );
+        let n = flat.len();
+        (g_density, g_color, flex(flat, [n]))
+    }
+
+    fn penalise(x: FlexTensor, g: FlexTensor, penalty: &GridPenalty) -> FlexTensor {
+        let [x, mut g] = [x, g].map(contiguous);
+        vm::penalise(&penalty.grid, &penalty.penalty, slice(&x), g.storage_mut::<f32>());
+        g
+    }
 
     fn sdf_field_forward(
         table: FlexTensor,

@@ -10,6 +10,7 @@ mod json;
 mod npy;
 mod pictures;
 mod tensors;
+mod torch;
 mod write;
 
 pub use self::exr::{ExrImage, read_exr_channels, read_exr_depth, read_exr_normals, write_exr};
@@ -23,6 +24,7 @@ pub use self::pictures::{
     write_png_rgb, write_png_rgba,
 };
 pub use self::tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
+pub use self::torch::{TorchNumbers, TorchTensor, TorchValue, parse_torch, read_torch, torch_bytes};
 pub use self::write::{WriteError, remove, remove_leftovers, rename, write_atomic};
 
 use std::fs::{self, File};

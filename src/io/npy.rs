@@ -212,7 +212,7 @@ impl Kind {
 }
 
 /// IEEE 754 binary16.
-fn from_half(h: u16) -> f64 {
+pub(super) fn from_half(h: u16) -> f64 {
     let sign = if h >> 15 == 1 { -1.0 } else { 1.0 };
     let (exponent, fraction) = ((h >> 10) & 31, (h & 1023) as f64);
     sign * match exponent {

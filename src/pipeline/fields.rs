@@ -10,7 +10,9 @@ use crate::io::Limits;
 use crate::run::{Done, Exit, Failure};
 use crate::tface::{self, TFace, TfaceError};
 use rayon::prelude::*;
+use serde_json::json;
 use std::cell::OnceCell;
+use std::path::Path;
 
 impl Line<'_> {
     /// Stage `iface`: learns the field; goes on from its last checkpoint.
@@ -39,6 +41,12 @@ impl Line<'_> {
         Ok(self.run.stage(plan, |stage| {
             let scene = self.scene_or_fail()?;
             let config = self.vm(name);
+            if !config.import.is_empty() {
+                let (file, place) = (Path::new(&config.import), &scene.scene_from_world);
+                tface::import_th(file, config.import_scale, place, stage.folder(), &identity)
+                    .map_err(|e| self.tface_failure(name, e))?;
+                return Ok(json!({"imported": config.import}));
+            }
             // without masks nothing may know where the head is: neither its outline nor what that carves
             let masked = config.masks != MaskUse::None;
             let views = self.train_views(&scene, masked)?;
@@ -61,6 +69,14 @@ impl Line<'_> {
             report.warnings.iter().for_each(|w| stage.warn(w));
             Ok(to_value(&report))
         })?)
+    }
+
+    /// The field of the stage `baseline` or `tface` as the bytes of a published checkpoint (`.th`), in the
+    /// dataset's world times the stage's `import_scale`.
+    pub fn export_th(&self, name: &'static str) -> Result<Vec<u8>, Failure> {
+        let scene = self.scene_or_fail()?;
+        tface::export_th(&self.run.path(name), self.vm(name).import_scale, &scene.scene_from_world)
+            .map_err(|e| self.tface_failure(name, e))
     }
 
     /// The photographs that are learned from, in the scene.
@@ -136,8 +152,7 @@ impl Fields for Trained<'_> {
 
     fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
         let line = self.line;
-        let load =
-            || TFace::load(&line.run.path(stage), line.vm(stage)).map_err(|e| line.tface_failure(stage, e));
+        let load = || TFace::load(&line.run.path(stage)).map_err(|e| line.tface_failure(stage, e));
         let cell = if stage == "baseline" { &self.baseline } else { &self.tface };
         once(cell, load).map(|f| f as &dyn Radiance)
     }

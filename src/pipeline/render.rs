@@ -10,7 +10,7 @@ use super::{Fields, Line, PipelineError, march::march, pictures};
 use crate::capture::scene::{self, Scene};
 use crate::capture::{Split, View};
 use crate::config::Method;
-use crate::geom::{Bvh, Camera, Mesh, Similarity};
+use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
 use crate::io::{self, Limits};
 use crate::render::path::{NamedCamera, PathError, from_json, orbit};
 use crate::render::{RaycastOptions, RenderedView, raycast};
@@ -129,7 +129,8 @@ impl Eye<'_> {
         Ok(match (method, &self.mesh) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
-                Some(march(camera, &self.world_from_scene, false, |rays| field.see(rays)))
+                let see = |rays: &[Ray]| field.see(rays, camera.forward());
+                Some(march(camera, &self.world_from_scene, false, see))
             }
             (Method::Volume, _) => self.fields.surface()?.volume(camera, &self.world_from_scene),
             (Method::Raycast, Some((mesh, bvh))) => {

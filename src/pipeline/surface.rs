@@ -26,8 +26,9 @@ pub trait Surface: Sync {
 
 /// A field that is looked at by marching rays through it.
 pub trait Radiance: Sync {
-    /// What rays in scene coordinates see; normals are not asked for. `[n]` → `[n]`.
-    fn see(&self, rays: &[Ray]) -> Vec<Seen>;
+    /// What rays in scene coordinates see, of a camera that looks along the unit vector `forward`; normals
+    /// are not asked for. `[n]` → `[n]`.
+    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<Seen>;
 }
 
 /// The trained fields, each loaded when it is first asked for.
@@ -69,14 +70,14 @@ impl Surface for crate::iface::IFace {
 
 #[cfg(feature = "cpu")]
 impl Radiance for crate::tface::TFace {
-    fn see(&self, rays: &[Ray]) -> Vec<Seen> {
+    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<Seen> {
         let seen = |p: crate::tface::VmPixel| Seen {
             color: p.color,
             opacity: p.opacity,
             depth: p.depth,
             normal: Vec3::ZERO,
         };
-        self.render(rays).into_iter().map(seen).collect()
+        self.render(rays, forward).into_iter().map(seen).collect()
     }
 }
 

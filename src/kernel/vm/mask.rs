@@ -87,6 +87,11 @@ impl BoxMask {
         (c[0] * self.size[1] + c[1]) * self.size[2] + c[2]
     }
 
+    /// Is a cell occupied?
+    pub fn get(&self, cell: [usize; 3]) -> bool {
+        bit(&self.bits, self.cell(cell))
+    }
+
     /// Lower and upper corner.
     pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
         (self.min, self.max)
@@ -171,21 +176,37 @@ pub struct Lattice {
     pub far: f32,
 }
 
+impl Lattice {
+    /// Lattice points of a ray inside the box: what a renderer that skips nothing evaluates.
+    pub fn points(&self, ray: &VmRay) -> u64 {
+        match self.crossing(ray) {
+            Some((enter, leave)) => {
+                let inside = (leave - enter.clamp(self.near, self.far)) / self.step;
+                (inside.max(0.0) as u64 + 1).min(self.samples as u64)
+            }
+            None => 0,
+        }
+    }
+
+    /// Where a ray enters and leaves the box; zero components of its direction count as 1e-6, as published.
+    #[inline(always)]
+    fn crossing(&self, ray: &VmRay) -> Option<(f32, f32)> {
+        let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
+        for a in 0..3 {
+            let d = if ray.direction[a] == 0.0 { 1e-6 } else { ray.direction[a] };
+            let (p, q) = ((self.min[a] - ray.origin[a]) / d, (self.max[a] - ray.origin[a]) / d);
+            enter = enter.max(p.min(q));
+            leave = leave.min(p.max(q));
+        }
+        // also refuses NaN
+        (enter <= leave).then_some((enter, leave))
+    }
+}
+
 /// Calls `emit` with every `t` of the ray's lattice inside the box and inside `mask`, until it says false.
-/// Returns how many lattice points lay in the box (or would have, beyond the stop none is counted).
 #[inline(always)]
 pub fn march(lattice: &Lattice, mask: Option<&BoxMask>, ray: &VmRay, mut emit: impl FnMut(f32) -> bool) {
-    let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
-    // the slab test replaces zero components by 1e-6, as published
-    for a in 0..3 {
-        let d = if ray.direction[a] == 0.0 { 1e-6 } else { ray.direction[a] };
-        let (p, q) = ((lattice.min[a] - ray.origin[a]) / d, (lattice.max[a] - ray.origin[a]) / d);
-        enter = enter.max(p.min(q));
-        leave = leave.min(p.max(q));
-    }
-    if enter.is_nan() || leave.is_nan() || lattice.step <= 0.0 || enter > leave {
-        return;
-    }
+    let Some((enter, leave)) = lattice.crossing(ray).filter(|_| lattice.step > 0.0) else { return };
     let start = enter.clamp(lattice.near, lattice.far) + ray.jitter * lattice.step;
     if !start.is_finite() {
         return;

@@ -119,6 +119,12 @@ pub fn step_size(extent: [f32; 3], size: [usize; 3], ratio: f32) -> f32 {
     (0..3).map(|a| extent[a] / (size[a] - 1) as f32).sum::<f32>() / 3.0 * ratio
 }
 
+/// Samples of a ray outside training: as many as the box's diagonal needs.
+pub fn samples_across(extent: [f32; 3], step: f32) -> usize {
+    let diagonal = extent.iter().map(|e| e * e).sum::<f32>().sqrt();
+    (diagonal / step) as usize + 1
+}
+
 /// The voxel counts of `steps` upsamplings: equal ratios from `first` to `last`, computed in f32 as published.
 pub fn voxel_schedule(first: u64, last: u64, steps: usize) -> Vec<u64> {
     let (a, b) = ((first as f64).ln() as f32, (last as f64).ln() as f32);
