@@ -106,12 +106,9 @@ impl Work<'_> {
             _ => None,
         };
         match (self.until, format) {
+            ("baseline" | "tface", None) if ending == "th" => write(out, &published(line, self.until)?),
             ("mesh" | "metrics" | "render", Some(format)) if line.order(self.until).contains(&"mesh") => {
-                let bytes = mesh_bytes(&line.read_mesh()?, format, &line.export())?;
-                if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
-                    io::create_folder(folder)?;
-                }
-                Ok(io::write_atomic(out, &bytes)?)
+                write(out, &mesh_bytes(&line.read_mesh()?, format, &line.export())?)
             }
             ("mesh", None) => Err(Ending::usage(
                 format!("`{}`: the ending picks the format, and this is none", out.display()),
@@ -235,6 +232,14 @@ fn is_demo(config: &Config, run: &Run) -> bool {
     io::real_path(&made).is_ok_and(|made| made == Path::new(&config.capture.path))
 }
 
+/// One file, and the folder it is in.
+fn write(out: &Path, bytes: &[u8]) -> Result<(), Ending> {
+    if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
+        io::create_folder(folder)?;
+    }
+    Ok(io::write_atomic(out, bytes)?)
+}
+
 /// All files but those that tell of the work, and all folders but those named; deeper down none but
 /// the views kept in float is left out.
 fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<(), Ending> {
@@ -256,6 +261,17 @@ fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<(), Ending> {
 #[cfg(feature = "cpu")]
 fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, Ending> {
     Ok(crate::pipeline::reconstruct(line, until)?)
+}
+
+/// A radiance field as a published checkpoint.
+#[cfg(feature = "cpu")]
+fn published(line: &Line, stage: &str) -> Result<Vec<u8>, Ending> {
+    Ok(line.export_th(if stage == "baseline" { "baseline" } else { "tface" })?)
+}
+
+#[cfg(not(feature = "cpu"))]
+fn published(_: &Line, stage: &str) -> Result<Vec<u8>, Ending> {
+    Err(Ending::cannot(format!("this build has no {stage}"), "build with the feature `cpu`, the default"))
 }
 
 #[cfg(not(feature = "cpu"))]

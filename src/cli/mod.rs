@@ -185,6 +185,18 @@ With --fit or --correct, some training views must be set aside before anything i
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
+    /// A learned radiance field as a published checkpoint (.th)
+    #[command(after_long_help = "Examples:
+  tiface export runs/002_00 --out tface.th      what the published TensoRF and T-Face code reads
+  tiface export runs/002_00 --with baseline --out baseline.th
+  tiface tface captures/002_00 --set tface.import=official.th    the other way")]
+    Export {
+        #[command(flatten)]
+        place: Place,
+        /// tface or baseline
+        #[arg(long = "with", value_name = "FIELD", default_value = "tface")]
+        field: String,
+    },
     /// Is this mesh sound: watertight, manifold, self-intersections, size
     #[command(after_long_help = "Examples:
   tiface check head.glb
@@ -317,6 +329,18 @@ impl Cli {
                 line(place, "ensemble", &[], &extra)
             }
             Command::Metrics { place, require } => line(place, "metrics", require, &[]),
+            Command::Export { place, field } => match (field.as_str(), &common.out) {
+                ("tface" | "baseline", Some(out)) if out.extension().is_some_and(|e| e == "th") => {
+                    line(place, field, &[], &[])
+                }
+                ("tface" | "baseline", _) => {
+                    Err(Ending::usage("no file to export to is named", "name one: `--out model.th`"))
+                }
+                _ => Err(Ending::usage(
+                    format!("`{field}` cannot be exported"),
+                    "tface and baseline can; the mesh is `tiface mesh --out head.glb`",
+                )),
+            },
             Command::Check { mesh, require, against, seen_by } => {
                 check::go(common, mesh, require, against.as_deref(), seen_by.as_deref())
             }

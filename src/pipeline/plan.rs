@@ -44,14 +44,19 @@ impl Line<'_> {
     }
 
     /// What would be done for `until`: each stage with `None` if it has to be worked on, else what
-    /// differs from the result that lies there (nothing, if it is done). Nothing is written.
+    /// differs from the result that lies there (nothing, if it is done). An error if what is to be blended
+    /// will not be there. Nothing is written.
     pub fn outlook(&self, until: &str) -> Result<Vec<(&'static str, Option<Vec<String>>)>, PipelineError> {
         let look = |name: &'static str| {
             let record = read_record(&self.run.path(name))?;
             let now = self.plan(name).fingerprint;
             Ok((name, record.map(|r| now.differences(&r.fingerprint))))
         };
-        self.order(until).into_iter().map(look).collect()
+        let order = self.order(until);
+        if order.contains(&"ensemble") {
+            self.can_blend()?;
+        }
+        order.into_iter().map(look).collect()
     }
 
     /// Writes the complete configuration into the run: what repeats it. Refused, before anything is
