@@ -14,6 +14,8 @@ pub struct Report {
     pub curves: Vec<Curve>,
     /// Photographs with what was rendered for them.
     pub rows: Vec<Row>,
+    /// Views that found no room.
+    pub left_out: usize,
     /// The configuration as TOML.
     pub settings: String,
 }
@@ -105,6 +107,9 @@ pub fn html(report: &Report) -> String {
             );
         }
         out.push_str("</div>\n");
+    }
+    if report.left_out > 0 {
+        let _ = writeln!(out, "<p>{} more views lie in <code>render/</code>.</p>", report.left_out);
     }
     let _ = writeln!(out, "<h2>Settings</h2>\n<pre>{}</pre>\n</body></html>", escape(&report.settings));
     out
@@ -216,11 +221,13 @@ mod tests {
                     Picture { caption: "ensemble".into(), bytes: vec![1] },
                 ],
             }],
+            left_out: 3,
             settings: "[mesh]".into(),
         });
         assert!(page.contains("<h1>&lt;head&gt;</h1>") && !page.contains("http"));
         assert!(page.contains("<td>report.volume</td><td>0.2500</td>"));
         assert!(page.contains("points=\"0.0,160.0 420.0,0.0\""), "{page}");
+        assert!(page.contains("<p>3 more views lie in"));
         assert!(page.contains("<h3>012</h3>") && page.contains("<figcaption>ensemble</figcaption>"));
         assert!(page.contains("data:image/jpeg;base64,/9gB") && page.contains("data:image/png;base64,AQ=="));
     }

@@ -16,6 +16,8 @@ mod mesh;
 mod metrics;
 mod render;
 mod source;
+#[cfg(test)]
+mod source_tests;
 mod vm;
 mod vm_keys;
 

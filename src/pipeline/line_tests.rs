@@ -107,6 +107,57 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     assert!(bytes("mesh/head.glb").starts_with(b"glTF"));
 }
 
+/// A radiance field that is one colour, and counts the views it was asked for.
+struct Fog(std::sync::atomic::AtomicUsize, Option<Stop>);
+
+impl Radiance for Fog {
+    fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<Seen> {
+        let views = self.0.fetch_add(1, std::sync::atomic::Ordering::SeqCst) + 1;
+        if let Some(stop) = self.1.as_ref().filter(|_| views == 2) {
+            stop.request(Exit::Interrupted);
+        }
+        vec![Seen { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..Seen::default() }; rays.len()]
+    }
+}
+
+impl Fields for Fog {
+    fn surface(&self) -> Result<&dyn Surface, Failure> {
+        panic!("no surface is asked for")
+    }
+
+    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
+        assert_eq!(stage, "tface");
+        Ok(self)
+    }
+}
+
+#[test]
+fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
+    let dir = tempfile::tempdir().unwrap();
+    capture(dir.path(), 4, 3);
+    let mut config = draft(dir.path());
+    config.render.method = vec![Method::Tface];
+    config.render.background = Background::White;
+    let run = quiet(dir.path());
+    Line::open(&config, &run, false).unwrap().mask().unwrap();
+    let interrupted = Fog(0.into(), Some(run.stop().clone()));
+    let e = Line::open(&config, &run, false).unwrap().render(&interrupted).unwrap_err();
+    assert_eq!(e.exit(), Exit::Interrupted);
+    let made = |run: &Run| io::list_files(&run.path("render/tface")).map_or(0, |f| f.len());
+    assert_eq!(made(&run), 1);
+    let run = quiet(dir.path());
+    let rest = Fog(0.into(), None);
+    let line = Line::open(&config, &run, false).unwrap();
+    assert_eq!(line.render(&rest).unwrap().summary["cameras"], 3);
+    assert_eq!((made(&run), rest.0.into_inner()), (3, 2));
+    // half a grey of 0.5 over white is 0.25 + 0.5; in float it is as it was
+    let name = line.capture().split(Split::Test).next().unwrap().name.clone();
+    let shown = pictures::read(&run.path(format!("render/tface/{name}.png")), config.render.format).unwrap();
+    assert_eq!(shown.pixel(3, 3), [191.0 / 255.0, 191.0 / 255.0, 191.0 / 255.0, 1.0]);
+    let float = pictures::read_float(&run.path(format!("render/tface/float/{name}.exr"))).unwrap();
+    assert_eq!(float.pixel(3, 3), [0.25, 0.25, 0.25, 0.5]);
+}
+
 #[test]
 fn a_command_runs_what_its_stage_needs_and_nothing_else() {
     let dir = tempfile::tempdir().unwrap();

@@ -26,7 +26,8 @@ pub struct Seen {
 /// The view of a camera in scene coordinates; depth and normals in the world.
 ///
 /// Depth and normal are kept where the opacity is at least a half. Where the lens model folds over, no
-/// ray is: the pixel stays empty. `see`: `[n]` rays → `[n]`, some tens of thousands at a time.
+/// ray is: the pixel stays empty. `see`: `[n]` rays → `[n]`, some tens of thousands at a time; where it
+/// answers nothing, those pixels stay empty too.
 pub(super) fn march(
     camera: &Camera,
     world_from_scene: &Similarity,

@@ -13,27 +13,40 @@ const LEARNED: [(&str, &[&str]); 3] = [
     ("iface", &["psnr", "eikonal", "inv_s"]),
 ];
 
+/// A page with more bytes of pictures than this is no pleasure in a browser; further views are only
+/// counted.
+const MOST: usize = 48 << 20;
+
 impl Line<'_> {
     /// Writes `report.html`.
     pub fn report(&self, done: &[(&'static str, Done)]) -> Result<(), PipelineError> {
         let limits = Limits::default();
-        let mut rows: Vec<Row> = Vec::new();
-        for set in self.sets() {
-            if self.config.render.format != PictureFormat::Png {
-                continue; // browsers show no EXR
+        let sets = match self.config.render.format {
+            PictureFormat::Png => self.sets(),
+            PictureFormat::Exr => Vec::new(), // browsers show none
+        };
+        let shown: Vec<_> = sets.iter().map(|set| (set.name.clone(), self.comparable(set))).collect();
+        let (mut rows, mut bytes, mut left_out) = (Vec::new(), 0, 0);
+        for view in &self.capture.views {
+            let mut files = Vec::new();
+            for (name, set) in &shown {
+                let file = set.iter().find(|s| s.view.name == view.name).map(|s| s.file.as_path());
+                files.extend(file.map(|file| (name.as_str(), file)));
             }
-            for shown in self.comparable(&set) {
-                let name = &shown.view.name;
-                if !rows.iter().any(|r| r.name == *name) {
-                    let bytes = io::read_bytes(&shown.view.photo, &limits)?;
-                    let photo = Picture { caption: "photograph".into(), bytes };
-                    rows.push(Row { name: name.clone(), pictures: vec![photo] });
-                }
-                if let Some(row) = rows.iter_mut().find(|r| r.name == *name) {
-                    let bytes = io::read_bytes(&shown.file, &limits)?;
-                    row.pictures.push(Picture { caption: set.name.clone(), bytes });
-                }
+            if files.is_empty() {
+                continue;
             }
+            if bytes > MOST {
+                left_out += 1;
+                continue;
+            }
+            let mut pictures = Vec::new();
+            for (caption, file) in [("photograph", view.photo.as_path())].into_iter().chain(files) {
+                let picture = io::read_bytes(file, &limits)?;
+                bytes += picture.len();
+                pictures.push(Picture { caption: caption.into(), bytes: picture });
+            }
+            rows.push(Row { name: view.name.clone(), pictures });
         }
         let mut curves = Vec::new();
         for (stage, names) in LEARNED {
@@ -50,6 +63,7 @@ impl Line<'_> {
             summaries,
             curves,
             rows,
+            left_out,
             settings: self.config.to_toml(),
         });
         Ok(self.run.write("report.html", html.as_bytes())?)

@@ -27,6 +27,22 @@ pub(super) fn path(folder: &Path, name: &str, format: PictureFormat) -> PathBuf 
     folder.join(format!("{name}.{ending}"))
 }
 
+/// All files of a view: the pictures as shown, and the float one below `float`.
+pub(super) fn files(
+    folder: &Path,
+    name: &str,
+    shown: bool,
+    float: Option<&Path>,
+    format: PictureFormat,
+) -> Vec<PathBuf> {
+    let mut files: Vec<PathBuf> = float.map(|f| float_path(f, name)).into_iter().collect();
+    if shown {
+        files.push(path(folder, name, format));
+        files.extend((format == PictureFormat::Png).then(|| path(&folder.join("depth"), name, format)));
+    }
+    files
+}
+
 /// Puts coded colour over a background: the result is opaque.
 pub(super) fn over(view: &mut RenderedView, background: [f32; 3]) {
     for p in view.color.data.as_chunks_mut::<4>().0 {

@@ -14,7 +14,7 @@ use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
 use crate::io::{self, Limits};
 use crate::render::path::{NamedCamera, PathError, from_json, orbit};
 use crate::render::{RaycastOptions, RenderedView, raycast};
-use crate::run::{Done, Failure};
+use crate::run::{Done, Failure, Stop};
 use serde_json::{Map, json};
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -35,38 +35,46 @@ impl Line<'_> {
                 mesh: mesh.as_ref().map(|m| (m, Bvh::new(m))),
                 samples: c.samples,
                 world_from_scene: scene.scene_from_world.inverse(),
+                stop: self.run.stop(),
             };
             // what a blend is fitted on is kept in float only: it is no picture to be judged
             let shown = self.cameras(&scene)?.into_iter().map(|c| (c, true));
             let cameras: Vec<_> = shown.chain(self.fit_cameras().into_iter().map(|c| (c, false))).collect();
             let background = pictures::behind(c.background);
             let total = (cameras.len() * c.method.len()) as u64;
-            let mut made = 0;
+            let mut done = 0;
             let mut seconds = Map::new();
             for &method in &c.method {
-                let mut spent = Duration::ZERO;
+                let (mut spent, mut made) = (Duration::ZERO, 0);
                 let folder = stage.folder().join(method.folder());
                 for (NamedCamera { name, camera }, shown) in &cameras {
-                    let camera = camera.transformed(&scene.scene_from_world);
-                    let begin = Instant::now();
-                    let view = eye.view(method, &camera)?;
-                    spent += begin.elapsed();
-                    if let Some(mut view) = view {
-                        if c.float || !shown {
-                            pictures::write_float(&folder.join(pictures::FLOAT), name, &view)?;
-                        }
-                        if let Some(background) = background {
-                            pictures::over(&mut view, background);
-                        }
-                        if *shown {
-                            pictures::write(&folder, name, &view, c.format, self.config.capture.unit_m)?;
+                    let float = (c.float || !shown).then(|| folder.join(pictures::FLOAT));
+                    let files = pictures::files(&folder, name, *shown, float.as_deref(), c.format);
+                    // an interrupted process left whole files or none, of the same settings
+                    if !files.iter().all(|file| io::is_file(file)) {
+                        let camera = camera.transformed(&scene.scene_from_world);
+                        let begin = Instant::now();
+                        let view = eye.view(method, &camera)?;
+                        spent += begin.elapsed();
+                        made += 1;
+                        self.stop_here()?; // what it holds then is not whole
+                        if let Some(mut view) = view {
+                            if let Some(float) = &float {
+                                pictures::write_float(float, name, &view)?;
+                            }
+                            if let Some(background) = background {
+                                pictures::over(&mut view, background);
+                            }
+                            if *shown {
+                                pictures::write(&folder, name, &view, c.format, self.config.capture.unit_m)?;
+                            }
                         }
                     }
-                    made += 1;
-                    stage.monitor().step(made, total, &[]);
+                    done += 1;
+                    stage.monitor().step(done, total, &[]);
                     self.stop_here()?;
                 }
-                let per_view = spent.as_secs_f64() / cameras.len().max(1) as f64;
+                let per_view = spent.as_secs_f64() / made.max(1) as f64;
                 seconds.insert(method.folder().to_owned(), json!(per_view));
             }
             let methods: Vec<_> = c.method.iter().map(|m| m.folder()).collect();
@@ -121,6 +129,7 @@ struct Eye<'a> {
     mesh: Option<(&'a Mesh, Bvh)>,
     samples: u32,
     world_from_scene: Similarity,
+    stop: &'a Stop,
 }
 
 impl Eye<'_> {
@@ -129,7 +138,11 @@ impl Eye<'_> {
         Ok(match (method, &self.mesh) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
-                let see = |rays: &[Ray]| field.see(rays, camera.forward());
+                // a large view takes minutes: nobody who asks to stop waits for the rest of it
+                let see = |rays: &[Ray]| match self.stop.requested() {
+                    Some(_) => Vec::new(),
+                    None => field.see(rays, camera.forward()),
+                };
                 Some(march(camera, &self.world_from_scene, false, see))
             }
             (Method::Volume, _) => self.fields.surface()?.volume(camera, &self.world_from_scene),
