@@ -1,8 +1,9 @@
 //! Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel views.
 //!
 //! The line, one word per stage: **capture** (what was photographed, from where) → **mask** (which
-//! pixels are the head) → **baseline**, **tface** (radiance fields) → **iface** (a learned signed distance) → **mesh** (its zero level
-//! set, closed) → **render** (views by ray casting and by volume rendering) → **metrics**.
+//! pixels are the head) → **baseline**, **tface** (radiance fields without and with masks), **iface** (a
+//! learned signed distance) → **mesh** (its zero level set, closed) → **render** (views by volume rendering
+//! and by ray casting) → **ensemble** (they become one) → **metrics**.
 //!
 //! Modules are declared in the order of that line; what they share stands first.
 
@@ -24,8 +25,11 @@ pub mod tface;
 #[cfg(feature = "cpu")]
 pub mod iface;
 pub mod mesh;
-pub mod metrics;
+
 pub mod render;
+
+pub mod ensemble;
+pub mod metrics;
 
 pub mod pipeline;
 

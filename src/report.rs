@@ -13,7 +13,9 @@ pub struct Report {
     /// Lines over training steps.
     pub curves: Vec<Curve>,
     /// Photographs with what was rendered for them.
-    pub pairs: Vec<Pair>,
+    pub rows: Vec<Row>,
+    /// Views that found no room.
+    pub left_out: usize,
     /// The configuration as TOML.
     pub settings: String,
 }
@@ -27,15 +29,22 @@ pub struct Curve {
     pub points: Vec<(f64, f64)>,
 }
 
-/// A photograph and a render, as the bytes of PNG or JPEG files.
+/// The pictures of one view: the photograph and what was made for it.
 #[derive(Clone, Debug)]
-pub struct Pair {
-    /// Below both.
+pub struct Row {
+    /// The view's name.
+    pub name: String,
+    /// The photograph first.
+    pub pictures: Vec<Picture>,
+}
+
+/// A picture as the bytes of a PNG or JPEG file.
+#[derive(Clone, Debug)]
+pub struct Picture {
+    /// Below it.
     pub caption: String,
-    /// The photograph.
-    pub photo: Vec<u8>,
-    /// The render.
-    pub render: Vec<u8>,
+    /// The file.
+    pub bytes: Vec<u8>,
 }
 
 /// The named figures of a `log.jsonl` over its steps. Lines that are not JSON (cut short by a crash)
@@ -68,7 +77,7 @@ pub fn html(report: &Report) -> String {
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title} · tiface</title>\n\
          <style>body{{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:70rem;padding:0 1rem}}\
-         figure{{display:inline-block;margin:.5rem}}img{{height:20rem;background:#000}}\
+         figure{{display:inline-block;margin:.5rem}}.row{{overflow-x:auto;white-space:nowrap}}img{{height:20rem;background:#000}}\
          table{{border-collapse:collapse}}td{{padding:.1rem 1rem .1rem 0}}pre{{overflow:auto}}\
          svg{{border:1px solid #8884}}</style></head><body>\n<h1>{title}</h1>\n"
     );
@@ -85,17 +94,22 @@ pub fn html(report: &Report) -> String {
         out.push_str("<h2>Training</h2>\n");
         report.curves.iter().for_each(|c| out.push_str(&svg(c)));
     }
-    if !report.pairs.is_empty() {
-        out.push_str("<h2>Photograph and render</h2>\n");
+    if !report.rows.is_empty() {
+        out.push_str("<h2>Photographs and renders</h2>\n");
     }
-    for pair in &report.pairs {
-        let _ = writeln!(
-            out,
-            "<figure><img alt=\"photograph\" src=\"{}\"><img alt=\"render\" src=\"{}\"><figcaption>{}</figcaption></figure>",
-            data_url(&pair.photo),
-            data_url(&pair.render),
-            escape(&pair.caption)
-        );
+    for row in &report.rows {
+        let _ = writeln!(out, "<h3>{}</h3>\n<div class=\"row\">", escape(&row.name));
+        for picture in &row.pictures {
+            let (caption, url) = (escape(&picture.caption), data_url(&picture.bytes));
+            let _ = writeln!(
+                out,
+                "<figure><img alt=\"{caption}\" src=\"{url}\"><figcaption>{caption}</figcaption></figure>"
+            );
+        }
+        out.push_str("</div>\n");
+    }
+    if report.left_out > 0 {
+        let _ = writeln!(out, "<p>{} more views lie in <code>render/</code>.</p>", report.left_out);
     }
     let _ = writeln!(out, "<h2>Settings</h2>\n<pre>{}</pre>\n</body></html>", escape(&report.settings));
     out
@@ -200,12 +214,21 @@ mod tests {
             title: "<head>".into(),
             summaries: vec![("mesh".into(), json!({"closed": true, "report": {"volume": 0.25}, "p": null}))],
             curves: vec![Curve { name: "psnr".into(), points: vec![(0.0, 1.0), (2.0, 3.0)] }],
-            pairs: vec![Pair { caption: "a".into(), photo: vec![0xFF, 0xD8, 1], render: vec![1] }],
+            rows: vec![Row {
+                name: "012".into(),
+                pictures: vec![
+                    Picture { caption: "photograph".into(), bytes: vec![0xFF, 0xD8, 1] },
+                    Picture { caption: "ensemble".into(), bytes: vec![1] },
+                ],
+            }],
+            left_out: 3,
             settings: "[mesh]".into(),
         });
         assert!(page.contains("<h1>&lt;head&gt;</h1>") && !page.contains("http"));
         assert!(page.contains("<td>report.volume</td><td>0.2500</td>"));
         assert!(page.contains("points=\"0.0,160.0 420.0,0.0\""), "{page}");
+        assert!(page.contains("<p>3 more views lie in"));
+        assert!(page.contains("<h3>012</h3>") && page.contains("<figcaption>ensemble</figcaption>"));
         assert!(page.contains("data:image/jpeg;base64,/9gB") && page.contains("data:image/png;base64,AQ=="));
     }
 }

@@ -82,6 +82,52 @@ fn a_folder_that_is_no_capture_ends_with_1_and_a_way_out() {
 }
 
 #[test]
+fn a_dry_run_names_only_the_stages_a_command_needs() {
+    use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    let stages = |words: &[&str]| {
+        let o = tiface(dir.path(), &[words, &["head", "--dry-run"]].concat());
+        assert_eq!(code(&o), 0, "{words:?}: {}", err(&o));
+        let first = |l: &str| l.split(' ').next().unwrap_or_default().to_string();
+        out(&o).lines().map(first).collect::<Vec<_>>().join(" ")
+    };
+    assert_eq!(stages(&["baseline"]), "mask baseline");
+    assert_eq!(stages(&["tface", "--ablation", "mask-ce"]), "mask tface");
+    assert_eq!(stages(&["mesh"]), "mask iface mesh");
+    assert_eq!(stages(&["render", "--with", "tface"]), "mask tface render");
+    assert_eq!(stages(&["render", "--with", "iface"]), "mask iface render");
+    assert_eq!(stages(&["run"]), "mask baseline tface iface mesh render ensemble metrics");
+    assert!(!dir.path().join("runs").exists());
+}
+
+#[test]
+fn a_blend_that_cannot_be_made_is_refused_before_anything_is_learned() {
+    use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    let o = tiface(dir.path(), &["ensemble", "head", "--fit", "global"]);
+    assert_eq!(code(&o), 2);
+    assert!(
+        err(&o).contains("no view is set aside") && err(&o).contains("capture.fit_views=8"),
+        "{}",
+        err(&o)
+    );
+    let o = tiface(dir.path(), &["run", "head", "--set", "render.method=volume"]);
+    assert_eq!(code(&o), 2);
+    assert!(err(&o).contains("names baseline, which render.method does not make"), "{}", err(&o));
+    let o = tiface(dir.path(), &["tface", "head", "--ablation", "mask-hard"]);
+    assert_eq!(code(&o), 2);
+    assert!(err(&o).contains("`--ablation mask-hard`") && err(&o).contains("`mask-l2`"), "{}", err(&o));
+    let o = tiface(dir.path(), &["export", "head"]);
+    assert_eq!(code(&o), 2);
+    assert!(err(&o).contains("--out model.th"), "{}", err(&o));
+    assert!(!dir.path().join("runs").exists());
+}
+
+#[test]
 fn an_open_mesh_is_below_the_bar() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("t.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 
 /// Small enough for seconds, large enough that every stage can be hit.
-const SETTINGS: [&str; 12] = [
+const SETTINGS: [&str; 26] = [
     "iface.steps=150",
     "iface.rays=256",
     "iface.max_rays=512",
@@ -17,6 +17,20 @@ const SETTINGS: [&str; 12] = [
     "iface.log2_table=12",
     "iface.occupancy_resolution=32",
     "iface.checkpoint_s=0.1",
+    "tface.steps=60",
+    "tface.rays=512",
+    "tface.voxels_start=4096",
+    "tface.voxels_final=13824",
+    "tface.upsample_steps=20,40",
+    "tface.mask_steps=20,40",
+    "tface.checkpoint_s=0.1",
+    "baseline.steps=30",
+    "baseline.rays=256",
+    "baseline.voxels_start=4096",
+    "baseline.voxels_final=4096",
+    "baseline.upsample_steps=",
+    "baseline.mask_steps=",
+    "baseline.checkpoint_s=0.1",
     "mesh.resolution=64",
     "mesh.format=glb,obj",
     "render.samples=1",
@@ -56,7 +70,7 @@ fn products(run: &Path) -> Vec<(PathBuf, Vec<u8>)> {
         }
     }
     let mut files = Vec::new();
-    for stage in ["mask", "iface", "mesh", "render", "metrics"] {
+    for stage in tiface::pipeline::STAGES {
         walk(&run.join(stage), &mut files);
     }
     files.push(run.join("config.toml"));

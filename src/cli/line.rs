@@ -1,5 +1,6 @@
 //! `tiface run` and the stage commands: the line, up to a stage.
 
+use super::demo::CAPTURE;
 use super::ending::{Ending, say};
 use super::options::Common;
 use super::screen::{Screen, figure};
@@ -60,7 +61,7 @@ impl Work<'_> {
             return self.outlook(&line);
         }
         if let Some(fresh) = &self.common.fresh {
-            run.fresh(fresh, STAGES)?;
+            run.fresh(fresh, &line.followers(fresh))?;
         }
         line.remember(self.until)?;
         let done = reconstruct(&line, self.until)?;
@@ -73,11 +74,10 @@ impl Work<'_> {
     }
 
     fn outlook(&self, line: &Line) -> Result<Exit, Ending> {
-        let last = STAGES.iter().position(|s| *s == self.until).unwrap_or(STAGES.len() - 1);
-        let fresh = self.common.fresh.as_deref().and_then(|f| STAGES.iter().position(|s| *s == f));
+        let fresh = self.common.fresh.as_deref().map(|f| line.followers(f)).unwrap_or_default();
         let mut text = String::new();
-        for (i, (stage, found)) in line.outlook()?.into_iter().enumerate().take(last + 1) {
-            let anew = fresh.is_some_and(|f| i >= f);
+        for (stage, found) in line.outlook(self.until)? {
+            let anew = fresh.contains(&stage);
             let (word, differences) = match found {
                 _ if anew => ("to do, afresh", Vec::new()),
                 None => ("to do", Vec::new()),
@@ -106,20 +106,21 @@ impl Work<'_> {
             _ => None,
         };
         match (self.until, format) {
-            ("mesh" | "metrics" | "render", Some(format)) => {
-                let bytes = mesh_bytes(&line.read_mesh()?, format, &line.export())?;
-                if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
-                    io::create_folder(folder)?;
-                }
-                Ok(io::write_atomic(out, &bytes)?)
+            ("baseline" | "tface", None) if ending == "th" => write(out, &published(line, self.until)?),
+            ("mesh" | "metrics" | "render", Some(format)) if line.order(self.until).contains(&"mesh") => {
+                write(out, &mesh_bytes(&line.read_mesh()?, format, &line.export())?)
             }
             ("mesh", None) => Err(Ending::usage(
                 format!("`{}`: the ending picks the format, and this is none", out.display()),
                 "end it in .glb, .obj or .ply",
             )),
             (stage, None) => {
-                let from = if stage == "metrics" { run.dir().to_path_buf() } else { run.path(stage) };
-                Ok(copy_folder(&from, out)?)
+                // fields, and pictures that only another stage can read, stay where they are
+                let fields = ["baseline", "tface", "iface", CAPTURE];
+                match stage {
+                    "metrics" => copy_folder(run.dir(), out, &fields),
+                    _ => copy_folder(&run.path(stage), out, &["float"]),
+                }
             }
             (stage, Some(_)) => Err(Ending::usage(
                 format!("the product of `{stage}` is no mesh"),
@@ -147,26 +148,36 @@ impl Work<'_> {
             let first = files.iter().find(|f| io::is_file(f)).unwrap_or(&files[0]);
             row("mesh", format!("{} ({} triangles, {state})", first.display(), mesh["triangles"]));
         }
-        if of("render").is_some() {
-            row("pictures", format!("{}", run.path("render").display()));
+        for stage in ["render", "ensemble"].into_iter().filter(|s| of(s).is_some()) {
+            row("pictures", format!("{}", run.path(stage).display()));
         }
         if let Some(metrics) = of("metrics") {
             row("report", format!("{}", run.path("report.html").display()));
             for line in judgement(metrics) {
                 row("quality", line);
             }
-        } else if of("mesh").is_none() {
+        } else if of("mesh").is_none() && of("render").is_none() {
             row("run", format!("{}", run.dir().display()));
         }
         say(&text)
     }
 }
 
+/// What is judged, and what a person calls it.
+const JUDGED: [(&str, &str); 6] = [
+    ("baseline", "views of the baseline"),
+    ("tface", "views of T-Face"),
+    ("volume", "views of I-Face"),
+    ("raycast", "views of the mesh"),
+    ("ensemble", "their blend"),
+    ("ensemble_fitted", "their fitted blend"),
+];
+
 /// How good the result is, one sentence per thing known.
 fn judgement(metrics: &Value) -> Vec<String> {
     let mut lines = Vec::new();
-    for (method, words) in [("raycast", "views of the mesh"), ("volume", "views of the field")] {
-        let mean = &metrics[method]["head"]["mean"];
+    for (set, words) in JUDGED {
+        let mean = &metrics[set]["head"]["mean"];
         if let Some(psnr) = mean["psnr_masked"].as_f64().or(mean["psnr"].as_f64()) {
             let ssim = mean["ssim_masked"].as_f64().or(mean["ssim"].as_f64());
             let ssim = ssim.map(|s| format!(", SSIM {s:.4}")).unwrap_or_default();
@@ -217,11 +228,21 @@ pub(super) fn configure(
 
 /// Was this run made by `tiface demo`?
 fn is_demo(config: &Config, run: &Run) -> bool {
-    let made = run.path(super::demo::CAPTURE);
+    let made = run.path(CAPTURE);
     io::real_path(&made).is_ok_and(|made| made == Path::new(&config.capture.path))
 }
 
-fn copy_folder(from: &Path, to: &Path) -> Result<(), Ending> {
+/// One file, and the folder it is in.
+fn write(out: &Path, bytes: &[u8]) -> Result<(), Ending> {
+    if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
+        io::create_folder(folder)?;
+    }
+    Ok(io::write_atomic(out, bytes)?)
+}
+
+/// All files but those that tell of the work, and all folders but those named; deeper down none but
+/// the views kept in float is left out.
+fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<(), Ending> {
     io::create_folder(to)?;
     for name in io::list_files(from)? {
         if !["done.json", "status.json", "log.jsonl"].contains(&name.as_str()) {
@@ -230,8 +251,8 @@ fn copy_folder(from: &Path, to: &Path) -> Result<(), Ending> {
         }
     }
     for folder in io::list_folders(from)? {
-        if let Some(name) = folder.file_name().filter(|n| !["iface", "capture"].iter().any(|k| n == k)) {
-            copy_folder(&folder, &to.join(name))?;
+        if let Some(name) = folder.file_name().filter(|n| !left.iter().any(|k| n == k)) {
+            copy_folder(&folder, &to.join(name), &["float"])?;
         }
     }
     Ok(())
@@ -240,6 +261,17 @@ fn copy_folder(from: &Path, to: &Path) -> Result<(), Ending> {
 #[cfg(feature = "cpu")]
 fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, Ending> {
     Ok(crate::pipeline::reconstruct(line, until)?)
+}
+
+/// A radiance field as a published checkpoint.
+#[cfg(feature = "cpu")]
+fn published(line: &Line, stage: &str) -> Result<Vec<u8>, Ending> {
+    Ok(line.export_th(if stage == "baseline" { "baseline" } else { "tface" })?)
+}
+
+#[cfg(not(feature = "cpu"))]
+fn published(_: &Line, stage: &str) -> Result<Vec<u8>, Ending> {
+    Err(Ending::cannot(format!("this build has no {stage}"), "build with the feature `cpu`, the default"))
 }
 
 #[cfg(not(feature = "cpu"))]
@@ -279,9 +311,9 @@ impl Bar {
             Bar::Watertight => Err(Ending::below("the mesh is not watertight", "`tiface check` says where")),
             Bar::Psnr(bar) => {
                 let metrics = of("metrics").unwrap_or(&Value::Null);
-                let best = ["raycast", "volume"]
-                    .iter()
-                    .filter_map(|m| metrics[m]["head"]["mean"]["psnr_masked"].as_f64())
+                let sets = metrics.as_object().into_iter().flat_map(|m| m.values());
+                let best = sets
+                    .filter_map(|set| set["head"]["mean"]["psnr_masked"].as_f64())
                     .fold(f64::NEG_INFINITY, f64::max);
                 if best >= *bar {
                     return Ok(());
@@ -309,7 +341,11 @@ mod tests {
         assert_eq!(Bar::parse("psnr=28").unwrap(), Bar::Psnr(28.0));
         assert_eq!(Bar::parse("psnr=nan").unwrap_err().exit.code(), 2);
         assert_eq!(Bar::parse("beauty").unwrap_err().exit.code(), 2);
-        let metrics = json!({"raycast": {"head": {"mean": {"psnr_masked": 27.5}}}});
+        let metrics = json!({
+            "tface": {"head": {"mean": {"psnr_masked": 25.0}}},
+            "ensemble_fitted": {"head": {"mean": {"psnr_masked": 27.5}}},
+            "truth_percent_of_head": {"accuracy_mean": 99.0},
+        });
         let stages = [("mesh", done(json!({"closed": true}))), ("metrics", done(metrics))];
         assert!(Bar::Watertight.check(&stages).is_ok() && Bar::Psnr(27.0).check(&stages).is_ok());
         assert_eq!(Bar::Psnr(28.0).check(&stages).unwrap_err().exit.code(), 3);
@@ -320,10 +356,12 @@ mod tests {
     fn the_judgement_names_what_was_measured() {
         let lines = judgement(&json!({
             "raycast": {"head": {"mean": {"psnr_masked": 28.123, "ssim_masked": 0.91}}},
+            "ensemble": {"head": {"mean": {"psnr_masked": 30.0}}},
             "truth_percent_of_head": {"accuracy_mean": 0.312, "accuracy_p90": 0.7},
         }));
-        assert_eq!(lines.len(), 2);
+        assert_eq!(lines.len(), 3);
         assert!(lines[0].contains("PSNR 28.12 dB, SSIM 0.9100"), "{}", lines[0]);
-        assert!(lines[1].contains("0.312 % of head height"), "{}", lines[1]);
+        assert!(lines[1].contains("their blend") && lines[1].contains("30.00 dB"), "{}", lines[1]);
+        assert!(lines[2].contains("0.312 % of head height"), "{}", lines[2]);
     }
 }

@@ -59,18 +59,19 @@ enum Command {
   tiface run captures/002_00
   tiface run captures/002_00 --run /data/002_00 --preset paper --seed 7
   tiface run runs/002_00 --fresh mesh --set mesh.resolution=1024
+  tiface run captures/002_00 --set capture.fit_views=8 --set ensemble.fit=global
   tiface run captures/002_00 --require psnr=28      exit code 3 if the views are worse than that")]
     Run {
         #[command(flatten)]
         place: Place,
-        /// Exit with 3 below this bar: watertight, psnr=DB (masked, best method); repeatable
+        /// Exit with 3 below this bar: watertight, psnr=DB (masked, the best of all); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
     /// The same on a synthetic head made on the spot: no data, weights or network needed
     #[command(after_long_help = "Examples:
   tiface demo
-  tiface demo --set iface.steps=500             a rougher head, sooner
+  tiface demo --set iface.steps=500 --set tface.steps=500    a rougher head, sooner
   tiface demo --run /tmp/demo --out head.glb    somewhere else, and the mesh beside it")]
     Demo,
     /// What was found: format, cameras, masks, splits, problems; writes nothing
@@ -87,7 +88,26 @@ enum Command {
         #[command(flatten)]
         place: Place,
     },
-    /// Stage: learn the signed-distance field
+    /// Stage: learn T-Face, a radiance field, from the masked photographs
+    #[command(after_long_help = "Examples:
+  tiface tface captures/002_00
+  tiface tface runs/002_00                      go on after a stop
+  tiface tface captures/002_00 --run runs/ce --ablation mask-ce
+  tiface tface captures/002_00 --set tface.import=official.th")]
+    Tface {
+        #[command(flatten)]
+        place: Place,
+    },
+    /// Stage: learn the same field from whole photographs, to compare T-Face with
+    #[command(after_long_help = "Examples:
+  tiface baseline captures/002_00
+  tiface baseline runs/002_00                   go on after a stop
+  tiface baseline runs/002_00 --fresh baseline --set baseline.steps=20000")]
+    Baseline {
+        #[command(flatten)]
+        place: Place,
+    },
+    /// Stage: learn I-Face, a signed-distance field
     #[command(after_long_help = "Examples:
   tiface iface captures/002_00
   tiface iface runs/002_00                      go on after a stop
@@ -111,9 +131,10 @@ enum Command {
         #[arg(long, value_name = "FRAME")]
         frame: Option<String>,
     },
-    /// Stage: make views by ray casting and by volume rendering
+    /// Stage: make views of the fields and of the mesh
     #[command(after_long_help = "Examples:
   tiface render runs/002_00
+  tiface render captures/002_00 --with tface    T-Face alone: no other field is learned for it
   tiface render runs/002_00 --fresh render --cameras orbit --background white --out turn/
   tiface render runs/002_00 --fresh render --cameras path.json --format exr")]
     Render {
@@ -122,8 +143,8 @@ enum Command {
         /// test, train, orbit, or a file: a nerfstudio camera path or a transforms.json
         #[arg(long, value_name = "WHICH")]
         cameras: Option<String>,
-        /// raycast, volume, or both with a comma
-        #[arg(long = "with", value_name = "METHOD")]
+        /// Any of baseline, tface, volume (I-Face's field) and raycast (its mesh), with commas
+        #[arg(long = "with", value_name = "LIST")]
         method: Option<String>,
         /// png or exr
         #[arg(long)]
@@ -132,13 +153,49 @@ enum Command {
         #[arg(long)]
         background: Option<String>,
     },
-    /// Stage: compare the views with held-out photographs
+    /// Stage: blend the views of baseline, T-Face and I-Face
+    #[command(after_long_help = "Examples:
+  tiface ensemble runs/002_00
+  tiface ensemble runs/002_00 --fresh ensemble --members tface,volume --weights 0.6,0.4
+  tiface ensemble captures/002_00 --set capture.fit_views=8 --fit regions --correct affine
+
+With --fit or --correct, some training views must be set aside before anything is learned
+(capture.fit_views). The given weights are used as well, and metrics reports both blends.")]
+    Ensemble {
+        #[command(flatten)]
+        place: Place,
+        /// Whose views: baseline, tface, volume, raycast
+        #[arg(long, value_name = "LIST")]
+        members: Option<String>,
+        /// Their shares, in that order; together 1
+        #[arg(long, value_name = "LIST")]
+        weights: Option<String>,
+        /// A second blend with fitted weights: none, global or regions
+        #[arg(long, value_name = "HOW")]
+        fit: Option<String>,
+        /// Correct the members' colours for it: none, gain or affine
+        #[arg(long, value_name = "HOW")]
+        correct: Option<String>,
+    },
+    /// Stage: compare views and blends with held-out photographs
     Metrics {
         #[command(flatten)]
         place: Place,
-        /// Exit with 3 below this bar: watertight, psnr=DB (masked, best method); repeatable
+        /// Exit with 3 below this bar: watertight, psnr=DB (masked, the best of all); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
+    },
+    /// A learned radiance field as a published checkpoint (.th)
+    #[command(after_long_help = "Examples:
+  tiface export runs/002_00 --out tface.th      what the published TensoRF and T-Face code reads
+  tiface export runs/002_00 --with baseline --out baseline.th
+  tiface tface captures/002_00 --set tface.import=official.th    the other way")]
+    Export {
+        #[command(flatten)]
+        place: Place,
+        /// tface or baseline
+        #[arg(long = "with", value_name = "FIELD", default_value = "tface")]
+        field: String,
     },
     /// Is this mesh sound: watertight, manifold, self-intersections, size
     #[command(after_long_help = "Examples:
@@ -246,6 +303,8 @@ impl Cli {
             Command::Demo => demo::go(common, screen, stop),
             Command::Inspect { capture } => inspect::go(common, capture),
             Command::Mask { place } => line(place, "mask", &[], &[]),
+            Command::Baseline { place } => line(place, "baseline", &[], &[]),
+            Command::Tface { place } => line(place, "tface", &[], &[]),
             Command::Iface { place } => line(place, "iface", &[], &[]),
             Command::Mesh { place, format, frame } => {
                 let extra = keys(&[("--format", "mesh.format", format), ("--frame", "mesh.frame", frame)]);
@@ -260,7 +319,28 @@ impl Cli {
                 ]);
                 line(place, "render", &[], &extra)
             }
+            Command::Ensemble { place, members, weights, fit, correct } => {
+                let extra = keys(&[
+                    ("--members", "ensemble.members", members),
+                    ("--weights", "ensemble.weights", weights),
+                    ("--fit", "ensemble.fit", fit),
+                    ("--correct", "ensemble.correct", correct),
+                ]);
+                line(place, "ensemble", &[], &extra)
+            }
             Command::Metrics { place, require } => line(place, "metrics", require, &[]),
+            Command::Export { place, field } => match (field.as_str(), &common.out) {
+                ("tface" | "baseline", Some(out)) if out.extension().is_some_and(|e| e == "th") => {
+                    line(place, field, &[], &[])
+                }
+                ("tface" | "baseline", _) => {
+                    Err(Ending::usage("no file to export to is named", "name one: `--out model.th`"))
+                }
+                _ => Err(Ending::usage(
+                    format!("`{field}` cannot be exported"),
+                    "tface and baseline can; the mesh is `tiface mesh --out head.glb`",
+                )),
+            },
             Command::Check { mesh, require, against, seen_by } => {
                 check::go(common, mesh, require, against.as_deref(), seen_by.as_deref())
             }

@@ -15,6 +15,8 @@ pub struct CaptureConfig {
     pub unit_m: f64,
     /// Folder of masks inside the capture; empty to look for one.
     pub mask_dir: String,
+    /// Every so-many-th training view is not learned from: the blend is fitted on it. 0 for none.
+    pub fit_views: usize,
 }
 
 pub(super) const KEYS: &[Key] = &[
@@ -30,11 +32,23 @@ pub(super) const KEYS: &[Key] = &[
         "mask_dir",
         "Folder of masks inside the capture, named like the photographs; empty to look for one.",
     ),
+    Key::number(
+        "fit_views",
+        "Every so-many-th training view is learned from by no field, for ensemble.fit and ensemble.correct; 0: none.",
+        0.0,
+        10_000.0,
+    ),
 ];
 
 impl CaptureConfig {
     /// The values a preset starts with.
     pub fn preset(_: Preset) -> CaptureConfig {
-        CaptureConfig { path: String::new(), downscale: 1, unit_m: 1.0, mask_dir: String::new() }
+        CaptureConfig {
+            path: String::new(),
+            downscale: 1,
+            unit_m: 1.0,
+            mask_dir: String::new(),
+            fit_views: 0,
+        }
     }
 }

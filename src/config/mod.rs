@@ -8,6 +8,7 @@
 //! of [`Key`]s with documentation and ranges. Everything here works on what serde says about them.
 
 mod capture;
+mod ensemble;
 pub mod iface;
 mod iface_keys;
 mod mask;
@@ -15,10 +16,13 @@ mod mesh;
 mod metrics;
 mod render;
 mod source;
+#[cfg(test)]
+mod source_tests;
 mod vm;
 mod vm_keys;
 
 pub use capture::CaptureConfig;
+pub use ensemble::{Correct, EnsembleConfig, Fit};
 pub use iface::IfaceConfig;
 pub use mask::{MaskConfig, MaskMeaning, MaskSource};
 pub use mesh::{MeshConfig, MeshFormat, MeshFrame};
@@ -90,6 +94,8 @@ pub struct Config {
     pub seed: u64,
     /// `auto`, `cpu`, `wgpu:N` or `cuda:N`.
     pub device: String,
+    /// The row of the paper's ablation that `tface` started from; empty for the preset's own.
+    pub ablation: String,
     /// What was photographed.
     pub capture: CaptureConfig,
     /// Which pixels are the head.
@@ -104,7 +110,9 @@ pub struct Config {
     pub mesh: MeshConfig,
     /// The views made of it.
     pub render: RenderConfig,
-    /// How they are judged.
+    /// How they are blended.
+    pub ensemble: EnsembleConfig,
+    /// How all of them are judged.
     pub metrics: MetricsConfig,
 }
 
@@ -120,6 +128,11 @@ const ROOT_KEYS: &[Key] = &[
         i64::MAX as f64,
     ),
     Key::word("device", "Where fields are learned: auto, cpu, wgpu:N or cuda:N."),
+    Key::word(
+        "ablation",
+        "Row of the paper's ablation that the masks of tface start from: baseline (none), mask-binary, mask-soft, \
+         mask-ce, mask-l2; empty for the preset's.",
+    ),
 ];
 
 /// Every table with its keys, in the order of the line; the first has no name.
@@ -132,6 +145,7 @@ const TABLES: &[(&str, &[Key])] = &[
     ("iface", iface_keys::KEYS),
     ("mesh", mesh::KEYS),
     ("render", render::KEYS),
+    ("ensemble", ensemble::KEYS),
     ("metrics", metrics::KEYS),
 ];
 
@@ -151,6 +165,7 @@ impl Config {
             preset,
             seed: 42,
             device: "auto".into(),
+            ablation: String::new(),
             capture: CaptureConfig::preset(preset),
             mask: MaskConfig::preset(preset),
             baseline: VmConfig::baseline(preset),
@@ -158,6 +173,7 @@ impl Config {
             iface: IfaceConfig::preset(preset),
             mesh: MeshConfig::preset(preset),
             render: RenderConfig::preset(preset),
+            ensemble: EnsembleConfig::preset(preset),
             metrics: MetricsConfig::preset(preset),
         }
     }

@@ -7,18 +7,35 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Method {
-    /// Rays cast at the mesh, learned colour where they hit.
-    Raycast,
-    /// The learned field, marched and composited.
+    /// The radiance field without masks, marched and composited.
+    Baseline,
+    /// T-Face, marched and composited.
+    Tface,
+    /// I-Face's field, marched and composited.
+    #[serde(alias = "iface")]
     Volume,
+    /// Rays cast at I-Face's mesh, learned colour where they hit.
+    Raycast,
 }
 
 impl Method {
-    /// The folder of its pictures below `render/`.
+    /// The folder of its pictures below `render/`, and its word in the configuration.
     pub fn folder(self) -> &'static str {
         match self {
-            Method::Raycast => "raycast",
+            Method::Baseline => "baseline",
+            Method::Tface => "tface",
             Method::Volume => "volume",
+            Method::Raycast => "raycast",
+        }
+    }
+
+    /// The stage whose result it shows.
+    pub fn stage(self) -> &'static str {
+        match self {
+            Method::Baseline => "baseline",
+            Method::Tface => "tface",
+            Method::Volume => "iface",
+            Method::Raycast => "mesh",
         }
     }
 }
@@ -61,6 +78,8 @@ pub struct RenderConfig {
     pub format: PictureFormat,
     /// What stands behind the head.
     pub background: Background,
+    /// Keep every view in float as well?
+    pub float: bool,
 }
 
 pub(super) const KEYS: &[Key] = &[
@@ -70,12 +89,13 @@ pub(super) const KEYS: &[Key] = &[
     ),
     Key::word(
         "method",
-        "A list of raycast (rays at the mesh, learned colour) and volume (the field itself, slower).",
+        "A list of baseline, tface, volume (I-Face's field) and raycast (rays at its mesh, learned colour).",
     ),
     Key::number("orbit_views", "Views of an orbit around the head.", 1.0, 10_000.0),
     Key::number("samples", "Rays along each side of a pixel on an edge of the mesh.", 1.0, 8.0),
     Key::word("format", "png (8-bit sRGB) or exr (float, with depth and normals)."),
     Key::word("background", "Behind the head: black, white or none (real alpha)."),
+    Key::word("float", "Keep every view in float, too, in METHOD/float: what is blended. true or false."),
 ];
 
 impl RenderConfig {
@@ -83,11 +103,12 @@ impl RenderConfig {
     pub fn preset(preset: Preset) -> RenderConfig {
         RenderConfig {
             cameras: "test".into(),
-            method: vec![Method::Raycast, Method::Volume],
+            method: vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast],
             orbit_views: 36,
             samples: if preset == Preset::Draft { 1 } else { 2 },
             format: PictureFormat::Png,
             background: Background::None,
+            float: true,
         }
     }
 }

@@ -1,6 +1,6 @@
 //! From files and `--set` to a [`Config`]: which value wins, and what is wrong with one.
 
-use super::{Config, Key, Preset, all_keys, lookup, show};
+use super::{Ablation, Config, Key, Preset, all_keys, lookup, show};
 use serde::Deserialize;
 use std::fmt;
 use toml::de::{DeTable, DeValue};
@@ -13,6 +13,9 @@ pub struct Sources {
     pub preset: Option<Preset>,
     /// Configuration files: name for messages, text.
     pub files: Vec<(String, String)>,
+    /// Which of the files is what a run remembers: a row of the ablation that is named elsewhere beats
+    /// what this one says of the keys it decides.
+    pub remembered: Option<usize>,
     /// `--set`: each `key=value`.
     pub set: Vec<String>,
     /// Options with a name of their own: as typed, the key they set, its value. Strongest.
@@ -133,8 +136,13 @@ type Assignment = (String, Given, Place);
 
 pub(super) fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
     let mut given: Vec<Assignment> = Vec::new();
-    for (name, text) in &sources.files {
+    let mut remembered = 0..0;
+    for (i, (name, text)) in sources.files.iter().enumerate() {
+        let before = given.len();
         read_file(name, text, &mut given)?;
+        if sources.remembered == Some(i) {
+            remembered = before..given.len();
+        }
     }
     for set in &sources.set {
         let place = Place::Option(format!("--set {set}"));
@@ -148,20 +156,37 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
     }
 
     // the preset comes first whatever line it stands on; what it means is checked by `assign` below
-    let named = given.iter().rev().find(|(key, ..)| key == "preset").and_then(|(_, value, _)| {
-        let word = match value {
+    let word = |key: &str| {
+        let at = given.iter().rposition(|(k, ..)| k == key)?;
+        let word = match &given[at].1 {
             Given::Toml(v) => v.as_str()?.to_owned(),
             Given::Text(t) => t.trim_matches('"').to_owned(),
         };
-        Preset::deserialize(Value::String(word)).ok()
-    });
+        Some((at, Value::String(word)))
+    };
+    let named = word("preset").and_then(|(_, word)| Preset::deserialize(word).ok());
     let preset = sources.preset.or(named).unwrap_or_default();
     let mut config = Config::preset(preset);
-    for (key, value, place) in given {
+    // as does the row of the ablation, right after it
+    let mut decided = false;
+    if let Some((at, word)) = word("ablation") {
+        config.tface = match Ablation::deserialize(word) {
+            Ok(row) => config.tface.with(row),
+            Err(_) => config.tface,
+        };
+        decided = !remembered.contains(&at);
+    }
+    for (i, (key, value, place)) in given.into_iter().enumerate() {
+        if decided && remembered.contains(&i) && ABLATED.contains(&key.as_str()) {
+            continue;
+        }
         config = assign(&config, &key, value, place)?;
     }
     Ok(Config { preset, ..config })
 }
+
+/// What a row of the ablation decides.
+const ABLATED: [&str; 2] = ["tface.masks", "tface.mask_loss"];
 
 fn read_file(name: &str, text: &str, given: &mut Vec<Assignment>) -> Result<(), ConfigError> {
     let text = text.strip_prefix('\u{FEFF}').unwrap_or(text);
@@ -236,6 +261,14 @@ fn assign(config: &Config, key: &str, given: Given, place: Place) -> Result<Conf
     {
         let problem = format!("unknown device `{word}`, expected auto, cpu, wgpu:N or cuda:N");
         return Err(ConfigError::Word { place, key: key.into(), problem });
+    }
+    if key == "ablation"
+        && let Some(word) = value.as_str().filter(|w| !w.is_empty())
+    {
+        Ablation::deserialize(Value::String(word.into())).map_err(|e| {
+            let problem = e.message().lines().next().unwrap_or_default().to_string();
+            ConfigError::Word { place: place.clone(), key: key.into(), problem }
+        })?;
     }
     put(&mut root, key, value);
     Config::deserialize(Value::Table(root)).map_err(|e| {
@@ -353,83 +386,6 @@ fn edit_distance(a: &str, b: &str) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::MeshFormat;
-
-    fn from(file: &str, set: &[&str]) -> Result<Config, ConfigError> {
-        let files = vec![("tiface.toml".to_string(), file.to_string())];
-        Config::resolve(&Sources {
-            files,
-            set: set.iter().map(|s| s.to_string()).collect(),
-            ..Sources::default()
-        })
-    }
-
-    #[test]
-    fn later_wins_default_preset_file_set() {
-        let c = from("preset = \"draft\"\n[mesh]\nresolution = 300\n", &["mesh.resolution=301"]).unwrap();
-        assert_eq!((c.preset, c.mesh.resolution), (Preset::Draft, 301));
-        let c = from("[mesh]\nresolution = 300\npreset_is_below = 1", &[]);
-        assert!(c.is_err());
-        let c = from("mesh.resolution = 300\npreset = \"draft\"", &[]).unwrap(); // the order of lines is no matter
-        assert_eq!((c.mesh.resolution, c.iface), (300, Config::preset(Preset::Draft).iface));
-        let c = Config::resolve(&Sources {
-            preset: Some(Preset::Paper),
-            files: vec![("f".into(), "preset = \"draft\"".into())],
-            ..Sources::default()
-        });
-        assert_eq!(c.unwrap(), Config::preset(Preset::Paper));
-    }
-
-    #[test]
-    fn an_unknown_key_names_its_line_and_the_nearest_known_one() {
-        let e = from("seed = 1\n\n[iface]\nstep = 5\n", &[]).unwrap_err();
-        assert_eq!(e.to_string(), "`tiface.toml`, line 4: there is no key `iface.step`");
-        assert!(e.hint().contains("`iface.steps`"), "{}", e.hint());
-        let e = from("", &["resolution=9"]).unwrap_err();
-        assert_eq!(e.to_string(), "`--set resolution=9`: there is no key `resolution`");
-        assert!(e.hint().contains("`mesh.resolution`"));
-        assert!(from("[iface.steps]\nx = 1", &[]).unwrap_err().to_string().contains("iface.steps.x"));
-        assert!(from("[nonsense]", &[]).unwrap_err().to_string().contains("nonsense"));
-        assert!(from("\"iface.steps\" = 3", &[]).is_err());
-    }
-
-    #[test]
-    fn a_number_out_of_range_names_the_range() {
-        let e = from("[mesh]\nresolution = 1", &[]).unwrap_err();
-        assert_eq!(e.to_string(), "`tiface.toml`, line 2: `mesh.resolution` is 1, allowed is 16 to 4096");
-        for bad in
-            ["iface.steps=0", "iface.rays=1000000000", "capture.unit_m=nan", "capture.unit_m=inf", "seed=-1"]
-        {
-            assert!(matches!(from("", &[bad]), Err(ConfigError::Range { .. })), "{bad}");
-        }
-    }
-
-    #[test]
-    fn a_wrong_type_and_a_wrong_word_say_what_is_expected() {
-        let e = from("[mesh]\nresolution = \"fine\"", &[]).unwrap_err();
-        assert_eq!(e.to_string(), "`tiface.toml`, line 2: `mesh.resolution` is an integer, found \"fine\"");
-        let e = from("", &["mask.source=guess"]).unwrap_err();
-        assert!(e.to_string().contains("unknown variant `guess`, expected one of `auto`, `alpha`"), "{e}");
-        let e = from("", &["capture.mask_dir=~/masks"]).unwrap_err();
-        assert!(e.to_string().contains("write the whole path"), "{e}");
-        let e = from("", &["device=gpu"]).unwrap_err();
-        assert!(e.to_string().contains("expected auto, cpu, wgpu:N or cuda:N"), "{e}");
-        assert!(from("", &["device=wgpu:1"]).is_ok());
-        assert!(from("preset = \"best\"", &[]).is_err());
-        assert!(matches!(from("", &["mesh.resolution"]), Err(ConfigError::Syntax { .. })));
-        let e = from("seed = 1\nmesh = = 2", &[]).unwrap_err();
-        assert!(matches!(&e, ConfigError::Syntax { place: Place::File { line: 2, .. }, .. }), "{e}");
-    }
-
-    #[test]
-    fn set_needs_neither_quotes_nor_brackets() {
-        let c = from("", &["mesh.format=glb,obj", "iface.steps=2e4", "capture.unit_m=1", "capture.path=a b"])
-            .unwrap();
-        assert_eq!(c.mesh.format, [MeshFormat::Glb, MeshFormat::Obj]);
-        assert_eq!((c.iface.steps, c.capture.unit_m, c.capture.path.as_str()), (20_000, 1.0, "a b"));
-        let c = from("", &["mesh.format=[\"ply\"]", "mask.source=\"none\""]).unwrap();
-        assert_eq!(c.mesh.format, [MeshFormat::Ply]);
-    }
 
     #[test]
     fn edit_distance_counts_letters() {

@@ -15,6 +15,9 @@ pub(super) fn behind(background: Background) -> Option<[f32; 3]> {
     }
 }
 
+/// Below a method's folder: its views as `ensemble` reads them.
+pub(super) const FLOAT: &str = "float";
+
 /// The file of a view: `folder/NAME.png` or `.exr`.
 pub(super) fn path(folder: &Path, name: &str, format: PictureFormat) -> PathBuf {
     let ending = match format {
@@ -22,6 +25,22 @@ pub(super) fn path(folder: &Path, name: &str, format: PictureFormat) -> PathBuf 
         PictureFormat::Exr => "exr",
     };
     folder.join(format!("{name}.{ending}"))
+}
+
+/// All files of a view: the pictures as shown, and the float one below `float`.
+pub(super) fn files(
+    folder: &Path,
+    name: &str,
+    shown: bool,
+    float: Option<&Path>,
+    format: PictureFormat,
+) -> Vec<PathBuf> {
+    let mut files: Vec<PathBuf> = float.map(|f| float_path(f, name)).into_iter().collect();
+    if shown {
+        files.push(path(folder, name, format));
+        files.extend((format == PictureFormat::Png).then(|| path(&folder.join("depth"), name, format)));
+    }
+    files
 }
 
 /// Puts coded colour over a background: the result is opaque.
@@ -33,7 +52,8 @@ pub(super) fn over(view: &mut RenderedView, background: [f32; 3]) {
 }
 
 /// Writes a view. PNG: 8-bit sRGB with straight alpha, and depth beside it in `depth/`, 16-bit
-/// millimetres, 0 = nothing. EXR: scene-linear, premultiplied, with `Z` and `N.X N.Y N.Z`.
+/// millimetres, 0 = nothing. EXR: scene-linear, premultiplied, with `Z` and `N.X N.Y N.Z`. Depth and
+/// normals only where the view has them.
 pub(super) fn write(
     folder: &Path,
     name: &str,
@@ -49,6 +69,9 @@ pub(super) fn write(
         PictureFormat::Png => {
             let rgba: Vec<[u8; 4]> = pixels.iter().map(|&p| straight(p).map(quantise)).collect();
             io::write_png_rgba(&file, w, h, &rgba)?;
+            if view.depth.data.is_empty() {
+                return Ok(());
+            }
             let depth = path(&folder.join("depth"), name, format);
             io::create_folder(depth.parent().unwrap_or(folder))?;
             let mm = |z: &f32| (*z as f64 * unit_m * 1000.0).round().clamp(0.0, 65_535.0) as u16;
@@ -67,19 +90,55 @@ pub(super) fn write(
             let normal = |k: usize| view.normal.data.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>();
             let (r, g, b, a) = (of(0), of(1), of(2), of(3));
             let (x, y, z) = (normal(0), normal(1), normal(2));
-            let channels: [(&str, &[f32]); 8] = [
-                ("R", &r),
-                ("G", &g),
-                ("B", &b),
-                ("A", &a),
-                ("Z", &view.depth.data),
-                ("N.X", &x),
-                ("N.Y", &y),
-                ("N.Z", &z),
-            ];
+            let mut channels: Vec<(&str, &[f32])> = vec![("R", &r), ("G", &g), ("B", &b), ("A", &a)];
+            if !view.depth.data.is_empty() {
+                channels.push(("Z", &view.depth.data));
+            }
+            if !view.normal.data.is_empty() {
+                channels.extend([("N.X", &x[..]), ("N.Y", &y[..]), ("N.Z", &z[..])]);
+            }
             io::write_exr(&file, w, h, &channels)
         }
     }
+}
+
+/// The channels of a float view. Not R, G and B: those are scene-linear in an EXR, these are coded.
+const CODED: [&str; 5] = ["coded.R", "coded.G", "coded.B", "A", "Z"];
+
+/// The float file of a view: `folder/NAME.exr`.
+pub(super) fn float_path(folder: &Path, name: &str) -> PathBuf {
+    path(folder, name, PictureFormat::Exr)
+}
+
+/// Writes a view as it is: 32-bit coded colour over black, opacity, and depth in world units.
+pub(super) fn write_float(folder: &Path, name: &str, view: &RenderedView) -> Result<(), WriteError> {
+    let file = float_path(folder, name);
+    io::create_folder(file.parent().unwrap_or(folder))?;
+    let of = |k: usize| view.color.data.iter().skip(k).step_by(4).copied().collect::<Vec<f32>>();
+    let color = [of(0), of(1), of(2), of(3)];
+    let all = CODED.iter().copied().zip(color.iter().chain([&view.depth.data]).map(Vec::as_slice));
+    let channels: Vec<(&str, &[f32])> = all.filter(|(_, values)| !values.is_empty()).collect();
+    io::write_exr(&file, view.color.width, view.color.height, &channels)
+}
+
+/// Reads what [`write_float`] wrote, bit by bit: the colour (RGBA over black).
+pub(super) fn read_float(file: &Path) -> Result<Image, ReadError> {
+    let read = io::read_exr_channels(file, &[&CODED[..4]], &Limits::default())?;
+    if read.replaced > 0 {
+        return Err(ReadError::Unsupported {
+            path: file.into(),
+            what: format!("a view with {} values that are not finite", read.replaced),
+            hint: "its field has diverged: train it again with another --seed, or leave it out of \
+                   ensemble.members"
+                .into(),
+        });
+    }
+    Ok(read.image)
+}
+
+/// The depth of a float view, in world units.
+pub(super) fn read_float_depth(file: &Path) -> Result<Image, ReadError> {
+    Ok(io::read_exr_channels(file, &[&CODED[4..]], &Limits::default())?.image)
 }
 
 /// Coded colour no longer multiplied by alpha.
@@ -159,6 +218,29 @@ mod tests {
         let red = io::read_exr_channels(&file, &[&["R", "Z"]], &Limits::default()).unwrap().image;
         assert!((red.data[0] - 0.3019).abs() < 1e-3 && (red.data[1] - 1.234).abs() < 1e-6);
         assert!(dir.path().join("depth/left/a.png").is_file());
+    }
+
+    #[test]
+    fn a_float_view_comes_back_bit_by_bit() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut view = RenderedView {
+            color: Image::new(2, 1, 4),
+            depth: Image::new(2, 1, 1),
+            normal: Image::new(0, 0, 3),
+        };
+        view.color.data.copy_from_slice(&[0.1, 1e-7, 0.333_333_34, 0.9, 0.0, 1.0, 0.2, 1.0]);
+        view.depth.data[1] = 2.5;
+        write_float(dir.path(), "left/a", &view).unwrap();
+        let file = float_path(dir.path(), "left/a");
+        assert_eq!(read_float(&file).unwrap(), view.color);
+        assert_eq!(read_float_depth(&file).unwrap(), view.depth);
+        // and views without depth or normals are pictures, too
+        view.depth = Image::new(0, 0, 1);
+        for format in [PictureFormat::Png, PictureFormat::Exr] {
+            write(dir.path(), "b", &view, format, 1.0).unwrap();
+            assert!(read(&path(dir.path(), "b", format), format).is_ok());
+        }
+        assert!(!dir.path().join("depth/b.png").exists());
     }
 
     #[test]

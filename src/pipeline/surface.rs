@@ -1,8 +1,10 @@
 //! What the later stages need of a learned field, and of anything else that can stand in for it.
 
+use super::march::Seen;
 use crate::capture::synthetic::SyntheticHead;
-use crate::geom::{Camera, Similarity};
+use crate::geom::{Camera, Ray, Similarity};
 use crate::render::RenderedView;
+use crate::run::Failure;
 use glam::Vec3;
 
 /// A coloured signed distance in scene coordinates.
@@ -22,6 +24,22 @@ pub trait Surface: Sync {
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView>;
 }
 
+/// A field that is looked at by marching rays through it.
+pub trait Radiance: Sync {
+    /// What rays in scene coordinates see, of a camera that looks along the unit vector `forward`; normals
+    /// are not asked for. `[n]` → `[n]`.
+    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<Seen>;
+}
+
+/// The trained fields, each loaded when it is first asked for.
+pub trait Fields {
+    /// I-Face.
+    fn surface(&self) -> Result<&dyn Surface, Failure>;
+
+    /// The field of the stage `baseline` or `tface`.
+    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure>;
+}
+
 #[cfg(feature = "cpu")]
 impl Surface for crate::iface::IFace {
     fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
@@ -37,34 +55,29 @@ impl Surface for crate::iface::IFace {
     }
 
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView> {
-        use crate::geom::Ray;
-        use crate::image::Image;
-        use glam::Vec2;
-        let (w, h) = (camera.width, camera.height);
-        let (mut rays, mut pixels) = (Vec::new(), Vec::new());
-        for i in 0..w * h {
-            // where the lens model folds over, no ray is: the pixel stays empty
-            if let Some(ray) = camera.ray(Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5)) {
-                rays.push(Ray { t_min: 0.0, t_max: f32::INFINITY, ..ray });
-                pixels.push((i % w, i / w));
-            }
-        }
-        let mut view = RenderedView {
-            color: Image::new(w, h, 4),
-            depth: Image::new(w, h, 1),
-            normal: Image::new(w, h, 3),
+        let see = |rays: &[Ray]| -> Vec<Seen> {
+            let seen = |v: crate::iface::VolumeRay| Seen {
+                color: v.color,
+                opacity: v.opacity,
+                depth: v.depth,
+                normal: v.normal,
+            };
+            self.render(rays).into_iter().map(seen).collect()
         };
-        for ((ray, seen), (x, y)) in rays.iter().zip(self.render(&rays)).zip(pixels) {
-            let [r, g, b] = seen.color;
-            view.color.pixel_mut(x, y).copy_from_slice(&[r, g, b, seen.opacity]);
-            if seen.opacity >= 0.5 {
-                let along = seen.depth * ray.direction.dot(camera.forward());
-                view.depth.pixel_mut(x, y)[0] = along * world_from_scene.scale as f32;
-                let normal = world_from_scene.direction(seen.normal);
-                view.normal.pixel_mut(x, y).copy_from_slice(&normal.to_array());
-            }
-        }
-        Some(view)
+        Some(super::march::march(camera, world_from_scene, true, see))
+    }
+}
+
+#[cfg(feature = "cpu")]
+impl Radiance for crate::tface::TFace {
+    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<Seen> {
+        let seen = |p: crate::tface::VmPixel| Seen {
+            color: p.color,
+            opacity: p.opacity,
+            depth: p.depth,
+            normal: Vec3::ZERO,
+        };
+        self.render(rays, forward).into_iter().map(seen).collect()
     }
 }
 

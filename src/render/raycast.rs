@@ -41,7 +41,8 @@ pub struct RenderedView {
     pub color: Image,
     /// One channel: distance along the viewing axis in world units at the pixel's centre; 0 = nothing.
     pub depth: Image,
-    /// Three channels: unit normal in the world at the pixel's centre; 0 = nothing.
+    /// Three channels: unit normal in the world at the pixel's centre; 0 = nothing. No pixels at all where
+    /// the method knows no normals.
     pub normal: Image,
 }
 

@@ -1,0 +1,105 @@
+//! Which value wins, and what is said of a wrong one.
+
+use super::{Config, ConfigError, MeshFormat, Place, Preset, Sources};
+
+fn from(file: &str, set: &[&str]) -> Result<Config, ConfigError> {
+    let files = vec![("tiface.toml".to_string(), file.to_string())];
+    Config::resolve(&Sources {
+        files,
+        set: set.iter().map(|s| s.to_string()).collect(),
+        ..Sources::default()
+    })
+}
+
+#[test]
+fn later_wins_default_preset_file_set() {
+    let c = from("preset = \"draft\"\n[mesh]\nresolution = 300\n", &["mesh.resolution=301"]).unwrap();
+    assert_eq!((c.preset, c.mesh.resolution), (Preset::Draft, 301));
+    let c = from("[mesh]\nresolution = 300\npreset_is_below = 1", &[]);
+    assert!(c.is_err());
+    let c = from("mesh.resolution = 300\npreset = \"draft\"", &[]).unwrap(); // the order of lines is no matter
+    assert_eq!((c.mesh.resolution, c.iface), (300, Config::preset(Preset::Draft).iface));
+    let c = Config::resolve(&Sources {
+        preset: Some(Preset::Paper),
+        files: vec![("f".into(), "preset = \"draft\"".into())],
+        ..Sources::default()
+    });
+    assert_eq!(c.unwrap(), Config::preset(Preset::Paper));
+}
+
+#[test]
+fn an_unknown_key_names_its_line_and_the_nearest_known_one() {
+    let e = from("seed = 1\n\n[iface]\nstep = 5\n", &[]).unwrap_err();
+    assert_eq!(e.to_string(), "`tiface.toml`, line 4: there is no key `iface.step`");
+    assert!(e.hint().contains("`iface.steps`"), "{}", e.hint());
+    let e = from("", &["resolution=9"]).unwrap_err();
+    assert_eq!(e.to_string(), "`--set resolution=9`: there is no key `resolution`");
+    assert!(e.hint().contains("`mesh.resolution`"));
+    assert!(from("[iface.steps]\nx = 1", &[]).unwrap_err().to_string().contains("iface.steps.x"));
+    assert!(from("[nonsense]", &[]).unwrap_err().to_string().contains("nonsense"));
+    assert!(from("\"iface.steps\" = 3", &[]).is_err());
+}
+
+#[test]
+fn a_number_out_of_range_names_the_range() {
+    let e = from("[mesh]\nresolution = 1", &[]).unwrap_err();
+    assert_eq!(e.to_string(), "`tiface.toml`, line 2: `mesh.resolution` is 1, allowed is 16 to 4096");
+    for bad in
+        ["iface.steps=0", "iface.rays=1000000000", "capture.unit_m=nan", "capture.unit_m=inf", "seed=-1"]
+    {
+        assert!(matches!(from("", &[bad]), Err(ConfigError::Range { .. })), "{bad}");
+    }
+}
+
+#[test]
+fn a_wrong_type_and_a_wrong_word_say_what_is_expected() {
+    let e = from("[mesh]\nresolution = \"fine\"", &[]).unwrap_err();
+    assert_eq!(e.to_string(), "`tiface.toml`, line 2: `mesh.resolution` is an integer, found \"fine\"");
+    let e = from("", &["mask.source=guess"]).unwrap_err();
+    assert!(e.to_string().contains("unknown variant `guess`, expected one of `auto`, `alpha`"), "{e}");
+    let e = from("", &["capture.mask_dir=~/masks"]).unwrap_err();
+    assert!(e.to_string().contains("write the whole path"), "{e}");
+    let e = from("", &["device=gpu"]).unwrap_err();
+    assert!(e.to_string().contains("expected auto, cpu, wgpu:N or cuda:N"), "{e}");
+    assert!(from("", &["device=wgpu:1"]).is_ok());
+    assert!(from("preset = \"best\"", &[]).is_err());
+    assert!(matches!(from("", &["mesh.resolution"]), Err(ConfigError::Syntax { .. })));
+    let e = from("seed = 1\nmesh = = 2", &[]).unwrap_err();
+    assert!(matches!(&e, ConfigError::Syntax { place: Place::File { line: 2, .. }, .. }), "{e}");
+}
+
+#[test]
+fn set_needs_neither_quotes_nor_brackets() {
+    let c = from("", &["mesh.format=glb,obj", "iface.steps=2e4", "capture.unit_m=1", "capture.path=a b"])
+        .unwrap();
+    assert_eq!(c.mesh.format, [MeshFormat::Glb, MeshFormat::Obj]);
+    assert_eq!((c.iface.steps, c.capture.unit_m, c.capture.path.as_str()), (20_000, 1.0, "a b"));
+    let c = from("", &["mesh.format=[\"ply\"]", "mask.source=\"none\""]).unwrap();
+    assert_eq!(c.mesh.format, [MeshFormat::Ply]);
+}
+
+#[test]
+fn a_row_of_the_ablation_comes_after_the_preset_and_before_files_and_set() {
+    use crate::config::{MaskLoss, MaskUse};
+    let masks = |c: &Config| (c.tface.masks, c.tface.mask_loss);
+    let c = from("", &["ablation=mask-ce"]).unwrap();
+    assert_eq!(masks(&c), (MaskUse::Soft, MaskLoss::Ce));
+    assert_eq!(c.baseline, Config::preset(Preset::Standard).baseline); // tface's alone
+    let c = from("tface.mask_loss = \"none\"", &["ablation=mask-ce"]).unwrap();
+    assert_eq!(masks(&c), (MaskUse::Soft, MaskLoss::None));
+    // what a run remembers is complete, and would win against any other row
+    let saved = from("", &["ablation=mask-binary"]).unwrap().to_toml();
+    let again = |set: &[&str]| {
+        let set = set.iter().map(|s| s.to_string()).collect();
+        let files = vec![("saved".into(), saved.clone())];
+        Config::resolve(&Sources { files, set, remembered: Some(0), ..Sources::default() }).unwrap()
+    };
+    assert_eq!(masks(&again(&[])), (MaskUse::Binary, MaskLoss::None));
+    assert_eq!(masks(&again(&["ablation=mask-l2"])), (MaskUse::Soft, MaskLoss::L2));
+    let e = from("", &["ablation=mask-hard"]).unwrap_err();
+    assert_eq!(
+        e.to_string(),
+        "`--set ablation=mask-hard`: `ablation`: unknown variant `mask-hard`, expected one of `baseline`, \
+         `mask-binary`, `mask-soft`, `mask-ce`, `mask-l2`"
+    );
+}

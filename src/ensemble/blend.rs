@@ -1,0 +1,189 @@
+//! Blending with given weights: `Σ_k w_k · clamp(I_k, 0, 1)`, alpha like colour (the paper's §5).
+
+use super::members::{channels, normalised, same_size};
+use super::{EnsembleError, Members, RegionWeights};
+use crate::image::Image;
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// The members with one weight each, in float; round once, when it is written.
+///
+/// Weights are shares: finite, from 0 up, with sum 1. A sum beside 1 by at most 0.001 is taken as
+/// rounding and divided out; beyond that it is an error, since the blend would be darker or brighter
+/// than its members.
+pub fn blend(members: &Members, weights: &[f32]) -> Result<Image, EnsembleError> {
+    let weights = normalised(weights, members.count())?;
+    Ok(each(members, |_, shares| shares.copy_from_slice(&weights)))
+}
+
+/// The members with weights that depend on the point of the head a pixel shows.
+///
+/// `points`: 3 channels, the point in scene coordinates ([-1, 1]³); not finite where there is none,
+/// which gives the global weights.
+pub fn blend_regions(
+    members: &Members,
+    points: &Image,
+    regions: &RegionWeights,
+) -> Result<Image, EnsembleError> {
+    check_points(members, points)?;
+    if regions.members() != members.count() {
+        return Err(EnsembleError::Members { found: members.count(), expected: regions.members() });
+    }
+    Ok(each(members, |i, shares| regions.write_at(point(points, i), shares)))
+}
+
+/// Are the points those of this view?
+pub(super) fn check_points(members: &Members, points: &Image) -> Result<(), EnsembleError> {
+    let what = || "the picture of points".to_string();
+    same_size(what, (points.width, points.height), members.size())?;
+    channels(what, points, 3)
+}
+
+pub(super) fn point(points: &Image, i: usize) -> Vec3 {
+    Vec3::from_slice(&points.data[3 * i..3 * i + 3])
+}
+
+fn each(members: &Members, weights: impl Fn(usize, &mut [f32]) + Sync) -> Image {
+    let (width, height) = members.size();
+    let mut out = Image::new(width, height, 4);
+    let row = width.max(1) as usize;
+    out.data.par_chunks_mut(4 * row).enumerate().for_each(|(y, line)| {
+        let mut colors = vec![[0f32; 4]; members.count()];
+        let mut shares = vec![0f32; members.count()];
+        for (x, o) in line.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+            members.read(y * row + x, &mut colors);
+            weights(y * row + x, &mut shares);
+            for (c, w) in colors.iter().zip(&shares) {
+                *o = std::array::from_fn(|j| o[j] + w * c[j]);
+            }
+            // the weights' last bit must not carry a white pixel past white
+            *o = o.map(|v| v.min(1.0));
+        }
+    });
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ensemble::{Member, PAPER_WEIGHTS};
+
+    fn flat(width: u32, height: u32, color: [f32; 4]) -> Image {
+        let mut image = Image::new(width, height, 4);
+        image.data.as_chunks_mut::<4>().0.fill(color);
+        image
+    }
+
+    fn member<'a>(name: &'a str, image: &'a Image) -> Member<'a> {
+        Member { name, image, masked: name != "baseline" }
+    }
+
+    fn near(found: &[f32], expected: [f32; 4]) {
+        assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?}, not {expected:?}");
+    }
+
+    #[test]
+    fn the_papers_weights_give_the_papers_blend() {
+        let views = [
+            flat(3, 2, [0.2, 1.5, 0.0, 1.0]),
+            flat(3, 2, [0.4, 1.0, -1.0, 0.5]),
+            flat(3, 2, [0.6, 0.0, 0.5, 1.0]),
+        ];
+        let members = ["baseline", "tface", "iface"];
+        let list: Vec<Member> = members.iter().zip(&views).map(|(n, v)| member(n, v)).collect();
+        let out = blend(&Members::new(&list).unwrap(), &PAPER_WEIGHTS).unwrap();
+        // red   0.1·0.2 + 0.6·0.4 + 0.3·0.6 = 0.44
+        // green 0.1·1 (clamped) + 0.6·1 = 0.7
+        // blue  0.6·0 (clamped) + 0.3·0.5 = 0.15
+        // alpha 0.1 + 0.3 + 0.3 = 0.7
+        for pixel in out.data.chunks(4) {
+            near(pixel, [0.44, 0.7, 0.15, 0.7]);
+        }
+        assert_eq!((out.width, out.height, out.channels), (3, 2, 4));
+    }
+
+    #[test]
+    fn one_member_is_itself_and_eleven_can_be_blended() {
+        let view = flat(2, 2, [0.25, 0.5, 0.75, 1.0]);
+        let alone = Members::new(&[member("iface", &view)]).unwrap();
+        assert_eq!(blend(&alone, &[1.0]).unwrap(), view);
+        let many = Members::new(&[member("iface", &view); 11]).unwrap();
+        near(&blend(&many, &[1.0 / 11.0; 11]).unwrap().data[..4], [0.25, 0.5, 0.75, 1.0]);
+    }
+
+    #[test]
+    fn a_member_without_masks_is_cut_to_the_head() {
+        // pixel 0: the stage; 1: hair, half opaque in T-Face, 0.8 in I-Face; 2: skin
+        let baseline = flat(3, 1, [0.8, 0.8, 0.8, 1.0]);
+        let (mut tface, mut iface) = (Image::new(3, 1, 4), Image::new(3, 1, 4));
+        tface.data[4..8].copy_from_slice(&[0.2, 0.2, 0.2, 0.5]);
+        iface.data[4..8].copy_from_slice(&[0.4, 0.4, 0.4, 0.8]);
+        tface.data[8..12].copy_from_slice(&[0.6, 0.6, 0.6, 1.0]);
+        iface.data[8..12].copy_from_slice(&[0.7, 0.7, 0.7, 1.0]);
+        let list = [member("baseline", &baseline), member("tface", &tface), member("iface", &iface)];
+        let members = Members::new(&list).unwrap();
+        let ghost = blend(&members, &PAPER_WEIGHTS).unwrap();
+        near(ghost.pixel(0, 0), [0.08, 0.08, 0.08, 0.1]);
+        let out = blend(&members.cut(&PAPER_WEIGHTS).unwrap(), &PAPER_WEIGHTS).unwrap();
+        near(out.pixel(0, 0), [0.0; 4]);
+        // opacity (0.6·0.5 + 0.3·0.8)/0.9 = 0.6; colour 0.1·0.8·0.6 + 0.6·0.2 + 0.3·0.4 = 0.288,
+        // alpha 0.1·0.6 + 0.6·0.5 + 0.3·0.8 = 0.6
+        near(out.pixel(1, 0), [0.288, 0.288, 0.288, 0.6]);
+        near(out.pixel(2, 0), [0.65, 0.65, 0.65, 1.0]);
+        near(ghost.pixel(2, 0), [0.65, 0.65, 0.65, 1.0]);
+        // weights of 0 for the masked ones: they count alike, opacity (0.5 + 0.8)/2 = 0.65
+        let alone = Members::new(&list).unwrap().cut(&[1.0, 0.0, 0.0]).unwrap();
+        let out = blend(&alone, &[1.0, 0.0, 0.0]).unwrap();
+        near(out.pixel(1, 0), [0.52, 0.52, 0.52, 0.65]);
+        // nothing to cut by: nothing is cut
+        let only = Members::new(&list[..1]).unwrap().cut(&[1.0]).unwrap();
+        assert_eq!(blend(&only, &[1.0]).unwrap(), baseline);
+    }
+
+    #[test]
+    fn regions_choose_by_the_point_a_pixel_shows() {
+        let (a, b) = (flat(3, 1, [0.2, 0.2, 0.2, 1.0]), flat(3, 1, [0.6, 0.6, 0.6, 1.0]));
+        let weights = (0..8).map(|n| if n % 2 == 0 { vec![1.0, 0.0] } else { vec![0.0, 1.0] }).collect();
+        let regions = RegionWeights::new(2, vec![0.5, 0.5], weights).unwrap();
+        let mut points = Image::new(3, 1, 3);
+        points.data[0] = -1.0; // A alone
+        points.data[3] = 0.5; // a quarter A
+        points.data[6] = f32::NAN; // no point: halves
+        let members = Members::new(&[member("tface", &a), member("iface", &b)]).unwrap();
+        let out = blend_regions(&members, &points, &regions).unwrap();
+        for (x, expected) in [0.2, 0.5, 0.4].into_iter().enumerate() {
+            near(out.pixel(x as u32, 0), [expected, expected, expected, 1.0]);
+        }
+        let one = Members::new(&[member("tface", &a)]).unwrap();
+        let e = blend_regions(&one, &points, &regions).unwrap_err();
+        assert_eq!(e, EnsembleError::Members { found: 1, expected: 2 });
+        let e = blend_regions(&members, &Image::new(3, 1, 4), &regions).unwrap_err();
+        assert_eq!(e.to_string(), "the picture of points has 4 channels, expected 3");
+    }
+
+    #[test]
+    fn what_cannot_be_blended_is_said() {
+        let (view, other, rgb) = (flat(4, 3, [0.5; 4]), flat(4, 4, [0.5; 4]), Image::new(4, 3, 3));
+        let error = |list: &[Member]| Members::new(list).unwrap_err().to_string();
+        assert_eq!(error(&[]), "there are no members to blend");
+        let e = error(&[member("tface", &view), member("iface", &other)]);
+        assert_eq!(e, "the view of member `iface` is 4 × 4 pixels, expected 4 × 3");
+        assert_eq!(error(&[member("tface", &rgb)]), "the view of member `tface` has 3 channels, expected 4");
+        let mut broken = view.clone();
+        broken.pixel_mut(2, 1)[3] = f32::NAN;
+        broken.pixel_mut(0, 2)[0] = f32::INFINITY;
+        let e = error(&[member("tface", &broken)]);
+        assert_eq!(e, "member `tface`: 2 pixels are not finite, the first in column 2 of row 1");
+
+        let members = Members::new(&[member("tface", &view), member("iface", &view)]).unwrap();
+        let error = |weights: &[f32]| blend(&members, weights).unwrap_err();
+        assert_eq!(error(&[1.0]).to_string(), "there are 1 weights for 2 members");
+        assert_eq!(error(&[1.5, -0.5]).to_string(), "weight 2 is -0.5, expected a finite number from 0 up");
+        assert!(error(&[f32::NAN, 0.5]).to_string().starts_with("weight 1 is NaN"));
+        assert_eq!(error(&[1.0, 3.0]).to_string(), "the weights sum to 4, expected 1");
+        assert_eq!(error(&[1.0, 3.0]).hint(), "the same shares with sum 1 are 0.2500, 0.7500");
+        assert_eq!(error(&[0.0, 0.0]).hint(), "give at least one member a weight above 0");
+        // a thousandth is rounding, and does not darken
+        near(&blend(&members, &[0.5, 0.4999]).unwrap().data[..4], [0.5; 4]);
+    }
+}

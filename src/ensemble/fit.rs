@@ -1,0 +1,139 @@
+//! The weights of least squared error, from the products of the members' errors.
+//!
+//! With `Σ_k w_k = 1` the blend's error is the blend of the errors, `e = Σ_k w_k e_k`, so all that a
+//! fit needs from the pixels is the matrix `D_kl = Σ ρ · e_k · e_l` over head pixels (counted ρ
+//! each) and channels: the squared error is `wᵀDw`, and no large numbers cancel in it.
+
+use super::members::{in_bands, normalised};
+use super::{EnsembleError, Members, Target, simplex};
+
+/// The most members a fit can weigh.
+pub const MAX_MEMBERS: usize = 8;
+
+/// Sums over the views seen so far: `members²` numbers, so each view may keep its own.
+///
+/// Give it views that were held out of training: on its own training views a member looks better
+/// than it is. Never test views.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Fit {
+    members: usize,
+    /// D, `[members · members]`, symmetric.
+    products: Vec<f64>,
+    /// How many pixels, each by its weight.
+    pixels: f64,
+}
+
+impl Fit {
+    /// Of no views yet. At most [`MAX_MEMBERS`] members.
+    pub fn new(members: usize) -> Result<Fit, EnsembleError> {
+        match members {
+            0 => Err(EnsembleError::NoMembers),
+            1..=MAX_MEMBERS => Ok(Fit::empty(members)),
+            found => Err(EnsembleError::TooManyMembers { found }),
+        }
+    }
+
+    pub(super) fn empty(members: usize) -> Fit {
+        Fit { members, products: vec![0.0; members * members], pixels: 0.0 }
+    }
+
+    /// Adds one view. Cut the members as they will be cut when they are blended.
+    pub fn add(&mut self, members: &Members, target: &Target) -> Result<(), EnsembleError> {
+        self.same_members(members.count())?;
+        members.check(target)?;
+        let bands = in_bands(members.pixels(), |band| {
+            let mut sums = Fit::empty(self.members);
+            members.errors(target, band, |_, weight, errors| sums.count(weight, errors));
+            sums
+        });
+        bands.iter().for_each(|b| self.sum(b));
+        Ok(())
+    }
+
+    /// Adds the views of another. The last bits depend on the order, nothing else does.
+    pub fn merge(&mut self, other: &Fit) -> Result<(), EnsembleError> {
+        self.same_members(other.members)?;
+        self.sum(other);
+        Ok(())
+    }
+
+    /// How many pixels were counted, each by its weight.
+    pub fn pixels(&self) -> f64 {
+        self.pixels
+    }
+
+    /// The weights: `argmin wᵀDw`, `w ≥ 0`, `Σ w = 1`. Members that are alike share alike.
+    pub fn solve(&self) -> Result<Vec<f32>, EnsembleError> {
+        if self.pixels <= 0.0 {
+            return Err(EnsembleError::NoPixels);
+        }
+        let m = self.members;
+        // far below what 8 bits can tell; it decides only between members that are the same
+        let trace: f64 = (0..m).map(|k| self.products[k * m + k]).sum();
+        let ridge = (1e-9 * trace / m as f64).max(1e-30);
+        let mut h = self.products.clone();
+        (0..m).for_each(|k| h[k * m + k] += ridge);
+        let weights = simplex::least(&h, &vec![0.0; m]);
+        Ok(weights[..m].iter().map(|w| *w as f32).collect())
+    }
+
+    /// PSNR of the blend with these weights over the counted pixels of all views together, dB.
+    ///
+    /// Before 8-bit rounding, and one mean over all pixels, where `metrics` takes one for each view.
+    /// `None` without pixels or without any error.
+    pub fn psnr(&self, weights: &[f32]) -> Result<Option<f64>, EnsembleError> {
+        let weights = normalised(weights, self.members)?;
+        Ok(decibels(self.error(&weights), self.pixels))
+    }
+
+    /// wᵀDw.
+    pub(super) fn error(&self, weights: &[f32]) -> f64 {
+        let m = self.members;
+        let row = |k: usize| -> f64 { (0..m).map(|l| self.products[k * m + l] * weights[l] as f64).sum() };
+        (0..m).map(|k| weights[k] as f64 * row(k)).sum()
+    }
+
+    /// Mean over pairs of members of `Σ ρ |c_k − c_l|²`: how much there is to choose.
+    pub(super) fn disagreement(&self) -> f64 {
+        let m = self.members;
+        let d = |k: usize, l: usize| self.products[k * m + l];
+        let pairs = (0..m).flat_map(|k| (0..k).map(move |l| (k, l)));
+        let sum: f64 = pairs.map(|(k, l)| (d(k, k) + d(l, l) - 2.0 * d(k, l)).max(0.0)).sum();
+        sum / (m * (m - 1) / 2).max(1) as f64
+    }
+
+    pub(super) fn members(&self) -> usize {
+        self.members
+    }
+
+    pub(super) fn same_members(&self, found: usize) -> Result<(), EnsembleError> {
+        let expected = self.members;
+        if found == expected { Ok(()) } else { Err(EnsembleError::Members { found, expected }) }
+    }
+
+    #[inline]
+    pub(super) fn count(&mut self, weight: f64, errors: &[[f64; 3]]) {
+        for (k, a) in errors.iter().enumerate() {
+            for (l, b) in errors.iter().enumerate() {
+                self.products[k * self.members + l] += weight * dot(a, b);
+            }
+        }
+        self.pixels += weight;
+    }
+
+    pub(super) fn sum(&mut self, other: &Fit) {
+        self.products.iter_mut().zip(&other.products).for_each(|(a, b)| *a += b);
+        self.pixels += other.pixels;
+    }
+}
+
+#[inline]
+pub(super) fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// `−10 log10(error / (3 · pixels))`, if it is a number.
+pub(super) fn decibels(error: f64, pixels: f64) -> Option<f64> {
+    let value = -10.0 * (error / (3.0 * pixels)).log10();
+    value.is_finite().then_some(value)
+}

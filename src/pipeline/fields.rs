@@ -1,0 +1,166 @@
+//! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
+
+use super::{Fields, Line, PipelineError, Radiance, Surface, bitmask, capture_failure, to_value};
+use crate::capture::scene::Scene;
+use crate::capture::{Split, View};
+use crate::config::MaskUse;
+use crate::field::pixels::TrainView;
+use crate::iface::{self, IFace, IfaceError};
+use crate::io::Limits;
+use crate::run::{Done, Exit, Failure};
+use crate::tface::{self, TFace, TfaceError};
+use rayon::prelude::*;
+use serde_json::json;
+use std::cell::OnceCell;
+use std::path::Path;
+
+impl Line<'_> {
+    /// Stage `iface`: learns the field; goes on from its last checkpoint.
+    pub fn iface(&self) -> Result<Done, PipelineError> {
+        let plan = self.plan("iface");
+        let identity = plan.fingerprint.digest();
+        Ok(self.run.stage(plan, |stage| {
+            let scene = self.scene_or_fail()?;
+            let views = self.train_views(&scene, true)?;
+            let (config, device) = (&self.config.iface, self.config.device.as_str());
+            let hull = bitmask(&scene);
+            let (folder, monitor) = (stage.folder(), stage.monitor());
+            let seed = self.config.seed;
+            let trained =
+                iface::train(&views, hull.as_ref(), config, seed, device, folder, &identity, monitor);
+            let (_, report) = trained.map_err(|e| self.iface_failure(e))?;
+            report.warnings.iter().for_each(|w| stage.warn(w));
+            Ok(to_value(&report))
+        })?)
+    }
+
+    /// Stages `baseline` and `tface`: the same learning, with the table of that name.
+    pub fn radiance(&self, name: &'static str) -> Result<Done, PipelineError> {
+        let plan = self.plan(name);
+        let identity = plan.fingerprint.digest();
+        Ok(self.run.stage(plan, |stage| {
+            let scene = self.scene_or_fail()?;
+            let config = self.vm(name);
+            if !config.import.is_empty() {
+                let (file, place) = (Path::new(&config.import), &scene.scene_from_world);
+                tface::import_th(file, config.import_scale, place, stage.folder(), &identity)
+                    .map_err(|e| self.tface_failure(name, e))?;
+                return Ok(json!({"imported": config.import}));
+            }
+            // without masks nothing may know where the head is: neither its outline nor what that carves
+            let masked = config.masks != MaskUse::None;
+            let views = self.train_views(&scene, masked)?;
+            let hull = bitmask(&scene).filter(|_| masked);
+            let (seed, device) = (self.config.seed, self.config.device.as_str());
+            let (folder, monitor) = (stage.folder(), stage.monitor());
+            let trained = tface::train(
+                name,
+                &views,
+                scene.aabb,
+                hull.as_ref(),
+                config,
+                seed,
+                device,
+                folder,
+                &identity,
+                monitor,
+            );
+            let (_, report) = trained.map_err(|e| self.tface_failure(name, e))?;
+            report.warnings.iter().for_each(|w| stage.warn(w));
+            Ok(to_value(&report))
+        })?)
+    }
+
+    /// The field of the stage `baseline` or `tface` as the bytes of a published checkpoint (`.th`), in the
+    /// dataset's world times the stage's `import_scale`.
+    pub fn export_th(&self, name: &'static str) -> Result<Vec<u8>, Failure> {
+        let scene = self.scene_or_fail()?;
+        tface::export_th(&self.run.path(name), self.vm(name).import_scale, &scene.scene_from_world)
+            .map_err(|e| self.tface_failure(name, e))
+    }
+
+    /// The photographs that are learned from, in the scene.
+    fn train_views(&self, scene: &Scene, masked: bool) -> Result<Vec<TrainView>, Failure> {
+        let limits = Limits::default();
+        let train: Vec<&View> = self.capture.split(Split::Train).collect();
+        let view = |view: &&View| {
+            let loaded = view.load(&limits).map_err(capture_failure)?;
+            Ok(TrainView {
+                camera: view.camera.transformed(&scene.scene_from_world),
+                photo: loaded.photo,
+                mask: loaded.mask.filter(|_| masked),
+                valid: loaded.valid,
+            })
+        };
+        train.par_iter().map(view).collect()
+    }
+
+    fn iface_failure(&self, e: IfaceError) -> Failure {
+        match e {
+            IfaceError::Stopped { .. } => Failure::stopped(self.run.stop()),
+            IfaceError::Device(_) => device_failure(e),
+            e => {
+                let hint = e.hint().unwrap_or_default();
+                Failure::cannot(e, hint)
+            }
+        }
+    }
+
+    fn tface_failure(&self, stage: &str, e: TfaceError) -> Failure {
+        match e {
+            TfaceError::Stopped { .. } => Failure::stopped(self.run.stop()),
+            TfaceError::Device(_) => device_failure(e),
+            e => {
+                let hint = e.hint(stage).unwrap_or_default();
+                let exit = if matches!(e, TfaceError::Settings { .. }) { Exit::Usage } else { Exit::Cannot };
+                Failure { exit, ..Failure::cannot(e, hint) }
+            }
+        }
+    }
+}
+
+fn device_failure(e: impl std::error::Error + Send + Sync + 'static) -> Failure {
+    Failure { exit: Exit::Usage, ..Failure::cannot(e, "choose another with `--device`") }
+}
+
+/// The fields as they lie in the run.
+pub struct Trained<'l> {
+    line: &'l Line<'l>,
+    iface: OnceCell<IFace>,
+    tface: OnceCell<TFace>,
+    baseline: OnceCell<TFace>,
+}
+
+impl<'l> Trained<'l> {
+    /// Of a line; nothing is loaded yet.
+    pub fn new(line: &'l Line<'l>) -> Trained<'l> {
+        Trained { line, iface: OnceCell::new(), tface: OnceCell::new(), baseline: OnceCell::new() }
+    }
+}
+
+impl Fields for Trained<'_> {
+    fn surface(&self) -> Result<&dyn Surface, Failure> {
+        let line = self.line;
+        let load = || {
+            let scene = line.scene_or_fail()?;
+            let hull = bitmask(&scene);
+            IFace::load(&line.run.path("iface"), &line.config.iface, hull.as_ref())
+                .map_err(|e| line.iface_failure(e))
+        };
+        once(&self.iface, load).map(|f| f as &dyn Surface)
+    }
+
+    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
+        let line = self.line;
+        let load = || TFace::load(&line.run.path(stage)).map_err(|e| line.tface_failure(stage, e));
+        let cell = if stage == "baseline" { &self.baseline } else { &self.tface };
+        once(cell, load).map(|f| f as &dyn Radiance)
+    }
+}
+
+fn once<T>(cell: &OnceCell<T>, load: impl FnOnce() -> Result<T, Failure>) -> Result<&T, Failure> {
+    if cell.get().is_none() {
+        let _ = cell.set(load()?);
+    }
+    cell.get().ok_or_else(|| Failure::cannot("no field", ""))
+}

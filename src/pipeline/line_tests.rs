@@ -1,0 +1,275 @@
+//! The line on the demo head.
+
+use super::*;
+use crate::capture::synthetic::{SyntheticOptions, write_capture};
+use crate::config::{Background, MeshFormat, Method, Preset};
+use crate::run::{Quiet, Stop};
+use std::sync::Arc;
+
+/// The demo head's formula in the place of all learned fields.
+struct Formula(Exact);
+
+impl Fields for Formula {
+    fn surface(&self) -> Result<&dyn Surface, Failure> {
+        Ok(&self.0)
+    }
+
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+        panic!("no radiance field is asked for")
+    }
+}
+
+/// Fields that nobody may ask for.
+struct Never;
+
+impl Fields for Never {
+    fn surface(&self) -> Result<&dyn Surface, Failure> {
+        panic!("loaded for nothing")
+    }
+
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+        panic!("loaded for nothing")
+    }
+}
+
+fn capture(root: &Path, train: usize, test: usize) {
+    let options = SyntheticOptions { width: 32, height: 40, train, test, seed: 1 };
+    write_capture(root, &options).unwrap();
+}
+
+fn draft(root: &Path) -> Config {
+    let mut config = Config::preset(Preset::Draft);
+    config.capture.path = root.to_str().unwrap().into();
+    config
+}
+
+fn quiet(dir: &Path) -> Run {
+    Run::open(&dir.join("run"), Stop::new(), Arc::new(Quiet))
+}
+
+/// The line with its own formula in the place of a learned field: whatever is wrong then is not the
+/// learning.
+#[test]
+fn the_line_after_learning_keeps_the_exact_head_exact() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 96, height: 120, train: 12, test: 2, seed: 1 };
+    let root = dir.path().join("head");
+    write_capture(&root, &options).unwrap();
+    let mut config = draft(&root);
+    config.mesh.resolution = 128;
+    config.mesh.format = vec![MeshFormat::Glb];
+    config.metrics.surface_points = 4000;
+    config.render.background = Background::None;
+    config.render.method = vec![Method::Raycast, Method::Volume];
+    config.ensemble.members = vec![Method::Raycast];
+    config.ensemble.weights = vec![1.0];
+    let run = quiet(dir.path());
+    let line = Line::open(&config, &run, true).unwrap();
+    line.remember("metrics").unwrap();
+    assert_eq!(line.mask().unwrap().summary["masks"], 14);
+    let scene = line.scene().unwrap();
+    let exact = Formula(Exact { world_from_scene: scene.scene_from_world.inverse() });
+    let mesh = line.mesh(&exact).unwrap();
+    assert_eq!(mesh.summary["closed"], true);
+    line.render(&exact).unwrap();
+    line.ensemble().unwrap();
+    let metrics = line.metrics().unwrap();
+
+    // a cell is 0.35 m / 128 = 2.7 mm = 1.1 % of the head; vertices lie on the surface, and the
+    // chords between them err by a small part of a cell
+    let truth = &metrics.summary["truth_percent_of_head"];
+    assert!(truth["accuracy_mean"].as_f64().unwrap() < 0.15, "{truth}");
+    assert!(truth["completeness_mean"].as_f64().unwrap() < 0.25, "{truth}");
+    // silhouettes agree with the masks: a flat brown head over black is no photograph, but its
+    // outline is in the right place, and next to nothing of it is outside
+    let file = run.path("render/raycast/012.png");
+    let render = pictures::read(&file, config.render.format).unwrap();
+    let view = line.capture().views.iter().find(|v| v.name == "012").unwrap();
+    let mask = view.load_mask(&Limits::default()).unwrap().unwrap();
+    let off = |(p, m): (&[f32; 4], &u8)| (p[3] - *m as f32 / 255.0).abs() as f64;
+    let mean = render.data.as_chunks::<4>().0.iter().zip(&mask.values).map(off).sum::<f64>()
+        / mask.values.len() as f64;
+    assert!(mean < 0.01, "{mean}");
+    let outside = metrics.summary["raycast"]["mean_square_opacity_outside"].as_f64().unwrap();
+    assert!(outside < 0.005, "{outside}");
+    // a blend of one member is that member, to the byte
+    let bytes = |file: &str| io::read_bytes(&run.path(file), &Limits::default()).unwrap();
+    assert_eq!(bytes("ensemble/012.png"), bytes("render/raycast/012.png"));
+    assert_eq!(metrics.summary["ensemble"]["head"], metrics.summary["raycast"]["head"]);
+
+    // all of it again: nothing is loaded, nothing is done
+    for done in [line.mask(), line.mesh(&Never), line.render(&Never), line.ensemble(), line.metrics()] {
+        assert!(done.unwrap().skipped);
+    }
+    line.report(&[("metrics", metrics)]).unwrap();
+    let page = String::from_utf8(bytes("report.html")).unwrap();
+    assert!(page.contains("<figcaption>ensemble</figcaption>") && run.path("cameras.json").is_file());
+    assert!(bytes("mesh/head.glb").starts_with(b"glTF"));
+}
+
+/// A radiance field that is one colour, and counts the views it was asked for.
+struct Fog(std::sync::atomic::AtomicUsize, Option<Stop>);
+
+impl Radiance for Fog {
+    fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<Seen> {
+        let views = self.0.fetch_add(1, std::sync::atomic::Ordering::SeqCst) + 1;
+        if let Some(stop) = self.1.as_ref().filter(|_| views == 2) {
+            stop.request(Exit::Interrupted);
+        }
+        vec![Seen { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..Seen::default() }; rays.len()]
+    }
+}
+
+impl Fields for Fog {
+    fn surface(&self) -> Result<&dyn Surface, Failure> {
+        panic!("no surface is asked for")
+    }
+
+    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
+        assert_eq!(stage, "tface");
+        Ok(self)
+    }
+}
+
+#[test]
+fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
+    let dir = tempfile::tempdir().unwrap();
+    capture(dir.path(), 4, 3);
+    let mut config = draft(dir.path());
+    config.render.method = vec![Method::Tface];
+    config.render.background = Background::White;
+    let run = quiet(dir.path());
+    Line::open(&config, &run, false).unwrap().mask().unwrap();
+    let interrupted = Fog(0.into(), Some(run.stop().clone()));
+    let e = Line::open(&config, &run, false).unwrap().render(&interrupted).unwrap_err();
+    assert_eq!(e.exit(), Exit::Interrupted);
+    let made = |run: &Run| io::list_files(&run.path("render/tface")).map_or(0, |f| f.len());
+    assert_eq!(made(&run), 1);
+    let run = quiet(dir.path());
+    let rest = Fog(0.into(), None);
+    let line = Line::open(&config, &run, false).unwrap();
+    assert_eq!(line.render(&rest).unwrap().summary["cameras"], 3);
+    assert_eq!((made(&run), rest.0.into_inner()), (3, 2));
+    // half a grey of 0.5 over white is 0.25 + 0.5; in float it is as it was
+    let name = line.capture().split(Split::Test).next().unwrap().name.clone();
+    let shown = pictures::read(&run.path(format!("render/tface/{name}.png")), config.render.format).unwrap();
+    assert_eq!(shown.pixel(3, 3), [191.0 / 255.0, 191.0 / 255.0, 191.0 / 255.0, 1.0]);
+    let float = pictures::read_float(&run.path(format!("render/tface/float/{name}.exr"))).unwrap();
+    assert_eq!(float.pixel(3, 3), [0.25, 0.25, 0.25, 0.5]);
+}
+
+#[test]
+fn a_command_runs_what_its_stage_needs_and_nothing_else() {
+    let dir = tempfile::tempdir().unwrap();
+    capture(dir.path(), 3, 1);
+    let run = quiet(dir.path());
+    let order = |until: &str, methods: &[Method]| {
+        let mut config = draft(dir.path());
+        if !methods.is_empty() {
+            config.render.method = methods.to_vec();
+        }
+        Line::open(&config, &run, false).unwrap().order(until).join(" ")
+    };
+    assert_eq!(order("baseline", &[]), "mask baseline");
+    assert_eq!(order("tface", &[]), "mask tface");
+    assert_eq!(order("iface", &[]), "mask iface");
+    assert_eq!(order("mesh", &[]), "mask iface mesh");
+    assert_eq!(order("render", &[Method::Tface]), "mask tface render");
+    assert_eq!(order("render", &[Method::Baseline]), "mask baseline render");
+    assert_eq!(order("render", &[Method::Volume]), "mask iface render");
+    assert_eq!(order("render", &[Method::Raycast]), "mask iface mesh render");
+    assert_eq!(order("ensemble", &[Method::Tface]), "mask tface render ensemble");
+    assert_eq!(order("metrics", &[]), STAGES.join(" "));
+    // and only those that build on it are out of date with it
+    let config = draft(dir.path());
+    let line = Line::open(&config, &run, false).unwrap();
+    assert_eq!(line.followers("tface").join(" "), "tface render ensemble metrics");
+    assert_eq!(line.followers("iface").join(" "), "iface mesh render ensemble metrics");
+    assert_eq!(line.followers("mask").join(" "), STAGES.join(" "));
+}
+
+#[test]
+fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
+    let dir = tempfile::tempdir().unwrap();
+    capture(dir.path(), 8, 1);
+    std::fs::write(dir.path().join("a.th"), b"weights").unwrap();
+    let run = quiet(dir.path());
+    let digests = |change: &dyn Fn(&mut Config)| -> Vec<String> {
+        let mut config = draft(dir.path());
+        change(&mut config);
+        let line = Line::open(&config, &run, false).unwrap();
+        STAGES.iter().map(|s| line.plan(s).fingerprint.digest()).collect()
+    };
+    let base = digests(&|_| {});
+    let changed = |change: &dyn Fn(&mut Config)| -> String {
+        let now = digests(change);
+        let names = STAGES.iter().zip(base.iter().zip(&now)).filter(|(_, (a, b))| a != b);
+        names.map(|(s, _)| *s).collect::<Vec<_>>().join(" ")
+    };
+    let all = STAGES.join(" ");
+    assert_eq!(changed(&|c| c.mesh.resolution = 100), "mesh render ensemble metrics");
+    assert_eq!(changed(&|c| c.tface.steps += 1), "tface render ensemble metrics");
+    assert_eq!(changed(&|c| c.baseline.masks = c.tface.masks), "baseline render ensemble metrics");
+    assert_eq!(changed(&|c| c.tface.checkpoint_s = 7.0), "");
+    assert_eq!(changed(&|c| c.ensemble.weights = vec![0.2, 0.5, 0.3]), "ensemble metrics");
+    assert_eq!(changed(&|c| c.seed = 7), all.replace("mask ", ""));
+    assert_eq!(changed(&|c| c.capture.downscale = 2), all);
+    assert_eq!(changed(&|c| c.capture.fit_views = 4), all);
+    assert_eq!(changed(&|c| c.device = "cpu".into()), "");
+    // a fit needs its own views rendered
+    assert_eq!(changed(&|c| c.ensemble.fit = crate::config::Fit::Global), "render ensemble metrics");
+    // what is imported counts, not where it lies
+    let import = |name: &str| {
+        let path = dir.path().join(name).to_str().unwrap().to_string();
+        digests(&|c| c.tface.import = path.clone())
+    };
+    let first = import("a.th");
+    assert_ne!(first[2], base[2]);
+    std::fs::copy(dir.path().join("a.th"), dir.path().join("b.th")).unwrap();
+    assert_eq!(import("b.th"), first);
+    std::fs::write(dir.path().join("a.th"), b"other").unwrap();
+    assert_ne!(import("a.th"), first);
+}
+
+#[test]
+fn what_is_not_rendered_does_not_shape_the_views() {
+    let dir = tempfile::tempdir().unwrap();
+    capture(dir.path(), 3, 1);
+    let run = quiet(dir.path());
+    let render = |change: &dyn Fn(&mut Config)| {
+        let mut config = draft(dir.path());
+        config.render.method = vec![Method::Tface];
+        change(&mut config);
+        Line::open(&config, &run, false).unwrap().plan("render").fingerprint
+    };
+    let base = render(&|_| {});
+    assert_eq!(base.inputs.keys().map(String::as_str).collect::<Vec<_>>(), ["mask", "tface"]);
+    assert_eq!(render(&|c| c.mesh.resolution = 100), base);
+    assert_eq!(render(&|c| c.baseline.steps = 9), base);
+    assert_ne!(render(&|c| c.tface.steps = 9), base);
+}
+
+#[test]
+fn views_set_aside_for_a_fit_are_training_views_and_never_test_views() {
+    let dir = tempfile::tempdir().unwrap();
+    capture(dir.path(), 9, 3);
+    let run = quiet(dir.path());
+    let splits = |every: usize| {
+        let mut config = draft(dir.path());
+        config.capture.fit_views = every;
+        let line = Line::open(&config, &run, false)?;
+        let names = |split| line.capture().split(split).map(|v| v.name.clone()).collect::<Vec<_>>();
+        Ok::<_, PipelineError>([Split::Train, Split::Val, Split::Test].map(names))
+    };
+    let [train, none, test] = splits(0).unwrap();
+    assert!(none.is_empty() && train.len() == 9 && test.len() == 3);
+    let [rest, aside, still] = splits(4).unwrap();
+    // of nine the third and the seventh
+    assert_eq!((aside.as_slice(), rest.len()), (&[train[2].clone(), train[6].clone()][..], 7));
+    assert_eq!(still, test);
+    for every in [1, 30] {
+        let e = splits(every).unwrap_err();
+        assert!(e.to_string().starts_with(&format!("`capture.fit_views` is {every}, which")), "{e}");
+        assert_eq!(e.exit().code(), 2);
+    }
+}

@@ -1,0 +1,143 @@
+//! Views by marching rays through a field, a band of rows at a time: a photograph of twelve megapixels
+//! has room for its picture, not for a ray and what it saw in every pixel.
+
+use crate::geom::{Camera, Ray, Similarity};
+use crate::image::Image;
+use crate::render::RenderedView;
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+
+/// Rays marched together: some megabytes, and enough for any number of threads.
+const BAND: usize = 1 << 16;
+
+/// What one ray saw; colour is premultiplied by opacity (over black).
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Seen {
+    /// sRGB-coded colour, premultiplied.
+    pub color: [f32; 3],
+    /// 0..=1.
+    pub opacity: f32,
+    /// Expected distance along the ray, scene units.
+    pub depth: f32,
+    /// Expected normal in the scene, unit length or zero.
+    pub normal: Vec3,
+}
+
+/// The view of a camera in scene coordinates; depth and normals in the world.
+///
+/// Depth and normal are kept where the opacity is at least a half. Where the lens model folds over, no
+/// ray is: the pixel stays empty. `see`: `[n]` rays → `[n]`, some tens of thousands at a time; where it
+/// answers nothing, those pixels stay empty too.
+pub(super) fn march(
+    camera: &Camera,
+    world_from_scene: &Similarity,
+    with_normals: bool,
+    see: impl Fn(&[Ray]) -> Vec<Seen>,
+) -> RenderedView {
+    let (w, h) = (camera.width, camera.height);
+    let sized = |wanted: bool| if wanted { (w, h) } else { (0, 0) };
+    let (nw, nh) = sized(with_normals);
+    let mut view = RenderedView {
+        color: Image::new(w, h, 4),
+        depth: Image::new(w, h, 1),
+        normal: Image::new(nw, nh, 3),
+    };
+    let width = w as usize;
+    let rows = (BAND / width.max(1)).max(1);
+    for top in (0..h as usize).step_by(rows) {
+        let pixels = top * width..(top + rows).min(h as usize) * width;
+        let made: Vec<(usize, Ray)> = pixels
+            .into_par_iter()
+            .filter_map(|i| {
+                let ray = camera.ray(Vec2::new((i % width) as f32 + 0.5, (i / width) as f32 + 0.5))?;
+                Some((i, Ray { t_min: 0.0, t_max: f32::INFINITY, ..ray }))
+            })
+            .collect();
+        let (at, rays): (Vec<usize>, Vec<Ray>) = made.into_iter().unzip();
+        for ((i, ray), seen) in at.iter().zip(&rays).zip(see(&rays)) {
+            let [r, g, b] = seen.color;
+            view.color.data[4 * i..4 * i + 4].copy_from_slice(&[r, g, b, seen.opacity]);
+            if seen.opacity >= 0.5 {
+                let along = seen.depth * ray.direction.dot(camera.forward());
+                view.depth.data[*i] = along * world_from_scene.scale as f32;
+                if with_normals {
+                    let normal = world_from_scene.direction(seen.normal);
+                    view.normal.data[3 * i..3 * i + 3].copy_from_slice(&normal.to_array());
+                }
+            }
+        }
+    }
+    view
+}
+
+/// The points of the scene that a view's pixels show, from its depth in the world; not a number where
+/// it has none. 3 channels.
+pub(super) fn points(camera: &Camera, depth: &Image, world_from_scene: &Similarity) -> Image {
+    let (w, h) = (camera.width, camera.height);
+    let mut points = Image::new(w, h, 3);
+    let scale = world_from_scene.scale as f32;
+    let forward = camera.forward();
+    points.data.as_chunks_mut::<3>().0.par_iter_mut().zip(&depth.data).enumerate().for_each(|(i, (p, z))| {
+        let pixel = Vec2::new((i as u32 % w) as f32 + 0.5, (i as u32 / w) as f32 + 0.5);
+        let found = camera.ray(pixel).filter(|_| *z > 0.0);
+        let point = |ray: Ray| ray.origin + ray.direction * (z / scale / ray.direction.dot(forward));
+        *p = found.map_or([f32::NAN; 3], |ray| point(ray).to_array());
+    });
+    points
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::Distortion;
+    use glam::{DMat3, DVec3};
+    use std::cell::Cell;
+
+    /// Looks along −Z from (0, 0, 3).
+    fn camera(width: u32, height: u32) -> Camera {
+        Camera {
+            width,
+            height,
+            fx: width as f64,
+            fy: width as f64,
+            cx: width as f64 / 2.0,
+            cy: height as f64 / 2.0,
+            distortion: Distortion::default(),
+            rotation: DMat3::IDENTITY,
+            position: DVec3::new(0.0, 0.0, 3.0),
+        }
+    }
+
+    #[test]
+    fn a_large_view_is_marched_in_bands_and_every_pixel_is_its_own() {
+        let largest = Cell::new(0);
+        // the plane z = 0, all opaque on the left, a quarter on the right
+        let see = |rays: &[Ray]| -> Vec<Seen> {
+            largest.set(largest.get().max(rays.len()));
+            let one = |ray: &Ray| Seen {
+                color: [0.5, 0.25, 0.0],
+                opacity: if ray.direction.x < 0.0 { 1.0 } else { 0.25 },
+                depth: -ray.origin.z / ray.direction.z,
+                normal: Vec3::Z,
+            };
+            rays.iter().map(one).collect()
+        };
+        let world_from_scene = Similarity { scale: 2.0, ..Similarity::IDENTITY };
+        let camera = camera(1000, 200);
+        let view = march(&camera, &world_from_scene, false, see);
+        assert!(largest.get() <= BAND && largest.get() > BAND / 2, "{}", largest.get());
+        assert_eq!((view.normal.width, view.normal.data.len()), (0, 0));
+        assert_eq!(view.color.pixel(10, 199), [0.5, 0.25, 0.0, 1.0]);
+        assert_eq!(view.color.pixel(990, 0)[3], 0.25);
+        // 3 scene units before the camera, 6 of the world; none where three quarters shine through
+        assert!((view.depth.pixel(10, 199)[0] - 6.0).abs() < 1e-5);
+        assert_eq!(view.depth.pixel(990, 0), [0.0]);
+        // pixel 0 lies half a picture left, less half a pixel: x = −3 · 499.5 / 1000
+        let points = points(&camera, &view.depth, &world_from_scene);
+        let p = Vec3::from_slice(points.pixel(0, 0));
+        assert!(p.distance(Vec3::new(-1.4985, 0.2985, 0.0)) < 1e-4, "{p}");
+        assert!(points.pixel(990, 0)[0].is_nan());
+        let upright = march(&camera, &world_from_scene, true, see);
+        assert_eq!(upright.normal.pixel(10, 5), [0.0, 0.0, 1.0]);
+    }
+}

@@ -1,0 +1,71 @@
+//! `report.html`, from what lies in the run.
+
+use super::{Line, PipelineError};
+use crate::config::PictureFormat;
+use crate::io::{self, Limits};
+use crate::report::{self, Picture, Report, Row};
+use crate::run::Done;
+
+/// The stages that learn, and what of their `log.jsonl` is drawn.
+const LEARNED: [(&str, &[&str]); 3] = [
+    ("baseline", &["psnr", "samples"]),
+    ("tface", &["psnr", "mask", "outside", "samples"]),
+    ("iface", &["psnr", "eikonal", "inv_s"]),
+];
+
+/// A page with more bytes of pictures than this is no pleasure in a browser; further views are only
+/// counted.
+const MOST: usize = 48 << 20;
+
+impl Line<'_> {
+    /// Writes `report.html`.
+    pub fn report(&self, done: &[(&'static str, Done)]) -> Result<(), PipelineError> {
+        let limits = Limits::default();
+        let sets = match self.config.render.format {
+            PictureFormat::Png => self.sets(),
+            PictureFormat::Exr => Vec::new(), // browsers show none
+        };
+        let shown: Vec<_> = sets.iter().map(|set| (set.name.clone(), self.comparable(set))).collect();
+        let (mut rows, mut bytes, mut left_out) = (Vec::new(), 0, 0);
+        for view in &self.capture.views {
+            let mut files = Vec::new();
+            for (name, set) in &shown {
+                let file = set.iter().find(|s| s.view.name == view.name).map(|s| s.file.as_path());
+                files.extend(file.map(|file| (name.as_str(), file)));
+            }
+            if files.is_empty() {
+                continue;
+            }
+            if bytes > MOST {
+                left_out += 1;
+                continue;
+            }
+            let mut pictures = Vec::new();
+            for (caption, file) in [("photograph", view.photo.as_path())].into_iter().chain(files) {
+                let picture = io::read_bytes(file, &limits)?;
+                bytes += picture.len();
+                pictures.push(Picture { caption: caption.into(), bytes: picture });
+            }
+            rows.push(Row { name: view.name.clone(), pictures });
+        }
+        let mut curves = Vec::new();
+        for (stage, names) in LEARNED {
+            let log = self.run.path(stage).join("log.jsonl");
+            if io::is_file(&log) {
+                let text = io::read_bytes(&log, &limits)?;
+                let found = report::curves(&String::from_utf8_lossy(&text), names).into_iter();
+                curves.extend(found.map(|c| report::Curve { name: format!("{stage} {}", c.name), ..c }));
+            }
+        }
+        let summaries: Vec<_> = done.iter().map(|(name, d)| (name.to_string(), d.summary.clone())).collect();
+        let html = report::html(&Report {
+            title: self.capture.name.clone(),
+            summaries,
+            curves,
+            rows,
+            left_out,
+            settings: self.config.to_toml(),
+        });
+        Ok(self.run.write("report.html", html.as_bytes())?)
+    }
+}

@@ -1,0 +1,152 @@
+//! What each stage builds on, and so what shapes it: known before anything runs.
+
+use super::{FORMAT, Line, PipelineError, STAGES};
+use crate::capture::View;
+use crate::config::{Method, VmConfig};
+use crate::run::{Fingerprint, Plan, read_record};
+
+impl Line<'_> {
+    /// The stages that a stage reads from. What views are made of decides what `render` needs.
+    pub fn needs(&self, stage: &str) -> Vec<&'static str> {
+        match stage {
+            "mask" => Vec::new(),
+            "baseline" | "tface" | "iface" => vec!["mask"],
+            "mesh" => vec!["iface"],
+            "render" => {
+                let methods = &self.config.render.method;
+                let shown = |stage: &str| methods.iter().any(|m: &Method| m.stage() == stage);
+                let mut needs = vec!["mask"];
+                needs.extend(["baseline", "tface", "iface", "mesh"].into_iter().filter(|s| shown(s)));
+                needs
+            }
+            "ensemble" => vec!["render"],
+            _ if self.config.ensemble.members.is_empty() => vec!["render"],
+            _ => vec!["render", "ensemble"],
+        }
+    }
+
+    /// The stages up to `until` that it needs, itself the last, in the order of the line.
+    pub fn order(&self, until: &str) -> Vec<&'static str> {
+        let mut wanted = vec![known(until)];
+        let mut next = 0;
+        while next < wanted.len() {
+            let more: Vec<_> = self.needs(wanted[next]).into_iter().filter(|s| !wanted.contains(s)).collect();
+            wanted.extend(more);
+            next += 1;
+        }
+        STAGES.iter().copied().filter(|s| wanted.contains(s)).collect()
+    }
+
+    /// A stage and all that build on it, in the order of the line: what is out of date when it is
+    /// recomputed.
+    pub fn followers(&self, stage: &str) -> Vec<&'static str> {
+        STAGES.iter().copied().filter(|s| self.order(s).contains(&stage)).collect()
+    }
+
+    /// What would be done for `until`: each stage with `None` if it has to be worked on, else what
+    /// differs from the result that lies there (nothing, if it is done). An error if what is to be blended
+    /// will not be there. Nothing is written.
+    pub fn outlook(&self, until: &str) -> Result<Vec<(&'static str, Option<Vec<String>>)>, PipelineError> {
+        let look = |name: &'static str| {
+            let record = read_record(&self.run.path(name))?;
+            let now = self.plan(name).fingerprint;
+            Ok((name, record.map(|r| now.differences(&r.fingerprint))))
+        };
+        let order = self.order(until);
+        if order.contains(&"ensemble") {
+            self.can_blend()?;
+        }
+        order.into_iter().map(look).collect()
+    }
+
+    /// Writes the complete configuration into the run: what repeats it. Refused, before anything is
+    /// changed, if a stage that `until` needs was made or begun with other settings, or if what is to
+    /// be blended will not be there.
+    pub fn remember(&self, until: &str) -> Result<(), PipelineError> {
+        let order = self.order(until);
+        if order.contains(&"ensemble") {
+            self.can_blend()?;
+        }
+        for name in order {
+            self.run.agrees(&self.plan(name))?;
+        }
+        Ok(self.run.write("config.toml", self.config.to_toml().as_bytes())?)
+    }
+
+    /// What a stage is about to do; its fingerprint holds those of the stages it needs.
+    pub fn plan(&self, name: &'static str) -> Plan<'_> {
+        let mut settings = self.config.values(name);
+        let mut needs_bytes = 16 << 20;
+        let needs = self.needs(name).into_iter();
+        let mut inputs: Vec<_> = needs.map(|s| (s, self.plan(s).fingerprint.digest())).collect();
+        match name {
+            "mask" => {
+                settings.extend(self.config.values("capture"));
+                settings.remove("capture.path"); // where it lies does not matter, what it holds does
+                inputs.push(("capture", self.digest.clone()));
+            }
+            "iface" => {
+                settings.remove("iface.checkpoint_s"); // how often is no matter of what
+                settings.insert("seed".into(), self.config.seed.to_string());
+                // weights and two moments, for two checkpoints and one being written
+                let c = &self.config.iface;
+                needs_bytes += (c.levels as u64) << c.log2_table.min(40) << 3 << 3;
+            }
+            "baseline" | "tface" => {
+                settings.remove(&format!("{name}.checkpoint_s"));
+                settings.insert("seed".into(), self.config.seed.to_string());
+                if let Some((_, digest)) = self.imports.iter().find(|(stage, _)| *stage == name) {
+                    settings.remove(&format!("{name}.import"));
+                    inputs.push(("import", digest.clone()));
+                }
+                needs_bytes += vm_bytes(self.vm(name));
+            }
+            "mesh" => {
+                settings.insert("capture.unit_m".into(), self.config.capture.unit_m.to_string());
+                // a few triangles per cell of a closed surface, three formats
+                needs_bytes += (self.config.mesh.resolution as u64).pow(2) * 12 * 100;
+            }
+            "render" => {
+                if !self.path_digest.is_empty() {
+                    inputs.push(("cameras", self.path_digest.clone()));
+                }
+                if self.config.ensemble.fits() {
+                    settings.insert("views of ensemble.fit and ensemble.correct".into(), "true".into());
+                }
+                let each = if self.config.render.float { 12 + 10 } else { 12 };
+                let methods = self.config.render.method.len().max(1) as u64;
+                needs_bytes += self.pixels() * each * methods / 2;
+            }
+            "ensemble" => needs_bytes += self.pixels() * 4,
+            _ => {}
+        }
+        let mut fingerprint = Fingerprint::new(FORMAT, settings);
+        for (name, digest) in inputs {
+            fingerprint = fingerprint.input(name, digest);
+        }
+        Plan { name, fingerprint, device: &self.config.device, needs_bytes }
+    }
+
+    /// The table of the stage `baseline` or `tface`.
+    pub(super) fn vm(&self, stage: &str) -> &VmConfig {
+        if stage == "baseline" { &self.config.baseline } else { &self.config.tface }
+    }
+
+    /// Of all photographs.
+    fn pixels(&self) -> u64 {
+        let pixels = |v: &View| v.camera.width as u64 * v.camera.height as u64;
+        self.capture.views.iter().map(pixels).sum()
+    }
+}
+
+/// Weights and two moments of the planes, for two checkpoints and one being written.
+fn vm_bytes(c: &VmConfig) -> u64 {
+    let channels: usize = c.density_rank.iter().chain(&c.color_rank).sum();
+    let side = (c.voxels_final as f64).cbrt();
+    (channels as f64 * side * side * 36.0) as u64
+}
+
+/// The word of the line; the last one for any other.
+fn known(stage: &str) -> &'static str {
+    STAGES.iter().copied().find(|s| *s == stage).unwrap_or(STAGES[STAGES.len() - 1])
+}

@@ -1,0 +1,158 @@
+//! Stage `render`: the views, one folder per method.
+//!
+//! ```text
+//! render/tface/NAME.png   as asked for: 8-bit or EXR, over the background
+//!        tface/depth/     16-bit millimetres beside 8-bit views
+//!        tface/float/     the same view for `ensemble`: float, coded, no background
+//! ```
+
+use super::{Fields, Line, PipelineError, march::march, pictures};
+use crate::capture::scene::{self, Scene};
+use crate::capture::{Split, View};
+use crate::config::Method;
+use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
+use crate::io::{self, Limits};
+use crate::render::path::{NamedCamera, PathError, from_json, orbit};
+use crate::render::{RaycastOptions, RenderedView, raycast};
+use crate::run::{Done, Failure, Stop};
+use serde_json::{Map, json};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+impl Line<'_> {
+    /// Stage `render`: one folder per method, one picture per camera. `fields` are only asked if there
+    /// is something to do, and only for those that the methods show.
+    pub fn render(&self, fields: &dyn Fields) -> Result<Done, PipelineError> {
+        Ok(self.run.stage(self.plan("render"), |stage| {
+            let scene = self.scene_or_fail()?;
+            let c = &self.config.render;
+            let mesh = match c.method.contains(&Method::Raycast) {
+                true => Some(self.read_mesh()?.transformed(&scene.scene_from_world)),
+                false => None,
+            };
+            let eye = Eye {
+                fields,
+                mesh: mesh.as_ref().map(|m| (m, Bvh::new(m))),
+                samples: c.samples,
+                world_from_scene: scene.scene_from_world.inverse(),
+                stop: self.run.stop(),
+            };
+            // what a blend is fitted on is kept in float only: it is no picture to be judged
+            let shown = self.cameras(&scene)?.into_iter().map(|c| (c, true));
+            let cameras: Vec<_> = shown.chain(self.fit_cameras().into_iter().map(|c| (c, false))).collect();
+            let background = pictures::behind(c.background);
+            let total = (cameras.len() * c.method.len()) as u64;
+            let mut done = 0;
+            let mut seconds = Map::new();
+            for &method in &c.method {
+                let (mut spent, mut made) = (Duration::ZERO, 0);
+                let folder = stage.folder().join(method.folder());
+                for (NamedCamera { name, camera }, shown) in &cameras {
+                    let float = (c.float || !shown).then(|| folder.join(pictures::FLOAT));
+                    let files = pictures::files(&folder, name, *shown, float.as_deref(), c.format);
+                    // an interrupted process left whole files or none, of the same settings
+                    if !files.iter().all(|file| io::is_file(file)) {
+                        let camera = camera.transformed(&scene.scene_from_world);
+                        let begin = Instant::now();
+                        let view = eye.view(method, &camera)?;
+                        spent += begin.elapsed();
+                        made += 1;
+                        self.stop_here()?; // what it holds then is not whole
+                        if let Some(mut view) = view {
+                            if let Some(float) = &float {
+                                pictures::write_float(float, name, &view)?;
+                            }
+                            if let Some(background) = background {
+                                pictures::over(&mut view, background);
+                            }
+                            if *shown {
+                                pictures::write(&folder, name, &view, c.format, self.config.capture.unit_m)?;
+                            }
+                        }
+                    }
+                    done += 1;
+                    stage.monitor().step(done, total, &[]);
+                    self.stop_here()?;
+                }
+                let per_view = spent.as_secs_f64() / made.max(1) as f64;
+                seconds.insert(method.folder().to_owned(), json!(per_view));
+            }
+            let methods: Vec<_> = c.method.iter().map(|m| m.folder()).collect();
+            let shown = cameras.iter().filter(|(_, shown)| *shown).count();
+            Ok(json!({"cameras": shown, "methods": methods, "seconds_per_view": seconds}))
+        })?)
+    }
+
+    /// The cameras to render: named like photographs where they have one.
+    pub(super) fn cameras(&self, scene: &Scene) -> Result<Vec<NamedCamera>, Failure> {
+        let wrong = |e: PathError| {
+            let hint = e.hint();
+            Failure::cannot(e, hint)
+        };
+        let all: Vec<Camera> = self.capture.views.iter().map(|v| v.camera.clone()).collect();
+        match self.config.render.cameras.as_str() {
+            "test" => {
+                // views that a blend is fitted on cannot stand in for test views
+                let instead = if self.config.ensemble.fits() { Split::Train } else { Split::Val };
+                let mut splits = [Split::Test, instead, Split::Train].map(|s| self.of(s)).into_iter();
+                Ok(splits.find(|cameras| !cameras.is_empty()).unwrap_or_default())
+            }
+            "train" => Ok(self.of(Split::Train)),
+            "orbit" => {
+                let centre = scene::world_box(scene).center();
+                let count = self.config.render.orbit_views as usize;
+                orbit(&all, centre, self.capture.up, count).map_err(wrong)
+            }
+            file => {
+                let path = Path::new(file);
+                let bytes = io::read_bytes(path, &Limits::default())?;
+                let text = String::from_utf8_lossy(&bytes);
+                from_json(&text, &all[0]).map_err(wrong)
+            }
+        }
+    }
+
+    /// The cameras of the views that a blend is fitted on; none where nothing is fitted.
+    fn fit_cameras(&self) -> Vec<NamedCamera> {
+        if self.config.ensemble.fits() { self.of(Split::Val) } else { Vec::new() }
+    }
+
+    fn of(&self, split: Split) -> Vec<NamedCamera> {
+        let named = |v: &View| NamedCamera { name: v.name.clone(), camera: v.camera.clone() };
+        self.capture.split(split).map(named).collect()
+    }
+}
+
+/// What every view is made with.
+struct Eye<'a> {
+    fields: &'a dyn Fields,
+    mesh: Option<(&'a Mesh, Bvh)>,
+    samples: u32,
+    world_from_scene: Similarity,
+    stop: &'a Stop,
+}
+
+impl Eye<'_> {
+    /// The view of a camera in scene coordinates, over nothing.
+    fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>, Failure> {
+        Ok(match (method, &self.mesh) {
+            (Method::Baseline | Method::Tface, _) => {
+                let field = self.fields.radiance(method.stage())?;
+                // a large view takes minutes: nobody who asks to stop waits for the rest of it
+                let see = |rays: &[Ray]| match self.stop.requested() {
+                    Some(_) => Vec::new(),
+                    None => field.see(rays, camera.forward()),
+                };
+                Some(march(camera, &self.world_from_scene, false, see))
+            }
+            (Method::Volume, _) => self.fields.surface()?.volume(camera, &self.world_from_scene),
+            (Method::Raycast, Some((mesh, bvh))) => {
+                let field = self.fields.surface()?;
+                let world_from_scene = self.world_from_scene;
+                let options = RaycastOptions { background: None, samples: self.samples, world_from_scene };
+                Some(raycast(bvh, mesh, camera, &options, |p, n, d| field.color(p, n, d)))
+            }
+            (Method::Raycast, None) => None,
+        })
+    }
+}
