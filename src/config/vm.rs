@@ -190,7 +190,8 @@ impl VmConfig {
     fn draft() -> VmConfig {
         VmConfig {
             steps: 2000,
-            rays: 4096,
+            rays: 2048,
+            hidden: 64,
             voxels_start: 96 * 96 * 96,
             voxels_final: 192 * 192 * 192,
             upsample_steps: vec![300, 500, 800],
@@ -202,7 +203,7 @@ impl VmConfig {
     /// The default: better and slower.
     fn standard() -> VmConfig {
         VmConfig {
-            steps: 10_000,
+            steps: 8000,
             masks: MaskUse::Soft,
             foreground: Foreground::Estimated,
             background: VmBackground::Random,
@@ -212,9 +213,14 @@ impl VmConfig {
             voxels_final: 300 * 300 * 300,
             upsample_steps: vec![500, 900, 1400, 2000, 3000],
             mask_steps: vec![500, 1400, 3000],
-            // scene units are some 1.6 of the published world's
-            distance_scale: 40.0,
-            stop: 1e-4,
+            // planes of the published ranks favour one axis of one stage; a head may face any way
+            density_rank: vec![8, 8, 8],
+            color_rank: vec![24, 24, 24],
+            // the published 25 per unit of its world would be 40 here; denser matter sets a thinner surface,
+            // and fewer samples of a ray need a colour
+            distance_scale: 200.0,
+            weight_threshold: 1e-3,
+            stop: 1e-3,
             ..VmConfig::paper()
         }
     }

@@ -192,7 +192,7 @@ pub fn save_field(dir: &Path, face: &TFace, record: FieldRecord, identity: &str)
 
 /// The field of a stage folder, for rendering; and what it says of itself.
 pub fn load(path: &Path) -> Result<(TFace, FieldRecord), TfaceError> {
-    let mut file = File::open(path)?;
+    let mut file = Opened::read(path)?;
     let record: FieldRecord = serde_json::from_str(&file.meta("field")?)
         .map_err(|e| file.wrong(format!("its `field` cannot be understood: {e}")))?;
     if record.hidden == 0
@@ -293,16 +293,16 @@ pub fn restore(
 }
 
 /// An open checkpoint.
-struct File<'a> {
+struct Opened<'a> {
     path: &'a Path,
     tensors: BTreeMap<String, (Vec<usize>, TensorValues)>,
     metadata: BTreeMap<String, String>,
 }
 
-impl<'a> File<'a> {
-    fn open(path: &'a Path) -> Result<File<'a>, TfaceError> {
+impl<'a> Opened<'a> {
+    fn read(path: &'a Path) -> Result<Opened<'a>, TfaceError> {
         let (tensors, metadata) = read_tensors(path, &Limits::default())?;
-        let file = File { path, tensors: tensors.into_iter().collect(), metadata };
+        let file = Opened { path, tensors: tensors.into_iter().collect(), metadata };
         match file.meta("format")? {
             format if format == FORMAT => Ok(file),
             format => Err(file.wrong(format!("format is `{format}`, this build reads `{FORMAT}`"))),
@@ -381,7 +381,7 @@ impl<'a> File<'a> {
 
 /// Reads one file; sizes and types must be exactly the configured model's.
 fn read(path: &Path, config: &VmConfig, identity: &str, device: &Device) -> Result<State, TfaceError> {
-    let mut file = File::open(path)?;
+    let mut file = Opened::read(path)?;
     if file.meta("identity")? != identity {
         return Err(file.wrong("it was trained with other settings or inputs".into()));
     }

@@ -202,21 +202,26 @@ struct Band<'a> {
     values: &'a mut [f32],
 }
 
+/// `into += weight · g`, n channels.
 #[inline(always)]
-fn add<const F: bool>(into: &mut [f32], g: &[f32], a: f32, b: f32, n: usize) {
-    // two neighbours at once: they lie one after the other
-    let (left, right) = into.split_at_mut(n);
-    let right = &mut right[..n];
-    let g = &g[..n];
+fn add<const F: bool>(into: &mut [f32], g: &[f32], weight: f32, n: usize) {
+    let (into, g) = (&mut into[..n], &g[..n]);
     in_pieces!(n, c, W, {
-        let l: &mut [f32; W] = (&mut left[c..c + W]).try_into().expect("a slice of W floats");
-        let r: &mut [f32; W] = (&mut right[c..c + W]).try_into().expect("a slice of W floats");
+        // a copy, so that nothing is written while there is something to read: this is what vectorises
+        let mut sum: [f32; W] = *lanes::<W>(into, c);
         let g: &[f32; W] = lanes::<W>(g, c);
         for k in 0..W {
-            l[k] = fma::<F>(a, g[k], l[k]);
-            r[k] = fma::<F>(b, g[k], r[k]);
+            sum[k] = fma::<F>(weight, g[k], sum[k]);
         }
+        into[c..c + W].copy_from_slice(&sum);
     });
+}
+
+/// Two neighbours along a row at once: they lie one after the other.
+#[inline(always)]
+fn add_pair<const F: bool>(into: &mut [f32], g: &[f32], a: f32, b: f32, n: usize) {
+    add::<F>(into, g, a, n);
+    add::<F>(&mut into[n..], g, b, n);
 }
 
 #[inline(always)]
@@ -228,7 +233,7 @@ fn band_body<const F: bool>(band: &mut Band, spread: &Spread) {
             let g = &spread.lines[s * spread.stride + band.first..][..n];
             let z = cell.frac[axis];
             let at = cell.index[axis] as usize * n;
-            add::<F>(&mut band.values[at..at + 2 * n], g, 1.0 - z, z, n);
+            add_pair::<F>(&mut band.values[at..at + 2 * n], g, 1.0 - z, z, n);
         }
         return;
     }
@@ -246,11 +251,11 @@ fn band_body<const F: bool>(band: &mut Band, spread: &Spread) {
         let at = cell.index[a] as usize * n;
         if row < rows {
             let w = 1.0 - y;
-            add::<F>(&mut band.values[row * pitch + at..][..2 * n], g, (1.0 - x) * w, x * w, n);
+            add_pair::<F>(&mut band.values[row * pitch + at..][..2 * n], g, (1.0 - x) * w, x * w, n);
         }
         let next = row.wrapping_add(1);
         if next < rows {
-            add::<F>(&mut band.values[next * pitch + at..][..2 * n], g, (1.0 - x) * y, x * y, n);
+            add_pair::<F>(&mut band.values[next * pitch + at..][..2 * n], g, (1.0 - x) * y, x * y, n);
         }
     }
 }

@@ -293,7 +293,7 @@ fn a_mask_removes_samples_and_moves_none() {
         far: 9.0,
     };
     // the mask's box is smaller than the field's, as after an update before the box shrinks again
-    let hit = |c: [usize; 3]| (c[0] * 7 + c[1] * 3 + c[2]) % 11 == 0 && c[0] < 30;
+    let hit = |c: [usize; 3]| (c[0] * 7 + c[1] * 3 + c[2]).is_multiple_of(11) && c[0] < 30;
     let mask = BoxMask::new([-0.9, -0.8, -1.2], [1.0, 0.7, 1.1], [37, 20, 29], hit);
     let mut met = 0;
     for i in 0..50 {
