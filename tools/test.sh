@@ -61,7 +61,7 @@ sphere() { cargo run --release --quiet --example sphere_to_glb -- "$scratch/sphe
 
 train_demo() {
   "$target/release/tiface" demo --run "$scratch/demo" --preset draft --set iface.steps=600 \
-    --set mesh.resolution=128 --set mesh.format=glb,obj,ply
+    --set tface.steps=400 --set baseline.steps=200 --set mesh.resolution=128 --set mesh.format=glb,obj,ply
 }
 
 step "independent readers are here" readers

@@ -15,6 +15,14 @@ use std::time::Instant;
 /// Where in its run the demo keeps its photographs.
 pub(super) const CAPTURE: &str = "capture";
 
+/// The demo's pictures are small, and it should end while its user still looks.
+const SHORTER: &str = "\
+tface.steps = 800
+tface.rays = 2048
+baseline.steps = 600
+baseline.rays = 2048
+";
+
 pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, Ending> {
     let run = common.run.clone().unwrap_or_else(|| PathBuf::from("runs/demo"));
     let capture = run.join(CAPTURE);
@@ -29,7 +37,7 @@ pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, 
     let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
     // repeated without options, the demo goes on as it was begun
     let target = Target { capture: Some(io::real_path(&capture)?), saved, run, guessed: false };
-    let fallback = Some(Preset::Draft);
+    let fallback = Some((Preset::Draft, SHORTER));
     let work = Work { common, until: "metrics", require: &[], synthetic: true, fallback, screen, stop };
     work.on(&target, &[])
 }

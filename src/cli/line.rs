@@ -37,8 +37,8 @@ pub(super) struct Work<'a> {
     pub require: &'a [String],
     /// Is it the demo head, whose surface is known?
     pub synthetic: bool,
-    /// The preset where nothing names one.
-    pub fallback: Option<Preset>,
+    /// The preset where nothing names one, and settings on top of it, as TOML.
+    pub fallback: Option<(Preset, &'static str)>,
     pub screen: &'a Screen,
     pub stop: &'a Stop,
 }
@@ -201,7 +201,7 @@ fn judgement(metrics: &Value) -> Vec<String> {
 pub(super) fn configure(
     common: &Common,
     target: &Target,
-    fallback: Option<Preset>,
+    fallback: Option<(Preset, &str)>,
     extra: &[(String, String, String)],
 ) -> Result<Config, Ending> {
     let mut extra = extra.to_vec();

@@ -112,12 +112,13 @@ impl Common {
 
     /// The configuration: the user's own file, the run's (`saved`), `--config`, `--set`, options.
     ///
-    /// `fallback` is the preset where nothing names one. `extra` are options of one command: as
+    /// `fallback` is the preset where nothing names one, and what it starts with on top of that, as TOML;
+    /// `extra` are options of one command: as
     /// typed, key, value.
     pub fn resolve(
         &self,
         saved: Option<&Path>,
-        fallback: Option<Preset>,
+        fallback: Option<(Preset, &str)>,
         extra: &[(String, String, String)],
     ) -> Result<Config, Ending> {
         let mut files = Vec::new();
@@ -131,7 +132,12 @@ impl Common {
         files.extend(self.config.iter().cloned());
         let nothing_names_one = files.is_empty() && !self.set.iter().any(|s| s.starts_with("preset"));
         let mut sources = Sources { set: self.set.clone(), remembered, ..Sources::default() };
-        sources.preset = self.preset().or(fallback.filter(|_| nothing_names_one));
+        if let Some((preset, text)) = fallback.filter(|_| nothing_names_one && self.preset.is_none()) {
+            sources.preset = Some(preset);
+            sources.files.push(("built in".into(), text.into()));
+        } else {
+            sources.preset = self.preset();
+        }
         for file in files {
             let limits = Limits { file_bytes: 1 << 20, ..Limits::default() };
             let bytes = io::read_bytes(&file, &limits)

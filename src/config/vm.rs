@@ -189,13 +189,12 @@ impl VmConfig {
     /// A minute or two on two cores.
     fn draft() -> VmConfig {
         VmConfig {
-            steps: 2000,
-            rays: 2048,
-            hidden: 64,
+            steps: 1500,
+            lr_final: 0.01,
             voxels_start: 96 * 96 * 96,
             voxels_final: 192 * 192 * 192,
-            upsample_steps: vec![300, 500, 800],
-            mask_steps: vec![300, 800],
+            upsample_steps: vec![150, 300, 500],
+            mask_steps: vec![150, 500],
             ..VmConfig::standard()
         }
     }
@@ -203,24 +202,31 @@ impl VmConfig {
     /// The default: better and slower.
     fn standard() -> VmConfig {
         VmConfig {
-            steps: 8000,
+            steps: 6000,
             masks: MaskUse::Soft,
             foreground: Foreground::Estimated,
             background: VmBackground::Random,
             start: VmStart::Hull,
             whole_frame: false,
             voxels_start: 128 * 128 * 128,
-            voxels_final: 300 * 300 * 300,
-            upsample_steps: vec![500, 900, 1400, 2000, 3000],
-            mask_steps: vec![500, 1400, 3000],
+            voxels_final: 256 * 256 * 256,
+            upsample_steps: vec![300, 600, 1000, 1500],
+            mask_steps: vec![300, 1000],
             // planes of the published ranks favour one axis of one stage; a head may face any way
             density_rank: vec![8, 8, 8],
             color_rank: vec![24, 24, 24],
+            hidden: 64,
             // the published 25 per unit of its world would be 40 here; denser matter sets a thinner surface,
             // and fewer samples of a ray need a colour
             distance_scale: 200.0,
+            // half as many samples as published, at the same quality
+            step_ratio: 1.0,
             weight_threshold: 1e-3,
             stop: 1e-3,
+            // rates that end low take the noise of single batches out of the result
+            lr_final: 0.003,
+            tv_density: 10.0,
+            tv_color: 10.0,
             ..VmConfig::paper()
         }
     }
