@@ -225,8 +225,8 @@ impl VmConfig {
             stop: 1e-3,
             // rates that end low take the noise of single batches out of the result
             lr_final: 0.003,
-            tv_density: 10.0,
-            tv_color: 10.0,
+            tv_density: 3.0,
+            tv_color: 3.0,
             ..VmConfig::paper()
         }
     }

@@ -250,7 +250,7 @@ impl<'a> Walk<'a> {
 
     /// The next `t`.
     #[inline(always)]
-    pub fn next(&mut self) -> Option<f32> {
+    pub fn advance(&mut self) -> Option<f32> {
         let l = self.lattice;
         while self.k < self.end {
             let t = self.start + l.step * self.k as f32;

@@ -135,7 +135,7 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
         let before = task.kept.len();
         let mut transmittance = 1f32;
         let mut walk = Walk::new(&field.lattice, field.mask.as_ref(), ray);
-        while let Some(t) = walk.next() {
+        while let Some(t) = walk.advance() {
             let cell = field.cell(ray, t);
             let feature = lookup.sum::<F>(&cell);
             task.looked_up += 1;

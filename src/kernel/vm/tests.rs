@@ -157,7 +157,7 @@ fn plain(f: &VmField, x: &[f64], rays: &[VmRay], g: &[f32]) -> f64 {
         let mut light = 1.0;
         let mut out = [0f64; RAY_WIDTH];
         let mut walk = Walk::new(&f.lattice, f.mask.as_ref(), ray);
-        while let Some(t) = walk.next() {
+        while let Some(t) = walk.advance() {
             let p = std::array::from_fn(|a| ray.origin[a] as f64 + t as f64 * ray.direction[a] as f64);
             let feature: f64 = factors(&f.density, density, p).iter().sum();
             let sigma = if f.shading.softplus {
@@ -302,7 +302,7 @@ fn a_mask_removes_samples_and_moves_none() {
         let ray = VmRay { origin: [u(2), u(3), 3.0], direction, jitter: u(4) + 0.5 };
         let points = |mask: Option<&BoxMask>| {
             let mut walk = Walk::new(&lattice, mask, &ray);
-            std::iter::from_fn(|| walk.next()).collect::<Vec<f32>>()
+            std::iter::from_fn(|| walk.advance()).collect::<Vec<f32>>()
         };
         let (all, some) = (points(None), points(Some(&mask)));
         let want: Vec<f32> = all
