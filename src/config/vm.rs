@@ -267,7 +267,8 @@ impl VmConfig {
             feature_frequencies: 0,
             activation: DensityActivation::Relu,
             density_shift: -10.0,
-            distance_scale: 25.0,
+            // 25 in the published world, whose box is 3.3 units long; the scene's is 2
+            distance_scale: 40.0,
             step_ratio: 0.5,
             weight_threshold: 1e-4,
             stop: 0.0,

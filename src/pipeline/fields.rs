@@ -47,7 +47,7 @@ impl Line<'_> {
                     .map_err(|e| self.tface_failure(name, e))?;
                 return Ok(json!({"imported": config.import}));
             }
-            // without masks nothing may know where the head is: neither its outline nor what that carves
+            // without masks nothing may know the head's outline nor what that carves; only the box stays
             let masked = config.masks != MaskUse::None;
             let views = self.train_views(&scene, masked)?;
             let hull = bitmask(&scene).filter(|_| masked);

@@ -7,7 +7,7 @@ use super::state::{State, decoder, grids, param, shading};
 use crate::config::VmConfig;
 use crate::field;
 use crate::field::optimizer::Moments;
-use crate::io::{Limits, TensorValues, is_file, read_tensors, remove, rename, write_tensors};
+use crate::io::{Limits, ReadError, TensorValues, is_file, read_tensors, remove, rename, write_tensors};
 use crate::kernel::vm::mask::{BoxMask, Lattice};
 use crate::kernel::vm::{DecoderShape, Grid, Shading, VmField, samples_across, step_size};
 use burn::tensor::Device;
@@ -104,6 +104,24 @@ impl FieldRecord {
         FieldRecord { placement: Some(placement), ..self }
     }
 
+    /// Can this be rendered at all? What is impossible, else.
+    pub fn sound(&self) -> Result<(), &'static str> {
+        let finite = [self.shift, self.distance_scale, self.weight_threshold, self.stop, self.near, self.far];
+        if !(1e-2..=100.0).contains(&self.step_ratio) {
+            return Err("its step ratio is not within 0.01 and 100");
+        }
+        if self.view_frequencies > 16 || self.feature_frequencies > 16 {
+            return Err("its encodings have more than 16 frequencies");
+        }
+        if self.hidden == 0 || !self.hidden.is_multiple_of(8) || self.hidden > 4096 || self.features > 4096 {
+            return Err("its decoder is wider than 4096, or its hidden layers are no multiple of 8 wide");
+        }
+        if finite.iter().any(|v| !v.is_finite()) || self.near > self.far {
+            return Err("its numbers are not finite, or near lies behind far");
+        }
+        Ok(())
+    }
+
     /// The field over a box.
     pub fn field(&self, bounds: [[f32; 3]; 2], size: [usize; 3], mask: Option<BoxMask>) -> VmField {
         let extent: [f32; 3] = std::array::from_fn(|a| bounds[1][a] - bounds[0][a]);
@@ -195,13 +213,7 @@ pub fn load(path: &Path) -> Result<(TFace, FieldRecord), TfaceError> {
     let mut file = Opened::read(path)?;
     let record: FieldRecord = serde_json::from_str(&file.meta("field")?)
         .map_err(|e| file.wrong(format!("its `field` cannot be understood: {e}")))?;
-    if record.hidden == 0
-        || !record.hidden.is_multiple_of(8)
-        || record.features > 4096
-        || record.hidden > 4096
-    {
-        return Err(file.wrong("its `field` has impossible sizes".into()));
-    }
+    record.sound().map_err(|why| file.wrong(why.into()))?;
     let (bounds, size, mask) = file.geometry()?;
     let field = record.field(bounds, size, mask);
     let lengths = [field.density.len(), field.color.len(), field.decoder.len()];
@@ -241,6 +253,7 @@ pub fn save(
     metadata.extend([
         ("step".to_owned(), state.step.to_string()),
         ("reset".to_owned(), state.reset.to_string()),
+        ("moments_from".to_owned(), state.moments_from.to_string()),
         ("masked".to_owned(), u64::from(state.masked).to_string()),
         ("mean_square".to_owned(), state.mean_square.to_bits().to_string()),
         ("salt".to_owned(), state.salt.to_string()),
@@ -275,13 +288,20 @@ pub fn restore(
             continue;
         }
         match read(&path, config, identity, device) {
-            Ok(state) => return Ok(Some((state, warnings))),
+            Ok(state) => {
+                // a damaged newest one must not take this one's place at the next save
+                if path == previous(dir)
+                    && is_file(&newest(dir))
+                    && matches!(failure, Some(TfaceError::Read(_)))
+                {
+                    remove(&newest(dir))?;
+                }
+                return Ok(Some((state, warnings)));
+            }
+            // a disk that does not answer is no damaged file: nothing may be lost over it
+            Err(e @ TfaceError::Read(ReadError::Io { .. } | ReadError::TooLarge { .. })) => return Err(e),
             Err(e) => {
                 warnings.push(format!("{e}; falling back to the checkpoint before it"));
-                // it must not take the good one's place at the next save
-                if matches!(e, TfaceError::Read(_)) && path == newest(dir) && is_file(&previous(dir)) {
-                    remove(&path)?;
-                }
                 failure.get_or_insert(e);
             }
         }
@@ -386,6 +406,11 @@ fn read(path: &Path, config: &VmConfig, identity: &str, device: &Device) -> Resu
         return Err(file.wrong("it was trained with other settings or inputs".into()));
     }
     let finished = file.number("finished")? == 1;
+    let (step, reset) = (file.number("step")?, file.number("reset")?);
+    let moments_from = file.number("moments_from")?;
+    if reset > step || moments_from > step {
+        return Err(file.wrong(format!("step {step} lies before its last start ({reset}, {moments_from})")));
+    }
     let (bounds, size, mask) = file.geometry()?;
     let (density, color) = grids(config, size);
     let lengths = [density.len(), color.len(), decoder(config).len()];
@@ -406,8 +431,9 @@ fn read(path: &Path, config: &VmConfig, identity: &str, device: &Device) -> Resu
         network,
         moments,
         mask,
-        step: file.number("step")?,
-        reset: file.number("reset")?,
+        step,
+        reset,
+        moments_from,
         masked: file.number("masked")? == 1,
         mean_square: f64::from_bits(file.number("mean_square")?),
         salt: file.number("salt")?,

@@ -33,8 +33,7 @@ fn flat(grid: &Grid, planes: &[Vec<f32>; 3], lines: &[Vec<f32>; 3]) -> Vec<f32> 
     planes.chain(lines).flatten().collect()
 }
 
-/// A published checkpoint as a field; without a placement its coordinates are taken as the scene's.
-fn field_of(c: &VmCheckpoint, placement: Option<Placement>) -> (TFace, FieldRecord) {
+fn record_of(c: &VmCheckpoint, placement: Option<Placement>) -> FieldRecord {
     let decoder = DecoderShape {
         channels: c.color_rank.iter().sum(),
         features: c.app_dim,
@@ -52,9 +51,15 @@ fn field_of(c: &VmCheckpoint, placement: Option<Placement>) -> (TFace, FieldReco
     let mut record = FieldRecord::new(c.density_rank, c.color_rank, decoder, shading, c.step_ratio)
         .between(c.near_far[0], c.near_far[1]);
     record.mask_threshold = c.alpha_mask_threshold;
-    if let Some(placement) = placement {
-        record = record.placed(placement);
+    match placement {
+        Some(placement) => record.placed(placement),
+        None => record,
     }
+}
+
+/// A published checkpoint as a field; without a placement its coordinates are taken as the scene's.
+fn field_of(c: &VmCheckpoint, placement: Option<Placement>) -> (TFace, FieldRecord) {
+    let record = record_of(c, placement);
     let mask = c.mask.as_ref().map(|m| {
         let [nz, ny, nx] = m.shape;
         let vertices: Vec<bool> =
@@ -79,9 +84,6 @@ pub fn import_th(
     identity: &str,
 ) -> Result<TFace, TfaceError> {
     let c = th::read_th(path, &Limits::default())?;
-    if !c.hidden.is_multiple_of(8) {
-        return Err(TfaceError::Exchange("hidden layers that are no multiple of 8 wide are not supported"));
-    }
     // field = scale · world = scale · (scene − t) / s
     let s = scene_from_world;
     let k = scale / s.scale;
@@ -90,7 +92,12 @@ pub fn import_th(
         offset: (s.translation * -k).as_vec3().to_array(),
         depth_directions: true,
     };
-    let (face, record) = field_of(&c, Some(placement));
+    if c.grid_size.iter().any(|&n| n > 1 << 16) {
+        return Err(TfaceError::Exchange("its grid has more than 65536 nodes along an axis"));
+    }
+    let (record, placed) = (record_of(&c, Some(placement)), Some(placement));
+    record.sound().map_err(TfaceError::Exchange)?;
+    let (face, record) = field_of(&c, placed);
     checkpoint::save_field(dir, &face, record, identity)?;
     Ok(face)
 }

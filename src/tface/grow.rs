@@ -144,6 +144,7 @@ pub fn upsample(state: &mut State, config: &VmConfig, which: usize, device: &Dev
 fn replace(state: &mut State, density: Vec<f32>, color: Vec<f32>, device: &Device) {
     let network = state.network.val().dims()[0];
     state.moments = no_moments([density.len(), color.len(), network], device);
+    state.moments_from = state.step;
     state.density = param(density, device);
     state.color = param(color, device);
 }

@@ -2,7 +2,7 @@
 //!
 //! Chen et al. 2022 (TensoRF) with the mask loss of T-Face (TI-Face, ICCV 2023 View Synthesis Challenge for
 //! Human Heads): the opacity that background rays collect is pushed to zero. The baseline is the same code
-//! without masks.
+//! on photographs as they are; only its box still comes from the masks.
 
 #[cfg(feature = "cpu")]
 mod checkpoint;

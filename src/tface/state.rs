@@ -31,8 +31,10 @@ pub struct State {
     pub mask: Option<BoxMask>,
     /// Optimiser steps done.
     pub step: u64,
-    /// Step at which learning rates and moments last started.
+    /// Step at which the learning rates last started.
     pub reset: u64,
+    /// Step at which the moments last started: whenever the grids change their size.
+    pub moments_from: u64,
     /// Has the alpha mask been rebuilt at least once?
     pub masked: bool,
     /// Running mean of the squared colour error, for the PSNR that is shown.
@@ -129,10 +131,17 @@ impl State {
             mask: hull.map(hull_mask),
             step: 0,
             reset: 0,
+            moments_from: 0,
             masked: false,
             mean_square: 0.0,
             salt: 0,
         }
+    }
+
+    /// Is every weight a finite number? A NaN in a relu density has neither weight nor gradient: no loss
+    /// would tell, and total variation would spread it.
+    pub fn is_finite(&self) -> bool {
+        [&self.density, &self.color, &self.network].iter().all(|p| read(p).iter().all(|v| v.is_finite()))
     }
 
     /// The field as the kernels see it. In training a ray has `‖size‖ / ratio` samples, else as many as the

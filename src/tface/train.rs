@@ -119,7 +119,13 @@ pub fn train(
     let mut density = 0;
     while trainer.state.step < config.steps {
         let step = trainer.state.step;
-        match trainer.step() {
+        let every = Duration::from_secs_f64(config.checkpoint_s);
+        let result = trainer.step().and_then(|figures| {
+            let saving = saved.elapsed() > every || monitor.stop() || trainer.state.step == config.steps;
+            // a poisoned field must not take the place of a good checkpoint
+            if saving && !trainer.state.is_finite() { Err(("grid", f32::NAN)) } else { Ok(figures) }
+        });
+        match result {
             Ok(figures) => {
                 let old = trainer.state.mean_square;
                 let keep = if old == 0.0 { 0.0 } else { 0.98 };
@@ -159,7 +165,7 @@ pub fn train(
             checkpoint::save(dir, &trainer.state, config, identity, false)?;
             return Err(TfaceError::Stopped { step: trainer.state.step, steps: config.steps });
         }
-        if saved.elapsed() > Duration::from_secs_f64(config.checkpoint_s) {
+        if saved.elapsed() > every {
             checkpoint::save(dir, &trainer.state, config, identity, false)?;
             saved = Instant::now();
         }
@@ -356,8 +362,8 @@ impl Trainer<'_> {
         (total, rgb, mask, outside)
     }
 
-    /// Backward and Adam. Nothing is updated where the decoder's gradient is not finite: what breaks the
-    /// grids' gradients passes through the same rays.
+    /// Backward and Adam. Nothing is updated where the decoder's gradient is not finite; the grids are looked
+    /// at before every checkpoint.
     fn descend(&mut self, loss: Tensor<1>, step: u64) -> Result<(), (&'static str, f32)> {
         let config = self.config;
         let state = &mut self.state;
@@ -375,7 +381,7 @@ impl Trainer<'_> {
             beta2: 0.99,
             epsilon: 1e-8,
             weight_decay: 0.0,
-            step: since + 1,
+            step: step - state.moments_from + 1,
             skip_zero: false,
         };
         let network = AdamStep { lr: (config.lr_network * factor) as f32, ..grid };

@@ -119,10 +119,10 @@ pub fn step_size(extent: [f32; 3], size: [usize; 3], ratio: f32) -> f32 {
     (0..3).map(|a| extent[a] / (size[a] - 1) as f32).sum::<f32>() / 3.0 * ratio
 }
 
-/// Samples of a ray outside training: as many as the box's diagonal needs.
+/// Samples of a ray outside training: as many as the box's diagonal needs, a million at most.
 pub fn samples_across(extent: [f32; 3], step: f32) -> usize {
     let diagonal = extent.iter().map(|e| e * e).sum::<f32>().sqrt();
-    (diagonal / step) as usize + 1
+    ((diagonal / step) as usize).saturating_add(1).min(1_000_000)
 }
 
 /// The voxel counts of `steps` upsamplings: equal ratios from `first` to `last`, computed in f32 as published.
