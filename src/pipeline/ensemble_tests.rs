@@ -119,8 +119,10 @@ fn a_fit_uses_the_views_set_aside_and_stands_beside_the_given_weights() {
                     (exact, flat([0.0, 0.0, 0.0, 1.0]))
                 }
             };
-            put(&run, "tface", &view.name, tface);
-            put(&run, "volume", &view.name, volume);
+            let name =
+                if view.split == Split::Val { format!("fit/{}", view.name) } else { view.name.clone() };
+            put(&run, "tface", &name, tface);
+            put(&run, "volume", &name, volume);
         }
         assert_eq!(black, 2);
         let done = line.ensemble().unwrap();

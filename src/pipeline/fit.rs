@@ -3,6 +3,7 @@
 //! Those views belong to the split `val`: no field learned from them, and they are no test views.
 
 use super::ensemble::ensemble_failure;
+use super::render::fit_name;
 use super::{Line, capture_failure, pictures, to_value};
 use crate::capture::scene::Scene;
 use crate::capture::{Split, View};
@@ -122,7 +123,7 @@ impl Line<'_> {
         let mut fits = vec![ColorFit::default(); names.len()];
         for view in views {
             let (photo, weight) = target(view)?;
-            for (k, image) in self.member_views(&view.name)?.iter().enumerate() {
+            for (k, image) in self.member_views(&fit_name(&view.name))?.iter().enumerate() {
                 let member = Member { name: names[k], image, masked: true };
                 fits[k].add(&member, &Target { photo: &photo, weight: &weight }).map_err(ensemble_failure)?;
             }
@@ -154,14 +155,14 @@ impl Line<'_> {
         let world_from_scene = scene.scene_from_world.inverse();
         let mut sums = Vec::new();
         for view in views {
-            let mut images = self.member_views(&view.name)?;
+            let mut images = self.member_views(&fit_name(&view.name))?;
             for ((map, image), name) in maps.iter().zip(&mut images).zip(self.members()) {
                 map.apply(name, image).map_err(ensemble_failure)?;
             }
             let (photo, weight) = target(view)?;
             let camera = view.camera.transformed(&scene.scene_from_world);
             let points = match c.fit {
-                Fit::Regions => self.points(&view.name, &camera, &world_from_scene)?,
+                Fit::Regions => self.points(&fit_name(&view.name), &camera, &world_from_scene)?,
                 // no pixel has a point then, and all of them count for the global weights
                 _ => nowhere(camera.width, camera.height),
             };

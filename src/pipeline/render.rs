@@ -107,20 +107,33 @@ impl Line<'_> {
                 let path = Path::new(file);
                 let bytes = io::read_bytes(path, &Limits::default())?;
                 let text = String::from_utf8_lossy(&bytes);
-                from_json(&text, &all[0]).map_err(wrong)
+                let cameras = from_json(&text, &all[0]).map_err(wrong)?;
+                let mut names: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();
+                names.sort_unstable();
+                if let Some(twice) = names.windows(2).find(|w| w[0] == w[1]) {
+                    let problem = format!("`{file}` names two cameras `{}`", twice[0]);
+                    return Err(Failure::cannot(problem, "give every frame a file name of its own"));
+                }
+                Ok(cameras)
             }
         }
     }
 
     /// The cameras of the views that a blend is fitted on; none where nothing is fitted.
     fn fit_cameras(&self) -> Vec<NamedCamera> {
-        if self.config.ensemble.fits() { self.of(Split::Val) } else { Vec::new() }
+        let all = if self.config.ensemble.fits() { self.of(Split::Val) } else { Vec::new() };
+        all.into_iter().map(|c| NamedCamera { name: fit_name(&c.name), ..c }).collect()
     }
 
     fn of(&self, split: Split) -> Vec<NamedCamera> {
         let named = |v: &View| NamedCamera { name: v.name.clone(), camera: v.camera.clone() };
         self.capture.split(split).map(named).collect()
     }
+}
+
+/// A folder of their own: a camera file may use a photograph's name for another camera.
+pub(super) fn fit_name(view: &str) -> String {
+    format!("fit/{view}")
 }
 
 /// What every view is made with.
