@@ -7,6 +7,7 @@
 pub mod autodiff;
 #[cfg(test)]
 pub(crate) mod ball;
+pub mod checkpoint;
 mod dark_stage;
 pub mod ops;
 pub mod optimizer;

@@ -1,21 +1,20 @@
 //! Everything training needs to go on, in one safetensors file.
-//!
-//! Two files take turns, `checkpoint.safetensors` and `checkpoint.previous.safetensors`: the newest
-//! complete one is never replaced before its successor is on disk, and one that fails its checks falls
-//! back to the other.
+//! How two of them take turns is [`crate::field::checkpoint`]'s.
 
 use super::IfaceError;
 use super::model::{Model, initial};
 use super::occupancy::Occupancy;
 use crate::config::iface::IfaceConfig;
 use crate::field;
+use crate::field::checkpoint as turns;
 use crate::field::optimizer::Moments;
-use crate::io::Limits;
-use crate::io::{TensorValues, is_file, read_tensors, remove, rename, write_tensors};
+use crate::io::{Limits, TensorValues, read_tensors};
 use crate::kernel::march::Bitmask;
 use burn::tensor::{Device, Tensor};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
+
+pub use turns::{finish, newest};
 
 /// Version of the file's layout.
 const FORMAT: &str = "tiface-iface-1";
@@ -122,15 +121,6 @@ impl State {
     }
 }
 
-/// Where the newest checkpoint of a stage folder lies.
-pub fn newest(dir: &Path) -> PathBuf {
-    dir.join("checkpoint.safetensors")
-}
-
-fn previous(dir: &Path) -> PathBuf {
-    dir.join("checkpoint.previous.safetensors")
-}
-
 fn words(mask: &Bitmask) -> TensorValues {
     TensorValues::U64(mask.bits.clone())
 }
@@ -160,18 +150,7 @@ pub fn save(dir: &Path, state: &State, identity: &str) -> Result<(), IfaceError>
         ("mean_square".to_owned(), state.mean_square.to_bits().to_string()),
         ("salt".to_owned(), state.salt.to_string()),
     ]);
-    let path = newest(dir);
-    let next = dir.join("checkpoint.next.safetensors");
-    write_tensors(&next, &tensors, &metadata)?;
-    if is_file(&path) {
-        rename(&path, &previous(dir))?;
-    }
-    Ok(rename(&next, &path)?)
-}
-
-/// Removes the older checkpoint: training is complete, the newest is all anyone needs.
-pub fn finish(dir: &Path) -> Result<(), IfaceError> {
-    Ok(remove(&previous(dir))?)
+    Ok(turns::save(dir, &tensors, &metadata)?)
 }
 
 /// The newest readable checkpoint of a stage folder, with what was wrong with a newer one; `None` where
@@ -183,28 +162,14 @@ pub fn restore(
     identity: &str,
     device: &Device,
 ) -> Result<Option<(State, Vec<String>)>, IfaceError> {
-    let mut warnings = Vec::new();
-    let mut failure = None;
-    for path in [newest(dir), previous(dir)] {
-        if !is_file(&path) {
-            continue;
-        }
-        match read(&path, config, hull, Some(identity), device) {
-            Ok(state) => return Ok(Some((state, warnings))),
-            Err(e) => {
-                warnings.push(format!("{e}; falling back to the checkpoint before it"));
-                // it must not take the good one's place at the next save
-                if matches!(e, IfaceError::Read(_)) && path == newest(dir) && is_file(&previous(dir)) {
-                    remove(&path)?;
-                }
-                failure.get_or_insert(e);
-            }
-        }
-    }
-    match failure {
-        Some(e) => Err(e),
-        None => Ok(None),
-    }
+    turns::restore(
+        dir,
+        |path| read(path, config, hull, Some(identity), device),
+        |e| match e {
+            IfaceError::Read(e) => Some(e),
+            _ => None,
+        },
+    )
 }
 
 /// Reads one file; names, shapes and types must be exactly the model's.

@@ -1,32 +1,26 @@
-//! Everything training needs to go on, in one safetensors file; two files take turns, so that the newest
-//! complete one is never replaced before its successor is on disk.
+//! Everything training needs to go on, in one safetensors file; how two of them take turns is
+//! [`crate::field::checkpoint`]'s.
 
 use super::TfaceError;
 use super::infer::{Placement, TFace};
 use super::state::{State, decoder, grids, param, shading};
 use crate::config::VmConfig;
 use crate::field;
+use crate::field::checkpoint as turns;
 use crate::field::optimizer::Moments;
-use crate::io::{Limits, ReadError, TensorValues, is_file, read_tensors, remove, rename, write_tensors};
+use crate::io::{Limits, TensorValues, read_tensors, write_tensors};
 use crate::kernel::vm::mask::{BoxMask, Lattice};
 use crate::kernel::vm::{DecoderShape, Grid, Shading, VmField, samples_across, step_size};
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
+
+pub use turns::{finish, newest};
 
 /// Version of the file's layout.
 const FORMAT: &str = "tiface-vm-1";
-
-/// Where the newest checkpoint of a stage folder lies.
-pub fn newest(dir: &Path) -> PathBuf {
-    dir.join("checkpoint.safetensors")
-}
-
-fn previous(dir: &Path) -> PathBuf {
-    dir.join("checkpoint.previous.safetensors")
-}
 
 const NAMES: [&str; 3] = ["density", "color", "network"];
 
@@ -259,18 +253,7 @@ pub fn save(
         ("salt".to_owned(), state.salt.to_string()),
         ("finished".to_owned(), u64::from(finished).to_string()),
     ]);
-    let path = newest(dir);
-    let next = dir.join("checkpoint.next.safetensors");
-    write_tensors(&next, &tensors, &metadata)?;
-    if is_file(&path) {
-        rename(&path, &previous(dir))?;
-    }
-    Ok(rename(&next, &path)?)
-}
-
-/// Removes the older checkpoint: training is complete, the newest is all anyone needs.
-pub fn finish(dir: &Path) -> Result<(), TfaceError> {
-    Ok(remove(&previous(dir))?)
+    Ok(turns::save(dir, &tensors, &metadata)?)
 }
 
 /// The newest readable checkpoint of a stage folder, with what was wrong with a newer one; `None` where
@@ -281,35 +264,14 @@ pub fn restore(
     identity: &str,
     device: &Device,
 ) -> Result<Option<(State, Vec<String>)>, TfaceError> {
-    let mut warnings = Vec::new();
-    let mut failure = None;
-    for path in [newest(dir), previous(dir)] {
-        if !is_file(&path) {
-            continue;
-        }
-        match read(&path, config, identity, device) {
-            Ok(state) => {
-                // a damaged newest one must not take this one's place at the next save
-                if path == previous(dir)
-                    && is_file(&newest(dir))
-                    && matches!(failure, Some(TfaceError::Read(_)))
-                {
-                    remove(&newest(dir))?;
-                }
-                return Ok(Some((state, warnings)));
-            }
-            // a disk that does not answer is no damaged file: nothing may be lost over it
-            Err(e @ TfaceError::Read(ReadError::Io { .. } | ReadError::TooLarge { .. })) => return Err(e),
-            Err(e) => {
-                warnings.push(format!("{e}; falling back to the checkpoint before it"));
-                failure.get_or_insert(e);
-            }
-        }
-    }
-    match failure {
-        Some(e) => Err(e),
-        None => Ok(None),
-    }
+    turns::restore(
+        dir,
+        |path| read(path, config, identity, device),
+        |e| match e {
+            TfaceError::Read(e) => Some(e),
+            _ => None,
+        },
+    )
 }
 
 /// An open checkpoint.

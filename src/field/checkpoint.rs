@@ -1,0 +1,74 @@
+//! Checkpoints of a training on disk: two files take turns, so that the newest complete one is never
+//! replaced before its successor is there, and one that fails its checks falls back to the other.
+
+use crate::io::{ReadError, TensorValues, WriteError, is_file, remove, rename, write_tensors};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Where the newest checkpoint of a stage folder lies.
+pub fn newest(dir: &Path) -> PathBuf {
+    dir.join("checkpoint.safetensors")
+}
+
+fn previous(dir: &Path) -> PathBuf {
+    dir.join("checkpoint.previous.safetensors")
+}
+
+/// Writes the next checkpoint; the newest becomes the previous one.
+pub fn save(
+    dir: &Path,
+    tensors: &[(String, Vec<usize>, TensorValues)],
+    metadata: &BTreeMap<String, String>,
+) -> Result<(), WriteError> {
+    let path = newest(dir);
+    let next = dir.join("checkpoint.next.safetensors");
+    write_tensors(&next, tensors, metadata)?;
+    if is_file(&path) {
+        rename(&path, &previous(dir))?;
+    }
+    rename(&next, &path)
+}
+
+/// Removes the older checkpoint: training is complete, the newest is all anyone needs.
+pub fn finish(dir: &Path) -> Result<(), WriteError> {
+    remove(&previous(dir))
+}
+
+/// The newest readable checkpoint of a stage folder, with what was wrong with a newer one; `None` where
+/// there is none at all.
+///
+/// `read` reads one file; `read_error` is the [`ReadError`] in one of its errors, if that is what it is.
+pub fn restore<S, E: std::fmt::Display + From<WriteError>>(
+    dir: &Path,
+    read: impl Fn(&Path) -> Result<S, E>,
+    read_error: impl Fn(&E) -> Option<&ReadError>,
+) -> Result<Option<(S, Vec<String>)>, E> {
+    let mut warnings = Vec::new();
+    let mut failure = None;
+    for path in [newest(dir), previous(dir)] {
+        if !is_file(&path) {
+            continue;
+        }
+        match read(&path) {
+            Ok(state) => {
+                // a damaged newest one must not take this one's place at the next save
+                if path != newest(dir) && failure.as_ref().and_then(&read_error).is_some() {
+                    remove(&newest(dir))?;
+                }
+                return Ok(Some((state, warnings)));
+            }
+            Err(e) => {
+                // a disk that does not answer is no damaged file: nothing may be lost over it
+                if matches!(read_error(&e), Some(ReadError::Io { .. } | ReadError::TooLarge { .. })) {
+                    return Err(e);
+                }
+                warnings.push(format!("{e}; falling back to the checkpoint before it"));
+                failure.get_or_insert(e);
+            }
+        }
+    }
+    match failure {
+        Some(e) => Err(e),
+        None => Ok(None),
+    }
+}
