@@ -1,6 +1,7 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
 mod aabb;
+mod atlas;
 mod bvh;
 mod camera;
 mod mesh;
@@ -9,6 +10,7 @@ mod similarity;
 mod topology;
 
 pub use aabb::Aabb;
+pub use atlas::Atlas;
 pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion};
 pub use mesh::Mesh;
