@@ -9,9 +9,11 @@
 //! 1.447; colour, mask and eikonal losses, backward to every parameter, AdamW. CPU time (user + system of
 //! the process) is what is compared: it does not depend on what else the machine does.
 
+mod process;
+
 use burn::tensor::{Device, Int, Tensor, TensorData};
+use process::cpu_s;
 use std::sync::Arc;
-use std::time::Instant;
 use tiface::field::{self, ops};
 use tiface::kernel::adam::{AdamStep, adam};
 use tiface::kernel::hash;
@@ -26,17 +28,6 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 const RAYS: usize = 256;
 const PER_RAY: usize = 128;
 const N: usize = RAYS * PER_RAY;
-
-/// User + system time of this process, seconds (Linux; wall time elsewhere).
-fn cpu_s() -> f64 {
-    let Ok(stat) = std::fs::read_to_string("/proc/self/stat") else {
-        static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
-        return START.get_or_init(Instant::now).elapsed().as_secs_f64();
-    };
-    let after = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
-    let field = |i: usize| after.split_whitespace().nth(i).and_then(|v| v.parse::<f64>().ok()).unwrap_or(0.0);
-    (field(11) + field(12)) / 100.0
-}
 
 struct Input {
     shape: Arc<FieldShape>,

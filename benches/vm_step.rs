@@ -16,6 +16,8 @@
 //! CPU time (user + system of the process) is what is compared: it does not depend on what else the machine
 //! does.
 
+mod process;
+
 #[path = "vm_step/plain.rs"]
 mod plain;
 #[path = "vm_step/scene.rs"]
@@ -24,11 +26,11 @@ mod scene;
 use burn::module::Param;
 use burn::tensor::{Device, Tensor};
 use plain::{Counts, Plain};
+use process::{cpu_s, peak_gib};
 use scene::{Scene, scene};
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::Instant;
 use tiface::field::ops::{self, GridPenalty, VmBatch};
 use tiface::field::optimizer::{Moments, update};
 use tiface::field::{tensor, values};
@@ -54,25 +56,6 @@ const GRID: AdamStep = AdamStep {
     skip_zero: false,
 };
 const NETWORK: AdamStep = AdamStep { lr: 1e-8, ..GRID };
-
-/// User + system time of this process, seconds (Linux; wall time elsewhere).
-fn cpu_s() -> f64 {
-    let Ok(stat) = std::fs::read_to_string("/proc/self/stat") else {
-        static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
-        return START.get_or_init(Instant::now).elapsed().as_secs_f64();
-    };
-    let after = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
-    let field = |i: usize| after.split_whitespace().nth(i).and_then(|v| v.parse::<f64>().ok()).unwrap_or(0.0);
-    (field(11) + field(12)) / 100.0
-}
-
-/// Most memory this process has had, GiB (Linux).
-fn peak_gib() -> f64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
-    let kib = line.and_then(|l| l.split_whitespace().next()?.parse::<f64>().ok());
-    kib.unwrap_or(0.0) / 1024.0 / 1024.0
-}
 
 /// Colour and mask losses of the rays `own`, as their part of the whole batch's. `out` is `[own, 5]`.
 pub fn losses(out: Tensor<2>, s: &Scene, own: Range<usize>, device: &Device) -> Tensor<1> {

@@ -226,21 +226,9 @@ fn dilated(values: &[u8], w: usize, h: usize, margin: usize) -> Vec<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Distortion;
-    use glam::{DMat3, DVec3};
 
     fn view() -> TrainView {
-        let camera = Camera {
-            width: 20,
-            height: 10,
-            fx: 20.0,
-            fy: 20.0,
-            cx: 10.0,
-            cy: 5.0,
-            distortion: Distortion::default(),
-            rotation: DMat3::IDENTITY,
-            position: DVec3::new(0.0, 0.0, 4.0),
-        };
+        let camera = Camera::above(20, 10, 20.0, 4.0);
         let rgb = (0..200).map(|i| [i as u8, 0, 255]).collect();
         let mut values = vec![0; 200];
         values[5 * 20 + 8] = 255;

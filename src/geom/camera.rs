@@ -150,6 +150,24 @@ impl Camera {
 }
 
 #[cfg(test)]
+impl Camera {
+    /// For tests: at (0, 0, z), looking along −Z, up +Y, without distortion.
+    pub(crate) fn above(width: u32, height: u32, focal: f64, z: f64) -> Camera {
+        Camera {
+            width,
+            height,
+            fx: focal,
+            fy: focal,
+            cx: width as f64 / 2.0,
+            cy: height as f64 / 2.0,
+            distortion: Distortion::default(),
+            rotation: DMat3::IDENTITY,
+            position: DVec3::new(0.0, 0.0, z),
+        }
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
 

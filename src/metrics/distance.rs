@@ -155,8 +155,7 @@ pub fn seen_one_way(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Distortion;
-    use glam::{DMat3, DVec3};
+    use glam::DVec3;
 
     /// A 2 × 1 rectangle at height z, of two triangles.
     fn sheet(z: f32) -> Mesh {
@@ -226,17 +225,7 @@ mod tests {
         let upper = sheet(1.0);
         mesh.positions.extend(&upper.positions);
         mesh.triangles.extend(upper.triangles.iter().map(|t| t.map(|i| i + 4)));
-        let camera = Camera {
-            width: 100,
-            height: 100,
-            fx: 1000.0,
-            fy: 1000.0,
-            cx: 50.0,
-            cy: 50.0,
-            distortion: Distortion::default(),
-            rotation: DMat3::IDENTITY,
-            position: DVec3::new(2.0, 0.5, 100.0),
-        };
+        let camera = Camera { position: DVec3::new(2.0, 0.5, 100.0), ..Camera::above(100, 100, 1000.0, 0.0) };
         let (d, share) = seen_one_way(&mesh, &Bvh::new(&sheet(0.0)), 6000, &[camera], 1).unwrap();
         // area 2 · 2 + 2 = 6 … the lower sheet is 4 × 1, the upper 2 × 1: seen 2 + 2 of 6
         assert!((share - 4.0 / 6.0).abs() < 0.01, "{share}");

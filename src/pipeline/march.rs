@@ -89,23 +89,10 @@ pub(super) fn points(camera: &Camera, depth: &Image, world_from_scene: &Similari
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Distortion;
-    use glam::{DMat3, DVec3};
     use std::cell::Cell;
 
-    /// Looks along −Z from (0, 0, 3).
     fn camera(width: u32, height: u32) -> Camera {
-        Camera {
-            width,
-            height,
-            fx: width as f64,
-            fy: width as f64,
-            cx: width as f64 / 2.0,
-            cy: height as f64 / 2.0,
-            distortion: Distortion::default(),
-            rotation: DMat3::IDENTITY,
-            position: DVec3::new(0.0, 0.0, 3.0),
-        }
+        Camera::above(width, height, width as f64, 3.0)
     }
 
     #[test]

@@ -251,22 +251,10 @@ impl Look<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Distortion;
     use glam::{DMat3, DVec3};
 
-    /// Looks along −z from z = 4 with a focal length of 100 pixels.
     fn camera(width: u32, height: u32) -> Camera {
-        Camera {
-            width,
-            height,
-            fx: 100.0,
-            fy: 100.0,
-            cx: width as f64 / 2.0,
-            cy: height as f64 / 2.0,
-            distortion: Distortion::default(),
-            rotation: DMat3::IDENTITY,
-            position: DVec3::new(0.0, 0.0, 4.0),
-        }
+        Camera::above(width, height, 100.0, 4.0)
     }
 
     /// Wound towards +z.
