@@ -103,9 +103,30 @@ impl IFace {
     /// sRGB-coded colour of surface points with unit `normals`, seen along unit `directions` (away from the
     /// camera).
     pub fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        self.shaded(points, normals, None, directions)
+    }
+
+    /// The same, point `i` seen along `counts[i]` directions, all in one list: one colour a direction.
+    pub fn colors(
+        &self,
+        points: &[Vec3],
+        normals: &[Vec3],
+        counts: &[u32],
+        directions: &[Vec3],
+    ) -> Vec<[f32; 3]> {
+        self.shaded(points, normals, Some(counts), directions)
+    }
+
+    fn shaded(
+        &self,
+        points: &[Vec3],
+        normals: &[Vec3],
+        counts: Option<&[u32]>,
+        directions: &[Vec3],
+    ) -> Vec<[f32; 3]> {
         let arrays = |v: &[Vec3]| -> Vec<[f32; 3]> { v.iter().map(|v| v.to_array()).collect() };
         let (x, normals, directions) = (self.scaled(points), arrays(normals), arrays(directions));
-        sdf::colors(&self.shape, self.table(), &self.weights, &x, &normals, &directions)
+        sdf::colors(&self.shape, self.table(), &self.weights, &x, &normals, counts, &directions)
     }
 
     /// Volume render of rays in scene coordinates: the reference every faster view is compared with.

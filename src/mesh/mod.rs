@@ -3,6 +3,7 @@
 //! [`marching`] meshes a dense grid, [`sparse`] asks a field only near its surface, [`clean`] keeps the
 //! head and drops the dust, [`extract`] is the stage: all of it, with normals and colours.
 
+pub mod bake;
 pub mod check;
 mod clean;
 mod error;

@@ -19,6 +19,15 @@ pub trait Surface: Sync {
     /// camera. All `[n, 3]`.
     fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]>;
 
+    /// The same, point `i` seen along `counts[i]` directions, all in one list: one colour a direction.
+    fn colors(
+        &self,
+        points: &[Vec3],
+        normals: &[Vec3],
+        counts: &[u32],
+        directions: &[Vec3],
+    ) -> Vec<[f32; 3]>;
+
     /// The view of a camera in scene coordinates by marching through the field itself; depth and
     /// normals in the world. `None` for what is only a surface.
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView>;
@@ -52,6 +61,16 @@ impl Surface for crate::iface::IFace {
 
     fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
         self.color(points, normals, directions)
+    }
+
+    fn colors(
+        &self,
+        points: &[Vec3],
+        normals: &[Vec3],
+        counts: &[u32],
+        directions: &[Vec3],
+    ) -> Vec<[f32; 3]> {
+        self.colors(points, normals, counts, directions)
     }
 
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView> {
@@ -101,6 +120,10 @@ impl Surface for Exact {
 
     fn color(&self, points: &[Vec3], _: &[Vec3], _: &[Vec3]) -> Vec<[f32; 3]> {
         vec![[0.6, 0.5, 0.4]; points.len()]
+    }
+
+    fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        vec![[0.6, 0.5, 0.4]; directions.len()]
     }
 
     fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {

@@ -66,8 +66,35 @@ pub fn values(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f
 struct ColorTask<'a> {
     inputs: Inputs<'a>,
     normal: &'a [[f32; 3]],
+    /// Directions of each point; one each where there is no list.
+    counts: Option<&'a [u32]>,
     direction: &'a [[f32; 3]],
     rgb: &'a mut [[f32; 3]],
+}
+
+/// The colour network on a tile whose inputs are filled; colours in the first `rows` of `out`.
+struct Shader {
+    c0: [f32; TILE * COLOR_INPUTS],
+    c1: [f32; TILE * HIDDEN],
+    c2: [f32; TILE * HIDDEN],
+    rgb: [f32; TILE * RGB_PADDED],
+}
+
+impl Shader {
+    #[inline(always)]
+    fn run<const F: bool>(&mut self, w: &Weights, out: &mut [[f32; 3]]) {
+        let ci = COLOR_INPUTS;
+        let Shader { c0, c1, c2, rgb } = self;
+        gemm::<F>((TILE, HIDDEN, ci), c0, (ci, 1), &w.c1t, HIDDEN, c1, HIDDEN, false);
+        c1.iter_mut().for_each(|v| *v = v.max(0.0));
+        gemm::<F>((TILE, HIDDEN, HIDDEN), c1, (HIDDEN, 1), &w.c2t, HIDDEN, c2, HIDDEN, false);
+        c2.iter_mut().for_each(|v| *v = v.max(0.0));
+        let last = (TILE, RGB_PADDED, HIDDEN);
+        gemm::<F>(last, c2, (HIDDEN, 1), &w.c3t, RGB_PADDED, rgb, RGB_PADDED, false);
+        for (r, out) in out.iter_mut().enumerate() {
+            *out = std::array::from_fn(|c| sigmoid::<F>(rgb[r * RGB_PADDED + c]));
+        }
+    }
 }
 
 #[inline(always)]
@@ -77,9 +104,14 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
     let mut u = vec![0f32; TILE * kp];
     let mut h = [0f32; TILE * HIDDEN];
     let mut o = [0f32; TILE * OUTPUTS_PADDED];
-    let mut c0 = [0f32; TILE * COLOR_INPUTS];
-    let mut c1 = [0f32; TILE * HIDDEN];
-    let mut rgb = [0f32; TILE * RGB_PADDED];
+    let mut shader = Shader {
+        c0: [0.0; TILE * COLOR_INPUTS],
+        c1: [0.0; TILE * HIDDEN],
+        c2: [0.0; TILE * HIDDEN],
+        rgb: [0.0; TILE * RGB_PADDED],
+    };
+    // directions that wait in the shader's tile, and those that are done
+    let (mut waiting, mut done) = (0, 0);
     for tile in 0..samples.div_ceil(TILE) {
         let base = tile * TILE;
         let rows = TILE.min(samples - base);
@@ -93,57 +125,69 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
         let op = OUTPUTS_PADDED;
         gemm::<F>((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2t, op, &mut o, op, false);
         for r in 0..rows {
-            let row = &mut c0[r * COLOR_INPUTS..][..COLOR_INPUTS];
-            (0..OUTPUTS).for_each(|j| row[j] = o[r * op + j] + w.b2[j]);
-            row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(task.direction[base + r]));
-            row[OUTPUTS + 16..].copy_from_slice(&task.normal[base + r]);
+            for _ in 0..task.counts.map_or(1, |c| c[base + r]) {
+                let row = &mut shader.c0[waiting * COLOR_INPUTS..][..COLOR_INPUTS];
+                (0..OUTPUTS).for_each(|j| row[j] = o[r * op + j] + w.b2[j]);
+                row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(task.direction[done + waiting]));
+                row[OUTPUTS + 16..].copy_from_slice(&task.normal[base + r]);
+                waiting += 1;
+                if waiting == TILE {
+                    shader.run::<F>(w, &mut task.rgb[done..done + TILE]);
+                    (waiting, done) = (0, done + TILE);
+                }
+            }
         }
-        let ci = COLOR_INPUTS;
-        gemm::<F>((TILE, HIDDEN, ci), &c0, (ci, 1), &w.c1t, HIDDEN, &mut c1, HIDDEN, false);
-        c1.iter_mut().for_each(|v| *v = v.max(0.0));
-        gemm::<F>((TILE, HIDDEN, HIDDEN), &c1, (HIDDEN, 1), &w.c2t, HIDDEN, &mut h, HIDDEN, false);
-        h.iter_mut().for_each(|v| *v = v.max(0.0));
-        let last = (TILE, RGB_PADDED, HIDDEN);
-        gemm::<F>(last, &h, (HIDDEN, 1), &w.c3t, RGB_PADDED, &mut rgb, RGB_PADDED, false);
-        for r in 0..rows {
-            task.rgb[base + r] = std::array::from_fn(|c| sigmoid::<F>(rgb[r * RGB_PADDED + c]));
-        }
+    }
+    if waiting > 0 {
+        shader.run::<F>(w, &mut task.rgb[done..done + waiting]);
     }
 }
 
 dispatch! { fn color_task / color_body(task: &mut ColorTask, w: &Weights) }
 
-/// Colour of points whose unit normals are known (of a mesh's surface): no gradient is computed, a third
-/// of the work of [`super::forward`]. All `[n, 3]`.
+/// Colour of points whose unit normals are known (of a mesh's surface), point `i` seen along `counts[i]` unit
+/// directions (one each without a list): no gradient is computed, a third of the work of [`super::forward`], and
+/// the geometry network is asked once a point.
+///
+/// # Shapes
+///
+/// - x, normal: `[n, 3]`; direction: `[sum of counts, 3]`, away from the camera, point by point
+/// - output: `[sum of counts, 3]`
 pub fn colors(
     shape: &FieldShape,
     table: &[[f32; 2]],
     weights: &Weights,
     x: &[[f32; 3]],
     normal: &[[f32; 3]],
+    counts: Option<&[u32]>,
     direction: &[[f32; 3]],
 ) -> Vec<[f32; 3]> {
     const PASS: usize = 1 << 15;
-    assert!(normal.len() == x.len() && direction.len() == x.len());
-    let mut rgb = vec![[0f32; 3]; x.len()];
+    let all = |counts: Option<&[u32]>, n: usize| counts.map_or(n, |c| c.iter().map(|&c| c as usize).sum());
+    assert!(normal.len() == x.len() && counts.is_none_or(|c| c.len() == x.len()));
+    assert_eq!(direction.len(), all(counts, x.len()));
+    let mut rgb = vec![[0f32; 3]; direction.len()];
     let active = &shape.levels[..shape.active];
-    for (pass, rgb) in rgb.chunks_mut(PASS).enumerate() {
-        let n = rgb.len();
-        let span = pass * PASS..pass * PASS + n;
-        let (x, normal, direction) = (&x[span.clone()], &normal[span.clone()], &direction[span]);
+    let (mut rest, mut ahead) = (&mut rgb[..], direction);
+    for first in (0..x.len()).step_by(PASS) {
+        let span = first..(first + PASS).min(x.len());
+        let (x, normal, counts) = (&x[span.clone()], &normal[span.clone()], counts.map(|c| &c[span]));
+        let n = x.len();
         let mut value = Buffer::scratch(active.len() * n * 2);
         hash::gather(active, table, &shape.x01(x), 1.0, bytemuck::cast_slice_mut(&mut value), None);
         let value = &value[..];
-        rgb.par_chunks_mut(CHUNK).enumerate().for_each(|(i, rgb)| {
-            let own = i * CHUNK..i * CHUNK + rgb.len();
-            let mut task = ColorTask {
-                inputs: Inputs::new(shape, x, value, own.clone()),
-                normal: &normal[own.clone()],
-                direction: &direction[own],
-                rgb,
-            };
-            color_task(&mut task, weights);
-        });
+        let mut tasks = Vec::with_capacity(n.div_ceil(CHUNK));
+        for start in (0..n).step_by(CHUNK) {
+            let own = start..(start + CHUNK).min(n);
+            let counts = counts.map(|c| &c[own.clone()]);
+            let colors = all(counts, own.len());
+            let (rgb, after) = rest.split_at_mut(colors);
+            let (direction, later) = ahead.split_at(colors);
+            (rest, ahead) = (after, later);
+            let normal = &normal[own.clone()];
+            tasks.push(ColorTask { inputs: Inputs::new(shape, x, value, own), normal, counts, direction, rgb });
+        }
+        tasks.par_iter_mut().for_each(|task| color_task(task, weights));
     }
     rgb
 }

@@ -1,0 +1,288 @@
+//! What colour a point of the surface has: where exactly it lies, which cameras see it, what they see.
+
+use super::lobes;
+use crate::geom::{Bvh, Camera, Ray};
+use crate::image::{linear_from_srgb, srgb_from_linear};
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// Cosine of the steepest angle at which a camera still tells the colour of a point: 75 degrees.
+const STEEPEST: f32 = 0.258_819;
+
+/// The learned field in the mesh's coordinates.
+pub struct Learned<'a> {
+    /// Signed distance and its gradient. `[n, 3]` → `[n]`, `[n, 3]`.
+    pub gradient: &'a (dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync),
+    /// sRGB-coded colours of points `[n, 3]` with unit normals `[n, 3]`, point `i` seen along `counts[i]` unit
+    /// directions away from the camera, all in one list: one colour a direction.
+    pub colors: &'a (dyn Fn(&[Vec3], &[Vec3], &[u32], &[Vec3]) -> Vec<[f32; 3]> + Sync),
+}
+
+/// Points of the surface with their unit normals.
+pub struct Points {
+    /// Where they are.
+    pub positions: Vec<Vec3>,
+    /// Unit normals, pointing out.
+    pub normals: Vec<Vec3>,
+}
+
+/// Moves points of the flat triangles onto the field's zero along their interpolated normals, at most `reach`
+/// far, and gives them the field's normals. A point from where the field's zero is not met stays as it is, with
+/// its interpolated normal.
+pub fn settle(flat: &Points, reach: f32, learned: &Learned) -> Points {
+    let n = flat.positions.len();
+    let mut offset = vec![0f32; n];
+    let mut start = vec![f32::INFINITY; n];
+    let mut points = Points { positions: flat.positions.clone(), normals: flat.normals.clone() };
+    for step in 0..3 {
+        let (values, gradients) = (learned.gradient)(&points.positions);
+        for i in 0..n {
+            let (Some(&f), Some(&g)) = (values.get(i), gradients.get(i)) else { continue };
+            let slope = g.dot(flat.normals[i]);
+            let norm = g.length();
+            if step == 0 {
+                start[i] = f.abs();
+            }
+            if step == 2 {
+                // accepted where the steps have closed in on the zero
+                let near = norm > 1e-6 && f.abs() <= 0.1 * reach * norm && f.abs() <= start[i];
+                if near && slope > 0.0 {
+                    points.normals[i] = g / norm;
+                } else {
+                    points.positions[i] = flat.positions[i];
+                }
+            } else if f.is_finite() && slope > 0.25 * norm {
+                offset[i] = (offset[i] - f / slope).clamp(-reach, reach);
+                points.positions[i] = flat.positions[i] + offset[i] * flat.normals[i];
+            }
+        }
+    }
+    points
+}
+
+/// Who sees points: the training cameras, with the mesh in the way.
+pub struct Eyes<'a> {
+    /// The cameras, in the mesh's coordinates.
+    pub cameras: &'a [Camera],
+    /// The mesh that hides.
+    pub bvh: &'a Bvh,
+    /// How far in front of the flat triangle a line of sight starts, so that it does not meet its own triangle.
+    pub clearance: f32,
+}
+
+/// Directions to the cameras that see each point, all in one list.
+#[derive(Default)]
+pub struct Seen {
+    /// Cameras that see point `i`.
+    pub counts: Vec<u32>,
+    /// Unit directions towards them.
+    pub directions: Vec<Vec3>,
+    /// cos² of the angle to the normal.
+    pub weights: Vec<f32>,
+}
+
+impl Eyes<'_> {
+    /// The cameras that see each point: in the frame, at most 75 degrees from its normal, nothing between.
+    /// Lines of sight start from the flat triangle (`flat`), which is part of what hides.
+    pub fn seen(&self, points: &Points, flat: &Points) -> Seen {
+        let each: Vec<Vec<(Vec3, f32)>> = (0..points.positions.len())
+            .into_par_iter()
+            .with_min_len(256)
+            .map(|i| {
+                let (p, normal) = (points.positions[i], points.normals[i]);
+                let from = flat.positions[i] + self.clearance * flat.normals[i];
+                self.cameras
+                    .iter()
+                    .filter_map(|camera| {
+                        let eye = camera.position.as_vec3();
+                        let direction = (eye - p).normalize_or_zero();
+                        let cos = direction.dot(normal);
+                        if cos < STEEPEST {
+                            return None;
+                        }
+                        let (pixel, _) = camera.project(p)?;
+                        let (w, h) = (camera.width as f32, camera.height as f32);
+                        if !(0.0..w).contains(&pixel.x) || !(0.0..h).contains(&pixel.y) {
+                            return None;
+                        }
+                        let way = eye - from;
+                        let ray = Ray {
+                            origin: from,
+                            direction: way.normalize_or_zero(),
+                            t_min: 0.0,
+                            t_max: way.length(),
+                        };
+                        (!self.bvh.any_hit(&ray)).then_some((direction, cos * cos))
+                    })
+                    .collect()
+            })
+            .collect();
+        let mut seen = Seen::default();
+        for list in each {
+            seen.counts.push(list.len() as u32);
+            for (direction, weight) in list {
+                seen.directions.push(direction);
+                seen.weights.push(weight);
+            }
+        }
+        seen
+    }
+}
+
+/// Colours of points: what the cameras that see them see on average, and how it changes between them.
+pub struct Shades {
+    /// `[n]` linear colour.
+    pub linear: Vec<[f32; 3]>,
+    /// `[n, functions]` lobes; empty without.
+    pub lobes: Vec<[f32; 3]>,
+    /// `[n]` does any camera see it?
+    pub seen: Vec<bool>,
+}
+
+/// Shades points. Where no camera sees a point, or with `head_on` for all, its colour is what is seen looking
+/// straight at it. `functions` lobes are fitted in the coordinates that `turned` rotates to; 0 for none.
+pub fn shade(
+    points: &Points,
+    mut seen: Seen,
+    learned: &Learned,
+    head_on: bool,
+    functions: usize,
+    turned: glam::Mat3,
+) -> Shades {
+    let n = points.positions.len();
+    let known: Vec<bool> = seen.counts.iter().map(|&c| c > 0).collect();
+    if head_on || known.contains(&false) {
+        // a view of their own for points without one
+        let mut patched = Seen::default();
+        let mut at = 0;
+        for i in 0..n {
+            let own = at..at + seen.counts[i] as usize;
+            at = own.end;
+            if head_on || own.is_empty() {
+                patched.counts.push(1);
+                patched.directions.push(points.normals[i]);
+                patched.weights.push(1.0);
+            } else {
+                patched.counts.push(own.len() as u32);
+                patched.directions.extend(&seen.directions[own.clone()]);
+                patched.weights.extend(&seen.weights[own]);
+            }
+        }
+        seen = patched;
+    }
+    let away: Vec<Vec3> = seen.directions.iter().map(|d| -*d).collect();
+    let colors = (learned.colors)(&points.positions, &points.normals, &seen.counts, &away);
+    let mut first = Vec::with_capacity(n + 1);
+    first.push(0usize);
+    seen.counts.iter().for_each(|&c| first.push(first[first.len() - 1] + c as usize));
+    let mut linear = vec![[0f32; 3]; n];
+    let mut fitted = vec![[0f32; 3]; n * functions];
+    let one = |i: usize, linear: &mut [f32; 3], lobes: &mut [[f32; 3]]| {
+        let own = first[i]..first[i + 1];
+        let Some(colors) = colors.get(own.clone()) else { return };
+        let weights = &seen.weights[own.clone()];
+        let total: f32 = weights.iter().sum::<f32>().max(1e-12);
+        for (c, w) in colors.iter().zip(weights) {
+            (0..3).for_each(|k| linear[k] += w / total * linear_from_srgb(c[k]));
+        }
+        if !lobes.is_empty() && known[i] && !head_on {
+            let base = linear.map(srgb_from_linear);
+            let directions: Vec<Vec3> = seen.directions[own].iter().map(|d| turned * *d).collect();
+            lobes::fit(base, &directions, weights, colors, lobes);
+        }
+    };
+    if functions > 0 {
+        linear
+            .par_iter_mut()
+            .zip(fitted.par_chunks_mut(functions))
+            .enumerate()
+            .with_min_len(256)
+            .for_each(|(i, (c, l))| one(i, c, l));
+    } else {
+        linear.par_iter_mut().enumerate().with_min_len(256).for_each(|(i, c)| one(i, c, &mut []));
+    }
+    Shades { linear, lobes: fitted, seen: known }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::Mesh;
+
+    fn sphere_gradient(p: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        p.iter().map(|p| (p.length() - 0.5, p.normalize_or_zero())).unzip()
+    }
+
+    fn flat(points: &[Vec3]) -> Points {
+        let normals = points.iter().map(|p| p.normalize()).collect();
+        Points { positions: points.to_vec(), normals }
+    }
+
+    #[test]
+    fn points_move_onto_the_sphere_unless_it_is_out_of_reach() {
+        let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], d: &[Vec3]| vec![[0.0; 3]; d.len()];
+        let learned = Learned { gradient: &sphere_gradient, colors: &colors };
+        let start = flat(&[Vec3::new(0.0, 0.0, 0.51), Vec3::new(0.0, 0.485, 0.0), Vec3::new(0.3, 0.0, 0.0)]);
+        let moved = settle(&start, 0.02, &learned);
+        assert!(moved.positions[0].distance(Vec3::Z * 0.5) < 1e-6);
+        assert!(moved.positions[1].distance(Vec3::Y * 0.5) < 1e-6);
+        // 0.2 deep, as a cap is: stays
+        assert_eq!(moved.positions[2], start.positions[2]);
+        assert_eq!(moved.normals[2], start.normals[2]);
+    }
+
+    #[test]
+    fn a_camera_sees_what_faces_it_with_nothing_between() {
+        // a square at z = 0.8 hides the points below x < 0
+        let corner = |x: f32, y: f32| Vec3::new(x, y, 0.8);
+        let hiding = Mesh {
+            positions: vec![corner(-1.0, -1.0), corner(0.0, -1.0), corner(0.0, 1.0), corner(-1.0, 1.0)],
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            ..Mesh::default()
+        };
+        let bvh = Bvh::new(&hiding);
+        let cameras = [Camera::above(100, 100, 100.0, 4.0)];
+        let eyes = Eyes { cameras: &cameras, bvh: &bvh, clearance: 1e-3 };
+        let at = |x: f32, n: Vec3| (Vec3::new(x, 0.0, 0.0), n);
+        let tilted = |degrees: f32| Vec3::new(degrees.to_radians().sin(), 0.0, degrees.to_radians().cos());
+        // free, hidden, turned away, 80 degrees off, outside the frame (50 / 100 · 4 = 2)
+        let all = [
+            at(0.5, Vec3::Z),
+            at(-0.5, Vec3::Z),
+            at(0.5, -Vec3::Z),
+            at(0.5, tilted(80.0)),
+            at(2.1, Vec3::Z),
+        ];
+        let (positions, normals) = all.into_iter().unzip();
+        let points = Points { positions, normals };
+        let seen = eyes.seen(&points, &points);
+        assert_eq!(seen.counts, [1, 0, 0, 0, 0]);
+        // direction (−0.5, 0, 4) / √16.25: cos² = 16 / 16.25
+        assert!((seen.weights[0] - 16.0 / 16.25).abs() < 1e-5);
+    }
+
+    #[test]
+    fn colours_are_averaged_in_linear_light_by_weight() {
+        // coded 0 and 1 with equal weights: linear 0.5, coded 0.735
+        let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], d: &[Vec3]| {
+            d.iter().map(|d| [f32::from(d.x < 0.0), 0.5, 0.0]).collect::<Vec<_>>()
+        };
+        let learned = Learned { gradient: &sphere_gradient, colors: &colors };
+        let points = Points { positions: vec![Vec3::Z; 2], normals: vec![Vec3::Z; 2] };
+        let side = |x: f32| Vec3::new(x, 0.0, 1.0).normalize();
+        let seen =
+            || Seen { counts: vec![2, 0], directions: vec![side(1.0), side(-1.0)], weights: vec![0.5; 2] };
+        let shades = shade(&points, seen(), &learned, false, 4, glam::Mat3::IDENTITY);
+        assert!((shades.linear[0][0] - 0.5).abs() < 1e-6);
+        assert!((shades.linear[0][1] - linear_from_srgb(0.5)).abs() < 1e-6);
+        assert_eq!(shades.seen, [true, false]);
+        // the second is looked at straight: direction −z, x is not negative
+        assert_eq!(shades.linear[1][0], 0.0);
+        // towards +x it is brighter than towards −x
+        let towards = |x: f32| lobes::add(&shades.lobes[..4], side(x))[0];
+        assert!(towards(1.0) > 0.1 && towards(-1.0) < -0.3, "{} {}", towards(1.0), towards(-1.0));
+        assert_eq!(shades.lobes[4..], [[0.0; 3]; 4]);
+        let straight = shade(&points, seen(), &learned, true, 0, glam::Mat3::IDENTITY);
+        assert_eq!(straight.linear[0][0], 0.0);
+    }
+}

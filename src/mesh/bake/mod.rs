@@ -1,0 +1,398 @@
+//! Learned colour becomes texels.
+//!
+//! Every texel that a chart covers is looked at through several samples ([`cover`]); each sample moves onto the
+//! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
+//! they see in linear light ([`light`]). What the cameras see differently can be kept as a few lobes a texel
+//! ([`lobes`]), and the field's normal as a picture of normals. Gaps are filled by [`fill`].
+//!
+//! The picture is baked in bands of rows: memory is bounded whatever the texture's size.
+
+mod cover;
+mod fill;
+mod light;
+pub mod lobes;
+
+pub use light::Learned;
+
+use super::MeshError;
+use crate::geom::{Atlas, Bvh, Camera, Mesh};
+use crate::image::Image;
+use crate::run::Monitor;
+use cover::{Bands, Sample};
+use glam::{Mat3, Vec3};
+use light::{Eyes, Points, settle, shade};
+use serde::{Deserialize, Serialize};
+use std::time::Instant;
+
+/// Whose view of a texel is its colour.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Viewer {
+    /// The mean over the training cameras that see it.
+    Cameras,
+    /// One that looks straight at the surface.
+    Normal,
+}
+
+/// How a texture is baked. Lengths are in the mesh's units.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BakeConfig {
+    /// Samples along each side of a texel, 1..=8.
+    pub side: u32,
+    /// Texels that repeat a chart's border around it.
+    pub gutter_px: u32,
+    /// How far a sample may lie from the true surface: the simplification's error and half a cell.
+    pub reach: f32,
+    /// Whose view counts.
+    pub viewer: Viewer,
+    /// Degree of the lobes, 1 or 2; 0 for none.
+    pub lobes: u32,
+    /// Also bake the field's normals.
+    pub normals: bool,
+    /// Turns directions of the mesh's coordinates into the coordinates that the lobes are kept in.
+    pub turned: Mat3,
+}
+
+/// A baked texture; every picture has the atlas's size.
+#[derive(Clone, Debug)]
+pub struct Baked {
+    /// Linear colour, 3 channels.
+    pub color: Image,
+    /// Lobes of [`lobes`], 3 channels each, sRGB-coded differences; one picture a function.
+    pub lobes: Vec<Image>,
+    /// Unit normals of the field in the mesh's coordinates, 3 channels.
+    pub normal: Option<Image>,
+    /// What was done.
+    pub report: BakeReport,
+}
+
+/// What baking did.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct BakeReport {
+    /// Texels across and down.
+    pub size: [u32; 2],
+    /// Share of texels that a chart covers, 0..=1.
+    pub covered: f64,
+    /// Points of the surface that were looked at.
+    pub samples: usize,
+    /// Share of the samples that at least one camera sees.
+    pub seen: f64,
+    /// Cameras that see a sample, on average over those that one sees.
+    pub views: f64,
+    /// How far samples moved onto the true surface: mean, mesh units.
+    pub moved: f64,
+    /// How long it took.
+    pub seconds: f64,
+}
+
+/// Rows baked together.
+const ROWS: u32 = 32;
+
+/// Points handed to the field at once.
+const BATCH: usize = 1 << 17;
+
+/// Bakes a texture for `mesh` with normals, laid out by `atlas`, from the field it was extracted from.
+///
+/// # Errors
+///
+/// [`MeshError::Config`] for a side of no samples, [`MeshError::Answer`] when the field answers with the wrong
+/// number of colours, [`MeshError::Stopped`].
+pub fn bake(
+    mesh: &Mesh,
+    atlas: &Atlas,
+    learned: &Learned,
+    cameras: &[Camera],
+    config: &BakeConfig,
+    monitor: &dyn Monitor,
+) -> Result<Baked, MeshError> {
+    let begin = Instant::now();
+    if !(1..=8).contains(&config.side) {
+        let found = config.side.to_string();
+        return Err(MeshError::Config { key: "texture_samples", expected: "1..=8", found });
+    }
+    let (width, height) = (atlas.width, atlas.height);
+    let functions = if config.lobes == 0 { 0 } else { lobes::count(config.lobes.min(2)) };
+    let mut color = Image::new(width, height, 3);
+    let mut lobes = vec![Image::new(width, height, 3); functions];
+    let mut normal = config.normals.then(|| Image::new(width, height, 3));
+    let mut covered = vec![false; width as usize * height as usize];
+    let mut totals = Totals::default();
+    let bvh = Bvh::new(mesh);
+    let eyes = Eyes { cameras, bvh: &bvh, clearance: 0.5 * config.reach };
+    let bands = Bands::new(atlas, ROWS);
+    for band in 0..bands.len() {
+        if monitor.stop() {
+            return Err(MeshError::Stopped);
+        }
+        let samples = bands.samples(atlas, band, config.side);
+        for own in whole_texels(&samples) {
+            let flat = on_triangles(mesh, own);
+            let points = settle(&flat, config.reach, learned);
+            let seen = match config.viewer {
+                Viewer::Cameras => eyes.seen(&points, &flat),
+                Viewer::Normal => light::Seen { counts: vec![0; own.len()], ..Default::default() },
+            };
+            totals.add(&seen, &flat, &points);
+            let head_on = config.viewer == Viewer::Normal;
+            let shades = shade(&points, seen, learned, head_on, functions, config.turned);
+            let mut i = 0;
+            for texel in own.chunk_by(|a, b| a.texel == b.texel) {
+                let at = texel[0].texel as usize;
+                covered[at] = true;
+                let all = i..i + texel.len();
+                // where some samples are seen, the unseen say nothing
+                let any = shades.seen[all.clone()].contains(&true);
+                let counts = |s: usize| if any && !shades.seen[s] { 0.0 } else { 1.0 };
+                let total: f32 = all.clone().map(counts).sum();
+                let mean = |value: &dyn Fn(usize) -> [f32; 3]| -> [f32; 3] {
+                    let mut sum = [0f32; 3];
+                    for s in all.clone() {
+                        let w = counts(s) / total;
+                        value(s).iter().zip(&mut sum).for_each(|(v, sum)| *sum += w * v);
+                    }
+                    sum
+                };
+                let put = |image: &mut Image, v: [f32; 3]| image.data[3 * at..3 * at + 3].copy_from_slice(&v);
+                put(&mut color, mean(&|s| shades.linear[s]));
+                for (k, image) in lobes.iter_mut().enumerate() {
+                    put(image, mean(&|s| shades.lobes[s * functions + k]));
+                }
+                if let Some(image) = &mut normal {
+                    let n = Vec3::from(mean(&|s| points.normals[s].to_array()));
+                    put(image, n.normalize_or(points.normals[all.start]).to_array());
+                }
+                i = all.end;
+            }
+        }
+        monitor.step(band as u64 + 1, bands.len() as u64, &[("texels", totals.samples as f64)]);
+    }
+    fill::fill(&mut color, &covered, config.gutter_px);
+    lobes.iter_mut().for_each(|l| fill::fill(l, &covered, config.gutter_px));
+    if let Some(normal) = &mut normal {
+        fill::fill(normal, &covered, config.gutter_px);
+    }
+    let report = totals.report([width, height], &covered, begin.elapsed().as_secs_f64());
+    Ok(Baked { color, lobes, normal, report })
+}
+
+/// Pieces of at most [`BATCH`] samples (or one texel) that end between texels.
+fn whole_texels(samples: &[Sample]) -> impl Iterator<Item = &[Sample]> {
+    let mut rest = samples;
+    std::iter::from_fn(move || {
+        if rest.is_empty() {
+            return None;
+        }
+        let mut end = rest.len().min(BATCH);
+        if end < rest.len() {
+            let last = rest[end].texel;
+            let texel = rest.partition_point(|s| s.texel < last);
+            end = if texel > 0 { texel } else { rest.partition_point(|s| s.texel <= last) };
+        }
+        let (own, after) = rest.split_at(end);
+        rest = after;
+        Some(own)
+    })
+}
+
+/// Positions and interpolated normals of samples.
+fn on_triangles(mesh: &Mesh, samples: &[Sample]) -> Points {
+    let mix = |values: &[Vec3], s: &Sample| {
+        let [a, b, c] = mesh.triangles[s.triangle as usize].map(|i| values[i as usize]);
+        (1.0 - s.u - s.v) * a + s.u * b + s.v * c
+    };
+    let face = |s: &Sample| {
+        let [a, b, c] = mesh.corners(s.triangle);
+        (b - a).cross(c - a).normalize_or(Vec3::Z)
+    };
+    let normal = |s: &Sample| match mesh.normals.is_empty() {
+        true => face(s),
+        false => mix(&mesh.normals, s).normalize_or(face(s)),
+    };
+    Points {
+        positions: samples.iter().map(|s| mix(&mesh.positions, s)).collect(),
+        normals: samples.iter().map(normal).collect(),
+    }
+}
+
+/// Sums for the report.
+#[derive(Default)]
+struct Totals {
+    samples: usize,
+    seen: usize,
+    views: usize,
+    moved: f64,
+}
+
+impl Totals {
+    fn add(&mut self, seen: &light::Seen, flat: &Points, points: &Points) {
+        self.samples += seen.counts.len();
+        self.seen += seen.counts.iter().filter(|&&c| c > 0).count();
+        self.views += seen.counts.iter().map(|&c| c as usize).sum::<usize>();
+        let moved = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
+        self.moved += moved.sum::<f64>();
+    }
+
+    fn report(&self, size: [u32; 2], covered: &[bool], seconds: f64) -> BakeReport {
+        let share = |a: f64, b: usize| if b > 0 { a / b as f64 } else { 0.0 };
+        BakeReport {
+            size,
+            covered: share(covered.iter().filter(|&&c| c).count() as f64, covered.len()),
+            samples: self.samples,
+            seen: share(self.seen as f64, self.samples),
+            views: share(self.views as f64, self.seen),
+            moved: share(self.moved, self.samples),
+            seconds,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::linear_from_srgb;
+    use crate::run::Quiet;
+    use glam::Vec2;
+
+    /// A latitude-longitude sphere of radius 0.5 (coarse), with a seam.
+    fn sphere(width: u32, height: u32) -> (Mesh, Atlas) {
+        let (nu, nv) = (24u32, 12u32);
+        let mut mesh = Mesh::default();
+        let mut atlas = Atlas { width, height, ..Atlas::default() };
+        for j in 0..=nv {
+            for i in 0..=nu {
+                let (lon, lat) = (i as f32 / nu as f32 * std::f32::consts::TAU, j as f32 / nv as f32);
+                let theta = (0.02 + 0.96 * lat) * std::f32::consts::PI;
+                let n = Vec3::new(theta.sin() * lon.cos(), theta.cos(), theta.sin() * lon.sin());
+                mesh.positions.push(0.5 * n);
+                mesh.normals.push(n);
+                let margin = 2.0 / width as f32;
+                let x = margin + (1.0 - 2.0 * margin) * i as f32 / nu as f32;
+                atlas.uvs.push(Vec2::new(x, margin + (1.0 - 2.0 * margin) * lat));
+            }
+        }
+        for j in 0..nv {
+            for i in 0..nu {
+                let at = |i: u32, j: u32| j * (nu + 1) + i;
+                mesh.triangles.push([at(i, j), at(i + 1, j), at(i + 1, j + 1)]);
+                mesh.triangles.push([at(i, j), at(i + 1, j + 1), at(i, j + 1)]);
+            }
+        }
+        atlas.triangles = mesh.triangles.clone();
+        (mesh, atlas)
+    }
+
+    fn gradient(p: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        p.iter().map(|p| (p.length() - 0.5, p.normalize_or_zero())).unzip()
+    }
+
+    fn ring() -> Vec<Camera> {
+        let mut cameras = Vec::new();
+        for k in 0..8 {
+            let a = k as f64 / 8.0 * std::f64::consts::TAU;
+            let rotation = glam::DMat3::from_rotation_y(a);
+            let position = rotation * glam::DVec3::new(0.0, 0.0, 3.0);
+            cameras.push(Camera { rotation, position, ..Camera::above(200, 200, 300.0, 0.0) });
+        }
+        cameras
+    }
+
+    fn config() -> BakeConfig {
+        BakeConfig {
+            side: 2,
+            gutter_px: 4,
+            reach: 0.02,
+            viewer: Viewer::Cameras,
+            lobes: 0,
+            normals: false,
+            turned: Mat3::IDENTITY,
+        }
+    }
+
+    #[test]
+    fn every_texel_has_the_colour_of_its_point_on_the_true_surface() {
+        let (mesh, atlas) = sphere(128, 64);
+        let paint = |p: Vec3| (0.5 + 0.8 * p).to_array();
+        let colors = |p: &[Vec3], _: &[Vec3], counts: &[u32], _: &[Vec3]| -> Vec<[f32; 3]> {
+            p.iter().zip(counts).flat_map(|(p, &n)| std::iter::repeat_n(paint(*p), n as usize)).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        let config = BakeConfig { normals: true, ..config() };
+        let baked = bake(&mesh, &atlas, &learned, &ring(), &config, &Quiet).unwrap();
+        assert!(baked.report.covered > 0.9 && baked.report.seen > 0.7, "{:?}", baked.report);
+        assert!(baked.report.moved > 1e-4 && baked.report.views > 1.5);
+        let normal = baked.normal.unwrap();
+        for y in 4..60 {
+            for x in 4..124 {
+                let n = Vec3::from_slice(normal.pixel(x, y));
+                // painted at the sphere's own point, not at the flat triangle's: 0.5 n
+                let want = paint(0.5 * n).map(linear_from_srgb);
+                let got = baked.color.pixel(x, y);
+                assert!((0..3).all(|k| (got[k] - want[k]).abs() < 4e-3), "{x} {y} {got:?} {want:?}");
+                let lon = (x as f32 + 0.5) / 128.0 * std::f32::consts::TAU;
+                assert!(n.x * lon.cos() + n.z * lon.sin() > 0.97 * n.x.hypot(n.z));
+            }
+        }
+    }
+
+    #[test]
+    fn both_sides_of_the_seam_agree() {
+        let (mesh, atlas) = sphere(256, 128);
+        let colors = |p: &[Vec3], _: &[Vec3], counts: &[u32], _: &[Vec3]| -> Vec<[f32; 3]> {
+            let paint = |p: &Vec3| (0.5 + 0.8 * *p).to_array();
+            p.iter().zip(counts).flat_map(|(p, &n)| std::iter::repeat_n(paint(p), n as usize)).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        let baked = bake(&mesh, &atlas, &learned, &ring(), &config(), &Quiet).unwrap();
+        for y in 4..124 {
+            // columns 2 and 253 lie on both sides of longitude 0, about two texels (0.05 rad) apart
+            let (a, b) = (baked.color.pixel(2, y), baked.color.pixel(253, y));
+            assert!((0..3).all(|k| (a[k] - b[k]).abs() < 0.02), "{a:?} {b:?}");
+        }
+    }
+
+    #[test]
+    fn lobes_keep_what_the_mean_loses() {
+        let (mesh, atlas) = sphere(64, 32);
+        // brighter towards +x
+        let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], away: &[Vec3]| -> Vec<[f32; 3]> {
+            away.iter().map(|d| [0.5 - 0.2 * d.x, 0.5, 0.5]).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        let config = BakeConfig { lobes: 1, ..config() };
+        let baked = bake(&mesh, &atlas, &learned, &ring(), &config, &Quiet).unwrap();
+        assert_eq!(baked.lobes.len(), 4);
+        // at longitude 90° (+z), seen by three cameras from −45° to 45°
+        let (x, y) = (16, 16);
+        let base = crate::image::srgb_from_linear(baked.color.pixel(x, y)[0]);
+        let l: Vec<[f32; 3]> = baked.lobes.iter().map(|i| i.pixel(x, y).try_into().unwrap()).collect();
+        for side in [-0.6f32, 0.0, 0.6] {
+            let d = Vec3::new(side, 0.0, 1.0).normalize();
+            let truth = 0.5 + 0.2 * d.x;
+            let with = base + lobes::add(&l, d)[0];
+            assert!(
+                (with - truth).abs() <= 0.3 * (base - truth).abs() + 0.01,
+                "{side}: {with} {base} {truth}"
+            );
+        }
+    }
+
+    #[test]
+    fn straight_views_and_texel_sized_textures_work() {
+        let (mesh, mut atlas) = sphere(8, 4);
+        atlas.uvs.iter_mut().for_each(|uv| *uv = uv.clamp(Vec2::ZERO, Vec2::ONE));
+        let colors = |_: &[Vec3], n: &[Vec3], counts: &[u32], away: &[Vec3]| -> Vec<[f32; 3]> {
+            assert!(counts.iter().all(|&c| c == 1));
+            n.iter().zip(away).map(|(n, d)| [n.dot(-*d), 0.0, 0.0]).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        for (width, height) in [(8, 4), (1, 1)] {
+            let atlas = Atlas { width, height, ..atlas.clone() };
+            let config = BakeConfig { viewer: Viewer::Normal, ..config() };
+            let baked = bake(&mesh, &atlas, &learned, &ring(), &config, &Quiet).unwrap();
+            assert!(baked.color.data.chunks(3).all(|c| (c[0] - 1.0).abs() < 1e-4));
+            assert_eq!(baked.report.seen, 0.0);
+        }
+        let bad = BakeConfig { side: 0, ..config() };
+        assert!(bake(&mesh, &atlas, &learned, &[], &bad, &Quiet).is_err());
+    }
+}
