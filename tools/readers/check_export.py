@@ -43,7 +43,7 @@ def turn_to_y_up(up):
 
 
 def with_trimesh(path):
-    scene = trimesh.load_scene(path, process=False, maintain_order=True)
+    scene = trimesh.load_scene(path, process=False)
     (node,) = scene.graph.nodes_geometry  # an export holds one mesh
     matrix, name = scene.graph[node]
     mesh = scene.geometry[name]
@@ -70,7 +70,7 @@ def with_open3d(path):
     faces = numpy.asarray(mesh.triangles)
     uvs = numpy.asarray(mesh.triangle_uvs).reshape(-1, 3, 2) if mesh.has_triangle_uvs() else None
     pictures = [numpy.asarray(t) for t in mesh.textures if not t.is_empty()]
-    picture = pictures[0][:, :, :3] if pictures else None
+    picture = pictures[0][::-1, :, :3] if pictures else None  # open3d keeps the lowest row first
     return Seen(numpy.asarray(mesh.vertices), faces, colors, uvs, picture)
 
 
