@@ -330,7 +330,8 @@ fn texture_coordinates_that_are_not_numbers_are_refused_in_every_format() {
         let (d, bin) = textured(&png(1, 1), uvs);
         assert!(whole_message(&glb(&d, &bin)).contains("accessor 2: element 2 is"));
     }
-    let obj = |vt: &str, f: &str| whole_message(format!("v 0 0 0\nv 1 0 0\nv 0 1 0\n{vt}\nf {f}\n").as_bytes());
+    let obj =
+        |vt: &str, f: &str| whole_message(format!("v 0 0 0\nv 1 0 0\nv 0 1 0\n{vt}\nf {f}\n").as_bytes());
     assert!(obj("vt nan 0", "1 2 3").contains("`bad`, line 4: `nan` is not a finite number"));
     assert!(obj("vt 0", "1 2 3").contains("1 numbers, expected u v"));
     assert!(obj("vt 0 0", "1/2 2/1 3/1").contains("index `2`, but there are 1 texture coordinates so far"));
@@ -433,7 +434,10 @@ fn crooked_plys_are_named_errors() {
     let xyz = "property float x\nproperty float y\nproperty float z\n";
     let list = "property list uchar int vertex_indices\n";
     let ascii = |v: &str, f: &str, body: &str| {
-        ply_of(&format!("format ascii 1.0\nelement vertex {v}\n{xyz}element face {f}\n{list}"), body.as_bytes())
+        ply_of(
+            &format!("format ascii 1.0\nelement vertex {v}\n{xyz}element face {f}\n{list}"),
+            body.as_bytes(),
+        )
     };
     let binary = |v: &str, f: &str, body: &[u8]| {
         ply_of(
