@@ -4,10 +4,13 @@
 use glam::Vec3;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use tiface::geom::Mesh;
+use tiface::geom::{Atlas, Mesh};
+use tiface::image::Photo;
 use tiface::mesh::check::check;
 use tiface::mesh::export::ExportOptions;
-use tiface::mesh::read::{Limits, ReadMeshError, read, read_limited};
+use tiface::mesh::read::{Limits, ReadMeshError, picture_of_mtl, read, read_limited, read_whole};
+use tiface::mesh::textured::{TextureOptions, Textured};
+use tiface::mesh::{gltf, obj, ply};
 use tiface::mesh::{gltf::to_glb, obj::to_obj, ply::to_ply};
 
 fn tetrahedron() -> Mesh {
@@ -216,7 +219,213 @@ fn polygons_are_fanned_and_negative_indices_count_from_the_end() {
     assert!(mesh.colors.is_empty() && mesh.normals.is_empty());
 }
 
-fn ply(header: &str, body: &[u8]) -> Vec<u8> {
+/// A 1 × 1 PNG whose header may lie about its size; the sums of the chunks are right.
+fn png(width: u32, height: u32) -> Vec<u8> {
+    let chunk = |kind: &[u8], data: &[u8]| {
+        let whole = [kind, data].concat();
+        let sum = crc32fast::hash(&whole).to_be_bytes();
+        [&(data.len() as u32).to_be_bytes()[..], &whole, &sum].concat()
+    };
+    let size = [width.to_be_bytes(), height.to_be_bytes()].concat();
+    // one grey pixel, stored: filter 0, value 7; Adler-32 of (0, 7) is 1 + 0 + 7 = 8, and 1 + 8 = 9
+    let data = [0x78, 0x01, 1, 2, 0, 0xfd, 0xff, 0, 7, 0, 9, 0, 8];
+    [
+        &b"\x89PNG\r\n\x1a\n"[..],
+        &chunk(b"IHDR", &[&size[..], &[8, 0, 0, 0, 0]].concat()),
+        &chunk(b"IDAT", &data),
+        &chunk(b"IEND", b""),
+    ]
+    .concat()
+}
+
+/// The tetrahedron with texture coordinates (32 bytes from 60) and a picture (from 92).
+fn textured(picture: &[u8], uvs: [[f32; 2]; 4]) -> (Value, Vec<u8>) {
+    let mut bin = bin();
+    bin.extend(uvs.as_flattened().iter().flat_map(|v| v.to_le_bytes()));
+    bin.extend(picture);
+    let mut d = document();
+    d["buffers"][0]["byteLength"] = json!(bin.len());
+    bin.resize(bin.len().next_multiple_of(4), 0);
+    let views = d["bufferViews"].as_array_mut().unwrap();
+    views.push(json!({"buffer": 0, "byteOffset": 60, "byteLength": 32}));
+    views.push(json!({"buffer": 0, "byteOffset": 92, "byteLength": picture.len()}));
+    let accessor = json!({"bufferView": 2, "componentType": 5126, "count": 4, "type": "VEC2"});
+    d["accessors"].as_array_mut().unwrap().push(accessor);
+    d["images"] = json!([{"bufferView": 3, "mimeType": "image/png"}]);
+    d["textures"] = json!([{"source": 0}]);
+    d["materials"] = json!([{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]);
+    let primitive = &mut d["meshes"][0]["primitives"][0];
+    primitive["attributes"]["TEXCOORD_0"] = json!(2);
+    primitive["material"] = json!(0);
+    (d, bin)
+}
+
+const UVS: [[f32; 2]; 4] = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.5]];
+
+fn whole_message(bytes: &[u8]) -> String {
+    match read_whole(bytes, Path::new("bad")) {
+        Ok(whole) => format!("read, texture {}", whole.texture.is_some()),
+        Err(e) => {
+            assert!(!e.hint().is_empty());
+            e.to_string()
+        }
+    }
+}
+
+#[test]
+fn crooked_textures_are_named_errors_but_leave_the_surface_readable() {
+    let (d, bin) = textured(&png(1, 1), UVS);
+    let good = read_whole(&glb(&d, &bin), Path::new("a")).unwrap();
+    let atlas = good.atlas.unwrap();
+    assert_eq!((atlas.width, atlas.height, atlas.uvs[3].to_array()), (1, 1, [0.5, 0.5]));
+    assert!(good.texture.is_some());
+    let info = "/materials/0/pbrMetallicRoughness/baseColorTexture";
+    let cases = [
+        ("/accessors/2/count", json!(5), "accessor 2: 5 elements do not fit into the 32 bytes"),
+        ("/accessors/2/count", json!(3), "3 of `TEXCOORD_0` for 4 of `POSITION`"),
+        ("/accessors/2/byteOffset", json!(u64::MAX), "elements do not fit"),
+        ("/accessors/2/type", json!("VEC3"), "type VEC3"),
+        ("/accessors/2/componentType", json!(5125), "of components 5125"),
+        ("/bufferViews/2/byteLength", json!(1 << 20), "do not fit into a buffer of"),
+        ("/meshes/0/primitives/0/attributes/TEXCOORD_0", json!(9), "accessor 9: is named"),
+        ("/meshes/0/primitives/0/material", json!(1), "names material 1, but there are only 1"),
+        (info, json!({"index": 3}), "texture 3: is named, but there are only 1"),
+        (info, json!({"index": -1}), "the JSON chunk"),
+        (info, json!({"index": 0, "texCoord": 1}), "there is no `TEXCOORD_1`"),
+        (
+            info,
+            json!({"index": 0, "extensions": {"KHR_texture_transform": {}}}),
+            "`KHR_texture_transform` is not supported",
+        ),
+        ("/textures/0/source", json!(4), "image 4: is named, but there are only 1"),
+        ("/textures/0/source", Value::Null, "a texture without a PNG or JPEG of its own"),
+        ("/images/0/bufferView", json!(4), "buffer view 4: is named, but there are only 4"),
+        ("/images/0/bufferView", Value::Null, "image 0: has no buffer view"),
+        ("/images/0/bufferView", json!(0), "image 0: "), // positions are no picture
+        ("/bufferViews/3/byteLength", json!(1 << 30), "do not fit into a buffer of"),
+        ("/bufferViews/3/byteLength", json!(20), "image 0: "),
+        ("/images/0/uri", json!("../../etc/passwd"), "image 0: a picture outside the file is not supported"),
+        ("/images/0/uri", json!("http://example.com/a.png"), "a picture outside the file"),
+        ("/images/0/uri", json!("data:image/png;base64,AAAA"), "a picture outside the file"),
+    ];
+    for (pointer, value, expected) in cases {
+        let mut d = d.clone();
+        let (parent, key) = pointer.rsplit_once('/').unwrap();
+        d.pointer_mut(parent).unwrap_or_else(|| panic!("{pointer}"))[key] = value;
+        let bytes = glb(&d, &bin);
+        let found = whole_message(&bytes);
+        assert!(found.contains(expected), "{pointer}: expected {expected:?}, found {found:?}");
+        // who wants the surface alone does not care
+        if expected != "the JSON chunk" && !pointer.starts_with("/bufferViews/2") {
+            assert!(read(&bytes, Path::new("a")).is_ok(), "{pointer}");
+        }
+    }
+}
+
+#[test]
+fn texture_coordinates_that_are_not_numbers_are_refused_in_every_format() {
+    for bad in [f32::NAN, f32::INFINITY] {
+        let mut uvs = UVS;
+        uvs[2][1] = bad;
+        let (d, bin) = textured(&png(1, 1), uvs);
+        assert!(whole_message(&glb(&d, &bin)).contains("accessor 2: element 2 is"));
+    }
+    let obj =
+        |vt: &str, f: &str| whole_message(format!("v 0 0 0\nv 1 0 0\nv 0 1 0\n{vt}\nf {f}\n").as_bytes());
+    assert!(obj("vt nan 0", "1 2 3").contains("`bad`, line 4: `nan` is not a finite number"));
+    assert!(obj("vt 0", "1 2 3").contains("1 numbers, expected u v"));
+    assert!(obj("vt 0 0", "1/2 2/1 3/1").contains("index `2`, but there are 1 texture coordinates so far"));
+    assert!(obj("vt 0 0", "1/0 2/1 3/1").contains("index `0`"));
+    assert_eq!(obj("vt 0 0", "1/1 2/1 3/-1"), "read, texture false");
+    let header = "format ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+                  property float s\nproperty float t\nelement face 1\n\
+                  property list uchar int vertex_indices\n";
+    let bytes = ply_of(header, b"0 0 0 0 0\n1 0 0 0 nan\n0 1 0 0 0\n3 0 1 2\n");
+    assert!(whole_message(&bytes).contains("vertex 1: its texture coordinate is not finite"));
+    assert!(read(&bytes, Path::new("a")).is_ok());
+}
+
+#[test]
+fn pictures_that_claim_too_much_are_refused_before_they_are_decoded() {
+    // a side above the limit; an area above it
+    for (width, height) in [(1_000_000, 1), (u32::MAX, u32::MAX), (16_384, 200_000)] {
+        let (d, bin) = textured(&png(width, height), UVS);
+        let found = whole_message(&glb(&d, &bin));
+        assert!(found.contains("`bad`, image 0: ") && found.contains("longest side"), "{found}");
+    }
+    // within the limits but more than 13 bytes can hold: named when it is decoded
+    let (d, bin) = textured(&png(16_384, 16_384), UVS);
+    let whole = read_whole(&glb(&d, &bin), Path::new("a")).unwrap();
+    let Some(tiface::mesh::read::Texture::Inside(bytes)) = whole.texture else { panic!("no picture") };
+    let e = tiface::io::parse_photo(&bytes, Path::new("a"), &tiface::io::Limits::default()).unwrap_err();
+    assert!(e.to_string().contains("cannot come from"), "{e}");
+}
+
+#[test]
+fn names_of_textures_never_leave_the_folder() {
+    for name in ["../a.mtl", "/etc/passwd", "a\\b.mtl", "http://example.com/a", "c:a.mtl", "..", ""] {
+        let obj = format!("mtllib {name}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n");
+        assert!(whole_message(obj.as_bytes()).contains("a texture outside the folder"), "{name}");
+        assert!(read(obj.as_bytes(), Path::new("a")).is_ok());
+        let mtl = format!("newmtl a\nmap_Kd  {name} \n");
+        let found = picture_of_mtl(mtl.as_bytes(), Path::new("a"));
+        // a line without a name names nothing
+        assert!(if name.is_empty() { matches!(found, Ok(None)) } else { found.is_err() }, "{name}");
+    }
+    let mtl = |text: &str| picture_of_mtl(text.as_bytes(), Path::new("a")).map_err(|e| e.to_string());
+    assert_eq!(mtl("newmtl a\r\nmap_Kd ./my head.png\r\n"), Ok(Some("my head.png".into())));
+    assert_eq!(mtl("newmtl a\nmap_Kdx a.png"), Ok(None));
+    assert!(mtl("map_Kd -s 2 2 2 a.png").unwrap_err().contains("a texture with options"));
+    assert!(mtl("map_Kd a.png\nmap_Kd b.png").unwrap_err().contains("several base colours"));
+}
+
+#[test]
+fn several_materials_have_no_single_atlas() {
+    let (mut d, bin) = textured(&png(1, 1), UVS);
+    let primitive = d["meshes"][0]["primitives"][0].clone();
+    d["meshes"][0]["primitives"].as_array_mut().unwrap().push(primitive);
+    assert_eq!(whole_message(&glb(&d, &bin)), "read, texture true"); // one texture, twice
+    d["meshes"][0]["primitives"][1]["material"] = Value::Null;
+    assert!(whole_message(&glb(&d, &bin)).contains("a mesh with several base colours is not supported"));
+    let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\nusemtl b\nf 1 2 3\n";
+    assert!(whole_message(obj.as_bytes()).contains("line 6: a mesh with several materials"));
+}
+
+#[test]
+fn a_bent_byte_in_a_textured_file_is_survived() {
+    let mesh = tetrahedron();
+    let uvs = (0..12).map(|i| glam::Vec2::new((i % 4) as f32 / 4.0, (i / 4) as f32 / 4.0)).collect();
+    let triangles = (0..4).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
+    let atlas = Atlas { uvs, triangles, width: 2, height: 2 };
+    let color = Photo { width: 2, height: 2, rgb: vec![[9, 8, 7]; 4], alpha: None };
+    let (whole, texture) = (Textured::new(&mesh, &atlas, &color), TextureOptions::default());
+    let options = ExportOptions::default();
+    let quantized = TextureOptions { quantize: true, ..texture.clone() };
+    for out in [
+        gltf::textured_to_glb(&whole, &options, &texture).unwrap(),
+        gltf::textured_to_glb(&whole, &options, &quantized).unwrap(),
+        obj::textured_to_obj(&whole, &options, &texture).unwrap(),
+        ply::textured_to_ply(&whole, &texture).unwrap(),
+    ] {
+        let bytes = &out.files[0].1;
+        assert!(read_whole(bytes, Path::new("a")).unwrap().atlas.is_some());
+        for at in 0..bytes.len() {
+            for value in [0x00, 0xff, b'9', b'-', bytes[at] ^ 0x80, bytes[at].wrapping_add(1)] {
+                let mut bent = bytes.clone();
+                bent[at] = value;
+                let Ok(found) = read_whole(&bent, Path::new("a")) else { continue };
+                let Some(atlas) = found.atlas else { continue };
+                assert_eq!(atlas.triangles.len(), found.mesh.triangles.len());
+                assert!(atlas.uvs.iter().all(|uv| uv.is_finite()));
+                let count = atlas.uvs.len() as u32;
+                assert!(atlas.triangles.iter().flatten().all(|&i| i < count));
+            }
+            assert!(at == 0 || out.files.len() > 1 || read_whole(&bytes[..at], Path::new("a")).is_err());
+        }
+    }
+}
+
+fn ply_of(header: &str, body: &[u8]) -> Vec<u8> {
     [b"ply\n", header.as_bytes(), b"end_header\n", body].concat()
 }
 
@@ -225,10 +434,13 @@ fn crooked_plys_are_named_errors() {
     let xyz = "property float x\nproperty float y\nproperty float z\n";
     let list = "property list uchar int vertex_indices\n";
     let ascii = |v: &str, f: &str, body: &str| {
-        ply(&format!("format ascii 1.0\nelement vertex {v}\n{xyz}element face {f}\n{list}"), body.as_bytes())
+        ply_of(
+            &format!("format ascii 1.0\nelement vertex {v}\n{xyz}element face {f}\n{list}"),
+            body.as_bytes(),
+        )
     };
     let binary = |v: &str, f: &str, body: &[u8]| {
-        ply(
+        ply_of(
             &format!("format binary_little_endian 1.0\nelement vertex {v}\n{xyz}element face {f}\n{list}"),
             body,
         )
@@ -262,16 +474,16 @@ fn crooked_plys_are_named_errors() {
             binary("1", "1", &[[0u8; 12].as_slice(), &[255, 0, 0]].concat()),
             "a list of 255 values does not fit",
         ),
-        (ply("format ascii 2.0\nelement vertex 99\n", b""), "element `vertex`: has no properties"),
-        (ply("format telepathy 1.0\n", b""), "format `telepathy` is unknown"),
-        (ply("element vertex 1\nproperty quad x\n", b""), "type `quad` is unknown"),
-        (ply("property float x\n", b""), "a property before any element"),
-        (ply("hello\n", b""), "header line 2: `hello` is not understood"),
-        (ply("", b""), "there was no `format`"),
+        (ply_of("format ascii 2.0\nelement vertex 99\n", b""), "element `vertex`: has no properties"),
+        (ply_of("format telepathy 1.0\n", b""), "format `telepathy` is unknown"),
+        (ply_of("element vertex 1\nproperty quad x\n", b""), "type `quad` is unknown"),
+        (ply_of("property float x\n", b""), "a property before any element"),
+        (ply_of("hello\n", b""), "header line 2: `hello` is not understood"),
+        (ply_of("", b""), "there was no `format`"),
         (b"ply\nformat ascii 1.0".to_vec(), "the header has no end"),
-        (ply("format ascii 1.0\nelement vertex 0\nproperty float x\n", b""), "has no x, y, z"),
+        (ply_of("format ascii 1.0\nelement vertex 0\nproperty float x\n", b""), "has no x, y, z"),
         (
-            ply(&format!("format ascii 1.0\nelement tristrips 1\n{list}"), b"3 0 1 2"),
+            ply_of(&format!("format ascii 1.0\nelement tristrips 1\n{list}"), b"3 0 1 2"),
             "a triangle strip is not supported",
         ),
     ];
@@ -317,7 +529,7 @@ fn every_dialect_of_ply_gives_the_same_mesh() {
     let meshes: Vec<Mesh> =
         [("ascii", text.as_bytes()), ("binary_little_endian", &little), ("binary_big_endian", &big)]
             .into_iter()
-            .map(|(format, body)| read(&ply(&header(format), body), Path::new("a")).unwrap())
+            .map(|(format, body)| read(&ply_of(&header(format), body), Path::new("a")).unwrap())
             .collect();
     assert_eq!(meshes[0].triangles, [[0, 1, 2], [0, 2, 3]]);
     assert_eq!(meshes[0].colors[0], [1.0, 0.2, 0.5]);

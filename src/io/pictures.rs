@@ -253,11 +253,19 @@ fn decode(
     expected: Option<(u32, u32)>,
     limits: &Limits,
 ) -> Result<(DynamicImage, Turn), ReadError> {
-    let bytes = read_bytes(path, limits)?;
-    let (mut picture, exif) = match kind(path, &bytes)? {
+    decode_bytes(&read_bytes(path, limits)?, path, expected, limits)
+}
+
+fn decode_bytes(
+    bytes: &[u8],
+    path: &Path,
+    expected: Option<(u32, u32)>,
+    limits: &Limits,
+) -> Result<(DynamicImage, Turn), ReadError> {
+    let (mut picture, exif) = match kind(path, bytes)? {
         Kind::Png => {
-            let data = walk_png(path, &bytes)?;
-            let mut decoder = png_decoder(path, &bytes, limits)?;
+            let data = walk_png(path, bytes)?;
+            let mut decoder = png_decoder(path, bytes, limits)?;
             let (width, height) = decoder.dimensions();
             check_size(path, width, height, decoder.color_type().bytes_per_pixel() as u64, limits)?;
             // deflate cannot shrink by more than 1032: a small file that claims more is lying
@@ -273,8 +281,8 @@ fn decode(
             (picture, exif)
         }
         Kind::Jpeg => {
-            walk_jpeg(path, &bytes)?;
-            let (mut decoder, info) = jpeg_decoder(path, &bytes, limits)?;
+            walk_jpeg(path, bytes)?;
+            let (mut decoder, info) = jpeg_decoder(path, bytes, limits)?;
             let pixels =
                 decoder.decode().map_err(|e| ReadError::damaged(path, "JPEG", None, format!("{e:?}")))?;
             let (w, h) = (info.width, info.height);
@@ -318,6 +326,21 @@ fn eight_bit(picture: DynamicImage) -> (usize, Vec<u8>) {
 /// not an error here.
 pub fn read_photo(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> Result<Picture, ReadError> {
     let (picture, turn) = decode(path, expected, limits)?;
+    Ok(Picture { photo: photo(picture), turn })
+}
+
+/// A picture that lies inside another file, as [`read_photo`] would read it from one of its own.
+/// `path` is for messages only.
+pub fn parse_photo(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Photo, ReadError> {
+    decode_bytes(bytes, path, None, limits).map(|(picture, _)| photo(picture))
+}
+
+/// [`picture_info`] of a picture that lies inside another file. `path` is for messages only.
+pub fn parse_picture_info(bytes: &[u8], path: &Path, limits: &Limits) -> Result<PictureInfo, ReadError> {
+    header(path, bytes, limits)
+}
+
+fn photo(picture: DynamicImage) -> Photo {
     let (width, height) = (picture.width(), picture.height());
     let (channels, bytes) = eight_bit(picture);
     let rgb = match channels {
@@ -325,7 +348,7 @@ pub fn read_photo(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) ->
         _ => bytes.chunks_exact(channels).map(|p| [p[0], p[1], p[2]]).collect(),
     };
     let alpha = (channels % 2 == 0).then(|| bytes.chunks_exact(channels).map(|p| p[channels - 1]).collect());
-    Ok(Picture { photo: Photo { width, height, rgb, alpha }, turn })
+    Photo { width, height, rgb, alpha }
 }
 
 /// Reads a mask: the grey channel; of a picture with alpha that is not opaque everywhere, the alpha;
@@ -406,6 +429,12 @@ mod tests {
         assert_eq!(read_gray(&path, None, &limits).unwrap().values, [4, 8]); // alpha says what is the head
         let info = picture_info(&path, &limits).unwrap();
         assert_eq!((info.width, info.height, info.alpha, info.exif), (1, 2, true, 1));
+        let bytes = std::fs::read(&path).unwrap();
+        assert_eq!(parse_picture_info(&bytes, &path, &limits).unwrap(), info);
+        assert_eq!(parse_photo(&bytes, &path, &limits).unwrap().rgb, [[1, 2, 3], [5, 6, 7]]);
+        let small = Limits { side_px: 1, ..limits };
+        assert!(parse_photo(&bytes, &path, &small).is_err());
+        assert!(parse_picture_info(&bytes, &path, &small).is_err());
     }
 
     #[test]

@@ -63,6 +63,42 @@ pub enum ExportError {
         /// How many there should be, if any.
         expected: usize,
     },
+    /// An atlas for another mesh.
+    #[error("the atlas has {found} triangles, the mesh {expected}")]
+    AtlasLength {
+        /// Triangles of the atlas.
+        found: usize,
+        /// Triangles of the mesh.
+        expected: usize,
+    },
+    /// A triangle names a texture coordinate that is not there.
+    #[error("triangle {triangle} uses texture coordinate {index}, but there are only {uvs}")]
+    AtlasIndex {
+        /// Which triangle.
+        triangle: usize,
+        /// What it names.
+        index: u32,
+        /// How many texture coordinates there are.
+        uvs: usize,
+    },
+    /// A texture coordinate that is NaN or off the texture.
+    #[error("texture coordinate {index} is {found}, expected 0 to 1 in both directions")]
+    Uv {
+        /// Which one.
+        index: usize,
+        /// Its value.
+        found: String,
+    },
+    /// A picture that does not fit its own size, the atlas, or its encoder.
+    #[error("the {what} is {found}, expected {expected}")]
+    Picture {
+        /// Which picture.
+        what: String,
+        /// What it is.
+        found: String,
+        /// What it should be.
+        expected: String,
+    },
     /// An up direction without direction, or a unit without size.
     #[error("`{what}` is {found}, expected {expected}")]
     Option {
@@ -88,6 +124,10 @@ impl ExportError {
             ExportError::Empty => "train longer, or check the mask: an empty surface has no file",
             ExportError::Option { .. } => "set it in the configuration, or leave it to the capture",
             ExportError::TooLarge { .. } => "ask for fewer triangles, or write a .ply",
+            ExportError::AtlasLength { .. } | ExportError::AtlasIndex { .. } | ExportError::Uv { .. } => {
+                "the atlas is damaged or belongs to another mesh; unwrap it again"
+            }
+            ExportError::Picture { .. } => "bake it again, for this atlas",
             _ => "the mesh is damaged; extract it again",
         }
     }
@@ -123,8 +163,7 @@ pub(super) fn ready(mesh: &Mesh, turn: DMat3, unit_m: f64, recentre: bool) -> Re
             return Err(ExportError::Length { what, found, expected: vertices });
         }
     }
-    let triangles: Vec<[u32; 3]> =
-        mesh.triangles.iter().copied().filter(|[a, b, c]| a != b && b != c && c != a).collect();
+    let triangles: Vec<[u32; 3]> = mesh.triangles.iter().copied().filter(has_three_corners).collect();
     if triangles.is_empty() {
         return Err(ExportError::Empty);
     }
@@ -154,6 +193,11 @@ pub(super) fn ready(mesh: &Mesh, turn: DMat3, unit_m: f64, recentre: bool) -> Re
     let mut normals: Vec<Vec3> = mesh.normals.iter().map(turned).collect();
     mend_normals(&mut normals, &positions, &triangles);
     Ok(Ready { positions, normals, colors: mesh.colors.clone(), triangles, translation })
+}
+
+/// Does a triangle name three different vertices? The others are not written.
+pub(super) fn has_three_corners([a, b, c]: &[u32; 3]) -> bool {
+    a != b && b != c && c != a
 }
 
 /// Gives every normal that is zero or not finite the area-weighted mean of its faces, or +Y.

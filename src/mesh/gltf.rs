@@ -1,26 +1,45 @@
 //! A mesh as GLB: glTF 2.0, binary, one file (Khronos, *glTF 2.0 Specification*).
 //!
-//! Right-handed, +Y up, metres, counter-clockwise. `COLOR_0` is **linear** light, while our vertex
-//! colours are sRGB-coded. Colours that already hold the light are marked `KHR_materials_unlit`,
-//! beside a rough non-metal for viewers that do not know it. Every accessor starts at a multiple of
-//! four bytes; `min` and `max` are the stored f32 numbers themselves.
+//! Right-handed, +Y up, metres, counter-clockwise. Colours that already hold the light are marked
+//! `KHR_materials_unlit`, beside a rough non-metal for viewers that do not know it.
+//!
+//! Colour is either the vertices' own or a texture's, never both, since viewers multiply them:
+//! `COLOR_0` is **linear** light, while our vertex colours and pictures are sRGB-coded. Pictures lie in
+//! the file. A mesh far from the origin is written around its middle, which its node carries.
+//!
+//! # Textures that depend on the view
+//!
+//! A texture that nothing refers to may be dropped by any tool, and the Khronos validator says so for
+//! one that is named in `extras` alone. So each lobe is the base colour of a material of its own, which
+//! the primitive offers as a variant (`KHR_materials_variants`). Viewers show the first material
+//! unless somebody asks for a variant, and those that know nothing of variants always do. The first
+//! material says how to use them:
+//!
+//! ```json
+//! "extras": { "tiface": { …what the caller gave…,
+//!   "lobes": [ { "name": "lobe 0", "texture": 1, "material": 1, "variant": 0 } ] } }
+//! ```
 
 use super::export::{ExportError, ExportOptions, check_unit, ready, turn_to_y_up};
+use super::gltf_document::{Document, info};
+use super::textured::{
+    Exported, PictureFormat, Split, TextureOptions, Textured, encode, placed, safe_stem, split,
+};
+use super::textured_tangents;
 use crate::geom::{Aabb, Mesh};
 use crate::image::linear_from_srgb;
 use glam::Vec3;
-use gltf_json::accessor::{ComponentType, GenericComponentType, Type};
-use gltf_json::buffer::Target;
-use gltf_json::material::{PbrMetallicRoughness, StrengthFactor};
+use gltf_json::extensions::mesh::{KhrMaterialsVariants, Mapping};
+use gltf_json::extensions::scene::khr_materials_variants::Variant;
+use gltf_json::material::{NormalTexture, PbrMetallicRoughness, StrengthFactor};
 use gltf_json::mesh::{Mode, Primitive, Semantic};
-use gltf_json::validation::{Checked::Valid, USize64};
-use gltf_json::{Accessor, Index, Root, Value};
+use gltf_json::texture::Info;
+use gltf_json::validation::Checked::Valid;
+use gltf_json::{Index, Material};
+use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
-/// Below this many vertices indices are 16 bit; 65 535 itself is kept free for primitive restart.
-const SHORT_INDICES: usize = 65_535;
-
-/// The mesh as the bytes of a `.glb` file.
+/// The mesh as the bytes of a `.glb` file, coloured by its vertices.
 ///
 /// # Errors
 ///
@@ -28,83 +47,127 @@ const SHORT_INDICES: usize = 65_535;
 /// the file would pass 4 GiB.
 pub fn to_glb(mesh: &Mesh, options: &ExportOptions) -> Result<Vec<u8>, ExportError> {
     check_unit(options.unit_m)?;
-    let mesh = ready(mesh, turn_to_y_up(options.up)?, options.unit_m, true)?;
-    let mut writer = Writer::default();
-    let vertices = mesh.positions.len();
-
-    let bounds = Aabb::around(mesh.positions.iter().copied());
-    let position = writer.vectors(&mesh.positions, Some(bounds));
-    let mut attributes = BTreeMap::from([(Valid(Semantic::Positions), position)]);
-    if !mesh.normals.is_empty() {
-        attributes.insert(Valid(Semantic::Normals), writer.vectors(&mesh.normals, None));
-    }
-    if !mesh.colors.is_empty() {
-        let linear: Vec<Vec3> = mesh.colors.iter().map(|c| c.map(linear_from_srgb).into()).collect();
-        attributes.insert(Valid(Semantic::Colors(0)), writer.vectors(&linear, None));
-    }
-    let flat = mesh.triangles.as_flattened();
-    let indices = if vertices < SHORT_INDICES {
-        let short: Vec<u16> = flat.iter().map(|&i| i as u16).collect();
-        writer.push(
-            bytes_of(&short),
-            short.len(),
-            ComponentType::U16,
-            Type::Scalar,
-            Target::ElementArrayBuffer,
-        )
-    } else {
-        writer.push(bytes_of(flat), flat.len(), ComponentType::U32, Type::Scalar, Target::ElementArrayBuffer)
+    let ready = ready(mesh, turn_to_y_up(options.up)?, options.unit_m, true)?;
+    let translation = ready.translation;
+    let shape = Split {
+        positions: ready.positions,
+        normals: ready.normals,
+        colors: ready.colors,
+        triangles: ready.triangles,
+        ..Split::default()
     };
-
-    let Writer { mut root, bin } = writer;
-    root.asset.generator = Some(concat!("tiface ", env!("CARGO_PKG_VERSION")).into());
-    let material = root.push(material(options));
-    let name = Some(options.name.clone());
-    let primitive = Primitive {
-        attributes,
-        indices: Some(indices),
-        material: Some(material),
-        mode: Valid(Mode::Triangles),
-        extensions: None,
-        extras: Default::default(),
-        targets: None,
-    };
-    let shape = root.push(gltf_json::Mesh {
-        primitives: vec![primitive],
-        name: name.clone(),
-        weights: None,
-        extensions: None,
-        extras: Default::default(),
-    });
-    let translation = (mesh.translation != Vec3::ZERO).then(|| mesh.translation.to_array());
-    let node = root.push(gltf_json::Node { mesh: Some(shape), name, translation, ..Default::default() });
-    let scene = root.push(gltf_json::Scene {
-        nodes: vec![node],
-        name: None,
-        extensions: None,
-        extras: Default::default(),
-    });
-    root.scene = Some(scene);
-    if options.unlit {
-        root.extensions_used.push("KHR_materials_unlit".into());
-    }
-    root.push(gltf_json::Buffer {
-        byte_length: USize64(bin.len() as u64),
-        name: None,
-        uri: None,
-        extensions: None,
-        extras: Default::default(),
-    });
-    pack(&root, bin)
+    let mut document = Document::default();
+    let material = material(options, options.name.clone(), None);
+    let material = document.root.push(material);
+    finish(document, &shape, translation, false, material, None, options)
 }
 
-fn material(options: &ExportOptions) -> gltf_json::Material {
+/// The mesh as one `.glb` file, with its pictures inside.
+///
+/// # Errors
+///
+/// [`ExportError`] when mesh, atlas and pictures do not belong together, before there are any bytes;
+/// else as [`to_glb`].
+pub fn textured_to_glb(
+    textured: &Textured,
+    options: &ExportOptions,
+    texture: &TextureOptions,
+) -> Result<Exported, ExportError> {
+    let prepared = placed(textured, options, true)?;
+    let ready = &prepared.ready;
+    let tangents = textured.normal.map(|_| {
+        let (positions, normals, triangles) = (&ready.positions, &ready.normals, &ready.triangles);
+        textured_tangents::of(positions, normals, triangles, &prepared.uvs, &prepared.corners)
+    });
+    let mut shape = split(&prepared, tangents.as_deref());
+    shape.colors = Vec::new(); // viewers would multiply them into the texture
+
+    let mut document = Document::default();
+    let mut picture = |name: &str, picture, format| -> Result<Index<gltf_json::Texture>, ExportError> {
+        let (bytes, ending) = encode(name, picture, format)?;
+        Ok(document.texture(name, &bytes, ending))
+    };
+    let color = picture("base colour", textured.color, texture.picture)?;
+    let normal = textured.normal.map(|map| picture("normal map", map, PictureFormat::Png)).transpose()?;
+    let mut lobes = Vec::with_capacity(textured.lobes.len());
+    for lobe in &textured.lobes {
+        lobes.push(picture(&lobe.name, lobe.picture, texture.picture)?);
+    }
+    let mut main = material(options, options.name.clone(), Some(info(color)));
+    main.normal_texture = normal.map(|index| NormalTexture {
+        index,
+        scale: 1.0,
+        tex_coord: 0,
+        extensions: None,
+        extras: Default::default(),
+    });
+    main.extras = extras(textured, &lobes);
+    let main = document.root.push(main);
+    let variants = (!lobes.is_empty()).then(|| variants(&mut document, textured, &lobes, options));
+    let bytes = finish(document, &shape, ready.translation, texture.quantize, main, variants, options)?;
+    let mut warnings = Vec::new();
+    if texture.quantize {
+        warnings.push(
+            "KHR_mesh_quantization: trimesh 5.2 and open3d 0.20 read wrong positions from this file; \
+             Blender and three.js read it"
+                .into(),
+        );
+    }
+    Ok(Exported { files: vec![(format!("{}.glb", safe_stem(texture)), bytes)], warnings })
+}
+
+/// One material for each lobe, offered by the primitive as variants.
+fn variants(
+    document: &mut Document,
+    textured: &Textured,
+    lobes: &[Index<gltf_json::Texture>],
+    options: &ExportOptions,
+) -> KhrMaterialsVariants {
+    let mut mappings = Vec::with_capacity(lobes.len());
+    let mut names = Vec::with_capacity(lobes.len());
+    for (variant, (lobe, &texture)) in textured.lobes.iter().zip(lobes).enumerate() {
+        let material = material(options, lobe.name.clone(), Some(info(texture)));
+        let material = document.root.push(material).value() as u32;
+        mappings.push(Mapping { material, variants: vec![variant as u32] });
+        names.push(Variant { name: lobe.name.clone() });
+    }
+    document.root.extensions_used.push("KHR_materials_variants".into());
+    document.root.extensions = Some(gltf_json::extensions::root::Root {
+        khr_materials_variants: Some(gltf_json::extensions::root::KhrMaterialsVariants { variants: names }),
+    });
+    KhrMaterialsVariants { mappings }
+}
+
+/// What the first material says of the lobes; see the head of this file.
+fn extras(textured: &Textured, lobes: &[Index<gltf_json::Texture>]) -> gltf_json::Extras {
+    let mut ours: Map<String, Value> = textured.extras.clone();
+    if !lobes.is_empty() {
+        let list: Vec<Value> = textured
+            .lobes
+            .iter()
+            .zip(lobes)
+            .enumerate()
+            .map(|(i, (lobe, texture))| {
+                json!({"name": lobe.name, "texture": texture.value(), "material": i + 1, "variant": i})
+            })
+            .collect();
+        ours.insert("lobes".into(), list.into());
+    }
+    if ours.is_empty() {
+        return None;
+    }
+    let text = json!({ "tiface": ours }).to_string();
+    Some(gltf_json::extras::RawValue::from_string(text).expect("a value is valid JSON"))
+}
+
+fn material(options: &ExportOptions, name: String, color: Option<Info>) -> Material {
     let unlit = options.unlit.then_some(gltf_json::extensions::material::Material {
         unlit: Some(gltf_json::extensions::material::Unlit {}),
     });
-    gltf_json::Material {
-        name: Some(options.name.clone()),
+    Material {
+        name: Some(name),
         pbr_metallic_roughness: PbrMetallicRoughness {
+            base_color_texture: color,
             metallic_factor: StrengthFactor(0.0),
             roughness_factor: StrengthFactor(1.0),
             ..Default::default()
@@ -114,93 +177,109 @@ fn material(options: &ExportOptions) -> gltf_json::Material {
     }
 }
 
-/// The document as it grows, with the bytes it speaks of.
-#[derive(Default)]
-struct Writer {
-    root: Root,
-    bin: Vec<u8>,
+/// Puts the shape under its material and packs the file.
+fn finish(
+    mut document: Document,
+    shape: &Split,
+    translation: Vec3,
+    quantize: bool,
+    material: Index<Material>,
+    variants: Option<KhrMaterialsVariants>,
+    options: &ExportOptions,
+) -> Result<Vec<u8>, ExportError> {
+    let mut node = gltf_json::Node { name: Some(options.name.clone()), ..Default::default() };
+    let attributes = if quantize {
+        let bounds = Aabb::around(shape.positions.iter().copied());
+        let size = bounds.size().max_element();
+        node.scale = Some([size; 3]);
+        node.translation = Some((translation.as_dvec3() + bounds.min.as_dvec3()).as_vec3().to_array());
+        document.root.extensions_used.push("KHR_mesh_quantization".into());
+        document.root.extensions_required.push("KHR_mesh_quantization".into());
+        short_attributes(&mut document, shape, bounds.min, size)
+    } else {
+        node.translation = (translation != Vec3::ZERO).then(|| translation.to_array());
+        attributes(&mut document, shape)
+    };
+    let indices = document.indices(&shape.triangles, shape.positions.len());
+    let root = &mut document.root;
+    root.asset.generator = Some(concat!("tiface ", env!("CARGO_PKG_VERSION")).into());
+    let primitive = Primitive {
+        attributes,
+        indices: Some(indices),
+        material: Some(material),
+        mode: Valid(Mode::Triangles),
+        extensions: variants
+            .map(|v| gltf_json::extensions::mesh::Primitive { khr_materials_variants: Some(v) }),
+        extras: Default::default(),
+        targets: None,
+    };
+    node.mesh = Some(root.push(gltf_json::Mesh {
+        primitives: vec![primitive],
+        name: Some(options.name.clone()),
+        weights: None,
+        extensions: None,
+        extras: Default::default(),
+    }));
+    let node = root.push(node);
+    root.scene = Some(root.push(gltf_json::Scene {
+        nodes: vec![node],
+        name: None,
+        extensions: None,
+        extras: Default::default(),
+    }));
+    if options.unlit {
+        root.extensions_used.push("KHR_materials_unlit".into());
+    }
+    document.pack()
 }
 
-impl Writer {
-    fn vectors(&mut self, values: &[Vec3], bounds: Option<Aabb>) -> Index<Accessor> {
-        let accessor =
-            self.push(bytes_of(values), values.len(), ComponentType::F32, Type::Vec3, Target::ArrayBuffer);
-        if let Some(bounds) = bounds {
-            let last = self.root.accessors.last_mut().expect("just pushed");
-            last.min = Some(Value::from(bounds.min.to_array().to_vec()));
-            last.max = Some(Value::from(bounds.max.to_array().to_vec()));
-        }
-        accessor
-    }
+type Attributes = BTreeMap<gltf_json::validation::Checked<Semantic>, Index<gltf_json::Accessor>>;
 
-    /// One accessor with a view of its own, at a multiple of four bytes.
-    fn push(
-        &mut self,
-        bytes: &[u8],
-        count: usize,
-        component: ComponentType,
-        type_: Type,
-        target: Target,
-    ) -> Index<Accessor> {
-        let view = self.root.push(gltf_json::buffer::View {
-            buffer: Index::new(0),
-            byte_length: USize64(bytes.len() as u64),
-            byte_offset: Some(USize64(self.bin.len() as u64)),
-            byte_stride: None,
-            name: None,
-            target: Some(Valid(target)),
-            extensions: None,
-            extras: Default::default(),
-        });
-        self.bin.extend_from_slice(bytes);
-        self.bin.resize(self.bin.len().next_multiple_of(4), 0);
-        self.root.push(Accessor {
-            buffer_view: Some(view),
-            byte_offset: None,
-            count: USize64(count as u64),
-            component_type: Valid(GenericComponentType(component)),
-            type_: Valid(type_),
-            min: None,
-            max: None,
-            name: None,
-            normalized: false,
-            sparse: None,
-            extensions: None,
-            extras: Default::default(),
-        })
+fn attributes(document: &mut Document, shape: &Split) -> Attributes {
+    let mut attributes = BTreeMap::from([(Valid(Semantic::Positions), document.positions(&shape.positions))]);
+    if !shape.normals.is_empty() {
+        attributes.insert(Valid(Semantic::Normals), document.floats(&shape.normals));
     }
+    if !shape.tangents.is_empty() {
+        let tangents: Vec<[f32; 4]> = shape.tangents.iter().map(|t| t.to_array()).collect();
+        attributes.insert(Valid(Semantic::Tangents), document.floats(&tangents));
+    }
+    if !shape.uvs.is_empty() {
+        attributes.insert(Valid(Semantic::TexCoords(0)), document.floats(&shape.uvs));
+    }
+    if !shape.colors.is_empty() {
+        let linear: Vec<Vec3> = shape.colors.iter().map(|c| c.map(linear_from_srgb).into()).collect();
+        attributes.insert(Valid(Semantic::Colors(0)), document.floats(&linear));
+    }
+    attributes
 }
 
-/// Numbers as glTF stores them. Its order is little endian, and so is every machine we build for.
-fn bytes_of<T: bytemuck::NoUninit>(values: &[T]) -> &[u8] {
-    const { assert!(cfg!(target_endian = "little"), "GLB is little endian") };
-    bytemuck::cast_slice(values)
-}
-
-/// Header, JSON chunk padded with spaces, binary chunk padded with zeros.
-fn pack(root: &Root, bin: Vec<u8>) -> Result<Vec<u8>, ExportError> {
-    let mut json = root.to_vec().expect("a document of plain numbers and names serialises");
-    json.resize(json.len().next_multiple_of(4), b' ');
-    let bytes = 12 + 8 + json.len() as u64 + 8 + bin.len() as u64;
-    let total = u32::try_from(bytes).map_err(|_| ExportError::TooLarge { bytes })?;
-    let mut out = Vec::with_capacity(total as usize);
-    out.extend_from_slice(b"glTF");
-    for word in [2, total, json.len() as u32] {
-        out.extend_from_slice(&word.to_le_bytes());
+/// The attributes of a textured shape in 16 bits.
+fn short_attributes(document: &mut Document, shape: &Split, low: Vec3, size: f32) -> Attributes {
+    let place = |p: &Vec3| ((p.as_dvec3() - low.as_dvec3()) / size as f64).as_vec3().to_array();
+    let placed: Vec<[f32; 3]> = shape.positions.iter().map(place).collect();
+    let position = document.short_positions(&placed);
+    let mut attributes = BTreeMap::from([(Valid(Semantic::Positions), position)]);
+    if !shape.normals.is_empty() {
+        let normals = shape.normals.iter().map(|n| n.to_array());
+        attributes.insert(Valid(Semantic::Normals), document.shorts(normals, true));
     }
-    out.extend_from_slice(b"JSON");
-    out.extend_from_slice(&json);
-    out.extend_from_slice(&(bin.len() as u32).to_le_bytes());
-    out.extend_from_slice(b"BIN\0");
-    out.extend_from_slice(&bin);
-    Ok(out)
+    if !shape.tangents.is_empty() {
+        let tangents = shape.tangents.iter().map(|t| t.to_array());
+        attributes.insert(Valid(Semantic::Tangents), document.shorts(tangents, true));
+    }
+    let uvs = shape.uvs.iter().map(|uv| uv.to_array());
+    attributes.insert(Valid(Semantic::TexCoords(0)), document.shorts(uvs, false));
+    attributes
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::image::srgb_from_linear;
-    use crate::mesh::read::read;
+    use crate::io::{Limits, parse_photo};
+    use crate::mesh::read::{Texture, read, read_whole, weld};
+    use crate::mesh::textured::{Lobe, tests::tetrahedron};
     use std::path::Path;
 
     /// A strip of `vertices` points on a helix, coloured.
@@ -286,6 +365,87 @@ mod tests {
         assert!((json_of(&glb)["nodes"][0]["translation"][1].as_f64().unwrap() - 10_000.0).abs() < 1.0);
         let back = read(&glb, Path::new("a.glb")).unwrap();
         assert!(back.positions.iter().zip(&mesh.positions).all(|(a, b)| a.distance(*b) < 1e-3));
+    }
+
+    #[test]
+    fn a_texture_replaces_the_vertex_colours_and_reads_back_exactly() {
+        let (mesh, atlas, color) = tetrahedron();
+        let textured = Textured::new(&mesh, &atlas, &color);
+        let options = ExportOptions::default();
+        let out = textured_to_glb(&textured, &options, &TextureOptions::default()).unwrap();
+        assert_eq!((out.files[0].0.as_str(), out.files.len(), out.warnings.len()), ("head.glb", 1, 0));
+        let json = json_of(&out.files[0].1);
+        let attributes = json["meshes"][0]["primitives"][0]["attributes"].as_object().unwrap();
+        assert_eq!(attributes.keys().collect::<Vec<_>>(), ["NORMAL", "POSITION", "TEXCOORD_0"]);
+        let sampler = json!({"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071});
+        assert_eq!(json["samplers"][0], sampler);
+        let back = read_whole(&out.files[0].1, Path::new("a.glb")).unwrap();
+        let Some(Texture::Inside(bytes)) = &back.texture else { panic!("{:?}", back.texture) };
+        assert_eq!(parse_photo(bytes, Path::new("a"), &Limits::default()).unwrap(), color);
+        let read_atlas = back.atlas.as_ref().unwrap();
+        assert_eq!((read_atlas.width, read_atlas.height), (8, 4));
+        for t in 0..4 {
+            assert_eq!(back.mesh.corners(t), mesh.corners(t));
+            assert_eq!(read_atlas.corners(t), atlas.corners(t));
+        }
+        assert!(!back.mesh.is_closed() && weld(&back.mesh).is_closed());
+        assert_eq!(weld(&back.mesh).positions.len(), 4);
+        assert_eq!(out, textured_to_glb(&textured, &options, &TextureOptions::default()).unwrap());
+    }
+
+    #[test]
+    fn a_normal_map_brings_tangents_and_lobes_are_variants_with_notes() {
+        let (mesh, atlas, color) = tetrahedron();
+        let lobes = ["one", "two"].map(|name| Lobe { name: name.into(), picture: &color }).to_vec();
+        let mut extras = Map::new();
+        extras.insert("kind".into(), "spherical gaussian".into());
+        let textured =
+            Textured { normal: Some(&color), lobes, extras, ..Textured::new(&mesh, &atlas, &color) };
+        let jpeg = TextureOptions { picture: PictureFormat::Jpeg { quality: 90 }, ..Default::default() };
+        let out = textured_to_glb(&textured, &ExportOptions::default(), &jpeg).unwrap();
+        let json = json_of(&out.files[0].1);
+        let primitive = &json["meshes"][0]["primitives"][0];
+        assert!(primitive["attributes"]["TANGENT"].is_number());
+        let mimes: Vec<&str> =
+            json["images"].as_array().unwrap().iter().map(|i| i["mimeType"].as_str().unwrap()).collect();
+        assert_eq!(mimes, ["image/jpeg", "image/png", "image/jpeg", "image/jpeg"]);
+        let ours = &json["materials"][0]["extras"]["tiface"];
+        assert_eq!(ours["kind"], "spherical gaussian");
+        assert_eq!(ours["lobes"][1], json!({"name": "two", "texture": 3, "material": 2, "variant": 1}));
+        let mapping = &primitive["extensions"]["KHR_materials_variants"]["mappings"][1];
+        assert_eq!(mapping, &json!({"material": 2, "variants": [1]}));
+        assert_eq!(json["materials"][2]["pbrMetallicRoughness"]["baseColorTexture"]["index"], 3);
+        let variants = &json["extensions"]["KHR_materials_variants"]["variants"];
+        assert_eq!(variants, &json!([{"name": "one"}, {"name": "two"}]));
+        assert!(json.get("extensionsRequired").is_none());
+        let back = read_whole(&out.files[0].1, Path::new("a.glb")).unwrap();
+        assert!(matches!(&back.texture, Some(Texture::Inside(b)) if b.starts_with(&[0xff, 0xd8])));
+    }
+
+    #[test]
+    fn quantised_files_are_close_still_closed_and_come_with_a_warning() {
+        let (mut mesh, atlas, color) = tetrahedron();
+        for p in &mut mesh.positions {
+            *p = *p * 0.25 + Vec3::new(0.5, 100.0, 1.0 / 3.0);
+        }
+        let textured = Textured { normal: Some(&color), ..Textured::new(&mesh, &atlas, &color) };
+        let texture = TextureOptions { quantize: true, ..Default::default() };
+        let out = textured_to_glb(&textured, &ExportOptions::default(), &texture).unwrap();
+        assert!(out.warnings[0].contains("trimesh") && out.warnings[0].contains("open3d"));
+        let json = json_of(&out.files[0].1);
+        assert_eq!(json["extensionsRequired"], json!(["KHR_mesh_quantization"]));
+        assert_eq!(json["accessors"][0]["max"], json!([65535, 65535, 65535]));
+        let back = read_whole(&out.files[0].1, Path::new("a.glb")).unwrap();
+        for t in 0..4 {
+            for (a, b) in back.mesh.corners(t).iter().zip(mesh.corners(t)) {
+                // half of 0.25 / 65,535 is 1.9e-6; f32 at 100 m resolves 7.6e-6
+                assert!(a.distance(b) < 1.2e-5, "{a} {b}");
+            }
+            for (a, b) in back.atlas.as_ref().unwrap().corners(t).iter().zip(atlas.corners(t)) {
+                assert!(a.distance(b) < 8.0 / 65_535.0);
+            }
+        }
+        assert!(weld(&back.mesh).is_closed());
     }
 
     #[test]

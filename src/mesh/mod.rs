@@ -10,6 +10,7 @@ mod error;
 pub mod export;
 mod extract;
 pub mod gltf;
+mod gltf_document;
 mod marching;
 mod marching_bits;
 mod marching_cell;
@@ -19,6 +20,8 @@ mod polish;
 pub mod read;
 mod sparse;
 mod sparse_blocks;
+pub mod textured;
+pub mod textured_tangents;
 mod verify;
 
 pub use clean::{CleanReport, clean};

@@ -1,13 +1,16 @@
-//! A mesh as Wavefront OBJ: text, +Y up, metres, `v x y z r g b` with sRGB-coded colours.
+//! A mesh as Wavefront OBJ: text, +Y up, metres.
 //!
 //! Numbers are the shortest that read back as the same f32, which is never more than nine
-//! significant digits. Vertices and triangles are those of the GLB.
+//! significant digits. `v`, `vt` and `vn` are indexed apart, so a surface that is closed stays closed
+//! whatever its seams. Colour is `v x y z r g b`, sRGB-coded, or a picture that a `.mtl` beside it
+//! names; never both.
 
-use super::export::{ExportError, ExportOptions, check_unit, ready, turn_to_y_up};
+use super::export::{ExportError, ExportOptions, Ready, check_unit, ready, turn_to_y_up};
+use super::textured::{Exported, TextureOptions, Textured, encode, left_out, placed, safe_stem};
 use crate::geom::Mesh;
 use std::io::Write;
 
-/// The mesh as the bytes of an `.obj` file.
+/// The mesh as the bytes of an `.obj` file, coloured by its vertices.
 ///
 /// # Errors
 ///
@@ -15,22 +18,11 @@ use std::io::Write;
 pub fn to_obj(mesh: &Mesh, options: &ExportOptions) -> Result<Vec<u8>, ExportError> {
     check_unit(options.unit_m)?;
     let mesh = ready(mesh, turn_to_y_up(options.up)?, options.unit_m, false)?;
-    let mut out = Vec::with_capacity(mesh.positions.len() * 60 + mesh.triangles.len() * 30);
-    // A name is one line; what would end it becomes a space.
-    let name: String = options.name.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
-    let header = concat!("# tiface ", env!("CARGO_PKG_VERSION"), ": metres, +Y up, sRGB vertex colours");
+    let header = concat!("# tiface ", env!("CARGO_PKG_VERSION"), ": metres, +Y up, sRGB vertex colours\n");
+    let mut out = header.as_bytes().to_vec();
     let mut write = || -> std::io::Result<()> {
-        writeln!(out, "{header}\no {}", name.trim())?;
-        for (i, p) in mesh.positions.iter().enumerate() {
-            write!(out, "v {} {} {}", Short(p.x), Short(p.y), Short(p.z))?;
-            match mesh.colors.get(i).map(|c| c.map(|v| v.clamp(0.0, 1.0))) {
-                Some([r, g, b]) => writeln!(out, " {} {} {}", Short(r), Short(g), Short(b))?,
-                None => writeln!(out)?,
-            }
-        }
-        for n in &mesh.normals {
-            writeln!(out, "vn {} {} {}", Short(n.x), Short(n.y), Short(n.z))?;
-        }
+        writeln!(out, "o {}", one_line(&options.name))?;
+        write_vertices(&mut out, &mesh)?;
         for [a, b, c] in mesh.triangles.iter().map(|t| t.map(|i| i as u64 + 1)) {
             if mesh.normals.is_empty() {
                 writeln!(out, "f {a} {b} {c}")?;
@@ -42,6 +34,81 @@ pub fn to_obj(mesh: &Mesh, options: &ExportOptions) -> Result<Vec<u8>, ExportErr
     };
     write().expect("writing to memory does not fail");
     Ok(out)
+}
+
+/// The mesh as an `.obj`, its `.mtl` and its picture, which must lie in one folder.
+///
+/// # Errors
+///
+/// [`ExportError`] when mesh, atlas and pictures do not belong together, before there are any bytes;
+/// else as [`to_obj`].
+pub fn textured_to_obj(
+    textured: &Textured,
+    options: &ExportOptions,
+    texture: &TextureOptions,
+) -> Result<Exported, ExportError> {
+    let prepared = placed(textured, options, false)?;
+    let mut mesh = prepared.ready;
+    mesh.colors = Vec::new(); // some readers multiply them into the texture
+    let stem = safe_stem(texture);
+    let (picture, ending) = encode("base colour", textured.color, texture.picture)?;
+    let generator = concat!("# tiface ", env!("CARGO_PKG_VERSION"));
+    let mut out = Vec::new();
+    let mut write = || -> std::io::Result<()> {
+        writeln!(out, "{generator}: metres, +Y up\nmtllib {stem}.mtl\no {}", one_line(&options.name))?;
+        write_vertices(&mut out, &mesh)?;
+        for uv in &prepared.uvs {
+            // OBJ's v runs up
+            writeln!(out, "vt {} {}", Short(uv.x), Short(1.0 - uv.y))?;
+        }
+        writeln!(out, "usemtl {stem}")?;
+        for (vertices, corners) in mesh.triangles.iter().zip(&prepared.corners) {
+            write!(out, "f")?;
+            for (v, t) in vertices.map(|i| i as u64 + 1).iter().zip(corners.map(|i| i as u64 + 1)) {
+                if mesh.normals.is_empty() {
+                    write!(out, " {v}/{t}")?;
+                } else {
+                    write!(out, " {v}/{t}/{v}")?;
+                }
+            }
+            writeln!(out)?;
+        }
+        Ok(())
+    };
+    write().expect("writing to memory does not fail");
+    let mtl = format!(
+        "{generator}\nnewmtl {stem}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {stem}.{ending}\n"
+    );
+    let files = vec![
+        (format!("{stem}.obj"), out),
+        (format!("{stem}.mtl"), mtl.into_bytes()),
+        (format!("{stem}.{ending}"), picture),
+    ];
+    let mut warnings = Vec::new();
+    left_out(textured, "obj", &mut warnings);
+    Ok(Exported { files, warnings })
+}
+
+/// `v` with colours where there are any, then `vn`.
+fn write_vertices(out: &mut Vec<u8>, mesh: &Ready) -> std::io::Result<()> {
+    out.reserve(mesh.positions.len() * 60 + mesh.triangles.len() * 30);
+    for (i, p) in mesh.positions.iter().enumerate() {
+        write!(out, "v {} {} {}", Short(p.x), Short(p.y), Short(p.z))?;
+        match mesh.colors.get(i).map(|c| c.map(|v| v.clamp(0.0, 1.0))) {
+            Some([r, g, b]) => writeln!(out, " {} {} {}", Short(r), Short(g), Short(b))?,
+            None => writeln!(out)?,
+        }
+    }
+    for n in &mesh.normals {
+        writeln!(out, "vn {} {} {}", Short(n.x), Short(n.y), Short(n.z))?;
+    }
+    Ok(())
+}
+
+/// A name is one line; what would end it becomes a space.
+fn one_line(name: &str) -> String {
+    let name: String = name.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    name.trim().into()
 }
 
 /// Shortest digits that give the same f32 back; with an exponent where zeros would fill the line.
@@ -61,7 +128,8 @@ impl std::fmt::Display for Short {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::read::read;
+    use crate::mesh::read::{Texture, picture_of_mtl, read, read_whole};
+    use crate::mesh::textured::tests::tetrahedron;
     use glam::Vec3;
     use std::path::Path;
 
@@ -91,5 +159,29 @@ mod tests {
         };
         let obj = to_obj(&mesh, &ExportOptions::default()).unwrap();
         assert_eq!(read(&obj, Path::new("a.obj")).unwrap(), mesh);
+    }
+
+    #[test]
+    fn a_textured_obj_stays_closed_and_names_its_files_plainly() {
+        let (mesh, atlas, color) = tetrahedron();
+        let texture = TextureOptions { stem: "my head".into(), ..Default::default() };
+        let textured = Textured { normal: Some(&color), ..Textured::new(&mesh, &atlas, &color) };
+        let out = textured_to_obj(&textured, &ExportOptions::default(), &texture).unwrap();
+        let names: Vec<&str> = out.files.iter().map(|(name, _)| name.as_str()).collect();
+        assert_eq!(names, ["my_head.obj", "my_head.mtl", "my_head.png"]);
+        assert!(out.warnings[0].contains("normal map"));
+        let obj = String::from_utf8(out.files[0].1.clone()).unwrap();
+        assert_eq!(obj.lines().nth(1), Some("mtllib my_head.mtl"));
+        assert!(obj.contains("\nvt 0 0.625\n"), "v = 0.375 from the top is 0.625 from the bottom");
+        assert!(obj.contains("\nusemtl my_head\nf 1/1/1 3/2/3 2/3/2\n"));
+        let mtl = String::from_utf8(out.files[1].1.clone()).unwrap();
+        assert!(mtl.ends_with("Ka 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd my_head.png\n"));
+        let picture = picture_of_mtl(&out.files[1].1, Path::new("my_head.mtl")).unwrap();
+        assert_eq!(picture.as_deref(), Some("my_head.png"));
+        let back = read_whole(&out.files[0].1, Path::new("a.obj")).unwrap();
+        assert_eq!(back.texture, Some(Texture::Material("my_head.mtl".into())));
+        assert!(back.mesh.is_closed() && back.mesh.colors.is_empty());
+        let read_atlas = back.atlas.unwrap();
+        assert_eq!((&read_atlas.uvs, &read_atlas.triangles), (&atlas.uvs, &atlas.triangles));
     }
 }

@@ -1,23 +1,63 @@
 //! A mesh as PLY: binary little endian, in the dataset's own world.
 //!
-//! No turn and no unit: PLY says nothing of either, and Blender does not turn it. Colours are 8-bit
-//! and sRGB-coded, as every reader takes them.
+//! No turn and no unit: PLY says nothing of either, and Blender does not turn it (it does turn OBJ and
+//! GLB). Colours are 8-bit and sRGB-coded, as every reader takes them.
+//!
+//! PLY has one index for everything. [`to_ply`] keeps vertices whole, so the surface stays closed:
+//! this is the file that later stages read. [`textured_to_ply`] splits vertices at seams for the sake
+//! of `s t` (v up, Blender's and trimesh's spelling) and names its picture in a comment, as MeshLab
+//! does; weld equal positions to close it again.
 
 use super::export::{ExportError, ready};
+use super::textured::{
+    Exported, Split, TextureOptions, Textured, encode, left_out, prepare, safe_stem, split,
+};
 use crate::geom::Mesh;
 use crate::image::quantise;
 use glam::DMat3;
 
-/// The mesh as the bytes of a `.ply` file.
+/// The mesh as the bytes of a `.ply` file, coloured by its vertices.
 ///
 /// # Errors
 ///
 /// [`ExportError`] when there is nothing to write or the mesh is damaged.
 pub fn to_ply(mesh: &Mesh) -> Result<Vec<u8>, ExportError> {
-    let mesh = ready(mesh, DMat3::IDENTITY, 1.0, false)?;
+    let ready = ready(mesh, DMat3::IDENTITY, 1.0, false)?;
+    let shape = Split {
+        positions: ready.positions,
+        normals: ready.normals,
+        colors: ready.colors,
+        triangles: ready.triangles,
+        ..Split::default()
+    };
+    Ok(bytes(&shape, None))
+}
+
+/// The mesh as a `.ply`, split at seams, with its vertex colours too, and its picture beside it.
+///
+/// # Errors
+///
+/// [`ExportError`] when mesh, atlas and pictures do not belong together, before there are any bytes;
+/// else as [`to_ply`].
+pub fn textured_to_ply(textured: &Textured, texture: &TextureOptions) -> Result<Exported, ExportError> {
+    let prepared = prepare(textured, DMat3::IDENTITY, 1.0, false)?;
+    let (picture, ending) = encode("base colour", textured.color, texture.picture)?;
+    let stem = safe_stem(texture);
+    let name = format!("{stem}.{ending}");
+    let files =
+        vec![(format!("{stem}.ply"), bytes(&split(&prepared, None), Some(&name))), (name.clone(), picture)];
+    let mut warnings = Vec::new();
+    left_out(textured, "ply", &mut warnings);
+    Ok(Exported { files, warnings })
+}
+
+fn bytes(mesh: &Split, picture: Option<&str>) -> Vec<u8> {
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     header += concat!("comment tiface ", env!("CARGO_PKG_VERSION"), "\n");
     header += "comment dataset world, dataset units; vertex colours are sRGB\n";
+    if let Some(name) = picture {
+        header += &format!("comment TextureFile {name}\n");
+    }
     header += &format!("element vertex {}\n", mesh.positions.len());
     let mut property = |kind: &str, names: &[&str]| {
         for name in names {
@@ -31,29 +71,37 @@ pub fn to_ply(mesh: &Mesh) -> Result<Vec<u8>, ExportError> {
     if !mesh.colors.is_empty() {
         property("uchar", &["red", "green", "blue"]);
     }
+    if !mesh.uvs.is_empty() {
+        property("float", &["s", "t"]);
+    }
     header += &format!("element face {}\n", mesh.triangles.len());
     header += "property list uchar uint vertex_indices\nend_header\n";
 
     let mut out = header.into_bytes();
-    out.reserve(mesh.positions.len() * 27 + mesh.triangles.len() * 13);
+    out.reserve(mesh.positions.len() * 35 + mesh.triangles.len() * 13);
     for (i, p) in mesh.positions.iter().enumerate() {
         let normal = mesh.normals.get(i);
         for v in [Some(p), normal].into_iter().flatten().flat_map(|v| v.to_array()) {
             out.extend_from_slice(&v.to_le_bytes());
         }
         out.extend(mesh.colors.get(i).into_iter().flatten().map(|&c| quantise(c)));
+        if let Some(uv) = mesh.uvs.get(i) {
+            out.extend_from_slice(&uv.x.to_le_bytes());
+            out.extend_from_slice(&(1.0 - uv.y).to_le_bytes());
+        }
     }
     for t in &mesh.triangles {
         out.push(3);
         out.extend(t.iter().flat_map(|i| i.to_le_bytes()));
     }
-    Ok(out)
+    out
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::read::read;
+    use crate::mesh::read::{Texture, read, read_whole, weld};
+    use crate::mesh::textured::tests::tetrahedron;
     use glam::Vec3;
     use std::path::Path;
 
@@ -71,5 +119,24 @@ mod tests {
         let ply = to_ply(&bare).unwrap();
         assert_eq!(read(&ply, Path::new("a.ply")).unwrap(), bare);
         assert_eq!(to_ply(&Mesh::default()), Err(ExportError::Empty));
+    }
+
+    #[test]
+    fn a_textured_ply_is_split_and_closes_when_welded() {
+        let (mesh, atlas, color) = tetrahedron();
+        let textured = Textured::new(&mesh, &atlas, &color);
+        let out = textured_to_ply(&textured, &TextureOptions::default()).unwrap();
+        let names: Vec<&str> = out.files.iter().map(|(name, _)| name.as_str()).collect();
+        assert_eq!(names, ["head.ply", "head.png"]);
+        let back = read_whole(&out.files[0].1, Path::new("a.ply")).unwrap();
+        assert_eq!(back.texture, Some(Texture::Beside("head.png".into())));
+        let read_atlas = back.atlas.unwrap();
+        for t in 0..4 {
+            assert_eq!(back.mesh.corners(t), mesh.corners(t));
+            let expected = atlas.triangles[t as usize].map(|i| atlas.uvs[i as usize]);
+            assert_eq!(read_atlas.triangles[t as usize].map(|i| read_atlas.uvs[i as usize]), expected);
+        }
+        assert_eq!(back.mesh.colors.len(), 12);
+        assert!(!back.mesh.is_closed() && weld(&back.mesh).is_closed());
     }
 }

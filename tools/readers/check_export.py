@@ -1,21 +1,35 @@
 """Opens one mesh as GLB, OBJ and PLY in trimesh and open3d and compares what they see.
 
-    cargo run --no-default-features --example sphere_to_glb -- DIR
-    python tools/readers/check_export.py DIR/sphere.glb [--up 0 0 1]
+    cargo run --no-default-features --example textured_sphere -- DIR
+    python tools/readers/check_export.py DIR/globe.glb [--up 0 0 1]
 
 The .obj and .ply are looked for beside the .glb. GLB and OBJ are +Y up; PLY is in the dataset's world,
 whose up direction is --up and whose unit is --unit-m metres. In every reader and every file: the same
-bounds to 1e-6 of the size, closed after welding equal positions, positive volume, colours present
-and alike. Exits 1 after printing every disagreement.
+bounds to 1e-6 of the size, closed after welding equal positions, positive volume. Files without a
+texture: colours present and alike. Files with one: its pixels are those of the .png beside them, and
+texture coordinates agree corner by corner, save where a reader drops them (open3d does in PLY), which
+is said. Exits 1 after printing every disagreement.
 """
 
 import argparse
 import pathlib
 import sys
+import typing
 
 import numpy
 import open3d
+import PIL.Image
 import trimesh
+
+
+class Seen(typing.NamedTuple):
+    """What a reader made of a file."""
+
+    vertices: numpy.ndarray
+    faces: numpy.ndarray
+    colors: numpy.ndarray | None  # of vertices, 0..1
+    uvs: numpy.ndarray | None  # [faces, 3, 2], v up
+    picture: numpy.ndarray | None  # [height, width, 3], 8 bit
 
 
 def turn_to_y_up(up):
@@ -33,20 +47,31 @@ def with_trimesh(path):
     (node,) = scene.graph.nodes_geometry  # an export holds one mesh
     matrix, name = scene.graph[node]
     mesh = scene.geometry[name]
+    colors = uvs = picture = None
     if mesh.visual.kind == "vertex":
         colors = mesh.visual.vertex_colors
     else:  # beside a material, trimesh keeps them as an attribute
         colors = mesh.visual.vertex_attributes.data.get("color")
+        if mesh.visual.uv is not None:
+            uvs = numpy.asarray(mesh.visual.uv)[mesh.faces]
+        material = mesh.visual.material
+        image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+        if image is not None and uvs is not None:
+            picture = numpy.asarray(image.convert("RGB"))
     if colors is not None:
         scale = 255.0 if numpy.issubdtype(colors.dtype, numpy.integer) else 1.0
         colors = numpy.asarray(colors)[:, :3] / scale
-    return trimesh.transform_points(mesh.vertices, matrix), mesh.faces, colors
+    return Seen(trimesh.transform_points(mesh.vertices, matrix), mesh.faces, colors, uvs, picture)
 
 
 def with_open3d(path):
     mesh = open3d.io.read_triangle_mesh(str(path))
     colors = numpy.asarray(mesh.vertex_colors) if mesh.has_vertex_colors() else None
-    return numpy.asarray(mesh.vertices), numpy.asarray(mesh.triangles), colors
+    faces = numpy.asarray(mesh.triangles)
+    uvs = numpy.asarray(mesh.triangle_uvs).reshape(-1, 3, 2) if mesh.has_triangle_uvs() else None
+    pictures = [numpy.asarray(t) for t in mesh.textures if not t.is_empty()]
+    picture = pictures[0][::-1, :, :3] if pictures else None  # open3d keeps the lowest row first
+    return Seen(numpy.asarray(mesh.vertices), faces, colors, uvs, picture)
 
 
 def closed_and_volume(vertices, faces):
@@ -65,6 +90,38 @@ def linear(coded):
     return numpy.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
 
 
+def colors_wrong(path, seen, expected):
+    """Mean colours against the PLY's; in a GLB they are stored in linear light."""
+    if seen.colors is None or seen.colors.std(axis=0).max() < 0.01:
+        return ["no colours"]
+    mean = (linear(expected) if path.suffix == ".glb" else expected).mean(axis=0)
+    if abs(seen.colors.mean(axis=0) - mean).max() > 0.01:
+        return [f"mean colour {seen.colors.mean(axis=0)}, expected {mean}"]
+    return []
+
+
+def texture_wrong(path, reader, seen, expected_uvs):
+    if path.suffix == ".ply" and reader is with_open3d:
+        print("    open3d drops texture coordinates from PLY, as it always does")
+        return []
+    if seen.uvs is None:
+        return ["no texture coordinates"]
+    wrong = []
+    if expected_uvs is not None:
+        apart = abs(seen.uvs - expected_uvs).max() if seen.uvs.shape == expected_uvs.shape else numpy.inf
+        print(f"    texture coordinates differ by {apart:.1e}")
+        if apart > 1e-6:
+            wrong.append(f"texture coordinates differ by {apart}")
+    truth = numpy.asarray(PIL.Image.open(path.with_suffix(".png")))
+    if seen.picture is None:
+        wrong.append("no picture")
+    elif not numpy.array_equal(seen.picture, truth):
+        wrong.append(f"picture {seen.picture.shape} is not that of {path.with_suffix('.png').name}")
+    else:
+        print(f"    picture {truth.shape[1]} x {truth.shape[0]} equal to the pixel")
+    return wrong
+
+
 def main():
     arguments = argparse.ArgumentParser()
     arguments.add_argument("glb", type=pathlib.Path)
@@ -72,12 +129,18 @@ def main():
     arguments.add_argument("--unit-m", type=float, default=1.0)
     arguments = arguments.parse_args()
     turn = turn_to_y_up(arguments.up) * arguments.unit_m
-    wrong, expected = [], None
+    textured = b"TEXCOORD_0" in arguments.glb.read_bytes()
+    ply_colors = None if textured else with_open3d(arguments.glb.with_suffix(".ply")).colors
+    wrong, expected, uvs = [], None, None
     for ending in [".ply", ".glb", ".obj"]:
         path = arguments.glb.with_suffix(ending)
+        if textured and not path.exists():
+            print(f"passed over: there is no {path.name}")
+            continue
         for reader in [with_trimesh, with_open3d]:
             name = f"{path.name} in {reader.__name__[5:]}"
-            vertices, faces, colors = reader(path)
+            seen = reader(path)
+            vertices, faces = seen.vertices, seen.faces
             placed = vertices @ turn.T if ending == ".ply" else vertices
             low, high = placed.min(axis=0), placed.max(axis=0)
             closed, volume = closed_and_volume(numpy.asarray(vertices), numpy.asarray(faces))
@@ -85,25 +148,22 @@ def main():
                 expected = (low, high)
             size = (expected[1] - expected[0]).max()
             apart = max(abs(low - expected[0]).max(), abs(high - expected[1]).max()) / size
-            has_colors = colors is not None and colors.std(axis=0).max() > 0.01
             print(
                 f"{name:24} {len(vertices)} vertices {len(faces)} triangles  bounds differ by {apart:.1e}"
-                f"  closed {closed}  volume {volume:.9f}  colours {has_colors}"
+                f"  closed {closed}  volume {volume:.9f}  colours {seen.colors is not None}"
+                f"  texture {seen.uvs is not None}"
             )
+            bad = []
             if apart > 1e-6:
-                wrong.append(f"{name}: box {low} to {high}, expected {expected[0]} to {expected[1]}")
+                bad.append(f"box {low} to {high}, expected {expected[0]} to {expected[1]}")
             if not closed:
-                wrong.append(f"{name}: not closed")
+                bad.append("not closed")
             if not volume > 0:
-                wrong.append(f"{name}: volume {volume}")
-            if not has_colors:
-                wrong.append(f"{name}: no colours")
-                continue
-            # the mean colour; in a GLB it is stored in linear light
-            ply = with_open3d(arguments.glb.with_suffix(".ply"))[2]
-            mean = (linear(ply) if ending == ".glb" else ply).mean(axis=0)
-            if abs(colors.mean(axis=0) - mean).max() > 0.01:
-                wrong.append(f"{name}: mean colour {colors.mean(axis=0)}, expected {mean}")
+                bad.append(f"volume {volume}")
+            bad += texture_wrong(path, reader, seen, uvs) if textured else colors_wrong(path, seen, ply_colors)
+            if uvs is None:
+                uvs = seen.uvs
+            wrong += [f"{name}: {line}" for line in bad]
     for line in wrong:
         print("WRONG", line)
     return 1 if wrong else 0

@@ -2,16 +2,17 @@
 //!
 //! Only what lies in the file is read: buffers with an address are refused, whatever it is.
 
-use super::{ReadMeshError, Source};
-use crate::geom::Mesh;
+use super::glb_texture::{ImageEntry, Material, TextureEntry};
+use super::{ReadMesh, ReadMeshError, Source};
+use crate::geom::{Atlas, Mesh};
 use crate::image::srgb_from_linear;
-use glam::{DMat3, DMat4, DQuat, DVec3};
+use glam::{DMat3, DMat4, DQuat, DVec3, Vec2};
 use serde::Deserialize;
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 
 #[derive(Deserialize, Default)]
 #[serde(rename_all = "camelCase", default)]
-struct Root {
+pub(super) struct Root {
     accessors: Vec<Accessor>,
     buffer_views: Vec<View>,
     buffers: Vec<Buffer>,
@@ -20,6 +21,9 @@ struct Root {
     scenes: Vec<Scene>,
     scene: Option<usize>,
     extensions_required: Vec<String>,
+    pub(super) materials: Vec<Material>,
+    pub(super) textures: Vec<TextureEntry>,
+    pub(super) images: Vec<ImageEntry>,
 }
 
 #[derive(Deserialize)]
@@ -64,6 +68,7 @@ struct Primitive {
     attributes: HashMap<String, usize>,
     indices: Option<usize>,
     mode: Option<u32>,
+    material: Option<usize>,
 }
 
 #[derive(Deserialize, Default)]
@@ -83,13 +88,17 @@ struct Scene {
     nodes: Vec<usize>,
 }
 
-/// Extensions that leave shape and colour attributes alone.
+/// What allows 8 and 16 bits in more attributes.
+const QUANTIZED: &str = "KHR_mesh_quantization";
+
+/// Extensions that leave shape and colour attributes alone, or that are read.
 fn is_harmless(extension: &str) -> bool {
     extension.starts_with("KHR_materials_")
+        || extension == QUANTIZED
         || ["KHR_texture_transform", "EXT_texture_webp", "KHR_texture_basisu"].contains(&extension)
 }
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshError> {
     let (json, bin) = chunks(bytes, source)?;
     let root: Root =
         serde_json::from_slice(json).map_err(|e| source.broken("the JSON chunk", e.to_string()))?;
@@ -123,7 +132,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> 
         }
         stack.extend(node.children.iter().rev().map(|&c| (c, matrix)));
     }
-    Ok(gathered.finish())
+    document.whole(gathered)
 }
 
 /// The JSON chunk and the binary one (empty when absent).
@@ -176,33 +185,50 @@ fn local(node: &Node) -> DMat4 {
     )
 }
 
-/// The mesh as it grows. Normals and colours survive only if every part has them.
+/// The mesh as it grows. Normals, colours and texture coordinates survive only if every part has them.
 #[derive(Default)]
 struct Gathered {
     mesh: Mesh,
     bare_normals: bool,
     bare_colors: bool,
+    /// One for each vertex.
+    uvs: Vec<Vec2>,
+    bare_uvs: bool,
+    /// The base colours of the parts; `None` for a part without.
+    textures: BTreeSet<Option<usize>>,
 }
 
-impl Gathered {
-    fn finish(mut self) -> Mesh {
-        if self.bare_normals {
-            self.mesh.normals.clear();
+pub(super) struct Document<'a> {
+    pub(super) root: &'a Root,
+    pub(super) bin: &'a [u8],
+    pub(super) source: Source<'a>,
+}
+
+impl<'a> Document<'a> {
+    fn whole(&self, gathered: Gathered) -> Result<ReadMesh, ReadMeshError> {
+        let Gathered { mut mesh, bare_normals, bare_colors, uvs, bare_uvs, textures } = gathered;
+        if bare_normals {
+            mesh.normals.clear();
         }
-        if self.bare_colors {
-            self.mesh.colors.clear();
+        if bare_colors {
+            mesh.colors.clear();
         }
-        self.mesh
+        let wanted = self.source.textures && !mesh.triangles.is_empty();
+        let mut atlas = (wanted && !bare_uvs).then(|| Atlas {
+            uvs,
+            triangles: mesh.triangles.clone(),
+            width: 0,
+            height: 0,
+        });
+        let texture = match textures.iter().collect::<Vec<_>>()[..] {
+            [Some(texture)] if wanted => Some(self.picture(*texture, atlas.as_mut())?),
+            [] | [None] => None,
+            _ if !wanted => None,
+            _ => return Err(self.source.unsupported("`materials`", "a mesh with several base colours")),
+        };
+        Ok(ReadMesh { mesh, atlas, texture })
     }
-}
 
-struct Document<'a> {
-    root: &'a Root,
-    bin: &'a [u8],
-    source: Source<'a>,
-}
-
-impl Document<'_> {
     fn roots(&self) -> Result<Vec<usize>, ReadMeshError> {
         let Root { scenes, scene, nodes, .. } = self.root;
         let index = scene.unwrap_or(0);
@@ -259,7 +285,9 @@ impl Document<'_> {
         let Some(&position) = primitive.attributes.get("POSITION") else {
             return Err(source.broken(at, "there is no `POSITION`"));
         };
-        let positions = self.numbers(position, "VEC3", &[FLOAT])?;
+        let short: &[u32] =
+            if self.root.extensions_required.iter().any(|e| e == QUANTIZED) { &SHORTENED } else { &[FLOAT] };
+        let positions = self.numbers(position, "VEC3", short)?;
         let count = positions.len() / 3;
         let indices: Vec<u32> = match primitive.indices {
             Some(i) => {
@@ -291,10 +319,10 @@ impl Document<'_> {
             linear.z_axis.cross(linear.x_axis),
             linear.x_axis.cross(linear.y_axis),
         ) * if mirrored { -1.0 } else { 1.0 };
-        let of = |name| primitive.attributes.get(name).copied();
+        let of = |name: &str| primitive.attributes.get(name).copied();
         out.bare_normals |= of("NORMAL").is_none();
         if let Some(normal) = of("NORMAL") {
-            let normals = self.numbers(normal, "VEC3", &[FLOAT])?;
+            let normals = self.numbers(normal, "VEC3", short)?;
             self.same_count(at, "NORMAL", normals.len() / 3, count)?;
             let moved = |n: &[f64; 3]| (cofactor * DVec3::from(*n)).normalize_or_zero().as_vec3();
             out.mesh.normals.extend(normals.as_chunks::<3>().0.iter().map(moved));
@@ -309,6 +337,21 @@ impl Document<'_> {
             out.mesh.colors.extend(
                 colors.chunks_exact(width).map(|c| [c[0], c[1], c[2]].map(|v| srgb_from_linear(v as f32))),
             );
+        }
+        if source.textures {
+            let info = self.base_color(at, primitive.material)?;
+            out.textures.insert(info.map(|i| i.index));
+            let name = format!("TEXCOORD_{}", info.map_or(0, |i| i.tex_coord));
+            match of(&name) {
+                Some(uv) => {
+                    let uvs = self.numbers(uv, "VEC2", &SHORTENED)?;
+                    self.same_count(at, &name, uvs.len() / 2, count)?;
+                    let uv = |&[u, v]: &[f64; 2]| Vec2::new(u as f32, v as f32);
+                    out.uvs.extend(uvs.as_chunks::<2>().0.iter().map(uv));
+                }
+                None if info.is_some() => return Err(source.broken(at, format!("there is no `{name}`"))),
+                None => out.bare_uvs = true,
+            }
         }
         for t in indices.as_chunks::<3>().0 {
             let [a, b, c] = t.map(|i| first as u32 + i);
@@ -347,12 +390,13 @@ impl Document<'_> {
         }
         let width = match kind {
             "SCALAR" => 1,
+            "VEC2" => 2,
             "VEC3" => 3,
             _ => 4,
         };
         let size: u64 = match accessor.component_type {
-            BYTE => 1,
-            SHORT => 2,
+            BYTE | SIGNED_BYTE => 1,
+            SHORT | SIGNED_SHORT => 2,
             _ => 4,
         };
         let element = size * width;
@@ -379,6 +423,8 @@ impl Document<'_> {
             for b in bytes[start..start + element as usize].chunks_exact(size as usize) {
                 let (value, top) = match accessor.component_type {
                     BYTE => (b[0] as f64, 255.0),
+                    SIGNED_BYTE => (b[0] as i8 as f64, 127.0),
+                    SIGNED_SHORT => (i16::from_le_bytes([b[0], b[1]]) as f64, 32767.0),
                     SHORT => (u16::from_le_bytes([b[0], b[1]]) as f64, 65535.0),
                     INT => (u32::from_le_bytes([b[0], b[1], b[2], b[3]]) as f64, 1.0),
                     _ => (f32::from_le_bytes([b[0], b[1], b[2], b[3]]) as f64, 1.0),
@@ -386,14 +432,14 @@ impl Document<'_> {
                 if !value.is_finite() {
                     return Err(broken(format!("element {i} is {value}, expected a finite number")));
                 }
-                numbers.push(if accessor.normalized { value / top } else { value });
+                numbers.push(if accessor.normalized { (value / top).max(-1.0) } else { value });
             }
         }
         Ok(numbers)
     }
 
     /// The bytes of a buffer view.
-    fn view(&self, index: usize) -> Result<&[u8], ReadMeshError> {
+    pub(super) fn view(&self, index: usize) -> Result<&'a [u8], ReadMeshError> {
         let (source, root) = (self.source, self.root);
         let broken = |what: String| source.broken(format!("buffer view {index}"), what);
         let view = root
@@ -421,10 +467,13 @@ impl Document<'_> {
     }
 }
 
+const SIGNED_BYTE: u32 = 5120;
 const BYTE: u32 = 5121;
+const SIGNED_SHORT: u32 = 5122;
 const SHORT: u32 = 5123;
 const INT: u32 = 5125;
 const FLOAT: u32 = 5126;
+const SHORTENED: [u32; 5] = [FLOAT, SIGNED_BYTE, BYTE, SIGNED_SHORT, SHORT];
 
 /// Not a test of reading (those are in `tests/hostile_mesh.rs`), but of where nodes put things.
 #[cfg(test)]

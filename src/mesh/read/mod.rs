@@ -1,13 +1,18 @@
 //! Meshes from files others wrote: GLB, PLY and OBJ, from bytes.
 //!
-//! What the bytes are decides, not the name. Every count is compared with the bytes that remain
+//! [`read`] gives the surface, [`read_whole`] also its texture. What the bytes are decides, not the name. Every count is compared with the bytes that remain
 //! before anything is reserved, no other file is opened, and numbers that are not finite are refused.
 
 mod glb;
+mod glb_texture;
 mod obj;
 mod ply;
+mod weld;
 
-use crate::geom::Mesh;
+pub use obj::picture_of_mtl;
+pub use weld::weld;
+
+use crate::geom::{Atlas, Mesh};
 use std::path::{Path, PathBuf};
 
 /// How much a file may ask for. GLB can show one buffer many times, so bytes alone do not bound it.
@@ -83,7 +88,9 @@ impl ReadMeshError {
                 "export it as .glb, .ply or .obj; a .gltf beside a .bin is not read"
             }
             ReadMeshError::Broken { .. } => "export it again; the Khronos validator explains a GLB in detail",
-            ReadMeshError::Unsupported { .. } => "export it as a plain .glb without compression",
+            ReadMeshError::Unsupported { .. } => {
+                "export it as a plain .glb without compression, with one picture inside"
+            }
             ReadMeshError::TooMany { .. } => "simplify it first",
             ReadMeshError::Empty { .. } => "export a surface, not points or curves",
         }
@@ -93,15 +100,54 @@ impl ReadMeshError {
 /// A mesh from the bytes of a `.glb`, `.ply` or `.obj` file, in the file's own coordinates.
 ///
 /// `path` is for messages only. Colours come back sRGB-coded; normals only when every vertex has
-/// one. Polygons are fanned. Nothing is welded or repaired.
+/// one. Polygons are fanned. Nothing is welded or repaired. Textures are passed over, sound or not.
 pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh, ReadMeshError> {
     read_limited(bytes, path, &Limits::default())
 }
 
 /// [`read`] with limits of one's own.
 pub fn read_limited(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Mesh, ReadMeshError> {
-    let source = Source { path, limits };
-    let mesh = if bytes.starts_with(b"glTF") {
+    any(bytes, Source { path, limits, textures: false }).map(|whole| whole.mesh)
+}
+
+/// A mesh as it was read, with its texture.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReadMesh {
+    /// The surface.
+    pub mesh: Mesh,
+    /// Where its triangles lie in the texture, if the file says so for all of them. The size is that
+    /// of the picture in the file, else 0 × 0. Coordinates are finite; in files of others they may
+    /// leave 0..=1, where a texture repeats.
+    pub atlas: Option<Atlas>,
+    /// The base colour.
+    pub texture: Option<Texture>,
+}
+
+/// Where the base colour of a file is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Texture {
+    /// In the file: PNG or JPEG, for [`crate::io::parse_photo`]. Its header is within the limits for
+    /// pictures; nothing more is known.
+    Inside(Vec<u8>),
+    /// In a picture of this bare name, in the same folder.
+    Beside(String),
+    /// In the picture that [`picture_of_mtl`] finds in the `.mtl` of this bare name, in the same folder.
+    Material(String),
+}
+
+/// A mesh with its texture, as far as these bytes hold it.
+///
+/// # Errors
+///
+/// As [`read`]; and when the texture is broken, lies outside the file and its folder, or when there are
+/// several.
+pub fn read_whole(bytes: &[u8], path: &Path) -> Result<ReadMesh, ReadMeshError> {
+    any(bytes, Source { path, limits: &Limits::default(), textures: true })
+}
+
+fn any(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshError> {
+    let path = source.path;
+    let whole = if bytes.starts_with(b"glTF") {
         glb::read(bytes, source)?
     } else if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
         ply::read(bytes, source)?
@@ -110,10 +156,10 @@ pub fn read_limited(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Mesh, 
     } else {
         return Err(ReadMeshError::Unknown { path: path.into() });
     };
-    if mesh.triangles.is_empty() {
+    if whole.mesh.triangles.is_empty() {
         return Err(ReadMeshError::Empty { path: path.into() });
     }
-    Ok(mesh)
+    Ok(whole)
 }
 
 /// Does some early line start with a word of OBJ?
@@ -126,11 +172,12 @@ fn looks_like_obj(bytes: &[u8]) -> bool {
         })
 }
 
-/// Which file is read, and how much it may ask for.
+/// Which file is read, how much it may ask for, and whether its texture is wanted.
 #[derive(Clone, Copy)]
 struct Source<'a> {
     path: &'a Path,
     limits: &'a Limits,
+    textures: bool,
 }
 
 impl Source<'_> {
@@ -140,6 +187,16 @@ impl Source<'_> {
 
     fn unsupported(&self, at: impl Into<String>, feature: impl Into<String>) -> ReadMeshError {
         ReadMeshError::Unsupported { path: self.path.into(), at: at.into(), feature: feature.into() }
+    }
+
+    /// The name of a file in the same folder: no path, no address.
+    fn bare_name(&self, at: impl Into<String>, name: &str) -> Result<String, ReadMeshError> {
+        let name = name.trim();
+        let name = name.strip_prefix("./").unwrap_or(name);
+        let is_bare = !name.is_empty()
+            && name != ".."
+            && !name.contains(|c: char| c.is_control() || "/\\:".contains(c));
+        if is_bare { Ok(name.into()) } else { Err(self.unsupported(at, "a texture outside the folder")) }
     }
 
     /// Are this many vertices and triangles allowed?

@@ -1,14 +1,21 @@
-//! OBJ → mesh: `v` with optional colours, `vn`, `f` in all its spellings; the rest is passed over.
+//! OBJ → mesh: `v` with optional colours, `vt`, `vn`, `f` in all its spellings; the rest is passed over.
+//! And `map_Kd` of the `.mtl` beside it.
 //!
 //! Written here because the reader the ecosystem has splits vertices by object, takes index 0 for
 //! "none", and multiplies unchecked indices.
 
-use super::{ReadMeshError, Source};
-use crate::geom::Mesh;
-use glam::Vec3;
+use super::{Limits, ReadMesh, ReadMeshError, Source, Texture};
+use crate::geom::{Atlas, Mesh};
+use glam::{Vec2, Vec3};
+use std::path::Path;
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshError> {
     let mut mesh = Mesh::default();
+    let mut atlas = Atlas::default();
+    let mut all_mapped = source.textures;
+    // the coordinates of the face at hand
+    let mut mapped: Vec<u32> = Vec::new();
+    let (mut library, mut material) = (None, None);
     let mut normals: Vec<Vec3> = Vec::new();
     // which normal each vertex was used with; `u32::MAX` for none yet
     let mut normal_of: Vec<u32> = Vec::new();
@@ -19,7 +26,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> 
         let line = String::from_utf8_lossy(line.trim_ascii());
         let mut words = line.split_ascii_whitespace();
         let keyword = words.next().unwrap_or("");
-        if ["v", "vn", "f"].contains(&keyword) && line.ends_with('\\') {
+        if ["v", "vt", "vn", "f"].contains(&keyword) && line.ends_with('\\') {
             return Err(source.unsupported(format!("line {}", number + 1), "a continued line"));
         }
         match keyword {
@@ -42,13 +49,38 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> 
                 };
                 normals.push(Vec3::new(x, y, z));
             }
+            "vt" if source.textures => {
+                let numbers = floats(words, &broken)?;
+                let [u, v, ..] = numbers[..] else {
+                    return Err(broken(format!("{} numbers, expected u v", numbers.len())));
+                };
+                source.allow(atlas.uvs.len() + 1, 0)?;
+                atlas.uvs.push(Vec2::new(u, 1.0 - v));
+            }
+            "mtllib" if source.textures && library.is_none() => {
+                let at = format!("line {}", number + 1);
+                library = Some(source.bare_name(at, line.strip_prefix("mtllib").unwrap_or(""))?);
+            }
+            "usemtl" if source.textures => {
+                let name = words.collect::<Vec<_>>().join(" ");
+                if !mesh.triangles.is_empty() && material.as_ref() != Some(&name) {
+                    let at = format!("line {}", number + 1);
+                    return Err(source.unsupported(at, "a mesh with several materials"));
+                }
+                material = Some(name);
+            }
             "f" => {
                 corners.clear();
+                mapped.clear();
                 for word in words {
                     let mut parts = word.split('/');
                     let vertex =
                         resolve(parts.next().unwrap_or(""), mesh.positions.len(), "vertices", &broken)?;
-                    let normal = match parts.nth(1) {
+                    let uv = parts.next().unwrap_or("");
+                    if source.textures && !uv.is_empty() {
+                        mapped.push(resolve(uv, atlas.uvs.len(), "texture coordinates", &broken)?);
+                    }
+                    let normal = match parts.next() {
                         Some(text) if !text.is_empty() => resolve(text, normals.len(), "normals", &broken)?,
                         _ => u32::MAX,
                     };
@@ -66,7 +98,14 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> 
                     )));
                 }
                 source.allow(0, mesh.triangles.len() + corners.len() - 2)?;
-                mesh.triangles.extend(corners.windows(2).skip(1).map(|w| [corners[0], w[0], w[1]]));
+                let fan = |c: &[u32], out: &mut Vec<[u32; 3]>| {
+                    out.extend(c.windows(2).skip(1).map(|w| [c[0], w[0], w[1]]));
+                };
+                fan(&corners, &mut mesh.triangles);
+                all_mapped &= mapped.len() == corners.len();
+                if all_mapped {
+                    fan(&mapped, &mut atlas.triangles);
+                }
             }
             _ => {}
         }
@@ -77,7 +116,34 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> 
     if normals_agree && !normal_of.contains(&u32::MAX) {
         mesh.normals = normal_of.iter().map(|&n| normals[n as usize].normalize_or_zero()).collect();
     }
-    Ok(mesh)
+    Ok(ReadMesh { mesh, atlas: all_mapped.then_some(atlas), texture: library.map(Texture::Material) })
+}
+
+/// The bare name of the picture that a `.mtl` file gives as its base colour (`map_Kd`), if any.
+///
+/// # Errors
+///
+/// [`ReadMeshError::Unsupported`] when it lies in another folder or behind an address, when it comes
+/// with options, or when there are several.
+pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>, ReadMeshError> {
+    let source = Source { path, limits: &Limits::default(), textures: true };
+    let mut found: Option<String> = None;
+    for (number, line) in bytes.split(|&b| b == b'\n').enumerate() {
+        let line = String::from_utf8_lossy(line.trim_ascii());
+        let Some(name) = line.strip_prefix("map_Kd").filter(|n| n.starts_with(char::is_whitespace)) else {
+            continue;
+        };
+        let at = format!("line {}", number + 1);
+        if name.trim_start().starts_with('-') {
+            return Err(source.unsupported(at, "a texture with options"));
+        }
+        let name = source.bare_name(at.as_str(), name)?;
+        if found.as_ref().is_some_and(|f| *f != name) {
+            return Err(source.unsupported(at, "a mesh with several base colours"));
+        }
+        found = Some(name);
+    }
+    Ok(found)
 }
 
 fn floats<'a>(

@@ -1,8 +1,8 @@
 //! PLY → mesh: text and both binary orders, any scalar types, polygons fanned.
 
-use super::{ReadMeshError, Source};
-use crate::geom::Mesh;
-use glam::Vec3;
+use super::{ReadMesh, ReadMeshError, Source, Texture};
+use crate::geom::{Atlas, Mesh};
+use glam::{Vec2, Vec3};
 
 /// A header is a few lines; more is an attack or another format.
 const HEADER_BYTES: usize = 1 << 20;
@@ -73,14 +73,15 @@ struct Element {
     properties: Vec<Property>,
 }
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> {
-    let (order, elements, start) = header(bytes, source)?;
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshError> {
+    let Header { order, elements, start, picture } = header(bytes, source)?;
     let mut body = Body { bytes, at: start, order, source };
     let mut mesh = Mesh::default();
+    let mut uvs = None;
     for element in &elements {
         body.check(element)?;
         match element.name.as_str() {
-            "vertex" => vertices(&mut body, element, &mut mesh)?,
+            "vertex" => uvs = vertices(&mut body, element, &mut mesh)?,
             "face" => faces(&mut body, element, &mut mesh)?,
             "tristrips" => return Err(source.unsupported("element `tristrips`", "a triangle strip")),
             _ => {
@@ -100,11 +101,22 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Mesh, ReadMeshError> 
             );
         }
     }
-    Ok(mesh)
+    let atlas = uvs.map(|uvs| Atlas { uvs, triangles: mesh.triangles.clone(), width: 0, height: 0 });
+    Ok(ReadMesh { mesh, atlas, texture: picture.map(Texture::Beside) })
 }
 
-fn header(bytes: &[u8], source: Source) -> Result<(Order, Vec<Element>, usize), ReadMeshError> {
+struct Header {
+    order: Order,
+    elements: Vec<Element>,
+    /// Where the body begins.
+    start: usize,
+    /// Of `comment TextureFile`, as MeshLab writes it.
+    picture: Option<String>,
+}
+
+fn header(bytes: &[u8], source: Source) -> Result<Header, ReadMeshError> {
     let (mut order, mut elements, mut at) = (None, Vec::<Element>::new(), 0);
+    let mut picture = None;
     for number in 1.. {
         let rest = &bytes[at..bytes.len().min(HEADER_BYTES).max(at)];
         let broken = |what: String| source.broken(format!("header line {number}"), what);
@@ -115,6 +127,13 @@ fn header(bytes: &[u8], source: Source) -> Result<(Order, Vec<Element>, usize), 
         at += length + 1;
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         match words[..] {
+            ["comment", "TextureFile", ref name @ ..] if source.textures => {
+                let name = source.bare_name(format!("header line {number}"), &name.join(" "))?;
+                if picture.as_ref().is_some_and(|p| *p != name) {
+                    return Err(source.unsupported(format!("header line {number}"), "a second texture"));
+                }
+                picture = Some(name);
+            }
             ["ply"] | ["comment" | "obj_info", ..] | [] => {}
             ["format", kind, _] => {
                 order = match kind {
@@ -148,7 +167,7 @@ fn header(bytes: &[u8], source: Source) -> Result<(Order, Vec<Element>, usize), 
             }
             ["end_header"] => {
                 let order = order.ok_or_else(|| broken("there was no `format`".into()))?;
-                return Ok((order, elements, at));
+                return Ok(Header { order, elements, start: at, picture });
             }
             _ => {
                 return Err(broken(format!(
@@ -250,7 +269,8 @@ impl Body<'_> {
     }
 }
 
-fn vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<(), ReadMeshError> {
+/// Adds the vertices; their texture coordinates come back, if wanted and there.
+fn vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<Option<Vec<Vec2>>, ReadMeshError> {
     let source = body.source;
     source.allow(element.count, 0)?;
     let slot = |name: &str| element.properties.iter().position(|p| p.name == name && p.length.is_none());
@@ -262,6 +282,12 @@ fn vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<(), R
         return Err(source.broken("element `vertex`", "has no x, y, z"));
     };
     let (normal, color) = (triple(["nx", "ny", "nz"]), triple(["red", "green", "blue"]));
+    let spellings = [["s", "t"], ["u", "v"], ["texture_u", "texture_v"]];
+    let uv = spellings.into_iter().find_map(|names| match names.map(slot) {
+        [Some(s), Some(t)] if source.textures => Some([s, t]),
+        _ => None,
+    });
+    let mut uvs = uv.map(|_| Vec::new());
     let mut row = vec![0.0; element.properties.len()];
     for i in 0..element.count {
         for (k, property) in element.properties.iter().enumerate() {
@@ -287,8 +313,16 @@ fn vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<(), R
             }
             mesh.colors.push(coded);
         }
+        if let (Some([s, t]), Some(uvs)) = (uv, &mut uvs) {
+            // PLY's v runs up
+            let uv = Vec2::new(row[s] as f32, 1.0 - row[t] as f32);
+            if !uv.is_finite() {
+                return Err(source.broken(format!("vertex {i}"), "its texture coordinate is not finite"));
+            }
+            uvs.push(uv);
+        }
     }
-    Ok(())
+    Ok(uvs)
 }
 
 fn faces(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<(), ReadMeshError> {

@@ -1,0 +1,71 @@
+//! Writes a textured ball, 20 cm across, as a GLB, an OBJ and a PLY, and as GLBs with everything else.
+//!
+//! `cargo run --no-default-features --example textured_sphere -- FOLDER`
+//!
+//! A map of the world: u runs around, v from pole to pole, so one meridian is a seam. `tools/readers`
+//! opens all of them with other people's programs.
+
+use glam::{Vec2, Vec3};
+use std::f32::consts::{PI, TAU};
+use tiface::geom::{Atlas, Mesh};
+use tiface::image::Photo;
+use tiface::mesh::textured::{Lobe, TextureOptions, Textured};
+use tiface::mesh::{
+    export::ExportOptions, gltf::textured_to_glb, obj::textured_to_obj, ply::textured_to_ply,
+};
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let folder = std::path::PathBuf::from(std::env::args().nth(1).unwrap_or_else(|| ".".into()));
+    let (mesh, atlas) = globe(32, 0.1, Vec3::new(0.3, -0.2, 1.6));
+    let color = picture(|x, y| [x as u8, 2 * y as u8, if (x / 16 + y / 16) % 2 == 0 { 40 } else { 220 }]);
+    let (flat, gloss) = (picture(|_, _| [128, 128, 255]), picture(|x, _| [(x / 4) as u8; 3]));
+    let options = ExportOptions { name: "globe".into(), up: Vec3::Z, ..ExportOptions::default() };
+    let plain = Textured::new(&mesh, &atlas, &color);
+    let lobes = vec![Lobe { name: "gloss".into(), picture: &gloss }];
+    let rich = Textured { normal: Some(&flat), lobes, ..plain.clone() };
+    let texture = TextureOptions { stem: "globe".into(), ..TextureOptions::default() };
+    let mut files = textured_to_glb(&plain, &options, &texture)?.files;
+    files.extend(textured_to_obj(&plain, &options, &texture)?.files);
+    files.extend(textured_to_ply(&plain, &texture)?.files);
+    let texture = TextureOptions { stem: "globe_rich".into(), ..texture };
+    files.extend(textured_to_glb(&rich, &options, &texture)?.files);
+    let texture = TextureOptions { stem: "globe_quantized".into(), quantize: true, ..texture };
+    files.extend(textured_to_glb(&rich, &options, &texture)?.files);
+    std::fs::create_dir_all(&folder)?;
+    Ok(files.iter().try_for_each(|(name, bytes)| std::fs::write(folder.join(name), bytes))?)
+}
+
+fn picture(texel: impl Fn(u32, u32) -> [u8; 3]) -> Photo {
+    Photo {
+        width: 256,
+        height: 128,
+        rgb: (0..256 * 128).map(|i| texel(i % 256, i / 256)).collect(),
+        alpha: None,
+    }
+}
+
+/// A sphere whose upper half is longer, so that a wrong turn shows in its box. Folded triangles at the
+/// poles are left to the export, which drops them.
+fn globe(rings: u32, radius: f32, center: Vec3) -> (Mesh, Atlas) {
+    let (n, mut mesh) = (2 * rings, Mesh::default());
+    let mut atlas = Atlas { width: 256, height: 128, ..Atlas::default() };
+    for (ring, i) in (0..=rings).flat_map(|ring| (0..=n).map(move |i| (ring, i))) {
+        let at = Vec2::new(i as f32 / n as f32, ring as f32 / rings as f32);
+        atlas.uvs.push(at);
+        if i == 0 || (ring % rings != 0 && i < n) {
+            let ((sin, z), (y, x)) = ((at.y * PI).sin_cos(), (at.x * TAU).sin_cos());
+            let stretch = if z > 0.0 { 1.3 } else { 1.0 };
+            mesh.positions.push(center + radius * Vec3::new(sin * x, sin * y, z * stretch));
+            mesh.normals.push(Vec3::new(sin * x, sin * y, z / stretch).normalize());
+        }
+    }
+    // poles and the seam: one vertex, several texture coordinates
+    let last = mesh.positions.len() as u32 - 1;
+    let vertex =
+        |uv: u32| if uv <= n { 0 } else { (1 + (uv / (n + 1) - 1) * n + uv % (n + 1) % n).min(last) };
+    for a in (0..rings * (n + 1)).filter(|a| a % (n + 1) < n) {
+        atlas.triangles.extend([[a, a + n + 1, a + n + 2], [a, a + n + 2, a + 1]]);
+    }
+    mesh.triangles = atlas.triangles.iter().map(|t| t.map(vertex)).collect();
+    (mesh, atlas)
+}
