@@ -25,6 +25,26 @@ pub enum MeshFrame {
     Head,
 }
 
+/// Whose view of a texel is its colour.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TextureView {
+    /// The mean over the training cameras that see it.
+    Cameras,
+    /// One that looks straight at the surface.
+    Normal,
+}
+
+/// How a texture is stored inside or beside a mesh.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TextureFormat {
+    /// Lossless.
+    Png,
+    /// Smaller, quality 92.
+    Jpeg,
+}
+
 /// How the surface is extracted and exported.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -41,6 +61,31 @@ pub struct MeshConfig {
     pub relax: f32,
     /// Also evaluate the whole grid and report what the sparse extraction lost.
     pub verify: bool,
+    /// Close the surface where the frames cut the body; else it stays open there.
+    pub cap: bool,
+    /// Triangles of the product; 0 keeps all of the extraction.
+    pub triangles: u32,
+    /// Largest distance of the product from the field's surface, in cells of the extraction: simplification
+    /// stops before it; 0 sets no limit.
+    pub max_error: f32,
+    /// Texels along each side of the texture; 0 leaves colours at the vertices.
+    pub texture_px: u32,
+    /// Samples along each side of a texel.
+    pub texture_samples: u32,
+    /// Texels that repeat a chart's border around it; charts lie twice as far apart.
+    pub gutter_px: u32,
+    /// Whose view of a texel is its colour.
+    pub texture_view: TextureView,
+    /// Degree of the view-dependent lobes in the GLB, 1 or 2; 0 for none.
+    pub lobes: u32,
+    /// A tangent-space map of the field's normals in the GLB.
+    pub normal_map: bool,
+    /// How pictures are stored in GLB and beside OBJ.
+    pub texture_format: TextureFormat,
+    /// Also keep the baked colour as `head.exr`, scene-linear.
+    pub exr: bool,
+    /// 16-bit coordinates in the GLB (`KHR_mesh_quantization`): half the size, but trimesh and open3d misread it.
+    pub quantize: bool,
     /// Files to write.
     pub format: Vec<MeshFormat>,
     /// Coordinates to write them in.
@@ -74,6 +119,26 @@ pub(super) const KEYS: &[Key] = &[
         1.0,
     ),
     Key::word("verify", "Also evaluate the whole grid and report what the sparse extraction lost: slow."),
+    Key::word("cap", "Close the surface where the frames cut the body: true or false."),
+    Key::number("triangles", "Triangles of the product; 0 keeps all of the extraction.", 0.0, 1e8),
+    Key::number(
+        "max_error",
+        "Largest distance of the product from the field's surface, in cells; 0 sets no limit.",
+        0.0,
+        100.0,
+    ),
+    Key::number("texture_px", "Texels along each side of the texture; 0: colours at the vertices.", 0.0, 16384.0),
+    Key::number("texture_samples", "Samples along each side of a texel.", 1.0, 8.0),
+    Key::number("gutter_px", "Texels that repeat a chart's border around it.", 0.0, 256.0),
+    Key::word(
+        "texture_view",
+        "Whose view of a texel is its colour: cameras (the mean of those that see it) or normal (straight at it).",
+    ),
+    Key::number("lobes", "Degree of view-dependent lobes in the GLB: 0 (none), 1 or 2.", 0.0, 2.0),
+    Key::word("normal_map", "A tangent-space map of the field's normals in the GLB: true or false."),
+    Key::word("texture_format", "How pictures are stored with the mesh: png or jpeg."),
+    Key::word("exr", "Also keep the baked colour as head.exr, scene-linear: true or false."),
+    Key::word("quantize", "16-bit coordinates in the GLB: half the size, misread by trimesh and open3d."),
     Key::word("format", "Files to write, a list of glb, obj, ply."),
     Key::word("frame", "Coordinates of the files: dataset, or head (+Y up, face towards +Z, centred)."),
 ];
@@ -88,6 +153,18 @@ impl MeshConfig {
             newton_steps: 2,
             relax: 0.5,
             verify: false,
+            cap: true,
+            triangles: 50_000,
+            max_error: 0.0,
+            texture_px: if preset == Preset::Draft { 1024 } else { 2048 },
+            texture_samples: 2,
+            gutter_px: 8,
+            texture_view: TextureView::Cameras,
+            lobes: 0,
+            normal_map: false,
+            texture_format: TextureFormat::Png,
+            exr: false,
+            quantize: false,
             format: vec![MeshFormat::Glb],
             frame: MeshFrame::Dataset,
         }

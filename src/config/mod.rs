@@ -25,7 +25,7 @@ pub use capture::CaptureConfig;
 pub use ensemble::{Correct, EnsembleConfig, Fit};
 pub use iface::IfaceConfig;
 pub use mask::{MaskConfig, MaskMeaning, MaskSource};
-pub use mesh::{MeshConfig, MeshFormat, MeshFrame};
+pub use mesh::{MeshConfig, MeshFormat, MeshFrame, TextureFormat, TextureView};
 pub use metrics::MetricsConfig;
 pub use render::{Background, Method, PictureFormat, RenderConfig};
 pub use source::{ConfigError, Place, Sources};

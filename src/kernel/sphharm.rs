@@ -26,6 +26,15 @@ pub fn sh16([x, y, z]: [f32; 3]) -> [f32; 16] {
     ]
 }
 
+/// `Σ_k c_k Y_k(d)` of up to 16 coefficients, per channel.
+pub fn combine(coefficients: &[[f32; 3]], d: [f32; 3]) -> [f32; 3] {
+    let mut out = [0f32; 3];
+    for (c, y) in coefficients.iter().zip(sh16(d)) {
+        (0..3).for_each(|k| out[k] += c[k] * y);
+    }
+    out
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

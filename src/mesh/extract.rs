@@ -17,6 +17,8 @@ pub struct MeshReport {
     pub cells: [usize; 3],
     /// Cell edge, in units of the bounds.
     pub cell_size: f32,
+    /// Lower and upper corner of the grid: where caps lie.
+    pub grid: [[f32; 3]; 2],
     /// Nodes the field was asked for.
     pub nodes_evaluated: usize,
     /// The same as a share of all nodes, 0..=1.
@@ -48,6 +50,12 @@ pub struct MeshReport {
 }
 
 impl MeshReport {
+    /// The box of the grid.
+    pub fn bounds(&self) -> Aabb {
+        let [min, max] = self.grid.map(Vec3::from);
+        Aabb { min, max }
+    }
+
     /// What a person should hear about, one sentence each.
     pub fn warnings(&self) -> Vec<String> {
         let mut out = Vec::new();
@@ -121,6 +129,7 @@ pub fn extract(
     let mut report = MeshReport {
         cells: grid.dims.map(|d| d - 1),
         cell_size: grid.spacing,
+        grid: [grid.origin.to_array(), grid.point(grid.dims.map(|d| d - 1)).to_array()],
         nodes_evaluated: found.evaluated,
         share_evaluated: found.evaluated as f64 / grid.nodes() as f64,
         nodes_outside_hull: found.skipped,

@@ -4,6 +4,7 @@
 //! head and drops the dust, [`extract`] is the stage: all of it, with normals and colours.
 
 pub mod bake;
+mod cap;
 pub mod check;
 mod clean;
 mod error;
@@ -24,6 +25,7 @@ pub mod textured;
 pub mod textured_tangents;
 mod verify;
 
+pub use cap::Cap;
 pub use clean::{CleanReport, clean};
 pub use error::MeshError;
 pub use extract::{MeshReport, extract};

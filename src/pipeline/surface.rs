@@ -20,13 +20,8 @@ pub trait Surface: Sync {
     fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]>;
 
     /// The same, point `i` seen along `counts[i]` directions, all in one list: one colour a direction.
-    fn colors(
-        &self,
-        points: &[Vec3],
-        normals: &[Vec3],
-        counts: &[u32],
-        directions: &[Vec3],
-    ) -> Vec<[f32; 3]>;
+    fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], directions: &[Vec3])
+    -> Vec<[f32; 3]>;
 
     /// The view of a camera in scene coordinates by marching through the field itself; depth and
     /// normals in the world. `None` for what is only a surface.

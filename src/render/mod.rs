@@ -2,5 +2,7 @@
 
 pub mod path;
 mod raycast;
+mod texture;
 
-pub use raycast::{RaycastOptions, RenderedView, raycast};
+pub use raycast::{RaycastOptions, RenderedView, Struck, raycast, raycast_hits};
+pub use texture::{LobePictures, Texture};

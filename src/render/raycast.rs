@@ -63,6 +63,30 @@ pub fn raycast(
     options: &RaycastOptions,
     color: impl Fn(&[Vec3], &[Vec3], &[Vec3]) -> Vec<[f32; 3]> + Sync,
 ) -> RenderedView {
+    raycast_hits(bvh, mesh, camera, options, |s: &Struck| color(s.points, s.normals, s.directions))
+}
+
+/// What rays met, for whoever colours it. All `[n]`.
+#[derive(Clone, Copy, Debug)]
+pub struct Struck<'a> {
+    /// Where, in the mesh's coordinates.
+    pub points: &'a [Vec3],
+    /// Unit normals: the vertices' interpolated, or the triangle's own.
+    pub normals: &'a [Vec3],
+    /// Unit directions, away from the camera.
+    pub directions: &'a [Vec3],
+    /// Triangle, weights of its corners and distance.
+    pub hits: &'a [Hit],
+}
+
+/// [`raycast`] for colours that need to know the triangle, as those of a texture do.
+pub fn raycast_hits(
+    bvh: &Bvh,
+    mesh: &Mesh,
+    camera: &Camera,
+    options: &RaycastOptions,
+    color: impl Fn(&Struck) -> Vec<[f32; 3]> + Sync,
+) -> RenderedView {
     let (width, height) = (camera.width, camera.height);
     let mut view = RenderedView {
         color: Image::new(width, height, 4),
@@ -101,6 +125,7 @@ struct Queue {
     points: Vec<Vec3>,
     normals: Vec<Vec3>,
     directions: Vec<Vec3>,
+    hits: Vec<Hit>,
     pixel: Vec<usize>,
 }
 
@@ -112,7 +137,7 @@ impl Look<'_> {
         rgba: &mut [[f32; 4]],
         depth: &mut [f32],
         normal: &mut [[f32; 3]],
-        color: &(impl Fn(&[Vec3], &[Vec3], &[Vec3]) -> Vec<[f32; 3]> + Sync),
+        color: &(impl Fn(&Struck) -> Vec<[f32; 3]> + Sync),
     ) {
         let w = self.camera.width as usize;
         let rows = rgba.len() / w;
@@ -217,6 +242,7 @@ impl Look<'_> {
         queue.points.push((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c);
         queue.normals.push(self.normal(hit));
         queue.directions.push(ray.direction);
+        queue.hits.push(*hit);
         queue.pixel.push(pixel);
     }
 
@@ -226,12 +252,17 @@ impl Look<'_> {
         queue: &mut Queue,
         n: usize,
         rgba: &mut [[f32; 4]],
-        color: &(impl Fn(&[Vec3], &[Vec3], &[Vec3]) -> Vec<[f32; 3]> + Sync),
+        color: &(impl Fn(&Struck) -> Vec<[f32; 3]> + Sync),
     ) {
         if queue.pixel.is_empty() {
             return;
         }
-        let colors = color(&queue.points, &queue.normals, &queue.directions);
+        let colors = color(&Struck {
+            points: &queue.points,
+            normals: &queue.normals,
+            directions: &queue.directions,
+            hits: &queue.hits,
+        });
         for group in
             (0..queue.pixel.len()).collect::<Vec<_>>().chunk_by(|&a, &b| queue.pixel[a] == queue.pixel[b])
         {

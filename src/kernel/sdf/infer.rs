@@ -185,7 +185,13 @@ pub fn colors(
             let (direction, later) = ahead.split_at(colors);
             (rest, ahead) = (after, later);
             let normal = &normal[own.clone()];
-            tasks.push(ColorTask { inputs: Inputs::new(shape, x, value, own), normal, counts, direction, rgb });
+            tasks.push(ColorTask {
+                inputs: Inputs::new(shape, x, value, own),
+                normal,
+                counts,
+                direction,
+                rgb,
+            });
         }
         tasks.par_iter_mut().for_each(|task| color_task(task, weights));
     }

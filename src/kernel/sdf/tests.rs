@@ -102,7 +102,7 @@ fn the_forward_agrees_with_an_f64_model() {
     let sdf = values(&shape, &table, &w, &x);
     let normals = gradients(&shape, &table, &w, &x);
     let units: Vec<[f32; 3]> = normals.iter().map(|n| unit(n.1)).collect();
-    let colors = colors(&shape, &table, &w, &x, &units, &d);
+    let colors = colors(&shape, &table, &w, &x, &units, None, &d);
     for i in 0..x.len() {
         let want = model(&shape, &table64, &flat64, x[i], d[i]);
         for k in 0..7 {
@@ -206,4 +206,24 @@ fn one_thread_and_many_give_the_same_bytes() {
         })
     };
     assert_eq!(once(1), once(3));
+}
+
+#[test]
+fn colours_along_many_directions_are_those_of_each() {
+    let (shape, table, flat) = field();
+    let (x, d) = points(3 * 5000);
+    let w = Weights::new(shape.layout(), &flat);
+    let normal: Vec<[f32; 3]> = x.iter().map(|&p| unit(p)).collect();
+    // 0, 1, 2 or 5 directions of each of the first points, over several chunks and tiles
+    let counts: Vec<u32> = (0..4000).map(|i| [0, 1, 2, 5][i % 4]).collect();
+    let total: u32 = counts.iter().sum();
+    let together =
+        colors(&shape, &table, &w, &x[..4000], &normal[..4000], Some(&counts), &d[..total as usize]);
+    let repeat = |v: &[[f32; 3]]| -> Vec<[f32; 3]> {
+        v.iter().zip(&counts).flat_map(|(v, &n)| std::iter::repeat_n(*v, n as usize)).collect()
+    };
+    let (px, pn) = (repeat(&x[..4000]), repeat(&normal[..4000]));
+    let apart = colors(&shape, &table, &w, &px, &pn, None, &d[..total as usize]);
+    assert_eq!(together.len(), 8000);
+    assert!(together.iter().zip(&apart).all(|(a, b)| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6)));
 }

@@ -246,13 +246,8 @@ mod tests {
         let at = |x: f32, n: Vec3| (Vec3::new(x, 0.0, 0.0), n);
         let tilted = |degrees: f32| Vec3::new(degrees.to_radians().sin(), 0.0, degrees.to_radians().cos());
         // free, hidden, turned away, 80 degrees off, outside the frame (50 / 100 · 4 = 2)
-        let all = [
-            at(0.5, Vec3::Z),
-            at(-0.5, Vec3::Z),
-            at(0.5, -Vec3::Z),
-            at(0.5, tilted(80.0)),
-            at(2.1, Vec3::Z),
-        ];
+        let all =
+            [at(0.5, Vec3::Z), at(-0.5, Vec3::Z), at(0.5, -Vec3::Z), at(0.5, tilted(80.0)), at(2.1, Vec3::Z)];
         let (positions, normals) = all.into_iter().unzip();
         let points = Points { positions, normals };
         let seen = eyes.seen(&points, &points);
@@ -279,7 +274,7 @@ mod tests {
         // the second is looked at straight: direction −z, x is not negative
         assert_eq!(shades.linear[1][0], 0.0);
         // towards +x it is brighter than towards −x
-        let towards = |x: f32| lobes::add(&shades.lobes[..4], side(x))[0];
+        let towards = |x: f32| crate::kernel::sphharm::combine(&shades.lobes[..4], side(x).to_array())[0];
         assert!(towards(1.0) > 0.1 && towards(-1.0) < -0.3, "{} {}", towards(1.0), towards(-1.0));
         assert_eq!(shades.lobes[4..], [[0.0; 3]; 4]);
         let straight = shade(&points, seen(), &learned, true, 0, glam::Mat3::IDENTITY);

@@ -1,7 +1,7 @@
 //! View-dependent colour in a few numbers a texel: real spherical harmonics of the direction to the viewer.
 //!
 //! A texel's colour seen from direction `d` is `base + Σ_k L_k Y_k(d)`, sRGB-coded, with `Y` up to degree 1 (4
-//! functions) or 2 (9) in the order and signs of [`sh16`]. `base` is what an ordinary viewer shows. The
+//! functions) or 2 (9) in the order and signs of [`sh16`]; [`crate::kernel::sphharm::combine`] sums them. `base` is what an ordinary viewer shows. The
 //! coefficients minimise, over the cameras that see the point,
 //!
 //! ```text
@@ -80,20 +80,15 @@ pub fn fit(base: [f32; 3], directions: &[Vec3], weights: &[f32], colors: &[[f32;
     }
 }
 
-/// What the coefficients add to the base colour, seen from the unit direction `d` towards the viewer.
-pub fn add(coefficients: &[[f32; 3]], d: Vec3) -> [f32; 3] {
-    let y = sh16(d.to_array());
-    let mut out = [0f32; 3];
-    for (l, y) in coefficients.iter().zip(y) {
-        (0..3).for_each(|k| out[k] += l[k] * y);
-    }
-    out
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::kernel::rng;
+    use crate::kernel::sphharm::combine;
+
+    fn add(coefficients: &[[f32; 3]], d: Vec3) -> [f32; 3] {
+        combine(coefficients, d.to_array())
+    }
 
     fn directions(n: u64) -> Vec<Vec3> {
         let at = |i: u64| Vec3::from_array(std::array::from_fn(|a| rng::normal(1, 2, 3 * i + a as u64)));

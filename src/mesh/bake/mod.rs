@@ -3,15 +3,18 @@
 //! Every texel that a chart covers is looked at through several samples ([`cover`]); each sample moves onto the
 //! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
 //! they see in linear light ([`light`]). What the cameras see differently can be kept as a few lobes a texel
-//! ([`lobes`]), and the field's normal as a picture of normals. Gaps are filled by [`fill`].
+//! ([`lobes`]), and the field's normal as a picture of normals
+//! ([`tangent_space`]). Gaps are filled by [`fill`].
 //!
 //! The picture is baked in bands of rows: memory is bounded whatever the texture's size.
 
 mod cover;
+mod detail;
 mod fill;
 mod light;
 pub mod lobes;
 
+pub use detail::tangent_space;
 pub use light::Learned;
 
 use super::MeshError;
@@ -368,7 +371,7 @@ mod tests {
         for side in [-0.6f32, 0.0, 0.6] {
             let d = Vec3::new(side, 0.0, 1.0).normalize();
             let truth = 0.5 + 0.2 * d.x;
-            let with = base + lobes::add(&l, d)[0];
+            let with = base + crate::kernel::sphharm::combine(&l, d.to_array())[0];
             assert!(
                 (with - truth).abs() <= 0.3 * (base - truth).abs() + 0.01,
                 "{side}: {with} {base} {truth}"

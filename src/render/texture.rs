@@ -1,0 +1,194 @@
+//! Colours from a texture: mip-mapped, filtered in linear light, with lobes for what depends on the view.
+
+use super::raycast::Struck;
+use crate::geom::{Atlas, Camera, Mesh};
+use crate::image::{Photo, linear_from_srgb, srgb_from_linear};
+use crate::kernel::sphharm;
+use glam::{Mat3, Vec2};
+
+/// View-dependent colour beside a base colour: one picture per spherical-harmonic function, in the order of
+/// [`sphharm::sh16`]. A byte `b` of picture `k` stands for the sRGB-coded difference `(b − 128) / 127 · scale[k]`.
+pub struct LobePictures<'a> {
+    /// Pictures of the atlas's size.
+    pub pictures: &'a [Photo],
+    /// Scale of each.
+    pub scale: &'a [f32],
+    /// Turns directions of the mesh's coordinates into those of the harmonics.
+    pub turned: Mat3,
+}
+
+/// A texture ready to be looked up.
+pub struct Texture<'a> {
+    atlas: &'a Atlas,
+    /// Linear colour and then the lobes, level by level; interleaved channels.
+    levels: Vec<Level>,
+    channels: usize,
+    turned: Mat3,
+    /// Texels per unit of length, per triangle.
+    density: Vec<f32>,
+}
+
+struct Level {
+    width: usize,
+    height: usize,
+    data: Vec<f32>,
+}
+
+impl<'a> Texture<'a> {
+    /// Prepares the pictures of a mesh; `color` and the lobes have one size of the atlas's shape.
+    pub fn new(mesh: &Mesh, atlas: &'a Atlas, color: &Photo, lobes: Option<&LobePictures>) -> Texture<'a> {
+        let table: [f32; 256] = std::array::from_fn(|i| linear_from_srgb(i as f32 / 255.0));
+        let pictures = lobes.map_or(&[][..], |l| l.pictures);
+        let channels = 3 + 3 * pictures.len();
+        let mut data = Vec::with_capacity(color.rgb.len() * channels);
+        for (i, c) in color.rgb.iter().enumerate() {
+            data.extend(c.map(|b| table[b as usize]));
+            for (k, picture) in pictures.iter().enumerate() {
+                let scale = lobes.map_or(0.0, |l| l.scale[k]) / 127.0;
+                data.extend(picture.rgb[i].map(|b| (f32::from(b) - 128.0) * scale));
+            }
+        }
+        let mut levels = vec![Level { width: color.width as usize, height: color.height as usize, data }];
+        while levels[levels.len() - 1].width.min(levels[levels.len() - 1].height) > 1 {
+            levels.push(levels[levels.len() - 1].halved(channels));
+        }
+        let density = (0..mesh.triangles.len() as u32)
+            .map(|t| {
+                let [a, b, c] = mesh.corners(t);
+                let [p, q, r] = atlas.corners(t);
+                let (space, texels) = ((b - a).cross(c - a).length(), (q - p).perp_dot(r - p).abs());
+                if space > 0.0 { (texels / space).sqrt() } else { 0.0 }
+            })
+            .collect();
+        Texture { atlas, levels, channels, turned: lobes.map_or(Mat3::IDENTITY, |l| l.turned), density }
+    }
+
+    /// sRGB-coded colours of what rays of a camera met.
+    pub fn colors(&self, struck: &Struck, camera: &Camera) -> Vec<[f32; 3]> {
+        let forward = camera.forward();
+        let mut values = vec![0f32; self.channels];
+        let one = |(i, hit): (usize, &crate::geom::Hit)| {
+            let corners = self.atlas.triangles[hit.triangle as usize].map(|c| self.atlas.uvs[c as usize]);
+            let uv = (1.0 - hit.u - hit.v) * corners[0] + hit.u * corners[1] + hit.v * corners[2];
+            // a pixel's width on a plane across the view; slanted surfaces stay sharp rather than blur
+            let footprint = hit.t * struck.directions[i].dot(forward) / camera.fx.abs() as f32;
+            let texels = footprint * self.density[hit.triangle as usize];
+            let level = texels.max(1.0).log2().round().clamp(0.0, (self.levels.len() - 1) as f32);
+            self.levels[level as usize].look_up(uv, &mut values);
+            let base: [f32; 3] = std::array::from_fn(|k| srgb_from_linear(values[k]));
+            if self.channels == 3 {
+                return base;
+            }
+            let d = self.turned * -struck.directions[i];
+            let lobes = values[3..].as_chunks::<3>().0;
+            let more = sphharm::combine(lobes, d.to_array());
+            std::array::from_fn(|k| (base[k] + more[k]).clamp(0.0, 1.0))
+        };
+        struck.hits.iter().enumerate().map(one).collect()
+    }
+}
+
+impl Level {
+    /// The mean of two by two texels.
+    fn halved(&self, channels: usize) -> Level {
+        let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
+        let mut data = Vec::with_capacity(width * height * channels);
+        for i in 0..width * height {
+            let (x, y) = (2 * (i % width), 2 * (i / width));
+            let (right, below) = ((x + 1).min(self.width - 1), (y + 1).min(self.height - 1));
+            for k in 0..channels {
+                let at = |x: usize, y: usize| self.data[(y * self.width + x) * channels + k];
+                data.push(0.25 * (at(x, y) + at(right, y) + at(x, below) + at(right, below)));
+            }
+        }
+        Level { width, height, data }
+    }
+
+    /// Bilinear, clamped at the borders.
+    fn look_up(&self, uv: Vec2, out: &mut [f32]) {
+        let at = |u: f32, n: usize| {
+            let p = (u * n as f32 - 0.5).clamp(0.0, (n - 1) as f32);
+            (p as usize, (p as usize + 1).min(n - 1), p.fract())
+        };
+        let (x0, x1, fx) = at(uv.x, self.width);
+        let (y0, y1, fy) = at(uv.y, self.height);
+        let channels = out.len();
+        let texel = |x: usize, y: usize| &self.data[(y * self.width + x) * channels..][..channels];
+        let (a, b, c, d) = (texel(x0, y0), texel(x1, y0), texel(x0, y1), texel(x1, y1));
+        for k in 0..channels {
+            let (top, bottom) = (a[k] + fx * (b[k] - a[k]), c[k] + fx * (d[k] - c[k]));
+            out[k] = top + fy * (bottom - top);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::raycast::{RaycastOptions, raycast_hits};
+    use super::*;
+    use crate::geom::Bvh;
+    use glam::Vec3;
+
+    /// A square from −1 to 1 at z = 0, its texture 4 × 4 from red (left) to green (right).
+    fn square() -> (Mesh, Atlas, Photo) {
+        let at = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
+        let mesh = Mesh {
+            positions: at.map(|(x, y)| Vec3::new(x, y, 0.0)).to_vec(),
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            ..Mesh::default()
+        };
+        // v runs down: the lower edge of the square is the lower row of the picture
+        let uvs = at.map(|(x, y)| Vec2::new(0.5 + 0.5 * x, 0.5 - 0.5 * y)).to_vec();
+        let atlas = Atlas { uvs, triangles: mesh.triangles.clone(), width: 4, height: 4 };
+        let rgb = (0..16).map(|i| if i % 4 < 2 { [255, 0, (i / 4 * 60) as u8] } else { [0, 255, 0] }).collect();
+        (mesh, atlas, Photo { width: 4, height: 4, rgb, alpha: None })
+    }
+
+    fn view(texture: &Texture, mesh: &Mesh, camera: &Camera) -> Vec<[f32; 4]> {
+        let bvh = Bvh::new(mesh);
+        let seen = raycast_hits(&bvh, mesh, camera, &RaycastOptions::default(), |s| texture.colors(s, camera));
+        seen.color.data.as_chunks::<4>().0.to_vec()
+    }
+
+    #[test]
+    fn texels_appear_where_they_lie() {
+        let (mesh, atlas, photo) = square();
+        let texture = Texture::new(&mesh, &atlas, &photo, None);
+        // 8 × 8 pixels over the square: focal 8 at distance 2 shows 2 units
+        let pixels = view(&texture, &mesh, &Camera::above(8, 8, 8.0, 2.0));
+        assert_eq!(pixels[0], [1.0, 0.0, 0.0, 1.0]);
+        assert_eq!(pixels[7], [0.0, 1.0, 0.0, 1.0]);
+        // the last row's left texel is 180 / 255 blue
+        assert!((pixels[56][2] - 180.0 / 255.0).abs() < 1e-3, "{:?}", pixels[56]);
+    }
+
+    #[test]
+    fn from_afar_the_mean_of_the_light_is_seen() {
+        let (mesh, atlas, mut photo) = square();
+        photo.rgb.iter_mut().enumerate().for_each(|(i, c)| *c = [255 * ((i + i / 4) % 2) as u8; 3]);
+        let texture = Texture::new(&mesh, &atlas, &photo, None);
+        // 2 pixels over the square: every pixel is the mean of 2 × 2 texels, linear 0.5, coded 0.735
+        for p in view(&texture, &mesh, &Camera::above(2, 2, 2.0, 2.0)) {
+            assert!((p[0] - srgb_from_linear(0.5)).abs() < 1e-3, "{p:?}");
+        }
+    }
+
+    #[test]
+    fn lobes_change_with_the_direction_of_view() {
+        let (mesh, atlas, mut photo) = square();
+        photo.rgb.fill([128; 3]);
+        let flat = |b: u8| Photo { rgb: vec![[b, 128, 128]; 16], ..photo.clone() };
+        // −0.4886 x is the fourth function: 255 stands for its scale
+        let pictures = [flat(128), flat(128), flat(128), flat(255)];
+        let scale = [0.1, 0.1, 0.1, 0.2];
+        let lobes = LobePictures { pictures: &pictures, scale: &scale, turned: Mat3::IDENTITY };
+        let texture = Texture::new(&mesh, &atlas, &photo, Some(&lobes));
+        let pixels = view(&texture, &mesh, &Camera::above(9, 9, 9.0, 2.0));
+        let middle = pixels[40];
+        assert!((middle[0] - 128.0 / 255.0).abs() < 1e-3);
+        // the leftmost pixel is seen from the right: its direction to the viewer has x = 0.889 / √(4 + 0.79)
+        let x = 8.0 / 9.0 / (4.0f32 + 64.0 / 81.0).sqrt();
+        assert!((pixels[36][0] - (128.0 / 255.0 - 0.2 * 0.4886 * x)).abs() < 1e-3, "{:?}", pixels[36]);
+        assert!((pixels[36][1] - 128.0 / 255.0).abs() < 1e-3);
+    }
+}
