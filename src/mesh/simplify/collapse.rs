@@ -6,7 +6,7 @@
 //! may not turn by more than 60° nor become worse than a quality of 0.05, unless they were worse.
 
 use super::quadric::{Freedom, Spread, best, lean_of};
-use super::rings::{BORDER, HELD, NONE, RESTING, Rings};
+use super::rings::{BORDER, HELD, NONE, Rings};
 use glam::Vec3;
 
 /// Squared cosine of how far a triangle may turn: 60°.
@@ -119,6 +119,7 @@ impl Star {
     /// Would the triangles that stay be sound with the new vertex at `x`?
     pub(super) fn fits(&mut self, rings: &Rings, x: Vec3) -> bool {
         self.leans.clear();
+        let mut worst = None;
         for side in &self.sides {
             let (p, q) = (rings.positions[side.from as usize], rings.positions[side.to as usize]);
             let (u, v) = (p - x, q - x);
@@ -131,13 +132,35 @@ impl Star {
                 return false;
             }
             // negated, so that what is not a number fails
-            let fair = 12.0 * area.length_squared() >= POOR * POOR * sum * sum && sum > 0.0;
-            if !fair && !(quality(u, v, q - p) > quality_of(rings.corners(side.triangle))) {
-                return false;
+            let fair = 12.0 * area.length_squared() >= *super::quadric::POORV * *super::quadric::POORV * sum * sum && sum > 0.0;
+            if !fair {
+                let worst = *worst.get_or_insert_with(|| self.worst(rings));
+                if !(quality(u, v, q - p) > worst) {
+                    return false;
+                }
             }
             self.leans.push(lean_of(area));
         }
         true
+    }
+
+    /// The triangles of both ends, before the collapse.
+    pub(super) fn triangles(&self) -> impl Iterator<Item = u32> {
+        self.sides.iter().map(|side| side.triangle).chain(self.gone.iter().map(|gone| gone.0))
+    }
+
+    /// The largest distance of `x` from the planes of the triangles of both ends.
+    pub(super) fn strays(&self, rings: &Rings, x: Vec3) -> f32 {
+        let far = |t: u32| {
+            let at = rings.positions[rings.triangles[t as usize][0] as usize];
+            rings.leans[t as usize].normalize_or_zero().dot(x - at).abs()
+        };
+        self.triangles().map(far).fold(0.0, f32::max)
+    }
+
+    /// The worst quality among all triangles of both ends.
+    fn worst(&self, rings: &Rings) -> f32 {
+        self.triangles().map(|t| quality_of(rings.corners(t))).fold(f32::INFINITY, f32::min)
     }
 
     /// Collapses edge (a, b), last gathered and found fit, into a at `x`.
@@ -193,7 +216,7 @@ impl Star {
 /// The best place for the collapse of (a, b), and its cost; `None` where an end is not to be touched.
 pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     let (fa, fb) = (rings.flags[a as usize], rings.flags[b as usize]);
-    if (fa | fb) & (HELD | RESTING) != 0 {
+    if (fa | fb) & (HELD) != 0 {
         return None;
     }
     let freedom = match (fa & BORDER != 0, fb & BORDER != 0) {
@@ -214,3 +237,4 @@ fn quality(u: Vec3, v: Vec3, w: Vec3) -> f32 {
 pub(super) fn quality_of([a, b, c]: [Vec3; 3]) -> f32 {
     quality(b - a, c - a, c - b)
 }
+

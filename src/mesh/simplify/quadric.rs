@@ -11,6 +11,10 @@ use glam::{DVec3, Vec3};
 /// Share of the trace added to the diagonal, about the middle of the edge: pulls the best point there
 /// where the triangles do not say (flat or along a crease), and keeps the condition below 1e4.
 const PULL: f64 = 3e-4;
+fn knob(n: &str, d: f64) -> f64 { std::env::var(n).ok().and_then(|s| s.parse().ok()).unwrap_or(d) }
+pub static PULLV: std::sync::LazyLock<f64> = std::sync::LazyLock::new(|| knob("PULL", 1e-5));
+pub static PULLC: std::sync::LazyLock<f64> = std::sync::LazyLock::new(|| knob("PULLC", 3e-5));
+pub static POORV: std::sync::LazyLock<f32> = std::sync::LazyLock::new(|| knob("POOR", 0.05) as f32);
 
 /// The best point lies at most this many edge lengths from the edge's middle.
 const REACH: f64 = 1.5;
@@ -87,12 +91,13 @@ pub(super) fn best(a: Vec3, qa: &Spread, b: Vec3, qb: &Spread, freedom: Freedom)
     //   = yᵀ (A + B) y + 2 yᵀ (A − B) h + hᵀ (A + B) h.
     let sum = qa.plus(qb, 1.0);
     let slope = times(&qa.plus(qb, -1.0), half);
-    let pull = PULL * (sum[0] + sum[3] + sum[5]);
+    let pullc = *PULLC * (sum[0] + sum[3] + sum[5]);
+    let pull = *PULLV * (sum[0] + sum[3] + sum[5]);
     let reach = half.length_squared();
     // The pull counts as cost at its full length, so that short edges go first where all is flat.
     let cost = |y: DVec3| {
         let q = y.dot(times(&sum, y)) + 2.0 * y.dot(slope) + half.dot(times(&sum, half));
-        (q.max(0.0) + pull * reach) as f32
+        (q.max(0.0) + pullc * reach) as f32
     };
     match freedom {
         Freedom::First => return (a, cost(-half)),

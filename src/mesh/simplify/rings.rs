@@ -15,8 +15,6 @@ pub(super) const BORDER: u8 = 1;
 pub(super) const HELD: u8 = 2;
 /// Another sheet of the surface is near: collapses look for intersections.
 pub(super) const CROWDED: u8 = 4;
-/// For the moment not to be collapsed: the surface is too far off already.
-pub(super) const RESTING: u8 = 8;
 
 /// What a dropped triangle's corners are.
 pub(super) const NONE: u32 = u32::MAX;
@@ -55,6 +53,14 @@ impl Rings {
     /// Around the triangles of `mesh`, whose indices must be in range and positions finite. Triangles
     /// with a repeated vertex are left out.
     pub(super) fn new(mesh: &Mesh) -> Rings {
+        let mut rings = Rings::bare(mesh);
+        rings.flags = held(&rings);
+        rings.measure();
+        rings
+    }
+
+    /// Without flags and measures.
+    pub(super) fn bare(mesh: &Mesh) -> Rings {
         let n = mesh.positions.len();
         let triangles: Vec<[u32; 3]> =
             mesh.triangles.iter().copied().filter(|t| t[0] != t[1] && t[1] != t[2] && t[2] != t[0]).collect();
@@ -86,8 +92,6 @@ impl Rings {
                 place.len += 1;
             }
         }
-        rings.flags = held(&rings);
-        rings.measure();
         rings
     }
 
