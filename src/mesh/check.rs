@@ -360,7 +360,7 @@ fn self_intersections(mesh: &Mesh, weld: &[u32], faces: &[([u32; 3], u32)]) -> u
 }
 
 /// Do two triangles meet in more than the corners they share?
-fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u32; 3]) -> bool {
+pub(super) fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u32; 3]) -> bool {
     let shared = |ids: [u32; 3], others: [u32; 3]| ids.map(|i| others.contains(&i));
     let (in_p, in_q) = (shared(p_ids, q_ids), shared(q_ids, p_ids));
     let count = in_p.iter().filter(|&&s| s).count();

@@ -83,6 +83,24 @@ pub enum MeshError {
         /// Pieces before.
         pieces: usize,
     },
+    /// A mesh with coordinates that are no numbers.
+    #[error("{count} vertices of the mesh have a coordinate that is not finite, the first is vertex {first}")]
+    NotFinite {
+        /// How many.
+        count: usize,
+        /// The first of them.
+        first: usize,
+    },
+    /// A triangle over a vertex that is not there.
+    #[error("triangle {triangle} names vertex {index}, but the mesh has {vertices}")]
+    Index {
+        /// Which triangle.
+        triangle: usize,
+        /// The largest index in it.
+        index: u32,
+        /// How many vertices there are.
+        vertices: usize,
+    },
     /// The monitor asked to stop.
     #[error("stopped on request")]
     Stopped,
@@ -107,6 +125,9 @@ impl MeshError {
             }
             MeshError::Answer { .. } => Some("a field must return one value a point, in order"),
             MeshError::NothingKept { .. } => Some("the field may be inverted: negative must be inside"),
+            MeshError::NotFinite { .. } | MeshError::Index { .. } => {
+                Some("the mesh is damaged: export it again, or remove these vertices and triangles")
+            }
             MeshError::Stopped => None,
         }
     }

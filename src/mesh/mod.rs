@@ -19,6 +19,7 @@ pub mod obj;
 pub mod ply;
 mod polish;
 pub mod read;
+mod simplify;
 mod sparse;
 mod sparse_blocks;
 pub mod textured;
@@ -30,6 +31,7 @@ pub use clean::{CleanReport, clean};
 pub use error::MeshError;
 pub use extract::{MeshReport, extract};
 pub use marching::{Surface, Volume, marching};
+pub use simplify::{SimplifyConfig, SimplifyReport, simplify};
 pub use sparse::{Asking, Grid, Sparse, sparse};
 pub use verify::Verified;
 

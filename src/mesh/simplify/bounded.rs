@@ -1,0 +1,109 @@
+//! As few triangles as an error allows.
+//!
+//! Between two looks at the field a collapse is only believed to stray as far as its new vertex lies from
+//! the planes before it, added up. Each round therefore may use a part of what the measured error leaves
+//! at each vertex, and is measured: at corners, middles of edges and of triangles. A round that went
+//! too far is undone and repeated with half of the part.
+
+use super::fit::{ask, newton};
+use super::round::{Task, prepare, reduce, settle};
+use super::{Placement, SimplifyReport};
+use crate::geom::Mesh;
+use crate::mesh::MeshError;
+use glam::Vec3;
+
+/// Most rounds, and most that may be undone.
+const ROUNDS: usize = 24;
+const UNDONE: usize = 5;
+/// A round gives up at most this share of the triangles: measuring often is cheaper than undoing.
+const SHARE: f64 = 0.5;
+/// A round that takes less than this share was the last.
+const LITTLE: f64 = 0.03;
+
+/// Simplifies until the error or the number of triangles is reached.
+pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh, MeshError> {
+    let (error, target) = (task.config.error, task.config.triangles.max(1));
+    let Some(field) = task.field else {
+        let mut rings = prepare(mesh, task, report);
+        let mut budgets = vec![error; rings.positions.len()];
+        reduce(&mut rings, task, target, Some(&mut budgets), report)?;
+        return Ok(rings.into_mesh());
+    };
+    let mut good = mesh.clone();
+    let mut at = measure(&good, task, report)?;
+    report.worst = Some(worst(&at));
+    let (mut part, mut undone) = (0.5, 0);
+    for round in 0..ROUNDS {
+        let before = good.triangles.len();
+        let mut rings = prepare(&good, task, report);
+        let mut budgets: Vec<f32> = at.iter().map(|e| part * (error - e)).collect();
+        let goal = target.max((SHARE * before as f64) as usize);
+        reduce(&mut rings, task, goal, Some(&mut budgets), report)?;
+        let mut next = rings.into_mesh();
+        if next.triangles.len() == before {
+            break;
+        }
+        settle(&mut next, field, task, Placement::OnSurface, true, report)?;
+        let errors = measure(&next, task, report)?;
+        let found = worst(&errors);
+        let after = next.triangles.len();
+        task.monitor.step(
+            round as u64 + 1,
+            ROUNDS as u64,
+            &[("triangles", after as f64), ("worst", f64::from(found))],
+        );
+        // An input that is farther off than asked may at least not become worse.
+        if found > error.max(report.worst.unwrap_or(0.0)) {
+            undone += 1;
+            part *= 0.5;
+            if undone > UNDONE {
+                break;
+            }
+            continue;
+        }
+        (good, at) = (next, errors);
+        report.worst = Some(found);
+        if after <= target || after as f64 > (1.0 - LITTLE) * before as f64 {
+            break;
+        }
+    }
+    if good.normals.is_empty() {
+        settle(&mut good, field, task, Placement::OnSurface, true, report)?;
+    }
+    Ok(good)
+}
+
+fn worst(errors: &[f32]) -> f32 {
+    errors.iter().copied().fold(0.0, f32::max)
+}
+
+/// For every vertex the largest distance to the surface at corners, middles of edges and middles of the
+/// triangles around it.
+fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<f32>, MeshError> {
+    let mut errors = vec![0.0f32; mesh.positions.len()];
+    let Some(field) = task.field else { return Ok(errors) };
+    // Where, and for whom: each inner edge once.
+    let mut points = mesh.positions.clone();
+    let mut whom: Vec<[u32; 3]> = (0..points.len() as u32).map(|v| [v; 3]).collect();
+    for t in &mesh.triangles {
+        let corners = t.map(|v| mesh.positions[v as usize]);
+        points.push((corners[0] + corners[1] + corners[2]) / 3.0);
+        whom.push(*t);
+        for k in 0..3 {
+            let n = (k + 1) % 3;
+            if t[k] < t[n] {
+                points.push(0.5 * (corners[k] + corners[n]));
+                whom.push([t[k], t[n], t[n]]);
+            }
+        }
+    }
+    let (f, g) = ask(field, &points, task.config.batch, &|| task.monitor.stop())?;
+    report.asked += f.len();
+    for (i, whom) in whom.iter().enumerate() {
+        let d = newton(f[i], g[i]).map_or(0.0, Vec3::length);
+        for &v in whom {
+            errors[v as usize] = errors[v as usize].max(d);
+        }
+    }
+    Ok(errors)
+}

@@ -1,0 +1,240 @@
+//! One collapse: may it be, and doing it.
+//!
+//! The link condition (Dey, Edelsbrunner, Guha, Nekhayev 1999): edge (a, b) may collapse without change
+//! of topology when every vertex joined to both is opposite to the edge in one of its triangles, and,
+//! with a border taken as joined to one vertex more, the same holds of edges. The triangles that stay
+//! may not turn by more than 60° nor become worse than a quality of 0.05, unless they were worse.
+
+use super::quadric::{Freedom, Spread, best, lean_of};
+use super::rings::{BORDER, HELD, NONE, Rings};
+use glam::Vec3;
+
+/// Squared cosine of how far a triangle may turn: 60°.
+const TURN: f32 = 0.25;
+/// Least quality `4 √3 area / Σ length²` of a triangle.
+const POOR: f32 = 0.05;
+/// No collapse leaves a vertex with more triangles than this, unless one of its ends had more.
+const CROWN: usize = 20;
+
+/// A triangle that will have the new vertex for a corner, and its other two corners in order.
+#[derive(Clone, Copy)]
+pub(super) struct Side {
+    pub triangle: u32,
+    pub from: u32,
+    pub to: u32,
+}
+
+/// What is around an edge. Kept between collapses for its memory.
+#[derive(Default)]
+pub(super) struct Star {
+    /// Triangles of a, then of b, that stay; the first `of_a` are a's.
+    pub sides: Vec<Side>,
+    of_a: usize,
+    /// Triangles that hold the edge, with the vertex opposite to it.
+    gone: Vec<(u32, u32)>,
+    /// Neighbours of the vertex to be.
+    pub around: Vec<u32>,
+    leans: Vec<Vec3>,
+    ring: Vec<u32>,
+    marks: Vec<u32>,
+    epoch: u32,
+}
+
+impl Star {
+    pub(super) fn new(vertices: usize) -> Star {
+        Star { marks: vec![0; vertices], ..Star::default() }
+    }
+
+    /// Looks around edge (a, b); false when its collapse would change the topology.
+    pub(super) fn gather(&mut self, rings: &Rings, a: u32, b: u32) -> bool {
+        if self.epoch >= u32::MAX - 2 {
+            self.marks.fill(0);
+            self.epoch = 0;
+        }
+        self.epoch += 2;
+        // neighbours of a, and those of b alone
+        let (near_a, near_b) = (self.epoch, self.epoch + 1);
+        self.sides.clear();
+        self.gone.clear();
+        self.around.clear();
+        let (va, vb) = (rings.valence(a), rings.valence(b));
+        if va + vb > (CROWN + 4).max(va.max(vb) + 4) {
+            return false;
+        }
+        for &t in rings.ring(a) {
+            let triangle = rings.triangles[t as usize];
+            let k = rings.corner_of(t, a);
+            let (from, to) = (triangle[(k + 1) % 3], triangle[(k + 2) % 3]);
+            for w in [from, to] {
+                if self.marks[w as usize] != near_a && w != b {
+                    self.marks[w as usize] = near_a;
+                    self.around.push(w);
+                }
+            }
+            if from == b {
+                self.gone.push((t, to));
+            } else if to == b {
+                self.gone.push((t, from));
+            } else {
+                self.sides.push(Side { triangle: t, from, to });
+            }
+        }
+        self.of_a = self.sides.len();
+        let opposite = match self.gone[..] {
+            [(_, c)] => [c, c],
+            [(_, c), (_, d)] if c != d => [c, d],
+            _ => return false,
+        };
+        let borders = (rings.flags[a as usize] & BORDER, rings.flags[b as usize] & BORDER);
+        if borders.0 & borders.1 != 0 && self.gone.len() == 2 {
+            return false; // would pinch the surface between two borders
+        }
+        let spans = |s: &Side| [s.from, s.to] == opposite || [s.to, s.from] == opposite;
+        let mut closes = false;
+        for &t in rings.ring(b) {
+            let triangle = rings.triangles[t as usize];
+            let k = rings.corner_of(t, b);
+            let (from, to) = (triangle[(k + 1) % 3], triangle[(k + 2) % 3]);
+            if from == a || to == a {
+                continue;
+            }
+            for w in [from, to] {
+                if self.marks[w as usize] < near_a {
+                    self.marks[w as usize] = near_b;
+                    self.around.push(w);
+                } else if self.marks[w as usize] == near_a && !opposite.contains(&w) {
+                    return false;
+                }
+            }
+            let side = Side { triangle: t, from, to };
+            closes |= spans(&side);
+            self.sides.push(side);
+        }
+        if self.sides.is_empty() || (closes && self.sides[..self.of_a].iter().any(spans)) {
+            return false; // nothing would be left, or two triangles over the same corners
+        }
+        true
+    }
+
+    /// Would the triangles that stay be sound with the new vertex at `x`?
+    pub(super) fn fits(&mut self, rings: &Rings, x: Vec3) -> bool {
+        self.leans.clear();
+        let mut worst = None;
+        for side in &self.sides {
+            let (p, q) = (rings.positions[side.from as usize], rings.positions[side.to as usize]);
+            let (u, v) = (p - x, q - x);
+            let area = u.cross(v);
+            let sum = u.length_squared() + v.length_squared() + (q - p).length_squared();
+            let old = rings.leans[side.triangle as usize];
+            let along = area.dot(old);
+            let turned = along <= 0.0 || along * along < TURN * area.length_squared() * old.length_squared();
+            if turned && old != Vec3::ZERO {
+                return false;
+            }
+            // negated, so that what is not a number fails
+            let fair = 12.0 * area.length_squared() >= *super::quadric::POORV * *super::quadric::POORV * sum * sum && sum > 0.0;
+            if !fair {
+                let worst = *worst.get_or_insert_with(|| self.worst(rings));
+                if !(quality(u, v, q - p) > worst) {
+                    return false;
+                }
+            }
+            self.leans.push(lean_of(area));
+        }
+        true
+    }
+
+    /// The triangles of both ends, before the collapse.
+    pub(super) fn triangles(&self) -> impl Iterator<Item = u32> {
+        self.sides.iter().map(|side| side.triangle).chain(self.gone.iter().map(|gone| gone.0))
+    }
+
+    /// The largest distance of `x` from the planes of the triangles of both ends.
+    pub(super) fn strays(&self, rings: &Rings, x: Vec3) -> f32 {
+        let far = |t: u32| {
+            let at = rings.positions[rings.triangles[t as usize][0] as usize];
+            rings.leans[t as usize].normalize_or_zero().dot(x - at).abs()
+        };
+        self.triangles().map(far).fold(0.0, f32::max)
+    }
+
+    /// The worst quality among all triangles of both ends.
+    fn worst(&self, rings: &Rings) -> f32 {
+        self.triangles().map(|t| quality_of(rings.corners(t))).fold(f32::INFINITY, f32::min)
+    }
+
+    /// Collapses edge (a, b), last gathered and found fit, into a at `x`.
+    pub(super) fn apply(&mut self, rings: &mut Rings, a: u32, b: u32, x: Vec3) {
+        if !rings.colors.is_empty() {
+            let (from, to) = (rings.positions[a as usize], rings.positions[b as usize]);
+            let edge = to - from;
+            let share = ((x - from).dot(edge) / edge.length_squared()).clamp(0.0, 1.0);
+            let share = if share.is_nan() { 0.5 } else { share };
+            let (ca, cb) = (rings.colors[a as usize], rings.colors[b as usize]);
+            rings.colors[a as usize] = [0, 1, 2].map(|k| ca[k] + share * (cb[k] - ca[k]));
+        }
+        rings.positions[a as usize] = x;
+        rings.flags[a as usize] |= rings.flags[b as usize];
+        rings.stamps[a as usize] += 1;
+        for &(t, opposite) in &self.gone {
+            rings.triangles[t as usize] = [NONE; 3];
+            rings.spreads[opposite as usize].subtract(rings.leans[t as usize]);
+            rings.leave(opposite, t);
+            rings.count -= 1;
+        }
+        self.ring.clear();
+        let mut spread = Spread::default();
+        for (i, (side, &lean)) in self.sides.iter().zip(&self.leans).enumerate() {
+            let t = side.triangle as usize;
+            if i >= self.of_a {
+                let k = rings.corner_of(side.triangle, b);
+                rings.triangles[t][k] = a;
+            }
+            for w in [side.from, side.to] {
+                let other = &mut rings.spreads[w as usize];
+                other.subtract(rings.leans[t]);
+                other.add(lean);
+            }
+            rings.leans[t] = lean;
+            spread.add(lean);
+            self.ring.push(side.triangle);
+        }
+        rings.spreads[a as usize] = spread;
+        rings.set_ring(a, &self.ring);
+        rings.set_ring(b, &[]);
+        if rings.flags[a as usize] & BORDER != 0 {
+            rings.measure_at(a);
+        }
+        for &w in &self.around {
+            if rings.flags[w as usize] & BORDER != 0 {
+                rings.measure_at(w);
+            }
+        }
+    }
+}
+
+/// The best place for the collapse of (a, b), and its cost; `None` where an end is not to be touched.
+pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
+    let (fa, fb) = (rings.flags[a as usize], rings.flags[b as usize]);
+    if (fa | fb) & (HELD) != 0 {
+        return None;
+    }
+    let freedom = match (fa & BORDER != 0, fb & BORDER != 0) {
+        (true, false) => Freedom::First,
+        (false, true) => Freedom::Second,
+        _ => Freedom::Free,
+    };
+    let [pa, pb] = [a, b].map(|v| rings.positions[v as usize]);
+    Some(best(pa, &rings.spreads[a as usize], pb, &rings.spreads[b as usize], freedom))
+}
+
+/// Shape of a triangle with these sides, 1 for equilateral, 0 for none: `4 √3 area / Σ length²`.
+fn quality(u: Vec3, v: Vec3, w: Vec3) -> f32 {
+    let sum = u.length_squared() + v.length_squared() + w.length_squared();
+    if sum > 0.0 { 2.0 * 3f32.sqrt() * u.cross(v).length() / sum } else { 0.0 }
+}
+
+pub(super) fn quality_of([a, b, c]: [Vec3; 3]) -> f32 {
+    quality(b - a, c - a, c - b)
+}
+

@@ -1,0 +1,238 @@
+//! Fewer triangles for the same surface: edge collapse by quadrics, checked against the field itself.
+//!
+//! Garland, Heckbert 1997 with the memoryless quadrics of Lindstrom, Turk 1998; see `quadric`. Every
+//! collapse keeps the link condition, turns no triangle by more than 60° and leaves none thinner than
+//! the thinnest it found (`collapse`), so a closed manifold stays one, of the same genus.
+//!
+//! The field is a network: thousands of points a call are cheap, single ones are not. So it is asked
+//! between rounds of collapses. After a round all vertices go to its zero in two batches (`fit`), from
+//! where the next round measures its planes; with an error to keep, one more batch at the middles of
+//! triangles and edges tells how much each place may still give. At the end vertices may leave the zero
+//! again for where their triangles lie nearest to it.
+//!
+//! Self-intersections are looked for once, at the end, which costs a tenth of the collapses. If there
+//! are any the work begins anew, and collapses near them look for crossings one by one (`crossing`); the
+//! last attempt looks everywhere. So none is made, and those of the input do not become more.
+
+mod bounded;
+mod collapse;
+mod crossing;
+mod fit;
+mod hold;
+mod quadric;
+mod queue;
+mod rings;
+mod round;
+
+use super::MeshError;
+use super::polish::angle_weighted_normals;
+use crate::geom::Mesh;
+use crate::run::Monitor;
+use bounded::bounded;
+use crossing::crossings;
+use fit::Field;
+use round::{Look, Task, rounds};
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+use std::time::Instant;
+
+/// Where vertices lie in the end, when there is a field.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Placement {
+    /// On the field's zero. Between them the triangles are chords.
+    OnSurface,
+    /// Where the triangles are nearest to the zero, in the least-squares sense.
+    #[default]
+    Nearest,
+}
+
+/// How far to simplify.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimplifyConfig {
+    /// Triangles to keep; 0 goes as far as `error` lets it.
+    pub triangles: usize,
+    /// Most distance from the surface, in units of the positions; 0 goes as far as `triangles` says.
+    pub error: f32,
+    /// Where vertices lie in the end.
+    pub placement: Placement,
+    /// Rounds of collapses between which the field is asked; 1..=16.
+    pub rounds: usize,
+    /// Most points in one call of the field; at least 1.
+    pub batch: usize,
+}
+
+impl Default for SimplifyConfig {
+    fn default() -> SimplifyConfig {
+        SimplifyConfig {
+            triangles: 200_000,
+            error: 0.0,
+            placement: Placement::default(),
+            rounds: 2,
+            batch: 1 << 16,
+        }
+    }
+}
+
+impl SimplifyConfig {
+    /// Every value in its range, else [`MeshError::Config`] that names the key.
+    pub fn check(&self) -> Result<(), MeshError> {
+        let bad = |key, expected, found: String| Err(MeshError::Config { key, expected, found });
+        if !(self.error >= 0.0 && self.error.is_finite()) {
+            return bad("error", "0 or more", self.error.to_string());
+        }
+        if self.triangles == 0 && self.error == 0.0 {
+            return bad("triangles", "at least 1, or an `error`", "0".into());
+        }
+        if !(1..=16).contains(&self.rounds) {
+            return bad("rounds", "1..=16", self.rounds.to_string());
+        }
+        if self.batch == 0 {
+            return bad("batch", "at least 1", "0".into());
+        }
+        Ok(())
+    }
+}
+
+/// What [`simplify`] did.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct SimplifyReport {
+    /// Triangles given.
+    pub before: usize,
+    /// Triangles left.
+    pub after: usize,
+    /// Edges collapsed in the attempt that counts.
+    pub collapses: usize,
+    /// Collapses refused because of topology, turned or thin triangles.
+    pub refused: usize,
+    /// Collapses refused because triangles would have met.
+    pub crossing: usize,
+    /// Vertices where the input is not a manifold; they stayed.
+    pub held: usize,
+    /// Triangles with a repeated vertex, left out.
+    pub degenerate: usize,
+    /// Vertices that moved less than the field asked, because a triangle would have been spoiled.
+    pub held_back: usize,
+    /// Points the field was asked at.
+    pub asked: usize,
+    /// How often the work began anew because of self-intersections.
+    pub again: usize,
+    /// Triangles that meet others in the result; not more than in the input.
+    pub self_intersections: usize,
+    /// Largest distance from the surface at corners, middles of edges and triangles; measured only with
+    /// a field and an `error`, in units of the positions.
+    pub worst: Option<f32>,
+    /// Wall time.
+    pub seconds: f64,
+}
+
+impl SimplifyReport {
+    /// What a person should hear about, one sentence each.
+    pub fn warnings(&self, config: &SimplifyConfig) -> Vec<String> {
+        let mut out = Vec::new();
+        if config.triangles > 0 && self.after > config.triangles && config.error == 0.0 {
+            out.push(format!(
+                "{} triangles are left instead of {}: fewer would change the topology, fold the surface or make it cross itself",
+                self.after, config.triangles
+            ));
+        }
+        if self.held > 0 {
+            out.push(format!("{} vertices are not manifold and stayed as they are", self.held));
+        }
+        if self.self_intersections > 0 {
+            out.push(format!("{} triangles cross others, as in the input", self.self_intersections));
+        }
+        out
+    }
+}
+
+/// A first attempt without looking, two that look near what was found, one that looks everywhere.
+const ATTEMPTS: usize = 4;
+
+/// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colours
+/// follow their vertices. A mesh that has no more triangles than asked stays as it is.
+///
+/// `field` answers values (negative inside) and gradients, at most `config.batch` points a call, from one
+/// thread. With it, vertices end as `config.placement` says and normals are its gradient; without it, or
+/// where the gradient is shorter than 1e-6, normals are angle-weighted. Without it the `error` is kept
+/// by adding up how far each collapse strays from the planes before it, which is cautious.
+///
+/// Topology never changes; borders stay borders. Vertices of edges with more than two triangles, or of
+/// several fans, are not touched. The same bytes for any number of threads.
+///
+/// # Errors
+///
+/// [`MeshError::Config`]; [`MeshError::NotFinite`] and [`MeshError::Index`] for a mesh that is none;
+/// [`MeshError::Answer`] when the field answers with the wrong length; [`MeshError::Stopped`]. The mesh
+/// is then as it was.
+pub fn simplify(
+    mesh: &mut Mesh,
+    field: Option<&Field>,
+    config: &SimplifyConfig,
+    monitor: &dyn Monitor,
+) -> Result<SimplifyReport, MeshError> {
+    let begin = Instant::now();
+    config.check()?;
+    sound(mesh)?;
+    let before = mesh.triangles.len();
+    let mut report = SimplifyReport { before, after: before, ..SimplifyReport::default() };
+    if before == 0 || config.triangles >= before {
+        return Ok(report);
+    }
+
+    let mut near: Vec<(Vec3, f32)> = Vec::new();
+    let mut found_before = None;
+    let mut out = Mesh::default();
+    for attempt in 0..ATTEMPTS {
+        let look = match attempt {
+            0 => Look::Nowhere,
+            i if i + 1 == ATTEMPTS => Look::Everywhere,
+            _ => Look::Near(&near),
+        };
+        report = SimplifyReport { before, again: attempt, asked: report.asked, ..SimplifyReport::default() };
+        let task = Task { field, config, look, monitor };
+        out = if config.error > 0.0 { bounded(mesh, &task, &mut report)? } else { rounds(mesh, &task, &mut report)? };
+        let found = crossings(&out.positions, &out.triangles);
+        report.self_intersections = found.len();
+        if found.is_empty() {
+            break;
+        }
+        let before = *found_before.get_or_insert_with(|| crossings(&mesh.positions, &mesh.triangles).len());
+        if found.len() <= before {
+            break;
+        }
+        for &t in &found {
+            let corners = out.corners(t);
+            let middle = (corners[0] + corners[1] + corners[2]) / 3.0;
+            let reach = corners.iter().map(|c| c.distance(middle)).fold(0.0, f32::max);
+            near.push((middle, 3.0 * (attempt + 1) as f32 * reach));
+        }
+    }
+    if field.is_none() && !mesh.normals.is_empty() {
+        out.normals = angle_weighted_normals(&out.positions, &out.triangles);
+    }
+    *mesh = out;
+    report.after = mesh.triangles.len();
+    report.seconds = begin.elapsed().as_secs_f64();
+    Ok(report)
+}
+
+/// Indices in range, positions finite, few enough.
+fn sound(mesh: &Mesh) -> Result<(), MeshError> {
+    let vertices = mesh.positions.len();
+    if let Some(first) = mesh.positions.iter().position(|p| !p.is_finite()) {
+        let count = mesh.positions.iter().filter(|p| !p.is_finite()).count();
+        return Err(MeshError::NotFinite { count, first });
+    }
+    let bad = |t: &[u32; 3]| t.iter().any(|&v| v as usize >= vertices);
+    if let Some(triangle) = mesh.triangles.iter().position(bad) {
+        let index = mesh.triangles[triangle].into_iter().max().unwrap_or_default();
+        return Err(MeshError::Index { triangle, index, vertices });
+    }
+    // Corners are numbered by 32 bits, and rings grow in their pool.
+    if mesh.triangles.len() as u64 > u64::from(u32::MAX) / 16 {
+        return Err(MeshError::TooLarge { vertices: vertices as u64 });
+    }
+    Ok(())
+}

@@ -1,0 +1,199 @@
+//! How far a point lies from the planes of the triangles around it: Garland, Heckbert 1997, without
+//! memory (Lindstrom, Turk 1998).
+//!
+//! Around a vertex `v` with triangles of unit normal `n` and area `A`, all of whose planes pass through
+//! `v`, the quadric is `Q(x) = (x − v)ᵀ S (x − v)` with `S = Σ A n nᵀ`. Since it forgets the triangles of
+//! former steps, six numbers a vertex are enough, and because they are relative to the vertex, f32 holds
+//! them wherever the mesh lies. An edge (a, b) costs the least of `Q_a + Q_b`, found in f64.
+
+use glam::{DVec3, Vec3};
+
+/// Share of the trace added to the diagonal, about the middle of the edge: pulls the best point there
+/// where the triangles do not say (flat or along a crease), and keeps the condition below 1e4.
+const PULL: f64 = 3e-4;
+fn knob(n: &str, d: f64) -> f64 { std::env::var(n).ok().and_then(|s| s.parse().ok()).unwrap_or(d) }
+pub static PULLV: std::sync::LazyLock<f64> = std::sync::LazyLock::new(|| knob("PULL", 1e-5));
+pub static PULLC: std::sync::LazyLock<f64> = std::sync::LazyLock::new(|| knob("PULLC", 3e-5));
+pub static POORV: std::sync::LazyLock<f32> = std::sync::LazyLock::new(|| knob("POOR", 0.05) as f32);
+
+/// The best point lies at most this many edge lengths from the edge's middle.
+const REACH: f64 = 1.5;
+
+/// The symmetric matrix `Σ A n nᵀ`: xx, xy, xz, yy, yz, zz.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Spread([f32; 6]);
+
+/// `√A n` (up to √2) of a triangle, whose outer product is its share of a [`Spread`]; zero for one
+/// without area.
+pub(super) fn lean(a: Vec3, b: Vec3, c: Vec3) -> Vec3 {
+    lean_of((b - a).cross(c - a))
+}
+
+/// The same from twice the area vector.
+pub(super) fn lean_of(area: Vec3) -> Vec3 {
+    let length = area.length();
+    if length > 0.0 { area / length.sqrt() } else { Vec3::ZERO }
+}
+
+impl Spread {
+    pub(super) fn add(&mut self, s: Vec3) {
+        let m = &mut self.0;
+        m[0] += s.x * s.x;
+        m[1] += s.x * s.y;
+        m[2] += s.x * s.z;
+        m[3] += s.y * s.y;
+        m[4] += s.y * s.z;
+        m[5] += s.z * s.z;
+    }
+
+    pub(super) fn subtract(&mut self, s: Vec3) {
+        let m = &mut self.0;
+        m[0] -= s.x * s.x;
+        m[1] -= s.x * s.y;
+        m[2] -= s.x * s.z;
+        m[3] -= s.y * s.y;
+        m[4] -= s.y * s.z;
+        m[5] -= s.z * s.z;
+    }
+
+    fn plus(&self, other: &Spread, sign: f64) -> [f64; 6] {
+        [0, 1, 2, 3, 4, 5].map(|i| f64::from(self.0[i]) + sign * f64::from(other.0[i]))
+    }
+}
+
+fn times(m: &[f64; 6], v: DVec3) -> DVec3 {
+    DVec3::new(
+        m[0] * v.x + m[1] * v.y + m[2] * v.z,
+        m[1] * v.x + m[3] * v.y + m[4] * v.z,
+        m[2] * v.x + m[4] * v.y + m[5] * v.z,
+    )
+}
+
+/// Where an edge may collapse to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Freedom {
+    /// Anywhere.
+    Free,
+    /// Only its first end.
+    First,
+    /// Only its second end.
+    Second,
+}
+
+/// The best point for the collapse of edge (a, b), and what it costs: squared distance times area.
+///
+/// Where the 3 × 3 system is worse than a condition of 1e6 or its solution lies far off, the better of
+/// the ends and the middle.
+pub(super) fn best(a: Vec3, qa: &Spread, b: Vec3, qb: &Spread, freedom: Freedom) -> (Vec3, f32) {
+    let (da, db) = (a.as_dvec3(), b.as_dvec3());
+    let (middle, half) = (0.5 * (da + db), 0.5 * (db - da));
+    // With y from the middle: (y + h)ᵀ A (y + h) + (y − h)ᵀ B (y − h)
+    //   = yᵀ (A + B) y + 2 yᵀ (A − B) h + hᵀ (A + B) h.
+    let sum = qa.plus(qb, 1.0);
+    let slope = times(&qa.plus(qb, -1.0), half);
+    let pullc = *PULLC * (sum[0] + sum[3] + sum[5]);
+    let pull = *PULLV * (sum[0] + sum[3] + sum[5]);
+    let reach = half.length_squared();
+    // The pull counts as cost at its full length, so that short edges go first where all is flat.
+    let cost = |y: DVec3| {
+        let q = y.dot(times(&sum, y)) + 2.0 * y.dot(slope) + half.dot(times(&sum, half));
+        (q.max(0.0) + pullc * reach) as f32
+    };
+    match freedom {
+        Freedom::First => return (a, cost(-half)),
+        Freedom::Second => return (b, cost(half)),
+        Freedom::Free => {}
+    }
+    if let Some(y) = solve([sum[0] + pull, sum[1], sum[2], sum[3] + pull, sum[4], sum[5] + pull], -slope)
+        && y.length_squared() <= 4.0 * REACH * REACH * reach
+    {
+        return ((middle + y).as_vec3(), cost(y));
+    }
+    let mut best = (middle.as_vec3(), cost(DVec3::ZERO));
+    for (point, c) in [(a, cost(-half)), (b, cost(half))] {
+        if c < best.1 {
+            best = (point, c);
+        }
+    }
+    best
+}
+
+/// Solves the symmetric system by cofactors; `None` where its condition is above about 1e6.
+fn solve(m: [f64; 6], r: DVec3) -> Option<DVec3> {
+    let [xx, xy, xz, yy, yz, zz] = m;
+    let c = [
+        yy * zz - yz * yz,
+        xz * yz - xy * zz,
+        xy * yz - xz * yy,
+        xx * zz - xz * xz,
+        xy * xz - xx * yz,
+        xx * yy - xy * xy,
+    ];
+    let det = xx * c[0] + xy * c[1] + xz * c[2];
+    let trace = xx + yy + zz;
+    // For eigenvalues p ≥ q ≥ r > 0: det = pqr and the sum of the principal minors c is about pq, so
+    // their quotient is about r, to be compared with the trace, about p.
+    let minors = c[0] + c[3] + c[5];
+    if !(trace > 0.0 && det > 1e-6 * trace * minors && det.is_finite()) {
+        return None;
+    }
+    let y = times(&c, r) / det;
+    y.is_finite().then_some(y)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn spread(s: &[Vec3]) -> Spread {
+        let mut q = Spread::default();
+        s.iter().for_each(|&s| q.add(s));
+        q
+    }
+
+    #[test]
+    fn three_planes_meet_in_their_corner() {
+        // The end a lies in the planes x = 0 and y = 0, the end b in z = 0: they meet in (0, 0, 0).
+        let (a, b) = (Vec3::new(0.0, 0.0, 1.0), Vec3::new(0.3, 0.2, 0.0));
+        let (x, cost) = best(a, &spread(&[Vec3::X, Vec3::Y]), b, &spread(&[Vec3::Z]), Freedom::Free);
+        assert!(x.length() < 2e-3, "{x}");
+        // the pull alone: 3e-4 · trace 3 · |h|² = 9e-4 · (0.09 + 0.04 + 1) / 4
+        assert!((cost - 2.5425e-4).abs() < 2e-6, "{cost}");
+    }
+
+    #[test]
+    fn a_flat_edge_goes_to_its_middle_and_a_crease_along_itself() {
+        let (a, b) = (Vec3::ZERO, Vec3::X);
+        let flat = spread(&[Vec3::Z, Vec3::Z]);
+        let (x, cost) = best(a, &flat, b, &flat, Freedom::Free);
+        assert_eq!(x, Vec3::new(0.5, 0.0, 0.0));
+        assert!((cost - 3e-4).abs() < 1e-7); // 3e-4 · 4 · 0.25
+        let crease = spread(&[Vec3::Z, Vec3::Y]);
+        assert_eq!(best(a, &crease, b, &flat, Freedom::Free).0, Vec3::new(0.5, 0.0, 0.0));
+    }
+
+    #[test]
+    fn a_held_end_stays_and_says_what_it_costs() {
+        // b leaves the plane x = 1 of its own by 1: cost 1 plus the pull 3e-4 · 2 · 0.25.
+        let (a, b) = (Vec3::ZERO, Vec3::X);
+        let (x, cost) = best(a, &spread(&[Vec3::Z]), b, &spread(&[Vec3::X]), Freedom::First);
+        assert_eq!(x, a);
+        assert!((cost - 1.00015).abs() < 1e-6);
+        assert_eq!(best(a, &spread(&[Vec3::Z]), b, &spread(&[Vec3::X]), Freedom::Second).0, b);
+    }
+
+    #[test]
+    fn nothing_around_is_no_reason_to_divide_by_zero() {
+        let none = Spread::default();
+        assert_eq!(best(Vec3::ZERO, &none, Vec3::X, &none, Freedom::Free), (Vec3::new(0.5, 0.0, 0.0), 0.0));
+        assert_eq!(lean(Vec3::X, Vec3::X, Vec3::Y), Vec3::ZERO);
+        assert_eq!(solve([1.0, 0.0, 0.0, 1e-3, 0.0, 1e-7], DVec3::ONE), None);
+    }
+
+    #[test]
+    fn subtracting_what_was_added_leaves_nothing() {
+        let mut q = spread(&[Vec3::new(1.0, 2.0, 3.0)]);
+        q.subtract(Vec3::new(1.0, 2.0, 3.0));
+        assert_eq!(q, Spread::default());
+    }
+}

@@ -1,0 +1,292 @@
+//! A round: collapses in the order of their cost, then all vertices to the field.
+
+use super::collapse::{Star, place};
+use super::crossing::{Sheets, crossings};
+use super::fit::{Field, ask, middles, move_to, newton, offsets, reaches};
+use super::queue::{Entry, Queue};
+use super::rings::{BORDER, CROWDED, HELD, Rings};
+use super::{Placement, SimplifyConfig, SimplifyReport};
+use crate::geom::{Aabb, Mesh};
+use crate::mesh::MeshError;
+use crate::mesh::polish::angle_weighted_normals;
+use crate::run::Monitor;
+use glam::Vec3;
+
+/// How many times the next round's triangles one round leaves: collapses that come late profit most from
+/// vertices on the surface.
+const STEP: f64 = 1.5;
+
+/// Asking whether to stop costs nothing this often.
+const BREATH: usize = 1 << 12;
+
+/// Which collapses are tested for crossings.
+#[derive(Clone, Copy)]
+pub(super) enum Look<'a> {
+    Nowhere,
+    /// Around these points, within these distances.
+    Near(&'a [(Vec3, f32)]),
+    Everywhere,
+}
+
+impl Look<'_> {
+    /// Is a collapse here to be tested?
+    fn at(&self, p: Vec3) -> bool {
+        match self {
+            Look::Nowhere => false,
+            Look::Near(balls) => balls.iter().any(|(c, r)| p.distance_squared(*c) <= r * r),
+            Look::Everywhere => true,
+        }
+    }
+
+    fn is_nowhere(&self) -> bool {
+        matches!(self, Look::Nowhere)
+    }
+}
+
+/// What every round needs to know.
+#[derive(Clone, Copy)]
+pub(super) struct Task<'a> {
+    pub field: Option<&'a Field<'a>>,
+    pub config: &'a SimplifyConfig,
+    pub look: Look<'a>,
+    pub monitor: &'a dyn Monitor,
+}
+
+impl Task<'_> {
+    pub(super) fn stop(&self) -> Result<(), MeshError> {
+        if self.monitor.stop() { Err(MeshError::Stopped) } else { Ok(()) }
+    }
+}
+
+/// Rounds down to the number of triangles asked for.
+pub(super) fn rounds(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh, MeshError> {
+    let target = task.config.triangles;
+    let count = if task.field.is_some() { task.config.rounds } else { 1 };
+    let mut out = None;
+    for round in 1..=count {
+        let goal = (target as f64 * STEP.powi((count - round) as i32)) as usize;
+        let from = out.as_ref().unwrap_or(mesh);
+        if goal >= from.triangles.len() && round < count {
+            continue;
+        }
+        let mut rings = prepare(from, task, report);
+        reduce(&mut rings, task, goal.max(target), None, report)?;
+        let mut next = rings.into_mesh();
+        if let Some(field) = task.field {
+            let last = round == count;
+            let placement = if last { task.config.placement } else { Placement::OnSurface };
+            settle(&mut next, field, task, placement, last, report)?;
+        }
+        let values = [("triangles", next.triangles.len() as f64), ("refused", report.refused as f64)];
+        task.monitor.step(round as u64, count as u64, &values);
+        out = Some(next);
+    }
+    Ok(out.unwrap_or_else(|| mesh.clone()))
+}
+
+/// A mesh ready for collapses.
+pub(super) fn prepare(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Rings {
+    let mut rings = Rings::new(mesh);
+    report.degenerate += mesh.triangles.len() - rings.triangles.len();
+    report.held = rings.flags.iter().filter(|&&f| f & HELD != 0).count();
+    if !task.look.is_nowhere() {
+        for (flags, &p) in rings.flags.iter_mut().zip(&rings.positions) {
+            *flags |= if task.look.at(p) { CROWDED } else { 0 };
+        }
+    }
+    rings
+}
+
+/// Collapses edges until `target` triangles are left, or no edge may. With `budgets`, a collapse may not
+/// stray farther from the planes before it than both its ends have left, and uses that up.
+pub(super) fn reduce(
+    rings: &mut Rings,
+    task: &Task,
+    target: usize,
+    mut budgets: Option<&mut [f32]>,
+    report: &mut SimplifyReport,
+) -> Result<(), MeshError> {
+    let mut star = Star::new(rings.positions.len());
+    let mut sheets = (!task.look.is_nowhere()).then(|| Sheets::new(rings));
+    let mut breath = 0;
+    // What was refused may be possible when all around has changed: so once more until nothing is.
+    loop {
+        let before = rings.count;
+        let mut queue = fill(rings);
+        while rings.count > target {
+            breath += 1;
+            if breath % BREATH == 0 {
+                task.stop()?;
+            }
+            let Some((bucket, Entry { a, b, stamp })) = queue.pop() else { break };
+            let stamps = rings.stamps[a as usize].wrapping_add(rings.stamps[b as usize]);
+            if rings.valence(a) == 0 || rings.valence(b) == 0 || stamps != stamp {
+                continue;
+            }
+            let Some((x, cost)) = place(rings, a, b) else { continue };
+            let now = Queue::bucket(cost);
+            if now > bucket {
+                queue.push(now, Entry { a, b, stamp });
+                continue;
+            }
+            if !star.gather(rings, a, b) || !star.fits(rings, x) {
+                report.refused += 1;
+                continue;
+            }
+            if let Some(budgets) = budgets.as_deref_mut() {
+                let left = budgets[a as usize].min(budgets[b as usize]) - star.strays(rings, x);
+                if left < 0.0 {
+                    report.refused += 1;
+                    continue;
+                }
+                budgets[a as usize] = left;
+            }
+            if let Some(sheets) = &mut sheets {
+                let crowded = (rings.flags[a as usize] | rings.flags[b as usize]) & CROWDED != 0;
+                let made = star.sides.iter().map(|s| {
+                    let [p, q] = [s.from, s.to].map(|v| rings.positions[v as usize]);
+                    ([a, s.from, s.to], [x, p, q])
+                });
+                if crowded && sheets.would_cross(rings, star.triangles(), made) {
+                    report.crossing += 1;
+                    continue;
+                }
+                for side in &star.sides {
+                    let [p, q] = [side.from, side.to].map(|v| rings.positions[v as usize]);
+                    let old = Aabb::around(rings.corners(side.triangle));
+                    sheets.enter(side.triangle, Aabb::around([x, p, q]), Some(old));
+                }
+            }
+            star.apply(rings, a, b, x);
+            report.collapses += 1;
+            for i in 0..star.around.len() {
+                push(&mut queue, rings, a, star.around[i]);
+            }
+        }
+        if rings.count <= target || rings.count as f64 > 0.99 * before as f64 {
+            return Ok(());
+        }
+    }
+}
+
+/// All edges.
+fn fill(rings: &Rings) -> Queue {
+    let mut queue = Queue::new();
+    for t in rings.alive() {
+        let triangle = rings.triangles[t as usize];
+        for k in 0..3 {
+            let (a, b) = (triangle[k], triangle[(k + 1) % 3]);
+            // inner edges are met from both ends, those of a border from one
+            let border = rings.flags[a as usize] & rings.flags[b as usize] & BORDER != 0;
+            if a < b || border {
+                push(&mut queue, rings, a, b);
+            }
+        }
+    }
+    queue
+}
+
+fn push(queue: &mut Queue, rings: &Rings, a: u32, b: u32) {
+    if let Some((_, cost)) = place(rings, a, b) {
+        let stamp = rings.stamps[a as usize].wrapping_add(rings.stamps[b as usize]);
+        queue.push(Queue::bucket(cost), Entry { a, b, stamp });
+    }
+}
+
+/// Takes the vertices to the field; the last time also their normals.
+pub(super) fn settle(
+    mesh: &mut Mesh,
+    field: &Field,
+    task: &Task,
+    placement: Placement,
+    last: bool,
+    report: &mut SimplifyReport,
+) -> Result<(), MeshError> {
+    let stop = || task.monitor.stop();
+    let fixed = fixed(mesh);
+    let reaches = reaches(&mesh.positions, &mesh.triangles);
+    let start = mesh.positions.clone();
+    let batch = task.config.batch;
+    let mut gradients = Vec::new();
+    let steps = match placement {
+        Placement::OnSurface => 2,
+        Placement::Nearest => 1,
+    };
+    for _ in 0..steps {
+        let (values, slopes) = ask(field, &mesh.positions, batch, &stop)?;
+        report.asked += values.len();
+        let targets: Vec<Vec3> = match placement {
+            Placement::OnSurface => (0..values.len())
+                .map(|i| {
+                    let step = newton(values[i], slopes[i]).filter(|_| !fixed[i]).unwrap_or(Vec3::ZERO);
+                    mesh.positions[i] + step.clamp_length_max(reaches[i])
+                })
+                .collect(),
+            Placement::Nearest => {
+                let points = middles(&mesh.positions, &mesh.triangles);
+                let (f, g) = ask(field, &points, batch, &stop)?;
+                report.asked += f.len();
+                let signed = |f: &[f32], g: &[Vec3]| -> Vec<f32> {
+                    let d = |(&f, &g): (&f32, &Vec3)| newton(f, g).map_or(0.0, |s| s.length().copysign(f));
+                    f.iter().zip(g).map(d).collect()
+                };
+                let (at_vertices, at_middles) = (signed(&values, &slopes), signed(&f, &g));
+                let shift = offsets(&mesh.positions, &mesh.triangles, &at_vertices, &at_middles);
+                (0..values.len())
+                    .map(|i| {
+                        let normal = if fixed[i] { Vec3::ZERO } else { slopes[i].normalize_or_zero() };
+                        let step = shift[i] as f32 * normal;
+                        let step = if step.is_finite() { step } else { Vec3::ZERO };
+                        mesh.positions[i] + step.clamp_length_max(reaches[i])
+                    })
+                    .collect()
+            }
+        };
+        report.held_back += move_to(&mut mesh.positions, &mesh.triangles, &targets);
+        gradients = slopes;
+    }
+    if !task.look.is_nowhere() {
+        report.held_back += without_crossings(&mut mesh.positions, &mesh.triangles, &start);
+    }
+    if last {
+        mesh.normals = angle_weighted_normals(&mesh.positions, &mesh.triangles);
+        for (normal, g) in mesh.normals.iter_mut().zip(&gradients) {
+            if g.is_finite() && g.length() >= 1e-6 {
+                *normal = g.normalize_or(*normal);
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Vertices that the field must not move: where the mesh is no surface, and its borders.
+fn fixed(mesh: &Mesh) -> Vec<bool> {
+    super::hold::held(&Rings::bare(mesh)).iter().map(|f| f & (HELD | BORDER) != 0).collect()
+}
+
+/// Takes back the moves of triangles that meet others now and did not at `start`; how many vertices.
+fn without_crossings(positions: &mut Vec<Vec3>, triangles: &[[u32; 3]], start: &[Vec3]) -> usize {
+    const TRIES: usize = 8;
+    let mut old = None;
+    let mut back = 0;
+    for _ in 0..TRIES {
+        let found = crossings(positions, triangles);
+        if found.is_empty() {
+            return back;
+        }
+        let old = old.get_or_insert_with(|| crossings(start, triangles));
+        let mut any = false;
+        for t in found.iter().filter(|t| old.binary_search(t).is_err()) {
+            for v in triangles[*t as usize].map(|v| v as usize) {
+                any |= positions[v] != start[v];
+                back += usize::from(positions[v] != start[v]);
+                positions[v] = start[v];
+            }
+        }
+        if !any {
+            return back;
+        }
+    }
+    positions.copy_from_slice(start);
+    back
+}
