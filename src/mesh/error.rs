@@ -83,6 +83,33 @@ pub enum MeshError {
         /// Pieces before.
         pieces: usize,
     },
+    /// A mesh to be textured has nothing to texture.
+    #[error("the mesh has no triangles")]
+    NoTriangles,
+    /// A triangle names a vertex that is not there.
+    #[error("triangle {triangle} has vertex {vertex}, but there are {vertices} vertices")]
+    Index {
+        /// The triangle.
+        triangle: usize,
+        /// The index found.
+        vertex: u32,
+        /// Vertices there are.
+        vertices: usize,
+    },
+    /// A vertex that a triangle uses is NaN or infinite.
+    #[error("vertex {vertex} is not at a finite position")]
+    NonFiniteVertex {
+        /// The vertex.
+        vertex: u32,
+    },
+    /// Not a texel for each triangle.
+    #[error("{triangles} triangles do not fit into a texture of {size_px} × {size_px} texels")]
+    AtlasTooSmall {
+        /// Texels across and down.
+        size_px: u32,
+        /// Triangles of the mesh.
+        triangles: usize,
+    },
     /// The monitor asked to stop.
     #[error("stopped on request")]
     Stopped,
@@ -107,6 +134,13 @@ impl MeshError {
             }
             MeshError::Answer { .. } => Some("a field must return one value a point, in order"),
             MeshError::NothingKept { .. } => Some("the field may be inverted: negative must be inside"),
+            MeshError::NoTriangles => Some("check that `mesh` ended with a surface"),
+            MeshError::Index { .. } | MeshError::NonFiniteVertex { .. } => {
+                Some("`tiface check` lists what is wrong with a mesh; extract it again")
+            }
+            MeshError::AtlasTooSmall { .. } => {
+                Some("a larger texture, or a mesh simplified to fewer triangles")
+            }
             MeshError::Stopped => None,
         }
     }

@@ -3,6 +3,7 @@
 //! [`marching`] meshes a dense grid, [`sparse`] asks a field only near its surface, [`clean`] keeps the
 //! head and drops the dust, [`extract`] is the stage: all of it, with normals and colours.
 
+mod atlas;
 pub mod check;
 mod clean;
 mod error;
@@ -18,8 +19,10 @@ mod polish;
 pub mod read;
 mod sparse;
 mod sparse_blocks;
+pub mod uv_check;
 mod verify;
 
+pub use atlas::{AtlasConfig, AtlasReport, atlas};
 pub use clean::{CleanReport, clean};
 pub use error::MeshError;
 pub use extract::{MeshReport, extract};
