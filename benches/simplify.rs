@@ -3,9 +3,9 @@
 mod fields;
 
 use glam::Vec3;
-use std::time::Instant;
-use std::sync::atomic::{AtomicU64, Ordering};
 use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Instant;
 use tiface::geom::Mesh;
 use tiface::mesh::{SimplifyConfig, Volume, check, marching, simplify};
 use tiface::run::Quiet;
@@ -99,9 +99,11 @@ fn main() {
     pool.install(|| {
         for (n, target) in [(245, 40_000)] {
             let (values, h) = fields::grid(fields::head, n);
-            let volume = Volume { dims: [n; 3], values: &values, origin: Vec3::NEG_ONE, spacing: Vec3::splat(h) };
+            let volume =
+                Volume { dims: [n; 3], values: &values, origin: Vec3::NEG_ONE, spacing: Vec3::splat(h) };
             let surface = marching(&volume, true).expect("a valid volume");
-            let input = Mesh { positions: surface.positions, triangles: surface.triangles, ..Mesh::default() };
+            let input =
+                Mesh { positions: surface.positions, triangles: surface.triangles, ..Mesh::default() };
             show(&format!("head {n}³"), 0.0, 0.0, &input);
             for with in [false, true] {
                 let mut best = (f64::INFINITY, 0.0);
@@ -110,14 +112,25 @@ fn main() {
                     mesh = input.clone();
                     FIELD_NS.store(0, Ordering::Relaxed);
                     let start = cpu_s();
-                    let config = SimplifyConfig { triangles: target, rounds: std::env::var("ROUNDS").map_or(2, |s| s.parse().unwrap()), placement: if std::env::var("ON").is_ok() { tiface::mesh::Placement::OnSurface } else { Default::default() }, ..Default::default() };
-                    let report =
-                        simplify(&mut mesh, with.then_some(&field as _), &config, &Quiet).expect("a sound mesh");
+                    let config = SimplifyConfig {
+                        triangles: target,
+                        rounds: std::env::var("ROUNDS").map_or(2, |s| s.parse().unwrap()),
+                        placement: if std::env::var("ON").is_ok() {
+                            tiface::mesh::Placement::OnSurface
+                        } else {
+                            Default::default()
+                        },
+                        ..Default::default()
+                    };
+                    let report = simplify(&mut mesh, with.then_some(&field as _), &config, &Quiet)
+                        .expect("a sound mesh");
                     let ms = 1e3 * (cpu_s() - start);
                     if ms < best.0 {
                         best = (ms, FIELD_NS.load(Ordering::Relaxed) as f64 * 1e-6);
                     }
-                    if std::env::var("V").is_ok() { println!("{report:?}"); }
+                    if std::env::var("V").is_ok() {
+                        println!("{report:?}");
+                    }
                 }
                 show(if with { "with the field" } else { "without" }, best.0, best.1, &mesh);
             }

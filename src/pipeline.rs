@@ -21,6 +21,7 @@ mod ensemble;
 mod export;
 #[cfg(feature = "cpu")]
 mod fields;
+mod finish;
 mod fit;
 mod march;
 mod mask;
@@ -29,15 +30,17 @@ mod metrics;
 mod page;
 mod pictures;
 mod plan;
+mod product;
 mod render;
 mod scene_file;
 mod surface;
 mod truth;
 
-pub use export::mesh_bytes;
+pub use export::Export;
 #[cfg(feature = "cpu")]
 pub use fields::Trained;
 pub use march::Seen;
+pub use product::{Lobes, Pictures, Product};
 pub use surface::{Exact, Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
 

@@ -7,7 +7,7 @@ use super::screen::{Screen, figure};
 use super::target::Target;
 use crate::config::{Config, MeshFormat, Preset};
 use crate::io;
-use crate::pipeline::{Line, STAGES, mesh_bytes};
+use crate::pipeline::{Line, STAGES};
 use crate::run::{Done, Exit, Run, Stop};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -108,7 +108,14 @@ impl Work<'_> {
         match (self.until, format) {
             ("baseline" | "tface", None) if ending == "th" => write(out, &published(line, self.until)?),
             ("mesh" | "metrics" | "render", Some(format)) if line.order(self.until).contains(&"mesh") => {
-                write(out, &mesh_bytes(&line.read_mesh()?, format, &line.export())?)
+                let stem = out.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
+                let files =
+                    line.read_product()?.files(format, &line.export(), line.mesh_config(), stem)?.files;
+                // the mesh names its pictures: it comes last, and under the name that was asked for
+                for (name, bytes) in files.iter().skip(1).rev() {
+                    write(&out.with_file_name(name), bytes)?;
+                }
+                write(out, &files[0].1)
             }
             ("mesh", None) => Err(Ending::usage(
                 format!("`{}`: the ending picks the format, and this is none", out.display()),
@@ -164,11 +171,12 @@ impl Work<'_> {
 }
 
 /// What is judged, and what a person calls it.
-const JUDGED: [(&str, &str); 6] = [
+const JUDGED: [(&str, &str); 7] = [
     ("baseline", "views of the baseline"),
     ("tface", "views of T-Face"),
     ("volume", "views of I-Face"),
     ("raycast", "views of the mesh"),
+    ("textured", "views of the textured mesh"),
     ("ensemble", "their blend"),
     ("ensemble_fitted", "their fitted blend"),
 ];

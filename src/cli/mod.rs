@@ -116,11 +116,12 @@ enum Command {
         #[command(flatten)]
         place: Place,
     },
-    /// Stage: extract the watertight mesh
+    /// Stage: extract the watertight mesh, simplify it, bake its texture
     #[command(after_long_help = "Examples:
   tiface mesh runs/002_00
   tiface mesh runs/002_00 --out head.glb        the ending picks the format
-  tiface mesh runs/002_00 --fresh mesh --format glb,obj,ply --frame head")]
+  tiface mesh runs/002_00 --fresh mesh --format glb,obj,ply --frame head
+  tiface mesh runs/002_00 --fresh mesh --triangles 20000 --texture 4096 --lobes 1 --normal-map")]
     Mesh {
         #[command(flatten)]
         place: Place,
@@ -130,6 +131,21 @@ enum Command {
         /// Coordinates: dataset, or head (+Y up, face towards +Z)
         #[arg(long, value_name = "FRAME")]
         frame: Option<String>,
+        /// Triangles of the product; 0 keeps all
+        #[arg(long, value_name = "N")]
+        triangles: Option<String>,
+        /// Texels along each side of the texture; 0: colours at the vertices
+        #[arg(long, value_name = "PX")]
+        texture: Option<String>,
+        /// Degree of view-dependent colour in the GLB: 0, 1 or 2
+        #[arg(long, value_name = "DEGREE")]
+        lobes: Option<String>,
+        /// Put the detail that simplification takes into a normal map (GLB)
+        #[arg(long)]
+        normal_map: bool,
+        /// Leave the surface open where the frames cut the body
+        #[arg(long)]
+        no_cap: bool,
     },
     /// Stage: make views of the fields and of the mesh
     #[command(after_long_help = "Examples:
@@ -143,7 +159,8 @@ enum Command {
         /// test, train, orbit, or a file: a nerfstudio camera path or a transforms.json
         #[arg(long, value_name = "WHICH")]
         cameras: Option<String>,
-        /// Any of baseline, tface, volume (I-Face's field) and raycast (its mesh), with commas
+        /// Any of baseline, tface, volume (I-Face's field), raycast (its whole mesh)
+        /// and textured (head.glb as a viewer shows it), with commas
         #[arg(long = "with", value_name = "LIST")]
         method: Option<String>,
         /// png or exr
@@ -306,8 +323,17 @@ impl Cli {
             Command::Baseline { place } => line(place, "baseline", &[], &[]),
             Command::Tface { place } => line(place, "tface", &[], &[]),
             Command::Iface { place } => line(place, "iface", &[], &[]),
-            Command::Mesh { place, format, frame } => {
-                let extra = keys(&[("--format", "mesh.format", format), ("--frame", "mesh.frame", frame)]);
+            Command::Mesh { place, format, frame, triangles, texture, lobes, normal_map, no_cap } => {
+                let given = |flag: bool, value: &str| flag.then(|| value.to_owned());
+                let extra = keys(&[
+                    ("--format", "mesh.format", format),
+                    ("--frame", "mesh.frame", frame),
+                    ("--triangles", "mesh.triangles", triangles),
+                    ("--texture", "mesh.texture_px", texture),
+                    ("--lobes", "mesh.lobes", lobes),
+                    ("--normal-map", "mesh.normal_map", &given(*normal_map, "true")),
+                    ("--no-cap", "mesh.cap", &given(*no_cap, "false")),
+                ]);
                 line(place, "mesh", &[], &extra)
             }
             Command::Render { place, cameras, method, format, background } => {

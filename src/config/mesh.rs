@@ -127,7 +127,12 @@ pub(super) const KEYS: &[Key] = &[
         0.0,
         100.0,
     ),
-    Key::number("texture_px", "Texels along each side of the texture; 0: colours at the vertices.", 0.0, 16384.0),
+    Key::number(
+        "texture_px",
+        "Texels along each side of the texture; 0: colours at the vertices.",
+        0.0,
+        16384.0,
+    ),
     Key::number("texture_samples", "Samples along each side of a texel.", 1.0, 8.0),
     Key::number("gutter_px", "Texels that repeat a chart's border around it.", 0.0, 256.0),
     Key::word(

@@ -14,8 +14,10 @@ pub enum Method {
     /// I-Face's field, marched and composited.
     #[serde(alias = "iface")]
     Volume,
-    /// Rays cast at I-Face's mesh, learned colour where they hit.
+    /// Rays cast at I-Face's whole mesh, learned colour where they hit.
     Raycast,
+    /// Rays cast at the product, colour from its texture: what a viewer of `head.glb` sees.
+    Textured,
 }
 
 impl Method {
@@ -26,6 +28,7 @@ impl Method {
             Method::Tface => "tface",
             Method::Volume => "volume",
             Method::Raycast => "raycast",
+            Method::Textured => "textured",
         }
     }
 
@@ -35,7 +38,7 @@ impl Method {
             Method::Baseline => "baseline",
             Method::Tface => "tface",
             Method::Volume => "iface",
-            Method::Raycast => "mesh",
+            Method::Raycast | Method::Textured => "mesh",
         }
     }
 }

@@ -101,6 +101,17 @@ pub enum MeshError {
         /// How many vertices there are.
         vertices: usize,
     },
+    /// A mesh to be textured has nothing to texture.
+    #[error("the mesh has no triangles")]
+    NoTriangles,
+    /// Not a texel for each triangle.
+    #[error("{triangles} triangles do not fit into a texture of {size_px} × {size_px} texels")]
+    AtlasTooSmall {
+        /// Texels across and down.
+        size_px: u32,
+        /// Triangles of the mesh.
+        triangles: usize,
+    },
     /// The monitor asked to stop.
     #[error("stopped on request")]
     Stopped,
@@ -127,6 +138,10 @@ impl MeshError {
             MeshError::NothingKept { .. } => Some("the field may be inverted: negative must be inside"),
             MeshError::NotFinite { .. } | MeshError::Index { .. } => {
                 Some("the mesh is damaged: export it again, or remove these vertices and triangles")
+            }
+            MeshError::NoTriangles => Some("check that `mesh` ended with a surface"),
+            MeshError::AtlasTooSmall { .. } => {
+                Some("a larger texture, or a mesh simplified to fewer triangles")
             }
             MeshError::Stopped => None,
         }

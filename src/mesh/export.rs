@@ -222,7 +222,7 @@ fn mend_normals(normals: &mut [Vec3], positions: &[Vec3], triangles: &[[u32; 3]]
 }
 
 /// The smallest rotation that brings `up` to +Y; exact for the six axes.
-pub(super) fn turn_to_y_up(up: Vec3) -> Result<DMat3, ExportError> {
+pub(crate) fn turn_to_y_up(up: Vec3) -> Result<DMat3, ExportError> {
     let bad = || ExportError::Option {
         what: "up",
         found: up.to_string(),

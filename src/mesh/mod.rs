@@ -1,8 +1,11 @@
 //! Stage: a surface an artist can open. The zero level set of a signed distance becomes a closed mesh.
 //!
 //! [`marching`] meshes a dense grid, [`sparse`] asks a field only near its surface, [`clean`] keeps the
-//! head and drops the dust, [`extract`] is the stage: all of it, with normals and colours.
+//! head and drops the dust, [`extract`] is all of it, with normals and colours; [`Cap`] closes what the frames
+//! cut. [`simplify`], [`atlas`] and [`bake`] make of it what an artist opens; [`gltf`], [`obj`] and [`ply`] its
+//! files.
 
+mod atlas;
 pub mod bake;
 mod cap;
 pub mod check;
@@ -24,14 +27,16 @@ mod sparse;
 mod sparse_blocks;
 pub mod textured;
 pub mod textured_tangents;
+pub mod uv_check;
 mod verify;
 
+pub use atlas::{AtlasConfig, AtlasReport, atlas};
 pub use cap::Cap;
 pub use clean::{CleanReport, clean};
 pub use error::MeshError;
 pub use extract::{MeshReport, extract};
 pub use marching::{Surface, Volume, marching};
-pub use simplify::{SimplifyConfig, SimplifyReport, simplify};
+pub use simplify::{Placement, SimplifyConfig, SimplifyReport, simplify};
 pub use sparse::{Asking, Grid, Sparse, sparse};
 pub use verify::Verified;
 

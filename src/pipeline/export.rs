@@ -1,11 +1,9 @@
-//! The mesh as files: in the dataset's world, or turned so that the face looks at the viewer.
+//! The coordinates of exported files: the dataset's, or turned so that the face looks at the viewer.
 
 use crate::config::{MeshFormat, MeshFrame};
 use crate::geom::{Mesh, Similarity};
-use crate::mesh::export::{ExportError, ExportOptions};
-use crate::mesh::{gltf, obj, ply};
-use crate::run::Failure;
-use glam::{DMat3, DVec3, Vec3};
+use crate::mesh::export::turn_to_y_up;
+use glam::{DMat3, DVec3, Mat3, Vec3};
 
 /// How a mesh of the dataset's world is exported.
 #[derive(Clone, Debug)]
@@ -31,51 +29,37 @@ pub(super) fn ending(format: MeshFormat) -> &'static str {
     }
 }
 
-/// A mesh of the dataset's world as the bytes of a file. PLY keeps the dataset's world whatever the
-/// frame: it is what the later stages read.
-pub fn mesh_bytes(mesh: &Mesh, format: MeshFormat, export: &Export) -> Result<Vec<u8>, Failure> {
-    let options =
-        ExportOptions { name: export.name.clone(), up: export.up, unit_m: export.unit_m, unlit: true };
-    let bytes = match (format, export.frame) {
-        (MeshFormat::Ply, _) => ply::to_ply(mesh),
-        (format, frame) => {
-            let (mesh, options) = match frame {
-                MeshFrame::Dataset => (mesh.clone(), options),
-                MeshFrame::Head => {
-                    let turned = mesh.transformed(&head_from_world(mesh, export));
-                    (turned, ExportOptions { up: Vec3::Y, ..options })
-                }
-            };
-            if format == MeshFormat::Glb {
-                gltf::to_glb(&mesh, &options)
-            } else {
-                obj::to_obj(&mesh, &options)
-            }
-        }
-    };
-    bytes.map_err(|e: ExportError| {
-        let hint = e.hint();
-        Failure::cannot(e, hint)
-    })
-}
+impl Export {
+    /// Where the face looks, a unit vector of the world across `up`: taken to be where most cameras stand. `None`
+    /// where they stand all around.
+    pub fn front(&self, mesh: &Mesh) -> Option<Vec3> {
+        let up = self.up.as_dvec3().normalize_or(DVec3::Y);
+        let centre = mesh.bounds().center().as_dvec3();
+        let across = |c: &Vec3| (c.as_dvec3() - centre).reject_from_normalized(up).normalize_or_zero();
+        let towards: DVec3 = self.cameras.iter().map(across).sum();
+        (towards.length() > 1e-3).then(|| towards.normalize().as_vec3())
+    }
 
-/// +Y up through the crown, the face towards +Z, the origin at the middle of the box. Where the face
-/// looks is taken to be where most cameras stand.
-fn head_from_world(mesh: &Mesh, export: &Export) -> Similarity {
-    let up = export.up.as_dvec3().normalize_or(DVec3::Y);
-    let centre = mesh.bounds().center().as_dvec3();
-    let towards: DVec3 = export
-        .cameras
-        .iter()
-        .map(|c| (c.as_dvec3() - centre).reject_from_normalized(up).normalize_or_zero())
-        .sum();
-    // cameras all around say nothing: any direction across `up` will do
-    let front = if towards.length() > 1e-3 { towards.normalize() } else { up.any_orthonormal_vector() };
-    let world_from_head = DMat3::from_cols(up.cross(front), up, front);
-    let rotation = world_from_head.transpose();
-    let turned = Similarity { scale: 1.0, rotation, translation: DVec3::ZERO };
-    let middle = mesh.transformed(&turned).bounds().center().as_dvec3();
-    Similarity { translation: -middle, ..turned }
+    /// +Y up through the crown, the face towards +Z, the origin at the middle of the box.
+    pub(super) fn head_from_world(&self, mesh: &Mesh) -> Similarity {
+        let up = self.up.as_dvec3().normalize_or(DVec3::Y);
+        // cameras all around say nothing: any direction across `up` will do
+        let front = self.front(mesh).map_or_else(|| up.any_orthonormal_vector(), |f| f.as_dvec3());
+        let front = front.reject_from_normalized(up).normalize_or(up.any_orthonormal_vector());
+        let world_from_head = DMat3::from_cols(up.cross(front), up, front);
+        let rotation = world_from_head.transpose();
+        let turned = Similarity { scale: 1.0, rotation, translation: DVec3::ZERO };
+        let middle = mesh.transformed(&turned).bounds().center().as_dvec3();
+        Similarity { translation: -middle, ..turned }
+    }
+
+    /// The turn from the dataset's world to the coordinates of GLB and OBJ files.
+    pub(super) fn asset_from_world(&self, mesh: &Mesh) -> Mat3 {
+        match self.frame {
+            MeshFrame::Dataset => turn_to_y_up(self.up).unwrap_or(DMat3::IDENTITY).as_mat3(),
+            MeshFrame::Head => self.head_from_world(mesh).rotation_f32(),
+        }
+    }
 }
 
 #[cfg(test)]
@@ -96,7 +80,7 @@ mod tests {
             frame: MeshFrame::Head,
             cameras: vec![Vec3::new(0.5, -9.0, 4.0)],
         };
-        let head_from_world = head_from_world(&mesh, &export);
+        let head_from_world = export.head_from_world(&mesh);
         // (0, 0, 3): x = 0.5 left of the middle, y = 1 towards the cameras, z = 1.5 above
         let p = head_from_world.point(Vec3::new(0.0, 0.0, 3.0));
         assert!(p.distance(Vec3::new(-0.5, 1.5, 1.0)) < 1e-5, "{p}");

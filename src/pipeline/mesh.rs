@@ -1,19 +1,21 @@
 //! Stage `mesh`: the zero level set of the learned distance, closed, in the dataset's world.
 
-use super::{Fields, Line, PipelineError, export, mesh_bytes};
+use super::finish::Finished;
+use super::product::Product;
+use super::{Fields, Line, PipelineError, export};
 use crate::capture::{self, Split};
-use crate::config::MeshFormat;
+use crate::config::MeshConfig;
 use crate::geom::{Camera, Mesh};
 use crate::io::{self, Limits};
 use crate::mesh::read::ReadMeshError;
-use crate::mesh::{self, MeshError};
+use crate::mesh::{self, Cap, MeshError, ply};
 use crate::run::{Done, Failure};
 use glam::Vec3;
 use serde_json::json;
 
 impl Line<'_> {
-    /// Stage `mesh`: the surface in the dataset's world, `head.ply` always, other formats as asked.
-    /// `fields` are only asked if there is something to do.
+    /// Stage `mesh`: the whole surface as `surface.ply` in the dataset's world, and the product an artist opens
+    /// in the formats asked for. `fields` are only asked if there is something to do.
     pub fn mesh(&self, fields: &dyn Fields) -> Result<Done, PipelineError> {
         Ok(self.run.stage(self.plan("mesh"), |stage| {
             let scene = self.scene_or_fail()?;
@@ -47,31 +49,68 @@ impl Line<'_> {
                 &config,
                 stage.monitor(),
             );
-            let (mesh, report) = extracted.map_err(|e| match e {
+            let failed = |e: MeshError| match e {
                 MeshError::Stopped => Failure::stopped(self.run.stop()),
                 e => {
                     let hint = e.hint().unwrap_or_default();
                     Failure::cannot(e, hint)
                 }
-            })?;
+            };
+            let (mut surface, report) = extracted.map_err(failed)?;
             report.warnings().iter().for_each(|w| stage.warn(w));
-            let mesh = mesh.transformed(&scene.scene_from_world.inverse());
-            let export = self.export();
-            // the form that the next stages read comes last
-            let formats = c.format.iter().filter(|f| **f != MeshFormat::Ply).chain([&MeshFormat::Ply]);
-            for &format in formats {
-                let bytes = mesh_bytes(&mesh, format, &export)?;
-                io::write_atomic(&stage.folder().join(format!("head.{}", export::ending(format))), &bytes)?;
+            let cap = Cap::of(&surface, report.bounds(), report.cell_size);
+            if let Some(cap) = &cap {
+                if c.cap {
+                    cap.paint(&mut surface);
+                } else {
+                    cap.open(&mut surface);
+                }
             }
-            let size = mesh.bounds().size() * self.config.capture.unit_m as f32;
+            let finished =
+                self.finish(&surface, cap.as_ref(), report.cell_size, &scene, field, stage.monitor());
+            let Finished { product, linear, report: steps, warnings } = finished.map_err(failed)?;
+            warnings.iter().for_each(|w| stage.warn(w));
+
+            let world = surface.transformed(&scene.scene_from_world.inverse());
+            let bytes = ply::to_ply(&world).map_err(|e| {
+                let hint = e.hint();
+                Failure::cannot(e, hint)
+            })?;
+            io::write_atomic(&stage.folder().join("surface.ply"), &bytes)?;
+            product.save(&stage.folder().join("parts"))?;
+            if let Some(linear) = linear.filter(|_| c.exr) {
+                let (w, h) = (linear.width, linear.height);
+                let plane = |k: usize| linear.data.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>();
+                let [r, g, b] = [plane(0), plane(1), plane(2)];
+                let channels = [("R", &r[..]), ("G", &g[..]), ("B", &b[..])];
+                io::write_exr(&stage.folder().join("head.exr"), w, h, &channels)?;
+            }
+            let export = self.export();
+            for &format in &c.format {
+                let exported = product.files(format, &export, c, "head")?;
+                exported.warnings.iter().for_each(|w| stage.warn(w));
+                // the mesh names the others: it comes last
+                for (name, bytes) in exported.files.iter().rev() {
+                    io::write_atomic(&stage.folder().join(name), bytes)?;
+                }
+            }
+            let size = product.mesh.bounds().size() * self.config.capture.unit_m as f32;
             Ok(json!({
-                "vertices": mesh.positions.len(),
-                "triangles": mesh.triangles.len(),
-                "closed": mesh.is_closed(),
+                "vertices": product.mesh.positions.len(),
+                "triangles": product.mesh.triangles.len(),
+                "closed": product.mesh.is_closed(),
+                "texture_px": product.pictures.as_ref().map_or(0, |p| p.color.width),
                 "size_m": size.to_array(),
+                "surface_triangles": world.triangles.len(),
                 "report": report,
+                "steps": steps,
             }))
         })?)
+    }
+
+    /// Settings of the stage.
+    pub fn mesh_config(&self) -> &MeshConfig {
+        &self.config.mesh
     }
 
     /// How meshes of this line are exported.
@@ -85,9 +124,14 @@ impl Line<'_> {
         }
     }
 
-    /// The mesh of the stage `mesh`, in the dataset's world.
+    /// What the stage `mesh` made for people, in the dataset's world.
+    pub fn read_product(&self) -> Result<Product, Failure> {
+        Product::load(&self.run.path("mesh/parts"))
+    }
+
+    /// The whole surface of the stage `mesh`, in the dataset's world.
     pub fn read_mesh(&self) -> Result<Mesh, Failure> {
-        let path = self.run.path("mesh/head.ply");
+        let path = self.run.path("mesh/surface.ply");
         let bytes = io::read_bytes(&path, &Limits::default())?;
         mesh::read::read(&bytes, &path).map_err(|e: ReadMeshError| {
             let hint = e.hint();

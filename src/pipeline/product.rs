@@ -86,7 +86,8 @@ impl Product {
                 for (k, picture) in lobes.pictures.iter().enumerate() {
                     write(format!("lobe_{k}.png"), picture)?;
                 }
-                tensors.push(("lobe_scale", (vec![lobes.scale.len()], TensorValues::F32(lobes.scale.clone()))));
+                tensors
+                    .push(("lobe_scale", (vec![lobes.scale.len()], TensorValues::F32(lobes.scale.clone()))));
                 let turned = lobes.asset_from_world.to_cols_array().to_vec();
                 tensors.push(("asset_from_world", (vec![3, 3], TensorValues::F32(turned))));
             }
@@ -145,8 +146,9 @@ impl Product {
         let normal = metadata.get("normal").map(|_| photo("normal.png", size)).transpose()?;
         let lobes = match (scale, turned) {
             (Some(scale), Some(turned)) if turned.len() == 9 && scale.len() <= 16 => {
-                let pictures =
-                    (0..scale.len()).map(|k| photo(&format!("lobe_{k}.png"), size)).collect::<Result<_, _>>()?;
+                let pictures = (0..scale.len())
+                    .map(|k| photo(&format!("lobe_{k}.png"), size))
+                    .collect::<Result<_, _>>()?;
                 Some(Lobes { pictures, scale, asset_from_world: Mat3::from_cols_slice(&turned) })
             }
             (None, None) => None,

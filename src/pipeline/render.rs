@@ -6,6 +6,7 @@
 //!        tface/float/     the same view for `ensemble`: float, coded, no background
 //! ```
 
+use super::product::Pictures;
 use super::{Fields, Line, PipelineError, march::march, pictures};
 use crate::capture::scene::{self, Scene};
 use crate::capture::{Split, View};
@@ -13,7 +14,7 @@ use crate::config::Method;
 use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
 use crate::io::{self, Limits};
 use crate::render::path::{NamedCamera, PathError, from_json, orbit};
-use crate::render::{RaycastOptions, RenderedView, raycast};
+use crate::render::{LobePictures, RaycastOptions, RenderedView, Texture, raycast, raycast_hits};
 use crate::run::{Done, Failure, Stop};
 use serde_json::{Map, json};
 use std::path::Path;
@@ -30,9 +31,14 @@ impl Line<'_> {
                 true => Some(self.read_mesh()?.transformed(&scene.scene_from_world)),
                 false => None,
             };
+            let product = match c.method.contains(&Method::Textured) {
+                true => Some(self.textured(&scene)?),
+                false => None,
+            };
             let eye = Eye {
                 fields,
                 mesh: mesh.as_ref().map(|m| (m, Bvh::new(m))),
+                product: product.as_ref().map(|p| Shown::new(p, &scene)),
                 samples: c.samples,
                 world_from_scene: scene.scene_from_world.inverse(),
                 stop: self.run.stop(),
@@ -81,6 +87,18 @@ impl Line<'_> {
             let shown = cameras.iter().filter(|(_, shown)| *shown).count();
             Ok(json!({"cameras": shown, "methods": methods, "seconds_per_view": seconds}))
         })?)
+    }
+
+    /// The product in scene coordinates; it must have a texture.
+    fn textured(&self, scene: &Scene) -> Result<(Mesh, Pictures), Failure> {
+        let product = self.read_product()?;
+        let pictures = product.pictures.ok_or_else(|| {
+            Failure::cannot(
+                "the mesh has no texture to be shown",
+                "make one: `tiface mesh --fresh mesh --texture 2048`",
+            )
+        })?;
+        Ok((product.mesh.transformed(&scene.scene_from_world), pictures))
     }
 
     /// The cameras to render: named like photographs where they have one.
@@ -136,10 +154,31 @@ pub(super) fn fit_name(view: &str) -> String {
     format!("fit/{view}")
 }
 
+/// A textured mesh, ready to be looked at.
+struct Shown<'a> {
+    mesh: &'a Mesh,
+    bvh: Bvh,
+    texture: Texture<'a>,
+}
+
+impl<'a> Shown<'a> {
+    fn new((mesh, pictures): &'a (Mesh, Pictures), scene: &Scene) -> Shown<'a> {
+        let world_from_scene = scene.scene_from_world.inverse().rotation_f32();
+        let lobes = pictures.lobes.as_ref().map(|l| LobePictures {
+            pictures: &l.pictures,
+            scale: &l.scale,
+            turned: l.asset_from_world * world_from_scene,
+        });
+        let texture = Texture::new(mesh, &pictures.atlas, &pictures.color, lobes.as_ref());
+        Shown { mesh, bvh: Bvh::new(mesh), texture }
+    }
+}
+
 /// What every view is made with.
 struct Eye<'a> {
     fields: &'a dyn Fields,
     mesh: Option<(&'a Mesh, Bvh)>,
+    product: Option<Shown<'a>>,
     samples: u32,
     world_from_scene: Similarity,
     stop: &'a Stop,
@@ -166,6 +205,11 @@ impl Eye<'_> {
                 Some(raycast(bvh, mesh, camera, &options, |p, n, d| field.color(p, n, d)))
             }
             (Method::Raycast, None) => None,
+            (Method::Textured, _) => self.product.as_ref().map(|shown| {
+                let world_from_scene = self.world_from_scene;
+                let options = RaycastOptions { background: None, samples: self.samples, world_from_scene };
+                raycast_hits(&shown.bvh, shown.mesh, camera, &options, |s| shown.texture.colors(s, camera))
+            }),
         })
     }
 }

@@ -140,13 +140,15 @@ mod tests {
         // v runs down: the lower edge of the square is the lower row of the picture
         let uvs = at.map(|(x, y)| Vec2::new(0.5 + 0.5 * x, 0.5 - 0.5 * y)).to_vec();
         let atlas = Atlas { uvs, triangles: mesh.triangles.clone(), width: 4, height: 4 };
-        let rgb = (0..16).map(|i| if i % 4 < 2 { [255, 0, (i / 4 * 60) as u8] } else { [0, 255, 0] }).collect();
+        let rgb =
+            (0..16).map(|i| if i % 4 < 2 { [255, 0, (i / 4 * 60) as u8] } else { [0, 255, 0] }).collect();
         (mesh, atlas, Photo { width: 4, height: 4, rgb, alpha: None })
     }
 
     fn view(texture: &Texture, mesh: &Mesh, camera: &Camera) -> Vec<[f32; 4]> {
         let bvh = Bvh::new(mesh);
-        let seen = raycast_hits(&bvh, mesh, camera, &RaycastOptions::default(), |s| texture.colors(s, camera));
+        let seen =
+            raycast_hits(&bvh, mesh, camera, &RaycastOptions::default(), |s| texture.colors(s, camera));
         seen.color.data.as_chunks::<4>().0.to_vec()
     }
 

@@ -132,7 +132,9 @@ impl Star {
                 return false;
             }
             // negated, so that what is not a number fails
-            let fair = 12.0 * area.length_squared() >= *super::quadric::POORV * *super::quadric::POORV * sum * sum && sum > 0.0;
+            let fair = 12.0 * area.length_squared()
+                >= *super::quadric::POORV * *super::quadric::POORV * sum * sum
+                && sum > 0.0;
             if !fair {
                 let worst = *worst.get_or_insert_with(|| self.worst(rings));
                 if !(quality(u, v, q - p) > worst) {
@@ -237,4 +239,3 @@ fn quality(u: Vec3, v: Vec3, w: Vec3) -> f32 {
 pub(super) fn quality_of([a, b, c]: [Vec3; 3]) -> f32 {
     quality(b - a, c - a, c - b)
 }
-

@@ -103,7 +103,9 @@ impl Facet {
         if self.lets_go(other, unsure) || other.lets_go(self, unsure) {
             return false;
         }
-        self.area != DVec3::ZERO && other.area != DVec3::ZERO && intersect(self.p, self.ids, other.p, other.ids)
+        self.area != DVec3::ZERO
+            && other.area != DVec3::ZERO
+            && intersect(self.p, self.ids, other.p, other.ids)
     }
 
     /// Does the other one lie strictly on one side, but for common corners?
@@ -226,9 +228,7 @@ impl Sheets {
         if one_another {
             return true;
         }
-        let Some(bounds) =
-            facets.iter().map(|f| f.bounds).reduce(|a, b| a.with(b.min).with(b.max))
-        else {
+        let Some(bounds) = facets.iter().map(|f| f.bounds).reduce(|a, b| a.with(b.min).with(b.max)) else {
             return false;
         };
         let (low, high) = (self.cells.cell(bounds.min), self.cells.cell(bounds.max));

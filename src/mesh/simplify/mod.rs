@@ -31,8 +31,8 @@ use crate::run::Monitor;
 use bounded::bounded;
 use crossing::crossings;
 use fit::Field;
-use round::{Look, Task, rounds};
 use glam::Vec3;
+use round::{Look, Task, rounds};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -192,7 +192,11 @@ pub fn simplify(
         };
         report = SimplifyReport { before, again: attempt, asked: report.asked, ..SimplifyReport::default() };
         let task = Task { field, config, look, monitor };
-        out = if config.error > 0.0 { bounded(mesh, &task, &mut report)? } else { rounds(mesh, &task, &mut report)? };
+        out = if config.error > 0.0 {
+            bounded(mesh, &task, &mut report)?
+        } else {
+            rounds(mesh, &task, &mut report)?
+        };
         let found = crossings(&out.positions, &out.triangles);
         report.self_intersections = found.len();
         if found.is_empty() {

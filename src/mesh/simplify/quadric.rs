@@ -11,7 +11,9 @@ use glam::{DVec3, Vec3};
 /// Share of the trace added to the diagonal, about the middle of the edge: pulls the best point there
 /// where the triangles do not say (flat or along a crease), and keeps the condition below 1e4.
 const PULL: f64 = 3e-4;
-fn knob(n: &str, d: f64) -> f64 { std::env::var(n).ok().and_then(|s| s.parse().ok()).unwrap_or(d) }
+fn knob(n: &str, d: f64) -> f64 {
+    std::env::var(n).ok().and_then(|s| s.parse().ok()).unwrap_or(d)
+}
 pub static PULLV: std::sync::LazyLock<f64> = std::sync::LazyLock::new(|| knob("PULL", 1e-5));
 pub static PULLC: std::sync::LazyLock<f64> = std::sync::LazyLock::new(|| knob("PULLC", 3e-5));
 pub static POORV: std::sync::LazyLock<f32> = std::sync::LazyLock::new(|| knob("POOR", 0.05) as f32);

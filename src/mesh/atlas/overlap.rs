@@ -1,0 +1,253 @@
+//! Which triangles of an atlas share area, decided without rounding.
+//!
+//! Two triangles share area unless a side of one of them has the whole other one on its far side: the
+//! separating axes of convex polygons in the plane. Each decision is the sign of an orientation determinant
+//! of f32 coordinates, in f64 with Shewchuk's error bound (1997), and where that cannot tell, as the exact sum
+//! of its six products. So triangles that share a side or a corner, or merely touch, never count.
+
+use glam::{DVec2, Vec2};
+use rayon::prelude::*;
+
+/// On which side of the line a → b is c: 1 where (b − a) × (c − a) is positive, −1 where negative, 0 on it.
+pub(crate) fn turn(a: Vec2, b: Vec2, c: Vec2) -> i32 {
+    let [p, q, r] = [a, b, c].map(|v| v.as_dvec2());
+    let (left, right) = ((p.x - r.x) * (q.y - r.y), (p.y - r.y) * (q.x - r.x));
+    let det = left - right;
+    // (3 + 16 u) u with u = 2⁻⁵³
+    if det.abs() > 3.4e-16 * (left.abs() + right.abs()) {
+        return if det > 0.0 { 1 } else { -1 };
+    }
+    if left == 0.0 && right == 0.0 {
+        return 0; // a difference is 0 only where the coordinates are equal
+    }
+    // Products of two f32 are exact in f64.
+    sign_of_sum([p.x * q.y, -p.y * q.x, q.x * r.y, -q.y * r.x, r.x * p.y, -r.y * p.x])
+}
+
+/// The sign of an exact sum (Shewchuk's expansion, grown term by term).
+fn sign_of_sum(terms: [f64; 6]) -> i32 {
+    let mut parts = [0.0f64; 6];
+    for (n, &term) in terms.iter().enumerate() {
+        let mut carry = term;
+        for part in &mut parts[..n] {
+            let sum = carry + *part;
+            let other = sum - carry;
+            *part = (carry - (sum - other)) + (*part - other);
+            carry = sum;
+        }
+        parts[n] = carry;
+    }
+    parts.iter().rev().find(|p| **p != 0.0).map_or(0, |p| if *p > 0.0 { 1 } else { -1 })
+}
+
+/// Do two triangles, neither without area, share area?
+pub(crate) fn share_area(p: [Vec2; 3], q: [Vec2; 3]) -> bool {
+    let separates = |a: [Vec2; 3], b: [Vec2; 3]| {
+        let inner = turn(a[0], a[1], a[2]);
+        (0..3).any(|k| b.iter().all(|&v| turn(a[k], a[(k + 1) % 3], v) * inner <= 0))
+    };
+    !separates(p, q) && !separates(q, p)
+}
+
+/// The area two triangles share, in the square of the coordinates' unit.
+pub(crate) fn shared_area(p: [DVec2; 3], q: [DVec2; 3]) -> f64 {
+    // Sutherland and Hodgman 1974: the first one clipped by the sides of the second.
+    let winding = (q[1] - q[0]).perp_dot(q[2] - q[0]).signum();
+    let mut polygon = p.to_vec();
+    for k in 0..3 {
+        let (from, along) = (q[k], q[(k + 1) % 3] - q[k]);
+        let side = |v: DVec2| along.perp_dot(v - from) * winding;
+        let old = std::mem::take(&mut polygon);
+        for i in 0..old.len() {
+            let (a, b) = (old[i], old[(i + 1) % old.len()]);
+            let (s, t) = (side(a), side(b));
+            if s >= 0.0 {
+                polygon.push(a);
+            }
+            if s * t < 0.0 {
+                polygon.push(a + (b - a) * (s / (s - t)));
+            }
+        }
+    }
+    let twice: f64 = (0..polygon.len()).map(|i| polygon[i].perp_dot(polygon[(i + 1) % polygon.len()])).sum();
+    0.5 * twice.abs()
+}
+
+/// Pairs of triangles that share area.
+pub(crate) struct Overlaps {
+    /// Each pair once, lower index first, in no order that means anything but always the same.
+    pub pairs: Vec<(u32, u32)>,
+    /// False when there were so many candidates that some were not looked at.
+    pub complete: bool,
+}
+
+/// Candidates a triangle has in a sound atlas: a dozen neighbours. Beyond this mean the rest is left out.
+const CANDIDATES: usize = 400;
+
+/// Finds the pairs among the triangles that `fit`; those must be finite and have area.
+pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool]) -> Overlaps {
+    let corners = |t: u32| triangles[t as usize].map(|i| uvs[i as usize]);
+    let listed: Vec<u32> = (0..triangles.len() as u32).filter(|&t| fit[t as usize]).collect();
+    if listed.len() < 2 {
+        return Overlaps { pairs: Vec::new(), complete: true };
+    }
+    let boxes: Vec<(Vec2, Vec2)> = listed
+        .iter()
+        .map(|&t| {
+            let [a, b, c] = corners(t);
+            (a.min(b).min(c), a.max(b).max(c))
+        })
+        .collect();
+    let low = boxes.iter().fold(Vec2::INFINITY, |m, b| m.min(b.0));
+    let high = boxes.iter().fold(Vec2::NEG_INFINITY, |m, b| m.max(b.1));
+    // About a triangle a cell, were they spread evenly.
+    let side = ((listed.len() as f32).sqrt() as usize).clamp(1, 2048);
+    let scale = side as f32 / (high - low).max(Vec2::splat(f32::MIN_POSITIVE));
+    let cell = |p: Vec2| {
+        let c = ((p - low) * scale).clamp(Vec2::ZERO, Vec2::splat(side as f32 - 1.0));
+        (c.x as usize, c.y as usize)
+    };
+    let each_cell = |b: &(Vec2, Vec2), visit: &mut dyn FnMut(usize)| {
+        let ((x0, y0), (x1, y1)) = (cell(b.0), cell(b.1));
+        (y0..=y1).for_each(|y| (x0..=x1).for_each(|x| visit(y * side + x)));
+    };
+    let mut start = vec![0u32; side * side + 1];
+    // An atlas of nothing but texture-wide triangles would fill memory: what comes after too many of
+    // them is left out.
+    let mut entries = 0usize;
+    let limit = CANDIDATES * listed.len();
+    let mut narrow = listed.len();
+    for (i, b) in boxes.iter().enumerate() {
+        let ((x0, y0), (x1, y1)) = (cell(b.0), cell(b.1));
+        entries += (x1 - x0 + 1) * (y1 - y0 + 1);
+        if entries > limit {
+            narrow = i;
+            break;
+        }
+    }
+    let boxes = &boxes[..narrow];
+    for b in boxes {
+        each_cell(b, &mut |c| start[c + 1] += 1);
+    }
+    for c in 0..side * side {
+        start[c + 1] += start[c];
+    }
+    let mut fill = start.clone();
+    let mut members = vec![0u32; start[side * side] as usize];
+    for (i, b) in boxes.iter().enumerate() {
+        each_cell(b, &mut |c| {
+            members[fill[c] as usize] = i as u32;
+            fill[c] += 1;
+        });
+    }
+    let budget = CANDIDATES * (listed.len() / side + 1) * 8;
+    let rows: Vec<(Vec<(u32, u32)>, bool)> = (0..side)
+        .into_par_iter()
+        .map(|y| {
+            let (mut pairs, mut looked) = (Vec::new(), 0);
+            for c in y * side..(y + 1) * side {
+                let inside = &members[start[c] as usize..start[c + 1] as usize];
+                for (k, &i) in inside.iter().enumerate() {
+                    let (low, high) = boxes[i as usize];
+                    looked += inside.len() - k;
+                    if looked > budget {
+                        return (pairs, false);
+                    }
+                    for &j in &inside[k + 1..] {
+                        let (other_low, other_high) = boxes[j as usize];
+                        let (from, to) = (low.max(other_low), high.min(other_high));
+                        // A pair that meets in several cells is looked at in the first.
+                        if from.cmpgt(to).any() || cell(from) != (c % side, y) {
+                            continue;
+                        }
+                        let (a, b) = (listed[i as usize], listed[j as usize]);
+                        if share_area(corners(a), corners(b)) {
+                            pairs.push((a, b));
+                        }
+                    }
+                }
+            }
+            (pairs, true)
+        })
+        .collect();
+    let complete = narrow == listed.len() && rows.iter().all(|r| r.1);
+    Overlaps { pairs: rows.into_iter().flat_map(|r| r.0).collect(), complete }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(p: [f32; 6]) -> [Vec2; 3] {
+        [Vec2::new(p[0], p[1]), Vec2::new(p[2], p[3]), Vec2::new(p[4], p[5])]
+    }
+
+    #[test]
+    fn turning_is_exact_where_f64_is_not() {
+        // c lies on the line through a and b but for one ulp of f32, near 1: the determinant is about 1e-15.
+        let (a, b) = (Vec2::new(0.1, 0.1), Vec2::new(0.9, 0.9));
+        assert_eq!(turn(a, b, Vec2::new(0.5, 0.5)), 0);
+        assert_eq!(turn(a, b, Vec2::new(0.5, 0.5f32.next_up())), 1);
+        assert_eq!(turn(a, b, Vec2::new(0.5, 0.5f32.next_down())), -1);
+        // far from the origin beside nothing: differences are not exact in f64
+        let (a, b) = (Vec2::new(1e-30, 0.0), Vec2::new(1.0, 0.0));
+        assert_eq!(turn(a, b, Vec2::new(0.5, 1e-38)), 1);
+        assert_eq!(sign_of_sum([1e30, 1.0, -1e30, -1.0, 1e-40, 0.0]), 1);
+        assert_eq!(sign_of_sum([1e30, 1.0, -1e30, -1.0, 0.0, 0.0]), 0);
+    }
+
+    #[test]
+    fn neighbours_touch_and_do_not_overlap() {
+        let t = at([0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);
+        assert!(!share_area(t, at([1.0, 0.0, 1.0, 1.0, 0.0, 1.0]))); // a common side
+        assert!(!share_area(t, at([0.5, 0.5, 1.0, 1.0, 0.9, 1.0]))); // a corner on a side
+        assert!(share_area(t, at([0.5f32.next_down(), 0.5, 1.0, 1.0, 0.9, 1.0])));
+        assert!(share_area(t, t));
+        assert!(share_area(t, at([0.1, 0.1, 0.1, 0.2, 0.2, 0.1]))); // inside, wound the other way
+    }
+
+    #[test]
+    fn the_shared_area_is_that_of_the_common_polygon() {
+        let d = |t: [Vec2; 3]| t.map(|v| v.as_dvec2());
+        let t = d(at([0.0, 0.0, 2.0, 0.0, 0.0, 2.0]));
+        // half of the unit square, all of it where x + y <= 2
+        let half = d(at([0.0, 0.0, 1.0, 0.0, 1.0, 1.0]));
+        assert!((shared_area(t, half) - 0.5).abs() < 1e-15);
+        assert!((shared_area(half, t) - 0.5).abs() < 1e-15);
+        assert_eq!(shared_area(t, d(at([3.0, 3.0, 4.0, 3.0, 3.0, 4.0]))), 0.0);
+    }
+
+    #[test]
+    fn planted_overlaps_are_found_once_each_among_many() {
+        // a fan-free grid of 2 · 30² triangles, and one more over two of them
+        let n = 30u32;
+        let at = |i: u32, j: u32| i * (n + 1) + j;
+        let mut uvs: Vec<Vec2> = (0..=n)
+            .flat_map(|i| (0..=n).map(move |j| Vec2::new(i as f32, j as f32) / (2.0 * n as f32)))
+            .collect();
+        let mut triangles = Vec::new();
+        for i in 0..n {
+            for j in 0..n {
+                triangles.push([at(i, j), at(i + 1, j), at(i + 1, j + 1)]);
+                triangles.push([at(i, j), at(i + 1, j + 1), at(i, j + 1)]);
+            }
+        }
+        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()]);
+        assert!(all.pairs.is_empty() && all.complete);
+        // across the diagonal of the quad (0, 0), within it
+        let s = 1.0 / 60.0;
+        uvs.extend([Vec2::new(0.4, 0.2) * s, Vec2::new(0.8, 0.6) * s, Vec2::new(0.2, 0.8) * s]);
+        let first = uvs.len() as u32 - 3;
+        triangles.push([first, first + 1, first + 2]);
+        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()]);
+        assert_eq!(all.pairs, [(0, 1800), (1, 1800)]);
+    }
+
+    #[test]
+    fn a_heap_of_texture_wide_triangles_ends() {
+        let uvs = vec![Vec2::ZERO, Vec2::X, Vec2::Y];
+        let triangles = vec![[0, 1, 2]; 20_000];
+        let found = overlaps(&uvs, &triangles, &vec![true; triangles.len()]);
+        assert!(!found.complete && !found.pairs.is_empty());
+    }
+}

@@ -1,0 +1,284 @@
+//! Shapes of charts on a grid of cells: every cell that a chart grown by its gutter touches.
+
+use glam::DVec2;
+
+/// A chart's shape: its width and height in cells and, row by row, which of them are taken.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Mask {
+    pub width: usize,
+    pub height: usize,
+    /// Taken cells `[from, to)`, all rows one after the other.
+    spans: Vec<[u32; 2]>,
+    /// Where each row's spans begin, and the end of the last.
+    starts: Vec<u32>,
+    /// The longest span of each row.
+    pub longest: Vec<u32>,
+    /// Rows in an order that finds a collision early: ends, middle, quarters.
+    pub order: Vec<u32>,
+}
+
+impl Mask {
+    pub fn row(&self, y: usize) -> &[[u32; 2]] {
+        &self.spans[self.starts[y] as usize..self.starts[y + 1] as usize]
+    }
+
+    /// The shape within an outline whose lowest coordinates are 0, grown by `reach`, so that the outline's
+    /// lowest corner lies at (`reach`, `reach`). Cells are squares of one unit.
+    pub fn of(outline: &[[DVec2; 2]], high: DVec2, reach: f64) -> Mask {
+        let [width, height] = (high + 2.0 * reach).to_array().map(|v| (v.ceil() as usize).max(1));
+        // Taken cells as intervals in each row; sorted and joined at the end.
+        let mut rows: Vec<Vec<[u32; 2]>> = vec![Vec::new(); height];
+        let mut crossings: Vec<Vec<f64>> = vec![Vec::new(); height];
+        for &[a, b] in outline {
+            let (a, b) = (a + reach, b + reach);
+            grown_side(&mut rows, a, b, reach, width);
+            // even-odd filling at the cells' centres
+            let (low, high) = if a.y < b.y { (a, b) } else { (b, a) };
+            let (from, to) =
+                ((low.y - 0.5).ceil().max(0.0) as usize, (high.y - 0.5).ceil().max(0.0) as usize);
+            for y in from..to.min(height) {
+                let t = (y as f64 + 0.5 - low.y) / (high.y - low.y);
+                crossings[y].push(low.x + (high.x - low.x) * t);
+            }
+        }
+        let mut mask = Mask { width, height, ..Mask::default() };
+        mask.starts.push(0);
+        for (row, crossings) in rows.iter_mut().zip(&mut crossings) {
+            crossings.sort_unstable_by(f64::total_cmp);
+            for pair in crossings.chunks_exact(2) {
+                row.push([pair[0] as u32, (pair[1].ceil() as u32).min(width as u32)]);
+            }
+            row.sort_unstable();
+            let first = mask.spans.len();
+            for &[from, to] in row.iter() {
+                match mask.spans[first..].last_mut() {
+                    Some(last) if last[1] >= from => last[1] = last[1].max(to),
+                    _ => mask.spans.push([from, to]),
+                }
+            }
+            mask.longest.push(mask.spans[first..].iter().map(|s| s[1] - s[0]).max().unwrap_or(0));
+            mask.starts.push(mask.spans.len() as u32);
+        }
+        mask.order = coarse_to_fine(height);
+        mask
+    }
+}
+
+/// Adds the cells that come within `reach` of a side: per row of cells the interval of two discs and the
+/// rectangle between them, which together are convex.
+fn grown_side(rows: &mut [Vec<[u32; 2]>], a: DVec2, b: DVec2, reach: f64, width: usize) {
+    let (low, high) = (a.y.min(b.y) - reach, a.y.max(b.y) + reach);
+    let normal = (b - a).perp().normalize_or_zero() * reach;
+    let quad = [a + normal, b + normal, b - normal, a - normal];
+    let last = (high.floor().max(0.0) as usize).min(rows.len() - 1);
+    for y in low.floor().max(0.0) as usize..=last {
+        let (top, bottom) = (y as f64, y as f64 + 1.0);
+        let (mut from, mut to) = (f64::INFINITY, f64::NEG_INFINITY);
+        for center in [a, b] {
+            let away = (top - center.y).max(center.y - bottom).max(0.0);
+            if away <= reach {
+                let half = (reach * reach - away * away).sqrt();
+                (from, to) = (from.min(center.x - half), to.max(center.x + half));
+            }
+        }
+        for k in 0..4 {
+            let (p, q) = (quad[k], quad[(k + 1) % 4]);
+            let (p, q) = if p.y <= q.y { (p, q) } else { (q, p) };
+            let (begin, end) = (p.y.max(top), q.y.min(bottom));
+            if begin <= end {
+                for at in [begin, end] {
+                    let t = if q.y > p.y { (at - p.y) / (q.y - p.y) } else { 0.0 };
+                    let x = p.x + (q.x - p.x) * t;
+                    (from, to) = (from.min(x), to.max(x));
+                }
+                if p.y == q.y {
+                    (from, to) = (from.min(q.x), to.max(q.x));
+                }
+            }
+        }
+        let (from, to) =
+            (from.floor().max(0.0) as u32, (to.floor() as i64 + 1).clamp(0, width as i64) as u32);
+        if from < to {
+            // sides come one after the other: most continue the last interval
+            match rows[y].last_mut() {
+                Some(l) if from <= l[1] && l[0] <= to => *l = [l[0].min(from), l[1].max(to)],
+                _ => rows[y].push([from, to]),
+            }
+        }
+    }
+}
+
+/// `0..n` by halving: 0, n − 1, the middle, the quarters, ...
+fn coarse_to_fine(n: usize) -> Vec<u32> {
+    let mut order: Vec<u32> = (0..n as u32).collect();
+    // more trailing zeros come first; the sort is stable
+    order.sort_by_key(|&i| if i == 0 || i as usize + 1 == n { 0 } else { 32 - i.trailing_zeros() });
+    order
+}
+
+/// The texture as a grid of cells, taken or free.
+pub(super) struct Page {
+    side: usize,
+    words: usize,
+    bits: Vec<u64>,
+    /// Longest run of free cells in each row.
+    free: Vec<u32>,
+}
+
+impl Page {
+    pub fn new(side: usize) -> Page {
+        let words = side.div_ceil(64);
+        Page { side, words, bits: vec![0; words * side], free: vec![side as u32; side] }
+    }
+
+    /// The first cell of a row from x on that is taken (or free); `side` if there is none.
+    fn next(&self, y: usize, x: usize, taken: bool) -> usize {
+        let row = &self.bits[y * self.words..(y + 1) * self.words];
+        let mut w = x / 64;
+        if x >= self.side {
+            return self.side;
+        }
+        let flip = if taken { 0 } else { !0 };
+        let mut word = (row[w] ^ flip) & (!0 << (x % 64));
+        while word == 0 {
+            w += 1;
+            if w == self.words {
+                return self.side;
+            }
+            word = row[w] ^ flip;
+        }
+        (w * 64 + word.trailing_zeros() as usize).min(self.side)
+    }
+
+    /// The lowest and then leftmost place for a mask whose upper end stays below `limit`.
+    pub fn find(&self, mask: &Mask, limit: usize) -> Option<(usize, usize)> {
+        if mask.width > self.side || mask.height > self.side {
+            return None;
+        }
+        let (mut stuck, mut narrow) = (0, 0);
+        for y in 0..=self.side - mask.height {
+            if y + mask.height >= limit {
+                return None;
+            }
+            let too_narrow = |r: usize| self.free[y + r] < mask.longest[r];
+            if too_narrow(narrow) {
+                continue;
+            }
+            if let Some(r) = (0..mask.height).find(|&r| too_narrow(r)) {
+                narrow = r;
+                continue;
+            }
+            let mut x = 0;
+            'x: while x + mask.width <= self.side {
+                // the row that was in the way before most likely is again
+                let rows = std::iter::once(stuck).chain(mask.order.iter().map(|&r| r as usize));
+                for r in rows {
+                    for &[from, to] in mask.row(r) {
+                        let (from, to) = (from as usize, to as usize);
+                        let hit = self.next(y + r, x + from, true);
+                        if hit < x + to {
+                            stuck = r;
+                            x = self.next(y + r, hit, false) - from;
+                            continue 'x;
+                        }
+                    }
+                }
+                return Some((x, y));
+            }
+        }
+        None
+    }
+
+    pub fn take(&mut self, mask: &Mask, x: usize, y: usize) {
+        for r in 0..mask.height {
+            let row = y + r;
+            for &[from, to] in mask.row(r) {
+                for w in (x + from as usize) / 64..=(x + to as usize - 1) / 64 {
+                    let (first, last) = ((x + from as usize).max(w * 64), (x + to as usize).min(w * 64 + 64));
+                    let ones = !0u64 >> (64 - (last - first));
+                    self.bits[row * self.words + w] |= ones << (first - w * 64);
+                }
+            }
+            let (mut at, mut longest) = (0, 0);
+            while at < self.side {
+                let from = self.next(row, at, false);
+                at = self.next(row, from, true);
+                longest = longest.max(at - from);
+            }
+            self.free[row] = longest as u32;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn square(side: f64) -> Vec<[DVec2; 2]> {
+        let p = [DVec2::ZERO, side * DVec2::X, DVec2::splat(side), side * DVec2::Y];
+        (0..4).map(|k| [p[k], p[(k + 1) % 4]]).collect()
+    }
+
+    #[test]
+    fn a_square_grown_by_two_loses_its_corners() {
+        let mask = Mask::of(&square(6.0), DVec2::splat(6.0), 2.0);
+        // rows 0..10; the corner cell (0, 0) is √2 away from the point (2, 2) at its nearest: taken
+        assert_eq!((mask.width, mask.height), (10, 10));
+        assert!((2..8).all(|y| mask.row(y) == [[0, 10]]));
+        assert_eq!(mask.row(0), [[0, 10]]);
+        let mask = Mask::of(&square(6.0), DVec2::splat(6.0), 4.0);
+        // grown by 4, cell (0, 0) reaches to (1, 1), 3 √2 = 4.24 away from (4, 4): free; (1, 0) is √13 = 3.6
+        assert_eq!(mask.row(0), [[1, 13]]);
+        assert_eq!(mask.row(7), [[0, 14]]);
+    }
+
+    #[test]
+    fn an_outline_with_a_hole_keeps_it_free() {
+        let mut outline = square(20.0);
+        outline.extend(square(10.0).iter().map(|s| s.map(|p| p + 5.0)));
+        let mask = Mask::of(&outline, DVec2::splat(20.0), 1.0);
+        // the hole is 6..16, less one on each side
+        assert_eq!(mask.row(11), [[0, 7], [15, 22]]);
+        let mut page = Page::new(70);
+        page.take(&mask, 0, 0);
+        let small = Mask::of(&square(6.0), DVec2::splat(6.0), 1.0);
+        assert_eq!(page.find(&small, usize::MAX), Some((22, 0)));
+        let tall = Mask::of(&square(68.0), DVec2::splat(68.0), 1.0);
+        assert_eq!(page.find(&tall, usize::MAX), None);
+        page.take(&small, 22, 0);
+        page.take(&small, 30, 0);
+        assert_eq!(page.find(&small, usize::MAX), Some((38, 0)));
+        assert_eq!(page.find(&small, 8), None);
+    }
+
+    #[test]
+    fn what_a_page_finds_free_is_free_and_the_first_such_place() {
+        let l_shape = |s: f64| -> Vec<[DVec2; 2]> {
+            let p = [(0., 0.), (3., 0.), (3., 1.), (1., 1.), (1., 4.), (0., 4.)]
+                .map(|(x, y)| s * DVec2::new(x, y));
+            (0..6).map(|k| [p[k], p[(k + 1) % 6]]).collect()
+        };
+        let mut page = Page::new(100);
+        let mut taken = vec![[false; 100]; 100];
+        for i in 0..14 {
+            let s = 3.0 + f64::from(i * 5 % 7);
+            let mask = Mask::of(&l_shape(s), s * DVec2::new(3.0, 4.0), 1.5);
+            let fits = |x: usize, y: usize| {
+                (0..mask.height)
+                    .all(|r| mask.row(r).iter().all(|s| (s[0]..s[1]).all(|c| !taken[y + r][x + c as usize])))
+            };
+            let mut places =
+                (0..=100 - mask.height).flat_map(|y| (0..=100 - mask.width).map(move |x| (x, y)));
+            let first = places.find(|&(x, y)| fits(x, y));
+            assert_eq!(page.find(&mask, usize::MAX), first, "{i}");
+            if let Some((x, y)) = first {
+                page.take(&mask, x, y);
+                for r in 0..mask.height {
+                    mask.row(r)
+                        .iter()
+                        .for_each(|s| (s[0]..s[1]).for_each(|c| taken[y + r][x + c as usize] = true));
+                }
+            }
+        }
+    }
+}

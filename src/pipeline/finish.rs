@@ -1,0 +1,158 @@
+//! From the whole extraction to what an artist opens: simplified, laid out, baked.
+
+use super::product::{Lobes, Pictures, Product};
+use super::{Line, Surface};
+use crate::capture::Split;
+use crate::capture::scene::Scene;
+use crate::config::TextureView;
+use crate::geom::{Camera, Mesh};
+use crate::image::{Image, Photo, quantise, srgb_from_linear};
+use crate::mesh::bake::{BakeConfig, Baked, Learned, Viewer, bake, tangent_space};
+use crate::mesh::textured_tangents::tangents;
+use crate::mesh::{AtlasConfig, Cap, MeshError, SimplifyConfig, atlas, simplify};
+use crate::run::Monitor;
+use glam::{Mat3, Vec3};
+use serde_json::{Map, Value, json};
+
+/// The product, what is to be kept beside it, and what happened.
+pub(super) struct Finished {
+    /// In the dataset's world.
+    pub product: Product,
+    /// The baked colour, linear.
+    pub linear: Option<Image>,
+    /// A report per step.
+    pub report: Map<String, Value>,
+    /// What a person should hear about.
+    pub warnings: Vec<String>,
+}
+
+impl Line<'_> {
+    /// Finishes a surface in scene coordinates, extracted with cells of `cell`.
+    pub(super) fn finish(
+        &self,
+        surface: &Mesh,
+        cap: Option<&Cap>,
+        cell: f32,
+        scene: &Scene,
+        field: &dyn Surface,
+        monitor: &dyn Monitor,
+    ) -> Result<Finished, MeshError> {
+        let c = &self.config.mesh;
+        let mut report = Map::new();
+        let mut warnings = Vec::new();
+        let mut mesh = surface.clone();
+        // on an open surface the field's own zero ends at the opening, which the closed one holds as well
+        let gradient = |points: &[Vec3]| {
+            let (mut values, mut gradients) = field.sdf_gradient(points);
+            if let Some(cap) = cap {
+                cap.close(points, &mut values, &mut gradients);
+            }
+            (values, gradients)
+        };
+        let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
+        if fewer || c.max_error > 0.0 {
+            let config = SimplifyConfig {
+                triangles: c.triangles as usize,
+                error: c.max_error * cell,
+                ..SimplifyConfig::default()
+            };
+            let done = simplify(&mut mesh, Some(&gradient), &config, monitor)?;
+            warnings.extend(done.warnings(&config));
+            report.insert("simplify".into(), json!(done));
+        }
+        let world_from_scene = scene.scene_from_world.inverse();
+        if c.texture_px == 0 {
+            let product = Product { mesh: mesh.transformed(&world_from_scene), pictures: None };
+            return Ok(Finished { product, linear: None, report, warnings });
+        }
+
+        let export = self.export();
+        let world = surface.transformed(&world_from_scene);
+        let front = export.front(&world).map(|d| scene.scene_from_world.direction(d));
+        let config = AtlasConfig { size_px: c.texture_px, gutter_px: c.gutter_px, front };
+        let (laid, done) = atlas(&mesh, &config, monitor)?;
+        warnings.extend(done.warnings());
+        report.insert("atlas".into(), json!(done));
+
+        let asset_from_world = export.asset_from_world(&world);
+        let config = BakeConfig {
+            side: c.texture_samples,
+            gutter_px: c.gutter_px,
+            // the chords of large triangles and half a cell
+            reach: 2.5 * cell,
+            viewer: match c.texture_view {
+                TextureView::Cameras => Viewer::Cameras,
+                TextureView::Normal => Viewer::Normal,
+            },
+            lobes: c.lobes,
+            normals: c.normal_map,
+            turned: asset_from_world * world_from_scene.rotation_f32(),
+        };
+        let colors = |p: &[Vec3], n: &[Vec3], counts: &[u32], d: &[Vec3]| {
+            let mut colors = field.colors(p, n, counts, d);
+            if let Some(cap) = cap {
+                let mut at = 0;
+                for (p, &count) in p.iter().zip(counts) {
+                    let own = at..at + count as usize;
+                    at = own.end;
+                    if cap.holds(*p) {
+                        let color = cap.color(*p);
+                        colors[own].fill(color);
+                    }
+                }
+            }
+            colors
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        let train = self.capture.split(Split::Train);
+        let cameras: Vec<Camera> = train.map(|v| v.camera.transformed(&scene.scene_from_world)).collect();
+        let baked = bake(&mesh, &laid, &learned, &cameras, &config, monitor)?;
+        report.insert("bake".into(), json!(baked.report));
+
+        let normal = match &baked.normal {
+            Some(normals) => match tangents(&mesh, &laid) {
+                Ok(tangents) => Some(tangent_space(&mesh, &laid, &tangents, normals, c.gutter_px)),
+                Err(e) => {
+                    warnings.push(format!("the mesh has no normal map: {e}"));
+                    None
+                }
+            },
+            None => None,
+        };
+        let pictures = Pictures {
+            atlas: laid,
+            color: coded(&baked.color),
+            normal,
+            lobes: lobes(&baked, asset_from_world),
+        };
+        let product = Product { mesh: mesh.transformed(&world_from_scene), pictures: Some(pictures) };
+        Ok(Finished { product, linear: Some(baked.color), report, warnings })
+    }
+}
+
+/// Linear colour as a picture, rounded to nearest.
+fn coded(image: &Image) -> Photo {
+    let texel = |c: &[f32; 3]| c.map(|v| quantise(srgb_from_linear(v)));
+    let rgb = image.data.as_chunks::<3>().0.iter().map(texel).collect();
+    Photo { width: image.width, height: image.height, rgb, alpha: None }
+}
+
+/// Lobes as pictures. Each is scaled by what all but a thousandth of its texels keep within: a few wild texels
+/// must not cost the others their precision.
+fn lobes(baked: &Baked, asset_from_world: Mat3) -> Option<Lobes> {
+    if baked.lobes.is_empty() {
+        return None;
+    }
+    let (mut pictures, mut scale) = (Vec::new(), Vec::new());
+    for image in &baked.lobes {
+        let mut sizes: Vec<f32> = image.data.iter().map(|v| v.abs()).collect();
+        let at = (sizes.len() as f64 * 0.999) as usize;
+        let most = if sizes.is_empty() { 0.0 } else { *sizes.select_nth_unstable_by(at, f32::total_cmp).1 };
+        let most = most.max(1e-4);
+        let byte = |v: f32| (v / most * 127.0 + 128.5).clamp(1.0, 255.0) as u8;
+        let rgb = image.data.as_chunks::<3>().0.iter().map(|c| c.map(byte)).collect();
+        pictures.push(Photo { width: image.width, height: image.height, rgb, alpha: None });
+        scale.push(most);
+    }
+    Some(Lobes { pictures, scale, asset_from_world })
+}
