@@ -70,10 +70,15 @@ pub struct Eyes<'a> {
     pub clearance: f32,
 }
 
+/// Cameras that stand in for those that see a point, where none does.
+const STAND_INS: usize = 3;
+
 /// Directions to the cameras that see each point, all in one list.
 #[derive(Default)]
 pub struct Seen {
-    /// Cameras that see point `i`.
+    /// Does any camera see point `i`? Else its directions are those of the cameras that come nearest to it.
+    pub known: Vec<bool>,
+    /// Directions of point `i`.
     pub counts: Vec<u32>,
     /// Unit directions towards them.
     pub directions: Vec<Vec3>,
@@ -83,42 +88,52 @@ pub struct Seen {
 
 impl Eyes<'_> {
     /// The cameras that see each point: in the frame, at most 75 degrees from its normal, nothing between.
-    /// Lines of sight start from the flat triangle (`flat`), which is part of what hides.
+    ///
+    /// Angles are those to the mesh's own normals and lines of sight start from the mesh (`flat`): the field's
+    /// normals are rough, and a camera must not come and go from texel to texel. A point that no camera sees is
+    /// looked at from where the cameras stand that face it most: those are directions that the field has
+    /// learned colours for, unlike the one straight at it.
     pub fn seen(&self, points: &Points, flat: &Points) -> Seen {
-        let each: Vec<Vec<(Vec3, f32)>> = (0..points.positions.len())
+        let each: Vec<(bool, Vec<(Vec3, f32)>)> = (0..points.positions.len())
             .into_par_iter()
             .with_min_len(256)
             .map(|i| {
-                let (p, normal) = (points.positions[i], points.normals[i]);
-                let from = flat.positions[i] + self.clearance * flat.normals[i];
-                self.cameras
+                let (p, normal) = (points.positions[i], flat.normals[i]);
+                let from = flat.positions[i] + self.clearance * normal;
+                let all: Vec<(Vec3, f32)> = self
+                    .cameras
                     .iter()
-                    .filter_map(|camera| {
-                        let eye = camera.position.as_vec3();
-                        let direction = (eye - p).normalize_or_zero();
-                        let cos = direction.dot(normal);
-                        if cos < STEEPEST {
-                            return None;
-                        }
-                        let (pixel, _) = camera.project(p)?;
-                        let (w, h) = (camera.width as f32, camera.height as f32);
-                        if !(0.0..w).contains(&pixel.x) || !(0.0..h).contains(&pixel.y) {
-                            return None;
-                        }
-                        let way = eye - from;
-                        let ray = Ray {
-                            origin: from,
-                            direction: way.normalize_or_zero(),
-                            t_min: 0.0,
-                            t_max: way.length(),
-                        };
-                        (!self.bvh.any_hit(&ray)).then_some((direction, cos * cos))
+                    .map(|camera| {
+                        let direction = (camera.position.as_vec3() - p).normalize_or_zero();
+                        (direction, direction.dot(normal))
                     })
-                    .collect()
+                    .collect();
+                let sees = |(camera, &(direction, cos)): (&Camera, &(Vec3, f32))| {
+                    if cos < STEEPEST || !in_frame(camera, p) {
+                        return None;
+                    }
+                    let way = camera.position.as_vec3() - from;
+                    let ray = Ray {
+                        origin: from,
+                        direction: way.normalize_or_zero(),
+                        t_min: 0.0,
+                        t_max: way.length(),
+                    };
+                    (!self.bvh.any_hit(&ray)).then_some((direction, cos * cos))
+                };
+                let list: Vec<_> = self.cameras.iter().zip(&all).filter_map(sees).collect();
+                if !list.is_empty() || all.is_empty() {
+                    return (!list.is_empty(), list);
+                }
+                let mut nearest = all;
+                nearest.sort_by(|a, b| b.1.total_cmp(&a.1));
+                nearest.truncate(STAND_INS);
+                (false, nearest.into_iter().map(|(d, cos)| (d, cos.max(0.0).powi(2) + 1e-3)).collect())
             })
             .collect();
         let mut seen = Seen::default();
-        for list in each {
+        for (known, list) in each {
+            seen.known.push(known);
             seen.counts.push(list.len() as u32);
             for (direction, weight) in list {
                 seen.directions.push(direction);
@@ -126,6 +141,25 @@ impl Eyes<'_> {
             }
         }
         seen
+    }
+}
+
+/// Is a point within a camera's picture?
+fn in_frame(camera: &Camera, p: Vec3) -> bool {
+    let (w, h) = (camera.width as f32, camera.height as f32);
+    camera.project(p).is_some_and(|(at, _)| (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y))
+}
+
+impl Seen {
+    /// Each of `points` looked at straight.
+    pub fn head_on(points: &Points) -> Seen {
+        let n = points.positions.len();
+        Seen {
+            known: vec![false; n],
+            counts: vec![1; n],
+            directions: points.normals.clone(),
+            weights: vec![1.0; n],
+        }
     }
 }
 
@@ -139,37 +173,10 @@ pub struct Shades {
     pub seen: Vec<bool>,
 }
 
-/// Shades points. Where no camera sees a point, or with `head_on` for all, its colour is what is seen looking
-/// straight at it. `functions` lobes are fitted in the coordinates that `turned` rotates to; 0 for none.
-pub fn shade(
-    points: &Points,
-    mut seen: Seen,
-    learned: &Learned,
-    head_on: bool,
-    functions: usize,
-    turned: glam::Mat3,
-) -> Shades {
+/// Shades points. `functions` lobes are fitted in the coordinates that `turned` rotates to, where cameras see a
+/// point; 0 for none.
+pub fn shade(points: &Points, seen: Seen, learned: &Learned, functions: usize, turned: glam::Mat3) -> Shades {
     let n = points.positions.len();
-    let known: Vec<bool> = seen.counts.iter().map(|&c| c > 0).collect();
-    if head_on || known.contains(&false) {
-        // a view of their own for points without one
-        let mut patched = Seen::default();
-        let mut at = 0;
-        for i in 0..n {
-            let own = at..at + seen.counts[i] as usize;
-            at = own.end;
-            if head_on || own.is_empty() {
-                patched.counts.push(1);
-                patched.directions.push(points.normals[i]);
-                patched.weights.push(1.0);
-            } else {
-                patched.counts.push(own.len() as u32);
-                patched.directions.extend(&seen.directions[own.clone()]);
-                patched.weights.extend(&seen.weights[own]);
-            }
-        }
-        seen = patched;
-    }
     let away: Vec<Vec3> = seen.directions.iter().map(|d| -*d).collect();
     let colors = (learned.colors)(&points.positions, &points.normals, &seen.counts, &away);
     let mut first = Vec::with_capacity(n + 1);
@@ -185,7 +192,7 @@ pub fn shade(
         for (c, w) in colors.iter().zip(weights) {
             (0..3).for_each(|k| linear[k] += w / total * linear_from_srgb(c[k]));
         }
-        if !lobes.is_empty() && known[i] && !head_on {
+        if !lobes.is_empty() && seen.known[i] {
             let base = linear.map(srgb_from_linear);
             let directions: Vec<Vec3> = seen.directions[own].iter().map(|d| turned * *d).collect();
             lobes::fit(base, &directions, weights, colors, lobes);
@@ -201,7 +208,7 @@ pub fn shade(
     } else {
         linear.par_iter_mut().enumerate().with_min_len(256).for_each(|(i, c)| one(i, c, &mut []));
     }
-    Shades { linear, lobes: fitted, seen: known }
+    Shades { linear, lobes: fitted, seen: seen.known }
 }
 
 #[cfg(test)]
@@ -251,7 +258,9 @@ mod tests {
         let (positions, normals) = all.into_iter().unzip();
         let points = Points { positions, normals };
         let seen = eyes.seen(&points, &points);
-        assert_eq!(seen.counts, [1, 0, 0, 0, 0]);
+        assert_eq!(seen.known, [true, false, false, false, false]);
+        // the others are looked at from where the one camera stands
+        assert_eq!(seen.counts, [1; 5]);
         // direction (−0.5, 0, 4) / √16.25: cos² = 16 / 16.25
         assert!((seen.weights[0] - 16.0 / 16.25).abs() < 1e-5);
     }
@@ -265,19 +274,19 @@ mod tests {
         let learned = Learned { gradient: &sphere_gradient, colors: &colors };
         let points = Points { positions: vec![Vec3::Z; 2], normals: vec![Vec3::Z; 2] };
         let side = |x: f32| Vec3::new(x, 0.0, 1.0).normalize();
-        let seen =
-            || Seen { counts: vec![2, 0], directions: vec![side(1.0), side(-1.0)], weights: vec![0.5; 2] };
-        let shades = shade(&points, seen(), &learned, false, 4, glam::Mat3::IDENTITY);
+        let directions = vec![side(1.0), side(-1.0), side(1.0)];
+        let seen = Seen { known: vec![true, false], counts: vec![2, 1], directions, weights: vec![0.5; 3] };
+        let shades = shade(&points, seen, &learned, 4, glam::Mat3::IDENTITY);
         assert!((shades.linear[0][0] - 0.5).abs() < 1e-6);
         assert!((shades.linear[0][1] - linear_from_srgb(0.5)).abs() < 1e-6);
         assert_eq!(shades.seen, [true, false]);
-        // the second is looked at straight: direction −z, x is not negative
-        assert_eq!(shades.linear[1][0], 0.0);
+        // the second is looked at by a stand-in at +x: away from it x is negative
+        assert_eq!(shades.linear[1][0], 1.0);
         // towards +x it is brighter than towards −x
         let towards = |x: f32| crate::kernel::sphharm::combine(&shades.lobes[..4], side(x).to_array())[0];
         assert!(towards(1.0) > 0.1 && towards(-1.0) < -0.3, "{} {}", towards(1.0), towards(-1.0));
         assert_eq!(shades.lobes[4..], [[0.0; 3]; 4]);
-        let straight = shade(&points, seen(), &learned, true, 0, glam::Mat3::IDENTITY);
+        let straight = shade(&points, Seen::head_on(&points), &learned, 0, glam::Mat3::IDENTITY);
         assert_eq!(straight.linear[0][0], 0.0);
     }
 }

@@ -132,12 +132,11 @@ pub fn bake(
             let flat = on_triangles(mesh, own);
             let points = settle(&flat, config.reach, learned);
             let seen = match config.viewer {
-                Viewer::Cameras => eyes.seen(&points, &flat),
-                Viewer::Normal => light::Seen { counts: vec![0; own.len()], ..Default::default() },
+                Viewer::Cameras if !cameras.is_empty() => eyes.seen(&points, &flat),
+                _ => light::Seen::head_on(&points),
             };
             totals.add(&seen, &flat, &points);
-            let head_on = config.viewer == Viewer::Normal;
-            let shades = shade(&points, seen, learned, head_on, functions, config.turned);
+            let shades = shade(&points, seen, learned, functions, config.turned);
             let mut i = 0;
             for texel in own.chunk_by(|a, b| a.texel == b.texel) {
                 let at = texel[0].texel as usize;
@@ -229,8 +228,9 @@ struct Totals {
 impl Totals {
     fn add(&mut self, seen: &light::Seen, flat: &Points, points: &Points) {
         self.samples += seen.counts.len();
-        self.seen += seen.counts.iter().filter(|&&c| c > 0).count();
-        self.views += seen.counts.iter().map(|&c| c as usize).sum::<usize>();
+        let known = || seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known);
+        self.seen += known().count();
+        self.views += known().map(|(_, &c)| c as usize).sum::<usize>();
         let moved = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
         self.moved += moved.sum::<f64>();
     }
