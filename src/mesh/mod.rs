@@ -25,7 +25,7 @@ pub use clean::{CleanReport, clean};
 pub use error::MeshError;
 pub use extract::{MeshReport, extract};
 pub use marching::{Surface, Volume, marching};
-pub use simplify::{SimplifyConfig, SimplifyReport, simplify};
+pub use simplify::{Placement, SimplifyConfig, SimplifyReport, simplify};
 pub use sparse::{Asking, Grid, Sparse, sparse};
 pub use verify::Verified;
 

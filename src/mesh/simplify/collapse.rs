@@ -132,7 +132,7 @@ impl Star {
                 return false;
             }
             // negated, so that what is not a number fails
-            let fair = 12.0 * area.length_squared() >= *super::quadric::POORV * *super::quadric::POORV * sum * sum && sum > 0.0;
+            let fair = 12.0 * area.length_squared() >= POOR * POOR * sum * sum && sum > 0.0;
             if !fair {
                 let worst = *worst.get_or_insert_with(|| self.worst(rings));
                 if !(quality(u, v, q - p) > worst) {
@@ -176,6 +176,7 @@ impl Star {
         rings.positions[a as usize] = x;
         rings.flags[a as usize] |= rings.flags[b as usize];
         rings.stamps[a as usize] += 1;
+        rings.stamps[b as usize] += 1;
         for &(t, opposite) in &self.gone {
             rings.triangles[t as usize] = [NONE; 3];
             rings.spreads[opposite as usize].subtract(rings.leans[t as usize]);
@@ -214,6 +215,7 @@ impl Star {
 }
 
 /// The best place for the collapse of (a, b), and its cost; `None` where an end is not to be touched.
+#[inline]
 pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     let (fa, fb) = (rings.flags[a as usize], rings.flags[b as usize]);
     if (fa | fb) & (HELD) != 0 {
@@ -237,4 +239,3 @@ fn quality(u: Vec3, v: Vec3, w: Vec3) -> f32 {
 pub(super) fn quality_of([a, b, c]: [Vec3; 3]) -> f32 {
     quality(b - a, c - a, c - b)
 }
-

@@ -54,8 +54,9 @@ impl Cells {
         self.dims.x as usize * self.dims.y as usize * self.dims.z as usize
     }
 
+    /// The conversion cuts off, which for points of the box is rounding down.
     fn cell(&self, p: Vec3) -> IVec3 {
-        ((p - self.origin) * self.per_unit).floor().as_ivec3().clamp(IVec3::ZERO, self.dims - 1)
+        ((p - self.origin) * self.per_unit).as_ivec3().clamp(IVec3::ZERO, self.dims - 1)
     }
 
     fn number(&self, c: IVec3) -> usize {
@@ -103,7 +104,9 @@ impl Facet {
         if self.lets_go(other, unsure) || other.lets_go(self, unsure) {
             return false;
         }
-        self.area != DVec3::ZERO && other.area != DVec3::ZERO && intersect(self.p, self.ids, other.p, other.ids)
+        self.area != DVec3::ZERO
+            && other.area != DVec3::ZERO
+            && intersect(self.p, self.ids, other.p, other.ids)
     }
 
     /// Does the other one lie strictly on one side, but for common corners?
@@ -226,9 +229,7 @@ impl Sheets {
         if one_another {
             return true;
         }
-        let Some(bounds) =
-            facets.iter().map(|f| f.bounds).reduce(|a, b| a.with(b.min).with(b.max))
-        else {
+        let Some(bounds) = facets.iter().map(|f| f.bounds).reduce(|a, b| a.with(b.min).with(b.max)) else {
             return false;
         };
         let (low, high) = (self.cells.cell(bounds.min), self.cells.cell(bounds.max));

@@ -31,8 +31,8 @@ use crate::run::Monitor;
 use bounded::bounded;
 use crossing::crossings;
 use fit::Field;
-use round::{Look, Task, rounds};
 use glam::Vec3;
+use round::{Look, Task, rounds};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -150,6 +150,9 @@ impl SimplifyReport {
 /// A first attempt without looking, two that look near what was found, one that looks everywhere.
 const ATTEMPTS: usize = 4;
 
+/// With more crossings than this, finding the vertices near them costs more than looking everywhere.
+const MANY: usize = 1000;
+
 /// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colours
 /// follow their vertices. A mesh that has no more triangles than asked stays as it is.
 ///
@@ -187,12 +190,16 @@ pub fn simplify(
     for attempt in 0..ATTEMPTS {
         let look = match attempt {
             0 => Look::Nowhere,
-            i if i + 1 == ATTEMPTS => Look::Everywhere,
+            i if i + 1 == ATTEMPTS || near.len() > MANY => Look::Everywhere,
             _ => Look::Near(&near),
         };
         report = SimplifyReport { before, again: attempt, asked: report.asked, ..SimplifyReport::default() };
         let task = Task { field, config, look, monitor };
-        out = if config.error > 0.0 { bounded(mesh, &task, &mut report)? } else { rounds(mesh, &task, &mut report)? };
+        out = if config.error > 0.0 {
+            bounded(mesh, &task, &mut report)?
+        } else {
+            rounds(mesh, &task, &mut report)?
+        };
         let found = crossings(&out.positions, &out.triangles);
         report.self_intersections = found.len();
         if found.is_empty() {
@@ -236,3 +243,6 @@ fn sound(mesh: &Mesh) -> Result<(), MeshError> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

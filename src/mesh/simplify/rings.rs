@@ -41,7 +41,7 @@ pub(super) struct Rings {
     pub leans: Vec<Vec3>,
     pub spreads: Vec<Spread>,
     pub flags: Vec<u8>,
-    /// Grows whenever a vertex is what a collapse left.
+    /// Grows whenever a vertex is what a collapse left or took away.
     pub stamps: Vec<u32>,
     /// Triangles that are left.
     pub count: usize,
@@ -104,6 +104,11 @@ impl Rings {
     /// How many triangles are around a vertex; none when it is gone.
     pub(super) fn valence(&self, v: u32) -> usize {
         self.places[v as usize].len as usize
+    }
+
+    /// Changes with either end: stamps only grow, so their sum stays the same only if both do.
+    pub(super) fn stamp(&self, a: u32, b: u32) -> u32 {
+        self.stamps[a as usize].wrapping_add(self.stamps[b as usize])
     }
 
     /// The three corners of a triangle.

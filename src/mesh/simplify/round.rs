@@ -16,6 +16,9 @@ use glam::Vec3;
 /// vertices on the surface.
 const STEP: f64 = 1.5;
 
+/// Buckets that a cost may have grown since the edge was entered: a quarter of it.
+const SLACK: usize = 4;
+
 /// Asking whether to stop costs nothing this often.
 const BREATH: usize = 1 << 12;
 
@@ -119,13 +122,12 @@ pub(super) fn reduce(
                 task.stop()?;
             }
             let Some((bucket, Entry { a, b, stamp })) = queue.pop() else { break };
-            let stamps = rings.stamps[a as usize].wrapping_add(rings.stamps[b as usize]);
-            if rings.valence(a) == 0 || rings.valence(b) == 0 || stamps != stamp {
-                continue;
+            if rings.stamp(a, b) != stamp {
+                continue; // an end is gone, or its edges were entered anew
             }
             let Some((x, cost)) = place(rings, a, b) else { continue };
             let now = Queue::bucket(cost);
-            if now > bucket {
+            if now > bucket + SLACK {
                 queue.push(now, Entry { a, b, stamp });
                 continue;
             }
@@ -188,8 +190,7 @@ fn fill(rings: &Rings) -> Queue {
 
 fn push(queue: &mut Queue, rings: &Rings, a: u32, b: u32) {
     if let Some((_, cost)) = place(rings, a, b) {
-        let stamp = rings.stamps[a as usize].wrapping_add(rings.stamps[b as usize]);
-        queue.push(Queue::bucket(cost), Entry { a, b, stamp });
+        queue.push(Queue::bucket(cost), Entry { a, b, stamp: rings.stamp(a, b) });
     }
 }
 
