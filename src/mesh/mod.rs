@@ -1,7 +1,8 @@
 //! Stage: a surface an artist can open. The zero level set of a signed distance becomes a closed mesh.
 //!
 //! [`marching`] meshes a dense grid, [`sparse`] asks a field only near its surface, [`clean`] keeps the
-//! head and drops the dust, [`extract`] is the stage: all of it, with normals and colours.
+//! head and drops the dust, [`extract`] is the stage: all of it, with normals and colours. [`simplify`]
+//! takes triangles away where the surface does not need them.
 
 pub mod check;
 mod clean;

@@ -27,7 +27,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         let mut rings = prepare(mesh, task, report);
         let mut budgets = vec![error; rings.positions.len()];
         reduce(&mut rings, task, target, Some(&mut budgets), report)?;
-        return Ok(rings.into_mesh());
+        return Ok(rings.into_mesh().0);
     };
     let mut good = mesh.clone();
     let mut at = measure(&good, task, report)?;
@@ -39,11 +39,11 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         let mut budgets: Vec<f32> = at.iter().map(|e| part * (error - e)).collect();
         let goal = target.max((SHARE * before as f64) as usize);
         reduce(&mut rings, task, goal, Some(&mut budgets), report)?;
-        let mut next = rings.into_mesh();
+        let (mut next, fixed) = rings.into_mesh();
         if next.triangles.len() == before {
             break;
         }
-        settle(&mut next, field, task, Placement::OnSurface, true, report)?;
+        settle(&mut next, &fixed, field, task, Placement::OnSurface, true, report)?;
         let errors = measure(&next, task, report)?;
         let found = worst(&errors);
         let after = next.triangles.len();
@@ -68,7 +68,9 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         }
     }
     if good.normals.is_empty() {
-        settle(&mut good, field, task, Placement::OnSurface, true, report)?;
+        // nothing may go: the mesh as it came, with normals
+        let fixed = vec![true; good.positions.len()];
+        settle(&mut good, &fixed, field, task, Placement::OnSurface, true, report)?;
     }
     Ok(good)
 }

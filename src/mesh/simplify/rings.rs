@@ -53,14 +53,6 @@ impl Rings {
     /// Around the triangles of `mesh`, whose indices must be in range and positions finite. Triangles
     /// with a repeated vertex are left out.
     pub(super) fn new(mesh: &Mesh) -> Rings {
-        let mut rings = Rings::bare(mesh);
-        rings.flags = held(&rings);
-        rings.measure();
-        rings
-    }
-
-    /// Without flags and measures.
-    pub(super) fn bare(mesh: &Mesh) -> Rings {
         let n = mesh.positions.len();
         let triangles: Vec<[u32; 3]> =
             mesh.triangles.iter().copied().filter(|t| t[0] != t[1] && t[1] != t[2] && t[2] != t[0]).collect();
@@ -92,6 +84,8 @@ impl Rings {
                 place.len += 1;
             }
         }
+        rings.flags = held(&rings);
+        rings.measure();
         rings
     }
 
@@ -205,14 +199,17 @@ impl Rings {
         }
     }
 
-    /// Drops gone vertices and triangles from the arrays; the order of the rest stays.
-    pub(super) fn into_mesh(self) -> Mesh {
+    /// Drops gone vertices and triangles from the arrays; the order of the rest stays. And which vertices
+    /// must not move: those of borders, and where the mesh is no surface.
+    pub(super) fn into_mesh(self) -> (Mesh, Vec<bool>) {
+        let mut fixed = Vec::new();
         let mut number = vec![NONE; self.positions.len()];
         let mut mesh = Mesh::default();
         for v in 0..self.positions.len() {
             if self.places[v].len > 0 {
                 number[v] = mesh.positions.len() as u32;
                 mesh.positions.push(self.positions[v]);
+                fixed.push(self.flags[v] & (BORDER | HELD) != 0);
                 if let Some(&color) = self.colors.get(v) {
                     mesh.colors.push(color);
                 }
@@ -220,6 +217,6 @@ impl Rings {
         }
         let alive = self.triangles.iter().filter(|t| t[0] != NONE);
         mesh.triangles = alive.map(|t| t.map(|v| number[v as usize])).collect();
-        mesh
+        (mesh, fixed)
     }
 }
