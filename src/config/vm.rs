@@ -213,7 +213,9 @@ impl VmConfig {
         VmConfig {
             steps: 6000,
             masks: MaskUse::Soft,
-            foreground: Foreground::Estimated,
+            // as published: the views are compared with photographs times mask, and what the stage sheds on soft
+            // hair belongs to those (I-Face, whose mesh leaves the stage, learns without it)
+            foreground: Foreground::Photo,
             background: VmBackground::Random,
             start: VmStart::Hull,
             whole_frame: false,
@@ -226,16 +228,14 @@ impl VmConfig {
             color_rank: vec![24, 24, 24],
             hidden: 64,
             // the published 25 per unit of its world would be 40 here; denser matter sets a thinner surface,
-            // and fewer samples of a ray need a colour
-            distance_scale: 200.0,
+            // and fewer samples of a ray need a colour, but from 200 on hair hardens
+            distance_scale: 100.0,
             // half as many samples as published, at the same quality
             step_ratio: 1.0,
             weight_threshold: 1e-3,
             stop: 1e-3,
             // rates that end low take the noise of single batches out of the result
             lr_final: 0.003,
-            tv_density: 3.0,
-            tv_color: 3.0,
             ..VmConfig::paper()
         }
     }

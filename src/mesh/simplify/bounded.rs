@@ -2,8 +2,8 @@
 //!
 //! Between two looks at the field a collapse is only believed to stray as far as its new vertex lies from
 //! the planes before it, added up. Each round therefore may use a part of what the measured error leaves
-//! at each vertex, and is measured: at corners, middles of edges and of triangles. A round that went
-//! too far is undone and repeated with half of the part.
+//! at each vertex (all of it at first), and is measured: at corners, middles of edges and of triangles. A round that went
+//! too far is undone and repeated with a smaller part.
 
 use super::fit::{ask, newton};
 use super::round::{Task, prepare, reduce, settle};
@@ -27,23 +27,23 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         let mut rings = prepare(mesh, task, report);
         let mut budgets = vec![error; rings.positions.len()];
         reduce(&mut rings, task, target, Some(&mut budgets), report)?;
-        return Ok(rings.into_mesh());
+        return Ok(rings.into_mesh().0);
     };
     let mut good = mesh.clone();
     let mut at = measure(&good, task, report)?;
     report.worst = Some(worst(&at));
-    let (mut part, mut undone) = (0.5, 0);
+    let (mut part, mut undone) = (1.0, 0);
     for round in 0..ROUNDS {
         let before = good.triangles.len();
         let mut rings = prepare(&good, task, report);
         let mut budgets: Vec<f32> = at.iter().map(|e| part * (error - e)).collect();
         let goal = target.max((SHARE * before as f64) as usize);
         reduce(&mut rings, task, goal, Some(&mut budgets), report)?;
-        let mut next = rings.into_mesh();
+        let (mut next, fixed) = rings.into_mesh();
         if next.triangles.len() == before {
             break;
         }
-        settle(&mut next, field, task, Placement::OnSurface, true, report)?;
+        settle(&mut next, &fixed, field, task, Placement::OnSurface, true, report)?;
         let errors = measure(&next, task, report)?;
         let found = worst(&errors);
         let after = next.triangles.len();
@@ -55,7 +55,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         // An input that is farther off than asked may at least not become worse.
         if found > error.max(report.worst.unwrap_or(0.0)) {
             undone += 1;
-            part *= 0.5;
+            part *= 0.6;
             if undone > UNDONE {
                 break;
             }
@@ -68,7 +68,9 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         }
     }
     if good.normals.is_empty() {
-        settle(&mut good, field, task, Placement::OnSurface, true, report)?;
+        // nothing may go: the mesh as it came, with normals
+        let fixed = vec![true; good.positions.len()];
+        settle(&mut good, &fixed, field, task, Placement::OnSurface, true, report)?;
     }
     Ok(good)
 }

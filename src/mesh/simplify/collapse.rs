@@ -9,8 +9,8 @@ use super::quadric::{Freedom, Spread, best, lean_of};
 use super::rings::{BORDER, HELD, NONE, Rings};
 use glam::Vec3;
 
-/// Squared cosine of how far a triangle may turn: 60°.
-const TURN: f32 = 0.25;
+/// Cosine of how far a triangle may turn: 60°.
+const TURN: f32 = 0.5;
 /// Least quality `4 √3 area / Σ length²` of a triangle.
 const POOR: f32 = 0.05;
 /// No collapse leaves a vertex with more triangles than this, unless one of its ends had more.
@@ -125,19 +125,15 @@ impl Star {
             let (u, v) = (p - x, q - x);
             let area = u.cross(v);
             let sum = u.length_squared() + v.length_squared() + (q - p).length_squared();
-            let old = rings.leans[side.triangle as usize];
-            let along = area.dot(old);
-            let turned = along <= 0.0 || along * along < TURN * area.length_squared() * old.length_squared();
-            if turned && old != Vec3::ZERO {
+            // Lengths, not their squares: the latter leave f32 where edges are shorter than 1e-7.
+            let (size, old) = (area.length(), rings.leans[side.triangle as usize]);
+            if area.dot(old) <= TURN * size * old.length() && old != Vec3::ZERO {
                 return false;
             }
-            // negated, so that what is not a number fails
-            let fair = 12.0 * area.length_squared()
-                >= *super::quadric::POORV * *super::quadric::POORV * sum * sum
-                && sum > 0.0;
-            if !fair {
+            let shape = 2.0 * 3f32.sqrt() * size / sum;
+            if shape < POOR || shape.is_nan() {
                 let worst = *worst.get_or_insert_with(|| self.worst(rings));
-                if !(quality(u, v, q - p) > worst) {
+                if shape <= worst || shape.is_nan() {
                     return false;
                 }
             }
@@ -178,6 +174,7 @@ impl Star {
         rings.positions[a as usize] = x;
         rings.flags[a as usize] |= rings.flags[b as usize];
         rings.stamps[a as usize] += 1;
+        rings.stamps[b as usize] += 1;
         for &(t, opposite) in &self.gone {
             rings.triangles[t as usize] = [NONE; 3];
             rings.spreads[opposite as usize].subtract(rings.leans[t as usize]);
@@ -216,6 +213,7 @@ impl Star {
 }
 
 /// The best place for the collapse of (a, b), and its cost; `None` where an end is not to be touched.
+#[inline]
 pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     let (fa, fb) = (rings.flags[a as usize], rings.flags[b as usize]);
     if (fa | fb) & (HELD) != 0 {
@@ -230,12 +228,8 @@ pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     Some(best(pa, &rings.spreads[a as usize], pb, &rings.spreads[b as usize], freedom))
 }
 
-/// Shape of a triangle with these sides, 1 for equilateral, 0 for none: `4 √3 area / Σ length²`.
-fn quality(u: Vec3, v: Vec3, w: Vec3) -> f32 {
-    let sum = u.length_squared() + v.length_squared() + w.length_squared();
-    if sum > 0.0 { 2.0 * 3f32.sqrt() * u.cross(v).length() / sum } else { 0.0 }
-}
-
+/// Shape of a triangle, 1 for equilateral, 0 for none: `4 √3 area / Σ length²`.
 pub(super) fn quality_of([a, b, c]: [Vec3; 3]) -> f32 {
-    quality(b - a, c - a, c - b)
+    let sum = (b - a).length_squared() + (c - b).length_squared() + (a - c).length_squared();
+    if sum > 0.0 { 2.0 * 3f32.sqrt() * (b - a).cross(c - a).length() / sum } else { 0.0 }
 }

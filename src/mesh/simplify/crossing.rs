@@ -54,8 +54,9 @@ impl Cells {
         self.dims.x as usize * self.dims.y as usize * self.dims.z as usize
     }
 
+    /// The conversion cuts off, which for points of the box is rounding down.
     fn cell(&self, p: Vec3) -> IVec3 {
-        ((p - self.origin) * self.per_unit).floor().as_ivec3().clamp(IVec3::ZERO, self.dims - 1)
+        ((p - self.origin) * self.per_unit).as_ivec3().clamp(IVec3::ZERO, self.dims - 1)
     }
 
     fn number(&self, c: IVec3) -> usize {

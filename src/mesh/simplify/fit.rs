@@ -9,7 +9,6 @@
 //! A vertex whose move would turn or spoil a triangle goes half the way, a quarter, or stays.
 
 use super::collapse::quality_of;
-use super::rings::NONE;
 use crate::mesh::MeshError;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -21,7 +20,7 @@ pub(super) type Field<'a> = dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync + 'a
 const TURN: f32 = 0.5;
 /// Least quality after a move, unless it was no better.
 const POOR: f32 = 0.05;
-/// Conjugate gradients gain a digit in about five steps; a tenth of a hundredth of the offset is ample.
+/// Conjugate gradients on a mass matrix gain a digit in about five steps; two digits are ample.
 const STEPS: usize = 12;
 
 /// Asks the field in batches.
@@ -71,9 +70,9 @@ pub(super) fn reaches(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<f32> {
 }
 
 /// Moves vertices to `targets`, or part of the way; how many were held back.
-pub(super) fn move_to(positions: &mut Vec<Vec3>, triangles: &[[u32; 3]], targets: &[Vec3]) -> usize {
+pub(super) fn move_to(positions: &mut [Vec3], triangles: &[[u32; 3]], targets: &[Vec3]) -> usize {
     const SHARES: [f32; 4] = [0.0, 0.25, 0.5, 1.0];
-    let from = positions.clone();
+    let from = positions.to_vec();
     positions.copy_from_slice(targets);
     let area = |p: &[Vec3], t: &[u32; 3]| {
         let [a, b, c] = t.map(|v| p[v as usize]);
@@ -84,7 +83,8 @@ pub(super) fn move_to(positions: &mut Vec<Vec3>, triangles: &[[u32; 3]], targets
             return false;
         }
         let (old, new) = (area(&from, t), area(to, t));
-        let turned = !(old.dot(new) > TURN * old.length() * new.length());
+        let along = old.dot(new);
+        let turned = along <= TURN * old.length() * new.length() || along.is_nan();
         let shape = quality_of(t.map(|v| to[v as usize]));
         (turned && old != Vec3::ZERO) || (shape < POOR && shape < quality_of(t.map(|v| from[v as usize])))
     };
@@ -183,9 +183,5 @@ pub(super) fn offsets(
 
 /// The middles of triangles.
 pub(super) fn middles(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<Vec3> {
-    triangles
-        .iter()
-        .filter(|t| t[0] != NONE)
-        .map(|t| t.iter().map(|&v| positions[v as usize] / 3.0).sum())
-        .collect()
+    triangles.iter().map(|t| t.iter().map(|&v| positions[v as usize] / 3.0).sum()).collect()
 }

@@ -5,10 +5,15 @@
 //! the thinnest it found (`collapse`), so a closed manifold stays one, of the same genus.
 //!
 //! The field is a network: thousands of points a call are cheap, single ones are not. So it is asked
-//! between rounds of collapses. After a round all vertices go to its zero in two batches (`fit`), from
-//! where the next round measures its planes; with an error to keep, one more batch at the middles of
-//! triangles and edges tells how much each place may still give. At the end vertices may leave the zero
-//! again for where their triangles lie nearest to it.
+//! between rounds of collapses: at the vertices and in the middles of triangles, in one batch each (`fit`).
+//! Vertices go to its zero, or where their triangles lie nearest to it, and from there the next round
+//! measures its planes. With an error to keep, a batch at the middles of triangles and edges tells how
+//! much each place may still give (`bounded`).
+//!
+//! Nearest is the default, since it is what accuracy means: a head of 202,276 triangles, itself 0.0155
+//! 512ths of the cube off, has a mean error of 0.0199 in 40,000 triangles without the field, 0.0257 with
+//! all vertices on its zero (chords lie on one side of a curve), and 0.0090 where they are nearest
+//! (`cargo bench --bench simplify`).
 //!
 //! Self-intersections are looked for once, at the end, which costs a tenth of the collapses. If there
 //! are any the work begins anew, and collapses near them look for crossings one by one (`crossing`); the
@@ -55,9 +60,10 @@ pub struct SimplifyConfig {
     pub triangles: usize,
     /// Most distance from the surface, in units of the positions; 0 goes as far as `triangles` says.
     pub error: f32,
-    /// Where vertices lie in the end.
+    /// Where vertices lie in the end; with an `error` always on the zero.
     pub placement: Placement,
-    /// Rounds of collapses between which the field is asked; 1..=16.
+    /// Rounds of collapses, after each of which the field is asked; 1..=16. More than one takes the worst
+    /// error down a little in strong simplifications, at the price of asking more. Not for `error`.
     pub rounds: usize,
     /// Most points in one call of the field; at least 1.
     pub batch: usize,
@@ -69,7 +75,7 @@ impl Default for SimplifyConfig {
             triangles: 200_000,
             error: 0.0,
             placement: Placement::default(),
-            rounds: 2,
+            rounds: 1,
             batch: 1 << 16,
         }
     }
@@ -150,6 +156,9 @@ impl SimplifyReport {
 /// A first attempt without looking, two that look near what was found, one that looks everywhere.
 const ATTEMPTS: usize = 4;
 
+/// With more crossings than this, finding the vertices near them costs more than looking everywhere.
+const MANY: usize = 1000;
+
 /// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colours
 /// follow their vertices. A mesh that has no more triangles than asked stays as it is.
 ///
@@ -187,7 +196,7 @@ pub fn simplify(
     for attempt in 0..ATTEMPTS {
         let look = match attempt {
             0 => Look::Nowhere,
-            i if i + 1 == ATTEMPTS => Look::Everywhere,
+            i if i + 1 == ATTEMPTS || near.len() > MANY => Look::Everywhere,
             _ => Look::Near(&near),
         };
         report = SimplifyReport { before, again: attempt, asked: report.asked, ..SimplifyReport::default() };
@@ -240,3 +249,6 @@ fn sound(mesh: &Mesh) -> Result<(), MeshError> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

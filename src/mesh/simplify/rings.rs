@@ -41,7 +41,7 @@ pub(super) struct Rings {
     pub leans: Vec<Vec3>,
     pub spreads: Vec<Spread>,
     pub flags: Vec<u8>,
-    /// Grows whenever a vertex is what a collapse left.
+    /// Grows whenever a vertex is what a collapse left or took away.
     pub stamps: Vec<u32>,
     /// Triangles that are left.
     pub count: usize,
@@ -53,14 +53,6 @@ impl Rings {
     /// Around the triangles of `mesh`, whose indices must be in range and positions finite. Triangles
     /// with a repeated vertex are left out.
     pub(super) fn new(mesh: &Mesh) -> Rings {
-        let mut rings = Rings::bare(mesh);
-        rings.flags = held(&rings);
-        rings.measure();
-        rings
-    }
-
-    /// Without flags and measures.
-    pub(super) fn bare(mesh: &Mesh) -> Rings {
         let n = mesh.positions.len();
         let triangles: Vec<[u32; 3]> =
             mesh.triangles.iter().copied().filter(|t| t[0] != t[1] && t[1] != t[2] && t[2] != t[0]).collect();
@@ -92,6 +84,8 @@ impl Rings {
                 place.len += 1;
             }
         }
+        rings.flags = held(&rings);
+        rings.measure();
         rings
     }
 
@@ -104,6 +98,11 @@ impl Rings {
     /// How many triangles are around a vertex; none when it is gone.
     pub(super) fn valence(&self, v: u32) -> usize {
         self.places[v as usize].len as usize
+    }
+
+    /// Changes with either end: stamps only grow, so their sum stays the same only if both do.
+    pub(super) fn stamp(&self, a: u32, b: u32) -> u32 {
+        self.stamps[a as usize].wrapping_add(self.stamps[b as usize])
     }
 
     /// The three corners of a triangle.
@@ -200,14 +199,17 @@ impl Rings {
         }
     }
 
-    /// Drops gone vertices and triangles from the arrays; the order of the rest stays.
-    pub(super) fn into_mesh(self) -> Mesh {
+    /// Drops gone vertices and triangles from the arrays; the order of the rest stays. And which vertices
+    /// must not move: those of borders, and where the mesh is no surface.
+    pub(super) fn into_mesh(self) -> (Mesh, Vec<bool>) {
+        let mut fixed = Vec::new();
         let mut number = vec![NONE; self.positions.len()];
         let mut mesh = Mesh::default();
         for v in 0..self.positions.len() {
             if self.places[v].len > 0 {
                 number[v] = mesh.positions.len() as u32;
                 mesh.positions.push(self.positions[v]);
+                fixed.push(self.flags[v] & (BORDER | HELD) != 0);
                 if let Some(&color) = self.colors.get(v) {
                     mesh.colors.push(color);
                 }
@@ -215,6 +217,6 @@ impl Rings {
         }
         let alive = self.triangles.iter().filter(|t| t[0] != NONE);
         mesh.triangles = alive.map(|t| t.map(|v| number[v as usize])).collect();
-        mesh
+        (mesh, fixed)
     }
 }

@@ -12,9 +12,16 @@ use crate::mesh::polish::angle_weighted_normals;
 use crate::run::Monitor;
 use glam::Vec3;
 
-/// How many times the next round's triangles one round leaves: collapses that come late profit most from
-/// vertices on the surface.
+/// How many times the next round's triangles one round leaves. Three rounds instead of one take the worst
+/// error of a head in 8,000 triangles from 0.46 to 0.37 512ths of the cube, but not the mean.
 const STEP: f64 = 1.5;
+
+/// Buckets that a cost may have grown since the edge was entered: a quarter of it.
+const SLACK: usize = 4;
+
+/// Of the edges of a new vertex only this many, the cheapest, are entered. The vertices around have theirs
+/// from before; all seven would take a tenth longer and win a hundredth of the error.
+const OFFERS: usize = 3;
 
 /// Asking whether to stop costs nothing this often.
 const BREATH: usize = 1 << 12;
@@ -71,11 +78,10 @@ pub(super) fn rounds(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> R
         }
         let mut rings = prepare(from, task, report);
         reduce(&mut rings, task, goal.max(target), None, report)?;
-        let mut next = rings.into_mesh();
+        let (mut next, fixed) = rings.into_mesh();
         if let Some(field) = task.field {
             let last = round == count;
-            let placement = if last { task.config.placement } else { Placement::OnSurface };
-            settle(&mut next, field, task, placement, last, report)?;
+            settle(&mut next, &fixed, field, task, task.config.placement, last, report)?;
         }
         let values = [("triangles", next.triangles.len() as f64), ("refused", report.refused as f64)];
         task.monitor.step(round as u64, count as u64, &values);
@@ -109,6 +115,7 @@ pub(super) fn reduce(
     let mut star = Star::new(rings.positions.len());
     let mut sheets = (!task.look.is_nowhere()).then(|| Sheets::new(rings));
     let mut breath = 0;
+    let mut offers: Vec<(u32, u32)> = Vec::new();
     // What was refused may be possible when all around has changed: so once more until nothing is.
     loop {
         let before = rings.count;
@@ -119,13 +126,12 @@ pub(super) fn reduce(
                 task.stop()?;
             }
             let Some((bucket, Entry { a, b, stamp })) = queue.pop() else { break };
-            let stamps = rings.stamps[a as usize].wrapping_add(rings.stamps[b as usize]);
-            if rings.valence(a) == 0 || rings.valence(b) == 0 || stamps != stamp {
-                continue;
+            if rings.stamp(a, b) != stamp {
+                continue; // an end is gone, or its edges were entered anew
             }
             let Some((x, cost)) = place(rings, a, b) else { continue };
             let now = Queue::bucket(cost);
-            if now > bucket {
+            if now > bucket + SLACK {
                 queue.push(now, Entry { a, b, stamp });
                 continue;
             }
@@ -159,8 +165,18 @@ pub(super) fn reduce(
             }
             star.apply(rings, a, b, x);
             report.collapses += 1;
-            for i in 0..star.around.len() {
-                push(&mut queue, rings, a, star.around[i]);
+            offers.clear();
+            for &w in &star.around {
+                if let Some((_, cost)) = place(rings, a, w) {
+                    offers.push((Queue::bucket(cost) as u32, w));
+                }
+            }
+            if offers.len() > OFFERS {
+                offers.select_nth_unstable(OFFERS - 1);
+                offers.truncate(OFFERS);
+            }
+            for &(bucket, w) in &offers {
+                queue.push(bucket as usize, Entry { a, b: w, stamp: rings.stamp(a, w) });
             }
         }
         if rings.count <= target || rings.count as f64 > 0.99 * before as f64 {
@@ -188,14 +204,14 @@ fn fill(rings: &Rings) -> Queue {
 
 fn push(queue: &mut Queue, rings: &Rings, a: u32, b: u32) {
     if let Some((_, cost)) = place(rings, a, b) {
-        let stamp = rings.stamps[a as usize].wrapping_add(rings.stamps[b as usize]);
-        queue.push(Queue::bucket(cost), Entry { a, b, stamp });
+        queue.push(Queue::bucket(cost), Entry { a, b, stamp: rings.stamp(a, b) });
     }
 }
 
-/// Takes the vertices to the field; the last time also their normals.
+/// Takes the vertices that are not `fixed` to the field; the last time also their normals.
 pub(super) fn settle(
     mesh: &mut Mesh,
+    fixed: &[bool],
     field: &Field,
     task: &Task,
     placement: Placement,
@@ -203,7 +219,6 @@ pub(super) fn settle(
     report: &mut SimplifyReport,
 ) -> Result<(), MeshError> {
     let stop = || task.monitor.stop();
-    let fixed = fixed(mesh);
     let reaches = reaches(&mesh.positions, &mesh.triangles);
     let start = mesh.positions.clone();
     let batch = task.config.batch;
@@ -259,13 +274,8 @@ pub(super) fn settle(
     Ok(())
 }
 
-/// Vertices that the field must not move: where the mesh is no surface, and its borders.
-fn fixed(mesh: &Mesh) -> Vec<bool> {
-    super::hold::held(&Rings::bare(mesh)).iter().map(|f| f & (HELD | BORDER) != 0).collect()
-}
-
 /// Takes back the moves of triangles that meet others now and did not at `start`; how many vertices.
-fn without_crossings(positions: &mut Vec<Vec3>, triangles: &[[u32; 3]], start: &[Vec3]) -> usize {
+fn without_crossings(positions: &mut [Vec3], triangles: &[[u32; 3]], start: &[Vec3]) -> usize {
     const TRIES: usize = 8;
     let mut old = None;
     let mut back = 0;
