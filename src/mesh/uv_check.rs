@@ -171,7 +171,9 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
     covered.dedup();
     report.overlapping = covered.len();
     report.overlaps_complete = found.complete;
-    report.overlap_px = found.pairs.iter().map(|&(a, b)| shared_area(px(a as usize), px(b as usize))).sum();
+    // a sum of nothing is −0
+    report.overlap_px =
+        found.pairs.iter().fold(0.0, |sum, &(a, b)| sum + shared_area(px(a as usize), px(b as usize)));
 
     let sides: Vec<Side> = joined
         .rims
@@ -195,9 +197,8 @@ fn is_valid(mesh: &Mesh, atlas: &Atlas, t: usize) -> bool {
 /// The share of the seams' length that can be seen looking at the mesh from the direction `front`, hidden or
 /// not: edges whose two triangles together face it. Nothing invalid may be in either.
 pub fn seam_share_in_front(mesh: &Mesh, atlas: &Atlas, front: Vec3) -> f64 {
-    let valid: Vec<bool> = (0..mesh.triangles.len().min(atlas.triangles.len()))
-        .map(|t| is_valid(mesh, atlas, t))
-        .collect();
+    let valid: Vec<bool> =
+        (0..mesh.triangles.len().min(atlas.triangles.len())).map(|t| is_valid(mesh, atlas, t)).collect();
     let joined = Joined::of(mesh, atlas, &valid);
     let (mut seen, mut all) = (0.0, 0.0);
     for &(corner, other, length) in &joined.cuts {

@@ -58,7 +58,10 @@ pub(super) fn lay(
         charts = charts.iter().flat_map(|c| c.parts(|k| !bad[c.triangles[k] as usize])).collect();
         loose.extend((0..mesh.triangles.len() as u32).filter(|&t| std::mem::take(&mut bad[t as usize])));
         if loose.len() > most {
-            return Err(Refusal::Because(format!("{} triangles, more than {most}, need mending", loose.len())));
+            return Err(Refusal::Because(format!(
+                "{} triangles, more than {most}, need mending",
+                loose.len()
+            )));
         }
         let mended = loose.len();
         let halves = loose.iter().map(|&t| Flat::half_square(mesh, t, half_square_leg(mesh, t, scale)));
@@ -80,7 +83,12 @@ fn half_square_leg(mesh: &Mesh, t: u32, scale: f64) -> f64 {
     (2.0 * area).sqrt().max(2.0 / scale)
 }
 
-fn placed(mesh: &Mesh, charts: &[Flat], place: impl Fn(usize, DVec2) -> DVec2, config: &AtlasConfig) -> Atlas {
+fn placed(
+    mesh: &Mesh,
+    charts: &[Flat],
+    place: impl Fn(usize, DVec2) -> DVec2,
+    config: &AtlasConfig,
+) -> Atlas {
     let size = f64::from(config.size_px);
     let mut atlas = Atlas {
         uvs: Vec::with_capacity(charts.iter().map(|c| c.points.len()).sum()),

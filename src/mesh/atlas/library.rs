@@ -36,8 +36,10 @@ pub(super) fn flatten(
     if !(texels_per_unit > 0.0 && texels_per_unit.is_finite()) {
         return Err(Refusal::because("the mesh is too large or too small for 32-bit texture coordinates"));
     }
-    let input =
-        uvunwrap::MeshInput { existing_uvs: uvs.as_deref(), ..uvunwrap::MeshInput::new(&positions, &indices) };
+    let input = uvunwrap::MeshInput {
+        existing_uvs: uvs.as_deref(),
+        ..uvunwrap::MeshInput::new(&positions, &indices)
+    };
     // Its packing is thrown away, so the fastest of them.
     let options = uvunwrap::Options {
         density: uvunwrap::Density::Fixed { texels_per_unit, page_size: None },
@@ -137,9 +139,7 @@ mod tests {
     /// Four unit squares in a row, folded up by a little each.
     fn steps() -> Mesh {
         let heights = [0.0, 0.1, 0.3, 0.6, 1.0];
-        let positions = (0..5)
-            .flat_map(|i| [0.0, 1.0].map(|y| Vec3::new(i as f32, y, heights[i])))
-            .collect();
+        let positions = (0..5).flat_map(|i| [0.0, 1.0].map(|y| Vec3::new(i as f32, y, heights[i]))).collect();
         let triangles = (0..4).flat_map(|i| [[2 * i, 2 * i + 2, 2 * i + 3], [2 * i, 2 * i + 3, 2 * i + 1]]);
         Mesh { positions, triangles: triangles.collect(), ..Mesh::default() }
     }

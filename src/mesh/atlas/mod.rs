@@ -93,7 +93,10 @@ impl AtlasReport {
             ));
         }
         if self.mended > 0 {
-            out.push(format!("{} triangles could not stay in their chart and got one of their own", self.mended));
+            out.push(format!(
+                "{} triangles could not stay in their chart and got one of their own",
+                self.mended
+            ));
         }
         out
     }
@@ -173,7 +176,11 @@ fn atlas_by(
         let apart = uv.chart_distance_px.unwrap_or(f64::INFINITY).min(uv.border_distance_px);
         // a thousandth of a texel: coordinates are rounded to f32
         if (!uv.is_sound() || apart < 2.0 * gutter_px - 1e-3) && fallback.is_none() {
-            fallback = Some("the finished atlas did not pass its check".into());
+            fallback = Some(format!(
+                "the finished atlas did not pass its check ({} overlapping, {} flipped, {} without area, {} outside, \
+                 {apart:.3} texels apart)",
+                uv.overlapping, uv.flipped, uv.zero_area, uv.outside
+            ));
             continue;
         }
         monitor.step(STEPS, STEPS, &[("charts", uv.charts as f64), ("used", uv.used)]);

@@ -64,15 +64,18 @@ mod tests {
     use glam::Vec3;
 
     fn heap(count: u32) -> Mesh {
-        let positions = (0..3 * count)
-            .map(|i| Vec3::new((i * 7 % 11) as f32, (i * 5 % 13) as f32, i as f32))
-            .collect();
-        Mesh { positions, triangles: (0..count).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect(), ..Mesh::default() }
+        let positions =
+            (0..3 * count).map(|i| Vec3::new((i * 7 % 11) as f32, (i * 5 % 13) as f32, i as f32)).collect();
+        Mesh {
+            positions,
+            triangles: (0..count).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect(),
+            ..Mesh::default()
+        }
     }
 
     #[test]
     fn halves_keep_the_gutter_or_say_what_is_left_of_it() {
-        for (count, size_px, full) in [(1, 64, true), (2, 64, true), (7, 256, true), (3000, 512, false)] {
+        for (count, size_px, full) in [(1, 128, true), (2, 128, true), (7, 256, true), (3000, 512, false)] {
             let config = AtlasConfig { size_px, ..AtlasConfig::default() };
             let mesh = heap(count);
             let laid = HalfSquares.unwrap(&mesh, &config, &Quiet).unwrap();
