@@ -13,7 +13,7 @@ mod fields;
 use glam::Vec3;
 use std::time::Instant;
 use tiface::geom::{Aabb, Mesh};
-use tiface::mesh::uv_check::{seam_share_in_front, uv_check};
+use tiface::mesh::uv_check::{seams_facing, uv_check};
 use tiface::mesh::{AtlasConfig, MeshConfig, atlas, extract};
 use tiface::run::Quiet;
 
@@ -58,7 +58,7 @@ fn main() {
                 uv.triangles
             );
             println!("mended {}, fall-back {:?}", report.mended, report.fallback);
-            println!("seams facing +z        {:.0} %", 100.0 * seam_share_in_front(&mesh, &atlas, Vec3::Z));
+            println!("seams facing +z      {:.2} × √area", seams_facing(&mesh, &atlas, Vec3::Z));
             println!("{uv}");
         }
     }
