@@ -18,7 +18,7 @@ const CELLS: f64 = 448.0;
 const TURNS: usize = 16;
 
 /// Orders tried, times charts.
-const PLACED: usize = 3600;
+const PLACED: usize = 2400;
 
 /// The share of the texture that the first drawing is meant for.
 const USED: f64 = 0.62;
