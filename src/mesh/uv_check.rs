@@ -171,7 +171,9 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
     covered.dedup();
     report.overlapping = covered.len();
     report.overlaps_complete = found.complete;
-    report.overlap_px = found.pairs.iter().map(|&(a, b)| shared_area(px(a as usize), px(b as usize))).sum();
+    // a sum of nothing is −0
+    report.overlap_px =
+        found.pairs.iter().fold(0.0, |sum, &(a, b)| sum + shared_area(px(a as usize), px(b as usize)));
 
     let sides: Vec<Side> = joined
         .rims
@@ -192,24 +194,21 @@ fn is_valid(mesh: &Mesh, atlas: &Atlas, t: usize) -> bool {
         && atlas.triangles[t].iter().all(|&i| atlas.uvs.get(i as usize).is_some_and(|v| v.is_finite()))
 }
 
-/// The share of the seams' length that can be seen looking at the mesh from the direction `front`, hidden or
-/// not: edges whose two triangles together face it. Nothing invalid may be in either.
-pub fn seam_share_in_front(mesh: &Mesh, atlas: &Atlas, front: Vec3) -> f64 {
+/// Length of the seams that look at someone looking from `front` within 45 degrees, over √area: edges whose two
+/// triangles together do, hidden or not.
+pub fn seams_facing(mesh: &Mesh, atlas: &Atlas, front: Vec3) -> f64 {
     let valid: Vec<bool> =
         (0..mesh.triangles.len().min(atlas.triangles.len())).map(|t| is_valid(mesh, atlas, t)).collect();
     let joined = Joined::of(mesh, atlas, &valid);
-    let (mut seen, mut all) = (0.0, 0.0);
-    for &(corner, other, length) in &joined.cuts {
-        let normal = |c: u32| {
-            let [a, b, c] = mesh.corners(c / 3);
-            (b - a).cross(c - a).normalize_or_zero()
-        };
-        all += length;
-        if (normal(corner) + normal(other)).dot(front) > 0.0 {
-            seen += length;
-        }
-    }
-    if all > 0.0 { seen / all } else { 0.0 }
+    let normal = |c: u32| {
+        let [a, b, c] = mesh.corners(c / 3);
+        (b - a).cross(c - a).normalize_or_zero()
+    };
+    let faces =
+        |n: Vec3| n.normalize_or_zero().dot(front.normalize_or_zero()) > std::f32::consts::FRAC_1_SQRT_2;
+    let facing = joined.cuts.iter().filter(|(a, b, _)| faces(normal(*a) + normal(*b)));
+    let length = facing.fold(0.0, |sum, c| sum + c.2);
+    if joined.surface > 0.0 { length / joined.surface.sqrt() } else { 0.0 }
 }
 
 /// Which triangles the texture joins.
@@ -453,10 +452,12 @@ mod tests {
     }
 
     #[test]
-    fn seams_in_front_are_those_that_face_it() {
+    fn seams_that_face_are_within_45_degrees() {
         let (mesh, atlas) = two_squares();
-        assert_eq!(seam_share_in_front(&mesh, &atlas, Vec3::Z), 1.0);
-        assert_eq!(seam_share_in_front(&mesh, &atlas, -Vec3::Z), 0.0);
+        // one seam of length 1 on an area of 2, looking along +z
+        let within = |v: Vec3| seams_facing(&mesh, &atlas, v);
+        assert!((within(Vec3::new(0.9, 0.0, 1.0)) - 1.0 / 2f64.sqrt()).abs() < 1e-12);
+        assert_eq!([within(Vec3::new(1.1, 0.0, 1.0)), within(-Vec3::Z)], [0.0, 0.0]);
         assert_eq!(uv_check(&Mesh::default(), &Atlas::default()).charts, 0);
     }
 }

@@ -3,8 +3,9 @@
 //! Triangles that are flipped, cover others, or are too thin for 32-bit coordinates leave their chart and become
 //! half squares of their own. What is left of a chart is packed again, part by part.
 
+use super::face::flatten_around;
 use super::flat::{Flat, height};
-use super::library::flatten;
+use super::library::{STRETCHED, flatten};
 use super::overlap::{overlaps, turn};
 use super::pack::pack;
 use super::{AtlasConfig, Laid, Refusal, Unwrap};
@@ -24,7 +25,10 @@ pub(super) struct Library;
 
 impl Unwrap for Library {
     fn unwrap(&self, mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result<Laid, Refusal> {
-        let flattened = flatten(mesh, None, monitor)?;
+        let flattened = match config.front {
+            Some(front) => flatten_around(mesh, front, monitor)?,
+            None => flatten(mesh, None, STRETCHED, monitor)?,
+        };
         let most = 64.max(mesh.triangles.len() / 20);
         if flattened.charts.len() > most {
             let found = flattened.charts.len();

@@ -1,14 +1,15 @@
 //! A texture atlas: the surface cut into charts, laid flat, and packed into a square.
 //!
 //! ```text
-//! divide into regions → flatten (uvunwrap) → mend → pack → check
-//!                               └── fails → one half square a triangle
+//! take out the face → divide and flatten (uvunwrap) → mend → pack → check
+//!                                └── fails → one half square a triangle
 //! ```
 //!
 //! Every triangle of the result has area, none is flipped, no two share any, and charts keep their distance: that
 //! is looked at, exactly, before an atlas is returned.
 
 pub(super) mod apart;
+mod face;
 mod flat;
 mod lay;
 mod library;
@@ -18,7 +19,7 @@ mod raster;
 mod squares;
 
 use super::MeshError;
-use super::uv_check::{UvReport, seam_share_in_front, uv_check};
+use super::uv_check::{UvReport, seams_facing, uv_check};
 use crate::geom::{Atlas, Mesh};
 use crate::run::Monitor;
 use glam::Vec3;
@@ -36,8 +37,8 @@ pub struct AtlasConfig {
     /// Charts are at least twice this far from each other and from the border; 0..=256 and at most an eighth of
     /// the texture.
     pub gutter_px: u32,
-    /// Where the face looks, in the mesh's coordinates: seams are led to where it does not. Without it
-    /// nowhere in particular.
+    /// Where the face looks, in the mesh's coordinates: what lies there becomes one chart, with seams around it
+    /// and none across. That costs stretch: the nose is laid flat with the cheeks.
     pub front: Option<Vec3>,
 }
 
@@ -74,8 +75,8 @@ pub struct AtlasReport {
     pub mended: usize,
     /// Half the distance that charts keep, in texels: as configured, less only for the fall-back.
     pub gutter_px: f64,
-    /// Share of the seams' length that faces `front`.
-    pub seams_in_front: Option<f64>,
+    /// Length of the seams that look along `front` within 45 degrees, over √area.
+    pub seams_facing: Option<f64>,
     /// The atlas, measured.
     pub uv: UvReport,
     /// Wall time.
@@ -176,7 +177,11 @@ fn atlas_by(
         let apart = uv.chart_distance_px.unwrap_or(f64::INFINITY).min(uv.border_distance_px);
         // a thousandth of a texel: coordinates are rounded to f32
         if (!uv.is_sound() || apart < 2.0 * gutter_px - 1e-3) && fallback.is_none() {
-            fallback = Some("the finished atlas did not pass its check".into());
+            fallback = Some(format!(
+                "the finished atlas did not pass its check ({} overlapping, {} flipped, {} without area, {} outside, \
+                 {apart:.3} texels apart)",
+                uv.overlapping, uv.flipped, uv.zero_area, uv.outside
+            ));
             continue;
         }
         monitor.step(STEPS, STEPS, &[("charts", uv.charts as f64), ("used", uv.used)]);
@@ -184,7 +189,7 @@ fn atlas_by(
             fallback,
             mended,
             gutter_px,
-            seams_in_front: config.front.map(|front| seam_share_in_front(mesh, &atlas, front)),
+            seams_facing: config.front.map(|front| seams_facing(mesh, &atlas, front)),
             uv,
             seconds: begin.elapsed().as_secs_f64(),
         };

@@ -81,8 +81,11 @@ pub(crate) struct Overlaps {
     pub complete: bool,
 }
 
-/// Candidates a triangle has in a sound atlas: a dozen neighbours. Beyond this mean the rest is left out.
+/// A triangle of a sound atlas has a dozen candidates. Beyond this mean the rest is left out,
 const CANDIDATES: usize = 400;
+
+/// but never below so many: a few long needles side by side are no reason.
+const ALWAYS: usize = 1 << 22;
 
 /// Finds the pairs among the triangles that `fit`; those must be finite and have area.
 pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool]) -> Overlaps {
@@ -115,7 +118,7 @@ pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool]) -> Ov
     // An atlas of nothing but texture-wide triangles would fill memory: what comes after too many of
     // them is left out.
     let mut entries = 0usize;
-    let limit = CANDIDATES * listed.len();
+    let limit = (CANDIDATES * listed.len()).max(ALWAYS);
     let mut narrow = listed.len();
     for (i, b) in boxes.iter().enumerate() {
         let ((x0, y0), (x1, y1)) = (cell(b.0), cell(b.1));
@@ -140,7 +143,7 @@ pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool]) -> Ov
             fill[c] += 1;
         });
     }
-    let budget = CANDIDATES * (listed.len() / side + 1) * 8;
+    let budget = (CANDIDATES * (listed.len() / side + 1) * 8).max(ALWAYS);
     let rows: Vec<(Vec<(u32, u32)>, bool)> = (0..side)
         .into_par_iter()
         .map(|y| {

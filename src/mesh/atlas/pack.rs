@@ -1,7 +1,9 @@
-//! Packing: charts turned, and placed one by one at the lowest free place, as large as all of them fit.
+//! Packing: charts turned, and placed one by one at the lowest free place, on the smallest square they all fit.
 //!
 //! Shapes, not boxes, on a grid of cells; in each a chart is grown by the gutter before it takes cells, so no two
-//! charts come closer than twice that. Largest first, each turned to where its upper end is lowest.
+//! charts come closer than twice that. Each is turned to where its upper end is lowest. Drawing the shapes is what
+//! costs, placing them takes a millisecond: so they are drawn once, and many orders are tried, each a change to the
+//! best one so far, on squares that get smaller cell by cell.
 
 use super::Refusal;
 use super::flat::Flat;
@@ -9,13 +11,19 @@ use super::raster::{Mask, Page};
 use glam::DVec2;
 use rayon::prelude::*;
 
-/// Cells along the texture: four texels each of 2048.
-const CELLS: usize = 512;
+/// Cells along the texture, about: between four and five texels each of 2048.
+const CELLS: f64 = 448.0;
 
 /// Turns tried for each chart; fewer where there are many charts.
 const TURNS: usize = 16;
 
-/// Where a chart goes: turned by the angle whose sine and cosine these are, scaled, and moved.
+/// Orders tried, times charts.
+const PLACED: usize = 2400;
+
+/// The share of the texture that the first drawing is meant for.
+const USED: f64 = 0.62;
+
+/// Where a chart goes: turned by the angle whose cosine and sine these are, scaled, and moved.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Place {
     turn: DVec2,
@@ -30,60 +38,83 @@ impl Place {
     }
 }
 
-struct Shape {
-    outline: Vec<[DVec2; 2]>,
-    /// Half the outline's length: larger ones are placed earlier.
-    rank: f64,
+/// A chart as drawn in one direction.
+struct Drawn {
+    mask: Mask,
+    turn: DVec2,
+    /// Lowest coordinates of the turned chart.
+    low: DVec2,
 }
+
+/// Which chart goes where: turn, column and row of each.
+type Layout = Vec<(usize, usize, usize)>;
 
 /// Places charts in a square texture: twice the gutter between any two of them and to the border.
 pub(super) fn pack(
     charts: &[Flat],
     size_px: f64,
     gutter_px: f64,
-    stop: &(dyn Fn() -> bool + Sync),
+    stop: &dyn Fn() -> bool,
 ) -> Result<Vec<Place>, Refusal> {
     let area: f64 = charts.iter().map(Flat::area).sum();
     let room = size_px - 2.0 * gutter_px;
     if !(area > 0.0 && area.is_finite() && room >= 1.0) {
         return Err(Refusal::TooSmall);
     }
-    let shapes: Vec<Shape> = charts
+    let outlines: Vec<Vec<[DVec2; 2]>> = charts
         .par_iter()
         .map(|chart| {
             let at = |i: u32| chart.points[i as usize];
-            let outline: Vec<_> = chart.outline().into_iter().map(|(a, b)| [at(a), at(b)]).collect();
-            let (low, high) = bounds(&outline, DVec2::X);
-            Shape { outline, rank: (high - low).element_sum() }
+            chart.outline().into_iter().map(|(a, b)| [at(a), at(b)]).collect()
         })
         .collect();
-    let cells = CELLS.min(room as usize).max(1);
-    let sheet = Sheet { cells, cell: room / cells as f64, gutter_px };
-    let turns = (8000 / charts.len().max(1)).clamp(4, TURNS) / 4 * 4;
-
-    // Shares of the texture covered: grow until it fails, then halve the bracket.
-    let scale_of = |used: f64| (used * size_px * size_px / area).sqrt();
-    let (mut low, mut high, mut used) = (0.0, 1.0, 0.6);
-    let mut best = None;
-    while high - low > 0.004 * high {
-        if stop() {
-            return Err(Refusal::Stopped);
-        }
-        match sheet.place(&shapes, scale_of(used), turns) {
-            Some(places) => {
-                (low, best) = (used, Some(places));
-                used = if high < 1.0 { 0.5 * (low + high) } else { (used * 1.06).min(0.99) };
+    let mut order = by_size(&outlines);
+    let turns = (16_000 / charts.len()).clamp(4, TURNS) / 4 * 4;
+    let cells = CELLS.min(room);
+    let mut used = USED;
+    while used > 1e-3 {
+        // Cells a unit, so that the texture is `cells` wide when `used` is right; it may become a fifth wider.
+        let scale = cells * (used / area).sqrt() * size_px / room;
+        let mut most = (1.2 * cells) as usize;
+        let mut start = cells as usize;
+        let mut found = None;
+        // The first time with the gutter that the widest needs, then with that of the size found.
+        for _ in 0..2 {
+            let reach = gutter_px * most as f64 / room;
+            let drawn = draw(&outlines, scale, reach, turns);
+            match smallest(&drawn, &mut order, start, most, stop)? {
+                Some((side, layout)) => {
+                    (most, start) = (side, side);
+                    found = Some((drawn, layout, side, reach));
+                }
+                None => break,
             }
-            None => {
-                high = used;
-                used = if low > 0.0 { 0.5 * (low + high) } else { used * 0.85 };
-            }
         }
-        if high < 1e-3 {
-            return Err(Refusal::TooSmall);
+        if let Some((drawn, layout, side, reach)) = found {
+            let cell = room / side as f64;
+            let place = |(chart, &(turn, x, y)): (usize, &(usize, usize, usize))| {
+                let Drawn { turn, low, .. } = drawn[chart][turn];
+                // The page begins a gutter from the border, the chart its reach from its shape's corner.
+                let corner = (DVec2::new(x as f64, y as f64) + reach) * cell + gutter_px;
+                Place { turn, scale: scale * cell, offset: corner - low * (scale * cell) }
+            };
+            return Ok(layout.iter().enumerate().map(place).collect());
         }
+        used *= 0.7;
     }
-    best.ok_or(Refusal::TooSmall)
+    Err(Refusal::TooSmall)
+}
+
+/// Charts from the one with the largest box to the smallest.
+fn by_size(outlines: &[Vec<[DVec2; 2]>]) -> Vec<usize> {
+    let size = |outline: &[[DVec2; 2]]| {
+        let (low, high) = bounds(outline, DVec2::X);
+        (high - low).element_sum()
+    };
+    let sizes: Vec<f64> = outlines.iter().map(|o| size(o)).collect();
+    let mut order: Vec<usize> = (0..outlines.len()).collect();
+    order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
+    order
 }
 
 fn bounds(outline: &[[DVec2; 2]], turn: DVec2) -> (DVec2, DVec2) {
@@ -91,50 +122,132 @@ fn bounds(outline: &[[DVec2; 2]], turn: DVec2) -> (DVec2, DVec2) {
     ends.fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)))
 }
 
-struct Sheet {
-    cells: usize,
-    /// Texels along a cell.
-    cell: f64,
-    gutter_px: f64,
+/// Each chart in each direction, `scale` cells a unit.
+fn draw(outlines: &[Vec<[DVec2; 2]>], scale: f64, reach: f64, turns: usize) -> Vec<Vec<Drawn>> {
+    let drawn = |outline: &[[DVec2; 2]], k: usize| {
+        let turn = DVec2::from_angle(std::f64::consts::TAU * k as f64 / turns as f64);
+        let (low, high) = bounds(outline, turn);
+        let sides: Vec<_> = outline.iter().map(|s| s.map(|p| (turn.rotate(p) - low) * scale)).collect();
+        Drawn { mask: Mask::of(&sides, (high - low) * scale, reach), turn, low }
+    };
+    outlines.par_iter().map(|outline| (0..turns).map(|k| drawn(outline, k)).collect()).collect()
 }
 
-impl Sheet {
-    fn place(&self, shapes: &[Shape], scale: f64, turns: usize) -> Option<Vec<Place>> {
-        let reach = self.gutter_px / self.cell;
-        let masks: Vec<Vec<(Mask, DVec2, DVec2)>> = shapes
-            .par_iter()
-            .map(|shape| {
-                (0..turns)
-                    .map(|k| {
-                        let turn = DVec2::from_angle(std::f64::consts::TAU * k as f64 / turns as f64);
-                        let (low, high) = bounds(&shape.outline, turn);
-                        let to_cells = |p: DVec2| (turn.rotate(p) - low) * (scale / self.cell);
-                        let outline: Vec<_> = shape.outline.iter().map(|s| s.map(to_cells)).collect();
-                        (Mask::of(&outline, (high - low) * (scale / self.cell), reach), turn, low)
-                    })
-                    .collect()
-            })
-            .collect();
-        let mut order: Vec<usize> = (0..shapes.len()).collect();
-        order.sort_by(|&a, &b| shapes[b].rank.total_cmp(&shapes[a].rank));
-        let mut page = Page::new(self.cells);
-        let mut places = vec![Place::default(); shapes.len()];
-        for i in order {
-            let mut best = None;
-            let mut limit = usize::MAX;
-            for (k, (mask, ..)) in masks[i].iter().enumerate() {
-                if let Some((x, y)) = page.find(mask, limit) {
-                    limit = y + mask.height;
-                    best = Some((k, x, y));
-                }
-            }
-            let (k, x, y) = best?;
-            let (mask, turn, low) = &masks[i][k];
-            page.take(mask, x, y);
-            // the grown shape may begin where the texture's border leaves one gutter
-            let corner = DVec2::new(x as f64, y as f64) * self.cell + 2.0 * self.gutter_px;
-            places[i] = Place { turn: *turn, scale, offset: corner - *low * scale };
+/// The smallest side found at which everything fits, from `start` on, at most `most`; `order` becomes the one that
+/// did it.
+fn smallest(
+    drawn: &[Vec<Drawn>],
+    order: &mut Vec<usize>,
+    start: usize,
+    most: usize,
+    stop: &dyn Fn() -> bool,
+) -> Result<Option<(usize, Layout)>, Refusal> {
+    let mut side = start;
+    let mut best = loop {
+        if let Some(layout) = lay_out(drawn, order, side) {
+            break layout;
         }
-        Some(places)
+        side += side / 40 + 1;
+        if side > most {
+            return Ok(None);
+        }
+    };
+    let count = order.len();
+    let mut random = Random(count as u64);
+    let tries = if count > 1 { (PLACED / count).clamp(8, 160) } else { 8 };
+    let mut step = (side / 40).max(1);
+    for _ in 0..tries {
+        if stop() {
+            return Err(Refusal::Stopped);
+        }
+        let mut trial = order.clone();
+        if step == 1 && count > 1 {
+            let i = random.below(count);
+            let j = (i + 1 + random.below(count.div_ceil(3))) % count;
+            trial.swap(i, j);
+        }
+        match lay_out(drawn, &trial, side.saturating_sub(step)) {
+            Some(layout) => (side, best, *order) = (side - step, layout, trial),
+            None => step = (step / 2).max(1),
+        }
+    }
+    Ok(Some((side, best)))
+}
+
+/// Places charts one after the other on a square of `side` cells.
+fn lay_out(drawn: &[Vec<Drawn>], order: &[usize], side: usize) -> Option<Layout> {
+    let mut page = Page::new(side);
+    let mut layout = vec![(0, 0, 0); drawn.len()];
+    for &chart in order {
+        let mut limit = usize::MAX;
+        let mut place = None;
+        for (turn, Drawn { mask, .. }) in drawn[chart].iter().enumerate() {
+            if let Some((x, y)) = page.find(mask, limit) {
+                limit = y + mask.height;
+                place = Some((turn, x, y));
+            }
+        }
+        let (turn, x, y) = place?;
+        page.take(&drawn[chart][turn].mask, x, y);
+        layout[chart] = (turn, x, y);
+    }
+    Some(layout)
+}
+
+/// Numbers without a pattern, the same every time (SplitMix64).
+struct Random(u64);
+
+impl Random {
+    /// 0..n
+    fn below(&mut self, n: usize) -> usize {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ z >> 31) % n as u64) as usize
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A rectangle of two triangles.
+    fn rectangle(width: f64, height: f64) -> Flat {
+        let p = |x: f64, y: f64| DVec2::new(x, y);
+        Flat {
+            triangles: vec![0, 1],
+            corners: vec![[0, 1, 2], [0, 2, 3]],
+            points: vec![p(0., 0.), p(width, 0.), p(width, height), p(0., height)],
+        }
+    }
+
+    fn corners(chart: &Flat, place: &Place) -> Vec<DVec2> {
+        chart.points.iter().map(|&p| place.of(p)).collect()
+    }
+
+    #[test]
+    fn a_square_fills_the_texture_but_for_two_gutters() {
+        let chart = rectangle(3.0, 3.0);
+        let places = pack(&[chart.clone()], 256.0, 8.0, &|| false).unwrap();
+        let p = corners(&chart, &places[0]);
+        let low = p.iter().fold(DVec2::INFINITY, |m, p| m.min(*p));
+        let high = p.iter().fold(DVec2::NEG_INFINITY, |m, p| m.max(*p));
+        // 16..240, less the cell (one texel here) it is rounded to
+        assert!(low.min_element() > 16.0 - 1e-9 && high.max_element() < 240.0 + 1e-9, "{low} {high}");
+        assert!((high - low).min_element() > 220.0, "{low} {high}");
+    }
+
+    #[test]
+    fn four_strips_lie_side_by_side_at_one_scale() {
+        // 4 × 1 each: together a square
+        let charts = vec![rectangle(4.0, 1.0); 4];
+        let places = pack(&charts, 512.0, 4.0, &|| false).unwrap();
+        let scale = places[0].scale;
+        assert!(places.iter().all(|p| p.scale == scale));
+        // (512 − 16) / 4 = 124 if side by side along their length; across (512 − 16 − 3 · 8) / 4 = 118
+        assert!((112.0..118.1).contains(&scale), "{scale}");
+        assert!(matches!(pack(&charts, 512.0, 4.0, &|| true), Err(Refusal::Stopped)));
+        assert!(matches!(pack(&charts, 16.0, 8.0, &|| false), Err(Refusal::TooSmall)));
     }
 }

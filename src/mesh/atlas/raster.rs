@@ -26,37 +26,42 @@ impl Mask {
     /// lowest corner lies at (`reach`, `reach`). Cells are squares of one unit.
     pub fn of(outline: &[[DVec2; 2]], high: DVec2, reach: f64) -> Mask {
         let [width, height] = (high + 2.0 * reach).to_array().map(|v| (v.ceil() as usize).max(1));
-        // Taken cells as intervals in each row; sorted and joined at the end.
-        let mut rows: Vec<Vec<[u32; 2]>> = vec![Vec::new(); height];
-        let mut crossings: Vec<Vec<f64>> = vec![Vec::new(); height];
+        let words = width.div_ceil(64);
+        let (mut near, mut within) = (vec![0u64; words * height], vec![0u64; words * height]);
         for &[a, b] in outline {
             let (a, b) = (a + reach, b + reach);
-            grown_side(&mut rows, a, b, reach, width);
-            // even-odd filling at the cells' centres
+            grown_side(&mut near, a, b, reach, [width, height]);
+            // even-odd filling at the cells' centres: a side turns over all that is right of it
             let (low, high) = if a.y < b.y { (a, b) } else { (b, a) };
             let (from, to) =
                 ((low.y - 0.5).ceil().max(0.0) as usize, (high.y - 0.5).ceil().max(0.0) as usize);
+            let slope = (high.x - low.x) / (high.y - low.y);
             for y in from..to.min(height) {
-                let t = (y as f64 + 0.5 - low.y) / (high.y - low.y);
-                crossings[y].push(low.x + (high.x - low.x) * t);
+                let x = (low.x + slope * (y as f64 + 0.5 - low.y) - 0.5).ceil().max(0.0) as usize;
+                let row = &mut within[y * words..(y + 1) * words];
+                if x < width {
+                    row[x / 64] ^= !0 << (x % 64);
+                    row[x / 64 + 1..].iter_mut().for_each(|w| *w = !*w);
+                }
             }
         }
         let mut mask = Mask { width, height, ..Mask::default() };
         mask.starts.push(0);
-        for (row, crossings) in rows.iter_mut().zip(&mut crossings) {
-            crossings.sort_unstable_by(f64::total_cmp);
-            for pair in crossings.chunks_exact(2) {
-                row.push([pair[0] as u32, (pair[1].ceil() as u32).min(width as u32)]);
-            }
-            row.sort_unstable();
-            let first = mask.spans.len();
-            for &[from, to] in row.iter() {
-                match mask.spans[first..].last_mut() {
-                    Some(last) if last[1] >= from => last[1] = last[1].max(to),
-                    _ => mask.spans.push([from, to]),
+        for y in 0..height {
+            let rows = y * words..(y + 1) * words;
+            let row: &mut [u64] = &mut near[rows.clone()];
+            row.iter_mut().zip(&within[rows]).for_each(|(n, w)| *n |= w);
+            let (mut at, mut longest) = (0, 0);
+            loop {
+                let from = next(row, at, width, true);
+                if from == width {
+                    break;
                 }
+                at = next(row, from, width, false);
+                longest = longest.max(at - from);
+                mask.spans.push([from as u32, at as u32]);
             }
-            mask.longest.push(mask.spans[first..].iter().map(|s| s[1] - s[0]).max().unwrap_or(0));
+            mask.longest.push(longest as u32);
             mask.starts.push(mask.spans.len() as u32);
         }
         mask.order = coarse_to_fine(height);
@@ -64,13 +69,14 @@ impl Mask {
     }
 }
 
-/// Adds the cells that come within `reach` of a side: per row of cells the interval of two discs and the
+/// Takes the cells that come within `reach` of a side: per row of cells the interval of two discs and the
 /// rectangle between them, which together are convex.
-fn grown_side(rows: &mut [Vec<[u32; 2]>], a: DVec2, b: DVec2, reach: f64, width: usize) {
+fn grown_side(bits: &mut [u64], a: DVec2, b: DVec2, reach: f64, [width, height]: [usize; 2]) {
+    let words = width.div_ceil(64);
     let (low, high) = (a.y.min(b.y) - reach, a.y.max(b.y) + reach);
     let normal = (b - a).perp().normalize_or_zero() * reach;
     let quad = [a + normal, b + normal, b - normal, a - normal];
-    let last = (high.floor().max(0.0) as usize).min(rows.len() - 1);
+    let last = (high.floor().max(0.0) as usize).min(height - 1);
     for y in low.floor().max(0.0) as usize..=last {
         let (top, bottom) = (y as f64, y as f64 + 1.0);
         let (mut from, mut to) = (f64::INFINITY, f64::NEG_INFINITY);
@@ -86,26 +92,45 @@ fn grown_side(rows: &mut [Vec<[u32; 2]>], a: DVec2, b: DVec2, reach: f64, width:
             let (p, q) = if p.y <= q.y { (p, q) } else { (q, p) };
             let (begin, end) = (p.y.max(top), q.y.min(bottom));
             if begin <= end {
-                for at in [begin, end] {
-                    let t = if q.y > p.y { (at - p.y) / (q.y - p.y) } else { 0.0 };
-                    let x = p.x + (q.x - p.x) * t;
-                    (from, to) = (from.min(x), to.max(x));
-                }
+                let slope = if q.y > p.y { (q.x - p.x) / (q.y - p.y) } else { 0.0 };
+                let (x, z) = (p.x + slope * (begin - p.y), p.x + slope * (end - p.y));
+                (from, to) = (from.min(x).min(z), to.max(x).max(z));
                 if p.y == q.y {
                     (from, to) = (from.min(q.x), to.max(q.x));
                 }
             }
         }
-        let (from, to) =
-            (from.floor().max(0.0) as u32, (to.floor() as i64 + 1).clamp(0, width as i64) as u32);
-        if from < to {
-            // sides come one after the other: most continue the last interval
-            match rows[y].last_mut() {
-                Some(l) if from <= l[1] && l[0] <= to => *l = [l[0].min(from), l[1].max(to)],
-                _ => rows[y].push([from, to]),
-            }
+        let (from, to) = (from.floor().max(0.0), to.ceil());
+        if from < to && from < width as f64 {
+            fill(&mut bits[y * words..(y + 1) * words], from as usize, (to as usize).min(width));
         }
     }
+}
+
+/// Sets the bits `from..to` of a row.
+fn fill(row: &mut [u64], from: usize, to: usize) {
+    for w in from / 64..to.div_ceil(64) {
+        let (first, last) = (from.max(w * 64), to.min(w * 64 + 64));
+        row[w] |= !0u64 >> (64 - (last - first)) << (first - w * 64);
+    }
+}
+
+/// The first bit of a row from x on that is set (or clear); `end` if there is none before it.
+fn next(row: &[u64], x: usize, end: usize, set: bool) -> usize {
+    if x >= end {
+        return end;
+    }
+    let flip = if set { 0 } else { !0 };
+    let mut w = x / 64;
+    let mut word = (row[w] ^ flip) & (!0 << (x % 64));
+    while word == 0 {
+        w += 1;
+        if w == row.len() {
+            return end;
+        }
+        word = row[w] ^ flip;
+    }
+    (w * 64 + word.trailing_zeros() as usize).min(end)
 }
 
 /// `0..n` by halving: 0, n − 1, the middle, the quarters, ...
@@ -133,21 +158,7 @@ impl Page {
 
     /// The first cell of a row from x on that is taken (or free); `side` if there is none.
     fn next(&self, y: usize, x: usize, taken: bool) -> usize {
-        let row = &self.bits[y * self.words..(y + 1) * self.words];
-        let mut w = x / 64;
-        if x >= self.side {
-            return self.side;
-        }
-        let flip = if taken { 0 } else { !0 };
-        let mut word = (row[w] ^ flip) & (!0 << (x % 64));
-        while word == 0 {
-            w += 1;
-            if w == self.words {
-                return self.side;
-            }
-            word = row[w] ^ flip;
-        }
-        (w * 64 + word.trailing_zeros() as usize).min(self.side)
+        next(&self.bits[y * self.words..(y + 1) * self.words], x, self.side, taken)
     }
 
     /// The lowest and then leftmost place for a mask whose upper end stays below `limit`.
@@ -193,11 +204,8 @@ impl Page {
         for r in 0..mask.height {
             let row = y + r;
             for &[from, to] in mask.row(r) {
-                for w in (x + from as usize) / 64..=(x + to as usize - 1) / 64 {
-                    let (first, last) = ((x + from as usize).max(w * 64), (x + to as usize).min(w * 64 + 64));
-                    let ones = !0u64 >> (64 - (last - first));
-                    self.bits[row * self.words + w] |= ones << (first - w * 64);
-                }
+                let cells = &mut self.bits[row * self.words..(row + 1) * self.words];
+                fill(cells, x + from as usize, x + to as usize);
             }
             let (mut at, mut longest) = (0, 0);
             while at < self.side {

@@ -75,7 +75,7 @@ mod tests {
 
     #[test]
     fn halves_keep_the_gutter_or_say_what_is_left_of_it() {
-        for (count, size_px, full) in [(1, 64, true), (2, 64, true), (7, 256, true), (3000, 512, false)] {
+        for (count, size_px, full) in [(1, 128, true), (2, 128, true), (7, 256, true), (3000, 512, false)] {
             let config = AtlasConfig { size_px, ..AtlasConfig::default() };
             let mesh = heap(count);
             let laid = HalfSquares.unwrap(&mesh, &config, &Quiet).unwrap();

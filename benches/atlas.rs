@@ -1,0 +1,65 @@
+//! Laying a head into its texture: CPU seconds and what comes out.
+//!
+//! ```text
+//! cargo bench --bench atlas                  20 k and 100 k triangles into 2048²
+//! cargo bench --bench atlas -- 4096          another texture
+//! ```
+//!
+//! CPU time (user + system of the process) does not depend on what else the machine does.
+
+#[path = "../tests/fields/mod.rs"]
+mod fields;
+
+use glam::Vec3;
+use std::time::Instant;
+use tiface::geom::{Aabb, Mesh};
+use tiface::mesh::uv_check::{seams_facing, uv_check};
+use tiface::mesh::{AtlasConfig, MeshConfig, atlas, extract};
+use tiface::run::Quiet;
+
+/// User + system time of this process, seconds (Linux; wall time elsewhere).
+fn cpu_s() -> f64 {
+    let Ok(stat) = std::fs::read_to_string("/proc/self/stat") else {
+        static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
+        return START.get_or_init(Instant::now).elapsed().as_secs_f64();
+    };
+    let after = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
+    let field = |i: usize| after.split_whitespace().nth(i).and_then(|v| v.parse::<f64>().ok()).unwrap_or(0.0);
+    (field(11) + field(12)) / 100.0
+}
+
+fn head(resolution: usize) -> Mesh {
+    let config = MeshConfig { resolution, ..MeshConfig::default() };
+    let color = |p: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; p.len()];
+    let (field, slope) = (fields::batch(fields::head), fields::batch_gradient(fields::head));
+    extract(field, slope, color, Aabb::SCENE, None, &config, &Quiet).expect("a head").0
+}
+
+fn main() {
+    let size_px = std::env::args().filter_map(|a| a.parse().ok()).next().unwrap_or(2048);
+    for resolution in [78, 172] {
+        let mesh = head(resolution);
+        for front in [None, Some(Vec3::Z)] {
+            let config = AtlasConfig { size_px, front, ..AtlasConfig::default() };
+            // the best of a few: the first one also warms up
+            let mut best = f64::INFINITY;
+            for _ in 0..4 {
+                let start = cpu_s();
+                atlas(&mesh, &config, &Quiet).expect("an atlas");
+                best = best.min(cpu_s() - start);
+            }
+            let (atlas, report) = atlas(&mesh, &config, &Quiet).expect("an atlas");
+            let start = cpu_s();
+            let uv = uv_check(&mesh, &atlas);
+            let check = cpu_s() - start;
+            let towards = if front.is_some() { ", front +z" } else { "" };
+            println!(
+                "{} triangles, {size_px}²{towards}: {best:.2} CPU s, of it {check:.2} the check",
+                uv.triangles
+            );
+            println!("mended {}, fall-back {:?}", report.mended, report.fallback);
+            println!("seams facing +z      {:.2} × √area", seams_facing(&mesh, &atlas, Vec3::Z));
+            println!("{uv}");
+        }
+    }
+}

@@ -1,0 +1,285 @@
+//! The face in one chart: what lies in front of a plane, as deep as it still lies flat.
+//!
+//! The library knows no costs of seams, so its charts meet anywhere, half of their seams where one looks first. Here
+//! the part of the surface around its foremost point, up to a plane across the direction the face looks, is taken out
+//! and flattened in one piece; the rim is the plane's contour, short and out of the way. The library divides the rest.
+
+use super::Refusal;
+use super::flat::{Flat, twice_area};
+use super::library::{Flattened, STRETCHED, flatten};
+use crate::geom::{Mesh, sorted_sides};
+use crate::run::Monitor;
+use glam::Vec3;
+
+/// The deepest plane lies so far behind the foremost point, in parts of the mesh's depth; the others are closer by
+/// equal steps.
+const DEEPEST: f32 = 0.5;
+const PLANES: usize = 16;
+
+/// Flattenings that may fail.
+const TRIES: usize = 3;
+
+/// Gaussian curvature beyond which the library halves a chart without a try is 3.
+const MOST_CURVED: f64 = 2.6;
+
+/// The share of the surface that a face may have.
+const LARGEST: f64 = 0.3;
+
+/// Mean area stretch that a face may have: (r + 1/r) / 2, r being the scale of areas.
+const STRETCH: f64 = 1.15;
+
+/// The same of any one triangle: twice what other charts may have, for the nose.
+const FACE_STRETCHED: f32 = 2.0 * STRETCHED;
+
+const NONE: u32 = u32::MAX;
+
+/// Flattens a mesh with its face in one chart, if there is one.
+pub(super) fn flatten_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<Flattened, Refusal> {
+    let mut tries = 0;
+    for inside in caps(mesh, front.normalize()) {
+        let (face, number) = part(mesh, |t| inside[t as usize]);
+        let alone = flatten(&face, Some(&vec![0; face.triangles.len()]), FACE_STRETCHED, monitor)?;
+        let fits = matches!(&alone.charts[..], [one] if stretch(&face, one) <= STRETCH);
+        if fits {
+            let (rest, rest_number) = part(mesh, |t| !inside[t as usize]);
+            let mut whole = flatten(&rest, None, STRETCHED, monitor)?.renumbered(&rest_number);
+            let alone = alone.renumbered(&number);
+            whole.charts.extend(alone.charts);
+            whole.without.extend(alone.without);
+            return Ok(whole);
+        }
+        tries += 1;
+        if tries == TRIES {
+            break;
+        }
+    }
+    flatten(mesh, None, STRETCHED, monitor)
+}
+
+/// The triangles that are `wanted`, and which those were.
+fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>) {
+    let number: Vec<u32> = (0..mesh.triangles.len() as u32).filter(|&t| wanted(t)).collect();
+    let mut vertex = vec![NONE; mesh.positions.len()];
+    let mut part = Mesh::default();
+    for &t in &number {
+        part.triangles.push(mesh.triangles[t as usize].map(|v| {
+            let n = &mut vertex[v as usize];
+            if *n == NONE {
+                *n = part.positions.len() as u32;
+                part.positions.push(mesh.positions[v as usize]);
+            }
+            *n
+        }));
+    }
+    (part, number)
+}
+
+/// Mean of (r + 1/r) / 2 over a chart that has the area of its surface.
+fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
+    let (mut sum, mut whole) = (0.0, 0.0);
+    for (k, &t) in flat.triangles.iter().enumerate() {
+        let area = area(mesh, t);
+        let ratio = 0.5 * twice_area(flat.at(k)) / area;
+        if ratio > 0.0 && ratio.is_finite() {
+            sum += area * 0.5 * (ratio + 1.0 / ratio);
+            whole += area;
+        }
+    }
+    sum / whole
+}
+
+fn area(mesh: &Mesh, t: u32) -> f64 {
+    let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
+    0.5 * (b - a).cross(c - a).length()
+}
+
+/// Caps worth flattening, the deepest first: for each triangle whether it belongs.
+fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
+    let count = mesh.triangles.len();
+    let beside = neighbours(mesh);
+    let depth: Vec<f32> = (0..count as u32)
+        .map(|t| {
+            let [a, b, c] = mesh.corners(t).map(|p| p.dot(front));
+            (a + b + c) / 3.0
+        })
+        .collect();
+    let areas: Vec<f64> = (0..count as u32).map(|t| area(mesh, t)).collect();
+    let whole: f64 = areas.iter().sum();
+    let curvature = curvature(mesh);
+    let foremost = (0..count).fold(0, |best, t| if depth[t] > depth[best] { t } else { best });
+    let (high, low) = (depth[foremost], depth.iter().copied().fold(f32::INFINITY, f32::min));
+    let corners = mesh.triangles.clone();
+    (1..=PLANES).rev().filter_map(move |i| {
+        let plane = high - (high - low) * DEEPEST * i as f32 / PLANES as f32;
+        let mut inside = cap(&beside, &depth, foremost as u32, plane);
+        straighten(&beside, &mut inside);
+        let share = (0..count).filter(|&t| inside[t]).map(|t| areas[t]).sum::<f64>() / whole;
+        // Of vertices with all of their triangles inside.
+        let mut cut = vec![false; curvature.len()];
+        (0..count)
+            .filter(|&t| !inside[t])
+            .for_each(|t| corners[t].iter().for_each(|&v| cut[v as usize] = true));
+        let inner = curvature.iter().zip(&cut).filter(|(_, cut)| !**cut).map(|(k, _)| k).sum::<f64>();
+        (share > 0.01 && share < LARGEST && inner.abs() < MOST_CURVED).then_some(inside)
+    })
+}
+
+/// Across the side from corner k to k + 1 of each triangle; [`NONE`] where there is not exactly one other.
+fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
+    let mut beside = vec![[NONE; 3]; mesh.triangles.len()];
+    for run in sorted_sides(&mesh.triangles).chunk_by(|a, b| a.0 == b.0) {
+        if let [(_, a), (_, b)] = *run {
+            beside[a as usize / 3][a as usize % 3] = b / 3;
+            beside[b as usize / 3][b as usize % 3] = a / 3;
+        }
+    }
+    beside
+}
+
+/// For each vertex 2π less the angles around it (Descartes): the integral of the Gaussian curvature.
+fn curvature(mesh: &Mesh) -> Vec<f64> {
+    let mut sum = vec![0.0; mesh.positions.len()];
+    for (t, corners) in mesh.triangles.iter().enumerate() {
+        let p = mesh.corners(t as u32);
+        for k in 0..3 {
+            let (a, b) = (p[(k + 1) % 3] - p[k], p[(k + 2) % 3] - p[k]);
+            sum[corners[k] as usize] += f64::from(a.cross(b).length().atan2(a.dot(b)));
+        }
+    }
+    sum.iter().map(|&s| if s > 0.0 { std::f64::consts::TAU - s } else { 0.0 }).collect()
+}
+
+/// Gives `number` to the first triangle and all without one that hang together with it; how many they are.
+fn flood(beside: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usize {
+    let (mut open, mut count) = (vec![first], 1);
+    piece[first as usize] = number;
+    while let Some(t) = open.pop() {
+        for n in beside[t as usize] {
+            if n != NONE && piece[n as usize] == NONE {
+                piece[n as usize] = number;
+                count += 1;
+                open.push(n);
+            }
+        }
+    }
+    count
+}
+
+/// What hangs together with the foremost triangle in front of the plane, and all it encloses: eye sockets are deep.
+fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<bool> {
+    // What is behind the plane has a number, so it is not flooded; then the rest takes its place.
+    let behind = u32::MAX - 1;
+    let mut piece: Vec<u32> = depth.iter().map(|&d| if d > plane { NONE } else { behind }).collect();
+    flood(beside, &mut piece, foremost, 0);
+    piece.iter_mut().filter(|p| **p == behind).for_each(|p| *p = NONE);
+    let (mut outside, mut most, mut number) = (NONE, 0, 0);
+    for t in 0..beside.len() {
+        if piece[t] == NONE {
+            number += 1;
+            let count = flood(beside, &mut piece, t as u32, number);
+            if count > most {
+                (outside, most) = (number, count);
+            }
+        }
+    }
+    piece.iter().map(|&p| p != outside).collect()
+}
+
+/// Takes teeth off the rim: triangles with two neighbours on the other side change it.
+fn straighten(beside: &[[u32; 3]], inside: &mut [bool]) {
+    for _ in 0..4 {
+        for t in 0..beside.len() {
+            let others = beside[t].iter().filter(|&&n| n != NONE && inside[n as usize] != inside[t]).count();
+            if others >= 2 {
+                inside[t] = !inside[t];
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run::Quiet;
+
+    /// A closed ball around the origin, a bump like a nose at its front (+z) and a dent below it.
+    fn ball() -> Mesh {
+        let (rings, around) = (40u32, 60u32);
+        let mut mesh = Mesh { positions: vec![Vec3::Y], ..Mesh::default() };
+        for i in 1..rings {
+            for j in 0..around {
+                let (polar, turn) = (
+                    std::f32::consts::PI * i as f32 / rings as f32,
+                    std::f32::consts::TAU * j as f32 / around as f32,
+                );
+                let p = Vec3::new(polar.sin() * turn.sin(), polar.cos(), polar.sin() * turn.cos());
+                let near = |q: Vec3| (-40.0 * p.distance_squared(q.normalize())).exp();
+                let r = 1.0 + 0.15 * near(Vec3::Z) - 0.05 * near(Vec3::new(0.0, -0.5, 1.0));
+                mesh.positions.push(r * p);
+            }
+        }
+        mesh.positions.push(-Vec3::Y);
+        let last = mesh.positions.len() as u32 - 1;
+        let at = |i: u32, j: u32| 1 + i * around + j % around;
+        for j in 0..around {
+            mesh.triangles.push([0, at(0, j), at(0, j + 1)]);
+            mesh.triangles.push([last, at(rings - 2, j + 1), at(rings - 2, j)]);
+            for i in 0..rings - 2 {
+                mesh.triangles.push([at(i, j), at(i + 1, j), at(i + 1, j + 1)]);
+                mesh.triangles.push([at(i, j), at(i + 1, j + 1), at(i, j + 1)]);
+            }
+        }
+        mesh
+    }
+
+    #[test]
+    fn the_face_is_one_chart_and_the_rest_the_librarys() {
+        let mesh = ball();
+        assert!(mesh.is_closed());
+        let flat = flatten_around(&mesh, Vec3::new(0.0, 0.0, 3.0), &Quiet).unwrap();
+        let mut seen = vec![0; mesh.triangles.len()];
+        flat.charts.iter().flat_map(|c| &c.triangles).for_each(|&t| seen[t as usize] += 1);
+        assert!(seen.iter().all(|&n| n == 1) && flat.without.is_empty());
+        // the nose, and what is around it up to 30 degrees
+        let chart = |t: u32| flat.charts.iter().position(|c| c.triangles.contains(&t));
+        let near = |t: &u32| mesh.corners(*t).iter().all(|p| p.normalize().z > 0.87);
+        let mut charts: Vec<_> = (0..mesh.triangles.len() as u32).filter(near).map(chart).collect();
+        charts.dedup();
+        assert_eq!(charts.len(), 1);
+    }
+
+    #[test]
+    fn caps_are_discs_from_deep_to_shallow() {
+        let mesh = ball();
+        let found: Vec<Vec<bool>> = caps(&mesh, Vec3::Z).collect();
+        assert!(found.len() > 2);
+        let sizes: Vec<usize> = found.iter().map(|c| c.iter().filter(|i| **i).count()).collect();
+        assert!(sizes.is_sorted_by(|a, b| a > b), "{sizes:?}");
+        // one piece within, one without: the rim is one line
+        let beside = neighbours(&mesh);
+        for inside in found {
+            for side in [true, false] {
+                let first = inside.iter().position(|&i| i == side).unwrap();
+                let mut own: Vec<u32> = inside.iter().map(|&i| if i == side { NONE } else { 7 }).collect();
+                let count = flood(&beside, &mut own, first as u32, 1);
+                assert_eq!(count, inside.iter().filter(|&&i| i == side).count());
+            }
+        }
+    }
+
+    #[test]
+    fn a_dent_behind_the_plane_is_part_of_the_face() {
+        // a strip: 0 in front, 1 behind, 2 in front, 3 to 6 behind
+        let beside = [
+            [NONE, 1, 2],
+            [0, 2, NONE],
+            [1, 0, 3],
+            [2, 4, NONE],
+            [3, 5, NONE],
+            [4, 6, NONE],
+            [5, NONE, NONE],
+        ];
+        let depth = [1.0, 0.2, 0.9, 0.1, 0.0, 0.0, 0.0];
+        assert_eq!(cap(&beside, &depth, 0, 0.5), [true, true, true, false, false, false, false]);
+    }
+}
