@@ -229,7 +229,7 @@ mod tests {
     #[test]
     fn a_square_fills_the_texture_but_for_two_gutters() {
         let chart = rectangle(3.0, 3.0);
-        let places = pack(&[chart.clone()], 256.0, 8.0, &|| false).unwrap();
+        let places = pack(std::slice::from_ref(&chart), 256.0, 8.0, &|| false).unwrap();
         let p = corners(&chart, &places[0]);
         let low = p.iter().fold(DVec2::INFINITY, |m, p| m.min(*p));
         let high = p.iter().fold(DVec2::NEG_INFINITY, |m, p| m.max(*p));
