@@ -233,3 +233,54 @@ pub(super) fn quality_of([a, b, c]: [Vec3; 3]) -> f32 {
     let sum = (b - a).length_squared() + (c - b).length_squared() + (a - c).length_squared();
     if sum > 0.0 { 2.0 * 3f32.sqrt() * (b - a).cross(c - a).length() / sum } else { 0.0 }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::Mesh;
+
+    fn may(triangles: &[[u32; 3]], a: u32, b: u32) -> bool {
+        let n = triangles.iter().flatten().max().unwrap() + 1;
+        // on a parabola, so that nothing is degenerate
+        let positions: Vec<Vec3> = (0..n).map(|i| i as f32).map(|x| Vec3::new(x, x * x, x * x * x)).collect();
+        let rings = Rings::new(&Mesh { positions, triangles: triangles.to_vec(), ..Mesh::default() });
+        Star::new(n as usize).gather(&rings, a, b)
+    }
+
+    #[test]
+    fn a_tetrahedron_gives_no_edge_and_an_octahedron_every_one() {
+        assert!(!may(&[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], 0, 1));
+        let octahedron =
+            [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]];
+        assert!(may(&octahedron, 0, 1) && may(&octahedron, 2, 4) && may(&octahedron, 5, 3));
+    }
+
+    #[test]
+    fn the_waist_of_a_double_pyramid_must_not_close() {
+        // Over and under the triangle 0, 1, 2, which is no face: 0 and 1 have 2 for a common neighbour.
+        let waist = [[0, 1, 3], [1, 2, 3], [2, 0, 3], [1, 0, 4], [2, 1, 4], [0, 2, 4]];
+        assert!(!may(&waist, 0, 1));
+        assert!(may(&waist, 0, 3)); // leaves the tetrahedron 0, 1, 2, 4
+    }
+
+    #[test]
+    fn borders_shrink_but_do_not_meet() {
+        assert!(!may(&[[0, 1, 2]], 0, 1));
+        // two triangles: the diagonal joins two borders, an outer edge may go
+        let square = [[0, 1, 2], [0, 2, 3]];
+        assert!(!may(&square, 0, 2));
+        assert!(may(&square, 0, 1));
+        // a ring between two borders of three: their last edges stay, and they do not meet
+        let hole = [[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]];
+        assert!(!may(&hole, 0, 1) && !may(&hole, 3, 4));
+        assert!(!may(&hole, 0, 4));
+    }
+
+    #[test]
+    fn shape_is_one_for_equilateral_and_none_on_a_line() {
+        let c = Vec3::new(0.5, 0.75f32.sqrt(), 0.0);
+        assert!((quality_of([Vec3::ZERO, Vec3::X, c]) - 1.0).abs() < 1e-6);
+        assert_eq!(quality_of([Vec3::ZERO, Vec3::X, 2.0 * Vec3::X]), 0.0);
+        assert_eq!(quality_of([Vec3::X; 3]), 0.0);
+    }
+}
