@@ -219,7 +219,7 @@ With --fit or --correct, some training views must be set aside before anything i
   tiface check head.glb
   tiface check scan.obj --require watertight --require one-piece
   tiface check head.ply --json
-  tiface check runs/lps/mesh/head.ply --against captures/lps/gt.ply --seen-by captures/lps")]
+  tiface check runs/lps/mesh/surface.ply --against captures/lps/gt.ply --seen-by captures/lps")]
     Check {
         /// A .glb, .obj or .ply file
         mesh: PathBuf,

@@ -199,6 +199,7 @@ impl VmConfig {
     fn draft() -> VmConfig {
         VmConfig {
             steps: 1500,
+            rays: 8192,
             lr_final: 0.01,
             voxels_start: 96 * 96 * 96,
             voxels_final: 192 * 192 * 192,
@@ -211,7 +212,9 @@ impl VmConfig {
     /// The default: better and slower.
     fn standard() -> VmConfig {
         VmConfig {
-            steps: 6000,
+            // few steps of many rays: twice the rays of a step are worth more than twice the steps
+            steps: 2000,
+            rays: 16_384,
             masks: MaskUse::Soft,
             // as published: the views are compared with photographs times mask, and what the stage sheds on soft
             // hair belongs to those (I-Face, whose mesh leaves the stage, learns without it)
@@ -221,8 +224,8 @@ impl VmConfig {
             whole_frame: false,
             voxels_start: 128 * 128 * 128,
             voxels_final: 256 * 256 * 256,
-            upsample_steps: vec![300, 600, 1000, 1500],
-            mask_steps: vec![300, 1000],
+            upsample_steps: vec![200, 400, 650, 1000],
+            mask_steps: vec![200, 650],
             // planes of the published ranks favour one axis of one stage; a head may face any way
             density_rank: vec![8, 8, 8],
             color_rank: vec![24, 24, 24],
