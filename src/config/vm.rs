@@ -180,7 +180,9 @@ impl VmConfig {
             VmBackground::Random => VmBackground::Black,
             other => other,
         };
-        VmConfig { background, ..tface.with(Ablation::Baseline) }
+        // whole frames cost several times a head: half the rays a step, but for the published recipe
+        let rays = if preset == Preset::Paper { tface.rays } else { tface.rays / 2 };
+        VmConfig { background, rays, ..tface.with(Ablation::Baseline) }
     }
 
     /// These settings with what a row of the ablation switches on and off.
