@@ -6,7 +6,8 @@ use crate::capture::{self, CaptureOptions, Split};
 use crate::geom::{Bvh, Camera, Mesh};
 use crate::io::{self, Limits};
 use crate::mesh::check::{CheckReport, RequireError, check};
-use crate::mesh::read::read;
+use crate::mesh::read::{Texture, picture_of_mtl, read, read_whole, weld};
+use crate::mesh::uv_check::{UvReport, uv_check};
 use crate::metrics::distance::{Distances, one_way, seen_one_way};
 use crate::run::Exit;
 use serde::Serialize;
@@ -73,6 +74,38 @@ fn load(path: &Path) -> Result<Mesh, Ending> {
     read(&bytes, path).map_err(|e| Ending::cannot(e.to_string(), e.hint()))
 }
 
+/// A texture of unknown size is measured as if it had this many texels along each side.
+const UNKNOWN_PX: u32 = 1024;
+
+/// The mesh, and its texture coordinates measured. A texture that cannot be understood is no reason not to check
+/// the mesh.
+fn load_whole(path: &Path) -> Result<(Mesh, Option<UvReport>), Ending> {
+    let bytes = io::read_bytes(path, &Limits::default())?;
+    let Ok(whole) = read_whole(&bytes, path) else { return Ok((load(path)?, None)) };
+    let uv = whole.atlas.map(|mut atlas| {
+        if atlas.width == 0 || atlas.height == 0 {
+            let size = whole.texture.and_then(|t| picture_size(&t, path));
+            (atlas.width, atlas.height) = size.unwrap_or((UNKNOWN_PX, UNKNOWN_PX));
+        }
+        uv_check(&weld(&whole.mesh), &atlas)
+    });
+    Ok((whole.mesh, uv))
+}
+
+/// Size of the picture beside a file.
+fn picture_size(texture: &Texture, path: &Path) -> Option<(u32, u32)> {
+    let limits = Limits::default();
+    let name = match texture {
+        Texture::Inside(_) => return None,
+        Texture::Beside(name) => name.clone(),
+        Texture::Material(mtl) => {
+            let mtl = path.with_file_name(mtl);
+            picture_of_mtl(&io::read_bytes(&mtl, &limits).ok()?, &mtl).ok()??
+        }
+    };
+    Some(io::picture_info(&path.with_file_name(name), &limits).ok()?.size(None))
+}
+
 pub(super) fn go(
     common: &Common,
     path: &Path,
@@ -81,9 +114,9 @@ pub(super) fn go(
     seen_by: Option<&Path>,
 ) -> Result<Exit, Ending> {
     let config = common.resolve(None, None, &[])?;
-    let mesh = load(path)?;
+    let (mesh, uv) = load_whole(path)?;
     let unit_m = config.capture.unit_m;
-    let report = check(&mesh, unit_m);
+    let report = CheckReport { uv, ..check(&mesh, unit_m) };
     let bars: Vec<&str> = require.iter().map(String::as_str).collect();
     let passed = report.require(&bars);
     if let Err(e @ RequireError::Unknown { .. }) = &passed {
@@ -94,7 +127,8 @@ pub(super) fn go(
         let whole = Whole { report: &report, against: against.as_ref() };
         format!("{}\n", serde_json::to_string(&whole).unwrap_or_default())
     } else {
-        format!("{report}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
+        let uv = report.uv.as_ref().map(|uv| format!("\ntexture\n{uv}")).unwrap_or_default();
+        format!("{report}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
     };
     say(&text)?;
     passed.map_err(|e| Ending::below(e.to_string(), e.hint()))?;

@@ -214,7 +214,7 @@ With --fit or --correct, some training views must be set aside before anything i
         #[arg(long = "with", value_name = "FIELD", default_value = "tface")]
         field: String,
     },
-    /// Is this mesh sound: watertight, manifold, self-intersections, size
+    /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates, size
     #[command(after_long_help = "Examples:
   tiface check head.glb
   tiface check scan.obj --require watertight --require one-piece
@@ -223,7 +223,8 @@ With --fit or --correct, some training views must be set aside before anything i
     Check {
         /// A .glb, .obj or .ply file
         mesh: PathBuf,
-        /// Exit with 3 if it is not: watertight, manifold, one-piece, no-self-intersections; repeatable
+        /// Exit with 3 if it is not: watertight, manifold, one-piece, no-self-intersections, sound-uv;
+        /// repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
         /// Also the distance to this surface, in the same coordinates (so a PLY: a GLB is turned +Y up)

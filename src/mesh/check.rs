@@ -9,6 +9,7 @@
 //!   Shewchuk's error bound (1997); what the bound cannot tell from zero counts as touching.
 //! - sliver: quality `4 √3 · area / Σ edge²` below 0.05 (1 for an equilateral triangle).
 
+use super::uv_check::UvReport;
 use crate::geom::{Aabb, Bvh, Mesh};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -71,6 +72,9 @@ pub struct CheckReport {
     pub has_normals: bool,
     /// Normals whose length is not 1 within 5e-4.
     pub bad_normals: usize,
+    /// Its texture coordinates, for those who have measured them: [`check`] knows only the mesh.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub uv: Option<UvReport>,
 }
 
 /// A bar that was not reached, or that does not exist.
@@ -104,7 +108,7 @@ impl RequireError {
 }
 
 /// What [`CheckReport::require`] understands.
-pub const BARS: [&str; 4] = ["watertight", "manifold", "one-piece", "no-self-intersections"];
+pub const BARS: [&str; 5] = ["watertight", "manifold", "one-piece", "no-self-intersections", "sound-uv"];
 
 impl CheckReport {
     /// Checks the named bars; the first one missed is the error. See [`BARS`].
@@ -126,6 +130,15 @@ impl CheckReport {
                 "one-piece" => (self.pieces != 1).then(|| format!("{} pieces", self.pieces)),
                 "no-self-intersections" => (self.self_intersections > 0)
                     .then(|| format!("{} triangles intersect others", self.self_intersections)),
+                "sound-uv" => match &self.uv {
+                    None => Some("no texture coordinates".into()),
+                    Some(uv) => (!uv.is_sound()).then(|| {
+                        format!(
+                            "{} triangles overlap, {} flipped, {} without area, {} outside, {} invalid",
+                            uv.overlapping, uv.flipped, uv.zero_area, uv.outside, uv.invalid
+                        )
+                    }),
+                },
                 _ => return Err(RequireError::Unknown { bar: bar.into() }),
             };
             if let Some(found) = missed {
@@ -239,6 +252,7 @@ pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
         has_colors: count > 0 && mesh.colors.len() == count,
         has_normals: count > 0 && mesh.normals.len() == count,
         bad_normals: mesh.normals.iter().filter(bad_normal).count(),
+        uv: None,
     }
 }
 

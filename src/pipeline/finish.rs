@@ -7,7 +7,7 @@ use crate::capture::scene::Scene;
 use crate::config::TextureView;
 use crate::geom::{Camera, Mesh};
 use crate::image::{Image, Photo, quantise, srgb_from_linear};
-use crate::mesh::bake::{BakeConfig, Baked, Learned, Viewer, bake, tangent_space};
+use crate::mesh::bake::{BakeConfig, Baked, Learned, Viewer, bake, seam_step, tangent_space};
 use crate::mesh::textured_tangents::tangents;
 use crate::mesh::{AtlasConfig, Cap, MeshError, SimplifyConfig, atlas, simplify};
 use crate::run::Monitor;
@@ -108,6 +108,8 @@ impl Line<'_> {
         let cameras: Vec<Camera> = train.map(|v| v.camera.transformed(&scene.scene_from_world)).collect();
         let baked = bake(&mesh, &laid, &learned, &cameras, &config, monitor)?;
         report.insert("bake".into(), json!(baked.report));
+        let color = coded(&baked.color);
+        report.insert("seam_step_255".into(), json!(seam_step(&mesh, &laid, &color)));
 
         let normal = match &baked.normal {
             Some(normals) => match tangents(&mesh, &laid) {
@@ -119,12 +121,7 @@ impl Line<'_> {
             },
             None => None,
         };
-        let pictures = Pictures {
-            atlas: laid,
-            color: coded(&baked.color),
-            normal,
-            lobes: lobes(&baked, asset_from_world),
-        };
+        let pictures = Pictures { atlas: laid, color, normal, lobes: lobes(&baked, asset_from_world) };
         let product = Product { mesh: mesh.transformed(&world_from_scene), pictures: Some(pictures) };
         Ok(Finished { product, linear: Some(baked.color), report, warnings })
     }

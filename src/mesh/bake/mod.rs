@@ -13,9 +13,11 @@ mod detail;
 mod fill;
 mod light;
 pub mod lobes;
+mod seams;
 
 pub use detail::tangent_space;
 pub use light::Learned;
+pub use seams::seam_step;
 
 use super::MeshError;
 use crate::geom::{Atlas, Bvh, Camera, Mesh};
