@@ -117,6 +117,7 @@ fi
 if [ $demo = yes ]; then
   step "the demo head is reconstructed" train_demo
   readers_agree "the demo head" "$scratch/demo/mesh/head.glb" --up 0 0 1
+  step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$scratch/demo/mesh/head.glb"
 else
   results+=("SKIPPED the demo head, as asked by --no-demo")
 fi

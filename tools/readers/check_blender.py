@@ -130,7 +130,9 @@ def main():
             bad.append("not closed")
         if not volume > 0:
             bad.append(f"volume {volume}")
-        if textured and not found.data.uv_layers:
+        # a PLY may have colours at its vertices in the texture's place
+        bare = ending == ".ply" and b"TextureFile" not in path.read_bytes()[:4096]
+        if textured and not bare and not found.data.uv_layers:
             bad.append("no texture coordinates")
         if textured and ending != ".ply":  # Blender knows no pictures in PLY
             image, unlit = shown_picture(found.data.materials[0])

@@ -160,7 +160,13 @@ def main():
                 bad.append("not closed")
             if not volume > 0:
                 bad.append(f"volume {volume}")
-            bad += texture_wrong(path, reader, seen, uvs) if textured else colors_wrong(path, seen, ply_colors)
+            if textured and ending == ".ply" and b"TextureFile" not in path.read_bytes()[:4096]:
+                # closed as it is, with colours at its vertices in the texture's place
+                bad += [] if seen.colors is not None else ["neither a texture nor colours"]
+            elif textured:
+                bad += texture_wrong(path, reader, seen, uvs)
+            else:
+                bad += colors_wrong(path, seen, ply_colors)
             if uvs is None:
                 uvs = seen.uvs
             wrong += [f"{name}: {line}" for line in bad]
