@@ -146,6 +146,9 @@ pub struct Line<'a> {
 impl<'a> Line<'a> {
     /// Opens the capture and reads every byte of it once, for its digest. Nothing is written.
     pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>, PipelineError> {
+        if let Some((key, problem, hint)) = config.mesh.problem() {
+            return Err(PipelineError::Settings { key, problem, hint: hint.into() });
+        }
         let mut capture = capture::open(Path::new(&config.capture.path), &capture_options(config))?;
         set_aside(&mut capture, config.capture.fit_views)?;
         let digest = capture_digest(&capture)?;

@@ -65,6 +65,9 @@ impl Display for Against {
 struct Whole<'a> {
     #[serde(flatten)]
     report: &'a CheckReport,
+    /// Why the texture was not looked at.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    texture_problem: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     against: Option<&'a Against>,
 }
@@ -79,9 +82,12 @@ const UNKNOWN_PX: u32 = 1024;
 
 /// The mesh, and its texture coordinates measured. A texture that cannot be understood is no reason not to check
 /// the mesh.
-fn load_whole(path: &Path) -> Result<(Mesh, Option<UvReport>), Ending> {
+fn load_whole(path: &Path) -> Result<(Mesh, Result<Option<UvReport>, String>), Ending> {
     let bytes = io::read_bytes(path, &Limits::default())?;
-    let Ok(whole) = read_whole(&bytes, path) else { return Ok((load(path)?, None)) };
+    let whole = match read_whole(&bytes, path) {
+        Ok(whole) => whole,
+        Err(e) => return Ok((load(path)?, Err(e.to_string()))),
+    };
     let uv = whole.atlas.map(|mut atlas| {
         if atlas.width == 0 || atlas.height == 0 {
             let size = whole.texture.and_then(|t| picture_size(&t, path));
@@ -89,7 +95,7 @@ fn load_whole(path: &Path) -> Result<(Mesh, Option<UvReport>), Ending> {
         }
         uv_check(&weld(&whole.mesh), &atlas)
     });
-    Ok((whole.mesh, uv))
+    Ok((whole.mesh, Ok(uv)))
 }
 
 /// Size of the picture beside a file.
@@ -115,6 +121,7 @@ pub(super) fn go(
 ) -> Result<Exit, Ending> {
     let config = common.resolve(None, None, &[])?;
     let (mesh, uv) = load_whole(path)?;
+    let (uv, problem) = uv.map_or_else(|e| (None, Some(e)), |uv| (uv, None));
     let unit_m = config.capture.unit_m;
     let report = CheckReport { uv, ..check(&mesh, unit_m) };
     let bars: Vec<&str> = require.iter().map(String::as_str).collect();
@@ -124,10 +131,14 @@ pub(super) fn go(
     }
     let against = against.map(|other| compare(&mesh, other, seen_by, unit_m)).transpose()?;
     let text = if common.json {
-        let whole = Whole { report: &report, against: against.as_ref() };
+        let whole = Whole { report: &report, texture_problem: problem.as_deref(), against: against.as_ref() };
         format!("{}\n", serde_json::to_string(&whole).unwrap_or_default())
     } else {
-        let uv = report.uv.as_ref().map(|uv| format!("\ntexture\n{uv}")).unwrap_or_default();
+        let uv = match (&report.uv, &problem) {
+            (Some(uv), _) => format!("\ntexture\n{uv}"),
+            (None, Some(e)) => format!("texture              NOT LOOKED AT: {e}\n"),
+            (None, None) => String::new(),
+        };
         format!("{report}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
     };
     say(&text)?;

@@ -109,8 +109,10 @@ impl Work<'_> {
             ("baseline" | "tface", None) if ending == "th" => write(out, &published(line, self.until)?),
             ("mesh" | "metrics" | "render", Some(format)) if line.order(self.until).contains(&"mesh") => {
                 let stem = out.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
-                let files =
-                    line.read_product()?.files(format, &line.export(), line.mesh_config(), stem)?.files;
+                let exported =
+                    line.read_product()?.files(format, &line.export(), line.mesh_config(), stem)?;
+                exported.warnings.iter().for_each(|w| run.warn("mesh", w));
+                let files = exported.files;
                 // the mesh names its pictures: it comes last, and under the name that was asked for
                 for (name, bytes) in files.iter().skip(1).rev() {
                     write(&out.with_file_name(name), bytes)?;

@@ -140,7 +140,7 @@ enum Command {
         /// Degree of view-dependent colour in the GLB: 0, 1 or 2
         #[arg(long, value_name = "DEGREE")]
         lobes: Option<String>,
-        /// Put the detail that simplification takes into a normal map (GLB)
+        /// Put the detail that simplification takes into a normal map; the GLB's material is lit then
         #[arg(long)]
         normal_map: bool,
         /// Leave the surface open where the frames cut the body
@@ -181,7 +181,7 @@ With --fit or --correct, some training views must be set aside before anything i
     Ensemble {
         #[command(flatten)]
         place: Place,
-        /// Whose views: baseline, tface, volume, raycast
+        /// Whose views: baseline, tface, volume, raycast, textured
         #[arg(long, value_name = "LIST")]
         members: Option<String>,
         /// Their shares, in that order; together 1

@@ -149,6 +149,49 @@ pub(super) const KEYS: &[Key] = &[
 ];
 
 impl MeshConfig {
+    /// Texels of a picture; 0 without a texture.
+    pub fn texels(&self) -> u64 {
+        u64::from(self.texture_px).pow(2)
+    }
+
+    /// Pictures of a texture: colour, normals, lobes.
+    pub fn pictures(&self) -> u64 {
+        let lobes = if self.lobes == 0 { 0 } else { (u64::from(self.lobes) + 1).pow(2) };
+        1 + u64::from(self.normal_map) + lobes
+    }
+
+    /// What the ranges of single keys cannot say: a key, its problem, and the way out.
+    pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
+        let px = self.texture_px;
+        if px == 0 {
+            let asked = [
+                (self.lobes > 0, "mesh.lobes"),
+                (self.normal_map, "mesh.normal_map"),
+                (self.exr, "mesh.exr"),
+            ];
+            return asked.iter().find(|(on, _)| *on).map(|(_, key)| {
+                let problem = "asks for a picture, but `mesh.texture_px` is 0".to_owned();
+                (*key, problem, "set `mesh.texture_px`, to 2048 for example")
+            });
+        }
+        if px < 64 || self.gutter_px > px / 8 {
+            let problem = format!("is {px}: no room for a gutter of {} texels", self.gutter_px);
+            let hint = "it must be 0, or at least 64 and eight times `mesh.gutter_px`";
+            return Some(("mesh.texture_px", problem, hint));
+        }
+        if self.lobes > 0 && self.texture_view == TextureView::Normal {
+            let problem = "needs the views of cameras, but `mesh.texture_view` is normal".to_owned();
+            return Some(("mesh.lobes", problem, "set `mesh.texture_view` to cameras"));
+        }
+        // held as floats while they are baked
+        let pictures = self.pictures();
+        let gib = (self.texels() * 21 * pictures) >> 30;
+        (gib > 16).then(|| {
+            let problem = format!("is {px}: {pictures} pictures of that size take {gib} GiB to bake");
+            ("mesh.texture_px", problem, "lower it, or `mesh.lobes`")
+        })
+    }
+
     /// The values a preset starts with.
     pub fn preset(preset: Preset) -> MeshConfig {
         MeshConfig {

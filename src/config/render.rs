@@ -92,7 +92,8 @@ pub(super) const KEYS: &[Key] = &[
     ),
     Key::word(
         "method",
-        "A list of baseline, tface, volume (I-Face's field) and raycast (rays at its mesh, learned colour).",
+        "A list of baseline, tface, volume (I-Face's field), raycast (rays at its mesh, learned colour) and textured \
+         (head.glb as a viewer shows it).",
     ),
     Key::number("orbit_views", "Views of an orbit around the head.", 1.0, 10_000.0),
     Key::number("samples", "Rays along each side of a pixel on an edge of the mesh.", 1.0, 8.0),

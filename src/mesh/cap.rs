@@ -77,7 +77,9 @@ impl Cap {
         let before = mesh.triangles.len();
         let capped: Vec<bool> = mesh.positions.iter().map(|&p| self.holds(p)).collect();
         mesh.triangles.retain(|t| !t.iter().all(|&i| capped[i as usize]));
-        before - mesh.triangles.len()
+        let removed = before - mesh.triangles.len();
+        super::clean::compact(mesh);
+        removed
     }
 
     /// Closes answers of a field at `points`: `max(f, d)` and its gradient.

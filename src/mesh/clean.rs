@@ -217,7 +217,7 @@ fn is_within(point: Vec3, mesh: &Mesh, piece_of: &[u32], keep: &[bool]) -> bool 
 }
 
 /// Drops vertices no triangle uses.
-fn compact(mesh: &mut Mesh) {
+pub(super) fn compact(mesh: &mut Mesh) {
     let mut to = vec![u32::MAX; mesh.positions.len()];
     mesh.triangles.iter().flatten().for_each(|&v| to[v as usize] = 0);
     for (next, slot) in to.iter_mut().filter(|s| **s == 0).enumerate() {

@@ -56,12 +56,13 @@ impl MeshReport {
         Aabb { min, max }
     }
 
-    /// What a person should hear about, one sentence each.
-    pub fn warnings(&self) -> Vec<String> {
+    /// What a person should hear about, one sentence each; `cap`: has the cap stayed?
+    pub fn warnings(&self, cap: bool) -> Vec<String> {
         let mut out = Vec::new();
         if self.capped > 0 {
+            let state = if cap { "was closed by a cap" } else { "is open" };
             out.push(format!(
-                "the surface was closed by a cap where the kept region ends ({} nodes): the frames cut the body there, or the box is too small",
+                "the surface {state} where the kept region ends ({} nodes): the frames cut the body there, or the box is too small",
                 self.capped
             ));
         }
@@ -278,7 +279,7 @@ mod tests {
         }
         // 4/3 π 0.7³ = 1.4368; inscribed, so a little less.
         assert!((1.43..1.4368).contains(&report.volume), "{}", report.volume);
-        assert!(report.warnings().is_empty(), "{:?}", report.warnings());
+        assert!(report.warnings(true).is_empty(), "{:?}", report.warnings(true));
     }
 
     #[test]
@@ -307,7 +308,7 @@ mod tests {
         let f = |p: Vec3| (p.x.hypot(p.z) - 0.3).max(p.y - 0.5);
         let (mesh, report) = mesh_of(f, &coarse()).unwrap();
         assert!(report.topology.is_solid());
-        assert!(report.capped > 0 && report.warnings().len() == 1);
+        assert!(report.capped > 0 && report.warnings(true).len() == 1);
         let low = mesh.bounds().min.y;
         assert!(low >= -1.0 && low < -1.0 + 1e-3 * report.cell_size);
         let middle = (0..mesh.positions.len())

@@ -74,7 +74,8 @@ impl Line<'_> {
         warnings.extend(done.warnings());
         report.insert("atlas".into(), json!(done));
 
-        let asset_from_world = export.asset_from_world(&world);
+        // as `Product::files` turns it
+        let asset_from_world = export.asset_from_world(&mesh.transformed(&world_from_scene));
         let config = BakeConfig {
             side: c.texture_samples,
             gutter_px: c.gutter_px,
@@ -123,7 +124,7 @@ impl Line<'_> {
         };
         let pictures = Pictures { atlas: laid, color, normal, lobes: lobes(&baked, asset_from_world) };
         let product = Product { mesh: mesh.transformed(&world_from_scene), pictures: Some(pictures) };
-        Ok(Finished { product, linear: Some(baked.color), report, warnings })
+        Ok(Finished { product, linear: c.exr.then_some(baked.color), report, warnings })
     }
 }
 

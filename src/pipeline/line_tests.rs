@@ -2,8 +2,9 @@
 
 use super::*;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
-use crate::config::{Background, MeshFormat, Method, Preset};
+use crate::config::{Background, MeshFormat, MeshFrame, Method, Preset};
 use crate::run::{Quiet, Stop};
+use serde_json::json;
 use std::sync::Arc;
 
 /// The demo head's formula in the place of all learned fields.
@@ -105,6 +106,88 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     let page = String::from_utf8(bytes("report.html")).unwrap();
     assert!(page.contains("<figcaption>ensemble</figcaption>") && run.path("cameras.json").is_file());
     assert!(bytes("mesh/head.glb").starts_with(b"glTF"));
+}
+
+/// The product looks like the whole surface, from cameras it was not baked for, in whatever frame it is exported;
+/// what depends on the view is in its lobes.
+#[test]
+fn the_textured_head_looks_like_the_field_it_was_baked_from() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 96, height: 120, train: 12, test: 2, seed: 1 };
+    let root = dir.path().join("head");
+    write_capture(&root, &options).unwrap();
+    let mut config = draft(&root);
+    config.mesh.resolution = 96;
+    config.mesh.triangles = 8000;
+    config.mesh.texture_px = 512;
+    config.mesh.format = vec![MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply];
+    config.render.background = Background::None;
+    config.render.method = vec![Method::Raycast, Method::Textured];
+    config.ensemble.members = Vec::new();
+    let mut errors = Vec::new();
+    for (lobes, frame) in [(0, MeshFrame::Dataset), (1, MeshFrame::Dataset), (1, MeshFrame::Head)] {
+        config.mesh.lobes = lobes;
+        config.mesh.normal_map = lobes > 0;
+        config.mesh.frame = frame;
+        let run = quiet(&dir.path().join(errors.len().to_string()));
+        let line = Line::open(&config, &run, true).unwrap();
+        line.remember("render").unwrap();
+        line.mask().unwrap();
+        let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
+        let mesh = line.mesh(&exact).unwrap().summary;
+        assert_eq!((&mesh["closed"], &mesh["triangles"]), (&json!(true), &json!(8000)));
+        // two texels a millimetre: the step across a seam is below a byte
+        assert!(mesh["steps"]["seam_step_255"].as_f64().unwrap() < 1.0, "{mesh}");
+        line.render(&exact).unwrap();
+        for ending in ["glb", "obj", "mtl", "png", "ply"] {
+            assert!(run.path(format!("mesh/head.{ending}")).is_file(), "{ending}");
+        }
+        let picture = |method: &str| {
+            pictures::read(&run.path(format!("render/{method}/012.png")), config.render.format).unwrap()
+        };
+        let (whole, textured) = (picture("raycast"), picture("textured"));
+        let (mut sum, mut n) = (0.0, 0);
+        for (a, b) in whole.data.as_chunks::<4>().0.iter().zip(textured.data.as_chunks::<4>().0) {
+            if a[3] == 1.0 && b[3] == 1.0 {
+                sum += (0..3).map(|k| f64::from((a[k] - b[k]).powi(2))).sum::<f64>();
+                n += 3;
+            }
+        }
+        assert!(n > 3000);
+        errors.push((sum / f64::from(n)).sqrt());
+    }
+    // the stripes swing by 0.1, the view's part by 0.05
+    assert!(errors[0] < 0.025, "{errors:?}");
+    assert!(errors[1] < 0.6 * errors[0] && (errors[1] - errors[2]).abs() < 1e-3, "{errors:?}");
+}
+
+#[test]
+fn a_surface_may_stay_open_and_without_a_texture() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 96, height: 120, train: 12, test: 2, seed: 1 };
+    let root = dir.path().join("head");
+    write_capture(&root, &options).unwrap();
+    let mut config = draft(&root);
+    config.mesh.resolution = 64;
+    config.mesh.triangles = 3000;
+    config.mesh.texture_px = 0;
+    config.mesh.cap = false;
+    config.render.method = vec![Method::Textured];
+    config.ensemble.members = Vec::new();
+    let run = quiet(dir.path());
+    let line = Line::open(&config, &run, true).unwrap();
+    line.remember("render").unwrap();
+    line.mask().unwrap();
+    let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
+    let mesh = line.mesh(&exact).unwrap().summary;
+    // the demo's neck runs out of the box
+    assert_eq!(mesh["closed"], json!(mesh["report"]["capped"] == 0), "{mesh}");
+    assert_eq!(mesh["texture_px"], 0);
+    let error = line.render(&exact).unwrap_err();
+    assert!(error.hint().contains("--texture"), "{error}");
+    config.mesh.lobes = 1;
+    let error = Line::open(&config, &run, true).err().unwrap();
+    assert!(error.to_string().contains("mesh.lobes") && error.hint().contains("texture_px"), "{error}");
 }
 
 /// A radiance field that is one colour, and counts the views it was asked for.

@@ -57,7 +57,7 @@ impl Line<'_> {
                 }
             };
             let (mut surface, report) = extracted.map_err(failed)?;
-            report.warnings().iter().for_each(|w| stage.warn(w));
+            report.warnings(c.cap).iter().for_each(|w| stage.warn(w));
             let cap = Cap::of(&surface, report.bounds(), report.cell_size);
             if let Some(cap) = &cap {
                 if c.cap {
@@ -66,19 +66,20 @@ impl Line<'_> {
                     cap.open(&mut surface);
                 }
             }
-            let finished =
-                self.finish(&surface, cap.as_ref(), report.cell_size, &scene, field, stage.monitor());
-            let Finished { product, linear, report: steps, warnings } = finished.map_err(failed)?;
-            warnings.iter().for_each(|w| stage.warn(w));
-
+            // what took longest is kept, whatever comes of the rest
             let world = surface.transformed(&scene.scene_from_world.inverse());
             let bytes = ply::to_ply(&world).map_err(|e| {
                 let hint = e.hint();
                 Failure::cannot(e, hint)
             })?;
             io::write_atomic(&stage.folder().join("surface.ply"), &bytes)?;
+            let finished =
+                self.finish(&surface, cap.as_ref(), report.cell_size, &scene, field, stage.monitor());
+            let Finished { product, linear, report: steps, warnings } = finished.map_err(failed)?;
+            warnings.iter().for_each(|w| stage.warn(w));
+
             product.save(&stage.folder().join("parts"))?;
-            if let Some(linear) = linear.filter(|_| c.exr) {
+            if let Some(linear) = linear {
                 let (w, h) = (linear.width, linear.height);
                 let plane = |k: usize| linear.data.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>();
                 let [r, g, b] = [plane(0), plane(1), plane(2)];

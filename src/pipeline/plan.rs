@@ -104,7 +104,10 @@ impl Line<'_> {
             "mesh" => {
                 settings.insert("capture.unit_m".into(), self.config.capture.unit_m.to_string());
                 // a few triangles per cell of a closed surface, three formats
-                needs_bytes += (self.config.mesh.resolution as u64).pow(2) * 12 * 100;
+                let c = &self.config.mesh;
+                needs_bytes += (c.resolution as u64).pow(2) * 12 * 100;
+                // pictures as parts and inside the files, and the float one
+                needs_bytes += c.texels() * (6 * c.pictures() + 3 + if c.exr { 12 } else { 0 });
             }
             "render" => {
                 if !self.path_digest.is_empty() {

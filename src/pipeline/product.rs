@@ -103,7 +103,7 @@ impl Product {
         let wrong = |what: &str| {
             Failure::cannot(
                 format!("`{}`: {what}", path.display()),
-                "make the mesh again: `tiface mesh --fresh mesh`",
+                "make the mesh again: `tiface mesh RUN --fresh mesh`",
             )
         };
         if metadata.get("format").map(String::as_str) != Some(FORMAT) {
@@ -165,8 +165,10 @@ impl Product {
         config: &MeshConfig,
         stem: &str,
     ) -> Result<Exported, Failure> {
+        // an unlit material shows no normal map: who asks for one wants light
+        let unlit = self.pictures.as_ref().is_none_or(|p| p.normal.is_none());
         let options =
-            ExportOptions { name: export.name.clone(), up: export.up, unit_m: export.unit_m, unlit: true };
+            ExportOptions { name: export.name.clone(), up: export.up, unit_m: export.unit_m, unlit };
         // PLY keeps the dataset's world whatever the frame
         let (mesh, options) = match (format, export.frame) {
             (MeshFormat::Ply, _) | (_, MeshFrame::Dataset) => (self.mesh.clone(), options),
@@ -188,14 +190,12 @@ impl Product {
             (None, MeshFormat::Obj) => alone(obj::to_obj(&mesh, &options)),
             (Some(p), _) => {
                 let mut textured = Textured::new(&mesh, &p.atlas, &p.color);
-                if format == MeshFormat::Glb {
-                    textured.normal = p.normal.as_ref();
-                    if let Some(lobes) = &p.lobes {
-                        let name = |k: usize| format!("lobe {k}");
-                        let all = lobes.pictures.iter().enumerate();
-                        textured.lobes = all.map(|(k, picture)| Lobe { name: name(k), picture }).collect();
-                        textured.extras = extras(lobes);
-                    }
+                textured.normal = p.normal.as_ref();
+                if let Some(lobes) = &p.lobes {
+                    let name = |k: usize| format!("lobe {k}");
+                    let all = lobes.pictures.iter().enumerate();
+                    textured.lobes = all.map(|(k, picture)| Lobe { name: name(k), picture }).collect();
+                    textured.extras = extras(lobes);
                 }
                 let picture = match config.texture_format {
                     TextureFormat::Png => PictureFormat::Png,

@@ -95,7 +95,7 @@ impl Line<'_> {
         let pictures = product.pictures.ok_or_else(|| {
             Failure::cannot(
                 "the mesh has no texture to be shown",
-                "make one: `tiface mesh --fresh mesh --texture 2048`",
+                "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
             )
         })?;
         Ok((product.mesh.transformed(&scene.scene_from_world), pictures))

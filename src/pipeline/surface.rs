@@ -95,7 +95,8 @@ impl Radiance for crate::tface::TFace {
     }
 }
 
-/// The demo head itself, as a perfectly learned field would be; painted in one colour.
+/// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little brighter seen
+/// from one side.
 pub struct Exact {
     /// Where the scene sits.
     pub world_from_scene: Similarity,
@@ -113,12 +114,25 @@ impl Surface for Exact {
         (self.sdf(points), points.iter().map(gradient).collect())
     }
 
-    fn color(&self, points: &[Vec3], _: &[Vec3], _: &[Vec3]) -> Vec<[f32; 3]> {
-        vec![[0.6, 0.5, 0.4]; points.len()]
+    fn color(&self, points: &[Vec3], _: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        let paint = |(p, d): (&Vec3, &Vec3)| {
+            let stripes = (9.0 * *p).to_array().map(f32::sin);
+            [0.6 + 0.1 * stripes[0] - 0.05 * d.x, 0.5 + 0.1 * stripes[1], 0.4 + 0.1 * stripes[2]]
+        };
+        points.iter().zip(directions).map(paint).collect()
     }
 
-    fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
-        vec![[0.6, 0.5, 0.4]; directions.len()]
+    fn colors(
+        &self,
+        points: &[Vec3],
+        normals: &[Vec3],
+        counts: &[u32],
+        directions: &[Vec3],
+    ) -> Vec<[f32; 3]> {
+        let each = |v: &[Vec3]| -> Vec<Vec3> {
+            v.iter().zip(counts).flat_map(|(v, &n)| std::iter::repeat_n(*v, n as usize)).collect()
+        };
+        self.color(&each(points), &each(normals), directions)
     }
 
     fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {

@@ -172,10 +172,15 @@ mod tests {
     fn mip_levels_of_a_chart_keep_its_colour() {
         let (mut image, covered) = charts();
         fill(&mut image, &covered, 8);
-        // box-filtered four times, a texel of the red chart's border is 16 × 16 texels, columns 16..32: all red
-        // within the gutter, and no green from the other chart before column 28
-        let mean: f32 = (16..28).map(|x| image.pixel(x, 5)[1]).sum();
-        assert_eq!(mean, 0.0);
+        // level 3: a texel is the mean of 8 × 8; columns 16..24 hold the red chart's border and its gutter
+        let mean = |texel: u32, channel: usize| -> f32 {
+            let all = (0..64).map(|i| image.pixel(8 * texel + i % 8, 8 + i / 8)[channel]);
+            all.sum::<f32>() / 64.0
+        };
+        assert!((mean(2, 0) - 1.0).abs() < 1e-6 && mean(2, 1) == 0.0);
+        // level 4 reaches four columns beyond the gutter: still three quarters its own
+        let wide = 0.5 * (mean(2, 0) + mean(3, 0));
+        assert!(wide > 0.75, "{wide}");
     }
 
     #[test]

@@ -6,7 +6,8 @@
 //! ([`lobes`]), and the field's normal as a picture of normals
 //! ([`tangent_space`]). Gaps are filled by [`fill`].
 //!
-//! The picture is baked in bands of rows: memory is bounded whatever the texture's size.
+//! The picture is baked in bands of rows, so that samples never lie in memory together: twelve bytes a texel for
+//! colour, normals and each lobe are what it takes.
 
 mod cover;
 mod detail;
@@ -126,11 +127,11 @@ pub fn bake(
     let eyes = Eyes { cameras, bvh: &bvh, clearance: 0.5 * config.reach };
     let bands = Bands::new(atlas, ROWS);
     for band in 0..bands.len() {
-        if monitor.stop() {
-            return Err(MeshError::Stopped);
-        }
         let samples = bands.samples(atlas, band, config.side);
         for own in whole_texels(&samples) {
+            if monitor.stop() {
+                return Err(MeshError::Stopped);
+            }
             let flat = on_triangles(mesh, own);
             let points = settle(&flat, config.reach, learned);
             let seen = match config.viewer {
