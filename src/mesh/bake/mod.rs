@@ -1,10 +1,10 @@
 //! Learned colour becomes texels.
 //!
-//! Every texel that a chart covers is looked at through several samples ([`cover`]); each sample moves onto the
+//! Every texel that a chart covers is looked at through several samples (`cover`); each sample moves onto the
 //! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
-//! they see in linear light ([`light`]). What the cameras see differently can be kept as a few lobes a texel
+//! they see in linear light (`light`). What the cameras see differently can be kept as a few lobes a texel
 //! ([`lobes`]), and the field's normal as a picture of normals
-//! ([`tangent_space`]). Gaps are filled by [`fill`].
+//! ([`tangent_space`]). Gaps are filled by `fill`.
 //!
 //! The picture is baked in bands of rows, so that samples never lie in memory together: twelve bytes a texel for
 //! colour, normals and each lobe are what it takes.
