@@ -3,7 +3,7 @@
 # readers say about our files. Nothing is skipped in silence; any failure fails the whole.
 #
 #     tools/test.sh            everything
-#     tools/test.sh --no-demo  without training the demo head (the readers then see the sphere alone)
+#     tools/test.sh --no-demo  without training the demo head (the readers then see the sphere and the globe)
 set -u -o pipefail
 cd "$(dirname "$0")/.."
 
