@@ -9,24 +9,14 @@
 
 #[path = "../tests/fields/mod.rs"]
 mod fields;
+mod process;
 
 use glam::Vec3;
-use std::time::Instant;
+use process::cpu_s;
 use tiface::geom::{Aabb, Mesh};
 use tiface::mesh::uv_check::{seams_facing, uv_check};
 use tiface::mesh::{AtlasConfig, MeshConfig, atlas, extract};
 use tiface::run::Quiet;
-
-/// User + system time of this process, seconds (Linux; wall time elsewhere).
-fn cpu_s() -> f64 {
-    let Ok(stat) = std::fs::read_to_string("/proc/self/stat") else {
-        static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
-        return START.get_or_init(Instant::now).elapsed().as_secs_f64();
-    };
-    let after = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
-    let field = |i: usize| after.split_whitespace().nth(i).and_then(|v| v.parse::<f64>().ok()).unwrap_or(0.0);
-    (field(11) + field(12)) / 100.0
-}
 
 fn head(resolution: usize) -> Mesh {
     let config = MeshConfig { resolution, ..MeshConfig::default() };

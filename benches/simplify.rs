@@ -12,11 +12,12 @@
 
 #[path = "../tests/fields/mod.rs"]
 mod fields;
+mod process;
 
 use glam::Vec3;
+use process::cpu_s;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Instant;
 use tiface::geom::Mesh;
 use tiface::mesh::{Placement, SimplifyConfig, Volume, check, marching, simplify};
 use tiface::run::Quiet;
@@ -25,13 +26,6 @@ use tiface::run::Quiet;
 const RUNS: usize = 5;
 
 /// CPU seconds of this thread so far; wall time where the system does not tell.
-fn cpu_s() -> f64 {
-    static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
-    let spent = std::fs::read_to_string("/proc/thread-self/schedstat").ok();
-    let ns = spent.and_then(|s| s.split(' ').next().and_then(|s| s.parse::<f64>().ok()));
-    ns.map_or_else(|| START.get_or_init(Instant::now).elapsed().as_secs_f64(), |ns| 1e-9 * ns)
-}
-
 static FIELD_NS: AtomicU64 = AtomicU64::new(0);
 
 /// The head with its gradient from the corners of a small tetrahedron: four values a point.

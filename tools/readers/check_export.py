@@ -21,6 +21,8 @@ import open3d
 import PIL.Image
 import trimesh
 
+from axes import turn_to_y_up
+
 
 class Seen(typing.NamedTuple):
     """What a reader made of a file."""
@@ -30,16 +32,6 @@ class Seen(typing.NamedTuple):
     colors: numpy.ndarray | None  # of vertices, 0..1
     uvs: numpy.ndarray | None  # [faces, 3, 2], v up
     picture: numpy.ndarray | None  # [height, width, 3], 8 bit
-
-
-def turn_to_y_up(up):
-    """The smallest rotation that brings `up` to +Y."""
-    up = numpy.asarray(up, float) / numpy.linalg.norm(up)
-    if up[1] < -1 + 1e-12:
-        return numpy.diag([1.0, -1.0, -1.0])
-    x, y, z = numpy.cross(up, [0, 1, 0])
-    skew = numpy.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return numpy.eye(3) + skew + skew @ skew / (1 + up[1])
 
 
 def with_trimesh(path):
