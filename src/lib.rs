@@ -20,6 +20,8 @@ pub mod capture;
 pub mod field;
 pub mod report;
 
+pub mod mask;
+
 pub mod tface;
 
 #[cfg(feature = "cpu")]

@@ -1,0 +1,23 @@
+//! Stage `mask`: which pixels are the head, from a few clicks.
+//!
+//! A click says "this is head" or "this is not". From clicks a hard mask is cut, a band around its
+//! outline is called unsure (the trimap), and the band's opacity is estimated from the photograph:
+//!
+//! ```text
+//! photograph + clicks → hard mask → trimap → soft alpha
+//! ```
+//!
+//! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unsure in a trimap.
+
+pub mod distance;
+
+/// One click of a person on a photograph.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Click {
+    /// Column, as a pixel index: 0 is the centre of the leftmost pixels (`prompts.json`'s convention).
+    pub x: f32,
+    /// Row, as a pixel index: 0 is the centre of the top pixels.
+    pub y: f32,
+    /// Is the head there?
+    pub head: bool,
+}
