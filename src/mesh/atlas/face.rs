@@ -1,12 +1,16 @@
 //! The face in one chart: what lies in front of a plane, as deep as it still lies flat.
 //!
 //! The library knows no costs of seams, so its charts meet anywhere, half of their seams where one looks first. Here
-//! the part of the surface around its foremost point, up to a plane across the direction the face looks, is taken out
-//! and flattened in one piece; the rim is the plane's contour, short and out of the way. The library divides the rest.
+//! the part of the surface around its foremost point, up to a plane across the direction the face looks, is taken out,
+//! flattened in one piece by a smooth copy, and relaxed to its true sizes; the rim is the plane's contour, short and
+//! out of the way. The rest is divided as any surface.
 
 use super::Refusal;
+use super::divide::divide;
 use super::flat::{Flat, twice_area};
 use super::library::{Flattened, STRETCHED, flatten};
+use super::relax::relax;
+use super::smooth::smoothed;
 use crate::geom::{Mesh, sorted_sides};
 use crate::run::Monitor;
 use glam::Vec3;
@@ -17,47 +21,48 @@ const DEEPEST: f32 = 0.5;
 const PLANES: usize = 16;
 
 /// Flattenings that may fail.
-const TRIES: usize = 3;
+const TRIES: usize = 8;
 
-/// Gaussian curvature beyond which the library halves a chart without a try is 3.
-const MOST_CURVED: f64 = 2.6;
+/// Rounds of smoothing for the copy that is flattened. With 30 a nose still folds, with 120 the ears of other heads do.
+const SMOOTHING: usize = 60;
+
+/// Most steps of relaxing.
+const RELAXING: usize = 200;
 
 /// The share of the surface that a face may have.
 const LARGEST: f64 = 0.3;
 
 /// Mean area stretch that a face may have: (r + 1/r) / 2, r being the scale of areas.
-const STRETCH: f64 = 1.15;
+const STRETCH: f64 = 1.05;
 
-/// The same of any one triangle: twice what other charts may have, for the nose.
+/// How many times smaller or larger than the rest a triangle of the smooth copy may be: relaxing evens it out.
 const FACE_STRETCHED: f32 = 2.0 * STRETCHED;
 
-const NONE: u32 = u32::MAX;
+pub(super) const NONE: u32 = u32::MAX;
 
-/// Flattens a mesh with its face in one chart, if there is one.
-pub(super) fn flatten_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<Flattened, Refusal> {
-    let mut tries = 0;
-    for inside in caps(mesh, front.normalize()) {
+/// Divides a mesh, with its face in one chart if there is a way.
+pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<Flattened, Refusal> {
+    for inside in caps(mesh, front.normalize()).take(TRIES) {
         let (face, number) = part(mesh, |t| inside[t as usize]);
-        let alone = flatten(&face, Some(&vec![0; face.triangles.len()]), FACE_STRETCHED, monitor)?;
-        let fits = matches!(&alone.charts[..], [one] if stretch(&face, one) <= STRETCH);
-        if fits {
-            let (rest, rest_number) = part(mesh, |t| !inside[t as usize]);
-            let mut whole = flatten(&rest, None, STRETCHED, monitor)?.renumbered(&rest_number);
-            let alone = alone.renumbered(&number);
-            whole.charts.extend(alone.charts);
-            whole.without.extend(alone.without);
-            return Ok(whole);
+        let whole = vec![0; face.triangles.len()];
+        let mut alone = flatten(&smoothed(&face, SMOOTHING), Some(&whole), FACE_STRETCHED, monitor)?;
+        let [chart] = &mut alone.charts[..] else { continue };
+        relax(&face, chart, RELAXING);
+        if stretch(&face, chart) > STRETCH {
+            continue;
         }
-        tries += 1;
-        if tries == TRIES {
-            break;
-        }
+        let (rest, rest_number) = part(mesh, |t| !inside[t as usize]);
+        let mut all = divide(&rest, monitor)?.renumbered(&rest_number);
+        let alone = alone.renumbered(&number);
+        all.charts.extend(alone.charts);
+        all.without.extend(alone.without);
+        return Ok(all);
     }
-    flatten(mesh, None, STRETCHED, monitor)
+    divide(mesh, monitor)
 }
 
 /// The triangles that are `wanted`, and which those were.
-fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>) {
+pub(super) fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>) {
     let number: Vec<u32> = (0..mesh.triangles.len() as u32).filter(|&t| wanted(t)).collect();
     let mut vertex = vec![NONE; mesh.positions.len()];
     let mut part = Mesh::default();
@@ -75,7 +80,7 @@ fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>) {
 }
 
 /// Mean of (r + 1/r) / 2 over a chart that has the area of its surface.
-fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
+pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
     let (mut sum, mut whole) = (0.0, 0.0);
     for (k, &t) in flat.triangles.iter().enumerate() {
         let area = area(mesh, t);
@@ -105,27 +110,19 @@ fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
         .collect();
     let areas: Vec<f64> = (0..count as u32).map(|t| area(mesh, t)).collect();
     let whole: f64 = areas.iter().sum();
-    let curvature = curvature(mesh);
     let foremost = (0..count).fold(0, |best, t| if depth[t] > depth[best] { t } else { best });
     let (high, low) = (depth[foremost], depth.iter().copied().fold(f32::INFINITY, f32::min));
-    let corners = mesh.triangles.clone();
     (1..=PLANES).rev().filter_map(move |i| {
         let plane = high - (high - low) * DEEPEST * i as f32 / PLANES as f32;
         let mut inside = cap(&beside, &depth, foremost as u32, plane);
         straighten(&beside, &mut inside);
         let share = (0..count).filter(|&t| inside[t]).map(|t| areas[t]).sum::<f64>() / whole;
-        // Of vertices with all of their triangles inside.
-        let mut cut = vec![false; curvature.len()];
-        (0..count)
-            .filter(|&t| !inside[t])
-            .for_each(|t| corners[t].iter().for_each(|&v| cut[v as usize] = true));
-        let inner = curvature.iter().zip(&cut).filter(|(_, cut)| !**cut).map(|(k, _)| k).sum::<f64>();
-        (share > 0.01 && share < LARGEST && inner.abs() < MOST_CURVED).then_some(inside)
+        (share > 0.01 && share < LARGEST).then_some(inside)
     })
 }
 
 /// Across the side from corner k to k + 1 of each triangle; [`NONE`] where there is not exactly one other.
-fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
+pub(super) fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
     let mut beside = vec![[NONE; 3]; mesh.triangles.len()];
     for run in sorted_sides(&mesh.triangles).chunk_by(|a, b| a.0 == b.0) {
         if let [(_, a), (_, b)] = *run {
@@ -134,19 +131,6 @@ fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
         }
     }
     beside
-}
-
-/// For each vertex 2π less the angles around it (Descartes): the integral of the Gaussian curvature.
-fn curvature(mesh: &Mesh) -> Vec<f64> {
-    let mut sum = vec![0.0; mesh.positions.len()];
-    for (t, corners) in mesh.triangles.iter().enumerate() {
-        let p = mesh.corners(t as u32);
-        for k in 0..3 {
-            let (a, b) = (p[(k + 1) % 3] - p[k], p[(k + 2) % 3] - p[k]);
-            sum[corners[k] as usize] += f64::from(a.cross(b).length().atan2(a.dot(b)));
-        }
-    }
-    sum.iter().map(|&s| if s > 0.0 { std::f64::consts::TAU - s } else { 0.0 }).collect()
 }
 
 /// Gives `number` to the first triangle and all without one that hang together with it; how many they are.
@@ -182,7 +166,10 @@ fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<boo
             }
         }
     }
-    piece.iter().map(|&p| p != outside).collect()
+    // of that only what hangs together with the foremost triangle: other pieces have charts of their own
+    let mut own: Vec<u32> = piece.iter().map(|&p| if p == outside { behind } else { NONE }).collect();
+    flood(beside, &mut own, foremost, 0);
+    own.iter().map(|&p| p == 0).collect()
 }
 
 /// Takes teeth off the rim: triangles with two neighbours on the other side change it.
@@ -236,7 +223,7 @@ mod tests {
     fn the_face_is_one_chart_and_the_rest_the_librarys() {
         let mesh = ball();
         assert!(mesh.is_closed());
-        let flat = flatten_around(&mesh, Vec3::new(0.0, 0.0, 3.0), &Quiet).unwrap();
+        let flat = divide_around(&mesh, Vec3::new(0.0, 0.0, 3.0), &Quiet).unwrap();
         let mut seen = vec![0; mesh.triangles.len()];
         flat.charts.iter().flat_map(|c| &c.triangles).for_each(|&t| seen[t as usize] += 1);
         assert!(seen.iter().all(|&n| n == 1) && flat.without.is_empty());

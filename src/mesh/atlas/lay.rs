@@ -3,11 +3,13 @@
 //! Triangles that are flipped, cover others, or are too thin for 32-bit coordinates leave their chart and become
 //! half squares of their own. What is left of a chart is packed again, part by part.
 
-use super::face::flatten_around;
+use super::divide::divide;
+use super::face::{divide_around, neighbours, part};
 use super::flat::{Flat, height};
-use super::library::{STRETCHED, flatten};
+use super::library::Flattened;
 use super::overlap::{overlaps, turn};
 use super::pack::pack;
+use super::planar::planar;
 use super::{AtlasConfig, Laid, Refusal, Unwrap};
 use crate::geom::{Atlas, Mesh};
 use crate::run::Monitor;
@@ -25,10 +27,17 @@ pub(super) struct Library;
 
 impl Unwrap for Library {
     fn unwrap(&self, mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result<Laid, Refusal> {
-        let flattened = match config.front {
-            Some(front) => flatten_around(mesh, front, monitor)?,
-            None => flatten(mesh, None, STRETCHED, monitor)?,
-        };
+        let flat = planar(mesh, &neighbours(mesh));
+        let mut taken = vec![false; mesh.triangles.len()];
+        flat.iter().flat_map(|f| &f.triangles).for_each(|&t| taken[t as usize] = true);
+        let (rest, number) = part(mesh, |t| !taken[t as usize]);
+        let mut flattened = match config.front {
+            _ if rest.triangles.is_empty() => Flattened { charts: Vec::new(), without: Vec::new() },
+            Some(front) => divide_around(&rest, front, monitor)?,
+            None => divide(&rest, monitor)?,
+        }
+        .renumbered(&number);
+        flattened.charts.extend(flat);
         let most = 64.max(mesh.triangles.len() / 20);
         if flattened.charts.len() > most {
             let found = flattened.charts.len();

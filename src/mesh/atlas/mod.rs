@@ -9,13 +9,17 @@
 //! is looked at, exactly, before an atlas is returned.
 
 pub(super) mod apart;
+mod divide;
 mod face;
 mod flat;
 mod lay;
 mod library;
 pub(super) mod overlap;
 mod pack;
+mod planar;
 mod raster;
+mod relax;
+mod smooth;
 mod squares;
 
 use super::MeshError;
