@@ -151,7 +151,7 @@ impl Session {
     pub(super) fn engine(&self) -> String {
         match &self.engine {
             Engine::Tract(_) => tract::NAME.into(),
-            Engine::Ort(model) => model.engine(),
+            Engine::Ort(_) => ort::NAME.into(),
         }
     }
 
@@ -251,8 +251,14 @@ fn engine_error(
              (`pip install onnxruntime` brings one){narrow}"
         )
     };
-    let engine = if runtime { "ONNX Runtime".into() } else { tract::NAME.into() };
-    MaskNetworkError::Engine { path: path.into(), engine, doing, problem: in_one_line(&problem), hint }
+    let engine = if runtime { ort::NAME } else { tract::NAME };
+    MaskNetworkError::Engine {
+        path: path.into(),
+        engine: engine.into(),
+        doing,
+        problem: in_one_line(&problem),
+        hint,
+    }
 }
 
 /// What an engine says, without line breaks and not endless.

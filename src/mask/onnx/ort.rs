@@ -9,6 +9,9 @@ use ort::value::Tensor;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
+/// The engine's name, as recorded with a run; its version is that of the library, recorded too.
+pub(super) const NAME: &str = "ONNX Runtime";
+
 /// A process can hold one ONNX Runtime, for good.
 static LOADED: Mutex<Option<Runtime>> = Mutex::new(None);
 
@@ -82,7 +85,6 @@ impl Runtime {
 pub(super) struct Model {
     // its bindings allow one run at a time; the run itself spreads over the threads
     session: Mutex<ort::session::Session>,
-    engine: String,
 }
 
 impl Model {
@@ -96,13 +98,7 @@ impl Model {
             builder.commit_from_memory(bytes)
         })()
         .map_err(|e| e.to_string())?;
-        let engine = format!("ONNX Runtime ({})", runtime.path.display());
-        Ok(Model { session: Mutex::new(session), engine })
-    }
-
-    /// Name of the engine, with its library.
-    pub(super) fn engine(&self) -> String {
-        self.engine.clone()
+        Ok(Model { session: Mutex::new(session) })
     }
 
     /// One run.

@@ -10,8 +10,8 @@
 //! - constants ask for an array beyond [`MAX_ELEMENTS`],
 //! - it holds functions, training graphs or sparse weights, which no file of these networks does.
 //!
-//! Extents computed from other constants are not followed here: the built-in engine bounds those once
-//! it knows every shape of the graph.
+//! Constants are followed through the few operators that extents are computed with. What depends on the
+//! picture's shape is not: the built-in engine bounds that once it knows every shape of the graph.
 
 use super::wire::{Broken, Field, Message, Value};
 use std::collections::{HashMap, HashSet};
@@ -295,6 +295,7 @@ impl<'a> Walk<'a> {
             for attribute in &node.attributes {
                 self.attribute(*attribute, node, outer)?;
             }
+            self.follow(node);
             self.sizes(node)?;
             let scope = outer.last_mut().expect("pushed above");
             for name in node.outputs.iter().filter(|n| !n.is_empty()) {
@@ -392,6 +393,31 @@ impl<'a> Walk<'a> {
             self.small.insert(name, numbers);
         }
         Ok(())
+    }
+
+    /// Computes small constants from small constants, as an engine will.
+    fn follow(&mut self, node: &Node<'a>) {
+        let known: Option<Vec<&Vec<f64>>> = node.inputs.iter().map(|name| self.small.get(name)).collect();
+        let Some(known) = known.filter(|k| !k.is_empty()) else { return };
+        let each = |f: fn(f64, f64) -> f64| {
+            let (a, b) = (known.first()?, known.get(1)?);
+            let n = a.len().max(b.len());
+            let at = |v: &[f64], i: usize| if v.len() == 1 { Some(v[0]) } else { v.get(i).copied() };
+            (0..n).map(|i| Some(f(at(a, i)?, at(b, i)?))).collect::<Option<Vec<f64>>>()
+        };
+        let made = match node.op {
+            "Identity" | "Cast" | "Unsqueeze" | "Squeeze" | "Reshape" => Some(known[0].clone()),
+            "Concat" => Some(known.iter().flat_map(|v| v.iter().copied()).collect())
+                .filter(|v: &Vec<f64>| v.len() <= SMALL),
+            "Add" => each(|a, b| a + b),
+            "Sub" => each(|a, b| a - b),
+            "Mul" => each(|a, b| a * b),
+            "Pow" => each(f64::powf),
+            _ => None,
+        };
+        if let (Some(made), Some(name)) = (made, node.outputs.first()) {
+            self.small.insert(name, made);
+        }
     }
 
     /// Refuses a node whose constants ask for an array no picture needs.

@@ -135,8 +135,11 @@ fn anyhow_from(problem: &str) -> TractError {
     TractError::msg(problem.to_string())
 }
 
-/// The first and the innermost of what the engine says: where, and why.
+/// Where and why, in a sentence: the first of what the engine says, and the beginning of the innermost; the
+/// pages of shape algebra between them go to the log.
 fn sentence(error: &TractError) -> String {
+    tracing::debug!(target: "tract", "{error:#}");
     let (first, root) = (error.to_string(), error.root_cause().to_string());
-    if first == root { first } else { format!("{first}: {root}") }
+    let why = root.split([':', '[', '\n']).next().unwrap_or_default().trim();
+    if first.contains(why) { first } else { format!("{first}: {why}") }
 }
