@@ -187,7 +187,7 @@ impl Networks {
     ///
     /// Two measured terms: what grows with the pixels, and attention, which grows with their square: `T²` for
     /// `T` cells of 16 × 16 pixels (SAM ViT-B 2.3 GB at 1024², ViTMatte-S 0.92 GB at 768 × 1024; this says
-    /// 3.2 and 1.2). Networks without attention over the whole picture are overestimated.
+    /// 3.4 and 1.2). Networks without attention over the whole picture are overestimated.
     pub fn bytes_per_photo(&self, width: u32, height: u32) -> u64 {
         let sam = self.sam.as_ref().map_or(0, |sam| {
             let pixels = (sam.side as u64).pow(2);

@@ -19,11 +19,6 @@ mod scan;
 mod tract;
 mod wire;
 
-#[cfg(test)]
-pub(super) mod made;
-#[cfg(test)]
-pub(super) mod tests;
-
 pub use self::contract::Contract;
 pub use self::error::MaskNetworkError;
 pub use self::ort::Runtime;
@@ -88,7 +83,7 @@ pub(super) struct SessionLimits {
 }
 
 enum Engine {
-    Tract(tract::Model),
+    Tract(Box<tract::Model>),
     Ort(ort::Model),
 }
 
@@ -135,7 +130,8 @@ impl Session {
         let engine = match runtime {
             None => {
                 let outputs = interface.outputs.iter().map(|p| p.name.clone()).collect();
-                guarded(|| tract::Model::load(&bytes, outputs, limits.array_bytes)).map(Engine::Tract)
+                guarded(|| tract::Model::load(&bytes, outputs, limits.array_bytes))
+                    .map(|model| Engine::Tract(Box::new(model)))
             }
             Some(runtime) => guarded(|| ort::Model::load(runtime, &bytes, limits.threads)).map(Engine::Ort),
         };
@@ -270,3 +266,8 @@ fn in_one_line(said: &str) -> String {
         None => line,
     }
 }
+
+#[cfg(test)]
+pub(super) mod made;
+#[cfg(test)]
+pub(super) mod tests;

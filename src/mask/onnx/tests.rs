@@ -124,6 +124,44 @@ fn any_single_byte_may_be_wrong_without_a_panic() {
     }
 }
 
+/// Minutes long, for changes here: `cargo test --release --no-default-features --features matting --lib damage -- --ignored`.
+#[test]
+#[ignore = "slow"]
+fn random_damage_to_a_whole_network_ends_in_a_result_or_an_error() {
+    let Some(folder) = shared("vitmatte_tiny") else { return };
+    let whole = fs::read(folder.join("model.onnx")).unwrap();
+    let (photo, trimap) = photo(40, 33);
+    let mut seed = 20_240_607u64;
+    let mut random = || {
+        // Steele, Lea & Flood 2014: splitmix64
+        seed = seed.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let z = (seed ^ (seed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        (z ^ (z >> 31)) as usize
+    };
+    let mut ends = std::collections::BTreeMap::new();
+    for _ in 0..300 {
+        let mut bytes = whole.clone();
+        // the graph's nodes stand before its weights
+        for _ in 0..1 + random() % 3 {
+            let at = random() % (whole.len() / 4);
+            bytes[at] ^= 1 << (random() % 8);
+        }
+        for engine in engines() {
+            let name = if engine.is_some() { "ONNX Runtime" } else { "tract" };
+            let end = match opened_with(&bytes, engine).and_then(|n| n.alpha(&photo, &trimap)) {
+                Ok(_) => "an alpha".to_string(),
+                Err(e) if e.to_string().contains("broke down") => format!("a panic caught: {e}"),
+                Err(e) => format!("{e:?}").split_whitespace().next().unwrap_or_default().to_string(),
+            };
+            *ends.entry(format!("{name}: {end}")).or_insert(0) += 1;
+        }
+    }
+    for (end, times) in ends {
+        println!("{times:4} {end}");
+    }
+}
+
 #[test]
 fn weights_in_another_file_are_refused_wherever_they_lie() {
     let dir = tempfile::tempdir().unwrap();
