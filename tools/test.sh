@@ -57,6 +57,22 @@ tests() {
   return "$ended"
 }
 
+# The networks of the feature `matting` on both engines. ONNX Runtime comes as a Python wheel; only the
+# library in it is used.
+networks() {
+  [ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv || return
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements-onnx.txt || return
+  local library
+  library=$(.venv/bin/python -c 'import glob, importlib.util as i
+print(*glob.glob(i.find_spec("onnxruntime").submodule_search_locations[0] + "/capi/libonnxruntime.*"))') || return
+  [ -f "$library" ] || { echo "the wheel holds no library: '$library'" >&2; return 1; }
+  TIFACE_ONNXRUNTIME="$library" cargo test --release --no-default-features --features matting --lib mask -- --nocapture 2>&1 |
+    tee "$scratch/networks.log"
+  local ended=${PIPESTATUS[0]}
+  grep -h '^skipped:' "$scratch/networks.log" | sort -u >> "$scratch/skipped"
+  return "$ended"
+}
+
 sphere() { cargo run --release --quiet --example sphere_to_glb -- "$scratch/sphere"; }
 globe() { cargo run --release --quiet --example textured_sphere -- "$scratch/globe"; }
 
@@ -96,9 +112,14 @@ step "independent readers are here" readers
 step "format" cargo fmt --all -- --check
 step "lints" cargo clippy --release --all-targets -- -D warnings
 step "lints, with wgpu" cargo clippy --release --features wgpu --all-targets -- -D warnings
+step "lints, with matting" \
+  cargo clippy --release --no-default-features --features matting --all-targets -- -D warnings
 step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --no-deps
+step "documentation, with matting" \
+  env RUSTDOCFLAGS="-D warnings" cargo doc --release --no-default-features --features matting --no-deps
 step "build" cargo build --release --all-targets
 step "tests" tests
+step "networks on both engines" networks
 blender=yes
 printf '\n== Blender is here\n'
 if ! blender_is_here; then

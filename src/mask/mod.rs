@@ -10,6 +10,23 @@
 //! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unsure in a trimap.
 
 pub mod distance;
+#[cfg(feature = "matting")]
+pub mod networks;
+#[cfg(all(test, feature = "matting"))]
+mod networks_tests;
+#[cfg(feature = "matting")]
+mod onnx;
+#[cfg(feature = "matting")]
+mod processor;
+#[cfg(feature = "matting")]
+mod resample;
+#[cfg(feature = "matting")]
+mod sam;
+#[cfg(feature = "matting")]
+mod vitmatte;
+
+#[cfg(feature = "matting")]
+pub use self::{onnx::MaskNetworkError, vitmatte::VitMatteColours};
 
 /// One click of a person on a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,0 +1,498 @@
+//! SAM and ViTMatte against the stored inputs and outputs of the reference, on every engine there is.
+//!
+//! Tolerances are those of the vectors' own description: 1e-4 for embeddings, masks and logits, 5e-5 for scores
+//! and alphas, 1e-6 for normalised pixels, 2 of 255 and a mean of 0.3 for resized pictures, 1 % of mask pixels.
+
+use super::networks::{NetworkFiles, NetworkOptions, Networks};
+use super::onnx::tests::{engines, shared};
+use super::onnx::{MaskNetworkError, Runtime, Session, SessionLimits, Tensor, Values, made};
+use super::processor::IMAGENET;
+use super::sam::{Sam, normalised};
+use super::vitmatte::VitMatte;
+use super::{Click, VitMatteColours, resample};
+use crate::image::{Gray, Photo};
+use crate::io::{Limits, NpyValues, read_gray, read_json, read_npy, read_photo};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+fn array(path: &Path) -> Tensor {
+    let npy = read_npy(path, &Limits::default()).unwrap();
+    let NpyValues::Number(values) = npy.values else { panic!("{} holds booleans", path.display()) };
+    if path.file_name().unwrap() == "input_labels.npy" {
+        return Tensor::i64(&npy.shape, values.iter().map(|&v| v as i64).collect());
+    }
+    Tensor::f32(&npy.shape, values.iter().map(|&v| v as f32).collect())
+}
+
+fn numbers(tensor: &Tensor) -> &[f32] {
+    match &tensor.values {
+        Values::F32(v) => v,
+        Values::I64(_) => panic!("integers"),
+    }
+}
+
+/// Largest difference, said aloud: the record of how far each engine is from the reference.
+fn close(what: &str, engine: &str, found: &[f32], expected: &[f32], tolerance: f32) {
+    assert_eq!(found.len(), expected.len(), "{what}");
+    let worst = found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    println!("{engine}: {what} differs by at most {worst:.2e} (allowed {tolerance:.0e})");
+    assert!(worst <= tolerance, "{what} on {engine}: {worst} > {tolerance}");
+}
+
+fn limits() -> SessionLimits {
+    SessionLimits { file_bytes: 1 << 30, array_bytes: 1 << 32, threads: 0 }
+}
+
+/// Each engine with its name.
+fn each_engine() -> Vec<(&'static str, Option<Runtime>)> {
+    engines()
+        .iter()
+        .map(|engine| match engine {
+            None => ("tract", None),
+            Some(path) => ("ONNX Runtime", Some(Runtime::load(path).unwrap())),
+        })
+        .collect()
+}
+
+fn picture(folder: &Path) -> Photo {
+    read_photo(&folder.join("image.png"), None, &Limits::default()).unwrap().photo
+}
+
+fn gray(path: &Path) -> Gray {
+    read_gray(path, None, &Limits::default()).unwrap()
+}
+
+fn clicks(folder: &Path) -> Vec<Click> {
+    let json = read_json(&folder.join("prompts.json"), &Limits::default()).unwrap();
+    let points = json["points"].as_array().unwrap();
+    points
+        .iter()
+        .map(|p| Click {
+            x: p["x"].as_f64().unwrap() as f32,
+            y: p["y"].as_f64().unwrap() as f32,
+            head: p["label"] == 1,
+        })
+        .collect()
+}
+
+const DECODER: &str = "prompt_encoder_mask_decoder.onnx";
+const NO_LABELS: &str = "prompt_encoder_mask_decoder_nolabels.onnx";
+const ORIGINAL: &str = "sam_decoder_multi.onnx";
+
+fn sam(folder: &Path, decoder: &str, runtime: Option<&Runtime>) -> Result<Sam, MaskNetworkError> {
+    Sam::open(&folder.join("vision_encoder.onnx"), &folder.join(decoder), runtime, &limits())
+}
+
+fn sam_files(folder: &Path, decoder: &str, onnxruntime: &Option<PathBuf>) -> NetworkFiles {
+    NetworkFiles {
+        sam: Some(folder.join("vision_encoder.onnx")),
+        sam_decoder: Some(folder.join(decoder)),
+        onnxruntime: onnxruntime.clone(),
+        ..NetworkFiles::default()
+    }
+}
+
+/// Share of pixels on which two masks differ.
+fn differing(a: &Gray, b: &Gray) -> f64 {
+    assert_eq!((a.width, a.height), (b.width, b.height));
+    let wrong = a.values.iter().zip(&b.values).filter(|(a, b)| (**a > 127) != (**b > 127)).count();
+    wrong as f64 / a.values.len() as f64
+}
+
+#[test]
+fn photographs_are_resized_as_pillow_does() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let (photo, reference) =
+        (picture(&folder), read_photo(&folder.join("resized.png"), None, &Limits::default()));
+    let reference = reference.unwrap().photo;
+    let resized = resample::photo(&photo, 192, 256);
+    let off: Vec<u8> =
+        resized.iter().flatten().zip(reference.rgb.iter().flatten()).map(|(a, b)| a.abs_diff(*b)).collect();
+    let (worst, sum) = (off.iter().max().unwrap(), off.iter().map(|&v| f64::from(v)).sum::<f64>());
+    println!("resized: worst {worst} of 255, mean {:.4}", sum / off.len() as f64);
+    assert!(*worst <= 2 && sum / off.len() as f64 <= 0.3);
+}
+
+#[test]
+fn the_encoder_sees_the_pixels_of_the_reference() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let resized = read_photo(&folder.join("resized.png"), None, &Limits::default()).unwrap().photo;
+    let pixels = normalised(&resized.rgb, 192, 256, &IMAGENET);
+    close(
+        "pixel_values",
+        "no engine",
+        numbers(&pixels),
+        numbers(&array(&folder.join("pixel_values.npy"))),
+        1e-6,
+    );
+    // the file's own side and processor are obeyed: 256, not 1024
+    let sam = sam(&folder, DECODER, None).unwrap();
+    assert_eq!((sam.side, sam.fitted(150, 200)), (256, (192, 256)));
+}
+
+#[test]
+fn sam_gives_the_reference_from_the_stored_inputs() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let at = |name: &str| array(&folder.join(name));
+    for (engine, runtime) in each_engine() {
+        let open = |name: &str| Session::open(&folder.join(name), runtime.as_ref(), &limits()).unwrap();
+        let encoder = open("vision_encoder.onnx");
+        let names = ["image_embeddings", "image_positional_embeddings"];
+        let given = encoder.run(&[("pixel_values", at("pixel_values.npy"))], &names).unwrap();
+        for (name, output) in names.iter().zip(&given) {
+            close(name, engine, &output.values, numbers(&at(&format!("{name}.npy"))), 1e-4);
+        }
+        for (file, prefix) in [(DECODER, ""), (NO_LABELS, "nolabels_")] {
+            let mut inputs = vec![
+                ("input_points", at("input_points.npy")),
+                (names[0], at("image_embeddings.npy")),
+                (names[1], at("image_positional_embeddings.npy")),
+            ];
+            if prefix.is_empty() {
+                inputs.push(("input_labels", at("input_labels.npy")));
+            }
+            let given = open(file).run(&inputs, &["iou_scores", "pred_masks"]).unwrap();
+            for (name, tolerance, output) in
+                [("iou_scores", 5e-5, &given[0]), ("pred_masks", 1e-4, &given[1])]
+            {
+                let name = format!("{prefix}{name}");
+                close(&name, engine, &output.values, numbers(&at(&format!("{name}.npy"))), tolerance);
+            }
+        }
+        let decoder = open(ORIGINAL);
+        for (prefix, has) in [("meta_", 0.0), ("meta_with_mask_", 1.0)] {
+            let inputs = [
+                (names[0], at("image_embeddings.npy")),
+                ("point_coords", at("meta_point_coords.npy")),
+                ("point_labels", at("meta_point_labels.npy")),
+                ("mask_input", at("meta_mask_input.npy")),
+                ("has_mask_input", Tensor::f32(&[1], vec![has])),
+                ("orig_im_size", at("meta_orig_im_size.npy")),
+            ];
+            let given = decoder.run(&inputs, &["iou_predictions", "low_res_masks"]).unwrap();
+            for (name, tolerance, output) in
+                [("iou_predictions", 5e-5, &given[0]), ("low_res_masks", 1e-4, &given[1])]
+            {
+                let name = format!("{prefix}{name}");
+                close(&name, engine, &output.values, numbers(&at(&format!("{name}.npy"))), tolerance);
+            }
+        }
+    }
+}
+
+#[test]
+fn logits_reach_the_photograph_as_in_the_reference() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    for (small, large, count) in
+        [("pred_masks.npy", "mask_logits.npy", 3), ("meta_low_res_masks.npy", "meta_masks.npy", 4)]
+    {
+        let small = array(&folder.join(small));
+        let found: Vec<f32> = (0..count)
+            .flat_map(|i| {
+                let square = resample::field(&numbers(&small)[i * 4096..][..4096], 64, (64, 64), (256, 256));
+                resample::field(&square, 256, (192, 256), (150, 200))
+            })
+            .collect();
+        close(large, "no engine", &found, numbers(&array(&folder.join(large))), 1e-4);
+    }
+}
+
+#[test]
+fn clicks_become_the_mask_of_the_reference_end_to_end() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let (photo, clicks) = (picture(&folder), clicks(&folder));
+    for engine in engines() {
+        let networks =
+            Networks::open(&sam_files(&folder, DECODER, &engine), &NetworkOptions::default()).unwrap();
+        let (mask, score) = networks.segment(&photo, &clicks).unwrap();
+        let off = differing(&mask, &gray(&folder.join("mask.png")));
+        println!("{engine:?}: mask differs on {:.3} % of the pixels, score {score}", 100.0 * off);
+        assert!(off <= 0.01);
+        let scores = array(&folder.join("iou_scores.npy"));
+        let best = numbers(&scores).iter().copied().fold(f32::MIN, f32::max);
+        assert!((score - best).abs() < 1e-2, "{score} {best}");
+    }
+}
+
+#[test]
+fn the_original_decoder_gets_the_padding_point_once_and_gives_the_first_of_four_masks() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let (photo, clicks) = (picture(&folder), clicks(&folder));
+    let reference = array(&folder.join("meta_masks.npy"));
+    let coords = array(&folder.join("meta_point_coords.npy"));
+    for (engine, runtime) in each_engine() {
+        let sam = sam(&folder, ORIGINAL, runtime.as_ref()).unwrap();
+        let embedding = sam.embed(&photo).unwrap();
+        // the prompt holds four clicks and one padding point, as the stored one
+        let prompt = sam.prompt(&embedding, &clicks).0;
+        let (_, points) = prompt.iter().find(|(name, _)| *name == "point_coords").unwrap();
+        let (_, labels) = prompt.iter().find(|(name, _)| *name == "point_labels").unwrap();
+        close("point_coords", engine, numbers(points), numbers(&coords), 1e-4);
+        assert_eq!(numbers(labels), [1.0, 1.0, 1.0, 0.0, -1.0]);
+        let candidates = sam.decode(&embedding, &clicks).unwrap();
+        assert_eq!((candidates.scores.len(), candidates.best), (4, 0));
+        let logits = sam.on_photo(&embedding, &candidates, 0);
+        // from the photograph on: the resized pixels may differ from the stored ones by rounding
+        let off = logits.iter().zip(numbers(&reference)).filter(|(a, b)| (**a > 0.0) != (**b > 0.0)).count();
+        assert!(off * 100 <= logits.len(), "{off} pixels of {}", logits.len());
+        // one click alone: the best of the three others
+        let one = sam.decode(&embedding, &clicks[..1]).unwrap();
+        let best = (1..4).max_by(|&a, &b| one.scores[a].total_cmp(&one.scores[b])).unwrap();
+        assert_eq!(one.best, best);
+    }
+}
+
+#[test]
+fn a_decoder_without_labels_takes_clicks_on_the_head_and_no_others() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let (photo, clicks) = (picture(&folder), clicks(&folder));
+    let sam = sam(&folder, NO_LABELS, None).unwrap();
+    let Err(error) = sam.segment(&photo, &clicks) else { panic!("the background was taken for head") };
+    assert!(error.to_string().contains("number 4 is on the background"), "{error}");
+    assert!(error.hint().contains("input_labels"));
+    sam.segment(&photo, &clicks[..3]).unwrap();
+}
+
+#[test]
+fn clicks_that_make_no_sense_are_named() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let photo = picture(&folder);
+    let sam = sam(&folder, DECODER, None).unwrap();
+    let head = |x: f32, y: f32| Click { x, y, head: true };
+    for (clicks, word) in [
+        (vec![], "none of them is on the head"),
+        (vec![Click { head: false, ..head(5.0, 5.0) }], "none of them is on the head"),
+        (vec![head(5.0, 5.0), head(150.0, 5.0)], "number 2 at (150, 5) lies outside"),
+        (vec![head(5.0, -3.0)], "lies outside"),
+        (vec![head(f32::NAN, 5.0)], "lies outside"),
+        (vec![head(5.0, f32::INFINITY)], "lies outside"),
+        (vec![head(5.0, 5.0); 257], "there are 257"),
+    ] {
+        let Err(error) = sam.segment(&photo, &clicks) else { panic!("{word}") };
+        assert!(
+            matches!(error, MaskNetworkError::Clicks { .. }) && error.to_string().contains(word),
+            "{error}"
+        );
+    }
+}
+
+#[test]
+fn odd_sizes_and_a_single_row_of_pixels_get_a_mask_of_their_own_size() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let files = NetworkFiles {
+        vitmatte: shared("vitmatte_tiny").map(|f| f.join("model.onnx")),
+        ..sam_files(&folder, DECODER, &None)
+    };
+    let networks = Networks::open(&files, &NetworkOptions::default()).unwrap();
+    for (width, height) in [(151, 97), (97, 151), (333, 1), (1, 1), (257, 256)] {
+        let rgb = (0..width * height).map(|i| [(i % 255) as u8; 3]).collect();
+        let photo = Photo { width, height, rgb, alpha: None };
+        let click = Click { x: (width - 1) as f32, y: (height - 1) as f32, head: true };
+        let (mask, _) = networks.segment(&photo, &[click]).unwrap();
+        assert_eq!((mask.width, mask.height, mask.values.len()), (width, height, (width * height) as usize));
+        assert!(mask.values.iter().all(|&v| v == 0 || v == 255));
+        assert_eq!(networks.alpha(&photo, &mask).unwrap().len(), (width * height) as usize);
+    }
+}
+
+#[test]
+fn both_encoders_of_the_original_form_feed_the_original_decoder() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    // 256 × 256: nothing to resize, nothing to pad
+    let rgb: Vec<[u8; 3]> = (0..256 * 256).map(|i| [(i % 256) as u8, (i / 256) as u8, 40]).collect();
+    let photo = Photo { width: 256, height: 256, rgb, alpha: None };
+    let click = Click { x: 120.0, y: 130.0, head: true };
+    for (engine, runtime) in each_engine() {
+        for picture in [true, false] {
+            let path = dir.path().join(format!("encoder_{picture}.onnx"));
+            fs::write(&path, made::original_encoder(picture, 256, 32)).unwrap();
+            let sam = Sam::open(&path, &folder.join(ORIGINAL), runtime.as_ref(), &limits()).unwrap();
+            assert_eq!(sam.side, 256);
+            sam.prepare(256, 256, 1).unwrap();
+            let pixels = sam.pixels(&photo);
+            let shape: &[usize] = if picture { &[256, 256, 3] } else { &[1, 3, 256, 256] };
+            assert_eq!(pixels.shape, shape);
+            // cell (1, 0) spans columns 16..32: mean red 23.5, of rows 0..16: mean green 7.5; channel 1 weighs 3, 4, 5 of 96
+            let given = sam.encoder.run(&[("input_image", pixels)], &["image_embeddings"]).unwrap();
+            let colour =
+                |v: f64, c: usize| if picture { v } else { (v / 255.0 - IMAGENET.mean[c]) / IMAGENET.std[c] };
+            let expected = (3.0 * colour(23.5, 0) + 4.0 * colour(7.5, 1) + 5.0 * colour(40.0, 2)) / 96.0;
+            close("cell (1, 0)", engine, &[given[0].values[256 + 1]], &[expected as f32], 1e-5);
+            let (mask, score) = sam.segment(&photo, &[click]).unwrap();
+            assert!(mask.values.len() == 65536 && score.is_finite());
+        }
+    }
+}
+
+#[test]
+fn encoder_and_decoder_that_do_not_fit_are_named_together() {
+    let Some(folder) = shared("sam_tiny") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let encoder = |picture, side, depth| {
+        let path = dir.path().join(format!("{picture}{side}{depth}.onnx"));
+        fs::write(&path, made::original_encoder(picture, side, depth)).unwrap();
+        path
+    };
+    let decoder = |name: &str| folder.join(name);
+    let open = |e: &Path, d: &Path| Sam::open(e, d, None, &limits());
+    let Err(error) = open(&encoder(false, 256, 32), &decoder(DECODER)) else { panic!("no position") };
+    assert!(error.to_string().contains("image_positional_embeddings"), "{error}");
+    let Err(error) = open(&encoder(false, 512, 32), &decoder(ORIGINAL)) else { panic!("512 is not 256") };
+    assert!(error.to_string().contains("32 × 32 cells, the decoder takes 16 × 16"), "{error}");
+    // the width of the embedding shows in its output
+    let sam = open(&encoder(false, 256, 8), &decoder(ORIGINAL)).unwrap();
+    let photo = Photo { width: 8, height: 8, rgb: vec![[9; 3]; 64], alpha: None };
+    let Err(error) = sam.segment(&photo, &[Click { x: 1.0, y: 1.0, head: true }]) else {
+        panic!("8 is not 32")
+    };
+    assert!(error.to_string().contains("[1, 8, 16, 16], expected [1, 32, 16, 16]"), "{error}");
+    // each in the other's place
+    let swapped = open(&decoder(DECODER), &decoder("vision_encoder.onnx"));
+    assert!(matches!(swapped, Err(MaskNetworkError::WrongRole { .. })));
+    let alone = NetworkFiles { sam: Some(decoder("vision_encoder.onnx")), ..NetworkFiles::default() };
+    assert!(matches!(
+        Networks::open(&alone, &NetworkOptions::default()),
+        Err(MaskNetworkError::Missing { .. })
+    ));
+}
+
+#[test]
+fn vitmatte_gives_the_reference_from_the_stored_inputs() {
+    let Some(folder) = shared("vitmatte_tiny") else { return };
+    for (engine, runtime) in each_engine() {
+        let open = |name: &str| Session::open(&folder.join(name), runtime.as_ref(), &limits());
+        let session = open("model.onnx").unwrap();
+        for kind in ["", "_imagenet", "_random_160x224", "_random_96x128"] {
+            let pixels = array(&folder.join(format!("pixel_values{kind}.npy")));
+            let alphas = array(&folder.join(format!("alphas{kind}.npy")));
+            let given = session.run(&[("pixel_values", pixels.clone())], &["alphas"]).unwrap();
+            assert_eq!(given[0].shape, alphas.shape);
+            close(&format!("alphas{kind}"), engine, &given[0].values, numbers(&alphas), 5e-5);
+            // the harder file: the same numbers, or one clear sentence
+            let recent = open("model_recent_exporter.onnx")
+                .and_then(|session| session.run(&[("pixel_values", pixels)], &["alphas"]));
+            match recent {
+                Ok(given) => {
+                    let what = format!("alphas{kind} of the recent exporter");
+                    close(&what, engine, &given[0].values, numbers(&alphas), 5e-5);
+                }
+                Err(error) => {
+                    println!("{engine}: {error}; {}", error.hint());
+                    assert!(runtime.is_none(), "{error}");
+                    assert!(matches!(error, MaskNetworkError::Engine { .. }));
+                    assert!(
+                        error.to_string().ends_with("Reshape_2\" Reshape: Reshape volume mismatch"),
+                        "{error}"
+                    );
+                    assert!(error.hint().contains("name its library"));
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn vitmatte_is_shown_the_colours_of_each_convention() {
+    let Some(folder) = shared("vitmatte_tiny") else { return };
+    let (photo, trimap) = (picture(&folder), gray(&folder.join("trimap.png")));
+    let dir = tempfile::tempdir().unwrap();
+    let alone = dir.path().join("model.onnx");
+    fs::copy(folder.join("model.onnx"), &alone).unwrap();
+    let beside = folder.join("model.onnx");
+    let (imagenet, transformers) = (VitMatteColours::ImageNet, VitMatteColours::Transformers);
+    for (path, set, kind) in [
+        (&beside, None, ""),
+        (&alone, None, "_imagenet"),
+        (&beside, Some(imagenet), "_imagenet"),
+        (&alone, Some(transformers), ""),
+    ] {
+        for (engine, runtime) in each_engine() {
+            let network = VitMatte::open(path, runtime.as_ref(), &limits(), set).unwrap();
+            assert_eq!(network.colours() == imagenet, kind == "_imagenet");
+            let padded = network.padded(150, 200).unwrap();
+            assert_eq!(padded, (160, 224));
+            let pixels = network.pixels(&photo, &trimap, padded);
+            let expected = array(&folder.join(format!("pixel_values{kind}.npy")));
+            close("pixel_values", "no engine", numbers(&pixels), numbers(&expected), 1e-6);
+            let alpha = network.alpha(&photo, &trimap).unwrap();
+            let whole = array(&folder.join(format!("alphas{kind}.npy")));
+            let cut: Vec<f32> =
+                numbers(&whole).chunks(160).take(200).flat_map(|row| row[..150].to_vec()).collect();
+            close(&format!("alpha{kind} of the photograph"), engine, &alpha, &cut, 5e-5);
+        }
+    }
+}
+
+#[test]
+fn the_record_names_each_file_with_its_size_and_its_hash() {
+    let (Some(folder), Some(matte)) = (shared("sam_tiny"), shared("vitmatte_tiny")) else { return };
+    for engine in engines() {
+        let vitmatte = Some(matte.join("model.onnx"));
+        let files = NetworkFiles { vitmatte, ..sam_files(&folder, DECODER, &engine) };
+        let networks = Networks::open(&files, &NetworkOptions::default()).unwrap();
+        let record = networks.files();
+        let roles: Vec<_> = record.iter().map(|f| f.role).collect();
+        assert_eq!(roles[..3], ["sam", "sam_decoder", "vitmatte"]);
+        assert_eq!(roles.len(), 3 + usize::from(engine.is_some()));
+        assert_eq!(record[0].bytes, 899_688);
+        assert!(record.iter().all(|f| f.sha256.len() == 64));
+        for file in record {
+            println!("{file:?}");
+        }
+        let at_once = networks.photos_at_once(384, 512, 8 << 30, 2);
+        assert_eq!(at_once, if engine.is_some() { 1 } else { 2 });
+        assert_eq!(networks.photos_at_once(384, 512, 1, 2), 1);
+        networks.prepare(150, 200, 4).unwrap();
+    }
+}
+
+#[test]
+fn photographs_side_by_side_get_what_they_get_alone() {
+    let (Some(folder), Some(matte)) = (shared("sam_tiny"), shared("vitmatte_tiny")) else { return };
+    let (photo, clicks, trimap) = (picture(&folder), clicks(&folder), gray(&matte.join("trimap.png")));
+    for engine in engines() {
+        let vitmatte = Some(matte.join("model.onnx"));
+        let files = NetworkFiles { vitmatte, ..sam_files(&folder, DECODER, &engine) };
+        let made = |threads: usize| {
+            let options = NetworkOptions { threads, ..NetworkOptions::default() };
+            let networks = Networks::open(&files, &options).unwrap();
+            std::thread::scope(|scope| {
+                let each: Vec<_> = (0..3)
+                    .map(|_| {
+                        scope.spawn(|| {
+                            (
+                                networks.segment(&photo, &clicks).unwrap(),
+                                networks.alpha(&photo, &trimap).unwrap(),
+                            )
+                        })
+                    })
+                    .collect();
+                each.into_iter().map(|t| t.join().unwrap()).collect::<Vec<_>>()
+            })
+        };
+        let (one, two) = (made(1), made(2));
+        assert!(one.iter().chain(&two).all(|r| *r == one[0]), "{engine:?}");
+    }
+}
+
+#[test]
+fn a_photograph_beyond_the_memory_limit_is_refused_before_it_is_run() {
+    let Some(folder) = shared("vitmatte_tiny") else { return };
+    let files = NetworkFiles { vitmatte: Some(folder.join("model.onnx")), ..NetworkFiles::default() };
+    let networks = Networks::open(&files, &NetworkOptions::default()).unwrap();
+    // 3000 × 4096 is 48 128 cells, and 48 bytes for each pair of them 104 GiB
+    let error = networks.prepare(3000, 4096, 1).unwrap_err();
+    assert!(error.to_string().contains("GiB") && error.hint().contains("1024"), "{error}");
+    networks.prepare(64, 64, 1).unwrap();
+    let photo = Photo { width: 4, height: 4, rgb: vec![[0; 3]; 16], alpha: None };
+    let trimap = Gray { width: 4, height: 3, values: vec![0; 12] };
+    assert!(matches!(networks.alpha(&photo, &trimap), Err(MaskNetworkError::Photo { .. })));
+    assert!(matches!(networks.segment(&photo, &[]), Err(MaskNetworkError::Missing { .. })));
+}
+
+#[test]
+fn networks_may_be_shared_between_threads() {
+    fn shared<T: Send + Sync>() {}
+    shared::<Networks>();
+}

@@ -1,0 +1,141 @@
+//! The engine that the user brings: an ONNX Runtime library, loaded from the path named and nowhere else.
+
+use super::{MaskNetworkError, Output, Values, guarded, hexadecimal, in_one_line};
+use crate::io::{self, Limits};
+use ort::environment::Environment;
+use ort::logging::LogLevel;
+use ort::session::{OutputSelector, RunOptions, SessionInputValue};
+use ort::value::Tensor;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// The engine's name, as recorded with a run; its version is that of the library, recorded too.
+pub(super) const NAME: &str = "ONNX Runtime";
+
+/// A process can hold one ONNX Runtime, for good.
+static LOADED: Mutex<Option<Runtime>> = Mutex::new(None);
+
+/// A loaded ONNX Runtime.
+#[derive(Clone)]
+pub struct Runtime {
+    /// The library as the user named it.
+    pub path: PathBuf,
+    /// Bytes of the library.
+    pub bytes: u64,
+    /// SHA-256 of the library, in hexadecimal.
+    pub sha256: String,
+    /// The library without links.
+    real: PathBuf,
+    environment: Environment,
+}
+
+impl Runtime {
+    /// Loads the library at `path`. A second call with the same library gives the same runtime.
+    ///
+    /// # Errors
+    /// When there is no such file, when it is no ONNX Runtime of 1.17 or later, or when this process
+    /// already holds another one.
+    pub fn load(path: &Path) -> Result<Runtime, MaskNetworkError> {
+        let real = io::real_path(path)?;
+        let wrong = |problem: String, hint: &str| MaskNetworkError::Library {
+            path: path.into(),
+            problem: in_one_line(&problem),
+            hint: hint.into(),
+        };
+        let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(runtime) = loaded.as_ref() {
+            if runtime.real == real {
+                return Ok(runtime.clone());
+            }
+            let problem = format!("this process already runs `{}`", runtime.path.display());
+            return Err(wrong(problem, "start the program anew for another library"));
+        }
+        let library = io::read_bytes(path, &Limits::default())?;
+        // also keeps a text file from the system's loader, whose words few understand
+        let environment = guarded(|| {
+            let builder = ort::init_from(&real).map_err(|e| e.to_string())?;
+            let to_log: ort::logging::LoggerFunction = Arc::new(|_, _, _, _, message: &str| {
+                tracing::debug!(target: "onnxruntime", "{message}");
+            });
+            let environment = builder
+                .with_name("tiface")
+                .with_telemetry(false)
+                .with_logger(to_log)
+                .build()
+                .map_err(|e| e.to_string())?;
+            environment.set_log_level(LogLevel::Error);
+            Ok(environment)
+        })
+        .map_err(|problem| {
+            wrong(problem, "name a libonnxruntime of 1.17 or later for this machine (`pip install onnxruntime` brings one)")
+        })?;
+        let bytes = library.len() as u64;
+        let runtime = Runtime { path: path.into(), bytes, sha256: hexadecimal(&library), real, environment };
+        *loaded = Some(runtime.clone());
+        Ok(runtime)
+    }
+
+    /// What the library says of itself.
+    pub fn version(&self) -> String {
+        guarded(|| Ok(ort::info().to_string())).unwrap_or_default()
+    }
+}
+
+/// A network in ONNX Runtime.
+pub(super) struct Model {
+    // its bindings allow one run at a time; the run itself spreads over the threads
+    session: Mutex<ort::session::Session>,
+}
+
+impl Model {
+    /// Loads a network from memory.
+    pub(super) fn load(runtime: &Runtime, bytes: &[u8], threads: usize) -> Result<Model, String> {
+        let session = (|| -> Result<ort::session::Session, ort::Error> {
+            let mut builder = ort::session::Session::builder(&runtime.environment)?
+                .with_intra_threads(threads)?
+                .with_deterministic_compute(true)?
+                .with_log_level(LogLevel::Error)?;
+            builder.commit_from_memory(bytes)
+        })()
+        .map_err(|e| e.to_string())?;
+        Ok(Model { session: Mutex::new(session) })
+    }
+
+    /// One run.
+    pub(super) fn run(
+        &self,
+        inputs: &[(&str, super::Tensor)],
+        outputs: &[&str],
+    ) -> Result<Vec<Output>, String> {
+        let mut session = self.session.lock().unwrap_or_else(PoisonError::into_inner);
+        self.fed(&mut session, inputs, outputs).map_err(|e| e.to_string())
+    }
+
+    fn fed(
+        &self,
+        session: &mut ort::session::Session,
+        inputs: &[(&str, super::Tensor)],
+        outputs: &[&str],
+    ) -> Result<Vec<Output>, ort::Error> {
+        let mut fed: Vec<(String, SessionInputValue<'_>)> = Vec::new();
+        for (name, tensor) in inputs {
+            let value: SessionInputValue<'_> = match &tensor.values {
+                Values::F32(v) => Tensor::from_array((tensor.shape.clone(), v.clone()))?.into(),
+                Values::I64(v) => Tensor::from_array((tensor.shape.clone(), v.clone()))?.into(),
+            };
+            fed.push((name.to_string(), value));
+        }
+        let wanted = outputs.iter().fold(OutputSelector::no_default(), |o, name| o.with(*name));
+        let options = RunOptions::new()?.with_outputs(wanted);
+        let given = session.run_with_options(fed, &options)?;
+        let mut found = Vec::new();
+        for name in outputs {
+            let value =
+                given.get(name).ok_or_else(|| ort::Error::new(format!("there is no output `{name}`")))?;
+            let (shape, values) = value.try_extract_tensor::<f32>()?;
+            let shape = shape.iter().map(|&d| usize::try_from(d).unwrap_or(0)).collect();
+            found.push(Output { shape, values: values.to_vec() });
+        }
+        Ok(found)
+    }
+}

@@ -1,0 +1,136 @@
+//! `preprocessor_config.json`: how the picture is prepared, as the publisher of a network says beside its file.
+//!
+//! Looked for in the folder of the network's file, and in the folder above when that is called `onnx`, which is
+//! how public collections lie. A file of the other network's processor is not obeyed.
+
+use super::onnx::MaskNetworkError;
+use crate::io::{self, Limits};
+use std::path::{Path, PathBuf};
+
+/// Mean and standard deviation of ImageNet's colours in 0..1: what SAM and ViTMatte were trained with.
+pub(super) const IMAGENET: Normal = Normal { mean: [0.485, 0.456, 0.406], std: [0.229, 0.224, 0.225] };
+
+/// How colours become numbers: `(c / 255 − mean) / std`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Normal {
+    /// Of red, green, blue in 0..1.
+    pub mean: [f64; 3],
+    /// Of red, green, blue in 0..1; positive.
+    pub std: [f64; 3],
+}
+
+impl Normal {
+    /// One channel of one pixel.
+    pub(super) fn apply(&self, value: u8, channel: usize) -> f32 {
+        ((f64::from(value) / 255.0 - self.mean[channel]) / self.std[channel]) as f32
+    }
+}
+
+/// What a processor file says.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Processor {
+    /// The file.
+    pub path: PathBuf,
+    /// How it normalises.
+    pub normal: Normal,
+    /// Side of the padded square (`pad_size`, else `size.longest_edge`), where it is said.
+    pub side: Option<usize>,
+}
+
+/// The processor file of the network at `network`, unless there is none or it is of another network than
+/// `kind` ("sam", "vitmatte").
+pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>, MaskNetworkError> {
+    const NAME: &str = "preprocessor_config.json";
+    let folder = network.parent().unwrap_or(Path::new(""));
+    let mut places = vec![folder.join(NAME)];
+    if folder.file_name().is_some_and(|n| n == "onnx") {
+        places.extend(folder.parent().map(|above| above.join(NAME)));
+    }
+    let Some(path) = places.into_iter().find(|p| io::is_file(p)) else { return Ok(None) };
+    let json = io::read_json(&path, &Limits { json_bytes: 1 << 20, ..Limits::default() })?;
+    let says = ["image_processor_type", "feature_extractor_type", "processor_class"]
+        .into_iter()
+        .filter_map(|key| json[key].as_str())
+        .map(str::to_lowercase)
+        .collect::<Vec<_>>();
+    if !says.is_empty() && !says.iter().any(|s| s.starts_with(kind)) {
+        return Ok(None);
+    }
+    let wrong = |problem: String| MaskNetworkError::Processor { path: path.clone(), problem };
+    let three = |key: &str, usual: [f64; 3], sound: fn(f64) -> bool| -> Result<[f64; 3], MaskNetworkError> {
+        let value = &json[key];
+        if value.is_null() {
+            return Ok(usual);
+        }
+        let numbers: Vec<f64> =
+            value.as_array().into_iter().flatten().filter_map(serde_json::Value::as_f64).collect();
+        <[f64; 3]>::try_from(numbers)
+            .ok()
+            .filter(|n| n.iter().all(|&v| sound(v)) && value.as_array().is_some_and(|a| a.len() == 3))
+            .ok_or_else(|| wrong(format!("`{key}` is {value}, expected three numbers of colours in 0..1")))
+    };
+    let mean = three("image_mean", IMAGENET.mean, |v| (0.0..=1.0).contains(&v))?;
+    let std = three("image_std", IMAGENET.std, |v| (1e-3..=1.0).contains(&v))?;
+    let side = match json["pad_size"]["height"].as_u64().or(json["size"]["longest_edge"].as_u64()) {
+        None => None,
+        Some(side) if kind == "sam" && (side % 16 != 0 || !(64..=4096).contains(&side)) => {
+            return Err(wrong(format!("the side is {side}, expected a multiple of 16 from 64 to 4096")));
+        }
+        Some(side) => usize::try_from(side).ok(),
+    };
+    Ok(Some(Processor { path: path.clone(), normal: Normal { mean, std }, side }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    fn at(text: &str, kind: &str) -> Result<Option<Processor>, MaskNetworkError> {
+        let dir = tempfile::tempdir().unwrap();
+        fs::write(dir.path().join("preprocessor_config.json"), text).unwrap();
+        beside(&dir.path().join("x.onnx"), kind)
+    }
+
+    #[test]
+    fn the_side_and_the_colours_are_read() {
+        let text =
+            r#"{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.25], "pad_size": {"height": 256}}"#;
+        let found = at(text, "sam").unwrap().unwrap();
+        assert_eq!(found.side, Some(256));
+        assert_eq!(found.normal, Normal { mean: [0.5; 3], std: [0.5, 0.5, 0.25] });
+    }
+
+    #[test]
+    fn the_file_of_the_other_network_is_not_obeyed() {
+        let text = r#"{"image_processor_type": "SamImageProcessor", "image_mean": [0.1, 0.1, 0.1]}"#;
+        assert_eq!(at(text, "vitmatte").unwrap(), None);
+        assert!(at(text, "sam").unwrap().is_some());
+    }
+
+    #[test]
+    fn impossible_numbers_are_an_error_with_the_key() {
+        for text in [
+            r#"{"image_std": [0, 0.2, 0.2]}"#,
+            r#"{"image_mean": [0.5, 0.5]}"#,
+            r#"{"image_mean": "0.5"}"#,
+            r#"{"image_mean": [1, "x", 0.5, 0.5]}"#,
+            r#"{"pad_size": {"height": 1000}}"#,
+        ] {
+            let error = at(text, "sam").unwrap_err();
+            assert!(matches!(error, MaskNetworkError::Processor { .. }), "{error}");
+        }
+        assert!(matches!(at("{", "sam"), Err(MaskNetworkError::Read(_))));
+    }
+
+    #[test]
+    fn the_folder_above_counts_only_from_a_folder_called_onnx() {
+        let dir = tempfile::tempdir().unwrap();
+        fs::write(dir.path().join("preprocessor_config.json"), "{}").unwrap();
+        for (folder, there) in [("onnx", true), ("weights", false)] {
+            fs::create_dir(dir.path().join(folder)).unwrap();
+            let found = beside(&dir.path().join(folder).join("model.onnx"), "sam").unwrap();
+            assert_eq!(found.is_some(), there);
+        }
+    }
+}

@@ -1,0 +1,354 @@
+//! SAM: from clicks to a hard mask, with the files of a user (Kirillov et al. 2023; SlimSAM, MobileSAM).
+//!
+//! ```text
+//! photograph ── longest side to S, normalise, pad to S × S ── encoder ── embedding ─┐
+//! clicks ────── times S / longest side ─────────────────────────────────── decoder ─┴─ S/4 × S/4 logits
+//!               logits ── bilinear to S × S ── cut the padding off ── bilinear to the photograph ── > 0
+//! ```
+//!
+//! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label −1 at the
+//! end when no box is given. S and the embedding's width are read from the files.
+
+use super::Click;
+use super::onnx::{Contract, MaskNetworkError, Output, Runtime, Session, SessionLimits, Tensor};
+use super::processor::{self, IMAGENET, Normal};
+use super::resample;
+use crate::image::{Gray, Photo};
+use std::path::Path;
+
+/// Pixels of the photograph under one cell of the embedding.
+const CELL: usize = 16;
+/// The side of every public file, where neither network nor processor file says otherwise.
+const USUAL_SIDE: usize = 1024;
+/// Clicks on one photograph; each is a token of the decoder.
+const MAX_CLICKS: usize = 256;
+const EMBEDDING: &str = "image_embeddings";
+const POSITION: &str = "image_positional_embeddings";
+
+/// An encoder and a decoder that fit together.
+pub(super) struct Sam {
+    pub(super) encoder: Session,
+    pub(super) decoder: Session,
+    /// S: the side of the square the encoder sees.
+    pub(super) side: usize,
+    normal: Normal,
+}
+
+/// What the encoder makes of a photograph, and how the photograph lay in the square.
+pub(super) struct Embedding {
+    /// `image_embeddings`, and for the split export `image_positional_embeddings`.
+    arrays: Vec<Output>,
+    /// Width and height inside the square.
+    new: (usize, usize),
+    /// Width and height of the photograph.
+    old: (usize, usize),
+}
+
+/// The candidates of the decoder.
+pub(super) struct Candidates {
+    /// `[candidates]`: how good each thinks it is (estimated IoU).
+    pub scores: Vec<f32>,
+    /// `[candidates, S/4, S/4]` logits.
+    pub logits: Vec<f32>,
+    /// Which of them is the mask.
+    pub best: usize,
+}
+
+impl Sam {
+    pub(super) fn open(
+        encoder: &Path,
+        decoder: &Path,
+        runtime: Option<&Runtime>,
+        limits: &SessionLimits,
+    ) -> Result<Sam, MaskNetworkError> {
+        let wrong = |s: &Session, given_as: &str| MaskNetworkError::WrongRole {
+            path: s.path.clone(),
+            is: s.contract.to_string(),
+            given_as: given_as.into(),
+        };
+        let encoder = Session::open(encoder, runtime, limits)?;
+        if !matches!(encoder.contract, Contract::SamEncoder | Contract::OriginalEncoder { .. }) {
+            return Err(wrong(&encoder, "the SAM encoder"));
+        }
+        let decoder = Session::open(decoder, runtime, limits)?;
+        if !matches!(decoder.contract, Contract::SamDecoder { .. } | Contract::OriginalDecoder) {
+            return Err(wrong(&decoder, "the SAM decoder"));
+        }
+        let mismatch = |problem: String| MaskNetworkError::Mismatch {
+            encoder: encoder.path.clone(),
+            decoder: decoder.path.clone(),
+            problem,
+        };
+        if matches!(encoder.contract, Contract::OriginalEncoder { .. })
+            && matches!(decoder.contract, Contract::SamDecoder { .. })
+        {
+            return Err(mismatch(format!("the decoder wants `{POSITION}`, which the encoder does not give")));
+        }
+        let processor = processor::beside(&encoder.path, "sam")?;
+        let takes = &encoder.interface.inputs[0];
+        let fixed = match encoder.contract {
+            Contract::OriginalEncoder { picture: true } => None,
+            _ => takes.extent(2).or(takes.extent(3)).map(|s| s as usize),
+        };
+        if takes
+            .dims
+            .as_ref()
+            .is_some_and(|d| d.len() == 4 && d[2] != d[3] && d[2].is_some() && d[3].is_some())
+        {
+            return Err(mismatch(format!("the encoder's input {} is not square", takes.shape_in_words())));
+        }
+        let grid = decoder.input_extent(EMBEDDING, 2).or(decoder.input_extent(EMBEDDING, 3));
+        let side = fixed
+            .or(processor.as_ref().and_then(|p| p.side))
+            .or(grid.map(|g| g.saturating_mul(CELL)))
+            .unwrap_or(USUAL_SIDE);
+        if !side.is_multiple_of(CELL) || !(64..=4096).contains(&side) {
+            return Err(mismatch(format!(
+                "the side is {side} pixels, expected a multiple of 16 from 64 to 4096"
+            )));
+        }
+        if let Some(grid) = grid.filter(|g| g.saturating_mul(CELL) != side) {
+            let cells = side / CELL;
+            return Err(mismatch(format!(
+                "the encoder makes {cells} × {cells} cells, the decoder takes {grid} × {grid}"
+            )));
+        }
+        let normal = processor.map_or(IMAGENET, |p| p.normal);
+        Ok(Sam { encoder, decoder, side, normal })
+    }
+
+    /// Width and height of a photograph inside the square: longest side S, the other rounded.
+    pub(super) fn fitted(&self, width: usize, height: usize) -> (usize, usize) {
+        let scale = self.side as f64 / width.max(height) as f64;
+        let fit = |old: usize| ((old as f64 * scale + 0.5) as usize).clamp(1, self.side);
+        (fit(width), fit(height))
+    }
+
+    /// Makes the plans for photographs of this size and for `clicks` clicks.
+    pub(super) fn prepare(&self, width: usize, height: usize, clicks: usize) -> Result<(), MaskNetworkError> {
+        let (w, h) = self.fitted(width, height);
+        let shape: &[usize] = match self.encoder.contract {
+            Contract::OriginalEncoder { picture: true } => &[h, w, 3],
+            _ => &[1, 3, self.side, self.side],
+        };
+        let blank = Tensor::f32(shape, vec![0.0; shape.iter().product()]);
+        self.encoder.prepare(&[(&self.encoder.interface.inputs[0].name, blank)], self.encoder_outputs())?;
+        // the embedding's width, unless the decoder leaves it open: then its plan waits for the first run
+        let Some(depth) = self.decoder.input_extent(EMBEDDING, 1) else { return Ok(()) };
+        let cells = self.side / CELL;
+        let blank = Output { shape: vec![1, depth, cells, cells], values: vec![0.0; depth * cells * cells] };
+        let embedding = Embedding { arrays: vec![blank.clone(), blank], new: (w, h), old: (width, height) };
+        let (inputs, outputs) = self.prompt(&embedding, &vec![Click { x: 0.0, y: 0.0, head: true }; clicks]);
+        self.decoder.prepare(&inputs, outputs)
+    }
+
+    fn encoder_outputs(&self) -> &'static [&'static str] {
+        match self.decoder.contract {
+            Contract::SamDecoder { .. } => &[EMBEDDING, POSITION],
+            _ => &[EMBEDDING],
+        }
+    }
+
+    /// The photograph as the encoder takes it.
+    pub(super) fn pixels(&self, photo: &Photo) -> Tensor {
+        let (w, h) = self.fitted(photo.width as usize, photo.height as usize);
+        let rgb = resample::photo(photo, w, h);
+        if let Contract::OriginalEncoder { picture: true } = self.encoder.contract {
+            return Tensor::f32(&[h, w, 3], rgb.iter().flatten().map(|&v| f32::from(v)).collect());
+        }
+        normalised(&rgb, w, self.side, &self.normal)
+    }
+
+    /// Runs the encoder.
+    pub(super) fn embed(&self, photo: &Photo) -> Result<Embedding, MaskNetworkError> {
+        let old = (photo.width as usize, photo.height as usize);
+        let pixels = self.pixels(photo);
+        let names = self.encoder_outputs();
+        let arrays = self.encoder.run(&[(&self.encoder.interface.inputs[0].name, pixels)], names)?;
+        let cells = self.side / CELL;
+        let depth = self.decoder.input_extent(EMBEDDING, 1);
+        for (name, array) in names.iter().zip(&arrays) {
+            let fits = matches!(array.shape[..], [1, d, r, c]
+                if d > 0 && r == cells && c == cells && depth.is_none_or(|depth| depth == d));
+            if !fits {
+                let depth = depth.map_or("any".into(), |d| d.to_string());
+                let problem = format!("it is {:?}, expected [1, {depth}, {cells}, {cells}]", array.shape);
+                return Err(self.encoder.unusable(name, problem));
+            }
+        }
+        Ok(Embedding { arrays, new: self.fitted(old.0, old.1), old })
+    }
+
+    /// The decoder's inputs for these clicks, and the outputs to ask for.
+    pub(super) fn prompt(
+        &self,
+        embedding: &Embedding,
+        clicks: &[Click],
+    ) -> (Vec<(&'static str, Tensor)>, &'static [&'static str]) {
+        let (sx, sy) = (
+            embedding.new.0 as f64 / embedding.old.0 as f64,
+            embedding.new.1 as f64 / embedding.old.1 as f64,
+        );
+        let mut points: Vec<f32> = clicks
+            .iter()
+            .flat_map(|c| [(f64::from(c.x) * sx) as f32, (f64::from(c.y) * sy) as f32])
+            .collect();
+        let array = |i: usize| Tensor::f32(&embedding.arrays[i].shape, embedding.arrays[i].values.clone());
+        let n = clicks.len();
+        if let Contract::SamDecoder { labels } = self.decoder.contract {
+            let mut inputs = vec![
+                ("input_points", Tensor::f32(&[1, 1, n, 2], points)),
+                (EMBEDDING, array(0)),
+                (POSITION, array(1)),
+            ];
+            if labels {
+                let each = clicks.iter().map(|c| i64::from(c.head)).collect();
+                inputs.push(("input_labels", Tensor::i64(&[1, 1, n], each)));
+            }
+            return (inputs, &["iou_scores", "pred_masks"]);
+        }
+        // no box: the original code fills its place with this point
+        points.extend([0.0, 0.0]);
+        let labels = clicks.iter().map(|c| f32::from(u8::from(c.head))).chain([-1.0]).collect();
+        let quarter = self.side / 4;
+        let inputs = vec![
+            (EMBEDDING, array(0)),
+            ("point_coords", Tensor::f32(&[1, n + 1, 2], points)),
+            ("point_labels", Tensor::f32(&[1, n + 1], labels)),
+            ("mask_input", Tensor::f32(&[1, 1, quarter, quarter], vec![0.0; quarter * quarter])),
+            ("has_mask_input", Tensor::f32(&[1], vec![0.0])),
+            ("orig_im_size", Tensor::f32(&[2], vec![embedding.old.1 as f32, embedding.old.0 as f32])),
+        ];
+        (inputs, &["iou_predictions", "low_res_masks"])
+    }
+
+    /// Runs the decoder.
+    pub(super) fn decode(
+        &self,
+        embedding: &Embedding,
+        clicks: &[Click],
+    ) -> Result<Candidates, MaskNetworkError> {
+        self.check(clicks, embedding.old)?;
+        let (inputs, names) = self.prompt(embedding, clicks);
+        let given = self.decoder.run(&inputs, names)?;
+        let [scores, logits] = <[Output; 2]>::try_from(given)
+            .map_err(|_| self.decoder.unusable(names[0], "the engine left it out"))?;
+        let quarter = self.side / 4;
+        let split = matches!(self.decoder.contract, Contract::SamDecoder { .. });
+        let lead: &[usize] = if split { &[1, 1] } else { &[1] };
+        let n = scores.shape.last().copied().unwrap_or(0);
+        if n == 0 || scores.shape[..scores.shape.len() - 1] != *lead {
+            let problem = format!("it is {:?}, expected {lead:?} and a number for each mask", scores.shape);
+            return Err(self.decoder.unusable(names[0], problem));
+        }
+        let expected: Vec<usize> = lead.iter().copied().chain([n, quarter, quarter]).collect();
+        if logits.shape != expected {
+            let problem = format!("it is {:?}, expected {expected:?}", logits.shape);
+            return Err(self.decoder.unusable(names[1], problem));
+        }
+        let best =
+            if split { highest(&scores.values, 0) } else { best_of_original(&scores.values, clicks.len()) };
+        Ok(Candidates { scores: scores.values, logits: logits.values, best })
+    }
+
+    /// One candidate's logits on the photograph's pixels; `[height · width]`.
+    pub(super) fn on_photo(&self, embedding: &Embedding, candidates: &Candidates, which: usize) -> Vec<f32> {
+        let quarter = self.side / 4;
+        let small = &candidates.logits[which * quarter * quarter..][..quarter * quarter];
+        let square = resample::field(small, quarter, (quarter, quarter), (self.side, self.side));
+        resample::field(&square, self.side, embedding.new, embedding.old)
+    }
+
+    /// The hard mask (0 or 255) and its score.
+    pub(super) fn segment(&self, photo: &Photo, clicks: &[Click]) -> Result<(Gray, f32), MaskNetworkError> {
+        // before the slow part
+        self.check(clicks, (photo.width as usize, photo.height as usize))?;
+        let embedding = self.embed(photo)?;
+        let candidates = self.decode(&embedding, clicks)?;
+        let logits = self.on_photo(&embedding, &candidates, candidates.best);
+        let values = logits.iter().map(|&l| if l > 0.0 { 255 } else { 0 }).collect();
+        let mask = Gray { width: photo.width, height: photo.height, values };
+        Ok((mask, candidates.scores[candidates.best]))
+    }
+
+    fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<(), MaskNetworkError> {
+        let fault =
+            |problem: String, hint: &str| Err(MaskNetworkError::Clicks { problem, hint: hint.into() });
+        if !clicks.iter().any(|c| c.head) {
+            return fault("none of them is on the head".into(), "click at least the face and the hair");
+        }
+        if clicks.len() > MAX_CLICKS {
+            let hint = format!("keep the {MAX_CLICKS} that matter most");
+            return fault(format!("there are {} on one photograph", clicks.len()), &hint);
+        }
+        let inside = |v: f32, end: usize| v >= -0.5 && f64::from(v) <= end as f64 - 0.5;
+        if let Some(i) = clicks.iter().position(|c| !inside(c.x, width) || !inside(c.y, height)) {
+            let c = clicks[i];
+            let at = format!("number {} at ({}, {})", i + 1, c.x, c.y);
+            return fault(
+                format!("{at} lies outside the photograph of {width} × {height} pixels"),
+                "clicks are pixels of this photograph, 0 at its left and upper edge",
+            );
+        }
+        if self.decoder.contract == (Contract::SamDecoder { labels: false })
+            && let Some(i) = clicks.iter().position(|c| !c.head)
+        {
+            let file = self.decoder.path.display();
+            return fault(
+                format!("number {} is on the background, but `{file}` takes no labels", i + 1),
+                "use a decoder with `input_labels`, or leave the clicks on the background out",
+            );
+        }
+        Ok(())
+    }
+}
+
+/// `[1, 3, side, side]`: normalised colours in the upper left, zeros right and below.
+pub(super) fn normalised(rgb: &[[u8; 3]], width: usize, side: usize, normal: &Normal) -> Tensor {
+    let mut values = vec![0.0; 3 * side * side];
+    for (i, colour) in rgb.iter().enumerate() {
+        let at = i / width * side + i % width;
+        for c in 0..3 {
+            values[c * side * side + at] = normal.apply(colour[c], c);
+        }
+    }
+    Tensor::f32(&[1, 3, side, side], values)
+}
+
+/// The first of the highest scores from `begin` on.
+fn highest(scores: &[f32], begin: usize) -> usize {
+    (begin..scores.len()).fold(begin, |best, i| if scores[i] > scores[best] { i } else { best })
+}
+
+/// The original decoder gives one mask for several points and three for a single, ambiguous one: with two
+/// or more clicks the first is meant, with one the best of the others.
+fn best_of_original(scores: &[f32], clicks: usize) -> usize {
+    match scores.len() {
+        4 if clicks >= 2 => 0,
+        4 => highest(scores, 1),
+        _ => highest(scores, 0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_best_of_four_depends_on_how_many_clicks_there_were() {
+        let scores = [0.9, 0.2, 0.8, 0.8];
+        assert_eq!(best_of_original(&scores, 2), 0);
+        assert_eq!(best_of_original(&scores, 1), 2);
+        assert_eq!(best_of_original(&scores[1..], 5), 1);
+        assert_eq!(best_of_original(&scores[..1], 1), 0);
+    }
+
+    #[test]
+    fn normalised_colours_lie_in_the_corner_and_zeros_around_them() {
+        // 2 × 1 pixels in a square of 3: red (255 − 0.485 · 255) / (0.229 · 255) = 2.2489
+        let tensor = normalised(&[[255, 0, 0], [0, 0, 0]], 2, 3, &IMAGENET);
+        let super::super::onnx::Values::F32(values) = tensor.values else { panic!() };
+        assert!((values[0] - 2.248_908).abs() < 1e-5 && (values[1] + 2.117_904).abs() < 1e-5);
+        assert_eq!(values[2..9], [0.0; 7]);
+    }
+}
