@@ -9,7 +9,12 @@
 //!
 //! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unsure in a trimap.
 
+pub mod alpha;
+pub mod closed_form;
 pub mod distance;
+pub mod guided;
+pub mod resample;
+pub mod trimap;
 
 /// One click of a person on a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
