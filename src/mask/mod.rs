@@ -12,8 +12,12 @@
 pub mod alpha;
 pub mod closed_form;
 pub mod distance;
+mod font;
 pub mod guided;
+pub mod page;
+pub mod points;
 pub mod resample;
+pub mod sheet;
 pub mod trimap;
 
 /// One click of a person on a photograph.
