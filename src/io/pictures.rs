@@ -495,7 +495,8 @@ mod tests {
         let photo = Photo { width: 16, height: 16, rgb, alpha: Some(vec![9; 256]) };
         let bytes = jpeg_bytes(&photo, 95, Path::new("a.jpg")).unwrap();
         let back = parse_photo(&bytes, Path::new("a.jpg"), &Limits::default()).unwrap();
-        let apart = back.rgb.iter().zip(&photo.rgb).map(|(a, b)| a[0].abs_diff(b[0]).max(a[2].abs_diff(b[2])));
+        let apart =
+            back.rgb.iter().zip(&photo.rgb).map(|(a, b)| a[0].abs_diff(b[0]).max(a[2].abs_diff(b[2])));
         assert!(apart.max() < Some(24) && back.alpha.is_none());
         let wrong = Photo { width: 3, ..photo };
         assert!(matches!(jpeg_bytes(&wrong, 95, Path::new("a.jpg")), Err(WriteError::Content { .. })));

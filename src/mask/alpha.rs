@@ -126,6 +126,10 @@ impl SoftenOptions {
         if let Some((name, value)) = positive.into_iter().find(|(_, v)| !(*v > 0.0 && v.is_finite())) {
             return wrong(name, value.to_string(), "a positive number");
         }
+        let hold = self.closed_form.hold;
+        if !(hold >= 0.0 && hold.is_finite()) {
+            return wrong("closed_form.hold", hold.to_string(), "a number of at least 0");
+        }
         if !share(self.guided.radius) {
             return wrong("guided.radius", self.guided.radius.to_string(), "a share of the height, 0 to 1");
         }
@@ -226,7 +230,7 @@ pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Sof
         Matting::Guided => filtered(),
         // tied to one side only, everything would become that side
         Matting::ClosedForm if !sides_known && trimap.values.contains(&UNSURE) => filtered(),
-        Matting::ClosedForm => match closed_form(photo, trimap, &options.closed_form) {
+        Matting::ClosedForm => match closed_form(photo, mask, trimap, &options.closed_form) {
             Ok(matte) => matte.alpha,
             Err(why) => {
                 warnings.push(format!("closed-form matting was replaced by the guided filter: {why}"));
@@ -241,6 +245,7 @@ pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Sof
 
 #[cfg(test)]
 mod tests {
+    use super::super::distance;
     use super::*;
     use crate::io::{Limits, read_gray, read_photo};
 
@@ -364,29 +369,47 @@ mod tests {
     }
 
     #[test]
-    fn alphas_of_the_clicked_heads_are_at_least_forty_percent_better_than_hard_masks() {
+    fn alphas_of_the_clicked_heads_are_forty_percent_better_than_hard_masks() {
         let shared = std::env::var("TIFACE_SHARED")
             .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
-        let folder = std::path::Path::new(&shared).join("data/captures/lps");
-        if !folder.is_dir() {
-            eprintln!("skipped: the capture `lps` is not at {}", folder.display());
-            return;
-        }
         let limits = Limits::default();
-        for view in ["010", "013", "015", "002", "006"] {
-            let picture = |kind: &str| folder.join(kind).join(format!("{view}.png"));
-            if !picture("images").is_file() {
+        // photographs whose masks are cut as they are at half, too wide and too narrow by 2 pixels; at least so much
+        // of the error is gone. At half, a mask of a sharp outline is better than any cut can be.
+        let heads = [
+            ("lps", ["002", "006", "010"], [0.2, 0.7, 0.7]),
+            ("nefertiti", ["010", "013", "015"], [-2.0, 0.8, 0.8]),
+        ];
+        for (capture, views, gains) in heads {
+            let folder = std::path::Path::new(&shared).join("data/captures").join(capture);
+            if !folder.is_dir() {
+                eprintln!("skipped: the capture `{capture}` is not at {}", folder.display());
                 continue;
             }
-            let photo = read_photo(&picture("images"), None, &limits).unwrap().photo;
-            let truth = read_gray(&picture("masks"), None, &limits).unwrap();
-            let soft_truth: Vec<f32> = truth.values.iter().map(|&v| v as f32 / 255.0).collect();
-            let mask = hard(&soft_truth, truth.width, truth.height);
+            let (mut hard_error, mut soft_error) = ([0.0; 3], [0.0; 3]);
             let start = std::time::Instant::now();
-            let soft = soften(&photo, &mask, &SoftenOptions::default()).unwrap();
-            let seconds = start.elapsed().as_secs_f64();
-            let (before, after) = (error(&mask.values, &soft_truth), error(&soft.alpha.values, &soft_truth));
-            eprintln!("{view}: {:.2} of 1000 became {:.2}, {seconds:.2} s", 1e3 * before, 1e3 * after);
+            for view in views {
+                let picture = |kind: &str| folder.join(kind).join(format!("{view}.png"));
+                let photo = read_photo(&picture("images"), None, &limits).unwrap().photo;
+                let truth = read_gray(&picture("masks"), None, &limits).unwrap();
+                let (w, h) = (truth.width as usize, truth.height as usize);
+                let soft_truth: Vec<f32> = truth.values.iter().map(|&v| v as f32 / 255.0).collect();
+                let cut: Vec<bool> = truth.values.iter().map(|&v| v >= 128).collect();
+                let masks = [cut.clone(), distance::grow(&cut, w, h, 2.0), distance::shrink(&cut, w, h, 2.0)];
+                for (k, mask) in masks.iter().enumerate() {
+                    let values = mask.iter().map(|&m| if m { 255 } else { 0 }).collect();
+                    let mask = Gray { values, ..truth };
+                    let soft = soften(&photo, &mask, &SoftenOptions::default()).unwrap();
+                    assert!(soft.warnings.is_empty(), "{:?}", soft.warnings);
+                    hard_error[k] += error(&mask.values, &soft_truth) / 3.0;
+                    soft_error[k] += error(&soft.alpha.values, &soft_truth) / 3.0;
+                }
+            }
+            let seconds = start.elapsed().as_secs_f64() / 9.0;
+            for k in 0..3 {
+                let (hard, soft) = (hard_error[k], soft_error[k]);
+                eprintln!("{capture}: {:.2} of 1000 became {:.2}, {seconds:.2} s", 1e3 * hard, 1e3 * soft);
+                assert!(soft <= (1.0 - gains[k]) * hard, "{capture} {k}: {soft:.2e} of {hard:.2e}");
+            }
         }
     }
 }

@@ -146,7 +146,9 @@ mod tests {
         ];
         assert_eq!(drawn("7A", 1), expected);
         let large = drawn("7A", 2);
-        assert!((0..14).all(|y| (0..24).all(|x| large[y].as_bytes()[x] == expected[y / 2].as_bytes()[x / 2])));
+        assert!(
+            (0..14).all(|y| (0..24).all(|x| large[y].as_bytes()[x] == expected[y / 2].as_bytes()[x / 2]))
+        );
     }
 
     #[test]

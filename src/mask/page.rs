@@ -98,7 +98,8 @@ pub fn page_of(
     let mut views = Vec::with_capacity(chosen.len());
     // a few at a time: photographs are large
     for few in chosen.chunks(rayon::current_num_threads().max(1)) {
-        let made: Vec<Result<PageView, PageError>> = few.par_iter().map(|&i| read(&capture.views[i])).collect();
+        let made: Vec<Result<PageView, PageError>> =
+            few.par_iter().map(|&i| read(&capture.views[i])).collect();
         for view in made {
             views.push(view?);
         }
@@ -175,7 +176,11 @@ mod tests {
         let page = page("t", &[view("a")], &Prompts::default());
         // the one address is the name of SVG's vocabulary, which nobody fetches
         let addresses: Vec<_> = page.match_indices("http").map(|(i, _)| &page[i..i + 26]).collect();
-        assert!(addresses.iter().all(|a| a.starts_with("http://www.w3.org/2000/svg") || a.starts_with("http-equiv")));
+        assert!(
+            addresses
+                .iter()
+                .all(|a| a.starts_with("http://www.w3.org/2000/svg") || a.starts_with("http-equiv"))
+        );
         assert!(!page.contains("src=\"") && page.contains("default-src 'none'"));
     }
 
@@ -196,7 +201,11 @@ mod tests {
         let view = PageView::new("a.png".into(), (640, 320), &photo, &options).unwrap();
         let small = io::parse_photo(&view.jpeg, Path::new("a"), &Limits::default()).unwrap();
         assert_eq!((small.width, small.height, view.size), (16, 8, (640, 320)));
-        assert!(small.rgb[40].iter().zip([200u8, 100, 50]).all(|(a, b)| a.abs_diff(b) < 4), "{:?}", small.rgb[40]);
+        assert!(
+            small.rgb[40].iter().zip([200u8, 100, 50]).all(|(a, b)| a.abs_diff(b) < 4),
+            "{:?}",
+            small.rgb[40]
+        );
         let none = Photo { width: 0, height: 0, rgb: vec![], alpha: None };
         assert!(PageView::new("a".into(), (1, 1), &none, &options).is_err());
     }

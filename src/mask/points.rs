@@ -180,7 +180,11 @@ fn parse(file: &str, value: &Value, limits: &Limits) -> Result<Prompts, PointsEr
             Ok(path) => path,
             Err(why) => {
                 let problem = format!("its `file_path` `{}` {why}", shown(name));
-                return wrong(&place, problem, "name the photograph as the camera file does: `images/010.png`");
+                return wrong(
+                    &place,
+                    problem,
+                    "name the photograph as the camera file does: `images/010.png`",
+                );
             }
         };
         if let Some(first) = seen.insert(file_path.clone(), i) {
@@ -205,7 +209,9 @@ fn parse(file: &str, value: &Value, limits: &Limits) -> Result<Prompts, PointsEr
                     None => Err(format!("is {}, not a number", found.map_or("missing".into(), kind))),
                 };
                 let place = inside(&format!(".{key}"));
-                value.map_err(|problem| content(&place, format!("it {problem}"), "correct that point, or remove it"))
+                value.map_err(|problem| {
+                    content(&place, format!("it {problem}"), "correct that point, or remove it")
+                })
             };
             let (x, y) = (number("x")?, number("y")?);
             let head = match point.get("label").map(|v| (v.as_f64(), v)) {
@@ -313,8 +319,10 @@ impl Prompts {
             let place = format!("`frames[{i}]`");
             let name = shown(&frame.file_path);
             let exact = photos.iter().position(|p| p.path == frame.file_path);
-            let Some(view) = exact.or_else(|| photos.iter().position(|p| p.is_called(&frame.file_path))) else {
-                let first = photos.first().map_or(String::new(), |p| format!(", such as `{}`", shown(&p.path)));
+            let Some(view) = exact.or_else(|| photos.iter().position(|p| p.is_called(&frame.file_path)))
+            else {
+                let first =
+                    photos.first().map_or(String::new(), |p| format!(", such as `{}`", shown(&p.path)));
                 let problem = format!("`{name}` is no photograph of this capture");
                 return wrong(place, problem, format!("name one of its {} photographs{first}", photos.len()));
             };
@@ -330,9 +338,12 @@ impl Prompts {
             for (j, click) in frame.points.iter().enumerate() {
                 let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;
                 if !(inside(click.x, w) && inside(click.y, h)) {
-                    let problem =
-                        format!("({}, {}) lies outside `{name}`, which is {w} × {h} pixels", click.x, click.y);
-                    let hint = "click on the full-size photograph: x from 0 to width − 1, y from 0 to height − 1";
+                    let problem = format!(
+                        "({}, {}) lies outside `{name}`, which is {w} × {h} pixels",
+                        click.x, click.y
+                    );
+                    let hint =
+                        "click on the full-size photograph: x from 0 to width − 1, y from 0 to height − 1";
                     return wrong(format!("`frames[{i}].points[{j}]`"), problem, hint.into());
                 }
                 // pixel i of the reduced picture averages pixels d i to d i + d − 1; what fills no block is dropped
@@ -416,7 +427,10 @@ mod tests {
         prompts.write(&path).unwrap();
         assert_eq!(read_prompts(&path, &Limits::default()).unwrap(), prompts);
         let text = std::fs::read_to_string(&path).unwrap();
-        assert!(text.contains("\"x\": 181,") && text.contains("51.25") && text.contains("foreground"), "{text}");
+        assert!(
+            text.contains("\"x\": 181,") && text.contains("51.25") && text.contains("foreground"),
+            "{text}"
+        );
     }
 
     #[test]
@@ -453,7 +467,10 @@ mod tests {
         for (text, place, problem) in cases {
             let error = parsed(&text).expect_err(&text);
             let said = error.to_string();
-            assert!(said.starts_with("`p.json`, ") && said.contains(place) && said.contains(problem), "{said}");
+            assert!(
+                said.starts_with("`p.json`, ") && said.contains(place) && said.contains(problem),
+                "{said}"
+            );
             assert!(said.len() < 400 && !error.hint().is_empty(), "{said}");
         }
     }
@@ -477,10 +494,14 @@ mod tests {
     #[test]
     fn photographs_are_found_by_several_names_and_by_no_wrong_one() {
         let full = photograph("images/left/010.JPG", "left/010", (40, 30), 1);
-        for name in ["images/left/010.JPG", "images/left/010", "images/left/010.png", "left/010", "left/010.jpg"] {
+        for name in
+            ["images/left/010.JPG", "images/left/010", "images/left/010.png", "left/010", "left/010.jpg"]
+        {
             assert!(full.is_called(name), "{name}");
         }
-        for name in ["010", "images/010.JPG", "images/left/01", "images/left/010.JPG.png", "images/left/010.txt"] {
+        for name in
+            ["010", "images/010.JPG", "images/left/01", "images/left/010.JPG.png", "images/left/010.txt"]
+        {
             assert!(!full.is_called(name), "{name}");
         }
         let reduced = photograph("images_4/a.b.png", "a.b", (40, 30), 4);
@@ -491,10 +512,8 @@ mod tests {
     #[test]
     fn clicks_come_in_the_pixels_of_the_reduced_picture() {
         let text = r#"[{"x": 0, "y": 1.5, "label": 1}, {"x": 41, "y": 29, "label": 0}]"#;
-        let photos = [
-            photograph("images/b.png", "b", (42, 30), 4),
-            photograph("images/a.png", "a", (42, 30), 4),
-        ];
+        let photos =
+            [photograph("images/b.png", "b", (42, 30), 4), photograph("images/a.png", "a", (42, 30), 4)];
         let clicks = parsed(&one("images/a.png", text)).unwrap().of_photographs("p.json", &photos).unwrap();
         // (0 + ½) / 4 − ½ = −3/8 and (1.5 + ½) / 4 − ½ = 0; (29 + ½) / 4 − ½ = 6.875 of 7 rows is 6 at most;
         // column 41 lies in the two that fill no block of four: the last of 10 takes it
@@ -505,7 +524,8 @@ mod tests {
 
     #[test]
     fn clicks_that_fit_no_photograph_are_named() {
-        let photos = [photograph("images/a.png", "a", (42, 30), 1), photograph("images/b.png", "b", (42, 30), 1)];
+        let photos =
+            [photograph("images/a.png", "a", (42, 30), 1), photograph("images/b.png", "b", (42, 30), 1)];
         let of = |text: String| parsed(&text).unwrap().of_photographs("p.json", &photos).unwrap_err();
         let error = of(one("images/c.png", POINT));
         assert!(error.to_string().contains("`images/c.png` is no photograph of this capture"), "{error}");
@@ -557,7 +577,8 @@ mod tests {
             let clicked = |v: &&Vec<Click>| v.len() == 6 && v.iter().filter(|c| c.head).count() == 3;
             assert_eq!(clicks.iter().filter(clicked).count(), 3, "{name}");
             for frame in &prompts.frames {
-                let view = capture.views.iter().position(|v| file_path(&capture, v) == frame.file_path).unwrap();
+                let view =
+                    capture.views.iter().position(|v| file_path(&capture, v) == frame.file_path).unwrap();
                 assert_eq!(clicks[view], frame.points);
             }
         }

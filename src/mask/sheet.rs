@@ -18,6 +18,7 @@ const ALARM: [u8; 3] = [255, 70, 60];
 /// Around a picture, with the frame in the middle.
 const MARGIN: u32 = 8;
 const FRAME: u32 = 4;
+/// Between lines of text, in pixels of a letter.
 const LINE_GAP: u32 = 3;
 
 /// How large a sheet may become.
@@ -122,7 +123,7 @@ pub fn sheet(tiles: &[Tile], options: &SheetOptions) -> Photo {
     let (widest, tallest) = (side(|p| p.width), side(|p| p.height));
     let cell_width = widest.max(60) + 2 * MARGIN;
     let scale = if cell_width >= 200 { 2 } else { 1 };
-    let line = font::HEIGHT * scale + LINE_GAP;
+    let line = (font::HEIGHT + LINE_GAP) * scale;
     let letters = ((cell_width - 2 * MARGIN) / (font::ADVANCE * scale)) as usize;
     let captions: Vec<Vec<(String, [u8; 3])>> = tiles.iter().map(|t| caption(t, letters)).collect();
     let lines = captions.iter().map(Vec::len).max().unwrap_or(0) as u32;
@@ -152,7 +153,7 @@ pub fn sheet(tiles: &[Tile], options: &SheetOptions) -> Photo {
         for (i, &color) in (0u32..).zip(&picture.rgb) {
             set(&mut out, x0 + i % picture.width, y0 + i / picture.width, color);
         }
-        let mut y = top + 2 * MARGIN + tallest - LINE_GAP;
+        let mut y = top + 2 * MARGIN + tallest;
         for (text, color) in &captions[i] {
             font::ink(text, scale, |dx, dy| set(&mut out, left + MARGIN + dx, y + dy, *color));
             y += line;
@@ -184,9 +185,8 @@ fn caption(tile: &Tile, letters: usize) -> Vec<(String, [u8; 3])> {
         _ => tile.name.clone(),
     };
     let mut lines = vec![(name, TEXT)];
-    let unsure = tile.unsure.map(|u| format!(" unsure {:.0} %", 100.0 * u)).unwrap_or_default();
-    let figures = format!("head {:.1} %{unsure}", 100.0 * tile.coverage);
-    lines.extend(wrapped(&figures, letters, 2).into_iter().map(|l| (l, TEXT)));
+    lines.push((format!("head {:.1} %", 100.0 * tile.coverage), TEXT));
+    lines.extend(tile.unsure.map(|u| (format!("unsure {:.1} %", 100.0 * u), TEXT)));
     for suspicion in &tile.suspicions {
         lines.extend(wrapped(suspicion, letters, 3).into_iter().map(|l| (l, ALARM)));
     }
@@ -246,7 +246,9 @@ mod tests {
         assert_eq!(count(&tile.picture, OUTLINE), 98);
         assert_eq!(count(&tile.picture, [40; 3]), 40 + 40 + 20);
         // 800 of 4800 pixels
-        assert!((tile.coverage - 1.0 / 6.0).abs() < 1e-12 && tile.suspicions.is_empty() && tile.unsure.is_none());
+        assert!(
+            (tile.coverage - 1.0 / 6.0).abs() < 1e-12 && tile.suspicions.is_empty() && tile.unsure.is_none()
+        );
     }
 
     #[test]
@@ -258,7 +260,8 @@ mod tests {
                 20..40 => UNSURE,
                 _ => 255,
             });
-            let tile = Tile::new("a", &photo(60, 80), &alpha, Some(&trimap), vec![], &SheetOptions::default());
+            let tile =
+                Tile::new("a", &photo(60, 80), &alpha, Some(&trimap), vec![], &SheetOptions::default());
             // columns 20 to 39 but the rim at 30 and the dark one at 29: 100 + 0.4 (255 − 100) = 162
             assert_eq!(count(&tile.picture, [162, 140, 60]), 18 * 80, "{scale}");
             assert!((tile.unsure.unwrap() - 1.0 / 3.0).abs() < 1e-9);
@@ -268,7 +271,8 @@ mod tests {
     #[test]
     fn suspicious_views_are_framed_and_say_why() {
         let white = gray(60, 80, |_, _| 255);
-        let tile = Tile::new("b", &photo(60, 80), &white, None, vec!["disagrees".into()], &SheetOptions::default());
+        let tile =
+            Tile::new("b", &photo(60, 80), &white, None, vec!["disagrees".into()], &SheetOptions::default());
         assert_eq!(tile.suspicions, ["disagrees", "is white everywhere"]);
         let fine = sheet(&[good("a")], &SheetOptions::default());
         let odd = sheet(&[good("a"), tile], &SheetOptions::default());
@@ -287,7 +291,9 @@ mod tests {
         assert!(count(&out, ALARM) > 0, "the suspicious view is among those shown");
         // never wider or higher, even if not one picture fits
         let tiny = sheet(&tiles, &SheetOptions { picture: 320, width: 30, height: 20 });
-        assert!(tiny.width <= 30 && tiny.height <= 20 && tiny.rgb.len() == (tiny.width * tiny.height) as usize);
+        assert!(
+            tiny.width <= 30 && tiny.height <= 20 && tiny.rgb.len() == (tiny.width * tiny.height) as usize
+        );
         let none = sheet(&[], &SheetOptions::default());
         assert_eq!(none.rgb.len(), (none.width * none.height) as usize);
     }
