@@ -11,7 +11,7 @@
 
 use super::closed_form::{ClosedFormOptions, closed_form};
 use super::guided::{GuidedOptions, guided};
-use super::resample::{enlarge, reduce_gray, reduce_photo, working_size};
+use super::scale::{enlarge, reduce_gray, reduce_photo, working_size};
 use super::trimap::{Band, HEAD, OUTSIDE, UNSURE, trimap, unsure_share};
 use crate::image::{Gray, Photo};
 
@@ -92,7 +92,8 @@ impl AlphaError {
     pub fn hint(&self) -> String {
         match self {
             AlphaError::Size { .. } => {
-                "make the mask from this very photograph, or at the size it is worked on".into()
+                "make the mask from this very photograph; it may be smaller, but of the same proportions"
+                    .into()
             }
             AlphaError::Option { expected, .. } => format!("choose {expected}"),
         }
@@ -163,17 +164,25 @@ pub struct Working {
 }
 
 impl Working {
-    /// Reduces a photograph and its mask (of its size, or of the working size already; head where it is 128 or
-    /// more) and finds the band.
+    /// Reduces a photograph, brings its mask (head where it is 128 or more; of any size with the photograph's
+    /// proportions, since cuts are made smaller still) to the same size and finds the band.
     pub fn new(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Working, AlphaError> {
         options.check()?;
         let size = (photo.width, photo.height);
         let working = working_size(photo.width, photo.height, options.side);
         let given = (mask.width, mask.height);
-        if given != size && given != working {
+        // sides of w s and h s, each rounded by up to half a pixel
+        let across = |a: u32, b: u32| a as u64 * b as u64;
+        let apart = across(given.0, size.1).abs_diff(across(given.1, size.0));
+        if given.0 == 0 || given.1 == 0 || apart > size.0.max(size.1) as u64 {
             return Err(AlphaError::Size { mask: given, photo: size });
         }
-        let mut mask = reduce_gray(mask, working);
+        let mut mask = if given.0 >= working.0 && given.1 >= working.1 {
+            reduce_gray(mask, working)
+        } else {
+            let head: Vec<f32> = mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect();
+            enlarge(&head, given, working, 0.0, 1.0)
+        };
         mask.values.iter_mut().for_each(|v| *v = if *v >= 128 { HEAD } else { OUTSIDE });
         let trimap = trimap(&mask, options.band);
         Ok(Working { photo: reduce_photo(photo, working), mask, trimap, size })
@@ -218,8 +227,7 @@ pub struct Softened {
     pub warnings: Vec<String>,
 }
 
-/// The soft alpha of a photograph from its hard mask, which has the photograph's size or that of the working
-/// picture.
+/// The soft alpha of a photograph from its hard mask, which has the photograph's proportions.
 pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Softened, AlphaError> {
     let working = Working::new(photo, mask, options)?;
     let mut warnings = working.warnings(options);
@@ -299,9 +307,11 @@ mod tests {
         let (before, after) =
             (error(&hard(&truth, 320, 400).values, &truth), error(&full.alpha.values, &truth));
         assert!(after < 0.1 * before, "{after:.2e} of {before:.2e}");
-        // a mask that has the working size already is taken as it is
+        // a mask that has the working size already is taken as it is; a smaller one is brought to it
         let small = soften(&photo, &reduce_gray(&hard(&truth, 320, 400), (160, 200)), &options).unwrap();
         assert_eq!(full.alpha, small.alpha);
+        let tiny = soften(&photo, &reduce_gray(&hard(&truth, 320, 400), (53, 67)), &options).unwrap();
+        assert!(error(&tiny.alpha.values, &truth) < 0.1 * before);
     }
 
     #[test]

@@ -16,7 +16,7 @@ mod font;
 pub mod guided;
 pub mod page;
 pub mod points;
-pub mod resample;
+pub mod scale;
 pub mod sheet;
 pub mod trimap;
 

@@ -5,7 +5,7 @@
 //! JSON in which no character can end the element that holds it.
 
 use super::points::{Prompts, file_path};
-use super::resample::{reduce_photo, working_size};
+use super::scale::{reduce_photo, working_size};
 use crate::capture::{Capture, View};
 use crate::image::Photo;
 use crate::io::{self, Limits, ReadError, WriteError};

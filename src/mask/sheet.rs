@@ -5,7 +5,7 @@
 
 use super::font;
 use super::page::spread;
-use super::resample::{reduce_gray, reduce_photo, working_size};
+use super::scale::{reduce_gray, reduce_photo, working_size};
 use super::trimap::{UNSURE, unsure_share};
 use crate::capture::{coverage, findings};
 use crate::image::{Gray, Photo};
