@@ -92,6 +92,18 @@ blender_is_here() {
   .venv-blender/bin/python -c 'import bpy'
 }
 
+# A browser for the page to click on; left out aloud where there is none and apt cannot get it.
+browser_is_here() {
+  "${CHROMIUM:-/usr/bin/chromium}" --version 2> /dev/null && return
+  [ -z "${CHROMIUM:-}" ] && command -v apt-get > /dev/null || return
+  local sudo=
+  [ "$(id -u)" = 0 ] || sudo=sudo
+  $sudo apt-get update -qq && $sudo apt-get install -y -qq --no-install-recommends chromium > /dev/null
+  /usr/bin/chromium --version
+}
+
+click_page() { cargo run --release --quiet --example click_page -- "$scratch/click/page.html"; }
+
 # Everything that reads files, on one export
 readers_agree() {
   local name=$1 glb=$2
@@ -125,6 +137,17 @@ printf '\n== Blender is here\n'
 if ! blender_is_here; then
   blender=no
   results+=("SKIPPED Blender: tools/readers/requirements-blender.txt could not be installed, or not be loaded")
+fi
+browser=yes
+printf '\n== a browser is here\n'
+if ! browser_is_here; then
+  browser=no
+  results+=("SKIPPED the page to click on: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it")
+fi
+mkdir -p "$scratch/click"
+step "the page to click on is written" click_page
+if [ $browser = yes ]; then
+  step "a browser clicks on the page" node tools/page/check_page.mjs "$scratch/click/page.html"
 fi
 step "a sphere is written" sphere
 readers_agree "the sphere" "$scratch/sphere/sphere.glb"

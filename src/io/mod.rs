@@ -20,8 +20,8 @@ pub use self::folder::{
 pub use self::json::parse_json;
 pub use self::npy::{Npy, NpyValues, parse_npy, read_npy};
 pub use self::pictures::{
-    Picture, PictureInfo, Turn, parse_photo, parse_picture_info, picture_info, read_gray, read_photo,
-    write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
+    Picture, PictureInfo, Turn, jpeg_bytes, parse_photo, parse_picture_info, picture_info, read_gray,
+    read_photo, write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
 };
 pub use self::tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
 pub use self::torch::{TorchNumbers, TorchTensor, TorchValue, parse_torch, read_torch, torch_bytes};

@@ -7,6 +7,7 @@
 
 use super::{Limits, ReadError, WriteError, open, read_bytes, write_atomic};
 use crate::image::{Gray, Photo};
+use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngDecoder, PngEncoder};
 use image::metadata::Orientation;
 use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder};
@@ -411,6 +412,21 @@ pub fn write_png_gray16(path: &Path, width: u32, height: u32, values: &[u16]) ->
     write_png(path, width, height, bytemuck::cast_slice(values), ExtendedColorType::L16)
 }
 
+/// A photograph as the bytes of a JPEG file of `quality` 1 to 100, without its alpha. `path` is for messages only.
+pub fn jpeg_bytes(photo: &Photo, quality: u8, path: &Path) -> Result<Vec<u8>, WriteError> {
+    let content = |problem: String| WriteError::Content { path: path.into(), problem };
+    let (width, height) = (photo.width, photo.height);
+    let pixels = width as u64 * height as u64;
+    if pixels == 0 || pixels != photo.rgb.len() as u64 || width.max(height) > u16::MAX as u32 {
+        return Err(content(format!("{width} × {height} with {} pixels is no JPEG", photo.rgb.len())));
+    }
+    let mut out = Vec::new();
+    JpegEncoder::new_with_quality(&mut out, quality.clamp(1, 100))
+        .write_image(photo.rgb.as_flattened(), width, height, ExtendedColorType::Rgb8)
+        .map_err(|e| content(e.to_string()))?;
+    Ok(out)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -471,5 +487,18 @@ mod tests {
         let path = dir.path().join("a.png");
         assert!(matches!(write_png_rgb(&path, 2, 2, &[[0; 3]]), Err(WriteError::Content { .. })));
         assert!(!path.exists());
+    }
+
+    #[test]
+    fn a_jpeg_of_a_photograph_looks_like_it() {
+        let rgb: Vec<[u8; 3]> = (0..256).map(|i| [i as u8, 128, 255 - i as u8]).collect();
+        let photo = Photo { width: 16, height: 16, rgb, alpha: Some(vec![9; 256]) };
+        let bytes = jpeg_bytes(&photo, 95, Path::new("a.jpg")).unwrap();
+        let back = parse_photo(&bytes, Path::new("a.jpg"), &Limits::default()).unwrap();
+        let apart =
+            back.rgb.iter().zip(&photo.rgb).map(|(a, b)| a[0].abs_diff(b[0]).max(a[2].abs_diff(b[2])));
+        assert!(apart.max() < Some(24) && back.alpha.is_none());
+        let wrong = Photo { width: 3, ..photo };
+        assert!(matches!(jpeg_bytes(&wrong, 95, Path::new("a.jpg")), Err(WriteError::Content { .. })));
     }
 }

@@ -9,7 +9,17 @@
 //!
 //! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unsure in a trimap.
 
+pub mod alpha;
+pub mod closed_form;
 pub mod distance;
+mod font;
+pub mod guided;
+pub mod page;
+pub mod points;
+pub mod scale;
+pub mod sheet;
+pub mod trimap;
+
 #[cfg(feature = "matting")]
 pub mod networks;
 #[cfg(all(test, feature = "matting"))]

@@ -1,0 +1,425 @@
+//! From a hard mask to a soft alpha: smaller, unsure band, opacity of the band, large again, hardened.
+//!
+//! ```text
+//! photograph ─ reduce ─┬────────────── opacity of the band ─ enlarge ─ harden ─ alpha
+//! hard mask ── reduce ─┴─ trimap ─────┘
+//! ```
+//!
+//! The opacity is found at a working size, since the band of a photograph of 3000 × 4096 would hold millions of
+//! pixels and its outline is no sharper than the lens. Whoever has another way to find it (a matting network)
+//! takes [`Working`] and gives back its alphas.
+
+use super::closed_form::{ClosedFormOptions, closed_form};
+use super::guided::{GuidedOptions, guided};
+use super::scale::{enlarge, reduce_gray, reduce_photo, working_size};
+use super::trimap::{Band, HEAD, OUTSIDE, UNSURE, trimap, unsure_share};
+use crate::image::{Gray, Photo};
+
+/// How the opacity of the unsure band is found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Matting {
+    /// [`closed_form`]; where it finds no solution, [`guided`] with a warning.
+    ClosedForm,
+    /// [`guided`]: a third of the time and about 60 % of the gain.
+    Guided,
+}
+
+/// Every constant on the way from a hard mask to an alpha.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SoftenOptions {
+    /// Longest side of the working picture at most, pixels.
+    pub side: u32,
+    /// Width of the unsure band.
+    pub band: Band,
+    /// How its opacity is found.
+    pub matting: Matting,
+    /// For [`Matting::ClosedForm`].
+    pub closed_form: ClosedFormOptions,
+    /// For [`Matting::Guided`].
+    pub guided: GuidedOptions,
+    /// Alphas below become 0.
+    pub lowest: f32,
+    /// Alphas above become 1.
+    pub highest: f32,
+    /// A band that is a larger share of the picture is worth a warning.
+    pub most_unsure: f64,
+}
+
+impl Default for SoftenOptions {
+    fn default() -> SoftenOptions {
+        SoftenOptions {
+            side: 1024,
+            band: Band::default(),
+            matting: Matting::ClosedForm,
+            closed_form: ClosedFormOptions::default(),
+            guided: GuidedOptions::default(),
+            lowest: 0.02,
+            highest: 0.98,
+            most_unsure: 0.3,
+        }
+    }
+}
+
+/// Why no alpha was made.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum AlphaError {
+    /// The mask is not one of this photograph.
+    #[error(
+        "the mask is {} × {} pixels, but its photograph is {} × {}",
+        mask.0, mask.1, photo.0, photo.1
+    )]
+    Size {
+        /// Width and height of the mask.
+        mask: (u32, u32),
+        /// Width and height of the photograph.
+        photo: (u32, u32),
+    },
+    /// An option makes no sense.
+    #[error("the matting option `{name}` is {found}; expected {expected}")]
+    Option {
+        /// Which.
+        name: &'static str,
+        /// Its value.
+        found: String,
+        /// What can be used.
+        expected: &'static str,
+    },
+}
+
+impl AlphaError {
+    /// The way out.
+    pub fn hint(&self) -> String {
+        match self {
+            AlphaError::Size { .. } => {
+                "make the mask from this very photograph; it may be smaller, but of the same proportions"
+                    .into()
+            }
+            AlphaError::Option { expected, .. } => format!("choose {expected}"),
+        }
+    }
+}
+
+impl SoftenOptions {
+    /// Names the first option that makes no sense.
+    pub fn check(&self) -> Result<(), AlphaError> {
+        let wrong = |name, found: String, expected| Err(AlphaError::Option { name, found, expected });
+        let share = |v: f32| (0.0..=1.0).contains(&v);
+        match self.band {
+            Band::Squares { kernel, iterations } if !(1..=1000).contains(&kernel) || iterations > 1000 => {
+                let found = format!("{kernel} × {kernel} ones, {iterations} times");
+                return wrong("band", found, "a kernel of 1 to 1000 pixels and up to 1000 iterations");
+            }
+            Band::Discs { share: s } if !share(s) => {
+                return wrong("band", s.to_string(), "a share of the height, 0 to 1");
+            }
+            _ => {}
+        }
+        if self.side < 16 {
+            return wrong("side", self.side.to_string(), "at least 16 pixels");
+        }
+        let positive = [
+            ("closed_form.epsilon", self.closed_form.epsilon),
+            ("closed_form.tie", self.closed_form.tie),
+            ("closed_form.tolerance", self.closed_form.tolerance),
+            ("guided.epsilon", self.guided.epsilon),
+        ];
+        if let Some((name, value)) = positive.into_iter().find(|(_, v)| !(*v > 0.0 && v.is_finite())) {
+            return wrong(name, value.to_string(), "a positive number");
+        }
+        let hold = self.closed_form.hold;
+        if !(hold >= 0.0 && hold.is_finite()) {
+            return wrong("closed_form.hold", hold.to_string(), "a number of at least 0");
+        }
+        if !share(self.guided.radius) {
+            return wrong("guided.radius", self.guided.radius.to_string(), "a share of the height, 0 to 1");
+        }
+        if !(share(self.lowest) && share(self.highest) && self.lowest <= self.highest) {
+            let found = format!("{} to {}", self.lowest, self.highest);
+            return wrong("lowest and highest", found, "two numbers of 0 to 1, the lower first");
+        }
+        Ok(())
+    }
+
+    /// Bytes needed at most beside the photograph and the mask themselves, for one photograph of this size:
+    /// the alpha, the working pictures, and the equations if the whole working picture were unsure.
+    pub fn memory_bytes(&self, width: u32, height: u32) -> u64 {
+        let pixels = |(w, h): (u32, u32)| w as u64 * h as u64;
+        // per working pixel: photograph 3, mask, trimap 2, alpha and rows 8, distances and marks 12, equations 310
+        pixels((width, height)) + 335 * pixels(working_size(width, height, self.side))
+    }
+}
+
+/// A photograph at the size it is worked on, with its hard mask and the band between.
+#[derive(Clone, Debug)]
+pub struct Working {
+    /// The photograph, reduced.
+    pub photo: Photo,
+    /// Its hard mask: 0 or 255.
+    pub mask: Gray,
+    /// Its trimap: 0, 128, 255.
+    pub trimap: Gray,
+    /// Width and height of the photograph itself.
+    pub size: (u32, u32),
+}
+
+impl Working {
+    /// Reduces a photograph, brings its mask (head where it is 128 or more; of any size with the photograph's
+    /// proportions, since cuts are made smaller still) to the same size and finds the band.
+    pub fn new(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Working, AlphaError> {
+        options.check()?;
+        let size = (photo.width, photo.height);
+        let working = working_size(photo.width, photo.height, options.side);
+        let given = (mask.width, mask.height);
+        // sides of w s and h s, each rounded by up to half a pixel
+        let across = |a: u32, b: u32| a as u64 * b as u64;
+        let apart = across(given.0, size.1).abs_diff(across(given.1, size.0));
+        if given.0 == 0 || given.1 == 0 || apart > size.0.max(size.1) as u64 {
+            return Err(AlphaError::Size { mask: given, photo: size });
+        }
+        let mut mask = if given.0 >= working.0 && given.1 >= working.1 {
+            reduce_gray(mask, working)
+        } else {
+            let head: Vec<f32> = mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect();
+            enlarge(&head, given, working, 0.0, 1.0)
+        };
+        mask.values.iter_mut().for_each(|v| *v = if *v >= 128 { HEAD } else { OUTSIDE });
+        let trimap = trimap(&mask, options.band);
+        Ok(Working { photo: reduce_photo(photo, working), mask, trimap, size })
+    }
+
+    /// Brings alphas of the working size to the photograph's, as 8 bit.
+    pub fn finish(&self, alpha: &[f32], options: &SoftenOptions) -> Gray {
+        let working = (self.photo.width, self.photo.height);
+        enlarge(alpha, working, self.size, options.lowest, options.highest)
+    }
+
+    /// What a person should know about the band, whoever finds its opacity.
+    pub fn warnings(&self, options: &SoftenOptions) -> Vec<String> {
+        let mut warnings = Vec::new();
+        let band = unsure_share(&self.trimap);
+        if band > options.most_unsure {
+            warnings.push(format!(
+                "{:.0} % of the picture are unsure: the mask is ragged or full of holes; a click on what it missed helps",
+                100.0 * band
+            ));
+        }
+        if band > 0.0 && !self.trimap.values.contains(&HEAD) {
+            warnings.push("no pixel is surely head: the mask is thinner than the unsure band".into());
+        }
+        if band > 0.0 && !self.trimap.values.contains(&OUTSIDE) {
+            warnings.push("no pixel is surely outside: the mask leaves less than the unsure band".into());
+        }
+        warnings
+    }
+}
+
+/// A soft alpha, and how sure it is.
+#[derive(Clone, Debug)]
+pub struct Softened {
+    /// At the photograph's size.
+    pub alpha: Gray,
+    /// At the working size: 0, 128, 255.
+    pub trimap: Gray,
+    /// Share of the picture that was unsure.
+    pub band_share: f64,
+    /// What a person should know, one sentence each.
+    pub warnings: Vec<String>,
+}
+
+/// The soft alpha of a photograph from its hard mask, which has the photograph's proportions.
+pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Softened, AlphaError> {
+    let working = Working::new(photo, mask, options)?;
+    let mut warnings = working.warnings(options);
+    let Working { photo, mask, trimap, .. } = &working;
+    let filtered = || guided(photo, mask, trimap, &options.guided);
+    let sides_known = trimap.values.contains(&HEAD) && trimap.values.contains(&OUTSIDE);
+    let alpha = match options.matting {
+        Matting::Guided => filtered(),
+        // tied to one side only, everything would become that side
+        Matting::ClosedForm if !sides_known && trimap.values.contains(&UNSURE) => filtered(),
+        Matting::ClosedForm => match closed_form(photo, mask, trimap, &options.closed_form) {
+            Ok(matte) => matte.alpha,
+            Err(why) => {
+                warnings.push(format!("closed-form matting was replaced by the guided filter: {why}"));
+                filtered()
+            }
+        },
+    };
+    let alpha = working.finish(&alpha, options);
+    let band_share = unsure_share(trimap);
+    Ok(Softened { alpha, trimap: working.trimap, band_share, warnings })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::distance;
+    use super::*;
+    use crate::io::{Limits, read_gray, read_photo};
+
+    /// A bright disc on a dark stage whose rim is soft over 6 pixels.
+    fn disc(width: u32, height: u32) -> (Photo, Vec<f32>) {
+        let (cx, cy, r) = (0.5 * width as f32, 0.5 * height as f32, 0.3 * height as f32);
+        let pixels = 0..width * height;
+        let truth: Vec<f32> = pixels
+            .map(|i| {
+                let (x, y) = ((i % width) as f32 + 0.5 - cx, (i / width) as f32 + 0.5 - cy);
+                ((r + 3.0 - x.hypot(y)) / 6.0).clamp(0.0, 1.0)
+            })
+            .collect();
+        let rgb =
+            truth.iter().map(|a| [20.0 + 180.0 * a, 25.0 + 120.0 * a, 30.0 + 90.0 * a].map(|v| v as u8));
+        (Photo { width, height, rgb: rgb.collect(), alpha: None }, truth)
+    }
+
+    fn hard(truth: &[f32], width: u32, height: u32) -> Gray {
+        Gray { width, height, values: truth.iter().map(|&a| if a >= 0.5 { 255 } else { 0 }).collect() }
+    }
+
+    /// Mean squared error of an 8-bit alpha against 0..=1.
+    fn error(alpha: &[u8], truth: &[f32]) -> f64 {
+        let squares = alpha.iter().zip(truth).map(|(&a, &t)| (a as f64 / 255.0 - t as f64).powi(2));
+        squares.sum::<f64>() / truth.len() as f64
+    }
+
+    #[test]
+    fn a_soft_rim_is_found_from_a_hard_mask_by_either_way() {
+        let (photo, truth) = disc(160, 200);
+        let mask = hard(&truth, 160, 200);
+        for (matting, share) in [(Matting::ClosedForm, 0.02), (Matting::Guided, 0.4)] {
+            let options = SoftenOptions { matting, ..SoftenOptions::default() };
+            let soft = soften(&photo, &mask, &options).unwrap();
+            assert!(soft.warnings.is_empty(), "{:?}", soft.warnings);
+            let (before, after) = (error(&mask.values, &truth), error(&soft.alpha.values, &truth));
+            assert!(after < share * before, "{matting:?}: {after:.2e} of {before:.2e}");
+            // discs of 4.6 pixels each way around a circle of 2π · 60: about 3470 of 32000 pixels
+            assert!((0.09..0.13).contains(&soft.band_share), "{}", soft.band_share);
+        }
+    }
+
+    #[test]
+    fn a_large_photograph_is_worked_on_small_and_its_alpha_made_large() {
+        let (photo, truth) = disc(320, 400);
+        let options = SoftenOptions { side: 200, ..SoftenOptions::default() };
+        let full = soften(&photo, &hard(&truth, 320, 400), &options).unwrap();
+        assert_eq!((full.alpha.width, full.alpha.height), (320, 400));
+        assert_eq!((full.trimap.width, full.trimap.height), (160, 200));
+        let (before, after) =
+            (error(&hard(&truth, 320, 400).values, &truth), error(&full.alpha.values, &truth));
+        assert!(after < 0.1 * before, "{after:.2e} of {before:.2e}");
+        // a mask that has the working size already is taken as it is; a smaller one is brought to it
+        let small = soften(&photo, &reduce_gray(&hard(&truth, 320, 400), (160, 200)), &options).unwrap();
+        assert_eq!(full.alpha, small.alpha);
+        let tiny = soften(&photo, &reduce_gray(&hard(&truth, 320, 400), (53, 67)), &options).unwrap();
+        assert!(error(&tiny.alpha.values, &truth) < 0.1 * before);
+    }
+
+    #[test]
+    fn without_rounds_the_guided_filter_steps_in_and_says_so() {
+        let (photo, truth) = disc(80, 100);
+        let mask = hard(&truth, 80, 100);
+        let mut options = SoftenOptions { matting: Matting::Guided, ..SoftenOptions::default() };
+        let by_filter = soften(&photo, &mask, &options).unwrap();
+        options.matting = Matting::ClosedForm;
+        options.closed_form.rounds = 0;
+        let soft = soften(&photo, &mask, &options).unwrap();
+        assert_eq!(soft.alpha, by_filter.alpha);
+        assert!(
+            soft.warnings[0].contains("guided filter") && soft.warnings.len() == 1,
+            "{:?}",
+            soft.warnings
+        );
+    }
+
+    #[test]
+    fn empty_full_and_thin_masks_stay_what_they_are() {
+        let (photo, _) = disc(64, 80);
+        let gray = |values: Vec<u8>| Gray { width: 64, height: 80, values };
+        let options = SoftenOptions::default();
+        for value in [0, 255] {
+            let soft = soften(&photo, &gray(vec![value; 64 * 80]), &options).unwrap();
+            assert!(soft.alpha.values.iter().all(|&a| a == value) && soft.band_share == 0.0);
+        }
+        // a line one pixel wide is all band: the filter keeps something of it, a tie to one side would not
+        let line = gray((0..64 * 80).map(|i| if i % 64 == 30 { 255 } else { 0 }).collect());
+        let soft = soften(&photo, &line, &options).unwrap();
+        assert!(soft.warnings.iter().any(|w| w.contains("surely head")), "{:?}", soft.warnings);
+        assert!(soft.alpha.values.iter().any(|&a| a > 0));
+    }
+
+    #[test]
+    fn a_mask_of_another_size_and_senseless_options_are_named() {
+        let (photo, _) = disc(64, 80);
+        let other = Gray { width: 80, height: 64, values: vec![0; 80 * 64] };
+        let error = soften(&photo, &other, &SoftenOptions::default()).unwrap_err();
+        assert_eq!(error.to_string(), "the mask is 80 × 64 pixels, but its photograph is 64 × 80");
+        let mask = Gray { width: 64, height: 80, values: vec![0; 80 * 64] };
+        let options = SoftenOptions::default();
+        for (options, name) in [
+            (SoftenOptions { side: 0, ..options }, "side"),
+            (SoftenOptions { band: Band::Discs { share: f32::NAN }, ..options }, "band"),
+            (SoftenOptions { band: Band::Squares { kernel: 0, iterations: 1 }, ..options }, "band"),
+            (SoftenOptions { lowest: 0.9, highest: 0.1, ..options }, "lowest"),
+            (
+                SoftenOptions { guided: GuidedOptions { radius: 0.1, epsilon: 0.0 }, ..options },
+                "guided.epsilon",
+            ),
+        ] {
+            let error = soften(&photo, &mask, &options).unwrap_err();
+            assert!(error.to_string().contains(name) && error.hint().starts_with("choose"), "{error}");
+        }
+    }
+
+    #[test]
+    fn three_megapixels_of_a_light_stage_need_less_than_two_gigabytes() {
+        // 3000 × 4096 alphas, and 335 bytes for each of 750 × 1024 pixels: 270 MB
+        let bytes = SoftenOptions::default().memory_bytes(3000, 4096);
+        assert_eq!(bytes, 3000 * 4096 + 335 * 750 * 1024);
+        assert!(bytes < 2 << 30);
+    }
+
+    #[test]
+    fn alphas_of_the_clicked_heads_are_forty_percent_better_than_hard_masks() {
+        let shared = std::env::var("TIFACE_SHARED")
+            .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
+        let limits = Limits::default();
+        // photographs whose masks are cut as they are at half, too wide and too narrow by 2 pixels; at least so much
+        // of the error is gone. At half, a mask of a sharp outline is better than any cut can be.
+        let heads = [
+            ("lps", ["002", "006", "010"], [0.2, 0.7, 0.7]),
+            ("nefertiti", ["010", "013", "015"], [-2.0, 0.8, 0.8]),
+        ];
+        for (capture, views, gains) in heads {
+            let folder = std::path::Path::new(&shared).join("data/captures").join(capture);
+            if !folder.is_dir() {
+                eprintln!("skipped: the capture `{capture}` is not at {}", folder.display());
+                continue;
+            }
+            let (mut hard_error, mut soft_error) = ([0.0; 3], [0.0; 3]);
+            let start = std::time::Instant::now();
+            for view in views {
+                let picture = |kind: &str| folder.join(kind).join(format!("{view}.png"));
+                let photo = read_photo(&picture("images"), None, &limits).unwrap().photo;
+                let truth = read_gray(&picture("masks"), None, &limits).unwrap();
+                let (w, h) = (truth.width as usize, truth.height as usize);
+                let soft_truth: Vec<f32> = truth.values.iter().map(|&v| v as f32 / 255.0).collect();
+                let cut: Vec<bool> = truth.values.iter().map(|&v| v >= 128).collect();
+                let masks = [cut.clone(), distance::grow(&cut, w, h, 2.0), distance::shrink(&cut, w, h, 2.0)];
+                for (k, mask) in masks.iter().enumerate() {
+                    let values = mask.iter().map(|&m| if m { 255 } else { 0 }).collect();
+                    let mask = Gray { values, ..truth };
+                    let soft = soften(&photo, &mask, &SoftenOptions::default()).unwrap();
+                    assert!(soft.warnings.is_empty(), "{:?}", soft.warnings);
+                    hard_error[k] += error(&mask.values, &soft_truth) / 3.0;
+                    soft_error[k] += error(&soft.alpha.values, &soft_truth) / 3.0;
+                }
+            }
+            let seconds = start.elapsed().as_secs_f64() / 9.0;
+            for k in 0..3 {
+                let (hard, soft) = (hard_error[k], soft_error[k]);
+                eprintln!("{capture}: {:.2} of 1000 became {:.2}, {seconds:.2} s", 1e3 * hard, 1e3 * soft);
+                assert!(soft <= (1.0 - gains[k]) * hard, "{capture} {k}: {soft:.2e} of {hard:.2e}");
+            }
+        }
+    }
+}

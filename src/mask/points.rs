@@ -1,0 +1,586 @@
+//! `prompts.json`: which pixels a person clicked on, photograph by photograph.
+//!
+//! ```json
+//! {"convention": "…", "frames": [
+//!   {"file_path": "images/010.png", "points": [{"x": 181, "y": 288, "label": 1}, {"x": 32, "y": 51, "label": 0}]}]}
+//! ```
+//!
+//! `x` runs right and `y` down, as pixel indices of the photograph at the size its camera was calibrated for,
+//! whatever it is reduced to later; label 1 is the head, 0 is not. The file is a stranger's: names are only
+//! compared with those of the capture, never opened, and every number is checked.
+
+use super::Click;
+use crate::capture::{Capture, View};
+use crate::io::{self, Limits, ReadError, WriteError};
+use serde_json::{Map, Number, Value, json};
+use std::path::{Component, Path};
+
+/// What the writer puts into `convention`.
+const CONVENTION: &str =
+    "x right, y down, pixel indices from the top left; label 1 = foreground, 0 = background";
+/// A person clicks a dozen times on a photograph.
+const MOST_POINTS: usize = 10_000;
+/// Longer names fit no file system.
+const LONGEST_NAME: usize = 4096;
+/// Hundred thousand views with ten points each stay below this.
+const MOST_BYTES: u64 = 64 << 20;
+
+/// The clicks of a `prompts.json`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Prompts {
+    /// Photographs, in the file's order; none twice.
+    pub frames: Vec<Frame>,
+}
+
+/// The clicks on one photograph.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// The photograph below the capture, with `/` between folders, with or without its ending.
+    pub file_path: String,
+    /// Its clicks, in the order they were made.
+    pub points: Vec<Click>,
+}
+
+/// What is wrong with a file of clicks.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PointsError {
+    /// It could not be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// It could not be written.
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    /// Something in it makes no sense.
+    #[error("`{file}`, {place}: {problem}")]
+    Content {
+        /// The file.
+        file: String,
+        /// Where in it: `frames[2].points[0].x`.
+        place: String,
+        /// What is wrong, and what was expected.
+        problem: String,
+        /// The way out.
+        hint: String,
+    },
+    /// A point of the command line makes no sense.
+    #[error("the point `{text}`: {problem}")]
+    Point {
+        /// As written.
+        text: String,
+        /// What is wrong.
+        problem: String,
+    },
+}
+
+impl PointsError {
+    /// The way out.
+    pub fn hint(&self) -> String {
+        match self {
+            PointsError::Read(e) => e.hint(),
+            PointsError::Write(e) => e.hint(),
+            PointsError::Content { hint, .. } => hint.clone(),
+            PointsError::Point { .. } => {
+                "write column, row and label: `181,288,1` for the head, `32,51,0` for what is not".into()
+            }
+        }
+    }
+}
+
+/// Reads a `prompts.json`.
+pub fn read_prompts(path: &Path, limits: &Limits) -> Result<Prompts, PointsError> {
+    let limits = Limits { json_bytes: limits.json_bytes.min(MOST_BYTES), ..limits.clone() };
+    parse(&path.to_string_lossy(), &io::read_json(path, &limits)?, &limits)
+}
+
+/// [`read_prompts`] on bytes; `path` is only for messages.
+pub fn parse_prompts(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Prompts, PointsError> {
+    let limits = Limits { json_bytes: limits.json_bytes.min(MOST_BYTES), ..limits.clone() };
+    parse(&path.to_string_lossy(), &io::parse_json(path, bytes, &limits)?, &limits)
+}
+
+/// One click as written on a command line: `x,y,label`.
+pub fn parse_point(text: &str) -> Result<Click, PointsError> {
+    let wrong = |problem: String| PointsError::Point { text: shown(text), problem };
+    let parts: Vec<&str> = text.split(',').map(str::trim).collect();
+    let [x, y, label] = parts[..] else {
+        return Err(wrong(format!("expected three values `x,y,label`, found {}", parts.len())));
+    };
+    let number = |name: &str, text: &str| {
+        let value = text.parse::<f64>().ok().filter(|v| v.is_finite());
+        let value = value.ok_or_else(|| wrong(format!("{name} is `{}`, not a number", shown(text))))?;
+        within(value).map_err(|problem| wrong(format!("{name} {problem}")))
+    };
+    let head = match label {
+        "1" => true,
+        "0" => false,
+        other => return Err(wrong(format!("its label is `{}`; known are 1 (head) and 0", shown(other)))),
+    };
+    Ok(Click { x: number("x", x)?, y: number("y", y)?, head })
+}
+
+/// A coordinate that some photograph may have.
+fn within(value: f64) -> Result<f32, String> {
+    if (-0.5..1e6).contains(&value) {
+        return Ok(value as f32);
+    }
+    Err(format!("is {value}, outside every photograph"))
+}
+
+/// A text from a stranger, for a message: short and on one line.
+fn shown(text: &str) -> String {
+    let plain: String = text.chars().take(80).flat_map(char::escape_debug).collect();
+    let cut = if text.chars().nth(80).is_some() { "…" } else { "" };
+    plain.replace("\\'", "'").replace("\\\"", "\"") + cut
+}
+
+/// A JSON value of the wrong kind, for a message.
+fn kind(value: &Value) -> String {
+    match value {
+        Value::Array(_) => "a list".into(),
+        Value::Object(_) => "an object".into(),
+        Value::String(s) => format!("the text `{}`", shown(s)),
+        other => other.to_string(),
+    }
+}
+
+fn parse(file: &str, value: &Value, limits: &Limits) -> Result<Prompts, PointsError> {
+    let content = |place: &str, problem: String, hint: &str| PointsError::Content {
+        file: file.into(),
+        place: place.into(),
+        problem,
+        hint: hint.into(),
+    };
+    let wrong = |place: &str, problem, hint: &str| Err(content(place, problem, hint));
+    let shape = "write `{\"frames\": [{\"file_path\": …, \"points\": [{\"x\": …, \"y\": …, \"label\": 1}]}]}`, or \
+                 click anew on the page that `tiface mask CAPTURE --page` writes";
+    let Some(frames) = value.get("frames") else {
+        let found = if value.is_object() { "it has none".into() } else { format!("it is {}", kind(value)) };
+        return wrong("at the top", format!("expected an object with a list `frames`, but {found}"), shape);
+    };
+    let Some(frames) = frames.as_array() else {
+        return wrong("`frames`", format!("expected a list, found {}", kind(frames)), shape);
+    };
+    if frames.is_empty() {
+        return wrong("`frames`", "it is empty: nothing was clicked on".into(), shape);
+    }
+    if frames.len() > limits.views {
+        let problem = format!("it has {} entries, the limit is {}", frames.len(), limits.views);
+        return wrong("`frames`", problem, "keep the photographs that were clicked on");
+    }
+    let mut prompts = Prompts::default();
+    let mut seen = std::collections::HashMap::new();
+    for (i, entry) in frames.iter().enumerate() {
+        let place = format!("`frames[{i}]`");
+        let Some(name) = entry.get("file_path").and_then(Value::as_str) else {
+            let found = entry.get("file_path").map_or("nothing".into(), kind);
+            return wrong(&place, format!("expected a text `file_path`, found {found}"), shape);
+        };
+        let file_path = match below(name) {
+            Ok(path) => path,
+            Err(why) => {
+                let problem = format!("its `file_path` `{}` {why}", shown(name));
+                return wrong(
+                    &place,
+                    problem,
+                    "name the photograph as the camera file does: `images/010.png`",
+                );
+            }
+        };
+        if let Some(first) = seen.insert(file_path.clone(), i) {
+            let problem = format!("`{}` was clicked on in `frames[{first}]` already", shown(&file_path));
+            return wrong(&place, problem, "put all points of a photograph into one frame");
+        }
+        let Some(points) = entry.get("points").and_then(Value::as_array) else {
+            let found = entry.get("points").map_or("nothing".into(), kind);
+            return wrong(&place, format!("expected a list `points`, found {found}"), shape);
+        };
+        if points.len() > MOST_POINTS {
+            let problem = format!("it has {} points, the limit is {MOST_POINTS}", points.len());
+            return wrong(&place, problem, "a dozen clicks are enough");
+        }
+        let mut clicks = Vec::with_capacity(points.len());
+        for (j, point) in points.iter().enumerate() {
+            let inside = |key: &str| format!("`frames[{i}].points[{j}]{key}`");
+            let number = |key: &str| -> Result<f32, PointsError> {
+                let found = point.get(key);
+                let value = match found.and_then(Value::as_f64) {
+                    Some(v) => within(v),
+                    None => Err(format!("is {}, not a number", found.map_or("missing".into(), kind))),
+                };
+                let place = inside(&format!(".{key}"));
+                value.map_err(|problem| {
+                    content(&place, format!("it {problem}"), "correct that point, or remove it")
+                })
+            };
+            let (x, y) = (number("x")?, number("y")?);
+            let head = match point.get("label").map(|v| (v.as_f64(), v)) {
+                Some((Some(1.0), _)) => true,
+                Some((Some(0.0), _)) => false,
+                found => {
+                    let found = found.map_or("missing".into(), |(_, v)| kind(v));
+                    let problem = format!("it is {found}; known are 1 (head) and 0 (not head)");
+                    return wrong(&inside(".label"), problem, "correct that point, or remove it");
+                }
+            };
+            clicks.push(Click { x, y, head });
+        }
+        prompts.frames.push(Frame { file_path, points: clicks });
+    }
+    Ok(prompts)
+}
+
+/// A name below the capture with `/` between its parts, or why it is none.
+fn below(name: &str) -> Result<String, &'static str> {
+    let text = name.replace('\\', "/");
+    if text.len() > LONGEST_NAME {
+        return Err("is too long for a name");
+    }
+    if text.contains('\0') {
+        return Err("holds a zero byte");
+    }
+    if text.starts_with('/') || text.as_bytes().get(1) == Some(&b':') {
+        return Err("is absolute; expected one relative to the capture");
+    }
+    let mut parts = Vec::new();
+    for part in Path::new(&text).components() {
+        match part {
+            Component::Normal(p) => parts.push(p.to_string_lossy().into_owned()),
+            Component::CurDir => {}
+            _ => return Err("leads out of the capture"),
+        }
+    }
+    if parts.is_empty() { Err("is empty") } else { Ok(parts.join("/")) }
+}
+
+/// The name by which `prompts.json` and camera files know a view's photograph: its path below the capture.
+pub fn file_path(capture: &Capture, view: &View) -> String {
+    let path = view.photo.strip_prefix(&capture.root).unwrap_or(&view.photo);
+    let parts: Vec<_> = path.components().map(|c| c.as_os_str().to_string_lossy()).collect();
+    parts.join("/")
+}
+
+/// A name without the ending of a picture.
+fn stem(name: &str) -> &str {
+    match name.rsplit_once('.') {
+        Some((stem, ending)) if ["png", "jpg", "jpeg"].iter().any(|e| ending.eq_ignore_ascii_case(e)) => stem,
+        _ => name,
+    }
+}
+
+/// A photograph of a capture, as far as clicks care.
+struct Photographed<'a> {
+    path: String,
+    name: &'a str,
+    /// The size clicks are in.
+    size: (u32, u32),
+    /// Whole factor by which it is reduced, and the size after.
+    downscale: u32,
+    reduced: (u32, u32),
+}
+
+impl Photographed<'_> {
+    /// Is it what a file of clicks calls `name`? With or without ending, with or without the folder common to all
+    /// photographs, and in the folder of pictures already reduced (`images_4/`) as well.
+    fn is_called(&self, name: &str) -> bool {
+        let bare = stem(name);
+        let same = |path: &str| path == name || stem(path) == name || stem(path) == bare;
+        let suffixes = [format!("_{}", self.downscale), format!("_{}x", self.downscale)];
+        let full = self.path.split_once('/').and_then(|(folder, rest)| {
+            let folder = suffixes.iter().find_map(|s| folder.strip_suffix(s.as_str()))?;
+            Some(format!("{folder}/{rest}"))
+        });
+        same(&self.path) || self.name == name || self.name == bare || full.is_some_and(|f| same(&f))
+    }
+}
+
+impl Prompts {
+    /// The clicks of each view of a capture, parallel to its `views`, in pixel indices of its camera's picture;
+    /// none where nothing was clicked. `file` is for messages. Errors: a photograph that is no view, two names of one
+    /// view, a point beside the photograph, a view without any click on the head.
+    pub fn clicks(&self, file: &str, capture: &Capture) -> Result<Vec<Vec<Click>>, PointsError> {
+        let of = |view| Photographed {
+            path: file_path(capture, view),
+            name: &view.name,
+            size: view.declared,
+            downscale: view.downscale,
+            reduced: (view.camera.width, view.camera.height),
+        };
+        self.of_photographs(file, &capture.views.iter().map(of).collect::<Vec<_>>())
+    }
+
+    fn of_photographs(&self, file: &str, photos: &[Photographed]) -> Result<Vec<Vec<Click>>, PointsError> {
+        let mut clicks = vec![Vec::new(); photos.len()];
+        let mut by = vec![None; photos.len()];
+        for (i, frame) in self.frames.iter().enumerate() {
+            let wrong = |place: String, problem: String, hint: String| {
+                Err(PointsError::Content { file: file.into(), place, problem, hint })
+            };
+            let place = format!("`frames[{i}]`");
+            let name = shown(&frame.file_path);
+            let exact = photos.iter().position(|p| p.path == frame.file_path);
+            let Some(view) = exact.or_else(|| photos.iter().position(|p| p.is_called(&frame.file_path)))
+            else {
+                let first =
+                    photos.first().map_or(String::new(), |p| format!(", such as `{}`", shown(&p.path)));
+                let problem = format!("`{name}` is no photograph of this capture");
+                return wrong(place, problem, format!("name one of its {} photographs{first}", photos.len()));
+            };
+            if let Some(first) = by[view].replace(i) {
+                let problem = format!("`{name}` is the photograph of `frames[{first}]`");
+                return wrong(place, problem, "put all points of a photograph into one frame".into());
+            }
+            if frame.points.is_empty() {
+                continue;
+            }
+            let photo = &photos[view];
+            let (w, h) = photo.size;
+            for (j, click) in frame.points.iter().enumerate() {
+                let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;
+                if !(inside(click.x, w) && inside(click.y, h)) {
+                    let problem = format!(
+                        "({}, {}) lies outside `{name}`, which is {w} × {h} pixels",
+                        click.x, click.y
+                    );
+                    let hint =
+                        "click on the full-size photograph: x from 0 to width − 1, y from 0 to height − 1";
+                    return wrong(format!("`frames[{i}].points[{j}]`"), problem, hint.into());
+                }
+                // pixel i of the reduced picture averages pixels d i to d i + d − 1; what fills no block is dropped
+                let scaled = |v: f32, side: u32| {
+                    let d = photo.downscale.max(1) as f32;
+                    ((v + 0.5) / d - 0.5).min(side as f32 - 1.0)
+                };
+                let (x, y) = (scaled(click.x, photo.reduced.0), scaled(click.y, photo.reduced.1));
+                clicks[view].push(Click { x, y, ..*click });
+            }
+            if !frame.points.iter().any(|p| p.head) {
+                let problem = format!("no point of `{name}` is on the head (label 1)");
+                return wrong(place, problem, "add a click on face and hair, or remove the frame".into());
+            }
+        }
+        Ok(clicks)
+    }
+
+    /// As the text of a `prompts.json`; whole coordinates without a fraction.
+    pub fn to_json(&self) -> Value {
+        let number = |v: f32| match v.fract() == 0.0 {
+            true => Some(Number::from(v as i64)),
+            false => Number::from_f64(v as f64),
+        };
+        let point = |click: &Click| {
+            let mut point = Map::new();
+            point.insert("x".into(), number(click.x).map_or(Value::Null, Value::Number));
+            point.insert("y".into(), number(click.y).map_or(Value::Null, Value::Number));
+            point.insert("label".into(), json!(click.head as u8));
+            Value::Object(point)
+        };
+        let frame = |frame: &Frame| {
+            let points: Vec<Value> = frame.points.iter().map(point).collect();
+            json!({"file_path": frame.file_path, "points": points})
+        };
+        json!({"convention": CONVENTION, "frames": self.frames.iter().map(frame).collect::<Vec<_>>()})
+    }
+
+    /// Writes a `prompts.json`.
+    pub fn write(&self, path: &Path) -> Result<(), PointsError> {
+        let text = format!("{:#}\n", self.to_json());
+        Ok(io::write_atomic(path, text.as_bytes())?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parsed(text: &str) -> Result<Prompts, PointsError> {
+        parse_prompts(Path::new("p.json"), text.as_bytes(), &Limits::default())
+    }
+
+    fn frame(path: &str, points: &str) -> String {
+        format!("{{\"file_path\": {}, \"points\": {points}}}", json!(path))
+    }
+
+    fn one(path: &str, points: &str) -> String {
+        format!("{{\"frames\": [{}]}}", frame(path, points))
+    }
+
+    const POINT: &str = r#"[{"x": 3, "y": 4.5, "label": 1}]"#;
+
+    fn photograph<'a>(path: &str, name: &'a str, size: (u32, u32), downscale: u32) -> Photographed<'a> {
+        Photographed {
+            path: path.into(),
+            name,
+            size,
+            downscale,
+            reduced: (size.0 / downscale, size.1 / downscale),
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("prompts.json");
+        let click = |x, y, head| Click { x, y, head };
+        let points = vec![click(181.0, 288.0, true), click(0.5, 51.25, false)];
+        let prompts = Prompts { frames: vec![Frame { file_path: "images/a </script>.png".into(), points }] };
+        prompts.write(&path).unwrap();
+        assert_eq!(read_prompts(&path, &Limits::default()).unwrap(), prompts);
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(
+            text.contains("\"x\": 181,") && text.contains("51.25") && text.contains("foreground"),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn whatever_is_wrong_is_named_with_its_place() {
+        let twice = format!("{{\"frames\": [{}, {}]}}", frame("a.png", POINT), frame("./a.png", POINT));
+        let cases = [
+            ("[]".into(), "at the top", "it is a list"),
+            ("{\"frame\": []}".into(), "at the top", "it has none"),
+            ("{\"frames\": 3}".into(), "`frames`", "found 3"),
+            ("{\"frames\": []}".into(), "`frames`", "is empty"),
+            ("{\"frames\": [7]}".into(), "`frames[0]`", "`file_path`, found nothing"),
+            ("{\"frames\": [{\"file_path\": 7}]}".into(), "`frames[0]`", "`file_path`, found 7"),
+            ("{\"frames\": [{\"file_path\": \"a\"}]}".into(), "`frames[0]`", "`points`, found nothing"),
+            (one("a", "{}"), "`frames[0]`", "`points`, found an object"),
+            (one("a", "[1]"), "`frames[0].points[0].x`", "missing"),
+            (one("a", r#"[{"x": "3", "y": 4, "label": 1}]"#), "points[0].x`", "the text `3`"),
+            (one("a", r#"[{"x": 3, "y": null, "label": 1}]"#), "points[0].y`", "null"),
+            (one("a", r#"[{"x": 3, "y": 4}]"#), "points[0].label`", "missing"),
+            (one("a", r#"[{"x": 3, "y": 4, "label": 2}]"#), "points[0].label`", "it is 2"),
+            (one("a", r#"[{"x": 3, "y": 4, "label": true}]"#), "points[0].label`", "true"),
+            (one("a", r#"[{"x": 3, "y": 4, "label": 0.5}]"#), "points[0].label`", "0.5"),
+            (one("a", r#"[{"x": -3, "y": 4, "label": 1}]"#), "points[0].x`", "-3, outside every"),
+            (one("a", r#"[{"x": 3, "y": 1e300, "label": 1}]"#), "points[0].y`", "outside every"),
+            (one("/etc/passwd", POINT), "`frames[0]`", "is absolute"),
+            (one("C:\\a.png", POINT), "`frames[0]`", "is absolute"),
+            (one("images/../../a.png", POINT), "`frames[0]`", "leads out"),
+            (one("..\\a.png", POINT), "`frames[0]`", "leads out"),
+            (one("", POINT), "`frames[0]`", "is empty"),
+            (one("./", POINT), "`frames[0]`", "is empty"),
+            (one("a\0b", POINT), "`frames[0]`", "zero byte"),
+            (one(&"a/".repeat(3000), POINT), "`frames[0]`", "too long"),
+            (twice, "`frames[1]`", "in `frames[0]` already"),
+        ];
+        for (text, place, problem) in cases {
+            let error = parsed(&text).expect_err(&text);
+            let said = error.to_string();
+            assert!(
+                said.starts_with("`p.json`, ") && said.contains(place) && said.contains(problem),
+                "{said}"
+            );
+            assert!(said.len() < 400 && !error.hint().is_empty(), "{said}");
+        }
+    }
+
+    #[test]
+    fn sizes_and_numbers_beyond_reason_are_refused_by_the_reader() {
+        let many = format!("[{}]", vec![r#"{"x":1,"y":1,"label":1}"#; MOST_POINTS + 1].join(","));
+        assert!(parsed(&one("a", &many)).unwrap_err().to_string().contains("the limit is 10000"));
+        let few = Limits { views: 1, ..Limits::default() };
+        let two = format!("{{\"frames\": [{}, {}]}}", frame("a", POINT), frame("b", POINT));
+        let error = parse_prompts(Path::new("p.json"), two.as_bytes(), &few).unwrap_err();
+        assert!(error.to_string().contains("2 entries, the limit is 1"), "{error}");
+        for text in [one("a", r#"[{"x": NaN}]"#), one("a", r#"[{"x": 1e999}]"#), "{".into(), String::new()] {
+            assert!(matches!(parsed(&text), Err(PointsError::Read(_))), "{text}");
+        }
+        let tight = Limits { json_bytes: 10, ..Limits::default() };
+        let error = parse_prompts(Path::new("p.json"), one("a", POINT).as_bytes(), &tight).unwrap_err();
+        assert!(matches!(error, PointsError::Read(ReadError::TooLarge { limit: 10, .. })), "{error}");
+    }
+
+    #[test]
+    fn photographs_are_found_by_several_names_and_by_no_wrong_one() {
+        let full = photograph("images/left/010.JPG", "left/010", (40, 30), 1);
+        for name in
+            ["images/left/010.JPG", "images/left/010", "images/left/010.png", "left/010", "left/010.jpg"]
+        {
+            assert!(full.is_called(name), "{name}");
+        }
+        for name in
+            ["010", "images/010.JPG", "images/left/01", "images/left/010.JPG.png", "images/left/010.txt"]
+        {
+            assert!(!full.is_called(name), "{name}");
+        }
+        let reduced = photograph("images_4/a.b.png", "a.b", (40, 30), 4);
+        assert!(reduced.is_called("images/a.b.png") && reduced.is_called("images/a.b"));
+        assert!(!reduced.is_called("images_2/a.b.png") && !reduced.is_called("images/a"));
+    }
+
+    #[test]
+    fn clicks_come_in_the_pixels_of_the_reduced_picture() {
+        let text = r#"[{"x": 0, "y": 1.5, "label": 1}, {"x": 41, "y": 29, "label": 0}]"#;
+        let photos =
+            [photograph("images/b.png", "b", (42, 30), 4), photograph("images/a.png", "a", (42, 30), 4)];
+        let clicks = parsed(&one("images/a.png", text)).unwrap().of_photographs("p.json", &photos).unwrap();
+        // (0 + ½) / 4 − ½ = −3/8 and (1.5 + ½) / 4 − ½ = 0; (29 + ½) / 4 − ½ = 6.875 of 7 rows is 6 at most;
+        // column 41 lies in the two that fill no block of four: the last of 10 takes it
+        assert!(clicks[0].is_empty());
+        let found: Vec<_> = clicks[1].iter().map(|c| (c.x, c.y, c.head)).collect();
+        assert_eq!(found, [(-0.375, 0.0, true), (9.0, 6.0, false)]);
+    }
+
+    #[test]
+    fn clicks_that_fit_no_photograph_are_named() {
+        let photos =
+            [photograph("images/a.png", "a", (42, 30), 1), photograph("images/b.png", "b", (42, 30), 1)];
+        let of = |text: String| parsed(&text).unwrap().of_photographs("p.json", &photos).unwrap_err();
+        let error = of(one("images/c.png", POINT));
+        assert!(error.to_string().contains("`images/c.png` is no photograph of this capture"), "{error}");
+        assert!(error.hint().contains("`images/a.png`"), "{}", error.hint());
+        let error = of(one("a", r#"[{"x": 1, "y": 2, "label": 1}, {"x": 41.5, "y": 2, "label": 0}]"#));
+        assert!(error.to_string().contains("`frames[0].points[1]`: (41.5, 2) lies outside `a`"), "{error}");
+        let error = of(format!("{{\"frames\": [{}, {}]}}", frame("a", POINT), frame("images/a.jpg", POINT)));
+        assert!(error.to_string().contains("is the photograph of `frames[0]`"), "{error}");
+        let error = of(one("b", r#"[{"x": 1, "y": 2, "label": 0}]"#));
+        assert!(error.to_string().contains("no point of `b` is on the head"), "{error}");
+        // nothing clicked is no error: the page keeps such frames out, a person may not
+        let empty = parsed(&one("b", "[]")).unwrap().of_photographs("p.json", &photos).unwrap();
+        assert!(empty.iter().all(Vec::is_empty));
+    }
+
+    #[test]
+    fn a_point_of_the_command_line_is_three_numbers() {
+        assert_eq!(parse_point(" 181, 288.5 ,1").unwrap(), Click { x: 181.0, y: 288.5, head: true });
+        assert!(!parse_point("0,0,0").unwrap().head);
+        for (text, word) in [
+            ("1,2", "found 2"),
+            ("1,2,1,3", "found 4"),
+            ("a,2,1", "x is `a`"),
+            ("1,NaN,1", "y is `NaN`"),
+            ("1,inf,1", "not a number"),
+            ("-4,2,1", "outside every"),
+            ("1,2,head", "`head`"),
+            ("1,2,-1", "known are 1"),
+        ] {
+            let error = parse_point(text).unwrap_err();
+            assert!(error.to_string().contains(word), "{text}: {error}");
+        }
+    }
+
+    #[test]
+    fn the_clicks_of_the_shared_captures_are_read() {
+        let shared = std::env::var("TIFACE_SHARED")
+            .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
+        for name in ["lps", "nefertiti"] {
+            let folder = Path::new(&shared).join("data/captures").join(name);
+            if !folder.is_dir() {
+                eprintln!("skipped: the capture `{name}` is not at {}", folder.display());
+                continue;
+            }
+            let prompts = read_prompts(&folder.join("prompts.json"), &Limits::default()).unwrap();
+            assert_eq!(prompts.frames.len(), 3);
+            let capture = crate::capture::open(&folder, &Default::default()).unwrap();
+            let clicks = prompts.clicks("prompts.json", &capture).unwrap();
+            let clicked = |v: &&Vec<Click>| v.len() == 6 && v.iter().filter(|c| c.head).count() == 3;
+            assert_eq!(clicks.iter().filter(clicked).count(), 3, "{name}");
+            for frame in &prompts.frames {
+                let view =
+                    capture.views.iter().position(|v| file_path(&capture, v) == frame.file_path).unwrap();
+                assert_eq!(clicks[view], frame.points);
+            }
+        }
+    }
+}

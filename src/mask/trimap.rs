@@ -1,0 +1,207 @@
+//! The band around a mask's outline that nobody is sure of.
+//!
+//! ```text
+//! 255  still head after the mask was shrunk      0  still outside after it was grown      128  between
+//! ```
+//!
+//! Two ways to shrink and grow: squares as the published pipeline does (OpenCV's `erode` and `dilate` with
+//! `k × k` ones, `i` times, anchor `k / 2`, nothing known beyond the picture), which are pixels whatever the
+//! picture's size; and discs whose radius is a share of the height.
+
+use super::distance;
+use crate::image::Gray;
+
+/// Head, in a trimap.
+pub const HEAD: u8 = 255;
+/// Unsure, in a trimap.
+pub const UNSURE: u8 = 128;
+/// Outside, in a trimap.
+pub const OUTSIDE: u8 = 0;
+
+/// How wide the unsure band is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Band {
+    /// `kernel × kernel` ones applied `iterations` times each way.
+    Squares {
+        /// Side of the square, pixels; with an even one the band lies half a pixel to the lower right.
+        kernel: u32,
+        /// How many times.
+        iterations: u32,
+    },
+    /// Discs each way, of this radius as a share of the picture's height.
+    Discs {
+        /// Radius over height.
+        share: f32,
+    },
+}
+
+impl Band {
+    /// What the published pipeline uses on pictures of 750 × 1024.
+    pub const PUBLISHED: Band = Band::Squares { kernel: 10, iterations: 5 };
+}
+
+impl Default for Band {
+    /// 2.3 % of the height: 24 pixels of 1024, about what [`Band::PUBLISHED`] makes of them.
+    fn default() -> Band {
+        Band::Discs { share: 0.023 }
+    }
+}
+
+/// The trimap of a mask, which is head where it is 128 or more.
+pub fn trimap(mask: &Gray, band: Band) -> Gray {
+    let (width, height) = (mask.width as usize, mask.height as usize);
+    let head: Vec<bool> = mask.values.iter().map(|&v| v >= 128).collect();
+    let (sure, maybe) = match band {
+        Band::Squares { kernel, iterations } => (
+            erode(&head, width, height, kernel, iterations),
+            dilate(&head, width, height, kernel, iterations),
+        ),
+        Band::Discs { share } => {
+            let radius = share * height as f32;
+            (distance::shrink(&head, width, height, radius), distance::grow(&head, width, height, radius))
+        }
+    };
+    let value = |(s, m)| match (s, m) {
+        (true, _) => HEAD,
+        (_, true) => UNSURE,
+        _ => OUTSIDE,
+    };
+    Gray { values: sure.into_iter().zip(maybe).map(value).collect(), ..*mask }
+}
+
+/// Share of a trimap's pixels that are unsure.
+pub fn unsure_share(trimap: &Gray) -> f64 {
+    let unsure = trimap.values.iter().filter(|&&v| v == UNSURE).count();
+    unsure as f64 / trimap.values.len().max(1) as f64
+}
+
+/// Marked where the whole of the square is, as far as it lies inside the picture.
+pub fn erode(marked: &[bool], width: usize, height: usize, kernel: u32, iterations: u32) -> Vec<bool> {
+    let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
+    dilate(&outside, width, height, kernel, iterations).into_iter().map(|m| !m).collect()
+}
+
+/// Marked where anything under the square is.
+pub fn dilate(marked: &[bool], width: usize, height: usize, kernel: u32, iterations: u32) -> Vec<bool> {
+    assert_eq!(marked.len(), width * height);
+    let (kernel, iterations) = (kernel.max(1) as usize, iterations as usize);
+    // squares applied in turn are one larger square, and a square is a row of columns; OpenCV does not
+    // mirror the kernel when it dilates, so both look as far before as behind
+    let before = (kernel / 2).saturating_mul(iterations);
+    let behind = (kernel - 1 - kernel / 2).saturating_mul(iterations);
+    let mut rows = vec![false; marked.len()];
+    let mut seen = Vec::new();
+    for (row, out) in marked.chunks_exact(width.max(1)).zip(rows.chunks_exact_mut(width.max(1))) {
+        windows(row.iter().copied(), before, behind, &mut seen, |x, any| out[x] = any);
+    }
+    let mut all = vec![false; marked.len()];
+    for x in 0..width {
+        let column = (0..height).map(|y| rows[y * width + x]);
+        windows(column, before, behind, &mut seen, |y, any| all[y * width + x] = any);
+    }
+    all
+}
+
+/// For each place of a line: is anything marked from `before` places before it to `behind` places behind?
+fn windows(
+    line: impl Iterator<Item = bool>,
+    before: usize,
+    behind: usize,
+    seen: &mut Vec<u32>,
+    mut put: impl FnMut(usize, bool),
+) {
+    seen.clear();
+    seen.push(0);
+    let mut count = 0;
+    seen.extend(line.map(|m| {
+        count += m as u32;
+        count
+    }));
+    let n = seen.len() - 1;
+    for i in 0..n {
+        let (from, to) = (i.saturating_sub(before), i.saturating_add(behind).saturating_add(1).min(n));
+        put(i, seen[to] > seen[from]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::{Limits, read_gray};
+
+    /// As OpenCV's documentation says it, once per iteration.
+    fn brute(marked: &[bool], w: i64, h: i64, k: i64, iterations: u32, any: bool) -> Vec<bool> {
+        let mut now = marked.to_vec();
+        for _ in 0..iterations {
+            let at = |i: usize| {
+                let (x, y) = (i as i64 % w, i as i64 / w);
+                let mut under = (0..k * k)
+                    .map(|j| (x + j % k - k / 2, y + j / k - k / 2))
+                    .filter(|&(x, y)| (0..w).contains(&x) && (0..h).contains(&y))
+                    .map(|(x, y)| now[(y * w + x) as usize]);
+                if any { under.any(|m| m) } else { under.all(|m| m) }
+            };
+            now = (0..now.len()).map(at).collect();
+        }
+        now
+    }
+
+    #[test]
+    fn squares_equal_the_definition_for_even_and_odd_kernels() {
+        let (w, h) = (23, 17);
+        let marked: Vec<bool> = (0..w * h).map(|i| (i * i + 7 * i) % 31 < 14 || i % w < 3).collect();
+        for (kernel, iterations) in [(1, 3), (2, 1), (3, 2), (4, 1), (5, 0), (10, 1), (10, 5)] {
+            let (grown, less) =
+                (dilate(&marked, w, h, kernel, iterations), erode(&marked, w, h, kernel, iterations));
+            let k = kernel as i64;
+            assert_eq!(
+                grown,
+                brute(&marked, w as i64, h as i64, k, iterations, true),
+                "{kernel} {iterations}"
+            );
+            assert_eq!(
+                less,
+                brute(&marked, w as i64, h as i64, k, iterations, false),
+                "{kernel} {iterations}"
+            );
+        }
+    }
+
+    #[test]
+    fn an_even_kernel_reaches_farther_right_than_left() {
+        // anchor 2 of 4: a pixel sees two before itself and one behind, so one mark is seen from 4 places
+        let mut one = [false; 9];
+        one[4] = true;
+        let grown = dilate(&one, 9, 1, 4, 1);
+        assert_eq!(grown, [0, 0, 0, 1, 1, 1, 1, 0, 0].map(|v| v == 1));
+    }
+
+    #[test]
+    fn discs_leave_a_band_of_their_radius_on_both_sides() {
+        // the lower half of 8 × 20 is head: rows 10 and on; 10 % of 20 rows are 2 pixels each way
+        let mask =
+            Gray { width: 8, height: 20, values: (0..160).map(|i| if i < 80 { 0 } else { 255 }).collect() };
+        let tri = trimap(&mask, Band::Discs { share: 0.1 });
+        let rows: Vec<u8> = (0..20).map(|y| tri.values[y * 8 + 3]).collect();
+        assert!(rows[..8].iter().all(|&v| v == 0) && rows[8..12].iter().all(|&v| v == 128), "{rows:?}");
+        assert!(rows[12..].iter().all(|&v| v == 255), "{rows:?}");
+        assert_eq!(unsure_share(&tri), 0.2);
+    }
+
+    #[test]
+    fn trimaps_equal_those_of_opencv() {
+        let shared = std::env::var("TIFACE_SHARED")
+            .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
+        let folder = std::path::Path::new(&shared).join("data/mask-models/classical");
+        if !folder.is_dir() {
+            eprintln!("skipped: the trimaps of OpenCV are not at {}", folder.display());
+            return;
+        }
+        let read = |name: &str| read_gray(&folder.join(name), None, &Limits::default()).unwrap();
+        let mask = read("mask.png");
+        for (kernel, iterations) in [(10, 5), (3, 3), (4, 2), (5, 1)] {
+            let ours = trimap(&mask, Band::Squares { kernel, iterations });
+            assert!(ours == read(&format!("trimap_k{kernel}_i{iterations}.png")), "{kernel} {iterations}");
+        }
+    }
+}
