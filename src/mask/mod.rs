@@ -9,7 +9,16 @@
 //!
 //! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unsure in a trimap.
 
+mod components;
+pub mod cut;
+mod cut_error;
 pub mod distance;
+mod known;
+pub mod maxflow;
+pub mod mixture;
+pub mod working;
+
+pub use cut_error::CutError;
 
 /// One click of a person on a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
