@@ -44,6 +44,9 @@ pub struct CutOptions {
     pub smoothness: f64,
     /// λ/γ: what contradicting a click or strip costs.
     pub certainty: f64,
+    /// The stage's first colours come from pixels this many times nearer to sure stage than to the head's clicks;
+    /// what lies between would teach it the colours of hair.
+    pub start_apart: f32,
     /// Rounds of fitting and cutting from clicks.
     pub rounds: usize,
     /// Holes up to this share of the picture are filled.
@@ -64,6 +67,7 @@ impl Default for CutOptions {
             strip_sides: 0.6,
             start_disc: 0.06,
             start_line: 0.02,
+            start_apart: 2.0,
             gaussians: 5,
             smoothness: 50.0,
             certainty: 9.0,
@@ -95,7 +99,7 @@ pub fn cut(view: &str, photo: &Photo, clicks: &[Click], options: &CutOptions) ->
     if !head.contains(&true) {
         return Err(CutError::Empty { view: view.into() });
     }
-    let unsure = ground.unsure(&head, &models, options);
+    let unsure = models.map_or(1.0, |m| ground.unsure(&head, &m, options));
     warnings.extend(ground.warnings(view, &head));
     Ok(Cut { mask: ground.gray(&head), unsure, warnings })
 }
@@ -143,9 +147,19 @@ impl Ground {
     /// Reduces a photograph and draws what its clicks make certain; also warnings about the clicks.
     pub fn new(view: &str, photo: &Photo, clicks: &[Click], options: &CutOptions) -> (Ground, Vec<String>) {
         let small = working_photo(photo, options.rows.max(16));
-        let size = (small.width, small.height);
+        Ground::reduced(view, small, (photo.width, photo.height), clicks, options)
+    }
+
+    /// The same for a photograph that is reduced already, from `size`, in whose pixels the clicks are.
+    pub fn reduced(
+        view: &str,
+        small: Photo,
+        size: (u32, u32),
+        clicks: &[Click],
+        options: &CutOptions,
+    ) -> (Ground, Vec<String>) {
         let clicks: Vec<Click> =
-            clicks.iter().map(|c| working_click(c, (photo.width, photo.height), size)).collect();
+            clicks.iter().map(|c| working_click(c, size, (small.width, small.height))).collect();
         let (width, height) = (small.width as usize, small.height as usize);
         let (known, warnings) = known::known(view, &clicks, width, height, options);
         let joints = joints(&small, options.smoothness);
@@ -154,10 +168,14 @@ impl Ground {
 
     /// GrabCut from the clicks: labels and the colours they end with.
     pub fn grab(&self, options: &CutOptions) -> (Vec<bool>, Option<Models>) {
-        let mut head = known::start(&self.known, &self.clicks, self.width, self.height, options);
+        let start = known::start(&self.known, &self.clicks, self.width, self.height, options);
+        let mut head = start.head;
         let mut models: Option<Models> = None;
         for _ in 0..options.rounds.max(1) {
-            let (inside, outside) = self.colors(&head);
+            let (inside, mut outside) = self.colors(&head);
+            if models.is_none() {
+                outside = self.colors(&start.not_far).1;
+            }
             models = match models {
                 None => Models::fit(&inside, &outside, options),
                 Some(m) => Some(Models { head: m.head.refit(&inside), stage: m.stage.refit(&outside) }),
@@ -204,22 +222,26 @@ impl Ground {
         graph.cut().0
     }
 
-    /// Pieces without a click go, small holes are filled, threads are opened. Without clicks the largest pieces
-    /// with sure head stay.
+    /// Pieces without a click go, small holes are filled, threads are opened.
     pub fn finish(&self, mut head: Vec<bool>, options: &CutOptions) -> Vec<bool> {
-        let sure = |which: Known| -> Vec<bool> { self.known.iter().map(|k| *k == which).collect() };
-        let (w, h) = (self.width, self.height);
-        keep_with_seeds(&mut head, &sure(Known::Head), w, h);
-        fill_holes(&mut head, &sure(Known::Stage), w, h, (options.hole * (w * h) as f64) as usize);
-        let mut opened = open(&head, w, h);
+        let clicked: Vec<bool> = self.known.iter().map(|k| *k == Known::Head).collect();
+        keep_with_seeds(&mut head, &clicked, self.width, self.height);
+        let mut smooth = self.smooth(head, options);
         // opening may part what a thread held together
-        keep_with_seeds(&mut opened, &sure(Known::Head), w, h);
-        opened
+        keep_with_seeds(&mut smooth, &clicked, self.width, self.height);
+        smooth
+    }
+
+    /// Small holes are filled, threads are opened.
+    pub fn smooth(&self, mut head: Vec<bool>, options: &CutOptions) -> Vec<bool> {
+        let stage: Vec<bool> = self.known.iter().map(|k| *k == Known::Stage).collect();
+        let largest = (options.hole * (self.width * self.height) as f64) as usize;
+        fill_holes(&mut head, &stage, self.width, self.height, largest);
+        open(&head, self.width, self.height)
     }
 
     /// Share of the picture near the outline whose colour does not tell the sides apart.
-    pub fn unsure(&self, head: &[bool], models: &Option<Models>, options: &CutOptions) -> f64 {
-        let Some(models) = models else { return 1.0 };
+    pub fn unsure(&self, head: &[bool], models: &Models, options: &CutOptions) -> f64 {
         let (w, h) = (self.width, self.height);
         let radius = options.band * h as f32;
         let near = |side: bool| {

@@ -19,10 +19,8 @@ pub(super) enum Known {
 
 /// Checks the clicks on a photograph of `width` × `height` pixels, before anything is computed.
 pub(super) fn check(view: &str, clicks: &[Click], width: u32, height: u32) -> Result<(), CutError> {
+    check_size(view, width, height)?;
     let view = || view.to_string();
-    if width < 16 || height < 16 {
-        return Err(CutError::TooSmall { view: view(), width, height });
-    }
     if clicks.is_empty() {
         return Err(CutError::NoClicks { view: view() });
     }
@@ -44,6 +42,14 @@ pub(super) fn check(view: &str, clicks: &[Click], width: u32, height: u32) -> Re
                 return Err(CutError::Contradiction { view: view(), first: i + 1, second: j + 1, x, y });
             }
         }
+    }
+    Ok(())
+}
+
+/// Two sides need some pixels each.
+pub(super) fn check_size(view: &str, width: u32, height: u32) -> Result<(), CutError> {
+    if width < 16 || height < 16 {
+        return Err(CutError::TooSmall { view: view.into(), width, height });
     }
     Ok(())
 }
@@ -130,14 +136,22 @@ pub(super) fn strips(width: usize, height: usize, options: &CutOptions) -> Vec<K
         .collect()
 }
 
-/// The Voronoi start: is the pixel nearer to the head's clicks than to sure stage?
+/// Where a cut starts from, each `[height · width]`.
+pub(super) struct Start {
+    /// Is the pixel nearer to the head's clicks than to sure stage?
+    pub head: Vec<bool>,
+    /// False where the pixel is so much nearer to sure stage that its colour is taken for the stage's.
+    pub not_far: Vec<bool>,
+}
+
+/// The Voronoi start.
 pub(super) fn start(
     known: &[Known],
     clicks: &[Click],
     width: usize,
     height: usize,
     options: &CutOptions,
-) -> Vec<bool> {
+) -> Start {
     let h = height as f32;
     let mut skeleton: Vec<bool> = known.iter().map(|k| *k == Known::Head).collect();
     let head: Vec<(f32, f32)> = clicks.iter().filter(|c| c.head).map(|c| (c.x, c.y)).collect();
@@ -150,15 +164,18 @@ pub(super) fn start(
     let stage: Vec<bool> = known.iter().map(|k| *k == Known::Stage).collect();
     let to_head = squared_distance(&skeleton, width, height);
     let to_stage = squared_distance(&stage, width, height);
-    known
-        .iter()
-        .zip(to_head.iter().zip(&to_stage))
-        .map(|(k, (head, stage))| match k {
-            Known::Head => true,
-            Known::Stage => false,
-            Known::Nothing => head < stage,
-        })
-        .collect()
+    let nearer = |times: f32| -> Vec<bool> {
+        known
+            .iter()
+            .zip(to_head.iter().zip(&to_stage))
+            .map(|(k, (head, stage))| match k {
+                Known::Head => true,
+                Known::Stage => false,
+                Known::Nothing => *head < times * times * stage,
+            })
+            .collect()
+    };
+    Start { head: nearer(1.0), not_far: nearer(options.start_apart) }
 }
 
 #[cfg(test)]
@@ -201,8 +218,10 @@ mod tests {
         let options = CutOptions { start_disc: 0.0, start_line: 0.0, strip: 0.0, ..CutOptions::default() };
         let clicks = [click(10.0, 15.0, true), click(30.0, 15.0, false)];
         let (known, _) = known("a", &clicks, 41, 31, &options);
-        let start = start(&known, &clicks, 41, 31, &options);
-        assert!(start[15 * 41 + 19] && !start[15 * 41 + 20] && start[0] && !start[40]);
+        let Start { head, not_far } = start(&known, &clicks, 41, 31, &options);
+        assert!(head[15 * 41 + 19] && !head[15 * 41 + 20] && head[0] && !head[40]);
+        // between the discs of 4 pixels 12 are free; twice as far from one as from the other at two thirds
+        assert!(not_far[15 * 41 + 21] && !not_far[15 * 41 + 23]);
     }
 
     #[test]

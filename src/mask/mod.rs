@@ -13,9 +13,11 @@ mod components;
 pub mod cut;
 mod cut_error;
 pub mod distance;
+mod hull;
 mod known;
 pub mod maxflow;
 pub mod mixture;
+pub mod spread;
 pub mod working;
 
 pub use cut_error::CutError;
