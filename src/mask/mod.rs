@@ -9,6 +9,7 @@
 //!
 //! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unsure in a trimap.
 
+pub mod agree;
 mod components;
 pub mod cut;
 mod cut_error;

@@ -60,7 +60,7 @@ impl Default for SpreadOptions {
             core: 0.55,
             core_shrink: 0.008,
             dissent: 2,
-            consent: 1.0 / 3.0,
+            consent: 0.1,
             rounds: 3,
             piece: 0.002,
             at_once: 8,
@@ -175,10 +175,12 @@ const MOST_COLORS: usize = 600_000;
 
 impl Spread<'_> {
     /// The clicks of a view brought to its working size.
-    fn ground(&self, i: usize) -> (Ground, Vec<String>) {
+    fn ground(&self, i: usize, strips: bool) -> (Ground, Vec<String>) {
         let (v, photo) = (&self.views[i], &self.photos[i]);
         let size = (v.camera.width, v.camera.height);
-        Ground::reduced(v.name, photo.clone(), size, v.clicks, &self.options.cut)
+        let mut options = self.options.cut.clone();
+        if !strips { options.strip = 0.0; }
+        Ground::reduced(v.name, photo.clone(), size, v.clicks, &options)
     }
 
     /// Cuts the clicked views by themselves and learns the common colours.
@@ -187,7 +189,7 @@ impl Spread<'_> {
         let found: Vec<_> = clicked
             .par_iter()
             .map(|&i| {
-                let (ground, warnings) = self.ground(i);
+                let (ground, warnings) = self.ground(i, true);
                 let (head, models) = ground.grab(cut);
                 let head = ground.finish(head, cut);
                 let models = models.filter(|_| head.contains(&true) && head.contains(&false));
@@ -231,7 +233,7 @@ impl Spread<'_> {
                 .into_par_iter()
                 .map(|i| {
                     let models = start.own[i].as_ref().map_or(&start.models, |(_, own)| own);
-                    self.cut_one(i, models, &hull, &core, round + 1 == rounds)
+                    self.cut_one(i, models, &hull, &core, (round, round + 1 == rounds))
                 })
                 .collect();
             for (i, (mask, open)) in done.into_iter().enumerate() {
@@ -270,9 +272,9 @@ impl Spread<'_> {
     }
 
     /// Cuts one view under what the hull allows.
-    fn cut_one(&self, i: usize, models: &Models, hull: &[bool], core: &[bool], last: bool) -> (Gray, f64) {
+    fn cut_one(&self, i: usize, models: &Models, hull: &[bool], core: &[bool], (round, last): (usize, bool)) -> (Gray, f64) {
         let options = &self.options.cut;
-        let (mut ground, _) = self.ground(i);
+        let (mut ground, _) = self.ground(i, round == 0);
         let (w, h) = (ground.width, ground.height);
         let camera = self.views[i].camera.resized(w as u32, h as u32);
         let allowed = hull::silhouette(&self.cube, hull, &camera);
