@@ -28,15 +28,25 @@ pub struct AgreeOptions {
     pub cube: f64,
     /// How many reduced pixels beside a mask, beyond the footprint of a cell, nothing is ruled out yet.
     pub slack_px: f32,
-    /// Share of a mask that no other mask explains, from which it is named.
-    pub too_much: f64,
-    /// Share of the other masks that one takes away, from which it is named.
-    pub too_little: f64,
+    /// Quarrel of a view, in whole masks, below which it is never named.
+    pub least: f64,
+    /// … and from which it always is.
+    pub loud: f64,
+    /// Between the two it is named when its quarrel is this many times the mean.
+    pub stand_out: f64,
 }
 
 impl Default for AgreeOptions {
     fn default() -> AgreeOptions {
-        AgreeOptions { rows: 160, cells: 128, cube: 1.3, slack_px: 1.0, too_much: 0.02, too_little: 0.004 }
+        AgreeOptions {
+            rows: 160,
+            cells: 128,
+            cube: 1.3,
+            slack_px: 1.0,
+            least: 0.005,
+            loud: 0.05,
+            stand_out: 4.0,
+        }
     }
 }
 
@@ -77,7 +87,8 @@ pub struct Agreement {
 
 /// Compares the masks of all views. Fewer than two masks have nothing to disagree about.
 pub fn agree(views: &[AgreeView], options: &AgreeOptions) -> Result<Agreement, CutError> {
-    let used: Vec<usize> = (0..views.len()).filter(|&i| views[i].mask.is_some_and(|m| !m.values.is_empty())).collect();
+    let used: Vec<usize> =
+        (0..views.len()).filter(|&i| views[i].mask.is_some_and(|m| !m.values.is_empty())).collect();
     if used.len() < 2 {
         return Ok(Agreement { masks: used.len(), ..Agreement::default() });
     }
@@ -92,14 +103,12 @@ pub fn agree(views: &[AgreeView], options: &AgreeOptions) -> Result<Agreement, C
     loop {
         let quarrel = Quarrel::of(&space, &parties, &active);
         let left = active.iter().filter(|a| **a).count();
+        // of equals the first
         let worst = (0..parties.len())
             .filter(|&i| active[i])
-            .filter(|&i| {
-                quarrel.too_much[i] > options.too_much || quarrel.too_little(i) > options.too_little
-            })
-            // of equals the first
             .rev()
-            .max_by(|&a, &b| quarrel.credit[a].total_cmp(&quarrel.credit[b]));
+            .max_by(|&a, &b| quarrel.credit[a].total_cmp(&quarrel.credit[b]))
+            .filter(|&i| quarrel.names(i, left, options));
         let Some(worst) = worst.filter(|_| left >= 2) else {
             let total: f64 = (0..parties.len()).filter(|&i| active[i]).map(|i| quarrel.too_much[i]).sum();
             return Ok(Agreement { masks: parties.len(), doubts, left: total / left.max(1) as f64 });
@@ -109,22 +118,25 @@ pub fn agree(views: &[AgreeView], options: &AgreeOptions) -> Result<Agreement, C
         for i in named {
             active[i] = false;
             let (much, little) = (quarrel.too_much[i], quarrel.too_little(i));
-            let text = sentence(views[used[i]].name, much, little, left == 2);
+            let text = sentence(views[used[i]].name, much, little, quarrel.taken[i], left == 2);
             doubts.push(Doubt { view: used[i], too_much: much, too_little: little, text });
         }
     }
 }
 
-fn sentence(view: &str, much: f64, little: f64, two: bool) -> String {
-    let percent = |v: f64| if v < 0.01 { format!("{:.1} %", 100.0 * v) } else { format!("{:.0} %", 100.0 * v) };
-    let parts = match (much > 0.005, little > 0.001) {
-        (true, false) => format!("shows too much: no other view has anything for {} of it", percent(much)),
-        (false, _) => format!("shows too little: it takes away {} of what the other masks show", percent(little)),
-        (true, true) => format!(
+fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String {
+    let percent =
+        |v: f64| if v < 0.02 { format!("{:.1} %", 100.0 * v) } else { format!("{:.0} %", 100.0 * v) };
+    let parts = if much > 3.0 * taken {
+        format!("shows too much: no other view has anything for {} of it", percent(much))
+    } else if taken > 3.0 * much {
+        format!("shows too little: it takes away {} of what the other masks show", percent(little))
+    } else {
+        format!(
             "does not fit: no other view has anything for {} of it, and it takes away {} of what the others show",
             percent(much),
             percent(little)
-        ),
+        )
     };
     let which = if two { "; with two masks left, the other may be the wrong one" } else { "" };
     format!("the mask of view `{view}` {parts}{which}")
@@ -201,7 +213,8 @@ impl Space {
                 let (mut no, mut yes) = (vec![0u64; n * n * words], vec![0u64; n * n * words]);
                 for (p, party) in parties.iter().enumerate() {
                     for i in 0..n * n {
-                        let Some((u, v, _)) = party.projector.project(cube.cell_center(x, i / n, i % n)) else {
+                        let Some((u, v, _)) = party.projector.project(cube.cell_center(x, i / n, i % n))
+                        else {
                             continue;
                         };
                         if u < 0.0 || v < 0.0 || u >= party.width as f64 || v >= party.height as f64 {
@@ -244,8 +257,10 @@ impl Quarrel {
             (0..space.words).map(|k| (set[i * space.words + k] & mask[k]).count_ones()).sum()
         };
         let cells = space.cube.n.pow(3);
-        let costs: Vec<(u16, u16)> =
-            (0..cells).into_par_iter().map(|i| (bits(&space.no, i) as u16, bits(&space.yes, i) as u16)).collect();
+        let costs: Vec<(u16, u16)> = (0..cells)
+            .into_par_iter()
+            .map(|i| (bits(&space.no, i) as u16, bits(&space.yes, i) as u16))
+            .collect();
         let found: Vec<Option<(f64, Vec<f64>)>> = (0..count)
             .into_par_iter()
             .map(|j| active[j].then(|| open_claims(space, &parties[j], &costs, &mask, count)))
@@ -263,6 +278,15 @@ impl Quarrel {
             }
         }
         quarrel
+    }
+
+    /// Is a view's part in the quarrel large, or at least unlike that of the others? Of `left` views a single
+    /// wrong one has half of all credit, so few views can stand out less.
+    fn names(&self, i: usize, left: usize, options: &AgreeOptions) -> bool {
+        let mean = self.credit.iter().sum::<f64>() / left as f64;
+        let times = if left == 2 { 0.0 } else { (left as f64 / 6.0).max(1.2).min(options.stand_out) };
+        let own = self.credit[i];
+        own > options.loud || (own > options.least && own > times * mean)
     }
 
     /// Mean share that a view takes away from the others.
@@ -304,7 +328,13 @@ fn open_claims(
 
 /// The cell on a pixel's ray that fewest views rule out; of equals the one that most have on the head. Nothing
 /// when the ray misses the cube.
-fn best_on_ray(space: &Space, camera: &Camera, x: usize, y: usize, costs: &[(u16, u16)]) -> Option<(u16, usize)> {
+fn best_on_ray(
+    space: &Space,
+    camera: &Camera,
+    x: usize,
+    y: usize,
+    costs: &[(u16, u16)],
+) -> Option<(u16, usize)> {
     let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
     let (n, cell) = (space.cube.n, space.cube.cell());
     // in cells from the cube's corner
@@ -342,4 +372,125 @@ fn best_on_ray(space: &Space, camera: &Camera, x: usize, y: usize, costs: &[(u16
         }
     }
     best.map(|(cost, _, i)| (cost, i))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::Distortion;
+    use glam::{DMat3, DVec3};
+
+    /// Eight cameras on a ring, rising a little from one to the next.
+    fn ring(count: usize) -> Vec<Camera> {
+        (0..count)
+            .map(|i| {
+                let turn = i as f64 * std::f64::consts::TAU / 9.0;
+                let rotation = DMat3::from_rotation_y(turn) * DMat3::from_rotation_x(-0.05 * i as f64);
+                Camera {
+                    width: 96,
+                    height: 128,
+                    fx: 300.0,
+                    fy: 300.0,
+                    cx: 48.0,
+                    cy: 64.0,
+                    distortion: Distortion::default(),
+                    rotation,
+                    position: rotation * DVec3::new(0.0, 0.0, 10.0),
+                }
+            })
+            .collect()
+    }
+
+    /// A snowman with a nose, seen by a camera.
+    fn mask(camera: &Camera) -> Gray {
+        let balls = [
+            (DVec3::new(0.0, -0.6, 0.0), 0.8),
+            (DVec3::new(0.0, 0.6, 0.0), 0.6),
+            (DVec3::new(0.0, 0.6, 0.7), 0.3),
+        ];
+        let values = (0..96 * 128)
+            .map(|i| {
+                let ray = camera.ray(Vec2::new((i % 96) as f32 + 0.5, (i / 96) as f32 + 0.5)).unwrap();
+                let hit = balls.iter().any(|(c, r)| {
+                    let to = *c - camera.position;
+                    to.cross(ray.direction.as_dvec3()).length() < *r
+                });
+                if hit { 255 } else { 0 }
+            })
+            .collect();
+        Gray { width: 96, height: 128, values }
+    }
+
+    fn check(cameras: &[Camera], masks: &[Gray]) -> Agreement {
+        let views: Vec<AgreeView> = cameras
+            .iter()
+            .zip(masks)
+            .map(|(camera, m)| AgreeView { name: "v", camera, mask: Some(m) })
+            .collect();
+        agree(&views, &AgreeOptions { rows: 128, cells: 64, ..AgreeOptions::default() }).unwrap()
+    }
+
+    fn shifted(mask: &Gray, by: usize) -> Gray {
+        let (w, n) = (mask.width as usize, mask.values.len());
+        let at = |i: usize| if i % w >= by { mask.values[i - by] } else { 0 };
+        Gray { values: (0..n).map(at).collect(), ..mask.clone() }
+    }
+
+    #[test]
+    fn true_masks_do_not_quarrel() {
+        let cameras = ring(8);
+        let masks: Vec<Gray> = cameras.iter().map(mask).collect();
+        let found = check(&cameras, &masks);
+        assert_eq!((found.masks, found.doubts.len()), (8, 0), "{found:?}");
+        assert!(found.left < 1e-3);
+    }
+
+    #[test]
+    fn one_wrong_mask_is_named_with_its_direction() {
+        let cameras = ring(8);
+        let masks: Vec<Gray> = cameras.iter().map(mask).collect();
+        let fill = |v: u8| Gray { values: vec![v; 96 * 128], ..masks[0].clone() };
+        let inverted = Gray { values: masks[3].values.iter().map(|v| 255 - v).collect(), ..masks[3].clone() };
+        for (wrong, said) in [
+            (fill(0), "shows too little"),
+            (fill(255), "shows too much"),
+            (inverted, "the mask of view"),
+            (shifted(&masks[3], 14), "the mask of view"),
+        ] {
+            let mut masks = masks.clone();
+            masks[3] = wrong;
+            let found = check(&cameras, &masks);
+            assert_eq!(found.doubts.iter().map(|d| d.view).collect::<Vec<_>>(), [3], "{said}: {found:?}");
+            assert!(found.doubts[0].text.contains(said), "{}", found.doubts[0].text);
+        }
+    }
+
+    #[test]
+    fn two_wrong_masks_are_both_named_and_nothing_else() {
+        let cameras = ring(8);
+        let mut masks: Vec<Gray> = cameras.iter().map(mask).collect();
+        masks[1].values.fill(0);
+        masks[6].values.fill(0);
+        let mut views: Vec<usize> = check(&cameras, &masks).doubts.iter().map(|d| d.view).collect();
+        views.sort_unstable();
+        assert_eq!(views, [1, 6]);
+    }
+
+    #[test]
+    fn of_two_masks_neither_can_be_trusted_and_one_has_no_one_to_disagree_with() {
+        let cameras = ring(2);
+        let mut masks: Vec<Gray> = cameras.iter().map(mask).collect();
+        masks[0].values.fill(0);
+        let found = check(&cameras, &masks);
+        assert_eq!(found.doubts.len(), 2);
+        assert!(found.doubts[0].text.contains("two masks left"));
+        assert!(check(&cameras[..1], &masks[..1]).doubts.is_empty());
+    }
+
+    #[test]
+    fn masks_are_reduced_by_area() {
+        // 4 x 2 to 2 x 1: left block three of four masked, right block one
+        let mask = Gray { width: 4, height: 2, values: vec![255, 255, 0, 0, 255, 0, 0, 200] };
+        assert_eq!(reduced(&mask, 2, 1), [true, false]);
+    }
 }

@@ -193,7 +193,8 @@ impl Ground {
 
     /// Colours of the pixels inside and outside a mask.
     pub fn colors(&self, head: &[bool]) -> (Vec<Rgb>, Vec<Rgb>) {
-        let of = |side: bool| self.photo.rgb.iter().zip(head).filter(move |(_, h)| **h == side).map(|(c, _)| *c);
+        let of =
+            |side: bool| self.photo.rgb.iter().zip(head).filter(move |(_, h)| **h == side).map(|(c, _)| *c);
         (of(true).collect(), of(false).collect())
     }
 

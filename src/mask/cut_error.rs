@@ -5,7 +5,9 @@
 #[non_exhaustive]
 pub enum CutError {
     /// A click is not on the photograph.
-    #[error("view `{view}`: click {number} at ({x}, {y}) is outside the photograph of {width} × {height} pixels")]
+    #[error(
+        "view `{view}`: click {number} at ({x}, {y}) is outside the photograph of {width} × {height} pixels"
+    )]
     OutsidePhoto {
         /// The view.
         view: String,

@@ -97,7 +97,12 @@ pub(super) fn silhouette(cube: &Cube, cells: &[bool], camera: &Camera) -> Vec<bo
         let surface = edge(x)
             || edge(y)
             || edge(z)
-            || !(cells[i - n * n] && cells[i + n * n] && cells[i - n] && cells[i + n] && cells[i - 1] && cells[i + 1]);
+            || !(cells[i - n * n]
+                && cells[i + n * n]
+                && cells[i - n]
+                && cells[i + n]
+                && cells[i - 1]
+                && cells[i + 1]);
         if !surface {
             continue; // what surrounds it covers it
         }
@@ -155,4 +160,68 @@ fn around([x, y, z]: [usize; 3], n: usize, corners: bool) -> impl Iterator<Item 
             (steps == 1 || (corners && steps > 1)).then_some((u * n + v) * n + w)
         },
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cameras() -> Vec<Camera> {
+        // along Z and along X, both 10 away, 1 unit = 20 pixels at the middle
+        let front = Camera::above(80, 80, 200.0, 10.0);
+        let side = Camera {
+            rotation: glam::DMat3::from_rotation_y(std::f64::consts::FRAC_PI_2),
+            position: DVec3::new(10.0, 0.0, 0.0),
+            ..front.clone()
+        };
+        vec![front, side]
+    }
+
+    /// A square of ± `half` pixels around the middle.
+    fn square(half: usize) -> Gray {
+        let inside = |v: usize| v >= 40 - half && v < 40 + half;
+        let values = (0..6400).map(|i| if inside(i % 80) && inside(i / 80) { 255 } else { 0 }).collect();
+        Gray { width: 80, height: 80, values }
+    }
+
+    #[test]
+    fn the_cube_surrounds_what_the_cameras_look_at() {
+        let cube = cube(&cameras(), 16, 1.5).unwrap();
+        // frames are 80 · 10 / 200 = 4 high at the middle
+        assert!(cube.center.length() < 1e-9 && (cube.half - 3.0).abs() < 1e-9);
+        let alike = super::cube(&cameras()[..1], 16, 1.5).unwrap_err();
+        assert!(matches!(alike, CutError::CamerasAlike { cameras: 1, .. }));
+    }
+
+    #[test]
+    fn two_squares_carve_a_box_and_draw_themselves_again() {
+        let cameras = cameras();
+        let cube = cube(&cameras, 48, 1.0).unwrap();
+        let witnesses: Vec<Witness> = cameras.iter().map(|c| Witness::new(c, &square(20))).collect();
+        let votes = Votes::count(&cube, &witnesses);
+        let cells = votes.cells(0, 2);
+        // a box of 2 units has 24 cells of 1/12 along each side; perspective moves its walls by a cell or two
+        let count = cells.iter().filter(|c| **c).count() as f64;
+        assert!((count.cbrt() - 24.0).abs() < 2.0, "{count}");
+        let drawn = silhouette(&cube, &cells, &cameras[0]);
+        let wrong = (drawn.iter().zip(&square(20).values)).filter(|(d, s)| **d != (**s == 255)).count();
+        assert!(wrong < 2 * 4 * 40, "{wrong}"); // two pixels along the outline
+        // one dissent lets all cells in that one view keeps: two beams
+        assert!(votes.cells(1, 0).iter().filter(|c| **c).count() as f64 > 2.0 * count);
+    }
+
+    #[test]
+    fn the_core_of_a_ball_is_a_smaller_ball() {
+        let n = 41;
+        let distance = |i: usize| {
+            let at = [i / (n * n), i / n % n, i % n].map(|v| v as f64 - 20.0);
+            (at[0] * at[0] + at[1] * at[1] + at[2] * at[2]).sqrt()
+        };
+        let ball: Vec<bool> = (0..n * n * n).map(|i| distance(i) < 16.0).collect();
+        let core = core(&ball, n, 0.5);
+        for i in (0..core.len()).filter(|&i| core[i]) {
+            assert!(distance(i) < 11.0, "{}", distance(i));
+        }
+        assert!((0..core.len()).filter(|&i| distance(i) < 5.0).all(|i| core[i]));
+    }
 }

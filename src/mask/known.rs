@@ -28,7 +28,14 @@ pub(super) fn check(view: &str, clicks: &[Click], width: u32, height: u32) -> Re
         // a pixel index of 0 is the pixel's centre, so the picture reaches half a pixel farther
         let inside = |v: f32, size: u32| v >= -0.5 && v <= size as f32 - 0.5;
         if !(inside(c.x, width) && inside(c.y, height)) {
-            return Err(CutError::OutsidePhoto { view: view(), number: i + 1, x: c.x, y: c.y, width, height });
+            return Err(CutError::OutsidePhoto {
+                view: view(),
+                number: i + 1,
+                x: c.x,
+                y: c.y,
+                width,
+                height,
+            });
         }
     }
     if clicks.iter().all(|c| !c.head) {
@@ -229,6 +236,8 @@ mod tests {
         let options = CutOptions { strip: 0.05, strip_sides: 0.6, ..CutOptions::default() };
         let known = strips(50, 100, &options);
         let at = |x: usize, y: usize| known[y * 50 + x] == Known::Stage;
-        assert!(at(25, 4) && !at(25, 5) && at(4, 59) && at(45, 59) && !at(5, 59) && !at(0, 60) && !at(25, 99));
+        assert!(
+            at(25, 4) && !at(25, 5) && at(4, 59) && at(45, 59) && !at(5, 59) && !at(0, 60) && !at(25, 99)
+        );
     }
 }

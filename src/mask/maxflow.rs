@@ -381,7 +381,8 @@ mod tests {
 
     impl Plain {
         fn cost(&self, head: &[bool]) -> i64 {
-            let own = self.costs.iter().zip(head).map(|(c, &h)| if h { c.0 } else { c.1 } as i64).sum::<i64>();
+            let own =
+                self.costs.iter().zip(head).map(|(c, &h)| if h { c.0 } else { c.1 } as i64).sum::<i64>();
             let cut = self.edges.iter().filter(|(i, j, _)| head[*i] != head[*j]).map(|e| e.2 as i64);
             own + cut.sum::<i64>()
         }

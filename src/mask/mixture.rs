@@ -148,8 +148,7 @@ impl Gaussian {
         let (a, b, d) = (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy);
         // the floor on the diagonal keeps it above LEAST_VARIANCE³ up to rounding
         let det = (xx * a + xy * b + xz * d).max(0.5 * LEAST_VARIANCE.powi(3));
-        let precision =
-            [a, b, d, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy].map(|v| v / det);
+        let precision = [a, b, d, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy].map(|v| v / det);
         let weight = n / total as f64;
         let offset = weight.ln() - 0.5 * (det.ln() + 3.0 * std::f64::consts::TAU.ln());
         Gaussian { weight, mean, precision, offset }

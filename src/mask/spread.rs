@@ -19,6 +19,7 @@ use super::known::{self, Known};
 use super::mixture::Rgb;
 use super::working::working_photo;
 use crate::capture::carve::{Cube, drop_dust};
+use crate::capture::findings;
 use crate::geom::Camera;
 use crate::image::{Gray, Photo};
 use rayon::prelude::*;
@@ -174,12 +175,15 @@ struct Spread<'a> {
 const MOST_COLORS: usize = 600_000;
 
 impl Spread<'_> {
-    /// The clicks of a view brought to its working size.
+    /// The clicks of a view brought to its working size. The strips are a guess: once a hull says where the head
+    /// is, it may touch any border.
     fn ground(&self, i: usize, strips: bool) -> (Ground, Vec<String>) {
         let (v, photo) = (&self.views[i], &self.photos[i]);
         let size = (v.camera.width, v.camera.height);
         let mut options = self.options.cut.clone();
-        if !strips { options.strip = 0.0; }
+        if !strips {
+            options.strip = 0.0;
+        }
         Ground::reduced(v.name, photo.clone(), size, v.clicks, &options)
     }
 
@@ -243,6 +247,12 @@ impl Spread<'_> {
         }
         let masks: Vec<Gray> = masks.into_iter().flatten().collect();
         self.warn(&masks, &unsure);
+        if start.own.iter().flatten().count() < 2 {
+            self.warnings.push(
+                "only one view is clicked: nothing bounds the head in depth at first; click a side view too"
+                    .into(),
+            );
+        }
         let views = masks.into_iter().zip(unsure).map(|(mask, unsure)| ViewMask { mask, unsure }).collect();
         Masks { views, warnings: self.warnings }
     }
@@ -265,14 +275,25 @@ impl Spread<'_> {
         };
         let mut hull = votes.cells(against, least);
         drop_dust(&mut hull, n, 0.02);
-        let solid: Vec<bool> =
-            votes.cells(against, least.max(total.div_ceil(2))).iter().zip(&hull).map(|(s, h)| *s && *h).collect();
+        let solid: Vec<bool> = votes
+            .cells(against, least.max(total.div_ceil(2)))
+            .iter()
+            .zip(&hull)
+            .map(|(s, h)| *s && *h)
+            .collect();
         let core = hull::core(&solid, n, self.options.core);
         (hull, core)
     }
 
     /// Cuts one view under what the hull allows.
-    fn cut_one(&self, i: usize, models: &Models, hull: &[bool], core: &[bool], (round, last): (usize, bool)) -> (Gray, f64) {
+    fn cut_one(
+        &self,
+        i: usize,
+        models: &Models,
+        hull: &[bool],
+        core: &[bool],
+        (round, last): (usize, bool),
+    ) -> (Gray, f64) {
         let options = &self.options.cut;
         let (mut ground, _) = self.ground(i, round == 0);
         let (w, h) = (ground.width, ground.height);
@@ -311,10 +332,17 @@ impl Spread<'_> {
         ground.smooth(head, &self.options.cut)
     }
 
+    /// What looks wrong about the finished masks.
     fn warn(&mut self, masks: &[Gray], unsure: &[f64]) {
+        for (i, mask) in masks.iter().enumerate().filter(|(i, _)| !self.views[*i].clicks.is_empty()) {
+            let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
+            let found = self.ground(i, false).0.warnings(self.views[i].name, &head);
+            self.warnings.extend(found);
+        }
         for (i, mask) in masks.iter().enumerate() {
             let view = self.views[i].name;
-            for finding in crate::capture::findings(mask) {
+            // shoulders do touch the sides
+            for finding in findings(mask).into_iter().filter(|f| !f.starts_with("touches")) {
                 self.warnings.push(format!("the mask cut for view `{view}` {finding}"));
             }
             if unsure[i] > 0.05 {
@@ -330,4 +358,106 @@ impl Spread<'_> {
 fn gray(photo: &Photo, head: &[bool]) -> Gray {
     let values = head.iter().map(|&h| if h { 255 } else { 0 }).collect();
     Gray { width: photo.width, height: photo.height, values }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::Distortion;
+    use crate::kernel::rng;
+    use glam::{DMat3, DVec3, Vec2};
+
+    fn ring() -> Vec<Camera> {
+        (0..6)
+            .map(|i| {
+                let rotation = DMat3::from_rotation_y(0.5 * i as f64);
+                Camera {
+                    width: 72,
+                    height: 96,
+                    fx: 240.0,
+                    fy: 240.0,
+                    cx: 36.0,
+                    cy: 48.0,
+                    distortion: Distortion::default(),
+                    rotation,
+                    position: rotation * DVec3::new(0.0, 0.0, 10.0),
+                }
+            })
+            .collect()
+    }
+
+    /// A ball of two colours before a dark stage with lamps, and which pixels are the ball.
+    fn photo(camera: &Camera, stream: u64) -> (Photo, Vec<bool>) {
+        let mut truth = Vec::new();
+        let rgb = (0..72 * 96u32)
+            .map(|i| {
+                let ray = camera.ray(Vec2::new((i % 72) as f32 + 0.5, (i / 72) as f32 + 0.5)).unwrap();
+                let near = (-camera.position).cross(ray.direction.as_dvec3()).length();
+                truth.push(near < 1.0);
+                let noise = (3.0 * rng::normal(1, stream, i as u64)) as i32;
+                let base = match (near < 1.0, i / 72 < 40) {
+                    (true, true) => [80, 55, 35],
+                    (true, false) => [200, 150, 130],
+                    _ if (i % 72 % 30).abs_diff(6) < 3 && (i / 72 % 30).abs_diff(6) < 3 => [210, 160, 140],
+                    _ => [14, 14, 16],
+                };
+                base.map(|c| (c + noise).clamp(0, 255) as u8)
+            })
+            .collect();
+        (Photo { width: 72, height: 96, rgb, alpha: None }, truth)
+    }
+
+    fn clicks() -> Vec<Click> {
+        [(36.0, 60.0, true), (36.0, 34.0, true), (20.0, 16.0, false), (66.0, 80.0, false)]
+            .map(|(x, y, head)| Click { x, y, head })
+            .into()
+    }
+
+    fn run(clicked: &[usize]) -> Result<Masks, CutError> {
+        let (cameras, clicks) = (ring(), clicks());
+        let views: Vec<SpreadView> = (cameras.iter().enumerate())
+            .map(|(i, camera)| {
+                let clicks: &[Click] = if clicked.contains(&i) { &clicks } else { &[] };
+                SpreadView { name: "v", camera, clicks, witness: i != 5 }
+            })
+            .collect();
+        let options = SpreadOptions { cells: 48, at_once: 2, ..SpreadOptions::default() };
+        spread(&views, |i| Ok(photo(&cameras[i], i as u64).0), &options)
+    }
+
+    #[test]
+    fn lamps_of_the_heads_own_colour_are_left_out_of_views_nobody_clicked() {
+        let masks = run(&[0, 3]).unwrap();
+        for (i, view) in masks.views.iter().enumerate() {
+            let truth = photo(&ring()[i], i as u64).1;
+            let wrong = view.mask.values.iter().zip(&truth).filter(|(m, t)| (**m > 127) != **t).count();
+            // the ball covers 1800 pixels
+            assert!(wrong < 40, "view {i}: {wrong} pixels are wrong");
+        }
+        assert_eq!(masks.warnings, Vec::<String>::new());
+    }
+
+    #[test]
+    fn the_same_masks_come_from_any_number_of_threads() {
+        let on = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| run(&[0, 3])).unwrap()
+        };
+        assert_eq!(on(1), on(3));
+    }
+
+    #[test]
+    fn no_clicks_and_failing_photographs_end_with_their_error() {
+        assert!(matches!(run(&[]), Err(CutError::NoClicks { .. })));
+        assert!(run(&[1]).unwrap().warnings.iter().any(|w| w.contains("only one view")));
+        let (cameras, clicks) = (ring(), clicks());
+        let views =
+            cameras.iter().map(|camera| SpreadView { name: "v", camera, clicks: &clicks, witness: true });
+        let views: Vec<SpreadView> = views.collect();
+        let small = |_| Ok(Photo { width: 20, height: 20, rgb: vec![[0; 3]; 400], alpha: None });
+        let e = spread::<CutError, _>(&views, small, &SpreadOptions::default()).unwrap_err();
+        assert!(matches!(e, CutError::Size { found: (20, 20), camera: (72, 96), .. }), "{e}");
+        let fail = |_| Err(CutError::NoSuchView { found: 9, views: 6 });
+        assert!(matches!(spread(&views, fail, &SpreadOptions::default()), Err(CutError::NoSuchView { .. })));
+    }
 }
