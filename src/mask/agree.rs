@@ -129,7 +129,7 @@ fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String
         |v: f64| if v < 0.02 { format!("{:.1} %", 100.0 * v) } else { format!("{:.0} %", 100.0 * v) };
     let parts = if much > 3.0 * taken {
         format!("shows too much: no other view has anything for {} of it", percent(much))
-    } else if taken > 3.0 * much {
+    } else if much < 0.01 && taken > 3.0 * much {
         format!("shows too little: it takes away {} of what the other masks show", percent(little))
     } else {
         format!(
@@ -326,8 +326,8 @@ fn open_claims(
     (open as f64 / asked, takers)
 }
 
-/// The cell on a pixel's ray that fewest views rule out; of equals the one that most have on the head. Nothing
-/// when the ray misses the cube.
+/// The cell on a pixel's ray that fewest views rule out, of those that another view has on the head if there are
+/// any; of equals the one that most have there. Nothing when no other view looks at the ray within the cube.
 fn best_on_ray(
     space: &Space,
     camera: &Camera,
@@ -353,7 +353,8 @@ fn best_on_ray(
         begin = begin.max(p.min(q));
         end = end.min(p.max(q));
     }
-    let mut best: Option<(u16, u16, usize)> = None;
+    // whom the ray's own view has on its side comes first, then who is against
+    let mut best: Option<(bool, u16, u16, usize)> = None;
     let mut t = begin + 0.25;
     while t < end {
         let p = origin + direction * t;
@@ -364,14 +365,18 @@ fn best_on_ray(
         }
         let i = (at[0] * n + at[1]) * n + at[2];
         let (no, yes) = costs[i];
-        if best.is_none_or(|(cost, agreed, _)| no < cost || (no == cost && yes > agreed)) {
-            best = Some((no, yes, i));
+        if no == 0 && yes < 2 {
+            continue; // no other view looks there, which explains nothing
+        }
+        let alone = yes < 2;
+        if best.is_none_or(|(a, cost, agreed, _)| (alone, no, agreed) < (a, cost, yes)) {
+            best = Some((alone, no, yes, i));
             if no == 0 {
                 break;
             }
         }
     }
-    best.map(|(cost, _, i)| (cost, i))
+    best.map(|(_, cost, _, i)| (cost, i))
 }
 
 #[cfg(test)]
