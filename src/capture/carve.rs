@@ -13,7 +13,7 @@ use glam::{DMat3, DVec3, Vec2};
 use rayon::prelude::*;
 
 /// A camera prepared for many projections.
-pub(super) struct Projector {
+pub(crate) struct Projector {
     camera_from_world: DMat3,
     position: DVec3,
     camera: Camera,
@@ -145,7 +145,7 @@ impl Silhouette {
 
 /// A cube of `n³` cells around a centre.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Cube {
+pub(crate) struct Cube {
     pub center: DVec3,
     pub half: f64,
     pub n: usize,
@@ -224,7 +224,7 @@ pub(super) fn carve(cube: &Cube, silhouettes: &[Silhouette]) -> Carved {
 }
 
 /// Removes every 26-connected piece smaller than `share` of the largest one; says how many cells went.
-pub(super) fn drop_dust(kept: &mut [bool], n: usize, share: f64) -> usize {
+pub(crate) fn drop_dust(kept: &mut [bool], n: usize, share: f64) -> usize {
     let mut label = vec![0u32; kept.len()];
     let mut sizes: Vec<usize> = vec![0];
     let mut stack = Vec::new();
@@ -277,7 +277,7 @@ pub(super) fn extent(kept: &[bool], n: usize) -> Option<[(usize, usize); 3]> {
 
 /// The point nearest to all rays, least squares: `Σ (I − ddᵀ)(p − o) = 0`. `None` when they are parallel
 /// within about half a degree.
-pub(super) fn meeting_point(rays: &[(DVec3, DVec3)]) -> Option<DVec3> {
+pub(crate) fn meeting_point(rays: &[(DVec3, DVec3)]) -> Option<DVec3> {
     // sums relative to one origin: far-away worlds would lose digits
     let base = rays.first()?.0;
     let (mut a, mut b) = (DMat3::ZERO, DVec3::ZERO);

@@ -4,7 +4,7 @@
 //! leaves the world as the dataset has it. [`View::load`] brings one photograph with its masks into
 //! memory; [`scene`] says where the head is; [`inspect`] reports everything that can be found wrong.
 
-mod carve;
+pub(crate) mod carve;
 mod error;
 pub mod inspect;
 mod listing;

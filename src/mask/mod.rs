@@ -9,16 +9,26 @@
 //!
 //! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unsure in a trimap.
 
+pub mod agree;
 pub mod alpha;
 pub mod closed_form;
+mod components;
+pub mod cut;
+mod cut_error;
 pub mod distance;
 mod font;
 pub mod guided;
+mod hull;
+mod known;
+pub mod maxflow;
+pub mod mixture;
 pub mod page;
 pub mod points;
 pub mod scale;
 pub mod sheet;
+pub mod spread;
 pub mod trimap;
+pub mod working;
 
 #[cfg(feature = "matting")]
 pub mod networks;
@@ -35,6 +45,7 @@ mod sam;
 #[cfg(feature = "matting")]
 mod vitmatte;
 
+pub use cut_error::CutError;
 #[cfg(feature = "matting")]
 pub use self::{onnx::MaskNetworkError, vitmatte::VitMatteColours};
 

@@ -1,0 +1,393 @@
+//! Clicks → hard mask: GrabCut (Rother, Kolmogorov, Blake 2004) from a Voronoi start.
+//!
+//! Head and stage are mixtures of colours, learned from the labels that the last round gave; a round's labels are
+//! the smallest cut of
+//!
+//! ```text
+//! E = Σ_p −ln p(c_p | label) + γ Σ_pq exp(−β ‖c_p − c_q‖²) / |p − q| · [labels differ],  β = 1 / (2 ⟨‖Δ‖²⟩)
+//! ```
+//!
+//! over 8 neighbours. At the end only pieces with a click stay, small holes are filled and threads are opened.
+
+use super::Click;
+use super::components::{fill_holes, keep_with_seeds, open};
+use super::cut_error::CutError;
+use super::known::{self, Known};
+use super::maxflow::PixelGraph;
+use super::mixture::{Mixture, Rgb};
+use super::working::{working_click, working_photo};
+use crate::image::{Gray, Photo};
+
+/// Whole-number capacities per unit of energy.
+const UNIT: f64 = 1000.0;
+
+/// How masks are cut. Lengths are shares of the picture's height H.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CutOptions {
+    /// Rows of the working size; larger photographs are averaged down to it.
+    pub rows: u32,
+    /// Radius of what a click makes certain.
+    pub disc: f32,
+    /// … and at least this many working pixels.
+    pub disc_least_px: f32,
+    /// Width of the strips along top and sides that are certainly stage.
+    pub strip: f32,
+    /// How far down the strips at the sides reach; shoulders may touch the rest.
+    pub strip_sides: f32,
+    /// Radius of the discs around head clicks in the start.
+    pub start_disc: f32,
+    /// Width of the line that joins head clicks in the start.
+    pub start_line: f32,
+    /// Gaussians per mixture, 1 to 16.
+    pub gaussians: usize,
+    /// γ: what an edge between equal colours costs.
+    pub smoothness: f64,
+    /// λ/γ: what contradicting a click or strip costs.
+    pub certainty: f64,
+    /// The stage's first colours come from pixels this many times nearer to sure stage than to the head's clicks;
+    /// what lies between would teach it the colours of hair.
+    pub start_apart: f32,
+    /// Rounds of fitting and cutting from clicks.
+    pub rounds: usize,
+    /// Holes up to this share of the picture are filled.
+    pub hole: f64,
+    /// Around the outline, what colours may leave open counts as unsure within this distance.
+    pub band: f32,
+    /// Seed of the k-means start.
+    pub seed: u64,
+}
+
+impl Default for CutOptions {
+    fn default() -> CutOptions {
+        CutOptions {
+            rows: 512,
+            disc: 0.012,
+            disc_least_px: 4.0,
+            strip: 0.012,
+            strip_sides: 0.6,
+            start_disc: 0.06,
+            start_line: 0.02,
+            start_apart: 2.0,
+            gaussians: 5,
+            smoothness: 50.0,
+            certainty: 9.0,
+            rounds: 8,
+            hole: 0.01,
+            band: 0.023,
+            seed: 42,
+        }
+    }
+}
+
+/// A hard mask at the working size.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Cut {
+    /// 255 head, 0 stage.
+    pub mask: Gray,
+    /// Share of the picture, 0..=1, that lies near the outline and has a colour that fits both sides.
+    pub unsure: f64,
+    /// What a person should look at.
+    pub warnings: Vec<String>,
+}
+
+/// Cuts the head out of one photograph. `view` is its name in messages; clicks are pixels of `photo`.
+pub fn cut(view: &str, photo: &Photo, clicks: &[Click], options: &CutOptions) -> Result<Cut, CutError> {
+    known::check(view, clicks, photo.width, photo.height)?;
+    let (ground, mut warnings) = Ground::new(view, photo, clicks, options);
+    let (head, models) = ground.grab(options);
+    let head = ground.finish(head, options);
+    if !head.contains(&true) {
+        return Err(CutError::Empty { view: view.into() });
+    }
+    let unsure = models.map_or(1.0, |m| ground.unsure(&head, &m, options));
+    warnings.extend(ground.warnings(view, &head));
+    Ok(Cut { mask: ground.gray(&head), unsure, warnings })
+}
+
+/// The colours of both sides.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Models {
+    pub head: Mixture,
+    pub stage: Mixture,
+}
+
+impl Models {
+    /// From k-means over both sides; `None` when one has no pixel.
+    pub fn fit(head: &[Rgb], stage: &[Rgb], options: &CutOptions) -> Option<Models> {
+        let count = options.gaussians.clamp(1, 16);
+        Some(Models {
+            head: Mixture::fit(head, count, options.seed)?,
+            stage: Mixture::fit(stage, count, options.seed)?,
+        })
+    }
+
+    /// `ln p(c | head) − ln p(c | stage)`.
+    pub fn lean(&self, color: &Rgb) -> f64 {
+        self.head.log_likelihood(color) - self.stage.log_likelihood(color)
+    }
+}
+
+/// A photograph at its working size with what is certain about it.
+pub(super) struct Ground {
+    pub photo: Photo,
+    pub width: usize,
+    pub height: usize,
+    /// Clicks in working pixels; empty where nobody clicked.
+    pub clicks: Vec<Click>,
+    /// `[height · width]`.
+    pub known: Vec<Known>,
+    /// What telling a pixel from its right, lower, lower right and lower left neighbour costs.
+    joints: Vec<[i32; 4]>,
+}
+
+/// Directions of [`PixelGraph::join`] with their steps, in the order of `Ground::joints`.
+const FORWARD: [(usize, isize, isize); 4] = [(0, 1, 0), (2, 0, 1), (4, 1, 1), (6, -1, 1)];
+
+impl Ground {
+    /// Reduces a photograph and draws what its clicks make certain; also warnings about the clicks.
+    pub fn new(view: &str, photo: &Photo, clicks: &[Click], options: &CutOptions) -> (Ground, Vec<String>) {
+        let small = working_photo(photo, options.rows.max(16));
+        Ground::reduced(view, small, (photo.width, photo.height), clicks, options)
+    }
+
+    /// The same for a photograph that is reduced already, from `size`, in whose pixels the clicks are.
+    pub fn reduced(
+        view: &str,
+        small: Photo,
+        size: (u32, u32),
+        clicks: &[Click],
+        options: &CutOptions,
+    ) -> (Ground, Vec<String>) {
+        let clicks: Vec<Click> =
+            clicks.iter().map(|c| working_click(c, size, (small.width, small.height))).collect();
+        let (width, height) = (small.width as usize, small.height as usize);
+        let (known, warnings) = known::known(view, &clicks, width, height, options);
+        let joints = joints(&small, options.smoothness);
+        (Ground { photo: small, width, height, clicks, known, joints }, warnings)
+    }
+
+    /// GrabCut from the clicks: labels and the colours they end with.
+    pub fn grab(&self, options: &CutOptions) -> (Vec<bool>, Option<Models>) {
+        let start = known::start(&self.known, &self.clicks, self.width, self.height, options);
+        let mut head = start.head;
+        let mut models: Option<Models> = None;
+        for _ in 0..options.rounds.max(1) {
+            let (inside, mut outside) = self.colors(&head);
+            if models.is_none() {
+                outside = self.colors(&start.not_far).1;
+            }
+            models = match models {
+                None => Models::fit(&inside, &outside, options),
+                Some(m) => Some(Models { head: m.head.refit(&inside), stage: m.stage.refit(&outside) }),
+            };
+            let Some(m) = &models else { break };
+            let labels = self.labels(&self.known, m, options);
+            let settled = labels == head;
+            head = labels;
+            if settled {
+                break;
+            }
+        }
+        (head, models)
+    }
+
+    /// Colours of the pixels inside and outside a mask.
+    pub fn colors(&self, head: &[bool]) -> (Vec<Rgb>, Vec<Rgb>) {
+        let of =
+            |side: bool| self.photo.rgb.iter().zip(head).filter(move |(_, h)| **h == side).map(|(c, _)| *c);
+        (of(true).collect(), of(false).collect())
+    }
+
+    /// One smallest cut under given colours.
+    pub fn labels(&self, known: &[Known], models: &Models, options: &CutOptions) -> Vec<bool> {
+        let certain = (options.certainty * options.smoothness * UNIT) as i32;
+        let mut graph = PixelGraph::new(self.width, self.height);
+        for (i, joint) in self.joints.iter().enumerate() {
+            let (x, y) = (i % self.width, i / self.width);
+            let (as_head, as_stage) = match known[i] {
+                Known::Head => (0, certain),
+                Known::Stage => (certain, 0),
+                Known::Nothing => {
+                    let lean = (models.lean(&self.photo.rgb[i]) * UNIT).clamp(-1e8, 1e8) as i32;
+                    ((-lean).max(0), lean.max(0))
+                }
+            };
+            graph.add_costs(x, y, as_head, as_stage);
+            for ((direction, dx, dy), &weight) in FORWARD.into_iter().zip(joint) {
+                let (u, v) = (x as isize + dx, y as isize + dy);
+                if u >= 0 && u < self.width as isize && v < self.height as isize {
+                    graph.join(x, y, direction, weight);
+                }
+            }
+        }
+        graph.cut().0
+    }
+
+    /// Pieces without a click go, small holes are filled, threads are opened.
+    pub fn finish(&self, mut head: Vec<bool>, options: &CutOptions) -> Vec<bool> {
+        let clicked: Vec<bool> = self.known.iter().map(|k| *k == Known::Head).collect();
+        keep_with_seeds(&mut head, &clicked, self.width, self.height);
+        let mut smooth = self.smooth(head, options);
+        // opening may part what a thread held together
+        keep_with_seeds(&mut smooth, &clicked, self.width, self.height);
+        smooth
+    }
+
+    /// Small holes are filled, threads are opened.
+    pub fn smooth(&self, mut head: Vec<bool>, options: &CutOptions) -> Vec<bool> {
+        let stage: Vec<bool> = self.known.iter().map(|k| *k == Known::Stage).collect();
+        let largest = (options.hole * (self.width * self.height) as f64) as usize;
+        fill_holes(&mut head, &stage, self.width, self.height, largest);
+        open(&head, self.width, self.height)
+    }
+
+    /// Share of the picture near the outline whose colour does not tell the sides apart.
+    pub fn unsure(&self, head: &[bool], models: &Models, options: &CutOptions) -> f64 {
+        let (w, h) = (self.width, self.height);
+        let radius = options.band * h as f32;
+        let near = |side: bool| {
+            let marked: Vec<bool> = head.iter().map(|&m| m == side).collect();
+            super::distance::grow(&marked, w, h, radius)
+        };
+        let (near_head, near_stage) = (near(true), near(false));
+        let open = (0..w * h).filter(|&i| {
+            near_head[i] && near_stage[i] && {
+                let lean = models.lean(&self.photo.rgb[i]);
+                // for the other side, or for this one by less than a factor of e
+                if head[i] { lean < 1.0 } else { lean > -1.0 }
+            }
+        });
+        open.count() as f64 / (w * h) as f64
+    }
+
+    /// What looks wrong about a finished mask.
+    pub fn warnings(&self, view: &str, head: &[bool]) -> Vec<String> {
+        let mut found = Vec::new();
+        for (n, c) in self.clicks.iter().enumerate() {
+            let at = |v: f32, size: usize| (v.round().max(0.0) as usize).min(size - 1);
+            if head[at(c.y, self.height) * self.width + at(c.x, self.width)] != c.head {
+                let (said, is) = if c.head { ("head", "stage") } else { ("stage", "head") };
+                found.push(format!(
+                    "view `{view}`: click {} says {said}, but its surroundings made it {is}; click more there",
+                    n + 1
+                ));
+            }
+        }
+        found
+    }
+
+    /// Labels as a picture.
+    pub fn gray(&self, head: &[bool]) -> Gray {
+        let values = head.iter().map(|&h| if h { 255 } else { 0 }).collect();
+        Gray { width: self.photo.width, height: self.photo.height, values }
+    }
+}
+
+/// `γ exp(−β ‖Δ‖²) / distance` to the four neighbours ahead; 0 where there is none.
+fn joints(photo: &Photo, smoothness: f64) -> Vec<[i32; 4]> {
+    let (w, h) = (photo.width as usize, photo.height as usize);
+    let square = |i: usize, step: (usize, isize, isize)| -> Option<u32> {
+        let (x, y) = ((i % w) as isize + step.1, (i / w) as isize + step.2);
+        if x < 0 || x >= w as isize || y >= h as isize {
+            return None;
+        }
+        let (a, b) = (photo.rgb[i], photo.rgb[y as usize * w + x as usize]);
+        Some((0..3).map(|c| (a[c].abs_diff(b[c]) as u32).pow(2)).sum())
+    };
+    let (mut sum, mut pairs) = (0u64, 0u64);
+    for i in 0..w * h {
+        for step in FORWARD {
+            if let Some(d) = square(i, step) {
+                sum += d as u64;
+                pairs += 1;
+            }
+        }
+    }
+    // a flat picture has no contrast to go by: every edge costs the same
+    let beta = if sum > 0 { pairs as f64 / (2.0 * sum as f64) } else { 0.0 };
+    (0..w * h)
+        .map(|i| {
+            FORWARD.map(|step| {
+                let length = if step.1 != 0 && step.2 != 0 { std::f64::consts::SQRT_2 } else { 1.0 };
+                let weight = |d: u32| (UNIT * smoothness * (-beta * d as f64).exp() / length) as i32;
+                square(i, step).map_or(0, weight)
+            })
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::rng;
+
+    /// A noisy disc of two skin-like colours on a dark stage with bright lamps; `scale` enlarges everything.
+    fn head(scale: f32) -> (Photo, Vec<bool>) {
+        let (width, height) = ((96.0 * scale) as u32, (128.0 * scale) as u32);
+        let mut truth = Vec::new();
+        let rgb = (0..width * height)
+            .map(|i| {
+                let (x, y) = (((i % width) as f32 + 0.5) / scale, ((i / width) as f32 + 0.5) / scale);
+                let inside = (x - 48.0).hypot(y - 60.0) < 32.0;
+                truth.push(inside);
+                let noise = (4.0 * rng::normal(1, 1, i as u64)) as i32;
+                let base = match (inside, y < 50.0) {
+                    (true, true) => [90, 60, 40],
+                    (true, false) => [200, 150, 130],
+                    _ if (x % 40.0 - 8.0).hypot(y % 40.0 - 8.0) < 4.0 => [250, 250, 250],
+                    _ => [15, 15, 18],
+                };
+                base.map(|c| (c + noise).clamp(0, 255) as u8)
+            })
+            .collect();
+        (Photo { width, height, rgb, alpha: None }, truth)
+    }
+
+    fn clicks(scale: f32) -> Vec<Click> {
+        [(48.0, 75.0, true), (48.0, 38.0, true), (6.0, 20.0, false), (90.0, 100.0, false)]
+            .map(|(x, y, head)| Click { x: x * scale, y: y * scale, head })
+            .into()
+    }
+
+    fn overlap(mask: &Gray, truth: &[bool]) -> f64 {
+        let both = mask.values.iter().zip(truth).filter(|(m, t)| **m > 127 && **t).count();
+        let any = mask.values.iter().zip(truth).filter(|(m, t)| **m > 127 || **t).count();
+        both as f64 / any as f64
+    }
+
+    #[test]
+    fn a_disc_of_two_colours_is_cut_out_among_lamps() {
+        let (photo, truth) = head(1.0);
+        let cut = cut("a", &photo, &clicks(1.0), &CutOptions::default()).unwrap();
+        assert!(overlap(&cut.mask, &truth) > 0.985, "{}", overlap(&cut.mask, &truth));
+        assert!(cut.warnings.is_empty() && cut.unsure < 0.03, "{:?} {}", cut.warnings, cut.unsure);
+    }
+
+    #[test]
+    fn a_large_photograph_is_cut_at_the_working_size() {
+        let (photo, truth) = head(3.0);
+        let cut = cut("a", &photo, &clicks(3.0), &CutOptions { rows: 128, ..CutOptions::default() }).unwrap();
+        assert_eq!((cut.mask.width, cut.mask.height), (96, 128));
+        let large = super::super::working::resized_mask(&cut.mask, photo.width, photo.height);
+        assert!(overlap(&large, &truth) > 0.97, "{}", overlap(&large, &truth));
+    }
+
+    #[test]
+    fn the_same_clicks_cut_the_same_mask_and_flat_pictures_do_not_fail() {
+        let (photo, _) = head(1.0);
+        let run = || cut("a", &photo, &clicks(1.0), &CutOptions::default());
+        assert_eq!(run(), run());
+        let flat = Photo { rgb: vec![[9, 9, 9]; photo.rgb.len()], ..photo };
+        // nothing tells head from stage: whatever comes, it holds the clicks or says so
+        if let Ok(cut) = cut("a", &flat, &clicks(1.0), &CutOptions::default()) {
+            assert!(cut.unsure > 0.0);
+        }
+    }
+
+    #[test]
+    fn photographs_of_one_row_or_of_nothing_are_refused_by_name() {
+        let photo = Photo { width: 100, height: 1, rgb: vec![[0; 3]; 100], alpha: None };
+        let e = cut("a", &photo, &[Click { x: 1.0, y: 0.0, head: true }], &CutOptions::default());
+        assert!(matches!(e, Err(CutError::TooSmall { width: 100, height: 1, .. })));
+    }
+}

@@ -1,0 +1,227 @@
+//! What masks of several views say about space: votes for every cell of a cube, and their silhouettes.
+//!
+//! A mask votes for a cell when the cell's centre falls on the head, against it when it falls beside, and not at
+//! all outside its frame: there nothing was seen. A set of cells is drawn back into any view by its surface.
+
+use super::cut_error::CutError;
+use crate::capture::carve::{Cube, Projector, meeting_point};
+use crate::geom::Camera;
+use crate::image::Gray;
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// A hard mask with its camera.
+pub(super) struct Witness {
+    projector: Projector,
+    width: usize,
+    height: usize,
+    head: Vec<bool>,
+}
+
+impl Witness {
+    /// Takes a mask for the camera's whole picture, at whatever size it is; head from 128.
+    pub fn new(camera: &Camera, mask: &Gray) -> Witness {
+        Witness {
+            projector: Projector::new(&camera.resized(mask.width, mask.height)),
+            width: mask.width as usize,
+            height: mask.height as usize,
+            head: mask.values.iter().map(|&v| v > 127).collect(),
+        }
+    }
+
+    /// Is the point on the head? Nothing outside the frame.
+    fn says(&self, point: DVec3) -> Option<bool> {
+        let (x, y, _) = self.projector.project(point)?;
+        let inside = x >= 0.0 && y >= 0.0 && x < self.width as f64 && y < self.height as f64;
+        inside.then(|| self.head[y as usize * self.width + x as usize])
+    }
+}
+
+/// Votes about every cell, `[n, n, n]` with x outermost.
+pub(super) struct Votes {
+    pub yes: Vec<u16>,
+    pub no: Vec<u16>,
+}
+
+impl Votes {
+    /// Asks every witness about every cell.
+    pub fn count(cube: &Cube, witnesses: &[Witness]) -> Votes {
+        let n = cube.n;
+        let slabs: Vec<(Vec<u16>, Vec<u16>)> = (0..n)
+            .into_par_iter()
+            .map(|x| {
+                let (mut yes, mut no) = (vec![0u16; n * n], vec![0u16; n * n]);
+                for w in witnesses {
+                    for i in 0..n * n {
+                        match w.says(cube.cell_center(x, i / n, i % n)) {
+                            Some(true) => yes[i] += 1,
+                            Some(false) => no[i] += 1,
+                            None => {}
+                        }
+                    }
+                }
+                (yes, no)
+            })
+            .collect();
+        let (yes, no): (Vec<_>, Vec<_>) = slabs.into_iter().unzip();
+        Votes { yes: yes.concat(), no: no.concat() }
+    }
+
+    /// The cells with at most `no` votes against and at least `yes` for them.
+    pub fn cells(&self, no: usize, yes: usize) -> Vec<bool> {
+        self.yes.iter().zip(&self.no).map(|(&y, &n)| n as usize <= no && y as usize >= yes).collect()
+    }
+}
+
+/// The cube around the point the cameras look at, `margin` times as high as their frames are there.
+pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube, CutError> {
+    let alike = |how| CutError::CamerasAlike { cameras: cameras.len(), how };
+    let axes: Vec<(DVec3, DVec3)> = cameras.iter().map(|c| (c.position, -c.rotation.z_axis)).collect();
+    let center = meeting_point(&axes).ok_or_else(|| alike("look in one direction"))?;
+    let reach = |c: &Camera| c.position.distance(center) * c.height as f64 / (2.0 * c.fy);
+    let half = margin * cameras.iter().map(reach).fold(0.0, f64::max);
+    if !(half.is_finite() && half > 0.0) {
+        return Err(alike("stand at one place"));
+    }
+    Ok(Cube { center, half, n })
+}
+
+/// The pixels that a set of cells covers in a view.
+pub(super) fn silhouette(cube: &Cube, cells: &[bool], camera: &Camera) -> Vec<bool> {
+    let (w, h, n) = (camera.width as usize, camera.height as usize, cube.n);
+    let projector = Projector::new(camera);
+    let mut covered = vec![false; w * h];
+    for i in (0..cells.len()).filter(|&i| cells[i]) {
+        let (x, y, z) = (i / (n * n), i / n % n, i % n);
+        let edge = |v: usize| v == 0 || v + 1 == n;
+        let surface = edge(x)
+            || edge(y)
+            || edge(z)
+            || !(cells[i - n * n]
+                && cells[i + n * n]
+                && cells[i - n]
+                && cells[i + n]
+                && cells[i - 1]
+                && cells[i + 1]);
+        if !surface {
+            continue; // what surrounds it covers it
+        }
+        let Some((u, v, depth)) = projector.project(cube.cell_center(x, y, z)) else { continue };
+        let (rx, ry) = (0.5 * camera.fx * cube.cell() / depth, 0.5 * camera.fy * cube.cell() / depth);
+        let range = |c: f64, r: f64, size: usize| {
+            let first = (c - r).floor().clamp(0.0, size as f64) as usize;
+            first..(c + r).ceil().clamp(0.0, size as f64) as usize
+        };
+        for row in range(v, ry, h) {
+            let columns = range(u, rx, w);
+            covered[row * w + columns.start..row * w + columns.end].fill(true);
+        }
+    }
+    covered
+}
+
+/// The cells deeper inside than `share` of the deepest one. Depth counts peeled layers, in turn over faces and
+/// over corners, which is near to distance.
+pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
+    let mut depth = vec![0u16; cells.len()];
+    let mut front = Vec::new();
+    let at = |i: usize| [i / (n * n), i / n % n, i % n];
+    // cells beside something outside; beyond the cube nothing is known, so its walls do not peel
+    for i in (0..cells.len()).filter(|&i| cells[i]) {
+        if around(at(i), n, false).any(|j| !cells[j]) {
+            depth[i] = 1;
+            front.push(i);
+        }
+    }
+    let mut layer = 1;
+    while !front.is_empty() {
+        layer += 1;
+        let mut next = Vec::new();
+        for &i in &front {
+            for j in around(at(i), n, layer % 2 == 0) {
+                if cells[j] && depth[j] == 0 {
+                    depth[j] = layer;
+                    next.push(j);
+                }
+            }
+        }
+        front = next;
+    }
+    let deepest = depth.iter().copied().max().unwrap_or(0) as f64;
+    depth.iter().map(|&d| d > 0 && d as f64 > share * deepest).collect()
+}
+
+/// Neighbours of a cell over faces, or over corners too.
+fn around([x, y, z]: [usize; 3], n: usize, corners: bool) -> impl Iterator<Item = usize> {
+    let span = move |v: usize| v.saturating_sub(1)..(v + 2).min(n);
+    span(x).flat_map(move |u| span(y).flat_map(move |v| span(z).map(move |w| (u, v, w)))).filter_map(
+        move |(u, v, w)| {
+            let steps = u.abs_diff(x) + v.abs_diff(y) + w.abs_diff(z);
+            (steps == 1 || (corners && steps > 1)).then_some((u * n + v) * n + w)
+        },
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cameras() -> Vec<Camera> {
+        // along Z and along X, both 10 away, 1 unit = 20 pixels at the middle
+        let front = Camera::above(80, 80, 200.0, 10.0);
+        let side = Camera {
+            rotation: glam::DMat3::from_rotation_y(std::f64::consts::FRAC_PI_2),
+            position: DVec3::new(10.0, 0.0, 0.0),
+            ..front.clone()
+        };
+        vec![front, side]
+    }
+
+    /// A square of ± `half` pixels around the middle.
+    fn square(half: usize) -> Gray {
+        let inside = |v: usize| v >= 40 - half && v < 40 + half;
+        let values = (0..6400).map(|i| if inside(i % 80) && inside(i / 80) { 255 } else { 0 }).collect();
+        Gray { width: 80, height: 80, values }
+    }
+
+    #[test]
+    fn the_cube_surrounds_what_the_cameras_look_at() {
+        let cube = cube(&cameras(), 16, 1.5).unwrap();
+        // frames are 80 · 10 / 200 = 4 high at the middle
+        assert!(cube.center.length() < 1e-9 && (cube.half - 3.0).abs() < 1e-9);
+        let alike = super::cube(&cameras()[..1], 16, 1.5).unwrap_err();
+        assert!(matches!(alike, CutError::CamerasAlike { cameras: 1, .. }));
+    }
+
+    #[test]
+    fn two_squares_carve_a_box_and_draw_themselves_again() {
+        let cameras = cameras();
+        let cube = cube(&cameras, 48, 1.0).unwrap();
+        let witnesses: Vec<Witness> = cameras.iter().map(|c| Witness::new(c, &square(20))).collect();
+        let votes = Votes::count(&cube, &witnesses);
+        let cells = votes.cells(0, 2);
+        // a box of 2 units has 24 cells of 1/12 along each side; perspective moves its walls by a cell or two
+        let count = cells.iter().filter(|c| **c).count() as f64;
+        assert!((count.cbrt() - 24.0).abs() < 2.0, "{count}");
+        let drawn = silhouette(&cube, &cells, &cameras[0]);
+        let wrong = (drawn.iter().zip(&square(20).values)).filter(|(d, s)| **d != (**s == 255)).count();
+        assert!(wrong < 2 * 4 * 40, "{wrong}"); // two pixels along the outline
+        // one dissent lets all cells in that one view keeps: two beams
+        assert!(votes.cells(1, 0).iter().filter(|c| **c).count() as f64 > 2.0 * count);
+    }
+
+    #[test]
+    fn the_core_of_a_ball_is_a_smaller_ball() {
+        let n = 41;
+        let distance = |i: usize| {
+            let at = [i / (n * n), i / n % n, i % n].map(|v| v as f64 - 20.0);
+            (at[0] * at[0] + at[1] * at[1] + at[2] * at[2]).sqrt()
+        };
+        let ball: Vec<bool> = (0..n * n * n).map(|i| distance(i) < 16.0).collect();
+        let core = core(&ball, n, 0.5);
+        for i in (0..core.len()).filter(|&i| core[i]) {
+            assert!(distance(i) < 11.0, "{}", distance(i));
+        }
+        assert!((0..core.len()).filter(|&i| distance(i) < 5.0).all(|i| core[i]));
+    }
+}

@@ -1,0 +1,243 @@
+//! What clicks say for certain, and where a cut starts from.
+//!
+//! Sure head are discs around the head's clicks; sure stage are discs around the others and strips along the top
+//! and the upper part of both sides. Everything else starts as head when it is nearer to the head's clicks, joined
+//! by a line, than to sure stage: this Voronoi start follows the size of the head, which no fixed radius does.
+
+use super::Click;
+use super::cut::CutOptions;
+use super::cut_error::CutError;
+use super::distance::squared_distance;
+
+/// What is certain about a pixel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Known {
+    Nothing,
+    Head,
+    Stage,
+}
+
+/// Checks the clicks on a photograph of `width` × `height` pixels, before anything is computed.
+pub(super) fn check(view: &str, clicks: &[Click], width: u32, height: u32) -> Result<(), CutError> {
+    check_size(view, width, height)?;
+    let view = || view.to_string();
+    if clicks.is_empty() {
+        return Err(CutError::NoClicks { view: view() });
+    }
+    for (i, c) in clicks.iter().enumerate() {
+        // a pixel index of 0 is the pixel's centre, so the picture reaches half a pixel farther
+        let inside = |v: f32, size: u32| v >= -0.5 && v <= size as f32 - 0.5;
+        if !(inside(c.x, width) && inside(c.y, height)) {
+            return Err(CutError::OutsidePhoto {
+                view: view(),
+                number: i + 1,
+                x: c.x,
+                y: c.y,
+                width,
+                height,
+            });
+        }
+    }
+    if clicks.iter().all(|c| !c.head) {
+        return Err(CutError::NoHead { view: view(), clicks: clicks.len() });
+    }
+    let pixel = |c: &Click| (c.x.round().max(0.0) as u32, c.y.round().max(0.0) as u32);
+    for (i, a) in clicks.iter().enumerate() {
+        for (j, b) in clicks.iter().enumerate().skip(i + 1) {
+            if a.head != b.head && pixel(a) == pixel(b) {
+                let (x, y) = pixel(a);
+                return Err(CutError::Contradiction { view: view(), first: i + 1, second: j + 1, x, y });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Two sides need some pixels each.
+pub(super) fn check_size(view: &str, width: u32, height: u32) -> Result<(), CutError> {
+    if width < 16 || height < 16 {
+        return Err(CutError::TooSmall { view: view.into(), width, height });
+    }
+    Ok(())
+}
+
+/// Marks the pixels whose centre is within `radius` of the segment from `a` to `b`.
+fn draw(marked: &mut [bool], width: usize, height: usize, a: (f32, f32), b: (f32, f32), radius: f32) {
+    let range = |u: f32, v: f32, size: usize| {
+        let first = (u.min(v) - radius).floor().clamp(0.0, size as f32) as usize;
+        let end = ((u.max(v) + radius).ceil() + 1.0).clamp(0.0, size as f32) as usize;
+        first..end
+    };
+    let (dx, dy) = (b.0 - a.0, b.1 - a.1);
+    let length = dx * dx + dy * dy;
+    for y in range(a.1, b.1, height) {
+        for x in range(a.0, b.0, width) {
+            let (px, py) = (x as f32 - a.0, y as f32 - a.1);
+            let t = if length > 0.0 { ((px * dx + py * dy) / length).clamp(0.0, 1.0) } else { 0.0 };
+            let (ex, ey) = (px - t * dx, py - t * dy);
+            if ex * ex + ey * ey <= radius * radius {
+                marked[y * width + x] = true;
+            }
+        }
+    }
+}
+
+/// What is certain from the clicks: `[height · width]`, and warnings about clicks in each other's way.
+pub(super) fn known(
+    view: &str,
+    clicks: &[Click],
+    width: usize,
+    height: usize,
+    options: &CutOptions,
+) -> (Vec<Known>, Vec<String>) {
+    let h = height as f32;
+    let mut known = strips(width, height, options);
+    let radius = (options.disc * h).max(options.disc_least_px);
+    let mut warnings = Vec::new();
+    // where discs of both kinds overlap the nearer click is believed
+    let mut nearest = vec![f32::INFINITY; width * height];
+    for c in clicks {
+        let mut disc = vec![false; width * height];
+        draw(&mut disc, width, height, (c.x, c.y), (c.x, c.y), radius);
+        // a click is worth its own pixel at least
+        let own = |v: f32, size: usize| (v.round().max(0.0) as usize).min(size - 1);
+        disc[own(c.y, height) * width + own(c.x, width)] = true;
+        for i in (0..disc.len()).filter(|&i| disc[i]) {
+            let (dx, dy) = ((i % width) as f32 - c.x, (i / width) as f32 - c.y);
+            let d = dx * dx + dy * dy;
+            if d < nearest[i] {
+                nearest[i] = d;
+                known[i] = if c.head { Known::Head } else { Known::Stage };
+            }
+        }
+    }
+    for (i, a) in clicks.iter().enumerate() {
+        for (j, b) in clicks.iter().enumerate().skip(i + 1) {
+            let (dx, dy) = (a.x - b.x, a.y - b.y);
+            if a.head != b.head && dx * dx + dy * dy < 4.0 * radius * radius {
+                warnings.push(format!(
+                    "view `{view}`: clicks {} and {} call places {:.0} pixels apart head and stage; are both right?",
+                    i + 1,
+                    j + 1,
+                    (dx * dx + dy * dy).sqrt()
+                ));
+            }
+        }
+    }
+    (known, warnings)
+}
+
+/// The strips along the borders where no head is expected.
+pub(super) fn strips(width: usize, height: usize, options: &CutOptions) -> Vec<Known> {
+    let strip = (options.strip * height as f32).ceil() as usize;
+    let sides = (options.strip_sides * height as f32) as usize;
+    (0..width * height)
+        .map(|i| {
+            let (x, y) = (i % width, i / width);
+            if y < strip || (y < sides && (x < strip || x + strip >= width)) {
+                Known::Stage
+            } else {
+                Known::Nothing
+            }
+        })
+        .collect()
+}
+
+/// Where a cut starts from, each `[height · width]`.
+pub(super) struct Start {
+    /// Is the pixel nearer to the head's clicks than to sure stage?
+    pub head: Vec<bool>,
+    /// False where the pixel is so much nearer to sure stage that its colour is taken for the stage's.
+    pub not_far: Vec<bool>,
+}
+
+/// The Voronoi start.
+pub(super) fn start(
+    known: &[Known],
+    clicks: &[Click],
+    width: usize,
+    height: usize,
+    options: &CutOptions,
+) -> Start {
+    let h = height as f32;
+    let mut skeleton: Vec<bool> = known.iter().map(|k| *k == Known::Head).collect();
+    let head: Vec<(f32, f32)> = clicks.iter().filter(|c| c.head).map(|c| (c.x, c.y)).collect();
+    for &p in &head {
+        draw(&mut skeleton, width, height, p, p, options.start_disc * h);
+    }
+    for pair in head.windows(2) {
+        draw(&mut skeleton, width, height, pair[0], pair[1], 0.5 * options.start_line * h);
+    }
+    let stage: Vec<bool> = known.iter().map(|k| *k == Known::Stage).collect();
+    let to_head = squared_distance(&skeleton, width, height);
+    let to_stage = squared_distance(&stage, width, height);
+    let nearer = |times: f32| -> Vec<bool> {
+        known
+            .iter()
+            .zip(to_head.iter().zip(&to_stage))
+            .map(|(k, (head, stage))| match k {
+                Known::Head => true,
+                Known::Stage => false,
+                Known::Nothing => *head < times * times * stage,
+            })
+            .collect()
+    };
+    Start { head: nearer(1.0), not_far: nearer(options.start_apart) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn click(x: f32, y: f32, head: bool) -> Click {
+        Click { x, y, head }
+    }
+
+    #[test]
+    fn clicks_that_cannot_be_used_are_named() {
+        let check = |clicks: &[Click]| check("007", clicks, 40, 30);
+        assert_eq!(check(&[click(39.4, 29.4, true), click(-0.4, 0.0, false)]), Ok(()));
+        assert_eq!(check(&[]), Err(CutError::NoClicks { view: "007".into() }));
+        assert_eq!(check(&[click(1.0, 1.0, false)]), Err(CutError::NoHead { view: "007".into(), clicks: 1 }));
+        for (x, y) in [(40.0, 3.0), (3.0, 30.0), (-1.0, 3.0), (f32::NAN, 3.0), (f32::INFINITY, 3.0)] {
+            let e = check(&[click(1.0, 1.0, true), click(x, y, false)]).unwrap_err();
+            assert!(matches!(e, CutError::OutsidePhoto { number: 2, .. }), "{e}");
+        }
+        let e = check(&[click(4.2, 5.0, true), click(9.0, 9.0, true), click(4.0, 5.3, false)]).unwrap_err();
+        assert!(matches!(e, CutError::Contradiction { first: 1, second: 3, x: 4, y: 5, .. }), "{e}");
+        assert!(!e.hint().is_empty());
+    }
+
+    #[test]
+    fn clicks_close_together_share_their_discs_and_are_warned_about() {
+        let options = CutOptions { strip: 0.0, ..CutOptions::default() };
+        let clicks = [click(10.0, 10.0, true), click(15.0, 10.0, false)];
+        let (known, warnings) = known("a", &clicks, 40, 30, &options);
+        // discs of 4 pixels, 5 apart: 12 is nearer to the head, 13 to the stage
+        assert_eq!((known[10 * 40 + 12], known[10 * 40 + 13]), (Known::Head, Known::Stage));
+        assert_eq!((known[10 * 40 + 6], known[10 * 40 + 5]), (Known::Head, Known::Nothing));
+        assert_eq!(warnings.len(), 1);
+        assert!(warnings[0].contains("clicks 1 and 2") && warnings[0].contains("5 pixels"));
+    }
+
+    #[test]
+    fn the_start_reaches_half_way_to_the_stage() {
+        let options = CutOptions { start_disc: 0.0, start_line: 0.0, strip: 0.0, ..CutOptions::default() };
+        let clicks = [click(10.0, 15.0, true), click(30.0, 15.0, false)];
+        let (known, _) = known("a", &clicks, 41, 31, &options);
+        let Start { head, not_far } = start(&known, &clicks, 41, 31, &options);
+        assert!(head[15 * 41 + 19] && !head[15 * 41 + 20] && head[0] && !head[40]);
+        // between the discs of 4 pixels 12 are free; twice as far from one as from the other at two thirds
+        assert!(not_far[15 * 41 + 21] && !not_far[15 * 41 + 23]);
+    }
+
+    #[test]
+    fn strips_leave_the_lower_sides_open() {
+        let options = CutOptions { strip: 0.05, strip_sides: 0.6, ..CutOptions::default() };
+        let known = strips(50, 100, &options);
+        let at = |x: usize, y: usize| known[y * 50 + x] == Known::Stage;
+        assert!(
+            at(25, 4) && !at(25, 5) && at(4, 59) && at(45, 59) && !at(5, 59) && !at(0, 60) && !at(25, 99)
+        );
+    }
+}

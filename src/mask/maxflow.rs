@@ -1,0 +1,489 @@
+//! The smallest cut of a picture's pixels into two sets (Boykov & Kolmogorov 2004).
+//!
+//! Pixels are nodes joined to their 8 neighbours and to two terminals, *head* and *stage*. A labelling costs
+//!
+//! ```text
+//! E = Σ_p cost of p's label + Σ_pq w_pq · [p and q have different labels]
+//! ```
+//!
+//! and the smallest cut is the labelling that costs least. Two search trees grow from the terminals until they
+//! touch; the path is saturated; what that tears off is adopted by another parent or set free, and the trees are
+//! reused for the next path. Capacities are whole numbers: sums are exact and the result is the same everywhere.
+
+use std::collections::VecDeque;
+
+/// Steps to the 8 neighbours; `d ^ 1` is the way back.
+const STEPS: [(isize, isize); 8] = [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (-1, 1), (1, -1)];
+
+/// A parent that is no neighbour: the tree's own terminal.
+const TERMINAL: u8 = 8;
+/// Torn off, waiting for adoption.
+const ORPHAN: u8 = 9;
+/// In no tree.
+const FREE: u8 = 10;
+
+const HEAD: u8 = 1;
+const STAGE: u8 = 2;
+
+/// A picture's graph: capacities in, labels out.
+///
+/// Nodes lie in a frame one pixel wider on each side, whose edges carry nothing; so no step needs a border test.
+pub struct PixelGraph {
+    width: usize,
+    height: usize,
+    steps: [isize; 8],
+    /// What still flows from a node to each neighbour.
+    residual: Vec<[i32; 8]>,
+    /// Positive: what the head terminal still gives; negative: what the stage terminal still takes.
+    terminal: Vec<i32>,
+    tree: Vec<u8>,
+    parent: Vec<u8>,
+    /// When the distance was last known to be right.
+    stamp: Vec<u32>,
+    /// Steps to the terminal, as far as known.
+    depth: Vec<u32>,
+    queued: Vec<bool>,
+    active: VecDeque<u32>,
+    orphans: VecDeque<u32>,
+    time: u32,
+    flow: i64,
+}
+
+impl PixelGraph {
+    /// A graph without any capacity.
+    pub fn new(width: usize, height: usize) -> PixelGraph {
+        let row = width + 2;
+        let n = row * (height + 2);
+        assert!(n < u32::MAX as usize, "a picture of {width} × {height} pixels is no graph of 32-bit nodes");
+        PixelGraph {
+            width,
+            height,
+            steps: STEPS.map(|(x, y)| y * row as isize + x),
+            residual: vec![[0; 8]; n],
+            terminal: vec![0; n],
+            tree: vec![0; n],
+            parent: vec![FREE; n],
+            stamp: vec![0; n],
+            depth: vec![0; n],
+            queued: vec![false; n],
+            active: VecDeque::new(),
+            orphans: VecDeque::new(),
+            time: 0,
+            flow: 0,
+        }
+    }
+
+    fn node(&self, x: usize, y: usize) -> usize {
+        (y + 1) * (self.width + 2) + x + 1
+    }
+
+    fn step(&self, node: usize, direction: usize) -> usize {
+        node.wrapping_add_signed(self.steps[direction])
+    }
+
+    /// What each label of a pixel costs; adds to what was said before. Costs are not negative.
+    pub fn add_costs(&mut self, x: usize, y: usize, as_head: i32, as_stage: i32) {
+        let i = self.node(x, y);
+        // whatever both labels pay is paid anyway; the rest hangs on one terminal
+        self.flow += as_head.min(as_stage) as i64;
+        let before = self.terminal[i];
+        let give = as_stage as i64 + before.max(0) as i64;
+        let take = as_head as i64 + (-before).max(0) as i64;
+        self.flow += give.min(take) - as_head.min(as_stage) as i64;
+        self.terminal[i] = (give - take).clamp(-(i32::MAX as i64), i32::MAX as i64) as i32;
+    }
+
+    /// What it costs to tell a pixel from its neighbour; `direction` 0 right, 2 below, 4 below right, 6 below
+    /// left. The neighbour must be in the picture.
+    pub fn join(&mut self, x: usize, y: usize, direction: usize, weight: i32) {
+        let (dx, dy) = STEPS[direction];
+        let (u, v) = (x.wrapping_add_signed(dx), y.wrapping_add_signed(dy));
+        assert!(direction < 8 && u < self.width && v < self.height, "no neighbour {direction} of ({x}, {y})");
+        let i = self.node(x, y);
+        let j = self.step(i, direction);
+        self.residual[i][direction] += weight;
+        self.residual[j][direction ^ 1] += weight;
+    }
+
+    /// Finds the smallest cut. Labels `[height · width]`: is the pixel head? And what the cut costs.
+    ///
+    /// Of several smallest cuts it is the one with the least head.
+    pub fn cut(mut self) -> (Vec<bool>, i64) {
+        for y in 0..self.height {
+            for x in 0..self.width {
+                let i = self.node(x, y);
+                if self.terminal[i] != 0 {
+                    self.tree[i] = if self.terminal[i] > 0 { HEAD } else { STAGE };
+                    self.parent[i] = TERMINAL;
+                    self.depth[i] = 1;
+                    self.activate(i);
+                }
+            }
+        }
+        while let Some(&p) = self.active.front() {
+            let p = p as usize;
+            // a torn-off pixel may wait here still; a front pixel stays until it finds no more paths
+            match self.grow(p) {
+                Some((from, direction)) => {
+                    self.augment(from, direction);
+                    self.adopt();
+                }
+                None => {
+                    self.active.pop_front();
+                    self.queued[p] = false;
+                }
+            }
+        }
+        let labels = (0..self.height)
+            .flat_map(|y| (0..self.width).map(move |x| (x, y)))
+            .map(|(x, y)| self.tree[self.node(x, y)] == HEAD)
+            .collect();
+        (labels, self.flow)
+    }
+
+    fn activate(&mut self, i: usize) {
+        if !self.queued[i] {
+            self.queued[i] = true;
+            self.active.push_back(i as u32);
+        }
+    }
+
+    /// Can flow run between `p` and its neighbour in the sense of `p`'s tree, away from the root?
+    fn open(&self, p: usize, direction: usize, q: usize) -> bool {
+        if self.tree[p] == HEAD {
+            self.residual[p][direction] > 0
+        } else {
+            self.residual[q][direction ^ 1] > 0
+        }
+    }
+
+    /// Takes free neighbours into `p`'s tree; ends with the first edge from the head's tree to the stage's.
+    fn grow(&mut self, p: usize) -> Option<(usize, usize)> {
+        if self.parent[p] == FREE {
+            return None;
+        }
+        for direction in 0..8 {
+            let q = self.step(p, direction);
+            if !self.open(p, direction, q) {
+                continue;
+            }
+            if self.parent[q] == FREE {
+                self.tree[q] = self.tree[p];
+                self.parent[q] = (direction ^ 1) as u8;
+                self.stamp[q] = self.stamp[p];
+                self.depth[q] = self.depth[p] + 1;
+                self.activate(q);
+            } else if self.tree[q] != self.tree[p] {
+                return Some(if self.tree[p] == HEAD { (p, direction) } else { (q, direction ^ 1) });
+            } else if self.stamp[q] <= self.stamp[p] && self.depth[q] > self.depth[p] + 1 {
+                // a shorter way to the root keeps later paths short
+                self.parent[q] = (direction ^ 1) as u8;
+                self.stamp[q] = self.stamp[p];
+                self.depth[q] = self.depth[p] + 1;
+            }
+        }
+        None
+    }
+
+    /// Saturates the path through the edge from `head_end`, in the head's tree, to its neighbour in the stage's.
+    fn augment(&mut self, head_end: usize, direction: usize) {
+        let stage_end = self.step(head_end, direction);
+        let mut least = self.residual[head_end][direction];
+        let mut p = head_end;
+        while self.parent[p] != TERMINAL {
+            let up = self.parent[p] as usize;
+            let q = self.step(p, up);
+            least = least.min(self.residual[q][up ^ 1]);
+            p = q;
+        }
+        least = least.min(self.terminal[p]);
+        p = stage_end;
+        while self.parent[p] != TERMINAL {
+            let up = self.parent[p] as usize;
+            least = least.min(self.residual[p][up]);
+            p = self.step(p, up);
+        }
+        least = least.min(-self.terminal[p]);
+
+        self.residual[head_end][direction] -= least;
+        self.residual[stage_end][direction ^ 1] += least;
+        p = head_end;
+        while self.parent[p] != TERMINAL {
+            let up = self.parent[p] as usize;
+            let q = self.step(p, up);
+            self.residual[p][up] += least;
+            self.residual[q][up ^ 1] -= least;
+            if self.residual[q][up ^ 1] == 0 {
+                self.tear(p);
+            }
+            p = q;
+        }
+        self.terminal[p] -= least;
+        if self.terminal[p] == 0 {
+            self.tear(p);
+        }
+        p = stage_end;
+        while self.parent[p] != TERMINAL {
+            let up = self.parent[p] as usize;
+            let q = self.step(p, up);
+            self.residual[q][up ^ 1] += least;
+            self.residual[p][up] -= least;
+            if self.residual[p][up] == 0 {
+                self.tear(p);
+            }
+            p = q;
+        }
+        self.terminal[p] += least;
+        if self.terminal[p] == 0 {
+            self.tear(p);
+        }
+        self.flow += least as i64;
+    }
+
+    /// The path is still being walked by its parents, so they are marked only afterwards.
+    fn tear(&mut self, p: usize) {
+        self.orphans.push_front(p as u32);
+    }
+
+    /// Finds a new parent for everything torn off, nearest to the root first choice; sets free what has none.
+    fn adopt(&mut self) {
+        self.time += 1;
+        for &p in &self.orphans {
+            self.parent[p as usize] = ORPHAN;
+        }
+        while let Some(p) = self.orphans.pop_front() {
+            self.adopt_one(p as usize);
+        }
+    }
+
+    fn adopt_one(&mut self, p: usize) {
+        let mut best: Option<(u32, usize)> = None;
+        for direction in 0..8 {
+            let q = self.step(p, direction);
+            if self.tree[q] != self.tree[p] || self.parent[q] == FREE {
+                continue;
+            }
+            // flow must run from the root through q to p
+            let feeds = if self.tree[p] == HEAD {
+                self.residual[q][direction ^ 1] > 0
+            } else {
+                self.residual[p][direction] > 0
+            };
+            if !feeds {
+                continue;
+            }
+            if let Some(depth) = self.depth_below_root(q)
+                && best.is_none_or(|(least, _)| depth < least)
+            {
+                best = Some((depth, direction));
+            }
+        }
+        if let Some((depth, direction)) = best {
+            self.parent[p] = direction as u8;
+            self.stamp[p] = self.time;
+            self.depth[p] = depth + 1;
+            return;
+        }
+        for direction in 0..8 {
+            let q = self.step(p, direction);
+            if self.tree[q] != self.tree[p] || self.parent[q] == FREE {
+                continue;
+            }
+            let feeds = if self.tree[p] == HEAD {
+                self.residual[q][direction ^ 1] > 0
+            } else {
+                self.residual[p][direction] > 0
+            };
+            if feeds {
+                self.activate(q);
+            }
+            if self.parent[q] == (direction ^ 1) as u8 {
+                self.parent[q] = ORPHAN;
+                self.orphans.push_back(q as u32);
+            }
+        }
+        self.parent[p] = FREE;
+        self.tree[p] = 0;
+    }
+
+    /// Steps from a node to its terminal, or nothing when it hangs on an orphan; marks the way as known.
+    fn depth_below_root(&mut self, start: usize) -> Option<u32> {
+        let (mut q, mut steps) = (start, 0);
+        let depth = loop {
+            if self.stamp[q] == self.time {
+                break steps + self.depth[q];
+            }
+            match self.parent[q] {
+                TERMINAL => {
+                    self.stamp[q] = self.time;
+                    self.depth[q] = 1;
+                    break steps + 1;
+                }
+                ORPHAN | FREE => return None,
+                up => q = self.step(q, up as usize),
+            }
+            steps += 1;
+        };
+        let (mut q, mut below) = (start, depth);
+        while self.stamp[q] != self.time {
+            self.stamp[q] = self.time;
+            self.depth[q] = below;
+            below -= 1;
+            q = self.step(q, self.parent[q] as usize);
+        }
+        Some(depth)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::rng;
+
+    struct Random(u64, u64);
+
+    impl Random {
+        fn below(&mut self, n: u64) -> i32 {
+            self.1 += 1;
+            rng::below(self.0, 0, self.1, n) as i32
+        }
+    }
+
+    /// A graph as plain lists: `(head cost, stage cost)` a pixel, `(i, j, weight)` an edge.
+    struct Plain {
+        w: usize,
+        h: usize,
+        costs: Vec<(i32, i32)>,
+        edges: Vec<(usize, usize, i32)>,
+    }
+
+    fn random(w: usize, h: usize, seed: u64) -> (PixelGraph, Plain) {
+        let mut r = Random(seed, 0);
+        let mut graph = PixelGraph::new(w, h);
+        let mut plain = Plain { w, h, costs: Vec::new(), edges: Vec::new() };
+        for y in 0..h {
+            for x in 0..w {
+                let (head, stage) = (r.below(30), r.below(30));
+                graph.add_costs(x, y, head, stage);
+                plain.costs.push((head, stage));
+                for direction in [0, 2, 4, 6] {
+                    let (u, v) = (x as isize + STEPS[direction].0, y as isize + STEPS[direction].1);
+                    if u >= 0 && u < w as isize && v < h as isize {
+                        let weight = r.below(16);
+                        graph.join(x, y, direction, weight);
+                        plain.edges.push((y * w + x, v as usize * w + u as usize, weight));
+                    }
+                }
+            }
+        }
+        (graph, plain)
+    }
+
+    impl Plain {
+        fn cost(&self, head: &[bool]) -> i64 {
+            let own =
+                self.costs.iter().zip(head).map(|(c, &h)| if h { c.0 } else { c.1 } as i64).sum::<i64>();
+            let cut = self.edges.iter().filter(|(i, j, _)| head[*i] != head[*j]).map(|e| e.2 as i64);
+            own + cut.sum::<i64>()
+        }
+
+        /// Edmonds & Karp 1972: shortest paths by breadth, on a matrix of capacities.
+        fn largest_flow(&self) -> i64 {
+            let n = self.w * self.h;
+            let (s, t) = (n, n + 1);
+            let mut capacity = vec![vec![0i64; n + 2]; n + 2];
+            for (i, &(head, stage)) in self.costs.iter().enumerate() {
+                capacity[s][i] += stage as i64;
+                capacity[i][t] += head as i64;
+            }
+            for &(i, j, weight) in &self.edges {
+                capacity[i][j] += weight as i64;
+                capacity[j][i] += weight as i64;
+            }
+            let mut flow = 0;
+            loop {
+                let mut from = vec![usize::MAX; n + 2];
+                let mut queue = VecDeque::from([s]);
+                while let Some(p) = queue.pop_front() {
+                    for q in 0..n + 2 {
+                        if q != s && from[q] == usize::MAX && capacity[p][q] > 0 {
+                            from[q] = p;
+                            queue.push_back(q);
+                        }
+                    }
+                }
+                if from[t] == usize::MAX {
+                    return flow;
+                }
+                let (mut least, mut q) = (i64::MAX, t);
+                while q != s {
+                    least = least.min(capacity[from[q]][q]);
+                    q = from[q];
+                }
+                q = t;
+                while q != s {
+                    capacity[from[q]][q] -= least;
+                    capacity[q][from[q]] += least;
+                    q = from[q];
+                }
+                flow += least;
+            }
+        }
+    }
+
+    #[test]
+    fn two_pixels_part_where_parting_is_cheapest() {
+        // left wants head (9 as stage), right wants stage (7 as head); telling them apart costs 5
+        let graph = |weight| {
+            let mut g = PixelGraph::new(2, 1);
+            g.add_costs(0, 0, 0, 9);
+            g.add_costs(1, 0, 7, 0);
+            g.join(0, 0, 0, weight);
+            g.cut()
+        };
+        assert_eq!(graph(5), (vec![true, false], 5));
+        // at 8 it is cheaper to give in: right becomes head for 7
+        assert_eq!(graph(8), (vec![true, true], 7));
+    }
+
+    #[test]
+    fn every_small_grid_is_cut_as_cheaply_as_trying_all_labellings() {
+        for (k, (w, h)) in [(1, 1), (4, 1), (1, 5), (3, 3), (4, 3), (3, 4), (2, 6)].into_iter().enumerate() {
+            for seed in 0..12 {
+                let (graph, plain) = random(w, h, 100 * k as u64 + seed);
+                let (labels, cost) = graph.cut();
+                let all = (0..1u32 << (w * h)).map(|bits| {
+                    let head: Vec<bool> = (0..w * h).map(|i| bits >> i & 1 == 1).collect();
+                    plain.cost(&head)
+                });
+                assert_eq!(cost, all.min().unwrap(), "{w} x {h}, seed {seed}");
+                assert_eq!(plain.cost(&labels), cost, "{w} x {h}, seed {seed}");
+            }
+        }
+    }
+
+    #[test]
+    fn larger_grids_carry_the_flow_that_edmonds_and_karp_find() {
+        for seed in 0..20 {
+            let (graph, plain) = random(12, 12, 1000 + seed);
+            let (labels, cost) = graph.cut();
+            assert_eq!(cost, plain.largest_flow(), "seed {seed}");
+            assert_eq!(plain.cost(&labels), cost, "seed {seed}");
+        }
+    }
+
+    #[test]
+    fn the_same_graph_is_cut_the_same_way_twice() {
+        let cut = || random(40, 30, 5).0.cut();
+        assert_eq!(cut(), cut());
+    }
+
+    #[test]
+    fn costs_said_twice_add_up() {
+        let mut g = PixelGraph::new(1, 1);
+        g.add_costs(0, 0, 3, 10);
+        g.add_costs(0, 0, 12, 2);
+        // head 15, stage 12
+        assert_eq!(g.cut(), (vec![false], 12));
+    }
+}

@@ -1,0 +1,463 @@
+//! A few clicked views → a mask for every view, through the known cameras.
+//!
+//! 1. The clicked views are cut by themselves; from all of them together the colours of head and stage are learned
+//!    once, and frozen.
+//! 2. The masks so far carve a cube of cells: the visual hull, which the head cannot leave.
+//! 3. In each view what lies outside the hull's silhouette is sure stage and what the hull's core covers is sure
+//!    head; between them the frozen colours cut.
+//! 4. All masks carve again, each cell forgiven a few votes against it, and 3 is repeated.
+//!
+//! The hull is an outer bound: it excludes and never includes, but for its core.
+
+use super::Click;
+use super::components::pieces;
+use super::cut::{CutOptions, Ground, Models};
+use super::cut_error::CutError;
+use super::distance::{grow, shrink};
+use super::hull::{self, Votes, Witness};
+use super::known::{self, Known};
+use super::mixture::Rgb;
+use super::working::working_photo;
+use crate::capture::carve::{Cube, drop_dust};
+use crate::capture::findings;
+use crate::geom::Camera;
+use crate::image::{Gray, Photo};
+use rayon::prelude::*;
+
+/// How clicks are carried to views that nobody clicked. Lengths are shares of the picture's height H.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SpreadOptions {
+    /// How each view is cut.
+    pub cut: CutOptions,
+    /// Cells along each side of the carved cube.
+    pub cells: usize,
+    /// Half side of the cube, in half heights of the frames at the point they look at.
+    pub cube: f64,
+    /// How far outside the hull's silhouette sure stage begins.
+    pub outside: f32,
+    /// Cells deeper inside than this share of the deepest one are the core.
+    pub core: f64,
+    /// By how much the core's silhouette is shrunk.
+    pub core_shrink: f32,
+    /// Votes against a cell that are forgiven once all views have masks.
+    pub dissent: usize,
+    /// Share of the views that must vote for a cell then.
+    pub consent: f64,
+    /// Rounds of carving and cutting.
+    pub rounds: usize,
+    /// Pieces of a mask below this share of the picture are left out, unless clicked or in the core.
+    pub piece: f64,
+    /// Views loaded and cut at once; bounds the memory.
+    pub at_once: usize,
+}
+
+impl Default for SpreadOptions {
+    fn default() -> SpreadOptions {
+        SpreadOptions {
+            cut: CutOptions::default(),
+            cells: 112,
+            cube: 1.15,
+            outside: 0.012,
+            core: 0.55,
+            core_shrink: 0.008,
+            dissent: 2,
+            consent: 0.1,
+            rounds: 3,
+            piece: 0.002,
+            at_once: 8,
+        }
+    }
+}
+
+/// One view to be masked.
+#[derive(Clone, Copy, Debug)]
+pub struct SpreadView<'a> {
+    /// Its name in messages.
+    pub name: &'a str,
+    /// Its camera, at the size of the photograph.
+    pub camera: &'a Camera,
+    /// Its clicks in pixels of the photograph; none where nobody clicked.
+    pub clicks: &'a [Click],
+    /// May its photograph shape the masks of other views? Held-out views may not.
+    pub witness: bool,
+}
+
+/// The mask of one view.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewMask {
+    /// 255 head, 0 stage, at the working size.
+    pub mask: Gray,
+    /// Share of the picture, 0..=1, that lies near the outline and has a colour that fits both sides.
+    pub unsure: f64,
+}
+
+/// Masks of all views.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Masks {
+    /// In the order of the views given.
+    pub views: Vec<ViewMask>,
+    /// What a person should look at.
+    pub warnings: Vec<String>,
+}
+
+/// Masks every view from the clicks on some. `load` gives the photograph of a view by its index.
+///
+/// Photographs are loaded [`SpreadOptions::at_once`] at a time and kept at the working size only. The result does
+/// not depend on the number of threads.
+pub fn spread<E, F>(views: &[SpreadView], load: F, options: &SpreadOptions) -> Result<Masks, E>
+where
+    E: From<CutError> + Send,
+    F: Fn(usize) -> Result<Photo, E> + Sync,
+{
+    let clicked: Vec<usize> = (0..views.len()).filter(|&i| !views[i].clicks.is_empty()).collect();
+    if clicked.is_empty() {
+        let view = views.first().map_or(String::new(), |v| v.name.into());
+        return Err(CutError::NoClicks { view }.into());
+    }
+    for &i in &clicked {
+        let v = &views[i];
+        known::check(v.name, v.clicks, v.camera.width, v.camera.height)?;
+    }
+    let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
+    let cube = hull::cube(&cameras, options.cells.max(8), options.cube)?;
+    let photos = load_all(views, load, options)?;
+    let mut spread = Spread { views, photos, cube, options, warnings: Vec::new() };
+    let start = spread.clicked(&clicked)?;
+    Ok(spread.run(start))
+}
+
+fn load_all<E, F>(views: &[SpreadView], load: F, options: &SpreadOptions) -> Result<Vec<Photo>, E>
+where
+    E: From<CutError> + Send,
+    F: Fn(usize) -> Result<Photo, E> + Sync,
+{
+    let all: Vec<usize> = (0..views.len()).collect();
+    let mut photos = Vec::with_capacity(views.len());
+    for some in all.chunks(options.at_once.max(1)) {
+        let loaded: Vec<Result<Photo, E>> = some
+            .par_iter()
+            .map(|&i| {
+                let photo = load(i)?;
+                let (found, camera) = ((photo.width, photo.height), views[i].camera);
+                if found != (camera.width, camera.height) {
+                    let camera = (camera.width, camera.height);
+                    return Err(CutError::Size { view: views[i].name.into(), found, camera }.into());
+                }
+                known::check_size(views[i].name, photo.width, photo.height)?;
+                Ok(working_photo(&photo, options.cut.rows.max(16)))
+            })
+            .collect();
+        for photo in loaded {
+            photos.push(photo?);
+        }
+    }
+    Ok(photos)
+}
+
+/// What the clicked views gave.
+struct Clicked {
+    /// Colours of all clicked views together.
+    models: Models,
+    /// Per view: its labels and own colours, where it was clicked.
+    own: Vec<Option<(Vec<bool>, Models)>>,
+}
+
+struct Spread<'a> {
+    views: &'a [SpreadView<'a>],
+    /// At the working size.
+    photos: Vec<Photo>,
+    cube: Cube,
+    options: &'a SpreadOptions,
+    warnings: Vec<String>,
+}
+
+/// Colours of one side that the common mixtures learn from, at most; more would only take time.
+const MOST_COLORS: usize = 600_000;
+
+impl Spread<'_> {
+    /// The clicks of a view brought to its working size. The strips are a guess: once a hull says where the head
+    /// is, it may touch any border.
+    fn ground(&self, i: usize, strips: bool) -> (Ground, Vec<String>) {
+        let (v, photo) = (&self.views[i], &self.photos[i]);
+        let size = (v.camera.width, v.camera.height);
+        let mut options = self.options.cut.clone();
+        if !strips {
+            options.strip = 0.0;
+        }
+        Ground::reduced(v.name, photo.clone(), size, v.clicks, &options)
+    }
+
+    /// Cuts the clicked views by themselves and learns the common colours.
+    fn clicked(&mut self, clicked: &[usize]) -> Result<Clicked, CutError> {
+        let cut = &self.options.cut;
+        let found: Vec<_> = clicked
+            .par_iter()
+            .map(|&i| {
+                let (ground, warnings) = self.ground(i, true);
+                let (head, models) = ground.grab(cut);
+                let head = ground.finish(head, cut);
+                let models = models.filter(|_| head.contains(&true) && head.contains(&false));
+                (head, models, warnings)
+            })
+            .collect();
+        let mut own: Vec<Option<(Vec<bool>, Models)>> = vec![None; self.views.len()];
+        let (mut inside, mut outside): (Vec<Rgb>, Vec<Rgb>) = Default::default();
+        for (&i, (head, models, warnings)) in clicked.iter().zip(found) {
+            self.warnings.extend(warnings);
+            let Some(models) = models else {
+                return Err(CutError::Empty { view: self.views[i].name.into() });
+            };
+            for (color, &h) in self.photos[i].rgb.iter().zip(&head) {
+                if h { inside.push(*color) } else { outside.push(*color) }
+            }
+            own[i] = Some((head, models));
+        }
+        for side in [&mut inside, &mut outside] {
+            let every = side.len().div_ceil(MOST_COLORS).max(1);
+            *side = side.iter().step_by(every).copied().collect();
+        }
+        let empty = || CutError::Empty { view: self.views[clicked[0]].name.into() };
+        let mut models = Models::fit(&inside, &outside, cut).ok_or_else(empty)?;
+        for _ in 0..cut.rounds {
+            models = Models { head: models.head.refit(&inside), stage: models.stage.refit(&outside) };
+        }
+        Ok(Clicked { models, own })
+    }
+
+    /// Carves and cuts in turn.
+    fn run(mut self, start: Clicked) -> Masks {
+        let mut masks: Vec<Option<Gray>> = (start.own.iter().zip(&self.photos))
+            .map(|(own, photo)| own.as_ref().map(|(head, _)| gray(photo, head)))
+            .collect();
+        let mut unsure = vec![0.0; self.views.len()];
+        let rounds = self.options.rounds.max(1);
+        for round in 0..rounds {
+            let (hull, core) = self.carve(&masks);
+            let done: Vec<(Gray, f64)> = (0..self.views.len())
+                .into_par_iter()
+                .map(|i| {
+                    let models = start.own[i].as_ref().map_or(&start.models, |(_, own)| own);
+                    self.cut_one(i, models, &hull, &core, (round, round + 1 == rounds))
+                })
+                .collect();
+            for (i, (mask, open)) in done.into_iter().enumerate() {
+                masks[i] = Some(mask);
+                unsure[i] = open;
+            }
+        }
+        let masks: Vec<Gray> = masks.into_iter().flatten().collect();
+        self.warn(&masks, &unsure);
+        if start.own.iter().flatten().count() < 2 {
+            self.warnings.push(
+                "only one view is clicked: nothing bounds the head in depth at first; click a side view too"
+                    .into(),
+            );
+        }
+        let views = masks.into_iter().zip(unsure).map(|(mask, unsure)| ViewMask { mask, unsure }).collect();
+        Masks { views, warnings: self.warnings }
+    }
+
+    /// The cells where the head may be, and the core where it must be.
+    fn carve(&self, masks: &[Option<Gray>]) -> (Vec<bool>, Vec<bool>) {
+        let witnesses: Vec<Witness> = (self.views.iter().zip(masks))
+            .filter(|(v, _)| v.witness)
+            .filter_map(|(v, m)| Some((v, m.as_ref().filter(|m| m.values.contains(&255))?)))
+            .map(|(v, m)| Witness::new(v.camera, m))
+            .collect();
+        let votes = Votes::count(&self.cube, &witnesses);
+        let (n, total) = (self.cube.n, witnesses.len());
+        let all = self.views.iter().filter(|v| v.witness).count();
+        // while only the clicked views have masks they decide alone
+        let (against, least) = if total < all {
+            (0, 0)
+        } else {
+            (self.options.dissent.min(total / 6), (self.options.consent * total as f64).ceil() as usize)
+        };
+        let mut hull = votes.cells(against, least);
+        drop_dust(&mut hull, n, 0.02);
+        let solid: Vec<bool> = votes
+            .cells(against, least.max(total.div_ceil(2)))
+            .iter()
+            .zip(&hull)
+            .map(|(s, h)| *s && *h)
+            .collect();
+        let core = hull::core(&solid, n, self.options.core);
+        (hull, core)
+    }
+
+    /// Cuts one view under what the hull allows.
+    fn cut_one(
+        &self,
+        i: usize,
+        models: &Models,
+        hull: &[bool],
+        core: &[bool],
+        (round, last): (usize, bool),
+    ) -> (Gray, f64) {
+        let options = &self.options.cut;
+        let (mut ground, _) = self.ground(i, round == 0);
+        let (w, h) = (ground.width, ground.height);
+        let camera = self.views[i].camera.resized(w as u32, h as u32);
+        let allowed = hull::silhouette(&self.cube, hull, &camera);
+        let allowed = grow(&allowed, w, h, self.options.outside * h as f32);
+        let within = hull::silhouette(&self.cube, core, &camera);
+        let within = shrink(&within, w, h, self.options.core_shrink * h as f32);
+        for (p, known) in ground.known.iter_mut().enumerate() {
+            // clicks count more than what follows from other views
+            if *known == Known::Nothing {
+                if !allowed[p] {
+                    *known = Known::Stage;
+                } else if within[p] {
+                    *known = Known::Head;
+                }
+            }
+        }
+        let head = ground.labels(&ground.known, models, options);
+        let head = self.finish(&ground, head);
+        let unsure = if last { ground.unsure(&head, models, options) } else { 0.0 };
+        (ground.gray(&head), unsure)
+    }
+
+    /// As [`Ground::finish`], but pieces need no click: the hull has left only what can be head.
+    fn finish(&self, ground: &Ground, mut head: Vec<bool>) -> Vec<bool> {
+        let (w, h) = (ground.width, ground.height);
+        let found = pieces(&head, w, h, true);
+        let least = self.options.piece * (w * h) as f64;
+        let mut wanted: Vec<bool> = found.size.iter().map(|&s| s as f64 >= least).collect();
+        for (known, &l) in ground.known.iter().zip(&found.label) {
+            wanted[l as usize] |= *known == Known::Head;
+        }
+        wanted[0] = false;
+        head.iter_mut().zip(&found.label).for_each(|(m, &l)| *m = wanted[l as usize]);
+        ground.smooth(head, &self.options.cut)
+    }
+
+    /// What looks wrong about the finished masks.
+    fn warn(&mut self, masks: &[Gray], unsure: &[f64]) {
+        for (i, mask) in masks.iter().enumerate().filter(|(i, _)| !self.views[*i].clicks.is_empty()) {
+            let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
+            let found = self.ground(i, false).0.warnings(self.views[i].name, &head);
+            self.warnings.extend(found);
+        }
+        for (i, mask) in masks.iter().enumerate() {
+            let view = self.views[i].name;
+            // shoulders do touch the sides
+            for finding in findings(mask).into_iter().filter(|f| !f.starts_with("touches")) {
+                self.warnings.push(format!("the mask cut for view `{view}` {finding}"));
+            }
+            if unsure[i] > 0.05 {
+                self.warnings.push(format!(
+                    "view `{view}`: {:.0} % of the picture may be head or stage by its colour; click there",
+                    100.0 * unsure[i]
+                ));
+            }
+        }
+    }
+}
+
+fn gray(photo: &Photo, head: &[bool]) -> Gray {
+    let values = head.iter().map(|&h| if h { 255 } else { 0 }).collect();
+    Gray { width: photo.width, height: photo.height, values }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::Distortion;
+    use crate::kernel::rng;
+    use glam::{DMat3, DVec3, Vec2};
+
+    fn ring() -> Vec<Camera> {
+        (0..6)
+            .map(|i| {
+                let rotation = DMat3::from_rotation_y(0.5 * i as f64);
+                Camera {
+                    width: 72,
+                    height: 96,
+                    fx: 240.0,
+                    fy: 240.0,
+                    cx: 36.0,
+                    cy: 48.0,
+                    distortion: Distortion::default(),
+                    rotation,
+                    position: rotation * DVec3::new(0.0, 0.0, 10.0),
+                }
+            })
+            .collect()
+    }
+
+    /// A ball of two colours before a dark stage with lamps, and which pixels are the ball.
+    fn photo(camera: &Camera, stream: u64) -> (Photo, Vec<bool>) {
+        let mut truth = Vec::new();
+        let rgb = (0..72 * 96u32)
+            .map(|i| {
+                let ray = camera.ray(Vec2::new((i % 72) as f32 + 0.5, (i / 72) as f32 + 0.5)).unwrap();
+                let near = (-camera.position).cross(ray.direction.as_dvec3()).length();
+                truth.push(near < 1.0);
+                let noise = (3.0 * rng::normal(1, stream, i as u64)) as i32;
+                let base = match (near < 1.0, i / 72 < 40) {
+                    (true, true) => [80, 55, 35],
+                    (true, false) => [200, 150, 130],
+                    _ if (i % 72 % 30).abs_diff(6) < 3 && (i / 72 % 30).abs_diff(6) < 3 => [210, 160, 140],
+                    _ => [14, 14, 16],
+                };
+                base.map(|c| (c + noise).clamp(0, 255) as u8)
+            })
+            .collect();
+        (Photo { width: 72, height: 96, rgb, alpha: None }, truth)
+    }
+
+    fn clicks() -> Vec<Click> {
+        [(36.0, 60.0, true), (36.0, 34.0, true), (20.0, 16.0, false), (66.0, 80.0, false)]
+            .map(|(x, y, head)| Click { x, y, head })
+            .into()
+    }
+
+    fn run(clicked: &[usize]) -> Result<Masks, CutError> {
+        let (cameras, clicks) = (ring(), clicks());
+        let views: Vec<SpreadView> = (cameras.iter().enumerate())
+            .map(|(i, camera)| {
+                let clicks: &[Click] = if clicked.contains(&i) { &clicks } else { &[] };
+                SpreadView { name: "v", camera, clicks, witness: i != 5 }
+            })
+            .collect();
+        let options = SpreadOptions { cells: 48, at_once: 2, ..SpreadOptions::default() };
+        spread(&views, |i| Ok(photo(&cameras[i], i as u64).0), &options)
+    }
+
+    #[test]
+    fn lamps_of_the_heads_own_colour_are_left_out_of_views_nobody_clicked() {
+        let masks = run(&[0, 3]).unwrap();
+        for (i, view) in masks.views.iter().enumerate() {
+            let truth = photo(&ring()[i], i as u64).1;
+            let wrong = view.mask.values.iter().zip(&truth).filter(|(m, t)| (**m > 127) != **t).count();
+            // the ball covers 1800 pixels
+            assert!(wrong < 40, "view {i}: {wrong} pixels are wrong");
+        }
+        assert_eq!(masks.warnings, Vec::<String>::new());
+    }
+
+    #[test]
+    fn the_same_masks_come_from_any_number_of_threads() {
+        let on = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| run(&[0, 3])).unwrap()
+        };
+        assert_eq!(on(1), on(3));
+    }
+
+    #[test]
+    fn no_clicks_and_failing_photographs_end_with_their_error() {
+        assert!(matches!(run(&[]), Err(CutError::NoClicks { .. })));
+        assert!(run(&[1]).unwrap().warnings.iter().any(|w| w.contains("only one view")));
+        let (cameras, clicks) = (ring(), clicks());
+        let views =
+            cameras.iter().map(|camera| SpreadView { name: "v", camera, clicks: &clicks, witness: true });
+        let views: Vec<SpreadView> = views.collect();
+        let small = |_| Ok(Photo { width: 20, height: 20, rgb: vec![[0; 3]; 400], alpha: None });
+        let e = spread::<CutError, _>(&views, small, &SpreadOptions::default()).unwrap_err();
+        assert!(matches!(e, CutError::Size { found: (20, 20), camera: (72, 96), .. }), "{e}");
+        let fail = |_| Err(CutError::NoSuchView { found: 9, views: 6 });
+        assert!(matches!(spread(&views, fail, &SpreadOptions::default()), Err(CutError::NoSuchView { .. })));
+    }
+}

@@ -1,0 +1,110 @@
+//! Masks from the clicks that come with the shared captures, against their true masks.
+//!
+//! They lie beside the repository, or where `TIFACE_SHARED` says; without them these tests skip, aloud.
+
+mod clicked;
+
+use clicked::{Clicked, mean_worst, overlap, read};
+use tiface::image::Gray;
+use tiface::mask::agree::{AgreeOptions, AgreeView, Agreement, agree};
+use tiface::mask::cut::{CutOptions, cut};
+use tiface::mask::spread::{Masks, SpreadOptions, SpreadView, spread};
+use tiface::mask::{Click, CutError};
+
+fn clicked_views(c: &Clicked) -> Vec<f64> {
+    let clicked = (0..c.views.len()).filter(|&i| !c.clicks[i].is_empty());
+    clicked
+        .map(|i| {
+            let cut = cut(&c.views[i].name, &c.photos[i], &c.clicks[i], &CutOptions::default()).unwrap();
+            assert!(cut.warnings.is_empty(), "{:?}", cut.warnings);
+            overlap(&cut.mask, &c.truth[i])
+        })
+        .collect()
+}
+
+fn all_views(c: &Clicked) -> Masks {
+    let views: Vec<SpreadView> = (c.views.iter().zip(&c.clicks))
+        .map(|(v, clicks)| SpreadView { name: &v.name, camera: &v.camera, clicks, witness: true })
+        .collect();
+    spread::<CutError, _>(&views, |i| Ok(c.photos[i].clone()), &SpreadOptions::default()).unwrap()
+}
+
+fn compare(c: &Clicked, masks: &[Gray]) -> Agreement {
+    let views: Vec<AgreeView> = (c.views.iter().zip(masks))
+        .map(|(v, mask)| AgreeView { name: &v.name, camera: &v.camera, mask: Some(mask) })
+        .collect();
+    agree(&views, &AgreeOptions::default()).unwrap()
+}
+
+fn names(found: &Agreement) -> Vec<usize> {
+    found.doubts.iter().map(|d| d.view).collect()
+}
+
+/// The bars stand a little below what was measured: see `cargo bench --bench masks`.
+fn masks_of(name: &str, clicked: (f64, f64), all: (f64, f64)) {
+    let Some(c) = read(name) else { return };
+    let (mean, worst) = mean_worst(&clicked_views(&c));
+    assert!(mean > clicked.0 && worst > clicked.1, "clicked views: mean {mean:.4}, worst {worst:.4}");
+    let masks = all_views(&c);
+    let overlaps: Vec<f64> = masks.views.iter().zip(&c.truth).map(|(m, t)| overlap(&m.mask, t)).collect();
+    let (mean, worst) = mean_worst(&overlaps);
+    assert!(mean > all.0 && worst > all.1, "all views: mean {mean:.4}, worst {worst:.4}");
+    assert!(masks.warnings.is_empty(), "{:?}", masks.warnings);
+    // what was made agrees with itself
+    let made: Vec<Gray> = masks.views.into_iter().map(|v| v.mask).collect();
+    assert_eq!(names(&compare(&c, &made)), [0usize; 0]);
+}
+
+#[test]
+fn three_clicked_views_of_lps_mask_all_of_them() {
+    masks_of("lps", (0.980, 0.975), (0.979, 0.970));
+}
+
+#[test]
+fn three_clicked_views_of_nefertiti_mask_all_of_them() {
+    masks_of("nefertiti", (0.989, 0.985), (0.991, 0.985));
+}
+
+fn shifted(mask: &Gray, by: usize) -> Gray {
+    let w = mask.width as usize;
+    let at = |i: usize| if i % w >= by { mask.values[i - by] } else { 0 };
+    Gray { values: (0..mask.values.len()).map(at).collect(), ..mask.clone() }
+}
+
+#[test]
+fn the_true_masks_agree_and_one_wrong_mask_among_them_is_named() {
+    let (Some(a), Some(b)) = (read("lps"), read("nefertiti")) else { return };
+    for (c, other) in [(&a, &b), (&b, &a)] {
+        let found = compare(c, &c.truth);
+        assert!(found.doubts.is_empty() && found.left < 1e-4, "{found:?}");
+        for i in [2, 12, 23] {
+            let own = &c.truth[i];
+            let inverted = Gray { values: own.values.iter().map(|v| 255 - v).collect(), ..own.clone() };
+            let empty = Gray { values: vec![0; own.values.len()], ..own.clone() };
+            let wrong = [
+                ("inverted", inverted),
+                ("empty", empty),
+                // 5 % of the width
+                ("shifted", shifted(own, 19)),
+                ("of another view", c.truth[(i + 1) % 24].clone()),
+                ("of another person", other.truth[i].clone()),
+            ];
+            for (what, mask) in wrong {
+                let mut masks = c.truth.clone();
+                masks[i] = mask;
+                let found = compare(c, &masks);
+                assert_eq!(names(&found), [i], "view {i} {what}: {:?}", found.doubts);
+            }
+        }
+    }
+}
+
+#[test]
+fn clicks_that_say_nothing_are_refused_before_anything_is_cut() {
+    let Some(c) = read("lps") else { return };
+    let try_clicks =
+        |clicks: &[Click]| cut("010", &c.photos[10], clicks, &CutOptions::default()).unwrap_err();
+    let stage = Click { x: 30.0, y: 50.0, head: false };
+    assert!(matches!(try_clicks(&[stage]), CutError::NoHead { .. }));
+    assert!(matches!(try_clicks(&[Click { x: 384.0, head: true, ..stage }]), CutError::OutsidePhoto { .. }));
+}
