@@ -17,6 +17,7 @@
 //! be done, and a finished stage is skipped without loading anything. The device is not part of it: it
 //! decides how fast a field is learned, not what it is.
 
+mod clicks;
 mod ensemble;
 mod export;
 #[cfg(feature = "cpu")]
@@ -27,6 +28,7 @@ mod march;
 mod mask;
 mod mesh;
 mod metrics;
+mod networks;
 mod page;
 mod pictures;
 mod plan;
@@ -40,6 +42,7 @@ pub use export::Export;
 #[cfg(feature = "cpu")]
 pub use fields::Trained;
 pub use march::Seen;
+pub use mask::{click_page, disagreements};
 pub use product::{Lobes, Pictures, Product};
 pub use surface::{Exact, Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
@@ -74,6 +77,14 @@ pub enum PipelineError {
     /// A file the line needs before its stages.
     #[error(transparent)]
     Read(#[from] io::ReadError),
+    /// The clicks that masks are to be made from.
+    #[error("{problem}")]
+    Clicks {
+        /// What is wrong.
+        problem: String,
+        /// The way out.
+        hint: String,
+    },
     /// Settings of several tables that contradict each other.
     #[error("`{key}` {problem}")]
     Settings {
@@ -102,7 +113,7 @@ impl PipelineError {
             PipelineError::Capture(e) => e.hint(),
             PipelineError::Run(e) => e.hint(),
             PipelineError::Read(e) => e.hint(),
-            PipelineError::Settings { hint, .. } => hint.clone(),
+            PipelineError::Settings { hint, .. } | PipelineError::Clicks { hint, .. } => hint.clone(),
         }
     }
 }
@@ -141,17 +152,20 @@ pub struct Line<'a> {
     imports: Vec<(&'static str, String)>,
     /// Is the capture the demo head, whose surface is known?
     synthetic: bool,
+    /// What masks are made from, if not found.
+    clicks: Option<clicks::Clicks>,
 }
 
 impl<'a> Line<'a> {
     /// Opens the capture and reads every byte of it once, for its digest. Nothing is written.
     pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>, PipelineError> {
-        if let Some((key, problem, hint)) = config.mesh.problem() {
+        if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
             return Err(PipelineError::Settings { key, problem, hint: hint.into() });
         }
         let mut capture = capture::open(Path::new(&config.capture.path), &capture_options(config))?;
         set_aside(&mut capture, config.capture.fit_views)?;
         let digest = capture_digest(&capture)?;
+        let clicks = clicks::clicks(&config.mask, &capture)?;
         let of_file = |file: &str| -> Result<String, PipelineError> {
             Ok(Fingerprint::of_bytes(&io::read_bytes(Path::new(file), &Limits::default())?))
         };
@@ -168,7 +182,15 @@ impl<'a> Line<'a> {
         for warning in &capture.warnings {
             run.warn("capture", warning);
         }
-        Ok(Line { capture, config, run, digest, path_digest, imports, synthetic })
+        let mut line = Line { capture, config, run, digest, path_digest, imports, synthetic, clicks };
+        if line.clicks.is_some() {
+            // what later stages read is what the stage `mask` makes
+            let files: Vec<_> = line.capture.views.iter().map(|v| line.mask_file(&v.name)).collect();
+            for (view, file) in line.capture.views.iter_mut().zip(files) {
+                view.mask = capture::MaskSource::File(file);
+            }
+        }
+        Ok(line)
     }
 
     /// The capture.
@@ -223,6 +245,8 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
     CaptureOptions {
         downscale: c.downscale,
         masks: match config.mask.source {
+            _ if config.mask.clicked() => MaskChoice::None,
+            MaskSource::Clicks => MaskChoice::None,
             MaskSource::Auto if c.mask_dir.is_empty() => MaskChoice::Auto,
             MaskSource::Auto | MaskSource::Folder => MaskChoice::Folder(c.mask_dir.clone()),
             MaskSource::Alpha => MaskChoice::Alpha,

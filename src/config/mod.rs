@@ -24,7 +24,7 @@ mod vm_keys;
 pub use capture::CaptureConfig;
 pub use ensemble::{Correct, EnsembleConfig, Fit};
 pub use iface::IfaceConfig;
-pub use mask::{MaskConfig, MaskMeaning, MaskSource};
+pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors};
 pub use mesh::{MeshConfig, MeshFormat, MeshFrame, TextureFormat, TextureView};
 pub use metrics::MetricsConfig;
 pub use render::{Background, Method, PictureFormat, RenderConfig};

@@ -2,56 +2,151 @@
 
 use super::{Line, PipelineError, capture_failure, scene_file};
 use crate::capture::scene::{self, Scene, SceneError, SceneOptions};
-use crate::capture::{self, Split};
+use crate::capture::{self, Capture, Split};
 use crate::config::MaskMeaning;
-use crate::image::Gray;
+use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
+use crate::mask::agree::{AgreeOptions, AgreeView, agree};
+use crate::mask::points;
+use crate::mask::sheet::{SheetOptions, Tile, sheet};
 use crate::run::{Done, Failure, Stage};
 use rayon::prelude::*;
-use serde_json::json;
+use serde_json::{Value, json};
+use std::path::PathBuf;
+
+/// The contact sheet, in the stage's folder.
+pub(super) const SHEET: &str = "sheet.png";
+
+/// Masks as they were found or made.
+struct Masked {
+    masks: Vec<Option<Gray>>,
+    /// The views for the contact sheet, those with masks.
+    tiles: Vec<Tile>,
+    /// Which view each tile shows.
+    shown: Vec<usize>,
+    /// The stage's record of how they were made.
+    made: Value,
+}
 
 impl Line<'_> {
-    /// Stage `mask`: the masks as pictures, and the box and hull they leave (`scene.json`).
+    /// Stage `mask`: the masks as pictures, a sheet of them, and the box and hull they leave (`scene.json`).
     pub fn mask(&self) -> Result<Done, PipelineError> {
         let done = self.run.stage(self.plan("mask"), |stage| {
-            let limits = Limits::default();
-            let total = self.capture.views.len();
-            let mut masks: Vec<Option<Gray>> = Vec::with_capacity(total);
-            let mut coverage = Vec::new();
-            // a few at a time: decoding is what takes time, and photographs are large
-            for (i, views) in self.capture.views.chunks(8).enumerate() {
-                let loaded: Vec<_> = views.par_iter().map(|v| v.load_mask(&limits)).collect();
-                for (view, mask) in views.iter().zip(loaded) {
-                    let mask = mask.map_err(capture_failure)?;
-                    if let Some(mask) = &mask {
-                        let file = stage.folder().join(format!("{}.png", view.name));
-                        io::create_folder(file.parent().unwrap_or(stage.folder()))?;
-                        io::write_png_gray(&file, mask)?;
-                        coverage.push(capture::coverage(mask));
-                    }
-                    masks.push(mask);
-                }
-                stage.monitor().step((8 * (i + 1)).min(total) as u64, total as u64, &[]);
-                self.stop_here()?;
-            }
+            let Masked { masks, mut tiles, shown, made } = match &self.clicks {
+                Some(clicks) => self.masks_from_clicks(stage, clicks)?,
+                None => self.masks_of_capture(stage)?,
+            };
+            let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
             if coverage.is_empty() {
-                stage.warn(
+                let mut text = String::from(
                     "no view has a head mask: there is no visual hull to start from, nothing says which pixels \
                      are background, and the box learns whatever it holds; give masks for a head on its own",
                 );
+                let prompts = self.capture.root.join("prompts.json");
+                if io::is_file(&prompts) {
+                    text += &format!(", or make them from the clicks that lie there: `--points {}`", prompts.display());
+                }
+                stage.warn(&text);
             }
+            let doubts = disagreements(&self.capture, &masks);
+            for (view, text) in &doubts {
+                stage.warn(text);
+                if let Some(k) = shown.iter().position(|v| v == view) {
+                    tiles[k].suspicions.push("disagrees with the others".into());
+                }
+            }
+            if !tiles.is_empty() {
+                let picture = sheet(&tiles, &SheetOptions::default());
+                io::write_png_rgb(&stage.folder().join(SHEET), picture.width, picture.height, &picture.rgb)?;
+            }
+            let suspicious: Vec<&str> =
+                tiles.iter().filter(|t| !t.suspicions.is_empty()).map(|t| t.name.as_str()).collect();
+            let suspicious = json!(suspicious);
             let scene = self.place(stage, masks)?;
             scene_file::write_scene(&stage.folder().join("scene.json"), &scene)?;
             let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;
             Ok(json!({
-                "views": total,
+                "views": self.capture.views.len(),
                 "masks": coverage.len(),
                 "coverage": covered,
+                "suspicious": suspicious,
+                "made": made,
                 "box": scene::world_box(&scene),
             }))
         })?;
         self.run.write("cameras.json", &scene_file::cameras_json(&self.capture, &self.scene()?))?;
         Ok(done)
+    }
+
+    /// Where the stage keeps the mask of a view.
+    pub(super) fn mask_file(&self, view: &str) -> PathBuf {
+        self.run.path("mask").join(format!("{view}.png"))
+    }
+
+    fn write_mask(&self, view: usize, mask: &Gray) -> Result<(), Failure> {
+        let file = self.mask_file(&self.capture.views[view].name);
+        if let Some(folder) = file.parent() {
+            io::create_folder(folder)?;
+        }
+        Ok(io::write_png_gray(&file, mask)?)
+    }
+
+    /// The masks that lie beside the photographs.
+    fn masks_of_capture(&self, stage: &Stage) -> Result<Masked, Failure> {
+        let limits = Limits::default();
+        let total = self.capture.views.len();
+        let mut out = Masked { masks: Vec::with_capacity(total), tiles: vec![], shown: vec![], made: Value::Null };
+        // a few at a time: decoding is what takes time, and photographs are large
+        for (i, views) in self.capture.views.chunks(8).enumerate() {
+            let loaded: Vec<_> = views
+                .par_iter()
+                .map(|v| {
+                    let Some(mask) = v.load_mask(&limits)? else { return Ok(None) };
+                    let photo = v.load_photo(&limits)?;
+                    let tile = Tile::new(&v.name, &photo, &mask, None, Vec::new(), &SheetOptions::default());
+                    Ok(Some((mask, tile)))
+                })
+                .collect();
+            for (k, found) in loaded.into_iter().enumerate() {
+                let view = 8 * i + k;
+                let found: Option<(Gray, Tile)> = found.map_err(capture_failure)?;
+                let Some((mask, tile)) = found else {
+                    out.masks.push(None);
+                    continue;
+                };
+                self.write_mask(view, &mask)?;
+                out.tiles.push(tile);
+                out.shown.push(view);
+                out.masks.push(Some(mask));
+            }
+            stage.monitor().step((8 * (i + 1)).min(total) as u64, total as u64, &[]);
+            self.stop_here()?;
+        }
+        Ok(out)
+    }
+
+    /// Masks made from clicks.
+    fn masks_from_clicks(&self, stage: &Stage, clicks: &super::clicks::Clicks) -> Result<Masked, Failure> {
+        let mut out = Masked { masks: vec![], tiles: vec![], shown: vec![], made: Value::Null };
+        let mut unsure = 0.0;
+        let networks = self.make_masks(stage, clicks, &mut |view, photo: &Photo, made| {
+            self.write_mask(view, &made.alpha)?;
+            let name = &self.capture.views[view].name;
+            let options = SheetOptions::default();
+            out.tiles.push(Tile::new(name, photo, &made.alpha, Some(&made.trimap), Vec::new(), &options));
+            out.shown.push(view);
+            out.masks.push(Some(made.alpha));
+            unsure += made.unsure;
+            Ok(())
+        })?;
+        let clicked = clicks.of.iter().filter(|c| !c.is_empty()).count();
+        out.made = json!({
+            "clicked_views": clicked,
+            "clicks": clicks.of.iter().map(Vec::len).sum::<usize>(),
+            "unsure": unsure / out.masks.len().max(1) as f64,
+            "networks": networks.record(),
+        });
+        Ok(out)
     }
 
     /// Where the head is, from the views that are learned from; held-out ones have no say.
@@ -73,4 +168,28 @@ impl Line<'_> {
         warnings.iter().for_each(|w| stage.warn(w));
         Ok(scene)
     }
+}
+
+/// The views whose masks do not fit the others, with a sentence each; none where the cameras cannot tell.
+pub fn disagreements(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> {
+    let views: Vec<AgreeView> = (capture.views.iter().zip(masks))
+        .map(|(v, mask)| AgreeView { name: &v.name, camera: &v.camera, mask: mask.as_ref() })
+        .collect();
+    match agree(&views, &AgreeOptions::default()) {
+        Ok(found) => found.doubts.into_iter().map(|d| (d.view, d.text)).collect(),
+        Err(_) => Vec::new(),
+    }
+}
+
+/// A page to click on; `prompts` are clicks that are there already.
+pub fn click_page(capture: &Capture, prompts: Option<&std::path::Path>) -> Result<String, PipelineError> {
+    let limits = Limits::default();
+    let known = match prompts {
+        Some(file) => points::read_prompts(file, &limits),
+        None => Ok(points::Prompts::default()),
+    };
+    let wrong = |problem: String, hint: String| PipelineError::Clicks { problem, hint };
+    let known = known.map_err(|e| wrong(e.to_string(), e.hint()))?;
+    let page = crate::mask::page::page_of(capture, &known, &Default::default(), &limits);
+    page.map_err(|e| wrong(e.to_string(), e.hint()))
 }

@@ -84,6 +84,13 @@ impl Line<'_> {
                 settings.extend(self.config.values("capture"));
                 settings.remove("capture.path"); // where it lies does not matter, what it holds does
                 inputs.push(("capture", self.digest.clone()));
+                // where clicks and networks lie does not matter either, nor how much memory they get
+                for key in ["points", "point", "view", "sam", "sam_decoder", "vitmatte", "onnxruntime", "memory_gib"] {
+                    settings.remove(&format!("mask.{key}"));
+                }
+                if let Some(clicks) = &self.clicks {
+                    inputs.extend(clicks.inputs.iter().cloned());
+                }
             }
             "iface" => {
                 settings.remove("iface.checkpoint_s"); // how often is no matter of what

@@ -1,0 +1,390 @@
+//! Masks from clicks: cut where somebody clicked, carried to every other view, made soft.
+//!
+//! ```text
+//! clicks → cut (GrabCut, or SAM) → carried through the cameras → band → matting (closed form, guided, ViTMatte) → alpha
+//! ```
+
+use super::networks::Networks;
+use super::{Line, PipelineError, capture_failure};
+use crate::capture::{Capture, Split};
+use crate::config::{MaskConfig, MattingMethod};
+use crate::image::{Gray, Photo};
+use crate::io::{Limits, ReadError};
+use crate::mask::alpha::{Matting, SoftenOptions, Working, soften};
+use crate::mask::closed_form::ClosedFormOptions;
+use crate::mask::cut::{CutOptions, cut};
+use crate::mask::guided::GuidedOptions;
+use crate::mask::points::{self, PointsError};
+use crate::mask::spread::{Masks, SpreadOptions, SpreadView, ViewMask, spread};
+use crate::mask::trimap::Band;
+use crate::mask::{Click, CutError, distance, scale};
+use crate::run::{Failure, Fingerprint, Stage};
+use rayon::prelude::*;
+use std::path::Path;
+
+/// The clicks that masks are made from.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Clicks {
+    /// Of each view, in pixels of its camera.
+    pub of: Vec<Vec<Click>>,
+    /// What shapes the masks beside the settings: clicks and network files.
+    pub inputs: Vec<(&'static str, String)>,
+}
+
+/// A mask that was made.
+pub(super) struct Made {
+    /// Soft alpha at the size of the camera.
+    pub alpha: Gray,
+    /// Where it is unsure, at the size that was worked on.
+    pub trimap: Gray,
+    /// Share of the picture that is unsure.
+    pub unsure: f64,
+}
+
+fn points_failure(e: PointsError) -> PipelineError {
+    match e {
+        PointsError::Read(e) => PipelineError::Read(e),
+        e => {
+            let hint = e.hint();
+            PipelineError::Clicks { problem: e.to_string(), hint }
+        }
+    }
+}
+
+fn cut_failure(e: CutError) -> Failure {
+    let hint = e.hint();
+    Failure::cannot(e, hint)
+}
+
+/// The clicks that a configuration means, checked against the capture; `None` if masks are not made from clicks.
+pub(super) fn clicks(config: &MaskConfig, capture: &Capture) -> Result<Option<Clicks>, PipelineError> {
+    if !config.clicked() {
+        return Ok(None);
+    }
+    let of = if config.points.is_empty() {
+        let clicks = config.point.iter().map(|p| points::parse_point(p)).collect::<Result<Vec<_>, _>>();
+        let view = match config.view.as_str() {
+            "" => capture.views.first(),
+            name => capture.views.iter().find(|v| v.name == name),
+        };
+        let Some(view) = view else {
+            return Err(PipelineError::Clicks {
+                problem: format!("there is no view `{}`", config.view),
+                hint: "`tiface inspect CAPTURE --json` lists them; names have no ending".into(),
+            });
+        };
+        let frame =
+            points::Frame { file_path: points::file_path(capture, view), points: clicks.map_err(points_failure)? };
+        points::Prompts { frames: vec![frame] }.clicks("mask.point", capture)
+    } else {
+        let read = points::read_prompts(Path::new(&config.points), &Limits::default());
+        read.and_then(|prompts| prompts.clicks(&config.points, capture))
+    }
+    .map_err(points_failure)?;
+    if of.iter().all(Vec::is_empty) {
+        return Err(PipelineError::Clicks {
+            problem: format!("`{}` holds no click on a photograph of this capture", config.points),
+            hint: "click on a few photographs: `tiface mask CAPTURE --page`".into(),
+        });
+    }
+    let mut inputs = vec![("clicks", Fingerprint::of_bytes(format!("{of:?}").as_bytes()))];
+    for (name, path) in files(config) {
+        inputs.push((name, Networks::digest(path)?));
+    }
+    Ok(Some(Clicks { of, inputs }))
+}
+
+/// The network files that will be used, by their key in `[mask]`.
+pub(super) fn files(config: &MaskConfig) -> Vec<(&'static str, &Path)> {
+    let mut files = Vec::new();
+    if config.with_sam() {
+        files.extend([("sam", config.sam.as_str()), ("sam_decoder", config.sam_decoder.as_str())]);
+    }
+    if config.with_vitmatte() {
+        files.push(("vitmatte", config.vitmatte.as_str()));
+    }
+    files.into_iter().map(|(name, path)| (name, Path::new(path))).collect()
+}
+
+fn cut_options(c: &MaskConfig) -> CutOptions {
+    CutOptions {
+        rows: c.cut_px,
+        disc: c.disc,
+        strip: c.strip,
+        strip_sides: c.strip_sides,
+        gaussians: c.gaussians,
+        smoothness: c.smoothness,
+        certainty: c.certainty,
+        rounds: c.cut_rounds,
+        band: c.band,
+        ..CutOptions::default()
+    }
+}
+
+fn spread_options(c: &MaskConfig) -> SpreadOptions {
+    SpreadOptions {
+        cut: cut_options(c),
+        cells: c.carve_cells,
+        outside: c.carve_outside,
+        core: c.carve_core,
+        dissent: c.carve_dissent,
+        consent: c.carve_consent,
+        rounds: c.carve_rounds,
+        ..SpreadOptions::default()
+    }
+}
+
+fn soften_options(c: &MaskConfig) -> SoftenOptions {
+    let defaults = SoftenOptions::default();
+    SoftenOptions {
+        side: c.side_px,
+        band: match c.kernel {
+            0 => Band::Discs { share: c.band },
+            kernel => Band::Squares { kernel, iterations: c.iterations },
+        },
+        matting: match c.matting {
+            MattingMethod::Guided => Matting::Guided,
+            _ => Matting::ClosedForm,
+        },
+        closed_form: ClosedFormOptions {
+            epsilon: c.epsilon,
+            tie: c.tie,
+            hold: c.hold,
+            ..defaults.closed_form.clone()
+        },
+        guided: GuidedOptions { radius: c.guided_radius, epsilon: c.guided_epsilon },
+        lowest: c.lowest,
+        highest: c.highest,
+        ..defaults
+    }
+}
+
+impl Line<'_> {
+    fn photo(&self, view: usize) -> Result<Photo, Failure> {
+        Ok(self.capture.views[view].load_photo(&Limits::default()).map_err(capture_failure)?)
+    }
+
+    /// Masks of all views from clicks on some.
+    pub(super) fn make_masks(
+        &self,
+        stage: &Stage,
+        clicks: &Clicks,
+        keep: &mut dyn FnMut(usize, &Photo, Made) -> Result<(), Failure>,
+    ) -> Result<Networks, Failure> {
+        let config = &self.config.mask;
+        let networks = Networks::open(config)?;
+        for file in networks.files() {
+            stage.note(&file);
+        }
+        let hard = self.hard(stage, clicks)?;
+        let soft = soften_options(config);
+        let total = hard.len();
+        let largest = self.capture.views.iter().map(|v| (v.camera.width, v.camera.height)).max();
+        let at_once = networks.at_once(largest.unwrap_or((1, 1)), &soft, config);
+        let mut unsure = Vec::new();
+        for start in (0..total).step_by(at_once) {
+            let made: Vec<Result<(Photo, Made, Vec<String>), Failure>> = (start..(start + at_once).min(total))
+                .into_par_iter()
+                .map(|i| {
+                    let photo = self.photo(i)?;
+                    let (made, warnings) = self.alpha(&networks, i, &photo, &hard[i], clicks, &soft)?;
+                    Ok((photo, made, warnings))
+                })
+                .collect();
+            for (i, made) in (start..).zip(made) {
+                let (photo, made, warnings) = made?;
+                let name = &self.capture.views[i].name;
+                warnings.iter().for_each(|w| stage.warn(&format!("view `{name}`: {w}")));
+                unsure.push(made.unsure);
+                keep(i, &photo, made)?;
+            }
+            stage.monitor().step((start + at_once).min(total) as u64, total as u64, &[]);
+            self.stop_here()?;
+        }
+        Ok(networks)
+    }
+
+    /// Hard masks of all views.
+    fn hard(&self, stage: &Stage, clicks: &Clicks) -> Result<Vec<ViewMask>, Failure> {
+        let views = &self.capture.views;
+        let masks = if let [view] = &views[..] {
+            let found = cut(&view.name, &self.photo(0)?, &clicks.of[0], &cut_options(&self.config.mask));
+            let found = found.map_err(cut_failure)?;
+            Masks { views: vec![ViewMask { mask: found.mask, unsure: found.unsure }], warnings: found.warnings }
+        } else {
+            let views: Vec<SpreadView> = views
+                .iter()
+                .zip(&clicks.of)
+                .map(|(v, clicks)| SpreadView {
+                    name: &v.name,
+                    camera: &v.camera,
+                    clicks,
+                    // held-out photographs shape nothing but their own masks
+                    witness: v.split == Split::Train,
+                })
+                .collect();
+            let load = |i| self.photo(i).map_err(Spread::Load);
+            spread(&views, load, &spread_options(&self.config.mask)).map_err(|e| match e {
+                Spread::Load(e) => e,
+                Spread::Cut(e) => cut_failure(e),
+            })?
+        };
+        masks.warnings.iter().for_each(|w| stage.warn(w));
+        Ok(masks.views)
+    }
+
+    /// One view's alpha.
+    fn alpha(
+        &self,
+        networks: &Networks,
+        view: usize,
+        photo: &Photo,
+        hard: &ViewMask,
+        clicks: &Clicks,
+        soft: &SoftenOptions,
+    ) -> Result<(Made, Vec<String>), Failure> {
+        let mut warnings = Vec::new();
+        let segmented = match networks.has_sam() {
+            true => {
+                let own = &clicks.of[view];
+                let size = scale::working_size(photo.width, photo.height, soft.side);
+                let small = scale::reduce_photo(photo, size);
+                let chosen = if own.is_empty() {
+                    carried(&hard.mask, size)
+                } else {
+                    let (x, y) = (size.0 as f32 / photo.width as f32, size.1 as f32 / photo.height as f32);
+                    let at = |v: f32, s: f32| (v + 0.5) * s - 0.5;
+                    own.iter().map(|c| Click { x: at(c.x, x), y: at(c.y, y), head: c.head }).collect()
+                };
+                let (mask, score) = networks.segment(&small, &chosen)?;
+                if !mask.values.contains(&255) {
+                    warnings.push("SAM found nothing of the head; the built-in cut stands in".into());
+                    None
+                } else {
+                    if score < 0.7 {
+                        warnings.push(format!("SAM gives its mask only {score:.2} of 1; look at it"));
+                    }
+                    Some(mask)
+                }
+            }
+            false => None,
+        };
+        let mask = segmented.as_ref().unwrap_or(&hard.mask);
+        let failed = |e: crate::mask::alpha::AlphaError| {
+            let hint = e.hint();
+            Failure::cannot(e, hint)
+        };
+        let made = if networks.has_vitmatte() {
+            let working = Working::new(photo, mask, soft).map_err(failed)?;
+            warnings.extend(working.warnings(soft));
+            let mut alpha = networks.alpha(&working.photo, &working.trimap)?;
+            // the network takes the trimap for a hint; what is sure is sure
+            for (a, t) in alpha.iter_mut().zip(&working.trimap.values) {
+                match t {
+                    0 => *a = 0.0,
+                    255 => *a = 1.0,
+                    _ => {}
+                }
+            }
+            let share = crate::mask::trimap::unsure_share(&working.trimap);
+            Made { alpha: working.finish(&alpha, soft), trimap: working.trimap, unsure: share }
+        } else {
+            let done = soften(photo, mask, soft).map_err(failed)?;
+            warnings.extend(done.warnings);
+            Made { alpha: done.alpha, trimap: done.trimap, unsure: done.band_share }
+        };
+        Ok((made, warnings))
+    }
+}
+
+/// Why clicks could not be carried.
+enum Spread {
+    Load(Failure),
+    Cut(CutError),
+}
+
+impl From<CutError> for Spread {
+    fn from(e: CutError) -> Spread {
+        Spread::Cut(e)
+    }
+}
+
+/// Clicks for a view that nobody clicked: the deepest places of the mask that was carried to it, each outside the
+/// disc of those before, and the two places farthest from it.
+fn carried(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
+    let (w, h) = (mask.width as usize, mask.height as usize);
+    let mut out = Vec::new();
+    for (head, count) in [(true, 3), (false, 2)] {
+        let outside: Vec<bool> = mask.values.iter().map(|&v| (v >= 128) != head).collect();
+        let mut deep = distance::squared_distance(&outside, w, h);
+        for _ in 0..count {
+            let Some((best, &d)) = deep.iter().enumerate().rev().max_by(|a, b| a.1.total_cmp(b.1)) else { break };
+            if d <= 1.0 || outside[best] {
+                break;
+            }
+            let (x, y) = (best % w, best / w);
+            let at = |v: usize, from: usize, to: u32| (v as f32 + 0.5) * to as f32 / from as f32 - 0.5;
+            out.push(Click { x: at(x, w, size.0), y: at(y, h, size.1), head });
+            let reach = if d.is_finite() { d } else { (w * w + h * h) as f32 / 16.0 };
+            for (i, v) in deep.iter_mut().enumerate() {
+                let (dx, dy) = ((i % w).abs_diff(x) as f32, (i / w).abs_diff(y) as f32);
+                if dx * dx + dy * dy < reach {
+                    *v = 0.0;
+                }
+            }
+        }
+    }
+    out
+}
+
+impl From<ReadError> for Spread {
+    fn from(e: ReadError) -> Spread {
+        Spread::Load(e.into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+
+    #[test]
+    fn defaults_are_those_of_the_modules() {
+        let c = MaskConfig::preset(Preset::Standard);
+        let spread = SpreadOptions::default();
+        let cut = &spread.cut;
+        assert_eq!((c.cut_px, c.gaussians, c.smoothness), (cut.rows, cut.gaussians, cut.smoothness));
+        assert_eq!((c.certainty, c.cut_rounds, c.disc), (cut.certainty, cut.rounds, cut.disc));
+        assert_eq!((c.strip, c.strip_sides), (cut.strip, cut.strip_sides));
+        assert_eq!((c.carve_cells, c.carve_rounds), (spread.cells, spread.rounds));
+        assert_eq!((c.carve_outside, c.carve_core), (spread.outside, spread.core));
+        assert_eq!((c.carve_dissent, c.carve_consent), (spread.dissent, spread.consent));
+        let soften = SoftenOptions::default();
+        assert_eq!((c.side_px, c.lowest, c.highest), (soften.side, soften.lowest, soften.highest));
+        let closed = &soften.closed_form;
+        assert_eq!((c.epsilon, c.tie, c.hold), (closed.epsilon, closed.tie, closed.hold));
+        assert_eq!((c.guided_radius, c.guided_epsilon), (soften.guided.radius, soften.guided.epsilon));
+    }
+
+    #[test]
+    fn carried_clicks_lie_deep_inside_and_far_outside() {
+        // a disc of radius 20 around (40, 50) in 100 × 80, seen at twice the size
+        let inside = |x: u32, y: u32| (x as i32 - 40).pow(2) + (y as i32 - 50).pow(2) <= 400;
+        let values = (0..8000).map(|i| if inside(i % 100, i / 100) { 255 } else { 0 }).collect();
+        let mask = Gray { width: 100, height: 80, values };
+        let clicks = carried(&mask, (200, 160));
+        assert!(clicks.len() >= 3, "{clicks:?}");
+        for click in &clicks {
+            let (x, y) = (((click.x + 0.5) / 2.0 - 0.5) as u32, ((click.y + 0.5) / 2.0 - 0.5) as u32);
+            assert_eq!(inside(x, y), click.head, "{click:?}");
+        }
+        assert!((clicks[0].x - 80.5).abs() <= 2.0 && (clicks[0].y - 100.5).abs() <= 2.0, "{clicks:?}");
+        assert_eq!(clicks.iter().filter(|c| !c.head).count(), 2);
+    }
+
+    #[test]
+    fn an_empty_mask_carries_no_click_on_the_head() {
+        let mask = Gray { width: 10, height: 10, values: vec![0; 100] };
+        assert!(carried(&mask, (10, 10)).iter().all(|c| !c.head));
+    }
+}

@@ -1,0 +1,148 @@
+//! SAM and ViTMatte for the stage `mask`, where this build has them.
+
+use super::PipelineError;
+use crate::config::MaskConfig;
+#[cfg(feature = "matting")]
+use crate::config::VitmatteColors;
+use crate::image::{Gray, Photo};
+use crate::io;
+use crate::mask::Click;
+use crate::mask::alpha::SoftenOptions;
+#[cfg(feature = "matting")]
+use crate::mask::{MaskNetworkError, VitMatteColours, networks};
+use crate::run::{Failure, Fingerprint};
+use serde_json::Value;
+use std::path::Path;
+
+/// The networks that the configuration names; without any, nothing is loaded.
+pub(super) struct Networks {
+    #[cfg(feature = "matting")]
+    of: Option<networks::Networks>,
+}
+
+#[cfg(feature = "matting")]
+fn failure(e: MaskNetworkError) -> Failure {
+    let hint = e.hint();
+    Failure::cannot(e, hint)
+}
+
+impl Networks {
+    /// Digest of a network's file.
+    pub fn digest(path: &Path) -> Result<String, PipelineError> {
+        let limits = io::Limits { file_bytes: 2 << 30, ..io::Limits::default() };
+        Ok(Fingerprint::of_bytes(&io::read_bytes(path, &limits)?))
+    }
+
+    /// Opens what is named. An error in a build without networks.
+    #[cfg(not(feature = "matting"))]
+    pub fn open(config: &MaskConfig) -> Result<Networks, Failure> {
+        if super::clicks::files(config).is_empty() {
+            return Ok(Networks {});
+        }
+        Err(Failure::cannot(
+            "this build cannot run networks, but SAM or ViTMatte is named",
+            "build with `--features matting`, or leave the files out: clicks work without them",
+        ))
+    }
+
+    /// Opens what is named.
+    #[cfg(feature = "matting")]
+    pub fn open(config: &MaskConfig) -> Result<Networks, Failure> {
+        let named = super::clicks::files(config);
+        if named.is_empty() {
+            return Ok(Networks { of: None });
+        }
+        let path = |key: &str| named.iter().find(|(k, _)| *k == key).map(|(_, p)| p.to_path_buf());
+        let files = networks::NetworkFiles {
+            sam: path("sam"),
+            sam_decoder: path("sam_decoder"),
+            vitmatte: path("vitmatte"),
+            onnxruntime: (!config.onnxruntime.is_empty()).then(|| (&config.onnxruntime).into()),
+        };
+        let options = networks::NetworkOptions {
+            memory_bytes: (config.memory_gib * (1u64 << 30) as f64) as u64,
+            colours: match config.vitmatte_colors {
+                VitmatteColors::Auto => None,
+                VitmatteColors::Imagenet => Some(VitMatteColours::ImageNet),
+                VitmatteColors::Half => Some(VitMatteColours::Transformers),
+            },
+            ..networks::NetworkOptions::default()
+        };
+        Ok(Networks { of: Some(networks::Networks::open(&files, &options).map_err(failure)?) })
+    }
+
+    /// What was loaded, one sentence a file.
+    pub fn files(&self) -> Vec<String> {
+        #[cfg(feature = "matting")]
+        if let Some(of) = &self.of {
+            let line = |f: &networks::NetworkFile| {
+                let (path, engine) = (f.path.display(), &f.engine);
+                format!("{}: `{path}`, {} bytes, SHA-256 {}, {}; {engine}", f.role, f.bytes, f.sha256, f.contract)
+            };
+            return of.files().iter().map(line).collect();
+        }
+        Vec::new()
+    }
+
+    /// The same for the record of the stage.
+    pub fn record(&self) -> Value {
+        #[cfg(feature = "matting")]
+        if let Some(of) = &self.of {
+            return serde_json::to_value(of.files()).unwrap_or(Value::Null);
+        }
+        Value::Array(Vec::new())
+    }
+
+    /// How many photographs of a size may be worked on side by side.
+    pub fn at_once(&self, size: (u32, u32), soft: &SoftenOptions, config: &MaskConfig) -> usize {
+        let threads = rayon::current_num_threads();
+        let memory = (config.memory_gib * (1u64 << 30) as f64) as u64;
+        // photograph, alpha and equations
+        let bytes = soft.memory_bytes(size.0, size.1) + 8 * u64::from(size.0) * u64::from(size.1);
+        // half a GiB for pictures without networks, whatever these may take
+        let built_in = ((1u64 << 29) / bytes.max(1)).clamp(1, threads as u64) as usize;
+        #[cfg(feature = "matting")]
+        if let Some(of) = &self.of {
+            let (w, h) = crate::mask::scale::working_size(size.0, size.1, soft.side);
+            return of.photos_at_once(w, h, memory, threads).min(built_in);
+        }
+        let _ = memory;
+        built_in
+    }
+
+    /// Is SAM here?
+    pub fn has_sam(&self) -> bool {
+        #[cfg(feature = "matting")]
+        return self.of.as_ref().is_some_and(|of| of.has_sam());
+        #[cfg(not(feature = "matting"))]
+        false
+    }
+
+    /// Is ViTMatte here?
+    pub fn has_vitmatte(&self) -> bool {
+        #[cfg(feature = "matting")]
+        return self.of.as_ref().is_some_and(|of| of.has_vitmatte());
+        #[cfg(not(feature = "matting"))]
+        false
+    }
+
+    /// SAM's mask of what was clicked, and how good it thinks that is.
+    #[cfg_attr(not(feature = "matting"), allow(unused_variables))]
+    pub fn segment(&self, photo: &Photo, clicks: &[Click]) -> Result<(Gray, f32), Failure> {
+        #[cfg(feature = "matting")]
+        if let Some(of) = &self.of {
+            return of.segment(photo, clicks).map_err(failure);
+        }
+        Err(Failure::cannot("SAM is not loaded", "name its files: `--sam`, `--sam-decoder`"))
+    }
+
+    /// ViTMatte's alpha.
+    #[cfg_attr(not(feature = "matting"), allow(unused_variables))]
+    pub fn alpha(&self, photo: &Photo, trimap: &Gray) -> Result<Vec<f32>, Failure> {
+        #[cfg(feature = "matting")]
+        if let Some(of) = &self.of {
+            return of.alpha(photo, trimap).map_err(failure);
+        }
+        Err(Failure::cannot("ViTMatte is not loaded", "name its file: `--vitmatte`"))
+    }
+}
