@@ -41,7 +41,7 @@ impl Default for AgreeOptions {
         AgreeOptions {
             rows: 160,
             cells: 128,
-            cube: 1.3,
+            cube: 1.6,
             slack_px: 1.0,
             least: 0.005,
             loud: 0.05,

@@ -66,14 +66,6 @@ pub enum CutError {
         /// The view.
         view: String,
     },
-    /// A click names a view that does not exist.
-    #[error("clicks are given for view {found}, but there are {views} views")]
-    NoSuchView {
-        /// The index given.
-        found: usize,
-        /// How many views there are.
-        views: usize,
-    },
     /// Nothing says where the cameras look.
     #[error("the {cameras} cameras {how}, so clicks cannot be carried from one view to another")]
     CamerasAlike {
@@ -113,7 +105,6 @@ impl CutError {
             CutError::Empty { .. } => {
                 "click more of the head: its face, hair and each part of the garment, and the stage beside it"
             }
-            CutError::NoSuchView { .. } => "give clicks for the views of this capture only",
             CutError::CamerasAlike { .. } => {
                 "click every view, or check that each frame has its own pose and cameras look from different sides"
             }

@@ -14,7 +14,7 @@ pub type Rgb = [u8; 3];
 const LEAST_VARIANCE: f64 = 1.0;
 
 /// The stream of random numbers that the k-means start draws from.
-const STREAM: u64 = 0x6d69_7874_7572_65;
+const STREAM: u64 = 0x6d_6978_7475_7265;
 
 #[derive(Clone, Debug, PartialEq)]
 struct Gaussian {

@@ -457,7 +457,7 @@ mod tests {
         let small = |_| Ok(Photo { width: 20, height: 20, rgb: vec![[0; 3]; 400], alpha: None });
         let e = spread::<CutError, _>(&views, small, &SpreadOptions::default()).unwrap_err();
         assert!(matches!(e, CutError::Size { found: (20, 20), camera: (72, 96), .. }), "{e}");
-        let fail = |_| Err(CutError::NoSuchView { found: 9, views: 6 });
-        assert!(matches!(spread(&views, fail, &SpreadOptions::default()), Err(CutError::NoSuchView { .. })));
+        let fail = |_| Err(CutError::Empty { view: "gone".into() });
+        assert!(matches!(spread(&views, fail, &SpreadOptions::default()), Err(CutError::Empty { .. })));
     }
 }
