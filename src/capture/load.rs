@@ -24,14 +24,19 @@ pub struct LoadedView {
 }
 
 impl View {
-    /// Reads the photograph, mask, valid mask and region of this view.
-    pub fn load(&self, limits: &Limits) -> Result<LoadedView, CaptureError> {
-        let picture = io::read_photo(&self.photo, Some(self.photo_size), limits)?;
-        let found = (picture.photo.width, picture.photo.height);
+    /// Reads the photograph alone, at the size of its camera.
+    pub fn load_photo(&self, limits: &Limits) -> Result<Photo, CaptureError> {
+        let photo = io::read_photo(&self.photo, Some(self.photo_size), limits)?.photo;
+        let found = (photo.width, photo.height);
         if found != self.photo_size {
             return Err(self.size_error(&self.photo, found)); // it was replaced since the capture was opened
         }
-        let photo = self.photo_reduced(picture.photo);
+        Ok(self.photo_reduced(photo))
+    }
+
+    /// Reads the photograph, mask, valid mask and region of this view.
+    pub fn load(&self, limits: &Limits) -> Result<LoadedView, CaptureError> {
+        let photo = self.load_photo(limits)?;
         let mask = self.head_mask(photo.alpha.as_deref(), limits)?;
         let mut valid = match &self.valid {
             None => None,
@@ -57,13 +62,7 @@ impl View {
     /// Only the mask of this view, at the camera's size, whatever it means; `None` without one.
     pub fn load_mask(&self, limits: &Limits) -> Result<Option<Gray>, CaptureError> {
         let alpha = match self.mask {
-            MaskSource::Alpha => {
-                let photo = io::read_photo(&self.photo, Some(self.photo_size), limits)?.photo;
-                if (photo.width, photo.height) != self.photo_size {
-                    return Err(self.size_error(&self.photo, (photo.width, photo.height)));
-                }
-                self.photo_reduced(photo).alpha
-            }
+            MaskSource::Alpha => self.load_photo(limits)?.alpha,
             _ => None,
         };
         self.head_mask(alpha.as_deref(), limits)

@@ -228,13 +228,17 @@ pub fn findings(mask: &Gray) -> Vec<&'static str> {
     let bottom = mean(&mut (0..w).map(|x| (h - 1) * w + x));
     let left = mean(&mut (0..h).map(|y| y * w));
     let right = mean(&mut (0..h).map(|y| y * w + w - 1));
+    // shoulders may leave through the lower part of the sides
+    let upper = 3 * h / 5;
+    let high_left = mean(&mut (0..upper).map(|y| y * w));
+    let high_right = mean(&mut (0..upper).map(|y| y * w + w - 1));
     let rows = h / 3..h - h / 3;
     let columns = w / 3..w - w / 3;
     let middle = mean(&mut rows.flat_map(|y| columns.clone().map(move |x| y * w + x)));
     let mut found = Vec::new();
     if (top + bottom + left + right) / 4.0 > 0.75 && middle < 0.5 {
         found.push("looks inverted: white must keep the head");
-    } else if [top, bottom, left, right].iter().filter(|&&b| b > 0.02).count() >= 3 {
+    } else if [top, bottom, high_left, high_right].iter().filter(|&&b| b > 0.02).count() >= 3 {
         found.push("touches three borders or more");
     }
     found
@@ -268,6 +272,16 @@ mod tests {
         assert_eq!(findings(&disc(0, 0, (0.0, 0.0))), ["is empty"]);
         assert_eq!(findings(&disc(255, 255, (0.0, 0.0))), ["is white everywhere"]);
         assert!(findings(&disc(1, 0, (20.0, 15.0)))[0].contains("0 and 1"));
+    }
+
+    #[test]
+    fn shoulders_may_touch_the_lower_sides_but_heads_no_three_borders() {
+        let bust = |from: u32| {
+            let values = (0..1200).map(|i| if i / 40 >= from { 255 } else { 0 }).collect();
+            Gray { width: 40, height: 30, values }
+        };
+        assert!(findings(&bust(22)).is_empty());
+        assert_eq!(findings(&bust(8)), ["touches three borders or more"]);
     }
 
     #[test]

@@ -3,13 +3,14 @@
 use super::ending::{Ending, say};
 use super::options::Common;
 use crate::capture::inspect::inspect;
-use crate::pipeline::capture_options;
+use crate::pipeline::{capture_options, disagreements};
 use crate::run::Exit;
 use std::path::Path;
 
 pub(super) fn go(common: &Common, capture: &Path) -> Result<Exit, Ending> {
     let config = common.resolve(None, None, &[])?;
-    let found = inspect(capture, &capture_options(&config));
+    let mut found = inspect(capture, &capture_options(&config));
+    found.warnings.extend(disagreements(capture, &capture_options(&config)));
     let text = if common.json {
         format!("{}\n", serde_json::to_string(&found).unwrap_or_default())
     } else {

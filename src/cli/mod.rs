@@ -11,6 +11,7 @@ mod ending;
 mod inspect;
 mod line;
 mod options;
+mod page;
 mod screen;
 mod status;
 mod target;
@@ -52,18 +53,77 @@ struct Place {
     path: Option<PathBuf>,
 }
 
+/// Masks from clicks.
+#[derive(Args, Debug, Default)]
+struct Clicks {
+    /// Make masks from the clicks in this prompts.json
+    #[arg(long, value_name = "FILE")]
+    points: Option<PathBuf>,
+    /// A click on one photograph, label 1 for the head, 0 for what is not; repeatable
+    #[arg(long, value_name = "X,Y,LABEL", conflicts_with = "points", allow_hyphen_values = true)]
+    point: Vec<String>,
+    /// The view that --point is on [default: the first]
+    #[arg(long, value_name = "NAME", requires = "point")]
+    view: Option<String>,
+    /// SAM's image encoder, ONNX; needs --sam-decoder
+    #[arg(long, value_name = "FILE")]
+    sam: Option<PathBuf>,
+    /// SAM's prompt encoder and mask decoder, ONNX
+    #[arg(long, value_name = "FILE")]
+    sam_decoder: Option<PathBuf>,
+    /// ViTMatte, ONNX
+    #[arg(long, value_name = "FILE")]
+    vitmatte: Option<PathBuf>,
+    /// An ONNX Runtime library to run them with, instead of the built-in engine
+    #[arg(long, value_name = "FILE")]
+    onnxruntime: Option<PathBuf>,
+}
+
+impl Clicks {
+    /// As keys of the configuration; files by their absolute path, so that the run remembers them from anywhere.
+    fn keys(&self) -> Result<Vec<(String, String, String)>, Ending> {
+        let mut keys = Vec::new();
+        let files = [
+            ("--points", "mask.points", &self.points),
+            ("--sam", "mask.sam", &self.sam),
+            ("--sam-decoder", "mask.sam_decoder", &self.sam_decoder),
+            ("--vitmatte", "mask.vitmatte", &self.vitmatte),
+            ("--onnxruntime", "mask.onnxruntime", &self.onnxruntime),
+        ];
+        for (option, key, file) in files {
+            let Some(file) = file else { continue };
+            let path = crate::io::real_path(file)?;
+            let text = path.to_str().ok_or_else(|| {
+                Ending::cannot(format!("the path `{}` is not UTF-8", path.display()), "rename the file")
+            })?;
+            keys.push((format!("{option} {}", file.display()), key.into(), text.into()));
+        }
+        if !self.point.is_empty() {
+            let list = serde_json::json!(self.point).to_string();
+            keys.push((format!("--point {}", self.point.join(" --point ")), "mask.point".into(), list));
+        }
+        if let Some(view) = &self.view {
+            keys.push((format!("--view {view}"), "mask.view".into(), view.clone()));
+        }
+        Ok(keys)
+    }
+}
+
 #[derive(Subcommand, Debug)]
 enum Command {
     /// Every stage in order, going on where the last command stopped
     #[command(after_long_help = "Examples:
   tiface run captures/002_00
   tiface run captures/002_00 --run /data/002_00 --preset paper --seed 7
+  tiface run captures/002_00 --points prompts.json  masks from clicks on a few photographs
   tiface run runs/002_00 --fresh mesh --set mesh.resolution=1024
   tiface run captures/002_00 --set capture.fit_views=8 --set ensemble.fit=global
   tiface run captures/002_00 --require psnr=28      exit code 3 if the views are worse than that")]
     Run {
         #[command(flatten)]
         place: Place,
+        #[command(flatten)]
+        clicks: Clicks,
         /// Exit with 3 below this bar: watertight, psnr=DB (masked, the best of all); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
@@ -84,9 +144,24 @@ enum Command {
         capture: PathBuf,
     },
     /// Stage: which pixels are the head, and where that puts it
+    #[command(after_long_help = "Examples:
+  tiface mask captures/002_00                   the masks that lie there; a sheet of them in the run's mask/
+  tiface mask captures/002_00 --page            a page to click on, which saves prompts.json
+  tiface mask captures/002_00 --points prompts.json
+  tiface mask captures/002_00 --view 010 --point 181,288,1 --point 32,51,0
+  tiface mask captures/002_00 --points prompts.json --sam encoder.onnx --sam-decoder decoder.onnx \\
+      --vitmatte vitmatte.onnx
+
+Click the face, the hair and every garment of another colour, and the stage twice; on three photographs
+from different sides. The other views follow from the cameras.")]
     Mask {
         #[command(flatten)]
         place: Place,
+        #[command(flatten)]
+        clicks: Clicks,
+        /// Write a page to click on instead, to --out or <capture>_clicks.html
+        #[arg(long)]
+        page: bool,
     },
     /// Stage: learn T-Face, a radiance field, from the masked photographs
     #[command(after_long_help = "Examples:
@@ -317,10 +392,13 @@ impl Cli {
             line::go(common, place.path.as_deref(), until, require, extra, screen, stop)
         };
         match &self.command {
-            Command::Run { place, require } => line(place, "metrics", require, &[]),
+            Command::Run { place, clicks, require } => line(place, "metrics", require, &clicks.keys()?),
             Command::Demo => demo::go(common, screen, stop),
             Command::Inspect { capture } => inspect::go(common, capture),
-            Command::Mask { place } => line(place, "mask", &[], &[]),
+            Command::Mask { place, clicks, page: true } => {
+                page::go(common, place.path.as_deref(), clicks.points.as_deref(), screen)
+            }
+            Command::Mask { place, clicks, page: false } => line(place, "mask", &[], &clicks.keys()?),
             Command::Baseline { place } => line(place, "baseline", &[], &[]),
             Command::Tface { place } => line(place, "tface", &[], &[]),
             Command::Iface { place } => line(place, "iface", &[], &[]),
@@ -412,7 +490,7 @@ mod tests {
     fn every_command_with_something_to_choose_shows_worked_examples() {
         for command in Cli::command().get_subcommands() {
             let shown = command.get_after_long_help().map(|h| h.to_string()).unwrap_or_default();
-            let plain = ["mask", "metrics", "completions"].contains(&command.get_name());
+            let plain = ["metrics", "completions"].contains(&command.get_name());
             assert!(plain || shown.matches("tiface ").count() >= 3, "{}", command.get_name());
         }
     }

@@ -166,6 +166,13 @@ impl Observer for Inner {
                     self.line(&format!("{stage}: already done"));
                 }
             }
+            Event::Note { stage, text } => {
+                if self.json {
+                    self.object(json!({"event": "note", "stage": stage, "text": text}));
+                } else if !self.quiet {
+                    self.line(&format!("{stage}: {text}"));
+                }
+            }
             Event::Warning { stage, text } => {
                 if self.json {
                     self.object(json!({"event": "warning", "stage": stage, "text": text}));

@@ -158,9 +158,15 @@ pub(super) const KEYS: &[Key] = &[
     ),
     Key::word("meaning", "What lies outside a mask: empty (nothing of the head) or ignore (not looked at)."),
     Key::word("points", "Clicks to make masks from: a prompts.json, as `tiface mask --page` saves it."),
-    Key::word("point", "A list of clicks x,y,label on one photograph (label 1: head, 0: not), for a quick try."),
+    Key::word(
+        "point",
+        "A list of clicks x,y,label on one photograph (label 1: head, 0: not), for a quick try.",
+    ),
     Key::word("view", "The view that `mask.point` is on; empty for the first."),
-    Key::word("cut", "From clicks to a hard mask: auto (sam if its files are named), grabcut (built in) or sam."),
+    Key::word(
+        "cut",
+        "From clicks to a hard mask: auto (sam if its files are named), grabcut (built in) or sam.",
+    ),
     Key::word(
         "matting",
         "From a hard mask to an alpha: auto (vitmatte if its file is named), closed (closed form, built in), guided \
@@ -179,19 +185,44 @@ pub(super) const KEYS: &[Key] = &[
     Key::number("cut_px", "Rows of the picture that GrabCut sees, pixels.", 64.0, 2048.0),
     Key::number("gaussians", "Gaussians of each colour mixture.", 1.0, 16.0),
     Key::number("smoothness", "What an edge between equal colours costs (gamma).", 0.0, 1e4),
-    Key::number("certainty", "What contradicting a click costs, times the smoothness (lambda / gamma).", 1.0, 1e4),
+    Key::number(
+        "certainty",
+        "What contradicting a click costs, times the smoothness (lambda / gamma).",
+        1.0,
+        1e4,
+    ),
     Key::number("cut_rounds", "Rounds of fitting colours and cutting.", 1.0, 100.0),
     Key::number("disc", "Radius around a click that is certain, share of the height.", 0.0, 0.5),
-    Key::number("strip", "Width of the strips at the borders that are no head, share of the height.", 0.0, 0.5),
+    Key::number(
+        "strip",
+        "Width of the strips at the borders that are no head, share of the height.",
+        0.0,
+        0.5,
+    ),
     Key::number("strip_sides", "How far down the strips at the sides reach, share of the height.", 0.0, 1.0),
-    Key::number("carve_cells", "Cells along each side of the cube carved to carry clicks to other views.", 16.0, 512.0),
+    Key::number(
+        "carve_cells",
+        "Cells along each side of the cube carved to carry clicks to other views.",
+        16.0,
+        512.0,
+    ),
     Key::number("carve_rounds", "Rounds of carving and cutting.", 1.0, 20.0),
     Key::number("carve_outside", "How far outside the hull nothing is head, share of the height.", 0.0, 0.5),
     Key::number("carve_core", "How deep inside all is head, share of the deepest cell.", 0.0, 1.0),
     Key::number("carve_dissent", "Views that may contradict a cell.", 0.0, 1000.0),
     Key::number("carve_consent", "Share of the views that must keep a cell.", 0.0, 1.0),
-    Key::number("band", "Radius of the unsure band to both sides of the outline, share of the height.", 0.0, 0.5),
-    Key::number("kernel", "Side of a square of ones for the band instead, pixels (the paper: 10); 0 for `band`.", 0.0, 1000.0),
+    Key::number(
+        "band",
+        "Radius of the unsure band to both sides of the outline, share of the height.",
+        0.0,
+        0.5,
+    ),
+    Key::number(
+        "kernel",
+        "Side of a square of ones for the band instead, pixels (the paper: 10); 0 for `band`.",
+        0.0,
+        1000.0,
+    ),
     Key::number("iterations", "How often the square is applied each way (the paper: 5).", 0.0, 1000.0),
     Key::number("epsilon", "Noise of colours in closed-form matting.", 0.0, 1.0),
     Key::number("tie", "Weight that ties sure pixels in closed-form matting.", 1e-6, 1e9),
@@ -237,7 +268,11 @@ impl MaskConfig {
         }
         match self.source {
             MaskSource::Clicks if !given => {
-                return say("mask.source", "is clicks, but there are none", "name a file: `--points prompts.json`");
+                return say(
+                    "mask.source",
+                    "is clicks, but there are none",
+                    "name a file: `--points prompts.json`",
+                );
             }
             MaskSource::Alpha | MaskSource::Folder | MaskSource::None if given => {
                 let hint = "leave out the clicks, or set `mask.source` to clicks";
@@ -257,7 +292,11 @@ impl MaskConfig {
             return say("mask.sam_decoder", "is named without `mask.sam`", "name SAM's encoder too");
         }
         if self.matting == MattingMethod::Vitmatte && self.vitmatte.is_empty() {
-            return say("mask.matting", "is vitmatte, but no file is named", "name it: `--vitmatte model.onnx`");
+            return say(
+                "mask.matting",
+                "is vitmatte, but no file is named",
+                "name it: `--vitmatte model.onnx`",
+            );
         }
         if self.lowest >= self.highest {
             return say("mask.lowest", "is not below `mask.highest`", "0.02 and 0.98 are usual");

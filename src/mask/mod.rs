@@ -45,9 +45,9 @@ mod sam;
 #[cfg(feature = "matting")]
 mod vitmatte;
 
-pub use cut_error::CutError;
 #[cfg(feature = "matting")]
 pub use self::{onnx::MaskNetworkError, vitmatte::VitMatteColours};
+pub use cut_error::CutError;
 
 /// One click of a person on a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -73,8 +73,10 @@ pub(super) fn clicks(config: &MaskConfig, capture: &Capture) -> Result<Option<Cl
                 hint: "`tiface inspect CAPTURE --json` lists them; names have no ending".into(),
             });
         };
-        let frame =
-            points::Frame { file_path: points::file_path(capture, view), points: clicks.map_err(points_failure)? };
+        let frame = points::Frame {
+            file_path: points::file_path(capture, view),
+            points: clicks.map_err(points_failure)?,
+        };
         points::Prompts { frames: vec![frame] }.clicks("mask.point", capture)
     } else {
         let read = points::read_prompts(Path::new(&config.points), &Limits::default());
@@ -150,7 +152,7 @@ fn soften_options(c: &MaskConfig) -> SoftenOptions {
             epsilon: c.epsilon,
             tie: c.tie,
             hold: c.hold,
-            ..defaults.closed_form.clone()
+            ..defaults.closed_form
         },
         guided: GuidedOptions { radius: c.guided_radius, epsilon: c.guided_epsilon },
         lowest: c.lowest,
@@ -161,7 +163,7 @@ fn soften_options(c: &MaskConfig) -> SoftenOptions {
 
 impl Line<'_> {
     fn photo(&self, view: usize) -> Result<Photo, Failure> {
-        Ok(self.capture.views[view].load_photo(&Limits::default()).map_err(capture_failure)?)
+        self.capture.views[view].load_photo(&Limits::default()).map_err(capture_failure)
     }
 
     /// Masks of all views from clicks on some.
@@ -183,7 +185,8 @@ impl Line<'_> {
         let at_once = networks.at_once(largest.unwrap_or((1, 1)), &soft, config);
         let mut unsure = Vec::new();
         for start in (0..total).step_by(at_once) {
-            let made: Vec<Result<(Photo, Made, Vec<String>), Failure>> = (start..(start + at_once).min(total))
+            let made: Vec<Result<(Photo, Made, Vec<String>), Failure>> = (start
+                ..(start + at_once).min(total))
                 .into_par_iter()
                 .map(|i| {
                     let photo = self.photo(i)?;
@@ -210,7 +213,10 @@ impl Line<'_> {
         let masks = if let [view] = &views[..] {
             let found = cut(&view.name, &self.photo(0)?, &clicks.of[0], &cut_options(&self.config.mask));
             let found = found.map_err(cut_failure)?;
-            Masks { views: vec![ViewMask { mask: found.mask, unsure: found.unsure }], warnings: found.warnings }
+            Masks {
+                views: vec![ViewMask { mask: found.mask, unsure: found.unsure }],
+                warnings: found.warnings,
+            }
         } else {
             let views: Vec<SpreadView> = views
                 .iter()
@@ -318,7 +324,9 @@ fn carried(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
         let outside: Vec<bool> = mask.values.iter().map(|&v| (v >= 128) != head).collect();
         let mut deep = distance::squared_distance(&outside, w, h);
         for _ in 0..count {
-            let Some((best, &d)) = deep.iter().enumerate().rev().max_by(|a, b| a.1.total_cmp(b.1)) else { break };
+            let Some((best, &d)) = deep.iter().enumerate().rev().max_by(|a, b| a.1.total_cmp(b.1)) else {
+                break;
+            };
             if d <= 1.0 || outside[best] {
                 break;
             }

@@ -48,7 +48,7 @@ impl Line<'_> {
                 }
                 stage.warn(&text);
             }
-            let doubts = disagreements(&self.capture, &masks);
+            let doubts = doubts(&self.capture, &masks);
             for (view, text) in &doubts {
                 stage.warn(text);
                 if let Some(k) = shown.iter().position(|v| v == view) {
@@ -95,7 +95,8 @@ impl Line<'_> {
     fn masks_of_capture(&self, stage: &Stage) -> Result<Masked, Failure> {
         let limits = Limits::default();
         let total = self.capture.views.len();
-        let mut out = Masked { masks: Vec::with_capacity(total), tiles: vec![], shown: vec![], made: Value::Null };
+        let mut out =
+            Masked { masks: Vec::with_capacity(total), tiles: vec![], shown: vec![], made: Value::Null };
         // a few at a time: decoding is what takes time, and photographs are large
         for (i, views) in self.capture.views.chunks(8).enumerate() {
             let loaded: Vec<_> = views
@@ -171,7 +172,7 @@ impl Line<'_> {
 }
 
 /// The views whose masks do not fit the others, with a sentence each; none where the cameras cannot tell.
-pub fn disagreements(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> {
+fn doubts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> {
     let views: Vec<AgreeView> = (capture.views.iter().zip(masks))
         .map(|(v, mask)| AgreeView { name: &v.name, camera: &v.camera, mask: mask.as_ref() })
         .collect();
@@ -179,6 +180,22 @@ pub fn disagreements(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, S
         Ok(found) => found.doubts.into_iter().map(|d| (d.view, d.text)).collect(),
         Err(_) => Vec::new(),
     }
+}
+
+/// What the masks of a capture say against each other, a sentence for each that a person should look at. What cannot
+/// be read is passed over: `inspect` itself tells that.
+pub fn disagreements(root: &std::path::Path, options: &capture::CaptureOptions) -> Vec<String> {
+    let Ok(capture) = capture::open(root, options) else { return Vec::new() };
+    let masks: Vec<Option<Gray>> = capture
+        .views
+        .par_iter()
+        .map(|v| {
+            let mask = v.load_mask(&options.limits).ok().flatten()?;
+            let size = crate::mask::scale::working_size(mask.width, mask.height, 512);
+            Some(crate::mask::scale::reduce_gray(&mask, size))
+        })
+        .collect();
+    doubts(&capture, &masks).into_iter().map(|(_, text)| text).collect()
 }
 
 /// A page to click on; `prompts` are clicks that are there already.

@@ -77,7 +77,10 @@ impl Networks {
         if let Some(of) = &self.of {
             let line = |f: &networks::NetworkFile| {
                 let (path, engine) = (f.path.display(), &f.engine);
-                format!("{}: `{path}`, {} bytes, SHA-256 {}, {}; {engine}", f.role, f.bytes, f.sha256, f.contract)
+                format!(
+                    "{}: `{path}`, {} bytes, SHA-256 {}, {}; {engine}",
+                    f.role, f.bytes, f.sha256, f.contract
+                )
             };
             return of.files().iter().map(line).collect();
         }

@@ -27,6 +27,13 @@ impl Line<'_> {
         };
         let shown: Vec<_> = sets.iter().map(|set| (set.name.clone(), self.comparable(set))).collect();
         let (mut rows, mut bytes, mut left_out) = (Vec::new(), 0, 0);
+        let masks = self.run.path("mask").join(super::mask::SHEET);
+        if io::is_file(&masks) {
+            let sheet = io::read_bytes(&masks, &limits)?;
+            bytes += sheet.len();
+            let caption = "outline of the mask, unsure pixels in yellow".into();
+            rows.push(Row { name: "masks".into(), pictures: vec![Picture { caption, bytes: sheet }] });
+        }
         for view in &self.capture.views {
             let mut files = Vec::new();
             for (name, set) in &shown {

@@ -85,7 +85,9 @@ impl Line<'_> {
                 settings.remove("capture.path"); // where it lies does not matter, what it holds does
                 inputs.push(("capture", self.digest.clone()));
                 // where clicks and networks lie does not matter either, nor how much memory they get
-                for key in ["points", "point", "view", "sam", "sam_decoder", "vitmatte", "onnxruntime", "memory_gib"] {
+                for key in
+                    ["points", "point", "view", "sam", "sam_decoder", "vitmatte", "onnxruntime", "memory_gib"]
+                {
                     settings.remove(&format!("mask.{key}"));
                 }
                 if let Some(clicks) = &self.clicks {

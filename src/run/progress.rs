@@ -47,6 +47,13 @@ pub enum Event<'a> {
         /// Which.
         stage: &'a str,
     },
+    /// Something worth knowing.
+    Note {
+        /// Which stage.
+        stage: &'a str,
+        /// A sentence.
+        text: &'a str,
+    },
     /// Something went differently than hoped.
     Warning {
         /// Where.
@@ -125,6 +132,10 @@ impl Progress {
         let mut pace = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         change(&mut pace.status);
         self.write(&mut pace)
+    }
+
+    pub fn note(&self, text: &str) {
+        self.observer.event(&Event::Note { stage: &self.stage, text });
     }
 
     pub fn warn(&self, text: &str) {

@@ -38,6 +38,11 @@ impl Stage {
         &self.progress
     }
 
+    /// Tells something worth knowing.
+    pub fn note(&self, text: &str) {
+        self.progress.note(text);
+    }
+
     /// Tells something that went differently than hoped.
     pub fn warn(&self, text: &str) {
         self.progress.warn(text);

@@ -1,0 +1,56 @@
+//! `tiface mask --page`: one file to click on in a browser.
+
+use super::ending::{Ending, say};
+use super::options::Common;
+use super::screen::Screen;
+use crate::capture;
+use crate::io;
+use crate::pipeline::{PipelineError, capture_options, click_page};
+use crate::run::Exit;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+/// Writes the page for a capture. Clicks that are there already, `points` or the capture's own `prompts.json`, are in
+/// it.
+pub(super) fn go(
+    common: &Common,
+    path: Option<&Path>,
+    points: Option<&Path>,
+    screen: &Screen,
+) -> Result<Exit, Ending> {
+    let Some(path) = path else {
+        return Err(Ending::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
+    };
+    let config = common.resolve(None, None, &[])?;
+    // a run knows its capture
+    let saved = path.join("config.toml");
+    let root = match io::is_file(&saved) {
+        true => PathBuf::from(common.resolve(Some(&saved), None, &[])?.capture.path),
+        false => path.to_path_buf(),
+    };
+    let root = if root.as_os_str().is_empty() { path.to_path_buf() } else { root };
+    // photographs are clicked on whether or not they have masks
+    let options = capture::CaptureOptions { masks: capture::MaskChoice::None, ..capture_options(&config) };
+    let capture = capture::open(&root, &options).map_err(PipelineError::from)?;
+    let own = capture.root.join("prompts.json");
+    let points = points.or_else(|| io::is_file(&own).then_some(own.as_path()));
+    let html = click_page(&capture, points)?;
+    let out = common.out.clone().unwrap_or_else(|| format!("{}_clicks.html", capture.name).into());
+    if common.dry_run {
+        screen.note(&format!("would write a page to click on to `{}`", out.display()));
+        return Ok(Exit::Done);
+    }
+    if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
+        io::create_folder(folder)?;
+    }
+    io::write_atomic(&out, html.as_bytes())?;
+    if common.json {
+        say(&format!("{}\n", json!({"event": "result", "page": out})))?;
+    } else if !common.quiet {
+        say(&format!(
+            "page      {} (open it, click, save prompts.json; then `--points prompts.json`)\n",
+            out.display()
+        ))?;
+    }
+    Ok(Exit::Done)
+}
