@@ -302,6 +302,8 @@ fn bitmask(scene: &Scene) -> Option<crate::kernel::march::Bitmask> {
 }
 
 #[cfg(test)]
+mod clicks_tests;
+#[cfg(test)]
 mod ensemble_tests;
 #[cfg(test)]
 mod line_tests;

@@ -160,3 +160,42 @@ fn shells_get_their_completions() {
         assert!(code(&o) == 0 && out(&o).contains("tiface"), "{shell}");
     }
 }
+
+#[test]
+fn a_page_to_click_on_is_one_file_without_a_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 3, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    let o = tiface(dir.path(), &["mask", "head", "--page"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    let page = std::fs::read_to_string(dir.path().join("head_clicks.html")).unwrap();
+    assert!(
+        page.contains("data:image/jpeg;base64,")
+            && !page.contains("http://")
+            && !page.contains("src=\"https")
+    );
+    assert!(!dir.path().join("runs").exists());
+    let o = tiface(dir.path(), &["mask", "head", "--page", "--out", "a/b.html", "--json"]);
+    assert!(out(&o).contains("b.html") && dir.path().join("a/b.html").is_file(), "{}", err(&o));
+}
+
+#[test]
+fn clicks_that_cannot_be_used_are_named_with_the_way_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 3, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    for (words, expected) in [
+        (&["mask", "head", "--points", "none.json"][..], "none.json"),
+        (&["mask", "head", "--point", "1,2"], "`1,2`"),
+        (&["mask", "head", "--point", "500,2,1"], "500"),
+        (&["mask", "head", "--point", "16,20,1", "--view", "nobody"], "nobody"),
+        (&["mask", "head", "--point", "16,20,0"], "head"),
+    ] {
+        let o = tiface(dir.path(), words);
+        assert!([1, 2].contains(&code(&o)), "{words:?}: {}", err(&o));
+        assert!(err(&o).contains(expected) && err(&o).contains("hint: "), "{words:?}: {}", err(&o));
+        assert!(!dir.path().join("runs/head/mask/done.json").exists());
+    }
+    let o = tiface(dir.path(), &["mask", "head", "--points", "a", "--point", "1,2,1"]);
+    assert_eq!(code(&o), 2);
+}

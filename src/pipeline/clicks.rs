@@ -317,7 +317,7 @@ impl From<CutError> for Spread {
 
 /// Clicks for a view that nobody clicked: the deepest places of the mask that was carried to it, each outside the
 /// disc of those before, and the two places farthest from it.
-fn carried(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
+pub(super) fn carried(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
     let (w, h) = (mask.width as usize, mask.height as usize);
     let mut out = Vec::new();
     for (head, count) in [(true, 3), (false, 2)] {

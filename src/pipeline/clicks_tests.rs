@@ -1,0 +1,163 @@
+//! Masks from clicks, as a stage of the line.
+
+use super::clicks::carried;
+use super::*;
+use crate::capture::synthetic::{SyntheticOptions, write_capture};
+use crate::config::Preset;
+use crate::image::Gray;
+use crate::mask::points::{Frame, Prompts, file_path};
+use crate::run::{Quiet, Stop};
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// A synthetic capture, clicks on three of its views at the deepest places of the true masks, and those masks.
+fn clicked(dir: &Path) -> (Config, Vec<Gray>) {
+    let root = dir.join("head");
+    let options = SyntheticOptions { width: 120, height: 160, train: 8, test: 2, seed: 1 };
+    write_capture(&root, &options).unwrap();
+    let capture = capture::open(&root, &CaptureOptions::default()).unwrap();
+    let truth: Vec<Gray> =
+        capture.views.iter().map(|v| v.load_mask(&Limits::default()).unwrap().unwrap()).collect();
+    let frame = |i: usize| Frame {
+        file_path: file_path(&capture, &capture.views[i]),
+        points: carried(&truth[i], (120, 160)),
+    };
+    Prompts { frames: [0, 3, 5].map(frame).to_vec() }.write(&dir.join("prompts.json")).unwrap();
+    let mut config = Config::preset(Preset::Draft);
+    config.capture.path = root.to_str().unwrap().into();
+    config.mask.points = dir.join("prompts.json").to_str().unwrap().into();
+    (config, truth)
+}
+
+fn run(dir: &Path, name: &str) -> Run {
+    Run::open(&dir.join(name), Stop::new(), Arc::new(Quiet))
+}
+
+fn iou(a: &Gray, b: &Gray) -> f64 {
+    assert_eq!((a.width, a.height), (b.width, b.height));
+    let both = |f: fn(bool, bool) -> bool| {
+        a.values.iter().zip(&b.values).filter(|(a, b)| f(**a >= 128, **b >= 128)).count() as f64
+    };
+    both(|a, b| a && b) / both(|a, b| a || b)
+}
+
+#[test]
+fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
+    let dir = tempfile::tempdir().unwrap();
+    let (config, truth) = clicked(dir.path());
+    let run = run(dir.path(), "run");
+    let line = Line::open(&config, &run, false).unwrap();
+    line.remember("mask").unwrap();
+    let done = line.mask().unwrap();
+    assert_eq!(done.summary["masks"], 10);
+    assert_eq!(done.summary["made"]["clicked_views"], 3);
+    assert_eq!(done.summary["suspicious"], serde_json::json!([]));
+    for (view, truth) in line.capture().views.iter().zip(&truth) {
+        // what a training reads
+        let loaded = view.load(&Limits::default()).unwrap().mask.unwrap();
+        assert!(iou(&loaded, truth) > 0.95, "{}: {}", view.name, iou(&loaded, truth));
+        // soft, and hardened at the ends
+        assert!(loaded.values.iter().any(|&v| v > 5 && v < 250) && !loaded.values.contains(&1));
+    }
+    let sheet = io::read_photo(&run.path("mask/sheet.png"), None, &Limits::default()).unwrap().photo;
+    assert!(sheet.width > 120 && sheet.height > 160);
+    assert!(line.mask().unwrap().skipped);
+
+    // the same clicks from another file are the same; other clicks are not
+    let moved = dir.path().join("elsewhere.json");
+    std::fs::rename(&config.mask.points, &moved).unwrap();
+    let mut config = config;
+    config.mask.points = moved.to_str().unwrap().into();
+    assert!(Line::open(&config, &run, false).unwrap().mask().unwrap().skipped);
+    let text = std::fs::read_to_string(&moved).unwrap();
+    let mut prompts: serde_json::Value = serde_json::from_str(&text).unwrap();
+    prompts["frames"][0]["points"].as_array_mut().unwrap().pop();
+    std::fs::write(&moved, prompts.to_string()).unwrap();
+    let error = Line::open(&config, &run, false).unwrap().mask().unwrap_err();
+    assert!(error.to_string().contains("clicks"), "{error}");
+}
+
+#[test]
+fn clicks_that_make_no_sense_end_before_anything_is_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let (good, _) = clicked(dir.path());
+    let refused = |change: &dyn Fn(&mut Config)| {
+        let mut config = good.clone();
+        change(&mut config);
+        let run = run(dir.path(), "refused");
+        let error = Line::open(&config, &run, false).err().expect("an error");
+        assert!(!error.hint().is_empty() && !run.dir().exists());
+        error.to_string()
+    };
+    let file = |text: &str| {
+        let path: PathBuf = dir.path().join("bad.json");
+        std::fs::write(&path, text).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    let text = refused(&|c| c.mask.points = "nowhere.json".into());
+    assert!(text.contains("nowhere.json"), "{text}");
+    let bad =
+        file(r#"{"frames": [{"file_path": "../../etc/passwd", "points": [{"x": 1, "y": 1, "label": 1}]}]}"#);
+    let text = refused(&|c| c.mask.points.clone_from(&bad));
+    assert!(text.contains("bad.json") && text.contains("frames[0]"), "{text}");
+    let bad = file(r#"{"frames": []}"#);
+    assert!(refused(&|c| c.mask.points.clone_from(&bad)).contains("bad.json"));
+    let point = |view: &'static str, point: &'static str| {
+        move |c: &mut Config| {
+            c.mask.points.clear();
+            c.mask.point = vec![point.into()];
+            c.mask.view = view.into();
+        }
+    };
+    assert!(refused(&point("", "9999,1,1")).contains("9999"));
+    assert!(refused(&point("nobody", "1,1,1")).contains("nobody"));
+    assert!(refused(&point("", "1;1;1")).contains("1;1;1"));
+    let text = refused(&|c| c.mask.source = MaskSource::Folder);
+    assert!(text.contains("mask.source"), "{text}");
+}
+
+#[test]
+fn a_network_that_is_no_network_is_refused_in_one_sentence() {
+    let dir = tempfile::tempdir().unwrap();
+    let (mut config, _) = clicked(dir.path());
+    config.mask.vitmatte = config.mask.points.clone();
+    let run = run(dir.path(), "run");
+    let error = Line::open(&config, &run, false).unwrap().mask().unwrap_err();
+    let expected = if cfg!(feature = "matting") { "prompts.json" } else { "this build cannot run networks" };
+    assert!(error.to_string().contains(expected), "{error}");
+    assert!(!run.path("mask/done.json").exists());
+}
+
+/// Random weights mean nothing; that they are asked, and told of in the record, is what is looked at.
+#[cfg(feature = "matting")]
+#[test]
+fn networks_cut_and_soften_and_are_recorded() {
+    let shared =
+        std::env::var("TIFACE_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
+    let models = Path::new(&shared).join("data/mask-models");
+    if !models.is_dir() {
+        eprintln!("skipped: networks on the demo head, there are no mask models at {}", models.display());
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let (mut config, _) = clicked(dir.path());
+    let file = |name: &str| models.join(name).to_str().unwrap().to_owned();
+    config.mask.vitmatte = file("vitmatte_tiny/model.onnx");
+    config.mask.sam = file("sam_tiny/vision_encoder.onnx");
+    config.mask.sam_decoder = file("sam_tiny/prompt_encoder_mask_decoder.onnx");
+    let run = run(dir.path(), "run");
+    let line = Line::open(&config, &run, false).unwrap();
+    // a mask of noise may leave no hull to place the head by: then that is what is said
+    match line.mask() {
+        Ok(done) => {
+            let networks = &done.summary["made"]["networks"];
+            assert_eq!(networks.as_array().unwrap().len(), 3, "{networks}");
+            assert!(networks.to_string().contains("sha256"));
+        }
+        Err(error) => assert!(!error.hint().is_empty(), "{error}"),
+    }
+    let first = run.path("mask").join(format!("{}.png", line.capture().views[0].name));
+    assert!(first.is_file());
+    let inputs: Vec<&str> = line.clicks.as_ref().map(|c| c.inputs.iter().map(|i| i.0).collect()).unwrap();
+    assert_eq!(inputs, ["clicks", "sam", "sam_decoder", "vitmatte"]);
+}
