@@ -123,12 +123,8 @@ train_demo() {
 step "independent readers are here" readers
 step "format" cargo fmt --all -- --check
 step "lints" cargo clippy --release --all-targets -- -D warnings
-step "lints, with wgpu" cargo clippy --release --features wgpu --all-targets -- -D warnings
-step "lints, with matting" \
-  cargo clippy --release --no-default-features --features matting --all-targets -- -D warnings
-step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --no-deps
-step "documentation, with matting" \
-  env RUSTDOCFLAGS="-D warnings" cargo doc --release --no-default-features --features matting --no-deps
+step "lints, with wgpu and matting" cargo clippy --release --features wgpu,matting --all-targets -- -D warnings
+step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting --no-deps
 step "build" cargo build --release --all-targets
 step "tests" tests
 step "networks on both engines" networks
