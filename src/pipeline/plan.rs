@@ -5,6 +5,21 @@ use crate::capture::View;
 use crate::config::{Method, VmConfig};
 use crate::run::{Fingerprint, Plan, read_record};
 
+/// Keys of `[mask]` that say where something lies; what it holds is an input of the stage.
+const PLACES: [&str; 8] = [
+    "mask.points",
+    "mask.point",
+    "mask.view",
+    "mask.sam",
+    "mask.sam_decoder",
+    "mask.vitmatte",
+    "mask.onnxruntime",
+    "mask.memory_gib",
+];
+
+/// Keys of `[mask]` that shape masks which were found.
+const FOUND: [&str; 2] = ["mask.source", "mask.meaning"];
+
 impl Line<'_> {
     /// The stages that a stage reads from. What views are made of decides what `render` needs.
     pub fn needs(&self, stage: &str) -> Vec<&'static str> {
@@ -84,14 +99,16 @@ impl Line<'_> {
                 settings.extend(self.config.values("capture"));
                 settings.remove("capture.path"); // where it lies does not matter, what it holds does
                 inputs.push(("capture", self.digest.clone()));
-                // where clicks and networks lie does not matter either, nor how much memory they get
-                for key in
-                    ["points", "point", "view", "sam", "sam_decoder", "vitmatte", "onnxruntime", "memory_gib"]
-                {
-                    settings.remove(&format!("mask.{key}"));
-                }
-                if let Some(clicks) = &self.clicks {
-                    inputs.extend(clicks.inputs.iter().cloned());
+                match &self.clicks {
+                    // where clicks and networks lie does not matter either, nor how much memory they get
+                    Some(clicks) => {
+                        settings.retain(|key, _| !PLACES.contains(&key.as_str()));
+                        inputs.extend(clicks.inputs.iter().cloned());
+                    }
+                    // how masks would be made does not shape those that were found
+                    None => {
+                        settings.retain(|key, _| !key.starts_with("mask.") || FOUND.contains(&key.as_str()))
+                    }
                 }
             }
             "iface" => {
