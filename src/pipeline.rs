@@ -165,7 +165,7 @@ impl<'a> Line<'a> {
         let mut capture = capture::open(Path::new(&config.capture.path), &capture_options(config))?;
         set_aside(&mut capture, config.capture.fit_views)?;
         let digest = capture_digest(&capture)?;
-        let clicks = clicks::clicks(&config.mask, &capture)?;
+        let clicks = clicks::clicks(&config.mask, &capture, &run.path("mask").join(mask::CLICKS))?;
         let of_file = |file: &str| -> Result<String, PipelineError> {
             Ok(Fingerprint::of_bytes(&io::read_bytes(Path::new(file), &Limits::default())?))
         };

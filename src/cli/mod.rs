@@ -62,7 +62,7 @@ struct Clicks {
     /// A click on one photograph, label 1 for the head, 0 for what is not; repeatable
     #[arg(long, value_name = "X,Y,LABEL", conflicts_with = "points", allow_hyphen_values = true)]
     point: Vec<String>,
-    /// The view that --point is on [default: the first]
+    /// The view that --point is on [default: the first that is trained on]
     #[arg(long, value_name = "NAME", requires = "point")]
     view: Option<String>,
     /// SAM's image encoder, ONNX; needs --sam-decoder
@@ -160,7 +160,7 @@ from different sides. The other views follow from the cameras.")]
         #[command(flatten)]
         clicks: Clicks,
         /// Write a page to click on instead, to --out or <capture>_clicks.html
-        #[arg(long)]
+        #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "onnxruntime"])]
         page: bool,
     },
     /// Stage: learn T-Face, a radiance field, from the masked photographs

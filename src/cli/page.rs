@@ -32,9 +32,17 @@ pub(super) fn go(
     // photographs are clicked on whether or not they have masks
     let options = capture::CaptureOptions { masks: capture::MaskChoice::None, ..capture_options(&config) };
     let capture = capture::open(&root, &options).map_err(PipelineError::from)?;
+    // the capture's own clicks are a help: what is wrong with them does not keep anybody from clicking
     let own = capture.root.join("prompts.json");
-    let points = points.or_else(|| io::is_file(&own).then_some(own.as_path()));
-    let html = click_page(&capture, points)?;
+    let inside =
+        io::real_path(&own).is_ok_and(|p| io::real_path(&capture.root).is_ok_and(|r| p.starts_with(r)));
+    let html = match points {
+        None if inside && io::is_file(&own) => click_page(&capture, Some(&own)).or_else(|e| {
+            screen.note(&format!("page: warning: {e}; the page starts without those clicks"));
+            click_page(&capture, None)
+        })?,
+        points => click_page(&capture, points)?,
+    };
     let out = common.out.clone().unwrap_or_else(|| format!("{}_clicks.html", capture.name).into());
     if common.dry_run {
         screen.note(&format!("would write a page to click on to `{}`", out.display()));

@@ -162,7 +162,7 @@ pub(super) const KEYS: &[Key] = &[
         "point",
         "A list of clicks x,y,label on one photograph (label 1: head, 0: not), for a quick try.",
     ),
-    Key::word("view", "The view that `mask.point` is on; empty for the first."),
+    Key::word("view", "The view that `mask.point` is on; empty for the first that is trained on."),
     Key::word(
         "cut",
         "From clicks to a hard mask: auto (sam if its files are named), grabcut (built in) or sam.",
@@ -280,6 +280,15 @@ impl MaskConfig {
             }
             _ => {}
         }
+        let networks = [&self.sam, &self.sam_decoder, &self.vitmatte];
+        if !self.clicked() && networks.iter().any(|file| !file.is_empty()) {
+            let hint = "give clicks: `--points prompts.json`";
+            return say(
+                "mask.sam",
+                "or `mask.vitmatte` names a network, but there are no clicks to start from",
+                hint,
+            );
+        }
         if self.clicked() && self.meaning == MaskMeaning::Ignore {
             let hint = "set `mask.meaning` to empty: clicks say what is head";
             return say("mask.meaning", "is ignore, but masks are made from clicks", hint);
@@ -366,6 +375,7 @@ mod tests {
         assert_eq!(key(MaskConfig { source: MaskSource::Folder, ..clicked.clone() }), "mask.source");
         assert_eq!(key(MaskConfig { point: vec!["1,2,1".into()], ..clicked.clone() }), "mask.point");
         assert_eq!(key(MaskConfig { meaning: MaskMeaning::Ignore, ..clicked.clone() }), "mask.meaning");
+        assert_eq!(key(MaskConfig { vitmatte: "a.onnx".into(), ..start() }), "mask.sam");
         assert_eq!(key(MaskConfig { sam: "a.onnx".into(), ..clicked.clone() }), "mask.cut");
         assert_eq!(key(MaskConfig { sam_decoder: "a.onnx".into(), ..clicked.clone() }), "mask.sam_decoder");
         assert_eq!(key(MaskConfig { matting: MattingMethod::Vitmatte, ..clicked.clone() }), "mask.matting");

@@ -28,6 +28,12 @@ pub enum CutError {
         /// The view.
         view: String,
     },
+    /// All clicks are on views that are held out, which shape no mask but their own.
+    #[error("the clicks are all on held-out views ({}), which may not shape the masks of others", .views.join(", "))]
+    OnlyHeldOut {
+        /// Their names.
+        views: Vec<String>,
+    },
     /// No click says what the head is.
     #[error("view `{view}`: all {clicks} clicks are on the stage, none is on the head")]
     NoHead {
@@ -99,6 +105,9 @@ impl CutError {
             }
             CutError::NoHead { .. } => {
                 "add clicks on the face, the hair and the garment: label 1 is the head, 0 the stage"
+            }
+            CutError::OnlyHeldOut { .. } => {
+                "click on photographs that are trained on; `tiface inspect CAPTURE --json` tells which are"
             }
             CutError::Contradiction { .. } => "remove the wrong one of the two clicks",
             CutError::TooSmall { .. } => "give a photograph of at least 16 × 16 pixels",

@@ -96,8 +96,9 @@ pub(super) fn known(
     let mut warnings = Vec::new();
     // where discs of both kinds overlap the nearer click is believed
     let mut nearest = vec![f32::INFINITY; width * height];
+    let mut disc = vec![false; width * height];
     for c in clicks {
-        let mut disc = vec![false; width * height];
+        disc.fill(false);
         draw(&mut disc, width, height, (c.x, c.y), (c.x, c.y), radius);
         // a click is worth its own pixel at least
         let own = |v: f32, size: usize| (v.round().max(0.0) as usize).min(size - 1);
@@ -111,18 +112,24 @@ pub(super) fn known(
             }
         }
     }
+    let mut close = Vec::new();
     for (i, a) in clicks.iter().enumerate() {
         for (j, b) in clicks.iter().enumerate().skip(i + 1) {
             let (dx, dy) = (a.x - b.x, a.y - b.y);
             if a.head != b.head && dx * dx + dy * dy < 4.0 * radius * radius {
-                warnings.push(format!(
-                    "view `{view}`: clicks {} and {} call places {:.0} pixels apart head and stage; are both right?",
-                    i + 1,
-                    j + 1,
-                    (dx * dx + dy * dy).sqrt()
-                ));
+                close.push((i + 1, j + 1, (dx * dx + dy * dy).sqrt()));
             }
         }
+    }
+    // one sentence a view, however many there are
+    if let Some((i, j, apart)) = close.first() {
+        let more = match close.len() {
+            1 => String::new(),
+            n => format!(", and so do {} more pairs", n - 1),
+        };
+        warnings.push(format!(
+            "view `{view}`: clicks {i} and {j} call places {apart:.0} pixels apart head and stage{more}; are both right?"
+        ));
     }
     (known, warnings)
 }

@@ -19,7 +19,7 @@ use std::path::{Component, Path};
 const CONVENTION: &str =
     "x right, y down, pixel indices from the top left; label 1 = foreground, 0 = background";
 /// A person clicks a dozen times on a photograph.
-const MOST_POINTS: usize = 10_000;
+const MOST_POINTS: usize = 500;
 /// Longer names fit no file system.
 const LONGEST_NAME: usize = 4096;
 /// Hundred thousand views with ten points each stay below this.

@@ -114,6 +114,11 @@ where
         let view = views.first().map_or(String::new(), |v| v.name.into());
         return Err(CutError::NoClicks { view }.into());
     }
+    if !clicked.iter().any(|&i| views[i].witness) {
+        return Err(
+            CutError::OnlyHeldOut { views: clicked.iter().map(|&i| views[i].name.into()).collect() }.into()
+        );
+    }
     for &i in &clicked {
         let v = &views[i];
         known::check(v.name, v.clicks, v.camera.width, v.camera.height)?;
@@ -207,8 +212,11 @@ impl Spread<'_> {
             let Some(models) = models else {
                 return Err(CutError::Empty { view: self.views[i].name.into() });
             };
-            for (color, &h) in self.photos[i].rgb.iter().zip(&head) {
-                if h { inside.push(*color) } else { outside.push(*color) }
+            // what is held out teaches no other view its colours
+            if self.views[i].witness {
+                for (color, &h) in self.photos[i].rgb.iter().zip(&head) {
+                    if h { inside.push(*color) } else { outside.push(*color) }
+                }
             }
             own[i] = Some((head, models));
         }
@@ -266,9 +274,9 @@ impl Spread<'_> {
             .collect();
         let votes = Votes::count(&self.cube, &witnesses);
         let (n, total) = (self.cube.n, witnesses.len());
-        let all = self.views.iter().filter(|v| v.witness).count();
-        // while only the clicked views have masks they decide alone
-        let (against, least) = if total < all {
+        // while only the clicked views have masks they decide alone; an empty mask is one, too
+        let unmasked = self.views.iter().zip(masks).any(|(v, m)| v.witness && m.is_none());
+        let (against, least) = if unmasked {
             (0, 0)
         } else {
             (self.options.dissent.min(total / 6), (self.options.consent * total as f64).ceil() as usize)

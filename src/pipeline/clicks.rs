@@ -9,7 +9,7 @@ use super::{Line, PipelineError, capture_failure};
 use crate::capture::{Capture, Split};
 use crate::config::{MaskConfig, MattingMethod};
 use crate::image::{Gray, Photo};
-use crate::io::{Limits, ReadError};
+use crate::io::{self, Limits, ReadError};
 use crate::mask::alpha::{Matting, SoftenOptions, Working, soften};
 use crate::mask::closed_form::ClosedFormOptions;
 use crate::mask::cut::{CutOptions, cut};
@@ -27,6 +27,8 @@ use std::path::Path;
 pub(super) struct Clicks {
     /// Of each view, in pixels of its camera.
     pub of: Vec<Vec<Click>>,
+    /// The file they came from, byte for byte; empty without one.
+    pub file: Vec<u8>,
     /// What shapes the masks beside the settings: clicks and network files.
     pub inputs: Vec<(&'static str, String)>,
 }
@@ -57,14 +59,21 @@ fn cut_failure(e: CutError) -> Failure {
 }
 
 /// The clicks that a configuration means, checked against the capture; `None` if masks are not made from clicks.
-pub(super) fn clicks(config: &MaskConfig, capture: &Capture) -> Result<Option<Clicks>, PipelineError> {
+///
+/// `kept` is the copy of the clicks that the run keeps, for when the file is gone.
+pub(super) fn clicks(
+    config: &MaskConfig,
+    capture: &Capture,
+    kept: &Path,
+) -> Result<Option<Clicks>, PipelineError> {
     if !config.clicked() {
         return Ok(None);
     }
+    let mut file = Vec::new();
     let of = if config.points.is_empty() {
         let clicks = config.point.iter().map(|p| points::parse_point(p)).collect::<Result<Vec<_>, _>>();
         let view = match config.view.as_str() {
-            "" => capture.views.first(),
+            "" => capture.views.iter().find(|v| v.split == Split::Train).or(capture.views.first()),
             name => capture.views.iter().find(|v| v.name == name),
         };
         let Some(view) = view else {
@@ -79,8 +88,11 @@ pub(super) fn clicks(config: &MaskConfig, capture: &Capture) -> Result<Option<Cl
         };
         points::Prompts { frames: vec![frame] }.clicks("mask.point", capture)
     } else {
-        let read = points::read_prompts(Path::new(&config.points), &Limits::default());
-        read.and_then(|prompts| prompts.clicks(&config.points, capture))
+        let named = Path::new(&config.points);
+        let path = if !io::is_file(named) && io::is_file(kept) { kept } else { named };
+        file = io::read_bytes(path, &Limits::default())?;
+        let read = points::parse_prompts(path, &file, &Limits::default());
+        read.and_then(|prompts| prompts.clicks(&path.to_string_lossy(), capture))
     }
     .map_err(points_failure)?;
     if of.iter().all(Vec::is_empty) {
@@ -91,9 +103,17 @@ pub(super) fn clicks(config: &MaskConfig, capture: &Capture) -> Result<Option<Cl
     }
     let mut inputs = vec![("clicks", Fingerprint::of_bytes(format!("{of:?}").as_bytes()))];
     for (name, path) in files(config) {
-        inputs.push((name, Networks::digest(path)?));
+        let mut digest = Networks::digest(path)?;
+        // what says how a picture is prepared for the network lies beside it
+        for sidecar in ["preprocessor_config.json", "../preprocessor_config.json"] {
+            let sidecar = path.with_file_name(sidecar);
+            if io::is_file(&sidecar) {
+                digest += &Networks::digest(&sidecar)?;
+            }
+        }
+        inputs.push((name, digest));
     }
-    Ok(Some(Clicks { of, inputs }))
+    Ok(Some(Clicks { of, file, inputs }))
 }
 
 /// The network files that will be used, by their key in `[mask]`.
@@ -163,6 +183,7 @@ fn soften_options(c: &MaskConfig) -> SoftenOptions {
 
 impl Line<'_> {
     fn photo(&self, view: usize) -> Result<Photo, Failure> {
+        self.stop_here()?;
         self.capture.views[view].load_photo(&Limits::default()).map_err(capture_failure)
     }
 
@@ -175,13 +196,19 @@ impl Line<'_> {
     ) -> Result<Networks, Failure> {
         let config = &self.config.mask;
         let networks = Networks::open(config)?;
+        // a file that the engine cannot run is refused before the work
+        let sizes: std::collections::BTreeSet<_> =
+            self.capture.views.iter().map(|v| (v.camera.width, v.camera.height)).collect();
+        for &(w, h) in &sizes {
+            networks.prepare(scale::working_size(w, h, config.side_px))?;
+        }
         for file in networks.files() {
             stage.note(&file);
         }
         let hard = self.hard(stage, clicks)?;
         let soft = soften_options(config);
         let total = hard.len();
-        let largest = self.capture.views.iter().map(|v| (v.camera.width, v.camera.height)).max();
+        let largest = sizes.into_iter().max_by_key(|&(w, h)| u64::from(w) * u64::from(h));
         let at_once = networks.at_once(largest.unwrap_or((1, 1)), &soft, config);
         let mut unsure = Vec::new();
         for start in (0..total).step_by(at_once) {

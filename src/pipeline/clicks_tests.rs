@@ -59,7 +59,7 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
         // soft, and hardened at the ends
         assert!(loaded.values.iter().any(|&v| v > 5 && v < 250) && !loaded.values.contains(&1));
     }
-    let sheet = io::read_photo(&run.path("mask/sheet.png"), None, &Limits::default()).unwrap().photo;
+    let sheet = io::read_photo(&run.path("mask/sheet.jpg"), None, &Limits::default()).unwrap().photo;
     assert!(sheet.width > 120 && sheet.height > 160);
     assert!(line.mask().unwrap().skipped);
 
@@ -69,7 +69,10 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
     let mut config = config;
     config.mask.points = moved.to_str().unwrap().into();
     assert!(Line::open(&config, &run, false).unwrap().mask().unwrap().skipped);
+    // and the run outlives the file
     let text = std::fs::read_to_string(&moved).unwrap();
+    std::fs::remove_file(&moved).unwrap();
+    assert!(Line::open(&config, &run, false).unwrap().mask().unwrap().skipped);
     let mut prompts: serde_json::Value = serde_json::from_str(&text).unwrap();
     prompts["frames"][0]["points"].as_array_mut().unwrap().pop();
     std::fs::write(&moved, prompts.to_string()).unwrap();
@@ -160,4 +163,82 @@ fn networks_cut_and_soften_and_are_recorded() {
     assert!(first.is_file());
     let inputs: Vec<&str> = line.clicks.as_ref().map(|c| c.inputs.iter().map(|i| i.0).collect()).unwrap();
     assert_eq!(inputs, ["clicks", "sam", "sam_decoder", "vitmatte"]);
+}
+
+/// What the clicks that come with a capture are worth, against its true masks.
+#[test]
+fn three_clicked_photographs_of_a_light_stage_mask_them_all() {
+    let shared =
+        std::env::var("TIFACE_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
+    let root = Path::new(&shared).join("data/captures/lps");
+    if !root.is_dir() {
+        eprintln!("skipped: masks of `lps` from clicks, it is not at {}", root.display());
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let truth = capture::open(&root, &CaptureOptions::default()).unwrap();
+    let mut errors = Vec::new();
+    for (name, band) in [("soft", 0.023), ("hard", 0.0)] {
+        let mut config = Config::preset(Preset::Draft);
+        config.capture.path = root.to_str().unwrap().into();
+        config.mask.points = root.join("prompts.json").to_str().unwrap().into();
+        config.mask.band = band;
+        let run = run(dir.path(), name);
+        let line = Line::open(&config, &run, false).unwrap();
+        assert_eq!(line.mask().unwrap().summary["suspicious"], serde_json::json!([]));
+        let (mut overlap, mut error) = (Vec::new(), 0.0);
+        for (view, truth) in line.capture().views.iter().zip(&truth.views) {
+            let limits = Limits::default();
+            let (made, truth) = (view.load_mask(&limits).unwrap(), truth.load_mask(&limits).unwrap());
+            let (made, truth) = (made.unwrap(), truth.unwrap());
+            if view.split == Split::Train {
+                overlap.push(iou(&made, &truth));
+            }
+            if ["010", "013", "015"].contains(&view.name.as_str()) {
+                let off = made.values.iter().zip(&truth.values).map(|(a, b)| (*a as f64 - *b as f64).powi(2));
+                error += off.sum::<f64>();
+            }
+        }
+        let mean = overlap.iter().sum::<f64>() / overlap.len() as f64;
+        let worst = overlap.iter().copied().fold(1.0, f64::min);
+        eprintln!("lps, {name}: IoU {mean:.4}, worst {worst:.4}, squared error {error:.0}");
+        assert!(overlap.len() == 24 && mean > 0.979 && worst > 0.965, "{mean} {worst}");
+        errors.push(error);
+    }
+    assert!(errors[0] < 0.6 * errors[1], "{errors:?}");
+}
+
+#[test]
+fn held_out_photographs_shape_only_their_own_masks() {
+    let dir = tempfile::tempdir().unwrap();
+    let (config, _) = clicked(dir.path());
+    let capture = capture::open(Path::new(&config.capture.path), &CaptureOptions::default()).unwrap();
+    let held_out = capture.views.iter().find(|v| v.split == Split::Test).unwrap();
+    // clicks on a test view as well: deep in its own true mask
+    let mask = held_out.load_mask(&Limits::default()).unwrap().unwrap();
+    let mut prompts =
+        crate::mask::points::read_prompts(Path::new(&config.mask.points), &Limits::default()).unwrap();
+    prompts
+        .frames
+        .push(Frame { file_path: file_path(&capture, held_out), points: carried(&mask, (120, 160)) });
+    prompts.write(Path::new(&config.mask.points)).unwrap();
+    let masks = |name: &str| -> Vec<Vec<u8>> {
+        let run = run(dir.path(), name);
+        let line = Line::open(&config, &run, false).unwrap();
+        line.mask().unwrap();
+        let train = line.capture().views.iter().filter(|v| v.split == Split::Train);
+        train.map(|v| v.load_mask(&Limits::default()).unwrap().unwrap().values).collect()
+    };
+    let before = masks("before");
+    // the same photograph, much darker
+    let mut photo = held_out.load_photo(&Limits::default()).unwrap();
+    photo.rgb.iter_mut().for_each(|c| *c = c.map(|v| v / 3));
+    io::write_png_rgb(&held_out.photo, photo.width, photo.height, &photo.rgb).unwrap();
+    assert!(before == masks("after"));
+    // and alone they are refused
+    prompts.frames.drain(..3);
+    prompts.write(Path::new(&config.mask.points)).unwrap();
+    let run = run(dir.path(), "alone");
+    let error = Line::open(&config, &run, false).unwrap().mask().unwrap_err();
+    assert!(error.to_string().contains("held-out"), "{error}");
 }

@@ -7,15 +7,24 @@ use crate::config::MaskMeaning;
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
 use crate::mask::agree::{AgreeOptions, AgreeView, agree};
-use crate::mask::points;
 use crate::mask::sheet::{SheetOptions, Tile, sheet};
+use crate::mask::{points, scale};
 use crate::run::{Done, Failure, Stage};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// The contact sheet, in the stage's folder.
-pub(super) const SHEET: &str = "sheet.png";
+/// The contact sheet, in the stage's folder. Not a PNG: a view may be called `sheet`.
+pub(super) const SHEET: &str = "sheet.jpg";
+
+/// The clicks that masks were made from, in the stage's folder: the run outlives the file they came from.
+pub(super) const CLICKS: &str = "prompts.json";
+
+/// Longest side of the masks that the head is placed by; a hull is coarser still.
+const PLACED_PX: u32 = 1024;
+
+/// Masks compared with each other, at most.
+const MOST_COMPARED: usize = 256;
 
 /// Masks as they were found or made.
 struct Masked {
@@ -48,16 +57,19 @@ impl Line<'_> {
                 }
                 stage.warn(&text);
             }
-            let doubts = doubts(&self.capture, &masks);
-            for (view, text) in &doubts {
-                stage.warn(text);
+            let meaning = self.config.mask.meaning;
+            let doubts =
+                if meaning == MaskMeaning::Empty { doubts(&self.capture, &masks) } else { Vec::new() };
+            told(&doubts, coverage.len()).iter().for_each(|text| stage.warn(text));
+            for (view, _) in &doubts {
                 if let Some(k) = shown.iter().position(|v| v == view) {
                     tiles[k].suspicions.push("disagrees with the others".into());
                 }
             }
             if !tiles.is_empty() {
                 let picture = sheet(&tiles, &SheetOptions::default());
-                io::write_png_rgb(&stage.folder().join(SHEET), picture.width, picture.height, &picture.rgb)?;
+                let file = stage.folder().join(SHEET);
+                io::write_atomic(&file, &io::jpeg_bytes(&picture, 90, &file)?)?;
             }
             let suspicious: Vec<&str> =
                 tiles.iter().filter(|t| !t.suspicions.is_empty()).map(|t| t.name.as_str()).collect();
@@ -118,7 +130,7 @@ impl Line<'_> {
                 self.write_mask(view, &mask)?;
                 out.tiles.push(tile);
                 out.shown.push(view);
-                out.masks.push(Some(mask));
+                out.masks.push(Some(for_placing(&mask)));
             }
             stage.monitor().step((8 * (i + 1)).min(total) as u64, total as u64, &[]);
             self.stop_here()?;
@@ -136,10 +148,13 @@ impl Line<'_> {
             let options = SheetOptions::default();
             out.tiles.push(Tile::new(name, photo, &made.alpha, Some(&made.trimap), Vec::new(), &options));
             out.shown.push(view);
-            out.masks.push(Some(made.alpha));
+            out.masks.push(Some(for_placing(&made.alpha)));
             unsure += made.unsure;
             Ok(())
         })?;
+        if !self.config.mask.points.is_empty() {
+            io::write_atomic(&stage.folder().join(CLICKS), &clicks.file)?;
+        }
         let clicked = clicks.of.iter().filter(|c| !c.is_empty()).count();
         out.made = json!({
             "clicked_views": clicked,
@@ -173,29 +188,59 @@ impl Line<'_> {
 
 /// The views whose masks do not fit the others, with a sentence each; none where the cameras cannot tell.
 fn doubts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> {
-    let views: Vec<AgreeView> = (capture.views.iter().zip(masks))
-        .map(|(v, mask)| AgreeView { name: &v.name, camera: &v.camera, mask: mask.as_ref() })
+    // evenly spread ones, where there are very many: the check keeps bits of every cell for each
+    let every = capture.views.len().div_ceil(MOST_COMPARED);
+    let views: Vec<AgreeView> = (capture.views.iter().zip(masks).enumerate())
+        .map(|(i, (v, mask))| AgreeView {
+            name: &v.name,
+            camera: &v.camera,
+            mask: mask.as_ref().filter(|_| i.is_multiple_of(every)),
+        })
         .collect();
     match agree(&views, &AgreeOptions::default()) {
-        Ok(found) => found.doubts.into_iter().map(|d| (d.view, d.text)).collect(),
+        // less than that is a matter of pixels
+        Ok(found) => (found.doubts.into_iter())
+            .filter(|d| d.too_much.max(d.too_little) >= 0.005)
+            .map(|d| (d.view, d.text))
+            .collect(),
         Err(_) => Vec::new(),
     }
+}
+
+/// The doubts as sentences; when most masks are doubted it is not single masks that are wrong.
+fn told(doubts: &[(usize, String)], masks: usize) -> Vec<String> {
+    if doubts.len() > 3 && 2 * doubts.len() > masks {
+        let (n, first) = (doubts.len(), &doubts[0].1);
+        return vec![format!(
+            "{n} of {masks} masks contradict each other: they, or the cameras, belong to other photographs ({first}, \
+             and so on)"
+        )];
+    }
+    doubts.iter().map(|(_, text)| text.clone()).collect()
+}
+
+/// A mask at a size that is enough to place the head and to compare masks.
+fn for_placing(mask: &Gray) -> Gray {
+    scale::reduce_gray(mask, scale::working_size(mask.width, mask.height, PLACED_PX))
 }
 
 /// What the masks of a capture say against each other, a sentence for each that a person should look at. What cannot
 /// be read is passed over: `inspect` itself tells that.
 pub fn disagreements(root: &std::path::Path, options: &capture::CaptureOptions) -> Vec<String> {
+    if options.mask_meaning == capture::MaskMeaning::Ignore {
+        return Vec::new(); // no silhouettes
+    }
     let Ok(capture) = capture::open(root, options) else { return Vec::new() };
     let masks: Vec<Option<Gray>> = capture
         .views
         .par_iter()
         .map(|v| {
             let mask = v.load_mask(&options.limits).ok().flatten()?;
-            let size = crate::mask::scale::working_size(mask.width, mask.height, 512);
-            Some(crate::mask::scale::reduce_gray(&mask, size))
+            Some(for_placing(&mask))
         })
         .collect();
-    doubts(&capture, &masks).into_iter().map(|(_, text)| text).collect()
+    let count = masks.iter().flatten().count();
+    told(&doubts(&capture, &masks), count)
 }
 
 /// A page to click on; `prompts` are clicks that are there already.

@@ -102,15 +102,24 @@ impl Networks {
         let memory = (config.memory_gib * (1u64 << 30) as f64) as u64;
         // photograph, alpha and equations
         let bytes = soft.memory_bytes(size.0, size.1) + 8 * u64::from(size.0) * u64::from(size.1);
-        // half a GiB for pictures without networks, whatever these may take
-        let built_in = ((1u64 << 29) / bytes.max(1)).clamp(1, threads as u64) as usize;
+        // at most a GiB and a half for pictures without networks
+        let built_in = (memory.min(3 << 29) / bytes.max(1)).clamp(1, threads as u64) as usize;
         #[cfg(feature = "matting")]
         if let Some(of) = &self.of {
             let (w, h) = crate::mask::scale::working_size(size.0, size.1, soft.side);
             return of.photos_at_once(w, h, memory, threads).min(built_in);
         }
-        let _ = memory;
         built_in
+    }
+
+    /// Plans the networks for photographs of a size, so that what the engine cannot run is refused first.
+    #[cfg_attr(not(feature = "matting"), allow(unused_variables))]
+    pub fn prepare(&self, (width, height): (u32, u32)) -> Result<(), Failure> {
+        #[cfg(feature = "matting")]
+        if let Some(of) = &self.of {
+            of.prepare(width, height, 1).map_err(failure)?;
+        }
+        Ok(())
     }
 
     /// Is SAM here?
