@@ -478,7 +478,7 @@ mod tests {
     #[test]
     fn sizes_and_numbers_beyond_reason_are_refused_by_the_reader() {
         let many = format!("[{}]", vec![r#"{"x":1,"y":1,"label":1}"#; MOST_POINTS + 1].join(","));
-        assert!(parsed(&one("a", &many)).unwrap_err().to_string().contains("the limit is 10000"));
+        assert!(parsed(&one("a", &many)).unwrap_err().to_string().contains("the limit is 500"));
         let few = Limits { views: 1, ..Limits::default() };
         let two = format!("{{\"frames\": [{}, {}]}}", frame("a", POINT), frame("b", POINT));
         let error = parse_prompts(Path::new("p.json"), two.as_bytes(), &few).unwrap_err();
