@@ -28,6 +28,7 @@ mod mask;
 mod mesh;
 mod metrics;
 mod page;
+mod parts;
 mod pictures;
 mod plan;
 mod product;
