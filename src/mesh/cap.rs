@@ -87,6 +87,14 @@ impl Cap {
         });
     }
 
+    /// Gives the ring other colours, made from its points and their normals.
+    pub fn shade(&mut self, colors: impl FnOnce(&[Vec3], &[Vec3]) -> Vec<[f32; 3]>) {
+        let (points, normals): (Vec<Vec3>, Vec<Vec3>) =
+            self.ring.iter().map(|s| (s.position, s.normal)).unzip();
+        let colors = colors(&points, &normals);
+        self.ring.iter_mut().zip(colors).for_each(|(skin, color)| skin.color = color);
+    }
+
     /// Gives those of the points that lie on the cap its colour instead.
     pub fn recolor(&self, points: &[Vec3], colors: &mut [[f32; 3]]) {
         for (p, color) in points.iter().zip(colors).filter(|(p, _)| self.holds(**p)) {
@@ -159,6 +167,20 @@ mod tests {
                 assert!(c[usize::from(p.x > 0.0)] > 0.8, "{p} {c:?}");
             }
         }
+    }
+
+    #[test]
+    fn a_ring_of_another_colour_colours_the_cap_and_nothing_else() {
+        let (_, mut cap) = column();
+        cap.shade(|points, normals| {
+            assert!(normals.iter().all(|n| (n.length() - 1.0).abs() < 1e-3 && n.y.abs() < 0.1));
+            vec![[0.0, 0.0, 1.0]; points.len()]
+        });
+        let points = [Vec3::new(0.1, -1.0, 0.0), Vec3::new(0.3, -0.9, 0.0)];
+        let mut colors = [[0.5; 3]; 2];
+        cap.recolor(&points, &mut colors);
+        assert!((colors[0][2] - 1.0).abs() < 1e-6 && colors[0][0] == 0.0, "{colors:?}");
+        assert_eq!(colors[1], [0.5; 3]);
     }
 
     #[test]

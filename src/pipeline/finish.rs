@@ -14,6 +14,9 @@ use crate::run::Monitor;
 use glam::{Mat3, Vec3};
 use serde_json::{Map, Value, json};
 
+/// How far the true surface may lie from a triangle, in cells: the chords of large triangles and half a cell.
+pub(super) const REACH: f32 = 2.5;
+
 /// The product, what is to be kept beside it, and what happened.
 pub(super) struct Finished {
     /// What an artist opens.
@@ -79,8 +82,7 @@ impl Line<'_> {
         let config = BakeConfig {
             side: c.texture_samples,
             gutter_px: c.gutter_px,
-            // the chords of large triangles and half a cell
-            reach: 2.5 * cell,
+            reach: REACH * cell,
             viewer: match c.texture_view {
                 TextureView::Cameras => Viewer::Cameras,
                 TextureView::Normal => Viewer::Normal,

@@ -1,13 +1,14 @@
 //! Stage `mesh`: the zero level set of the learned distance, closed, in the dataset's world.
 
-use super::finish::Finished;
+use super::finish::{Finished, REACH};
 use super::parts::Whole;
 use super::product::Product;
 use super::{Fields, Line, PipelineError, export};
 use crate::capture::{self, Split};
-use crate::config::MeshConfig;
+use crate::config::{MeshConfig, TextureView};
 use crate::geom::{Camera, Mesh, Similarity};
 use crate::io::{self, Limits};
+use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::read::ReadMeshError;
 use crate::mesh::{self, Cap, MeshError, ply};
 use crate::run::{Done, Failure};
@@ -59,7 +60,7 @@ impl Line<'_> {
             };
             let (mut surface, report) = extracted.map_err(failed)?;
             report.warnings(c.cap).iter().for_each(|w| stage.warn(w));
-            let cap = Cap::of(&surface, report.bounds(), report.cell_size);
+            let mut cap = Cap::of(&surface, report.bounds(), report.cell_size);
             if let Some(cap) = &cap {
                 if c.cap {
                     cap.paint(&mut surface);
@@ -75,6 +76,17 @@ impl Line<'_> {
             io::write_atomic(&stage.folder().join("surface.ply"), &bytes)?;
             let parts = stage.folder().join("parts");
             let surface_triangles = surface.triangles.len();
+            // vertices have the colour seen straight; textures and rays that of the cameras, and so their cap
+            if let Some(cap) = cap.as_mut().filter(|_| c.texture_view == TextureView::Cameras) {
+                let learned = Learned {
+                    gradient: &|p| field.sdf_gradient(p),
+                    colors: &|p, n, counts, d| field.colors(p, n, counts, d),
+                };
+                let cameras: Vec<Camera> =
+                    cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
+                let reach = REACH * report.cell_size;
+                cap.shade(|p, n| seen_colors(&surface, p, n, &learned, &cameras, reach));
+            }
             let finished =
                 self.finish(&surface, cap.as_ref(), report.cell_size, &scene, field, stage.monitor());
             let Finished { product, linear, report: steps, warnings } = finished.map_err(failed)?;

@@ -221,3 +221,81 @@ impl Eye<'_> {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Radiance, Surface};
+    use super::*;
+    use crate::geom::Aabb;
+    use crate::mesh::{Cap, Skin};
+    use glam::Vec3;
+
+    /// A field that is red everywhere.
+    struct Red;
+
+    impl Fields for Red {
+        fn surface(&self) -> Result<&dyn Surface, Failure> {
+            Ok(self)
+        }
+
+        fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+            panic!("no radiance field is asked for")
+        }
+    }
+
+    impl Surface for Red {
+        fn sdf(&self, _: &[Vec3]) -> Vec<f32> {
+            panic!("no distance is asked for")
+        }
+
+        fn sdf_gradient(&self, _: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+            panic!("no distance is asked for")
+        }
+
+        fn color(&self, points: &[Vec3], _: &[Vec3], _: &[Vec3]) -> Vec<[f32; 3]> {
+            vec![[1.0, 0.0, 0.0]; points.len()]
+        }
+
+        fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
+            vec![[1.0, 0.0, 0.0]; directions.len()]
+        }
+
+        fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {
+            None
+        }
+    }
+
+    #[test]
+    fn rays_see_the_cap_painted_and_the_skin_as_the_field_has_it() {
+        // to the left a square in the box's face z = 1, to the right one within
+        let square = |x: f32, z: f32| {
+            [(x, -0.9), (x + 0.9, -0.9), (x + 0.9, 0.9), (x, 0.9)].map(|(x, y)| Vec3::new(x, y, z))
+        };
+        let mesh = Mesh {
+            positions: [square(-0.9, 1.0), square(0.0, 0.5)].concat(),
+            triangles: vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]],
+            ..Mesh::default()
+        };
+        let skin = Skin { position: Vec3::new(-0.9, 0.0, 0.9), normal: -Vec3::X, color: [0.0, 1.0, 0.0] };
+        let cap = Cap { bounds: Aabb::SCENE, near: 1e-4, ring: vec![skin] };
+        let camera = Camera::above(8, 8, 8.0, 4.0);
+        let look = |cap: Option<Cap>| {
+            let whole = Whole { mesh: mesh.clone(), cap };
+            let bvh = Bvh::new(&whole.mesh);
+            let eye = Eye {
+                fields: &Red,
+                whole: Some((&whole, bvh)),
+                product: None,
+                samples: 1,
+                world_from_scene: Similarity::IDENTITY,
+                stop: &Stop::new(),
+            };
+            let view = eye.view(Method::Raycast, &camera).unwrap().unwrap();
+            // at x = (2.5 − 4) / 8 · 3 = −0.56 and (5.5 − 4) / 8 · 3.5 = 0.66
+            [view.color.pixel(2, 4).to_vec(), view.color.pixel(5, 4).to_vec()]
+        };
+        let red = vec![1.0, 0.0, 0.0, 1.0];
+        assert_eq!(look(Some(cap)), [vec![0.0, 1.0, 0.0, 1.0], red.clone()]);
+        assert_eq!(look(None), [red.clone(), red]);
+    }
+}
