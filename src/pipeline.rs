@@ -30,6 +30,7 @@ mod mesh;
 mod metrics;
 mod networks;
 mod page;
+mod parts;
 mod pictures;
 mod plan;
 mod product;

@@ -45,6 +45,15 @@ impl Similarity {
         self.rotation.as_mat3()
     }
 
+    /// First `first`, then this one.
+    pub fn after(&self, first: &Similarity) -> Similarity {
+        Similarity {
+            scale: self.scale * first.scale,
+            rotation: self.rotation * first.rotation,
+            translation: self.point_f64(first.translation),
+        }
+    }
+
     /// The way back.
     pub fn inverse(&self) -> Similarity {
         let rotation = self.rotation.transpose();
@@ -68,5 +77,14 @@ mod tests {
         assert!(s.inverse().point(s.point(p)).distance(p) < 1e-6);
         let d = Vec3::new(0.6, 0.0, 0.8);
         assert!((s.direction(d).length() - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn one_after_the_other_is_both() {
+        let turn = Similarity { rotation: DMat3::from_rotation_z(0.3), ..Similarity::IDENTITY };
+        let far = Similarity::scale_translate(2.0, DVec3::new(5e6, -3e6, 2e5));
+        let p = DVec3::new(0.3, -0.8, 0.1);
+        assert!(turn.after(&far).point_f64(p).distance(turn.point_f64(far.point_f64(p))) < 1e-8);
+        assert_eq!(Similarity::IDENTITY.after(&far), far);
     }
 }

@@ -13,14 +13,25 @@ use rayon::prelude::*;
 const RING: usize = 512;
 
 /// Where a surface is capped, and with which colours.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Cap {
     /// The box of the extraction.
-    bounds: Aabb,
+    pub bounds: Aabb,
     /// How near to the box's face the cap lies.
-    near: f32,
+    pub near: f32,
     /// Skin around the cap.
-    ring: Vec<(Vec3, [f32; 3])>,
+    pub ring: Vec<Skin>,
+}
+
+/// A point of the skin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Skin {
+    /// Where it is.
+    pub position: Vec3,
+    /// Unit normal, pointing out; zero where none is known.
+    pub normal: Vec3,
+    /// sRGB-coded.
+    pub color: [f32; 3],
 }
 
 impl Cap {
@@ -42,8 +53,12 @@ impl Cap {
         }
         let all: Vec<usize> = (0..on_ring.len()).filter(|&i| on_ring[i]).collect();
         let step = all.len().div_ceil(RING).max(1);
-        let color = |i: usize| mesh.colors.get(i).copied().unwrap_or([0.5; 3]);
-        let ring = all.into_iter().step_by(step).map(|i| (mesh.positions[i], color(i))).collect();
+        let skin = |i: usize| Skin {
+            position: mesh.positions[i],
+            normal: mesh.normals.get(i).copied().unwrap_or(Vec3::ZERO),
+            color: mesh.colors.get(i).copied().unwrap_or([0.5; 3]),
+        };
+        let ring = all.into_iter().step_by(step).map(skin).collect();
         Some(Cap { ring, ..cap })
     }
 
@@ -55,9 +70,9 @@ impl Cap {
     /// The colour of a point of the cap.
     pub fn color(&self, p: Vec3) -> [f32; 3] {
         let (mut sum, mut total) = ([0f64; 3], 0f64);
-        for (at, color) in &self.ring {
+        for Skin { position, color, .. } in &self.ring {
             // the fourth power keeps the middle from being grey of everything
-            let w = 1.0 / f64::from(at.distance_squared(p)).max(1e-18).powi(2);
+            let w = 1.0 / f64::from(position.distance_squared(p)).max(1e-18).powi(2);
             total += w;
             (0..3).for_each(|k| sum[k] += w * f64::from(color[k]));
         }
@@ -70,6 +85,21 @@ impl Cap {
         colors.par_iter_mut().zip(&*positions).filter(|(_, p)| self.holds(**p)).for_each(|(c, &p)| {
             *c = self.color(p);
         });
+    }
+
+    /// Gives the ring other colours, made from its points and their normals.
+    pub fn shade(&mut self, colors: impl FnOnce(&[Vec3], &[Vec3]) -> Vec<[f32; 3]>) {
+        let (points, normals): (Vec<Vec3>, Vec<Vec3>) =
+            self.ring.iter().map(|s| (s.position, s.normal)).unzip();
+        let colors = colors(&points, &normals);
+        self.ring.iter_mut().zip(colors).for_each(|(skin, color)| skin.color = color);
+    }
+
+    /// Gives those of the points that lie on the cap its colour instead.
+    pub fn recolor(&self, points: &[Vec3], colors: &mut [[f32; 3]]) {
+        for (p, color) in points.iter().zip(colors).filter(|(p, _)| self.holds(**p)) {
+            *color = self.color(*p);
+        }
     }
 
     /// Takes the cap off: an opening for those who fit something to it. Returns the triangles removed.
@@ -137,6 +167,20 @@ mod tests {
                 assert!(c[usize::from(p.x > 0.0)] > 0.8, "{p} {c:?}");
             }
         }
+    }
+
+    #[test]
+    fn a_ring_of_another_colour_colours_the_cap_and_nothing_else() {
+        let (_, mut cap) = column();
+        cap.shade(|points, normals| {
+            assert!(normals.iter().all(|n| (n.length() - 1.0).abs() < 1e-3 && n.y.abs() < 0.1));
+            vec![[0.0, 0.0, 1.0]; points.len()]
+        });
+        let points = [Vec3::new(0.1, -1.0, 0.0), Vec3::new(0.3, -0.9, 0.0)];
+        let mut colors = [[0.5; 3]; 2];
+        cap.recolor(&points, &mut colors);
+        assert!((colors[0][2] - 1.0).abs() < 1e-6 && colors[0][0] == 0.0, "{colors:?}");
+        assert_eq!(colors[1], [0.5; 3]);
     }
 
     #[test]

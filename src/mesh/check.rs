@@ -9,12 +9,12 @@
 //!   Shewchuk's error bound (1997); what the bound cannot tell from zero counts as touching.
 //! - sliver: quality `4 √3 · area / Σ edge²` below 0.05 (1 for an equilateral triangle).
 
+use super::read::places;
 use super::uv_check::UvReport;
 use crate::geom::{Aabb, Bvh, Mesh};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use serde::Serialize;
-use std::collections::HashMap;
 use std::fmt;
 
 /// Triangles worse than this are slivers; an equilateral one has 1.
@@ -191,7 +191,7 @@ impl fmt::Display for CheckReport {
 
 /// Examines a mesh whose coordinates are `unit_m` metres each. Never panics, whatever the mesh.
 pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
-    let (weld, welded_vertices) = weld(mesh);
+    let (weld, welded_vertices) = places(mesh);
     let valid =
         |t: &[u32; 3]| t.iter().all(|&i| mesh.positions.get(i as usize).is_some_and(|p| p.is_finite()));
     // Triangles that are still triangles after welding, by their welded corners.
@@ -254,21 +254,6 @@ pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
         bad_normals: mesh.normals.iter().filter(bad_normal).count(),
         uv: None,
     }
-}
-
-/// For each vertex the number of its position, and how many positions there are.
-fn weld(mesh: &Mesh) -> (Vec<u32>, usize) {
-    let mut numbers = HashMap::with_capacity(mesh.positions.len());
-    let weld = mesh
-        .positions
-        .iter()
-        .map(|p| {
-            let next = numbers.len() as u32;
-            // + 0 makes −0 and 0 equal
-            *numbers.entry(p.to_array().map(|v| (v + 0.0).to_bits())).or_insert(next)
-        })
-        .collect();
-    (weld, numbers.len())
 }
 
 #[derive(Default)]

@@ -3,8 +3,11 @@
 //!
 //! The dataset's world stays untouched until here. glTF and OBJ are right-handed with +Y up, so a
 //! capture with another `up` is turned once, in the vertices: `(x, y, z) → (x, z, −y)` for +Z up.
+//!
+//! A scene may lie kilometres from its origin, where f32 steps over a whole head. So meshes come in
+//! coordinates of their own with the way into the world in f64, and are made ready around their own middle.
 
-use crate::geom::Mesh;
+use crate::geom::{Mesh, Similarity};
 use glam::{DMat3, DVec3, Vec3};
 
 /// How a mesh leaves the dataset's world.
@@ -18,11 +21,29 @@ pub struct ExportOptions {
     pub unit_m: f64,
     /// Do the colours already contain the light? Then viewers should not light them again.
     pub unlit: bool,
+    /// From the mesh's own coordinates into the dataset's world.
+    pub world_from_mesh: Similarity,
 }
 
 impl Default for ExportOptions {
     fn default() -> ExportOptions {
-        ExportOptions { name: "head".into(), up: Vec3::Y, unit_m: 1.0, unlit: true }
+        ExportOptions {
+            name: "head".into(),
+            up: Vec3::Y,
+            unit_m: 1.0,
+            unlit: true,
+            world_from_mesh: Similarity::IDENTITY,
+        }
+    }
+}
+
+impl ExportOptions {
+    /// From the mesh's own coordinates to metres with +Y up.
+    pub(super) fn file_from_mesh(&self) -> Result<Similarity, ExportError> {
+        check_unit(self.unit_m)?;
+        let rotation = turn_to_y_up(self.up)?;
+        let turned = Similarity { scale: self.unit_m, rotation, translation: DVec3::ZERO };
+        Ok(turned.after(&self.world_from_mesh))
     }
 }
 
@@ -142,16 +163,60 @@ pub(super) struct Ready {
     pub colors: Vec<[f32; 3]>,
     /// Without those that use a vertex twice.
     pub triangles: Vec<[u32; 3]>,
-    /// To be added to every position; zero unless asked for and worth it.
-    pub translation: Vec3,
+    /// To be added to every position, in f64; zero unless the mesh lies far from the origin. Every
+    /// coordinate is a number of f32.
+    pub translation: DVec3,
 }
 
-/// Which offset from the origin, in sizes of the mesh, makes f32 lose visible precision.
-const FAR_IN_SIZES: f64 = 64.0;
+impl Ready {
+    /// Does f32 lose visible precision where this mesh lies?
+    pub fn is_far(&self) -> bool {
+        self.translation != DVec3::ZERO
+    }
 
-/// Checks, turns and scales. With `recentre`, a mesh far from the origin is written around its own
-/// middle, and that middle comes back as `translation`.
-pub(super) fn ready(mesh: &Mesh, turn: DMat3, unit_m: f64, recentre: bool) -> Result<Ready, ExportError> {
+    /// Where a position really is.
+    pub fn place(&self, position: Vec3) -> DVec3 {
+        self.translation + position.as_dvec3()
+    }
+}
+
+/// From how many of its own sizes away on a mesh counts as far: up to there f32 rounds by less than a
+/// millionth of the size.
+const FAR_IN_SIZES: f64 = 15.0;
+
+/// The box of a mesh where it goes.
+fn placed_box(mesh: &Mesh, file_from_mesh: &Similarity) -> (DVec3, DVec3) {
+    let empty = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+    let place = |p: &Vec3| file_from_mesh.point_f64(p.as_dvec3());
+    mesh.positions.iter().map(place).fold(empty, |(low, high), q| (low.min(q), high.max(q)))
+}
+
+/// Middle and size of a box, and whether it is far from the origin.
+fn middle((low, high): (DVec3, DVec3)) -> (DVec3, f64, bool) {
+    let (center, size) = (0.5 * (low + high), (high - low).max_element());
+    (center, size, center.abs().max_element() > FAR_IN_SIZES * size)
+}
+
+/// What becomes of a mesh far from the origin in a format that keeps every vertex where it is: the files hold
+/// enough digits, but many readers do not. `None` where nothing is lost.
+pub fn distance_warning(mesh: &Mesh, options: &ExportOptions, ending: &str) -> Option<String> {
+    let (center, size, far) = middle(placed_box(mesh, &options.file_from_mesh().ok()?));
+    let away = center.abs().max_element();
+    // the distance between neighbouring numbers of f32
+    let step = 2f64.powf(away.log2().floor() - 23.0);
+    (far && away.is_finite()).then(|| {
+        format!(
+            "the .{ending} lies {away:.3e} from the origin, {:.1e} times its own size: readers in single precision \
+             round its vertices to {step:.1e}, {:.1e} of its size; the .glb is written around its own middle",
+            away / size,
+            step / size
+        )
+    })
+}
+
+/// Checks, turns and scales. A mesh far from the origin comes back around its own middle, with that middle as
+/// `translation`.
+pub(super) fn ready(mesh: &Mesh, file_from_mesh: &Similarity) -> Result<Ready, ExportError> {
     let vertices = mesh.positions.len();
     for (triangle, t) in mesh.triangles.iter().enumerate() {
         if let Some(&index) = t.iter().find(|&&i| i as usize >= vertices) {
@@ -167,19 +232,13 @@ pub(super) fn ready(mesh: &Mesh, turn: DMat3, unit_m: f64, recentre: bool) -> Re
     if triangles.is_empty() {
         return Err(ExportError::Empty);
     }
-    let there = turn * unit_m;
-    let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-    for p in &mesh.positions {
-        let q = there * p.as_dvec3();
-        (low, high) = (low.min(q), high.max(q));
-    }
-    let (center, size) = (0.5 * (low + high), (high - low).max_element());
-    let far = recentre && center.abs().max_element() > FAR_IN_SIZES * size;
-    let translation = if far { center.as_vec3() } else { Vec3::ZERO };
+    let (center, _, far) = middle(placed_box(mesh, file_from_mesh));
+    // rounded, so that those who keep it in f32 and those who do not have the same
+    let translation = if far { center.as_vec3().as_dvec3() } else { DVec3::ZERO };
     let mut positions = Vec::with_capacity(vertices);
     for (vertex, p) in mesh.positions.iter().enumerate() {
         // + 0 turns −0 into 0, so that equal positions are equal bytes
-        let q = (there * p.as_dvec3() - translation.as_dvec3()).as_vec3() + Vec3::ZERO;
+        let q = (file_from_mesh.point_f64(p.as_dvec3()) - translation).as_vec3() + Vec3::ZERO;
         if !q.is_finite() || !translation.is_finite() {
             return Err(ExportError::NotFinite { vertex, what: "position", found: p.to_string() });
         }
@@ -189,7 +248,8 @@ pub(super) fn ready(mesh: &Mesh, turn: DMat3, unit_m: f64, recentre: bool) -> Re
         let found = format!("{:?}", mesh.colors[vertex]);
         return Err(ExportError::NotFinite { vertex, what: "color", found });
     }
-    let turned = |n: &Vec3| (turn * n.as_dvec3()).normalize_or_zero().as_vec3() + Vec3::ZERO;
+    let turned =
+        |n: &Vec3| (file_from_mesh.rotation * n.as_dvec3()).normalize_or_zero().as_vec3() + Vec3::ZERO;
     let mut normals: Vec<Vec3> = mesh.normals.iter().map(turned).collect();
     mend_normals(&mut normals, &positions, &triangles);
     Ok(Ready { positions, normals, colors: mesh.colors.clone(), triangles, translation })
@@ -285,7 +345,7 @@ mod tests {
 
     #[test]
     fn a_mesh_that_is_empty_or_damaged_is_an_error_before_there_are_bytes() {
-        let go = |m: &Mesh| ready(m, DMat3::IDENTITY, 1.0, true).map(|_| ());
+        let go = |m: &Mesh| ready(m, &Similarity::IDENTITY).map(|_| ());
         assert_eq!(go(&Mesh::default()), Err(ExportError::Empty));
         let folded = Mesh { triangles: vec![[0, 0, 1]], ..triangle() };
         assert_eq!(go(&folded), Err(ExportError::Empty));
@@ -299,9 +359,7 @@ mod tests {
         assert!(matches!(
             ready(
                 &Mesh { positions: vec![Vec3::ZERO, Vec3::splat(1e38), Vec3::Y], ..triangle() },
-                DMat3::IDENTITY,
-                1e3,
-                false
+                &Similarity::scale_translate(1e3, DVec3::ZERO),
             ),
             Err(ExportError::NotFinite { vertex: 1, .. })
         ));
@@ -312,7 +370,7 @@ mod tests {
     fn normals_come_out_unit_and_missing_ones_are_mended() {
         let mut m = triangle();
         m.normals = vec![Vec3::ZERO, Vec3::new(0.0, 0.0, 3.0), Vec3::NAN];
-        let r = ready(&m, DMat3::IDENTITY, 1.0, false).unwrap();
+        let r = ready(&m, &Similarity::IDENTITY).unwrap();
         assert_eq!(r.normals, vec![Vec3::Z; 3]);
     }
 
@@ -321,10 +379,23 @@ mod tests {
         let far = Vec3::new(10_000.0, 0.0, -10_000.0);
         let mut m = triangle();
         m.positions = vec![far, far + Vec3::X, far + Vec3::new(0.0, 0.25, 0.0)];
-        let r = ready(&m, DMat3::IDENTITY, 1.0, true).unwrap();
+        let r = ready(&m, &Similarity::IDENTITY).unwrap();
         // the middle of the box
-        assert_eq!(r.translation, Vec3::new(10_000.5, 0.125, -10_000.0));
+        assert_eq!(r.translation, DVec3::new(10_000.5, 0.125, -10_000.0));
         assert_eq!(r.positions[0], Vec3::new(-0.5, -0.125, 0.0));
-        assert_eq!(ready(&m, DMat3::IDENTITY, 1.0, false).unwrap().positions, m.positions);
+        assert_eq!(r.place(r.positions[1]), (far + Vec3::X).as_dvec3());
+    }
+
+    #[test]
+    fn only_what_is_far_is_warned_of_and_in_numbers() {
+        let at = |x: f64| ExportOptions {
+            world_from_mesh: Similarity::scale_translate(0.25, DVec3::new(x, 0.0, 0.0)),
+            ..ExportOptions::default()
+        };
+        // half a unit wide: the middle of the box is 0.125 further
+        assert_eq!(distance_warning(&triangle(), &at(3.0), "obj"), None);
+        // f32 above 2²² has steps of a half
+        let text = distance_warning(&triangle(), &at(5e6), "obj").unwrap();
+        assert!(text.contains("the .obj lies 5.000e6") && text.contains("to 5.0e-1, 2.0e0 of its"), "{text}");
     }
 }

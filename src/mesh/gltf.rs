@@ -5,7 +5,8 @@
 //!
 //! Colour is either the vertices' own or a texture's, never both, since viewers multiply them:
 //! `COLOR_0` is **linear** light, while our vertex colours and pictures are sRGB-coded. Pictures lie in
-//! the file. A mesh far from the origin is written around its middle, which its node carries.
+//! the file. A mesh far from the origin is written around its middle, which its node carries in f64: its shape
+//! is as exact as that of any other.
 //!
 //! # Textures that depend on the view
 //!
@@ -20,15 +21,15 @@
 //!   "lobes": [ { "name": "lobe 0", "texture": 1, "material": 1, "variant": 0 } ] } }
 //! ```
 
-use super::export::{ExportError, ExportOptions, check_unit, ready, turn_to_y_up};
+use super::export::{ExportError, ExportOptions, ready};
 use super::gltf_document::{Document, info};
 use super::textured::{
-    Exported, PictureFormat, Split, TextureOptions, Textured, encode, placed, safe_stem, split,
+    Exported, PictureFormat, Split, TextureOptions, Textured, encode, prepare, safe_stem, split,
 };
 use super::textured_tangents;
 use crate::geom::{Aabb, Mesh};
 use crate::image::linear_from_srgb;
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use gltf_json::extensions::mesh::{KhrMaterialsVariants, Mapping};
 use gltf_json::extensions::scene::khr_materials_variants::Variant;
 use gltf_json::material::{NormalTexture, PbrMetallicRoughness, StrengthFactor};
@@ -46,8 +47,7 @@ use std::collections::BTreeMap;
 /// [`ExportError`] when there is nothing to write, the mesh is damaged, an option makes no sense, or
 /// the file would pass 4 GiB.
 pub fn to_glb(mesh: &Mesh, options: &ExportOptions) -> Result<Vec<u8>, ExportError> {
-    check_unit(options.unit_m)?;
-    let ready = ready(mesh, turn_to_y_up(options.up)?, options.unit_m, true)?;
+    let ready = ready(mesh, &options.file_from_mesh()?)?;
     let translation = ready.translation;
     let shape = Split {
         positions: ready.positions,
@@ -73,7 +73,7 @@ pub fn textured_to_glb(
     options: &ExportOptions,
     texture: &TextureOptions,
 ) -> Result<Exported, ExportError> {
-    let prepared = placed(textured, options, true)?;
+    let prepared = prepare(textured, &options.file_from_mesh()?)?;
     let ready = &prepared.ready;
     let tangents = textured.normal.map(|_| {
         let (positions, normals, triangles) = (&ready.positions, &ready.normals, &ready.triangles);
@@ -181,25 +181,26 @@ fn material(options: &ExportOptions, name: String, color: Option<Info>) -> Mater
 fn finish(
     mut document: Document,
     shape: &Split,
-    translation: Vec3,
+    translation: DVec3,
     quantize: bool,
     material: Index<Material>,
     variants: Option<KhrMaterialsVariants>,
     options: &ExportOptions,
 ) -> Result<Vec<u8>, ExportError> {
     let mut node = gltf_json::Node { name: Some(options.name.clone()), ..Default::default() };
+    let mut at = translation;
     let attributes = if quantize {
         let bounds = Aabb::around(shape.positions.iter().copied());
         let size = bounds.size().max_element();
         node.scale = Some([size; 3]);
-        node.translation = Some((translation.as_dvec3() + bounds.min.as_dvec3()).as_vec3().to_array());
+        at += bounds.min.as_dvec3();
         document.root.extensions_used.push("KHR_mesh_quantization".into());
         document.root.extensions_required.push("KHR_mesh_quantization".into());
         short_attributes(&mut document, shape, bounds.min, size)
     } else {
-        node.translation = (translation != Vec3::ZERO).then(|| translation.to_array());
         attributes(&mut document, shape)
     };
+    node.translation = (at != DVec3::ZERO || quantize).then(|| at.as_vec3().to_array());
     let indices = document.indices(&shape.triangles, shape.positions.len());
     let root = &mut document.root;
     root.asset.generator = Some(concat!("tiface ", env!("CARGO_PKG_VERSION")).into());
@@ -229,6 +230,10 @@ fn finish(
     }));
     if options.unlit {
         root.extensions_used.push("KHR_materials_unlit".into());
+    }
+    // within f32's reach its shortest digits will do
+    if translation != DVec3::ZERO {
+        document.far = Some((node, at));
     }
     document.pack()
 }
@@ -276,6 +281,7 @@ fn short_attributes(document: &mut Document, shape: &Split, low: Vec3, size: f32
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geom::Similarity;
     use crate::image::srgb_from_linear;
     use crate::io::{Limits, parse_photo};
     use crate::mesh::read::{Texture, read, read_whole, weld};
@@ -330,7 +336,10 @@ mod tests {
 
     #[test]
     fn the_document_says_what_it_must() {
-        let options = ExportOptions { name: "Büste 頭".into(), up: Vec3::Z, unit_m: 0.001, unlit: true };
+        let options =
+            ExportOptions {
+                name: "Büste 頭".into(), up: Vec3::Z, unit_m: 0.001, ..ExportOptions::default()
+            };
         let mut mesh = strip(10);
         mesh.positions[3] = Vec3::new(0.1, 0.2, 0.3);
         let glb = to_glb(&mesh, &options).unwrap();
@@ -446,6 +455,22 @@ mod tests {
             }
         }
         assert!(weld(&back.mesh).is_closed());
+    }
+
+    #[test]
+    fn a_distant_quantised_mesh_stands_where_it_should_to_the_micrometre() {
+        let (mesh, atlas, color) = tetrahedron();
+        let place = Similarity::scale_translate(0.25, DVec3::new(5e6, -3e6, 2e5 + 0.1));
+        let options = ExportOptions { world_from_mesh: place, ..ExportOptions::default() };
+        let texture = TextureOptions { quantize: true, ..Default::default() };
+        let out = textured_to_glb(&Textured::new(&mesh, &atlas, &color), &options, &texture).unwrap();
+        let json = json_of(&out.files[0].1);
+        let vector = |what: &str| -> DVec3 {
+            DVec3::from(serde_json::from_value::<[f64; 3]>(json["nodes"][0][what].clone()).unwrap())
+        };
+        // the corner of the cube is the tetrahedron's own, to within f32 around its middle
+        assert!(vector("translation").distance(place.translation) < 1e-7, "{}", vector("translation"));
+        assert!(vector("scale").distance(DVec3::splat(0.25)) < 1e-7);
     }
 
     #[test]

@@ -5,7 +5,7 @@
 
 use super::export::ExportError;
 use crate::geom::Aabb;
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use gltf_json::accessor::{ComponentType, GenericComponentType, Type};
 use gltf_json::buffer::{Stride, Target};
 use gltf_json::image::MimeType;
@@ -20,6 +20,9 @@ const SHORT_INDICES: usize = 65_535;
 pub(super) struct Document {
     pub root: Root,
     pub bin: Vec<u8>,
+    /// A node, and where it stands in f64: gltf-json's own translations are f32, and print as numbers that read
+    /// as others in f64.
+    pub far: Option<(Index<gltf_json::Node>, DVec3)>,
 }
 
 impl Document {
@@ -180,8 +183,15 @@ impl Document {
             extensions: None,
             extras: Default::default(),
         });
-        let Document { root, bin } = self;
-        let mut json = root.to_vec().expect("a document of plain numbers and names serialises");
+        let Document { root, bin, far } = self;
+        let json = match far {
+            None => root.to_vec(),
+            Some((node, at)) => serde_json::to_value(&root).and_then(|mut json| {
+                json["nodes"][node.value()]["translation"] = at.to_array().to_vec().into();
+                serde_json::to_vec(&json)
+            }),
+        };
+        let mut json = json.expect("a document of plain numbers and names serialises");
         json.resize(json.len().next_multiple_of(4), b' ');
         let bytes = 12 + 8 + json.len() as u64 + 8 + bin.len() as u64;
         let total = u32::try_from(bytes).map_err(|_| ExportError::TooLarge { bytes })?;

@@ -31,7 +31,7 @@ pub mod uv_check;
 mod verify;
 
 pub use atlas::{AtlasConfig, AtlasReport, atlas};
-pub use cap::Cap;
+pub use cap::{Cap, Skin};
 pub use clean::{CleanReport, clean};
 pub use error::MeshError;
 pub use extract::{MeshReport, extract};

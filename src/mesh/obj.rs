@@ -4,10 +4,13 @@
 //! significant digits. `v`, `vt` and `vn` are indexed apart, so a surface that is closed stays closed
 //! whatever its seams. Colour is `v x y z r g b`, sRGB-coded, or a picture that a `.mtl` beside it
 //! names; never both.
+//!
+//! A mesh far from the origin needs more digits than f32 has: its positions are written with as many as
+//! hold a billionth of its size, for readers that keep f64.
 
-use super::export::{ExportError, ExportOptions, Ready, check_unit, ready, turn_to_y_up};
-use super::textured::{Exported, TextureOptions, Textured, encode, left_out, placed, safe_stem};
-use crate::geom::Mesh;
+use super::export::{ExportError, ExportOptions, Ready, ready};
+use super::textured::{Exported, TextureOptions, Textured, encode, left_out, prepare, safe_stem};
+use crate::geom::{Aabb, Mesh};
 use std::io::Write;
 
 /// The mesh as the bytes of an `.obj` file, coloured by its vertices.
@@ -16,8 +19,7 @@ use std::io::Write;
 ///
 /// [`ExportError`] when there is nothing to write, the mesh is damaged, or an option makes no sense.
 pub fn to_obj(mesh: &Mesh, options: &ExportOptions) -> Result<Vec<u8>, ExportError> {
-    check_unit(options.unit_m)?;
-    let mesh = ready(mesh, turn_to_y_up(options.up)?, options.unit_m, false)?;
+    let mesh = ready(mesh, &options.file_from_mesh()?)?;
     let header = concat!("# tiface ", env!("CARGO_PKG_VERSION"), ": metres, +Y up, sRGB vertex colours\n");
     let mut out = header.as_bytes().to_vec();
     let mut write = || -> std::io::Result<()> {
@@ -47,7 +49,7 @@ pub fn textured_to_obj(
     options: &ExportOptions,
     texture: &TextureOptions,
 ) -> Result<Exported, ExportError> {
-    let prepared = placed(textured, options, false)?;
+    let prepared = prepare(textured, &options.file_from_mesh()?)?;
     let mut mesh = prepared.ready;
     mesh.colors = Vec::new(); // some readers multiply them into the texture
     let stem = safe_stem(texture);
@@ -92,8 +94,15 @@ pub fn textured_to_obj(
 /// `v` with colours where there are any, then `vn`.
 fn write_vertices(out: &mut Vec<u8>, mesh: &Ready) -> std::io::Result<()> {
     out.reserve(mesh.positions.len() * 60 + mesh.triangles.len() * 30);
+    let size = Aabb::around(mesh.positions.iter().copied()).size().max_element();
+    let digits = (9.0 - size.log10()).ceil().clamp(0.0, 45.0) as usize;
     for (i, p) in mesh.positions.iter().enumerate() {
-        write!(out, "v {} {} {}", Short(p.x), Short(p.y), Short(p.z))?;
+        if mesh.is_far() {
+            let p = mesh.place(*p);
+            write!(out, "v {:.digits$} {:.digits$} {:.digits$}", p.x, p.y, p.z)?;
+        } else {
+            write!(out, "v {} {} {}", Short(p.x), Short(p.y), Short(p.z))?;
+        }
         match mesh.colors.get(i).map(|c| c.map(|v| v.clamp(0.0, 1.0))) {
             Some([r, g, b]) => writeln!(out, " {} {} {}", Short(r), Short(g), Short(b))?,
             None => writeln!(out)?,

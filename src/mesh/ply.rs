@@ -1,7 +1,8 @@
 //! A mesh as PLY: binary little endian, in the dataset's own world.
 //!
 //! No turn and no unit: PLY says nothing of either, and Blender does not turn it (it does turn OBJ and
-//! GLB). Colours are 8-bit and sRGB-coded, as every reader takes them.
+//! GLB). Colours are 8-bit and sRGB-coded, as every reader takes them. Positions are `float`, or `double` where
+//! the mesh lies so far from the origin that f32 would show.
 //!
 //! PLY has one index for everything. [`to_ply`] keeps vertices whole, so the surface stays closed:
 //! this is the file that later stages read. [`textured_to_ply`] splits vertices at seams for the sake
@@ -12,9 +13,9 @@ use super::export::{ExportError, ready};
 use super::textured::{
     Exported, Split, TextureOptions, Textured, encode, left_out, prepare, safe_stem, split,
 };
-use crate::geom::Mesh;
+use crate::geom::{Mesh, Similarity};
 use crate::image::quantise;
-use glam::DMat3;
+use glam::DVec3;
 
 /// The mesh as the bytes of a `.ply` file, coloured by its vertices.
 ///
@@ -22,7 +23,17 @@ use glam::DMat3;
 ///
 /// [`ExportError`] when there is nothing to write or the mesh is damaged.
 pub fn to_ply(mesh: &Mesh) -> Result<Vec<u8>, ExportError> {
-    let ready = ready(mesh, DMat3::IDENTITY, 1.0, false)?;
+    placed_to_ply(mesh, &Similarity::IDENTITY)
+}
+
+/// [`to_ply`] of a mesh in coordinates of its own.
+///
+/// # Errors
+///
+/// As [`to_ply`].
+pub fn placed_to_ply(mesh: &Mesh, world_from_mesh: &Similarity) -> Result<Vec<u8>, ExportError> {
+    let ready = ready(mesh, world_from_mesh)?;
+    let translation = ready.translation;
     let shape = Split {
         positions: ready.positions,
         normals: ready.normals,
@@ -30,7 +41,7 @@ pub fn to_ply(mesh: &Mesh) -> Result<Vec<u8>, ExportError> {
         triangles: ready.triangles,
         ..Split::default()
     };
-    Ok(bytes(&shape, None))
+    Ok(bytes(&shape, translation, None))
 }
 
 /// The mesh as a `.ply`, split at seams, with its vertex colours too, and its picture beside it.
@@ -40,18 +51,19 @@ pub fn to_ply(mesh: &Mesh) -> Result<Vec<u8>, ExportError> {
 /// [`ExportError`] when mesh, atlas and pictures do not belong together, before there are any bytes;
 /// else as [`to_ply`].
 pub fn textured_to_ply(textured: &Textured, texture: &TextureOptions) -> Result<Exported, ExportError> {
-    let prepared = prepare(textured, DMat3::IDENTITY, 1.0, false)?;
+    let prepared = prepare(textured, &Similarity::IDENTITY)?;
     let (picture, ending) = encode("base colour", textured.color, texture.picture)?;
     let stem = safe_stem(texture);
     let name = format!("{stem}.{ending}");
-    let files =
-        vec![(format!("{stem}.ply"), bytes(&split(&prepared, None), Some(&name))), (name.clone(), picture)];
+    let ply = bytes(&split(&prepared, None), prepared.ready.translation, Some(&name));
+    let files = vec![(format!("{stem}.ply"), ply), (name.clone(), picture)];
     let mut warnings = Vec::new();
     left_out(textured, "ply", &mut warnings);
     Ok(Exported { files, warnings })
 }
 
-fn bytes(mesh: &Split, picture: Option<&str>) -> Vec<u8> {
+fn bytes(mesh: &Split, translation: DVec3, picture: Option<&str>) -> Vec<u8> {
+    let far = translation != DVec3::ZERO;
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     header += concat!("comment tiface ", env!("CARGO_PKG_VERSION"), "\n");
     header += "comment dataset world, dataset units; vertex colours are sRGB\n";
@@ -64,7 +76,7 @@ fn bytes(mesh: &Split, picture: Option<&str>) -> Vec<u8> {
             header += &format!("property {kind} {name}\n");
         }
     };
-    property("float", &["x", "y", "z"]);
+    property(if far { "double" } else { "float" }, &["x", "y", "z"]);
     if !mesh.normals.is_empty() {
         property("float", &["nx", "ny", "nz"]);
     }
@@ -78,12 +90,14 @@ fn bytes(mesh: &Split, picture: Option<&str>) -> Vec<u8> {
     header += "property list uchar uint vertex_indices\nend_header\n";
 
     let mut out = header.into_bytes();
-    out.reserve(mesh.positions.len() * 35 + mesh.triangles.len() * 13);
+    out.reserve(mesh.positions.len() * if far { 47 } else { 35 } + mesh.triangles.len() * 13);
     for (i, p) in mesh.positions.iter().enumerate() {
-        let normal = mesh.normals.get(i);
-        for v in [Some(p), normal].into_iter().flatten().flat_map(|v| v.to_array()) {
-            out.extend_from_slice(&v.to_le_bytes());
+        if far {
+            out.extend((translation + p.as_dvec3()).to_array().iter().flat_map(|v| v.to_le_bytes()));
+        } else {
+            out.extend(p.to_array().iter().flat_map(|v| v.to_le_bytes()));
         }
+        out.extend(mesh.normals.get(i).iter().flat_map(|n| n.to_array()).flat_map(f32::to_le_bytes));
         out.extend(mesh.colors.get(i).into_iter().flatten().map(|&c| quantise(c)));
         if let Some(uv) = mesh.uvs.get(i) {
             out.extend_from_slice(&uv.x.to_le_bytes());

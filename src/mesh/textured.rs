@@ -5,10 +5,10 @@
 //! everything, so there vertices are split where corners disagree. The copies are bit-identical in
 //! position and normal: welding equal positions closes the surface again.
 
-use super::export::{ExportError, ExportOptions, Ready, has_three_corners, ready};
-use crate::geom::{Atlas, Mesh};
+use super::export::{ExportError, Ready, has_three_corners, ready};
+use crate::geom::{Atlas, Mesh, Similarity};
 use crate::image::Photo;
-use glam::{DMat3, Vec2, Vec3, Vec4};
+use glam::{Vec2, Vec3, Vec4};
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -100,15 +100,10 @@ pub(super) struct Prepared {
     pub corners: Vec<[u32; 3]>,
 }
 
-pub(super) fn prepare(
-    textured: &Textured,
-    turn: DMat3,
-    unit_m: f64,
-    recentre: bool,
-) -> Result<Prepared, ExportError> {
+pub(super) fn prepare(textured: &Textured, file_from_mesh: &Similarity) -> Result<Prepared, ExportError> {
     let Textured { mesh, atlas, .. } = *textured;
     check_atlas(mesh, atlas)?;
-    let ready = ready(mesh, turn, unit_m, recentre)?;
+    let ready = ready(mesh, file_from_mesh)?;
     check_picture("base colour", textured.color, atlas)?;
     if let Some(normal) = textured.normal {
         check_picture("normal map", normal, atlas)?;
@@ -260,16 +255,6 @@ pub(super) fn left_out(textured: &Textured, ending: &str, warnings: &mut Vec<Str
     }
 }
 
-/// The rotation and unit of a format that has them.
-pub(super) fn placed(
-    textured: &Textured,
-    options: &ExportOptions,
-    recentre: bool,
-) -> Result<Prepared, ExportError> {
-    super::export::check_unit(options.unit_m)?;
-    prepare(textured, super::export::turn_to_y_up(options.up)?, options.unit_m, recentre)
-}
-
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
@@ -294,7 +279,7 @@ pub(super) mod tests {
     }
 
     fn go(textured: &Textured) -> Result<Prepared, ExportError> {
-        prepare(textured, DMat3::IDENTITY, 1.0, false)
+        prepare(textured, &Similarity::IDENTITY)
     }
 
     #[test]

@@ -13,6 +13,7 @@
 
 use super::atlas::apart::{Side, nearest_charts};
 use super::atlas::overlap::{overlaps, shared_area, turn};
+use super::read::places;
 use crate::geom::{Atlas, Mesh, Sets};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -227,7 +228,7 @@ struct Joined {
 
 impl Joined {
     fn of(mesh: &Mesh, atlas: &Atlas, valid: &[bool]) -> Joined {
-        let weld = weld(mesh);
+        let (weld, _) = places(mesh);
         // + 0 makes −0 and 0 equal
         let uv = |c: u32, k: u32| {
             let t = c as usize / 3;
@@ -283,18 +284,6 @@ impl Joined {
 fn twice_area(mesh: &Mesh, t: usize) -> f64 {
     let [a, b, c] = mesh.corners(t as u32).map(|p| p.as_dvec3());
     (b - a).cross(c - a).length()
-}
-
-/// For each vertex the number of its position: files with a texture repeat vertices at seams.
-fn weld(mesh: &Mesh) -> Vec<u32> {
-    let mut numbers = HashMap::with_capacity(mesh.positions.len());
-    mesh.positions
-        .iter()
-        .map(|p| {
-            let next = numbers.len() as u32;
-            *numbers.entry(p.to_array().map(|v| (v + 0.0).to_bits())).or_insert(next)
-        })
-        .collect()
 }
 
 fn stretches(report: &mut UvReport, triangles: &[([DVec3; 3], [DVec2; 3])]) {

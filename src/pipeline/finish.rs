@@ -1,7 +1,7 @@
 //! From the whole extraction to what an artist opens: simplified, laid out, baked.
 
 use super::product::{Lobes, Pictures, Product};
-use super::{Line, Surface};
+use super::{Line, Surface, export};
 use crate::capture::Split;
 use crate::capture::scene::Scene;
 use crate::config::TextureView;
@@ -14,9 +14,12 @@ use crate::run::Monitor;
 use glam::{Mat3, Vec3};
 use serde_json::{Map, Value, json};
 
+/// How far the true surface may lie from a triangle, in cells: the chords of large triangles and half a cell.
+pub(super) const REACH: f32 = 2.5;
+
 /// The product, what is to be kept beside it, and what happened.
 pub(super) struct Finished {
-    /// In the dataset's world.
+    /// What an artist opens.
     pub product: Product,
     /// The baked colour, linear.
     pub linear: Option<Image>,
@@ -62,25 +65,24 @@ impl Line<'_> {
         }
         let world_from_scene = scene.scene_from_world.inverse();
         if c.texture_px == 0 {
-            let product = Product { mesh: mesh.transformed(&world_from_scene), pictures: None };
+            let product = Product { mesh, world_from_scene, pictures: None };
             return Ok(Finished { product, linear: None, report, warnings });
         }
 
         let export = self.export();
-        let world = surface.transformed(&world_from_scene);
-        let front = export.front(&world).map(|d| scene.scene_from_world.direction(d));
+        let centre = export::centre(surface, &world_from_scene);
+        let front = export.front(centre).map(|d| scene.scene_from_world.direction(d));
         let config = AtlasConfig { size_px: c.texture_px, gutter_px: c.gutter_px, front };
         let (laid, done) = atlas(&mesh, &config, monitor)?;
         warnings.extend(done.warnings());
         report.insert("atlas".into(), json!(done));
 
         // as `Product::files` turns it
-        let asset_from_world = export.asset_from_world(&mesh.transformed(&world_from_scene));
+        let asset_from_world = export.asset_from_world(&mesh, &world_from_scene);
         let config = BakeConfig {
             side: c.texture_samples,
             gutter_px: c.gutter_px,
-            // the chords of large triangles and half a cell
-            reach: 2.5 * cell,
+            reach: REACH * cell,
             viewer: match c.texture_view {
                 TextureView::Cameras => Viewer::Cameras,
                 TextureView::Normal => Viewer::Normal,
@@ -123,7 +125,7 @@ impl Line<'_> {
             None => None,
         };
         let pictures = Pictures { atlas: laid, color, normal, lobes: lobes(&baked, asset_from_world) };
-        let product = Product { mesh: mesh.transformed(&world_from_scene), pictures: Some(pictures) };
+        let product = Product { mesh, world_from_scene, pictures: Some(pictures) };
         Ok(Finished { product, linear: c.exr.then_some(baked.color), report, warnings })
     }
 }

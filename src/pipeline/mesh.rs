@@ -1,16 +1,18 @@
 //! Stage `mesh`: the zero level set of the learned distance, closed, in the dataset's world.
 
-use super::finish::Finished;
+use super::finish::{Finished, REACH};
+use super::parts::Whole;
 use super::product::Product;
 use super::{Fields, Line, PipelineError, export};
 use crate::capture::{self, Split};
-use crate::config::MeshConfig;
-use crate::geom::{Camera, Mesh};
+use crate::config::{MeshConfig, TextureView};
+use crate::geom::{Camera, Mesh, Similarity};
 use crate::io::{self, Limits};
+use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::read::ReadMeshError;
 use crate::mesh::{self, Cap, MeshError, ply};
 use crate::run::{Done, Failure};
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use serde_json::json;
 
 impl Line<'_> {
@@ -58,7 +60,7 @@ impl Line<'_> {
             };
             let (mut surface, report) = extracted.map_err(failed)?;
             report.warnings(c.cap).iter().for_each(|w| stage.warn(w));
-            let cap = Cap::of(&surface, report.bounds(), report.cell_size);
+            let mut cap = Cap::of(&surface, report.bounds(), report.cell_size);
             if let Some(cap) = &cap {
                 if c.cap {
                     cap.paint(&mut surface);
@@ -67,18 +69,32 @@ impl Line<'_> {
                 }
             }
             // what took longest is kept, whatever comes of the rest
-            let world = surface.transformed(&scene.scene_from_world.inverse());
-            let bytes = ply::to_ply(&world).map_err(|e| {
+            let bytes = ply::placed_to_ply(&surface, &scene.scene_from_world.inverse()).map_err(|e| {
                 let hint = e.hint();
                 Failure::cannot(e, hint)
             })?;
             io::write_atomic(&stage.folder().join("surface.ply"), &bytes)?;
+            let parts = stage.folder().join("parts");
+            let surface_triangles = surface.triangles.len();
+            // vertices have the colour seen straight; textures and rays that of the cameras, and so their cap
+            if let Some(cap) = cap.as_mut().filter(|_| c.texture_view == TextureView::Cameras) {
+                let learned = Learned {
+                    gradient: &|p| field.sdf_gradient(p),
+                    colors: &|p, n, counts, d| field.colors(p, n, counts, d),
+                };
+                let cameras: Vec<Camera> =
+                    cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
+                let reach = REACH * report.cell_size;
+                cap.shade(|p, n| seen_colors(&surface, p, n, &learned, &cameras, reach));
+            }
             let finished =
                 self.finish(&surface, cap.as_ref(), report.cell_size, &scene, field, stage.monitor());
             let Finished { product, linear, report: steps, warnings } = finished.map_err(failed)?;
             warnings.iter().for_each(|w| stage.warn(w));
 
-            product.save(&stage.folder().join("parts"))?;
+            product.save(&parts)?;
+            let plain = Mesh { colors: Vec::new(), ..surface };
+            Whole { mesh: plain, cap: cap.filter(|_| c.cap) }.save(&parts)?;
             if let Some(linear) = linear {
                 let (w, h) = (linear.width, linear.height);
                 let plane = |k: usize| linear.data.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>();
@@ -95,14 +111,17 @@ impl Line<'_> {
                     io::write_atomic(&stage.folder().join(name), bytes)?;
                 }
             }
-            let size = product.mesh.bounds().size() * self.config.capture.unit_m as f32;
+            // without the way, which f32 may not hold
+            let in_place = Similarity { translation: DVec3::ZERO, ..product.world_from_scene };
+            let size =
+                product.mesh.transformed(&in_place).bounds().size() * self.config.capture.unit_m as f32;
             Ok(json!({
                 "vertices": product.mesh.positions.len(),
                 "triangles": product.mesh.triangles.len(),
                 "closed": product.mesh.is_closed(),
                 "texture_px": product.pictures.as_ref().map_or(0, |p| p.color.width),
                 "size_m": size.to_array(),
-                "surface_triangles": world.triangles.len(),
+                "surface_triangles": surface_triangles,
                 "report": report,
                 "steps": steps,
             }))
@@ -121,13 +140,18 @@ impl Line<'_> {
             up: self.capture.up,
             unit_m: self.config.capture.unit_m,
             frame: self.config.mesh.frame,
-            cameras: self.capture.views.iter().map(|v| v.camera.position.as_vec3()).collect(),
+            cameras: self.capture.views.iter().map(|v| v.camera.position).collect(),
         }
     }
 
-    /// What the stage `mesh` made for people, in the dataset's world.
+    /// What the stage `mesh` made for people.
     pub fn read_product(&self) -> Result<Product, Failure> {
         Product::load(&self.run.path("mesh/parts"))
+    }
+
+    /// The whole surface of the stage `mesh` in scene coordinates, as it was before it became a file.
+    pub(super) fn read_whole(&self) -> Result<Whole, Failure> {
+        Whole::load(&self.run.path("mesh/parts"))
     }
 
     /// The whole surface of the stage `mesh`, in the dataset's world.

@@ -129,9 +129,10 @@ impl Line<'_> {
             }
             "mesh" => {
                 settings.insert("capture.unit_m".into(), self.config.capture.unit_m.to_string());
-                // a few triangles per cell of a closed surface, three formats
+                settings.insert("format of mesh/parts".into(), super::parts::FORMAT.into());
+                // a few triangles per cell of a closed surface, three formats and the parts
                 let c = &self.config.mesh;
-                needs_bytes += (c.resolution as u64).pow(2) * 12 * 100;
+                needs_bytes += (c.resolution as u64).pow(2) * 12 * 130;
                 // pictures as parts and inside the files, and the float one
                 needs_bytes += c.texels() * (6 * c.pictures() + 3 + if c.exr { 12 } else { 0 });
             }

@@ -1,24 +1,21 @@
 //! What the stage `mesh` makes for people: a simplified mesh, its texture, and the files they become.
 //!
 //! ```text
-//! mesh/surface.ply            the whole extraction with colours at its vertices: what rays are cast at
-//!      parts/geometry.safetensors, color.png, normal.png, lobe_K.png     the product in the dataset's world
-//!      head.glb …             the product as files
+//! mesh/surface.ply   the whole extraction with colours at its vertices, in the dataset's world
+//!      parts         the same and the product, for the stages after this one
+//!      head.glb …    the product as files
 //! ```
 
 use super::export::Export;
 use crate::config::{MeshConfig, MeshFormat, MeshFrame, TextureFormat};
-use crate::geom::{Atlas, Mesh};
+use crate::geom::{Atlas, Mesh, Similarity};
 use crate::image::Photo;
-use crate::io::{self, Limits, TensorValues};
-use crate::mesh::export::{ExportError, ExportOptions};
+use crate::mesh::export::{ExportError, ExportOptions, distance_warning};
 use crate::mesh::textured::{Exported, Lobe, PictureFormat, TextureOptions, Textured};
 use crate::mesh::{gltf, obj, ply};
 use crate::run::Failure;
-use glam::{Mat3, Vec2, Vec3};
+use glam::{Mat3, Vec3};
 use serde_json::{Map, json};
-use std::collections::BTreeMap;
-use std::path::Path;
 
 /// View-dependent colour of a texture.
 #[derive(Clone, Debug, PartialEq)]
@@ -44,119 +41,18 @@ pub struct Pictures {
     pub lobes: Option<Lobes>,
 }
 
-/// A mesh for people, in the dataset's world.
+/// A mesh for people.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Product {
-    /// The surface; without pictures it has colours at its vertices.
+    /// The surface in scene coordinates; without pictures it has colours at its vertices.
     pub mesh: Mesh,
+    /// Where the scene sits in the dataset's world.
+    pub world_from_scene: Similarity,
     /// Its texture, if it has one.
     pub pictures: Option<Pictures>,
 }
 
-/// Version of the layout of `parts`.
-const FORMAT: &str = "tiface-mesh-1";
-
 impl Product {
-    /// Writes the parts into a folder.
-    pub fn save(&self, folder: &Path) -> Result<(), Failure> {
-        io::create_folder(folder)?;
-        let floats = |v: &[Vec3]| (vec![v.len(), 3], TensorValues::F32(bytemuck::cast_slice(v).to_vec()));
-        let indices = |v: &[[u32; 3]]| (vec![v.len(), 3], TensorValues::U32(v.as_flattened().to_vec()));
-        let colors: Vec<Vec3> = self.mesh.colors.iter().map(|c| Vec3::from(*c)).collect();
-        let mut tensors = vec![
-            ("positions", floats(&self.mesh.positions)),
-            ("normals", floats(&self.mesh.normals)),
-            ("colors", floats(&colors)),
-            ("triangles", indices(&self.mesh.triangles)),
-        ];
-        let mut metadata = BTreeMap::from([("format".to_owned(), FORMAT.to_owned())]);
-        if let Some(p) = &self.pictures {
-            let uvs: &[f32] = bytemuck::cast_slice(&p.atlas.uvs);
-            tensors.push(("uvs", (vec![p.atlas.uvs.len(), 2], TensorValues::F32(uvs.to_vec()))));
-            tensors.push(("uv_triangles", indices(&p.atlas.triangles)));
-            let write = |name: String, photo: &Photo| {
-                io::write_png_rgb(&folder.join(name), photo.width, photo.height, &photo.rgb)
-            };
-            write("color.png".into(), &p.color)?;
-            if let Some(normal) = &p.normal {
-                write("normal.png".into(), normal)?;
-                metadata.insert("normal".into(), "normal.png".into());
-            }
-            if let Some(lobes) = &p.lobes {
-                for (k, picture) in lobes.pictures.iter().enumerate() {
-                    write(format!("lobe_{k}.png"), picture)?;
-                }
-                tensors
-                    .push(("lobe_scale", (vec![lobes.scale.len()], TensorValues::F32(lobes.scale.clone()))));
-                let turned = lobes.asset_from_world.to_cols_array().to_vec();
-                tensors.push(("asset_from_world", (vec![3, 3], TensorValues::F32(turned))));
-            }
-        }
-        let tensors: Vec<_> = tensors.into_iter().map(|(n, (s, v))| (n.to_owned(), s, v)).collect();
-        Ok(io::write_tensors(&folder.join("geometry.safetensors"), &tensors, &metadata)?)
-    }
-
-    /// Reads the parts back.
-    pub fn load(folder: &Path) -> Result<Product, Failure> {
-        let path = folder.join("geometry.safetensors");
-        let (mut tensors, metadata) = io::read_tensors(&path, &Limits::default())?;
-        let wrong = |what: &str| {
-            Failure::cannot(
-                format!("`{}`: {what}", path.display()),
-                "make the mesh again: `tiface mesh RUN --fresh mesh`",
-            )
-        };
-        if metadata.get("format").map(String::as_str) != Some(FORMAT) {
-            return Err(wrong("its layout is another version's"));
-        }
-        let mut floats = |name: &str, width: usize| -> Option<Vec<f32>> {
-            match tensors.remove(name)? {
-                (shape, TensorValues::F32(v)) if shape.get(1).is_none_or(|&w| w == width) => Some(v),
-                _ => None,
-            }
-        };
-        let vectors = |v: Vec<f32>| -> Vec<Vec3> { v.chunks_exact(3).map(Vec3::from_slice).collect() };
-        let missing = |name: &str| wrong(&format!("`{name}` is missing or of another shape"));
-        let positions = vectors(floats("positions", 3).ok_or_else(|| missing("positions"))?);
-        let normals = vectors(floats("normals", 3).ok_or_else(|| missing("normals"))?);
-        let colors = floats("colors", 3).ok_or_else(|| missing("colors"))?;
-        let uvs = floats("uvs", 2);
-        let (scale, turned) = (floats("lobe_scale", 1), floats("asset_from_world", 3));
-        let mut indices = |name: &str, below: usize| match tensors.remove(name) {
-            Some((shape, TensorValues::U32(v))) if shape.get(1) == Some(&3) => {
-                let sound = v.iter().all(|&i| (i as usize) < below);
-                if sound { Ok(v.as_chunks::<3>().0.to_vec()) } else { Err(missing(name)) }
-            }
-            _ => Err(missing(name)),
-        };
-        let triangles = indices("triangles", positions.len())?;
-        let mesh = Mesh { positions, normals, colors: colors.as_chunks::<3>().0.to_vec(), triangles };
-        let Some(uvs) = uvs else { return Ok(Product { mesh, pictures: None }) };
-        let photo = |name: &str, size: Option<(u32, u32)>| -> Result<Photo, Failure> {
-            Ok(io::read_photo(&folder.join(name), size, &Limits::default())?.photo)
-        };
-        let color = photo("color.png", None)?;
-        let size = Some((color.width, color.height));
-        let triangles = indices("uv_triangles", uvs.len() / 2)?;
-        if triangles.len() != mesh.triangles.len() {
-            return Err(missing("uv_triangles"));
-        }
-        let uvs = uvs.chunks_exact(2).map(Vec2::from_slice).collect();
-        let atlas = Atlas { uvs, triangles, width: color.width, height: color.height };
-        let normal = metadata.get("normal").map(|_| photo("normal.png", size)).transpose()?;
-        let lobes = match (scale, turned) {
-            (Some(scale), Some(turned)) if turned.len() == 9 && scale.len() <= 16 => {
-                let pictures = (0..scale.len())
-                    .map(|k| photo(&format!("lobe_{k}.png"), size))
-                    .collect::<Result<_, _>>()?;
-                Some(Lobes { pictures, scale, asset_from_world: Mat3::from_cols_slice(&turned) })
-            }
-            (None, None) => None,
-            _ => return Err(missing("lobe_scale")),
-        };
-        Ok(Product { mesh, pictures: Some(Pictures { atlas, color, normal, lobes }) })
-    }
-
     /// The product as the files of a format, the mesh first. `stem` names them.
     pub fn files(
         &self,
@@ -167,29 +63,26 @@ impl Product {
     ) -> Result<Exported, Failure> {
         // an unlit material shows no normal map: who asks for one wants light
         let unlit = self.pictures.as_ref().is_none_or(|p| p.normal.is_none());
-        let options =
-            ExportOptions { name: export.name.clone(), up: export.up, unit_m: export.unit_m, unlit };
-        // PLY keeps the dataset's world whatever the frame
-        let (mesh, options) = match (format, export.frame) {
-            (MeshFormat::Ply, _) | (_, MeshFrame::Dataset) => (self.mesh.clone(), options),
-            (_, MeshFrame::Head) => {
-                let turned = self.mesh.transformed(&export.head_from_world(&self.mesh));
-                (turned, ExportOptions { up: Vec3::Y, ..options })
-            }
+        let Product { mesh, world_from_scene, pictures } = self;
+        let (up, unit_m, world_from_mesh) = match (format, export.frame) {
+            // PLY keeps the dataset's world whatever the frame
+            (MeshFormat::Ply, _) => (Vec3::Y, 1.0, *world_from_scene),
+            (_, MeshFrame::Dataset) => (export.up, export.unit_m, *world_from_scene),
+            (_, MeshFrame::Head) => (Vec3::Y, export.unit_m, export.head_from_mesh(mesh, world_from_scene)),
         };
+        let options = ExportOptions { name: export.name.clone(), up, unit_m, unlit, world_from_mesh };
+        let ending = super::export::ending(format);
         let alone = |bytes: Result<Vec<u8>, ExportError>| {
-            bytes.map(|b| Exported {
-                files: vec![(format!("{stem}.{}", super::export::ending(format)), b)],
-                warnings: Vec::new(),
-            })
+            let file = |bytes| (format!("{stem}.{ending}"), bytes);
+            bytes.map(|b| Exported { files: vec![file(b)], warnings: Vec::new() })
         };
-        let exported = match (&self.pictures, format) {
+        let exported = match (pictures, format) {
             // colours at the vertices: one index, so the surface stays closed for whoever reads it
-            (_, MeshFormat::Ply) => alone(ply::to_ply(&mesh)),
-            (None, MeshFormat::Glb) => alone(gltf::to_glb(&mesh, &options)),
-            (None, MeshFormat::Obj) => alone(obj::to_obj(&mesh, &options)),
+            (_, MeshFormat::Ply) => alone(ply::placed_to_ply(mesh, world_from_scene)),
+            (None, MeshFormat::Glb) => alone(gltf::to_glb(mesh, &options)),
+            (None, MeshFormat::Obj) => alone(obj::to_obj(mesh, &options)),
             (Some(p), _) => {
-                let mut textured = Textured::new(&mesh, &p.atlas, &p.color);
+                let mut textured = Textured::new(mesh, &p.atlas, &p.color);
                 textured.normal = p.normal.as_ref();
                 if let Some(lobes) = &p.lobes {
                     let name = |k: usize| format!("lobe {k}");
@@ -208,10 +101,14 @@ impl Product {
                 }
             }
         };
-        exported.map_err(|e| {
+        let mut exported = exported.map_err(|e| {
             let hint = e.hint();
             Failure::cannot(e, hint)
-        })
+        })?;
+        if format != MeshFormat::Glb {
+            exported.warnings.extend(distance_warning(mesh, &options, ending));
+        }
+        Ok(exported)
     }
 }
 
@@ -231,11 +128,13 @@ fn extras(lobes: &Lobes) -> Map<String, serde_json::Value> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::config::Preset;
+    use glam::{DMat3, DVec3, Vec2};
+    use std::f32::consts::PI;
 
-    fn product() -> Product {
+    pub fn product() -> Product {
         let at = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)];
         let mesh = Mesh {
             positions: at.map(|(x, y, z)| Vec3::new(x, y, z)).to_vec(),
@@ -256,29 +155,157 @@ mod tests {
             asset_from_world: Mat3::from_rotation_x(0.5),
         };
         let pictures = Pictures { atlas, color: photo(9), normal: Some(photo(128)), lobes: Some(lobes) };
-        Product { mesh, pictures: Some(pictures) }
+        let world_from_scene = Similarity {
+            scale: 0.125,
+            rotation: DMat3::from_rotation_x(0.3),
+            translation: DVec3::new(5e6, -3e6, 2e5),
+        };
+        Product { mesh, world_from_scene, pictures: Some(pictures) }
     }
 
-    #[test]
-    fn parts_are_read_back_as_they_were() {
-        let dir = tempfile::tempdir().unwrap();
-        let whole = product();
-        whole.save(dir.path()).unwrap();
-        assert_eq!(Product::load(dir.path()).unwrap(), whole);
-        let bare = Product { pictures: None, ..whole };
-        bare.save(dir.path()).unwrap();
-        assert_eq!(Product::load(dir.path()).unwrap(), bare);
+    /// A wrinkled ball, closed, a scene of its own.
+    fn ball() -> Mesh {
+        let (across, down) = (40u32, 20u32);
+        let at = |i: u32, j: u32| {
+            let (a, b) = (i as f32 / across as f32 * 2.0 * PI, j as f32 / down as f32 * PI);
+            let r = 0.95 + 0.05 * (7.0 * a).sin() * b.sin();
+            r * Vec3::new(b.sin() * a.cos(), b.sin() * a.sin(), b.cos())
+        };
+        let mut mesh = Mesh { positions: vec![at(0, 0), at(0, down)], ..Mesh::default() };
+        mesh.positions.extend((0..across * (down - 1)).map(|k| at(k % across, 1 + k / across)));
+        let ring = |i: u32, j: u32| 2 + (j - 1) * across + i % across;
+        for i in 0..across {
+            mesh.triangles.push([0, ring(i, 1), ring(i + 1, 1)]);
+            mesh.triangles.push([1, ring(i + 1, down - 1), ring(i, down - 1)]);
+            for j in 1..down - 1 {
+                let [a, b] = [ring(i, j), ring(i + 1, j)];
+                let [c, d] = [ring(i + 1, j + 1), ring(i, j + 1)];
+                mesh.triangles.extend([[a, d, c], [a, c, b]]);
+            }
+        }
+        mesh.normals = mesh.positions.iter().map(|p| p.normalize()).collect();
+        mesh.colors = vec![[0.5; 3]; mesh.positions.len()];
+        mesh
     }
 
+    /// Corners of the triangles of a GLB, relative to the node, and the node's translation.
+    fn corners_of(glb: &[u8]) -> (Vec<[Vec3; 3]>, DVec3) {
+        let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
+        let json: serde_json::Value = serde_json::from_slice(&glb[20..20 + length]).unwrap();
+        let bin = &glb[28 + length..];
+        let primitive = &json["meshes"][0]["primitives"][0];
+        let bytes = |accessor: &serde_json::Value| {
+            let accessor = &json["accessors"][accessor.as_u64().unwrap() as usize];
+            let view = &json["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
+            let at = view["byteOffset"].as_u64().unwrap() as usize;
+            &bin[at..at + view["byteLength"].as_u64().unwrap() as usize]
+        };
+        let number = |b: &[u8; 4]| f32::from_le_bytes(*b);
+        let positions = bytes(&primitive["attributes"]["POSITION"]).as_chunks::<4>().0;
+        let positions: Vec<Vec3> =
+            positions.as_chunks::<3>().0.iter().map(|p| Vec3::from(p.each_ref().map(number))).collect();
+        let indices = bytes(&primitive["indices"]).as_chunks::<2>().0; // fewer than 65 535
+        let index = |b: &[u8; 2]| positions[u16::from_le_bytes(*b) as usize];
+        let corners = indices.as_chunks::<3>().0.iter().map(|t| t.each_ref().map(index)).collect();
+        let translation = &json["nodes"][0]["translation"];
+        let k = |k: usize| translation[k].as_f64().unwrap_or(0.0);
+        (corners, DVec3::new(k(0), k(1), k(2)))
+    }
+
+    /// A head of a quarter of a metre, six thousand kilometres from the origin: where f32 has steps of half a metre.
     #[test]
-    fn damaged_parts_are_named_with_the_way_out() {
+    fn a_head_at_the_end_of_the_world_keeps_its_shape_in_every_file() {
+        let mesh = ball();
+        assert!(mesh.is_closed());
+        let mut far = product();
+        far.pictures.as_mut().unwrap().atlas.triangles = vec![[0, 1, 2]; mesh.triangles.len()];
+        far.mesh = mesh.clone();
+        // as it is when it has been kept for a while
         let dir = tempfile::tempdir().unwrap();
-        let mut product = product();
-        product.mesh.triangles[2] = [0, 1, 9];
-        product.save(dir.path()).unwrap();
-        let error = Product::load(dir.path()).unwrap_err();
-        assert!(format!("{error:?}").contains("triangles"), "{error:?}");
-        assert!(Product::load(&dir.path().join("nothing")).is_err());
+        far.save(dir.path()).unwrap();
+        let far = Product::load(dir.path()).unwrap();
+        let place = far.world_from_scene;
+        let exact = |p: Vec3| place.point_f64(p.as_dvec3());
+        let mut export = Export {
+            name: "x".into(),
+            up: Vec3::Z,
+            unit_m: 1.0,
+            frame: MeshFrame::Dataset,
+            cameras: vec![place.translation + DVec3::new(0.3, -0.6, 0.1)],
+        };
+        let config = MeshConfig::preset(Preset::Draft);
+        let bare = Product { pictures: None, ..far.clone() };
+        let close = 1e-6 * 0.25;
+        for product in [&far, &bare] {
+            export.frame = MeshFrame::Dataset;
+            let glb = product.files(MeshFormat::Glb, &export, &config, "head").unwrap();
+            assert_eq!(glb.warnings, Vec::<String>::new());
+            let (corners, translation) = corners_of(&glb.files[0].1);
+            for (found, t) in corners.iter().zip(0..) {
+                let expected = mesh.corners(t).map(exact);
+                for (p, e) in found.iter().zip(expected) {
+                    // z up: (x, y, z) becomes (x, z, −y)
+                    let e = DVec3::new(e.x, e.z, -e.y) - translation;
+                    assert!(p.as_dvec3().distance(e) < close, "{p} {e}");
+                }
+                let area = |[a, b, c]: [DVec3; 3]| (b - a).cross(c - a).length();
+                let ratio = area(found.map(|p| p.as_dvec3())) / area(expected);
+                assert!((ratio - 1.0).abs() < 1e-3, "triangle {t}: {ratio}");
+            }
+            // around the middle, looking at the camera
+            export.frame = MeshFrame::Head;
+            let glb = product.files(MeshFormat::Glb, &export, &config, "head").unwrap();
+            let (corners, translation) = corners_of(&glb.files[0].1);
+            assert_eq!(translation, DVec3::ZERO);
+            let centre = exact(mesh.bounds().center());
+            let front = ((export.cameras[0] - centre) * DVec3::new(1.0, 1.0, 0.0)).normalize();
+            let axes = [DVec3::Z.cross(front), DVec3::Z, front];
+            let turned = |p: Vec3| DVec3::from(axes.map(|a| a.dot(exact(p) - place.translation)));
+            let all = || mesh.positions.iter().map(|&p| turned(p));
+            let middle = 0.5 * (all().reduce(DVec3::min).unwrap() + all().reduce(DVec3::max).unwrap());
+            for (found, t) in corners.iter().zip(0..) {
+                for (p, e) in found.iter().zip(mesh.corners(t)) {
+                    assert!(p.as_dvec3().distance(turned(e) - middle) < close, "{p}");
+                }
+            }
+            assert!(
+                product
+                    .files(MeshFormat::Obj, &export, &config, "head")
+                    .unwrap()
+                    .warnings
+                    .iter()
+                    .all(|w| !w.contains("origin"))
+            );
+
+            export.frame = MeshFrame::Dataset;
+            let obj = product.files(MeshFormat::Obj, &export, &config, "head").unwrap();
+            assert!(
+                obj.warnings.last().unwrap().contains("round its vertices to 5.0e-1"),
+                "{:?}",
+                obj.warnings
+            );
+            let text = String::from_utf8(obj.files[0].1.clone()).unwrap();
+            let lines: Vec<&str> = text.lines().filter(|l| l.starts_with("v ")).collect();
+            assert_eq!(lines.len(), mesh.positions.len());
+            for (line, &p) in lines.iter().zip(&mesh.positions) {
+                let v: Vec<f64> = line[2..].split(' ').map(|v| v.parse().unwrap()).collect();
+                let e = exact(p);
+                assert!(DVec3::new(v[0], v[1], v[2]).distance(DVec3::new(e.x, e.z, -e.y)) < close, "{line}");
+            }
+
+            let ply = product.files(MeshFormat::Ply, &export, &config, "head").unwrap();
+            assert!(ply.warnings.last().unwrap().contains("the .ply lies"), "{:?}", ply.warnings);
+            let bytes = &ply.files[0].1;
+            let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+            assert!(String::from_utf8_lossy(&bytes[..end]).contains("property double x\n"));
+            // three doubles, a normal, a colour
+            for (row, &p) in bytes[end..].chunks(24 + 12 + 3).zip(&mesh.positions) {
+                let v = row.as_chunks::<8>().0;
+                let found =
+                    DVec3::new(f64::from_le_bytes(v[0]), f64::from_le_bytes(v[1]), f64::from_le_bytes(v[2]));
+                assert!(found.distance(exact(p)) < close);
+            }
+        }
     }
 
     #[test]
@@ -288,7 +315,7 @@ mod tests {
             up: Vec3::Z,
             unit_m: 1.0,
             frame: MeshFrame::Dataset,
-            cameras: vec![Vec3::new(0.0, -3.0, 0.0)],
+            cameras: vec![DVec3::new(0.0, -3.0, 0.0)],
         };
         let config = MeshConfig::preset(Preset::Draft);
         let names = |format| {

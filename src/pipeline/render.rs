@@ -6,7 +6,8 @@
 //!        tface/float/     the same view for `ensemble`: float, coded, no background
 //! ```
 
-use super::product::Pictures;
+use super::parts::Whole;
+use super::product::{Pictures, Product};
 use super::{Fields, Line, PipelineError, march::march, pictures};
 use crate::capture::scene::{self, Scene};
 use crate::capture::{Split, View};
@@ -27,18 +28,18 @@ impl Line<'_> {
         Ok(self.run.stage(self.plan("render"), |stage| {
             let scene = self.scene_or_fail()?;
             let c = &self.config.render;
-            let mesh = match c.method.contains(&Method::Raycast) {
-                true => Some(self.read_mesh()?.transformed(&scene.scene_from_world)),
+            let whole = match c.method.contains(&Method::Raycast) {
+                true => Some(self.read_whole()?),
                 false => None,
             };
             let product = match c.method.contains(&Method::Textured) {
-                true => Some(self.textured(&scene)?),
+                true => Some(self.textured()?),
                 false => None,
             };
             let eye = Eye {
                 fields,
-                mesh: mesh.as_ref().map(|m| (m, Bvh::new(m))),
-                product: product.as_ref().map(|p| Shown::new(p, &scene)),
+                whole: whole.as_ref().map(|w| (w, Bvh::new(&w.mesh))),
+                product: product.as_ref().map(|(product, pictures)| Shown::new(product, pictures)),
                 samples: c.samples,
                 world_from_scene: scene.scene_from_world.inverse(),
                 stop: self.run.stop(),
@@ -89,16 +90,16 @@ impl Line<'_> {
         })?)
     }
 
-    /// The product in scene coordinates; it must have a texture.
-    fn textured(&self, scene: &Scene) -> Result<(Mesh, Pictures), Failure> {
-        let product = self.read_product()?;
-        let pictures = product.pictures.ok_or_else(|| {
+    /// The product and its texture, which it must have.
+    fn textured(&self) -> Result<(Product, Pictures), Failure> {
+        let mut product = self.read_product()?;
+        let pictures = product.pictures.take().ok_or_else(|| {
             Failure::cannot(
                 "the mesh has no texture to be shown",
                 "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
             )
         })?;
-        Ok((product.mesh.transformed(&scene.scene_from_world), pictures))
+        Ok((product, pictures))
     }
 
     /// The cameras to render: named like photographs where they have one.
@@ -162,8 +163,8 @@ struct Shown<'a> {
 }
 
 impl<'a> Shown<'a> {
-    fn new((mesh, pictures): &'a (Mesh, Pictures), scene: &Scene) -> Shown<'a> {
-        let world_from_scene = scene.scene_from_world.inverse().rotation_f32();
+    fn new(product: &'a Product, pictures: &'a Pictures) -> Shown<'a> {
+        let (mesh, world_from_scene) = (&product.mesh, product.world_from_scene.rotation_f32());
         let lobes = pictures.lobes.as_ref().map(|l| LobePictures {
             pictures: &l.pictures,
             scale: &l.scale,
@@ -177,7 +178,7 @@ impl<'a> Shown<'a> {
 /// What every view is made with.
 struct Eye<'a> {
     fields: &'a dyn Fields,
-    mesh: Option<(&'a Mesh, Bvh)>,
+    whole: Option<(&'a Whole, Bvh)>,
     product: Option<Shown<'a>>,
     samples: u32,
     world_from_scene: Similarity,
@@ -187,7 +188,7 @@ struct Eye<'a> {
 impl Eye<'_> {
     /// The view of a camera in scene coordinates, over nothing.
     fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>, Failure> {
-        Ok(match (method, &self.mesh) {
+        Ok(match (method, &self.whole) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
                 // a large view takes minutes: nobody who asks to stop waits for the rest of it
@@ -198,11 +199,18 @@ impl Eye<'_> {
                 Some(march(camera, &self.world_from_scene, false, see))
             }
             (Method::Volume, _) => self.fields.surface()?.volume(camera, &self.world_from_scene),
-            (Method::Raycast, Some((mesh, bvh))) => {
+            (Method::Raycast, Some((Whole { mesh, cap }, bvh))) => {
                 let field = self.fields.surface()?;
                 let world_from_scene = self.world_from_scene;
                 let options = RaycastOptions { background: None, samples: self.samples, world_from_scene };
-                Some(raycast(bvh, mesh, camera, &options, |p, n, d| field.color(p, n, d)))
+                Some(raycast(bvh, mesh, camera, &options, |points, normals, directions| {
+                    let mut colors = field.color(points, normals, directions);
+                    // what the field says of a cap is of the body's inside
+                    if let Some(cap) = cap {
+                        cap.recolor(points, &mut colors);
+                    }
+                    colors
+                }))
             }
             (Method::Raycast, None) => None,
             (Method::Textured, _) => self.product.as_ref().map(|shown| {
@@ -211,5 +219,83 @@ impl Eye<'_> {
                 raycast_hits(&shown.bvh, shown.mesh, camera, &options, |s| shown.texture.colors(s, camera))
             }),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Radiance, Surface};
+    use super::*;
+    use crate::geom::Aabb;
+    use crate::mesh::{Cap, Skin};
+    use glam::Vec3;
+
+    /// A field that is red everywhere.
+    struct Red;
+
+    impl Fields for Red {
+        fn surface(&self) -> Result<&dyn Surface, Failure> {
+            Ok(self)
+        }
+
+        fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+            panic!("no radiance field is asked for")
+        }
+    }
+
+    impl Surface for Red {
+        fn sdf(&self, _: &[Vec3]) -> Vec<f32> {
+            panic!("no distance is asked for")
+        }
+
+        fn sdf_gradient(&self, _: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+            panic!("no distance is asked for")
+        }
+
+        fn color(&self, points: &[Vec3], _: &[Vec3], _: &[Vec3]) -> Vec<[f32; 3]> {
+            vec![[1.0, 0.0, 0.0]; points.len()]
+        }
+
+        fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
+            vec![[1.0, 0.0, 0.0]; directions.len()]
+        }
+
+        fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {
+            None
+        }
+    }
+
+    #[test]
+    fn rays_see_the_cap_painted_and_the_skin_as_the_field_has_it() {
+        // to the left a square in the box's face z = 1, to the right one within
+        let square = |x: f32, z: f32| {
+            [(x, -0.9), (x + 0.9, -0.9), (x + 0.9, 0.9), (x, 0.9)].map(|(x, y)| Vec3::new(x, y, z))
+        };
+        let mesh = Mesh {
+            positions: [square(-0.9, 1.0), square(0.0, 0.5)].concat(),
+            triangles: vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]],
+            ..Mesh::default()
+        };
+        let skin = Skin { position: Vec3::new(-0.9, 0.0, 0.9), normal: -Vec3::X, color: [0.0, 1.0, 0.0] };
+        let cap = Cap { bounds: Aabb::SCENE, near: 1e-4, ring: vec![skin] };
+        let camera = Camera::above(8, 8, 8.0, 4.0);
+        let look = |cap: Option<Cap>| {
+            let whole = Whole { mesh: mesh.clone(), cap };
+            let bvh = Bvh::new(&whole.mesh);
+            let eye = Eye {
+                fields: &Red,
+                whole: Some((&whole, bvh)),
+                product: None,
+                samples: 1,
+                world_from_scene: Similarity::IDENTITY,
+                stop: &Stop::new(),
+            };
+            let view = eye.view(Method::Raycast, &camera).unwrap().unwrap();
+            // at x = (2.5 − 4) / 8 · 3 = −0.56 and (5.5 − 4) / 8 · 3.5 = 0.66
+            [view.color.pixel(2, 4).to_vec(), view.color.pixel(5, 4).to_vec()]
+        };
+        let red = vec![1.0, 0.0, 0.0, 1.0];
+        assert_eq!(look(Some(cap)), [vec![0.0, 1.0, 0.0, 1.0], red.clone()]);
+        assert_eq!(look(None), [red.clone(), red]);
     }
 }

@@ -1,4 +1,8 @@
 //! Colours from a texture: mip-mapped, filtered in linear light, with lobes for what depends on the view.
+//!
+//! A level has half the texels of the one before, rounded down, each the mean of the part of the picture that it
+//! covers: of three texels by their share where the number is odd (Guthe and Heckbert, *Non-power-of-two
+//! mipmapping*, 2005), so that no level is shifted against another.
 
 use super::raycast::Struck;
 use crate::geom::{Atlas, Camera, Mesh};
@@ -89,16 +93,17 @@ impl<'a> Texture<'a> {
 }
 
 impl Level {
-    /// The mean of two by two texels.
+    /// Half the texels each way.
     fn halved(&self, channels: usize) -> Level {
-        let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
-        let mut data = Vec::with_capacity(width * height * channels);
-        for i in 0..width * height {
-            let (x, y) = (2 * (i % width), 2 * (i / width));
-            let (right, below) = ((x + 1).min(self.width - 1), (y + 1).min(self.height - 1));
-            for k in 0..channels {
-                let at = |x: usize, y: usize| self.data[(y * self.width + x) * channels + k];
-                data.push(0.25 * (at(x, y) + at(right, y) + at(x, below) + at(right, below)));
+        let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
+        let (across, down) = (shares(self.width, width), shares(self.height, height));
+        let mut data = vec![0f32; width * height * channels];
+        for (texel, out) in data.chunks_exact_mut(channels).enumerate() {
+            for &(y, wy) in &down[texel / width] {
+                for &(x, wx) in across[texel % width].iter().filter(|(_, wx)| wx * wy > 0.0) {
+                    let own = &self.data[(y * self.width + x) * channels..][..channels];
+                    out.iter_mut().zip(own).for_each(|(sum, v)| *sum += wx * wy * v);
+                }
             }
         }
         Level { width, height, data }
@@ -120,6 +125,20 @@ impl Level {
             out[k] = top + fy * (bottom - top);
         }
     }
+}
+
+/// The texels under each of `n` equal parts of a row of `from`, which has two to three a part, with their shares.
+fn shares(from: usize, n: usize) -> Vec<[(usize, f32); 3]> {
+    let part = |i: usize| {
+        let first = i * from / n;
+        // in n-ths of a texel
+        std::array::from_fn(|k| {
+            let texel = first + k;
+            let (low, high) = ((texel * n).max(i * from), ((texel + 1) * n).min((i + 1) * from));
+            (texel.min(from - 1), high.saturating_sub(low) as f32 / from as f32)
+        })
+    };
+    (0..n).map(part).collect()
 }
 
 #[cfg(test)]
@@ -162,6 +181,34 @@ mod tests {
         assert!(near(pixels[0], [1.0, 0.0, 0.0, 1.0]) && near(pixels[7], [0.0, 1.0, 0.0, 1.0]));
         // the last row's left texel is 180 / 255 blue
         assert!((pixels[56][2] - 180.0 / 255.0).abs() < 1e-3, "{:?}", pixels[56]);
+    }
+
+    #[test]
+    fn levels_of_any_size_lie_where_the_picture_lies() {
+        let row = |data: &[f32]| Level { width: data.len(), height: 1, data: data.to_vec() };
+        // five texels in halves of 2.5: (1 + 2 + 0.5 · 4) / 2.5 and (0.5 · 4 + 8 + 16) / 2.5
+        let half = row(&[1.0, 2.0, 4.0, 8.0, 16.0]).halved(1);
+        assert_eq!((half.width, half.height), (2, 1));
+        assert!((half.data[0] - 2.0).abs() < 1e-6 && (half.data[1] - 10.4).abs() < 1e-6, "{:?}", half.data);
+        assert_eq!(row(&[3.0, 6.0, 0.0]).halved(1).data, [3.0]);
+        assert_eq!(row(&[1.0, 3.0, 5.0, 9.0]).halved(1).data, [2.0, 7.0]);
+        // a bright spot keeps its place and its light on every level: 23 by 37 texels, the spot at (5, 30)
+        let (width, height) = (23, 37);
+        let mut level = Level { width, height, data: vec![0.0; width * height] };
+        level.data[30 * width + 5] = 1.0;
+        while level.width.min(level.height) > 1 {
+            level = level.halved(1);
+            let (w, h) = (level.width as f32, level.height as f32);
+            let mut sums = [0f32; 3];
+            for (i, v) in level.data.iter().enumerate() {
+                let at = [(i % level.width) as f32 + 0.5, (i / level.width) as f32 + 0.5];
+                [1.0, at[0] / w, at[1] / h].iter().zip(&mut sums).for_each(|(x, sum)| *sum += x * v);
+            }
+            assert!((sums[0] / (w * h) * 851.0 - 1.0).abs() < 1e-4, "{w} {h}");
+            // within half a texel of the level
+            assert!((sums[1] / sums[0] - 5.5 / 23.0).abs() < 0.5 / w, "{w}: {}", sums[1] / sums[0]);
+            assert!((sums[2] / sums[0] - 30.5 / 37.0).abs() < 0.5 / h, "{h}: {}", sums[2] / sums[0]);
+        }
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What colour a point of the surface has: where exactly it lies, which cameras see it, what they see.
 
 use super::lobes;
-use crate::geom::{Bvh, Camera, Ray};
+use crate::geom::{Bvh, Camera, Mesh, Ray};
 use crate::image::{linear_from_srgb, srgb_from_linear};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -211,10 +211,29 @@ pub fn shade(points: &Points, seen: Seen, learned: &Learned, functions: usize, t
     Shades { linear, lobes: fitted, seen: seen.known }
 }
 
+/// sRGB-coded colours of points of a mesh with their normals, as its texture would have them: the mean over the
+/// cameras that see them. `reach` as in [`super::BakeConfig`].
+pub fn seen_colors(
+    mesh: &Mesh,
+    positions: &[Vec3],
+    normals: &[Vec3],
+    learned: &Learned,
+    cameras: &[Camera],
+    reach: f32,
+) -> Vec<[f32; 3]> {
+    let points = Points { positions: positions.to_vec(), normals: normals.to_vec() };
+    let bvh = Bvh::new(mesh);
+    let seen = match cameras {
+        [] => Seen::head_on(&points),
+        cameras => Eyes { cameras, bvh: &bvh, clearance: 0.5 * reach }.seen(&points, &points),
+    };
+    let shades = shade(&points, seen, learned, 0, glam::Mat3::IDENTITY);
+    shades.linear.into_iter().map(|c| c.map(srgb_from_linear)).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Mesh;
 
     fn sphere_gradient(p: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         p.iter().map(|p| (p.length() - 0.5, p.normalize_or_zero())).unzip()
@@ -257,6 +276,17 @@ mod tests {
             [at(0.5, Vec3::Z), at(-0.5, Vec3::Z), at(0.5, -Vec3::Z), at(0.5, tilted(80.0)), at(2.1, Vec3::Z)];
         let (positions, normals) = all.into_iter().unzip();
         let points = Points { positions, normals };
+        // blue where x > 0: all that the one camera sees of the first point
+        let colors = |p: &[Vec3], _: &[Vec3], _: &[u32], d: &[Vec3]| -> Vec<[f32; 3]> {
+            assert_eq!(d.len(), p.len());
+            p.iter().zip(d).map(|(p, d)| [0.0, -d.z, f32::from(p.x > 0.0)]).collect()
+        };
+        let learned = Learned { gradient: &sphere_gradient, colors: &colors };
+        let [first] = seen_colors(&hiding, &[at(0.5, Vec3::Z).0], &[Vec3::Z], &learned, &cameras, 2e-3)[..]
+        else {
+            panic!("one colour a point")
+        };
+        assert!((first[1] - 4.0 / 16.25f32.sqrt()).abs() < 1e-3 && first[2] > 0.999, "{first:?}");
         let seen = eyes.seen(&points, &points);
         assert_eq!(seen.known, [true, false, false, false, false]);
         // the others are looked at from where the one camera stands

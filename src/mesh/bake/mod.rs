@@ -17,7 +17,7 @@ pub mod lobes;
 mod seams;
 
 pub use detail::tangent_space;
-pub use light::Learned;
+pub use light::{Learned, seen_colors};
 pub use seams::seam_step;
 
 use super::MeshError;
@@ -379,6 +379,38 @@ mod tests {
                 (with - truth).abs() <= 0.3 * (base - truth).abs() + 0.01,
                 "{side}: {with} {base} {truth}"
             );
+        }
+    }
+
+    #[test]
+    fn a_mirrored_atlas_gives_the_mirrored_picture_and_charts_may_end_at_the_border() {
+        let (width, height) = (64u32, 32u32);
+        let (mesh, mut atlas) = sphere(width, height);
+        let margin = 2.0 / width as f32;
+        for uv in &mut atlas.uvs {
+            *uv = ((*uv - margin) / (1.0 - 2.0 * margin)).clamp(Vec2::ZERO, Vec2::ONE);
+        }
+        let colors = |p: &[Vec3], _: &[Vec3], counts: &[u32], _: &[Vec3]| -> Vec<[f32; 3]> {
+            p.iter().zip(counts).flat_map(|(p, &n)| vec![(0.5 + 0.8 * *p).to_array(); n as usize]).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        let mut turned = atlas.clone();
+        turned.uvs.iter_mut().for_each(|uv| uv.x = 1.0 - uv.x);
+        let [plain, mirrored] =
+            [&atlas, &turned].map(|a| bake(&mesh, a, &learned, &ring(), &config(), &Quiet).unwrap());
+        assert_eq!((plain.report.covered, mirrored.report.covered), (1.0, 1.0));
+        for y in 0..height {
+            for x in 0..width {
+                let (a, b) = (plain.color.pixel(x, y), mirrored.color.pixel(width - 1 - x, y));
+                assert!((0..3).all(|k| (a[k] - b[k]).abs() < 0.01), "{x} {y}: {a:?} {b:?}");
+            }
+        }
+        // the first texel of a row half way down: longitude half a texel, latitude 16.5 of 32 rows
+        let (lon, theta) =
+            (std::f32::consts::TAU * 0.5 / 64.0, std::f32::consts::PI * (0.02 + 0.96 * 16.5 / 32.0));
+        let p = 0.5 * Vec3::new(theta.sin() * lon.cos(), theta.cos(), theta.sin() * lon.sin());
+        for (found, coded) in plain.color.pixel(0, 16).iter().zip((0.5 + 0.8 * p).to_array()) {
+            assert!((found - crate::image::linear_from_srgb(coded)).abs() < 0.02, "{found} {coded}");
         }
     }
 

@@ -10,6 +10,7 @@ mod ply;
 mod weld;
 
 pub use obj::picture_of_mtl;
+pub(super) use weld::places;
 pub use weld::weld;
 
 use crate::geom::{Atlas, Mesh};

@@ -4,22 +4,31 @@ use crate::geom::Mesh;
 use glam::Vec3;
 use std::collections::HashMap;
 
+/// For each vertex the number of its position, in order of first use, and how many there are: files with a
+/// texture repeat vertices at seams. −0 is 0.
+pub(in crate::mesh) fn places(mesh: &Mesh) -> (Vec<u32>, usize) {
+    let mut numbers: HashMap<[u32; 3], u32> = HashMap::with_capacity(mesh.positions.len());
+    let place = |p: &Vec3| {
+        let next = numbers.len() as u32;
+        // −0 + 0 is 0
+        *numbers.entry((p + Vec3::ZERO).to_array().map(f32::to_bits)).or_insert(next)
+    };
+    let places = mesh.positions.iter().map(place).collect();
+    (places, numbers.len())
+}
+
 /// The mesh with equal positions merged, −0 being 0. Triangles keep their number and order, so an atlas
 /// stays parallel to them; those that fold are kept too.
 ///
 /// A merged vertex has the colour of its first copy, and their common normal; copies that disagree, as
 /// on creases, get the unit of their sum.
 pub fn weld(mesh: &Mesh) -> Mesh {
-    let mut numbers: HashMap<[u32; 3], u32> = HashMap::with_capacity(mesh.positions.len());
+    let (new, _) = places(mesh);
     let mut out = Mesh::default();
     let mut creased = Vec::new();
-    let mut new = Vec::with_capacity(mesh.positions.len());
-    for (i, &p) in mesh.positions.iter().enumerate() {
-        let p = p + Vec3::ZERO; // −0 + 0 is 0
-        let next = out.positions.len() as u32;
-        let number = *numbers.entry(p.to_array().map(f32::to_bits)).or_insert(next);
-        if number == next {
-            out.positions.push(p);
+    for (i, &number) in new.iter().enumerate() {
+        if number as usize == out.positions.len() {
+            out.positions.push(mesh.positions[i] + Vec3::ZERO);
             out.colors.extend(mesh.colors.get(i));
             out.normals.extend(mesh.normals.get(i));
             creased.push(false);
@@ -30,7 +39,6 @@ pub fn weld(mesh: &Mesh) -> Mesh {
                 *creased = true;
             }
         }
-        new.push(number);
     }
     for (normal, creased) in out.normals.iter_mut().zip(creased) {
         if creased {

@@ -10,9 +10,9 @@ use super::rings::{BORDER, HELD, NONE, Rings};
 use glam::Vec3;
 
 /// Cosine of how far a triangle may turn: 60°.
-const TURN: f32 = 0.5;
+pub(super) const TURN: f32 = 0.5;
 /// Least quality `4 √3 area / Σ length²` of a triangle.
-const POOR: f32 = 0.05;
+pub(super) const POOR: f32 = 0.05;
 /// No collapse leaves a vertex with more triangles than this, unless one of its ends had more.
 const CROWN: usize = 20;
 

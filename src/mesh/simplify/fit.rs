@@ -6,9 +6,9 @@
 //!   the surface and `φ` the hat functions: `M δ = −∫ d φᵢ`, `M` the mass matrix of the mesh, solved by
 //!   conjugate gradients. That takes out three quarters of the error on a sphere.
 //!
-//! A vertex whose move would turn or spoil a triangle goes half the way, a quarter, or stays.
+//! A vertex whose move would turn or spoil a triangle, as no collapse may, goes half the way, a quarter, or stays.
 
-use super::collapse::quality_of;
+use super::collapse::{POOR, TURN, quality_of};
 use crate::mesh::MeshError;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -16,10 +16,6 @@ use rayon::prelude::*;
 /// Values and gradients at points.
 pub(super) type Field<'a> = dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync + 'a;
 
-/// A triangle may turn by 60° in a move.
-const TURN: f32 = 0.5;
-/// Least quality after a move, unless it was no better.
-const POOR: f32 = 0.05;
 /// Conjugate gradients on a mass matrix gain a digit in about five steps; two digits are ample.
 const STEPS: usize = 12;
 
