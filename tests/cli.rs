@@ -3,6 +3,7 @@
 
 use std::path::Path;
 use std::process::{Command, Output};
+use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 
 fn tiface(folder: &Path, words: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_tiface"))
