@@ -84,7 +84,6 @@ fn a_folder_that_is_no_capture_ends_with_1_and_a_way_out() {
 
 #[test]
 fn a_dry_run_names_only_the_stages_a_command_needs() {
-    use tiface::capture::synthetic::{SyntheticOptions, write_capture};
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
     write_capture(&dir.path().join("head"), &options).unwrap();
@@ -105,7 +104,6 @@ fn a_dry_run_names_only_the_stages_a_command_needs() {
 
 #[test]
 fn a_blend_that_cannot_be_made_is_refused_before_anything_is_learned() {
-    use tiface::capture::synthetic::{SyntheticOptions, write_capture};
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
     write_capture(&dir.path().join("head"), &options).unwrap();
