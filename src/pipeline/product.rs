@@ -241,6 +241,10 @@ pub(super) mod tests {
             let glb = product.files(MeshFormat::Glb, &export, &config, "head").unwrap();
             assert_eq!(glb.warnings, Vec::<String>::new());
             let (corners, translation) = corners_of(&glb.files[0].1);
+            // a document that is put together by hand for its node keeps what readers of lobes must know
+            let notes =
+                String::from_utf8_lossy(&glb.files[0].1).contains("\"extras\":{\"tiface\":{\"lobes\":[{");
+            assert_eq!(notes, product.pictures.is_some());
             for (found, t) in corners.iter().zip(0..) {
                 let expected = mesh.corners(t).map(exact);
                 for (p, e) in found.iter().zip(expected) {
