@@ -51,7 +51,7 @@ readers() {
 # Tests skip aloud what a machine cannot give; here those lines are shown again, so that nobody
 # takes a skipped test for a passed one.
 tests() {
-  cargo test --release -- --nocapture 2>&1 | tee "$scratch/tests.log"
+  cargo test --release --no-fail-fast -- --nocapture 2>&1 | tee "$scratch/tests.log"
   local ended=${PIPESTATUS[0]}
   grep -h '^skipped:' "$scratch/tests.log" | sort -u > "$scratch/skipped"
   return "$ended"

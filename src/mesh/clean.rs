@@ -1,10 +1,11 @@
 //! What does not belong to the head goes: dust, inner shells, doubled faces, vertices that touch.
 //!
 //! Order: faces without three vertices and doubled faces; vertices whose triangles form several fans
-//! become several; then whole pieces by their signed volume. Nothing here opens a closed mesh of sound
-//! pieces: only whole pieces, or faces that cancel, are removed.
+//! become several; small holes are closed; then whole pieces by their signed volume. Nothing here opens a closed
+//! mesh of sound pieces: only whole pieces, or faces that cancel, are removed.
 
 use super::MeshError;
+use super::holes::fill_holes;
 use crate::geom::{Mesh, Sets, fans, sorted_sides};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
@@ -30,6 +31,12 @@ pub struct CleanReport {
     pub duplicate: usize,
     /// Vertices added where fans only touched.
     pub split_vertices: usize,
+    /// Small holes that were closed.
+    #[serde(default)]
+    pub filled_holes: usize,
+    /// Triangles that closed them.
+    #[serde(default)]
+    pub filled_triangles: usize,
     /// The mesh was inside out and has been turned.
     pub turned: bool,
 }
@@ -47,6 +54,7 @@ pub fn clean(mesh: &mut Mesh, keep_share: f64) -> Result<CleanReport, MeshError>
     let mut report = CleanReport::default();
     drop_faces(mesh, &mut report);
     split_fans(mesh, &mut report);
+    (report.filled_holes, report.filled_triangles) = fill_holes(mesh);
 
     // Pieces in order of their lowest vertex.
     let mut sets = Sets::new(mesh.positions.len());

@@ -15,6 +15,7 @@ pub mod export;
 mod extract;
 pub mod gltf;
 mod gltf_document;
+mod holes;
 mod marching;
 mod marching_bits;
 mod marching_cell;
