@@ -31,8 +31,10 @@ const SMALL: f64 = 0.008;
 /// Times that regions are joined and laid flat.
 const JOINS: usize = 2;
 
-/// Most steps of relaxing; nearly all charts are at rest before.
+/// Most steps of relaxing, and most triangles times steps: charts of very many triangles are smooth ones, whose
+/// sizes are nearly right after half of the steps.
 const RELAXING: usize = 100;
+const RELAXING_WORK: usize = 1_000_000;
 
 /// Mean area stretch, (r + 1/r) / 2, from which a relaxed chart is halved.
 const STRETCH: f64 = 1.05;
@@ -63,7 +65,8 @@ pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<Flattened, Re
 
 /// A chart at its true sizes, or its halves if it cannot have them without stretching.
 fn settled(mesh: &Mesh, mut chart: Flat, splits: usize) -> Vec<Flat> {
-    relax(mesh, &mut chart, RELAXING);
+    let steps = (RELAXING_WORK / chart.triangles.len().max(1)).clamp(RELAXING / 4, RELAXING);
+    relax(mesh, &mut chart, steps);
     if splits == 0 || stretch(mesh, &chart) <= STRETCH {
         return uncovered(chart);
     }
