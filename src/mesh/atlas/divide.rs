@@ -9,10 +9,10 @@
 //! away from the mean of their chart, and each of them costs a gutter and a seam.
 
 use super::Refusal;
-use super::face::{NONE, neighbours, stretch};
 use super::flat::Flat;
 use super::library::{Flattened, STRETCHED, flatten};
 use super::overlap::overlaps;
+use super::patch::{NONE, neighbours, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
 use crate::geom::Mesh;
@@ -184,20 +184,6 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &Flattened) -> Vec<u32> {
             *number.entry(*l).or_insert(next)
         })
         .collect()
-}
-
-/// Takes teeth off the borders: a triangle with two neighbours in one other region joins it.
-fn straighten(beside: &[[u32; 3]], label: &mut [u32]) {
-    for _ in 0..4 {
-        for t in 0..beside.len() {
-            let of = beside[t].map(|n| if n == NONE { NONE } else { label[n as usize] });
-            for (a, b) in [(0, 1), (1, 2), (2, 0)] {
-                if of[a] == of[b] && of[a] != NONE {
-                    label[t] = of[a];
-                }
-            }
-        }
-    }
 }
 
 #[cfg(test)]

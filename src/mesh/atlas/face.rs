@@ -7,11 +7,11 @@
 
 use super::Refusal;
 use super::divide::divide;
-use super::flat::{Flat, twice_area};
 use super::library::{Flattened, STRETCHED, flatten};
+use super::patch::{NONE, area, neighbours, part, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
-use crate::geom::{Mesh, sorted_sides};
+use crate::geom::Mesh;
 use crate::run::Monitor;
 use glam::Vec3;
 
@@ -38,8 +38,6 @@ const STRETCH: f64 = 1.05;
 /// How many times smaller or larger than the rest a triangle of the smooth copy may be: relaxing evens it out.
 const FACE_STRETCHED: f32 = 2.0 * STRETCHED;
 
-pub(super) const NONE: u32 = u32::MAX;
-
 /// Divides a mesh, with its face in one chart if there is a way.
 pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<Flattened, Refusal> {
     for inside in caps(mesh, front.normalize()).take(TRIES) {
@@ -59,43 +57,6 @@ pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> 
         return Ok(all);
     }
     divide(mesh, monitor)
-}
-
-/// The triangles that are `wanted`, and which those were.
-pub(super) fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>) {
-    let number: Vec<u32> = (0..mesh.triangles.len() as u32).filter(|&t| wanted(t)).collect();
-    let mut vertex = vec![NONE; mesh.positions.len()];
-    let mut part = Mesh::default();
-    for &t in &number {
-        part.triangles.push(mesh.triangles[t as usize].map(|v| {
-            let n = &mut vertex[v as usize];
-            if *n == NONE {
-                *n = part.positions.len() as u32;
-                part.positions.push(mesh.positions[v as usize]);
-            }
-            *n
-        }));
-    }
-    (part, number)
-}
-
-/// Mean of (r + 1/r) / 2 over a chart that has the area of its surface.
-pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
-    let (mut sum, mut whole) = (0.0, 0.0);
-    for (k, &t) in flat.triangles.iter().enumerate() {
-        let area = area(mesh, t);
-        let ratio = 0.5 * twice_area(flat.at(k)) / area;
-        if ratio > 0.0 && ratio.is_finite() {
-            sum += area * 0.5 * (ratio + 1.0 / ratio);
-            whole += area;
-        }
-    }
-    sum / whole
-}
-
-fn area(mesh: &Mesh, t: u32) -> f64 {
-    let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
-    0.5 * (b - a).cross(c - a).length()
 }
 
 /// Caps worth flattening, the deepest first: for each triangle whether it belongs.
@@ -119,18 +80,6 @@ fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
         let share = (0..count).filter(|&t| inside[t]).map(|t| areas[t]).sum::<f64>() / whole;
         (share > 0.01 && share < LARGEST).then_some(inside)
     })
-}
-
-/// Across the side from corner k to k + 1 of each triangle; [`NONE`] where there is not exactly one other.
-pub(super) fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
-    let mut beside = vec![[NONE; 3]; mesh.triangles.len()];
-    for run in sorted_sides(&mesh.triangles).chunk_by(|a, b| a.0 == b.0) {
-        if let [(_, a), (_, b)] = *run {
-            beside[a as usize / 3][a as usize % 3] = b / 3;
-            beside[b as usize / 3][b as usize % 3] = a / 3;
-        }
-    }
-    beside
 }
 
 /// Gives `number` to the first triangle and all without one that hang together with it; how many they are.
@@ -170,18 +119,6 @@ fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<boo
     let mut own: Vec<u32> = piece.iter().map(|&p| if p == outside { behind } else { NONE }).collect();
     flood(beside, &mut own, foremost, 0);
     own.iter().map(|&p| p == 0).collect()
-}
-
-/// Takes teeth off the rim: triangles with two neighbours on the other side change it.
-fn straighten(beside: &[[u32; 3]], inside: &mut [bool]) {
-    for _ in 0..4 {
-        for t in 0..beside.len() {
-            let others = beside[t].iter().filter(|&&n| n != NONE && inside[n as usize] != inside[t]).count();
-            if others >= 2 {
-                inside[t] = !inside[t];
-            }
-        }
-    }
 }
 
 #[cfg(test)]

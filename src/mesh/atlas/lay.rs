@@ -4,11 +4,12 @@
 //! half squares of their own. What is left of a chart is packed again, part by part.
 
 use super::divide::divide;
-use super::face::{divide_around, neighbours, part};
+use super::face::divide_around;
 use super::flat::{Flat, height};
 use super::library::Flattened;
 use super::overlap::{overlaps, turn};
 use super::pack::pack;
+use super::patch::{neighbours, part};
 use super::planar::planar;
 use super::{AtlasConfig, Laid, Refusal, Unwrap};
 use crate::geom::{Atlas, Mesh};

@@ -16,6 +16,7 @@ mod lay;
 mod library;
 pub(super) mod overlap;
 mod pack;
+mod patch;
 mod planar;
 mod raster;
 mod relax;

@@ -1,7 +1,7 @@
 //! Flat pieces of a surface, such as the cap under a bust: laid out as they are, in one chart each.
 
-use super::face::NONE;
 use super::flat::Flat;
+use super::patch::NONE;
 use crate::geom::Mesh;
 use glam::{DVec2, DVec3};
 
@@ -86,8 +86,8 @@ fn projected(mesh: &Mesh, triangles: &[u32], n: DVec3) -> Flat {
 
 #[cfg(test)]
 mod tests {
-    use super::super::face::neighbours;
     use super::super::flat::twice_area;
+    use super::super::patch::neighbours;
     use super::*;
     use glam::Vec3;
 

@@ -1,0 +1,74 @@
+//! Patches of a surface: which triangles lie beside each other, parts as meshes of their own, how far a chart is
+//! from the sizes of its surface.
+
+use super::flat::{Flat, twice_area};
+use crate::geom::{Mesh, sorted_sides};
+
+/// No triangle, no vertex, no number.
+pub(super) const NONE: u32 = u32::MAX;
+
+/// The triangles that are `wanted`, and which those were.
+pub(super) fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>) {
+    let number: Vec<u32> = (0..mesh.triangles.len() as u32).filter(|&t| wanted(t)).collect();
+    let mut vertex = vec![NONE; mesh.positions.len()];
+    let mut part = Mesh::default();
+    for &t in &number {
+        part.triangles.push(mesh.triangles[t as usize].map(|v| {
+            let n = &mut vertex[v as usize];
+            if *n == NONE {
+                *n = part.positions.len() as u32;
+                part.positions.push(mesh.positions[v as usize]);
+            }
+            *n
+        }));
+    }
+    (part, number)
+}
+
+/// Mean of (r + 1/r) / 2 over a chart that has the area of its surface.
+pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
+    let (mut sum, mut whole) = (0.0, 0.0);
+    for (k, &t) in flat.triangles.iter().enumerate() {
+        let area = area(mesh, t);
+        let ratio = 0.5 * twice_area(flat.at(k)) / area;
+        if ratio > 0.0 && ratio.is_finite() {
+            sum += area * 0.5 * (ratio + 1.0 / ratio);
+            whole += area;
+        }
+    }
+    sum / whole
+}
+
+/// Area of a triangle.
+pub(super) fn area(mesh: &Mesh, t: u32) -> f64 {
+    let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
+    0.5 * (b - a).cross(c - a).length()
+}
+
+/// Across the side from corner k to k + 1 of each triangle; [`NONE`] where there is not exactly one other.
+pub(super) fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
+    let mut beside = vec![[NONE; 3]; mesh.triangles.len()];
+    for run in sorted_sides(&mesh.triangles).chunk_by(|a, b| a.0 == b.0) {
+        if let [(_, a), (_, b)] = *run {
+            beside[a as usize / 3][a as usize % 3] = b / 3;
+            beside[b as usize / 3][b as usize % 3] = a / 3;
+        }
+    }
+    beside
+}
+
+/// Takes teeth off the borders of regions: a triangle with two neighbours in one other region joins it.
+pub(super) fn straighten<L: Copy + PartialEq>(beside: &[[u32; 3]], region: &mut [L]) {
+    for _ in 0..4 {
+        for t in 0..beside.len() {
+            let of = beside[t].map(|n| (n != NONE).then(|| region[n as usize]));
+            for (a, b) in [(0, 1), (1, 2), (2, 0)] {
+                if let (Some(one), Some(other)) = (of[a], of[b])
+                    && one == other
+                {
+                    region[t] = one;
+                }
+            }
+        }
+    }
+}
