@@ -7,6 +7,7 @@ mod camera;
 mod mesh;
 mod ray;
 mod similarity;
+mod symmetric;
 mod topology;
 
 pub use aabb::Aabb;
@@ -16,5 +17,6 @@ pub use camera::{Camera, Distortion};
 pub use mesh::Mesh;
 pub use ray::{Hit, Ray};
 pub use similarity::Similarity;
+pub(crate) use symmetric::cofactors;
 pub(crate) use topology::{Sets, fans, sorted_sides};
 pub use topology::{Topology, topology};

@@ -23,6 +23,7 @@
 //! symmetric, 12 before the diagonal are kept.
 
 use super::trimap::{HEAD, UNSURE};
+use crate::geom::cofactors;
 use crate::image::{Gray, Photo};
 
 /// How the opacity of the band is solved for.
@@ -315,16 +316,8 @@ fn window(colours: &[[u8; 3]; 9], epsilon: f64) -> ([[f64; 3]; 9], [[f64; 3]; 9]
 }
 
 /// The inverse of a symmetric matrix, each as `xx xy xz yy yz zz`.
-pub(super) fn inverted([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> [f64; 6] {
-    let cofactors = [
-        yy * zz - yz * yz,
-        xz * yz - xy * zz,
-        xy * yz - xz * yy,
-        xx * zz - xz * xz,
-        xy * xz - xx * yz,
-        xx * yy - xy * xy,
-    ];
-    let determinant = xx * cofactors[0] + xy * cofactors[1] + xz * cofactors[2];
+pub(super) fn inverted(matrix: [f64; 6]) -> [f64; 6] {
+    let (cofactors, determinant) = cofactors(matrix);
     cofactors.map(|c| c / determinant)
 }
 

@@ -6,6 +6,7 @@
 //! former steps, six numbers a vertex are enough, and because they are relative to the vertex, f32 holds
 //! them wherever the mesh lies. An edge (a, b) costs the least of `Q_a + Q_b`, found in f64.
 
+use crate::geom::cofactors;
 use glam::{DVec3, Vec3};
 
 /// Share of the trace added to the diagonal, about the middle of the edge: pulls the best point there
@@ -125,16 +126,8 @@ pub(super) fn best(a: Vec3, qa: &Spread, b: Vec3, qb: &Spread, freedom: Freedom)
 /// Solves the symmetric system by cofactors; `None` where its condition is above about 1e6.
 #[inline]
 fn solve(m: [f64; 6], r: DVec3) -> Option<DVec3> {
-    let [xx, xy, xz, yy, yz, zz] = m;
-    let c = [
-        yy * zz - yz * yz,
-        xz * yz - xy * zz,
-        xy * yz - xz * yy,
-        xx * zz - xz * xz,
-        xy * xz - xx * yz,
-        xx * yy - xy * xy,
-    ];
-    let det = xx * c[0] + xy * c[1] + xz * c[2];
+    let (c, det) = cofactors(m);
+    let [xx, _, _, yy, _, zz] = m;
     let trace = xx + yy + zz;
     // For eigenvalues p ≥ q ≥ r > 0: det = pqr and the sum of the principal minors c is about pq, so
     // their quotient is about r, to be compared with the trace, about p.
