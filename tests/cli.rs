@@ -1,20 +1,12 @@
 //! The command line as a user sees it: exit codes, messages, streams.
 #![cfg(feature = "cpu")]
 
+mod command;
+
+use command::tiface;
 use std::path::Path;
 use std::process::{Command, Output};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
-
-fn tiface(folder: &Path, words: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_tiface"))
-        .args(words)
-        .current_dir(folder)
-        .env("XDG_CONFIG_HOME", folder) // nobody's own configuration
-        .env_remove("RUST_LOG")
-        .env("NO_COLOR", "1")
-        .output()
-        .unwrap()
-}
 
 fn code(output: &Output) -> i32 {
     output.status.code().unwrap()

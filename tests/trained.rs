@@ -1,24 +1,16 @@
 //! From photographs without masks to closed meshes at several resolutions: clicks, a short training, extraction.
 #![cfg(feature = "cpu")]
 
+mod command;
+
+use command::tiface;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Output;
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 use tiface::io::{Limits, read_gray};
 use tiface::mask::Click;
 use tiface::mask::distance::squared_distance;
 use tiface::mask::points::{Frame, Prompts};
-
-fn tiface(folder: &Path, words: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_tiface"))
-        .args(words)
-        .current_dir(folder)
-        .env("XDG_CONFIG_HOME", folder) // nobody's own configuration
-        .env_remove("RUST_LOG")
-        .env("NO_COLOR", "1")
-        .output()
-        .unwrap()
-}
 
 fn worked(output: &Output) {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
