@@ -11,7 +11,7 @@
 
 use super::closed_form::{ClosedFormOptions, closed_form};
 use super::guided::{GuidedOptions, guided};
-use super::scale::{enlarge, reduce_gray, reduce_photo, working_size};
+use super::scale::{enlarge, reduce_photo, resize_hard, working_size};
 use super::trimap::{Band, HEAD, OUTSIDE, UNSURE, trimap, unsure_share};
 use crate::image::{Gray, Photo};
 
@@ -177,13 +177,7 @@ impl Working {
         if given.0 == 0 || given.1 == 0 || apart > size.0.max(size.1) as u64 {
             return Err(AlphaError::Size { mask: given, photo: size });
         }
-        let mut mask = if given.0 >= working.0 && given.1 >= working.1 {
-            reduce_gray(mask, working)
-        } else {
-            let head: Vec<f32> = mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect();
-            enlarge(&head, given, working, 0.0, 1.0)
-        };
-        mask.values.iter_mut().for_each(|v| *v = if *v >= 128 { HEAD } else { OUTSIDE });
+        let mask = resize_hard(mask, working);
         let trimap = trimap(&mask, options.band);
         Ok(Working { photo: reduce_photo(photo, working), mask, trimap, size })
     }
@@ -254,6 +248,7 @@ pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Sof
 #[cfg(test)]
 mod tests {
     use super::super::distance;
+    use super::super::scale::reduce_gray;
     use super::*;
     use crate::io::{Limits, read_gray, read_photo};
 

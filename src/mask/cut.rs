@@ -15,7 +15,7 @@ use super::cut_error::CutError;
 use super::known::{self, Known};
 use super::maxflow::PixelGraph;
 use super::mixture::{Mixture, Rgb};
-use super::working::{working_click, working_photo};
+use super::scale::reduce_to_rows;
 use crate::image::{Gray, Photo};
 
 /// Whole-number capacities per unit of energy.
@@ -146,7 +146,7 @@ const FORWARD: [(usize, isize, isize); 4] = [(0, 1, 0), (2, 0, 1), (4, 1, 1), (6
 impl Ground {
     /// Reduces a photograph and draws what its clicks make certain; also warnings about the clicks.
     pub fn new(view: &str, photo: &Photo, clicks: &[Click], options: &CutOptions) -> (Ground, Vec<String>) {
-        let small = working_photo(photo, options.rows.max(16));
+        let small = reduce_to_rows(photo, options.rows.max(16));
         Ground::reduced(view, small, (photo.width, photo.height), clicks, options)
     }
 
@@ -158,8 +158,7 @@ impl Ground {
         clicks: &[Click],
         options: &CutOptions,
     ) -> (Ground, Vec<String>) {
-        let clicks: Vec<Click> =
-            clicks.iter().map(|c| working_click(c, size, (small.width, small.height))).collect();
+        let clicks: Vec<Click> = clicks.iter().map(|c| c.moved(size, (small.width, small.height))).collect();
         let (width, height) = (small.width as usize, small.height as usize);
         let (known, warnings) = known::known(view, &clicks, width, height, options);
         let joints = joints(&small, options.smoothness);
@@ -368,7 +367,7 @@ mod tests {
         let (photo, truth) = head(3.0);
         let cut = cut("a", &photo, &clicks(3.0), &CutOptions { rows: 128, ..CutOptions::default() }).unwrap();
         assert_eq!((cut.mask.width, cut.mask.height), (96, 128));
-        let large = super::super::working::resized_mask(&cut.mask, photo.width, photo.height);
+        let large = super::super::scale::resize_hard(&cut.mask, (photo.width, photo.height));
         assert!(overlap(&large, &truth) > 0.97, "{}", overlap(&large, &truth));
     }
 

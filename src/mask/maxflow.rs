@@ -263,13 +263,7 @@ impl PixelGraph {
             if self.tree[q] != self.tree[p] || self.parent[q] == FREE {
                 continue;
             }
-            // flow must run from the root through q to p
-            let feeds = if self.tree[p] == HEAD {
-                self.residual[q][direction ^ 1] > 0
-            } else {
-                self.residual[p][direction] > 0
-            };
-            if !feeds {
+            if !self.feeds(q, p, direction) {
                 continue;
             }
             if let Some(depth) = self.depth_below_root(q)
@@ -289,12 +283,7 @@ impl PixelGraph {
             if self.tree[q] != self.tree[p] || self.parent[q] == FREE {
                 continue;
             }
-            let feeds = if self.tree[p] == HEAD {
-                self.residual[q][direction ^ 1] > 0
-            } else {
-                self.residual[p][direction] > 0
-            };
-            if feeds {
+            if self.feeds(q, p, direction) {
                 self.activate(q);
             }
             if self.parent[q] == (direction ^ 1) as u8 {
@@ -304,6 +293,15 @@ impl PixelGraph {
         }
         self.parent[p] = FREE;
         self.tree[p] = 0;
+    }
+
+    /// May flow run between the root and `p` through its neighbour `q` in this direction?
+    fn feeds(&self, q: usize, p: usize, direction: usize) -> bool {
+        if self.tree[p] == HEAD {
+            self.residual[q][direction ^ 1] > 0
+        } else {
+            self.residual[p][direction] > 0
+        }
     }
 
     /// Steps from a node to its terminal, or nothing when it hangs on an orphan; marks the way as known.

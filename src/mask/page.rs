@@ -126,7 +126,7 @@ pub fn page(title: &str, views: &[PageView], prompts: &Prompts) -> String {
     let views: Vec<Value> = views.iter().map(view).collect();
     let data = inside_script(&json!({"views": views, "prompts": prompts.to_json()}));
     let (before, after) = TEMPLATE.split_once("__DATA__").unwrap_or((TEMPLATE, ""));
-    // a title that holds a placeholder's name must stay what it is
+    // the title goes into the part before the data, so one that says `__DATA__` stays as it is
     let before = before.replace("__TITLE__", &escape(title));
     [&before, data.as_str(), after].concat()
 }

@@ -1,10 +1,11 @@
 //! Pictures made smaller before the mask is cut, and alphas made large again afterwards.
 //!
 //! Smaller is the area average of coded values (what the networks were trained on, and what keeps the
-//! matting equation `I = α F + (1 − α) B` true in the space it is solved in); larger is bilinear between
+//! matting equation `I = α F + (1 − α) B` true in the space it is solved in); for a cut, whose colours only tell
+//! two sides apart, it is taken in linear light. Larger is bilinear between
 //! pixel centres: column `x` of `W` looks at `(x + ½) w / W − ½` of `w`.
 
-use crate::image::{Gray, Photo, quantise};
+use crate::image::{Gray, Photo, linear_from_srgb, quantise, srgb_from_linear};
 use rayon::prelude::*;
 
 /// The size of a picture brought down to at most `side` pixels on its longest side; never larger than it is.
@@ -38,8 +39,34 @@ fn shares(from: u32, to: u32) -> Vec<Share> {
         .collect()
 }
 
+/// What bytes stand for while they are averaged.
+#[derive(Clone, Copy, PartialEq)]
+enum Scale {
+    /// Themselves: coded colours, masks.
+    Coded,
+    /// Linear light, as a coarser sensor would have seen it.
+    Light,
+}
+
+impl Scale {
+    fn value(self, byte: u8) -> f32 {
+        match self {
+            Scale::Coded => byte as f32,
+            Scale::Light => linear_from_srgb(byte as f32 / 255.0),
+        }
+    }
+
+    fn byte(self, value: f32) -> u8 {
+        match self {
+            Scale::Coded => (value + 0.5) as u8,
+            Scale::Light => quantise(srgb_from_linear(value)),
+        }
+    }
+}
+
 /// `channels` interleaved bytes a pixel, averaged. Rows are computed apart, each in a fixed order.
-fn average(bytes: &[u8], channels: usize, from: (u32, u32), to: (u32, u32)) -> Vec<u8> {
+fn average(bytes: &[u8], channels: usize, from: (u32, u32), to: (u32, u32), scale: Scale) -> Vec<u8> {
+    let values: Vec<f32> = (0..=255).map(|b| scale.value(b)).collect();
     assert!(to.0 >= 1 && to.1 >= 1 && to.0 <= from.0 && to.1 <= from.1, "only smaller pictures are made");
     let (across, down) = (shares(from.0, to.0), shares(from.1, to.1));
     let stride = from.0 as usize * channels;
@@ -50,13 +77,13 @@ fn average(bytes: &[u8], channels: usize, from: (u32, u32), to: (u32, u32)) -> V
             column.fill(0.0);
             for (k, &weight) in share.weights.iter().enumerate() {
                 let source = &bytes[(share.first + k) * stride..][..stride];
-                column.iter_mut().zip(source).for_each(|(sum, &v)| *sum += weight * v as f32);
+                column.iter_mut().zip(source).for_each(|(sum, &v)| *sum += weight * values[v as usize]);
             }
             for (pixel, share) in row.chunks_exact_mut(channels).zip(&across) {
                 for (c, value) in pixel.iter_mut().enumerate() {
                     let part = share.weights.iter().enumerate();
                     let sum: f32 = part.map(|(k, w)| w * column[(share.first + k) * channels + c]).sum();
-                    *value = (sum + 0.5) as u8;
+                    *value = scale.byte(sum);
                 }
             }
         },
@@ -70,10 +97,23 @@ pub fn reduce_photo(photo: &Photo, size: (u32, u32)) -> Photo {
     if size == from {
         return photo.clone();
     }
-    let bytes = average(photo.rgb.as_flattened(), 3, from, size);
+    let bytes = average(photo.rgb.as_flattened(), 3, from, size, Scale::Coded);
     let rgb = bytes.as_chunks::<3>().0.to_vec();
-    let alpha = photo.alpha.as_ref().map(|a| average(a, 1, from, size));
+    let alpha = photo.alpha.as_ref().map(|a| average(a, 1, from, size, Scale::Coded));
     Photo { width: size.0, height: size.1, rgb, alpha }
+}
+
+/// A photograph averaged down in linear light to at most `rows` rows, without its alpha; the same photograph when it is
+/// small enough already.
+pub fn reduce_to_rows(photo: &Photo, rows: u32) -> Photo {
+    let from = (photo.width, photo.height);
+    if photo.height <= rows {
+        return Photo { alpha: None, ..photo.clone() };
+    }
+    let width = (photo.width as f64 * rows as f64 / photo.height as f64).round() as u32;
+    let size = (width.max(1), rows);
+    let bytes = average(photo.rgb.as_flattened(), 3, from, size, Scale::Light);
+    Photo { width: size.0, height: size.1, rgb: bytes.as_chunks::<3>().0.to_vec(), alpha: None }
 }
 
 /// A mask averaged down to `size`, which is nowhere larger than its own.
@@ -82,7 +122,21 @@ pub fn reduce_gray(gray: &Gray, size: (u32, u32)) -> Gray {
     if size == from {
         return gray.clone();
     }
-    Gray { width: size.0, height: size.1, values: average(&gray.values, 1, from, size) }
+    Gray { width: size.0, height: size.1, values: average(&gray.values, 1, from, size, Scale::Coded) }
+}
+
+/// A hard mask (head where it is 128 or more) at another size, 255 or 0: averaged down, or up by bilinear
+/// interpolation, and cut at one half. Its outline is smooth where copied pixels would make stairs.
+pub fn resize_hard(mask: &Gray, size: (u32, u32)) -> Gray {
+    let from = (mask.width, mask.height);
+    let mut resized = if from.0 >= size.0 && from.1 >= size.1 {
+        reduce_gray(mask, size)
+    } else {
+        let head: Vec<f32> = mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect();
+        enlarge(&head, from, size, 0.0, 1.0)
+    };
+    resized.values.iter_mut().for_each(|v| *v = if *v >= 128 { 255 } else { 0 });
+    resized
 }
 
 /// Alpha within 0..=1, with what is nearly nothing made nothing and what is nearly full made full. First
@@ -181,5 +235,44 @@ mod tests {
         // 0.021 · 255 = 5.4 → 5: the smallest value that is left
         assert_eq!(enlarge(&given, (7, 1), (7, 1), 0.02, 0.98).values, [0, 0, 5, 128, 250, 255, 255]);
         assert_eq!(enlarge(&[f32::NAN], (1, 1), (2, 1), 0.02, 0.98).values, [0, 0]);
+    }
+
+    #[test]
+    fn only_tall_photographs_are_reduced_to_rows() {
+        let size = |width: u32, height: u32| {
+            let rgb = vec![[0; 3]; (width * height) as usize];
+            let small = reduce_to_rows(&Photo { width, height, rgb, alpha: None }, 512);
+            (small.width, small.height)
+        };
+        assert_eq!(size(384, 512), (384, 512));
+        assert_eq!(size(3000, 4096), (375, 512));
+        assert_eq!(size(4096, 100), (4096, 100));
+        assert_eq!(size(1, 4096), (1, 512));
+    }
+
+    #[test]
+    fn averages_are_taken_in_linear_light_over_parts_of_pixels() {
+        // three rows into two: rows 0 and half of 1, half of 1 and 2
+        let rgb = vec![[255, 0, 0], [0, 0, 255], [0, 0, 255]];
+        let small = reduce_to_rows(&Photo { width: 1, height: 3, rgb, alpha: None }, 2);
+        let coded = |v: f32| quantise(srgb_from_linear(v));
+        assert_eq!((small.width, small.height), (1, 2));
+        assert_eq!(small.rgb, [[coded(2.0 / 3.0), 0, coded(1.0 / 3.0)], [0, 0, 255]]);
+    }
+
+    #[test]
+    fn a_flat_photograph_stays_flat_at_every_size() {
+        let photo = Photo { width: 61, height: 83, rgb: vec![[200, 100, 7]; 61 * 83], alpha: None };
+        for rows in [82, 60, 41, 40, 13, 1] {
+            assert!(reduce_to_rows(&photo, rows).rgb.iter().all(|c| *c == [200, 100, 7]), "{rows} rows");
+        }
+    }
+
+    #[test]
+    fn a_mask_goes_up_in_size_with_its_edge_in_place() {
+        let mask = Gray { width: 4, height: 1, values: vec![255, 255, 0, 0] };
+        let large = resize_hard(&mask, (12, 2));
+        assert_eq!(large.values[..12], [255, 255, 255, 255, 255, 255, 0, 0, 0, 0, 0, 0]);
+        assert_eq!(large.values[12..], large.values[..12]);
     }
 }

@@ -17,7 +17,7 @@ use super::distance::{grow, shrink};
 use super::hull::{self, Votes, Witness};
 use super::known::{self, Known};
 use super::mixture::Rgb;
-use super::working::working_photo;
+use super::scale::reduce_to_rows;
 use crate::capture::carve::{Cube, drop_dust};
 use crate::capture::findings;
 use crate::geom::Camera;
@@ -149,7 +149,7 @@ where
                     return Err(CutError::Size { view: views[i].name.into(), found, camera }.into());
                 }
                 known::check_size(views[i].name, photo.width, photo.height)?;
-                Ok(working_photo(&photo, options.cut.rows.max(16)))
+                Ok(reduce_to_rows(&photo, options.cut.rows.max(16)))
             })
             .collect();
         for photo in loaded {

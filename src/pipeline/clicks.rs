@@ -9,7 +9,7 @@ use super::{Line, PipelineError, capture_failure};
 use crate::capture::{Capture, Split};
 use crate::config::{MaskConfig, MattingMethod};
 use crate::image::{Gray, Photo};
-use crate::io::{self, Limits, ReadError};
+use crate::io::{self, Limits};
 use crate::mask::alpha::{Matting, SoftenOptions, Working, soften};
 use crate::mask::closed_form::ClosedFormOptions;
 use crate::mask::cut::{CutOptions, cut};
@@ -210,7 +210,6 @@ impl Line<'_> {
         let total = hard.len();
         let largest = sizes.into_iter().max_by_key(|&(w, h)| u64::from(w) * u64::from(h));
         let at_once = networks.at_once(largest.unwrap_or((1, 1)), &soft, config);
-        let mut unsure = Vec::new();
         for start in (0..total).step_by(at_once) {
             let made: Vec<Result<(Photo, Made, Vec<String>), Failure>> = (start
                 ..(start + at_once).min(total))
@@ -225,7 +224,6 @@ impl Line<'_> {
                 let (photo, made, warnings) = made?;
                 let name = &self.capture.views[i].name;
                 warnings.iter().for_each(|w| stage.warn(&format!("view `{name}`: {w}")));
-                unsure.push(made.unsure);
                 keep(i, &photo, made)?;
             }
             stage.monitor().step((start + at_once).min(total) as u64, total as u64, &[]);
@@ -285,9 +283,7 @@ impl Line<'_> {
                 let chosen = if own.is_empty() {
                     carried(&hard.mask, size)
                 } else {
-                    let (x, y) = (size.0 as f32 / photo.width as f32, size.1 as f32 / photo.height as f32);
-                    let at = |v: f32, s: f32| (v + 0.5) * s - 0.5;
-                    own.iter().map(|c| Click { x: at(c.x, x), y: at(c.y, y), head: c.head }).collect()
+                    own.iter().map(|c| c.moved((photo.width, photo.height), size)).collect()
                 };
                 let (mask, score) = networks.segment(&small, &chosen)?;
                 if !mask.values.contains(&255) {
@@ -358,8 +354,7 @@ pub(super) fn carried(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
                 break;
             }
             let (x, y) = (best % w, best / w);
-            let at = |v: usize, from: usize, to: u32| (v as f32 + 0.5) * to as f32 / from as f32 - 0.5;
-            out.push(Click { x: at(x, w, size.0), y: at(y, h, size.1), head });
+            out.push(Click { x: x as f32, y: y as f32, head }.moved((mask.width, mask.height), size));
             let reach = if d.is_finite() { d } else { (w * w + h * h) as f32 / 16.0 };
             for (i, v) in deep.iter_mut().enumerate() {
                 let (dx, dy) = ((i % w).abs_diff(x) as f32, (i / w).abs_diff(y) as f32);
@@ -370,12 +365,6 @@ pub(super) fn carried(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
         }
     }
     out
-}
-
-impl From<ReadError> for Spread {
-    fn from(e: ReadError) -> Spread {
-        Spread::Load(e.into())
-    }
 }
 
 #[cfg(test)]
