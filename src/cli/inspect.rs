@@ -9,8 +9,9 @@ use std::path::Path;
 
 pub(super) fn go(common: &Common, capture: &Path) -> Result<Exit, Ending> {
     let config = common.resolve(None, None, &[])?;
-    let mut found = inspect(capture, &capture_options(&config));
-    found.warnings.extend(disagreements(capture, &capture_options(&config)));
+    let options = capture_options(&config);
+    let mut found = inspect(capture, &options);
+    found.warnings.extend(disagreements(capture, &options));
     let text = if common.json {
         format!("{}\n", serde_json::to_string(&found).unwrap_or_default())
     } else {

@@ -8,7 +8,7 @@ use crate::io;
 use crate::pipeline::{PipelineError, capture_options, click_page};
 use crate::run::Exit;
 use serde_json::json;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Writes the page for a capture. Clicks that are there already, `points` or the capture's own `prompts.json`, are in
 /// it.
@@ -21,17 +21,17 @@ pub(super) fn go(
     let Some(path) = path else {
         return Err(Ending::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
     };
-    let config = common.resolve(None, None, &[])?;
-    // a run knows its capture
-    let saved = path.join("config.toml");
-    let root = match io::is_file(&saved) {
-        true => PathBuf::from(common.resolve(Some(&saved), None, &[])?.capture.path),
-        false => path.to_path_buf(),
+    // a run knows its capture, and how large its photographs are taken
+    let saved = Some(path.join("config.toml")).filter(|file| io::is_file(file));
+    let config = common.resolve(saved.as_deref(), None, &[])?;
+    let root = match config.capture.path.as_str() {
+        "" => path,
+        _ if saved.is_none() => path,
+        known => Path::new(known),
     };
-    let root = if root.as_os_str().is_empty() { path.to_path_buf() } else { root };
     // photographs are clicked on whether or not they have masks
     let options = capture::CaptureOptions { masks: capture::MaskChoice::None, ..capture_options(&config) };
-    let capture = capture::open(&root, &options).map_err(PipelineError::from)?;
+    let capture = capture::open(root, &options).map_err(PipelineError::from)?;
     // the capture's own clicks are a help: what is wrong with them does not keep anybody from clicking
     let own = capture.root.join("prompts.json");
     let inside =

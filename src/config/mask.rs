@@ -80,7 +80,7 @@ pub struct MaskConfig {
     pub points: String,
     /// Clicks as `x,y,label`, for a quick try.
     pub point: Vec<String>,
-    /// The view that `point` is on; empty for the first.
+    /// The view that `point` is on; empty for the first that is trained on.
     pub view: String,
     /// How a hard mask comes from clicks.
     pub cut: CutMethod,
