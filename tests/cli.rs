@@ -4,7 +4,6 @@
 mod command;
 
 use command::tiface;
-use std::path::Path;
 use std::process::{Command, Output};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 
