@@ -43,7 +43,7 @@ struct Input {
 
 fn input() -> Input {
     let levels = hash::levels(16, 16, 1.447_269_237_440_378, 19);
-    let shape = Arc::new(FieldShape { levels, radius: 1.0, active: 16 });
+    let shape = Arc::new(FieldShape { levels, radius: 1.0, active: 16, color_skip: false });
     let u = |s: u64, i: usize| 2.0 * rng::uniform(9, s, i as u64) - 1.0;
     let table = (0..2 * hash::entries(&shape.levels)).map(|i| 1e-4 * u(1, i)).collect();
     let flat = (0..shape.layout().len()).map(|i| 0.2 * u(2, i)).collect();
@@ -184,7 +184,7 @@ fn plain_input(i: &Input, device: &Device) -> Plain {
 }
 
 fn plain(i: &Input, q: &Plain, device: &Device, table: &mut [Option<Tensor<2>>; 3], flat: &Tensor<1>) {
-    let layout = Layout::new(16);
+    let layout = Layout::new(16, false);
     let p = table[0].take().expect("kept").autodiff().require_grad();
     let mut start = 0;
     let mats: Vec<Tensor<2>> = layout

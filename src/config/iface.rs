@@ -66,6 +66,8 @@ pub struct IfaceConfig {
     pub start_levels: usize,
     /// One more level every so many steps (0: all at once).
     pub level_every: u64,
+    /// Does the colour network read the hash features beside the geometry network's outputs?
+    pub color_skip: bool,
     /// Half edge of the field's box.
     pub radius: f32,
     /// Where the surface starts.
@@ -151,6 +153,7 @@ impl IfaceConfig {
             log2_table: 18,
             start_levels: 6,
             level_every: 100,
+            color_skip: true,
             radius: 1.0,
             start: Start::Hull,
             lr_table: 1e-2,
@@ -213,6 +216,7 @@ impl IfaceConfig {
             log2_table: 19,
             start_levels: 16,
             level_every: 0,
+            color_skip: false,
             radius: 0.3,
             start: Start::Sphere,
             lr_table: 1e-2,

@@ -19,6 +19,10 @@ pub(super) const KEYS: &[Key] = &[
     Key::number("log2_table", "Binary logarithm of a level's largest table.", 4.0, 24.0),
     Key::number("start_levels", "Levels that take part from the first step.", 1.0, 32.0),
     Key::number("level_every", "One more level every so many steps; 0 takes all at once.", 0.0, 1e7),
+    Key::word(
+        "color_skip",
+        "The colour network reads the hash features too, true or false (published: false).",
+    ),
     Key::number("radius", "Half edge of the field's box.", 1e-3, 1e3),
     Key::word("start", "Where the surface starts: hull (the masks' visual hull) or sphere."),
     Key::number("lr_table", "Learning rate of the hash table at its peak.", 0.0, 1.0),

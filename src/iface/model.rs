@@ -3,7 +3,7 @@
 use crate::config::iface::IfaceConfig;
 use crate::field::{self, ops};
 use crate::kernel::hash;
-use crate::kernel::mlp::{COLOR_INPUTS, HIDDEN, Layout, OUTPUTS};
+use crate::kernel::mlp::{HIDDEN, OUTPUTS};
 use crate::kernel::rng;
 use crate::kernel::sdf::FieldShape;
 use burn::module::{Module, Param};
@@ -27,7 +27,7 @@ pub struct Model {
     pub g2: Param<Tensor<2>>,
     /// `[13]`
     pub b2: Param<Tensor<1>>,
-    /// `[64, 32]`
+    /// `[64, 32]`, with the colour skip `[64, 32 + 2 levels]`
     pub c1: Param<Tensor<2>>,
     /// `[64, 64]`
     pub c2: Param<Tensor<2>>,
@@ -43,6 +43,7 @@ pub fn shape(config: &IfaceConfig) -> FieldShape {
         levels: hash::levels(config.levels, config.base_resolution, config.growth, config.log2_table),
         radius: config.radius,
         active: config.levels,
+        color_skip: config.color_skip,
     }
 }
 
@@ -53,8 +54,8 @@ pub fn shape(config: &IfaceConfig) -> FieldShape {
 /// and starts with gradients of 1 / radius.
 pub fn initial(config: &IfaceConfig, seed: u64) -> Vec<(&'static str, Vec<usize>, Vec<f32>)> {
     let shape = shape(config);
-    let layout = Layout::new(config.levels);
-    let inputs = layout.inputs;
+    let layout = shape.layout();
+    let (inputs, colored) = (layout.inputs, layout.color_inputs());
     let entries = hash::entries(&shape.levels);
     let table = (0..2 * entries as u64).map(|i| 2e-4 * rng::uniform(seed, 101, i) - 1e-4).collect();
     let first = (2.0f32).sqrt() / (HIDDEN as f32).sqrt();
@@ -88,7 +89,7 @@ pub fn initial(config: &IfaceConfig, seed: u64) -> Vec<(&'static str, Vec<usize>
         ("v2", vec![OUTPUTS, HIDDEN], v2),
         ("g2", vec![OUTPUTS, 1], g2),
         ("b2", vec![OUTPUTS], b2),
-        ("c1", vec![HIDDEN, COLOR_INPUTS], xavier(104, HIDDEN, HIDDEN, COLOR_INPUTS)),
+        ("c1", vec![HIDDEN, colored], xavier(104, HIDDEN, HIDDEN, colored)),
         ("c2", vec![HIDDEN, HIDDEN], xavier(105, HIDDEN, HIDDEN, HIDDEN)),
         ("c3", vec![3, HIDDEN], xavier(106, 3, 16, HIDDEN)),
         ("variance", vec![1], vec![config.variance as f32]),

@@ -2,14 +2,17 @@
 //!
 //! ```text
 //! geometry  [x 3, hash 2L] ─ 64 ─ softplus₁₀₀ ─ 13     out[0] is the sdf, all 13 go to the colour
-//! colour    [13, SH 16, normal 3] ─ 64 ─ relu ─ 64 ─ relu ─ 3 ─ sigmoid      no biases
+//! colour    [13, SH 16, normal 3 (, hash 2L)] ─ 64 ─ relu ─ 64 ─ relu ─ 3 ─ sigmoid      no biases
 //! ```
+//!
+//! With the colour skip (not published) the colour network reads the hash features themselves too: twelve numbers
+//! behind a layer that is shaped by the surface are a narrow way for all that is seen on a head.
 
 /// Width of every hidden layer.
 pub const HIDDEN: usize = 64;
 /// Outputs of the geometry network.
 pub const OUTPUTS: usize = 13;
-/// Inputs of the colour network: 13 features, 16 harmonics, 3 of the normal.
+/// Inputs of the colour network without the skip: 13 features, 16 harmonics, 3 of the normal.
 pub const COLOR_INPUTS: usize = 32;
 /// [`OUTPUTS`] as stored in tiles.
 pub const OUTPUTS_PADDED: usize = 16;
@@ -23,12 +26,24 @@ pub const TILE: usize = 64;
 pub struct Layout {
     /// Inputs of the geometry network: 3 + 2 · levels.
     pub inputs: usize,
+    /// Does the colour network read the hash features too?
+    pub color_skip: bool,
 }
 
 impl Layout {
     /// For a hash grid of so many levels.
-    pub fn new(levels: usize) -> Layout {
-        Layout { inputs: 3 + 2 * levels }
+    pub fn new(levels: usize, color_skip: bool) -> Layout {
+        Layout { inputs: 3 + 2 * levels, color_skip }
+    }
+
+    /// Inputs of the colour network.
+    pub fn color_inputs(&self) -> usize {
+        COLOR_INPUTS + if self.color_skip { self.inputs - 3 } else { 0 }
+    }
+
+    /// Columns of a tile of colour inputs: zeros up to a multiple of 8.
+    pub fn color_padded(&self) -> usize {
+        self.color_inputs().next_multiple_of(8)
     }
 
     /// Shapes `[out, in]` in storage order: W1, b1, W2, b2, C1, C2, C3 (biases as `[n, 1]`).
@@ -38,7 +53,7 @@ impl Layout {
             (HIDDEN, 1),
             (OUTPUTS, HIDDEN),
             (OUTPUTS, 1),
-            (HIDDEN, COLOR_INPUTS),
+            (HIDDEN, self.color_inputs()),
             (HIDDEN, HIDDEN),
             (3, HIDDEN),
         ]
@@ -71,8 +86,8 @@ pub struct Weights {
     pub(super) w2: Vec<f32>,  // [16, 64]
     pub(super) w2t: Vec<f32>, // [64, 16]
     pub(super) b2: Vec<f32>,  // [16]
-    pub(super) c1: Vec<f32>,  // [64, 32]
-    pub(super) c1t: Vec<f32>, // [32, 64]
+    pub(super) c1: Vec<f32>,  // [64, cp]
+    pub(super) c1t: Vec<f32>, // [cp, 64]
     pub(super) c2: Vec<f32>,  // [64, 64]
     pub(super) c2t: Vec<f32>, // [64, 64]
     pub(super) c3: Vec<f32>,  // [8, 64]
@@ -112,6 +127,11 @@ impl Weights {
             out[..layout.inputs - 3].copy_from_slice(&row[3..]);
             out[layout.inputs - 3..layout.inputs].copy_from_slice(&row[..3]);
         }
+        let (ci, cp) = (layout.color_inputs(), layout.color_padded());
+        let mut c1p = vec![0.0; HIDDEN * cp];
+        for (row, out) in c1.chunks_exact(ci).zip(c1p.chunks_exact_mut(cp)) {
+            out[..ci].copy_from_slice(row);
+        }
         Weights {
             layout,
             w1t: transposed(&w1, HIDDEN, kp, HIDDEN),
@@ -120,8 +140,8 @@ impl Weights {
             w2t: transposed(w2, OUTPUTS, HIDDEN, OUTPUTS_PADDED),
             w2: padded(w2, OUTPUTS_PADDED * HIDDEN),
             b2: padded(b2, OUTPUTS_PADDED),
-            c1t: transposed(c1, HIDDEN, COLOR_INPUTS, HIDDEN),
-            c1: c1.to_vec(),
+            c1t: transposed(&c1p, HIDDEN, cp, HIDDEN),
+            c1: c1p,
             c2t: transposed(c2, HIDDEN, HIDDEN, HIDDEN),
             c2: c2.to_vec(),
             c3t: transposed(c3, 3, HIDDEN, RGB_PADDED),
@@ -137,7 +157,7 @@ pub struct WeightGradients {
     pub(super) b1: Vec<f32>, // [64]
     pub(super) w2: Vec<f32>, // [16, 64]
     pub(super) b2: Vec<f32>, // [16]
-    pub(super) c1: Vec<f32>, // [64, 32]
+    pub(super) c1: Vec<f32>, // [64, cp]
     pub(super) c2: Vec<f32>, // [64, 64]
     pub(super) c3: Vec<f32>, // [4, 64]
 }
@@ -150,7 +170,7 @@ impl WeightGradients {
             b1: vec![0.0; HIDDEN],
             w2: vec![0.0; OUTPUTS_PADDED * HIDDEN],
             b2: vec![0.0; OUTPUTS_PADDED],
-            c1: vec![0.0; HIDDEN * COLOR_INPUTS],
+            c1: vec![0.0; HIDDEN * layout.color_padded()],
             c2: vec![0.0; HIDDEN * HIDDEN],
             c3: vec![0.0; 4 * HIDDEN],
         }
@@ -174,17 +194,19 @@ impl WeightGradients {
                 row[i] += g[i - 3];
             }
         }
-        for (part, len) in [
-            (&self.b1, HIDDEN),
-            (&self.w2, OUTPUTS * HIDDEN),
-            (&self.b2, OUTPUTS),
-            (&self.c1, HIDDEN * COLOR_INPUTS),
-            (&self.c2, HIDDEN * HIDDEN),
-            (&self.c3, 3 * HIDDEN),
-        ] {
-            for (a, b) in next(len).iter_mut().zip(part.iter()) {
-                *a += b;
+        let mut add = |part: &[f32], rows: usize, columns: usize, stride: usize| {
+            let own = next(rows * columns);
+            for (row, g) in own.chunks_exact_mut(columns).zip(part.chunks_exact(stride)) {
+                for (a, b) in row.iter_mut().zip(g) {
+                    *a += b;
+                }
             }
-        }
+        };
+        add(&self.b1, 1, HIDDEN, HIDDEN);
+        add(&self.w2, OUTPUTS, HIDDEN, HIDDEN);
+        add(&self.b2, 1, OUTPUTS, OUTPUTS);
+        add(&self.c1, HIDDEN, layout.color_inputs(), layout.color_padded());
+        add(&self.c2, HIDDEN, HIDDEN, HIDDEN);
+        add(&self.c3, 3, HIDDEN, HIDDEN);
     }
 }

@@ -45,12 +45,14 @@ pub struct FieldShape {
     pub radius: f32,
     /// Hash levels that take part (the rest read as zero): coarse-to-fine training.
     pub active: usize,
+    /// Does the colour network read the hash features too?
+    pub color_skip: bool,
 }
 
 impl FieldShape {
     /// Layout of the network weights.
     pub fn layout(&self) -> Layout {
-        Layout::new(self.levels.len())
+        Layout::new(self.levels.len(), self.color_skip)
     }
 
     /// d x01 / d position.
@@ -74,7 +76,7 @@ pub struct Activations {
     q: Buffer,        // [levels, n, 2]
     u: Buffer,        // [np, kp]; np = n rounded up to whole tiles
     h: Buffer,        // [np, 64]
-    c0: Buffer,       // [np, 32] colour inputs
+    c0: Buffer,       // [np, cp] colour inputs
     c1: Buffer,       // [np, 64]
     c2: Buffer,       // [np, 64]
     out: Buffer,      // [n, 8]
@@ -160,7 +162,7 @@ fn activate<const F: bool>(z: &mut [f32], s: &mut [f32], b: &[f32]) {
 
 #[inline(always)]
 fn forward_body<const F: bool>(t: &mut ForwardTask, w: &Weights) {
-    let kp = w.layout.padded();
+    let (kp, ci) = (w.layout.padded(), w.layout.color_padded());
     let inputs = &t.inputs;
     let first = 2 * inputs.levels;
     let samples = inputs.x.len();
@@ -205,18 +207,19 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &Weights) {
                 }
             }
         }
-        let c0 = &mut t.c0[base * COLOR_INPUTS..][..TILE * COLOR_INPUTS];
+        let c0 = &mut t.c0[base * ci..][..TILE * ci];
         if let Some(direction) = t.direction {
             for r in 0..rows {
-                let row = &mut c0[r * COLOR_INPUTS..][..COLOR_INPUTS];
+                let row = &mut c0[r * ci..][..ci];
                 row[..OUTPUTS].copy_from_slice(&o[r * out16..][..OUTPUTS]);
                 row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(direction[base + r]));
-                row[OUTPUTS + 16..].copy_from_slice(&unit(n[r]));
+                row[OUTPUTS + 16..COLOR_INPUTS].copy_from_slice(&unit(n[r]));
+                skip(w.layout, &u[r * kp..], row);
             }
-            c0[rows * COLOR_INPUTS..].fill(0.0);
+            c0[rows * ci..].fill(0.0);
             let c1 = &mut t.c1[base * HIDDEN..][..TILE * HIDDEN];
-            let inner = (TILE, HIDDEN, COLOR_INPUTS);
-            gemm::<F>(inner, c0, (COLOR_INPUTS, 1), &w.c1t, HIDDEN, c1, HIDDEN, false);
+            let inner = (TILE, HIDDEN, ci);
+            gemm::<F>(inner, c0, (ci, 1), &w.c1t, HIDDEN, c1, HIDDEN, false);
             c1.iter_mut().for_each(|v| *v = v.max(0.0));
             let c2 = &mut t.c2[base * HIDDEN..][..TILE * HIDDEN];
             gemm::<F>((TILE, HIDDEN, HIDDEN), c1, (HIDDEN, 1), &w.c2t, HIDDEN, c2, HIDDEN, false);
@@ -233,6 +236,14 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &Weights) {
 }
 
 dispatch! { fn forward_task / forward_body(t: &mut ForwardTask, w: &Weights) }
+
+/// What follows the first [`COLOR_INPUTS`] of a row: the hash features, if the colour network reads them, and zeros.
+#[inline(always)]
+fn skip(layout: Layout, u: &[f32], row: &mut [f32]) {
+    let count = layout.color_inputs() - COLOR_INPUTS;
+    row[COLOR_INPUTS..COLOR_INPUTS + count].copy_from_slice(&u[..count]);
+    row[COLOR_INPUTS + count..].fill(0.0);
+}
 
 /// v / ‖v‖, zero for a (nearly) zero vector: torch's `normalize` with ε = 1e-12.
 #[inline(always)]
@@ -269,7 +280,7 @@ fn run(
     let n = x.len();
     let np = n.next_multiple_of(TILE);
     let levels = shape.levels.len();
-    let kp = weights.layout.padded();
+    let (kp, ci) = (weights.layout.padded(), weights.layout.color_padded());
     let x01 = shape.x01(x);
     let mut value = Buffer::scratch(levels * n * 2);
     let mut jacobian = Buffer::scratch(levels * n * 6);
@@ -286,7 +297,7 @@ fn run(
     let mut u = Buffer::scratch(np * kp);
     let mut qr = Buffer::scratch(np * kp);
     let mut h = Buffer::scratch(np * HIDDEN);
-    let mut c0 = Buffer::scratch(np * COLOR_INPUTS);
+    let mut c0 = Buffer::scratch(np * ci);
     let mut c1 = Buffer::scratch(if color { np * HIDDEN } else { 0 });
     let mut c2 = Buffer::scratch(if color { np * HIDDEN } else { 0 });
     let mut out = Buffer::scratch(n * WIDTH);
@@ -297,7 +308,7 @@ fn run(
         let mut us = u.chunks_mut(piece(kp));
         let mut qs = qr.chunks_mut(piece(kp));
         let mut hs = h.chunks_mut(piece(HIDDEN));
-        let mut c0s = c0.chunks_mut(piece(COLOR_INPUTS));
+        let mut c0s = c0.chunks_mut(piece(ci));
         let mut c1s = c1.chunks_mut(piece(HIDDEN));
         let mut c2s = c2.chunks_mut(piece(HIDDEN));
         let mut outs = out.chunks_mut(piece(WIDTH));

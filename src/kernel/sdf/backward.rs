@@ -22,7 +22,7 @@ struct BackwardTask<'a> {
 
 #[inline(always)]
 fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weights) {
-    let kp = w.layout.padded();
+    let (kp, ci) = (w.layout.padded(), w.layout.color_padded());
     let levels = a.shape.levels.len();
     let features = 2 * levels;
     let features_padded = features.next_multiple_of(8);
@@ -32,7 +32,7 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
     let mut g_pre = [0f32; TILE * RGB_PADDED];
     let mut g_c2 = [0f32; TILE * HIDDEN];
     let mut g_c1 = [0f32; TILE * HIDDEN];
-    let mut g_c0 = [0f32; TILE * COLOR_INPUTS];
+    let mut g_c0 = vec![0f32; TILE * ci];
     let mut g_o = [0f32; TILE * OUTPUTS_PADDED];
     let mut g_q = vec![0f32; TILE * kp];
     let mut g_u = vec![0f32; TILE * kp];
@@ -45,7 +45,7 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
         let rows = TILE.min(t.n - tile * TILE);
         let h = &a.h[base * HIDDEN..][..TILE * HIDDEN];
         let u = &a.u[base * kp..][..TILE * kp];
-        let c0 = &a.c0[base * COLOR_INPUTS..][..TILE * COLOR_INPUTS];
+        let c0 = &a.c0[base * ci..][..TILE * ci];
         let c1 = &a.c1[base * HIDDEN..][..TILE * HIDDEN];
         let c2 = &a.c2[base * HIDDEN..][..TILE * HIDDEN];
         let g_out = &t.g_out[tile * TILE * WIDTH..][..rows * WIDTH];
@@ -69,7 +69,6 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
         for i in 0..TILE * HIDDEN {
             g_c1[i] = if c1[i] > 0.0 { g_c1[i] } else { 0.0 };
         }
-        let ci = COLOR_INPUTS;
         gemm::<F>((HIDDEN, ci, TILE), &g_c1, (1, HIDDEN), c0, ci, &mut g.c1, ci, true);
         gemm::<F>((TILE, ci, HIDDEN), &g_c1, (HIDDEN, 1), &w.c1, ci, &mut g_c0, ci, false);
 
@@ -84,7 +83,7 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
             let raw = &out[r * WIDTH + 1..][..3];
             let length = (raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2]).sqrt().max(1e-12);
             let unit: [f32; 3] = std::array::from_fn(|k| raw[k] / length);
-            let gn = &from_color[OUTPUTS + 16..];
+            let gn = &from_color[OUTPUTS + 16..COLOR_INPUTS];
             let along = unit[0] * gn[0] + unit[1] * gn[1] + unit[2] * gn[2];
             let n: [f32; 3] =
                 std::array::from_fn(|k| g_out[r * WIDTH + 1 + k] + (gn[k] - unit[k] * along) / length);
@@ -132,7 +131,12 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
         let wide = (TILE, features_padded, HIDDEN);
         gemm::<F>(wide, &g_z, (HIDDEN, 1), &w.w1, kp, &mut g_u, kp, false);
         for r in 0..rows {
-            t.g_value[(tile * TILE + r) * features..][..features].copy_from_slice(&g_u[r * kp..][..features]);
+            let own = &mut t.g_value[(tile * TILE + r) * features..][..features];
+            own.copy_from_slice(&g_u[r * kp..][..features]);
+            if w.layout.color_skip {
+                let skipped = &g_c0[r * ci + COLOR_INPUTS..][..features];
+                own.iter_mut().zip(skipped).for_each(|(g, s)| *g += s);
+            }
         }
     }
 }

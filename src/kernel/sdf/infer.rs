@@ -1,6 +1,6 @@
 //! The signed-distance field asked, not trained: nothing is kept for a backward.
 
-use super::{CHUNK, FieldShape, Inputs, WIDTH, run};
+use super::{CHUNK, FieldShape, Inputs, WIDTH, run, skip};
 use crate::dispatch;
 use crate::kernel::hash;
 use crate::kernel::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, TILE, Weights};
@@ -74,7 +74,7 @@ struct ColorTask<'a> {
 
 /// The colour network on a tile whose inputs are filled; colours in the first `rows` of `out`.
 struct Shader {
-    c0: [f32; TILE * COLOR_INPUTS],
+    c0: Vec<f32>, // [TILE, cp]
     c1: [f32; TILE * HIDDEN],
     c2: [f32; TILE * HIDDEN],
     rgb: [f32; TILE * RGB_PADDED],
@@ -83,7 +83,7 @@ struct Shader {
 impl Shader {
     #[inline(always)]
     fn run<const F: bool>(&mut self, w: &Weights, out: &mut [[f32; 3]]) {
-        let ci = COLOR_INPUTS;
+        let ci = w.layout.color_padded();
         let Shader { c0, c1, c2, rgb } = self;
         gemm::<F>((TILE, HIDDEN, ci), c0, (ci, 1), &w.c1t, HIDDEN, c1, HIDDEN, false);
         c1.iter_mut().for_each(|v| *v = v.max(0.0));
@@ -99,13 +99,13 @@ impl Shader {
 
 #[inline(always)]
 fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
-    let kp = w.layout.padded();
+    let (kp, ci) = (w.layout.padded(), w.layout.color_padded());
     let samples = task.inputs.x.len();
     let mut u = vec![0f32; TILE * kp];
     let mut h = [0f32; TILE * HIDDEN];
     let mut o = [0f32; TILE * OUTPUTS_PADDED];
     let mut shader = Shader {
-        c0: [0.0; TILE * COLOR_INPUTS],
+        c0: vec![0.0; TILE * ci],
         c1: [0.0; TILE * HIDDEN],
         c2: [0.0; TILE * HIDDEN],
         rgb: [0.0; TILE * RGB_PADDED],
@@ -126,10 +126,11 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
         gemm::<F>((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2t, op, &mut o, op, false);
         for r in 0..rows {
             for _ in 0..task.counts.map_or(1, |c| c[base + r]) {
-                let row = &mut shader.c0[waiting * COLOR_INPUTS..][..COLOR_INPUTS];
+                let row = &mut shader.c0[waiting * ci..][..ci];
                 (0..OUTPUTS).for_each(|j| row[j] = o[r * op + j] + w.b2[j]);
                 row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(task.direction[done + waiting]));
-                row[OUTPUTS + 16..].copy_from_slice(&task.normal[base + r]);
+                row[OUTPUTS + 16..COLOR_INPUTS].copy_from_slice(&task.normal[base + r]);
+                skip(w.layout, &u[r * kp..], row);
                 waiting += 1;
                 if waiting == TILE {
                     shader.run::<F>(w, &mut task.rgb[done..done + TILE]);

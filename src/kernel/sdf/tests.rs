@@ -4,8 +4,13 @@ use super::*;
 
 /// A small field with lively weights.
 fn field() -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
+    shaped(false)
+}
+
+/// The same, with or without the colour skip.
+fn shaped(color_skip: bool) -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
     let levels = hash::levels(5, 4, 1.8, 9);
-    let shape = FieldShape { levels, radius: 1.3, active: 5 };
+    let shape = FieldShape { levels, radius: 1.3, active: 5, color_skip };
     let table = (0..hash::entries(&shape.levels))
         .map(|i| [(i as f32 * 0.731).sin() * 0.4, (i as f32 * 0.317).cos() * 0.4])
         .collect();
@@ -78,6 +83,9 @@ fn model(shape: &FieldShape, table: &[[f64; 2]], flat: &[f64], x: [f32; 3], d: [
     let mut c0 = o.to_vec();
     c0.extend(sh16(d).map(|v| v as f64));
     c0.extend(n.map(|v| v / len));
+    if layout.color_skip {
+        c0.extend_from_slice(&u[3..]);
+    }
     let dense = |m: &[f64], v: &[f64]| -> Vec<f64> {
         m.chunks(v.len()).map(|row| row.iter().zip(v).map(|(a, b)| a * b).sum()).collect()
     };
@@ -93,7 +101,11 @@ fn wide(flat: &[f32]) -> Vec<f64> {
 
 #[test]
 fn the_forward_agrees_with_an_f64_model() {
-    let (shape, table, flat) = field();
+    [false, true].map(forward_agrees);
+}
+
+fn forward_agrees(color_skip: bool) {
+    let (shape, table, flat) = shaped(color_skip);
     let (x, d) = points(150); // two full tiles and a part
     let w = Weights::new(shape.layout(), &flat);
     let a = forward(&shape, &table, &w, &x, &d);
@@ -132,7 +144,11 @@ fn levels_that_are_not_active_read_as_zero() {
 /// Worst and median relative error of the gradients by a selection of parameters.
 #[test]
 fn the_backward_agrees_with_f64_finite_differences_second_order_included() {
-    let (shape, table, flat) = field();
+    [false, true].map(backward_agrees);
+}
+
+fn backward_agrees(color_skip: bool) {
+    let (shape, table, flat) = shaped(color_skip);
     let (x, d) = points(90);
     let w = Weights::new(shape.layout(), &flat);
     let a = forward(&shape, &table, &w, &x, &d);
@@ -167,10 +183,10 @@ fn the_backward_agrees_with_f64_finite_differences_second_order_included() {
     let scale = g_flat.iter().fold(0f32, |m, v| m.max(v.abs())) as f64;
     for i in (0..flat.len()).step_by(31) {
         let mut f = flat64.clone();
-        f[i] += 1e-5;
+        f[i] += 1e-6;
         let up = loss(&table64, &f);
-        f[i] -= 2e-5;
-        let slope = (up - loss(&table64, &f)) / 2e-5;
+        f[i] -= 2e-6;
+        let slope = (up - loss(&table64, &f)) / 2e-6;
         errors.push((slope - g_flat[i] as f64).abs() / slope.abs().max(1e-3 * scale));
     }
     let touched: Vec<usize> = (0..table.len()).filter(|&i| g_table[i] != [0.0; 2]).collect();
@@ -178,10 +194,10 @@ fn the_backward_agrees_with_f64_finite_differences_second_order_included() {
     for &i in touched.iter().step_by(touched.len() / 120) {
         for j in 0..2 {
             let mut t = table64.clone();
-            t[i][j] += 1e-5;
+            t[i][j] += 1e-6;
             let up = loss(&t, &flat64);
-            t[i][j] -= 2e-5;
-            let slope = (up - loss(&t, &flat64)) / 2e-5;
+            t[i][j] -= 2e-6;
+            let slope = (up - loss(&t, &flat64)) / 2e-6;
             errors.push((slope - g_table[i][j] as f64).abs() / slope.abs().max(1e-3 * scale));
         }
     }
