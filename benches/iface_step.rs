@@ -43,7 +43,7 @@ struct Input {
 
 fn input() -> Input {
     let levels = hash::levels(16, 16, 1.447_269_237_440_378, 19);
-    let shape = Arc::new(FieldShape { levels, radius: 1.0, active: 16, color_skip: false });
+    let shape = Arc::new(FieldShape { levels, radius: 1.0, active: 16, color_skip: false, soften: 0.0 });
     let u = |s: u64, i: usize| 2.0 * rng::uniform(9, s, i as u64) - 1.0;
     let table = (0..2 * hash::entries(&shape.levels)).map(|i| 1e-4 * u(1, i)).collect();
     let flat = (0..shape.layout().len()).map(|i| 0.2 * u(2, i)).collect();

@@ -71,7 +71,11 @@ fn products(run: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     }
     let mut files = Vec::new();
     for stage in tiface::pipeline::STAGES {
-        walk(&run.join(stage), &mut files);
+        let folder = run.join(stage);
+        // nothing asks for the twin here
+        if folder.is_dir() || stage != &"twin" {
+            walk(&folder, &mut files);
+        }
     }
     files.push(run.join("config.toml"));
     files.push(run.join("cameras.json"));

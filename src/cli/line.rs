@@ -173,9 +173,10 @@ impl Work<'_> {
 }
 
 /// What is judged, and what a person calls it.
-const JUDGED: [(&str, &str); 7] = [
+const JUDGED: [(&str, &str); 8] = [
     ("baseline", "views of the baseline"),
     ("tface", "views of T-Face"),
+    ("twin", "views of its twin"),
     ("volume", "views of I-Face"),
     ("raycast", "views of the mesh"),
     ("textured", "views of the textured mesh"),

@@ -234,7 +234,7 @@ from different sides. The other views follow from the cameras.")]
         /// test, train, orbit, or a file: a nerfstudio camera path or a transforms.json
         #[arg(long, value_name = "WHICH")]
         cameras: Option<String>,
-        /// Any of baseline, tface, volume (I-Face's field), raycast (its whole mesh)
+        /// Any of baseline, tface, twin, volume (I-Face's field), raycast (its whole mesh)
         /// and textured (head.glb as a viewer shows it), with commas
         #[arg(long = "with", value_name = "LIST")]
         method: Option<String>,
@@ -256,7 +256,7 @@ With --fit or --correct, some training views must be set aside before anything i
     Ensemble {
         #[command(flatten)]
         place: Place,
-        /// Whose views: baseline, tface, volume, raycast, textured
+        /// Whose views: baseline, tface, twin, volume, raycast, textured
         #[arg(long, value_name = "LIST")]
         members: Option<String>,
         /// Their shares, in that order; together 1

@@ -68,6 +68,8 @@ pub struct IfaceConfig {
     pub level_every: u64,
     /// Does the colour network read the hash features beside the geometry network's outputs?
     pub color_skip: bool,
+    /// How many times softer than its sharpest the surface may be where that pays; 1: one sharpness everywhere.
+    pub soften: f64,
     /// Half edge of the field's box.
     pub radius: f32,
     /// Where the surface starts.
@@ -154,6 +156,7 @@ impl IfaceConfig {
             start_levels: 6,
             level_every: 100,
             color_skip: true,
+            soften: 8.0,
             radius: 1.0,
             start: Start::Hull,
             lr_table: 1e-2,
@@ -217,6 +220,7 @@ impl IfaceConfig {
             start_levels: 16,
             level_every: 0,
             color_skip: false,
+            soften: 1.0,
             radius: 0.3,
             start: Start::Sphere,
             lr_table: 1e-2,

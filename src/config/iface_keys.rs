@@ -23,6 +23,13 @@ pub(super) const KEYS: &[Key] = &[
         "color_skip",
         "The colour network reads the hash features too, true or false (published: false).",
     ),
+    Key::number(
+        "soften",
+        "How many times softer than its sharpest the surface may be where that pays, as in hair; 1 is one sharpness \
+         everywhere (published).",
+        1.0,
+        1e3,
+    ),
     Key::number("radius", "Half edge of the field's box.", 1e-3, 1e3),
     Key::word("start", "Where the surface starts: hull (the masks' visual hull) or sphere."),
     Key::number("lr_table", "Learning rate of the hash table at its peak.", 0.0, 1.0),

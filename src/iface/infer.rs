@@ -55,7 +55,8 @@ impl IFace {
         if config.occupancy == OccupancyRule::Band {
             // the surface moved since the last update
             let mut occupancy = face.occupancy.clone();
-            occupancy.update(config, (0, 0), face.inv_s, 0.0, |x| face.raw_sdf(x));
+            let soft = |x: &[[f32; 3]]| sdf::softness(&face.shape, face.table(), &face.weights, x);
+            occupancy.update(config, (0, 0), face.inv_s, 0.0, |x| face.raw_sdf(x), soft);
             face.occupancy = occupancy;
         }
         face
@@ -68,7 +69,7 @@ impl IFace {
         Ok(IFace::new(config, &state))
     }
 
-    /// Sharpness of the trained surface, per scene unit.
+    /// Sharpness of the trained surface where it is sharpest, per scene unit.
     pub fn inv_s(&self) -> f32 {
         self.inv_s * self.config.radius
     }

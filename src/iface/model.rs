@@ -44,6 +44,7 @@ pub fn shape(config: &IfaceConfig) -> FieldShape {
         radius: config.radius,
         active: config.levels,
         color_skip: config.color_skip,
+        soften: (config.soften as f32).ln(),
     }
 }
 

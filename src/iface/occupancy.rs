@@ -76,7 +76,8 @@ impl Occupancy {
         Occupancy { occupied: allowed.clone(), solid: Bitmask::filled(r, false), allowed, history }
     }
 
-    /// Looks at the field again. `sdf` evaluates points in field coordinates; `step` is the march step.
+    /// Looks at the field again. `sdf` evaluates points in field coordinates, `soft` the logarithm of the local
+    /// sharpness as a share of `inv_s`; `step` is the march step.
     pub fn update(
         &mut self,
         config: &IfaceConfig,
@@ -84,21 +85,28 @@ impl Occupancy {
         inv_s: f32,
         step: f32,
         sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
+        soft: impl Fn(&[[f32; 3]]) -> Vec<f32>,
     ) {
         match config.occupancy {
-            OccupancyRule::Band => self.update_band(config, inv_s, sdf),
+            OccupancyRule::Band => self.update_band(config, inv_s, sdf, soft),
             OccupancyRule::Nerfacc => self.update_nerfacc(config, (seed, n), inv_s, step, sdf),
         }
     }
 
-    /// A cell stays when the zero set's band (`band / inv_s`) may reach it, for gradients up to about
+    /// A cell stays when the zero set's band (`band` over the local sharpness) may reach it, for gradients up to about
     /// one, or when a neighbour's centre lies on the other side, however steep the field is there; what is
     /// left of the inside is solid.
-    fn update_band(&mut self, config: &IfaceConfig, inv_s: f32, sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>) {
+    fn update_band(
+        &mut self,
+        config: &IfaceConfig,
+        inv_s: f32,
+        sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
+        soft: impl Fn(&[[f32; 3]]) -> Vec<f32>,
+    ) {
         let r = config.occupancy_resolution;
         let cell = 2.0 * config.radius / r as f32;
         let half_diagonal = 0.5 * 3f32.sqrt() * cell;
-        let band = config.band / inv_s + half_diagonal;
+        let widest = config.band * config.soften as f32 / inv_s + half_diagonal;
         let cells: Vec<usize> = (0..r * r * r).filter(|&i| self.allowed.get(i)).collect();
         let center =
             |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - config.radius);
@@ -110,6 +118,17 @@ impl Occupancy {
                 f[i] = value;
             }
         }
+        // sharpness is asked only where the softest surface would reach
+        let mut band = vec![config.band / inv_s + half_diagonal; r * r * r];
+        if config.soften > 1.0 {
+            let near: Vec<usize> = cells.iter().copied().filter(|&i| f[i].abs() < widest).collect();
+            for near in near.chunks(1 << 17) {
+                let points: Vec<[f32; 3]> = near.par_iter().map(|&i| center(i)).collect();
+                for (&i, soft) in near.iter().zip(soft(&points)) {
+                    band[i] = config.band / (inv_s * soft.exp()) + half_diagonal;
+                }
+            }
+        }
         self.occupied.bits.fill(0);
         self.solid.bits.fill(0);
         for &i in &cells {
@@ -118,7 +137,7 @@ impl Occupancy {
                 let other = |j: usize| f[j] * f[i] < 0.0;
                 (at > 0 && other(i - stride)) || (at + 1 < r && other(i + stride))
             });
-            if f[i].abs() < band || crossed {
+            if f[i].abs() < band[i] || crossed {
                 self.occupied.set(i, true);
             } else if f[i] < 0.0 {
                 self.solid.set(i, true);
@@ -187,6 +206,10 @@ impl Occupancy {
 mod tests {
     use super::*;
 
+    fn even(points: &[[f32; 3]]) -> Vec<f32> {
+        vec![0.0; points.len()]
+    }
+
     fn sphere(points: &[[f32; 3]]) -> Vec<f32> {
         points.iter().map(|p| (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt() - 0.5).collect()
     }
@@ -195,7 +218,7 @@ mod tests {
     fn the_band_keeps_every_cell_the_sphere_crosses_and_nothing_far() {
         let config = IfaceConfig { occupancy_resolution: 32, band: 6.0, ..IfaceConfig::draft() };
         let mut o = Occupancy::new(&config, None);
-        o.update(&config, (1, 0), 600.0, 0.0, sphere);
+        o.update(&config, (1, 0), 600.0, 0.0, sphere, even);
         let center = |i: usize| [i / 1024, i / 32 % 32, i % 32].map(|c| (c as f32 + 0.5) / 16.0 - 1.0);
         for i in 0..32 * 32 * 32 {
             let f = sphere(&[center(i)])[0];
@@ -213,7 +236,7 @@ mod tests {
         let mut o = Occupancy::new(&config, Some(&hull));
         // half of the box is hull, and one layer more is kept
         assert_eq!(o.occupied.count(), 16 * 16 * 9);
-        o.update(&config, (1, 0), 20.0, 0.01, sphere);
+        o.update(&config, (1, 0), 20.0, 0.01, sphere, even);
         assert!((0..16 * 16 * 7).all(|i| !o.occupied.get(i)) && o.occupied.count() > 0);
         // the published rule knows no hull
         let config = IfaceConfig { occupancy: OccupancyRule::Nerfacc, ..config };
@@ -225,7 +248,7 @@ mod tests {
         // slope 40: every centre is far from zero in value, the wall at x = 0.01 is crossed all the same
         let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::draft() };
         let mut o = Occupancy::new(&config, None);
-        o.update(&config, (1, 0), 600.0, 0.0, |p| p.iter().map(|p| 40.0 * (p[0] - 0.01)).collect());
+        o.update(&config, (1, 0), 600.0, 0.0, |p| p.iter().map(|p| 40.0 * (p[0] - 0.01)).collect(), even);
         for x in 0..16 {
             assert_eq!(o.occupied.get((x * 16 + 5) * 16 + 5), x == 7 || x == 8, "{x}");
             assert_eq!(o.solid.get((x * 16 + 5) * 16 + 5), x < 7, "{x}");

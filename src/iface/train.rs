@@ -275,9 +275,9 @@ impl Trainer<'_> {
         let table = field::values(self.state.model.table.val().inner());
         let table: &[[f32; 2]] = bytemuck::cast_slice(&table);
         let step = self.state.step;
-        self.state
-            .occupancy
-            .update(self.config, (seed, step), inv_s, dt, |x| sdf::values(shape, table, &weights, x));
+        let distances = |x: &[[f32; 3]]| sdf::values(shape, table, &weights, x);
+        let soft = |x: &[[f32; 3]]| sdf::softness(shape, table, &weights, x);
+        self.state.occupancy.update(self.config, (seed, step), inv_s, dt, distances, soft);
     }
 
     fn losses(

@@ -14,6 +14,8 @@ pub const HIDDEN: usize = 64;
 pub const OUTPUTS: usize = 13;
 /// Inputs of the colour network without the skip: 13 features, 16 harmonics, 3 of the normal.
 pub const COLOR_INPUTS: usize = 32;
+/// The output that says how soft the surface is, where a field's sharpness is local.
+pub const SOFTNESS: usize = OUTPUTS - 1;
 /// [`OUTPUTS`] as stored in tiles.
 pub const OUTPUTS_PADDED: usize = 16;
 /// Colour channels as stored in tiles.

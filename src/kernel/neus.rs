@@ -8,6 +8,8 @@
 //! P = σ(s (f − ½ ic δ))     N = σ(s (f + ½ ic δ))     α = clip((P − N + ε)/(P + ε), 0, 1),  ε = 1e-5
 //! T_i = Π_{j<i} (1 − α_j)     w = T α     out = Σ w · (rgb, 1, t, n̂)
 //! ```
+//!
+//! The last column of the field's output is `ln(s / inv_s)` of its sample: 0 everywhere in NeuS.
 
 use super::sdf::WIDTH;
 use rayon::prelude::*;
@@ -79,6 +81,11 @@ fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
+/// Sharpness at a sample.
+fn local(inv_s: f32, field: &[f32]) -> f32 {
+    (inv_s * field[7].exp()).clamp(1e-6, 1e6)
+}
+
 /// Composites. A ray without samples gives zeros.
 ///
 /// # Shapes
@@ -94,7 +101,7 @@ pub fn forward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
         for s in rays.offsets[r] as usize..rays.offsets[r + 1] as usize {
             let f = &field[s * WIDTH..][..WIDTH];
             let (n, _) = normal_of(f);
-            let a = alpha_of(f[0], dot(rays.direction[r], n), rays.dt[s], inv_s, anneal).alpha;
+            let a = alpha_of(f[0], dot(rays.direction[r], n), rays.dt[s], local(inv_s, f), anneal).alpha;
             let w = transmittance * a;
             for c in 0..3 {
                 out[c] += w * f[4 + c];
@@ -140,7 +147,8 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
                 let f = &field[s * WIDTH..][..WIDTH];
                 let (normal, length) = normal_of(f);
                 let cos = dot(rays.direction[r], normal);
-                let a = alpha_of(f[0], cos, rays.dt[s], clamped, anneal);
+                let sharp = local(clamped, f);
+                let a = alpha_of(f[0], cos, rays.dt[s], sharp, anneal);
                 let worth = g[0] * f[4]
                     + g[1] * f[5]
                     + g[2] * f[6]
@@ -150,13 +158,13 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
                     + g[6] * normal[1]
                     + g[7] * normal[2];
                 let next = transmittance * (1.0 - a.alpha);
-                samples.push((a, normal, length, transmittance, worth));
+                samples.push((a, normal, length, transmittance, worth, sharp));
                 transmittance = next;
             }
             let mut behind = 0f32; // Σ_{j>k} w_j worth_j
             let mut g_s = 0f64;
             for k in (0..n).rev() {
-                let (a, normal, length, transmittance, worth) = &samples[k];
+                let (a, normal, length, transmittance, worth, sharp) = &samples[k];
                 let s = first + k;
                 let w = transmittance * a.alpha;
                 let out = &mut own[k * WIDTH..][..WIDTH];
@@ -173,11 +181,14 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
                     // α = (P − N + ε)/(P + ε): ∂P = N/(P+ε)², ∂N = −1/(P+ε)
                     let g_p = g_alpha * q / (d * d) * p * (1.0 - p);
                     let g_q = -g_alpha / d * q * (1.0 - q);
-                    out[0] = (g_p + g_q) * clamped;
+                    out[0] = (g_p + g_q) * sharp;
                     let half = 0.5 * a.ic * rays.dt[s];
                     let sdf = field[s * WIDTH];
-                    g_s += (g_p * (sdf - half) + g_q * (sdf + half)) as f64;
-                    let g_ic = (g_q - g_p) * clamped * 0.5 * rays.dt[s];
+                    // by ln s: the same for the sample's own offset and, divided by inv_s, for inv_s
+                    let g_ln = (g_p * (sdf - half) + g_q * (sdf + half)) * sharp;
+                    out[7] = g_ln;
+                    g_s += g_ln as f64;
+                    let g_ic = (g_q - g_p) * sharp * 0.5 * rays.dt[s];
                     let g_cos = g_ic * a.ic_by_cos;
                     for c in 0..3 {
                         g_normal[c] += g_cos * rays.direction[r][c];
@@ -192,7 +203,7 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
         })
         .collect();
     let inside = (1e-6..=1e6).contains(&inv_s);
-    (g_field, if inside { g_inv_s.iter().sum::<f64>() as f32 } else { 0.0 })
+    (g_field, if inside { (g_inv_s.iter().sum::<f64>() / inv_s as f64) as f32 } else { 0.0 })
 }
 
 #[cfg(test)]
@@ -234,7 +245,8 @@ mod tests {
                 let cos: f64 = (0..3).map(|c| rays.direction[r][c] as f64 * n[c]).sum();
                 let ic = -((0.5 - 0.5 * cos).max(0.0) * (1.0 - anneal) + (-cos).max(0.0) * anneal);
                 let half = 0.5 * ic * rays.dt[s] as f64;
-                let (p, q) = (sigmoid((f[0] - half) * inv_s), sigmoid((f[0] + half) * inv_s));
+                let sharp = inv_s * f[7].exp();
+                let (p, q) = (sigmoid((f[0] - half) * sharp), sigmoid((f[0] + half) * sharp));
                 let a = ((p - q + 1e-5) / (p + 1e-5)).clamp(0.0, 1.0);
                 let w = transmittance * a;
                 for c in 0..3 {
@@ -260,6 +272,7 @@ mod tests {
         let field: Vec<f32> = (0..96)
             .map(|i| match i % 8 {
                 0 => 0.12 - 0.03 * (i / 8 % 6) as f32,
+                7 => -0.1 * (i % 5) as f32,
                 1..=3 => (i as f32 * 0.7).sin() * 0.8 + if i % 8 == 3 { 0.5 } else { 0.0 },
                 _ => 0.5 + 0.4 * (i as f32 * 1.3).cos(),
             })
@@ -270,7 +283,7 @@ mod tests {
         let wide: Vec<f64> = field.iter().map(|&v| v as f64).collect();
         let at = |f: &[f64], s: f64| loss(rays, f, s, anneal as f64, &g);
         let scale = g_field.iter().fold(0f32, |a, &b| a.max(b.abs())) as f64;
-        for i in (0..96).filter(|i| i % 8 != 7) {
+        for i in 0..96 {
             let mut f = wide.clone();
             f[i] += 1e-6;
             let up = at(&f, inv_s as f64);

@@ -16,10 +16,16 @@
 //! table[corner] += g_F w + q_F (g_n · ∇w)
 //! ```
 //!
+//! Where sharpness is local, the last of the thirteen outputs also says by how much the surface is softer there
+//! than at its sharpest: `ln(s / s_max) = −L σ(o₁₂ − 2)`, after Wang et al. 2023, "Adaptive Shells", who learn a
+//! kernel size at each place: hair is soft where skin is sharp.
+//!
 //! Only `h` is kept of `z`, `h`, `s`: `s = 1 − e^{−100 h}`.
 
 use super::hash::{self, Level};
-use super::mlp::{COLOR_INPUTS, HIDDEN, Layout, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, TILE, Weights};
+use super::mlp::{
+    COLOR_INPUTS, HIDDEN, Layout, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
+};
 use super::pool::Buffer;
 use super::simd::{exp, gemm, ln_1p, sigmoid};
 use super::sphharm::sh16;
@@ -31,9 +37,10 @@ mod backward;
 mod infer;
 
 pub use backward::backward;
-pub use infer::{colors, gradients, values};
+pub use infer::{colors, gradients, softness, values};
 
-/// Values per sample of the field's output: sdf, gradient (3), colour (3), one zero.
+/// Values per sample of the field's output: sdf, gradient (3), colour (3), logarithm of the local sharpness as a
+/// share of the sharpest (0 where it is global).
 pub const WIDTH: usize = 8;
 
 /// Shape of the field: its grid and the half edge of its box.
@@ -47,6 +54,14 @@ pub struct FieldShape {
     pub active: usize,
     /// Does the colour network read the hash features too?
     pub color_skip: bool,
+    /// ln of how many times softer than its sharpest the surface may be; 0: one sharpness everywhere.
+    pub soften: f32,
+}
+
+/// ln of the local sharpness as a share of the sharpest, from the network's output. At the start most of it is left.
+#[inline(always)]
+fn softened<const F: bool>(soften: f32, output: f32) -> f32 {
+    -soften * sigmoid::<F>(output - 2.0)
 }
 
 impl FieldShape {
@@ -137,6 +152,7 @@ struct ForwardTask<'a> {
     inputs: Inputs<'a>,
     direction: Option<&'a [[f32; 3]]>,
     jacobian: &'a [f32],
+    soften: f32,
     u: &'a mut [f32],
     h: &'a mut [f32],
     q: &'a mut [f32], // [n, kp]
@@ -230,7 +246,8 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &Weights) {
         }
         for r in 0..rows {
             let (c, out) = (&rgb[r * RGB_PADDED..], &mut t.out[(base + r) * WIDTH..][..WIDTH]);
-            out.copy_from_slice(&[o[r * out16], n[r][0], n[r][1], n[r][2], c[0], c[1], c[2], 0.0]);
+            let soft = softened::<F>(t.soften, o[r * out16 + SOFTNESS]);
+            out.copy_from_slice(&[o[r * out16], n[r][0], n[r][1], n[r][2], c[0], c[1], c[2], soft]);
         }
     }
 }
@@ -258,7 +275,7 @@ fn unit(v: [f32; 3]) -> [f32; 3] {
 ///
 /// - table: `[entries, 2]`; weights: prepared from the flat `[P]`
 /// - x: `[n, 3]` in the field's box; direction: `[n, 3]` unit, away from the camera
-/// - output: `[n, 8]` = sdf, ∇sdf (3, field units), rgb (3, sRGB-coded, 0..1), 0
+/// - output: `[n, 8]` = sdf, ∇sdf (3, field units), rgb (3, sRGB-coded, 0..1), ln of the local sharpness
 pub fn forward(
     shape: &FieldShape,
     table: &[[f32; 2]],
@@ -318,6 +335,7 @@ fn run(
                 inputs: Inputs::new(shape, x, &value, start..start + count),
                 direction: direction.map(|d| &d[start..start + count]),
                 jacobian: &jacobian,
+                soften: shape.soften,
                 u: us.next().unwrap_or_default(),
                 h: hs.next().unwrap_or_default(),
                 q: qs.next().unwrap_or_default(),

@@ -1,5 +1,6 @@
 //! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
 
+use super::plan::table;
 use super::{Fields, Line, PipelineError, Radiance, Surface, bitmask, capture_failure, to_value};
 use crate::capture::scene::Scene;
 use crate::capture::{Split, View};
@@ -34,7 +35,7 @@ impl Line<'_> {
         })?)
     }
 
-    /// Stages `baseline` and `tface`: the same learning, with the table of that name.
+    /// Stages `baseline`, `tface` and `twin`: the same learning with other settings, or other random numbers.
     pub fn radiance(&self, name: &'static str) -> Result<Done, PipelineError> {
         let plan = self.plan(name);
         let identity = plan.fingerprint.digest();
@@ -51,7 +52,7 @@ impl Line<'_> {
             let masked = config.masks != MaskUse::None;
             let views = self.train_views(&scene, masked)?;
             let hull = bitmask(&scene).filter(|_| masked);
-            let (seed, device) = (self.config.seed, self.config.device.as_str());
+            let (seed, device) = (self.vm_seed(name), self.config.device.as_str());
             let (folder, monitor) = (stage.folder(), stage.monitor());
             let trained = tface::train(
                 name,
@@ -111,7 +112,7 @@ impl Line<'_> {
             TfaceError::Stopped { .. } => Failure::stopped(self.run.stop()),
             TfaceError::Device(_) => device_failure(e),
             e => {
-                let hint = e.hint(stage).unwrap_or_default();
+                let hint = e.hint(table(stage)).unwrap_or_default();
                 let exit = if matches!(e, TfaceError::Settings { .. }) { Exit::Usage } else { Exit::Cannot };
                 Failure { exit, ..Failure::cannot(e, hint) }
             }
@@ -128,13 +129,15 @@ pub struct Trained<'l> {
     line: &'l Line<'l>,
     iface: OnceCell<IFace>,
     tface: OnceCell<TFace>,
+    twin: OnceCell<TFace>,
     baseline: OnceCell<TFace>,
 }
 
 impl<'l> Trained<'l> {
     /// Of a line; nothing is loaded yet.
     pub fn new(line: &'l Line<'l>) -> Trained<'l> {
-        Trained { line, iface: OnceCell::new(), tface: OnceCell::new(), baseline: OnceCell::new() }
+        let [tface, twin, baseline] = std::array::from_fn(|_| OnceCell::new());
+        Trained { line, iface: OnceCell::new(), tface, twin, baseline }
     }
 }
 
@@ -153,7 +156,11 @@ impl Fields for Trained<'_> {
     fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
         let line = self.line;
         let load = || TFace::load(&line.run.path(stage)).map_err(|e| line.tface_failure(stage, e));
-        let cell = if stage == "baseline" { &self.baseline } else { &self.tface };
+        let cell = match stage {
+            "baseline" => &self.baseline,
+            "twin" => &self.twin,
+            _ => &self.tface,
+        };
         once(cell, load).map(|f| f as &dyn Radiance)
     }
 }

@@ -4,7 +4,7 @@ use super::{Activations, CHUNK, WIDTH};
 use crate::dispatch;
 use crate::kernel::hash;
 use crate::kernel::mlp::{
-    COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, TILE, WeightGradients, Weights,
+    COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, WeightGradients, Weights,
 };
 use crate::kernel::pool::Buffer;
 use crate::kernel::simd::{exp, gemm};
@@ -79,6 +79,11 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
             let from_color = &g_c0[r * ci..][..ci];
             g_o[r * OUTPUTS_PADDED..][..OUTPUTS].copy_from_slice(&from_color[..OUTPUTS]);
             g_o[r * OUTPUTS_PADDED] += g_out[r * WIDTH];
+            // through −L σ: its slope is y (1 + y / L)
+            if a.shape.soften > 0.0 {
+                let y = out[r * WIDTH + 7];
+                g_o[r * OUTPUTS_PADDED + SOFTNESS] += g_out[r * WIDTH + 7] * y * (1.0 + y / a.shape.soften);
+            }
             // through n̂ = n / ‖n‖: (g − n̂ (n̂ · g)) / ‖n‖
             let raw = &out[r * WIDTH + 1..][..3];
             let length = (raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2]).sqrt().max(1e-12);
@@ -147,7 +152,7 @@ dispatch! { fn backward_task / backward_body(t: &mut BackwardTask, a: &Activatio
 ///
 /// # Shapes
 ///
-/// - g_out: `[n, 8]`, the loss's gradient by the output (the last column is ignored)
+/// - g_out: `[n, 8]`, the loss's gradient by the output (the last column counts where sharpness is local)
 /// - g_table: `[entries, 2]`, added to
 /// - output: `[P]`, flat as [`Layout`](crate::kernel::mlp::Layout) describes
 pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32; 2]]) -> Vec<f32> {

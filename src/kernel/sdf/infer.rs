@@ -1,9 +1,11 @@
 //! The signed-distance field asked, not trained: nothing is kept for a backward.
 
-use super::{CHUNK, FieldShape, Inputs, WIDTH, run, skip};
+use super::{CHUNK, FieldShape, Inputs, WIDTH, run, skip, softened};
 use crate::dispatch;
 use crate::kernel::hash;
-use crate::kernel::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, TILE, Weights};
+use crate::kernel::mlp::{
+    COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
+};
 use crate::kernel::pool::Buffer;
 use crate::kernel::simd::{exp, gemm, ln_1p, sigmoid};
 use crate::kernel::sphharm::sh16;
@@ -17,7 +19,9 @@ fn softplus<const F: bool>(v: f32) -> f32 {
 
 struct ValueTask<'a> {
     inputs: Inputs<'a>,
-    sdf: &'a mut [f32],
+    /// Which of the geometry network's outputs.
+    output: usize,
+    values: &'a mut [f32],
 }
 
 #[inline(always)]
@@ -26,6 +30,7 @@ fn value_body<const F: bool>(t: &mut ValueTask, w: &Weights) {
     let samples = t.inputs.x.len();
     let mut u = vec![0f32; TILE * kp];
     let mut h = [0f32; TILE * HIDDEN];
+    let w2 = &w.w2[t.output * HIDDEN..][..HIDDEN];
     for tile in 0..samples.div_ceil(TILE) {
         let base = tile * TILE;
         let rows = TILE.min(samples - base);
@@ -35,9 +40,9 @@ fn value_body<const F: bool>(t: &mut ValueTask, w: &Weights) {
             let row = &h[r * HIDDEN..][..HIDDEN];
             let mut sum = [0f32; 8];
             for j in 0..HIDDEN {
-                sum[j % 8] += softplus::<F>(row[j] + w.b1[j]) * w.w2[j];
+                sum[j % 8] += softplus::<F>(row[j] + w.b1[j]) * w2[j];
             }
-            t.sdf[base + r] = sum.iter().sum::<f32>() + w.b2[0];
+            t.values[base + r] = sum.iter().sum::<f32>() + w.b2[t.output];
         }
     }
 }
@@ -46,21 +51,43 @@ dispatch! { fn value_task / value_body(t: &mut ValueTask, w: &Weights) }
 
 /// Signed distance alone: a quarter of the work of [`super::forward`]. `[n, 3]` → `[n]`.
 pub fn values(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
+    output(shape, table, weights, x, 0)
+}
+
+/// ln of the local sharpness as a share of the sharpest, `-soften..=0`. `[n, 3]` → `[n]`.
+pub fn softness(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
+    if shape.soften == 0.0 {
+        return vec![0.0; x.len()];
+    }
+    let mut soft = output(shape, table, weights, x, SOFTNESS);
+    soft.iter_mut().for_each(|v| *v = softened::<true>(shape.soften, *v));
+    soft
+}
+
+/// One of the geometry network's outputs.
+fn output(
+    shape: &FieldShape,
+    table: &[[f32; 2]],
+    weights: &Weights,
+    x: &[[f32; 3]],
+    output: usize,
+) -> Vec<f32> {
     /// Points per pass: bounds the scratch memory whatever the caller asks for.
     const PASS: usize = 1 << 16;
-    let mut sdf = vec![0.0; x.len()];
+    let mut values = vec![0.0; x.len()];
     let active = &shape.levels[..shape.active];
-    for (x, sdf) in x.chunks(PASS).zip(sdf.chunks_mut(PASS)) {
+    for (x, values) in x.chunks(PASS).zip(values.chunks_mut(PASS)) {
         let n = x.len();
         let mut value = Buffer::scratch(active.len() * n * 2);
         hash::gather(active, table, &shape.x01(x), 1.0, bytemuck::cast_slice_mut(&mut value), None);
         let value = &value[..];
-        sdf.par_chunks_mut(CHUNK).enumerate().for_each(|(i, sdf)| {
-            let own = i * CHUNK..i * CHUNK + sdf.len();
-            value_task(&mut ValueTask { inputs: Inputs::new(shape, x, value, own), sdf }, weights);
+        values.par_chunks_mut(CHUNK).enumerate().for_each(|(i, values)| {
+            let own = i * CHUNK..i * CHUNK + values.len();
+            let inputs = Inputs::new(shape, x, value, own);
+            value_task(&mut ValueTask { inputs, output, values }, weights);
         });
     }
-    sdf
+    values
 }
 
 struct ColorTask<'a> {

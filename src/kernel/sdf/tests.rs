@@ -10,7 +10,8 @@ fn field() -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
 /// The same, with or without the colour skip.
 fn shaped(color_skip: bool) -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
     let levels = hash::levels(5, 4, 1.8, 9);
-    let shape = FieldShape { levels, radius: 1.3, active: 5, color_skip };
+    let shape =
+        FieldShape { levels, radius: 1.3, active: 5, color_skip, soften: if color_skip { 1.5 } else { 0.0 } };
     let table = (0..hash::entries(&shape.levels))
         .map(|i| [(i as f32 * 0.731).sin() * 0.4, (i as f32 * 0.317).cos() * 0.4])
         .collect();
@@ -28,7 +29,7 @@ fn points(n: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
 }
 
 /// Independent model in f64: loops, no tiles, gradient of the sdf by the chain rule written out.
-fn model(shape: &FieldShape, table: &[[f64; 2]], flat: &[f64], x: [f32; 3], d: [f32; 3]) -> [f64; 7] {
+fn model(shape: &FieldShape, table: &[[f64; 2]], flat: &[f64], x: [f32; 3], d: [f32; 3]) -> [f64; 8] {
     let layout = shape.layout();
     let mut start = 0;
     let mats = layout.shapes().map(|(o, i)| {
@@ -92,7 +93,8 @@ fn model(shape: &FieldShape, table: &[[f64; 2]], flat: &[f64], x: [f32; 3], d: [
     let relu = |v: Vec<f64>| v.into_iter().map(|x: f64| x.max(0.0)).collect::<Vec<_>>();
     let rgb = dense(mats[6], &relu(dense(mats[5], &relu(dense(mats[4], &c0)))));
     let sigmoid = |v: f64| 1.0 / (1.0 + (-v).exp());
-    [o[0], n[0], n[1], n[2], sigmoid(rgb[0]), sigmoid(rgb[1]), sigmoid(rgb[2])]
+    let soft = -(shape.soften as f64) * sigmoid(o[12] - 2.0);
+    [o[0], n[0], n[1], n[2], sigmoid(rgb[0]), sigmoid(rgb[1]), sigmoid(rgb[2]), soft]
 }
 
 fn wide(flat: &[f32]) -> Vec<f64> {
@@ -101,7 +103,9 @@ fn wide(flat: &[f32]) -> Vec<f64> {
 
 #[test]
 fn the_forward_agrees_with_an_f64_model() {
-    [false, true].map(forward_agrees);
+    for skip in [false, true] {
+        forward_agrees(skip);
+    }
 }
 
 fn forward_agrees(color_skip: bool) {
@@ -112,17 +116,19 @@ fn forward_agrees(color_skip: bool) {
     let table64: Vec<[f64; 2]> = table.iter().map(|e| [e[0] as f64, e[1] as f64]).collect();
     let flat64 = wide(&flat);
     let sdf = values(&shape, &table, &w, &x);
+    let soft = softness(&shape, &table, &w, &x);
     let normals = gradients(&shape, &table, &w, &x);
     let units: Vec<[f32; 3]> = normals.iter().map(|n| unit(n.1)).collect();
     let colors = colors(&shape, &table, &w, &x, &units, None, &d);
     for i in 0..x.len() {
         let want = model(&shape, &table64, &flat64, x[i], d[i]);
-        for k in 0..7 {
+        for k in 0..8 {
             let got = a.output()[i * WIDTH + k] as f64;
             assert!((got - want[k]).abs() < 2e-4 * want[k].abs().max(1.0), "{i} {k}: {got} {}", want[k]);
         }
         assert!(colors[i].iter().zip(&a.output()[i * WIDTH + 4..]).all(|(c, o)| (c - o).abs() < 1e-5));
         assert!((sdf[i] - a.output()[i * WIDTH]).abs() < 1e-5);
+        assert!((soft[i] - a.output()[i * WIDTH + 7]).abs() < 1e-5);
         assert_eq!(normals[i].1, [1, 2, 3].map(|k| a.output()[i * WIDTH + k]));
     }
 }
@@ -144,7 +150,9 @@ fn levels_that_are_not_active_read_as_zero() {
 /// Worst and median relative error of the gradients by a selection of parameters.
 #[test]
 fn the_backward_agrees_with_f64_finite_differences_second_order_included() {
-    [false, true].map(backward_agrees);
+    for skip in [false, true] {
+        backward_agrees(skip);
+    }
 }
 
 fn backward_agrees(color_skip: bool) {
@@ -153,13 +161,13 @@ fn backward_agrees(color_skip: bool) {
     let w = Weights::new(shape.layout(), &flat);
     let a = forward(&shape, &table, &w, &x, &d);
     // loss = Σ g·out + 0.1 Σ (‖n‖ − 1)²: every output and the eikonal path
-    let g: Vec<f64> = (0..x.len() * 7).map(|i| (i as f64 * 0.77).sin()).collect();
+    let g: Vec<f64> = (0..x.len() * 8).map(|i| (i as f64 * 0.77).sin()).collect();
     let mut g_out = vec![0f32; x.len() * WIDTH];
     for i in 0..x.len() {
         let o = &a.output()[i * WIDTH..][..WIDTH];
         let len = (o[1] * o[1] + o[2] * o[2] + o[3] * o[3]).sqrt();
-        for k in 0..7 {
-            g_out[i * WIDTH + k] = g[i * 7 + k] as f32;
+        for k in 0..8 {
+            g_out[i * WIDTH + k] = g[i * 8 + k] as f32;
             if (1..4).contains(&k) {
                 g_out[i * WIDTH + k] += 0.2 * (len - 1.0) / len * o[k];
             }
@@ -175,7 +183,7 @@ fn backward_agrees(color_skip: bool) {
             .map(|i| {
                 let o = model(&shape, table, flat, x[i], d[i]);
                 let len = (o[1] * o[1] + o[2] * o[2] + o[3] * o[3]).sqrt();
-                (0..7).map(|k| o[k] * g[i * 7 + k]).sum::<f64>() + 0.1 * (len - 1.0).powi(2)
+                (0..8).map(|k| o[k] * g[i * 8 + k]).sum::<f64>() + 0.1 * (len - 1.0).powi(2)
             })
             .sum()
     };
