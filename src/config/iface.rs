@@ -161,7 +161,8 @@ impl IfaceConfig {
             start: Start::Hull,
             lr_table: 1e-2,
             lr_network: 5e-3,
-            lr_variance: 1e-3,
+            // four times as published: where softness is local, skin may become as sharp as it is
+            lr_variance: 4e-3,
             warmup: 100,
             lr_final: 0.05,
             weight_decay: 0.0,
@@ -269,5 +270,6 @@ mod tests {
         assert_eq!((p.levels, p.base_resolution, p.log2_table), (16, 32, 19));
         assert_eq!((p.mask, p.eikonal, p.sparsity, p.sparsity_scale), (0.1, 0.1, 0.5, 1.0));
         assert_eq!((p.weight_decay, p.table_decay, p.lr_variance), (0.01, 0.01, 0.001));
+        assert_eq!((p.color_skip, p.soften), (false, 1.0));
     }
 }

@@ -3,8 +3,9 @@
 //! Instant-NGP's hash grid (Müller et al. 2022) under a small network gives a signed distance; NeuS
 //! (Wang et al. 2021) renders it; colour, mask, eikonal and sparsity losses train it (I-Face of
 //! TI-Face, ICCV 2023 View Synthesis Challenge for Human Heads). The `paper` preset follows the
-//! published system; the others start from the masks' visual hull and sample only a band around the
-//! surface.
+//! published system; the others start from the masks' visual hull, sample only a band around the
+//! surface, let the surface be softer in hair than on skin (Wang et al. 2023, "Adaptive Shells"), and
+//! show the colour network the hash features themselves.
 
 mod checkpoint;
 mod hull_start;
