@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 
 /// Small enough for seconds, large enough that every stage can be hit.
-const SETTINGS: [&str; 26] = [
+const SETTINGS: [&str; 29] = [
     "iface.steps=150",
     "iface.rays=256",
     "iface.max_rays=512",
@@ -34,6 +34,9 @@ const SETTINGS: [&str; 26] = [
     "mesh.resolution=64",
     "mesh.format=glb,obj",
     "render.samples=1",
+    "render.method=baseline,tface,twin,volume,raycast",
+    "ensemble.members=tface,twin,volume",
+    "ensemble.weights=0.4,0.4,0.2",
     "device=cpu",
 ];
 
@@ -71,11 +74,7 @@ fn products(run: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     }
     let mut files = Vec::new();
     for stage in tiface::pipeline::STAGES {
-        let folder = run.join(stage);
-        // nothing asks for the twin here
-        if folder.is_dir() || stage != &"twin" {
-            walk(&folder, &mut files);
-        }
+        walk(&run.join(stage), &mut files);
     }
     files.push(run.join("config.toml"));
     files.push(run.join("cameras.json"));
@@ -134,6 +133,11 @@ fn killed_again_and_again_the_run_ends_with_the_same_bytes() {
     eprintln!("killed {killed} times in a run of {:.1} s", whole.as_secs_f64());
     assert!(killed >= 2, "the test killed nothing");
     assert_same(&calm, &hunted);
+
+    // the twin is another field, from the same settings
+    let field = |stage: &str| std::fs::read(calm.join(stage).join("checkpoint.safetensors")).unwrap();
+    assert_eq!(field("twin").len(), field("tface").len());
+    assert!(field("twin") != field("tface"));
 
     // done is done: nothing is touched, and it is quick
     let begin = Instant::now();
