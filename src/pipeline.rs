@@ -180,7 +180,7 @@ impl<'a> Line<'a> {
                 key: "render.method",
                 problem: "names twin, but tface.import takes T-Face from a file: nothing is left to chance"
                     .into(),
-                hint: "leave twin out".into(),
+                hint: "leave twin out of render.method and ensemble.members, with its weight".into(),
             });
         }
         let mut imports = Vec::new();

@@ -106,7 +106,9 @@ impl Work<'_> {
             _ => None,
         };
         match (self.until, format) {
-            ("baseline" | "tface", None) if ending == "th" => write(out, &published(line, self.until)?),
+            ("baseline" | "tface" | "twin", None) if ending == "th" => {
+                write(out, &published(line, self.until)?)
+            }
             ("mesh" | "metrics" | "render", Some(format)) if line.order(self.until).contains(&"mesh") => {
                 let stem = out.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
                 let exported =
@@ -125,7 +127,7 @@ impl Work<'_> {
             )),
             (stage, None) => {
                 // fields, and pictures that only another stage can read, stay where they are
-                let fields = ["baseline", "tface", "iface", CAPTURE];
+                let fields = ["baseline", "tface", "twin", "iface", CAPTURE];
                 match stage {
                     "metrics" => copy_folder(run.dir(), out, &fields),
                     _ => copy_folder(&run.path(stage), out, &["float"]),
@@ -277,7 +279,8 @@ fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, En
 /// A radiance field as a published checkpoint.
 #[cfg(feature = "cpu")]
 fn published(line: &Line, stage: &str) -> Result<Vec<u8>, Ending> {
-    Ok(line.export_th(if stage == "baseline" { "baseline" } else { "tface" })?)
+    let known = ["baseline", "twin"].into_iter().find(|s| *s == stage);
+    Ok(line.export_th(known.unwrap_or("tface"))?)
 }
 
 #[cfg(not(feature = "cpu"))]

@@ -182,6 +182,15 @@ from different sides. The other views follow from the cameras.")]
         #[command(flatten)]
         place: Place,
     },
+    /// Stage: learn T-Face again from other random numbers, for the blend
+    #[command(after_long_help = "Its settings are those of [tface]. Examples:
+  tiface twin runs/002_00
+  tiface run captures/002_00 --set render.method=tface,twin,volume,raycast \
+    --set ensemble.members=tface,twin,volume --set ensemble.weights=0.4,0.4,0.2")]
+    Twin {
+        #[command(flatten)]
+        place: Place,
+    },
     /// Stage: learn I-Face, a signed-distance field
     #[command(after_long_help = "Examples:
   tiface iface captures/002_00
@@ -285,7 +294,7 @@ With --fit or --correct, some training views must be set aside before anything i
     Export {
         #[command(flatten)]
         place: Place,
-        /// tface or baseline
+        /// tface, twin or baseline
         #[arg(long = "with", value_name = "FIELD", default_value = "tface")]
         field: String,
     },
@@ -401,6 +410,7 @@ impl Cli {
             Command::Mask { place, clicks, page: false } => line(place, "mask", &[], &clicks.keys()?),
             Command::Baseline { place } => line(place, "baseline", &[], &[]),
             Command::Tface { place } => line(place, "tface", &[], &[]),
+            Command::Twin { place } => line(place, "twin", &[], &[]),
             Command::Iface { place } => line(place, "iface", &[], &[]),
             Command::Mesh { place, format, frame, triangles, texture, lobes, normal_map, no_cap } => {
                 let given = |flag: bool, value: &str| flag.then(|| value.to_owned());
@@ -435,15 +445,15 @@ impl Cli {
             }
             Command::Metrics { place, require } => line(place, "metrics", require, &[]),
             Command::Export { place, field } => match (field.as_str(), &common.out) {
-                ("tface" | "baseline", Some(out)) if out.extension().is_some_and(|e| e == "th") => {
+                ("tface" | "twin" | "baseline", Some(out)) if out.extension().is_some_and(|e| e == "th") => {
                     line(place, field, &[], &[])
                 }
-                ("tface" | "baseline", _) => {
+                ("tface" | "twin" | "baseline", _) => {
                     Err(Ending::usage("no file to export to is named", "name one: `--out model.th`"))
                 }
                 _ => Err(Ending::usage(
                     format!("`{field}` cannot be exported"),
-                    "tface and baseline can; the mesh is `tiface mesh --out head.glb`",
+                    "tface, twin and baseline can; the mesh is `tiface mesh --out head.glb`",
                 )),
             },
             Command::Check { mesh, require, against, seen_by } => {

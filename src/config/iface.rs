@@ -115,9 +115,9 @@ pub struct IfaceConfig {
     pub occupancy_resolution: usize,
     /// Steps between updates of the occupancy grid.
     pub occupancy_every: u64,
-    /// Half width of the band in units of 1 / inv_s.
+    /// Half width of the band in units of 1 / local sharpness.
     pub band: f32,
-    /// March step in units of 1 / inv_s (`band` rule).
+    /// March step in units of 1 / inv_s, the sharpest (`band` rule).
     pub march: f32,
     /// Shortest march step of the `band` rule.
     pub min_step: f32,

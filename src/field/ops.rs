@@ -123,7 +123,7 @@ pub trait FieldKernels: FieldOps {
 ///
 /// - table: `[entries, 2]`; weights: `[P]` as [`crate::kernel::mlp::Layout`] describes
 /// - x: `[n, 3]` in the field's box; direction: `[n, 3]` unit
-/// - output: `[n, 8]` = sdf, ∇sdf (3), rgb (3), 0; differentiable by table and weights
+/// - output: `[n, 8]` = sdf, ∇sdf (3), rgb (3), ln of the local sharpness's share; differentiable by table and weights
 pub fn sdf_field(
     table: Tensor<2>,
     weights: Tensor<1>,

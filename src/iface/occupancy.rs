@@ -89,7 +89,7 @@ impl Occupancy {
     ) {
         match config.occupancy {
             OccupancyRule::Band => self.update_band(config, inv_s, sdf, soft),
-            OccupancyRule::Nerfacc => self.update_nerfacc(config, (seed, n), inv_s, step, sdf),
+            OccupancyRule::Nerfacc => self.update_nerfacc(config, (seed, n), inv_s, step, sdf, soft),
         }
     }
 
@@ -129,6 +129,15 @@ impl Occupancy {
                 }
             }
         }
+        // softness changes within a cell: the softest of a cell and its neighbours counts, or rays would end in hair
+        let widest_near = |i: usize| {
+            [1, r, r * r].into_iter().fold(band[i], |most, stride| {
+                let at = i / stride % r;
+                let before = if at > 0 { band[i - stride] } else { 0.0 };
+                let after = if at + 1 < r { band[i + stride] } else { 0.0 };
+                most.max(before).max(after)
+            })
+        };
         self.occupied.bits.fill(0);
         self.solid.bits.fill(0);
         for &i in &cells {
@@ -137,7 +146,7 @@ impl Occupancy {
                 let other = |j: usize| f[j] * f[i] < 0.0;
                 (at > 0 && other(i - stride)) || (at + 1 < r && other(i + stride))
             });
-            if f[i].abs() < band[i] || crossed {
+            if f[i].abs() < widest_near(i) || crossed {
                 self.occupied.set(i, true);
             } else if f[i] < 0.0 {
                 self.solid.set(i, true);
@@ -153,6 +162,7 @@ impl Occupancy {
         inv_s: f32,
         step: f32,
         sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
+        soft: impl Fn(&[[f32; 3]]) -> Vec<f32>,
     ) {
         let r = config.occupancy_resolution;
         let total = r * r * r;
@@ -182,8 +192,12 @@ impl Occupancy {
                 })
             })
             .collect();
-        let opacity: Vec<f32> =
-            sdf(&points).into_par_iter().map(|f| neus::occupancy(f, 0.5 * step, inv_s)).collect();
+        let local = if config.soften > 1.0 { soft(&points) } else { vec![0.0; points.len()] };
+        let opacity: Vec<f32> = sdf(&points)
+            .into_par_iter()
+            .zip(local)
+            .map(|(f, soft)| neus::occupancy(f, 0.5 * step, inv_s * soft.exp()))
+            .collect();
         let decayed: Vec<(usize, f32)> =
             cells.iter().zip(&opacity).map(|(&i, &o)| (i, (0.95 * self.history[i]).max(o))).collect();
         for (i, o) in decayed {
@@ -253,5 +267,28 @@ mod tests {
             assert_eq!(o.occupied.get((x * 16 + 5) * 16 + 5), x == 7 || x == 8, "{x}");
             assert_eq!(o.solid.get((x * 16 + 5) * 16 + 5), x < 7, "{x}");
         }
+    }
+
+    #[test]
+    fn soft_places_are_kept_wider_and_their_neighbours_with_them() {
+        let config = IfaceConfig { occupancy_resolution: 32, band: 4.0, ..IfaceConfig::draft() };
+        // one side of the sphere is eight times softer
+        let soft = |p: &[[f32; 3]]| p.iter().map(|p| if p[0] > 0.0 { -(8f32.ln()) } else { 0.0 }).collect();
+        let mut o = Occupancy::new(&config, None);
+        o.update(&config, (1, 0), 200.0, 0.0, sphere, soft);
+        let at = |x: f32| {
+            let cell = |c: f32| ((c + 1.0) * 16.0) as usize;
+            let i = (cell(x) * 32 + cell(0.01)) * 32 + cell(0.01);
+            (o.occupied.get(i), o.solid.get(i))
+        };
+        // 0.13 inside: beyond 4 / 200 of the sharp side, within 4 / 25 of the soft one
+        assert_eq!((at(-0.37), at(0.37)), ((false, true), (true, false)));
+        // a sharp cell beside soft ones does not end a ray either
+        let hard_spot = |p: &[[f32; 3]]| {
+            p.iter().map(|p| if (p[0] - 0.36).abs() < 0.032 { 0.0 } else { -(8f32.ln()) }).collect()
+        };
+        o.update(&config, (1, 1), 200.0, 0.0, sphere, hard_spot);
+        let i = ((1.36f32 * 16.0) as usize * 32 + 16) * 32 + 16;
+        assert!(o.occupied.get(i) && !o.solid.get(i));
     }
 }

@@ -55,7 +55,7 @@ impl Line<'_> {
             let (seed, device) = (self.vm_seed(name), self.config.device.as_str());
             let (folder, monitor) = (stage.folder(), stage.monitor());
             let trained = tface::train(
-                name,
+                table(name),
                 &views,
                 scene.aabb,
                 hull.as_ref(),
@@ -72,7 +72,7 @@ impl Line<'_> {
         })?)
     }
 
-    /// The field of the stage `baseline` or `tface` as the bytes of a published checkpoint (`.th`), in the
+    /// The field of the stage `baseline`, `tface` or `twin` as the bytes of a published checkpoint (`.th`), in the
     /// dataset's world times the stage's `import_scale`.
     pub fn export_th(&self, name: &'static str) -> Result<Vec<u8>, Failure> {
         let scene = self.scene_or_fail()?;
@@ -107,12 +107,14 @@ impl Line<'_> {
         }
     }
 
-    fn tface_failure(&self, stage: &str, e: TfaceError) -> Failure {
+    fn tface_failure(&self, stage: &'static str, e: TfaceError) -> Failure {
         match e {
             TfaceError::Stopped { .. } => Failure::stopped(self.run.stop()),
             TfaceError::Device(_) => device_failure(e),
             e => {
-                let hint = e.hint(table(stage)).unwrap_or_default();
+                // a checkpoint is the stage's own, settings are its table's
+                let word = if matches!(e, TfaceError::Checkpoint { .. }) { stage } else { table(stage) };
+                let hint = e.hint(word).unwrap_or_default();
                 let exit = if matches!(e, TfaceError::Settings { .. }) { Exit::Usage } else { Exit::Cannot };
                 Failure { exit, ..Failure::cannot(e, hint) }
             }

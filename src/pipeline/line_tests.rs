@@ -267,7 +267,7 @@ fn a_command_runs_what_its_stage_needs_and_nothing_else() {
     // and only those that build on it are out of date with it
     let config = draft(dir.path());
     let line = Line::open(&config, &run, false).unwrap();
-    assert_eq!(line.followers("tface").join(" "), "tface render ensemble metrics");
+    assert_eq!(line.followers("tface").join(" "), "tface twin render ensemble metrics");
     assert_eq!(line.followers("iface").join(" "), "iface mesh render ensemble metrics");
     assert_eq!(line.followers("mask").join(" "), STAGES.join(" "));
 }

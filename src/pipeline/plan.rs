@@ -53,9 +53,10 @@ impl Line<'_> {
     }
 
     /// A stage and all that build on it, in the order of the line: what is out of date when it is
-    /// recomputed.
+    /// recomputed. The twin goes with T-Face, whose settings it shares.
     pub fn followers(&self, stage: &str) -> Vec<&'static str> {
-        STAGES.iter().copied().filter(|s| self.order(s).contains(&stage)).collect()
+        let with = |s: &str| stage == "tface" && s == "twin";
+        STAGES.iter().copied().filter(|s| with(s) || self.order(s).contains(&stage)).collect()
     }
 
     /// What would be done for `until`: each stage with `None` if it has to be worked on, else what
@@ -186,7 +187,7 @@ fn vm_bytes(c: &VmConfig) -> u64 {
 }
 
 /// The table of the configuration that a stage reads: the twin is T-Face again.
-pub(super) fn table(stage: &str) -> &str {
+pub(super) fn table(stage: &'static str) -> &'static str {
     if stage == "twin" { "tface" } else { stage }
 }
 

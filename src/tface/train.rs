@@ -76,7 +76,7 @@ struct Trainer<'a> {
 
 /// Trains until `config.steps`, saving checkpoints into `dir` and continuing from the one that lies there.
 ///
-/// `stage` is `tface` or `baseline`, for messages. `views` have their cameras in scene coordinates; `bounds`
+/// `stage` is `tface` or `baseline`, the table of the settings, for messages. `views` have their cameras in scene coordinates; `bounds`
 /// is the scene's tight box; `hull` the masks' visual hull over [-1, 1]³. `identity` names settings and
 /// inputs: a checkpoint of another identity is refused.
 pub fn train(
