@@ -184,7 +184,8 @@ from different sides. The other views follow from the cameras.")]
     },
     /// Stage: learn T-Face again from other random numbers, for the blend
     #[command(after_long_help = "Its settings are those of [tface]. Examples:
-  tiface twin runs/002_00
+  tiface twin captures/002_00
+  tiface twin runs/002_00                       go on after a stop
   tiface run captures/002_00 --set render.method=tface,twin,volume,raycast \
     --set ensemble.members=tface,twin,volume --set ensemble.weights=0.4,0.4,0.2")]
     Twin {
