@@ -60,7 +60,8 @@ pub fn softness(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[
         return vec![0.0; x.len()];
     }
     let mut soft = output(shape, table, weights, x, SOFTNESS);
-    soft.iter_mut().for_each(|v| *v = softened::<true>(shape.soften, *v));
+    // fused products outside of a dispatched function would be calls of the C library
+    soft.iter_mut().for_each(|v| *v = softened::<false>(shape.soften, *v));
     soft
 }
 
