@@ -10,6 +10,7 @@
 mod checkpoint;
 mod hull_start;
 mod infer;
+mod losses;
 mod model;
 mod occupancy;
 mod schedule;

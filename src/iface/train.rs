@@ -3,19 +3,20 @@
 use super::checkpoint::{self, State};
 use super::hull_start::HullDistance;
 use super::infer::IFace;
+use super::losses::{Marched, losses};
 use super::model::shape;
 use super::{IfaceError, schedule};
-use crate::config::iface::{Background, IfaceConfig, OccupancyRule, Start};
+use crate::config::iface::{IfaceConfig, OccupancyRule, Start};
+use crate::field;
 use crate::field::optimizer::update;
 use crate::field::pixels::{Batch, Pixels, TrainView};
-use crate::field::{self, ops};
 use crate::kernel::adam::AdamStep;
 use crate::kernel::march::{self, Bitmask};
 use crate::kernel::mlp::Weights;
 use crate::kernel::rng;
 use crate::kernel::sdf::{self, FieldShape};
 use crate::run::Monitor;
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use serde::Serialize;
 use std::path::Path;
 use std::sync::Arc;
@@ -36,15 +37,6 @@ pub struct TrainReport {
     pub occupied: f64,
     /// Oddities on the way: a damaged checkpoint, a restored step.
     pub warnings: Vec<String>,
-}
-
-/// Named losses of one step, for the log and for naming the one that broke.
-struct Losses {
-    total: Tensor<1>,
-    rgb: Tensor<1>,
-    mask: Option<Tensor<1>>,
-    eikonal: Tensor<1>,
-    sparsity: Option<Tensor<1>>,
 }
 
 /// Steps in a row without a single sample after which nothing can bring the surface back.
@@ -244,7 +236,9 @@ impl Trainer<'_> {
             self.state.step += 1;
             return Ok(Ok(Figures { rgb: 0.0, mask: 0.0, eikonal: 0.0, sparsity: 0.0, samples: 0 }));
         }
-        let losses = self.losses(&shape, &batch, samples, dt, step, seed);
+        let model = &self.state.model;
+        let marched = Marched { batch: &batch, samples, dt, masked: self.pixels.masked };
+        let losses = losses(config, model, &shape, marched, (seed, step), &self.device);
         let read = |t: &Tensor<1>| field::values(t.clone().inner())[0];
         let figures = Figures {
             rgb: read(&losses.rgb),
@@ -278,113 +272,6 @@ impl Trainer<'_> {
         let distances = |x: &[[f32; 3]]| sdf::values(shape, table, &weights, x);
         let soft = |x: &[[f32; 3]]| sdf::softness(shape, table, &weights, x);
         self.state.occupancy.update(self.config, (seed, step), inv_s, dt, distances, soft);
-    }
-
-    fn losses(
-        &self,
-        shape: &Arc<FieldShape>,
-        batch: &Batch,
-        samples: march::Samples,
-        dt: f32,
-        step: u64,
-        seed: u64,
-    ) -> Losses {
-        let config = self.config;
-        let device = &self.device;
-        let (n, rays) = (samples.t.len(), batch.rays.len());
-        let mut x = vec![0f32; 3 * n];
-        let mut d = vec![0f32; 3 * n];
-        for (r, ray) in batch.rays.iter().enumerate() {
-            for s in samples.offsets[r] as usize..samples.offsets[r + 1] as usize {
-                for a in 0..3 {
-                    x[3 * s + a] = ray.origin[a] + samples.t[s] * ray.direction[a];
-                    d[3 * s + a] = ray.direction[a];
-                }
-            }
-        }
-        let directions: Vec<f32> = batch.rays.iter().flat_map(|r| r.direction).collect();
-        // target and render over the same background, whatever it is
-        let background: Vec<[f32; 3]> = match config.background {
-            Background::Black => vec![[0.0; 3]; rays],
-            Background::Random => (0..rays as u64)
-                .map(|r| std::array::from_fn(|c| rng::uniform(seed, step << 4 | 3, 3 * r + c as u64)))
-                .collect(),
-        };
-        let mut target = Vec::with_capacity(3 * rays);
-        for r in 0..rays {
-            let a = batch.alpha[r];
-            for c in 0..3 {
-                target.push(batch.color[r][c] + (1.0 - a) * background[r][c]);
-            }
-        }
-        let has_samples: Vec<f32> = samples.offsets.windows(2).map(|w| f32::from(w[1] > w[0])).collect();
-        let alpha: Tensor<2> = field::tensor(batch.alpha.clone(), [rays, 1], device).autodiff();
-        let background: Tensor<2> =
-            field::tensor(background.into_iter().flatten().collect(), [rays, 3], device).autodiff();
-        let target: Tensor<2> = field::tensor(target, [rays, 3], device).autodiff();
-        // rays that are all head, and their colour: background plays no part
-        let full: Vec<f32> = batch.alpha.iter().map(|&a| f32::from(a > 0.999)).collect();
-        let all_head = full.iter().sum::<f32>();
-        let full: Tensor<2> = field::tensor(full, [rays, 1], device).autodiff();
-        let head: Tensor<2> =
-            field::tensor(batch.color.iter().flatten().copied().collect(), [rays, 3], device).autodiff();
-
-        let out =
-            self.state.model.field(shape, field::tensor(x, [n, 3], device), field::tensor(d, [n, 3], device)); // [n, 8]
-        let bundle = ops::RaySamples {
-            direction: field::tensor(directions, [rays, 3], device).autodiff(),
-            dt: field::tensor(vec![dt; n], [n], device).autodiff(),
-            t: field::tensor(samples.t, [n], device).autodiff(),
-            offsets: Tensor::<1, Int>::from_data(TensorData::new(samples.offsets, [rays + 1]), device)
-                .autodiff(),
-        };
-        let anneal = schedule::anneal(config, step);
-        let inv_s = self.state.model.inv_s();
-        let composed = ops::neus(out.clone(), inv_s.clone(), bundle.clone(), anneal); // [rays, 8]
-        let opacity = composed.clone().narrow(1, 3, 1); // [rays, 1]
-        // Σ w ‖c − h‖² = Σ w c² − 2 h Σ w c + h² Σ w, so compositing c² beside c gives it
-        let single = (config.rgb_sample > 0.0 && all_head > 0.0).then(|| {
-            let rgb = out.clone().narrow(1, 4, 3);
-            let squared =
-                Tensor::cat(vec![out.clone().narrow(1, 0, 4), rgb.square(), out.clone().narrow(1, 7, 1)], 1);
-            let second = ops::neus(squared, inv_s, bundle, anneal).narrow(1, 0, 3); // [rays, 3]
-            let first = composed.clone().narrow(1, 0, 3);
-            let error = second - first * head.clone() * 2.0 + head.square() * opacity.clone();
-            (error * full).sum() / (3.0 * all_head as f64)
-        });
-        let color = composed.narrow(1, 0, 3) + background * (opacity.clone().neg() + 1.0);
-
-        // colour over the rays that met something; the others are constant
-        let counted: f32 = has_samples.iter().sum();
-        let met: Tensor<2> = field::tensor(has_samples, [rays, 1], device).autodiff();
-        let error = (color - target) * met;
-        let denominator = 3.0 * counted.max(1.0) as f64;
-        let rgb = error.clone().square().sum() / denominator;
-        let mut total = rgb.clone() * config.rgb_mse;
-        if let Some(single) = single {
-            total = total + single * config.rgb_sample;
-        }
-        if config.rgb_l1 > 0.0 {
-            total = total + error.abs().sum() / denominator * config.rgb_l1;
-        }
-        let mask = (self.pixels.masked && config.mask > 0.0).then(|| {
-            let p = opacity.clamp(1e-3, 1.0 - 1e-3);
-            let cross = alpha.clone() * p.clone().log() + (alpha.neg() + 1.0) * (p.neg() + 1.0).log();
-            cross.mean().neg()
-        });
-        if let Some(mask) = &mask {
-            total = total + mask.clone() * config.mask;
-        }
-        let gradient = out.clone().narrow(1, 1, 3); // [n, 3]
-        let length = (gradient.square().sum_dim(1) + 1e-12).sqrt();
-        let eikonal = (length - 1.0).square().mean();
-        total = total + eikonal.clone() * config.eikonal;
-        let sparsity = (config.sparsity > 0.0)
-            .then(|| (out.narrow(1, 0, 1).abs() * -config.sparsity_scale).exp().mean());
-        if let Some(sparsity) = &sparsity {
-            total = total + sparsity.clone() * config.sparsity;
-        }
-        Losses { total, rgb, mask, eikonal, sparsity }
     }
 
     /// Backward and AdamW, each group at its own rate.
