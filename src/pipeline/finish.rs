@@ -7,7 +7,7 @@ use crate::capture::scene::Scene;
 use crate::config::TextureView;
 use crate::geom::{Camera, Mesh};
 use crate::image::{Image, Photo, quantise, srgb_from_linear};
-use crate::mesh::bake::{BakeConfig, Baked, Learned, Viewer, bake, seam_step, tangent_space};
+use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, Viewer, bake, tangent_space};
 use crate::mesh::textured_tangents::tangents;
 use crate::mesh::{AtlasConfig, Cap, MeshError, SimplifyConfig, atlas, simplify};
 use crate::run::Monitor;
@@ -112,7 +112,7 @@ impl Line<'_> {
         let baked = bake(&mesh, &laid, &learned, &cameras, &config, monitor)?;
         report.insert("bake".into(), json!(baked.report));
         let color = coded(&baked.color);
-        report.insert("seam_step_255".into(), json!(seam_step(&mesh, &laid, &color)));
+        report.insert("seam_step_255".into(), json!(Seams::new(&mesh, &laid).step(&color)));
 
         let normal = match &baked.normal {
             Some(normals) => match tangents(&mesh, &laid) {

@@ -4,7 +4,7 @@
 //! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
 //! they see in linear light (`light`). What the cameras see differently can be kept as a few lobes a texel
 //! ([`lobes`]), and the field's normal as a picture of normals
-//! ([`tangent_space`]). Gaps are filled by `fill`.
+//! ([`tangent_space`]). Gaps are filled by `fill`, and both sides of a seam made to agree by [`Seams`].
 //!
 //! The picture is baked in bands of rows, so that samples never lie in memory together: twelve bytes a texel for
 //! colour, normals and each lobe are what it takes.
@@ -18,11 +18,11 @@ mod seams;
 
 pub use detail::tangent_space;
 pub use light::{Learned, seen_colors};
-pub use seams::seam_step;
+pub use seams::Seams;
 
 use super::MeshError;
 use crate::geom::{Atlas, Bvh, Camera, Mesh};
-use crate::image::Image;
+use crate::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::run::Monitor;
 use cover::{Bands, Sample};
 use glam::{Mat3, Vec3};
@@ -173,6 +173,9 @@ pub fn bake(
     }
     fill::fill(&mut color, &covered, config.gutter_px);
     lobes.iter_mut().for_each(|l| fill::fill(l, &covered, config.gutter_px));
+    let seams = Seams::new(mesh, atlas);
+    seams.even(&mut color, srgb_from_linear, linear_from_srgb);
+    lobes.iter_mut().for_each(|l| seams.even(l, |v| v, |v| v));
     if let Some(normal) = &mut normal {
         fill::fill(normal, &covered, config.gutter_px);
     }
@@ -255,7 +258,6 @@ impl Totals {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::linear_from_srgb;
     use crate::run::Quiet;
     use glam::Vec2;
 
