@@ -1,9 +1,9 @@
 //! Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel views.
 //!
 //! The line, one word per stage: **capture** (what was photographed, from where) → **mask** (which
-//! pixels are the head) → **baseline**, **tface** (radiance fields without and with masks; **twin** is a second
-//! tface, if asked for), **iface** (a learned signed distance) → **mesh** (its zero level set, closed) →
-//! **render** (views by volume rendering and by ray casting) → **ensemble** (they become one) → **metrics**.
+//! pixels are the head) → **baseline**, **tface** (radiance fields without and with masks), **iface** (a
+//! learned signed distance) → **mesh** (its zero level set, closed) → **render** (views by volume rendering and by
+//! ray casting) → **ensemble** (they become one) → **metrics**.
 //!
 //! Modules are declared in the order of that line; what they share stands first.
 

@@ -50,7 +50,7 @@ pub use truth::{Truth, against_truth};
 
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, CaptureError, CaptureOptions, MaskChoice, Split, View};
-use crate::config::{Config, MaskMeaning, MaskSource, Method};
+use crate::config::{Config, MaskMeaning, MaskSource};
 use crate::io::{self, Limits};
 #[cfg(feature = "cpu")]
 use crate::run::Done;
@@ -60,8 +60,7 @@ use serde_json::Value;
 use std::path::Path;
 
 /// The stages in order.
-pub const STAGES: &[&str] =
-    &["mask", "baseline", "tface", "twin", "iface", "mesh", "render", "ensemble", "metrics"];
+pub const STAGES: &[&str] = &["mask", "baseline", "tface", "iface", "mesh", "render", "ensemble", "metrics"];
 
 /// Raised when the meaning of a stage's files changes.
 const FORMAT: u32 = 1;
@@ -128,7 +127,7 @@ pub fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>
     for name in line.order(until) {
         let stage = match name {
             "mask" => line.mask()?,
-            "baseline" | "tface" | "twin" => line.radiance(name)?,
+            "baseline" | "tface" => line.radiance(name)?,
             "iface" => line.iface()?,
             "mesh" => line.mesh(&fields)?,
             "render" => line.render(&fields)?,
@@ -175,14 +174,6 @@ impl<'a> Line<'a> {
             "test" | "train" | "orbit" => String::new(),
             file => of_file(file)?,
         };
-        if config.render.method.contains(&Method::Twin) && !config.tface.import.is_empty() {
-            return Err(PipelineError::Settings {
-                key: "render.method",
-                problem: "names twin, but tface.import takes T-Face from a file: nothing is left to chance"
-                    .into(),
-                hint: "leave twin out of render.method and ensemble.members, with its weight".into(),
-            });
-        }
         let mut imports = Vec::new();
         for (stage, table) in [("baseline", &config.baseline), ("tface", &config.tface)] {
             if !table.import.is_empty() {

@@ -106,9 +106,7 @@ impl Work<'_> {
             _ => None,
         };
         match (self.until, format) {
-            ("baseline" | "tface" | "twin", None) if ending == "th" => {
-                write(out, &published(line, self.until)?)
-            }
+            ("baseline" | "tface", None) if ending == "th" => write(out, &published(line, self.until)?),
             ("mesh" | "metrics" | "render", Some(format)) if line.order(self.until).contains(&"mesh") => {
                 let stem = out.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
                 let exported =
@@ -127,7 +125,7 @@ impl Work<'_> {
             )),
             (stage, None) => {
                 // fields, and pictures that only another stage can read, stay where they are
-                let fields = ["baseline", "tface", "twin", "iface", CAPTURE];
+                let fields = ["baseline", "tface", "iface", CAPTURE];
                 match stage {
                     "metrics" => copy_folder(run.dir(), out, &fields),
                     _ => copy_folder(&run.path(stage), out, &["float"]),
@@ -175,10 +173,9 @@ impl Work<'_> {
 }
 
 /// What is judged, and what a person calls it.
-const JUDGED: [(&str, &str); 8] = [
+const JUDGED: [(&str, &str); 7] = [
     ("baseline", "views of the baseline"),
     ("tface", "views of T-Face"),
-    ("twin", "views of its twin"),
     ("volume", "views of I-Face"),
     ("raycast", "views of the mesh"),
     ("textured", "views of the textured mesh"),
@@ -279,8 +276,8 @@ fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, En
 /// A radiance field as a published checkpoint.
 #[cfg(feature = "cpu")]
 fn published(line: &Line, stage: &str) -> Result<Vec<u8>, Ending> {
-    let known = ["baseline", "twin"].into_iter().find(|s| *s == stage);
-    Ok(line.export_th(known.unwrap_or("tface"))?)
+    let known = if stage == "baseline" { "baseline" } else { "tface" };
+    Ok(line.export_th(known)?)
 }
 
 #[cfg(not(feature = "cpu"))]

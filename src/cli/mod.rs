@@ -168,6 +168,7 @@ from different sides. The other views follow from the cameras.")]
   tiface tface captures/002_00
   tiface tface runs/002_00                      go on after a stop
   tiface tface captures/002_00 --run runs/ce --ablation mask-ce
+  tiface tface captures/002_00 --set tface.fields=3    the mean of three fields
   tiface tface captures/002_00 --set tface.import=official.th")]
     Tface {
         #[command(flatten)]
@@ -179,16 +180,6 @@ from different sides. The other views follow from the cameras.")]
   tiface baseline runs/002_00                   go on after a stop
   tiface baseline runs/002_00 --fresh baseline --set baseline.steps=20000")]
     Baseline {
-        #[command(flatten)]
-        place: Place,
-    },
-    /// Stage: learn T-Face again from other random numbers, for the blend
-    #[command(after_long_help = "Its settings are those of [tface]. Examples:
-  tiface twin captures/002_00
-  tiface twin runs/002_00                       go on after a stop
-  tiface run captures/002_00 --set render.method=tface,twin,volume,raycast \
-    --set ensemble.members=tface,twin,volume --set ensemble.weights=0.4,0.4,0.2")]
-    Twin {
         #[command(flatten)]
         place: Place,
     },
@@ -244,7 +235,7 @@ from different sides. The other views follow from the cameras.")]
         /// test, train, orbit, or a file: a nerfstudio camera path or a transforms.json
         #[arg(long, value_name = "WHICH")]
         cameras: Option<String>,
-        /// Any of baseline, tface, twin, volume (I-Face's field), raycast (its whole mesh)
+        /// Any of baseline, tface, volume (I-Face's field), raycast (its whole mesh)
         /// and textured (head.glb as a viewer shows it), with commas
         #[arg(long = "with", value_name = "LIST")]
         method: Option<String>,
@@ -266,7 +257,7 @@ With --fit or --correct, some training views must be set aside before anything i
     Ensemble {
         #[command(flatten)]
         place: Place,
-        /// Whose views: baseline, tface, twin, volume, raycast, textured
+        /// Whose views: baseline, tface, volume, raycast, textured
         #[arg(long, value_name = "LIST")]
         members: Option<String>,
         /// Their shares, in that order; together 1
@@ -295,7 +286,7 @@ With --fit or --correct, some training views must be set aside before anything i
     Export {
         #[command(flatten)]
         place: Place,
-        /// tface, twin or baseline
+        /// tface or baseline
         #[arg(long = "with", value_name = "FIELD", default_value = "tface")]
         field: String,
     },
@@ -411,7 +402,6 @@ impl Cli {
             Command::Mask { place, clicks, page: false } => line(place, "mask", &[], &clicks.keys()?),
             Command::Baseline { place } => line(place, "baseline", &[], &[]),
             Command::Tface { place } => line(place, "tface", &[], &[]),
-            Command::Twin { place } => line(place, "twin", &[], &[]),
             Command::Iface { place } => line(place, "iface", &[], &[]),
             Command::Mesh { place, format, frame, triangles, texture, lobes, normal_map, no_cap } => {
                 let given = |flag: bool, value: &str| flag.then(|| value.to_owned());
@@ -446,15 +436,15 @@ impl Cli {
             }
             Command::Metrics { place, require } => line(place, "metrics", require, &[]),
             Command::Export { place, field } => match (field.as_str(), &common.out) {
-                ("tface" | "twin" | "baseline", Some(out)) if out.extension().is_some_and(|e| e == "th") => {
+                ("tface" | "baseline", Some(out)) if out.extension().is_some_and(|e| e == "th") => {
                     line(place, field, &[], &[])
                 }
-                ("tface" | "twin" | "baseline", _) => {
+                ("tface" | "baseline", _) => {
                     Err(Ending::usage("no file to export to is named", "name one: `--out model.th`"))
                 }
                 _ => Err(Ending::usage(
                     format!("`{field}` cannot be exported"),
-                    "tface, twin and baseline can; the mesh is `tiface mesh --out head.glb`",
+                    "tface and baseline can; the mesh is `tiface mesh --out head.glb`",
                 )),
             },
             Command::Check { mesh, require, against, seen_by } => {

@@ -24,10 +24,6 @@ pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<Exit, Ending> {
             return Err(Ending::cannot(format!("`{}` is not a folder", run.display()), "name a run folder"));
         }
         for stage in STAGES {
-            // few runs ask for a second T-Face
-            if *stage == "twin" && !io::is_folder(&run.join(stage)) {
-                continue;
-            }
             text += &line(common, run, stage)?;
         }
     }

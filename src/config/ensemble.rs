@@ -48,7 +48,7 @@ pub struct EnsembleConfig {
 pub(super) const KEYS: &[Key] = &[
     Key::word(
         "members",
-        "A list of baseline, tface, twin (a second T-Face), volume (I-Face), raycast (its mesh) and textured \
+        "A list of baseline, tface, volume (I-Face), raycast (its mesh) and textured \
          (head.glb); an empty list for no blend.",
     ),
     Key::number("weights", "The share of each member, in their order; together 1.", 0.0, 1.0),

@@ -11,10 +11,6 @@ pub enum Method {
     Baseline,
     /// T-Face, marched and composited.
     Tface,
-    /// T-Face once more, learned from other random numbers. What a field makes up where photographs leave it free
-    /// differs from one training to the next: the mean of two is nearer to the truth than either (Lakshminarayanan
-    /// et al. 2017).
-    Twin,
     /// I-Face's field, marched and composited.
     #[serde(alias = "iface")]
     Volume,
@@ -30,7 +26,6 @@ impl Method {
         match self {
             Method::Baseline => "baseline",
             Method::Tface => "tface",
-            Method::Twin => "twin",
             Method::Volume => "volume",
             Method::Raycast => "raycast",
             Method::Textured => "textured",
@@ -42,7 +37,6 @@ impl Method {
         match self {
             Method::Baseline => "baseline",
             Method::Tface => "tface",
-            Method::Twin => "twin",
             Method::Volume => "iface",
             Method::Raycast | Method::Textured => "mesh",
         }
@@ -98,7 +92,7 @@ pub(super) const KEYS: &[Key] = &[
     ),
     Key::word(
         "method",
-        "A list of baseline, tface, twin (a second T-Face from other random numbers), volume (I-Face's field), raycast \
+        "A list of baseline, tface, volume (I-Face's field), raycast \
          (rays at its mesh, learned colour) and textured (head.glb as a viewer shows it).",
     ),
     Key::number("orbit_views", "Views of an orbit around the head.", 1.0, 10_000.0),

@@ -10,7 +10,13 @@ pub(super) const KEYS: &[Key] = &[
         1e-6,
         1e6,
     ),
-    Key::number("steps", "Optimiser steps.", 1.0, 1e7),
+    Key::number(
+        "fields",
+        "Fields learned one after the other from different random numbers; their mean is what is seen.",
+        1.0,
+        16.0,
+    ),
+    Key::number("steps", "Optimiser steps of each.", 1.0, 1e7),
     Key::number("rays", "Rays per step.", 1.0, 1_048_576.0),
     Key::word("masks", "What masks do to the photographs: none, binary (a little head is head) or soft."),
     Key::word(

@@ -190,7 +190,7 @@ impl Line<'_> {
             .iter()
             .any(|v| v.mask != MaskSource::None && v.mask_meaning == MaskMeaning::Empty);
         let used = match method {
-            Method::Baseline | Method::Tface | Method::Twin => self.vm(method.stage()).masks != MaskUse::None,
+            Method::Baseline | Method::Tface => self.vm(method.stage()).masks != MaskUse::None,
             Method::Volume | Method::Raycast | Method::Textured => true,
         };
         any && used
@@ -203,14 +203,7 @@ impl Line<'_> {
         camera: &Camera,
         world_from_scene: &Similarity,
     ) -> Result<Image, Failure> {
-        let best = [
-            Method::Volume,
-            Method::Raycast,
-            Method::Textured,
-            Method::Tface,
-            Method::Twin,
-            Method::Baseline,
-        ];
+        let best = [Method::Volume, Method::Raycast, Method::Textured, Method::Tface, Method::Baseline];
         let members = &self.config.ensemble.members;
         let member = best.into_iter().find(|m| members.contains(m)).unwrap_or(Method::Volume);
         let depth = pictures::read_float_depth(&self.member_file(member, name)?)?;

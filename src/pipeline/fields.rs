@@ -1,6 +1,5 @@
 //! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
 
-use super::plan::table;
 use super::{Fields, Line, PipelineError, Radiance, Surface, bitmask, capture_failure, to_value};
 use crate::capture::scene::Scene;
 use crate::capture::{Split, View};
@@ -9,7 +8,7 @@ use crate::field::pixels::TrainView;
 use crate::iface::{self, IFace, IfaceError};
 use crate::io::Limits;
 use crate::run::{Done, Exit, Failure};
-use crate::tface::{self, TFace, TfaceError};
+use crate::tface::{self, MeanField, TfaceError};
 use rayon::prelude::*;
 use serde_json::json;
 use std::cell::OnceCell;
@@ -35,7 +34,7 @@ impl Line<'_> {
         })?)
     }
 
-    /// Stages `baseline`, `tface` and `twin`: the same learning with other settings, or other random numbers.
+    /// Stages `baseline` and `tface`: the same learning with other settings.
     pub fn radiance(&self, name: &'static str) -> Result<Done, PipelineError> {
         let plan = self.plan(name);
         let identity = plan.fingerprint.digest();
@@ -52,10 +51,10 @@ impl Line<'_> {
             let masked = config.masks != MaskUse::None;
             let views = self.train_views(&scene, masked)?;
             let hull = bitmask(&scene).filter(|_| masked);
-            let (seed, device) = (self.vm_seed(name), self.config.device.as_str());
+            let (seed, device) = (self.config.seed, self.config.device.as_str());
             let (folder, monitor) = (stage.folder(), stage.monitor());
             let trained = tface::train(
-                table(name),
+                name,
                 &views,
                 scene.aabb,
                 hull.as_ref(),
@@ -66,16 +65,20 @@ impl Line<'_> {
                 &identity,
                 monitor,
             );
-            let (_, report) = trained.map_err(|e| self.tface_failure(name, e))?;
+            let report = trained.map_err(|e| self.tface_failure(name, e))?;
             report.warnings.iter().for_each(|w| stage.warn(w));
             Ok(to_value(&report))
         })?)
     }
 
-    /// The field of the stage `baseline`, `tface` or `twin` as the bytes of a published checkpoint (`.th`), in the
-    /// dataset's world times the stage's `import_scale`.
+    /// The field of the stage `baseline` or `tface`, the first of several, as the bytes of a published checkpoint
+    /// (`.th`), in the dataset's world times the stage's `import_scale`.
     pub fn export_th(&self, name: &'static str) -> Result<Vec<u8>, Failure> {
         let scene = self.scene_or_fail()?;
+        let fields = self.vm(name).learned();
+        if fields > 1 {
+            self.run.warn(name, &format!("a .th file holds one field: this is the first of {fields}"));
+        }
         tface::export_th(&self.run.path(name), self.vm(name).import_scale, &scene.scene_from_world)
             .map_err(|e| self.tface_failure(name, e))
     }
@@ -112,9 +115,7 @@ impl Line<'_> {
             TfaceError::Stopped { .. } => Failure::stopped(self.run.stop()),
             TfaceError::Device(_) => device_failure(e),
             e => {
-                // a checkpoint is the stage's own, settings are its table's
-                let word = if matches!(e, TfaceError::Checkpoint { .. }) { stage } else { table(stage) };
-                let hint = e.hint(word).unwrap_or_default();
+                let hint = e.hint(stage).unwrap_or_default();
                 let exit = if matches!(e, TfaceError::Settings { .. }) { Exit::Usage } else { Exit::Cannot };
                 Failure { exit, ..Failure::cannot(e, hint) }
             }
@@ -130,16 +131,14 @@ fn device_failure(e: impl std::error::Error + Send + Sync + 'static) -> Failure 
 pub struct Trained<'l> {
     line: &'l Line<'l>,
     iface: OnceCell<IFace>,
-    tface: OnceCell<TFace>,
-    twin: OnceCell<TFace>,
-    baseline: OnceCell<TFace>,
+    tface: OnceCell<MeanField>,
+    baseline: OnceCell<MeanField>,
 }
 
 impl<'l> Trained<'l> {
     /// Of a line; nothing is loaded yet.
     pub fn new(line: &'l Line<'l>) -> Trained<'l> {
-        let [tface, twin, baseline] = std::array::from_fn(|_| OnceCell::new());
-        Trained { line, iface: OnceCell::new(), tface, twin, baseline }
+        Trained { line, iface: OnceCell::new(), tface: OnceCell::new(), baseline: OnceCell::new() }
     }
 }
 
@@ -157,12 +156,11 @@ impl Fields for Trained<'_> {
 
     fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
         let line = self.line;
-        let load = || TFace::load(&line.run.path(stage)).map_err(|e| line.tface_failure(stage, e));
-        let cell = match stage {
-            "baseline" => &self.baseline,
-            "twin" => &self.twin,
-            _ => &self.tface,
+        let load = || {
+            let (folder, count) = (line.run.path(stage), line.vm(stage).learned());
+            MeanField::load(&folder, count).map_err(|e| line.tface_failure(stage, e))
         };
+        let cell = if stage == "baseline" { &self.baseline } else { &self.tface };
         once(cell, load).map(|f| f as &dyn Radiance)
     }
 }

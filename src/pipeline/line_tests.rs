@@ -262,12 +262,11 @@ fn a_command_runs_what_its_stage_needs_and_nothing_else() {
     assert_eq!(order("render", &[Method::Volume]), "mask iface render");
     assert_eq!(order("render", &[Method::Raycast]), "mask iface mesh render");
     assert_eq!(order("ensemble", &[Method::Tface]), "mask tface render ensemble");
-    assert_eq!(order("metrics", &[]), STAGES.join(" ").replace("twin ", ""));
-    assert_eq!(order("render", &[Method::Tface, Method::Twin]), "mask tface twin render");
+    assert_eq!(order("metrics", &[]), STAGES.join(" "));
     // and only those that build on it are out of date with it
     let config = draft(dir.path());
     let line = Line::open(&config, &run, false).unwrap();
-    assert_eq!(line.followers("tface").join(" "), "tface twin render ensemble metrics");
+    assert_eq!(line.followers("tface").join(" "), "tface render ensemble metrics");
     assert_eq!(line.followers("iface").join(" "), "iface mesh render ensemble metrics");
     assert_eq!(line.followers("mask").join(" "), STAGES.join(" "));
 }
@@ -292,7 +291,7 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
     };
     let all = STAGES.join(" ");
     assert_eq!(changed(&|c| c.mesh.resolution = 100), "mesh render ensemble metrics");
-    assert_eq!(changed(&|c| c.tface.steps += 1), "tface twin render ensemble metrics");
+    assert_eq!(changed(&|c| c.tface.steps += 1), "tface render ensemble metrics");
     assert_eq!(changed(&|c| c.baseline.masks = c.tface.masks), "baseline render ensemble metrics");
     assert_eq!(changed(&|c| c.tface.checkpoint_s = 7.0), "");
     assert_eq!(changed(&|c| c.ensemble.weights = vec![0.2, 0.5, 0.3]), "ensemble metrics");
@@ -309,9 +308,7 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
     };
     let first = import("a.th");
     assert_ne!(first[2], base[2]);
-    // the twin learns from the same settings, but not from the same numbers
-    assert_eq!((STAGES[2], STAGES[3]), ("tface", "twin"));
-    assert_ne!(base[2], base[3]);
+    assert_eq!(STAGES[2], "tface");
     std::fs::copy(dir.path().join("a.th"), dir.path().join("b.th")).unwrap();
     assert_eq!(import("b.th"), first);
     std::fs::write(dir.path().join("a.th"), b"other").unwrap();

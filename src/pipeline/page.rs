@@ -7,10 +7,9 @@ use crate::report::{self, Picture, Report, Row};
 use crate::run::Done;
 
 /// The stages that learn, and what of their `log.jsonl` is drawn.
-const LEARNED: [(&str, &[&str]); 4] = [
+const LEARNED: [(&str, &[&str]); 3] = [
     ("baseline", &["psnr", "samples"]),
     ("tface", &["psnr", "mask", "outside", "samples"]),
-    ("twin", &["psnr", "mask", "outside", "samples"]),
     ("iface", &["psnr", "eikonal", "inv_s"]),
 ];
 

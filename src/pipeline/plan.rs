@@ -25,13 +25,13 @@ impl Line<'_> {
     pub fn needs(&self, stage: &str) -> Vec<&'static str> {
         match stage {
             "mask" => Vec::new(),
-            "baseline" | "tface" | "twin" | "iface" => vec!["mask"],
+            "baseline" | "tface" | "iface" => vec!["mask"],
             "mesh" => vec!["iface"],
             "render" => {
                 let methods = &self.config.render.method;
                 let shown = |stage: &str| methods.iter().any(|m: &Method| m.stage() == stage);
                 let mut needs = vec!["mask"];
-                needs.extend(["baseline", "tface", "twin", "iface", "mesh"].into_iter().filter(|s| shown(s)));
+                needs.extend(["baseline", "tface", "iface", "mesh"].into_iter().filter(|s| shown(s)));
                 needs
             }
             "ensemble" => vec!["render"],
@@ -53,10 +53,9 @@ impl Line<'_> {
     }
 
     /// A stage and all that build on it, in the order of the line: what is out of date when it is
-    /// recomputed. The twin goes with T-Face, whose settings it shares.
+    /// recomputed.
     pub fn followers(&self, stage: &str) -> Vec<&'static str> {
-        let with = |s: &str| stage == "tface" && s == "twin";
-        STAGES.iter().copied().filter(|s| with(s) || self.order(s).contains(&stage)).collect()
+        STAGES.iter().copied().filter(|s| self.order(s).contains(&stage)).collect()
     }
 
     /// What would be done for `until`: each stage with `None` if it has to be worked on, else what
@@ -91,7 +90,7 @@ impl Line<'_> {
 
     /// What a stage is about to do; its fingerprint holds those of the stages it needs.
     pub fn plan(&self, name: &'static str) -> Plan<'_> {
-        let mut settings = self.config.values(table(name));
+        let mut settings = self.config.values(name);
         let mut needs_bytes = 16 << 20;
         let needs = self.needs(name).into_iter();
         let mut inputs: Vec<_> = needs.map(|s| (s, self.plan(s).fingerprint.digest())).collect();
@@ -119,11 +118,11 @@ impl Line<'_> {
                 let c = &self.config.iface;
                 needs_bytes += (c.levels as u64) << c.log2_table.min(40) << 3 << 3;
             }
-            "baseline" | "tface" | "twin" => {
-                settings.remove(&format!("{}.checkpoint_s", table(name)));
-                settings.insert("seed".into(), self.vm_seed(name).to_string());
-                if let Some((_, digest)) = self.imports.iter().find(|(stage, _)| *stage == table(name)) {
-                    settings.remove(&format!("{}.import", table(name)));
+            "baseline" | "tface" => {
+                settings.remove(&format!("{name}.checkpoint_s"));
+                settings.insert("seed".into(), self.config.seed.to_string());
+                if let Some((_, digest)) = self.imports.iter().find(|(stage, _)| *stage == name) {
+                    settings.remove(&format!("{name}.import"));
                     inputs.push(("import", digest.clone()));
                 }
                 needs_bytes += vm_bytes(self.vm(name));
@@ -158,18 +157,9 @@ impl Line<'_> {
         Plan { name, fingerprint, device: &self.config.device, needs_bytes }
     }
 
-    /// Settings of the stage `baseline`, `tface` or `twin`.
+    /// Settings of the stage `baseline` or `tface`.
     pub(super) fn vm(&self, stage: &str) -> &VmConfig {
         if stage == "baseline" { &self.config.baseline } else { &self.config.tface }
-    }
-
-    /// What the random numbers of the stage `baseline`, `tface` or `twin` come from.
-    pub(super) fn vm_seed(&self, stage: &str) -> u64 {
-        match stage {
-            // any number but that of its sibling; two runs with neighbouring seeds share no field
-            "twin" => self.config.seed ^ 0x7477_696e,
-            _ => self.config.seed,
-        }
     }
 
     /// Of all photographs.
@@ -179,16 +169,11 @@ impl Line<'_> {
     }
 }
 
-/// Weights and two moments of the planes, for two checkpoints and one being written.
+/// Weights and two moments of the planes, for two checkpoints and one being written; weights of the fields before.
 fn vm_bytes(c: &VmConfig) -> u64 {
     let channels: usize = c.density_rank.iter().chain(&c.color_rank).sum();
     let side = (c.voxels_final as f64).cbrt();
-    (channels as f64 * side * side * 36.0) as u64
-}
-
-/// The table of the configuration that a stage reads: the twin is T-Face again.
-pub(super) fn table(stage: &'static str) -> &'static str {
-    if stage == "twin" { "tface" } else { stage }
+    (channels as f64 * side * side * (36.0 + 4.0 * (c.learned() - 1) as f64)) as u64
 }
 
 /// The word of the line; the last one for any other.

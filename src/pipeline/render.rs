@@ -189,7 +189,7 @@ impl Eye<'_> {
     /// The view of a camera in scene coordinates, over nothing.
     fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>, Failure> {
         Ok(match (method, &self.whole) {
-            (Method::Baseline | Method::Tface | Method::Twin, _) => {
+            (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
                 // a large view takes minutes: nobody who asks to stop waits for the rest of it
                 let see = |rays: &[Ray]| match self.stop.requested() {

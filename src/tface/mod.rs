@@ -15,6 +15,8 @@ mod grow;
 #[cfg(feature = "cpu")]
 mod infer;
 #[cfg(feature = "cpu")]
+mod mean;
+#[cfg(feature = "cpu")]
 mod state;
 pub mod th;
 #[cfg(feature = "cpu")]
@@ -27,4 +29,6 @@ pub use exchange::{export_th, import_th};
 #[cfg(feature = "cpu")]
 pub use infer::{TFace, VmPixel};
 #[cfg(feature = "cpu")]
-pub use train::{TrainReport, train};
+pub use mean::{MeanField, train};
+#[cfg(feature = "cpu")]
+pub use train::TrainReport;

@@ -27,15 +27,17 @@ use std::time::{Duration, Instant};
 /// What training did.
 #[derive(Clone, Debug, Serialize)]
 pub struct TrainReport {
-    /// Optimiser steps.
+    /// Fields learned.
+    pub fields: usize,
+    /// Optimiser steps of each.
     pub steps: u64,
     /// Seconds in this process (less than the whole when resumed).
     pub seconds: f64,
-    /// PSNR of the last training batches, dB.
+    /// PSNR of the last training batches, dB; mean over the fields.
     pub train_psnr: f64,
-    /// Share of the box's cells that are marched at the end.
+    /// Share of the box's cells that are marched at the end; mean over the fields.
     pub occupied: f64,
-    /// Vertices of the final grid along x, y, z.
+    /// Vertices of the first field's final grid along x, y, z.
     pub size: [usize; 3],
     /// Rays of this process.
     pub rays: u64,
@@ -47,6 +49,27 @@ pub struct TrainReport {
     pub color_samples: u64,
     /// Oddities on the way.
     pub warnings: Vec<String>,
+}
+
+impl TrainReport {
+    /// With what another field's training did.
+    pub(super) fn and(self, other: TrainReport) -> TrainReport {
+        let fields = self.fields + other.fields;
+        let mean = |a: f64, b: f64| (a * self.fields as f64 + b * other.fields as f64) / fields as f64;
+        TrainReport {
+            fields,
+            steps: self.steps,
+            seconds: self.seconds + other.seconds,
+            train_psnr: mean(self.train_psnr, other.train_psnr),
+            occupied: mean(self.occupied, other.occupied),
+            size: self.size,
+            rays: self.rays + other.rays,
+            lattice_samples: self.lattice_samples + other.lattice_samples,
+            density_samples: self.density_samples + other.density_samples,
+            color_samples: self.color_samples + other.color_samples,
+            warnings: [self.warnings, other.warnings].concat(),
+        }
+    }
 }
 
 /// Samples of this process.
@@ -74,11 +97,8 @@ struct Trainer<'a> {
     counts: Counts,
 }
 
-/// Trains until `config.steps`, saving checkpoints into `dir` and continuing from the one that lies there.
-///
-/// `stage` is `tface` or `baseline`, the table of the settings, for messages. `views` have their cameras in scene coordinates; `bounds`
-/// is the scene's tight box; `hull` the masks' visual hull over [-1, 1]³. `identity` names settings and
-/// inputs: a checkpoint of another identity is refused.
+/// Trains one field until `config.steps`, saving checkpoints into `dir` and continuing from the one that lies there;
+/// the rest is [`super::mean::train`]'s.
 pub fn train(
     stage: &'static str,
     views: &[TrainView],
@@ -174,6 +194,7 @@ pub fn train(
     checkpoint::finish(dir)?;
     let (state, counts) = (&trainer.state, trainer.counts);
     let report = TrainReport {
+        fields: 1,
         steps: config.steps,
         seconds: began.elapsed().as_secs_f64(),
         train_psnr: -10.0 * state.mean_square.max(1e-12).log10(),

@@ -1,0 +1,206 @@
+//! Several fields of one head, learned from different random numbers and seen as one.
+//!
+//! What a field makes up where photographs leave it free, in hair above all, is another thing in each training; the
+//! mean of a few is nearer to the truth than any of them (Lakshminarayanan, Pritzel, Blundell 2017, "Deep
+//! ensembles"). Two fields together are worth more than one of twice the rays or four times the steps.
+
+use super::train::{self, TrainReport};
+use super::{TFace, TfaceError, VmPixel};
+use crate::config::VmConfig;
+use crate::field::pixels::TrainView;
+use crate::geom::{Aabb, Ray};
+use crate::io;
+use crate::kernel::march::Bitmask;
+use crate::run::Monitor;
+use glam::Vec3;
+use std::path::{Path, PathBuf};
+
+/// The trained fields of a stage. Positions and distances are in scene units.
+pub struct MeanField {
+    fields: Vec<TFace>,
+}
+
+impl MeanField {
+    /// From the checkpoints in a stage folder.
+    pub fn load(dir: &Path, count: usize) -> Result<MeanField, TfaceError> {
+        let fields = (0..count.max(1)).map(|i| TFace::load(&folder(dir, i))).collect::<Result<_, _>>()?;
+        Ok(MeanField { fields })
+    }
+
+    /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
+    /// vector `forward`: mean colour (premultiplied, coded) and opacity; depth by opacity.
+    pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<VmPixel> {
+        let (first, others) = self.fields.split_first().expect("load reads at least one");
+        let mut seen = first.render(rays, forward);
+        if others.is_empty() {
+            return seen;
+        }
+        seen.iter_mut().for_each(|p| p.depth *= p.opacity);
+        for other in others {
+            for (sum, p) in seen.iter_mut().zip(other.render(rays, forward)) {
+                (0..3).for_each(|c| sum.color[c] += p.color[c]);
+                sum.opacity += p.opacity;
+                sum.depth += p.depth * p.opacity;
+            }
+        }
+        let share = 1.0 / self.fields.len() as f32;
+        for p in &mut seen {
+            p.depth = if p.opacity > 0.0 { p.depth / p.opacity } else { 0.0 };
+            p.color = p.color.map(|c| c * share);
+            p.opacity *= share;
+        }
+        seen
+    }
+}
+
+/// Where a field lies in its stage's folder: the first in the folder itself, the others in one each.
+fn folder(dir: &Path, i: usize) -> PathBuf {
+    if i == 0 { dir.to_owned() } else { dir.join(format!("field_{}", i + 1)) }
+}
+
+/// Trains `config.fields` fields one after the other, saving checkpoints into the stage folder `dir` and continuing
+/// from those that lie there.
+///
+/// `stage` is `tface` or `baseline`, the table of the settings, for messages. `views` have their cameras in scene
+/// coordinates; `bounds` is the scene's tight box; `hull` the masks' visual hull over [-1, 1]³. `identity` names
+/// settings and inputs: a checkpoint of another identity is refused.
+pub fn train(
+    stage: &'static str,
+    views: &[TrainView],
+    bounds: Aabb,
+    hull: Option<&Bitmask>,
+    config: &VmConfig,
+    seed: u64,
+    device: &str,
+    dir: &Path,
+    identity: &str,
+    monitor: &dyn Monitor,
+) -> Result<TrainReport, TfaceError> {
+    let mut whole: Option<TrainReport> = None;
+    for i in 0..config.fields.max(1) {
+        let folder = folder(dir, i);
+        let identity = if i == 0 { identity.to_owned() } else { format!("{identity} {}", i + 1) };
+        io::create_folder(&folder)?;
+        // far from the seeds that people count through
+        let seed = seed ^ (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        let part =
+            Part { monitor, before: i as u64 * config.steps, all: config.fields as u64 * config.steps };
+        let (_, report) =
+            train::train(stage, views, bounds, hull, config, seed, device, &folder, &identity, &part)?;
+        whole = Some(match whole {
+            None => report,
+            Some(sum) => sum.and(report),
+        });
+    }
+    Ok(whole.expect("at least one field"))
+}
+
+/// One field's share of the stage's steps.
+struct Part<'a> {
+    monitor: &'a dyn Monitor,
+    before: u64,
+    all: u64,
+}
+
+impl Monitor for Part<'_> {
+    fn step(&self, step: u64, _: u64, values: &[(&str, f64)]) {
+        self.monitor.step(self.before + step, self.all, values);
+    }
+
+    fn stop(&self) -> bool {
+        self.monitor.stop()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+    use crate::field::ball::{hull, views};
+    use crate::run::Quiet;
+    use std::sync::Mutex;
+
+    const BOX: Aabb = Aabb { min: Vec3::splat(-0.8), max: Vec3::splat(0.8) };
+
+    fn config(fields: usize) -> VmConfig {
+        VmConfig {
+            fields,
+            steps: 40,
+            rays: 256,
+            voxels_start: 1000,
+            voxels_final: 4096,
+            upsample_steps: vec![20],
+            mask_steps: vec![20],
+            ..VmConfig::tface(Preset::Draft)
+        }
+    }
+
+    /// Steps and their total as a person sees them.
+    #[derive(Default)]
+    struct Heard(Mutex<Vec<(u64, u64)>>);
+
+    impl Monitor for Heard {
+        fn step(&self, step: u64, steps: u64, _: &[(&str, f64)]) {
+            self.0.lock().unwrap().push((step, steps));
+        }
+
+        fn stop(&self) -> bool {
+            false
+        }
+    }
+
+    #[test]
+    fn two_fields_are_seen_as_their_mean_and_counted_as_one_training() {
+        let dir = tempfile::tempdir().unwrap();
+        let (views, hull, heard) = (views(), hull(), Heard::default());
+        let learn = |fields: usize, monitor: &dyn Monitor| {
+            let config = config(fields);
+            train("tface", &views, BOX, Some(&hull), &config, 3, "cpu", dir.path(), "ball", monitor).unwrap()
+        };
+        let report = learn(2, &heard);
+        let heard = heard.0.into_inner().unwrap();
+        assert_eq!(heard, (1..=80).map(|s| (s, 80)).collect::<Vec<_>>());
+        assert_eq!((report.fields, report.steps), (2, 40));
+        assert!(report.rays > 40 * 256 && report.train_psnr > 5.0);
+
+        let rays: Vec<Ray> = (0..64)
+            .map(|i| {
+                let at = |k: i32| 0.02 * k as f32 - 0.07;
+                let origin = Vec3::new(at(i % 8), at(i / 8), 3.0);
+                Ray { origin, direction: -Vec3::Z, t_min: 0.0, t_max: f32::INFINITY }
+            })
+            .collect();
+        let see = |fields: usize| MeanField::load(dir.path(), fields).unwrap().render(&rays, -Vec3::Z);
+        let second = TFace::load(&dir.path().join("field_2")).unwrap().render(&rays, -Vec3::Z);
+        let (one, both) = (see(1), see(2));
+        assert!(one != second);
+        for ((a, b), mean) in one.iter().zip(&second).zip(&both) {
+            for c in 0..3 {
+                assert!((mean.color[c] - 0.5 * (a.color[c] + b.color[c])).abs() < 1e-6);
+            }
+            assert!((mean.opacity - 0.5 * (a.opacity + b.opacity)).abs() < 1e-6);
+            let depth = (a.depth * a.opacity + b.depth * b.opacity) / (a.opacity + b.opacity).max(1e-9);
+            assert!((mean.depth - depth).abs() < 1e-4, "{mean:?} {depth}");
+        }
+        assert!(both.iter().any(|p| p.opacity > 0.5));
+
+        // nothing is learned twice, and the first field is that of a training of one
+        let bytes = |name: &str| std::fs::read(dir.path().join(name)).unwrap();
+        let before = bytes("field_2/checkpoint.safetensors");
+        assert_eq!(learn(2, &Quiet).rays, 0);
+        assert_eq!(bytes("field_2/checkpoint.safetensors"), before);
+        assert!(matches!(MeanField::load(dir.path(), 3), Err(TfaceError::Read(_))));
+    }
+
+    #[test]
+    fn a_field_in_another_ones_place_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let (views, hull) = (views(), hull());
+        let learn =
+            || train("tface", &views, BOX, Some(&hull), &config(2), 3, "cpu", dir.path(), "ball", &Quiet);
+        learn().unwrap();
+        let name = "checkpoint.safetensors";
+        std::fs::copy(dir.path().join(name), dir.path().join("field_2").join(name)).unwrap();
+        assert!(matches!(learn(), Err(TfaceError::Checkpoint { .. })));
+    }
+}
