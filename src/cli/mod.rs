@@ -174,7 +174,7 @@ from different sides. The other views follow from the cameras.")]
         #[command(flatten)]
         place: Place,
     },
-    /// Stage: learn the same field from whole photographs, to compare T-Face with
+    /// Stage: learn one such field from whole photographs, to compare T-Face with
     #[command(after_long_help = "Examples:
   tiface baseline captures/002_00
   tiface baseline runs/002_00                   go on after a stop

@@ -12,11 +12,12 @@ pub(super) const KEYS: &[Key] = &[
     ),
     Key::number(
         "fields",
-        "Fields learned one after the other from different random numbers; their mean is what is seen.",
+        "Fields learned one after the other from different random numbers; their mean is what is seen. Only one \
+         where import names a file.",
         1.0,
         16.0,
     ),
-    Key::number("steps", "Optimiser steps of each.", 1.0, 1e7),
+    Key::number("steps", "Optimiser steps of each field.", 1.0, 1e7),
     Key::number("rays", "Rays per step.", 1.0, 1_048_576.0),
     Key::word("masks", "What masks do to the photographs: none, binary (a little head is head) or soft."),
     Key::word(

@@ -37,6 +37,11 @@ pub struct Marched<'a> {
 }
 
 /// The losses of step `step`; random backgrounds come from `seed`.
+///
+/// # Shapes
+///
+/// `marched` holds `[rays]` pixels and `[n]` samples; the field is asked at `[n, 3]` and answers `[n, 8]` (distance,
+/// gradient, colour, softness); composited, that is `[rays, 8]`.
 pub fn losses(
     config: &IfaceConfig,
     model: &Model,

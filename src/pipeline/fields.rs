@@ -8,7 +8,7 @@ use crate::field::pixels::TrainView;
 use crate::iface::{self, IFace, IfaceError};
 use crate::io::Limits;
 use crate::run::{Done, Exit, Failure};
-use crate::tface::{self, MeanField, TfaceError};
+use crate::tface::{self, FieldMean, TfaceError};
 use rayon::prelude::*;
 use serde_json::json;
 use std::cell::OnceCell;
@@ -131,8 +131,8 @@ fn device_failure(e: impl std::error::Error + Send + Sync + 'static) -> Failure 
 pub struct Trained<'l> {
     line: &'l Line<'l>,
     iface: OnceCell<IFace>,
-    tface: OnceCell<MeanField>,
-    baseline: OnceCell<MeanField>,
+    tface: OnceCell<FieldMean>,
+    baseline: OnceCell<FieldMean>,
 }
 
 impl<'l> Trained<'l> {
@@ -158,7 +158,7 @@ impl Fields for Trained<'_> {
         let line = self.line;
         let load = || {
             let (folder, count) = (line.run.path(stage), line.vm(stage).learned());
-            MeanField::load(&folder, count).map_err(|e| line.tface_failure(stage, e))
+            FieldMean::load(&folder, count).map_err(|e| line.tface_failure(stage, e))
         };
         let cell = if stage == "baseline" { &self.baseline } else { &self.tface };
         once(cell, load).map(|f| f as &dyn Radiance)

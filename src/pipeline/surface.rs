@@ -83,7 +83,7 @@ impl Surface for crate::iface::IFace {
 }
 
 #[cfg(feature = "cpu")]
-impl Radiance for crate::tface::MeanField {
+impl Radiance for crate::tface::FieldMean {
     fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<Seen> {
         let seen = |p: crate::tface::VmPixel| Seen {
             color: p.color,

@@ -43,6 +43,16 @@ pub enum TfaceError {
         /// The mask's threshold.
         threshold: f64,
     },
+    /// The training of one field of several broke.
+    #[error("field {field} of {fields}: {source}")]
+    Field {
+        /// Which, from 1.
+        field: usize,
+        /// Of how many.
+        fields: usize,
+        /// How.
+        source: Box<TfaceError>,
+    },
     /// A stop was asked for. A checkpoint was saved, unless there was no step to save.
     #[error("stopped at step {step} of {steps}; repeat the command to continue")]
     Stopped {
@@ -74,6 +84,16 @@ pub enum TfaceError {
 }
 
 impl TfaceError {
+    /// The same, where `field` (from 1) of several fields broke and the error speaks of its steps.
+    pub(super) fn of_field(self, field: usize, fields: usize) -> TfaceError {
+        match self {
+            TfaceError::Diverged { .. } | TfaceError::Empty { .. } if fields > 1 => {
+                TfaceError::Field { field, fields, source: Box::new(self) }
+            }
+            other => other,
+        }
+    }
+
     /// The way out, if there is one to name; `stage` is `tface` or `baseline`.
     pub fn hint(&self, stage: &str) -> Option<String> {
         Some(match self {
@@ -88,6 +108,7 @@ impl TfaceError {
                 "look at the masks and poses with `tiface inspect`; lower {stage}.mask_threshold and {stage}.mask_weight"
             ),
             TfaceError::Checkpoint { .. } => format!("start the stage afresh with `--fresh {stage}`"),
+            TfaceError::Field { source, .. } => return source.hint(stage),
             TfaceError::Th(e) => e.hint(),
             TfaceError::Read(e) => e.hint(),
             TfaceError::Write(e) => e.hint(),

@@ -1,8 +1,6 @@
 //! A trained field, asked from outside.
 
-use super::state::{State, read};
 use super::{TfaceError, checkpoint};
-use crate::config::VmConfig;
 use crate::geom::Ray;
 use crate::kernel::vm::mask::VmRay;
 use crate::kernel::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
@@ -48,11 +46,6 @@ pub struct TFace {
 const PASS: usize = 1 << 13;
 
 impl TFace {
-    pub(super) fn new(config: &VmConfig, state: &State) -> TFace {
-        let field = state.field(config, false);
-        TFace::from_parts(field, read(&state.density), read(&state.color), read(&state.network), None)
-    }
-
     pub(super) fn from_parts(
         field: Arc<VmField>,
         density: Vec<f32>,

@@ -16,21 +16,21 @@ use glam::Vec3;
 use std::path::{Path, PathBuf};
 
 /// The trained fields of a stage. Positions and distances are in scene units.
-pub struct MeanField {
+pub struct FieldMean {
     fields: Vec<TFace>,
 }
 
-impl MeanField {
+impl FieldMean {
     /// From the checkpoints in a stage folder.
-    pub fn load(dir: &Path, count: usize) -> Result<MeanField, TfaceError> {
-        let fields = (0..count.max(1)).map(|i| TFace::load(&folder(dir, i))).collect::<Result<_, _>>()?;
-        Ok(MeanField { fields })
+    pub fn load(dir: &Path, count: usize) -> Result<FieldMean, TfaceError> {
+        let fields = (0..count).map(|i| TFace::load(&folder(dir, i))).collect::<Result<_, _>>()?;
+        Ok(FieldMean { fields })
     }
 
     /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
     /// vector `forward`: mean colour (premultiplied, coded) and opacity; depth by opacity.
     pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<VmPixel> {
-        let (first, others) = self.fields.split_first().expect("load reads at least one");
+        let Some((first, others)) = self.fields.split_first() else { return Vec::new() };
         let mut seen = first.render(rays, forward);
         if others.is_empty() {
             return seen;
@@ -76,35 +76,49 @@ pub fn train(
     identity: &str,
     monitor: &dyn Monitor,
 ) -> Result<TrainReport, TfaceError> {
+    let fields = config.learned();
+    let steps = fields as u64 * config.steps;
     let mut whole: Option<TrainReport> = None;
-    for i in 0..config.fields.max(1) {
+    for i in 0..fields {
+        let before = i as u64 * config.steps;
+        if monitor.stop() {
+            return Err(TfaceError::Stopped { step: before, steps });
+        }
         let folder = folder(dir, i);
         let identity = if i == 0 { identity.to_owned() } else { format!("{identity} {}", i + 1) };
         io::create_folder(&folder)?;
         // far from the seeds that people count through
         let seed = seed ^ (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        let part =
-            Part { monitor, before: i as u64 * config.steps, all: config.fields as u64 * config.steps };
-        let (_, report) =
-            train::train(stage, views, bounds, hull, config, seed, device, &folder, &identity, &part)?;
+        let part = Part { monitor, field: i + 1, fields, before };
+        let trained =
+            train::train(stage, views, bounds, hull, config, seed, device, &folder, &identity, &part);
+        let mut report = trained.map_err(|e| e.of_field(i + 1, fields))?;
+        if fields > 1 {
+            report.warnings.iter_mut().for_each(|w| *w = format!("field {} of {fields}: {w}", i + 1));
+        }
         whole = Some(match whole {
             None => report,
             Some(sum) => sum.and(report),
         });
     }
-    Ok(whole.expect("at least one field"))
+    Ok(whole.expect("at least one field is learned"))
 }
 
 /// One field's share of the stage's steps.
 struct Part<'a> {
     monitor: &'a dyn Monitor,
+    /// From 1.
+    field: usize,
+    fields: usize,
+    /// Steps of the fields before it.
     before: u64,
-    all: u64,
 }
 
 impl Monitor for Part<'_> {
-    fn step(&self, step: u64, _: u64, values: &[(&str, f64)]) {
-        self.monitor.step(self.before + step, self.all, values);
+    fn step(&self, step: u64, steps: u64, values: &[(&str, f64)]) {
+        let field = (self.fields > 1).then_some(("field", self.field as f64));
+        let values: Vec<_> = values.iter().copied().chain(field).collect();
+        self.monitor.step(self.before + step, self.fields as u64 * steps, &values);
     }
 
     fn stop(&self) -> bool {
@@ -116,15 +130,15 @@ impl Monitor for Part<'_> {
 mod tests {
     use super::*;
     use crate::config::Preset;
-    use crate::field::ball::{hull, views};
+    use crate::field::ball::{StopAfter, hull, temporary, views};
     use crate::run::Quiet;
     use std::sync::Mutex;
 
     const BOX: Aabb = Aabb { min: Vec3::splat(-0.8), max: Vec3::splat(0.8) };
 
-    fn config(fields: usize) -> VmConfig {
+    fn config() -> VmConfig {
         VmConfig {
-            fields,
+            fields: 2,
             steps: 40,
             rays: 256,
             voxels_start: 1000,
@@ -151,13 +165,12 @@ mod tests {
 
     #[test]
     fn two_fields_are_seen_as_their_mean_and_counted_as_one_training() {
-        let dir = tempfile::tempdir().unwrap();
+        let dir = temporary();
         let (views, hull, heard) = (views(), hull(), Heard::default());
-        let learn = |fields: usize, monitor: &dyn Monitor| {
-            let config = config(fields);
-            train("tface", &views, BOX, Some(&hull), &config, 3, "cpu", dir.path(), "ball", monitor).unwrap()
+        let learn = |dir: &Path, monitor: &dyn Monitor| {
+            train("tface", &views, BOX, Some(&hull), &config(), 3, "cpu", dir, "ball", monitor)
         };
-        let report = learn(2, &heard);
+        let report = learn(dir.path(), &heard).unwrap();
         let heard = heard.0.into_inner().unwrap();
         assert_eq!(heard, (1..=80).map(|s| (s, 80)).collect::<Vec<_>>());
         assert_eq!((report.fields, report.steps), (2, 40));
@@ -170,7 +183,7 @@ mod tests {
                 Ray { origin, direction: -Vec3::Z, t_min: 0.0, t_max: f32::INFINITY }
             })
             .collect();
-        let see = |fields: usize| MeanField::load(dir.path(), fields).unwrap().render(&rays, -Vec3::Z);
+        let see = |fields: usize| FieldMean::load(dir.path(), fields).unwrap().render(&rays, -Vec3::Z);
         let second = TFace::load(&dir.path().join("field_2")).unwrap().render(&rays, -Vec3::Z);
         let (one, both) = (see(1), see(2));
         assert!(one != second);
@@ -184,20 +197,30 @@ mod tests {
         }
         assert!(both.iter().any(|p| p.opacity > 0.5));
 
-        // nothing is learned twice, and the first field is that of a training of one
-        let bytes = |name: &str| std::fs::read(dir.path().join(name)).unwrap();
-        let before = bytes("field_2/checkpoint.safetensors");
-        assert_eq!(learn(2, &Quiet).rays, 0);
-        assert_eq!(bytes("field_2/checkpoint.safetensors"), before);
-        assert!(matches!(MeanField::load(dir.path(), 3), Err(TfaceError::Read(_))));
+        // nothing is learned twice
+        let files = ["checkpoint.safetensors", "field_2/checkpoint.safetensors"];
+        let bytes = |dir: &Path| files.map(|f| std::fs::read(dir.join(f)).unwrap());
+        assert_eq!(learn(dir.path(), &Quiet).unwrap().rays, 0);
+        assert!(matches!(FieldMean::load(dir.path(), 3), Err(TfaceError::Read(_))));
+
+        // stopped in the second field, it goes on there
+        let again = temporary();
+        let end = learn(again.path(), &StopAfter::new(50));
+        assert!(matches!(end, Err(TfaceError::Stopped { .. })));
+        let rest = Heard::default();
+        learn(again.path(), &rest).unwrap();
+        let rest = rest.0.into_inner().unwrap();
+        assert_eq!((rest[0], rest.last()), ((40, 80), Some(&(80, 80))));
+        assert!(rest.len() <= 32, "{rest:?}");
+        assert_eq!(bytes(again.path()), bytes(dir.path()));
     }
 
     #[test]
     fn a_field_in_another_ones_place_is_refused() {
-        let dir = tempfile::tempdir().unwrap();
+        let dir = temporary();
         let (views, hull) = (views(), hull());
         let learn =
-            || train("tface", &views, BOX, Some(&hull), &config(2), 3, "cpu", dir.path(), "ball", &Quiet);
+            || train("tface", &views, BOX, Some(&hull), &config(), 3, "cpu", dir.path(), "ball", &Quiet);
         learn().unwrap();
         let name = "checkpoint.safetensors";
         std::fs::copy(dir.path().join(name), dir.path().join("field_2").join(name)).unwrap();

@@ -29,6 +29,6 @@ pub use exchange::{export_th, import_th};
 #[cfg(feature = "cpu")]
 pub use infer::{TFace, VmPixel};
 #[cfg(feature = "cpu")]
-pub use mean::{MeanField, train};
+pub use mean::{FieldMean, train};
 #[cfg(feature = "cpu")]
 pub use train::TrainReport;

@@ -1,9 +1,9 @@
 //! The training loop of the stages `baseline` and `tface`.
 
+use super::TfaceError;
 use super::checkpoint;
 use super::grow::{update_mask, upsample};
 use super::state::State;
-use super::{TFace, TfaceError};
 use crate::config::{MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 use crate::field;
 use crate::field::ops::{self, GridPenalty, VmBatch};
@@ -29,7 +29,7 @@ use std::time::{Duration, Instant};
 pub struct TrainReport {
     /// Fields learned.
     pub fields: usize,
-    /// Optimiser steps of each.
+    /// Optimiser steps of each field.
     pub steps: u64,
     /// Seconds in this process (less than the whole when resumed).
     pub seconds: f64,
@@ -97,8 +97,8 @@ struct Trainer<'a> {
     counts: Counts,
 }
 
-/// Trains one field until `config.steps`, saving checkpoints into `dir` and continuing from the one that lies there;
-/// the rest is [`super::mean::train`]'s.
+/// Trains one field until `config.steps`, saving checkpoints into its own folder `dir` and continuing from the one
+/// that lies there; a finished one is left as it is. Arguments as in [`super::mean::train`].
 pub fn train(
     stage: &'static str,
     views: &[TrainView],
@@ -110,10 +110,18 @@ pub fn train(
     dir: &Path,
     identity: &str,
     monitor: &dyn Monitor,
-) -> Result<(TFace, TrainReport), TfaceError> {
+) -> Result<TrainReport, TfaceError> {
     let device = field::device(device)?;
     let began = Instant::now();
     check(stage, config)?;
+    let restored = checkpoint::restore(dir, config, identity, &device)?;
+    if let Some((state, warnings)) = &restored
+        && state.step == config.steps
+    {
+        checkpoint::finish(dir)?;
+        monitor.step(config.steps, config.steps, &[]);
+        return Ok(report(config, state, Counts::default(), began, warnings.clone()));
+    }
     let views = masked_as_configured(views, config.masks);
     let hull = hull.filter(|_| config.start == VmStart::Hull && config.masks != MaskUse::None);
     // rays that meet the hull, grown by the cells around it
@@ -125,7 +133,7 @@ pub fn train(
     let mut warnings = Vec::new();
     let bounds = [bounds.min.to_array(), bounds.max.to_array()];
     let fresh = || State::new(config, seed, bounds, hull, &device);
-    let state = match checkpoint::restore(dir, config, identity, &device)? {
+    let state = match restored {
         Some((state, notes)) => {
             warnings.extend(notes);
             state
@@ -192,8 +200,17 @@ pub fn train(
     }
     checkpoint::save(dir, &trainer.state, config, identity, true)?;
     checkpoint::finish(dir)?;
-    let (state, counts) = (&trainer.state, trainer.counts);
-    let report = TrainReport {
+    Ok(report(config, &trainer.state, trainer.counts, began, warnings))
+}
+
+fn report(
+    config: &VmConfig,
+    state: &State,
+    counts: Counts,
+    began: Instant,
+    warnings: Vec<String>,
+) -> TrainReport {
+    TrainReport {
         fields: 1,
         steps: config.steps,
         seconds: began.elapsed().as_secs_f64(),
@@ -205,8 +222,7 @@ pub fn train(
         density_samples: counts.density,
         color_samples: counts.color,
         warnings,
-    };
-    Ok((TFace::new(config, &trainer.state), report))
+    }
 }
 
 /// What ranges of single keys cannot say.

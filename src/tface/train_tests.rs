@@ -5,6 +5,7 @@ use crate::config::{Ablation, DensityActivation, Preset};
 use crate::field::ball::{BALL, StopAfter, hull, temporary, views};
 use crate::kernel::vm::size_for;
 use crate::run::Quiet;
+use crate::tface::TFace;
 use glam::{Vec2, Vec3};
 
 const BOX: Aabb = Aabb { min: Vec3::splat(-0.8), max: Vec3::splat(0.8) };
@@ -24,14 +25,15 @@ fn config() -> VmConfig {
     }
 }
 
-fn run(config: &VmConfig, dir: &Path, monitor: &dyn Monitor) -> Result<(TFace, TrainReport), TfaceError> {
+fn run(config: &VmConfig, dir: &Path, monitor: &dyn Monitor) -> Result<TrainReport, TfaceError> {
     train("tface", &views(), BOX, Some(&hull()), config, 3, "cpu", dir, "ball", monitor)
 }
 
 #[test]
 fn a_ball_is_learned_from_eight_views() {
     let dir = temporary();
-    let (face, report) = run(&config(), dir.path(), &Quiet).unwrap();
+    let report = run(&config(), dir.path(), &Quiet).unwrap();
+    let face = TFace::load(dir.path()).unwrap();
     assert!(report.train_psnr > 20.0, "{report:?}");
     // colour is asked of a part of the densities, and those of a part of the lattice
     assert!(report.color_samples < report.density_samples && report.density_samples < report.lattice_samples);
@@ -47,9 +49,6 @@ fn a_ball_is_learned_from_eight_views() {
     // nothing beside it
     let beside = face.render(&[camera.ray(Vec2::new(2.0, 20.0)).unwrap()], camera.forward())[0];
     assert!(beside.opacity < 0.05, "{beside:?}");
-    // the same field comes back from its checkpoint
-    let loaded = TFace::load(dir.path()).unwrap();
-    assert_eq!(loaded.render(&[ray], camera.forward())[0], seen);
 }
 
 #[test]
@@ -97,7 +96,7 @@ fn every_row_of_the_ablation_and_both_activations_train() {
                 density_shift: -1.0,
                 ..config().with(row)
             };
-            let (_, report) = run(&config, dir.path(), &Quiet).unwrap();
+            let report = run(&config, dir.path(), &Quiet).unwrap();
             assert!(report.train_psnr > 1.0, "{row:?} {background:?} {report:?}");
         }
     }

@@ -2,7 +2,7 @@
 //!
 //! Filtering and mip maps read beyond a chart's border. The nearest `gutter` texels repeat the chart's own
 //! (nearest covered texel), all else is filled by pull and push over a pyramid (Gortler et al. 1996), so that
-//! every mip level of every chart sees its own colours.
+//! every mip level of every chart sees its own colours. ([`super::Seams`] then moves the texels next to a seam a little.)
 
 use crate::image::Image;
 

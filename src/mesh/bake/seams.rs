@@ -10,13 +10,14 @@ use crate::image::{Image, Photo};
 use glam::Vec2;
 use std::collections::HashMap;
 
-/// What a texel's change costs beside a difference along one texel of a seam.
+/// What a texel's change costs beside a difference along one texel of a seam: little enough that what is left of a
+/// step is below the rounding to bytes, enough that a texel which hardly matters to a seam keeps its colour.
 const STIFFNESS: f64 = 0.02;
 
-/// Points along each texel of a seam at which its sides are held together.
+/// Points along each texel of a seam at which its sides are held together: each texel is looked at.
 const DENSITY: f32 = 2.0;
 
-/// Rounds of conjugate gradients; each texel of a seam hangs on a dozen others, so errors fade in a few.
+/// Most rounds of conjugate gradients; each texel of a seam hangs on a dozen others only, so errors fade fast.
 const ROUNDS: usize = 60;
 
 /// Points looked at along each edge of a seam by [`Seams::step`].
@@ -34,7 +35,7 @@ pub struct Seams {
 type Taps = [(u32, f32); 4];
 
 impl Seams {
-    /// Finds the seams of a closed or open mesh, edge by edge in the order of its triangles.
+    /// Finds the seams of a manifold mesh, closed or open, edge by edge in the order of its triangles.
     pub fn new(mesh: &Mesh, atlas: &Atlas) -> Seams {
         // each directed edge of a triangle, with its texture coordinates
         let mut sides: HashMap<(u32, u32), (Vec2, Vec2)> = HashMap::with_capacity(3 * mesh.triangles.len());
@@ -84,7 +85,12 @@ impl Seams {
     }
 
     /// Changes the texels around the seams of a picture with 3 channels, so that both sides agree in the
-    /// values that `code` makes of them; `decode` goes back. Texels between charts must be filled already.
+    /// values that `code` makes of them; `decode` goes back. Texels between charts must be filled already: a seam is
+    /// drawn from the first of them, too.
+    ///
+    /// # Panics
+    ///
+    /// Where the picture has not the atlas's size and 3 channels.
     pub fn even(&self, image: &mut Image, code: impl Fn(f32) -> f32, decode: impl Fn(f32) -> f32) {
         assert_eq!((image.width, image.height, image.channels), (self.width, self.height, 3));
         let (texels, rows) = self.system();
@@ -211,6 +217,7 @@ mod tests {
         };
         assert_eq!(Seams::new(&mesh, &joined).step(&photo), 0.0);
     }
+
     /// Two triangles over a common edge, laid apart and turned, on a picture of stripes.
     fn striped() -> (Mesh, Atlas, Image) {
         let mesh = Mesh {
@@ -274,6 +281,7 @@ mod tests {
         assert_eq!(image, before);
         // and no seam at all is no system
         let joined = Atlas { triangles: vec![[0, 1, 2], [1, 0, 5]], ..atlas };
+        assert!(Seams::new(&mesh, &joined).system().1.is_empty());
         Seams::new(&mesh, &joined).even(&mut image, |v| v, |v| v);
         assert_eq!(image, before);
     }
