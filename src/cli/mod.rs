@@ -282,7 +282,10 @@ With --fit or --correct, some training views must be set aside before anything i
     #[command(after_long_help = "Examples:
   tiface export runs/002_00 --out tface.th      what the published TensoRF and T-Face code reads
   tiface export runs/002_00 --with baseline --out baseline.th
-  tiface tface captures/002_00 --set tface.import=official.th    the other way")]
+  tiface tface captures/002_00 --set tface.import=official.th    the other way
+
+A file holds one field: of several, it is the first. For the best one field, learn it alone:
+  tiface tface captures/002_00 --set tface.fields=1 --set tface.rays=16384")]
     Export {
         #[command(flatten)]
         place: Place,

@@ -1,5 +1,5 @@
 //! `[baseline]` and `[tface]`: TensoRF's vector-matrix radiance field and its training. Both stages are the
-//! same code; they differ in what masks do.
+//! same code; they differ in what masks do, and T-Face may be the mean of several fields.
 
 use super::Preset;
 use super::iface::Foreground;
