@@ -206,10 +206,12 @@ fn progress(step: u64, steps: u64, rate: Option<f64>, eta_s: Option<f64>, values
     text
 }
 
-/// Four significant digits.
+/// Four significant digits; counts as they are.
 pub(super) fn figure(value: f64) -> String {
     let size = value.abs();
-    if size != 0.0 && size < 1e-3 {
+    if value.fract() == 0.0 {
+        format!("{value:.0}")
+    } else if size < 1e-3 {
         format!("{value:.2e}")
     } else if size < 10.0 {
         format!("{value:.3}")
@@ -242,7 +244,8 @@ mod tests {
             [8.24, 59.6, 145.0, 11_220.0].map(duration),
             ["8.2 s", "1 min 00 s", "2 min 25 s", "3 h 07 min"]
         );
-        assert_eq!([0.000123, 0.5, 27.31, 41234.0].map(figure), ["1.23e-4", "0.500", "27.3", "41234"]);
+        let figures = [0.000123, 0.5, 27.31, 41234.4, 2.0, 0.0].map(figure);
+        assert_eq!(figures, ["1.23e-4", "0.500", "27.3", "41234", "2", "0"]);
         let line = progress(1200, 3000, Some(12.4), Some(145.0), &[("psnr", 27.31)]);
         assert_eq!(line, "1200/3000  12.4/s  2 min 25 s left  psnr 27.3");
     }
