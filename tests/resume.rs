@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 
 /// Small enough for seconds, large enough that every stage can be hit.
-const SETTINGS: [&str; 30] = [
+const SETTINGS: [&str; 31] = [
     "iface.steps=150",
     "iface.rays=256",
     "iface.max_rays=512",
@@ -33,6 +33,7 @@ const SETTINGS: [&str; 30] = [
     "baseline.mask_steps=",
     "baseline.checkpoint_s=0.1",
     "mesh.resolution=64",
+    "mesh.texture_px=256",
     "mesh.format=glb,obj",
     "render.samples=1",
     "render.method=baseline,tface,volume,raycast",
