@@ -63,7 +63,7 @@ use std::path::Path;
 pub const STAGES: &[&str] = &["mask", "baseline", "tface", "iface", "mesh", "render", "ensemble", "metrics"];
 
 /// Raised when the meaning of a stage's files changes.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
 /// Why the line stopped.
 #[derive(Debug, thiserror::Error)]
@@ -175,9 +175,9 @@ impl<'a> Line<'a> {
             file => of_file(file)?,
         };
         let mut imports = Vec::new();
-        for (stage, table) in [("baseline", &config.baseline), ("tface", &config.tface)] {
-            if !table.import.is_empty() {
-                imports.push((stage, of_file(&table.import)?));
+        for (stage, file) in [("baseline", &config.baseline.import), ("tface", &config.tface.import)] {
+            if !file.is_empty() {
+                imports.push((stage, of_file(file)?));
             }
         }
         for warning in &capture.warnings {

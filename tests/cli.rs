@@ -85,7 +85,7 @@ fn a_dry_run_names_only_the_stages_a_command_needs() {
         out(&o).lines().map(first).collect::<Vec<_>>().join(" ")
     };
     assert_eq!(stages(&["baseline"]), "mask baseline");
-    assert_eq!(stages(&["tface", "--ablation", "mask-ce"]), "mask tface");
+    assert_eq!(stages(&["tface", "--set", "tface.mask_loss=ce"]), "mask tface");
     assert_eq!(stages(&["mesh"]), "mask iface mesh");
     assert_eq!(stages(&["render", "--with", "tface"]), "mask tface render");
     assert_eq!(stages(&["render", "--with", "iface"]), "mask iface render");
@@ -108,9 +108,6 @@ fn a_blend_that_cannot_be_made_is_refused_before_anything_is_learned() {
     let o = tiface(dir.path(), &["run", "head", "--set", "render.method=volume"]);
     assert_eq!(code(&o), 2);
     assert!(err(&o).contains("names baseline, which render.method does not make"), "{}", err(&o));
-    let o = tiface(dir.path(), &["tface", "head", "--ablation", "mask-hard"]);
-    assert_eq!(code(&o), 2);
-    assert!(err(&o).contains("`--ablation mask-hard`") && err(&o).contains("`mask-l2`"), "{}", err(&o));
     let o = tiface(dir.path(), &["export", "head"]);
     assert_eq!(code(&o), 2);
     assert!(err(&o).contains("--out model.th"), "{}", err(&o));

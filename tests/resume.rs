@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 
 /// Small enough for seconds, large enough that every stage can be hit.
-const SETTINGS: [&str; 31] = [
+const SETTINGS: [&str; 26] = [
     "iface.steps=150",
     "iface.rays=256",
     "iface.max_rays=512",
@@ -27,11 +27,6 @@ const SETTINGS: [&str; 31] = [
     "tface.checkpoint_s=0.1",
     "baseline.steps=30",
     "baseline.rays=256",
-    "baseline.voxels_start=4096",
-    "baseline.voxels_final=4096",
-    "baseline.upsample_steps=",
-    "baseline.mask_steps=",
-    "baseline.checkpoint_s=0.1",
     "mesh.resolution=64",
     "mesh.texture_px=256",
     "mesh.format=glb,obj",

@@ -167,7 +167,7 @@ from different sides. The other views follow from the cameras.")]
     #[command(after_long_help = "Examples:
   tiface tface captures/002_00
   tiface tface runs/002_00                      go on after a stop
-  tiface tface captures/002_00 --run runs/ce --ablation mask-ce
+  tiface tface captures/002_00 --run runs/ce --set tface.mask_loss=ce
   tiface tface captures/002_00 --set tface.fields=3    the mean of three fields
   tiface tface captures/002_00 --set tface.import=official.th")]
     Tface {

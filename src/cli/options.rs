@@ -37,10 +37,6 @@ pub(super) struct Common {
     /// Starting values
     #[arg(long, global = true, value_enum, env = "TIFACE_PRESET", hide_env = true)]
     pub preset: Option<PresetName>,
-    /// Row of the paper's ablation that tface's masks start from: baseline, mask-binary, mask-soft,
-    /// mask-ce or mask-l2
-    #[arg(long, global = true, value_name = "ROW", env = "TIFACE_ABLATION", hide_env = true)]
-    pub ablation: Option<String>,
     /// Set a key of the configuration; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
@@ -127,11 +123,10 @@ impl Common {
         }
         // another preset starts over: the values a run remembers would all win against it
         let saved = saved.filter(|_| self.preset.is_none());
-        let remembered = saved.map(|_| files.len());
         files.extend(saved.map(Path::to_path_buf));
         files.extend(self.config.iter().cloned());
         let nothing_names_one = files.is_empty() && !self.set.iter().any(|s| s.starts_with("preset"));
-        let mut sources = Sources { set: self.set.clone(), remembered, ..Sources::default() };
+        let mut sources = Sources { set: self.set.clone(), ..Sources::default() };
         if let Some((preset, text)) = fallback.filter(|_| nothing_names_one && self.preset.is_none()) {
             sources.preset = Some(preset);
             sources.files.push(("built in".into(), text.into()));
@@ -146,9 +141,6 @@ impl Common {
             let text = String::from_utf8(bytes)
                 .map_err(|_| Ending::usage(format!("`{name}` is not UTF-8"), "save it as UTF-8"))?;
             sources.files.push((name, text));
-        }
-        if let Some(row) = &self.ablation {
-            sources.options.push((format!("--ablation {row}"), "ablation".into(), row.clone()));
         }
         if let Some(device) = &self.device {
             sources.options.push((format!("--device {device}"), "device".into(), device.clone()));

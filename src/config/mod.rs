@@ -4,13 +4,14 @@
 //! the wrong type or out of range is an error that names the line, the key and the way out. The
 //! complete result ([`Config::to_toml`]) passed back as a file gives the same configuration.
 //!
-//! Each stage owns its table: a serde struct with `fn preset(Preset) -> Self` and one constant list
-//! of [`Key`]s with documentation and ranges. Everything here works on what serde says about them.
+//! Each stage owns its table, declared by `table!`: a key, its documentation, range and the values of the presets
+//! stand once, on its field. Everything here works on what serde says about them. What no user has a reason to
+//! change is no key but a constant of the preset, in the same place.
 
+mod baseline;
 mod capture;
 mod ensemble;
 pub mod iface;
-mod iface_keys;
 mod mask;
 mod mesh;
 mod metrics;
@@ -18,9 +19,10 @@ mod render;
 mod source;
 #[cfg(test)]
 mod source_tests;
+mod table;
 mod vm;
-mod vm_keys;
 
+pub use baseline::BaselineConfig;
 pub use capture::CaptureConfig;
 pub use ensemble::{Correct, EnsembleConfig, Fit};
 pub use iface::IfaceConfig;
@@ -29,7 +31,7 @@ pub use mesh::{MeshConfig, MeshFormat, MeshFrame, TextureFormat, TextureView};
 pub use metrics::MetricsConfig;
 pub use render::{Background, Method, PictureFormat, RenderConfig};
 pub use source::{ConfigError, Place, Sources};
-pub use vm::{Ablation, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
+pub use vm::{DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -84,6 +86,17 @@ pub enum Preset {
     Paper,
 }
 
+impl Preset {
+    /// Its word in the configuration.
+    pub fn name(self) -> &'static str {
+        match self {
+            Preset::Draft => "draft",
+            Preset::Standard => "standard",
+            Preset::Paper => "paper",
+        }
+    }
+}
+
 /// The whole configuration, complete and valid.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -94,14 +107,12 @@ pub struct Config {
     pub seed: u64,
     /// `auto`, `cpu`, `wgpu:N` or `cuda:N`.
     pub device: String,
-    /// The row of the paper's ablation that `tface` started from; empty for the preset's own.
-    pub ablation: String,
     /// What was photographed.
     pub capture: CaptureConfig,
     /// Which pixels are the head.
     pub mask: MaskConfig,
     /// The radiance field without masks that T-Face is compared with.
-    pub baseline: VmConfig,
+    pub baseline: BaselineConfig,
     /// T-Face.
     pub tface: VmConfig,
     /// The learned signed-distance field.
@@ -128,11 +139,6 @@ const ROOT_KEYS: &[Key] = &[
         i64::MAX as f64,
     ),
     Key::word("device", "Where fields are learned: auto, cpu, wgpu:N or cuda:N."),
-    Key::word(
-        "ablation",
-        "Row of the paper's ablation that the masks of tface start from: baseline (none), mask-binary, mask-soft, \
-         mask-ce, mask-l2; empty for the preset's.",
-    ),
 ];
 
 /// Every table with its keys, in the order of the line; the first has no name.
@@ -140,9 +146,9 @@ const TABLES: &[(&str, &[Key])] = &[
     ("", ROOT_KEYS),
     ("capture", capture::KEYS),
     ("mask", mask::KEYS),
-    ("baseline", vm_keys::KEYS),
-    ("tface", vm_keys::KEYS),
-    ("iface", iface_keys::KEYS),
+    ("baseline", baseline::KEYS),
+    ("tface", vm::KEYS),
+    ("iface", iface::KEYS),
     ("mesh", mesh::KEYS),
     ("render", render::KEYS),
     ("ensemble", ensemble::KEYS),
@@ -165,16 +171,24 @@ impl Config {
             preset,
             seed: 42,
             device: "auto".into(),
-            ablation: String::new(),
             capture: CaptureConfig::preset(preset),
             mask: MaskConfig::preset(preset),
-            baseline: VmConfig::baseline(preset),
-            tface: VmConfig::tface(preset),
+            baseline: BaselineConfig::preset(preset),
+            tface: VmConfig::preset(preset),
             iface: IfaceConfig::preset(preset),
             mesh: MeshConfig::preset(preset),
             render: RenderConfig::preset(preset),
             ensemble: EnsembleConfig::preset(preset),
             metrics: MetricsConfig::preset(preset),
+        }
+    }
+
+    /// With the constants of its preset, which are not read from text.
+    fn keep_constants(self) -> Config {
+        Config {
+            tface: self.tface.keep_constants(self.preset),
+            iface: self.iface.keep_constants(self.preset),
+            ..self
         }
     }
 

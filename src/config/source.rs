@@ -1,6 +1,6 @@
 //! From files and `--set` to a [`Config`]: which value wins, and what is wrong with one.
 
-use super::{Ablation, Config, Key, Preset, all_keys, lookup, show};
+use super::{Config, Key, Preset, all_keys, lookup, show};
 use serde::Deserialize;
 use std::fmt;
 use toml::de::{DeTable, DeValue};
@@ -13,9 +13,6 @@ pub struct Sources {
     pub preset: Option<Preset>,
     /// Configuration files: name for messages, text.
     pub files: Vec<(String, String)>,
-    /// Which of the files is what a run remembers: a row of the ablation that is named elsewhere beats
-    /// what this one says of the keys it decides.
-    pub remembered: Option<usize>,
     /// `--set`: each `key=value`.
     pub set: Vec<String>,
     /// Options with a name of their own: as typed, the key they set, its value. Strongest.
@@ -136,13 +133,8 @@ type Assignment = (String, Given, Place);
 
 pub(super) fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
     let mut given: Vec<Assignment> = Vec::new();
-    let mut remembered = 0..0;
-    for (i, (name, text)) in sources.files.iter().enumerate() {
-        let before = given.len();
+    for (name, text) in &sources.files {
         read_file(name, text, &mut given)?;
-        if sources.remembered == Some(i) {
-            remembered = before..given.len();
-        }
     }
     for set in &sources.set {
         let place = Place::Option(format!("--set {set}"));
@@ -156,37 +148,20 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
     }
 
     // the preset comes first whatever line it stands on; what it means is checked by `assign` below
-    let word = |key: &str| {
-        let at = given.iter().rposition(|(k, ..)| k == key)?;
-        let word = match &given[at].1 {
-            Given::Toml(v) => v.as_str()?.to_owned(),
-            Given::Text(t) => t.trim_matches('"').to_owned(),
+    let named = given.iter().rfind(|(key, ..)| key == "preset").and_then(|(_, value, _)| {
+        let word = match value {
+            Given::Toml(value) => value.as_str()?,
+            Given::Text(text) => text.trim_matches('"'),
         };
-        Some((at, Value::String(word)))
-    };
-    let named = word("preset").and_then(|(_, word)| Preset::deserialize(word).ok());
+        Preset::deserialize(Value::String(word.into())).ok()
+    });
     let preset = sources.preset.or(named).unwrap_or_default();
     let mut config = Config::preset(preset);
-    // as does the row of the ablation, right after it
-    let mut decided = false;
-    if let Some((at, word)) = word("ablation") {
-        config.tface = match Ablation::deserialize(word) {
-            Ok(row) => config.tface.with(row),
-            Err(_) => config.tface,
-        };
-        decided = !remembered.contains(&at);
-    }
-    for (i, (key, value, place)) in given.into_iter().enumerate() {
-        if decided && remembered.contains(&i) && ABLATED.contains(&key.as_str()) {
-            continue;
-        }
+    for (key, value, place) in given {
         config = assign(&config, &key, value, place)?;
     }
-    Ok(Config { preset, ..config })
+    Ok(Config { preset, ..config }.keep_constants())
 }
-
-/// What a row of the ablation decides.
-const ABLATED: [&str; 2] = ["tface.masks", "tface.mask_loss"];
 
 fn read_file(name: &str, text: &str, given: &mut Vec<Assignment>) -> Result<(), ConfigError> {
     let text = text.strip_prefix('\u{FEFF}').unwrap_or(text);
@@ -261,14 +236,6 @@ fn assign(config: &Config, key: &str, given: Given, place: Place) -> Result<Conf
     {
         let problem = format!("unknown device `{word}`, expected auto, cpu, wgpu:N or cuda:N");
         return Err(ConfigError::Word { place, key: key.into(), problem });
-    }
-    if key == "ablation"
-        && let Some(word) = value.as_str().filter(|w| !w.is_empty())
-    {
-        Ablation::deserialize(Value::String(word.into())).map_err(|e| {
-            let problem = e.message().lines().next().unwrap_or_default().to_string();
-            ConfigError::Word { place: place.clone(), key: key.into(), problem }
-        })?;
     }
     put(&mut root, key, value);
     Config::deserialize(Value::Table(root)).map_err(|e| {
@@ -358,39 +325,11 @@ fn nearest(key: &str) -> Option<String> {
     let last = |name: &str| name.rsplit('.').next().unwrap_or_default().to_string();
     all_keys()
         .map(|(name, _)| {
-            let whole = edit_distance(key, &name);
-            let word = edit_distance(&last(key), &last(&name)) + usize::from(!name.ends_with(key));
+            let whole = strsim::levenshtein(key, &name);
+            let word = strsim::levenshtein(&last(key), &last(&name)) + usize::from(!name.ends_with(key));
             (whole.min(word), name)
         })
         .min()
         .filter(|(distance, _)| *distance <= 2 + key.len() / 4)
         .map(|(_, name)| name)
-}
-
-/// Letters to insert, remove or change to make `a` into `b` (Levenshtein 1966).
-fn edit_distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.chars().enumerate() {
-        let mut corner = row[0];
-        row[0] = i + 1;
-        for (j, y) in b.iter().enumerate() {
-            let change = corner + usize::from(x != *y);
-            corner = row[j + 1];
-            row[j + 1] = change.min(corner + 1).min(row[j] + 1);
-        }
-    }
-    row[b.len()]
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn edit_distance_counts_letters() {
-        assert_eq!(edit_distance("kitten", "sitting"), 3); // the textbook pair
-        assert_eq!(edit_distance("", "abc"), 3);
-        assert_eq!(edit_distance("step", "steps"), 1);
-    }
 }

@@ -79,27 +79,27 @@ fn set_needs_neither_quotes_nor_brackets() {
 }
 
 #[test]
-fn a_row_of_the_ablation_comes_after_the_preset_and_before_files_and_set() {
+fn constants_of_a_preset_are_no_keys_and_come_with_it() {
+    let paper = Config::preset(Preset::Paper);
+    let text = paper.to_toml();
+    assert!(!text.contains("lr_grid") && !text.contains("step_ratio"), "{text}");
+    let back = from(&text, &["tface.steps=7"]).unwrap();
+    // 0.5 as published, 1.0 in the other presets
+    assert_eq!((back.tface.steps, back.tface.step_ratio, back.iface.radius), (7, 0.5, 0.3));
+    assert!(matches!(from("", &["tface.step_ratio=1"]), Err(ConfigError::Unknown { .. })));
+}
+
+#[test]
+fn the_baseline_is_tface_without_masks() {
     use crate::config::{MaskLoss, MaskUse};
-    let masks = |c: &Config| (c.tface.masks, c.tface.mask_loss);
-    let c = from("", &["ablation=mask-ce"]).unwrap();
-    assert_eq!(masks(&c), (MaskUse::Soft, MaskLoss::Ce));
-    assert_eq!(c.baseline, Config::preset(Preset::Standard).baseline); // tface's alone
-    let c = from("tface.mask_loss = \"none\"", &["ablation=mask-ce"]).unwrap();
-    assert_eq!(masks(&c), (MaskUse::Soft, MaskLoss::None));
-    // what a run remembers is complete, and would win against any other row
-    let saved = from("", &["ablation=mask-binary"]).unwrap().to_toml();
-    let again = |set: &[&str]| {
-        let set = set.iter().map(|s| s.to_string()).collect();
-        let files = vec![("saved".into(), saved.clone())];
-        Config::resolve(&Sources { files, set, remembered: Some(0), ..Sources::default() }).unwrap()
-    };
-    assert_eq!(masks(&again(&[])), (MaskUse::Binary, MaskLoss::None));
-    assert_eq!(masks(&again(&["ablation=mask-l2"])), (MaskUse::Soft, MaskLoss::L2));
-    let e = from("", &["ablation=mask-hard"]).unwrap_err();
-    assert_eq!(
-        e.to_string(),
-        "`--set ablation=mask-hard`: `ablation`: unknown variant `mask-hard`, expected one of `baseline`, \
-         `mask-binary`, `mask-soft`, `mask-ce`, `mask-l2`"
-    );
+    let c = from("", &["tface.voxels_final=1000000", "baseline.steps=9", "tface.fields=4"]).unwrap();
+    let b = c.baseline.field(&c.tface);
+    assert_eq!((b.steps, b.voxels_final, b.fields), (9, 1_000_000, 1));
+    assert_eq!((b.masks, b.mask_loss), (MaskUse::None, MaskLoss::None));
+}
+
+#[test]
+fn there_are_no_more_settings_than_a_person_can_survey() {
+    let count = super::all_keys().count();
+    assert!(count <= 110, "{count} keys");
 }

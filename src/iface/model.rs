@@ -177,12 +177,13 @@ impl Model {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Preset;
     use crate::kernel::mlp::Weights;
     use crate::kernel::sdf;
 
     #[test]
     fn the_start_is_a_sphere_of_half_the_box_with_unit_gradient() {
-        let config = IfaceConfig { log2_table: 12, levels: 6, ..IfaceConfig::draft() };
+        let config = IfaceConfig { log2_table: 12, levels: 6, ..IfaceConfig::preset(Preset::Draft) };
         let device = Device::flex();
         let values = initial(&config, 7).into_iter().map(|(_, s, v)| (s, v)).collect();
         let model = Model::from_values(values, &device);

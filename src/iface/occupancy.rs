@@ -219,6 +219,7 @@ impl Occupancy {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Preset;
 
     fn even(points: &[[f32; 3]]) -> Vec<f32> {
         vec![0.0; points.len()]
@@ -230,7 +231,7 @@ mod tests {
 
     #[test]
     fn the_band_keeps_every_cell_the_sphere_crosses_and_nothing_far() {
-        let config = IfaceConfig { occupancy_resolution: 32, band: 6.0, ..IfaceConfig::draft() };
+        let config = IfaceConfig { occupancy_resolution: 32, band: 6.0, ..IfaceConfig::preset(Preset::Draft) };
         let mut o = Occupancy::new(&config, None);
         o.update(&config, (1, 0), 600.0, 0.0, sphere, even);
         let center = |i: usize| [i / 1024, i / 32 % 32, i % 32].map(|c| (c as f32 + 0.5) / 16.0 - 1.0);
@@ -244,7 +245,7 @@ mod tests {
 
     #[test]
     fn cells_outside_the_hull_never_come_back() {
-        let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::draft() };
+        let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::preset(Preset::Draft) };
         let mut hull = Bitmask::filled(8, true);
         (0..512).filter(|i| i / 64 < 4).for_each(|i| hull.set(i, false));
         let mut o = Occupancy::new(&config, Some(&hull));
@@ -260,7 +261,7 @@ mod tests {
     #[test]
     fn a_steep_wall_is_kept_although_its_values_are_large() {
         // slope 40: every centre is far from zero in value, the wall at x = 0.01 is crossed all the same
-        let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::draft() };
+        let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::preset(Preset::Draft) };
         let mut o = Occupancy::new(&config, None);
         o.update(&config, (1, 0), 600.0, 0.0, |p| p.iter().map(|p| 40.0 * (p[0] - 0.01)).collect(), even);
         for x in 0..16 {
@@ -271,7 +272,7 @@ mod tests {
 
     #[test]
     fn soft_places_are_kept_wider_and_their_neighbours_with_them() {
-        let config = IfaceConfig { occupancy_resolution: 32, band: 4.0, ..IfaceConfig::draft() };
+        let config = IfaceConfig { occupancy_resolution: 32, band: 4.0, ..IfaceConfig::preset(Preset::Draft) };
         // one side of the sphere is eight times softer
         let soft = |p: &[[f32; 3]]| p.iter().map(|p| if p[0] > 0.0 { -(8f32.ln()) } else { 0.0 }).collect();
         let mut o = Occupancy::new(&config, None);

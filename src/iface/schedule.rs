@@ -40,10 +40,11 @@ pub fn anneal(config: &IfaceConfig, step: u64) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Preset;
 
     #[test]
     fn learning_rates_match_the_published_schedule() {
-        let config = IfaceConfig::paper();
+        let config = IfaceConfig::preset(Preset::Paper);
         for (n, want) in [
             (0, 1e-4),
             (1, 1.198e-4),

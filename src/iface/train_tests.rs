@@ -1,6 +1,7 @@
 //! Training on an analytic ball: does it learn, resume, guard and stop?
 
 use super::*;
+use crate::config::Preset;
 use crate::field::ball::{BALL, StopAfter, hull, temporary, views};
 use crate::run::Quiet;
 use glam::{Vec2, Vec3};
@@ -18,7 +19,7 @@ fn config() -> IfaceConfig {
         anneal_end: 50,
         warmup: 20,
         min_step: 0.02,
-        ..IfaceConfig::draft()
+        ..IfaceConfig::preset(Preset::Draft)
     }
 }
 
@@ -123,7 +124,7 @@ fn the_paper_preset_trains_too() {
         samples: 8192,
         occupancy_resolution: 16,
         samples_per_ray: 64,
-        ..IfaceConfig::paper()
+        ..IfaceConfig::preset(Preset::Paper)
     };
     let (face, report) = train(&views, None, &config, 3, "cpu", dir.path(), "p", &Quiet).unwrap();
     assert!(report.train_psnr.is_finite() && face.sdf(&[Vec3::ZERO])[0] < 0.0);

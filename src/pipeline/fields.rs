@@ -58,7 +58,7 @@ impl Line<'_> {
                 &views,
                 scene.aabb,
                 hull.as_ref(),
-                config,
+                &config,
                 seed,
                 device,
                 folder,

@@ -2,7 +2,7 @@
 
 use super::{FORMAT, Line, PipelineError, STAGES};
 use crate::capture::View;
-use crate::config::{Method, VmConfig};
+use crate::config::{Config, Method, VmConfig};
 use crate::run::{Fingerprint, Plan, read_record};
 
 /// Keys of `[mask]` that say where something lies; what it holds is an input of the stage.
@@ -114,18 +114,26 @@ impl Line<'_> {
             "iface" => {
                 settings.remove("iface.checkpoint_s"); // how often is no matter of what
                 settings.insert("seed".into(), self.config.seed.to_string());
+                settings.insert("preset".into(), self.config.preset.name().into());
                 // weights and two moments, for two checkpoints and one being written
                 let c = &self.config.iface;
                 needs_bytes += (c.levels as u64) << c.log2_table.min(40) << 3 << 3;
             }
             "baseline" | "tface" => {
-                settings.remove(&format!("{name}.checkpoint_s"));
+                // the baseline's own table says only where it differs from T-Face's
+                let learned = Config { tface: self.vm(name), ..self.config.clone() };
+                for (key, value) in learned.values("tface") {
+                    let own = key.replacen("tface", name, 1);
+                    settings.insert(if settings.contains_key(&own) { own } else { key }, value);
+                }
+                settings.remove("tface.checkpoint_s");
+                settings.insert("preset".into(), self.config.preset.name().into());
                 settings.insert("seed".into(), self.config.seed.to_string());
                 if let Some((_, digest)) = self.imports.iter().find(|(stage, _)| *stage == name) {
-                    settings.remove(&format!("{name}.import"));
+                    settings.retain(|key, _| !key.ends_with(".import"));
                     inputs.push(("import", digest.clone()));
                 }
-                needs_bytes += vm_bytes(self.vm(name));
+                needs_bytes += vm_bytes(&self.vm(name));
             }
             "mesh" => {
                 settings.insert("capture.unit_m".into(), self.config.capture.unit_m.to_string());
@@ -158,8 +166,9 @@ impl Line<'_> {
     }
 
     /// Settings of the stage `baseline` or `tface`.
-    pub(super) fn vm(&self, stage: &str) -> &VmConfig {
-        if stage == "baseline" { &self.config.baseline } else { &self.config.tface }
+    pub(super) fn vm(&self, stage: &str) -> VmConfig {
+        let Config { baseline, tface, .. } = self.config;
+        if stage == "baseline" { baseline.field(tface) } else { tface.clone() }
     }
 
     /// Of all photographs.

@@ -155,7 +155,7 @@ mod tests {
             voxels_final: 4096,
             upsample_steps: vec![20],
             mask_steps: vec![20],
-            ..VmConfig::tface(Preset::Draft)
+            ..VmConfig::preset(Preset::Draft)
         }
     }
 

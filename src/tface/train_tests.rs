@@ -1,7 +1,7 @@
 //! Training on an analytic ball: does it learn, resume, guard and stop?
 
 use super::*;
-use crate::config::{Ablation, DensityActivation, Preset};
+use crate::config::{DensityActivation, Preset};
 use crate::field::ball::{BALL, StopAfter, hull, temporary, views};
 use crate::kernel::vm::size_for;
 use crate::run::Quiet;
@@ -21,7 +21,7 @@ fn config() -> VmConfig {
         density_rank: vec![8, 8, 8],
         color_rank: vec![8, 4, 9],
         hidden: 32,
-        ..VmConfig::tface(Preset::Draft)
+        ..VmConfig::preset(Preset::Draft)
     }
 }
 
@@ -73,9 +73,13 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
 
 #[test]
 fn every_row_of_the_ablation_and_both_activations_train() {
-    for row in
-        [Ablation::Baseline, Ablation::MaskBinary, Ablation::MaskSoft, Ablation::MaskCe, Ablation::MaskL2]
-    {
+    for (masks, mask_loss) in [
+        (MaskUse::None, MaskLoss::None),
+        (MaskUse::Binary, MaskLoss::None),
+        (MaskUse::Soft, MaskLoss::None),
+        (MaskUse::Soft, MaskLoss::Ce),
+        (MaskUse::Soft, MaskLoss::L2),
+    ] {
         for (background, activation) in [
             (VmBackground::Reference, DensityActivation::Relu),
             (VmBackground::Black, DensityActivation::Softplus),
@@ -94,17 +98,19 @@ fn every_row_of_the_ablation_and_both_activations_train() {
                 feature_frequencies: 1,
                 view_frequencies: 2,
                 density_shift: -1.0,
-                ..config().with(row)
+                masks,
+                mask_loss,
+                ..config()
             };
             let report = run(&config, dir.path(), &Quiet).unwrap();
-            assert!(report.train_psnr > 1.0, "{row:?} {background:?} {report:?}");
+            assert!(report.train_psnr > 1.0, "{masks:?} {mask_loss:?} {background:?} {report:?}");
         }
     }
 }
 
 #[test]
 fn published_rates_are_reproduced() {
-    let p = VmConfig::tface(Preset::Paper);
+    let p = VmConfig::preset(Preset::Paper);
     // decay per step, then rates used at steps 1999, 2001 (just started again) and 49999 (7001 was the last start)
     assert!((learning_rate(&p, 1) - 0.99995395).abs() < 1e-8);
     assert!((0.02 * learning_rate(&p, 1999) - 0.0182411).abs() < 1e-7);

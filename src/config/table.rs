@@ -1,0 +1,104 @@
+//! One place for a setting: its field is its key, its comment the documentation that users read.
+
+/// Declares the settings of a stage.
+///
+/// ```text
+/// table! {
+///     /// What the table is about.
+///     pub struct NameConfig;
+///     keys {
+///         /// What it means, with its unit.
+///         steps: u64, 1.0..=1e7 => 3000, 8000, 20_000;   // draft, standard, paper
+///         /// A word, text, switch or list has no range; one value may serve every preset.
+///         masks: MaskUse => MaskUse::Soft;
+///     }
+///     constants {
+///         /// Part of a preset that nobody has a reason to change: no key, not written to `config.toml`.
+///         lr_grid: f64 => 0.02;
+///     }
+/// }
+/// ```
+///
+/// Makes the struct, its list of [`Key`](super::Key)s as `KEYS`, `preset(Preset)`, and `keep_constants(Preset)`, which
+/// gives the constants their values again after the keys were read from text.
+macro_rules! table {
+    (
+        $(#[$about:meta])*
+        pub struct $name:ident;
+        keys {
+            $($(#[doc = $doc:literal])+ $key:ident: $ty:ty $(, $min:literal ..= $max:literal)?
+                => $draft:expr $(, $standard:expr, $paper:expr)?;)+
+        }
+        $(constants {
+            $($(#[doc = $constant_doc:literal])+ $constant:ident: $constant_ty:ty
+                => $constant_draft:expr $(, $constant_standard:expr, $constant_paper:expr)?;)+
+        })?
+    ) => {
+        $(#[$about])*
+        #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub struct $name {
+            $($(#[doc = $doc])+ pub $key: $ty,)+
+            $($($(#[doc = $constant_doc])+ #[serde(skip)] pub $constant: $constant_ty,)+)?
+        }
+
+        pub(super) const KEYS: &[super::Key] = &[
+            $(super::Key {
+                name: stringify!($key),
+                doc: concat!($($doc),+).trim_ascii_start(),
+                min: $crate::config::table::bound!(f64::NEG_INFINITY $(, $min)?),
+                max: $crate::config::table::bound!(f64::INFINITY $(, $max)?),
+            },)+
+        ];
+
+        impl $name {
+            /// The values a preset starts with.
+            pub fn preset(preset: super::Preset) -> $name {
+                $name {
+                    $($key: $crate::config::table::of_preset!(preset, $draft $(, $standard, $paper)?),)+
+                    $($($constant: $crate::config::table::of_preset!(
+                        preset, $constant_draft $(, $constant_standard, $constant_paper)?
+                    ),)+)?
+                }
+            }
+        }
+
+        $(impl $name {
+            /// These keys with a preset's constants.
+            pub(super) fn keep_constants(self, preset: super::Preset) -> $name {
+                $name {
+                    $($constant: $crate::config::table::of_preset!(
+                        preset, $constant_draft $(, $constant_standard, $constant_paper)?
+                    ),)+
+                    ..self
+                }
+            }
+        })?
+    };
+}
+
+/// The second value, else the first.
+macro_rules! bound {
+    ($none:expr) => {
+        $none
+    };
+    ($none:expr, $value:literal) => {
+        $value
+    };
+}
+
+/// The value of a preset: one for all, or draft, standard, paper.
+macro_rules! of_preset {
+    ($preset:ident, $all:expr) => {
+        $all
+    };
+    ($preset:ident, $draft:expr, $standard:expr, $paper:expr) => {
+        match $preset {
+            super::Preset::Draft => $draft,
+            super::Preset::Standard => $standard,
+            super::Preset::Paper => $paper,
+        }
+    };
+}
+
+pub(super) use {bound, of_preset, table};
