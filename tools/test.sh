@@ -48,33 +48,26 @@ readers() {
     npm ci --silent --no-audit --no-fund --prefix tools/readers
 }
 
+# The library of ONNX Runtime comes as a Python wheel; only the library in it is used.
+onnx_runtime() {
+  [ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv || return
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements-onnx.txt || return
+  TIFACE_ONNXRUNTIME=$(.venv/bin/python -c 'import glob, importlib.util as i
+print(*glob.glob(i.find_spec("onnxruntime").submodule_search_locations[0] + "/capi/libonnxruntime.*"))') || return
+  [ -f "$TIFACE_ONNXRUNTIME" ] || { echo "the wheel holds no library: '$TIFACE_ONNXRUNTIME'" >&2; return 1; }
+  export TIFACE_ONNXRUNTIME
+}
+
 # Tests skip aloud what a machine cannot give; here those lines are shown again, so that nobody
-# takes a skipped test for a passed one.
+# takes a skipped test for a passed one. One build serves them all: with the networks, on both engines.
 tests() {
-  cargo test --release --no-fail-fast -- --nocapture 2>&1 | tee "$scratch/tests.log"
+  cargo test --release --features matting --no-fail-fast -- --nocapture 2>&1 | tee "$scratch/tests.log"
   local ended=${PIPESTATUS[0]}
   grep -h '^skipped:' "$scratch/tests.log" | sort -u > "$scratch/skipped"
   return "$ended"
 }
 
-# The networks of the feature `matting` on both engines. ONNX Runtime comes as a Python wheel; only the
-# library in it is used.
-networks() {
-  [ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv || return
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements-onnx.txt || return
-  local library
-  library=$(.venv/bin/python -c 'import glob, importlib.util as i
-print(*glob.glob(i.find_spec("onnxruntime").submodule_search_locations[0] + "/capi/libonnxruntime.*"))') || return
-  [ -f "$library" ] || { echo "the wheel holds no library: '$library'" >&2; return 1; }
-  TIFACE_ONNXRUNTIME="$library" cargo test --release --no-default-features --features matting --lib mask -- --nocapture 2>&1 |
-    tee "$scratch/networks.log"
-  local ended=${PIPESTATUS[0]}
-  grep -h '^skipped:' "$scratch/networks.log" | sort -u >> "$scratch/skipped"
-  return "$ended"
-}
-
-sphere() { cargo run --release --quiet --example sphere_to_glb -- "$scratch/sphere"; }
-globe() { cargo run --release --quiet --example textured_sphere -- "$scratch/globe"; }
+example() { "$target/release/examples/$1" "$2"; }
 
 # Blender as a module has its own environment: it brings its own numpy. Only when pip cannot get it
 # (no wheel for this system, no network) or the system cannot load it is it left out, and the summary says so.
@@ -102,8 +95,6 @@ browser_is_here() {
   /usr/bin/chromium --version
 }
 
-click_page() { cargo run --release --quiet --example click_page -- "$scratch/click/page.html"; }
-
 # Everything that reads files, on one export
 readers_agree() {
   local name=$1 glb=$2
@@ -122,12 +113,15 @@ train_demo() {
 
 step "independent readers are here" readers
 step "format" cargo fmt --all -- --check
-step "lints" cargo clippy --release --all-targets -- -D warnings
-step "lints, with wgpu and matting" cargo clippy --release --features wgpu,matting --all-targets -- -D warnings
-step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting --no-deps
-step "build" cargo build --release --all-targets
+# Everything is checked once with all features, and the default ones and the core alone (no burn) by themselves;
+# then built once.
+step "lints, all features" cargo clippy --release --all-targets --all-features -- -D warnings
+step "lints, default features" cargo clippy --release -- -D warnings
+step "lints, without the learned fields" cargo clippy --release --no-default-features --lib -- -D warnings
+step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --all-features --no-deps
+step "build" cargo build --release --features matting --bins --examples --benches
+step "ONNX Runtime is here" onnx_runtime
 step "tests" tests
-step "networks on both engines" networks
 blender=yes
 printf '\n== Blender is here\n'
 if ! blender_is_here; then
@@ -141,13 +135,13 @@ if ! browser_is_here; then
   results+=("SKIPPED the page to click on: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it")
 fi
 mkdir -p "$scratch/click"
-step "the page to click on is written" click_page
+step "the page to click on is written" example click_page "$scratch/click/page.html"
 if [ $browser = yes ]; then
   step "a browser clicks on the page" node tools/page/check_page.mjs "$scratch/click/page.html"
 fi
-step "a sphere is written" sphere
+step "a sphere is written" example sphere_to_glb "$scratch/sphere"
 readers_agree "the sphere" "$scratch/sphere/sphere.glb"
-step "a textured globe is written" globe
+step "a textured globe is written" example textured_sphere "$scratch/globe"
 readers_agree "the globe" "$scratch/globe/globe.glb"
 step "three.js agrees on the globe" node tools/readers/check_three.mjs "$scratch/globe/globe.glb"
 # with a normal map and a second texture, and the same in 16 bits, which not all readers understand

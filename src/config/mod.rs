@@ -27,7 +27,7 @@ pub use capture::CaptureConfig;
 pub use ensemble::{Correct, EnsembleConfig, Fit};
 pub use iface::IfaceConfig;
 pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors};
-pub use mesh::{MeshConfig, MeshFormat, MeshFrame, TextureFormat, TextureView};
+pub use mesh::{MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 pub use metrics::MetricsConfig;
 pub use render::{Background, Method, PictureFormat, RenderConfig};
 pub use source::{ConfigError, Place, Sources};
@@ -188,6 +188,7 @@ impl Config {
         Config {
             tface: self.tface.keep_constants(self.preset),
             iface: self.iface.keep_constants(self.preset),
+            mesh: self.mesh.keep_constants(self.preset),
             ..self
         }
     }

@@ -66,6 +66,7 @@ macro_rules! table {
         $(impl $name {
             /// These keys with a preset's constants.
             pub(super) fn keep_constants(self, preset: super::Preset) -> $name {
+                let _ = preset; // where every preset has the same constants
                 $name {
                     $($constant: $crate::config::table::of_preset!(
                         preset, $constant_draft $(, $constant_standard, $constant_paper)?

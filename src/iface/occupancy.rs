@@ -231,7 +231,8 @@ mod tests {
 
     #[test]
     fn the_band_keeps_every_cell_the_sphere_crosses_and_nothing_far() {
-        let config = IfaceConfig { occupancy_resolution: 32, band: 6.0, ..IfaceConfig::preset(Preset::Draft) };
+        let config =
+            IfaceConfig { occupancy_resolution: 32, band: 6.0, ..IfaceConfig::preset(Preset::Draft) };
         let mut o = Occupancy::new(&config, None);
         o.update(&config, (1, 0), 600.0, 0.0, sphere, even);
         let center = |i: usize| [i / 1024, i / 32 % 32, i % 32].map(|c| (c as f32 + 0.5) / 16.0 - 1.0);
@@ -272,7 +273,8 @@ mod tests {
 
     #[test]
     fn soft_places_are_kept_wider_and_their_neighbours_with_them() {
-        let config = IfaceConfig { occupancy_resolution: 32, band: 4.0, ..IfaceConfig::preset(Preset::Draft) };
+        let config =
+            IfaceConfig { occupancy_resolution: 32, band: 4.0, ..IfaceConfig::preset(Preset::Draft) };
         // one side of the sphere is eight times softer
         let soft = |p: &[[f32; 3]]| p.iter().map(|p| if p[0] > 0.0 { -(8f32.ln()) } else { 0.0 }).collect();
         let mut o = Occupancy::new(&config, None);

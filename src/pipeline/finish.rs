@@ -4,10 +4,9 @@ use super::product::{Lobes, Pictures, Product};
 use super::{Line, Surface, export};
 use crate::capture::Split;
 use crate::capture::scene::Scene;
-use crate::config::TextureView;
 use crate::geom::{Camera, Mesh};
 use crate::image::{Image, Photo, quantise, srgb_from_linear};
-use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, Viewer, bake, tangent_space};
+use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, bake, tangent_space};
 use crate::mesh::textured_tangents::tangents;
 use crate::mesh::{AtlasConfig, Cap, MeshError, SimplifyConfig, atlas, simplify};
 use crate::run::Monitor;
@@ -83,10 +82,6 @@ impl Line<'_> {
             side: c.texture_samples,
             gutter_px: c.gutter_px,
             reach: REACH * cell,
-            viewer: match c.texture_view {
-                TextureView::Cameras => Viewer::Cameras,
-                TextureView::Normal => Viewer::Normal,
-            },
             lobes: c.lobes,
             normals: c.normal_map,
             turned: asset_from_world * world_from_scene.rotation_f32(),

@@ -5,7 +5,7 @@ use super::parts::Whole;
 use super::product::Product;
 use super::{Fields, Line, PipelineError, export};
 use crate::capture::{self, Split};
-use crate::config::{MeshConfig, TextureView};
+use crate::config::MeshConfig;
 use crate::geom::{Camera, Mesh, Similarity};
 use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
@@ -77,7 +77,7 @@ impl Line<'_> {
             let parts = stage.folder().join("parts");
             let surface_triangles = surface.triangles.len();
             // vertices have the colour seen straight; textures and rays that of the cameras, and so their cap
-            if let Some(cap) = cap.as_mut().filter(|_| c.texture_view == TextureView::Cameras) {
+            if let Some(cap) = cap.as_mut() {
                 let learned = Learned {
                     gradient: &|p| field.sdf_gradient(p),
                     colors: &|p, n, counts, d| field.colors(p, n, counts, d),

@@ -30,16 +30,6 @@ use light::{Eyes, Points, settle, shade};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// Whose view of a texel is its colour.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Viewer {
-    /// The mean over the training cameras that see it.
-    Cameras,
-    /// One that looks straight at the surface.
-    Normal,
-}
-
 /// How a texture is baked. Lengths are in the mesh's units.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BakeConfig {
@@ -49,8 +39,6 @@ pub struct BakeConfig {
     pub gutter_px: u32,
     /// How far a sample may lie from the true surface: the simplification's error and half a cell.
     pub reach: f32,
-    /// Whose view counts.
-    pub viewer: Viewer,
     /// Degree of the lobes, 1 or 2; 0 for none.
     pub lobes: u32,
     /// Also bake the field's normals.
@@ -134,10 +122,8 @@ pub fn bake(
             }
             let flat = on_triangles(mesh, own);
             let points = settle(&flat, config.reach, learned);
-            let seen = match config.viewer {
-                Viewer::Cameras if !cameras.is_empty() => eyes.seen(&points, &flat),
-                _ => light::Seen::head_on(&points),
-            };
+            let seen =
+                if cameras.is_empty() { light::Seen::head_on(&points) } else { eyes.seen(&points, &flat) };
             totals.add(&seen, &flat, &points);
             let shades = shade(&points, seen, learned, functions, config.turned);
             let mut i = 0;
@@ -305,15 +291,7 @@ mod tests {
     }
 
     fn config() -> BakeConfig {
-        BakeConfig {
-            side: 2,
-            gutter_px: 4,
-            reach: 0.02,
-            viewer: Viewer::Cameras,
-            lobes: 0,
-            normals: false,
-            turned: Mat3::IDENTITY,
-        }
+        BakeConfig { side: 2, gutter_px: 4, reach: 0.02, lobes: 0, normals: false, turned: Mat3::IDENTITY }
     }
 
     #[test]
@@ -429,7 +407,7 @@ mod tests {
     }
 
     #[test]
-    fn straight_views_and_texel_sized_textures_work() {
+    fn without_cameras_views_are_straight_and_texel_sized_textures_work() {
         let (mesh, mut atlas) = sphere(8, 4);
         atlas.uvs.iter_mut().for_each(|uv| *uv = uv.clamp(Vec2::ZERO, Vec2::ONE));
         let colors = |_: &[Vec3], n: &[Vec3], counts: &[u32], away: &[Vec3]| -> Vec<[f32; 3]> {
@@ -439,8 +417,7 @@ mod tests {
         let learned = Learned { gradient: &gradient, colors: &colors };
         for (width, height) in [(8, 4), (1, 1)] {
             let atlas = Atlas { width, height, ..atlas.clone() };
-            let config = BakeConfig { viewer: Viewer::Normal, ..config() };
-            let baked = bake(&mesh, &atlas, &learned, &ring(), &config, &Quiet).unwrap();
+            let baked = bake(&mesh, &atlas, &learned, &[], &config(), &Quiet).unwrap();
             assert!(baked.color.data.chunks(3).all(|c| (c[0] - 1.0).abs() < 1e-4));
             assert_eq!(baked.report.seen, 0.0);
         }
