@@ -48,9 +48,13 @@ fn capture(folder: &Path) -> PathBuf {
 }
 
 fn start(capture: &Path, run: &Path) -> Child {
+    command_on("run", capture, run, &[])
+}
+
+fn command_on(name: &str, capture: &Path, run: &Path, more: &[&str]) -> Child {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tiface"));
-    command.arg("run").arg(capture).arg("--run").arg(run).args(["--preset", "draft", "--quiet"]);
-    for setting in SETTINGS {
+    command.arg(name).arg(capture).arg("--run").arg(run).args(["--preset", "draft"]);
+    for setting in SETTINGS.iter().chain(more) {
         command.args(["--set", setting]);
     }
     command.env("XDG_CONFIG_HOME", run).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
@@ -169,4 +173,54 @@ fn a_signal_saves_and_names_itself_in_the_exit_code_and_two_processes_do_not_sha
     }
     assert_eq!(finish(start(&capture, &run)).0, 0);
     assert!(run.join("metrics/done.json").is_file());
+}
+
+/// Waits until the stage `iface` of this process has done a step.
+fn wait_for_training(run: &Path, child: &Child) {
+    let own = format!("\"pid\": {},", child.id());
+    let begin = Instant::now();
+    let learning = |text: &str| text.contains(&own) && !text.contains("\"step\": 0,");
+    while !std::fs::read_to_string(run.join("iface/status.json")).is_ok_and(|text| learning(&text)) {
+        assert!(begin.elapsed() < Duration::from_secs(120), "training never began");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn a_signal_sent_twice_at_once_saves_what_was_learned() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let dir = tempfile::tempdir().unwrap();
+    let capture = capture(dir.path());
+    let run = dir.path().join("run");
+    let child = command_on("iface", &capture, &run, &["iface.steps=100000", "iface.checkpoint_s=3600"]);
+    wait_for_training(&run, &child);
+    // as GNU `timeout` does: to the process, and to its group
+    let twice = format!("kill -TERM {0}; kill -TERM {0}", child.id());
+    Command::new("sh").args(["-c", &twice]).status().unwrap();
+    let (code, text) = finish(child);
+    assert_eq!(code, 143, "{text}");
+    assert!(text.contains("stopped: stage `iface`: saved at step ") && !text.contains("error"), "{text}");
+    let status = std::fs::read_to_string(run.join("iface/status.json")).unwrap();
+    assert!(status.contains("\"state\": \"stopped\""), "{status}");
+}
+
+#[test]
+fn a_signal_is_heard_where_nothing_can_be_saved() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let dir = tempfile::tempdir().unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_tiface"))
+        .args(["demo", "--run"])
+        .arg(dir.path().join("run"))
+        .env("XDG_CONFIG_HOME", dir.path())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut said = std::io::BufReader::new(child.stderr.take().unwrap());
+    let mut line = String::new();
+    std::io::BufRead::read_line(&mut said, &mut line).unwrap();
+    assert!(line.contains("photographing"), "{line}");
+    Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    line.clear();
+    std::io::BufRead::read_line(&mut said, &mut line).unwrap();
+    assert_eq!((line.trim(), child.wait().unwrap().code()), ("stopped: before its end", Some(130)));
 }

@@ -13,6 +13,7 @@ mod line;
 mod options;
 mod page;
 mod screen;
+mod signals;
 mod status;
 mod target;
 
@@ -354,7 +355,7 @@ pub fn main() -> ExitCode {
     let screen = Screen::new(&cli.common);
     cli.common.log();
     let stop = Stop::new();
-    let ended = listen(&stop).and_then(|()| cli.run(&screen, &stop));
+    let ended = signals::listen(&stop, &screen).and_then(|()| cli.run(&screen, &stop));
     ExitCode::from(match ended {
         Ok(exit) => exit.code(),
         Err(ending) => {
@@ -362,24 +363,6 @@ pub fn main() -> ExitCode {
             ending.exit.code()
         }
     })
-}
-
-/// The first Ctrl-C or SIGTERM asks to stop, the second stops at once with the same code.
-fn listen(stop: &Stop) -> Result<(), Ending> {
-    use signal_hook::consts::{SIGINT, SIGTERM};
-    use signal_hook::flag;
-    use std::sync::Arc;
-    use std::sync::atomic::AtomicBool;
-    let asked = Arc::new(AtomicBool::new(false));
-    for (signal, exit) in [(SIGINT, Exit::Interrupted), (SIGTERM, Exit::Terminated)] {
-        let code = exit.code();
-        // handlers run in this order: the first signal finds `asked` still false
-        flag::register_conditional_shutdown(signal, code.into(), asked.clone())
-            .and_then(|_| flag::register(signal, asked.clone()))
-            .and_then(|_| flag::register_usize(signal, stop.cell(), code.into()))
-            .map_err(|e| Ending::cannot(format!("signals cannot be handled: {e}"), ""))?;
-    }
-    Ok(())
 }
 
 impl Cli {

@@ -53,22 +53,33 @@ impl Screen {
         }
     }
 
-    /// The error and the way out, once.
+    /// The error and the way out, once; who asked to stop gets no error.
     pub fn ending(&self, ending: &Ending) {
+        self.0.end();
+        let Ending { exit, message, hint } = ending;
+        let asked = exit.is_asked_for();
         if self.0.json {
-            let (message, hint) = (&ending.message, &ending.hint);
-            self.0.object(
-                json!({"event": "error", "exit": ending.exit.code(), "message": message, "hint": hint}),
-            );
+            let event = if asked { "stopped" } else { "error" };
+            self.0.object(json!({"event": event, "exit": exit.code(), "message": message, "hint": hint}));
         }
-        let paint = |code: &str, word: &str| {
-            if self.0.colored { format!("\x1b[{code}m{word}\x1b[0m") } else { word.to_string() }
+        let text = match (asked, hint.is_empty()) {
+            (true, true) => format!("stopped: {message}"),
+            (true, false) => format!("stopped: {message}; {hint}"),
+            (false, _) => {
+                let paint = |code: &str, word: &str| {
+                    if self.0.colored { format!("\x1b[{code}m{word}\x1b[0m") } else { word.to_string() }
+                };
+                let mut text = format!("{}: {message}", paint("1;31", "error"));
+                if !hint.is_empty() {
+                    text += &format!("\n\n{}: {hint}", paint("1;36", "hint"));
+                }
+                text
+            }
         };
-        let mut text = format!("{}: {}", paint("1;31", "error"), ending.message);
-        if !ending.hint.is_empty() {
-            text += &format!("\n\n{}: {}", paint("1;36", "hint"), ending.hint);
+        // `--quiet` leaves errors only
+        if !(asked && self.0.quiet) {
+            self.0.line(&text);
         }
-        self.0.line(&text);
     }
 }
 

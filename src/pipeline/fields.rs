@@ -101,7 +101,7 @@ impl Line<'_> {
 
     fn iface_failure(&self, e: IfaceError) -> Failure {
         match e {
-            IfaceError::Stopped { .. } => Failure::stopped(self.run.stop()),
+            IfaceError::Stopped { .. } => Failure::stopped_at(self.run.stop(), e),
             IfaceError::Device(_) => device_failure(e),
             e => {
                 let hint = e.hint().unwrap_or_default();
@@ -112,7 +112,7 @@ impl Line<'_> {
 
     fn tface_failure(&self, stage: &'static str, e: TfaceError) -> Failure {
         match e {
-            TfaceError::Stopped { .. } => Failure::stopped(self.run.stop()),
+            TfaceError::Stopped { .. } => Failure::stopped_at(self.run.stop(), e),
             TfaceError::Device(_) => device_failure(e),
             e => {
                 let hint = e.hint(stage).unwrap_or_default();

@@ -162,7 +162,8 @@ impl Line<'_> {
         for (name, digest) in inputs {
             fingerprint = fingerprint.input(name, digest);
         }
-        Plan { name, fingerprint, device: &self.config.device, needs_bytes }
+        let saves = ["baseline", "tface", "iface"].contains(&name);
+        Plan { name, fingerprint, device: &self.config.device, needs_bytes, saves }
     }
 
     /// Settings of the stage `baseline` or `tface`.

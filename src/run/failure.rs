@@ -1,10 +1,9 @@
-//! How a run ends: exit codes, stop requests, and errors that know theirs.
+//! How a run ends: exit codes, and errors that know theirs.
 
+use super::Stop;
 use crate::io::{LockError, ReadError, WriteError};
 use std::error::Error;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// The exit codes of `tiface`, and what they tell a scheduler.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -32,35 +31,10 @@ impl Exit {
     pub fn code(self) -> u8 {
         self as u8
     }
-}
 
-/// A request to stop, shared between a signal handler and everything that computes.
-#[derive(Clone, Debug, Default)]
-pub struct Stop(Arc<AtomicUsize>);
-
-impl Stop {
-    /// Not requested.
-    pub fn new() -> Stop {
-        Stop::default()
-    }
-
-    /// Asks to stop, to end with `exit`.
-    pub fn request(&self, exit: Exit) {
-        self.0.store(exit.code() as usize, Ordering::SeqCst);
-    }
-
-    /// The exit code to end with, if a stop was requested.
-    pub fn requested(&self) -> Option<Exit> {
-        match self.0.load(Ordering::SeqCst) {
-            0 => None,
-            143 => Some(Exit::Terminated),
-            _ => Some(Exit::Interrupted),
-        }
-    }
-
-    /// The shared cell, holding 0 or the exit code (130, 143), for a signal handler to store into.
-    pub fn cell(&self) -> Arc<AtomicUsize> {
-        self.0.clone()
+    /// Did somebody ask for this end? Then it is no error.
+    pub fn is_asked_for(self) -> bool {
+        matches!(self, Exit::Interrupted | Exit::Terminated)
     }
 }
 
@@ -87,10 +61,15 @@ impl Failure {
         Failure { exit: Exit::NotNow, error: error.into(), hint: hint.into() }
     }
 
-    /// Stopped on request, after saving.
+    /// Stopped on request; what was done is kept as far as it is whole.
     pub fn stopped(stop: &Stop) -> Failure {
+        Failure::stopped_at(stop, "what is complete is kept")
+    }
+
+    /// Stopped on request, with what became of the work.
+    pub fn stopped_at(stop: &Stop, kept: impl Into<Box<dyn Error + Send + Sync>>) -> Failure {
         let exit = stop.requested().unwrap_or(Exit::Interrupted);
-        Failure { exit, error: "stopped as asked".into(), hint: "repeat the command to continue".into() }
+        Failure { exit, error: kept.into(), hint: "repeat the command to continue".into() }
     }
 }
 
@@ -143,7 +122,7 @@ pub enum RunError {
         run: PathBuf,
     },
     /// Stopped before this stage began.
-    #[error("stopped before stage `{stage}`")]
+    #[error("before stage `{stage}`")]
     Stopped {
         /// Which stage.
         stage: String,
@@ -196,21 +175,5 @@ impl RunError {
             RunError::Read(e) => e.hint(),
             RunError::Write(e) => e.hint(),
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_stop_request_keeps_the_signal_that_made_it() {
-        let stop = Stop::new();
-        assert_eq!(stop.requested(), None);
-        stop.clone().request(Exit::Terminated); // clones share
-        assert_eq!(stop.requested(), Some(Exit::Terminated));
-        assert_eq!(Failure::stopped(&stop).exit.code(), 143);
-        stop.cell().store(130, Ordering::SeqCst); // as a signal handler does
-        assert_eq!(stop.requested(), Some(Exit::Interrupted));
     }
 }

@@ -21,12 +21,14 @@ mod fingerprint;
 mod progress;
 mod stage;
 mod status;
+mod stop;
 
-pub use failure::{Exit, Failure, RunError, Stop};
+pub use failure::{Exit, Failure, RunError};
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer};
 pub use stage::{Done, Plan, Stage};
 pub use status::{Record, State, Status, read_record, read_status};
+pub use stop::Stop;
 
 use crate::io::{self, Lock, LockError};
 use std::path::{Path, PathBuf};

@@ -3,7 +3,7 @@
 //! All pacing is by the monotonic clock: setting the machine's time does not disturb it.
 
 use super::status::now;
-use super::{Monitor, Status, Stop};
+use super::{Monitor, State, Status, Stop};
 use crate::io;
 use serde_json::{Map, Value};
 use std::path::PathBuf;
@@ -90,6 +90,8 @@ struct Pace {
     saved: Option<Instant>,
     /// A status that cannot be written is told once, not once a second.
     complained: bool,
+    /// Has this process done a step?
+    stepped: bool,
 }
 
 const SHOW: Duration = Duration::from_millis(100);
@@ -111,7 +113,15 @@ impl Progress {
         status: Status,
     ) -> Progress {
         let before_s = status.elapsed_s;
-        let pace = Pace { status, mark: None, shown: None, logged: None, saved: None, complained: false };
+        let pace = Pace {
+            status,
+            mark: None,
+            shown: None,
+            logged: None,
+            saved: None,
+            complained: false,
+            stepped: false,
+        };
         Progress {
             stage: stage.into(),
             folder,
@@ -123,6 +133,10 @@ impl Progress {
         }
     }
 
+    pub fn stage(&self) -> &str {
+        &self.stage
+    }
+
     pub fn elapsed_s(&self) -> f64 {
         self.before_s + self.start.elapsed().as_secs_f64()
     }
@@ -132,6 +146,19 @@ impl Progress {
         let mut pace = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         change(&mut pace.status);
         self.write(&mut pace)
+    }
+
+    /// The status of a stage that was stopped; failing to write it changes nothing about that.
+    pub fn stopped(&self) {
+        let _ = self.save(|s| {
+            s.state = State::Stopped;
+            s.eta_s = None;
+        });
+    }
+
+    /// Has this process done a step of the stage?
+    pub fn has_stepped(&self) -> bool {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner).stepped
     }
 
     pub fn note(&self, text: &str) {
@@ -176,6 +203,7 @@ impl Monitor for Progress {
                 pace.mark = Some((step, now));
             }
         }
+        pace.stepped = true;
         pace.status.step = step;
         pace.status.steps = steps;
         pace.status.eta_s =

@@ -7,6 +7,7 @@ use super::{read_record, read_status};
 use crate::io;
 use serde_json::Value;
 use std::path::Path;
+use std::sync::Arc;
 
 /// What a stage is about to do.
 #[derive(Clone, Debug)]
@@ -19,12 +20,14 @@ pub struct Plan<'a> {
     pub device: &'a str,
     /// Bytes it will need on the disk, roughly.
     pub needs_bytes: u64,
+    /// Does it save what it has when asked to stop, to go on from there? Nobody waits for one that does not.
+    pub saves: bool,
 }
 
 /// A stage at work: where to put files, how to report.
 pub struct Stage {
     folder: std::path::PathBuf,
-    progress: Progress,
+    progress: Arc<Progress>,
 }
 
 impl Stage {
@@ -35,7 +38,7 @@ impl Stage {
 
     /// Progress out, stop request in.
     pub fn monitor(&self) -> &dyn Monitor {
-        &self.progress
+        self.progress.as_ref()
     }
 
     /// Tells something worth knowing.
@@ -110,7 +113,9 @@ impl Run {
             updated: now(),
             fingerprint: plan.fingerprint.clone(),
         };
-        let progress = Progress::new(name, folder.clone(), self.stop.clone(), self.observer.clone(), status);
+        let (stop, observer) = (self.stop.clone(), self.observer.clone());
+        let progress = Arc::new(Progress::new(name, folder.clone(), stop, observer, status));
+        let _at_work = self.stop.at_work(&progress, plan.saves);
         progress.save(|_| {})?;
         self.observer.event(&Event::Started { stage: name });
         let stage = Stage { folder, progress };
@@ -118,12 +123,16 @@ impl Run {
             Ok(summary) => self.record(&plan, &stage, summary),
             Err(failure) => {
                 let stopped = self.stop.requested() == Some(failure.exit);
-                // the failure is the thing to tell, whether or not it can be written down
-                let _ = stage.progress.save(|s| {
-                    s.state = if stopped { State::Stopped } else { State::Failed };
-                    s.error = (!stopped).then(|| failure.error.to_string());
-                    s.eta_s = None;
-                });
+                if stopped {
+                    stage.progress.stopped();
+                } else {
+                    // the failure is the thing to tell, whether or not it can be written down
+                    let _ = stage.progress.save(|s| {
+                        s.state = State::Failed;
+                        s.error = Some(failure.error.to_string());
+                        s.eta_s = None;
+                    });
+                }
                 Err(RunError::Stage { stage: name.into(), failure })
             }
         }
@@ -207,11 +216,12 @@ mod tests {
     use crate::run::{Exit, Observer, Quiet, Stop};
     use serde_json::json;
     use std::fs;
-    use std::sync::{Arc, Mutex};
+    use std::sync::Mutex;
+    use std::time::Duration;
 
     fn plan(steps: u32) -> Plan<'static> {
         let fingerprint = Fingerprint::default().setting("iface.steps", steps);
-        Plan { name: "iface", fingerprint, device: "cpu", needs_bytes: 1 }
+        Plan { name: "iface", fingerprint, device: "cpu", needs_bytes: 1, saves: true }
     }
 
     fn open(dir: &Path) -> Run {
@@ -321,6 +331,33 @@ mod tests {
         let status = read_status(&dir.path().join("iface")).unwrap().unwrap();
         assert_eq!((status.state, status.error), (State::Stopped, None));
         assert!(matches!(run.stage(plan(5), never), Err(RunError::Stopped { .. })));
+    }
+
+    #[test]
+    fn only_a_stage_that_has_steps_to_save_is_waited_for() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        let now = |patience| run.stop().abandon(patience).is_some();
+        assert!(now(Duration::from_secs(99)), "nothing is at work");
+        let state = |stage| read_status(&dir.path().join(stage)).unwrap().unwrap().state;
+        run.stage(plan(5), |stage| {
+            assert!(!now(Duration::from_secs(99)), "it has only just begun");
+            assert!(now(Duration::ZERO), "it has nothing to save yet");
+            assert_eq!(state("iface"), State::Stopped);
+            let done = work(stage);
+            assert!(!now(Duration::ZERO), "its steps would be lost");
+            done
+        })
+        .unwrap();
+        assert!(!now(Duration::from_secs(99)) && now(Duration::ZERO), "what comes next has time to tell");
+        run.stage(Plan { name: "mesh", saves: false, ..plan(5) }, |stage| {
+            let done = work(stage);
+            assert!(now(Duration::ZERO), "it begins anew in any case");
+            assert_eq!(state("mesh"), State::Stopped);
+            done
+        })
+        .unwrap();
+        assert_eq!((state("iface"), state("mesh")), (State::Done, State::Done));
     }
 
     #[test]

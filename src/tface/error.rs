@@ -54,7 +54,7 @@ pub enum TfaceError {
         source: Box<TfaceError>,
     },
     /// A stop was asked for. A checkpoint was saved, unless there was no step to save.
-    #[error("stopped at step {step} of {steps}; repeat the command to continue")]
+    #[error("saved at step {step} of {steps}")]
     Stopped {
         /// Steps done.
         step: u64,

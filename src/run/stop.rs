@@ -1,0 +1,104 @@
+//! A request to stop, and what is at work meanwhile.
+
+use super::progress::Progress;
+use super::{Exit, Failure};
+use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// A request to stop, shared between whoever hears signals and everything that computes.
+#[derive(Clone, Default)]
+pub struct Stop(Arc<Inner>);
+
+#[derive(Default)]
+struct Inner {
+    /// 0 or the exit code.
+    code: AtomicU8,
+    work: Mutex<Work>,
+}
+
+#[derive(Default)]
+struct Work {
+    /// The stage at work, and whether it saves what it has when asked to stop.
+    stage: Option<(Arc<Progress>, bool)>,
+    /// When a stage began or ended last.
+    since: Option<Instant>,
+}
+
+/// A stage is at work as long as this lives.
+pub(super) struct AtWork<'a>(&'a Stop);
+
+impl Stop {
+    /// Not requested.
+    pub fn new() -> Stop {
+        Stop::default()
+    }
+
+    /// Asks to stop, to end with `exit`.
+    pub fn request(&self, exit: Exit) {
+        self.0.code.store(exit.code(), Ordering::SeqCst);
+    }
+
+    /// The exit code to end with, if a stop was requested.
+    pub fn requested(&self) -> Option<Exit> {
+        match self.0.code.load(Ordering::SeqCst) {
+            0 => None,
+            143 => Some(Exit::Terminated),
+            _ => Some(Exit::Interrupted),
+        }
+    }
+
+    /// What to end the process with now, though nothing has come to its end. `None` while a stage that saves has
+    /// something to save, and within `patience` of a stage's beginning or end. The status of the stage then says that
+    /// it was stopped.
+    ///
+    /// Nothing is lost by it that a stop would have kept: files are written aside and renamed, and only learning can
+    /// go on in the middle of a stage.
+    pub fn abandon(&self, patience: Duration) -> Option<Failure> {
+        let work = self.lock();
+        if work.since.is_some_and(|t| t.elapsed() < patience) {
+            return None;
+        }
+        match &work.stage {
+            Some((progress, saves)) if *saves && progress.has_stepped() => None,
+            Some((progress, _)) => {
+                progress.stopped();
+                let failure = Failure::stopped(self);
+                Some(Failure {
+                    error: format!("stage `{}`: {}", progress.stage(), failure.error).into(),
+                    ..failure
+                })
+            }
+            None => Some(Failure { hint: String::new(), ..Failure::stopped_at(self, "before its end") }),
+        }
+    }
+
+    pub(super) fn at_work(&self, progress: &Arc<Progress>, saves: bool) -> AtWork<'_> {
+        *self.lock() = Work { stage: Some((progress.clone(), saves)), since: Some(Instant::now()) };
+        AtWork(self)
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Work> {
+        self.0.work.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Drop for AtWork<'_> {
+    fn drop(&mut self) {
+        *self.0.lock() = Work { stage: None, since: Some(Instant::now()) };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stop_request_keeps_the_signal_that_made_it() {
+        let stop = Stop::new();
+        assert_eq!(stop.requested(), None);
+        stop.clone().request(Exit::Terminated); // clones share
+        assert_eq!(stop.requested(), Some(Exit::Terminated));
+        assert_eq!(Failure::stopped(&stop).exit.code(), 143);
+    }
+}
