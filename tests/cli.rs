@@ -184,3 +184,43 @@ fn clicks_that_cannot_be_used_are_named_with_the_way_out() {
     let o = tiface(dir.path(), &["mask", "head", "--points", "a", "--point", "1,2,1"]);
     assert_eq!(code(&o), 2);
 }
+
+#[test]
+fn a_damaged_status_hides_no_other_run() {
+    let dir = tempfile::tempdir().unwrap();
+    for run in ["bad", "good"] {
+        std::fs::create_dir_all(dir.path().join(run).join("mask")).unwrap();
+    }
+    std::fs::write(dir.path().join("bad/mask/status.json"), "{\"state\": ").unwrap();
+    let o = tiface(dir.path(), &["status", "bad", "absent", "good"]);
+    assert_eq!(code(&o), 1);
+    let text = out(&o);
+    let rows = |run: &str| text.lines().filter(|l| l.starts_with(run)).count();
+    assert_eq!((rows("bad "), rows("absent "), rows("good ")), (8, 1, 8), "{text}");
+    assert_eq!(text.matches("UNREADABLE: ").count(), 2, "{text}");
+    assert!(text.contains("mask     UNREADABLE: `bad/mask/status.json`"), "{text}");
+    assert!(err(&o).contains("2 of these lines"), "{}", err(&o));
+    let o = tiface(dir.path(), &["status", "bad", "good", "--json"]);
+    assert_eq!((code(&o), out(&o).lines().filter(|l| l.contains("\"error\":")).count()), (1, 1));
+}
+
+#[test]
+fn escape_sequences_out_of_files_do_not_reach_the_terminal() {
+    let dir = tempfile::tempdir().unwrap();
+    let foul = "v 0 0 0\nv 1 0 0\nv 0 1 0\nmtllib \u{1b}[2J\u{9b}31m.mtl\nv \u{1b}]0;x\u{7}\nf 1 2 3\n";
+    std::fs::write(dir.path().join("t.obj"), foul).unwrap();
+    std::fs::create_dir_all(dir.path().join("run/mask")).unwrap();
+    let status = r#"{"state": "failed", "step": 1, "steps": 2, "rate": null, "eta_s": null, "elapsed_s": 1,
+        "device": "cpu", "pid": 1, "host": "h\u001b[31m", "error": "no\nrun  tface  done\u001b[1A", "updated": 0,
+        "fingerprint": {"format": 1, "settings": {}, "inputs": {}}}"#;
+    std::fs::write(dir.path().join("run/mask/status.json"), status).unwrap();
+    for words in [&["check", "t.obj"][..], &["status", "run"], &["check", "\u{1b}[2J.obj"]] {
+        let o = tiface(dir.path(), words);
+        let both = out(&o) + &err(&o);
+        let acts = |c: &char| c.is_control() && *c != '\n';
+        assert_eq!(both.chars().find(acts), None, "{both:?}");
+    }
+    let text = out(&tiface(dir.path(), &["status", "run"]));
+    assert!(text.contains(r"failed: no\nrun  tface  done\u001b[1A"), "{text}");
+    assert_eq!(text.lines().count(), 8, "{text}");
+}

@@ -2,6 +2,7 @@
 
 use super::ending::{Ending, say};
 use super::options::Common;
+use super::plain::one_line;
 use crate::capture::{self, CaptureOptions, Split};
 use crate::geom::{Bvh, Camera, Mesh};
 use crate::io::{self, Limits};
@@ -136,7 +137,7 @@ pub(super) fn go(
     } else {
         let uv = match (&report.uv, &problem) {
             (Some(uv), _) => format!("\ntexture\n{uv}"),
-            (None, Some(e)) => format!("texture              NOT LOOKED AT: {e}\n"),
+            (None, Some(e)) => format!("texture              NOT LOOKED AT: {}\n", one_line(e)),
             (None, None) => String::new(),
         };
         format!("{report}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())

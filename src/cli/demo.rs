@@ -29,7 +29,8 @@ pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, 
     // the cameras are written last: where they are, everything is
     if !io::is_file(&capture.join("transforms.json")) {
         if common.dry_run {
-            screen.note(&format!("would photograph a synthetic head into `{}`", capture.display()));
+            screen
+                .note("capture", &format!("would photograph a synthetic head into `{}`", capture.display()));
             return Ok(Exit::Done);
         }
         make(&capture, screen)?;
@@ -45,10 +46,10 @@ pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, 
 fn make(capture: &Path, screen: &Screen) -> Result<(), Ending> {
     let options = SyntheticOptions::default();
     let views = options.train + options.test;
-    screen.note(&format!("capture: photographing a synthetic head from {views} sides"));
+    screen.note("capture", &format!("photographing a synthetic head from {views} sides"));
     let start = Instant::now();
     io::create_folder(capture)?;
     write_capture(capture, &options).map_err(|e| Ending::cannot(e.to_string(), e.hint()))?;
-    screen.note(&format!("capture: done in {}", duration(start.elapsed().as_secs_f64())));
+    screen.note("capture", &format!("done in {}", duration(start.elapsed().as_secs_f64())));
     Ok(())
 }

@@ -1,5 +1,6 @@
 //! How a command ends when it does not end well.
 
+use super::plain::plain;
 use crate::config::ConfigError;
 use crate::io::{ReadError, WriteError};
 use crate::pipeline::PipelineError;
@@ -68,10 +69,10 @@ impl From<WriteError> for Ending {
     }
 }
 
-/// Prints data to stdout. A reader that has gone away (`| head`) is not an error.
+/// Prints data to stdout, as [`plain`] text. A reader that has gone away (`| head`) is not an error.
 pub(super) fn say(text: &str) -> Result<(), Ending> {
     let mut out = std::io::stdout().lock();
-    let written = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    let written = out.write_all(plain(text).as_bytes()).and_then(|()| out.flush());
     match written {
         Err(e) if e.kind() != ErrorKind::BrokenPipe => {
             Err(Ending::cannot(format!("stdout cannot be written: {e}"), "check where it leads"))

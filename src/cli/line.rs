@@ -24,7 +24,7 @@ pub(super) fn go(
 ) -> Result<Exit, Ending> {
     let target = Target::find(common, path)?;
     if target.guessed {
-        screen.note(&format!("using the run `{}`", target.run.display()));
+        screen.note("run", &format!("using `{}`", target.run.display()));
     }
     let work = Work { common, until, require, synthetic: false, fallback: None, screen, stop };
     work.on(&target, extra)

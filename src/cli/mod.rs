@@ -12,6 +12,7 @@ mod inspect;
 mod line;
 mod options;
 mod page;
+mod plain;
 mod screen;
 mod signals;
 mod status;

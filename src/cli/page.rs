@@ -38,14 +38,14 @@ pub(super) fn go(
         io::real_path(&own).is_ok_and(|p| io::real_path(&capture.root).is_ok_and(|r| p.starts_with(r)));
     let html = match points {
         None if inside && io::is_file(&own) => click_page(&capture, Some(&own)).or_else(|e| {
-            screen.note(&format!("page: warning: {e}; the page starts without those clicks"));
+            screen.note("page: warning", &format!("{e}; the page starts without those clicks"));
             click_page(&capture, None)
         })?,
         points => click_page(&capture, points)?,
     };
     let out = common.out.clone().unwrap_or_else(|| format!("{}_clicks.html", capture.name).into());
     if common.dry_run {
-        screen.note(&format!("would write a page to click on to `{}`", out.display()));
+        screen.note("page", &format!("would write a page to click on to `{}`", out.display()));
         return Ok(Exit::Done);
     }
     if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {

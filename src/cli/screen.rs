@@ -2,6 +2,7 @@
 
 use super::ending::Ending;
 use super::options::Common;
+use super::plain::indented;
 use crate::run::{Event, Observer};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Map, Value, json};
@@ -46,10 +47,10 @@ impl Screen {
         self.0.clone()
     }
 
-    /// A remark for people.
-    pub fn note(&self, text: &str) {
+    /// A remark for people: about what, and what.
+    pub fn note(&self, head: &str, text: &str) {
         if !self.0.quiet {
-            self.0.line(text);
+            self.0.line(head, text);
         }
     }
 
@@ -62,33 +63,28 @@ impl Screen {
             let event = if asked { "stopped" } else { "error" };
             self.0.object(json!({"event": event, "exit": exit.code(), "message": message, "hint": hint}));
         }
-        let text = match (asked, hint.is_empty()) {
-            (true, true) => format!("stopped: {message}"),
-            (true, false) => format!("stopped: {message}; {hint}"),
-            (false, _) => {
-                let paint = |code: &str, word: &str| {
-                    if self.0.colored { format!("\x1b[{code}m{word}\x1b[0m") } else { word.to_string() }
-                };
-                let mut text = format!("{}: {message}", paint("1;31", "error"));
-                if !hint.is_empty() {
-                    text += &format!("\n\n{}: {hint}", paint("1;36", "hint"));
-                }
-                text
-            }
+        if asked {
+            let way = if hint.is_empty() { String::new() } else { format!("; {hint}") };
+            return self.note("stopped", &format!("{message}{way}"));
+        }
+        let paint = |code: &str, word: &str| {
+            if self.0.colored { format!("\x1b[{code}m{word}\x1b[0m") } else { word.to_string() }
         };
-        // `--quiet` leaves errors only
-        if !(asked && self.0.quiet) {
-            self.0.line(&text);
+        self.0.line(&paint("1;31", "error"), message);
+        if !hint.is_empty() {
+            self.0.line(&format!("\n{}", paint("1;36", "hint")), hint);
         }
     }
 }
 
 impl Inner {
-    /// Above the moving line, if there is one. A closed stderr is nothing to complain about.
-    fn line(&self, text: &str) {
+    /// Above the moving line, if there is one: a word of ours, and a text that may quote files. A closed stderr is
+    /// nothing to complain about.
+    fn line(&self, head: &str, text: &str) {
+        let text = indented(text);
         let bar = self.state.lock().unwrap_or_else(PoisonError::into_inner).bar.clone();
         let print = || {
-            let _ = writeln!(std::io::stderr(), "{text}");
+            let _ = writeln!(std::io::stderr(), "{head}: {text}");
         };
         match bar {
             Some(bar) => bar.suspend(print),
@@ -156,7 +152,7 @@ impl Observer for Inner {
                 let bar = self.state.lock().unwrap_or_else(PoisonError::into_inner).bar.clone();
                 match bar {
                     Some(bar) => bar.set_message(text),
-                    None if !self.json && self.due(PLAIN, false) => self.line(&format!("{stage}: {text}")),
+                    None if !self.json && self.due(PLAIN, false) => self.line(stage, &text),
                     None => {}
                 }
             }
@@ -167,21 +163,21 @@ impl Observer for Inner {
                         json!({"event": "done", "stage": stage, "elapsed_s": elapsed_s, "summary": summary}),
                     );
                 } else if !self.quiet {
-                    self.line(&format!("{stage}: done in {}", duration(elapsed_s)));
+                    self.line(stage, &format!("done in {}", duration(elapsed_s)));
                 }
             }
             Event::Skipped { stage } => {
                 if self.json {
                     self.object(json!({"event": "skipped", "stage": stage}));
                 } else if !self.quiet {
-                    self.line(&format!("{stage}: already done"));
+                    self.line(stage, "already done");
                 }
             }
             Event::Note { stage, text } => {
                 if self.json {
                     self.object(json!({"event": "note", "stage": stage, "text": text}));
                 } else if !self.quiet {
-                    self.line(&format!("{stage}: {text}"));
+                    self.line(stage, text);
                 }
             }
             Event::Warning { stage, text } => {
@@ -189,7 +185,7 @@ impl Observer for Inner {
                     self.object(json!({"event": "warning", "stage": stage, "text": text}));
                 }
                 if !self.quiet {
-                    self.line(&format!("{stage}: warning: {text}"));
+                    self.line(&format!("{stage}: warning"), text);
                 }
             }
         }

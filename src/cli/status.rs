@@ -2,6 +2,7 @@
 
 use super::ending::{Ending, say};
 use super::options::Common;
+use super::plain::one_line;
 use super::screen::{duration, figure};
 use crate::io;
 use crate::pipeline::STAGES;
@@ -19,19 +20,38 @@ pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<Exit, Ending> {
         return Err(Ending::cannot("there are no runs under `runs/`", "name a run folder"));
     }
     let mut text = String::new();
+    let mut damaged = 0;
     for run in &all {
-        if !io::is_folder(run) {
-            return Err(Ending::cannot(format!("`{}` is not a folder", run.display()), "name a run folder"));
-        }
-        for stage in STAGES {
-            text += &line(common, run, stage)?;
+        let stages = if io::is_folder(run) { STAGES } else { &["–"] };
+        for stage in stages {
+            text += &line(common, run, stage).unwrap_or_else(|e| {
+                damaged += 1;
+                if common.json {
+                    format!("{}\n", json!({"run": run, "stage": stage, "error": e.message}))
+                } else {
+                    row(run, stage, &format!("UNREADABLE: {}", e.message))
+                }
+            });
         }
     }
     say(&text)?;
+    if damaged > 0 {
+        return Err(Ending::cannot(
+            format!("{damaged} of these lines could not be told"),
+            "name run folders; `tiface run RUN --fresh STAGE` makes a stage anew",
+        ));
+    }
     Ok(Exit::Done)
 }
 
+fn row(run: &Path, stage: &str, words: &str) -> String {
+    format!("{:<24} {stage:<8} {}\n", one_line(&run.display().to_string()), one_line(words))
+}
+
 fn line(common: &Common, run: &Path, stage: &str) -> Result<String, Ending> {
+    if !io::is_folder(run) {
+        return Err(Ending::cannot(format!("`{}` is not a folder", run.display()), ""));
+    }
     let folder = run.join(stage);
     let status = read_status(&folder)?;
     // the record is the truth: it is written after the status that says "done"
@@ -67,5 +87,5 @@ fn line(common: &Common, run: &Path, stage: &str) -> Result<String, Ending> {
             words + &format!(" (process {} on {})", s.pid, s.host)
         }
     };
-    Ok(format!("{:<24} {stage:<8} {words}\n", run.display().to_string()))
+    Ok(row(run, stage, &words))
 }
