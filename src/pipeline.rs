@@ -86,6 +86,10 @@ pub enum PipelineError {
         /// The way out.
         hint: String,
     },
+    /// The device that fields are to be learned on.
+    #[cfg(feature = "cpu")]
+    #[error(transparent)]
+    Device(#[from] crate::field::DeviceError),
     /// Settings of several tables that contradict each other.
     #[error("`{key}` {problem}")]
     Settings {
@@ -104,6 +108,8 @@ impl PipelineError {
         match self {
             PipelineError::Run(e) => e.exit(),
             PipelineError::Settings { .. } => Exit::Usage,
+            #[cfg(feature = "cpu")]
+            PipelineError::Device(_) => Exit::Usage,
             _ => Exit::Cannot,
         }
     }
@@ -114,6 +120,8 @@ impl PipelineError {
             PipelineError::Capture(e) => e.hint(),
             PipelineError::Run(e) => e.hint(),
             PipelineError::Read(e) => e.hint(),
+            #[cfg(feature = "cpu")]
+            PipelineError::Device(_) => "choose another with `--device`".into(),
             PipelineError::Settings { hint, .. } | PipelineError::Clicks { hint, .. } => hint.clone(),
         }
     }
@@ -160,9 +168,7 @@ pub struct Line<'a> {
 impl<'a> Line<'a> {
     /// Opens the capture and reads every byte of it once, for its digest. Nothing is written.
     pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>, PipelineError> {
-        if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
-            return Err(PipelineError::Settings { key, problem, hint: hint.into() });
-        }
+        feasible(config)?;
         let mut capture = capture::open(Path::new(&config.capture.path), &capture_options(config))?;
         set_aside(&mut capture, config.capture.fit_views)?;
         let digest = capture_digest(&capture)?;
@@ -214,6 +220,16 @@ impl<'a> Line<'a> {
             None => Ok(()),
         }
     }
+}
+
+/// Refuses settings that contradict each other, and a device that this build cannot learn on.
+pub fn feasible(config: &Config) -> Result<(), PipelineError> {
+    if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
+        return Err(PipelineError::Settings { key, problem, hint: hint.into() });
+    }
+    #[cfg(feature = "cpu")]
+    crate::field::device(&config.device)?;
+    Ok(())
 }
 
 /// Takes every `every`-th training view, in name order, out of training: from the middle of each

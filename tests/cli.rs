@@ -160,6 +160,7 @@ fn a_page_to_click_on_is_one_file_without_a_run() {
     let page = page.replace("http://www.w3.org/2000/svg", "");
     assert!(page.contains("data:image/jpeg;base64,") && !page.contains("http:") && !page.contains("https:"));
     assert!(!dir.path().join("runs").exists());
+    std::fs::create_dir(dir.path().join("a")).unwrap();
     let o = tiface(dir.path(), &["mask", "head", "--page", "--out", "a/b.html", "--json"]);
     assert!(out(&o).contains("b.html") && dir.path().join("a/b.html").is_file(), "{}", err(&o));
 }
@@ -223,4 +224,51 @@ fn escape_sequences_out_of_files_do_not_reach_the_terminal() {
     let text = out(&tiface(dir.path(), &["status", "run"]));
     assert!(text.contains(r"failed: no\nrun  tface  done\u001b[1A"), "{text}");
     assert_eq!(text.lines().count(), 8, "{text}");
+}
+
+#[test]
+fn an_out_or_a_device_that_cannot_be_is_refused_before_anything_begins() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    for (words, expected, said) in [
+        (&["mesh", "head", "--out", "head.fbx"][..], 2, "end it in .glb, .obj, .ply, or in `/`"),
+        (&["run", "head", "--out", "head.stl"], 2, ".json"),
+        (&["metrics", "head", "--out", "m.glb"], 2, "end it in .json"),
+        (&["render", "head", "--out", "turn"], 2, "with `/` at its end"),
+        (&["mesh", "head", "--out", "absent/head.glb"], 1, "no folder `absent`"),
+        (
+            &["run", "head", "--out", "h.glb", "--set", "render.method=tface", "--set", "ensemble.members="],
+            2,
+            "no mesh",
+        ),
+        (&["iface", "head", "--device", "wgpu:0"], 2, "`wgpu:0` has no training kernels"),
+        (&["demo", "--device", "wgpu:0"], 2, "`wgpu:0` has no training kernels"),
+        (&["demo", "--out", "head.fbx"], 2, "head.fbx"),
+        (&["check", "head.glb", "--out", "x/"], 2, "`check` makes nothing"),
+    ] {
+        for dry in [&["--dry-run"][..], &[]] {
+            let o = tiface(dir.path(), &[words, dry].concat());
+            assert_eq!(code(&o), expected, "{words:?}: {}", err(&o));
+            assert!(err(&o).contains(said), "{words:?}: {}", err(&o));
+        }
+    }
+    let o = tiface(dir.path(), &["mesh", "head", "--out", "new/", "--dry-run"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    let left: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+    assert_eq!(left, ["head"]);
+}
+
+#[test]
+fn what_out_received_is_told_and_nothing_else_is_written_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    let o = tiface(dir.path(), &["mask", "head", "--out", "masks/"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    assert!(out(&o).contains("out       masks/\n"), "{}", out(&o));
+    assert!(dir.path().join("masks/scene.json").is_file() && !dir.path().join("masks/done.json").exists());
+    let o = tiface(dir.path(), &["mask", "runs/head", "--out", "runs/head/copy/"]);
+    assert_eq!(code(&o), 2, "{}", err(&o));
+    assert!(!dir.path().join("runs/head/copy").exists());
 }

@@ -3,11 +3,13 @@
 use super::ending::Ending;
 use super::line::Work;
 use super::options::Common;
+use super::out::Out;
 use super::screen::{Screen, duration};
 use super::target::Target;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::Preset;
 use crate::io;
+use crate::pipeline::feasible;
 use crate::run::{Exit, Stop};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -26,6 +28,11 @@ baseline.rays = 2048
 pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, Ending> {
     let run = common.run.clone().unwrap_or_else(|| PathBuf::from("runs/demo"));
     let capture = run.join(CAPTURE);
+    let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
+    let fallback = Some((Preset::Draft, SHORTER));
+    // what is wrong with the command line is told before the head is photographed
+    let out = Out::find(common.out.as_deref(), "run")?;
+    feasible(&common.resolve(saved.as_deref(), fallback, &[])?)?;
     // the cameras are written last: where they are, everything is
     if !io::is_file(&capture.join("transforms.json")) {
         if common.dry_run {
@@ -35,11 +42,10 @@ pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, 
         }
         make(&capture, screen)?;
     }
-    let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
     // repeated without options, the demo goes on as it was begun
     let target = Target { capture: Some(io::real_path(&capture)?), saved, run, guessed: false };
-    let fallback = Some((Preset::Draft, SHORTER));
-    let work = Work { common, until: "metrics", require: &[], synthetic: true, fallback, screen, stop };
+    let (product, until) = ("run", "metrics");
+    let work = Work { common, product, until, out, require: &[], synthetic: true, fallback, screen, stop };
     work.on(&target, &[])
 }
 

@@ -3,6 +3,7 @@
 use super::demo::CAPTURE;
 use super::ending::{Ending, say};
 use super::options::Common;
+use super::out::Out;
 use super::screen::{Screen, figure};
 use super::target::Target;
 use crate::config::{Config, MeshFormat, Preset};
@@ -10,30 +11,37 @@ use crate::io;
 use crate::pipeline::{Line, STAGES};
 use crate::run::{Done, Exit, Run, Stop};
 use serde_json::{Value, json};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-/// Works on the run that `path` and the options mean, up to the stage `until`.
+/// Works on the run that `path` and the options mean, up to the stage `until`, for a command's `product`.
 pub(super) fn go(
     common: &Common,
     path: Option<&Path>,
+    product: &str,
     until: &str,
     require: &[String],
     extra: &[(String, String, String)],
     screen: &Screen,
     stop: &Stop,
 ) -> Result<Exit, Ending> {
+    let out = Out::find(common.out.as_deref(), product)?;
     let target = Target::find(common, path)?;
     if target.guessed {
         screen.note("run", &format!("using `{}`", target.run.display()));
     }
-    let work = Work { common, until, require, synthetic: false, fallback: None, screen, stop };
+    let work = Work { common, product, until, out, require, synthetic: false, fallback: None, screen, stop };
     work.on(&target, extra)
 }
 
 /// A command on the line.
 pub(super) struct Work<'a> {
     pub common: &'a Common,
+    /// What the command makes: `run` (all there is), `export`, or the stage.
+    pub product: &'a str,
+    /// The last stage that it needs.
     pub until: &'a str,
+    /// Where the product goes as well.
+    pub out: Option<Out>,
     pub require: &'a [String],
     /// Is it the demo head, whose surface is known?
     pub synthetic: bool,
@@ -57,6 +65,16 @@ impl Work<'_> {
         // the demo's own runs are recognised when their stages are run one by one, too
         let synthetic = self.synthetic || is_demo(&config, &run);
         let line = Line::open(&config, &run, synthetic)?;
+        if let Some(out) = &self.out {
+            out.is_outside(run.dir())?;
+            let mesh = matches!(out, Out::File(_, ending) if mesh_format(ending).is_some());
+            if mesh && !line.order(self.until).contains(&"mesh") {
+                return Err(Ending::usage(
+                    "no mesh is made with these settings, so `--out` has none to write",
+                    "use `tiface mesh --out head.glb`",
+                ));
+            }
+        }
         if self.common.dry_run {
             return self.outlook(&line);
         }
@@ -65,10 +83,11 @@ impl Work<'_> {
         }
         line.remember(self.until)?;
         let done = reconstruct(&line, self.until)?;
-        if let Some(out) = &self.common.out {
-            self.copy(&line, &run, out)?;
-        }
-        self.closing(&run, &done)?;
+        let written = match &self.out {
+            Some(out) => self.copy(&line, &run, out)?,
+            None => Vec::new(),
+        };
+        self.closing(&run, &done, &written)?;
         bars.iter().try_for_each(|bar| bar.check(&done))?;
         Ok(Exit::Done)
     }
@@ -96,55 +115,59 @@ impl Work<'_> {
         Ok(Exit::Done)
     }
 
-    /// Puts the command's product where `--out` says.
-    fn copy(&self, line: &Line, run: &Run, out: &Path) -> Result<(), Ending> {
-        let ending = out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
-        let format = match ending.as_str() {
-            "glb" => Some(MeshFormat::Glb),
-            "obj" => Some(MeshFormat::Obj),
-            "ply" => Some(MeshFormat::Ply),
-            _ => None,
-        };
-        match (self.until, format) {
-            ("baseline" | "tface", None) if ending == "th" => write(out, &published(line, self.until)?),
-            ("mesh" | "metrics" | "render", Some(format)) if line.order(self.until).contains(&"mesh") => {
-                let stem = out.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
+    /// Puts the command's product where `--out` says, and says what was written.
+    fn copy(&self, line: &Line, run: &Run, out: &Out) -> Result<Vec<PathBuf>, Ending> {
+        match out {
+            Out::File(file, ending) if let Some(format) = mesh_format(ending) => {
+                let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
                 let exported =
                     line.read_product()?.files(format, &line.export(), line.mesh_config(), stem)?;
                 exported.warnings.iter().for_each(|w| run.warn("mesh", w));
                 let files = exported.files;
                 // the mesh names its pictures: it comes last, and under the name that was asked for
+                let mut written = vec![file.clone()];
                 for (name, bytes) in files.iter().skip(1).rev() {
-                    write(&out.with_file_name(name), bytes)?;
+                    written.push(file.with_file_name(name));
+                    io::write_atomic(&written[written.len() - 1], bytes)?;
                 }
-                write(out, &files[0].1)
+                io::write_atomic(file, &files[0].1)?;
+                return Ok(written);
             }
-            ("mesh", None) => Err(Ending::usage(
-                format!("`{}`: the ending picks the format, and this is none", out.display()),
-                "end it in .glb, .obj or .ply",
-            )),
-            (stage, None) => {
-                // fields, and pictures that only another stage can read, stay where they are
-                let fields = ["baseline", "tface", "iface", CAPTURE];
-                match stage {
-                    "metrics" => copy_folder(run.dir(), out, &fields),
-                    _ => copy_folder(&run.path(stage), out, &["float"]),
-                }
+            Out::File(file, ending) if ending == "json" => {
+                copy_file(&run.path("metrics/metrics.json"), file)?;
+                return Ok(vec![file.clone()]);
             }
-            (stage, Some(_)) => Err(Ending::usage(
-                format!("the product of `{stage}` is no mesh"),
-                "use `tiface mesh --out head.glb`",
-            )),
+            Out::File(..) => {}
+            Out::Folder(folder) => io::create_folder(folder)?,
         }
+        let to = out.file(&format!("{}.th", self.until));
+        match (out, self.product) {
+            (Out::File(..), _) | (_, "export") => {
+                io::write_atomic(&to, &published(line, self.until)?)?;
+                return Ok(vec![to]);
+            }
+            // fields, and pictures that only another stage can read, stay where they are
+            (Out::Folder(folder), "run") => {
+                copy_folder(run.dir(), folder, &["baseline", "tface", "iface", CAPTURE])?
+            }
+            (Out::Folder(folder), stage) => {
+                copy_folder(&run.path(stage), folder, &["float", "parts"])?;
+                if stage == "metrics" {
+                    copy_file(&run.path("report.html"), &folder.join("report.html"))?;
+                }
+            }
+        }
+        Ok(vec![out.file("")])
     }
 
     /// Where everything is, and how good it is.
-    fn closing(&self, run: &Run, done: &[(&'static str, Done)]) -> Result<(), Ending> {
+    fn closing(&self, run: &Run, done: &[(&'static str, Done)], written: &[PathBuf]) -> Result<(), Ending> {
         let of = |name: &str| done.iter().find(|(n, _)| *n == name).map(|(_, d)| &d.summary);
         if self.common.json {
             let stages: serde_json::Map<String, Value> =
                 done.iter().map(|(n, d)| (n.to_string(), d.summary.clone())).collect();
-            return say(&format!("{}\n", json!({"event": "result", "run": run.dir(), "stages": stages})));
+            let result = json!({"event": "result", "run": run.dir(), "out": written, "stages": stages});
+            return say(&format!("{result}\n"));
         }
         if self.common.quiet {
             return Ok(());
@@ -167,6 +190,9 @@ impl Work<'_> {
             }
         } else if of("mesh").is_none() && of("render").is_none() {
             row("run", format!("{}", run.dir().display()));
+        }
+        for path in written {
+            row("out", format!("{}", path.display()));
         }
         say(&text)
     }
@@ -242,12 +268,18 @@ fn is_demo(config: &Config, run: &Run) -> bool {
     io::real_path(&made).is_ok_and(|made| made == Path::new(&config.capture.path))
 }
 
-/// One file, and the folder it is in.
-fn write(out: &Path, bytes: &[u8]) -> Result<(), Ending> {
-    if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
-        io::create_folder(folder)?;
+/// The format that an ending means.
+fn mesh_format(ending: &str) -> Option<MeshFormat> {
+    match ending {
+        "glb" => Some(MeshFormat::Glb),
+        "obj" => Some(MeshFormat::Obj),
+        "ply" => Some(MeshFormat::Ply),
+        _ => None,
     }
-    Ok(io::write_atomic(out, bytes)?)
+}
+
+fn copy_file(from: &Path, to: &Path) -> Result<(), Ending> {
+    Ok(io::write_atomic(to, &io::read_bytes(from, &io::Limits::default())?)?)
 }
 
 /// All files but those that tell of the work, and all folders but those named; deeper down none but
@@ -256,8 +288,7 @@ fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<(), Ending> {
     io::create_folder(to)?;
     for name in io::list_files(from)? {
         if !["done.json", "status.json", "log.jsonl"].contains(&name.as_str()) {
-            let bytes = io::read_bytes(&from.join(&name), &io::Limits::default())?;
-            io::write_atomic(&to.join(&name), &bytes)?;
+            copy_file(&from.join(&name), &to.join(&name))?;
         }
     }
     for folder in io::list_folders(from)? {

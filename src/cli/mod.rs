@@ -11,6 +11,7 @@ mod ending;
 mod inspect;
 mod line;
 mod options;
+mod out;
 mod page;
 mod plain;
 mod screen;
@@ -22,6 +23,7 @@ use crate::run::{Exit, Stop};
 use clap::{Args, CommandFactory, Parser, Subcommand};
 use ending::Ending;
 use options::Common;
+use out::Out;
 use screen::Screen;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -376,20 +378,24 @@ impl Cli {
             });
             given.collect()
         };
-        let line = |place: &Place, until: &str, require: &[String], extra: &[_]| {
-            line::go(common, place.path.as_deref(), until, require, extra, screen, stop)
+        let works = |place: &Place, product: &str, until: &str, require: &[String], extra: &[_]| {
+            line::go(common, place.path.as_deref(), product, until, require, extra, screen, stop)
         };
+        let line = |place: &Place, stage: &str, extra: &[_]| works(place, stage, stage, &[], extra);
+        let nothing = |command: &str| Out::none(common.out.as_deref(), command);
         match &self.command {
-            Command::Run { place, clicks, require } => line(place, "metrics", require, &clicks.keys()?),
+            Command::Run { place, clicks, require } => {
+                works(place, "run", "metrics", require, &clicks.keys()?)
+            }
             Command::Demo => demo::go(common, screen, stop),
-            Command::Inspect { capture } => inspect::go(common, capture),
+            Command::Inspect { capture } => nothing("inspect").and_then(|()| inspect::go(common, capture)),
             Command::Mask { place, clicks, page: true } => {
                 page::go(common, place.path.as_deref(), clicks.points.as_deref(), screen)
             }
-            Command::Mask { place, clicks, page: false } => line(place, "mask", &[], &clicks.keys()?),
-            Command::Baseline { place } => line(place, "baseline", &[], &[]),
-            Command::Tface { place } => line(place, "tface", &[], &[]),
-            Command::Iface { place } => line(place, "iface", &[], &[]),
+            Command::Mask { place, clicks, page: false } => line(place, "mask", &clicks.keys()?),
+            Command::Baseline { place } => line(place, "baseline", &[]),
+            Command::Tface { place } => line(place, "tface", &[]),
+            Command::Iface { place } => line(place, "iface", &[]),
             Command::Mesh { place, format, frame, triangles, texture, lobes, normal_map, no_cap } => {
                 let given = |flag: bool, value: &str| flag.then(|| value.to_owned());
                 let extra = keys(&[
@@ -401,7 +407,7 @@ impl Cli {
                     ("--normal-map", "mesh.normal_map", &given(*normal_map, "true")),
                     ("--no-cap", "mesh.cap", &given(*no_cap, "false")),
                 ]);
-                line(place, "mesh", &[], &extra)
+                line(place, "mesh", &extra)
             }
             Command::Render { place, cameras, method, format, background } => {
                 let extra = keys(&[
@@ -410,7 +416,7 @@ impl Cli {
                     ("--format", "render.format", format),
                     ("--background", "render.background", background),
                 ]);
-                line(place, "render", &[], &extra)
+                line(place, "render", &extra)
             }
             Command::Ensemble { place, members, weights, fit, correct } => {
                 let extra = keys(&[
@@ -419,14 +425,12 @@ impl Cli {
                     ("--fit", "ensemble.fit", fit),
                     ("--correct", "ensemble.correct", correct),
                 ]);
-                line(place, "ensemble", &[], &extra)
+                line(place, "ensemble", &extra)
             }
-            Command::Metrics { place, require } => line(place, "metrics", require, &[]),
+            Command::Metrics { place, require } => works(place, "metrics", "metrics", require, &[]),
             Command::Export { place, field } => match (field.as_str(), &common.out) {
-                ("tface" | "baseline", Some(out)) if out.extension().is_some_and(|e| e == "th") => {
-                    line(place, field, &[], &[])
-                }
-                ("tface" | "baseline", _) => {
+                ("tface" | "baseline", Some(_)) => works(place, "export", field, &[], &[]),
+                ("tface" | "baseline", None) => {
                     Err(Ending::usage("no file to export to is named", "name one: `--out model.th`"))
                 }
                 _ => Err(Ending::usage(
@@ -435,13 +439,17 @@ impl Cli {
                 )),
             },
             Command::Check { mesh, require, against, seen_by } => {
+                nothing("check")?;
                 check::go(common, mesh, require, against.as_deref(), seen_by.as_deref())
             }
-            Command::Status { runs } => status::go(common, runs),
+            Command::Status { runs } => nothing("status").and_then(|()| status::go(common, runs)),
             Command::Config { place, explain } => {
+                nothing("config")?;
                 config::go(common, place.path.as_deref(), explain.as_deref())
             }
-            Command::Completions { shell } => completions::go(*shell, &mut Cli::command()),
+            Command::Completions { shell } => {
+                nothing("completions").and_then(|()| completions::go(*shell, &mut Cli::command()))
+            }
         }
     }
 }

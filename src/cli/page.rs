@@ -2,13 +2,14 @@
 
 use super::ending::{Ending, say};
 use super::options::Common;
+use super::out::Out;
 use super::screen::Screen;
 use crate::capture;
 use crate::io;
 use crate::pipeline::{PipelineError, capture_options, click_page};
 use crate::run::Exit;
 use serde_json::json;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Writes the page for a capture. Clicks that are there already, `points` or the capture's own `prompts.json`, are in
 /// it.
@@ -18,6 +19,7 @@ pub(super) fn go(
     points: Option<&Path>,
     screen: &Screen,
 ) -> Result<Exit, Ending> {
+    let asked = Out::find(common.out.as_deref(), "page")?;
     let Some(path) = path else {
         return Err(Ending::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
     };
@@ -43,12 +45,13 @@ pub(super) fn go(
         })?,
         points => click_page(&capture, points)?,
     };
-    let out = common.out.clone().unwrap_or_else(|| format!("{}_clicks.html", capture.name).into());
+    let name = format!("{}_clicks.html", capture.name);
+    let out = asked.as_ref().map_or_else(|| PathBuf::from(&name), |out| out.file(&name));
     if common.dry_run {
         screen.note("page", &format!("would write a page to click on to `{}`", out.display()));
         return Ok(Exit::Done);
     }
-    if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
+    if let Some(Out::Folder(folder)) = &asked {
         io::create_folder(folder)?;
     }
     io::write_atomic(&out, html.as_bytes())?;

@@ -23,7 +23,7 @@ pub enum DeviceError {
     #[error("device `{0}` is not known here; this build trains on: cpu")]
     Unknown(String),
     /// Known, but without training kernels.
-    #[error("device `{0}` has no training kernels yet; use `--device cpu`")]
+    #[error("device `{0}` has no training kernels yet; this build trains on: cpu")]
     NoKernels(String),
 }
 

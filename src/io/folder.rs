@@ -91,6 +91,19 @@ fn ends_with_newline(file: &mut File) -> std::io::Result<bool> {
     Ok(last[0] == b'\n')
 }
 
+/// May files be made in this folder, as far as can be known without making one?
+#[cfg(unix)]
+pub fn is_writable(folder: &Path) -> bool {
+    use rustix::fs::{Access, access};
+    access(folder, Access::WRITE_OK | Access::EXEC_OK).is_ok()
+}
+
+/// May files be made in this folder, as far as can be known without making one?
+#[cfg(not(unix))]
+pub fn is_writable(folder: &Path) -> bool {
+    fs::metadata(folder).is_ok_and(|m| !m.permissions().readonly())
+}
+
 /// Bytes an ordinary user may still write on the disk that holds `path`; `None` where the system
 /// does not tell.
 #[cfg(unix)]

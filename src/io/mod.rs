@@ -15,7 +15,8 @@ mod write;
 
 pub use self::exr::{ExrImage, read_exr_channels, read_exr_depth, read_exr_normals, write_exr};
 pub use self::folder::{
-    Lock, LockError, append, clear_folder, create_folder, free_bytes, list_folders, modified, remove_file,
+    Lock, LockError, append, clear_folder, create_folder, free_bytes, is_writable, list_folders, modified,
+    remove_file,
 };
 pub use self::json::parse_json;
 pub use self::npy::{Npy, NpyValues, parse_npy, read_npy};
@@ -256,6 +257,11 @@ fn read_capped(path: &Path, limit: u64, what: &'static str) -> Result<Vec<u8>, R
 /// Is there a regular file (through links)?
 pub fn is_file(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|m| m.is_file())
+}
+
+/// Is there anything by this name, even a link that leads nowhere?
+pub fn exists(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok()
 }
 
 /// Is there a folder (through links)?

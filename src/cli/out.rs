@@ -1,0 +1,132 @@
+//! `--out`: where the product of a command goes as well. One rule for all of them, and checked before anything begins.
+//!
+//! An ending that the product has is a file of that kind; a folder, there already or named with a `/` at its end,
+//! takes the product under its own names; all else is refused.
+
+use super::ending::Ending;
+use crate::io;
+use std::path::{Path, PathBuf};
+
+/// A place that can be written.
+#[derive(Debug, PartialEq)]
+pub(super) enum Out {
+    /// One file, and the ending that says which, in small letters.
+    File(PathBuf, String),
+    /// A folder; made if it is not there.
+    Folder(PathBuf),
+}
+
+/// The endings of what a command makes.
+fn endings(product: &str) -> &'static [&'static str] {
+    match product {
+        "run" => &["glb", "obj", "ply", "json"],
+        "mesh" => &["glb", "obj", "ply"],
+        "metrics" => &["json"],
+        "export" | "tface" | "baseline" => &["th"],
+        "page" => &["html"],
+        _ => &[],
+    }
+}
+
+impl Out {
+    /// Where `out` is for the product of a command, which is called as the command is. Nothing is written.
+    pub fn find(out: Option<&Path>, product: &str) -> Result<Option<Out>, Ending> {
+        let Some(out) = out else { return Ok(None) };
+        let shown = out.display();
+        if io::is_folder(out) {
+            return writable(out).map(|()| Some(Out::Folder(out.into())));
+        }
+        let folder = out.to_string_lossy().ends_with(std::path::is_separator);
+        let ending = out.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+        let known = endings(product);
+        if !folder && !known.contains(&ending.as_str()) {
+            let list: Vec<String> = known.iter().map(|e| format!(".{e}")).collect();
+            let hint = match list.len() {
+                0 => "name a folder, with `/` at its end".to_string(),
+                _ => format!("end it in {}, or in `/` for a folder", list.join(", ")),
+            };
+            return Err(Ending::usage(format!("`--out {shown}`: `{product}` makes no such file"), hint));
+        }
+        if io::exists(out) && (folder || !io::is_file(out)) {
+            let what = if folder { "folder" } else { "regular file" };
+            return Err(Ending::cannot(format!("`--out {shown}` is no {what}"), "choose another name"));
+        }
+        writable(out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))?;
+        Ok(Some(if folder { Out::Folder(out.into()) } else { Out::File(out.into(), ending) }))
+    }
+
+    /// Refused for a command that makes nothing.
+    pub fn none(out: Option<&Path>, command: &str) -> Result<(), Ending> {
+        match out {
+            Some(_) => Err(Ending::usage(format!("`{command}` makes nothing for `--out`"), "leave it out")),
+            None => Ok(()),
+        }
+    }
+
+    /// Refuses a folder inside the run that would be copied into it.
+    pub fn is_outside(&self, run: &Path) -> Result<(), Ending> {
+        let Out::Folder(folder) = self else { return Ok(()) };
+        let there = folder
+            .ancestors()
+            .find_map(|f| io::real_path(if f.as_os_str().is_empty() { Path::new(".") } else { f }).ok());
+        match (there, io::real_path(run)) {
+            (Some(there), Ok(run)) if there.starts_with(&run) => {
+                let text = format!("`--out {}` lies in the run itself", folder.display());
+                Err(Ending::usage(text, "choose a folder beside the run"))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The file to write: the one that was named, or `name` in the folder.
+    pub fn file(&self, name: &str) -> PathBuf {
+        match self {
+            Out::File(file, _) => file.clone(),
+            Out::Folder(folder) => folder.join(name),
+        }
+    }
+}
+
+fn writable(folder: &Path) -> Result<(), Ending> {
+    let shown = folder.display();
+    if !io::is_folder(folder) {
+        return Err(Ending::cannot(format!("there is no folder `{shown}` to write to"), "make it first"));
+    }
+    if !io::is_writable(folder) {
+        return Err(Ending::cannot(
+            format!("nothing may be written into the folder `{shown}`"),
+            "choose a folder you may write to",
+        ));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_out_means_is_known_before_anything_begins() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| format!("{}/{name}", dir.path().display());
+        std::fs::create_dir(at("there.glb")).unwrap();
+        std::fs::write(at("plain"), "").unwrap();
+        let find = |name: &str, product: &str| Out::find(Some(Path::new(&at(name))), product);
+        let code = |name: &str, product: &str| find(name, product).unwrap_err().exit.code();
+        assert_eq!(find("a.GLB", "mesh").unwrap(), Some(Out::File(at("a.GLB").into(), "glb".into())));
+        assert_eq!(find("m.json", "metrics").unwrap(), Some(Out::File(at("m.json").into(), "json".into())));
+        for (name, product) in [("new/", "mesh"), ("there.glb", "render"), ("new.d/", "page")] {
+            assert_eq!(find(name, product).unwrap(), Some(Out::Folder(at(name).into())));
+        }
+        for (name, product) in [("a.fbx", "mesh"), ("a.stl", "run"), ("a", "render"), ("a.glb", "metrics")] {
+            assert_eq!(code(name, product), 2, "{name}");
+        }
+        for (name, product) in [("absent/a.glb", "mesh"), ("absent/new/", "run"), ("plain/", "mask")] {
+            assert_eq!(code(name, product), 1, "{name}");
+        }
+        let run = dir.path().join("there.glb");
+        assert!(find("there.glb/", "run").unwrap().unwrap().is_outside(&run).is_err());
+        assert!(find("there.glb/new/", "run").unwrap().unwrap().is_outside(&run).is_err());
+        assert!(find("new/", "run").unwrap().unwrap().is_outside(&run).is_ok());
+    }
+}
