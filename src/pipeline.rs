@@ -49,7 +49,7 @@ pub use surface::{Exact, Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
 
 use crate::capture::scene::Scene;
-use crate::capture::{self, Capture, CaptureError, CaptureOptions, MaskChoice, Split, View};
+use crate::capture::{self, Capture, CaptureError, CaptureOptions, MaskChoice};
 use crate::config::{Config, MaskMeaning, MaskSource};
 use crate::io::{self, Limits};
 #[cfg(feature = "cpu")]
@@ -139,7 +139,7 @@ pub fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>
             "iface" => line.iface()?,
             "mesh" => line.mesh(&fields)?,
             "render" => line.render(&fields)?,
-            "ensemble" => line.ensemble()?,
+            "ensemble" => line.ensemble(&fields)?,
             _ => line.metrics()?,
         };
         done.push((name, stage));
@@ -169,8 +169,7 @@ impl<'a> Line<'a> {
     /// Opens the capture and reads every byte of it once, for its digest. Nothing is written.
     pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>, PipelineError> {
         feasible(config)?;
-        let mut capture = capture::open(Path::new(&config.capture.path), &capture_options(config))?;
-        set_aside(&mut capture, config.capture.fit_views)?;
+        let capture = capture::open(Path::new(&config.capture.path), &capture_options(config))?;
         let digest = capture_digest(&capture)?;
         let clicks = clicks::clicks(&config.mask, &capture, &run.path("mask").join(mask::CLICKS))?;
         let of_file = |file: &str| -> Result<String, PipelineError> {
@@ -229,30 +228,6 @@ pub fn feasible(config: &Config) -> Result<(), PipelineError> {
     }
     #[cfg(feature = "cpu")]
     crate::field::device(&config.device)?;
-    Ok(())
-}
-
-/// Takes every `every`-th training view, in name order, out of training: from the middle of each
-/// such row, so that the views around it stay. Test views are not touched. 0 for none.
-fn set_aside(capture: &mut Capture, every: usize) -> Result<(), PipelineError> {
-    if every == 0 {
-        return Ok(());
-    }
-    let mut train: Vec<&mut View> = capture.views.iter_mut().filter(|v| v.split == Split::Train).collect();
-    train.sort_by(|a, b| a.name.cmp(&b.name));
-    let total = train.len();
-    let mut aside = 0;
-    for view in train.into_iter().skip(every / 2).step_by(every) {
-        view.split = Split::Val;
-        aside += 1;
-    }
-    if aside == 0 || 2 * aside > total {
-        return Err(PipelineError::Settings {
-            key: "capture.fit_views",
-            problem: format!("is {every}, which sets aside {aside} of {total} training views"),
-            hint: "8 sets every 8th aside; at least one, and no more than half of them".into(),
-        });
-    }
     Ok(())
 }
 

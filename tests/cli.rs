@@ -89,7 +89,9 @@ fn a_dry_run_names_only_the_stages_a_command_needs() {
     assert_eq!(stages(&["mesh"]), "mask iface mesh");
     assert_eq!(stages(&["render", "--with", "tface"]), "mask tface render");
     assert_eq!(stages(&["render", "--with", "iface"]), "mask iface render");
-    assert_eq!(stages(&["run"]), "mask baseline tface iface mesh render ensemble metrics");
+    assert_eq!(stages(&["run"]), "mask tface iface mesh render ensemble metrics");
+    let paper = stages(&["run", "--preset", "paper"]);
+    assert_eq!(paper, "mask baseline tface iface mesh render ensemble metrics");
     assert!(!dir.path().join("runs").exists());
 }
 
@@ -98,16 +100,16 @@ fn a_blend_that_cannot_be_made_is_refused_before_anything_is_learned() {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
     write_capture(&dir.path().join("head"), &options).unwrap();
-    let o = tiface(dir.path(), &["ensemble", "head", "--fit", "global"]);
+    let o = tiface(dir.path(), &["ensemble", "head", "--set", "capture.tiles=0"]);
     assert_eq!(code(&o), 2);
     assert!(
-        err(&o).contains("no view is set aside") && err(&o).contains("capture.fit_views=8"),
+        err(&o).contains("nothing to fit them on") && err(&o).contains("capture.tiles=0.04"),
         "{}",
         err(&o)
     );
     let o = tiface(dir.path(), &["run", "head", "--set", "render.method=volume"]);
     assert_eq!(code(&o), 2);
-    assert!(err(&o).contains("names baseline, which render.method does not make"), "{}", err(&o));
+    assert!(err(&o).contains("names tface, which render.method does not make"), "{}", err(&o));
     let o = tiface(dir.path(), &["export", "head"]);
     assert_eq!(code(&o), 2);
     assert!(err(&o).contains("--out model.th"), "{}", err(&o));

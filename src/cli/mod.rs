@@ -121,7 +121,6 @@ enum Command {
   tiface run captures/002_00 --run /data/002_00 --preset paper --seed 7
   tiface run captures/002_00 --points prompts.json  masks from clicks on a few photographs
   tiface run runs/002_00 --fresh mesh --set mesh.resolution=1024
-  tiface run captures/002_00 --set capture.fit_views=8 --set ensemble.fit=global
   tiface run captures/002_00 --require psnr=28      exit code 3 if the views are worse than that")]
     Run {
         #[command(flatten)]
@@ -250,29 +249,23 @@ from different sides. The other views follow from the cameras.")]
         #[arg(long)]
         background: Option<String>,
     },
-    /// Stage: blend the views of baseline, T-Face and I-Face
+    /// Stage: blend the views of T-Face and I-Face, or of others
     #[command(after_long_help = "Examples:
   tiface ensemble runs/002_00
   tiface ensemble runs/002_00 --fresh ensemble --members tface,volume --weights 0.6,0.4
-  tiface ensemble captures/002_00 --set capture.fit_views=8 --fit regions --correct affine
+  tiface ensemble captures/002_00 --members tface,raycast
 
-With --fit or --correct, some training views must be set aside before anything is learned
-(capture.fit_views). The given weights are used as well, and metrics reports both blends.")]
+Without --weights, they are fitted on small squares of the training photographs that no field
+learned from (capture.tiles): the blend follows the better member.")]
     Ensemble {
         #[command(flatten)]
         place: Place,
         /// Whose views: baseline, tface, volume, raycast, textured
         #[arg(long, value_name = "LIST")]
         members: Option<String>,
-        /// Their shares, in that order; together 1
+        /// Their shares, in that order, together 1 [default: fitted]
         #[arg(long, value_name = "LIST")]
         weights: Option<String>,
-        /// A second blend with fitted weights: none, global or regions
-        #[arg(long, value_name = "HOW")]
-        fit: Option<String>,
-        /// Correct the members' colours for it: none, gain or affine
-        #[arg(long, value_name = "HOW")]
-        correct: Option<String>,
     },
     /// Stage: compare views and blends with held-out photographs
     Metrics {
@@ -418,12 +411,10 @@ impl Cli {
                 ]);
                 line(place, "render", &extra)
             }
-            Command::Ensemble { place, members, weights, fit, correct } => {
+            Command::Ensemble { place, members, weights } => {
                 let extra = keys(&[
                     ("--members", "ensemble.members", members),
                     ("--weights", "ensemble.weights", weights),
-                    ("--fit", "ensemble.fit", fit),
-                    ("--correct", "ensemble.correct", correct),
                 ]);
                 line(place, "ensemble", &extra)
             }

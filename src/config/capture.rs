@@ -15,8 +15,9 @@ pub struct CaptureConfig {
     pub unit_m: f64,
     /// Folder of masks inside the capture; empty to look for one.
     pub mask_dir: String,
-    /// Every so-many-th training view is not learned from: the blend is fitted on it. 0 for none.
-    pub fit_views: usize,
+    /// The share of the training photographs that no field learns from, in squares: the weights of the blend are
+    /// fitted there. 0 for none.
+    pub tiles: f64,
 }
 
 pub(super) const KEYS: &[Key] = &[
@@ -33,22 +34,23 @@ pub(super) const KEYS: &[Key] = &[
         "Folder of masks inside the capture, named like the photographs; empty to look for one.",
     ),
     Key::number(
-        "fit_views",
-        "Every so-many-th training view is learned from by no field, for ensemble.fit and ensemble.correct; 0: none.",
+        "tiles",
+        "Share of the training photographs' pixels that no field learns from, in small squares, so that the weights \
+         of the blend can be fitted there; 0: none.",
         0.0,
-        10_000.0,
+        0.25,
     ),
 ];
 
 impl CaptureConfig {
     /// The values a preset starts with.
-    pub fn preset(_: Preset) -> CaptureConfig {
+    pub fn preset(preset: Preset) -> CaptureConfig {
         CaptureConfig {
             path: String::new(),
             downscale: 1,
             unit_m: 1.0,
             mask_dir: String::new(),
-            fit_views: 0,
+            tiles: if preset == Preset::Paper { 0.0 } else { 0.04 },
         }
     }
 }

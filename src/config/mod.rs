@@ -24,7 +24,7 @@ mod vm;
 
 pub use baseline::BaselineConfig;
 pub use capture::CaptureConfig;
-pub use ensemble::{Correct, EnsembleConfig, Fit};
+pub use ensemble::EnsembleConfig;
 pub use iface::IfaceConfig;
 pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors};
 pub use mesh::{MeshConfig, MeshFormat, MeshFrame, TextureFormat};

@@ -107,7 +107,10 @@ impl RenderConfig {
     pub fn preset(preset: Preset) -> RenderConfig {
         RenderConfig {
             cameras: "test".into(),
-            method: vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast],
+            method: match preset {
+                Preset::Paper => vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast],
+                _ => vec![Method::Tface, Method::Volume, Method::Raycast],
+            },
             orbit_views: 36,
             samples: if preset == Preset::Draft { 1 } else { 2 },
             format: PictureFormat::Png,

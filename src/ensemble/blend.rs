@@ -1,9 +1,8 @@
 //! Blending with given weights: `Σ_k w_k · clamp(I_k, 0, 1)`, alpha like colour (the paper's §5).
 
-use super::members::{channels, normalised, same_size};
-use super::{EnsembleError, Members, RegionWeights};
+use super::members::normalised;
+use super::{EnsembleError, Members};
 use crate::image::Image;
-use glam::Vec3;
 use rayon::prelude::*;
 
 /// The members with one weight each, in float; round once, when it is written.
@@ -13,54 +12,21 @@ use rayon::prelude::*;
 /// than its members.
 pub fn blend(members: &Members, weights: &[f32]) -> Result<Image, EnsembleError> {
     let weights = normalised(weights, members.count())?;
-    Ok(each(members, |_, shares| shares.copy_from_slice(&weights)))
-}
-
-/// The members with weights that depend on the point of the head a pixel shows.
-///
-/// `points`: 3 channels, the point in scene coordinates ([-1, 1]³); not finite where there is none,
-/// which gives the global weights.
-pub fn blend_regions(
-    members: &Members,
-    points: &Image,
-    regions: &RegionWeights,
-) -> Result<Image, EnsembleError> {
-    check_points(members, points)?;
-    if regions.members() != members.count() {
-        return Err(EnsembleError::Members { found: members.count(), expected: regions.members() });
-    }
-    Ok(each(members, |i, shares| regions.write_at(point(points, i), shares)))
-}
-
-/// Are the points those of this view?
-pub(super) fn check_points(members: &Members, points: &Image) -> Result<(), EnsembleError> {
-    let what = || "the picture of points".to_string();
-    same_size(what, (points.width, points.height), members.size())?;
-    channels(what, points, 3)
-}
-
-pub(super) fn point(points: &Image, i: usize) -> Vec3 {
-    Vec3::from_slice(&points.data[3 * i..3 * i + 3])
-}
-
-fn each(members: &Members, weights: impl Fn(usize, &mut [f32]) + Sync) -> Image {
     let (width, height) = members.size();
     let mut out = Image::new(width, height, 4);
     let row = width.max(1) as usize;
     out.data.par_chunks_mut(4 * row).enumerate().for_each(|(y, line)| {
         let mut colors = vec![[0f32; 4]; members.count()];
-        let mut shares = vec![0f32; members.count()];
         for (x, o) in line.as_chunks_mut::<4>().0.iter_mut().enumerate() {
             members.read(y * row + x, &mut colors);
-            weights(y * row + x, &mut shares);
-            for (c, w) in colors.iter().zip(&shares) {
+            for (c, w) in colors.iter().zip(&weights) {
                 *o = std::array::from_fn(|j| o[j] + w * c[j]);
             }
             // the weights' last bit must not carry a white pixel past white
             *o = o.map(|v| v.min(1.0));
         }
     });
-    out
+    Ok(out)
 }
 
 #[cfg(test)]
@@ -138,27 +104,6 @@ mod tests {
         // nothing to cut by: nothing is cut
         let only = Members::new(&list[..1]).unwrap().cut(&[1.0]).unwrap();
         assert_eq!(blend(&only, &[1.0]).unwrap(), baseline);
-    }
-
-    #[test]
-    fn regions_choose_by_the_point_a_pixel_shows() {
-        let (a, b) = (flat(3, 1, [0.2, 0.2, 0.2, 1.0]), flat(3, 1, [0.6, 0.6, 0.6, 1.0]));
-        let weights = (0..8).map(|n| if n % 2 == 0 { vec![1.0, 0.0] } else { vec![0.0, 1.0] }).collect();
-        let regions = RegionWeights::new(2, vec![0.5, 0.5], weights).unwrap();
-        let mut points = Image::new(3, 1, 3);
-        points.data[0] = -1.0; // A alone
-        points.data[3] = 0.5; // a quarter A
-        points.data[6] = f32::NAN; // no point: halves
-        let members = Members::new(&[member("tface", &a), member("iface", &b)]).unwrap();
-        let out = blend_regions(&members, &points, &regions).unwrap();
-        for (x, expected) in [0.2, 0.5, 0.4].into_iter().enumerate() {
-            near(out.pixel(x as u32, 0), [expected, expected, expected, 1.0]);
-        }
-        let one = Members::new(&[member("tface", &a)]).unwrap();
-        let e = blend_regions(&one, &points, &regions).unwrap_err();
-        assert_eq!(e, EnsembleError::Members { found: 1, expected: 2 });
-        let e = blend_regions(&members, &Image::new(3, 1, 4), &regions).unwrap_err();
-        assert_eq!(e.to_string(), "the picture of points has 4 channels, expected 3");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! What can be wrong with members, weights and fits.
 
-use super::{MAX_MEMBERS, MAX_NODES};
+use super::MAX_MEMBERS;
 
 /// Why views cannot be blended, or a blend not be fitted.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -26,7 +26,7 @@ pub enum EnsembleError {
     /// Pictures of one view differ in size.
     #[error("{what} is {} × {} pixels, expected {} × {}", found.0, found.1, expected.0, expected.1)]
     Size {
-        /// Which picture: the member by name, the photograph, the weight map or the points.
+        /// Which picture: the member by name, the photograph or the weight map.
         what: String,
         /// Its width and height.
         found: (u32, u32),
@@ -82,34 +82,6 @@ pub enum EnsembleError {
     /// No pixel to fit on.
     #[error("no pixel counts: the weight maps of all views are empty")]
     NoPixels,
-    /// Too few views to leave one out.
-    #[error("{found} views cannot judge each other, at least 2 can")]
-    Views {
-        /// How many were given.
-        found: usize,
-    },
-    /// A grid of regions that cannot be.
-    #[error("a grid of {found} nodes along an axis cannot be used, expected 2 to {MAX_NODES}")]
-    Nodes {
-        /// As given.
-        found: usize,
-    },
-    /// A grid with nodes missing.
-    #[error("the weights of {found} nodes are given, expected {expected}")]
-    NodeCount {
-        /// How many are there.
-        found: usize,
-        /// The cube of the nodes along an axis.
-        expected: usize,
-    },
-    /// A pull that would make the fit meaningless.
-    #[error("the stiffness `{name}` is {value}, expected a finite number from 0 up")]
-    Stiffness {
-        /// Which one.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-    },
 }
 
 impl EnsembleError {
@@ -124,9 +96,7 @@ impl EnsembleError {
             EnsembleError::Size { .. } => {
                 "render the members again, all at the size of the photograph".into()
             }
-            EnsembleError::Channels { .. } => {
-                "members are RGBA renders, points have x, y and z; render the view again".into()
-            }
+            EnsembleError::Channels { .. } => "members are RGBA renders: render the view again".into(),
             EnsembleError::NotFinite { .. } => {
                 "its training has probably diverged: train that member again, or leave it out".into()
             }
@@ -137,11 +107,7 @@ impl EnsembleError {
                 format!("the same shares with sum 1 are {}", scaled.join(", "))
             }
             EnsembleError::WeightSum { .. } => "give at least one member a weight above 0".into(),
-            EnsembleError::NoPixels => "hold out views in which the head is seen and masked".into(),
-            EnsembleError::Views { .. } => "hold out two views or more for the blend".into(),
-            EnsembleError::Nodes { .. } => "5 suits a head".into(),
-            EnsembleError::NodeCount { .. } => "the file is not whole: fit the regions again".into(),
-            EnsembleError::Stiffness { .. } => "0.1 suits most captures".into(),
+            EnsembleError::NoPixels => "hold out pixels in which the head is seen and masked".into(),
         }
     }
 }

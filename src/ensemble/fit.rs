@@ -10,9 +10,9 @@ use super::{EnsembleError, Members, Target, simplex};
 /// The most members a fit can weigh.
 pub const MAX_MEMBERS: usize = 8;
 
-/// Sums over the views seen so far: `members²` numbers, so each view may keep its own.
+/// Sums over the pixels seen so far: `members²` numbers, so each view may keep its own.
 ///
-/// Give it views that were held out of training: on its own training views a member looks better
+/// Give it pixels that were held out of training: on those it learned from a member looks better
 /// than it is. Never test views.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fit {
@@ -33,11 +33,11 @@ impl Fit {
         }
     }
 
-    pub(super) fn empty(members: usize) -> Fit {
+    fn empty(members: usize) -> Fit {
         Fit { members, products: vec![0.0; members * members], pixels: 0.0 }
     }
 
-    /// Adds one view. Cut the members as they will be cut when they are blended.
+    /// Adds one view, or a part of it. Cut the members as they will be cut when they are blended.
     pub fn add(&mut self, members: &Members, target: &Target) -> Result<(), EnsembleError> {
         self.same_members(members.count())?;
         members.check(target)?;
@@ -87,32 +87,19 @@ impl Fit {
     }
 
     /// wᵀDw.
-    pub(super) fn error(&self, weights: &[f32]) -> f64 {
+    fn error(&self, weights: &[f32]) -> f64 {
         let m = self.members;
         let row = |k: usize| -> f64 { (0..m).map(|l| self.products[k * m + l] * weights[l] as f64).sum() };
         (0..m).map(|k| weights[k] as f64 * row(k)).sum()
     }
 
-    /// Mean over pairs of members of `Σ ρ |c_k − c_l|²`: how much there is to choose.
-    pub(super) fn disagreement(&self) -> f64 {
-        let m = self.members;
-        let d = |k: usize, l: usize| self.products[k * m + l];
-        let pairs = (0..m).flat_map(|k| (0..k).map(move |l| (k, l)));
-        let sum: f64 = pairs.map(|(k, l)| (d(k, k) + d(l, l) - 2.0 * d(k, l)).max(0.0)).sum();
-        sum / (m * (m - 1) / 2).max(1) as f64
-    }
-
-    pub(super) fn members(&self) -> usize {
-        self.members
-    }
-
-    pub(super) fn same_members(&self, found: usize) -> Result<(), EnsembleError> {
+    fn same_members(&self, found: usize) -> Result<(), EnsembleError> {
         let expected = self.members;
         if found == expected { Ok(()) } else { Err(EnsembleError::Members { found, expected }) }
     }
 
     #[inline]
-    pub(super) fn count(&mut self, weight: f64, errors: &[[f64; 3]]) {
+    fn count(&mut self, weight: f64, errors: &[[f64; 3]]) {
         for (k, a) in errors.iter().enumerate() {
             for (l, b) in errors.iter().enumerate() {
                 self.products[k * self.members + l] += weight * dot(a, b);
@@ -121,19 +108,48 @@ impl Fit {
         self.pixels += weight;
     }
 
-    pub(super) fn sum(&mut self, other: &Fit) {
+    fn sum(&mut self, other: &Fit) {
         self.products.iter_mut().zip(&other.products).for_each(|(a, b)| *a += b);
         self.pixels += other.pixels;
     }
 }
 
+/// The weights of least squared error over several views; all of one member where that member alone is no
+/// worse on views that had no say, each judged with the weights of the others.
+pub fn weigh(views: &[Fit]) -> Result<Vec<f32>, EnsembleError> {
+    let Some(first) = views.first() else { return Err(EnsembleError::NoPixels) };
+    let merged = |left_out: Option<usize>| {
+        let mut all = Fit::empty(first.members);
+        let kept = views.iter().enumerate().filter(|(i, _)| Some(*i) != left_out);
+        kept.map(|(_, view)| view).try_for_each(|view| all.merge(view))?;
+        Ok(all)
+    };
+    let all = merged(None)?;
+    let weights = all.solve()?;
+    let mut unseen = 0.0;
+    for (i, view) in views.iter().enumerate().filter(|(_, view)| view.pixels > 0.0) {
+        match merged(Some(i))?.solve() {
+            Ok(others) => unseen += view.error(&others),
+            // the only view with a pixel: nothing can judge it
+            Err(EnsembleError::NoPixels) => return Ok(weights),
+            Err(e) => return Err(e),
+        }
+    }
+    let alone = |k: usize| all.products[k * all.members + k];
+    let best = (0..all.members).min_by(|&a, &b| alone(a).total_cmp(&alone(b)));
+    Ok(match best.filter(|&k| unseen >= alone(k)) {
+        Some(best) => (0..all.members).map(|k| if k == best { 1.0 } else { 0.0 }).collect(),
+        None => weights,
+    })
+}
+
 #[inline]
-pub(super) fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
+fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 /// `−10 log10(error / (3 · pixels))`, if it is a number.
-pub(super) fn decibels(error: f64, pixels: f64) -> Option<f64> {
+fn decibels(error: f64, pixels: f64) -> Option<f64> {
     let value = -10.0 * (error / (3.0 * pixels)).log10();
     value.is_finite().then_some(value)
 }

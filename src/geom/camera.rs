@@ -134,6 +134,12 @@ impl Camera {
         }
     }
 
+    /// The camera of a part of the picture, which begins in column `x` of row `y`.
+    pub fn part(&self, x: u32, y: u32, width: u32, height: u32) -> Camera {
+        let (cx, cy) = (self.cx - x as f64, self.cy - y as f64);
+        Camera { width, height, cx, cy, ..self.clone() }
+    }
+
     /// The camera of the same picture at another size.
     pub fn resized(&self, width: u32, height: u32) -> Camera {
         let (sx, sy) = (width as f64 / self.width as f64, height as f64 / self.height as f64);

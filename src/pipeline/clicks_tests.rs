@@ -2,6 +2,7 @@
 
 use super::clicks::carried;
 use super::*;
+use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::Preset;
 use crate::image::Gray;

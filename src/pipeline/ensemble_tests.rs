@@ -1,13 +1,15 @@
 //! The stage `ensemble` on pictures made by hand.
 
-use super::{Line, pictures};
-use crate::capture::Split;
+use super::{Fields, Line, Radiance, Seen, Surface, pictures};
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
-use crate::config::{Background, Config, Correct, Fit, Method, Preset};
+use crate::capture::{Split, View};
+use crate::config::{Background, Config, Method, Preset};
+use crate::geom::{Camera, Ray};
 use crate::image::{Image, quantise};
 use crate::io;
 use crate::render::RenderedView;
-use crate::run::{Exit, Quiet, Run, Stop};
+use crate::run::{Exit, Failure, Quiet, Run, Stop};
+use glam::Vec3;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -50,7 +52,9 @@ fn pixel(run: &Run, file: &str, at: usize) -> [u8; 3] {
 #[test]
 fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     let dir = tempfile::tempdir().unwrap();
-    let config = config(&dir.path().join("head"));
+    let mut config = config(&dir.path().join("head"));
+    let paper = Config::preset(Preset::Paper);
+    (config.ensemble, config.render.method) = (paper.ensemble, paper.render.method);
     let run = run(dir.path());
     let line = Line::open(&config, &run, false).unwrap();
     line.mask().unwrap();
@@ -59,7 +63,7 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
         put(&run, "baseline", name, flat([0.2, 0.2, 0.2, 1.0]));
         put(&run, "tface", name, flat([0.402, 0.402, 0.402, 1.0]));
     }
-    let e = line.ensemble().unwrap_err();
+    let e = line.ensemble(&NoField).unwrap_err();
     let missing = format!("render/volume/float/{}.exr", names[0]);
     assert_eq!(
         e.to_string(),
@@ -73,93 +77,145 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     for name in &names {
         put(&run, "volume", name, flat([0.601, 0.601, 0.601, 1.0]));
     }
-    let done = line.ensemble().unwrap();
+    let done = line.ensemble(&NoField).unwrap();
     assert_eq!(done.summary["views"], 2);
     // 0.1 · 0.2 + 0.6 · 0.402 + 0.3 · 0.601 = 0.4415 → 112.58 → 113; bytes blended would give
     // 0.1 · 51 + 0.6 · 103 + 0.3 · 153 = 112.8, and truncated 112
     assert_eq!(quantise(0.4415), 113);
     assert_eq!(pixel(&run, &format!("ensemble/{}.png", names[1]), 77), [113; 3]);
     let weights = io::read_json(&run.path("ensemble/weights.json"), &io::Limits::default()).unwrap();
-    assert_eq!(weights["weights"], json!([0.1, 0.6, 0.3]));
-    assert!(weights["fitted"].is_null() && !run.path("ensemble/fitted").exists());
-    assert!(line.ensemble().unwrap().skipped);
+    assert_eq!((&weights["weights"], &weights["fitted"]), (&json!([0.1f32, 0.6f32, 0.3f32]), &json!(null)));
+    assert!(line.ensemble(&NoField).unwrap().skipped);
+}
+
+/// Nothing is asked for where weights are given.
+struct NoField;
+
+impl Fields for NoField {
+    fn surface(&self) -> Result<&dyn Surface, Failure> {
+        panic!("no field is asked for")
+    }
+
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+        panic!("no field is asked for")
+    }
+}
+
+/// A field that has learned every photograph by heart, each pixel `off` from what it should be.
+struct ByHeart {
+    views: Vec<(Camera, Image)>,
+    asked: std::sync::atomic::AtomicUsize,
+}
+
+impl ByHeart {
+    fn new(line: &Line, off: f32) -> ByHeart {
+        let scene = line.scene().unwrap();
+        let learned = |view: &View| {
+            let loaded = view.load(&io::Limits::default()).unwrap();
+            let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), Background::None);
+            let mut image = flat([0.0, 0.0, 0.0, 1.0]);
+            for (p, rgb) in image.data.as_chunks_mut::<4>().0.iter_mut().zip(&photo.rgb) {
+                (0..3).for_each(|k| p[k] = rgb[k] as f32 / 255.0 + off);
+            }
+            (view.camera.transformed(&scene.scene_from_world), image)
+        };
+        ByHeart { views: line.capture().views.iter().map(learned).collect(), asked: 0.into() }
+    }
+}
+
+impl Radiance for ByHeart {
+    fn see(&self, rays: &[Ray], _: Vec3) -> Vec<Seen> {
+        self.asked.fetch_add(rays.len(), std::sync::atomic::Ordering::Relaxed);
+        let see = |ray: &Ray| {
+            let own = |(camera, _): &&(Camera, Image)| camera.position.as_vec3().distance(ray.origin) < 1e-5;
+            let (camera, image) = self.views.iter().find(own).unwrap();
+            let (at, _) = camera.project(ray.origin + ray.direction).unwrap();
+            let p = image.pixel(at.x as u32, at.y as u32);
+            Seen { color: [p[0], p[1], p[2]], opacity: 1.0, ..Seen::default() }
+        };
+        rays.iter().map(see).collect()
+    }
+}
+
+/// T-Face and the baseline, of known errors.
+struct Two(ByHeart, ByHeart);
+
+impl Fields for Two {
+    fn surface(&self) -> Result<&dyn Surface, Failure> {
+        panic!("no distance is asked for")
+    }
+
+    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
+        Ok(if stage == "tface" { &self.0 } else { &self.1 })
+    }
 }
 
 #[test]
-fn a_fit_uses_the_views_set_aside_and_stands_beside_the_given_weights() {
-    for fit in [Fit::Global, Fit::Regions, Fit::None] {
+fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
+    // errors of one sign cannot be blended away: the better member takes all; of two signs, they cancel
+    for (tface, baseline, expected) in
+        [(0.02, 0.1, 1.0), (0.1, 0.02, 0.0), (0.05, -0.05, 0.5), (0.02, -0.06, 0.75)]
+    {
         let dir = tempfile::tempdir().unwrap();
         let mut config = config(&dir.path().join("head"));
-        config.capture.fit_views = 4;
-        config.render.method = vec![Method::Tface, Method::Volume];
-        config.ensemble.members = vec![Method::Tface, Method::Volume];
-        config.ensemble.weights = vec![0.5, 0.5];
-        config.ensemble.fit = fit;
-        config.ensemble.correct = if fit == Fit::Regions { Correct::None } else { Correct::Gain };
+        config.render.method = vec![Method::Tface, Method::Baseline];
+        config.ensemble.members = vec![Method::Tface, Method::Baseline];
         config.metrics.surface_points = 100;
         let run = run(dir.path());
         let line = Line::open(&config, &run, false).unwrap();
         line.mask().unwrap();
-        // T-Face is the photograph itself, too bright by a quarter where colours are corrected; I-Face
-        // is black inside the head. Test views are white: had they a say, T-Face would lose.
-        let gain = if fit == Fit::Regions { 1.0 } else { 1.25 };
-        let mut black = 0;
-        for view in &line.capture().views.clone() {
-            let (tface, volume) = match view.split {
-                Split::Train => continue,
-                Split::Test => (flat([1.0; 4]), flat([0.0, 0.0, 0.0, 1.0])),
-                Split::Val => {
-                    let loaded = view.load(&io::Limits::default()).unwrap();
-                    let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), Background::None);
-                    let mut exact = flat([0.0, 0.0, 0.0, 1.0]);
-                    for (p, rgb) in exact.data.as_chunks_mut::<4>().0.iter_mut().zip(&photo.rgb) {
-                        (0..3).for_each(|k| p[k] = (rgb[k] as f32 / 255.0 * gain).min(1.0));
-                    }
-                    black += 1;
-                    (exact, flat([0.0, 0.0, 0.0, 1.0]))
-                }
-            };
-            let name =
-                if view.split == Split::Val { format!("fit/{}", view.name) } else { view.name.clone() };
-            put(&run, "tface", &name, tface);
-            put(&run, "volume", &name, volume);
+        // what is rendered of test views says the opposite: had they a say, the worse member would win
+        let names: Vec<String> = line.capture().split(Split::Test).map(|v| v.name.clone()).collect();
+        for name in &names {
+            put(&run, "tface", name, flat([1.0; 4]));
+            put(&run, "baseline", name, flat([0.0, 0.0, 0.0, 1.0]));
         }
-        assert_eq!(black, 2);
-        let done = line.ensemble().unwrap();
-        let fitted = &done.summary["fitted"];
-        let name = line.capture().split(Split::Test).next().unwrap().name.clone();
-        // white and black in equal shares
-        assert_eq!(pixel(&run, &format!("ensemble/{name}.png"), 700), [128; 3]);
-        let better = pixel(&run, &format!("ensemble/fitted/{name}.png"), 700);
-        if fit == Fit::None {
-            // corrected by 1 / 1.25 = 0.8: 0.5 · 0.8 · 255 = 102
-            assert!((better[0] as i32 - 102).abs() <= 3, "{better:?}");
-            assert!(fitted.get("weights").is_none(), "{fitted}");
-        } else {
-            assert!(fitted["weights"][0].as_f64().unwrap() > 0.95, "{fitted}");
-            assert!(fitted["psnr_global"].as_f64() > fitted["psnr_given"].as_f64(), "{fitted}");
+        let fields = Two(ByHeart::new(&line, tface), ByHeart::new(&line, baseline));
+        let done = line.ensemble(&fields).unwrap().summary;
+        let first = done["weights"][0].as_f64().unwrap();
+        assert!((first - expected).abs() < 0.05, "{tface} {baseline}: {done}");
+        let found = &done["fitted"];
+        for member in ["tface", "baseline"] {
+            assert!(
+                found["psnr"].as_f64().unwrap() + 1e-6 > found["psnr_alone"][member].as_f64().unwrap(),
+                "{done}"
+            );
         }
-        if fit == Fit::Regions {
-            assert!(better[0] > 240 && fitted["psnr_regions"].is_f64(), "{better:?} {fitted}");
-            assert!(!run.path("ensemble/corrected").exists());
-        } else {
-            let corrected = pixel(&run, &format!("ensemble/corrected/tface/{name}.png"), 700);
-            assert!((corrected[0] as i32 - 204).abs() <= 5, "{corrected:?}"); // 0.8 · 255
-        }
-        // judged beside each other; a training view that was set aside is not judged
+        // white at the weight of T-Face
+        let shown = pixel(&run, &format!("ensemble/{}.png", names[0]), 700)[0] as f64;
+        assert!((shown - 255.0 * first).abs() < 1.0, "{shown} {first}");
+        // only squares are marched: 8 views of 32 × 40 pixels, one tile of 8 × 8 in each
+        assert!(fields.0.asked.into_inner() <= 8 * 64, "of 8 · 1280");
         let sets: Vec<String> = line.sets().into_iter().map(|s| s.name).collect();
-        let corrected = ["tface_corrected", "volume_corrected"].iter().filter(|_| fit != Fit::Regions);
-        let all = ["tface", "volume", "ensemble", "ensemble_fitted"].iter().chain(corrected);
-        assert_eq!(sets, all.copied().collect::<Vec<_>>());
-        let judged = line.comparable(&line.sets()[3]);
-        assert_eq!(judged.len(), 2);
-        assert!(judged.iter().all(|s| s.view.split == Split::Test));
-        let metrics = line.metrics().unwrap().summary;
-        assert!(metrics["ensemble"]["head"]["mean"]["psnr_masked"].is_f64(), "{metrics}");
-        // the blend is opaque all over, so is what is outside
-        let outside = metrics["ensemble"]["mean_square_opacity_outside"].as_f64().unwrap();
-        assert!((outside - 1.0).abs() < 1e-6, "{outside}");
+        assert_eq!(sets, ["tface", "baseline", "ensemble"]);
     }
+}
+
+#[test]
+fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut config = config(&dir.path().join("head"));
+    let run = run(dir.path());
+    let blind = |config: &Config| -> Vec<usize> {
+        let line = Line::open(config, &run, false).unwrap();
+        if !run.path("mask/scene.json").exists() {
+            line.mask().unwrap();
+        }
+        let views = line.train_views(&line.scene().unwrap(), true).unwrap();
+        let tiles = line.tiles();
+        for (view, (_, tiles)) in views.iter().zip(&tiles) {
+            let Some(valid) = &view.valid else { continue };
+            assert!(tiles.iter().flat_map(|t| t.pixels(SIZE.0)).all(|i| valid.values[i] == 0));
+        }
+        views
+            .iter()
+            .map(|v| v.valid.as_ref().map_or(0, |g| g.values.iter().filter(|x| **x == 0).count()))
+            .collect()
+    };
+    // one tile of 8 × 8 in each photograph, whose masks and cameras stay whole
+    assert_eq!(blind(&config), [64; 8]);
+    config.capture.tiles = 0.0;
+    assert_eq!(blind(&config), [0; 8]);
 }
 
 #[test]
@@ -177,18 +233,16 @@ fn what_cannot_be_blended_is_said_before_anything_is_learned() {
         (e.to_string(), e.hint())
     };
     let (text, hint) = error(&|c| c.render.method = vec![Method::Volume]);
-    assert_eq!(text, "`ensemble.members` names baseline, which render.method does not make");
-    assert!(hint.contains("tiface render --fresh render --with baseline,tface,volume"), "{hint}");
-    let (text, hint) = error(&|c| c.ensemble.fit = Fit::Global);
-    assert_eq!(text, "`ensemble.fit` asks for a fit of weights, but no view is set aside to fit it on");
-    assert!(hint.contains("capture.fit_views=8"), "{hint}");
-    let (text, _) = error(&|c| c.ensemble.correct = Correct::Affine);
-    assert!(text.starts_with("`ensemble.correct` asks for a correction of colours"), "{text}");
-    let (text, _) = error(&|c| c.ensemble.members.truncate(2));
+    assert_eq!(text, "`ensemble.members` names tface, which render.method does not make");
+    assert!(hint.contains("tiface render --fresh render --with tface,volume"), "{hint}");
+    let (text, hint) = error(&|c| c.capture.tiles = 0.0);
+    assert_eq!(text, "`ensemble.weights` is empty, but there is nothing to fit them on: capture.tiles is 0");
+    assert!(hint.contains("capture.tiles=0.04"), "{hint}");
+    let (text, _) = error(&|c| c.ensemble.weights = vec![0.1, 0.6, 0.3]);
     assert_eq!(text, "`ensemble.weights` has 3 weights for 2 members");
-    let (text, hint) = error(&|c| c.ensemble.weights = vec![1.0, 1.0, 2.0]);
+    let (text, hint) = error(&|c| c.ensemble.weights = vec![1.0, 3.0]);
     assert_eq!(text, "`ensemble.weights` sum to 4, expected 1");
-    assert!(hint.contains("0.2500, 0.2500, 0.5000"), "{hint}");
+    assert!(hint.contains("0.2500, 0.7500"), "{hint}");
     let (text, _) = error(&|c| c.render.float = false);
     assert!(text.starts_with("`render.float` is false"), "{text}");
     // no members: no blend, and nothing to complain about

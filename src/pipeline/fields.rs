@@ -1,11 +1,13 @@
 //! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
 
 use super::{Fields, Line, PipelineError, Radiance, Surface, bitmask, capture_failure, to_value};
+use crate::capture::View;
 use crate::capture::scene::Scene;
-use crate::capture::{Split, View};
 use crate::config::MaskUse;
+use crate::ensemble::Tile;
 use crate::field::pixels::TrainView;
 use crate::iface::{self, IFace, IfaceError};
+use crate::image::Gray;
 use crate::io::Limits;
 use crate::run::{Done, Exit, Failure};
 use crate::tface::{self, FieldMean, TfaceError};
@@ -83,20 +85,26 @@ impl Line<'_> {
             .map_err(|e| self.tface_failure(name, e))
     }
 
-    /// The photographs that are learned from, in the scene.
-    fn train_views(&self, scene: &Scene, masked: bool) -> Result<Vec<TrainView>, Failure> {
+    /// The photographs that are learned from, in the scene. Pixels of `capture.tiles` count as not valid.
+    pub(super) fn train_views(&self, scene: &Scene, masked: bool) -> Result<Vec<TrainView>, Failure> {
         let limits = Limits::default();
-        let train: Vec<&View> = self.capture.split(Split::Train).collect();
-        let view = |view: &&View| {
+        let view = |(view, tiles): &(&View, Vec<Tile>)| {
             let loaded = view.load(&limits).map_err(capture_failure)?;
+            let (width, height) = (loaded.photo.width, loaded.photo.height);
+            let mut valid = loaded.valid;
+            for tile in tiles {
+                let all = || Gray { width, height, values: vec![255; loaded.photo.rgb.len()] };
+                let values = &mut valid.get_or_insert_with(all).values;
+                tile.pixels(width).for_each(|i| values[i] = 0);
+            }
             Ok(TrainView {
                 camera: view.camera.transformed(&scene.scene_from_world),
                 photo: loaded.photo,
                 mask: loaded.mask.filter(|_| masked),
-                valid: loaded.valid,
+                valid,
             })
         };
-        train.par_iter().map(view).collect()
+        self.tiles().par_iter().map(view).collect()
     }
 
     fn iface_failure(&self, e: IfaceError) -> Failure {

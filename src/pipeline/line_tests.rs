@@ -1,6 +1,7 @@
 //! The line on the demo head.
 
 use super::*;
+use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::{Background, MeshFormat, MeshFrame, Method, Preset};
 use crate::run::{Quiet, Stop};
@@ -73,7 +74,7 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     let mesh = line.mesh(&exact).unwrap();
     assert_eq!(mesh.summary["closed"], true);
     line.render(&exact).unwrap();
-    line.ensemble().unwrap();
+    line.ensemble(&Never).unwrap();
     let metrics = line.metrics().unwrap();
 
     // a cell is 0.35 m / 128 = 2.7 mm = 1.1 % of the head; vertices lie on the surface, and the
@@ -99,7 +100,7 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     assert_eq!(metrics.summary["ensemble"]["head"], metrics.summary["raycast"]["head"]);
 
     // all of it again: nothing is loaded, nothing is done
-    for done in [line.mask(), line.mesh(&Never), line.render(&Never), line.ensemble(), line.metrics()] {
+    for done in [line.mask(), line.mesh(&Never), line.render(&Never), line.ensemble(&Never), line.metrics()] {
         assert!(done.unwrap().skipped);
     }
     line.report(&[("metrics", metrics)]).unwrap();
@@ -262,7 +263,10 @@ fn a_command_runs_what_its_stage_needs_and_nothing_else() {
     assert_eq!(order("render", &[Method::Volume]), "mask iface render");
     assert_eq!(order("render", &[Method::Raycast]), "mask iface mesh render");
     assert_eq!(order("ensemble", &[Method::Tface]), "mask tface render ensemble");
-    assert_eq!(order("metrics", &[]), STAGES.join(" "));
+    // the paper's baseline is learned where it is shown
+    assert_eq!(order("metrics", &[]), STAGES.join(" ").replace("baseline ", ""));
+    let shown = [Method::Baseline, Method::Tface, Method::Volume, Method::Raycast];
+    assert_eq!(order("metrics", &shown), STAGES.join(" "));
     // and only those that build on it are out of date with it
     let config = draft(dir.path());
     let line = Line::open(&config, &run, false).unwrap();
@@ -292,15 +296,13 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
     let all = STAGES.join(" ");
     assert_eq!(changed(&|c| c.mesh.resolution = 100), "mesh render ensemble metrics");
     assert_eq!(changed(&|c| c.tface.steps += 1), "tface render ensemble metrics");
-    assert_eq!(changed(&|c| c.baseline.steps += 1), "baseline render ensemble metrics");
+    assert_eq!(changed(&|c| c.baseline.steps += 1), "baseline");
     assert_eq!(changed(&|c| c.tface.checkpoint_s = 7.0), "");
-    assert_eq!(changed(&|c| c.ensemble.weights = vec![0.2, 0.5, 0.3]), "ensemble metrics");
+    assert_eq!(changed(&|c| c.ensemble.weights = vec![0.5, 0.5]), "ensemble metrics");
     assert_eq!(changed(&|c| c.seed = 7), all.replace("mask ", ""));
     assert_eq!(changed(&|c| c.capture.downscale = 2), all);
-    assert_eq!(changed(&|c| c.capture.fit_views = 4), all);
+    assert_eq!(changed(&|c| c.capture.tiles = 0.0), all.replace("mask ", ""));
     assert_eq!(changed(&|c| c.device = "cpu".into()), "");
-    // a fit needs its own views rendered
-    assert_eq!(changed(&|c| c.ensemble.fit = crate::config::Fit::Global), "render ensemble metrics");
     // what is imported counts, not where it lies
     let import = |name: &str| {
         let path = dir.path().join(name).to_str().unwrap().to_string();
@@ -331,29 +333,4 @@ fn what_is_not_rendered_does_not_shape_the_views() {
     assert_eq!(render(&|c| c.mesh.resolution = 100), base);
     assert_eq!(render(&|c| c.baseline.steps = 9), base);
     assert_ne!(render(&|c| c.tface.steps = 9), base);
-}
-
-#[test]
-fn views_set_aside_for_a_fit_are_training_views_and_never_test_views() {
-    let dir = tempfile::tempdir().unwrap();
-    capture(dir.path(), 9, 3);
-    let run = quiet(dir.path());
-    let splits = |every: usize| {
-        let mut config = draft(dir.path());
-        config.capture.fit_views = every;
-        let line = Line::open(&config, &run, false)?;
-        let names = |split| line.capture().split(split).map(|v| v.name.clone()).collect::<Vec<_>>();
-        Ok::<_, PipelineError>([Split::Train, Split::Val, Split::Test].map(names))
-    };
-    let [train, none, test] = splits(0).unwrap();
-    assert!(none.is_empty() && train.len() == 9 && test.len() == 3);
-    let [rest, aside, still] = splits(4).unwrap();
-    // of nine the third and the seventh
-    assert_eq!((aside.as_slice(), rest.len()), (&[train[2].clone(), train[6].clone()][..], 7));
-    assert_eq!(still, test);
-    for every in [1, 30] {
-        let e = splits(every).unwrap_err();
-        assert!(e.to_string().starts_with(&format!("`capture.fit_views` is {every}, which")), "{e}");
-        assert_eq!(e.exit().code(), 2);
-    }
 }

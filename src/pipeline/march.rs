@@ -70,22 +70,6 @@ pub(super) fn march(
     view
 }
 
-/// The points of the scene that a view's pixels show, from its depth in the world; not a number where
-/// it has none. 3 channels.
-pub(super) fn points(camera: &Camera, depth: &Image, world_from_scene: &Similarity) -> Image {
-    let (w, h) = (camera.width, camera.height);
-    let mut points = Image::new(w, h, 3);
-    let scale = world_from_scene.scale as f32;
-    let forward = camera.forward();
-    points.data.as_chunks_mut::<3>().0.par_iter_mut().zip(&depth.data).enumerate().for_each(|(i, (p, z))| {
-        let pixel = Vec2::new((i as u32 % w) as f32 + 0.5, (i as u32 / w) as f32 + 0.5);
-        let found = camera.ray(pixel).filter(|_| *z > 0.0);
-        let point = |ray: Ray| ray.origin + ray.direction * (z / scale / ray.direction.dot(forward));
-        *p = found.map_or([f32::NAN; 3], |ray| point(ray).to_array());
-    });
-    points
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -119,11 +103,6 @@ mod tests {
         // 3 scene units before the camera, 6 of the world; none where three quarters shine through
         assert!((view.depth.pixel(10, 199)[0] - 6.0).abs() < 1e-5);
         assert_eq!(view.depth.pixel(990, 0), [0.0]);
-        // pixel 0 lies half a picture left, less half a pixel: x = −3 · 499.5 / 1000
-        let points = points(&camera, &view.depth, &world_from_scene);
-        let p = Vec3::from_slice(points.pixel(0, 0));
-        assert!(p.distance(Vec3::new(-1.4985, 0.2985, 0.0)) < 1e-4, "{p}");
-        assert!(points.pixel(990, 0)[0].is_nan());
         let upright = march(&camera, &world_from_scene, true, see);
         assert_eq!(upright.normal.pixel(10, 5), [0.0, 0.0, 1.0]);
     }

@@ -2,7 +2,7 @@
 
 use super::{Line, PipelineError, against_truth, capture_failure, pictures, to_value};
 use crate::capture::{LoadedView, View};
-use crate::config::{Background, Correct};
+use crate::config::Background;
 use crate::image::{Gray, Image};
 use crate::io::{self, Limits};
 use crate::metrics::{Metrics, MetricsError, ViewMetrics, compare};
@@ -16,7 +16,7 @@ const NOTHING: u8 = 0;
 
 /// Pictures of one kind, one for each view.
 pub(super) struct Set {
-    /// What it is called in `metrics.json`: a member, `ensemble`, `ensemble_fitted`.
+    /// What it is called in `metrics.json`: a member, or `ensemble`.
     pub name: String,
     /// Where its pictures are.
     folder: PathBuf,
@@ -49,13 +49,6 @@ impl Line<'_> {
         let mut sets: Vec<Set> = methods.map(|m| set(m, &format!("render/{m}"))).collect();
         if !c.members.is_empty() {
             sets.push(set("ensemble", "ensemble"));
-        }
-        if c.fits() {
-            sets.push(set("ensemble_fitted", "ensemble/fitted"));
-        }
-        if c.fits() && c.correct != Correct::None {
-            let corrected = |m: &str| set(&format!("{m}_corrected"), &format!("ensemble/corrected/{m}"));
-            sets.extend(self.members().into_iter().map(corrected));
         }
         sets
     }

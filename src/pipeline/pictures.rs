@@ -28,18 +28,10 @@ pub(super) fn path(folder: &Path, name: &str, format: PictureFormat) -> PathBuf 
 }
 
 /// All files of a view: the pictures as shown, and the float one below `float`.
-pub(super) fn files(
-    folder: &Path,
-    name: &str,
-    shown: bool,
-    float: Option<&Path>,
-    format: PictureFormat,
-) -> Vec<PathBuf> {
+pub(super) fn files(folder: &Path, name: &str, float: Option<&Path>, format: PictureFormat) -> Vec<PathBuf> {
     let mut files: Vec<PathBuf> = float.map(|f| float_path(f, name)).into_iter().collect();
-    if shown {
-        files.push(path(folder, name, format));
-        files.extend((format == PictureFormat::Png).then(|| path(&folder.join("depth"), name, format)));
-    }
+    files.push(path(folder, name, format));
+    files.extend((format == PictureFormat::Png).then(|| path(&folder.join("depth"), name, format)));
     files
 }
 
@@ -136,11 +128,6 @@ pub(super) fn read_float(file: &Path) -> Result<Image, ReadError> {
     Ok(read.image)
 }
 
-/// The depth of a float view, in world units.
-pub(super) fn read_float_depth(file: &Path) -> Result<Image, ReadError> {
-    Ok(io::read_exr_channels(file, &[&CODED[4..]], &Limits::default())?.image)
-}
-
 /// Coded colour no longer multiplied by alpha.
 fn straight([r, g, b, a]: [f32; 4]) -> [f32; 4] {
     let k = if a > 0.0 { 1.0 / a } else { 0.0 };
@@ -233,7 +220,8 @@ mod tests {
         write_float(dir.path(), "left/a", &view).unwrap();
         let file = float_path(dir.path(), "left/a");
         assert_eq!(read_float(&file).unwrap(), view.color);
-        assert_eq!(read_float_depth(&file).unwrap(), view.depth);
+        let depth = io::read_exr_channels(&file, &[&["Z"]], &Limits::default()).unwrap().image;
+        assert_eq!(depth, view.depth);
         // and views without depth or normals are pictures, too
         view.depth = Image::new(0, 0, 1);
         for format in [PictureFormat::Png, PictureFormat::Exr] {

@@ -94,10 +94,14 @@ impl Line<'_> {
         let mut needs_bytes = 16 << 20;
         let needs = self.needs(name).into_iter();
         let mut inputs: Vec<_> = needs.map(|s| (s, self.plan(s).fingerprint.digest())).collect();
+        if ["baseline", "tface", "iface"].contains(&name) {
+            settings.insert("capture.tiles".into(), self.config.capture.tiles.to_string());
+        }
         match name {
             "mask" => {
                 settings.extend(self.config.values("capture"));
                 settings.remove("capture.path"); // where it lies does not matter, what it holds does
+                settings.remove("capture.tiles"); // masks are of whole photographs
                 inputs.push(("capture", self.digest.clone()));
                 match &self.clicks {
                     // where clicks and networks lie does not matter either, nor how much memory they get
@@ -147,9 +151,6 @@ impl Line<'_> {
             "render" => {
                 if !self.path_digest.is_empty() {
                     inputs.push(("cameras", self.path_digest.clone()));
-                }
-                if self.config.ensemble.fits() {
-                    settings.insert("views of ensemble.fit and ensemble.correct".into(), "true".into());
                 }
                 let each = if self.config.render.float { 12 + 10 } else { 12 };
                 let methods = self.config.render.method.len().max(1) as u64;

@@ -28,25 +28,9 @@ impl Line<'_> {
         Ok(self.run.stage(self.plan("render"), |stage| {
             let scene = self.scene_or_fail()?;
             let c = &self.config.render;
-            let whole = match c.method.contains(&Method::Raycast) {
-                true => Some(self.read_whole()?),
-                false => None,
-            };
-            let product = match c.method.contains(&Method::Textured) {
-                true => Some(self.textured()?),
-                false => None,
-            };
-            let eye = Eye {
-                fields,
-                whole: whole.as_ref().map(|w| (w, Bvh::new(&w.mesh))),
-                product: product.as_ref().map(|(product, pictures)| Shown::new(product, pictures)),
-                samples: c.samples,
-                world_from_scene: scene.scene_from_world.inverse(),
-                stop: self.run.stop(),
-            };
-            // what a blend is fitted on is kept in float only: it is no picture to be judged
-            let shown = self.cameras(&scene)?.into_iter().map(|c| (c, true));
-            let cameras: Vec<_> = shown.chain(self.fit_cameras().into_iter().map(|c| (c, false))).collect();
+            let meshes = self.meshes(&c.method)?;
+            let eye = self.eye(&scene, fields, &meshes);
+            let cameras = self.cameras(&scene)?;
             let background = pictures::behind(c.background);
             let total = (cameras.len() * c.method.len()) as u64;
             let mut done = 0;
@@ -54,9 +38,9 @@ impl Line<'_> {
             for &method in &c.method {
                 let (mut spent, mut made) = (Duration::ZERO, 0);
                 let folder = stage.folder().join(method.folder());
-                for (NamedCamera { name, camera }, shown) in &cameras {
-                    let float = (c.float || !shown).then(|| folder.join(pictures::FLOAT));
-                    let files = pictures::files(&folder, name, *shown, float.as_deref(), c.format);
+                for NamedCamera { name, camera } in &cameras {
+                    let float = c.float.then(|| folder.join(pictures::FLOAT));
+                    let files = pictures::files(&folder, name, float.as_deref(), c.format);
                     // an interrupted process left whole files or none, of the same settings
                     if !files.iter().all(|file| io::is_file(file)) {
                         let camera = camera.transformed(&scene.scene_from_world);
@@ -72,9 +56,7 @@ impl Line<'_> {
                             if let Some(background) = background {
                                 pictures::over(&mut view, background);
                             }
-                            if *shown {
-                                pictures::write(&folder, name, &view, c.format, self.config.capture.unit_m)?;
-                            }
+                            pictures::write(&folder, name, &view, c.format, self.config.capture.unit_m)?;
                         }
                     }
                     done += 1;
@@ -85,9 +67,27 @@ impl Line<'_> {
                 seconds.insert(method.folder().to_owned(), json!(per_view));
             }
             let methods: Vec<_> = c.method.iter().map(|m| m.folder()).collect();
-            let shown = cameras.iter().filter(|(_, shown)| *shown).count();
-            Ok(json!({"cameras": shown, "methods": methods, "seconds_per_view": seconds}))
+            Ok(json!({"cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds}))
         })?)
+    }
+
+    /// The meshes that these methods show.
+    pub(super) fn meshes(&self, methods: &[Method]) -> Result<Meshes, Failure> {
+        let whole = methods.contains(&Method::Raycast).then(|| self.read_whole()).transpose()?;
+        let product = methods.contains(&Method::Textured).then(|| self.textured()).transpose()?;
+        Ok(Meshes { whole, product })
+    }
+
+    /// What views are made with.
+    pub(super) fn eye<'e>(&'e self, scene: &Scene, fields: &'e dyn Fields, meshes: &'e Meshes) -> Eye<'e> {
+        Eye {
+            fields,
+            whole: meshes.whole.as_ref().map(|w| (w, Bvh::new(&w.mesh))),
+            product: meshes.product.as_ref().map(|(product, pictures)| Shown::new(product, pictures)),
+            samples: self.config.render.samples,
+            world_from_scene: scene.scene_from_world.inverse(),
+            stop: self.run.stop(),
+        }
     }
 
     /// The product and its texture, which it must have.
@@ -111,9 +111,7 @@ impl Line<'_> {
         let all: Vec<Camera> = self.capture.views.iter().map(|v| v.camera.clone()).collect();
         match self.config.render.cameras.as_str() {
             "test" => {
-                // views that a blend is fitted on cannot stand in for test views
-                let instead = if self.config.ensemble.fits() { Split::Train } else { Split::Val };
-                let mut splits = [Split::Test, instead, Split::Train].map(|s| self.of(s)).into_iter();
+                let mut splits = [Split::Test, Split::Val, Split::Train].map(|s| self.of(s)).into_iter();
                 Ok(splits.find(|cameras| !cameras.is_empty()).unwrap_or_default())
             }
             "train" => Ok(self.of(Split::Train)),
@@ -138,21 +136,16 @@ impl Line<'_> {
         }
     }
 
-    /// The cameras of the views that a blend is fitted on; none where nothing is fitted.
-    fn fit_cameras(&self) -> Vec<NamedCamera> {
-        let all = if self.config.ensemble.fits() { self.of(Split::Val) } else { Vec::new() };
-        all.into_iter().map(|c| NamedCamera { name: fit_name(&c.name), ..c }).collect()
-    }
-
     fn of(&self, split: Split) -> Vec<NamedCamera> {
         let named = |v: &View| NamedCamera { name: v.name.clone(), camera: v.camera.clone() };
         self.capture.split(split).map(named).collect()
     }
 }
 
-/// A folder of their own: a camera file may use a photograph's name for another camera.
-pub(super) fn fit_name(view: &str) -> String {
-    format!("fit/{view}")
+/// The meshes that some methods show.
+pub(super) struct Meshes {
+    whole: Option<Whole>,
+    product: Option<(Product, Pictures)>,
 }
 
 /// A textured mesh, ready to be looked at.
@@ -176,7 +169,7 @@ impl<'a> Shown<'a> {
 }
 
 /// What every view is made with.
-struct Eye<'a> {
+pub(super) struct Eye<'a> {
     fields: &'a dyn Fields,
     whole: Option<(&'a Whole, Bvh)>,
     product: Option<Shown<'a>>,
@@ -187,7 +180,7 @@ struct Eye<'a> {
 
 impl Eye<'_> {
     /// The view of a camera in scene coordinates, over nothing.
-    fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>, Failure> {
+    pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>, Failure> {
         Ok(match (method, &self.whole) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
