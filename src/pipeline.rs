@@ -169,7 +169,11 @@ impl<'a> Line<'a> {
     /// Opens the capture and reads every byte of it once, for its digest. Nothing is written.
     pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>, PipelineError> {
         feasible(config)?;
-        let capture = capture::open(Path::new(&config.capture.path), &capture_options(config))?;
+        let mut capture = capture::open(Path::new(&config.capture.path), &capture_options(config))?;
+        if synthetic {
+            // its folder is called after what it holds
+            capture.name = "demo".into();
+        }
         let digest = capture_digest(&capture)?;
         let clicks = clicks::clicks(&config.mask, &capture, &run.path("mask").join(mask::CLICKS))?;
         let of_file = |file: &str| -> Result<String, PipelineError> {

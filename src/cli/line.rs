@@ -6,7 +6,7 @@ use super::options::Common;
 use super::out::Out;
 use super::screen::{Screen, figure};
 use super::target::Target;
-use crate::config::{Config, MeshFormat, Preset};
+use crate::config::{Config, MeshFormat, NAMES, Preset, called};
 use crate::io;
 use crate::pipeline::{Line, STAGES};
 use crate::run::{Done, Exit, Run, Stop};
@@ -198,28 +198,20 @@ impl Work<'_> {
     }
 }
 
-/// What is judged, and what a person calls it.
-const JUDGED: [(&str, &str); 7] = [
-    ("baseline", "views of the baseline"),
-    ("tface", "views of T-Face"),
-    ("volume", "views of I-Face"),
-    ("raycast", "views of the mesh"),
-    ("textured", "views of the textured mesh"),
-    ("ensemble", "their blend"),
-    ("ensemble_fitted", "their fitted blend"),
-];
-
 /// How good the result is, one sentence per thing known.
 fn judgement(metrics: &Value) -> Vec<String> {
     let mut lines = Vec::new();
-    for (set, words) in JUDGED {
+    for (set, _) in NAMES {
         let mean = &metrics[set]["head"]["mean"];
         if let Some(psnr) = mean["psnr_masked"].as_f64().or(mean["psnr"].as_f64()) {
             let ssim = mean["ssim_masked"].as_f64().or(mean["ssim"].as_f64());
             let ssim = ssim.map(|s| format!(", SSIM {s:.4}")).unwrap_or_default();
             let masked = mean["psnr_masked"].is_f64();
             let region = if masked { "inside the mask" } else { "whole frame (no masks)" };
-            lines.push(format!("{words} against held-out photographs: PSNR {psnr:.2} dB{ssim}, {region}"));
+            lines.push(format!(
+                "{} against held-out photographs: PSNR {psnr:.2} dB{ssim}, {region}",
+                called(set)
+            ));
         }
     }
     let truth = &metrics["truth_percent_of_head"];
@@ -385,7 +377,7 @@ mod tests {
         assert_eq!(Bar::parse("beauty").unwrap_err().exit.code(), 2);
         let metrics = json!({
             "tface": {"head": {"mean": {"psnr_masked": 25.0}}},
-            "ensemble_fitted": {"head": {"mean": {"psnr_masked": 27.5}}},
+            "ensemble": {"head": {"mean": {"psnr_masked": 27.5}}},
             "truth_percent_of_head": {"accuracy_mean": 99.0},
         });
         let stages = [("mesh", done(json!({"closed": true}))), ("metrics", done(metrics))];
@@ -402,8 +394,9 @@ mod tests {
             "truth_percent_of_head": {"accuracy_mean": 0.312, "accuracy_p90": 0.7},
         }));
         assert_eq!(lines.len(), 3);
+        assert!(lines[0].starts_with("I-Face's mesh (raycast) against"), "{}", lines[0]);
         assert!(lines[0].contains("PSNR 28.12 dB, SSIM 0.9100"), "{}", lines[0]);
-        assert!(lines[1].contains("their blend") && lines[1].contains("30.00 dB"), "{}", lines[1]);
+        assert!(lines[1].starts_with("blend (ensemble)") && lines[1].contains("30.00 dB"), "{}", lines[1]);
         assert!(lines[2].contains("0.312 % of head height"), "{}", lines[2]);
     }
 }

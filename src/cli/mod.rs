@@ -238,8 +238,8 @@ from different sides. The other views follow from the cameras.")]
         /// test, train, orbit, or a file: a nerfstudio camera path or a transforms.json
         #[arg(long, value_name = "WHICH")]
         cameras: Option<String>,
-        /// Any of baseline, tface, volume (I-Face's field), raycast (its whole mesh)
-        /// and textured (head.glb as a viewer shows it), with commas
+        /// Any of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured
+        /// (head.glb, as a viewer shows it), with commas
         #[arg(long = "with", value_name = "LIST")]
         method: Option<String>,
         /// png or exr
@@ -260,7 +260,7 @@ learned from (capture.tiles): the blend follows the better member.")]
     Ensemble {
         #[command(flatten)]
         place: Place,
-        /// Whose views: baseline, tface, volume, raycast, textured
+        /// Whose views: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured (head.glb)
         #[arg(long, value_name = "LIST")]
         members: Option<String>,
         /// Their shares, in that order, together 1 [default: fitted]

@@ -18,8 +18,8 @@ pub struct EnsembleConfig {
 pub(super) const KEYS: &[Key] = &[
     Key::word(
         "members",
-        "A list of baseline, tface, volume (I-Face), raycast (its mesh) and textured \
-         (head.glb); an empty list for no blend.",
+        "A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb); an empty list for \
+         no blend.",
     ),
     Key::number(
         "weights",

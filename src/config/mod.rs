@@ -29,7 +29,7 @@ pub use iface::IfaceConfig;
 pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors};
 pub use mesh::{MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 pub use metrics::MetricsConfig;
-pub use render::{Background, Method, PictureFormat, RenderConfig};
+pub use render::{Background, Method, NAMES, PictureFormat, RenderConfig, called};
 pub use source::{ConfigError, Place, Sources};
 pub use vm::{DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 

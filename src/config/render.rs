@@ -20,16 +20,29 @@ pub enum Method {
     Textured,
 }
 
+/// Pictures that are judged, in the order of the line: their word in folders, the configuration and
+/// `metrics.json`, and what they are called. The first five are those of [`Method`].
+pub const NAMES: [(&str, &str); 6] = [
+    ("baseline", "baseline"),
+    ("tface", "T-Face"),
+    ("volume", "I-Face"),
+    ("raycast", "I-Face's mesh"),
+    ("textured", "head.glb"),
+    ("ensemble", "blend"),
+];
+
+/// What a person reads of pictures with this word: `I-Face (volume)`; the word itself where it is no other.
+pub fn called(word: &str) -> String {
+    match NAMES.iter().find(|(w, title)| *w == word && title != w) {
+        Some((_, title)) => format!("{title} ({word})"),
+        None => word.into(),
+    }
+}
+
 impl Method {
     /// The folder of its pictures below `render/`, and its word in the configuration.
     pub fn folder(self) -> &'static str {
-        match self {
-            Method::Baseline => "baseline",
-            Method::Tface => "tface",
-            Method::Volume => "volume",
-            Method::Raycast => "raycast",
-            Method::Textured => "textured",
-        }
+        NAMES[self as usize].0
     }
 
     /// The stage whose result it shows.
@@ -92,8 +105,8 @@ pub(super) const KEYS: &[Key] = &[
     ),
     Key::word(
         "method",
-        "A list of baseline, tface, volume (I-Face's field), raycast \
-         (rays at its mesh, learned colour) and textured (head.glb as a viewer shows it).",
+        "A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh, learned colour) and textured \
+         (head.glb, as a viewer shows it).",
     ),
     Key::number("orbit_views", "Views of an orbit around the head.", 1.0, 10_000.0),
     Key::number("samples", "Rays along each side of a pixel on an edge of the mesh.", 1.0, 8.0),
@@ -117,5 +130,21 @@ impl RenderConfig {
             background: Background::None,
             float: true,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_picture_has_one_word_and_one_name() {
+        let methods = [Method::Baseline, Method::Tface, Method::Volume, Method::Raycast, Method::Textured];
+        for (method, (word, _)) in methods.into_iter().zip(NAMES) {
+            // the word of the folder is the word of the configuration
+            assert_eq!((serde_json::json!(method), method.folder()), (serde_json::json!(word), word));
+        }
+        assert_eq!(called("volume"), "I-Face (volume)");
+        assert_eq!((called("baseline"), called("truth")), ("baseline".into(), "truth".into()));
     }
 }

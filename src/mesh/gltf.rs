@@ -24,7 +24,7 @@
 use super::export::{ExportError, ExportOptions, ready};
 use super::gltf_document::{Document, info};
 use super::textured::{
-    Exported, PictureFormat, Split, TextureOptions, Textured, encode, prepare, safe_stem, split,
+    Exported, PictureFormat, Split, TextureOptions, Textured, encode, prepare, safe_name, split,
 };
 use super::textured_tangents;
 use crate::geom::{Aabb, Mesh};
@@ -113,7 +113,7 @@ pub fn textured_to_glb(
                 .into(),
         );
     }
-    Ok(Exported { files: vec![(format!("{}.glb", safe_stem(texture)), bytes)], warnings })
+    Ok(Exported { files: vec![(format!("{}.glb", safe_name(&texture.stem)), bytes)], warnings })
 }
 
 /// One material for each lobe, offered by the primitive as variants.

@@ -9,7 +9,7 @@
 //! hold a billionth of its size, for readers that keep f64.
 
 use super::export::{ExportError, ExportOptions, Ready, ready};
-use super::textured::{Exported, TextureOptions, Textured, encode, left_out, prepare, safe_stem};
+use super::textured::{Exported, TextureOptions, Textured, encode, left_out, prepare, safe_name};
 use crate::geom::{Aabb, Mesh};
 use std::io::Write;
 
@@ -23,7 +23,7 @@ pub fn to_obj(mesh: &Mesh, options: &ExportOptions) -> Result<Vec<u8>, ExportErr
     let header = concat!("# tiface ", env!("CARGO_PKG_VERSION"), ": metres, +Y up, sRGB vertex colours\n");
     let mut out = header.as_bytes().to_vec();
     let mut write = || -> std::io::Result<()> {
-        writeln!(out, "o {}", one_line(&options.name))?;
+        writeln!(out, "o {}", safe_name(&options.name))?;
         write_vertices(&mut out, &mesh)?;
         for [a, b, c] in mesh.triangles.iter().map(|t| t.map(|i| i as u64 + 1)) {
             if mesh.normals.is_empty() {
@@ -52,18 +52,18 @@ pub fn textured_to_obj(
     let prepared = prepare(textured, &options.file_from_mesh()?)?;
     let mut mesh = prepared.ready;
     mesh.colors = Vec::new(); // some readers multiply them into the texture
-    let stem = safe_stem(texture);
+    let (stem, name) = (safe_name(&texture.stem), safe_name(&options.name));
     let (picture, ending) = encode("base colour", textured.color, texture.picture)?;
     let generator = concat!("# tiface ", env!("CARGO_PKG_VERSION"));
     let mut out = Vec::new();
     let mut write = || -> std::io::Result<()> {
-        writeln!(out, "{generator}: metres, +Y up\nmtllib {stem}.mtl\no {}", one_line(&options.name))?;
+        writeln!(out, "{generator}: metres, +Y up\nmtllib {stem}.mtl\no {name}")?;
         write_vertices(&mut out, &mesh)?;
         for uv in &prepared.uvs {
             // OBJ's v runs up
             writeln!(out, "vt {} {}", Short(uv.x), Short(1.0 - uv.y))?;
         }
-        writeln!(out, "usemtl {stem}")?;
+        writeln!(out, "usemtl {name}")?;
         for (vertices, corners) in mesh.triangles.iter().zip(&prepared.corners) {
             write!(out, "f")?;
             for (v, t) in vertices.map(|i| i as u64 + 1).iter().zip(corners.map(|i| i as u64 + 1)) {
@@ -79,7 +79,7 @@ pub fn textured_to_obj(
     };
     write().expect("writing to memory does not fail");
     let mtl = format!(
-        "{generator}\nnewmtl {stem}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {stem}.{ending}\n"
+        "{generator}\nnewmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {stem}.{ending}\n"
     );
     let files = vec![
         (format!("{stem}.obj"), out),
@@ -112,12 +112,6 @@ fn write_vertices(out: &mut Vec<u8>, mesh: &Ready) -> std::io::Result<()> {
         writeln!(out, "vn {} {} {}", Short(n.x), Short(n.y), Short(n.z))?;
     }
     Ok(())
-}
-
-/// A name is one line; what would end it becomes a space.
-fn one_line(name: &str) -> String {
-    let name: String = name.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
-    name.trim().into()
 }
 
 /// Shortest digits that give the same f32 back; with an exponent where zeros would fill the line.
@@ -153,7 +147,7 @@ mod tests {
         let options = ExportOptions { up: Vec3::Z, name: "two\nlines".into(), ..Default::default() };
         let obj = String::from_utf8(to_obj(&mesh, &options).unwrap()).unwrap();
         // z becomes y; −y, the normal, becomes z
-        let expected = "o two lines\nv 0 0 0 1 0.5 0.25\nv 1 0 0 0 0 0\nv 0 1e-7 0 1 0 0.1\n\
+        let expected = "o two_lines\nv 0 0 0 1 0.5 0.25\nv 1 0 0 0 0 0\nv 0 1e-7 0 1 0 0.1\n\
                         vn 0 0 1\nvn 0 0 1\nvn 0 0 1\nf 1//1 2//2 3//3\n";
         assert_eq!(obj.split_once('\n').unwrap().1, expected);
     }
@@ -175,15 +169,18 @@ mod tests {
         let (mesh, atlas, color) = tetrahedron();
         let texture = TextureOptions { stem: "my head".into(), ..Default::default() };
         let textured = Textured { normal: Some(&color), ..Textured::new(&mesh, &atlas, &color) };
-        let out = textured_to_obj(&textured, &ExportOptions::default(), &texture).unwrap();
+        let options = ExportOptions { name: "Büste 7".into(), ..Default::default() };
+        let out = textured_to_obj(&textured, &options, &texture).unwrap();
         let names: Vec<&str> = out.files.iter().map(|(name, _)| name.as_str()).collect();
         assert_eq!(names, ["my_head.obj", "my_head.mtl", "my_head.png"]);
         assert!(out.warnings[0].contains("normal map"));
         let obj = String::from_utf8(out.files[0].1.clone()).unwrap();
         assert_eq!(obj.lines().nth(1), Some("mtllib my_head.mtl"));
         assert!(obj.contains("\nvt 0 0.625\n"), "v = 0.375 from the top is 0.625 from the bottom");
-        assert!(obj.contains("\nusemtl my_head\nf 1/1/1 3/2/3 2/3/2\n"));
+        // object and material are called after the head
+        assert!(obj.contains("\no B_ste_7\n") && obj.contains("\nusemtl B_ste_7\nf 1/1/1 3/2/3 2/3/2\n"));
         let mtl = String::from_utf8(out.files[1].1.clone()).unwrap();
+        assert!(mtl.contains("\nnewmtl B_ste_7\n"), "{mtl}");
         assert!(mtl.ends_with("Ka 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd my_head.png\n"));
         let picture = picture_of_mtl(&out.files[1].1, Path::new("my_head.mtl")).unwrap();
         assert_eq!(picture.as_deref(), Some("my_head.png"));

@@ -11,7 +11,7 @@
 
 use super::export::{ExportError, ready};
 use super::textured::{
-    Exported, Split, TextureOptions, Textured, encode, left_out, prepare, safe_stem, split,
+    Exported, Split, TextureOptions, Textured, encode, left_out, prepare, safe_name, split,
 };
 use crate::geom::{Mesh, Similarity};
 use crate::image::quantise;
@@ -53,7 +53,7 @@ pub fn placed_to_ply(mesh: &Mesh, world_from_mesh: &Similarity) -> Result<Vec<u8
 pub fn textured_to_ply(textured: &Textured, texture: &TextureOptions) -> Result<Exported, ExportError> {
     let prepared = prepare(textured, &Similarity::IDENTITY)?;
     let (picture, ending) = encode("base colour", textured.color, texture.picture)?;
-    let stem = safe_stem(texture);
+    let stem = safe_name(&texture.stem);
     let name = format!("{stem}.{ending}");
     let ply = bytes(&split(&prepared, None), prepared.ready.translation, Some(&name));
     let files = vec![(format!("{stem}.ply"), ply), (name.clone(), picture)];

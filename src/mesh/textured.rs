@@ -233,13 +233,13 @@ pub(super) fn encode(
     }
 }
 
-/// The stem as a file name that every reader of MTL understands.
-pub(super) fn safe_stem(options: &TextureOptions) -> String {
+/// A name, of a file too, that every reader of OBJ and MTL understands.
+pub(super) fn safe_name(name: &str) -> String {
     let safe = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
-    let stem: String = options.stem.trim().chars().map(safe).collect();
+    let name: String = name.trim().chars().map(safe).collect();
     // a leading dot hides a file, and `..` leaves the folder
-    let stem = stem.trim_start_matches('.');
-    if stem.is_empty() { "mesh".into() } else { stem.into() }
+    let name = name.trim_start_matches('.');
+    if name.is_empty() { "mesh".into() } else { name.into() }
 }
 
 /// Says what a format without a place for it leaves out.
@@ -347,7 +347,7 @@ pub(super) mod tests {
 
     #[test]
     fn names_of_files_are_plain() {
-        let safe = |stem: &str| safe_stem(&TextureOptions { stem: stem.into(), ..Default::default() });
+        let safe = safe_name;
         assert_eq!(safe("my head/../Büste"), "my_head_.._B_ste");
         assert_eq!(
             (safe(".."), safe(""), safe("head-2.v")),

@@ -105,7 +105,7 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     }
     line.report(&[("metrics", metrics)]).unwrap();
     let page = String::from_utf8(bytes("report.html")).unwrap();
-    assert!(page.contains("<figcaption>ensemble</figcaption>") && run.path("cameras.json").is_file());
+    assert!(page.contains("<figcaption>blend (ensemble)</figcaption>") && run.path("cameras.json").is_file());
     assert!(bytes("mesh/head.glb").starts_with(b"glTF"));
 }
 

@@ -1,10 +1,11 @@
 //! `report.html`, from what lies in the run.
 
 use super::{Line, PipelineError};
-use crate::config::PictureFormat;
+use crate::config::{PictureFormat, called};
 use crate::io::{self, Limits};
 use crate::report::{self, Picture, Report, Row};
 use crate::run::Done;
+use serde_json::Value;
 
 /// The stages that learn, and what of their `log.jsonl` is drawn.
 const LEARNED: [(&str, &[&str]); 3] = [
@@ -51,7 +52,7 @@ impl Line<'_> {
             for (caption, file) in [("photograph", view.photo.as_path())].into_iter().chain(files) {
                 let picture = io::read_bytes(file, &limits)?;
                 bytes += picture.len();
-                pictures.push(Picture { caption: caption.into(), bytes: picture });
+                pictures.push(Picture { caption: called(caption), bytes: picture });
             }
             rows.push(Row { name: view.name.clone(), pictures });
         }
@@ -64,7 +65,13 @@ impl Line<'_> {
                 curves.extend(found.map(|c| report::Curve { name: format!("{stage} {}", c.name), ..c }));
             }
         }
-        let summaries: Vec<_> = done.iter().map(|(name, d)| (name.to_string(), d.summary.clone())).collect();
+        let named = |name: &str, summary: &Value| match summary {
+            Value::Object(sets) if name == "metrics" => {
+                sets.iter().map(|(set, figures)| (called(set), figures.clone())).collect()
+            }
+            other => other.clone(),
+        };
+        let summaries = done.iter().map(|(name, d)| (name.to_string(), named(name, &d.summary))).collect();
         let html = report::html(&Report {
             title: self.capture.name.clone(),
             summaries,

@@ -116,9 +116,9 @@ impl Line<'_> {
             }
             "train" => Ok(self.of(Split::Train)),
             "orbit" => {
-                let centre = scene::world_box(scene).center();
+                let bounds = scene::world_box(scene);
                 let count = self.config.render.orbit_views as usize;
-                orbit(&all, centre, self.capture.up, count).map_err(wrong)
+                orbit(&all, bounds, self.capture.up, count).map_err(wrong)
             }
             file => {
                 let path = Path::new(file);

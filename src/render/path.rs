@@ -5,8 +5,8 @@
 //! must be in the dataset's own world. A path from nerfstudio's viewer is only if training there ran
 //! with `--orientation-method none --center-method none --auto-scale-poses False`.
 
-use crate::geom::{Camera, Distortion};
-use glam::{DMat3, DVec3, Vec3};
+use crate::geom::{Aabb, Camera, Distortion};
+use glam::{BVec3, DMat3, DVec3, Vec3};
 use serde::Deserialize;
 
 /// Most cameras in one file.
@@ -66,14 +66,18 @@ impl PathError {
     }
 }
 
-/// `count` cameras on a circle around `center`, evenly spaced, all looking at it.
+/// The part of a picture that `orbit` fills at most, so that nothing touches its border.
+const FILLED: f64 = 0.95;
+
+/// `count` cameras on a circle around the middle of `bounds`, evenly spaced, all looking at it.
 ///
-/// The circle lies across `up` at the mean height and mean distance of the capture's cameras, and
-/// begins where their mean direction is. Lens and picture size are those of the first camera, without
+/// The circle lies across `up` at the mean height and mean distance of the capture's cameras, or so much
+/// farther away, in the same direction, that every picture shows all of `bounds`. It begins where the mean
+/// direction of the cameras is. Lens and picture size are those of the first camera, without
 /// distortion and with the middle of the picture as principal point.
 pub fn orbit(
     cameras: &[Camera],
-    center: Vec3,
+    bounds: Aabb,
     up: Vec3,
     count: usize,
 ) -> Result<Vec<NamedCamera>, PathError> {
@@ -82,7 +86,7 @@ pub fn orbit(
     if count == 0 || count > MAX_CAMERAS {
         return Err(PathError::Count { found: count });
     }
-    let center = center.as_dvec3();
+    let center = bounds.center().as_dvec3();
     let (mut height, mut radius, mut toward) = (0.0, 0.0, DVec3::ZERO);
     for camera in cameras {
         let arm = camera.position - center;
@@ -98,17 +102,31 @@ pub fn orbit(
     let start = if toward.length() > 1e-6 { toward.normalize() } else { up.any_orthonormal_vector() };
     let side = up.cross(start);
     let digits = count.to_string().len().max(4);
-    let made = (0..count).map(|i| {
+    let turned = |i: usize| {
         let angle = std::f64::consts::TAU * i as f64 / count as f64;
-        let position = center + height * up + radius * (angle.cos() * start + angle.sin() * side);
-        let back = (position - center).normalize();
+        let back = (height * up + radius * (angle.cos() * start + angle.sin() * side)).normalize();
         let right = up.cross(back).normalize();
+        DMat3::from_cols(right, back.cross(right), back)
+    };
+    let rotations: Vec<DMat3> = (0..count).map(turned).collect();
+    // a corner at (x, y, z) from the middle, as the camera sees it, is f·x / (distance − z) from the picture's middle
+    let reach = |focal: f64, side: u32| focal / (FILLED * side as f64 / 2.0);
+    let (reach_x, reach_y) = (reach(like.fx, like.width), reach(like.fy, like.height));
+    let mut distance = height.hypot(radius);
+    for rotation in &rotations {
+        for corner in (0..8).map(|k| BVec3::new(k & 1 > 0, k & 2 > 0, k & 4 > 0)) {
+            let corner = Vec3::select(corner, bounds.max, bounds.min).as_dvec3() - center;
+            let p = rotation.transpose() * corner;
+            distance = distance.max(p.z + (p.x.abs() * reach_x).max(p.y.abs() * reach_y));
+        }
+    }
+    let made = rotations.iter().enumerate().map(|(i, &rotation)| {
         let camera = Camera {
             cx: like.width as f64 / 2.0,
             cy: like.height as f64 / 2.0,
             distortion: Distortion::default(),
-            rotation: DMat3::from_cols(right, back.cross(right), back),
-            position,
+            rotation,
+            position: center + distance * rotation.z_axis,
             ..like.clone()
         };
         NamedCamera { name: format!("{:0digits$}", i + 1), camera }
@@ -334,7 +352,8 @@ mod tests {
         other.position = DVec3::new(0.0, 1.0, 6.0);
         // around (0, 1, 0): heights 2 and 0, distances 4 and 6: mean 1 and 5
         let center = Vec3::new(0.0, 1.0, 0.0);
-        let path = orbit(&[like(), other], center, Vec3::Y, 4).unwrap();
+        let point = Aabb { min: center, max: center };
+        let path = orbit(&[like(), other], point, Vec3::Y, 4).unwrap();
         assert_eq!(path.len(), 4);
         assert!(path[0].camera.position.distance(DVec3::new(0.0, 2.0, 5.0)) < 1e-12);
         assert!(path[1].camera.position.distance(DVec3::new(5.0, 2.0, 0.0)) < 1e-12);
@@ -347,9 +366,35 @@ mod tests {
             assert!((c.camera.rotation.determinant() - 1.0).abs() < 1e-12);
         }
         assert_eq!(path[3].name, "0004");
-        assert!(orbit(&[], center, Vec3::Y, 4).is_err());
-        assert!(orbit(&[like()], center, Vec3::ZERO, 4).is_err());
-        assert!(orbit(&[like()], center, Vec3::Y, 0).is_err());
+        assert!(orbit(&[], point, Vec3::Y, 4).is_err());
+        assert!(orbit(&[like()], point, Vec3::ZERO, 4).is_err());
+        assert!(orbit(&[like()], point, Vec3::Y, 0).is_err());
+    }
+
+    #[test]
+    fn an_orbit_never_cuts_the_bottom_of_a_bust() {
+        // 5 away, cameras for a face: the bust is 4 high, and wide across where it is seen from the side
+        let bounds = Aabb { min: Vec3::new(-1.5, -2.0, -1.0), max: Vec3::new(1.5, 2.0, 1.0) };
+        for (width, height) in [(400, 200), (200, 400), (300, 300)] {
+            let camera = Camera { width, height, ..like() };
+            let path = orbit(&[camera], bounds, Vec3::Y, 7).unwrap();
+            let mut nearest = f32::INFINITY;
+            for c in &path {
+                for k in 0..8 {
+                    let corner =
+                        Vec3::select(BVec3::new(k & 1 > 0, k & 2 > 0, k & 4 > 0), bounds.max, bounds.min);
+                    let (at, _) = c.camera.project(corner).unwrap();
+                    let (x, y) = (at.x / width as f32, at.y / height as f32);
+                    nearest = nearest.min(x).min(y).min(1.0 - x).min(1.0 - y);
+                }
+            }
+            // a fortieth of the picture stays free, and no more
+            assert!((nearest - 0.025).abs() < 1e-3, "{width} × {height}: {nearest}");
+        }
+        // what is shown already is not moved away from
+        let small = Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(0.1) };
+        let path = orbit(&[like()], small, Vec3::Y, 3).unwrap();
+        assert!((path[0].camera.position.length() - 5.0).abs() < 1e-12);
     }
 
     #[test]
