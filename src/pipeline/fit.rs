@@ -4,7 +4,7 @@ use super::ensemble::ensemble_failure;
 use super::{Fields, Line, capture_failure, pictures};
 use crate::capture::scene::Scene;
 use crate::capture::{Split, View};
-use crate::config::Background;
+use crate::config::{Background, called};
 use crate::ensemble::{self, EnsembleError, Fit, Target, Tile};
 use crate::image::{Gray, Image, Photo};
 use crate::io::Limits;
@@ -83,6 +83,9 @@ impl Line<'_> {
             let one: Vec<f32> = (0..methods.len()).map(|l| if l == k { 1.0 } else { 0.0 }).collect();
             alone.insert(name.into(), json!(psnr(&one)?));
         }
+        let each = self.members().into_iter().zip(&weights);
+        let told: Vec<String> = each.map(|(name, w)| format!("{} {w:.3}", called(name))).collect();
+        stage.note(&format!("fitted weights: {}", told.join(", ")));
         let record = json!({"pixels": all.pixels(), "psnr": psnr(&weights)?, "psnr_alone": alone});
         Ok((weights, record))
     }
