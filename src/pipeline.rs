@@ -6,10 +6,12 @@
 //! tface     the same, learned from masked ones
 //! iface     a signed distance learned from the masked photographs
 //! mesh      its zero level set, closed, in the dataset's world
-//! render    held-out (or other) views, by marching the fields and by casting rays at the mesh
+//! render    held-out views, by marching the fields and by casting rays at the mesh
 //! ensemble  those views become one
 //! metrics   all of them against the photographs
 //! ```
+//!
+//! Views from other cameras, a turntable for example, are a product beside the line ([`Line::along`]).
 //!
 //! Each stage names those it reads from ([`Line::needs`]); a command runs what its stage needs and
 //! nothing else. What shapes a stage is known before it runs: its settings, and the same of the stages
@@ -31,9 +33,11 @@ mod metrics;
 mod networks;
 mod page;
 mod parts;
+mod path;
 mod pictures;
 mod plan;
 mod product;
+mod remembered;
 mod render;
 mod scene_file;
 mod surface;
@@ -56,6 +60,7 @@ use crate::io::{self, Limits};
 use crate::run::Done;
 use crate::run::{Exit, Failure, Fingerprint, Run, RunError};
 use rayon::prelude::*;
+use remembered::remembered;
 use serde_json::Value;
 use std::path::Path;
 
@@ -75,6 +80,12 @@ pub enum PipelineError {
     /// A stage, or the run folder.
     #[error(transparent)]
     Run(#[from] RunError),
+    /// The capture of a run that has work left is no longer where it was.
+    #[error("the capture of this run cannot be opened: {problem}")]
+    Gone {
+        /// What is wrong.
+        problem: String,
+    },
     /// A file the line needs before its stages.
     #[error(transparent)]
     Read(#[from] io::ReadError),
@@ -122,6 +133,10 @@ impl PipelineError {
             PipelineError::Read(e) => e.hint(),
             #[cfg(feature = "cpu")]
             PipelineError::Device(_) => "choose another with `--device`".into(),
+            PipelineError::Gone { .. } => {
+                "say where it lies now: `--set capture.path=FOLDER`; the same photographs give the same run"
+                    .into()
+            }
             PipelineError::Settings { hint, .. } | PipelineError::Clicks { hint, .. } => hint.clone(),
         }
     }
@@ -144,7 +159,8 @@ pub fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>
         };
         done.push((name, stage));
     }
-    line.report(&done)?;
+    let idle = done.iter().all(|(_, stage)| stage.skipped);
+    line.unless_idle(idle, line.report())?;
     Ok(done)
 }
 
@@ -155,10 +171,12 @@ pub struct Line<'a> {
     run: &'a Run,
     /// Digest of everything read from the capture.
     digest: String,
-    /// Digest of the camera file, if `render.cameras` names one.
-    path_digest: String,
+    /// What `render` shows instead of the held-out views.
+    path: Option<path::CameraPath>,
     /// Digests of checkpoints that stages take instead of learning.
     imports: Vec<(&'static str, String)>,
+    /// Why the capture cannot be opened, where it is only as the run remembers it.
+    gone: Option<String>,
     /// Is the capture the demo head, whose surface is known?
     synthetic: bool,
     /// What masks are made from, if not found.
@@ -167,21 +185,30 @@ pub struct Line<'a> {
 
 impl<'a> Line<'a> {
     /// Opens the capture and reads every byte of it once, for its digest. Nothing is written.
+    ///
+    /// The capture of a run that is done may lie somewhere else by now: its cameras are then those that the run
+    /// remembers, and nothing can be worked on ([`Line::remember`]).
     pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>, PipelineError> {
         feasible(config)?;
-        let mut capture = capture::open(Path::new(&config.capture.path), &capture_options(config))?;
-        if synthetic {
-            // its folder is called after what it holds
-            capture.name = "demo".into();
-        }
-        let digest = capture_digest(&capture)?;
-        let clicks = clicks::clicks(&config.mask, &capture, &run.path("mask").join(mask::CLICKS))?;
+        let (capture, digest, clicks, gone) =
+            match capture::open(Path::new(&config.capture.path), &capture_options(config)) {
+                Err(e) => match remembered(config, run, &e)? {
+                    Some(known) => (known.capture, known.digest, known.clicks, Some(e.to_string())),
+                    None => return Err(e.into()),
+                },
+                Ok(mut capture) => {
+                    if synthetic {
+                        // its folder is called after what it holds
+                        capture.name = "demo".into();
+                    }
+                    let digest = capture_digest(&capture)?;
+                    let kept = run.path("mask").join(mask::CLICKS);
+                    let clicks = clicks::clicks(&config.mask, &capture, &kept)?;
+                    (capture, digest, clicks, None)
+                }
+            };
         let of_file = |file: &str| -> Result<String, PipelineError> {
             Ok(Fingerprint::of_bytes(&io::read_bytes(Path::new(file), &Limits::default())?))
-        };
-        let path_digest = match config.render.cameras.as_str() {
-            "test" | "train" | "orbit" => String::new(),
-            file => of_file(file)?,
         };
         let mut imports = Vec::new();
         for (stage, file) in [("baseline", &config.baseline.import), ("tface", &config.tface.import)] {
@@ -192,7 +219,7 @@ impl<'a> Line<'a> {
         for warning in &capture.warnings {
             run.warn("capture", warning);
         }
-        let mut line = Line { capture, config, run, digest, path_digest, imports, synthetic, clicks };
+        let mut line = Line { capture, config, run, digest, path: None, imports, gone, synthetic, clicks };
         if line.clicks.is_some() {
             // what later stages read is what the stage `mask` makes
             let files: Vec<_> = line.capture.views.iter().map(|v| line.mask_file(&v.name)).collect();
@@ -215,6 +242,26 @@ impl<'a> Line<'a> {
 
     fn scene_or_fail(&self) -> Result<Scene, Failure> {
         Ok(scene_file::read_scene(&self.run.path("mask/scene.json"))?)
+    }
+
+    /// An error if the capture is no longer there: nothing can be worked on then.
+    fn is_there(&self) -> Result<(), PipelineError> {
+        match &self.gone {
+            Some(problem) => Err(PipelineError::Gone { problem: problem.clone() }),
+            None => Ok(()),
+        }
+    }
+
+    /// A file of the run itself that cannot be written is no failure where nothing is left to do: a run that is done
+    /// may lie where nobody may write.
+    fn unless_idle(&self, idle: bool, written: Result<(), PipelineError>) -> Result<(), PipelineError> {
+        match written {
+            Err(PipelineError::Run(RunError::Write(e))) if idle => {
+                self.run.warn("run", &format!("{e}; all that was asked for is done"));
+                Ok(())
+            }
+            other => other,
+        }
     }
 
     fn stop_here(&self) -> Result<(), Failure> {
@@ -303,3 +350,5 @@ mod clicks_tests;
 mod ensemble_tests;
 #[cfg(test)]
 mod line_tests;
+#[cfg(test)]
+mod path_tests;

@@ -135,7 +135,7 @@ pub struct Capture {
 }
 
 /// One photograph with its camera.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct View {
     /// The photograph's path below the folder common to all, without ending: `024`, `left/07`.
     pub name: String,

@@ -6,7 +6,7 @@ use super::options::Common;
 use super::out::Out;
 use super::screen::{Screen, figure};
 use super::target::Target;
-use crate::config::{Config, MeshFormat, NAMES, Preset, called};
+use crate::config::{Config, MeshFormat, NAMES, Preset, RenderConfig, called};
 use crate::io;
 use crate::pipeline::{Line, STAGES};
 use crate::run::{Done, Exit, Run, Stop};
@@ -53,7 +53,12 @@ pub(super) struct Work<'a> {
 
 impl Work<'_> {
     pub fn on(&self, target: &Target, extra: &[(String, String, String)]) -> Result<Exit, Ending> {
-        let config = configure(self.common, target, self.fallback, extra)?;
+        let mut config = configure(self.common, target, self.fallback, extra)?;
+        // views of a path are made as asked for here; what the evaluation shows stays as it was
+        let path = (self.until == "render" && config.render.cameras != "test").then(|| config.render.clone());
+        if path.is_some() {
+            config.render = evaluation(self.common, target)?;
+        }
         let bars = self.require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>, _>>()?;
         if let Some(fresh) = &self.common.fresh
             && !STAGES.contains(&fresh.as_str())
@@ -64,7 +69,10 @@ impl Work<'_> {
         let run = Run::open(&target.run, self.stop.clone(), self.screen.observer());
         // the demo's own runs are recognised when their stages are run one by one, too
         let synthetic = self.synthetic || is_demo(&config, &run);
-        let line = Line::open(&config, &run, synthetic)?;
+        let mut line = Line::open(&config, &run, synthetic)?;
+        if let Some(path) = path {
+            line = line.along(path)?;
+        }
         if let Some(out) = &self.out {
             out.is_outside(run.dir())?;
             let mesh = matches!(out, Out::File(_, ending) if mesh_format(ending).is_some());
@@ -79,7 +87,7 @@ impl Work<'_> {
             return self.outlook(&line);
         }
         if let Some(fresh) = &self.common.fresh {
-            run.fresh(fresh, &line.followers(fresh))?;
+            line.fresh(fresh)?;
         }
         line.remember(self.until)?;
         let done = reconstruct(&line, self.until)?;
@@ -87,13 +95,14 @@ impl Work<'_> {
             Some(out) => self.copy(&line, &run, out)?,
             None => Vec::new(),
         };
-        self.closing(&run, &done, &written)?;
+        self.closing(&run, line.views(), &done, &written)?;
         bars.iter().try_for_each(|bar| bar.check(&done))?;
         Ok(Exit::Done)
     }
 
     fn outlook(&self, line: &Line) -> Result<Exit, Ending> {
-        let fresh = self.common.fresh.as_deref().map(|f| line.followers(f)).unwrap_or_default();
+        let fresh =
+            self.common.fresh.as_deref().map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
         let mut text = String::new();
         for (stage, found) in line.outlook(self.until)? {
             let anew = fresh.contains(&stage);
@@ -150,6 +159,9 @@ impl Work<'_> {
             (Out::Folder(folder), "run") => {
                 copy_folder(run.dir(), folder, &["baseline", "tface", "iface", CAPTURE])?
             }
+            (Out::Folder(folder), "render") => {
+                copy_folder(&run.path(line.views()), folder, &["float", "paths"])?
+            }
             (Out::Folder(folder), stage) => {
                 copy_folder(&run.path(stage), folder, &["float", "parts"])?;
                 if stage == "metrics" {
@@ -161,7 +173,13 @@ impl Work<'_> {
     }
 
     /// Where everything is, and how good it is.
-    fn closing(&self, run: &Run, done: &[(&'static str, Done)], written: &[PathBuf]) -> Result<(), Ending> {
+    fn closing(
+        &self,
+        run: &Run,
+        views: &str,
+        done: &[(&'static str, Done)],
+        written: &[PathBuf],
+    ) -> Result<(), Ending> {
         let of = |name: &str| done.iter().find(|(n, _)| *n == name).map(|(_, d)| &d.summary);
         if self.common.json {
             let stages: serde_json::Map<String, Value> =
@@ -180,8 +198,10 @@ impl Work<'_> {
             let first = files.iter().find(|f| io::is_file(f)).unwrap_or(&files[0]);
             row("mesh", format!("{} ({} triangles, {state})", first.display(), mesh["triangles"]));
         }
-        for stage in ["render", "ensemble"].into_iter().filter(|s| of(s).is_some()) {
-            row("pictures", format!("{}", run.path(stage).display()));
+        for (_, folder) in
+            [("render", views), ("ensemble", "ensemble")].iter().filter(|(s, _)| of(s).is_some())
+        {
+            row("pictures", format!("{}", run.path(folder).display()));
         }
         if let Some(metrics) = of("metrics") {
             row("report", format!("{}", run.path("report.html").display()));
@@ -252,6 +272,17 @@ pub(super) fn configure(
         return Err(Ending::usage("no capture is named", "name one: `tiface run CAPTURE`"));
     }
     Ok(config)
+}
+
+/// How the evaluation's views are made: as the run remembers it, else as it starts out.
+fn evaluation(common: &Common, target: &Target) -> Result<RenderConfig, Ending> {
+    let kept = Some(target.run.join("config.toml")).filter(|file| io::is_file(file));
+    let bare = match kept {
+        Some(_) => Common { color: common.color, ..Common::default() },
+        None => Common { preset: common.preset, config: common.config.clone(), ..Common::default() },
+    };
+    let render = bare.resolve(kept.as_deref(), None, &[])?.render;
+    Ok(RenderConfig { cameras: "test".into(), ..render })
 }
 
 /// Was this run made by `tiface demo`?

@@ -33,6 +33,10 @@ pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<Exit, Ending> {
                 }
             });
         }
+        for path in io::list_folders(&run.join("render/paths"))? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            text += &line(common, run, &format!("render/paths/{name}"))?;
+        }
     }
     say(&text)?;
     if damaged > 0 {

@@ -15,9 +15,13 @@ pub fn create_folder(path: &Path) -> Result<(), WriteError> {
     fs::create_dir_all(path).map_err(failed(path))
 }
 
-/// Removes everything inside `path` except files directly in it called `keep`; a folder that does
-/// not exist is empty. Links are removed, never followed.
-pub fn clear_folder(path: &Path, keep: &str) -> Result<(), WriteError> {
+/// Removes everything inside `path` except files called `keep` and folders that are `apart`, which stay
+/// as they are; a folder that does not exist is empty. Links inside are removed, never followed; a link in
+/// the place of the folder itself is an error.
+pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> Result<(), WriteError> {
+    if is_link(path) {
+        return Err(failed(path)(linked()));
+    }
     let entries = match fs::read_dir(path) {
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
         other => other.map_err(failed(path))?,
@@ -25,14 +29,52 @@ pub fn clear_folder(path: &Path, keep: &str) -> Result<(), WriteError> {
     for entry in entries {
         let entry = entry.map_err(failed(path))?;
         let inside = entry.path();
-        if entry.file_name() == keep {
-            continue;
-        }
-        let kind = entry.file_type().map_err(failed(&inside))?;
-        let gone = if kind.is_dir() { fs::remove_dir_all(&inside) } else { fs::remove_file(&inside) };
+        let is_folder = entry.file_type().map_err(failed(&inside))?.is_dir();
+        let gone = if is_folder && !apart(&inside) {
+            clear_folder(&inside, keep, apart)?;
+            match fs::remove_dir(&inside) {
+                Err(e) if e.kind() == ErrorKind::DirectoryNotEmpty => Ok(()), // something apart is in it
+                other => other,
+            }
+        } else if is_folder || entry.file_name() == keep {
+            Ok(())
+        } else {
+            fs::remove_file(&inside)
+        };
         gone.map_err(failed(&inside))?;
     }
     Ok(())
+}
+
+/// Returns a file in a folder or below, but not in folders that are `apart`; `None` where there is none, and
+/// no folder.
+pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<PathBuf>, ReadError> {
+    let entries = match fs::read_dir(path) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
+        other => other.map_err(|e| ReadError::io(path, e))?,
+    };
+    for entry in entries {
+        let entry = entry.map_err(|e| ReadError::io(path, e))?;
+        let inside = entry.path();
+        if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            return Ok(Some(inside));
+        }
+        if !apart(&inside)
+            && let Some(file) = any_file(&inside, apart)?
+        {
+            return Ok(Some(file));
+        }
+    }
+    Ok(None)
+}
+
+/// Is there a link, wherever it leads?
+pub fn is_link(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok_and(|m| m.is_symlink())
+}
+
+fn linked() -> std::io::Error {
+    std::io::Error::other("it is a link, which is not followed here")
 }
 
 /// Removes a file; one that is not there is fine.
@@ -66,8 +108,11 @@ pub fn modified(path: &Path) -> Option<SystemTime> {
 }
 
 /// Appends a line to a log. If the last writer was stopped in the middle of a line, that line is
-/// ended first, so that it spoils only itself.
+/// ended first, so that it spoils only itself. A link is an error: what it leads to is no log of ours.
 pub fn append(path: &Path, line: &str) -> Result<(), WriteError> {
+    if is_link(path) {
+        return Err(failed(path)(linked()));
+    }
     let mut file =
         OpenOptions::new().read(true).append(true).create(true).open(path).map_err(failed(path))?;
     let mut bytes = Vec::with_capacity(line.len() + 2);
@@ -147,9 +192,12 @@ pub enum LockError {
 
 impl Lock {
     /// Takes the lock `path` without waiting. The file stays when the lock is freed: removing it
-    /// would let two processes lock two files of the same name.
+    /// would let two processes lock two files of the same name. A link is an error.
     pub fn take(path: &Path) -> Result<Lock, LockError> {
         let fail = |source| LockError::Io { path: path.into(), source };
+        if is_link(path) {
+            return Err(fail(linked()));
+        }
         let file = OpenOptions::new()
             .read(true)
             .write(true)
@@ -186,10 +234,43 @@ mod tests {
         for name in [".lock", "a.png", "views/b.png"] {
             fs::write(dir.path().join(name), b"x").unwrap();
         }
-        clear_folder(dir.path(), ".lock").unwrap();
+        let apart = |path: &Path| path.ends_with("paths/orbit");
+        clear_folder(dir.path(), ".lock", &apart).unwrap();
         let left: Vec<_> = fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
         assert_eq!(left, [".lock"]);
-        clear_folder(&dir.path().join("absent"), ".lock").unwrap();
+        clear_folder(&dir.path().join("absent"), ".lock", &apart).unwrap();
+        // what is apart stays, and so do the folders on the way to it
+        fs::create_dir_all(dir.path().join("paths/orbit/a")).unwrap();
+        fs::create_dir_all(dir.path().join("paths/other")).unwrap();
+        fs::write(dir.path().join("paths/orbit/a/b.png"), b"x").unwrap();
+        assert_eq!(any_file(&dir.path().join("paths"), &apart).unwrap(), None);
+        fs::write(dir.path().join("paths/c.png"), b"x").unwrap();
+        assert!(any_file(dir.path(), &|_| false).unwrap().is_some());
+        clear_folder(dir.path(), ".lock", &apart).unwrap();
+        assert!(dir.path().join("paths/orbit/a/b.png").is_file());
+        assert!(!dir.path().join("paths/other").exists() && !dir.path().join("paths/c.png").exists());
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn nothing_behind_a_link_is_removed_locked_or_appended_to() {
+        use std::os::unix::fs::symlink;
+        let dir = tempfile::tempdir().unwrap();
+        let (own, others) = (dir.path().join("own"), dir.path().join("others"));
+        fs::create_dir(&own).unwrap();
+        fs::create_dir(&others).unwrap();
+        fs::write(others.join("mine.txt"), b"x").unwrap();
+        symlink(&others, own.join("views")).unwrap();
+        symlink(others.join("mine.txt"), own.join("log.jsonl")).unwrap();
+        symlink(others.join("new"), own.join(".lock")).unwrap();
+        assert!(append(&own.join("log.jsonl"), "{}").unwrap_err().to_string().contains("a link"));
+        assert!(Lock::take(&own.join(".lock")).unwrap_err().to_string().contains("a link"));
+        clear_folder(&own, "", &|_| false).unwrap();
+        assert_eq!(fs::read_dir(&own).unwrap().count(), 0);
+        symlink(&others, own.join("views")).unwrap();
+        assert!(clear_folder(&own.join("views"), "", &|_| false).is_err());
+        assert_eq!(fs::read(others.join("mine.txt")).unwrap(), b"x");
+        assert!(!others.join("new").exists());
     }
 
     #[test]

@@ -15,8 +15,8 @@ mod write;
 
 pub use self::exr::{ExrImage, read_exr_channels, read_exr_depth, read_exr_normals, write_exr};
 pub use self::folder::{
-    Lock, LockError, append, clear_folder, create_folder, free_bytes, is_writable, list_folders, modified,
-    remove_file,
+    Lock, LockError, any_file, append, clear_folder, create_folder, free_bytes, is_link, is_writable,
+    list_folders, modified, remove_file,
 };
 pub use self::json::parse_json;
 pub use self::npy::{Npy, NpyValues, parse_npy, read_npy};

@@ -44,7 +44,7 @@ impl Line<'_> {
             }
         }
         let meshes = self.meshes(methods)?;
-        let eye = self.eye(scene, fields, &meshes);
+        let eye = self.eye(scene, fields, &meshes, self.config.render.samples);
         let mut sums = Vec::new();
         for (view, tiles) in self.tiles() {
             let (photo, weight) = target(view)?;

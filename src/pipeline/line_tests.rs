@@ -103,7 +103,7 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     for done in [line.mask(), line.mesh(&Never), line.render(&Never), line.ensemble(&Never), line.metrics()] {
         assert!(done.unwrap().skipped);
     }
-    line.report(&[("metrics", metrics)]).unwrap();
+    line.report().unwrap();
     let page = String::from_utf8(bytes("report.html")).unwrap();
     assert!(page.contains("<figcaption>blend (ensemble)</figcaption>") && run.path("cameras.json").is_file());
     assert!(bytes("mesh/head.glb").starts_with(b"glTF"));

@@ -86,7 +86,11 @@ impl Line<'_> {
                 "box": scene::world_box(&scene),
             }))
         })?;
-        self.run.write("cameras.json", &scene_file::cameras_json(&self.capture, &self.scene()?))?;
+        if self.gone.is_none() {
+            let cameras = scene_file::cameras_json(&self.capture, &self.scene()?);
+            let written = self.run.write("cameras.json", &cameras).map_err(PipelineError::from);
+            self.unless_idle(done.skipped, written)?;
+        }
         Ok(done)
     }
 

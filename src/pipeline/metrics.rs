@@ -55,14 +55,10 @@ impl Line<'_> {
 
     /// The pictures of a set that have a photograph.
     pub(super) fn comparable(&self, set: &Set) -> Vec<Shown<'_>> {
-        let c = &self.config.render;
-        if !matches!(c.cameras.as_str(), "test" | "train") {
-            return Vec::new(); // the same name does not make it the same camera
-        }
         let floats = set.folder.join(pictures::FLOAT);
         let shown = |view| {
             let View { name, .. }: &View = view;
-            let file = pictures::path(&set.folder, name, c.format);
+            let file = pictures::path(&set.folder, name, self.config.render.format);
             Shown { view, file, float: pictures::float_path(&floats, name) }
         };
         self.capture.views.iter().map(shown).filter(|s| io::is_file(&s.file)).collect()
@@ -83,6 +79,12 @@ impl Line<'_> {
                 }
                 stage.monitor().step(i as u64 + 1, sets.len() as u64, &[]);
                 self.stop_here()?;
+            }
+            if out.is_empty() {
+                return Err(Failure::cannot(
+                    "there is no view to be judged",
+                    "name methods in `render.method`, and make their views with `--fresh render`",
+                ));
             }
             if self.synthetic && self.order("metrics").contains(&"mesh") {
                 let points = self.config.metrics.surface_points as usize;

@@ -1,10 +1,10 @@
 //! `report.html`, from what lies in the run.
 
-use super::{Line, PipelineError};
+use super::{Line, PipelineError, STAGES};
 use crate::config::{PictureFormat, called};
 use crate::io::{self, Limits};
 use crate::report::{self, Picture, Report, Row};
-use crate::run::Done;
+use crate::run::read_record;
 use serde_json::Value;
 
 /// The stages that learn, and what of their `log.jsonl` is drawn.
@@ -19,8 +19,11 @@ const LEARNED: [(&str, &[&str]); 3] = [
 const MOST: usize = 48 << 20;
 
 impl Line<'_> {
-    /// Writes `report.html`.
-    pub fn report(&self, done: &[(&'static str, Done)]) -> Result<(), PipelineError> {
+    /// Writes `report.html`, of every stage that is done; without the photographs it stays as it is.
+    pub fn report(&self) -> Result<(), PipelineError> {
+        if self.gone.is_some() {
+            return Ok(());
+        }
         let limits = Limits::default();
         let sets = match self.config.render.format {
             PictureFormat::Png => self.sets(),
@@ -65,13 +68,17 @@ impl Line<'_> {
                 curves.extend(found.map(|c| report::Curve { name: format!("{stage} {}", c.name), ..c }));
             }
         }
-        let named = |name: &str, summary: &Value| match summary {
+        let named = |name: &str, summary: Value| match summary {
             Value::Object(sets) if name == "metrics" => {
                 sets.iter().map(|(set, figures)| (called(set), figures.clone())).collect()
             }
-            other => other.clone(),
+            other => other,
         };
-        let summaries = done.iter().map(|(name, d)| (name.to_string(), named(name, &d.summary))).collect();
+        let figures = |name: &&str| {
+            let record = read_record(&self.run.path(name)).ok()??;
+            Some((name.to_string(), named(name, record.summary)))
+        };
+        let summaries: Vec<_> = STAGES.iter().filter_map(figures).collect();
         let html = report::html(&Report {
             title: self.capture.name.clone(),
             summaries,

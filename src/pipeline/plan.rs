@@ -27,22 +27,28 @@ impl Line<'_> {
             "mask" => Vec::new(),
             "baseline" | "tface" | "iface" => vec!["mask"],
             "mesh" => vec!["iface"],
-            "render" => {
-                let methods = &self.config.render.method;
-                let shown = |stage: &str| methods.iter().any(|m: &Method| m.stage() == stage);
-                let mut needs = vec!["mask"];
-                needs.extend(["baseline", "tface", "iface", "mesh"].into_iter().filter(|s| shown(s)));
-                needs
-            }
+            "render" => shown(&self.config.render.method),
             "ensemble" => vec!["render"],
             _ if self.config.ensemble.members.is_empty() => vec!["render"],
             _ => vec!["render", "ensemble"],
         }
     }
 
-    /// The stages up to `until` that it needs, itself the last, in the order of the line.
+    /// The stages up to `until` that it needs, itself the last, in the order of the line. Views of a path need what
+    /// they show, and nothing that only the evaluation shows.
     pub fn order(&self, until: &str) -> Vec<&'static str> {
-        let mut wanted = vec![known(until)];
+        match &self.path {
+            Some(path) if until == "render" => {
+                let mut order = self.with_needs(shown(&path.render.method));
+                order.push("render");
+                order
+            }
+            _ => self.with_needs(vec![known(until)]),
+        }
+    }
+
+    /// Stages and all that they need, in the order of the line.
+    fn with_needs(&self, mut wanted: Vec<&'static str>) -> Vec<&'static str> {
         let mut next = 0;
         while next < wanted.len() {
             let more: Vec<_> = self.needs(wanted[next]).into_iter().filter(|s| !wanted.contains(s)).collect();
@@ -55,41 +61,63 @@ impl Line<'_> {
     /// A stage and all that build on it, in the order of the line: what is out of date when it is
     /// recomputed.
     pub fn followers(&self, stage: &str) -> Vec<&'static str> {
-        STAGES.iter().copied().filter(|s| self.order(s).contains(&stage)).collect()
+        STAGES.iter().copied().filter(|s| self.with_needs(vec![s]).contains(&stage)).collect()
     }
 
-    /// What would be done for `until`: each stage with `None` if it has to be worked on, else what
-    /// differs from the result that lies there (nothing, if it is done). An error if what is to be blended
-    /// will not be there. Nothing is written.
-    pub fn outlook(&self, until: &str) -> Result<Vec<(&'static str, Option<Vec<String>>)>, PipelineError> {
+    /// What would be done for `until`: the folder of each stage with `None` if it has to be worked on, else what
+    /// differs from the result that lies there (nothing, if it is done). An error if the settings contradict
+    /// each other. Nothing is written.
+    pub fn outlook(&self, until: &str) -> Result<Vec<(String, Option<Vec<String>>)>, PipelineError> {
         let look = |name: &'static str| {
+            let Plan { name, fingerprint, .. } = self.plan(name);
             let record = read_record(&self.run.path(name))?;
-            let now = self.plan(name).fingerprint;
-            Ok((name, record.map(|r| now.differences(&r.fingerprint))))
+            Ok((name.into(), record.map(|r| fingerprint.differences(&r.fingerprint))))
         };
-        let order = self.order(until);
-        if order.contains(&"ensemble") {
-            self.can_blend()?;
+        self.can_make(until)?;
+        let found: Vec<_> = self.order(until).into_iter().map(look).collect::<Result<_, PipelineError>>()?;
+        if found.iter().any(|(_, record)| record.is_none()) {
+            self.is_there()?;
         }
-        order.into_iter().map(look).collect()
+        Ok(found)
     }
 
     /// Writes the complete configuration into the run: what repeats it. Refused, before anything is
-    /// changed, if a stage that `until` needs was made or begun with other settings, or if what is to
-    /// be blended will not be there.
+    /// changed, if a stage that `until` needs was made or begun with other settings, if the settings contradict
+    /// each other, or if there is work left and no capture to do it on.
     pub fn remember(&self, until: &str) -> Result<(), PipelineError> {
+        self.can_make(until)?;
+        let plans: Vec<Plan> = self.order(until).into_iter().map(|name| self.plan(name)).collect();
+        plans.iter().try_for_each(|plan| self.run.agrees(plan))?;
+        let idle = plans.iter().all(|plan| self.run.is_done(plan));
+        if !idle {
+            self.is_there()?;
+        }
+        let written = self.run.write("config.toml", self.config.to_toml().as_bytes());
+        self.unless_idle(idle, written.map_err(PipelineError::from))
+    }
+
+    /// Do the settings go together, as far as `until` depends on them? Asked before any work.
+    fn can_make(&self, until: &str) -> Result<(), PipelineError> {
         let order = self.order(until);
-        if order.contains(&"ensemble") {
-            self.can_blend()?;
+        let cameras = &self.config.render.cameras;
+        if order.contains(&"render") && cameras != "test" {
+            return Err(PipelineError::Settings {
+                key: "render.cameras",
+                problem: format!("is {cameras}, but it is the held-out views that are blended and judged"),
+                hint: format!(
+                    "set it back with `--set render.cameras=test`; `tiface render RUN --cameras {cameras}` makes the \
+                     others, in a folder of their own"
+                ),
+            });
         }
-        for name in order {
-            self.run.agrees(&self.plan(name))?;
-        }
-        Ok(self.run.write("config.toml", self.config.to_toml().as_bytes())?)
+        if order.contains(&"ensemble") { self.can_blend() } else { Ok(()) }
     }
 
     /// What a stage is about to do; its fingerprint holds those of the stages it needs.
     pub fn plan(&self, name: &'static str) -> Plan<'_> {
+        if let ("render", Some(path)) = (name, &self.path) {
+            return self.path_plan(path);
+        }
         let mut settings = self.config.values(name);
         let mut needs_bytes = 16 << 20;
         let needs = self.needs(name).into_iter();
@@ -149,9 +177,9 @@ impl Line<'_> {
                 needs_bytes += c.texels() * (6 * c.pictures() + 3 + if c.exr { 12 } else { 0 });
             }
             "render" => {
-                if !self.path_digest.is_empty() {
-                    inputs.push(("cameras", self.path_digest.clone()));
-                }
+                // what only paths ask for shapes no held-out view
+                settings.remove("render.cameras");
+                settings.remove("render.orbit_views");
                 let each = if self.config.render.float { 12 + 10 } else { 12 };
                 let methods = self.config.render.method.len().max(1) as u64;
                 needs_bytes += self.pixels() * each * methods / 2;
@@ -185,6 +213,12 @@ fn vm_bytes(c: &VmConfig) -> u64 {
     let channels: usize = c.density_rank.iter().chain(&c.color_rank).sum();
     let side = (c.voxels_final as f64).cbrt();
     (channels as f64 * side * side * (36.0 + 4.0 * (c.learned() - 1) as f64)) as u64
+}
+
+/// The stages whose results views by these methods show.
+pub(super) fn shown(methods: &[Method]) -> Vec<&'static str> {
+    let is_shown = |stage: &&str| *stage == "mask" || methods.iter().any(|m| m.stage() == *stage);
+    ["mask", "baseline", "tface", "iface", "mesh"].into_iter().filter(is_shown).collect()
 }
 
 /// The word of the line; the last one for any other.

@@ -5,31 +5,34 @@
 //!        tface/depth/     16-bit millimetres beside 8-bit views
 //!        tface/float/     the same view for `ensemble`: float, coded, no background
 //! ```
+//!
+//! These are the held-out views. Those of other cameras lie in a folder of their own, `render/paths/`.
 
 use super::parts::Whole;
+use super::path::CameraPath;
 use super::product::{Pictures, Product};
 use super::{Fields, Line, PipelineError, march::march, pictures};
 use crate::capture::scene::{self, Scene};
 use crate::capture::{Split, View};
 use crate::config::Method;
 use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
-use crate::io::{self, Limits};
-use crate::render::path::{NamedCamera, PathError, from_json, orbit};
+use crate::io;
+use crate::render::path::{NamedCamera, PathError, orbit};
 use crate::render::{LobePictures, RaycastOptions, RenderedView, Texture, raycast, raycast_hits};
 use crate::run::{Done, Failure, Stop};
 use serde_json::{Map, json};
-use std::path::Path;
 use std::time::{Duration, Instant};
 
 impl Line<'_> {
-    /// Stage `render`: one folder per method, one picture per camera. `fields` are only asked if there
-    /// is something to do, and only for those that the methods show.
+    /// Stage `render`: one folder per method, one picture per camera, of the held-out views or along a path
+    /// ([`Line::along`]). `fields` are only asked if there is something to do, and only for those that the methods
+    /// show.
     pub fn render(&self, fields: &dyn Fields) -> Result<Done, PipelineError> {
         Ok(self.run.stage(self.plan("render"), |stage| {
             let scene = self.scene_or_fail()?;
-            let c = &self.config.render;
+            let c = self.path.as_ref().map_or(&self.config.render, |path| &path.render);
             let meshes = self.meshes(&c.method)?;
-            let eye = self.eye(&scene, fields, &meshes);
+            let eye = self.eye(&scene, fields, &meshes, c.samples);
             let cameras = self.cameras(&scene)?;
             let background = pictures::behind(c.background);
             let total = (cameras.len() * c.method.len()) as u64;
@@ -79,12 +82,18 @@ impl Line<'_> {
     }
 
     /// What views are made with.
-    pub(super) fn eye<'e>(&'e self, scene: &Scene, fields: &'e dyn Fields, meshes: &'e Meshes) -> Eye<'e> {
+    pub(super) fn eye<'e>(
+        &'e self,
+        scene: &Scene,
+        fields: &'e dyn Fields,
+        meshes: &'e Meshes,
+        samples: u32,
+    ) -> Eye<'e> {
         Eye {
             fields,
             whole: meshes.whole.as_ref().map(|w| (w, Bvh::new(&w.mesh))),
             product: meshes.product.as_ref().map(|(product, pictures)| Shown::new(product, pictures)),
-            samples: self.config.render.samples,
+            samples,
             world_from_scene: scene.scene_from_world.inverse(),
             stop: self.run.stop(),
         }
@@ -104,42 +113,30 @@ impl Line<'_> {
 
     /// The cameras to render: named like photographs where they have one.
     pub(super) fn cameras(&self, scene: &Scene) -> Result<Vec<NamedCamera>, Failure> {
-        let wrong = |e: PathError| {
-            let hint = e.hint();
-            Failure::cannot(e, hint)
-        };
-        let all: Vec<Camera> = self.capture.views.iter().map(|v| v.camera.clone()).collect();
-        match self.config.render.cameras.as_str() {
-            "test" => {
+        match &self.path {
+            None => {
                 let mut splits = [Split::Test, Split::Val, Split::Train].map(|s| self.of(s)).into_iter();
                 Ok(splits.find(|cameras| !cameras.is_empty()).unwrap_or_default())
             }
-            "train" => Ok(self.of(Split::Train)),
-            "orbit" => {
+            Some(CameraPath { cameras: Some(cameras), .. }) => Ok(cameras.clone()),
+            Some(CameraPath { render, .. }) => {
+                let all: Vec<Camera> = self.capture.views.iter().map(|v| v.camera.clone()).collect();
                 let bounds = scene::world_box(scene);
-                let count = self.config.render.orbit_views as usize;
-                orbit(&all, bounds, self.capture.up, count).map_err(wrong)
-            }
-            file => {
-                let path = Path::new(file);
-                let bytes = io::read_bytes(path, &Limits::default())?;
-                let text = String::from_utf8_lossy(&bytes);
-                let cameras = from_json(&text, &all[0]).map_err(wrong)?;
-                let mut names: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();
-                names.sort_unstable();
-                if let Some(twice) = names.windows(2).find(|w| w[0] == w[1]) {
-                    let problem = format!("`{file}` names two cameras `{}`", twice[0]);
-                    return Err(Failure::cannot(problem, "give every frame a file name of its own"));
-                }
-                Ok(cameras)
+                let count = render.orbit_views as usize;
+                orbit(&all, bounds, self.capture.up, count).map_err(path_failure)
             }
         }
     }
 
-    fn of(&self, split: Split) -> Vec<NamedCamera> {
+    pub(super) fn of(&self, split: Split) -> Vec<NamedCamera> {
         let named = |v: &View| NamedCamera { name: v.name.clone(), camera: v.camera.clone() };
         self.capture.split(split).map(named).collect()
     }
+}
+
+pub(super) fn path_failure(e: PathError) -> Failure {
+    let hint = e.hint();
+    Failure::cannot(e, hint)
 }
 
 /// The meshes that some methods show.

@@ -1,9 +1,10 @@
 //! `mask/scene.json` and `cameras.json`: where the head is, kept between stages and for other programs.
 
-use crate::capture::Capture;
 use crate::capture::scene::{Hull, Scene};
+use crate::capture::{Capture, View};
 use crate::geom::{Aabb, Similarity};
 use crate::io::{self, Limits, ReadError, WriteError};
+use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use std::path::Path;
@@ -50,4 +51,33 @@ pub(super) fn cameras_json(capture: &Capture, scene: &Scene) -> Vec<u8> {
         "views": capture.views,
     });
     format!("{value:#}\n").into_bytes()
+}
+
+#[derive(Deserialize)]
+struct CamerasFile {
+    capture: String,
+    format: String,
+    up: Vec3,
+    unit_m: f64,
+    views: Vec<View>,
+}
+
+/// Reads the capture that [`cameras_json`] was written of; `root` is where its photographs were.
+pub(super) fn read_capture(path: &Path, root: &Path) -> Result<Capture, ReadError> {
+    let value = io::read_json(path, &Limits::default())?;
+    let wrong = |problem: String| ReadError::Json { path: path.into(), line: 1, column: 1, problem };
+    let file: CamerasFile = serde_json::from_value(value).map_err(|e| wrong(e.to_string()))?;
+    if file.views.is_empty() {
+        return Err(wrong("there are no views".into()));
+    }
+    Ok(Capture {
+        root: root.into(),
+        name: file.capture,
+        format: file.format,
+        reasons: Vec::new(),
+        views: file.views,
+        up: file.up,
+        unit_m: file.unit_m,
+        warnings: Vec::new(),
+    })
 }

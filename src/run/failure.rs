@@ -109,6 +109,20 @@ pub enum RunError {
         /// One line per difference.
         differences: Vec<String>,
     },
+    /// A stage's folder holds something that no stage has made.
+    #[error("`{}` is in the way: it is no folder of a run, and holds `{}`", folder.display(), file.display())]
+    NotOurs {
+        /// The folder.
+        folder: PathBuf,
+        /// A file in it.
+        file: PathBuf,
+    },
+    /// A link where a folder is to be cleared.
+    #[error("`{}` is a link, and what lies behind a link is not removed", path.display())]
+    Linked {
+        /// The link.
+        path: PathBuf,
+    },
     /// Too little room on the disk.
     #[error("stage `{stage}` needs about {needed} bytes, but only {free} are free on the disk of `{}`", run.display())]
     NoSpace {
@@ -163,9 +177,20 @@ impl RunError {
     pub fn hint(&self) -> String {
         match self {
             RunError::Held { .. } => "wait for it, or stop it, then repeat the command".into(),
-            RunError::Changed { stage, .. } => format!(
-                "repeat with the old settings, choose another folder with `--run DIR`, or recompute this stage and what follows with `--fresh {stage}`"
-            ),
+            RunError::Changed { stage, .. } => match stage.split_once('/') {
+                // a product of its own: nothing follows it
+                Some((owner, _)) => format!(
+                    "repeat with the old settings, or add `--fresh {owner}` to make `{stage}` anew, and nothing else"
+                ),
+                None => format!(
+                    "repeat with the old settings, choose another folder with `--run DIR`, or recompute this stage and what follows with `--fresh {stage}`"
+                ),
+            },
+            RunError::NotOurs { .. } => {
+                "choose another folder for the run with `--run DIR`, or move what lies there somewhere else"
+                    .into()
+            }
+            RunError::Linked { .. } => "remove the link, then repeat the command".into(),
             RunError::NoSpace { .. } => {
                 "free space, or place the run on another disk with `--run DIR`".into()
             }

@@ -75,7 +75,11 @@ impl Fingerprint {
         }
         let names: BTreeSet<_> = self.inputs.keys().chain(older.inputs.keys()).collect();
         for name in names.into_iter().filter(|n| self.inputs.get(*n) != older.inputs.get(*n)) {
-            lines.push(format!("{name}: has changed since"));
+            lines.push(match (older.inputs.contains_key(name), self.inputs.contains_key(name)) {
+                (true, false) => format!("{name}: was part of it, is not asked for now"),
+                (false, true) => format!("{name}: is asked for now, was no part of it"),
+                _ => format!("{name}: has changed since"),
+            });
         }
         lines
     }
@@ -97,6 +101,12 @@ mod tests {
         assert_eq!(
             new.differences(&old),
             ["iface.rays: was not set, is 8", "iface.steps: was 20000, is 5000", "mask: has changed since"]
+        );
+        // nothing about what is merely not asked for has changed
+        let other = Fingerprint::default().setting("iface.steps", 20000).input("tface", "cc");
+        assert_eq!(
+            other.differences(&old),
+            ["mask: was part of it, is not asked for now", "tface: is asked for now, was no part of it"]
         );
         assert_ne!(new.digest(), old.digest());
         assert_eq!(old.digest(), old.clone().digest());

@@ -69,6 +69,15 @@ pub struct Run {
 
 const LOCK: &str = ".lock";
 
+/// Is this the folder of a stage, or of a product of its own below one? It has a lock from the first moment;
+/// a copy may have lost that.
+fn has_record(folder: &Path) -> bool {
+    let lock = folder.join(LOCK);
+    (io::is_file(&lock) && !io::is_link(&lock))
+        || matches!(read_record(folder), Ok(Some(_)))
+        || matches!(read_status(folder), Ok(Some(_)))
+}
+
 impl Run {
     /// The run in `dir`; the folder is made with the first file that is written. Events go to
     /// `observer`; every stage stops when `stop` says so.
@@ -97,20 +106,49 @@ impl Run {
         Ok(io::write_atomic(&path, bytes)?)
     }
 
-    /// Removes what a stage and those after it in `order` have made, so that they start anew. All
-    /// their locks are held meanwhile.
-    pub fn fresh(&self, stage: &str, order: &[&str]) -> Result<(), RunError> {
-        let from = order.iter().position(|s| *s == stage).unwrap_or(order.len());
+    /// Removes what stages have made, so that they start anew; `names` in the order of the line. All their
+    /// locks are held meanwhile. What has a lock or a record of its own below a stage's folder stays.
+    ///
+    /// # Errors
+    ///
+    /// A folder that is a link, or that holds what no stage has made, and then nothing is removed at all.
+    pub fn fresh(&self, names: &[String]) -> Result<(), RunError> {
+        let there: Vec<&String> = names.iter().filter(|n| io::is_folder(&self.path(n))).collect();
+        for name in &there {
+            if let Some(link) = self.link(name) {
+                return Err(RunError::Linked { path: link });
+            }
+            self.is_ours(name)?;
+        }
         let mut locks = Vec::new();
-        for name in order[from..].iter().filter(|n| io::is_folder(&self.path(n))) {
+        for name in there {
             locks.push((self.path(name), self.lock(name)?));
         }
         // the last stage first: stopped halfway, no stage is left whose input is gone
         for (folder, _lock) in locks.iter().rev() {
             io::remove_file(&folder.join("done.json"))?;
-            io::clear_folder(folder, LOCK)?;
+            io::clear_folder(folder, LOCK, &has_record)?;
         }
         Ok(())
+    }
+
+    /// An error if a stage's folder holds something, and nothing says that a stage has made it.
+    fn is_ours(&self, name: &str) -> Result<(), RunError> {
+        let folder = self.path(name);
+        if has_record(&folder) {
+            return Ok(());
+        }
+        match io::any_file(&folder, &has_record)? {
+            Some(file) => Err(RunError::NotOurs { folder, file }),
+            None => Ok(()),
+        }
+    }
+
+    /// The link, if there is one, on the way from the run's folder to that of a stage.
+    fn link(&self, name: &str) -> Option<PathBuf> {
+        let below = self.path(name);
+        let inside = below.ancestors().take_while(|path| *path != self.dir);
+        inside.filter(|path| io::is_link(path)).last().map(Path::to_path_buf)
     }
 
     /// Tells the observer something that went differently than hoped.

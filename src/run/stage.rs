@@ -3,7 +3,7 @@
 use super::progress::Progress;
 use super::status::{host, now};
 use super::{Event, Failure, Fingerprint, Monitor, Record, Run, RunError, State, Status};
-use super::{read_record, read_status};
+use super::{has_record, read_record, read_status};
 use crate::io;
 use serde_json::Value;
 use std::path::Path;
@@ -83,6 +83,7 @@ impl Run {
         if let Some(done) = self.complete(&plan)? {
             return Ok(done);
         }
+        self.is_ours(name)?;
         io::create_folder(&folder)?;
         let _lock = self.lock(name)?;
         // another process may have finished between the look and the lock
@@ -139,13 +140,21 @@ impl Run {
     }
 
     /// Was what lies in the stage's folder made, or begun, with this plan? An error that prints the
-    /// differences if not; an empty folder agrees with everything.
+    /// differences if not; an empty folder agrees with everything. An error, too, if what lies there was made by
+    /// no stage.
     pub fn agrees(&self, plan: &Plan) -> Result<(), RunError> {
         // a record that cannot be read counts as none, and is told when the stage is worked on
         if let Ok(Some(record)) = read_record(&self.path(plan.name)) {
             return same(plan, &record.fingerprint, true);
         }
+        self.is_ours(plan.name)?;
         self.begun(plan).map(|_| ())
+    }
+
+    /// Is the stage complete, as planned?
+    pub fn is_done(&self, plan: &Plan) -> bool {
+        let record = read_record(&self.path(plan.name));
+        record.is_ok_and(|r| r.is_some_and(|r| r.fingerprint == plan.fingerprint))
     }
 
     /// The finished stage, if its record is there and fits.
@@ -201,11 +210,15 @@ fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<(), RunError> {
     Err(RunError::Changed { stage: plan.name.into(), done, differences })
 }
 
-/// Removes half-written files in a stage's folder and the folders directly in it.
+/// Removes half-written files in a stage's folder and the folders in it; not behind links, nor where another
+/// process may be writing.
 fn sweep(folder: &Path) -> Result<usize, RunError> {
+    if io::is_link(folder) {
+        return Ok(0);
+    }
     let mut removed = io::remove_leftovers(folder)?;
-    for inner in io::list_folders(folder)? {
-        removed += sweep(&inner)?;
+    for inner in io::list_folders(folder)?.iter().filter(|f| !has_record(f)) {
+        removed += sweep(inner)?;
     }
     Ok(removed)
 }
@@ -232,6 +245,10 @@ mod tests {
         io::write_atomic(&stage.folder().join("checkpoint"), b"weights")?;
         stage.monitor().step(5, 5, &[("loss", 0.5), ("bad", f64::NAN)]);
         Ok(json!({"loss": 0.5}))
+    }
+
+    fn fresh(run: &Run, names: &[&str]) -> Result<(), RunError> {
+        run.fresh(&names.iter().map(|n| n.to_string()).collect::<Vec<_>>())
     }
 
     fn never(_: &Stage) -> Result<Value, Failure> {
@@ -274,13 +291,13 @@ mod tests {
         assert_eq!(run.agrees(&plan(7)).unwrap_err().to_string(), error.to_string());
         assert!(run.agrees(&plan(5)).is_ok());
         assert!(error.hint().contains("--fresh iface"));
-        fs::create_dir(dir.path().join("mesh")).unwrap();
-        fs::write(dir.path().join("mesh/head.glb"), b"old").unwrap();
-        fs::create_dir(dir.path().join("mask")).unwrap();
-        fs::write(dir.path().join("mask/a.png"), b"kept").unwrap();
-        run.fresh("iface", &["mask", "iface", "mesh"]).unwrap();
-        assert!(dir.path().join("mask/a.png").is_file());
-        assert!(!dir.path().join("mesh/head.glb").exists() && !dir.path().join("iface/checkpoint").exists());
+        run.stage(Plan { name: "mesh", ..plan(5) }, work).unwrap();
+        run.stage(Plan { name: "mask", ..plan(5) }, work).unwrap();
+        fresh(&run, &["iface", "mesh"]).unwrap();
+        assert!(dir.path().join("mask/checkpoint").is_file());
+        assert!(
+            !dir.path().join("mesh/checkpoint").exists() && !dir.path().join("iface/checkpoint").exists()
+        );
         assert!(!run.stage(plan(7), work).unwrap().skipped);
     }
 
@@ -306,7 +323,7 @@ mod tests {
         run.stage(plan(5), |stage| {
             let error = inner.stage(plan(5), never).unwrap_err();
             assert_eq!(error.exit().code(), 75);
-            assert_eq!(inner.fresh("iface", &["iface"]).unwrap_err().exit().code(), 75);
+            assert_eq!(fresh(&inner, &["iface"]).unwrap_err().exit().code(), 75);
             // other stages are free meanwhile
             inner.stage(Plan { name: "tface", ..plan(5) }, work).unwrap();
             work(stage)
@@ -373,6 +390,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         fs::create_dir_all(dir.path().join("iface/views")).unwrap();
         fs::write(dir.path().join("iface/views/.a.png.99.tmp"), b"half").unwrap();
+        fs::write(dir.path().join("iface/.lock"), b"").unwrap();
         fs::write(dir.path().join("iface/done.json"), b"").unwrap(); // a crash before any sync
         let seen = Arc::new(Warnings(Mutex::new(Vec::new())));
         let run = Run::open(dir.path(), Stop::new(), seen.clone());
@@ -381,6 +399,69 @@ mod tests {
         let told = seen.0.lock().unwrap();
         assert!(told.iter().any(|t| t.contains("1 half-written")), "{told:?}");
         assert!(told.iter().any(|t| t.contains("done.json")), "{told:?}");
+    }
+
+    #[test]
+    fn somebodys_own_folder_beside_the_run_is_neither_cleared_nor_written_to() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        run.stage(Plan { name: "mask", ..plan(5) }, work).unwrap();
+        let own = dir.path().join("iface/scans");
+        fs::create_dir_all(&own).unwrap();
+        fs::write(own.join("a.png"), b"mine").unwrap();
+        for error in [
+            fresh(&run, &["mask", "iface"]).unwrap_err(),
+            run.agrees(&plan(5)).unwrap_err(),
+            run.stage(plan(5), never).unwrap_err(),
+        ] {
+            assert!(error.to_string().contains("scans/a.png") && error.exit() == Exit::Cannot, "{error}");
+            assert!(error.hint().contains("--run DIR"), "{}", error.hint());
+        }
+        assert_eq!(fs::read(own.join("a.png")).unwrap(), b"mine");
+        assert_eq!(fs::read_dir(dir.path().join("iface")).unwrap().count(), 1);
+        // refused as a whole: the stage that could have been cleared is still there
+        assert!(dir.path().join("mask/done.json").is_file());
+        fs::remove_dir_all(&own).unwrap();
+        assert!(run.stage(plan(5), work).is_ok());
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn a_stage_folder_that_is_a_link_keeps_what_lies_behind_it() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        let elsewhere = dir.path().join("scratch");
+        open(&elsewhere).stage(plan(5), work).unwrap();
+        fs::write(elsewhere.join("iface/.a.png.99.tmp"), b"half").unwrap();
+        std::os::unix::fs::symlink(elsewhere.join("iface"), dir.path().join("iface")).unwrap();
+        // it may lie elsewhere
+        assert!(run.stage(plan(5), never).unwrap().skipped);
+        let error = fresh(&run, &["iface"]).unwrap_err();
+        assert!(matches!(&error, RunError::Linked { path } if path.ends_with("iface")), "{error}");
+        assert!(elsewhere.join("iface/checkpoint").is_file());
+        fs::remove_file(elsewhere.join("iface/done.json")).unwrap();
+        assert!(!run.stage(plan(5), work).unwrap().skipped);
+        assert!(elsewhere.join("iface/.a.png.99.tmp").is_file());
+    }
+
+    #[test]
+    fn a_product_with_a_record_of_its_own_outlives_its_stage_and_is_made_anew_alone() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        let (stage, own) = (Plan { name: "render", ..plan(5) }, Plan { name: "render/paths/a", ..plan(5) });
+        run.stage(own.clone(), work).unwrap();
+        fs::write(dir.path().join("render/paths/a/.b.png.99.tmp"), b"in progress").unwrap();
+        run.stage(stage.clone(), work).unwrap();
+        assert!(dir.path().join("render/paths/a/.b.png.99.tmp").is_file());
+        fresh(&run, &["render"]).unwrap();
+        assert!(!dir.path().join("render/checkpoint").exists());
+        assert!(run.stage(own.clone(), never).unwrap().skipped);
+        run.stage(stage.clone(), work).unwrap();
+        let error = run.stage(Plan { name: own.name, ..plan(7) }, never).unwrap_err();
+        assert!(error.hint().contains("`--fresh render` to make `render/paths/a` anew"), "{}", error.hint());
+        fresh(&run, &["render/paths/a"]).unwrap();
+        assert!(!run.stage(Plan { name: own.name, ..plan(7) }, work).unwrap().skipped);
+        assert!(run.stage(stage, never).unwrap().skipped);
     }
 
     #[test]

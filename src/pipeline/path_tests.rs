@@ -1,0 +1,308 @@
+//! Views of camera paths, beside a finished evaluation.
+
+use super::*;
+use crate::capture::synthetic::{SyntheticOptions, write_capture};
+use crate::config::{Background, Method, PictureFormat, Preset, RenderConfig};
+use crate::run::{Quiet, Stop};
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// Radiance fields that are one colour; others may not be asked for.
+struct Fog;
+
+impl Radiance for Fog {
+    fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<Seen> {
+        vec![Seen { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..Seen::default() }; rays.len()]
+    }
+}
+
+impl Fields for Fog {
+    fn surface(&self) -> Result<&dyn Surface, Failure> {
+        panic!("no surface is asked for")
+    }
+
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+        Ok(self)
+    }
+}
+
+fn config(root: &Path) -> Config {
+    let options = SyntheticOptions { width: 16, height: 20, train: 4, test: 2, seed: 1 };
+    write_capture(root, &options).unwrap();
+    let mut config = Config::preset(Preset::Draft);
+    config.capture.path = root.to_str().unwrap().into();
+    config.render.method = vec![Method::Baseline, Method::Tface];
+    config.ensemble.members = vec![Method::Baseline, Method::Tface];
+    config.ensemble.weights = vec![0.25, 0.75];
+    config
+}
+
+/// As `--cameras CAMERAS --with tface --background white` asks for it.
+fn turn(config: &Config, cameras: &str) -> RenderConfig {
+    RenderConfig {
+        cameras: cameras.into(),
+        method: vec![Method::Tface],
+        background: Background::White,
+        orbit_views: 3,
+        ..config.render.clone()
+    }
+}
+
+fn quiet(dir: &Path) -> Run {
+    Run::open(&dir.join("run"), Stop::new(), Arc::new(Quiet))
+}
+
+/// All stages, with fields that nobody has learned; were they skipped?
+fn evaluate(line: &Line) -> Vec<bool> {
+    line.remember("metrics").unwrap();
+    let mask = line.mask();
+    for name in ["baseline", "tface"] {
+        line.run.stage(line.plan(name), |_| Ok(Value::Null)).unwrap();
+    }
+    let done = [mask, line.render(&Fog), line.ensemble(&Fog), line.metrics()];
+    line.report().unwrap();
+    done.map(|d| d.unwrap().skipped).to_vec()
+}
+
+/// Every file of a run with its bytes, those of paths left out.
+fn files(run: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut found = Vec::new();
+    let mut folders = vec![run.to_path_buf()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.ends_with("render/paths") {
+                continue;
+            } else if path.is_dir() {
+                folders.push(path);
+            } else {
+                let bytes = std::fs::read(&path).unwrap();
+                found.push((path, bytes));
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+#[test]
+fn camera_paths_never_touch_the_evaluations_views() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = config(&dir.path().join("head"));
+    let run = quiet(dir.path());
+    let open = || Line::open(&config, &run, false).unwrap();
+    assert_eq!(evaluate(&open()), [false; 4]);
+    let before = files(run.dir());
+    assert!(before.iter().any(|(path, _)| path.ends_with("metrics/metrics.json")));
+
+    let flight = dir.path().join("flight.json");
+    let eye = "[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]";
+    std::fs::write(&flight, format!(r#"{{"frames": [{{"transform_matrix": {eye}}}]}}"#)).unwrap();
+    for (cameras, views) in [("orbit", 3), ("train", 4), (flight.to_str().unwrap(), 1)] {
+        let line = open().along(turn(&config, cameras)).unwrap();
+        // nothing but what the views show, and nothing that builds on them
+        assert_eq!(line.order("render").join(" "), "mask tface render");
+        line.fresh("render").unwrap();
+        for again in [false, true] {
+            line.remember("render").unwrap();
+            let done = line.render(&Fog).unwrap();
+            line.report().unwrap();
+            assert_eq!((done.skipped, &done.summary["cameras"]), (again, &Value::from(views)), "{cameras}");
+        }
+        let folder = run.path(line.views());
+        assert!(folder.starts_with(run.path("render/paths")), "{}", folder.display());
+        assert_eq!(io::list_files(&folder.join("tface")).unwrap().len() as u64, views);
+        assert!(!folder.join("tface/float").exists());
+    }
+    assert!(run.path("render/paths/orbit/done.json").is_file());
+    assert_eq!(io::list_folders(&run.path("render/paths")).unwrap().len(), 3);
+    // half a grey of 0.5 over white
+    let shown = pictures::read(&run.path("render/paths/orbit/tface/0001.png"), PictureFormat::Png).unwrap();
+    assert_eq!(shown.pixel(3, 3)[0], 191.0 / 255.0);
+
+    assert!(before == files(run.dir()), "the evaluation has changed");
+    assert_eq!(evaluate(&open()), [true; 4]);
+    assert!(before == files(run.dir()), "the evaluation has changed");
+}
+
+#[test]
+fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = config(&dir.path().join("head"));
+    let run = quiet(dir.path());
+    let line = || Line::open(&config, &run, false).unwrap();
+    evaluate(&line());
+    let orbit = turn(&config, "orbit");
+    line().along(orbit.clone()).unwrap().render(&Fog).unwrap();
+    line().along(turn(&config, "train")).unwrap().render(&Fog).unwrap();
+    let black = line().along(RenderConfig { background: Background::Black, ..orbit.clone() }).unwrap();
+    let e = black.remember("render").unwrap_err();
+    assert!(e.to_string().contains("render.background: was \"white\", is \"black\""), "{e}");
+    assert!(e.hint().contains("`--fresh render`") && e.hint().contains("nothing else"), "{}", e.hint());
+    black.fresh("render").unwrap();
+    assert!(!black.render(&Fog).unwrap().skipped);
+    assert_eq!(evaluate(&line()), [true; 4]);
+    assert!(line().along(turn(&config, "train")).unwrap().render(&Fog).unwrap().skipped);
+    // the held-out views made anew are no reason to make others anew, another field is one
+    line().fresh("render").unwrap();
+    assert!(run.path("render/paths/orbit/done.json").is_file() && !run.path("render/done.json").is_file());
+    line().fresh("baseline").unwrap();
+    assert!(run.path("render/paths/orbit/done.json").is_file());
+    line().fresh("tface").unwrap();
+    assert!(!run.path("render/paths/orbit/done.json").exists());
+}
+
+#[test]
+fn a_file_of_cameras_is_read_before_anything_is_learned() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = config(&dir.path().join("head"));
+    let run = quiet(dir.path());
+    let path = dir.path().join("path.json");
+    let along = |text: &str| {
+        std::fs::write(&path, text).unwrap();
+        let line = Line::open(&config, &run, false).unwrap();
+        let line = line.along(turn(&config, path.to_str().unwrap()))?;
+        Ok::<_, PipelineError>(line.views().to_owned())
+    };
+    let e = along("{}").unwrap_err();
+    assert!(e.to_string().contains("camera_path") && e.exit().code() == 1, "{e}");
+    let frame = r#"{"file_path": "a.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]}"#;
+    let e = along(&format!(r#"{{"frames": [{frame}, {frame}]}}"#)).unwrap_err();
+    assert!(e.to_string().contains("two cameras `a`"), "{e}");
+    // another content, another folder
+    let (first, second) =
+        (along(&format!(r#"{{"frames": [{frame}]}}"#)), along(&format!(r#"{{"frames":[{frame}]}}"#)));
+    assert_ne!(first.unwrap(), second.unwrap());
+}
+
+#[test]
+fn a_method_that_is_not_asked_for_is_not_called_changed() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut config = config(&dir.path().join("head"));
+    let run = quiet(dir.path());
+    evaluate(&Line::open(&config, &run, false).unwrap());
+    config.render.method = vec![Method::Tface];
+    let e = Line::open(&config, &run, false).unwrap().remember("render").unwrap_err().to_string();
+    assert!(e.contains("render.method: was [\"baseline\", \"tface\"], is [\"tface\"]"), "{e}");
+    assert!(
+        e.contains("baseline: was part of it, is not asked for now") && !e.contains("has changed"),
+        "{e}"
+    );
+}
+
+#[test]
+fn an_evaluation_of_other_cameras_than_the_held_out_ones_is_refused_with_the_way_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut config = config(&dir.path().join("head"));
+    let run = quiet(dir.path());
+    config.render.cameras = "orbit".into();
+    let line = Line::open(&config, &run, false).unwrap();
+    let e = line.remember("metrics").unwrap_err();
+    assert!(e.to_string().starts_with("`render.cameras` is orbit") && e.exit() == Exit::Usage, "{e}");
+    assert!(
+        e.hint().contains("--set render.cameras=test") && e.hint().contains("--cameras orbit"),
+        "{}",
+        e.hint()
+    );
+    assert!(line.outlook("metrics").is_err() && !run.dir().exists());
+}
+
+#[test]
+fn nothing_to_judge_is_an_error_and_no_empty_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut config = config(&dir.path().join("head"));
+    config.render.method.clear();
+    config.ensemble.members.clear();
+    let run = quiet(dir.path());
+    let line = Line::open(&config, &run, false).unwrap();
+    line.mask().unwrap();
+    line.render(&Fog).unwrap();
+    let e = line.metrics().unwrap_err();
+    assert!(e.hint().contains("`render.method`") && !run.path("metrics/metrics.json").exists(), "{e}");
+}
+
+#[test]
+fn a_stage_command_does_not_shrink_the_report_of_a_finished_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = config(&dir.path().join("head"));
+    let run = quiet(dir.path());
+    let line = Line::open(&config, &run, false).unwrap();
+    evaluate(&line);
+    let page = || std::fs::read_to_string(run.path("report.html")).unwrap();
+    let whole = page();
+    assert_eq!(whole.matches("<h2>mask</h2>").count() + whole.matches("<h2>metrics</h2>").count(), 2);
+    std::fs::remove_file(run.path("report.html")).unwrap();
+    // as a later command on one stage leaves it
+    let line = Line::open(&config, &run, false).unwrap();
+    line.remember("mask").unwrap();
+    line.mask().unwrap();
+    line.report().unwrap();
+    assert!(page() == whole);
+}
+
+#[test]
+fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_name_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    let config = config(&root);
+    let run = quiet(dir.path());
+    let first = Line::open(&config, &run, false).unwrap();
+    evaluate(&first);
+    let (before, export) = (files(run.dir()), first.export());
+    std::fs::rename(&root, dir.path().join("moved")).unwrap();
+
+    let line = Line::open(&config, &run, false).unwrap();
+    assert_eq!(evaluate(&line), [true; 4]);
+    assert!(line.outlook("metrics").is_ok());
+    assert!(before == files(run.dir()));
+    let again = line.export();
+    assert_eq!((again.name, again.up, again.cameras), (export.name, export.up, export.cameras));
+
+    // there is work: nothing is removed or written before it is known that it cannot be done
+    for e in [
+        line.fresh("metrics").unwrap_err(),
+        Line::open(&config, &run, false)
+            .unwrap()
+            .along(turn(&config, "orbit"))
+            .unwrap()
+            .remember("render")
+            .unwrap_err(),
+    ] {
+        assert!(e.to_string().contains("head") && e.exit().code() == 1, "{e}");
+        assert!(e.hint().contains("--set capture.path="), "{}", e.hint());
+    }
+    assert!(before == files(run.dir()));
+    std::fs::remove_file(run.path("mask/done.json")).unwrap();
+    let e = Line::open(&config, &run, false).err().unwrap();
+    assert!(e.hint().contains("--set capture.path="), "{e}");
+
+    // and that way out is one
+    let mut moved = config.clone();
+    moved.capture.path = dir.path().join("moved").to_str().unwrap().into();
+    assert_eq!(evaluate(&Line::open(&moved, &run, false).unwrap()), [false, true, true, true]);
+    // where there is no run, it is the capture that is wrong
+    let e = Line::open(&config, &quiet(&dir.path().join("new")), false).err().unwrap();
+    assert!(!e.hint().contains("capture.path"), "{e}");
+}
+
+#[test]
+#[cfg(feature = "cpu")]
+fn a_finished_run_that_cannot_be_written_is_still_done() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut config = config(&dir.path().join("head"));
+    let run = quiet(dir.path());
+    evaluate(&Line::open(&config, &run, false).unwrap());
+    // a folder in the place of a file cannot be written by anybody
+    for file in ["config.toml", "cameras.json", "report.html"] {
+        std::fs::remove_file(run.path(file)).unwrap();
+        std::fs::create_dir(run.path(file)).unwrap();
+    }
+    config.device = "cpu".into();
+    let line = Line::open(&config, &run, false).unwrap();
+    line.remember("metrics").unwrap();
+    let done = reconstruct(&line, "metrics").unwrap();
+    assert!(done.len() == 6 && done.iter().all(|(_, stage)| stage.skipped), "{done:?}");
+    // with work to do it is an error, before that is begun
+    line.fresh("metrics").unwrap();
+    assert!(line.remember("metrics").unwrap_err().to_string().contains("config.toml"));
+}
