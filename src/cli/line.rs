@@ -196,7 +196,8 @@ impl Work<'_> {
             let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
             let files = ["glb", "obj", "ply"].map(|e| run.path(format!("mesh/head.{e}")));
             let first = files.iter().find(|f| io::is_file(f)).unwrap_or(&files[0]);
-            row("mesh", format!("{} ({} triangles, {state})", first.display(), mesh["triangles"]));
+            let loops = handles(&mesh["handles"]);
+            row("mesh", format!("{} ({} triangles, {state}{loops})", first.display(), mesh["triangles"]));
         }
         for (_, folder) in
             [("render", views), ("ensemble", "ensemble")].iter().filter(|(s, _)| of(s).is_some())
@@ -216,6 +217,19 @@ impl Work<'_> {
         }
         say(&text)
     }
+}
+
+/// What became of handles, after a comma; nothing where there were none.
+fn handles(figures: &Value) -> String {
+    let count = |key: &str| figures[key].as_array().map_or(0, Vec::len) as u64;
+    let all = [
+        (count("cut_mm"), "cut"),
+        (count("filled_mm"), "filled"),
+        (figures["left"].as_u64().unwrap_or(0), "left"),
+    ];
+    let parts: Vec<String> =
+        all.iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!("{n} {what}")).collect();
+    if parts.is_empty() { String::new() } else { format!(", handles: {}", parts.join(", ")) }
 }
 
 /// How good the result is, one sentence per thing known.

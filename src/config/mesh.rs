@@ -25,6 +25,16 @@ pub enum MeshFrame {
     Head,
 }
 
+/// What becomes of handles: loops of hair, holes between locks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Genus {
+    /// They stay.
+    Keep,
+    /// Small ones are cut or filled.
+    Simple,
+}
+
 /// How a texture is stored inside or beside a mesh.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -41,6 +51,9 @@ table! {
     keys {
         /// Samples along the longest side of the box.
         resolution: u32, 16.0..=4096.0 => 256, 512, 512;
+        /// Handles, such as loops of hair: keep, or simple (cut or filled, up to a loop of 0.15 of the surface's
+        /// longest side: about 45 mm on a head).
+        genus: Genus => Genus::Simple;
         /// Also evaluate the whole grid and report what the sparse extraction lost: slow.
         verify: bool => false;
         /// Close the surface where the frames cut the body: true or false.

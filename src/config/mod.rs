@@ -27,7 +27,7 @@ pub use capture::CaptureConfig;
 pub use ensemble::EnsembleConfig;
 pub use iface::IfaceConfig;
 pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors};
-pub use mesh::{MeshConfig, MeshFormat, MeshFrame, TextureFormat};
+pub use mesh::{Genus, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 pub use metrics::MetricsConfig;
 pub use render::{Background, Method, NAMES, PictureFormat, RenderConfig, called};
 pub use source::{ConfigError, Place, Sources};

@@ -1,5 +1,6 @@
 //! The stage: from a signed distance to a closed mesh with normals and colours.
 
+use super::handles::{HandleReport, Patches, cut_handles};
 use super::polish::{Polish, angle_weighted_normals};
 use super::sparse::{Asking, Grid, Sparse, sparse};
 use super::verify::{Verified, dense_triangles};
@@ -41,6 +42,9 @@ pub struct MeshReport {
     pub off_surface_after: f64,
     /// Vertices that some step moved less than asked, because a face would have been spoiled.
     pub held_back: usize,
+    /// Handles that were cut, filled or left.
+    #[serde(default)]
+    pub handles: HandleReport,
     /// The finished mesh: closed, manifold, pieces, Euler number.
     pub topology: Topology,
     /// Enclosed volume, in units of the bounds cubed.
@@ -89,7 +93,7 @@ impl MeshReport {
 /// with unit normals. Points for which `inside_hull` is false count as outside without being asked.
 ///
 /// The mesh is closed (capped where the field leaves the box), its vertices moved onto the field's zero,
-/// its normals the field's gradient.
+/// its normals the field's gradient. Handles with a loop no longer than `config.longest_handle` are gone.
 ///
 /// # Errors
 ///
@@ -160,10 +164,22 @@ pub fn extract(
     }
     report.off_surface_after = off_surface(&values, &gradients, &capped, grid.spacing);
 
+    let longest = config.longest_handle * mesh.bounds().size().max_element();
+    if longest > 0.0 {
+        let values = |points: &[Vec3]| values_at(points, config.batch, &sdf);
+        report.handles = cut_handles(&mut mesh, longest, &values, &|| monitor.stop())?;
+    }
+    // vertices whose normal is not the field's slope
+    let mut edged: Vec<bool> = mesh.positions.iter().map(|&p| on_border(&grid, p)).collect();
+    if let Some(patches) = Patches::of(&mesh, &report.handles) {
+        patches.corners().for_each(|v| edged[v as usize] = true);
+        gradients = gradient(&mesh.positions)?.1;
+    }
+
     mesh.normals = angle_weighted_normals(&mesh.positions, &mesh.triangles);
     for (i, normal) in mesh.normals.iter_mut().enumerate() {
         let g = gradients[i];
-        if !capped[i] && g.is_finite() && g.length() >= 1e-6 {
+        if !edged[i] && g.is_finite() && g.length() >= 1e-6 {
             *normal = g.normalize();
         }
     }
@@ -180,6 +196,7 @@ pub fn extract(
     tell(&[("vertices", mesh.positions.len() as f64)])?;
 
     report.topology = topology(&mesh.positions, &mesh.triangles);
+    report.handles.left = report.topology.genus.map_or(0, |g| g as usize);
     report.volume = mesh.signed_volume();
     report.seconds = begin.elapsed().as_secs_f64();
     tell(&[("euler", report.topology.euler as f64)])?;
@@ -229,6 +246,23 @@ fn answers(
         gradients.extend(g);
     }
     Ok((values, gradients))
+}
+
+fn values_at(
+    points: &[Vec3],
+    batch: usize,
+    sdf: &(impl Fn(&[Vec3]) -> Vec<f32> + Sync),
+) -> Result<Vec<f32>, MeshError> {
+    let mut values = Vec::with_capacity(points.len());
+    for points in points.chunks(batch) {
+        values.extend(sdf(points));
+    }
+    match (points.len(), values.len()) {
+        (asked, answered) if asked != answered => {
+            Err(MeshError::Answer { what: "signed distance", asked, answered })
+        }
+        _ => Ok(values),
+    }
 }
 
 /// Mean first-order distance to the surface, in cells, over vertices that are not capped.

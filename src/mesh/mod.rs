@@ -1,7 +1,7 @@
 //! Stage: a surface an artist can open. The zero level set of a signed distance becomes a closed mesh.
 //!
 //! [`marching`] meshes a dense grid, [`sparse`] asks a field only near its surface, [`clean`] keeps the
-//! head and drops the dust, [`extract`] is all of it, with normals and colours; [`Cap`] closes what the frames
+//! head and drops the dust, `handles` makes it simple, [`extract`] is all of it, with normals and colours; [`Cap`] closes what the frames
 //! cut. [`simplify`], [`atlas`] and [`bake`] make of it what an artist opens; [`gltf`], [`obj`] and [`ply`] its
 //! files.
 
@@ -15,7 +15,9 @@ pub mod export;
 mod extract;
 pub mod gltf;
 mod gltf_document;
+mod handles;
 mod holes;
+mod loops;
 mod marching;
 mod marching_bits;
 mod marching_cell;
@@ -36,6 +38,7 @@ pub use cap::{Cap, Skin};
 pub use clean::{CleanReport, clean};
 pub use error::MeshError;
 pub use extract::{MeshReport, extract};
+pub use handles::{HandleReport, Patches};
 pub use marching::{Surface, Volume, marching};
 pub use simplify::{Placement, SimplifyConfig, SimplifyReport, simplify};
 pub use sparse::{Asking, Grid, Sparse, sparse};
@@ -60,9 +63,16 @@ pub struct MeshConfig {
     pub newton_steps: usize,
     /// How far vertices slide towards the middle of their neighbours with the first step; 0..=1.
     pub relax: f32,
+    /// Handles are cut, or their holes filled, where they have a loop no longer than this share of the surface's
+    /// longest side; 0..=1, 0 leaves them all.
+    pub longest_handle: f32,
     /// Also evaluate the whole grid and report what the sparse extraction lost: slow, for checking.
     pub verify: bool,
 }
+
+/// The loops of locks and between them, not those of a body: 45 mm of a head with its neck, 300 mm long, which
+/// is a strand or a hole as thick as a thumb. A share, since not every capture knows its unit.
+pub const LONGEST_HANDLE: f32 = 0.15;
 
 impl Default for MeshConfig {
     fn default() -> MeshConfig {
@@ -73,6 +83,7 @@ impl Default for MeshConfig {
             keep_share: 1.0,
             newton_steps: 2,
             relax: 0.5,
+            longest_handle: LONGEST_HANDLE,
             verify: false,
         }
     }
@@ -100,6 +111,12 @@ impl MeshConfig {
         if !(0.0..=1.0).contains(&self.relax) {
             return bad("relax", "0..=1", self.relax.to_string());
         }
+        if !(0.0..=1.0).contains(&self.longest_handle) {
+            return bad("longest_handle", "0..=1", self.longest_handle.to_string());
+        }
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod handles_tests;

@@ -8,7 +8,7 @@ use crate::geom::{Camera, Mesh};
 use crate::image::{Image, Photo, quantise, srgb_from_linear};
 use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, bake, tangent_space};
 use crate::mesh::textured_tangents::tangents;
-use crate::mesh::{AtlasConfig, Cap, MeshError, SimplifyConfig, atlas, simplify};
+use crate::mesh::{AtlasConfig, Cap, MeshError, Patches, SimplifyConfig, atlas, simplify};
 use crate::run::Monitor;
 use glam::{Mat3, Vec3};
 use serde_json::{Map, Value, json};
@@ -28,12 +28,21 @@ pub(super) struct Finished {
     pub warnings: Vec<String>,
 }
 
+/// What closes a surface where the field's own zero does not.
+#[derive(Clone, Copy)]
+pub(super) struct Closing<'a> {
+    /// Where the frames cut the body.
+    pub cap: Option<&'a Cap>,
+    /// Where handles were cut.
+    pub patches: Option<&'a Patches>,
+}
+
 impl Line<'_> {
     /// Finishes a surface in scene coordinates, extracted with cells of `cell`.
     pub(super) fn finish(
         &self,
         surface: &Mesh,
-        cap: Option<&Cap>,
+        Closing { cap, patches }: Closing,
         cell: f32,
         scene: &Scene,
         field: &dyn Surface,
@@ -48,6 +57,9 @@ impl Line<'_> {
             let (mut values, mut gradients) = field.sdf_gradient(points);
             if let Some(cap) = cap {
                 cap.close(points, &mut values, &mut gradients);
+            }
+            if let Some(patches) = patches {
+                patches.close(points, &mut values, &mut gradients);
             }
             (values, gradients)
         };

@@ -1,19 +1,19 @@
 //! Stage `mesh`: the zero level set of the learned distance, closed, in the dataset's world.
 
-use super::finish::{Finished, REACH};
+use super::finish::{Closing, Finished, REACH};
 use super::parts::Whole;
 use super::product::Product;
 use super::{Fields, Line, PipelineError, export};
 use crate::capture::{self, Split};
-use crate::config::MeshConfig;
+use crate::config::{Genus, MeshConfig};
 use crate::geom::{Camera, Mesh, Similarity};
 use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::read::ReadMeshError;
-use crate::mesh::{self, Cap, MeshError, ply};
+use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshError, Patches, ply};
 use crate::run::{Done, Failure};
 use glam::{DVec3, Vec3};
-use serde_json::json;
+use serde_json::{Value, json};
 
 impl Line<'_> {
     /// Stage `mesh`: the whole surface as `surface.ply` in the dataset's world, and the product an artist opens
@@ -29,6 +29,7 @@ impl Line<'_> {
                 keep_share: c.keep_share,
                 newton_steps: c.newton_steps as usize,
                 relax: c.relax,
+                longest_handle: if c.genus == Genus::Simple { LONGEST_HANDLE } else { 0.0 },
                 verify: c.verify,
                 ..mesh::MeshConfig::default()
             };
@@ -60,6 +61,9 @@ impl Line<'_> {
             };
             let (mut surface, report) = extracted.map_err(failed)?;
             report.warnings(c.cap).iter().for_each(|w| stage.warn(w));
+            let mm = scene.scene_from_world.inverse().scale * self.config.capture.unit_m * 1000.0;
+            report.handles.warning(mm).iter().for_each(|w| stage.warn(w));
+            let patches = Patches::of(&surface, &report.handles);
             let mut cap = Cap::of(&surface, report.bounds(), report.cell_size);
             if let Some(cap) = &cap {
                 if c.cap {
@@ -87,8 +91,8 @@ impl Line<'_> {
                 let reach = REACH * report.cell_size;
                 cap.shade(|p, n| seen_colors(&surface, p, n, &learned, &cameras, reach));
             }
-            let finished =
-                self.finish(&surface, cap.as_ref(), report.cell_size, &scene, field, stage.monitor());
+            let closing = Closing { cap: cap.as_ref(), patches: patches.as_ref() };
+            let finished = self.finish(&surface, closing, report.cell_size, &scene, field, stage.monitor());
             let Finished { product, linear, report: steps, warnings } = finished.map_err(failed)?;
             warnings.iter().for_each(|w| stage.warn(w));
 
@@ -122,6 +126,7 @@ impl Line<'_> {
                 "texture_px": product.pictures.as_ref().map_or(0, |p| p.color.width),
                 "size_m": size.to_array(),
                 "surface_triangles": surface_triangles,
+                "handles": handles(&report.handles, mm),
                 "report": report,
                 "steps": steps,
             }))
@@ -163,4 +168,15 @@ impl Line<'_> {
             Failure::cannot(e, hint)
         })
     }
+}
+
+/// What became of handles, in millimetres around.
+fn handles(report: &HandleReport, mm: f64) -> Value {
+    let each = |lengths: &[f32]| lengths.iter().map(|&l| f64::from(l) * mm).collect::<Vec<_>>();
+    json!({
+        "cut_mm": each(&report.cut),
+        "filled_mm": each(&report.filled),
+        "left": report.left,
+        "left_mm": report.left_length.map(|l| f64::from(l) * mm),
+    })
 }

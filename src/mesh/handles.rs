@@ -1,0 +1,344 @@
+//! Small handles go: loops of hair are cut, holes between locks are filled.
+//!
+//! A surface is cut along a short loop that does not separate it (`loops`), both rims are drawn apart by half an
+//! edge and each is closed by the triangulation of least area. That takes away exactly one handle and
+//! changes nothing else: where the loop goes around matter it is cut, where it goes around air that is
+//! filled, and the two are told apart only by which side of the new triangles is out.
+//!
+//! Of the loops of a handle the field chooses: that over whose disc it is least to be overcome, `∫ |f|`. A thin
+//! strand has little matter to cut and a narrow slit little air to fill, however long the slit is. The
+//! field is not closed or opened itself and meshed again, as morphology would: how far that goes before a
+//! handle gives way is known only afterwards, it rounds off what is beside, and costs a second extraction. Here
+//! every vertex stays on the zero set, and the new triangles become part of it for those who hold
+//! the mesh against the field later ([`Patches`]).
+//!
+//! A loop whose discs would meet the surface is no place to cut (another strand may run through the hole): the
+//! next best is taken, and without any the handle stays and is counted.
+
+use super::MeshError;
+use super::check::intersect;
+use super::holes::least_area;
+use super::loops::{Loop, Loops};
+use crate::geom::{Aabb, Bvh, Mesh, Sets};
+use glam::{DVec3, Vec3};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+/// Sides of the longest loop that is cut: the triangulation takes the cube of it.
+const MOST_SIDES: usize = 256;
+
+/// How far the rims are drawn back, as shares of the way to the vertices behind them; the first that fits.
+const DRAWN: [f32; 3] = [0.5, 0.25, 0.1];
+
+/// A triangle may turn until this cosine when its rim is drawn back.
+const TURN: f64 = 0.3;
+
+/// What became of a surface's handles. Lengths are of loops, in units of the positions.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct HandleReport {
+    /// Loops around matter that was cut.
+    pub cut: Vec<f32>,
+    /// Loops around holes that were filled.
+    pub filled: Vec<f32>,
+    /// Handles that stayed.
+    pub left: usize,
+    /// A loop of one that stayed although it was to go: too long, or in the way of something.
+    pub left_length: Option<f32>,
+    /// Triangles that close cut rims: the last ones of the mesh.
+    pub triangles: usize,
+}
+
+impl HandleReport {
+    /// One sentence if handles were cut or filled; `mm` is the unit of the positions in millimetres.
+    pub fn warning(&self, mm: f64) -> Option<String> {
+        let list = |lengths: &[f32]| {
+            let each: Vec<String> = lengths.iter().map(|&l| format!("{:.0}", f64::from(l) * mm)).collect();
+            if each.is_empty() { String::new() } else { format!(" ({} mm around)", each.join(", ")) }
+        };
+        (!self.cut.is_empty() || !self.filled.is_empty()).then(|| {
+            format!(
+                "the surface had loops: {} cut{}, {} hole{} filled{}, {} left; `mesh.genus = \"keep\"` keeps all",
+                self.cut.len(),
+                list(&self.cut),
+                self.filled.len(),
+                if self.filled.len() == 1 { "" } else { "s" },
+                list(&self.filled),
+                self.left
+            )
+        })
+    }
+}
+
+/// Takes away the handles of a closed manifold that have a loop no longer than `longest`, in place. Where `sdf`
+/// is not finite it counts as 0. Attributes of vertices must not be there yet. A surface without handles, or one
+/// that is open, stays as it is.
+///
+/// # Errors
+///
+/// Those of `sdf`; [`MeshError::Stopped`] when `stop` says so.
+pub(super) fn cut_handles(
+    mesh: &mut Mesh,
+    longest: f32,
+    sdf: &dyn Fn(&[Vec3]) -> Result<Vec<f32>, MeshError>,
+    stop: &dyn Fn() -> bool,
+) -> Result<HandleReport, MeshError> {
+    let mut report = HandleReport::default();
+    while has_handles(mesh) {
+        let Some(loops) = Loops::new(&mesh.positions, &mesh.triangles) else { break };
+        let found = loops.short(longest, stop).ok_or(MeshError::Stopped)?;
+        let discs = by_field(discs(&loops, found), |v| loops.place(v), sdf)?;
+        let mut work = Work::new(mesh, &loops);
+        for disc in &discs {
+            if let Some(cut) = work.along(disc) {
+                let lengths = if cut { &mut report.cut } else { &mut report.filled };
+                lengths.push(disc.rim.length);
+            }
+        }
+        let Work { next, basis, .. } = work;
+        if basis.is_empty() {
+            let shortest = discs.iter().map(|d| d.rim.length).min_by(f32::total_cmp);
+            report.left_length = shortest.or_else(|| loops.some_length());
+            break;
+        }
+        report.triangles += next.triangles.len() - mesh.triangles.len();
+        *mesh = next;
+    }
+    Ok(report)
+}
+
+/// `2 · pieces − V + E − F` of a closed surface is twice its handles; of an open one it is something.
+fn has_handles(mesh: &Mesh) -> bool {
+    let mut sets = Sets::new(mesh.positions.len());
+    for t in &mesh.triangles {
+        sets.join(t[0], t[1]);
+        sets.join(t[0], t[2]);
+    }
+    let pieces = (0..mesh.positions.len() as u32).filter(|&v| sets.find(v) == v).count();
+    4 * pieces + mesh.triangles.len() != 2 * mesh.positions.len()
+}
+
+/// A loop and what could close it.
+struct Disc {
+    rim: Loop,
+    /// Places in the rim.
+    triangles: Vec<[usize; 3]>,
+}
+
+/// A disc for each loop that has one, each loop once.
+fn discs(loops: &Loops, found: Vec<Loop>) -> Vec<Disc> {
+    let mut seen = BTreeSet::new();
+    let disc = |rim: Loop| {
+        let mut key = rim.vertices.clone();
+        key.sort_unstable();
+        let n = rim.vertices.len();
+        if !(3..=MOST_SIDES).contains(&n) || !seen.insert(key) {
+            return None;
+        }
+        let places: HashMap<u32, usize> = rim.vertices.iter().enumerate().map(|(i, &v)| (v, i)).collect();
+        let mut taken = vec![false; n * n];
+        for (i, &v) in rim.vertices.iter().enumerate() {
+            for j in loops.at(v).filter_map(|side| places.get(&loops.end(side)).copied()) {
+                taken[i * n + j] = (i + 1) % n != j && (j + 1) % n != i;
+            }
+        }
+        let points: Vec<DVec3> = rim.vertices.iter().map(|&v| loops.place(v).as_dvec3()).collect();
+        let triangles = least_area(&points, |i, j| taken[i * n + j])?;
+        Some(Disc { rim, triangles })
+    };
+    found.into_iter().filter_map(disc).collect()
+}
+
+/// Those first over which the field is least to be overcome: `∫ |f|`, by the middles of the triangles.
+fn by_field(
+    discs: Vec<Disc>,
+    place: impl Fn(u32) -> Vec3,
+    sdf: &dyn Fn(&[Vec3]) -> Result<Vec<f32>, MeshError>,
+) -> Result<Vec<Disc>, MeshError> {
+    let (mut middles, mut areas) = (Vec::new(), Vec::new());
+    for disc in &discs {
+        for t in &disc.triangles {
+            let [a, b, c] = t.map(|i| place(disc.rim.vertices[i]));
+            middles.push((a + b + c) / 3.0);
+            areas.push(0.5 * (b - a).cross(c - a).length());
+        }
+    }
+    let values = sdf(&middles)?;
+    let mut each = values.iter().zip(&areas).map(|(f, a)| if f.is_finite() { f.abs() * a } else { 0.0 });
+    let mut costs: Vec<(f32, Disc)> =
+        discs.into_iter().map(|disc| (each.by_ref().take(disc.triangles.len()).sum(), disc)).collect();
+    costs.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.rim.length.total_cmp(&b.1.rim.length)));
+    Ok(costs.into_iter().map(|(_, disc)| disc).collect())
+}
+
+/// A surface on which several loops are cut, none of which touches another.
+struct Work<'a> {
+    mesh: &'a Mesh,
+    loops: &'a Loops<'a>,
+    bvh: Bvh,
+    next: Mesh,
+    /// Triangles of `mesh` that are no longer what they were.
+    changed: Vec<bool>,
+    /// What stands for them in `next`, and what is new there.
+    fresh: Vec<u32>,
+    /// The classes of the loops cut, reduced: while they are independent, the surface stays in one piece.
+    basis: Vec<u64>,
+}
+
+/// What a cut does to the mesh.
+struct Cut {
+    /// Where vertices go, the copies included.
+    moved: HashMap<u32, Vec3>,
+    /// Triangles at the rims, with the copies on the right.
+    at_rims: BTreeMap<u32, [u32; 3]>,
+    caps: Vec<[u32; 3]>,
+}
+
+impl<'a> Work<'a> {
+    fn new(mesh: &'a Mesh, loops: &'a Loops<'a>) -> Work<'a> {
+        Work {
+            mesh,
+            loops,
+            bvh: Bvh::new(mesh),
+            next: mesh.clone(),
+            changed: vec![false; mesh.triangles.len()],
+            fresh: Vec::new(),
+            basis: Vec::new(),
+        }
+    }
+
+    /// Cuts along a rim and closes both sides. Was matter cut, or else a hole filled? `None` if it cannot be
+    /// done, or not in one with what has been done already.
+    fn along(&mut self, disc: &Disc) -> Option<bool> {
+        let class = self.basis.iter().fold(disc.rim.class, |word, b| word.min(word ^ b));
+        if class == 0 {
+            return None;
+        }
+        let cut = DRAWN.iter().find_map(|&share| self.cut(disc, share).filter(|cut| self.fits(cut)))?;
+        let n = disc.rim.vertices.len();
+        let copies = self.next.positions.len() as u32;
+        self.next.positions.resize(copies as usize + n, Vec3::ZERO);
+        for (&v, &p) in &cut.moved {
+            self.next.positions[v as usize] = p;
+        }
+        for (&t, &corners) in &cut.at_rims {
+            self.next.triangles[t as usize] = corners;
+            self.changed[t as usize] = true;
+            self.fresh.push(t);
+        }
+        let first = self.next.triangles.len() as u32;
+        self.next.triangles.extend(&cut.caps);
+        self.fresh.extend(first..self.next.triangles.len() as u32);
+        self.basis.push(class);
+
+        // the right cap looks towards the left one through air, or else away from it
+        let right = &cut.caps[cut.caps.len() / 2..];
+        let out: Vec3 = right.iter().map(|t| area_vector(t.map(|v| cut.moved[&v]))).sum();
+        let apart: Vec3 =
+            (0..n).map(|i| cut.moved[&disc.rim.vertices[i]] - cut.moved[&(copies + i as u32)]).sum();
+        Some(out.dot(apart) > 0.0)
+    }
+
+    fn cut(&self, disc: &Disc, share: f32) -> Option<Cut> {
+        let (loops, rim) = (self.loops, &disc.rim.vertices);
+        let (n, copies) = (rim.len(), self.next.positions.len() as u32);
+        let mut moved = HashMap::new();
+        let mut at_rims: BTreeMap<u32, [u32; 3]> = BTreeMap::new();
+        for (i, &v) in rim.iter().enumerate() {
+            let towards = |w: u32| loops.at(v).find(|&side| loops.end(side) == w);
+            let on = towards(rim[(i + 1) % n])?;
+            let back = towards(rim[(i + n - 1) % n])?;
+            let copy = copies + i as u32;
+            for (from, to, name) in [(on, back, v), (back, on, copy)] {
+                let (mut sum, mut count) = (Vec3::ZERO, 0.0);
+                for side in loops.around(from).take_while(|&side| side != to) {
+                    if side != from {
+                        sum += loops.place(loops.end(side));
+                        count += 1.0;
+                    }
+                    let corners = at_rims.entry(side / 3).or_insert(self.mesh.triangles[side as usize / 3]);
+                    corners[side as usize % 3] = name;
+                }
+                let p = loops.place(v);
+                moved.insert(name, if count > 0.0 { p.lerp(sum / count, share) } else { p });
+            }
+        }
+        let left = disc.triangles.iter().map(|&[a, b, c]| [rim[a], rim[c], rim[b]]);
+        let right = disc.triangles.iter().map(|t| t.map(|i| copies + i as u32));
+        Some(Cut { moved, at_rims, caps: left.chain(right).collect() })
+    }
+
+    /// Is no triangle turned over, flat, or in the way of another?
+    fn fits(&self, cut: &Cut) -> bool {
+        let corners = |t: [u32; 3]| {
+            t.map(|v| cut.moved.get(&v).copied().unwrap_or_else(|| self.next.positions[v as usize]))
+        };
+        let turned = cut.at_rims.iter().any(|(&t, &to)| {
+            let was = area_vector(self.mesh.corners(t)).as_dvec3();
+            let is = area_vector(corners(to)).as_dvec3();
+            was.dot(is) <= TURN * was.length() * is.length()
+        });
+        let taken = cut.at_rims.keys().any(|&t| self.changed[t as usize]);
+        if turned || taken || cut.caps.iter().any(|&t| area_vector(corners(t)) == Vec3::ZERO) {
+            return false;
+        }
+        let all: Vec<[u32; 3]> = cut.at_rims.values().chain(&cut.caps).copied().collect();
+        all.iter().enumerate().all(|(i, &t)| {
+            let p = corners(t);
+            let bounds = Aabb::around(p);
+            let meets = |other: [u32; 3]| {
+                let q = corners(other);
+                let around = Aabb::around(q);
+                let apart = around.min.cmpgt(bounds.max).any() || around.max.cmplt(bounds.min).any();
+                !apart && area_vector(q) != Vec3::ZERO && {
+                    intersect(p.map(|p| p.as_dvec3()), t, q.map(|q| q.as_dvec3()), other)
+                }
+            };
+            let mut free = true;
+            self.bvh.overlapping(bounds, |o| {
+                let replaced = self.changed[o as usize] || cut.at_rims.contains_key(&o);
+                free = replaced || !meets(self.mesh.triangles[o as usize]);
+                free
+            });
+            free && !all[..i].iter().any(|&o| meets(o))
+                && !self.fresh.iter().any(|&o| meets(self.next.triangles[o as usize]))
+        })
+    }
+}
+
+fn area_vector([a, b, c]: [Vec3; 3]) -> Vec3 {
+    (b - a).cross(c - a)
+}
+
+/// The triangles that close what was cut: part of the surface, although the field is not zero there.
+pub struct Patches {
+    mesh: Mesh,
+    bvh: Bvh,
+}
+
+impl Patches {
+    /// The patches of a mesh as extracted; `None` if nothing was cut.
+    pub fn of(mesh: &Mesh, report: &HandleReport) -> Option<Patches> {
+        let first = mesh.triangles.len().checked_sub(report.triangles)?;
+        let triangles = mesh.triangles[first..].to_vec();
+        let mesh = Mesh { positions: mesh.positions.clone(), triangles, ..Mesh::default() };
+        (!mesh.triangles.is_empty()).then(|| Patches { bvh: Bvh::new(&mesh), mesh })
+    }
+
+    /// The vertices of the mesh that patches use.
+    pub(super) fn corners(&self) -> impl Iterator<Item = u32> + '_ {
+        self.mesh.triangles.iter().flatten().copied()
+    }
+
+    /// Makes a field's answers at `points` those of whichever is nearer, its own zero or a patch.
+    pub fn close(&self, points: &[Vec3], values: &mut [f32], gradients: &mut [Vec3]) {
+        for ((&p, f), g) in points.iter().zip(values).zip(gradients) {
+            let Some(near) = self.bvh.closest_point(p) else { continue };
+            if near.distance < f.abs() {
+                let out = area_vector(self.mesh.corners(near.triangle)).normalize_or_zero();
+                let side = if (p - near.point).dot(out) < 0.0 { -1.0 } else { 1.0 };
+                *f = side * near.distance;
+                *g = out;
+            }
+        }
+    }
+}
