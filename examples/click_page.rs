@@ -11,7 +11,7 @@ use tiface::io::{self, Limits};
 use tiface::mask::page::{PageOptions, page_of};
 use tiface::mask::points::{Prompts, read_prompts};
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut paths = std::env::args_os().skip(1).map(PathBuf::from);
     let out = paths.next().unwrap_or_else(|| "page.html".into());
     let folder = match paths.next() {

@@ -110,9 +110,6 @@ fn a_blend_that_cannot_be_made_is_refused_before_anything_is_learned() {
     let o = tiface(dir.path(), &["run", "head", "--set", "render.method=volume"]);
     assert_eq!(code(&o), 2);
     assert!(err(&o).contains("names tface, which render.method does not make"), "{}", err(&o));
-    let o = tiface(dir.path(), &["export", "head"]);
-    assert_eq!(code(&o), 2);
-    assert!(err(&o).contains("--out model.th"), "{}", err(&o));
     assert!(!dir.path().join("runs").exists());
 }
 

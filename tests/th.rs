@@ -1,5 +1,5 @@
-//! Published checkpoints, in and out: files that torch wrote (tools/reference/tensorf_checkpoint.py), read
-//! here, written again, and packed otherwise.
+//! Published checkpoints: files that torch wrote (tools/reference/tensorf_checkpoint.py), read here, and packed
+//! otherwise.
 
 mod zips;
 
@@ -120,20 +120,6 @@ fn planes_and_lines_lie_along_the_axes_the_published_code_gives_them() {
 }
 
 #[test]
-fn what_is_written_reads_as_it_was_and_is_the_same_bytes_each_time() {
-    let mut vm = fixture();
-    let read = |bytes: &[u8]| th::from_bytes(bytes, Path::new("again.th"), &Limits::default()).unwrap();
-    let bytes = th::th_bytes(&vm);
-    assert_eq!(read(&bytes), vm);
-    assert_eq!(bytes, th::th_bytes(&vm));
-    vm.mask = None;
-    vm.activation = Activation::Softplus;
-    vm.density_shift = -9.7;
-    vm.near_far = [0.1, 6.000001];
-    assert_eq!(read(&th::th_bytes(&vm)), vm);
-}
-
-#[test]
 fn a_checkpoint_packed_again_with_compression_reads_alike() {
     let bytes = std::fs::read(reference("vm_g5.th")).unwrap();
     let entries = zips::entries(&bytes);
@@ -196,8 +182,5 @@ fn every_kind_of_value_is_read_in_every_protocol_torch_offers() {
             TorchValue::Dict(vec![("a".into(), TorchValue::Dict(vec![]))]),
         ]);
         is("plain", TorchValue::List(plain.collect()));
-        // ours in turn
-        let again = io::parse_torch(&path, &io::torch_bytes(&root), &Limits::default()).unwrap();
-        assert_eq!(again, root);
     }
 }

@@ -36,7 +36,7 @@ pub(super) fn go(
 /// A command on the line.
 pub(super) struct Work<'a> {
     pub common: &'a Common,
-    /// What the command makes: `run` (all there is), `export`, or the stage.
+    /// What the command makes: `run` (all there is), or the stage.
     pub product: &'a str,
     /// The last stage that it needs.
     pub until: &'a str,
@@ -140,36 +140,28 @@ impl Work<'_> {
                     io::write_atomic(&written[written.len() - 1], bytes)?;
                 }
                 io::write_atomic(file, &files[0].1)?;
-                return Ok(written);
+                Ok(written)
             }
             Out::File(file, ending) if ending == "json" => {
                 copy_file(&run.path("metrics/metrics.json"), file)?;
-                return Ok(vec![file.clone()]);
+                Ok(vec![file.clone()])
             }
-            Out::File(..) => {}
-            Out::Folder(folder) => io::create_folder(folder)?,
-        }
-        let to = out.file(&format!("{}.th", self.until));
-        match (out, self.product) {
-            (Out::File(..), _) | (_, "export") => {
-                io::write_atomic(&to, &published(line, self.until)?)?;
-                return Ok(vec![to]);
-            }
-            // fields, and pictures that only another stage can read, stay where they are
-            (Out::Folder(folder), "run") => {
-                copy_folder(run.dir(), folder, &["baseline", "tface", "iface", CAPTURE])?
-            }
-            (Out::Folder(folder), "render") => {
-                copy_folder(&run.path(line.views()), folder, &["float", "paths"])?
-            }
-            (Out::Folder(folder), stage) => {
-                copy_folder(&run.path(stage), folder, &["float", "parts"])?;
-                if stage == "metrics" {
+            // no stage makes another file: `Out::find` has refused it
+            Out::File(file, _) => Ok(vec![file.clone()]),
+            Out::Folder(folder) => {
+                io::create_folder(folder)?;
+                // fields, and pictures that only another stage can read, stay where they are
+                match self.product {
+                    "run" => copy_folder(run.dir(), folder, &["baseline", "tface", "iface", CAPTURE])?,
+                    "render" => copy_folder(&run.path(line.views()), folder, &["float", "paths"])?,
+                    stage => copy_folder(&run.path(stage), folder, &["float", "parts"])?,
+                }
+                if self.product == "metrics" {
                     copy_file(&run.path("report.html"), &folder.join("report.html"))?;
                 }
+                Ok(vec![folder.clone()])
             }
         }
-        Ok(vec![out.file("")])
     }
 
     /// Where everything is, and how good it is.
@@ -339,18 +331,6 @@ fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<(), Ending> {
 #[cfg(feature = "cpu")]
 fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, Ending> {
     Ok(crate::pipeline::reconstruct(line, until)?)
-}
-
-/// A radiance field as a published checkpoint.
-#[cfg(feature = "cpu")]
-fn published(line: &Line, stage: &str) -> Result<Vec<u8>, Ending> {
-    let known = if stage == "baseline" { "baseline" } else { "tface" };
-    Ok(line.export_th(known)?)
-}
-
-#[cfg(not(feature = "cpu"))]
-fn published(_: &Line, stage: &str) -> Result<Vec<u8>, Ending> {
-    Err(Ending::cannot(format!("this build has no {stage}"), "build with the feature `cpu`, the default"))
 }
 
 #[cfg(not(feature = "cpu"))]

@@ -275,21 +275,6 @@ learned from (capture.tiles): the blend follows the better member.")]
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
-    /// A learned radiance field as a published checkpoint (.th)
-    #[command(after_long_help = "Examples:
-  tiface export runs/002_00 --out tface.th      what the published TensoRF and T-Face code reads
-  tiface export runs/002_00 --with baseline --out baseline.th
-  tiface tface captures/002_00 --set tface.import=official.th    the other way
-
-A file holds one field: of several, it is the first. For the best one field, learn it alone:
-  tiface tface captures/002_00 --set tface.fields=1 --set tface.rays=16384")]
-    Export {
-        #[command(flatten)]
-        place: Place,
-        /// tface or baseline
-        #[arg(long = "with", value_name = "FIELD", default_value = "tface")]
-        field: String,
-    },
     /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates, size
     #[command(after_long_help = "Examples:
   tiface check head.glb
@@ -419,16 +404,6 @@ impl Cli {
                 line(place, "ensemble", &extra)
             }
             Command::Metrics { place, require } => works(place, "metrics", "metrics", require, &[]),
-            Command::Export { place, field } => match (field.as_str(), &common.out) {
-                ("tface" | "baseline", Some(_)) => works(place, "export", field, &[], &[]),
-                ("tface" | "baseline", None) => {
-                    Err(Ending::usage("no file to export to is named", "name one: `--out model.th`"))
-                }
-                _ => Err(Ending::usage(
-                    format!("`{field}` cannot be exported"),
-                    "tface and baseline can; the mesh is `tiface mesh --out head.glb`",
-                )),
-            },
             Command::Check { mesh, require, against, seen_by } => {
                 nothing("check")?;
                 check::go(common, mesh, require, against.as_deref(), seen_by.as_deref())

@@ -29,7 +29,7 @@ pub(super) struct Common {
     #[arg(short, long, global = true, value_name = "DIR", env = "TIFACE_RUN", hide_env = true)]
     pub run: Option<PathBuf>,
     /// Where the product of this command goes as well: a file whose ending says what it is to be (.glb,
-    /// .obj, .ply; .json of metrics; .th), or a folder, there already or with / at its end
+    /// .obj, .ply; .json of metrics), or a folder, there already or with / at its end
     #[arg(short, long, global = true, value_name = "PATH")]
     pub out: Option<PathBuf>,
     /// A configuration file; later ones win

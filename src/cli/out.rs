@@ -22,7 +22,6 @@ fn endings(product: &str) -> &'static [&'static str] {
         "run" => &["glb", "obj", "ply", "json"],
         "mesh" => &["glb", "obj", "ply"],
         "metrics" => &["json"],
-        "export" | "tface" | "baseline" => &["th"],
         "page" => &["html"],
         _ => &[],
     }

@@ -25,7 +25,7 @@ pub use self::pictures::{
     read_photo, write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
 };
 pub use self::tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
-pub use self::torch::{TorchNumbers, TorchTensor, TorchValue, parse_torch, read_torch, torch_bytes};
+pub use self::torch::{TorchNumbers, TorchTensor, TorchValue, parse_torch, read_torch};
 pub use self::write::{WriteError, remove, remove_leftovers, rename, write_atomic};
 
 use std::fs::{self, File};

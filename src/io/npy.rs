@@ -1,14 +1,18 @@
-//! NumPy's `.npy`: our own reader, since those at hand reserve what a header claims.
+//! NumPy's `.npy`, parsed by `npyz` once the sizes that a file claims are known to be true.
 //!
 //! Format: magic, version, header length (u16 in version 1, u32 in 2 and 3), a Python dictionary with
-//! `descr`, `fortran_order` and `shape`, then exactly shape × size bytes (NumPy NEP 1).
+//! `descr`, `fortran_order` and `shape`, then exactly shape × size bytes (NumPy NEP 1). `npyz` reserves what
+//! the length says and multiplies the extents unchecked, so both are bounded here first.
 
 use super::{Limits, ReadError, read_bytes};
+use npyz::{DType, Deserialize, NpyFile, NpyHeader, Order, TypeChar, TypeStr};
 use std::path::Path;
 
 const MAGIC: &[u8] = b"\x93NUMPY";
 /// A header of arrays without named fields is under 200 bytes; NumPy itself stops at 10 000.
 const MAX_HEADER: usize = 64 << 10;
+/// As in NumPy 1.
+const MAX_RANK: usize = 32;
 
 /// An array in row-major (C) order, whatever order the file had.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,29 +32,6 @@ pub enum NpyValues {
     Number(Vec<f64>),
 }
 
-impl NpyValues {
-    /// How many values there are.
-    pub fn len(&self) -> usize {
-        match self {
-            NpyValues::Bool(v) => v.len(),
-            NpyValues::Number(v) => v.len(),
-        }
-    }
-
-    /// Is there none?
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// Is value `i` true, or a number other than 0?
-    pub fn is_set(&self, i: usize) -> bool {
-        match self {
-            NpyValues::Bool(v) => v[i],
-            NpyValues::Number(v) => v[i] != 0.0,
-        }
-    }
-}
-
 /// Reads a `.npy` file: bool, integers, float16/32/64 in either byte order and either array order.
 /// Objects, complex numbers, strings and records are refused.
 pub fn read_npy(path: &Path, limits: &Limits) -> Result<Npy, ReadError> {
@@ -64,8 +45,7 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
         return Err(bad(0, "it does not begin with `\\x93NUMPY`".into()));
     }
     let cut = || bad(bytes.len(), "it ends inside its header".into());
-    let major = *bytes.get(6).ok_or_else(cut)?;
-    let (start, length) = match major {
+    let (start, length) = match *bytes.get(6).ok_or_else(cut)? {
         1 => {
             let l = bytes.get(8..10).ok_or_else(cut)?;
             (10, u16::from_le_bytes([l[0], l[1]]) as usize)
@@ -74,7 +54,7 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
             let l = bytes.get(8..12).ok_or_else(cut)?;
             (12, u32::from_le_bytes([l[0], l[1], l[2], l[3]]) as usize)
         }
-        _ => return Err(bad(6, format!("format version {major} is unknown (1, 2 and 3 are read)"))),
+        major => return Err(bad(6, format!("format version {major} is unknown (1, 2 and 3 are read)"))),
     };
     if length > MAX_HEADER {
         return Err(ReadError::TooLarge {
@@ -84,26 +64,33 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
             limit: MAX_HEADER as u64,
         });
     }
-    let header = bytes.get(start..start + length).ok_or_else(cut)?;
+    let text = bytes.get(start..start + length).ok_or_else(cut)?;
     let data = &bytes[start + length..];
-    let header =
-        Header::parse(header).map_err(|(at, problem)| bad(start + at, format!("header: {problem}")))?;
-    let kind = Kind::parse(&header.descr).ok_or_else(|| unsupported(path, &header.descr))?;
-
-    let count = header.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
-    let needed = count.and_then(|n| n.checked_mul(kind.size));
-    let (Some(count), Some(needed)) = (count, needed) else {
-        return Err(bad(start, format!("its shape {:?} has more values than can be counted", header.shape)));
+    if !countable(text) {
+        return Err(bad(start, "its shape is not of whole numbers with a product that can be held".into()));
+    }
+    let header = NpyHeader::from_reader(&bytes[..start + length]).map_err(|e| {
+        // the first line says what and where, those below repeat the header
+        let problem: String = e.to_string().lines().take(1).flat_map(|l| l.chars().take(120)).collect();
+        bad(start, format!("header: {problem}"))
+    })?;
+    let dtype = header.dtype();
+    let kind = match &dtype {
+        DType::Plain(kind) if !kind.uses_pickled_array() => kind,
+        other => return Err(unsupported(path, other)),
     };
-    if needed != data.len() {
+    let shape: Vec<usize> = header.shape().iter().map(|&n| n as usize).collect();
+    if shape.len() > MAX_RANK {
+        return Err(bad(start, format!("it has {} dimensions, {MAX_RANK} are read", shape.len())));
+    }
+    let count: usize = shape.iter().product();
+    let needed = kind.num_bytes().and_then(|size| size.checked_mul(count));
+    if needed != Some(data.len()) {
+        let needed = needed.map_or("more".into(), |n| n.to_string());
+        let found = data.len();
         return Err(bad(
             start + length,
-            format!(
-                "shape {:?} of `{}` needs {needed} bytes, {} follow",
-                header.shape,
-                header.descr,
-                data.len()
-            ),
+            format!("shape {shape:?} of `{kind}` needs {needed} bytes, {found} follow"),
         ));
     }
     let decoded = (count as u64).saturating_mul(8);
@@ -115,242 +102,80 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
             limit: limits.decoded_bytes,
         });
     }
-    let values = if kind.letter == b'b' {
+    let values = if kind.type_char() == TypeChar::Bool {
         NpyValues::Bool(row_major(data.iter().map(|&b| b != 0).collect(), &header))
     } else {
-        let numbers = data.chunks_exact(kind.size).map(|c| kind.number(c)).collect();
-        NpyValues::Number(row_major(numbers, &header))
+        let numbers = numbers(kind, NpyFile::with_header(header.clone(), data));
+        let numbers = numbers.ok_or_else(|| unsupported(path, &dtype))?;
+        NpyValues::Number(row_major(numbers.map_err(|e| bad(start + length, e.to_string()))?, &header))
     };
-    Ok(Npy { shape: header.shape, values })
+    Ok(Npy { shape, values })
 }
 
-fn unsupported(path: &Path, descr: &str) -> ReadError {
-    if descr.contains('O') {
+/// Are the header's numbers plain ones, and can their product be held, with 1 for an extent of 0? The parser
+/// also knows sums, signs, hexadecimals and `1_000`, which no array needs.
+fn countable(header: &[u8]) -> bool {
+    let words = header.split(|b| !(b.is_ascii_alphanumeric() || b"_+-".contains(b)));
+    let mut numbers = words.filter(|w| w.first().is_some_and(|b| !(b.is_ascii_alphabetic() || *b == b'_')));
+    let product = numbers.try_fold(1u64, |product, word| {
+        let digits = word.iter().all(u8::is_ascii_digit).then(|| std::str::from_utf8(word).ok())??;
+        product.checked_mul(digits.parse::<u64>().ok()?.max(1))
+    });
+    product.is_some()
+}
+
+fn unsupported(path: &Path, dtype: &DType) -> ReadError {
+    if dtype.uses_pickled_array() {
         return ReadError::Unsupported {
             path: path.into(),
-            what: format!("an npy array of Python objects (`{descr}`, a pickle)"),
+            what: "an npy array of Python objects (a pickle)".into(),
             hint: "save plain numbers: `numpy.save(file, array.astype(float))`; pickles can run code".into(),
         };
     }
     ReadError::Unsupported {
         path: path.into(),
-        what: format!("an npy array of type `{descr}`"),
+        what: match dtype {
+            DType::Plain(kind) => format!("an npy array of type `{kind}`"),
+            _ => "an npy array of records".into(),
+        },
         hint: "save it as bool, an integer or a float type".into(),
     }
 }
 
-/// Column-major values brought into row-major order.
-fn row_major<T: Copy>(values: Vec<T>, header: &Header) -> Vec<T> {
-    let shape = &header.shape;
-    if !header.fortran_order || shape.len() < 2 || values.is_empty() {
+/// Every number in the order of the file; `None` for a type that is none.
+fn numbers(kind: &TypeStr, file: NpyFile<&[u8]>) -> Option<std::io::Result<Vec<f64>>> {
+    fn each<T: Deserialize>(file: NpyFile<&[u8]>, to: fn(T) -> f64) -> Option<std::io::Result<Vec<f64>>> {
+        Some(file.data::<T>().ok()?.map(|value| value.map(to)).collect())
+    }
+    match (kind.type_char(), kind.size_field()) {
+        (TypeChar::Int, 1) => each(file, |v: i8| v.into()),
+        (TypeChar::Int, 2) => each(file, |v: i16| v.into()),
+        (TypeChar::Int, 4) => each(file, |v: i32| v.into()),
+        (TypeChar::Int, 8) => each(file, |v: i64| v as f64),
+        (TypeChar::Uint, 1) => each(file, |v: u8| v.into()),
+        (TypeChar::Uint, 2) => each(file, |v: u16| v.into()),
+        (TypeChar::Uint, 4) => each(file, |v: u32| v.into()),
+        (TypeChar::Uint, 8) => each(file, |v: u64| v as f64),
+        (TypeChar::Float, 2) => each(file, |v: half::f16| v.into()),
+        (TypeChar::Float, 4) => each(file, |v: f32| v.into()),
+        (TypeChar::Float, 8) => each(file, |v: f64| v),
+        _ => None,
+    }
+}
+
+/// Values in the order of the file brought into row-major order.
+fn row_major<T: Copy>(values: Vec<T>, header: &NpyHeader) -> Vec<T> {
+    if header.order() == Order::C {
         return values;
     }
-    // strides of the file's order: the first index runs fastest
-    let mut strides = vec![1; shape.len()];
-    for k in 1..shape.len() {
-        strides[k] = strides[k - 1] * shape[k - 1];
-    }
-    let mut index = vec![0; shape.len()];
-    let mut out = Vec::with_capacity(values.len());
-    let mut at = 0;
-    loop {
-        out.push(values[at]);
-        let mut axis = shape.len() - 1;
-        loop {
-            index[axis] += 1;
-            at += strides[axis];
-            if index[axis] < shape[axis] {
-                break;
-            }
-            at -= strides[axis] * shape[axis];
-            index[axis] = 0;
-            if axis == 0 {
-                return out;
-            }
-            axis -= 1;
-        }
-    }
-}
-
-struct Kind {
-    letter: u8,
-    size: usize,
-    big: bool,
-}
-
-impl Kind {
-    fn parse(descr: &str) -> Option<Kind> {
-        let (order, rest) = match descr.as_bytes() {
-            [order @ (b'<' | b'>' | b'|' | b'='), rest @ ..] => (*order, rest),
-            rest => (b'=', rest),
-        };
-        let (letter, size) = match rest {
-            b"?" | b"b1" => (b'b', 1),
-            [l @ (b'i' | b'u'), s @ (b'1' | b'2' | b'4' | b'8')] => (*l, (s - b'0') as usize),
-            [b'f', s @ (b'2' | b'4' | b'8')] => (b'f', (s - b'0') as usize),
-            _ => return None,
-        };
-        let big = order == b'>' || (order == b'=' && cfg!(target_endian = "big"));
-        Some(Kind { letter, size, big })
-    }
-
-    fn number(&self, chunk: &[u8]) -> f64 {
-        let mut word = 0u64;
-        for i in 0..self.size {
-            let byte = if self.big { chunk[i] } else { chunk[self.size - 1 - i] };
-            word = word << 8 | byte as u64;
-        }
-        let spare = 64 - 8 * self.size as u32;
-        match (self.letter, self.size) {
-            (b'u', _) => word as f64,
-            (b'i', _) => (((word << spare) as i64) >> spare) as f64,
-            (_, 2) => from_half(word as u16),
-            (_, 4) => f32::from_bits(word as u32) as f64,
-            _ => f64::from_bits(word),
-        }
-    }
-}
-
-/// IEEE 754 binary16.
-pub(super) fn from_half(h: u16) -> f64 {
-    let sign = if h >> 15 == 1 { -1.0 } else { 1.0 };
-    let (exponent, fraction) = ((h >> 10) & 31, (h & 1023) as f64);
-    sign * match exponent {
-        0 => fraction * 2f64.powi(-24),
-        31 if fraction == 0.0 => f64::INFINITY,
-        31 => f64::NAN,
-        e => (1.0 + fraction / 1024.0) * 2f64.powi(e as i32 - 15),
-    }
-}
-
-struct Header {
-    descr: String,
-    fortran_order: bool,
-    shape: Vec<usize>,
-}
-
-impl Header {
-    /// Parses the Python dictionary; an error carries its offset within the header.
-    fn parse(text: &[u8]) -> Result<Header, (usize, String)> {
-        let mut r = Reader { text, at: 0 };
-        let (mut descr, mut order, mut shape) = (None, None, None);
-        r.expect(b'{')?;
-        while !r.take(b'}') {
-            let key = r.string()?;
-            r.expect(b':')?;
-            let twice = match key.as_str() {
-                "descr" => descr.replace(r.type_name()?).is_some(),
-                "fortran_order" => order.replace(r.boolean()?).is_some(),
-                "shape" => shape.replace(r.tuple()?).is_some(),
-                _ => return Err((r.at, format!("unknown key `{key}`"))),
-            };
-            if twice {
-                return Err((r.at, format!("the key `{key}` appears twice")));
-            }
-            if !r.take(b',') {
-                r.expect(b'}')?;
-                break;
-            }
-        }
-        r.skip();
-        if r.at != text.len() {
-            return Err((r.at, "text after the dictionary".into()));
-        }
-        let missing = |key: &str| (r.at, format!("the key `{key}` is missing"));
-        Ok(Header {
-            descr: descr.ok_or_else(|| missing("descr"))?,
-            fortran_order: order.ok_or_else(|| missing("fortran_order"))?,
-            shape: shape.ok_or_else(|| missing("shape"))?,
+    let place = |mut i: usize| {
+        header.shape().iter().zip(header.strides()).rev().fold(0, |at, (&size, &stride)| {
+            let index = i % size as usize;
+            i /= size as usize;
+            at + index * stride as usize
         })
-    }
-}
-
-struct Reader<'a> {
-    text: &'a [u8],
-    at: usize,
-}
-
-impl Reader<'_> {
-    fn skip(&mut self) {
-        while self.text.get(self.at).is_some_and(|b| b.is_ascii_whitespace()) {
-            self.at += 1;
-        }
-    }
-
-    fn take(&mut self, byte: u8) -> bool {
-        self.skip();
-        let found = self.text.get(self.at) == Some(&byte);
-        self.at += found as usize;
-        found
-    }
-
-    fn expect(&mut self, byte: u8) -> Result<(), (usize, String)> {
-        if self.take(byte) { Ok(()) } else { Err((self.at, format!("expected `{}`", byte as char))) }
-    }
-
-    fn string(&mut self) -> Result<String, (usize, String)> {
-        self.skip();
-        let quote = match self.text.get(self.at) {
-            Some(&q @ (b'\'' | b'"')) => q,
-            _ => return Err((self.at, "expected a quoted word".into())),
-        };
-        let rest = &self.text[self.at + 1..];
-        let end = rest.iter().position(|&b| b == quote).ok_or((self.at, "a quote is not closed".into()))?;
-        self.at += end + 2;
-        Ok(String::from_utf8_lossy(&rest[..end]).into_owned())
-    }
-
-    /// A quoted type, or the whole list of a record type, which then is refused by its name.
-    fn type_name(&mut self) -> Result<String, (usize, String)> {
-        self.skip();
-        if self.text.get(self.at) != Some(&b'[') {
-            return self.string();
-        }
-        let rest = &self.text[self.at..];
-        let end = rest.iter().rposition(|&b| b == b']').ok_or((self.at, "a `[` is not closed".into()))?;
-        // fields of records may have any name; only objects deserve their own message
-        let objects = rest[..end].windows(2).any(|w| w == b"|O");
-        self.at += end + 1;
-        Ok(if objects { "record with |O".into() } else { "record".into() })
-    }
-
-    fn boolean(&mut self) -> Result<bool, (usize, String)> {
-        self.skip();
-        for (word, value) in [(&b"True"[..], true), (&b"False"[..], false)] {
-            if self.text[self.at..].starts_with(word) {
-                self.at += word.len();
-                return Ok(value);
-            }
-        }
-        Err((self.at, "expected `True` or `False`".into()))
-    }
-
-    fn tuple(&mut self) -> Result<Vec<usize>, (usize, String)> {
-        self.expect(b'(')?;
-        let mut shape = Vec::new();
-        while !self.take(b')') {
-            self.skip();
-            let digits = self.text[self.at..].iter().take_while(|b| b.is_ascii_digit()).count();
-            let number = std::str::from_utf8(&self.text[self.at..self.at + digits]).unwrap_or("");
-            let n = number
-                .parse()
-                .map_err(|_| (self.at, "expected an extent, a whole number of at least 0".to_string()))?;
-            if shape.len() == 32 {
-                return Err((self.at, "more than 32 dimensions".into()));
-            }
-            shape.push(n);
-            self.at += digits;
-            let _ = self.text.get(self.at) == Some(&b'L') && {
-                self.at += 1;
-                true
-            }; // Python 2 wrote 24L
-            if !self.take(b',') {
-                self.expect(b')')?;
-                break;
-            }
-        }
-        Ok(shape)
-    }
+    };
+    (0..values.len()).map(|i| values[place(i)]).collect()
 }
 
 #[cfg(test)]
@@ -429,6 +254,25 @@ mod tests {
             let h = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}");
             assert!(matches!(parse(&npy(&h, &[0; 8])), Err(ReadError::Damaged { .. })), "{shape}");
         }
+    }
+
+    #[test]
+    fn extents_written_to_overflow_the_parser_are_an_error_not_a_panic() {
+        let sums = format!("({})", "1+1+1+1,".repeat(32));
+        for shape in [
+            "(0, 9223372036854775807, 9223372036854775807)",
+            "(0xFFFFFFFFFFFF, 0xFFFFFFFFFFFF)",
+            "(1_000_000_000_000, 1_000_000_000_000)",
+            "(1 +1, 1 + 1)",
+            "(1e5,)",
+            &sums,
+        ] {
+            let h = format!("{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}, }}");
+            assert!(matches!(parse(&npy(&h, &[])), Err(ReadError::Damaged { .. })), "{shape}");
+        }
+        let nested = "{'descr': ".to_string() + &"(".repeat(60_000);
+        let error = parse(&npy(&nested, &[])).unwrap_err().to_string();
+        assert!(error.contains("header: ") && error.len() < 300, "{error}");
     }
 
     #[test]

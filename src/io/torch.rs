@@ -9,10 +9,7 @@
 mod objects;
 mod pickle;
 mod tree;
-mod write;
 mod zip;
-
-pub use self::write::torch_bytes;
 
 use super::{Limits, ReadError, read_bytes};
 use std::path::Path;

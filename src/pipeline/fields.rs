@@ -73,18 +73,6 @@ impl Line<'_> {
         })?)
     }
 
-    /// The field of the stage `baseline` or `tface`, the first of several, as the bytes of a published checkpoint
-    /// (`.th`), in the dataset's world times the stage's `import_scale`.
-    pub fn export_th(&self, name: &'static str) -> Result<Vec<u8>, Failure> {
-        let scene = self.scene_or_fail()?;
-        let fields = self.vm(name).learned();
-        if fields > 1 {
-            self.run.warn(name, &format!("a .th file holds one field: this is the first of {fields}"));
-        }
-        tface::export_th(&self.run.path(name), self.vm(name).import_scale, &scene.scene_from_world)
-            .map_err(|e| self.tface_failure(name, e))
-    }
-
     /// The photographs that are learned from, in the scene. Pixels of `capture.tiles` count as not valid.
     pub(super) fn train_views(&self, scene: &Scene, masked: bool) -> Result<Vec<TrainView>, Failure> {
         let limits = Limits::default();

@@ -1,7 +1,8 @@
-//! Published checkpoints rendered by our kernels, and fields that go out and come back.
+//! Published checkpoints rendered by our kernels, and where our own files hold their arrays.
 
 use super::*;
 use crate::geom::Ray;
+use crate::io::{TensorValues, read_tensors};
 use crate::kernel::vm::mask::VmRay;
 use crate::kernel::vm::{DecoderWeights, RAY_WIDTH, render};
 use glam::{DVec3, Vec3};
@@ -48,25 +49,10 @@ fn an_imported_checkpoint_renders_as_the_published_arithmetic_does() {
 }
 
 #[test]
-fn a_field_goes_out_and_comes_back_the_same() {
+fn an_imported_field_renders_in_the_scene_as_in_its_own_world() {
     let dir = tempfile::tempdir().unwrap();
-    let path = reference("vm_g5.th");
     let scene = Similarity::scale_translate(2.5, DVec3::new(0.3, -0.2, 0.1));
-    let face = import_th(&path, 1.0 / 0.3, &scene, dir.path(), "x").unwrap();
-    // out again: what the file held; the mask may differ in vertices that make no cell
-    let bytes = export_th(dir.path(), 1.0 / 0.3, &scene).unwrap();
-    let (there, back) = (
-        th::read_th(&path, &Limits::default()).unwrap(),
-        th::from_bytes(&bytes, Path::new("out.th"), &Limits::default()).unwrap(),
-    );
-    let bare = |c: &VmCheckpoint| VmCheckpoint { mask: None, ..c.clone() };
-    assert_eq!(bare(&there), bare(&back));
-    let mask = |c: &VmCheckpoint| field_of(c, None).0.field.mask.clone().unwrap();
-    let (a, b) = (mask(&there), mask(&back));
-    assert_eq!((a.size(), a.bits()), (b.size(), b.bits()));
-    let corners = |m: &BoxMask| [m.bounds().0, m.bounds().1].concat();
-    assert!(corners(&a).iter().zip(corners(&b)).all(|(a, b)| (a - b).abs() < 1e-5));
-
+    let face = import_th(&reference("vm_g5.th"), 1.0 / 0.3, &scene, dir.path(), "x").unwrap();
     // a ray of the published loader, written in the scene: world = field · 0.3, directions of depth 1
     let (origin, direction) = (Vec3::new(0.1, -0.2, 4.5), Vec3::new(0.02, 0.05, -1.0));
     let in_scene = |p: Vec3| scene.point(p * 0.3);
@@ -85,21 +71,43 @@ fn a_field_goes_out_and_comes_back_the_same() {
 }
 
 #[test]
-fn a_field_of_ours_lies_in_the_datasets_world_when_exported() {
-    let checkpoint = th::read_th(&reference("vm_g5.th"), &Limits::default()).unwrap();
-    let (face, record) = field_of(&checkpoint, None);
+fn our_own_file_holds_the_published_arrays_where_the_page_says() {
     let dir = tempfile::tempdir().unwrap();
-    checkpoint::save_field(dir.path(), &face, record, "x").unwrap();
-    // scene = 2 · world + (1, 0, 0), and the file's world is twice the dataset's: file = scene − (1, 0, 0)
-    let scene = Similarity::scale_translate(2.0, DVec3::X);
-    let bytes = export_th(dir.path(), 2.0, &scene).unwrap();
-    let out = th::from_bytes(&bytes, Path::new("out.th"), &Limits::default()).unwrap();
-    assert_eq!(out.aabb, [[-2.5, -1.67, -1.0], [0.5, 1.67, 1.0]]);
-    assert_eq!(out.distance_scale, 25.0);
-    // four times the dataset's: lengths double, so densities count half
-    let bytes = export_th(dir.path(), 4.0, &scene).unwrap();
-    let out = th::from_bytes(&bytes, Path::new("out.th"), &Limits::default()).unwrap();
-    assert_eq!((out.aabb[1][1], out.distance_scale), (3.34, 12.5));
-    let turned = Similarity { rotation: DMat3::from_rotation_x(0.1), ..scene };
-    assert!(export_th(dir.path(), 2.0, &turned).is_err());
+    let path = reference("vm_g5.th");
+    import_th(&path, 1.0 / 0.3, &Similarity::IDENTITY, dir.path(), "x").unwrap();
+    let there = th::read_th(&path, &Limits::default()).unwrap();
+    let (tensors, metadata) = read_tensors(&checkpoint::newest(dir.path()), &Limits::default()).unwrap();
+    let ours = |name: &str| match tensors.iter().find(|(n, ..)| *n == name).map(|(_, (_, v))| v) {
+        Some(TensorValues::F32(values)) => values.as_slice(),
+        other => panic!("{name}: {other:?}"),
+    };
+    for (name, planes, lines, rank) in [
+        ("model.density", &there.density_planes, &there.density_lines, there.density_rank),
+        ("model.color", &there.color_planes, &there.color_lines, there.color_rank),
+    ] {
+        let mut rest = ours(name);
+        for (factor, channels) in planes.iter().chain(lines).zip(rank.iter().cycle()) {
+            let (own, tail) = rest.split_at(factor.len());
+            rest = tail;
+            let places = factor.len() / channels;
+            // [C, H, W] there, [H, W, C] here
+            assert!(
+                (0..factor.len()).all(|i| own[i] == factor[i % channels * places + i / channels]),
+                "{name}"
+            );
+        }
+        assert!(rest.is_empty());
+    }
+    let [(w1, b1), (w2, b2), (w3, b3)] = &there.mlp;
+    let network = [&there.basis, w1, b1, w2, b2, w3, b3].map(|m| m.as_slice()).concat();
+    assert_eq!((ours("model.network"), ours("bounds")), (&network[..], there.aabb.as_flattened()));
+    let field: Value = serde_json::from_str(&metadata["field"]).unwrap();
+    assert_eq!(
+        (&field["features"], &field["hidden"], &field["softplus"]),
+        (&27.into(), &128.into(), &false.into())
+    );
+    assert_eq!(
+        (&field["near"], &field["far"], &field["step_ratio"]),
+        (&3.5.into(), &7.0.into(), &0.5.into())
+    );
 }

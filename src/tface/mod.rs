@@ -25,7 +25,7 @@ mod train;
 #[cfg(feature = "cpu")]
 pub use error::TfaceError;
 #[cfg(feature = "cpu")]
-pub use exchange::{export_th, import_th};
+pub use exchange::import_th;
 #[cfg(feature = "cpu")]
 pub use infer::{TFace, VmPixel};
 #[cfg(feature = "cpu")]

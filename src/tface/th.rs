@@ -1,16 +1,39 @@
-//! Checkpoints of the published T-Face and TensoRF code (`.th`), in and out.
+//! Checkpoints of the published T-Face and TensoRF code (`.th`), read.
 //!
 //! A dictionary of `kwargs` (what the Python constructor takes), `state_dict` (planes, lines, basis and the
 //! colour network) and, once an alpha mask was made, `alphaMask.shape`, `.mask` (packed bits, the highest
 //! first) and `.aabb`. Plane i spans the axes `(0,1)`, `(0,2)`, `(1,2)` as width and height, line i the one
 //! that is left: `TensorVMSplit` of TensoRF (Chen et al. 2022). Optimiser and schedule are not in the file.
+//!
+//! # Where our own files hold the same
+//!
+//! No `.th` is written. `checkpoint.safetensors` of a stage folder, one per field, holds one field with all that a
+//! script needs to make one: arrays are little-endian and row-major, `C` channels are [`VmCheckpoint::density_rank`]
+//! or [`VmCheckpoint::color_rank`] of plane i, and `field` is the JSON text of that name in `__metadata__`.
+//!
+//! | ours | published |
+//! |---|---|
+//! | `model.density`: planes 0, 1, 2 as `[H, W, C]`, then lines 0, 1, 2 as `[N, C]` | `state_dict`: `density_plane.i` `[1, C, H, W]`, `density_line.i` `[1, C, N, 1]` |
+//! | `model.color`, likewise | `app_plane.i`, `app_line.i` |
+//! | `model.network`: seven matrices, one after the other | `basis_mat.weight`, then weight and bias of `renderModule.mlp.0`, `.2`, `.4` |
+//! | `bounds` `[2, 3]`, `size` `[3]` | `kwargs`: `aabb`, `gridSize` |
+//! | `field`: `density_rank`, `color_rank`, `features`, `hidden` | `density_n_comp`, `appearance_n_comp`, `app_dim`, `featureC` |
+//! | `view_frequencies`, `feature_frequencies` | `view_pe`, `fea_pe`; `pos_pe` is 0 and `shadingMode` is `MLP_Fea` |
+//! | `softplus`, `shift` | `fea2denseAct` (`softplus` or `relu`), `density_shift` |
+//! | `distance_scale`, `weight_threshold`, `step_ratio` | `distance_scale`, `rayMarch_weight_thres`, `step_ratio` |
+//! | `near`, `far`, `mask_threshold` | `near_far`, `alphaMask_thres` |
+//! | `mask.bits` over `mask.size` cells, x slowest, bit `i % 64` of word `i / 64` | `alphaMask.mask` over vertices, z slowest |
+//!
+//! Where `field.placement` is null, positions are the scene's. A published world is the dataset's times s (1 / 0.3
+//! in the published loader, `tface.import_scale` here): with `scene_from_world` of `cameras.json` and k = s over
+//! its scale, `aabb` is k · (`bounds` − its translation) and `distance_scale` is ours / k. Cells of our mask go one
+//! further than the vertices: a vertex is one whose eight cells are all set, and the mask's box is as much smaller.
 
 mod table;
 
 use self::table::{MAX_COUNT, Table, about, about_tensor, integer};
-use crate::io::{self, Limits, ReadError, TorchNumbers, TorchTensor, TorchValue};
+use crate::io::{self, Limits, ReadError, TorchNumbers, TorchValue};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 /// Width and height of plane i.
 const PLANE_AXES: [[usize; 2]; 3] = [[0, 1], [0, 2], [1, 2]];
@@ -264,90 +287,4 @@ fn mask(root: &Table) -> Result<VmMask, ThError> {
     };
     let occupied = (0..count).map(|i| packed[i / 8] >> (7 - i % 8) & 1 == 1).collect();
     Ok(VmMask { shape, occupied, aabb: root.aabb("alphaMask.aabb")? })
-}
-
-/// The bytes of a file that the published code loads (`torch.load`, then `TensorVMSplit(**kwargs).load`).
-/// Expects what [`VmCheckpoint`] says about lengths; numbers of `kwargs` are written by their shortest
-/// decimals, so 1e-4 is 1e-4 in Python too.
-pub fn th_bytes(checkpoint: &VmCheckpoint) -> Vec<u8> {
-    let vm = checkpoint;
-    let counts = |v: [usize; 3]| TorchValue::List(v.map(int).into());
-    let kwargs = vec![
-        entry("aabb", tensor(&[2, 3], vm.aabb.as_flattened())),
-        entry("gridSize", counts(vm.grid_size)),
-        entry("density_n_comp", counts(vm.density_rank)),
-        entry("appearance_n_comp", counts(vm.color_rank)),
-        entry("app_dim", int(vm.app_dim)),
-        entry("density_shift", decimal(vm.density_shift)),
-        entry("alphaMask_thres", decimal(vm.alpha_mask_threshold)),
-        entry("distance_scale", decimal(vm.distance_scale)),
-        entry("rayMarch_weight_thres", decimal(vm.weight_threshold)),
-        entry(
-            "fea2denseAct",
-            text(match vm.activation {
-                Activation::Relu => "relu",
-                Activation::Softplus => "softplus",
-            }),
-        ),
-        entry("near_far", TorchValue::List(vm.near_far.map(decimal).into())),
-        entry("step_ratio", decimal(vm.step_ratio)),
-        entry("shadingMode", text("MLP_Fea")),
-        entry("pos_pe", int(vm.position_frequencies)),
-        entry("view_pe", int(vm.view_frequencies)),
-        entry("fea_pe", int(vm.feature_frequencies)),
-        entry("featureC", int(vm.hidden)),
-    ];
-    let mut state = Vec::new();
-    let (density, color) = (vm.factor_shapes(vm.density_rank), vm.factor_shapes(vm.color_rank));
-    let mut add =
-        |key: String, shape: &[usize], values: &[f32]| state.push(entry(&key, tensor(shape, values)));
-    for (name, values) in [("density", &vm.density_planes), ("app", &vm.color_planes)] {
-        let (shapes, lines) =
-            if name == "app" { (&color, &vm.color_lines) } else { (&density, &vm.density_lines) };
-        (0..3).for_each(|i| add(format!("{name}_plane.{i}"), &shapes[i].0, &values[i]));
-        (0..3).for_each(|i| add(format!("{name}_line.{i}"), &shapes[i].1, &lines[i]));
-    }
-    add("basis_mat.weight".into(), &[vm.app_dim, vm.color_rank.iter().sum()], &vm.basis);
-    for (layer, shape) in vm.layer_shapes().iter().enumerate() {
-        let (weight, bias) = &vm.mlp[layer];
-        add(format!("renderModule.mlp.{}.weight", LAYERS[layer]), shape, weight);
-        add(format!("renderModule.mlp.{}.bias", LAYERS[layer]), &shape[..1], bias);
-    }
-    let mut root =
-        vec![entry("kwargs", TorchValue::Dict(kwargs)), entry("state_dict", TorchValue::OrderedDict(state))];
-    if let Some(mask) = &vm.mask {
-        let [z, y, x] = mask.shape;
-        let mut packed = vec![0u8; mask.occupied.len().div_ceil(8)];
-        for i in (0..mask.occupied.len()).filter(|&i| mask.occupied[i]) {
-            packed[i / 8] |= 0x80 >> (i % 8);
-        }
-        let packed = TorchTensor { shape: vec![packed.len()], values: TorchNumbers::U8(packed) };
-        root.push(entry("alphaMask.shape", TorchValue::Tuple([1, 1, z, y, x].map(int).into())));
-        root.push(entry("alphaMask.mask", TorchValue::Array(Arc::new(packed))));
-        root.push(entry("alphaMask.aabb", tensor(&[2, 3], mask.aabb.as_flattened())));
-    }
-    io::torch_bytes(&TorchValue::Dict(root))
-}
-
-fn entry(key: &str, value: TorchValue) -> (Arc<str>, TorchValue) {
-    (key.into(), value)
-}
-
-fn text(value: &str) -> TorchValue {
-    TorchValue::Str(value.into())
-}
-
-fn int(value: usize) -> TorchValue {
-    TorchValue::Int(value as i64)
-}
-
-fn decimal(value: f32) -> TorchValue {
-    TorchValue::Float(value.to_string().parse().unwrap_or(value as f64))
-}
-
-fn tensor(shape: &[usize], values: &[f32]) -> TorchValue {
-    TorchValue::Tensor(Arc::new(TorchTensor {
-        shape: shape.into(),
-        values: TorchNumbers::F32(values.into()),
-    }))
 }

@@ -1,6 +1,5 @@
 //! From the objects of a pickle to a tree of values; here the numbers are read from their storages.
 
-use super::super::npy::from_half;
 use super::super::{Limits, ReadError};
 use super::objects::{Array, Kind, Node, NumpyType, View};
 use super::pickle::{Graph, Id, MAX_VALUES};
@@ -34,7 +33,7 @@ pub(super) fn build(
 struct Builder<'a> {
     path: &'a Path,
     graph: &'a Graph<'a>,
-    archive: &'a Archive<'a>,
+    archive: &'a Archive,
     big: bool,
     /// What was decoded, by node: a shared object is one here too.
     seen: HashMap<Id, TorchValue>,
@@ -270,7 +269,7 @@ fn gather(data: &[u8], number: NumpyType, view: &View, count: usize) -> TorchNum
 fn read(data: &[u8], number: NumpyType) -> TorchNumbers {
     let big = number.big;
     match number.kind {
-        Kind::F16 => TorchNumbers::F32(each(data, big, |b| from_half(u16::from_le_bytes(b)) as f32)),
+        Kind::F16 => TorchNumbers::F32(each(data, big, |b| half::f16::from_le_bytes(b).to_f32())),
         Kind::F32 => TorchNumbers::F32(each(data, big, f32::from_le_bytes)),
         Kind::F64 => TorchNumbers::F32(each(data, big, |b| f64::from_le_bytes(b) as f32)),
         Kind::I8 => TorchNumbers::I64(each(data, big, |b| i8::from_le_bytes(b) as i64)),

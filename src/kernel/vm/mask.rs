@@ -77,25 +77,6 @@ impl BoxMask {
         })
     }
 
-    /// The vertices between cells: their box, how many there are along each axis, and those whose cells are
-    /// all occupied. The way back from [`BoxMask::from_vertices`], up to vertices that make no difference;
-    /// cells that no vertex explains are lost. `None` for a mask of single cells.
-    pub fn vertices(&self) -> Option<([[f32; 3]; 2], [usize; 3], Vec<bool>)> {
-        if self.size.iter().any(|&n| n < 3) {
-            return None;
-        }
-        let n = self.size.map(|n| n - 1);
-        let unit: [f32; 3] = std::array::from_fn(|a| (self.max[a] - self.min[a]) / self.size[a] as f32);
-        let bounds =
-            [std::array::from_fn(|a| self.min[a] + unit[a]), std::array::from_fn(|a| self.max[a] - unit[a])];
-        let all = |x: usize, y: usize, z: usize| {
-            (0..8).all(|k| bit(&self.bits, self.cell([x + (k & 1), y + (k >> 1 & 1), z + (k >> 2)])))
-        };
-        let vertices =
-            (0..n[0] * n[1] * n[2]).map(|i| all(i / (n[1] * n[2]), i / n[2] % n[1], i % n[2])).collect();
-        Some((bounds, n, vertices))
-    }
-
     fn group(&mut self) {
         let b = self.size.map(|n| n.div_ceil(BLOCK));
         self.blocks = vec![0; (b[0] * b[1] * b[2]).div_ceil(64)];
