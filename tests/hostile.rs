@@ -295,6 +295,24 @@ fn a_bomb_is_refused_by_its_size_before_it_is_decoded() {
 }
 
 #[test]
+fn a_small_jpeg_that_claims_a_large_picture_is_refused_and_an_even_one_is_read() {
+    for progressive in [false, true] {
+        for components in [1, 3] {
+            // nothing packs a picture tighter than this
+            let mut b = flat_jpeg(200, 123, components, progressive);
+            let (_d, path) = file("even.jpg", &b);
+            assert_eq!(io::read_photo(&path, None, &limits()).unwrap().photo.rgb.len(), 200 * 123);
+            let frame = b.windows(2).position(|w| w == [0xFF, 0xC0] || w == [0xFF, 0xC2]).unwrap();
+            b[frame + 5..frame + 9].copy_from_slice(&[0x3F, 0xFF, 0x3F, 0xFF]);
+            let (_d, path) = file("bomb.jpg", &b);
+            let e = io::read_photo(&path, None, &limits()).unwrap_err();
+            assert!(e.to_string().contains("16383 × 16383 pixels cannot come from"), "{e}");
+            names_file(&e, "bomb.jpg");
+        }
+    }
+}
+
+#[test]
 fn a_picture_with_a_wrong_checksum_or_damaged_data_is_an_error() {
     let mut b = png(40, 40);
     let middle = b.len() / 2;

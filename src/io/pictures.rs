@@ -219,11 +219,12 @@ fn walk_png(path: &Path, bytes: &[u8]) -> Result<u64, ReadError> {
     }
 }
 
-/// Walks the segments of a JPEG to the end-of-image marker.
-fn walk_jpeg(path: &Path, bytes: &[u8]) -> Result<(), ReadError> {
+/// Walks the segments of a JPEG to the end-of-image marker and returns the most pixels its picture data can hold: a
+/// block of 64 takes a bit at least, and without progression a second one for its end.
+fn walk_jpeg(path: &Path, bytes: &[u8]) -> Result<u64, ReadError> {
     let bad = |at: usize, problem: &str| ReadError::damaged(path, "JPEG", Some(at as u64), problem);
     let mut at = 2;
-    let mut scanned = false;
+    let (mut scanned, mut data, mut progressive) = (false, 0, false);
     loop {
         // between segments and inside a scan: forward to the next 0xFF that begins a marker
         let Some(step) = bytes[at.min(bytes.len())..]
@@ -233,9 +234,10 @@ fn walk_jpeg(path: &Path, bytes: &[u8]) -> Result<(), ReadError> {
             return Err(bad(bytes.len(), "it ends before the end-of-image marker: cut short"));
         };
         at += step;
+        data += if scanned { step as u64 } else { 0 };
         let marker = bytes[at + 1];
         match marker {
-            0xD9 if scanned => return Ok(()),
+            0xD9 if scanned => return Ok(data * if progressive { 8 * 64 } else { 4 * 64 }),
             0xD9 => return Err(bad(at, "it holds no picture data")),
             0x01 | 0xD8 => at += 2,
             _ => {
@@ -243,6 +245,7 @@ fn walk_jpeg(path: &Path, bytes: &[u8]) -> Result<(), ReadError> {
                     return Err(bad(bytes.len(), "it ends inside a segment: cut short"));
                 };
                 scanned |= marker == 0xDA;
+                progressive |= marker == 0xC2;
                 at += 2 + u16::from_be_bytes([l[0], l[1]]) as usize;
             }
         }
@@ -282,8 +285,14 @@ fn decode_bytes(
             (picture, exif)
         }
         Kind::Jpeg => {
-            walk_jpeg(path, bytes)?;
+            let most = walk_jpeg(path, bytes)?;
             let (mut decoder, info) = jpeg_decoder(path, bytes, limits)?;
+            if u64::from(info.width) * u64::from(info.height) > most {
+                let (width, height) = (info.width, info.height);
+                let problem =
+                    format!("{width} × {height} pixels cannot come from its picture data, enough for {most}");
+                return Err(ReadError::damaged(path, "JPEG", None, problem));
+            }
             let pixels =
                 decoder.decode().map_err(|e| ReadError::damaged(path, "JPEG", None, format!("{e:?}")))?;
             let (w, h) = (info.width, info.height);
