@@ -35,8 +35,14 @@ Examples:
   tiface run captures/002_00 --preset draft     a first look at your own head, into runs/002_00
   tiface mesh --format glb,ply --out head.glb   the mesh of the newest run, once more, as a file
 
-Exit codes: 0 done · 1 cannot be done as asked · 2 wrong command line or configuration · 3 below a bar
-you set · 75 not now, try again · 101 a bug · 130, 143 stopped after saving: repeat to continue";
+Exit codes:
+  0         done
+  1         cannot be done as asked
+  2         wrong command line or configuration
+  3         below a bar you set
+  75        not now, try again
+  101       a bug
+  130, 143  stopped: repeat to continue";
 
 /// Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel views.
 #[derive(Parser, Debug)]
@@ -439,6 +445,18 @@ mod tests {
             let cli = Cli::try_parse_from(words).unwrap();
             assert_eq!(cli.common.seed, Some(7));
             assert!(matches!(cli.command, Command::Run { place, .. } if place.path.is_some()));
+        }
+    }
+
+    #[test]
+    fn every_exit_code_has_a_line_of_its_own_on_any_terminal() {
+        let (_, codes) = EXAMPLES.split_once("Exit codes:\n").unwrap();
+        assert_eq!(codes.lines().count(), 7);
+        for columns in [50, 60, 80, 100, 200] {
+            let help = Cli::command().term_width(columns).render_long_help().to_string();
+            for row in codes.lines() {
+                assert!(help.lines().any(|l| l == row), "{columns} columns break `{row}`:\n{help}");
+            }
         }
     }
 

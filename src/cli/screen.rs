@@ -27,6 +27,8 @@ struct Inner {
 struct State {
     bar: Option<ProgressBar>,
     told: Option<Instant>,
+    /// The stages of the command, in order.
+    order: Vec<&'static str>,
 }
 
 const PLAIN: Duration = Duration::from_secs(30);
@@ -45,6 +47,11 @@ impl Screen {
 
     pub fn observer(&self) -> Arc<dyn Observer> {
         self.0.clone()
+    }
+
+    /// The stages that are to come: what is left of one is not what is left of all.
+    pub fn expect(&self, order: Vec<&'static str>) {
+        self.0.state.lock().unwrap_or_else(PoisonError::into_inner).order = order;
     }
 
     /// A remark for people: about what, and what.
@@ -117,6 +124,12 @@ impl Inner {
         }
     }
 
+    /// How many stages come after this one.
+    fn after(&self, stage: &str) -> usize {
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        state.order.iter().rev().position(|s| *s == stage).unwrap_or(0)
+    }
+
     /// Is it time for the next plain line or object?
     fn due(&self, every: Duration, last: bool) -> bool {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
@@ -139,16 +152,17 @@ impl Observer for Inner {
             }
             Event::Progress { stage, step, steps, rate, eta_s, values } => {
                 let last = step >= steps;
+                let after = self.after(stage);
                 if self.json && self.due(OBJECTS, last) {
                     let values: Map<String, Value> =
                         values.iter().map(|(k, v)| (k.to_string(), Value::from(*v))).collect();
                     self.object(json!({"event": "progress", "stage": stage, "step": step, "steps": steps,
-                        "rate": rate, "eta_s": eta_s, "values": values}));
+                        "rate": rate, "eta_s": eta_s, "stages_after": after, "values": values}));
                 }
                 if self.quiet {
                     return;
                 }
-                let text = progress(step, steps, rate, eta_s, values);
+                let text = progress(step, steps, rate, eta_s, after, values);
                 let bar = self.state.lock().unwrap_or_else(PoisonError::into_inner).bar.clone();
                 match bar {
                     Some(bar) => bar.set_message(text),
@@ -198,14 +212,25 @@ impl Drop for Inner {
     }
 }
 
-/// `1200/3000  12.4/s  2 min 25 s left  psnr 27.31  inv_s 412`
-fn progress(step: u64, steps: u64, rate: Option<f64>, eta_s: Option<f64>, values: &[(&str, f64)]) -> String {
+/// `1200/3000  12.4/s  2 min 25 s left of this stage, 4 to come  psnr 27.31`
+fn progress(
+    step: u64,
+    steps: u64,
+    rate: Option<f64>,
+    eta_s: Option<f64>,
+    after: usize,
+    values: &[(&str, f64)],
+) -> String {
     let mut text = format!("{step}/{steps}");
     if let Some(rate) = rate {
         text += &format!("  {}/s", figure(rate));
     }
     if let Some(eta) = eta_s.filter(|_| step < steps) {
         text += &format!("  {} left", duration(eta));
+        // how long a stage takes that has not begun depends on what the ones before it make
+        if after > 0 {
+            text += &format!(" of this stage, {after} to come");
+        }
     }
     for (name, value) in values {
         text += &format!("  {name} {}", figure(*value));
@@ -253,7 +278,16 @@ mod tests {
         );
         let figures = [0.000123, 0.5, 27.31, 41234.4, 2.0, 0.0].map(figure);
         assert_eq!(figures, ["1.23e-4", "0.500", "27.3", "41234", "2", "0"]);
-        let line = progress(1200, 3000, Some(12.4), Some(145.0), &[("psnr", 27.31)]);
-        assert_eq!(line, "1200/3000  12.4/s  2 min 25 s left  psnr 27.3");
+        let line = |after| progress(1200, 3000, Some(12.4), Some(145.0), after, &[("psnr", 27.31)]);
+        assert_eq!(line(0), "1200/3000  12.4/s  2 min 25 s left  psnr 27.3");
+    }
+
+    #[test]
+    fn time_left_of_a_stage_is_not_told_as_that_of_the_run() {
+        let screen = Screen::new(&Common::default());
+        screen.expect(vec!["mask", "tface", "render"]);
+        assert_eq!(["mask", "tface", "render", "other"].map(|s| screen.0.after(s)), [2, 1, 0, 0]);
+        let line = progress(1, 3, None, Some(145.0), 1, &[]);
+        assert_eq!(line, "1/3  2 min 25 s left of this stage, 1 to come");
     }
 }

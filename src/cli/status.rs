@@ -86,7 +86,7 @@ fn line(common: &Common, run: &Path, stage: &str) -> Result<String, Ending> {
                 words += &format!(", {}/s", figure(rate));
             }
             if let Some(eta) = s.eta_s {
-                words += &format!(", {} left", duration(eta));
+                words += &format!(", {} left of this stage", duration(eta));
             }
             words + &format!(" (process {} on {})", s.pid, s.host)
         }
