@@ -202,38 +202,6 @@ impl Bvh {
         }
     }
 
-    /// Calls `visit` with every triangle whose box meets `query` (a few more may come: boxes are
-    /// grown). Stops when it returns false.
-    pub fn overlapping(&self, query: Aabb, mut visit: impl FnMut(u32) -> bool) {
-        if self.is_empty() {
-            return;
-        }
-        let [low, high] = [query.min, query.max].map(|p| p.to_array().map(Vec4::splat));
-        let mut stack = vec![0u32];
-        while let Some(current) = stack.pop() {
-            if current & LEAF != 0 {
-                let leaf = &self.leaves[(current ^ LEAF) as usize];
-                for lane in 0..leaf.len() {
-                    let b = Aabb::around([0, 1, 2].map(|k| leaf.corner(k, lane)));
-                    let apart = b.min.cmpgt(query.max).any() || b.max.cmplt(query.min).any();
-                    if !apart && !visit(leaf.triangle[lane]) {
-                        return;
-                    }
-                }
-                continue;
-            }
-            let node = &self.nodes[current as usize];
-            let mut meets = 0xfu32;
-            for axis in 0..3 {
-                let [lows, highs] = [node.bounds[0][axis], node.bounds[1][axis]];
-                meets &= (lows.cmple(high[axis]) & highs.cmpge(low[axis])).bitmask();
-            }
-            for k in (0..4).rev().filter(|&k| meets >> k & 1 == 1) {
-                stack.push(node.child[k]);
-            }
-        }
-    }
-
     /// A stack of the size this tree needs: on the machine's own unless the tree is degenerate.
     fn stack_space<'a>(
         &self,

@@ -9,10 +9,11 @@
 //!   Shewchuk's error bound (1997); what the bound cannot tell from zero counts as touching.
 //! - sliver: quality `4 √3 · area / Σ edge²` below 0.05 (1 for an equilateral triangle).
 
+use super::boxes::{Boxes, EFFORT, Span, share_out};
 use super::read::places;
-use super::uv_check::UvReport;
-use crate::geom::{Aabb, Bvh, Mesh};
-use glam::{DVec2, DVec3};
+use super::uv_check::{UvReport, bound};
+use crate::geom::{Aabb, Mesh, Sets};
+use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::fmt;
@@ -54,20 +55,26 @@ pub struct CheckReport {
     pub genus: Option<i64>,
     /// Triangles that pass through or lie on another.
     pub self_intersections: usize,
+    /// Triangles not among them that were not compared with all that lie near them, because too many do: then
+    /// their number is a lower bound.
+    pub self_intersections_left: usize,
     /// Long thin triangles.
     pub slivers: usize,
     /// Triangles without area.
     pub degenerate: usize,
     /// Lowest corner, in the file's units.
-    pub min: [f32; 3],
+    pub min: [f64; 3],
     /// Highest corner.
-    pub max: [f32; 3],
+    pub max: [f64; 3],
     /// Size of the box in metres.
     pub size_m: [f64; 3],
     /// Enclosed volume in litres; negative when wound inward, meaningless when open.
     pub volume_l: f64,
     /// Does every vertex have a colour?
     pub has_colors: bool,
+    /// Does a picture give it its colours? For those who have read it: [`check`] knows only the mesh.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub has_texture: Option<bool>,
     /// Does every vertex have a normal?
     pub has_normals: bool,
     /// Normals whose length is not 1 within 5e-4.
@@ -128,13 +135,19 @@ impl CheckReport {
                     )
                 }),
                 "one-piece" => (self.pieces != 1).then(|| format!("{} pieces", self.pieces)),
-                "no-self-intersections" => (self.self_intersections > 0)
-                    .then(|| format!("{} triangles intersect others", self.self_intersections)),
+                "no-self-intersections" => {
+                    let (found, left) = (self.self_intersections, self.self_intersections_left);
+                    (found + left > 0).then(|| {
+                        let (least, left) = bound("at least ", left, "triangles");
+                        format!("{least}{found} triangles intersect others{left}")
+                    })
+                }
                 "sound-uv" => match &self.uv {
                     None => Some("no texture coordinates".into()),
                     Some(uv) => (!uv.is_sound()).then(|| {
+                        let (least, left) = bound("at least ", uv.overlaps_left, "triangles");
                         format!(
-                            "{} triangles overlap, {} flipped, {} without area, {} outside, {} invalid",
+                            "{least}{} triangles overlap{left}, {} flipped, {} without area, {} outside, {} invalid",
                             uv.overlapping, uv.flipped, uv.zero_area, uv.outside, uv.invalid
                         )
                     }),
@@ -175,22 +188,38 @@ impl fmt::Display for CheckReport {
         )?;
         let genus = self.genus.map_or("undefined".into(), |g| g.to_string());
         row("pieces", format!("{} (Euler {}, genus {genus})", self.pieces, self.euler))?;
-        row("self-intersecting", format!("{} triangles", self.self_intersections))?;
+        let (least, left) = bound("at least ", self.self_intersections_left, "triangles");
+        row("self-intersecting", format!("{least}{} triangles{left}", self.self_intersections))?;
         row(
             "slivers",
             format!("{} triangles, {} without area, {} invalid", self.slivers, self.degenerate, self.invalid),
         )?;
         let [x, y, z] = self.size_m;
         row("size", format!("{x:.4} × {y:.4} × {z:.4} m"))?;
-        row("box", format!("{:?} to {:?}", self.min, self.max))?;
+        let (low, high) = (DVec3::from(self.min), DVec3::from(self.max));
+        // a millionth of its size
+        let digits = (6.0 - (high - low).max_element().log10()).ceil().clamp(0.0, 45.0) as usize;
+        row("box", format!("{low:.digits$} to {high:.digits$}"))?;
         row("volume", format!("{:.4} litres", self.volume_l))?;
-        row("colours", yes(self.has_colors).into())?;
+        let colors = match (self.has_texture, self.has_colors) {
+            (Some(true), true) => "yes, a texture and at the vertices",
+            (Some(true), false) => "yes, a texture",
+            (_, true) => "yes, at the vertices",
+            (Some(false), false) => "NO",
+            (None, false) => "NO, not at the vertices",
+        };
+        row("colours", colors.into())?;
         row("normals", format!("{} ({} not of unit length)", yes(self.has_normals), self.bad_normals))
     }
 }
 
 /// Examines a mesh whose coordinates are `unit_m` metres each. Never panics, whatever the mesh.
 pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
+    check_around(mesh, DVec3::ZERO, unit_m)
+}
+
+/// [`check`] of a mesh whose positions are relative to `origin`.
+pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
     let (weld, welded_vertices) = places(mesh);
     let valid =
         |t: &[u32; 3]| t.iter().all(|&i| mesh.positions.get(i as usize).is_some_and(|p| p.is_finite()));
@@ -226,8 +255,10 @@ pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
         && topology.boundary_edges + topology.flipped_edges + topology.nonmanifold_edges == 0;
     let manifold = topology.nonmanifold_edges + topology.nonmanifold_vertices == 0;
     let bad_normal = |n: &&glam::Vec3| (n.length() - 1.0).abs() > UNIT || n.is_nan();
-    let size = if bounds.is_empty() { DVec3::ZERO } else { bounds.max.as_dvec3() - bounds.min.as_dvec3() };
+    let [low, high] = [bounds.min, bounds.max].map(|p| if bounds.is_empty() { Vec3::ZERO } else { p });
+    let [low, high] = [low, high].map(|p| p.as_dvec3() + origin);
     let count = mesh.positions.len();
+    let (self_intersections, self_intersections_left) = self_intersections(mesh, &faces);
     CheckReport {
         vertices: count,
         triangles: mesh.triangles.len(),
@@ -242,14 +273,16 @@ pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
         pieces: topology.pieces,
         euler: topology.euler,
         genus: (closed && manifold).then_some(topology.pieces as i64 - topology.euler / 2),
-        self_intersections: self_intersections(mesh, &weld, &faces),
+        self_intersections,
+        self_intersections_left,
         slivers,
         degenerate,
-        min: if bounds.is_empty() { [0.0; 3] } else { bounds.min.to_array() },
-        max: if bounds.is_empty() { [0.0; 3] } else { bounds.max.to_array() },
-        size_m: (size * unit_m).to_array(),
+        min: low.to_array(),
+        max: high.to_array(),
+        size_m: ((high - low) * unit_m).to_array(),
         volume_l: volume * unit_m.powi(3) * 1000.0,
         has_colors: count > 0 && mesh.colors.len() == count,
+        has_texture: None,
         has_normals: count > 0 && mesh.normals.len() == count,
         bad_normals: mesh.normals.iter().filter(bad_normal).count(),
         uv: None,
@@ -314,48 +347,52 @@ impl Topology {
     }
 }
 
-/// Disjoint sets with path halving; the smallest member represents.
-struct Sets(Vec<u32>);
+/// What comparing two triangles costs, in comparisons of boxes.
+const COMPARING: usize = 16;
 
-impl Sets {
-    fn new(n: usize) -> Sets {
-        Sets((0..n as u32).collect())
-    }
-
-    fn find(&mut self, mut x: u32) -> u32 {
-        while self.0[x as usize] != x {
-            self.0[x as usize] = self.0[self.0[x as usize] as usize];
-            x = self.0[x as usize];
-        }
-        x
-    }
-
-    fn join(&mut self, a: u32, b: u32) {
-        let (a, b) = (self.find(a), self.find(b));
-        self.0[a.max(b) as usize] = a.min(b);
-    }
-}
-
-/// How many triangles pass through or lie on another one.
-fn self_intersections(mesh: &Mesh, weld: &[u32], faces: &[([u32; 3], u32)]) -> usize {
-    let bvh = Bvh::new(mesh);
-    let has_area = |t: [DVec3; 3]| (t[1] - t[0]).cross(t[2] - t[0]) != DVec3::ZERO;
-    let corners = |t: u32| mesh.corners(t).map(|p| p.as_dvec3());
-    faces
-        .par_iter()
-        .filter(|&&(ids, t)| {
-            let (p, mut meets) = (corners(t), false);
-            if has_area(p) {
-                bvh.overlapping(Aabb::around(mesh.corners(t)), |other| {
-                    let q = corners(other);
-                    let other_ids = mesh.triangles[other as usize].map(|i| weld[i as usize]);
-                    meets = other != t && has_area(q) && intersect(p, ids, q, other_ids);
-                    !meets
-                });
-            }
-            meets
+/// How many triangles pass through or lie on another one, and how many more were not compared with all they might.
+fn self_intersections(mesh: &Mesh, faces: &[([u32; 3], u32)]) -> (usize, usize) {
+    // Triangles over the same corners lie on each other, and one of them stands for all: a shape shown twice in
+    // one place is no more work than shown once.
+    let mut sorted: Vec<([u32; 3], u32)> = (0..faces.len() as u32)
+        .into_par_iter()
+        .filter_map(|f| {
+            let (mut ids, t) = faces[f as usize];
+            let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
+            ids.sort_unstable();
+            ((b - a).cross(c - a) != DVec3::ZERO).then_some((ids, f))
         })
-        .count()
+        .collect();
+    sorted.par_sort_unstable();
+    let mut found = 0;
+    let (mut facets, mut alone) = (Vec::new(), Vec::new());
+    for copies in sorted.chunk_by(|a, b| a.0 == b.0) {
+        let (ids, t) = faces[copies[0].1 as usize];
+        if copies.len() > 1 {
+            found += copies.len();
+        } else {
+            alone.push(facets.len());
+        }
+        facets.push((mesh.corners(t).map(|p| p.as_dvec3()), ids));
+    }
+    let boxes = Boxes::new(facets.iter().map(|f| Span::around(f.0)));
+    let shared = share_out(alone.len(), EFFORT, |i, effort| {
+        let (own, mut meets) = (alone[i], false);
+        let (p, ids) = facets[own];
+        boxes.meeting(&Span::around(p), effort, |other, effort| {
+            let (q, other_ids) = facets[other as usize];
+            if other as usize != own {
+                if !effort.spend(COMPARING) {
+                    return false;
+                }
+                meets = intersect(p, ids, q, other_ids);
+            }
+            !meets
+        });
+        meets
+    });
+    found += shared.found.iter().filter(|&&meets| meets).count();
+    (found, shared.unfinished.len())
 }
 
 /// Do two triangles meet in more than the corners they share?
@@ -367,8 +404,10 @@ pub(super) fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u
         return true;
     }
     let sides = q.map(|v| orient(p[0], p[1], p[2], v));
-    if sides == [0, 0, 0] {
-        return overlap_in_plane(p, q);
+    match sides {
+        [0, 0, 0] => return overlap_in_plane(p, q),
+        [1, 1, 1] | [-1, -1, -1] => return false, // apart
+        _ => {}
     }
     // The edge opposite a shared corner, or every edge without one; with a shared edge, none.
     let crosses = |a: [DVec3; 3], touching: [bool; 3], b: [DVec3; 3]| {
@@ -427,7 +466,6 @@ fn overlap_in_plane(p: [DVec3; 3], q: [DVec3; 3]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::Vec3;
 
     /// A box from `low` to `high`, wound outward.
     fn cuboid(low: Vec3, high: Vec3) -> Mesh {

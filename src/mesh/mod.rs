@@ -7,6 +7,7 @@
 
 mod atlas;
 pub mod bake;
+mod boxes;
 mod cap;
 pub mod check;
 mod clean;

@@ -13,6 +13,7 @@
 
 use super::atlas::apart::{Side, nearest_charts};
 use super::atlas::overlap::{overlaps, shared_area, turn};
+use super::boxes::EFFORT;
 use super::read::places;
 use crate::geom::{Atlas, Mesh, Sets};
 use glam::{DVec2, DVec3, Vec2, Vec3};
@@ -54,8 +55,9 @@ pub struct UvReport {
     pub overlapping: usize,
     /// The area they share, in texels, summed over pairs.
     pub overlap_px: f64,
-    /// False when so many triangles cover each other that not all pairs were looked at.
-    pub overlaps_complete: bool,
+    /// Triangles that were not compared with all that lie near them, because too many do: then the two above
+    /// are lower bounds.
+    pub overlaps_left: usize,
     /// Triangles wound against the rest of their chart.
     pub flipped: usize,
     /// Charts that show the surface mirrored: clockwise as seen in the image.
@@ -67,6 +69,8 @@ pub struct UvReport {
     /// Smallest distance between two charts, in texels; none for a single chart. Up to
     /// [`FARTHEST_PX`](UvReport::FARTHEST_PX).
     pub chart_distance_px: Option<f64>,
+    /// Sides of charts that were not compared with all that lie near them: then the distance is an upper bound.
+    pub chart_distance_left: usize,
     /// Smallest distance of a chart to the texture's border, in texels; negative when it reaches out.
     pub border_distance_px: f64,
 }
@@ -78,7 +82,7 @@ impl UvReport {
     /// Can every point of the surface have its own texel? No triangle invalid, overlapping, flipped, without
     /// area or outside.
     pub fn is_sound(&self) -> bool {
-        self.overlaps_complete
+        self.overlaps_left == 0
             && self.invalid + self.overlapping + self.flipped + self.zero_area + self.outside == 0
     }
 }
@@ -94,8 +98,9 @@ impl fmt::Display for UvReport {
         let [a, b] = [self.angle_stretch_median, self.angle_stretch_p99];
         row("angle stretch", format!("median {a:.4}, 99 % below {b:.4}"))?;
         row("used", format!("{:.1} %", 100.0 * self.used))?;
-        let least = if self.overlaps_complete { "" } else { "at least " };
-        row("overlapping", format!("{least}{} triangles, {:.3} texels", self.overlapping, self.overlap_px))?;
+        let (least, left) = bound("at least ", self.overlaps_left, "triangles");
+        let (n, px) = (self.overlapping, self.overlap_px);
+        row("overlapping", format!("{least}{n} triangles, {px:.3} texels{left}"))?;
         row(
             "broken",
             format!(
@@ -103,9 +108,16 @@ impl fmt::Display for UvReport {
                 self.flipped, self.zero_area, self.outside, self.invalid
             ),
         )?;
-        let apart = self.chart_distance_px.map_or("one chart".into(), |d| format!("{d:.2} texels"));
+        let (most, left) = bound("at most ", self.chart_distance_left, "sides of charts");
+        let apart =
+            self.chart_distance_px.map_or("one chart".into(), |d| format!("{most}{d:.2} texels{left}"));
         row("apart", format!("{apart}, from the border {:.2} texels", self.border_distance_px))
     }
+}
+
+/// How a figure is printed for which so many were not looked at further: what stands before and after it.
+pub(super) fn bound(which: &'static str, left: usize, of: &str) -> (&'static str, String) {
+    if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not looked at further)")) }
 }
 
 /// Measures an atlas. Never panics, whatever mesh and atlas; lengths are those of the mesh.
@@ -114,13 +126,8 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
     let common = count.min(listed);
     let valid: Vec<bool> = (0..common).map(|t| is_valid(mesh, atlas, t)).collect();
     let invalid = valid.iter().filter(|v| !**v).count() + count.max(listed) - common;
-    let mut report = UvReport {
-        triangles: count,
-        invalid,
-        overlaps_complete: true,
-        border_distance_px: f64::INFINITY,
-        ..UvReport::default()
-    };
+    let mut report =
+        UvReport { triangles: count, invalid, border_distance_px: f64::INFINITY, ..UvReport::default() };
     let size = DVec2::new(f64::from(atlas.width), f64::from(atlas.height));
     let uv = |t: usize| atlas.triangles[t].map(|i| atlas.uvs[i as usize]);
     let px = |t: usize| uv(t).map(|v| v.as_dvec2() * size);
@@ -166,15 +173,13 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
             valid[t] && has_area(uv(t))
         })
         .collect();
-    let found = overlaps(&atlas.uvs, &atlas.triangles[..common], &fit);
-    let mut covered: Vec<u32> = found.pairs.iter().flat_map(|&(a, b)| [a, b]).collect();
-    covered.sort_unstable();
-    covered.dedup();
-    report.overlapping = covered.len();
-    report.overlaps_complete = found.complete;
+    let found = overlaps(&atlas.uvs, &atlas.triangles[..common], &fit, EFFORT);
+    report.overlapping = found.covered;
+    report.overlaps_left = found.left;
+    let shared: Vec<f64> =
+        found.pairs.par_iter().map(|&(a, b)| shared_area(px(a as usize), px(b as usize))).collect();
     // a sum of nothing is −0
-    report.overlap_px =
-        found.pairs.iter().fold(0.0, |sum, &(a, b)| sum + shared_area(px(a as usize), px(b as usize)));
+    report.overlap_px = shared.iter().fold(0.0, |sum, area| sum + area);
 
     let sides: Vec<Side> = joined
         .rims
@@ -185,7 +190,8 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
             Side { chart: joined.chart[t], from: p[k], to: p[(k + 1) % 3] }
         })
         .collect();
-    report.chart_distance_px = nearest_charts(&sides, UvReport::FARTHEST_PX);
+    let apart = nearest_charts(&sides, UvReport::FARTHEST_PX);
+    (report.chart_distance_px, report.chart_distance_left) = (apart.distance, apart.left);
     stretches(&mut report, &each().filter(|&t| !flat[t]).map(|t| (points(t), px(t))).collect::<Vec<_>>());
     report
 }
@@ -248,6 +254,7 @@ impl Joined {
         sides.par_sort_unstable();
         let mut sets = Sets::new(valid.len());
         let (mut rims, mut cuts, mut seams) = (Vec::new(), Vec::new(), 0.0);
+        let mut keyed: Vec<([[u32; 2]; 2], u32)> = Vec::new();
         // Corner k of a triangle is followed by k + 1 of the same one.
         let next = |c: u32| c / 3 * 3 + (c + 1) % 3;
         let vertex = |c: u32| weld[mesh.triangles[c as usize / 3][c as usize % 3] as usize];
@@ -257,17 +264,21 @@ impl Joined {
                 let (from, to) = (uv(c / 3 * 3, c % 3), uv(next(c) / 3 * 3, next(c) % 3));
                 if vertex(c) == low { (from, to) } else { (to, from) }
             };
-            let mut cut = None;
-            for (i, &(_, a)) in run.iter().enumerate() {
-                let twins = || run.iter().enumerate().filter(move |(j, _)| *j != i).map(|(_, &(_, b))| b);
-                match twins().find(|&b| ends(a) == ends(b)) {
-                    Some(b) => sets.join(a / 3, b / 3),
-                    None => {
-                        rims.push(a);
-                        cut = cut.or(twins().next().map(|b| (a, b)));
-                    }
+            // sides with equal ends belong together, however many meet in this edge
+            keyed.clear();
+            let bits = |p: Vec2| p.to_array().map(f32::to_bits);
+            keyed.extend(run.iter().map(|&(_, c)| (<[Vec2; 2]>::from(ends(c)).map(bits), c)));
+            keyed.sort_unstable();
+            let mut single = None;
+            for group in keyed.chunk_by(|a, b| a.0 == b.0) {
+                group.windows(2).for_each(|pair| sets.join(pair[0].1 / 3, pair[1].1 / 3));
+                if let [(_, side)] = *group {
+                    rims.push(side);
+                    single = Some(single.map_or(side, |s: u32| s.min(side)));
                 }
             }
+            let other = |a: u32| run.iter().map(|r| r.1).find(|&b| b != a);
+            let cut = single.and_then(|a| other(a).map(|b| (a, b)));
             if let Some((a, b)) = cut {
                 let [p, q] = [a, next(a)]
                     .map(|c| mesh.positions[mesh.triangles[c as usize / 3][c as usize % 3] as usize]);

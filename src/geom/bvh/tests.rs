@@ -275,7 +275,6 @@ fn an_empty_mesh_is_met_by_nothing() {
     assert!(bvh.closest_hit(&ray(Vec3::ZERO, Vec3::X)).is_none());
     assert!(!bvh.any_hit(&ray(Vec3::ZERO, Vec3::X)));
     assert!(bvh.closest_point(Vec3::ZERO).is_none());
-    bvh.overlapping(Aabb::SCENE, |_| panic!("nothing to visit"));
 }
 
 #[test]
@@ -304,10 +303,4 @@ fn many_copies_of_one_triangle_make_a_tree_that_still_answers() {
     let bvh = Bvh::new(&mesh);
     let hit = bvh.closest_hit(&ray(Vec3::new(0.75, 0.25, 2.0), -Vec3::Z)).unwrap();
     assert_eq!(hit.triangle, 0);
-    let mut seen = 0;
-    bvh.overlapping(Aabb::SCENE, |_| {
-        seen += 1;
-        true
-    });
-    assert_eq!(seen, 5000);
 }

@@ -1,7 +1,7 @@
 //! How far the charts of an atlas are apart.
 
+use crate::mesh::boxes::{Boxes, EFFORT, Span, share_out};
 use glam::DVec2;
-use rayon::prelude::*;
 
 /// A piece of a chart's outline, in texels.
 #[derive(Clone, Copy, Debug)]
@@ -14,80 +14,57 @@ pub(crate) struct Side {
     pub to: DVec2,
 }
 
-/// The smallest distance between sides of different charts, up to `farthest`, beyond which it is given as
-/// that; none when there are no two charts.
-pub(crate) fn nearest_charts(sides: &[Side], farthest: f64) -> Option<f64> {
-    sides.iter().find(|s| s.chart != sides[0].chart)?;
-    // Cells as wide as the reach: what lies within it is in the neighbouring cells. Most atlases have their
-    // answer within a few texels, so the reach starts there.
-    let mut reach = 2.0f64.min(farthest);
-    loop {
-        let found = within(sides, reach);
-        if found <= reach {
-            return Some(found);
-        }
-        if reach >= farthest {
-            return Some(farthest);
-        }
-        reach = (4.0 * reach).min(farthest);
-    }
+/// How far charts are apart.
+pub(crate) struct Apart {
+    /// The smallest distance between sides of different charts, at most as far as was asked for; none when there
+    /// are no two charts.
+    pub distance: Option<f64>,
+    /// Sides of which not all neighbours were looked at: then the distance may be smaller.
+    pub left: usize,
 }
 
-/// The smallest distance, exact where it is at most `reach`.
-fn within(sides: &[Side], reach: f64) -> f64 {
-    let cell = |v: f64| (v / reach).floor().clamp(-1e9, 1e9) as i32;
-    // (cell row, cell column, side), a side in every cell that its box touches
-    let mut placed: Vec<(i32, i32, u32)> = Vec::with_capacity(2 * sides.len());
-    for (i, s) in sides.iter().enumerate() {
-        let (low, high) = (s.from.min(s.to), s.from.max(s.to));
-        // Coordinates far out of the texture, or a texture of nothing but texture-wide triangles: no gutter
-        // is asked of those.
-        if (high - low).max_element() > 16384.0 * reach || placed.len() > 1 << 26 {
-            continue;
-        }
-        for y in cell(low.y)..=cell(high.y) {
-            // the stretch of the side in this row of cells
-            let at = |y: f64| s.from + (s.to - s.from) * ((y - s.from.y) / (s.to.y - s.from.y));
-            let (above, below) = (reach * f64::from(y), reach * f64::from(y + 1));
-            let (x0, x1) = if low.y >= above && high.y <= below {
-                (low.x, high.x)
-            } else {
-                let (p, q) = (at(above.max(low.y)).x, at(below.min(high.y)).x);
-                (p.min(q), p.max(q))
-            };
-            for x in cell(x0)..=cell(x1) {
-                placed.push((y, x, i as u32));
-            }
-        }
+/// The smallest distance between sides of different charts, up to `farthest`, beyond which it is given as that.
+pub(crate) fn nearest_charts(sides: &[Side], farthest: f64) -> Apart {
+    if sides.iter().all(|s| s.chart == sides[0].chart) {
+        return Apart { distance: None, left: 0 };
     }
-    placed.par_sort_unstable();
-    let row_of = |y: i32, x0: i32, x1: i32| {
-        let from = placed.partition_point(|p| (p.0, p.1) < (y, x0));
-        let to = placed.partition_point(|p| (p.0, p.1) <= (y, x1));
-        &placed[from..to]
-    };
-    placed
-        .chunk_by(|a, b| (a.0, a.1) == (b.0, b.1))
-        .collect::<Vec<_>>()
-        .par_iter()
-        .map(|own| {
-            let (y, x, _) = own[0];
-            let mut least = f64::INFINITY;
-            for row in y - 1..=y + 1 {
-                for &(_, _, j) in row_of(row, x - 1, x + 1) {
-                    let other = &sides[j as usize];
-                    for &(_, _, i) in own.iter() {
-                        let side = &sides[i as usize];
-                        if side.chart < other.chart {
-                            least = least.min(distance(side, other));
-                        }
+    let span = |s: &Side| Span::around([s.from, s.to].map(|p| p.extend(0.0)));
+    let boxes = Boxes::new(sides.iter().map(span));
+    // What lies beside each other in the tree mostly lies beside each other: a first bound, so that the search
+    // has a short way to go.
+    let order: Vec<u32> = boxes.order().collect();
+    let mut bound = farthest;
+    for near in order.windows(BESIDE) {
+        let side = &sides[near[0] as usize];
+        let others = near[1..].iter().map(|&i| &sides[i as usize]).filter(|s| s.chart != side.chart);
+        bound = others.fold(bound, |least, other| least.min(distance(side, other)));
+    }
+    let shared = share_out(sides.len(), EFFORT / 2, |i, effort| {
+        let (side, mut least) = (&sides[i], bound);
+        if least > 0.0 {
+            boxes.meeting(&span(side).grown(bound), effort, |j, effort| {
+                let other = &sides[j as usize];
+                if side.chart < other.chart {
+                    if !effort.spend(DISTANCE) {
+                        return false;
                     }
+                    least = least.min(distance(side, other));
                 }
-            }
-            least
-        })
-        .reduce(|| f64::INFINITY, f64::min)
+                least > 0.0
+            });
+        }
+        least
+    });
+    let least = shared.found.into_iter().fold(bound, f64::min);
+    // nothing is nearer than touching
+    Apart { distance: Some(least), left: if least > 0.0 { shared.unfinished.len() } else { 0 } }
 }
+
+/// How many that follow each other in the tree are compared first.
+const BESIDE: usize = 8;
+
+/// What a distance of two sides costs, in comparisons of boxes.
+const DISTANCE: usize = 8;
 
 fn point_distance(p: DVec2, s: &Side) -> f64 {
     let along = s.to - s.from;
@@ -112,15 +89,21 @@ mod tests {
         Side { chart, from: DVec2::new(p[0], p[1]), to: DVec2::new(p[2], p[3]) }
     }
 
+    fn nearest(sides: &[Side], farthest: f64) -> Option<f64> {
+        let Apart { distance, left } = nearest_charts(sides, farthest);
+        assert_eq!(left, 0);
+        distance
+    }
+
     #[test]
     fn distances_are_between_different_charts_only() {
         let a = side(0, [0.0, 0.0, 10.0, 0.0]);
-        assert_eq!(nearest_charts(&[a, side(0, [0.0, 1.0, 10.0, 1.0])], 64.0), None);
-        assert_eq!(nearest_charts(&[a, side(1, [3.0, 5.0, 3.0, 9.0])], 64.0), Some(5.0));
-        assert_eq!(nearest_charts(&[a, side(1, [3.0, -5.0, 3.0, 9.0])], 64.0), Some(0.0)); // crossing
-        assert_eq!(nearest_charts(&[a, side(1, [13.0, 4.0, 19.0, 4.0])], 64.0), Some(5.0)); // 3, 4, 5
-        assert_eq!(nearest_charts(&[a, side(1, [0.0, 900.0, 1.0, 900.0])], 64.0), Some(64.0));
-        assert_eq!(nearest_charts(&[], 64.0), None);
+        assert_eq!(nearest(&[a, side(0, [0.0, 1.0, 10.0, 1.0])], 64.0), None);
+        assert_eq!(nearest(&[a, side(1, [3.0, 5.0, 3.0, 9.0])], 64.0), Some(5.0));
+        assert_eq!(nearest(&[a, side(1, [3.0, -5.0, 3.0, 9.0])], 64.0), Some(0.0)); // crossing
+        assert_eq!(nearest(&[a, side(1, [13.0, 4.0, 19.0, 4.0])], 64.0), Some(5.0)); // 3, 4, 5
+        assert_eq!(nearest(&[a, side(1, [0.0, 900.0, 1.0, 900.0])], 64.0), Some(64.0));
+        assert_eq!(nearest(&[], 64.0), None);
     }
 
     #[test]
@@ -141,6 +124,6 @@ mod tests {
                 }
             }
         }
-        assert_eq!(nearest_charts(&sides, 64.0), Some(least));
+        assert_eq!(nearest(&sides, 64.0), Some(least));
     }
 }

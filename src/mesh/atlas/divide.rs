@@ -11,7 +11,7 @@
 use super::Refusal;
 use super::flat::Flat;
 use super::library::{Flattened, STRETCHED, flatten};
-use super::overlap::overlaps;
+use super::overlap::{THOROUGH, overlaps};
 use super::patch::{NONE, neighbours, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
@@ -89,7 +89,7 @@ fn settled(mesh: &Mesh, mut chart: Flat, splits: usize) -> Vec<Flat> {
 /// meet, the smaller of the two strips that lie over each other becomes a chart of its own.
 fn uncovered(chart: Flat) -> Vec<Flat> {
     let points: Vec<Vec2> = chart.points.iter().map(|p| p.as_vec2()).collect();
-    let pairs = overlaps(&points, &chart.corners, &vec![true; chart.corners.len()]).pairs;
+    let pairs = overlaps(&points, &chart.corners, &vec![true; chart.corners.len()], THOROUGH).pairs;
     if pairs.is_empty() {
         return vec![chart];
     }

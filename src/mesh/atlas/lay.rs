@@ -7,7 +7,7 @@ use super::divide::divide;
 use super::face::divide_around;
 use super::flat::{Flat, height};
 use super::library::Flattened;
-use super::overlap::{overlaps, turn};
+use super::overlap::{THOROUGH, overlaps, turn};
 use super::pack::pack;
 use super::patch::{neighbours, part};
 use super::planar::planar;
@@ -135,7 +135,7 @@ fn faults(atlas: &Atlas) -> Vec<bool> {
         })
         .collect();
     let mut bad: Vec<bool> = upright.iter().map(|u| !u).collect();
-    for (a, b) in overlaps(&atlas.uvs, &atlas.triangles, &upright).pairs {
+    for (a, b) in overlaps(&atlas.uvs, &atlas.triangles, &upright, THOROUGH).pairs {
         let (a, b) = (a as usize, b as usize);
         if !bad[a] && !bad[b] {
             let thin = |t: usize| height(corners(t).map(|v| v.as_dvec2())).abs();

@@ -5,6 +5,7 @@
 //! of f32 coordinates, in f64 with Shewchuk's error bound (1997), and where that cannot tell, as the exact sum
 //! of its six products. So triangles that share a side or a corner, or merely touch, never count.
 
+use crate::mesh::boxes::{Boxes, Span, share_out};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
@@ -75,111 +76,81 @@ pub(crate) fn shared_area(p: [DVec2; 3], q: [DVec2; 3]) -> f64 {
 
 /// Pairs of triangles that share area.
 pub(crate) struct Overlaps {
-    /// Each pair once, lower index first, in no order that means anything but always the same.
+    /// Each pair once, lower index first, in the order of where they begin in the texture.
     pub pairs: Vec<(u32, u32)>,
-    /// False when there were so many candidates that some were not looked at.
-    pub complete: bool,
+    /// How many triangles share area with another one.
+    pub covered: usize,
+    /// Triangles of which not all neighbours with a higher index were looked at: then there may be more of both.
+    pub left: usize,
 }
 
-/// A triangle of a sound atlas has a dozen candidates. Beyond this mean the rest is left out,
-const CANDIDATES: usize = 400;
+/// Effort for an atlas in the making, which should know all of its overlaps.
+pub(crate) const THOROUGH: usize = 1 << 16;
 
-/// but never below so many: a few long needles side by side are no reason.
-const ALWAYS: usize = 1 << 22;
+/// What deciding about a pair costs, in comparisons of boxes, and what keeping and measuring one costs.
+const DECIDING: usize = 12;
+const KEEPING: usize = 64;
 
-/// Finds the pairs among the triangles that `fit`; those must be finite and have area.
-pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool]) -> Overlaps {
+/// Finds the pairs among the triangles that `fit`, for so much effort a triangle; those must be finite and have
+/// area.
+pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effort: usize) -> Overlaps {
     let corners = |t: u32| triangles[t as usize].map(|i| uvs[i as usize]);
     let listed: Vec<u32> = (0..triangles.len() as u32).filter(|&t| fit[t as usize]).collect();
-    if listed.len() < 2 {
-        return Overlaps { pairs: Vec::new(), complete: true };
+    let span = |t: u32| Span::around(corners(t).map(|v| v.as_dvec2().extend(0.0)));
+    let boxes = Boxes::new(listed.iter().map(|&t| span(t)));
+    let shared = share_out(listed.len(), effort, |i, effort| {
+        let (a, mut pairs) = (listed[i], Vec::new());
+        boxes.meeting(&span(a), effort, |j, effort| {
+            let b = listed[j as usize];
+            if b <= a {
+                return true;
+            }
+            let meets = effort.spend(DECIDING) && share_area(corners(a), corners(b));
+            if meets && effort.spend(KEEPING) {
+                pairs.push((a, b));
+            }
+            true
+        });
+        pairs
+    });
+    let mut pairs: Vec<(u32, u32)> = shared.found.into_iter().flatten().collect();
+    let mut covered = vec![false; triangles.len()];
+    pairs.iter().for_each(|&(a, b)| (covered[a as usize], covered[b as usize]) = (true, true));
+    if !shared.unfinished.is_empty() {
+        // any other one will do, whatever its index
+        let rest: Vec<u32> = listed.iter().copied().filter(|&t| !covered[t as usize]).collect();
+        let known = share_out(rest.len(), effort, |i, effort| {
+            let (a, mut known) = (rest[i], false);
+            boxes.meeting(&span(a), effort, |j, effort| {
+                let b = listed[j as usize];
+                known = a != b && effort.spend(DECIDING) && share_area(corners(a), corners(b));
+                !known
+            });
+            known
+        });
+        rest.iter().zip(known.found).for_each(|(&t, known)| covered[t as usize] = known);
     }
-    let boxes: Vec<(Vec2, Vec2)> = listed
-        .iter()
-        .map(|&t| {
-            let [a, b, c] = corners(t);
-            (a.min(b).min(c), a.max(b).max(c))
-        })
-        .collect();
-    let low = boxes.iter().fold(Vec2::INFINITY, |m, b| m.min(b.0));
-    let high = boxes.iter().fold(Vec2::NEG_INFINITY, |m, b| m.max(b.1));
-    // About a triangle a cell, were they spread evenly.
-    let side = ((listed.len() as f32).sqrt() as usize).clamp(1, 2048);
-    let scale = side as f32 / (high - low).max(Vec2::splat(f32::MIN_POSITIVE));
-    let cell = |p: Vec2| {
-        let c = ((p - low) * scale).clamp(Vec2::ZERO, Vec2::splat(side as f32 - 1.0));
-        (c.x as usize, c.y as usize)
-    };
-    let each_cell = |b: &(Vec2, Vec2), visit: &mut dyn FnMut(usize)| {
-        let ((x0, y0), (x1, y1)) = (cell(b.0), cell(b.1));
-        (y0..=y1).for_each(|y| (x0..=x1).for_each(|x| visit(y * side + x)));
-    };
-    let mut start = vec![0u32; side * side + 1];
-    // An atlas of nothing but texture-wide triangles would fill memory: what comes after too many of
-    // them is left out.
-    let mut entries = 0usize;
-    let limit = (CANDIDATES * listed.len()).max(ALWAYS);
-    let mut narrow = listed.len();
-    for (i, b) in boxes.iter().enumerate() {
-        let ((x0, y0), (x1, y1)) = (cell(b.0), cell(b.1));
-        entries += (x1 - x0 + 1) * (y1 - y0 + 1);
-        if entries > limit {
-            narrow = i;
-            break;
-        }
-    }
-    let boxes = &boxes[..narrow];
-    for b in boxes {
-        each_cell(b, &mut |c| start[c + 1] += 1);
-    }
-    for c in 0..side * side {
-        start[c + 1] += start[c];
-    }
-    let mut fill = start.clone();
-    let mut members = vec![0u32; start[side * side] as usize];
-    for (i, b) in boxes.iter().enumerate() {
-        each_cell(b, &mut |c| {
-            members[fill[c] as usize] = i as u32;
-            fill[c] += 1;
+    if !pairs.is_empty() {
+        // cells of about a triangle each, were they spread evenly
+        let low_of = |t: u32| corners(t).into_iter().fold(Vec2::INFINITY, Vec2::min);
+        let high_of = |t: u32| corners(t).into_iter().fold(Vec2::NEG_INFINITY, Vec2::max);
+        let low = listed.iter().fold(Vec2::INFINITY, |m, &t| m.min(low_of(t)));
+        let high = listed.iter().fold(Vec2::NEG_INFINITY, |m, &t| m.max(high_of(t)));
+        let side = ((listed.len() as f32).sqrt() as usize).clamp(1, 2048) as f32;
+        let scale = side / (high - low).max(Vec2::splat(f32::MIN_POSITIVE));
+        pairs.par_sort_by_cached_key(|&(a, b)| {
+            let at = ((low_of(a).max(low_of(b)) - low) * scale).clamp(Vec2::ZERO, Vec2::splat(side - 1.0));
+            (at.y as u32, at.x as u32, a, b)
         });
     }
-    let budget = (CANDIDATES * (listed.len() / side + 1) * 8).max(ALWAYS);
-    let rows: Vec<(Vec<(u32, u32)>, bool)> = (0..side)
-        .into_par_iter()
-        .map(|y| {
-            let (mut pairs, mut looked) = (Vec::new(), 0);
-            for c in y * side..(y + 1) * side {
-                let inside = &members[start[c] as usize..start[c + 1] as usize];
-                for (k, &i) in inside.iter().enumerate() {
-                    let (low, high) = boxes[i as usize];
-                    looked += inside.len() - k;
-                    if looked > budget {
-                        return (pairs, false);
-                    }
-                    for &j in &inside[k + 1..] {
-                        let (other_low, other_high) = boxes[j as usize];
-                        let (from, to) = (low.max(other_low), high.min(other_high));
-                        // A pair that meets in several cells is looked at in the first.
-                        if from.cmpgt(to).any() || cell(from) != (c % side, y) {
-                            continue;
-                        }
-                        let (a, b) = (listed[i as usize], listed[j as usize]);
-                        if share_area(corners(a), corners(b)) {
-                            pairs.push((a, b));
-                        }
-                    }
-                }
-            }
-            (pairs, true)
-        })
-        .collect();
-    let complete = narrow == listed.len() && rows.iter().all(|r| r.1);
-    Overlaps { pairs: rows.into_iter().flat_map(|r| r.0).collect(), complete }
+    let covered = covered.iter().filter(|&&c| c).count();
+    Overlaps { pairs, covered, left: shared.unfinished.len() }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mesh::boxes::EFFORT;
 
     fn at(p: [f32; 6]) -> [Vec2; 3] {
         [Vec2::new(p[0], p[1]), Vec2::new(p[2], p[3]), Vec2::new(p[4], p[5])]
@@ -235,22 +206,24 @@ mod tests {
                 triangles.push([at(i, j), at(i + 1, j + 1), at(i, j + 1)]);
             }
         }
-        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()]);
-        assert!(all.pairs.is_empty() && all.complete);
+        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()], EFFORT);
+        assert!(all.pairs.is_empty() && all.left == 0);
         // across the diagonal of the quad (0, 0), within it
         let s = 1.0 / 60.0;
         uvs.extend([Vec2::new(0.4, 0.2) * s, Vec2::new(0.8, 0.6) * s, Vec2::new(0.2, 0.8) * s]);
         let first = uvs.len() as u32 - 3;
         triangles.push([first, first + 1, first + 2]);
-        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()]);
+        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()], EFFORT);
         assert_eq!(all.pairs, [(0, 1800), (1, 1800)]);
     }
 
     #[test]
     fn a_heap_of_texture_wide_triangles_ends() {
         let uvs = vec![Vec2::ZERO, Vec2::X, Vec2::Y];
-        let triangles = vec![[0, 1, 2]; 20_000];
-        let found = overlaps(&uvs, &triangles, &vec![true; triangles.len()]);
-        assert!(!found.complete && !found.pairs.is_empty());
+        let triangles = vec![[0, 1, 2]; 40_000];
+        let found = overlaps(&uvs, &triangles, &vec![true; triangles.len()], EFFORT);
+        assert!(found.left > 39_000 && found.pairs.len() * KEEPING <= EFFORT * triangles.len());
+        // what each of them finds first is enough to know that it is covered, but not by how many
+        assert_eq!(found.covered, triangles.len());
     }
 }

@@ -1,0 +1,239 @@
+//! Which boxes meet, for a bounded effort.
+//!
+//! A triangle of a sound mesh has a few dozen neighbours, but a file may put all of its triangles into one place,
+//! and comparing all with all is quadratic. So every search here counts what it looks at: each item gets a share
+//! of an effort proportional to their number, what some leave over is dealt to those that need more, and who is
+//! not done then is named. All of it is counted work, never time: the answer is the same on every machine.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// What may be spent on each item on average, in comparisons of boxes: about five microseconds of one core. A
+/// triangle of a sound mesh takes half of it or less.
+pub(super) const EFFORT: usize = 512;
+
+/// As many items' effort may be spent however few there are: two thousand triangles in one place are no reason.
+const ALWAYS: usize = 1 << 15;
+
+/// What one item may still spend.
+pub(super) struct Effort {
+    left: usize,
+    short: bool,
+}
+
+impl Effort {
+    /// Spends, or returns false from the first time that too little is left.
+    pub(super) fn spend(&mut self, cost: usize) -> bool {
+        self.short |= self.left < cost;
+        self.left = if self.short { 0 } else { self.left - cost };
+        !self.short
+    }
+}
+
+/// What [`share_out`] found.
+pub(super) struct Shared<T> {
+    /// One for each item; of those that were not finished, what they have so far.
+    pub(super) found: Vec<T>,
+    /// Who ran short, in order.
+    pub(super) unfinished: Vec<usize>,
+    /// What was spent on all together.
+    pub(super) spent: usize,
+}
+
+/// Does `work` for each item, with `each` to spend on average and no more than that on all.
+pub(super) fn share_out<T: Send>(
+    items: usize,
+    each: usize,
+    work: impl Fn(usize, &mut Effort) -> T + Sync,
+) -> Shared<T> {
+    let mut total = each.saturating_mul(items.max(ALWAYS));
+    let go = |i: usize, share: usize| {
+        let mut effort = Effort { left: share, short: false };
+        let found = work(i, &mut effort);
+        (found, share - effort.left, effort.short)
+    };
+    let first: Vec<(T, usize, bool)> = (0..items).into_par_iter().map(|i| go(i, each)).collect();
+    let mut shared = Shared { found: Vec::with_capacity(items), unfinished: Vec::new(), spent: 0 };
+    for (i, (found, spent, short)) in first.into_iter().enumerate() {
+        shared.found.push(found);
+        shared.spent += spent;
+        if short {
+            shared.unfinished.push(i);
+        }
+    }
+    // once more from the start, with what is left over
+    total = total.saturating_sub(shared.spent);
+    let share = total / shared.unfinished.len().max(1);
+    if share > each {
+        let again: Vec<(T, usize, bool)> = shared.unfinished.par_iter().map(|&i| go(i, share)).collect();
+        for (i, (found, spent, short)) in std::mem::take(&mut shared.unfinished).into_iter().zip(again) {
+            shared.found[i] = found;
+            shared.spent += spent;
+            if short {
+                shared.unfinished.push(i);
+            }
+        }
+    }
+    shared
+}
+
+/// A box along the axes.
+#[derive(Clone, Copy)]
+pub(super) struct Span {
+    low: DVec3,
+    high: DVec3,
+}
+
+impl Span {
+    const EMPTY: Span = Span { low: DVec3::INFINITY, high: DVec3::NEG_INFINITY };
+
+    pub(super) fn around(points: impl IntoIterator<Item = DVec3>) -> Span {
+        points.into_iter().fold(Span::EMPTY, |s, p| Span { low: s.low.min(p), high: s.high.max(p) })
+    }
+
+    pub(super) fn grown(self, margin: f64) -> Span {
+        Span { low: self.low - margin, high: self.high + margin }
+    }
+
+    fn with(self, other: Span) -> Span {
+        Span { low: self.low.min(other.low), high: self.high.max(other.high) }
+    }
+
+    fn meets(&self, other: &Span) -> bool {
+        self.low.cmple(other.high).all() && other.low.cmple(self.high).all()
+    }
+
+    /// Twice its middle.
+    fn middle(&self) -> DVec3 {
+        self.low + self.high
+    }
+}
+
+/// Most boxes in a leaf of the tree.
+const LEAF: usize = 4;
+
+/// Boxes in a balanced tree: each node holds half of its parent's, parted across the longest side. Its depth does
+/// not depend on where they are.
+pub(super) struct Boxes {
+    /// In the order of the tree, with their numbers.
+    items: Vec<(Span, u32)>,
+    /// A node, then those below its first half, then those below its second.
+    nodes: Vec<Span>,
+}
+
+impl Boxes {
+    pub(super) fn new(spans: impl Iterator<Item = Span>) -> Boxes {
+        let mut items: Vec<(Span, u32)> = spans.zip(0..).collect();
+        let leaves = items.len().div_ceil(LEAF).next_power_of_two();
+        let mut nodes = vec![Span::EMPTY; 2 * leaves - 1];
+        part(&mut items, &mut nodes);
+        Boxes { items, nodes }
+    }
+
+    /// The numbers of the boxes, neighbours mostly beside each other.
+    pub(super) fn order(&self) -> impl Iterator<Item = u32> {
+        self.items.iter().map(|&(_, i)| i)
+    }
+
+    /// Calls `visit` with every box that meets `query`, until it returns false or the effort is spent.
+    pub(super) fn meeting(
+        &self,
+        query: &Span,
+        effort: &mut Effort,
+        mut visit: impl FnMut(u32, &mut Effort) -> bool,
+    ) {
+        // node, nodes from it on, its items
+        let mut stack = vec![(0, self.nodes.len(), 0, self.items.len())];
+        while let Some((node, count, from, to)) = stack.pop() {
+            if !effort.spend(1) {
+                return;
+            }
+            if !self.nodes[node].meets(query) {
+                continue;
+            }
+            if count > 1 {
+                let (below, half) = (count / 2, from + (to - from) / 2);
+                stack.push((node + 1 + below, below, half, to));
+                stack.push((node + 1, below, from, half));
+                continue;
+            }
+            for (span, i) in &self.items[from..to] {
+                if !effort.spend(1) || span.meets(query) && !visit(*i, effort) {
+                    return;
+                }
+            }
+        }
+    }
+}
+
+fn part(items: &mut [(Span, u32)], nodes: &mut [Span]) {
+    let Some((node, below)) = nodes.split_first_mut() else { return };
+    *node = items.iter().fold(Span::EMPTY, |s, i| s.with(i.0));
+    if below.is_empty() || items.is_empty() {
+        return;
+    }
+    let middles = Span::around(items.iter().map(|i| i.0.middle()));
+    let axis = (middles.high - middles.low).max_position();
+    let at = |i: &(Span, u32)| i.0.middle()[axis];
+    let half = items.len() / 2;
+    items.select_nth_unstable_by(half, |a, b| at(a).total_cmp(&at(b)).then(a.1.cmp(&b.1)));
+    let (a, b) = items.split_at_mut(half);
+    let (below_a, below_b) = below.split_at_mut(below.len() / 2);
+    if b.len() > 4096 {
+        rayon::join(|| part(a, below_a), || part(b, below_b));
+    } else {
+        part(a, below_a);
+        part(b, below_b);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_tree_finds_what_all_pairs_find() {
+        // boxes 0 to 0.2 wide in the unit cube, from a counter; one of them far out, as strays of scans are
+        let mut state = 7u64;
+        let mut next = move || {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            (state >> 40) as f64 / (1u64 << 24) as f64
+        };
+        let mut spans: Vec<Span> = (0..501)
+            .map(|_| {
+                let low = DVec3::new(next(), next(), next());
+                Span { low, high: low + 0.2 * DVec3::new(next(), next(), next()) }
+            })
+            .collect();
+        spans[17] = Span::around([DVec3::splat(1e30)]);
+        let boxes = Boxes::new(spans.iter().copied());
+        for query in &spans {
+            let mut found = Vec::new();
+            let mut effort = Effort { left: usize::MAX, short: false };
+            boxes.meeting(query, &mut effort, |i, _| {
+                found.push(i);
+                true
+            });
+            found.sort_unstable();
+            let all = (0..501).filter(|&i| spans[i as usize].meets(query)).collect::<Vec<u32>>();
+            assert_eq!(found, all);
+            // most of the tree is not looked at
+            assert!(usize::MAX - effort.left < 400);
+        }
+        assert_eq!(Boxes::new(std::iter::empty()).nodes.len(), 1);
+    }
+
+    #[test]
+    fn what_some_leave_over_goes_to_those_that_need_more() {
+        // item 3 asks for a hundred thousand, which all of them together may spend; none else asks for any
+        let need = |i: usize| if i == 3 { 100_000 } else { 0 };
+        let work = |i: usize, effort: &mut Effort| (0..need(i)).take_while(|_| effort.spend(1)).count();
+        let shared = share_out(10, 10, work);
+        assert_eq!((shared.found[3], shared.unfinished.len()), (100_000, 0));
+        // three of them are more than that: each is told what it has
+        let work = |_: usize, effort: &mut Effort| (0..200_000).take_while(|_| effort.spend(1)).count();
+        let shared = share_out(3, 10, work);
+        assert_eq!(shared.unfinished, [0, 1, 2]);
+        assert!(shared.spent <= 10 * ALWAYS && shared.found.iter().all(|&n| n > 100_000));
+    }
+}
