@@ -123,6 +123,61 @@ fn an_open_mesh_is_below_the_bar() {
     assert_eq!(code(&tiface(dir.path(), &["check", "t.obj", "--require", "beauty"])), 2);
 }
 
+/// A cube around a point, each coordinate of its corners with all its digits.
+fn cube(center: [f64; 3], half: f64) -> ([[f64; 3]; 8], [[usize; 4]; 6]) {
+    let corner = |i: usize| [0, 1, 2].map(|k| center[k] + if i >> k & 1 == 1 { half } else { -half });
+    let quads = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+    ([0, 1, 2, 3, 4, 5, 6, 7].map(corner), quads)
+}
+
+#[test]
+fn a_head_far_from_the_origin_is_checked_and_measured_like_one_near_it() {
+    let dir = tempfile::tempdir().unwrap();
+    for center in [[0.0, 0.0, 0.0], [1e6, -1e6, 0.0], [1e7, 1e7, 1e7]] {
+        let (corners, quads) = cube(center, 0.1);
+        let mut obj: String = corners.iter().map(|[x, y, z]| format!("v {x} {y} {z}\n")).collect();
+        quads.iter().for_each(|q| {
+            let [a, b, c, d] = q.map(|i| i + 1);
+            obj += &format!("f {a} {b} {c} {d}\n");
+        });
+        std::fs::write(dir.path().join("head.obj"), obj).unwrap();
+        // a millimetre larger on all sides
+        let (corners, quads) = cube(center, 0.101);
+        let mut ply = String::from(
+            "ply\nformat ascii 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty double z\n\
+             element face 6\nproperty list uchar int vertex_indices\nend_header\n",
+        );
+        corners.iter().for_each(|[x, y, z]| ply += &format!("{x} {y} {z}\n"));
+        quads.iter().for_each(|[a, b, c, d]| ply += &format!("4 {a} {b} {c} {d}\n"));
+        std::fs::write(dir.path().join("truth.ply"), ply).unwrap();
+        let args = ["check", "head.obj", "--against", "truth.ply", "--require", "watertight"];
+        let o = tiface(dir.path(), &args);
+        assert_eq!(code(&o), 0, "{center:?} {}{}", out(&o), err(&o));
+        // from every point of the cube it is a millimetre to the other
+        let expected = "distance to the other   mean 1.000, median 1.000, 90 % below 1.000, worst 1.00 mm";
+        assert!(out(&o).contains(expected), "{center:?} {}", out(&o));
+        assert!(out(&o).contains("8.0000 litres") && out(&o).contains("0.2000 × 0.2000 × 0.2000 m"));
+    }
+}
+
+#[test]
+fn a_textured_mesh_has_its_colours_from_a_texture() {
+    let dir = tempfile::tempdir().unwrap();
+    let obj = "mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n";
+    std::fs::write(dir.path().join("t.obj"), obj).unwrap();
+    // a material of one colour is no texture
+    for (mtl, colours, json) in [
+        ("newmtl a\nKd 1 1 1\n", "colours              NO\n", "\"has_texture\":false"),
+        ("newmtl a\nmap_Kd t.png\n", "colours              yes, a texture\n", "\"has_texture\":true"),
+    ] {
+        std::fs::write(dir.path().join("t.mtl"), mtl).unwrap();
+        let o = tiface(dir.path(), &["check", "t.obj"]);
+        assert!(out(&o).contains(colours), "{}", out(&o));
+        let o = tiface(dir.path(), &["check", "t.obj", "--json"]);
+        assert!(out(&o).contains(json), "{}", out(&o));
+    }
+}
+
 #[test]
 #[cfg(unix)]
 fn a_closed_stdout_is_not_an_error() {

@@ -1,15 +1,18 @@
 //! Mesh files made to hurt, and the message each must produce. Nothing here may panic, hang or
 //! reserve memory for what a file merely claims.
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use tiface::geom::{Atlas, Mesh};
+use tiface::geom::{Atlas, Mesh, Similarity};
 use tiface::image::Photo;
-use tiface::mesh::check::check;
+use tiface::mesh::check::{CheckReport, check, check_around};
 use tiface::mesh::export::ExportOptions;
-use tiface::mesh::read::{Limits, ReadMeshError, picture_of_mtl, read, read_limited, read_whole};
+use tiface::mesh::read::{
+    Limits, ReadMeshError, picture_of_mtl, read, read_limited, read_placed, read_whole, weld,
+};
 use tiface::mesh::textured::{TextureOptions, Textured};
+use tiface::mesh::uv_check::uv_check;
 use tiface::mesh::{gltf, obj, ply};
 use tiface::mesh::{gltf::to_glb, obj::to_obj, ply::to_ply};
 
@@ -196,17 +199,33 @@ fn crooked_objs_are_named_errors() {
         ("f -5 1 2\n", "index `-5`"),
         ("f 1 2 99999999999999999999\n", "index `99999999999999999999`"),
         ("f 1 2\n", "a face with 2 corners"),
-        ("f 1//1 2//1 3//1\n", "index `1`, but there are 0 normals so far"),
+        ("vn 0 0 1\nf 1//1 2//2 3//1\n", "`bad`, line 6: index `2`, but there are 1 normals so far"),
+        ("f 1 2 \\\n\\\n9\n", "`bad`, line 5: index `9`"),
         ("f a b c\n", "index `a`"),
         ("v 1 2\n", "2 numbers, expected x y z"),
         ("v nan 0 0\n", "`nan` is not a finite number"),
         ("v inf 0 0\n", "`inf` is not a finite number"),
         ("v 1e39 0 0\n", "`1e39` is not a finite number"),
-        ("v 1 2 \\\n3\n", "a continued line is not supported"),
+        ("v 1 2 \\\n\n", "2 numbers, expected x y z"),
         ("", "holds no triangles"),
     ] {
         let found = message(format!("{good}{end}").as_bytes());
         assert!(found.contains(expected), "expected {expected:?}, found {found:?}");
+    }
+}
+
+#[test]
+fn obj_files_may_continue_lines_add_comments_and_name_normals_they_do_not_write() {
+    let corners = "v 0 0 0 # first\nv 1 0 \\\n0\nv 0 1 0\n# not continued \\\nv 0 0 1\n";
+    for (faces, triangles) in [
+        ("f 1 3 2 # comment", vec![[0, 2, 1]]),
+        ("f 1 3 \\\r\n 2 \\\r\n 4\r\n", vec![[0, 2, 1], [0, 1, 3]]),
+        ("f 1//1 3//2 2//3", vec![[0, 2, 1]]),
+        ("f 1 3 2 \\", vec![[0, 2, 1]]),
+    ] {
+        let mesh = read(format!("{corners}{faces}").as_bytes(), Path::new("a")).unwrap();
+        assert_eq!((mesh.triangles, mesh.normals.len()), (triangles, 0), "{faces}");
+        assert_eq!(mesh.positions, tetrahedron().positions);
     }
 }
 
@@ -484,13 +503,65 @@ fn crooked_plys_are_named_errors() {
         (ply_of("format ascii 1.0\nelement vertex 0\nproperty float x\n", b""), "has no x, y, z"),
         (
             ply_of(&format!("format ascii 1.0\nelement tristrips 1\n{list}"), b"3 0 1 2"),
-            "a triangle strip is not supported",
+            "triangle 0: index 0, but there are 0 vertices",
+        ),
+        (
+            ply_of(&format!("format ascii 1.0\nelement tristrips 1\n{list}"), b"3 0 1 -2"),
+            "strip 0: index -2, expected a whole number from −1",
         ),
     ];
     for (bytes, expected) in cases {
         let found = message(&bytes);
         assert!(found.contains(expected), "expected {expected:?}, found {found:?}");
     }
+}
+
+#[test]
+fn a_ply_is_read_whatever_ends_its_lines() {
+    let header = |format: &str| {
+        format!(
+            "ply\nformat {format} 1.0\ncomment c\nelement vertex 3\nproperty float x\nproperty float y\n\
+             property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+    };
+    // its first byte is a line feed
+    let x = f32::from_bits(0x3f80_000a);
+    let mut body: Vec<u8> =
+        [x, 0., 0., 1., 2., 0., 0., 1., 3.].iter().flat_map(|v| v.to_le_bytes()).collect();
+    body.extend([3, 0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0]);
+    for ending in ["\n", "\r\n", "\r"] {
+        let text = header("ascii") + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
+        let mesh = read(text.replace('\n', ending).as_bytes(), Path::new("a")).unwrap();
+        assert_eq!((mesh.positions[1], &mesh.triangles[..]), (Vec3::X, &[[0, 1, 2]][..]));
+        let binary =
+            [header("binary_little_endian").replace('\n', ending).into_bytes(), body.clone()].concat();
+        let mesh = read(&binary, Path::new("a")).unwrap();
+        assert_eq!((mesh.positions[0].x, mesh.positions[2].z), (x, 3.0), "{ending:?}");
+    }
+}
+
+#[test]
+fn triangle_strips_of_a_ply_are_cut_into_triangles() {
+    let bytes = ply_of(
+        "format ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n\
+         element tristrips 1\nproperty list int int vertex_indices\n",
+        b"0 0 0  1 0 0  0 1 0  1 1 0  0 2 0\n11 0 1 2 3 -1 2 3 3 4 -1 0\n",
+    );
+    // 0 1 2, then 2 1 3 the other way round; then 2 3 3 and 3 3 4, which are none; a lone corner is none either
+    assert_eq!(read(&bytes, Path::new("a")).unwrap().triangles, [[0, 1, 2], [2, 1, 3]]);
+}
+
+#[test]
+fn advice_fits_the_format() {
+    let hint = |bytes: &[u8]| read_whole(bytes, Path::new("a")).unwrap_err().hint();
+    let glb = with("/accessors/0/count", json!(5));
+    let (obj, ply) = (&b"v 0 0 0\nf 1 2 3\n"[..], &b"ply\nformat telepathy 1.0\n"[..]);
+    assert!(hint(&glb).contains("Khronos"));
+    for text in [obj, ply] {
+        assert!(!hint(text).contains("GLB") && !hint(text).contains("Khronos"), "{}", hint(text));
+    }
+    let several = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\nusemtl b\nf 1 2 3\n";
+    assert!(hint(several).contains("one texture") && !hint(several).contains("compression"));
 }
 
 #[test]
@@ -567,6 +638,168 @@ fn a_flipped_byte_anywhere_is_survived_by_reader_and_check() {
             }
         }
     }
+}
+
+/// The whole report of a file, as `tiface check` makes it. Nothing here takes more than a second or two.
+fn report(bytes: &[u8]) -> CheckReport {
+    let begin = std::time::Instant::now();
+    let whole = read_whole(bytes, Path::new("a")).unwrap();
+    let uv =
+        whole.atlas.map(|atlas| uv_check(&weld(&whole.mesh), &Atlas { width: 1024, height: 1024, ..atlas }));
+    let report = CheckReport { uv, ..check_around(&whole.mesh, whole.origin, 1.0) };
+    assert!(begin.elapsed().as_secs() < 120, "{:?}", begin.elapsed());
+    report
+}
+
+#[test]
+fn quads_that_each_show_the_whole_texture_are_counted_not_waited_for() {
+    let n = 64;
+    let mut obj = String::from("vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n");
+    (0..=n).for_each(|i| (0..=n).for_each(|j| obj += &format!("v {i} {j} 0\n")));
+    let v = |i: usize, j: usize| i * (n + 1) + j + 1;
+    for (i, j) in (0..n).flat_map(|i| (0..n).map(move |j| (i, j))) {
+        let [a, b, c, d] = [v(i, j), v(i + 1, j), v(i + 1, j + 1), v(i, j + 1)];
+        obj += &format!("f {a}/1 {b}/2 {c}/3 {d}/4\n");
+    }
+    let r = report(obj.as_bytes());
+    let uv = r.uv.as_ref().unwrap();
+    // every triangle lies on 4,095 others: 8 million pairs, of which some are measured
+    assert_eq!((r.triangles, uv.overlapping, uv.chart_distance_px), (8192, 8192, Some(0.0)));
+    assert!(uv.overlaps_left > 7000 && !uv.is_sound());
+    assert_eq!((uv.chart_distance_left, r.self_intersections, r.self_intersections_left), (0, 0, 0));
+    let text = r.require(&["sound-uv"]).unwrap_err().to_string() + &uv.to_string();
+    assert!(text.matches("at least 8192 triangles").count() == 2 && text.contains("not looked at further"));
+    assert!(r.require(&["no-self-intersections"]).is_ok());
+}
+
+#[test]
+fn thousands_of_parallel_slivers_are_counted_not_waited_for() {
+    let mut obj = String::new();
+    for k in 0..8000 {
+        // along a diagonal, in space and in the texture, so that all boxes meet and no two triangles do
+        let e = f64::from(k) / 800_000.0;
+        let (x, y) = (1.0 + e, 1.0 - e);
+        obj += &format!("v {e} {} {e}\nv {x} {y} {x}\nv {} {} {x}\n", -e, x + 1e-7, y - 1e-7);
+        obj += &format!("vt {e} 0\nvt {} 1\nvt {} 1\n", 0.9 + e, 0.9 + e + 1e-6);
+        let a = 3 * k + 1;
+        obj += &format!("f {a}/{a} {}/{} {}/{}\n", a + 1, a + 1, a + 2, a + 2);
+    }
+    let r = report(obj.as_bytes());
+    let uv = r.uv.as_ref().unwrap();
+    assert!(r.self_intersections_left > 1000 && uv.chart_distance_left > 1000, "{r}\n{uv}");
+    // none was found, but nobody can say that there are none
+    let text = r.require(&["no-self-intersections"]).unwrap_err().to_string();
+    assert!(text.contains("not looked at further"), "{text}");
+    assert!(uv.to_string().contains("at most 0.") && r.to_string().contains("at least "), "{r}\n{uv}");
+}
+
+#[test]
+fn a_shape_shown_many_times_in_one_place_is_looked_at_once() {
+    let mut d = document();
+    let primitive = d["meshes"][0]["primitives"][0].clone();
+    d["meshes"][0]["primitives"] = json!(vec![primitive; 100]);
+    d["nodes"] = json!(vec![json!({"mesh": 0}); 100]);
+    d["scenes"][0]["nodes"] = json!((0..100).collect::<Vec<_>>());
+    let r = report(&glb(&d, &bin()));
+    assert_eq!((r.triangles, r.self_intersections, r.self_intersections_left), (40_000, 40_000, 0));
+    // the same a little beside itself each time
+    for (k, node) in d["nodes"].as_array_mut().unwrap().iter_mut().enumerate() {
+        node["translation"] = json!([1e-5 * k as f64, 1e-5 * k as f64, 1e-5 * k as f64]);
+    }
+    let r = report(&glb(&d, &bin()));
+    assert_eq!(r.self_intersections, 40_000);
+}
+
+#[test]
+fn an_edge_of_many_triangles_with_coordinates_of_their_own_is_no_more_work_than_others() {
+    let n = 50_000;
+    let mut obj = String::from("v 0 0 0\nv 0 0 1\n");
+    for k in 0..n {
+        let (x, u) = (f64::from(k), f64::from(k) / f64::from(n));
+        obj += &format!("v {} {} 0.5\nvt {u} 0\nvt {u} 1\nvt {} 0.5\n", x.cos(), x.sin(), u + 1e-5);
+    }
+    for k in 0..n {
+        obj += &format!("f 1/{} 2/{} {}/{}\n", 3 * k + 1, 3 * k + 2, k + 3, 3 * k + 3);
+    }
+    let r = report(obj.as_bytes());
+    assert_eq!((r.nonmanifold_edges, r.uv.unwrap().charts), (1, n as usize));
+}
+
+/// A closed ball of 0.25 m, without its poles' many corners: 24 × 12 quads a side.
+fn ball() -> (Mesh, Atlas) {
+    let (across, down) = (48u32, 24u32);
+    let at = |i: u32, j: u32| {
+        let (a, b) =
+            (i as f32 / across as f32 * std::f32::consts::TAU, j as f32 / down as f32 * std::f32::consts::PI);
+        0.125 * Vec3::new(b.sin() * a.cos(), b.sin() * a.sin(), b.cos())
+    };
+    let mut mesh = Mesh { positions: vec![at(0, 0), at(0, down)], ..Mesh::default() };
+    mesh.positions.extend((0..across * (down - 1)).map(|k| at(k % across, 1 + k / across)));
+    let ring = |i: u32, j: u32| 2 + (j - 1) * across + i % across;
+    for i in 0..across {
+        mesh.triangles.push([0, ring(i, 1), ring(i + 1, 1)]);
+        mesh.triangles.push([1, ring(i + 1, down - 1), ring(i, down - 1)]);
+        for j in 1..down - 1 {
+            let [a, b, c, d] = [ring(i, j), ring(i + 1, j), ring(i + 1, j + 1), ring(i, j + 1)];
+            mesh.triangles.extend([[a, d, c], [a, c, b]]);
+        }
+    }
+    mesh.normals = mesh.positions.iter().map(|p| p.normalize()).collect();
+    let uvs = vec![glam::Vec2::ZERO, glam::Vec2::X, glam::Vec2::Y];
+    let atlas = Atlas { uvs, triangles: vec![[0, 1, 2]; mesh.triangles.len()], width: 2, height: 2 };
+    (mesh, atlas)
+}
+
+/// A thousand and ten thousand kilometres from the origin, where f32 has steps of 6 cm and a metre.
+#[test]
+fn a_head_far_from_the_origin_is_watertight_in_every_format() {
+    let (mesh, atlas) = ball();
+    let near = check(&mesh, 1.0);
+    assert!(near.closed && near.self_intersections == 0);
+    let color = Photo { width: 2, height: 2, rgb: vec![[9, 8, 7]; 4], alpha: None };
+    let whole = Textured::new(&mesh, &atlas, &color);
+    for away in [DVec3::new(1e6, -1e6, 1e6), DVec3::new(0.0, 1e7, 3e6)] {
+        let place = Similarity::scale_translate(1.0, away);
+        let options = ExportOptions { world_from_mesh: place, ..ExportOptions::default() };
+        let texture = TextureOptions::default();
+        let quantized = TextureOptions { quantize: true, ..texture.clone() };
+        let files = [
+            to_glb(&mesh, &options).unwrap(),
+            to_obj(&mesh, &options).unwrap(),
+            ply::placed_to_ply(&mesh, &place).unwrap(),
+            gltf::textured_to_glb(&whole, &options, &texture).unwrap().files.remove(0).1,
+            gltf::textured_to_glb(&whole, &options, &quantized).unwrap().files.remove(0).1,
+            obj::textured_to_obj(&whole, &options, &texture).unwrap().files.remove(0).1,
+        ];
+        for (k, bytes) in files.iter().enumerate() {
+            for found in [read_placed(bytes, Path::new("a")), read_whole(bytes, Path::new("a"))] {
+                let found = found.unwrap();
+                let r = check_around(&found.mesh, found.origin, 1.0);
+                let same = |r: &CheckReport| (r.closed, r.manifold, r.welded_vertices, r.euler, r.degenerate);
+                assert_eq!(same(&r), same(&near), "{away} file {k}");
+                assert_eq!(r.self_intersections, 0, "{away} file {k}");
+                assert!((r.volume_l / near.volume_l - 1.0).abs() < 1e-3, "{away} file {k}: {}", r.volume_l);
+                for axis in 0..3 {
+                    // 16 bits across a quarter of a metre are steps of 4 µm
+                    let expected = away[axis] + near.min[axis];
+                    assert!((r.min[axis] - expected).abs() < 1e-5, "{away} file {k}: {:?}", r.min);
+                }
+            }
+        }
+    }
+}
+
+/// Loose vertices may be anywhere: only what is shown says where a mesh is.
+#[test]
+fn a_loose_vertex_does_not_move_the_origin_of_a_far_mesh() {
+    let obj = "v 0 0 0\nv 1e7 1e7 1e7\nv 10000000.125 1e7 1e7\nv 1e7 10000000.125 1e7\nf 2 3 4\n";
+    let found = read_placed(obj.as_bytes(), Path::new("a")).unwrap();
+    let [a, b, _] = found.mesh.corners(0);
+    assert_eq!((b - a, found.origin), (0.125 * Vec3::X, DVec3::splat(1e7)));
+    // near the origin nothing moves
+    let found =
+        read_placed(&to_obj(&tetrahedron(), &ExportOptions::default()).unwrap(), Path::new("a")).unwrap();
+    assert_eq!((found.origin, found.mesh.positions), (DVec3::ZERO, tetrahedron().positions));
 }
 
 #[test]

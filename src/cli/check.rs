@@ -4,10 +4,10 @@ use super::ending::{Ending, say};
 use super::options::Common;
 use super::plain::one_line;
 use crate::capture::{self, CaptureOptions, Split};
-use crate::geom::{Bvh, Camera, Mesh};
+use crate::geom::{Bvh, Camera};
 use crate::io::{self, Limits};
-use crate::mesh::check::{CheckReport, RequireError, check};
-use crate::mesh::read::{Texture, picture_of_mtl, read, read_whole, weld};
+use crate::mesh::check::{CheckReport, RequireError, check_around};
+use crate::mesh::read::{ReadMesh, Texture, picture_of_mtl, read_placed, read_whole, weld};
 use crate::mesh::uv_check::{UvReport, uv_check};
 use crate::metrics::distance::{Distances, one_way, seen_one_way};
 use crate::run::Exit;
@@ -73,44 +73,52 @@ struct Whole<'a> {
     against: Option<&'a Against>,
 }
 
-fn load(path: &Path) -> Result<Mesh, Ending> {
+fn load(path: &Path) -> Result<ReadMesh, Ending> {
     let bytes = io::read_bytes(path, &Limits::default())?;
-    read(&bytes, path).map_err(|e| Ending::cannot(e.to_string(), e.hint()))
+    read_placed(&bytes, path).map_err(|e| Ending::cannot(e.to_string(), e.hint()))
 }
 
 /// A texture of unknown size is measured as if it had this many texels along each side.
 const UNKNOWN_PX: u32 = 1024;
 
-/// The mesh, and its texture coordinates measured. A texture that cannot be understood is no reason not to check
-/// the mesh.
-fn load_whole(path: &Path) -> Result<(Mesh, Result<Option<UvReport>, String>), Ending> {
+/// What is known of a texture.
+#[derive(Default)]
+struct Textured {
+    /// Is there a picture?
+    is_there: Option<bool>,
+    /// The texture coordinates, measured.
+    uv: Option<UvReport>,
+    /// Why it was not looked at.
+    problem: Option<String>,
+}
+
+/// The mesh and its texture. One that cannot be understood is no reason not to check the mesh.
+fn load_whole(path: &Path) -> Result<(ReadMesh, Textured), Ending> {
     let bytes = io::read_bytes(path, &Limits::default())?;
     let whole = match read_whole(&bytes, path) {
         Ok(whole) => whole,
-        Err(e) => return Ok((load(path)?, Err(e.to_string()))),
+        Err(e) => return Ok((load(path)?, Textured { problem: Some(e.to_string()), ..Textured::default() })),
     };
-    let uv = whole.atlas.map(|mut atlas| {
+    let beside = match &whole.texture {
+        Some(Texture::Beside(name)) => Some(name.clone()),
+        Some(Texture::Material(mtl)) => picture_of_material(&path.with_file_name(mtl)),
+        Some(Texture::Inside(_)) | None => None,
+    };
+    let is_there = beside.is_some() || matches!(whole.texture, Some(Texture::Inside(_)));
+    let uv = whole.atlas.clone().map(|mut atlas| {
         if atlas.width == 0 || atlas.height == 0 {
-            let size = whole.texture.and_then(|t| picture_size(&t, path));
-            (atlas.width, atlas.height) = size.unwrap_or((UNKNOWN_PX, UNKNOWN_PX));
+            let info =
+                beside.and_then(|name| io::picture_info(&path.with_file_name(name), &Limits::default()).ok());
+            (atlas.width, atlas.height) = info.map_or((UNKNOWN_PX, UNKNOWN_PX), |i| i.size(None));
         }
         uv_check(&weld(&whole.mesh), &atlas)
     });
-    Ok((whole.mesh, Ok(uv)))
+    Ok((whole, Textured { is_there: Some(is_there), uv, problem: None }))
 }
 
-/// Size of the picture beside a file.
-fn picture_size(texture: &Texture, path: &Path) -> Option<(u32, u32)> {
-    let limits = Limits::default();
-    let name = match texture {
-        Texture::Inside(_) => return None,
-        Texture::Beside(name) => name.clone(),
-        Texture::Material(mtl) => {
-            let mtl = path.with_file_name(mtl);
-            picture_of_mtl(&io::read_bytes(&mtl, &limits).ok()?, &mtl).ok()??
-        }
-    };
-    Some(io::picture_info(&path.with_file_name(name), &limits).ok()?.size(None))
+/// The name of the picture that a material file gives.
+fn picture_of_material(mtl: &Path) -> Option<String> {
+    picture_of_mtl(&io::read_bytes(mtl, &Limits::default()).ok()?, mtl).ok()?
 }
 
 pub(super) fn go(
@@ -121,16 +129,15 @@ pub(super) fn go(
     seen_by: Option<&Path>,
 ) -> Result<Exit, Ending> {
     let config = common.resolve(None, None, &[])?;
-    let (mesh, uv) = load_whole(path)?;
-    let (uv, problem) = uv.map_or_else(|e| (None, Some(e)), |uv| (uv, None));
+    let (found, Textured { is_there, uv, problem }) = load_whole(path)?;
     let unit_m = config.capture.unit_m;
-    let report = CheckReport { uv, ..check(&mesh, unit_m) };
+    let report = CheckReport { uv, has_texture: is_there, ..check_around(&found.mesh, found.origin, unit_m) };
     let bars: Vec<&str> = require.iter().map(String::as_str).collect();
     let passed = report.require(&bars);
     if let Err(e @ RequireError::Unknown { .. }) = &passed {
         return Err(Ending::usage(e.to_string(), e.hint()));
     }
-    let against = against.map(|other| compare(&mesh, other, seen_by, unit_m)).transpose()?;
+    let against = against.map(|other| compare(&found, other, seen_by, unit_m)).transpose()?;
     let text = if common.json {
         let whole = Whole { report: &report, texture_problem: problem.as_deref(), against: against.as_ref() };
         format!("{}\n", serde_json::to_string(&whole).unwrap_or_default())
@@ -147,8 +154,12 @@ pub(super) fn go(
     Ok(Exit::Done)
 }
 
-fn compare(mesh: &Mesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Result<Against, Ending> {
-    let truth = load(other)?;
+fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Result<Against, Ending> {
+    let ReadMesh { mesh, origin, .. } = found;
+    let ReadMesh { mesh: mut truth, origin: elsewhere, .. } = load(other)?;
+    // both around one origin
+    let way = elsewhere - origin;
+    truth.positions.iter_mut().for_each(|p| *p = (p.as_dvec3() + way).as_vec3());
     let empty = |e: &Path| Ending::cannot(format!("`{}` has no surface to measure", e.display()), "");
     let bvh = Bvh::new(&truth);
     let mm = |d| Millimetres::new(d, unit_m);
@@ -159,7 +170,8 @@ fn compare(mesh: &Mesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Re
         Some(root) => {
             let capture = capture::open(root, &CaptureOptions::default())
                 .map_err(|e| Ending::cannot(e.to_string(), e.hint()))?;
-            let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
+            let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
+            let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| moved(&v.camera)).collect();
             seen_one_way(mesh, &bvh, POINTS, &cameras, 3).map(|(d, share)| (mm(d), share))
         }
     };

@@ -192,7 +192,7 @@ fn placed_box(mesh: &Mesh, file_from_mesh: &Similarity) -> (DVec3, DVec3) {
 }
 
 /// Middle and size of a box, and whether it is far from the origin.
-fn middle((low, high): (DVec3, DVec3)) -> (DVec3, f64, bool) {
+pub(super) fn middle((low, high): (DVec3, DVec3)) -> (DVec3, f64, bool) {
     let (center, size) = (0.5 * (low + high), (high - low).max_element());
     (center, size, center.abs().max_element() > FAR_IN_SIZES * size)
 }

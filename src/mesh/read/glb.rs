@@ -3,7 +3,7 @@
 //! Only what lies in the file is read: buffers with an address are refused, whatever it is.
 
 use super::glb_texture::{ImageEntry, Material, TextureEntry};
-use super::{ReadMesh, ReadMeshError, Source};
+use super::{Parsed, ReadMeshError, Source};
 use crate::geom::{Atlas, Mesh};
 use crate::image::srgb_from_linear;
 use glam::{DMat3, DMat4, DQuat, DVec3, Vec2};
@@ -98,7 +98,7 @@ fn is_harmless(extension: &str) -> bool {
         || ["KHR_texture_transform", "EXT_texture_webp", "KHR_texture_basisu"].contains(&extension)
 }
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshError> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError> {
     let (json, bin) = chunks(bytes, source)?;
     let root: Root =
         serde_json::from_slice(json).map_err(|e| source.broken("the JSON chunk", e.to_string()))?;
@@ -188,6 +188,8 @@ fn local(node: &Node) -> DMat4 {
 /// The mesh as it grows. Normals, colours and texture coordinates survive only if every part has them.
 #[derive(Default)]
 struct Gathered {
+    positions: Vec<DVec3>,
+    /// The rest of it.
     mesh: Mesh,
     bare_normals: bool,
     bare_colors: bool,
@@ -205,8 +207,8 @@ pub(super) struct Document<'a> {
 }
 
 impl<'a> Document<'a> {
-    fn whole(&self, gathered: Gathered) -> Result<ReadMesh, ReadMeshError> {
-        let Gathered { mut mesh, bare_normals, bare_colors, uvs, bare_uvs, textures } = gathered;
+    fn whole(&self, gathered: Gathered) -> Result<Parsed, ReadMeshError> {
+        let Gathered { positions, mut mesh, bare_normals, bare_colors, uvs, bare_uvs, textures } = gathered;
         if bare_normals {
             mesh.normals.clear();
         }
@@ -226,7 +228,7 @@ impl<'a> Document<'a> {
             _ if !wanted => None,
             _ => return Err(self.source.unsupported("`materials`", "a mesh with several base colours")),
         };
-        Ok(ReadMesh { mesh, atlas, texture })
+        Ok(Parsed { positions, mesh, atlas, texture })
     }
 
     fn roots(&self) -> Result<Vec<usize>, ReadMeshError> {
@@ -301,17 +303,17 @@ impl<'a> Document<'a> {
         if let Some(i) = indices.iter().find(|&&i| i as usize >= count) {
             return Err(source.broken(at, format!("index {i}, but there are {count} vertices")));
         }
-        let first = out.mesh.positions.len();
+        let first = out.positions.len();
         source.allow(first + count, out.mesh.triangles.len() + indices.len() / 3)?;
 
         let linear = DMat3::from_mat4(matrix);
         let mirrored = linear.determinant() < 0.0;
         for p in positions.as_chunks::<3>().0 {
-            let moved = matrix.transform_point3(DVec3::from(*p)).as_vec3();
-            if !moved.is_finite() {
+            let moved = matrix.transform_point3(DVec3::from(*p));
+            if !moved.as_vec3().is_finite() {
                 return Err(source.broken(at, "a vertex is not finite once its node has moved it"));
             }
-            out.mesh.positions.push(moved);
+            out.positions.push(moved);
         }
         // the inverse transpose, up to a factor that normalising removes, also for singular matrices
         let cofactor = DMat3::from_cols(

@@ -1,7 +1,11 @@
 //! Meshes from files others wrote: GLB, PLY and OBJ, from bytes.
 //!
-//! [`read`] gives the surface, [`read_whole`] also its texture. What the bytes are decides, not the name. Every count is compared with the bytes that remain
-//! before anything is reserved, no other file is opened, and numbers that are not finite are refused.
+//! [`read`] gives the surface, [`read_whole`] also its texture. What the bytes are decides, not the name. Every
+//! count is compared with the bytes that remain before anything is reserved, no other file is opened, and numbers
+//! that are not finite are refused.
+//!
+//! Positions are read in f64. Those of a mesh far from the origin, where f32 steps over its triangles, come around
+//! an origin of their own, see [`ReadMesh::origin`].
 
 mod glb;
 mod glb_texture;
@@ -13,7 +17,9 @@ pub use obj::picture_of_mtl;
 pub(super) use weld::places;
 pub use weld::weld;
 
+use super::export::middle;
 use crate::geom::{Atlas, Mesh};
+use glam::{DVec3, Vec3};
 use std::path::{Path, PathBuf};
 
 /// How much a file may ask for. GLB can show one buffer many times, so bytes alone do not bound it.
@@ -48,6 +54,8 @@ pub enum ReadMeshError {
     Broken {
         /// Which file.
         path: PathBuf,
+        /// What it is: `GLB`, `PLY`, `OBJ` or `MTL`.
+        format: &'static str,
         /// Where in it.
         at: String,
         /// What is wrong: expected and found.
@@ -58,6 +66,8 @@ pub enum ReadMeshError {
     Unsupported {
         /// Which file.
         path: PathBuf,
+        /// What it is, as in [`ReadMeshError::Broken`].
+        format: &'static str,
         /// Where in it.
         at: String,
         /// What it uses.
@@ -88,9 +98,17 @@ impl ReadMeshError {
             ReadMeshError::Unknown { .. } => {
                 "export it as .glb, .ply or .obj; a .gltf beside a .bin is not read"
             }
-            ReadMeshError::Broken { .. } => "export it again; the Khronos validator explains a GLB in detail",
-            ReadMeshError::Unsupported { .. } => {
+            ReadMeshError::Broken { format: "GLB", .. } => {
+                "export it again; the Khronos validator explains a GLB in detail"
+            }
+            ReadMeshError::Broken { .. } => {
+                "export it again, or open it in Blender or MeshLab and save it anew from there"
+            }
+            ReadMeshError::Unsupported { format: "GLB", .. } => {
                 "export it as a plain .glb without compression, with one picture inside"
+            }
+            ReadMeshError::Unsupported { .. } => {
+                "export it with one texture that lies in the same folder, or as a .glb with the picture inside"
             }
             ReadMeshError::TooMany { .. } => "simplify it first",
             ReadMeshError::Empty { .. } => "export a surface, not points or curves",
@@ -98,7 +116,8 @@ impl ReadMeshError {
     }
 }
 
-/// A mesh from the bytes of a `.glb`, `.ply` or `.obj` file, in the file's own coordinates.
+/// A mesh from the bytes of a `.glb`, `.ply` or `.obj` file, in the file's own coordinates, rounded to f32: for a
+/// mesh far from the origin see [`read_placed`].
 ///
 /// `path` is for messages only. Colours come back sRGB-coded; normals only when every vertex has
 /// one. Polygons are fanned. Nothing is welded or repaired. Textures are passed over, sound or not.
@@ -108,14 +127,18 @@ pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh, ReadMeshError> {
 
 /// [`read`] with limits of one's own.
 pub fn read_limited(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Mesh, ReadMeshError> {
-    any(bytes, Source { path, limits, textures: false }).map(|whole| whole.mesh)
+    let Parsed { positions, mesh, .. } = any(bytes, path, limits, false)?;
+    Ok(Mesh { positions: positions.iter().map(|p| p.as_vec3()).collect(), ..mesh })
 }
 
 /// A mesh as it was read, with its texture.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReadMesh {
-    /// The surface.
+    /// The surface, its positions relative to `origin`.
     pub mesh: Mesh,
+    /// Where in the file's coordinates the mesh's are 0: the middle of a mesh that lies more than fifteen of its
+    /// sizes from the file's origin, else that.
+    pub origin: DVec3,
     /// Where its triangles lie in the texture, if the file says so for all of them. The size is that
     /// of the picture in the file, else 0 × 0. Coordinates are finite; in files of others they may
     /// leave 0..=1, where a texture repeats.
@@ -143,17 +166,52 @@ pub enum Texture {
 /// As [`read`]; and when the texture is broken, lies outside the file and its folder, or when there are
 /// several.
 pub fn read_whole(bytes: &[u8], path: &Path) -> Result<ReadMesh, ReadMeshError> {
-    any(bytes, Source { path, limits: &Limits::default(), textures: true })
+    Ok(any(bytes, path, &Limits::default(), true)?.placed())
 }
 
-fn any(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshError> {
-    let path = source.path;
+/// [`read_whole`] without the texture, sound or not.
+///
+/// # Errors
+///
+/// As [`read`].
+pub fn read_placed(bytes: &[u8], path: &Path) -> Result<ReadMesh, ReadMeshError> {
+    Ok(any(bytes, path, &Limits::default(), false)?.placed())
+}
+
+/// What the reader of a format finds: a [`ReadMesh`] whose positions are still the file's.
+#[derive(Default)]
+struct Parsed {
+    positions: Vec<DVec3>,
+    /// All but the positions.
+    mesh: Mesh,
+    atlas: Option<Atlas>,
+    texture: Option<Texture>,
+}
+
+impl Parsed {
+    fn placed(self) -> ReadMesh {
+        let Parsed { positions, mut mesh, atlas, texture } = self;
+        // the box of what is shown: loose vertices may be anywhere
+        let corners = mesh.triangles.iter().flatten().map(|&i| positions[i as usize]);
+        let (low, high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        let (center, _, far) = middle(corners.fold((low, high), |(low, high), p| (low.min(p), high.max(p))));
+        // rounded as export does, so that what it wrote comes back as it was
+        let origin = if far { center.as_vec3().as_dvec3() } else { DVec3::ZERO };
+        // −0 stays what it was
+        let place = |p: &DVec3| if far { (p - origin).as_vec3() } else { p.as_vec3() };
+        mesh.positions = positions.iter().map(place).collect::<Vec<Vec3>>();
+        ReadMesh { mesh, origin, atlas, texture }
+    }
+}
+
+fn any(bytes: &[u8], path: &Path, limits: &Limits, textures: bool) -> Result<Parsed, ReadMeshError> {
+    let source = |format| Source { path, format, limits, textures };
     let whole = if bytes.starts_with(b"glTF") {
-        glb::read(bytes, source)?
+        glb::read(bytes, source("GLB"))?
     } else if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
-        ply::read(bytes, source)?
+        ply::read(bytes, source("PLY"))?
     } else if looks_like_obj(bytes) {
-        obj::read(bytes, source)?
+        obj::read(bytes, source("OBJ"))?
     } else {
         return Err(ReadMeshError::Unknown { path: path.into() });
     };
@@ -177,17 +235,20 @@ fn looks_like_obj(bytes: &[u8]) -> bool {
 #[derive(Clone, Copy)]
 struct Source<'a> {
     path: &'a Path,
+    format: &'static str,
     limits: &'a Limits,
     textures: bool,
 }
 
 impl Source<'_> {
     fn broken(&self, at: impl Into<String>, what: impl Into<String>) -> ReadMeshError {
-        ReadMeshError::Broken { path: self.path.into(), at: at.into(), what: what.into() }
+        let (path, format) = (self.path.into(), self.format);
+        ReadMeshError::Broken { path, format, at: at.into(), what: what.into() }
     }
 
     fn unsupported(&self, at: impl Into<String>, feature: impl Into<String>) -> ReadMeshError {
-        ReadMeshError::Unsupported { path: self.path.into(), at: at.into(), feature: feature.into() }
+        let (path, format) = (self.path.into(), self.format);
+        ReadMeshError::Unsupported { path, format, at: at.into(), feature: feature.into() }
     }
 
     /// The name of a file in the same folder: no path, no address.

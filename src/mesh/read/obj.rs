@@ -4,12 +4,14 @@
 //! Written here because the reader the ecosystem has splits vertices by object, takes index 0 for
 //! "none", and multiplies unchecked indices.
 
-use super::{Limits, ReadMesh, ReadMeshError, Source, Texture};
+use super::{Limits, Parsed, ReadMeshError, Source, Texture};
 use crate::geom::{Atlas, Mesh};
-use glam::{Vec2, Vec3};
+use glam::{DVec3, Vec2, Vec3};
+use std::borrow::Cow;
 use std::path::Path;
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshError> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError> {
+    let mut positions: Vec<DVec3> = Vec::new();
     let mut mesh = Mesh::default();
     let mut atlas = Atlas::default();
     let mut all_mapped = source.textures;
@@ -21,25 +23,20 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshErr
     let mut normal_of: Vec<u32> = Vec::new();
     let mut normals_agree = true;
     let mut corners: Vec<u32> = Vec::new();
-    for (number, line) in bytes.split(|&b| b == b'\n').enumerate() {
-        let broken = |what: String| source.broken(format!("line {}", number + 1), what);
-        let line = String::from_utf8_lossy(line.trim_ascii());
+    for (number, line) in lines(bytes) {
+        let broken = |what: String| source.broken(format!("line {number}"), what);
         let mut words = line.split_ascii_whitespace();
-        let keyword = words.next().unwrap_or("");
-        if ["v", "vt", "vn", "f"].contains(&keyword) && line.ends_with('\\') {
-            return Err(source.unsupported(format!("line {}", number + 1), "a continued line"));
-        }
-        match keyword {
+        match words.next().unwrap_or("") {
             "v" => {
                 let numbers = floats(words, &broken)?;
                 let [x, y, z, rest @ ..] = &numbers[..] else {
                     return Err(broken(format!("{} numbers, expected x y z", numbers.len())));
                 };
-                source.allow(mesh.positions.len() + 1, 0)?;
-                mesh.positions.push(Vec3::new(*x, *y, *z));
+                source.allow(positions.len() + 1, 0)?;
+                positions.push(DVec3::new(*x, *y, *z));
                 normal_of.push(u32::MAX);
                 if let [r, g, b] = rest {
-                    mesh.colors.push([*r, *g, *b].map(|c| c.clamp(0.0, 1.0)));
+                    mesh.colors.push([*r, *g, *b].map(|c| c.clamp(0.0, 1.0) as f32));
                 }
             }
             "vn" => {
@@ -47,7 +44,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshErr
                 let [x, y, z] = numbers[..] else {
                     return Err(broken(format!("{} numbers, expected x y z", numbers.len())));
                 };
-                normals.push(Vec3::new(x, y, z));
+                normals.push(DVec3::new(x, y, z).as_vec3());
             }
             "vt" if source.textures => {
                 let numbers = floats(words, &broken)?;
@@ -55,33 +52,34 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshErr
                     return Err(broken(format!("{} numbers, expected u v", numbers.len())));
                 };
                 source.allow(atlas.uvs.len() + 1, 0)?;
-                atlas.uvs.push(Vec2::new(u, 1.0 - v));
+                atlas.uvs.push(Vec2::new(u as f32, 1.0 - v as f32));
             }
             "mtllib" if source.textures && library.is_none() => {
-                let at = format!("line {}", number + 1);
+                let at = format!("line {number}");
                 library = Some(source.bare_name(at, line.strip_prefix("mtllib").unwrap_or(""))?);
             }
             "usemtl" if source.textures => {
                 let name = words.collect::<Vec<_>>().join(" ");
                 if !mesh.triangles.is_empty() && material.as_ref() != Some(&name) {
-                    let at = format!("line {}", number + 1);
-                    return Err(source.unsupported(at, "a mesh with several materials"));
+                    return Err(source.unsupported(format!("line {number}"), "a mesh with several materials"));
                 }
                 material = Some(name);
             }
             "f" => {
                 corners.clear();
                 mapped.clear();
-                for word in words {
+                for word in words.take_while(|w| !w.starts_with('#')) {
                     let mut parts = word.split('/');
-                    let vertex =
-                        resolve(parts.next().unwrap_or(""), mesh.positions.len(), "vertices", &broken)?;
+                    let vertex = resolve(parts.next().unwrap_or(""), positions.len(), "vertices", &broken)?;
                     let uv = parts.next().unwrap_or("");
                     if source.textures && !uv.is_empty() {
                         mapped.push(resolve(uv, atlas.uvs.len(), "texture coordinates", &broken)?);
                     }
                     let normal = match parts.next() {
-                        Some(text) if !text.is_empty() => resolve(text, normals.len(), "normals", &broken)?,
+                        // some programs name normals that they do not write
+                        Some(text) if !text.is_empty() && !normals.is_empty() => {
+                            resolve(text, normals.len(), "normals", &broken)?
+                        }
                         _ => u32::MAX,
                     };
                     let known = &mut normal_of[vertex as usize];
@@ -110,13 +108,35 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshErr
             _ => {}
         }
     }
-    if mesh.colors.len() != mesh.positions.len() {
+    if mesh.colors.len() != positions.len() {
         mesh.colors.clear();
     }
     if normals_agree && !normal_of.contains(&u32::MAX) {
         mesh.normals = normal_of.iter().map(|&n| normals[n as usize].normalize_or_zero()).collect();
     }
-    Ok(ReadMesh { mesh, atlas: all_mapped.then_some(atlas), texture: library.map(Texture::Material) })
+    let texture = library.map(Texture::Material);
+    Ok(Parsed { positions, mesh, atlas: all_mapped.then_some(atlas), texture })
+}
+
+/// The lines with their numbers. One that ends with a backslash goes on in the next, under its own number; what is
+/// in a comment does not.
+fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
+    let mut lines = bytes.split(|&b| b == b'\n').map(|line| line.trim_ascii()).zip(1..);
+    std::iter::from_fn(move || {
+        let (line, number) = lines.next()?;
+        let open = |line: &[u8]| line.ends_with(b"\\") && !line.contains(&b'#');
+        if !open(line) {
+            return Some((number, String::from_utf8_lossy(line)));
+        }
+        let (mut whole, mut line) = (Vec::new(), line);
+        while open(line) {
+            whole.extend(&line[..line.len() - 1]);
+            whole.push(b' ');
+            line = lines.next().map_or(&[], |(next, _)| next);
+        }
+        whole.extend(line);
+        Some((number, String::from_utf8_lossy(&whole).into_owned().into()))
+    })
 }
 
 /// The bare name of the picture that a `.mtl` file gives as its base colour (`map_Kd`), if any.
@@ -126,7 +146,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshErr
 /// [`ReadMeshError::Unsupported`] when it lies in another folder or behind an address, when it comes
 /// with options, or when there are several.
 pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>, ReadMeshError> {
-    let source = Source { path, limits: &Limits::default(), textures: true };
+    let source = Source { path, format: "MTL", limits: &Limits::default(), textures: true };
     let mut found: Option<String> = None;
     for (number, line) in bytes.split(|&b| b == b'\n').enumerate() {
         let line = String::from_utf8_lossy(line.trim_ascii());
@@ -149,11 +169,11 @@ pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>, ReadM
 fn floats<'a>(
     words: impl Iterator<Item = &'a str>,
     broken: &impl Fn(String) -> ReadMeshError,
-) -> Result<Vec<f32>, ReadMeshError> {
+) -> Result<Vec<f64>, ReadMeshError> {
     words
         .take_while(|w| !w.starts_with('#'))
-        .map(|w| match w.parse::<f32>() {
-            Ok(v) if v.is_finite() => Ok(v),
+        .map(|w| match w.parse::<f64>() {
+            Ok(v) if (v as f32).is_finite() => Ok(v),
             _ => Err(broken(format!("`{}` is not a finite number", w.chars().take(40).collect::<String>()))),
         })
         .collect()

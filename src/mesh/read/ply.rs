@@ -1,8 +1,8 @@
-//! PLY → mesh: text and both binary orders, any scalar types, polygons fanned.
+//! PLY → mesh: text and both binary orders, any scalar types, any line ends, polygons fanned, strips cut up.
 
-use super::{ReadMesh, ReadMeshError, Source, Texture};
-use crate::geom::{Atlas, Mesh};
-use glam::{Vec2, Vec3};
+use super::{Parsed, ReadMeshError, Source, Texture};
+use crate::geom::Atlas;
+use glam::{DVec3, Vec2, Vec3};
 
 /// A header is a few lines; more is an attack or another format.
 const HEADER_BYTES: usize = 1 << 20;
@@ -73,17 +73,17 @@ struct Element {
     properties: Vec<Property>,
 }
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshError> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError> {
     let Header { order, elements, start, picture } = header(bytes, source)?;
     let mut body = Body { bytes, at: start, order, source };
-    let mut mesh = Mesh::default();
+    let mut out = Parsed::default();
     let mut uvs = None;
     for element in &elements {
         body.check(element)?;
         match element.name.as_str() {
-            "vertex" => uvs = vertices(&mut body, element, &mut mesh)?,
-            "face" => faces(&mut body, element, &mut mesh)?,
-            "tristrips" => return Err(source.unsupported("element `tristrips`", "a triangle strip")),
+            "vertex" => uvs = vertices(&mut body, element, &mut out)?,
+            "face" => faces(&mut body, element, &mut out.mesh.triangles)?,
+            "tristrips" => strips(&mut body, element, &mut out.mesh.triangles)?,
             _ => {
                 for _ in 0..element.count {
                     for property in &element.properties {
@@ -93,16 +93,17 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh, ReadMeshErr
             }
         }
     }
-    let count = mesh.positions.len();
-    for (i, t) in mesh.triangles.iter().enumerate() {
+    let count = out.positions.len();
+    for (i, t) in out.mesh.triangles.iter().enumerate() {
         if let Some(v) = t.iter().find(|&&v| v as usize >= count) {
             return Err(
                 source.broken(format!("triangle {i}"), format!("index {v}, but there are {count} vertices"))
             );
         }
     }
-    let atlas = uvs.map(|uvs| Atlas { uvs, triangles: mesh.triangles.clone(), width: 0, height: 0 });
-    Ok(ReadMesh { mesh, atlas, texture: picture.map(Texture::Beside) })
+    out.atlas = uvs.map(|uvs| Atlas { uvs, triangles: out.mesh.triangles.clone(), width: 0, height: 0 });
+    out.texture = picture.map(Texture::Beside);
+    Ok(out)
 }
 
 struct Header {
@@ -117,14 +118,21 @@ struct Header {
 fn header(bytes: &[u8], source: Source) -> Result<Header, ReadMeshError> {
     let (mut order, mut elements, mut at) = (None, Vec::<Element>::new(), 0);
     let mut picture = None;
+    // All lines end as the first one does: what follows the last may be any byte, a line feed too.
+    let end = bytes.iter().position(|b| b"\r\n".contains(b)).unwrap_or(0);
+    let ending: &[u8] = match bytes.get(end..) {
+        Some([b'\r', b'\n', ..]) => b"\r\n",
+        Some([b'\r', ..]) => b"\r",
+        _ => b"\n",
+    };
     for number in 1.. {
         let rest = &bytes[at..bytes.len().min(HEADER_BYTES).max(at)];
         let broken = |what: String| source.broken(format!("header line {number}"), what);
-        let Some(length) = rest.iter().position(|&b| b == b'\n') else {
+        let Some(length) = rest.windows(ending.len()).position(|w| w == ending) else {
             return Err(broken("the header has no end".into()));
         };
         let line = String::from_utf8_lossy(rest[..length].trim_ascii()).into_owned();
-        at += length + 1;
+        at += length + ending.len();
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         match words[..] {
             ["comment", "TextureFile", ref name @ ..] if source.textures => {
@@ -270,7 +278,11 @@ impl Body<'_> {
 }
 
 /// Adds the vertices; their texture coordinates come back, if wanted and there.
-fn vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<Option<Vec<Vec2>>, ReadMeshError> {
+fn vertices(
+    body: &mut Body,
+    element: &Element,
+    out: &mut Parsed,
+) -> Result<Option<Vec<Vec2>>, ReadMeshError> {
     let source = body.source;
     source.allow(element.count, 0)?;
     let slot = |name: &str| element.properties.iter().position(|p| p.name == name && p.length.is_none());
@@ -296,22 +308,22 @@ fn vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<Optio
                 Ok(())
             })?;
         }
-        let vector = |at: [usize; 3]| Vec3::from(at.map(|k| row[k] as f32));
+        let vector = |at: [usize; 3]| DVec3::from(at.map(|k| row[k]));
         let position = vector(xyz);
-        let direction = normal.map(vector).unwrap_or(Vec3::ZERO);
-        if !position.is_finite() || !direction.is_finite() {
+        let direction = normal.map_or(Vec3::ZERO, |n| vector(n).as_vec3());
+        if !position.as_vec3().is_finite() || !direction.is_finite() {
             return Err(source.broken(format!("vertex {i}"), format!("{position} {direction} is not finite")));
         }
-        mesh.positions.push(position);
+        out.positions.push(position);
         if normal.is_some() {
-            mesh.normals.push(direction.normalize_or_zero());
+            out.mesh.normals.push(direction.normalize_or_zero());
         }
         if let Some(color) = color {
             let coded = color.map(|k| ((row[k] / element.properties[k].item.white()) as f32).clamp(0.0, 1.0));
             if coded.iter().any(|c| c.is_nan()) {
                 return Err(source.broken(format!("vertex {i}"), "its colour is not a number"));
             }
-            mesh.colors.push(coded);
+            out.mesh.colors.push(coded);
         }
         if let (Some([s, t]), Some(uvs)) = (uv, &mut uvs) {
             // PLY's v runs up
@@ -325,33 +337,70 @@ fn vertices(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<Optio
     Ok(uvs)
 }
 
-fn faces(body: &mut Body, element: &Element, mesh: &mut Mesh) -> Result<(), ReadMeshError> {
+fn faces(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> Result<(), ReadMeshError> {
     let source = body.source;
     source.allow(0, element.count)?;
-    let is_list =
-        |p: &Property| p.length.is_some() && ["vertex_indices", "vertex_index"].contains(&p.name.as_str());
-    if !element.properties.iter().any(is_list) {
-        return Err(source.broken("element `face`", "has no list `vertex_indices`"));
-    }
     let mut corners: Vec<u32> = Vec::new();
     for i in 0..element.count {
-        for property in &element.properties {
-            if !is_list(property) {
-                body.each(property, |_| Ok(()))?;
-                continue;
-            }
-            corners.clear();
-            body.each(property, |v| {
-                if v.fract() != 0.0 || !(0.0..4294967295.0).contains(&v) {
-                    return Err(source
-                        .broken(format!("face {i}"), format!("index {v}, expected a whole number from 0")));
-                }
-                corners.push(v as u32);
-                Ok(())
-            })?;
-            source.allow(0, mesh.triangles.len() + corners.len().saturating_sub(2))?;
-            mesh.triangles.extend(corners.windows(2).skip(1).map(|w| [corners[0], w[0], w[1]]));
-        }
+        corners.clear();
+        lists(body, element, |v| {
+            corners.push(index(v).ok_or_else(|| {
+                source.broken(format!("face {i}"), format!("index {v}, expected a whole number from 0"))
+            })?);
+            Ok(())
+        })?;
+        source.allow(0, triangles.len() + corners.len().saturating_sub(2))?;
+        triangles.extend(corners.windows(2).skip(1).map(|w| [corners[0], w[0], w[1]]));
     }
     Ok(())
+}
+
+/// Each corner makes a triangle with the two before it, wound the other way every other time; −1 starts anew.
+fn strips(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> Result<(), ReadMeshError> {
+    let source = body.source;
+    for i in 0..element.count {
+        let mut strip: Vec<u32> = Vec::new();
+        lists(body, element, |v| {
+            if v == -1.0 {
+                strip.clear();
+                return Ok(());
+            }
+            let next = index(v).ok_or_else(|| {
+                source.broken(format!("strip {i}"), format!("index {v}, expected a whole number from −1"))
+            })?;
+            strip.push(next);
+            if let [.., a, b, c] = strip[..] {
+                source.allow(0, triangles.len() + 1)?;
+                let turned = strip.len() % 2 == 0;
+                // corners that repeat only carry the strip on
+                if a != b && b != c && c != a {
+                    triangles.push(if turned { [b, a, c] } else { [a, b, c] });
+                }
+            }
+            Ok(())
+        })?;
+    }
+    Ok(())
+}
+
+/// Passes the values of the next row's list of corners to `take`.
+fn lists(
+    body: &mut Body,
+    element: &Element,
+    mut take: impl FnMut(f64) -> Result<(), ReadMeshError>,
+) -> Result<(), ReadMeshError> {
+    let is_list =
+        |p: &Property| p.length.is_some() && ["vertex_indices", "vertex_index"].contains(&p.name.as_str());
+    let Some(list) = element.properties.iter().position(is_list) else {
+        let what = "has no list `vertex_indices`";
+        return Err(body.source.broken(format!("element `{}`", element.name), what));
+    };
+    for (k, property) in element.properties.iter().enumerate() {
+        body.each(property, |v| if k == list { take(v) } else { Ok(()) })?;
+    }
+    Ok(())
+}
+
+fn index(v: f64) -> Option<u32> {
+    (v.fract() == 0.0 && (0.0..4294967295.0).contains(&v)).then_some(v as u32)
 }
