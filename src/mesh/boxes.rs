@@ -8,9 +8,9 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// What may be spent on each item on average, in comparisons of boxes: about five microseconds of one core. A
-/// triangle of a sound mesh takes half of it or less.
-pub(super) const EFFORT: usize = 512;
+/// What may be spent on each item on average, in comparisons of boxes of two or three nanoseconds. A triangle of a
+/// sound mesh takes half of it or less.
+pub(super) const EFFORT: usize = 1024;
 
 /// As many items' effort may be spent however few there are: two thousand triangles in one place are no reason.
 const ALWAYS: usize = 1 << 15;

@@ -117,9 +117,19 @@ pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effor
     let mut covered = vec![false; triangles.len()];
     pairs.iter().for_each(|&(a, b)| (covered[a as usize], covered[b as usize]) = (true, true));
     if !shared.unfinished.is_empty() {
-        // any other one will do, whatever its index
+        // copies cover each other; for the others any one will do, whatever its index
+        let bits = |t: u32| {
+            let mut bits = corners(t).map(|v| (v + 0.0).to_array().map(f32::to_bits));
+            bits.sort_unstable();
+            bits
+        };
+        let mut keyed: Vec<_> = listed.par_iter().map(|&t| (bits(t), t)).collect();
+        keyed.par_sort_unstable();
+        for copies in keyed.chunk_by(|a, b| a.0 == b.0).filter(|copies| copies.len() > 1) {
+            copies.iter().for_each(|&(_, t)| covered[t as usize] = true);
+        }
         let rest: Vec<u32> = listed.iter().copied().filter(|&t| !covered[t as usize]).collect();
-        let known = share_out(rest.len(), effort, |i, effort| {
+        let known = share_out(rest.len(), effort / 4, |i, effort| {
             let (a, mut known) = (rest[i], false);
             boxes.meeting(&span(a), effort, |j, effort| {
                 let b = listed[j as usize];
