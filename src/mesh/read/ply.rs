@@ -371,7 +371,7 @@ fn strips(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> 
             strip.push(next);
             if let [.., a, b, c] = strip[..] {
                 source.allow(0, triangles.len() + 1)?;
-                let turned = strip.len() % 2 == 0;
+                let turned = strip.len().is_multiple_of(2);
                 // corners that repeat only carry the strip on
                 if a != b && b != c && c != a {
                     triangles.push(if turned { [b, a, c] } else { [a, b, c] });
