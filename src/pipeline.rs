@@ -237,11 +237,12 @@ impl<'a> Line<'a> {
 
     /// The box and hull that the stage `mask` found.
     pub fn scene(&self) -> Result<Scene, PipelineError> {
-        Ok(scene_file::read_scene(&self.run.path("mask/scene.json"))?)
+        let failed = |failure| RunError::Stage { stage: "mask".into(), failure };
+        Ok(self.scene_or_fail().map_err(failed)?)
     }
 
     fn scene_or_fail(&self) -> Result<Scene, Failure> {
-        Ok(scene_file::read_scene(&self.run.path("mask/scene.json"))?)
+        scene_file::read_scene(&self.run.path("mask/scene.json")).map_err(|e| unusable(e, "mask"))
     }
 
     /// An error if the capture is no longer there: nothing can be worked on then.
@@ -326,6 +327,14 @@ fn capture_digest(capture: &Capture) -> Result<String, PipelineError> {
         })
         .collect::<Result<Vec<_>, io::ReadError>>()?;
     Ok(Fingerprint::of_bytes(format!("{} {}", capture.up, views.join("\n")).as_bytes()))
+}
+
+/// A file that a stage of this run made cannot be used: the way out is to make it again.
+fn unusable(e: io::ReadError, stage: &str) -> Failure {
+    match &e {
+        io::ReadError::Io { source, .. } if source.kind() != std::io::ErrorKind::NotFound => e.into(),
+        _ => Failure::cannot(e, format!("make it again: repeat the command with `--fresh {stage}`")),
+    }
 }
 
 fn capture_failure(e: CaptureError) -> Failure {

@@ -3,9 +3,11 @@
 use super::pixels::TrainView;
 use crate::geom::{Camera, Distortion};
 use crate::image::{Gray, Photo};
+use crate::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
 use crate::kernel::march::Bitmask;
 use crate::run::Monitor;
 use glam::{DMat3, DVec3, Vec2, Vec3};
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 const SIZE: u32 = 40;
@@ -86,5 +88,27 @@ impl Monitor for StopAfter {
     }
     fn stop(&self) -> bool {
         self.0.load(Ordering::SeqCst) == 0
+    }
+}
+
+/// Writes the newest checkpoint of a stage folder again, with a change.
+pub fn tampered(dir: &Path, change: impl FnOnce(&mut Tensors)) {
+    let path = super::checkpoint::newest(dir);
+    let mut all = read_tensors(&path, &Limits::default()).unwrap();
+    change(&mut all);
+    let tensors: Vec<_> = all.0.into_iter().map(|(name, (shape, values))| (name, shape, values)).collect();
+    write_tensors(&path, &tensors, &all.1).unwrap();
+}
+
+/// A change that makes a number of the metadata this one.
+pub fn says(key: &str, value: &str) -> impl Fn(&mut Tensors) {
+    move |(_, metadata)| drop(metadata.insert(key.into(), value.into()))
+}
+
+/// A change that makes the first value of a tensor negative.
+pub fn negative(name: &str) -> impl Fn(&mut Tensors) {
+    move |(tensors, _)| match &mut tensors.get_mut(name).unwrap().1 {
+        TensorValues::F32(values) => values[0] = -1.0,
+        other => panic!("{name}: {other:?}"),
     }
 }

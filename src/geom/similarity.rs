@@ -20,6 +20,23 @@ impl Similarity {
     pub const IDENTITY: Similarity =
         Similarity { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
+    /// Is it one at all? What is wrong else: a part, what it is, and what it should be.
+    pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
+        // beyond that the way back is lost in f64
+        if !(1e-12..=1e12).contains(&self.scale) {
+            return Some(("scale", self.scale.to_string(), "a number from 1e-12 to 1e12"));
+        }
+        let off = self.rotation * self.rotation.transpose() - DMat3::IDENTITY;
+        let turns = off.to_cols_array().iter().all(|v| v.abs() < 1e-6) && self.rotation.determinant() > 0.0;
+        if !turns {
+            return Some(("rotation", format!("{:?}", self.rotation.to_cols_array()), "a rotation"));
+        }
+        if !self.translation.is_finite() {
+            return Some(("translation", self.translation.to_string(), "finite numbers"));
+        }
+        None
+    }
+
     /// Scale about the origin, then move: no rotation.
     pub fn scale_translate(scale: f64, translation: DVec3) -> Similarity {
         Similarity { scale, rotation: DMat3::IDENTITY, translation }

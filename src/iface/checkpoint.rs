@@ -184,10 +184,7 @@ pub fn read(
     let (mut tensors, metadata) = read_tensors(path, &Limits::default())?;
     let meta =
         |key: &str| metadata.get(key).cloned().ok_or_else(|| wrong(format!("its metadata has no `{key}`")));
-    let number = |key: &str| -> Result<u64, IfaceError> {
-        let text = meta(key)?;
-        text.parse().map_err(|_| wrong(format!("`{key}` is `{text}`, not a number")))
-    };
+    let number = |key: &str, range| turns::number(path, &metadata, key, range);
     if meta("format")? != FORMAT {
         return Err(wrong(format!("format is `{}`, this build reads `{FORMAT}`", meta("format")?)));
     }
@@ -211,7 +208,9 @@ pub fn read(
     for (name, shape, _) in initial(config, 0) {
         model.push((shape.clone(), floats(format!("model.{name}"), &shape)?));
         let first = floats(format!("first.{name}"), &shape)?;
-        moments.push((shape.clone(), first, floats(format!("second.{name}"), &shape)?));
+        let second = format!("second.{name}");
+        let values = turns::second_moments(path, &second, floats(second.clone(), &shape)?)?;
+        moments.push((shape.clone(), first, values));
     }
     let mut occupancy = Occupancy::new(config, hull);
     if !occupancy.history.is_empty() {
@@ -229,9 +228,9 @@ pub fn read(
         model: Model::from_values(model, device),
         moments: AllMoments::from_values(moments, device),
         occupancy,
-        step: number("step")?,
-        rays: number("rays")? as usize,
-        mean_square: f64::from_bits(number("mean_square")?),
-        salt: number("salt")?,
+        step: number("step", 0..=config.steps)?,
+        rays: number("rays", 1..=config.rays.max(config.max_rays) as u64)? as usize,
+        mean_square: turns::mean_square(path, &metadata)?,
+        salt: number("salt", 0..=1)?,
     })
 }

@@ -20,7 +20,7 @@ pub use infer::{IFace, VolumeRay};
 pub use schedule::{learning_rate, next_rays};
 pub use train::{TrainReport, train};
 
-use crate::field::DeviceError;
+use crate::field::{self, DeviceError};
 use crate::io::ReadError;
 use crate::io::WriteError;
 use std::path::PathBuf;
@@ -91,7 +91,7 @@ impl IfaceError {
                 "lower iface.lr_network and iface.lr_table, or start again with another --seed".into()
             }
             IfaceError::Checkpoint { .. } => "start the stage afresh with `--fresh iface`".into(),
-            IfaceError::Read(e) => e.hint(),
+            IfaceError::Read(e) => field::checkpoint::way_out(e, "iface"),
             IfaceError::Write(e) => e.hint(),
             IfaceError::SurfaceLost { .. } => {
                 "look at the masks and poses with `tiface inspect`; lower iface.lr_network".into()

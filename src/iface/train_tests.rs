@@ -2,7 +2,8 @@
 
 use super::*;
 use crate::config::Preset;
-use crate::field::ball::{BALL, StopAfter, hull, temporary, views};
+use crate::field::ball::{BALL, StopAfter, hull, negative, says, tampered, temporary, views};
+use crate::io::Tensors;
 use crate::run::Quiet;
 use glam::{Vec2, Vec3};
 
@@ -69,6 +70,52 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
     run(stopped.path(), &Quiet).unwrap();
     assert_eq!(bytes(undisturbed.path()), bytes(stopped.path()));
     assert!(!stopped.path().join("checkpoint.previous.safetensors").exists());
+}
+
+#[test]
+fn a_hostile_checkpoint_is_named_and_the_one_before_it_is_taken() {
+    let (views, hull) = (views(), hull());
+    let config = IfaceConfig { steps: 9, start: Start::Sphere, ..config() };
+    let run = |dir: &Path, monitor: &dyn Monitor| {
+        train(&views, Some(&hull), &config, 3, "cpu", dir, "ball", monitor).map(|(_, report)| report.warnings)
+    };
+    let begun = temporary();
+    for _ in 0..2 {
+        assert!(run(begun.path(), &StopAfter::new(2)).is_err());
+    }
+    let undisturbed = temporary();
+    run(undisturbed.path(), &Quiet).unwrap();
+    let nan = f64::NAN.to_bits().to_string();
+    let rows: [(&str, &dyn Fn(&mut Tensors)); 8] = [
+        ("`rays`", &says("rays", "18446744073709551615")),
+        ("`rays`", &says("rays", "0")),
+        ("`step`", &says("step", "10")),
+        ("`step`", &says("step", "-1")),
+        ("`mean_square`", &says("mean_square", &nan)),
+        ("`salt`", &says("salt", "2")),
+        ("`rays`", &|all| drop(all.1.remove("rays"))),
+        ("second.table", &negative("second.table")),
+    ];
+    for (i, (key, change)) in rows.iter().enumerate() {
+        let dir = temporary();
+        for file in std::fs::read_dir(begun.path()).unwrap().map(|f| f.unwrap()) {
+            std::fs::copy(file.path(), dir.path().join(file.file_name())).unwrap();
+        }
+        tampered(dir.path(), change);
+        if i % 4 == 0 {
+            let warnings = run(dir.path(), &Quiet).unwrap();
+            assert!(warnings.iter().any(|w| w.contains(key) && w.contains("falling back")), "{warnings:?}");
+            assert_eq!(bytes(undisturbed.path()), bytes(dir.path()));
+        } else {
+            // nothing before it to take
+            std::fs::remove_file(dir.path().join("checkpoint.previous.safetensors")).unwrap();
+            let e = run(dir.path(), &Quiet).unwrap_err();
+            assert!(e.to_string().contains(key) && e.to_string().contains("checkpoint.safetensors"), "{e}");
+            assert_eq!(e.hint().unwrap(), "start the stage afresh with `--fresh iface`");
+        }
+    }
+    tampered(undisturbed.path(), says("rays", "18446744073709551615"));
+    assert!(IFace::load(undisturbed.path(), &config, Some(&hull)).is_err());
 }
 
 #[test]

@@ -137,6 +137,18 @@ pub enum ReadError {
         /// What is wrong there.
         problem: String,
     },
+    /// A value that whoever wrote the file cannot have written.
+    #[error("`{}`: `{key}` is {found}, expected {expected}", path.display())]
+    Value {
+        /// The file.
+        path: PathBuf,
+        /// Where in it.
+        key: String,
+        /// What stands there.
+        found: String,
+        /// What could.
+        expected: String,
+    },
 }
 
 fn at(offset: Option<u64>) -> String {
@@ -153,7 +165,8 @@ impl ReadError {
             | ReadError::TooLarge { path, .. }
             | ReadError::Damaged { path, .. }
             | ReadError::Unsupported { path, .. }
-            | ReadError::Json { path, .. } => path,
+            | ReadError::Json { path, .. }
+            | ReadError::Value { path, .. } => path,
         }
     }
 
@@ -171,7 +184,18 @@ impl ReadError {
             ReadError::Damaged { .. } => "copy or export it again from its source".into(),
             ReadError::Unsupported { hint, .. } => hint.clone(),
             ReadError::Json { .. } => "correct the file at that place".into(),
+            ReadError::Value { .. } => "the file was damaged, or changed by hand: make it again".into(),
         }
+    }
+
+    pub(crate) fn value(
+        path: &Path,
+        key: impl Into<String>,
+        found: impl ToString,
+        expected: impl Into<String>,
+    ) -> ReadError {
+        let (key, found, expected) = (key.into(), found.to_string(), expected.into());
+        ReadError::Value { path: path.into(), key, found, expected }
     }
 
     pub(crate) fn io(path: &Path, source: std::io::Error) -> ReadError {

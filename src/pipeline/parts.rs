@@ -7,9 +7,10 @@
 //! ```
 
 use super::product::{Lobes, Pictures, Product};
+use super::unusable;
 use crate::geom::{Aabb, Atlas, Mesh, Similarity};
 use crate::image::Photo;
-use crate::io::{self, Limits, TensorValues};
+use crate::io::{self, Limits, ReadError, TensorValues};
 use crate::mesh::{Cap, Skin};
 use crate::run::Failure;
 use glam::{DMat3, DVec3, Mat3, Vec2, Vec3};
@@ -88,6 +89,13 @@ impl Whole {
         };
         let ring = ring.iter().zip(&normals).zip(&colors).map(skin).collect();
         let bounds = Aabb { min: Vec3::from(*low), max: Vec3::from(*high) };
+        if bounds.min.cmpge(bounds.max).any() {
+            let found = format!("{} to {}", bounds.min, bounds.max);
+            return Err(parts.wrong("cap_box", found, "a box, its lowest corner first"));
+        }
+        if *near < 0.0 {
+            return Err(parts.wrong("cap_near", near, "0 or more"));
+        }
         Ok(Whole { mesh, cap: Some(Cap { bounds, near: *near, ring }) })
     }
 }
@@ -138,7 +146,17 @@ impl Product {
             return Ok(Product { mesh, world_from_scene, pictures: None });
         }
         let photo = |name: &str, size: Option<(u32, u32)>| -> Result<Photo, Failure> {
-            Ok(io::read_photo(&folder.join(name), size, &Limits::default())?.photo)
+            let read = io::read_photo(&folder.join(name), size, &Limits::default());
+            let photo = read.map_err(|e| unusable(e, "mesh"))?.photo;
+            let found = (photo.width, photo.height);
+            match size.filter(|size| *size != found) {
+                None => Ok(photo),
+                Some(size) => {
+                    let found = format!("{} × {} pixels", found.0, found.1);
+                    let expected = format!("{} × {}, as `color.png`", size.0, size.1);
+                    Err(unusable(ReadError::value(&folder.join(name), "size", found, expected), "mesh"))
+                }
+            }
         };
         let color = photo("color.png", None)?;
         let size = Some((color.width, color.height));
@@ -184,7 +202,8 @@ impl Parts {
         if !io::is_file(&path) {
             return Err(wrong("it is not there"));
         }
-        let (tensors, metadata) = io::read_tensors(&path, &Limits::default())?;
+        let (tensors, metadata) =
+            io::read_tensors(&path, &Limits::default()).map_err(|e| unusable(e, "mesh"))?;
         match metadata.get("format").map(String::as_str) {
             Some(FORMAT) => Ok(Parts { path, tensors, metadata }),
             found => Err(wrong(&format!(
@@ -199,6 +218,10 @@ impl Parts {
             format!("`{}`: `{name}` is missing or of another shape", self.path.display()),
             "make the mesh again: `tiface mesh RUN --fresh mesh`",
         )
+    }
+
+    fn wrong(&self, key: &str, found: impl ToString, expected: &str) -> Failure {
+        unusable(ReadError::value(&self.path, key, found, expected), "mesh")
     }
 
     /// `[n, N]` numbers.
@@ -234,6 +257,9 @@ impl Parts {
             }
         }
         let triangles = self.indices("triangles", positions.len())?;
+        if triangles.is_empty() {
+            return Err(self.wrong("triangles", "an empty list", "at least one"));
+        }
         Ok(Mesh { positions, normals, colors, triangles })
     }
 
@@ -244,12 +270,10 @@ impl Parts {
         };
         let &[scale, a, b, c, d, e, f, g, h, i, x, y, z] = &v[..] else { return Err(self.missing(name)) };
         let rotation = DMat3::from_cols_array(&[a, b, c, d, e, f, g, h, i]);
-        let off = rotation * rotation.transpose() - DMat3::IDENTITY;
-        let proper = off.to_cols_array().iter().all(|v| v.abs() < 1e-6) && rotation.determinant() > 0.0;
-        if scale > 0.0 && proper {
-            Ok(Similarity { scale, rotation, translation: DVec3::new(x, y, z) })
-        } else {
-            Err(self.missing(name))
+        let found = Similarity { scale, rotation, translation: DVec3::new(x, y, z) };
+        match found.problem() {
+            None => Ok(found),
+            Some((part, found, expected)) => Err(self.wrong(&format!("{name}.{part}"), found, expected)),
         }
     }
 }
@@ -283,6 +307,28 @@ mod tests {
         }
     }
 
+    /// A picture of another size than the texture.
+    fn odd() -> Photo {
+        Photo { width: 3, height: 1, rgb: vec![[1, 2, 3]; 3], alpha: None }
+    }
+
+    #[test]
+    fn a_hostile_cap_is_refused_with_its_key() {
+        let dir = tempfile::tempdir().unwrap();
+        let error = |bounds: Aabb, near: f32| {
+            let mesh = Mesh { colors: Vec::new(), ..product().mesh };
+            Whole { mesh, cap: Some(Cap { bounds, near, ring: Vec::new() }) }.save(dir.path()).unwrap();
+            let error = Whole::load(dir.path()).unwrap_err();
+            assert!(error.hint.contains("--fresh mesh"), "{error:?}");
+            error.error.to_string()
+        };
+        let swapped = Aabb { min: Vec3::ONE, max: Vec3::NEG_ONE };
+        assert!(error(swapped, 1e-5).contains("`cap_box`"));
+        assert!(error(Aabb::SCENE, -1.0).contains("`cap_near` is -1, expected 0 or more"));
+        std::fs::write(dir.path().join("surface.safetensors"), b"torn").unwrap();
+        assert!(Whole::load(dir.path()).unwrap_err().hint.contains("--fresh mesh"));
+    }
+
     #[test]
     fn damaged_and_older_parts_are_named_with_the_way_out() {
         let dir = tempfile::tempdir().unwrap();
@@ -296,8 +342,13 @@ mod tests {
         };
         assert!(error(&|p| p.mesh.triangles[2] = [0, 1, 9]).contains("`triangles`"));
         assert!(error(&|p| p.mesh.normals.truncate(2)).contains("`normals`"));
-        assert!(error(&|p| p.world_from_scene.scale = -1.0).contains("`world_from_scene`"));
-        assert!(error(&|p| p.world_from_scene.rotation.x_axis *= -1.0).contains("`world_from_scene`"));
+        assert!(error(&|p| p.mesh.triangles.clear()).contains("`triangles`"));
+        assert!(error(&|p| p.world_from_scene.scale = -1.0).contains("`world_from_scene.scale` is -1"));
+        assert!(error(&|p| p.world_from_scene.scale = 0.0).contains("`world_from_scene.scale`"));
+        assert!(
+            error(&|p| p.world_from_scene.rotation.x_axis *= -1.0).contains("`world_from_scene.rotation`")
+        );
+        assert!(error(&|p| p.pictures.as_mut().unwrap().normal = Some(odd())).contains("`size`"));
         assert!(
             error(&|p| p.pictures.as_mut().unwrap().atlas.triangles.truncate(1)).contains("uv_triangles")
         );

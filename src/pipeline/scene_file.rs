@@ -9,6 +9,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 use std::path::Path;
 
+/// Cells along an axis of a hull, at most: the stage makes 128.
+const MOST_CELLS: usize = 1024;
+
 #[derive(Serialize, Deserialize)]
 struct SceneFile {
     scene_from_world: Similarity,
@@ -25,15 +28,38 @@ pub(super) fn write_scene(path: &Path, scene: &Scene) -> Result<(), WriteError> 
     io::write_atomic(path, &text)
 }
 
-/// Reads what [`write_scene`] wrote.
+/// Reads what [`write_scene`] wrote; what could not have been written is refused with its key.
 pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
     let value = io::read_json(path, &Limits::default())?;
-    let wrong = |problem: String| ReadError::Json { path: path.into(), line: 1, column: 1, problem };
-    let file: SceneFile = serde_json::from_value(value).map_err(|e| wrong(e.to_string()))?;
-    if let Some(hull) = &file.hull
-        && hull.resolution.checked_pow(3).map(|n| n.div_ceil(64)) != Some(hull.bits.len())
+    let file: SceneFile = serde_json::from_value(value).map_err(|e| ReadError::Json {
+        path: path.into(),
+        line: 1,
+        column: 1,
+        problem: e.to_string(),
+    })?;
+    let wrong = |key: &str, found: String, expected: &str| Err(ReadError::value(path, key, found, expected));
+    if let Some((part, found, expected)) = file.scene_from_world.problem() {
+        return wrong(&format!("scene_from_world.{part}"), found, expected);
+    }
+    let Aabb { min, max } = file.aabb;
+    if !(min.cmplt(max).all()
+        && Aabb::SCENE.grown(1e-3).contains(min)
+        && Aabb::SCENE.grown(1e-3).contains(max))
     {
-        return Err(wrong(format!("a hull of {}³ cells in {} words", hull.resolution, hull.bits.len())));
+        return wrong("aabb", format!("{min} to {max}"), "a box within -1 and 1, its lowest corner first");
+    }
+    if let Some(Hull { resolution, bits }) = &file.hull {
+        if !(2..=MOST_CELLS).contains(resolution) {
+            return wrong("hull.resolution", resolution.to_string(), &format!("2 to {MOST_CELLS}"));
+        }
+        let words = resolution.pow(3).div_ceil(64);
+        if bits.len() != words {
+            let expected = format!("{words}, for {resolution}³ cells");
+            return wrong("hull.bits", format!("{} words", bits.len()), &expected);
+        }
+        if bits.iter().all(|b| *b == 0) {
+            return wrong("hull.bits", "0 everywhere".into(), "at least one cell of the head");
+        }
     }
     Ok(Scene { scene_from_world: file.scene_from_world, aabb: file.aabb, hull: file.hull })
 }
@@ -80,4 +106,79 @@ pub(super) fn read_capture(path: &Path, root: &Path) -> Result<Capture, ReadErro
         unit_m: file.unit_m,
         warnings: Vec::new(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::Similarity;
+    use glam::{DMat3, DVec3, Vec3};
+    use serde_json::Value;
+
+    fn scene() -> Scene {
+        let mut bits = vec![0; 8];
+        bits[3] = 5;
+        Scene {
+            scene_from_world: Similarity {
+                scale: 4.0,
+                rotation: DMat3::from_rotation_z(0.3),
+                translation: DVec3::new(1.0, -2.0, 5e6),
+            },
+            aabb: Aabb { min: Vec3::new(-1.0, -0.5, -0.7), max: Vec3::new(1.0, 0.6, 0.8) },
+            hull: Some(Hull { resolution: 8, bits }),
+        }
+    }
+
+    /// What reading says after `change`.
+    fn after(change: &dyn Fn(&mut Value)) -> Result<Scene, ReadError> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.json");
+        write_scene(&path, &scene()).unwrap();
+        let mut value = io::read_json(&path, &Limits::default()).unwrap();
+        change(&mut value);
+        std::fs::write(&path, value.to_string()).unwrap();
+        read_scene(&path)
+    }
+
+    #[test]
+    fn a_scene_is_read_back_as_it_was() {
+        assert_eq!(after(&|_| {}).unwrap(), scene());
+        assert_eq!(after(&|v| v["hull"] = Value::Null).unwrap().hull, None);
+    }
+
+    #[test]
+    fn a_hostile_scene_is_refused_with_its_key() {
+        let rows: [(&str, &dyn Fn(&mut Value)); 14] = [
+            ("hull.resolution", &|v| v["hull"] = json!({"resolution": 0, "bits": []})),
+            ("hull.resolution", &|v| v["hull"]["resolution"] = json!(1)),
+            ("hull.resolution", &|v| v["hull"]["resolution"] = json!(u64::MAX)),
+            ("hull.bits", &|v| v["hull"]["resolution"] = json!(9)),
+            ("hull.bits", &|v| v["hull"]["bits"] = json!([0, 0, 0, 0, 0, 0, 0, 0])),
+            ("scene_from_world.scale", &|v| v["scene_from_world"]["scale"] = json!(-1.0)),
+            ("scene_from_world.scale", &|v| v["scene_from_world"]["scale"] = json!(0.0)),
+            ("scene_from_world.scale", &|v| v["scene_from_world"]["scale"] = json!(1e-300)),
+            ("scene_from_world.rotation", &|v| {
+                v["scene_from_world"]["rotation"] = json!([0, 0, 0, 0, 0, 0, 0, 0, 0])
+            }),
+            ("scene_from_world.rotation", &|v| {
+                v["scene_from_world"]["rotation"] = json!([-1, 0, 0, 0, 1, 0, 0, 0, 1])
+            }),
+            ("aabb", &|v| v["aabb"] = json!({"min": [1, 1, 1], "max": [-1, -1, -1]})),
+            ("aabb", &|v| v["aabb"]["max"] = v["aabb"]["min"].clone()),
+            ("aabb", &|v| v["aabb"]["max"][1] = json!(1e300)), // infinite in f32
+            ("aabb", &|v| v["aabb"]["min"][2] = json!(-40.0)),
+        ];
+        for (i, (key, change)) in rows.iter().enumerate() {
+            match after(change).unwrap_err() {
+                ReadError::Value { path, key: named, .. } => {
+                    assert!(named == *key && path.ends_with("scene.json"), "row {i}: {named}");
+                }
+                e => panic!("row {i}: {e}"),
+            }
+        }
+        for key in ["scene_from_world", "aabb"] {
+            let e = after(&|v| drop(v.as_object_mut().unwrap().remove(key))).unwrap_err();
+            assert!(e.to_string().contains(key) && e.to_string().contains("scene.json"), "{e}");
+        }
+    }
 }

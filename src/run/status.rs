@@ -71,12 +71,38 @@ pub struct Record {
 
 /// The `status.json` of a stage folder; `None` if there is none.
 pub fn read_status(folder: &Path) -> Result<Option<Status>, ReadError> {
-    read(&folder.join("status.json"))
+    let path = folder.join("status.json");
+    let status: Option<Status> = read(&path)?;
+    if let Some(s) = &status {
+        let seconds = [("elapsed_s", Some(s.elapsed_s)), ("eta_s", s.eta_s), ("rate", s.rate)];
+        seconds.into_iter().try_for_each(|(key, value)| not_negative(&path, key, value))?;
+    }
+    Ok(status)
 }
 
 /// The `done.json` of a stage folder; `None` if there is none.
 pub fn read_record(folder: &Path) -> Result<Option<Record>, ReadError> {
-    read(&folder.join("done.json"))
+    let path = folder.join("done.json");
+    let record: Option<Record> = read(&path)?;
+    if let Some(r) = &record {
+        not_negative(&path, "elapsed_s", Some(r.elapsed_s))?;
+        let digest = r.fingerprint.digest();
+        if r.digest != digest {
+            return Err(ReadError::value(&path, "digest", &r.digest, format!("{digest}, its fingerprint's")));
+        }
+        if !folder.ends_with(&r.stage) {
+            return Err(ReadError::value(&path, "stage", &r.stage, "the name of its folder"));
+        }
+    }
+    Ok(record)
+}
+
+/// Times and rates; JSON holds no number that is not finite.
+fn not_negative(path: &Path, key: &str, value: Option<f64>) -> Result<(), ReadError> {
+    match value.filter(|v| !(0.0..=1e15).contains(v)) {
+        Some(v) => Err(ReadError::value(path, key, v, "a number from 0 to 1e15")),
+        None => Ok(()),
+    }
 }
 
 fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Result<Option<T>, ReadError> {
@@ -103,5 +129,65 @@ pub(super) fn host() -> String {
     match kernel.map(|b| String::from_utf8_lossy(&b).trim().to_string()) {
         Ok(name) if !name.is_empty() => name,
         _ => std::env::var("HOSTNAME").or_else(|_| std::env::var("COMPUTERNAME")).unwrap_or_default(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    /// What reading `name` says after `change`.
+    fn after(name: &str, change: &dyn Fn(&mut Value)) -> Option<ReadError> {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("iface");
+        std::fs::create_dir(&folder).unwrap();
+        let fingerprint = Fingerprint::default().setting("iface.steps", 5);
+        let digest = fingerprint.digest();
+        let mut value = match name {
+            "done.json" => json!({
+                "stage": "iface", "fingerprint": fingerprint, "digest": digest, "summary": {}, "elapsed_s": 2.0,
+                "finished": 1, "version": "0",
+            }),
+            _ => json!({
+                "state": "running", "step": 1, "steps": 5, "rate": 2.0, "eta_s": 2.0, "elapsed_s": 0.5,
+                "device": "cpu", "pid": 1, "host": "h", "error": null, "updated": 1, "fingerprint": fingerprint,
+            }),
+        };
+        change(&mut value);
+        std::fs::write(folder.join(name), value.to_string()).unwrap();
+        match name {
+            "done.json" => read_record(&folder).err(),
+            _ => read_status(&folder).err(),
+        }
+    }
+
+    #[test]
+    fn hostile_records_and_statuses_are_refused_with_their_key() {
+        assert!(after("done.json", &|_| {}).is_none() && after("status.json", &|_| {}).is_none());
+        let rows: [(&str, &str, Value); 8] = [
+            ("done.json", "elapsed_s", json!(-1.0)),
+            ("done.json", "elapsed_s", json!(1e300)),
+            ("done.json", "digest", json!("0")),
+            ("done.json", "stage", json!("tface")),
+            ("status.json", "elapsed_s", json!(-0.5)),
+            ("status.json", "eta_s", json!(-3)),
+            ("status.json", "eta_s", json!(1e300)),
+            ("status.json", "rate", json!(-1e-9)),
+        ];
+        for (name, key, value) in rows {
+            match after(name, &|v| v[key] = value.clone()) {
+                Some(ReadError::Value { path, key: named, .. }) => {
+                    assert!(named == key && path.ends_with(name), "{name}, {key}: {named}");
+                }
+                other => panic!("{name}, {key}: {other:?}"),
+            }
+        }
+        // of another type, and another setting than the digest was made of
+        assert!(
+            after("status.json", &|v| v["step"] = json!(-1)).unwrap().to_string().contains("status.json")
+        );
+        let other = |v: &mut Value| v["fingerprint"]["settings"]["iface.steps"] = json!("6");
+        assert!(after("done.json", &other).unwrap().to_string().contains("`digest`"));
     }
 }

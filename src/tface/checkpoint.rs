@@ -14,6 +14,7 @@ use crate::kernel::vm::{DecoderShape, Grid, Shading, VmField, samples_across, st
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -100,7 +101,12 @@ impl FieldRecord {
 
     /// Can this be rendered at all? What is impossible, else.
     pub fn sound(&self) -> Result<(), &'static str> {
-        let finite = [self.shift, self.distance_scale, self.weight_threshold, self.stop, self.near, self.far];
+        let shading =
+            [self.shift, self.distance_scale, self.weight_threshold, self.stop, self.mask_threshold];
+        let ranks = [self.density_rank, self.color_rank];
+        if ranks.iter().any(|r| r.iter().all(|n| *n == 0) || r.iter().any(|n| *n > 4096)) {
+            return Err("its planes have no channels, or more than 4096");
+        }
         if !(1e-2..=100.0).contains(&self.step_ratio) {
             return Err("its step ratio is not within 0.01 and 100");
         }
@@ -110,8 +116,14 @@ impl FieldRecord {
         if self.hidden == 0 || !self.hidden.is_multiple_of(8) || self.hidden > 4096 || self.features > 4096 {
             return Err("its decoder is wider than 4096, or its hidden layers are no multiple of 8 wide");
         }
-        if finite.iter().any(|v| !v.is_finite()) || self.near > self.far {
+        let finite = |v: &f32| v.is_finite();
+        if !shading.iter().chain([&self.near, &self.far]).all(finite) || self.near > self.far {
             return Err("its numbers are not finite, or near lies behind far");
+        }
+        if let Some(p) = &self.placement
+            && !(p.scale.is_normal() && p.scale > 0.0 && p.offset.iter().all(finite))
+        {
+            return Err("it is placed by a scale that is not positive, or by numbers that are not finite");
         }
         Ok(())
     }
@@ -299,9 +311,8 @@ impl<'a> Opened<'a> {
         self.metadata.get(key).cloned().ok_or_else(|| self.wrong(format!("its metadata has no `{key}`")))
     }
 
-    fn number(&self, key: &str) -> Result<u64, TfaceError> {
-        let text = self.meta(key)?;
-        text.parse().map_err(|_| self.wrong(format!("`{key}` is `{text}`, not a number")))
+    fn number(&self, key: &str, range: RangeInclusive<u64>) -> Result<u64, TfaceError> {
+        Ok(turns::number(self.path, &self.metadata, key, range)?)
     }
 
     fn floats(&mut self, name: &str, len: usize) -> Result<Vec<f32>, TfaceError> {
@@ -367,12 +378,10 @@ fn read(path: &Path, config: &VmConfig, identity: &str, device: &Device) -> Resu
     if file.meta("identity")? != identity {
         return Err(file.wrong("it was trained with other settings or inputs".into()));
     }
-    let finished = file.number("finished")? == 1;
-    let (step, reset) = (file.number("step")?, file.number("reset")?);
-    let moments_from = file.number("moments_from")?;
-    if reset > step || moments_from > step {
-        return Err(file.wrong(format!("step {step} lies before its last start ({reset}, {moments_from})")));
-    }
+    let finished = file.number("finished", 0..=1)? == 1;
+    // a finished one has no moments to go on with
+    let step = file.number("step", if finished { config.steps } else { 0 }..=config.steps)?;
+    let (reset, moments_from) = (file.number("reset", 0..=step)?, file.number("moments_from", 0..=step)?);
     let (bounds, size, mask) = file.geometry()?;
     let (density, color) = grids(config, size);
     let lengths = [density.len(), color.len(), decoder(config).len()];
@@ -381,8 +390,9 @@ fn read(path: &Path, config: &VmConfig, identity: &str, device: &Device) -> Resu
     if !finished {
         for ((name, len), m) in NAMES.iter().zip(lengths).zip(&mut moments) {
             let first = field::tensor(file.floats(&format!("first.{name}"), len)?, [len], device);
-            let second = field::tensor(file.floats(&format!("second.{name}"), len)?, [len], device);
-            *m = Moments { first, second };
+            let second = format!("second.{name}");
+            let values = turns::second_moments(path, &second, file.floats(&second, len)?)?;
+            *m = Moments { first, second: field::tensor(values, [len], device) };
         }
     }
     Ok(State {
@@ -396,8 +406,8 @@ fn read(path: &Path, config: &VmConfig, identity: &str, device: &Device) -> Resu
         step,
         reset,
         moments_from,
-        masked: file.number("masked")? == 1,
-        mean_square: f64::from_bits(file.number("mean_square")?),
-        salt: file.number("salt")?,
+        masked: file.number("masked", 0..=1)? == 1,
+        mean_square: turns::mean_square(path, &file.metadata)?,
+        salt: file.number("salt", 0..=1)?,
     })
 }

@@ -1,6 +1,6 @@
 //! Why a radiance field cannot be had.
 
-use crate::field::DeviceError;
+use crate::field::{self, DeviceError};
 use crate::io::{ReadError, WriteError};
 use crate::tface::th::ThError;
 use std::path::PathBuf;
@@ -110,7 +110,7 @@ impl TfaceError {
             TfaceError::Checkpoint { .. } => format!("start the stage afresh with `--fresh {stage}`"),
             TfaceError::Field { source, .. } => return source.hint(stage),
             TfaceError::Th(e) => e.hint(),
-            TfaceError::Read(e) => e.hint(),
+            TfaceError::Read(e) => field::checkpoint::way_out(e, stage),
             TfaceError::Write(e) => e.hint(),
             _ => return None,
         })

@@ -2,7 +2,8 @@
 
 use super::*;
 use crate::config::{DensityActivation, Preset};
-use crate::field::ball::{BALL, StopAfter, hull, temporary, views};
+use crate::field::ball::{BALL, StopAfter, hull, negative, says, tampered, temporary, views};
+use crate::io::Tensors;
 use crate::kernel::vm::size_for;
 use crate::run::Quiet;
 use crate::tface::TFace;
@@ -69,6 +70,79 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
     run(&config, stopped.path(), &Quiet).unwrap();
     assert_eq!(bytes(undisturbed.path()), bytes(stopped.path()));
     assert!(!stopped.path().join("checkpoint.previous.safetensors").exists());
+}
+
+#[test]
+fn a_hostile_checkpoint_is_named_and_the_one_before_it_is_taken() {
+    let config = VmConfig { steps: 9, upsample_steps: vec![5], mask_steps: vec![5], ..config() };
+    let begun = temporary();
+    for _ in 0..2 {
+        assert!(run(&config, begun.path(), &StopAfter::new(3)).is_err());
+    }
+    let undisturbed = temporary();
+    run(&config, undisturbed.path(), &Quiet).unwrap();
+    let bytes = |dir: &Path| std::fs::read(checkpoint::newest(dir)).unwrap();
+    let infinite = f64::INFINITY.to_bits().to_string();
+    let rows: [(&str, &dyn Fn(&mut Tensors)); 8] = [
+        ("`step`", &says("step", "18446744073709551615")),
+        ("`mean_square`", &says("mean_square", &infinite)),
+        ("`reset`", &says("reset", "7")),
+        ("`moments_from`", &says("moments_from", "18446744073709551615")),
+        ("second.color", &negative("second.color")),
+        ("`masked`", &says("masked", "2")),
+        ("`salt`", &says("salt", "9")),
+        // it would go on without moments
+        ("`step`", &says("finished", "1")),
+    ];
+    for (i, (key, change)) in rows.iter().enumerate() {
+        let dir = temporary();
+        for file in std::fs::read_dir(begun.path()).unwrap().map(|f| f.unwrap()) {
+            std::fs::copy(file.path(), dir.path().join(file.file_name())).unwrap();
+        }
+        tampered(dir.path(), change);
+        if i % 4 == 0 {
+            let report = run(&config, dir.path(), &Quiet).unwrap();
+            let told = |w: &String| w.contains(key) && w.contains("falling back");
+            assert!(report.warnings.iter().any(told), "{:?}", report.warnings);
+            assert_eq!(bytes(undisturbed.path()), bytes(dir.path()));
+        } else {
+            // nothing before it to take
+            std::fs::remove_file(dir.path().join("checkpoint.previous.safetensors")).unwrap();
+            let e = run(&config, dir.path(), &Quiet).unwrap_err();
+            assert!(e.to_string().contains(key) && e.to_string().contains("checkpoint.safetensors"), "{e}");
+            assert_eq!(e.hint("baseline").unwrap(), "start the stage afresh with `--fresh baseline`");
+        }
+    }
+}
+
+#[test]
+fn a_hostile_description_of_a_field_is_refused_before_it_is_rendered() {
+    let dir = temporary();
+    run(&VmConfig { steps: 2, ..config() }, dir.path(), &Quiet).unwrap();
+    let whole = std::fs::read(checkpoint::newest(dir.path())).unwrap();
+    for (key, value) in [
+        ("density_rank", "[18446744073709551615,1,1]"),
+        ("color_rank", "[0,0,0]"),
+        ("features", "18446744073709551615"),
+        ("hidden", "0"),
+        ("step_ratio", "0.0"),
+        ("stop", "1e300"),
+        ("mask_threshold", "1e300"),
+        ("near", "7.0e6"),
+        ("placement", r#"{"scale":0.0,"offset":[0,0,0],"depth_directions":false}"#),
+        ("placement", r#"{"scale":1.0,"offset":[1e300,0,0],"depth_directions":false}"#),
+    ] {
+        std::fs::write(checkpoint::newest(dir.path()), &whole).unwrap();
+        tampered(dir.path(), |(_, metadata)| {
+            let mut field: serde_json::Value = serde_json::from_str(&metadata["field"]).unwrap();
+            assert!(field.get(key).is_some(), "{key}");
+            field[key] = serde_json::from_str(value).unwrap();
+            metadata.insert("field".into(), field.to_string());
+        });
+        let e = TFace::load(dir.path()).err().unwrap_or_else(|| panic!("{key} = {value} is accepted"));
+        assert!(e.to_string().contains("checkpoint.safetensors"), "{key}: {e}");
+        assert!(e.hint("tface").unwrap().contains("--fresh tface"), "{key}: {e}");
+    }
 }
 
 #[test]
