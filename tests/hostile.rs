@@ -764,6 +764,102 @@ fn a_size_that_is_not_the_declared_one_says_the_factor() {
     assert_eq!(c.views[0].load(&limits()).unwrap().photo.rgb.len(), 48);
 }
 
+/// A folder with these files, `/` at the end for folders, and what opening it says: the message and the way out.
+fn unread(names: &[(&str, &[u8])]) -> (String, String) {
+    let dir = tempfile::tempdir().unwrap();
+    for (name, bytes) in names {
+        let path = dir.path().join(name);
+        if name.ends_with('/') {
+            fs::create_dir_all(path).unwrap();
+        } else {
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, bytes).unwrap();
+        }
+    }
+    let e = open(&dir).unwrap_err();
+    assert!(matches!(e, CaptureError::NotACapture { .. }), "{e}");
+    let root = dir.path().display().to_string();
+    (e.to_string().replace(&root, "ROOT"), e.hint().replace(&root, "ROOT"))
+}
+
+#[test]
+fn formats_that_are_not_read_are_named_with_the_way_from_there() {
+    let photo = png(4, 4);
+    let picture = |name: &'static str| (name, &photo[..]);
+    let rows: [(&[(&str, &[u8])], &str, &str); 16] = [
+        (&[picture("images/0.png"), ("a.psx", b"<")], "Metashape project (`a.psx`)", "Export Cameras"),
+        (
+            &[picture("images/0.png"), ("cams.xml", b"<document>\n<chunk label=\"1\">")],
+            "Metashape export (`cams.xml`)",
+            "`ns-process-data metashape --data ROOT/images --xml ROOT/cams.xml --output-dir NEW`",
+        ),
+        (&[picture("0.png"), ("a.rcproj", b"x")], "RealityCapture project (`a.rcproj`)", "as CSV"),
+        (
+            &[picture("0.png"), ("reg.csv", b"#name,x,y,alt,heading,pitch,roll,f\n")],
+            "RealityCapture export (`reg.csv`)",
+            "realitycapture --data ROOT --csv ROOT/reg.csv",
+        ),
+        (&[("cameras_sphere.npz", b"PK"), picture("image/000.png")], "NeuS or DTU", "`world_mat_I`"),
+        (
+            &[("cameras.npz", b"PK"), ("full_head.obj", b"v")],
+            "an H3DS scene (`cameras.npz`)",
+            "`world_mat_I`",
+        ),
+        (&[("cameras.npz", b"PK"), ("image/", b"")], "an IDR scene", "`transform_matrix`"),
+        (&[("calibration/camera_params.json", b"{}")], "NeRSemble", "`world_2_cam`"),
+        (
+            &[("KRT", b"400002"), ("images/", b"")],
+            "Multiface recording (`KRT`)",
+            "one frame of one expression",
+        ),
+        (&[("params.json", b"{}"), picture("0.jpg")], "FaceScape tuple (`params.json`)", "`I_Rt`"),
+        (
+            &[("keyframes/images/", b"")],
+            "Polycam raw export (`keyframes`)",
+            "polycam --data ROOT --output-dir NEW",
+        ),
+        (&[("sparse/0/", b""), picture("images/0.jpg")], "COLMAP model (`sparse`)", "--skip-colmap"),
+        (
+            &[picture("b.JPG"), picture("a.jpg")],
+            "photographs without cameras (`a.jpg`)",
+            "images --data ROOT --output",
+        ),
+        (&[picture("input/1.png")], "photographs without cameras (`1.png`)", "--data ROOT/input"),
+        (&[("head.MOV", b"ftyp")], "a video (`head.MOV`)", "video --data ROOT/head.MOV"),
+        (&[("scan/transforms.json", b"{}")], "`transforms.json` lies in its folder `scan`", "`ROOT/scan`"),
+    ];
+    for (files, what, way) in rows {
+        let (message, hint) = unread(files);
+        assert!(message.contains(what), "{what}: {message}");
+        assert!(hint.contains(way), "{what}: {hint}");
+    }
+    // other tools' XML and CSV are not theirs, and a list of parameters without photographs is nobody's
+    let (message, hint) =
+        unread(&[("a.xml", b"<svg/>"), ("b.csv", b"a,b\n"), ("params.json", b"{}"), ("notes.txt", b"x")]);
+    assert!(message.contains("neither `transforms.json`"), "{message}");
+    for format in
+        ["COLMAP", "Metashape", "RealityCapture", "Polycam", "NeRSemble", "Multiface", "FaceScape", "H3DS"]
+    {
+        assert!(hint.contains(format), "{hint}");
+    }
+}
+
+#[test]
+fn a_file_in_the_place_of_a_folder_says_which_folder() {
+    let of = |name: &str| {
+        let (dir, path) = file(name, b"x");
+        let e = capture::open(&path, &CaptureOptions::default()).unwrap_err();
+        assert!(matches!(e, CaptureError::NotACapture { .. }), "{e}");
+        (e.to_string(), e.hint().replace(&dir.path().display().to_string(), "ROOT"))
+    };
+    assert_eq!(of("transforms.json").1, "give the folder it lies in: `ROOT`");
+    let (message, hint) = of("head.mp4");
+    assert!(
+        message.contains("it is a video") && hint.contains("ns-process-data video --data ROOT/head.mp4"),
+        "{hint}"
+    );
+}
+
 #[test]
 fn a_folder_without_cameras_says_what_was_looked_for() {
     let dir = tempfile::tempdir().unwrap();

@@ -6,6 +6,7 @@
 
 pub(crate) mod carve;
 mod error;
+mod foreign;
 pub mod inspect;
 mod listing;
 mod llff;
@@ -207,12 +208,10 @@ enum Format {
 impl Format {
     fn of(root: &Path) -> Result<Format, CaptureError> {
         if !io::is_folder(root) {
-            io::read_bytes(root, &Limits::default())?; // names what it is instead, if it is not a file
-            return Err(CaptureError::NotACapture {
-                root: root.into(),
-                seen: "it is a file".into(),
-                hint: "give the folder that holds the photographs and cameras".into(),
-            });
+            if io::is_file(root) {
+                return Err(foreign::explain_file(root));
+            }
+            io::read_bytes(root, &Limits::default())?; // names what it is instead, or that it is not there
         }
         let there = |names: &[&'static str]| -> Vec<&'static str> {
             names.iter().copied().filter(|n| io::is_file(&root.join(n))).collect()
@@ -232,24 +231,7 @@ impl Format {
         if !poses.is_empty() {
             return Ok(Format::Llff { poses });
         }
-        let colmap = ["sparse", "colmap", "cameras.bin", "cameras.txt", "database.db"]
-            .into_iter()
-            .find(|n| io::is_folder(&root.join(n)) || io::is_file(&root.join(n)));
-        Err(match colmap {
-            Some(n) => CaptureError::NotACapture {
-                root: root.into(),
-                seen: format!("it looks like a COLMAP model (`{n}`), which is not read"),
-                hint: "convert it to `transforms.json`, with instant-ngp's `colmap2nerf.py` or nerfstudio's \
-                       `ns-process-data`"
-                    .into(),
-            },
-            None => CaptureError::NotACapture {
-                root: root.into(),
-                seen: "it holds neither `transforms.json`, `transforms_train.json` nor `poses_bounds*.npy`"
-                    .into(),
-                hint: "give the folder that holds one of them".into(),
-            },
-        })
+        Err(foreign::explain(root))
     }
 
     fn name(&self) -> &'static str {
