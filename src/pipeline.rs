@@ -190,23 +190,24 @@ impl<'a> Line<'a> {
     /// remembers, and nothing can be worked on ([`Line::remember`]).
     pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>, PipelineError> {
         feasible(config)?;
-        let (capture, digest, clicks, gone) =
-            match capture::open(Path::new(&config.capture.path), &capture_options(config)) {
-                Err(e) => match remembered(config, run, &e)? {
-                    Some(known) => (known.capture, known.digest, known.clicks, Some(e.to_string())),
-                    None => return Err(e.into()),
-                },
-                Ok(mut capture) => {
-                    if synthetic {
-                        // its folder is called after what it holds
-                        capture.name = "demo".into();
-                    }
-                    let digest = capture_digest(&capture)?;
-                    let kept = run.path("mask").join(mask::CLICKS);
-                    let clicks = clicks::clicks(&config.mask, &capture, &kept)?;
-                    (capture, digest, clicks, None)
+        let options = capture_options(config);
+        let (capture, digest, clicks, gone) = match capture::open(Path::new(&config.capture.path), &options) {
+            Err(e) => match remembered(config, run, &e)? {
+                Some(known) => (known.capture, known.digest, known.clicks, Some(e.to_string())),
+                None => return Err(e.into()),
+            },
+            Ok(mut capture) => {
+                capture::require_masks(&capture, &options)?;
+                if synthetic {
+                    // its folder is called after what it holds
+                    capture.name = "demo".into();
                 }
-            };
+                let digest = capture_digest(&capture)?;
+                let kept = run.path("mask").join(mask::CLICKS);
+                let clicks = clicks::clicks(&config.mask, &capture, &kept)?;
+                (capture, digest, clicks, None)
+            }
+        };
         let of_file = |file: &str| -> Result<String, PipelineError> {
             Ok(Fingerprint::of_bytes(&io::read_bytes(Path::new(file), &Limits::default())?))
         };

@@ -6,7 +6,7 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tiface::capture::inspect::inspect;
-use tiface::capture::{self, CaptureError, CaptureOptions, MaskSource, Split};
+use tiface::capture::{self, CaptureError, CaptureOptions, MaskChoice, MaskMeaning, MaskSource, Split};
 use tiface::io::{self, Limits, NpyValues, ReadError, TensorValues, Turn};
 
 fn limits() -> Limits {
@@ -988,6 +988,101 @@ fn inspecting_reports_every_problem_not_the_first() {
     }
     assert!(!found.is_sound() && found.problems.len() >= 4);
     assert!(found.problems.iter().all(|p| !p.hint.is_empty()));
+}
+
+#[test]
+fn a_problem_of_every_frame_is_one_line_with_a_count() {
+    let dir = capture_with(|f| sound(f).replace("{\"file", "{\"mask_path\": \"m.png\", \"file"), 24);
+    let found = inspect(dir.path(), &CaptureOptions::default());
+    let masks: Vec<_> =
+        found.problems.iter().filter(|p| p.what.contains("mask it names is missing")).collect();
+    assert!(matches!(&masks[..], [p] if p.count == 24 && p.what.contains("`images/0.png`")), "{found}");
+    assert!(
+        found.to_string().contains("24 times, the first: `transforms.json`, frame `images/0.png`"),
+        "{found}"
+    );
+
+    // numbers that differ, and photographs that cannot be read, count together as well; other problems do not
+    let dir = capture_with(
+        |f| {
+            let moved = |(i, f): (usize, &String)| match i {
+                0..6 => f.replace("[0,1,0,0]", &format!("[0,1.0{},0,0]", i + 2)),
+                6 => f.replace("transform_matrix", "pose"),
+                _ => f.clone(),
+            };
+            sound(&f.iter().enumerate().map(moved).collect::<Vec<_>>())
+        },
+        12,
+    );
+    for i in 7..10 {
+        fs::write(dir.path().join(format!("images/{i}.png")), b"no picture at all").unwrap();
+    }
+    let found = inspect(dir.path(), &CaptureOptions::default());
+    let counts: Vec<usize> = found.problems.iter().map(|p| p.count).collect();
+    assert!(counts.starts_with(&[6, 1, 3]), "{found}");
+}
+
+/// A capture of nine photographs, seven of them to learn from, with masks of these.
+fn masked(views: &[usize]) -> TempDir {
+    let dir = capture_with(sound, 9);
+    fs::create_dir(dir.path().join("masks")).unwrap();
+    let values = (0..48).map(|i| if (i % 8) / 4 == 1 { 255 } else { 0 }).collect();
+    let mask = tiface::image::Gray { width: 8, height: 6, values };
+    for i in views {
+        io::write_png_gray(&dir.path().join(format!("masks/{i}.png")), &mask).unwrap();
+    }
+    dir
+}
+
+#[test]
+fn photographs_without_masks_do_not_pass_inspection() {
+    let problem = |dir: &TempDir, options: &CaptureOptions| {
+        let found = inspect(dir.path(), options);
+        let of = |p: &&tiface::capture::inspect::Problem| p.hint.contains("--page");
+        let problem = found.problems.iter().find(of).cloned();
+        assert!(problem.is_none() || !found.to_string().contains("nothing stands in the way"));
+        // what stops training is what inspection says
+        let open = capture::open(dir.path(), options).unwrap();
+        let required = capture::require_masks(&open, options);
+        assert_eq!(required.as_ref().err().map(|e| e.to_string()), problem.as_ref().map(|p| p.what.clone()));
+        problem
+    };
+    let default = CaptureOptions::default();
+    // views 0 and 8 are held out: their masks help nobody, and nobody misses them
+    for views in [&[][..], &[0, 8]] {
+        let told = problem(&masked(views), &default).unwrap();
+        assert!(told.what.contains("no photograph that is learned from has a head mask"), "{}", told.what);
+        for way in
+            ["tiface mask ", "--page", "masks/NAME.png", "mask_path", "rembg p -om", "--set mask.source=none"]
+        {
+            assert!(told.hint.contains(way), "{way}: {}", told.hint);
+        }
+    }
+    let told = problem(&masked(&[1, 2, 3]), &default).unwrap();
+    assert!(told.what.contains("4 of 7") && told.what.contains("`4`, `5`, `6`, `7`"), "{}", told.what);
+    let some = masked(&[1, 2, 3, 4]);
+    assert_eq!(problem(&some, &default), None);
+    let warnings = open(&some).unwrap().warnings;
+    assert!(
+        warnings.iter().any(|w| w.contains("5 views have no mask") && w.contains("learns nothing")),
+        "{warnings:?}"
+    );
+    // told to go on without, or what is not masked is looked at as it is
+    assert_eq!(problem(&masked(&[]), &CaptureOptions { masks: MaskChoice::None, ..default.clone() }), None);
+    let ignore = CaptureOptions { mask_meaning: MaskMeaning::Ignore, ..default.clone() };
+    assert_eq!(problem(&masked(&[1]), &ignore), None);
+    // a folder that was named, and holds none
+    let named = CaptureOptions { masks: MaskChoice::Folder("mattes".into()), ..default };
+    assert!(problem(&masked(&[1, 2, 3, 4]), &named).is_some());
+    // clicks that lie there are the shortest way
+    let dir = masked(&[]);
+    fs::write(dir.path().join("prompts.json"), b"{}").unwrap();
+    let e = capture::require_masks(&open(&dir).unwrap(), &CaptureOptions::default()).unwrap_err();
+    assert!(
+        e.hint().contains(&format!("--points {}", dir.path().join("prompts.json").display())),
+        "{}",
+        e.hint()
+    );
 }
 
 #[test]

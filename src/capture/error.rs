@@ -79,6 +79,16 @@ pub enum CaptureError {
         /// The second.
         second: String,
     },
+    /// The head masks that were asked for are not there.
+    #[error("`{}`: {problem}", root.display())]
+    NoMasks {
+        /// The capture.
+        root: PathBuf,
+        /// What is missing, and what that means.
+        problem: String,
+        /// The ways out.
+        hint: String,
+    },
     /// Nothing to learn from.
     #[error("`{}` has no usable view: {found}", root.display())]
     NoViews {
@@ -129,6 +139,17 @@ impl CaptureError {
         CaptureError::Size { picture, found, declared, file, hint }
     }
 
+    /// What of the message is another for each frame or file that has the same problem.
+    pub(super) fn subject(&self) -> Option<String> {
+        match self {
+            CaptureError::Frame { frame, .. } => Some(frame.clone()),
+            CaptureError::Size { picture, .. } => Some(picture.clone()),
+            CaptureError::Outside { name, .. } => Some(name.clone()),
+            CaptureError::Read(e) => Some(e.path().display().to_string()),
+            _ => None,
+        }
+    }
+
     /// The way out.
     pub fn hint(&self) -> String {
         match self {
@@ -136,7 +157,8 @@ impl CaptureError {
             CaptureError::NotACapture { hint, .. }
             | CaptureError::Structure { hint, .. }
             | CaptureError::Frame { hint, .. }
-            | CaptureError::Size { hint, .. } => hint.clone(),
+            | CaptureError::Size { hint, .. }
+            | CaptureError::NoMasks { hint, .. } => hint.clone(),
             CaptureError::Outside { .. } => {
                 "copy the file into the capture, or give the folder that holds both".into()
             }

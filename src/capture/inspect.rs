@@ -2,13 +2,13 @@
 
 use super::llff::Agreement;
 use super::scene::{self, SceneOptions};
-use super::{Capture, CaptureOptions, MaskSource, Split, View, gather, masks};
+use super::{Capture, CaptureError, CaptureOptions, MaskSource, Split, View, gather, masks};
 use crate::geom::Aabb;
 use crate::image::Gray;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -19,6 +19,28 @@ pub struct Problem {
     pub what: String,
     /// What to do about it.
     pub hint: String,
+    /// How many frames or files have it; `what` names the first.
+    pub count: usize,
+}
+
+/// One entry for all that have the same problem but for the frame or file, and the numbers in it.
+fn grouped<'a>(all: impl IntoIterator<Item = &'a CaptureError>) -> Vec<Problem> {
+    let mut problems: Vec<Problem> = Vec::new();
+    let mut first: HashMap<(String, String), usize> = HashMap::new();
+    for problem in all {
+        let (what, hint) = (problem.to_string(), problem.hint());
+        let subject = problem.subject().filter(|s| !s.is_empty());
+        let bare = subject.map_or(what.clone(), |s| what.replace(&s, ""));
+        let no_digits = |text: &str| text.replace(|c: char| c.is_ascii_digit(), "");
+        match first.get(&(no_digits(&bare), no_digits(&hint))) {
+            Some(&i) => problems[i].count += 1,
+            None => {
+                first.insert((no_digits(&bare), no_digits(&hint)), problems.len());
+                problems.push(Problem { what, hint, count: 1 });
+            }
+        }
+    }
+    problems
 }
 
 /// Least, middle and greatest of some numbers.
@@ -117,7 +139,7 @@ pub fn inspect(root: &Path, options: &CaptureOptions) -> Inspection {
         poses: found.agreements,
         scene: None,
         scene_text: None,
-        problems: found.problems.iter().map(|p| Problem { what: p.to_string(), hint: p.hint() }).collect(),
+        problems: grouped(&found.problems),
         warnings: Vec::new(),
     };
     let Some(capture) = found.capture else { return out };
@@ -128,6 +150,7 @@ pub fn inspect(root: &Path, options: &CaptureOptions) -> Inspection {
     cameras(&capture, &mut out);
     let masks = pixels(&capture, options, &mut out);
     place(&capture, masks, &mut out);
+    out.problems.extend(grouped(&masks::require_masks(&capture, options).err()));
     out
 }
 
@@ -187,8 +210,9 @@ fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> 
                 mask,
             })
         })
-        .collect::<Vec<Result<Seen, super::CaptureError>>>();
+        .collect::<Vec<Result<Seen, CaptureError>>>();
     let mut kinds: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    let mut unreadable = Vec::new();
     let (mut all, mut covered, mut usable) = (Vec::new(), Vec::new(), Vec::new());
     for (view, seen) in capture.views.iter().zip(seen) {
         match seen {
@@ -201,11 +225,12 @@ fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> 
                 all.push(s.mask);
             }
             Err(e) => {
-                out.problems.push(Problem { what: e.to_string(), hint: e.hint() });
+                unreadable.push(e);
                 all.push(None);
             }
         }
     }
+    out.problems.extend(grouped(&unreadable));
     for (finding, views) in kinds {
         let (n, list) = (views.len(), masks::few(views.into_iter()));
         out.warnings.push(format!("the mask {finding} in {n} views: {list}"));
@@ -239,7 +264,7 @@ fn place(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
             out.scene = Some(b);
             out.warnings.extend(warnings);
         }
-        Err(e) => out.problems.push(Problem { what: e.to_string(), hint: e.hint().into() }),
+        Err(e) => out.problems.push(Problem { what: e.to_string(), hint: e.hint().into(), count: 1 }),
     }
 }
 
@@ -276,6 +301,9 @@ impl fmt::Display for Inspection {
                 100.0 * r.median
             )?;
         }
+        if self.masks == 0 && self.format.is_some() {
+            writeln!(f, "  masks     none")?;
+        }
         if let Some(r) = self.valid_share {
             writeln!(
                 f,
@@ -291,8 +319,9 @@ impl fmt::Display for Inspection {
         for warning in &self.warnings {
             writeln!(f, "  warning   {warning}")?;
         }
-        for problem in &self.problems {
-            writeln!(f, "  problem   {}\n            hint: {}", problem.what, problem.hint)?;
+        for Problem { what, hint, count } in &self.problems {
+            let times = if *count > 1 { format!("{count} times, the first: ") } else { String::new() };
+            writeln!(f, "  problem   {times}{what}\n            hint: {hint}")?;
         }
         if self.is_sound() {
             writeln!(f, "  sound     nothing stands in the way")?;

@@ -2,7 +2,7 @@
 
 use super::listing::{Frame, Listing};
 use super::names::Place;
-use super::{CaptureError, CaptureOptions, MaskChoice, MaskSource, View};
+use super::{Capture, CaptureError, CaptureOptions, MaskChoice, MaskMeaning, MaskSource, Split, View};
 use crate::image::Gray;
 use crate::io::{self, PictureInfo};
 use std::path::{Path, PathBuf};
@@ -100,7 +100,11 @@ fn choose_checked(
             }
             if n < views.len() {
                 let without = views.iter().filter(|v| v.mask == MaskSource::None).map(|v| v.name.as_str());
-                listing.warnings.push(format!("{} views have no mask: {}", views.len() - n, few(without)));
+                let mut text = format!("{} views have no mask: {}", views.len() - n, few(without));
+                if options.mask_meaning == MaskMeaning::Empty {
+                    text += "; what is learned with masks learns nothing from them";
+                }
+                listing.warnings.push(text);
             }
         }
         None => match &options.masks {
@@ -133,6 +137,45 @@ fn choose_checked(
         listing.reasons.push(format!("face regions for the metrics, for {region} of {} views", views.len()));
     }
     Ok(())
+}
+
+/// Are the head masks there that `options` ask for? Without, everything the cameras see would be learned as the head:
+/// whoever wants that says so with [`MaskChoice::None`]. Held-out views need none, and of the others at least half must
+/// have one.
+pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<(), CaptureError> {
+    if options.masks == MaskChoice::None {
+        return Ok(());
+    }
+    let train: Vec<&View> = capture.split(Split::Train).collect();
+    let without: Vec<&str> =
+        train.iter().filter(|v| v.mask == MaskSource::None).map(|v| v.name.as_str()).collect();
+    let (total, missing) = (train.len(), without.len());
+    let problem = if missing == total {
+        "no photograph that is learned from has a head mask: nothing says which pixels are background, and there is \
+         no visual hull to start from"
+            .into()
+    } else if options.mask_meaning == MaskMeaning::Empty && 2 * missing > total {
+        let named = few(without.into_iter());
+        format!("{missing} of {total} photographs that are learned from have no head mask: {named}")
+    } else {
+        return Ok(());
+    };
+    let root = &capture.root;
+    let shown = root.display();
+    let prompts = root.join("prompts.json");
+    let clicks = if io::is_file(&prompts) {
+        format!("make them from the clicks that lie there: `--points {}`", prompts.display())
+    } else {
+        format!("click on three photographs: `tiface mask {shown} --page`, then `--points prompts.json`")
+    };
+    let photographs = train.first().and_then(|v| v.photo.parent()).unwrap_or(root).display();
+    let hint = format!(
+        "{clicks}; or put masks there, white on the head, found by themselves as alpha, `mask_path`, `vit_mask/NAME.png` \
+         or `masks/NAME.png` (a background remover writes them: `rembg p -om {photographs} {shown}/masks`), or in a \
+         folder named with `--set capture.mask_dir=FOLDER`; or go on without any, and learn whatever the cameras see: \
+         `--set mask.source=none`"
+    );
+    Err(CaptureError::NoMasks { root: root.clone(), problem, hint })
 }
 
 /// Folders beside the photographs' own, else in the capture's root.

@@ -21,7 +21,7 @@ mod well_seen;
 
 pub use error::CaptureError;
 pub use load::LoadedView;
-pub use masks::{coverage, findings};
+pub use masks::{coverage, findings, require_masks};
 pub use well_seen::well_seen;
 
 use crate::geom::Camera;

@@ -13,6 +13,7 @@
 //! meeting point of the viewing axes than 0.6 of the cameras' median distance to it.
 
 use super::carve::{self, Cube, Projector, Silhouette};
+use super::masks::few;
 use crate::geom::{Aabb, Camera, Similarity};
 use crate::image::Gray;
 use glam::{DVec3, Vec3};
@@ -165,7 +166,9 @@ impl SceneError {
             SceneError::HeadOutside { .. } => {
                 "check the axis convention of the poses: cameras must look along their -Z axis (OpenGL)"
             }
-            SceneError::AllWhite { .. } => "make head masks, or go on without: `mask.source = \"none\"`",
+            SceneError::AllWhite { .. } => {
+                "make head masks: `tiface mask CAPTURE --page`; or go on without: `--set mask.source=none`"
+            }
             SceneError::AllEmpty { .. } => "white must keep the head: were the masks saved as 0 and 1?",
             SceneError::EmptyHull { .. } => {
                 "look at that view's mask and pose; are masks inverted, or poses of another capture?"
@@ -191,27 +194,28 @@ pub fn fit(
     }
     let name = |i: usize| options.names.get(i).cloned().unwrap_or_else(|| i.to_string());
     let mut warnings = Vec::new();
-    let (mut white, mut empty, mut used) = (0, 0, Vec::new());
+    let (mut white, mut empty, mut used) = (Vec::new(), Vec::new(), Vec::new());
     for (i, mask) in masks.iter().enumerate() {
         let Some(mask) = mask else { continue };
         if mask.values.iter().all(|&v| v <= options.threshold) {
-            empty += 1;
-            warnings.push(format!("the mask of view `{}` is empty; it does not place the head", name(i)));
+            empty.push(name(i));
         } else if mask.values.iter().all(|&v| v > options.threshold) {
-            white += 1;
-            warnings.push(format!(
-                "the mask of view `{}` is white everywhere; it does not place the head",
-                name(i)
-            ));
+            white.push(name(i));
         } else {
             used.push(i);
         }
     }
-    if used.is_empty() && white > 0 {
-        return Err(SceneError::AllWhite { masks: white });
+    if used.is_empty() && !white.is_empty() {
+        return Err(SceneError::AllWhite { masks: white.len() });
     }
-    if used.is_empty() && empty > 0 {
-        return Err(SceneError::AllEmpty { masks: empty });
+    if used.is_empty() && !empty.is_empty() {
+        return Err(SceneError::AllEmpty { masks: empty.len() });
+    }
+    for (views, what) in [(empty, "empty"), (white, "white everywhere")] {
+        if !views.is_empty() {
+            let (n, named) = (views.len(), few(views.iter().map(String::as_str)));
+            warnings.push(format!("in {n} views the mask is {what} and does not place the head: {named}"));
+        }
     }
     if used.len() < 2 {
         // one silhouette alone bounds nothing in depth
@@ -530,7 +534,10 @@ mod tests {
             *v *= (i % 60 < 30) as u8;
         }
         let (_, warnings) = fit(&cameras, &masks, &small()).unwrap();
-        assert!(warnings.iter().any(|w| w.contains("view `3` is empty")), "{warnings:?}");
+        assert!(
+            warnings.iter().any(|w| w.contains("in 1 views the mask is empty") && w.contains("`3`")),
+            "{warnings:?}"
+        );
         assert!(warnings.iter().any(|w| w.contains("view `7` alone removes")), "{warnings:?}");
         assert_eq!(warnings.len(), 2, "{warnings:?}");
     }

@@ -16,7 +16,7 @@ pub enum MaskSource {
     Folder,
     /// Made from clicks: `mask.points` or `mask.point`.
     Clicks,
-    /// None: everything in the picture is reconstructed.
+    /// None, as is only done when asked for: everything in the picture is reconstructed.
     None,
 }
 
@@ -154,7 +154,7 @@ pub(super) const KEYS: &[Key] = &[
     Key::word(
         "source",
         "Where masks come from: auto (clicks if given, else what the capture has), alpha, folder (capture.mask_dir), \
-         clicks or none.",
+         clicks or none (go on without: whatever the cameras see is learned).",
     ),
     Key::word("meaning", "What lies outside a mask: empty (nothing of the head) or ignore (not looked at)."),
     Key::word("points", "Clicks to make masks from: a prompts.json, as `tiface mask --page` saves it."),

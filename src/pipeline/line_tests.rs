@@ -243,6 +243,54 @@ fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
 }
 
 #[test]
+fn a_run_without_masks_stops_before_anything_is_written_unless_told_to_go_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root, 4, 1);
+    std::fs::remove_dir_all(root.join("masks")).unwrap();
+    let json = root.join("transforms.json");
+    let mut value = io::read_json(&json, &Limits::default()).unwrap();
+    for frame in value["frames"].as_array_mut().unwrap() {
+        frame.as_object_mut().unwrap().remove("mask_path");
+    }
+    std::fs::write(&json, value.to_string()).unwrap();
+    let run = quiet(dir.path());
+    let mut config = draft(&root);
+    let e = Line::open(&config, &run, false).err().unwrap();
+    assert!(e.to_string().contains("head mask") && e.exit() == Exit::Cannot, "{e}");
+    assert!(e.hint().contains("--page") && e.hint().contains("--set mask.source=none"), "{}", e.hint());
+    assert!(!run.dir().exists());
+    config.mask.source = MaskSource::None;
+    let line = Line::open(&config, &run, false).unwrap();
+    line.remember("mask").unwrap();
+    assert_eq!(line.mask().unwrap().summary["masks"], 0);
+}
+
+#[test]
+fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root, 4, 1);
+    let mut config = draft(&root);
+    config.render.method = vec![Method::Tface];
+    let run = quiet(dir.path());
+    let line = Line::open(&config, &run, false).unwrap();
+    line.mask().unwrap();
+    let path = run.path("mask/scene.json");
+    let mut value = io::read_json(&path, &Limits::default()).unwrap();
+    value["hull"] = json!({"resolution": 0, "bits": []});
+    std::fs::write(&path, value.to_string()).unwrap();
+    let fog = Fog(0.into(), None);
+    for e in [line.mask().unwrap_err(), line.mesh(&Never).unwrap_err(), line.render(&fog).unwrap_err()] {
+        assert!(e.to_string().contains("`hull.resolution` is 0, expected 2 to 1024"), "{e}");
+        assert!(e.hint().contains("`--fresh mask`") && e.exit() == Exit::Cannot, "{}", e.hint());
+    }
+    // which it is
+    run.fresh("mask", &line.followers("mask")).unwrap();
+    line.mask().unwrap();
+}
+
+#[test]
 fn a_command_runs_what_its_stage_needs_and_nothing_else() {
     let dir = tempfile::tempdir().unwrap();
     capture(dir.path(), 3, 1);

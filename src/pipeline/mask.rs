@@ -47,15 +47,10 @@ impl Line<'_> {
             };
             let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
             if coverage.is_empty() {
-                let mut text = String::from(
-                    "no view has a head mask: there is no visual hull to start from, nothing says which pixels \
-                     are background, and the box learns whatever it holds; give masks for a head on its own",
+                stage.warn(
+                    "no head masks, as asked: nothing says which pixels are background, and the box learns whatever it \
+                     holds",
                 );
-                let prompts = self.capture.root.join("prompts.json");
-                if io::is_file(&prompts) {
-                    text += &format!(", or make them from the clicks that lie there: `--points {}`", prompts.display());
-                }
-                stage.warn(&text);
             }
             let meaning = self.config.mask.meaning;
             let doubts =
