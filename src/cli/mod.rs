@@ -236,12 +236,16 @@ from different sides. The other views follow from the cameras.")]
     #[command(after_long_help = "Examples:
   tiface render runs/002_00
   tiface render captures/002_00 --with tface    T-Face alone: no other field is learned for it
-  tiface render runs/002_00 --fresh render --cameras orbit --background white --out turn/
-  tiface render runs/002_00 --fresh render --cameras path.json --format exr")]
+  tiface render runs/002_00 --cameras orbit --with tface --background white --out turn/
+  tiface render runs/002_00 --cameras path.json --format exr
+
+Views of other cameras than the held-out ones lie in render/paths/, one folder for each path. They leave
+the held-out views, their blend and the metrics alone; --fresh render then makes only that path anew.")]
     Render {
         #[command(flatten)]
         place: Place,
-        /// test, train, orbit, or a file: a nerfstudio camera path or a transforms.json
+        /// test (the held-out views); train, orbit or a file (a nerfstudio camera path or a
+        /// transforms.json), into a folder of their own
         #[arg(long, value_name = "WHICH")]
         cameras: Option<String>,
         /// Any of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured

@@ -82,7 +82,8 @@ pub enum Background {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RenderConfig {
-    /// `test`, `train`, `orbit`, or a file of cameras.
+    /// Which cameras `tiface render` shows: `test`, or in a folder of their own `train`, `orbit`, or a file of
+    /// cameras.
     pub cameras: String,
     /// Which ways to make them.
     pub method: Vec<Method>,
@@ -101,7 +102,8 @@ pub struct RenderConfig {
 pub(super) const KEYS: &[Key] = &[
     Key::word(
         "cameras",
-        "Which cameras: test, train, orbit, or a file (transforms.json or a nerfstudio camera path).",
+        "Cameras of `tiface render`: test (held-out views); train, orbit or a file (transforms.json or a nerfstudio \
+         camera path) into a folder of their own. Blend and metrics are always of test.",
     ),
     Key::word(
         "method",

@@ -1,0 +1,111 @@
+//! A finished run in its user's hands: turntables, single stages, a capture that has moved.
+#![cfg(feature = "cpu")]
+
+mod command;
+
+use command::tiface;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+
+fn text(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
+}
+
+fn worked(output: &Output) -> String {
+    assert!(output.status.success(), "{}", text(output));
+    text(output)
+}
+
+/// A run with an imported T-Face: nothing has to be learned.
+fn finished(folder: &Path) {
+    let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
+    write_capture(&folder.join("head"), &options).unwrap();
+    let import = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.th");
+    let import = format!("tface.import={}", import.display());
+    let mut words = vec!["run", "head", "--preset", "draft"];
+    let settings = [
+        &import,
+        "render.method=tface",
+        "ensemble.members=tface",
+        "ensemble.weights=1",
+        "render.orbit_views=3",
+        "device=cpu",
+    ];
+    settings.iter().for_each(|s| words.extend(["--set", s]));
+    worked(&tiface(folder, &words));
+}
+
+/// The files of a run with their bytes, those of camera paths left out.
+fn files(run: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(run).unwrap() {
+        let path = entry.unwrap().path();
+        if !path.is_dir() {
+            found.push((path.clone(), std::fs::read(&path).unwrap()));
+        } else if !path.ends_with("render/paths") {
+            found.extend(files(&path));
+        }
+    }
+    found.sort();
+    found
+}
+
+#[test]
+fn a_turntable_leaves_the_finished_run_as_it_is() {
+    let dir = tempfile::tempdir().unwrap();
+    finished(dir.path());
+    let run = dir.path().join("runs/head");
+    let before = files(&run);
+    let words = [
+        "render",
+        "runs/head",
+        "--with",
+        "tface",
+        "--cameras",
+        "orbit",
+        "--background",
+        "white",
+        "--out",
+        "turn/",
+    ];
+    let said = worked(&tiface(dir.path(), &words));
+    assert!(said.contains("render/paths/orbit"), "{said}");
+    for view in ["0001", "0002", "0003"] {
+        assert!(dir.path().join(format!("turn/tface/{view}.png")).is_file());
+    }
+    assert!(!dir.path().join("turn/paths").exists());
+    assert!(worked(&tiface(dir.path(), &words)).contains("render/paths/orbit: already done"));
+    let other = tiface(dir.path(), &["render", "runs/head", "--cameras", "orbit", "--format", "exr"]);
+    assert_eq!(other.status.code(), Some(1));
+    assert!(text(&other).contains("`--fresh render` to make `render/paths/orbit` anew"), "{}", text(&other));
+    assert!(before == files(&run), "the turntable has changed the run");
+    assert!(worked(&tiface(dir.path(), &["run", "runs/head"])).contains("metrics: already done"));
+    assert!(before == files(&run));
+    // and what has been made of other cameras is told of
+    assert!(worked(&tiface(dir.path(), &["status", "runs/head"])).contains("render/paths/orbit done in"));
+    let anew = ["render", "runs/head", "--cameras", "orbit", "--format", "exr", "--fresh", "render"];
+    assert!(
+        worked(&tiface(dir.path(), &[&anew[..], &["--dry-run"]].concat())).contains("orbit to do, afresh")
+    );
+    worked(&tiface(dir.path(), &anew));
+    assert!(run.join("render/paths/orbit/tface/0001.exr").is_file());
+    assert!(!run.join("render/paths/orbit/tface/0001.png").exists() && before == files(&run));
+}
+
+#[test]
+fn a_finished_run_outlives_its_capture_and_single_stages() {
+    let dir = tempfile::tempdir().unwrap();
+    finished(dir.path());
+    let run = dir.path().join("runs/head");
+    let before = files(&run);
+    worked(&tiface(dir.path(), &["tface", "runs/head"]));
+    worked(&tiface(dir.path(), &["render", "runs/head", "--cameras", "test"]));
+    assert!(before == files(&run), "a command on one stage has changed the run");
+    std::fs::rename(dir.path().join("head"), dir.path().join("moved")).unwrap();
+    assert!(worked(&tiface(dir.path(), &["run", "runs/head"])).contains("metrics: already done"));
+    let o = tiface(dir.path(), &["mesh", "runs/head"]);
+    assert_eq!(o.status.code(), Some(1));
+    assert!(text(&o).contains("--set capture.path="), "{}", text(&o));
+    assert!(before == files(&run));
+}
