@@ -87,7 +87,7 @@ impl Work<'_> {
             return self.outlook(&line);
         }
         if let Some(fresh) = &self.common.fresh {
-            line.fresh(fresh)?;
+            line.fresh(fresh, self.until)?;
         }
         line.remember(self.until)?;
         self.screen.expect(line.order(self.until));

@@ -85,10 +85,13 @@ impl<'a> Line<'a> {
         Ok(names)
     }
 
-    /// Removes what is out of date when a stage is made anew.
-    pub fn fresh(&self, stage: &str) -> Result<(), PipelineError> {
+    /// Removes what is out of date when a stage is made anew on the way to `until`; nothing, if what `until` asks for
+    /// would be refused then.
+    pub fn fresh(&self, stage: &str, until: &str) -> Result<(), PipelineError> {
         self.is_there()?;
-        Ok(self.run.fresh(&self.out_of_date(stage)?)?)
+        let names = self.out_of_date(stage)?;
+        self.agrees(until, &names)?;
+        Ok(self.run.fresh(&names)?)
     }
 
     /// What the views of a path are made of.

@@ -102,7 +102,7 @@ fn camera_paths_never_touch_the_evaluations_views() {
         let line = open().along(turn(&config, cameras)).unwrap();
         // nothing but what the views show, and nothing that builds on them
         assert_eq!(line.order("render").join(" "), "mask tface render");
-        line.fresh("render").unwrap();
+        line.fresh("render", "render").unwrap();
         for again in [false, true] {
             line.remember("render").unwrap();
             let done = line.render(&Fog).unwrap();
@@ -139,16 +139,16 @@ fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
     let e = black.remember("render").unwrap_err();
     assert!(e.to_string().contains("render.background: was \"white\", is \"black\""), "{e}");
     assert!(e.hint().contains("`--fresh render`") && e.hint().contains("nothing else"), "{}", e.hint());
-    black.fresh("render").unwrap();
+    black.fresh("render", "render").unwrap();
     assert!(!black.render(&Fog).unwrap().skipped);
     assert_eq!(evaluate(&line()), [true; 4]);
     assert!(line().along(turn(&config, "train")).unwrap().render(&Fog).unwrap().skipped);
     // the held-out views made anew are no reason to make others anew, another field is one
-    line().fresh("render").unwrap();
+    line().fresh("render", "metrics").unwrap();
     assert!(run.path("render/paths/orbit/done.json").is_file() && !run.path("render/done.json").is_file());
-    line().fresh("baseline").unwrap();
+    line().fresh("baseline", "metrics").unwrap();
     assert!(run.path("render/paths/orbit/done.json").is_file());
-    line().fresh("tface").unwrap();
+    line().fresh("tface", "metrics").unwrap();
     assert!(!run.path("render/paths/orbit/done.json").exists());
 }
 
@@ -260,7 +260,7 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
 
     // there is work: nothing is removed or written before it is known that it cannot be done
     for e in [
-        line.fresh("metrics").unwrap_err(),
+        line.fresh("metrics", "metrics").unwrap_err(),
         Line::open(&config, &run, false)
             .unwrap()
             .along(turn(&config, "orbit"))
@@ -303,6 +303,26 @@ fn a_finished_run_that_cannot_be_written_is_still_done() {
     let done = reconstruct(&line, "metrics").unwrap();
     assert!(done.len() == 6 && done.iter().all(|(_, stage)| stage.skipped), "{done:?}");
     // with work to do it is an error, before that is begun
-    line.fresh("metrics").unwrap();
+    line.fresh("metrics", "metrics").unwrap();
     assert!(line.remember("metrics").unwrap_err().to_string().contains("config.toml"));
+}
+
+#[test]
+fn a_command_that_is_refused_clears_nothing_with_fresh() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = config(&dir.path().join("head"));
+    let run = quiet(dir.path());
+    evaluate(&Line::open(&config, &run, false).unwrap());
+    let before = files(run.dir());
+    let refused = |change: &dyn Fn(&mut Config)| {
+        let mut config = config.clone();
+        change(&mut config);
+        let line = Line::open(&config, &run, false).unwrap();
+        line.fresh("render", "metrics").unwrap_err().to_string()
+    };
+    // what has no member, other cameras, and a field of other settings that is not made anew
+    assert!(refused(&|c| c.render.method = vec![Method::Tface]).contains("`ensemble.members`"));
+    assert!(refused(&|c| c.render.cameras = "orbit".into()).contains("`render.cameras`"));
+    assert!(refused(&|c| c.tface.steps += 1).contains("tface.steps"));
+    assert!(before == files(run.dir()));
 }

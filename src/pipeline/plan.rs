@@ -85,15 +85,23 @@ impl Line<'_> {
     /// changed, if a stage that `until` needs was made or begun with other settings, if the settings contradict
     /// each other, or if there is work left and no capture to do it on.
     pub fn remember(&self, until: &str) -> Result<(), PipelineError> {
-        self.can_make(until)?;
-        let plans: Vec<Plan> = self.order(until).into_iter().map(|name| self.plan(name)).collect();
-        plans.iter().try_for_each(|plan| self.run.agrees(plan))?;
-        let idle = plans.iter().all(|plan| self.run.is_done(plan));
+        self.agrees(until, &[])?;
+        let idle = self.order(until).into_iter().all(|name| self.run.is_done(&self.plan(name)));
         if !idle {
             self.is_there()?;
         }
         let written = self.run.write("config.toml", self.config.to_toml().as_bytes());
         self.unless_idle(idle, written.map_err(PipelineError::from))
+    }
+
+    /// Does what lies in the run agree with what `until` asks for, but for the folders in `cleared`?
+    pub(super) fn agrees(&self, until: &str, cleared: &[String]) -> Result<(), PipelineError> {
+        self.can_make(until)?;
+        let plans = self.order(until).into_iter().map(|name| self.plan(name));
+        for plan in plans.filter(|plan| !cleared.iter().any(|name| name == plan.name)) {
+            self.run.agrees(&plan)?;
+        }
+        Ok(())
     }
 
     /// Do the settings go together, as far as `until` depends on them? Asked before any work.
