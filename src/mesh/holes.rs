@@ -10,6 +10,9 @@ use std::collections::{HashMap, HashSet};
 /// Sides of the largest hole that is filled.
 const MOST_SIDES: usize = 64;
 
+/// A triangle with less area than this share of a side's square is flat.
+const FLAT: f64 = 1e-4;
+
 /// Closes holes of at most 64 sides in place; every vertex must have one fan. Returns how many, and with how
 /// many triangles.
 pub(super) fn fill_holes(mesh: &mut Mesh) -> (usize, usize) {
@@ -79,7 +82,10 @@ pub(super) fn least_area(points: &[DVec3], taken: impl Fn(usize, usize) -> bool)
             }
             for k in i + 1..j {
                 let area = 0.5 * (points[k] - points[i]).cross(points[j] - points[i]).length();
-                let sum = cost[at(i, k)] + cost[at(k, j)] + area;
+                // along a straight side a triangle without area would cost nothing: only if nothing else is left
+                let across = points[j].distance_squared(points[i]);
+                let flat = if area <= FLAT * across { across / FLAT } else { 0.0 };
+                let sum = cost[at(i, k)] + cost[at(k, j)] + area + flat;
                 if sum < cost[at(i, j)] {
                     cost[at(i, j)] = sum;
                     apex[at(i, j)] = k;
@@ -185,6 +191,23 @@ mod tests {
             ..Mesh::default()
         };
         assert_eq!(fill_holes(&mut strip), (0, 0));
+    }
+
+    #[test]
+    fn a_straight_side_of_many_vertices_gets_no_triangle_without_area() {
+        // a square of 4 × 1 with the long sides in quarters
+        let at = |i: usize| match i {
+            0..=4 => DVec3::new(i as f64, 0.0, 0.0),
+            _ => DVec3::new(9.0 - i as f64, 1.0, 0.0),
+        };
+        let points: Vec<DVec3> = (0..10).map(at).collect();
+        let found = least_area(&points, |_, _| false).unwrap();
+        let area = |t: &[usize; 3]| {
+            let [a, b, c] = t.map(|i| points[i]);
+            0.5 * (b - a).cross(c - a).z
+        };
+        assert!(found.iter().all(|t| area(t) > 0.1), "{found:?}");
+        assert!((found.iter().map(area).sum::<f64>() - 4.0).abs() < 1e-12);
     }
 
     #[test]
