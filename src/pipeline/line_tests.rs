@@ -3,8 +3,11 @@
 use super::*;
 use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
-use crate::config::{Background, MeshFormat, MeshFrame, Method, Preset};
+use crate::config::{Background, Genus, MeshFormat, MeshFrame, Method, Preset};
+use crate::geom::{Camera, Similarity};
+use crate::render::RenderedView;
 use crate::run::{Quiet, Stop};
+use glam::Vec3;
 use serde_json::json;
 use std::sync::Arc;
 
@@ -189,6 +192,90 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     config.mesh.lobes = 1;
     let error = Line::open(&config, &run, true).err().unwrap();
     assert!(error.to_string().contains("mesh.lobes") && error.hint().contains("texture_px"), "{error}");
+}
+
+/// The demo head with a tunnel from ear to ear, 0.06 wide in a scene of 2.
+struct Drilled(Exact);
+
+impl Drilled {
+    const RADIUS: f32 = 0.03;
+
+    fn tunnel(p: &Vec3) -> (f32, Vec3) {
+        let across = Vec3::new(0.0, p.y - 0.2, p.z);
+        (Self::RADIUS - across.length(), -across.normalize_or_zero())
+    }
+}
+
+impl Surface for Drilled {
+    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+        let drilled = |(f, p): (f32, &Vec3)| f.max(Self::tunnel(p).0);
+        self.0.sdf(points).into_iter().zip(points).map(drilled).collect()
+    }
+
+    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        let (values, gradients) = self.0.sdf_gradient(points);
+        let drilled = |((f, g), p): ((f32, Vec3), &Vec3)| {
+            let (tunnel, slope) = Self::tunnel(p);
+            if tunnel > f { (tunnel, slope) } else { (f, g) }
+        };
+        values.into_iter().zip(gradients).zip(points).map(drilled).unzip()
+    }
+
+    fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        self.0.color(points, normals, directions)
+    }
+
+    fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], d: &[Vec3]) -> Vec<[f32; 3]> {
+        self.0.colors(points, normals, counts, d)
+    }
+
+    fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {
+        None
+    }
+}
+
+impl Fields for Drilled {
+    fn surface(&self) -> Result<&dyn Surface, Failure> {
+        Ok(self)
+    }
+
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+        panic!("no radiance field is asked for")
+    }
+}
+
+#[test]
+fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 96, height: 120, train: 12, test: 2, seed: 1 };
+    let root = dir.path().join("head");
+    write_capture(&root, &options).unwrap();
+    let mut digests = Vec::new();
+    for genus in [Genus::Simple, Genus::Keep] {
+        let mut config = draft(&root);
+        config.mesh.resolution = 64;
+        config.mesh.triangles = 3000;
+        config.mesh.texture_px = 0;
+        config.mesh.genus = genus;
+        let run = Run::open(&dir.path().join(format!("{genus:?}")), Stop::new(), Arc::new(Quiet));
+        let line = Line::open(&config, &run, true).unwrap();
+        line.remember("mesh").unwrap();
+        line.mask().unwrap();
+        let world_from_scene = line.scene().unwrap().scene_from_world.inverse();
+        let mm = world_from_scene.scale * config.capture.unit_m * 1000.0;
+        let summary = line.mesh(&Drilled(Exact { world_from_scene })).unwrap().summary;
+        digests.push(line.plan("mesh").fingerprint.digest());
+        let (handles, product) = (&summary["handles"], line.read_product().unwrap().mesh);
+        let left = i64::from(genus == Genus::Keep);
+        assert_eq!(handles["left"], json!(left), "{summary}");
+        assert_eq!(crate::geom::topology(&product.positions, &product.triangles).genus, Some(left));
+        if genus == Genus::Simple {
+            let around = handles["filled_mm"][0].as_f64().unwrap();
+            let expected = std::f64::consts::TAU * f64::from(Drilled::RADIUS) * mm;
+            assert!((0.7..1.4).contains(&(around / expected)), "{handles}");
+        }
+    }
+    assert_ne!(digests[0], digests[1]);
 }
 
 /// A radiance field that is one colour, and counts the views it was asked for.
