@@ -50,8 +50,6 @@ pub enum MattingMethod {
     Auto,
     /// Closed-form matting, built in.
     Closed,
-    /// A guided filter, built in: a third of the time, about 60 % of the gain.
-    Guided,
     /// The network of `mask.vitmatte`.
     Vitmatte,
 }
@@ -140,10 +138,6 @@ pub struct MaskConfig {
     pub tie: f64,
     /// Weight by which unsure pixels are held to the hard mask.
     pub hold: f64,
-    /// Half side of the guided filter's windows, share of the height.
-    pub guided_radius: f32,
-    /// ε of the guided filter.
-    pub guided_epsilon: f64,
     /// Alphas below become 0.
     pub lowest: f32,
     /// Alphas above become 1.
@@ -169,8 +163,8 @@ pub(super) const KEYS: &[Key] = &[
     ),
     Key::word(
         "matting",
-        "From a hard mask to an alpha: auto (vitmatte if its file is named), closed (closed form, built in), guided \
-         (guided filter, built in) or vitmatte.",
+        "From a hard mask to an alpha: auto (vitmatte if its file is named), closed (closed form, built in) or \
+         vitmatte.",
     ),
     Key::word("sam", "SAM's image encoder as an ONNX file (needs a build with the feature `matting`)."),
     Key::word("sam_decoder", "SAM's prompt encoder and mask decoder as an ONNX file."),
@@ -227,8 +221,6 @@ pub(super) const KEYS: &[Key] = &[
     Key::number("epsilon", "Noise of colours in closed-form matting.", 0.0, 1.0),
     Key::number("tie", "Weight that ties sure pixels in closed-form matting.", 1e-6, 1e9),
     Key::number("hold", "Weight that holds unsure pixels to the hard mask in closed-form matting.", 0.0, 1e9),
-    Key::number("guided_radius", "Half side of the guided filter's windows, share of the height.", 0.0, 0.5),
-    Key::number("guided_epsilon", "Noise of colours in the guided filter.", 1e-12, 1.0),
     Key::number("lowest", "Alphas below this become 0.", 0.0, 1.0),
     Key::number("highest", "Alphas above this become 1.", 0.0, 1.0),
 ];
@@ -351,8 +343,6 @@ impl MaskConfig {
             epsilon: 1e-5,
             tie: 100.0,
             hold: 3e-3,
-            guided_radius: 0.008,
-            guided_epsilon: 1e-4,
             lowest: 0.02,
             highest: 0.98,
         }

@@ -10,19 +10,9 @@
 //! takes [`Working`] and gives back its alphas.
 
 use super::closed_form::{ClosedFormOptions, closed_form};
-use super::guided::{GuidedOptions, guided};
 use super::scale::{enlarge, reduce_photo, resize_hard, working_size};
 use super::trimap::{Band, HEAD, OUTSIDE, UNSURE, trimap, unsure_share};
 use crate::image::{Gray, Photo};
-
-/// How the opacity of the unsure band is found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Matting {
-    /// [`closed_form`]; where it finds no solution, [`guided`] with a warning.
-    ClosedForm,
-    /// [`guided`]: a third of the time and about 60 % of the gain.
-    Guided,
-}
 
 /// Every constant on the way from a hard mask to an alpha.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,11 +22,7 @@ pub struct SoftenOptions {
     /// Width of the unsure band.
     pub band: Band,
     /// How its opacity is found.
-    pub matting: Matting,
-    /// For [`Matting::ClosedForm`].
     pub closed_form: ClosedFormOptions,
-    /// For [`Matting::Guided`].
-    pub guided: GuidedOptions,
     /// Alphas below become 0.
     pub lowest: f32,
     /// Alphas above become 1.
@@ -50,9 +36,7 @@ impl Default for SoftenOptions {
         SoftenOptions {
             side: 1024,
             band: Band::default(),
-            matting: Matting::ClosedForm,
             closed_form: ClosedFormOptions::default(),
-            guided: GuidedOptions::default(),
             lowest: 0.02,
             highest: 0.98,
             most_unsure: 0.3,
@@ -122,7 +106,6 @@ impl SoftenOptions {
             ("closed_form.epsilon", self.closed_form.epsilon),
             ("closed_form.tie", self.closed_form.tie),
             ("closed_form.tolerance", self.closed_form.tolerance),
-            ("guided.epsilon", self.guided.epsilon),
         ];
         if let Some((name, value)) = positive.into_iter().find(|(_, v)| !(*v > 0.0 && v.is_finite())) {
             return wrong(name, value.to_string(), "a positive number");
@@ -130,9 +113,6 @@ impl SoftenOptions {
         let hold = self.closed_form.hold;
         if !(hold >= 0.0 && hold.is_finite()) {
             return wrong("closed_form.hold", hold.to_string(), "a number of at least 0");
-        }
-        if !share(self.guided.radius) {
-            return wrong("guided.radius", self.guided.radius.to_string(), "a share of the height, 0 to 1");
         }
         if !(share(self.lowest) && share(self.highest) && self.lowest <= self.highest) {
             let found = format!("{} to {}", self.lowest, self.highest);
@@ -221,24 +201,25 @@ pub struct Softened {
     pub warnings: Vec<String>,
 }
 
-/// The soft alpha of a photograph from its hard mask, which has the photograph's proportions.
+/// The soft alpha of a photograph from its hard mask, which has the photograph's proportions. Where closed-form
+/// matting finds no solution the band stays hard, with a warning.
 pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Softened, AlphaError> {
     let working = Working::new(photo, mask, options)?;
     let mut warnings = working.warnings(options);
     let Working { photo, mask, trimap, .. } = &working;
-    let filtered = || guided(photo, mask, trimap, &options.guided);
+    let hard = || mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect();
     let sides_known = trimap.values.contains(&HEAD) && trimap.values.contains(&OUTSIDE);
-    let alpha = match options.matting {
-        Matting::Guided => filtered(),
+    let alpha = if !sides_known && trimap.values.contains(&UNSURE) {
         // tied to one side only, everything would become that side
-        Matting::ClosedForm if !sides_known && trimap.values.contains(&UNSURE) => filtered(),
-        Matting::ClosedForm => match closed_form(photo, mask, trimap, &options.closed_form) {
-            Ok(matte) => matte.alpha,
-            Err(why) => {
-                warnings.push(format!("closed-form matting was replaced by the guided filter: {why}"));
-                filtered()
-            }
-        },
+        hard()
+    } else {
+        closed_form(photo, mask, trimap, &options.closed_form).map_or_else(
+            |why| {
+                warnings.push(format!("closed-form matting found no alpha, so the mask stays hard: {why}"));
+                hard()
+            },
+            |matte| matte.alpha,
+        )
     };
     let alpha = working.finish(&alpha, options);
     let band_share = unsure_share(trimap);
@@ -278,18 +259,15 @@ mod tests {
     }
 
     #[test]
-    fn a_soft_rim_is_found_from_a_hard_mask_by_either_way() {
+    fn a_soft_rim_is_found_from_a_hard_mask() {
         let (photo, truth) = disc(160, 200);
         let mask = hard(&truth, 160, 200);
-        for (matting, share) in [(Matting::ClosedForm, 0.02), (Matting::Guided, 0.4)] {
-            let options = SoftenOptions { matting, ..SoftenOptions::default() };
-            let soft = soften(&photo, &mask, &options).unwrap();
-            assert!(soft.warnings.is_empty(), "{:?}", soft.warnings);
-            let (before, after) = (error(&mask.values, &truth), error(&soft.alpha.values, &truth));
-            assert!(after < share * before, "{matting:?}: {after:.2e} of {before:.2e}");
-            // discs of 4.6 pixels each way around a circle of 2π · 60: about 3470 of 32000 pixels
-            assert!((0.09..0.13).contains(&soft.band_share), "{}", soft.band_share);
-        }
+        let soft = soften(&photo, &mask, &SoftenOptions::default()).unwrap();
+        assert!(soft.warnings.is_empty(), "{:?}", soft.warnings);
+        let (before, after) = (error(&mask.values, &truth), error(&soft.alpha.values, &truth));
+        assert!(after < 0.02 * before, "{after:.2e} of {before:.2e}");
+        // discs of 4.6 pixels each way around a circle of 2π · 60: about 3470 of 32000 pixels
+        assert!((0.09..0.13).contains(&soft.band_share), "{}", soft.band_share);
     }
 
     #[test]
@@ -310,20 +288,14 @@ mod tests {
     }
 
     #[test]
-    fn without_rounds_the_guided_filter_steps_in_and_says_so() {
+    fn without_rounds_the_mask_stays_hard_and_says_so() {
         let (photo, truth) = disc(80, 100);
         let mask = hard(&truth, 80, 100);
-        let mut options = SoftenOptions { matting: Matting::Guided, ..SoftenOptions::default() };
-        let by_filter = soften(&photo, &mask, &options).unwrap();
-        options.matting = Matting::ClosedForm;
+        let mut options = SoftenOptions::default();
         options.closed_form.rounds = 0;
         let soft = soften(&photo, &mask, &options).unwrap();
-        assert_eq!(soft.alpha, by_filter.alpha);
-        assert!(
-            soft.warnings[0].contains("guided filter") && soft.warnings.len() == 1,
-            "{:?}",
-            soft.warnings
-        );
+        assert_eq!(soft.alpha, mask);
+        assert!(soft.warnings[0].contains("stays hard") && soft.warnings.len() == 1, "{:?}", soft.warnings);
     }
 
     #[test]
@@ -335,11 +307,11 @@ mod tests {
             let soft = soften(&photo, &gray(vec![value; 64 * 80]), &options).unwrap();
             assert!(soft.alpha.values.iter().all(|&a| a == value) && soft.band_share == 0.0);
         }
-        // a line one pixel wide is all band: the filter keeps something of it, a tie to one side would not
+        // a line one pixel wide is all band: it stays as it is, where a tie to one side would lose it
         let line = gray((0..64 * 80).map(|i| if i % 64 == 30 { 255 } else { 0 }).collect());
         let soft = soften(&photo, &line, &options).unwrap();
         assert!(soft.warnings.iter().any(|w| w.contains("surely head")), "{:?}", soft.warnings);
-        assert!(soft.alpha.values.iter().any(|&a| a > 0));
+        assert_eq!(soft.alpha, line);
     }
 
     #[test]
@@ -356,8 +328,11 @@ mod tests {
             (SoftenOptions { band: Band::Squares { kernel: 0, iterations: 1 }, ..options }, "band"),
             (SoftenOptions { lowest: 0.9, highest: 0.1, ..options }, "lowest"),
             (
-                SoftenOptions { guided: GuidedOptions { radius: 0.1, epsilon: 0.0 }, ..options },
-                "guided.epsilon",
+                SoftenOptions {
+                    closed_form: ClosedFormOptions { epsilon: 0.0, ..options.closed_form },
+                    ..options
+                },
+                "closed_form.epsilon",
             ),
         ] {
             let error = soften(&photo, &mask, &options).unwrap_err();

@@ -316,13 +316,13 @@ fn window(colours: &[[u8; 3]; 9], epsilon: f64) -> ([[f64; 3]; 9], [[f64; 3]; 9]
 }
 
 /// The inverse of a symmetric matrix, each as `xx xy xz yy yz zz`.
-pub(super) fn inverted(matrix: [f64; 6]) -> [f64; 6] {
+fn inverted(matrix: [f64; 6]) -> [f64; 6] {
     let (cofactors, determinant) = cofactors(matrix);
     cofactors.map(|c| c / determinant)
 }
 
 /// A symmetric matrix `xx xy xz yy yz zz` times a vector.
-pub(super) fn product([xx, xy, xz, yy, yz, zz]: &[f64; 6], [x, y, z]: [f64; 3]) -> [f64; 3] {
+fn product([xx, xy, xz, yy, yz, zz]: &[f64; 6], [x, y, z]: [f64; 3]) -> [f64; 3] {
     [xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z]
 }
 

@@ -17,7 +17,6 @@ pub mod cut;
 mod cut_error;
 pub mod distance;
 mod font;
-pub mod guided;
 mod hull;
 mod known;
 pub mod maxflow;

@@ -1,19 +1,18 @@
 //! Masks from clicks: cut where somebody clicked, carried to every other view, made soft.
 //!
 //! ```text
-//! clicks → cut (GrabCut, or SAM) → carried through the cameras → band → matting (closed form, guided, ViTMatte) → alpha
+//! clicks → cut (GrabCut, or SAM) → carried through the cameras → band → matting (closed form, ViTMatte) → alpha
 //! ```
 
 use super::networks::Networks;
 use super::{Line, PipelineError, capture_failure};
 use crate::capture::{Capture, Split};
-use crate::config::{MaskConfig, MattingMethod};
+use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
-use crate::mask::alpha::{Matting, SoftenOptions, Working, soften};
+use crate::mask::alpha::{SoftenOptions, Working, soften};
 use crate::mask::closed_form::ClosedFormOptions;
 use crate::mask::cut::{CutOptions, cut};
-use crate::mask::guided::GuidedOptions;
 use crate::mask::points::{self, PointsError};
 use crate::mask::spread::{Masks, SpreadOptions, SpreadView, ViewMask, spread};
 use crate::mask::trimap::Band;
@@ -164,17 +163,12 @@ fn soften_options(c: &MaskConfig) -> SoftenOptions {
             0 => Band::Discs { share: c.band },
             kernel => Band::Squares { kernel, iterations: c.iterations },
         },
-        matting: match c.matting {
-            MattingMethod::Guided => Matting::Guided,
-            _ => Matting::ClosedForm,
-        },
         closed_form: ClosedFormOptions {
             epsilon: c.epsilon,
             tie: c.tie,
             hold: c.hold,
             ..defaults.closed_form
         },
-        guided: GuidedOptions { radius: c.guided_radius, epsilon: c.guided_epsilon },
         lowest: c.lowest,
         highest: c.highest,
         ..defaults
@@ -387,7 +381,6 @@ mod tests {
         assert_eq!((c.side_px, c.lowest, c.highest), (soften.side, soften.lowest, soften.highest));
         let closed = &soften.closed_form;
         assert_eq!((c.epsilon, c.tie, c.hold), (closed.epsilon, closed.tie, closed.hold));
-        assert_eq!((c.guided_radius, c.guided_epsilon), (soften.guided.radius, soften.guided.epsilon));
     }
 
     #[test]
