@@ -15,9 +15,9 @@ use clicked::{Clicked, mean_worst, overlap, read};
 use process::{cpu_s, peak_gib};
 use tiface::geom::Camera;
 use tiface::image::{Gray, Photo};
-use tiface::mask::agree::{AgreeOptions, AgreeView, agree};
-use tiface::mask::cut::{CutOptions, cut};
-use tiface::mask::spread::{SpreadOptions, SpreadView, spread};
+use tiface::mask::consistency::{AgreeOptions, AgreeView, agree};
+use tiface::mask::grabcut::{CutOptions, cut};
+use tiface::mask::propagate::{SpreadOptions, SpreadView, spread};
 use tiface::mask::{Click, CutError};
 
 fn main() {

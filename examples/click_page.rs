@@ -8,8 +8,8 @@ use std::path::PathBuf;
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 use tiface::capture::{self, CaptureOptions};
 use tiface::io::{self, Limits};
-use tiface::mask::page::{PageOptions, page_of};
-use tiface::mask::points::{Prompts, read_prompts};
+use tiface::mask::annotation::{PageOptions, page_of};
+use tiface::mask::prompts::{Prompts, read_prompts};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut paths = std::env::args_os().skip(1).map(PathBuf::from);

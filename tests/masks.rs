@@ -6,9 +6,9 @@ mod clicked;
 
 use clicked::{Clicked, mean_worst, overlap, read};
 use tiface::image::Gray;
-use tiface::mask::agree::{AgreeOptions, AgreeView, Agreement, agree};
-use tiface::mask::cut::{CutOptions, cut};
-use tiface::mask::spread::{Masks, SpreadOptions, SpreadView, spread};
+use tiface::mask::consistency::{AgreeOptions, AgreeView, Agreement, agree};
+use tiface::mask::grabcut::{CutOptions, cut};
+use tiface::mask::propagate::{Masks, SpreadOptions, SpreadView, spread};
 use tiface::mask::{Click, CutError};
 
 fn clicked_views(c: &Clicked) -> Vec<f64> {

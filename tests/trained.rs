@@ -10,7 +10,7 @@ use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 use tiface::io::{Limits, read_gray};
 use tiface::mask::Click;
 use tiface::mask::distance::squared_distance;
-use tiface::mask::points::{Frame, Prompts};
+use tiface::mask::prompts::{Frame, Prompts};
 
 fn worked(output: &Output) {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -3,7 +3,7 @@
 //! A mask votes for a cell when the cell's centre falls on the head, against it when it falls beside, and not at
 //! all outside its frame: there nothing was seen. A set of cells is drawn back into any view by its surface.
 
-use super::cut_error::CutError;
+use super::error::CutError;
 use crate::capture::carve::{Cube, Projector, meeting_point};
 use crate::geom::Camera;
 use crate::image::Gray;

@@ -8,10 +8,21 @@
 //! with size and SHA-256. Nothing is downloaded, and nothing is read but the files named, the processor
 //! file beside a network, and the ONNX Runtime library when one is named.
 
-use super::Click;
-use super::onnx::{Contract, MaskNetworkError, Runtime, Session, SessionLimits};
-use super::sam::Sam;
-use super::vitmatte::{VitMatte, VitMatteColours};
+mod onnx;
+mod processor;
+mod resample;
+mod sam;
+#[cfg(test)]
+mod tests;
+mod vitmatte;
+
+pub use self::onnx::MaskNetworkError;
+pub use self::vitmatte::VitMatteColours;
+
+use self::onnx::{Contract, Runtime, Session, SessionLimits};
+use self::sam::Sam;
+use self::vitmatte::VitMatte;
+use super::click::Click;
 use crate::image::{Gray, Photo};
 use std::path::PathBuf;
 

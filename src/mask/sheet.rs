@@ -3,10 +3,10 @@
 //! The mask's outline is cyan, the unsure band yellow; below each picture stand the view's name, how much the mask
 //! covers and how much is unsure. Views that look suspicious have a red frame and say why.
 
+use super::annotation::spread;
 use super::font;
-use super::page::spread;
+use super::matting::trimap::{UNSURE, unsure_share};
 use super::scale::{reduce_gray, reduce_photo, working_size};
-use super::trimap::{UNSURE, unsure_share};
 use crate::capture::{coverage, findings};
 use crate::image::{Gray, Photo};
 

@@ -10,12 +10,12 @@ use crate::capture::{Capture, Split};
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
-use crate::mask::alpha::{SoftenOptions, Working, soften};
-use crate::mask::closed_form::ClosedFormOptions;
-use crate::mask::cut::{CutOptions, cut};
-use crate::mask::points::{self, PointsError};
-use crate::mask::spread::{Masks, SpreadOptions, SpreadView, ViewMask, spread};
-use crate::mask::trimap::Band;
+use crate::mask::grabcut::{CutOptions, cut};
+use crate::mask::matting::closed_form::ClosedFormOptions;
+use crate::mask::matting::trimap::Band;
+use crate::mask::matting::{SoftenOptions, Working, soften};
+use crate::mask::prompts::{self, PointsError};
+use crate::mask::propagate::{Masks, SpreadOptions, SpreadView, ViewMask, spread};
 use crate::mask::{Click, CutError, distance, scale};
 use crate::run::{Failure, Fingerprint, Stage};
 use rayon::prelude::*;
@@ -70,7 +70,7 @@ pub(super) fn clicks(
     }
     let mut file = Vec::new();
     let of = if config.points.is_empty() {
-        let clicks = config.point.iter().map(|p| points::parse_point(p)).collect::<Result<Vec<_>, _>>();
+        let clicks = config.point.iter().map(|p| prompts::parse_point(p)).collect::<Result<Vec<_>, _>>();
         let view = match config.view.as_str() {
             "" => capture.views.iter().find(|v| v.split == Split::Train).or(capture.views.first()),
             name => capture.views.iter().find(|v| v.name == name),
@@ -81,16 +81,16 @@ pub(super) fn clicks(
                 hint: "`tiface inspect CAPTURE --json` lists them; names have no ending".into(),
             });
         };
-        let frame = points::Frame {
-            file_path: points::file_path(capture, view),
+        let frame = prompts::Frame {
+            file_path: prompts::file_path(capture, view),
             points: clicks.map_err(points_failure)?,
         };
-        points::Prompts { frames: vec![frame] }.clicks("mask.point", capture)
+        prompts::Prompts { frames: vec![frame] }.clicks("mask.point", capture)
     } else {
         let named = Path::new(&config.points);
         let path = if !io::is_file(named) && io::is_file(kept) { kept } else { named };
         file = io::read_bytes(path, &Limits::default())?;
-        let read = points::parse_prompts(path, &file, &Limits::default());
+        let read = prompts::parse_prompts(path, &file, &Limits::default());
         read.and_then(|prompts| prompts.clicks(&path.to_string_lossy(), capture))
     }
     .map_err(points_failure)?;
@@ -293,7 +293,7 @@ impl Line<'_> {
             false => None,
         };
         let mask = segmented.as_ref().unwrap_or(&hard.mask);
-        let failed = |e: crate::mask::alpha::AlphaError| {
+        let failed = |e: crate::mask::matting::AlphaError| {
             let hint = e.hint();
             Failure::cannot(e, hint)
         };
@@ -309,7 +309,7 @@ impl Line<'_> {
                     _ => {}
                 }
             }
-            let share = crate::mask::trimap::unsure_share(&working.trimap);
+            let share = crate::mask::matting::trimap::unsure_share(&working.trimap);
             Made { alpha: working.finish(&alpha, soft), trimap: working.trimap, unsure: share }
         } else {
             let done = soften(photo, mask, soft).map_err(failed)?;

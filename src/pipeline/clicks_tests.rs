@@ -6,7 +6,7 @@ use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::Preset;
 use crate::image::Gray;
-use crate::mask::points::{Frame, Prompts, file_path};
+use crate::mask::prompts::{Frame, Prompts, file_path};
 use crate::run::{Quiet, Stop};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -218,7 +218,7 @@ fn held_out_photographs_shape_only_their_own_masks() {
     // clicks on a test view as well: deep in its own true mask
     let mask = held_out.load_mask(&Limits::default()).unwrap().unwrap();
     let mut prompts =
-        crate::mask::points::read_prompts(Path::new(&config.mask.points), &Limits::default()).unwrap();
+        crate::mask::prompts::read_prompts(Path::new(&config.mask.points), &Limits::default()).unwrap();
     prompts
         .frames
         .push(Frame { file_path: file_path(&capture, held_out), points: carried(&mask, (120, 160)) });

@@ -6,9 +6,9 @@ use crate::capture::{self, Capture, Split};
 use crate::config::MaskMeaning;
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
-use crate::mask::agree::{AgreeOptions, AgreeView, agree};
+use crate::mask::consistency::{AgreeOptions, AgreeView, agree};
 use crate::mask::sheet::{SheetOptions, Tile, sheet};
-use crate::mask::{points, scale};
+use crate::mask::{prompts, scale};
 use crate::run::{Done, Failure, Stage};
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -246,11 +246,11 @@ pub fn disagreements(root: &std::path::Path, options: &capture::CaptureOptions) 
 pub fn click_page(capture: &Capture, prompts: Option<&std::path::Path>) -> Result<String, PipelineError> {
     let limits = Limits::default();
     let known = match prompts {
-        Some(file) => points::read_prompts(file, &limits),
-        None => Ok(points::Prompts::default()),
+        Some(file) => prompts::read_prompts(file, &limits),
+        None => Ok(prompts::Prompts::default()),
     };
     let wrong = |problem: String, hint: String| PipelineError::Clicks { problem, hint };
     let known = known.map_err(|e| wrong(e.to_string(), e.hint()))?;
-    let page = crate::mask::page::page_of(capture, &known, &Default::default(), &limits);
+    let page = crate::mask::annotation::page_of(capture, &known, &Default::default(), &limits);
     page.map_err(|e| wrong(e.to_string(), e.hint()))
 }

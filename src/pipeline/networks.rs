@@ -7,9 +7,9 @@ use crate::config::VitmatteColors;
 use crate::image::{Gray, Photo};
 use crate::io;
 use crate::mask::Click;
-use crate::mask::alpha::SoftenOptions;
+use crate::mask::matting::SoftenOptions;
 #[cfg(feature = "matting")]
-use crate::mask::{MaskNetworkError, VitMatteColours, networks};
+use crate::mask::networks::{self, MaskNetworkError, VitMatteColours};
 use crate::run::{Failure, Fingerprint};
 use serde_json::Value;
 use std::path::Path;

@@ -1,10 +1,10 @@
 //! One HTML file to click on: photographs in, `prompts.json` out.
 //!
 //! Nothing is loaded from elsewhere and nothing is sent: photographs lie inside as JPEG, reduced, while clicks
-//! are counted in pixels of the originals. The page's own text is `page.html`; names of files reach it only as
+//! are counted in pixels of the originals. The page's own text is `annotation.html`; names of files reach it only as
 //! JSON in which no character can end the element that holds it.
 
-use super::points::{Prompts, file_path};
+use super::prompts::{Prompts, file_path};
 use super::scale::{reduce_photo, working_size};
 use crate::capture::{Capture, View};
 use crate::image::Photo;
@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::Path;
 
-const TEMPLATE: &str = include_str!("page.html");
+const TEMPLATE: &str = include_str!("annotation.html");
 
 /// How photographs are put into the page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -140,7 +140,7 @@ fn inside_script(value: &Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::super::Click;
-    use super::super::points::Frame;
+    use super::super::prompts::Frame;
     use super::*;
 
     const HOSTILE: &str = "images/</script><script>alert(1)</script>&\u{2028}\"__DATA__.png";

@@ -8,8 +8,8 @@
 //!
 //! Nothing but masks and cameras is needed, so masks a person brought are checked the same way.
 
-use super::cut_error::CutError;
 use super::distance::squared_distance;
+use super::error::CutError;
 use super::hull;
 use crate::capture::carve::{Cube, Projector};
 use crate::geom::Camera;

@@ -3,15 +3,16 @@
 //! Tolerances are those of the vectors' own description: 1e-4 for embeddings, masks and logits, 5e-5 for scores
 //! and alphas, 1e-6 for normalised pixels, 2 of 255 and a mean of 0.3 for resized pictures, 1 % of mask pixels.
 
-use super::networks::{NetworkFiles, NetworkOptions, Networks};
 use super::onnx::tests::{engines, shared};
 use super::onnx::{MaskNetworkError, Runtime, Session, SessionLimits, Tensor, Values, made};
 use super::processor::IMAGENET;
 use super::sam::{Sam, normalised};
 use super::vitmatte::VitMatte;
-use super::{Click, VitMatteColours, resample};
+use super::{NetworkFiles, NetworkOptions, Networks};
+use super::{VitMatteColours, resample};
 use crate::image::{Gray, Photo};
 use crate::io::{Limits, NpyValues, read_gray, read_json, read_npy, read_photo};
+use crate::mask::Click;
 use std::fs;
 use std::path::{Path, PathBuf};
 

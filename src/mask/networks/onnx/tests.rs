@@ -432,6 +432,6 @@ fn a_file_that_is_no_library_is_refused_with_the_way_out() {
 fn the_engine_recorded_is_the_one_the_manifest_pins() {
     let version = tract::NAME.strip_prefix("tract ").unwrap();
     assert!(
-        include_str!("../../../Cargo.toml").contains(&format!("tract-onnx = {{ version = \"={version}\""))
+        include_str!("../../../../Cargo.toml").contains(&format!("tract-onnx = {{ version = \"={version}\""))
     );
 }

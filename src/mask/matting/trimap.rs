@@ -8,8 +8,8 @@
 //! `k × k` ones, `i` times, anchor `k / 2`, nothing known beyond the picture), which are pixels whatever the
 //! picture's size; and discs whose radius is a share of the height.
 
-use super::distance;
 use crate::image::Gray;
+use crate::mask::distance;
 
 /// Head, in a trimap.
 pub const HEAD: u8 = 255;

@@ -69,7 +69,7 @@ pub struct Interface {
     /// Outputs, in the file's order.
     pub outputs: Vec<Port>,
     /// Weights by the bits of their number: 32 (or 64), 16, 8 (or fewer).
-    pub(in crate::mask::onnx) weights: [u64; 3],
+    pub(in crate::mask::networks::onnx) weights: [u64; 3],
 }
 
 impl Interface {

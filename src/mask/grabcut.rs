@@ -9,75 +9,24 @@
 //!
 //! over 8 neighbours. At the end only pieces with a click stay, small holes are filled and threads are opened.
 
-use super::Click;
+pub mod maxflow;
+pub mod mixture;
+mod options;
+pub(super) mod seeds;
+
+pub use self::options::CutOptions;
+
+use self::maxflow::PixelGraph;
+use self::mixture::{Mixture, Rgb};
+use self::seeds::Known;
+use super::click::Click;
 use super::components::{fill_holes, keep_with_seeds, open};
-use super::cut_error::CutError;
-use super::known::{self, Known};
-use super::maxflow::PixelGraph;
-use super::mixture::{Mixture, Rgb};
+use super::error::CutError;
 use super::scale::reduce_to_rows;
 use crate::image::{Gray, Photo};
 
 /// Whole-number capacities per unit of energy.
 const UNIT: f64 = 1000.0;
-
-/// How masks are cut. Lengths are shares of the picture's height H.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CutOptions {
-    /// Rows of the working size; larger photographs are averaged down to it.
-    pub rows: u32,
-    /// Radius of what a click makes certain.
-    pub disc: f32,
-    /// … and at least this many working pixels.
-    pub disc_least_px: f32,
-    /// Width of the strips along top and sides that are certainly stage.
-    pub strip: f32,
-    /// How far down the strips at the sides reach; shoulders may touch the rest.
-    pub strip_sides: f32,
-    /// Radius of the discs around head clicks in the start.
-    pub start_disc: f32,
-    /// Width of the line that joins head clicks in the start.
-    pub start_line: f32,
-    /// Gaussians per mixture, 1 to 16.
-    pub gaussians: usize,
-    /// γ: what an edge between equal colours costs.
-    pub smoothness: f64,
-    /// λ/γ: what contradicting a click or strip costs.
-    pub certainty: f64,
-    /// The stage's first colours come from pixels this many times nearer to sure stage than to the head's clicks;
-    /// what lies between would teach it the colours of hair.
-    pub start_apart: f32,
-    /// Rounds of fitting and cutting from clicks.
-    pub rounds: usize,
-    /// Holes up to this share of the picture are filled.
-    pub hole: f64,
-    /// Around the outline, what colours may leave open counts as unsure within this distance.
-    pub band: f32,
-    /// Seed of the k-means start.
-    pub seed: u64,
-}
-
-impl Default for CutOptions {
-    fn default() -> CutOptions {
-        CutOptions {
-            rows: 512,
-            disc: 0.012,
-            disc_least_px: 4.0,
-            strip: 0.012,
-            strip_sides: 0.6,
-            start_disc: 0.06,
-            start_line: 0.02,
-            start_apart: 2.0,
-            gaussians: 5,
-            smoothness: 50.0,
-            certainty: 9.0,
-            rounds: 8,
-            hole: 0.01,
-            band: 0.023,
-            seed: 42,
-        }
-    }
-}
 
 /// A hard mask at the working size.
 #[derive(Clone, Debug, PartialEq)]
@@ -92,7 +41,7 @@ pub struct Cut {
 
 /// Cuts the head out of one photograph. `view` is its name in messages; clicks are pixels of `photo`.
 pub fn cut(view: &str, photo: &Photo, clicks: &[Click], options: &CutOptions) -> Result<Cut, CutError> {
-    known::check(view, clicks, photo.width, photo.height)?;
+    seeds::check(view, clicks, photo.width, photo.height)?;
     let (ground, mut warnings) = Ground::new(view, photo, clicks, options);
     let (head, models) = ground.grab(options);
     let head = ground.finish(head, options);
@@ -160,14 +109,14 @@ impl Ground {
     ) -> (Ground, Vec<String>) {
         let clicks: Vec<Click> = clicks.iter().map(|c| c.moved(size, (small.width, small.height))).collect();
         let (width, height) = (small.width as usize, small.height as usize);
-        let (known, warnings) = known::known(view, &clicks, width, height, options);
+        let (known, warnings) = seeds::known(view, &clicks, width, height, options);
         let joints = joints(&small, options.smoothness);
         (Ground { photo: small, width, height, clicks, known, joints }, warnings)
     }
 
     /// GrabCut from the clicks: labels and the colours they end with.
     pub fn grab(&self, options: &CutOptions) -> (Vec<bool>, Option<Models>) {
-        let start = known::start(&self.known, &self.clicks, self.width, self.height, options);
+        let start = seeds::start(&self.known, &self.clicks, self.width, self.height, options);
         let mut head = start.head;
         let mut models: Option<Models> = None;
         for _ in 0..options.rounds.max(1) {

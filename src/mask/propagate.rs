@@ -9,14 +9,14 @@
 //!
 //! The hull is an outer bound: it excludes and never includes, but for its core.
 
-use super::Click;
+use super::click::Click;
 use super::components::pieces;
-use super::cut::{CutOptions, Ground, Models};
-use super::cut_error::CutError;
 use super::distance::{grow, shrink};
+use super::error::CutError;
+use super::grabcut::mixture::Rgb;
+use super::grabcut::seeds::{self, Known};
+use super::grabcut::{CutOptions, Ground, Models};
 use super::hull::{self, Votes, Witness};
-use super::known::{self, Known};
-use super::mixture::Rgb;
 use super::scale::reduce_to_rows;
 use crate::capture::carve::{Cube, drop_dust};
 use crate::capture::findings;
@@ -121,7 +121,7 @@ where
     }
     for &i in &clicked {
         let v = &views[i];
-        known::check(v.name, v.clicks, v.camera.width, v.camera.height)?;
+        seeds::check(v.name, v.clicks, v.camera.width, v.camera.height)?;
     }
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
     let cube = hull::cube(&cameras, options.cells.max(8), options.cube)?;
@@ -148,7 +148,7 @@ where
                     let camera = (camera.width, camera.height);
                     return Err(CutError::Size { view: views[i].name.into(), found, camera }.into());
                 }
-                known::check_size(views[i].name, photo.width, photo.height)?;
+                seeds::check_size(views[i].name, photo.width, photo.height)?;
                 Ok(reduce_to_rows(&photo, options.cut.rows.max(16)))
             })
             .collect();

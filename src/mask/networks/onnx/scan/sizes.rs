@@ -4,7 +4,7 @@ use super::numbers::SMALL;
 use super::{Fault, HINT_DAMAGED, Node, Walk, refused, shown};
 
 /// Elements of one array that constants may ask for: 1 GiB of float32.
-pub(in crate::mask::onnx) const MAX_ELEMENTS: f64 = (1u64 << 28) as f64;
+pub(in crate::mask::networks::onnx) const MAX_ELEMENTS: f64 = (1u64 << 28) as f64;
 
 impl<'a> Walk<'a> {
     /// Computes small constants from small constants, as an engine will.

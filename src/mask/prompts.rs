@@ -9,7 +9,7 @@
 //! whatever it is reduced to later; label 1 is the head, 0 is not. The file is a stranger's: names are only
 //! compared with those of the capture, never opened, and every number is checked.
 
-use super::Click;
+use super::click::Click;
 use crate::capture::{Capture, View};
 use crate::io::{self, Limits, ReadError, WriteError};
 use serde_json::{Map, Number, Value, json};

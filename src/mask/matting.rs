@@ -9,9 +9,12 @@
 //! pixels and its outline is no sharper than the lens. Whoever has another way to find it (a matting network)
 //! takes [`Working`] and gives back its alphas.
 
-use super::closed_form::{ClosedFormOptions, closed_form};
+pub mod closed_form;
+pub mod trimap;
+
+use self::closed_form::{ClosedFormOptions, closed_form};
+use self::trimap::{Band, HEAD, OUTSIDE, UNSURE, trimap, unsure_share};
 use super::scale::{enlarge, reduce_photo, resize_hard, working_size};
-use super::trimap::{Band, HEAD, OUTSIDE, UNSURE, trimap, unsure_share};
 use crate::image::{Gray, Photo};
 
 /// Every constant on the way from a hard mask to an alpha.

@@ -4,21 +4,21 @@
 //! and the upper part of both sides. Everything else starts as head when it is nearer to the head's clicks, joined
 //! by a line, than to sure stage: this Voronoi start follows the size of the head, which no fixed radius does.
 
-use super::Click;
-use super::cut::CutOptions;
-use super::cut_error::CutError;
-use super::distance::squared_distance;
+use super::options::CutOptions;
+use crate::mask::click::Click;
+use crate::mask::distance::squared_distance;
+use crate::mask::error::CutError;
 
 /// What is certain about a pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Known {
+pub(in crate::mask) enum Known {
     Nothing,
     Head,
     Stage,
 }
 
 /// Checks the clicks on a photograph of `width` × `height` pixels, before anything is computed.
-pub(super) fn check(view: &str, clicks: &[Click], width: u32, height: u32) -> Result<(), CutError> {
+pub(in crate::mask) fn check(view: &str, clicks: &[Click], width: u32, height: u32) -> Result<(), CutError> {
     check_size(view, width, height)?;
     let view = || view.to_string();
     if clicks.is_empty() {
@@ -54,7 +54,7 @@ pub(super) fn check(view: &str, clicks: &[Click], width: u32, height: u32) -> Re
 }
 
 /// Two sides need some pixels each.
-pub(super) fn check_size(view: &str, width: u32, height: u32) -> Result<(), CutError> {
+pub(in crate::mask) fn check_size(view: &str, width: u32, height: u32) -> Result<(), CutError> {
     if width < 16 || height < 16 {
         return Err(CutError::TooSmall { view: view.into(), width, height });
     }
@@ -83,7 +83,7 @@ fn draw(marked: &mut [bool], width: usize, height: usize, a: (f32, f32), b: (f32
 }
 
 /// What is certain from the clicks: `[height · width]`, and warnings about clicks in each other's way.
-pub(super) fn known(
+pub(in crate::mask) fn known(
     view: &str,
     clicks: &[Click],
     width: usize,
@@ -135,7 +135,7 @@ pub(super) fn known(
 }
 
 /// The strips along the borders where no head is expected.
-pub(super) fn strips(width: usize, height: usize, options: &CutOptions) -> Vec<Known> {
+pub(in crate::mask) fn strips(width: usize, height: usize, options: &CutOptions) -> Vec<Known> {
     let strip = (options.strip * height as f32).ceil() as usize;
     let sides = (options.strip_sides * height as f32) as usize;
     (0..width * height)
@@ -151,7 +151,7 @@ pub(super) fn strips(width: usize, height: usize, options: &CutOptions) -> Vec<K
 }
 
 /// Where a cut starts from, each `[height · width]`.
-pub(super) struct Start {
+pub(in crate::mask) struct Start {
     /// Is the pixel nearer to the head's clicks than to sure stage?
     pub head: Vec<bool>,
     /// False where the pixel is so much nearer to sure stage that its colour is taken for the stage's.
@@ -159,7 +159,7 @@ pub(super) struct Start {
 }
 
 /// The Voronoi start.
-pub(super) fn start(
+pub(in crate::mask) fn start(
     known: &[Known],
     clicks: &[Click],
     width: usize,

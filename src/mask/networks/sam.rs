@@ -9,11 +9,11 @@
 //! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label −1 at the
 //! end when no box is given. S and the embedding's width are read from the files.
 
-use super::Click;
 use super::onnx::{Contract, MaskNetworkError, Output, Runtime, Session, SessionLimits, Tensor};
 use super::processor::{self, IMAGENET, Normal};
 use super::resample;
 use crate::image::{Gray, Photo};
+use crate::mask::click::Click;
 use std::path::Path;
 
 /// Pixels of the photograph under one cell of the embedding.
