@@ -10,6 +10,8 @@ pub struct Report {
     pub title: String,
     /// Stage and its figures.
     pub summaries: Vec<(String, Value)>,
+    /// The masks over their photographs: a part of a page, already escaped.
+    pub masks: String,
     /// Lines over training steps.
     pub curves: Vec<Curve>,
     /// Photographs with what was rendered for them.
@@ -89,6 +91,9 @@ pub fn html(report: &Report) -> String {
             let _ = writeln!(out, "<tr><td>{}</td><td>{}</td></tr>", escape(&name), escape(&value));
         }
         out.push_str("</table>\n");
+    }
+    if !report.masks.is_empty() {
+        let _ = writeln!(out, "<h2>Masks</h2>\n{}", report.masks);
     }
     if !report.curves.is_empty() {
         out.push_str("<h2>Training</h2>\n");
@@ -214,6 +219,7 @@ mod tests {
         let page = html(&Report {
             title: "<head>".into(),
             summaries: vec![("mesh".into(), json!({"closed": true, "report": {"volume": 0.25}, "p": null}))],
+            masks: "<figure>mask</figure>".into(),
             curves: vec![Curve { name: "psnr".into(), points: vec![(0.0, 1.0), (2.0, 3.0)] }],
             rows: vec![Row {
                 name: "012".into(),
@@ -229,6 +235,7 @@ mod tests {
         assert!(page.contains("<td>report.volume</td><td>0.2500</td>"));
         assert!(page.contains("points=\"0.0,160.0 420.0,0.0\""), "{page}");
         assert!(page.contains("<p>3 more views lie in"));
+        assert!(page.contains("<h2>Masks</h2>\n<figure>mask</figure>"));
         assert!(page.contains("<h3>012</h3>") && page.contains("<figcaption>ensemble</figcaption>"));
         assert!(page.contains("data:image/jpeg;base64,/9gB") && page.contains("data:image/png;base64,AQ=="));
     }

@@ -75,7 +75,7 @@ fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
     words.push(&points);
     settings.iter().for_each(|s| words.extend(["--set", *s]));
     worked(&tiface(dir.path(), &words));
-    assert!(dir.path().join("runs/head/mask/sheet.jpg").is_file());
+    assert!(dir.path().join("runs/head/mask/sheet.html").is_file());
     let mut found = Vec::new();
     for resolution in ["40", "67", "96", "150"] {
         let set = format!("mesh.resolution={resolution}");

@@ -90,7 +90,7 @@ pub fn page_of(
 ) -> Result<String, PageError> {
     let clicked = prompts.clicks("prompts.json", capture).unwrap_or_default();
     let clicked = |i: usize| clicked.get(i).is_some_and(|points| !points.is_empty());
-    let chosen = spread(capture.views.len(), options.most_views, clicked);
+    let chosen = evenly(capture.views.len(), options.most_views, clicked);
     let read = |view: &View| {
         let photo = io::read_photo(&view.photo, Some(view.photo_size), limits)?.photo;
         PageView::new(file_path(capture, view), view.declared, &photo, options)
@@ -108,7 +108,7 @@ pub fn page_of(
 }
 
 /// At most `most` of `count` indices in order: those that `wanted` names first, the others evenly.
-pub(super) fn spread(count: usize, most: usize, wanted: impl Fn(usize) -> bool) -> Vec<usize> {
+pub(super) fn evenly(count: usize, most: usize, wanted: impl Fn(usize) -> bool) -> Vec<usize> {
     let named: Vec<usize> = (0..count).filter(|&i| wanted(i)).take(most).collect();
     let rest: Vec<usize> = (0..count).filter(|i| named.binary_search(i).is_err()).collect();
     let room = (most - named.len()).min(rest.len());
@@ -186,12 +186,12 @@ mod tests {
 
     #[test]
     fn too_many_views_are_thinned_evenly_but_clicked_ones_stay() {
-        assert_eq!(spread(4, 10, |_| false), [0, 1, 2, 3]);
-        assert_eq!(spread(10, 5, |_| false), [0, 2, 4, 6, 8]);
+        assert_eq!(evenly(4, 10, |_| false), [0, 1, 2, 3]);
+        assert_eq!(evenly(10, 5, |_| false), [0, 2, 4, 6, 8]);
         // 7 stays; two of the nine others, the first of each half: 0 and the fifth, 4
-        assert_eq!(spread(10, 3, |i| i == 7), [0, 4, 7]);
-        assert_eq!(spread(10, 2, |i| i > 3), [4, 5]);
-        assert!(spread(0, 5, |_| true).is_empty() && spread(5, 0, |_| true).is_empty());
+        assert_eq!(evenly(10, 3, |i| i == 7), [0, 4, 7]);
+        assert_eq!(evenly(10, 2, |i| i > 3), [4, 5]);
+        assert!(evenly(0, 5, |_| true).is_empty() && evenly(5, 0, |_| true).is_empty());
     }
 
     #[test]

@@ -13,7 +13,6 @@ mod click;
 mod components;
 pub mod distance;
 mod error;
-mod font;
 mod hull;
 pub mod scale;
 

@@ -7,15 +7,15 @@ use crate::config::MaskMeaning;
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
 use crate::mask::consistency::{AgreeOptions, AgreeView, agree};
-use crate::mask::sheet::{SheetOptions, Tile, sheet};
+use crate::mask::sheet::{Tile, sheet};
 use crate::mask::{prompts, scale};
 use crate::run::{Done, Failure, Stage};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// The contact sheet, in the stage's folder. Not a PNG: a view may be called `sheet`.
-pub(super) const SHEET: &str = "sheet.jpg";
+/// The contact sheet, in the stage's folder.
+pub(super) const SHEET: &str = "sheet.html";
 
 /// The clicks that masks were made from, in the stage's folder: the run outlives the file they came from.
 pub(super) const CLICKS: &str = "prompts.json";
@@ -62,9 +62,7 @@ impl Line<'_> {
                 }
             }
             if !tiles.is_empty() {
-                let picture = sheet(&tiles, &SheetOptions::default());
-                let file = stage.folder().join(SHEET);
-                io::write_atomic(&file, &io::jpeg_bytes(&picture, 90, &file)?)?;
+                io::write_atomic(&stage.folder().join(SHEET), sheet(&tiles).as_bytes())?;
             }
             let suspicious: Vec<&str> =
                 tiles.iter().filter(|t| !t.suspicions.is_empty()).map(|t| t.name.as_str()).collect();
@@ -115,19 +113,19 @@ impl Line<'_> {
                 .map(|v| {
                     let Some(mask) = v.load_mask(&limits)? else { return Ok(None) };
                     let photo = v.load_photo(&limits)?;
-                    let tile = Tile::new(&v.name, &photo, &mask, None, Vec::new(), &SheetOptions::default());
+                    let tile = Tile::new(&v.name, &photo, &mask, None);
                     Ok(Some((mask, tile)))
                 })
                 .collect();
             for (k, found) in loaded.into_iter().enumerate() {
                 let view = 8 * i + k;
-                let found: Option<(Gray, Tile)> = found.map_err(capture_failure)?;
+                let found: Option<(Gray, Result<Tile, _>)> = found.map_err(capture_failure)?;
                 let Some((mask, tile)) = found else {
                     out.masks.push(None);
                     continue;
                 };
                 self.write_mask(view, &mask)?;
-                out.tiles.push(tile);
+                out.tiles.push(tile?);
                 out.shown.push(view);
                 out.masks.push(Some(for_placing(&mask)));
             }
@@ -144,8 +142,7 @@ impl Line<'_> {
         let networks = self.make_masks(stage, clicks, &mut |view, photo: &Photo, made| {
             self.write_mask(view, &made.alpha)?;
             let name = &self.capture.views[view].name;
-            let options = SheetOptions::default();
-            out.tiles.push(Tile::new(name, photo, &made.alpha, Some(&made.trimap), Vec::new(), &options));
+            out.tiles.push(Tile::new(name, photo, &made.alpha, Some(&made.trimap))?);
             out.shown.push(view);
             out.masks.push(Some(for_placing(&made.alpha)));
             unsure += made.unsure;

@@ -32,11 +32,10 @@ impl Line<'_> {
         let shown: Vec<_> = sets.iter().map(|set| (set.name.clone(), self.comparable(set))).collect();
         let (mut rows, mut bytes, mut left_out) = (Vec::new(), 0, 0);
         let masks = self.run.path("mask").join(super::mask::SHEET);
+        let mut sheet = String::new();
         if io::is_file(&masks) {
-            let sheet = io::read_bytes(&masks, &limits)?;
+            sheet = String::from_utf8_lossy(&io::read_bytes(&masks, &limits)?).into_owned();
             bytes += sheet.len();
-            let caption = "outline of the mask, unsure pixels in yellow".into();
-            rows.push(Row { name: "masks".into(), pictures: vec![Picture { caption, bytes: sheet }] });
         }
         for view in &self.capture.views {
             let mut files = Vec::new();
@@ -82,6 +81,7 @@ impl Line<'_> {
         let html = report::html(&Report {
             title: self.capture.name.clone(),
             summaries,
+            masks: crate::mask::sheet::part(&sheet).unwrap_or_default().into(),
             curves,
             rows,
             left_out,
