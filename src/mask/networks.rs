@@ -12,8 +12,6 @@ mod onnx;
 mod processor;
 mod resample;
 mod sam;
-#[cfg(test)]
-mod tests;
 mod vitmatte;
 
 pub use self::onnx::MaskNetworkError;
@@ -100,8 +98,7 @@ impl Networks {
         let sam = match (&files.sam, &files.sam_decoder) {
             (None, None) => None,
             (Some(encoder), Some(decoder)) => Some(Sam::open(encoder, decoder, runtime, &limits)?),
-            (Some(_), None) => return Err(missing("SAM's decoder", "the export's second file")),
-            (None, Some(_)) => return Err(missing("SAM's encoder", "the export's first file")),
+            _ => return Err(missing("SAM's other half", "both of its files")),
         };
         let vitmatte = files
             .vitmatte
@@ -149,16 +146,17 @@ impl Networks {
         &self.files
     }
 
-    /// Plans the networks for photographs of this size and this many clicks, so that a file the engine
-    /// cannot run is refused before the first photograph. Costs about a second with the built-in engine.
-    pub fn prepare(&self, width: u32, height: u32, clicks: usize) -> Result<(), MaskNetworkError> {
+    /// Runs the networks once, on an empty photograph of this size, so that a file that cannot be run, or gives what
+    /// is no number, is refused before the first photograph. Costs what one photograph does.
+    pub fn prepare(&self, width: u32, height: u32) -> Result<(), MaskNetworkError> {
         self.affordable(width, height)?;
-        let (w, h) = (width as usize, height as usize);
-        if let Some(sam) = &self.sam {
-            sam.prepare(w, h, clicks.max(1))?;
+        let pixels = width as usize * height as usize;
+        let photo = Photo { width, height, rgb: vec![[128; 3]; pixels], alpha: None };
+        if self.has_sam() {
+            self.segment(&photo, &[Click { x: 0.0, y: 0.0, head: true }])?;
         }
-        if let Some(vitmatte) = &self.vitmatte {
-            vitmatte.prepare(w, h)?;
+        if self.has_vitmatte() {
+            self.alpha(&photo, &Gray { width, height, values: vec![128; pixels] })?;
         }
         Ok(())
     }
@@ -182,13 +180,11 @@ impl Networks {
         if (trimap.width, trimap.height) != (photo.width, photo.height)
             || trimap.values.len() != photo.rgb.len()
         {
-            return Err(MaskNetworkError::Photo {
-                problem: format!(
-                    "it has {} × {} pixels, but its trimap {} × {}",
-                    photo.width, photo.height, trimap.width, trimap.height
-                ),
-                hint: "make the trimap from this photograph's mask".into(),
-            });
+            let problem = format!(
+                "the photograph has {} × {} pixels, but its trimap {} × {}",
+                photo.width, photo.height, trimap.width, trimap.height
+            );
+            return Err(MaskNetworkError::asked(problem, "make the trimap from this photograph's mask"));
         }
         self.affordable(photo.width, photo.height)?;
         vitmatte.alpha(photo, trimap)
@@ -235,14 +231,13 @@ impl Networks {
             return Ok(());
         }
         let gib = |bytes: u64| bytes as f64 / f64::from(1u32 << 30);
-        Err(MaskNetworkError::Photo {
-            problem: format!(
-                "{width} × {height} pixels need about {:.1} GiB in these networks, the limit is {:.1}",
-                gib(needs),
-                gib(self.memory_bytes)
+        let (needs, limit) = (gib(needs), gib(self.memory_bytes));
+        Err(MaskNetworkError::asked(
+            format!(
+                "{width} × {height} pixels need about {needs:.1} GiB in these networks, the limit is {limit:.1}"
             ),
-            hint: "make the masks at a longest side of 1024 pixels, or raise the limit".into(),
-        })
+            "make the masks at a longest side of 1024 pixels, or raise the limit",
+        ))
     }
 }
 
@@ -253,21 +248,23 @@ fn recorded(role: &'static str, session: &Session, how: &str) -> NetworkFile {
         bytes: session.bytes,
         sha256: session.sha256.clone(),
         contract: format!("{}, {how}", session.contract),
-        engine: session.engine(),
+        engine: session.engine().into(),
     }
 }
 
 fn missing(what: &'static str, file: &str) -> MaskNetworkError {
-    MaskNetworkError::Missing { what, hint: format!("name {file}; the built-in path needs no file at all") }
+    let hint = format!("name {file}; the built-in path needs no file at all");
+    MaskNetworkError::asked(format!("no file was given for {what}"), &hint)
 }
 
 fn sound(photo: &Photo) -> Result<(), MaskNetworkError> {
     let pixels = u64::from(photo.width) * u64::from(photo.height);
     if pixels == 0 || pixels != photo.rgb.len() as u64 {
-        return Err(MaskNetworkError::Photo {
-            problem: format!("{} × {} pixels, but {} colours", photo.width, photo.height, photo.rgb.len()),
-            hint: "read the photograph again".into(),
-        });
+        let problem = format!("{} × {} pixels, but {} colours", photo.width, photo.height, photo.rgb.len());
+        return Err(MaskNetworkError::asked(problem, "read the photograph again"));
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

@@ -193,17 +193,15 @@ impl Line<'_> {
         // a file that the engine cannot run is refused before the work
         let sizes: std::collections::BTreeSet<_> =
             self.capture.views.iter().map(|v| (v.camera.width, v.camera.height)).collect();
-        for &(w, h) in &sizes {
-            networks.prepare(scale::working_size(w, h, config.side_px))?;
-        }
+        let largest = sizes.into_iter().max_by_key(|&(w, h)| u64::from(w) * u64::from(h)).unwrap_or((1, 1));
+        networks.prepare(scale::working_size(largest.0, largest.1, config.side_px))?;
         for file in networks.files() {
             stage.note(&file);
         }
         let hard = self.hard(stage, clicks)?;
         let soft = soften_options(config);
         let total = hard.len();
-        let largest = sizes.into_iter().max_by_key(|&(w, h)| u64::from(w) * u64::from(h));
-        let at_once = networks.at_once(largest.unwrap_or((1, 1)), &soft, config);
+        let at_once = networks.at_once(largest, &soft, config);
         for start in (0..total).step_by(at_once) {
             let made: Vec<Result<(Photo, Made, Vec<String>), Failure>> = (start
                 ..(start + at_once).min(total))

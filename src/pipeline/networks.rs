@@ -112,12 +112,12 @@ impl Networks {
         built_in
     }
 
-    /// Plans the networks for photographs of a size, so that what the engine cannot run is refused first.
+    /// Runs the networks once on an empty photograph of a size, so that what cannot be run is refused first.
     #[cfg_attr(not(feature = "matting"), allow(unused_variables))]
     pub fn prepare(&self, (width, height): (u32, u32)) -> Result<(), Failure> {
         #[cfg(feature = "matting")]
         if let Some(of) = &self.of {
-            of.prepare(width, height, 1).map_err(failure)?;
+            of.prepare(width, height).map_err(failure)?;
         }
         Ok(())
     }

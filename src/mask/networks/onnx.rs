@@ -1,75 +1,54 @@
-//! ONNX networks in a session: a file is read once, looked through, recognised, and run by one of two engines.
+//! ONNX networks in a session: a file is read once, recognised, and run by one of two engines.
 //!
 //! | engine | when | what it runs |
 //! | --- | --- | --- |
 //! | tract (built in) | no library is named | float32 files of the public generation |
 //! | ONNX Runtime | the user names its library | those too, and recent exporters, float16, int8 |
 //!
-//! The bytes are read once: the same ones are hashed, looked through ([`scan`]) and given to the engine,
-//! so no other file is ever opened and the record tells what has really run. Nothing is downloaded.
+//! The bytes are read once: the same ones are hashed and given to the engine, and a file that would have another
+//! one opened is refused, so the record tells what has really run. Nothing is downloaded.
 //!
 //! Engines are large programs fed with a stranger's file. Every call into one runs under `catch_unwind`: a
 //! panic inside becomes an error that names the file. (The process's panic hook still shows its line, and
-//! an engine that runs out of memory ends the process; what can be foreseen is refused before.)
+//! an engine that runs out of memory ends the process; the built-in one is kept from arrays beyond a limit.)
 
 mod contract;
 mod error;
 mod ort;
-mod scan;
 mod tract;
-mod wire;
 
-pub use self::contract::Contract;
+pub use self::contract::{Contract, Port};
 pub use self::error::MaskNetworkError;
 pub use self::ort::Runtime;
-pub use self::scan::Interface;
 
-use self::scan::Fault;
 use crate::io::{self, Limits};
 use sha2::{Digest, Sha256};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
+use tract_onnx::prelude::Framework;
 
-/// The numbers of an array.
+/// An array a network takes or gives, row-major.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Values {
-    /// 32-bit floats.
-    F32(Vec<f32>),
-    /// 64-bit integers.
-    I64(Vec<i64>),
-}
-
-/// An array to feed: row-major.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Tensor {
+pub(super) struct Array {
     /// Extents.
     pub shape: Vec<usize>,
-    /// As many values as the extents' product.
-    pub values: Values,
-}
-
-impl Tensor {
-    /// An array of floats.
-    pub(super) fn f32(shape: &[usize], values: Vec<f32>) -> Tensor {
-        debug_assert_eq!(shape.iter().product::<usize>(), values.len());
-        Tensor { shape: shape.to_vec(), values: Values::F32(values) }
-    }
-
-    /// An array of integers.
-    pub(super) fn i64(shape: &[usize], values: Vec<i64>) -> Tensor {
-        debug_assert_eq!(shape.iter().product::<usize>(), values.len());
-        Tensor { shape: shape.to_vec(), values: Values::I64(values) }
-    }
-}
-
-/// An array a network gave: finite floats, row-major.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Output {
-    /// Extents.
-    pub shape: Vec<usize>,
-    /// As many values as the extents' product.
+    /// As many values as the extents' product; whole numbers where the network takes integers.
     pub values: Vec<f32>,
 }
+
+impl Array {
+    pub(super) fn new(shape: &[usize], values: Vec<f32>) -> Array {
+        debug_assert_eq!(shape.iter().product::<usize>(), values.len());
+        Array { shape: shape.to_vec(), values }
+    }
+
+    fn integers(&self) -> Vec<i64> {
+        self.values.iter().map(|&v| v as i64).collect()
+    }
+}
+
+/// Every input of a network, in the file's order, with what it is fed.
+type Fed<'a> = [(&'a Port, &'a Array)];
 
 /// What bounds a session.
 #[derive(Clone, Debug)]
@@ -95,60 +74,80 @@ pub(super) struct Session {
     pub bytes: u64,
     /// SHA-256 of the file, in hexadecimal.
     pub sha256: String,
-    /// What it takes and gives.
-    pub interface: Interface,
+    /// What it takes, in the file's order.
+    pub inputs: Vec<Port>,
     /// Which network it is.
     pub contract: Contract,
     engine: Engine,
 }
 
 impl Session {
-    /// Reads, looks through, recognises and loads a file; with `runtime` ONNX Runtime runs it, else tract.
+    /// Reads, recognises and loads a file; with `runtime` ONNX Runtime runs it, else tract.
     pub(super) fn open(
         path: &Path,
         runtime: Option<&Runtime>,
         limits: &SessionLimits,
     ) -> Result<Session, MaskNetworkError> {
-        let reading = Limits { file_bytes: limits.file_bytes, ..Limits::default() };
-        let bytes = io::read_bytes(path, &reading)?;
-        let interface = scan::scan(&bytes).map_err(|fault| match fault {
-            Fault::Broken(broken) => {
-                MaskNetworkError::NotOnnx { path: path.into(), offset: broken.at, problem: broken.problem }
-            }
-            Fault::Refused(problem, hint) => {
-                MaskNetworkError::Refused { path: path.into(), problem, hint: hint.into() }
-            }
-        })?;
-        let contract = contract::recognise(&interface).map_err(|why| MaskNetworkError::NotRecognised {
-            path: path.into(),
-            found: format!("{why} ({})", interface.in_words()),
-            hint:
-                "give a SAM encoder and its decoder, or a ViTMatte network, exported with transformers or by \
-                   SAM's own script"
-                    .into(),
+        let wrong = |problem: String, hint| MaskNetworkError::file(path, problem, hint);
+        let bytes = io::read_bytes(path, &Limits { file_bytes: limits.file_bytes, ..Limits::default() })?;
+        if names_another_file(&bytes) {
+            return Err(wrong(
+                "is refused: its weights lie in another file".into(),
+                "take a file that holds its weights itself; `onnx.save(onnx.load(FILE), NEW)` in Python makes one",
+            ));
+        }
+        let read = || tract_onnx::onnx().proto_model_for_read(&mut &bytes[..]).map_err(|e| format!("{e:#}"));
+        let not_onnx = |why: String| {
+            let hint = "copy the file again; a broken download, or the web page around it, looks like this";
+            wrong(format!("is not a sound ONNX file: {}", shown(&why)), hint)
+        };
+        let proto = guarded(read).map_err(not_onnx)?;
+        let graph = proto.graph.as_ref().ok_or_else(|| not_onnx("it holds no graph".into()))?;
+        // older files list their weights among the inputs
+        let weights: std::collections::HashSet<_> = graph.initializer.iter().map(|t| &t.name).collect();
+        let inputs = graph.input.iter().filter(|p| !weights.contains(&p.name));
+        let inputs: Vec<Port> = inputs.map(Port::new).collect();
+        let outputs: Vec<Port> = graph.output.iter().map(Port::new).collect();
+        let contract = contract::recognise(&inputs, &outputs).map_err(|why| {
+            wrong(
+                format!("is no SAM or ViTMatte network: {why}"),
+                "give a SAM encoder and its decoder, or a ViTMatte network, exported with transformers or by SAM's \
+                 own script",
+            )
         })?;
         let engine = match runtime {
-            None => {
-                let outputs = interface.outputs.iter().map(|p| p.name.clone()).collect();
-                guarded(|| tract::Model::load(&bytes, outputs, limits.array_bytes))
-                    .map(|model| Engine::Tract(Box::new(model)))
+            None => guarded(|| tract::Model::load(&proto, contract.outputs(), limits.array_bytes))
+                .map(|model| Engine::Tract(Box::new(model))),
+            Some(runtime) => {
+                guarded(|| ort::Model::load(runtime, &bytes, contract.outputs(), limits.threads))
+                    .map(Engine::Ort)
             }
-            Some(runtime) => guarded(|| ort::Model::load(runtime, &bytes, limits.threads)).map(Engine::Ort),
         };
-        let engine = match engine {
-            Ok(engine) => engine,
-            Err(problem) => return Err(engine_error(path, &interface, runtime.is_some(), "load", problem)),
-        };
+        let engine = engine.map_err(|problem| engine_error(path, runtime.is_some(), "load", &problem))?;
         let sha256 = hexadecimal(&bytes);
-        Ok(Session { path: path.into(), bytes: bytes.len() as u64, sha256, interface, contract, engine })
+        Ok(Session { path: path.into(), bytes: bytes.len() as u64, sha256, inputs, contract, engine })
+    }
+
+    /// Opens a file that must be of one of these forms.
+    pub(super) fn open_as(
+        given_as: &str,
+        is_one: fn(Contract) -> bool,
+        path: &Path,
+        runtime: Option<&Runtime>,
+        limits: &SessionLimits,
+    ) -> Result<Session, MaskNetworkError> {
+        let session = Session::open(path, runtime, limits)?;
+        if is_one(session.contract) {
+            return Ok(session);
+        }
+        let is = session.contract.to_string();
+        let hint = format!("give the file where a {is} is asked for");
+        Err(MaskNetworkError::file(path, format!("is a {is}, but was given as {given_as}"), &hint))
     }
 
     /// Name and version of the engine.
-    pub(super) fn engine(&self) -> String {
-        match &self.engine {
-            Engine::Tract(_) => tract::NAME.into(),
-            Engine::Ort(_) => ort::NAME.into(),
-        }
+    pub(super) fn engine(&self) -> &'static str {
+        if self.runs_alone() { ort::NAME } else { tract::NAME }
     }
 
     /// Does one run at a time use all threads? tract runs several side by side, each on one thread.
@@ -156,41 +155,31 @@ impl Session {
         matches!(self.engine, Engine::Ort(_))
     }
 
-    /// Makes ready for inputs of these shapes, so that a file that cannot be run is refused early.
-    pub(super) fn prepare(
-        &self,
-        inputs: &[(&str, Tensor)],
-        outputs: &[&str],
-    ) -> Result<(), MaskNetworkError> {
-        match &self.engine {
-            Engine::Tract(model) => guarded(|| model.plan(inputs, outputs).map(|_| ()))
-                .map_err(|problem| engine_error(&self.path, &self.interface, false, "load", problem)),
-            Engine::Ort(_) => Ok(()),
-        }
-    }
-
-    /// Feeds the inputs by name; gives the outputs asked for, every number of them finite.
-    pub(super) fn run(
-        &self,
-        inputs: &[(&str, Tensor)],
-        outputs: &[&str],
-    ) -> Result<Vec<Output>, MaskNetworkError> {
-        self.prepare(inputs, outputs)?;
-        let given = match &self.engine {
-            Engine::Tract(model) => guarded(|| model.run(inputs, outputs)),
-            Engine::Ort(model) => guarded(|| model.run(inputs, outputs)),
+    /// Feeds the inputs by name; gives the outputs of its form, every number of them finite.
+    pub(super) fn run(&self, inputs: &[(&str, Array)]) -> Result<Vec<Array>, MaskNetworkError> {
+        let run = || {
+            let mut fed = Vec::new();
+            for port in &self.inputs {
+                let found = inputs.iter().find(|(name, _)| *name == port.name);
+                fed.push((port, &found.ok_or(format!("`{}` is not fed", port.name))?.1));
+            }
+            match &self.engine {
+                Engine::Tract(model) => model.run(&fed),
+                Engine::Ort(model) => model.run(&fed),
+            }
         };
-        let given = given.map_err(|problem| {
-            engine_error(&self.path, &self.interface, self.runs_alone(), "run", problem)
-        })?;
-        for (name, output) in outputs.iter().zip(&given) {
+        let given = guarded(run).map_err(|e| engine_error(&self.path, self.runs_alone(), "run", &e))?;
+        let names = self.contract.outputs();
+        if given.len() != names.len() {
+            return Err(self.unusable(names[0], "the engine left outputs out"));
+        }
+        for (name, output) in names.iter().zip(&given) {
             if output.shape.iter().product::<usize>() != output.values.len() {
                 return Err(self.unusable(name, "its numbers do not fill its extents"));
             }
             if let Some(i) = output.values.iter().position(|v| !v.is_finite()) {
-                let of = output.values.len();
-                let problem = format!("number {} of {of} is {}", i + 1, output.values[i]);
-                return Err(self.unusable(name, problem));
+                let (v, of) = (output.values[i], output.values.len());
+                return Err(self.unusable(name, format!("number {} of {of} is {v}", i + 1)));
             }
         }
         Ok(given)
@@ -203,9 +192,17 @@ impl Session {
 
     /// Extent of one axis of an input, where the file fixes it.
     pub(super) fn input_extent(&self, name: &str, axis: usize) -> Option<usize> {
-        let port = self.interface.inputs.iter().find(|p| p.name == name)?;
-        port.extent(axis).and_then(|d| usize::try_from(d).ok())
+        self.inputs.iter().find(|p| p.name == name)?.extent(axis)
     }
+}
+
+/// Could an engine open another file for this one's sake? Weights elsewhere are named by an entry with the key
+/// `location`, and pieces compiled for a device by the operator `EPContext`. Whatever the message around them, in
+/// functions or training graphs too, the key's eight letters stand behind their length: 8, or 8 spelled longer.
+fn names_another_file(bytes: &[u8]) -> bool {
+    let at = |i: usize| bytes[..i].last().is_some_and(|&length| length == 8 || length == 0);
+    bytes.windows(8).enumerate().any(|(i, w)| w == b"location" && at(i))
+        || bytes.windows(9).any(|w| w == b"EPContext")
 }
 
 /// SHA-256 in hexadecimal.
@@ -215,52 +212,32 @@ fn hexadecimal(bytes: &[u8]) -> String {
 
 /// Runs a piece of an engine; a panic inside becomes its message.
 ///
-/// `AssertUnwindSafe`: what an engine shares between runs is a list of finished plans behind a lock, changed
-/// by one push, so a run that panics leaves nothing half made that a later run would see.
+/// `AssertUnwindSafe`: what an engine shares between runs is a map of finished plans behind a lock, changed
+/// by one insertion, so a run that panics leaves nothing half made that a later run would see.
 fn guarded<T>(piece: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
-    match catch_unwind(AssertUnwindSafe(piece)) {
-        Ok(result) => result,
-        Err(panic) => {
-            let said = panic
-                .downcast_ref::<String>()
-                .map(String::as_str)
-                .or_else(|| panic.downcast_ref::<&str>().copied())
-                .unwrap_or("it gave no reason");
-            Err(format!("it broke down: {said}"))
-        }
-    }
+    catch_unwind(AssertUnwindSafe(piece)).unwrap_or_else(|panic| {
+        let said = panic.downcast_ref::<String>().map(String::as_str);
+        let said = said.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("it gave no reason");
+        Err(format!("it broke down: {said}"))
+    })
 }
 
-fn engine_error(
-    path: &Path,
-    interface: &Interface,
-    runtime: bool,
-    doing: &'static str,
-    problem: String,
-) -> MaskNetworkError {
-    let narrow = if interface.is_float32() { "" } else { ", or use the float32 file of this network" };
-    let hint = if runtime {
-        format!("take a newer ONNX Runtime, or the file from its publisher again{narrow}")
-    } else {
-        format!(
-            "ONNX Runtime runs files that the built-in engine cannot: name its library, 1.17 or later \
-             (`pip install onnxruntime` brings one){narrow}"
-        )
+fn engine_error(path: &Path, runtime: bool, doing: &'static str, problem: &str) -> MaskNetworkError {
+    let (engine, hint) = match runtime {
+        true => (ort::NAME, "take a newer ONNX Runtime, or the float32 file from its publisher again"),
+        false => (
+            tract::NAME,
+            "use the float32 file of this network, or ONNX Runtime, which runs files that the built-in engine \
+             cannot: name its library, 1.17 or later (`pip install onnxruntime` brings one)",
+        ),
     };
-    let engine = if runtime { ort::NAME } else { tract::NAME };
-    MaskNetworkError::Engine {
-        path: path.into(),
-        engine: engine.into(),
-        doing,
-        problem: in_one_line(&problem),
-        hint,
-    }
+    MaskNetworkError::Engine { path: path.into(), engine, doing, problem: shown(problem), hint }
 }
 
-/// What an engine says, without line breaks and not endless.
-fn in_one_line(said: &str) -> String {
-    let words: Vec<&str> = said.split_whitespace().collect();
-    let line = words.join(" ");
+/// What an engine or a file says: one line, no control characters, not endless.
+fn shown(said: &str) -> String {
+    let line = said.split_whitespace().collect::<Vec<_>>().join(" ");
+    let line: String = line.chars().filter(|c| !c.is_control()).collect();
     match line.char_indices().nth(300) {
         Some((end, _)) => format!("{}…", &line[..end]),
         None => line,

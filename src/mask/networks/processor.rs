@@ -56,7 +56,10 @@ pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>, Ma
     if !says.is_empty() && !says.iter().any(|s| s.starts_with(kind)) {
         return Ok(None);
     }
-    let wrong = |problem: String| MaskNetworkError::Processor { path: path.clone(), problem };
+    let wrong = |problem: String| {
+        let hint = "take the processor file of the same export, or remove it: then the network's published numbers hold";
+        MaskNetworkError::file(&path, format!("is unusable: {problem}"), hint)
+    };
     let three = |key: &str, usual: [f64; 3], sound: fn(f64) -> bool| -> Result<[f64; 3], MaskNetworkError> {
         let value = &json[key];
         if value.is_null() {
@@ -118,7 +121,7 @@ mod tests {
             r#"{"pad_size": {"height": 1000}}"#,
         ] {
             let error = at(text, "sam").unwrap_err();
-            assert!(matches!(error, MaskNetworkError::Processor { .. }), "{error}");
+            assert!(matches!(error, MaskNetworkError::File { .. }), "{error}");
         }
         assert!(matches!(at("{", "sam"), Err(MaskNetworkError::Read(_))));
     }

@@ -9,7 +9,7 @@
 //! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label −1 at the
 //! end when no box is given. S and the embedding's width are read from the files.
 
-use super::onnx::{Contract, MaskNetworkError, Output, Runtime, Session, SessionLimits, Tensor};
+use super::onnx::{Array, Contract, MaskNetworkError, Runtime, Session, SessionLimits};
 use super::processor::{self, IMAGENET, Normal};
 use super::resample;
 use crate::image::{Gray, Photo};
@@ -37,7 +37,7 @@ pub(super) struct Sam {
 /// What the encoder makes of a photograph, and how the photograph lay in the square.
 pub(super) struct Embedding {
     /// `image_embeddings`, and for the split export `image_positional_embeddings`.
-    arrays: Vec<Output>,
+    arrays: Vec<Array>,
     /// Width and height inside the square.
     new: (usize, usize),
     /// Width and height of the photograph.
@@ -61,23 +61,13 @@ impl Sam {
         runtime: Option<&Runtime>,
         limits: &SessionLimits,
     ) -> Result<Sam, MaskNetworkError> {
-        let wrong = |s: &Session, given_as: &str| MaskNetworkError::WrongRole {
-            path: s.path.clone(),
-            is: s.contract.to_string(),
-            given_as: given_as.into(),
-        };
-        let encoder = Session::open(encoder, runtime, limits)?;
-        if !matches!(encoder.contract, Contract::SamEncoder | Contract::OriginalEncoder { .. }) {
-            return Err(wrong(&encoder, "the SAM encoder"));
-        }
-        let decoder = Session::open(decoder, runtime, limits)?;
-        if !matches!(decoder.contract, Contract::SamDecoder { .. } | Contract::OriginalDecoder) {
-            return Err(wrong(&decoder, "the SAM decoder"));
-        }
-        let mismatch = |problem: String| MaskNetworkError::Mismatch {
-            encoder: encoder.path.clone(),
-            decoder: decoder.path.clone(),
-            problem,
+        let encodes = |c| matches!(c, Contract::SamEncoder | Contract::OriginalEncoder { .. });
+        let decodes = |c| matches!(c, Contract::SamDecoder { .. } | Contract::OriginalDecoder);
+        let encoder = Session::open_as("the SAM encoder", encodes, encoder, runtime, limits)?;
+        let decoder = Session::open_as("the SAM decoder", decodes, decoder, runtime, limits)?;
+        let mismatch = |problem: String| {
+            let problem = format!("does not fit to `{}`: {problem}", decoder.path.display());
+            MaskNetworkError::file(&encoder.path, problem, "take encoder and decoder from the same export")
         };
         if matches!(encoder.contract, Contract::OriginalEncoder { .. })
             && matches!(decoder.contract, Contract::SamDecoder { .. })
@@ -85,16 +75,12 @@ impl Sam {
             return Err(mismatch(format!("the decoder wants `{POSITION}`, which the encoder does not give")));
         }
         let processor = processor::beside(&encoder.path, "sam")?;
-        let takes = &encoder.interface.inputs[0];
+        let takes = &encoder.inputs[0];
         let fixed = match encoder.contract {
             Contract::OriginalEncoder { picture: true } => None,
-            _ => takes.extent(2).or(takes.extent(3)).map(|s| s as usize),
+            _ => takes.extent(2).or(takes.extent(3)),
         };
-        if takes
-            .dims
-            .as_ref()
-            .is_some_and(|d| d.len() == 4 && d[2] != d[3] && d[2].is_some() && d[3].is_some())
-        {
+        if takes.extent(2).zip(takes.extent(3)).is_some_and(|(rows, columns)| rows != columns) {
             return Err(mismatch(format!("the encoder's input {} is not square", takes.shape_in_words())));
         }
         let grid = decoder.input_extent(EMBEDDING, 2).or(decoder.input_extent(EMBEDDING, 3));
@@ -124,37 +110,12 @@ impl Sam {
         (fit(width), fit(height))
     }
 
-    /// Makes the plans for photographs of this size and for `clicks` clicks.
-    pub(super) fn prepare(&self, width: usize, height: usize, clicks: usize) -> Result<(), MaskNetworkError> {
-        let (w, h) = self.fitted(width, height);
-        let shape: &[usize] = match self.encoder.contract {
-            Contract::OriginalEncoder { picture: true } => &[h, w, 3],
-            _ => &[1, 3, self.side, self.side],
-        };
-        let blank = Tensor::f32(shape, vec![0.0; shape.iter().product()]);
-        self.encoder.prepare(&[(&self.encoder.interface.inputs[0].name, blank)], self.encoder_outputs())?;
-        // the embedding's width, unless the decoder leaves it open: then its plan waits for the first run
-        let Some(depth) = self.decoder.input_extent(EMBEDDING, 1) else { return Ok(()) };
-        let cells = self.side / CELL;
-        let blank = Output { shape: vec![1, depth, cells, cells], values: vec![0.0; depth * cells * cells] };
-        let embedding = Embedding { arrays: vec![blank.clone(), blank], new: (w, h), old: (width, height) };
-        let (inputs, outputs) = self.prompt(&embedding, &vec![Click { x: 0.0, y: 0.0, head: true }; clicks]);
-        self.decoder.prepare(&inputs, outputs)
-    }
-
-    fn encoder_outputs(&self) -> &'static [&'static str] {
-        match self.decoder.contract {
-            Contract::SamDecoder { .. } => &[EMBEDDING, POSITION],
-            _ => &[EMBEDDING],
-        }
-    }
-
     /// The photograph as the encoder takes it.
-    pub(super) fn pixels(&self, photo: &Photo) -> Tensor {
+    pub(super) fn pixels(&self, photo: &Photo) -> Array {
         let (w, h) = self.fitted(photo.width as usize, photo.height as usize);
         let rgb = resample::photo(photo, w, h);
         if let Contract::OriginalEncoder { picture: true } = self.encoder.contract {
-            return Tensor::f32(&[h, w, 3], rgb.iter().flatten().map(|&v| f32::from(v)).collect());
+            return Array::new(&[h, w, 3], rgb.iter().flatten().map(|&v| f32::from(v)).collect());
         }
         normalised(&rgb, w, self.side, &self.normal)
     }
@@ -163,8 +124,8 @@ impl Sam {
     pub(super) fn embed(&self, photo: &Photo) -> Result<Embedding, MaskNetworkError> {
         let old = (photo.width as usize, photo.height as usize);
         let pixels = self.pixels(photo);
-        let names = self.encoder_outputs();
-        let arrays = self.encoder.run(&[(&self.encoder.interface.inputs[0].name, pixels)], names)?;
+        let names = self.encoder.contract.outputs();
+        let arrays = self.encoder.run(&[(&self.encoder.inputs[0].name, pixels)])?;
         let cells = self.side / CELL;
         let depth = self.decoder.input_extent(EMBEDDING, 1);
         for (name, array) in names.iter().zip(&arrays) {
@@ -179,47 +140,38 @@ impl Sam {
         Ok(Embedding { arrays, new: self.fitted(old.0, old.1), old })
     }
 
-    /// The decoder's inputs for these clicks, and the outputs to ask for.
-    pub(super) fn prompt(
-        &self,
-        embedding: &Embedding,
-        clicks: &[Click],
-    ) -> (Vec<(&'static str, Tensor)>, &'static [&'static str]) {
-        let (sx, sy) = (
-            embedding.new.0 as f64 / embedding.old.0 as f64,
-            embedding.new.1 as f64 / embedding.old.1 as f64,
-        );
-        let mut points: Vec<f32> = clicks
-            .iter()
-            .flat_map(|c| [(f64::from(c.x) * sx) as f32, (f64::from(c.y) * sy) as f32])
-            .collect();
-        let array = |i: usize| Tensor::f32(&embedding.arrays[i].shape, embedding.arrays[i].values.clone());
+    /// The decoder's inputs for these clicks.
+    pub(super) fn prompt(&self, embedding: &Embedding, clicks: &[Click]) -> Vec<(&'static str, Array)> {
+        let (new, old) = (embedding.new, embedding.old);
+        let (sx, sy) = (new.0 as f64 / old.0 as f64, new.1 as f64 / old.1 as f64);
+        let placed = |c: &Click| [(f64::from(c.x) * sx) as f32, (f64::from(c.y) * sy) as f32];
+        let mut points: Vec<f32> = clicks.iter().flat_map(placed).collect();
+        let array = |i: usize| embedding.arrays[i].clone();
+        let label = |c: &Click| f32::from(u8::from(c.head));
         let n = clicks.len();
         if let Contract::SamDecoder { labels } = self.decoder.contract {
             let mut inputs = vec![
-                ("input_points", Tensor::f32(&[1, 1, n, 2], points)),
+                ("input_points", Array::new(&[1, 1, n, 2], points)),
                 (EMBEDDING, array(0)),
                 (POSITION, array(1)),
             ];
             if labels {
-                let each = clicks.iter().map(|c| i64::from(c.head)).collect();
-                inputs.push(("input_labels", Tensor::i64(&[1, 1, n], each)));
+                inputs.push(("input_labels", Array::new(&[1, 1, n], clicks.iter().map(label).collect())));
             }
-            return (inputs, &["iou_scores", "pred_masks"]);
+            return inputs;
         }
         // no box: the original code fills its place with this point
         points.extend([0.0, 0.0]);
-        let labels = clicks.iter().map(|c| f32::from(u8::from(c.head))).chain([-1.0]).collect();
+        let labels = clicks.iter().map(label).chain([-1.0]).collect();
         let quarter = self.side / 4;
-        let inputs = vec![
+        vec![
             (EMBEDDING, array(0)),
-            ("point_coords", Tensor::f32(&[1, n + 1, 2], points)),
-            ("point_labels", Tensor::f32(&[1, n + 1], labels)),
-            ("mask_input", Tensor::f32(&[1, 1, quarter, quarter], vec![0.0; quarter * quarter])),
-            ("has_mask_input", Tensor::f32(&[1], vec![0.0])),
-            ("orig_im_size", Tensor::f32(&[2], vec![embedding.old.1 as f32, embedding.old.0 as f32])),
-        ];
-        (inputs, &["iou_predictions", "low_res_masks"])
+            ("point_coords", Array::new(&[1, n + 1, 2], points)),
+            ("point_labels", Array::new(&[1, n + 1], labels)),
+            ("mask_input", Array::new(&[1, 1, quarter, quarter], vec![0.0; quarter * quarter])),
+            ("has_mask_input", Array::new(&[1], vec![0.0])),
+            ("orig_im_size", Array::new(&[2], vec![old.1 as f32, old.0 as f32])),
+        ]
     }
 
     /// Runs the decoder.
@@ -229,9 +181,9 @@ impl Sam {
         clicks: &[Click],
     ) -> Result<Candidates, MaskNetworkError> {
         self.check(clicks, embedding.old)?;
-        let (inputs, names) = self.prompt(embedding, clicks);
-        let given = self.decoder.run(&inputs, names)?;
-        let [scores, logits] = <[Output; 2]>::try_from(given)
+        let names = self.decoder.contract.outputs();
+        let given = self.decoder.run(&self.prompt(embedding, clicks))?;
+        let [scores, logits] = <[Array; 2]>::try_from(given)
             .map_err(|_| self.decoder.unusable(names[0], "the engine left it out"))?;
         let quarter = self.side / 4;
         let split = matches!(self.decoder.contract, Contract::SamDecoder { .. });
@@ -272,8 +224,9 @@ impl Sam {
     }
 
     fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<(), MaskNetworkError> {
-        let fault =
-            |problem: String, hint: &str| Err(MaskNetworkError::Clicks { problem, hint: hint.into() });
+        let fault = |problem: String, hint: &str| {
+            Err(MaskNetworkError::asked(format!("the clicks cannot be used: {problem}"), hint))
+        };
         if !clicks.iter().any(|c| c.head) {
             return fault("none of them is on the head".into(), "click at least the face and the hair");
         }
@@ -304,7 +257,7 @@ impl Sam {
 }
 
 /// `[1, 3, side, side]`: normalised colours in the upper left, zeros right and below.
-pub(super) fn normalised(rgb: &[[u8; 3]], width: usize, side: usize, normal: &Normal) -> Tensor {
+pub(super) fn normalised(rgb: &[[u8; 3]], width: usize, side: usize, normal: &Normal) -> Array {
     let mut values = vec![0.0; 3 * side * side];
     for (i, colour) in rgb.iter().enumerate() {
         let at = i / width * side + i % width;
@@ -312,7 +265,7 @@ pub(super) fn normalised(rgb: &[[u8; 3]], width: usize, side: usize, normal: &No
             values[c * side * side + at] = normal.apply(colour[c], c);
         }
     }
-    Tensor::f32(&[1, 3, side, side], values)
+    Array::new(&[1, 3, side, side], values)
 }
 
 /// The first of the highest scores from `begin` on.
@@ -347,7 +300,7 @@ mod tests {
     fn normalised_colours_lie_in_the_corner_and_zeros_around_them() {
         // 2 × 1 pixels in a square of 3: red (255 − 0.485 · 255) / (0.229 · 255) = 2.2489
         let tensor = normalised(&[[255, 0, 0], [0, 0, 0]], 2, 3, &IMAGENET);
-        let super::super::onnx::Values::F32(values) = tensor.values else { panic!() };
+        let values = tensor.values;
         assert!((values[0] - 2.248_908).abs() < 1e-5 && (values[1] + 2.117_904).abs() < 1e-5);
         assert_eq!(values[2..9], [0.0; 7]);
     }

@@ -9,7 +9,7 @@
 //!
 //! The file `preprocessor_config.json` beside the network means the second; without it, the first.
 
-use super::onnx::{Contract, MaskNetworkError, Runtime, Session, SessionLimits, Tensor};
+use super::onnx::{Array, Contract, MaskNetworkError, Runtime, Session, SessionLimits};
 use super::processor::{self, IMAGENET, Normal};
 use crate::image::{Gray, Photo};
 use std::path::Path;
@@ -41,14 +41,8 @@ impl VitMatte {
         limits: &SessionLimits,
         colours: Option<VitMatteColours>,
     ) -> Result<VitMatte, MaskNetworkError> {
-        let session = Session::open(path, runtime, limits)?;
-        if session.contract != Contract::VitMatte {
-            return Err(MaskNetworkError::WrongRole {
-                path: path.into(),
-                is: session.contract.to_string(),
-                given_as: "the ViTMatte network".into(),
-            });
-        }
+        let is_one = |c| c == Contract::VitMatte;
+        let session = Session::open_as("the ViTMatte network", is_one, path, runtime, limits)?;
         let half = Normal { mean: [0.5; 3], std: [0.5; 3] };
         let (colours, normal) = match colours {
             Some(VitMatteColours::ImageNet) => (VitMatteColours::ImageNet, IMAGENET),
@@ -74,26 +68,18 @@ impl VitMatte {
         };
         match (fit(width, 3), fit(height, 2)) {
             (Some(w), Some(h)) => Ok((w, h)),
-            _ => Err(MaskNetworkError::Photo {
-                problem: format!(
-                    "it has {width} × {height} pixels, but `{}` takes only {}",
-                    self.session.path.display(),
-                    self.session.interface.inputs[0].shape_in_words()
-                ),
-                hint: "use the network's file that leaves width and height open".into(),
-            }),
+            _ => {
+                let (file, shape) = (self.session.path.display(), self.session.inputs[0].shape_in_words());
+                Err(MaskNetworkError::asked(
+                    format!("the photograph has {width} × {height} pixels, but `{file}` takes only {shape}"),
+                    "use the network's file that leaves width and height open",
+                ))
+            }
         }
     }
 
-    /// Makes the plan for photographs of this size.
-    pub(super) fn prepare(&self, width: usize, height: usize) -> Result<(), MaskNetworkError> {
-        let (w, h) = self.padded(width, height)?;
-        let blank = Tensor::f32(&[1, 4, h, w], vec![0.0; 4 * h * w]);
-        self.session.prepare(&[("pixel_values", blank)], &["alphas"])
-    }
-
     /// Colours and trimap as the network takes them: `[1, 4, h, w]`, zeros right and below.
-    pub(super) fn pixels(&self, photo: &Photo, trimap: &Gray, padded: (usize, usize)) -> Tensor {
+    pub(super) fn pixels(&self, photo: &Photo, trimap: &Gray, padded: (usize, usize)) -> Array {
         let (w, h) = padded;
         let plane = w * h;
         let mut values = vec![0.0; 4 * plane];
@@ -111,7 +97,7 @@ impl VitMatte {
                 (VitMatteColours::ImageNet, _) => 1.0,
             };
         }
-        Tensor::f32(&[1, 4, h, w], values)
+        Array::new(&[1, 4, h, w], values)
     }
 
     /// Alpha in 0..=1 of each pixel, `[height · width]`, as the network says it: no cutting near 0 and 1.
@@ -119,13 +105,12 @@ impl VitMatte {
         let (width, height) = (photo.width as usize, photo.height as usize);
         let (w, h) = self.padded(width, height)?;
         let pixels = self.pixels(photo, trimap, (w, h));
-        let given = self.session.run(&[("pixel_values", pixels)], &["alphas"])?;
-        let Some(alphas) = given.first().filter(|a| a.shape == [1, 1, h, w]) else {
-            let shape = given.first().map(|a| a.shape.clone()).unwrap_or_default();
-            return Err(self
-                .session
-                .unusable("alphas", format!("it is {shape:?}, expected [1, 1, {h}, {w}]")));
-        };
+        let given = self.session.run(&[("pixel_values", pixels)])?;
+        let alphas = &given[0];
+        if alphas.shape != [1, 1, h, w] {
+            let problem = format!("it is {:?}, expected [1, 1, {h}, {w}]", alphas.shape);
+            return Err(self.session.unusable("alphas", problem));
+        }
         if let Some(v) = alphas.values.iter().find(|v| !(-0.01..=1.01).contains(*v)) {
             return Err(self.session.unusable("alphas", format!("it holds {v}, expected 0 to 1")));
         }

@@ -1,15 +1,13 @@
 //! Which network a file is, by its inputs and outputs and never by its name.
-//!
-//! | form | inputs → outputs |
-//! | --- | --- |
-//! | split SAM encoder | `pixel_values` `[B,3,S,S]` → `image_embeddings`, `image_positional_embeddings` |
-//! | split SAM decoder | `input_points`, `input_labels` (absent in the oldest), both embeddings → `iou_scores`, `pred_masks` |
-//! | original encoder | a picture `[H,W,3]` 0..255, or normalised `[1,3,S,S]` → `image_embeddings` |
-//! | original decoder | `image_embeddings`, `point_coords`, `point_labels`, `mask_input`, `has_mask_input`, `orig_im_size` → `iou_predictions`, `low_res_masks` |
-//! | ViTMatte | `pixel_values` `[B,4,H,W]` → `alphas` `[B,1,H,W]` |
 
-use super::scan::{Interface, Kind, Port};
+use super::shown;
 use std::fmt;
+use tract_onnx::pb;
+
+/// ONNX's number for 32-bit floats.
+const F32: i32 = 1;
+/// ONNX's number for 64-bit integers.
+pub(super) const I64: i32 = 7;
 
 /// The form of a network: how it is fed and what it answers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,152 +31,177 @@ pub enum Contract {
     VitMatte,
 }
 
+struct Form {
+    contract: Contract,
+    name: &'static str,
+    /// Name ("" for any), numbers and extents (0 for any) of each input.
+    inputs: &'static [(&'static str, i32, &'static [usize])],
+    outputs: &'static [&'static str],
+}
+
+const EMBEDDING: (&str, i32, &[usize]) = ("image_embeddings", F32, &[0, 0, 0, 0]);
+const POSITION: (&str, i32, &[usize]) = ("image_positional_embeddings", F32, &[0, 0, 0, 0]);
+const POINTS: (&str, i32, &[usize]) = ("input_points", F32, &[0, 0, 0, 2]);
+
+/// A file is the first of these whose inputs and outputs it has.
+#[rustfmt::skip]
+const FORMS: &[Form] = &[
+    Form { contract: Contract::VitMatte, name: "ViTMatte network",
+        inputs: &[("pixel_values", F32, &[0, 4, 0, 0])], outputs: &["alphas"] },
+    Form { contract: Contract::SamDecoder { labels: true }, name: "SAM decoder (split export)",
+        inputs: &[POINTS, ("input_labels", I64, &[0, 0, 0]), EMBEDDING, POSITION],
+        outputs: &["iou_scores", "pred_masks"] },
+    Form { contract: Contract::SamDecoder { labels: false }, name: "SAM decoder (split export, without labels)",
+        inputs: &[POINTS, EMBEDDING, POSITION], outputs: &["iou_scores", "pred_masks"] },
+    Form { contract: Contract::OriginalDecoder, name: "SAM decoder (original form)",
+        inputs: &[EMBEDDING, ("point_coords", F32, &[0, 0, 2]), ("point_labels", F32, &[0, 0]),
+            ("mask_input", F32, &[0, 1, 0, 0]), ("has_mask_input", F32, &[1]), ("orig_im_size", F32, &[2])],
+        outputs: &["iou_predictions", "low_res_masks"] },
+    Form { contract: Contract::SamEncoder, name: "SAM encoder (split export)",
+        inputs: &[("pixel_values", F32, &[0, 3, 0, 0])],
+        outputs: &["image_embeddings", "image_positional_embeddings"] },
+    Form { contract: Contract::OriginalEncoder { picture: true },
+        name: "SAM encoder (original form, takes the picture)",
+        inputs: &[("", F32, &[0, 0, 3])], outputs: &["image_embeddings"] },
+    Form { contract: Contract::OriginalEncoder { picture: false },
+        name: "SAM encoder (original form, takes normalised numbers)",
+        inputs: &[("", F32, &[1, 3, 0, 0])], outputs: &["image_embeddings"] },
+];
+
+impl Contract {
+    fn form(self) -> &'static Form {
+        FORMS.iter().find(|f| f.contract == self).unwrap_or(&FORMS[0])
+    }
+
+    /// The outputs that are asked for, in order.
+    pub(in crate::mask::networks) fn outputs(self) -> &'static [&'static str] {
+        self.form().outputs
+    }
+}
+
 impl fmt::Display for Contract {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Contract::SamEncoder => "SAM encoder (split export)",
-            Contract::SamDecoder { labels: true } => "SAM decoder (split export)",
-            Contract::SamDecoder { labels: false } => "SAM decoder (split export, without labels)",
-            Contract::OriginalEncoder { picture: true } => "SAM encoder (original form, takes the picture)",
-            Contract::OriginalEncoder { picture: false } => {
-                "SAM encoder (original form, takes normalised numbers)"
-            }
-            Contract::OriginalDecoder => "SAM decoder (original form)",
-            Contract::VitMatte => "ViTMatte network",
-        })
+        f.write_str(self.form().name)
     }
 }
 
-/// One input a form has: its name, what numbers, which fixed extents (0: any).
-struct Want(&'static str, Kind, &'static [u64]);
-
-const EMBEDDING: Want = Want("image_embeddings", Kind::F32, &[0, 0, 0, 0]);
-const POSITION: Want = Want("image_positional_embeddings", Kind::F32, &[0, 0, 0, 0]);
-const POINTS: Want = Want("input_points", Kind::F32, &[0, 0, 0, 2]);
-
-/// The form of a file with this interface, or why it is none.
-pub fn recognise(interface: &Interface) -> Result<Contract, String> {
-    let has = |name: &str| interface.inputs.iter().any(|p| p.name == name);
-    let gives = |name: &str| interface.outputs.iter().any(|p| p.name == name);
-    if gives("alphas") && has("pixel_values") {
-        fits(&interface.inputs, &[Want("pixel_values", Kind::F32, &[0, 4, 0, 0])])?;
-        return Ok(Contract::VitMatte);
-    }
-    if gives("pred_masks") && has("input_points") {
-        promises(interface, &["iou_scores"])?;
-        let labels = has("input_labels");
-        let mut wanted = vec![POINTS, EMBEDDING, POSITION];
-        if labels {
-            wanted.push(Want("input_labels", Kind::I64, &[0, 0, 0]));
-        }
-        fits(&interface.inputs, &wanted)?;
-        return Ok(Contract::SamDecoder { labels });
-    }
-    if gives("low_res_masks") || (gives("iou_predictions") && has("point_coords")) {
-        promises(interface, &["low_res_masks", "iou_predictions"])?;
-        let wanted = [
-            EMBEDDING,
-            Want("point_coords", Kind::F32, &[0, 0, 2]),
-            Want("point_labels", Kind::F32, &[0, 0]),
-            Want("mask_input", Kind::F32, &[0, 1, 0, 0]),
-            Want("has_mask_input", Kind::F32, &[1]),
-            Want("orig_im_size", Kind::F32, &[2]),
-        ];
-        fits(&interface.inputs, &wanted)?;
-        return Ok(Contract::OriginalDecoder);
-    }
-    if gives("image_embeddings") && gives("image_positional_embeddings") && has("pixel_values") {
-        fits(&interface.inputs, &[Want("pixel_values", Kind::F32, &[0, 3, 0, 0])])?;
-        return Ok(Contract::SamEncoder);
-    }
-    if gives("image_embeddings")
-        && let [input] = interface.inputs.as_slice()
-    {
-        return original_encoder(input);
-    }
-    Err("its inputs and outputs are those of no known form".into())
+/// An input or output of a network.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Port {
+    /// Its name.
+    pub name: String,
+    /// ONNX's number for what it holds.
+    pub kind: i32,
+    /// Its extents, `None` where any will do; `None` as a whole when not even the number of axes is said.
+    pub dims: Option<Vec<Option<usize>>>,
 }
 
-fn original_encoder(input: &Port) -> Result<Contract, String> {
-    let Some(dims) = &input.dims else {
-        return Err(format!("`{}` does not say how many axes it has", input.name));
-    };
-    let any = |d: Option<u64>, wanted: u64| d.is_none_or(|d| d == wanted);
-    if input.kind != Kind::F32 {
-        return Err(format!("`{}` takes {}, not float32", input.name, input.kind));
-    }
-    match dims.as_slice() {
-        [_, _, c] if any(*c, 3) => Ok(Contract::OriginalEncoder { picture: true }),
-        [b, c, _, _] if any(*b, 1) && any(*c, 3) => Ok(Contract::OriginalEncoder { picture: false }),
-        _ => Err(format!("`{}` is {}, neither [H,W,3] nor [1,3,S,S]", input.name, input.shape_in_words())),
-    }
-}
-
-fn promises(interface: &Interface, outputs: &[&str]) -> Result<(), String> {
-    match outputs.iter().find(|name| !interface.outputs.iter().any(|p| p.name == **name)) {
-        Some(name) => Err(format!("it lacks the output `{name}`")),
-        None => Ok(()),
-    }
-}
-
-/// Are these exactly the inputs wanted?
-fn fits(inputs: &[Port], wanted: &[Want]) -> Result<(), String> {
-    for Want(name, kind, extents) in wanted {
-        let Some(port) = inputs.iter().find(|p| p.name == *name) else {
-            return Err(format!("it lacks the input `{name}`"));
+impl Port {
+    pub(super) fn new(about: &pb::ValueInfoProto) -> Port {
+        use pb::tensor_shape_proto::dimension::Value::DimValue;
+        let value = about.r#type.as_ref().and_then(|t| t.value.as_ref());
+        let tensor = value.map(|pb::type_proto::Value::TensorType(tensor)| tensor);
+        let extent = |d: &pb::tensor_shape_proto::Dimension| match d.value {
+            Some(DimValue(extent)) => usize::try_from(extent).ok().filter(|&e| e > 0),
+            _ => None,
         };
+        let shape = tensor.and_then(|t| t.shape.as_ref());
+        let dims = shape.map(|shape| shape.dim.iter().map(extent).collect());
+        Port { name: about.name.clone(), kind: tensor.map_or(0, |t| t.elem_type), dims }
+    }
+
+    /// `[1, 3, any, any]`.
+    pub fn shape_in_words(&self) -> String {
+        self.dims.as_ref().map_or("of any shape".into(), |dims| in_words(dims.iter().copied()))
+    }
+
+    /// Extent of one axis, where it is fixed.
+    pub fn extent(&self, axis: usize) -> Option<usize> {
+        self.dims.as_ref().and_then(|d| d.get(axis).copied().flatten())
+    }
+}
+
+fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
+    let each: Vec<String> = dims.map(|d| d.map_or("any".into(), |d| d.to_string())).collect();
+    format!("[{}]", each.join(", "))
+}
+
+/// The form of a file with these inputs and outputs, or why it is none.
+pub(super) fn recognise(inputs: &[Port], outputs: &[Port]) -> Result<Contract, String> {
+    let mut near = None;
+    let gives = |name: &&str| outputs.iter().any(|p| p.name == **name);
+    for form in FORMS.iter().filter(|f| f.outputs.iter().all(|name| gives(name))) {
+        match misfit(inputs, form.inputs) {
+            None => return Ok(form.contract),
+            Some(why) => near = near.or(Some(why)),
+        }
+    }
+    let side = |ports: &[Port]| -> String {
+        ports.iter().map(|p| format!("{} {}", p.name, p.shape_in_words())).collect::<Vec<_>>().join(", ")
+    };
+    let why = near.unwrap_or("its inputs and outputs are those of no known form".into());
+    Err(shown(&format!("{why} ({} → {})", side(inputs), side(outputs))))
+}
+
+/// What keeps these from being exactly the inputs wanted.
+fn misfit(inputs: &[Port], wanted: &[(&str, i32, &[usize])]) -> Option<String> {
+    for (name, kind, extents) in wanted {
+        let Some(port) = inputs.iter().find(|p| p.name == *name || name.is_empty()) else {
+            return Some(format!("it lacks the input `{name}`"));
+        };
+        let (name, kinds) = (&port.name, pb::tensor_proto::DataType::try_from(port.kind));
         if port.kind != *kind {
-            return Err(format!("`{name}` takes {}, not {kind}: use the float32 file", port.kind));
+            let found = kinds.map_or("unknown numbers".into(), |k| k.as_str_name().to_lowercase());
+            return Some(format!("`{name}` takes {found}: use the float32 file"));
         }
-        let Some(dims) = &port.dims else { continue };
-        let same = dims.len() == extents.len()
-            && dims.iter().zip(*extents).all(|(d, e)| d.is_none_or(|d| d == *e || *e == 0));
-        if !same {
-            let words: Vec<String> =
-                extents.iter().map(|e| if *e == 0 { "any".into() } else { e.to_string() }).collect();
-            return Err(format!("`{name}` is {}, expected [{}]", port.shape_in_words(), words.join(", ")));
+        let fits = |dims: &Vec<Option<usize>>| {
+            let same = |(d, e): (&Option<usize>, &usize)| d.is_none_or(|d| d == *e || *e == 0);
+            dims.len() == extents.len() && dims.iter().zip(*extents).all(same)
+        };
+        if !port.dims.as_ref().is_none_or(fits) {
+            let expected = in_words(extents.iter().map(|&e| (e > 0).then_some(e)));
+            return Some(format!("`{name}` is {}, expected {expected}", port.shape_in_words()));
         }
     }
-    match inputs.iter().find(|p| !wanted.iter().any(|w| w.0 == p.name)) {
-        Some(port) => Err(format!("it asks for `{}` too, which no known form has", port.name)),
-        None => Ok(()),
-    }
+    let more = inputs.iter().find(|p| !wanted.iter().any(|(name, ..)| p.name == *name || name.is_empty()));
+    let port = more.or(inputs.get(wanted.len()))?;
+    Some(format!("it asks for `{}` too, which no known form has", port.name))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn port(name: &str, kind: Kind, dims: &[u64]) -> Port {
+    fn port(name: &str, kind: i32, dims: &[usize]) -> Port {
         let dims = dims.iter().map(|&d| (d > 0).then_some(d)).collect();
         Port { name: name.into(), kind, dims: Some(dims) }
     }
 
-    fn interface(inputs: Vec<Port>, outputs: &[&str]) -> Interface {
-        let outputs = outputs.iter().map(|n| port(n, Kind::F32, &[])).collect();
-        Interface { inputs, outputs, ..Interface::default() }
+    fn recognised(inputs: Vec<Port>, outputs: &[&str]) -> Result<Contract, String> {
+        recognise(&inputs, &outputs.iter().map(|n| port(n, F32, &[])).collect::<Vec<_>>())
     }
 
     #[test]
     fn both_original_encoders_are_told_by_their_axes() {
-        let of =
-            |dims: &[u64]| recognise(&interface(vec![port("x", Kind::F32, dims)], &["image_embeddings"]));
+        let of = |dims: &[usize]| recognised(vec![port("x", F32, dims)], &["image_embeddings"]);
         assert_eq!(of(&[0, 0, 3]), Ok(Contract::OriginalEncoder { picture: true }));
         assert_eq!(of(&[1, 3, 1024, 1024]), Ok(Contract::OriginalEncoder { picture: false }));
         assert!(of(&[1, 4, 64, 64]).unwrap_err().contains("[1, 4, 64, 64]"));
+        let two = vec![port("x", F32, &[0, 0, 3]), port("y", F32, &[0, 0, 3])];
+        assert!(recognised(two, &["image_embeddings"]).unwrap_err().contains("`y`"));
     }
 
     #[test]
     fn half_precision_inputs_and_unknown_inputs_are_named() {
-        let half = interface(vec![port("pixel_values", Kind::F16, &[0, 4, 0, 0])], &["alphas"]);
-        assert!(recognise(&half).unwrap_err().contains("float16"));
-        let more = vec![port("pixel_values", Kind::F32, &[0, 4, 0, 0]), port("style", Kind::F32, &[1])];
-        assert!(recognise(&interface(more, &["alphas"])).unwrap_err().contains("`style`"));
+        let half = vec![port("pixel_values", 10, &[0, 4, 0, 0])];
+        assert!(recognised(half, &["alphas"]).unwrap_err().contains("float16"));
+        let more = vec![port("pixel_values", F32, &[0, 4, 0, 0]), port("style", F32, &[1])];
+        assert!(recognised(more, &["alphas"]).unwrap_err().contains("`style`"));
     }
 
     #[test]
     fn an_encoder_with_the_channels_of_vitmatte_is_neither() {
-        let odd = interface(vec![port("pixel_values", Kind::F32, &[0, 3, 0, 0])], &["alphas"]);
-        assert!(recognise(&odd).unwrap_err().contains("expected [any, 4, any, any]"));
+        let odd = vec![port("pixel_values", F32, &[0, 3, 0, 0])];
+        assert!(recognised(odd, &["alphas"]).unwrap_err().contains("expected [any, 4, any, any]"));
     }
 }

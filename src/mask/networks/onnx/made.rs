@@ -76,6 +76,16 @@ pub(crate) fn node(op: &str, inputs: &[&str], outputs: &[&str], attributes: &[Me
     m.text(3, &format!("the_{}", op.to_lowercase())).text(4, op).messages(5, attributes)
 }
 
+/// One integer without axes.
+pub(crate) fn integer(name: &str, value: i64) -> Message {
+    tensor(name, 7, &[]).bytes(9, &value.to_le_bytes())
+}
+
+/// An attribute that is an integer.
+pub(crate) fn int(name: &str, value: i64) -> Message {
+    Message::new().text(1, name).int(3, value).int(20, 2)
+}
+
 /// An attribute that is a list of integers.
 pub(crate) fn ints(name: &str, values: &[i64]) -> Message {
     values.iter().fold(Message::new().text(1, name), |m, &v| m.int(8, v)).int(20, 7)

@@ -1,6 +1,7 @@
 //! The engine that the user brings: an ONNX Runtime library, loaded from the path named and nowhere else.
 
-use super::{MaskNetworkError, Output, Values, guarded, hexadecimal, in_one_line};
+use super::contract::I64;
+use super::{Array, Fed, MaskNetworkError, guarded, hexadecimal, shown};
 use crate::io::{self, Limits};
 use ort::environment::Environment;
 use ort::logging::LogLevel;
@@ -37,10 +38,9 @@ impl Runtime {
     /// already holds another one.
     pub fn load(path: &Path) -> Result<Runtime, MaskNetworkError> {
         let real = io::real_path(path)?;
-        let wrong = |problem: String, hint: &str| MaskNetworkError::Library {
-            path: path.into(),
-            problem: in_one_line(&problem),
-            hint: hint.into(),
+        let wrong = |problem: String, hint| {
+            let problem = format!("cannot be used as ONNX Runtime: {}", shown(&problem));
+            MaskNetworkError::file(path, problem, hint)
         };
         let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(runtime) = loaded.as_ref() {
@@ -85,57 +85,50 @@ impl Runtime {
 pub(super) struct Model {
     // its bindings allow one run at a time; the run itself spreads over the threads
     session: Mutex<ort::session::Session>,
+    outputs: &'static [&'static str],
 }
 
 impl Model {
-    /// Loads a network from memory.
-    pub(super) fn load(runtime: &Runtime, bytes: &[u8], threads: usize) -> Result<Model, String> {
-        let session = (|| -> Result<ort::session::Session, ort::Error> {
+    /// Loads a network from memory. `outputs`: those that will be asked for.
+    pub(super) fn load(
+        runtime: &Runtime,
+        bytes: &[u8],
+        outputs: &'static [&'static str],
+        threads: usize,
+    ) -> Result<Model, String> {
+        let session = || -> Result<ort::session::Session, ort::Error> {
             let mut builder = ort::session::Session::builder(&runtime.environment)?
                 .with_intra_threads(threads)?
                 .with_deterministic_compute(true)?
                 .with_log_level(LogLevel::Error)?;
             builder.commit_from_memory(bytes)
-        })()
-        .map_err(|e| e.to_string())?;
-        Ok(Model { session: Mutex::new(session) })
+        };
+        let session = Mutex::new(session().map_err(|e| e.to_string())?);
+        Ok(Model { session, outputs })
     }
 
     /// One run.
-    pub(super) fn run(
-        &self,
-        inputs: &[(&str, super::Tensor)],
-        outputs: &[&str],
-    ) -> Result<Vec<Output>, String> {
+    pub(super) fn run(&self, fed: &Fed) -> Result<Vec<Array>, String> {
         let mut session = self.session.lock().unwrap_or_else(PoisonError::into_inner);
-        self.fed(&mut session, inputs, outputs).map_err(|e| e.to_string())
-    }
-
-    fn fed(
-        &self,
-        session: &mut ort::session::Session,
-        inputs: &[(&str, super::Tensor)],
-        outputs: &[&str],
-    ) -> Result<Vec<Output>, ort::Error> {
-        let mut fed: Vec<(String, SessionInputValue<'_>)> = Vec::new();
-        for (name, tensor) in inputs {
-            let value: SessionInputValue<'_> = match &tensor.values {
-                Values::F32(v) => Tensor::from_array((tensor.shape.clone(), v.clone()))?.into(),
-                Values::I64(v) => Tensor::from_array((tensor.shape.clone(), v.clone()))?.into(),
-            };
-            fed.push((name.to_string(), value));
-        }
-        let wanted = outputs.iter().fold(OutputSelector::no_default(), |o, name| o.with(*name));
-        let options = RunOptions::new()?.with_outputs(wanted);
-        let given = session.run_with_options(fed, &options)?;
-        let mut found = Vec::new();
-        for name in outputs {
-            let value =
-                given.get(name).ok_or_else(|| ort::Error::new(format!("there is no output `{name}`")))?;
-            let (shape, values) = value.try_extract_tensor::<f32>()?;
-            let shape = shape.iter().map(|&d| usize::try_from(d).unwrap_or(0)).collect();
-            found.push(Output { shape, values: values.to_vec() });
-        }
-        Ok(found)
+        let mut run = || -> Result<Vec<Array>, ort::Error> {
+            let mut inputs: Vec<(&str, SessionInputValue<'_>)> = Vec::new();
+            for (port, array) in fed {
+                let value = match port.kind {
+                    I64 => Tensor::from_array((array.shape.clone(), array.integers()))?.into(),
+                    _ => Tensor::from_array((array.shape.clone(), array.values.clone()))?.into(),
+                };
+                inputs.push((&port.name, value));
+            }
+            let wanted = self.outputs.iter().fold(OutputSelector::no_default(), |o, name| o.with(*name));
+            let given = session.run_with_options(inputs, &RunOptions::new()?.with_outputs(wanted))?;
+            let mut found = Vec::new();
+            for value in self.outputs.iter().filter_map(|name| given.get(name)) {
+                let (shape, values) = value.try_extract_tensor::<f32>()?;
+                let shape = shape.iter().map(|&d| usize::try_from(d).unwrap_or(0)).collect();
+                found.push(Array { shape, values: values.to_vec() });
+            }
+            Ok(found)
+        };
+        run().map_err(|e| e.to_string())
     }
 }

@@ -43,29 +43,31 @@ fn opened_with(bytes: &[u8], onnxruntime: Option<PathBuf>) -> Result<Networks, M
     Networks::open(&files, &NetworkOptions::default())
 }
 
-fn opened(bytes: &[u8]) -> Result<Networks, MaskNetworkError> {
-    opened_with(bytes, None)
+/// Opens a file and runs it once on an empty photograph.
+fn tried(bytes: &[u8], engine: Option<PathBuf>) -> Result<Networks, MaskNetworkError> {
+    let networks = opened_with(bytes, engine)?;
+    networks.prepare(32, 32)?;
+    Ok(networks)
 }
 
-/// The error of a file that must not open, on both engines the same, with a hint.
-fn refusal(bytes: &[u8]) -> MaskNetworkError {
-    let mut errors = engines().into_iter().map(|engine| match opened_with(bytes, engine) {
-        Ok(_) => panic!("it opened"),
-        Err(e) => e,
+/// What a file that must not be used is refused with, on each engine: a sentence with its name, and a way out.
+fn refusals(bytes: &[u8]) -> Vec<String> {
+    let each = engines().into_iter().map(|engine| match tried(bytes, engine) {
+        Ok(_) => panic!("it runs"),
+        Err(error) => {
+            let said = error.to_string();
+            assert!(said.contains("network.onnx") && !said.contains('\n'), "{said}");
+            assert!(error.hint().len() > 10, "no way out of: {said}");
+            said
+        }
     });
-    let first = errors.next().unwrap();
-    for other in errors {
-        assert_eq!(std::mem::discriminant(&other), std::mem::discriminant(&first), "{other}");
-    }
-    assert!(first.hint().len() > 10, "no way out of: {first}");
-    assert!(!first.to_string().contains('\n'));
-    first
+    each.collect()
 }
 
-fn refused(bytes: &[u8]) -> String {
-    match refusal(bytes) {
-        MaskNetworkError::Refused { problem, .. } => problem,
-        other => panic!("another error: {other}"),
+/// As [`refusals`], each of which holds the word.
+fn refused_for(word: &str, bytes: &[u8]) {
+    for said in refusals(bytes) {
+        assert!(said.contains(word), "not for `{word}`: {said}");
     }
 }
 
@@ -91,34 +93,29 @@ fn a_sound_network_made_by_hand_gives_the_trimap_on_each_engine() {
 fn text_nothing_and_half_a_file_are_no_onnx() {
     let page = b"<!DOCTYPE html><html><body>404</body></html>".as_slice();
     for bytes in [page, b"version https://git-lfs.github.com/spec/v1\n", &[0xff; 100], b"\n\x00\x12"] {
-        assert!(matches!(refusal(bytes), MaskNetworkError::NotOnnx { .. }), "{}", refusal(bytes));
+        refused_for("is not a sound ONNX file", bytes);
     }
-    assert!(matches!(refusal(b""), MaskNetworkError::Read(_)));
+    refused_for("it holds no graph", &Message::new().int(1, 7).0);
+    assert!(matches!(tried(b"", None), Err(MaskNetworkError::Read(_))));
     let whole = trimap_times(1.0);
     for end in 1..whole.len() {
-        // an end between two fields leaves a message that parses and lacks what comes later
-        let error = match opened(&whole[..end]) {
-            // the last field is the opset: without it the rest still stands
-            Ok(_) => continue,
-            Err(e) => e,
-        };
-        let named = matches!(error, MaskNetworkError::NotOnnx { .. } | MaskNetworkError::Engine { .. });
-        assert!(named, "cut at {end}: {error}");
+        // an end between two fields leaves a message that parses and lacks what comes later; the last one is the
+        // opset, without which the rest still stands
+        if let Err(error) = tried(&whole[..end], None) {
+            assert!(!matches!(error, MaskNetworkError::Asked { .. }), "cut at {end}: {error}");
+        }
     }
 }
 
 #[test]
-fn any_single_byte_may_be_wrong_without_a_panic() {
+fn any_single_byte_may_be_wrong_without_a_crash() {
     let whole = trimap_times(1.0);
-    let (photo, trimap) = photo(8, 8);
     for at in 0..whole.len() {
         for flip in [0x01, 0xff] {
             let mut bytes = whole.clone();
             bytes[at] ^= flip;
-            let given = opened(&bytes).and_then(|networks| networks.alpha(&photo, &trimap));
-            if let Err(error) = given {
-                assert!(!error.hint().is_empty());
-                assert!(!error.to_string().contains("broke down"), "byte {at} ^ {flip:#x}: {error}");
+            if let Err(error) = tried(&bytes, None) {
+                assert!(!error.hint().is_empty() && error.to_string().contains("network.onnx"), "{error}");
             }
         }
     }
@@ -168,57 +165,77 @@ fn weights_in_another_file_are_refused_wherever_they_lie() {
     let beside = dir.path().join("weights.bin");
     fs::write(&beside, [0; 16]).unwrap();
     let absolute = beside.display().to_string();
+    let nodes = [node("Conv", &["pixel_values", "w"], &["alphas"], &[])];
+    let sound = vitmatte(&nodes, &[floats("w", &[1, 4, 1, 1], &[0.0; 4])]);
     for location in [absolute.as_str(), "../weights.bin", "weights.bin", "/etc/passwd", "missing\u{1b}[2J"] {
         let entry = Message::new().text(1, "location").text(2, location);
         let w = tensor("w", 1, &[1, 4, 1, 1]).message(13, &entry).int(14, 1);
-        let nodes = [node("Conv", &["pixel_values", "w"], &["alphas"], &[])];
-        let bytes = vitmatte(&nodes, &[w]);
+        let bytes = vitmatte(&nodes, std::slice::from_ref(&w));
         let path = dir.path().join("network.onnx");
         fs::write(&path, &bytes).unwrap();
         let files = NetworkFiles { vitmatte: Some(path), ..NetworkFiles::default() };
-        let Err(MaskNetworkError::Refused { problem, .. }) =
-            Networks::open(&files, &NetworkOptions::default())
-        else {
+        let Err(error) = Networks::open(&files, &NetworkOptions::default()) else {
             panic!("{location} was followed")
         };
-        assert!(problem.contains("another file") && !problem.contains('\u{1b}'), "{problem}");
-        assert!(refused(&bytes).contains("another file"));
+        assert!(
+            error.to_string().contains("in another file") && error.hint().contains("onnx.save"),
+            "{error}"
+        );
+        refused_for("in another file", &bytes);
+        // hidden in a function of the file's own, which the reader of graphs passes over
+        let hidden =
+            Message(sound.clone()).message(25, &Message::new().message(7, &Message::new().message(5, &w)));
+        refused_for("in another file", &hidden.0);
     }
+    // the key's length spelled with more bytes than it needs: 88 80 00
+    let entry = [b"\x0a\x88\x80\x00location\x12\x01w".as_slice()].concat();
+    refused_for("in another file", &vitmatte(&nodes, &[tensor("w", 1, &[1, 4, 1, 1]).bytes(13, &entry)]));
     // announced, but not named
-    let w = tensor("w", 1, &[1, 4, 1, 1]).int(14, 1);
-    assert!(refused(&vitmatte(&[], &[w])).contains("does not name"));
+    refusals(&vitmatte(&nodes, &[tensor("w", 1, &[1, 4, 1, 1]).int(14, 1)]));
+    // a name that only contains the word is no key
+    let named = [node("Conv", &["pixel_values", "relocation"], &["alphas"], &[])];
+    let weights = [floats("relocation", &[1, 4, 1, 1], &[0.0; 4])];
+    tried(&vitmatte(&named, &weights), None).unwrap();
 }
 
 #[test]
 fn a_circle_and_a_name_from_nowhere_are_refused() {
-    let circle = [node("Add", &["pixel_values", "b"], &["a"], &[]), node("Relu", &["a"], &["b"], &[])];
-    assert!(refused(&vitmatte(&circle, &[])).contains("in a circle"));
-    let itself = [node("Relu", &["alphas"], &["alphas"], &[])];
-    assert!(refused(&vitmatte(&itself, &[])).contains("in a circle"));
-    let nowhere = [node("Add", &["pixel_values", "ghost"], &["alphas"], &[])];
-    assert!(refused(&vitmatte(&nowhere, &[])).contains("`ghost`, which nothing makes"));
-    assert!(refused(&vitmatte(&[], &[])).contains("nothing makes its output `alphas`"));
-    let twice =
-        [node("Relu", &["pixel_values"], &["alphas"], &[]), node("Abs", &["pixel_values"], &["alphas"], &[])];
-    assert!(refused(&vitmatte(&twice, &[])).contains("made twice"));
+    let circle = [
+        node("Add", &["pixel_values", "b"], &["a"], &[]),
+        node("Relu", &["a"], &["b"], &[]),
+        node("Identity", &["b"], &["alphas"], &[]),
+    ];
+    refusals(&vitmatte(&circle, &[]));
+    refusals(&vitmatte(&[node("Relu", &["alphas"], &["alphas"], &[])], &[]));
+    refusals(&vitmatte(&[node("Add", &["pixel_values", "ghost"], &["alphas"], &[])], &[]));
+    refusals(&vitmatte(&[], &[]));
+    // graphs in graphs beyond any depth
+    let deep = (0..200).fold(graph(&[], &[], &[], &[]), |inner, _| {
+        let branch = made::graph_attribute("then_branch", &inner);
+        graph(&[node("If", &["pixel_values"], &["x"], &[branch])], &[], &[], &[])
+    });
+    let branch = made::graph_attribute("then_branch", &deep);
+    refusals(&vitmatte(&[node("If", &["pixel_values"], &["alphas"], &[branch])], &[]));
 }
 
 #[test]
-fn extents_that_the_data_does_not_fill_are_refused_before_anything_is_reserved() {
+fn extents_that_the_data_does_not_fill_are_refused() {
     let nodes = [node("Conv", &["pixel_values", "w"], &["alphas"], &[])];
-    let with = |w: Message| refused(&vitmatte(&nodes, &[w]));
     let huge = [1 << 20, 1 << 20, 16, 16];
-    assert!(with(tensor("w", 1, &huge)).contains("but holds 0"));
-    assert!(with(tensor("w", 1, &huge).bytes(9, &[0; 64])).contains("but holds 64"));
-    assert!(with(tensor("w", 1, &[i64::MAX, i64::MAX])).contains("impossible extents"));
-    assert!(with(tensor("w", 1, &[-1, 4])).contains("impossible extents"));
-    assert!(with(tensor("w", 1, &[1; 40]).bytes(9, &[0; 4])).contains("impossible extents"));
-    // one number short, one too many, and the same as a list instead of raw bytes
-    assert!(with(tensor("w", 1, &[4]).bytes(9, &[0; 12])).contains("promises 16 bytes"));
-    assert!(with(tensor("w", 1, &[4]).bytes(9, &[0; 20])).contains("promises 16 bytes"));
-    assert!(with(tensor("w", 1, &[4]).bytes(4, &[0; 12])).contains("promises 4 numbers"));
-    assert!(with(tensor("w", 7, &[4]).bytes(7, &[0; 3])).contains("promises 4 numbers"));
-    assert!(with(tensor("w", 99, &[1])).contains("ONNX type 99"));
+    for w in [
+        tensor("w", 1, &huge),
+        tensor("w", 1, &huge).bytes(9, &[0; 64]),
+        tensor("w", 1, &[i64::MAX, i64::MAX]),
+        tensor("w", 1, &[-1, 4]),
+        tensor("w", 1, &[1; 40]).bytes(9, &[0; 4]),
+        // one number short, one too many, and the same as a list instead of raw bytes
+        tensor("w", 1, &[4]).bytes(9, &[0; 12]),
+        tensor("w", 1, &[4]).bytes(9, &[0; 20]),
+        tensor("w", 1, &[4]).bytes(4, &[0; 12]),
+        tensor("w", 99, &[1]),
+    ] {
+        refusals(&vitmatte(&nodes, &[w]));
+    }
 }
 
 #[test]
@@ -226,24 +243,20 @@ fn constants_that_ask_for_an_array_beyond_all_pictures_are_refused() {
     let filled = node("ConstantOfShape", &["size"], &["big"], &[]);
     let tiled = node("Tile", &["pixel_values", "size"], &["big"], &[]);
     let ranged = node("Range", &["zero", "size", "one"], &["big"], &[]);
-    let resized = node("Resize", &["pixel_values", "", "", "size"], &["big"], &[]);
     for (first, size) in [
         (filled, vec![1 << 20, 1 << 20]),
         (tiled, vec![1, 1 << 15, 1 << 15, 1 << 15]),
-        (ranged, vec![1 << 40]),
-        (resized, vec![1, 4, 1 << 20, 1 << 20]),
+        (ranged, vec![1 << 42]),
     ] {
-        let nodes = [first, node("Identity", &["pixel_values"], &["alphas"], &[])];
-        let weights = [integers("size", &size), integers("zero", &[0]), integers("one", &[1])];
-        let problem = refused(&vitmatte(&nodes, &weights));
-        assert!(problem.contains("asks for"), "{problem}");
+        let nodes = [
+            first,
+            node("ReduceMax", &["big"], &["most"], &[]),
+            node("Add", &["pixel_values", "most"], &["alphas"], &[]),
+        ];
+        let size = if size.len() == 1 { made::integer("size", size[0]) } else { integers("size", &size) };
+        let weights = [size, made::integer("zero", 0), made::integer("one", 1)];
+        refused_for("tract", &vitmatte(&nodes, &weights));
     }
-    // each small enough, together not: 2¹⁵ · 2¹⁵
-    let nodes = [
-        node("Tile", &["pixel_values", "size"], &["a"], &[]),
-        node("Tile", &["a", "size"], &["alphas"], &[]),
-    ];
-    assert!(refused(&vitmatte(&nodes, &[integers("size", &[1, 1, 1, 1 << 15])])).contains("asks for"));
 }
 
 #[test]
@@ -251,12 +264,14 @@ fn extents_computed_from_constants_are_followed() {
     // 2¹⁵ · 2¹⁵ joined with 64: 2³⁶ numbers
     let nodes = [
         node("Mul", &["half", "half"], &["square"], &[]),
-        node("Concat", &["square", "more"], &["size"], &[]),
+        node("Concat", &["square", "more"], &["size"], &[made::int("axis", 0)]),
         node("ConstantOfShape", &["size"], &["big"], &[]),
-        node("Identity", &["pixel_values"], &["alphas"], &[]),
+        node("ReduceMax", &["big"], &["most"], &[]),
+        node("Add", &["pixel_values", "most"], &["alphas"], &[]),
     ];
     let weights = [integers("half", &[1 << 15]), integers("more", &[64])];
-    assert!(refused(&vitmatte(&nodes, &weights)).contains("asks for 68719476736 numbers"));
+    let Err(error) = tried(&vitmatte(&nodes, &weights), None) else { panic!("it runs") };
+    assert!(error.to_string().contains("asks for an array of 274877906944 bytes"), "{error}");
 }
 
 #[test]
@@ -268,85 +283,16 @@ fn extents_computed_from_the_picture_end_in_an_error_too() {
         node("Expand", &["pixel_values", "size"], &["alphas"], &[]),
     ];
     let bytes = vitmatte(&nodes, &[integers("factor", &[1 << 30, 1, 1, 1])]);
-    let (photo, trimap) = photo(32, 32);
-    for engine in engines() {
-        let builtin = engine.is_none();
-        let error = opened_with(&bytes, engine).unwrap().alpha(&photo, &trimap).unwrap_err();
-        assert!(matches!(error, MaskNetworkError::Engine { .. }), "{error}");
-        assert_eq!(
-            error.to_string().contains("asks for an array of 17592186044416 bytes"),
-            builtin,
-            "{error}"
-        );
-    }
+    let said = refusals(&bytes);
+    assert!(said[0].contains("asks for an array of 17592186044416 bytes"), "{}", said[0]);
 }
 
 #[test]
-fn weights_that_are_no_numbers_are_refused_in_every_storage() {
+fn weights_that_are_no_numbers_are_found_before_the_first_photograph() {
     let nodes = [node("Conv", &["pixel_values", "w"], &["alphas"], &[])];
-    let with = |w: Message| vitmatte(&nodes, &[w]);
-    let four = [1, 4, 1, 1];
-    let bad = [1.0, 2.0, f32::NAN, 4.0];
-    let raw: Vec<u8> = bad.iter().flat_map(|v| v.to_le_bytes()).collect();
-    let doubles: Vec<u8> = bad.iter().flat_map(|&v| f64::from(v).to_le_bytes()).collect();
-    let halves =
-        |nan: u16| [0x3c00, nan, 0, 0].iter().flat_map(|v: &u16| v.to_le_bytes()).collect::<Vec<u8>>();
-    let listed =
-        [0x3c00u16, 0x7e00, 0, 0].iter().fold(tensor("w", 10, &four), |t, &v| t.int(5, i64::from(v)));
-    for (w, word) in [
-        (floats("w", &four, &bad), "NaN"),
-        (tensor("w", 1, &four).bytes(4, &raw), "NaN"),
-        (tensor("w", 11, &four).bytes(9, &doubles), "NaN"),
-        (tensor("w", 11, &four).bytes(10, &doubles), "NaN"),
-        (tensor("w", 10, &four).bytes(9, &halves(0x7e00)), "NaN"),
-        (listed, "NaN"),
-        (tensor("w", 16, &four).bytes(9, &halves(0x7fc0)), "NaN"),
-        (floats("w", &four, &[1.0, f32::INFINITY, 0.0, 0.0]), "infinite"),
-        (tensor("w", 10, &four).bytes(9, &halves(0xfc00)), "infinite"),
-    ] {
-        let problem = refused(&with(w));
-        assert!(problem.contains(word) && problem.contains("`w`"), "{problem}");
+    for bad in [f32::NAN, f32::INFINITY] {
+        refused_for("`alphas`", &vitmatte(&nodes, &[floats("w", &[1, 4, 1, 1], &[1.0, 2.0, bad, 4.0])]));
     }
-    // one infinite number alone is a filler, as in masks of attention
-    let one = node("Max", &["pixel_values", "low"], &["m"], &[]);
-    let conv = node("Conv", &["m", "w"], &["alphas"], &[]);
-    let weights = [floats("low", &[1], &[f32::NEG_INFINITY]), floats("w", &four, &[0.0, 0.0, 0.0, 1.0])];
-    opened(&vitmatte(&[one, conv], &weights)).unwrap();
-}
-
-#[test]
-fn graphs_in_graphs_end_at_a_depth_and_see_what_is_around_them() {
-    let deep = (0..20).fold(graph(&[], &[], &[], &[]), |inner, _| {
-        let branch = made::graph_attribute("then_branch", &inner);
-        graph(&[node("If", &["pixel_values"], &["x"], &[branch])], &[], &[], &[])
-    });
-    let branch = made::graph_attribute("then_branch", &deep);
-    let nodes = [node("If", &["pixel_values"], &["alphas"], &[branch])];
-    assert!(refused(&vitmatte(&nodes, &[])).contains("deeper"));
-    // inside, a name of the graph around is known, one of a graph beside is not
-    let reads = |name: &str| {
-        let inner = graph(&[node("Relu", &[name], &["y"], &[])], &[], &[], &[port("y", 1, &[])]);
-        node("If", &["pixel_values"], &["x"], &[made::graph_attribute("then_branch", &inner)])
-    };
-    let end = node("Identity", &["pixel_values"], &["alphas"], &[]);
-    assert!(scan::scan(&vitmatte(&[reads("pixel_values"), end.clone()], &[])).is_ok());
-    assert!(refused(&vitmatte(&[reads("y"), end.clone()], &[])).contains("circle"));
-    assert!(refused(&vitmatte(&[reads("x"), end], &[])).contains("nothing makes"));
-}
-
-#[test]
-fn what_no_such_network_needs_is_refused() {
-    let sound = graph(&[node("Relu", &["pixel_values"], &["alphas"], &[])], &[], &[], &[]);
-    let twice = Message::new().message(7, &sound).message(7, &sound).0;
-    assert!(matches!(refusal(&twice), MaskNetworkError::NotOnnx { .. }));
-    for (field, word) in [(20, "training"), (25, "functions")] {
-        let bytes = Message::new().message(field, &Message::new()).message(7, &sound).0;
-        assert!(refused(&bytes).contains(word));
-    }
-    let sparse = graph(&[], &[], &[], &[]).message(15, &Message::new());
-    assert!(refused(&model(&sparse)).contains("sparse"));
-    let many = graph(&vec![node("", &[], &[], &[]); 100_001], &[], &[], &[]);
-    assert!(refused(&model(&many)).contains("more than 100000 nodes"));
 }
 
 #[test]
@@ -357,12 +303,8 @@ fn another_network_is_named_by_what_it_takes_and_gives() {
         &[port("data", 1, &[1, 3, 224, 224])],
         &[port("prob", 1, &[1, 1000])],
     );
-    let error = refusal(&model(&classifier));
-    assert!(matches!(error, MaskNetworkError::NotRecognised { .. }));
-    assert!(error.to_string().contains("data [1, 3, 224, 224] → prob [1, 1000]"), "{error}");
-    let encoder = made::original_encoder(true, 256, 32);
-    let error = refusal(&encoder);
-    assert!(matches!(error, MaskNetworkError::WrongRole { .. }), "{error}");
+    refused_for("data [1, 3, 224, 224] → prob [1, 1000]", &model(&classifier));
+    refused_for("was given as the ViTMatte network", &made::original_encoder(true, 256, 32));
 }
 
 #[test]
@@ -392,23 +334,13 @@ fn outputs_that_are_not_as_promised_are_errors() {
 
 #[test]
 fn operators_nobody_knows_are_an_error_of_the_engine_with_the_way_out() {
-    let (photo, trimap) = photo(32, 32);
     let bytes = vitmatte(&[node("Teleport", &["pixel_values"], &["alphas"], &[])], &[]);
     for engine in engines() {
         let builtin = engine.is_none();
-        let error = match opened_with(&bytes, engine) {
-            Err(e) => e,
-            Ok(networks) => networks.alpha(&photo, &trimap).unwrap_err(),
-        };
+        let Err(error) = tried(&bytes, engine) else { panic!("it runs") };
         assert!(matches!(error, MaskNetworkError::Engine { .. }), "{error}");
         assert_eq!(error.hint().contains("pip install onnxruntime"), builtin, "{}", error.hint());
-        assert!(!error.hint().contains("float32"));
     }
-    // half-precision weights are named as another reason
-    let halves = tensor("w", 10, &[2]).bytes(9, &[0; 4]);
-    let bytes = vitmatte(&[node("Teleport", &["pixel_values", "w"], &["alphas"], &[])], &[halves]);
-    let error = opened(&bytes).and_then(|networks| networks.alpha(&photo, &trimap)).unwrap_err();
-    assert!(error.hint().contains("use the float32 file"), "{}", error.hint());
 }
 
 #[test]
@@ -423,7 +355,7 @@ fn a_file_that_is_no_library_is_refused_with_the_way_out() {
     let path = dir.path().join("libonnxruntime.so");
     fs::write(&path, "not a library").unwrap();
     let Err(error) = Runtime::load(&path) else { panic!("it loaded") };
-    assert!(matches!(error, MaskNetworkError::Library { .. }), "{error}");
+    assert!(error.to_string().contains("cannot be used as ONNX Runtime"), "{error}");
     assert!(error.hint().contains("1.17") || error.hint().contains("anew"), "{}", error.hint());
     assert!(matches!(Runtime::load(&dir.path().join("none.so")), Err(MaskNetworkError::Read(_))));
 }

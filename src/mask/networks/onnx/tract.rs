@@ -3,136 +3,121 @@
 //! It wants every shape fixed. The file is parsed once; for each set of input shapes a plan is made from it
 //! (0.2 to 1 s for public networks) and kept, since the photographs of a capture share their size.
 
-use super::{Output, Tensor, Values};
-use std::collections::VecDeque;
+use super::contract::{I64, Port};
+use super::{Array, Fed};
+use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
+use tract_onnx::pb;
 use tract_onnx::prelude::*;
 use tract_onnx::tract_hir::infer::Factoid;
 
 /// Name and version, as recorded with a run.
 pub(super) const NAME: &str = "tract 0.23.9";
 
-/// Plans kept of one file; the oldest goes first. Each holds its own packed weights.
+/// Plans kept of one file. Each holds its own packed weights.
 const KEPT_PLANS: usize = 4;
 
 type Plan = Arc<TypedRunnableModel>;
-/// Shape of every input in the order of the model, and the outputs asked for.
-type Key = (Vec<Vec<usize>>, Vec<String>);
 
-/// A parsed file and its plans.
+/// A parsed file and its plans by the shapes of its inputs.
 pub(super) struct Model {
     parsed: InferenceModel,
-    inputs: Vec<String>,
-    outputs: Vec<String>,
     array_bytes: u64,
-    plans: Mutex<VecDeque<(Key, Plan)>>,
+    plans: Mutex<HashMap<Vec<Vec<usize>>, Plan>>,
 }
 
 impl Model {
-    /// Parses; shapes that the file states for inner arrays are not trusted, exporters write wrong ones.
-    /// `outputs`: the names of the file's outputs, in order.
-    pub(super) fn load(bytes: &[u8], outputs: Vec<String>, array_bytes: u64) -> Result<Model, String> {
-        let parsed = tract_onnx::onnx()
-            .with_ignore_output_shapes(true)
-            .with_ignore_value_info(true)
-            .model_for_read(&mut &bytes[..])
-            .map_err(|e| sentence(&e))?;
-        let inputs = parsed
-            .input_outlets()
-            .map_err(|e| sentence(&e))?
-            .iter()
-            .map(|outlet| parsed.node(outlet.node).name.clone())
-            .collect();
-        Ok(Model { parsed, inputs, outputs, array_bytes, plans: Mutex::default() })
+    /// Takes the graph of a file; shapes that it states for inner arrays are not trusted, exporters write wrong
+    /// ones. `outputs`: those that will be asked for. `array_bytes`: bytes of the largest array that may be planned.
+    pub(super) fn load(proto: &pb::ModelProto, outputs: &[&str], array_bytes: u64) -> Result<Model, String> {
+        let read = || -> TractResult<InferenceModel> {
+            let onnx = tract_onnx::onnx().with_ignore_output_shapes(true).with_ignore_value_info(true);
+            let mut parsed = onnx.model_for_proto_model(proto)?;
+            let named = proto.graph.iter().flat_map(|g| &g.output).zip(&parsed.outputs);
+            let named: HashMap<&str, OutletId> = named.map(|(port, at)| (port.name.as_str(), *at)).collect();
+            let wanted: Vec<OutletId> = outputs.iter().filter_map(|name| named.get(name).copied()).collect();
+            parsed.select_output_outlets(&wanted)?;
+            Ok(parsed)
+        };
+        let parsed = read().map_err(|e| sentence(&e))?;
+        Ok(Model { parsed, array_bytes, plans: Mutex::default() })
     }
 
     /// The plan for these shapes, made when there is none yet.
-    pub(super) fn plan(&self, inputs: &[(&str, Tensor)], outputs: &[&str]) -> Result<Plan, String> {
-        let shapes = self.ordered(inputs)?.into_iter().map(|t| t.shape.clone()).collect();
-        let key: Key = (shapes, outputs.iter().map(|o| o.to_string()).collect());
+    fn plan(&self, fed: &Fed) -> TractResult<Plan> {
+        let key: Vec<Vec<usize>> = fed.iter().map(|(_, array)| array.shape.clone()).collect();
         // held while planning: photographs that come together wait for the one plan they share
         let mut plans = self.plans.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, plan)) = plans.iter().find(|(k, _)| *k == key) {
+        if let Some(plan) = plans.get(&key) {
             return Ok(plan.clone());
         }
-        let plan = self.make(inputs, outputs).map_err(|e| sentence(&e))?;
-        if plans.len() >= KEPT_PLANS {
-            plans.pop_front();
+        let mut model = self.parsed.clone();
+        for (i, (port, array)) in fed.iter().enumerate() {
+            let kind = if port.kind == I64 { i64::datum_type() } else { f32::datum_type() };
+            model.set_input_fact(i, InferenceFact::dt_shape(kind, array.shape.as_slice()))?;
         }
-        plans.push_back((key, plan.clone()));
+        self.bounded(&mut model)?;
+        model.analyse(false)?;
+        let plan = model.into_optimized()?.into_runnable()?;
+        if plans.len() >= KEPT_PLANS {
+            plans.clear();
+        }
+        plans.insert(key, plan.clone());
         Ok(plan)
     }
 
-    fn make(&self, inputs: &[(&str, Tensor)], outputs: &[&str]) -> TractResult<Plan> {
-        let mut model = self.parsed.clone();
-        for (i, tensor) in self.ordered(inputs).map_err(|e| anyhow_from(&e))?.into_iter().enumerate() {
-            let kind = match tensor.values {
-                Values::F32(_) => f32::datum_type(),
-                Values::I64(_) => i64::datum_type(),
-            };
-            model.set_input_fact(i, InferenceFact::dt_shape(kind, tensor.shape.as_slice()))?;
-        }
-        let mut wanted = Vec::new();
-        for name in outputs {
-            let place = self.outputs.iter().position(|o| o == name);
-            let outlet = place.and_then(|i| model.outputs.get(i).copied());
-            wanted.push(outlet.ok_or_else(|| anyhow_from(&format!("there is no output `{name}`")))?);
-        }
-        model.select_output_outlets(&wanted)?;
-        model.analyse(false)?;
-        self.bounded(&model)?;
-        model.into_optimized()?.into_runnable()
-    }
-
-    /// Refuses a graph with an array no photograph needs, before the engine makes it.
-    fn bounded(&self, model: &InferenceModel) -> TractResult<()> {
-        for node in model.nodes() {
-            for output in &node.outputs {
-                let Some(shape) = output.fact.shape.concretize() else { continue };
+    /// Refuses a graph with an array no photograph needs, before the engine makes it. Inferring a node's facts
+    /// also computes what is constant, so its extents are asked for first.
+    fn bounded(&self, model: &mut InferenceModel) -> TractResult<()> {
+        for id in model.eval_order()? {
+            let node = model.node(id).clone();
+            let own = |facts: TVec<&InferenceFact>| facts.into_iter().cloned().collect::<TVec<_>>();
+            let (inputs, outputs) = model.node_facts(id)?;
+            let (inputs, outputs) = (own(inputs), own(outputs));
+            let seen = node.op.observe_outlets(model, &node)?;
+            let seen =
+                seen.iter().map(|at| model.outlet_fact(*at).cloned()).collect::<TractResult<TVec<_>>>()?;
+            let facts = || (inputs.iter().collect(), outputs.iter().collect(), seen.iter().collect());
+            let mut op = node.op.clone();
+            let (a, b, c) = facts();
+            let made = op.infer_facts(a, b, c)?.1;
+            for shape in made.iter().filter_map(|fact| fact.shape.concretize()) {
                 let extents = shape.iter().map(|d| d.to_i64().unwrap_or(1).unsigned_abs());
                 let bytes = extents.fold(4u64, |n, d| n.saturating_mul(d));
                 if bytes > self.array_bytes {
                     let problem = format!("its node `{}` asks for an array of {bytes} bytes", node.name);
-                    return Err(anyhow_from(&problem));
+                    return Err(TractError::msg(problem));
                 }
+            }
+            let (a, b, c) = facts();
+            let known = op.infer(a, b, c)?.1;
+            for (slot, (known, old)) in known.iter().zip(&outputs).enumerate() {
+                model.set_outlet_fact(OutletId::new(id, slot), known.unify(old)?)?;
             }
         }
         Ok(())
     }
 
-    /// The inputs in the order of the model.
-    fn ordered<'a>(&self, inputs: &'a [(&str, Tensor)]) -> Result<Vec<&'a Tensor>, String> {
-        let find = |name: &String| {
-            let found = inputs.iter().find(|(n, _)| n == name).map(|(_, t)| t);
-            found.ok_or_else(|| format!("it asks for `{name}`, which is not fed"))
-        };
-        self.inputs.iter().map(find).collect()
-    }
-
     /// One run.
-    pub(super) fn run(&self, inputs: &[(&str, Tensor)], outputs: &[&str]) -> Result<Vec<Output>, String> {
-        let plan = self.plan(inputs, outputs)?;
-        let mut fed = TVec::new();
-        for tensor in self.ordered(inputs)? {
-            let made = match &tensor.values {
-                Values::F32(v) => tract_onnx::prelude::Tensor::from_shape(&tensor.shape, v),
-                Values::I64(v) => tract_onnx::prelude::Tensor::from_shape(&tensor.shape, v),
+    pub(super) fn run(&self, fed: &Fed) -> Result<Vec<Array>, String> {
+        let run = || -> TractResult<Vec<Array>> {
+            let plan = self.plan(fed)?;
+            let value = |(port, array): &(&Port, &Array)| -> TractResult<TValue> {
+                let made = match port.kind {
+                    I64 => Tensor::from_shape(&array.shape, &array.integers())?,
+                    _ => Tensor::from_shape(&array.shape, &array.values)?,
+                };
+                Ok(made.into_tvalue())
             };
-            fed.push(made.map_err(|e| sentence(&e))?.into_tvalue());
-        }
-        let given = plan.run(fed).map_err(|e| sentence(&e))?;
-        given
-            .iter()
-            .map(|value| {
-                let view = value.to_plain_array_view::<f32>().map_err(|e| sentence(&e))?;
-                Ok(Output { shape: view.shape().to_vec(), values: view.iter().copied().collect() })
-            })
-            .collect()
+            let given = plan.run(fed.iter().map(value).collect::<TractResult<TVec<_>>>()?)?;
+            let array = |value: &TValue| -> TractResult<Array> {
+                let view = value.to_plain_array_view::<f32>()?;
+                Ok(Array { shape: view.shape().to_vec(), values: view.iter().copied().collect() })
+            };
+            given.iter().map(array).collect()
+        };
+        run().map_err(|e| sentence(&e))
     }
-}
-
-fn anyhow_from(problem: &str) -> TractError {
-    TractError::msg(problem.to_string())
 }
 
 /// Where and why, in a sentence: the first of what the engine says, and the beginning of the innermost; the
