@@ -46,7 +46,9 @@ impl Out {
             };
             return Err(Ending::usage(format!("`--out {shown}`: `{product}` makes no such file"), hint));
         }
-        if io::exists(out) && (folder || !io::is_file(out)) {
+        // by its name without the `/`, by which a file is not found
+        let bare = out.components().as_path();
+        if io::exists(bare) && (folder || !io::is_file(bare)) {
             let what = if folder { "folder" } else { "regular file" };
             return Err(Ending::cannot(format!("`--out {shown}` is no {what}"), "choose another name"));
         }
