@@ -22,6 +22,15 @@ pub(super) struct Effort {
 }
 
 impl Effort {
+    pub(super) fn of(left: usize) -> Effort {
+        Effort { left, short: false }
+    }
+
+    /// Was too little left for something?
+    pub(super) fn ran_short(&self) -> bool {
+        self.short
+    }
+
     /// Spends, or returns false from the first time that too little is left.
     pub(super) fn spend(&mut self, cost: usize) -> bool {
         self.short |= self.left < cost;
@@ -48,7 +57,7 @@ pub(super) fn share_out<T: Send>(
 ) -> Shared<T> {
     let mut total = each.saturating_mul(items.max(ALWAYS));
     let go = |i: usize, share: usize| {
-        let mut effort = Effort { left: share, short: false };
+        let mut effort = Effort::of(share);
         let found = work(i, &mut effort);
         (found, share - effort.left, effort.short)
     };

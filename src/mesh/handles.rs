@@ -16,6 +16,7 @@
 //! next best is taken, and without any the handle stays and is counted.
 
 use super::MeshError;
+use super::boxes::{Boxes, Effort, Span};
 use super::check::intersect;
 use super::holes::least_area;
 use super::loops::{Loop, Loops};
@@ -29,6 +30,9 @@ const MOST_SIDES: usize = 256;
 
 /// How far the rims are drawn back, as shares of the way to the vertices behind them; the first that fits.
 const DRAWN: [f32; 3] = [0.5, 0.25, 0.1];
+
+/// Boxes compared for one triangle of a cap, at most: a sound surface takes hundreds.
+const EFFORT_OF_A_CAP: usize = 1 << 20;
 
 /// A triangle may turn until this cosine when its rim is drawn back.
 const TURN: f64 = 0.3;
@@ -174,7 +178,7 @@ fn by_field(
 struct Work<'a> {
     mesh: &'a Mesh,
     loops: &'a Loops<'a>,
-    bvh: Bvh,
+    boxes: Boxes,
     next: Mesh,
     /// Triangles of `mesh` that are no longer what they were.
     changed: Vec<bool>,
@@ -198,7 +202,7 @@ impl<'a> Work<'a> {
         Work {
             mesh,
             loops,
-            bvh: Bvh::new(mesh),
+            boxes: Boxes::new((0..mesh.triangles.len() as u32).map(|t| span(mesh.corners(t)))),
             next: mesh.clone(),
             changed: vec![false; mesh.triangles.len()],
             fresh: Vec::new(),
@@ -294,15 +298,21 @@ impl<'a> Work<'a> {
                 }
             };
             let mut free = true;
-            self.bvh.overlapping(bounds, |o| {
+            let mut effort = Effort::of(EFFORT_OF_A_CAP);
+            self.boxes.meeting(&span(p), &mut effort, |o, _| {
                 let replaced = self.changed[o as usize] || cut.at_rims.contains_key(&o);
                 free = replaced || !meets(self.mesh.triangles[o as usize]);
                 free
             });
-            free && !all[..i].iter().any(|&o| meets(o))
+            free && !effort.ran_short()
+                && !all[..i].iter().any(|&o| meets(o))
                 && !self.fresh.iter().any(|&o| meets(self.next.triangles[o as usize]))
         })
     }
+}
+
+fn span(corners: [Vec3; 3]) -> Span {
+    Span::around(corners.map(Vec3::as_dvec3))
 }
 
 fn area_vector([a, b, c]: [Vec3; 3]) -> Vec3 {

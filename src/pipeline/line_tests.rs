@@ -374,7 +374,7 @@ fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
         assert!(e.hint().contains("`--fresh mask`") && e.exit() == Exit::Cannot, "{}", e.hint());
     }
     // which it is
-    run.fresh("mask", &line.followers("mask")).unwrap();
+    line.fresh("mask", "mask").unwrap();
     line.mask().unwrap();
 }
 
