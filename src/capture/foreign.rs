@@ -92,7 +92,7 @@ pub(super) fn explain(root: &Path) -> CaptureError {
     match recognised(&found) {
         Some((what, telltale, hint)) => CaptureError::NotACapture {
             root: root.into(),
-            seen: format!("it looks like {what} (`{telltale}`), which is not read"),
+            seen: format!("it looks like {what} (`{telltale}`); that is not read"),
             hint,
         },
         None => CaptureError::NotACapture {
