@@ -15,9 +15,9 @@ use clicked::{Clicked, mean_worst, overlap, read};
 use process::{cpu_s, peak_gib};
 use tiface::geom::Camera;
 use tiface::image::{Gray, Photo};
-use tiface::mask::consistency::{AgreeOptions, AgreeView, agree};
-use tiface::mask::grabcut::{CutOptions, cut};
-use tiface::mask::propagate::{SpreadOptions, SpreadView, spread};
+use tiface::mask::consistency::{ConsistencyOptions, ConsistencyView, check_consistency};
+use tiface::mask::grabcut::{GrabcutOptions, grabcut};
+use tiface::mask::propagate::{PropagateOptions, PropagateView, propagate};
 use tiface::mask::{Click, CutError};
 
 fn main() {
@@ -40,8 +40,8 @@ fn table(name: &str, c: &Clicked, times: u32) {
     let alone: Vec<f64> = (0..c.views.len())
         .filter(|&i| !c.clicks[i].is_empty())
         .map(|i| {
-            let cut =
-                cut(&c.views[i].name, &c.photos[i], &c.clicks[i], &CutOptions::default()).expect("a mask");
+            let cut = grabcut(&c.views[i].name, &c.photos[i], &c.clicks[i], &GrabcutOptions::default())
+                .expect("a mask");
             overlap(&cut.mask, &c.truth[i])
         })
         .collect();
@@ -52,28 +52,28 @@ fn table(name: &str, c: &Clicked, times: u32) {
     let scaled = |v: f32| (v + 0.5) * times as f32 - 0.5;
     let moved = |k: &Click| Click { x: scaled(k.x), y: scaled(k.y), head: k.head };
     let clicks: Vec<Vec<Click>> = c.clicks.iter().map(|k| k.iter().map(moved).collect()).collect();
-    let views: Vec<SpreadView> = (0..c.views.len())
-        .map(|i| SpreadView {
+    let views: Vec<PropagateView> = (0..c.views.len())
+        .map(|i| PropagateView {
             name: &c.views[i].name,
             camera: &cameras[i],
             clicks: &clicks[i],
-            witness: true,
+            votes: true,
         })
         .collect();
     let start = cpu_s();
     let load = |i: usize| Ok(enlarged(&c.photos[i], times));
-    let masks = spread::<CutError, _>(&views, load, &SpreadOptions::default()).expect("masks");
+    let masks = propagate::<CutError, _>(&views, load, &PropagateOptions::default()).expect("masks");
     let s = cpu_s() - start;
     let overlaps: Vec<f64> = masks.views.iter().zip(&c.truth).map(|(m, t)| overlap(&m.mask, t)).collect();
     row("all views", &overlaps, s);
     masks.warnings.iter().for_each(|w| println!("  {w}"));
 
     let start = cpu_s();
-    let check: Vec<AgreeView> = (c.views.iter().zip(&masks.views))
-        .map(|(v, m)| AgreeView { name: &v.name, camera: &v.camera, mask: Some::<&Gray>(&m.mask) })
+    let check: Vec<ConsistencyView> = (c.views.iter().zip(&masks.views))
+        .map(|(v, m)| ConsistencyView { name: &v.name, camera: &v.camera, mask: Some::<&Gray>(&m.mask) })
         .collect();
-    let found = agree(&check, &AgreeOptions::default()).expect("a comparison");
-    println!("{name:10} check          {} doubts, {:.2} CPU s", found.doubts.len(), cpu_s() - start);
+    let found = check_consistency(&check, &ConsistencyOptions::default()).expect("a comparison");
+    println!("{name:10} check          {} conflicts, {:.2} CPU s", found.conflicts.len(), cpu_s() - start);
 }
 
 /// Each pixel `times` × `times` times.

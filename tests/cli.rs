@@ -225,7 +225,9 @@ fn clicks_that_cannot_be_used_are_named_with_the_way_out() {
     let options = SyntheticOptions { width: 32, height: 40, train: 3, test: 1, seed: 1 };
     write_capture(&dir.path().join("head"), &options).unwrap();
     for (words, expected) in [
-        (&["mask", "head", "--points", "none.json"][..], "none.json"),
+        (&["mask", "head", "--prompts", "none.json"][..], "none.json"),
+        // as the option was spelled once
+        (&["mask", "head", "--points", "none.json"], "none.json"),
         (&["mask", "head", "--point", "1,2"], "`1,2`"),
         (&["mask", "head", "--point", "500,2,1"], "500"),
         (&["mask", "head", "--point", "16,20,1", "--view", "nobody"], "nobody"),
@@ -236,7 +238,7 @@ fn clicks_that_cannot_be_used_are_named_with_the_way_out() {
         assert!(err(&o).contains(expected) && err(&o).contains("hint: "), "{words:?}: {}", err(&o));
         assert!(!dir.path().join("runs/head/mask/done.json").exists());
     }
-    let o = tiface(dir.path(), &["mask", "head", "--points", "a", "--point", "1,2,1"]);
+    let o = tiface(dir.path(), &["mask", "head", "--prompts", "a", "--point", "1,2,1"]);
     assert_eq!(code(&o), 2);
 }
 

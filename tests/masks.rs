@@ -6,16 +6,17 @@ mod clicked;
 
 use clicked::{Clicked, mean_worst, overlap, read};
 use tiface::image::Gray;
-use tiface::mask::consistency::{AgreeOptions, AgreeView, Agreement, agree};
-use tiface::mask::grabcut::{CutOptions, cut};
-use tiface::mask::propagate::{Masks, SpreadOptions, SpreadView, spread};
+use tiface::mask::consistency::{Consistency, ConsistencyOptions, ConsistencyView, check_consistency};
+use tiface::mask::grabcut::{GrabcutOptions, grabcut};
+use tiface::mask::propagate::{Masks, PropagateOptions, PropagateView, propagate};
 use tiface::mask::{Click, CutError};
 
 fn clicked_views(c: &Clicked) -> Vec<f64> {
     let clicked = (0..c.views.len()).filter(|&i| !c.clicks[i].is_empty());
     clicked
         .map(|i| {
-            let cut = cut(&c.views[i].name, &c.photos[i], &c.clicks[i], &CutOptions::default()).unwrap();
+            let cut =
+                grabcut(&c.views[i].name, &c.photos[i], &c.clicks[i], &GrabcutOptions::default()).unwrap();
             assert!(cut.warnings.is_empty(), "{:?}", cut.warnings);
             overlap(&cut.mask, &c.truth[i])
         })
@@ -23,21 +24,21 @@ fn clicked_views(c: &Clicked) -> Vec<f64> {
 }
 
 fn all_views(c: &Clicked) -> Masks {
-    let views: Vec<SpreadView> = (c.views.iter().zip(&c.clicks))
-        .map(|(v, clicks)| SpreadView { name: &v.name, camera: &v.camera, clicks, witness: true })
+    let views: Vec<PropagateView> = (c.views.iter().zip(&c.clicks))
+        .map(|(v, clicks)| PropagateView { name: &v.name, camera: &v.camera, clicks, votes: true })
         .collect();
-    spread::<CutError, _>(&views, |i| Ok(c.photos[i].clone()), &SpreadOptions::default()).unwrap()
+    propagate::<CutError, _>(&views, |i| Ok(c.photos[i].clone()), &PropagateOptions::default()).unwrap()
 }
 
-fn compare(c: &Clicked, masks: &[Gray]) -> Agreement {
-    let views: Vec<AgreeView> = (c.views.iter().zip(masks))
-        .map(|(v, mask)| AgreeView { name: &v.name, camera: &v.camera, mask: Some(mask) })
+fn compare(c: &Clicked, masks: &[Gray]) -> Consistency {
+    let views: Vec<ConsistencyView> = (c.views.iter().zip(masks))
+        .map(|(v, mask)| ConsistencyView { name: &v.name, camera: &v.camera, mask: Some(mask) })
         .collect();
-    agree(&views, &AgreeOptions::default()).unwrap()
+    check_consistency(&views, &ConsistencyOptions::default()).unwrap()
 }
 
-fn names(found: &Agreement) -> Vec<usize> {
-    found.doubts.iter().map(|d| d.view).collect()
+fn names(found: &Consistency) -> Vec<usize> {
+    found.conflicts.iter().map(|d| d.view).collect()
 }
 
 /// The bars stand a little below what was measured: see `cargo bench --bench masks`.
@@ -76,7 +77,7 @@ fn the_true_masks_agree_and_one_wrong_mask_among_them_is_named() {
     let (Some(a), Some(b)) = (read("lps"), read("nefertiti")) else { return };
     for (c, other) in [(&a, &b), (&b, &a)] {
         let found = compare(c, &c.truth);
-        assert!(found.doubts.is_empty() && found.left < 1e-4, "{found:?}");
+        assert!(found.conflicts.is_empty() && found.left < 1e-4, "{found:?}");
         for i in [2, 12, 23] {
             let own = &c.truth[i];
             let inverted = Gray { values: own.values.iter().map(|v| 255 - v).collect(), ..own.clone() };
@@ -93,7 +94,7 @@ fn the_true_masks_agree_and_one_wrong_mask_among_them_is_named() {
                 let mut masks = c.truth.clone();
                 masks[i] = mask;
                 let found = compare(c, &masks);
-                assert_eq!(names(&found), [i], "view {i} {what}: {:?}", found.doubts);
+                assert_eq!(names(&found), [i], "view {i} {what}: {:?}", found.conflicts);
             }
         }
     }
@@ -103,7 +104,7 @@ fn the_true_masks_agree_and_one_wrong_mask_among_them_is_named() {
 fn clicks_that_say_nothing_are_refused_before_anything_is_cut() {
     let Some(c) = read("lps") else { return };
     let try_clicks =
-        |clicks: &[Click]| cut("010", &c.photos[10], clicks, &CutOptions::default()).unwrap_err();
+        |clicks: &[Click]| grabcut("010", &c.photos[10], clicks, &GrabcutOptions::default()).unwrap_err();
     let stage = Click { x: 30.0, y: 50.0, head: false };
     assert!(matches!(try_clicks(&[stage]), CutError::NoHead { .. }));
     assert!(matches!(try_clicks(&[Click { x: 384.0, head: true, ..stage }]), CutError::OutsidePhoto { .. }));

@@ -71,7 +71,7 @@ fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
         "device=cpu",
     ];
     let mut words = vec!["mesh", "head", "--preset", "draft", "--set"];
-    let points = ["mask.points=", dir.path().join("prompts.json").to_str().unwrap()].concat();
+    let points = ["mask.prompts=", dir.path().join("prompts.json").to_str().unwrap()].concat();
     words.push(&points);
     settings.iter().for_each(|s| words.extend(["--set", *s]));
     worked(&tiface(dir.path(), &words));

@@ -67,10 +67,10 @@ struct Place {
 #[derive(Args, Debug, Default)]
 struct Clicks {
     /// Make masks from the clicks in this prompts.json
-    #[arg(long, value_name = "FILE")]
-    points: Option<PathBuf>,
+    #[arg(long, alias = "points", value_name = "FILE")]
+    prompts: Option<PathBuf>,
     /// A click on one photograph, label 1 for the head, 0 for what is not; repeatable
-    #[arg(long, value_name = "X,Y,LABEL", conflicts_with = "points", allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,LABEL", conflicts_with = "prompts", allow_hyphen_values = true)]
     point: Vec<String>,
     /// The view that --point is on [default: the first that is trained on]
     #[arg(long, value_name = "NAME", requires = "point")]
@@ -94,7 +94,7 @@ impl Clicks {
     fn keys(&self) -> Result<Vec<(String, String, String)>, Ending> {
         let mut keys = Vec::new();
         let files = [
-            ("--points", "mask.points", &self.points),
+            ("--prompts", "mask.prompts", &self.prompts),
             ("--sam", "mask.sam", &self.sam),
             ("--sam-decoder", "mask.sam_decoder", &self.sam_decoder),
             ("--vitmatte", "mask.vitmatte", &self.vitmatte),
@@ -125,7 +125,7 @@ enum Command {
     #[command(after_long_help = "Examples:
   tiface run captures/002_00
   tiface run captures/002_00 --run /data/002_00 --preset paper --seed 7
-  tiface run captures/002_00 --points prompts.json  masks from clicks on a few photographs
+  tiface run captures/002_00 --prompts prompts.json  masks from clicks on a few photographs
   tiface run runs/002_00 --fresh mesh --set mesh.resolution=1024
   tiface run captures/002_00 --require psnr=28      exit code 3 if the views are worse than that")]
     Run {
@@ -155,10 +155,10 @@ enum Command {
     /// Stage: which pixels are the head, and where that puts it
     #[command(after_long_help = "Examples:
   tiface mask captures/002_00                   the masks that lie there; a sheet of them in the run's mask/
-  tiface mask captures/002_00 --page            a page to click on, which saves prompts.json
-  tiface mask captures/002_00 --points prompts.json
+  tiface mask captures/002_00 --page            an annotation page, which saves prompts.json
+  tiface mask captures/002_00 --prompts prompts.json
   tiface mask captures/002_00 --view 010 --point 181,288,1 --point 32,51,0
-  tiface mask captures/002_00 --points prompts.json --sam encoder.onnx --sam-decoder decoder.onnx \\
+  tiface mask captures/002_00 --prompts prompts.json --sam encoder.onnx --sam-decoder decoder.onnx \\
       --vitmatte vitmatte.onnx
 
 Click the face, the hair and every garment of another colour, and the stage twice; on three photographs
@@ -168,7 +168,7 @@ from different sides. The other views follow from the cameras.")]
         place: Place,
         #[command(flatten)]
         clicks: Clicks,
-        /// Write a page to click on instead, to --out or <capture>_clicks.html
+        /// Write an annotation page to click on instead, to --out or <capture>_clicks.html
         #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "onnxruntime"])]
         page: bool,
     },
@@ -378,7 +378,7 @@ impl Cli {
             Command::Demo => demo::go(common, screen, stop),
             Command::Inspect { capture } => nothing("inspect").and_then(|()| inspect::go(common, capture)),
             Command::Mask { place, clicks, page: true } => {
-                page::go(common, place.path.as_deref(), clicks.points.as_deref(), screen)
+                page::go(common, place.path.as_deref(), clicks.prompts.as_deref(), screen)
             }
             Command::Mask { place, clicks, page: false } => line(place, "mask", &clicks.keys()?),
             Command::Baseline { place } => line(place, "baseline", &[]),

@@ -48,7 +48,7 @@ pub(super) fn go(
     let name = format!("{}_clicks.html", capture.name);
     let out = asked.as_ref().map_or_else(|| PathBuf::from(&name), |out| out.file(&name));
     if common.dry_run {
-        screen.note("page", &format!("would write a page to click on to `{}`", out.display()));
+        screen.note("page", &format!("would write an annotation page to `{}`", out.display()));
         return Ok(Exit::Done);
     }
     if let Some(Out::Folder(folder)) = &asked {
@@ -59,7 +59,7 @@ pub(super) fn go(
         say(&format!("{}\n", json!({"event": "result", "page": out})))?;
     } else if !common.quiet {
         say(&format!(
-            "page      {} (open it, click, save prompts.json; then `--points prompts.json`)\n",
+            "page      {} (open it, click, save prompts.json; then `--prompts prompts.json`)\n",
             out.display()
         ))?;
     }

@@ -14,7 +14,7 @@ pub enum MaskSource {
     Alpha,
     /// The folder `capture.mask_dir`.
     Folder,
-    /// Made from clicks: `mask.points` or `mask.point`.
+    /// Made from clicks: `mask.prompts` or `mask.point`.
     Clicks,
     /// None, as is only done when asked for: everything in the picture is reconstructed.
     None,
@@ -42,7 +42,7 @@ pub enum CutMethod {
     Sam,
 }
 
-/// How the opacity of the unsure band is found.
+/// How the opacity of the unknown band is found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MattingMethod {
@@ -75,7 +75,7 @@ pub struct MaskConfig {
     /// What the rest of the picture is.
     pub meaning: MaskMeaning,
     /// A `prompts.json`; empty for none.
-    pub points: String,
+    pub prompts: String,
     /// Clicks as `x,y,label`, for a quick try.
     pub point: Vec<String>,
     /// The view that `point` is on; empty for the first that is trained on.
@@ -109,24 +109,24 @@ pub struct MaskConfig {
     /// Rounds of fitting and cutting.
     pub cut_rounds: usize,
     /// Radius of what a click makes certain, share of the height.
-    pub disc: f32,
-    /// Width of the sure strips at the borders, share of the height.
-    pub strip: f32,
-    /// How far down the strips at the sides reach, share of the height.
-    pub strip_sides: f32,
+    pub seed_radius: f32,
+    /// Width of the margins at the borders, share of the height.
+    pub border_margin: f32,
+    /// How far down the border margins at the sides reach, share of the height.
+    pub border_sides: f32,
     /// Cells along each side of the carved cube.
     pub carve_cells: usize,
     /// Rounds of carving and cutting.
     pub carve_rounds: usize,
-    /// Distance from the hull's silhouette to sure stage, share of the height.
+    /// Distance from the hull's silhouette to definite background, share of the height.
     pub carve_outside: f32,
     /// Depth of the core, share of the deepest cell.
     pub carve_core: f64,
     /// Votes against a cell that are forgiven.
-    pub carve_dissent: usize,
+    pub carve_most_negative: usize,
     /// Share of the views that must keep a cell.
-    pub carve_consent: f64,
-    /// Radius of the unsure band, share of the height.
+    pub carve_least_positive: f64,
+    /// Radius of the unknown band, share of the height.
     pub band: f32,
     /// Side of the square of ones instead; 0 for discs.
     pub kernel: u32,
@@ -134,10 +134,10 @@ pub struct MaskConfig {
     pub iterations: u32,
     /// ε of closed-form matting.
     pub epsilon: f64,
-    /// Weight of sure pixels.
-    pub tie: f64,
-    /// Weight by which unsure pixels are held to the hard mask.
-    pub hold: f64,
+    /// Weight of definite pixels.
+    pub constraint_weight: f64,
+    /// Weight by which unknown pixels are held to the hard mask.
+    pub prior_weight: f64,
     /// Alphas below become 0.
     pub lowest: f32,
     /// Alphas above become 1.
@@ -151,7 +151,7 @@ pub(super) const KEYS: &[Key] = &[
          clicks or none (go on without: whatever the cameras see is learned).",
     ),
     Key::word("meaning", "What lies outside a mask: empty (nothing of the head) or ignore (not looked at)."),
-    Key::word("points", "Clicks to make masks from: a prompts.json, as `tiface mask --page` saves it."),
+    Key::word("prompts", "Clicks to make masks from: a prompts.json, as `tiface mask --page` saves it."),
     Key::word(
         "point",
         "A list of clicks x,y,label on one photograph (label 1: head, 0: not), for a quick try.",
@@ -186,14 +186,19 @@ pub(super) const KEYS: &[Key] = &[
         1e4,
     ),
     Key::number("cut_rounds", "Rounds of fitting colours and cutting.", 1.0, 100.0),
-    Key::number("disc", "Radius around a click that is certain, share of the height.", 0.0, 0.5),
+    Key::number("seed_radius", "Radius around a click that is certain, share of the height.", 0.0, 0.5),
     Key::number(
-        "strip",
-        "Width of the strips at the borders that are no head, share of the height.",
+        "border_margin",
+        "Width of the border margins at the borders that are no head, share of the height.",
         0.0,
         0.5,
     ),
-    Key::number("strip_sides", "How far down the strips at the sides reach, share of the height.", 0.0, 1.0),
+    Key::number(
+        "border_sides",
+        "How far down the border margins at the sides reach, share of the height.",
+        0.0,
+        1.0,
+    ),
     Key::number(
         "carve_cells",
         "Cells along each side of the cube carved to carry clicks to other views.",
@@ -203,11 +208,11 @@ pub(super) const KEYS: &[Key] = &[
     Key::number("carve_rounds", "Rounds of carving and cutting.", 1.0, 20.0),
     Key::number("carve_outside", "How far outside the hull nothing is head, share of the height.", 0.0, 0.5),
     Key::number("carve_core", "How deep inside all is head, share of the deepest cell.", 0.0, 1.0),
-    Key::number("carve_dissent", "Views that may contradict a cell.", 0.0, 1000.0),
-    Key::number("carve_consent", "Share of the views that must keep a cell.", 0.0, 1.0),
+    Key::number("carve_most_negative", "Views that may contradict a cell.", 0.0, 1000.0),
+    Key::number("carve_least_positive", "Share of the views that must keep a cell.", 0.0, 1.0),
     Key::number(
         "band",
-        "Radius of the unsure band to both sides of the outline, share of the height.",
+        "Radius of the unknown band to both sides of the outline, share of the height.",
         0.0,
         0.5,
     ),
@@ -219,8 +224,13 @@ pub(super) const KEYS: &[Key] = &[
     ),
     Key::number("iterations", "How often the square is applied each way (the paper: 5).", 0.0, 1000.0),
     Key::number("epsilon", "Noise of colours in closed-form matting.", 0.0, 1.0),
-    Key::number("tie", "Weight that ties sure pixels in closed-form matting.", 1e-6, 1e9),
-    Key::number("hold", "Weight that holds unsure pixels to the hard mask in closed-form matting.", 0.0, 1e9),
+    Key::number("constraint_weight", "Weight that ties definite pixels in closed-form matting.", 1e-6, 1e9),
+    Key::number(
+        "prior_weight",
+        "Weight that holds unknown pixels to the hard mask in closed-form matting.",
+        0.0,
+        1e9,
+    ),
     Key::number("lowest", "Alphas below this become 0.", 0.0, 1.0),
     Key::number("highest", "Alphas above this become 1.", 0.0, 1.0),
 ];
@@ -230,7 +240,7 @@ impl MaskConfig {
     pub fn clicked(&self) -> bool {
         match self.source {
             MaskSource::Clicks => true,
-            MaskSource::Auto => !self.points.is_empty() || !self.point.is_empty(),
+            MaskSource::Auto => !self.prompts.is_empty() || !self.point.is_empty(),
             _ => false,
         }
     }
@@ -253,17 +263,17 @@ impl MaskConfig {
 
     /// What the ranges of single keys cannot say: a key, its problem, and the way out.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
-        let given = !self.points.is_empty() || !self.point.is_empty();
+        let given = !self.prompts.is_empty() || !self.point.is_empty();
         let say = |key, problem: &str, hint| Some((key, problem.to_owned(), hint));
-        if !self.points.is_empty() && !self.point.is_empty() {
-            return say("mask.point", "is given beside `mask.points`", "give one of them");
+        if !self.prompts.is_empty() && !self.point.is_empty() {
+            return say("mask.point", "is given beside `mask.prompts`", "give one of them");
         }
         match self.source {
             MaskSource::Clicks if !given => {
                 return say(
                     "mask.source",
                     "is clicks, but there are none",
-                    "name a file: `--points prompts.json`",
+                    "name a file: `--prompts prompts.json`",
                 );
             }
             MaskSource::Alpha | MaskSource::Folder | MaskSource::None if given => {
@@ -274,7 +284,7 @@ impl MaskConfig {
         }
         let networks = [&self.sam, &self.sam_decoder, &self.vitmatte];
         if !self.clicked() && networks.iter().any(|file| !file.is_empty()) {
-            let hint = "give clicks: `--points prompts.json`";
+            let hint = "give clicks: `--prompts prompts.json`";
             return say(
                 "mask.sam",
                 "or `mask.vitmatte` names a network, but there are no clicks to start from",
@@ -310,7 +320,7 @@ impl MaskConfig {
         MaskConfig {
             source: MaskSource::Auto,
             meaning: MaskMeaning::Empty,
-            points: String::new(),
+            prompts: String::new(),
             point: Vec::new(),
             view: String::new(),
             cut: CutMethod::Auto,
@@ -327,22 +337,22 @@ impl MaskConfig {
             smoothness: 50.0,
             certainty: 9.0,
             cut_rounds: 8,
-            disc: 0.012,
-            strip: 0.012,
-            strip_sides: 0.6,
+            seed_radius: 0.012,
+            border_margin: 0.012,
+            border_sides: 0.6,
             carve_cells: 112,
             carve_rounds: 3,
             carve_outside: 0.012,
             carve_core: 0.55,
-            carve_dissent: 2,
-            carve_consent: 0.1,
+            carve_most_negative: 2,
+            carve_least_positive: 0.1,
             band: 0.023,
             // the paper's band, made for pictures of 1024 rows
             kernel: if preset == Preset::Paper { 10 } else { 0 },
             iterations: 5,
             epsilon: 1e-5,
-            tie: 100.0,
-            hold: 3e-3,
+            constraint_weight: 100.0,
+            prior_weight: 3e-3,
             lowest: 0.02,
             highest: 0.98,
         }
@@ -358,7 +368,7 @@ mod tests {
         let start = || MaskConfig::preset(Preset::Standard);
         assert_eq!(start().problem(), None);
         assert!(!start().clicked());
-        let clicked = MaskConfig { points: "p.json".into(), ..start() };
+        let clicked = MaskConfig { prompts: "p.json".into(), ..start() };
         assert!(clicked.clicked() && clicked.problem().is_none());
         let key = |c: MaskConfig| c.problem().unwrap().0;
         assert_eq!(key(MaskConfig { source: MaskSource::Clicks, ..start() }), "mask.source");

@@ -1,4 +1,4 @@
-//! One HTML file to click on: photographs in, `prompts.json` out.
+//! The annotation page, one HTML file to click on: photographs in, `prompts.json` out.
 //!
 //! Nothing is loaded from elsewhere and nothing is sent: photographs lie inside as JPEG, reduced, while clicks
 //! are counted in pixels of the originals. The page's own text is `annotation.html`; names of files reach it only as

@@ -3,7 +3,7 @@
 //! Of masks that are right, every ray through a masked pixel meets the visual hull: somewhere along it lies a point
 //! that no other mask rules out. Where none does, masks contradict each other: either this view shows too much, or
 //! each view that rules out the best point of the ray shows too little. One such pixel cannot tell which; all of
-//! them together can. The view whose removal settles most of the quarrel is named first, and the rest is asked
+//! them together can. The view whose removal settles most of the conflict is named first, and the rest is asked
 //! again without it, until what is left is no more than discretisation.
 //!
 //! Nothing but masks and cameras is needed, so masks a person brought are checked the same way.
@@ -19,7 +19,7 @@ use rayon::prelude::*;
 
 /// How masks are checked against each other.
 #[derive(Clone, Debug, PartialEq)]
-pub struct AgreeOptions {
+pub struct ConsistencyOptions {
     /// Rows that masks are reduced to.
     pub rows: u32,
     /// Cells along each side of the cube.
@@ -28,23 +28,23 @@ pub struct AgreeOptions {
     pub cube: f64,
     /// How many reduced pixels beside a mask, beyond the footprint of a cell, nothing is ruled out yet.
     pub slack_px: f32,
-    /// Quarrel of a view, in whole masks, below which it is never named.
-    pub least: f64,
+    /// Conflicts of a view, in whole masks, below which it is never named.
+    pub threshold: f64,
     /// … and from which it always is.
-    pub loud: f64,
-    /// Between the two it is named when its quarrel is this many times the mean.
+    pub certain_threshold: f64,
+    /// Between the two it is named when its conflict is this many times the mean.
     pub stand_out: f64,
 }
 
-impl Default for AgreeOptions {
-    fn default() -> AgreeOptions {
-        AgreeOptions {
+impl Default for ConsistencyOptions {
+    fn default() -> ConsistencyOptions {
+        ConsistencyOptions {
             rows: 160,
             cells: 128,
             cube: 1.6,
             slack_px: 1.0,
-            least: 0.005,
-            loud: 0.05,
+            threshold: 0.005,
+            certain_threshold: 0.05,
             stand_out: 4.0,
         }
     }
@@ -52,7 +52,7 @@ impl Default for AgreeOptions {
 
 /// A view with its mask.
 #[derive(Clone, Copy, Debug)]
-pub struct AgreeView<'a> {
+pub struct ConsistencyView<'a> {
     /// Its name in messages.
     pub name: &'a str,
     /// Its camera.
@@ -63,7 +63,7 @@ pub struct AgreeView<'a> {
 
 /// A mask that does not fit the others.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Doubt {
+pub struct Conflict {
     /// Which view, counted as given.
     pub view: usize,
     /// Share of its mask, 0..=1, where no point in space is on the head in the other views.
@@ -76,50 +76,55 @@ pub struct Doubt {
 
 /// What the check found.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Agreement {
+pub struct Consistency {
     /// How many masks were compared.
     pub masks: usize,
     /// The masks to look at, the worst first.
-    pub doubts: Vec<Doubt>,
+    pub conflicts: Vec<Conflict>,
     /// Share of all masks that is left unexplained once those are set aside.
     pub left: f64,
 }
 
 /// Compares the masks of all views. Fewer than two masks have nothing to disagree about.
-pub fn agree(views: &[AgreeView], options: &AgreeOptions) -> Result<Agreement, CutError> {
+pub fn check_consistency(
+    views: &[ConsistencyView],
+    options: &ConsistencyOptions,
+) -> Result<Consistency, CutError> {
     let used: Vec<usize> =
         (0..views.len()).filter(|&i| views[i].mask.is_some_and(|m| !m.values.is_empty())).collect();
     if used.len() < 2 {
-        return Ok(Agreement { masks: used.len(), ..Agreement::default() });
+        return Ok(Consistency { masks: used.len(), ..Consistency::default() });
     }
     let cameras: Vec<Camera> = used.iter().map(|&i| views[i].camera.clone()).collect();
     let cube = hull::cube(&cameras, options.cells.max(8), options.cube)?;
-    let parties: Vec<Party> = (used.par_iter())
-        .filter_map(|&i| Some(Party::new(views[i].camera, views[i].mask?, &cube, options)))
+    let silhouettes: Vec<Silhouette> = (used.par_iter())
+        .filter_map(|&i| Some(Silhouette::new(views[i].camera, views[i].mask?, &cube, options)))
         .collect();
-    let space = Space::ask(cube, &parties);
-    let mut active = vec![true; parties.len()];
-    let mut doubts = Vec::new();
+    let space = Space::new(cube, &silhouettes);
+    let mut active = vec![true; silhouettes.len()];
+    let mut conflicts = Vec::new();
     loop {
-        let quarrel = Quarrel::of(&space, &parties, &active);
+        let conflict = Conflicts::of(&space, &silhouettes, &active);
         let left = active.iter().filter(|a| **a).count();
         // of equals the first
-        let worst = (0..parties.len())
+        let worst = (0..silhouettes.len())
             .filter(|&i| active[i])
             .rev()
-            .max_by(|&a, &b| quarrel.credit[a].total_cmp(&quarrel.credit[b]))
-            .filter(|&i| quarrel.names(i, left, options));
+            .max_by(|&a, &b| conflict.credit[a].total_cmp(&conflict.credit[b]))
+            .filter(|&i| conflict.names(i, left, options));
         let Some(worst) = worst.filter(|_| left >= 2) else {
-            let total: f64 = (0..parties.len()).filter(|&i| active[i]).map(|i| quarrel.too_much[i]).sum();
-            return Ok(Agreement { masks: parties.len(), doubts, left: total / left.max(1) as f64 });
+            let total: f64 =
+                (0..silhouettes.len()).filter(|&i| active[i]).map(|i| conflict.too_much[i]).sum();
+            return Ok(Consistency { masks: silhouettes.len(), conflicts, left: total / left.max(1) as f64 });
         };
         // of two masks nothing says which is wrong
-        let named = if left == 2 { (0..parties.len()).filter(|&i| active[i]).collect() } else { vec![worst] };
+        let named =
+            if left == 2 { (0..silhouettes.len()).filter(|&i| active[i]).collect() } else { vec![worst] };
         for i in named {
             active[i] = false;
-            let (much, little) = (quarrel.too_much[i], quarrel.too_little(i));
-            let text = sentence(views[used[i]].name, much, little, quarrel.taken[i], left == 2);
-            doubts.push(Doubt { view: used[i], too_much: much, too_little: little, text });
+            let (much, little) = (conflict.too_much[i], conflict.too_little(i));
+            let text = sentence(views[used[i]].name, much, little, conflict.taken[i], left == 2);
+            conflicts.push(Conflict { view: used[i], too_much: much, too_little: little, text });
         }
     }
 }
@@ -143,7 +148,7 @@ fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String
 }
 
 /// A reduced mask and what it rules out.
-struct Party {
+struct Silhouette {
     camera: Camera,
     projector: Projector,
     width: usize,
@@ -155,8 +160,8 @@ struct Party {
     claims: Vec<usize>,
 }
 
-impl Party {
-    fn new(camera: &Camera, mask: &Gray, cube: &Cube, options: &AgreeOptions) -> Party {
+impl Silhouette {
+    fn new(camera: &Camera, mask: &Gray, cube: &Cube, options: &ConsistencyOptions) -> Silhouette {
         let height = options.rows.clamp(16, mask.height.max(16));
         let width = ((mask.width as f64 * height as f64 / mask.height as f64).round() as u32).max(1);
         let camera = camera.resized(width, height);
@@ -170,7 +175,7 @@ impl Party {
         // an all-white mask is infinitely far from its outside
         let inner = squared_distance(&off, w, h);
         let claims = (0..w * h).filter(|&i| inner[i] > options.slack_px * options.slack_px).collect();
-        Party { projector: Projector::new(&camera), camera, width: w, height: h, beside, on, claims }
+        Silhouette { projector: Projector::new(&camera), camera, width: w, height: h, beside, on, claims }
     }
 }
 
@@ -205,25 +210,26 @@ struct Space {
 }
 
 impl Space {
-    fn ask(cube: Cube, parties: &[Party]) -> Space {
-        let (n, words) = (cube.n, parties.len().div_ceil(64));
+    fn new(cube: Cube, silhouettes: &[Silhouette]) -> Space {
+        let (n, words) = (cube.n, silhouettes.len().div_ceil(64));
         let slabs: Vec<(Vec<u64>, Vec<u64>)> = (0..n)
             .into_par_iter()
             .map(|x| {
                 let (mut no, mut yes) = (vec![0u64; n * n * words], vec![0u64; n * n * words]);
-                for (p, party) in parties.iter().enumerate() {
+                for (p, silhouette) in silhouettes.iter().enumerate() {
                     for i in 0..n * n {
-                        let Some((u, v, _)) = party.projector.project(cube.cell_center(x, i / n, i % n))
+                        let Some((u, v, _)) = silhouette.projector.project(cube.cell_center(x, i / n, i % n))
                         else {
                             continue;
                         };
-                        if u < 0.0 || v < 0.0 || u >= party.width as f64 || v >= party.height as f64 {
+                        if u < 0.0 || v < 0.0 || u >= silhouette.width as f64 || v >= silhouette.height as f64
+                        {
                             continue;
                         }
-                        let pixel = v as usize * party.width + u as usize;
+                        let pixel = v as usize * silhouette.width + u as usize;
                         let at = i * words + p / 64;
-                        no[at] |= (party.beside[pixel] as u64) << (p % 64);
-                        yes[at] |= (party.on[pixel] as u64) << (p % 64);
+                        no[at] |= (silhouette.beside[pixel] as u64) << (p % 64);
+                        yes[at] |= (silhouette.on[pixel] as u64) << (p % 64);
                     }
                 }
                 (no, yes)
@@ -235,19 +241,19 @@ impl Space {
 }
 
 /// Who stands against whom among the views still believed.
-struct Quarrel {
+struct Conflicts {
     /// Per view: unexplained share of its own claims.
     too_much: Vec<f64>,
     /// Per view: shares of other views' claims that it takes away, summed.
     taken: Vec<f64>,
-    /// How much of the quarrel its removal settles, in whole masks.
+    /// How much of the conflict its removal settles, in whole masks.
     credit: Vec<f64>,
     others: f64,
 }
 
-impl Quarrel {
-    fn of(space: &Space, parties: &[Party], active: &[bool]) -> Quarrel {
-        let count = parties.len();
+impl Conflicts {
+    fn of(space: &Space, silhouettes: &[Silhouette], active: &[bool]) -> Conflicts {
+        let count = silhouettes.len();
         let mut mask = vec![0u64; space.words];
         for i in (0..count).filter(|&i| active[i]) {
             mask[i / 64] |= 1 << (i % 64);
@@ -263,30 +269,30 @@ impl Quarrel {
             .collect();
         let found: Vec<Option<(f64, Vec<f64>)>> = (0..count)
             .into_par_iter()
-            .map(|j| active[j].then(|| open_claims(space, &parties[j], &costs, &mask, count)))
+            .map(|j| active[j].then(|| open_claims(space, &silhouettes[j], &costs, &mask, count)))
             .collect();
         let others = (active.iter().filter(|a| **a).count().max(2) - 1) as f64;
         let zero = || vec![0.0; count];
-        let mut quarrel = Quarrel { too_much: zero(), taken: zero(), credit: zero(), others };
+        let mut conflict = Conflicts { too_much: zero(), taken: zero(), credit: zero(), others };
         for (j, open) in found.into_iter().enumerate() {
             let Some((own, takers)) = open else { continue };
-            quarrel.too_much[j] = own;
-            quarrel.credit[j] += own;
+            conflict.too_much[j] = own;
+            conflict.credit[j] += own;
             for (i, t) in takers.into_iter().enumerate() {
-                quarrel.taken[i] += t;
-                quarrel.credit[i] += t;
+                conflict.taken[i] += t;
+                conflict.credit[i] += t;
             }
         }
-        quarrel
+        conflict
     }
 
-    /// Is a view's part in the quarrel large, or at least unlike that of the others? Of `left` views a single
+    /// Is a view's part in the conflict large, or at least unlike that of the others? Of `left` views a single
     /// wrong one has half of all credit, so few views can stand out less.
-    fn names(&self, i: usize, left: usize, options: &AgreeOptions) -> bool {
+    fn names(&self, i: usize, left: usize, options: &ConsistencyOptions) -> bool {
         let mean = self.credit.iter().sum::<f64>() / left as f64;
         let times = if left == 2 { 0.0 } else { (left as f64 / 6.0).max(1.2).min(options.stand_out) };
         let own = self.credit[i];
-        own > options.loud || (own > options.least && own > times * mean)
+        own > options.certain_threshold || (own > options.threshold && own > times * mean)
     }
 
     /// Mean share that a view takes away from the others.
@@ -299,16 +305,16 @@ impl Quarrel {
 /// ray: `k` of them share a claim in equal parts.
 fn open_claims(
     space: &Space,
-    party: &Party,
+    silhouette: &Silhouette,
     costs: &[(u16, u16)],
     mask: &[u64],
     count: usize,
 ) -> (f64, Vec<f64>) {
     let mut takers = vec![0.0; count];
     let (mut open, mut asked) = (0usize, 0usize);
-    for &pixel in &party.claims {
-        let (x, y) = (pixel % party.width, pixel / party.width);
-        let Some((cost, cell)) = best_on_ray(space, &party.camera, x, y, costs) else { continue };
+    for &pixel in &silhouette.claims {
+        let (x, y) = (pixel % silhouette.width, pixel / silhouette.width);
+        let Some((cost, cell)) = best_on_ray(space, &silhouette.camera, x, y, costs) else { continue };
         asked += 1;
         if cost == 0 {
             continue;
@@ -426,13 +432,17 @@ mod tests {
         Gray { width: 96, height: 128, values }
     }
 
-    fn check(cameras: &[Camera], masks: &[Gray]) -> Agreement {
-        let views: Vec<AgreeView> = cameras
+    fn check(cameras: &[Camera], masks: &[Gray]) -> Consistency {
+        let views: Vec<ConsistencyView> = cameras
             .iter()
             .zip(masks)
-            .map(|(camera, m)| AgreeView { name: "v", camera, mask: Some(m) })
+            .map(|(camera, m)| ConsistencyView { name: "v", camera, mask: Some(m) })
             .collect();
-        agree(&views, &AgreeOptions { rows: 128, cells: 64, ..AgreeOptions::default() }).unwrap()
+        check_consistency(
+            &views,
+            &ConsistencyOptions { rows: 128, cells: 64, ..ConsistencyOptions::default() },
+        )
+        .unwrap()
     }
 
     fn shifted(mask: &Gray, by: usize) -> Gray {
@@ -442,11 +452,11 @@ mod tests {
     }
 
     #[test]
-    fn true_masks_do_not_quarrel() {
+    fn true_masks_are_consistent() {
         let cameras = ring(8);
         let masks: Vec<Gray> = cameras.iter().map(mask).collect();
         let found = check(&cameras, &masks);
-        assert_eq!((found.masks, found.doubts.len()), (8, 0), "{found:?}");
+        assert_eq!((found.masks, found.conflicts.len()), (8, 0), "{found:?}");
         assert!(found.left < 1e-3);
     }
 
@@ -465,8 +475,8 @@ mod tests {
             let mut masks = masks.clone();
             masks[3] = wrong;
             let found = check(&cameras, &masks);
-            assert_eq!(found.doubts.iter().map(|d| d.view).collect::<Vec<_>>(), [3], "{said}: {found:?}");
-            assert!(found.doubts[0].text.contains(said), "{}", found.doubts[0].text);
+            assert_eq!(found.conflicts.iter().map(|d| d.view).collect::<Vec<_>>(), [3], "{said}: {found:?}");
+            assert!(found.conflicts[0].text.contains(said), "{}", found.conflicts[0].text);
         }
     }
 
@@ -476,7 +486,7 @@ mod tests {
         let mut masks: Vec<Gray> = cameras.iter().map(mask).collect();
         masks[1].values.fill(0);
         masks[6].values.fill(0);
-        let mut views: Vec<usize> = check(&cameras, &masks).doubts.iter().map(|d| d.view).collect();
+        let mut views: Vec<usize> = check(&cameras, &masks).conflicts.iter().map(|d| d.view).collect();
         views.sort_unstable();
         assert_eq!(views, [1, 6]);
     }
@@ -487,9 +497,9 @@ mod tests {
         let mut masks: Vec<Gray> = cameras.iter().map(mask).collect();
         masks[0].values.fill(0);
         let found = check(&cameras, &masks);
-        assert_eq!(found.doubts.len(), 2);
-        assert!(found.doubts[0].text.contains("two masks left"));
-        assert!(check(&cameras[..1], &masks[..1]).doubts.is_empty());
+        assert_eq!(found.conflicts.len(), 2);
+        assert!(found.conflicts[0].text.contains("two masks left"));
+        assert!(check(&cameras[..1], &masks[..1]).conflicts.is_empty());
     }
 
     #[test]

@@ -35,7 +35,7 @@ pub enum CutError {
         views: Vec<String>,
     },
     /// No click says what the head is.
-    #[error("view `{view}`: all {clicks} clicks are on the stage, none is on the head")]
+    #[error("view `{view}`: all {clicks} clicks are on the background, none is on the head")]
     NoHead {
         /// The view.
         view: String,
@@ -43,7 +43,7 @@ pub enum CutError {
         clicks: usize,
     },
     /// One pixel is said to be both.
-    #[error("view `{view}`: clicks {first} and {second} call the same pixel ({x}, {y}) head and stage")]
+    #[error("view `{view}`: clicks {first} and {second} call the same pixel ({x}, {y}) head and background")]
     Contradiction {
         /// The view.
         view: String,
@@ -73,7 +73,7 @@ pub enum CutError {
         view: String,
     },
     /// Nothing says where the cameras look.
-    #[error("the {cameras} cameras {how}, so clicks cannot be carried from one view to another")]
+    #[error("the {cameras} cameras {how}, so clicks cannot be propagated from one view to another")]
     CamerasAlike {
         /// How many cameras.
         cameras: usize,
@@ -101,10 +101,10 @@ impl CutError {
                  clicks made on a photograph of another size?"
             }
             CutError::NoClicks { .. } => {
-                "click the face, the hair and each part of the garment (label 1), and twice the stage (label 0)"
+                "click the face, the hair and each part of the garment (label 1), and twice the background (label 0)"
             }
             CutError::NoHead { .. } => {
-                "add clicks on the face, the hair and the garment: label 1 is the head, 0 the stage"
+                "add clicks on the face, the hair and the garment: label 1 is the head, 0 the background"
             }
             CutError::OnlyHeldOut { .. } => {
                 "click on photographs that are trained on; `tiface inspect CAPTURE --json` tells which are"
@@ -112,7 +112,7 @@ impl CutError {
             CutError::Contradiction { .. } => "remove the wrong one of the two clicks",
             CutError::TooSmall { .. } => "give a photograph of at least 16 × 16 pixels",
             CutError::Empty { .. } => {
-                "click more of the head: its face, hair and each part of the garment, and the stage beside it"
+                "click more of the head: its face, hair and each part of the garment, and the background beside it"
             }
             CutError::CamerasAlike { .. } => {
                 "click every view, or check that each frame has its own pose and cameras look from different sides"

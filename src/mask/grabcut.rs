@@ -1,6 +1,6 @@
 //! Clicks → hard mask: GrabCut (Rother, Kolmogorov, Blake 2004) from a Voronoi start.
 //!
-//! Head and stage are mixtures of colours, learned from the labels that the last round gave; a round's labels are
+//! Head and background are mixtures of colours, learned from the labels that the last round gave; a round's labels are
 //! the smallest cut of
 //!
 //! ```text
@@ -14,11 +14,11 @@ pub mod mixture;
 mod options;
 pub(super) mod seeds;
 
-pub use self::options::CutOptions;
+pub use self::options::GrabcutOptions;
 
 use self::maxflow::PixelGraph;
 use self::mixture::{Mixture, Rgb};
-use self::seeds::Known;
+use self::seeds::Seed;
 use super::click::Click;
 use super::components::{fill_holes, keep_with_seeds, open};
 use super::error::CutError;
@@ -31,72 +31,82 @@ const UNIT: f64 = 1000.0;
 /// A hard mask at the working size.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cut {
-    /// 255 head, 0 stage.
+    /// 255 head, 0 background.
     pub mask: Gray,
     /// Share of the picture, 0..=1, that lies near the outline and has a colour that fits both sides.
-    pub unsure: f64,
+    pub ambiguous: f64,
     /// What a person should look at.
     pub warnings: Vec<String>,
 }
 
 /// Cuts the head out of one photograph. `view` is its name in messages; clicks are pixels of `photo`.
-pub fn cut(view: &str, photo: &Photo, clicks: &[Click], options: &CutOptions) -> Result<Cut, CutError> {
+pub fn grabcut(
+    view: &str,
+    photo: &Photo,
+    clicks: &[Click],
+    options: &GrabcutOptions,
+) -> Result<Cut, CutError> {
     seeds::check(view, clicks, photo.width, photo.height)?;
-    let (ground, mut warnings) = Ground::new(view, photo, clicks, options);
-    let (head, models) = ground.grab(options);
-    let head = ground.finish(head, options);
+    let (grabcut, mut warnings) = Grabcut::new(view, photo, clicks, options);
+    let (head, models) = grabcut.from_clicks(options);
+    let head = grabcut.finish(head, options);
     if !head.contains(&true) {
         return Err(CutError::Empty { view: view.into() });
     }
-    let unsure = models.map_or(1.0, |m| ground.unsure(&head, &m, options));
-    warnings.extend(ground.warnings(view, &head));
-    Ok(Cut { mask: ground.gray(&head), unsure, warnings })
+    let ambiguous = models.map_or(1.0, |m| grabcut.ambiguous(&head, &m, options));
+    warnings.extend(grabcut.warnings(view, &head));
+    Ok(Cut { mask: grabcut.gray(&head), ambiguous, warnings })
 }
 
 /// The colours of both sides.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Models {
     pub head: Mixture,
-    pub stage: Mixture,
+    pub background: Mixture,
 }
 
 impl Models {
     /// From k-means over both sides; `None` when one has no pixel.
-    pub fn fit(head: &[Rgb], stage: &[Rgb], options: &CutOptions) -> Option<Models> {
+    pub fn fit(head: &[Rgb], background: &[Rgb], options: &GrabcutOptions) -> Option<Models> {
         let count = options.gaussians.clamp(1, 16);
         Some(Models {
             head: Mixture::fit(head, count, options.seed)?,
-            stage: Mixture::fit(stage, count, options.seed)?,
+            background: Mixture::fit(background, count, options.seed)?,
         })
     }
 
-    /// `ln p(c | head) − ln p(c | stage)`.
+    /// `ln p(c | head) − ln p(c | background)`.
     pub fn lean(&self, color: &Rgb) -> f64 {
-        self.head.log_likelihood(color) - self.stage.log_likelihood(color)
+        self.head.log_likelihood(color) - self.background.log_likelihood(color)
     }
 }
 
 /// A photograph at its working size with what is certain about it.
-pub(super) struct Ground {
+pub(super) struct Grabcut {
     pub photo: Photo,
     pub width: usize,
     pub height: usize,
     /// Clicks in working pixels; empty where nobody clicked.
     pub clicks: Vec<Click>,
     /// `[height · width]`.
-    pub known: Vec<Known>,
+    pub seeds: Vec<Seed>,
     /// What telling a pixel from its right, lower, lower right and lower left neighbour costs.
-    joints: Vec<[i32; 4]>,
+    edges: Vec<[i32; 4]>,
 }
 
-/// Directions of [`PixelGraph::join`] with their steps, in the order of `Ground::joints`.
+/// Directions of [`PixelGraph::join`] with their steps, in the order of `Grabcut::edges`.
 const FORWARD: [(usize, isize, isize); 4] = [(0, 1, 0), (2, 0, 1), (4, 1, 1), (6, -1, 1)];
 
-impl Ground {
+impl Grabcut {
     /// Reduces a photograph and draws what its clicks make certain; also warnings about the clicks.
-    pub fn new(view: &str, photo: &Photo, clicks: &[Click], options: &CutOptions) -> (Ground, Vec<String>) {
+    pub fn new(
+        view: &str,
+        photo: &Photo,
+        clicks: &[Click],
+        options: &GrabcutOptions,
+    ) -> (Grabcut, Vec<String>) {
         let small = reduce_to_rows(photo, options.rows.max(16));
-        Ground::reduced(view, small, (photo.width, photo.height), clicks, options)
+        Grabcut::reduced(view, small, (photo.width, photo.height), clicks, options)
     }
 
     /// The same for a photograph that is reduced already, from `size`, in whose pixels the clicks are.
@@ -105,18 +115,18 @@ impl Ground {
         small: Photo,
         size: (u32, u32),
         clicks: &[Click],
-        options: &CutOptions,
-    ) -> (Ground, Vec<String>) {
+        options: &GrabcutOptions,
+    ) -> (Grabcut, Vec<String>) {
         let clicks: Vec<Click> = clicks.iter().map(|c| c.moved(size, (small.width, small.height))).collect();
         let (width, height) = (small.width as usize, small.height as usize);
-        let (known, warnings) = seeds::known(view, &clicks, width, height, options);
-        let joints = joints(&small, options.smoothness);
-        (Ground { photo: small, width, height, clicks, known, joints }, warnings)
+        let (seeds, warnings) = seeds::from_clicks(view, &clicks, width, height, options);
+        let edges = edges(&small, options.smoothness);
+        (Grabcut { photo: small, width, height, clicks, seeds, edges }, warnings)
     }
 
     /// GrabCut from the clicks: labels and the colours they end with.
-    pub fn grab(&self, options: &CutOptions) -> (Vec<bool>, Option<Models>) {
-        let start = seeds::start(&self.known, &self.clicks, self.width, self.height, options);
+    pub fn from_clicks(&self, options: &GrabcutOptions) -> (Vec<bool>, Option<Models>) {
+        let start = seeds::start(&self.seeds, &self.clicks, self.width, self.height, options);
         let mut head = start.head;
         let mut models: Option<Models> = None;
         for _ in 0..options.rounds.max(1) {
@@ -126,10 +136,12 @@ impl Ground {
             }
             models = match models {
                 None => Models::fit(&inside, &outside, options),
-                Some(m) => Some(Models { head: m.head.refit(&inside), stage: m.stage.refit(&outside) }),
+                Some(m) => {
+                    Some(Models { head: m.head.refit(&inside), background: m.background.refit(&outside) })
+                }
             };
             let Some(m) = &models else { break };
-            let labels = self.labels(&self.known, m, options);
+            let labels = self.min_cut(&self.seeds, m, options);
             let settled = labels == head;
             head = labels;
             if settled {
@@ -147,21 +159,21 @@ impl Ground {
     }
 
     /// One smallest cut under given colours.
-    pub fn labels(&self, known: &[Known], models: &Models, options: &CutOptions) -> Vec<bool> {
+    pub fn min_cut(&self, seeds: &[Seed], models: &Models, options: &GrabcutOptions) -> Vec<bool> {
         let certain = (options.certainty * options.smoothness * UNIT) as i32;
         let mut graph = PixelGraph::new(self.width, self.height);
-        for (i, joint) in self.joints.iter().enumerate() {
+        for (i, edge) in self.edges.iter().enumerate() {
             let (x, y) = (i % self.width, i / self.width);
-            let (as_head, as_stage) = match known[i] {
-                Known::Head => (0, certain),
-                Known::Stage => (certain, 0),
-                Known::Nothing => {
+            let (as_head, as_background) = match seeds[i] {
+                Seed::Head => (0, certain),
+                Seed::Background => (certain, 0),
+                Seed::Unknown => {
                     let lean = (models.lean(&self.photo.rgb[i]) * UNIT).clamp(-1e8, 1e8) as i32;
                     ((-lean).max(0), lean.max(0))
                 }
             };
-            graph.add_costs(x, y, as_head, as_stage);
-            for ((direction, dx, dy), &weight) in FORWARD.into_iter().zip(joint) {
+            graph.add_costs(x, y, as_head, as_background);
+            for ((direction, dx, dy), &weight) in FORWARD.into_iter().zip(edge) {
                 let (u, v) = (x as isize + dx, y as isize + dy);
                 if u >= 0 && u < self.width as isize && v < self.height as isize {
                     graph.join(x, y, direction, weight);
@@ -172,8 +184,8 @@ impl Ground {
     }
 
     /// Pieces without a click go, small holes are filled, threads are opened.
-    pub fn finish(&self, mut head: Vec<bool>, options: &CutOptions) -> Vec<bool> {
-        let clicked: Vec<bool> = self.known.iter().map(|k| *k == Known::Head).collect();
+    pub fn finish(&self, mut head: Vec<bool>, options: &GrabcutOptions) -> Vec<bool> {
+        let clicked: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Head).collect();
         keep_with_seeds(&mut head, &clicked, self.width, self.height);
         let mut smooth = self.smooth(head, options);
         // opening may part what a thread held together
@@ -182,24 +194,24 @@ impl Ground {
     }
 
     /// Small holes are filled, threads are opened.
-    pub fn smooth(&self, mut head: Vec<bool>, options: &CutOptions) -> Vec<bool> {
-        let stage: Vec<bool> = self.known.iter().map(|k| *k == Known::Stage).collect();
+    pub fn smooth(&self, mut head: Vec<bool>, options: &GrabcutOptions) -> Vec<bool> {
+        let background: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Background).collect();
         let largest = (options.hole * (self.width * self.height) as f64) as usize;
-        fill_holes(&mut head, &stage, self.width, self.height, largest);
+        fill_holes(&mut head, &background, self.width, self.height, largest);
         open(&head, self.width, self.height)
     }
 
     /// Share of the picture near the outline whose colour does not tell the sides apart.
-    pub fn unsure(&self, head: &[bool], models: &Models, options: &CutOptions) -> f64 {
+    pub fn ambiguous(&self, head: &[bool], models: &Models, options: &GrabcutOptions) -> f64 {
         let (w, h) = (self.width, self.height);
         let radius = options.band * h as f32;
         let near = |side: bool| {
             let marked: Vec<bool> = head.iter().map(|&m| m == side).collect();
             super::distance::grow(&marked, w, h, radius)
         };
-        let (near_head, near_stage) = (near(true), near(false));
+        let (near_head, near_background) = (near(true), near(false));
         let open = (0..w * h).filter(|&i| {
-            near_head[i] && near_stage[i] && {
+            near_head[i] && near_background[i] && {
                 let lean = models.lean(&self.photo.rgb[i]);
                 // for the other side, or for this one by less than a factor of e
                 if head[i] { lean < 1.0 } else { lean > -1.0 }
@@ -214,7 +226,7 @@ impl Ground {
         for (n, c) in self.clicks.iter().enumerate() {
             let at = |v: f32, size: usize| (v.round().max(0.0) as usize).min(size - 1);
             if head[at(c.y, self.height) * self.width + at(c.x, self.width)] != c.head {
-                let (said, is) = if c.head { ("head", "stage") } else { ("stage", "head") };
+                let (said, is) = if c.head { ("head", "background") } else { ("background", "head") };
                 found.push(format!(
                     "view `{view}`: click {} says {said}, but its surroundings made it {is}; click more there",
                     n + 1
@@ -232,7 +244,7 @@ impl Ground {
 }
 
 /// `γ exp(−β ‖Δ‖²) / distance` to the four neighbours ahead; 0 where there is none.
-fn joints(photo: &Photo, smoothness: f64) -> Vec<[i32; 4]> {
+fn edges(photo: &Photo, smoothness: f64) -> Vec<[i32; 4]> {
     let (w, h) = (photo.width as usize, photo.height as usize);
     let square = |i: usize, step: (usize, isize, isize)| -> Option<u32> {
         let (x, y) = ((i % w) as isize + step.1, (i / w) as isize + step.2);
@@ -269,7 +281,7 @@ mod tests {
     use super::*;
     use crate::kernel::rng;
 
-    /// A noisy disc of two skin-like colours on a dark stage with bright lamps; `scale` enlarges everything.
+    /// A noisy disc of two skin-like colours on a dark background with bright lamps; `scale` enlarges everything.
     fn head(scale: f32) -> (Photo, Vec<bool>) {
         let (width, height) = ((96.0 * scale) as u32, (128.0 * scale) as u32);
         let mut truth = Vec::new();
@@ -306,15 +318,17 @@ mod tests {
     #[test]
     fn a_disc_of_two_colours_is_cut_out_among_lamps() {
         let (photo, truth) = head(1.0);
-        let cut = cut("a", &photo, &clicks(1.0), &CutOptions::default()).unwrap();
+        let cut = grabcut("a", &photo, &clicks(1.0), &GrabcutOptions::default()).unwrap();
         assert!(overlap(&cut.mask, &truth) > 0.985, "{}", overlap(&cut.mask, &truth));
-        assert!(cut.warnings.is_empty() && cut.unsure < 0.03, "{:?} {}", cut.warnings, cut.unsure);
+        assert!(cut.warnings.is_empty() && cut.ambiguous < 0.03, "{:?} {}", cut.warnings, cut.ambiguous);
     }
 
     #[test]
     fn a_large_photograph_is_cut_at_the_working_size() {
         let (photo, truth) = head(3.0);
-        let cut = cut("a", &photo, &clicks(3.0), &CutOptions { rows: 128, ..CutOptions::default() }).unwrap();
+        let cut =
+            grabcut("a", &photo, &clicks(3.0), &GrabcutOptions { rows: 128, ..GrabcutOptions::default() })
+                .unwrap();
         assert_eq!((cut.mask.width, cut.mask.height), (96, 128));
         let large = super::super::scale::resize_hard(&cut.mask, (photo.width, photo.height));
         assert!(overlap(&large, &truth) > 0.97, "{}", overlap(&large, &truth));
@@ -323,19 +337,19 @@ mod tests {
     #[test]
     fn the_same_clicks_cut_the_same_mask_and_flat_pictures_do_not_fail() {
         let (photo, _) = head(1.0);
-        let run = || cut("a", &photo, &clicks(1.0), &CutOptions::default());
+        let run = || grabcut("a", &photo, &clicks(1.0), &GrabcutOptions::default());
         assert_eq!(run(), run());
         let flat = Photo { rgb: vec![[9, 9, 9]; photo.rgb.len()], ..photo };
-        // nothing tells head from stage: whatever comes, it holds the clicks or says so
-        if let Ok(cut) = cut("a", &flat, &clicks(1.0), &CutOptions::default()) {
-            assert!(cut.unsure > 0.0);
+        // nothing tells head from background: whatever comes, it holds the clicks or says so
+        if let Ok(cut) = grabcut("a", &flat, &clicks(1.0), &GrabcutOptions::default()) {
+            assert!(cut.ambiguous > 0.0);
         }
     }
 
     #[test]
     fn photographs_of_one_row_or_of_nothing_are_refused_by_name() {
         let photo = Photo { width: 100, height: 1, rgb: vec![[0; 3]; 100], alpha: None };
-        let e = cut("a", &photo, &[Click { x: 1.0, y: 0.0, head: true }], &CutOptions::default());
+        let e = grabcut("a", &photo, &[Click { x: 1.0, y: 0.0, head: true }], &GrabcutOptions::default());
         assert!(matches!(e, Err(CutError::TooSmall { width: 100, height: 1, .. })));
     }
 }

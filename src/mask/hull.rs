@@ -11,17 +11,17 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 /// A hard mask with its camera.
-pub(super) struct Witness {
+pub(super) struct Voter {
     projector: Projector,
     width: usize,
     height: usize,
     head: Vec<bool>,
 }
 
-impl Witness {
+impl Voter {
     /// Takes a mask for the camera's whole picture, at whatever size it is; head from 128.
-    pub fn new(camera: &Camera, mask: &Gray) -> Witness {
-        Witness {
+    pub fn new(camera: &Camera, mask: &Gray) -> Voter {
+        Voter {
             projector: Projector::new(&camera.resized(mask.width, mask.height)),
             width: mask.width as usize,
             height: mask.height as usize,
@@ -44,14 +44,14 @@ pub(super) struct Votes {
 }
 
 impl Votes {
-    /// Asks every witness about every cell.
-    pub fn count(cube: &Cube, witnesses: &[Witness]) -> Votes {
+    /// Asks every voter about every cell.
+    pub fn count(cube: &Cube, voters: &[Voter]) -> Votes {
         let n = cube.n;
         let slabs: Vec<(Vec<u16>, Vec<u16>)> = (0..n)
             .into_par_iter()
             .map(|x| {
                 let (mut yes, mut no) = (vec![0u16; n * n], vec![0u16; n * n]);
-                for w in witnesses {
+                for w in voters {
                     for i in 0..n * n {
                         match w.says(cube.cell_center(x, i / n, i % n)) {
                             Some(true) => yes[i] += 1,
@@ -197,8 +197,8 @@ mod tests {
     fn two_squares_carve_a_box_and_draw_themselves_again() {
         let cameras = cameras();
         let cube = cube(&cameras, 48, 1.0).unwrap();
-        let witnesses: Vec<Witness> = cameras.iter().map(|c| Witness::new(c, &square(20))).collect();
-        let votes = Votes::count(&cube, &witnesses);
+        let voters: Vec<Voter> = cameras.iter().map(|c| Voter::new(c, &square(20))).collect();
+        let votes = Votes::count(&cube, &voters);
         let cells = votes.cells(0, 2);
         // a box of 2 units has 24 cells of 1/12 along each side; perspective moves its walls by a cell or two
         let count = cells.iter().filter(|c| **c).count() as f64;
@@ -206,7 +206,7 @@ mod tests {
         let drawn = silhouette(&cube, &cells, &cameras[0]);
         let wrong = (drawn.iter().zip(&square(20).values)).filter(|(d, s)| **d != (**s == 255)).count();
         assert!(wrong < 2 * 4 * 40, "{wrong}"); // two pixels along the outline
-        // one dissent lets all cells in that one view keeps: two beams
+        // one forgiven vote lets all cells in that one view keeps: two beams
         assert!(votes.cells(1, 0).iter().filter(|c| **c).count() as f64 > 2.0 * count);
     }
 

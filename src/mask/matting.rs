@@ -1,4 +1,4 @@
-//! From a hard mask to a soft alpha: smaller, unsure band, opacity of the band, large again, hardened.
+//! From a hard mask to a soft alpha: smaller, unknown band, opacity of the band, large again, hardened.
 //!
 //! ```text
 //! photograph ─ reduce ─┬────────────── opacity of the band ─ enlarge ─ harden ─ alpha
@@ -13,7 +13,7 @@ pub mod closed_form;
 pub mod trimap;
 
 use self::closed_form::{ClosedFormOptions, closed_form};
-use self::trimap::{Band, HEAD, OUTSIDE, UNSURE, trimap, unsure_share};
+use self::trimap::{Band, HEAD, OUTSIDE, UNKNOWN, trimap, unknown_share};
 use super::scale::{enlarge, reduce_photo, resize_hard, working_size};
 use crate::image::{Gray, Photo};
 
@@ -22,7 +22,7 @@ use crate::image::{Gray, Photo};
 pub struct SoftenOptions {
     /// Longest side of the working picture at most, pixels.
     pub side: u32,
-    /// Width of the unsure band.
+    /// Width of the unknown band.
     pub band: Band,
     /// How its opacity is found.
     pub closed_form: ClosedFormOptions,
@@ -31,7 +31,7 @@ pub struct SoftenOptions {
     /// Alphas above become 1.
     pub highest: f32,
     /// A band that is a larger share of the picture is worth a warning.
-    pub most_unsure: f64,
+    pub most_unknown: f64,
 }
 
 impl Default for SoftenOptions {
@@ -42,7 +42,7 @@ impl Default for SoftenOptions {
             closed_form: ClosedFormOptions::default(),
             lowest: 0.02,
             highest: 0.98,
-            most_unsure: 0.3,
+            most_unknown: 0.3,
         }
     }
 }
@@ -107,15 +107,15 @@ impl SoftenOptions {
         }
         let positive = [
             ("closed_form.epsilon", self.closed_form.epsilon),
-            ("closed_form.tie", self.closed_form.tie),
+            ("closed_form.constraint_weight", self.closed_form.constraint_weight),
             ("closed_form.tolerance", self.closed_form.tolerance),
         ];
         if let Some((name, value)) = positive.into_iter().find(|(_, v)| !(*v > 0.0 && v.is_finite())) {
             return wrong(name, value.to_string(), "a positive number");
         }
-        let hold = self.closed_form.hold;
+        let hold = self.closed_form.prior_weight;
         if !(hold >= 0.0 && hold.is_finite()) {
-            return wrong("closed_form.hold", hold.to_string(), "a number of at least 0");
+            return wrong("closed_form.prior_weight", hold.to_string(), "a number of at least 0");
         }
         if !(share(self.lowest) && share(self.highest) && self.lowest <= self.highest) {
             let found = format!("{} to {}", self.lowest, self.highest);
@@ -125,7 +125,7 @@ impl SoftenOptions {
     }
 
     /// Bytes needed at most beside the photograph and the mask themselves, for one photograph of this size:
-    /// the alpha, the working pictures, and the equations if the whole working picture were unsure.
+    /// the alpha, the working pictures, and the equations if the whole working picture were unknown.
     pub fn memory_bytes(&self, width: u32, height: u32) -> u64 {
         let pixels = |(w, h): (u32, u32)| w as u64 * h as u64;
         // per working pixel: photograph 3, mask, trimap 2, alpha and rows 8, distances and marks 12, equations 310
@@ -174,31 +174,32 @@ impl Working {
     /// What a person should know about the band, whoever finds its opacity.
     pub fn warnings(&self, options: &SoftenOptions) -> Vec<String> {
         let mut warnings = Vec::new();
-        let band = unsure_share(&self.trimap);
-        if band > options.most_unsure {
+        let band = unknown_share(&self.trimap);
+        if band > options.most_unknown {
             warnings.push(format!(
-                "{:.0} % of the picture are unsure: the mask is ragged or full of holes; a click on what it missed helps",
+                "{:.0} % of the picture are unknown: the mask is ragged or full of holes; a click on what it missed helps",
                 100.0 * band
             ));
         }
         if band > 0.0 && !self.trimap.values.contains(&HEAD) {
-            warnings.push("no pixel is surely head: the mask is thinner than the unsure band".into());
+            warnings.push("no pixel is definitely head: the mask is thinner than the unknown band".into());
         }
         if band > 0.0 && !self.trimap.values.contains(&OUTSIDE) {
-            warnings.push("no pixel is surely outside: the mask leaves less than the unsure band".into());
+            warnings
+                .push("no pixel is definitely outside: the mask leaves less than the unknown band".into());
         }
         warnings
     }
 }
 
-/// A soft alpha, and how sure it is.
+/// A soft alpha, and what was unknown.
 #[derive(Clone, Debug)]
 pub struct Softened {
     /// At the photograph's size.
     pub alpha: Gray,
     /// At the working size: 0, 128, 255.
     pub trimap: Gray,
-    /// Share of the picture that was unsure.
+    /// Share of the picture that was unknown.
     pub band_share: f64,
     /// What a person should know, one sentence each.
     pub warnings: Vec<String>,
@@ -212,7 +213,7 @@ pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Sof
     let Working { photo, mask, trimap, .. } = &working;
     let hard = || mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect();
     let sides_known = trimap.values.contains(&HEAD) && trimap.values.contains(&OUTSIDE);
-    let alpha = if !sides_known && trimap.values.contains(&UNSURE) {
+    let alpha = if !sides_known && trimap.values.contains(&UNKNOWN) {
         // tied to one side only, everything would become that side
         hard()
     } else {
@@ -225,7 +226,7 @@ pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Sof
         )
     };
     let alpha = working.finish(&alpha, options);
-    let band_share = unsure_share(trimap);
+    let band_share = unknown_share(trimap);
     Ok(Softened { alpha, trimap: working.trimap, band_share, warnings })
 }
 
@@ -236,7 +237,7 @@ mod tests {
     use super::*;
     use crate::io::{Limits, read_gray, read_photo};
 
-    /// A bright disc on a dark stage whose rim is soft over 6 pixels.
+    /// A bright disc on a dark background whose rim is soft over 6 pixels.
     fn disc(width: u32, height: u32) -> (Photo, Vec<f32>) {
         let (cx, cy, r) = (0.5 * width as f32, 0.5 * height as f32, 0.3 * height as f32);
         let pixels = 0..width * height;
@@ -313,7 +314,7 @@ mod tests {
         // a line one pixel wide is all band: it stays as it is, where a tie to one side would lose it
         let line = gray((0..64 * 80).map(|i| if i % 64 == 30 { 255 } else { 0 }).collect());
         let soft = soften(&photo, &line, &options).unwrap();
-        assert!(soft.warnings.iter().any(|w| w.contains("surely head")), "{:?}", soft.warnings);
+        assert!(soft.warnings.iter().any(|w| w.contains("definitely head")), "{:?}", soft.warnings);
         assert_eq!(soft.alpha, line);
     }
 

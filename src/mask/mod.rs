@@ -1,13 +1,13 @@
 //! Stage `mask`: which pixels are the head, from a few clicks.
 //!
 //! A click says "this is head" or "this is not". From clicks a hard mask is cut, a band around its
-//! outline is called unsure (the trimap), and the band's opacity is estimated from the photograph:
+//! outline is unknown (the trimap), and the band's opacity is estimated from the photograph:
 //!
 //! ```text
 //! photograph + clicks → hard mask → trimap → soft alpha
 //! ```
 //!
-//! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unsure in a trimap.
+//! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unknown in a trimap.
 
 mod click;
 mod components;

@@ -44,7 +44,7 @@ pub struct Frame {
 /// What is wrong with a file of clicks.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum PointsError {
+pub enum PromptsError {
     /// It could not be read.
     #[error(transparent)]
     Read(#[from] ReadError),
@@ -73,14 +73,14 @@ pub enum PointsError {
     },
 }
 
-impl PointsError {
+impl PromptsError {
     /// The way out.
     pub fn hint(&self) -> String {
         match self {
-            PointsError::Read(e) => e.hint(),
-            PointsError::Write(e) => e.hint(),
-            PointsError::Content { hint, .. } => hint.clone(),
-            PointsError::Point { .. } => {
+            PromptsError::Read(e) => e.hint(),
+            PromptsError::Write(e) => e.hint(),
+            PromptsError::Content { hint, .. } => hint.clone(),
+            PromptsError::Point { .. } => {
                 "write column, row and label: `181,288,1` for the head, `32,51,0` for what is not".into()
             }
         }
@@ -88,20 +88,20 @@ impl PointsError {
 }
 
 /// Reads a `prompts.json`.
-pub fn read_prompts(path: &Path, limits: &Limits) -> Result<Prompts, PointsError> {
+pub fn read_prompts(path: &Path, limits: &Limits) -> Result<Prompts, PromptsError> {
     let limits = Limits { json_bytes: limits.json_bytes.min(MOST_BYTES), ..limits.clone() };
     parse(&path.to_string_lossy(), &io::read_json(path, &limits)?, &limits)
 }
 
 /// [`read_prompts`] on bytes; `path` is only for messages.
-pub fn parse_prompts(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Prompts, PointsError> {
+pub fn parse_prompts(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Prompts, PromptsError> {
     let limits = Limits { json_bytes: limits.json_bytes.min(MOST_BYTES), ..limits.clone() };
     parse(&path.to_string_lossy(), &io::parse_json(path, bytes, &limits)?, &limits)
 }
 
 /// One click as written on a command line: `x,y,label`.
-pub fn parse_point(text: &str) -> Result<Click, PointsError> {
-    let wrong = |problem: String| PointsError::Point { text: shown(text), problem };
+pub fn parse_point(text: &str) -> Result<Click, PromptsError> {
+    let wrong = |problem: String| PromptsError::Point { text: shown(text), problem };
     let parts: Vec<&str> = text.split(',').map(str::trim).collect();
     let [x, y, label] = parts[..] else {
         return Err(wrong(format!("expected three values `x,y,label`, found {}", parts.len())));
@@ -144,8 +144,8 @@ fn kind(value: &Value) -> String {
     }
 }
 
-fn parse(file: &str, value: &Value, limits: &Limits) -> Result<Prompts, PointsError> {
-    let content = |place: &str, problem: String, hint: &str| PointsError::Content {
+fn parse(file: &str, value: &Value, limits: &Limits) -> Result<Prompts, PromptsError> {
+    let content = |place: &str, problem: String, hint: &str| PromptsError::Content {
         file: file.into(),
         place: place.into(),
         problem,
@@ -202,7 +202,7 @@ fn parse(file: &str, value: &Value, limits: &Limits) -> Result<Prompts, PointsEr
         let mut clicks = Vec::with_capacity(points.len());
         for (j, point) in points.iter().enumerate() {
             let inside = |key: &str| format!("`frames[{i}].points[{j}]{key}`");
-            let number = |key: &str| -> Result<f32, PointsError> {
+            let number = |key: &str| -> Result<f32, PromptsError> {
                 let found = point.get(key);
                 let value = match found.and_then(Value::as_f64) {
                     Some(v) => within(v),
@@ -298,7 +298,7 @@ impl Prompts {
     /// The clicks of each view of a capture, parallel to its `views`, in pixel indices of its camera's picture;
     /// none where nothing was clicked. `file` is for messages. Errors: a photograph that is no view, two names of one
     /// view, a point beside the photograph, a view without any click on the head.
-    pub fn clicks(&self, file: &str, capture: &Capture) -> Result<Vec<Vec<Click>>, PointsError> {
+    pub fn clicks(&self, file: &str, capture: &Capture) -> Result<Vec<Vec<Click>>, PromptsError> {
         let of = |view| Photographed {
             path: file_path(capture, view),
             name: &view.name,
@@ -309,12 +309,12 @@ impl Prompts {
         self.of_photographs(file, &capture.views.iter().map(of).collect::<Vec<_>>())
     }
 
-    fn of_photographs(&self, file: &str, photos: &[Photographed]) -> Result<Vec<Vec<Click>>, PointsError> {
+    fn of_photographs(&self, file: &str, photos: &[Photographed]) -> Result<Vec<Vec<Click>>, PromptsError> {
         let mut clicks = vec![Vec::new(); photos.len()];
         let mut by = vec![None; photos.len()];
         for (i, frame) in self.frames.iter().enumerate() {
             let wrong = |place: String, problem: String, hint: String| {
-                Err(PointsError::Content { file: file.into(), place, problem, hint })
+                Err(PromptsError::Content { file: file.into(), place, problem, hint })
             };
             let place = format!("`frames[{i}]`");
             let name = shown(&frame.file_path);
@@ -383,7 +383,7 @@ impl Prompts {
     }
 
     /// Writes a `prompts.json`.
-    pub fn write(&self, path: &Path) -> Result<(), PointsError> {
+    pub fn write(&self, path: &Path) -> Result<(), PromptsError> {
         let text = format!("{:#}\n", self.to_json());
         Ok(io::write_atomic(path, text.as_bytes())?)
     }
@@ -393,7 +393,7 @@ impl Prompts {
 mod tests {
     use super::*;
 
-    fn parsed(text: &str) -> Result<Prompts, PointsError> {
+    fn parsed(text: &str) -> Result<Prompts, PromptsError> {
         parse_prompts(Path::new("p.json"), text.as_bytes(), &Limits::default())
     }
 
@@ -484,11 +484,11 @@ mod tests {
         let error = parse_prompts(Path::new("p.json"), two.as_bytes(), &few).unwrap_err();
         assert!(error.to_string().contains("2 entries, the limit is 1"), "{error}");
         for text in [one("a", r#"[{"x": NaN}]"#), one("a", r#"[{"x": 1e999}]"#), "{".into(), String::new()] {
-            assert!(matches!(parsed(&text), Err(PointsError::Read(_))), "{text}");
+            assert!(matches!(parsed(&text), Err(PromptsError::Read(_))), "{text}");
         }
         let tight = Limits { json_bytes: 10, ..Limits::default() };
         let error = parse_prompts(Path::new("p.json"), one("a", POINT).as_bytes(), &tight).unwrap_err();
-        assert!(matches!(error, PointsError::Read(ReadError::TooLarge { limit: 10, .. })), "{error}");
+        assert!(matches!(error, PromptsError::Read(ReadError::TooLarge { limit: 10, .. })), "{error}");
     }
 
     #[test]

@@ -1,9 +1,9 @@
-//! A few clicked views → a mask for every view, through the known cameras.
+//! A few clicked views → a mask for every view, through the seeds cameras.
 //!
-//! 1. The clicked views are cut by themselves; from all of them together the colours of head and stage are learned
+//! 1. The clicked views are cut by themselves; from all of them together the colours of head and background are learned
 //!    once, and frozen.
 //! 2. The masks so far carve a cube of cells: the visual hull, which the head cannot leave.
-//! 3. In each view what lies outside the hull's silhouette is sure stage and what the hull's core covers is sure
+//! 3. In each view what lies outside the hull's silhouette is definite background and what the hull's core covers is definite
 //!    head; between them the frozen colours cut.
 //! 4. All masks carve again, each cell forgiven a few votes against it, and 3 is repeated.
 //!
@@ -14,9 +14,9 @@ use super::components::pieces;
 use super::distance::{grow, shrink};
 use super::error::CutError;
 use super::grabcut::mixture::Rgb;
-use super::grabcut::seeds::{self, Known};
-use super::grabcut::{CutOptions, Ground, Models};
-use super::hull::{self, Votes, Witness};
+use super::grabcut::seeds::{self, Seed};
+use super::grabcut::{Grabcut, GrabcutOptions, Models};
+use super::hull::{self, Voter, Votes};
 use super::scale::reduce_to_rows;
 use crate::capture::carve::{Cube, drop_dust};
 use crate::capture::findings;
@@ -24,25 +24,25 @@ use crate::geom::Camera;
 use crate::image::{Gray, Photo};
 use rayon::prelude::*;
 
-/// How clicks are carried to views that nobody clicked. Lengths are shares of the picture's height H.
+/// How clicks are propagated to views that nobody clicked. Lengths are shares of the picture's height H.
 #[derive(Clone, Debug, PartialEq)]
-pub struct SpreadOptions {
+pub struct PropagateOptions {
     /// How each view is cut.
-    pub cut: CutOptions,
+    pub cut: GrabcutOptions,
     /// Cells along each side of the carved cube.
     pub cells: usize,
     /// Half side of the cube, in half heights of the frames at the point they look at.
     pub cube: f64,
-    /// How far outside the hull's silhouette sure stage begins.
+    /// How far outside the hull's silhouette definite background begins.
     pub outside: f32,
     /// Cells deeper inside than this share of the deepest one are the core.
     pub core: f64,
     /// By how much the core's silhouette is shrunk.
     pub core_shrink: f32,
     /// Votes against a cell that are forgiven once all views have masks.
-    pub dissent: usize,
+    pub most_negative: usize,
     /// Share of the views that must vote for a cell then.
-    pub consent: f64,
+    pub least_positive: f64,
     /// Rounds of carving and cutting.
     pub rounds: usize,
     /// Pieces of a mask below this share of the picture are left out, unless clicked or in the core.
@@ -51,17 +51,17 @@ pub struct SpreadOptions {
     pub at_once: usize,
 }
 
-impl Default for SpreadOptions {
-    fn default() -> SpreadOptions {
-        SpreadOptions {
-            cut: CutOptions::default(),
+impl Default for PropagateOptions {
+    fn default() -> PropagateOptions {
+        PropagateOptions {
+            cut: GrabcutOptions::default(),
             cells: 112,
             cube: 1.15,
             outside: 0.012,
             core: 0.55,
             core_shrink: 0.008,
-            dissent: 2,
-            consent: 0.1,
+            most_negative: 2,
+            least_positive: 0.1,
             rounds: 3,
             piece: 0.002,
             at_once: 8,
@@ -71,7 +71,7 @@ impl Default for SpreadOptions {
 
 /// One view to be masked.
 #[derive(Clone, Copy, Debug)]
-pub struct SpreadView<'a> {
+pub struct PropagateView<'a> {
     /// Its name in messages.
     pub name: &'a str,
     /// Its camera, at the size of the photograph.
@@ -79,16 +79,16 @@ pub struct SpreadView<'a> {
     /// Its clicks in pixels of the photograph; none where nobody clicked.
     pub clicks: &'a [Click],
     /// May its photograph shape the masks of other views? Held-out views may not.
-    pub witness: bool,
+    pub votes: bool,
 }
 
 /// The mask of one view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewMask {
-    /// 255 head, 0 stage, at the working size.
+    /// 255 head, 0 background, at the working size.
     pub mask: Gray,
     /// Share of the picture, 0..=1, that lies near the outline and has a colour that fits both sides.
-    pub unsure: f64,
+    pub ambiguous: f64,
 }
 
 /// Masks of all views.
@@ -102,9 +102,9 @@ pub struct Masks {
 
 /// Masks every view from the clicks on some. `load` gives the photograph of a view by its index.
 ///
-/// Photographs are loaded [`SpreadOptions::at_once`] at a time and kept at the working size only. The result does
+/// Photographs are loaded [`PropagateOptions::at_once`] at a time and kept at the working size only. The result does
 /// not depend on the number of threads.
-pub fn spread<E, F>(views: &[SpreadView], load: F, options: &SpreadOptions) -> Result<Masks, E>
+pub fn propagate<E, F>(views: &[PropagateView], load: F, options: &PropagateOptions) -> Result<Masks, E>
 where
     E: From<CutError> + Send,
     F: Fn(usize) -> Result<Photo, E> + Sync,
@@ -114,7 +114,7 @@ where
         let view = views.first().map_or(String::new(), |v| v.name.into());
         return Err(CutError::NoClicks { view }.into());
     }
-    if !clicked.iter().any(|&i| views[i].witness) {
+    if !clicked.iter().any(|&i| views[i].votes) {
         return Err(
             CutError::OnlyHeldOut { views: clicked.iter().map(|&i| views[i].name.into()).collect() }.into()
         );
@@ -126,12 +126,12 @@ where
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
     let cube = hull::cube(&cameras, options.cells.max(8), options.cube)?;
     let photos = load_all(views, load, options)?;
-    let mut spread = Spread { views, photos, cube, options, warnings: Vec::new() };
-    let start = spread.clicked(&clicked)?;
-    Ok(spread.run(start))
+    let mut propagation = Propagation { views, photos, cube, options, warnings: Vec::new() };
+    let start = propagation.clicked(&clicked)?;
+    Ok(propagation.run(start))
 }
 
-fn load_all<E, F>(views: &[SpreadView], load: F, options: &SpreadOptions) -> Result<Vec<Photo>, E>
+fn load_all<E, F>(views: &[PropagateView], load: F, options: &PropagateOptions) -> Result<Vec<Photo>, E>
 where
     E: From<CutError> + Send,
     F: Fn(usize) -> Result<Photo, E> + Sync,
@@ -167,29 +167,29 @@ struct Clicked {
     own: Vec<Option<(Vec<bool>, Models)>>,
 }
 
-struct Spread<'a> {
-    views: &'a [SpreadView<'a>],
+struct Propagation<'a> {
+    views: &'a [PropagateView<'a>],
     /// At the working size.
     photos: Vec<Photo>,
     cube: Cube,
-    options: &'a SpreadOptions,
+    options: &'a PropagateOptions,
     warnings: Vec<String>,
 }
 
 /// Colours of one side that the common mixtures learn from, at most; more would only take time.
 const MOST_COLORS: usize = 600_000;
 
-impl Spread<'_> {
-    /// The clicks of a view brought to its working size. The strips are a guess: once a hull says where the head
+impl Propagation<'_> {
+    /// The clicks of a view brought to its working size. The border margins are a guess: once a hull says where the head
     /// is, it may touch any border.
-    fn ground(&self, i: usize, strips: bool) -> (Ground, Vec<String>) {
+    fn grabcut(&self, i: usize, margins: bool) -> (Grabcut, Vec<String>) {
         let (v, photo) = (&self.views[i], &self.photos[i]);
         let size = (v.camera.width, v.camera.height);
         let mut options = self.options.cut.clone();
-        if !strips {
-            options.strip = 0.0;
+        if !margins {
+            options.border_margin = 0.0;
         }
-        Ground::reduced(v.name, photo.clone(), size, v.clicks, &options)
+        Grabcut::reduced(v.name, photo.clone(), size, v.clicks, &options)
     }
 
     /// Cuts the clicked views by themselves and learns the common colours.
@@ -198,9 +198,9 @@ impl Spread<'_> {
         let found: Vec<_> = clicked
             .par_iter()
             .map(|&i| {
-                let (ground, warnings) = self.ground(i, true);
-                let (head, models) = ground.grab(cut);
-                let head = ground.finish(head, cut);
+                let (grabcut, warnings) = self.grabcut(i, true);
+                let (head, models) = grabcut.from_clicks(cut);
+                let head = grabcut.finish(head, cut);
                 let models = models.filter(|_| head.contains(&true) && head.contains(&false));
                 (head, models, warnings)
             })
@@ -213,7 +213,7 @@ impl Spread<'_> {
                 return Err(CutError::Empty { view: self.views[i].name.into() });
             };
             // what is held out teaches no other view its colours
-            if self.views[i].witness {
+            if self.views[i].votes {
                 for (color, &h) in self.photos[i].rgb.iter().zip(&head) {
                     if h { inside.push(*color) } else { outside.push(*color) }
                 }
@@ -227,7 +227,8 @@ impl Spread<'_> {
         let empty = || CutError::Empty { view: self.views[clicked[0]].name.into() };
         let mut models = Models::fit(&inside, &outside, cut).ok_or_else(empty)?;
         for _ in 0..cut.rounds {
-            models = Models { head: models.head.refit(&inside), stage: models.stage.refit(&outside) };
+            models =
+                Models { head: models.head.refit(&inside), background: models.background.refit(&outside) };
         }
         Ok(Clicked { models, own })
     }
@@ -237,7 +238,7 @@ impl Spread<'_> {
         let mut masks: Vec<Option<Gray>> = (start.own.iter().zip(&self.photos))
             .map(|(own, photo)| own.as_ref().map(|(head, _)| gray(photo, head)))
             .collect();
-        let mut unsure = vec![0.0; self.views.len()];
+        let mut ambiguous = vec![0.0; self.views.len()];
         let rounds = self.options.rounds.max(1);
         for round in 0..rounds {
             let (hull, core) = self.carve(&masks);
@@ -250,36 +251,40 @@ impl Spread<'_> {
                 .collect();
             for (i, (mask, open)) in done.into_iter().enumerate() {
                 masks[i] = Some(mask);
-                unsure[i] = open;
+                ambiguous[i] = open;
             }
         }
         let masks: Vec<Gray> = masks.into_iter().flatten().collect();
-        self.warn(&masks, &unsure);
+        self.warn(&masks, &ambiguous);
         if start.own.iter().flatten().count() < 2 {
             self.warnings.push(
                 "only one view is clicked: nothing bounds the head in depth at first; click a side view too"
                     .into(),
             );
         }
-        let views = masks.into_iter().zip(unsure).map(|(mask, unsure)| ViewMask { mask, unsure }).collect();
+        let views =
+            masks.into_iter().zip(ambiguous).map(|(mask, ambiguous)| ViewMask { mask, ambiguous }).collect();
         Masks { views, warnings: self.warnings }
     }
 
     /// The cells where the head may be, and the core where it must be.
     fn carve(&self, masks: &[Option<Gray>]) -> (Vec<bool>, Vec<bool>) {
-        let witnesses: Vec<Witness> = (self.views.iter().zip(masks))
-            .filter(|(v, _)| v.witness)
+        let voters: Vec<Voter> = (self.views.iter().zip(masks))
+            .filter(|(v, _)| v.votes)
             .filter_map(|(v, m)| Some((v, m.as_ref().filter(|m| m.values.contains(&255))?)))
-            .map(|(v, m)| Witness::new(v.camera, m))
+            .map(|(v, m)| Voter::new(v.camera, m))
             .collect();
-        let votes = Votes::count(&self.cube, &witnesses);
-        let (n, total) = (self.cube.n, witnesses.len());
+        let votes = Votes::count(&self.cube, &voters);
+        let (n, total) = (self.cube.n, voters.len());
         // while only the clicked views have masks they decide alone; an empty mask is one, too
-        let unmasked = self.views.iter().zip(masks).any(|(v, m)| v.witness && m.is_none());
+        let unmasked = self.views.iter().zip(masks).any(|(v, m)| v.votes && m.is_none());
         let (against, least) = if unmasked {
             (0, 0)
         } else {
-            (self.options.dissent.min(total / 6), (self.options.consent * total as f64).ceil() as usize)
+            (
+                self.options.most_negative.min(total / 6),
+                (self.options.least_positive * total as f64).ceil() as usize,
+            )
         };
         let mut hull = votes.cells(against, least);
         drop_dust(&mut hull, n, 0.02);
@@ -303,48 +308,48 @@ impl Spread<'_> {
         (round, last): (usize, bool),
     ) -> (Gray, f64) {
         let options = &self.options.cut;
-        let (mut ground, _) = self.ground(i, round == 0);
-        let (w, h) = (ground.width, ground.height);
+        let (mut grabcut, _) = self.grabcut(i, round == 0);
+        let (w, h) = (grabcut.width, grabcut.height);
         let camera = self.views[i].camera.resized(w as u32, h as u32);
         let allowed = hull::silhouette(&self.cube, hull, &camera);
         let allowed = grow(&allowed, w, h, self.options.outside * h as f32);
         let within = hull::silhouette(&self.cube, core, &camera);
         let within = shrink(&within, w, h, self.options.core_shrink * h as f32);
-        for (p, known) in ground.known.iter_mut().enumerate() {
+        for (p, seeds) in grabcut.seeds.iter_mut().enumerate() {
             // clicks count more than what follows from other views
-            if *known == Known::Nothing {
+            if *seeds == Seed::Unknown {
                 if !allowed[p] {
-                    *known = Known::Stage;
+                    *seeds = Seed::Background;
                 } else if within[p] {
-                    *known = Known::Head;
+                    *seeds = Seed::Head;
                 }
             }
         }
-        let head = ground.labels(&ground.known, models, options);
-        let head = self.finish(&ground, head);
-        let unsure = if last { ground.unsure(&head, models, options) } else { 0.0 };
-        (ground.gray(&head), unsure)
+        let head = grabcut.min_cut(&grabcut.seeds, models, options);
+        let head = self.finish(&grabcut, head);
+        let ambiguous = if last { grabcut.ambiguous(&head, models, options) } else { 0.0 };
+        (grabcut.gray(&head), ambiguous)
     }
 
-    /// As [`Ground::finish`], but pieces need no click: the hull has left only what can be head.
-    fn finish(&self, ground: &Ground, mut head: Vec<bool>) -> Vec<bool> {
-        let (w, h) = (ground.width, ground.height);
+    /// As [`Grabcut::finish`], but pieces need no click: the hull has left only what can be head.
+    fn finish(&self, grabcut: &Grabcut, mut head: Vec<bool>) -> Vec<bool> {
+        let (w, h) = (grabcut.width, grabcut.height);
         let found = pieces(&head, w, h, true);
         let least = self.options.piece * (w * h) as f64;
         let mut wanted: Vec<bool> = found.size.iter().map(|&s| s as f64 >= least).collect();
-        for (known, &l) in ground.known.iter().zip(&found.label) {
-            wanted[l as usize] |= *known == Known::Head;
+        for (seeds, &l) in grabcut.seeds.iter().zip(&found.label) {
+            wanted[l as usize] |= *seeds == Seed::Head;
         }
         wanted[0] = false;
         head.iter_mut().zip(&found.label).for_each(|(m, &l)| *m = wanted[l as usize]);
-        ground.smooth(head, &self.options.cut)
+        grabcut.smooth(head, &self.options.cut)
     }
 
     /// What looks wrong about the finished masks.
-    fn warn(&mut self, masks: &[Gray], unsure: &[f64]) {
+    fn warn(&mut self, masks: &[Gray], ambiguous: &[f64]) {
         for (i, mask) in masks.iter().enumerate().filter(|(i, _)| !self.views[*i].clicks.is_empty()) {
             let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
-            let found = self.ground(i, false).0.warnings(self.views[i].name, &head);
+            let found = self.grabcut(i, false).0.warnings(self.views[i].name, &head);
             self.warnings.extend(found);
         }
         for (i, mask) in masks.iter().enumerate() {
@@ -353,10 +358,10 @@ impl Spread<'_> {
             for finding in findings(mask).into_iter().filter(|f| !f.starts_with("touches")) {
                 self.warnings.push(format!("the mask cut for view `{view}` {finding}"));
             }
-            if unsure[i] > 0.05 {
+            if ambiguous[i] > 0.05 {
                 self.warnings.push(format!(
-                    "view `{view}`: {:.0} % of the picture may be head or stage by its colour; click there",
-                    100.0 * unsure[i]
+                    "view `{view}`: {:.0} % of the picture may be head or background by its colour; click there",
+                    100.0 * ambiguous[i]
                 ));
             }
         }
@@ -394,7 +399,7 @@ mod tests {
             .collect()
     }
 
-    /// A ball of two colours before a dark stage with lamps, and which pixels are the ball.
+    /// A ball of two colours before a dark background with lamps, and which pixels are the ball.
     fn photo(camera: &Camera, stream: u64) -> (Photo, Vec<bool>) {
         let mut truth = Vec::new();
         let rgb = (0..72 * 96u32)
@@ -423,14 +428,14 @@ mod tests {
 
     fn run(clicked: &[usize]) -> Result<Masks, CutError> {
         let (cameras, clicks) = (ring(), clicks());
-        let views: Vec<SpreadView> = (cameras.iter().enumerate())
+        let views: Vec<PropagateView> = (cameras.iter().enumerate())
             .map(|(i, camera)| {
                 let clicks: &[Click] = if clicked.contains(&i) { &clicks } else { &[] };
-                SpreadView { name: "v", camera, clicks, witness: i != 5 }
+                PropagateView { name: "v", camera, clicks, votes: i != 5 }
             })
             .collect();
-        let options = SpreadOptions { cells: 48, at_once: 2, ..SpreadOptions::default() };
-        spread(&views, |i| Ok(photo(&cameras[i], i as u64).0), &options)
+        let options = PropagateOptions { cells: 48, at_once: 2, ..PropagateOptions::default() };
+        propagate(&views, |i| Ok(photo(&cameras[i], i as u64).0), &options)
     }
 
     #[test]
@@ -460,12 +465,12 @@ mod tests {
         assert!(run(&[1]).unwrap().warnings.iter().any(|w| w.contains("only one view")));
         let (cameras, clicks) = (ring(), clicks());
         let views =
-            cameras.iter().map(|camera| SpreadView { name: "v", camera, clicks: &clicks, witness: true });
-        let views: Vec<SpreadView> = views.collect();
+            cameras.iter().map(|camera| PropagateView { name: "v", camera, clicks: &clicks, votes: true });
+        let views: Vec<PropagateView> = views.collect();
         let small = |_| Ok(Photo { width: 20, height: 20, rgb: vec![[0; 3]; 400], alpha: None });
-        let e = spread::<CutError, _>(&views, small, &SpreadOptions::default()).unwrap_err();
+        let e = propagate::<CutError, _>(&views, small, &PropagateOptions::default()).unwrap_err();
         assert!(matches!(e, CutError::Size { found: (20, 20), camera: (72, 96), .. }), "{e}");
         let fail = |_| Err(CutError::Empty { view: "gone".into() });
-        assert!(matches!(spread(&views, fail, &SpreadOptions::default()), Err(CutError::Empty { .. })));
+        assert!(matches!(propagate(&views, fail, &PropagateOptions::default()), Err(CutError::Empty { .. })));
     }
 }

@@ -1,11 +1,11 @@
 //! A contact sheet: all masks over their photographs, to see at a glance which went wrong.
 //!
-//! The mask's outline is cyan, the unsure band yellow; below each picture stand the view's name, how much the mask
-//! covers and how much is unsure. Views that look suspicious have a red frame and say why. The sheet is HTML with
+//! The mask's outline is cyan, the unknown band yellow; below each picture stand the view's name, how much the mask
+//! covers and how much is unknown. Views that look suspicious have a red frame and say why. The sheet is HTML with
 //! the pictures inside: a page of its own, and a part of the report.
 
 use super::annotation::evenly;
-use super::matting::trimap::{UNSURE, unsure_share};
+use super::matting::trimap::{UNKNOWN, unknown_share};
 use super::scale::{reduce_gray, reduce_photo, working_size};
 use crate::capture::{coverage, findings};
 use crate::image::{Gray, Photo};
@@ -36,8 +36,8 @@ pub struct Tile {
     pub jpeg: Vec<u8>,
     /// Share of the picture that is head, 0..=1.
     pub coverage: f64,
-    /// Share that is unsure, where that is known.
-    pub unsure: Option<f64>,
+    /// Share that is unknown, where that is known.
+    pub unknown: Option<f64>,
     /// Why a person should look.
     pub suspicions: Vec<String>,
 }
@@ -51,20 +51,20 @@ impl Tile {
             name: name.into(),
             jpeg: io::jpeg_bytes(&picture, 85, Path::new(name))?,
             coverage: coverage(alpha),
-            unsure: trimap.map(unsure_share),
+            unknown: trimap.map(unknown_share),
             suspicions: findings(alpha).into_iter().map(String::from).collect(),
         })
     }
 }
 
-/// The reduced photograph with the mask's outline and the unsure band drawn into it.
+/// The reduced photograph with the mask's outline and the unknown band drawn into it.
 fn overlaid(photo: &Photo, alpha: &Gray, trimap: Option<&Gray>, side: u32) -> Photo {
     let size = working_size(photo.width, photo.height, side);
     let mut picture = reduce_photo(photo, size);
     if let Some(trimap) = trimap {
-        let values = trimap.values.iter().map(|&v| if v == UNSURE { 255 } else { 0 }).collect();
-        let unsure = brought_to(&Gray { values, ..*trimap }, size);
-        for (pixel, &u) in picture.rgb.iter_mut().zip(&unsure.values) {
+        let values = trimap.values.iter().map(|&v| if v == UNKNOWN { 255 } else { 0 }).collect();
+        let unknown = brought_to(&Gray { values, ..*trimap }, size);
+        for (pixel, &u) in picture.rgb.iter_mut().zip(&unknown.values) {
             *pixel = mixed(*pixel, BAND, u as f32 / 255.0 * 0.4);
         }
     }
@@ -115,7 +115,7 @@ pub fn sheet(tiles: &[Tile]) -> String {
             border:4px solid transparent;max-width:320px;font-size:.85rem;overflow-wrap:anywhere}\
             .masks figure.odd{border-color:#ff463c}.masks .why{color:#ff463c}\
             .masks img{display:block;height:auto;max-width:100%}</style>\n\
-            <p>The outline of each mask is cyan, unsure pixels are yellow; framed in red is what a person should look \
+            <p>The outline of each mask is cyan, unknown pixels are yellow; framed in red is what a person should look \
             at.</p>\n<div class=\"masks\">\n";
     let shown = evenly(tiles.len(), MOST, |i| !tiles[i].suspicions.is_empty());
     for tile in shown.iter().map(|&i| &tiles[i]) {
@@ -126,8 +126,8 @@ pub fn sheet(tiles: &[Tile]) -> String {
             "<figure{odd}><img alt=\"{name}\" src=\"data:image/jpeg;base64,{jpeg}\"><figcaption><b>{name}</b><br>\
              head {covered:.1} %"
         );
-        if let Some(unsure) = tile.unsure {
-            let _ = write!(out, ", unsure {:.1} %", 100.0 * unsure);
+        if let Some(unknown) = tile.unknown {
+            let _ = write!(out, ", unknown {:.1} %", 100.0 * unknown);
         }
         for why in &tile.suspicions {
             let _ = write!(out, "<br><span class=\"why\">{}</span>", escape(why));
@@ -175,7 +175,7 @@ mod tests {
         let tile = Tile::new("a", &photo(60, 80), &bust(), None).unwrap();
         // 800 of 4800 pixels
         assert!((tile.coverage - 1.0 / 6.0).abs() < 1e-12 && tile.suspicions.is_empty());
-        assert!(tile.unsure.is_none());
+        assert!(tile.unknown.is_none());
     }
 
     #[test]
@@ -184,14 +184,14 @@ mod tests {
         for scale in [1, 2, 10] {
             let trimap = gray(60 / scale, 80 / scale, |x, _| match x * scale {
                 0..20 => 0,
-                20..40 => UNSURE,
+                20..40 => UNKNOWN,
                 _ => 255,
             });
             let picture = overlaid(&photo(60, 80), &alpha, Some(&trimap), 320);
             // columns 20 to 39 but the rim at 30 and the dark one at 29: 100 + 0.4 (255 − 100) = 162
             assert_eq!(count(&picture, [162, 140, 60]), 18 * 80, "{scale}");
             let tile = Tile::new("a", &photo(60, 80), &alpha, Some(&trimap)).unwrap();
-            assert!((tile.unsure.unwrap() - 1.0 / 3.0).abs() < 1e-9);
+            assert!((tile.unknown.unwrap() - 1.0 / 3.0).abs() < 1e-9);
         }
     }
 

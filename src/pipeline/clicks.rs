@@ -1,7 +1,7 @@
-//! Masks from clicks: cut where somebody clicked, carried to every other view, made soft.
+//! Masks from clicks: cut where somebody clicked, propagated to every other view, made soft.
 //!
 //! ```text
-//! clicks → cut (GrabCut, or SAM) → carried through the cameras → band → matting (closed form, ViTMatte) → alpha
+//! clicks → cut (GrabCut, or SAM) → propagated through the cameras → band → matting (closed form, ViTMatte) → alpha
 //! ```
 
 use super::networks::Networks;
@@ -10,12 +10,12 @@ use crate::capture::{Capture, Split};
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
-use crate::mask::grabcut::{CutOptions, cut};
+use crate::mask::grabcut::{GrabcutOptions, grabcut};
 use crate::mask::matting::closed_form::ClosedFormOptions;
 use crate::mask::matting::trimap::Band;
 use crate::mask::matting::{SoftenOptions, Working, soften};
-use crate::mask::prompts::{self, PointsError};
-use crate::mask::propagate::{Masks, SpreadOptions, SpreadView, ViewMask, spread};
+use crate::mask::prompts::{self, PromptsError};
+use crate::mask::propagate::{Masks, PropagateOptions, PropagateView, ViewMask, propagate};
 use crate::mask::{Click, CutError, distance, scale};
 use crate::run::{Failure, Fingerprint, Stage};
 use rayon::prelude::*;
@@ -36,15 +36,15 @@ pub(super) struct Clicks {
 pub(super) struct Made {
     /// Soft alpha at the size of the camera.
     pub alpha: Gray,
-    /// Where it is unsure, at the size that was worked on.
+    /// Where it is unknown, at the size that was worked on.
     pub trimap: Gray,
-    /// Share of the picture that is unsure.
-    pub unsure: f64,
+    /// Share of the picture that is unknown.
+    pub unknown: f64,
 }
 
-fn points_failure(e: PointsError) -> PipelineError {
+fn prompts_failure(e: PromptsError) -> PipelineError {
     match e {
-        PointsError::Read(e) => PipelineError::Read(e),
+        PromptsError::Read(e) => PipelineError::Read(e),
         e => {
             let hint = e.hint();
             PipelineError::Clicks { problem: e.to_string(), hint }
@@ -69,7 +69,7 @@ pub(super) fn clicks(
         return Ok(None);
     }
     let mut file = Vec::new();
-    let of = if config.points.is_empty() {
+    let of = if config.prompts.is_empty() {
         let clicks = config.point.iter().map(|p| prompts::parse_point(p)).collect::<Result<Vec<_>, _>>();
         let view = match config.view.as_str() {
             "" => capture.views.iter().find(|v| v.split == Split::Train).or(capture.views.first()),
@@ -83,20 +83,20 @@ pub(super) fn clicks(
         };
         let frame = prompts::Frame {
             file_path: prompts::file_path(capture, view),
-            points: clicks.map_err(points_failure)?,
+            points: clicks.map_err(prompts_failure)?,
         };
         prompts::Prompts { frames: vec![frame] }.clicks("mask.point", capture)
     } else {
-        let named = Path::new(&config.points);
+        let named = Path::new(&config.prompts);
         let path = if !io::is_file(named) && io::is_file(kept) { kept } else { named };
         file = io::read_bytes(path, &Limits::default())?;
         let read = prompts::parse_prompts(path, &file, &Limits::default());
         read.and_then(|prompts| prompts.clicks(&path.to_string_lossy(), capture))
     }
-    .map_err(points_failure)?;
+    .map_err(prompts_failure)?;
     if of.iter().all(Vec::is_empty) {
         return Err(PipelineError::Clicks {
-            problem: format!("`{}` holds no click on a photograph of this capture", config.points),
+            problem: format!("`{}` holds no click on a photograph of this capture", config.prompts),
             hint: "click on a few photographs: `tiface mask CAPTURE --page`".into(),
         });
     }
@@ -127,31 +127,31 @@ pub(super) fn files(config: &MaskConfig) -> Vec<(&'static str, &Path)> {
     files.into_iter().map(|(name, path)| (name, Path::new(path))).collect()
 }
 
-fn cut_options(c: &MaskConfig) -> CutOptions {
-    CutOptions {
+fn grabcut_options(c: &MaskConfig) -> GrabcutOptions {
+    GrabcutOptions {
         rows: c.cut_px,
-        disc: c.disc,
-        strip: c.strip,
-        strip_sides: c.strip_sides,
+        seed_radius: c.seed_radius,
+        border_margin: c.border_margin,
+        border_sides: c.border_sides,
         gaussians: c.gaussians,
         smoothness: c.smoothness,
         certainty: c.certainty,
         rounds: c.cut_rounds,
         band: c.band,
-        ..CutOptions::default()
+        ..GrabcutOptions::default()
     }
 }
 
-fn spread_options(c: &MaskConfig) -> SpreadOptions {
-    SpreadOptions {
-        cut: cut_options(c),
+fn propagate_options(c: &MaskConfig) -> PropagateOptions {
+    PropagateOptions {
+        cut: grabcut_options(c),
         cells: c.carve_cells,
         outside: c.carve_outside,
         core: c.carve_core,
-        dissent: c.carve_dissent,
-        consent: c.carve_consent,
+        most_negative: c.carve_most_negative,
+        least_positive: c.carve_least_positive,
         rounds: c.carve_rounds,
-        ..SpreadOptions::default()
+        ..PropagateOptions::default()
     }
 }
 
@@ -165,8 +165,8 @@ fn soften_options(c: &MaskConfig) -> SoftenOptions {
         },
         closed_form: ClosedFormOptions {
             epsilon: c.epsilon,
-            tie: c.tie,
-            hold: c.hold,
+            constraint_weight: c.constraint_weight,
+            prior_weight: c.prior_weight,
             ..defaults.closed_form
         },
         lowest: c.lowest,
@@ -228,28 +228,29 @@ impl Line<'_> {
     fn hard(&self, stage: &Stage, clicks: &Clicks) -> Result<Vec<ViewMask>, Failure> {
         let views = &self.capture.views;
         let masks = if let [view] = &views[..] {
-            let found = cut(&view.name, &self.photo(0)?, &clicks.of[0], &cut_options(&self.config.mask));
+            let found =
+                grabcut(&view.name, &self.photo(0)?, &clicks.of[0], &grabcut_options(&self.config.mask));
             let found = found.map_err(cut_failure)?;
             Masks {
-                views: vec![ViewMask { mask: found.mask, unsure: found.unsure }],
+                views: vec![ViewMask { mask: found.mask, ambiguous: found.ambiguous }],
                 warnings: found.warnings,
             }
         } else {
-            let views: Vec<SpreadView> = views
+            let views: Vec<PropagateView> = views
                 .iter()
                 .zip(&clicks.of)
-                .map(|(v, clicks)| SpreadView {
+                .map(|(v, clicks)| PropagateView {
                     name: &v.name,
                     camera: &v.camera,
                     clicks,
                     // held-out photographs shape nothing but their own masks
-                    witness: v.split == Split::Train,
+                    votes: v.split == Split::Train,
                 })
                 .collect();
-            let load = |i| self.photo(i).map_err(Spread::Load);
-            spread(&views, load, &spread_options(&self.config.mask)).map_err(|e| match e {
-                Spread::Load(e) => e,
-                Spread::Cut(e) => cut_failure(e),
+            let load = |i| self.photo(i).map_err(Unpropagated::Load);
+            propagate(&views, load, &propagate_options(&self.config.mask)).map_err(|e| match e {
+                Unpropagated::Load(e) => e,
+                Unpropagated::Cut(e) => cut_failure(e),
             })?
         };
         masks.warnings.iter().for_each(|w| stage.warn(w));
@@ -273,7 +274,7 @@ impl Line<'_> {
                 let size = scale::working_size(photo.width, photo.height, soft.side);
                 let small = scale::reduce_photo(photo, size);
                 let chosen = if own.is_empty() {
-                    carried(&hard.mask, size)
+                    propagated_clicks(&hard.mask, size)
                 } else {
                     own.iter().map(|c| c.moved((photo.width, photo.height), size)).collect()
                 };
@@ -299,7 +300,7 @@ impl Line<'_> {
             let working = Working::new(photo, mask, soft).map_err(failed)?;
             warnings.extend(working.warnings(soft));
             let mut alpha = networks.alpha(&working.photo, &working.trimap)?;
-            // the network takes the trimap for a hint; what is sure is sure
+            // the network takes the trimap for a hint; what is definite stays
             for (a, t) in alpha.iter_mut().zip(&working.trimap.values) {
                 match t {
                     0 => *a = 0.0,
@@ -307,32 +308,32 @@ impl Line<'_> {
                     _ => {}
                 }
             }
-            let share = crate::mask::matting::trimap::unsure_share(&working.trimap);
-            Made { alpha: working.finish(&alpha, soft), trimap: working.trimap, unsure: share }
+            let share = crate::mask::matting::trimap::unknown_share(&working.trimap);
+            Made { alpha: working.finish(&alpha, soft), trimap: working.trimap, unknown: share }
         } else {
             let done = soften(photo, mask, soft).map_err(failed)?;
             warnings.extend(done.warnings);
-            Made { alpha: done.alpha, trimap: done.trimap, unsure: done.band_share }
+            Made { alpha: done.alpha, trimap: done.trimap, unknown: done.band_share }
         };
         Ok((made, warnings))
     }
 }
 
-/// Why clicks could not be carried.
-enum Spread {
+/// Why clicks could not be propagated.
+enum Unpropagated {
     Load(Failure),
     Cut(CutError),
 }
 
-impl From<CutError> for Spread {
-    fn from(e: CutError) -> Spread {
-        Spread::Cut(e)
+impl From<CutError> for Unpropagated {
+    fn from(e: CutError) -> Unpropagated {
+        Unpropagated::Cut(e)
     }
 }
 
-/// Clicks for a view that nobody clicked: the deepest places of the mask that was carried to it, each outside the
+/// Clicks for a view that nobody clicked: the deepest places of the mask that was propagated to it, each outside the
 /// disc of those before, and the two places farthest from it.
-pub(super) fn carried(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
+pub(super) fn propagated_clicks(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
     let (w, h) = (mask.width as usize, mask.height as usize);
     let mut out = Vec::new();
     for (head, count) in [(true, 3), (false, 2)] {
@@ -367,27 +368,33 @@ mod tests {
     #[test]
     fn defaults_are_those_of_the_modules() {
         let c = MaskConfig::preset(Preset::Standard);
-        let spread = SpreadOptions::default();
-        let cut = &spread.cut;
+        let propagate = PropagateOptions::default();
+        let cut = &propagate.cut;
         assert_eq!((c.cut_px, c.gaussians, c.smoothness), (cut.rows, cut.gaussians, cut.smoothness));
-        assert_eq!((c.certainty, c.cut_rounds, c.disc), (cut.certainty, cut.rounds, cut.disc));
-        assert_eq!((c.strip, c.strip_sides), (cut.strip, cut.strip_sides));
-        assert_eq!((c.carve_cells, c.carve_rounds), (spread.cells, spread.rounds));
-        assert_eq!((c.carve_outside, c.carve_core), (spread.outside, spread.core));
-        assert_eq!((c.carve_dissent, c.carve_consent), (spread.dissent, spread.consent));
+        assert_eq!((c.certainty, c.cut_rounds, c.seed_radius), (cut.certainty, cut.rounds, cut.seed_radius));
+        assert_eq!((c.border_margin, c.border_sides), (cut.border_margin, cut.border_sides));
+        assert_eq!((c.carve_cells, c.carve_rounds), (propagate.cells, propagate.rounds));
+        assert_eq!((c.carve_outside, c.carve_core), (propagate.outside, propagate.core));
+        assert_eq!(
+            (c.carve_most_negative, c.carve_least_positive),
+            (propagate.most_negative, propagate.least_positive)
+        );
         let soften = SoftenOptions::default();
         assert_eq!((c.side_px, c.lowest, c.highest), (soften.side, soften.lowest, soften.highest));
         let closed = &soften.closed_form;
-        assert_eq!((c.epsilon, c.tie, c.hold), (closed.epsilon, closed.tie, closed.hold));
+        assert_eq!(
+            (c.epsilon, c.constraint_weight, c.prior_weight),
+            (closed.epsilon, closed.constraint_weight, closed.prior_weight)
+        );
     }
 
     #[test]
-    fn carried_clicks_lie_deep_inside_and_far_outside() {
+    fn propagated_clicks_lie_deep_inside_and_far_outside() {
         // a disc of radius 20 around (40, 50) in 100 × 80, seen at twice the size
         let inside = |x: u32, y: u32| (x as i32 - 40).pow(2) + (y as i32 - 50).pow(2) <= 400;
         let values = (0..8000).map(|i| if inside(i % 100, i / 100) { 255 } else { 0 }).collect();
         let mask = Gray { width: 100, height: 80, values };
-        let clicks = carried(&mask, (200, 160));
+        let clicks = propagated_clicks(&mask, (200, 160));
         assert!(clicks.len() >= 3, "{clicks:?}");
         for click in &clicks {
             let (x, y) = (((click.x + 0.5) / 2.0 - 0.5) as u32, ((click.y + 0.5) / 2.0 - 0.5) as u32);
@@ -400,6 +407,6 @@ mod tests {
     #[test]
     fn an_empty_mask_carries_no_click_on_the_head() {
         let mask = Gray { width: 10, height: 10, values: vec![0; 100] };
-        assert!(carried(&mask, (10, 10)).iter().all(|c| !c.head));
+        assert!(propagated_clicks(&mask, (10, 10)).iter().all(|c| !c.head));
     }
 }

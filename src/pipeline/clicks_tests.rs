@@ -1,6 +1,6 @@
 //! Masks from clicks, as a stage of the line.
 
-use super::clicks::carried;
+use super::clicks::propagated_clicks;
 use super::*;
 use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
@@ -21,12 +21,12 @@ fn clicked(dir: &Path) -> (Config, Vec<Gray>) {
         capture.views.iter().map(|v| v.load_mask(&Limits::default()).unwrap().unwrap()).collect();
     let frame = |i: usize| Frame {
         file_path: file_path(&capture, &capture.views[i]),
-        points: carried(&truth[i], (120, 160)),
+        points: propagated_clicks(&truth[i], (120, 160)),
     };
     Prompts { frames: [0, 3, 5].map(frame).to_vec() }.write(&dir.join("prompts.json")).unwrap();
     let mut config = Config::preset(Preset::Draft);
     config.capture.path = root.to_str().unwrap().into();
-    config.mask.points = dir.join("prompts.json").to_str().unwrap().into();
+    config.mask.prompts = dir.join("prompts.json").to_str().unwrap().into();
     (config, truth)
 }
 
@@ -66,9 +66,9 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
 
     // the same clicks from another file are the same; other clicks are not
     let moved = dir.path().join("elsewhere.json");
-    std::fs::rename(&config.mask.points, &moved).unwrap();
+    std::fs::rename(&config.mask.prompts, &moved).unwrap();
     let mut config = config;
-    config.mask.points = moved.to_str().unwrap().into();
+    config.mask.prompts = moved.to_str().unwrap().into();
     assert!(Line::open(&config, &run, false).unwrap().mask().unwrap().skipped);
     // and the run outlives the file
     let text = std::fs::read_to_string(&moved).unwrap();
@@ -98,17 +98,17 @@ fn clicks_that_make_no_sense_end_before_anything_is_written() {
         std::fs::write(&path, text).unwrap();
         path.to_str().unwrap().to_owned()
     };
-    let text = refused(&|c| c.mask.points = "nowhere.json".into());
+    let text = refused(&|c| c.mask.prompts = "nowhere.json".into());
     assert!(text.contains("nowhere.json"), "{text}");
     let bad =
         file(r#"{"frames": [{"file_path": "../../etc/passwd", "points": [{"x": 1, "y": 1, "label": 1}]}]}"#);
-    let text = refused(&|c| c.mask.points.clone_from(&bad));
+    let text = refused(&|c| c.mask.prompts.clone_from(&bad));
     assert!(text.contains("bad.json") && text.contains("frames[0]"), "{text}");
     let bad = file(r#"{"frames": []}"#);
-    assert!(refused(&|c| c.mask.points.clone_from(&bad)).contains("bad.json"));
+    assert!(refused(&|c| c.mask.prompts.clone_from(&bad)).contains("bad.json"));
     let point = |view: &'static str, point: &'static str| {
         move |c: &mut Config| {
-            c.mask.points.clear();
+            c.mask.prompts.clear();
             c.mask.point = vec![point.into()];
             c.mask.view = view.into();
         }
@@ -124,7 +124,7 @@ fn clicks_that_make_no_sense_end_before_anything_is_written() {
 fn a_network_that_is_no_network_is_refused_in_one_sentence() {
     let dir = tempfile::tempdir().unwrap();
     let (mut config, _) = clicked(dir.path());
-    config.mask.vitmatte = config.mask.points.clone();
+    config.mask.vitmatte = config.mask.prompts.clone();
     let run = run(dir.path(), "run");
     let error = Line::open(&config, &run, false).unwrap().mask().unwrap_err();
     let expected = if cfg!(feature = "matting") { "prompts.json" } else { "this build cannot run networks" };
@@ -182,7 +182,7 @@ fn three_clicked_photographs_of_a_light_stage_mask_them_all() {
     for (name, band) in [("soft", 0.023), ("hard", 0.0)] {
         let mut config = Config::preset(Preset::Draft);
         config.capture.path = root.to_str().unwrap().into();
-        config.mask.points = root.join("prompts.json").to_str().unwrap().into();
+        config.mask.prompts = root.join("prompts.json").to_str().unwrap().into();
         config.mask.band = band;
         let run = run(dir.path(), name);
         let line = Line::open(&config, &run, false).unwrap();
@@ -218,11 +218,12 @@ fn held_out_photographs_shape_only_their_own_masks() {
     // clicks on a test view as well: deep in its own true mask
     let mask = held_out.load_mask(&Limits::default()).unwrap().unwrap();
     let mut prompts =
-        crate::mask::prompts::read_prompts(Path::new(&config.mask.points), &Limits::default()).unwrap();
-    prompts
-        .frames
-        .push(Frame { file_path: file_path(&capture, held_out), points: carried(&mask, (120, 160)) });
-    prompts.write(Path::new(&config.mask.points)).unwrap();
+        crate::mask::prompts::read_prompts(Path::new(&config.mask.prompts), &Limits::default()).unwrap();
+    prompts.frames.push(Frame {
+        file_path: file_path(&capture, held_out),
+        points: propagated_clicks(&mask, (120, 160)),
+    });
+    prompts.write(Path::new(&config.mask.prompts)).unwrap();
     let masks = |name: &str| -> Vec<Vec<u8>> {
         let run = run(dir.path(), name);
         let line = Line::open(&config, &run, false).unwrap();
@@ -238,7 +239,7 @@ fn held_out_photographs_shape_only_their_own_masks() {
     assert!(before == masks("after"));
     // and alone they are refused
     prompts.frames.drain(..3);
-    prompts.write(Path::new(&config.mask.points)).unwrap();
+    prompts.write(Path::new(&config.mask.prompts)).unwrap();
     let run = run(dir.path(), "alone");
     let error = Line::open(&config, &run, false).unwrap().mask().unwrap_err();
     assert!(error.to_string().contains("held-out"), "{error}");

@@ -6,7 +6,7 @@ use crate::capture::{self, Capture, Split};
 use crate::config::MaskMeaning;
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
-use crate::mask::consistency::{AgreeOptions, AgreeView, agree};
+use crate::mask::consistency::{ConsistencyOptions, ConsistencyView, check_consistency};
 use crate::mask::sheet::{Tile, sheet};
 use crate::mask::{prompts, scale};
 use crate::run::{Done, Failure, Stage};
@@ -53,10 +53,10 @@ impl Line<'_> {
                 );
             }
             let meaning = self.config.mask.meaning;
-            let doubts =
-                if meaning == MaskMeaning::Empty { doubts(&self.capture, &masks) } else { Vec::new() };
-            told(&doubts, coverage.len()).iter().for_each(|text| stage.warn(text));
-            for (view, _) in &doubts {
+            let conflicts =
+                if meaning == MaskMeaning::Empty { conflicts(&self.capture, &masks) } else { Vec::new() };
+            as_warnings(&conflicts, coverage.len()).iter().for_each(|text| stage.warn(text));
+            for (view, _) in &conflicts {
                 if let Some(k) = shown.iter().position(|v| v == view) {
                     tiles[k].suspicions.push("disagrees with the others".into());
                 }
@@ -138,24 +138,24 @@ impl Line<'_> {
     /// Masks made from clicks.
     fn masks_from_clicks(&self, stage: &Stage, clicks: &super::clicks::Clicks) -> Result<Masked, Failure> {
         let mut out = Masked { masks: vec![], tiles: vec![], shown: vec![], made: Value::Null };
-        let mut unsure = 0.0;
+        let mut unknown = 0.0;
         let networks = self.make_masks(stage, clicks, &mut |view, photo: &Photo, made| {
             self.write_mask(view, &made.alpha)?;
             let name = &self.capture.views[view].name;
             out.tiles.push(Tile::new(name, photo, &made.alpha, Some(&made.trimap))?);
             out.shown.push(view);
             out.masks.push(Some(for_placing(&made.alpha)));
-            unsure += made.unsure;
+            unknown += made.unknown;
             Ok(())
         })?;
-        if !self.config.mask.points.is_empty() {
+        if !self.config.mask.prompts.is_empty() {
             io::write_atomic(&stage.folder().join(CLICKS), &clicks.file)?;
         }
         let clicked = clicks.of.iter().filter(|c| !c.is_empty()).count();
         out.made = json!({
             "clicked_views": clicked,
             "clicks": clicks.of.iter().map(Vec::len).sum::<usize>(),
-            "unsure": unsure / out.masks.len().max(1) as f64,
+            "unknown": unknown / out.masks.len().max(1) as f64,
             "networks": networks.record(),
         });
         Ok(out)
@@ -183,19 +183,19 @@ impl Line<'_> {
 }
 
 /// The views whose masks do not fit the others, with a sentence each; none where the cameras cannot tell.
-fn doubts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> {
+fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> {
     // evenly spread ones, where there are very many: the check keeps bits of every cell for each
     let every = capture.views.len().div_ceil(MOST_COMPARED);
-    let views: Vec<AgreeView> = (capture.views.iter().zip(masks).enumerate())
-        .map(|(i, (v, mask))| AgreeView {
+    let views: Vec<ConsistencyView> = (capture.views.iter().zip(masks).enumerate())
+        .map(|(i, (v, mask))| ConsistencyView {
             name: &v.name,
             camera: &v.camera,
             mask: mask.as_ref().filter(|_| i.is_multiple_of(every)),
         })
         .collect();
-    match agree(&views, &AgreeOptions::default()) {
+    match check_consistency(&views, &ConsistencyOptions::default()) {
         // less than that is a matter of pixels
-        Ok(found) => (found.doubts.into_iter())
+        Ok(found) => (found.conflicts.into_iter())
             .filter(|d| d.too_much.max(d.too_little) >= 0.005)
             .map(|d| (d.view, d.text))
             .collect(),
@@ -203,16 +203,16 @@ fn doubts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> {
     }
 }
 
-/// The doubts as sentences; when most masks are doubted it is not single masks that are wrong.
-fn told(doubts: &[(usize, String)], masks: usize) -> Vec<String> {
-    if doubts.len() > 3 && 2 * doubts.len() > masks {
-        let (n, first) = (doubts.len(), &doubts[0].1);
+/// The conflicts as sentences; when most masks are doubted it is not single masks that are wrong.
+fn as_warnings(conflicts: &[(usize, String)], masks: usize) -> Vec<String> {
+    if conflicts.len() > 3 && 2 * conflicts.len() > masks {
+        let (n, first) = (conflicts.len(), &conflicts[0].1);
         return vec![format!(
             "{n} of {masks} masks contradict each other: they, or the cameras, belong to other photographs ({first}, \
              and so on)"
         )];
     }
-    doubts.iter().map(|(_, text)| text.clone()).collect()
+    conflicts.iter().map(|(_, text)| text.clone()).collect()
 }
 
 /// A mask at a size that is enough to place the head and to compare masks.
@@ -236,10 +236,10 @@ pub fn disagreements(root: &std::path::Path, options: &capture::CaptureOptions) 
         })
         .collect();
     let count = masks.iter().flatten().count();
-    told(&doubts(&capture, &masks), count)
+    as_warnings(&conflicts(&capture, &masks), count)
 }
 
-/// A page to click on; `prompts` are clicks that are there already.
+/// An annotation page; `prompts` are clicks that are there already.
 pub fn click_page(capture: &Capture, prompts: Option<&std::path::Path>) -> Result<String, PipelineError> {
     let limits = Limits::default();
     let known = match prompts {

@@ -1,20 +1,20 @@
 //! What clicks say for certain, and where a cut starts from.
 //!
-//! Sure head are discs around the head's clicks; sure stage are discs around the others and strips along the top
+//! Definite head are discs around the head's clicks; definite background are discs around the others and margins along the top
 //! and the upper part of both sides. Everything else starts as head when it is nearer to the head's clicks, joined
-//! by a line, than to sure stage: this Voronoi start follows the size of the head, which no fixed radius does.
+//! by a line, than to definite background: this Voronoi start follows the size of the head, which no fixed radius does.
 
-use super::options::CutOptions;
+use super::options::GrabcutOptions;
 use crate::mask::click::Click;
 use crate::mask::distance::squared_distance;
 use crate::mask::error::CutError;
 
 /// What is certain about a pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::mask) enum Known {
-    Nothing,
+pub(in crate::mask) enum Seed {
+    Unknown,
     Head,
-    Stage,
+    Background,
 }
 
 /// Checks the clicks on a photograph of `width` × `height` pixels, before anything is computed.
@@ -83,32 +83,32 @@ fn draw(marked: &mut [bool], width: usize, height: usize, a: (f32, f32), b: (f32
 }
 
 /// What is certain from the clicks: `[height · width]`, and warnings about clicks in each other's way.
-pub(in crate::mask) fn known(
+pub(in crate::mask) fn from_clicks(
     view: &str,
     clicks: &[Click],
     width: usize,
     height: usize,
-    options: &CutOptions,
-) -> (Vec<Known>, Vec<String>) {
+    options: &GrabcutOptions,
+) -> (Vec<Seed>, Vec<String>) {
     let h = height as f32;
-    let mut known = strips(width, height, options);
-    let radius = (options.disc * h).max(options.disc_least_px);
+    let mut seeds = border(width, height, options);
+    let radius = (options.seed_radius * h).max(options.seed_radius_least_px);
     let mut warnings = Vec::new();
     // where discs of both kinds overlap the nearer click is believed
     let mut nearest = vec![f32::INFINITY; width * height];
-    let mut disc = vec![false; width * height];
+    let mut near = vec![false; width * height];
     for c in clicks {
-        disc.fill(false);
-        draw(&mut disc, width, height, (c.x, c.y), (c.x, c.y), radius);
+        near.fill(false);
+        draw(&mut near, width, height, (c.x, c.y), (c.x, c.y), radius);
         // a click is worth its own pixel at least
         let own = |v: f32, size: usize| (v.round().max(0.0) as usize).min(size - 1);
-        disc[own(c.y, height) * width + own(c.x, width)] = true;
-        for i in (0..disc.len()).filter(|&i| disc[i]) {
+        near[own(c.y, height) * width + own(c.x, width)] = true;
+        for i in (0..near.len()).filter(|&i| near[i]) {
             let (dx, dy) = ((i % width) as f32 - c.x, (i / width) as f32 - c.y);
             let d = dx * dx + dy * dy;
             if d < nearest[i] {
                 nearest[i] = d;
-                known[i] = if c.head { Known::Head } else { Known::Stage };
+                seeds[i] = if c.head { Seed::Head } else { Seed::Background };
             }
         }
     }
@@ -128,23 +128,23 @@ pub(in crate::mask) fn known(
             n => format!(", and so do {} more pairs", n - 1),
         };
         warnings.push(format!(
-            "view `{view}`: clicks {i} and {j} call places {apart:.0} pixels apart head and stage{more}; are both right?"
+            "view `{view}`: clicks {i} and {j} call places {apart:.0} pixels apart head and background{more}; are both right?"
         ));
     }
-    (known, warnings)
+    (seeds, warnings)
 }
 
-/// The strips along the borders where no head is expected.
-pub(in crate::mask) fn strips(width: usize, height: usize, options: &CutOptions) -> Vec<Known> {
-    let strip = (options.strip * height as f32).ceil() as usize;
-    let sides = (options.strip_sides * height as f32) as usize;
+/// The margins along the borders where no head is expected.
+pub(in crate::mask) fn border(width: usize, height: usize, options: &GrabcutOptions) -> Vec<Seed> {
+    let margin = (options.border_margin * height as f32).ceil() as usize;
+    let sides = (options.border_sides * height as f32) as usize;
     (0..width * height)
         .map(|i| {
             let (x, y) = (i % width, i / width);
-            if y < strip || (y < sides && (x < strip || x + strip >= width)) {
-                Known::Stage
+            if y < margin || (y < sides && (x < margin || x + margin >= width)) {
+                Seed::Background
             } else {
-                Known::Nothing
+                Seed::Unknown
             }
         })
         .collect()
@@ -152,40 +152,40 @@ pub(in crate::mask) fn strips(width: usize, height: usize, options: &CutOptions)
 
 /// Where a cut starts from, each `[height · width]`.
 pub(in crate::mask) struct Start {
-    /// Is the pixel nearer to the head's clicks than to sure stage?
+    /// Is the pixel nearer to the head's clicks than to definite background?
     pub head: Vec<bool>,
-    /// False where the pixel is so much nearer to sure stage that its colour is taken for the stage's.
+    /// False where the pixel is so much nearer to definite background that its colour is taken for the background's.
     pub not_far: Vec<bool>,
 }
 
 /// The Voronoi start.
 pub(in crate::mask) fn start(
-    known: &[Known],
+    seeds: &[Seed],
     clicks: &[Click],
     width: usize,
     height: usize,
-    options: &CutOptions,
+    options: &GrabcutOptions,
 ) -> Start {
     let h = height as f32;
-    let mut skeleton: Vec<bool> = known.iter().map(|k| *k == Known::Head).collect();
+    let mut skeleton: Vec<bool> = seeds.iter().map(|k| *k == Seed::Head).collect();
     let head: Vec<(f32, f32)> = clicks.iter().filter(|c| c.head).map(|c| (c.x, c.y)).collect();
     for &p in &head {
-        draw(&mut skeleton, width, height, p, p, options.start_disc * h);
+        draw(&mut skeleton, width, height, p, p, options.start_radius * h);
     }
     for pair in head.windows(2) {
         draw(&mut skeleton, width, height, pair[0], pair[1], 0.5 * options.start_line * h);
     }
-    let stage: Vec<bool> = known.iter().map(|k| *k == Known::Stage).collect();
+    let background: Vec<bool> = seeds.iter().map(|k| *k == Seed::Background).collect();
     let to_head = squared_distance(&skeleton, width, height);
-    let to_stage = squared_distance(&stage, width, height);
+    let to_background = squared_distance(&background, width, height);
     let nearer = |times: f32| -> Vec<bool> {
-        known
+        seeds
             .iter()
-            .zip(to_head.iter().zip(&to_stage))
-            .map(|(k, (head, stage))| match k {
-                Known::Head => true,
-                Known::Stage => false,
-                Known::Nothing => *head < times * times * stage,
+            .zip(to_head.iter().zip(&to_background))
+            .map(|(k, (head, background))| match k {
+                Seed::Head => true,
+                Seed::Background => false,
+                Seed::Unknown => *head < times * times * background,
             })
             .collect()
     };
@@ -217,32 +217,37 @@ mod tests {
 
     #[test]
     fn clicks_close_together_share_their_discs_and_are_warned_about() {
-        let options = CutOptions { strip: 0.0, ..CutOptions::default() };
+        let options = GrabcutOptions { border_margin: 0.0, ..GrabcutOptions::default() };
         let clicks = [click(10.0, 10.0, true), click(15.0, 10.0, false)];
-        let (known, warnings) = known("a", &clicks, 40, 30, &options);
-        // discs of 4 pixels, 5 apart: 12 is nearer to the head, 13 to the stage
-        assert_eq!((known[10 * 40 + 12], known[10 * 40 + 13]), (Known::Head, Known::Stage));
-        assert_eq!((known[10 * 40 + 6], known[10 * 40 + 5]), (Known::Head, Known::Nothing));
+        let (seeds, warnings) = from_clicks("a", &clicks, 40, 30, &options);
+        // discs of 4 pixels, 5 apart: 12 is nearer to the head, 13 to the background
+        assert_eq!((seeds[10 * 40 + 12], seeds[10 * 40 + 13]), (Seed::Head, Seed::Background));
+        assert_eq!((seeds[10 * 40 + 6], seeds[10 * 40 + 5]), (Seed::Head, Seed::Unknown));
         assert_eq!(warnings.len(), 1);
         assert!(warnings[0].contains("clicks 1 and 2") && warnings[0].contains("5 pixels"));
     }
 
     #[test]
     fn the_start_reaches_half_way_to_the_stage() {
-        let options = CutOptions { start_disc: 0.0, start_line: 0.0, strip: 0.0, ..CutOptions::default() };
+        let options = GrabcutOptions {
+            start_radius: 0.0,
+            start_line: 0.0,
+            border_margin: 0.0,
+            ..GrabcutOptions::default()
+        };
         let clicks = [click(10.0, 15.0, true), click(30.0, 15.0, false)];
-        let (known, _) = known("a", &clicks, 41, 31, &options);
-        let Start { head, not_far } = start(&known, &clicks, 41, 31, &options);
+        let (seeds, _) = from_clicks("a", &clicks, 41, 31, &options);
+        let Start { head, not_far } = start(&seeds, &clicks, 41, 31, &options);
         assert!(head[15 * 41 + 19] && !head[15 * 41 + 20] && head[0] && !head[40]);
         // between the discs of 4 pixels 12 are free; twice as far from one as from the other at two thirds
         assert!(not_far[15 * 41 + 21] && !not_far[15 * 41 + 23]);
     }
 
     #[test]
-    fn strips_leave_the_lower_sides_open() {
-        let options = CutOptions { strip: 0.05, strip_sides: 0.6, ..CutOptions::default() };
-        let known = strips(50, 100, &options);
-        let at = |x: usize, y: usize| known[y * 50 + x] == Known::Stage;
+    fn border_margins_leave_the_lower_sides_open() {
+        let options = GrabcutOptions { border_margin: 0.05, border_sides: 0.6, ..GrabcutOptions::default() };
+        let seeds = border(50, 100, &options);
+        let at = |x: usize, y: usize| seeds[y * 50 + x] == Seed::Background;
         assert!(
             at(25, 4) && !at(25, 5) && at(4, 59) && at(45, 59) && !at(5, 59) && !at(0, 60) && !at(25, 99)
         );

@@ -1,28 +1,28 @@
-//! Closed-form matting (Levin, Lischinski, Weiss 2008): the opacity of the unsure band from the photograph.
+//! Closed-form matting (Levin, Lischinski, Weiss 2008): the opacity of the unknown band from the photograph.
 //!
-//! Where colours of head and stage each lie on a line within every 3 × 3 window, alpha is an affine function
+//! Where colours of head and background each lie on a line within every 3 × 3 window, alpha is an affine function
 //! of colour there. How far it is from one, over all windows, is a quadratic form `αᵀ L α` with
 //!
 //! ```text
 //! L_ij = Σ_w  δ_ij − (1 + (I_i − μ_w)ᵀ (Σ_w + ε/9 · 1)⁻¹ (I_j − μ_w)) / 9
 //! ```
 //!
-//! (their equation 12; `I` coded colour in 0..=1). Sure pixels are tied to their value with a weight, and
+//! (their equation 12; `I` coded colour in 0..=1). Definite pixels are tied to their value with a weight, and
 //! `(L + D) α = D b` is solved by conjugate gradients, preconditioned by an incomplete Cholesky factor with
 //! the pattern of `L` itself.
 //!
-//! Beyond the paper, unsure pixels are held to the hard mask by a weight far below the tie. Where the photograph
-//! says what alpha is, that changes little; where colours of head and stage agree (dark hair before a dark stage),
+//! Beyond the paper, unknown pixels are held to the hard mask by a weight far below the tie. Where the photograph
+//! says what alpha is, that changes little; where colours of head and background agree (dark hair before a dark background),
 //! alpha stays near the cut instead of bleeding through the band. Measured on three views each of two heads, mean
 //! squared error without and with it: hard masks cut from clicks 2.9 and 3.0, 2.7 and 2.1 of 1000; true ones 2.3 and
 //! 1.6, 1.6 and 1.2; 2 pixels too wide 2.8 and 2.7, 1.4 and 1.3; 2 too narrow 2.0 and 1.7, 1.8 and 1.8. Rounds of
 //! conjugate gradients fall from 70 to 42.
 //!
-//! Only windows that hold an unsure pixel are assembled, so work and memory follow the band, not the picture:
+//! Only windows that hold an unknown pixel are assembled, so work and memory follow the band, not the picture:
 //! about 310 bytes for each of its pixels and their neighbours within two. A row has 25 entries; being
 //! symmetric, 12 before the diagonal are kept.
 
-use super::trimap::{HEAD, UNSURE};
+use super::trimap::{HEAD, UNKNOWN};
 use crate::geom::cofactors;
 use crate::image::{Gray, Photo};
 
@@ -31,10 +31,10 @@ use crate::image::{Gray, Photo};
 pub struct ClosedFormOptions {
     /// Noise of colours, added to their covariance; squared colour differences of 0..=1.
     pub epsilon: f64,
-    /// Weight with which sure pixels are tied to their value.
-    pub tie: f64,
-    /// Weight with which unsure pixels are held to the hard mask; 0 as published.
-    pub hold: f64,
+    /// Weight with which definite pixels are tied to their value.
+    pub constraint_weight: f64,
+    /// Weight with which unknown pixels are held to the hard mask; 0 as published.
+    pub prior_weight: f64,
     /// Ends when the residual is this small against the right-hand side.
     pub tolerance: f64,
     /// Rounds of conjugate gradients at most.
@@ -43,7 +43,13 @@ pub struct ClosedFormOptions {
 
 impl Default for ClosedFormOptions {
     fn default() -> ClosedFormOptions {
-        ClosedFormOptions { epsilon: 1e-5, tie: 100.0, hold: 3e-3, tolerance: 1e-7, rounds: 2000 }
+        ClosedFormOptions {
+            epsilon: 1e-5,
+            constraint_weight: 100.0,
+            prior_weight: 3e-3,
+            tolerance: 1e-7,
+            rounds: 2000,
+        }
     }
 }
 
@@ -54,7 +60,7 @@ pub struct Matte {
     pub alpha: Vec<f32>,
     /// Rounds of conjugate gradients.
     pub rounds: usize,
-    /// Pixels that were solved for, sure ones at the rim of the band among them.
+    /// Pixels that were solved for, definite ones at the rim of the band among them.
     pub unknowns: usize,
 }
 
@@ -206,9 +212,9 @@ pub fn closed_form(
 ) -> Result<Matte, Unsolved> {
     assert_eq!((photo.width, photo.height), (mask.width, mask.height));
     assert_eq!((photo.width, photo.height), (trimap.width, trimap.height));
-    let sure = |v: u8| if v == HEAD { 1.0 } else { 0.0 };
-    let mut alpha: Vec<f32> = trimap.values.iter().map(|&v| sure(v)).collect();
-    if !trimap.values.contains(&UNSURE) {
+    let definite = |v: u8| if v == HEAD { 1.0 } else { 0.0 };
+    let mut alpha: Vec<f32> = trimap.values.iter().map(|&v| definite(v)).collect();
+    if !trimap.values.contains(&UNKNOWN) {
         return Ok(Matte { alpha, rounds: 0, unknowns: 0 });
     }
     if photo.width < 3 || photo.height < 3 {
@@ -219,32 +225,35 @@ pub fn closed_form(
     let mut x = vec![0.0; pixels.len()];
     for (i, &pixel) in pixels.iter().enumerate() {
         let (value, hard) = (trimap.values[pixel as usize], mask.values[pixel as usize] >= 128);
-        let (head, weight) =
-            if value == UNSURE { (hard, options.hold) } else { (value == HEAD, options.tie) };
+        let (head, weight) = if value == UNKNOWN {
+            (hard, options.prior_weight)
+        } else {
+            (value == HEAD, options.constraint_weight)
+        };
         x[i] = if head { 1.0 } else { 0.0 };
         right[i] = weight * x[i];
         matrix.diagonal[i] += weight;
     }
     let rounds = conjugate_gradients(&matrix, &right, &mut x, options)?;
     for (&pixel, &value) in pixels.iter().zip(&x) {
-        if trimap.values[pixel as usize] == UNSURE {
+        if trimap.values[pixel as usize] == UNKNOWN {
             alpha[pixel as usize] = value.clamp(0.0, 1.0) as f32;
         }
     }
     Ok(Matte { alpha, rounds, unknowns: pixels.len() })
 }
 
-/// The matting Laplacian of the windows that hold an unsure pixel, and which pixel each row is.
+/// The matting Laplacian of the windows that hold an unknown pixel, and which pixel each row is.
 fn assemble(photo: &Photo, trimap: &Gray, epsilon: f64) -> (Stencil, Vec<u32>) {
     const NONE: u32 = u32::MAX;
     let (width, height) = (photo.width as usize, photo.height as usize);
-    let unsure = |i: usize| trimap.values[i] == UNSURE;
+    let unknown = |i: usize| trimap.values[i] == UNKNOWN;
     let mut centres = Vec::new();
     let mut row_of = vec![NONE; width * height];
     for y in 1..height - 1 {
         for x in 1..width - 1 {
             let window = [y - 1, y, y + 1].map(|y| y * width + x);
-            if window.iter().any(|&i| unsure(i - 1) || unsure(i) || unsure(i + 1)) {
+            if window.iter().any(|&i| unknown(i - 1) || unknown(i) || unknown(i + 1)) {
                 centres.push(window[1] as u32);
                 window.iter().for_each(|&i| row_of[i - 1..=i + 1].fill(0));
             }
@@ -336,7 +345,7 @@ fn conjugate_gradients(
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let scale = dot(right, right).sqrt();
     if scale == 0.0 {
-        x.fill(0.0); // no sure head beside the band: alpha 0 satisfies everything
+        x.fill(0.0); // no definite head beside the band: alpha 0 satisfies everything
         return Ok(0);
     }
     let factor = matrix.factor();
@@ -372,7 +381,7 @@ mod tests {
     use super::*;
     use crate::io::{Limits, NpyValues, read_gray, read_npy, read_photo};
 
-    /// Photograph with two colours that meet softly, and noise; trimap unsure in the middle.
+    /// Photograph with two colours that meet softly, and noise; trimap unknown in the middle.
     fn small(width: usize, height: usize) -> (Photo, Gray) {
         let mut state = 3u64;
         let mut noise = || {
@@ -386,7 +395,7 @@ mod tests {
         }
         let value = |x: usize| match 3 * x / width {
             0 => 0,
-            1 => UNSURE,
+            1 => UNKNOWN,
             _ => HEAD,
         };
         let values = (0..width * height).map(|i| value(i % width)).collect();
@@ -401,8 +410,13 @@ mod tests {
     }
 
     /// As published: nothing is held to the mask.
-    const PUBLISHED: ClosedFormOptions =
-        ClosedFormOptions { epsilon: 1e-5, tie: 100.0, hold: 0.0, tolerance: 1e-7, rounds: 2000 };
+    const PUBLISHED: ClosedFormOptions = ClosedFormOptions {
+        epsilon: 1e-5,
+        constraint_weight: 100.0,
+        prior_weight: 0.0,
+        tolerance: 1e-7,
+        rounds: 2000,
+    };
 
     /// The equations entry by entry over the whole picture, solved by elimination.
     fn dense(photo: &Photo, mask: &Gray, trimap: &Gray, options: &ClosedFormOptions) -> Vec<f64> {
@@ -431,9 +445,9 @@ mod tests {
             }
         }
         for i in 0..n {
-            let unsure = trimap.values[i] == UNSURE;
-            let weight = if unsure { options.hold } else { options.tie };
-            let head = if unsure { mask.values[i] == 255 } else { trimap.values[i] == HEAD };
+            let unknown = trimap.values[i] == UNKNOWN;
+            let weight = if unknown { options.prior_weight } else { options.constraint_weight };
+            let head = if unknown { mask.values[i] == 255 } else { trimap.values[i] == HEAD };
             a[i][i] += weight;
             a[i][n] = if head { weight } else { 0.0 };
         }
@@ -457,16 +471,21 @@ mod tests {
     fn gradients_find_what_elimination_finds() {
         let (photo, trimap) = small(12, 10);
         let mask = cut(&trimap);
-        for hold in [0.0, 3e-3, 1.0] {
-            let options = ClosedFormOptions { tolerance: 1e-11, hold, ..PUBLISHED };
+        for prior_weight in [0.0, 3e-3, 1.0] {
+            let options = ClosedFormOptions { tolerance: 1e-11, prior_weight, ..PUBLISHED };
             let truth = dense(&photo, &mask, &trimap, &options);
             let matte = closed_form(&photo, &mask, &trimap, &options).unwrap();
-            // elimination ties sure pixels softly over the whole picture; far ones only here
-            for i in (0..120).filter(|&i| trimap.values[i] == UNSURE) {
+            // elimination ties definite pixels softly over the whole picture; far ones only here
+            for i in (0..120).filter(|&i| trimap.values[i] == UNKNOWN) {
                 let difference = (matte.alpha[i] as f64 - truth[i].clamp(0.0, 1.0)).abs();
-                assert!(difference < 2e-4, "hold {hold}, {i}: {} against {}", matte.alpha[i], truth[i]);
+                assert!(
+                    difference < 2e-4,
+                    "prior {prior_weight}, {i}: {} against {}",
+                    matte.alpha[i],
+                    truth[i]
+                );
             }
-            // columns 4 to 7 are unsure: windows reach to columns 2 to 9, all 10 rows
+            // columns 4 to 7 are unknown: windows reach to columns 2 to 9, all 10 rows
             assert_eq!(matte.unknowns, 80);
         }
     }
@@ -476,8 +495,8 @@ mod tests {
         let (mut photo, trimap) = small(30, 20);
         photo.rgb.fill([60; 3]);
         let mask = cut(&trimap);
-        let far = |hold: f64| {
-            let options = ClosedFormOptions { hold, ..PUBLISHED };
+        let far = |prior_weight: f64| {
+            let options = ClosedFormOptions { prior_weight, ..PUBLISHED };
             let alpha = closed_form(&photo, &mask, &trimap, &options).unwrap().alpha;
             let apart = alpha.iter().zip(&mask.values).map(|(a, &m)| (a - m as f32 / 255.0).powi(2));
             apart.sum::<f32>()
@@ -488,7 +507,7 @@ mod tests {
     #[test]
     fn the_matrix_is_that_of_the_formula_and_its_rows_sum_to_nothing() {
         let (photo, mut trimap) = small(9, 7);
-        trimap.values.fill(UNSURE);
+        trimap.values.fill(UNKNOWN);
         let (matrix, pixels) = assemble(&photo, &trimap, 1e-5);
         assert_eq!(pixels.len(), 63);
         let mut sums = vec![0.0; 63];
@@ -544,7 +563,7 @@ mod tests {
         let (photo, trimap) = small(12, 2);
         assert_eq!(closed_form(&photo, &cut(&trimap), &trimap, &PUBLISHED), Err(Unsolved::Small));
         let (photo, mut trimap) = small(12, 10);
-        trimap.values.fill(UNSURE);
+        trimap.values.fill(UNKNOWN);
         let matte = closed_form(&photo, &cut(&trimap), &trimap, &PUBLISHED).unwrap();
         assert!(matte.alpha.iter().all(|&a| a == 0.0));
     }

@@ -1,4 +1,4 @@
-//! The band around a mask's outline that nobody is sure of.
+//! The unknown region around a mask's outline.
 //!
 //! ```text
 //! 255  still head after the mask was shrunk      0  still outside after it was grown      128  between
@@ -13,12 +13,12 @@ use crate::mask::distance;
 
 /// Head, in a trimap.
 pub const HEAD: u8 = 255;
-/// Unsure, in a trimap.
-pub const UNSURE: u8 = 128;
+/// Unknown, in a trimap.
+pub const UNKNOWN: u8 = 128;
 /// Outside, in a trimap.
 pub const OUTSIDE: u8 = 0;
 
-/// How wide the unsure band is.
+/// How wide the unknown band is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Band {
     /// `kernel × kernel` ones applied `iterations` times each way.
@@ -51,7 +51,7 @@ impl Default for Band {
 pub fn trimap(mask: &Gray, band: Band) -> Gray {
     let (width, height) = (mask.width as usize, mask.height as usize);
     let head: Vec<bool> = mask.values.iter().map(|&v| v >= 128).collect();
-    let (sure, maybe) = match band {
+    let (definite, maybe) = match band {
         Band::Squares { kernel, iterations } => (
             erode(&head, width, height, kernel, iterations),
             dilate(&head, width, height, kernel, iterations),
@@ -63,16 +63,16 @@ pub fn trimap(mask: &Gray, band: Band) -> Gray {
     };
     let value = |(s, m)| match (s, m) {
         (true, _) => HEAD,
-        (_, true) => UNSURE,
+        (_, true) => UNKNOWN,
         _ => OUTSIDE,
     };
-    Gray { values: sure.into_iter().zip(maybe).map(value).collect(), ..*mask }
+    Gray { values: definite.into_iter().zip(maybe).map(value).collect(), ..*mask }
 }
 
-/// Share of a trimap's pixels that are unsure.
-pub fn unsure_share(trimap: &Gray) -> f64 {
-    let unsure = trimap.values.iter().filter(|&&v| v == UNSURE).count();
-    unsure as f64 / trimap.values.len().max(1) as f64
+/// Share of a trimap's pixels that are unknown.
+pub fn unknown_share(trimap: &Gray) -> f64 {
+    let unknown = trimap.values.iter().filter(|&&v| v == UNKNOWN).count();
+    unknown as f64 / trimap.values.len().max(1) as f64
 }
 
 /// Marked where the whole of the square is, as far as it lies inside the picture.
@@ -185,7 +185,7 @@ mod tests {
         let rows: Vec<u8> = (0..20).map(|y| tri.values[y * 8 + 3]).collect();
         assert!(rows[..8].iter().all(|&v| v == 0) && rows[8..12].iter().all(|&v| v == 128), "{rows:?}");
         assert!(rows[12..].iter().all(|&v| v == 255), "{rows:?}");
-        assert_eq!(unsure_share(&tri), 0.2);
+        assert_eq!(unknown_share(&tri), 0.2);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 //!
 //! The network sees four channels, colour and trimap, at a multiple of 32 pixels. Two conventions exist:
 //!
-//! | | colours | unsure |
+//! | | colours | unknown |
 //! | --- | --- | --- |
 //! | original code | ImageNet's mean and deviation | exactly 0.5 |
 //! | transformers | 0.5 and 0.5 (or as its file says) | 128 / 255 |
