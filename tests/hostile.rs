@@ -1079,7 +1079,7 @@ fn photographs_without_masks_do_not_pass_inspection() {
     fs::write(dir.path().join("prompts.json"), b"{}").unwrap();
     let e = capture::require_masks(&open(&dir).unwrap(), &CaptureOptions::default()).unwrap_err();
     assert!(
-        e.hint().contains(&format!("--points {}", dir.path().join("prompts.json").display())),
+        e.hint().contains(&format!("--prompts {}", dir.path().join("prompts.json").display())),
         "{}",
         e.hint()
     );

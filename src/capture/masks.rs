@@ -164,9 +164,9 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<(), 
     let shown = root.display();
     let prompts = root.join("prompts.json");
     let clicks = if io::is_file(&prompts) {
-        format!("make them from the clicks that lie there: `--points {}`", prompts.display())
+        format!("make them from the clicks that lie there: `--prompts {}`", prompts.display())
     } else {
-        format!("click on three photographs: `tiface mask {shown} --page`, then `--points prompts.json`")
+        format!("click on three photographs: `tiface mask {shown} --page`, then `--prompts prompts.json`")
     };
     let photographs = train.first().and_then(|v| v.photo.parent()).unwrap_or(root).display();
     let hint = format!(

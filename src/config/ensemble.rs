@@ -1,44 +1,21 @@
 //! `[ensemble]`: how several views of one camera become one.
 
-use super::{Key, Method, Preset};
-use serde::{Deserialize, Serialize};
+use super::Method;
+use super::table::table;
 
-/// Which views are blended, and how.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct EnsembleConfig {
-    /// Whose views; none of them for no blend.
-    pub members: Vec<Method>,
-    /// The share of each member, in their order; empty to fit them on `capture.tiles`.
-    pub weights: Vec<f64>,
-    /// Are members that were trained without masks cut to the head?
-    pub cut: bool,
-}
-
-pub(super) const KEYS: &[Key] = &[
-    Key::word(
-        "members",
-        "A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb); an empty list for \
-         no blend.",
-    ),
-    Key::number(
-        "weights",
-        "The share of each member, in their order, together 1; an empty list fits them on capture.tiles.",
-        0.0,
-        1.0,
-    ),
-    Key::word("cut", "Cut members trained without masks to the head, true or false; else the stage shows."),
-];
-
-impl EnsembleConfig {
-    /// The values a preset starts with: the paper's §5, or the two fields that know masks, which a baseline without
-    /// them makes no better.
-    pub fn preset(preset: Preset) -> EnsembleConfig {
-        let (members, weights) = match preset {
-            Preset::Paper => (vec![Method::Baseline, Method::Tface, Method::Volume], vec![0.1, 0.6, 0.3]),
-            _ => (vec![Method::Tface, Method::Volume], Vec::new()),
-        };
-        EnsembleConfig { members, weights, cut: true }
+table! {
+    /// Which views are blended, and how.
+    pub struct EnsembleConfig;
+    keys {
+        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb); an empty list
+        /// for no blend.
+        members: Vec<Method>
+            => vec![Method::Tface, Method::Volume], vec![Method::Tface, Method::Volume],
+            vec![Method::Baseline, Method::Tface, Method::Volume];
+        /// The share of each member, in their order, together 1; an empty list fits them on capture.tiles.
+        weights: Vec<f64>, 0.0..=1.0 => Vec::new(), Vec::new(), vec![0.1, 0.6, 0.3];
+        /// Cut members trained without masks to the head, true or false; else the background shows.
+        cut: bool => true;
     }
 }
 

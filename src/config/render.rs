@@ -1,6 +1,6 @@
 //! `[render]`: the views made of the result.
 
-use super::{Key, Preset};
+use super::table::table;
 use serde::{Deserialize, Serialize};
 
 /// A way to make a view.
@@ -78,60 +78,29 @@ pub enum Background {
     None,
 }
 
-/// Which views are made, and how.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RenderConfig {
-    /// Which cameras `tiface render` shows: `test`, or in a folder of their own `train`, `orbit`, or a file of
-    /// cameras.
-    pub cameras: String,
-    /// Which ways to make them.
-    pub method: Vec<Method>,
-    /// Views of an orbit.
-    pub orbit_views: u32,
-    /// Samples along each side of a pixel on an edge.
-    pub samples: u32,
-    /// Files to write.
-    pub format: PictureFormat,
-    /// What stands behind the head.
-    pub background: Background,
-    /// Keep every view in float as well?
-    pub float: bool,
-}
-
-pub(super) const KEYS: &[Key] = &[
-    Key::word(
-        "cameras",
-        "Cameras of `tiface render`: test (held-out views); train, orbit or a file (transforms.json or a nerfstudio \
-         camera path) into a folder of their own. Blend and metrics are always of test.",
-    ),
-    Key::word(
-        "method",
-        "A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh, learned colour) and textured \
-         (head.glb, as a viewer shows it).",
-    ),
-    Key::number("orbit_views", "Views of an orbit around the head.", 1.0, 10_000.0),
-    Key::number("samples", "Rays along each side of a pixel on an edge of the mesh.", 1.0, 8.0),
-    Key::word("format", "png (8-bit sRGB) or exr (float, with depth and normals)."),
-    Key::word("background", "Behind the head: black, white or none (real alpha)."),
-    Key::word("float", "Keep every view in float, too, in METHOD/float: what is blended. true or false."),
-];
-
-impl RenderConfig {
-    /// The values a preset starts with.
-    pub fn preset(preset: Preset) -> RenderConfig {
-        RenderConfig {
-            cameras: "test".into(),
-            method: match preset {
-                Preset::Paper => vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast],
-                _ => vec![Method::Tface, Method::Volume, Method::Raycast],
-            },
-            orbit_views: 36,
-            samples: if preset == Preset::Draft { 1 } else { 2 },
-            format: PictureFormat::Png,
-            background: Background::None,
-            float: true,
-        }
+table! {
+    /// Which views are made, and how.
+    pub struct RenderConfig;
+    keys {
+        /// Cameras of `tiface render`: test (held-out views); train, orbit or a file (transforms.json or a nerfstudio
+        /// camera path) into a folder of their own. Blend and metrics are always of test.
+        cameras: String => "test".into();
+        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh, learned colour) and textured
+        /// (head.glb, as a viewer shows it).
+        method: Vec<Method>
+            => vec![Method::Tface, Method::Volume, Method::Raycast],
+            vec![Method::Tface, Method::Volume, Method::Raycast],
+            vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast];
+        /// Views of an orbit around the head.
+        orbit_views: u32, 1.0..=10_000.0 => 36;
+        /// Rays along each side of a pixel on an edge of the mesh.
+        samples: u32, 1.0..=8.0 => 1, 2, 2;
+        /// png (8-bit sRGB) or exr (float, with depth and normals).
+        format: PictureFormat => PictureFormat::Png;
+        /// Behind the head: black, white or none (real alpha).
+        background: Background => Background::None;
+        /// Keep every view in float, too, in METHOD/float: what is blended. true or false.
+        float: bool => true;
     }
 }
 

@@ -7,7 +7,7 @@ use crate::run::{Fingerprint, Plan, read_record};
 
 /// Keys of `[mask]` that say where something lies; what it holds is an input of the stage.
 const PLACES: [&str; 8] = [
-    "mask.points",
+    "mask.prompts",
     "mask.point",
     "mask.view",
     "mask.sam",
