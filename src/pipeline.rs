@@ -49,7 +49,7 @@ pub use fields::Trained;
 pub use march::Seen;
 pub use mask::{click_page, disagreements};
 pub use product::{Lobes, Pictures, Product};
-pub use surface::{Exact, Fields, Radiance, Surface};
+pub use surface::{Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
 
 use crate::capture::scene::Scene;

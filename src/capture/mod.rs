@@ -182,12 +182,6 @@ pub fn open(root: &Path, options: &CaptureOptions) -> Result<Capture, CaptureErr
     }
 }
 
-/// What the format of a folder is, and why; nothing but names is looked at.
-pub fn detect(root: &Path) -> Result<(String, Vec<String>), CaptureError> {
-    let format = Format::of(root)?;
-    Ok((format.name().into(), format.reasons()))
-}
-
 /// A capture with everything that is wrong with it.
 pub(crate) struct Gathered {
     pub capture: Option<Capture>,

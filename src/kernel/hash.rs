@@ -12,9 +12,6 @@ use super::simd::fma;
 use crate::dispatch;
 use rayon::prelude::*;
 
-/// Features per entry.
-pub const FEATURES: usize = 2;
-
 /// One resolution of the grid.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Level {

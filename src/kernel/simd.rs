@@ -155,13 +155,6 @@ pub fn sigmoid<const F: bool>(x: f32) -> f32 {
     1.0 / (1.0 + exp::<F>(-x))
 }
 
-/// Softplus of sharpness 100, `ln(1 + e^{100 z}) / 100`: the activation of IGR and NeuS.
-#[inline(always)]
-pub fn softplus100<const F: bool>(z: f32) -> f32 {
-    let e = exp::<F>(-(100.0 * z).abs());
-    z.max(0.0) + 0.01 * ln_1p::<F>(e)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -177,16 +170,6 @@ mod tests {
         for i in 0..=1000 {
             let e = i as f32 / 1000.0;
             assert!((ln_1p::<true>(e) as f64 - (e as f64).ln_1p()).abs() < 2e-7, "ln_1p {e}");
-        }
-    }
-
-    #[test]
-    fn softplus_gives_the_published_values() {
-        // reference values of softplus with β = 100 at four places
-        let golden = [(-0.05, 6.715348e-5), (0.0, 0.0069314718), (0.01, 0.0131326169), (0.3, 0.3)];
-        for (z, want) in golden {
-            let got = softplus100::<true>(z);
-            assert!((got - want).abs() < 2e-9 + 2e-7 * want, "{z}: {got} {want}");
         }
     }
 

@@ -10,7 +10,7 @@ mod psnr;
 mod ssim;
 
 pub use psnr::psnr;
-pub use ssim::{ssim_reflect, ssim_reflect_map, ssim_valid};
+pub use ssim::{ssim_reflect_map, ssim_valid};
 
 use crate::image::{Gray, Image, Photo, quantise};
 use serde::Serialize;

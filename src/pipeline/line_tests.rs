@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::capture::Split;
-use crate::capture::synthetic::{SyntheticOptions, write_capture};
+use crate::capture::synthetic::{SyntheticHead, SyntheticOptions, write_capture};
 use crate::config::{Background, Genus, MeshFormat, MeshFrame, Method, Preset};
 use crate::geom::{Camera, Similarity};
 use crate::render::RenderedView;
@@ -10,6 +10,50 @@ use crate::run::{Quiet, Stop};
 use glam::Vec3;
 use serde_json::json;
 use std::sync::Arc;
+
+/// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little brighter seen
+/// from one side.
+struct Exact {
+    world_from_scene: Similarity,
+}
+
+impl Surface for Exact {
+    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+        let scale = self.world_from_scene.scale as f32;
+        points.iter().map(|&p| SyntheticHead.sdf(self.world_from_scene.point(p)) / scale).collect()
+    }
+
+    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        // the scene is scaled and moved, never turned: slopes are the same
+        let gradient = |&p: &Vec3| SyntheticHead.gradient(self.world_from_scene.point(p));
+        (self.sdf(points), points.iter().map(gradient).collect())
+    }
+
+    fn color(&self, points: &[Vec3], _: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        let paint = |(p, d): (&Vec3, &Vec3)| {
+            let stripes = (9.0 * *p).to_array().map(f32::sin);
+            [0.6 + 0.1 * stripes[0] - 0.05 * d.x, 0.5 + 0.1 * stripes[1], 0.4 + 0.1 * stripes[2]]
+        };
+        points.iter().zip(directions).map(paint).collect()
+    }
+
+    fn colors(
+        &self,
+        points: &[Vec3],
+        normals: &[Vec3],
+        counts: &[u32],
+        directions: &[Vec3],
+    ) -> Vec<[f32; 3]> {
+        let each = |v: &[Vec3]| -> Vec<Vec3> {
+            v.iter().zip(counts).flat_map(|(v, &n)| std::iter::repeat_n(*v, n as usize)).collect()
+        };
+        self.color(&each(points), &each(normals), directions)
+    }
+
+    fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {
+        None
+    }
+}
 
 /// The demo head's formula in the place of all learned fields.
 struct Formula(Exact);

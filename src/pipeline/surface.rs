@@ -1,7 +1,6 @@
 //! What the later stages need of a learned field, and of anything else that can stand in for it.
 
 use super::march::Seen;
-use crate::capture::synthetic::SyntheticHead;
 use crate::geom::{Camera, Ray, Similarity};
 use crate::render::RenderedView;
 use crate::run::Failure;
@@ -92,50 +91,5 @@ impl Radiance for crate::tface::FieldMean {
             normal: Vec3::ZERO,
         };
         self.render(rays, forward).into_iter().map(seen).collect()
-    }
-}
-
-/// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little brighter seen
-/// from one side.
-pub struct Exact {
-    /// Where the scene sits.
-    pub world_from_scene: Similarity,
-}
-
-impl Surface for Exact {
-    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
-        let scale = self.world_from_scene.scale as f32;
-        points.iter().map(|&p| SyntheticHead.sdf(self.world_from_scene.point(p)) / scale).collect()
-    }
-
-    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
-        // the scene is scaled and moved, never turned: slopes are the same
-        let gradient = |&p: &Vec3| SyntheticHead.gradient(self.world_from_scene.point(p));
-        (self.sdf(points), points.iter().map(gradient).collect())
-    }
-
-    fn color(&self, points: &[Vec3], _: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
-        let paint = |(p, d): (&Vec3, &Vec3)| {
-            let stripes = (9.0 * *p).to_array().map(f32::sin);
-            [0.6 + 0.1 * stripes[0] - 0.05 * d.x, 0.5 + 0.1 * stripes[1], 0.4 + 0.1 * stripes[2]]
-        };
-        points.iter().zip(directions).map(paint).collect()
-    }
-
-    fn colors(
-        &self,
-        points: &[Vec3],
-        normals: &[Vec3],
-        counts: &[u32],
-        directions: &[Vec3],
-    ) -> Vec<[f32; 3]> {
-        let each = |v: &[Vec3]| -> Vec<Vec3> {
-            v.iter().zip(counts).flat_map(|(v, &n)| std::iter::repeat_n(*v, n as usize)).collect()
-        };
-        self.color(&each(points), &each(normals), directions)
-    }
-
-    fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {
-        None
     }
 }

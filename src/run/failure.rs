@@ -56,11 +56,6 @@ impl Failure {
         Failure { exit: Exit::Cannot, error: error.into(), hint: hint.into() }
     }
 
-    /// Exit code 75 with this error.
-    pub fn not_now(error: impl Into<Box<dyn Error + Send + Sync>>, hint: impl Into<String>) -> Failure {
-        Failure { exit: Exit::NotNow, error: error.into(), hint: hint.into() }
-    }
-
     /// Stopped on request; what was done is kept as far as it is whole.
     pub fn stopped(stop: &Stop) -> Failure {
         Failure::stopped_at(stop, "what is complete is kept")

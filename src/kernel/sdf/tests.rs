@@ -102,6 +102,18 @@ fn wide(flat: &[f32]) -> Vec<f64> {
 }
 
 #[test]
+fn the_activation_gives_the_published_values() {
+    // reference values of softplus with β = 100 at four places
+    let golden = [(-0.05, 6.715348e-5), (0.0, 0.0069314718), (0.01, 0.0131326169), (0.3, 0.3)];
+    let (mut z, mut s) = ([0f32; HIDDEN], [0f32; HIDDEN]);
+    golden.iter().zip(&mut z).for_each(|((place, _), z)| *z = *place);
+    activate::<true>(&mut z, &mut s, &[0.0; HIDDEN]);
+    for ((place, want), got) in golden.iter().zip(z) {
+        assert!((got - want).abs() < 2e-9 + 2e-7 * want, "{place}: {got} {want}");
+    }
+}
+
+#[test]
 fn the_forward_agrees_with_an_f64_model() {
     for skip in [false, true] {
         forward_agrees(skip);

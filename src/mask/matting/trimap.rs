@@ -35,13 +35,9 @@ pub enum Band {
     },
 }
 
-impl Band {
-    /// What the published pipeline uses on pictures of 750 × 1024.
-    pub const PUBLISHED: Band = Band::Squares { kernel: 10, iterations: 5 };
-}
-
 impl Default for Band {
-    /// 2.3 % of the height: 24 pixels of 1024, about what [`Band::PUBLISHED`] makes of them.
+    /// 2.3 % of the height: 24 pixels of 1024, about what the published squares, 10 wide and
+    /// five times, make of them.
     fn default() -> Band {
         Band::Discs { share: 0.023 }
     }
