@@ -90,7 +90,7 @@ impl Work<'_> {
             line.fresh(fresh, self.until)?;
         }
         line.remember(self.until)?;
-        self.screen.expect(line.order(self.until));
+        self.screen.expect(line.ahead(self.until)?);
         let done = reconstruct(&line, self.until)?;
         let written = match &self.out {
             Some(out) => self.copy(&line, &run, out)?,

@@ -27,8 +27,8 @@ struct Inner {
 struct State {
     bar: Option<ProgressBar>,
     told: Option<Instant>,
-    /// The stages of the command, in order.
-    order: Vec<&'static str>,
+    /// The stages of the command that are to be worked on, in order, with the seconds that each may take.
+    ahead: Vec<(&'static str, f64)>,
 }
 
 const PLAIN: Duration = Duration::from_secs(30);
@@ -49,9 +49,9 @@ impl Screen {
         self.0.clone()
     }
 
-    /// The stages that are to come: what is left of one is not what is left of all.
-    pub fn expect(&self, order: Vec<&'static str>) {
-        self.0.state.lock().unwrap_or_else(PoisonError::into_inner).order = order;
+    /// The stages that are to come, with the seconds that each may take: what is left of one is not what is left of all.
+    pub fn expect(&self, ahead: Vec<(&'static str, f64)>) {
+        self.0.state.lock().unwrap_or_else(PoisonError::into_inner).ahead = ahead;
     }
 
     /// A remark for people: about what, and what.
@@ -124,10 +124,14 @@ impl Inner {
         }
     }
 
-    /// How many stages come after this one.
-    fn after(&self, stage: &str) -> usize {
+    /// How many stages come after this one, and the seconds left of all together when of this one `eta_s` are left
+    /// and it takes `all_s`: the others are as much slower or faster than was estimated as this one is.
+    fn after(&self, stage: &str, eta_s: Option<f64>, all_s: Option<f64>) -> (usize, Option<f64>) {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        state.order.iter().rev().position(|s| *s == stage).unwrap_or(0)
+        let Some(at) = state.ahead.iter().position(|(s, _)| *s == stage) else { return (0, eta_s) };
+        let later = &state.ahead[at + 1..];
+        let pace = all_s.map_or(1.0, |s| s / state.ahead[at].1.max(1.0)).clamp(0.02, 50.0);
+        (later.len(), eta_s.map(|eta| eta + pace * later.iter().map(|(_, seconds)| seconds).sum::<f64>()))
     }
 
     /// Is it time for the next plain line or object?
@@ -152,17 +156,19 @@ impl Observer for Inner {
             }
             Event::Progress { stage, step, steps, rate, eta_s, values } => {
                 let last = step >= steps;
-                let after = self.after(stage);
+                let all_s = rate.filter(|r| *r > 0.0).map(|r| steps as f64 / r);
+                let (after, run_eta_s) = self.after(stage, eta_s, all_s);
                 if self.json && self.due(OBJECTS, last) {
                     let values: Map<String, Value> =
                         values.iter().map(|(k, v)| (k.to_string(), Value::from(*v))).collect();
                     self.object(json!({"event": "progress", "stage": stage, "step": step, "steps": steps,
-                        "rate": rate, "eta_s": eta_s, "stages_after": after, "values": values}));
+                        "rate": rate, "eta_s": eta_s, "stages_after": after, "run_eta_s": run_eta_s,
+                        "values": values}));
                 }
                 if self.quiet {
                     return;
                 }
-                let text = progress(step, steps, rate, eta_s, after, values);
+                let text = progress(step, steps, rate, eta_s, run_eta_s.filter(|_| after > 0), values);
                 let bar = self.state.lock().unwrap_or_else(PoisonError::into_inner).bar.clone();
                 match bar {
                     Some(bar) => bar.set_message(text),
@@ -212,13 +218,13 @@ impl Drop for Inner {
     }
 }
 
-/// `1200/3000  12.4/s  2 min 25 s left of this stage, 4 to come  psnr 27.31`
+/// `1200/3000  12.4/s  2 min 25 s left, about 9 min 10 s of the run  psnr 27.31`
 fn progress(
     step: u64,
     steps: u64,
     rate: Option<f64>,
     eta_s: Option<f64>,
-    after: usize,
+    run_eta_s: Option<f64>,
     values: &[(&str, f64)],
 ) -> String {
     let mut text = format!("{step}/{steps}");
@@ -227,9 +233,8 @@ fn progress(
     }
     if let Some(eta) = eta_s.filter(|_| step < steps) {
         text += &format!("  {} left", duration(eta));
-        // how long a stage takes that has not begun depends on what the ones before it make
-        if after > 0 {
-            text += &format!(" of this stage, {after} to come");
+        if let Some(all) = run_eta_s {
+            text += &format!(", about {} of the run", duration(all));
         }
     }
     for (name, value) in values {
@@ -278,16 +283,20 @@ mod tests {
         );
         let figures = [0.000123, 0.5, 27.31, 41234.4, 2.0, 0.0].map(figure);
         assert_eq!(figures, ["1.23e-4", "0.500", "27.3", "41234", "2", "0"]);
-        let line = |after| progress(1200, 3000, Some(12.4), Some(145.0), after, &[("psnr", 27.31)]);
-        assert_eq!(line(0), "1200/3000  12.4/s  2 min 25 s left  psnr 27.3");
+        let line = |all| progress(1200, 3000, Some(12.4), Some(145.0), all, &[("psnr", 27.31)]);
+        assert_eq!(line(None), "1200/3000  12.4/s  2 min 25 s left  psnr 27.3");
     }
 
     #[test]
     fn time_left_of_a_stage_is_not_told_as_that_of_the_run() {
         let screen = Screen::new(&Common::default());
-        screen.expect(vec!["mask", "tface", "render"]);
-        assert_eq!(["mask", "tface", "render", "other"].map(|s| screen.0.after(s)), [2, 1, 0, 0]);
-        let line = progress(1, 3, None, Some(145.0), 1, &[]);
-        assert_eq!(line, "1/3  2 min 25 s left of this stage, 1 to come");
+        screen.expect(vec![("mask", 10.0), ("tface", 100.0), ("render", 30.0)]);
+        // T-Face takes twice the estimate, and so may what comes after it: 50 + 2 * 30
+        assert_eq!(screen.0.after("tface", Some(50.0), Some(200.0)), (1, Some(110.0)));
+        assert_eq!(screen.0.after("mask", Some(5.0), None), (2, Some(135.0)));
+        assert_eq!(screen.0.after("render", None, None), (0, None));
+        assert_eq!(screen.0.after("other", Some(1.0), None), (0, Some(1.0)));
+        let line = progress(1, 3, None, Some(145.0), Some(550.0), &[]);
+        assert_eq!(line, "1/3  2 min 25 s left, about 9 min 10 s of the run");
     }
 }

@@ -48,7 +48,7 @@ pub fn grabcut(
 ) -> Result<Cut, CutError> {
     seeds::check(view, clicks, photo.width, photo.height)?;
     let (grabcut, mut warnings) = Grabcut::new(view, photo, clicks, options);
-    let (head, models) = grabcut.cut_clicks(options);
+    let (head, models) = grabcut.cut_from_clicks(options);
     let head = grabcut.finish(head, options);
     if !head.contains(&true) {
         return Err(CutError::Empty { view: view.into() });
@@ -125,7 +125,7 @@ impl Grabcut {
     }
 
     /// GrabCut from the clicks: labels and the colours they end with.
-    pub fn cut_clicks(&self, options: &GrabcutOptions) -> (Vec<bool>, Option<Models>) {
+    pub fn cut_from_clicks(&self, options: &GrabcutOptions) -> (Vec<bool>, Option<Models>) {
         let start = seeds::start(&self.seeds, &self.clicks, self.width, self.height, options);
         let mut head = start.head;
         let mut models: Option<Models> = None;

@@ -199,7 +199,7 @@ impl Propagation<'_> {
             .par_iter()
             .map(|&i| {
                 let (grabcut, warnings) = self.grabcut(i, true);
-                let (head, models) = grabcut.cut_clicks(cut);
+                let (head, models) = grabcut.cut_from_clicks(cut);
                 let head = grabcut.finish(head, cut);
                 let models = models.filter(|_| head.contains(&true) && head.contains(&false));
                 (head, models, warnings)

@@ -1,7 +1,7 @@
 //! What each stage builds on, and so what shapes it: known before anything runs.
 
 use super::{FORMAT, Line, PipelineError, STAGES};
-use crate::capture::View;
+use crate::capture::{Split, View};
 use crate::config::{Config, Method, VmConfig};
 use crate::run::{Fingerprint, Plan, read_record};
 
@@ -207,6 +207,44 @@ impl Line<'_> {
     pub(super) fn vm(&self, stage: &str) -> VmConfig {
         let Config { baseline, tface, .. } = self.config;
         if stage == "baseline" { baseline.field(tface) } else { tface.clone() }
+    }
+
+    /// The stages that `until` needs and that are not done, with the seconds that each may take on two cores: from
+    /// counts of rays, samples, cells and pixels, and what one of each took where it was measured. No more than an
+    /// estimate; whoever shows it corrects it by the pace of the stage at work.
+    pub fn ahead(&self, until: &str) -> Result<Vec<(&'static str, f64)>, PipelineError> {
+        let Config { iface, mesh, render, .. } = self.config;
+        let shown = self.path.as_ref().map_or(render, |path| &path.render);
+        let pixels = self.pixels() as f64;
+        let test =
+            pixels * self.capture.split(Split::Test).count().max(1) as f64 / self.capture.views.len() as f64;
+        let seconds = |stage: &str| match stage {
+            "mask" => 2.0 + 2e-6 * pixels,
+            "baseline" | "tface" => {
+                let c = self.vm(stage);
+                // whole frames are mostly outside the hull, and nothing of them is skipped
+                let each = if stage == "baseline" { 60e-6 } else { 23e-6 };
+                if c.import.is_empty() {
+                    each * (c.steps as usize * c.rays * c.learned()) as f64
+                } else {
+                    1.0
+                }
+            }
+            "iface" => 3e-6 * (iface.steps as usize * iface.samples) as f64,
+            "mesh" => {
+                3e-4 * f64::from(mesh.resolution).powi(2) + 5e-6 * (mesh.texels() * mesh.pictures()) as f64
+            }
+            "render" => 8e-6 * test * shown.method.len() as f64,
+            "ensemble" => 1e-6 * pixels,
+            _ => 2.0 + 1e-6 * test,
+        };
+        let ahead = self.outlook(until)?.into_iter();
+        let to_do = ahead.filter(|(_, found)| found.as_ref().is_none_or(|d| !d.is_empty()));
+        let order = self.order(until);
+        Ok(to_do
+            .filter_map(|(name, _)| order.iter().find(|s| **s == *name))
+            .map(|s| (*s, seconds(s)))
+            .collect())
     }
 
     /// Of all photographs.

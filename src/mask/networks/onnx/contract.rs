@@ -130,7 +130,7 @@ fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
 pub(super) fn recognise(inputs: &[Port], outputs: &[Port]) -> Result<Contract, String> {
     let mut near = None;
     let gives = |name: &&str| outputs.iter().any(|p| p.name == **name);
-    for form in FORMS.iter().filter(|f| f.outputs.iter().all(|name| gives(name))) {
+    for form in FORMS.iter().filter(|f| f.outputs.iter().all(gives)) {
         match misfit(inputs, form.inputs) {
             None => return Ok(form.contract),
             Some(why) => near = near.or(Some(why)),

@@ -120,7 +120,8 @@ impl Model {
                 inputs.push((&port.name, value));
             }
             let wanted = self.outputs.iter().fold(OutputSelector::no_default(), |o, name| o.with(*name));
-            let given = session.run_with_options(inputs, &RunOptions::new()?.with_outputs(wanted))?;
+            let options = RunOptions::new()?.with_outputs(wanted);
+            let given = session.run_with_options(inputs, &options)?;
             let mut found = Vec::new();
             for value in self.outputs.iter().filter_map(|name| given.get(name)) {
                 let (shape, values) = value.try_extract_tensor::<f32>()?;
