@@ -242,8 +242,8 @@ impl Line<'_> {
         let to_do = ahead.filter(|(_, found)| found.as_ref().is_none_or(|d| !d.is_empty()));
         let order = self.order(until);
         Ok(to_do
-            .filter_map(|(name, _)| order.iter().find(|s| **s == *name))
-            .map(|s| (*s, seconds(s)))
+            .filter_map(|(name, _)| order.iter().copied().find(|s| *s == name))
+            .map(|s| (s, seconds(s)))
             .collect())
     }
 
