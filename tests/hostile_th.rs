@@ -451,9 +451,9 @@ fn archives_that_lie_are_errors() {
     assert!(message(made(&|e| e[1].name = "b/data.pkl".into())).contains("more than one `data.pkl`"));
     assert!(message(made(&|e| e[0].name = "a/data.pickle".into())).contains("no `data.pkl`"));
     assert!(message(made(&|e| e[1].crc ^= 1)).contains("cannot be unpacked"));
-    assert!(message(made(&|e| e[1].size += 1)).contains("fewer bytes than its entry says, 25"));
+    assert!(message(made(&|e| e[1].size += 1)).contains("has 24 bytes, its entry says 25"));
     assert!(message(made(&|e| e[1].flags = 1)).contains("Password"));
-    assert!(message(made(&|e| e[1].method = 12)).contains("Compression method"));
+    assert!(message(made(&|e| e[1].method = 12)).contains("not supported: 12"));
     assert!(message(made(&|e| e[1].method = 8)).contains("cannot be unpacked"));
     // two entries on the same bytes
     let twice = zips::archive(&[good[0].clone(), good[0].clone()], |_, _| 0);
@@ -480,7 +480,7 @@ fn small_archives_that_unpack_to_much_are_refused_before_they_are_unpacked() {
     // the size it claims is all it gets
     let liar = Entry { size: 100, ..zeros };
     let error = parse(&zips::archive(&[Entry::stored("a/data.pkl", b"\x80\x02N."), liar], |_, at| at));
-    assert!(error.unwrap_err().to_string().contains("more bytes than its entry says, 100"));
+    assert!(error.unwrap_err().to_string().contains("cannot be unpacked"));
     assert!(begin.elapsed().as_secs() < 20);
 }
 

@@ -76,7 +76,7 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
     })?;
     let dtype = header.dtype();
     let kind = match &dtype {
-        DType::Plain(kind) if !kind.uses_pickled_array() => kind,
+        DType::Plain(kind) if is_read(kind) => kind,
         other => return Err(unsupported(path, other)),
     };
     let shape: Vec<usize> = header.shape().iter().map(|&n| n as usize).collect();
@@ -122,6 +122,15 @@ fn countable(header: &[u8]) -> bool {
         product.checked_mul(digits.parse::<u64>().ok()?.max(1))
     });
     product.is_some()
+}
+
+/// Is it bool, an integer or a float of up to 64 bits?
+fn is_read(kind: &TypeStr) -> bool {
+    match kind.type_char() {
+        TypeChar::Bool | TypeChar::Int | TypeChar::Uint => true,
+        TypeChar::Float => kind.size_field() <= 8,
+        _ => false,
+    }
 }
 
 fn unsupported(path: &Path, dtype: &DType) -> ReadError {

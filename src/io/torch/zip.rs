@@ -50,7 +50,7 @@ impl Archive {
             let name = zip.name_for_index(i).unwrap_or(Err(ZipError::FileNotFound));
             let name = name.map_err(|e| bad(e.to_string()))?.into_owned();
             let seen = shown(name.as_bytes());
-            let entry = zip.by_index(i).map_err(|e| match e {
+            let mut entry = zip.by_index(i).map_err(|e| match e {
                 ZipError::UnsupportedArchive(_) | ZipError::CompressionMethodNotSupported(_) => {
                     ReadError::Unsupported {
                         path: path.into(),
@@ -61,14 +61,12 @@ impl Archive {
                 }
                 e => bad(format!("`{seen}`: {e}")),
             })?;
-            // the declared sizes were counted against the limit, and no more than that is unpacked
-            let size = entry.size();
-            let mut content = Vec::new();
-            let read = entry.take(size.saturating_add(1)).read_to_end(&mut content);
-            read.map_err(|e| bad(format!("`{seen}` cannot be unpacked: {e}")))?;
+            // the declared sizes were counted against the limit, and `zip` unpacks no more than that
+            let (size, mut content) = (entry.size(), Vec::new());
+            entry.read_to_end(&mut content).map_err(|e| bad(format!("`{seen}` cannot be unpacked: {e}")))?;
             if content.len() as u64 != size {
-                let most = if content.len() as u64 > size { "more" } else { "fewer" };
-                return Err(bad(format!("`{seen}` has {most} bytes than its entry says, {size}")));
+                let found = content.len();
+                return Err(bad(format!("`{seen}` has {found} bytes, its entry says {size}")));
             }
             entries.insert(name, content);
         }
