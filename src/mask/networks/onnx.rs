@@ -15,40 +15,19 @@
 mod contract;
 mod error;
 mod ort;
+mod seam;
 mod tract;
 
 pub use self::contract::{Contract, Port};
 pub use self::error::MaskNetworkError;
 pub use self::ort::Runtime;
+pub(super) use self::seam::Array;
 
+use self::error::shown;
+use self::seam::{guarded, hexadecimal};
 use crate::io::{self, Limits};
-use sha2::{Digest, Sha256};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use tract_onnx::prelude::Framework;
-
-/// An array a network takes or gives, row-major.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Array {
-    /// Extents.
-    pub shape: Vec<usize>,
-    /// As many values as the extents' product; whole numbers where the network takes integers.
-    pub values: Vec<f32>,
-}
-
-impl Array {
-    pub(super) fn new(shape: &[usize], values: Vec<f32>) -> Array {
-        debug_assert_eq!(shape.iter().product::<usize>(), values.len());
-        Array { shape: shape.to_vec(), values }
-    }
-
-    fn integers(&self) -> Vec<i64> {
-        self.values.iter().map(|&v| v as i64).collect()
-    }
-}
-
-/// Every input of a network, in the file's order, with what it is fed.
-type Fed<'a> = [(&'a Port, &'a Array)];
 
 /// What bounds a session.
 #[derive(Clone, Debug)]
@@ -205,23 +184,6 @@ fn names_another_file(bytes: &[u8]) -> bool {
         || bytes.windows(9).any(|w| w == b"EPContext")
 }
 
-/// SHA-256 in hexadecimal.
-fn hexadecimal(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
-}
-
-/// Runs a piece of an engine; a panic inside becomes its message.
-///
-/// `AssertUnwindSafe`: what an engine shares between runs is a map of finished plans behind a lock, changed
-/// by one insertion, so a run that panics leaves nothing half made that a later run would see.
-fn guarded<T>(piece: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
-    catch_unwind(AssertUnwindSafe(piece)).unwrap_or_else(|panic| {
-        let said = panic.downcast_ref::<String>().map(String::as_str);
-        let said = said.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("it gave no reason");
-        Err(format!("it broke down: {said}"))
-    })
-}
-
 fn engine_error(path: &Path, runtime: bool, doing: &'static str, problem: &str) -> MaskNetworkError {
     let (engine, hint) = match runtime {
         true => (ort::NAME, "take a newer ONNX Runtime, or the float32 file from its publisher again"),
@@ -232,16 +194,6 @@ fn engine_error(path: &Path, runtime: bool, doing: &'static str, problem: &str) 
         ),
     };
     MaskNetworkError::Engine { path: path.into(), engine, doing, problem: shown(problem), hint }
-}
-
-/// What an engine or a file says: one line, no control characters, not endless.
-fn shown(said: &str) -> String {
-    let line = said.split_whitespace().collect::<Vec<_>>().join(" ");
-    let line: String = line.chars().filter(|c| !c.is_control()).collect();
-    match line.char_indices().nth(300) {
-        Some((end, _)) => format!("{}…", &line[..end]),
-        None => line,
-    }
 }
 
 #[cfg(test)]

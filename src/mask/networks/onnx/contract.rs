@@ -1,6 +1,6 @@
 //! Which network a file is, by its inputs and outputs and never by its name.
 
-use super::shown;
+use super::error::shown;
 use std::fmt;
 use tract_onnx::pb;
 

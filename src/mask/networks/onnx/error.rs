@@ -80,3 +80,13 @@ impl MaskNetworkError {
         }
     }
 }
+
+/// What an engine or a file says: one line, no control characters, not endless.
+pub(super) fn shown(said: &str) -> String {
+    let line = said.split_whitespace().collect::<Vec<_>>().join(" ");
+    let line: String = line.chars().filter(|c| !c.is_control()).collect();
+    match line.char_indices().nth(300) {
+        Some((end, _)) => format!("{}…", &line[..end]),
+        None => line,
+    }
+}

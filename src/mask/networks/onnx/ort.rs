@@ -1,7 +1,8 @@
 //! The engine that the user brings: an ONNX Runtime library, loaded from the path named and nowhere else.
 
 use super::contract::I64;
-use super::{Array, Fed, MaskNetworkError, guarded, hexadecimal, shown};
+use super::error::{MaskNetworkError, shown};
+use super::seam::{Array, Fed, guarded, hexadecimal};
 use crate::io::{self, Limits};
 use ort::environment::Environment;
 use ort::logging::LogLevel;

@@ -4,7 +4,7 @@
 //! (0.2 to 1 s for public networks) and kept, since the photographs of a capture share their size.
 
 use super::contract::{I64, Port};
-use super::{Array, Fed};
+use super::seam::{Array, Fed};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use tract_onnx::pb;
@@ -66,36 +66,36 @@ impl Model {
         Ok(plan)
     }
 
-    /// Refuses a graph with an array no photograph needs, before the engine makes it. Inferring a node's facts
-    /// also computes what is constant, so its extents are asked for first.
+    /// Refuses a graph with an array no photograph needs, before the engine makes it.
     fn bounded(&self, model: &mut InferenceModel) -> TractResult<()> {
         for id in model.eval_order()? {
-            let node = model.node(id).clone();
-            let own = |facts: TVec<&InferenceFact>| facts.into_iter().cloned().collect::<TVec<_>>();
-            let (inputs, outputs) = model.node_facts(id)?;
-            let (inputs, outputs) = (own(inputs), own(outputs));
-            let seen = node.op.observe_outlets(model, &node)?;
-            let seen =
-                seen.iter().map(|at| model.outlet_fact(*at).cloned()).collect::<TractResult<TVec<_>>>()?;
-            let facts = || (inputs.iter().collect(), outputs.iter().collect(), seen.iter().collect());
-            let mut op = node.op.clone();
-            let (a, b, c) = facts();
-            let made = op.infer_facts(a, b, c)?.1;
-            for shape in made.iter().filter_map(|fact| fact.shape.concretize()) {
-                let extents = shape.iter().map(|d| d.to_i64().unwrap_or(1).unsigned_abs());
-                let bytes = extents.fold(4u64, |n, d| n.saturating_mul(d));
-                if bytes > self.array_bytes {
-                    let problem = format!("its node `{}` asks for an array of {bytes} bytes", node.name);
-                    return Err(TractError::msg(problem));
-                }
-            }
-            let (a, b, c) = facts();
-            let known = op.infer(a, b, c)?.1;
-            for (slot, (known, old)) in known.iter().zip(&outputs).enumerate() {
-                model.set_outlet_fact(OutletId::new(id, slot), known.unify(old)?)?;
+            let about = |e: TractError| e.context(format!("Failed analyse for node {}", model.node(id)));
+            let known = self.inferred(model, id).map_err(about)?;
+            for (slot, known) in known.into_iter().enumerate() {
+                model.set_outlet_fact(OutletId::new(id, slot), known)?;
             }
         }
         Ok(())
+    }
+
+    /// What is known of a node's outputs once what is known of its inputs is taken in. Inferring also computes
+    /// what is constant, so the extents alone are asked for first.
+    fn inferred(&self, model: &InferenceModel, id: usize) -> TractResult<Vec<InferenceFact>> {
+        let node = model.node(id);
+        let mut op = node.op.clone();
+        let (inputs, outputs) = model.node_facts(id)?;
+        let seen = op.observe_outlets(model, node)?;
+        let seen = seen.iter().map(|at| model.outlet_fact(*at)).collect::<TractResult<TVec<_>>>()?;
+        let extents = op.infer_facts(inputs.clone(), outputs.clone(), seen.clone())?.1;
+        for shape in extents.iter().filter_map(|fact| fact.shape.concretize()) {
+            let extents = shape.iter().map(|d| d.to_i64().unwrap_or(1).unsigned_abs());
+            let bytes = extents.fold(4u64, |n, d| n.saturating_mul(d));
+            if bytes > self.array_bytes {
+                return Err(TractError::msg(format!("it asks for an array of {bytes} bytes")));
+            }
+        }
+        let known = op.infer(inputs, outputs.clone(), seen)?.1;
+        known.iter().zip(outputs).map(|(known, old)| known.unify(old)).collect()
     }
 
     /// One run.
