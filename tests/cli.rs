@@ -249,16 +249,34 @@ fn a_damaged_status_hides_no_other_run() {
         std::fs::create_dir_all(dir.path().join(run).join("mask")).unwrap();
     }
     std::fs::write(dir.path().join("bad/mask/status.json"), "{\"state\": ").unwrap();
-    let o = tiface(dir.path(), &["status", "bad", "absent", "good"]);
+    std::fs::create_dir_all(dir.path().join("bad/render/paths/orbit")).unwrap();
+    std::fs::write(dir.path().join("bad/render/paths/orbit/done.json"), "").unwrap();
+    std::fs::write(dir.path().join("notes"), "no run").unwrap();
+    let o = tiface(dir.path(), &["status", "bad", "absent", "notes", "good"]);
     assert_eq!(code(&o), 1);
     let text = out(&o);
     let rows = |run: &str| text.lines().filter(|l| l.starts_with(run)).count();
-    assert_eq!((rows("bad "), rows("absent "), rows("good ")), (8, 1, 8), "{text}");
-    assert_eq!(text.matches("UNREADABLE: ").count(), 2, "{text}");
+    assert_eq!((rows("bad "), rows("absent "), rows("notes "), rows("good ")), (9, 1, 1, 8), "{text}");
+    assert_eq!(text.matches("UNREADABLE: ").count(), 4, "{text}");
     assert!(text.contains("mask     UNREADABLE: `bad/mask/status.json`"), "{text}");
-    assert!(err(&o).contains("2 of these lines"), "{}", err(&o));
+    assert!(err(&o).contains("4 of these lines"), "{}", err(&o));
     let o = tiface(dir.path(), &["status", "bad", "good", "--json"]);
-    assert_eq!((code(&o), out(&o).lines().filter(|l| l.contains("\"error\":")).count()), (1, 1));
+    assert_eq!((code(&o), out(&o).lines().filter(|l| l.contains("\"error\":")).count()), (1, 2));
+}
+
+#[test]
+fn a_record_that_a_crash_left_empty_counts_as_none() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    std::fs::create_dir_all(dir.path().join("runs/head/mask")).unwrap();
+    for file in ["done.json", ".lock"] {
+        std::fs::write(dir.path().join("runs/head/mask").join(file), "").unwrap();
+    }
+    let o = tiface(dir.path(), &["mask", "head", "--dry-run"]);
+    assert_eq!((code(&o), out(&o).contains("to do")), (0, true), "{}", err(&o));
+    let o = tiface(dir.path(), &["mask", "head"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
 }
 
 #[test]

@@ -21,6 +21,10 @@ shared=${TIFACE_SHARED:-../shared}
 scratch=${SAME_KEEP:-$(mktemp -d)}
 [ -n "${SAME_KEEP:-}" ] || trap 'rm -rf "$scratch"' EXIT
 mkdir -p "$scratch"
+if [ -e "$scratch/demo" ] || [ -e "$scratch/lps" ]; then
+  echo "$scratch holds runs already: what is done would not be made again, and nothing compared" >&2
+  exit 2
+fi
 # nothing of the user's own configuration
 export XDG_CONFIG_HOME=$scratch/none
 

@@ -90,7 +90,7 @@ impl Work<'_> {
             line.fresh(fresh, self.until)?;
         }
         line.remember(self.until)?;
-        self.screen.expect(line.ahead(self.until)?);
+        self.screen.expect(line.ahead(self.until));
         let done = reconstruct(&line, self.until)?;
         let written = match &self.out {
             Some(out) => self.copy(&line, &run, out)?,
@@ -323,7 +323,7 @@ fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<(), Ending> {
     }
     for folder in io::list_folders(from)? {
         if let Some(name) = folder.file_name().filter(|n| !left.iter().any(|k| n == k)) {
-            copy_folder(&folder, &to.join(name), &["float"])?;
+            copy_folder(&folder, &to.join(name), &["float", "parts"])?;
         }
     }
     Ok(())

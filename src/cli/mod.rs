@@ -161,7 +161,7 @@ enum Command {
   tiface mask captures/002_00 --prompts prompts.json --sam encoder.onnx --sam-decoder decoder.onnx \\
       --vitmatte vitmatte.onnx
 
-Click the face, the hair and every garment of another colour, and the stage twice; on three photographs
+Click the face, the hair and every garment of another colour, and the background twice; on three photographs
 from different sides. The other views follow from the cameras.")]
     Mask {
         #[command(flatten)]

@@ -11,12 +11,12 @@ use crate::run::Exit;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Writes the page for a capture. Clicks that are there already, `points` or the capture's own `prompts.json`, are in
+/// Writes the page for a capture. Clicks that are there already, `prompts` or the capture's own `prompts.json`, are in
 /// it.
 pub(super) fn go(
     common: &Common,
     path: Option<&Path>,
-    points: Option<&Path>,
+    prompts: Option<&Path>,
     screen: &Screen,
 ) -> Result<Exit, Ending> {
     let asked = Out::find(common.out.as_deref(), "page")?;
@@ -38,12 +38,12 @@ pub(super) fn go(
     let own = capture.root.join("prompts.json");
     let inside =
         io::real_path(&own).is_ok_and(|p| io::real_path(&capture.root).is_ok_and(|r| p.starts_with(r)));
-    let html = match points {
+    let html = match prompts {
         None if inside && io::is_file(&own) => click_page(&capture, Some(&own)).or_else(|e| {
             screen.note("page: warning", &format!("{e}; the page starts without those clicks"));
             click_page(&capture, None)
         })?,
-        points => click_page(&capture, points)?,
+        prompts => click_page(&capture, prompts)?,
     };
     let name = format!("{}_clicks.html", capture.name);
     let out = asked.as_ref().map_or_else(|| PathBuf::from(&name), |out| out.file(&name));

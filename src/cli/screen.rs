@@ -28,7 +28,7 @@ struct State {
     bar: Option<ProgressBar>,
     told: Option<Instant>,
     /// The stages of the command that are to be worked on, in order, with the seconds that each may take.
-    ahead: Vec<(&'static str, f64)>,
+    ahead: Vec<(String, f64)>,
 }
 
 const PLAIN: Duration = Duration::from_secs(30);
@@ -50,7 +50,7 @@ impl Screen {
     }
 
     /// The stages that are to come, with the seconds that each may take: what is left of one is not what is left of all.
-    pub fn expect(&self, ahead: Vec<(&'static str, f64)>) {
+    pub fn expect(&self, ahead: Vec<(String, f64)>) {
         self.0.state.lock().unwrap_or_else(PoisonError::into_inner).ahead = ahead;
     }
 
@@ -128,9 +128,11 @@ impl Inner {
     /// and it takes `all_s`: the others are as much slower or faster than was estimated as this one is.
     fn after(&self, stage: &str, eta_s: Option<f64>, all_s: Option<f64>) -> (usize, Option<f64>) {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(at) = state.ahead.iter().position(|(s, _)| *s == stage) else { return (0, eta_s) };
+        let Some(at) = state.ahead.iter().position(|(s, _)| s == stage) else { return (0, eta_s) };
         let later = &state.ahead[at + 1..];
-        let pace = all_s.map_or(1.0, |s| s / state.ahead[at].1.max(1.0)).clamp(0.02, 50.0);
+        // other stages count several things one after the other
+        let learns = ["baseline", "tface", "iface"].contains(&stage);
+        let pace = all_s.filter(|_| learns).map_or(1.0, |s| s / state.ahead[at].1.max(1.0)).clamp(0.02, 50.0);
         (later.len(), eta_s.map(|eta| eta + pace * later.iter().map(|(_, seconds)| seconds).sum::<f64>()))
     }
 
@@ -290,7 +292,8 @@ mod tests {
     #[test]
     fn time_left_of_a_stage_is_not_told_as_that_of_the_run() {
         let screen = Screen::new(&Common::default());
-        screen.expect(vec![("mask", 10.0), ("tface", 100.0), ("render", 30.0)]);
+        screen
+            .expect([("mask", 10.0), ("tface", 100.0), ("render", 30.0)].map(|(s, t)| (s.into(), t)).into());
         // T-Face takes twice the estimate, and so may what comes after it: 50 + 2 * 30
         assert_eq!(screen.0.after("tface", Some(50.0), Some(200.0)), (1, Some(110.0)));
         assert_eq!(screen.0.after("mask", Some(5.0), None), (2, Some(135.0)));

@@ -22,8 +22,7 @@ pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<Exit, Ending> {
     let mut text = String::new();
     let mut damaged = 0;
     for run in &all {
-        let stages = if io::is_folder(run) { STAGES } else { &["–"] };
-        for stage in stages {
+        let mut told = |stage: &str| {
             text += &line(common, run, stage).unwrap_or_else(|e| {
                 damaged += 1;
                 if common.json {
@@ -32,10 +31,14 @@ pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<Exit, Ending> {
                     row(run, stage, &format!("UNREADABLE: {}", e.message))
                 }
             });
+        };
+        if !io::is_folder(run) {
+            told("–");
+            continue;
         }
-        for path in io::list_folders(&run.join("render/paths"))? {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            text += &line(common, run, &format!("render/paths/{name}"))?;
+        STAGES.iter().for_each(|stage| told(stage));
+        for path in io::list_folders(&run.join("render/paths")).unwrap_or_default() {
+            told(&format!("render/paths/{}", path.file_name().unwrap_or_default().to_string_lossy()));
         }
     }
     say(&text)?;

@@ -247,7 +247,6 @@ mod tests {
         assert_eq!(key(MaskConfig { vitmatte: "a.onnx".into(), ..start() }), "mask.sam");
         assert_eq!(key(MaskConfig { sam: "a.onnx".into(), ..clicked.clone() }), "mask.cut");
         assert_eq!(key(MaskConfig { sam_decoder: "a.onnx".into(), ..clicked.clone() }), "mask.sam_decoder");
-        assert_eq!(key(MaskConfig { matting: MattingMethod::Vitmatte, ..clicked.clone() }), "mask.matting");
-        assert_eq!(key(MaskConfig { lowest: 0.98, ..clicked }), "mask.lowest");
+        assert_eq!(key(MaskConfig { matting: MattingMethod::Vitmatte, ..clicked }), "mask.matting");
     }
 }

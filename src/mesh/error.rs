@@ -126,7 +126,7 @@ impl MeshError {
             MeshError::Bounds { .. } => Some("check the scene box of the capture"),
             MeshError::Config { .. } => None,
             MeshError::AllOutside { .. } => Some(
-                "train `iface` longer, check that the box holds the head, or lower `mesh.coarse_step` for small pieces",
+                "train `iface` longer, check that the box holds the head, or raise `mesh.resolution` for small pieces",
             ),
             MeshError::AllInside { .. } => Some(
                 "the field may be inverted (negative must be inside), untrained, or the box may lie within the head",

@@ -61,9 +61,9 @@ impl Line<'_> {
             if !self.config.render.method.contains(member) {
                 let problem = format!("names {name}, which render.method does not make");
                 let hint = format!(
-                    "render it too (`tiface render --fresh render --with {}`), or blend what there is with \
+                    "render it too (`tiface render RUN --fresh render --with {}`), or blend what there is with \
                      ensemble.members and ensemble.weights; `--set ensemble.members=` blends nothing",
-                    self.members().join(",")
+                    self.shown_with_members()
                 );
                 return wrong("ensemble.members", problem, &hint);
             }
@@ -99,6 +99,13 @@ impl Line<'_> {
         self.config.ensemble.members.iter().map(|m| m.folder()).collect()
     }
 
+    /// What is shown and what is blended, as `--with` takes it.
+    fn shown_with_members(&self) -> String {
+        let shown = &self.config.render.method;
+        let more = self.config.ensemble.members.iter().filter(|m| !shown.contains(m));
+        shown.iter().chain(more).map(|m| m.folder()).collect::<Vec<_>>().join(",")
+    }
+
     /// The weights as given; alike where none are.
     pub(super) fn shares(&self) -> Vec<f32> {
         let c = &self.config.ensemble;
@@ -125,9 +132,9 @@ impl Line<'_> {
         Err(Failure::cannot(
             format!("member `{word}` is missing: there is no `{below}/{name}.exr`"),
             format!(
-                "`tiface render --fresh render --with {}` makes it from the stage `{stage}`, or leave it out of \
+                "`tiface render RUN --fresh render --with {}` makes it from the stage `{stage}`, or leave it out of \
                  ensemble.members",
-                self.members().join(",")
+                self.shown_with_members()
             ),
         ))
     }

@@ -15,7 +15,7 @@ use crate::capture::Split;
 use crate::config::{Config, RenderConfig};
 use crate::io::{self, Limits};
 use crate::render::path::{NamedCamera, from_json};
-use crate::run::{Failure, Fingerprint, Plan, RunError, read_status};
+use crate::run::{Failure, Fingerprint, Plan, RunError, read_record, read_status};
 use std::path::Path;
 
 /// Below the run: one folder for each path.
@@ -90,6 +90,13 @@ impl<'a> Line<'a> {
     pub fn fresh(&self, stage: &str, until: &str) -> Result<(), PipelineError> {
         self.is_there()?;
         let names = self.out_of_date(stage)?;
+        // a finished blend is not cleared for views that it could not be made of again
+        let blended = names.iter().any(|n| n == "ensemble")
+            && !self.config.ensemble.members.is_empty()
+            && read_record(&self.run.path("ensemble")).ok().flatten().is_some();
+        if blended {
+            self.can_blend()?;
+        }
         self.agrees(until, &names)?;
         Ok(self.run.fresh(&names)?)
     }

@@ -70,11 +70,12 @@ impl Line<'_> {
     pub fn outlook(&self, until: &str) -> Result<Vec<(String, Option<Vec<String>>)>, PipelineError> {
         let look = |name: &'static str| {
             let Plan { name, fingerprint, .. } = self.plan(name);
-            let record = read_record(&self.run.path(name))?;
-            Ok((name.into(), record.map(|r| fingerprint.differences(&r.fingerprint))))
+            // a record that cannot be read is none: the stage counts as not done
+            let record = read_record(&self.run.path(name)).ok().flatten();
+            (name.to_string(), record.map(|r| fingerprint.differences(&r.fingerprint)))
         };
         self.can_make(until)?;
-        let found: Vec<_> = self.order(until).into_iter().map(look).collect::<Result<_, PipelineError>>()?;
+        let found: Vec<_> = self.order(until).into_iter().map(look).collect();
         if found.iter().any(|(_, record)| record.is_none()) {
             self.is_there()?;
         }
@@ -167,10 +168,13 @@ impl Line<'_> {
                     settings.insert(if settings.contains_key(&own) { own } else { key }, value);
                 }
                 settings.remove("tface.checkpoint_s");
+                if name == "baseline" {
+                    settings.remove("tface.mask_weight"); // of a loss that it has not
+                }
                 settings.insert("preset".into(), self.config.preset.name().into());
                 settings.insert("seed".into(), self.config.seed.to_string());
                 if let Some((_, digest)) = self.imports.iter().find(|(stage, _)| *stage == name) {
-                    settings.retain(|key, _| !key.ends_with(".import"));
+                    settings.retain(|key, _| !key.ends_with(".import") && key != "capture.tiles");
                     inputs.push(("import", digest.clone()));
                 }
                 needs_bytes += vm_bytes(&self.vm(name));
@@ -209,42 +213,39 @@ impl Line<'_> {
         if stage == "baseline" { baseline.field(tface) } else { tface.clone() }
     }
 
-    /// The stages that `until` needs and that are not done, with the seconds that each may take on two cores: from
-    /// counts of rays, samples, cells and pixels, and what one of each took where it was measured. No more than an
-    /// estimate; whoever shows it corrects it by the pace of the stage at work.
-    pub fn ahead(&self, until: &str) -> Result<Vec<(&'static str, f64)>, PipelineError> {
+    /// The folders of the stages that `until` needs and that are not done, with the seconds that each may take on two
+    /// cores: from counts of rays, samples, cells and pixels, and what one of each took where it was measured. No more
+    /// than an estimate; whoever shows it corrects it by the pace of the stage at work.
+    pub fn ahead(&self, until: &str) -> Vec<(String, f64)> {
         let Config { iface, mesh, render, .. } = self.config;
-        let shown = self.path.as_ref().map_or(render, |path| &path.render);
-        let pixels = self.pixels() as f64;
-        let test =
-            pixels * self.capture.split(Split::Test).count().max(1) as f64 / self.capture.views.len() as f64;
+        let all = self.pixels() as f64;
+        let each = all / self.capture.views.len().max(1) as f64;
+        let test = each * self.capture.split(Split::Test).count().max(1) as f64;
+        let (shown, seen) = match &self.path {
+            Some(path) => {
+                let count = path.cameras.as_ref().map_or(path.render.orbit_views as usize, Vec::len);
+                (&path.render, each * count as f64)
+            }
+            None => (render, test),
+        };
         let seconds = |stage: &str| match stage {
-            "mask" => 2.0 + 2e-6 * pixels,
+            "mask" => 2.0 + 2e-6 * all,
             "baseline" | "tface" => {
                 let c = self.vm(stage);
                 // whole frames are mostly outside the hull, and nothing of them is skipped
-                let each = if stage == "baseline" { 60e-6 } else { 23e-6 };
-                if c.import.is_empty() {
-                    each * (c.steps as usize * c.rays * c.learned()) as f64
-                } else {
-                    1.0
-                }
+                let ray = if stage == "baseline" { 60e-6 } else { 23e-6 };
+                if c.import.is_empty() { ray * (c.steps as usize * c.rays * c.learned()) as f64 } else { 1.0 }
             }
             "iface" => 3e-6 * (iface.steps as usize * iface.samples) as f64,
             "mesh" => {
                 3e-4 * f64::from(mesh.resolution).powi(2) + 5e-6 * (mesh.texels() * mesh.pictures()) as f64
             }
-            "render" => 8e-6 * test * shown.method.len() as f64,
-            "ensemble" => 1e-6 * pixels,
+            "render" => 8e-6 * seen * shown.method.len() as f64,
+            "ensemble" => 1e-6 * all,
             _ => 2.0 + 1e-6 * test,
         };
-        let ahead = self.outlook(until)?.into_iter();
-        let to_do = ahead.filter(|(_, found)| found.as_ref().is_none_or(|d| !d.is_empty()));
-        let order = self.order(until);
-        Ok(to_do
-            .filter_map(|(name, _)| order.iter().copied().find(|s| *s == name))
-            .map(|s| (s, seconds(s)))
-            .collect())
+        let order = self.order(until).into_iter().map(|stage| (stage, self.plan(stage)));
+        order.filter(|(_, p)| !self.run.is_done(p)).map(|(s, p)| (p.name.into(), seconds(s))).collect()
     }
 
     /// Of all photographs.

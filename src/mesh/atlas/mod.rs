@@ -61,7 +61,7 @@ impl AtlasConfig {
             return bad("size_px", "16..=16384", self.size_px.to_string());
         }
         if self.gutter_px > 256 || self.gutter_px > self.size_px / 8 {
-            let expected = "0..=256 and at most an eighth of `mesh.size_px`";
+            let expected = "0..=256 and at most an eighth of the texture's side";
             return bad("gutter_px", expected, self.gutter_px.to_string());
         }
         match self.front {
