@@ -235,7 +235,7 @@ fn what_cannot_be_blended_is_said_before_anything_is_learned() {
     };
     let (text, hint) = error(&|c| c.render.method = vec![Method::Volume]);
     assert_eq!(text, "`ensemble.members` names tface, which render.method does not make");
-    assert!(hint.contains("tiface render RUN --fresh render --with tface,volume"), "{hint}");
+    assert!(hint.contains("tiface render RUN --fresh render --with volume,tface"), "{hint}");
     let (text, hint) = error(&|c| c.capture.tiles = 0.0);
     assert_eq!(text, "`ensemble.weights` is empty, but there is nothing to fit them on: capture.tiles is 0");
     assert!(hint.contains("capture.tiles=0.04"), "{hint}");
