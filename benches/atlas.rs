@@ -13,10 +13,10 @@ mod process;
 
 use glam::Vec3;
 use process::cpu_s;
+use tiface::Quiet;
 use tiface::geom::{Aabb, Mesh};
 use tiface::mesh::uv_check::{seams_facing, uv_check};
 use tiface::mesh::{AtlasConfig, MeshConfig, atlas, extract};
-use tiface::run::Quiet;
 
 fn head(resolution: usize) -> Mesh {
     let config = MeshConfig { resolution, ..MeshConfig::default() };

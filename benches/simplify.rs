@@ -18,9 +18,9 @@ use glam::Vec3;
 use process::cpu_s;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
+use tiface::Quiet;
 use tiface::geom::Mesh;
 use tiface::mesh::{Placement, SimplifyConfig, Volume, check, marching, simplify};
-use tiface::run::Quiet;
 
 /// Runs of which the fastest counts: what else the machine does only ever adds.
 const RUNS: usize = 5;

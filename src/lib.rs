@@ -7,10 +7,15 @@
 //!
 //! Modules are declared in the order of that line; what they share stands first.
 
+pub mod error;
 pub mod geom;
 pub mod image;
 pub mod io;
 pub mod kernel;
+pub mod monitor;
+
+pub use error::{Error, ErrorKind, Result};
+pub use monitor::{Monitor, Quiet};
 
 pub mod config;
 pub mod run;

@@ -19,6 +19,7 @@
 //! be done, and a finished stage is skipped without loading anything. The device is not part of it: it
 //! decides how fast a field is learned, not what it is.
 
+use crate::{Error, Result};
 mod clicks;
 mod ensemble;
 mod export;
@@ -53,12 +54,12 @@ pub use surface::{Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
 
 use crate::capture::scene::Scene;
-use crate::capture::{self, Capture, CaptureError, CaptureOptions, MaskChoice};
+use crate::capture::{self, Capture, CaptureOptions, MaskChoice};
 use crate::config::{Config, MaskMeaning, MaskSource};
 use crate::io::{self, Limits};
 #[cfg(feature = "cpu")]
 use crate::run::Done;
-use crate::run::{Exit, Failure, Fingerprint, Run, RunError};
+use crate::run::{Fingerprint, Run};
 use rayon::prelude::*;
 use remembered::remembered;
 use serde_json::Value;
@@ -70,81 +71,9 @@ pub const STAGES: &[&str] = &["mask", "baseline", "tface", "iface", "mesh", "ren
 /// Raised when the meaning of a stage's files changes.
 const FORMAT: u32 = 2;
 
-/// Why the line stopped.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum PipelineError {
-    /// The capture cannot be used.
-    #[error(transparent)]
-    Capture(#[from] CaptureError),
-    /// A stage, or the run folder.
-    #[error(transparent)]
-    Run(#[from] RunError),
-    /// The capture of a run that has work left is no longer where it was.
-    #[error("the capture of this run cannot be opened: {problem}")]
-    Gone {
-        /// What is wrong.
-        problem: String,
-    },
-    /// A file the line needs before its stages.
-    #[error(transparent)]
-    Read(#[from] io::ReadError),
-    /// The clicks that masks are to be made from.
-    #[error("{problem}")]
-    Clicks {
-        /// What is wrong.
-        problem: String,
-        /// The way out.
-        hint: String,
-    },
-    /// The device that fields are to be learned on.
-    #[cfg(feature = "cpu")]
-    #[error(transparent)]
-    Device(#[from] crate::field::DeviceError),
-    /// Settings of several tables that contradict each other.
-    #[error("`{key}` {problem}")]
-    Settings {
-        /// A key of the configuration.
-        key: &'static str,
-        /// What is wrong with it.
-        problem: String,
-        /// The way out.
-        hint: String,
-    },
-}
-
-impl PipelineError {
-    /// How the process should end.
-    pub fn exit(&self) -> Exit {
-        match self {
-            PipelineError::Run(e) => e.exit(),
-            PipelineError::Settings { .. } => Exit::Usage,
-            #[cfg(feature = "cpu")]
-            PipelineError::Device(_) => Exit::Usage,
-            _ => Exit::Cannot,
-        }
-    }
-
-    /// The way out; may be empty.
-    pub fn hint(&self) -> String {
-        match self {
-            PipelineError::Capture(e) => e.hint(),
-            PipelineError::Run(e) => e.hint(),
-            PipelineError::Read(e) => e.hint(),
-            #[cfg(feature = "cpu")]
-            PipelineError::Device(_) => "choose another with `--device`".into(),
-            PipelineError::Gone { .. } => {
-                "say where it lies now: `--set capture.path=FOLDER`; the same photographs give the same run"
-                    .into()
-            }
-            PipelineError::Settings { hint, .. } | PipelineError::Clicks { hint, .. } => hint.clone(),
-        }
-    }
-}
-
 /// Every stage that `until` needs, and itself, each only if it is not done.
 #[cfg(feature = "cpu")]
-pub fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, PipelineError> {
+pub fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>> {
     let fields = Trained::new(line);
     let mut done = Vec::new();
     for name in line.order(until) {
@@ -188,7 +117,7 @@ impl<'a> Line<'a> {
     ///
     /// The capture of a run that is done may lie somewhere else by now: its cameras are then those that the run
     /// remembers, and nothing can be worked on ([`Line::remember`]).
-    pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>, PipelineError> {
+    pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>> {
         feasible(config)?;
         let options = capture_options(config);
         let (capture, digest, clicks, gone) = match capture::open(Path::new(&config.capture.path), &options) {
@@ -208,7 +137,7 @@ impl<'a> Line<'a> {
                 (capture, digest, clicks, None)
             }
         };
-        let of_file = |file: &str| -> Result<String, PipelineError> {
+        let of_file = |file: &str| -> Result<String> {
             Ok(Fingerprint::of_bytes(&io::read_bytes(Path::new(file), &Limits::default())?))
         };
         let mut imports = Vec::new();
@@ -237,28 +166,27 @@ impl<'a> Line<'a> {
     }
 
     /// The box and hull that the stage `mask` found.
-    pub fn scene(&self) -> Result<Scene, PipelineError> {
-        let failed = |failure| RunError::Stage { stage: "mask".into(), failure };
-        Ok(self.scene_or_fail().map_err(failed)?)
+    pub fn scene(&self) -> Result<Scene> {
+        self.scene_or_fail().map_err(|e| e.within("stage `mask`"))
     }
 
-    fn scene_or_fail(&self) -> Result<Scene, Failure> {
+    fn scene_or_fail(&self) -> Result<Scene> {
         scene_file::read_scene(&self.run.path("mask/scene.json")).map_err(|e| unusable(e, "mask"))
     }
 
     /// An error if the capture is no longer there: nothing can be worked on then.
-    fn is_there(&self) -> Result<(), PipelineError> {
+    fn is_there(&self) -> Result<()> {
         match &self.gone {
-            Some(problem) => Err(PipelineError::Gone { problem: problem.clone() }),
+            Some(problem) => Err(gone(problem)),
             None => Ok(()),
         }
     }
 
     /// A file of the run itself that cannot be written is no failure where nothing is left to do: a run that is done
     /// may lie where nobody may write.
-    fn unless_idle(&self, idle: bool, written: Result<(), PipelineError>) -> Result<(), PipelineError> {
+    fn unless_idle(&self, idle: bool, written: Result<()>) -> Result<()> {
         match written {
-            Err(PipelineError::Run(RunError::Write(e))) if idle => {
+            Err(e) if idle => {
                 self.run.warn("run", &format!("{e}; all that was asked for is done"));
                 Ok(())
             }
@@ -266,18 +194,18 @@ impl<'a> Line<'a> {
         }
     }
 
-    fn stop_here(&self) -> Result<(), Failure> {
+    fn stop_here(&self) -> Result<()> {
         match self.run.stop().requested() {
-            Some(_) => Err(Failure::stopped(self.run.stop())),
+            Some(_) => Err(self.run.stop().error("what is complete is kept")),
             None => Ok(()),
         }
     }
 }
 
 /// Refuses settings that contradict each other, and a device that this build cannot learn on.
-pub fn feasible(config: &Config) -> Result<(), PipelineError> {
+pub fn feasible(config: &Config) -> Result<()> {
     if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
-        return Err(PipelineError::Settings { key, problem, hint: hint.into() });
+        return Err(Error::usage(format!("`{key}` {problem}"), hint));
     }
     #[cfg(feature = "cpu")]
     crate::field::device(&config.device)?;
@@ -307,7 +235,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
 }
 
 /// Digest of all that a capture means: cameras, splits and the bytes of every picture.
-fn capture_digest(capture: &Capture) -> Result<String, PipelineError> {
+fn capture_digest(capture: &Capture) -> Result<String> {
     let limits = Limits::default();
     let views = capture
         .views
@@ -330,17 +258,20 @@ fn capture_digest(capture: &Capture) -> Result<String, PipelineError> {
     Ok(Fingerprint::of_bytes(format!("{} {}", capture.up, views.join("\n")).as_bytes()))
 }
 
-/// A file that a stage of this run made cannot be used: the way out is to make it again.
-fn unusable(e: io::ReadError, stage: &str) -> Failure {
-    match &e {
-        io::ReadError::Io { source, .. } if source.kind() != std::io::ErrorKind::NotFound => e.into(),
-        _ => Failure::cannot(e, format!("make it again: repeat the command with `--fresh {stage}`")),
-    }
+/// The capture of a run that has work left is no longer where it was.
+fn gone(problem: &str) -> Error {
+    Error::cannot(
+        format!("the capture of this run cannot be opened: {problem}"),
+        "say where it lies now: `--set capture.path=FOLDER`; the same photographs give the same run",
+    )
 }
 
-fn capture_failure(e: CaptureError) -> Failure {
-    let hint = e.hint();
-    Failure::cannot(e, hint)
+/// A file that a stage of this run made cannot be used: the way out is to make it again.
+fn unusable(e: io::ReadError, stage: &str) -> Error {
+    match &e {
+        io::ReadError::Io { source, .. } if source.kind() != std::io::ErrorKind::NotFound => e.into(),
+        _ => Error::cannot(&e, format!("make it again: repeat the command with `--fresh {stage}`")),
+    }
 }
 
 /// Figures as JSON; what is not finite becomes null.

@@ -503,7 +503,7 @@ fn a_head_becomes_one_closed_piece_on_the_surface_with_unit_normals() {
             Aabb::SCENE,
             None,
             &config,
-            &tiface::run::Quiet,
+            &tiface::Quiet,
         )
         .unwrap();
         println!("{}", serde_json::to_string(&report).unwrap());
@@ -540,7 +540,7 @@ fn noise_through_the_whole_stage_stays_a_closed_manifold() {
             Aabb { min: Vec3::new(-1.0, -0.7, -0.9), max: Vec3::new(0.8, 0.9, 1.0) },
             None,
             &config,
-            &tiface::run::Quiet,
+            &tiface::Quiet,
         )
         .unwrap();
         assert!(report.topology.is_solid(), "{report:?}");

@@ -117,6 +117,8 @@ pub enum CaptureError {
     },
 }
 
+crate::error::error_from!(CaptureError, Cannot);
+
 impl CaptureError {
     /// A size that is not the declared one, with the factor between the two as the way out.
     pub(crate) fn size(

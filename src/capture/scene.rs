@@ -154,6 +154,8 @@ fn suspect(culprit: &Option<String>) -> String {
         .unwrap_or_default()
 }
 
+crate::error::error_from!(SceneError, Cannot);
+
 impl SceneError {
     /// The way out.
     pub fn hint(&self) -> &'static str {

@@ -35,6 +35,8 @@ pub struct SyntheticOptions {
     pub seed: u64,
 }
 
+crate::error::error_from!(SyntheticError, Cannot);
+
 impl SyntheticError {
     /// The way out.
     pub fn hint(&self) -> String {

@@ -1,8 +1,8 @@
 //! `tiface check`: is a mesh sound, and how far is it from another?
 
-use super::ending::{Ending, say};
 use super::options::Common;
 use super::plain::one_line;
+use super::stdout::print;
 use crate::capture::{self, CaptureOptions, Split};
 use crate::geom::{Bvh, Camera};
 use crate::io::{self, Limits};
@@ -10,7 +10,7 @@ use crate::mesh::check::{CheckReport, RequireError, check_around};
 use crate::mesh::read::{ReadMesh, Texture, picture_of_mtl, read_placed, read_whole, weld};
 use crate::mesh::uv_check::{UvReport, uv_check};
 use crate::metrics::distance::{Distances, one_way, seen_one_way};
-use crate::run::Exit;
+use crate::{Error, Result};
 use serde::Serialize;
 use std::fmt::{self, Display};
 use std::path::Path;
@@ -73,9 +73,9 @@ struct Whole<'a> {
     against: Option<&'a Against>,
 }
 
-fn load(path: &Path) -> Result<ReadMesh, Ending> {
+fn load(path: &Path) -> Result<ReadMesh> {
     let bytes = io::read_bytes(path, &Limits::default())?;
-    read_placed(&bytes, path).map_err(|e| Ending::cannot(e.to_string(), e.hint()))
+    Ok(read_placed(&bytes, path)?)
 }
 
 /// A texture of unknown size is measured as if it had this many texels along each side.
@@ -93,7 +93,7 @@ struct Textured {
 }
 
 /// The mesh and its texture. One that cannot be understood is no reason not to check the mesh.
-fn load_whole(path: &Path) -> Result<(ReadMesh, Textured), Ending> {
+fn load_whole(path: &Path) -> Result<(ReadMesh, Textured)> {
     let bytes = io::read_bytes(path, &Limits::default())?;
     let whole = match read_whole(&bytes, path) {
         Ok(whole) => whole,
@@ -127,7 +127,7 @@ pub(super) fn go(
     require: &[String],
     against: Option<&Path>,
     seen_by: Option<&Path>,
-) -> Result<Exit, Ending> {
+) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
     let (found, Textured { is_there, uv, problem }) = load_whole(path)?;
     let unit_m = config.capture.unit_m;
@@ -135,7 +135,7 @@ pub(super) fn go(
     let bars: Vec<&str> = require.iter().map(String::as_str).collect();
     let passed = report.require(&bars);
     if let Err(e @ RequireError::Unknown { .. }) = &passed {
-        return Err(Ending::usage(e.to_string(), e.hint()));
+        return Err(Error::usage(e.to_string(), e.hint()));
     }
     let against = against.map(|other| compare(&found, other, seen_by, unit_m)).transpose()?;
     let text = if common.json {
@@ -149,18 +149,18 @@ pub(super) fn go(
         };
         format!("{report}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
     };
-    say(&text)?;
-    passed.map_err(|e| Ending::below(e.to_string(), e.hint()))?;
-    Ok(Exit::Done)
+    print(&text)?;
+    passed.map_err(|e| Error::below(e.to_string(), e.hint()))?;
+    Ok(())
 }
 
-fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Result<Against, Ending> {
+fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Result<Against> {
     let ReadMesh { mesh, origin, .. } = found;
     let ReadMesh { mesh: mut truth, origin: elsewhere, .. } = load(other)?;
     // both around one origin
     let way = elsewhere - origin;
     truth.positions.iter_mut().for_each(|p| *p = (p.as_dvec3() + way).as_vec3());
-    let empty = |e: &Path| Ending::cannot(format!("`{}` has no surface to measure", e.display()), "");
+    let empty = |e: &Path| Error::cannot(format!("`{}` has no surface to measure", e.display()), "");
     let bvh = Bvh::new(&truth);
     let mm = |d| Millimetres::new(d, unit_m);
     let whole = one_way(mesh, &bvh, POINTS, |_| true).ok_or_else(|| empty(other))?;
@@ -168,8 +168,7 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     let seen = match seen_by {
         None => None,
         Some(root) => {
-            let capture = capture::open(root, &CaptureOptions::default())
-                .map_err(|e| Ending::cannot(e.to_string(), e.hint()))?;
+            let capture = capture::open(root, &CaptureOptions::default())?;
             let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
             let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| moved(&v.camera)).collect();
             seen_one_way(mesh, &bvh, POINTS, &cameras, 3).map(|(d, share)| (mm(d), share))

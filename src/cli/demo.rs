@@ -1,16 +1,16 @@
 //! `tiface demo`: the line on a synthetic head made on the spot.
 
-use super::ending::Ending;
 use super::line::Work;
 use super::options::Common;
 use super::out::Out;
 use super::screen::{Screen, duration};
 use super::target::Target;
+use crate::Result;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::Preset;
 use crate::io;
 use crate::pipeline::feasible;
-use crate::run::{Exit, Stop};
+use crate::run::Stop;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -25,7 +25,7 @@ baseline.steps = 600
 baseline.rays = 2048
 ";
 
-pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, Ending> {
+pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<()> {
     let run = common.run.clone().unwrap_or_else(|| PathBuf::from("runs/demo"));
     let capture = run.join(CAPTURE);
     let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
@@ -38,7 +38,7 @@ pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, 
         if common.dry_run {
             screen
                 .note("capture", &format!("would photograph a synthetic head into `{}`", capture.display()));
-            return Ok(Exit::Done);
+            return Ok(());
         }
         make(&capture, screen)?;
     }
@@ -49,13 +49,13 @@ pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<Exit, 
     work.on(&target, &[])
 }
 
-fn make(capture: &Path, screen: &Screen) -> Result<(), Ending> {
+fn make(capture: &Path, screen: &Screen) -> Result<()> {
     let options = SyntheticOptions::default();
     let views = options.train + options.test;
     screen.note("capture", &format!("photographing a synthetic head from {views} sides"));
     let start = Instant::now();
     io::create_folder(capture)?;
-    write_capture(capture, &options).map_err(|e| Ending::cannot(e.to_string(), e.hint()))?;
+    write_capture(capture, &options)?;
     screen.note("capture", &format!("done in {}", duration(start.elapsed().as_secs_f64())));
     Ok(())
 }

@@ -1,13 +1,13 @@
 //! `tiface inspect`: what was found in a capture.
 
-use super::ending::{Ending, say};
 use super::options::Common;
+use super::stdout::print;
 use crate::capture::inspect::inspect;
 use crate::pipeline::{capture_options, disagreements};
-use crate::run::Exit;
+use crate::{Error, Result};
 use std::path::Path;
 
-pub(super) fn go(common: &Common, capture: &Path) -> Result<Exit, Ending> {
+pub(super) fn go(common: &Common, capture: &Path) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
     let options = capture_options(&config);
     let mut found = inspect(capture, &options);
@@ -17,6 +17,7 @@ pub(super) fn go(common: &Common, capture: &Path) -> Result<Exit, Ending> {
     } else {
         format!("{found}\n")
     };
-    say(&text)?;
-    Ok(if found.is_sound() { Exit::Done } else { Exit::Cannot })
+    print(&text)?;
+    // what is wrong has been printed
+    if found.is_sound() { Ok(()) } else { Err(Error::cannot("", "")) }
 }

@@ -1,15 +1,16 @@
 //! `tiface run` and the stage commands: the line, up to a stage.
 
 use super::demo::CAPTURE;
-use super::ending::{Ending, say};
 use super::options::Common;
 use super::out::Out;
 use super::screen::{Screen, figure};
+use super::stdout::print;
 use super::target::Target;
 use crate::config::{Config, MeshFormat, NAMES, Preset, RenderConfig, called};
 use crate::io;
 use crate::pipeline::{Line, STAGES};
-use crate::run::{Done, Exit, Run, Stop};
+use crate::run::{Done, Run, Stop};
+use crate::{Error, Result};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -23,7 +24,7 @@ pub(super) fn go(
     extra: &[(String, String, String)],
     screen: &Screen,
     stop: &Stop,
-) -> Result<Exit, Ending> {
+) -> Result<()> {
     let out = Out::find(common.out.as_deref(), product)?;
     let target = Target::find(common, path)?;
     if target.guessed {
@@ -52,7 +53,7 @@ pub(super) struct Work<'a> {
 }
 
 impl Work<'_> {
-    pub fn on(&self, target: &Target, extra: &[(String, String, String)]) -> Result<Exit, Ending> {
+    pub fn on(&self, target: &Target, extra: &[(String, String, String)]) -> Result<()> {
         let mut config = configure(self.common, target, self.fallback, extra)?;
         // views of a path are made as asked for here; what the evaluation shows stays as it was
         let path = (self.until == "render" && config.render.cameras != "test").then(|| config.render.clone());
@@ -64,7 +65,7 @@ impl Work<'_> {
             && !STAGES.contains(&fresh.as_str())
         {
             let known = STAGES.join(", ");
-            return Err(Ending::usage(format!("there is no stage `{fresh}`"), format!("stages are {known}")));
+            return Err(Error::usage(format!("there is no stage `{fresh}`"), format!("stages are {known}")));
         }
         let run = Run::open(&target.run, self.stop.clone(), self.screen.observer());
         // the demo's own runs are recognised when their stages are run one by one, too
@@ -77,7 +78,7 @@ impl Work<'_> {
             out.is_outside(run.dir())?;
             let mesh = matches!(out, Out::File(_, ending) if mesh_format(ending).is_some());
             if mesh && !line.order(self.until).contains(&"mesh") {
-                return Err(Ending::usage(
+                return Err(Error::usage(
                     "no mesh is made with these settings, so `--out` has none to write",
                     "use `tiface mesh --out head.glb`",
                 ));
@@ -98,10 +99,10 @@ impl Work<'_> {
         };
         self.closing(&run, line.views(), &done, &written)?;
         bars.iter().try_for_each(|bar| bar.check(&done))?;
-        Ok(Exit::Done)
+        Ok(())
     }
 
-    fn outlook(&self, line: &Line) -> Result<Exit, Ending> {
+    fn outlook(&self, line: &Line) -> Result<()> {
         let fresh =
             self.common.fresh.as_deref().map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
         let mut text = String::new();
@@ -121,12 +122,12 @@ impl Work<'_> {
                 text.extend(differences.iter().map(|d| format!("           {d}\n")));
             }
         }
-        say(&text)?;
-        Ok(Exit::Done)
+        print(&text)?;
+        Ok(())
     }
 
     /// Puts the command's product where `--out` says, and says what was written.
-    fn copy(&self, line: &Line, run: &Run, out: &Out) -> Result<Vec<PathBuf>, Ending> {
+    fn copy(&self, line: &Line, run: &Run, out: &Out) -> Result<Vec<PathBuf>> {
         match out {
             Out::File(file, ending) if let Some(format) = mesh_format(ending) => {
                 let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
@@ -172,13 +173,13 @@ impl Work<'_> {
         views: &str,
         done: &[(&'static str, Done)],
         written: &[PathBuf],
-    ) -> Result<(), Ending> {
+    ) -> Result<()> {
         let of = |name: &str| done.iter().find(|(n, _)| *n == name).map(|(_, d)| &d.summary);
         if self.common.json {
             let stages: serde_json::Map<String, Value> =
                 done.iter().map(|(n, d)| (n.to_string(), d.summary.clone())).collect();
             let result = json!({"event": "result", "run": run.dir(), "out": written, "stages": stages});
-            return say(&format!("{result}\n"));
+            return print(&format!("{result}\n"));
         }
         if self.common.quiet {
             return Ok(());
@@ -208,7 +209,7 @@ impl Work<'_> {
         for path in written {
             row("out", format!("{}", path.display()));
         }
-        say(&text)
+        print(&text)
     }
 }
 
@@ -258,7 +259,7 @@ pub(super) fn configure(
     target: &Target,
     fallback: Option<(Preset, &str)>,
     extra: &[(String, String, String)],
-) -> Result<Config, Ending> {
+) -> Result<Config> {
     let mut extra = extra.to_vec();
     let mut remember = |path: &str| {
         extra.push((format!("CAPTURE {path}"), "capture.path".into(), path.into()));
@@ -266,7 +267,7 @@ pub(super) fn configure(
     if let Some(capture) = &target.capture {
         let path = capture.to_str().ok_or_else(|| {
             let shown = capture.display();
-            Ending::cannot(format!("the path of the capture is not UTF-8: `{shown}`"), "rename the folder")
+            Error::cannot(format!("the path of the capture is not UTF-8: `{shown}`"), "rename the folder")
         })?;
         remember(path);
     } else if let Some(saved) = target.saved.as_deref().filter(|_| common.preset.is_some()) {
@@ -276,13 +277,13 @@ pub(super) fn configure(
     }
     let config = common.resolve(target.saved.as_deref(), fallback, &extra)?;
     if config.capture.path.is_empty() {
-        return Err(Ending::usage("no capture is named", "name one: `tiface run CAPTURE`"));
+        return Err(Error::usage("no capture is named", "name one: `tiface run CAPTURE`"));
     }
     Ok(config)
 }
 
 /// How the evaluation's views are made: as the run remembers it, else as it starts out.
-fn evaluation(common: &Common, target: &Target) -> Result<RenderConfig, Ending> {
+fn evaluation(common: &Common, target: &Target) -> Result<RenderConfig> {
     let kept = Some(target.run.join("config.toml")).filter(|file| io::is_file(file));
     let bare = match kept {
         Some(_) => Common { color: common.color, ..Common::default() },
@@ -308,13 +309,13 @@ fn mesh_format(ending: &str) -> Option<MeshFormat> {
     }
 }
 
-fn copy_file(from: &Path, to: &Path) -> Result<(), Ending> {
+fn copy_file(from: &Path, to: &Path) -> Result<()> {
     Ok(io::write_atomic(to, &io::read_bytes(from, &io::Limits::default())?)?)
 }
 
 /// All files but those that tell of the work, and all folders but those named; deeper down none but
 /// the views kept in float is left out.
-fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<(), Ending> {
+fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<()> {
     io::create_folder(to)?;
     for name in io::list_files(from)? {
         if !["done.json", "status.json", "log.jsonl"].contains(&name.as_str()) {
@@ -330,19 +331,16 @@ fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<(), Ending> {
 }
 
 #[cfg(feature = "cpu")]
-fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, Ending> {
+fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>> {
     Ok(crate::pipeline::reconstruct(line, until)?)
 }
 
 #[cfg(not(feature = "cpu"))]
-fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>, Ending> {
+fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>> {
     if until == "mask" {
         return Ok(vec![("mask", line.mask()?)]);
     }
-    Err(Ending::cannot(
-        "this build cannot learn fields",
-        "build with the feature `cpu`, which is the default",
-    ))
+    Err(Error::cannot("this build cannot learn fields", "build with the feature `cpu`, which is the default"))
 }
 
 /// A bar set by `--require`.
@@ -353,22 +351,22 @@ enum Bar {
 }
 
 impl Bar {
-    fn parse(text: &str) -> Result<Bar, Ending> {
+    fn parse(text: &str) -> Result<Bar> {
         let bar = match text.split_once('=') {
             Some(("psnr", db)) => db.parse().ok().filter(|v: &f64| v.is_finite()).map(Bar::Psnr),
             None if text == "watertight" => Some(Bar::Watertight),
             _ => None,
         };
         bar.ok_or_else(|| {
-            Ending::usage(format!("there is no requirement `{text}`"), "known are watertight and psnr=DB")
+            Error::usage(format!("there is no requirement `{text}`"), "known are watertight and psnr=DB")
         })
     }
 
-    fn check(&self, done: &[(&'static str, Done)]) -> Result<(), Ending> {
+    fn check(&self, done: &[(&'static str, Done)]) -> Result<()> {
         let of = |name: &str| done.iter().find(|(n, _)| *n == name).map(|(_, d)| &d.summary);
         match self {
             Bar::Watertight if of("mesh").is_some_and(|m| m["closed"] == true) => Ok(()),
-            Bar::Watertight => Err(Ending::below("the mesh is not watertight", "`tiface check` says where")),
+            Bar::Watertight => Err(Error::below("the mesh is not watertight", "`tiface check` says where")),
             Bar::Psnr(bar) => {
                 let metrics = of("metrics").unwrap_or(&Value::Null);
                 let sets = metrics.as_object().into_iter().flat_map(|m| m.values());
@@ -379,7 +377,7 @@ impl Bar {
                     return Ok(());
                 }
                 let found = if best.is_finite() { format!("{best:.2} dB") } else { "unknown".into() };
-                Err(Ending::below(
+                Err(Error::below(
                     format!("PSNR is {found}, required are {bar} dB"),
                     "train longer, or lower the bar",
                 ))
@@ -399,8 +397,8 @@ mod tests {
     #[test]
     fn bars_are_parsed_and_missed_with_exit_code_3() {
         assert_eq!(Bar::parse("psnr=28").unwrap(), Bar::Psnr(28.0));
-        assert_eq!(Bar::parse("psnr=nan").unwrap_err().exit.code(), 2);
-        assert_eq!(Bar::parse("beauty").unwrap_err().exit.code(), 2);
+        assert_eq!(Bar::parse("psnr=nan").unwrap_err().kind().code(), 2);
+        assert_eq!(Bar::parse("beauty").unwrap_err().kind().code(), 2);
         let metrics = json!({
             "tface": {"head": {"mean": {"psnr_masked": 25.0}}},
             "ensemble": {"head": {"mean": {"psnr_masked": 27.5}}},
@@ -408,8 +406,8 @@ mod tests {
         });
         let stages = [("mesh", done(json!({"closed": true}))), ("metrics", done(metrics))];
         assert!(Bar::Watertight.check(&stages).is_ok() && Bar::Psnr(27.0).check(&stages).is_ok());
-        assert_eq!(Bar::Psnr(28.0).check(&stages).unwrap_err().exit.code(), 3);
-        assert_eq!(Bar::Psnr(1.0).check(&[]).unwrap_err().exit.code(), 3);
+        assert_eq!(Bar::Psnr(28.0).check(&stages).unwrap_err().kind().code(), 3);
+        assert_eq!(Bar::Psnr(1.0).check(&[]).unwrap_err().kind().code(), 3);
     }
 
     #[test]

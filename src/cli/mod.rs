@@ -1,13 +1,13 @@
 //! The command line: one file per command, named as it is typed. The only module that prints.
 //!
 //! Data goes to stdout, everything else to stderr; the exit code says whether to try again
-//! ([`crate::run::Exit`]).
+//! ([`crate::ErrorKind`]).
 
+use crate::{Error, Result};
 mod check;
 mod completions;
 mod config;
 mod demo;
-mod ending;
 mod inspect;
 mod line;
 mod options;
@@ -17,11 +17,11 @@ mod plain;
 mod screen;
 mod signals;
 mod status;
+mod stdout;
 mod target;
 
-use crate::run::{Exit, Stop};
+use crate::run::Stop;
 use clap::{Args, CommandFactory, Parser, Subcommand};
-use ending::Ending;
 use options::Common;
 use out::Out;
 use screen::Screen;
@@ -91,7 +91,7 @@ struct Clicks {
 
 impl Clicks {
     /// As keys of the configuration; files by their absolute path, so that the run remembers them from anywhere.
-    fn keys(&self) -> Result<Vec<(String, String, String)>, Ending> {
+    fn keys(&self) -> Result<Vec<(String, String, String)>> {
         let mut keys = Vec::new();
         let files = [
             ("--prompts", "mask.prompts", &self.prompts),
@@ -104,7 +104,7 @@ impl Clicks {
             let Some(file) = file else { continue };
             let path = crate::io::real_path(file)?;
             let text = path.to_str().ok_or_else(|| {
-                Ending::cannot(format!("the path `{}` is not UTF-8", path.display()), "rename the file")
+                Error::cannot(format!("the path `{}` is not UTF-8", path.display()), "rename the file")
             })?;
             keys.push((format!("{option} {}", file.display()), key.into(), text.into()));
         }
@@ -348,16 +348,16 @@ pub fn main() -> ExitCode {
     let stop = Stop::new();
     let ended = signals::listen(&stop, &screen).and_then(|()| cli.run(&screen, &stop));
     ExitCode::from(match ended {
-        Ok(exit) => exit.code(),
-        Err(ending) => {
-            screen.ending(&ending);
-            ending.exit.code()
+        Ok(()) => 0,
+        Err(error) => {
+            screen.error(&error);
+            error.kind().code()
         }
     })
 }
 
 impl Cli {
-    fn run(&self, screen: &Screen, stop: &Stop) -> Result<Exit, Ending> {
+    fn run(&self, screen: &Screen, stop: &Stop) -> Result<()> {
         let common = &self.common;
         // options of one command are keys of the configuration under a shorter name
         let keys = |pairs: &[(&str, &str, &Option<String>)]| -> Vec<(String, String, String)> {

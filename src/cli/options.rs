@@ -1,8 +1,8 @@
 //! The options that every command shares, and the configuration they amount to.
 
-use super::ending::Ending;
 use crate::config::{Config, Preset, Sources};
 use crate::io::{self, Limits};
+use crate::{Error, Result};
 use clap::{Args, ValueEnum};
 use std::path::{Path, PathBuf};
 
@@ -117,7 +117,7 @@ impl Common {
         saved: Option<&Path>,
         fallback: Option<(Preset, &str)>,
         extra: &[(String, String, String)],
-    ) -> Result<Config, Ending> {
+    ) -> Result<Config> {
         let mut files = Vec::new();
         if let Some(own) = own_file().filter(|f| io::is_file(f)) {
             files.push(own);
@@ -136,11 +136,10 @@ impl Common {
         }
         for file in files {
             let limits = Limits { file_bytes: 1 << 20, ..Limits::default() };
-            let bytes = io::read_bytes(&file, &limits)
-                .map_err(|e| Ending { exit: crate::run::Exit::Usage, ..e.into() })?;
+            let bytes = io::read_bytes(&file, &limits).map_err(|e| Error::usage(&e, e.hint()))?;
             let name = file.display().to_string();
             let text = String::from_utf8(bytes)
-                .map_err(|_| Ending::usage(format!("`{name}` is not UTF-8"), "save it as UTF-8"))?;
+                .map_err(|_| Error::usage(format!("`{name}` is not UTF-8"), "save it as UTF-8"))?;
             sources.files.push((name, text));
         }
         if let Some(device) = &self.device {

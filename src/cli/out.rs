@@ -3,8 +3,8 @@
 //! An ending that the product has is a file of that kind; a folder, there already or named with a `/` at its end,
 //! takes the product under its own names; all else is refused.
 
-use super::ending::Ending;
 use crate::io;
+use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// A place that can be written.
@@ -29,7 +29,7 @@ fn endings(product: &str) -> &'static [&'static str] {
 
 impl Out {
     /// Where `out` is for the product of a command, which is called as the command is. Nothing is written.
-    pub fn find(out: Option<&Path>, product: &str) -> Result<Option<Out>, Ending> {
+    pub fn find(out: Option<&Path>, product: &str) -> Result<Option<Out>> {
         let Some(out) = out else { return Ok(None) };
         let shown = out.display();
         if io::is_folder(out) {
@@ -44,28 +44,28 @@ impl Out {
                 0 => "name a folder, with `/` at its end".to_string(),
                 _ => format!("end it in {}, or in `/` for a folder", list.join(", ")),
             };
-            return Err(Ending::usage(format!("`--out {shown}`: `{product}` makes no such file"), hint));
+            return Err(Error::usage(format!("`--out {shown}`: `{product}` makes no such file"), hint));
         }
         // by its name without the `/`, by which a file is not found
         let bare = out.components().as_path();
         if io::exists(bare) && (folder || !io::is_file(bare)) {
             let what = if folder { "folder" } else { "regular file" };
-            return Err(Ending::cannot(format!("`--out {shown}` is no {what}"), "choose another name"));
+            return Err(Error::cannot(format!("`--out {shown}` is no {what}"), "choose another name"));
         }
         writable(out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))?;
         Ok(Some(if folder { Out::Folder(out.into()) } else { Out::File(out.into(), ending) }))
     }
 
     /// Refused for a command that makes nothing.
-    pub fn none(out: Option<&Path>, command: &str) -> Result<(), Ending> {
+    pub fn none(out: Option<&Path>, command: &str) -> Result<()> {
         match out {
-            Some(_) => Err(Ending::usage(format!("`{command}` makes nothing for `--out`"), "leave it out")),
+            Some(_) => Err(Error::usage(format!("`{command}` makes nothing for `--out`"), "leave it out")),
             None => Ok(()),
         }
     }
 
     /// Refuses a folder inside the run that would be copied into it.
-    pub fn is_outside(&self, run: &Path) -> Result<(), Ending> {
+    pub fn is_outside(&self, run: &Path) -> Result<()> {
         let Out::Folder(folder) = self else { return Ok(()) };
         let there = folder
             .ancestors()
@@ -73,7 +73,7 @@ impl Out {
         match (there, io::real_path(run)) {
             (Some(there), Ok(run)) if there.starts_with(&run) => {
                 let text = format!("`--out {}` lies in the run itself", folder.display());
-                Err(Ending::usage(text, "choose a folder beside the run"))
+                Err(Error::usage(text, "choose a folder beside the run"))
             }
             _ => Ok(()),
         }
@@ -88,13 +88,13 @@ impl Out {
     }
 }
 
-fn writable(folder: &Path) -> Result<(), Ending> {
+fn writable(folder: &Path) -> Result<()> {
     let shown = folder.display();
     if !io::is_folder(folder) {
-        return Err(Ending::cannot(format!("there is no folder `{shown}` to write to"), "make it first"));
+        return Err(Error::cannot(format!("there is no folder `{shown}` to write to"), "make it first"));
     }
     if !io::is_writable(folder) {
-        return Err(Ending::cannot(
+        return Err(Error::cannot(
             format!("nothing may be written into the folder `{shown}`"),
             "choose a folder you may write to",
         ));
@@ -113,7 +113,7 @@ mod tests {
         std::fs::create_dir(at("there.glb")).unwrap();
         std::fs::write(at("plain"), "").unwrap();
         let find = |name: &str, product: &str| Out::find(Some(Path::new(&at(name))), product);
-        let code = |name: &str, product: &str| find(name, product).unwrap_err().exit.code();
+        let code = |name: &str, product: &str| find(name, product).unwrap_err().kind().code();
         assert_eq!(find("a.GLB", "mesh").unwrap(), Some(Out::File(at("a.GLB").into(), "glb".into())));
         assert_eq!(find("m.json", "metrics").unwrap(), Some(Out::File(at("m.json").into(), "json".into())));
         for (name, product) in [("new/", "mesh"), ("there.glb", "render"), ("new.d/", "page")] {

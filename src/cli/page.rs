@@ -1,13 +1,13 @@
 //! `tiface mask --page`: one file to click on in a browser.
 
-use super::ending::{Ending, say};
 use super::options::Common;
 use super::out::Out;
 use super::screen::Screen;
+use super::stdout::print;
 use crate::capture;
 use crate::io;
-use crate::pipeline::{PipelineError, capture_options, click_page};
-use crate::run::Exit;
+use crate::pipeline::{capture_options, click_page};
+use crate::{Error, Result};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -18,10 +18,10 @@ pub(super) fn go(
     path: Option<&Path>,
     prompts: Option<&Path>,
     screen: &Screen,
-) -> Result<Exit, Ending> {
+) -> Result<()> {
     let asked = Out::find(common.out.as_deref(), "page")?;
     let Some(path) = path else {
-        return Err(Ending::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
+        return Err(Error::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
     };
     // a run knows its capture, and how large its photographs are taken
     let saved = Some(path.join("config.toml")).filter(|file| io::is_file(file));
@@ -33,7 +33,7 @@ pub(super) fn go(
     };
     // photographs are clicked on whether or not they have masks
     let options = capture::CaptureOptions { masks: capture::MaskChoice::None, ..capture_options(&config) };
-    let capture = capture::open(root, &options).map_err(PipelineError::from)?;
+    let capture = capture::open(root, &options)?;
     // the capture's own clicks are a help: what is wrong with them does not keep anybody from clicking
     let own = capture.root.join("prompts.json");
     let inside =
@@ -49,19 +49,19 @@ pub(super) fn go(
     let out = asked.as_ref().map_or_else(|| PathBuf::from(&name), |out| out.file(&name));
     if common.dry_run {
         screen.note("page", &format!("would write an annotation page to `{}`", out.display()));
-        return Ok(Exit::Done);
+        return Ok(());
     }
     if let Some(Out::Folder(folder)) = &asked {
         io::create_folder(folder)?;
     }
     io::write_atomic(&out, html.as_bytes())?;
     if common.json {
-        say(&format!("{}\n", json!({"event": "result", "page": out})))?;
+        print(&format!("{}\n", json!({"event": "result", "page": out})))?;
     } else if !common.quiet {
-        say(&format!(
+        print(&format!(
             "page      {} (open it, click, save prompts.json; then `--prompts prompts.json`)\n",
             out.display()
         ))?;
     }
-    Ok(Exit::Done)
+    Ok(())
 }

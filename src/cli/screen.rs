@@ -1,8 +1,8 @@
 //! What a person (or a program) sees while stages run.
 
-use super::ending::Ending;
 use super::options::Common;
 use super::plain::indented;
+use crate::Error;
 use crate::run::{Event, Observer};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Map, Value, json};
@@ -62,13 +62,18 @@ impl Screen {
     }
 
     /// The error and the way out, once; who asked to stop gets no error.
-    pub fn ending(&self, ending: &Ending) {
+    pub fn error(&self, error: &Error) {
         self.0.end();
-        let Ending { exit, message, hint } = ending;
-        let asked = exit.is_asked_for();
+        let (message, hint) = (error.to_string(), error.hint());
+        if message.is_empty() {
+            return; // the command has printed what is wrong
+        }
+        let asked = error.kind().is_stop();
         if self.0.json {
             let event = if asked { "stopped" } else { "error" };
-            self.0.object(json!({"event": event, "exit": exit.code(), "message": message, "hint": hint}));
+            self.0.object(
+                json!({"event": event, "exit": error.kind().code(), "message": message, "hint": hint}),
+            );
         }
         if asked {
             let way = if hint.is_empty() { String::new() } else { format!("; {hint}") };
@@ -77,7 +82,7 @@ impl Screen {
         let paint = |code: &str, word: &str| {
             if self.0.colored { format!("\x1b[{code}m{word}\x1b[0m") } else { word.to_string() }
         };
-        self.0.line(&paint("1;31", "error"), message);
+        self.0.line(&paint("1;31", "error"), &message);
         if !hint.is_empty() {
             self.0.line(&format!("\n{}", paint("1;36", "hint")), hint);
         }
@@ -101,7 +106,7 @@ impl Inner {
 
     fn object(&self, value: Value) {
         // a reader that has gone away does not stop the work
-        let _ = super::ending::say(&format!("{value}\n"));
+        let _ = super::stdout::print(&format!("{value}\n"));
     }
 
     fn begin(&self, stage: &str) {

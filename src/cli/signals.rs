@@ -3,9 +3,9 @@
 //! The first signal asks to stop. What comes within a second of it is the same request, made twice as GNU `timeout`
 //! does; a later one ends the process at once.
 
-use super::ending::Ending;
 use super::screen::Screen;
-use crate::run::{Exit, Stop};
+use crate::run::Stop;
+use crate::{Error, ErrorKind, Result};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::{flag, low_level};
 use std::sync::Arc;
@@ -22,10 +22,10 @@ const PATIENCE: Duration = Duration::from_millis(500);
 const ONE: Duration = Duration::from_secs(1);
 
 /// Listens until the process ends; requests go to `stop`.
-pub(super) fn listen(stop: &Stop, screen: &Screen) -> Result<(), Ending> {
-    let cannot = |e: std::io::Error| Ending::cannot(format!("signals cannot be handled: {e}"), "");
+pub(super) fn listen(stop: &Stop, screen: &Screen) -> Result<()> {
+    let cannot = |e: std::io::Error| Error::cannot(format!("signals cannot be handled: {e}"), "");
     let last = Arc::new(AtomicUsize::new(0));
-    for (signal, exit) in [(SIGINT, Exit::Interrupted), (SIGTERM, Exit::Terminated)] {
+    for (signal, exit) in [(SIGINT, ErrorKind::Interrupted), (SIGTERM, ErrorKind::Terminated)] {
         flag::register_usize(signal, last.clone(), exit.code().into()).map_err(cannot)?;
     }
     let (stop, screen) = (stop.clone(), screen.clone());
@@ -35,15 +35,15 @@ pub(super) fn listen(stop: &Stop, screen: &Screen) -> Result<(), Ending> {
             std::thread::sleep(LOOK);
             let signal = match last.swap(0, Ordering::SeqCst) {
                 0 => None,
-                143 => Some(Exit::Terminated),
-                _ => Some(Exit::Interrupted),
+                143 => Some(ErrorKind::Terminated),
+                _ => Some(ErrorKind::Interrupted),
             };
             match heard.at(Instant::now(), signal) {
                 Some(Answer::Ask(exit)) => stop.request(exit),
                 Some(Answer::EndIfIdle) => {
                     if let Some(failure) = stop.abandon(PATIENCE) {
-                        let exit = failure.exit;
-                        screen.ending(&failure.into());
+                        let exit = failure.kind();
+                        screen.error(&failure);
                         low_level::exit(exit.code().into());
                     }
                 }
@@ -59,11 +59,11 @@ pub(super) fn listen(stop: &Stop, screen: &Screen) -> Result<(), Ending> {
 #[derive(Debug, PartialEq)]
 enum Answer {
     /// Ask everybody to stop.
-    Ask(Exit),
+    Ask(ErrorKind),
     /// End, unless a stage has something to save.
     EndIfIdle,
     /// End at once.
-    End(Exit),
+    End(ErrorKind),
 }
 
 /// When the first signal came.
@@ -71,7 +71,7 @@ enum Answer {
 struct Heard(Option<Instant>);
 
 impl Heard {
-    fn at(&mut self, now: Instant, signal: Option<Exit>) -> Option<Answer> {
+    fn at(&mut self, now: Instant, signal: Option<ErrorKind>) -> Option<Answer> {
         let Some(first) = self.0 else {
             self.0 = signal.map(|_| now);
             return signal.map(Answer::Ask);
@@ -94,13 +94,13 @@ mod tests {
         let start = Instant::now();
         let mut heard = Heard::default();
         let mut at = |ms, signal| heard.at(start + Duration::from_millis(ms), signal);
-        let (term, int) = (Some(Exit::Terminated), Some(Exit::Interrupted));
+        let (term, int) = (Some(ErrorKind::Terminated), Some(ErrorKind::Interrupted));
         assert_eq!(at(0, None), None);
-        assert_eq!(at(100, term), Some(Answer::Ask(Exit::Terminated)));
+        assert_eq!(at(100, term), Some(Answer::Ask(ErrorKind::Terminated)));
         assert_eq!(at(150, term), None);
         assert_eq!(at(400, int), None);
         assert_eq!(at(600, None), Some(Answer::EndIfIdle));
         assert_eq!(at(1090, term), Some(Answer::EndIfIdle));
-        assert_eq!(at(1100, int), Some(Answer::End(Exit::Interrupted)));
+        assert_eq!(at(1100, int), Some(Answer::End(ErrorKind::Interrupted)));
     }
 }

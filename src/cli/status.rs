@@ -1,23 +1,24 @@
 //! `tiface status`: where runs stand; reads only `status.json` and `done.json`.
 
-use super::ending::{Ending, say};
 use super::options::Common;
 use super::plain::one_line;
 use super::screen::{duration, figure};
+use super::stdout::print;
 use crate::io;
 use crate::pipeline::STAGES;
-use crate::run::{Exit, State, read_record, read_status};
+use crate::run::{State, read_record, read_status};
+use crate::{Error, Result};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<Exit, Ending> {
+pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<()> {
     let all = match (runs.is_empty(), &common.run) {
         (false, _) => runs.to_vec(),
         (true, Some(run)) => vec![run.clone()],
         (true, None) => io::list_folders(Path::new("runs"))?,
     };
     if all.is_empty() {
-        return Err(Ending::cannot("there are no runs under `runs/`", "name a run folder"));
+        return Err(Error::cannot("there are no runs under `runs/`", "name a run folder"));
     }
     let mut text = String::new();
     let mut damaged = 0;
@@ -26,9 +27,9 @@ pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<Exit, Ending> {
             text += &line(common, run, stage).unwrap_or_else(|e| {
                 damaged += 1;
                 if common.json {
-                    format!("{}\n", json!({"run": run, "stage": stage, "error": e.message}))
+                    format!("{}\n", json!({"run": run, "stage": stage, "error": e.to_string()}))
                 } else {
-                    row(run, stage, &format!("UNREADABLE: {}", e.message))
+                    row(run, stage, &format!("UNREADABLE: {}", e.to_string()))
                 }
             });
         };
@@ -41,23 +42,23 @@ pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<Exit, Ending> {
             told(&format!("render/paths/{}", path.file_name().unwrap_or_default().to_string_lossy()));
         }
     }
-    say(&text)?;
+    print(&text)?;
     if damaged > 0 {
-        return Err(Ending::cannot(
+        return Err(Error::cannot(
             format!("{damaged} of these lines could not be told"),
             "name run folders; `tiface run RUN --fresh STAGE` makes a stage anew",
         ));
     }
-    Ok(Exit::Done)
+    Ok(())
 }
 
 fn row(run: &Path, stage: &str, words: &str) -> String {
     format!("{:<24} {stage:<8} {}\n", one_line(&run.display().to_string()), one_line(words))
 }
 
-fn line(common: &Common, run: &Path, stage: &str) -> Result<String, Ending> {
+fn line(common: &Common, run: &Path, stage: &str) -> Result<String> {
     if !io::is_folder(run) {
-        return Err(Ending::cannot(format!("`{}` is not a folder", run.display()), ""));
+        return Err(Error::cannot(format!("`{}` is not a folder", run.display()), ""));
     }
     let folder = run.join(stage);
     let status = read_status(&folder)?;

@@ -1,8 +1,8 @@
 //! Which capture and which run a command means.
 
-use super::ending::Ending;
 use super::options::Common;
 use crate::io;
+use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// What a command works on.
@@ -23,7 +23,7 @@ const CAPTURE_FILES: [&str; 4] =
 
 impl Target {
     /// From the path on the command line and `--run`.
-    pub fn find(common: &Common, path: Option<&Path>) -> Result<Target, Ending> {
+    pub fn find(common: &Common, path: Option<&Path>) -> Result<Target> {
         match path {
             Some(path) if is_run(path) => Ok(Target::run(path.into(), false)),
             Some(path) => {
@@ -32,7 +32,7 @@ impl Target {
                     Some(run) => run.clone(),
                     None => {
                         let name = capture.file_name().ok_or_else(|| {
-                            Ending::usage("this capture has no name", "place the run with `--run DIR`")
+                            Error::usage("this capture has no name", "place the run with `--run DIR`")
                         })?;
                         Path::new("runs").join(name)
                     }
@@ -41,7 +41,7 @@ impl Target {
             }
             None => match &common.run {
                 Some(run) if is_run(run) => Ok(Target::run(run.clone(), false)),
-                Some(run) => Err(Ending::usage(
+                Some(run) => Err(Error::usage(
                     format!("`{}` is not a run yet, and no capture is named", run.display()),
                     "name the capture: `tiface run CAPTURE --run DIR`",
                 )),
@@ -61,7 +61,7 @@ fn is_run(path: &Path) -> bool {
 }
 
 /// The run in `here`, else the one under `here/runs` that was configured last.
-fn guess(here: &Path) -> Result<Target, Ending> {
+fn guess(here: &Path) -> Result<Target> {
     if is_run(here) {
         return Ok(Target::run(here.into(), true));
     }
@@ -70,7 +70,7 @@ fn guess(here: &Path) -> Result<Target, Ending> {
         runs.into_iter().filter(|run| is_run(run)).max_by_key(|run| io::modified(&run.join("config.toml")));
     match newest {
         Some(run) => Ok(Target::run(run, true)),
-        None => Err(Ending::usage(
+        None => Err(Error::usage(
             "no capture or run is named, this folder is no run, and there is none under `runs/`",
             "name a capture: `tiface run CAPTURE`, or try `tiface demo`",
         )),
@@ -102,7 +102,7 @@ mod tests {
     #[test]
     fn the_newest_run_is_guessed_and_none_is_a_usage_error() {
         let dir = tempfile::tempdir().unwrap();
-        assert_eq!(guess(dir.path()).unwrap_err().exit.code(), 2);
+        assert_eq!(guess(dir.path()).unwrap_err().kind().code(), 2);
         for name in ["a", "b"] {
             let run = dir.path().join("runs").join(name);
             fs::create_dir_all(&run).unwrap();
@@ -117,6 +117,6 @@ mod tests {
     #[test]
     fn a_missing_capture_is_named() {
         let e = Target::find(&Common::default(), Some(Path::new("no/such/capture"))).unwrap_err();
-        assert!(e.message.contains("no/such/capture") && e.exit.code() == 1, "{e:?}");
+        assert!(e.to_string().contains("no/such/capture") && e.kind().code() == 1, "{e:?}");
     }
 }

@@ -100,6 +100,8 @@ pub enum ConfigError {
     },
 }
 
+crate::error::error_from!(ConfigError, Usage);
+
 impl ConfigError {
     pub(super) fn unknown(place: Place, key: &str) -> ConfigError {
         ConfigError::Unknown { place, key: key.into(), nearest: nearest(key) }

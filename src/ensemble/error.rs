@@ -84,6 +84,8 @@ pub enum EnsembleError {
     NoPixels,
 }
 
+crate::error::error_from!(EnsembleError, Cannot);
+
 impl EnsembleError {
     /// The way out.
     pub fn hint(&self) -> String {

@@ -1,11 +1,11 @@
 //! An analytic ball to train on: what the tests of learned fields share.
 
 use super::pixels::TrainView;
+use crate::Monitor;
 use crate::geom::{Camera, Distortion};
 use crate::image::{Gray, Photo};
 use crate::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
 use crate::kernel::march::Bitmask;
-use crate::run::Monitor;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};

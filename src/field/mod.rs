@@ -4,6 +4,7 @@
 //! tensor's device, and [`autodiff`] gives each one backward for every device. A new device
 //! implements [`ops::FieldKernels`] and nothing else changes.
 
+use crate::{Error, Result};
 pub mod autodiff;
 #[cfg(test)]
 pub(crate) mod ball;
@@ -15,27 +16,20 @@ pub mod pixels;
 
 use burn::tensor::{Device, Tensor, TensorData};
 
-/// Why a device cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum DeviceError {
-    /// Not a name this build knows.
-    #[error("device `{0}` is not known here; this build trains on: cpu")]
-    Unknown(String),
-    /// Known, but without training kernels.
-    #[error("device `{0}` has no training kernels yet; this build trains on: cpu")]
-    NoKernels(String),
-}
-
 /// The device of a name: `auto` or `cpu`.
-pub fn device(name: &str) -> Result<Device, DeviceError> {
+pub fn device(name: &str) -> Result<Device> {
     match name {
         "auto" | "cpu" => Ok(Device::flex()),
         other if other.starts_with("wgpu") || other.starts_with("cuda") => {
-            Err(DeviceError::NoKernels(other.to_owned()))
+            Err(unusable(other, "has no training kernels yet"))
         }
-        other => Err(DeviceError::Unknown(other.to_owned())),
+        other => Err(unusable(other, "is not known here")),
     }
+}
+
+fn unusable(name: &str, why: &str) -> Error {
+    let problem = format!("device `{name}` {why}; this build trains on: cpu");
+    Error::usage(problem, "choose another with `--device`")
 }
 
 /// A tensor of these values; takes the vector without copying.

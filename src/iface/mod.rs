@@ -20,7 +20,8 @@ pub use infer::{IFace, VolumeRay};
 pub use schedule::{learning_rate, next_rays};
 pub use train::{TrainReport, train};
 
-use crate::field::{self, DeviceError};
+use crate::Error;
+use crate::field;
 use crate::io::ReadError;
 use crate::io::WriteError;
 use std::path::PathBuf;
@@ -31,7 +32,7 @@ use std::path::PathBuf;
 pub enum IfaceError {
     /// The device cannot train.
     #[error(transparent)]
-    Device(#[from] DeviceError),
+    Device(#[from] Error),
     /// Nothing to learn from.
     #[error("no training view has a pixel to learn from (masks empty, or everything marked invalid)")]
     NoPixels,

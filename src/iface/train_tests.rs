@@ -1,10 +1,10 @@
 //! Training on an analytic ball: does it learn, resume, guard and stop?
 
 use super::*;
+use crate::Quiet;
 use crate::config::Preset;
 use crate::field::ball::{BALL, StopAfter, hull, negative, says, tampered, temporary, views};
 use crate::io::Tensors;
-use crate::run::Quiet;
 use glam::{Vec2, Vec3};
 
 fn config() -> IfaceConfig {

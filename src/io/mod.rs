@@ -155,6 +155,8 @@ fn at(offset: Option<u64>) -> String {
     offset.map(|o| format!(" (at byte {o})")).unwrap_or_default()
 }
 
+crate::error::error_from!(ReadError, Cannot);
+
 impl ReadError {
     /// The file the error is about.
     pub fn path(&self) -> &Path {

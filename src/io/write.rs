@@ -37,6 +37,8 @@ pub enum WriteError {
     },
 }
 
+crate::error::error_from!(WriteError, Cannot);
+
 impl WriteError {
     /// The way out.
     pub fn hint(&self) -> String {

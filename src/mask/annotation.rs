@@ -45,6 +45,8 @@ pub enum PageError {
     Write(#[from] WriteError),
 }
 
+crate::error::error_from!(PageError, Cannot);
+
 impl PageError {
     /// The way out.
     pub fn hint(&self) -> String {

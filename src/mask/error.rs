@@ -92,6 +92,8 @@ pub enum CutError {
     },
 }
 
+crate::error::error_from!(CutError, Cannot);
+
 impl CutError {
     /// The way out.
     pub fn hint(&self) -> &'static str {

@@ -74,6 +74,8 @@ pub enum AlphaError {
     },
 }
 
+crate::error::error_from!(AlphaError, Cannot);
+
 impl AlphaError {
     /// The way out.
     pub fn hint(&self) -> String {

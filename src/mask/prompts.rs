@@ -73,6 +73,8 @@ pub enum PromptsError {
     },
 }
 
+crate::error::error_from!(PromptsError, Cannot);
+
 impl PromptsError {
     /// The way out.
     pub fn hint(&self) -> String {

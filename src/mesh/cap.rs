@@ -130,8 +130,8 @@ impl Cap {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Quiet;
     use crate::mesh::{MeshConfig, extract};
-    use crate::run::Quiet;
 
     /// A column through the floor of the scene's box, red to the left and green to the right.
     fn column() -> (Mesh, Cap) {

@@ -138,6 +138,8 @@ pub enum ExportError {
     },
 }
 
+crate::error::error_from!(ExportError, Cannot);
+
 impl ExportError {
     /// The way out.
     pub fn hint(&self) -> &'static str {

@@ -5,8 +5,8 @@ use super::polish::{Polish, angle_weighted_normals};
 use super::sparse::{Asking, Grid, Sparse, sparse};
 use super::verify::{Verified, dense_triangles};
 use super::{CleanReport, MeshConfig, MeshError, clean};
+use crate::Monitor;
 use crate::geom::{Aabb, Mesh, Topology, topology};
-use crate::run::Monitor;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -278,7 +278,7 @@ fn off_surface(values: &[f32], gradients: &[Vec3], capped: &[bool], cell: f32) -
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::Quiet;
+    use crate::Quiet;
 
     fn mesh_of(f: impl Fn(Vec3) -> f32 + Sync, config: &MeshConfig) -> Result<(Mesh, MeshReport), MeshError> {
         let gradient = |p: Vec3| {

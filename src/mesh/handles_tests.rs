@@ -2,8 +2,8 @@
 
 use super::check::check;
 use super::{MeshConfig, MeshReport, Patches, SimplifyConfig, extract, simplify};
+use crate::Quiet;
 use crate::geom::{Aabb, Mesh, topology};
-use crate::run::Quiet;
 use glam::Vec3;
 
 /// The surface of a field with 64 cells along the box; loops up to a share of its longest side go.

@@ -52,9 +52,9 @@ pub(super) fn dense_triangles(
 
 #[cfg(test)]
 mod tests {
+    use crate::Quiet;
     use crate::geom::Aabb;
     use crate::mesh::{MeshConfig, extract};
-    use crate::run::Quiet;
     use glam::Vec3;
 
     #[test]

@@ -98,6 +98,8 @@ pub enum MetricsError {
     },
 }
 
+crate::error::error_from!(MetricsError, Cannot);
+
 impl MetricsError {
     /// The way out.
     pub fn hint(&self) -> &'static str {

@@ -4,8 +4,8 @@
 //! clicks → cut (GrabCut, or SAM) → propagated through the cameras → band → matting (closed form, ViTMatte) → alpha
 //! ```
 
+use super::Line;
 use super::networks::Networks;
-use super::{Line, PipelineError, capture_failure};
 use crate::capture::{Capture, Split};
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
@@ -14,10 +14,11 @@ use crate::mask::grabcut::{GrabcutOptions, grabcut};
 use crate::mask::matting::closed_form::ClosedFormOptions;
 use crate::mask::matting::trimap::Band;
 use crate::mask::matting::{SoftenOptions, Working, soften};
-use crate::mask::prompts::{self, PromptsError};
+use crate::mask::prompts;
 use crate::mask::propagate::{Masks, PropagateOptions, PropagateView, ViewMask, propagate};
 use crate::mask::{Click, CutError, distance, scale};
-use crate::run::{Failure, Fingerprint, Stage};
+use crate::run::{Fingerprint, Stage};
+use crate::{Error, Result};
 use rayon::prelude::*;
 use std::path::Path;
 
@@ -42,29 +43,10 @@ pub(super) struct Made {
     pub unknown: f64,
 }
 
-fn prompts_failure(e: PromptsError) -> PipelineError {
-    match e {
-        PromptsError::Read(e) => PipelineError::Read(e),
-        e => {
-            let hint = e.hint();
-            PipelineError::Clicks { problem: e.to_string(), hint }
-        }
-    }
-}
-
-fn cut_failure(e: CutError) -> Failure {
-    let hint = e.hint();
-    Failure::cannot(e, hint)
-}
-
 /// The clicks that a configuration means, checked against the capture; `None` if masks are not made from clicks.
 ///
 /// `kept` is the copy of the clicks that the run keeps, for when the file is gone.
-pub(super) fn clicks(
-    config: &MaskConfig,
-    capture: &Capture,
-    kept: &Path,
-) -> Result<Option<Clicks>, PipelineError> {
+pub(super) fn clicks(config: &MaskConfig, capture: &Capture, kept: &Path) -> Result<Option<Clicks>> {
     if !config.clicked() {
         return Ok(None);
     }
@@ -76,15 +58,12 @@ pub(super) fn clicks(
             name => capture.views.iter().find(|v| v.name == name),
         };
         let Some(view) = view else {
-            return Err(PipelineError::Clicks {
-                problem: format!("there is no view `{}`", config.view),
-                hint: "`tiface inspect CAPTURE --json` lists them; names have no ending".into(),
-            });
+            return Err(Error::cannot(
+                format!("there is no view `{}`", config.view),
+                "`tiface inspect CAPTURE --json` lists them; names have no ending",
+            ));
         };
-        let frame = prompts::Frame {
-            file_path: prompts::file_path(capture, view),
-            points: clicks.map_err(prompts_failure)?,
-        };
+        let frame = prompts::Frame { file_path: prompts::file_path(capture, view), points: clicks? };
         prompts::Prompts { frames: vec![frame] }.clicks("mask.point", capture)
     } else {
         let named = Path::new(&config.prompts);
@@ -92,13 +71,12 @@ pub(super) fn clicks(
         file = io::read_bytes(path, &Limits::default())?;
         let read = prompts::parse_prompts(path, &file, &Limits::default());
         read.and_then(|prompts| prompts.clicks(&path.to_string_lossy(), capture))
-    }
-    .map_err(prompts_failure)?;
+    }?;
     if of.iter().all(Vec::is_empty) {
-        return Err(PipelineError::Clicks {
-            problem: format!("`{}` holds no click on a photograph of this capture", config.prompts),
-            hint: "click on a few photographs: `tiface mask CAPTURE --page`".into(),
-        });
+        return Err(Error::cannot(
+            format!("`{}` holds no click on a photograph of this capture", config.prompts),
+            "click on a few photographs: `tiface mask CAPTURE --page`",
+        ));
     }
     let mut inputs = vec![("clicks", Fingerprint::of_bytes(format!("{of:?}").as_bytes()))];
     for (name, path) in files(config) {
@@ -176,9 +154,9 @@ fn soften_options(c: &MaskConfig) -> SoftenOptions {
 }
 
 impl Line<'_> {
-    fn photo(&self, view: usize) -> Result<Photo, Failure> {
+    fn photo(&self, view: usize) -> Result<Photo> {
         self.stop_here()?;
-        self.capture.views[view].load_photo(&Limits::default()).map_err(capture_failure)
+        Ok(self.capture.views[view].load_photo(&Limits::default())?)
     }
 
     /// Masks of all views from clicks on some.
@@ -186,8 +164,8 @@ impl Line<'_> {
         &self,
         stage: &Stage,
         clicks: &Clicks,
-        keep: &mut dyn FnMut(usize, &Photo, Made) -> Result<(), Failure>,
-    ) -> Result<Networks, Failure> {
+        keep: &mut dyn FnMut(usize, &Photo, Made) -> Result<()>,
+    ) -> Result<Networks> {
         let config = &self.config.mask;
         let networks = Networks::open(config)?;
         // a file that the engine cannot run is refused before the work
@@ -203,8 +181,7 @@ impl Line<'_> {
         let total = hard.len();
         let at_once = networks.at_once(largest, &soft, config);
         for start in (0..total).step_by(at_once) {
-            let made: Vec<Result<(Photo, Made, Vec<String>), Failure>> = (start
-                ..(start + at_once).min(total))
+            let made: Vec<Result<(Photo, Made, Vec<String>)>> = (start..(start + at_once).min(total))
                 .into_par_iter()
                 .map(|i| {
                     let photo = self.photo(i)?;
@@ -225,12 +202,12 @@ impl Line<'_> {
     }
 
     /// Hard masks of all views.
-    fn hard(&self, stage: &Stage, clicks: &Clicks) -> Result<Vec<ViewMask>, Failure> {
+    fn hard(&self, stage: &Stage, clicks: &Clicks) -> Result<Vec<ViewMask>> {
         let views = &self.capture.views;
         let masks = if let [view] = &views[..] {
             let found =
                 grabcut(&view.name, &self.photo(0)?, &clicks.of[0], &grabcut_options(&self.config.mask));
-            let found = found.map_err(cut_failure)?;
+            let found = found?;
             Masks {
                 views: vec![ViewMask { mask: found.mask, ambiguous: found.ambiguous }],
                 warnings: found.warnings,
@@ -250,7 +227,7 @@ impl Line<'_> {
             let load = |i| self.photo(i).map_err(Unpropagated::Load);
             propagate(&views, load, &propagate_options(&self.config.mask)).map_err(|e| match e {
                 Unpropagated::Load(e) => e,
-                Unpropagated::Cut(e) => cut_failure(e),
+                Unpropagated::Cut(e) => e.into(),
             })?
         };
         masks.warnings.iter().for_each(|w| stage.warn(w));
@@ -266,7 +243,7 @@ impl Line<'_> {
         hard: &ViewMask,
         clicks: &Clicks,
         soft: &SoftenOptions,
-    ) -> Result<(Made, Vec<String>), Failure> {
+    ) -> Result<(Made, Vec<String>)> {
         let mut warnings = Vec::new();
         let segmented = match networks.has_sam() {
             true => {
@@ -294,7 +271,7 @@ impl Line<'_> {
         let mask = segmented.as_ref().unwrap_or(&hard.mask);
         let failed = |e: crate::mask::matting::AlphaError| {
             let hint = e.hint();
-            Failure::cannot(e, hint)
+            Error::cannot(e, hint)
         };
         let made = if networks.has_vitmatte() {
             let working = Working::new(photo, mask, soft).map_err(failed)?;
@@ -321,7 +298,7 @@ impl Line<'_> {
 
 /// Why clicks could not be propagated.
 enum Unpropagated {
-    Load(Failure),
+    Load(Error),
     Cut(CutError),
 }
 

@@ -2,12 +2,13 @@
 
 use super::clicks::propagated_clicks;
 use super::*;
+use crate::Quiet;
 use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::Preset;
 use crate::image::Gray;
 use crate::mask::prompts::{Frame, Prompts, file_path};
-use crate::run::{Quiet, Stop};
+use crate::run::Stop;
 use std::path::PathBuf;
 use std::sync::Arc;
 

@@ -5,20 +5,21 @@
 //!          weights.json   the weights, and what they gain where they were fitted
 //! ```
 
-use super::{Fields, Line, PipelineError, pictures};
+use super::{Fields, Line, pictures};
 use crate::capture::{MaskMeaning, MaskSource};
 use crate::config::{MaskUse, Method};
 use crate::ensemble::{EnsembleError, Member, Members, blend};
 use crate::image::Image;
 use crate::io;
 use crate::render::RenderedView;
-use crate::run::{Done, Failure};
+use crate::run::Done;
+use crate::{Error, Result};
 use serde_json::{Value, json};
 use std::path::Path;
 
 impl Line<'_> {
     /// Stage `ensemble`: one picture per camera of `render`. `fields` are only asked if weights are to be fitted.
-    pub fn ensemble(&self, fields: &dyn Fields) -> Result<Done, PipelineError> {
+    pub fn ensemble(&self, fields: &dyn Fields) -> Result<Done> {
         self.can_blend()?;
         Ok(self.run.stage(self.plan("ensemble"), |stage| {
             let scene = self.scene_or_fail()?;
@@ -30,7 +31,7 @@ impl Line<'_> {
             };
             for (i, named) in cameras.iter().enumerate() {
                 let images = self.member_views(&named.name)?;
-                let blended = blend(&self.checked(&images)?, &weights).map_err(ensemble_failure)?;
+                let blended = blend(&self.checked(&images)?, &weights)?;
                 self.write_blend(stage.folder(), &named.name, blended)?;
                 stage.monitor().step(i as u64 + 1, cameras.len() as u64, &[]);
                 self.stop_here()?;
@@ -45,10 +46,10 @@ impl Line<'_> {
     }
 
     /// Will everything be there that is to be blended? Asked before any work.
-    pub(super) fn can_blend(&self) -> Result<(), PipelineError> {
+    pub(super) fn can_blend(&self) -> Result<()> {
         let c = &self.config.ensemble;
         let wrong = |key: &'static str, problem: String, hint: &str| {
-            Err(PipelineError::Settings { key, problem, hint: hint.into() })
+            Err(Error::usage(format!("`{key}` {problem}"), hint))
         };
         if c.members.is_empty() {
             return wrong("ensemble.members", "is empty: there is nothing to blend".into(), "name members");
@@ -116,20 +117,20 @@ impl Line<'_> {
     }
 
     /// The views of all members from one camera, in float.
-    fn member_views(&self, name: &str) -> Result<Vec<Image>, Failure> {
+    fn member_views(&self, name: &str) -> Result<Vec<Image>> {
         let members = self.config.ensemble.members.iter();
         members.map(|m| Ok(pictures::read_float(&self.member_file(*m, name)?)?)).collect()
     }
 
     /// The float view of a member, if it was rendered.
-    fn member_file(&self, member: Method, name: &str) -> Result<std::path::PathBuf, Failure> {
+    fn member_file(&self, member: Method, name: &str) -> Result<std::path::PathBuf> {
         let below = format!("render/{}/{}", member.folder(), pictures::FLOAT);
         let file = pictures::float_path(&self.run.path(&below), name);
         if io::is_file(&file) {
             return Ok(file);
         }
         let (word, stage) = (member.folder(), member.stage());
-        Err(Failure::cannot(
+        Err(Error::cannot(
             format!("member `{word}` is missing: there is no `{below}/{name}.exr`"),
             format!(
                 "`tiface render RUN --fresh render --with {}` makes it from the stage `{stage}`, or leave it out of \
@@ -142,14 +143,14 @@ impl Line<'_> {
     /// The members of one view, checked, and cut to the head where that is asked for.
     ///
     /// Never by fitted weights: so a fit sees the members as they will be blended.
-    pub(super) fn checked<'i>(&self, images: &'i [Image]) -> Result<Members<'i>, Failure> {
+    pub(super) fn checked<'i>(&self, images: &'i [Image]) -> Result<Members<'i>> {
         let named = self.config.ensemble.members.iter().zip(images);
         let list: Vec<Member<'i>> = named
             .map(|(m, image)| Member { name: m.folder(), image, masked: self.knows_masks(*m) })
             .collect();
-        let members = Members::new(&list).map_err(ensemble_failure)?;
+        let members = Members::new(&list)?;
         if self.config.ensemble.cut {
-            return members.cut(&self.shares()).map_err(ensemble_failure);
+            return Ok(members.cut(&self.shares())?);
         }
         Ok(members)
     }
@@ -168,7 +169,7 @@ impl Line<'_> {
         any && used
     }
 
-    fn write_blend(&self, folder: &Path, name: &str, color: Image) -> Result<(), Failure> {
+    fn write_blend(&self, folder: &Path, name: &str, color: Image) -> Result<()> {
         let c = &self.config.render;
         let mut view = RenderedView { color, depth: Image::new(0, 0, 1), normal: Image::new(0, 0, 3) };
         if let Some(background) = pictures::behind(c.background) {
@@ -176,9 +177,4 @@ impl Line<'_> {
         }
         Ok(pictures::write(folder, name, &view, c.format, self.config.capture.unit_m)?)
     }
-}
-
-pub(super) fn ensemble_failure(e: EnsembleError) -> Failure {
-    let hint = e.hint();
-    Failure::cannot(e, hint)
 }

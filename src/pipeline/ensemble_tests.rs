@@ -8,7 +8,8 @@ use crate::geom::{Camera, Ray};
 use crate::image::{Image, quantise};
 use crate::io;
 use crate::render::RenderedView;
-use crate::run::{Exit, Failure, Quiet, Run, Stop};
+use crate::run::{Run, Stop};
+use crate::{ErrorKind, Quiet, Result};
 use glam::Vec3;
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -92,11 +93,11 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
 struct NoField;
 
 impl Fields for NoField {
-    fn surface(&self) -> Result<&dyn Surface, Failure> {
+    fn surface(&self) -> Result<&dyn Surface> {
         panic!("no field is asked for")
     }
 
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
         panic!("no field is asked for")
     }
 }
@@ -141,11 +142,11 @@ impl Radiance for ByHeart {
 struct Two(ByHeart, ByHeart);
 
 impl Fields for Two {
-    fn surface(&self) -> Result<&dyn Surface, Failure> {
+    fn surface(&self) -> Result<&dyn Surface> {
         panic!("no distance is asked for")
     }
 
-    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
+    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance> {
         Ok(if stage == "tface" { &self.0 } else { &self.1 })
     }
 }
@@ -229,9 +230,9 @@ fn what_cannot_be_blended_is_said_before_anything_is_learned() {
         change(&mut config);
         let line = Line::open(&config, &run, false).unwrap();
         let e = line.remember("metrics").unwrap_err();
-        assert_eq!(e.exit(), Exit::Usage);
+        assert_eq!(e.kind(), ErrorKind::Usage);
         assert!(!run.path("config.toml").exists());
-        (e.to_string(), e.hint())
+        (e.to_string(), e.hint().to_owned())
     };
     let (text, hint) = error(&|c| c.render.method = vec![Method::Volume]);
     assert_eq!(text, "`ensemble.members` names tface, which render.method does not make");

@@ -1,6 +1,6 @@
 //! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
 
-use super::{Fields, Line, PipelineError, Radiance, Surface, bitmask, capture_failure, to_value};
+use super::{Fields, Line, Radiance, Surface, bitmask, to_value};
 use crate::capture::View;
 use crate::capture::scene::Scene;
 use crate::config::MaskUse;
@@ -9,8 +9,9 @@ use crate::field::pixels::TrainView;
 use crate::iface::{self, IFace, IfaceError};
 use crate::image::Gray;
 use crate::io::Limits;
-use crate::run::{Done, Exit, Failure};
+use crate::run::Done;
 use crate::tface::{self, FieldMean, TfaceError};
+use crate::{Error, ErrorKind, Result};
 use rayon::prelude::*;
 use serde_json::json;
 use std::cell::OnceCell;
@@ -18,7 +19,7 @@ use std::path::Path;
 
 impl Line<'_> {
     /// Stage `iface`: learns the field; goes on from its last checkpoint.
-    pub fn iface(&self) -> Result<Done, PipelineError> {
+    pub fn iface(&self) -> Result<Done> {
         let plan = self.plan("iface");
         let identity = plan.fingerprint.digest();
         Ok(self.run.stage(plan, |stage| {
@@ -37,7 +38,7 @@ impl Line<'_> {
     }
 
     /// Stages `baseline` and `tface`: the same learning with other settings.
-    pub fn radiance(&self, name: &'static str) -> Result<Done, PipelineError> {
+    pub fn radiance(&self, name: &'static str) -> Result<Done> {
         let plan = self.plan(name);
         let identity = plan.fingerprint.digest();
         Ok(self.run.stage(plan, |stage| {
@@ -74,10 +75,10 @@ impl Line<'_> {
     }
 
     /// The photographs that are learned from, in the scene. Pixels of `capture.tiles` count as not valid.
-    pub(super) fn train_views(&self, scene: &Scene, masked: bool) -> Result<Vec<TrainView>, Failure> {
+    pub(super) fn train_views(&self, scene: &Scene, masked: bool) -> Result<Vec<TrainView>> {
         let limits = Limits::default();
         let view = |(view, tiles): &(&View, Vec<Tile>)| {
-            let loaded = view.load(&limits).map_err(capture_failure)?;
+            let loaded = view.load(&limits)?;
             let (width, height) = (loaded.photo.width, loaded.photo.height);
             let mut valid = loaded.valid;
             for tile in tiles {
@@ -95,32 +96,33 @@ impl Line<'_> {
         self.tiles().par_iter().map(view).collect()
     }
 
-    fn iface_failure(&self, e: IfaceError) -> Failure {
+    fn iface_failure(&self, e: IfaceError) -> Error {
         match e {
-            IfaceError::Stopped { .. } => Failure::stopped_at(self.run.stop(), e),
+            IfaceError::Stopped { .. } => Error::stopped(e),
             IfaceError::Device(_) => device_failure(e),
             e => {
                 let hint = e.hint().unwrap_or_default();
-                Failure::cannot(e, hint)
+                Error::cannot(e, hint)
             }
         }
     }
 
-    fn tface_failure(&self, stage: &'static str, e: TfaceError) -> Failure {
+    fn tface_failure(&self, stage: &'static str, e: TfaceError) -> Error {
         match e {
-            TfaceError::Stopped { .. } => Failure::stopped_at(self.run.stop(), e),
+            TfaceError::Stopped { .. } => Error::stopped(e),
             TfaceError::Device(_) => device_failure(e),
             e => {
                 let hint = e.hint(stage).unwrap_or_default();
-                let exit = if matches!(e, TfaceError::Settings { .. }) { Exit::Usage } else { Exit::Cannot };
-                Failure { exit, ..Failure::cannot(e, hint) }
+                let settings = matches!(e, TfaceError::Settings { .. });
+                let kind = if settings { ErrorKind::Usage } else { ErrorKind::Cannot };
+                Error::new(kind, e).with_hint(hint)
             }
         }
     }
 }
 
-fn device_failure(e: impl std::error::Error + Send + Sync + 'static) -> Failure {
-    Failure { exit: Exit::Usage, ..Failure::cannot(e, "choose another with `--device`") }
+fn device_failure(e: impl std::error::Error + Send + Sync + 'static) -> Error {
+    Error::usage(e, "choose another with `--device`")
 }
 
 /// The fields as they lie in the run.
@@ -139,7 +141,7 @@ impl<'l> Trained<'l> {
 }
 
 impl Fields for Trained<'_> {
-    fn surface(&self) -> Result<&dyn Surface, Failure> {
+    fn surface(&self) -> Result<&dyn Surface> {
         let line = self.line;
         let load = || {
             let scene = line.scene_or_fail()?;
@@ -150,7 +152,7 @@ impl Fields for Trained<'_> {
         once(&self.iface, load).map(|f| f as &dyn Surface)
     }
 
-    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
+    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance> {
         let line = self.line;
         let load = || {
             let (folder, count) = (line.run.path(stage), line.vm(stage).learned());
@@ -161,9 +163,9 @@ impl Fields for Trained<'_> {
     }
 }
 
-fn once<T>(cell: &OnceCell<T>, load: impl FnOnce() -> Result<T, Failure>) -> Result<&T, Failure> {
+fn once<T>(cell: &OnceCell<T>, load: impl FnOnce() -> Result<T>) -> Result<&T> {
     if cell.get().is_none() {
         let _ = cell.set(load()?);
     }
-    cell.get().ok_or_else(|| Failure::cannot("no field", ""))
+    cell.get().ok_or_else(|| Error::cannot("no field", ""))
 }

@@ -9,7 +9,7 @@ use crate::image::{Image, Photo, quantise, srgb_from_linear};
 use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, bake, tangent_space};
 use crate::mesh::textured_tangents::tangents;
 use crate::mesh::{AtlasConfig, Cap, MeshError, Patches, SimplifyConfig, atlas, simplify};
-use crate::run::Monitor;
+use crate::{Monitor, Result};
 use glam::{Mat3, Vec3};
 use serde_json::{Map, Value, json};
 

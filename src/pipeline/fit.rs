@@ -1,14 +1,14 @@
 //! The weights of the blend, fitted on the squares of the training photographs that no field learned from.
 
-use super::ensemble::ensemble_failure;
-use super::{Fields, Line, capture_failure, pictures};
+use super::{Fields, Line, pictures};
+use crate::Result;
 use crate::capture::scene::Scene;
 use crate::capture::{Split, View};
 use crate::config::{Background, called};
 use crate::ensemble::{self, EnsembleError, Fit, Target, Tile};
 use crate::image::{Gray, Image, Photo};
 use crate::io::Limits;
-use crate::run::{Failure, Stage};
+use crate::run::Stage;
 use serde_json::{Value, json};
 
 /// A mask and a valid mask count from here on, as in `metrics`.
@@ -27,12 +27,7 @@ impl Line<'_> {
     /// Weights for the members, and what is known of them; alike where no tile shows the head.
     ///
     /// Only the tiles are rendered: a few percent of the pixels of the training views.
-    pub(super) fn fit(
-        &self,
-        stage: &Stage,
-        scene: &Scene,
-        fields: &dyn Fields,
-    ) -> Result<(Vec<f32>, Value), Failure> {
+    pub(super) fn fit(&self, stage: &Stage, scene: &Scene, fields: &dyn Fields) -> Result<(Vec<f32>, Value)> {
         let methods = &self.config.ensemble.members;
         for method in methods {
             let (name, imports) = (method.stage(), &self.imports);
@@ -49,7 +44,7 @@ impl Line<'_> {
         for (view, tiles) in self.tiles() {
             let (photo, weight) = target(view)?;
             let camera = view.camera.transformed(&scene.scene_from_world);
-            let mut sum = Fit::new(methods.len()).map_err(ensemble_failure)?;
+            let mut sum = Fit::new(methods.len())?;
             for tile in tiles {
                 let (photo, weight) = cut_out(&photo, &weight, tile);
                 if weight.values.iter().all(|w| *w == 0) {
@@ -64,7 +59,7 @@ impl Line<'_> {
                     images.push(shown.map_or_else(empty, |view| view.color));
                 }
                 let target = Target { photo: &photo, weight: &weight };
-                sum.add(&self.checked(&images)?, &target).map_err(ensemble_failure)?;
+                sum.add(&self.checked(&images)?, &target)?;
             }
             sums.push(sum);
         }
@@ -73,11 +68,11 @@ impl Line<'_> {
                 stage.warn("no square of capture.tiles shows the head: the members are blended alike");
                 return Ok((self.shares(), Value::Null));
             }
-            weights => weights.map_err(ensemble_failure)?,
+            weights => weights?,
         };
-        let mut all = Fit::new(methods.len()).map_err(ensemble_failure)?;
-        sums.iter().try_for_each(|sum| all.merge(sum)).map_err(ensemble_failure)?;
-        let psnr = |weights: &[f32]| all.psnr(weights).map_err(ensemble_failure);
+        let mut all = Fit::new(methods.len())?;
+        sums.iter().try_for_each(|sum| all.merge(sum))?;
+        let psnr = |weights: &[f32]| all.psnr(weights);
         let mut alone = serde_json::Map::new();
         for (k, name) in self.members().into_iter().enumerate() {
             let one: Vec<f32> = (0..methods.len()).map(|l| if l == k { 1.0 } else { 0.0 }).collect();
@@ -92,8 +87,8 @@ impl Line<'_> {
 }
 
 /// What the members should have shown of a view, and where that counts.
-fn target(view: &View) -> Result<(Photo, Gray), Failure> {
-    let loaded = view.load(&Limits::default()).map_err(capture_failure)?;
+fn target(view: &View) -> Result<(Photo, Gray)> {
+    let loaded = view.load(&Limits::default())?;
     let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), Background::None);
     let (width, height) = (photo.width, photo.height);
     let inside = |of: &Option<Gray>, i: usize| of.as_ref().is_none_or(|m| m.values[i] >= INSIDE);

@@ -6,7 +6,8 @@ use crate::capture::synthetic::{SyntheticHead, SyntheticOptions, write_capture};
 use crate::config::{Background, Genus, MeshFormat, MeshFrame, Method, Preset};
 use crate::geom::{Camera, Similarity};
 use crate::render::RenderedView;
-use crate::run::{Quiet, Stop};
+use crate::run::Stop;
+use crate::{ErrorKind, Quiet, Result};
 use glam::Vec3;
 use serde_json::json;
 use std::sync::Arc;
@@ -59,11 +60,11 @@ impl Surface for Exact {
 struct Formula(Exact);
 
 impl Fields for Formula {
-    fn surface(&self) -> Result<&dyn Surface, Failure> {
+    fn surface(&self) -> Result<&dyn Surface> {
         Ok(&self.0)
     }
 
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
         panic!("no radiance field is asked for")
     }
 }
@@ -72,11 +73,11 @@ impl Fields for Formula {
 struct Never;
 
 impl Fields for Never {
-    fn surface(&self) -> Result<&dyn Surface, Failure> {
+    fn surface(&self) -> Result<&dyn Surface> {
         panic!("loaded for nothing")
     }
 
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
         panic!("loaded for nothing")
     }
 }
@@ -279,11 +280,11 @@ impl Surface for Drilled {
 }
 
 impl Fields for Drilled {
-    fn surface(&self) -> Result<&dyn Surface, Failure> {
+    fn surface(&self) -> Result<&dyn Surface> {
         Ok(self)
     }
 
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
         panic!("no radiance field is asked for")
     }
 }
@@ -334,18 +335,18 @@ impl Radiance for Fog {
     fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<Seen> {
         let views = self.0.fetch_add(1, std::sync::atomic::Ordering::SeqCst) + 1;
         if let Some(stop) = self.1.as_ref().filter(|_| views == 2) {
-            stop.request(Exit::Interrupted);
+            stop.request(ErrorKind::Interrupted);
         }
         vec![Seen { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..Seen::default() }; rays.len()]
     }
 }
 
 impl Fields for Fog {
-    fn surface(&self) -> Result<&dyn Surface, Failure> {
+    fn surface(&self) -> Result<&dyn Surface> {
         panic!("no surface is asked for")
     }
 
-    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure> {
+    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance> {
         assert_eq!(stage, "tface");
         Ok(self)
     }
@@ -362,7 +363,7 @@ fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
     Line::open(&config, &run, false).unwrap().mask().unwrap();
     let interrupted = Fog(0.into(), Some(run.stop().clone()));
     let e = Line::open(&config, &run, false).unwrap().render(&interrupted).unwrap_err();
-    assert_eq!(e.exit(), Exit::Interrupted);
+    assert_eq!(e.kind(), ErrorKind::Interrupted);
     let made = |run: &Run| io::list_files(&run.path("render/tface")).map_or(0, |f| f.len());
     assert_eq!(made(&run), 1);
     let run = quiet(dir.path());
@@ -394,7 +395,7 @@ fn a_run_without_masks_stops_before_anything_is_written_unless_told_to_go_on() {
     let run = quiet(dir.path());
     let mut config = draft(&root);
     let e = Line::open(&config, &run, false).err().unwrap();
-    assert!(e.to_string().contains("head mask") && e.exit() == Exit::Cannot, "{e}");
+    assert!(e.to_string().contains("head mask") && e.kind() == ErrorKind::Cannot, "{e}");
     assert!(e.hint().contains("--page") && e.hint().contains("--set mask.source=none"), "{}", e.hint());
     assert!(!run.dir().exists());
     config.mask.source = MaskSource::None;
@@ -420,7 +421,7 @@ fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
     let fog = Fog(0.into(), None);
     for e in [line.mask().unwrap_err(), line.mesh(&Never).unwrap_err(), line.render(&fog).unwrap_err()] {
         assert!(e.to_string().contains("`hull.resolution` is 0, expected 2 to 1024"), "{e}");
-        assert!(e.hint().contains("`--fresh mask`") && e.exit() == Exit::Cannot, "{}", e.hint());
+        assert!(e.hint().contains("`--fresh mask`") && e.kind() == ErrorKind::Cannot, "{}", e.hint());
     }
     // which it is
     line.fresh("mask", "mask").unwrap();

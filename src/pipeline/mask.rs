@@ -1,6 +1,6 @@
 //! Stage `mask`: which pixels are the head, and where that puts it in space.
 
-use super::{Line, PipelineError, capture_failure, scene_file};
+use super::{Line, scene_file};
 use crate::capture::scene::{self, Scene, SceneError, SceneOptions};
 use crate::capture::{self, Capture, Split};
 use crate::config::MaskMeaning;
@@ -9,7 +9,8 @@ use crate::io::{self, Limits};
 use crate::mask::consistency::{ConsistencyOptions, ConsistencyView, check_consistency};
 use crate::mask::sheet::{Tile, sheet};
 use crate::mask::{prompts, scale};
-use crate::run::{Done, Failure, Stage};
+use crate::run::{Done, Stage};
+use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -39,7 +40,7 @@ struct Masked {
 
 impl Line<'_> {
     /// Stage `mask`: the masks as pictures, a sheet of them, and the box and hull they leave (`scene.json`).
-    pub fn mask(&self) -> Result<Done, PipelineError> {
+    pub fn mask(&self) -> Result<Done> {
         let done = self.run.stage(self.plan("mask"), |stage| {
             let Masked { masks, mut tiles, shown, made } = match &self.clicks {
                 Some(clicks) => self.masks_from_clicks(stage, clicks)?,
@@ -81,7 +82,7 @@ impl Line<'_> {
         })?;
         if self.gone.is_none() {
             let cameras = scene_file::cameras_json(&self.capture, &self.scene()?);
-            let written = self.run.write("cameras.json", &cameras).map_err(PipelineError::from);
+            let written = self.run.write("cameras.json", &cameras);
             self.unless_idle(done.skipped, written)?;
         }
         Ok(done)
@@ -92,7 +93,7 @@ impl Line<'_> {
         self.run.path("mask").join(format!("{view}.png"))
     }
 
-    fn write_mask(&self, view: usize, mask: &Gray) -> Result<(), Failure> {
+    fn write_mask(&self, view: usize, mask: &Gray) -> Result<()> {
         let file = self.mask_file(&self.capture.views[view].name);
         if let Some(folder) = file.parent() {
             io::create_folder(folder)?;
@@ -101,14 +102,14 @@ impl Line<'_> {
     }
 
     /// The masks that lie beside the photographs.
-    fn masks_of_capture(&self, stage: &Stage) -> Result<Masked, Failure> {
+    fn masks_of_capture(&self, stage: &Stage) -> Result<Masked> {
         let limits = Limits::default();
         let total = self.capture.views.len();
         let mut out =
             Masked { masks: Vec::with_capacity(total), tiles: vec![], shown: vec![], made: Value::Null };
         // a few at a time: decoding is what takes time, and photographs are large
         for (i, views) in self.capture.views.chunks(8).enumerate() {
-            let loaded: Vec<_> = views
+            let loaded: Vec<Result<_>> = views
                 .par_iter()
                 .map(|v| {
                     let Some(mask) = v.load_mask(&limits)? else { return Ok(None) };
@@ -119,7 +120,7 @@ impl Line<'_> {
                 .collect();
             for (k, found) in loaded.into_iter().enumerate() {
                 let view = 8 * i + k;
-                let found: Option<(Gray, Result<Tile, _>)> = found.map_err(capture_failure)?;
+                let found: Option<(Gray, Result<Tile, _>)> = found?;
                 let Some((mask, tile)) = found else {
                     out.masks.push(None);
                     continue;
@@ -136,7 +137,7 @@ impl Line<'_> {
     }
 
     /// Masks made from clicks.
-    fn masks_from_clicks(&self, stage: &Stage, clicks: &super::clicks::Clicks) -> Result<Masked, Failure> {
+    fn masks_from_clicks(&self, stage: &Stage, clicks: &super::clicks::Clicks) -> Result<Masked> {
         let mut out = Masked { masks: vec![], tiles: vec![], shown: vec![], made: Value::Null };
         let mut unknown = 0.0;
         let networks = self.make_masks(stage, clicks, &mut |view, photo: &Photo, made| {
@@ -162,7 +163,7 @@ impl Line<'_> {
     }
 
     /// Where the head is, from the views that are learned from; held-out ones have no say.
-    fn place(&self, stage: &Stage, masks: Vec<Option<Gray>>) -> Result<Scene, Failure> {
+    fn place(&self, stage: &Stage, masks: Vec<Option<Gray>>) -> Result<Scene> {
         let (mut cameras, mut carving, mut names) = (Vec::new(), Vec::new(), Vec::new());
         for (view, mask) in self.capture.views.iter().zip(masks) {
             if view.split == Split::Train {
@@ -175,7 +176,7 @@ impl Line<'_> {
         let options = SceneOptions { names, ..SceneOptions::default() };
         let (scene, warnings) = scene::fit(&cameras, &carving, &options).map_err(|e: SceneError| {
             let hint = e.hint();
-            Failure::cannot(e, hint)
+            Error::cannot(e, hint)
         })?;
         warnings.iter().for_each(|w| stage.warn(w));
         Ok(scene)
@@ -240,14 +241,11 @@ pub fn disagreements(root: &std::path::Path, options: &capture::CaptureOptions) 
 }
 
 /// An annotation page; `prompts` are clicks that are there already.
-pub fn click_page(capture: &Capture, prompts: Option<&std::path::Path>) -> Result<String, PipelineError> {
+pub fn click_page(capture: &Capture, prompts: Option<&std::path::Path>) -> Result<String> {
     let limits = Limits::default();
     let known = match prompts {
         Some(file) => prompts::read_prompts(file, &limits),
         None => Ok(prompts::Prompts::default()),
     };
-    let wrong = |problem: String, hint: String| PipelineError::Clicks { problem, hint };
-    let known = known.map_err(|e| wrong(e.to_string(), e.hint()))?;
-    let page = crate::mask::annotation::page_of(capture, &known, &Default::default(), &limits);
-    page.map_err(|e| wrong(e.to_string(), e.hint()))
+    Ok(crate::mask::annotation::page_of(capture, &known?, &Default::default(), &limits)?)
 }

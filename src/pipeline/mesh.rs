@@ -3,7 +3,7 @@
 use super::finish::{Closing, Finished, REACH};
 use super::parts::Whole;
 use super::product::Product;
-use super::{Fields, Line, PipelineError, export};
+use super::{Fields, Line, export};
 use crate::capture::{self, Split};
 use crate::config::{Genus, MeshConfig};
 use crate::geom::{Camera, Mesh, Similarity};
@@ -11,14 +11,15 @@ use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::read::ReadMeshError;
 use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshError, Patches, ply};
-use crate::run::{Done, Failure};
+use crate::run::Done;
+use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
 
 impl Line<'_> {
     /// Stage `mesh`: the whole surface as `surface.ply` in the dataset's world, and the product an artist opens
     /// in the formats asked for. `fields` are only asked if there is something to do.
-    pub fn mesh(&self, fields: &dyn Fields) -> Result<Done, PipelineError> {
+    pub fn mesh(&self, fields: &dyn Fields) -> Result<Done> {
         Ok(self.run.stage(self.plan("mesh"), |stage| {
             let scene = self.scene_or_fail()?;
             let field = fields.surface()?;
@@ -53,10 +54,10 @@ impl Line<'_> {
                 stage.monitor(),
             );
             let failed = |e: MeshError| match e {
-                MeshError::Stopped => Failure::stopped(self.run.stop()),
+                MeshError::Stopped => Error::stopped("what is complete is kept"),
                 e => {
                     let hint = e.hint().unwrap_or_default();
-                    Failure::cannot(e, hint)
+                    Error::cannot(e, hint)
                 }
             };
             let (mut surface, report) = extracted.map_err(failed)?;
@@ -73,10 +74,7 @@ impl Line<'_> {
                 }
             }
             // what took longest is kept, whatever comes of the rest
-            let bytes = ply::placed_to_ply(&surface, &scene.scene_from_world.inverse()).map_err(|e| {
-                let hint = e.hint();
-                Failure::cannot(e, hint)
-            })?;
+            let bytes = ply::placed_to_ply(&surface, &scene.scene_from_world.inverse())?;
             io::write_atomic(&stage.folder().join("surface.ply"), &bytes)?;
             let parts = stage.folder().join("parts");
             let surface_triangles = surface.triangles.len();
@@ -150,22 +148,22 @@ impl Line<'_> {
     }
 
     /// What the stage `mesh` made for people.
-    pub fn read_product(&self) -> Result<Product, Failure> {
+    pub fn read_product(&self) -> Result<Product> {
         Product::load(&self.run.path("mesh/parts"))
     }
 
     /// The whole surface of the stage `mesh` in scene coordinates, as it was before it became a file.
-    pub(super) fn read_whole(&self) -> Result<Whole, Failure> {
+    pub(super) fn read_whole(&self) -> Result<Whole> {
         Whole::load(&self.run.path("mesh/parts"))
     }
 
     /// The whole surface of the stage `mesh`, in the dataset's world.
-    pub fn read_mesh(&self) -> Result<Mesh, Failure> {
+    pub fn read_mesh(&self) -> Result<Mesh> {
         let path = self.run.path("mesh/surface.ply");
         let bytes = io::read_bytes(&path, &Limits::default())?;
         mesh::read::read(&bytes, &path).map_err(|e: ReadMeshError| {
             let hint = e.hint();
-            Failure::cannot(e, hint)
+            Error::cannot(e, hint)
         })
     }
 }

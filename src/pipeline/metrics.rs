@@ -1,12 +1,13 @@
 //! Stage `metrics`: every view, of every member and of the blends, against its photograph.
 
-use super::{Line, PipelineError, against_truth, capture_failure, pictures, to_value};
+use super::{Line, against_truth, pictures, to_value};
 use crate::capture::{LoadedView, View};
 use crate::config::Background;
 use crate::image::{Gray, Image};
 use crate::io::{self, Limits};
-use crate::metrics::{Metrics, MetricsError, ViewMetrics, compare};
-use crate::run::{Done, Failure};
+use crate::metrics::{Metrics, ViewMetrics, compare};
+use crate::run::Done;
+use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::{Map, Value};
 use std::path::PathBuf;
@@ -67,13 +68,13 @@ impl Line<'_> {
     /// Stage `metrics`: `metrics.json`, every rendered or blended view against its photograph, inside
     /// the mask and inside the capture's region of interest; how much of it is in the way outside; and
     /// the mesh against the truth where it is known.
-    pub fn metrics(&self) -> Result<Done, PipelineError> {
+    pub fn metrics(&self) -> Result<Done> {
         Ok(self.run.stage(self.plan("metrics"), |stage| {
             let mut out = Map::new();
             let sets = self.sets();
             for (i, set) in sets.iter().enumerate() {
                 let shown = self.comparable(set);
-                let judged = shown.par_iter().map(|s| self.judge(s)).collect::<Result<Vec<_>, Failure>>()?;
+                let judged = shown.par_iter().map(|s| self.judge(s)).collect::<Result<Vec<_>>>()?;
                 if !judged.is_empty() {
                     out.insert(set.name.clone(), entry(judged));
                 }
@@ -81,7 +82,7 @@ impl Line<'_> {
                 self.stop_here()?;
             }
             if out.is_empty() {
-                return Err(Failure::cannot(
+                return Err(Error::cannot(
                     "there is no view to be judged",
                     "name methods in `render.method`, and make their views with `--fresh render`",
                 ));
@@ -97,14 +98,13 @@ impl Line<'_> {
         })?)
     }
 
-    fn judge(&self, shown: &Shown) -> Result<Judged, Failure> {
+    fn judge(&self, shown: &Shown) -> Result<Judged> {
         let background = self.config.render.background;
-        let loaded = shown.view.load(&Limits::default()).map_err(capture_failure)?;
+        let loaded = shown.view.load(&Limits::default())?;
         let render = pictures::read(&shown.file, self.config.render.format)?;
         let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
-        let against = |mask: Option<&Gray>| {
-            compare(&shown.view.name, &render, &photo, mask, loaded.valid.as_ref()).map_err(metrics_failure)
-        };
+        let against =
+            |mask: Option<&Gray>| compare(&shown.view.name, &render, &photo, mask, loaded.valid.as_ref());
         let region = loaded.region.as_ref().map(|r| against(Some(r))).transpose()?;
         let head = against(loaded.mask.as_ref())?;
         // a picture over a background is opaque; what it was before is in the float view
@@ -158,11 +158,6 @@ fn means(metrics: &Value) -> Value {
         }
         other => other.clone(),
     }
-}
-
-fn metrics_failure(e: MetricsError) -> Failure {
-    let hint = e.hint();
-    Failure::cannot(e, hint)
 }
 
 #[cfg(test)]

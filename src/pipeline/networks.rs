@@ -1,6 +1,5 @@
 //! SAM and ViTMatte for the stage `mask`, where this build has them.
 
-use super::PipelineError;
 use crate::config::MaskConfig;
 #[cfg(feature = "matting")]
 use crate::config::VitmatteColors;
@@ -10,7 +9,8 @@ use crate::mask::Click;
 use crate::mask::matting::SoftenOptions;
 #[cfg(feature = "matting")]
 use crate::mask::networks::{self, MaskNetworkError, VitMatteColours};
-use crate::run::{Failure, Fingerprint};
+use crate::run::Fingerprint;
+use crate::{Error, Result};
 use serde_json::Value;
 use std::path::Path;
 
@@ -21,25 +21,25 @@ pub(super) struct Networks {
 }
 
 #[cfg(feature = "matting")]
-fn failure(e: MaskNetworkError) -> Failure {
+fn failure(e: MaskNetworkError) -> Error {
     let hint = e.hint();
-    Failure::cannot(e, hint)
+    Error::cannot(e, hint)
 }
 
 impl Networks {
     /// Digest of a network's file.
-    pub fn digest(path: &Path) -> Result<String, PipelineError> {
+    pub fn digest(path: &Path) -> Result<String> {
         let limits = io::Limits { file_bytes: 2 << 30, ..io::Limits::default() };
         Ok(Fingerprint::of_bytes(&io::read_bytes(path, &limits)?))
     }
 
     /// Opens what is named. An error in a build without networks.
     #[cfg(not(feature = "matting"))]
-    pub fn open(config: &MaskConfig) -> Result<Networks, Failure> {
+    pub fn open(config: &MaskConfig) -> Result<Networks> {
         if super::clicks::files(config).is_empty() {
             return Ok(Networks {});
         }
-        Err(Failure::cannot(
+        Err(Error::cannot(
             "this build cannot run networks, but SAM or ViTMatte is named",
             "build with `--features matting`, or leave the files out: clicks work without them",
         ))
@@ -47,7 +47,7 @@ impl Networks {
 
     /// Opens what is named.
     #[cfg(feature = "matting")]
-    pub fn open(config: &MaskConfig) -> Result<Networks, Failure> {
+    pub fn open(config: &MaskConfig) -> Result<Networks> {
         let named = super::clicks::files(config);
         if named.is_empty() {
             return Ok(Networks { of: None });
@@ -114,7 +114,7 @@ impl Networks {
 
     /// Runs the networks once on an empty photograph of a size, so that what cannot be run is refused first.
     #[cfg_attr(not(feature = "matting"), allow(unused_variables))]
-    pub fn prepare(&self, (width, height): (u32, u32)) -> Result<(), Failure> {
+    pub fn prepare(&self, (width, height): (u32, u32)) -> Result<()> {
         #[cfg(feature = "matting")]
         if let Some(of) = &self.of {
             of.prepare(width, height).map_err(failure)?;
@@ -140,21 +140,21 @@ impl Networks {
 
     /// SAM's mask of what was clicked, and how good it thinks that is.
     #[cfg_attr(not(feature = "matting"), allow(unused_variables))]
-    pub fn segment(&self, photo: &Photo, clicks: &[Click]) -> Result<(Gray, f32), Failure> {
+    pub fn segment(&self, photo: &Photo, clicks: &[Click]) -> Result<(Gray, f32)> {
         #[cfg(feature = "matting")]
         if let Some(of) = &self.of {
             return of.segment(photo, clicks).map_err(failure);
         }
-        Err(Failure::cannot("SAM is not loaded", "name its files: `--sam`, `--sam-decoder`"))
+        Err(Error::cannot("SAM is not loaded", "name its files: `--sam`, `--sam-decoder`"))
     }
 
     /// ViTMatte's alpha.
     #[cfg_attr(not(feature = "matting"), allow(unused_variables))]
-    pub fn alpha(&self, photo: &Photo, trimap: &Gray) -> Result<Vec<f32>, Failure> {
+    pub fn alpha(&self, photo: &Photo, trimap: &Gray) -> Result<Vec<f32>> {
         #[cfg(feature = "matting")]
         if let Some(of) = &self.of {
             return of.alpha(photo, trimap).map_err(failure);
         }
-        Err(Failure::cannot("ViTMatte is not loaded", "name its file: `--vitmatte`"))
+        Err(Error::cannot("ViTMatte is not loaded", "name its file: `--vitmatte`"))
     }
 }

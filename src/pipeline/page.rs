@@ -1,6 +1,7 @@
 //! `report.html`, from what lies in the run.
 
-use super::{Line, PipelineError, STAGES};
+use super::{Line, STAGES};
+use crate::Result;
 use crate::config::{PictureFormat, called};
 use crate::io::{self, Limits};
 use crate::report::{self, Picture, Report, Row};
@@ -20,7 +21,7 @@ const MOST: usize = 48 << 20;
 
 impl Line<'_> {
     /// Writes `report.html`, of every stage that is done; without the photographs it stays as it is.
-    pub fn report(&self) -> Result<(), PipelineError> {
+    pub fn report(&self) -> Result<()> {
         if self.gone.is_some() {
             return Ok(());
         }

@@ -12,7 +12,7 @@ use crate::geom::{Aabb, Atlas, Mesh, Similarity};
 use crate::image::Photo;
 use crate::io::{self, Limits, ReadError, TensorValues};
 use crate::mesh::{Cap, Skin};
-use crate::run::Failure;
+use crate::{Error, Result};
 use glam::{DMat3, DVec3, Mat3, Vec2, Vec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -54,7 +54,7 @@ fn format() -> BTreeMap<String, String> {
 
 impl Whole {
     /// Writes it into the folder of the parts.
-    pub fn save(&self, folder: &Path) -> Result<(), Failure> {
+    pub fn save(&self, folder: &Path) -> Result<()> {
         io::create_folder(folder)?;
         let mut tensors = geometry(&self.mesh);
         if let Some(cap) = &self.cap {
@@ -69,7 +69,7 @@ impl Whole {
     }
 
     /// Reads it back.
-    pub fn load(folder: &Path) -> Result<Whole, Failure> {
+    pub fn load(folder: &Path) -> Result<Whole> {
         let mut parts = Parts::open(folder.join("surface.safetensors"))?;
         let mesh = parts.mesh()?;
         if !parts.tensors.contains_key("cap_box") {
@@ -102,7 +102,7 @@ impl Whole {
 
 impl Product {
     /// Writes the parts into a folder.
-    pub fn save(&self, folder: &Path) -> Result<(), Failure> {
+    pub fn save(&self, folder: &Path) -> Result<()> {
         io::create_folder(folder)?;
         let mut tensors = geometry(&self.mesh);
         let Similarity { scale, rotation, translation } = self.world_from_scene;
@@ -138,14 +138,14 @@ impl Product {
     /// # Errors
     ///
     /// Parts that are missing, damaged or of another version; the way out is to make them again.
-    pub fn load(folder: &Path) -> Result<Product, Failure> {
+    pub fn load(folder: &Path) -> Result<Product> {
         let mut parts = Parts::open(folder.join("geometry.safetensors"))?;
         let mesh = parts.mesh()?;
         let world_from_scene = parts.similarity("world_from_scene")?;
         if !parts.tensors.contains_key("uvs") {
             return Ok(Product { mesh, world_from_scene, pictures: None });
         }
-        let photo = |name: &str, size: Option<(u32, u32)>| -> Result<Photo, Failure> {
+        let photo = |name: &str, size: Option<(u32, u32)>| -> Result<Photo> {
             let read = io::read_photo(&folder.join(name), size, &Limits::default());
             let photo = read.map_err(|e| unusable(e, "mesh"))?.photo;
             let found = (photo.width, photo.height);
@@ -192,9 +192,9 @@ struct Parts {
 }
 
 impl Parts {
-    fn open(path: PathBuf) -> Result<Parts, Failure> {
+    fn open(path: PathBuf) -> Result<Parts> {
         let wrong = |what: &str| {
-            Failure::cannot(
+            Error::cannot(
                 format!("`{}`: {what}", path.display()),
                 "make the mesh again: `tiface mesh RUN --fresh mesh`",
             )
@@ -213,19 +213,19 @@ impl Parts {
         }
     }
 
-    fn missing(&self, name: &str) -> Failure {
-        Failure::cannot(
+    fn missing(&self, name: &str) -> Error {
+        Error::cannot(
             format!("`{}`: `{name}` is missing or of another shape", self.path.display()),
             "make the mesh again: `tiface mesh RUN --fresh mesh`",
         )
     }
 
-    fn wrong(&self, key: &str, found: impl ToString, expected: &str) -> Failure {
+    fn wrong(&self, key: &str, found: impl ToString, expected: &str) -> Error {
         unusable(ReadError::value(&self.path, key, found, expected), "mesh")
     }
 
     /// `[n, N]` numbers.
-    fn rows<const N: usize>(&mut self, name: &str) -> Result<Vec<[f32; N]>, Failure> {
+    fn rows<const N: usize>(&mut self, name: &str) -> Result<Vec<[f32; N]>> {
         match self.tensors.remove(name) {
             Some((shape, TensorValues::F32(v))) if shape.len() == 2 && shape[1] == N => {
                 Ok(v.as_chunks::<N>().0.to_vec())
@@ -235,7 +235,7 @@ impl Parts {
     }
 
     /// `[n, 3]` indices below a bound.
-    fn indices(&mut self, name: &str, below: usize) -> Result<Vec<[u32; 3]>, Failure> {
+    fn indices(&mut self, name: &str, below: usize) -> Result<Vec<[u32; 3]>> {
         match self.tensors.remove(name) {
             Some((shape, TensorValues::U32(v)))
                 if shape.len() == 2 && shape[1] == 3 && v.iter().all(|&i| (i as usize) < below) =>
@@ -246,7 +246,7 @@ impl Parts {
         }
     }
 
-    fn mesh(&mut self) -> Result<Mesh, Failure> {
+    fn mesh(&mut self) -> Result<Mesh> {
         let vectors = |rows: Vec<[f32; 3]>| rows.into_iter().map(Vec3::from).collect::<Vec<_>>();
         let positions = vectors(self.rows("positions")?);
         let normals = vectors(self.rows("normals")?);
@@ -264,7 +264,7 @@ impl Parts {
     }
 
     /// Scale, rotation by columns, translation.
-    fn similarity(&mut self, name: &str) -> Result<Similarity, Failure> {
+    fn similarity(&mut self, name: &str) -> Result<Similarity> {
         let Some((_, TensorValues::F64(v))) = self.tensors.remove(name) else {
             return Err(self.missing(name));
         };
@@ -319,14 +319,14 @@ mod tests {
             let mesh = Mesh { colors: Vec::new(), ..product().mesh };
             Whole { mesh, cap: Some(Cap { bounds, near, ring: Vec::new() }) }.save(dir.path()).unwrap();
             let error = Whole::load(dir.path()).unwrap_err();
-            assert!(error.hint.contains("--fresh mesh"), "{error:?}");
-            error.error.to_string()
+            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+            error.to_string()
         };
         let swapped = Aabb { min: Vec3::ONE, max: Vec3::NEG_ONE };
         assert!(error(swapped, 1e-5).contains("`cap_box`"));
         assert!(error(Aabb::SCENE, -1.0).contains("`cap_near` is -1, expected 0 or more"));
         std::fs::write(dir.path().join("surface.safetensors"), b"torn").unwrap();
-        assert!(Whole::load(dir.path()).unwrap_err().hint.contains("--fresh mesh"));
+        assert!(Whole::load(dir.path()).unwrap_err().hint().contains("--fresh mesh"));
     }
 
     #[test]
@@ -337,8 +337,8 @@ mod tests {
             change(&mut product);
             product.save(dir.path()).unwrap();
             let error = Product::load(dir.path()).unwrap_err();
-            assert!(error.hint.contains("--fresh mesh"), "{error:?}");
-            error.error.to_string()
+            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+            error.to_string()
         };
         assert!(error(&|p| p.mesh.triangles[2] = [0, 1, 9]).contains("`triangles`"));
         assert!(error(&|p| p.mesh.normals.truncate(2)).contains("`normals`"));
@@ -360,8 +360,8 @@ mod tests {
             Product::load(&dir.path().join("nothing")).unwrap_err(),
             Whole::load(&dir.path().join("nothing")).unwrap_err(),
         ] {
-            assert!(error.hint.contains("--fresh mesh"), "{error:?}");
+            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
         }
-        assert!(Product::load(dir.path()).unwrap_err().error.to_string().contains("`tiface-mesh-1`"));
+        assert!(Product::load(dir.path()).unwrap_err().to_string().contains("`tiface-mesh-1`"));
     }
 }

@@ -9,13 +9,13 @@
 //! No stage reads them, so none is out of date with them: they come and go without the evaluation's views, their
 //! blend and the metrics.
 
-use super::render::path_failure;
-use super::{FORMAT, Line, PipelineError};
+use super::{FORMAT, Line};
 use crate::capture::Split;
 use crate::config::{Config, RenderConfig};
 use crate::io::{self, Limits};
 use crate::render::path::{NamedCamera, from_json};
-use crate::run::{Failure, Fingerprint, Plan, RunError, read_record, read_status};
+use crate::run::{Fingerprint, Plan, read_record, read_status};
+use crate::{Error, Result};
 use std::path::Path;
 
 /// Below the run: one folder for each path.
@@ -39,7 +39,7 @@ pub(super) struct CameraPath {
 impl<'a> Line<'a> {
     /// Returns the line whose stage `render` makes views of `render.cameras` in a folder of their own, and not those
     /// of the evaluation; a file of cameras is read here. For `test` the line as it is.
-    pub fn along(mut self, render: RenderConfig) -> Result<Line<'a>, PipelineError> {
+    pub fn along(mut self, render: RenderConfig) -> Result<Line<'a>> {
         if render.cameras == "test" {
             return Ok(self);
         }
@@ -49,8 +49,7 @@ impl<'a> Line<'a> {
             "orbit" => ("orbit".into(), None),
             file => {
                 let bytes = io::read_bytes(Path::new(file), &Limits::default())?;
-                let failed = |failure| RunError::Stage { stage: "render".into(), failure };
-                let cameras = self.cameras_of_file(file, &bytes).map_err(failed)?;
+                let cameras = self.cameras_of_file(file, &bytes).map_err(|e| e.within("stage `render`"))?;
                 let stem = Path::new(file).file_stem().unwrap_or_default().to_string_lossy();
                 let stem: String = stem.chars().take(STEM).collect();
                 let digest = digest.insert(Fingerprint::of_bytes(&bytes));
@@ -70,7 +69,7 @@ impl<'a> Line<'a> {
 
     /// Folders below the run that are out of date when a stage is made anew, in the order of the line: its own, those
     /// of what builds on it, and views of paths that show it. Where views of a path are made anew, they alone.
-    pub fn out_of_date(&self, stage: &str) -> Result<Vec<String>, PipelineError> {
+    pub fn out_of_date(&self, stage: &str) -> Result<Vec<String>> {
         if stage == "render" && self.path.is_some() {
             return Ok(vec![self.views().into()]);
         }
@@ -87,7 +86,7 @@ impl<'a> Line<'a> {
 
     /// Removes what is out of date when a stage is made anew on the way to `until`; nothing, if what `until` asks for
     /// would be refused then.
-    pub fn fresh(&self, stage: &str, until: &str) -> Result<(), PipelineError> {
+    pub fn fresh(&self, stage: &str, until: &str) -> Result<()> {
         self.is_there()?;
         let names = self.out_of_date(stage)?;
         // a finished blend is not cleared for views that it could not be made of again
@@ -127,14 +126,14 @@ impl<'a> Line<'a> {
         Plan { name: folder, fingerprint, device: &self.config.device, needs_bytes, saves: false }
     }
 
-    fn cameras_of_file(&self, file: &str, bytes: &[u8]) -> Result<Vec<NamedCamera>, Failure> {
+    fn cameras_of_file(&self, file: &str, bytes: &[u8]) -> Result<Vec<NamedCamera>> {
         let like = &self.capture.views[0].camera;
-        let cameras = from_json(&String::from_utf8_lossy(bytes), like).map_err(path_failure)?;
+        let cameras = from_json(&String::from_utf8_lossy(bytes), like)?;
         let mut names: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();
         names.sort_unstable();
         if let Some(twice) = names.windows(2).find(|w| w[0] == w[1]) {
             let problem = format!("`{file}` names two cameras `{}`", twice[0]);
-            return Err(Failure::cannot(problem, "give every frame a file name of its own"));
+            return Err(Error::cannot(problem, "give every frame a file name of its own"));
         }
         Ok(cameras)
     }

@@ -3,7 +3,8 @@
 use super::*;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::{Background, Method, PictureFormat, Preset, RenderConfig};
-use crate::run::{Quiet, Stop};
+use crate::run::Stop;
+use crate::{ErrorKind, Quiet, Result};
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -17,11 +18,11 @@ impl Radiance for Fog {
 }
 
 impl Fields for Fog {
-    fn surface(&self) -> Result<&dyn Surface, Failure> {
+    fn surface(&self) -> Result<&dyn Surface> {
         panic!("no surface is asked for")
     }
 
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
         Ok(self)
     }
 }
@@ -162,10 +163,10 @@ fn a_file_of_cameras_is_read_before_anything_is_learned() {
         std::fs::write(&path, text).unwrap();
         let line = Line::open(&config, &run, false).unwrap();
         let line = line.along(turn(&config, path.to_str().unwrap()))?;
-        Ok::<_, PipelineError>(line.views().to_owned())
+        Ok::<_, crate::Error>(line.views().to_owned())
     };
     let e = along("{}").unwrap_err();
-    assert!(e.to_string().contains("camera_path") && e.exit().code() == 1, "{e}");
+    assert!(e.to_string().contains("camera_path") && e.kind().code() == 1, "{e}");
     let frame = r#"{"file_path": "a.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]}"#;
     let e = along(&format!(r#"{{"frames": [{frame}, {frame}]}}"#)).unwrap_err();
     assert!(e.to_string().contains("two cameras `a`"), "{e}");
@@ -198,7 +199,7 @@ fn an_evaluation_of_other_cameras_than_the_held_out_ones_is_refused_with_the_way
     config.render.cameras = "orbit".into();
     let line = Line::open(&config, &run, false).unwrap();
     let e = line.remember("metrics").unwrap_err();
-    assert!(e.to_string().starts_with("`render.cameras` is orbit") && e.exit() == Exit::Usage, "{e}");
+    assert!(e.to_string().starts_with("`render.cameras` is orbit") && e.kind() == ErrorKind::Usage, "{e}");
     assert!(
         e.hint().contains("--set render.cameras=test") && e.hint().contains("--cameras orbit"),
         "{}",
@@ -268,7 +269,7 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
             .remember("render")
             .unwrap_err(),
     ] {
-        assert!(e.to_string().contains("head") && e.exit().code() == 1, "{e}");
+        assert!(e.to_string().contains("head") && e.kind().code() == 1, "{e}");
         assert!(e.hint().contains("--set capture.path="), "{}", e.hint());
     }
     assert!(before == files(run.dir()));

@@ -1,5 +1,6 @@
 //! Rendered views as files, and back.
 
+use crate::Result;
 use crate::config::{Background, PictureFormat};
 use crate::image::{Gray, Image, Photo, linear_from_srgb, quantise, srgb_from_linear};
 use crate::io::{self, Limits, ReadError, WriteError};

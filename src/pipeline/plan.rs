@@ -1,9 +1,10 @@
 //! What each stage builds on, and so what shapes it: known before anything runs.
 
-use super::{FORMAT, Line, PipelineError, STAGES};
+use super::{FORMAT, Line, STAGES};
 use crate::capture::{Split, View};
 use crate::config::{Config, Method, VmConfig};
 use crate::run::{Fingerprint, Plan, read_record};
+use crate::{Error, Result};
 
 /// Keys of `[mask]` that say where something lies; what it holds is an input of the stage.
 const PLACES: [&str; 8] = [
@@ -67,7 +68,7 @@ impl Line<'_> {
     /// What would be done for `until`: the folder of each stage with `None` if it has to be worked on, else what
     /// differs from the result that lies there (nothing, if it is done). An error if the settings contradict
     /// each other. Nothing is written.
-    pub fn outlook(&self, until: &str) -> Result<Vec<(String, Option<Vec<String>>)>, PipelineError> {
+    pub fn outlook(&self, until: &str) -> Result<Vec<(String, Option<Vec<String>>)>> {
         let look = |name: &'static str| {
             let Plan { name, fingerprint, .. } = self.plan(name);
             // a record that cannot be read is none: the stage counts as not done
@@ -85,18 +86,18 @@ impl Line<'_> {
     /// Writes the complete configuration into the run: what repeats it. Refused, before anything is
     /// changed, if a stage that `until` needs was made or begun with other settings, if the settings contradict
     /// each other, or if there is work left and no capture to do it on.
-    pub fn remember(&self, until: &str) -> Result<(), PipelineError> {
+    pub fn remember(&self, until: &str) -> Result<()> {
         self.agrees(until, &[])?;
         let idle = self.order(until).into_iter().all(|name| self.run.is_done(&self.plan(name)));
         if !idle {
             self.is_there()?;
         }
         let written = self.run.write("config.toml", self.config.to_toml().as_bytes());
-        self.unless_idle(idle, written.map_err(PipelineError::from))
+        self.unless_idle(idle, written)
     }
 
     /// Does what lies in the run agree with what `until` asks for, but for the folders in `cleared`?
-    pub(super) fn agrees(&self, until: &str, cleared: &[String]) -> Result<(), PipelineError> {
+    pub(super) fn agrees(&self, until: &str, cleared: &[String]) -> Result<()> {
         self.can_make(until)?;
         let plans = self.order(until).into_iter().map(|name| self.plan(name));
         for plan in plans.filter(|plan| !cleared.iter().any(|name| name == plan.name)) {
@@ -106,18 +107,19 @@ impl Line<'_> {
     }
 
     /// Do the settings go together, as far as `until` depends on them? Asked before any work.
-    fn can_make(&self, until: &str) -> Result<(), PipelineError> {
+    fn can_make(&self, until: &str) -> Result<()> {
         let order = self.order(until);
         let cameras = &self.config.render.cameras;
         if order.contains(&"render") && cameras != "test" {
-            return Err(PipelineError::Settings {
-                key: "render.cameras",
-                problem: format!("is {cameras}, but it is the held-out views that are blended and judged"),
-                hint: format!(
+            return Err(Error::usage(
+                format!(
+                    "`render.cameras` is {cameras}, but it is the held-out views that are blended and judged"
+                ),
+                format!(
                     "set it back with `--set render.cameras=test`; `tiface render RUN --cameras {cameras}` makes the \
                      others, in a folder of their own"
                 ),
-            });
+            ));
         }
         if order.contains(&"ensemble") { self.can_blend() } else { Ok(()) }
     }

@@ -13,7 +13,7 @@ use crate::image::Photo;
 use crate::mesh::export::{ExportError, ExportOptions, distance_warning};
 use crate::mesh::textured::{Exported, Lobe, PictureFormat, TextureOptions, Textured};
 use crate::mesh::{gltf, obj, ply};
-use crate::run::Failure;
+use crate::{Error, Result};
 use glam::{Mat3, Vec3};
 use serde_json::{Map, json};
 
@@ -60,7 +60,7 @@ impl Product {
         export: &Export,
         config: &MeshConfig,
         stem: &str,
-    ) -> Result<Exported, Failure> {
+    ) -> Result<Exported> {
         // an unlit material shows no normal map: who asks for one wants light
         let unlit = self.pictures.as_ref().is_none_or(|p| p.normal.is_none());
         let Product { mesh, world_from_scene, pictures } = self;
@@ -103,7 +103,7 @@ impl Product {
         };
         let mut exported = exported.map_err(|e| {
             let hint = e.hint();
-            Failure::cannot(e, hint)
+            Error::cannot(e, hint)
         })?;
         if format != MeshFormat::Glb {
             exported.warnings.extend(distance_warning(mesh, &options, ending));

@@ -1,6 +1,7 @@
 //! The capture as a run remembers it: a run that is done does not need its photographs any more.
 
-use super::{PipelineError, clicks::Clicks, scene_file};
+use super::{clicks::Clicks, scene_file};
+use crate::Result;
 use crate::capture::{Capture, CaptureError};
 use crate::config::Config;
 use crate::io;
@@ -23,17 +24,13 @@ pub(super) struct Remembered {
 /// # Errors
 ///
 /// A run that has not come far enough to remember it.
-pub(super) fn remembered(
-    config: &Config,
-    run: &Run,
-    error: &CaptureError,
-) -> Result<Option<Remembered>, PipelineError> {
+pub(super) fn remembered(config: &Config, run: &Run, error: &CaptureError) -> Result<Option<Remembered>> {
     let root = Path::new(&config.capture.path);
     let is_there = io::is_folder(root) && !matches!(error, CaptureError::NotACapture { .. });
     if is_there || !io::is_file(&run.path("config.toml")) {
         return Ok(None);
     }
-    let gone = || PipelineError::Gone { problem: error.to_string() };
+    let gone = || super::gone(&error.to_string());
     let record = read_record(&run.path("mask")).ok().flatten().ok_or_else(gone)?;
     let capture = scene_file::read_capture(&run.path("cameras.json"), root).map_err(|_| gone())?;
     let input = |name: &&'static str| Some((*name, record.fingerprint.inputs.get(*name)?.clone()));

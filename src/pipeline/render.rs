@@ -11,15 +11,16 @@
 use super::parts::Whole;
 use super::path::CameraPath;
 use super::product::{Pictures, Product};
-use super::{Fields, Line, PipelineError, march::march, pictures};
+use super::{Fields, Line, march::march, pictures};
 use crate::capture::scene::{self, Scene};
 use crate::capture::{Split, View};
 use crate::config::Method;
 use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
 use crate::io;
-use crate::render::path::{NamedCamera, PathError, orbit};
+use crate::render::path::{NamedCamera, orbit};
 use crate::render::{LobePictures, RaycastOptions, RenderedView, Texture, raycast, raycast_hits};
-use crate::run::{Done, Failure, Stop};
+use crate::run::{Done, Stop};
+use crate::{Error, Result};
 use serde_json::{Map, json};
 use std::time::{Duration, Instant};
 
@@ -27,7 +28,7 @@ impl Line<'_> {
     /// Stage `render`: one folder per method, one picture per camera, of the held-out views or along a path
     /// ([`Line::along`]). `fields` are only asked if there is something to do, and only for those that the methods
     /// show.
-    pub fn render(&self, fields: &dyn Fields) -> Result<Done, PipelineError> {
+    pub fn render(&self, fields: &dyn Fields) -> Result<Done> {
         Ok(self.run.stage(self.plan("render"), |stage| {
             let scene = self.scene_or_fail()?;
             let c = self.path.as_ref().map_or(&self.config.render, |path| &path.render);
@@ -75,7 +76,7 @@ impl Line<'_> {
     }
 
     /// The meshes that these methods show.
-    pub(super) fn meshes(&self, methods: &[Method]) -> Result<Meshes, Failure> {
+    pub(super) fn meshes(&self, methods: &[Method]) -> Result<Meshes> {
         let whole = methods.contains(&Method::Raycast).then(|| self.read_whole()).transpose()?;
         let product = methods.contains(&Method::Textured).then(|| self.textured()).transpose()?;
         Ok(Meshes { whole, product })
@@ -100,10 +101,10 @@ impl Line<'_> {
     }
 
     /// The product and its texture, which it must have.
-    fn textured(&self) -> Result<(Product, Pictures), Failure> {
+    fn textured(&self) -> Result<(Product, Pictures)> {
         let mut product = self.read_product()?;
         let pictures = product.pictures.take().ok_or_else(|| {
-            Failure::cannot(
+            Error::cannot(
                 "the mesh has no texture to be shown",
                 "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
             )
@@ -112,7 +113,7 @@ impl Line<'_> {
     }
 
     /// The cameras to render: named like photographs where they have one.
-    pub(super) fn cameras(&self, scene: &Scene) -> Result<Vec<NamedCamera>, Failure> {
+    pub(super) fn cameras(&self, scene: &Scene) -> Result<Vec<NamedCamera>> {
         match &self.path {
             None => {
                 let mut splits = [Split::Test, Split::Val, Split::Train].map(|s| self.of(s)).into_iter();
@@ -123,7 +124,7 @@ impl Line<'_> {
                 let all: Vec<Camera> = self.capture.views.iter().map(|v| v.camera.clone()).collect();
                 let bounds = scene::world_box(scene);
                 let count = render.orbit_views as usize;
-                orbit(&all, bounds, self.capture.up, count).map_err(path_failure)
+                Ok(orbit(&all, bounds, self.capture.up, count)?)
             }
         }
     }
@@ -132,11 +133,6 @@ impl Line<'_> {
         let named = |v: &View| NamedCamera { name: v.name.clone(), camera: v.camera.clone() };
         self.capture.split(split).map(named).collect()
     }
-}
-
-pub(super) fn path_failure(e: PathError) -> Failure {
-    let hint = e.hint();
-    Failure::cannot(e, hint)
 }
 
 /// The meshes that some methods show.
@@ -177,7 +173,7 @@ pub(super) struct Eye<'a> {
 
 impl Eye<'_> {
     /// The view of a camera in scene coordinates, over nothing.
-    pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>, Failure> {
+    pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>> {
         Ok(match (method, &self.whole) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
@@ -224,11 +220,11 @@ mod tests {
     struct Red;
 
     impl Fields for Red {
-        fn surface(&self) -> Result<&dyn Surface, Failure> {
+        fn surface(&self) -> Result<&dyn Surface> {
             Ok(self)
         }
 
-        fn radiance(&self, _: &'static str) -> Result<&dyn Radiance, Failure> {
+        fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
             panic!("no radiance field is asked for")
         }
     }

@@ -1,5 +1,6 @@
 //! `mask/scene.json` and `cameras.json`: where the head is, kept between stages and for other programs.
 
+use crate::Result;
 use crate::capture::scene::{Hull, Scene};
 use crate::capture::{Capture, View};
 use crate::geom::{Aabb, Similarity};

@@ -1,9 +1,9 @@
 //! What the later stages need of a learned field, and of anything else that can stand in for it.
 
 use super::march::Seen;
+use crate::Result;
 use crate::geom::{Camera, Ray, Similarity};
 use crate::render::RenderedView;
-use crate::run::Failure;
 use glam::Vec3;
 
 /// A coloured signed distance in scene coordinates.
@@ -37,10 +37,10 @@ pub trait Radiance: Sync {
 /// The trained fields, each loaded when it is first asked for.
 pub trait Fields {
     /// I-Face.
-    fn surface(&self) -> Result<&dyn Surface, Failure>;
+    fn surface(&self) -> Result<&dyn Surface>;
 
     /// The field of the stage `baseline` or `tface`.
-    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance, Failure>;
+    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance>;
 }
 
 #[cfg(feature = "cpu")]

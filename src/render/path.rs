@@ -56,6 +56,8 @@ pub enum PathError {
     },
 }
 
+crate::error::error_from!(PathError, Cannot);
+
 impl PathError {
     /// The way out.
     pub fn hint(&self) -> &'static str {

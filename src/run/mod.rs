@@ -16,14 +16,13 @@
 //! device and for one seed). `status.json`, `log.jsonl` and `done.json` tell when and how fast
 //! things happened, and so differ from run to run.
 
-mod failure;
+use crate::{Error, ErrorKind, Quiet, Result};
 mod fingerprint;
 mod progress;
 mod stage;
 mod status;
 mod stop;
 
-pub use failure::{Exit, Failure, RunError};
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer};
 pub use stage::{Done, Plan, Stage};
@@ -33,28 +32,6 @@ pub use stop::Stop;
 use crate::io::{self, Lock, LockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-
-/// How a long computation reports progress and learns that it should stop.
-///
-/// Called from the computing thread between steps, never in the middle of one, so that whatever it
-/// stops is in a state that can be saved.
-pub trait Monitor: Send + Sync {
-    /// `step` of `steps` is done; `values` are named figures of this step (losses, rays, rate, ...).
-    fn step(&self, step: u64, steps: u64, values: &[(&str, f64)]);
-
-    /// Has someone asked to stop?
-    fn stop(&self) -> bool;
-}
-
-/// Reports nothing, never stops.
-pub struct Quiet;
-
-impl Monitor for Quiet {
-    fn step(&self, _: u64, _: u64, _: &[(&str, f64)]) {}
-    fn stop(&self) -> bool {
-        false
-    }
-}
 
 impl Observer for Quiet {
     fn event(&self, _: &Event) {}
@@ -97,7 +74,7 @@ impl Run {
 
     /// Writes a file of the run itself (`config.toml`, `cameras.json`, `report.html`); one that
     /// holds the same bytes already is left alone, so that its time of modification stays honest.
-    pub fn write(&self, name: &str, bytes: &[u8]) -> Result<(), RunError> {
+    pub fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
         let path = self.path(name);
         if io::is_file(&path) && io::read_bytes(&path, &io::Limits::default()).is_ok_and(|old| old == bytes) {
             return Ok(());
@@ -112,11 +89,14 @@ impl Run {
     /// # Errors
     ///
     /// A folder that is a link, or that holds what no stage has made, and then nothing is removed at all.
-    pub fn fresh(&self, names: &[String]) -> Result<(), RunError> {
+    pub fn fresh(&self, names: &[String]) -> Result<()> {
         let there: Vec<&String> = names.iter().filter(|n| io::is_folder(&self.path(n))).collect();
         for name in &there {
             if let Some(link) = self.link(name) {
-                return Err(RunError::Linked { path: link });
+                return Err(Error::cannot(
+                    format!("`{}` is a link, and what lies behind a link is not removed", link.display()),
+                    "remove the link, then repeat the command",
+                ));
             }
             self.is_ours(name)?;
         }
@@ -133,13 +113,20 @@ impl Run {
     }
 
     /// An error if a stage's folder holds something, and nothing says that a stage has made it.
-    fn is_ours(&self, name: &str) -> Result<(), RunError> {
+    fn is_ours(&self, name: &str) -> Result<()> {
         let folder = self.path(name);
         if has_record(&folder) {
             return Ok(());
         }
         match io::any_file(&folder, &has_record)? {
-            Some(file) => Err(RunError::NotOurs { folder, file }),
+            Some(file) => Err(Error::cannot(
+                format!(
+                    "`{}` is in the way: it is no folder of a run, and holds `{}`",
+                    folder.display(),
+                    file.display()
+                ),
+                "choose another folder for the run with `--run DIR`, or move what lies there somewhere else",
+            )),
             None => Ok(()),
         }
     }
@@ -161,10 +148,15 @@ impl Run {
         &self.stop
     }
 
-    fn lock(&self, stage: &str) -> Result<Lock, RunError> {
+    fn lock(&self, stage: &str) -> Result<Lock> {
         Lock::take(&self.path(stage).join(LOCK)).map_err(|e| match e {
-            LockError::Held { .. } => RunError::Held { stage: stage.into(), run: self.dir.clone() },
-            other => RunError::Lock(other),
+            LockError::Held { .. } => {
+                let run = self.dir.display();
+                let problem = format!("stage `{stage}` of `{run}` is locked: another process works on it");
+                Error::new(ErrorKind::NotNow, problem)
+                    .with_hint("wait for it, or stop it, then repeat the command")
+            }
+            other => Error::cannot(other, "check that you may write in the run folder"),
         })
     }
 }

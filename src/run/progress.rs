@@ -3,8 +3,9 @@
 //! All pacing is by the monotonic clock: setting the machine's time does not disturb it.
 
 use super::status::now;
-use super::{Monitor, State, Status, Stop};
+use super::{State, Status, Stop};
 use crate::io;
+use crate::{Monitor, Result};
 use serde_json::{Map, Value};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};

@@ -2,9 +2,10 @@
 
 use super::progress::Progress;
 use super::status::{host, now};
-use super::{Event, Failure, Fingerprint, Monitor, Record, Run, RunError, State, Status};
+use super::{Event, Fingerprint, Record, Run, State, Status};
 use super::{has_record, read_record, read_status};
 use crate::io;
+use crate::{Error, Monitor, Result};
 use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;
@@ -70,14 +71,10 @@ impl Run {
     /// Exit code 75 if another process holds the stage, 1 if it was done or begun with another
     /// fingerprint or if the disk has too little room. `work` leaves the stage's files in
     /// [`Stage::folder`], complete and durable, before it returns.
-    pub fn stage(
-        &self,
-        plan: Plan,
-        work: impl FnOnce(&Stage) -> Result<Value, Failure>,
-    ) -> Result<Done, RunError> {
+    pub fn stage(&self, plan: Plan, work: impl FnOnce(&Stage) -> Result<Value>) -> Result<Done> {
         let name = plan.name;
         if let Some(exit) = self.stop.requested() {
-            return Err(RunError::Stopped { stage: name.into(), exit });
+            return Err(Error::stopped(format!("before stage `{name}`")).with_kind(exit));
         }
         let folder = self.path(name);
         if let Some(done) = self.complete(&plan)? {
@@ -96,8 +93,13 @@ impl Run {
             self.warn(name, &format!("removed {removed} half-written files of an interrupted process"));
         }
         if let Some(free) = io::free_bytes(&folder).filter(|free| *free < plan.needs_bytes) {
-            let needed = plan.needs_bytes;
-            return Err(RunError::NoSpace { stage: name.into(), needed, free, run: self.dir.clone() });
+            let (needed, run) = (plan.needs_bytes, self.dir.display());
+            return Err(Error::cannot(
+                format!(
+                    "stage `{name}` needs about {needed} bytes, but only {free} are free on the disk of `{run}`"
+                ),
+                "free space, or place the run on another disk with `--run DIR`",
+            ));
         }
 
         let status = Status {
@@ -123,18 +125,19 @@ impl Run {
         match work(&stage) {
             Ok(summary) => self.record(&plan, &stage, summary),
             Err(failure) => {
-                let stopped = self.stop.requested() == Some(failure.exit);
-                if stopped {
+                let signal = self.stop.requested().filter(|_| failure.kind().is_stop());
+                let failure = signal.map_or(failure.clone(), |kind| failure.with_kind(kind));
+                if signal.is_some() {
                     stage.progress.stopped();
                 } else {
                     // the failure is the thing to tell, whether or not it can be written down
                     let _ = stage.progress.save(|s| {
                         s.state = State::Failed;
-                        s.error = Some(failure.error.to_string());
+                        s.error = Some(failure.to_string());
                         s.eta_s = None;
                     });
                 }
-                Err(RunError::Stage { stage: name.into(), failure })
+                Err(failure.within(format!("stage `{name}`")))
             }
         }
     }
@@ -142,7 +145,7 @@ impl Run {
     /// Was what lies in the stage's folder made, or begun, with this plan? An error that prints the
     /// differences if not; an empty folder agrees with everything. An error, too, if what lies there was made by
     /// no stage.
-    pub fn agrees(&self, plan: &Plan) -> Result<(), RunError> {
+    pub fn agrees(&self, plan: &Plan) -> Result<()> {
         // a record that cannot be read counts as none, and is told when the stage is worked on
         if let Ok(Some(record)) = read_record(&self.path(plan.name)) {
             return same(plan, &record.fingerprint, true);
@@ -158,7 +161,7 @@ impl Run {
     }
 
     /// The finished stage, if its record is there and fits.
-    fn complete(&self, plan: &Plan) -> Result<Option<Done>, RunError> {
+    fn complete(&self, plan: &Plan) -> Result<Option<Done>> {
         let record = match read_record(&self.path(plan.name)) {
             Ok(record) => record,
             Err(e) => {
@@ -173,13 +176,13 @@ impl Run {
     }
 
     /// Seconds of work an earlier process left in the folder; an error if it had other settings.
-    fn begun(&self, plan: &Plan) -> Result<f64, RunError> {
+    fn begun(&self, plan: &Plan) -> Result<f64> {
         let Ok(Some(status)) = read_status(&self.path(plan.name)) else { return Ok(0.0) };
         same(plan, &status.fingerprint, false)?;
         Ok(status.elapsed_s)
     }
 
-    fn record(&self, plan: &Plan, stage: &Stage, summary: Value) -> Result<Done, RunError> {
+    fn record(&self, plan: &Plan, stage: &Stage, summary: Value) -> Result<Done> {
         let elapsed_s = stage.progress.elapsed_s();
         stage.progress.save(|s| {
             s.state = State::Done;
@@ -202,17 +205,30 @@ impl Run {
     }
 }
 
-fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<(), RunError> {
+fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<()> {
     let differences = plan.fingerprint.differences(found);
     if differences.is_empty() {
         return Ok(());
     }
-    Err(RunError::Changed { stage: plan.name.into(), done, differences })
+    let (stage, state) = (plan.name, if done { "done" } else { "begun" });
+    let problem = format!("stage `{stage}` was {state} with other settings:\n  {}", differences.join("\n  "));
+    Err(Error::cannot(
+        problem,
+        match stage.split_once('/') {
+            // a product of its own: nothing follows it
+            Some((owner, _)) => format!(
+                "repeat with the old settings, or add `--fresh {owner}` to make `{stage}` anew, and nothing else"
+            ),
+            None => format!(
+                "repeat with the old settings, choose another folder with `--run DIR`, or recompute this stage and what follows with `--fresh {stage}`"
+            ),
+        },
+    ))
 }
 
 /// Removes half-written files in a stage's folder and the folders in it; not behind links, nor where another
 /// process may be writing.
-fn sweep(folder: &Path) -> Result<usize, RunError> {
+fn sweep(folder: &Path) -> Result<usize> {
     if io::is_link(folder) {
         return Ok(0);
     }
@@ -226,7 +242,8 @@ fn sweep(folder: &Path) -> Result<usize, RunError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::{Exit, Observer, Quiet, Stop};
+    use crate::run::{Observer, Stop};
+    use crate::{ErrorKind, Quiet};
     use serde_json::json;
     use std::fs;
     use std::sync::Mutex;
@@ -241,17 +258,17 @@ mod tests {
         Run::open(dir, Stop::new(), Arc::new(Quiet))
     }
 
-    fn work(stage: &Stage) -> Result<Value, Failure> {
+    fn work(stage: &Stage) -> Result<Value> {
         io::write_atomic(&stage.folder().join("checkpoint"), b"weights")?;
         stage.monitor().step(5, 5, &[("loss", 0.5), ("bad", f64::NAN)]);
         Ok(json!({"loss": 0.5}))
     }
 
-    fn fresh(run: &Run, names: &[&str]) -> Result<(), RunError> {
+    fn fresh(run: &Run, names: &[&str]) -> Result<()> {
         run.fresh(&names.iter().map(|n| n.to_string()).collect::<Vec<_>>())
     }
 
-    fn never(_: &Stage) -> Result<Value, Failure> {
+    fn never(_: &Stage) -> Result<Value> {
         panic!("the stage should have been skipped")
     }
 
@@ -286,7 +303,7 @@ mod tests {
         let run = open(dir.path());
         run.stage(plan(5), work).unwrap();
         let error = run.stage(plan(7), never).unwrap_err();
-        assert_eq!(error.exit(), Exit::Cannot);
+        assert_eq!(error.kind(), ErrorKind::Cannot);
         assert!(error.to_string().contains("iface.steps: was 5, is 7"), "{error}");
         assert_eq!(run.agrees(&plan(7)).unwrap_err().to_string(), error.to_string());
         assert!(run.agrees(&plan(5)).is_ok());
@@ -305,7 +322,7 @@ mod tests {
     fn a_stage_begun_with_other_settings_is_not_continued_in_silence() {
         let dir = tempfile::tempdir().unwrap();
         let run = open(dir.path());
-        let fails = |_: &Stage| Err(Failure::cannot("no surface", "more steps"));
+        let fails = |_: &Stage| Err(Error::cannot("no surface", "more steps"));
         let error = run.stage(plan(5), fails).unwrap_err();
         assert_eq!(error.to_string(), "stage `iface`: no surface");
         let status = read_status(&dir.path().join("iface")).unwrap().unwrap();
@@ -322,8 +339,8 @@ mod tests {
         let inner = open(dir.path());
         run.stage(plan(5), |stage| {
             let error = inner.stage(plan(5), never).unwrap_err();
-            assert_eq!(error.exit().code(), 75);
-            assert_eq!(fresh(&inner, &["iface"]).unwrap_err().exit().code(), 75);
+            assert_eq!(error.kind().code(), 75);
+            assert_eq!(fresh(&inner, &["iface"]).unwrap_err().kind().code(), 75);
             // other stages are free meanwhile
             inner.stage(Plan { name: "tface", ..plan(5) }, work).unwrap();
             work(stage)
@@ -339,15 +356,15 @@ mod tests {
         let error = run
             .stage(plan(5), |stage| {
                 assert!(!stage.monitor().stop());
-                stop.request(Exit::Terminated);
+                stop.request(ErrorKind::Terminated);
                 assert!(stage.monitor().stop());
-                Err(Failure::stopped(&stop))
+                Err(stop.error("what is complete is kept"))
             })
             .unwrap_err();
-        assert_eq!(error.exit().code(), 143);
+        assert_eq!(error.kind().code(), 143);
         let status = read_status(&dir.path().join("iface")).unwrap().unwrap();
         assert_eq!((status.state, status.error), (State::Stopped, None));
-        assert!(matches!(run.stage(plan(5), never), Err(RunError::Stopped { .. })));
+        assert!(run.stage(plan(5), never).unwrap_err().to_string().contains("before stage"));
     }
 
     #[test]
@@ -414,7 +431,10 @@ mod tests {
             run.agrees(&plan(5)).unwrap_err(),
             run.stage(plan(5), never).unwrap_err(),
         ] {
-            assert!(error.to_string().contains("scans/a.png") && error.exit() == Exit::Cannot, "{error}");
+            assert!(
+                error.to_string().contains("scans/a.png") && error.kind() == ErrorKind::Cannot,
+                "{error}"
+            );
             assert!(error.hint().contains("--run DIR"), "{}", error.hint());
         }
         assert_eq!(fs::read(own.join("a.png")).unwrap(), b"mine");
@@ -437,7 +457,7 @@ mod tests {
         // it may lie elsewhere
         assert!(run.stage(plan(5), never).unwrap().skipped);
         let error = fresh(&run, &["iface"]).unwrap_err();
-        assert!(matches!(&error, RunError::Linked { path } if path.ends_with("iface")), "{error}");
+        assert!(error.to_string().contains("iface` is a link"), "{error}");
         assert!(elsewhere.join("iface/checkpoint").is_file());
         fs::remove_file(elsewhere.join("iface/done.json")).unwrap();
         assert!(!run.stage(plan(5), work).unwrap().skipped);
@@ -473,6 +493,6 @@ mod tests {
             return;
         }
         let error = run.stage(Plan { needs_bytes: u64::MAX, ..plan(5) }, never).unwrap_err();
-        assert!(matches!(error, RunError::NoSpace { .. }) && error.exit() == Exit::Cannot, "{error}");
+        assert!(error.to_string().contains("are free") && error.kind() == ErrorKind::Cannot, "{error}");
     }
 }

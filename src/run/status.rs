@@ -1,6 +1,7 @@
 //! `status.json` and `done.json`: what a stage says of itself.
 
 use super::Fingerprint;
+use crate::Result;
 use crate::io::{self, Limits, ReadError};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;

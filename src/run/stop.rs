@@ -1,7 +1,7 @@
 //! A request to stop, and what is at work meanwhile.
 
 use super::progress::Progress;
-use super::{Exit, Failure};
+use crate::{Error, ErrorKind};
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -35,17 +35,22 @@ impl Stop {
     }
 
     /// Asks to stop, to end with `exit`.
-    pub fn request(&self, exit: Exit) {
+    pub fn request(&self, exit: ErrorKind) {
         self.0.code.store(exit.code(), Ordering::SeqCst);
     }
 
     /// The exit code to end with, if a stop was requested.
-    pub fn requested(&self) -> Option<Exit> {
+    pub fn requested(&self) -> Option<ErrorKind> {
         match self.0.code.load(Ordering::SeqCst) {
             0 => None,
-            143 => Some(Exit::Terminated),
-            _ => Some(Exit::Interrupted),
+            143 => Some(ErrorKind::Terminated),
+            _ => Some(ErrorKind::Interrupted),
         }
+    }
+
+    /// The error to end with, which says what is kept.
+    pub fn error(&self, kept: impl std::fmt::Display) -> Error {
+        Error::stopped(kept).with_kind(self.requested().unwrap_or(ErrorKind::Interrupted))
     }
 
     /// What to end the process with now, though nothing has come to its end. `None` while a stage that saves has
@@ -54,7 +59,7 @@ impl Stop {
     ///
     /// Nothing is lost by it that a stop would have kept: files are written aside and renamed, and only learning can
     /// go on in the middle of a stage.
-    pub fn abandon(&self, patience: Duration) -> Option<Failure> {
+    pub fn abandon(&self, patience: Duration) -> Option<Error> {
         let work = self.lock();
         if work.since.is_some_and(|t| t.elapsed() < patience) {
             return None;
@@ -63,13 +68,10 @@ impl Stop {
             Some((progress, saves)) if *saves && progress.has_stepped() => None,
             Some((progress, _)) => {
                 progress.stopped();
-                let failure = Failure::stopped(self);
-                Some(Failure {
-                    error: format!("stage `{}`: {}", progress.stage(), failure.error).into(),
-                    ..failure
-                })
+                let stage = format!("stage `{}`", progress.stage());
+                Some(self.error("what is complete is kept").within(stage))
             }
-            None => Some(Failure { hint: String::new(), ..Failure::stopped_at(self, "before its end") }),
+            None => Some(self.error("before its end").with_hint("")),
         }
     }
 
@@ -97,8 +99,8 @@ mod tests {
     fn a_stop_request_keeps_the_signal_that_made_it() {
         let stop = Stop::new();
         assert_eq!(stop.requested(), None);
-        stop.clone().request(Exit::Terminated); // clones share
-        assert_eq!(stop.requested(), Some(Exit::Terminated));
-        assert_eq!(Failure::stopped(&stop).exit.code(), 143);
+        stop.clone().request(ErrorKind::Terminated); // clones share
+        assert_eq!(stop.requested(), Some(ErrorKind::Terminated));
+        assert_eq!(stop.error("x").kind().code(), 143);
     }
 }

@@ -1,6 +1,7 @@
 //! Why a radiance field cannot be had.
 
-use crate::field::{self, DeviceError};
+use crate::Error;
+use crate::field;
 use crate::io::{ReadError, WriteError};
 use crate::tface::th::ThError;
 use std::path::PathBuf;
@@ -11,7 +12,7 @@ use std::path::PathBuf;
 pub enum TfaceError {
     /// The device cannot train.
     #[error(transparent)]
-    Device(#[from] DeviceError),
+    Device(#[from] Error),
     /// Nothing to learn from.
     #[error("no training view has a pixel to learn from (masks empty, or everything marked invalid)")]
     NoPixels,

@@ -16,12 +16,12 @@
 
 use super::train::{self, TrainReport};
 use super::{TFace, TfaceError, VmPixel};
+use crate::Monitor;
 use crate::config::VmConfig;
 use crate::field::pixels::TrainView;
 use crate::geom::{Aabb, Ray};
 use crate::io;
 use crate::kernel::march::Bitmask;
-use crate::run::Monitor;
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 
@@ -139,9 +139,9 @@ impl Monitor for Part<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Quiet;
     use crate::config::Preset;
     use crate::field::ball::{StopAfter, hull, temporary, views};
-    use crate::run::Quiet;
     use std::sync::Mutex;
 
     const BOX: Aabb = Aabb { min: Vec3::splat(-0.8), max: Vec3::splat(0.8) };

@@ -166,6 +166,8 @@ pub enum ThError {
     },
 }
 
+crate::error::error_from!(ThError, Cannot);
+
 impl ThError {
     /// The way out.
     pub fn hint(&self) -> String {

@@ -1,11 +1,11 @@
 //! Training on an analytic ball: does it learn, resume, guard and stop?
 
 use super::*;
+use crate::Quiet;
 use crate::config::{DensityActivation, Preset};
 use crate::field::ball::{BALL, StopAfter, hull, negative, says, tampered, temporary, views};
 use crate::io::Tensors;
 use crate::kernel::vm::size_for;
-use crate::run::Quiet;
 use crate::tface::TFace;
 use glam::{Vec2, Vec3};
 

@@ -15,8 +15,8 @@ use super::overlap::{THOROUGH, overlaps};
 use super::patch::{NONE, neighbours, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
+use crate::Monitor;
 use crate::geom::Mesh;
-use crate::run::Monitor;
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -189,7 +189,7 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &Flattened) -> Vec<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::Quiet;
+    use crate::Quiet;
     use glam::Vec3;
 
     /// `n` × `n` unit squares, two triangles each, with heights.

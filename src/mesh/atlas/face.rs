@@ -11,8 +11,8 @@ use super::library::{Flattened, STRETCHED, flatten};
 use super::patch::{NONE, area, neighbours, part, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
+use crate::Monitor;
 use crate::geom::Mesh;
-use crate::run::Monitor;
 use glam::Vec3;
 
 /// The deepest plane lies so far behind the foremost point, in parts of the mesh's depth; the others are closer by
@@ -124,7 +124,7 @@ fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<boo
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::Quiet;
+    use crate::Quiet;
 
     /// A closed ball around the origin, a bump like a nose at its front (+z) and a dent below it.
     fn ball() -> Mesh {

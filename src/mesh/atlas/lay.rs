@@ -12,8 +12,8 @@ use super::pack::pack;
 use super::patch::{neighbours, part};
 use super::planar::planar;
 use super::{AtlasConfig, Laid, Refusal, Unwrap};
+use crate::Monitor;
 use crate::geom::{Atlas, Mesh};
-use crate::run::Monitor;
 use glam::{DVec2, Vec2};
 
 /// Thinner than this, in texels, and rounding to f32 could turn a triangle: eight times the distance of two

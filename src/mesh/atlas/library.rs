@@ -3,8 +3,8 @@
 
 use super::Refusal;
 use super::flat::Flat;
+use crate::Monitor;
 use crate::geom::Mesh;
-use crate::run::Monitor;
 use glam::DVec2;
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -153,7 +153,7 @@ fn words(panic: &(dyn std::any::Any + Send)) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::Quiet;
+    use crate::Quiet;
     use glam::Vec3;
 
     /// Four unit squares in a row, folded up by a little each.

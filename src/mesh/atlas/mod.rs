@@ -25,8 +25,8 @@ mod squares;
 
 use super::MeshError;
 use super::uv_check::{UvReport, seams_facing, uv_check};
+use crate::Monitor;
 use crate::geom::{Atlas, Mesh};
-use crate::run::Monitor;
 use glam::Vec3;
 use lay::Library;
 use serde::{Deserialize, Serialize};

@@ -5,8 +5,8 @@
 
 use super::flat::widest;
 use super::{Laid, Refusal, Unwrap};
+use crate::Monitor;
 use crate::geom::{Atlas, Mesh};
-use crate::run::Monitor;
 use glam::{DVec2, Vec2};
 
 /// The shortest leg worth having, in texels.
@@ -58,9 +58,9 @@ impl Unwrap for HalfSquares {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Quiet;
     use crate::mesh::atlas::AtlasConfig;
     use crate::mesh::uv_check::uv_check;
-    use crate::run::Quiet;
     use glam::Vec3;
 
     fn heap(count: u32) -> Mesh {

@@ -1,8 +1,8 @@
 //! Hard meshes, and ways that fail.
 
 use super::*;
+use crate::Quiet;
 use crate::mesh::uv_check::uv_check;
-use crate::run::Quiet;
 use std::f32::consts::{PI, TAU};
 use std::sync::atomic::{AtomicU64, Ordering};
 

@@ -21,9 +21,9 @@ pub use light::{Learned, seen_colors};
 pub use seams::Seams;
 
 use super::MeshError;
+use crate::Monitor;
 use crate::geom::{Atlas, Bvh, Camera, Mesh};
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
-use crate::run::Monitor;
 use cover::{Bands, Sample};
 use glam::{Mat3, Vec3};
 use light::{Eyes, Points, settle, shade};
@@ -244,7 +244,7 @@ impl Totals {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::Quiet;
+    use crate::Quiet;
     use glam::Vec2;
 
     /// A latitude-longitude sphere of radius 0.5 (coarse), with a seam.

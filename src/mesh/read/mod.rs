@@ -91,6 +91,8 @@ pub enum ReadMeshError {
     },
 }
 
+crate::error::error_from!(ReadMeshError, Cannot);
+
 impl ReadMeshError {
     /// The way out.
     pub fn hint(&self) -> &'static str {

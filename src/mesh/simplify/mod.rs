@@ -32,8 +32,8 @@ mod round;
 
 use super::MeshError;
 use super::polish::angle_weighted_normals;
+use crate::Monitor;
 use crate::geom::Mesh;
-use crate::run::Monitor;
 use bounded::bounded;
 use crossing::crossings;
 use fit::Field;

@@ -6,10 +6,10 @@ use super::fit::{Field, ask, middles, move_to, newton, offsets, reaches};
 use super::queue::{Entry, Queue};
 use super::rings::{BORDER, CROWDED, HELD, Rings};
 use super::{Placement, SimplifyConfig, SimplifyReport};
+use crate::Monitor;
 use crate::geom::{Aabb, Mesh};
 use crate::mesh::MeshError;
 use crate::mesh::polish::angle_weighted_normals;
-use crate::run::Monitor;
 use glam::Vec3;
 
 /// How many times the next round's triangles one round leaves. Three rounds instead of one take the worst

@@ -2,9 +2,9 @@
 
 use super::crossing::crossings;
 use super::*;
+use crate::Quiet;
 use crate::geom::{Topology, topology};
 use crate::mesh::{Volume, marching};
-use crate::run::Quiet;
 
 type Answer = (Vec<f32>, Vec<Vec3>);
 

@@ -54,6 +54,8 @@ pub enum MaskNetworkError {
     },
 }
 
+crate::error::error_from!(MaskNetworkError, Cannot);
+
 impl MaskNetworkError {
     pub(in crate::mask::networks) fn file(
         path: &Path,
