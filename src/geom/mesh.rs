@@ -42,6 +42,22 @@ impl Mesh {
             && edges.iter().all(|(&(a, b), &n)| a != b && n == 1 && edges.get(&(b, a)) == Some(&1))
     }
 
+    /// Unit vertex normals, weighted by the angles of the triangles at each vertex (Thürmer, Wüthrich 1998); +z
+    /// where all of them are degenerate.
+    pub fn angle_weighted_normals(&self) -> Vec<Vec3> {
+        let mut sums = vec![Vec3::ZERO; self.positions.len()];
+        for t in &self.triangles {
+            let [a, b, c] = t.map(|v| self.positions[v as usize]);
+            let normal = (b - a).cross(c - a).normalize_or_zero();
+            for k in 0..3 {
+                let [p, q, r] = [0, 1, 2].map(|o| self.positions[t[(k + o) % 3] as usize]);
+                let (u, v) = ((q - p).normalize_or_zero(), (r - p).normalize_or_zero());
+                sums[t[k] as usize] += u.dot(v).clamp(-1.0, 1.0).acos() * normal;
+            }
+        }
+        sums.into_iter().map(|n| n.normalize_or(Vec3::Z)).collect()
+    }
+
     /// Enclosed volume, signed: positive when triangles are wound outward. f64 sum.
     pub fn signed_volume(&self) -> f64 {
         let sum: f64 = (0..self.triangles.len() as u32)
@@ -81,6 +97,26 @@ mod tests {
         let m = tetrahedron();
         assert!(m.is_closed());
         assert!((m.signed_volume() - 1.0 / 6.0).abs() < 1e-7);
+    }
+
+    #[test]
+    fn vertex_normals_of_an_octahedron_point_away_from_its_middle() {
+        let m = Mesh {
+            positions: vec![Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z],
+            triangles: vec![
+                [0, 1, 2],
+                [1, 3, 2],
+                [3, 4, 2],
+                [4, 0, 2],
+                [1, 0, 5],
+                [3, 1, 5],
+                [4, 3, 5],
+                [0, 4, 5],
+            ],
+            ..Mesh::default()
+        };
+        let n = m.angle_weighted_normals();
+        assert!(n.iter().zip(&m.positions).all(|(n, p)| n.distance(*p) < 1e-6));
     }
 
     #[test]

@@ -1,20 +1,28 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
 mod aabb;
+mod apart;
 mod atlas;
+mod boxes;
 mod bvh;
 mod camera;
+mod intersect;
 mod mesh;
+mod overlap;
 mod ray;
 mod similarity;
 mod symmetric;
 mod topology;
 
 pub use aabb::Aabb;
+pub(crate) use apart::{Side, nearest_charts};
 pub use atlas::Atlas;
+pub(crate) use boxes::{Boxes, EFFORT, Effort, Span, share_out};
 pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion};
+pub(crate) use intersect::intersect;
 pub use mesh::Mesh;
+pub(crate) use overlap::{THOROUGH, overlaps, shared_area, turn};
 pub use ray::{Hit, Ray};
 pub use similarity::Similarity;
 pub(crate) use symmetric::cofactors;

@@ -11,11 +11,8 @@
 //!
 //! Texels are square even where the texture is not: all of it is measured in texels.
 
-use super::atlas::apart::{Side, nearest_charts};
-use super::atlas::overlap::{overlaps, shared_area, turn};
-use super::boxes::EFFORT;
 use super::read::places;
-use crate::geom::{Atlas, Mesh, Sets};
+use crate::geom::{Atlas, EFFORT, Mesh, Sets, Side, nearest_charts, overlaps, shared_area, turn};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;

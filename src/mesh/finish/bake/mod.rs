@@ -20,10 +20,10 @@ pub use detail::tangent_space;
 pub use light::{Learned, seen_colors};
 pub use seams::Seams;
 
-use super::MeshError;
 use crate::Monitor;
 use crate::geom::{Atlas, Bvh, Camera, Mesh};
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
+use crate::mesh::MeshError;
 use cover::{Bands, Sample};
 use glam::{Mat3, Vec3};
 use light::{Eyes, Points, settle, shade};

@@ -8,9 +8,9 @@
 //!
 //! An exact zero is outside, `-0.0` too.
 
-use super::MeshError;
 use super::marching_bits::{Bits, crossings, for_each_active};
 use super::marching_cell::{CASES, CellSurface, INNER, crossing, resolve};
+use crate::mesh::MeshError;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::borrow::Cow;

@@ -1,8 +1,8 @@
 //! Did the sparse extraction lose anything? The dense grid knows.
 
-use super::MeshError;
 use super::marching::{Volume, marching};
 use super::sparse::Grid;
+use crate::mesh::MeshError;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 

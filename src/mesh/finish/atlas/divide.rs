@@ -11,12 +11,11 @@
 use super::Refusal;
 use super::flat::Flat;
 use super::library::{Flattened, STRETCHED, flatten};
-use super::overlap::{THOROUGH, overlaps};
 use super::patch::{NONE, neighbours, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
 use crate::Monitor;
-use crate::geom::Mesh;
+use crate::geom::{Mesh, THOROUGH, overlaps};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 use std::collections::HashMap;

@@ -5,10 +5,10 @@
 //! vertex on a block's border has one owner and one index: the block's first plus a count of bits before
 //! it. Nothing is merged by distance.
 
-use super::MeshError;
 use super::marching::{Surface, cell_point, edge_point, sided};
 use super::marching_cell::{CASES, CellSurface, EDGES, INNER, crossed, crossing, resolve};
 use super::sparse::Grid;
+use crate::mesh::MeshError;
 use glam::Vec3;
 use rayon::prelude::*;
 

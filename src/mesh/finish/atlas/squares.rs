@@ -59,7 +59,7 @@ impl Unwrap for HalfSquares {
 mod tests {
     use super::*;
     use crate::Quiet;
-    use crate::mesh::atlas::AtlasConfig;
+    use crate::mesh::finish::atlas::AtlasConfig;
     use crate::mesh::uv_check::uv_check;
     use glam::Vec3;
 

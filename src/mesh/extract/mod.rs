@@ -1,15 +1,106 @@
 //! The stage: from a signed distance to a closed mesh with normals and colours.
 
-use super::handles::{HandleReport, Patches, cut_handles};
-use super::polish::{Polish, angle_weighted_normals};
-use super::sparse::{Asking, Grid, Sparse, sparse};
-use super::verify::{Verified, dense_triangles};
-use super::{CleanReport, MeshConfig, MeshError, clean};
+mod cap;
+mod clean;
+mod handles;
+mod holes;
+mod loops;
+mod marching;
+mod marching_bits;
+mod marching_cell;
+mod polish;
+mod sparse;
+mod sparse_blocks;
+mod verify;
+
+pub use cap::{Cap, Skin};
+pub use clean::{CleanReport, clean};
+pub use handles::{HandleReport, Patches};
+pub use marching::{Surface, Volume, marching};
+pub use sparse::{Asking, Grid, Sparse, sparse};
+pub use verify::Verified;
+
+use super::MeshError;
 use crate::Monitor;
 use crate::geom::{Aabb, Mesh, Topology, topology};
 use glam::Vec3;
+use handles::cut_handles;
+use polish::Polish;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
+use verify::dense_triangles;
+
+/// How the surface is extracted.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MeshConfig {
+    /// Cells along the longest side of the box; 2..=8192.
+    pub resolution: usize,
+    /// Every how many cells the field is asked first: 2, 4 or 8. Smaller finds smaller loose pieces.
+    pub coarse_step: usize,
+    /// Most points in one call of the field; at least 1.
+    pub batch: usize,
+    /// Pieces beside the largest stay when they have at least this share of its volume; 0..=1, where 1
+    /// keeps the largest alone.
+    pub keep_share: f64,
+    /// Newton steps that move vertices onto the field's zero; 0..=8, 0 leaves them where they are.
+    pub newton_steps: usize,
+    /// How far vertices slide towards the middle of their neighbours with the first step; 0..=1.
+    pub relax: f32,
+    /// Handles are cut, or their holes filled, where they have a loop no longer than this share of the surface's
+    /// longest side; 0..=1, 0 leaves them all.
+    pub longest_handle: f32,
+    /// Also evaluate the whole grid and report what the sparse extraction lost: slow, for checking.
+    pub verify: bool,
+}
+
+/// The loops of locks and between them, not those of a body: 45 mm of a head with its neck, 300 mm long, which
+/// is a strand or a hole as thick as a thumb. A share, since not every capture knows its unit.
+pub const LONGEST_HANDLE: f32 = 0.15;
+
+impl Default for MeshConfig {
+    fn default() -> MeshConfig {
+        MeshConfig {
+            resolution: 512,
+            coarse_step: 8,
+            batch: 1 << 16,
+            keep_share: 1.0,
+            newton_steps: 2,
+            relax: 0.5,
+            longest_handle: LONGEST_HANDLE,
+            verify: false,
+        }
+    }
+}
+
+impl MeshConfig {
+    /// Every value in its range, else [`MeshError::Config`] that names the key.
+    pub fn check(&self) -> Result<(), MeshError> {
+        let bad = |key, expected, found: String| Err(MeshError::Config { key, expected, found });
+        if !(2..=8192).contains(&self.resolution) {
+            return bad("resolution", "2..=8192", self.resolution.to_string());
+        }
+        if ![2, 4, 8].contains(&self.coarse_step) {
+            return bad("coarse_step", "2, 4 or 8", self.coarse_step.to_string());
+        }
+        if self.batch == 0 {
+            return bad("batch", "at least 1", self.batch.to_string());
+        }
+        if !(0.0..=1.0).contains(&self.keep_share) {
+            return bad("keep_share", "0..=1", self.keep_share.to_string());
+        }
+        if self.newton_steps > 8 {
+            return bad("newton_steps", "0..=8", self.newton_steps.to_string());
+        }
+        if !(0.0..=1.0).contains(&self.relax) {
+            return bad("relax", "0..=1", self.relax.to_string());
+        }
+        if !(0.0..=1.0).contains(&self.longest_handle) {
+            return bad("longest_handle", "0..=1", self.longest_handle.to_string());
+        }
+        Ok(())
+    }
+}
 
 /// What [`extract`] found and did.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -176,7 +267,7 @@ pub fn extract(
         gradients = gradient(&mesh.positions)?.1;
     }
 
-    mesh.normals = angle_weighted_normals(&mesh.positions, &mesh.triangles);
+    mesh.normals = mesh.angle_weighted_normals();
     for (i, normal) in mesh.normals.iter_mut().enumerate() {
         let g = gradients[i];
         if !edged[i] && g.is_finite() && g.length() >= 1e-6 {
@@ -274,6 +365,9 @@ fn off_surface(values: &[f32], gradients: &[Vec3], capped: &[bool], cell: f32) -
     let (sum, n) = distances.fold((0.0, 0usize), |(s, n), d| (s + d, n + 1));
     if n > 0 { sum / n as f64 } else { 0.0 }
 }
+
+#[cfg(test)]
+mod handles_tests;
 
 #[cfg(test)]
 mod tests {

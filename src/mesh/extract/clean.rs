@@ -4,9 +4,9 @@
 //! become several; small holes are closed; then whole pieces by their signed volume. Nothing here opens a closed
 //! mesh of sound pieces: only whole pieces, or faces that cancel, are removed.
 
-use super::MeshError;
 use super::holes::fill_holes;
 use crate::geom::{Mesh, Sets, fans, sorted_sides};
+use crate::mesh::MeshError;
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 

@@ -14,10 +14,10 @@
 //! which `outside` says so, without asking the field. Waves of a flood that starts everywhere are few
 //! and large, so that the field is asked thousands of points at a time.
 
-use super::MeshError;
 use super::marching::Surface;
 use super::sparse_blocks::Blocks;
 use crate::geom::Aabb;
+use crate::mesh::MeshError;
 use glam::{DVec3, Vec3};
 
 /// Cubic cells over a box.

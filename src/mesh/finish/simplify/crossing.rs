@@ -5,7 +5,7 @@
 
 use super::rings::{NONE, Rings};
 use crate::geom::Aabb;
-use crate::mesh::check::intersect;
+use crate::geom::intersect;
 use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 

@@ -8,13 +8,11 @@
 //! Every triangle of the result has area, none is flipped, no two share any, and charts keep their distance: that
 //! is looked at, exactly, before an atlas is returned.
 
-pub(super) mod apart;
 mod divide;
 mod face;
 mod flat;
 mod lay;
 mod library;
-pub(super) mod overlap;
 mod pack;
 mod patch;
 mod planar;
@@ -23,10 +21,10 @@ mod relax;
 mod smooth;
 mod squares;
 
-use super::MeshError;
-use super::uv_check::{UvReport, seams_facing, uv_check};
 use crate::Monitor;
 use crate::geom::{Atlas, Mesh};
+use crate::mesh::MeshError;
+use crate::mesh::uv_check::{UvReport, seams_facing, uv_check};
 use glam::Vec3;
 use lay::Library;
 use serde::{Deserialize, Serialize};

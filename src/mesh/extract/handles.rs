@@ -15,12 +15,12 @@
 //! A loop whose discs would meet the surface is no place to cut (another strand may run through the hole): the
 //! next best is taken, and without any the handle stays and is counted.
 
-use super::MeshError;
-use super::boxes::{Boxes, Effort, Span};
-use super::check::intersect;
 use super::holes::least_area;
 use super::loops::{Loop, Loops};
+use crate::geom::intersect;
 use crate::geom::{Aabb, Bvh, Mesh, Sets};
+use crate::geom::{Boxes, Effort, Span};
+use crate::mesh::MeshError;
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, HashMap};

@@ -30,10 +30,9 @@ mod queue;
 mod rings;
 mod round;
 
-use super::MeshError;
-use super::polish::angle_weighted_normals;
 use crate::Monitor;
 use crate::geom::Mesh;
+use crate::mesh::MeshError;
 use bounded::bounded;
 use crossing::crossings;
 use fit::Field;
@@ -224,7 +223,7 @@ pub fn simplify(
         }
     }
     if field.is_none() && !mesh.normals.is_empty() {
-        out.normals = angle_weighted_normals(&out.positions, &out.triangles);
+        out.normals = out.angle_weighted_normals();
     }
     *mesh = out;
     report.after = mesh.triangles.len();

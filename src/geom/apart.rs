@@ -1,6 +1,6 @@
 //! How far the charts of an atlas are apart.
 
-use crate::mesh::boxes::{Boxes, EFFORT, Span, share_out};
+use crate::geom::{Boxes, EFFORT, Span, share_out};
 use glam::DVec2;
 
 /// A piece of a chart's outline, in texels.

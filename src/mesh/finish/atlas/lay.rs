@@ -7,13 +7,12 @@ use super::divide::divide;
 use super::face::divide_around;
 use super::flat::{Flat, height};
 use super::library::Flattened;
-use super::overlap::{THOROUGH, overlaps, turn};
 use super::pack::pack;
 use super::patch::{neighbours, part};
 use super::planar::planar;
 use super::{AtlasConfig, Laid, Refusal, Unwrap};
 use crate::Monitor;
-use crate::geom::{Atlas, Mesh};
+use crate::geom::{Atlas, Mesh, THOROUGH, overlaps, turn};
 use glam::{DVec2, Vec2};
 
 /// Thinner than this, in texels, and rounding to f32 could turn a triangle: eight times the distance of two

@@ -133,21 +133,6 @@ fn area_vector(positions: &[Vec3], t: &[u32; 3]) -> Vec3 {
     (b - a).cross(c - a)
 }
 
-/// Unit normals weighted by the faces' angles at each vertex (Thürmer, Wüthrich 1998); +z where all
-/// faces are degenerate.
-pub(super) fn angle_weighted_normals(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<Vec3> {
-    let mut sums = vec![Vec3::ZERO; positions.len()];
-    for t in triangles {
-        let normal = area_vector(positions, t).normalize_or_zero();
-        for k in 0..3 {
-            let [p, q, r] = [0, 1, 2].map(|o| positions[t[(k + o) % 3] as usize]);
-            let (u, v) = ((q - p).normalize_or_zero(), (r - p).normalize_or_zero());
-            sums[t[k] as usize] += u.dot(v).clamp(-1.0, 1.0).acos() * normal;
-        }
-    }
-    sums.into_iter().map(|n| n.normalize_or(Vec3::Z)).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -201,12 +186,5 @@ mod tests {
         polish.step(&mut p, &[f32::NAN; 6], &[Vec3::X; 6], 0.5);
         polish.step(&mut p, &[1.0; 6], &[Vec3::ZERO; 6], 0.5);
         assert_eq!(p, octahedron().0);
-    }
-
-    #[test]
-    fn face_normals_of_an_octahedron_point_away_from_its_middle() {
-        let (p, t) = octahedron();
-        let n = angle_weighted_normals(&p, &t);
-        assert!(n.iter().zip(&p).all(|(n, p)| n.distance(*p) < 1e-6));
     }
 }

@@ -10,29 +10,29 @@ use rayon::prelude::*;
 
 /// What may be spent on each item on average, in comparisons of boxes of two or three nanoseconds. A triangle of a
 /// sound mesh takes half of it or less.
-pub(super) const EFFORT: usize = 1024;
+pub(crate) const EFFORT: usize = 1024;
 
 /// As many items' effort may be spent however few there are: two thousand triangles in one place are no reason.
 const ALWAYS: usize = 1 << 15;
 
 /// What one item may still spend.
-pub(super) struct Effort {
+pub(crate) struct Effort {
     left: usize,
     short: bool,
 }
 
 impl Effort {
-    pub(super) fn of(left: usize) -> Effort {
+    pub(crate) fn of(left: usize) -> Effort {
         Effort { left, short: false }
     }
 
     /// Was too little left for something?
-    pub(super) fn ran_short(&self) -> bool {
+    pub(crate) fn ran_short(&self) -> bool {
         self.short
     }
 
     /// Spends, or returns false from the first time that too little is left.
-    pub(super) fn spend(&mut self, cost: usize) -> bool {
+    pub(crate) fn spend(&mut self, cost: usize) -> bool {
         self.short |= self.left < cost;
         self.left = if self.short { 0 } else { self.left - cost };
         !self.short
@@ -40,17 +40,17 @@ impl Effort {
 }
 
 /// What [`share_out`] found.
-pub(super) struct Shared<T> {
+pub(crate) struct Shared<T> {
     /// One for each item; of those that were not finished, what they have so far.
-    pub(super) found: Vec<T>,
+    pub(crate) found: Vec<T>,
     /// Who ran short, in order.
-    pub(super) unfinished: Vec<usize>,
+    pub(crate) unfinished: Vec<usize>,
     /// What was spent on all together.
-    pub(super) spent: usize,
+    pub(crate) spent: usize,
 }
 
 /// Does `work` for each item, with `each` to spend on average and no more than that on all.
-pub(super) fn share_out<T: Send>(
+pub(crate) fn share_out<T: Send>(
     items: usize,
     each: usize,
     work: impl Fn(usize, &mut Effort) -> T + Sync,
@@ -88,7 +88,7 @@ pub(super) fn share_out<T: Send>(
 
 /// A box along the axes.
 #[derive(Clone, Copy)]
-pub(super) struct Span {
+pub(crate) struct Span {
     low: DVec3,
     high: DVec3,
 }
@@ -96,11 +96,11 @@ pub(super) struct Span {
 impl Span {
     const EMPTY: Span = Span { low: DVec3::INFINITY, high: DVec3::NEG_INFINITY };
 
-    pub(super) fn around(points: impl IntoIterator<Item = DVec3>) -> Span {
+    pub(crate) fn around(points: impl IntoIterator<Item = DVec3>) -> Span {
         points.into_iter().fold(Span::EMPTY, |s, p| Span { low: s.low.min(p), high: s.high.max(p) })
     }
 
-    pub(super) fn grown(self, margin: f64) -> Span {
+    pub(crate) fn grown(self, margin: f64) -> Span {
         Span { low: self.low - margin, high: self.high + margin }
     }
 
@@ -123,7 +123,7 @@ const LEAF: usize = 4;
 
 /// Boxes in a balanced tree: each node holds half of its parent's, parted across the longest side. Its depth does
 /// not depend on where they are.
-pub(super) struct Boxes {
+pub(crate) struct Boxes {
     /// In the order of the tree, with their numbers.
     items: Vec<(Span, u32)>,
     /// A node, then those below its first half, then those below its second.
@@ -131,7 +131,7 @@ pub(super) struct Boxes {
 }
 
 impl Boxes {
-    pub(super) fn new(spans: impl Iterator<Item = Span>) -> Boxes {
+    pub(crate) fn new(spans: impl Iterator<Item = Span>) -> Boxes {
         let mut items: Vec<(Span, u32)> = spans.zip(0..).collect();
         let leaves = items.len().div_ceil(LEAF).next_power_of_two();
         let mut nodes = vec![Span::EMPTY; 2 * leaves - 1];
@@ -140,12 +140,12 @@ impl Boxes {
     }
 
     /// The numbers of the boxes, neighbours mostly beside each other.
-    pub(super) fn order(&self) -> impl Iterator<Item = u32> {
+    pub(crate) fn order(&self) -> impl Iterator<Item = u32> {
         self.items.iter().map(|&(_, i)| i)
     }
 
     /// Calls `visit` with every box that meets `query`, until it returns false or the effort is spent.
-    pub(super) fn meeting(
+    pub(crate) fn meeting(
         &self,
         query: &Span,
         effort: &mut Effort,

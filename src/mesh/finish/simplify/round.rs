@@ -9,7 +9,6 @@ use super::{Placement, SimplifyConfig, SimplifyReport};
 use crate::Monitor;
 use crate::geom::{Aabb, Mesh};
 use crate::mesh::MeshError;
-use crate::mesh::polish::angle_weighted_normals;
 use glam::Vec3;
 
 /// How many times the next round's triangles one round leaves. Three rounds instead of one take the worst
@@ -264,7 +263,7 @@ pub(super) fn settle(
         report.held_back += without_crossings(&mut mesh.positions, &mesh.triangles, &start);
     }
     if last {
-        mesh.normals = angle_weighted_normals(&mesh.positions, &mesh.triangles);
+        mesh.normals = mesh.angle_weighted_normals();
         for (normal, g) in mesh.normals.iter_mut().zip(&gradients) {
             if g.is_finite() && g.length() >= 1e-6 {
                 *normal = g.normalize_or(*normal);

@@ -1,9 +1,10 @@
 //! Handles of known fields, through the whole extraction.
 
-use super::check::check;
-use super::{MeshConfig, MeshReport, Patches, SimplifyConfig, extract, simplify};
+use super::{MeshConfig, MeshReport, Patches, extract};
 use crate::Quiet;
 use crate::geom::{Aabb, Mesh, topology};
+use crate::mesh::check::check;
+use crate::mesh::{SimplifyConfig, simplify};
 use glam::Vec3;
 
 /// The surface of a field with 64 cells along the box; loops up to a share of its longest side go.

@@ -5,7 +5,7 @@
 //! of f32 coordinates, in f64 with Shewchuk's error bound (1997), and where that cannot tell, as the exact sum
 //! of its six products. So triangles that share a side or a corner, or merely touch, never count.
 
-use crate::mesh::boxes::{Boxes, Span, share_out};
+use crate::geom::{Boxes, Span, share_out};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
@@ -160,7 +160,7 @@ pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effor
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::boxes::EFFORT;
+    use crate::geom::EFFORT;
 
     fn at(p: [f32; 6]) -> [Vec2; 3] {
         [Vec2::new(p[0], p[1]), Vec2::new(p[2], p[3]), Vec2::new(p[4], p[5])]

@@ -1,0 +1,8 @@
+//! From the extracted surface to the mesh an artist opens: fewer triangles, an atlas, textures.
+
+mod atlas;
+pub mod bake;
+mod simplify;
+
+pub use atlas::{AtlasConfig, AtlasReport, atlas};
+pub use simplify::{Placement, SimplifyConfig, SimplifyReport, simplify};
