@@ -15,7 +15,7 @@ use glam::Vec3;
 use process::cpu_s;
 use tiface::Quiet;
 use tiface::geom::{Aabb, Mesh};
-use tiface::mesh::uv_check::{seams_facing, uv_check};
+use tiface::mesh::files::{seams_facing, uv_check};
 use tiface::mesh::{AtlasConfig, MeshConfig, atlas, extract};
 
 fn head(resolution: usize) -> Mesh {

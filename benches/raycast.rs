@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
     }
     let mesh = match &given {
-        Some(path) => tiface::mesh::read::read(&std::fs::read(path)?, path)?,
+        Some(path) => tiface::mesh::files::read(&std::fs::read(path)?, path)?,
         None => head(129),
     };
     rayon::ThreadPoolBuilder::new().num_threads(1).build_global()?;
@@ -56,7 +56,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     if let Some(folder) = dump {
         std::fs::create_dir_all(&folder)?;
-        std::fs::write(folder.join("mesh.ply"), tiface::mesh::ply::to_ply(&mesh)?)?;
+        std::fs::write(folder.join("mesh.ply"), tiface::mesh::files::to_ply(&mesh)?)?;
         write_rays(&folder.join("primary.f32"), &primary)?;
         write_rays(&folder.join("random.f32"), &random)?;
     }

@@ -20,7 +20,8 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 use tiface::Quiet;
 use tiface::geom::Mesh;
-use tiface::mesh::{Placement, SimplifyConfig, Volume, check, marching, simplify};
+use tiface::mesh::files::check;
+use tiface::mesh::{Placement, SimplifyConfig, Volume, marching, simplify};
 
 /// Runs of which the fastest counts: what else the machine does only ever adds.
 const RUNS: usize = 5;
@@ -85,7 +86,7 @@ fn error(mesh: &Mesh) -> (f64, f64) {
 
 fn show(name: &str, ms: Option<(f64, f64)>, mesh: &Mesh) {
     let (mean, worst) = error(mesh);
-    let r = check::check(mesh, 1.0);
+    let r = check(mesh, 1.0);
     let time = ms.map_or(String::new(), |(all, field)| format!("{all:.1} ms ({field:.1} in the field)"));
     println!(
         "{name:<22} {:>7} triangles  {time:<32} mean {mean:.4} worst {worst:.3}  slivers {:.3} %  {}, Euler {}, {} self-intersect",

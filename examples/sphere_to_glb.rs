@@ -8,7 +8,7 @@
 use glam::Vec3;
 use std::path::PathBuf;
 use tiface::geom::Mesh;
-use tiface::mesh::{check::check, export::ExportOptions, gltf::to_glb, obj::to_obj, ply::to_ply};
+use tiface::mesh::files::{ExportOptions, check, to_glb, to_obj, to_ply};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = PathBuf::from(std::env::args().nth(1).unwrap_or_else(|| ".".into()));

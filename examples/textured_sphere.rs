@@ -9,10 +9,8 @@ use glam::{Vec2, Vec3};
 use std::f32::consts::{PI, TAU};
 use tiface::geom::{Atlas, Mesh};
 use tiface::image::Photo;
-use tiface::mesh::textured::{Lobe, TextureOptions, Textured};
-use tiface::mesh::{
-    export::ExportOptions, gltf::textured_to_glb, obj::textured_to_obj, ply::textured_to_ply,
-};
+use tiface::mesh::files::{ExportOptions, Lobe, TextureOptions, Textured};
+use tiface::mesh::files::{textured_to_glb, textured_to_obj, textured_to_ply};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = std::path::PathBuf::from(std::env::args().nth(1).unwrap_or_else(|| ".".into()));

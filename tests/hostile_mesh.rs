@@ -6,15 +6,11 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tiface::geom::{Atlas, Mesh, Similarity};
 use tiface::image::Photo;
-use tiface::mesh::check::{CheckReport, check, check_around};
-use tiface::mesh::export::ExportOptions;
-use tiface::mesh::read::{
-    Limits, ReadMeshError, picture_of_mtl, read, read_limited, read_placed, read_whole, weld,
+use tiface::mesh::files::{
+    CheckReport, ExportOptions, Limits, ReadMeshError, Texture, TextureOptions, Textured, check,
+    check_around, picture_of_mtl, placed_to_ply, read, read_limited, read_placed, read_whole,
+    textured_to_glb, textured_to_obj, textured_to_ply, to_glb, to_obj, to_ply, uv_check, weld,
 };
-use tiface::mesh::textured::{TextureOptions, Textured};
-use tiface::mesh::uv_check::uv_check;
-use tiface::mesh::{gltf, obj, ply};
-use tiface::mesh::{gltf::to_glb, obj::to_obj, ply::to_ply};
 
 fn tetrahedron() -> Mesh {
     Mesh {
@@ -375,7 +371,7 @@ fn pictures_that_claim_too_much_are_refused_before_they_are_decoded() {
     // within the limits but more than 13 bytes can hold: named when it is decoded
     let (d, bin) = textured(&png(16_384, 16_384), UVS);
     let whole = read_whole(&glb(&d, &bin), Path::new("a")).unwrap();
-    let Some(tiface::mesh::read::Texture::Inside(bytes)) = whole.texture else { panic!("no picture") };
+    let Some(Texture::Inside(bytes)) = whole.texture else { panic!("no picture") };
     let e = tiface::io::parse_photo(&bytes, Path::new("a"), &tiface::io::Limits::default()).unwrap_err();
     assert!(e.to_string().contains("cannot come from"), "{e}");
 }
@@ -421,10 +417,10 @@ fn a_bent_byte_in_a_textured_file_is_survived() {
     let options = ExportOptions::default();
     let quantized = TextureOptions { quantize: true, ..texture.clone() };
     for out in [
-        gltf::textured_to_glb(&whole, &options, &texture).unwrap(),
-        gltf::textured_to_glb(&whole, &options, &quantized).unwrap(),
-        obj::textured_to_obj(&whole, &options, &texture).unwrap(),
-        ply::textured_to_ply(&whole, &texture).unwrap(),
+        textured_to_glb(&whole, &options, &texture).unwrap(),
+        textured_to_glb(&whole, &options, &quantized).unwrap(),
+        textured_to_obj(&whole, &options, &texture).unwrap(),
+        textured_to_ply(&whole, &texture).unwrap(),
     ] {
         let bytes = &out.files[0].1;
         assert!(read_whole(bytes, Path::new("a")).unwrap().atlas.is_some());
@@ -766,10 +762,10 @@ fn a_head_far_from_the_origin_is_watertight_in_every_format() {
         let files = [
             to_glb(&mesh, &options).unwrap(),
             to_obj(&mesh, &options).unwrap(),
-            ply::placed_to_ply(&mesh, &place).unwrap(),
-            gltf::textured_to_glb(&whole, &options, &texture).unwrap().files.remove(0).1,
-            gltf::textured_to_glb(&whole, &options, &quantized).unwrap().files.remove(0).1,
-            obj::textured_to_obj(&whole, &options, &texture).unwrap().files.remove(0).1,
+            placed_to_ply(&mesh, &place).unwrap(),
+            textured_to_glb(&whole, &options, &texture).unwrap().files.remove(0).1,
+            textured_to_glb(&whole, &options, &quantized).unwrap().files.remove(0).1,
+            textured_to_obj(&whole, &options, &texture).unwrap().files.remove(0).1,
         ];
         for (k, bytes) in files.iter().enumerate() {
             for found in [read_placed(bytes, Path::new("a")), read_whole(bytes, Path::new("a"))] {

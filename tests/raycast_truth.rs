@@ -4,7 +4,7 @@ use exr::prelude::*;
 use glam::{DMat3, DVec3};
 use std::path::{Path, PathBuf};
 use tiface::geom::{Bvh, Camera, Distortion};
-use tiface::mesh::read::read;
+use tiface::mesh::files::read;
 use tiface::render::path::from_json;
 use tiface::render::{RaycastOptions, raycast};
 

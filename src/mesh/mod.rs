@@ -2,22 +2,13 @@
 //!
 //! [`marching`] meshes a dense grid, [`sparse`] asks a field only near its surface, [`clean`] keeps the
 //! head and drops the dust, `handles` makes it simple, [`extract`] is all of it, with normals and colours; [`Cap`] closes what the frames
-//! cut. [`simplify`], [`atlas`] and [`bake`] make of it what an artist opens; [`gltf`], [`obj`] and [`ply`] its
+//! cut. [`simplify`], [`atlas`] and [`bake`] make of it what an artist opens; [`files`] its
 //! files.
 
-pub mod check;
 mod error;
-pub mod export;
 mod extract;
+pub mod files;
 mod finish;
-pub mod gltf;
-mod gltf_document;
-pub mod obj;
-pub mod ply;
-pub mod read;
-pub mod textured;
-pub mod textured_tangents;
-pub mod uv_check;
 
 pub use error::MeshError;
 pub use extract::{

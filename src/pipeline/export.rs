@@ -2,7 +2,7 @@
 
 use crate::config::{MeshFormat, MeshFrame};
 use crate::geom::{Mesh, Similarity};
-use crate::mesh::export::turn_to_y_up;
+use crate::mesh::files::turn_to_y_up;
 use glam::{DMat3, DVec3, Mat3, Vec3};
 
 /// How a mesh is exported from the dataset's world.

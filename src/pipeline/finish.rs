@@ -7,7 +7,7 @@ use crate::capture::scene::Scene;
 use crate::geom::{Camera, Mesh};
 use crate::image::{Image, Photo, quantise, srgb_from_linear};
 use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, bake, tangent_space};
-use crate::mesh::textured_tangents::tangents;
+use crate::mesh::files::tangents;
 use crate::mesh::{AtlasConfig, Cap, MeshError, Patches, SimplifyConfig, atlas, simplify};
 use crate::{Monitor, Result};
 use glam::{Mat3, Vec3};

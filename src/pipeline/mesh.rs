@@ -9,8 +9,8 @@ use crate::config::{Genus, MeshConfig};
 use crate::geom::{Camera, Mesh, Similarity};
 use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
-use crate::mesh::read::ReadMeshError;
-use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshError, Patches, ply};
+use crate::mesh::files::ReadMeshError;
+use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshError, Patches, files};
 use crate::run::Done;
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
@@ -74,7 +74,7 @@ impl Line<'_> {
                 }
             }
             // what took longest is kept, whatever comes of the rest
-            let bytes = ply::placed_to_ply(&surface, &scene.scene_from_world.inverse())?;
+            let bytes = files::placed_to_ply(&surface, &scene.scene_from_world.inverse())?;
             io::write_atomic(&stage.folder().join("surface.ply"), &bytes)?;
             let parts = stage.folder().join("parts");
             let surface_triangles = surface.triangles.len();
@@ -161,7 +161,7 @@ impl Line<'_> {
     pub fn read_mesh(&self) -> Result<Mesh> {
         let path = self.run.path("mesh/surface.ply");
         let bytes = io::read_bytes(&path, &Limits::default())?;
-        mesh::read::read(&bytes, &path).map_err(|e: ReadMeshError| {
+        mesh::files::read(&bytes, &path).map_err(|e: ReadMeshError| {
             let hint = e.hint();
             Error::cannot(e, hint)
         })

@@ -10,9 +10,9 @@ use super::export::Export;
 use crate::config::{MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 use crate::geom::{Atlas, Mesh, Similarity};
 use crate::image::Photo;
-use crate::mesh::export::{ExportError, ExportOptions, distance_warning};
-use crate::mesh::textured::{Exported, Lobe, PictureFormat, TextureOptions, Textured};
-use crate::mesh::{gltf, obj, ply};
+use crate::mesh::files;
+use crate::mesh::files::{ExportError, ExportOptions, distance_warning};
+use crate::mesh::files::{Exported, Lobe, PictureFormat, TextureOptions, Textured};
 use crate::{Error, Result};
 use glam::{Mat3, Vec3};
 use serde_json::{Map, json};
@@ -78,9 +78,9 @@ impl Product {
         };
         let exported = match (pictures, format) {
             // colours at the vertices: one index, so the surface stays closed for whoever reads it
-            (_, MeshFormat::Ply) => alone(ply::placed_to_ply(mesh, world_from_scene)),
-            (None, MeshFormat::Glb) => alone(gltf::to_glb(mesh, &options)),
-            (None, MeshFormat::Obj) => alone(obj::to_obj(mesh, &options)),
+            (_, MeshFormat::Ply) => alone(files::placed_to_ply(mesh, world_from_scene)),
+            (None, MeshFormat::Glb) => alone(files::to_glb(mesh, &options)),
+            (None, MeshFormat::Obj) => alone(files::to_obj(mesh, &options)),
             (Some(p), _) => {
                 let mut textured = Textured::new(mesh, &p.atlas, &p.color);
                 textured.normal = p.normal.as_ref();
@@ -96,8 +96,8 @@ impl Product {
                 };
                 let texture = TextureOptions { stem: stem.into(), picture, quantize: config.quantize };
                 match format {
-                    MeshFormat::Obj => obj::textured_to_obj(&textured, &options, &texture),
-                    _ => gltf::textured_to_glb(&textured, &options, &texture),
+                    MeshFormat::Obj => files::textured_to_obj(&textured, &options, &texture),
+                    _ => files::textured_to_glb(&textured, &options, &texture),
                 }
             }
         };

@@ -3,7 +3,7 @@
 use super::{MeshConfig, MeshReport, Patches, extract};
 use crate::Quiet;
 use crate::geom::{Aabb, Mesh, topology};
-use crate::mesh::check::check;
+use crate::mesh::files::check;
 use crate::mesh::{SimplifyConfig, simplify};
 use glam::Vec3;
 

@@ -24,7 +24,7 @@ mod squares;
 use crate::Monitor;
 use crate::geom::{Atlas, Mesh};
 use crate::mesh::MeshError;
-use crate::mesh::uv_check::{UvReport, seams_facing, uv_check};
+use crate::mesh::files::{UvReport, seams_facing, uv_check};
 use glam::Vec3;
 use lay::Library;
 use serde::{Deserialize, Serialize};

@@ -59,8 +59,8 @@ impl Unwrap for HalfSquares {
 mod tests {
     use super::*;
     use crate::Quiet;
+    use crate::mesh::files::uv_check;
     use crate::mesh::finish::atlas::AtlasConfig;
-    use crate::mesh::uv_check::uv_check;
     use glam::Vec3;
 
     fn heap(count: u32) -> Mesh {

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::Quiet;
-use crate::mesh::uv_check::uv_check;
+use crate::mesh::files::uv_check;
 use std::f32::consts::{PI, TAU};
 use std::sync::atomic::{AtomicU64, Ordering};
 

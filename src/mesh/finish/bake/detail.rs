@@ -69,7 +69,7 @@ mod tests {
         };
         let uvs = at.map(|(x, y)| Vec2::new(x, 1.0 - y)).to_vec();
         let atlas = Atlas { uvs, triangles: mesh.triangles.clone(), width: 4, height: 4 };
-        let tangents = crate::mesh::textured_tangents::tangents(&mesh, &atlas).unwrap();
+        let tangents = crate::mesh::files::tangents(&mesh, &atlas).unwrap();
         let picture = |n: Vec3| {
             let data = (0..16).flat_map(|_| n.normalize().to_array()).collect();
             let normals = Image { width: 4, height: 4, channels: 3, data };

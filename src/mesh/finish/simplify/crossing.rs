@@ -1,7 +1,7 @@
 //! Triangles that pass through others: found in a finished mesh, and refused in the making.
 //!
 //! Triangles are entered into the cells of a grid that their boxes meet. The test of a pair is the one
-//! of `mesh::check`; before it, a triangle strictly on one side of the other's plane is let go.
+//! of `mesh::files::check`; before it, a triangle strictly on one side of the other's plane is let go.
 
 use super::rings::{NONE, Rings};
 use crate::geom::Aabb;
@@ -261,7 +261,7 @@ impl Sheets {
 mod tests {
     use super::*;
     use crate::geom::Mesh;
-    use crate::mesh::check::check;
+    use crate::mesh::files::check;
 
     #[test]
     fn a_soup_has_the_same_crossings_as_the_check_of_meshes() {

@@ -7,17 +7,8 @@
 //! Positions are read in f64. Those of a mesh far from the origin, where f32 steps over its triangles, come around
 //! an origin of their own, see [`ReadMesh::origin`].
 
-mod glb;
-mod glb_texture;
-mod obj;
-mod ply;
-mod weld;
-
-pub use obj::picture_of_mtl;
-pub(super) use weld::places;
-pub use weld::weld;
-
 use super::export::middle;
+use super::{glb_read, obj_read, ply_read};
 use crate::geom::{Atlas, Mesh};
 use glam::{DVec3, Vec3};
 use std::path::{Path, PathBuf};
@@ -157,7 +148,7 @@ pub enum Texture {
     Inside(Vec<u8>),
     /// In a picture of this bare name, in the same folder.
     Beside(String),
-    /// In the picture that [`picture_of_mtl`] finds in the `.mtl` of this bare name, in the same folder.
+    /// In the picture that [`super::picture_of_mtl`] finds in the `.mtl` of this bare name, in the same folder.
     Material(String),
 }
 
@@ -182,12 +173,12 @@ pub fn read_placed(bytes: &[u8], path: &Path) -> Result<ReadMesh, ReadMeshError>
 
 /// What the reader of a format finds: a [`ReadMesh`] whose positions are still the file's.
 #[derive(Default)]
-struct Parsed {
-    positions: Vec<DVec3>,
+pub(super) struct Parsed {
+    pub positions: Vec<DVec3>,
     /// All but the positions.
-    mesh: Mesh,
-    atlas: Option<Atlas>,
-    texture: Option<Texture>,
+    pub mesh: Mesh,
+    pub atlas: Option<Atlas>,
+    pub texture: Option<Texture>,
 }
 
 impl Parsed {
@@ -209,11 +200,11 @@ impl Parsed {
 fn any(bytes: &[u8], path: &Path, limits: &Limits, textures: bool) -> Result<Parsed, ReadMeshError> {
     let source = |format| Source { path, format, limits, textures };
     let whole = if bytes.starts_with(b"glTF") {
-        glb::read(bytes, source("GLB"))?
+        glb_read::read(bytes, source("GLB"))?
     } else if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
-        ply::read(bytes, source("PLY"))?
+        ply_read::read(bytes, source("PLY"))?
     } else if looks_like_obj(bytes) {
-        obj::read(bytes, source("OBJ"))?
+        obj_read::read(bytes, source("OBJ"))?
     } else {
         return Err(ReadMeshError::Unknown { path: path.into() });
     };
@@ -235,26 +226,26 @@ fn looks_like_obj(bytes: &[u8]) -> bool {
 
 /// Which file is read, how much it may ask for, and whether its texture is wanted.
 #[derive(Clone, Copy)]
-struct Source<'a> {
-    path: &'a Path,
-    format: &'static str,
-    limits: &'a Limits,
-    textures: bool,
+pub(super) struct Source<'a> {
+    pub path: &'a Path,
+    pub format: &'static str,
+    pub limits: &'a Limits,
+    pub textures: bool,
 }
 
 impl Source<'_> {
-    fn broken(&self, at: impl Into<String>, what: impl Into<String>) -> ReadMeshError {
+    pub fn broken(&self, at: impl Into<String>, what: impl Into<String>) -> ReadMeshError {
         let (path, format) = (self.path.into(), self.format);
         ReadMeshError::Broken { path, format, at: at.into(), what: what.into() }
     }
 
-    fn unsupported(&self, at: impl Into<String>, feature: impl Into<String>) -> ReadMeshError {
+    pub fn unsupported(&self, at: impl Into<String>, feature: impl Into<String>) -> ReadMeshError {
         let (path, format) = (self.path.into(), self.format);
         ReadMeshError::Unsupported { path, format, at: at.into(), feature: feature.into() }
     }
 
     /// The name of a file in the same folder: no path, no address.
-    fn bare_name(&self, at: impl Into<String>, name: &str) -> Result<String, ReadMeshError> {
+    pub fn bare_name(&self, at: impl Into<String>, name: &str) -> Result<String, ReadMeshError> {
         let name = name.trim();
         let name = name.strip_prefix("./").unwrap_or(name);
         let is_bare = !name.is_empty()
@@ -264,7 +255,7 @@ impl Source<'_> {
     }
 
     /// Are this many vertices and triangles allowed?
-    fn allow(&self, vertices: usize, triangles: usize) -> Result<(), ReadMeshError> {
+    pub fn allow(&self, vertices: usize, triangles: usize) -> Result<(), ReadMeshError> {
         let Limits { vertices: v, triangles: t, .. } = *self.limits;
         for (what, found, limit) in [("vertices", vertices, v), ("triangles", triangles, t)] {
             if found > limit {

@@ -9,8 +9,8 @@
 //!   Shewchuk's error bound (1997); what the bound cannot tell from zero counts as touching.
 //! - sliver: quality `4 √3 · area / Σ edge²` below 0.05 (1 for an equilateral triangle).
 
-use super::read::places;
 use super::uv_check::{UvReport, bound};
+use super::weld::places;
 use crate::geom::{Aabb, Boxes, EFFORT, Mesh, Sets, Span, intersect, share_out};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;

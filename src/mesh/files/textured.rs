@@ -25,7 +25,7 @@ pub struct Textured<'a> {
     /// Base colour, sRGB-coded; its alpha is not written.
     pub color: &'a Photo,
     /// Normals in tangent space: linear, +X along u, +Y up the picture (OpenGL), for the tangents of
-    /// [`super::textured_tangents::tangents`]. GLB only.
+    /// [`super::tangents::tangents`]. GLB only.
     pub normal: Option<&'a Photo>,
     /// Further textures, for colours that depend on the view. GLB only.
     pub lobes: Vec<Lobe<'a>>,

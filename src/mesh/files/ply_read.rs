@@ -1,6 +1,6 @@
 //! PLY → mesh: text and both binary orders, any scalar types, any line ends, polygons fanned, strips cut up.
 
-use super::{Parsed, ReadMeshError, Source, Texture};
+use super::read::{Parsed, ReadMeshError, Source, Texture};
 use crate::geom::Atlas;
 use glam::{DVec3, Vec2, Vec3};
 

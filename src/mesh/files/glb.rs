@@ -22,11 +22,11 @@
 //! ```
 
 use super::export::{ExportError, ExportOptions, ready};
-use super::gltf_document::{Document, info};
+use super::glb_document::{Document, info};
+use super::tangents;
 use super::textured::{
     Exported, PictureFormat, Split, TextureOptions, Textured, encode, prepare, safe_name, split,
 };
-use super::textured_tangents;
 use crate::geom::{Aabb, Mesh};
 use crate::image::linear_from_srgb;
 use glam::{DVec3, Vec3};
@@ -77,7 +77,7 @@ pub fn textured_to_glb(
     let ready = &prepared.ready;
     let tangents = textured.normal.map(|_| {
         let (positions, normals, triangles) = (&ready.positions, &ready.normals, &ready.triangles);
-        textured_tangents::of(positions, normals, triangles, &prepared.uvs, &prepared.corners)
+        tangents::of(positions, normals, triangles, &prepared.uvs, &prepared.corners)
     });
     let mut shape = split(&prepared, tangents.as_deref());
     shape.colors = Vec::new(); // viewers would multiply them into the texture
@@ -284,8 +284,8 @@ mod tests {
     use crate::geom::Similarity;
     use crate::image::srgb_from_linear;
     use crate::io::{Limits, parse_photo};
-    use crate::mesh::read::{Texture, read, read_whole, weld};
-    use crate::mesh::textured::{Lobe, tests::tetrahedron};
+    use crate::mesh::files::{Lobe, textured::tests::tetrahedron};
+    use crate::mesh::files::{Texture, read, read_whole, weld};
     use std::path::Path;
 
     /// A strip of `vertices` points on a helix, coloured.

@@ -4,7 +4,7 @@
 //! Written here because the reader the ecosystem has splits vertices by object, takes index 0 for
 //! "none", and multiplies unchecked indices.
 
-use super::{Limits, Parsed, ReadMeshError, Source, Texture};
+use super::read::{Limits, Parsed, ReadMeshError, Source, Texture};
 use crate::geom::{Atlas, Mesh};
 use glam::{DVec3, Vec2, Vec3};
 use std::borrow::Cow;

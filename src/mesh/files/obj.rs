@@ -131,8 +131,8 @@ impl std::fmt::Display for Short {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::read::{Texture, picture_of_mtl, read, read_whole};
-    use crate::mesh::textured::tests::tetrahedron;
+    use crate::mesh::files::textured::tests::tetrahedron;
+    use crate::mesh::files::{Texture, picture_of_mtl, read, read_whole};
     use glam::Vec3;
     use std::path::Path;
 

@@ -1,7 +1,7 @@
 //! The texture of a GLB: from a primitive's material to the bytes of a picture in the file.
 
-use super::glb::{Document, Root};
-use super::{ReadMeshError, Texture};
+use super::glb_read::{Document, Root};
+use super::read::{ReadMeshError, Texture};
 use crate::geom::Atlas;
 use crate::io;
 use serde::Deserialize;

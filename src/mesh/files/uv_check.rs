@@ -11,7 +11,7 @@
 //!
 //! Texels are square even where the texture is not: all of it is measured in texels.
 
-use super::read::places;
+use super::weld::places;
 use crate::geom::{Atlas, EFFORT, Mesh, Sets, Side, nearest_charts, overlaps, shared_area, turn};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;

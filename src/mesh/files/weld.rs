@@ -6,7 +6,7 @@ use std::collections::HashMap;
 
 /// For each vertex the number of its position, in order of first use, and how many there are: files with a
 /// texture repeat vertices at seams. −0 is 0.
-pub(in crate::mesh) fn places(mesh: &Mesh) -> (Vec<u32>, usize) {
+pub(super) fn places(mesh: &Mesh) -> (Vec<u32>, usize) {
     let mut numbers: HashMap<[u32; 3], u32> = HashMap::with_capacity(mesh.positions.len());
     let place = |p: &Vec3| {
         let next = numbers.len() as u32;

@@ -114,8 +114,8 @@ fn bytes(mesh: &Split, translation: DVec3, picture: Option<&str>) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::read::{Texture, read, read_whole, weld};
-    use crate::mesh::textured::tests::tetrahedron;
+    use crate::mesh::files::textured::tests::tetrahedron;
+    use crate::mesh::files::{Texture, read, read_whole, weld};
     use glam::Vec3;
     use std::path::Path;
 

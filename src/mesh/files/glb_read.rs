@@ -3,7 +3,7 @@
 //! Only what lies in the file is read: buffers with an address are refused, whatever it is.
 
 use super::glb_texture::{ImageEntry, Material, TextureEntry};
-use super::{Parsed, ReadMeshError, Source};
+use super::read::{Parsed, ReadMeshError, Source};
 use crate::geom::{Atlas, Mesh};
 use crate::image::srgb_from_linear;
 use glam::{DMat3, DMat4, DQuat, DVec3, Vec2};
