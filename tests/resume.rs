@@ -74,7 +74,7 @@ fn products(run: &Path) -> Vec<(PathBuf, Vec<u8>)> {
         }
     }
     let mut files = Vec::new();
-    for stage in tiface::pipeline::STAGES {
+    for stage in tiface::pipeline::Stage::ALL {
         walk(&run.join(stage), &mut files);
     }
     files.push(run.join("config.toml"));

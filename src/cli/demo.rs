@@ -9,7 +9,7 @@ use crate::Result;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::Preset;
 use crate::io;
-use crate::pipeline::feasible;
+use crate::pipeline::{Stage, feasible};
 use crate::run::Stop;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -44,7 +44,7 @@ pub(super) fn go(common: &Common, screen: &Screen, stop: &Stop) -> Result<()> {
     }
     // repeated without options, the demo goes on as it was begun
     let target = Target { capture: Some(io::real_path(&capture)?), saved, run, guessed: false };
-    let (product, until) = ("run", "metrics");
+    let (product, until) = ("run", Stage::Metrics);
     let work = Work { common, product, until, out, require: &[], synthetic: true, fallback, screen, stop };
     work.on(&target, &[])
 }

@@ -8,7 +8,7 @@ use super::stdout::print;
 use super::target::Target;
 use crate::config::{Config, MeshFormat, NAMES, Preset, RenderConfig, called};
 use crate::io;
-use crate::pipeline::{Line, STAGES};
+use crate::pipeline::{Line, Stage, reconstruct};
 use crate::run::{Done, Run, Stop};
 use crate::{Error, Result};
 use serde_json::{Value, json};
@@ -19,7 +19,7 @@ pub(super) fn go(
     common: &Common,
     path: Option<&Path>,
     product: &str,
-    until: &str,
+    until: Stage,
     require: &[String],
     extra: &[(String, String, String)],
     screen: &Screen,
@@ -40,7 +40,7 @@ pub(super) struct Work<'a> {
     /// What the command makes: `run` (all there is), or the stage.
     pub product: &'a str,
     /// The last stage that it needs.
-    pub until: &'a str,
+    pub until: Stage,
     /// Where the product goes as well.
     pub out: Option<Out>,
     pub require: &'a [String],
@@ -56,17 +56,12 @@ impl Work<'_> {
     pub fn on(&self, target: &Target, extra: &[(String, String, String)]) -> Result<()> {
         let mut config = configure(self.common, target, self.fallback, extra)?;
         // views of a path are made as asked for here; what the evaluation shows stays as it was
-        let path = (self.until == "render" && config.render.cameras != "test").then(|| config.render.clone());
+        let path =
+            (self.until == Stage::Render && config.render.cameras != "test").then(|| config.render.clone());
         if path.is_some() {
             config.render = evaluation(self.common, target)?;
         }
         let bars = self.require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>, _>>()?;
-        if let Some(fresh) = &self.common.fresh
-            && !STAGES.contains(&fresh.as_str())
-        {
-            let known = STAGES.join(", ");
-            return Err(Error::usage(format!("there is no stage `{fresh}`"), format!("stages are {known}")));
-        }
         let run = Run::open(&target.run, self.stop.clone(), self.screen.observer());
         // the demo's own runs are recognised when their stages are run one by one, too
         let synthetic = self.synthetic || is_demo(&config, &run);
@@ -77,7 +72,7 @@ impl Work<'_> {
         if let Some(out) = &self.out {
             out.is_outside(run.dir())?;
             let mesh = matches!(out, Out::File(_, ending) if mesh_format(ending).is_some());
-            if mesh && !line.order(self.until).contains(&"mesh") {
+            if mesh && !line.order(self.until).contains(&Stage::Mesh) {
                 return Err(Error::usage(
                     "no mesh is made with these settings, so `--out` has none to write",
                     "use `tiface mesh --out head.glb`",
@@ -87,7 +82,7 @@ impl Work<'_> {
         if self.common.dry_run {
             return self.outlook(&line);
         }
-        if let Some(fresh) = &self.common.fresh {
+        if let Some(fresh) = self.common.fresh {
             line.fresh(fresh, self.until)?;
         }
         line.remember(self.until)?;
@@ -103,8 +98,7 @@ impl Work<'_> {
     }
 
     fn outlook(&self, line: &Line) -> Result<()> {
-        let fresh =
-            self.common.fresh.as_deref().map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
+        let fresh = self.common.fresh.map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
         let mut text = String::new();
         for (stage, found) in line.outlook(self.until)? {
             let anew = fresh.contains(&stage);
@@ -167,14 +161,8 @@ impl Work<'_> {
     }
 
     /// Where everything is, and how good it is.
-    fn closing(
-        &self,
-        run: &Run,
-        views: &str,
-        done: &[(&'static str, Done)],
-        written: &[PathBuf],
-    ) -> Result<()> {
-        let of = |name: &str| done.iter().find(|(n, _)| *n == name).map(|(_, d)| &d.summary);
+    fn closing(&self, run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) -> Result<()> {
+        let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
         if self.common.json {
             let stages: serde_json::Map<String, Value> =
                 done.iter().map(|(n, d)| (n.to_string(), d.summary.clone())).collect();
@@ -186,24 +174,23 @@ impl Work<'_> {
         }
         let mut text = String::new();
         let mut row = |name: &str, value: String| text += &format!("{name:<9} {value}\n");
-        if let Some(mesh) = of("mesh") {
+        if let Some(mesh) = of(Stage::Mesh) {
             let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
             let files = ["glb", "obj", "ply"].map(|e| run.path(format!("mesh/head.{e}")));
             let first = files.iter().find(|f| io::is_file(f)).unwrap_or(&files[0]);
             let loops = handles(&mesh["handles"]);
             row("mesh", format!("{} ({} triangles, {state}{loops})", first.display(), mesh["triangles"]));
         }
-        for (_, folder) in
-            [("render", views), ("ensemble", "ensemble")].iter().filter(|(s, _)| of(s).is_some())
-        {
+        let folders = [(Stage::Render, views), (Stage::Ensemble, Stage::Ensemble.word())];
+        for (_, folder) in folders.into_iter().filter(|(s, _)| of(*s).is_some()) {
             row("pictures", format!("{}", run.path(folder).display()));
         }
-        if let Some(metrics) = of("metrics") {
+        if let Some(metrics) = of(Stage::Metrics) {
             row("report", format!("{}", run.path("report.html").display()));
             for line in judgement(metrics) {
                 row("quality", line);
             }
-        } else if of("mesh").is_none() && of("render").is_none() {
+        } else if of(Stage::Mesh).is_none() && of(Stage::Render).is_none() {
             row("run", format!("{}", run.dir().display()));
         }
         for path in written {
@@ -330,19 +317,6 @@ fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<()> {
     Ok(())
 }
 
-#[cfg(feature = "cpu")]
-fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>> {
-    Ok(crate::pipeline::reconstruct(line, until)?)
-}
-
-#[cfg(not(feature = "cpu"))]
-fn reconstruct(line: &Line, until: &str) -> Result<Vec<(&'static str, Done)>> {
-    if until == "mask" {
-        return Ok(vec![("mask", line.mask()?)]);
-    }
-    Err(Error::cannot("this build cannot learn fields", "build with the feature `cpu`, which is the default"))
-}
-
 /// A bar set by `--require`.
 #[derive(Debug, PartialEq)]
 enum Bar {
@@ -362,13 +336,13 @@ impl Bar {
         })
     }
 
-    fn check(&self, done: &[(&'static str, Done)]) -> Result<()> {
-        let of = |name: &str| done.iter().find(|(n, _)| *n == name).map(|(_, d)| &d.summary);
+    fn check(&self, done: &[(Stage, Done)]) -> Result<()> {
+        let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
         match self {
-            Bar::Watertight if of("mesh").is_some_and(|m| m["closed"] == true) => Ok(()),
+            Bar::Watertight if of(Stage::Mesh).is_some_and(|m| m["closed"] == true) => Ok(()),
             Bar::Watertight => Err(Error::below("the mesh is not watertight", "`tiface check` says where")),
             Bar::Psnr(bar) => {
-                let metrics = of("metrics").unwrap_or(&Value::Null);
+                let metrics = of(Stage::Metrics).unwrap_or(&Value::Null);
                 let sets = metrics.as_object().into_iter().flat_map(|m| m.values());
                 let best = sets
                     .filter_map(|set| set["head"]["mean"]["psnr_masked"].as_f64())
@@ -404,7 +378,7 @@ mod tests {
             "ensemble": {"head": {"mean": {"psnr_masked": 27.5}}},
             "truth_percent_of_head": {"accuracy_mean": 99.0},
         });
-        let stages = [("mesh", done(json!({"closed": true}))), ("metrics", done(metrics))];
+        let stages = [(Stage::Mesh, done(json!({"closed": true}))), (Stage::Metrics, done(metrics))];
         assert!(Bar::Watertight.check(&stages).is_ok() && Bar::Psnr(27.0).check(&stages).is_ok());
         assert_eq!(Bar::Psnr(28.0).check(&stages).unwrap_err().kind().code(), 3);
         assert_eq!(Bar::Psnr(1.0).check(&[]).unwrap_err().kind().code(), 3);

@@ -20,6 +20,7 @@ mod status;
 mod stdout;
 mod target;
 
+use crate::pipeline::Stage;
 use crate::run::Stop;
 use clap::{Args, CommandFactory, Parser, Subcommand};
 use options::Common;
@@ -366,24 +367,24 @@ impl Cli {
             });
             given.collect()
         };
-        let works = |place: &Place, product: &str, until: &str, require: &[String], extra: &[_]| {
+        let works = |place: &Place, product: &str, until: Stage, require: &[String], extra: &[_]| {
             line::go(common, place.path.as_deref(), product, until, require, extra, screen, stop)
         };
-        let line = |place: &Place, stage: &str, extra: &[_]| works(place, stage, stage, &[], extra);
+        let line = |place: &Place, stage: Stage, extra: &[_]| works(place, stage.word(), stage, &[], extra);
         let nothing = |command: &str| Out::none(common.out.as_deref(), command);
         match &self.command {
             Command::Run { place, clicks, require } => {
-                works(place, "run", "metrics", require, &clicks.keys()?)
+                works(place, "run", Stage::Metrics, require, &clicks.keys()?)
             }
             Command::Demo => demo::go(common, screen, stop),
             Command::Inspect { capture } => nothing("inspect").and_then(|()| inspect::go(common, capture)),
             Command::Mask { place, clicks, page: true } => {
                 page::go(common, place.path.as_deref(), clicks.prompts.as_deref(), screen)
             }
-            Command::Mask { place, clicks, page: false } => line(place, "mask", &clicks.keys()?),
-            Command::Baseline { place } => line(place, "baseline", &[]),
-            Command::Tface { place } => line(place, "tface", &[]),
-            Command::Iface { place } => line(place, "iface", &[]),
+            Command::Mask { place, clicks, page: false } => line(place, Stage::Mask, &clicks.keys()?),
+            Command::Baseline { place } => line(place, Stage::Baseline, &[]),
+            Command::Tface { place } => line(place, Stage::Tface, &[]),
+            Command::Iface { place } => line(place, Stage::Iface, &[]),
             Command::Mesh { place, format, frame, triangles, texture, lobes, normal_map, no_cap } => {
                 let given = |flag: bool, value: &str| flag.then(|| value.to_owned());
                 let extra = keys(&[
@@ -395,7 +396,7 @@ impl Cli {
                     ("--normal-map", "mesh.normal_map", &given(*normal_map, "true")),
                     ("--no-cap", "mesh.cap", &given(*no_cap, "false")),
                 ]);
-                line(place, "mesh", &extra)
+                line(place, Stage::Mesh, &extra)
             }
             Command::Render { place, cameras, method, format, background } => {
                 let extra = keys(&[
@@ -404,16 +405,16 @@ impl Cli {
                     ("--format", "render.format", format),
                     ("--background", "render.background", background),
                 ]);
-                line(place, "render", &extra)
+                line(place, Stage::Render, &extra)
             }
             Command::Ensemble { place, members, weights } => {
                 let extra = keys(&[
                     ("--members", "ensemble.members", members),
                     ("--weights", "ensemble.weights", weights),
                 ]);
-                line(place, "ensemble", &extra)
+                line(place, Stage::Ensemble, &extra)
             }
-            Command::Metrics { place, require } => works(place, "metrics", "metrics", require, &[]),
+            Command::Metrics { place, require } => works(place, "metrics", Stage::Metrics, require, &[]),
             Command::Check { mesh, require, against, seen_by } => {
                 nothing("check")?;
                 check::go(common, mesh, require, against.as_deref(), seen_by.as_deref())

@@ -1,6 +1,6 @@
 //! The options that every command shares, and the configuration they amount to.
 
-use crate::config::{Config, Preset, Sources};
+use crate::config::{Config, Preset, Sources, Stage};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
 use clap::{Args, ValueEnum};
@@ -49,7 +49,7 @@ pub(super) struct Common {
     pub seed: Option<u64>,
     /// Recompute a stage and what follows
     #[arg(long, global = true, value_name = "STAGE")]
-    pub fresh: Option<String>,
+    pub fresh: Option<Stage>,
     /// Say what would be done, and do nothing
     #[arg(long, global = true)]
     pub dry_run: bool,

@@ -5,7 +5,7 @@ use super::plain::one_line;
 use super::screen::{duration, figure};
 use super::stdout::print;
 use crate::io;
-use crate::pipeline::STAGES;
+use crate::pipeline::Stage;
 use crate::run::{State, read_record, read_status};
 use crate::{Error, Result};
 use serde_json::json;
@@ -37,7 +37,7 @@ pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<()> {
             told("–");
             continue;
         }
-        STAGES.iter().for_each(|stage| told(stage));
+        Stage::ALL.iter().for_each(|stage| told(stage.word()));
         for path in io::list_folders(&run.join("render/paths")).unwrap_or_default() {
             told(&format!("render/paths/{}", path.file_name().unwrap_or_default().to_string_lossy()));
         }

@@ -19,6 +19,7 @@ mod render;
 mod source;
 #[cfg(test)]
 mod source_tests;
+mod stage;
 mod table;
 mod vm;
 
@@ -31,6 +32,7 @@ pub use mesh::{Genus, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 pub use metrics::MetricsConfig;
 pub use render::{Background, Method, NAMES, PictureFormat, RenderConfig, called};
 pub use source::{ConfigError, Place, Sources};
+pub use stage::Stage;
 pub use vm::{DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
 use serde::{Deserialize, Serialize};
@@ -181,6 +183,11 @@ impl Config {
             ensemble: EnsembleConfig::preset(preset),
             metrics: MetricsConfig::preset(preset),
         }
+    }
+
+    /// Settings of the radiance field that the stage `baseline` or `tface` learns.
+    pub fn radiance(&self, stage: Stage) -> VmConfig {
+        if stage == Stage::Baseline { self.baseline.field(&self.tface) } else { self.tface.clone() }
     }
 
     /// With the constants of its preset, which are not read from text.

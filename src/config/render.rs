@@ -1,5 +1,6 @@
 //! `[render]`: the views made of the result.
 
+use super::stage::Stage;
 use super::table::table;
 use serde::{Deserialize, Serialize};
 
@@ -46,12 +47,12 @@ impl Method {
     }
 
     /// The stage whose result it shows.
-    pub fn stage(self) -> &'static str {
+    pub fn stage(self) -> Stage {
         match self {
-            Method::Baseline => "baseline",
-            Method::Tface => "tface",
-            Method::Volume => "iface",
-            Method::Raycast | Method::Textured => "mesh",
+            Method::Baseline => Stage::Baseline,
+            Method::Tface => Stage::Tface,
+            Method::Volume => Stage::Iface,
+            Method::Raycast | Method::Textured => Stage::Mesh,
         }
     }
 }
@@ -101,6 +102,14 @@ table! {
         background: Background => Background::None;
         /// Keep every view in float, too, in METHOD/float: what is blended. true or false.
         float: bool => true;
+    }
+}
+
+impl RenderConfig {
+    /// The stages whose results its views show.
+    pub fn shows(&self) -> Vec<Stage> {
+        let is_shown = |s: &Stage| *s == Stage::Mask || self.method.iter().any(|m| m.stage() == *s);
+        Stage::ALL.into_iter().filter(is_shown).collect()
     }
 }
 

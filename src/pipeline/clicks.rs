@@ -4,7 +4,6 @@
 //! clicks → cut (GrabCut, or SAM) → propagated through the cameras → band → matting (closed form, ViTMatte) → alpha
 //! ```
 
-use super::Line;
 use super::networks::Networks;
 use crate::capture::{Capture, Split};
 use crate::config::MaskConfig;
@@ -17,9 +16,10 @@ use crate::mask::matting::{SoftenOptions, Working, soften};
 use crate::mask::prompts;
 use crate::mask::propagate::{Masks, PropagateOptions, PropagateView, ViewMask, propagate};
 use crate::mask::{Click, CutError, distance, scale};
-use crate::run::{Fingerprint, Stage};
+use crate::run::{Fingerprint, StageDir};
 use crate::{Error, Result};
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The clicks that masks are made from.
@@ -31,6 +31,17 @@ pub(super) struct Clicks {
     pub file: Vec<u8>,
     /// What shapes the masks beside the settings: clicks and network files.
     pub inputs: Vec<(&'static str, String)>,
+}
+
+/// What of the clicks comes from files, as `inputs` names them.
+const INPUTS: [&str; 4] = ["clicks", "sam", "sam_decoder", "vitmatte"];
+
+impl Clicks {
+    /// What a stage's record holds of clicks that are no longer there: their digests.
+    pub fn remembered(inputs: &BTreeMap<String, String>) -> Clicks {
+        let input = |name: &'static str| Some((name, inputs.get(name)?.clone()));
+        Clicks { of: Vec::new(), file: Vec::new(), inputs: INPUTS.into_iter().filter_map(input).collect() }
+    }
 }
 
 /// A mask that was made.
@@ -153,147 +164,140 @@ fn soften_options(c: &MaskConfig) -> SoftenOptions {
     }
 }
 
-impl Line<'_> {
-    fn photo(&self, view: usize) -> Result<Photo> {
-        self.stop_here()?;
-        Ok(self.capture.views[view].load_photo(&Limits::default())?)
-    }
+fn photo(capture: &Capture, view: usize, dir: &StageDir) -> Result<Photo> {
+    dir.check_stop()?;
+    Ok(capture.views[view].load_photo(&Limits::default())?)
+}
 
-    /// Masks of all views from clicks on some.
-    pub(super) fn make_masks(
-        &self,
-        stage: &Stage,
-        clicks: &Clicks,
-        keep: &mut dyn FnMut(usize, &Photo, Made) -> Result<()>,
-    ) -> Result<Networks> {
-        let config = &self.config.mask;
-        let networks = Networks::open(config)?;
-        // a file that the engine cannot run is refused before the work
-        let sizes: std::collections::BTreeSet<_> =
-            self.capture.views.iter().map(|v| (v.camera.width, v.camera.height)).collect();
-        let largest = sizes.into_iter().max_by_key(|&(w, h)| u64::from(w) * u64::from(h)).unwrap_or((1, 1));
-        networks.prepare(scale::working_size(largest.0, largest.1, config.side_px))?;
-        for file in networks.files() {
-            stage.note(&file);
+/// Masks of all views from clicks on some.
+pub(super) fn make_masks(
+    capture: &Capture,
+    clicks: &Clicks,
+    config: &MaskConfig,
+    dir: &StageDir,
+    keep: &mut dyn FnMut(usize, &Photo, Made) -> Result<()>,
+) -> Result<Networks> {
+    let networks = Networks::open(config)?;
+    // a file that the engine cannot run is refused before the work
+    let sizes: std::collections::BTreeSet<_> =
+        capture.views.iter().map(|v| (v.camera.width, v.camera.height)).collect();
+    let largest = sizes.into_iter().max_by_key(|&(w, h)| u64::from(w) * u64::from(h)).unwrap_or((1, 1));
+    networks.prepare(scale::working_size(largest.0, largest.1, config.side_px))?;
+    for file in networks.files() {
+        dir.note(&file);
+    }
+    let hard = hard(capture, clicks, config, dir)?;
+    let soft = soften_options(config);
+    let total = hard.len();
+    let at_once = networks.at_once(largest, &soft, config);
+    for start in (0..total).step_by(at_once) {
+        let made: Vec<Result<(Photo, Made, Vec<String>)>> = (start..(start + at_once).min(total))
+            .into_par_iter()
+            .map(|i| {
+                let photo = photo(capture, i, dir)?;
+                let (made, warnings) = alpha(&networks, &photo, &hard[i], &clicks.of[i], &soft)?;
+                Ok((photo, made, warnings))
+            })
+            .collect();
+        for (i, made) in (start..).zip(made) {
+            let (photo, made, warnings) = made?;
+            let name = &capture.views[i].name;
+            warnings.iter().for_each(|w| dir.warn(&format!("view `{name}`: {w}")));
+            keep(i, &photo, made)?;
         }
-        let hard = self.hard(stage, clicks)?;
-        let soft = soften_options(config);
-        let total = hard.len();
-        let at_once = networks.at_once(largest, &soft, config);
-        for start in (0..total).step_by(at_once) {
-            let made: Vec<Result<(Photo, Made, Vec<String>)>> = (start..(start + at_once).min(total))
-                .into_par_iter()
-                .map(|i| {
-                    let photo = self.photo(i)?;
-                    let (made, warnings) = self.alpha(&networks, i, &photo, &hard[i], clicks, &soft)?;
-                    Ok((photo, made, warnings))
-                })
-                .collect();
-            for (i, made) in (start..).zip(made) {
-                let (photo, made, warnings) = made?;
-                let name = &self.capture.views[i].name;
-                warnings.iter().for_each(|w| stage.warn(&format!("view `{name}`: {w}")));
-                keep(i, &photo, made)?;
-            }
-            stage.monitor().step((start + at_once).min(total) as u64, total as u64, &[]);
-            self.stop_here()?;
+        dir.step((start + at_once).min(total), total)?;
+    }
+    Ok(networks)
+}
+
+/// Hard masks of all views.
+fn hard(capture: &Capture, clicks: &Clicks, config: &MaskConfig, dir: &StageDir) -> Result<Vec<ViewMask>> {
+    let views = &capture.views;
+    let masks = if let [view] = &views[..] {
+        let found = grabcut(&view.name, &photo(capture, 0, dir)?, &clicks.of[0], &grabcut_options(config));
+        let found = found?;
+        Masks {
+            views: vec![ViewMask { mask: found.mask, ambiguous: found.ambiguous }],
+            warnings: found.warnings,
         }
-        Ok(networks)
-    }
+    } else {
+        let views: Vec<PropagateView> = views
+            .iter()
+            .zip(&clicks.of)
+            .map(|(v, clicks)| PropagateView {
+                name: &v.name,
+                camera: &v.camera,
+                clicks,
+                // held-out photographs shape nothing but their own masks
+                votes: v.split == Split::Train,
+            })
+            .collect();
+        let load = |i| photo(capture, i, dir).map_err(Unpropagated::Load);
+        propagate(&views, load, &propagate_options(config)).map_err(|e| match e {
+            Unpropagated::Load(e) => e,
+            Unpropagated::Cut(e) => e.into(),
+        })?
+    };
+    masks.warnings.iter().for_each(|w| dir.warn(w));
+    Ok(masks.views)
+}
 
-    /// Hard masks of all views.
-    fn hard(&self, stage: &Stage, clicks: &Clicks) -> Result<Vec<ViewMask>> {
-        let views = &self.capture.views;
-        let masks = if let [view] = &views[..] {
-            let found =
-                grabcut(&view.name, &self.photo(0)?, &clicks.of[0], &grabcut_options(&self.config.mask));
-            let found = found?;
-            Masks {
-                views: vec![ViewMask { mask: found.mask, ambiguous: found.ambiguous }],
-                warnings: found.warnings,
-            }
-        } else {
-            let views: Vec<PropagateView> = views
-                .iter()
-                .zip(&clicks.of)
-                .map(|(v, clicks)| PropagateView {
-                    name: &v.name,
-                    camera: &v.camera,
-                    clicks,
-                    // held-out photographs shape nothing but their own masks
-                    votes: v.split == Split::Train,
-                })
-                .collect();
-            let load = |i| self.photo(i).map_err(Unpropagated::Load);
-            propagate(&views, load, &propagate_options(&self.config.mask)).map_err(|e| match e {
-                Unpropagated::Load(e) => e,
-                Unpropagated::Cut(e) => e.into(),
-            })?
-        };
-        masks.warnings.iter().for_each(|w| stage.warn(w));
-        Ok(masks.views)
-    }
-
-    /// One view's alpha.
-    fn alpha(
-        &self,
-        networks: &Networks,
-        view: usize,
-        photo: &Photo,
-        hard: &ViewMask,
-        clicks: &Clicks,
-        soft: &SoftenOptions,
-    ) -> Result<(Made, Vec<String>)> {
-        let mut warnings = Vec::new();
-        let segmented = match networks.has_sam() {
-            true => {
-                let own = &clicks.of[view];
-                let size = scale::working_size(photo.width, photo.height, soft.side);
-                let small = scale::reduce_photo(photo, size);
-                let chosen = if own.is_empty() {
-                    propagated_clicks(&hard.mask, size)
-                } else {
-                    own.iter().map(|c| c.moved((photo.width, photo.height), size)).collect()
-                };
-                let (mask, score) = networks.segment(&small, &chosen)?;
-                if !mask.values.contains(&255) {
-                    warnings.push("SAM found nothing of the head; the built-in cut stands in".into());
-                    None
-                } else {
-                    if score < 0.7 {
-                        warnings.push(format!("SAM gives its mask only {score:.2} of 1; look at it"));
-                    }
-                    Some(mask)
+/// One view's alpha.
+fn alpha(
+    networks: &Networks,
+    photo: &Photo,
+    hard: &ViewMask,
+    clicks: &[Click],
+    soft: &SoftenOptions,
+) -> Result<(Made, Vec<String>)> {
+    let mut warnings = Vec::new();
+    let segmented = match networks.has_sam() {
+        true => {
+            let size = scale::working_size(photo.width, photo.height, soft.side);
+            let small = scale::reduce_photo(photo, size);
+            let chosen = if clicks.is_empty() {
+                propagated_clicks(&hard.mask, size)
+            } else {
+                clicks.iter().map(|c| c.moved((photo.width, photo.height), size)).collect()
+            };
+            let (mask, score) = networks.segment(&small, &chosen)?;
+            if !mask.values.contains(&255) {
+                warnings.push("SAM found nothing of the head; the built-in cut stands in".into());
+                None
+            } else {
+                if score < 0.7 {
+                    warnings.push(format!("SAM gives its mask only {score:.2} of 1; look at it"));
                 }
+                Some(mask)
             }
-            false => None,
-        };
-        let mask = segmented.as_ref().unwrap_or(&hard.mask);
-        let failed = |e: crate::mask::matting::AlphaError| {
-            let hint = e.hint();
-            Error::cannot(e, hint)
-        };
-        let made = if networks.has_vitmatte() {
-            let working = Working::new(photo, mask, soft).map_err(failed)?;
-            warnings.extend(working.warnings(soft));
-            let mut alpha = networks.alpha(&working.photo, &working.trimap)?;
-            // the network takes the trimap for a hint; what is definite stays
-            for (a, t) in alpha.iter_mut().zip(&working.trimap.values) {
-                match t {
-                    0 => *a = 0.0,
-                    255 => *a = 1.0,
-                    _ => {}
-                }
+        }
+        false => None,
+    };
+    let mask = segmented.as_ref().unwrap_or(&hard.mask);
+    let failed = |e: crate::mask::matting::AlphaError| {
+        let hint = e.hint();
+        Error::cannot(e, hint)
+    };
+    let made = if networks.has_vitmatte() {
+        let working = Working::new(photo, mask, soft).map_err(failed)?;
+        warnings.extend(working.warnings(soft));
+        let mut alpha = networks.alpha(&working.photo, &working.trimap)?;
+        // the network takes the trimap for a hint; what is definite stays
+        for (a, t) in alpha.iter_mut().zip(&working.trimap.values) {
+            match t {
+                0 => *a = 0.0,
+                255 => *a = 1.0,
+                _ => {}
             }
-            let share = crate::mask::matting::trimap::unknown_share(&working.trimap);
-            Made { alpha: working.finish(&alpha, soft), trimap: working.trimap, unknown: share }
-        } else {
-            let done = soften(photo, mask, soft).map_err(failed)?;
-            warnings.extend(done.warnings);
-            Made { alpha: done.alpha, trimap: done.trimap, unknown: done.band_share }
-        };
-        Ok((made, warnings))
-    }
+        }
+        let share = crate::mask::matting::trimap::unknown_share(&working.trimap);
+        Made { alpha: working.finish(&alpha, soft), trimap: working.trimap, unknown: share }
+    } else {
+        let done = soften(photo, mask, soft).map_err(failed)?;
+        warnings.extend(done.warnings);
+        Made { alpha: done.alpha, trimap: done.trimap, unknown: done.band_share }
+    };
+    Ok((made, warnings))
 }
 
 /// Why clicks could not be propagated.

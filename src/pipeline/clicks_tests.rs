@@ -1,15 +1,17 @@
 //! Masks from clicks, as a stage of the line.
 
 use super::clicks::propagated_clicks;
+use super::tests::NoFields;
 use super::*;
 use crate::Quiet;
-use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
-use crate::config::Preset;
+use crate::capture::{self, CaptureOptions, Split};
+use crate::config::{Config, MaskSource, Preset};
 use crate::image::Gray;
+use crate::io::{self, Limits};
 use crate::mask::prompts::{Frame, Prompts, file_path};
-use crate::run::Stop;
-use std::path::PathBuf;
+use crate::run::{Run, Stop};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// A synthetic capture, clicks on three of its views at the deepest places of the true masks, and those masks.
@@ -49,8 +51,8 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
     let (config, truth) = clicked(dir.path());
     let run = run(dir.path(), "run");
     let line = Line::open(&config, &run, false).unwrap();
-    line.remember("mask").unwrap();
-    let done = line.mask().unwrap();
+    line.remember(Stage::Mask).unwrap();
+    let done = complete(&line, Stage::Mask, &NoFields).unwrap();
     assert_eq!(done.summary["masks"], 10);
     assert_eq!(done.summary["made"]["clicked_views"], 3);
     assert_eq!(done.summary["suspicious"], serde_json::json!([]));
@@ -63,22 +65,22 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
     }
     let sheet = String::from_utf8(io::read_bytes(&run.path("mask/sheet.html"), &Limits::default()).unwrap());
     assert_eq!(sheet.unwrap().matches("<figure").count(), 10);
-    assert!(line.mask().unwrap().skipped);
+    assert!(complete(&line, Stage::Mask, &NoFields).unwrap().skipped);
 
     // the same clicks from another file are the same; other clicks are not
     let moved = dir.path().join("elsewhere.json");
     std::fs::rename(&config.mask.prompts, &moved).unwrap();
     let mut config = config;
     config.mask.prompts = moved.to_str().unwrap().into();
-    assert!(Line::open(&config, &run, false).unwrap().mask().unwrap().skipped);
+    assert!(complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
     // and the run outlives the file
     let text = std::fs::read_to_string(&moved).unwrap();
     std::fs::remove_file(&moved).unwrap();
-    assert!(Line::open(&config, &run, false).unwrap().mask().unwrap().skipped);
+    assert!(complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
     let mut prompts: serde_json::Value = serde_json::from_str(&text).unwrap();
     prompts["frames"][0]["points"].as_array_mut().unwrap().pop();
     std::fs::write(&moved, prompts.to_string()).unwrap();
-    let error = Line::open(&config, &run, false).unwrap().mask().unwrap_err();
+    let error = complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     assert!(error.to_string().contains("clicks"), "{error}");
 }
 
@@ -127,7 +129,7 @@ fn a_network_that_is_no_network_is_refused_in_one_sentence() {
     let (mut config, _) = clicked(dir.path());
     config.mask.vitmatte = config.mask.prompts.clone();
     let run = run(dir.path(), "run");
-    let error = Line::open(&config, &run, false).unwrap().mask().unwrap_err();
+    let error = complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     let expected = if cfg!(feature = "matting") { "prompts.json" } else { "this build cannot run networks" };
     assert!(error.to_string().contains(expected), "{error}");
     assert!(!run.path("mask/done.json").exists());
@@ -153,7 +155,7 @@ fn networks_cut_and_soften_and_are_recorded() {
     let run = run(dir.path(), "run");
     let line = Line::open(&config, &run, false).unwrap();
     // a mask of noise may leave no hull to place the head by: then that is what is said
-    match line.mask() {
+    match complete(&line, Stage::Mask, &NoFields) {
         Ok(done) => {
             let networks = &done.summary["made"]["networks"];
             assert_eq!(networks.as_array().unwrap().len(), 3, "{networks}");
@@ -187,7 +189,10 @@ fn three_clicked_photographs_of_a_light_stage_mask_them_all() {
         config.mask.band = band;
         let run = run(dir.path(), name);
         let line = Line::open(&config, &run, false).unwrap();
-        assert_eq!(line.mask().unwrap().summary["suspicious"], serde_json::json!([]));
+        assert_eq!(
+            complete(&line, Stage::Mask, &NoFields).unwrap().summary["suspicious"],
+            serde_json::json!([])
+        );
         let (mut overlap, mut error) = (Vec::new(), 0.0);
         for (view, truth) in line.capture().views.iter().zip(&truth.views) {
             let limits = Limits::default();
@@ -228,7 +233,7 @@ fn held_out_photographs_shape_only_their_own_masks() {
     let masks = |name: &str| -> Vec<Vec<u8>> {
         let run = run(dir.path(), name);
         let line = Line::open(&config, &run, false).unwrap();
-        line.mask().unwrap();
+        complete(&line, Stage::Mask, &NoFields).unwrap();
         let train = line.capture().views.iter().filter(|v| v.split == Split::Train);
         train.map(|v| v.load_mask(&Limits::default()).unwrap().unwrap().values).collect()
     };
@@ -242,6 +247,6 @@ fn held_out_photographs_shape_only_their_own_masks() {
     prompts.frames.drain(..3);
     prompts.write(Path::new(&config.mask.prompts)).unwrap();
     let run = run(dir.path(), "alone");
-    let error = Line::open(&config, &run, false).unwrap().mask().unwrap_err();
+    let error = complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     assert!(error.to_string().contains("held-out"), "{error}");
 }

@@ -4,177 +4,237 @@
 //! ensemble/NAME.png       over the background
 //!          weights.json   the weights, and what they gain where they were fitted
 //! ```
+//!
+//! The weights are fitted on the squares of the training photographs that no field learned from, unless they are given.
 
-use super::{Fields, Line, pictures};
-use crate::capture::{MaskMeaning, MaskSource};
-use crate::config::{MaskUse, Method};
-use crate::ensemble::{EnsembleError, Member, Members, blend};
-use crate::image::Image;
-use crate::io;
+use super::render::{Meshes, Renderer, cameras};
+use super::surface::Fields;
+use super::{Line, pictures, tiles};
+use crate::capture::scene::Scene;
+use crate::capture::{MaskMeaning, MaskSource, View};
+use crate::config::{Background, Config, EnsembleConfig, MaskUse, Method, called};
+use crate::ensemble::{self, EnsembleError, Fit, Member, Members, Target, Tile, blend};
+use crate::image::{Gray, Image, Photo};
+use crate::io::{self, Limits};
 use crate::render::RenderedView;
-use crate::run::Done;
+use crate::run::StageDir;
 use crate::{Error, Result};
-use serde_json::{Value, json};
-use std::path::Path;
+use serde_json::{Map, Value, json};
 
-impl Line<'_> {
-    /// Stage `ensemble`: one picture per camera of `render`. `fields` are only asked if weights are to be fitted.
-    pub fn ensemble(&self, fields: &dyn Fields) -> Result<Done> {
-        self.can_blend()?;
-        Ok(self.run.stage(self.plan("ensemble"), |stage| {
-            let scene = self.scene_or_fail()?;
-            let cameras = self.cameras(&scene)?;
-            let names = self.members();
-            let (weights, fitted) = match self.config.ensemble.weights.is_empty() {
-                true => self.fit(stage, &scene, fields)?,
-                false => (self.shares(), Value::Null),
-            };
-            for (i, named) in cameras.iter().enumerate() {
-                let images = self.member_views(&named.name)?;
-                let blended = blend(&self.checked(&images)?, &weights)?;
-                self.write_blend(stage.folder(), &named.name, blended)?;
-                stage.monitor().step(i as u64 + 1, cameras.len() as u64, &[]);
-                self.stop_here()?;
-            }
-            let told = json!({"members": names, "weights": weights, "fitted": fitted});
-            let file = stage.folder().join("weights.json");
-            io::write_atomic(&file, format!("{told:#}\n").as_bytes())?;
-            let mut summary = told;
-            summary["views"] = json!(cameras.len());
-            Ok(summary)
-        })?)
-    }
+/// A mask and a valid mask count from here on, as in `metrics`.
+const INSIDE: u8 = 128;
 
-    /// Will everything be there that is to be blended? Asked before any work.
-    pub(super) fn can_blend(&self) -> Result<()> {
-        let c = &self.config.ensemble;
-        let wrong = |key: &'static str, problem: String, hint: &str| {
-            Err(Error::usage(format!("`{key}` {problem}"), hint))
-        };
-        if c.members.is_empty() {
-            return wrong("ensemble.members", "is empty: there is nothing to blend".into(), "name members");
+/// Blends one picture per camera of `render`. `fields` are only asked if weights are to be fitted.
+pub(super) fn ensemble(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<Value> {
+    let Config { ensemble: c, render, capture, .. } = line.config;
+    can_blend(line.config)?;
+    let cameras = cameras(line, scene)?;
+    let (weights, fitted) = match c.weights.is_empty() {
+        true => fit(line, scene, fields, dir)?,
+        false => (shares(c), Value::Null),
+    };
+    for (i, camera) in cameras.iter().enumerate() {
+        let views = member_views(line, &camera.name)?;
+        let color = blend(&members(line, &views)?, &weights)?;
+        let mut view = RenderedView { color, depth: Image::new(0, 0, 1), normal: Image::new(0, 0, 3) };
+        if let Some(background) = pictures::behind(render.background) {
+            pictures::over(&mut view, background);
         }
-        for (i, member) in c.members.iter().enumerate() {
-            let name = member.folder();
-            if c.members[..i].contains(member) {
-                return wrong("ensemble.members", format!("names {name} twice"), "name every member once");
-            }
-            if !self.config.render.method.contains(member) {
-                let problem = format!("names {name}, which render.method does not make");
-                let hint = format!(
-                    "render it too (`tiface render RUN --fresh render --with {}`), or blend what there is with \
+        pictures::write(dir.folder(), &camera.name, &view, render.format, capture.unit_m)?;
+        dir.step(i + 1, cameras.len())?;
+    }
+    let mut summary = json!({"members": words(&c.members), "weights": weights, "fitted": fitted});
+    io::write_atomic(&dir.folder().join("weights.json"), format!("{summary:#}\n").as_bytes())?;
+    summary["views"] = json!(cameras.len());
+    Ok(summary)
+}
+
+/// Will everything be there that is to be blended? Asked before any work.
+pub(super) fn can_blend(config: &Config) -> Result<()> {
+    let c = &config.ensemble;
+    let wrong = |key: &'static str, problem: String, hint: &str| {
+        Err(Error::usage(format!("`{key}` {problem}"), hint))
+    };
+    if c.members.is_empty() {
+        return wrong("ensemble.members", "is empty: there is nothing to blend".into(), "name members");
+    }
+    for (i, member) in c.members.iter().enumerate() {
+        let name = member.folder();
+        if c.members[..i].contains(member) {
+            return wrong("ensemble.members", format!("names {name} twice"), "name every member once");
+        }
+        if !config.render.method.contains(member) {
+            let problem = format!("names {name}, which render.method does not make");
+            let hint = format!(
+                "render it too (`tiface render RUN --fresh render --with {}`), or blend what there is with \
                      ensemble.members and ensemble.weights; `--set ensemble.members=` blends nothing",
-                    self.shown_with_members()
-                );
-                return wrong("ensemble.members", problem, &hint);
-            }
-        }
-        let (found, members) = (c.weights.len(), c.members.len());
-        let sum: f64 = c.weights.iter().sum();
-        if found == 0 && self.config.capture.tiles <= 0.0 {
-            let problem = "is empty, but there is nothing to fit them on: capture.tiles is 0".into();
-            return wrong(
-                "ensemble.weights",
-                problem,
-                "give one for each of ensemble.members, or set capture.tiles=0.04",
+                shown_with_members(config)
             );
-        }
-        if found != members && found > 0 {
-            let problem = format!("has {found} weights for {members} members");
-            let hint = "give one for each of ensemble.members, in that order, or none to have them fitted";
-            return wrong("ensemble.weights", problem, hint);
-        }
-        if found > 0 && (sum - 1.0).abs() > 1e-3 {
-            let hint = EnsembleError::WeightSum { weights: self.shares(), sum }.hint();
-            return wrong("ensemble.weights", format!("sum to {sum}, expected 1"), &hint);
-        }
-        if !self.config.render.float {
-            let problem = "is false, but members are blended in float".into();
-            return wrong("render.float", problem, "set it to true, or blend nothing: ensemble.members=");
-        }
-        Ok(())
-    }
-
-    /// The members' words.
-    pub(super) fn members(&self) -> Vec<&'static str> {
-        self.config.ensemble.members.iter().map(|m| m.folder()).collect()
-    }
-
-    /// What is shown and what is blended, as `--with` takes it.
-    fn shown_with_members(&self) -> String {
-        let shown = &self.config.render.method;
-        let more = self.config.ensemble.members.iter().filter(|m| !shown.contains(m));
-        shown.iter().chain(more).map(|m| m.folder()).collect::<Vec<_>>().join(",")
-    }
-
-    /// The weights as given; alike where none are.
-    pub(super) fn shares(&self) -> Vec<f32> {
-        let c = &self.config.ensemble;
-        match c.weights.is_empty() {
-            true => vec![1.0 / c.members.len() as f32; c.members.len()],
-            false => c.weights.iter().map(|w| *w as f32).collect(),
+            return wrong("ensemble.members", problem, &hint);
         }
     }
-
-    /// The views of all members from one camera, in float.
-    fn member_views(&self, name: &str) -> Result<Vec<Image>> {
-        let members = self.config.ensemble.members.iter();
-        members.map(|m| Ok(pictures::read_float(&self.member_file(*m, name)?)?)).collect()
+    let (found, members) = (c.weights.len(), c.members.len());
+    let sum: f64 = c.weights.iter().sum();
+    if found == 0 && config.capture.tiles <= 0.0 {
+        let problem = "is empty, but there is nothing to fit them on: capture.tiles is 0".into();
+        return wrong(
+            "ensemble.weights",
+            problem,
+            "give one for each of ensemble.members, or set capture.tiles=0.04",
+        );
     }
+    if found != members && found > 0 {
+        let problem = format!("has {found} weights for {members} members");
+        let hint = "give one for each of ensemble.members, in that order, or none to have them fitted";
+        return wrong("ensemble.weights", problem, hint);
+    }
+    if found > 0 && (sum - 1.0).abs() > 1e-3 {
+        let hint = EnsembleError::WeightSum { weights: shares(c), sum }.hint();
+        return wrong("ensemble.weights", format!("sum to {sum}, expected 1"), &hint);
+    }
+    if !config.render.float {
+        let problem = "is false, but members are blended in float".into();
+        return wrong("render.float", problem, "set it to true, or blend nothing: ensemble.members=");
+    }
+    Ok(())
+}
 
-    /// The float view of a member, if it was rendered.
-    fn member_file(&self, member: Method, name: &str) -> Result<std::path::PathBuf> {
-        let below = format!("render/{}/{}", member.folder(), pictures::FLOAT);
-        let file = pictures::float_path(&self.run.path(&below), name);
+/// The words of methods.
+fn words(methods: &[Method]) -> Vec<&'static str> {
+    methods.iter().map(|m| m.folder()).collect()
+}
+
+/// What is shown and what is blended, as `--with` takes it.
+fn shown_with_members(config: &Config) -> String {
+    let mut methods = config.render.method.clone();
+    methods.extend(config.ensemble.members.iter().filter(|m| !config.render.method.contains(m)));
+    words(&methods).join(",")
+}
+
+/// The weights as given; alike where none are.
+fn shares(c: &EnsembleConfig) -> Vec<f32> {
+    match c.weights.is_empty() {
+        true => vec![1.0 / c.members.len() as f32; c.members.len()],
+        false => c.weights.iter().map(|w| *w as f32).collect(),
+    }
+}
+
+/// The views of all members from one camera, in float.
+fn member_views(line: &Line, name: &str) -> Result<Vec<Image>> {
+    let view = |member: &Method| {
+        let word = member.folder();
+        let below = format!("render/{word}/{}", pictures::FLOAT);
+        let file = pictures::float_path(&line.run.path(&below), name);
         if io::is_file(&file) {
-            return Ok(file);
+            return Ok(pictures::read_float(&file)?);
         }
-        let (word, stage) = (member.folder(), member.stage());
         Err(Error::cannot(
             format!("member `{word}` is missing: there is no `{below}/{name}.exr`"),
             format!(
-                "`tiface render RUN --fresh render --with {}` makes it from the stage `{stage}`, or leave it out of \
+                "`tiface render RUN --fresh render --with {}` makes it from the stage `{}`, or leave it out of \
                  ensemble.members",
-                self.shown_with_members()
+                shown_with_members(line.config),
+                member.stage()
             ),
         ))
-    }
+    };
+    line.config.ensemble.members.iter().map(view).collect()
+}
 
-    /// The members of one view, checked, and cut to the head where that is asked for.
-    ///
-    /// Never by fitted weights: so a fit sees the members as they will be blended.
-    pub(super) fn checked<'i>(&self, images: &'i [Image]) -> Result<Members<'i>> {
-        let named = self.config.ensemble.members.iter().zip(images);
-        let list: Vec<Member<'i>> = named
-            .map(|(m, image)| Member { name: m.folder(), image, masked: self.knows_masks(*m) })
-            .collect();
-        let members = Members::new(&list)?;
-        if self.config.ensemble.cut {
-            return Ok(members.cut(&self.shares())?);
+/// The members of one view, checked, and cut to the head where that is asked for.
+///
+/// Never by fitted weights: so a fit sees the members as they will be blended.
+fn members<'i>(line: &Line, views: &'i [Image]) -> Result<Members<'i>> {
+    let c = &line.config.ensemble;
+    let member =
+        |(m, image): (&Method, &'i Image)| Member { name: m.folder(), image, masked: knows_masks(line, *m) };
+    let list: Vec<Member<'i>> = c.members.iter().zip(views).map(member).collect();
+    let members = Members::new(&list)?;
+    if c.cut { Ok(members.cut(&shares(c))?) } else { Ok(members) }
+}
+
+/// Was the field learned with masks?
+fn knows_masks(line: &Line, method: Method) -> bool {
+    let has_mask = |v: &View| v.mask != MaskSource::None && v.mask_meaning == MaskMeaning::Empty;
+    let used = match method {
+        Method::Baseline | Method::Tface => line.config.radiance(method.stage()).masks != MaskUse::None,
+        Method::Volume | Method::Raycast | Method::Textured => true,
+    };
+    used && line.capture.views.iter().any(has_mask)
+}
+
+/// Returns weights for the members, and what is known of them; alike where no tile shows the head.
+///
+/// Only the tiles are rendered: a few percent of the pixels of the training views.
+fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<(Vec<f32>, Value)> {
+    let c = &line.config.ensemble;
+    let imported = |method: &&Method| line.imports.iter().any(|import| import.stage == method.stage());
+    for method in c.members.iter().filter(imported) {
+        dir.warn(&format!(
+            "`{}` was not learned here and may know the pixels that weights are fitted on: its weight may be too \
+             large; ensemble.weights gives others",
+            method.stage()
+        ));
+    }
+    let meshes = Meshes::load(line, &c.members)?;
+    let renderer = Renderer::new(scene, fields, &meshes, line.config.render.samples, dir.monitor());
+    let mut sums = Vec::new();
+    for (view, tiles) in tiles::held_out_tiles(&line.capture, line.config) {
+        let (photo, weight) = target(view)?;
+        let camera = view.camera.transformed(&scene.scene_from_world);
+        let mut sum = Fit::new(c.members.len())?;
+        for tile in tiles {
+            let (photo, weight) = cut_out(&photo, &weight, tile);
+            if weight.values.iter().all(|w| *w == 0) {
+                continue;
+            }
+            let part = camera.part(tile.x, tile.y, tile.side, tile.side);
+            let mut images: Vec<Image> = Vec::new();
+            for method in &c.members {
+                let view = renderer.view(*method, &part)?;
+                dir.check_stop()?; // what it holds then is not whole
+                images.push(view.map_or_else(|| Image::new(tile.side, tile.side, 4), |view| view.color));
+            }
+            sum.add(&members(line, &images)?, &Target { photo: &photo, weight: &weight })?;
         }
-        Ok(members)
+        sums.push(sum);
     }
-
-    /// Was the field learned with masks?
-    fn knows_masks(&self, method: Method) -> bool {
-        let any = self
-            .capture
-            .views
-            .iter()
-            .any(|v| v.mask != MaskSource::None && v.mask_meaning == MaskMeaning::Empty);
-        let used = match method {
-            Method::Baseline | Method::Tface => self.vm(method.stage()).masks != MaskUse::None,
-            Method::Volume | Method::Raycast | Method::Textured => true,
-        };
-        any && used
-    }
-
-    fn write_blend(&self, folder: &Path, name: &str, color: Image) -> Result<()> {
-        let c = &self.config.render;
-        let mut view = RenderedView { color, depth: Image::new(0, 0, 1), normal: Image::new(0, 0, 3) };
-        if let Some(background) = pictures::behind(c.background) {
-            pictures::over(&mut view, background);
+    let weights = match ensemble::weigh(&sums) {
+        Err(EnsembleError::NoPixels) => {
+            dir.warn("no square of capture.tiles shows the head: the members are blended alike");
+            return Ok((shares(c), Value::Null));
         }
-        Ok(pictures::write(folder, name, &view, c.format, self.config.capture.unit_m)?)
+        weights => weights?,
+    };
+    let mut all = Fit::new(c.members.len())?;
+    sums.iter().try_for_each(|sum| all.merge(sum))?;
+    let mut alone = Map::new();
+    for (k, name) in words(&c.members).into_iter().enumerate() {
+        let one: Vec<f32> = (0..c.members.len()).map(|l| if l == k { 1.0 } else { 0.0 }).collect();
+        alone.insert(name.into(), json!(all.psnr(&one)?));
     }
+    let each = words(&c.members).into_iter().zip(&weights);
+    let shares: Vec<String> = each.map(|(name, w)| format!("{} {w:.3}", called(name))).collect();
+    dir.note(&format!("fitted weights: {}", shares.join(", ")));
+    let record = json!({"pixels": all.pixels(), "psnr": all.psnr(&weights)?, "psnr_alone": alone});
+    Ok((weights, record))
+}
+
+/// What the members should have shown of a view, and where that counts.
+fn target(view: &View) -> Result<(Photo, Gray)> {
+    let loaded = view.load(&Limits::default())?;
+    let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), Background::None);
+    let (width, height) = (photo.width, photo.height);
+    let inside = |of: &Option<Gray>, i: usize| of.as_ref().is_none_or(|m| m.values[i] >= INSIDE);
+    let counts = |i: usize| if inside(&loaded.mask, i) && inside(&loaded.valid, i) { 255 } else { 0 };
+    let values = (0..photo.rgb.len()).map(counts).collect();
+    Ok((photo, Gray { width, height, values }))
+}
+
+/// What of them is in a tile.
+fn cut_out(photo: &Photo, weight: &Gray, tile: Tile) -> (Photo, Gray) {
+    let (width, height) = (tile.side, tile.side);
+    let rgb = tile.pixels(photo.width).map(|i| photo.rgb[i]).collect();
+    let values = tile.pixels(weight.width).map(|i| weight.values[i]).collect();
+    (Photo { width, height, rgb, alpha: None }, Gray { width, height, values })
 }

@@ -1,6 +1,7 @@
 //! The stage `ensemble` on pictures made by hand.
 
-use super::{Fields, Line, Radiance, Seen, Surface, pictures};
+use super::tests::{NoFields, quiet, words};
+use super::*;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::capture::{Split, View};
 use crate::config::{Background, Config, Method, Preset};
@@ -8,12 +9,11 @@ use crate::geom::{Camera, Ray};
 use crate::image::{Image, quantise};
 use crate::io;
 use crate::render::RenderedView;
-use crate::run::{Run, Stop};
-use crate::{ErrorKind, Quiet, Result};
+use crate::run::Run;
+use crate::{ErrorKind, Result};
 use glam::Vec3;
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 const SIZE: (u32, u32) = (32, 40);
 
@@ -23,10 +23,6 @@ fn config(root: &Path) -> Config {
     let mut config = Config::preset(Preset::Draft);
     config.capture.path = root.to_str().unwrap().into();
     config
-}
-
-fn run(dir: &Path) -> Run {
-    Run::open(&dir.join("run"), Stop::new(), Arc::new(Quiet))
 }
 
 fn flat(color: [f32; 4]) -> Image {
@@ -56,15 +52,15 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     let mut config = config(&dir.path().join("head"));
     let paper = Config::preset(Preset::Paper);
     (config.ensemble, config.render.method) = (paper.ensemble, paper.render.method);
-    let run = run(dir.path());
+    let run = quiet(dir.path());
     let line = Line::open(&config, &run, false).unwrap();
-    line.mask().unwrap();
+    complete(&line, Stage::Mask, &NoFields).unwrap();
     let names: Vec<String> = line.capture().split(Split::Test).map(|v| v.name.clone()).collect();
     for name in &names {
         put(&run, "baseline", name, flat([0.2, 0.2, 0.2, 1.0]));
         put(&run, "tface", name, flat([0.402, 0.402, 0.402, 1.0]));
     }
-    let e = line.ensemble(&NoField).unwrap_err();
+    let e = complete(&line, Stage::Ensemble, &NoFields).unwrap_err();
     let missing = format!("render/volume/float/{}.exr", names[0]);
     assert_eq!(
         e.to_string(),
@@ -78,7 +74,7 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     for name in &names {
         put(&run, "volume", name, flat([0.601, 0.601, 0.601, 1.0]));
     }
-    let done = line.ensemble(&NoField).unwrap();
+    let done = complete(&line, Stage::Ensemble, &NoFields).unwrap();
     assert_eq!(done.summary["views"], 2);
     // 0.1 · 0.2 + 0.6 · 0.402 + 0.3 · 0.601 = 0.4415 → 112.58 → 113; bytes blended would give
     // 0.1 · 51 + 0.6 · 103 + 0.3 · 153 = 112.8, and truncated 112
@@ -86,20 +82,7 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     assert_eq!(pixel(&run, &format!("ensemble/{}.png", names[1]), 77), [113; 3]);
     let weights = io::read_json(&run.path("ensemble/weights.json"), &io::Limits::default()).unwrap();
     assert_eq!((&weights["weights"], &weights["fitted"]), (&json!([0.1f32, 0.6f32, 0.3f32]), &json!(null)));
-    assert!(line.ensemble(&NoField).unwrap().skipped);
-}
-
-/// Nothing is asked for where weights are given.
-struct NoField;
-
-impl Fields for NoField {
-    fn surface(&self) -> Result<&dyn Surface> {
-        panic!("no field is asked for")
-    }
-
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
-        panic!("no field is asked for")
-    }
+    assert!(complete(&line, Stage::Ensemble, &NoFields).unwrap().skipped);
 }
 
 /// A field that has learned every photograph by heart, each pixel `off` from what it should be.
@@ -146,8 +129,8 @@ impl Fields for Two {
         panic!("no distance is asked for")
     }
 
-    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance> {
-        Ok(if stage == "tface" { &self.0 } else { &self.1 })
+    fn radiance(&self, stage: Stage) -> Result<&dyn Radiance> {
+        Ok(if stage == Stage::Tface { &self.0 } else { &self.1 })
     }
 }
 
@@ -162,9 +145,9 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
         config.render.method = vec![Method::Tface, Method::Baseline];
         config.ensemble.members = vec![Method::Tface, Method::Baseline];
         config.metrics.surface_points = 100;
-        let run = run(dir.path());
+        let run = quiet(dir.path());
         let line = Line::open(&config, &run, false).unwrap();
-        line.mask().unwrap();
+        complete(&line, Stage::Mask, &NoFields).unwrap();
         // what is rendered of test views says the opposite: had they a say, the worse member would win
         let names: Vec<String> = line.capture().split(Split::Test).map(|v| v.name.clone()).collect();
         for name in &names {
@@ -172,7 +155,7 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
             put(&run, "baseline", name, flat([0.0, 0.0, 0.0, 1.0]));
         }
         let fields = Two(ByHeart::new(&line, tface), ByHeart::new(&line, baseline));
-        let done = line.ensemble(&fields).unwrap().summary;
+        let done = complete(&line, Stage::Ensemble, &fields).unwrap().summary;
         let first = done["weights"][0].as_f64().unwrap();
         assert!((first - expected).abs() < 0.05, "{tface} {baseline}: {done}");
         let found = &done["fitted"];
@@ -187,7 +170,7 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
         assert!((shown - 255.0 * first).abs() < 1.0, "{shown} {first}");
         // only squares are marched: 8 views of 32 × 40 pixels, one tile of 8 × 8 in each
         assert!(fields.0.asked.into_inner() <= 8 * 64, "of 8 · 1280");
-        let sets: Vec<String> = line.sets().into_iter().map(|s| s.name).collect();
+        let sets: Vec<String> = metrics::picture_sets(&line).into_iter().map(|s| s.name).collect();
         assert_eq!(sets, ["tface", "baseline", "ensemble"]);
     }
 }
@@ -197,14 +180,14 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
 fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
     let dir = tempfile::tempdir().unwrap();
     let mut config = config(&dir.path().join("head"));
-    let run = run(dir.path());
+    let run = quiet(dir.path());
     let blind = |config: &Config| -> Vec<usize> {
         let line = Line::open(config, &run, false).unwrap();
         if !run.path("mask/scene.json").exists() {
-            line.mask().unwrap();
+            complete(&line, Stage::Mask, &NoFields).unwrap();
         }
-        let views = line.train_views(&line.scene().unwrap(), true).unwrap();
-        let tiles = line.tiles();
+        let views = learn::train_views(&line.capture, &line.scene().unwrap(), config, true).unwrap();
+        let tiles = tiles::held_out_tiles(&line.capture, config);
         for (view, (_, tiles)) in views.iter().zip(&tiles) {
             let Some(valid) = &view.valid else { continue };
             assert!(tiles.iter().flat_map(|t| t.pixels(SIZE.0)).all(|i| valid.values[i] == 0));
@@ -224,12 +207,12 @@ fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
 fn what_cannot_be_blended_is_said_before_anything_is_learned() {
     let dir = tempfile::tempdir().unwrap();
     let base = config(&dir.path().join("head"));
-    let run = run(dir.path());
+    let run = quiet(dir.path());
     let error = |change: &dyn Fn(&mut Config)| {
         let mut config = base.clone();
         change(&mut config);
         let line = Line::open(&config, &run, false).unwrap();
-        let e = line.remember("metrics").unwrap_err();
+        let e = line.remember(Stage::Metrics).unwrap_err();
         assert_eq!(e.kind(), ErrorKind::Usage);
         assert!(!run.path("config.toml").exists());
         (e.to_string(), e.hint().to_owned())
@@ -252,6 +235,6 @@ fn what_cannot_be_blended_is_said_before_anything_is_learned() {
     config.render.method = vec![Method::Volume];
     config.ensemble.members.clear();
     let line = Line::open(&config, &run, false).unwrap();
-    assert_eq!(line.order("metrics").join(" "), "mask iface render metrics");
-    line.remember("metrics").unwrap();
+    assert_eq!(words(&line.order(Stage::Metrics)), "mask iface render metrics");
+    line.remember(Stage::Metrics).unwrap();
 }

@@ -1,15 +1,18 @@
 //! The line on the demo head.
 
+use super::tests::{NoFields, quiet, words};
 use super::*;
 use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticHead, SyntheticOptions, write_capture};
-use crate::config::{Background, Genus, MeshFormat, MeshFrame, Method, Preset};
+use crate::config::{Background, Config, Genus, MaskSource, MeshFormat, MeshFrame, Method, Preset};
 use crate::geom::{Camera, Similarity};
+use crate::io::{self, Limits};
 use crate::render::RenderedView;
-use crate::run::Stop;
+use crate::run::{Run, Stop};
 use crate::{ErrorKind, Quiet, Result};
 use glam::Vec3;
 use serde_json::json;
+use std::path::Path;
 use std::sync::Arc;
 
 /// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little brighter seen
@@ -64,21 +67,8 @@ impl Fields for Formula {
         Ok(&self.0)
     }
 
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
+    fn radiance(&self, _: Stage) -> Result<&dyn Radiance> {
         panic!("no radiance field is asked for")
-    }
-}
-
-/// Fields that nobody may ask for.
-struct Never;
-
-impl Fields for Never {
-    fn surface(&self) -> Result<&dyn Surface> {
-        panic!("loaded for nothing")
-    }
-
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
-        panic!("loaded for nothing")
     }
 }
 
@@ -91,10 +81,6 @@ fn draft(root: &Path) -> Config {
     let mut config = Config::preset(Preset::Draft);
     config.capture.path = root.to_str().unwrap().into();
     config
-}
-
-fn quiet(dir: &Path) -> Run {
-    Run::open(&dir.join("run"), Stop::new(), Arc::new(Quiet))
 }
 
 /// The line with its own formula in the place of a learned field: whatever is wrong then is not the
@@ -115,15 +101,15 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     config.ensemble.weights = vec![1.0];
     let run = quiet(dir.path());
     let line = Line::open(&config, &run, true).unwrap();
-    line.remember("metrics").unwrap();
-    assert_eq!(line.mask().unwrap().summary["masks"], 14);
+    line.remember(Stage::Metrics).unwrap();
+    assert_eq!(complete(&line, Stage::Mask, &NoFields).unwrap().summary["masks"], 14);
     let scene = line.scene().unwrap();
     let exact = Formula(Exact { world_from_scene: scene.scene_from_world.inverse() });
-    let mesh = line.mesh(&exact).unwrap();
+    let mesh = complete(&line, Stage::Mesh, &exact).unwrap();
     assert_eq!(mesh.summary["closed"], true);
-    line.render(&exact).unwrap();
-    line.ensemble(&Never).unwrap();
-    let metrics = line.metrics().unwrap();
+    complete(&line, Stage::Render, &exact).unwrap();
+    complete(&line, Stage::Ensemble, &NoFields).unwrap();
+    let metrics = complete(&line, Stage::Metrics, &NoFields).unwrap();
 
     // a cell is 0.35 m / 128 = 2.7 mm = 1.1 % of the head; vertices lie on the surface, and the
     // chords between them err by a small part of a cell
@@ -148,10 +134,10 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     assert_eq!(metrics.summary["ensemble"]["head"], metrics.summary["raycast"]["head"]);
 
     // all of it again: nothing is loaded, nothing is done
-    for done in [line.mask(), line.mesh(&Never), line.render(&Never), line.ensemble(&Never), line.metrics()] {
-        assert!(done.unwrap().skipped);
+    for stage in [Stage::Mask, Stage::Mesh, Stage::Render, Stage::Ensemble, Stage::Metrics] {
+        assert!(complete(&line, stage, &NoFields).unwrap().skipped);
     }
-    line.report().unwrap();
+    page::write_report(&line).unwrap();
     let page = String::from_utf8(bytes("report.html")).unwrap();
     assert!(page.contains("<figcaption>blend (ensemble)</figcaption>") && run.path("cameras.json").is_file());
     assert!(bytes("mesh/head.glb").starts_with(b"glTF"));
@@ -180,14 +166,14 @@ fn the_textured_head_looks_like_the_field_it_was_baked_from() {
         config.mesh.frame = frame;
         let run = quiet(&dir.path().join(errors.len().to_string()));
         let line = Line::open(&config, &run, true).unwrap();
-        line.remember("render").unwrap();
-        line.mask().unwrap();
+        line.remember(Stage::Render).unwrap();
+        complete(&line, Stage::Mask, &NoFields).unwrap();
         let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
-        let mesh = line.mesh(&exact).unwrap().summary;
+        let mesh = complete(&line, Stage::Mesh, &exact).unwrap().summary;
         assert_eq!((&mesh["closed"], &mesh["triangles"]), (&json!(true), &json!(8000)));
         // two texels a millimetre: the step across a seam is below a byte
         assert!(mesh["steps"]["seam_step_255"].as_f64().unwrap() < 1.0, "{mesh}");
-        line.render(&exact).unwrap();
+        complete(&line, Stage::Render, &exact).unwrap();
         for ending in ["glb", "obj", "mtl", "png", "ply"] {
             assert!(run.path(format!("mesh/head.{ending}")).is_file(), "{ending}");
         }
@@ -225,14 +211,14 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     config.ensemble.members = Vec::new();
     let run = quiet(dir.path());
     let line = Line::open(&config, &run, true).unwrap();
-    line.remember("render").unwrap();
-    line.mask().unwrap();
+    line.remember(Stage::Render).unwrap();
+    complete(&line, Stage::Mask, &NoFields).unwrap();
     let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
-    let mesh = line.mesh(&exact).unwrap().summary;
+    let mesh = complete(&line, Stage::Mesh, &exact).unwrap().summary;
     // the demo's neck runs out of the box
     assert_eq!(mesh["closed"], json!(mesh["report"]["capped"] == 0), "{mesh}");
     assert_eq!(mesh["texture_px"], 0);
-    let error = line.render(&exact).unwrap_err();
+    let error = complete(&line, Stage::Render, &exact).unwrap_err();
     assert!(error.hint().contains("--texture"), "{error}");
     config.mesh.lobes = 1;
     let error = Line::open(&config, &run, true).err().unwrap();
@@ -284,7 +270,7 @@ impl Fields for Drilled {
         Ok(self)
     }
 
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
+    fn radiance(&self, _: Stage) -> Result<&dyn Radiance> {
         panic!("no radiance field is asked for")
     }
 }
@@ -304,12 +290,12 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
         config.mesh.genus = genus;
         let run = Run::open(&dir.path().join(format!("{genus:?}")), Stop::new(), Arc::new(Quiet));
         let line = Line::open(&config, &run, true).unwrap();
-        line.remember("mesh").unwrap();
-        line.mask().unwrap();
+        line.remember(Stage::Mesh).unwrap();
+        complete(&line, Stage::Mask, &NoFields).unwrap();
         let world_from_scene = line.scene().unwrap().scene_from_world.inverse();
         let mm = world_from_scene.scale * config.capture.unit_m * 1000.0;
-        let summary = line.mesh(&Drilled(Exact { world_from_scene })).unwrap().summary;
-        digests.push(line.plan("mesh").fingerprint.digest());
+        let summary = complete(&line, Stage::Mesh, &Drilled(Exact { world_from_scene })).unwrap().summary;
+        digests.push(line.plan(Stage::Mesh).fingerprint.digest());
         let (handles, product) = (&summary["handles"], line.read_product().unwrap().mesh);
         let left = handles["left"].as_u64().unwrap() as usize;
         let lengths = |key: &str| handles[key].as_array().unwrap().len();
@@ -346,8 +332,8 @@ impl Fields for Fog {
         panic!("no surface is asked for")
     }
 
-    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance> {
-        assert_eq!(stage, "tface");
+    fn radiance(&self, stage: Stage) -> Result<&dyn Radiance> {
+        assert_eq!(stage, Stage::Tface);
         Ok(self)
     }
 }
@@ -360,16 +346,16 @@ fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
     config.render.method = vec![Method::Tface];
     config.render.background = Background::White;
     let run = quiet(dir.path());
-    Line::open(&config, &run, false).unwrap().mask().unwrap();
+    complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap();
     let interrupted = Fog(0.into(), Some(run.stop().clone()));
-    let e = Line::open(&config, &run, false).unwrap().render(&interrupted).unwrap_err();
+    let e = complete(&Line::open(&config, &run, false).unwrap(), Stage::Render, &interrupted).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::Interrupted);
     let made = |run: &Run| io::list_files(&run.path("render/tface")).map_or(0, |f| f.len());
     assert_eq!(made(&run), 1);
     let run = quiet(dir.path());
     let rest = Fog(0.into(), None);
     let line = Line::open(&config, &run, false).unwrap();
-    assert_eq!(line.render(&rest).unwrap().summary["cameras"], 3);
+    assert_eq!(complete(&line, Stage::Render, &rest).unwrap().summary["cameras"], 3);
     assert_eq!((made(&run), rest.0.into_inner()), (3, 2));
     // half a grey of 0.5 over white is 0.25 + 0.5; in float it is as it was
     let name = line.capture().split(Split::Test).next().unwrap().name.clone();
@@ -400,8 +386,8 @@ fn a_run_without_masks_stops_before_anything_is_written_unless_told_to_go_on() {
     assert!(!run.dir().exists());
     config.mask.source = MaskSource::None;
     let line = Line::open(&config, &run, false).unwrap();
-    line.remember("mask").unwrap();
-    assert_eq!(line.mask().unwrap().summary["masks"], 0);
+    line.remember(Stage::Mask).unwrap();
+    assert_eq!(complete(&line, Stage::Mask, &NoFields).unwrap().summary["masks"], 0);
 }
 
 #[test]
@@ -413,19 +399,23 @@ fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
     config.render.method = vec![Method::Tface];
     let run = quiet(dir.path());
     let line = Line::open(&config, &run, false).unwrap();
-    line.mask().unwrap();
+    complete(&line, Stage::Mask, &NoFields).unwrap();
     let path = run.path("mask/scene.json");
     let mut value = io::read_json(&path, &Limits::default()).unwrap();
     value["hull"] = json!({"resolution": 0, "bits": []});
     std::fs::write(&path, value.to_string()).unwrap();
     let fog = Fog(0.into(), None);
-    for e in [line.mask().unwrap_err(), line.mesh(&Never).unwrap_err(), line.render(&fog).unwrap_err()] {
+    for e in [
+        complete(&line, Stage::Mask, &NoFields).unwrap_err(),
+        complete(&line, Stage::Mesh, &NoFields).unwrap_err(),
+        complete(&line, Stage::Render, &fog).unwrap_err(),
+    ] {
         assert!(e.to_string().contains("`hull.resolution` is 0, expected 2 to 1024"), "{e}");
         assert!(e.hint().contains("`--fresh mask`") && e.kind() == ErrorKind::Cannot, "{}", e.hint());
     }
     // which it is
-    line.fresh("mask", "mask").unwrap();
-    line.mask().unwrap();
+    line.fresh(Stage::Mask, Stage::Mask).unwrap();
+    complete(&line, Stage::Mask, &NoFields).unwrap();
 }
 
 #[test]
@@ -433,32 +423,31 @@ fn a_command_runs_what_its_stage_needs_and_nothing_else() {
     let dir = tempfile::tempdir().unwrap();
     capture(dir.path(), 3, 1);
     let run = quiet(dir.path());
-    let order = |until: &str, methods: &[Method]| {
+    let order = |until: Stage, methods: &[Method]| {
         let mut config = draft(dir.path());
         if !methods.is_empty() {
             config.render.method = methods.to_vec();
         }
-        Line::open(&config, &run, false).unwrap().order(until).join(" ")
+        words(&Line::open(&config, &run, false).unwrap().order(until))
     };
-    assert_eq!(order("baseline", &[]), "mask baseline");
-    assert_eq!(order("tface", &[]), "mask tface");
-    assert_eq!(order("iface", &[]), "mask iface");
-    assert_eq!(order("mesh", &[]), "mask iface mesh");
-    assert_eq!(order("render", &[Method::Tface]), "mask tface render");
-    assert_eq!(order("render", &[Method::Baseline]), "mask baseline render");
-    assert_eq!(order("render", &[Method::Volume]), "mask iface render");
-    assert_eq!(order("render", &[Method::Raycast]), "mask iface mesh render");
-    assert_eq!(order("ensemble", &[Method::Tface]), "mask tface render ensemble");
+    assert_eq!(order(Stage::Baseline, &[]), "mask baseline");
+    assert_eq!(order(Stage::Tface, &[]), "mask tface");
+    assert_eq!(order(Stage::Iface, &[]), "mask iface");
+    assert_eq!(order(Stage::Mesh, &[]), "mask iface mesh");
+    assert_eq!(order(Stage::Render, &[Method::Tface]), "mask tface render");
+    assert_eq!(order(Stage::Render, &[Method::Baseline]), "mask baseline render");
+    assert_eq!(order(Stage::Render, &[Method::Volume]), "mask iface render");
+    assert_eq!(order(Stage::Render, &[Method::Raycast]), "mask iface mesh render");
+    assert_eq!(order(Stage::Ensemble, &[Method::Tface]), "mask tface render ensemble");
     // the paper's baseline is learned where it is shown
-    assert_eq!(order("metrics", &[]), STAGES.join(" ").replace("baseline ", ""));
+    assert_eq!(order(Stage::Metrics, &[]), words(&Stage::ALL).replace("baseline ", ""));
     let shown = [Method::Baseline, Method::Tface, Method::Volume, Method::Raycast];
-    assert_eq!(order("metrics", &shown), STAGES.join(" "));
+    assert_eq!(order(Stage::Metrics, &shown), words(&Stage::ALL));
     // and only those that build on it are out of date with it
     let config = draft(dir.path());
-    let line = Line::open(&config, &run, false).unwrap();
-    assert_eq!(line.followers("tface").join(" "), "tface render ensemble metrics");
-    assert_eq!(line.followers("iface").join(" "), "iface mesh render ensemble metrics");
-    assert_eq!(line.followers("mask").join(" "), STAGES.join(" "));
+    assert_eq!(words(&Stage::Tface.followers(&config)), "tface render ensemble metrics");
+    assert_eq!(words(&Stage::Iface.followers(&config)), "iface mesh render ensemble metrics");
+    assert_eq!(words(&Stage::Mask.followers(&config)), words(&Stage::ALL));
 }
 
 #[test]
@@ -471,15 +460,15 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
         let mut config = draft(dir.path());
         change(&mut config);
         let line = Line::open(&config, &run, false).unwrap();
-        STAGES.iter().map(|s| line.plan(s).fingerprint.digest()).collect()
+        Stage::ALL.iter().map(|s| line.plan(*s).fingerprint.digest()).collect()
     };
     let base = digests(&|_| {});
     let changed = |change: &dyn Fn(&mut Config)| -> String {
         let now = digests(change);
-        let names = STAGES.iter().zip(base.iter().zip(&now)).filter(|(_, (a, b))| a != b);
-        names.map(|(s, _)| *s).collect::<Vec<_>>().join(" ")
+        let names = Stage::ALL.iter().zip(base.iter().zip(&now)).filter(|(_, (a, b))| a != b);
+        names.map(|(s, _)| s.word()).collect::<Vec<_>>().join(" ")
     };
-    let all = STAGES.join(" ");
+    let all = words(&Stage::ALL);
     assert_eq!(changed(&|c| c.mesh.resolution = 100), "mesh render ensemble metrics");
     assert_eq!(changed(&|c| c.tface.steps += 1), "tface render ensemble metrics");
     assert_eq!(changed(&|c| c.baseline.steps += 1), "baseline");
@@ -496,7 +485,7 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
     };
     let first = import("a.th");
     assert_ne!(first[2], base[2]);
-    assert_eq!(STAGES[2], "tface");
+    assert_eq!(Stage::ALL[2], Stage::Tface);
     std::fs::copy(dir.path().join("a.th"), dir.path().join("b.th")).unwrap();
     assert_eq!(import("b.th"), first);
     std::fs::write(dir.path().join("a.th"), b"other").unwrap();
@@ -512,7 +501,7 @@ fn what_is_not_rendered_does_not_shape_the_views() {
         let mut config = draft(dir.path());
         config.render.method = vec![Method::Tface];
         change(&mut config);
-        Line::open(&config, &run, false).unwrap().plan("render").fingerprint
+        Line::open(&config, &run, false).unwrap().plan(Stage::Render).fingerprint
     };
     let base = render(&|_| {});
     assert_eq!(base.inputs.keys().map(String::as_str).collect::<Vec<_>>(), ["mask", "tface"]);

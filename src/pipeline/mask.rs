@@ -1,19 +1,20 @@
 //! Stage `mask`: which pixels are the head, and where that puts it in space.
 
-use super::{Line, scene_file};
-use crate::capture::scene::{self, Scene, SceneError, SceneOptions};
+use super::clicks::{Clicks, make_masks};
+use super::scene_file;
+use crate::Result;
+use crate::capture::scene::{self, Scene, SceneOptions};
 use crate::capture::{self, Capture, Split};
-use crate::config::MaskMeaning;
+use crate::config::{MaskConfig, MaskMeaning};
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
 use crate::mask::consistency::{ConsistencyOptions, ConsistencyView, check_consistency};
 use crate::mask::sheet::{Tile, sheet};
 use crate::mask::{prompts, scale};
-use crate::run::{Done, Stage};
-use crate::{Error, Result};
+use crate::run::StageDir;
 use rayon::prelude::*;
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// The contact sheet, in the stage's folder.
 pub(super) const SHEET: &str = "sheet.html";
@@ -38,149 +39,149 @@ struct Masked {
     made: Value,
 }
 
-impl Line<'_> {
-    /// Stage `mask`: the masks as pictures, a sheet of them, and the box and hull they leave (`scene.json`).
-    pub fn mask(&self) -> Result<Done> {
-        let done = self.run.stage(self.plan("mask"), |stage| {
-            let Masked { masks, mut tiles, shown, made } = match &self.clicks {
-                Some(clicks) => self.masks_from_clicks(stage, clicks)?,
-                None => self.masks_of_capture(stage)?,
+/// Finds the masks beside the photographs, or makes them from clicks: the masks as pictures, a sheet of them, and the
+/// box and hull they leave (`scene.json`).
+pub(super) fn mask(
+    capture: &Capture,
+    clicks: Option<&Clicks>,
+    config: &MaskConfig,
+    dir: &StageDir,
+) -> Result<Value> {
+    let Masked { masks, mut tiles, shown, made } = match clicks {
+        Some(clicks) => masks_from_clicks(capture, clicks, config, dir)?,
+        None => masks_of_capture(capture, dir)?,
+    };
+    let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
+    if coverage.is_empty() {
+        dir.warn(
+            "no head masks, as asked: nothing says which pixels are background, and the box learns whatever it \
+             holds",
+        );
+    }
+    let silhouettes = config.meaning == MaskMeaning::Empty;
+    let conflicts = if silhouettes { conflicts(capture, &masks) } else { Vec::new() };
+    as_warnings(&conflicts, coverage.len()).iter().for_each(|text| dir.warn(text));
+    for (view, _) in &conflicts {
+        if let Some(k) = shown.iter().position(|v| v == view) {
+            tiles[k].suspicions.push("disagrees with the others".into());
+        }
+    }
+    if !tiles.is_empty() {
+        io::write_atomic(&dir.folder().join(SHEET), sheet(&tiles).as_bytes())?;
+    }
+    let suspicious: Vec<&str> =
+        tiles.iter().filter(|t| !t.suspicions.is_empty()).map(|t| t.name.as_str()).collect();
+    let suspicious = json!(suspicious);
+    // what a mask calls "not looked at" may still hold head
+    let scene = place(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), dir)?;
+    scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
+    let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;
+    Ok(json!({
+        "views": capture.views.len(),
+        "masks": coverage.len(),
+        "coverage": covered,
+        "suspicious": suspicious,
+        "made": made,
+        "box": scene::world_box(&scene),
+    }))
+}
+
+/// Where the stage keeps the mask of a view, in its folder.
+pub(super) fn mask_file(folder: &Path, view: &str) -> PathBuf {
+    folder.join(format!("{view}.png"))
+}
+
+fn write_mask(folder: &Path, view: &str, mask: &Gray) -> Result<()> {
+    let file = mask_file(folder, view);
+    if let Some(folder) = file.parent() {
+        io::create_folder(folder)?;
+    }
+    Ok(io::write_png_gray(&file, mask)?)
+}
+
+/// The masks that lie beside the photographs.
+fn masks_of_capture(capture: &Capture, dir: &StageDir) -> Result<Masked> {
+    let limits = Limits::default();
+    let total = capture.views.len();
+    let mut out =
+        Masked { masks: Vec::with_capacity(total), tiles: vec![], shown: vec![], made: Value::Null };
+    // a few at a time: decoding is what takes time, and photographs are large
+    for (i, views) in capture.views.chunks(8).enumerate() {
+        let loaded: Vec<Result<_>> = views
+            .par_iter()
+            .map(|v| {
+                let Some(mask) = v.load_mask(&limits)? else { return Ok(None) };
+                let photo = v.load_photo(&limits)?;
+                let tile = Tile::new(&v.name, &photo, &mask, None);
+                Ok(Some((mask, tile)))
+            })
+            .collect();
+        for (k, found) in loaded.into_iter().enumerate() {
+            let view = 8 * i + k;
+            let found: Option<(Gray, Result<Tile, _>)> = found?;
+            let Some((mask, tile)) = found else {
+                out.masks.push(None);
+                continue;
             };
-            let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
-            if coverage.is_empty() {
-                stage.warn(
-                    "no head masks, as asked: nothing says which pixels are background, and the box learns whatever it \
-                     holds",
-                );
-            }
-            let meaning = self.config.mask.meaning;
-            let conflicts =
-                if meaning == MaskMeaning::Empty { conflicts(&self.capture, &masks) } else { Vec::new() };
-            as_warnings(&conflicts, coverage.len()).iter().for_each(|text| stage.warn(text));
-            for (view, _) in &conflicts {
-                if let Some(k) = shown.iter().position(|v| v == view) {
-                    tiles[k].suspicions.push("disagrees with the others".into());
-                }
-            }
-            if !tiles.is_empty() {
-                io::write_atomic(&stage.folder().join(SHEET), sheet(&tiles).as_bytes())?;
-            }
-            let suspicious: Vec<&str> =
-                tiles.iter().filter(|t| !t.suspicions.is_empty()).map(|t| t.name.as_str()).collect();
-            let suspicious = json!(suspicious);
-            let scene = self.place(stage, masks)?;
-            scene_file::write_scene(&stage.folder().join("scene.json"), &scene)?;
-            let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;
-            Ok(json!({
-                "views": self.capture.views.len(),
-                "masks": coverage.len(),
-                "coverage": covered,
-                "suspicious": suspicious,
-                "made": made,
-                "box": scene::world_box(&scene),
-            }))
-        })?;
-        if self.gone.is_none() {
-            let cameras = scene_file::cameras_json(&self.capture, &self.scene()?);
-            let written = self.run.write("cameras.json", &cameras);
-            self.unless_idle(done.skipped, written)?;
-        }
-        Ok(done)
-    }
-
-    /// Where the stage keeps the mask of a view.
-    pub(super) fn mask_file(&self, view: &str) -> PathBuf {
-        self.run.path("mask").join(format!("{view}.png"))
-    }
-
-    fn write_mask(&self, view: usize, mask: &Gray) -> Result<()> {
-        let file = self.mask_file(&self.capture.views[view].name);
-        if let Some(folder) = file.parent() {
-            io::create_folder(folder)?;
-        }
-        Ok(io::write_png_gray(&file, mask)?)
-    }
-
-    /// The masks that lie beside the photographs.
-    fn masks_of_capture(&self, stage: &Stage) -> Result<Masked> {
-        let limits = Limits::default();
-        let total = self.capture.views.len();
-        let mut out =
-            Masked { masks: Vec::with_capacity(total), tiles: vec![], shown: vec![], made: Value::Null };
-        // a few at a time: decoding is what takes time, and photographs are large
-        for (i, views) in self.capture.views.chunks(8).enumerate() {
-            let loaded: Vec<Result<_>> = views
-                .par_iter()
-                .map(|v| {
-                    let Some(mask) = v.load_mask(&limits)? else { return Ok(None) };
-                    let photo = v.load_photo(&limits)?;
-                    let tile = Tile::new(&v.name, &photo, &mask, None);
-                    Ok(Some((mask, tile)))
-                })
-                .collect();
-            for (k, found) in loaded.into_iter().enumerate() {
-                let view = 8 * i + k;
-                let found: Option<(Gray, Result<Tile, _>)> = found?;
-                let Some((mask, tile)) = found else {
-                    out.masks.push(None);
-                    continue;
-                };
-                self.write_mask(view, &mask)?;
-                out.tiles.push(tile?);
-                out.shown.push(view);
-                out.masks.push(Some(for_placing(&mask)));
-            }
-            stage.monitor().step((8 * (i + 1)).min(total) as u64, total as u64, &[]);
-            self.stop_here()?;
-        }
-        Ok(out)
-    }
-
-    /// Masks made from clicks.
-    fn masks_from_clicks(&self, stage: &Stage, clicks: &super::clicks::Clicks) -> Result<Masked> {
-        let mut out = Masked { masks: vec![], tiles: vec![], shown: vec![], made: Value::Null };
-        let mut unknown = 0.0;
-        let networks = self.make_masks(stage, clicks, &mut |view, photo: &Photo, made| {
-            self.write_mask(view, &made.alpha)?;
-            let name = &self.capture.views[view].name;
-            out.tiles.push(Tile::new(name, photo, &made.alpha, Some(&made.trimap))?);
+            write_mask(dir.folder(), &capture.views[view].name, &mask)?;
+            out.tiles.push(tile?);
             out.shown.push(view);
-            out.masks.push(Some(for_placing(&made.alpha)));
-            unknown += made.unknown;
-            Ok(())
-        })?;
-        if !self.config.mask.prompts.is_empty() {
-            io::write_atomic(&stage.folder().join(CLICKS), &clicks.file)?;
+            out.masks.push(Some(for_placing(&mask)));
         }
-        let clicked = clicks.of.iter().filter(|c| !c.is_empty()).count();
-        out.made = json!({
-            "clicked_views": clicked,
-            "clicks": clicks.of.iter().map(Vec::len).sum::<usize>(),
-            "unknown": unknown / out.masks.len().max(1) as f64,
-            "networks": networks.record(),
-        });
-        Ok(out)
+        dir.step((8 * (i + 1)).min(total), total)?;
     }
+    Ok(out)
+}
 
-    /// Where the head is, from the views that are learned from; held-out ones have no say.
-    fn place(&self, stage: &Stage, masks: Vec<Option<Gray>>) -> Result<Scene> {
-        let (mut cameras, mut carving, mut names) = (Vec::new(), Vec::new(), Vec::new());
-        for (view, mask) in self.capture.views.iter().zip(masks) {
-            if view.split == Split::Train {
-                cameras.push(view.camera.clone());
-                // what a mask calls "not looked at" may still hold head
-                carving.push(mask.filter(|_| self.config.mask.meaning == MaskMeaning::Empty));
-                names.push(view.name.clone());
-            }
-        }
-        let options = SceneOptions { names, ..SceneOptions::default() };
-        let (scene, warnings) = scene::fit(&cameras, &carving, &options).map_err(|e: SceneError| {
-            let hint = e.hint();
-            Error::cannot(e, hint)
-        })?;
-        warnings.iter().for_each(|w| stage.warn(w));
-        Ok(scene)
+/// Masks made from clicks.
+fn masks_from_clicks(
+    capture: &Capture,
+    clicks: &Clicks,
+    config: &MaskConfig,
+    dir: &StageDir,
+) -> Result<Masked> {
+    let mut out = Masked { masks: vec![], tiles: vec![], shown: vec![], made: Value::Null };
+    let mut unknown = 0.0;
+    let networks = make_masks(capture, clicks, config, dir, &mut |view, photo: &Photo, made| {
+        let name = &capture.views[view].name;
+        write_mask(dir.folder(), name, &made.alpha)?;
+        out.tiles.push(Tile::new(name, photo, &made.alpha, Some(&made.trimap))?);
+        out.shown.push(view);
+        out.masks.push(Some(for_placing(&made.alpha)));
+        unknown += made.unknown;
+        Ok(())
+    })?;
+    if !config.prompts.is_empty() {
+        io::write_atomic(&dir.folder().join(CLICKS), &clicks.file)?;
     }
+    let clicked = clicks.of.iter().filter(|c| !c.is_empty()).count();
+    out.made = json!({
+        "clicked_views": clicked,
+        "clicks": clicks.of.iter().map(Vec::len).sum::<usize>(),
+        "unknown": unknown / out.masks.len().max(1) as f64,
+        "networks": networks.record(),
+    });
+    Ok(out)
+}
+
+/// Where the head is, from the views that are learned from; held-out ones have no say.
+fn place(
+    capture: &Capture,
+    silhouettes: impl Iterator<Item = Option<Gray>>,
+    dir: &StageDir,
+) -> Result<Scene> {
+    let (mut cameras, mut carving, mut names) = (Vec::new(), Vec::new(), Vec::new());
+    for (view, mask) in capture.views.iter().zip(silhouettes) {
+        if view.split == Split::Train {
+            cameras.push(view.camera.clone());
+            carving.push(mask);
+            names.push(view.name.clone());
+        }
+    }
+    let options = SceneOptions { names, ..SceneOptions::default() };
+    let (scene, warnings) = scene::fit(&cameras, &carving, &options)?;
+    warnings.iter().for_each(|w| dir.warn(w));
+    Ok(scene)
 }
 
 /// The views whose masks do not fit the others, with a sentence each; none where the cameras cannot tell.
@@ -223,7 +224,7 @@ fn for_placing(mask: &Gray) -> Gray {
 
 /// What the masks of a capture say against each other, a sentence for each that a person should look at. What cannot
 /// be read is passed over: `inspect` itself tells that.
-pub fn disagreements(root: &std::path::Path, options: &capture::CaptureOptions) -> Vec<String> {
+pub fn disagreements(root: &Path, options: &capture::CaptureOptions) -> Vec<String> {
     if options.mask_meaning == capture::MaskMeaning::Ignore {
         return Vec::new(); // no silhouettes
     }
@@ -241,7 +242,7 @@ pub fn disagreements(root: &std::path::Path, options: &capture::CaptureOptions) 
 }
 
 /// An annotation page; `prompts` are clicks that are there already.
-pub fn click_page(capture: &Capture, prompts: Option<&std::path::Path>) -> Result<String> {
+pub fn click_page(capture: &Capture, prompts: Option<&Path>) -> Result<String> {
     let limits = Limits::default();
     let known = match prompts {
         Some(file) => prompts::read_prompts(file, &limits),

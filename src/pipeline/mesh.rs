@@ -3,7 +3,9 @@
 use super::finish::{Closing, Finished, REACH};
 use super::parts::Whole;
 use super::product::Product;
-use super::{Fields, Line, export};
+use super::surface::Surface;
+use super::{Line, export};
+use crate::capture::scene::Scene;
 use crate::capture::{self, Split};
 use crate::config::{Genus, MeshConfig};
 use crate::geom::{Camera, Mesh, Similarity};
@@ -11,7 +13,7 @@ use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::files::ReadMeshError;
 use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshError, Patches, files};
-use crate::run::Done;
+use crate::run::StageDir;
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
@@ -19,10 +21,8 @@ use serde_json::{Value, json};
 impl Line<'_> {
     /// Stage `mesh`: the whole surface as `surface.ply` in the dataset's world, and the product an artist opens
     /// in the formats asked for. `fields` are only asked if there is something to do.
-    pub fn mesh(&self, fields: &dyn Fields) -> Result<Done> {
-        Ok(self.run.stage(self.plan("mesh"), |stage| {
-            let scene = self.scene_or_fail()?;
-            let field = fields.surface()?;
+    pub(super) fn mesh(&self, scene: &Scene, field: &dyn Surface, dir: &StageDir) -> Result<Value> {
+        Ok((|stage: &StageDir| -> Result<Value> {
             let c = &self.config.mesh;
             let config = mesh::MeshConfig {
                 resolution: c.resolution as usize,
@@ -128,7 +128,7 @@ impl Line<'_> {
                 "report": report,
                 "steps": steps,
             }))
-        })?)
+        })(dir)?)
     }
 
     /// Settings of the stage.

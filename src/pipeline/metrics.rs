@@ -1,22 +1,23 @@
 //! Stage `metrics`: every view, of every member and of the blends, against its photograph.
 
-use super::{Line, against_truth, pictures, to_value};
+use super::truth::against_truth;
+use super::{Line, pictures};
 use crate::capture::{LoadedView, View};
-use crate::config::Background;
+use crate::config::{Background, RenderConfig, Stage};
 use crate::image::{Gray, Image};
 use crate::io::{self, Limits};
 use crate::metrics::{Metrics, ViewMetrics, compare};
-use crate::run::Done;
+use crate::run::StageDir;
 use crate::{Error, Result};
 use rayon::prelude::*;
-use serde_json::{Map, Value};
+use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 
 /// A mask counts as empty only where it is nothing at all.
 const NOTHING: u8 = 0;
 
 /// Pictures of one kind, one for each view.
-pub(super) struct Set {
+pub(super) struct PictureSet {
     /// What it is called in `metrics.json`: a member, or `ensemble`.
     pub name: String,
     /// Where its pictures are.
@@ -24,7 +25,7 @@ pub(super) struct Set {
 }
 
 /// A picture that has a photograph.
-pub(super) struct Shown<'a> {
+pub(super) struct Comparable<'a> {
     /// Its view.
     pub view: &'a View,
     /// The picture.
@@ -34,104 +35,98 @@ pub(super) struct Shown<'a> {
 }
 
 /// Figures of one picture.
-struct Judged {
+struct Figures {
     head: ViewMetrics,
     region: Option<ViewMetrics>,
     /// Sum of opacity² over the pixels without any head, and how many those are.
     outside: Option<(f64, u64)>,
 }
 
-impl Line<'_> {
-    /// Everything that is judged, in the order of the line.
-    pub(super) fn sets(&self) -> Vec<Set> {
-        let c = &self.config.ensemble;
-        let set = |name: &str, folder: &str| Set { name: name.into(), folder: self.run.path(folder) };
-        let methods = self.config.render.method.iter().map(|m| m.folder());
-        let mut sets: Vec<Set> = methods.map(|m| set(m, &format!("render/{m}"))).collect();
-        if !c.members.is_empty() {
-            sets.push(set("ensemble", "ensemble"));
+/// Everything that is judged, in the order of the line.
+pub(super) fn picture_sets(line: &Line) -> Vec<PictureSet> {
+    let set = |name: &str, folder: &str| PictureSet { name: name.into(), folder: line.run.path(folder) };
+    let methods = line.config.render.method.iter().map(|m| m.folder());
+    let mut sets: Vec<PictureSet> = methods.map(|m| set(m, &format!("render/{m}"))).collect();
+    if !line.config.ensemble.members.is_empty() {
+        sets.push(set("ensemble", "ensemble"));
+    }
+    sets
+}
+
+/// The pictures of a set that have a photograph.
+pub(super) fn comparable<'l>(line: &'l Line, set: &PictureSet) -> Vec<Comparable<'l>> {
+    let floats = set.folder.join(pictures::FLOAT);
+    let picture = |view: &'l View| {
+        let file = pictures::path(&set.folder, &view.name, line.config.render.format);
+        Comparable { view, file, float: pictures::float_path(&floats, &view.name) }
+    };
+    line.capture.views.iter().map(picture).filter(|c| io::is_file(&c.file)).collect()
+}
+
+/// Writes `metrics.json`: every rendered or blended view against its photograph, inside the mask and inside the
+/// capture's region of interest; how much of it is in the way outside; and the mesh against the truth where it is
+/// known.
+pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
+    let mut out = Map::new();
+    let sets = picture_sets(line);
+    for (i, set) in sets.iter().enumerate() {
+        let pictures = comparable(line, set);
+        let figures =
+            pictures.par_iter().map(|p| figures(p, &line.config.render)).collect::<Result<Vec<_>>>()?;
+        if !figures.is_empty() {
+            out.insert(set.name.clone(), entry(figures));
         }
-        sets
+        dir.step(i + 1, sets.len())?;
     }
+    if out.is_empty() {
+        return Err(Error::cannot(
+            "there is no view to be judged",
+            "name methods in `render.method`, and make their views with `--fresh render`",
+        ));
+    }
+    if line.synthetic && line.order(Stage::Metrics).contains(&Stage::Mesh) {
+        let points = line.config.metrics.surface_points as usize;
+        let truth = against_truth(&line.read_mesh()?, points);
+        out.insert("truth_percent_of_head".into(), json!(truth));
+    }
+    let value = Value::Object(out);
+    io::write_atomic(&dir.folder().join("metrics.json"), format!("{value:#}\n").as_bytes())?;
+    Ok(means(&value))
+}
 
-    /// The pictures of a set that have a photograph.
-    pub(super) fn comparable(&self, set: &Set) -> Vec<Shown<'_>> {
-        let floats = set.folder.join(pictures::FLOAT);
-        let shown = |view| {
-            let View { name, .. }: &View = view;
-            let file = pictures::path(&set.folder, name, self.config.render.format);
-            Shown { view, file, float: pictures::float_path(&floats, name) }
-        };
-        self.capture.views.iter().map(shown).filter(|s| io::is_file(&s.file)).collect()
-    }
-
-    /// Stage `metrics`: `metrics.json`, every rendered or blended view against its photograph, inside
-    /// the mask and inside the capture's region of interest; how much of it is in the way outside; and
-    /// the mesh against the truth where it is known.
-    pub fn metrics(&self) -> Result<Done> {
-        Ok(self.run.stage(self.plan("metrics"), |stage| {
-            let mut out = Map::new();
-            let sets = self.sets();
-            for (i, set) in sets.iter().enumerate() {
-                let shown = self.comparable(set);
-                let judged = shown.par_iter().map(|s| self.judge(s)).collect::<Result<Vec<_>>>()?;
-                if !judged.is_empty() {
-                    out.insert(set.name.clone(), entry(judged));
-                }
-                stage.monitor().step(i as u64 + 1, sets.len() as u64, &[]);
-                self.stop_here()?;
-            }
-            if out.is_empty() {
-                return Err(Error::cannot(
-                    "there is no view to be judged",
-                    "name methods in `render.method`, and make their views with `--fresh render`",
-                ));
-            }
-            if self.synthetic && self.order("metrics").contains(&"mesh") {
-                let points = self.config.metrics.surface_points as usize;
-                let truth = against_truth(&self.read_mesh()?, points);
-                out.insert("truth_percent_of_head".into(), to_value(&truth));
-            }
-            let value = Value::Object(out);
-            io::write_atomic(&stage.folder().join("metrics.json"), format!("{value:#}\n").as_bytes())?;
-            Ok(means(&value))
-        })?)
-    }
-
-    fn judge(&self, shown: &Shown) -> Result<Judged> {
-        let background = self.config.render.background;
-        let loaded = shown.view.load(&Limits::default())?;
-        let render = pictures::read(&shown.file, self.config.render.format)?;
-        let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
-        let against =
-            |mask: Option<&Gray>| compare(&shown.view.name, &render, &photo, mask, loaded.valid.as_ref());
-        let region = loaded.region.as_ref().map(|r| against(Some(r))).transpose()?;
-        let head = against(loaded.mask.as_ref())?;
-        // a picture over a background is opaque; what it was before is in the float view
-        let outside = if io::is_file(&shown.float) {
-            square_opacity_outside(&pictures::read_float(&shown.float)?, &loaded)
-        } else if background == Background::None {
-            square_opacity_outside(&render, &loaded)
-        } else {
-            None
-        };
-        Ok(Judged { head, region, outside })
-    }
+fn figures(picture: &Comparable, config: &RenderConfig) -> Result<Figures> {
+    let background = config.background;
+    let loaded = picture.view.load(&Limits::default())?;
+    let render = pictures::read(&picture.file, config.format)?;
+    let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
+    let against =
+        |mask: Option<&Gray>| compare(&picture.view.name, &render, &photo, mask, loaded.valid.as_ref());
+    let region = loaded.region.as_ref().map(|r| against(Some(r))).transpose()?;
+    let head = against(loaded.mask.as_ref())?;
+    // a picture over a background is opaque; what it was before is in the float view
+    let outside = if io::is_file(&picture.float) {
+        square_opacity_outside(&pictures::read_float(&picture.float)?, &loaded)
+    } else if background == Background::None {
+        square_opacity_outside(&render, &loaded)
+    } else {
+        None
+    };
+    Ok(Figures { head, region, outside })
 }
 
 /// One set's part of the file.
-fn entry(judged: Vec<Judged>) -> Value {
+fn entry(figures: Vec<Figures>) -> Value {
     let (mut heads, mut regions, mut outside) = (Vec::new(), Vec::new(), (0.0, 0));
-    for j in judged {
-        heads.push(j.head);
-        regions.extend(j.region);
-        let (sum, pixels) = j.outside.unwrap_or_default();
+    for f in figures {
+        heads.push(f.head);
+        regions.extend(f.region);
+        let (sum, pixels) = f.outside.unwrap_or_default();
         outside = (outside.0 + sum, outside.1 + pixels);
     }
     let mut entry = Map::new();
-    entry.insert("head".into(), to_value(&Metrics::new(heads)));
+    entry.insert("head".into(), json!(Metrics::new(heads)));
     if !regions.is_empty() {
-        entry.insert("region".into(), to_value(&Metrics::new(regions)));
+        entry.insert("region".into(), json!(Metrics::new(regions)));
     }
     if outside.1 > 0 {
         entry.insert("mean_square_opacity_outside".into(), (outside.0 / outside.1 as f64).into());

@@ -1,12 +1,13 @@
 //! Views of camera paths, beside a finished evaluation.
 
+use super::tests::{NoFields, quiet, words};
 use super::*;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
-use crate::config::{Background, Method, PictureFormat, Preset, RenderConfig};
-use crate::run::Stop;
-use crate::{ErrorKind, Quiet, Result};
-use std::path::PathBuf;
-use std::sync::Arc;
+use crate::config::{Background, Config, Method, PictureFormat, Preset, RenderConfig};
+use crate::io;
+use crate::{ErrorKind, Result};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
 
 /// Radiance fields that are one colour; others may not be asked for.
 struct Fog;
@@ -22,7 +23,7 @@ impl Fields for Fog {
         panic!("no surface is asked for")
     }
 
-    fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
+    fn radiance(&self, _: Stage) -> Result<&dyn Radiance> {
         Ok(self)
     }
 }
@@ -49,20 +50,17 @@ fn turn(config: &Config, cameras: &str) -> RenderConfig {
     }
 }
 
-fn quiet(dir: &Path) -> Run {
-    Run::open(&dir.join("run"), Stop::new(), Arc::new(Quiet))
-}
-
 /// All stages, with fields that nobody has learned; were they skipped?
 fn evaluate(line: &Line) -> Vec<bool> {
-    line.remember("metrics").unwrap();
-    let mask = line.mask();
-    for name in ["baseline", "tface"] {
-        line.run.stage(line.plan(name), |_| Ok(Value::Null)).unwrap();
+    line.remember(Stage::Metrics).unwrap();
+    let skipped = |stage| complete(line, stage, &Fog).unwrap().skipped;
+    let mask = skipped(Stage::Mask);
+    for stage in [Stage::Baseline, Stage::Tface] {
+        line.run.stage(line.plan(stage), |_| Ok(Value::Null)).unwrap();
     }
-    let done = [mask, line.render(&Fog), line.ensemble(&Fog), line.metrics()];
-    line.report().unwrap();
-    done.map(|d| d.unwrap().skipped).to_vec()
+    let rest = [Stage::Render, Stage::Ensemble, Stage::Metrics].map(skipped);
+    page::write_report(line).unwrap();
+    [&[mask], &rest[..]].concat()
 }
 
 /// Every file of a run with its bytes, those of paths left out.
@@ -102,12 +100,12 @@ fn camera_paths_never_touch_the_evaluations_views() {
     for (cameras, views) in [("orbit", 3), ("train", 4), (flight.to_str().unwrap(), 1)] {
         let line = open().along(turn(&config, cameras)).unwrap();
         // nothing but what the views show, and nothing that builds on them
-        assert_eq!(line.order("render").join(" "), "mask tface render");
-        line.fresh("render", "render").unwrap();
+        assert_eq!(words(&line.order(Stage::Render)), "mask tface render");
+        line.fresh(Stage::Render, Stage::Render).unwrap();
         for again in [false, true] {
-            line.remember("render").unwrap();
-            let done = line.render(&Fog).unwrap();
-            line.report().unwrap();
+            line.remember(Stage::Render).unwrap();
+            let done = complete(&line, Stage::Render, &Fog).unwrap();
+            page::write_report(&line).unwrap();
             assert_eq!((done.skipped, &done.summary["cameras"]), (again, &Value::from(views)), "{cameras}");
         }
         let folder = run.path(line.views());
@@ -134,22 +132,22 @@ fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
     let line = || Line::open(&config, &run, false).unwrap();
     evaluate(&line());
     let orbit = turn(&config, "orbit");
-    line().along(orbit.clone()).unwrap().render(&Fog).unwrap();
-    line().along(turn(&config, "train")).unwrap().render(&Fog).unwrap();
+    complete(&line().along(orbit.clone()).unwrap(), Stage::Render, &Fog).unwrap();
+    complete(&line().along(turn(&config, "train")).unwrap(), Stage::Render, &Fog).unwrap();
     let black = line().along(RenderConfig { background: Background::Black, ..orbit.clone() }).unwrap();
-    let e = black.remember("render").unwrap_err();
+    let e = black.remember(Stage::Render).unwrap_err();
     assert!(e.to_string().contains("render.background: was \"white\", is \"black\""), "{e}");
     assert!(e.hint().contains("`--fresh render`") && e.hint().contains("nothing else"), "{}", e.hint());
-    black.fresh("render", "render").unwrap();
-    assert!(!black.render(&Fog).unwrap().skipped);
+    black.fresh(Stage::Render, Stage::Render).unwrap();
+    assert!(!complete(&black, Stage::Render, &Fog).unwrap().skipped);
     assert_eq!(evaluate(&line()), [true; 4]);
-    assert!(line().along(turn(&config, "train")).unwrap().render(&Fog).unwrap().skipped);
+    assert!(complete(&line().along(turn(&config, "train")).unwrap(), Stage::Render, &Fog).unwrap().skipped);
     // the held-out views made anew are no reason to make others anew, another field is one
-    line().fresh("render", "metrics").unwrap();
+    line().fresh(Stage::Render, Stage::Metrics).unwrap();
     assert!(run.path("render/paths/orbit/done.json").is_file() && !run.path("render/done.json").is_file());
-    line().fresh("baseline", "metrics").unwrap();
+    line().fresh(Stage::Baseline, Stage::Metrics).unwrap();
     assert!(run.path("render/paths/orbit/done.json").is_file());
-    line().fresh("tface", "metrics").unwrap();
+    line().fresh(Stage::Tface, Stage::Metrics).unwrap();
     assert!(!run.path("render/paths/orbit/done.json").exists());
 }
 
@@ -183,7 +181,7 @@ fn a_method_that_is_not_asked_for_is_not_called_changed() {
     let run = quiet(dir.path());
     evaluate(&Line::open(&config, &run, false).unwrap());
     config.render.method = vec![Method::Tface];
-    let e = Line::open(&config, &run, false).unwrap().remember("render").unwrap_err().to_string();
+    let e = Line::open(&config, &run, false).unwrap().remember(Stage::Render).unwrap_err().to_string();
     assert!(e.contains("render.method: was [\"baseline\", \"tface\"], is [\"tface\"]"), "{e}");
     assert!(
         e.contains("baseline: was part of it, is not asked for now") && !e.contains("has changed"),
@@ -198,14 +196,14 @@ fn an_evaluation_of_other_cameras_than_the_held_out_ones_is_refused_with_the_way
     let run = quiet(dir.path());
     config.render.cameras = "orbit".into();
     let line = Line::open(&config, &run, false).unwrap();
-    let e = line.remember("metrics").unwrap_err();
+    let e = line.remember(Stage::Metrics).unwrap_err();
     assert!(e.to_string().starts_with("`render.cameras` is orbit") && e.kind() == ErrorKind::Usage, "{e}");
     assert!(
         e.hint().contains("--set render.cameras=test") && e.hint().contains("--cameras orbit"),
         "{}",
         e.hint()
     );
-    assert!(line.outlook("metrics").is_err() && !run.dir().exists());
+    assert!(line.outlook(Stage::Metrics).is_err() && !run.dir().exists());
 }
 
 #[test]
@@ -216,9 +214,9 @@ fn nothing_to_judge_is_an_error_and_no_empty_file() {
     config.ensemble.members.clear();
     let run = quiet(dir.path());
     let line = Line::open(&config, &run, false).unwrap();
-    line.mask().unwrap();
-    line.render(&Fog).unwrap();
-    let e = line.metrics().unwrap_err();
+    complete(&line, Stage::Mask, &NoFields).unwrap();
+    complete(&line, Stage::Render, &Fog).unwrap();
+    let e = complete(&line, Stage::Metrics, &NoFields).unwrap_err();
     assert!(e.hint().contains("`render.method`") && !run.path("metrics/metrics.json").exists(), "{e}");
 }
 
@@ -235,9 +233,9 @@ fn a_stage_command_does_not_shrink_the_report_of_a_finished_run() {
     std::fs::remove_file(run.path("report.html")).unwrap();
     // as a later command on one stage leaves it
     let line = Line::open(&config, &run, false).unwrap();
-    line.remember("mask").unwrap();
-    line.mask().unwrap();
-    line.report().unwrap();
+    line.remember(Stage::Mask).unwrap();
+    complete(&line, Stage::Mask, &NoFields).unwrap();
+    page::write_report(&line).unwrap();
     assert!(page() == whole);
 }
 
@@ -254,19 +252,19 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
 
     let line = Line::open(&config, &run, false).unwrap();
     assert_eq!(evaluate(&line), [true; 4]);
-    assert!(line.outlook("metrics").is_ok());
+    assert!(line.outlook(Stage::Metrics).is_ok());
     assert!(before == files(run.dir()));
     let again = line.export();
     assert_eq!((again.name, again.up, again.cameras), (export.name, export.up, export.cameras));
 
     // there is work: nothing is removed or written before it is known that it cannot be done
     for e in [
-        line.fresh("metrics", "metrics").unwrap_err(),
+        line.fresh(Stage::Metrics, Stage::Metrics).unwrap_err(),
         Line::open(&config, &run, false)
             .unwrap()
             .along(turn(&config, "orbit"))
             .unwrap()
-            .remember("render")
+            .remember(Stage::Render)
             .unwrap_err(),
     ] {
         assert!(e.to_string().contains("head") && e.kind().code() == 1, "{e}");
@@ -300,12 +298,12 @@ fn a_finished_run_that_cannot_be_written_is_still_done() {
     }
     config.device = "cpu".into();
     let line = Line::open(&config, &run, false).unwrap();
-    line.remember("metrics").unwrap();
-    let done = reconstruct(&line, "metrics").unwrap();
+    line.remember(Stage::Metrics).unwrap();
+    let done = reconstruct(&line, Stage::Metrics).unwrap();
     assert!(done.len() == 6 && done.iter().all(|(_, stage)| stage.skipped), "{done:?}");
     // with work to do it is an error, before that is begun
-    line.fresh("metrics", "metrics").unwrap();
-    assert!(line.remember("metrics").unwrap_err().to_string().contains("config.toml"));
+    line.fresh(Stage::Metrics, Stage::Metrics).unwrap();
+    assert!(line.remember(Stage::Metrics).unwrap_err().to_string().contains("config.toml"));
 }
 
 #[test]
@@ -319,7 +317,7 @@ fn a_command_that_is_refused_clears_nothing_with_fresh() {
         let mut config = config.clone();
         change(&mut config);
         let line = Line::open(&config, &run, false).unwrap();
-        line.fresh("render", "metrics").unwrap_err().to_string()
+        line.fresh(Stage::Render, Stage::Metrics).unwrap_err().to_string()
     };
     // what has no member, other cameras, and a field of other settings that is not made anew
     assert!(refused(&|c| c.render.method = vec![Method::Tface]).contains("`ensemble.members`"));

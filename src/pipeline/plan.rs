@@ -1,10 +1,17 @@
 //! What each stage builds on, and so what shapes it: known before anything runs.
 
-use super::{FORMAT, Line, STAGES};
+use super::Line;
+use super::ensemble::can_blend;
+use super::path::{CameraPath, PATHS};
 use crate::capture::{Split, View};
-use crate::config::{Config, Method, VmConfig};
-use crate::run::{Fingerprint, Plan, read_record};
+use crate::config::{Config, Stage, VmConfig};
+use crate::io;
+use crate::run::{Fingerprint, Plan, read_record, read_status};
 use crate::{Error, Result};
+use std::path::Path;
+
+/// Raised when the meaning of a stage's files changes.
+const FORMAT: u32 = 2;
 
 /// Keys of `[mask]` that say where something lies; what it holds is an input of the stage.
 const PLACES: [&str; 8] = [
@@ -22,95 +29,98 @@ const PLACES: [&str; 8] = [
 const FOUND: [&str; 2] = ["mask.source", "mask.meaning"];
 
 impl Line<'_> {
-    /// The stages that a stage reads from. What views are made of decides what `render` needs.
-    pub fn needs(&self, stage: &str) -> Vec<&'static str> {
-        match stage {
-            "mask" => Vec::new(),
-            "baseline" | "tface" | "iface" => vec!["mask"],
-            "mesh" => vec!["iface"],
-            "render" => shown(&self.config.render.method),
-            "ensemble" => vec!["render"],
-            _ if self.config.ensemble.members.is_empty() => vec!["render"],
-            _ => vec!["render", "ensemble"],
-        }
-    }
-
     /// The stages up to `until` that it needs, itself the last, in the order of the line. Views of a path need what
     /// they show, and nothing that only the evaluation shows.
-    pub fn order(&self, until: &str) -> Vec<&'static str> {
+    pub fn order(&self, until: Stage) -> Vec<Stage> {
         match &self.path {
-            Some(path) if until == "render" => {
-                let mut order = self.with_needs(shown(&path.render.method));
-                order.push("render");
+            Some(path) if until == Stage::Render => {
+                let mut order = Stage::with_needs(path.render.shows(), self.config);
+                order.push(Stage::Render);
                 order
             }
-            _ => self.with_needs(vec![known(until)]),
+            _ => Stage::with_needs(vec![until], self.config),
         }
     }
 
-    /// Stages and all that they need, in the order of the line.
-    fn with_needs(&self, mut wanted: Vec<&'static str>) -> Vec<&'static str> {
-        let mut next = 0;
-        while next < wanted.len() {
-            let more: Vec<_> = self.needs(wanted[next]).into_iter().filter(|s| !wanted.contains(s)).collect();
-            wanted.extend(more);
-            next += 1;
-        }
-        STAGES.iter().copied().filter(|s| wanted.contains(s)).collect()
-    }
-
-    /// A stage and all that build on it, in the order of the line: what is out of date when it is
-    /// recomputed.
-    pub fn followers(&self, stage: &str) -> Vec<&'static str> {
-        STAGES.iter().copied().filter(|s| self.with_needs(vec![s]).contains(&stage)).collect()
+    /// The folder of the views that this line makes, below the run.
+    pub fn views(&self) -> &str {
+        self.path.as_ref().map_or("render", |path| &path.folder)
     }
 
     /// What would be done for `until`: the folder of each stage with `None` if it has to be worked on, else what
     /// differs from the result that lies there (nothing, if it is done). An error if the settings contradict
     /// each other. Nothing is written.
-    pub fn outlook(&self, until: &str) -> Result<Vec<(String, Option<Vec<String>>)>> {
-        let look = |name: &'static str| {
-            let Plan { name, fingerprint, .. } = self.plan(name);
+    pub fn outlook(&self, until: Stage) -> Result<Vec<(String, Option<Vec<String>>)>> {
+        self.can_make(until)?;
+        let (mut found, mut missing) = (Vec::new(), Vec::new());
+        for stage in self.order(until) {
+            let Plan { name, fingerprint, .. } = self.plan(stage);
             // a record that cannot be read is none: the stage counts as not done
             let record = read_record(&self.run.path(name)).ok().flatten();
-            (name.to_string(), record.map(|r| fingerprint.differences(&r.fingerprint)))
-        };
-        self.can_make(until)?;
-        let found: Vec<_> = self.order(until).into_iter().map(look).collect();
-        if found.iter().any(|(_, record)| record.is_none()) {
-            self.is_there()?;
+            missing.extend(record.is_none().then_some(stage));
+            found.push((name.to_string(), record.map(|r| fingerprint.differences(&r.fingerprint))));
         }
+        self.require_inputs(&missing)?;
         Ok(found)
     }
 
     /// Writes the complete configuration into the run: what repeats it. Refused, before anything is
     /// changed, if a stage that `until` needs was made or begun with other settings, if the settings contradict
     /// each other, or if there is work left and no capture to do it on.
-    pub fn remember(&self, until: &str) -> Result<()> {
+    pub fn remember(&self, until: Stage) -> Result<()> {
         self.agrees(until, &[])?;
-        let idle = self.order(until).into_iter().all(|name| self.run.is_done(&self.plan(name)));
-        if !idle {
-            self.is_there()?;
-        }
+        let order = self.order(until).into_iter();
+        let left: Vec<Stage> = order.filter(|stage| !self.run.is_done(&self.plan(*stage))).collect();
+        self.require_inputs(&left)?;
         let written = self.run.write("config.toml", self.config.to_toml().as_bytes());
-        self.unless_idle(idle, written)
+        self.unless_idle(left.is_empty(), written)
+    }
+
+    /// Folders below the run that are out of date when a stage is made anew, in the order of the line: its own, those
+    /// of what builds on it, and views of paths that show it. Where views of a path are made anew, they alone.
+    pub fn out_of_date(&self, stage: Stage) -> Result<Vec<String>> {
+        if stage == Stage::Render && self.path.is_some() {
+            return Ok(vec![self.views().into()]);
+        }
+        let mut names: Vec<String> = stage.followers(self.config).iter().map(Stage::to_string).collect();
+        for folder in io::list_folders(&self.run.path(PATHS))? {
+            if may_show(&folder, &names) {
+                let name = folder.file_name().unwrap_or_default().to_string_lossy();
+                names.push(format!("{PATHS}/{name}"));
+            }
+        }
+        Ok(names)
+    }
+
+    /// Removes what is out of date when a stage is made anew on the way to `until`; nothing, if what `until` asks for
+    /// would be refused then.
+    pub fn fresh(&self, stage: Stage, until: Stage) -> Result<()> {
+        let names = self.out_of_date(stage)?;
+        self.require_inputs(&stage.followers(self.config))?;
+        // a finished blend is not cleared for views that it could not be made of again
+        let blended = names.iter().any(|n| n == Stage::Ensemble.word())
+            && !self.config.ensemble.members.is_empty()
+            && read_record(&self.run.path(Stage::Ensemble)).ok().flatten().is_some();
+        if blended {
+            can_blend(self.config)?;
+        }
+        self.agrees(until, &names)?;
+        self.run.fresh(&names)
     }
 
     /// Does what lies in the run agree with what `until` asks for, but for the folders in `cleared`?
-    pub(super) fn agrees(&self, until: &str, cleared: &[String]) -> Result<()> {
+    fn agrees(&self, until: Stage, cleared: &[String]) -> Result<()> {
         self.can_make(until)?;
-        let plans = self.order(until).into_iter().map(|name| self.plan(name));
-        for plan in plans.filter(|plan| !cleared.iter().any(|name| name == plan.name)) {
-            self.run.agrees(&plan)?;
-        }
-        Ok(())
+        let plans = self.order(until).into_iter().map(|stage| self.plan(stage));
+        let mut kept = plans.filter(|plan| !cleared.iter().any(|name| name == plan.name));
+        kept.try_for_each(|plan| self.run.agrees(&plan))
     }
 
     /// Do the settings go together, as far as `until` depends on them? Asked before any work.
-    fn can_make(&self, until: &str) -> Result<()> {
+    fn can_make(&self, until: Stage) -> Result<()> {
         let order = self.order(until);
         let cameras = &self.config.render.cameras;
-        if order.contains(&"render") && cameras != "test" {
+        if order.contains(&Stage::Render) && cameras != "test" {
             return Err(Error::usage(
                 format!(
                     "`render.cameras` is {cameras}, but it is the held-out views that are blended and judged"
@@ -121,24 +131,28 @@ impl Line<'_> {
                 ),
             ));
         }
-        if order.contains(&"ensemble") { self.can_blend() } else { Ok(()) }
+        if order.contains(&Stage::Ensemble) { can_blend(self.config) } else { Ok(()) }
     }
 
     /// What a stage is about to do; its fingerprint holds those of the stages it needs.
-    pub fn plan(&self, name: &'static str) -> Plan<'_> {
-        if let ("render", Some(path)) = (name, &self.path) {
+    pub fn plan(&self, stage: Stage) -> Plan<'_> {
+        if let (Stage::Render, Some(path)) = (stage, &self.path) {
             return self.path_plan(path);
         }
-        let mut settings = self.config.values(name);
+        let config = self.config;
+        let name = stage.word();
+        let mut settings = config.values(name);
         let mut needs_bytes = 16 << 20;
-        let needs = self.needs(name).into_iter();
-        let mut inputs: Vec<_> = needs.map(|s| (s, self.plan(s).fingerprint.digest())).collect();
-        if ["baseline", "tface", "iface"].contains(&name) {
-            settings.insert("capture.tiles".into(), self.config.capture.tiles.to_string());
+        let needs = stage.needs(config).into_iter();
+        let mut inputs: Vec<_> = needs.map(|s| (s.word(), self.plan(s).fingerprint.digest())).collect();
+        if stage.learns() {
+            settings.insert("capture.tiles".into(), config.capture.tiles.to_string());
+            settings.insert("seed".into(), config.seed.to_string());
+            settings.insert("preset".into(), config.preset.name().into());
         }
-        match name {
-            "mask" => {
-                settings.extend(self.config.values("capture"));
+        match stage {
+            Stage::Mask => {
+                settings.extend(config.values("capture"));
                 settings.remove("capture.path"); // where it lies does not matter, what it holds does
                 settings.remove("capture.tiles"); // masks are of whole photographs
                 inputs.push(("capture", self.digest.clone()));
@@ -154,97 +168,109 @@ impl Line<'_> {
                     }
                 }
             }
-            "iface" => {
+            Stage::Iface => {
                 settings.remove("iface.checkpoint_s"); // how often is no matter of what
-                settings.insert("seed".into(), self.config.seed.to_string());
-                settings.insert("preset".into(), self.config.preset.name().into());
                 // weights and two moments, for two checkpoints and one being written
-                let c = &self.config.iface;
-                needs_bytes += (c.levels as u64) << c.log2_table.min(40) << 3 << 3;
+                needs_bytes += (config.iface.levels as u64) << config.iface.log2_table.min(40) << 3 << 3;
             }
-            "baseline" | "tface" => {
+            Stage::Baseline | Stage::Tface => {
                 // the baseline's own table says only where it differs from T-Face's
-                let learned = Config { tface: self.vm(name), ..self.config.clone() };
+                let learned = Config { tface: config.radiance(stage), ..config.clone() };
                 for (key, value) in learned.values("tface") {
                     let own = key.replacen("tface", name, 1);
                     settings.insert(if settings.contains_key(&own) { own } else { key }, value);
                 }
                 settings.remove("tface.checkpoint_s");
-                if name == "baseline" {
+                if stage == Stage::Baseline {
                     settings.remove("tface.mask_weight"); // of a loss that it has not
                 }
-                settings.insert("preset".into(), self.config.preset.name().into());
-                settings.insert("seed".into(), self.config.seed.to_string());
-                if let Some((_, digest)) = self.imports.iter().find(|(stage, _)| *stage == name) {
+                if let Some(import) = self.imports.iter().find(|import| import.stage == stage) {
                     settings.retain(|key, _| !key.ends_with(".import") && key != "capture.tiles");
-                    inputs.push(("import", digest.clone()));
+                    inputs.push(("import", import.digest.clone()));
                 }
-                needs_bytes += vm_bytes(&self.vm(name));
+                needs_bytes += vm_bytes(&learned.tface);
             }
-            "mesh" => {
-                settings.insert("capture.unit_m".into(), self.config.capture.unit_m.to_string());
+            Stage::Mesh => {
+                settings.insert("capture.unit_m".into(), config.capture.unit_m.to_string());
                 settings.insert("format of mesh/parts".into(), super::parts::FORMAT.into());
                 // a few triangles per cell of a closed surface, three formats and the parts
-                let c = &self.config.mesh;
+                let c = &config.mesh;
                 needs_bytes += (c.resolution as u64).pow(2) * 12 * 130;
                 // pictures as parts and inside the files, and the float one
                 needs_bytes += c.texels() * (6 * c.pictures() + 3 + if c.exr { 12 } else { 0 });
             }
-            "render" => {
+            Stage::Render => {
                 // what only paths ask for shapes no held-out view
                 settings.remove("render.cameras");
                 settings.remove("render.orbit_views");
-                let each = if self.config.render.float { 12 + 10 } else { 12 };
-                let methods = self.config.render.method.len().max(1) as u64;
-                needs_bytes += self.pixels() * each * methods / 2;
+                let each = if config.render.float { 12 + 10 } else { 12 };
+                needs_bytes += self.pixels() * each * config.render.method.len().max(1) as u64 / 2;
             }
-            "ensemble" => needs_bytes += self.pixels() * 4,
-            _ => {}
+            Stage::Ensemble => needs_bytes += self.pixels() * 4,
+            Stage::Metrics => {}
         }
         let mut fingerprint = Fingerprint::new(FORMAT, settings);
         for (name, digest) in inputs {
             fingerprint = fingerprint.input(name, digest);
         }
-        let saves = ["baseline", "tface", "iface"].contains(&name);
-        Plan { name, fingerprint, device: &self.config.device, needs_bytes, saves }
+        Plan { name, fingerprint, device: &config.device, needs_bytes, saves: stage.learns() }
     }
 
-    /// Settings of the stage `baseline` or `tface`.
-    pub(super) fn vm(&self, stage: &str) -> VmConfig {
-        let Config { baseline, tface, .. } = self.config;
-        if stage == "baseline" { baseline.field(tface) } else { tface.clone() }
+    /// What the views of a path are made of.
+    fn path_plan<'p>(&'p self, path: &'p CameraPath) -> Plan<'p> {
+        let CameraPath { folder, render, cameras, digest } = path;
+        let mut settings = Config { render: render.clone(), ..self.config.clone() }.values("render");
+        settings.remove("render.float");
+        if cameras.is_some() {
+            settings.remove("render.orbit_views");
+        }
+        if digest.is_some() {
+            settings.remove("render.cameras"); // what the file holds matters, not where it lies
+        }
+        let mut fingerprint = Fingerprint::new(FORMAT, settings);
+        if let Some(digest) = digest {
+            fingerprint = fingerprint.input("cameras", digest);
+        }
+        for stage in render.shows() {
+            fingerprint = fingerprint.input(stage.word(), self.plan(stage).fingerprint.digest());
+        }
+        let pixels = |c: &crate::geom::Camera| c.width as u64 * c.height as u64;
+        let all = match cameras {
+            Some(cameras) => cameras.iter().map(|c| pixels(&c.camera)).sum(),
+            None => self.capture.views.first().map_or(0, |v| pixels(&v.camera)) * render.orbit_views as u64,
+        };
+        let needs_bytes = (16 << 20) + 6 * all * render.method.len().max(1) as u64;
+        Plan { name: folder, fingerprint, device: &self.config.device, needs_bytes, saves: false }
     }
 
     /// The folders of the stages that `until` needs and that are not done, with the seconds that each may take on two
     /// cores: from counts of rays, samples, cells and pixels, and what one of each took where it was measured. No more
     /// than an estimate; whoever shows it corrects it by the pace of the stage at work.
-    pub fn ahead(&self, until: &str) -> Vec<(String, f64)> {
-        let Config { iface, mesh, render, .. } = self.config;
+    pub fn ahead(&self, until: Stage) -> Vec<(String, f64)> {
+        let Config { iface, mesh, .. } = self.config;
         let all = self.pixels() as f64;
         let each = all / self.capture.views.len().max(1) as f64;
         let test = each * self.capture.split(Split::Test).count().max(1) as f64;
-        let (shown, seen) = match &self.path {
-            Some(path) => {
-                let count = path.cameras.as_ref().map_or(path.render.orbit_views as usize, Vec::len);
-                (&path.render, each * count as f64)
-            }
-            None => (render, test),
+        let rendered = match &self.path {
+            Some(CameraPath { cameras: Some(cameras), .. }) => each * cameras.len() as f64,
+            Some(CameraPath { render, .. }) => each * f64::from(render.orbit_views),
+            None => test,
         };
-        let seconds = |stage: &str| match stage {
-            "mask" => 2.0 + 2e-6 * all,
-            "baseline" | "tface" => {
-                let c = self.vm(stage);
+        let seconds = |stage: Stage| match stage {
+            Stage::Mask => 2.0 + 2e-6 * all,
+            Stage::Baseline | Stage::Tface => {
+                let c = self.config.radiance(stage);
                 // whole frames are mostly outside the hull, and nothing of them is skipped
-                let ray = if stage == "baseline" { 60e-6 } else { 23e-6 };
+                let ray = if stage == Stage::Baseline { 60e-6 } else { 23e-6 };
                 if c.import.is_empty() { ray * (c.steps as usize * c.rays * c.learned()) as f64 } else { 1.0 }
             }
-            "iface" => 3e-6 * (iface.steps as usize * iface.samples) as f64,
-            "mesh" => {
+            Stage::Iface => 3e-6 * (iface.steps as usize * iface.samples) as f64,
+            Stage::Mesh => {
                 3e-4 * f64::from(mesh.resolution).powi(2) + 5e-6 * (mesh.texels() * mesh.pictures()) as f64
             }
-            "render" => 8e-6 * seen * shown.method.len() as f64,
-            "ensemble" => 1e-6 * all,
-            _ => 2.0 + 1e-6 * test,
+            Stage::Render => 8e-6 * rendered * self.render_config().method.len() as f64,
+            Stage::Ensemble => 1e-6 * all,
+            Stage::Metrics => 2.0 + 1e-6 * test,
         };
         let order = self.order(until).into_iter().map(|stage| (stage, self.plan(stage)));
         order.filter(|(_, p)| !self.run.is_done(p)).map(|(s, p)| (p.name.into(), seconds(s))).collect()
@@ -257,20 +283,19 @@ impl Line<'_> {
     }
 }
 
+/// Do the views in a path's folder show one of these stages? Views whose records cannot be read may.
+fn may_show(folder: &Path, stages: &[String]) -> bool {
+    match (read_status(folder), read_record(folder)) {
+        (Ok(None), Ok(None)) => false,
+        (Ok(Some(status)), _) => status.fingerprint.inputs.keys().any(|input| stages.contains(input)),
+        (_, Ok(Some(record))) => record.fingerprint.inputs.keys().any(|input| stages.contains(input)),
+        _ => true,
+    }
+}
+
 /// Weights and two moments of the planes, for two checkpoints and one being written; weights of the fields before.
 fn vm_bytes(c: &VmConfig) -> u64 {
     let channels: usize = c.density_rank.iter().chain(&c.color_rank).sum();
     let side = (c.voxels_final as f64).cbrt();
     (channels as f64 * side * side * (36.0 + 4.0 * (c.learned() - 1) as f64)) as u64
-}
-
-/// The stages whose results views by these methods show.
-pub(super) fn shown(methods: &[Method]) -> Vec<&'static str> {
-    let is_shown = |stage: &&str| *stage == "mask" || methods.iter().any(|m| m.stage() == *stage);
-    ["mask", "baseline", "tface", "iface", "mesh"].into_iter().filter(is_shown).collect()
-}
-
-/// The word of the line; the last one for any other.
-fn known(stage: &str) -> &'static str {
-    STAGES.iter().copied().find(|s| *s == stage).unwrap_or(STAGES[STAGES.len() - 1])
 }

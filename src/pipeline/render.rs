@@ -9,129 +9,81 @@
 //! These are the held-out views. Those of other cameras lie in a folder of their own, `render/paths/`.
 
 use super::parts::Whole;
-use super::path::CameraPath;
+use super::path::{CameraPath, cameras_of};
 use super::product::{Pictures, Product};
-use super::{Fields, Line, march::march, pictures};
+use super::surface::Fields;
+use super::{Line, march::march, pictures};
+use crate::capture::Split;
 use crate::capture::scene::{self, Scene};
-use crate::capture::{Split, View};
 use crate::config::Method;
 use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
 use crate::io;
 use crate::render::path::{NamedCamera, orbit};
 use crate::render::{LobePictures, RaycastOptions, RenderedView, Texture, raycast, raycast_hits};
-use crate::run::{Done, Stop};
-use crate::{Error, Result};
-use serde_json::{Map, json};
+use crate::run::StageDir;
+use crate::{Error, Monitor, Result};
+use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
 
-impl Line<'_> {
-    /// Stage `render`: one folder per method, one picture per camera, of the held-out views or along a path
-    /// ([`Line::along`]). `fields` are only asked if there is something to do, and only for those that the methods
-    /// show.
-    pub fn render(&self, fields: &dyn Fields) -> Result<Done> {
-        Ok(self.run.stage(self.plan("render"), |stage| {
-            let scene = self.scene_or_fail()?;
-            let c = self.path.as_ref().map_or(&self.config.render, |path| &path.render);
-            let meshes = self.meshes(&c.method)?;
-            let eye = self.eye(&scene, fields, &meshes, c.samples);
-            let cameras = self.cameras(&scene)?;
-            let background = pictures::behind(c.background);
-            let total = (cameras.len() * c.method.len()) as u64;
-            let mut done = 0;
-            let mut seconds = Map::new();
-            for &method in &c.method {
-                let (mut spent, mut made) = (Duration::ZERO, 0);
-                let folder = stage.folder().join(method.folder());
-                for NamedCamera { name, camera } in &cameras {
-                    let float = c.float.then(|| folder.join(pictures::FLOAT));
-                    let files = pictures::files(&folder, name, float.as_deref(), c.format);
-                    // an interrupted process left whole files or none, of the same settings
-                    if !files.iter().all(|file| io::is_file(file)) {
-                        let camera = camera.transformed(&scene.scene_from_world);
-                        let begin = Instant::now();
-                        let view = eye.view(method, &camera)?;
-                        spent += begin.elapsed();
-                        made += 1;
-                        self.stop_here()?; // what it holds then is not whole
-                        if let Some(mut view) = view {
-                            if let Some(float) = &float {
-                                pictures::write_float(float, name, &view)?;
-                            }
-                            if let Some(background) = background {
-                                pictures::over(&mut view, background);
-                            }
-                            pictures::write(&folder, name, &view, c.format, self.config.capture.unit_m)?;
-                        }
+/// Makes one folder per method, one picture per camera, of the held-out views or along a path ([`Line::along`]). Only
+/// those `fields` are asked for that the methods show.
+pub(super) fn render(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<Value> {
+    let c = line.render_config();
+    let meshes = Meshes::load(line, &c.method)?;
+    let renderer = Renderer::new(scene, fields, &meshes, c.samples, dir.monitor());
+    let cameras = cameras(line, scene)?;
+    let background = pictures::behind(c.background);
+    let total = cameras.len() * c.method.len();
+    let mut done = 0;
+    let mut seconds = Map::new();
+    for &method in &c.method {
+        let (mut spent, mut made) = (Duration::ZERO, 0);
+        let folder = dir.folder().join(method.folder());
+        for NamedCamera { name, camera } in &cameras {
+            let float = c.float.then(|| folder.join(pictures::FLOAT));
+            let files = pictures::files(&folder, name, float.as_deref(), c.format);
+            // an interrupted process left whole files or none, of the same settings
+            if !files.iter().all(|file| io::is_file(file)) {
+                let camera = camera.transformed(&scene.scene_from_world);
+                let begin = Instant::now();
+                let view = renderer.view(method, &camera)?;
+                spent += begin.elapsed();
+                made += 1;
+                dir.check_stop()?; // what it holds then is not whole
+                if let Some(mut view) = view {
+                    if let Some(float) = &float {
+                        pictures::write_float(float, name, &view)?;
                     }
-                    done += 1;
-                    stage.monitor().step(done, total, &[]);
-                    self.stop_here()?;
+                    if let Some(background) = background {
+                        pictures::over(&mut view, background);
+                    }
+                    pictures::write(&folder, name, &view, c.format, line.config.capture.unit_m)?;
                 }
-                let per_view = spent.as_secs_f64() / made.max(1) as f64;
-                seconds.insert(method.folder().to_owned(), json!(per_view));
             }
-            let methods: Vec<_> = c.method.iter().map(|m| m.folder()).collect();
-            Ok(json!({"cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds}))
-        })?)
-    }
-
-    /// The meshes that these methods show.
-    pub(super) fn meshes(&self, methods: &[Method]) -> Result<Meshes> {
-        let whole = methods.contains(&Method::Raycast).then(|| self.read_whole()).transpose()?;
-        let product = methods.contains(&Method::Textured).then(|| self.textured()).transpose()?;
-        Ok(Meshes { whole, product })
-    }
-
-    /// What views are made with.
-    pub(super) fn eye<'e>(
-        &'e self,
-        scene: &Scene,
-        fields: &'e dyn Fields,
-        meshes: &'e Meshes,
-        samples: u32,
-    ) -> Eye<'e> {
-        Eye {
-            fields,
-            whole: meshes.whole.as_ref().map(|w| (w, Bvh::new(&w.mesh))),
-            product: meshes.product.as_ref().map(|(product, pictures)| Shown::new(product, pictures)),
-            samples,
-            world_from_scene: scene.scene_from_world.inverse(),
-            stop: self.run.stop(),
+            done += 1;
+            dir.step(done, total)?;
         }
+        let per_view = spent.as_secs_f64() / made.max(1) as f64;
+        seconds.insert(method.folder().to_owned(), json!(per_view));
     }
+    let methods: Vec<_> = c.method.iter().map(|m| m.folder()).collect();
+    Ok(json!({"cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds}))
+}
 
-    /// The product and its texture, which it must have.
-    fn textured(&self) -> Result<(Product, Pictures)> {
-        let mut product = self.read_product()?;
-        let pictures = product.pictures.take().ok_or_else(|| {
-            Error::cannot(
-                "the mesh has no texture to be shown",
-                "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
-            )
-        })?;
-        Ok((product, pictures))
-    }
-
-    /// The cameras to render: named like photographs where they have one.
-    pub(super) fn cameras(&self, scene: &Scene) -> Result<Vec<NamedCamera>> {
-        match &self.path {
-            None => {
-                let mut splits = [Split::Test, Split::Val, Split::Train].map(|s| self.of(s)).into_iter();
-                Ok(splits.find(|cameras| !cameras.is_empty()).unwrap_or_default())
-            }
-            Some(CameraPath { cameras: Some(cameras), .. }) => Ok(cameras.clone()),
-            Some(CameraPath { render, .. }) => {
-                let all: Vec<Camera> = self.capture.views.iter().map(|v| v.camera.clone()).collect();
-                let bounds = scene::world_box(scene);
-                let count = render.orbit_views as usize;
-                Ok(orbit(&all, bounds, self.capture.up, count)?)
-            }
+/// The cameras to render: named like photographs where they have one.
+pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
+    let capture = &line.capture;
+    match &line.path {
+        None => {
+            let mut splits =
+                [Split::Test, Split::Val, Split::Train].map(|s| cameras_of(capture, s)).into_iter();
+            Ok(splits.find(|cameras| !cameras.is_empty()).unwrap_or_default())
         }
-    }
-
-    pub(super) fn of(&self, split: Split) -> Vec<NamedCamera> {
-        let named = |v: &View| NamedCamera { name: v.name.clone(), camera: v.camera.clone() };
-        self.capture.split(split).map(named).collect()
+        Some(CameraPath { cameras: Some(cameras), .. }) => Ok(cameras.clone()),
+        Some(CameraPath { render, .. }) => {
+            let all: Vec<Camera> = capture.views.iter().map(|v| v.camera.clone()).collect();
+            Ok(orbit(&all, scene::world_box(scene), capture.up, render.orbit_views as usize)?)
+        }
     }
 }
 
@@ -141,15 +93,36 @@ pub(super) struct Meshes {
     product: Option<(Product, Pictures)>,
 }
 
-/// A textured mesh, ready to be looked at.
-struct Shown<'a> {
+impl Meshes {
+    /// Those that `methods` show, as they lie in the run.
+    pub fn load(line: &Line, methods: &[Method]) -> Result<Meshes> {
+        let whole = methods.contains(&Method::Raycast).then(|| line.read_whole()).transpose()?;
+        let product = methods.contains(&Method::Textured).then(|| textured(line)).transpose()?;
+        Ok(Meshes { whole, product })
+    }
+}
+
+/// The product and its texture, which it must have.
+fn textured(line: &Line) -> Result<(Product, Pictures)> {
+    let mut product = line.read_product()?;
+    let pictures = product.pictures.take().ok_or_else(|| {
+        Error::cannot(
+            "the mesh has no texture to be shown",
+            "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
+        )
+    })?;
+    Ok((product, pictures))
+}
+
+/// A mesh with its texture and what rays need to find it.
+struct TexturedMesh<'a> {
     mesh: &'a Mesh,
     bvh: Bvh,
     texture: Texture<'a>,
 }
 
-impl<'a> Shown<'a> {
-    fn new(product: &'a Product, pictures: &'a Pictures) -> Shown<'a> {
+impl<'a> TexturedMesh<'a> {
+    fn new(product: &'a Product, pictures: &'a Pictures) -> TexturedMesh<'a> {
         let (mesh, world_from_scene) = (&product.mesh, product.world_from_scene.rotation_f32());
         let lobes = pictures.lobes.as_ref().map(|l| LobePictures {
             pictures: &l.pictures,
@@ -157,30 +130,48 @@ impl<'a> Shown<'a> {
             turned: l.asset_from_world * world_from_scene,
         });
         let texture = Texture::new(mesh, &pictures.atlas, &pictures.color, lobes.as_ref());
-        Shown { mesh, bvh: Bvh::new(mesh), texture }
+        TexturedMesh { mesh, bvh: Bvh::new(mesh), texture }
     }
 }
 
-/// What every view is made with.
-pub(super) struct Eye<'a> {
+/// Makes views by any method.
+pub(super) struct Renderer<'a> {
     fields: &'a dyn Fields,
     whole: Option<(&'a Whole, Bvh)>,
-    product: Option<Shown<'a>>,
+    product: Option<TexturedMesh<'a>>,
     samples: u32,
     world_from_scene: Similarity,
-    stop: &'a Stop,
+    monitor: &'a dyn Monitor,
 }
 
-impl Eye<'_> {
+impl<'a> Renderer<'a> {
+    /// Of these fields and meshes; `samples` rays along each side of a pixel on an edge of a mesh.
+    pub fn new(
+        scene: &Scene,
+        fields: &'a dyn Fields,
+        meshes: &'a Meshes,
+        samples: u32,
+        monitor: &'a dyn Monitor,
+    ) -> Renderer<'a> {
+        Renderer {
+            fields,
+            whole: meshes.whole.as_ref().map(|w| (w, Bvh::new(&w.mesh))),
+            product: meshes.product.as_ref().map(|(product, pictures)| TexturedMesh::new(product, pictures)),
+            samples,
+            world_from_scene: scene.scene_from_world.inverse(),
+            monitor,
+        }
+    }
+
     /// The view of a camera in scene coordinates, over nothing.
     pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>> {
         Ok(match (method, &self.whole) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
                 // a large view takes minutes: nobody who asks to stop waits for the rest of it
-                let see = |rays: &[Ray]| match self.stop.requested() {
-                    Some(_) => Vec::new(),
-                    None => field.see(rays, camera.forward()),
+                let see = |rays: &[Ray]| match self.monitor.stop() {
+                    true => Vec::new(),
+                    false => field.see(rays, camera.forward()),
                 };
                 Some(march(camera, &self.world_from_scene, false, see))
             }
@@ -199,10 +190,12 @@ impl Eye<'_> {
                 }))
             }
             (Method::Raycast, None) => None,
-            (Method::Textured, _) => self.product.as_ref().map(|shown| {
+            (Method::Textured, _) => self.product.as_ref().map(|product| {
                 let world_from_scene = self.world_from_scene;
                 let options = RaycastOptions { background: None, samples: self.samples, world_from_scene };
-                raycast_hits(&shown.bvh, shown.mesh, camera, &options, |s| shown.texture.colors(s, camera))
+                raycast_hits(&product.bvh, product.mesh, camera, &options, |s| {
+                    product.texture.colors(s, camera)
+                })
             }),
         })
     }
@@ -210,8 +203,10 @@ impl Eye<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Radiance, Surface};
+    use super::super::surface::{Radiance, Surface};
     use super::*;
+    use crate::Quiet;
+    use crate::config::Stage;
     use crate::geom::Aabb;
     use crate::mesh::{Cap, Skin};
     use glam::Vec3;
@@ -224,7 +219,7 @@ mod tests {
             Ok(self)
         }
 
-        fn radiance(&self, _: &'static str) -> Result<&dyn Radiance> {
+        fn radiance(&self, _: Stage) -> Result<&dyn Radiance> {
             panic!("no radiance field is asked for")
         }
     }
@@ -268,15 +263,15 @@ mod tests {
         let look = |cap: Option<Cap>| {
             let whole = Whole { mesh: mesh.clone(), cap };
             let bvh = Bvh::new(&whole.mesh);
-            let eye = Eye {
+            let renderer = Renderer {
                 fields: &Red,
                 whole: Some((&whole, bvh)),
                 product: None,
                 samples: 1,
                 world_from_scene: Similarity::IDENTITY,
-                stop: &Stop::new(),
+                monitor: &Quiet,
             };
-            let view = eye.view(Method::Raycast, &camera).unwrap().unwrap();
+            let view = renderer.view(Method::Raycast, &camera).unwrap().unwrap();
             // at x = (2.5 − 4) / 8 · 3 = −0.56 and (5.5 − 4) / 8 · 3.5 = 0.66
             [view.color.pixel(2, 4).to_vec(), view.color.pixel(5, 4).to_vec()]
         };

@@ -2,6 +2,7 @@
 
 use super::march::Seen;
 use crate::Result;
+use crate::config::Stage;
 use crate::geom::{Camera, Ray, Similarity};
 use crate::render::RenderedView;
 use glam::Vec3;
@@ -40,7 +41,7 @@ pub trait Fields {
     fn surface(&self) -> Result<&dyn Surface>;
 
     /// The field of the stage `baseline` or `tface`.
-    fn radiance(&self, stage: &'static str) -> Result<&dyn Radiance>;
+    fn radiance(&self, stage: Stage) -> Result<&dyn Radiance>;
 }
 
 #[cfg(feature = "cpu")]

@@ -25,7 +25,7 @@ mod stop;
 
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer};
-pub use stage::{Done, Plan, Stage};
+pub use stage::{Done, Plan, StageDir};
 pub use status::{Record, State, Status, read_record, read_status};
 pub use stop::Stop;
 

@@ -25,16 +25,22 @@ pub struct Plan<'a> {
     pub saves: bool,
 }
 
-/// A stage at work: where to put files, how to report.
-pub struct Stage {
+/// The folder of a stage at work: where to put files, how to report.
+pub struct StageDir {
     folder: std::path::PathBuf,
+    identity: String,
     progress: Arc<Progress>,
 }
 
-impl Stage {
-    /// The stage's folder.
+impl StageDir {
+    /// The folder.
     pub fn folder(&self) -> &Path {
         &self.folder
+    }
+
+    /// Digest of everything that shapes the stage's result.
+    pub fn identity(&self) -> &str {
+        &self.identity
     }
 
     /// Progress out, stop request in.
@@ -42,12 +48,27 @@ impl Stage {
         self.progress.as_ref()
     }
 
-    /// Tells something worth knowing.
+    /// `step` of `steps` is done.
+    ///
+    /// # Errors
+    ///
+    /// A request to stop.
+    pub fn step(&self, step: usize, steps: usize) -> Result<()> {
+        self.progress.step(step as u64, steps as u64, &[]);
+        self.check_stop()
+    }
+
+    /// An error if somebody asked to stop.
+    pub fn check_stop(&self) -> Result<()> {
+        if self.progress.stop() { Err(Error::stopped("what is complete is kept")) } else { Ok(()) }
+    }
+
+    /// Reports something worth knowing.
     pub fn note(&self, text: &str) {
         self.progress.note(text);
     }
 
-    /// Tells something that went differently than hoped.
+    /// Reports something that went differently than hoped.
     pub fn warn(&self, text: &str) {
         self.progress.warn(text);
     }
@@ -70,8 +91,8 @@ impl Run {
     ///
     /// Exit code 75 if another process holds the stage, 1 if it was done or begun with another
     /// fingerprint or if the disk has too little room. `work` leaves the stage's files in
-    /// [`Stage::folder`], complete and durable, before it returns.
-    pub fn stage(&self, plan: Plan, work: impl FnOnce(&Stage) -> Result<Value>) -> Result<Done> {
+    /// [`StageDir::folder`], complete and durable, before it returns.
+    pub fn stage(&self, plan: Plan, work: impl FnOnce(&StageDir) -> Result<Value>) -> Result<Done> {
         let name = plan.name;
         if let Some(exit) = self.stop.requested() {
             return Err(Error::stopped(format!("before stage `{name}`")).with_kind(exit));
@@ -121,7 +142,7 @@ impl Run {
         let _at_work = self.stop.at_work(&progress, plan.saves);
         progress.save(|_| {})?;
         self.observer.event(&Event::Started { stage: name });
-        let stage = Stage { folder, progress };
+        let stage = StageDir { folder, identity: plan.fingerprint.digest(), progress };
         match work(&stage) {
             Ok(summary) => self.record(&plan, &stage, summary),
             Err(failure) => {
@@ -182,7 +203,7 @@ impl Run {
         Ok(status.elapsed_s)
     }
 
-    fn record(&self, plan: &Plan, stage: &Stage, summary: Value) -> Result<Done> {
+    fn record(&self, plan: &Plan, stage: &StageDir, summary: Value) -> Result<Done> {
         let elapsed_s = stage.progress.elapsed_s();
         stage.progress.save(|s| {
             s.state = State::Done;
@@ -258,7 +279,7 @@ mod tests {
         Run::open(dir, Stop::new(), Arc::new(Quiet))
     }
 
-    fn work(stage: &Stage) -> Result<Value> {
+    fn work(stage: &StageDir) -> Result<Value> {
         io::write_atomic(&stage.folder().join("checkpoint"), b"weights")?;
         stage.monitor().step(5, 5, &[("loss", 0.5), ("bad", f64::NAN)]);
         Ok(json!({"loss": 0.5}))
@@ -268,7 +289,7 @@ mod tests {
         run.fresh(&names.iter().map(|n| n.to_string()).collect::<Vec<_>>())
     }
 
-    fn never(_: &Stage) -> Result<Value> {
+    fn never(_: &StageDir) -> Result<Value> {
         panic!("the stage should have been skipped")
     }
 
@@ -322,7 +343,7 @@ mod tests {
     fn a_stage_begun_with_other_settings_is_not_continued_in_silence() {
         let dir = tempfile::tempdir().unwrap();
         let run = open(dir.path());
-        let fails = |_: &Stage| Err(Error::cannot("no surface", "more steps"));
+        let fails = |_: &StageDir| Err(Error::cannot("no surface", "more steps"));
         let error = run.stage(plan(5), fails).unwrap_err();
         assert_eq!(error.to_string(), "stage `iface`: no surface");
         let status = read_status(&dir.path().join("iface")).unwrap().unwrap();

@@ -1,0 +1,107 @@
+//! The words of the line: each names a stage, its table in `config.toml`, its folder in the run and its command.
+
+use super::Config;
+use crate::{Error, Result};
+use std::fmt::{self, Display};
+use std::path::Path;
+use std::str::FromStr;
+
+/// A stage of the line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// Which pixels are the head, and where that puts it in space.
+    Mask,
+    /// A radiance field learned from whole photographs.
+    Baseline,
+    /// A radiance field learned from masked photographs.
+    Tface,
+    /// A signed distance learned from masked photographs.
+    Iface,
+    /// The zero level set of that distance, closed.
+    Mesh,
+    /// Views of the fields and of the mesh.
+    Render,
+    /// Those views become one.
+    Ensemble,
+    /// All of them against the photographs.
+    Metrics,
+}
+
+use Stage::{Baseline, Ensemble, Iface, Mask, Mesh, Metrics, Render, Tface};
+
+impl Stage {
+    /// All stages in order.
+    pub const ALL: [Stage; 8] = [Mask, Baseline, Tface, Iface, Mesh, Render, Ensemble, Metrics];
+
+    /// Its word.
+    pub fn word(self) -> &'static str {
+        match self {
+            Mask => "mask",
+            Baseline => "baseline",
+            Tface => "tface",
+            Iface => "iface",
+            Mesh => "mesh",
+            Render => "render",
+            Ensemble => "ensemble",
+            Metrics => "metrics",
+        }
+    }
+
+    /// Does it learn a field, step by step?
+    pub fn learns(self) -> bool {
+        matches!(self, Baseline | Tface | Iface)
+    }
+
+    /// The stages that it reads from. What views are made of decides what `render` needs.
+    pub fn needs(self, config: &Config) -> Vec<Stage> {
+        match self {
+            Mask => Vec::new(),
+            Baseline | Tface | Iface => vec![Mask],
+            Mesh => vec![Iface],
+            Render => config.render.shows(),
+            Ensemble => vec![Render],
+            Metrics if config.ensemble.members.is_empty() => vec![Render],
+            Metrics => vec![Render, Ensemble],
+        }
+    }
+
+    /// The stages and all that they need, in order.
+    pub fn with_needs(mut wanted: Vec<Stage>, config: &Config) -> Vec<Stage> {
+        let mut next = 0;
+        while next < wanted.len() {
+            let needs = wanted[next].needs(config);
+            wanted.extend(needs);
+            next += 1;
+        }
+        Stage::ALL.into_iter().filter(|stage| wanted.contains(stage)).collect()
+    }
+
+    /// The stage and all that build on it, in order: what is out of date when it is made anew.
+    pub fn followers(self, config: &Config) -> Vec<Stage> {
+        Stage::ALL.into_iter().filter(|s| Stage::with_needs(vec![*s], config).contains(&self)).collect()
+    }
+}
+
+impl Display for Stage {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(self.word())
+    }
+}
+
+impl FromStr for Stage {
+    type Err = Error;
+
+    fn from_str(word: &str) -> Result<Stage> {
+        Stage::ALL.into_iter().find(|s| s.word() == word).ok_or_else(|| {
+            let known = Stage::ALL.map(Stage::word).join(", ");
+            Error::usage(format!("there is no stage `{word}`"), format!("stages are {known}"))
+        })
+    }
+}
+
+/// Its folder in a run.
+impl AsRef<Path> for Stage {
+    fn as_ref(&self) -> &Path {
+        Path::new(self.word())
+    }
+}

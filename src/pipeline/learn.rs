@@ -1,0 +1,163 @@
+//! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
+
+use super::surface::{Fields, Radiance, Surface};
+use super::{Line, tiles};
+use crate::capture::scene::Scene;
+use crate::capture::{Capture, View};
+use crate::config::{Config, MaskUse, Stage};
+use crate::ensemble::Tile;
+use crate::field::pixels::TrainView;
+use crate::iface::{self, IFace, IfaceError};
+use crate::image::Gray;
+use crate::io::Limits;
+use crate::kernel::march::Bitmask;
+use crate::run::StageDir;
+use crate::tface::{self, FieldMean, TfaceError};
+use crate::{Error, ErrorKind, Result};
+use rayon::prelude::*;
+use serde_json::{Value, json};
+use std::cell::OnceCell;
+use std::path::Path;
+
+/// Learns the signed distance of the stage `iface` from the masked photographs; goes on from its last checkpoint.
+pub(super) fn distance(capture: &Capture, scene: &Scene, config: &Config, dir: &StageDir) -> Result<Value> {
+    let views = train_views(capture, scene, config, true)?;
+    let (hull, device) = (bitmask(scene), config.device.as_str());
+    let (folder, identity, monitor) = (dir.folder(), dir.identity(), dir.monitor());
+    let trained =
+        iface::train(&views, hull.as_ref(), &config.iface, config.seed, device, folder, identity, monitor);
+    let (_, report) = trained.map_err(iface_failure)?;
+    report.warnings.iter().for_each(|w| dir.warn(w));
+    Ok(json!(report))
+}
+
+/// Learns, or imports, the radiance field of the stage `baseline` or `tface`: the same learning with other settings.
+pub(super) fn radiance(
+    stage: Stage,
+    capture: &Capture,
+    scene: &Scene,
+    config: &Config,
+    dir: &StageDir,
+) -> Result<Value> {
+    let c = config.radiance(stage);
+    let (folder, identity, monitor) = (dir.folder(), dir.identity(), dir.monitor());
+    let failed = |e| tface_failure(stage, e);
+    if !c.import.is_empty() {
+        let (file, place) = (Path::new(&c.import), &scene.scene_from_world);
+        tface::import_th(file, c.import_scale, place, folder, identity).map_err(failed)?;
+        return Ok(json!({"imported": c.import}));
+    }
+    // without masks nothing may know the head's outline nor what that carves; only the box stays
+    let masked = c.masks != MaskUse::None;
+    let views = train_views(capture, scene, config, masked)?;
+    let hull = bitmask(scene).filter(|_| masked);
+    let (bounds, seed, device) = (scene.aabb, config.seed, config.device.as_str());
+    let name = stage.word();
+    let trained =
+        tface::train(name, &views, bounds, hull.as_ref(), &c, seed, device, folder, identity, monitor);
+    let report = trained.map_err(failed)?;
+    report.warnings.iter().for_each(|w| dir.warn(w));
+    Ok(json!(report))
+}
+
+/// The photographs that are learned from, in the scene. Pixels of `capture.tiles` count as not valid.
+pub(super) fn train_views(
+    capture: &Capture,
+    scene: &Scene,
+    config: &Config,
+    masked: bool,
+) -> Result<Vec<TrainView>> {
+    let view = |(view, tiles): &(&View, Vec<Tile>)| {
+        let loaded = view.load(&Limits::default())?;
+        let (width, height) = (loaded.photo.width, loaded.photo.height);
+        let mut valid = loaded.valid;
+        for tile in tiles {
+            let all = || Gray { width, height, values: vec![255; loaded.photo.rgb.len()] };
+            let values = &mut valid.get_or_insert_with(all).values;
+            tile.pixels(width).for_each(|i| values[i] = 0);
+        }
+        Ok(TrainView {
+            camera: view.camera.transformed(&scene.scene_from_world),
+            photo: loaded.photo,
+            mask: loaded.mask.filter(|_| masked),
+            valid,
+        })
+    };
+    tiles::held_out_tiles(capture, config).par_iter().map(view).collect()
+}
+
+fn bitmask(scene: &Scene) -> Option<Bitmask> {
+    let hull = scene.hull.as_ref()?;
+    Some(Bitmask { resolution: hull.resolution, bits: hull.bits.clone() })
+}
+
+fn iface_failure(e: IfaceError) -> Error {
+    match e {
+        IfaceError::Stopped { .. } => Error::stopped(e),
+        IfaceError::Device(_) => device_failure(e),
+        e => {
+            let hint = e.hint().unwrap_or_default();
+            Error::cannot(e, hint)
+        }
+    }
+}
+
+fn tface_failure(stage: Stage, e: TfaceError) -> Error {
+    match e {
+        TfaceError::Stopped { .. } => Error::stopped(e),
+        TfaceError::Device(_) => device_failure(e),
+        e => {
+            let hint = e.hint(stage.word()).unwrap_or_default();
+            let settings = matches!(e, TfaceError::Settings { .. });
+            let kind = if settings { ErrorKind::Usage } else { ErrorKind::Cannot };
+            Error::new(kind, e).with_hint(hint)
+        }
+    }
+}
+
+fn device_failure(e: impl std::error::Error + Send + Sync + 'static) -> Error {
+    Error::usage(e, "choose another with `--device`")
+}
+
+/// The fields as they lie in the run, each loaded when it is first asked for.
+pub struct TrainedFields<'l> {
+    line: &'l Line<'l>,
+    iface: OnceCell<IFace>,
+    tface: OnceCell<FieldMean>,
+    baseline: OnceCell<FieldMean>,
+}
+
+impl<'l> TrainedFields<'l> {
+    /// Of a line; nothing is loaded yet.
+    pub fn new(line: &'l Line<'l>) -> TrainedFields<'l> {
+        TrainedFields { line, iface: OnceCell::new(), tface: OnceCell::new(), baseline: OnceCell::new() }
+    }
+}
+
+impl Fields for TrainedFields<'_> {
+    fn surface(&self) -> Result<&dyn Surface> {
+        let Line { run, config, .. } = self.line;
+        let load = || {
+            let hull = bitmask(&self.line.scene()?);
+            IFace::load(&run.path(Stage::Iface), &config.iface, hull.as_ref()).map_err(iface_failure)
+        };
+        once(&self.iface, load).map(|f| f as &dyn Surface)
+    }
+
+    fn radiance(&self, stage: Stage) -> Result<&dyn Radiance> {
+        let Line { run, config, .. } = self.line;
+        let load = || {
+            let count = config.radiance(stage).learned();
+            FieldMean::load(&run.path(stage), count).map_err(|e| tface_failure(stage, e))
+        };
+        let cell = if stage == Stage::Baseline { &self.baseline } else { &self.tface };
+        once(cell, load).map(|f| f as &dyn Radiance)
+    }
+}
+
+fn once<T>(cell: &OnceCell<T>, load: impl FnOnce() -> Result<T>) -> Result<&T> {
+    if cell.get().is_none() {
+        let _ = cell.set(load()?);
+    }
+    cell.get().ok_or_else(|| Error::cannot("no field", ""))
+}

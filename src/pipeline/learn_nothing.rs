@@ -1,0 +1,42 @@
+//! In the place of `learn` in a build without the feature `cpu`: no field is learned or loaded.
+
+use super::Line;
+use super::surface::{Fields, Radiance, Surface};
+use crate::capture::Capture;
+use crate::capture::scene::Scene;
+use crate::config::{Config, Stage};
+use crate::run::StageDir;
+use crate::{Error, Result};
+use serde_json::Value;
+
+fn no_fields<T>() -> Result<T> {
+    Err(Error::cannot("this build cannot learn fields", "build with the feature `cpu`, which is the default"))
+}
+
+pub(super) fn distance(_: &Capture, _: &Scene, _: &Config, _: &StageDir) -> Result<Value> {
+    no_fields()
+}
+
+pub(super) fn radiance(_: Stage, _: &Capture, _: &Scene, _: &Config, _: &StageDir) -> Result<Value> {
+    no_fields()
+}
+
+/// No fields.
+pub struct TrainedFields;
+
+impl TrainedFields {
+    /// Of a line.
+    pub fn new(_: &Line) -> TrainedFields {
+        TrainedFields
+    }
+}
+
+impl Fields for TrainedFields {
+    fn surface(&self) -> Result<&dyn Surface> {
+        no_fields()
+    }
+
+    fn radiance(&self, _: Stage) -> Result<&dyn Radiance> {
+        no_fields()
+    }
+}

@@ -1,0 +1,246 @@
+//! A capture, its configuration and its run: what every stage works on.
+
+use super::clicks::{Clicks, clicks};
+use super::path::CameraPath;
+use super::{mask, scene_file};
+use crate::capture::scene::Scene;
+use crate::capture::{self, Capture, CaptureError, CaptureOptions, MaskChoice};
+use crate::config::{Config, MaskMeaning, MaskSource, RenderConfig, Stage};
+use crate::io::{self, Limits};
+use crate::run::{Fingerprint, Run, read_record};
+use crate::{Error, Result};
+use rayon::prelude::*;
+use std::fmt::Display;
+use std::path::Path;
+
+/// A capture, its configuration and its run folder.
+pub struct Line<'a> {
+    pub(super) capture: Capture,
+    pub(super) config: &'a Config,
+    pub(super) run: &'a Run,
+    /// Digest of everything read from the capture.
+    pub(super) digest: String,
+    /// What `render` shows instead of the held-out views.
+    pub(super) path: Option<CameraPath>,
+    /// Checkpoints that stages take instead of learning.
+    pub(super) imports: Vec<Import>,
+    /// Why the capture cannot be opened, where it is only as the run remembers it.
+    pub(super) gone: Option<String>,
+    /// Is the capture the demo head, whose surface is known?
+    pub(super) synthetic: bool,
+    /// What masks are made from, if not found.
+    pub(super) clicks: Option<Clicks>,
+}
+
+/// A checkpoint that a stage takes instead of learning.
+pub(super) struct Import {
+    /// The stage.
+    pub stage: Stage,
+    /// Digest of the file.
+    pub digest: String,
+    /// Why the file cannot be read, where its digest is only as the run remembers it.
+    gone: Option<Error>,
+}
+
+impl<'a> Line<'a> {
+    /// Opens the capture and reads every byte of it once, for its digest. Nothing is written.
+    ///
+    /// The capture of a run that is done may lie somewhere else by now: its cameras are then those that the run
+    /// remembers, and nothing can be worked on ([`Line::remember`]).
+    pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>> {
+        feasible(config)?;
+        let options = capture_options(config);
+        let (mut capture, digest, clicks, gone) =
+            match capture::open(Path::new(&config.capture.path), &options) {
+                Err(e) => remembered(config, run, e)?,
+                Ok(mut capture) => {
+                    capture::require_masks(&capture, &options)?;
+                    if synthetic {
+                        // its folder is called after what it holds
+                        capture.name = "demo".into();
+                    }
+                    let digest = capture_digest(&capture)?;
+                    let clicks = clicks(&config.mask, &capture, &run.path(Stage::Mask).join(mask::CLICKS))?;
+                    (capture, digest, clicks, None)
+                }
+            };
+        let imports = imports(config, run)?;
+        capture.warnings.iter().for_each(|warning| run.warn("capture", warning));
+        if clicks.is_some() {
+            // what later stages read is what the stage `mask` makes
+            for view in &mut capture.views {
+                view.mask = capture::MaskSource::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
+            }
+        }
+        Ok(Line { capture, config, run, digest, path: None, imports, gone, synthetic, clicks })
+    }
+
+    /// Returns the line whose stage `render` makes views of `render.cameras` in a folder of their own, and not those
+    /// of the evaluation; a file of cameras is read here. For `test` the line as it is.
+    pub fn along(self, render: RenderConfig) -> Result<Line<'a>> {
+        let path = CameraPath::new(render, &self.capture)?;
+        Ok(Line { path, ..self })
+    }
+
+    /// The capture.
+    pub fn capture(&self) -> &Capture {
+        &self.capture
+    }
+
+    /// The box and hull that the stage `mask` found.
+    pub fn scene(&self) -> Result<Scene> {
+        scene_file::read_scene(&self.run.path("mask/scene.json")).map_err(|e| unusable(e, Stage::Mask))
+    }
+
+    /// Writes `cameras.json`, where the photographs are there.
+    pub(super) fn write_cameras(&self, idle: bool) -> Result<()> {
+        if self.gone.is_some() {
+            return Ok(());
+        }
+        let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
+        let cameras = scene_file::cameras_json(&self.capture, &scene);
+        self.unless_idle(idle, self.run.write("cameras.json", &cameras))
+    }
+
+    /// How the views of the stage `render` are made: those of the path, if there is one.
+    pub(super) fn render_config(&self) -> &RenderConfig {
+        self.path.as_ref().map_or(&self.config.render, |path| &path.render)
+    }
+
+    /// An error if something that one of these stages works on is no longer there.
+    pub(super) fn require_inputs(&self, stages: &[Stage]) -> Result<()> {
+        if let Some(problem) = self.gone.as_ref().filter(|_| !stages.is_empty()) {
+            return Err(gone(problem));
+        }
+        let mut lost =
+            self.imports.iter().filter(|i| stages.contains(&i.stage)).filter_map(|i| i.gone.clone());
+        lost.next().map_or(Ok(()), Err)
+    }
+
+    /// A file of the run itself that cannot be written is no failure where nothing is left to do: a run that is done
+    /// may lie where nobody may write.
+    pub(super) fn unless_idle(&self, idle: bool, written: Result<()>) -> Result<()> {
+        match written {
+            Err(e) if idle => {
+                self.run.warn("run", &format!("{e}; all that was asked for is done"));
+                Ok(())
+            }
+            other => other,
+        }
+    }
+}
+
+/// Refuses settings that contradict each other, and a device that this build cannot learn on.
+pub fn feasible(config: &Config) -> Result<()> {
+    if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
+        return Err(Error::usage(format!("`{key}` {problem}"), hint));
+    }
+    #[cfg(feature = "cpu")]
+    crate::field::device(&config.device)?;
+    Ok(())
+}
+
+/// How the configuration opens a capture.
+pub fn capture_options(config: &Config) -> CaptureOptions {
+    let c = &config.capture;
+    CaptureOptions {
+        downscale: c.downscale,
+        masks: match config.mask.source {
+            _ if config.mask.clicked() => MaskChoice::None,
+            MaskSource::Clicks => MaskChoice::None,
+            MaskSource::Auto if c.mask_dir.is_empty() => MaskChoice::Auto,
+            MaskSource::Auto | MaskSource::Folder => MaskChoice::Folder(c.mask_dir.clone()),
+            MaskSource::Alpha => MaskChoice::Alpha,
+            MaskSource::None => MaskChoice::None,
+        },
+        mask_meaning: match config.mask.meaning {
+            MaskMeaning::Empty => capture::MaskMeaning::Empty,
+            MaskMeaning::Ignore => capture::MaskMeaning::Ignore,
+        },
+        unit_m: c.unit_m,
+        ..CaptureOptions::default()
+    }
+}
+
+/// Digest of all that a capture means: cameras, splits and the bytes of every picture.
+fn capture_digest(capture: &Capture) -> Result<String> {
+    let views = capture
+        .views
+        .par_iter()
+        .map(|view| {
+            let mut text = format!("{} {:?} {:?} {}", view.name, view.split, view.camera, view.downscale);
+            let mask = match &view.mask {
+                capture::MaskSource::File(path) => Some(path),
+                _ => None,
+            };
+            for path in [Some(&view.photo), mask, view.valid.as_ref(), view.region.as_ref()] {
+                text += " ";
+                if let Some(path) = path {
+                    text += &file_digest(path)?;
+                }
+            }
+            Ok(text)
+        })
+        .collect::<Result<Vec<_>>>()?;
+    Ok(Fingerprint::of_bytes(format!("{} {}", capture.up, views.join("\n")).as_bytes()))
+}
+
+fn file_digest(path: &Path) -> Result<String> {
+    Ok(Fingerprint::of_bytes(&io::read_bytes(path, &Limits::default())?))
+}
+
+/// The checkpoints that the configuration names. A stage that took one needs it no more.
+fn imports(config: &Config, run: &Run) -> Result<Vec<Import>> {
+    let named = [(Stage::Baseline, &config.baseline.import), (Stage::Tface, &config.tface.import)];
+    let open = |(stage, file): (Stage, &String)| match file_digest(Path::new(file)) {
+        Ok(digest) => Ok(Import { stage, digest, gone: None }),
+        Err(e) => {
+            let record = read_record(&run.path(stage)).ok().flatten();
+            let digest = record.and_then(|r| r.fingerprint.inputs.get("import").cloned());
+            digest.map(|digest| Import { stage, digest, gone: Some(e.clone()) }).ok_or(e)
+        }
+    };
+    named.into_iter().filter(|(_, file)| !file.is_empty()).map(open).collect()
+}
+
+/// What a run remembers of a capture that is no longer there: its cameras, its digest, the clicks' digests, and why it
+/// cannot be opened. A run that is done does not need its photographs any more.
+///
+/// # Errors
+///
+/// `error` itself if the capture is there, and it tells what is wrong with it, or if there is no run yet; else that the
+/// run has not come far enough to remember it.
+fn remembered(
+    config: &Config,
+    run: &Run,
+    error: CaptureError,
+) -> Result<(Capture, String, Option<Clicks>, Option<String>)> {
+    let root = Path::new(&config.capture.path);
+    let is_there = io::is_folder(root) && !matches!(error, CaptureError::NotACapture { .. });
+    if is_there || !io::is_file(&run.path("config.toml")) {
+        return Err(error.into());
+    }
+    let problem = error.to_string();
+    let record = read_record(&run.path(Stage::Mask)).ok().flatten().ok_or_else(|| gone(&problem))?;
+    let capture = scene_file::read_capture(&run.path("cameras.json"), root).map_err(|_| gone(&problem))?;
+    let mut inputs = record.fingerprint.inputs;
+    let digest = inputs.remove("capture").unwrap_or_default();
+    let clicks = config.mask.clicked().then(|| Clicks::remembered(&inputs));
+    Ok((capture, digest, clicks, Some(problem)))
+}
+
+/// The capture of a run that has work left is no longer where it was.
+fn gone(problem: &str) -> Error {
+    Error::cannot(
+        format!("the capture of this run cannot be opened: {problem}"),
+        "say where it lies now: `--set capture.path=FOLDER`; the same photographs give the same run",
+    )
+}
+
+/// A file that a stage of this run made cannot be used: the suggested fix is to make it again.
+pub(super) fn unusable(e: io::ReadError, stage: impl Display) -> Error {
+    match &e {
+        io::ReadError::Io { source, .. } if source.kind() != std::io::ErrorKind::NotFound => e.into(),
+        _ => Error::cannot(&e, format!("make it again: repeat the command with `--fresh {stage}`")),
+    }
+}

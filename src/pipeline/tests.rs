@@ -1,0 +1,30 @@
+//! What the tests of the line share.
+
+use super::{Fields, Radiance, Stage, Surface};
+use crate::run::{Run, Stop};
+use crate::{Quiet, Result};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Fields that nobody may ask for.
+pub(super) struct NoFields;
+
+impl Fields for NoFields {
+    fn surface(&self) -> Result<&dyn Surface> {
+        panic!("loaded for nothing")
+    }
+
+    fn radiance(&self, _: Stage) -> Result<&dyn Radiance> {
+        panic!("loaded for nothing")
+    }
+}
+
+/// A run in `dir/run` that reports nothing.
+pub(super) fn quiet(dir: &Path) -> Run {
+    Run::open(&dir.join("run"), Stop::new(), Arc::new(Quiet))
+}
+
+/// The words of stages, with spaces.
+pub(super) fn words(stages: &[Stage]) -> String {
+    stages.iter().map(|s| s.word()).collect::<Vec<_>>().join(" ")
+}
