@@ -29,9 +29,9 @@ pub enum Background {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Foreground {
-    /// Alpha times the photograph, stage light included (published).
+    /// Alpha times the photograph, the background's light included (published).
     Photo,
-    /// The photograph less the stage's light, estimated from pixels nearby.
+    /// The photograph less the background's light, estimated from pixels nearby.
     #[default]
     Estimated,
 }

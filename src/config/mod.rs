@@ -1,7 +1,7 @@
 //! Every knob: defaults, presets, files, `--set`; checked before anything is computed.
 //!
 //! Later wins: defaults, then the preset, then each file, then `--set`. A key that is not known, of
-//! the wrong type or out of range is an error that names the line, the key and the way out. The
+//! the wrong type or out of range is an error that names the line, the key and a suggested fix. The
 //! complete result ([`Config::to_toml`]) passed back as a file gives the same configuration.
 //!
 //! Each stage owns its table, declared by `table!`: a key, its documentation, range and the values of the presets
@@ -31,10 +31,11 @@ pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, Vi
 pub use mesh::{Genus, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 pub use metrics::MetricsConfig;
 pub use render::{Background, Method, NAMES, PictureFormat, RenderConfig, called};
-pub use source::{ConfigError, Place, Sources};
+pub use source::Sources;
 pub use stage::Stage;
 pub use vm::{DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
+use crate::Result;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -202,7 +203,7 @@ impl Config {
     }
 
     /// The configuration that `sources` describe, or the first thing wrong with them.
-    pub fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
+    pub fn resolve(sources: &Sources) -> Result<Config> {
         source::resolve(sources)
     }
 
@@ -245,11 +246,11 @@ impl Config {
 
 /// What a key or a whole table means, its range and its value in every preset; an unknown name is an
 /// error that knows the nearest one.
-pub fn explain(name: &str) -> Result<String, ConfigError> {
+pub fn explain(name: &str) -> Result<String> {
     let wanted: Vec<_> =
         all_keys().filter(|(full, _)| full == name || full.starts_with(&format!("{name}."))).collect();
     if wanted.is_empty() {
-        return Err(ConfigError::unknown(Place::Option("--explain".into()), name));
+        return Err(source::unknown(name).within("`--explain`"));
     }
     let presets = [Preset::Draft, Preset::Standard, Preset::Paper];
     let tables = presets.map(|p| Config::preset(p).to_table());

@@ -1,8 +1,8 @@
 //! From files and `--set` to a [`Config`]: which value wins, and what is wrong with one.
 
 use super::{Config, Key, Preset, all_keys, lookup, show};
+use crate::{Error, Result};
 use serde::Deserialize;
-use std::fmt;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
@@ -19,111 +19,6 @@ pub struct Sources {
     pub options: Vec<(String, String, String)>,
 }
 
-/// Where a value was given.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Place {
-    /// In a file, at a line counted from 1.
-    File {
-        /// As it was named.
-        name: String,
-        /// Counted from 1.
-        line: usize,
-    },
-    /// By an option of the command line.
-    Option(String),
-}
-
-impl fmt::Display for Place {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        match self {
-            Place::File { name, line } => write!(f, "`{name}`, line {line}"),
-            Place::Option(option) => write!(f, "`{option}`"),
-        }
-    }
-}
-
-/// What is wrong with a configuration.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum ConfigError {
-    /// Not TOML, or not `key=value`.
-    #[error("{place}: {problem}")]
-    Syntax {
-        /// Where.
-        place: Place,
-        /// What the parser says.
-        problem: String,
-    },
-    /// No such key.
-    #[error("{place}: there is no key `{key}`")]
-    Unknown {
-        /// Where.
-        place: Place,
-        /// As written.
-        key: String,
-        /// The known key most like it.
-        nearest: Option<String>,
-    },
-    /// A key of another type.
-    #[error("{place}: `{key}` is {expected}, found {found}")]
-    Type {
-        /// Where.
-        place: Place,
-        /// The key.
-        key: String,
-        /// Expected type, with its article.
-        expected: &'static str,
-        /// The value as written.
-        found: String,
-    },
-    /// A number out of range.
-    #[error("{place}: `{key}` is {found}, allowed is {range}")]
-    Range {
-        /// Where.
-        place: Place,
-        /// The key.
-        key: String,
-        /// The value.
-        found: String,
-        /// `1 to 64`.
-        range: String,
-    },
-    /// A word that means nothing here.
-    #[error("{place}: `{key}`: {problem}")]
-    Word {
-        /// Where.
-        place: Place,
-        /// The key.
-        key: String,
-        /// What was found and what is known.
-        problem: String,
-    },
-}
-
-crate::error::error_from!(ConfigError, Usage);
-
-impl ConfigError {
-    pub(super) fn unknown(place: Place, key: &str) -> ConfigError {
-        ConfigError::Unknown { place, key: key.into(), nearest: nearest(key) }
-    }
-
-    /// The way out.
-    pub fn hint(&self) -> String {
-        match self {
-            ConfigError::Syntax { .. } => "write `table.key = value`; words in double quotes".into(),
-            ConfigError::Unknown { nearest: Some(name), .. } => {
-                format!("did you mean `{name}`? `tiface config` lists all keys")
-            }
-            ConfigError::Unknown { .. } => "`tiface config` lists all keys".into(),
-            ConfigError::Type { key, .. }
-            | ConfigError::Range { key, .. }
-            | ConfigError::Word { key, .. } => {
-                format!("`tiface config --explain {key}` says what it means")
-            }
-        }
-    }
-}
-
 /// A value as given, before its type is known to fit.
 enum Given {
     Toml(Value),
@@ -131,22 +26,23 @@ enum Given {
     Text(String),
 }
 
-type Assignment = (String, Given, Place);
+/// A key, its value, and where that was given, as a message begins.
+type Assignment = (String, Given, String);
 
-pub(super) fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
+pub(super) fn resolve(sources: &Sources) -> Result<Config> {
     let mut given: Vec<Assignment> = Vec::new();
     for (name, text) in &sources.files {
         read_file(name, text, &mut given)?;
     }
     for set in &sources.set {
-        let place = Place::Option(format!("--set {set}"));
+        let place = format!("`--set {set}`");
         let Some((key, value)) = set.split_once('=') else {
-            return Err(ConfigError::Syntax { place, problem: "expected KEY=VALUE".into() });
+            return Err(not_toml(&place, "expected KEY=VALUE"));
         };
         given.push((key.trim().into(), Given::Text(value.trim().into()), place));
     }
     for (typed, key, value) in &sources.options {
-        given.push((key.clone(), Given::Text(value.clone()), Place::Option(typed.clone())));
+        given.push((key.clone(), Given::Text(value.clone()), format!("`{typed}`")));
     }
 
     // the preset comes first whatever line it stands on; what it means is checked by `assign` below
@@ -160,35 +56,42 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config, ConfigError> {
     let preset = sources.preset.or(named).unwrap_or_default();
     let mut config = Config::preset(preset);
     for (key, value, place) in given {
-        config = assign(&config, &key, value, place)?;
+        config = assign(&config, &key, value).map_err(|e| e.within(place))?;
     }
     Ok(Config { preset, ..config }.keep_constants())
 }
 
-fn read_file(name: &str, text: &str, given: &mut Vec<Assignment>) -> Result<(), ConfigError> {
+fn not_toml(place: &str, problem: &str) -> Error {
+    Error::usage(problem, "write `table.key = value`; words in double quotes").within(place)
+}
+
+/// There is no such key; the suggested fix is the known one most like it.
+pub(super) fn unknown(key: &str) -> Error {
+    let meant = nearest(key).map(|name| format!("did you mean `{name}`? ")).unwrap_or_default();
+    Error::usage(format!("there is no key `{key}`"), format!("{meant}`tiface config` lists all keys"))
+}
+
+/// A value that the key cannot have.
+fn wrong(key: &str, problem: &str) -> Error {
+    Error::usage(format!("`{key}`{problem}"), format!("`tiface config --explain {key}` says what it means"))
+}
+
+fn read_file(name: &str, text: &str, given: &mut Vec<Assignment>) -> Result<()> {
     let text = text.strip_prefix('\u{FEFF}').unwrap_or(text);
     let line_at =
         |offset: usize| text.as_bytes()[..offset.min(text.len())].iter().filter(|&&b| b == b'\n').count() + 1;
-    let place = |offset| Place::File { name: name.into(), line: line_at(offset) };
-    let root = DeTable::parse(text).map_err(|e| ConfigError::Syntax {
-        place: place(e.span().map_or(0, |s| s.start)),
-        problem: e.message().to_string(),
-    })?;
+    let place = |offset| format!("`{name}`, line {}", line_at(offset));
+    let failed = |e: toml::de::Error| not_toml(&place(e.span().map_or(0, |s| s.start)), e.message());
+    let root = DeTable::parse(text).map_err(failed)?;
     // plain values once more, where a date or an odd integer has already become what it is
-    let plain: Table = toml::from_str(text).map_err(|e| ConfigError::Syntax {
-        place: place(e.span().map_or(0, |s| s.start)),
-        problem: e.message().to_string(),
-    })?;
+    let plain: Table = toml::from_str(text).map_err(failed)?;
     let mut found: Vec<(usize, String)> = Vec::new();
     walk(root.get_ref(), "", &mut found);
     found.sort(); // as they stand in the file
     for (offset, key) in found {
-        if let Some(value) = lookup(&plain, &key) {
-            given.push((key, Given::Toml(value.clone()), place(offset)));
-        } else {
-            // a key with a dot inside quotes: no key of ours
-            return Err(ConfigError::unknown(place(offset), &key));
-        }
+        // a key with a dot inside quotes is no key of ours
+        let value = lookup(&plain, &key).ok_or_else(|| unknown(&key).within(place(offset)))?;
+        given.push((key, Given::Toml(value.clone()), place(offset)));
     }
     Ok(())
 }
@@ -210,40 +113,32 @@ fn is_table(name: &str) -> bool {
 }
 
 /// `config` with one key changed.
-fn assign(config: &Config, key: &str, given: Given, place: Place) -> Result<Config, ConfigError> {
+fn assign(config: &Config, key: &str, given: Given) -> Result<Config> {
     let mut root = config.to_table();
     let known = all_keys().find(|(name, _)| name == key);
-    let (Some((_, about)), Some(old)) = (known, lookup(&root, key)) else {
-        return Err(ConfigError::unknown(place, key));
-    };
+    let (Some((_, about)), Some(old)) = (known, lookup(&root, key)) else { return Err(unknown(key)) };
     let found = match &given {
         Given::Toml(value) => show(value),
         Given::Text(text) => format!("`{text}`"),
     };
     let Some(value) = fit(old, given) else {
-        return Err(ConfigError::Type { place, key: key.into(), expected: kind(old), found });
+        return Err(wrong(key, &format!(" is {}, found {found}", kind(old))));
     };
-    check_range(about, &value).map_err(|found| ConfigError::Range {
-        place: place.clone(),
-        key: key.into(),
-        found,
-        range: about.range(),
-    })?;
-    if let Some(word) = value.as_str().filter(|w| w.starts_with('~')) {
-        let problem = format!("`{word}`: `~` is a word of the shell; write the whole path");
-        return Err(ConfigError::Word { place, key: key.into(), problem });
+    check_range(about, &value)
+        .map_err(|found| wrong(key, &format!(" is {found}, allowed is {}", about.range())))?;
+    match value.as_str() {
+        Some(word) if word.starts_with('~') => {
+            let problem = format!(": `{word}`: `~` is a word of the shell; write the whole path");
+            return Err(wrong(key, &problem));
+        }
+        Some(word) if key == "device" && !is_device(word) => {
+            let problem = format!(": unknown device `{word}`, expected auto, cpu, wgpu:N or cuda:N");
+            return Err(wrong(key, &problem));
+        }
+        _ => put(&mut root, key, value),
     }
-    if key == "device"
-        && let Some(word) = value.as_str().filter(|w| !is_device(w))
-    {
-        let problem = format!("unknown device `{word}`, expected auto, cpu, wgpu:N or cuda:N");
-        return Err(ConfigError::Word { place, key: key.into(), problem });
-    }
-    put(&mut root, key, value);
-    Config::deserialize(Value::Table(root)).map_err(|e| {
-        let problem = e.message().lines().next().unwrap_or_default().to_string();
-        ConfigError::Word { place, key: key.into(), problem }
-    })
+    Config::deserialize(Value::Table(root))
+        .map_err(|e| wrong(key, &format!(": {}", e.message().lines().next().unwrap_or_default())))
 }
 
 /// `given` as a value of the same type as `old`, if it can be one.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MaskUse {
-    /// Nothing: the field learns the whole frame, stage included.
+    /// Nothing: the field learns the whole frame, background included.
     None,
     /// Every pixel that is a little head is head (published).
     Binary,
