@@ -16,10 +16,10 @@ use process::cpu_s;
 use tiface::Quiet;
 use tiface::geom::{Aabb, Mesh};
 use tiface::mesh::files::{seams_facing, uv_check};
-use tiface::mesh::{AtlasConfig, MeshConfig, atlas, extract};
+use tiface::mesh::{AtlasConfig, ExtractOptions, atlas, extract};
 
 fn head(resolution: usize) -> Mesh {
-    let config = MeshConfig { resolution, ..MeshConfig::default() };
+    let config = ExtractOptions { resolution, ..ExtractOptions::default() };
     let color = |p: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; p.len()];
     let (field, slope) = (fields::batch(fields::head), fields::batch_gradient(fields::head));
     extract(field, slope, color, Aabb::SCENE, None, &config, &Quiet).expect("a head").0

@@ -21,7 +21,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use tiface::Quiet;
 use tiface::geom::Mesh;
 use tiface::mesh::files::check;
-use tiface::mesh::{Placement, SimplifyConfig, Volume, marching, simplify};
+use tiface::mesh::{SimplifyConfig, VertexPlacement, Volume, marching, simplify};
 
 /// Runs of which the fastest counts: what else the machine does only ever adds.
 const RUNS: usize = 5;
@@ -109,9 +109,9 @@ fn measure(n: usize, triangles: usize, rounds: usize) {
     let input = head(n);
     show(&format!("head {n}³"), None, &input);
     let ways = [
-        ("without the field", false, Placement::Nearest),
-        ("with it, on its zero", true, Placement::OnSurface),
-        ("with it, nearest", true, Placement::Nearest),
+        ("without the field", false, VertexPlacement::Nearest),
+        ("with it, on its zero", true, VertexPlacement::OnSurface),
+        ("with it, nearest", true, VertexPlacement::Nearest),
     ];
     for (name, with, placement) in ways {
         let config = SimplifyConfig { triangles, rounds, placement, ..SimplifyConfig::default() };

@@ -1,5 +1,7 @@
 //! How a long computation reports progress and learns that it should stop.
 
+use crate::{Error, Result};
+
 /// Progress out, stop request in.
 ///
 /// Called from the computing thread between steps, never in the middle of one, so that whatever it
@@ -10,6 +12,11 @@ pub trait Monitor: Send + Sync {
 
     /// Has someone asked to stop?
     fn stop(&self) -> bool;
+
+    /// Returns an error once someone has asked to stop.
+    fn check_stop(&self) -> Result<()> {
+        if self.stop() { Err(Error::stopped("what is complete is kept")) } else { Ok(()) }
+    }
 }
 
 /// Reports nothing, never stops.
@@ -19,5 +26,17 @@ impl Monitor for Quiet {
     fn step(&self, _: u64, _: u64, _: &[(&str, f64)]) {}
     fn stop(&self) -> bool {
         false
+    }
+}
+
+/// Reports nothing, asks to stop from the start.
+#[cfg(test)]
+pub(crate) struct Stopping;
+
+#[cfg(test)]
+impl Monitor for Stopping {
+    fn step(&self, _: u64, _: u64, _: &[(&str, f64)]) {}
+    fn stop(&self) -> bool {
+        true
     }
 }

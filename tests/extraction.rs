@@ -8,13 +8,13 @@ use glam::Vec3;
 use proptest::prelude::*;
 use rayon::prelude::*;
 use tiface::geom::{Aabb, Mesh, Topology, topology};
-use tiface::mesh::{Asking, Grid, MeshConfig, Sparse, Surface, Volume, extract, marching, sparse};
+use tiface::mesh::{ExtractOptions, LevelSet, NodeGrid, Sparse, Volume, extract, marching, sparse};
 
-fn surface(dims: [usize; 3], values: &[f32], closed: bool) -> Surface {
+fn surface(dims: [usize; 3], values: &[f32], closed: bool) -> LevelSet {
     marching(&Volume { dims, values, origin: Vec3::ZERO, spacing: Vec3::ONE }, closed).unwrap()
 }
 
-fn analysed(s: &Surface) -> Topology {
+fn analysed(s: &LevelSet) -> Topology {
     topology(&s.positions, &s.triangles)
 }
 
@@ -182,7 +182,7 @@ fn the_bytes_do_not_depend_on_the_number_of_threads() {
         pool.install(|| surface([70; 3], &values, true))
     };
     assert_eq!(on(1), on(3));
-    let grid = Grid::fit(Aabb::SCENE, 70).unwrap();
+    let grid = NodeGrid::fit(Aabb::SCENE, 70).unwrap();
     let few = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| ask(fields::gyroid, &grid).surface)
@@ -396,13 +396,13 @@ fn the_head_has_the_area_and_volume_of_another_marching_cubes() {
 
 // ---- few evaluations ----
 
-fn ask(field: fn(Vec3) -> f32, grid: &Grid) -> Sparse {
-    sparse(&fields::batch(field), None, grid, Asking::default(), &|| false).unwrap()
+fn ask(field: fn(Vec3) -> f32, grid: &NodeGrid) -> Sparse {
+    sparse(&fields::batch(field), None, grid, 8, 1 << 16, &tiface::Quiet).unwrap()
 }
 
 /// Share of nodes evaluated and triangles the sparse surface lacks, against the dense one.
 fn cost(field: fn(Vec3) -> f32, cells: usize) -> (f64, i64) {
-    let grid = Grid::fit(Aabb::SCENE, cells).unwrap();
+    let grid = NodeGrid::fit(Aabb::SCENE, cells).unwrap();
     let start = std::time::Instant::now();
     let few = ask(field, &grid);
     let seconds = start.elapsed().as_secs_f64();
@@ -457,7 +457,7 @@ fn a_head_at_512_needs_a_hundredth_of_the_nodes() {
 #[test]
 #[ignore = "a 1024³ grid; prints time and peak memory; run alone with --ignored"]
 fn a_head_at_1024_fits_in_half_a_gigabyte() {
-    let grid = Grid::fit(Aabb::SCENE, 1024).unwrap();
+    let grid = NodeGrid::fit(Aabb::SCENE, 1024).unwrap();
     let start = std::time::Instant::now();
     let few = ask(fields::head, &grid);
     println!(
@@ -485,7 +485,7 @@ fn fields_of_any_slope_and_offset_lose_nothing() {
     assert_eq!(cost(soft, 64).1, 0);
     assert_eq!(cost(steep, 64).1, 0);
     assert_eq!(cost(saturated, 64).1, 0);
-    let grid = Grid::fit(Aabb::SCENE, 32).unwrap();
+    let grid = NodeGrid::fit(Aabb::SCENE, 32).unwrap();
     assert!(ask(|_| 0.5, &grid).surface.triangles.is_empty());
     assert!(ball(Vec3::ZERO) < 0.0);
 }
@@ -494,7 +494,7 @@ fn fields_of_any_slope_and_offset_lose_nothing() {
 
 #[test]
 fn a_head_becomes_one_closed_piece_on_the_surface_with_unit_normals() {
-    let config = MeshConfig { resolution: 128, ..MeshConfig::default() };
+    let config = ExtractOptions { resolution: 128, ..ExtractOptions::default() };
     for field in [fields::head as fn(Vec3) -> f32, fields::bent_head] {
         let (mesh, report) = extract(
             fields::batch(field),
@@ -532,7 +532,7 @@ fn noise_through_the_whole_stage_stays_a_closed_manifold() {
         (q.x + 2.0 * q.y.sin()).sin() + (q.y + 2.0 * q.z.sin()).sin() + (q.z + 2.0 * q.x.sin()).sin()
     };
     for keep_share in [0.0, 1.0] {
-        let config = MeshConfig { resolution: 24, keep_share, ..MeshConfig::default() };
+        let config = ExtractOptions { resolution: 24, keep_share, ..ExtractOptions::default() };
         let (_, report) = extract(
             fields::batch(field),
             fields::batch_gradient(field),

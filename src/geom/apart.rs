@@ -1,11 +1,11 @@
 //! How far the charts of an atlas are apart.
 
-use crate::geom::{Boxes, EFFORT, Span, share_out};
+use crate::geom::{Boxes, DBox, EFFORT, share_out};
 use glam::DVec2;
 
 /// A piece of a chart's outline, in texels.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Side {
+pub(crate) struct OutlineSide {
     /// Which chart.
     pub chart: u32,
     /// Its ends.
@@ -24,11 +24,11 @@ pub(crate) struct Apart {
 }
 
 /// The smallest distance between sides of different charts, up to `farthest`, beyond which it is given as that.
-pub(crate) fn nearest_charts(sides: &[Side], farthest: f64) -> Apart {
+pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> Apart {
     if sides.iter().all(|s| s.chart == sides[0].chart) {
         return Apart { distance: None, left: 0 };
     }
-    let span = |s: &Side| Span::around([s.from, s.to].map(|p| p.extend(0.0)));
+    let span = |s: &OutlineSide| DBox::around([s.from, s.to].map(|p| p.extend(0.0)));
     let boxes = Boxes::new(sides.iter().map(span));
     // What lies beside each other in the tree mostly lies beside each other: a first bound, so that the search
     // has a short way to go.
@@ -66,14 +66,14 @@ const BESIDE: usize = 8;
 /// What a distance of two sides costs, in comparisons of boxes.
 const DISTANCE: usize = 8;
 
-fn point_distance(p: DVec2, s: &Side) -> f64 {
+fn point_distance(p: DVec2, s: &OutlineSide) -> f64 {
     let along = s.to - s.from;
     let t = (p - s.from).dot(along) / along.length_squared();
     p.distance(s.from + along * if t.is_nan() { 0.0 } else { t.clamp(0.0, 1.0) })
 }
 
-fn distance(a: &Side, b: &Side) -> f64 {
-    let turn = |s: &Side, p: DVec2| (s.to - s.from).perp_dot(p - s.from);
+fn distance(a: &OutlineSide, b: &OutlineSide) -> f64 {
+    let turn = |s: &OutlineSide, p: DVec2| (s.to - s.from).perp_dot(p - s.from);
     if turn(a, b.from) * turn(a, b.to) < 0.0 && turn(b, a.from) * turn(b, a.to) < 0.0 {
         return 0.0; // they cross
     }
@@ -85,11 +85,11 @@ fn distance(a: &Side, b: &Side) -> f64 {
 mod tests {
     use super::*;
 
-    fn side(chart: u32, p: [f64; 4]) -> Side {
-        Side { chart, from: DVec2::new(p[0], p[1]), to: DVec2::new(p[2], p[3]) }
+    fn side(chart: u32, p: [f64; 4]) -> OutlineSide {
+        OutlineSide { chart, from: DVec2::new(p[0], p[1]), to: DVec2::new(p[2], p[3]) }
     }
 
-    fn nearest(sides: &[Side], farthest: f64) -> Option<f64> {
+    fn nearest(sides: &[OutlineSide], farthest: f64) -> Option<f64> {
         let Apart { distance, left } = nearest_charts(sides, farthest);
         assert_eq!(left, 0);
         distance
@@ -109,7 +109,7 @@ mod tests {
     #[test]
     fn far_and_long_sides_agree_with_all_pairs() {
         // sides on two combs of slanted teeth
-        let sides: Vec<Side> = (0..200)
+        let sides: Vec<OutlineSide> = (0..200)
             .map(|i| {
                 let x = 3.0 * f64::from(i) + f64::from(i % 7);
                 let chart = (i / 2) as u32;

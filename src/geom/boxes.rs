@@ -88,27 +88,27 @@ pub(crate) fn share_out<T: Send>(
 
 /// A box along the axes.
 #[derive(Clone, Copy)]
-pub(crate) struct Span {
+pub(crate) struct DBox {
     low: DVec3,
     high: DVec3,
 }
 
-impl Span {
-    const EMPTY: Span = Span { low: DVec3::INFINITY, high: DVec3::NEG_INFINITY };
+impl DBox {
+    const EMPTY: DBox = DBox { low: DVec3::INFINITY, high: DVec3::NEG_INFINITY };
 
-    pub(crate) fn around(points: impl IntoIterator<Item = DVec3>) -> Span {
-        points.into_iter().fold(Span::EMPTY, |s, p| Span { low: s.low.min(p), high: s.high.max(p) })
+    pub(crate) fn around(points: impl IntoIterator<Item = DVec3>) -> DBox {
+        points.into_iter().fold(DBox::EMPTY, |s, p| DBox { low: s.low.min(p), high: s.high.max(p) })
     }
 
-    pub(crate) fn grown(self, margin: f64) -> Span {
-        Span { low: self.low - margin, high: self.high + margin }
+    pub(crate) fn grown(self, margin: f64) -> DBox {
+        DBox { low: self.low - margin, high: self.high + margin }
     }
 
-    fn with(self, other: Span) -> Span {
-        Span { low: self.low.min(other.low), high: self.high.max(other.high) }
+    fn with(self, other: DBox) -> DBox {
+        DBox { low: self.low.min(other.low), high: self.high.max(other.high) }
     }
 
-    fn meets(&self, other: &Span) -> bool {
+    fn meets(&self, other: &DBox) -> bool {
         self.low.cmple(other.high).all() && other.low.cmple(self.high).all()
     }
 
@@ -125,16 +125,16 @@ const LEAF: usize = 4;
 /// not depend on where they are.
 pub(crate) struct Boxes {
     /// In the order of the tree, with their numbers.
-    items: Vec<(Span, u32)>,
+    items: Vec<(DBox, u32)>,
     /// A node, then those below its first half, then those below its second.
-    nodes: Vec<Span>,
+    nodes: Vec<DBox>,
 }
 
 impl Boxes {
-    pub(crate) fn new(spans: impl Iterator<Item = Span>) -> Boxes {
-        let mut items: Vec<(Span, u32)> = spans.zip(0..).collect();
+    pub(crate) fn new(spans: impl Iterator<Item = DBox>) -> Boxes {
+        let mut items: Vec<(DBox, u32)> = spans.zip(0..).collect();
         let leaves = items.len().div_ceil(LEAF).next_power_of_two();
-        let mut nodes = vec![Span::EMPTY; 2 * leaves - 1];
+        let mut nodes = vec![DBox::EMPTY; 2 * leaves - 1];
         part(&mut items, &mut nodes);
         Boxes { items, nodes }
     }
@@ -147,7 +147,7 @@ impl Boxes {
     /// Calls `visit` with every box that meets `query`, until it returns false or the effort is spent.
     pub(crate) fn meeting(
         &self,
-        query: &Span,
+        query: &DBox,
         effort: &mut Effort,
         mut visit: impl FnMut(u32, &mut Effort) -> bool,
     ) {
@@ -175,15 +175,15 @@ impl Boxes {
     }
 }
 
-fn part(items: &mut [(Span, u32)], nodes: &mut [Span]) {
+fn part(items: &mut [(DBox, u32)], nodes: &mut [DBox]) {
     let Some((node, below)) = nodes.split_first_mut() else { return };
-    *node = items.iter().fold(Span::EMPTY, |s, i| s.with(i.0));
+    *node = items.iter().fold(DBox::EMPTY, |s, i| s.with(i.0));
     if below.is_empty() || items.is_empty() {
         return;
     }
-    let middles = Span::around(items.iter().map(|i| i.0.middle()));
+    let middles = DBox::around(items.iter().map(|i| i.0.middle()));
     let axis = (middles.high - middles.low).max_position();
-    let at = |i: &(Span, u32)| i.0.middle()[axis];
+    let at = |i: &(DBox, u32)| i.0.middle()[axis];
     let half = items.len() / 2;
     items.select_nth_unstable_by(half, |a, b| at(a).total_cmp(&at(b)).then(a.1.cmp(&b.1)));
     let (a, b) = items.split_at_mut(half);
@@ -208,13 +208,13 @@ mod tests {
             state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
             (state >> 40) as f64 / (1u64 << 24) as f64
         };
-        let mut spans: Vec<Span> = (0..501)
+        let mut spans: Vec<DBox> = (0..501)
             .map(|_| {
                 let low = DVec3::new(next(), next(), next());
-                Span { low, high: low + 0.2 * DVec3::new(next(), next(), next()) }
+                DBox { low, high: low + 0.2 * DVec3::new(next(), next(), next()) }
             })
             .collect();
-        spans[17] = Span::around([DVec3::splat(1e30)]);
+        spans[17] = DBox::around([DVec3::splat(1e30)]);
         let boxes = Boxes::new(spans.iter().copied());
         for query in &spans {
             let mut found = Vec::new();

@@ -1,8 +1,8 @@
 //! A triangle mesh with what the pipeline attaches to its vertices.
 
+use super::topology::topology;
 use super::{Aabb, Similarity};
 use glam::Vec3;
-use std::collections::HashMap;
 
 /// Triangles over shared vertices, counter-clockwise seen from outside.
 ///
@@ -19,6 +19,17 @@ pub struct Mesh {
     pub triangles: Vec<[u32; 3]>,
 }
 
+/// Twice the area of a triangle along its normal.
+pub(crate) fn area_vector([a, b, c]: [Vec3; 3]) -> Vec3 {
+    (b - a).cross(c - a)
+}
+
+/// The shape of a triangle, 1 for equilateral, 0 for none: `4 √3 area / Σ length²`.
+pub(crate) fn shape([a, b, c]: [Vec3; 3]) -> f32 {
+    let sum = (b - a).length_squared() + (c - b).length_squared() + (a - c).length_squared();
+    if sum > 0.0 { 2.0 * 3f32.sqrt() * area_vector([a, b, c]).length() / sum } else { 0.0 }
+}
+
 impl Mesh {
     /// The box around all vertices.
     pub fn bounds(&self) -> Aabb {
@@ -30,16 +41,15 @@ impl Mesh {
         self.triangles[triangle as usize].map(|i| self.positions[i as usize])
     }
 
+    /// The area of a triangle, in f64.
+    pub fn area(&self, triangle: u32) -> f64 {
+        let [a, b, c] = self.corners(triangle).map(|p| p.as_dvec3());
+        0.5 * (b - a).cross(c - a).length()
+    }
+
     /// Watertight: every edge shared by exactly two triangles, oppositely wound.
     pub fn is_closed(&self) -> bool {
-        let mut edges: HashMap<(u32, u32), u32> = HashMap::with_capacity(self.triangles.len() * 3);
-        for t in &self.triangles {
-            for k in 0..3 {
-                *edges.entry((t[k], t[(k + 1) % 3])).or_default() += 1;
-            }
-        }
-        !self.triangles.is_empty()
-            && edges.iter().all(|(&(a, b), &n)| a != b && n == 1 && edges.get(&(b, a)) == Some(&1))
+        topology(&self.positions, &self.triangles).closed
     }
 
     /// Unit vertex normals, weighted by the angles of the triangles at each vertex (Thürmer, Wüthrich 1998); +z
@@ -47,8 +57,7 @@ impl Mesh {
     pub fn angle_weighted_normals(&self) -> Vec<Vec3> {
         let mut sums = vec![Vec3::ZERO; self.positions.len()];
         for t in &self.triangles {
-            let [a, b, c] = t.map(|v| self.positions[v as usize]);
-            let normal = (b - a).cross(c - a).normalize_or_zero();
+            let normal = area_vector(t.map(|v| self.positions[v as usize])).normalize_or_zero();
             for k in 0..3 {
                 let [p, q, r] = [0, 1, 2].map(|o| self.positions[t[(k + o) % 3] as usize]);
                 let (u, v) = ((q - p).normalize_or_zero(), (r - p).normalize_or_zero());

@@ -15,13 +15,14 @@ mod symmetric;
 mod topology;
 
 pub use aabb::Aabb;
-pub(crate) use apart::{Side, nearest_charts};
+pub(crate) use apart::{OutlineSide, nearest_charts};
 pub use atlas::Atlas;
-pub(crate) use boxes::{Boxes, EFFORT, Effort, Span, share_out};
+pub(crate) use boxes::{Boxes, DBox, EFFORT, Effort, share_out};
 pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion};
 pub(crate) use intersect::intersect;
 pub use mesh::Mesh;
+pub(crate) use mesh::{area_vector, shape};
 pub(crate) use overlap::{THOROUGH, overlaps, shared_area, turn};
 pub use ray::{Hit, Ray};
 pub use similarity::Similarity;

@@ -5,7 +5,7 @@
 //! of f32 coordinates, in f64 with Shewchuk's error bound (1997), and where that cannot tell, as the exact sum
 //! of its six products. So triangles that share a side or a corner, or merely touch, never count.
 
-use crate::geom::{Boxes, Span, share_out};
+use crate::geom::{Boxes, DBox, share_out};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
@@ -96,7 +96,7 @@ const KEEPING: usize = 64;
 pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effort: usize) -> Overlaps {
     let corners = |t: u32| triangles[t as usize].map(|i| uvs[i as usize]);
     let listed: Vec<u32> = (0..triangles.len() as u32).filter(|&t| fit[t as usize]).collect();
-    let span = |t: u32| Span::around(corners(t).map(|v| v.as_dvec2().extend(0.0)));
+    let span = |t: u32| DBox::around(corners(t).map(|v| v.as_dvec2().extend(0.0)));
     let boxes = Boxes::new(listed.iter().map(|&t| span(t)));
     let shared = share_out(listed.len(), effort, |i, effort| {
         let (a, mut pairs) = (listed[i], Vec::new());

@@ -62,6 +62,16 @@ impl Sets {
         Sets((0..n as u32).collect())
     }
 
+    /// Vertices in sets of those that triangles connect.
+    pub(crate) fn of_pieces(vertices: usize, triangles: &[[u32; 3]]) -> Sets {
+        let mut sets = Sets::new(vertices);
+        for t in triangles {
+            sets.join(t[0], t[1]);
+            sets.join(t[0], t[2]);
+        }
+        sets
+    }
+
     /// The smallest member of `i`'s set.
     pub(crate) fn find(&mut self, mut i: u32) -> u32 {
         while self.0[i as usize] != i {
@@ -160,11 +170,7 @@ pub fn topology(positions: &[Vec3], triangles: &[[u32; 3]]) -> Topology {
     }
     out.non_manifold_vertices = fans_of.iter().filter(|&&n| n > 1).count();
 
-    let mut pieces = Sets::new(positions.len());
-    for t in triangles {
-        pieces.join(t[0], t[1]);
-        pieces.join(t[0], t[2]);
-    }
+    let mut pieces = Sets::of_pieces(positions.len(), triangles);
     out.pieces = (0..positions.len()).filter(|&v| used[v] && pieces.find(v as u32) == v as u32).count();
 
     out.euler = out.vertices as i64 - out.edges as i64 + out.triangles as i64;

@@ -4,6 +4,7 @@
 //! size, each piece owns what it writes, and sums over pieces are taken in a fixed order.
 
 pub mod adam;
+pub mod cg;
 pub mod hash;
 pub mod march;
 pub mod mlp;

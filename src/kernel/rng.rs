@@ -10,8 +10,9 @@ pub fn bits(seed: u64, stream: u64, index: u64) -> u64 {
         .wrapping_add(index.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
 }
 
+/// SplitMix64's finalizer: words that look random, the same every time.
 #[inline]
-fn mix(mut z: u64) -> u64 {
+pub(crate) fn mix(mut z: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
     z ^ (z >> 31)

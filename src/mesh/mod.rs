@@ -5,16 +5,16 @@
 //! cut. [`simplify`], [`atlas`] and [`bake`] make of it what an artist opens; [`files`] its
 //! files.
 
-mod error;
 mod extract;
 pub mod files;
 mod finish;
+mod input;
+mod moves;
 
-pub use error::MeshError;
 pub use extract::{
-    Asking, Cap, CleanReport, Grid, HandleReport, LONGEST_HANDLE, MeshConfig, MeshReport, Patches, Skin,
-    Sparse, Surface, Verified, Volume, clean, extract, marching, sparse,
+    Cap, CleanReport, ExtractOptions, HandleReport, LONGEST_HANDLE, LevelSet, MeshReport, NodeGrid, Patches,
+    Skin, Sparse, Verified, Volume, clean, extract, marching, sparse,
 };
 pub use finish::{
-    AtlasConfig, AtlasReport, Placement, SimplifyConfig, SimplifyReport, atlas, bake, simplify,
+    AtlasConfig, AtlasReport, SimplifyConfig, SimplifyReport, VertexPlacement, atlas, bake, simplify,
 };

@@ -8,7 +8,7 @@ use crate::geom::{Camera, Mesh};
 use crate::image::{Image, Photo, quantise, srgb_from_linear};
 use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, bake, tangent_space};
 use crate::mesh::files::tangents;
-use crate::mesh::{AtlasConfig, Cap, MeshError, Patches, SimplifyConfig, atlas, simplify};
+use crate::mesh::{AtlasConfig, Cap, Patches, SimplifyConfig, atlas, simplify};
 use crate::{Monitor, Result};
 use glam::{Mat3, Vec3};
 use serde_json::{Map, Value, json};
@@ -47,7 +47,7 @@ impl Line<'_> {
         scene: &Scene,
         field: &dyn Surface,
         monitor: &dyn Monitor,
-    ) -> Result<Finished, MeshError> {
+    ) -> Result<Finished> {
         let c = &self.config.mesh;
         let mut report = Map::new();
         let mut warnings = Vec::new();

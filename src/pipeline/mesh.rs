@@ -12,7 +12,7 @@ use crate::geom::{Camera, Mesh, Similarity};
 use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::files::ReadMeshError;
-use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshError, Patches, files};
+use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, Patches, files};
 use crate::run::StageDir;
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
@@ -24,7 +24,7 @@ impl Line<'_> {
     pub(super) fn mesh(&self, scene: &Scene, field: &dyn Surface, dir: &StageDir) -> Result<Value> {
         Ok((|stage: &StageDir| -> Result<Value> {
             let c = &self.config.mesh;
-            let config = mesh::MeshConfig {
+            let config = mesh::ExtractOptions {
                 resolution: c.resolution as usize,
                 coarse_step: c.coarse_step as usize,
                 keep_share: c.keep_share,
@@ -32,7 +32,7 @@ impl Line<'_> {
                 relax: c.relax,
                 longest_handle: if c.genus == Genus::Simple { LONGEST_HANDLE } else { 0.0 },
                 verify: c.verify,
-                ..mesh::MeshConfig::default()
+                ..mesh::ExtractOptions::default()
             };
             let hull = scene.hull.as_ref().map(|hull| |p: Vec3| hull.contains(p));
             let inside_hull = hull.as_ref().map(|f| f as &(dyn Fn(Vec3) -> bool + Sync));
@@ -53,14 +53,7 @@ impl Line<'_> {
                 &config,
                 stage.monitor(),
             );
-            let failed = |e: MeshError| match e {
-                MeshError::Stopped => Error::stopped("what is complete is kept"),
-                e => {
-                    let hint = e.hint().unwrap_or_default();
-                    Error::cannot(e, hint)
-                }
-            };
-            let (mut surface, report) = extracted.map_err(failed)?;
+            let (mut surface, report) = extracted?;
             report.warnings(c.cap).iter().for_each(|w| stage.warn(w));
             let mm = scene.scene_from_world.inverse().scale * self.config.capture.unit_m * 1000.0;
             report.handles.warning(mm).iter().for_each(|w| stage.warn(w));
@@ -91,7 +84,7 @@ impl Line<'_> {
             }
             let closing = Closing { cap: cap.as_ref(), patches: patches.as_ref() };
             let finished = self.finish(&surface, closing, report.cell_size, &scene, field, stage.monitor());
-            let Finished { product, linear, report: steps, warnings } = finished.map_err(failed)?;
+            let Finished { product, linear, report: steps, warnings } = finished?;
             warnings.iter().for_each(|w| stage.warn(w));
 
             product.save(&parts)?;

@@ -25,6 +25,7 @@
 use super::trimap::{HEAD, UNKNOWN};
 use crate::geom::cofactors;
 use crate::image::{Gray, Photo};
+use crate::kernel::cg::{self, dot};
 
 /// How the opacity of the band is solved for.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -342,38 +343,24 @@ fn conjugate_gradients(
     x: &mut [f64],
     options: &ClosedFormOptions,
 ) -> Result<usize, Unsolved> {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let scale = dot(right, right).sqrt();
     if scale == 0.0 {
         x.fill(0.0); // no definite head beside the band: alpha 0 satisfies everything
         return Ok(0);
     }
     let factor = matrix.factor();
-    let n = x.len();
-    let (mut r, mut z, mut p, mut ap) = (vec![0.0; n], vec![0.0; n], vec![0.0; n], vec![0.0; n]);
-    matrix.times(x, &mut ap);
-    (0..n).for_each(|i| r[i] = right[i] - ap[i]);
-    let mut rz = 0.0;
-    for round in 0..=options.rounds {
-        let residual = dot(&r, &r).sqrt() / scale;
-        if residual <= options.tolerance {
-            return Ok(round);
-        }
-        if round == options.rounds || !residual.is_finite() {
-            return Err(Unsolved::Rounds { rounds: round, residual, tolerance: options.tolerance });
-        }
-        factor.solve(&r, &mut z);
-        let before = std::mem::replace(&mut rz, dot(&r, &z));
-        let beta = if round == 0 { 0.0 } else { rz / before };
-        (0..n).for_each(|i| p[i] = z[i] + beta * p[i]);
-        matrix.times(&p, &mut ap);
-        let step = rz / dot(&p, &ap);
-        for i in 0..n {
-            x[i] += step * p[i];
-            r[i] -= step * ap[i];
-        }
-    }
-    unreachable!("the last round returns")
+    let mut start = vec![0.0; x.len()];
+    matrix.times(x, &mut start);
+    start.iter_mut().zip(right).for_each(|(s, right)| *s = right - *s);
+    let (mut residual, tolerance) = (f64::INFINITY, options.tolerance);
+    let done = |round: usize, r: &[f64]| {
+        residual = dot(r, r).sqrt() / scale;
+        residual <= tolerance || round == options.rounds || !residual.is_finite()
+    };
+    let (times, solve) =
+        (|p: &[f64], ap: &mut [f64]| matrix.times(p, ap), |r: &[f64], z: &mut [f64]| factor.solve(r, z));
+    let rounds = cg::conjugate_gradients(x, start, times, solve, done);
+    if residual <= tolerance { Ok(rounds) } else { Err(Unsolved::Rounds { rounds, residual, tolerance }) }
 }
 
 #[cfg(test)]

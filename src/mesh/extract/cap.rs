@@ -35,9 +35,14 @@ pub struct Skin {
 }
 
 impl Cap {
+    /// A cap without a ring, to ask where it lies.
+    pub(super) fn bare(bounds: Aabb, cell: f32) -> Cap {
+        Cap { bounds, near: cell / 256.0, ring: Vec::new() }
+    }
+
     /// The cap of a mesh extracted within `bounds` with cells of `cell`, if it has one.
     pub fn of(mesh: &Mesh, bounds: Aabb, cell: f32) -> Option<Cap> {
-        let cap = Cap { bounds, near: cell / 256.0, ring: Vec::new() };
+        let cap = Cap::bare(bounds, cell);
         let capped: Vec<bool> = mesh.positions.iter().map(|&p| cap.holds(p)).collect();
         let mut on_ring = vec![false; mesh.positions.len()];
         let mut any = false;
@@ -131,7 +136,7 @@ impl Cap {
 mod tests {
     use super::*;
     use crate::Quiet;
-    use crate::mesh::{MeshConfig, extract};
+    use crate::mesh::{ExtractOptions, extract};
 
     /// A column through the floor of the scene's box, red to the left and green to the right.
     fn column() -> (Mesh, Cap) {
@@ -146,7 +151,7 @@ mod tests {
             |p, _| p.iter().map(|p| if p.x < 0.0 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] }).collect(),
             Aabb::SCENE,
             None,
-            &MeshConfig { resolution: 48, ..MeshConfig::default() },
+            &ExtractOptions { resolution: 48, ..ExtractOptions::default() },
             &Quiet,
         )
         .unwrap();

@@ -6,7 +6,7 @@
 
 use super::holes::fill_holes;
 use crate::geom::{Mesh, Sets, fans, sorted_sides};
-use crate::mesh::MeshError;
+use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
@@ -49,19 +49,15 @@ pub struct CleanReport {
 ///
 /// # Errors
 ///
-/// [`MeshError::NothingKept`] when no piece has a volume.
-pub fn clean(mesh: &mut Mesh, keep_share: f64) -> Result<CleanReport, MeshError> {
+/// No piece has a volume.
+pub fn clean(mesh: &mut Mesh, keep_share: f64) -> Result<CleanReport> {
     let mut report = CleanReport::default();
     drop_faces(mesh, &mut report);
     split_fans(mesh, &mut report);
     (report.filled_holes, report.filled_triangles) = fill_holes(mesh);
 
     // Pieces in order of their lowest vertex.
-    let mut sets = Sets::new(mesh.positions.len());
-    for t in &mesh.triangles {
-        sets.join(t[0], t[1]);
-        sets.join(t[0], t[2]);
-    }
+    let mut sets = Sets::of_pieces(mesh.positions.len(), &mesh.triangles);
     let mut number = vec![u32::MAX; mesh.positions.len()];
     let mut pieces: Vec<Piece> = Vec::new();
     let center = mesh.bounds().center().as_dvec3();
@@ -80,10 +76,13 @@ pub fn clean(mesh: &mut Mesh, keep_share: f64) -> Result<CleanReport, MeshError>
     }
     report.pieces = pieces.len();
 
-    let Some(largest) =
-        (0..pieces.len()).max_by(|&a, &b| pieces[a].volume.abs().total_cmp(&pieces[b].volume.abs()))
-    else {
-        return Err(MeshError::NothingKept { pieces: 0 });
+    let largest =
+        (0..pieces.len()).max_by(|&a, &b| pieces[a].volume.abs().total_cmp(&pieces[b].volume.abs()));
+    let Some(largest) = largest.filter(|&i| pieces[i].volume.abs() > 0.0) else {
+        let count = pieces.len();
+        let message =
+            format!("cleaning removed every one of the {count} pieces: none encloses a positive volume");
+        return Err(Error::cannot(message, "the field may be inverted: negative must be inside"));
     };
     if pieces[largest].volume < 0.0 {
         // A hollow is smaller than what it is in, so the largest volume tells which way is out.
@@ -93,9 +92,6 @@ pub fn clean(mesh: &mut Mesh, keep_share: f64) -> Result<CleanReport, MeshError>
         pieces.iter_mut().for_each(|p| p.volume = -p.volume);
     }
     let size = pieces[largest].volume;
-    if size.is_nan() || size <= 0.0 {
-        return Err(MeshError::NothingKept { pieces: pieces.len() });
-    }
 
     let mut keep = vec![false; pieces.len()];
     let mut by_size: Vec<usize> = (0..pieces.len()).collect();
@@ -366,6 +362,7 @@ mod tests {
             triangles: vec![[0, 1, 2]],
             ..Mesh::default()
         };
-        assert!(matches!(clean(&mut flat, 1.0), Err(MeshError::NothingKept { pieces: 1 })));
+        let error = clean(&mut flat, 1.0).unwrap_err().to_string();
+        assert!(error.contains("every one of the 1 pieces"), "{error}");
     }
 }

@@ -16,11 +16,9 @@
 //! next best is taken, and without any the handle stays and is counted.
 
 use super::holes::least_area;
-use super::loops::{Loop, Loops};
-use crate::geom::intersect;
-use crate::geom::{Aabb, Bvh, Mesh, Sets};
-use crate::geom::{Boxes, Effort, Span};
-use crate::mesh::MeshError;
+use super::loops::{Loop, LoopFinder};
+use crate::geom::{Aabb, Boxes, Bvh, DBox, Effort, Mesh, area_vector, intersect, topology};
+use crate::{Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -40,9 +38,9 @@ const TURN: f64 = 0.3;
 /// What became of a surface's handles. Lengths are of loops, in units of the positions.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct HandleReport {
-    /// Loops around matter that was cut.
+    /// LoopFinder around matter that was cut.
     pub cut: Vec<f32>,
-    /// Loops around holes that were filled.
+    /// LoopFinder around holes that were filled.
     pub filled: Vec<f32>,
     /// Handles that stayed.
     pub left: usize,
@@ -79,26 +77,26 @@ impl HandleReport {
 ///
 /// # Errors
 ///
-/// Those of `sdf`; [`MeshError::Stopped`] when `stop` says so.
+/// Those of `sdf`, and a request to stop.
 pub(super) fn cut_handles(
     mesh: &mut Mesh,
     longest: f32,
-    sdf: &dyn Fn(&[Vec3]) -> Result<Vec<f32>, MeshError>,
-    stop: &dyn Fn() -> bool,
-) -> Result<HandleReport, MeshError> {
+    sdf: &dyn Fn(&[Vec3]) -> Result<Vec<f32>>,
+    monitor: &dyn Monitor,
+) -> Result<HandleReport> {
     let mut report = HandleReport::default();
-    while has_handles(mesh) {
-        let Some(loops) = Loops::new(&mesh.positions, &mesh.triangles) else { break };
-        let found = loops.short(longest, stop).ok_or(MeshError::Stopped)?;
+    while topology(&mesh.positions, &mesh.triangles).genus.is_some_and(|handles| handles > 0) {
+        let Some(loops) = LoopFinder::new(&mesh.positions, &mesh.triangles) else { break };
+        let found = loops.short(longest, monitor)?;
         let discs = by_field(discs(&loops, found), |v| loops.place(v), sdf)?;
-        let mut work = Work::new(mesh, &loops);
+        let mut work = Surgery::new(mesh, &loops);
         for disc in &discs {
             if let Some(cut) = work.along(disc) {
                 let lengths = if cut { &mut report.cut } else { &mut report.filled };
                 lengths.push(disc.rim.length);
             }
         }
-        let Work { next, basis, .. } = work;
+        let Surgery { next, basis, .. } = work;
         if basis.is_empty() {
             let shortest = discs.iter().map(|d| d.rim.length).min_by(f32::total_cmp);
             report.left_length = shortest.or_else(|| loops.some_length());
@@ -110,17 +108,6 @@ pub(super) fn cut_handles(
     Ok(report)
 }
 
-/// `2 · pieces − V + E − F` of a closed surface is twice its handles; of an open one it is something.
-fn has_handles(mesh: &Mesh) -> bool {
-    let mut sets = Sets::new(mesh.positions.len());
-    for t in &mesh.triangles {
-        sets.join(t[0], t[1]);
-        sets.join(t[0], t[2]);
-    }
-    let pieces = (0..mesh.positions.len() as u32).filter(|&v| sets.find(v) == v).count();
-    4 * pieces + mesh.triangles.len() != 2 * mesh.positions.len()
-}
-
 /// A loop and what could close it.
 struct Disc {
     rim: Loop,
@@ -129,7 +116,7 @@ struct Disc {
 }
 
 /// A disc for each loop that has one, each loop once.
-fn discs(loops: &Loops, found: Vec<Loop>) -> Vec<Disc> {
+fn discs(loops: &LoopFinder, found: Vec<Loop>) -> Vec<Disc> {
     let mut seen = BTreeSet::new();
     let disc = |rim: Loop| {
         let mut key = rim.vertices.clone();
@@ -156,8 +143,8 @@ fn discs(loops: &Loops, found: Vec<Loop>) -> Vec<Disc> {
 fn by_field(
     discs: Vec<Disc>,
     place: impl Fn(u32) -> Vec3,
-    sdf: &dyn Fn(&[Vec3]) -> Result<Vec<f32>, MeshError>,
-) -> Result<Vec<Disc>, MeshError> {
+    sdf: &dyn Fn(&[Vec3]) -> Result<Vec<f32>>,
+) -> Result<Vec<Disc>> {
     let (mut middles, mut areas) = (Vec::new(), Vec::new());
     for disc in &discs {
         for t in &disc.triangles {
@@ -175,9 +162,9 @@ fn by_field(
 }
 
 /// A surface on which several loops are cut, none of which touches another.
-struct Work<'a> {
+struct Surgery<'a> {
     mesh: &'a Mesh,
-    loops: &'a Loops<'a>,
+    loops: &'a LoopFinder<'a>,
     boxes: Boxes,
     next: Mesh,
     /// Triangles of `mesh` that are no longer what they were.
@@ -189,7 +176,7 @@ struct Work<'a> {
 }
 
 /// What a cut does to the mesh.
-struct Cut {
+struct CutPlan {
     /// Where vertices go, the copies included.
     moved: HashMap<u32, Vec3>,
     /// Triangles at the rims, with the copies on the right.
@@ -197,9 +184,9 @@ struct Cut {
     caps: Vec<[u32; 3]>,
 }
 
-impl<'a> Work<'a> {
-    fn new(mesh: &'a Mesh, loops: &'a Loops<'a>) -> Work<'a> {
-        Work {
+impl<'a> Surgery<'a> {
+    fn new(mesh: &'a Mesh, loops: &'a LoopFinder<'a>) -> Surgery<'a> {
+        Surgery {
             mesh,
             loops,
             boxes: Boxes::new((0..mesh.triangles.len() as u32).map(|t| span(mesh.corners(t)))),
@@ -242,7 +229,7 @@ impl<'a> Work<'a> {
         Some(out.dot(apart) > 0.0)
     }
 
-    fn cut(&self, disc: &Disc, share: f32) -> Option<Cut> {
+    fn cut(&self, disc: &Disc, share: f32) -> Option<CutPlan> {
         let (loops, rim) = (self.loops, &disc.rim.vertices);
         let (n, copies) = (rim.len(), self.next.positions.len() as u32);
         let mut moved = HashMap::new();
@@ -268,11 +255,11 @@ impl<'a> Work<'a> {
         }
         let left = disc.triangles.iter().map(|&[a, b, c]| [rim[a], rim[c], rim[b]]);
         let right = disc.triangles.iter().map(|t| t.map(|i| copies + i as u32));
-        Some(Cut { moved, at_rims, caps: left.chain(right).collect() })
+        Some(CutPlan { moved, at_rims, caps: left.chain(right).collect() })
     }
 
     /// Is no triangle turned over, flat, or in the way of another?
-    fn fits(&self, cut: &Cut) -> bool {
+    fn fits(&self, cut: &CutPlan) -> bool {
         let corners = |t: [u32; 3]| {
             t.map(|v| cut.moved.get(&v).copied().unwrap_or_else(|| self.next.positions[v as usize]))
         };
@@ -311,12 +298,8 @@ impl<'a> Work<'a> {
     }
 }
 
-fn span(corners: [Vec3; 3]) -> Span {
-    Span::around(corners.map(Vec3::as_dvec3))
-}
-
-fn area_vector([a, b, c]: [Vec3; 3]) -> Vec3 {
-    (b - a).cross(c - a)
+fn span(corners: [Vec3; 3]) -> DBox {
+    DBox::around(corners.map(Vec3::as_dvec3))
 }
 
 /// The triangles that close what was cut: part of the surface, although the field is not zero there.

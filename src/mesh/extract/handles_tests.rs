@@ -1,6 +1,6 @@
 //! Handles of known fields, through the whole extraction.
 
-use super::{MeshConfig, MeshReport, Patches, extract};
+use super::{ExtractOptions, MeshReport, Patches, extract};
 use crate::Quiet;
 use crate::geom::{Aabb, Mesh, topology};
 use crate::mesh::files::check;
@@ -13,7 +13,7 @@ fn mesh_of(f: impl Fn(Vec3) -> f32 + Sync, longest_handle: f32) -> (Mesh, MeshRe
 }
 
 fn mesh_at(resolution: usize, f: impl Fn(Vec3) -> f32 + Sync, longest_handle: f32) -> (Mesh, MeshReport) {
-    let config = MeshConfig { resolution, longest_handle, ..MeshConfig::default() };
+    let config = ExtractOptions { resolution, longest_handle, ..ExtractOptions::default() };
     let slope = |p: Vec3| slope(&f, p);
     extract(
         |p| p.iter().map(|&p| f(p)).collect(),

@@ -12,6 +12,8 @@
 //! The words have 64 bits: two classes are taken for one by an accident of 1 in 10¹⁹, and then a handle stays.
 
 use crate::geom::{Sets, sorted_sides};
+use crate::kernel::rng::mix;
+use crate::{Monitor, Result};
 use glam::Vec3;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
@@ -38,7 +40,7 @@ pub(super) struct Loop {
 
 /// A closed manifold and how its loops are told apart. Corner `3 t + k` stands for the side from vertex k to
 /// k + 1 of triangle t.
-pub(super) struct Loops<'a> {
+pub(super) struct LoopFinder<'a> {
     positions: &'a [Vec3],
     triangles: &'a [[u32; 3]],
     /// The same side from the other triangle.
@@ -51,9 +53,9 @@ pub(super) struct Loops<'a> {
     seeds: Vec<u32>,
 }
 
-impl<'a> Loops<'a> {
+impl<'a> LoopFinder<'a> {
     /// `None` for a surface that is not closed or wound inconsistently; every vertex must have one fan.
-    pub(super) fn new(positions: &'a [Vec3], triangles: &'a [[u32; 3]]) -> Option<Loops<'a>> {
+    pub(super) fn new(positions: &'a [Vec3], triangles: &'a [[u32; 3]]) -> Option<LoopFinder<'a>> {
         let mut twin = vec![NONE; 3 * triangles.len()];
         let start = |c: u32| triangles[c as usize / 3][c as usize % 3];
         for run in sorted_sides(triangles).chunk_by(|a, b| a.0 == b.0) {
@@ -68,7 +70,7 @@ impl<'a> Loops<'a> {
             first[start(c) as usize] = c;
         }
         let word = vec![0; twin.len()];
-        let mut loops = Loops { positions, triangles, twin, first, word, seeds: Vec::new() };
+        let mut loops = LoopFinder { positions, triangles, twin, first, word, seeds: Vec::new() };
         loops.tell_apart();
         Some(loops)
     }
@@ -149,7 +151,7 @@ impl<'a> Loops<'a> {
             }
         }
         for (i, &seed) in self.seeds.iter().enumerate() {
-            let word = scrambled(i as u64 + 1);
+            let word = mix((i as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
             let mut cross = |c: u32| {
                 self.word[c as usize] ^= word;
                 self.word[self.twin[c as usize] as usize] ^= word;
@@ -166,8 +168,7 @@ impl<'a> Loops<'a> {
     }
 
     /// Loops up to a length that do not separate the surface, some for every class found, in no useful order.
-    /// `None` when `stop` says so.
-    pub(super) fn short(&self, longest: f32, stop: &dyn Fn() -> bool) -> Option<Vec<Loop>> {
+    pub(super) fn short(&self, longest: f32, monitor: &dyn Monitor) -> Result<Vec<Loop>> {
         // from places a quarter of the length apart, as far as any short loop through that quarter goes
         let apart = 0.25 * longest;
         let mut ball = Ball::new(self);
@@ -178,9 +179,7 @@ impl<'a> Loops<'a> {
             if self.word[side as usize] == 0 || covered[from as usize] {
                 continue;
             }
-            if stop() {
-                return None;
-            }
+            monitor.check_stop()?;
             ball.grow(from, 0.5 * longest + apart);
             for &v in &ball.reached {
                 covered[v as usize] |= ball.distance[v as usize] <= apart;
@@ -199,9 +198,7 @@ impl<'a> Loops<'a> {
         for mut tight in classes {
             let mut found = Vec::new();
             for _ in 0..PULLS {
-                if stop() {
-                    return None;
-                }
+                monitor.check_stop()?;
                 let reach = 0.51 * tight.length.min(longest * 1.5);
                 let step = tight.vertices.len().div_ceil(TRIES);
                 found.clear();
@@ -219,7 +216,7 @@ impl<'a> Loops<'a> {
             found.push(tight);
             out.extend(found.into_iter().filter(|l| l.length <= longest));
         }
-        Some(out)
+        Ok(out)
     }
 
     /// Length of a loop that does not separate the surface: no longer one than the shortest through a few
@@ -238,7 +235,7 @@ impl<'a> Loops<'a> {
 
 /// Shortest paths from one vertex, as far as some distance (Dijkstra 1959).
 struct Ball<'a> {
-    loops: &'a Loops<'a>,
+    loops: &'a LoopFinder<'a>,
     distance: Vec<f32>,
     /// The word of the path to each vertex.
     word: Vec<u64>,
@@ -248,7 +245,7 @@ struct Ball<'a> {
 }
 
 impl<'a> Ball<'a> {
-    fn new(loops: &'a Loops<'a>) -> Ball<'a> {
+    fn new(loops: &'a LoopFinder<'a>) -> Ball<'a> {
         let n = loops.positions.len();
         Ball {
             loops,
@@ -335,12 +332,4 @@ impl<'a> Ball<'a> {
         let length = (0..vertices.len()).map(|i| place(i).distance(place(i + 1))).sum();
         Loop { vertices, length, class }
     }
-}
-
-/// SplitMix64 (Steele, Lea, Flood 2014): words that look random, the same every time.
-fn scrambled(i: u64) -> u64 {
-    let mut z = i.wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
 }

@@ -10,7 +10,8 @@
 
 use super::marching_bits::{Bits, crossings, for_each_active};
 use super::marching_cell::{CASES, CellSurface, INNER, crossing, resolve};
-use crate::mesh::MeshError;
+use crate::mesh::input::few_enough;
+use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -30,7 +31,7 @@ pub struct Volume<'a> {
 
 /// A level set as triangles, counter-clockwise seen from outside.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Surface {
+pub struct LevelSet {
     /// Vertices: first one for each crossed grid edge, then those inside cells.
     pub positions: Vec<Vec3>,
     /// Three vertex indices each.
@@ -50,15 +51,20 @@ pub struct Surface {
 ///
 /// # Errors
 ///
-/// [`MeshError::Volume`] when `dims` and `values` disagree or an axis has fewer than two nodes;
-/// [`MeshError::TooLarge`] when vertices or triangles do not fit 32-bit indices.
-pub fn marching(volume: &Volume, closed: bool) -> Result<Surface, MeshError> {
+/// Disagreeing `dims` and `values`, an axis with fewer than two nodes, more vertices or triangles than 32-bit indices
+/// can name.
+pub fn marching(volume: &Volume, closed: bool) -> Result<LevelSet> {
     let nodes = volume.dims.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
     if volume.dims.iter().any(|&d| d < 2) || nodes != Some(volume.values.len()) {
-        return Err(MeshError::Volume { dims: volume.dims, values: volume.values.len() });
+        let ([x, y, z], values) = (volume.dims, volume.values.len());
+        let needed = x.saturating_mul(y).saturating_mul(z);
+        let message = format!(
+            "a volume of {x} × {y} × {z} nodes needs {needed} values (and two nodes along each axis), but has {values}"
+        );
+        return Err(Error::cannot(message, "values are stored x fastest, then y, then z"));
     }
     let (mut bits, all_finite) = Bits::scan(volume.values, volume.dims);
-    let mut out = Surface::default();
+    let mut out = LevelSet::default();
     let mut values = Cow::Borrowed(volume.values);
     if !all_finite {
         values = Cow::Owned(repair(volume, &mut out));
@@ -74,9 +80,9 @@ pub fn marching(volume: &Volume, closed: bool) -> Result<Surface, MeshError> {
 
 /// Where the vertex of a crossed edge lies: on the edge that leaves `node` along `axis`, at `t` cells.
 pub(super) fn edge_point(origin: Vec3, spacing: Vec3, node: [usize; 3], axis: usize, t: f64) -> Vec3 {
-    let mut cell = DVec3::new(node[0] as f64, node[1] as f64, node[2] as f64);
-    cell[axis] += t;
-    (origin.as_dvec3() + cell * spacing.as_dvec3()).as_vec3()
+    let mut at = [0.0; 3];
+    at[axis] = t;
+    cell_point(origin, spacing, node, at)
 }
 
 /// Where an inner vertex of a cell lies.
@@ -90,29 +96,38 @@ pub(super) fn sided(value: f32, inside: bool) -> f32 {
     if inside { value } else { value.max(0.0) }
 }
 
-/// Finite stand-ins: the sign as documented, the size that of the largest finite neighbour (1 without
-/// any). One value per node, not per cell, so that cells agree on their common edges.
-fn repair(volume: &Volume, out: &mut Surface) -> Vec<f32> {
-    let [nx, ny, nz] = volume.dims;
+/// Finite stand-ins: the sign as documented, the size that of the largest finite neighbour. One value per node, not
+/// per cell, so that cells agree on their common edges.
+fn repair(volume: &Volume, out: &mut LevelSet) -> Vec<f32> {
+    let [nx, ny, _] = volume.dims;
     let mut values = volume.values.to_vec();
     for (i, &v) in volume.values.iter().enumerate().filter(|(_, v)| !v.is_finite()) {
         let node = [i % nx, i / nx % ny, i / nx / ny];
         out.non_finite += 1;
         out.first_non_finite.get_or_insert(node);
-        let around = |at: usize, n: usize| at.saturating_sub(1)..(at + 2).min(n);
-        let mut size = 0.0f32;
-        for z in around(node[2], nz) {
-            for y in around(node[1], ny) {
-                for x in around(node[0], nx) {
-                    let near = volume.values[(z * ny + y) * nx + x].abs();
-                    size = if near.is_finite() { size.max(near) } else { size };
-                }
-            }
-        }
-        let size = if size > 0.0 { size } else { 1.0 };
+        let size = largest_neighbour(node, volume.dims, |[x, y, z]| volume.values[(z * ny + y) * nx + x]);
         values[i] = if v == f32::NEG_INFINITY { -size } else { size };
     }
     values
+}
+
+/// The size of the largest finite value among a node and its 26 neighbours; 1 without any.
+pub(super) fn largest_neighbour(
+    node: [usize; 3],
+    dims: [usize; 3],
+    value: impl Fn([usize; 3]) -> f32,
+) -> f32 {
+    let around = |axis: usize| node[axis].saturating_sub(1)..(node[axis] + 2).min(dims[axis]);
+    let mut size = 0.0f32;
+    for z in around(2) {
+        for y in around(1) {
+            for x in around(0) {
+                let near = value([x, y, z]).abs();
+                size = if near.is_finite() { size.max(near) } else { size };
+            }
+        }
+    }
+    if size > 0.0 { size } else { 1.0 }
 }
 
 struct Passes<'a> {
@@ -132,7 +147,7 @@ struct Plane {
 }
 
 impl Passes<'_> {
-    fn run(&self, out: &mut Surface) -> Result<(), MeshError> {
+    fn run(&self, out: &mut LevelSet) -> Result<()> {
         let [_, ny, nz] = self.dims;
         // Vertices before each row's x, y and z edges, counted from the start of its plane.
         let mut rows = vec![[0u32; 3]; ny * nz];
@@ -147,9 +162,7 @@ impl Passes<'_> {
             total.inner += p.inner;
             total.triangles += p.triangles;
         }
-        if total.vertices + total.inner > u64::from(u32::MAX) || total.triangles > u64::from(u32::MAX) {
-            return Err(MeshError::TooLarge { vertices: total.vertices + total.inner });
-        }
+        few_enough(total.vertices + total.inner, total.triangles)?;
         rows.par_chunks_mut(ny).zip(&starts).for_each(|(rows, start)| {
             rows.iter_mut().flatten().for_each(|r| *r += start.vertices as u32);
         });

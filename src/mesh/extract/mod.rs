@@ -16,13 +16,13 @@ mod verify;
 pub use cap::{Cap, Skin};
 pub use clean::{CleanReport, clean};
 pub use handles::{HandleReport, Patches};
-pub use marching::{Surface, Volume, marching};
-pub use sparse::{Asking, Grid, Sparse, sparse};
+pub use marching::{LevelSet, Volume, marching};
+pub use sparse::{NodeGrid, Sparse, sparse};
 pub use verify::Verified;
 
-use super::MeshError;
-use crate::Monitor;
+use super::input::{answered, evaluate, setting};
 use crate::geom::{Aabb, Mesh, Topology, topology};
+use crate::{Error, Monitor, Result};
 use glam::Vec3;
 use handles::cut_handles;
 use polish::Polish;
@@ -31,9 +31,8 @@ use std::time::Instant;
 use verify::dense_triangles;
 
 /// How the surface is extracted.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct MeshConfig {
+#[derive(Clone, Debug, PartialEq)]
+pub struct ExtractOptions {
     /// Cells along the longest side of the box; 2..=8192.
     pub resolution: usize,
     /// Every how many cells the field is asked first: 2, 4 or 8. Smaller finds smaller loose pieces.
@@ -58,9 +57,9 @@ pub struct MeshConfig {
 /// is a strand or a hole as thick as a thumb. A share, since not every capture knows its unit.
 pub const LONGEST_HANDLE: f32 = 0.15;
 
-impl Default for MeshConfig {
-    fn default() -> MeshConfig {
-        MeshConfig {
+impl Default for ExtractOptions {
+    fn default() -> ExtractOptions {
+        ExtractOptions {
             resolution: 512,
             coarse_step: 8,
             batch: 1 << 16,
@@ -73,32 +72,15 @@ impl Default for MeshConfig {
     }
 }
 
-impl MeshConfig {
-    /// Every value in its range, else [`MeshError::Config`] that names the key.
-    pub fn check(&self) -> Result<(), MeshError> {
-        let bad = |key, expected, found: String| Err(MeshError::Config { key, expected, found });
-        if !(2..=8192).contains(&self.resolution) {
-            return bad("resolution", "2..=8192", self.resolution.to_string());
-        }
-        if ![2, 4, 8].contains(&self.coarse_step) {
-            return bad("coarse_step", "2, 4 or 8", self.coarse_step.to_string());
-        }
-        if self.batch == 0 {
-            return bad("batch", "at least 1", self.batch.to_string());
-        }
-        if !(0.0..=1.0).contains(&self.keep_share) {
-            return bad("keep_share", "0..=1", self.keep_share.to_string());
-        }
-        if self.newton_steps > 8 {
-            return bad("newton_steps", "0..=8", self.newton_steps.to_string());
-        }
-        if !(0.0..=1.0).contains(&self.relax) {
-            return bad("relax", "0..=1", self.relax.to_string());
-        }
-        if !(0.0..=1.0).contains(&self.longest_handle) {
-            return bad("longest_handle", "0..=1", self.longest_handle.to_string());
-        }
-        Ok(())
+impl ExtractOptions {
+    /// The ranges that no later step looks at.
+    fn check(&self) -> Result<()> {
+        let share = 0.0..=1.0;
+        setting(self.batch > 0, "batch", "at least 1", self.batch)?;
+        setting((0.0..=1.0).contains(&self.keep_share), "keep_share", "0..=1", self.keep_share)?;
+        setting(self.newton_steps <= 8, "newton_steps", "0..=8", self.newton_steps)?;
+        setting(share.contains(&self.relax), "relax", "0..=1", self.relax)?;
+        setting(share.contains(&self.longest_handle), "longest_handle", "0..=1", self.longest_handle)
     }
 }
 
@@ -179,45 +161,42 @@ impl MeshReport {
 
 /// Meshes the zero level set of `sdf` (negative inside) within `bounds`.
 ///
-/// All closures get points of the same space as `bounds`, at most `config.batch` a call, from one
-/// thread. `sdf_gradient` answers values and gradients; `color` answers sRGB-coded colours for points
-/// with unit normals. Points for which `inside_hull` is false count as outside without being asked.
+/// All closures get points of the same space as `bounds`, at most `options.batch` a call, from one
+/// thread. `sdf_gradient` returns values and gradients; `color` returns sRGB-coded colors for points
+/// with unit normals. Points for which `inside_hull` is false count as outside and are not evaluated.
 ///
 /// The mesh is closed (capped where the field leaves the box), its vertices moved onto the field's zero,
-/// its normals the field's gradient. Handles with a loop no longer than `config.longest_handle` are gone.
+/// its normals the field's gradient. Handles with a loop no longer than `options.longest_handle` are gone.
 ///
 /// # Errors
 ///
-/// A box or configuration out of range, a field without a surface ([`MeshError::AllOutside`],
-/// [`MeshError::AllInside`], [`MeshError::NoneFinite`]), answers of the wrong length, a request to stop.
+/// A box or option out of range, a field without a surface, answers of the wrong length, a request to stop.
 pub fn extract(
     sdf: impl Fn(&[Vec3]) -> Vec<f32> + Sync,
     sdf_gradient: impl Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync,
     color: impl Fn(&[Vec3], &[Vec3]) -> Vec<[f32; 3]> + Sync,
     bounds: Aabb,
     inside_hull: Option<&(dyn Fn(Vec3) -> bool + Sync)>,
-    config: &MeshConfig,
+    options: &ExtractOptions,
     monitor: &dyn Monitor,
-) -> Result<(Mesh, MeshReport), MeshError> {
+) -> Result<(Mesh, MeshReport)> {
     let begin = Instant::now();
-    config.check()?;
-    let grid = Grid::fit(bounds, config.resolution)?;
-    let steps = config.newton_steps as u64 + 4;
+    options.check()?;
+    let grid = NodeGrid::fit(bounds, options.resolution)?;
+    let steps = options.newton_steps as u64 + 4;
     let mut done = 0;
-    let mut tell = |values: &[(&str, f64)]| {
+    let mut progress = |values: &[(&str, f64)]| {
         done += 1;
         monitor.step(done, steps, values);
-        if monitor.stop() { Err(MeshError::Stopped) } else { Ok(()) }
+        monitor.check_stop()
     };
 
-    let outside = inside_hull.map(|inside| move |p: Vec3| !inside(p));
-    let outside = outside.as_ref().map(|o| o as &dyn Fn(Vec3) -> bool);
-    let asking = Asking { coarse_step: config.coarse_step, batch: config.batch };
-    let found = sparse(&sdf, outside, &grid, asking, &|| monitor.stop())?;
-    has_surface(&found)?;
-    let verified = match config.verify {
+    let inside_hull = inside_hull.map(|inside| inside as &dyn Fn(Vec3) -> bool);
+    let found = sparse(&sdf, inside_hull, &grid, options.coarse_step, options.batch, monitor)?;
+    check_surface(&found)?;
+    let verified = match options.verify {
         true => Some(Verified {
-            dense_triangles: dense_triangles(&sdf, outside, &grid, config.batch, &|| monitor.stop())?,
+            dense_triangles: dense_triangles(&sdf, inside_hull, &grid, options.batch, monitor)?,
             sparse_triangles: found.surface.triangles.len(),
         }),
         false => None,
@@ -237,31 +216,36 @@ pub fn extract(
     };
     let mut mesh =
         Mesh { positions: found.surface.positions, triangles: found.surface.triangles, ..Mesh::default() };
-    tell(&[("nodes", found.evaluated as f64), ("triangles", mesh.triangles.len() as f64)])?;
+    progress(&[("nodes", found.evaluated as f64), ("triangles", mesh.triangles.len() as f64)])?;
 
-    report.clean = clean(&mut mesh, config.keep_share)?;
-    tell(&[("pieces", report.clean.pieces as f64), ("triangles", mesh.triangles.len() as f64)])?;
+    report.clean = clean(&mut mesh, options.keep_share)?;
+    progress(&[("pieces", report.clean.pieces as f64), ("triangles", mesh.triangles.len() as f64)])?;
 
-    let capped: Vec<bool> = mesh.positions.iter().map(|&p| on_border(&grid, p)).collect();
-    let gradient = |points: &[Vec3]| answers(points, config.batch, &sdf_gradient);
+    let cap = Cap::bare(report.bounds(), grid.spacing);
+    let on_faces = |mesh: &Mesh| -> Vec<bool> { mesh.positions.iter().map(|&p| cap.holds(p)).collect() };
+    let capped = on_faces(&mesh);
+    let gradient = |points: &[Vec3]| evaluate(&sdf_gradient, points, options.batch, monitor);
     let polish = Polish::new(&mesh.positions, &mesh.triangles, 0.5 * grid.spacing, capped.clone());
     let (mut values, mut gradients) = gradient(&mesh.positions)?;
     report.off_surface_before = off_surface(&values, &gradients, &capped, grid.spacing);
-    for step in 0..config.newton_steps {
-        let relax = if step == 0 { config.relax } else { 0.0 };
+    for step in 0..options.newton_steps {
+        let relax = if step == 0 { options.relax } else { 0.0 };
         report.held_back += polish.step(&mut mesh.positions, &values, &gradients, relax);
         (values, gradients) = gradient(&mesh.positions)?;
-        tell(&[("held_back", report.held_back as f64)])?;
+        progress(&[("held_back", report.held_back as f64)])?;
     }
     report.off_surface_after = off_surface(&values, &gradients, &capped, grid.spacing);
 
-    let longest = config.longest_handle * mesh.bounds().size().max_element();
+    let longest = options.longest_handle * mesh.bounds().size().max_element();
     if longest > 0.0 {
-        let values = |points: &[Vec3]| values_at(points, config.batch, &sdf);
-        report.handles = cut_handles(&mut mesh, longest, &values, &|| monitor.stop())?;
+        let values = |points: &[Vec3]| {
+            let values: Vec<f32> = points.chunks(options.batch).flat_map(&sdf).collect();
+            answered("signed distance", points.len(), values.len()).map(|()| values)
+        };
+        report.handles = cut_handles(&mut mesh, longest, &values, monitor)?;
     }
     // vertices whose normal is not the field's slope
-    let mut edged: Vec<bool> = mesh.positions.iter().map(|&p| on_border(&grid, p)).collect();
+    let mut edged = on_faces(&mesh);
     if let Some(patches) = Patches::of(&mesh, &report.handles) {
         patches.corners().for_each(|v| edged[v as usize] = true);
         gradients = gradient(&mesh.positions)?.1;
@@ -274,86 +258,48 @@ pub fn extract(
             *normal = g.normalize();
         }
     }
-    mesh.colors = Vec::with_capacity(mesh.positions.len());
-    for (points, normals) in mesh.positions.chunks(config.batch).zip(mesh.normals.chunks(config.batch)) {
+    for (points, normals) in mesh.positions.chunks(options.batch).zip(mesh.normals.chunks(options.batch)) {
         let colors = color(points, normals);
-        if colors.len() != points.len() {
-            let (asked, answered) = (points.len(), colors.len());
-            return Err(MeshError::Answer { what: "color", asked, answered });
-        }
+        answered("color", points.len(), colors.len())?;
         let tame = |c: f32| if c.is_finite() { c.clamp(0.0, 1.0) } else { 0.0 };
         mesh.colors.extend(colors.iter().map(|c| c.map(tame)));
     }
-    tell(&[("vertices", mesh.positions.len() as f64)])?;
+    progress(&[("vertices", mesh.positions.len() as f64)])?;
 
     report.topology = topology(&mesh.positions, &mesh.triangles);
     report.handles.left = report.topology.genus.map_or(0, |g| g as usize);
     report.volume = mesh.signed_volume();
     report.seconds = begin.elapsed().as_secs_f64();
-    tell(&[("euler", report.topology.euler as f64)])?;
+    progress(&[("euler", report.topology.euler as f64)])?;
     Ok((mesh, report))
 }
 
-fn has_surface(found: &Sparse) -> Result<(), MeshError> {
+/// Refuses an extraction that met no surface.
+fn check_surface(found: &Sparse) -> Result<()> {
     let nodes = found.evaluated;
     let (smallest, largest) = found.range;
-    if smallest > largest {
-        // Nothing finite; but nothing asked either when the hull is empty.
-        return Err(if nodes > 0 {
-            MeshError::NoneFinite { nodes }
-        } else {
-            MeshError::AllOutside { nodes, smallest: f32::INFINITY }
-        });
+    let none =
+        |what: String, hint: &str| Err(Error::cannot(format!("no surface: the field is {what}"), hint));
+    if smallest > largest && nodes > 0 {
+        return none(
+            format!("NaN or infinite at all {nodes} nodes asked"),
+            "training diverged: resume `iface` from an earlier checkpoint",
+        );
     }
-    if largest < 0.0 && found.skipped == 0 && found.surface.non_finite == 0 {
-        return Err(MeshError::AllInside { nodes, largest });
+    if largest < 0.0 && found.skipped == 0 && found.surface.non_finite == 0 && nodes > 0 {
+        return none(
+            format!("negative at all {nodes} nodes asked (largest {largest:.3e}), everything is inside"),
+            "the field may be inverted (negative must be inside), untrained, or the box may lie within the head",
+        );
     }
+    // with an empty hull nothing is evaluated: then the smallest is infinite
     if found.surface.triangles.is_empty() {
-        return Err(MeshError::AllOutside { nodes, smallest });
+        return none(
+            format!("positive at all {nodes} nodes asked (smallest {smallest:.3e}), nothing is inside"),
+            "train `iface` longer, check that the box holds the head, or raise `mesh.resolution` for small pieces",
+        );
     }
     Ok(())
-}
-
-/// Cap vertices lie within a thousandth of a cell of the box.
-fn on_border(grid: &Grid, p: Vec3) -> bool {
-    let far = grid.point(grid.dims.map(|d| d - 1));
-    let near = grid.spacing / 256.0;
-    (p - grid.origin).min_element() < near || (far - p).min_element() < near
-}
-
-fn answers(
-    points: &[Vec3],
-    batch: usize,
-    field: &(impl Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync),
-) -> Result<(Vec<f32>, Vec<Vec3>), MeshError> {
-    let (mut values, mut gradients) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
-    for points in points.chunks(batch) {
-        let (f, g) = field(points);
-        if f.len() != points.len() || g.len() != points.len() {
-            let (asked, answered) = (points.len(), f.len().min(g.len()));
-            return Err(MeshError::Answer { what: "gradient", asked, answered });
-        }
-        values.extend(f);
-        gradients.extend(g);
-    }
-    Ok((values, gradients))
-}
-
-fn values_at(
-    points: &[Vec3],
-    batch: usize,
-    sdf: &(impl Fn(&[Vec3]) -> Vec<f32> + Sync),
-) -> Result<Vec<f32>, MeshError> {
-    let mut values = Vec::with_capacity(points.len());
-    for points in points.chunks(batch) {
-        values.extend(sdf(points));
-    }
-    match (points.len(), values.len()) {
-        (asked, answered) if asked != answered => {
-            Err(MeshError::Answer { what: "signed distance", asked, answered })
-        }
-        _ => Ok(values),
-    }
 }
 
 /// Mean first-order distance to the surface, in cells, over vertices that are not capped.
@@ -374,7 +320,7 @@ mod tests {
     use super::*;
     use crate::Quiet;
 
-    fn mesh_of(f: impl Fn(Vec3) -> f32 + Sync, config: &MeshConfig) -> Result<(Mesh, MeshReport), MeshError> {
+    fn mesh_of(f: impl Fn(Vec3) -> f32 + Sync, config: &ExtractOptions) -> Result<(Mesh, MeshReport)> {
         let gradient = |p: Vec3| {
             let d = |e: Vec3| (f(p + 1e-3 * e) - f(p - 1e-3 * e)) / 2e-3;
             Vec3::new(d(Vec3::X), d(Vec3::Y), d(Vec3::Z))
@@ -390,8 +336,8 @@ mod tests {
         )
     }
 
-    fn coarse() -> MeshConfig {
-        MeshConfig { resolution: 48, ..MeshConfig::default() }
+    fn coarse() -> ExtractOptions {
+        ExtractOptions { resolution: 48, ..ExtractOptions::default() }
     }
 
     #[test]
@@ -412,7 +358,7 @@ mod tests {
 
     #[test]
     fn moving_leaves_no_slivers_and_turns_no_face() {
-        let plain = MeshConfig { newton_steps: 0, ..coarse() };
+        let plain = ExtractOptions { newton_steps: 0, ..coarse() };
         let slivers = |m: &Mesh| {
             let poor = (0..m.triangles.len() as u32).filter(|&t| {
                 let [a, b, c] = m.corners(t);
@@ -460,21 +406,21 @@ mod tests {
     fn a_field_without_a_surface_is_a_named_error_with_a_way_out() {
         let err = |f: fn(Vec3) -> f32| mesh_of(f, &coarse()).unwrap_err();
         let all = [
-            (err(|_| 1.0), "AllOutside"),
-            (err(|p| p.length() - 9.0), "AllInside"),
-            (err(|_| f32::NAN), "NoneFinite"),
-            (err(|_| f32::INFINITY), "NoneFinite"),
-            (err(|_| -0.0), "AllOutside"),
+            (err(|_| 1.0), "nothing is inside"),
+            (err(|p| p.length() - 9.0), "everything is inside"),
+            (err(|_| f32::NAN), "NaN or infinite"),
+            (err(|_| f32::INFINITY), "NaN or infinite"),
+            (err(|_| -0.0), "nothing is inside"),
         ];
         for (e, name) in all {
-            assert!(format!("{e:?}").starts_with(name), "{e:?} is not {name}");
-            assert!(e.hint().is_some());
+            assert!(e.to_string().contains(name), "{e} is not {name}");
+            assert!(!e.hint().is_empty());
         }
     }
 
     #[test]
     fn a_bad_configuration_names_its_key() {
-        let bad = MeshConfig { keep_share: 2.0, ..coarse() };
+        let bad = ExtractOptions { keep_share: 2.0, ..coarse() };
         assert!(mesh_of(|p| p.length() - 0.5, &bad).unwrap_err().to_string().contains("keep_share"));
     }
 }

@@ -5,14 +5,10 @@
 //! surface towards the middle of its neighbours, which turns the slivers of marching cubes into fair
 //! triangles at no further evaluation.
 
+use crate::geom::{area_vector, shape};
+use crate::mesh::moves::{move_vertices, newton};
 use glam::Vec3;
 use rayon::prelude::*;
-
-/// Shape of a triangle, 1 for equilateral, 0 for none: `4 √3 area / Σ length²`.
-fn quality(a: Vec3, b: Vec3, c: Vec3) -> f32 {
-    let sum = (b - a).length_squared() + (c - b).length_squared() + (a - c).length_squared();
-    if sum > 0.0 { 2.0 * 3f32.sqrt() * (b - a).cross(c - a).length() / sum } else { 0.0 }
-}
 
 /// Below this shape a face counts as spoiled, unless it was no better before.
 const POOR: f32 = 0.02;
@@ -38,7 +34,7 @@ impl<'a> Polish<'a> {
         reach: f32,
         fixed: Vec<bool>,
     ) -> Polish<'a> {
-        let facing = triangles.par_iter().map(|t| area_vector(positions, t)).collect();
+        let facing = triangles.par_iter().map(|t| area_vector(t.map(|v| positions[v as usize]))).collect();
         Polish { triangles, start: positions.to_vec(), facing, reach, fixed }
     }
 
@@ -47,7 +43,7 @@ impl<'a> Polish<'a> {
     /// undone; how many vertices that held back.
     pub(super) fn step(
         &self,
-        positions: &mut Vec<Vec3>,
+        positions: &mut [Vec3],
         values: &[f32],
         gradients: &[Vec3],
         relax: f32,
@@ -56,14 +52,10 @@ impl<'a> Polish<'a> {
         let targets: Vec<Vec3> = (0..positions.len())
             .into_par_iter()
             .map(|i| {
-                let (p, f, g) = (positions[i], values[i], gradients[i]);
-                let slope = g.length_squared();
-                if self.fixed[i] || !f.is_finite() || !slope.is_finite() || slope < 1e-12 {
-                    return p;
-                }
-                let mut step = -f / slope * g;
+                let (p, g) = (positions[i], gradients[i]);
+                let Some(mut step) = newton(values[i], g).filter(|_| !self.fixed[i]) else { return p };
                 if let Some(&middle) = middles.get(i) {
-                    let normal = g / slope.sqrt();
+                    let normal = g / g.length_squared().sqrt();
                     step = step.clamp_length_max(self.reach)
                         + relax * (middle - p).reject_from_normalized(normal);
                 }
@@ -71,7 +63,14 @@ impl<'a> Polish<'a> {
                 if moved.is_finite() { moved } else { p }
             })
             .collect();
-        self.go(positions, &targets)
+        let at = |i: usize, p: Vec3, share: f32| p + share * (targets[i] - p);
+        let spoiled = |t: usize, from: &[Vec3], to: &[Vec3]| {
+            let [was, is] = [from, to].map(|p| self.triangles[t].map(|v| p[v as usize]));
+            let now = area_vector(is);
+            let turned = now.dot(self.facing[t]) <= TURN * now.length() * self.facing[t].length();
+            turned || (shape(is) < POOR && shape(is) < shape(was))
+        };
+        move_vertices(positions, self.triangles, at, spoiled)
     }
 
     /// Mean of each vertex's neighbours.
@@ -87,50 +86,6 @@ impl<'a> Polish<'a> {
         }
         sums.iter().zip(positions).map(|(&(s, n), &p)| if n > 0.0 { s / n } else { p }).collect()
     }
-
-    /// Moves towards the targets: all the way, half, a quarter, or not at all where a face forbids it.
-    fn go(&self, positions: &mut Vec<Vec3>, targets: &[Vec3]) -> usize {
-        const SHARES: [f32; 4] = [0.0, 0.25, 0.5, 1.0];
-        let from = positions.clone();
-        let mut share = vec![3u8; from.len()];
-        loop {
-            positions.par_iter_mut().enumerate().for_each(|(i, p)| {
-                *p = from[i] + SHARES[share[i] as usize] * (targets[i] - from[i]);
-            });
-            let bad: Vec<usize> = (0..self.triangles.len())
-                .into_par_iter()
-                .filter(|&t| self.is_spoiled(t, &from, positions))
-                .collect();
-            let mut corners: Vec<u32> =
-                bad.iter().flat_map(|&t| self.triangles[t]).filter(|&v| share[v as usize] > 0).collect();
-            // Faces that were spoiled from the start stay so without anyone to hold back.
-            if corners.is_empty() {
-                break;
-            }
-            corners.sort_unstable();
-            corners.dedup();
-            corners.iter().for_each(|&v| share[v as usize] -= 1);
-        }
-        share.iter().filter(|&&s| s < 3).count()
-    }
-
-    fn is_spoiled(&self, t: usize, from: &[Vec3], to: &[Vec3]) -> bool {
-        let tri = &self.triangles[t];
-        if tri.iter().all(|&v| from[v as usize] == to[v as usize]) {
-            return false;
-        }
-        let now = area_vector(to, tri);
-        let turned = now.dot(self.facing[t]) <= TURN * now.length() * self.facing[t].length();
-        let [a, b, c] = tri.map(|v| to[v as usize]);
-        let shape = quality(a, b, c);
-        let [a, b, c] = tri.map(|v| from[v as usize]);
-        turned || (shape < POOR && shape < quality(a, b, c))
-    }
-}
-
-fn area_vector(positions: &[Vec3], t: &[u32; 3]) -> Vec3 {
-    let [a, b, c] = t.map(|v| positions[v as usize]);
-    (b - a).cross(c - a)
 }
 
 #[cfg(test)]
@@ -176,7 +131,7 @@ mod tests {
         let g = p.clone();
         assert_eq!(polish.step(&mut p, &f, &g, 0.0), 5);
         assert_eq!(p[2], Vec3::Z);
-        assert!(t.iter().all(|t| area_vector(&p, t).dot(p[t[0] as usize]) > 0.0));
+        assert!(t.iter().all(|t| area_vector(t.map(|v| p[v as usize])).dot(p[t[0] as usize]) > 0.0));
     }
 
     #[test]

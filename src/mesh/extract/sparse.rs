@@ -11,18 +11,19 @@
 //!
 //! A piece that lies between coarse nodes and whose neighbours' values do not betray it is missed: take
 //! a finer coarse step for that. Nodes on the outer faces of the grid count as outside; so do nodes for
-//! which `outside` says so, without asking the field. Waves of a flood that starts everywhere are few
+//! outside the hull, without asking the field. Waves of a flood that starts everywhere are few
 //! and large, so that the field is asked thousands of points at a time.
 
-use super::marching::Surface;
+use super::marching::LevelSet;
 use super::sparse_blocks::Blocks;
 use crate::geom::Aabb;
-use crate::mesh::MeshError;
+use crate::mesh::input::{answered, setting};
+use crate::{Error, Monitor, Result};
 use glam::{DVec3, Vec3};
 
 /// Cubic cells over a box.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Grid {
+pub struct NodeGrid {
     /// Nodes along x, y, z.
     pub dims: [usize; 3],
     /// Node (0, 0, 0).
@@ -31,33 +32,28 @@ pub struct Grid {
     pub spacing: f32,
 }
 
-impl Grid {
+impl NodeGrid {
     /// `resolution` cells along the longest side; along the others as many as cover the box, the
     /// surplus split between both ends.
     ///
     /// # Errors
     ///
-    /// [`MeshError::Bounds`] for an empty or unbounded box, [`MeshError::Config`] for a resolution
-    /// outside 2..=8192.
-    pub fn fit(bounds: Aabb, resolution: usize) -> Result<Grid, MeshError> {
+    /// An empty or unbounded box, a resolution outside 2..=8192.
+    pub fn fit(bounds: Aabb, resolution: usize) -> Result<NodeGrid> {
         let size = bounds.size();
         if bounds.is_empty() || !size.is_finite() || !bounds.center().is_finite() || size.min_element() <= 0.0
         {
-            return Err(MeshError::Bounds { min: bounds.min, max: bounds.max });
+            let Aabb { min, max } = bounds;
+            let message = format!("the box to mesh in, {min} to {max}, is empty or not finite");
+            return Err(Error::cannot(message, "check the scene box of the capture"));
         }
-        if !(2..=8192).contains(&resolution) {
-            return Err(MeshError::Config {
-                key: "resolution",
-                expected: "2..=8192",
-                found: resolution.to_string(),
-            });
-        }
+        setting((2..=8192).contains(&resolution), "resolution", "2..=8192", resolution)?;
         let spacing = size.max_element() / resolution as f32;
         // A side a rounding error longer than n cells is n cells long.
         let cells = size.to_array().map(|s| ((s / spacing - 1e-3).ceil() as usize).max(2));
         let half = DVec3::from(cells.map(|c| 0.5 * c as f64 * f64::from(spacing)));
         let origin = (bounds.center().as_dvec3() - half).as_vec3();
-        Ok(Grid { dims: cells.map(|c| c + 1), origin, spacing })
+        Ok(NodeGrid { dims: cells.map(|c| c + 1), origin, spacing })
     }
 
     /// Where a node lies.
@@ -76,26 +72,11 @@ impl Grid {
     }
 }
 
-/// How to ask.
-#[derive(Clone, Copy, Debug)]
-pub struct Asking {
-    /// Distance of the first nodes asked: 2, 4 or 8 cells.
-    pub coarse_step: usize,
-    /// Most points in one call of the field.
-    pub batch: usize,
-}
-
-impl Default for Asking {
-    fn default() -> Asking {
-        Asking { coarse_step: 8, batch: 1 << 16 }
-    }
-}
-
 /// A surface and what it cost.
 #[derive(Clone, Debug, Default)]
 pub struct Sparse {
     /// The closed surface; empty when no piece was met.
-    pub surface: Surface,
+    pub surface: LevelSet,
     /// Nodes the field was asked for.
     pub evaluated: usize,
     /// Nodes that counted as outside without being asked.
@@ -106,35 +87,32 @@ pub struct Sparse {
     pub range: (f32, f32),
 }
 
-/// The zero level set of `field` over `grid`, closed at its borders. `field` gets at most
-/// `asking.batch` points a call and is called from one thread: it may well use all of them.
+/// The zero level set of `field` over `grid`, closed at its borders.
+///
+/// The first nodes evaluated lie `coarse_step` cells apart. `field` gets at most `batch` points a call and is called
+/// from one thread: it may well use all of them. Nodes for which `inside_hull` is false count as outside.
 ///
 /// # Errors
 ///
-/// [`MeshError::Answer`] when the field returns the wrong number of values, [`MeshError::Config`] for a
-/// coarse step other than 2, 4, 8, [`MeshError::TooLarge`], [`MeshError::Stopped`] when `stop` says so
-/// between batches.
+/// A field that returns the wrong number of values, a coarse step other than 2, 4, 8, more vertices than 32-bit
+/// indices can name, a request to stop, which is looked for between batches.
 pub fn sparse(
     field: &dyn Fn(&[Vec3]) -> Vec<f32>,
-    outside: Option<&dyn Fn(Vec3) -> bool>,
-    grid: &Grid,
-    asking: Asking,
-    stop: &dyn Fn() -> bool,
-) -> Result<Sparse, MeshError> {
-    if ![2, 4, 8].contains(&asking.coarse_step) {
-        return Err(MeshError::Config {
-            key: "coarse_step",
-            expected: "2, 4 or 8",
-            found: asking.coarse_step.to_string(),
-        });
-    }
-    let lattice = grid.dims.map(|d| (d - 1) / asking.coarse_step + 1);
+    inside_hull: Option<&dyn Fn(Vec3) -> bool>,
+    grid: &NodeGrid,
+    coarse_step: usize,
+    batch: usize,
+    monitor: &dyn Monitor,
+) -> Result<Sparse> {
+    setting([2, 4, 8].contains(&coarse_step), "coarse_step", "2, 4 or 8", coarse_step)?;
+    let lattice = grid.dims.map(|d| (d - 1) / coarse_step + 1);
     let mut flood = Flood {
         field,
-        outside,
+        inside_hull,
         grid: *grid,
-        asking,
-        stop,
+        coarse_step,
+        batch,
+        monitor,
         lattice,
         coarse: vec![f32::NAN; lattice.iter().product()],
         blocks: Blocks::new(grid.dims),
@@ -155,7 +133,7 @@ pub fn sparse(
 
 /// A run of nodes along `axis` from one that is on one side of the surface to one on the other.
 #[derive(Clone, Copy)]
-struct Span {
+struct NodeRun {
     start: [usize; 3],
     axis: usize,
     /// Ends as coordinates along the axis, `low < high`.
@@ -167,10 +145,11 @@ struct Span {
 
 struct Flood<'a> {
     field: &'a dyn Fn(&[Vec3]) -> Vec<f32>,
-    outside: Option<&'a dyn Fn(Vec3) -> bool>,
-    grid: Grid,
-    asking: Asking,
-    stop: &'a dyn Fn() -> bool,
+    inside_hull: Option<&'a dyn Fn(Vec3) -> bool>,
+    grid: NodeGrid,
+    coarse_step: usize,
+    batch: usize,
+    monitor: &'a dyn Monitor,
     lattice: [usize; 3],
     /// `[z, y, x]` over the lattice: NaN where not asked (border) or not a number: outside.
     coarse: Vec<f32>,
@@ -184,28 +163,18 @@ struct Flood<'a> {
 
 impl Flood<'_> {
     /// Values at nodes, outside ones without asking. Order as given.
-    fn ask(&mut self, nodes: &[[usize; 3]]) -> Result<Vec<f32>, MeshError> {
+    fn ask(&mut self, nodes: &[[usize; 3]]) -> Result<Vec<f32>> {
         let mut values = Vec::with_capacity(nodes.len());
-        for nodes in nodes.chunks(self.asking.batch.max(1)) {
-            if (self.stop)() {
-                return Err(MeshError::Stopped);
-            }
+        for nodes in nodes.chunks(self.batch.max(1)) {
+            self.monitor.check_stop()?;
             let points: Vec<Vec3> = nodes.iter().map(|&n| self.grid.point(n)).collect();
             // One cell is a fair guess of how far outside a skipped node is.
             let mut batch = vec![self.grid.spacing; points.len()];
-            let keep: Vec<usize> = match self.outside {
-                Some(outside) => (0..points.len()).filter(|&i| !outside(points[i])).collect(),
-                None => (0..points.len()).collect(),
-            };
+            let inside = |p: Vec3| self.inside_hull.is_none_or(|inside| inside(p));
+            let keep: Vec<usize> = (0..points.len()).filter(|&i| inside(points[i])).collect();
             let asked: Vec<Vec3> = keep.iter().map(|&i| points[i]).collect();
             let answer = if asked.is_empty() { Vec::new() } else { (self.field)(&asked) };
-            if answer.len() != asked.len() {
-                return Err(MeshError::Answer {
-                    what: "signed distance",
-                    asked: asked.len(),
-                    answered: answer.len(),
-                });
-            }
+            answered("signed distance", asked.len(), answer.len())?;
             for (&i, &v) in keep.iter().zip(&answer) {
                 batch[i] = v;
                 if v.is_finite() {
@@ -229,8 +198,8 @@ impl Flood<'_> {
         (0..nz).flat_map(move |z| (0..ny).flat_map(move |y| (0..nx).map(move |x| [x, y, z])))
     }
 
-    fn ask_coarse(&mut self) -> Result<(), MeshError> {
-        let step = self.asking.coarse_step;
+    fn ask_coarse(&mut self) -> Result<()> {
+        let step = self.coarse_step;
         let nodes: Vec<[usize; 3]> =
             self.lattice_points().map(|l| l.map(|c| c * step)).filter(|&n| !self.grid.on_border(n)).collect();
         let values = self.ask(&nodes)?;
@@ -265,8 +234,8 @@ impl Flood<'_> {
         self.coarse[self.lattice_index(at)] < 0.0
     }
 
-    fn coarse_crossings(&self) -> Vec<Span> {
-        let step = self.asking.coarse_step;
+    fn coarse_crossings(&self) -> Vec<NodeRun> {
+        let step = self.coarse_step;
         let mut spans = Vec::new();
         for l in self.lattice_points() {
             let low_inside = self.coarse_inside(l);
@@ -279,7 +248,7 @@ impl Flood<'_> {
                 let low = l[axis] * step;
                 let high = if last { self.grid.dims[axis] - 1 } else { low + step };
                 if low_inside != high_inside && high > low {
-                    spans.push(Span { start: l.map(|c| c * step), axis, low, high, low_inside });
+                    spans.push(NodeRun { start: l.map(|c| c * step), axis, low, high, low_inside });
                 }
             }
         }
@@ -287,8 +256,8 @@ impl Flood<'_> {
     }
 
     /// Halves all spans until their ends are neighbours, the ends' values known.
-    fn bisect(&mut self, mut spans: Vec<Span>) -> Result<(), MeshError> {
-        let at = |s: &Span, c: usize| {
+    fn bisect(&mut self, mut spans: Vec<NodeRun>) -> Result<()> {
+        let at = |s: &NodeRun, c: usize| {
             let mut n = s.start;
             n[s.axis] = c;
             n
@@ -301,7 +270,7 @@ impl Flood<'_> {
         }
         self.settle()?;
         while !spans.is_empty() {
-            let middle = |s: &Span| s.low.midpoint(s.high);
+            let middle = |s: &NodeRun| s.low.midpoint(s.high);
             spans.retain(|s| s.high - s.low > 1);
             for s in &spans {
                 self.want(at(s, middle(s)));
@@ -321,7 +290,7 @@ impl Flood<'_> {
 
     /// The lattice's value of a node, where it has been asked.
     fn lattice_value(&self, node: [usize; 3]) -> Option<f32> {
-        let step = self.asking.coarse_step;
+        let step = self.coarse_step;
         (node.iter().all(|c| c % step == 0) && !self.grid.on_border(node))
             .then(|| self.coarse[self.lattice_index(node.map(|c| c / step))])
     }
@@ -334,7 +303,7 @@ impl Flood<'_> {
     }
 
     /// Evaluates what is wanted and queues the cells around every edge found crossed.
-    fn settle(&mut self) -> Result<(), MeshError> {
+    fn settle(&mut self) -> Result<()> {
         let nodes = std::mem::take(&mut self.wanted);
         let (old, new): (Vec<_>, Vec<_>) = nodes.iter().partition(|&&n| self.lattice_value(n).is_some());
         for &n in &old {
@@ -387,7 +356,7 @@ impl Flood<'_> {
     }
 
     /// Floods until no crossed edge has a cell that was not evaluated.
-    fn spread(&mut self) -> Result<(), MeshError> {
+    fn spread(&mut self) -> Result<()> {
         while !self.cells.is_empty() {
             for cell in std::mem::take(&mut self.cells) {
                 for c in 0..8 {
@@ -400,8 +369,8 @@ impl Flood<'_> {
     }
 
     /// Looks for pieces between coarse nodes of one sign.
-    fn probe(&mut self) -> Result<(), MeshError> {
-        let step = self.asking.coarse_step;
+    fn probe(&mut self) -> Result<()> {
+        let step = self.coarse_step;
         let reach =
             |cells: usize| 0.5 * 3f32.sqrt() * cells as f32 * self.grid.spacing * self.out.gradient_norm;
         let (whole, half) = (reach(step), step / 2);
@@ -454,7 +423,7 @@ impl Flood<'_> {
                 if self.blocks.inside(a) != self.blocks.inside(b) {
                     // The walk goes towards the lower corner: b is the low end.
                     let low_inside = self.blocks.inside(b);
-                    spans.push(Span { start: a, axis, low: b[axis], high: a[axis], low_inside });
+                    spans.push(NodeRun { start: a, axis, low: b[axis], high: a[axis], low_inside });
                 }
             }
         }
@@ -466,19 +435,16 @@ impl Flood<'_> {
 mod tests {
     use super::*;
     use crate::mesh::{Volume, marching};
-
-    fn never() -> bool {
-        false
-    }
+    use crate::monitor::{Quiet, Stopping};
 
     fn ball(center: Vec3, radius: f32) -> impl Fn(Vec3) -> f32 {
         move |p| p.distance(center) - radius
     }
 
-    fn both(field: impl Fn(Vec3) -> f32, bounds: Aabb, resolution: usize) -> (Sparse, Surface) {
-        let grid = Grid::fit(bounds, resolution).unwrap();
+    fn both(field: impl Fn(Vec3) -> f32, bounds: Aabb, resolution: usize) -> (Sparse, LevelSet) {
+        let grid = NodeGrid::fit(bounds, resolution).unwrap();
         let ask = |p: &[Vec3]| p.iter().map(|&p| field(p)).collect::<Vec<_>>();
-        let few = sparse(&ask, None, &grid, Asking::default(), &never).unwrap();
+        let few = sparse(&ask, None, &grid, 8, 1 << 16, &Quiet).unwrap();
         let mut values = Vec::new();
         for k in 0..grid.dims[2] {
             for j in 0..grid.dims[1] {
@@ -495,7 +461,7 @@ mod tests {
     }
 
     /// The triangles as sorted positions: equal for equal surfaces, however numbered.
-    fn key(s: &Surface) -> Vec<[[u32; 3]; 3]> {
+    fn key(s: &LevelSet) -> Vec<[[u32; 3]; 3]> {
         let mut all: Vec<_> = s
             .triangles
             .iter()
@@ -514,9 +480,9 @@ mod tests {
     fn the_grid_covers_a_long_box_with_cubes() {
         // 2 × 1 × 0.5 at 8 cells along x: h = 0.25, 8 × 4 × 2 cells.
         let b = Aabb { min: Vec3::ZERO, max: Vec3::new(2.0, 1.0, 0.5) };
-        let g = Grid::fit(b, 8).unwrap();
+        let g = NodeGrid::fit(b, 8).unwrap();
         assert_eq!((g.dims, g.spacing, g.origin), ([9, 5, 3], 0.25, Vec3::ZERO));
-        assert!(Grid::fit(Aabb::EMPTY, 8).is_err() && Grid::fit(b, 1).is_err());
+        assert!(NodeGrid::fit(Aabb::EMPTY, 8).is_err() && NodeGrid::fit(b, 1).is_err());
     }
 
     #[test]
@@ -566,14 +532,14 @@ mod tests {
 
     #[test]
     fn a_skipped_half_is_never_asked_and_the_rest_is_closed_there() {
-        let grid = Grid::fit(Aabb::SCENE, 48).unwrap();
+        let grid = NodeGrid::fit(Aabb::SCENE, 48).unwrap();
         let field = ball(Vec3::ZERO, 0.6);
         let ask = |p: &[Vec3]| {
             assert!(p.iter().all(|p| p.x <= 0.1));
             p.iter().map(|&p| field(p)).collect::<Vec<_>>()
         };
-        let outside = |p: Vec3| p.x > 0.1;
-        let s = sparse(&ask, Some(&outside), &grid, Asking::default(), &never).unwrap();
+        let inside = |p: Vec3| p.x <= 0.1;
+        let s = sparse(&ask, Some(&inside), &grid, 8, 1 << 16, &Quiet).unwrap();
         let mesh = crate::geom::Mesh {
             positions: s.surface.positions,
             triangles: s.surface.triangles,
@@ -585,13 +551,11 @@ mod tests {
 
     #[test]
     fn a_stop_and_a_short_answer_are_errors() {
-        let grid = Grid::fit(Aabb::SCENE, 16).unwrap();
+        let grid = NodeGrid::fit(Aabb::SCENE, 16).unwrap();
         let ask = |p: &[Vec3]| vec![1.0; p.len()];
-        assert!(matches!(sparse(&ask, None, &grid, Asking::default(), &|| true), Err(MeshError::Stopped)));
+        assert!(sparse(&ask, None, &grid, 8, 64, &Stopping).unwrap_err().kind().is_stop());
         let short = |p: &[Vec3]| vec![1.0; p.len() - 1];
-        assert!(matches!(
-            sparse(&short, None, &grid, Asking::default(), &never),
-            Err(MeshError::Answer { .. })
-        ));
+        let error = sparse(&short, None, &grid, 8, 1 << 16, &Quiet).unwrap_err().to_string();
+        assert!(error.contains("asked at 1 points and answered 0"), "{error}");
     }
 }

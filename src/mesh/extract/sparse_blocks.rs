@@ -5,10 +5,11 @@
 //! vertex on a block's border has one owner and one index: the block's first plus a count of bits before
 //! it. Nothing is merged by distance.
 
-use super::marching::{Surface, cell_point, edge_point, sided};
+use super::marching::{LevelSet, cell_point, edge_point, largest_neighbour, sided};
 use super::marching_cell::{CASES, CellSurface, EDGES, INNER, crossed, crossing, resolve};
-use super::sparse::Grid;
-use crate::mesh::MeshError;
+use super::sparse::NodeGrid;
+use crate::Result;
+use crate::mesh::input::few_enough;
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -139,27 +140,18 @@ impl Blocks {
     }
 
     /// As in the dense volume: the size of the largest finite known neighbour, 1 without any.
-    fn repair(&mut self, out: &mut Surface) {
+    fn repair(&mut self, out: &mut LevelSet) {
         let mut nodes = std::mem::take(&mut self.non_finite);
         nodes.sort_unstable_by_key(|n| [n[2], n[1], n[0]]);
         out.non_finite = nodes.len();
         out.first_non_finite = nodes.first().copied();
         let sizes: Vec<f32> = nodes
             .iter()
-            .map(|n| {
-                let around = |a: usize| n[a].saturating_sub(1)..(n[a] + 2).min(self.dims[a]);
-                let mut size = 0.0f32;
-                for z in around(2) {
-                    for y in around(1) {
-                        for x in around(0) {
-                            let near = self.value([x, y, z]).abs();
-                            if near.is_finite() && self.known([x, y, z]).is_some() {
-                                size = size.max(near);
-                            }
-                        }
-                    }
-                }
-                if size > 0.0 { size } else { 1.0 }
+            .map(|&n| {
+                largest_neighbour(n, self.dims, |m| match self.known(m) {
+                    Some(_) => self.value(m),
+                    None => f32::NAN,
+                })
             })
             .collect();
         for (&n, size) in nodes.iter().zip(sizes) {
@@ -170,8 +162,8 @@ impl Blocks {
     }
 
     /// The closed surface through all evaluated cells, blocks in order of z, y, x.
-    pub(super) fn surface(&mut self, grid: &Grid) -> Result<Surface, MeshError> {
-        let mut out = Surface::default();
+    pub(super) fn surface(&mut self, grid: &NodeGrid) -> Result<LevelSet> {
+        let mut out = LevelSet::default();
         self.repair(&mut out);
         // Blocks in grid order, whatever order the flood met them in.
         let order: Vec<usize> = self.directory.iter().filter(|&&b| b != NONE).map(|&b| b as usize).collect();
@@ -188,9 +180,7 @@ impl Blocks {
         let counted: Vec<(u64, u64)> = order.par_iter().map(|&b| self.count(&self.blocks[b])).collect();
         let inner: u64 = counted.iter().map(|c| c.0).sum();
         let triangles: u64 = counted.iter().map(|c| c.1).sum();
-        if total + inner > u64::from(u32::MAX) || triangles > u64::from(u32::MAX) {
-            return Err(MeshError::TooLarge { vertices: total + inner });
-        }
+        few_enough(total + inner, triangles)?;
 
         out.positions = vec![Vec3::ZERO; (total + inner) as usize];
         out.triangles = vec![[0; 3]; triangles as usize];
@@ -305,7 +295,7 @@ impl Blocks {
         (inner, triangles)
     }
 
-    fn place(&self, b: usize, owner: &Owner, grid: &Grid, vertices: &mut [Vec3]) {
+    fn place(&self, b: usize, owner: &Owner, grid: &NodeGrid, vertices: &mut [Vec3]) {
         let block = &self.blocks[b];
         let next = [0, 1, 2].map(|axis| self.after(block, axis));
         let mut at = 0;
@@ -336,7 +326,7 @@ impl Blocks {
         b: usize,
         owners: &[Owner],
         firsts: &[u32],
-        grid: &Grid,
+        grid: &NodeGrid,
         mut next_inner: u32,
         mut inner: &mut [Vec3],
         triangles: &mut [[u32; 3]],

@@ -1,8 +1,8 @@
 //! Did the sparse extraction lose anything? The dense grid knows.
 
 use super::marching::{Volume, marching};
-use super::sparse::Grid;
-use crate::mesh::MeshError;
+use super::sparse::NodeGrid;
+use crate::{Monitor, Result};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
@@ -18,32 +18,23 @@ pub struct Verified {
 /// Evaluates every node of `grid` and counts the triangles of its surface. Needs four bytes a node.
 pub(super) fn dense_triangles(
     sdf: &dyn Fn(&[Vec3]) -> Vec<f32>,
-    outside: Option<&dyn Fn(Vec3) -> bool>,
-    grid: &Grid,
+    inside_hull: Option<&dyn Fn(Vec3) -> bool>,
+    grid: &NodeGrid,
     batch: usize,
-    stop: &dyn Fn() -> bool,
-) -> Result<usize, MeshError> {
+    monitor: &dyn Monitor,
+) -> Result<usize> {
     let [nx, ny, _] = grid.dims;
     let mut values = vec![grid.spacing; grid.nodes()];
-    let node = |i: usize| grid.point([i % nx, i / nx % ny, i / (nx * ny)]);
-    let mut points = Vec::with_capacity(batch);
-    let mut places = Vec::with_capacity(batch);
-    for i in 0..values.len() {
-        let p = node(i);
-        if outside.is_none_or(|outside| !outside(p)) {
-            points.push(p);
-            places.push(i);
+    let mut nodes = (0..values.len())
+        .map(|i| (i, grid.point([i % nx, i / nx % ny, i / (nx * ny)])))
+        .filter(|&(_, p)| inside_hull.is_none_or(|inside| inside(p)));
+    loop {
+        monitor.check_stop()?;
+        let (places, points): (Vec<usize>, Vec<Vec3>) = nodes.by_ref().take(batch).unzip();
+        if points.is_empty() {
+            break;
         }
-        if points.len() == batch || i + 1 == values.len() {
-            if stop() {
-                return Err(MeshError::Stopped);
-            }
-            for (&place, f) in places.iter().zip(sdf(&points)) {
-                values[place] = f;
-            }
-            points.clear();
-            places.clear();
-        }
+        places.into_iter().zip(sdf(&points)).for_each(|(i, f)| values[i] = f);
     }
     let spacing = Vec3::splat(grid.spacing);
     let volume = Volume { dims: grid.dims, values: &values, origin: grid.point([0; 3]), spacing };
@@ -54,14 +45,14 @@ pub(super) fn dense_triangles(
 mod tests {
     use crate::Quiet;
     use crate::geom::Aabb;
-    use crate::mesh::{MeshConfig, extract};
+    use crate::mesh::{ExtractOptions, extract};
     use glam::Vec3;
 
     #[test]
     fn a_ball_has_the_same_triangles_either_way_and_a_lost_piece_shows() {
         let ball = |c: Vec3, r: f32| move |p: &Vec3| (*p - c).length() - r;
         let (big, small) = (ball(Vec3::ZERO, 0.6), ball(Vec3::splat(0.9), 0.009));
-        let config = MeshConfig { resolution: 128, verify: true, ..MeshConfig::default() };
+        let config = ExtractOptions { resolution: 128, verify: true, ..ExtractOptions::default() };
         let run = |sdf: &(dyn Fn(&Vec3) -> f32 + Sync)| {
             let values = |p: &[Vec3]| p.iter().map(sdf).collect::<Vec<f32>>();
             let gradient = |p: &[Vec3]| (values(p), p.iter().map(|p| p.normalize_or_zero()).collect());

@@ -11,7 +11,7 @@
 
 use super::uv_check::{UvReport, bound};
 use super::weld::places;
-use crate::geom::{Aabb, Boxes, EFFORT, Mesh, Sets, Span, intersect, share_out};
+use crate::geom::{Aabb, Boxes, DBox, EFFORT, Mesh, Sets, intersect, share_out};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -374,11 +374,11 @@ fn self_intersections(mesh: &Mesh, faces: &[([u32; 3], u32)]) -> (usize, usize) 
         }
         facets.push((mesh.corners(t).map(|p| p.as_dvec3()), ids));
     }
-    let boxes = Boxes::new(facets.iter().map(|f| Span::around(f.0)));
+    let boxes = Boxes::new(facets.iter().map(|f| DBox::around(f.0)));
     let shared = share_out(alone.len(), EFFORT, |i, effort| {
         let (own, mut meets) = (alone[i], false);
         let (p, ids) = facets[own];
-        boxes.meeting(&Span::around(p), effort, |other, effort| {
+        boxes.meeting(&DBox::around(p), effort, |other, effort| {
             let (q, other_ids) = facets[other as usize];
             if other as usize != own {
                 if !effort.spend(COMPARING) {

@@ -12,7 +12,7 @@
 //! Texels are square even where the texture is not: all of it is measured in texels.
 
 use super::weld::places;
-use crate::geom::{Atlas, EFFORT, Mesh, Sets, Side, nearest_charts, overlaps, shared_area, turn};
+use crate::geom::{Atlas, EFFORT, Mesh, OutlineSide, Sets, nearest_charts, overlaps, shared_area, turn};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -178,13 +178,13 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
     // a sum of nothing is −0
     report.overlap_px = shared.iter().fold(0.0, |sum, area| sum + area);
 
-    let sides: Vec<Side> = joined
+    let sides: Vec<OutlineSide> = joined
         .rims
         .iter()
         .map(|&corner| {
             let (t, k) = (corner as usize / 3, corner as usize % 3);
             let p = px(t);
-            Side { chart: joined.chart[t], from: p[k], to: p[(k + 1) % 3] }
+            OutlineSide { chart: joined.chart[t], from: p[k], to: p[(k + 1) % 3] }
         })
         .collect();
     let apart = nearest_charts(&sides, UvReport::FARTHEST_PX);

@@ -5,4 +5,4 @@ pub mod bake;
 mod simplify;
 
 pub use atlas::{AtlasConfig, AtlasReport, atlas};
-pub use simplify::{Placement, SimplifyConfig, SimplifyReport, simplify};
+pub use simplify::{SimplifyConfig, SimplifyReport, VertexPlacement, simplify};

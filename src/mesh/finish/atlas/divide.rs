@@ -8,14 +8,13 @@
 //! Divided as it is, a learned head gives hundreds of charts: a rough garment or the rim of a cap tilts single triangles
 //! away from the mean of their chart, and each of them costs a gutter and a seam.
 
-use super::Refusal;
 use super::flat::Flat;
 use super::library::{Flattened, STRETCHED, flatten};
 use super::patch::{NONE, neighbours, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
-use crate::Monitor;
 use crate::geom::{Mesh, THOROUGH, overlaps};
+use crate::{Monitor, Result};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -42,7 +41,7 @@ const STRETCH: f64 = 1.05;
 const SPLITS: usize = 3;
 
 /// Divides a mesh and lays it flat.
-pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<Flattened, Refusal> {
+pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<Flattened> {
     let beside = neighbours(mesh);
     let smooth = smoothed(mesh, SMOOTHING);
     let mut best = flatten(&smooth, None, STRETCHED, monitor)?;
@@ -136,7 +135,7 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &Flattened) -> Vec<u32> {
     let mut border: Vec<HashMap<u32, f64>> = vec![HashMap::new(); regions as usize];
     for (t, &own) in label.iter().enumerate() {
         let p = mesh.corners(t as u32).map(|p| p.as_dvec3());
-        area[own as usize] += 0.5 * (p[1] - p[0]).cross(p[2] - p[0]).length();
+        area[own as usize] += mesh.area(t as u32);
         for k in 0..3 {
             let n = beside[t][k];
             if n != NONE && label[n as usize] != own {

@@ -5,14 +5,13 @@
 //! flattened in one piece by a smooth copy, and relaxed to its true sizes; the rim is the plane's contour, short and
 //! out of the way. The rest is divided as any surface.
 
-use super::Refusal;
 use super::divide::divide;
 use super::library::{Flattened, STRETCHED, flatten};
-use super::patch::{NONE, area, neighbours, part, straighten, stretch};
+use super::patch::{NONE, neighbours, part, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
-use crate::Monitor;
 use crate::geom::Mesh;
+use crate::{Monitor, Result};
 use glam::Vec3;
 
 /// The deepest plane lies so far behind the foremost point, in parts of the mesh's depth; the others are closer by
@@ -39,7 +38,7 @@ const STRETCH: f64 = 1.05;
 const FACE_STRETCHED: f32 = 2.0 * STRETCHED;
 
 /// Divides a mesh, with its face in one chart if there is a way.
-pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<Flattened, Refusal> {
+pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<Flattened> {
     for inside in caps(mesh, front.normalize()).take(TRIES) {
         let (face, number) = part(mesh, |t| inside[t as usize]);
         let whole = vec![0; face.triangles.len()];
@@ -69,7 +68,7 @@ fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
             (a + b + c) / 3.0
         })
         .collect();
-    let areas: Vec<f64> = (0..count as u32).map(|t| area(mesh, t)).collect();
+    let areas: Vec<f64> = (0..count as u32).map(|t| mesh.area(t)).collect();
     let whole: f64 = areas.iter().sum();
     let foremost = (0..count).fold(0, |best, t| if depth[t] > depth[best] { t } else { best });
     let (high, low) = (depth[foremost], depth.iter().copied().fold(f32::INFINITY, f32::min));

@@ -1,12 +1,12 @@
 //! Flattening by the crate `uvunwrap`: least squares conformal maps (Lévy, Petitjean, Ray, Maillot 2002), halved
 //! until none folds.
 
-use super::Refusal;
 use super::flat::Flat;
-use crate::Monitor;
 use crate::geom::Mesh;
+use crate::{Error, Monitor, Result};
 use glam::DVec2;
 use std::collections::HashMap;
+use std::fmt::Display;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Degrees between a triangle and the mean of its chart. Lower than the library's own 70: rims come out straighter, so
@@ -17,6 +17,7 @@ const MOST_TILTED: f32 = 55.0;
 pub(super) const STRETCHED: f32 = 4.0;
 
 /// The charts of a mesh, and the triangles that got none because they have no area.
+#[derive(Default)]
 pub(super) struct Flattened {
     pub charts: Vec<Flat>,
     pub without: Vec<u32>,
@@ -39,20 +40,15 @@ pub(super) fn flatten(
     labels: Option<&[u32]>,
     most_stretched: f32,
     monitor: &dyn Monitor,
-) -> Result<Flattened, Refusal> {
+) -> Result<Flattened> {
     let (positions, indices, uvs) = divided(mesh, labels);
-    let area: f64 = (0..mesh.triangles.len() as u32)
-        .map(|t| {
-            let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
-            0.5 * (b - a).cross(c - a).length()
-        })
-        .sum();
+    let area: f64 = (0..mesh.triangles.len() as u32).map(|t| mesh.area(t)).sum();
     if !(area > 0.0 && area.is_finite()) {
-        return Err(Refusal::because("the mesh has no area"));
+        return Err(unusable("the mesh has no area"));
     }
     let texels_per_unit = (256.0 / area.sqrt()) as f32;
     if !(texels_per_unit > 0.0 && texels_per_unit.is_finite()) {
-        return Err(Refusal::because("the mesh is too large or too small for 32-bit texture coordinates"));
+        return Err(unusable("the mesh is too large or too small for 32-bit texture coordinates"));
     }
     let input = uvunwrap::MeshInput {
         existing_uvs: uvs.as_deref(),
@@ -70,13 +66,13 @@ pub(super) fn flatten(
     let call = || uvunwrap::generate_with_progress(&[input], &options, |_| !monitor.stop());
     let answer = match catch_unwind(AssertUnwindSafe(call)) {
         Ok(Ok(answer)) => answer,
-        Ok(Err(uvunwrap::Error::Cancelled)) => return Err(Refusal::Stopped),
-        Ok(Err(error)) => return Err(Refusal::Because(format!("uvunwrap: {error}"))),
-        Err(panic) => return Err(Refusal::Because(format!("uvunwrap panicked: {}", words(&*panic)))),
+        Ok(Err(uvunwrap::Error::Cancelled)) => return Err(Error::stopped("what is complete is kept")),
+        Ok(Err(error)) => return Err(unusable(format!("uvunwrap: {error}"))),
+        Err(panic) => return Err(unusable(format!("uvunwrap panicked: {}", words(&*panic)))),
     };
     let out = match &answer.meshes[..] {
         [one] if one.indices.len() == indices.len() => one,
-        _ => return Err(Refusal::because("uvunwrap answered with other triangles than it was given")),
+        _ => return Err(unusable("uvunwrap answered with other triangles than it was given")),
     };
     collect(out, DVec2::new(answer.width.into(), answer.height.into()) / f64::from(answer.texels_per_unit))
 }
@@ -103,7 +99,7 @@ fn divided(mesh: &Mesh, labels: Option<&[u32]>) -> (Vec<[f32; 3]>, Vec<u32>, Opt
     (positions, indices, Some(uvs))
 }
 
-fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<Flattened, Refusal> {
+fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<Flattened> {
     let mut charts: Vec<Flat> = Vec::new();
     let mut without = Vec::new();
     let mut number_of: HashMap<u32, u32> = HashMap::new();
@@ -111,7 +107,7 @@ fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<Flattened, Refusal
     for (t, corners) in out.indices.chunks_exact(3).enumerate() {
         let at = |k: usize| out.vertices.get(corners[k] as usize);
         let (Some(a), Some(b), Some(c)) = (at(0), at(1), at(2)) else {
-            return Err(Refusal::because("uvunwrap left a corner without coordinates"));
+            return Err(unusable("uvunwrap left a corner without coordinates"));
         };
         let chart = match a.chart {
             Some(chart) if b.chart == a.chart && c.chart == a.chart && a.uv != b.uv && b.uv != c.uv => chart,
@@ -130,7 +126,7 @@ fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<Flattened, Refusal
         for (k, vertex) in [a, b, c].into_iter().enumerate() {
             let point = DVec2::new(vertex.uv[0].into(), vertex.uv[1].into()) * page;
             if !point.is_finite() {
-                return Err(Refusal::because("uvunwrap gave a coordinate that is not finite"));
+                return Err(unusable("uvunwrap gave a coordinate that is not finite"));
             }
             let slot = &mut local[corners[k] as usize];
             if *slot == u32::MAX {
@@ -143,6 +139,11 @@ fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<Flattened, Refusal
         flat.corners.push(corner);
     }
     Ok(Flattened { charts, without })
+}
+
+/// Why there will be no charts.
+fn unusable(reason: impl Display) -> Error {
+    Error::cannot(reason, "")
 }
 
 fn words(panic: &(dyn std::any::Any + Send)) -> String {
@@ -184,6 +185,6 @@ mod tests {
         mesh.triangles.push([0, 0, 1]);
         assert_eq!(flatten(&mesh, None, STRETCHED, &Quiet).unwrap().without, [8]);
         mesh.triangles = vec![[0, 0, 1]];
-        assert!(matches!(flatten(&mesh, None, STRETCHED, &Quiet), Err(Refusal::Because(_))));
+        assert!(flatten(&mesh, None, STRETCHED, &Quiet).is_err());
     }
 }

@@ -1,7 +1,7 @@
 //! A texture atlas: the surface cut into charts, laid flat, and packed into a square.
 //!
 //! ```text
-//! take out the face → divide and flatten (uvunwrap) → mend → pack → check
+//! take out the face → divide and flatten (uvunwrap) → repair → pack → check
 //!                                └── fails → one half square a triangle
 //! ```
 //!
@@ -12,6 +12,7 @@ mod divide;
 mod face;
 mod flat;
 mod lay;
+mod layout;
 mod library;
 mod pack;
 mod patch;
@@ -21,53 +22,17 @@ mod relax;
 mod smooth;
 mod squares;
 
-use crate::Monitor;
+pub use layout::AtlasConfig;
+
 use crate::geom::{Atlas, Mesh};
-use crate::mesh::MeshError;
 use crate::mesh::files::{UvReport, seams_facing, uv_check};
-use glam::Vec3;
-use lay::Library;
-use serde::{Deserialize, Serialize};
-use squares::HalfSquares;
+use crate::mesh::input::sound;
+use crate::{Error, Monitor, Result};
+use lay::by_charts;
+use layout::{AtlasLayout, STEPS};
+use serde::Serialize;
+use squares::half_squares;
 use std::time::Instant;
-
-/// How a mesh is laid into its texture.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct AtlasConfig {
-    /// Texels across and down; 16..=16384.
-    pub size_px: u32,
-    /// Charts are at least twice this far from each other and from the border; 0..=256 and at most an eighth of
-    /// the texture.
-    pub gutter_px: u32,
-    /// Where the face looks, in the mesh's coordinates: what lies there becomes one chart, with seams around it
-    /// and none across. That costs stretch: the nose is laid flat with the cheeks.
-    pub front: Option<Vec3>,
-}
-
-impl Default for AtlasConfig {
-    fn default() -> AtlasConfig {
-        AtlasConfig { size_px: 2048, gutter_px: 8, front: None }
-    }
-}
-
-impl AtlasConfig {
-    /// Every value in its range, else [`MeshError::Config`] that names the key.
-    pub fn check(&self) -> Result<(), MeshError> {
-        let bad = |key, expected, found: String| Err(MeshError::Config { key, expected, found });
-        if !(16..=16384).contains(&self.size_px) {
-            return bad("size_px", "16..=16384", self.size_px.to_string());
-        }
-        if self.gutter_px > 256 || self.gutter_px > self.size_px / 8 {
-            let expected = "0..=256 and at most an eighth of the texture's side";
-            return bad("gutter_px", expected, self.gutter_px.to_string());
-        }
-        match self.front {
-            Some(v) if !v.is_finite() || v == Vec3::ZERO => bad("front", "a direction", v.to_string()),
-            _ => Ok(()),
-        }
-    }
-}
 
 /// How an atlas came about, and how good it is.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -106,76 +71,40 @@ impl AtlasReport {
     }
 }
 
-const STEPS: u64 = 4;
-
-/// A way to lay a mesh out.
-trait Unwrap {
-    /// Every triangle placed, none flipped, flat or covering another.
-    fn unwrap(&self, mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result<Laid, Refusal>;
-}
-
-/// An atlas that keeps what [`Unwrap`] promises.
-struct Laid {
-    atlas: Atlas,
-    mended: usize,
-    gutter_px: f64,
-}
-
-/// Why a way did not lead to an atlas.
-#[derive(Debug)]
-enum Refusal {
-    Stopped,
-    TooSmall,
-    Because(String),
-}
-
-impl Refusal {
-    fn because(reason: &str) -> Refusal {
-        Refusal::Because(reason.into())
-    }
-}
-
 /// Lays a mesh into a square texture. Meant for closed meshes of up to some 200,000 triangles; others work too.
 ///
 /// # Errors
 ///
 /// A configuration out of range; a mesh without triangles, with an index out of range or a vertex that is not
 /// finite; a texture too small for its triangles; a stop that the monitor asked for.
-pub fn atlas(
-    mesh: &Mesh,
-    config: &AtlasConfig,
-    monitor: &dyn Monitor,
-) -> Result<(Atlas, AtlasReport), MeshError> {
-    atlas_by(&Library, mesh, config, monitor)
+pub fn atlas(mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result<(Atlas, AtlasReport)> {
+    atlas_by(by_charts, mesh, config, monitor)
 }
 
 fn atlas_by(
-    first: &dyn Unwrap,
+    charts: impl Fn(&Mesh, &AtlasConfig, &dyn Monitor) -> Result<AtlasLayout>,
     mesh: &Mesh,
     config: &AtlasConfig,
     monitor: &dyn Monitor,
-) -> Result<(Atlas, AtlasReport), MeshError> {
+) -> Result<(Atlas, AtlasReport)> {
     let begin = Instant::now();
     config.check()?;
-    is_sound(mesh)?;
-    let (mut laid, mut fallback) = match first.unwrap(mesh, config, monitor) {
-        Ok(laid) => (Some(laid), None),
-        Err(Refusal::Stopped) => return Err(MeshError::Stopped),
-        Err(Refusal::TooSmall) => (None, Some("the charts do not fit into the texture".into())),
-        Err(Refusal::Because(reason)) => (None, Some(reason)),
+    if mesh.triangles.is_empty() {
+        return Err(Error::cannot("the mesh has no triangles", "check that `mesh` ended with a surface"));
+    }
+    sound(mesh)?;
+    let mut fallback = None;
+    let mut layout = match charts(mesh, config, monitor) {
+        Err(e) if !e.kind().is_stop() => {
+            fallback = Some(e.to_string());
+            half_squares(mesh, config)?
+        }
+        other => other?,
     };
     loop {
-        let Laid { atlas, mended, gutter_px } = match laid.take() {
-            Some(laid) => laid,
-            None => HalfSquares.unwrap(mesh, config, monitor).map_err(|_| MeshError::AtlasTooSmall {
-                size_px: config.size_px,
-                triangles: mesh.triangles.len(),
-            })?,
-        };
-        monitor.step(STEPS - 1, STEPS, &[("mended", mended as f64)]);
-        if monitor.stop() {
-            return Err(MeshError::Stopped);
-        }
+        let AtlasLayout { atlas, repaired, gutter_px } = layout;
+        monitor.step(STEPS - 1, STEPS, &[("repaired", repaired as f64)]);
+        monitor.check_stop()?;
         let uv = uv_check(mesh, &atlas);
         let apart = uv.chart_distance_px.unwrap_or(f64::INFINITY).min(uv.border_distance_px);
         // a thousandth of a texel: coordinates are rounded to f32
@@ -185,12 +114,13 @@ fn atlas_by(
                  {apart:.3} texels apart)",
                 uv.overlapping, uv.flipped, uv.zero_area, uv.outside
             ));
+            layout = half_squares(mesh, config)?;
             continue;
         }
         monitor.step(STEPS, STEPS, &[("charts", uv.charts as f64), ("used", uv.used)]);
         let report = AtlasReport {
             fallback,
-            mended,
+            mended: repaired,
             gutter_px,
             seams_facing: config.front.map(|front| seams_facing(mesh, &atlas, front)),
             uv,
@@ -198,25 +128,6 @@ fn atlas_by(
         };
         return Ok((atlas, report));
     }
-}
-
-fn is_sound(mesh: &Mesh) -> Result<(), MeshError> {
-    if mesh.triangles.is_empty() {
-        return Err(MeshError::NoTriangles);
-    }
-    let vertices = mesh.positions.len();
-    for (triangle, corners) in mesh.triangles.iter().enumerate() {
-        for &vertex in corners {
-            match mesh.positions.get(vertex as usize) {
-                None => return Err(MeshError::Index { triangle, index: vertex, vertices }),
-                Some(p) if !p.is_finite() => {
-                    return Err(MeshError::NotFinite { count: 1, first: vertex as usize });
-                }
-                _ => {}
-            }
-        }
-    }
-    Ok(())
 }
 
 #[cfg(test)]

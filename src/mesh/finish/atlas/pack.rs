@@ -5,9 +5,10 @@
 //! costs, placing them takes a millisecond: so they are drawn once, and many orders are tried, each a change to the
 //! best one so far, on squares that get smaller cell by cell.
 
-use super::Refusal;
 use super::flat::Flat;
 use super::raster::{Mask, Page};
+use crate::kernel::rng::mix;
+use crate::{Error, Monitor, Result};
 use glam::DVec2;
 use rayon::prelude::*;
 
@@ -25,13 +26,13 @@ const USED: f64 = 0.62;
 
 /// Where a chart goes: turned by the angle whose cosine and sine these are, scaled, and moved.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Place {
+pub(super) struct ChartPose {
     turn: DVec2,
     scale: f64,
     offset: DVec2,
 }
 
-impl Place {
+impl ChartPose {
     /// In texels, y up.
     pub fn of(&self, p: DVec2) -> DVec2 {
         self.turn.rotate(p) * self.scale + self.offset
@@ -47,19 +48,19 @@ struct Drawn {
 }
 
 /// Which chart goes where: turn, column and row of each.
-type Layout = Vec<(usize, usize, usize)>;
+type CellPlaces = Vec<(usize, usize, usize)>;
 
 /// Places charts in a square texture: twice the gutter between any two of them and to the border.
 pub(super) fn pack(
     charts: &[Flat],
     size_px: f64,
     gutter_px: f64,
-    stop: &dyn Fn() -> bool,
-) -> Result<Vec<Place>, Refusal> {
+    monitor: &dyn Monitor,
+) -> Result<Vec<ChartPose>> {
     let area: f64 = charts.iter().map(Flat::area).sum();
     let room = size_px - 2.0 * gutter_px;
     if !(area > 0.0 && area.is_finite() && room >= 1.0) {
-        return Err(Refusal::TooSmall);
+        return Err(too_small());
     }
     let outlines: Vec<Vec<[DVec2; 2]>> = charts
         .par_iter()
@@ -82,7 +83,7 @@ pub(super) fn pack(
         for _ in 0..2 {
             let reach = gutter_px * most as f64 / room;
             let drawn = draw(&outlines, scale, reach, turns);
-            match smallest(&drawn, &mut order, start, most, stop)? {
+            match smallest(&drawn, &mut order, start, most, monitor)? {
                 Some((side, layout)) => {
                     (most, start) = (side, side);
                     found = Some((drawn, layout, side, reach));
@@ -96,13 +97,13 @@ pub(super) fn pack(
                 let Drawn { turn, low, .. } = drawn[chart][turn];
                 // The page begins a gutter from the border, the chart its reach from its shape's corner.
                 let corner = (DVec2::new(x as f64, y as f64) + reach) * cell + gutter_px;
-                Place { turn, scale: scale * cell, offset: corner - low * (scale * cell) }
+                ChartPose { turn, scale: scale * cell, offset: corner - low * (scale * cell) }
             };
             return Ok(layout.iter().enumerate().map(place).collect());
         }
         used *= 0.7;
     }
-    Err(Refusal::TooSmall)
+    Err(too_small())
 }
 
 /// Charts from the one with the largest box to the smallest.
@@ -140,8 +141,8 @@ fn smallest(
     order: &mut Vec<usize>,
     start: usize,
     most: usize,
-    stop: &dyn Fn() -> bool,
-) -> Result<Option<(usize, Layout)>, Refusal> {
+    monitor: &dyn Monitor,
+) -> Result<Option<(usize, CellPlaces)>> {
     let mut side = start;
     let mut best = loop {
         if let Some(layout) = lay_out(drawn, order, side) {
@@ -153,17 +154,20 @@ fn smallest(
         }
     };
     let count = order.len();
-    let mut random = Random(count as u64);
+    // numbers without a pattern, the same every time (SplitMix64)
+    let mut state = count as u64;
+    let mut below = |n: usize| {
+        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        (mix(state) % n as u64) as usize
+    };
     let tries = if count > 1 { (PLACED / count).clamp(8, 160) } else { 8 };
     let mut step = (side / 40).max(1);
     for _ in 0..tries {
-        if stop() {
-            return Err(Refusal::Stopped);
-        }
+        monitor.check_stop()?;
         let mut trial = order.clone();
         if step == 1 && count > 1 {
-            let i = random.below(count);
-            let j = (i + 1 + random.below(count.div_ceil(3))) % count;
+            let i = below(count);
+            let j = (i + 1 + below(count.div_ceil(3))) % count;
             trial.swap(i, j);
         }
         match lay_out(drawn, &trial, side.saturating_sub(step)) {
@@ -175,7 +179,7 @@ fn smallest(
 }
 
 /// Places charts one after the other on a square of `side` cells.
-fn lay_out(drawn: &[Vec<Drawn>], order: &[usize], side: usize) -> Option<Layout> {
+fn lay_out(drawn: &[Vec<Drawn>], order: &[usize], side: usize) -> Option<CellPlaces> {
     let mut page = Page::new(side);
     let mut layout = vec![(0, 0, 0); drawn.len()];
     for &chart in order {
@@ -194,23 +198,14 @@ fn lay_out(drawn: &[Vec<Drawn>], order: &[usize], side: usize) -> Option<Layout>
     Some(layout)
 }
 
-/// Numbers without a pattern, the same every time (SplitMix64).
-struct Random(u64);
-
-impl Random {
-    /// 0..n
-    fn below(&mut self, n: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ z >> 31) % n as u64) as usize
-    }
+fn too_small() -> Error {
+    Error::cannot("the charts do not fit into the texture", "")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::monitor::{Quiet, Stopping};
 
     /// A rectangle of two triangles.
     fn rectangle(width: f64, height: f64) -> Flat {
@@ -222,14 +217,14 @@ mod tests {
         }
     }
 
-    fn corners(chart: &Flat, place: &Place) -> Vec<DVec2> {
+    fn corners(chart: &Flat, place: &ChartPose) -> Vec<DVec2> {
         chart.points.iter().map(|&p| place.of(p)).collect()
     }
 
     #[test]
     fn a_square_fills_the_texture_but_for_two_gutters() {
         let chart = rectangle(3.0, 3.0);
-        let places = pack(std::slice::from_ref(&chart), 256.0, 8.0, &|| false).unwrap();
+        let places = pack(std::slice::from_ref(&chart), 256.0, 8.0, &Quiet).unwrap();
         let p = corners(&chart, &places[0]);
         let low = p.iter().fold(DVec2::INFINITY, |m, p| m.min(*p));
         let high = p.iter().fold(DVec2::NEG_INFINITY, |m, p| m.max(*p));
@@ -242,12 +237,12 @@ mod tests {
     fn four_strips_lie_side_by_side_at_one_scale() {
         // 4 × 1 each: together a square
         let charts = vec![rectangle(4.0, 1.0); 4];
-        let places = pack(&charts, 512.0, 4.0, &|| false).unwrap();
+        let places = pack(&charts, 512.0, 4.0, &Quiet).unwrap();
         let scale = places[0].scale;
         assert!(places.iter().all(|p| p.scale == scale));
         // (512 − 16) / 4 = 124 if side by side along their length; across (512 − 16 − 3 · 8) / 4 = 118
         assert!((112.0..118.1).contains(&scale), "{scale}");
-        assert!(matches!(pack(&charts, 512.0, 4.0, &|| true), Err(Refusal::Stopped)));
-        assert!(matches!(pack(&charts, 16.0, 8.0, &|| false), Err(Refusal::TooSmall)));
+        assert!(pack(&charts, 512.0, 4.0, &Stopping).unwrap_err().kind().is_stop());
+        assert!(pack(&charts, 16.0, 8.0, &Quiet).unwrap_err().to_string().contains("do not fit"));
     }
 }

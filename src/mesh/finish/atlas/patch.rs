@@ -29,7 +29,7 @@ pub(super) fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>
 pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
     let (mut sum, mut whole) = (0.0, 0.0);
     for (k, &t) in flat.triangles.iter().enumerate() {
-        let area = area(mesh, t);
+        let area = mesh.area(t);
         let ratio = 0.5 * twice_area(flat.at(k)) / area;
         if ratio > 0.0 && ratio.is_finite() {
             sum += area * 0.5 * (ratio + 1.0 / ratio);
@@ -37,12 +37,6 @@ pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
         }
     }
     sum / whole
-}
-
-/// Area of a triangle.
-pub(super) fn area(mesh: &Mesh, t: u32) -> f64 {
-    let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
-    0.5 * (b - a).cross(c - a).length()
 }
 
 /// Across the side from corner k to k + 1 of each triangle; [`NONE`] where there is not exactly one other.

@@ -20,10 +20,10 @@ pub use detail::tangent_space;
 pub use light::{Learned, seen_colors};
 pub use seams::Seams;
 
-use crate::Monitor;
 use crate::geom::{Atlas, Bvh, Camera, Mesh};
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
-use crate::mesh::MeshError;
+use crate::mesh::input::setting;
+use crate::{Monitor, Result};
 use cover::{Bands, Sample};
 use glam::{Mat3, Vec3};
 use light::{Eyes, Points, settle, shade};
@@ -89,8 +89,7 @@ const BATCH: usize = 1 << 17;
 ///
 /// # Errors
 ///
-/// [`MeshError::Config`] for a side of no samples, [`MeshError::Answer`] when the field answers with the wrong
-/// number of colours, [`MeshError::Stopped`].
+/// A side of no or too many samples, a request to stop.
 pub fn bake(
     mesh: &Mesh,
     atlas: &Atlas,
@@ -98,12 +97,9 @@ pub fn bake(
     cameras: &[Camera],
     config: &BakeConfig,
     monitor: &dyn Monitor,
-) -> Result<Baked, MeshError> {
+) -> Result<Baked> {
     let begin = Instant::now();
-    if !(1..=8).contains(&config.side) {
-        let found = config.side.to_string();
-        return Err(MeshError::Config { key: "texture_samples", expected: "1..=8", found });
-    }
+    setting((1..=8).contains(&config.side), "texture_samples", "1..=8", config.side)?;
     let (width, height) = (atlas.width, atlas.height);
     let functions = if config.lobes == 0 { 0 } else { lobes::count(config.lobes.min(2)) };
     let mut color = Image::new(width, height, 3);
@@ -117,9 +113,7 @@ pub fn bake(
     for band in 0..bands.len() {
         let samples = bands.samples(atlas, band, config.side);
         for own in whole_texels(&samples) {
-            if monitor.stop() {
-                return Err(MeshError::Stopped);
-            }
+            monitor.check_stop()?;
             let flat = on_triangles(mesh, own);
             let points = settle(&flat, config.reach, learned);
             let seen =

@@ -7,6 +7,7 @@
 
 use crate::geom::{Atlas, Mesh};
 use crate::image::{Image, Photo};
+use crate::kernel::cg::{conjugate_gradients, dot};
 use glam::Vec2;
 use std::collections::HashMap;
 
@@ -32,7 +33,7 @@ pub struct Seams {
 }
 
 /// A bilinear look-up: texels and their weights.
-type Taps = [(u32, f32); 4];
+type SeamTexels = [(u32, f32); 4];
 
 impl Seams {
     /// Finds the seams of a manifold mesh, closed or open, edge by edge in the order of its triangles.
@@ -106,7 +107,7 @@ impl Seams {
         }
     }
 
-    fn taps(&self, uv: Vec2) -> Taps {
+    fn taps(&self, uv: Vec2) -> SeamTexels {
         let at = |u: f32, n: u32| {
             let p = (u * n as f32 - 0.5).clamp(0.0, (n - 1) as f32);
             (p as u32, (p as u32 + 1).min(n - 1), p.fract())
@@ -153,36 +154,25 @@ impl Seams {
 
 /// x with the least ‖R (start + x)‖² + STIFFNESS ‖x‖², by conjugate gradients.
 fn changes(rows: &[[(u32, f64); 8]], start: &[f64]) -> Vec<f64> {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     // Rᵀ R v + stiffness v
-    let normal = |v: &[f64], stiffness: f64| {
-        let mut out: Vec<f64> = v.iter().map(|v| stiffness * v).collect();
+    let normal = |v: &[f64], stiffness: f64, out: &mut [f64]| {
+        out.iter_mut().zip(v).for_each(|(out, v)| *out = stiffness * v);
         for row in rows {
             let sum: f64 = row.iter().map(|&(i, w)| w * v[i as usize]).sum();
             row.iter().for_each(|&(i, w)| out[i as usize] += w * sum);
         }
-        out
     };
-    let mut x = vec![0.0; start.len()];
-    let mut residual: Vec<f64> = normal(start, 0.0).iter().map(|r| -r).collect();
-    let mut direction = residual.clone();
-    let mut square = dot(&residual, &residual);
-    let enough = 1e-8 * square;
-    for _ in 0..ROUNDS {
-        if square <= enough {
-            break;
-        }
-        let moved = normal(&direction, STIFFNESS);
-        let along = square / dot(&direction, &moved);
-        for i in 0..x.len() {
-            x[i] += along * direction[i];
-            residual[i] -= along * moved[i];
-        }
-        let next = dot(&residual, &residual);
-        let keep = next / square;
-        direction.iter_mut().zip(&residual).for_each(|(d, r)| *d = r + keep * *d);
-        square = next;
-    }
+    let (mut x, mut residual) = (vec![0.0; start.len()], vec![0.0; start.len()]);
+    normal(start, 0.0, &mut residual);
+    residual.iter_mut().for_each(|r| *r = -*r);
+    let enough = 1e-8 * dot(&residual, &residual);
+    conjugate_gradients(
+        &mut x,
+        residual,
+        |v, out| normal(v, STIFFNESS, out),
+        |r, z| z.copy_from_slice(r),
+        |round, r| round == ROUNDS || dot(r, r) <= enough,
+    );
     x
 }
 

@@ -5,11 +5,12 @@
 //! is measured: at corners, middles of edges and of triangles. A round that went too far is undone and
 //! repeated with a smaller part. A ball takes 2.2 to 2.4 times the fewest triangles that would do.
 
-use super::fit::{ask, newton};
 use super::round::{Task, prepare, reduce, settle};
-use super::{Placement, SimplifyReport};
+use super::{SimplifyReport, VertexPlacement};
+use crate::Result;
 use crate::geom::Mesh;
-use crate::mesh::MeshError;
+use crate::mesh::input::evaluate;
+use crate::mesh::moves::newton;
 use glam::Vec3;
 
 /// Most rounds, and most that may be undone.
@@ -21,7 +22,7 @@ const SHARE: f64 = 0.5;
 const LITTLE: f64 = 0.03;
 
 /// Simplifies until the error or the number of triangles is reached.
-pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh, MeshError> {
+pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh> {
     let (error, target) = (task.config.error, task.config.triangles.max(1));
     let Some(field) = task.field else {
         let mut rings = prepare(mesh, task, report);
@@ -43,7 +44,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         if next.triangles.len() == before {
             break;
         }
-        settle(&mut next, &fixed, field, task, Placement::OnSurface, true, report)?;
+        settle(&mut next, &fixed, field, task, VertexPlacement::OnSurface, true, report)?;
         let errors = measure(&next, task, report)?;
         let found = worst(&errors);
         let after = next.triangles.len();
@@ -70,7 +71,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
     if good.normals.is_empty() {
         // nothing may go: the mesh as it came, with normals
         let fixed = vec![true; good.positions.len()];
-        settle(&mut good, &fixed, field, task, Placement::OnSurface, true, report)?;
+        settle(&mut good, &fixed, field, task, VertexPlacement::OnSurface, true, report)?;
     }
     Ok(good)
 }
@@ -81,7 +82,7 @@ fn worst(errors: &[f32]) -> f32 {
 
 /// For every vertex the largest distance to the surface at corners, middles of edges and middles of the
 /// triangles around it.
-fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<f32>, MeshError> {
+fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<f32>> {
     let mut errors = vec![0.0f32; mesh.positions.len()];
     let Some(field) = task.field else { return Ok(errors) };
     // Where, and for whom: each inner edge once.
@@ -99,7 +100,7 @@ fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<
             }
         }
     }
-    let (f, g) = ask(field, &points, task.config.batch, &|| task.monitor.stop())?;
+    let (f, g) = evaluate(field, &points, task.config.batch, task.monitor)?;
     report.asked += f.len();
     for (i, whom) in whom.iter().enumerate() {
         let d = newton(f[i], g[i]).map_or(0.0, Vec3::length);

@@ -5,8 +5,9 @@
 //! with a border taken as joined to one vertex more, the same holds of edges. The triangles that stay
 //! may not turn by more than 60° nor become worse than a quality of 0.05, unless they were worse.
 
-use super::quadric::{Freedom, Spread, best, lean_of};
+use super::quadric::{Freedom, PlaneQuadric, best, lean_of};
 use super::rings::{BORDER, HELD, NONE, Rings};
+use crate::geom::shape;
 use glam::Vec3;
 
 /// Cosine of how far a triangle may turn: 60°.
@@ -18,7 +19,7 @@ const CROWN: usize = 20;
 
 /// A triangle that will have the new vertex for a corner, and its other two corners in order.
 #[derive(Clone, Copy)]
-pub(super) struct Side {
+pub(super) struct FanTriangle {
     pub triangle: u32,
     pub from: u32,
     pub to: u32,
@@ -28,7 +29,7 @@ pub(super) struct Side {
 #[derive(Default)]
 pub(super) struct Star {
     /// Triangles of a, then of b, that stay; the first `of_a` are a's.
-    pub sides: Vec<Side>,
+    pub sides: Vec<FanTriangle>,
     of_a: usize,
     /// Triangles that hold the edge, with the vertex opposite to it.
     gone: Vec<(u32, u32)>,
@@ -76,7 +77,7 @@ impl Star {
             } else if to == b {
                 self.gone.push((t, from));
             } else {
-                self.sides.push(Side { triangle: t, from, to });
+                self.sides.push(FanTriangle { triangle: t, from, to });
             }
         }
         self.of_a = self.sides.len();
@@ -89,7 +90,7 @@ impl Star {
         if borders.0 & borders.1 != 0 && self.gone.len() == 2 {
             return false; // would pinch the surface between two borders
         }
-        let spans = |s: &Side| [s.from, s.to] == opposite || [s.to, s.from] == opposite;
+        let spans = |s: &FanTriangle| [s.from, s.to] == opposite || [s.to, s.from] == opposite;
         let mut closes = false;
         for &t in rings.ring(b) {
             let triangle = rings.triangles[t as usize];
@@ -106,7 +107,7 @@ impl Star {
                     return false;
                 }
             }
-            let side = Side { triangle: t, from, to };
+            let side = FanTriangle { triangle: t, from, to };
             closes |= spans(&side);
             self.sides.push(side);
         }
@@ -130,10 +131,10 @@ impl Star {
             if area.dot(old) <= TURN * size * old.length() && old != Vec3::ZERO {
                 return false;
             }
-            let shape = 2.0 * 3f32.sqrt() * size / sum;
-            if shape < POOR || shape.is_nan() {
+            let quality = 2.0 * 3f32.sqrt() * size / sum;
+            if quality < POOR || quality.is_nan() {
                 let worst = *worst.get_or_insert_with(|| self.worst(rings));
-                if shape <= worst || shape.is_nan() {
+                if quality <= worst || quality.is_nan() {
                     return false;
                 }
             }
@@ -158,7 +159,7 @@ impl Star {
 
     /// The worst quality among all triangles of both ends.
     fn worst(&self, rings: &Rings) -> f32 {
-        self.triangles().map(|t| quality_of(rings.corners(t))).fold(f32::INFINITY, f32::min)
+        self.triangles().map(|t| shape(rings.corners(t))).fold(f32::INFINITY, f32::min)
     }
 
     /// Collapses edge (a, b), last gathered and found fit, into a at `x`.
@@ -182,7 +183,7 @@ impl Star {
             rings.count -= 1;
         }
         self.ring.clear();
-        let mut spread = Spread::default();
+        let mut spread = PlaneQuadric::default();
         for (i, (side, &lean)) in self.sides.iter().zip(&self.leans).enumerate() {
             let t = side.triangle as usize;
             if i >= self.of_a {
@@ -226,12 +227,6 @@ pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     };
     let [pa, pb] = [a, b].map(|v| rings.positions[v as usize]);
     Some(best(pa, &rings.spreads[a as usize], pb, &rings.spreads[b as usize], freedom))
-}
-
-/// Shape of a triangle, 1 for equilateral, 0 for none: `4 √3 area / Σ length²`.
-pub(super) fn quality_of([a, b, c]: [Vec3; 3]) -> f32 {
-    let sum = (b - a).length_squared() + (c - b).length_squared() + (a - c).length_squared();
-    if sum > 0.0 { 2.0 * 3f32.sqrt() * (b - a).cross(c - a).length() / sum } else { 0.0 }
 }
 
 #[cfg(test)]
@@ -279,8 +274,8 @@ mod tests {
     #[test]
     fn shape_is_one_for_equilateral_and_none_on_a_line() {
         let c = Vec3::new(0.5, 0.75f32.sqrt(), 0.0);
-        assert!((quality_of([Vec3::ZERO, Vec3::X, c]) - 1.0).abs() < 1e-6);
-        assert_eq!(quality_of([Vec3::ZERO, Vec3::X, 2.0 * Vec3::X]), 0.0);
-        assert_eq!(quality_of([Vec3::X; 3]), 0.0);
+        assert!((shape([Vec3::ZERO, Vec3::X, c]) - 1.0).abs() < 1e-6);
+        assert_eq!(shape([Vec3::ZERO, Vec3::X, 2.0 * Vec3::X]), 0.0);
+        assert_eq!(shape([Vec3::X; 3]), 0.0);
     }
 }

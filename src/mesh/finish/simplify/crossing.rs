@@ -4,8 +4,7 @@
 //! of `mesh::files::check`; before it, a triangle strictly on one side of the other's plane is let go.
 
 use super::rings::{NONE, Rings};
-use crate::geom::Aabb;
-use crate::geom::intersect;
+use crate::geom::{Aabb, Boxes, DBox, Effort, intersect};
 use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 
@@ -127,44 +126,20 @@ impl Facet {
 
 /// The triangles that meet others in more than common corners, in order.
 pub(super) fn crossings(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<u32> {
-    let cells = Cells::fit(positions, triangles);
     let facets: Vec<Facet> =
         triangles.par_iter().map(|&t| Facet::new(t, t.map(|v| positions[v as usize]))).collect();
-    // Per cell its triangles, one cell after the other.
-    let range = |f: &Facet| (cells.cell(f.bounds.min), cells.cell(f.bounds.max));
-    let mut starts = vec![0u32; cells.len() + 1];
-    for f in &facets {
-        let (low, high) = range(f);
-        cells.for_each(low, high, |_, i| starts[i + 1] += 1);
-    }
-    for i in 1..starts.len() {
-        starts[i] += starts[i - 1];
-    }
-    let mut members = vec![0u32; starts[cells.len()] as usize];
-    let mut next = starts.clone();
-    for (t, f) in facets.iter().enumerate() {
-        let (low, high) = range(f);
-        cells.for_each(low, high, |_, i| {
-            members[next[i] as usize] = t as u32;
-            next[i] += 1;
-        });
-    }
-    let mut found: Vec<u32> = (0..cells.len())
-        .into_par_iter()
-        .with_min_len(1024)
-        .flat_map_iter(|i| {
-            let here = &members[starts[i] as usize..starts[i + 1] as usize];
+    let boxes = Boxes::new(facets.iter().map(|f| DBox::around(f.p)));
+    let mut found: Vec<u32> = facets
+        .par_iter()
+        .enumerate()
+        .flat_map_iter(|(t, facet)| {
             let mut met = Vec::new();
-            for (k, &t) in here.iter().enumerate() {
-                let f = &facets[t as usize];
-                for &other in &here[k + 1..] {
-                    let g = &facets[other as usize];
-                    // two triangles may share cells: the pair belongs to the first of them
-                    if cells.number(cells.cell(f.bounds.min.max(g.bounds.min))) == i && f.meets(g) {
-                        met.extend([t, other]);
-                    }
+            boxes.meeting(&DBox::around(facet.p), &mut Effort::of(usize::MAX), |other, _| {
+                if other as usize > t && facet.meets(&facets[other as usize]) {
+                    met.extend([t as u32, other]);
                 }
-            }
+                true
+            });
             met
         })
         .collect();

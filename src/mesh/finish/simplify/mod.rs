@@ -30,21 +30,19 @@ mod queue;
 mod rings;
 mod round;
 
-use crate::Monitor;
 use crate::geom::Mesh;
-use crate::mesh::MeshError;
+use crate::mesh::input::{Field, few_enough, setting, sound};
+use crate::{Monitor, Result};
 use bounded::bounded;
 use crossing::crossings;
-use fit::Field;
 use glam::Vec3;
-use round::{Look, Task, rounds};
+use round::{CrossingSearch, Task, rounds};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
 /// Where vertices lie in the end, when there is a field.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Placement {
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum VertexPlacement {
     /// On the field's zero. Between them the triangles are chords.
     OnSurface,
     /// Where the triangles are nearest to the zero, in the least-squares sense.
@@ -53,15 +51,14 @@ pub enum Placement {
 }
 
 /// How far to simplify.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct SimplifyConfig {
     /// Triangles to keep; 0 goes as far as `error` lets it.
     pub triangles: usize,
     /// Most distance from the surface, in units of the positions; 0 goes as far as `triangles` says.
     pub error: f32,
     /// Where vertices lie in the end; with an `error` always on the zero.
-    pub placement: Placement,
+    pub placement: VertexPlacement,
     /// Rounds of collapses, after each of which the field is asked; 1..=16. More than one takes the worst
     /// error down a little in strong simplifications, at the price of asking more. Not for `error`.
     pub rounds: usize,
@@ -74,7 +71,7 @@ impl Default for SimplifyConfig {
         SimplifyConfig {
             triangles: 200_000,
             error: 0.0,
-            placement: Placement::default(),
+            placement: VertexPlacement::default(),
             rounds: 1,
             batch: 1 << 16,
         }
@@ -82,22 +79,11 @@ impl Default for SimplifyConfig {
 }
 
 impl SimplifyConfig {
-    /// Every value in its range, else [`MeshError::Config`] that names the key.
-    pub fn check(&self) -> Result<(), MeshError> {
-        let bad = |key, expected, found: String| Err(MeshError::Config { key, expected, found });
-        if !(self.error >= 0.0 && self.error.is_finite()) {
-            return bad("error", "0 or more", self.error.to_string());
-        }
-        if self.triangles == 0 && self.error == 0.0 {
-            return bad("triangles", "at least 1, or an `error`", "0".into());
-        }
-        if !(1..=16).contains(&self.rounds) {
-            return bad("rounds", "1..=16", self.rounds.to_string());
-        }
-        if self.batch == 0 {
-            return bad("batch", "at least 1", "0".into());
-        }
-        Ok(())
+    fn check(&self) -> Result<()> {
+        setting(self.error >= 0.0 && self.error.is_finite(), "error", "0 or more", self.error)?;
+        setting(self.triangles > 0 || self.error > 0.0, "triangles", "at least 1, or an `error`", 0)?;
+        setting((1..=16).contains(&self.rounds), "rounds", "1..=16", self.rounds)?;
+        setting(self.batch > 0, "batch", "at least 1", 0)
     }
 }
 
@@ -172,18 +158,19 @@ const MANY: usize = 1000;
 ///
 /// # Errors
 ///
-/// [`MeshError::Config`]; [`MeshError::NotFinite`] and [`MeshError::Index`] for a mesh that is none;
-/// [`MeshError::Answer`] when the field answers with the wrong length; [`MeshError::Stopped`]. The mesh
-/// is then as it was.
+/// A setting out of range, a mesh with a coordinate that is not finite or an index out of range, a field that answers
+/// with the wrong length, a request to stop. The mesh is then as it was.
 pub fn simplify(
     mesh: &mut Mesh,
     field: Option<&Field>,
     config: &SimplifyConfig,
     monitor: &dyn Monitor,
-) -> Result<SimplifyReport, MeshError> {
+) -> Result<SimplifyReport> {
     let begin = Instant::now();
     config.check()?;
     sound(mesh)?;
+    // corners are numbered by 32 bits, and rings grow in their pool
+    few_enough(mesh.positions.len() as u64, 16 * mesh.triangles.len() as u64)?;
     let before = mesh.triangles.len();
     let mut report = SimplifyReport { before, after: before, ..SimplifyReport::default() };
     if before == 0 || config.triangles >= before {
@@ -195,9 +182,9 @@ pub fn simplify(
     let mut out = Mesh::default();
     for attempt in 0..ATTEMPTS {
         let look = match attempt {
-            0 => Look::Nowhere,
-            i if i + 1 == ATTEMPTS || near.len() > MANY => Look::Everywhere,
-            _ => Look::Near(&near),
+            0 => CrossingSearch::Nowhere,
+            i if i + 1 == ATTEMPTS || near.len() > MANY => CrossingSearch::Everywhere,
+            _ => CrossingSearch::Near(&near),
         };
         report = SimplifyReport { before, again: attempt, asked: report.asked, ..SimplifyReport::default() };
         let task = Task { field, config, look, monitor };
@@ -229,25 +216,6 @@ pub fn simplify(
     report.after = mesh.triangles.len();
     report.seconds = begin.elapsed().as_secs_f64();
     Ok(report)
-}
-
-/// Indices in range, positions finite, few enough.
-fn sound(mesh: &Mesh) -> Result<(), MeshError> {
-    let vertices = mesh.positions.len();
-    if let Some(first) = mesh.positions.iter().position(|p| !p.is_finite()) {
-        let count = mesh.positions.iter().filter(|p| !p.is_finite()).count();
-        return Err(MeshError::NotFinite { count, first });
-    }
-    let bad = |t: &[u32; 3]| t.iter().any(|&v| v as usize >= vertices);
-    if let Some(triangle) = mesh.triangles.iter().position(bad) {
-        let index = mesh.triangles[triangle].into_iter().max().unwrap_or_default();
-        return Err(MeshError::Index { triangle, index, vertices });
-    }
-    // Corners are numbered by 32 bits, and rings grow in their pool.
-    if mesh.triangles.len() as u64 > u64::from(u32::MAX) / 16 {
-        return Err(MeshError::TooLarge { vertices: vertices as u64 });
-    }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -23,9 +23,9 @@ const REACH: f64 = 1.5;
 
 /// The symmetric matrix `Σ A n nᵀ`: xx, xy, xz, yy, yz, zz.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Spread([f32; 6]);
+pub(super) struct PlaneQuadric([f32; 6]);
 
-/// `√A n` (up to √2) of a triangle, whose outer product is its share of a [`Spread`]; zero for one
+/// `√A n` (up to √2) of a triangle, whose outer product is its share of a [`PlaneQuadric`]; zero for one
 /// without area.
 pub(super) fn lean(a: Vec3, b: Vec3, c: Vec3) -> Vec3 {
     lean_of((b - a).cross(c - a))
@@ -37,7 +37,7 @@ pub(super) fn lean_of(area: Vec3) -> Vec3 {
     if length > 0.0 { area / length.sqrt() } else { Vec3::ZERO }
 }
 
-impl Spread {
+impl PlaneQuadric {
     #[inline]
     pub(super) fn add(&mut self, s: Vec3) {
         let m = &mut self.0;
@@ -61,7 +61,7 @@ impl Spread {
     }
 
     #[inline]
-    fn plus(&self, other: &Spread, sign: f64) -> [f64; 6] {
+    fn plus(&self, other: &PlaneQuadric, sign: f64) -> [f64; 6] {
         [0, 1, 2, 3, 4, 5].map(|i| f64::from(self.0[i]) + sign * f64::from(other.0[i]))
     }
 }
@@ -90,7 +90,7 @@ pub(super) enum Freedom {
 ///
 /// Where the 3 × 3 system is worse than a condition of 1e6 or its solution lies far off, the better of
 /// the ends and the middle.
-pub(super) fn best(a: Vec3, qa: &Spread, b: Vec3, qb: &Spread, freedom: Freedom) -> (Vec3, f32) {
+pub(super) fn best(a: Vec3, qa: &PlaneQuadric, b: Vec3, qb: &PlaneQuadric, freedom: Freedom) -> (Vec3, f32) {
     let (da, db) = (a.as_dvec3(), b.as_dvec3());
     let (middle, half) = (0.5 * (da + db), 0.5 * (db - da));
     // With y from the middle: (y + h)ᵀ A (y + h) + (y − h)ᵀ B (y − h)
@@ -143,8 +143,8 @@ fn solve(m: [f64; 6], r: DVec3) -> Option<DVec3> {
 mod tests {
     use super::*;
 
-    fn spread(s: &[Vec3]) -> Spread {
-        let mut q = Spread::default();
+    fn spread(s: &[Vec3]) -> PlaneQuadric {
+        let mut q = PlaneQuadric::default();
         s.iter().for_each(|&s| q.add(s));
         q
     }
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn nothing_around_is_no_reason_to_divide_by_zero() {
-        let none = Spread::default();
+        let none = PlaneQuadric::default();
         assert_eq!(best(Vec3::ZERO, &none, Vec3::X, &none, Freedom::Free), (Vec3::new(0.5, 0.0, 0.0), 0.0));
         assert_eq!(lean(Vec3::X, Vec3::X, Vec3::Y), Vec3::ZERO);
         assert_eq!(solve([1.0, 0.0, 0.0, 1e-3, 0.0, 1e-7], DVec3::ONE), None);
@@ -192,6 +192,6 @@ mod tests {
     fn subtracting_what_was_added_leaves_nothing() {
         let mut q = spread(&[Vec3::new(1.0, 2.0, 3.0)]);
         q.subtract(Vec3::new(1.0, 2.0, 3.0));
-        assert_eq!(q, Spread::default());
+        assert_eq!(q, PlaneQuadric::default());
     }
 }

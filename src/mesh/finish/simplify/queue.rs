@@ -18,7 +18,7 @@ pub(super) struct Entry {
 }
 
 /// The buckets.
-pub(super) struct Queue {
+pub(super) struct EdgeQueue {
     buckets: Vec<Vec<Entry>>,
     /// No bucket below this one has entries.
     lowest: usize,
@@ -28,10 +28,10 @@ pub(super) struct Queue {
     bucket: usize,
 }
 
-impl Queue {
-    pub(super) fn new() -> Queue {
+impl EdgeQueue {
+    pub(super) fn new() -> EdgeQueue {
         let buckets = vec![Vec::new(); (f32::INFINITY.to_bits() >> SHIFT) as usize + 1];
-        Queue { buckets, lowest: usize::MAX, current: Vec::new(), done: 0, bucket: 0 }
+        EdgeQueue { buckets, lowest: usize::MAX, current: Vec::new(), done: 0, bucket: 0 }
     }
 
     /// The bucket of a cost ≥ 0; whatever is not a number goes last.
@@ -67,13 +67,13 @@ mod tests {
 
     #[test]
     fn cheap_edges_come_first_and_equal_ones_in_their_order() {
-        let mut q = Queue::new();
+        let mut q = EdgeQueue::new();
         for (a, cost) in [(0, 2.0), (1, 1e-20), (2, 2.01), (3, 0.0), (4, f32::NAN), (5, 1e30)] {
-            q.push(Queue::bucket(cost), Entry { a, b: 9, stamp: 0 });
+            q.push(EdgeQueue::bucket(cost), Entry { a, b: 9, stamp: 0 });
         }
         let order: Vec<u32> = std::iter::from_fn(|| q.pop()).map(|(_, e)| e.a).collect();
         assert_eq!(order, [3, 1, 0, 2, 5, 4]);
-        q.push(Queue::bucket(1.0), Entry { a: 7, b: 9, stamp: 0 });
+        q.push(EdgeQueue::bucket(1.0), Entry { a: 7, b: 9, stamp: 0 });
         assert_eq!(q.pop().map(|(_, e)| e.a), Some(7));
         assert_eq!(q.pop(), None);
     }

@@ -5,7 +5,7 @@
 //! the edge; nothing else in the mesh changes its number.
 
 use super::hold::held;
-use super::quadric::{Spread, lean};
+use super::quadric::{PlaneQuadric, lean};
 use crate::geom::Mesh;
 use glam::Vec3;
 
@@ -23,7 +23,7 @@ pub(super) const NONE: u32 = u32::MAX;
 const BORDER_WEIGHT: f32 = 3.0;
 
 #[derive(Clone, Copy, Debug, Default)]
-struct Place {
+struct RingSlot {
     start: u32,
     len: u32,
     room: u32,
@@ -39,13 +39,13 @@ pub(super) struct Rings {
     pub triangles: Vec<[u32; 3]>,
     /// `√A n` of each triangle.
     pub leans: Vec<Vec3>,
-    pub spreads: Vec<Spread>,
+    pub spreads: Vec<PlaneQuadric>,
     pub flags: Vec<u8>,
     /// Grows whenever a vertex is what a collapse left or took away.
     pub stamps: Vec<u32>,
     /// Triangles that are left.
     pub count: usize,
-    places: Vec<Place>,
+    places: Vec<RingSlot>,
     pool: Vec<u32>,
 }
 
@@ -61,11 +61,11 @@ impl Rings {
             positions: mesh.positions.clone(),
             colors,
             leans: vec![Vec3::ZERO; triangles.len()],
-            spreads: vec![Spread::default(); n],
+            spreads: vec![PlaneQuadric::default(); n],
             flags: vec![0; n],
             stamps: vec![0; n],
             count: triangles.len(),
-            places: vec![Place::default(); n],
+            places: vec![RingSlot::default(); n],
             pool: vec![0; 3 * triangles.len()],
             triangles,
         };
@@ -129,7 +129,7 @@ impl Rings {
 
     /// Leans and spreads of everything, from the positions as they are now.
     pub(super) fn measure(&mut self) {
-        self.spreads.fill(Spread::default());
+        self.spreads.fill(PlaneQuadric::default());
         for t in 0..self.triangles.len() {
             let triangle = self.triangles[t];
             if triangle[0] == NONE {
@@ -151,7 +151,7 @@ impl Rings {
 
     /// The spread of one vertex, with the planes through its border edges, upright on their triangles.
     pub(super) fn measure_at(&mut self, v: u32) {
-        let mut spread = Spread::default();
+        let mut spread = PlaneQuadric::default();
         let at = self.positions[v as usize];
         for &t in self.ring(v) {
             let s = self.leans[t as usize];

@@ -2,13 +2,14 @@
 
 use super::collapse::{Star, place};
 use super::crossing::{Sheets, crossings};
-use super::fit::{Field, ask, middles, move_to, newton, offsets, reaches};
-use super::queue::{Entry, Queue};
+use super::fit::{middles, move_to, offsets, reaches};
+use super::queue::{EdgeQueue, Entry};
 use super::rings::{BORDER, CROWDED, HELD, Rings};
-use super::{Placement, SimplifyConfig, SimplifyReport};
-use crate::Monitor;
+use super::{SimplifyConfig, SimplifyReport, VertexPlacement};
 use crate::geom::{Aabb, Mesh};
-use crate::mesh::MeshError;
+use crate::mesh::input::{Field, evaluate};
+use crate::mesh::moves::newton;
+use crate::{Monitor, Result};
 use glam::Vec3;
 
 /// How many times the next round's triangles one round leaves. Three rounds instead of one take the worst
@@ -27,25 +28,25 @@ const BREATH: usize = 1 << 12;
 
 /// Which collapses are tested for crossings.
 #[derive(Clone, Copy)]
-pub(super) enum Look<'a> {
+pub(super) enum CrossingSearch<'a> {
     Nowhere,
     /// Around these points, within these distances.
     Near(&'a [(Vec3, f32)]),
     Everywhere,
 }
 
-impl Look<'_> {
+impl CrossingSearch<'_> {
     /// Is a collapse here to be tested?
     fn at(&self, p: Vec3) -> bool {
         match self {
-            Look::Nowhere => false,
-            Look::Near(balls) => balls.iter().any(|(c, r)| p.distance_squared(*c) <= r * r),
-            Look::Everywhere => true,
+            CrossingSearch::Nowhere => false,
+            CrossingSearch::Near(balls) => balls.iter().any(|(c, r)| p.distance_squared(*c) <= r * r),
+            CrossingSearch::Everywhere => true,
         }
     }
 
     fn is_nowhere(&self) -> bool {
-        matches!(self, Look::Nowhere)
+        matches!(self, CrossingSearch::Nowhere)
     }
 }
 
@@ -54,18 +55,12 @@ impl Look<'_> {
 pub(super) struct Task<'a> {
     pub field: Option<&'a Field<'a>>,
     pub config: &'a SimplifyConfig,
-    pub look: Look<'a>,
+    pub look: CrossingSearch<'a>,
     pub monitor: &'a dyn Monitor,
 }
 
-impl Task<'_> {
-    pub(super) fn stop(&self) -> Result<(), MeshError> {
-        if self.monitor.stop() { Err(MeshError::Stopped) } else { Ok(()) }
-    }
-}
-
 /// Rounds down to the number of triangles asked for.
-pub(super) fn rounds(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh, MeshError> {
+pub(super) fn rounds(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh> {
     let target = task.config.triangles;
     let count = if task.field.is_some() { task.config.rounds } else { 1 };
     let mut out = None;
@@ -110,7 +105,7 @@ pub(super) fn reduce(
     target: usize,
     mut budgets: Option<&mut [f32]>,
     report: &mut SimplifyReport,
-) -> Result<(), MeshError> {
+) -> Result<()> {
     let mut star = Star::new(rings.positions.len());
     let mut sheets = (!task.look.is_nowhere()).then(|| Sheets::new(rings));
     let mut breath = 0;
@@ -122,14 +117,14 @@ pub(super) fn reduce(
         while rings.count > target {
             breath += 1;
             if breath % BREATH == 0 {
-                task.stop()?;
+                task.monitor.check_stop()?;
             }
             let Some((bucket, Entry { a, b, stamp })) = queue.pop() else { break };
             if rings.stamp(a, b) != stamp {
                 continue; // an end is gone, or its edges were entered anew
             }
             let Some((x, cost)) = place(rings, a, b) else { continue };
-            let now = Queue::bucket(cost);
+            let now = EdgeQueue::bucket(cost);
             if now > bucket + SLACK {
                 queue.push(now, Entry { a, b, stamp });
                 continue;
@@ -167,7 +162,7 @@ pub(super) fn reduce(
             offers.clear();
             for &w in &star.around {
                 if let Some((_, cost)) = place(rings, a, w) {
-                    offers.push((Queue::bucket(cost) as u32, w));
+                    offers.push((EdgeQueue::bucket(cost) as u32, w));
                 }
             }
             if offers.len() > OFFERS {
@@ -185,8 +180,8 @@ pub(super) fn reduce(
 }
 
 /// All edges.
-fn fill(rings: &Rings) -> Queue {
-    let mut queue = Queue::new();
+fn fill(rings: &Rings) -> EdgeQueue {
+    let mut queue = EdgeQueue::new();
     for t in rings.alive() {
         let triangle = rings.triangles[t as usize];
         for k in 0..3 {
@@ -201,9 +196,9 @@ fn fill(rings: &Rings) -> Queue {
     queue
 }
 
-fn push(queue: &mut Queue, rings: &Rings, a: u32, b: u32) {
+fn push(queue: &mut EdgeQueue, rings: &Rings, a: u32, b: u32) {
     if let Some((_, cost)) = place(rings, a, b) {
-        queue.push(Queue::bucket(cost), Entry { a, b, stamp: rings.stamp(a, b) });
+        queue.push(EdgeQueue::bucket(cost), Entry { a, b, stamp: rings.stamp(a, b) });
     }
 }
 
@@ -213,32 +208,31 @@ pub(super) fn settle(
     fixed: &[bool],
     field: &Field,
     task: &Task,
-    placement: Placement,
+    placement: VertexPlacement,
     last: bool,
     report: &mut SimplifyReport,
-) -> Result<(), MeshError> {
-    let stop = || task.monitor.stop();
+) -> Result<()> {
     let reaches = reaches(&mesh.positions, &mesh.triangles);
     let start = mesh.positions.clone();
     let batch = task.config.batch;
     let mut gradients = Vec::new();
     let steps = match placement {
-        Placement::OnSurface => 2,
-        Placement::Nearest => 1,
+        VertexPlacement::OnSurface => 2,
+        VertexPlacement::Nearest => 1,
     };
     for _ in 0..steps {
-        let (values, slopes) = ask(field, &mesh.positions, batch, &stop)?;
+        let (values, slopes) = evaluate(field, &mesh.positions, batch, task.monitor)?;
         report.asked += values.len();
         let targets: Vec<Vec3> = match placement {
-            Placement::OnSurface => (0..values.len())
+            VertexPlacement::OnSurface => (0..values.len())
                 .map(|i| {
                     let step = newton(values[i], slopes[i]).filter(|_| !fixed[i]).unwrap_or(Vec3::ZERO);
                     mesh.positions[i] + step.clamp_length_max(reaches[i])
                 })
                 .collect(),
-            Placement::Nearest => {
+            VertexPlacement::Nearest => {
                 let points = middles(&mesh.positions, &mesh.triangles);
-                let (f, g) = ask(field, &points, batch, &stop)?;
+                let (f, g) = evaluate(field, &points, batch, task.monitor)?;
                 report.asked += f.len();
                 let signed = |f: &[f32], g: &[Vec3]| -> Vec<f32> {
                     let d = |(&f, &g): (&f32, &Vec3)| newton(f, g).map_or(0.0, |s| s.length().copysign(f));

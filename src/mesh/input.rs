@@ -1,0 +1,75 @@
+//! What callers give is checked: settings, meshes, and the answers of fields.
+
+use crate::geom::Mesh;
+use crate::{Error, Monitor, Result};
+use glam::Vec3;
+use std::fmt::Display;
+
+/// Refuses a setting that is not `ok`.
+pub(super) fn setting(ok: bool, key: &str, expected: &str, found: impl Display) -> Result<()> {
+    if ok { Ok(()) } else { Err(Error::cannot(format!("`mesh.{key}` is {found}, expected {expected}"), "")) }
+}
+
+/// Refuses triangles over vertices that are not there or not finite.
+pub(super) fn sound(mesh: &Mesh) -> Result<()> {
+    let damaged = |what| {
+        let hint = "the mesh is damaged: export it again, or remove these vertices and triangles";
+        Err(Error::cannot(what, hint))
+    };
+    let vertices = mesh.positions.len();
+    for (i, &v) in mesh.triangles.as_flattened().iter().enumerate() {
+        match mesh.positions.get(v as usize) {
+            None => {
+                let t = i / 3;
+                return damaged(format!("triangle {t} names vertex {v}, but the mesh has {vertices}"));
+            }
+            Some(p) if !p.is_finite() => {
+                let count = mesh.positions.iter().filter(|p| !p.is_finite()).count();
+                return damaged(format!(
+                    "{count} vertices of the mesh have a coordinate that is not finite, the first is vertex {v}"
+                ));
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Refuses more vertices than 32-bit indices can name.
+pub(super) fn few_enough(vertices: u64, triangles: u64) -> Result<()> {
+    if vertices.max(triangles) <= u64::from(u32::MAX) {
+        return Ok(());
+    }
+    let message = format!("the surface has {vertices} vertices, more than 32-bit indices can name");
+    Err(Error::cannot(message, "lower `mesh.resolution`"))
+}
+
+/// Refuses answers of another number than the points.
+pub(super) fn answered(what: &str, points: usize, answers: usize) -> Result<()> {
+    if points == answers {
+        return Ok(());
+    }
+    let message = format!("the {what} was asked at {points} points and answered {answers}");
+    Err(Error::cannot(message, "a field must return one value a point, in order"))
+}
+
+/// Values and gradients at points.
+pub(super) type Field<'a> = dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync + 'a;
+
+/// Evaluates a field at points, at most `batch` of them a call.
+pub(super) fn evaluate(
+    field: &Field,
+    points: &[Vec3],
+    batch: usize,
+    monitor: &dyn Monitor,
+) -> Result<(Vec<f32>, Vec<Vec3>)> {
+    let (mut values, mut gradients) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
+    for points in points.chunks(batch) {
+        monitor.check_stop()?;
+        let (f, g) = field(points);
+        answered("gradient", points.len(), f.len().min(g.len()))?;
+        values.extend(f);
+        gradients.extend(g);
+    }
+    Ok((values, gradients))
+}

@@ -1,0 +1,51 @@
+//! Vertices move towards a surface, none so far that it spoils a triangle.
+
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// The first-order step to a field's zero, `−f g / |g|²`; none where the field says nothing useful.
+pub(super) fn newton(f: f32, g: Vec3) -> Option<Vec3> {
+    let slope = g.length_squared();
+    let step = -f / slope * g;
+    (slope.is_finite() && slope >= 1e-12 && step.is_finite()).then_some(step)
+}
+
+/// Moves vertices all the way, half of it, a quarter, or not at all where a triangle would be spoiled; returns how many
+/// were held back.
+///
+/// `at(v, p, share)` is where vertex `v`, now at `p`, is after that share of its way. `spoiled(t, from, to)` is only
+/// asked for triangles of which a vertex moved.
+pub(super) fn move_vertices(
+    positions: &mut [Vec3],
+    triangles: &[[u32; 3]],
+    at: impl Fn(usize, Vec3, f32) -> Vec3,
+    spoiled: impl Fn(usize, &[Vec3], &[Vec3]) -> bool + Sync,
+) -> usize {
+    const SHARES: [f32; 4] = [0.0, 0.25, 0.5, 1.0];
+    let from = positions.to_vec();
+    positions.iter_mut().enumerate().for_each(|(v, p)| *p = at(v, *p, 1.0));
+    let mut share = vec![3u8; from.len()];
+    let mut watched: Vec<usize> = (0..triangles.len()).collect();
+    loop {
+        let moved = |t: usize| triangles[t].iter().any(|&v| from[v as usize] != positions[v as usize]);
+        let bad: Vec<usize> =
+            watched.into_par_iter().filter(|&t| moved(t) && spoiled(t, &from, positions)).collect();
+        let mut corners: Vec<u32> =
+            bad.iter().flat_map(|&t| triangles[t]).filter(|&v| share[v as usize] > 0).collect();
+        // triangles that were spoiled from the start stay so without anyone to hold back
+        if corners.is_empty() {
+            break;
+        }
+        corners.sort_unstable();
+        corners.dedup();
+        let mut changed = vec![false; from.len()];
+        for v in corners.into_iter().map(|v| v as usize) {
+            share[v] -= 1;
+            changed[v] = true;
+            positions[v] = at(v, from[v], SHARES[share[v] as usize]);
+        }
+        let touched = |t: &usize| triangles[*t].iter().any(|&v| changed[v as usize]);
+        watched = (0..triangles.len()).filter(touched).collect();
+    }
+    share.iter().filter(|&&s| s < 3).count()
+}
