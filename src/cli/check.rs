@@ -121,7 +121,7 @@ fn picture_of_material(mtl: &Path) -> Option<String> {
     picture_of_mtl(&io::read_bytes(mtl, &Limits::default()).ok()?, mtl).ok()?
 }
 
-pub(super) fn go(
+pub(super) fn run(
     common: &Common,
     path: &Path,
     require: &[String],

@@ -5,7 +5,7 @@ use crate::Result;
 use clap::Command;
 use clap_complete::{Shell, generate};
 
-pub(super) fn go(shell: Shell, command: &mut Command) -> Result<()> {
+pub(super) fn run(shell: Shell, command: &mut Command) -> Result<()> {
     let mut script = Vec::new();
     generate(shell, command, "tiface", &mut script);
     print(&String::from_utf8_lossy(&script))?;

@@ -2,19 +2,19 @@
 
 use super::options::Common;
 use super::stdout::print;
-use super::target::Target;
+use super::target::RunTarget;
 use crate::Result;
 use crate::config::explain;
 use std::path::Path;
 
-pub(super) fn go(common: &Common, path: Option<&Path>, key: Option<&str>) -> Result<()> {
+pub(super) fn run(common: &Common, path: Option<&Path>, key: Option<&str>) -> Result<()> {
     if let Some(key) = key {
         print(&explain(key)?)?;
         return Ok(());
     }
     // without a capture or run it is the configuration of a run that is yet to be
     let saved = match path.or(common.run.as_deref()) {
-        Some(path) => Target::find(common, Some(path))?.saved,
+        Some(path) => RunTarget::find(common, Some(path))?.saved,
         None => None,
     };
     print(&common.resolve(saved.as_deref(), None, &[])?.to_toml())?;

@@ -7,7 +7,7 @@ use crate::pipeline::{capture_options, disagreements};
 use crate::{Error, Result};
 use std::path::Path;
 
-pub(super) fn go(common: &Common, capture: &Path) -> Result<()> {
+pub(super) fn run(common: &Common, capture: &Path) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
     let options = capture_options(&config);
     let mut found = inspect(capture, &options);

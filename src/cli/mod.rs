@@ -3,31 +3,36 @@
 //! Data goes to stdout, everything else to stderr; the exit code says whether to try again
 //! ([`crate::ErrorKind`]).
 
-use crate::{Error, Result};
+mod bar;
 mod check;
 mod completions;
 mod config;
 mod demo;
 mod inspect;
-mod line;
 mod options;
 mod out;
 mod page;
 mod plain;
+mod run;
 mod screen;
 mod signals;
 mod status;
 mod stdout;
+mod summary;
 mod target;
 
 use crate::pipeline::Stage;
 use crate::run::Stop;
+use crate::{Error, Result};
 use clap::{Args, CommandFactory, Parser, Subcommand};
-use options::Common;
+use options::{Common, KeyOption};
 use out::Out;
+use run::LineCommand;
 use screen::Screen;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
+use target::RunTarget;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -57,7 +62,7 @@ struct Cli {
 
 /// What a stage command works on.
 #[derive(Args, Debug)]
-struct Place {
+struct CaptureOrRun {
     /// A capture (a folder of photographs with cameras) or a run; without one, the run in this
     /// folder, else the newest under runs/
     #[arg(value_name = "CAPTURE|RUN")]
@@ -66,7 +71,7 @@ struct Place {
 
 /// Masks from clicks.
 #[derive(Args, Debug, Default)]
-struct Clicks {
+struct ClickOptions {
     /// Make masks from the clicks in this prompts.json
     #[arg(long, alias = "points", value_name = "FILE")]
     prompts: Option<PathBuf>,
@@ -90,32 +95,30 @@ struct Clicks {
     onnxruntime: Option<PathBuf>,
 }
 
-impl Clicks {
+impl ClickOptions {
     /// As keys of the configuration; files by their absolute path, so that the run remembers them from anywhere.
-    fn keys(&self) -> Result<Vec<(String, String, String)>> {
-        let mut keys = Vec::new();
-        let files = [
-            ("--prompts", "mask.prompts", &self.prompts),
-            ("--sam", "mask.sam", &self.sam),
-            ("--sam-decoder", "mask.sam_decoder", &self.sam_decoder),
-            ("--vitmatte", "mask.vitmatte", &self.vitmatte),
-            ("--onnxruntime", "mask.onnxruntime", &self.onnxruntime),
-        ];
-        for (option, key, file) in files {
-            let Some(file) = file else { continue };
+    fn keys(&self) -> Result<Vec<KeyOption>> {
+        let file = |option: &str, key: &str, file: &Option<PathBuf>| -> Result<Option<KeyOption>> {
+            let Some(file) = file else { return Ok(None) };
             let path = crate::io::real_path(file)?;
             let text = path.to_str().ok_or_else(|| {
                 Error::cannot(format!("the path `{}` is not UTF-8", path.display()), "rename the file")
             })?;
-            keys.push((format!("{option} {}", file.display()), key.into(), text.into()));
-        }
+            Ok(Some((format!("{option} {}", file.display()), key.into(), text.into())))
+        };
+        let files = [
+            file("--prompts", "mask.prompts", &self.prompts)?,
+            file("--sam", "mask.sam", &self.sam)?,
+            file("--sam-decoder", "mask.sam_decoder", &self.sam_decoder)?,
+            file("--vitmatte", "mask.vitmatte", &self.vitmatte)?,
+            file("--onnxruntime", "mask.onnxruntime", &self.onnxruntime)?,
+        ];
+        let mut keys: Vec<KeyOption> = files.into_iter().flatten().collect();
         if !self.point.is_empty() {
             let list = serde_json::json!(self.point).to_string();
             keys.push((format!("--point {}", self.point.join(" --point ")), "mask.point".into(), list));
         }
-        if let Some(view) = &self.view {
-            keys.push((format!("--view {view}"), "mask.view".into(), view.clone()));
-        }
+        keys.extend(key_options([("--view", "mask.view", self.view.as_deref())]));
         Ok(keys)
     }
 }
@@ -131,9 +134,9 @@ enum Command {
   tiface run captures/002_00 --require psnr=28      exit code 3 if the views are worse than that")]
     Run {
         #[command(flatten)]
-        place: Place,
+        place: CaptureOrRun,
         #[command(flatten)]
-        clicks: Clicks,
+        clicks: ClickOptions,
         /// Exit with 3 below this bar: watertight, psnr=DB (masked, the best of all); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
@@ -162,13 +165,13 @@ enum Command {
   tiface mask captures/002_00 --prompts prompts.json --sam encoder.onnx --sam-decoder decoder.onnx \\
       --vitmatte vitmatte.onnx
 
-Click the face, the hair and every garment of another colour, and the background twice; on three photographs
+Click the face, the hair and every garment of another color, and the background twice; on three photographs
 from different sides. The other views follow from the cameras.")]
     Mask {
         #[command(flatten)]
-        place: Place,
+        place: CaptureOrRun,
         #[command(flatten)]
-        clicks: Clicks,
+        clicks: ClickOptions,
         /// Write an annotation page to click on instead, to --out or <capture>_clicks.html
         #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "onnxruntime"])]
         page: bool,
@@ -180,28 +183,19 @@ from different sides. The other views follow from the cameras.")]
   tiface tface captures/002_00 --run runs/ce --set tface.mask_loss=ce
   tiface tface captures/002_00 --set tface.fields=3    the mean of three fields
   tiface tface captures/002_00 --set tface.import=official.th")]
-    Tface {
-        #[command(flatten)]
-        place: Place,
-    },
+    Tface(CaptureOrRun),
     /// Stage: learn one such field from whole photographs, to compare T-Face with
     #[command(after_long_help = "Examples:
   tiface baseline captures/002_00
   tiface baseline runs/002_00                   go on after a stop
   tiface baseline runs/002_00 --fresh baseline --set baseline.steps=20000")]
-    Baseline {
-        #[command(flatten)]
-        place: Place,
-    },
+    Baseline(CaptureOrRun),
     /// Stage: learn I-Face, a signed-distance field
     #[command(after_long_help = "Examples:
   tiface iface captures/002_00
   tiface iface runs/002_00                      go on after a stop
   tiface iface runs/002_00 --fresh iface --set iface.steps=30000")]
-    Iface {
-        #[command(flatten)]
-        place: Place,
-    },
+    Iface(CaptureOrRun),
     /// Stage: extract the watertight mesh, simplify it, bake its texture
     #[command(after_long_help = "Examples:
   tiface mesh runs/002_00
@@ -210,7 +204,7 @@ from different sides. The other views follow from the cameras.")]
   tiface mesh runs/002_00 --fresh mesh --triangles 20000 --texture 4096 --lobes 1 --normal-map")]
     Mesh {
         #[command(flatten)]
-        place: Place,
+        place: CaptureOrRun,
         /// Files to write: glb, obj, ply
         #[arg(long, value_name = "LIST")]
         format: Option<String>,
@@ -220,10 +214,10 @@ from different sides. The other views follow from the cameras.")]
         /// Triangles of the product; 0 keeps all
         #[arg(long, value_name = "N")]
         triangles: Option<String>,
-        /// Texels along each side of the texture; 0: colours at the vertices
+        /// Texels along each side of the texture; 0: colors at the vertices
         #[arg(long, value_name = "PX")]
         texture: Option<String>,
-        /// Degree of view-dependent colour in the GLB: 0, 1 or 2
+        /// Degree of view-dependent color in the GLB: 0, 1 or 2
         #[arg(long, value_name = "DEGREE")]
         lobes: Option<String>,
         /// Put the detail that simplification takes into a normal map; the GLB's material is lit then
@@ -244,7 +238,7 @@ Views of other cameras than the held-out ones lie in render/paths/, one folder f
 the held-out views, their blend and the metrics alone; --fresh render then makes only that path anew.")]
     Render {
         #[command(flatten)]
-        place: Place,
+        place: CaptureOrRun,
         /// test (the held-out views); train, orbit or a file (a nerfstudio camera path or a
         /// transforms.json), into a folder of their own
         #[arg(long, value_name = "WHICH")]
@@ -270,7 +264,7 @@ Without --weights, they are fitted on small squares of the training photographs 
 learned from (capture.tiles): the blend follows the better member.")]
     Ensemble {
         #[command(flatten)]
-        place: Place,
+        place: CaptureOrRun,
         /// Whose views: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured (head.glb)
         #[arg(long, value_name = "LIST")]
         members: Option<String>,
@@ -281,7 +275,7 @@ learned from (capture.tiles): the blend follows the better member.")]
     /// Stage: compare views and blends with held-out photographs
     Metrics {
         #[command(flatten)]
-        place: Place,
+        place: CaptureOrRun,
         /// Exit with 3 below this bar: watertight, psnr=DB (masked, the best of all); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
@@ -322,7 +316,7 @@ learned from (capture.tiles): the blend follows the better member.")]
   tiface config --explain iface.steps           a whole table: --explain mesh")]
     Config {
         #[command(flatten)]
-        place: Place,
+        place: CaptureOrRun,
         /// Say what a key or a table means, its range and its value in every preset
         #[arg(long, value_name = "KEY")]
         explain: Option<String>,
@@ -334,9 +328,19 @@ learned from (capture.tiles): the blend follows the better member.")]
     },
 }
 
+/// What every command works with.
+struct Session<'a> {
+    /// The options that every command shares.
+    common: &'a Common,
+    /// Where people see what happens.
+    screen: Arc<Screen>,
+    /// Set when somebody asks to stop.
+    stop: Stop,
+}
+
 /// Parses the command line, does what it says, and gives the exit code.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let Cli { command, common } = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
             // help and version end here too, with 0; a closed stdout is no error
@@ -344,91 +348,93 @@ pub fn main() -> ExitCode {
             return ExitCode::from(e.exit_code() as u8);
         }
     };
-    let screen = Screen::new(&cli.common);
-    cli.common.log();
-    let stop = Stop::new();
-    let ended = signals::listen(&stop, &screen).and_then(|()| cli.run(&screen, &stop));
+    let session = Session { common: &common, screen: Screen::new(&common), stop: Stop::new() };
+    common.log();
+    let makes_nothing = |command: &str| Out::none(common.out.as_deref(), command);
+    let ended = signals::listen(&session).and_then(|()| match &command {
+        Command::Demo => demo::run(&session),
+        Command::Mask { place, clicks, page: true } => {
+            page::run(&session, place.path.as_deref(), clicks.prompts.as_deref())
+        }
+        Command::Inspect { capture } => {
+            makes_nothing("inspect").and_then(|()| inspect::run(&common, capture))
+        }
+        Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
+            .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
+        Command::Status { runs } => makes_nothing("status").and_then(|()| status::run(&common, runs)),
+        Command::Config { place, explain } => makes_nothing("config")
+            .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),
+        Command::Completions { shell } => {
+            makes_nothing("completions").and_then(|()| completions::run(*shell, &mut Cli::command()))
+        }
+        stages => run::run(&session, &stages.on_line(&common)?),
+    });
     ExitCode::from(match ended {
         Ok(()) => 0,
         Err(error) => {
-            screen.error(&error);
+            session.screen.error(&error);
             error.kind().code()
         }
     })
 }
 
-impl Cli {
-    fn run(&self, screen: &Screen, stop: &Stop) -> Result<()> {
-        let common = &self.common;
-        // options of one command are keys of the configuration under a shorter name
-        let keys = |pairs: &[(&str, &str, &Option<String>)]| -> Vec<(String, String, String)> {
-            let given = pairs.iter().filter_map(|(option, key, value)| {
-                value.as_ref().map(|v| (format!("{option} {v}"), key.to_string(), v.clone()))
-            });
-            given.collect()
-        };
-        let works = |place: &Place, product: &str, until: Stage, require: &[String], extra: &[_]| {
-            line::go(common, place.path.as_deref(), product, until, require, extra, screen, stop)
-        };
-        let line = |place: &Place, stage: Stage, extra: &[_]| works(place, stage.word(), stage, &[], extra);
-        let nothing = |command: &str| Out::none(common.out.as_deref(), command);
-        match &self.command {
-            Command::Run { place, clicks, require } => {
-                works(place, "run", Stage::Metrics, require, &clicks.keys()?)
-            }
-            Command::Demo => demo::go(common, screen, stop),
-            Command::Inspect { capture } => nothing("inspect").and_then(|()| inspect::go(common, capture)),
-            Command::Mask { place, clicks, page: true } => {
-                page::go(common, place.path.as_deref(), clicks.prompts.as_deref(), screen)
-            }
-            Command::Mask { place, clicks, page: false } => line(place, Stage::Mask, &clicks.keys()?),
-            Command::Baseline { place } => line(place, Stage::Baseline, &[]),
-            Command::Tface { place } => line(place, Stage::Tface, &[]),
-            Command::Iface { place } => line(place, Stage::Iface, &[]),
+impl Command {
+    /// What a command on stages does on the line.
+    fn on_line(&self, common: &Common) -> Result<LineCommand<'_>> {
+        let on = |flag: bool, value: &'static str| flag.then_some(value);
+        let (place, until, keys) = match self {
+            Command::Run { place, clicks, .. } => (place, Stage::Metrics, clicks.keys()?),
+            Command::Mask { place, clicks, .. } => (place, Stage::Mask, clicks.keys()?),
+            Command::Baseline(place) => (place, Stage::Baseline, Vec::new()),
+            Command::Tface(place) => (place, Stage::Tface, Vec::new()),
+            Command::Iface(place) => (place, Stage::Iface, Vec::new()),
             Command::Mesh { place, format, frame, triangles, texture, lobes, normal_map, no_cap } => {
-                let given = |flag: bool, value: &str| flag.then(|| value.to_owned());
-                let extra = keys(&[
-                    ("--format", "mesh.format", format),
-                    ("--frame", "mesh.frame", frame),
-                    ("--triangles", "mesh.triangles", triangles),
-                    ("--texture", "mesh.texture_px", texture),
-                    ("--lobes", "mesh.lobes", lobes),
-                    ("--normal-map", "mesh.normal_map", &given(*normal_map, "true")),
-                    ("--no-cap", "mesh.cap", &given(*no_cap, "false")),
+                let keys = key_options([
+                    ("--format", "mesh.format", format.as_deref()),
+                    ("--frame", "mesh.frame", frame.as_deref()),
+                    ("--triangles", "mesh.triangles", triangles.as_deref()),
+                    ("--texture", "mesh.texture_px", texture.as_deref()),
+                    ("--lobes", "mesh.lobes", lobes.as_deref()),
+                    ("--normal-map", "mesh.normal_map", on(*normal_map, "true")),
+                    ("--no-cap", "mesh.cap", on(*no_cap, "false")),
                 ]);
-                line(place, Stage::Mesh, &extra)
+                (place, Stage::Mesh, keys)
             }
             Command::Render { place, cameras, method, format, background } => {
-                let extra = keys(&[
-                    ("--cameras", "render.cameras", cameras),
-                    ("--with", "render.method", method),
-                    ("--format", "render.format", format),
-                    ("--background", "render.background", background),
+                let keys = key_options([
+                    ("--cameras", "render.cameras", cameras.as_deref()),
+                    ("--with", "render.method", method.as_deref()),
+                    ("--format", "render.format", format.as_deref()),
+                    ("--background", "render.background", background.as_deref()),
                 ]);
-                line(place, Stage::Render, &extra)
+                (place, Stage::Render, keys)
             }
             Command::Ensemble { place, members, weights } => {
-                let extra = keys(&[
-                    ("--members", "ensemble.members", members),
-                    ("--weights", "ensemble.weights", weights),
+                let keys = key_options([
+                    ("--members", "ensemble.members", members.as_deref()),
+                    ("--weights", "ensemble.weights", weights.as_deref()),
                 ]);
-                line(place, Stage::Ensemble, &extra)
+                (place, Stage::Ensemble, keys)
             }
-            Command::Metrics { place, require } => works(place, "metrics", Stage::Metrics, require, &[]),
-            Command::Check { mesh, require, against, seen_by } => {
-                nothing("check")?;
-                check::go(common, mesh, require, against.as_deref(), seen_by.as_deref())
-            }
-            Command::Status { runs } => nothing("status").and_then(|()| status::go(common, runs)),
-            Command::Config { place, explain } => {
-                nothing("config")?;
-                config::go(common, place.path.as_deref(), explain.as_deref())
-            }
-            Command::Completions { shell } => {
-                nothing("completions").and_then(|()| completions::go(*shell, &mut Cli::command()))
-            }
-        }
+            Command::Metrics { place, .. } => (place, Stage::Metrics, Vec::new()),
+            other => unreachable!("{other:?} does not work on the line"),
+        };
+        let (product, require) = match self {
+            Command::Run { require, .. } => ("run", &require[..]),
+            Command::Metrics { require, .. } => ("metrics", &require[..]),
+            _ => (until.word(), &[][..]),
+        };
+        let target = RunTarget::find(common, place.path.as_deref())?;
+        Ok(LineCommand { product, until, target, require, keys, fallback: None })
     }
+}
+
+/// Options of one command that are keys of the configuration under a shorter name: those that were given.
+fn key_options<const N: usize>(options: [(&str, &str, Option<&str>); N]) -> Vec<KeyOption> {
+    let given = options.into_iter().filter_map(|(option, key, value)| {
+        value.map(|v| (format!("{option} {v}"), key.to_string(), v.to_string()))
+    });
+    given.collect()
 }
 
 #[cfg(test)]

@@ -3,24 +3,12 @@
 use crate::config::{Config, Preset, Sources, Stage};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
-use clap::{Args, ValueEnum};
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clap::{Args, ColorChoice};
 use std::path::{Path, PathBuf};
 
-/// When to colour messages.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub(super) enum When {
-    #[default]
-    Auto,
-    Always,
-    Never,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(super) enum PresetName {
-    Draft,
-    Standard,
-    Paper,
-}
+/// An option of one command that is a key of the configuration: as typed, the key, its value.
+pub(super) type KeyOption = (String, String, String);
 
 #[derive(Args, Debug, Default)]
 #[command(next_help_heading = "Options of all commands")]
@@ -36,8 +24,9 @@ pub(super) struct Common {
     #[arg(short, long, global = true, value_name = "FILE", env = "TIFACE_CONFIG", hide_env = true)]
     pub config: Vec<PathBuf>,
     /// Starting values
-    #[arg(long, global = true, value_enum, env = "TIFACE_PRESET", hide_env = true)]
-    pub preset: Option<PresetName>,
+    #[arg(long, global = true, env = "TIFACE_PRESET", hide_env = true)]
+    #[arg(value_parser = PossibleValuesParser::new(Preset::ALL.map(Preset::name)).try_map(|word| word.parse::<Preset>()))]
+    pub preset: Option<Preset>,
     /// Set a key of the configuration; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
@@ -62,9 +51,9 @@ pub(super) struct Common {
     /// More about what happens; twice for all
     #[arg(short, long, global = true, action = clap::ArgAction::Count)]
     pub verbose: u8,
-    /// Colour in messages
+    /// Color in messages
     #[arg(long, global = true, value_enum, default_value_t, value_name = "WHEN")]
-    pub color: When,
+    pub color: ColorChoice,
 }
 
 impl Common {
@@ -86,37 +75,26 @@ impl Common {
             .try_init();
     }
 
-    /// Should messages on stderr be coloured?
+    /// Should messages on stderr be colored?
     pub fn colored(&self) -> bool {
         use std::io::IsTerminal;
         match self.color {
-            When::Always => true,
-            When::Never => false,
-            When::Auto => {
+            ColorChoice::Always => true,
+            ColorChoice::Never => false,
+            ColorChoice::Auto => {
                 std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()) && std::io::stderr().is_terminal()
             }
         }
     }
 
-    /// `--preset`.
-    pub fn preset(&self) -> Option<Preset> {
-        self.preset.map(|p| match p {
-            PresetName::Draft => Preset::Draft,
-            PresetName::Standard => Preset::Standard,
-            PresetName::Paper => Preset::Paper,
-        })
-    }
-
     /// The configuration: the user's own file, the run's (`saved`), `--config`, `--set`, options.
     ///
-    /// `fallback` is the preset where nothing names one, and what it starts with on top of that, as TOML;
-    /// `extra` are options of one command: as
-    /// typed, key, value.
+    /// `fallback` is the preset where nothing names one, and what it starts with on top of that, as TOML.
     pub fn resolve(
         &self,
         saved: Option<&Path>,
         fallback: Option<(Preset, &str)>,
-        extra: &[(String, String, String)],
+        options: &[KeyOption],
     ) -> Result<Config> {
         let mut files = Vec::new();
         if let Some(own) = own_file().filter(|f| io::is_file(f)) {
@@ -132,7 +110,7 @@ impl Common {
             sources.preset = Some(preset);
             sources.files.push(("built in".into(), text.into()));
         } else {
-            sources.preset = self.preset();
+            sources.preset = self.preset;
         }
         for file in files {
             let limits = Limits { file_bytes: 1 << 20, ..Limits::default() };
@@ -148,8 +126,8 @@ impl Common {
         if let Some(seed) = self.seed {
             sources.options.push((format!("--seed {seed}"), "seed".into(), seed.to_string()));
         }
-        sources.options.extend_from_slice(extra);
-        Ok(Config::resolve(&sources)?)
+        sources.options.extend_from_slice(options);
+        Config::resolve(&sources)
     }
 }
 

@@ -3,7 +3,11 @@
 //! An ending that the product has is a file of that kind; a folder, there already or named with a `/` at its end,
 //! takes the product under its own names; all else is refused.
 
+use super::target::DEMO_CAPTURE;
+use crate::config::MeshFormat;
 use crate::io;
+use crate::pipeline::{Line, Stage};
+use crate::run::Run;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
@@ -64,8 +68,20 @@ impl Out {
         }
     }
 
+    /// Refuses a folder inside the run that would be copied into it, and a mesh where none of these stages makes one.
+    pub fn check(&self, run: &Path, stages: &[Stage]) -> Result<()> {
+        let mesh = matches!(self, Out::File(_, ending) if mesh_format(ending).is_some());
+        if mesh && !stages.contains(&Stage::Mesh) {
+            return Err(Error::usage(
+                "no mesh is made with these settings, so `--out` has none to write",
+                "use `tiface mesh --out head.glb`",
+            ));
+        }
+        self.is_outside(run)
+    }
+
     /// Refuses a folder inside the run that would be copied into it.
-    pub fn is_outside(&self, run: &Path) -> Result<()> {
+    fn is_outside(&self, run: &Path) -> Result<()> {
         let Out::Folder(folder) = self else { return Ok(()) };
         let there = folder
             .ancestors()
@@ -79,6 +95,46 @@ impl Out {
         }
     }
 
+    /// Puts the command's product where `--out` says, and returns what was written.
+    pub fn write(&self, product: &str, line: &Line, run: &Run) -> Result<Vec<PathBuf>> {
+        match self {
+            Out::File(file, ending) if let Some(format) = mesh_format(ending) => {
+                let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
+                let exported =
+                    line.read_product()?.files(format, &line.export(), line.mesh_config(), stem)?;
+                exported.warnings.iter().for_each(|w| run.warn("mesh", w));
+                let files = exported.files;
+                // the mesh names its pictures: it comes last, and under the name that was asked for
+                let mut written = vec![file.clone()];
+                for (name, bytes) in files.iter().skip(1).rev() {
+                    written.push(file.with_file_name(name));
+                    io::write_atomic(&written[written.len() - 1], bytes)?;
+                }
+                io::write_atomic(file, &files[0].1)?;
+                Ok(written)
+            }
+            Out::File(file, ending) if ending == "json" => {
+                copy_file(&run.path("metrics/metrics.json"), file)?;
+                Ok(vec![file.clone()])
+            }
+            // no stage makes another file: `Out::find` has refused it
+            Out::File(file, _) => Ok(vec![file.clone()]),
+            Out::Folder(folder) => {
+                io::create_folder(folder)?;
+                // fields, and pictures that only another stage can read, stay where they are
+                match product {
+                    "run" => copy_folder(run.dir(), folder, &["baseline", "tface", "iface", DEMO_CAPTURE])?,
+                    "render" => copy_folder(&run.path(line.views()), folder, &["float", "paths"])?,
+                    stage => copy_folder(&run.path(stage), folder, &["float", "parts"])?,
+                }
+                if product == "metrics" {
+                    copy_file(&run.path("report.html"), &folder.join("report.html"))?;
+                }
+                Ok(vec![folder.clone()])
+            }
+        }
+    }
+
     /// The file to write: the one that was named, or `name` in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         match self {
@@ -86,6 +142,37 @@ impl Out {
             Out::Folder(folder) => folder.join(name),
         }
     }
+}
+
+/// The format that an ending means.
+fn mesh_format(ending: &str) -> Option<MeshFormat> {
+    match ending {
+        "glb" => Some(MeshFormat::Glb),
+        "obj" => Some(MeshFormat::Obj),
+        "ply" => Some(MeshFormat::Ply),
+        _ => None,
+    }
+}
+
+fn copy_file(from: &Path, to: &Path) -> Result<()> {
+    Ok(io::write_atomic(to, &io::read_bytes(from, &io::Limits::default())?)?)
+}
+
+/// All files but those that tell of the work, and all folders but those named; deeper down none but
+/// the views kept in float is left out.
+fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<()> {
+    io::create_folder(to)?;
+    for name in io::list_files(from)? {
+        if !["done.json", "status.json", "log.jsonl"].contains(&name.as_str()) {
+            copy_file(&from.join(&name), &to.join(&name))?;
+        }
+    }
+    for folder in io::list_folders(from)? {
+        if let Some(name) = folder.file_name().filter(|n| !left.iter().any(|k| n == k)) {
+            copy_folder(&folder, &to.join(name), &["float", "parts"])?;
+        }
+    }
+    Ok(())
 }
 
 fn writable(folder: &Path) -> Result<()> {

@@ -1,8 +1,7 @@
 //! `tiface mask --page`: one file to click on in a browser.
 
-use super::options::Common;
+use super::Session;
 use super::out::Out;
-use super::screen::Screen;
 use super::stdout::print;
 use crate::capture;
 use crate::io;
@@ -13,12 +12,8 @@ use std::path::{Path, PathBuf};
 
 /// Writes the page for a capture. Clicks that are there already, `prompts` or the capture's own `prompts.json`, are in
 /// it.
-pub(super) fn go(
-    common: &Common,
-    path: Option<&Path>,
-    prompts: Option<&Path>,
-    screen: &Screen,
-) -> Result<()> {
+pub(super) fn run(session: &Session, path: Option<&Path>, prompts: Option<&Path>) -> Result<()> {
+    let (common, screen) = (session.common, &session.screen);
     let asked = Out::find(common.out.as_deref(), "page")?;
     let Some(path) = path else {
         return Err(Error::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));

@@ -3,30 +3,30 @@
 use super::options::Common;
 use super::plain::indented;
 use crate::Error;
+use crate::pipeline::Stage;
 use crate::run::{Event, Observer};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 use std::io::{IsTerminal, Write};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Shows events: a line that moves on a terminal, else one plain line every 30 s; with `--json` one
 /// object per event on stdout.
-#[derive(Clone)]
-pub(super) struct Screen(Arc<Inner>);
-
-struct Inner {
+pub(super) struct Screen {
     json: bool,
     quiet: bool,
     colored: bool,
     terminal: bool,
-    state: Mutex<State>,
+    moving: Mutex<MovingLine>,
 }
 
+/// The line that moves, and what it is made of.
 #[derive(Default)]
-struct State {
+struct MovingLine {
     bar: Option<ProgressBar>,
-    told: Option<Instant>,
+    /// When progress was shown last, where it does not move.
+    last: Option<Instant>,
     /// The stages of the command that are to be worked on, in order, with the seconds that each may take.
     ahead: Vec<(String, f64)>,
 }
@@ -35,66 +35,64 @@ const PLAIN: Duration = Duration::from_secs(30);
 const OBJECTS: Duration = Duration::from_secs(1);
 
 impl Screen {
-    pub fn new(common: &Common) -> Screen {
-        Screen(Arc::new(Inner {
+    pub fn new(common: &Common) -> Arc<Screen> {
+        Arc::new(Screen {
             json: common.json,
             quiet: common.quiet,
             colored: common.colored(),
             terminal: std::io::stderr().is_terminal(),
-            state: Mutex::default(),
-        }))
+            moving: Mutex::default(),
+        })
     }
 
-    pub fn observer(&self) -> Arc<dyn Observer> {
-        self.0.clone()
+    fn moving(&self) -> MutexGuard<'_, MovingLine> {
+        self.moving.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The stages that are to come, with the seconds that each may take: what is left of one is not what is left of all.
     pub fn expect(&self, ahead: Vec<(String, f64)>) {
-        self.0.state.lock().unwrap_or_else(PoisonError::into_inner).ahead = ahead;
+        self.moving().ahead = ahead;
     }
 
     /// A remark for people: about what, and what.
     pub fn note(&self, head: &str, text: &str) {
-        if !self.0.quiet {
-            self.0.line(head, text);
+        if !self.quiet {
+            self.line(head, text);
         }
     }
 
-    /// The error and the way out, once; who asked to stop gets no error.
+    /// The error and the suggested fix, once; who asked to stop gets no error.
     pub fn error(&self, error: &Error) {
-        self.0.end();
+        self.end();
         let (message, hint) = (error.to_string(), error.hint());
         if message.is_empty() {
             return; // the command has printed what is wrong
         }
         let asked = error.kind().is_stop();
-        if self.0.json {
+        if self.json {
             let event = if asked { "stopped" } else { "error" };
-            self.0.object(
-                json!({"event": event, "exit": error.kind().code(), "message": message, "hint": hint}),
+            self.object(
+                &json!({"event": event, "exit": error.kind().code(), "message": message, "hint": hint}),
             );
         }
         if asked {
-            let way = if hint.is_empty() { String::new() } else { format!("; {hint}") };
-            return self.note("stopped", &format!("{message}{way}"));
+            let hint = if hint.is_empty() { String::new() } else { format!("; {hint}") };
+            return self.note("stopped", &format!("{message}{hint}"));
         }
         let paint = |code: &str, word: &str| {
-            if self.0.colored { format!("\x1b[{code}m{word}\x1b[0m") } else { word.to_string() }
+            if self.colored { format!("\x1b[{code}m{word}\x1b[0m") } else { word.to_string() }
         };
-        self.0.line(&paint("1;31", "error"), &message);
+        self.line(&paint("1;31", "error"), &message);
         if !hint.is_empty() {
-            self.0.line(&format!("\n{}", paint("1;36", "hint")), hint);
+            self.line(&format!("\n{}", paint("1;36", "hint")), hint);
         }
     }
-}
 
-impl Inner {
     /// Above the moving line, if there is one: a word of ours, and a text that may quote files. A closed stderr is
     /// nothing to complain about.
     fn line(&self, head: &str, text: &str) {
         let text = indented(text);
-        let bar = self.state.lock().unwrap_or_else(PoisonError::into_inner).bar.clone();
+        let bar = self.moving().bar.clone();
         let print = || {
             let _ = writeln!(std::io::stderr(), "{head}: {text}");
         };
@@ -104,27 +102,26 @@ impl Inner {
         }
     }
 
-    fn object(&self, value: Value) {
+    fn object(&self, value: &Value) {
         // a reader that has gone away does not stop the work
         let _ = super::stdout::print(&format!("{value}\n"));
     }
 
     fn begin(&self, stage: &str) {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        state.told = None;
+        let mut moving = self.moving();
+        moving.last = None;
         if self.terminal && !self.quiet {
             let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
             let style = ProgressStyle::with_template("{prefix:>8} {spinner} {wide_msg}");
             bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()));
             bar.set_prefix(stage.to_string());
             bar.enable_steady_tick(Duration::from_millis(200));
-            state.bar = Some(bar);
+            moving.bar = Some(bar);
         }
     }
 
     fn end(&self) {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(bar) = state.bar.take() {
+        if let Some(bar) = self.moving().bar.take() {
             bar.finish_and_clear();
         }
     }
@@ -132,94 +129,71 @@ impl Inner {
     /// How many stages come after this one, and the seconds left of all together when of this one `eta_s` are left
     /// and it takes `all_s`: the others are as much slower or faster than was estimated as this one is.
     fn after(&self, stage: &str, eta_s: Option<f64>, all_s: Option<f64>) -> (usize, Option<f64>) {
-        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(at) = state.ahead.iter().position(|(s, _)| s == stage) else { return (0, eta_s) };
-        let later = &state.ahead[at + 1..];
+        let moving = self.moving();
+        let Some(at) = moving.ahead.iter().position(|(s, _)| s == stage) else { return (0, eta_s) };
+        let later = &moving.ahead[at + 1..];
         // other stages count several things one after the other
-        let learns = ["baseline", "tface", "iface"].contains(&stage);
-        let pace = all_s.filter(|_| learns).map_or(1.0, |s| s / state.ahead[at].1.max(1.0)).clamp(0.02, 50.0);
+        let learns = stage.parse().is_ok_and(Stage::learns);
+        let pace =
+            all_s.filter(|_| learns).map_or(1.0, |s| s / moving.ahead[at].1.max(1.0)).clamp(0.02, 50.0);
         (later.len(), eta_s.map(|eta| eta + pace * later.iter().map(|(_, seconds)| seconds).sum::<f64>()))
     }
 
     /// Is it time for the next plain line or object?
-    fn due(&self, every: Duration, last: bool) -> bool {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        let due = last || state.told.is_none_or(|t| t.elapsed() >= every);
+    fn due(&self, every: Duration, last_step: bool) -> bool {
+        let mut moving = self.moving();
+        let due = last_step || moving.last.is_none_or(|t| t.elapsed() >= every);
         if due {
-            state.told = Some(Instant::now());
+            moving.last = Some(Instant::now());
         }
         due
     }
 }
 
-impl Observer for Inner {
+impl Observer for Screen {
     fn event(&self, event: &Event) {
-        match *event {
+        let (head, text) = match *event {
             Event::Started { stage } => {
                 self.begin(stage);
-                if self.json {
-                    self.object(json!({"event": "started", "stage": stage}));
-                }
+                (stage.to_string(), String::new())
             }
             Event::Progress { stage, step, steps, rate, eta_s, values } => {
-                let last = step >= steps;
                 let all_s = rate.filter(|r| *r > 0.0).map(|r| steps as f64 / r);
                 let (after, run_eta_s) = self.after(stage, eta_s, all_s);
-                if self.json && self.due(OBJECTS, last) {
-                    let values: Map<String, Value> =
-                        values.iter().map(|(k, v)| (k.to_string(), Value::from(*v))).collect();
-                    self.object(json!({"event": "progress", "stage": stage, "step": step, "steps": steps,
-                        "rate": rate, "eta_s": eta_s, "stages_after": after, "run_eta_s": run_eta_s,
-                        "values": values}));
-                }
-                if self.quiet {
-                    return;
+                if self.json && self.due(OBJECTS, step >= steps) {
+                    let mut object = json!(event);
+                    object["stages_after"] = json!(after);
+                    object["run_eta_s"] = json!(run_eta_s);
+                    self.object(&object);
                 }
                 let text = progress(step, steps, rate, eta_s, run_eta_s.filter(|_| after > 0), values);
-                let bar = self.state.lock().unwrap_or_else(PoisonError::into_inner).bar.clone();
+                let bar = self.moving().bar.clone();
                 match bar {
                     Some(bar) => bar.set_message(text),
-                    None if !self.json && self.due(PLAIN, false) => self.line(stage, &text),
+                    None if !self.quiet && !self.json && self.due(PLAIN, false) => self.line(stage, &text),
                     None => {}
                 }
+                return;
             }
-            Event::Done { stage, elapsed_s, summary } => {
+            Event::Done { stage, elapsed_s, .. } => {
                 self.end();
-                if self.json {
-                    self.object(
-                        json!({"event": "done", "stage": stage, "elapsed_s": elapsed_s, "summary": summary}),
-                    );
-                } else if !self.quiet {
-                    self.line(stage, &format!("done in {}", duration(elapsed_s)));
-                }
+                (stage.to_string(), format!("done in {}", duration(elapsed_s)))
             }
-            Event::Skipped { stage } => {
-                if self.json {
-                    self.object(json!({"event": "skipped", "stage": stage}));
-                } else if !self.quiet {
-                    self.line(stage, "already done");
-                }
-            }
-            Event::Note { stage, text } => {
-                if self.json {
-                    self.object(json!({"event": "note", "stage": stage, "text": text}));
-                } else if !self.quiet {
-                    self.line(stage, text);
-                }
-            }
-            Event::Warning { stage, text } => {
-                if self.json {
-                    self.object(json!({"event": "warning", "stage": stage, "text": text}));
-                }
-                if !self.quiet {
-                    self.line(&format!("{stage}: warning"), text);
-                }
-            }
+            Event::Skipped { stage } => (stage.to_string(), "already done".into()),
+            Event::Note { stage, text } => (stage.to_string(), text.into()),
+            Event::Warning { stage, text } => (format!("{stage}: warning"), text.into()),
+        };
+        if self.json {
+            self.object(&json!(event));
+        }
+        // a warning is for people too, whoever reads the objects
+        if !text.is_empty() && (!self.json || matches!(event, Event::Warning { .. })) {
+            self.note(&head, &text);
         }
     }
 }
 
-impl Drop for Inner {
+impl Drop for Screen {
     fn drop(&mut self) {
         self.end();
     }
@@ -300,10 +274,10 @@ mod tests {
         screen
             .expect([("mask", 10.0), ("tface", 100.0), ("render", 30.0)].map(|(s, t)| (s.into(), t)).into());
         // T-Face takes twice the estimate, and so may what comes after it: 50 + 2 * 30
-        assert_eq!(screen.0.after("tface", Some(50.0), Some(200.0)), (1, Some(110.0)));
-        assert_eq!(screen.0.after("mask", Some(5.0), None), (2, Some(135.0)));
-        assert_eq!(screen.0.after("render", None, None), (0, None));
-        assert_eq!(screen.0.after("other", Some(1.0), None), (0, Some(1.0)));
+        assert_eq!(screen.after("tface", Some(50.0), Some(200.0)), (1, Some(110.0)));
+        assert_eq!(screen.after("mask", Some(5.0), None), (2, Some(135.0)));
+        assert_eq!(screen.after("render", None, None), (0, None));
+        assert_eq!(screen.after("other", Some(1.0), None), (0, Some(1.0)));
         let line = progress(1, 3, None, Some(145.0), Some(550.0), &[]);
         assert_eq!(line, "1/3  2 min 25 s left, about 9 min 10 s of the run");
     }

@@ -11,7 +11,7 @@ use crate::{Error, Result};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-pub(super) fn go(common: &Common, runs: &[PathBuf]) -> Result<()> {
+pub(super) fn run(common: &Common, runs: &[PathBuf]) -> Result<()> {
     let all = match (runs.is_empty(), &common.run) {
         (false, _) => runs.to_vec(),
         (true, Some(run)) => vec![run.clone()],

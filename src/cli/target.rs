@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 /// What a command works on.
 #[derive(Debug, PartialEq)]
-pub(super) struct Target {
+pub(super) struct RunTarget {
     /// The run folder; need not exist.
     pub run: PathBuf,
     /// The capture, absolute; `None` if the run remembers it.
@@ -18,14 +18,17 @@ pub(super) struct Target {
     pub guessed: bool,
 }
 
+/// Where in its run the demo keeps its photographs.
+pub(super) const DEMO_CAPTURE: &str = "capture";
+
 const CAPTURE_FILES: [&str; 4] =
     ["transforms.json", "transforms_train.json", "poses_bounds.npy", "poses_bounds_train.npy"];
 
-impl Target {
+impl RunTarget {
     /// From the path on the command line and `--run`.
-    pub fn find(common: &Common, path: Option<&Path>) -> Result<Target> {
+    pub fn find(common: &Common, path: Option<&Path>) -> Result<RunTarget> {
         match path {
-            Some(path) if is_run(path) => Ok(Target::run(path.into(), false)),
+            Some(path) if is_run(path) => Ok(RunTarget::run(path.into(), false)),
             Some(path) => {
                 let capture = io::real_path(path)?;
                 let run = match &common.run {
@@ -37,10 +40,10 @@ impl Target {
                         Path::new("runs").join(name)
                     }
                 };
-                Ok(Target { run, capture: Some(capture), saved: None, guessed: false })
+                Ok(RunTarget { run, capture: Some(capture), saved: None, guessed: false })
             }
             None => match &common.run {
-                Some(run) if is_run(run) => Ok(Target::run(run.clone(), false)),
+                Some(run) if is_run(run) => Ok(RunTarget::run(run.clone(), false)),
                 Some(run) => Err(Error::usage(
                     format!("`{}` is not a run yet, and no capture is named", run.display()),
                     "name the capture: `tiface run CAPTURE --run DIR`",
@@ -50,8 +53,8 @@ impl Target {
         }
     }
 
-    fn run(run: PathBuf, guessed: bool) -> Target {
-        Target { saved: Some(run.join("config.toml")), run, capture: None, guessed }
+    fn run(run: PathBuf, guessed: bool) -> RunTarget {
+        RunTarget { saved: Some(run.join("config.toml")), run, capture: None, guessed }
     }
 }
 
@@ -61,15 +64,15 @@ fn is_run(path: &Path) -> bool {
 }
 
 /// The run in `here`, else the one under `here/runs` that was configured last.
-fn guess(here: &Path) -> Result<Target> {
+fn guess(here: &Path) -> Result<RunTarget> {
     if is_run(here) {
-        return Ok(Target::run(here.into(), true));
+        return Ok(RunTarget::run(here.into(), true));
     }
     let runs = io::list_folders(&here.join("runs"))?;
     let newest =
         runs.into_iter().filter(|run| is_run(run)).max_by_key(|run| io::modified(&run.join("config.toml")));
     match newest {
-        Some(run) => Ok(Target::run(run, true)),
+        Some(run) => Ok(RunTarget::run(run, true)),
         None => Err(Error::usage(
             "no capture or run is named, this folder is no run, and there is none under `runs/`",
             "name a capture: `tiface run CAPTURE`, or try `tiface demo`",
@@ -87,16 +90,16 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let capture = dir.path().join("002_00");
         fs::create_dir(&capture).unwrap();
-        let t = Target::find(&Common::default(), Some(&capture)).unwrap();
+        let t = RunTarget::find(&Common::default(), Some(&capture)).unwrap();
         assert_eq!((t.run, t.saved), (PathBuf::from("runs/002_00"), None));
         assert_eq!(t.capture, Some(fs::canonicalize(&capture).unwrap()));
         fs::write(capture.join("config.toml"), "").unwrap();
-        let t = Target::find(&Common::default(), Some(&capture)).unwrap();
+        let t = RunTarget::find(&Common::default(), Some(&capture)).unwrap();
         assert_eq!((t.run.clone(), t.capture), (capture.clone(), None));
         assert!(t.saved.is_some());
         // a capture in which someone keeps a config.toml stays a capture
         fs::write(capture.join("transforms.json"), "{}").unwrap();
-        assert!(Target::find(&Common::default(), Some(&capture)).unwrap().capture.is_some());
+        assert!(RunTarget::find(&Common::default(), Some(&capture)).unwrap().capture.is_some());
     }
 
     #[test]
@@ -116,7 +119,7 @@ mod tests {
 
     #[test]
     fn a_missing_capture_is_named() {
-        let e = Target::find(&Common::default(), Some(Path::new("no/such/capture"))).unwrap_err();
+        let e = RunTarget::find(&Common::default(), Some(Path::new("no/such/capture"))).unwrap_err();
         assert!(e.to_string().contains("no/such/capture") && e.kind().code() == 1, "{e:?}");
     }
 }

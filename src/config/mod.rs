@@ -35,10 +35,11 @@ pub use source::Sources;
 pub use stage::Stage;
 pub use vm::{DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
-use crate::Result;
+use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
+use std::str::FromStr;
 use toml::{Table, Value};
 
 /// A key of the configuration: what it means and what a number may be.
@@ -90,6 +91,9 @@ pub enum Preset {
 }
 
 impl Preset {
+    /// All presets, from the least effort to the most.
+    pub const ALL: [Preset; 3] = [Preset::Draft, Preset::Standard, Preset::Paper];
+
     /// Its word in the configuration.
     pub fn name(self) -> &'static str {
         match self {
@@ -97,6 +101,17 @@ impl Preset {
             Preset::Standard => "standard",
             Preset::Paper => "paper",
         }
+    }
+}
+
+impl FromStr for Preset {
+    type Err = Error;
+
+    fn from_str(word: &str) -> Result<Preset> {
+        let found = Preset::ALL.into_iter().find(|preset| preset.name() == word);
+        found.ok_or_else(|| {
+            Error::usage(format!("there is no preset `{word}`"), "use draft, standard or paper")
+        })
     }
 }
 
@@ -252,8 +267,7 @@ pub fn explain(name: &str) -> Result<String> {
     if wanted.is_empty() {
         return Err(source::unknown(name).within("`--explain`"));
     }
-    let presets = [Preset::Draft, Preset::Standard, Preset::Paper];
-    let tables = presets.map(|p| Config::preset(p).to_table());
+    let tables = Preset::ALL.map(|p| Config::preset(p).to_table());
     let mut out = String::new();
     for (i, (full, key)) in wanted.into_iter().enumerate() {
         if i > 0 {
@@ -300,7 +314,7 @@ mod tests {
 
     #[test]
     fn every_field_has_a_documented_key_and_every_key_a_field() {
-        for preset in [Preset::Draft, Preset::Standard, Preset::Paper] {
+        for preset in Preset::ALL {
             let root = Config::preset(preset).to_table();
             let mut fields = Vec::new();
             for (name, value) in &root {
@@ -321,7 +335,7 @@ mod tests {
 
     #[test]
     fn every_preset_lies_in_its_own_ranges_and_comes_back_from_its_own_file() {
-        for preset in [Preset::Draft, Preset::Standard, Preset::Paper] {
+        for preset in Preset::ALL {
             let config = Config::preset(preset);
             let text = config.to_toml();
             let sources = Sources { files: vec![("saved.toml".into(), text.clone())], ..Sources::default() };

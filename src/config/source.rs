@@ -51,7 +51,7 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config> {
             Given::Toml(value) => value.as_str()?,
             Given::Text(text) => text.trim_matches('"'),
         };
-        Preset::deserialize(Value::String(word.into())).ok()
+        word.parse().ok()
     });
     let preset = sources.preset.or(named).unwrap_or_default();
     let mut config = Config::preset(preset);

@@ -35,16 +35,7 @@ impl Stage {
 
     /// Its word.
     pub fn word(self) -> &'static str {
-        match self {
-            Mask => "mask",
-            Baseline => "baseline",
-            Tface => "tface",
-            Iface => "iface",
-            Mesh => "mesh",
-            Render => "render",
-            Ensemble => "ensemble",
-            Metrics => "metrics",
-        }
+        ["mask", "baseline", "tface", "iface", "mesh", "render", "ensemble", "metrics"][self as usize]
     }
 
     /// Does it learn a field, step by step?

@@ -6,13 +6,15 @@ use super::status::now;
 use super::{State, Status, Stop};
 use crate::io;
 use crate::{Monitor, Result};
+use serde::{Serialize, Serializer};
 use serde_json::{Map, Value};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// What happens in a run, for whoever shows it.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug, Serialize)]
+#[serde(tag = "event", rename_all = "lowercase")]
 pub enum Event<'a> {
     /// A stage begins, or goes on after an interruption.
     Started {
@@ -31,7 +33,8 @@ pub enum Event<'a> {
         rate: Option<f64>,
         /// Seconds left.
         eta_s: Option<f64>,
-        /// Named figures of this step.
+        /// Named figures of this step; an object in JSON.
+        #[serde(serialize_with = "as_object")]
         values: &'a [(&'a str, f64)],
     },
     /// A stage is complete.
@@ -62,6 +65,10 @@ pub enum Event<'a> {
         /// What.
         text: &'a str,
     },
+}
+
+fn as_object<S: Serializer>(values: &[(&str, f64)], to: S) -> Result<S::Ok, S::Error> {
+    to.collect_map(values.iter().copied())
 }
 
 /// Shows or records events. Called from computing threads; must be quick.

@@ -1,0 +1,140 @@
+//! `tiface run` and the commands of single stages: the line, up to a stage.
+
+use super::Session;
+use super::bar::Bar;
+use super::options::{Common, KeyOption};
+use super::out::Out;
+use super::stdout::print;
+use super::summary::summary;
+use super::target::{DEMO_CAPTURE, RunTarget};
+use crate::config::{Config, Preset, RenderConfig};
+use crate::io;
+use crate::pipeline::{Line, Stage, reconstruct};
+use crate::run::Run;
+use crate::{Error, Result};
+use serde_json::{Map, Value, json};
+use std::path::Path;
+
+/// A command that works on the line.
+pub(super) struct LineCommand<'a> {
+    /// What it makes: `run` (all there is), or the stage.
+    pub product: &'static str,
+    /// The last stage that it needs.
+    pub until: Stage,
+    /// What it works on.
+    pub target: RunTarget,
+    /// Bars that the result must reach.
+    pub require: &'a [String],
+    /// Its own options that are keys of the configuration.
+    pub keys: Vec<KeyOption>,
+    /// The preset where nothing names one, and settings on top of it, as TOML.
+    pub fallback: Option<(Preset, &'static str)>,
+}
+
+/// Completes the stages that a command needs, and puts its product where it was asked for.
+pub(super) fn run(session: &Session, command: &LineCommand) -> Result<()> {
+    let Session { common, screen, stop } = session;
+    let LineCommand { product, until, target, require, .. } = command;
+    let out = Out::find(common.out.as_deref(), product)?;
+    if target.guessed {
+        screen.note("run", &format!("using `{}`", target.run.display()));
+    }
+    let mut config = configure(common, command)?;
+    // views of a path are made as asked for here; what the evaluation shows stays as it was
+    let path = (*until == Stage::Render && config.render.cameras != "test").then(|| config.render.clone());
+    if path.is_some() {
+        config.render = evaluation(common, target)?;
+    }
+    let bars = require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>>>()?;
+    let run = Run::open(&target.run, stop.clone(), screen.clone());
+    // the demo's own runs are recognised when their stages are run one by one, too
+    let mut line = Line::open(&config, &run, is_demo(&config, &run))?;
+    if let Some(path) = path {
+        line = line.along(path)?;
+    }
+    if let Some(out) = &out {
+        out.check(run.dir(), &line.order(*until))?;
+    }
+    if common.dry_run {
+        return print(&outlook(&line, *until, common)?);
+    }
+    if let Some(fresh) = common.fresh {
+        line.fresh(fresh, *until)?;
+    }
+    line.remember(*until)?;
+    screen.expect(line.ahead(*until));
+    let done = reconstruct(&line, *until)?;
+    let written = out.map(|out| out.write(product, &line, &run)).transpose()?.unwrap_or_default();
+    if common.json {
+        let stages: Map<String, Value> =
+            done.iter().map(|(s, d)| (s.to_string(), d.summary.clone())).collect();
+        let result = json!({"event": "result", "run": run.dir(), "out": written, "stages": stages});
+        print(&format!("{result}\n"))?;
+    } else if !common.quiet {
+        print(&summary(&run, line.views(), &done, &written))?;
+    }
+    bars.iter().try_for_each(|bar| bar.check(&done))
+}
+
+/// What would be done for `until`, a row for each stage.
+fn outlook(line: &Line, until: Stage, common: &Common) -> Result<String> {
+    let fresh = common.fresh.map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
+    let mut text = String::new();
+    for (stage, found) in line.outlook(until)? {
+        let anew = fresh.contains(&stage);
+        let (outlook, differences) = match found {
+            _ if anew => ("to do, afresh", Vec::new()),
+            None => ("to do", Vec::new()),
+            Some(d) if d.is_empty() => ("done", d),
+            Some(d) => ("would stop: done with other settings", d),
+        };
+        if common.json {
+            text += &format!("{}\n", json!({"stage": stage, "outlook": outlook, "differences": differences}));
+        } else {
+            text += &format!("{stage:<8} {outlook}\n");
+            text.extend(differences.iter().map(|d| format!("           {d}\n")));
+        }
+    }
+    Ok(text)
+}
+
+/// The configuration that a target and the options amount to; it remembers its capture.
+fn configure(common: &Common, command: &LineCommand) -> Result<Config> {
+    let LineCommand { target, fallback, keys, .. } = command;
+    let mut keys = keys.clone();
+    let mut remember = |path: &str| {
+        keys.push((format!("CAPTURE {path}"), "capture.path".into(), path.into()));
+    };
+    if let Some(capture) = &target.capture {
+        let path = capture.to_str().ok_or_else(|| {
+            let shown = capture.display();
+            Error::cannot(format!("the path of the capture is not UTF-8: `{shown}`"), "rename the folder")
+        })?;
+        remember(path);
+    } else if let Some(saved) = target.saved.as_deref().filter(|_| common.preset.is_some()) {
+        // a new preset starts over, but on the same photographs
+        remember(&Common::default().resolve(Some(saved), None, &[])?.capture.path);
+    }
+    let config = common.resolve(target.saved.as_deref(), *fallback, &keys)?;
+    if config.capture.path.is_empty() {
+        return Err(Error::usage("no capture is named", "name one: `tiface run CAPTURE`"));
+    }
+    Ok(config)
+}
+
+/// How the evaluation's views are made: as the run remembers it, else as it starts out, by `--set` but not by the options
+/// of this command.
+fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
+    let kept = Some(target.run.join("config.toml")).filter(|file| io::is_file(file));
+    let config = match kept {
+        Some(kept) => Common::default().resolve(Some(&kept), None, &[])?,
+        None => common.resolve(None, None, &[])?,
+    };
+    Ok(RenderConfig { cameras: "test".into(), ..config.render })
+}
+
+/// Was this run made by `tiface demo`?
+fn is_demo(config: &Config, run: &Run) -> bool {
+    let made = run.path(DEMO_CAPTURE);
+    io::real_path(&made).is_ok_and(|made| made == Path::new(&config.capture.path))
+}
