@@ -5,7 +5,7 @@ use super::metrics::{Comparable, comparable, picture_sets};
 use crate::Result;
 use crate::config::{PictureFormat, Stage, called};
 use crate::io::{self, Limits};
-use crate::report::{self, Curve, Picture, Report, Row};
+use crate::report::{self, CaptionedPicture, Curve, Report, ViewRow};
 use crate::run::read_record;
 use serde_json::Value;
 use std::path::Path;
@@ -41,7 +41,7 @@ pub(super) fn write_report(line: &Line) -> Result<()> {
         let found = report::curves(&log, names).into_iter();
         curves.extend(found.map(|c| Curve { name: format!("{stage} {}", c.name), ..c }));
     }
-    let html = report::html(&Report {
+    let page = Report {
         title: line.capture.name.clone(),
         summaries: Stage::ALL.into_iter().filter_map(|stage| summary(line, stage)).collect(),
         masks: crate::mask::sheet::part(&sheet).unwrap_or_default().into(),
@@ -49,12 +49,12 @@ pub(super) fn write_report(line: &Line) -> Result<()> {
         rows,
         left_out,
         settings: line.config.to_toml(),
-    });
-    line.run.write("report.html", html.as_bytes())
+    };
+    line.run.write("report.html", report::html(&page)?.as_bytes())
 }
 
 /// The views with their pictures, and how many found no room beside as many `bytes` as there are already.
-fn rows(line: &Line, mut bytes: usize) -> Result<(Vec<Row>, usize)> {
+fn rows(line: &Line, mut bytes: usize) -> Result<(Vec<ViewRow>, usize)> {
     let sets = match line.config.render.format {
         PictureFormat::Png => picture_sets(line),
         PictureFormat::Exr => Vec::new(), // browsers show none
@@ -78,20 +78,20 @@ fn rows(line: &Line, mut bytes: usize) -> Result<(Vec<Row>, usize)> {
         for (word, file) in [("photograph".into(), view.photo.clone())].into_iter().chain(files) {
             let picture = io::read_bytes(&file, &Limits::default())?;
             bytes += picture.len();
-            pictures.push(Picture { caption: called(&word), bytes: picture });
+            pictures.push(CaptionedPicture::new(called(&word), &picture));
         }
-        rows.push(Row { name: view.name.clone(), pictures });
+        rows.push(ViewRow { name: view.name.clone(), pictures });
     }
     Ok((rows, left_out))
 }
 
 /// The figures of a stage that is done.
-fn summary(line: &Line, stage: Stage) -> Option<(String, Value)> {
+fn summary(line: &Line, stage: Stage) -> Option<(String, Vec<(String, String)>)> {
     let figures = match read_record(&line.run.path(stage)).ok()??.summary {
         Value::Object(sets) if stage == Stage::Metrics => {
             sets.iter().map(|(set, figures)| (called(set), figures.clone())).collect()
         }
         other => other,
     };
-    Some((stage.to_string(), figures))
+    Some((stage.to_string(), report::leaves(&figures)))
 }
