@@ -3,9 +3,9 @@
 //! `cargo run --release --no-default-features --example synthetic_head -- FOLDER`
 
 use std::{path::PathBuf, time::Instant};
-use tiface::capture::synthetic::{SyntheticError, SyntheticOptions, write_capture};
+use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 
-fn main() -> Result<(), SyntheticError> {
+fn main() -> tiface::Result<()> {
     let dir = PathBuf::from(std::env::args_os().nth(1).unwrap_or_else(|| "synthetic_head".into()));
     let options = SyntheticOptions::default();
     let start = Instant::now();

@@ -7,7 +7,7 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use tiface::capture::inspect::inspect;
 use tiface::capture::scene::{self, Scene, SceneOptions};
-use tiface::capture::{self, Capture, CaptureOptions, MaskChoice, MaskMeaning, MaskSource, Split};
+use tiface::capture::{self, Capture, CaptureOptions, MaskChoice, MaskMeaning, Split, ViewMask};
 use tiface::geom::Camera;
 use tiface::image::Gray;
 use tiface::io::Limits;
@@ -65,7 +65,7 @@ fn light_stage(name: &str) {
     let names: HashSet<_> = c.views.iter().map(|v| v.name.clone()).collect();
     assert!(names.len() == 32 && names.contains("024"));
     for v in &c.views {
-        assert!(matches!(&v.mask, MaskSource::File(p) if p.ends_with(format!("masks/{}.png", v.name))));
+        assert!(matches!(&v.mask, ViewMask::File(p) if p.ends_with(format!("masks/{}.png", v.name))));
         assert!(v.region.is_some() && v.valid.is_none());
     }
 
@@ -98,7 +98,7 @@ fn fox_opens_with_distortion_and_a_box_without_masks() {
     let Some(root) = folder("fox") else { return };
     let c = capture::open(&root, &CaptureOptions::default()).unwrap();
     assert_eq!((count(&c, Split::Train), count(&c, Split::Test)), (43, 7));
-    assert!(c.views.iter().all(|v| v.mask == MaskSource::None && v.camera.distortion.k1 == 0.0578421));
+    assert!(c.views.iter().all(|v| v.mask == ViewMask::None && v.camera.distortion.k1 == 0.0578421));
     assert_eq!(c.up, Vec3::Z); // the mean of the cameras' ups is within 20° of it
     let (scene, warnings, cameras) = place(&c);
     eprintln!("fox: {} {warnings:?}", scene::describe(&scene));
@@ -128,9 +128,9 @@ fn masks_can_be_left_out_named_or_mean_not_looked_at() {
     let Some(root) = folder("nefertiti") else { return };
     let with = |o: CaptureOptions| capture::open(&root, &o).unwrap();
     let none = with(CaptureOptions { masks: MaskChoice::None, ..Default::default() });
-    assert!(none.views.iter().all(|v| v.mask == MaskSource::None));
+    assert!(none.views.iter().all(|v| v.mask == ViewMask::None));
     let named = with(CaptureOptions { masks: MaskChoice::Folder("face_masks".into()), ..Default::default() });
-    assert!(matches!(&named.views[3].mask, MaskSource::File(p) if p.ends_with("face_masks/003.png")));
+    assert!(matches!(&named.views[3].mask, ViewMask::File(p) if p.ends_with("face_masks/003.png")));
     let ignore = with(CaptureOptions { mask_meaning: MaskMeaning::Ignore, ..Default::default() });
     let loaded = ignore.views[0].load(&Limits::default()).unwrap();
     let valid = loaded.valid.unwrap();

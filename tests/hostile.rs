@@ -6,8 +6,11 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tiface::capture::inspect::inspect;
-use tiface::capture::{self, CaptureError, CaptureOptions, MaskChoice, MaskMeaning, MaskSource, Split};
-use tiface::io::{self, Limits, NpyValues, ReadError, TensorValues, Turn};
+use tiface::capture::{self, CaptureOptions, MaskChoice, MaskMeaning, Split, ViewMask};
+use tiface::io::{self, Limits, NpyValues, ReadError, TensorValues};
+
+/// The channel of depth.
+const DEPTH: &[&[&str]] = &[&["Z"]];
 
 fn limits() -> Limits {
     Limits::default()
@@ -112,7 +115,7 @@ fn an_empty_file_is_empty_for_every_reader() {
         io::read_photo(&path, None, &limits()).unwrap_err(),
         io::picture_info(&path, &limits()).unwrap_err(),
         io::read_gray(&path, None, &limits()).unwrap_err(),
-        io::read_exr_depth(&path, &limits()).unwrap_err(),
+        io::read_exr(&path, DEPTH, &limits()).unwrap_err(),
         io::read_npy(&path, &limits()).unwrap_err(),
         io::read_json(&path, &limits()).unwrap_err(),
         io::read_tensors(&path, &limits()).unwrap_err(),
@@ -168,9 +171,9 @@ fn a_file_that_may_not_be_read_is_named() {
 #[test]
 fn the_content_decides_the_format_whatever_the_ending_says() {
     let (_d, path) = file("really_a_png.jpg", &png(4, 3));
-    assert_eq!(io::read_photo(&path, None, &limits()).unwrap().photo.width, 4);
+    assert_eq!(io::read_photo(&path, None, &limits()).unwrap().width, 4);
     let (_d, path) = file("really_a_jpeg.png", &jpeg(8, 8));
-    assert_eq!(io::read_photo(&path, None, &limits()).unwrap().photo.height, 8);
+    assert_eq!(io::read_photo(&path, None, &limits()).unwrap().height, 8);
     for (bytes, word) in [
         (&b"GIF89a......"[..], "GIF"),
         (b"RIFF....WEBPVP8 ", "WebP"),
@@ -195,7 +198,7 @@ fn read_all(dir: &Path, bytes: &[u8]) {
     let _ = io::read_photo(&path, None, &limits);
     let _ = io::picture_info(&path, &limits);
     let _ = io::read_gray(&path, None, &limits);
-    let _ = io::read_exr_depth(&path, &limits);
+    let _ = io::read_exr(&path, DEPTH, &limits);
     let _ = io::parse_npy(&path, bytes, &limits);
     let _ = io::parse_json(&path, bytes, &limits);
     let _ = io::parse_tensors(&path, bytes, &limits);
@@ -211,7 +214,7 @@ fn truncation_at_every_byte_is_an_error_with_the_path() {
         ("cut.png", png(7, 5), |p, l| io::read_photo(p, None, l).err()),
         ("cut.jpg", jpeg(17, 9), |p, l| io::read_photo(p, None, l).err()),
         ("cut-progressive.jpg", progressive, |p, l| io::read_photo(p, None, l).err()),
-        ("cut.exr", exr(9, 40), |p, l| io::read_exr_depth(p, l).err()),
+        ("cut.exr", exr(9, 40), |p, l| io::read_exr(p, DEPTH, l).err()),
         ("cut.npy", array, |p, l| io::read_npy(p, l).err()),
         ("cut.json", json, |p, l| io::read_json(p, l).err()),
         ("cut.safetensors", tensors(), |p, l| io::read_tensors(p, l).err()),
@@ -301,7 +304,7 @@ fn a_small_jpeg_that_claims_a_large_picture_is_refused_and_an_even_one_is_read()
             // nothing packs a picture tighter than this
             let mut b = flat_jpeg(200, 123, components, progressive);
             let (_d, path) = file("even.jpg", &b);
-            assert_eq!(io::read_photo(&path, None, &limits()).unwrap().photo.rgb.len(), 200 * 123);
+            assert_eq!(io::read_photo(&path, None, &limits()).unwrap().rgb.len(), 200 * 123);
             let frame = b.windows(2).position(|w| w == [0xFF, 0xC0] || w == [0xFF, 0xC2]).unwrap();
             b[frame + 5..frame + 9].copy_from_slice(&[0x3F, 0xFF, 0x3F, 0xFF]);
             let (_d, path) = file("bomb.jpg", &b);
@@ -344,11 +347,11 @@ fn grey_palette_and_sixteen_bit_pictures_are_accepted_and_cmyk_is_refused() {
         (&[10, 10, 200, 200], ExtendedColorType::L16),
     ] {
         let (_d, path) = file("g.png", &encode(bytes, color));
-        let p = io::read_photo(&path, None, &limits()).unwrap().photo;
+        let p = io::read_photo(&path, None, &limits()).unwrap();
         assert_eq!(p.rgb, [[10; 3], [200; 3]], "{color:?}");
     }
     let (_d, path) = file("palette.png", &palette_png());
-    assert_eq!(io::read_photo(&path, None, &limits()).unwrap().photo.rgb, [[1, 2, 3], [250, 0, 9]]);
+    assert_eq!(io::read_photo(&path, None, &limits()).unwrap().rgb, [[1, 2, 3], [250, 0, 9]]);
 
     let (_d, path) = file("print.jpg", &flat_jpeg(8, 8, 4, false));
     for e in
@@ -358,7 +361,7 @@ fn grey_palette_and_sixteen_bit_pictures_are_accepted_and_cmyk_is_refused() {
         names_file(&e, "print.jpg");
     }
     let (_d, path) = file("p.jpg", &flat_jpeg(24, 18, 1, true));
-    assert_eq!(io::read_photo(&path, None, &limits()).unwrap().photo.rgb.len(), 24 * 18);
+    assert_eq!(io::read_photo(&path, None, &limits()).unwrap().rgb.len(), 24 * 18);
 }
 
 /// Two pixels, 1 bit each, from a palette; deflate "stored" block.
@@ -389,12 +392,17 @@ fn an_exif_turn_is_applied_only_when_the_declared_size_agrees() {
     let turned = [&plain[..2], &app1, &plain[2..]].concat();
     let (_d, path) = file("side.jpg", &turned);
     assert_eq!(io::picture_info(&path, &limits()).unwrap().exif, 6);
+    let info = io::picture_info(&path, &limits()).unwrap();
+    assert_eq!(
+        (info.size(Some((16, 8))), info.size(Some((8, 16))), info.size(None)),
+        ((16, 8), (8, 16), (16, 8))
+    );
     let stored = io::read_photo(&path, Some((16, 8)), &limits()).unwrap();
-    assert_eq!((stored.photo.width, stored.turn), (16, Turn::Ignored(6)));
+    assert_eq!((stored.width, stored.height), (16, 8));
     let upright = io::read_photo(&path, Some((8, 16)), &limits()).unwrap();
-    assert_eq!((upright.photo.width, upright.photo.height, upright.turn), (8, 16, Turn::Applied(6)));
+    assert_eq!((upright.width, upright.height), (8, 16));
     // code 6: shown turned clockwise, so the stored bottom-left corner comes to the top left
-    assert_eq!(upright.photo.rgb[0], stored.photo.rgb[7 * 16]);
+    assert_eq!(upright.rgb[0], stored.rgb[7 * 16]);
 }
 
 // ---------------------------------------------------------------------------------------------- EXR
@@ -421,7 +429,7 @@ fn a_data_window_is_placed_inside_the_display_window() {
     let mut out = Cursor::new(Vec::new());
     picture.write().to_buffered(&mut out).unwrap();
     let (_d, path) = file("window.exr", &out.into_inner());
-    let read = io::read_exr_depth(&path, &limits()).unwrap();
+    let read = io::read_exr(&path, DEPTH, &limits()).unwrap();
     assert_eq!((read.image.width, read.image.height), (4, 3));
     let rows = [0., 0., 0., 0., 2., 3., 0., 0., 5., 6., 0., 0.];
     assert_eq!(read.image.data, rows);
@@ -436,9 +444,9 @@ fn the_first_layer_with_the_channels_is_read_and_others_are_listed() {
     let mut out = Cursor::new(Vec::new());
     picture.write().to_buffered(&mut out).unwrap();
     let (_d, path) = file("parts.exr", &out.into_inner());
-    let read = io::read_exr_normals(&path, &limits()).unwrap();
+    let read = io::read_exr(&path, &[&["N.X", "N.Y", "N.Z"], &["R", "G", "B"]], &limits()).unwrap();
     assert_eq!(read.image.data, [1., 1., 1., 2., 2., 2.]);
-    let e = io::read_exr_channels(&path, &[&["W"]], &limits()).unwrap_err();
+    let e = io::read_exr(&path, &[&["W"]], &limits()).unwrap_err();
     assert!(matches!(e, ReadError::Unsupported { .. }) && e.to_string().contains("`A"), "{e}");
     names_file(&e, "parts.exr");
 }
@@ -448,7 +456,7 @@ fn deep_and_subsampled_and_huge_exr_pictures_are_refused_by_name() {
     let mut deep = exr(4, 4);
     deep[5] |= 0x08;
     let (_d, path) = file("deep.exr", &deep);
-    let e = io::read_exr_depth(&path, &limits()).unwrap_err();
+    let e = io::read_exr(&path, DEPTH, &limits()).unwrap_err();
     assert!(matches!(e, ReadError::Unsupported { .. }) && e.to_string().contains("deep"), "{e}");
 
     // channel list entry of `Z`: name, type i32, linear and 3 reserved bytes, then the two samplings
@@ -457,14 +465,14 @@ fn deep_and_subsampled_and_huge_exr_pictures_are_refused_by_name() {
     assert_eq!(&sub[list..list + 2], b"Z\0");
     sub[list + 10] = 2;
     let (_d, path) = file("sub.exr", &sub);
-    let e = io::read_exr_depth(&path, &limits()).unwrap_err();
+    let e = io::read_exr(&path, DEPTH, &limits()).unwrap_err();
     names_file(&e, "sub.exr");
 
     let mut huge = exr(4, 4);
     let window = huge.windows(6).position(|w| w == b"box2i\0").unwrap() + 10;
     huge[window + 8..window + 12].copy_from_slice(&(1_000_000i32).to_le_bytes());
     let (_d, path) = file("huge.exr", &huge);
-    let e = io::read_exr_depth(&path, &limits()).unwrap_err();
+    let e = io::read_exr(&path, DEPTH, &limits()).unwrap_err();
     assert!(matches!(e, ReadError::TooLarge { .. }), "{e}");
 }
 
@@ -472,7 +480,7 @@ fn deep_and_subsampled_and_huge_exr_pictures_are_refused_by_name() {
 fn values_that_are_not_finite_become_zero_and_are_counted() {
     let (_d, path) = file("nan.exr", b"");
     io::write_exr(&path, 3, 1, &[("Z", &[f32::NAN, 2.0, f32::INFINITY])]).unwrap();
-    let read = io::read_exr_depth(&path, &limits()).unwrap();
+    let read = io::read_exr(&path, DEPTH, &limits()).unwrap();
     assert_eq!((read.image.data.as_slice(), read.replaced), (&[0.0, 2.0, 0.0][..], 2));
 }
 
@@ -599,7 +607,7 @@ fn sound(frames: &[String]) -> String {
     )
 }
 
-fn open(dir: &TempDir) -> Result<capture::Capture, CaptureError> {
+fn open(dir: &TempDir) -> tiface::Result<capture::Capture> {
     let result = capture::open(dir.path(), &CaptureOptions::default());
     if let Err(e) = &result {
         assert!(!e.hint().is_empty(), "{e}");
@@ -668,7 +676,7 @@ fn hostile_json_is_refused_with_file_and_place() {
 fn more_frames_than_views_are_allowed_is_an_error_in_a_moment() {
     let many = |_: &[String]| format!(r#"{{"frames": [{}0]}}"#, "0,".repeat(100_000));
     let e = open(&capture_with(many, 1)).unwrap_err();
-    assert!(matches!(e, CaptureError::Read(ReadError::TooLarge { found: 100_001, .. })), "{e}");
+    assert!(e.to_string().contains("the number of frames is 100001, the limit is 100000"), "{e}");
     // a million entries are more values than one file may hold
     let e =
         open(&capture_with(|_| format!(r#"{{"frames": [{}0]}}"#, "[],".repeat(9_000_000)), 1)).unwrap_err();
@@ -681,7 +689,7 @@ fn names_that_lead_out_of_the_capture_are_refused() {
         let dir = capture_with(|f| sound(f).replacen("images/0.png", name, 1), 3);
         fs::write(dir.path().parent().unwrap().join("tiface-outside.png"), png(8, 6)).unwrap();
         let e = open(&dir).unwrap_err();
-        assert!(matches!(e, CaptureError::Outside { .. }), "{name}: {e}");
+        assert!(e.to_string().contains("outside the capture"), "{name}: {e}");
     }
     let _ = fs::remove_file(std::env::temp_dir().join("tiface-outside.png"));
 }
@@ -720,7 +728,7 @@ fn twins_by_case_are_a_warning_and_twins_by_name_an_error() {
     }
     fs::write(dir.path().join("transforms.json"), two("a.png", "a.jpg")).unwrap();
     let e = open(&dir).unwrap_err();
-    assert!(matches!(e, CaptureError::SameName { .. }), "{e}");
+    assert!(e.to_string().contains("would both be called `a`"), "{e}");
 }
 
 #[test]
@@ -750,7 +758,7 @@ fn missing_photographs_are_counted_and_listed() {
         fs::remove_file(dir.path().join(format!("images/{i}.png"))).unwrap();
     }
     let e = open(&dir).unwrap_err();
-    assert!(matches!(e, CaptureError::NoViews { .. }) && e.to_string().contains("5 of 5"), "{e}");
+    assert!(e.to_string().contains("has no usable view: 5 of 5"), "{e}");
 }
 
 #[test]
@@ -777,7 +785,7 @@ fn unread(names: &[(&str, &[u8])]) -> (String, String) {
         }
     }
     let e = open(&dir).unwrap_err();
-    assert!(matches!(e, CaptureError::NotACapture { .. }), "{e}");
+    assert!(e.to_string().contains("is not a capture"), "{e}");
     let root = dir.path().display().to_string();
     (e.to_string().replace(&root, "ROOT"), e.hint().replace(&root, "ROOT"))
 }
@@ -849,7 +857,7 @@ fn a_file_in_the_place_of_a_folder_says_which_folder() {
     let of = |name: &str| {
         let (dir, path) = file(name, b"x");
         let e = capture::open(&path, &CaptureOptions::default()).unwrap_err();
-        assert!(matches!(e, CaptureError::NotACapture { .. }), "{e}");
+        assert!(e.to_string().contains("is not a capture"), "{e}");
         (e.to_string(), e.hint().replace(&dir.path().display().to_string(), "ROOT"))
     };
     assert_eq!(of("transforms.json").1, "give the folder it lies in: `ROOT`");
@@ -864,15 +872,12 @@ fn a_file_in_the_place_of_a_folder_says_which_folder() {
 fn a_folder_without_cameras_says_what_was_looked_for() {
     let dir = tempfile::tempdir().unwrap();
     let e = open(&dir).unwrap_err();
-    assert!(
-        matches!(e, CaptureError::NotACapture { .. }) && e.to_string().contains("transforms.json"),
-        "{e}"
-    );
+    assert!(e.to_string().contains("is not a capture") && e.to_string().contains("transforms.json"), "{e}");
     fs::create_dir(dir.path().join("sparse")).unwrap();
     assert!(open(&dir).unwrap_err().to_string().contains("COLMAP"));
     let (_d, path) = file("x.json", b"{}");
     let e = capture::open(&path, &CaptureOptions::default()).unwrap_err();
-    assert!(matches!(e, CaptureError::NotACapture { .. }), "{e}");
+    assert!(e.to_string().contains("is not a capture"), "{e}");
     assert!(capture::open(&path.join("none"), &CaptureOptions::default()).is_err());
 }
 
@@ -912,7 +917,7 @@ fn llff_poses_alone_make_a_capture_and_disagreeing_ones_an_error() {
     let moved = capture_with(|f| sound(f).replacen("[0,1,0,0]", "[0,1,0,0.5]", 1), 9);
     fs::write(moved.path().join("poses_bounds.npy"), poses(9, 6.0, 8.0)).unwrap();
     let e = open(&moved).unwrap_err();
-    assert!(matches!(&e, CaptureError::PosesDisagree { frame, .. } if frame == "images/0.png"), "{e}");
+    assert!(e.to_string().contains("disagree about frame `images/0.png`"), "{e}");
     names_file(&e, "poses_bounds.npy");
 }
 
@@ -931,7 +936,7 @@ fn ilsh_folders_take_the_matte_for_the_head_and_npy_for_valid_pixels() {
         fs::write(dir.path().join(format!("masks/{i}.npy")), npy("'|b1'", "False", shape, &usable)).unwrap();
     }
     let c = open(&dir).unwrap();
-    assert!(matches!(&c.views[1].mask, MaskSource::File(p) if p.ends_with("vit_mask/1.png")));
+    assert!(matches!(&c.views[1].mask, ViewMask::File(p) if p.ends_with("vit_mask/1.png")));
     let v = c.views[0].load(&limits()).unwrap();
     assert_eq!(v.mask.unwrap().values[7], 35);
     let valid = v.valid.unwrap().values;
@@ -939,7 +944,7 @@ fn ilsh_folders_take_the_matte_for_the_head_and_npy_for_valid_pixels() {
     // a valid mask of another size is named
     fs::write(dir.path().join("masks/2.npy"), npy("'|b1'", "False", "(2, 2)", &[1; 4])).unwrap();
     let e = open(&dir).unwrap().views[2].load(&limits()).unwrap_err();
-    assert!(matches!(e, CaptureError::Size { found: (2, 2), .. }), "{e}");
+    assert!(e.to_string().contains("is 2 × 2 pixels"), "{e}");
     names_file(&e, "2.npy");
 }
 
@@ -955,7 +960,7 @@ fn alpha_is_the_mask_unless_it_is_opaque_everywhere() {
         }
         fs::write(dir.path().join("transforms.json"), sound(&frames)).unwrap();
         let c = open(&dir).unwrap();
-        assert_eq!(c.views[0].mask == MaskSource::Alpha, expected);
+        assert_eq!(c.views[0].mask == ViewMask::Alpha, expected);
         assert_eq!(c.warnings.iter().any(|w| w.contains("opaque")), !expected);
         let loaded = c.views[0].load(&limits()).unwrap();
         assert_eq!(loaded.mask.map(|m| m.values[20]), expected.then_some(90));

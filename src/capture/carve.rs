@@ -69,7 +69,7 @@ impl Projector {
 }
 
 /// One view's mask, ready to be asked about rectangles.
-pub(super) struct Silhouette {
+pub(super) struct SilhouetteTable {
     /// Which view this is.
     pub view: usize,
     projector: Projector,
@@ -90,10 +90,10 @@ enum Verdict {
     Undecided,
 }
 
-impl Silhouette {
+impl SilhouetteTable {
     /// Pixels over `threshold` count as masked. A mask of another size than the camera's is taken for the
     /// same picture at that size.
-    pub fn new(view: usize, camera: &Camera, mask: &Gray, threshold: u8) -> Silhouette {
+    pub fn new(view: usize, camera: &Camera, mask: &Gray, threshold: u8) -> SilhouetteTable {
         let (width, height) = (mask.width as usize, mask.height as usize);
         let row = width + 1;
         let mut table = vec![0u32; row * (height + 1)];
@@ -105,7 +105,7 @@ impl Silhouette {
             }
         }
         let projector = Projector::new(&camera.resized(mask.width, mask.height));
-        let mut silhouette = Silhouette { view, projector, width, height, table, cut: [false; 4] };
+        let mut silhouette = SilhouetteTable { view, projector, width, height, table, cut: [false; 4] };
         let (w, h, b) = (width, height, 2.min(width).min(height));
         let bands = [(0, 0, b, h), (0, 0, w, b), (w - b, 0, w, h), (0, h - b, w, h)];
         silhouette.cut = bands.map(|(x0, y0, x1, y1)| silhouette.any(x0, y0, x1, y1));
@@ -183,7 +183,7 @@ impl Carved {
 }
 
 /// Asks every silhouette about every cell.
-pub(super) fn carve(cube: &Cube, silhouettes: &[Silhouette]) -> Carved {
+pub(super) fn carve(cube: &Cube, silhouettes: &[SilhouetteTable]) -> Carved {
     let (n, radius) = (cube.n, cube.radius());
     let slabs: Vec<(Vec<u16>, Vec<u64>)> = (0..n)
         .into_par_iter()

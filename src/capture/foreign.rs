@@ -1,7 +1,8 @@
-//! Formats that are recognised but not read, each by its telltale files, and the way from there to `transforms.json`.
+//! Formats that are recognized but not read, each by its telltale files, and the way from there to `transforms.json`.
 
-use super::CaptureError;
+use crate::Error;
 use crate::io::{self, Limits};
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 /// What a capture needs, one of them.
@@ -17,18 +18,18 @@ const BY_HAND: &str = "no common tool converts it: write `transforms.json` with 
                        -Z: the second and third column of an OpenCV pose, negated)";
 
 /// What lies directly in a folder.
-struct Found {
+struct FolderEntries {
     root: PathBuf,
     files: Vec<String>,
     folders: Vec<String>,
 }
 
-impl Found {
+impl FolderEntries {
     /// Names that are not UTF-8 tell nothing, nor do those that cannot be listed.
-    fn of(root: &Path) -> Found {
+    fn of(root: &Path) -> FolderEntries {
         let name = |p: &PathBuf| Some(p.file_name()?.to_str()?.to_owned());
         let folders = io::list_folders(root).unwrap_or_default();
-        Found {
+        FolderEntries {
             root: root.into(),
             files: io::list_files(root).unwrap_or_default(),
             folders: folders.iter().filter_map(name).collect(),
@@ -63,7 +64,10 @@ impl Found {
     fn photographs(&self) -> Option<PathBuf> {
         let inside = ["images", "image", "input", "rgb", "photos"].into_iter();
         let folders = inside.filter(|n| self.any(&[n]).is_some()).map(|n| self.root.join(n));
-        [self.root.clone()].into_iter().chain(folders).find(|f| Found::of(f).ending(&PHOTOGRAPHS).is_some())
+        [self.root.clone()]
+            .into_iter()
+            .chain(folders)
+            .find(|f| FolderEntries::of(f).ending(&PHOTOGRAPHS).is_some())
     }
 }
 
@@ -73,50 +77,47 @@ fn has_ending(name: &str, endings: &[&str]) -> bool {
 }
 
 /// A command of nerfstudio, and what to do with what it writes.
-fn nerfstudio(kind: &str, data: impl std::fmt::Display, more: &str) -> String {
+fn nerfstudio(kind: &str, data: impl Display, more: &str) -> String {
     format!(
         "nerfstudio converts it: `ns-process-data {kind} --data {data}{more} --output-dir NEW`, then `tiface inspect NEW`"
     )
 }
 
+fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> Error {
+    Error::cannot(format_args!("`{}` is not a capture: {found}", root.display()), hint)
+}
+
 /// Why a folder is no capture: what it looks like instead, and the way from there.
-pub(super) fn explain(root: &Path) -> CaptureError {
-    let found = Found::of(root);
+pub(super) fn explain(root: &Path) -> Error {
+    let found = FolderEntries::of(root);
     if let Some((inner, file)) = nested(&found) {
-        return CaptureError::NotACapture {
-            root: root.into(),
-            seen: format!("`{file}` lies in its folder `{inner}`"),
-            hint: format!("give that folder: `{}`", found.at(inner)),
-        };
+        let what = format!("`{file}` lies in its folder `{inner}`");
+        return not_a_capture(root, what, format!("give that folder: `{}`", found.at(inner)));
     }
-    match recognised(&found) {
-        Some((what, telltale, hint)) => CaptureError::NotACapture {
-            root: root.into(),
-            seen: format!("it looks like {what} (`{telltale}`); that is not read"),
-            hint,
-        },
-        None => CaptureError::NotACapture {
-            root: root.into(),
-            seen: "it holds neither `transforms.json`, `transforms_train.json` nor `poses_bounds*.npy`".into(),
-            hint: "give the folder that holds one of them; of COLMAP, Metashape, RealityCapture, Polycam, NeuS, DTU, \
-                   H3DS, NeRSemble, Multiface, FaceScape, photographs alone and a video, the way there is told"
-                .into(),
-        },
+    match recognized(&found) {
+        Some((what, telltale, hint)) => {
+            not_a_capture(root, format!("it looks like {what} (`{telltale}`); that is not read"), hint)
+        }
+        None => not_a_capture(
+            root,
+            "it holds neither `transforms.json`, `transforms_train.json` nor `poses_bounds*.npy`",
+            "give the folder that holds one of them; of COLMAP, Metashape, RealityCapture, Polycam, NeuS, DTU, \
+             H3DS, NeRSemble, Multiface, FaceScape, photographs alone and a video, the way there is told",
+        ),
     }
 }
 
 /// Why a file is no capture.
-pub(super) fn explain_file(file: &Path) -> CaptureError {
+pub(super) fn explain_file(file: &Path) -> Error {
     let name = file.file_name().and_then(|n| n.to_str()).unwrap_or_default();
     let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let (seen, hint) = if has_ending(name, &VIDEOS) {
-        ("it is a video", from_video(file))
+    if has_ending(name, &VIDEOS) {
+        not_a_capture(file, "it is a video", from_video(file))
     } else if READ.contains(&name) || name.starts_with("transforms_") || name.starts_with("poses_bounds") {
-        ("it is a file", format!("give the folder it lies in: `{}`", folder.display()))
+        not_a_capture(file, "it is a file", format!("give the folder it lies in: `{}`", folder.display()))
     } else {
-        ("it is a file", "give the folder that holds the photographs and cameras".into())
-    };
-    CaptureError::NotACapture { root: file.into(), seen: seen.into(), hint }
+        not_a_capture(file, "it is a file", "give the folder that holds the photographs and cameras")
+    }
 }
 
 fn from_video(file: &Path) -> String {
@@ -125,48 +126,42 @@ fn from_video(file: &Path) -> String {
 }
 
 /// A folder inside that is a capture, with its camera file.
-fn nested(found: &Found) -> Option<(&str, &'static str)> {
+fn nested(found: &FolderEntries) -> Option<(&str, &'static str)> {
     let of = |name: &String| READ.into_iter().find(|file| io::is_file(&found.root.join(name).join(file)));
     found.folders.iter().take(1000).find_map(|name| Some((name.as_str(), of(name)?)))
 }
 
 /// What it looks like, by which file, and the way to `transforms.json`.
-fn recognised(found: &Found) -> Option<(&'static str, String, String)> {
+fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
     let photographs = found.photographs();
     let images = photographs.clone().unwrap_or_else(|| found.root.join("images")).display().to_string();
     let one = |what, telltale: &str, way| Some((what, telltale.to_owned(), way));
+    let by_hand = |what, telltale, more: &str| one(what, telltale, format!("{BY_HAND}; {more}"));
+    let projections =
+        "its `world_mat_I` is the projection K [R|t] of photograph I, `mask/` can be named as `mask_path`";
 
     if let Some(t) = found.any(&["cameras_sphere.npz"]) {
-        let matrices = "its `world_mat_I` is the projection K [R|t] of photograph I";
-        return one(
-            "a NeuS or DTU scene",
-            t,
-            format!("{BY_HAND}; {matrices}, `mask/` can be named as `mask_path`"),
-        );
+        return by_hand("a NeuS or DTU scene", t, projections);
     }
     if let Some(t) = found.any(&["cameras.npz"]) {
-        let what = match found.any(&["full_head.obj", "regions", "landmarks.txt"]) {
-            Some(_) => "an H3DS scene",
-            None => "an IDR scene",
-        };
-        let matrices = "its `world_mat_I` is the projection K [R|t] of photograph I";
-        return one(what, t, format!("{BY_HAND}; {matrices}, `mask/` can be named as `mask_path`"));
+        let h3ds = found.any(&["full_head.obj", "regions", "landmarks.txt"]).is_some();
+        return by_hand(if h3ds { "an H3DS scene" } else { "an IDR scene" }, t, projections);
     }
     if let Some(t) = found.any(&["KRT"]) {
         let moment =
             "it holds K, distortion and [R|t] of each camera; take one frame of one expression of `images/`";
-        return one("a Multiface recording", t, format!("{BY_HAND}; {moment}"));
+        return by_hand("a Multiface recording", t, moment);
     }
     let calibration = ["calibration/camera_params.json", "camera_params.json"];
     if let Some(t) = calibration.into_iter().find(|t| io::is_file(&found.root.join(t))) {
         let moment = "it holds `world_2_cam` of each camera and one `intrinsics`; take one moment of one sequence, \
                       its `alpha_maps` are masks";
-        return one("a NeRSemble participant", t, format!("{BY_HAND}; {moment}"));
+        return by_hand("a NeRSemble participant", t, moment);
     }
     if let Some(t) = found.any(&["params.json"]).filter(|_| photographs.is_some()) {
-        let keys =
-            "it holds `I_K`, `I_Rt` (world to camera), `I_distortion` and `I_valid` of photograph I.jpg";
-        return one("a FaceScape tuple", t, format!("{BY_HAND}; {keys}: leave out what is not valid"));
+        let keys = "it holds `I_K`, `I_Rt` (world to camera), `I_distortion` and `I_valid` of photograph I.jpg: \
+                    leave out what is not valid";
+        return by_hand("a FaceScape tuple", t, keys);
     }
     if let Some(t) = found.any(&["keyframes"]) {
         return one("a Polycam raw export", t, nerfstudio("polycam", found.root.display(), ""));
@@ -177,11 +172,8 @@ fn recognised(found: &Found) -> Option<(&'static str, String, String)> {
     }
     if let Some(t) = found.ending(&["psx", "psz"]) {
         let way = nerfstudio("metashape", images, " --xml cameras.xml");
-        return one(
-            "a Metashape project",
-            t,
-            format!("export its cameras as XML (File, Export, Export Cameras); {way}"),
-        );
+        let export = "export its cameras as XML (File, Export, Export Cameras)";
+        return one("a Metashape project", t, format!("{export}; {way}"));
     }
     if let Some(t) = found.holding("csv", "#name,x,y,alt") {
         let way = nerfstudio("realitycapture", images, &format!(" --csv {}", found.at(t)));
@@ -202,7 +194,7 @@ fn recognised(found: &Found) -> Option<(&'static str, String, String)> {
         return one("a COLMAP model", t, way + "; so does instant-ngp's `colmap2nerf.py`");
     }
     if let Some(folder) = photographs {
-        let first = Found::of(&folder).ending(&PHOTOGRAPHS).cloned().unwrap_or_default();
+        let first = FolderEntries::of(&folder).ending(&PHOTOGRAPHS).cloned().unwrap_or_default();
         let way = nerfstudio("images", folder.display(), "");
         return one("photographs without cameras", &first, format!("{way} (it needs COLMAP)"));
     }

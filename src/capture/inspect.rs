@@ -1,8 +1,11 @@
 //! What was found: format, cameras, masks, splits, and every problem there is, not only the first.
 
-use super::llff::Agreement;
+use super::frame::Agreement;
+use super::gather::gather;
+use super::masks::{self, few};
 use super::scene::{self, SceneOptions};
-use super::{Capture, CaptureError, CaptureOptions, MaskSource, Split, View, gather, masks};
+use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
+use crate::Error;
 use crate::geom::Aabb;
 use crate::image::Gray;
 use glam::{DVec3, Vec3};
@@ -12,7 +15,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-/// A problem and the way out.
+/// A problem and its suggested fix.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Problem {
     /// What is wrong, and where.
@@ -24,23 +27,32 @@ pub struct Problem {
 }
 
 /// One entry for all that have the same problem but for the frame or file, and the numbers in it.
-fn grouped<'a>(all: impl IntoIterator<Item = &'a CaptureError>) -> Vec<Problem> {
+fn grouped(all: &[Error]) -> Vec<Problem> {
     let mut problems: Vec<Problem> = Vec::new();
     let mut first: HashMap<(String, String), usize> = HashMap::new();
-    for problem in all {
-        let (what, hint) = (problem.to_string(), problem.hint());
-        let subject = problem.subject().filter(|s| !s.is_empty());
-        let bare = subject.map_or(what.clone(), |s| what.replace(&s, ""));
-        let no_digits = |text: &str| text.replace(|c: char| c.is_ascii_digit(), "");
-        match first.get(&(no_digits(&bare), no_digits(&hint))) {
-            Some(&i) => problems[i].count += 1,
-            None => {
-                first.insert((no_digits(&bare), no_digits(&hint)), problems.len());
-                problems.push(Problem { what, hint, count: 1 });
-            }
+    for error in all {
+        let (what, hint) = (error.to_string(), error.hint().to_string());
+        let same = *first.entry((without_names(&what), without_names(&hint))).or_insert(problems.len());
+        match problems.get_mut(same) {
+            Some(problem) => problem.count += 1,
+            None => problems.push(Problem { what, hint, count: 1 }),
         }
     }
     problems
+}
+
+/// A message without its digits and what it quotes as the name of a file or frame.
+fn without_names(message: &str) -> String {
+    let mut before = "";
+    let mut rest = String::new();
+    for (i, part) in message.split('`').enumerate() {
+        let is_name = i % 2 == 1 && (before.ends_with("frame ") || part.contains(['.', '/', '\\']));
+        if !is_name {
+            rest.extend(part.chars().filter(|c| !c.is_ascii_digit()));
+        }
+        before = part;
+    }
+    rest
 }
 
 /// Least, middle and greatest of some numbers.
@@ -63,11 +75,11 @@ impl Range {
 }
 
 /// Everything [`inspect`] found.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct Inspection {
     /// The folder.
     pub root: PathBuf,
-    /// The format, if one was recognised and something can be used.
+    /// The format, if one was recognized and something can be used.
     pub format: Option<String>,
     /// Why, and what else lies there.
     pub reasons: Vec<String>,
@@ -118,31 +130,14 @@ impl Inspection {
 
 /// Reads everything in a capture, every photograph to its last pixel, and reports; never fails itself.
 pub fn inspect(root: &Path, options: &CaptureOptions) -> Inspection {
-    let found = gather(root, options);
+    let (capture, listing) = gather(root, options);
     let mut out = Inspection {
         root: root.into(),
-        format: None,
-        reasons: Vec::new(),
-        train: 0,
-        val: 0,
-        test: 0,
-        sizes: Vec::new(),
-        focal_px: None,
-        distance: None,
-        distorted: 0,
-        up: None,
-        masks: 0,
-        coverage: None,
-        valid: 0,
-        valid_share: None,
-        regions: 0,
-        poses: found.agreements,
-        scene: None,
-        scene_text: None,
-        problems: grouped(&found.problems),
-        warnings: Vec::new(),
+        poses: listing.agreements,
+        problems: grouped(&listing.problems),
+        ..Inspection::default()
     };
-    let Some(capture) = found.capture else { return out };
+    let Some(capture) = capture else { return out };
     out.format = Some(capture.format.clone());
     out.reasons = capture.reasons.clone();
     out.warnings = capture.warnings.clone();
@@ -150,7 +145,7 @@ pub fn inspect(root: &Path, options: &CaptureOptions) -> Inspection {
     cameras(&capture, &mut out);
     let masks = pixels(&capture, options, &mut out);
     place(&capture, masks, &mut out);
-    out.problems.extend(grouped(&masks::require_masks(&capture, options).err()));
+    out.problems.extend(grouped(masks::require_masks(&capture, options).err().as_slice()));
     out
 }
 
@@ -179,50 +174,39 @@ fn cameras(capture: &Capture, out: &mut Inspection) {
         out.warnings.push(format!(
             "the lens distortion folds over in the corners of {} views, whose pixels there are not used: {}",
             folded.len(),
-            masks::few(folded.into_iter())
+            few(folded.into_iter())
         ));
     }
 }
 
 /// Loads every view; returns the masks at a size that is enough to place the head.
 fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> Vec<Option<Gray>> {
-    struct Seen {
-        mask: Option<Gray>,
-        valid: Option<f64>,
-        findings: Vec<&'static str>,
-        coverage: Option<f64>,
-    }
-    let seen: Vec<Result<Seen, _>> = capture
+    let loaded: Vec<Result<_, Error>> = capture
         .views
         .par_iter()
         .map(|view| {
             let loaded = view.load(&options.limits)?;
-            let valid = loaded.valid.as_ref().map(masks::coverage);
             let mask = match (loaded.mask, &view.mask) {
-                (None, MaskSource::None) => None,
+                (None, ViewMask::None) => None,
                 (None, _) => view.load_mask(&options.limits)?, // "not looked at": judged all the same
                 (mask, _) => mask,
             };
-            Ok(Seen {
-                valid,
-                findings: mask.as_ref().map(masks::findings).unwrap_or_default(),
-                coverage: mask.as_ref().map(masks::coverage),
-                mask,
-            })
+            let judged = mask.as_ref().map(|m| (masks::findings(m), masks::coverage(m)));
+            Ok((mask, judged, loaded.valid.as_ref().map(masks::coverage)))
         })
-        .collect::<Vec<Result<Seen, CaptureError>>>();
+        .collect();
     let mut kinds: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     let mut unreadable = Vec::new();
     let (mut all, mut covered, mut usable) = (Vec::new(), Vec::new(), Vec::new());
-    for (view, seen) in capture.views.iter().zip(seen) {
-        match seen {
-            Ok(s) => {
-                for f in s.findings {
-                    kinds.entry(f).or_default().push(&view.name);
+    for (view, loaded) in capture.views.iter().zip(loaded) {
+        match loaded {
+            Ok((mask, judged, valid)) => {
+                if let Some((findings, coverage)) = judged {
+                    findings.into_iter().for_each(|f| kinds.entry(f).or_default().push(&view.name));
+                    covered.push(coverage);
                 }
-                covered.extend(s.coverage);
-                usable.extend(s.valid);
-                all.push(s.mask);
+                usable.extend(valid);
+                all.push(mask);
             }
             Err(e) => {
                 unreadable.push(e);
@@ -232,7 +216,7 @@ fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> 
     }
     out.problems.extend(grouped(&unreadable));
     for (finding, views) in kinds {
-        let (n, list) = (views.len(), masks::few(views.into_iter()));
+        let (n, list) = (views.len(), few(views.into_iter()));
         out.warnings.push(format!("the mask {finding} in {n} views: {list}"));
     }
     out.masks = covered.len();
@@ -245,16 +229,12 @@ fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> 
 
 /// Places the head from the views that are learned from.
 fn place(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
-    let (mut cameras, mut some, mut names) = (Vec::new(), Vec::new(), Vec::new());
-    for (view, mask) in capture.views.iter().zip(masks) {
-        if view.split == Split::Train {
-            cameras.push(view.camera.clone());
-            names.push(view.name.clone());
-            some.push(mask);
-        }
-    }
+    let train = capture.views.iter().zip(masks).filter(|(view, _)| view.split == Split::Train);
+    let (views, masks): (Vec<&View>, Vec<Option<Gray>>) = train.unzip();
+    let cameras: Vec<_> = views.iter().map(|v| v.camera.clone()).collect();
+    let names = views.iter().map(|v| v.name.clone()).collect();
     let options = SceneOptions { names, ..SceneOptions::default() };
-    match scene::fit(&cameras, &some, &options) {
+    match scene::fit(&cameras, &masks, &options) {
         Ok((scene, warnings)) => {
             let b = scene::world_box(&scene);
             let middle = b.center().as_dvec3();
@@ -264,14 +244,14 @@ fn place(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
             out.scene = Some(b);
             out.warnings.extend(warnings);
         }
-        Err(e) => out.problems.push(Problem { what: e.to_string(), hint: e.hint().into(), count: 1 }),
+        Err(e) => out.problems.extend(grouped(&[e])),
     }
 }
 
 impl fmt::Display for Inspection {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         writeln!(f, "{}", self.root.display())?;
-        writeln!(f, "  format    {}", self.format.as_deref().unwrap_or("not recognised"))?;
+        writeln!(f, "  format    {}", self.format.as_deref().unwrap_or("not recognized"))?;
         for reason in &self.reasons {
             writeln!(f, "            {reason}")?;
         }
@@ -291,27 +271,17 @@ impl fmt::Display for Inspection {
         if let Some(up) = self.up {
             writeln!(f, "            up is ({:.3}, {:.3}, {:.3})", up.x, up.y, up.z)?;
         }
-        if let Some(r) = self.coverage {
-            writeln!(
-                f,
-                "  masks     {} views; they cover {:.1} % to {:.1} % of the picture, in the middle {:.1} %",
-                self.masks,
-                100.0 * r.min,
-                100.0 * r.max,
-                100.0 * r.median
-            )?;
-        }
-        if self.masks == 0 && self.format.is_some() {
+        let percent = |r: Range| [r.min, r.max, r.median].map(|v| 100.0 * v);
+        if let Some([min, max, median]) = self.coverage.map(percent) {
+            let n = self.masks;
+            write!(f, "  masks     {n} views; they cover {min:.1} % to {max:.1} % of the picture, ")?;
+            writeln!(f, "in the middle {median:.1} %")?;
+        } else if self.format.is_some() {
             writeln!(f, "  masks     none")?;
         }
-        if let Some(r) = self.valid_share {
-            writeln!(
-                f,
-                "  valid     {} views; {:.1} % to {:.1} % of the pixels are usable",
-                self.valid,
-                100.0 * r.min,
-                100.0 * r.max
-            )?;
+        if let Some([min, max, _]) = self.valid_share.map(percent) {
+            let n = self.valid;
+            writeln!(f, "  valid     {n} views; {min:.1} % to {max:.1} % of the pixels are usable")?;
         }
         if let Some(text) = &self.scene_text {
             writeln!(f, "  head      {text}")?;

@@ -4,7 +4,10 @@
 //! so that every intrinsic is divided by exactly `d`. Colour is averaged in linear light, as a sensor
 //! with larger pixels would, weighted by alpha where there is one.
 
-use super::{CaptureError, MaskMeaning, MaskSource, View};
+use super::error::wrong_size;
+use super::view::{View, ViewMask};
+use crate::Result;
+use crate::config::MaskMeaning;
 use crate::geom::Camera;
 use crate::image::{Gray, Photo, linear_from_srgb, quantise, srgb_from_linear};
 use crate::io::{self, Limits, NpyValues};
@@ -25,23 +28,27 @@ pub struct LoadedView {
 
 impl View {
     /// Reads the photograph alone, at the size of its camera.
-    pub fn load_photo(&self, limits: &Limits) -> Result<Photo, CaptureError> {
-        let photo = io::read_photo(&self.photo, Some(self.photo_size), limits)?.photo;
+    pub fn load_photo(&self, limits: &Limits) -> Result<Photo> {
+        let photo = io::read_photo(&self.photo, Some(self.photo_size), limits)?;
         let found = (photo.width, photo.height);
         if found != self.photo_size {
             return Err(self.size_error(&self.photo, found)); // it was replaced since the capture was opened
         }
-        Ok(self.photo_reduced(photo))
+        if found == (self.camera.width, self.camera.height) {
+            return Ok(photo);
+        }
+        Ok(average_photo(&photo, self.downscale))
     }
 
     /// Reads the photograph, mask, valid mask and region of this view.
-    pub fn load(&self, limits: &Limits) -> Result<LoadedView, CaptureError> {
+    pub fn load(&self, limits: &Limits) -> Result<LoadedView> {
         let photo = self.load_photo(limits)?;
         let mask = self.head_mask(photo.alpha.as_deref(), limits)?;
-        let mut valid = match &self.valid {
-            None => None,
-            Some(path) => Some(self.reduced(path, self.read_valid(path, limits)?, Average::Least)?),
-        };
+        let valid = self
+            .valid
+            .as_deref()
+            .map(|path| self.reduced(path, self.read_valid(path, limits)?, Average::Least));
+        let mut valid = valid.transpose()?;
         let mask = match (mask, self.mask_meaning) {
             (Some(mask), MaskMeaning::Ignore) => {
                 let looked_at = |m: u8, v: u8| if m >= 128 && v != 0 { 255 } else { 0 };
@@ -52,41 +59,37 @@ impl View {
             }
             (mask, _) => mask,
         };
-        let region = match &self.region {
-            None => None,
-            Some(path) => Some(self.reduced(path, self.read_mask(path, limits)?, Average::Mean)?),
-        };
+        let region = self.region.as_deref().map(|path| self.read_mask(path, limits)).transpose()?;
         Ok(LoadedView { photo, mask, valid, region })
     }
 
     /// Only the mask of this view, at the camera's size, whatever it means; `None` without one.
-    pub fn load_mask(&self, limits: &Limits) -> Result<Option<Gray>, CaptureError> {
+    pub fn load_mask(&self, limits: &Limits) -> Result<Option<Gray>> {
         let alpha = match self.mask {
-            MaskSource::Alpha => self.load_photo(limits)?.alpha,
+            ViewMask::Alpha => self.load_photo(limits)?.alpha,
             _ => None,
         };
         self.head_mask(alpha.as_deref(), limits)
     }
 
-    fn head_mask(&self, alpha: Option<&[u8]>, limits: &Limits) -> Result<Option<Gray>, CaptureError> {
+    fn head_mask(&self, alpha: Option<&[u8]>, limits: &Limits) -> Result<Option<Gray>> {
         let (width, height) = (self.camera.width, self.camera.height);
         match &self.mask {
-            MaskSource::None => Ok(None),
-            MaskSource::Alpha => Ok(alpha.map(|a| Gray { width, height, values: a.to_vec() })),
-            MaskSource::File(path) => {
-                Ok(Some(self.reduced(path, self.read_mask(path, limits)?, Average::Mean)?))
-            }
+            ViewMask::None => Ok(None),
+            ViewMask::Alpha => Ok(alpha.map(|a| Gray { width, height, values: a.to_vec() })),
+            ViewMask::File(path) => self.read_mask(path, limits).map(Some),
         }
     }
 
-    fn read_mask(&self, path: &Path, limits: &Limits) -> Result<Gray, CaptureError> {
-        Ok(io::read_gray(path, Some(self.photo_size), limits)?)
+    /// A soft mask at the camera's size.
+    fn read_mask(&self, path: &Path, limits: &Limits) -> Result<Gray> {
+        self.reduced(path, io::read_gray(path, Some(self.photo_size), limits)?, Average::Mean)
     }
 
     /// A valid mask as 0 or 255; `.npy` of shape (h, w) or (h, w, 1), or a picture.
-    fn read_valid(&self, path: &Path, limits: &Limits) -> Result<Gray, CaptureError> {
+    fn read_valid(&self, path: &Path, limits: &Limits) -> Result<Gray> {
         if path.extension().is_none_or(|e| e != "npy") {
-            let mut gray = self.read_mask(path, limits)?;
+            let mut gray = io::read_gray(path, Some(self.photo_size), limits)?;
             gray.values.iter_mut().for_each(|v| *v = if *v >= 128 { 255 } else { 0 });
             return Ok(gray);
         }
@@ -94,12 +97,9 @@ impl View {
         let (height, width) = match npy.shape[..] {
             [h, w] | [h, w, 1] if h > 0 && w > 0 && h.max(w) <= limits.side_px as usize => (h, w),
             _ => {
-                return Err(io::ReadError::Unsupported {
-                    path: path.into(),
-                    what: format!("a valid mask of shape {:?}", npy.shape),
-                    hint: "its shape must be (height, width) or (height, width, 1)".into(),
-                }
-                .into());
+                let what = format!("a valid mask of shape {:?}", npy.shape);
+                let hint = "its shape must be (height, width) or (height, width, 1)";
+                return Err(io::ReadError::unsupported(path, what, hint).into());
             }
         };
         let values = match npy.values {
@@ -109,15 +109,7 @@ impl View {
         Ok(Gray { width: width as u32, height: height as u32, values })
     }
 
-    fn photo_reduced(&self, photo: Photo) -> Photo {
-        if (photo.width, photo.height) == (self.camera.width, self.camera.height) {
-            photo
-        } else {
-            average_photo(&photo, self.downscale)
-        }
-    }
-
-    fn reduced(&self, path: &Path, gray: Gray, average: Average) -> Result<Gray, CaptureError> {
+    fn reduced(&self, path: &Path, gray: Gray, average: Average) -> Result<Gray> {
         let found = (gray.width, gray.height);
         if found == (self.camera.width, self.camera.height) {
             Ok(gray)
@@ -128,9 +120,8 @@ impl View {
         }
     }
 
-    fn size_error(&self, path: &Path, found: (u32, u32)) -> CaptureError {
-        let by = self.declared_by.clone();
-        CaptureError::size(path.to_string_lossy().into_owned(), found, self.declared, by, self.downscale)
+    fn size_error(&self, path: &Path, found: (u32, u32)) -> crate::Error {
+        wrong_size(&path.to_string_lossy(), found, self.declared, &self.declared_by, self.downscale)
     }
 }
 

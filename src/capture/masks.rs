@@ -1,10 +1,12 @@
 //! Which masks lie beside the photographs, and whether they look like masks of a head.
 
-use super::listing::{Frame, Listing};
-use super::names::Place;
-use super::{Capture, CaptureError, CaptureOptions, MaskChoice, MaskMeaning, MaskSource, Split, View};
+use super::frame::{CameraFrame, Listing};
+use super::names::CaptureFolder;
+use super::view::{Capture, CaptureOptions, MaskChoice, Split, View, ViewMask};
+use crate::config::MaskMeaning;
 use crate::image::Gray;
 use crate::io::{self, PictureInfo};
+use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Names for a message: at most six, then how many more.
@@ -19,78 +21,54 @@ pub(super) fn few<'a>(names: impl Iterator<Item = &'a str>) -> String {
 
 /// Decides where masks come from, once for the whole capture, and finds valid masks and regions.
 ///
-/// `folder` is the one common to all photographs; mask folders lie beside it, or in the root.
+/// `common` is the folder of all photographs; mask folders lie beside it, or in the root.
 pub(super) fn choose(
-    place: &Place,
-    folder: &Path,
+    folder: &CaptureFolder,
+    common: &Path,
     views: &mut [View],
-    kept: &[(Frame, PictureInfo)],
+    kept: &[(CameraFrame, PictureInfo)],
     options: &CaptureOptions,
     listing: &mut Listing,
-) {
-    if let Err(problem) = choose_checked(place, folder, views, kept, options, listing) {
-        listing.problems.push(problem);
-    }
-}
-
-fn choose_checked(
-    place: &Place,
-    folder: &Path,
-    views: &mut [View],
-    kept: &[(Frame, PictureInfo)],
-    options: &CaptureOptions,
-    listing: &mut Listing,
-) -> Result<(), CaptureError> {
-    let beside = Beside { place, base: folder.parent().unwrap_or(Path::new("")).into() };
-    let mut candidates: Vec<(String, Vec<MaskSource>)> = Vec::new();
-    let alpha = |listing: &mut Listing| -> Result<Vec<MaskSource>, CaptureError> {
-        if !kept.iter().any(|(_, info)| info.alpha) || all_opaque(views, kept, options, listing)? {
-            return Ok(Vec::new());
-        }
-        let source = |info: &PictureInfo| if info.alpha { MaskSource::Alpha } else { MaskSource::None };
-        Ok(kept.iter().map(|(_, info)| source(info)).collect())
+) -> Result<()> {
+    let root = Path::new("");
+    let beside = [common.parent().unwrap_or(root), root];
+    let files = |bases: &[&Path], names: &dyn Fn(&View) -> Vec<String>| -> Result<Vec<ViewMask>> {
+        views.iter().map(|v| Ok(first_of(folder, bases, &names(v))?.into())).collect()
     };
-    let files = |pattern: &dyn Fn(&View) -> Vec<PathBuf>| -> Result<Vec<MaskSource>, CaptureError> {
-        views
-            .iter()
-            .map(|v| Ok(beside.first(&pattern(v))?.map_or(MaskSource::None, MaskSource::File)))
-            .collect()
+    let alpha = |listing: &mut Listing| -> Result<(String, Vec<ViewMask>)> {
+        let is_mask = kept.iter().any(|(_, info)| info.alpha) && !all_opaque(views, kept, options, listing)?;
+        let source =
+            |info: &PictureInfo| if is_mask && info.alpha { ViewMask::Alpha } else { ViewMask::None };
+        let sources = kept.iter().map(|(_, info)| source(info)).collect();
+        Ok(("the alpha channel of the photographs".into(), sources))
     };
-    match &options.masks {
-        MaskChoice::None => {}
-        MaskChoice::Alpha => {
-            candidates.push(("the alpha channel of the photographs".into(), alpha(listing)?));
-        }
+    let candidates = match &options.masks {
+        MaskChoice::None => Vec::new(),
+        MaskChoice::Alpha => vec![alpha(listing)?],
         MaskChoice::Folder(name) => {
-            let inside = place.relative("mask folder", name)?;
-            let found = views
-                .iter()
-                .map(|v| {
-                    let names = in_folder(&inside, v);
-                    Ok(first_of(place, &names)?.map_or(MaskSource::None, MaskSource::File))
-                })
-                .collect::<Result<Vec<_>, CaptureError>>()?;
-            candidates.push((format!("`{name}/`"), found));
+            let inside = folder.relative("mask folder", name)?;
+            let names = |v: &View| {
+                let stem = &v.name;
+                [format!("{stem}.png"), full_name(v) + ".png", format!("{stem}.jpg"), format!("{stem}.jpeg")]
+                    .into()
+            };
+            vec![(format!("`{name}/`"), files(&[&inside], &names)?)]
         }
         MaskChoice::Auto => {
-            candidates.push(("the alpha channel of the photographs".into(), alpha(listing)?));
-            let named = kept.iter().map(|(f, _)| f.mask.clone().map_or(MaskSource::None, MaskSource::File));
-            candidates.push(("`mask_path` of each frame".into(), named.collect()));
-            candidates.push((
-                "`vit_mask/NAME.png`".into(),
-                files(&|v| vec![Path::new("vit_mask").join(format!("{}.png", v.name))])?,
-            ));
-            candidates.push((
-                "`masks/NAME.png`".into(),
-                files(&|v| vec![Path::new("masks").join(format!("{}.png", v.name))])?,
-            ));
-            candidates.push((
-                "`masks/NAME.jpg.png`".into(),
-                files(&|v| vec![Path::new("masks").join(full_name(v) + ".png")])?,
-            ));
+            let named = kept.iter().map(|(f, _)| f.mask.clone().into()).collect();
+            let in_folder = |text: &str, name: &dyn Fn(&View) -> String| -> Result<_> {
+                Ok((format!("`{text}`"), files(&beside, &|v| vec![name(v)])?))
+            };
+            vec![
+                alpha(listing)?,
+                ("`mask_path` of each frame".into(), named),
+                in_folder("vit_mask/NAME.png", &|v| format!("vit_mask/{}.png", v.name))?,
+                in_folder("masks/NAME.png", &|v| format!("masks/{}.png", v.name))?,
+                in_folder("masks/NAME.jpg.png", &|v| format!("masks/{}.png", full_name(v)))?,
+            ]
         }
-    }
-    let has = |s: &[MaskSource]| s.iter().filter(|m| **m != MaskSource::None).count();
+    };
+    let has = |s: &[ViewMask]| s.iter().filter(|m| **m != ViewMask::None).count();
     match candidates.into_iter().find(|(_, sources)| has(sources) > 0) {
         Some((text, sources)) => {
             let n = has(&sources);
@@ -99,7 +77,7 @@ fn choose_checked(
                 view.mask = source;
             }
             if n < views.len() {
-                let without = views.iter().filter(|v| v.mask == MaskSource::None).map(|v| v.name.as_str());
+                let without = views.iter().filter(|v| v.mask == ViewMask::None).map(|v| v.name.as_str());
                 let mut text = format!("{} views have no mask: {}", views.len() - n, few(without));
                 if options.mask_meaning == MaskMeaning::Empty {
                     text += "; what is learned with masks learns nothing from them";
@@ -121,11 +99,11 @@ fn choose_checked(
 
     let (mut valid, mut region) = (0, 0);
     for (view, (frame, _)) in views.iter_mut().zip(kept) {
-        let names = ["masks", "valid"].map(|f| Path::new(f).join(format!("{}.npy", view.name)));
-        view.valid = beside.first(&names)?;
+        let name = &view.name;
+        view.valid = first_of(folder, &beside, &[format!("masks/{name}.npy"), format!("valid/{name}.npy")])?;
         view.region = match &frame.region {
             Some(path) => Some(path.clone()),
-            None => beside.first(&[Path::new("face_masks").join(format!("{}.png", view.name))])?,
+            None => first_of(folder, &beside, &[format!("face_masks/{name}.png")])?,
         };
         valid += view.valid.is_some() as usize;
         region += view.region.is_some() as usize;
@@ -142,13 +120,13 @@ fn choose_checked(
 /// Are the head masks there that `options` ask for? Without, everything the cameras see would be learned as the head:
 /// whoever wants that says so with [`MaskChoice::None`]. Held-out views need none, and of the others at least half must
 /// have one.
-pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<(), CaptureError> {
+pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> {
     if options.masks == MaskChoice::None {
         return Ok(());
     }
     let train: Vec<&View> = capture.split(Split::Train).collect();
     let without: Vec<&str> =
-        train.iter().filter(|v| v.mask == MaskSource::None).map(|v| v.name.as_str()).collect();
+        train.iter().filter(|v| v.mask == ViewMask::None).map(|v| v.name.as_str()).collect();
     let (total, missing) = (train.len(), without.len());
     let problem = if missing == total {
         "no photograph that is learned from has a head mask: nothing says which pixels are background, and there is \
@@ -175,29 +153,14 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<(), 
          folder named with `--set capture.mask_dir=FOLDER`; or go on without any, and learn whatever the cameras see: \
          `--set mask.source=none`"
     );
-    Err(CaptureError::NoMasks { root: root.clone(), problem, hint })
+    Err(Error::cannot(format_args!("`{shown}`: {problem}"), hint))
 }
 
-/// Folders beside the photographs' own, else in the capture's root.
-struct Beside<'a> {
-    place: &'a Place,
-    base: PathBuf,
-}
-
-impl Beside<'_> {
-    fn first(&self, names: &[PathBuf]) -> Result<Option<PathBuf>, CaptureError> {
-        let near: Vec<PathBuf> = names.iter().map(|n| self.base.join(n)).collect();
-        match first_of(self.place, &near)? {
-            None if !self.base.as_os_str().is_empty() => first_of(self.place, names),
-            found => Ok(found),
-        }
-    }
-}
-
-fn first_of(place: &Place, names: &[PathBuf]) -> Result<Option<PathBuf>, CaptureError> {
-    for name in names {
-        if let Some(path) = place.file("masks", name)? {
-            return Ok(Some(path));
+/// The first of these files that is there, below the first base with any.
+fn first_of(folder: &CaptureFolder, bases: &[&Path], names: &[String]) -> Result<Option<PathBuf>> {
+    for path in bases.iter().flat_map(|base| names.iter().map(move |name| base.join(name))) {
+        if let Some(file) = folder.file("masks", &path)? {
+            return Ok(Some(file));
         }
     }
     Ok(None)
@@ -209,24 +172,16 @@ fn full_name(view: &View) -> String {
     format!("{}.{ending}", view.name)
 }
 
-fn in_folder(folder: &Path, view: &View) -> Vec<PathBuf> {
-    let stem = &view.name;
-    [format!("{stem}.png"), full_name(view) + ".png", format!("{stem}.jpg"), format!("{stem}.jpeg")]
-        .iter()
-        .map(|n| folder.join(n))
-        .collect()
-}
-
 /// Is the alpha channel only a formality? Three photographs decide: an exporter that adds an opaque
 /// alpha adds it to all.
 fn all_opaque(
     views: &[View],
-    kept: &[(Frame, PictureInfo)],
+    kept: &[(CameraFrame, PictureInfo)],
     options: &CaptureOptions,
     listing: &mut Listing,
-) -> Result<bool, CaptureError> {
+) -> Result<bool> {
     for (view, _) in views.iter().zip(kept).filter(|(_, (_, info))| info.alpha).take(3) {
-        let photo = io::read_photo(&view.photo, Some(view.photo_size), &options.limits)?.photo;
+        let photo = io::read_photo(&view.photo, Some(view.photo_size), &options.limits)?;
         if photo.alpha.is_some_and(|a| a.iter().any(|&v| v != 255)) {
             return Ok(false);
         }
@@ -259,25 +214,18 @@ pub fn findings(mask: &Gray) -> Vec<&'static str> {
     if darkest >= 250 {
         return vec!["is white everywhere"];
     }
-    let mean = |indices: &mut dyn Iterator<Item = usize>| {
-        let (mut sum, mut n) = (0u64, 0u64);
-        for i in indices {
-            sum += mask.values[i] as u64;
-            n += 1;
-        }
-        sum as f64 / (255 * n.max(1)) as f64
+    // mean over columns x0..x1 of rows y0..y1, 0..=1
+    let mean = |x0: usize, x1: usize, y0: usize, y1: usize| {
+        let rows = mask.values.chunks_exact(w).take(y1).skip(y0);
+        let sum: u64 = rows.flat_map(|row| &row[x0..x1]).map(|&v| v as u64).sum();
+        sum as f64 / (255 * ((x1 - x0) * (y1 - y0)).max(1)) as f64
     };
-    let top = mean(&mut (0..w));
-    let bottom = mean(&mut (0..w).map(|x| (h - 1) * w + x));
-    let left = mean(&mut (0..h).map(|y| y * w));
-    let right = mean(&mut (0..h).map(|y| y * w + w - 1));
+    let (top, bottom, left, right) =
+        (mean(0, w, 0, 1), mean(0, w, h - 1, h), mean(0, 1, 0, h), mean(w - 1, w, 0, h));
     // shoulders may leave through the lower part of the sides
     let upper = 3 * h / 5;
-    let high_left = mean(&mut (0..upper).map(|y| y * w));
-    let high_right = mean(&mut (0..upper).map(|y| y * w + w - 1));
-    let rows = h / 3..h - h / 3;
-    let columns = w / 3..w - w / 3;
-    let middle = mean(&mut rows.flat_map(|y| columns.clone().map(move |x| y * w + x)));
+    let (high_left, high_right) = (mean(0, 1, 0, upper), mean(w - 1, w, 0, upper));
+    let middle = mean(w / 3, w - w / 3, h / 3, h - h / 3);
     let mut found = Vec::new();
     if (top + bottom + left + right) / 4.0 > 0.75 && middle < 0.5 {
         found.push("looks inverted: white must keep the head");

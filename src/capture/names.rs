@@ -1,21 +1,22 @@
 //! Names in camera files: only what lies inside the capture is ever opened.
 
-use super::CaptureError;
-use super::listing::Frame;
-use crate::io;
+use super::error::outside;
+use super::frame::CameraFrame;
+use crate::{Result, io};
 use std::path::{Component, Path, PathBuf};
 
-const ENDINGS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
+/// What may be missing at the end of a photograph's name.
+const ENDINGS: [&str; 7] = ["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"];
 
 /// The capture's folder, as given and without links.
-pub(super) struct Place {
+pub(super) struct CaptureFolder {
     root: PathBuf,
     real: PathBuf,
 }
 
-impl Place {
-    pub fn new(root: &Path) -> Result<Place, CaptureError> {
-        Ok(Place { root: root.into(), real: io::real_path(root)? })
+impl CaptureFolder {
+    pub fn new(root: &Path) -> Result<CaptureFolder> {
+        Ok(CaptureFolder { root: root.into(), real: io::real_path(root)? })
     }
 
     pub fn root(&self) -> &Path {
@@ -29,8 +30,8 @@ impl Place {
 
     /// The path below the capture that `name` means. `\` counts as a separator, since tools on Windows
     /// write it; an absolute name is taken if it points into the capture.
-    pub fn relative(&self, file: &str, name: &str) -> Result<PathBuf, CaptureError> {
-        let outside = || CaptureError::Outside { file: file.into(), name: name.into() };
+    pub fn relative(&self, file: &str, name: &str) -> Result<PathBuf> {
+        let outside = || outside(file, name);
         if name.is_empty() || name.contains('\0') {
             return Err(outside());
         }
@@ -57,47 +58,39 @@ impl Place {
     }
 
     /// The regular file at a relative path, if there is one; a link that leads out is an error.
-    pub fn file(&self, file: &str, relative: &Path) -> Result<Option<PathBuf>, CaptureError> {
+    pub fn file(&self, file: &str, relative: &Path) -> Result<Option<PathBuf>> {
         let path = self.root.join(relative);
         if !io::is_file(&path) {
             return Ok(None);
         }
         if !io::real_path(&path)?.starts_with(&self.real) {
-            let name = relative.to_string_lossy().into_owned();
-            return Err(CaptureError::Outside { file: file.into(), name });
+            return Err(outside(file, &relative.to_string_lossy()));
         }
         Ok(Some(path))
+    }
+
+    /// A camera file directly in the capture.
+    pub fn camera_file(&self, file: &str) -> Result<PathBuf> {
+        self.file(file, Path::new(file))?.ok_or_else(|| outside(file, file))
     }
 
     /// The photograph that `name` means, with its path below the capture: the very name, else with a
     /// usual ending, else in the folder of pictures already reduced by `downscale`
     /// (`images_4/`, `images_4x/`).
-    pub fn photo(
-        &self,
-        file: &str,
-        name: &str,
-        downscale: u32,
-    ) -> Result<(PathBuf, Option<PathBuf>), CaptureError> {
+    pub fn photo(&self, file: &str, name: &str, downscale: u32) -> Result<(PathBuf, Option<PathBuf>)> {
         let wanted = self.relative(file, name)?;
-        let mut folders = vec![wanted.clone()];
+        let mut candidates = vec![wanted.clone()];
         let mut parts = wanted.components();
-        if let Some(first) = parts.next()
+        if let Some(first) = parts.next().map(|c| c.as_os_str().to_string_lossy())
             && downscale > 1
             && !parts.as_path().as_os_str().is_empty()
         {
-            for suffix in [format!("_{downscale}"), format!("_{downscale}x")] {
-                let mut folder = first.as_os_str().to_owned();
-                folder.push(suffix);
-                folders.push(Path::new(&folder).join(parts.as_path()));
-            }
+            let reduced = [format!("{first}_{downscale}"), format!("{first}_{downscale}x")];
+            candidates.extend(reduced.map(|folder| Path::new(&folder).join(parts.as_path())));
         }
-        for candidate in folders {
-            if let Some(path) = self.file(file, &candidate)? {
-                return Ok((candidate, Some(path)));
-            }
+        for candidate in candidates {
             for ending in ENDINGS {
                 let mut with = candidate.clone().into_os_string();
-                with.push(".");
                 with.push(ending);
                 if let Some(path) = self.file(file, Path::new(&with))? {
                     return Ok((with.into(), Some(path)));
@@ -109,7 +102,7 @@ impl Place {
 }
 
 /// The folder common to all photographs, and each one's path below it without ending, `/` between.
-pub(super) fn view_names(frames: &[Frame]) -> (PathBuf, Vec<String>) {
+pub(super) fn view_names(frames: &[CameraFrame]) -> (PathBuf, Vec<String>) {
     let mut folder: Option<PathBuf> = None;
     for frame in frames {
         let parent = frame.relative.parent().unwrap_or(Path::new(""));
@@ -139,7 +132,7 @@ mod tests {
     #[test]
     fn names_stay_inside_the_capture_however_they_are_written() {
         let dir = tempfile::tempdir().unwrap();
-        let place = Place::new(dir.path()).unwrap();
+        let folder = CaptureFolder::new(dir.path()).unwrap();
         let good = [
             ("./images/a.png", "images/a.png"),
             ("images/../b/./c", "b/c"),
@@ -147,12 +140,13 @@ mod tests {
             ("a b/ü.png", "a b/ü.png"),
         ];
         for (name, path) in good {
-            assert_eq!(place.relative("t.json", name).unwrap(), Path::new(path));
+            assert_eq!(folder.relative("t.json", name).unwrap(), Path::new(path));
         }
         let inside = dir.path().join("x/y.png");
-        assert_eq!(place.relative("t.json", inside.to_str().unwrap()).unwrap(), Path::new("x/y.png"));
+        assert_eq!(folder.relative("t.json", inside.to_str().unwrap()).unwrap(), Path::new("x/y.png"));
         for name in ["../a.png", "a/../../b", "/etc/passwd", "", "C:\\a.png", "a\0b", "..\\a"] {
-            assert!(matches!(place.relative("t.json", name), Err(CaptureError::Outside { .. })), "{name:?}");
+            let error = folder.relative("t.json", name).unwrap_err().to_string();
+            assert!(error.contains("outside the capture"), "{name:?}: {error}");
         }
     }
 
@@ -162,7 +156,7 @@ mod tests {
         let (dir, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         std::fs::write(other.path().join("a.png"), b"x").unwrap();
         std::os::unix::fs::symlink(other.path().join("a.png"), dir.path().join("a.png")).unwrap();
-        let place = Place::new(dir.path()).unwrap();
-        assert!(matches!(place.photo("t.json", "a.png", 1), Err(CaptureError::Outside { .. })));
+        let folder = CaptureFolder::new(dir.path()).unwrap();
+        assert!(folder.photo("t.json", "a.png", 1).unwrap_err().to_string().contains("outside the capture"));
     }
 }

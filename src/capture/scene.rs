@@ -12,10 +12,11 @@
 //! Without masks: the box of the region that 40 % of the cameras have in their frame, no farther from the
 //! meeting point of the viewing axes than 0.6 of the cameras' median distance to it.
 
-use super::carve::{self, Cube, Projector, Silhouette};
+use super::carve::{self, Cube, Projector, SilhouetteTable};
 use super::masks::few;
 use crate::geom::{Aabb, Camera, Similarity};
 use crate::image::Gray;
+use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
@@ -91,94 +92,6 @@ impl Default for SceneOptions {
     }
 }
 
-/// Why no box can be found.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum SceneError {
-    /// No cameras at all, or one.
-    #[error("{found} cameras cannot place a head, two are needed at least")]
-    TooFewCameras {
-        /// How many there are.
-        found: usize,
-    },
-    /// Cameras and masks do not match.
-    #[error("there are {cameras} cameras but {masks} masks")]
-    Unpaired {
-        /// How many cameras.
-        cameras: usize,
-        /// How many entries for masks.
-        masks: usize,
-    },
-    /// One place, or one direction.
-    #[error("all {cameras} cameras {how}, so nothing says how far away the head is")]
-    CamerasAlike {
-        /// How many cameras.
-        cameras: usize,
-        /// What they share.
-        how: &'static str,
-    },
-    /// The cameras do not look at one thing.
-    #[error("the point all views aim at is inside the frame of only {seen} of {cameras} cameras")]
-    HeadOutside {
-        /// Frames that hold it.
-        seen: usize,
-        /// How many cameras.
-        cameras: usize,
-    },
-    /// Masks that keep everything.
-    #[error("all {masks} masks are white everywhere, so they say nothing about where the head is")]
-    AllWhite {
-        /// How many masks.
-        masks: usize,
-    },
-    /// Masks that keep nothing.
-    #[error("all {masks} masks are empty")]
-    AllEmpty {
-        /// How many masks.
-        masks: usize,
-    },
-    /// Silhouettes that contradict each other everywhere.
-    #[error("no point in space is inside all {masks} masks{}", suspect(culprit))]
-    EmptyHull {
-        /// How many masks.
-        masks: usize,
-        /// The view that removes most of what all others keep, if one stands out.
-        culprit: Option<String>,
-    },
-}
-
-fn suspect(culprit: &Option<String>) -> String {
-    culprit
-        .as_ref()
-        .map(|c| format!("; the mask of view `{c}` contradicts the others most"))
-        .unwrap_or_default()
-}
-
-crate::error::error_from!(SceneError, Cannot);
-
-impl SceneError {
-    /// The way out.
-    pub fn hint(&self) -> &'static str {
-        match self {
-            SceneError::TooFewCameras { .. } => "photograph the head from more sides",
-            SceneError::Unpaired { .. } => "give one mask, or none, per camera",
-            SceneError::CamerasAlike { .. } => {
-                "check that each frame has its own pose; cameras must look from different sides"
-            }
-            SceneError::HeadOutside { .. } => {
-                "check the axis convention of the poses: cameras must look along their -Z axis (OpenGL)"
-            }
-            SceneError::AllWhite { .. } => {
-                "make head masks: `tiface mask CAPTURE --page`; or go on without: `--set mask.source=none`"
-            }
-            SceneError::AllEmpty { .. } => "white must keep the head: were the masks saved as 0 and 1?",
-            SceneError::EmptyHull { .. } => {
-                "look at that view's mask and pose; are masks inverted, or poses of another capture?"
-            }
-        }
-    }
-}
-
 /// Finds the box, and the hull where there are masks; warnings name views that look wrong.
 ///
 /// `masks[i]` belongs to `cameras[i]`; a view without one does not carve. Masks may have another size than
@@ -187,12 +100,14 @@ pub fn fit(
     cameras: &[Camera],
     masks: &[Option<Gray>],
     options: &SceneOptions,
-) -> Result<(Scene, Vec<String>), SceneError> {
+) -> Result<(Scene, Vec<String>)> {
     if cameras.len() != masks.len() {
-        return Err(SceneError::Unpaired { cameras: cameras.len(), masks: masks.len() });
+        let message = format!("there are {} cameras but {} masks", cameras.len(), masks.len());
+        return Err(Error::cannot(message, "give one mask, or none, per camera"));
     }
     if cameras.len() < 2 {
-        return Err(SceneError::TooFewCameras { found: cameras.len() });
+        let message = format!("{} cameras cannot place a head, two are needed at least", cameras.len());
+        return Err(Error::cannot(message, "photograph the head from more sides"));
     }
     let name = |i: usize| options.names.get(i).cloned().unwrap_or_else(|| i.to_string());
     let mut warnings = Vec::new();
@@ -208,10 +123,15 @@ pub fn fit(
         }
     }
     if used.is_empty() && !white.is_empty() {
-        return Err(SceneError::AllWhite { masks: white.len() });
+        let n = white.len();
+        return Err(Error::cannot(
+            format_args!("all {n} masks are white everywhere, so they say nothing about where the head is"),
+            "make head masks: `tiface mask CAPTURE --page`; or go on without: `--set mask.source=none`",
+        ));
     }
     if used.is_empty() && !empty.is_empty() {
-        return Err(SceneError::AllEmpty { masks: empty.len() });
+        let message = format!("all {} masks are empty", empty.len());
+        return Err(Error::cannot(message, "white must keep the head: were the masks saved as 0 and 1?"));
     }
     for (views, what) in [(empty, "empty"), (white, "white everywhere")] {
         if !views.is_empty() {
@@ -228,9 +148,9 @@ pub fn fit(
     let aims: Vec<_> = used.iter().map(|&i| carve::ray_to(&cameras[i], masks[i].as_ref())).collect();
     let some: Vec<&Camera> = used.iter().map(|&i| &cameras[i]).collect();
     let center = aim(&some, &aims)?;
-    let silhouettes: Vec<Silhouette> = used
+    let silhouettes: Vec<SilhouetteTable> = used
         .iter()
-        .filter_map(|&i| Some(Silhouette::new(i, &cameras[i], masks[i].as_ref()?, options.threshold)))
+        .filter_map(|&i| Some(SilhouetteTable::new(i, &cameras[i], masks[i].as_ref()?, options.threshold)))
         .collect();
     let least = options.least_views.min(used.len());
     let core = used.len().div_ceil(3).max(least);
@@ -251,8 +171,13 @@ pub fn fit(
         }
         let Some(extent) = carve::extent(&kept, cube.n) else {
             let most = (0..silhouettes.len()).max_by_key(|&i| word.0[i]);
-            let culprit = most.filter(|&i| word.0[i] > 0).map(|i| name(silhouettes[i].view));
-            return Err(SceneError::EmptyHull { masks: used.len(), culprit });
+            let culprit = most.filter(|&i| word.0[i] > 0).map_or(String::new(), |i| {
+                format!("; the mask of view `{}` contradicts the others most", name(silhouettes[i].view))
+            });
+            return Err(Error::cannot(
+                format_args!("no point in space is inside all {} masks{culprit}", used.len()),
+                "look at that view's mask and pose; are masks inverted, or poses of another capture?",
+            ));
         };
         let (first, last) = (cube.n == options.resolution, shrunk == 4);
         let cut = extent.iter().any(|&(lo, hi)| lo == 0 || hi == cube.n - 1);
@@ -319,9 +244,14 @@ fn scene_from(center: DVec3, half: f64) -> Similarity {
 }
 
 /// Where the rays meet, once it is clear that they do.
-fn aim(cameras: &[&Camera], rays: &[(DVec3, DVec3)]) -> Result<DVec3, SceneError> {
+fn aim(cameras: &[&Camera], rays: &[(DVec3, DVec3)]) -> Result<DVec3> {
     let n = cameras.len();
-    let alike = |how| SceneError::CamerasAlike { cameras: n, how };
+    let alike = |how: &str| {
+        Error::cannot(
+            format_args!("all {n} cameras {how}, so nothing says how far away the head is"),
+            "check that each frame has its own pose; cameras must look from different sides",
+        )
+    };
     let mean = cameras.iter().map(|c| c.position).sum::<DVec3>() / n as f64;
     let spread = cameras.iter().map(|c| c.position.distance(mean)).fold(0.0, f64::max);
     if spread <= 1e-9 * (1.0 + mean.length()) {
@@ -334,9 +264,16 @@ fn aim(cameras: &[&Camera], rays: &[(DVec3, DVec3)]) -> Result<DVec3, SceneError
     }
     let seen = cameras.iter().filter(|c| Projector::new(c).sees(center)).count();
     if seen < n.min(3) {
-        return Err(SceneError::HeadOutside { seen, cameras: n });
+        return Err(head_outside(seen, n));
     }
     Ok(center)
+}
+
+fn head_outside(seen: usize, cameras: usize) -> Error {
+    Error::cannot(
+        format_args!("the point all views aim at is inside the frame of only {seen} of {cameras} cameras"),
+        "check the axis convention of the poses: cameras must look along their -Z axis (OpenGL)",
+    )
 }
 
 /// Half the side of a cube around `center` that no frame's picture of it leaves, short of the cameras.
@@ -350,7 +287,7 @@ fn first_half(cameras: &[&Camera], center: DVec3) -> f64 {
 }
 
 /// The box without masks: see the module's text.
-fn from_frusta(cameras: &[Camera]) -> Result<Scene, SceneError> {
+fn from_frusta(cameras: &[Camera]) -> Result<Scene> {
     let some: Vec<&Camera> = cameras.iter().collect();
     let axes: Vec<_> = cameras.iter().map(|c| carve::ray_to(c, None)).collect();
     let center = aim(&some, &axes)?;
@@ -368,7 +305,7 @@ fn from_frusta(cameras: &[Camera]) -> Result<Scene, SceneError> {
     carve::drop_dust(&mut kept, cube.n, 1.0);
     let Some(extent) = carve::extent(&kept, cube.n) else {
         let seen = projectors.iter().filter(|c| c.sees(center)).count();
-        return Err(SceneError::HeadOutside { seen, cameras: cameras.len() });
+        return Err(head_outside(seen, cameras.len()));
     };
     let lo = DVec3::from(extent.map(|(lo, _)| lo as f64));
     let hi = DVec3::from(extent.map(|(_, hi)| hi as f64 + 1.0));
@@ -496,11 +433,11 @@ mod tests {
         let one = ring(1)[0].clone();
         let cameras = vec![one.clone(); 5];
         let error = fit(&cameras, &vec![None; 5], &small()).unwrap_err();
-        assert!(matches!(error, SceneError::CamerasAlike { how: "stand at one place", .. }), "{error}");
+        assert!(error.to_string().contains("all 5 cameras stand at one place"), "{error}");
         let side = one.rotation.x_axis;
         let beside = vec![one.clone(), Camera { position: one.position + side, ..one }];
         let error = fit(&beside, &[None, None], &small()).unwrap_err();
-        assert!(matches!(error, SceneError::CamerasAlike { how: "look in one direction", .. }), "{error}");
+        assert!(error.to_string().contains("all 2 cameras look in one direction"), "{error}");
     }
 
     #[test]
@@ -508,22 +445,23 @@ mod tests {
         let cameras: Vec<_> =
             ring(6).into_iter().map(|c| camera(c.position, c.position + (c.position - CENTER))).collect();
         let error = fit(&cameras, &vec![None; 6], &small()).unwrap_err();
-        assert!(matches!(error, SceneError::HeadOutside { seen: 0, cameras: 6 }), "{error}");
+        assert!(error.to_string().contains("only 0 of 6 cameras"), "{error}");
     }
 
     #[test]
     fn white_empty_and_contradicting_masks_are_named_errors() {
         let cameras = ring(6);
         let flat = |v: u8| vec![Some(Gray { width: 60, height: 60, values: vec![v; 3600] }); 6];
-        assert!(matches!(fit(&cameras, &flat(255), &small()), Err(SceneError::AllWhite { masks: 6 })));
-        assert!(matches!(fit(&cameras, &flat(0), &small()), Err(SceneError::AllEmpty { masks: 6 })));
+        let message = |masks: &[Option<Gray>]| fit(&cameras, masks, &small()).unwrap_err().to_string();
+        assert!(message(&flat(255)).starts_with("all 6 masks are white everywhere"));
+        assert_eq!(message(&flat(0)), "all 6 masks are empty");
         let mut masks: Vec<_> = cameras.iter().map(ball).collect();
         let mut corner = vec![0; 3600];
         corner[..5].fill(255);
         masks[2] = Some(Gray { width: 60, height: 60, values: corner });
         let options = SceneOptions { names: (0..6).map(|i| format!("cam{i}")).collect(), ..small() };
         let error = fit(&cameras, &masks, &options).unwrap_err();
-        assert!(matches!(&error, SceneError::EmptyHull { culprit: Some(c), .. } if c == "cam2"), "{error}");
+        assert!(error.to_string().contains("inside all 6 masks; the mask of view `cam2`"), "{error}");
     }
 
     #[test]

@@ -14,7 +14,7 @@ mod shape;
 pub use shape::{Material, SyntheticHead};
 
 use crate::geom::{Camera, Distortion};
-use crate::io::{self, WriteError};
+use crate::{Error, Result, io};
 use glam::{DMat3, DVec3};
 use photograph::Studio;
 use serde_json::{Value, json};
@@ -35,45 +35,10 @@ pub struct SyntheticOptions {
     pub seed: u64,
 }
 
-crate::error::error_from!(SyntheticError, Cannot);
-
-impl SyntheticError {
-    /// The way out.
-    pub fn hint(&self) -> String {
-        match self {
-            SyntheticError::Options { .. } => "ask for a size and number of views within these bounds".into(),
-            SyntheticError::Write(e) => e.hint(),
-        }
-    }
-}
-
 impl Default for SyntheticOptions {
     fn default() -> Self {
         SyntheticOptions { width: 256, height: 320, train: 24, test: 8, seed: 42 }
     }
-}
-
-/// Why no capture was written.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum SyntheticError {
-    /// A size or count that makes no capture.
-    #[error(
-        "a synthetic capture of {train} + {test} views at {width} × {height} pixels: expected 1..=999 views in all and sides of 16..=4096"
-    )]
-    Options {
-        /// As asked.
-        width: u32,
-        /// As asked.
-        height: u32,
-        /// As asked.
-        train: usize,
-        /// As asked.
-        test: usize,
-    },
-    /// A file could not be written.
-    #[error(transparent)]
-    Write(#[from] WriteError),
 }
 
 /// The cameras of a capture, training views first: `(camera, is it for training)`.
@@ -130,12 +95,18 @@ fn aim(options: &SyntheticOptions, azimuth: f64, elevation: f64, distance: f64, 
 /// `face_masks/` (binary), `transforms.json` with every view and its split, `transforms_train.json`,
 /// `transforms_test.json` and `README.md`. `transforms.json` comes last: a capture that has one is
 /// complete.
-pub fn write_capture(dir: &Path, options: &SyntheticOptions) -> Result<(), SyntheticError> {
+pub fn write_capture(dir: &Path, options: &SyntheticOptions) -> Result<()> {
     let &SyntheticOptions { width, height, train, test, seed } = options;
     let sides = 16..=4096;
     let views = train.saturating_add(test);
     if !sides.contains(&width) || !sides.contains(&height) || train == 0 || views > 999 {
-        return Err(SyntheticError::Options { width, height, train, test });
+        return Err(Error::cannot(
+            format_args!(
+                "a synthetic capture of {train} + {test} views at {width} × {height} pixels: expected 1..=999 views \
+                 in all and sides of 16..=4096"
+            ),
+            "ask for a size and number of views within these bounds",
+        ));
     }
     let studio = Studio::new();
     let cameras = cameras(options);
@@ -260,6 +231,6 @@ mod tests {
             }
         }
         let none = SyntheticOptions { train: 0, ..SMALL };
-        assert!(matches!(write_capture(dir.path(), &none), Err(SyntheticError::Options { .. })));
+        assert!(write_capture(dir.path(), &none).unwrap_err().to_string().contains("0 + 2 views"));
     }
 }

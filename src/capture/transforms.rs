@@ -1,120 +1,195 @@
 //! `transforms.json` and its split forms: the dialects of NeRF-Blender, instant-ngp and nerfstudio.
 //!
 //! Poses are camera-to-world with OpenGL axes in all three. Intrinsics may stand at the top or in each
-//! frame; a frame's own win. Unknown keys are ignored; known ones of the wrong type are errors.
+//! frame; a frame's own win. Unknown keys are ignored, `null` counts as absent; known ones of the wrong type are
+//! errors.
 
-use super::listing::{Frame, Lens, Listing};
-use super::names::Place;
+use super::error::{in_file, in_frame};
+use super::frame::{CameraFrame, Intrinsics, Listing};
+use super::names::CaptureFolder;
 use super::pose;
-use super::{CaptureError, CaptureOptions, Split};
+use super::view::{CaptureOptions, Split};
+use crate::Result;
 use crate::geom::Distortion;
 use crate::io::{self, ReadError};
 use glam::DVec3;
+use serde::Deserialize;
 use serde_json::{Map, Value};
+use std::collections::HashSet;
 
 type Object = Map<String, Value>;
 
+/// Keys of the focal length: whoever names one names all, or a frame's own angle would be overruled by the whole
+/// file's focal length.
+const FOCAL: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
+
+/// The other keys that may stand at the top for all frames.
+const SHARED: [&str; 14] =
+    ["w", "h", "cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "is_fisheye", "camera_model"];
+
+/// What is read at the top of a file, besides frames and intrinsics.
+#[derive(Default, Deserialize)]
+#[serde(default)]
+struct TopKeys {
+    up: Option<[f64; 3]>,
+    // nerfstudio's splits
+    train_filenames: HashSet<String>,
+    val_filenames: HashSet<String>,
+    test_filenames: HashSet<String>,
+}
+
+impl TopKeys {
+    fn split(&self, name: &str) -> Option<Split> {
+        let lists = [
+            (&self.train_filenames, Split::Train),
+            (&self.val_filenames, Split::Val),
+            (&self.test_filenames, Split::Test),
+        ];
+        lists.iter().find(|(names, _)| names.contains(name)).map(|(_, split)| *split)
+    }
+}
+
+/// What is read of a frame, intrinsics from the top included.
+#[derive(Deserialize)]
+struct FrameKeys {
+    file_path: String,
+    transform_matrix: Vec<Vec<f64>>,
+    split: Option<String>,
+    mask_path: Option<String>,
+    face_mask_path: Option<String>,
+    w: Option<f64>,
+    h: Option<f64>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    camera_angle_x: Option<f64>,
+    camera_angle_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    #[serde(default)]
+    k1: f64,
+    #[serde(default)]
+    k2: f64,
+    #[serde(default)]
+    k3: f64,
+    #[serde(default)]
+    k4: f64,
+    #[serde(default)]
+    k5: f64,
+    #[serde(default)]
+    k6: f64,
+    #[serde(default)]
+    p1: f64,
+    #[serde(default)]
+    p2: f64,
+    #[serde(default)]
+    is_fisheye: bool,
+    camera_model: Option<String>,
+}
+
+impl FrameKeys {
+    fn read(top: &Object, entry: &Value) -> Result<FrameKeys, String> {
+        let own = entry.as_object().ok_or("it is not a JSON object")?;
+        let own_focal = FOCAL.iter().any(|key| own.contains_key(*key));
+        let shared = SHARED.iter().chain(FOCAL.iter().filter(|_| !own_focal));
+        let shared = shared.filter_map(|key| top.get_key_value(*key));
+        let is_given = |(_, value): &(&String, &Value)| !value.is_null();
+        let merged: Object = (shared.filter(is_given).chain(own.iter().filter(is_given)))
+            .map(|(key, value)| (key.clone(), value.clone()))
+            .collect();
+        io::typed(&Value::Object(merged))
+            .map_err(|[key, found, expected]| format!("its `{key}` is {found}, expected {expected}"))
+    }
+}
+
 /// Lists the frames of `files`, in order; everything wrong goes to the listing's problems.
-pub(super) fn list(place: &Place, files: &[&str], options: &CaptureOptions, listing: &mut Listing) {
-    for &file in files {
-        let split = match file {
-            "transforms_train.json" => Some(Split::Train),
-            "transforms_val.json" => Some(Split::Val),
-            "transforms_test.json" => Some(Split::Test),
-            _ => None,
-        };
-        if let Err(problem) = list_file(place, file, split, options, listing) {
+pub(super) fn list(folder: &CaptureFolder, files: &[&str], options: &CaptureOptions, listing: &mut Listing) {
+    for file in files {
+        if let Err(problem) = list_file(folder, file, options, listing) {
             listing.problems.push(problem);
         }
     }
-    if listing.frames.len() > options.limits.views {
-        listing.problems.push(CaptureError::Read(ReadError::TooLarge {
-            path: place.root().into(),
-            what: "the number of views",
-            found: listing.frames.len() as u64,
-            limit: options.limits.views as u64,
-        }));
+    let (found, limit) = (listing.frames.len() as u64, options.limits.views as u64);
+    if found > limit {
+        let problem = ReadError::too_large(folder.root(), "the number of views", found, limit);
+        listing.problems.push(problem.into());
         listing.frames.clear();
     }
 }
 
 fn list_file(
-    place: &Place,
+    folder: &CaptureFolder,
     file: &str,
-    split: Option<Split>,
     options: &CaptureOptions,
     listing: &mut Listing,
-) -> Result<(), CaptureError> {
-    let path = place.root().join(file);
-    if place.file(file, file.as_ref())?.is_none() {
-        return Err(CaptureError::Outside { file: file.into(), name: file.into() });
-    }
+) -> Result<()> {
+    let path = folder.camera_file(file)?;
     let value = io::read_json(&path, &options.limits)?;
-    let structure = |problem: String, hint: &str| CaptureError::Structure {
-        file: file.into(),
-        problem,
-        hint: hint.into(),
+    let Some(top) = value.as_object() else {
+        return Err(in_file(file, "it is not a JSON object", "it must begin with `{`"));
     };
-    let top = value
-        .as_object()
-        .ok_or_else(|| structure("it is not a JSON object".into(), "it must begin with `{`"))?;
-    let frames = top.get("frames").and_then(Value::as_array).ok_or_else(|| {
-        structure("it has no list `frames`".into(), "each entry of `frames` describes one photograph")
-    })?;
+    let Some(frames) = top.get("frames").and_then(Value::as_array) else {
+        let hint = "each entry of `frames` describes one photograph";
+        return Err(in_file(file, "it has no list `frames`", hint));
+    };
     if frames.is_empty() {
-        return Err(structure(
-            "its list `frames` is empty".into(),
-            "it must describe at least one photograph",
+        let hint = "it must describe at least one photograph";
+        return Err(in_file(file, "its list `frames` is empty", hint));
+    }
+    let (found, limit) = (frames.len() as u64, options.limits.views as u64);
+    if found > limit {
+        return Err(ReadError::too_large(&path, "the number of frames", found, limit).into());
+    }
+    let about: TopKeys = io::typed(&value).map_err(|[key, found, expected]| {
+        in_file(file, format_args!("`{key}` is {found}, expected {expected}"), "correct that key")
+    })?;
+    if top.contains_key("applied_transform") || top.contains_key("applied_scale") {
+        listing.reasons.push(format!(
+            "`{file}` says its world was moved (`applied_transform`): results come out in the moved world"
         ));
     }
-    if frames.len() > options.limits.views {
-        return Err(CaptureError::Read(ReadError::TooLarge {
-            path,
-            what: "the number of frames",
-            found: frames.len() as u64,
-            limit: options.limits.views as u64,
-        }));
-    }
-    notes(top, file, listing);
-    let named = named_splits(top).map_err(|problem| structure(problem, "list file names there"))?;
+    listing.up = listing.up.or(about.up.and_then(|up| DVec3::from(up).try_normalize()));
+    let split_of_file = match file {
+        "transforms_train.json" => Some(Split::Train),
+        "transforms_val.json" => Some(Split::Val),
+        "transforms_test.json" => Some(Split::Test),
+        _ => None,
+    };
     let mut ignored = Vec::new();
     for (i, entry) in frames.iter().enumerate() {
-        let number = format!("#{i}");
         let name = entry.get("file_path").and_then(Value::as_str);
-        let problem = |problem: String| CaptureError::Frame {
-            file: file.into(),
-            frame: name.unwrap_or(&number).into(),
-            problem,
-            hint: "correct that frame, or remove it".into(),
-        };
-        let parsed = match (entry.as_object(), name) {
-            (Some(entry), Some(name)) => {
-                parse_frame(top, entry, name, split.or(named.of(name)), &mut ignored)
+        let number = format!("#{i}");
+        let problem = |text: String| in_frame(file, name.unwrap_or(&number), text);
+        let frame = FrameKeys::read(top, entry).map_err(problem).and_then(|keys| {
+            let split = split_of_file.or(about.split(&keys.file_path));
+            let (rotation, position) =
+                upper_rows(&keys.transform_matrix).and_then(|rows| pose::pose(&rows)).map_err(problem)?;
+            let split = named_split(keys.split.as_deref(), split).map_err(problem)?;
+            let intrinsics = intrinsics(&keys, &mut ignored).map_err(problem)?;
+            let (relative, photo) = folder.photo(file, &keys.file_path, options.downscale)?;
+            let beside = |name: &Option<String>| match name {
+                Some(name) => folder.file(file, &folder.relative(file, name)?),
+                None => Ok(None),
+            };
+            let (mask, region) = (beside(&keys.mask_path)?, beside(&keys.face_mask_path)?);
+            if keys.mask_path.is_some() && mask.is_none() && photo.is_some() {
+                listing.problems.push(problem("the mask it names is missing".into()));
             }
-            _ => Err("it has no `file_path`".into()),
-        };
-        let mut frame = match parsed {
-            Ok(frame) => frame,
-            Err(text) => {
-                listing.problems.push(problem(text));
-                continue;
-            }
-        };
-        frame.file = file.into();
-        let beside = |key: &str| -> Result<_, CaptureError> {
-            let Some(name) = entry.get(key).and_then(Value::as_str) else { return Ok(None) };
-            place.file(file, &place.relative(file, name)?)
-        };
-        let files = place
-            .photo(file, &frame.name, options.downscale)
-            .and_then(|photo| Ok((photo, beside("mask_path")?, beside("face_mask_path")?)));
-        match files {
-            Ok(((relative, photo), mask, region)) => {
-                if entry.get("mask_path").is_some() && mask.is_none() && photo.is_some() {
-                    listing.problems.push(problem("the mask it names is missing".into()));
-                }
-                listing.frames.push(Frame { relative, photo, mask, region, ..frame });
-            }
+            let (file, name) = (file.to_string(), keys.file_path);
+            Ok(CameraFrame {
+                file,
+                name,
+                photo,
+                relative,
+                split,
+                intrinsics,
+                rotation,
+                position,
+                mask,
+                region,
+            })
+        });
+        match frame {
+            Ok(frame) => listing.frames.push(frame),
             Err(problem) => listing.problems.push(problem),
         }
     }
@@ -127,121 +202,56 @@ fn list_file(
     Ok(())
 }
 
-/// Things at the top that change nothing here but that a person should know.
-fn notes(top: &Object, file: &str, listing: &mut Listing) {
-    if top.contains_key("applied_transform") || top.contains_key("applied_scale") {
-        listing.reasons.push(format!(
-            "`{file}` says its world was moved (`applied_transform`): results come out in the moved world"
-        ));
+/// The split a frame names, else the one it is in otherwise.
+fn named_split(name: Option<&str>, otherwise: Option<Split>) -> Result<Option<Split>, String> {
+    match name {
+        None => Ok(otherwise),
+        Some("train") => Ok(Some(Split::Train)),
+        Some("val" | "eval" | "validation") => Ok(Some(Split::Val)),
+        Some("test") => Ok(Some(Split::Test)),
+        Some(other) => Err(format!("its split is `{other}`; known are train, val, test")),
     }
-    if listing.up.is_none()
-        && let Some(up) = top.get("up").and_then(Value::as_array)
-        && let [Some(x), Some(y), Some(z)] = [0, 1, 2].map(|k| up.get(k).and_then(Value::as_f64))
-        && let Some(up) = DVec3::new(x, y, z).try_normalize()
-    {
-        listing.up = Some(up);
-    }
-}
-
-/// nerfstudio's `train_filenames`, `val_filenames`, `test_filenames`.
-#[derive(Default)]
-struct NamedSplits<'a> {
-    lists: Vec<(Split, std::collections::HashSet<&'a str>)>,
-}
-
-impl NamedSplits<'_> {
-    fn of(&self, name: &str) -> Option<Split> {
-        self.lists.iter().find(|(_, names)| names.contains(name)).map(|(split, _)| *split)
-    }
-}
-
-fn named_splits(top: &Object) -> Result<NamedSplits<'_>, String> {
-    let mut splits = NamedSplits::default();
-    let keys =
-        [("train_filenames", Split::Train), ("val_filenames", Split::Val), ("test_filenames", Split::Test)];
-    for (key, split) in keys {
-        if let Some(value) = top.get(key) {
-            let names = value.as_array().and_then(|a| a.iter().map(Value::as_str).collect());
-            splits.lists.push((split, names.ok_or_else(|| format!("`{key}` is not a list of names"))?));
-        }
-    }
-    Ok(splits)
-}
-
-fn parse_frame(
-    top: &Object,
-    entry: &Object,
-    name: &str,
-    split: Option<Split>,
-    ignored: &mut Vec<String>,
-) -> Result<Frame, String> {
-    let matrix = entry.get("transform_matrix").ok_or("it has no `transform_matrix`")?;
-    let (rotation, position) = pose::pose(&matrix_rows(matrix)?)?;
-    let split = match entry.get("split").map(|s| s.as_str()) {
-        None => split,
-        Some(Some("train")) => Some(Split::Train),
-        Some(Some("val" | "eval" | "validation")) => Some(Split::Val),
-        Some(Some("test")) => Some(Split::Test),
-        Some(other) => {
-            return Err(format!("its split is `{}`; known are train, val, test", other.unwrap_or("?")));
-        }
-    };
-    Ok(Frame {
-        file: String::new(),
-        name: name.into(),
-        photo: None,
-        relative: Default::default(),
-        split,
-        lens: lens(top, entry, ignored)?,
-        rotation,
-        position,
-        mask: None,
-        region: None,
-    })
 }
 
 /// The upper three rows of a 3×4 or 4×4 matrix.
-fn matrix_rows(value: &Value) -> Result<[[f64; 4]; 3], String> {
-    let shape = "its `transform_matrix` is not 4 × 4 or 3 × 4 numbers";
-    let rows = value.as_array().filter(|r| r.len() == 3 || r.len() == 4).ok_or(shape)?;
-    let mut out = [[0.0; 4]; 4];
-    out[3] = [0.0, 0.0, 0.0, 1.0];
-    for (row, to) in rows.iter().zip(&mut out) {
-        let row = row.as_array().filter(|r| r.len() == 4).ok_or(shape)?;
-        for (v, to) in row.iter().zip(to) {
-            *to = v.as_f64().ok_or(shape)?;
-        }
-    }
-    let last = out[3];
+fn upper_rows(matrix: &[Vec<f64>]) -> Result<[[f64; 4]; 3], String> {
+    let rows: Option<Vec<[f64; 4]>> = matrix.iter().map(|row| row.as_slice().try_into().ok()).collect();
+    let ([a, b, c], last) = match rows.as_deref() {
+        Some(&[a, b, c]) => ([a, b, c], [0.0, 0.0, 0.0, 1.0]),
+        Some(&[a, b, c, last]) => ([a, b, c], last),
+        _ => return Err("its `transform_matrix` is not 4 × 4 or 3 × 4 numbers".into()),
+    };
     if last[..3].iter().any(|v| v.abs() > 1e-6) || (last[3] - 1.0).abs() > 1e-6 {
         return Err(format!("the last row of its `transform_matrix` is {last:?}, not 0 0 0 1"));
     }
-    Ok([out[0], out[1], out[2]])
+    Ok([a, b, c])
 }
 
-fn lens(top: &Object, entry: &Object, ignored: &mut Vec<String>) -> Result<Lens, String> {
-    let number = |of: &Object, key: &str| match of.get(key) {
-        None | Some(Value::Null) => Ok(None),
-        Some(v) => v.as_f64().map(Some).ok_or_else(|| format!("`{key}` is {v}, not a number")),
+fn intrinsics(keys: &FrameKeys, ignored: &mut Vec<String>) -> Result<Intrinsics, String> {
+    let side = |key: &str, value: Option<f64>| match value {
+        Some(v) if v.fract() != 0.0 || !(1.0..=1e6).contains(&v) => {
+            Err(format!("`{key}` is {v}, not a whole number of pixels"))
+        }
+        _ => Ok(value.map(|v| v as u32)),
     };
-    let either = |key: &str| Ok::<_, String>(number(entry, key)?.or(number(top, key)?));
-    let side = |key: &str| match either(key)? {
-        None => Ok(None),
-        Some(v) if v.fract() == 0.0 && (1.0..=1e6).contains(&v) => Ok(Some(v as u32)),
-        Some(v) => Err(format!("`{key}` is {v}, not a whole number of pixels")),
-    };
-    let fisheye = [entry, top].iter().any(|o| o.get("is_fisheye").and_then(Value::as_bool) == Some(true));
-    let model = [entry, top].iter().find_map(|o| o.get("camera_model")).and_then(Value::as_str);
-    let model = if fisheye { "OPENCV_FISHEYE (`is_fisheye`)" } else { model.unwrap_or("OPENCV") };
-    let k = |key: &str| Ok::<_, String>(either(key)?.unwrap_or(0.0));
-    let found = Distortion { k1: k("k1")?, k2: k("k2")?, k3: k("k3")?, p1: k("p1")?, p2: k("p2")? };
-    let distortion = match model {
-        "OPENCV" | "FULL_OPENCV" | "SIMPLE_RADIAL" | "RADIAL" => found,
+    let model = keys.camera_model.as_deref().unwrap_or("OPENCV");
+    let model = if keys.is_fisheye { "OPENCV_FISHEYE (`is_fisheye`)" } else { model };
+    let &FrameKeys { k1, k2, k3, p1, p2, .. } = keys;
+    let mut distortion = Distortion { k1, k2, k3, p1, p2 };
+    let higher = [("k4", keys.k4), ("k5", keys.k5), ("k6", keys.k6)].into_iter().find(|(_, k)| *k != 0.0);
+    match model {
+        "OPENCV" | "FULL_OPENCV" | "SIMPLE_RADIAL" | "RADIAL" => {
+            if let Some((key, _)) = higher {
+                return Err(format!(
+                    "its lens has `{key}`, which is not supported; undistort the photographs first"
+                ));
+            }
+        }
         "PINHOLE" | "SIMPLE_PINHOLE" | "PERSPECTIVE" => {
-            if !found.is_none() {
+            if !distortion.is_none() || higher.is_some() {
                 ignored.push(model.into());
             }
-            Distortion::default()
+            distortion = Distortion::default();
         }
         other => {
             return Err(format!(
@@ -249,36 +259,19 @@ fn lens(top: &Object, entry: &Object, ignored: &mut Vec<String>) -> Result<Lens,
                  undistort the photographs first"
             ));
         }
-    };
-    for key in ["k4", "k5", "k6"] {
-        if k(key)? != 0.0 && !model.contains("PINHOLE") {
-            return Err(format!(
-                "its lens has `{key}`, which is not supported; undistort the photographs first"
-            ));
+    }
+    let (w, h) = (side("w", keys.w)?, side("h", keys.h)?);
+    if w.is_some() != h.is_some() {
+        return Err("it has only one of `w` and `h`".into());
+    }
+    let angle = [keys.camera_angle_x, keys.camera_angle_y];
+    for (key, angle) in ["camera_angle_x", "camera_angle_y"].into_iter().zip(angle) {
+        if let Some(a) = angle.filter(|a| !(*a > 0.0 && *a < std::f64::consts::PI)) {
+            return Err(format!("`{key}` is {a}, not an angle between 0 and π"));
         }
     }
-    let size = match (side("w")?, side("h")?) {
-        (Some(w), Some(h)) => Some((w, h)),
-        (None, None) => None,
-        _ => return Err("it has only one of `w` and `h`".into()),
-    };
-    // whoever names a focal length or an angle names all of them: a frame's own angle must not be
-    // overruled by the whole file's focal length
-    let own = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"].iter().any(|k| entry.contains_key(*k));
-    let of = if own { entry } else { top };
-    let lens = Lens {
-        size,
-        focal: [number(of, "fl_x")?, number(of, "fl_y")?],
-        angle: [number(of, "camera_angle_x")?, number(of, "camera_angle_y")?],
-        center: [either("cx")?, either("cy")?],
-        distortion,
-    };
-    for (key, a) in [("camera_angle_x", lens.angle[0]), ("camera_angle_y", lens.angle[1])] {
-        if a.is_some_and(|a| !(a > 0.0 && a < std::f64::consts::PI)) {
-            return Err(format!("`{key}` is {}, not an angle between 0 and π", a.unwrap_or(0.0)));
-        }
-    }
-    Ok(lens)
+    let (focal, center) = ([keys.fl_x, keys.fl_y], [keys.cx, keys.cy]);
+    Ok(Intrinsics { size: w.zip(h), focal, angle, center, distortion })
 }
 
 #[cfg(test)]
@@ -289,18 +282,20 @@ mod tests {
         serde_json::from_str(text).unwrap()
     }
 
-    fn lens_of(top: &str, entry: &str) -> Result<Lens, String> {
-        lens(&object(top), &object(entry), &mut Vec::new())
+    fn intrinsics_of(top: &str, entry: &str) -> Result<Intrinsics, String> {
+        let mut entry = object(entry);
+        entry.extend(object(r#"{"file_path": "a", "transform_matrix": []}"#));
+        intrinsics(&FrameKeys::read(&object(top), &entry.into())?, &mut Vec::new())
     }
 
     #[test]
     fn a_frames_own_intrinsics_win_over_the_files() {
         let top = r#"{"fl_x": 10, "fl_y": 11, "cx": 5, "cy": 6, "w": 20, "h": 12, "k1": 0.1}"#;
-        let l = lens_of(top, r#"{"camera_angle_x": 1.0, "cx": 7, "k1": 0.2}"#).unwrap();
+        let l = intrinsics_of(top, r#"{"camera_angle_x": 1.0, "cx": 7, "k1": 0.2}"#).unwrap();
         assert_eq!((l.focal, l.angle), ([None, None], [Some(1.0), None]));
         assert_eq!((l.center, l.size), ([Some(7.0), Some(6.0)], Some((20, 12))));
         assert_eq!(l.distortion.k1, 0.2);
-        assert_eq!(lens_of(top, "{}").unwrap().focal, [Some(10.0), Some(11.0)]);
+        assert_eq!(intrinsics_of(top, "{}").unwrap().focal, [Some(10.0), Some(11.0)]);
     }
 
     #[test]
@@ -314,18 +309,21 @@ mod tests {
             (r#"{"fl_x": "wide"}"#, "fl_x"),
             (r#"{"camera_angle_x": 4.0}"#, "camera_angle_x"),
         ] {
-            assert!(lens_of(top, "{}").unwrap_err().contains(word), "{top}");
+            assert!(intrinsics_of(top, "{}").unwrap_err().contains(word), "{top}");
         }
     }
 
     #[test]
     fn matrices_of_three_and_four_rows_are_read() {
-        let rows = "[1,0,0,5],[0,1,0,6],[0,0,1,7]";
-        let three: Value = serde_json::from_str(&format!("[{rows}]")).unwrap();
-        let four: Value = serde_json::from_str(&format!("[{rows},[0,0,0,1]]")).unwrap();
-        assert_eq!(matrix_rows(&three).unwrap(), matrix_rows(&four).unwrap());
-        let bad: Value = serde_json::from_str(&format!("[{rows},[0,0,1,1]]")).unwrap();
-        assert!(matrix_rows(&bad).unwrap_err().contains("last row"));
-        assert!(matrix_rows(&Value::Null).is_err());
+        let three = vec![vec![1., 0., 0., 5.], vec![0., 1., 0., 6.], vec![0., 0., 1., 7.]];
+        let with = |last: [f64; 4]| [three.clone(), vec![last.to_vec()]].concat();
+        assert_eq!(upper_rows(&three).unwrap(), upper_rows(&with([0., 0., 0., 1.])).unwrap());
+        assert!(upper_rows(&with([0., 0., 1., 1.])).unwrap_err().contains("last row"));
+        assert!(upper_rows(&[]).is_err());
+        let text = FrameKeys::read(
+            &Object::new(),
+            &serde_json::json!({"file_path": "a", "transform_matrix": [[1, "x"]]}),
+        );
+        assert_eq!(text.err().unwrap(), "its `transform_matrix[0][1]` is string \"x\", expected f64");
     }
 }

@@ -1,7 +1,8 @@
 //! Folders: making, clearing, listing and locking them, and how much room is left.
 
-use super::{ReadError, WriteError};
-use std::fs::{self, File, OpenOptions, TryLockError};
+use super::error::ReadError;
+use super::write::WriteError;
+use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -15,6 +16,14 @@ pub fn create_folder(path: &Path) -> Result<(), WriteError> {
     fs::create_dir_all(path).map_err(failed(path))
 }
 
+/// What is directly in a folder; nothing if it does not exist.
+fn entries(path: &Path) -> std::io::Result<Vec<DirEntry>> {
+    match fs::read_dir(path) {
+        Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+        other => other?.collect(),
+    }
+}
+
 /// Removes everything inside `path` except files called `keep` and folders that are `apart`, which stay
 /// as they are; a folder that does not exist is empty. Links inside are removed, never followed; a link in
 /// the place of the folder itself is an error.
@@ -22,12 +31,7 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
     if is_link(path) {
         return Err(failed(path)(linked()));
     }
-    let entries = match fs::read_dir(path) {
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
-        other => other.map_err(failed(path))?,
-    };
-    for entry in entries {
-        let entry = entry.map_err(failed(path))?;
+    for entry in entries(path).map_err(failed(path))? {
         let inside = entry.path();
         let is_folder = entry.file_type().map_err(failed(&inside))?.is_dir();
         let gone = if is_folder && !apart(&inside) {
@@ -49,12 +53,7 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
 /// Returns a file in a folder or below, but not in folders that are `apart`; `None` where there is none, and
 /// no folder.
 pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<PathBuf>, ReadError> {
-    let entries = match fs::read_dir(path) {
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
-        other => other.map_err(|e| ReadError::io(path, e))?,
-    };
-    for entry in entries {
-        let entry = entry.map_err(|e| ReadError::io(path, e))?;
+    for entry in entries(path).map_err(|e| ReadError::io(path, e))? {
         let inside = entry.path();
         if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
             return Ok(Some(inside));
@@ -68,6 +67,47 @@ pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<Pat
     Ok(None)
 }
 
+/// Is there a regular file (through links)?
+pub fn is_file(path: &Path) -> bool {
+    fs::metadata(path).is_ok_and(|m| m.is_file())
+}
+
+/// Is there anything by this name, even a link that leads nowhere?
+pub fn exists(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok()
+}
+
+/// Is there a folder (through links)?
+pub fn is_folder(path: &Path) -> bool {
+    fs::metadata(path).is_ok_and(|m| m.is_dir())
+}
+
+/// Names of the regular files directly in a folder, sorted by bytes; hidden ones left out. A name that
+/// is not UTF-8 is an error that shows it as well as it can.
+pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
+    let mut names = Vec::new();
+    for entry in fs::read_dir(folder).map_err(|e| ReadError::io(folder, e))? {
+        let entry = entry.map_err(|e| ReadError::io(folder, e))?;
+        let path = entry.path();
+        if !is_file(&path) {
+            continue;
+        }
+        let Ok(name) = entry.file_name().into_string() else {
+            return Err(ReadError::unsupported(&path, "a file name that is not UTF-8", "rename the file"));
+        };
+        if !name.starts_with('.') {
+            names.push(name);
+        }
+    }
+    names.sort();
+    Ok(names)
+}
+
+/// The same path without links, `.` and `..`; the file must exist.
+pub fn real_path(path: &Path) -> Result<PathBuf, ReadError> {
+    fs::canonicalize(path).map_err(|e| ReadError::io(path, e))
+}
+
 /// Is there a link, wherever it leads?
 pub fn is_link(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|m| m.is_symlink())
@@ -77,27 +117,12 @@ fn linked() -> std::io::Error {
     std::io::Error::other("it is a link, which is not followed here")
 }
 
-/// Removes a file; one that is not there is fine.
-pub fn remove_file(path: &Path) -> Result<(), WriteError> {
-    match fs::remove_file(path) {
-        Err(e) if e.kind() == ErrorKind::NotFound => Ok(()),
-        other => other.map_err(failed(path)),
-    }
-}
-
 /// Folders directly inside `path`, sorted by name, hidden ones left out; none if it does not exist.
 pub fn list_folders(path: &Path) -> Result<Vec<PathBuf>, ReadError> {
-    let entries = match fs::read_dir(path) {
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
-        other => other.map_err(|e| ReadError::io(path, e))?,
-    };
-    let mut folders = Vec::new();
-    for entry in entries {
-        let entry = entry.map_err(|e| ReadError::io(path, e))?;
-        if entry.path().is_dir() && !entry.file_name().as_encoded_bytes().starts_with(b".") {
-            folders.push(entry.path());
-        }
-    }
+    let entries = entries(path).map_err(|e| ReadError::io(path, e))?;
+    let is_hidden = |e: &DirEntry| e.file_name().as_encoded_bytes().starts_with(b".");
+    let folders = entries.into_iter().filter(|e| !is_hidden(e)).map(|e| e.path());
+    let mut folders: Vec<PathBuf> = folders.filter(|path| path.is_dir()).collect();
     folders.sort();
     Ok(folders)
 }
@@ -288,5 +313,15 @@ mod tests {
     fn the_disk_says_how_much_room_is_left() {
         assert!(free_bytes(Path::new("/")).is_some());
         assert!(free_bytes(Path::new("/no/such/folder")).is_none());
+    }
+
+    #[test]
+    fn files_are_listed_in_order_without_folders_and_hidden_ones() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["b.png", "a.png", ".a.png.77.tmp"] {
+            fs::write(dir.path().join(name), b"x").unwrap();
+        }
+        fs::create_dir(dir.path().join("c")).unwrap();
+        assert_eq!(list_files(dir.path()).unwrap(), ["a.png", "b.png"]);
     }
 }

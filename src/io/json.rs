@@ -1,11 +1,40 @@
 //! JSON as untrusted input: bounded in bytes, depth and values, every key once, every number finite.
 
-use super::{Limits, ReadError};
-use serde::de::{DeserializeSeed, Error, MapAccess, SeqAccess, Visitor};
+use super::error::ReadError;
+use super::limits::Limits;
+use super::read::read_capped;
+use serde::de::{Deserialize, DeserializeOwned, DeserializeSeed, Error, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 use std::cell::Cell;
 use std::fmt;
 use std::path::Path;
+
+const SIZE: &str = "the JSON text's size in bytes";
+
+/// As [`super::read_bytes`], under [`Limits::json_bytes`], parsed by [`parse_json`].
+pub fn read_json(path: &Path, limits: &Limits) -> Result<Value, ReadError> {
+    parse_json(path, &read_capped(path, limits.json_bytes, SIZE)?, limits)
+}
+
+/// As [`read_json`], as a value of a type. What does not fit is named with its key ([`ReadError::Value`]).
+pub fn read_typed<T: DeserializeOwned>(path: &Path, limits: &Limits) -> Result<T, ReadError> {
+    typed(&read_json(path, limits)?)
+        .map_err(|[key, found, expected]| ReadError::value(path, key, found, expected))
+}
+
+/// A JSON value as a value of a type, or the key that does not fit, what stands there and what could.
+pub fn typed<'v, T: Deserialize<'v>>(value: &'v Value) -> Result<T, [String; 3]> {
+    serde_path_to_error::deserialize(value).map_err(|e| {
+        let (key, text) = (e.path().to_string(), e.inner().to_string());
+        if let Some(field) = text.strip_prefix("missing field `").and_then(|t| t.strip_suffix('`')) {
+            let key = if key == "." { field.to_string() } else { format!("{key}.{field}") };
+            return [key, "missing".into(), "a value".into()];
+        }
+        let (found, expected) = text.split_once(", expected ").unwrap_or((&text, "another value"));
+        let found = found.trim_start_matches("invalid type: ").trim_start_matches("invalid value: ");
+        [key, found.into(), expected.into()]
+    })
+}
 
 /// The value in `bytes`; `path` is only for messages.
 ///
@@ -14,31 +43,19 @@ use std::path::Path;
 /// nesting or counts over the limits, anything after the value.
 pub fn parse_json(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Value, ReadError> {
     if bytes.len() as u64 > limits.json_bytes {
-        return Err(ReadError::TooLarge {
-            path: path.into(),
-            what: "the JSON text's size in bytes",
-            found: bytes.len() as u64,
-            limit: limits.json_bytes,
-        });
+        return Err(ReadError::too_large(path, SIZE, bytes.len() as u64, limits.json_bytes));
     }
     if bytes.starts_with(&[0xFF, 0xFE]) || bytes.starts_with(&[0xFE, 0xFF]) {
-        return Err(ReadError::Unsupported {
-            path: path.into(),
-            what: "JSON in UTF-16".into(),
-            hint: "save the file as UTF-8".into(),
-        });
+        return Err(ReadError::unsupported(path, "JSON in UTF-16", "save the file as UTF-8"));
     }
     let bytes = bytes.strip_prefix(&[0xEF, 0xBB, 0xBF]).unwrap_or(bytes);
     let left = Cell::new(limits.json_values);
     let mut reader = serde_json::Deserializer::from_slice(bytes);
-    let seed = Node { depth: limits.json_depth, left: &left };
+    let seed = BoundedValue { depth: limits.json_depth, left: &left };
     seed.deserialize(&mut reader).and_then(|value| reader.end().map(|()| value)).map_err(|e| {
         let problem = literal_at(bytes, e.line(), e.column()).unwrap_or_else(|| {
             let text = e.to_string();
-            match text.rfind(" at line ") {
-                Some(cut) => text[..cut].to_string(),
-                None => text,
-            }
+            text.rsplit_once(" at line ").map_or(text.clone(), |(problem, _)| problem.into())
         });
         ReadError::Json { path: path.into(), line: e.line(), column: e.column(), problem }
     })
@@ -57,21 +74,21 @@ fn literal_at(bytes: &[u8], line: usize, column: usize) -> Option<String> {
 }
 
 #[derive(Clone, Copy)]
-struct Node<'a> {
+struct BoundedValue<'a> {
     depth: usize,
     left: &'a Cell<usize>,
 }
 
-impl Node<'_> {
+impl BoundedValue<'_> {
     fn inner<E: Error>(self) -> Result<Self, E> {
         match self.depth.checked_sub(1) {
-            Some(depth) => Ok(Node { depth, ..self }),
+            Some(depth) => Ok(BoundedValue { depth, ..self }),
             None => Err(E::custom("nested too deeply")),
         }
     }
 }
 
-impl<'de> DeserializeSeed<'de> for Node<'_> {
+impl<'de> DeserializeSeed<'de> for BoundedValue<'_> {
     type Value = Value;
 
     fn deserialize<D: serde::Deserializer<'de>>(self, reader: D) -> Result<Value, D::Error> {
@@ -83,7 +100,7 @@ impl<'de> DeserializeSeed<'de> for Node<'_> {
     }
 }
 
-impl<'de> Visitor<'de> for Node<'_> {
+impl<'de> Visitor<'de> for BoundedValue<'_> {
     type Value = Value;
 
     fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {

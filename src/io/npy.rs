@@ -4,7 +4,9 @@
 //! `descr`, `fortran_order` and `shape`, then exactly shape × size bytes (NumPy NEP 1). `npyz` reserves what
 //! the length says and multiplies the extents unchecked, so both are bounded here first.
 
-use super::{Limits, ReadError, read_bytes};
+use super::error::ReadError;
+use super::limits::Limits;
+use super::read::read_bytes;
 use npyz::{DType, Deserialize, NpyFile, NpyHeader, Order, TypeChar, TypeStr};
 use std::path::Path;
 
@@ -57,12 +59,8 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
         major => return Err(bad(6, format!("format version {major} is unknown (1, 2 and 3 are read)"))),
     };
     if length > MAX_HEADER {
-        return Err(ReadError::TooLarge {
-            path: path.into(),
-            what: "the npy header's length in bytes",
-            found: length as u64,
-            limit: MAX_HEADER as u64,
-        });
+        let what = "the npy header's length in bytes";
+        return Err(ReadError::too_large(path, what, length as u64, MAX_HEADER as u64));
     }
     let text = bytes.get(start..start + length).ok_or_else(cut)?;
     let data = &bytes[start + length..];
@@ -95,12 +93,7 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
     }
     let decoded = (count as u64).saturating_mul(8);
     if decoded > limits.decoded_bytes {
-        return Err(ReadError::TooLarge {
-            path: path.into(),
-            what: "the array's size in bytes",
-            found: decoded,
-            limit: limits.decoded_bytes,
-        });
+        return Err(ReadError::too_large(path, "the array's size in bytes", decoded, limits.decoded_bytes));
     }
     let values = if kind.type_char() == TypeChar::Bool {
         NpyValues::Bool(row_major(data.iter().map(|&b| b != 0).collect(), &header))
@@ -135,20 +128,14 @@ fn is_read(kind: &TypeStr) -> bool {
 
 fn unsupported(path: &Path, dtype: &DType) -> ReadError {
     if dtype.uses_pickled_array() {
-        return ReadError::Unsupported {
-            path: path.into(),
-            what: "an npy array of Python objects (a pickle)".into(),
-            hint: "save plain numbers: `numpy.save(file, array.astype(float))`; pickles can run code".into(),
-        };
+        let hint = "save plain numbers: `numpy.save(file, array.astype(float))`; pickles can run code";
+        return ReadError::unsupported(path, "an npy array of Python objects (a pickle)", hint);
     }
-    ReadError::Unsupported {
-        path: path.into(),
-        what: match dtype {
-            DType::Plain(kind) => format!("an npy array of type `{kind}`"),
-            _ => "an npy array of records".into(),
-        },
-        hint: "save it as bool, an integer or a float type".into(),
-    }
+    let what = match dtype {
+        DType::Plain(kind) => format!("an npy array of type `{kind}`"),
+        _ => "an npy array of records".into(),
+    };
+    ReadError::unsupported(path, what, "save it as bool, an integer or a float type")
 }
 
 /// Every number in the order of the file; `None` for a type that is none.

@@ -5,7 +5,10 @@
 //! fill it with grey, which would then be learned as a face. One damage passes: a baseline JPEG whose scan was
 //! cut and closed again with a proper end marker, since only decoding each code could tell.
 
-use super::{Limits, ReadError, WriteError, open, read_bytes, write_atomic};
+use super::error::ReadError;
+use super::limits::Limits;
+use super::read::{open, read_bytes};
+use super::write::{WriteError, write_atomic};
 use crate::image::{Gray, Photo};
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngDecoder, PngEncoder};
@@ -14,26 +17,6 @@ use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder};
 use std::io::{Cursor, Read};
 use std::path::Path;
 use zune_jpeg::zune_core::{bytestream::ZCursor, colorspace::ColorSpace, options::DecoderOptions};
-
-/// What became of the turn that the EXIF orientation of a file asks for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Turn {
-    /// The file asks for none.
-    None,
-    /// Turned by this EXIF code (2..=8), because only then the declared size agrees.
-    Applied(u8),
-    /// Left as stored though the file asks for this EXIF code: cameras were found for the stored pixels.
-    Ignored(u8),
-}
-
-/// A photograph and how it was turned.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Picture {
-    /// 8-bit pixels; 16-bit files are rounded.
-    pub photo: Photo,
-    /// What happened to its EXIF orientation.
-    pub turn: Turn,
-}
 
 /// What the header of a picture says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,34 +34,23 @@ pub struct PictureInfo {
 impl PictureInfo {
     /// The size after the turn that `expected` calls for, as [`read_photo`] would return it.
     pub fn size(&self, expected: Option<(u32, u32)>) -> (u32, u32) {
-        match turn(self.exif, (self.width, self.height), expected) {
-            Turn::Applied(_) => (self.height, self.width),
-            _ => (self.width, self.height),
-        }
+        let stored = (self.width, self.height);
+        if is_turned(self.exif, stored, expected) { (stored.1, stored.0) } else { stored }
     }
 }
 
-/// A quarter turn is applied only when it is what makes the declared size true. Half turns and mirrors
-/// fit any size, so nothing can tell whether the cameras were found before or after them; like COLMAP
-/// they are left alone.
-fn turn(exif: u8, stored: (u32, u32), expected: Option<(u32, u32)>) -> Turn {
+/// Is the turn that EXIF asks for applied? A quarter turn is, only when it is what makes the declared size true:
+/// else cameras were found for the stored pixels. Half turns and mirrors fit any size, so nothing can tell whether
+/// the cameras were found before or after them; like COLMAP they are left alone.
+fn is_turned(exif: u8, stored: (u32, u32), expected: Option<(u32, u32)>) -> bool {
     let turned = (stored.1, stored.0);
-    match exif {
-        5..=8 if expected == Some(turned) && stored != turned => Turn::Applied(exif),
-        2..=8 => Turn::Ignored(exif),
-        _ => Turn::None,
-    }
+    (5..=8).contains(&exif) && expected == Some(turned) && stored != turned
 }
 
-enum Kind {
-    Png,
-    Jpeg,
-}
-
-fn kind(path: &Path, bytes: &[u8]) -> Result<Kind, ReadError> {
+fn is_png(path: &Path, bytes: &[u8]) -> Result<bool, ReadError> {
     let other = match bytes {
-        [0x89, b'P', b'N', b'G', 0x0D, 0x0A, 0x1A, 0x0A, ..] => return Ok(Kind::Png),
-        [0xFF, 0xD8, 0xFF, ..] => return Ok(Kind::Jpeg),
+        [0x89, b'P', b'N', b'G', 0x0D, 0x0A, 0x1A, 0x0A, ..] => return Ok(true),
+        [0xFF, 0xD8, 0xFF, ..] => return Ok(false),
         [b'G', b'I', b'F', b'8', ..] => "a GIF picture",
         [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P', ..] => "a WebP picture",
         [b'I', b'I', 42, 0, ..] | [b'M', b'M', 0, 42, ..] => "a TIFF or camera raw picture",
@@ -86,19 +58,11 @@ fn kind(path: &Path, bytes: &[u8]) -> Result<Kind, ReadError> {
         [0x76, 0x2F, 0x31, 0x01, ..] => "an OpenEXR picture",
         [b'B', b'M', ..] => "a BMP picture",
         _ => {
-            return Err(ReadError::damaged(
-                path,
-                "PNG or JPEG",
-                Some(0),
-                "its first bytes are those of neither",
-            ));
+            let problem = "its first bytes are those of neither";
+            return Err(ReadError::damaged(path, "PNG or JPEG", Some(0), problem));
         }
     };
-    Err(ReadError::Unsupported {
-        path: path.into(),
-        what: other.into(),
-        hint: "convert it to PNG or JPEG".into(),
-    })
+    Err(ReadError::unsupported(path, other, "convert it to PNG or JPEG"))
 }
 
 /// The size, alpha and orientation of a PNG or JPEG file, from its header only.
@@ -117,36 +81,33 @@ pub fn picture_info(path: &Path, limits: &Limits) -> Result<PictureInfo, ReadErr
 }
 
 fn header(path: &Path, bytes: &[u8], limits: &Limits) -> Result<PictureInfo, ReadError> {
-    match kind(path, bytes)? {
-        Kind::Png => {
-            let mut decoder = png_decoder(path, bytes, limits)?;
-            let (width, height) = decoder.dimensions();
-            let exif = decoder.orientation().map_or(1, Orientation::to_exif);
-            Ok(PictureInfo { width, height, alpha: decoder.color_type().has_alpha(), exif })
-        }
-        Kind::Jpeg => jpeg_decoder(path, bytes, limits).map(|(_, info)| info),
+    if is_png(path, bytes)? {
+        png_decoder(path, bytes, limits).map(|(_, info)| info)
+    } else {
+        jpeg_decoder(path, bytes, limits).map(|(_, info)| info)
     }
 }
 
-fn check_size(path: &Path, width: u32, height: u32, bytes_px: u64, limits: &Limits) -> Result<(), ReadError> {
-    let side = width.max(height);
-    let too_large =
-        |what, found: u64, limit: u64| ReadError::TooLarge { path: path.into(), what, found, limit };
-    if side > limits.side_px {
-        return Err(too_large("the picture's longest side in pixels", side as u64, limits.side_px as u64));
-    }
-    let decoded = (width as u64 * height as u64).saturating_mul(bytes_px);
-    if decoded > limits.decoded_bytes {
-        return Err(too_large("the decoded picture's size in bytes", decoded, limits.decoded_bytes));
-    }
-    Ok(())
+fn png(path: &Path, problem: impl ToString) -> ReadError {
+    ReadError::damaged(path, "PNG", None, problem.to_string())
 }
+
+fn jpeg(path: &Path, problem: impl Into<String>) -> ReadError {
+    ReadError::damaged(path, "JPEG", None, problem)
+}
+
+fn check_size(path: &Path, width: u32, height: u32, bytes_px: u64, limits: &Limits) -> Result<(), ReadError> {
+    limits.check_side(path, width.max(height).into())?;
+    limits.check_decoded(path, (width as u64 * height as u64).saturating_mul(bytes_px))
+}
+
+type Png<'a> = PngDecoder<Cursor<&'a [u8]>>;
 
 fn png_decoder<'a>(
     path: &Path,
     bytes: &'a [u8],
     limits: &Limits,
-) -> Result<PngDecoder<Cursor<&'a [u8]>>, ReadError> {
+) -> Result<(Png<'a>, PictureInfo), ReadError> {
     let be = |at: usize| bytes.get(at..at + 4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
     // width and height of IHDR, which must come first: checked before the decoder reserves a row
     if let (Some(width), Some(height)) = (be(16), be(20)) {
@@ -156,8 +117,11 @@ fn png_decoder<'a>(
     allowed.max_image_width = Some(limits.side_px);
     allowed.max_image_height = Some(limits.side_px);
     allowed.max_alloc = Some(limits.decoded_bytes);
-    PngDecoder::with_limits(Cursor::new(bytes), allowed)
-        .map_err(|e| ReadError::damaged(path, "PNG", None, e.to_string()))
+    let mut decoder = PngDecoder::with_limits(Cursor::new(bytes), allowed).map_err(|e| png(path, e))?;
+    let (width, height) = decoder.dimensions();
+    let exif = decoder.orientation().map_or(1, Orientation::to_exif);
+    let alpha = decoder.color_type().has_alpha();
+    Ok((decoder, PictureInfo { width, height, alpha, exif }))
 }
 
 type Jpeg<'a> = zune_jpeg::JpegDecoder<ZCursor<&'a [u8]>>;
@@ -167,28 +131,23 @@ fn jpeg_decoder<'a>(
     bytes: &'a [u8],
     limits: &Limits,
 ) -> Result<(Jpeg<'a>, PictureInfo), ReadError> {
-    let bad = |e: zune_jpeg::errors::DecodeErrors| ReadError::damaged(path, "JPEG", None, format!("{e:?}"));
     // strict: a photograph with damaged data is an error, not a picture with grey blocks
     let options = DecoderOptions::default()
         .set_strict_mode(true)
         .set_max_width(usize::from(u16::MAX))
         .set_max_height(usize::from(u16::MAX));
     let mut decoder = Jpeg::new_with_options(ZCursor::new(bytes), options);
-    decoder.decode_headers().map_err(bad)?;
+    decoder.decode_headers().map_err(|e| jpeg(path, format!("{e:?}")))?;
     let (Some((width, height)), Some(space)) = (decoder.dimensions(), decoder.input_colorspace()) else {
-        return Err(ReadError::damaged(path, "JPEG", None, "it has no frame header"));
+        return Err(jpeg(path, "it has no frame header"));
     };
     check_size(path, width as u32, height as u32, 3, limits)?;
     let out = match space {
         ColorSpace::Luma => ColorSpace::Luma,
         ColorSpace::RGB | ColorSpace::YCbCr => ColorSpace::RGB,
         other => {
-            return Err(ReadError::Unsupported {
-                path: path.into(),
-                what: format!("a JPEG in {other:?} colours"),
-                hint: "export the photograph in sRGB; print colours (CMYK) have no single meaning here"
-                    .into(),
-            });
+            let hint = "export the photograph in sRGB; print colors (CMYK) have no single meaning here";
+            return Err(ReadError::unsupported(path, format!("a JPEG in {other:?} colors"), hint));
         }
     };
     decoder.set_options(options.jpeg_set_out_colorspace(out));
@@ -253,96 +212,78 @@ fn walk_jpeg(path: &Path, bytes: &[u8]) -> Result<u64, ReadError> {
 }
 
 fn decode(
-    path: &Path,
-    expected: Option<(u32, u32)>,
-    limits: &Limits,
-) -> Result<(DynamicImage, Turn), ReadError> {
-    decode_bytes(&read_bytes(path, limits)?, path, expected, limits)
-}
-
-fn decode_bytes(
     bytes: &[u8],
     path: &Path,
     expected: Option<(u32, u32)>,
     limits: &Limits,
-) -> Result<(DynamicImage, Turn), ReadError> {
-    let (mut picture, exif) = match kind(path, bytes)? {
-        Kind::Png => {
-            let data = walk_png(path, bytes)?;
-            let mut decoder = png_decoder(path, bytes, limits)?;
-            let (width, height) = decoder.dimensions();
-            check_size(path, width, height, decoder.color_type().bytes_per_pixel() as u64, limits)?;
-            // deflate cannot shrink by more than 1032: a small file that claims more is lying
-            let claimed =
-                width as u64 * height as u64 * decoder.original_color_type().bits_per_pixel() as u64 / 8;
-            if claimed / 1032 > data {
-                let problem = format!("{width} × {height} pixels cannot come from its {data} bytes of data");
-                return Err(ReadError::damaged(path, "PNG", None, problem));
-            }
-            let exif = decoder.orientation().map_or(1, Orientation::to_exif);
-            let picture = DynamicImage::from_decoder(decoder)
-                .map_err(|e| ReadError::damaged(path, "PNG", None, e.to_string()))?;
-            (picture, exif)
-        }
-        Kind::Jpeg => {
-            let most = walk_jpeg(path, bytes)?;
-            let (mut decoder, info) = jpeg_decoder(path, bytes, limits)?;
-            if u64::from(info.width) * u64::from(info.height) > most {
-                let (width, height) = (info.width, info.height);
-                let problem =
-                    format!("{width} × {height} pixels cannot come from its picture data, enough for {most}");
-                return Err(ReadError::damaged(path, "JPEG", None, problem));
-            }
-            let pixels =
-                decoder.decode().map_err(|e| ReadError::damaged(path, "JPEG", None, format!("{e:?}")))?;
-            let (w, h) = (info.width, info.height);
-            let picture = match pixels.len() as u64 / (w as u64 * h as u64).max(1) {
-                1 => image::GrayImage::from_raw(w, h, pixels).map(DynamicImage::from),
-                _ => image::RgbImage::from_raw(w, h, pixels).map(DynamicImage::from),
-            };
-            let problem = "the decoder returned another number of pixels than the header names";
-            (picture.ok_or_else(|| ReadError::damaged(path, "JPEG", None, problem))?, info.exif)
-        }
+) -> Result<Photo, ReadError> {
+    let (mut picture, exif) = if is_png(path, bytes)? {
+        decode_png(bytes, path, limits)?
+    } else {
+        decode_jpeg(bytes, path, limits)?
     };
-    let turn = turn(exif, (picture.width(), picture.height()), expected);
-    if let (Turn::Applied(code), Some(orientation)) = (turn, Orientation::from_exif(exif)) {
-        debug_assert_eq!(code, exif);
+    if is_turned(exif, (picture.width(), picture.height()), expected)
+        && let Some(orientation) = Orientation::from_exif(exif)
+    {
         picture.apply_orientation(orientation);
     }
-    Ok((picture, turn))
+    let (width, height) = (picture.width(), picture.height());
+    let color = picture.color();
+    let pixels: Vec<[u8; 4]> = if color.has_color() {
+        picture.into_rgba8().pixels().map(|p| p.0).collect()
+    } else {
+        picture.into_luma_alpha8().pixels().map(|p| [p[0], p[0], p[0], p[1]]).collect()
+    };
+    let alpha = color.has_alpha().then(|| pixels.iter().map(|p| p[3]).collect());
+    Ok(Photo { width, height, rgb: pixels.into_iter().map(|[r, g, b, _]| [r, g, b]).collect(), alpha })
 }
 
-/// The channels of a picture in 8 bit, interleaved; 1 grey, 2 grey + alpha, 3 colour, 4 colour + alpha.
-fn eight_bit(picture: DynamicImage) -> (usize, Vec<u8>) {
-    fn narrow(wide: Vec<u16>) -> Vec<u8> {
-        wide.into_iter().map(|v| ((v as u32 * 255 + 32_767) / 65_535) as u8).collect()
+fn decode_png(bytes: &[u8], path: &Path, limits: &Limits) -> Result<(DynamicImage, u8), ReadError> {
+    let data = walk_png(path, bytes)?;
+    let (decoder, PictureInfo { width, height, exif, .. }) = png_decoder(path, bytes, limits)?;
+    check_size(path, width, height, decoder.color_type().bytes_per_pixel() as u64, limits)?;
+    // deflate cannot shrink by more than 1032: a small file that claims more is lying
+    let claimed = width as u64 * height as u64 * decoder.original_color_type().bits_per_pixel() as u64 / 8;
+    if claimed / 1032 > data {
+        return Err(png(
+            path,
+            format!("{width} × {height} pixels cannot come from its {data} bytes of data"),
+        ));
     }
-    match picture {
-        DynamicImage::ImageLuma8(p) => (1, p.into_raw()),
-        DynamicImage::ImageLumaA8(p) => (2, p.into_raw()),
-        DynamicImage::ImageRgb8(p) => (3, p.into_raw()),
-        DynamicImage::ImageRgba8(p) => (4, p.into_raw()),
-        DynamicImage::ImageLuma16(p) => (1, narrow(p.into_raw())),
-        DynamicImage::ImageLumaA16(p) => (2, narrow(p.into_raw())),
-        DynamicImage::ImageRgb16(p) => (3, narrow(p.into_raw())),
-        other => (4, narrow(other.into_rgba16().into_raw())),
-    }
+    Ok((DynamicImage::from_decoder(decoder).map_err(|e| png(path, e))?, exif))
 }
 
-/// Reads a photograph: PNG (grey, palette, colour, 8 or 16 bit, with or without alpha) or JPEG (grey or
-/// colour; CMYK is refused). Colour profiles are not applied: bytes are taken as sRGB.
+fn decode_jpeg(bytes: &[u8], path: &Path, limits: &Limits) -> Result<(DynamicImage, u8), ReadError> {
+    let most = walk_jpeg(path, bytes)?;
+    let (mut decoder, PictureInfo { width, height, exif, .. }) = jpeg_decoder(path, bytes, limits)?;
+    let claimed = u64::from(width) * u64::from(height);
+    if claimed > most {
+        let problem =
+            format!("{width} × {height} pixels cannot come from its picture data, enough for {most}");
+        return Err(jpeg(path, problem));
+    }
+    let pixels = decoder.decode().map_err(|e| jpeg(path, format!("{e:?}")))?;
+    let picture = match pixels.len() as u64 / claimed.max(1) {
+        1 => image::GrayImage::from_raw(width, height, pixels).map(DynamicImage::from),
+        _ => image::RgbImage::from_raw(width, height, pixels).map(DynamicImage::from),
+    };
+    let problem = "the decoder returned another number of pixels than the header names";
+    Ok((picture.ok_or_else(|| jpeg(path, problem))?, exif))
+}
+
+/// Reads a photograph: PNG (gray, palette, color, 8 or 16 bit, with or without alpha) or JPEG (gray or
+/// color; CMYK is refused). Color profiles are not applied: bytes are taken as sRGB, 16 bits are rounded to 8.
 ///
-/// `expected` is the size its cameras were calibrated for, if declared; see [`Turn`]. Another size is
-/// not an error here.
-pub fn read_photo(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> Result<Picture, ReadError> {
-    let (picture, turn) = decode(path, expected, limits)?;
-    Ok(Picture { photo: photo(picture), turn })
+/// `expected` is the size its cameras were calibrated for, if declared: a quarter turn that EXIF asks for is
+/// applied only if it leads to that size. Another size is not an error here.
+pub fn read_photo(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> Result<Photo, ReadError> {
+    decode(&read_bytes(path, limits)?, path, expected, limits)
 }
 
 /// A picture that lies inside another file, as [`read_photo`] would read it from one of its own.
 /// `path` is for messages only.
 pub fn parse_photo(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Photo, ReadError> {
-    decode_bytes(bytes, path, None, limits).map(|(picture, _)| photo(picture))
+    decode(bytes, path, None, limits)
 }
 
 /// [`picture_info`] of a picture that lies inside another file. `path` is for messages only.
@@ -350,32 +291,14 @@ pub fn parse_picture_info(bytes: &[u8], path: &Path, limits: &Limits) -> Result<
     header(path, bytes, limits)
 }
 
-fn photo(picture: DynamicImage) -> Photo {
-    let (width, height) = (picture.width(), picture.height());
-    let (channels, bytes) = eight_bit(picture);
-    let rgb = match channels {
-        1 | 2 => bytes.chunks_exact(channels).map(|p| [p[0]; 3]).collect(),
-        _ => bytes.chunks_exact(channels).map(|p| [p[0], p[1], p[2]]).collect(),
-    };
-    let alpha = (channels % 2 == 0).then(|| bytes.chunks_exact(channels).map(|p| p[channels - 1]).collect());
-    Photo { width, height, rgb, alpha }
-}
-
-/// Reads a mask: the grey channel; of a picture with alpha that is not opaque everywhere, the alpha;
-/// of a coloured one the luma (Rec. 601).
+/// Reads a mask: the gray channel; of a picture with alpha that is not opaque everywhere, the alpha;
+/// of a colored one the luma (Rec. 601).
 pub fn read_gray(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> Result<Gray, ReadError> {
-    let (picture, _) = decode(path, expected, limits)?;
-    let (width, height) = (picture.width(), picture.height());
-    let (channels, bytes) = eight_bit(picture);
-    let pixels = bytes.chunks_exact(channels);
-    let translucent = channels % 2 == 0 && pixels.clone().any(|p| p[channels - 1] != 255);
-    let values = if translucent {
-        pixels.map(|p| p[channels - 1]).collect()
-    } else if channels <= 2 {
-        pixels.map(|p| p[0]).collect()
-    } else {
-        let luma = |p: &[u8]| (299 * p[0] as u32 + 587 * p[1] as u32 + 114 * p[2] as u32 + 500) / 1000;
-        pixels.map(|p| luma(p) as u8).collect()
+    let Photo { width, height, rgb, alpha } = read_photo(path, expected, limits)?;
+    let luma = |[r, g, b]: [u8; 3]| (299 * r as u32 + 587 * g as u32 + 114 * b as u32 + 500) / 1000;
+    let values = match alpha {
+        Some(alpha) if alpha.iter().any(|&a| a != 255) => alpha,
+        _ => rgb.into_iter().map(|c| luma(c) as u8).collect(), // of a gray one its gray
     };
     Ok(Gray { width, height, values })
 }
@@ -387,7 +310,7 @@ fn write_png(
     bytes: &[u8],
     color: ExtendedColorType,
 ) -> Result<(), WriteError> {
-    let content = |problem: String| WriteError::Content { path: path.into(), problem };
+    let content = |problem: String| WriteError::content(path, problem);
     let needed = width as u64 * height as u64 * color.bits_per_pixel() as u64 / 8;
     if needed != bytes.len() as u64 || needed == 0 {
         let problem = format!("{width} × {height} pixels need {needed} bytes, {} were given", bytes.len());
@@ -423,7 +346,7 @@ pub fn write_png_gray16(path: &Path, width: u32, height: u32, values: &[u16]) ->
 
 /// A photograph as the bytes of a JPEG file of `quality` 1 to 100, without its alpha. `path` is for messages only.
 pub fn jpeg_bytes(photo: &Photo, quality: u8, path: &Path) -> Result<Vec<u8>, WriteError> {
-    let content = |problem: String| WriteError::Content { path: path.into(), problem };
+    let content = |problem: String| WriteError::content(path, problem);
     let (width, height) = (photo.width, photo.height);
     let pixels = width as u64 * height as u64;
     if pixels == 0 || pixels != photo.rgb.len() as u64 || width.max(height) > u16::MAX as u32 {
@@ -446,11 +369,11 @@ mod tests {
         let path = dir.path().join("a.png");
         let limits = Limits::default();
         write_png_rgb(&path, 2, 1, &[[1, 2, 3], [250, 251, 252]]).unwrap();
-        let p = read_photo(&path, None, &limits).unwrap().photo;
+        let p = read_photo(&path, None, &limits).unwrap();
         assert_eq!((p.width, p.height, p.alpha), (2, 1, None));
         assert_eq!(p.rgb, [[1, 2, 3], [250, 251, 252]]);
         write_png_rgba(&path, 1, 2, &[[1, 2, 3, 4], [5, 6, 7, 8]]).unwrap();
-        assert_eq!(read_photo(&path, None, &limits).unwrap().photo.alpha, Some(vec![4, 8]));
+        assert_eq!(read_photo(&path, None, &limits).unwrap().alpha, Some(vec![4, 8]));
         assert_eq!(read_gray(&path, None, &limits).unwrap().values, [4, 8]); // alpha says what is the head
         let info = picture_info(&path, &limits).unwrap();
         assert_eq!((info.width, info.height, info.alpha, info.exif), (1, 2, true, 1));
@@ -482,12 +405,17 @@ mod tests {
 
     #[test]
     fn a_quarter_turn_is_applied_only_when_the_declared_size_agrees() {
-        assert_eq!(turn(6, (40, 30), Some((30, 40))), Turn::Applied(6));
-        assert_eq!(turn(6, (40, 30), Some((40, 30))), Turn::Ignored(6));
-        assert_eq!(turn(6, (40, 30), None), Turn::Ignored(6));
-        assert_eq!(turn(6, (40, 40), Some((40, 40))), Turn::Ignored(6));
-        assert_eq!(turn(3, (40, 30), Some((40, 30))), Turn::Ignored(3));
-        assert_eq!(turn(1, (40, 30), Some((40, 30))), Turn::None);
+        assert!(is_turned(6, (40, 30), Some((30, 40))));
+        for (exif, stored, expected) in [
+            (6, (40, 30), Some((40, 30))),
+            (6, (40, 30), None),
+            (6, (40, 40), Some((40, 40))),
+            (3, (40, 30), Some((40, 30))),
+            (3, (40, 30), Some((30, 40))),
+            (1, (40, 30), Some((40, 30))),
+        ] {
+            assert!(!is_turned(exif, stored, expected), "{exif} {expected:?}");
+        }
     }
 
     #[test]

@@ -5,7 +5,11 @@
 //! and so gives other bytes each time; on reading, the crate checks offsets and we check what it accepts:
 //! duplicate names, NaN, and headers that take seconds.
 
-use super::{Limits, ReadError, WriteError, read_bytes, write_atomic};
+use super::error::ReadError;
+use super::json::parse_json;
+use super::limits::Limits;
+use super::read::read_bytes;
+use super::write::{WriteError, write_atomic};
 use safetensors::{Dtype, SafeTensors};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -77,8 +81,7 @@ pub fn write_tensors(
     tensors: &[(String, Vec<usize>, TensorValues)],
     metadata: &BTreeMap<String, String>,
 ) -> Result<(), WriteError> {
-    let bytes = tensor_bytes(tensors, metadata)
-        .map_err(|problem| WriteError::Content { path: path.into(), problem })?;
+    let bytes = tensor_bytes(tensors, metadata).map_err(|problem| WriteError::content(path, problem))?;
     write_atomic(path, &bytes)
 }
 
@@ -146,14 +149,9 @@ pub fn parse_tensors(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Tenso
         return Err(bad(Some(bytes.len() as u64), "it ends inside its header".into()));
     };
     // the JSON reader refuses what appears twice; the crate would keep the last
-    let names = super::parse_json(path, header, limits)?.as_object().map_or(0, |o| o.len());
+    let names = parse_json(path, header, limits)?.as_object().map_or(0, |o| o.len());
     if names > MAX_NAMES + 1 {
-        return Err(ReadError::TooLarge {
-            path: path.into(),
-            what: "the number of tensors",
-            found: names as u64,
-            limit: MAX_NAMES as u64,
-        });
+        return Err(ReadError::too_large(path, "the number of tensors", names as u64, MAX_NAMES as u64));
     }
     let file = SafeTensors::deserialize(bytes).map_err(|e| bad(None, e.to_string()))?;
     let (_, about) = SafeTensors::read_metadata(bytes).map_err(|e| bad(None, e.to_string()))?;
@@ -167,11 +165,8 @@ pub fn parse_tensors(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Tenso
             Dtype::U32 => TensorValues::U32(numbers(data, u32::from_le_bytes)),
             Dtype::U64 => TensorValues::U64(numbers(data, u64::from_le_bytes)),
             other => {
-                return Err(ReadError::Unsupported {
-                    path: path.into(),
-                    what: format!("tensor `{name}` of type {other:?}"),
-                    hint: "checkpoints hold F32, F64, U32 and U64; this one was not written by tiface".into(),
-                });
+                let hint = "checkpoints hold F32, F64, U32 and U64; this one was not written by tiface";
+                return Err(ReadError::unsupported(path, format!("tensor `{name}` of type {other:?}"), hint));
             }
         };
         if let Some(i) = values.not_finite() {

@@ -40,7 +40,7 @@ pub enum WriteError {
 crate::error::error_from!(WriteError, Cannot);
 
 impl WriteError {
-    /// The way out.
+    /// The suggested fix.
     pub fn hint(&self) -> String {
         match self {
             WriteError::Full { needed, .. } => format!("free at least {needed} bytes on that disk"),
@@ -51,6 +51,10 @@ impl WriteError {
             },
             WriteError::Content { .. } => "check the values that should be stored".into(),
         }
+    }
+
+    pub(crate) fn content(path: &Path, problem: impl Into<String>) -> WriteError {
+        WriteError::Content { path: path.into(), problem: problem.into() }
     }
 
     fn from_io(path: &Path, needed: usize, source: std::io::Error) -> WriteError {

@@ -94,7 +94,7 @@ pub fn page_of(
     let clicked = |i: usize| clicked.get(i).is_some_and(|points| !points.is_empty());
     let chosen = evenly(capture.views.len(), options.most_views, clicked);
     let read = |view: &View| {
-        let photo = io::read_photo(&view.photo, Some(view.photo_size), limits)?.photo;
+        let photo = io::read_photo(&view.photo, Some(view.photo_size), limits)?;
         PageView::new(file_path(capture, view), view.declared, &photo, options)
     };
     let mut views = Vec::with_capacity(chosen.len());

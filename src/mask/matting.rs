@@ -375,7 +375,7 @@ mod tests {
             let start = std::time::Instant::now();
             for view in views {
                 let picture = |kind: &str| folder.join(kind).join(format!("{view}.png"));
-                let photo = read_photo(&picture("images"), None, &limits).unwrap().photo;
+                let photo = read_photo(&picture("images"), None, &limits).unwrap();
                 let truth = read_gray(&picture("masks"), None, &limits).unwrap();
                 let (w, h) = (truth.width as usize, truth.height as usize);
                 let soft_truth: Vec<f32> = truth.values.iter().map(|&v| v as f32 / 255.0).collect();

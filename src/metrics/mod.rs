@@ -13,6 +13,7 @@ pub use psnr::psnr;
 pub use ssim::{ssim_reflect_map, ssim_valid};
 
 use crate::image::{Gray, Image, Photo, quantise};
+use crate::{Error, Result};
 use serde::Serialize;
 
 /// A mask counts from here on: half.
@@ -72,41 +73,6 @@ impl Metrics {
     }
 }
 
-/// Why two pictures cannot be compared.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
-pub enum MetricsError {
-    /// Different sizes.
-    #[error("view `{name}`: the {what} is {} × {} pixels, expected {} × {}", found.0, found.1, expected.0, expected.1)]
-    Size {
-        /// Which view.
-        name: String,
-        /// `render`, `mask` or `valid mask`.
-        what: &'static str,
-        /// Its width and height.
-        found: (u32, u32),
-        /// The photograph's.
-        expected: (u32, u32),
-    },
-    /// Not a colour picture.
-    #[error("view `{name}`: the render has {found} channels, expected 3 or 4")]
-    Channels {
-        /// Which view.
-        name: String,
-        /// How many there are.
-        found: usize,
-    },
-}
-
-crate::error::error_from!(MetricsError, Cannot);
-
-impl MetricsError {
-    /// The way out.
-    pub fn hint(&self) -> &'static str {
-        "render the view again at the size of the photograph"
-    }
-}
-
 /// Compares a render with the photograph of the same view.
 ///
 /// A render with alpha is taken as it is over black. `mask` says where the head is, `valid` where the
@@ -117,20 +83,24 @@ pub fn compare(
     photo: &Photo,
     mask: Option<&Gray>,
     valid: Option<&Gray>,
-) -> Result<ViewMetrics, MetricsError> {
-    let expected = (photo.width, photo.height);
+) -> Result<ViewMetrics> {
+    let problem = |text: String| {
+        let hint = "render the view again at the size of the photograph";
+        Err(Error::cannot(format_args!("view `{name}`: {text}"), hint))
+    };
+    let (width, height) = (photo.width, photo.height);
     let sizes = [
         ("render", Some((render.width, render.height))),
         ("mask", mask.map(|m| (m.width, m.height))),
         ("valid mask", valid.map(|m| (m.width, m.height))),
     ];
     for (what, found) in sizes {
-        if let Some(found) = found.filter(|&f| f != expected) {
-            return Err(MetricsError::Size { name: name.into(), what, found, expected });
+        if let Some((w, h)) = found.filter(|&found| found != (width, height)) {
+            return problem(format!("the {what} is {w} × {h} pixels, expected {width} × {height}"));
         }
     }
     if !(3..=4).contains(&render.channels) {
-        return Err(MetricsError::Channels { name: name.into(), found: render.channels });
+        return problem(format!("the render has {} channels, expected 3 or 4", render.channels));
     }
     let ours = rounded(render);
     let mut theirs = Image::new(photo.width, photo.height, 3);

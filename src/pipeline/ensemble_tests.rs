@@ -43,7 +43,7 @@ fn put(run: &Run, member: &str, name: &str, color: Image) -> PathBuf {
 
 fn pixel(run: &Run, file: &str, at: usize) -> [u8; 3] {
     let read = io::read_photo(&run.path(file), None, &io::Limits::default()).unwrap();
-    read.photo.rgb[at]
+    read.rgb[at]
 }
 
 #[test]

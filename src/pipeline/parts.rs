@@ -147,7 +147,7 @@ impl Product {
         }
         let photo = |name: &str, size: Option<(u32, u32)>| -> Result<Photo> {
             let read = io::read_photo(&folder.join(name), size, &Limits::default());
-            let photo = read.map_err(|e| unusable(e, "mesh"))?.photo;
+            let photo = read.map_err(|e| unusable(e, "mesh"))?;
             let found = (photo.width, photo.height);
             match size.filter(|size| *size != found) {
                 None => Ok(photo),

@@ -116,15 +116,12 @@ pub(super) fn write_float(folder: &Path, name: &str, view: &RenderedView) -> Res
 
 /// Reads what [`write_float`] wrote, bit by bit: the colour (RGBA over black).
 pub(super) fn read_float(file: &Path) -> Result<Image, ReadError> {
-    let read = io::read_exr_channels(file, &[&CODED[..4]], &Limits::default())?;
+    let read = io::read_exr(file, &[&CODED[..4]], &Limits::default())?;
     if read.replaced > 0 {
-        return Err(ReadError::Unsupported {
-            path: file.into(),
-            what: format!("a view with {} values that are not finite", read.replaced),
-            hint: "its field has diverged: train it again with another --seed, or leave it out of \
-                   ensemble.members"
-                .into(),
-        });
+        let hint =
+            "its field has diverged: train it again with another --seed, or leave it out of ensemble.members";
+        let what = format!("a view with {} values that are not finite", read.replaced);
+        return Err(ReadError::unsupported(file, what, hint));
     }
     Ok(read.image)
 }
@@ -140,7 +137,7 @@ pub(super) fn read(file: &Path, format: PictureFormat) -> Result<Image, ReadErro
     let limits = Limits::default();
     match format {
         PictureFormat::Png => {
-            let photo = io::read_photo(file, None, &limits)?.photo;
+            let photo = io::read_photo(file, None, &limits)?;
             let mut image = Image::new(photo.width, photo.height, 4);
             for (i, p) in image.data.as_chunks_mut::<4>().0.iter_mut().enumerate() {
                 let a = photo.alpha.as_ref().map_or(1.0, |a| a[i] as f32 / 255.0);
@@ -150,7 +147,7 @@ pub(super) fn read(file: &Path, format: PictureFormat) -> Result<Image, ReadErro
             Ok(image)
         }
         PictureFormat::Exr => {
-            let mut image = io::read_exr_channels(file, &[&["R", "G", "B", "A"]], &limits)?.image;
+            let mut image = io::read_exr(file, &[&["R", "G", "B", "A"]], &limits)?.image;
             for p in image.data.as_chunks_mut::<4>().0 {
                 let [r, g, b, a] = straight(*p);
                 let coded = [r, g, b].map(|v| srgb_from_linear(v) * a);
@@ -203,7 +200,7 @@ mod tests {
         }
         // EXR: linear and premultiplied, 0.5 · linear(0.8) = 0.5 · 0.6038
         let file = path(dir.path(), "left/a", PictureFormat::Exr);
-        let red = io::read_exr_channels(&file, &[&["R", "Z"]], &Limits::default()).unwrap().image;
+        let red = io::read_exr(&file, &[&["R", "Z"]], &Limits::default()).unwrap().image;
         assert!((red.data[0] - 0.3019).abs() < 1e-3 && (red.data[1] - 1.234).abs() < 1e-6);
         assert!(dir.path().join("depth/left/a.png").is_file());
     }
@@ -221,7 +218,7 @@ mod tests {
         write_float(dir.path(), "left/a", &view).unwrap();
         let file = float_path(dir.path(), "left/a");
         assert_eq!(read_float(&file).unwrap(), view.color);
-        let depth = io::read_exr_channels(&file, &[&["Z"]], &Limits::default()).unwrap().image;
+        let depth = io::read_exr(&file, &[&["Z"]], &Limits::default()).unwrap().image;
         assert_eq!(depth, view.depth);
         // and views without depth or normals are pictures, too
         view.depth = Image::new(0, 0, 1);

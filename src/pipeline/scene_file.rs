@@ -24,20 +24,13 @@ struct SceneFile {
 pub(super) fn write_scene(path: &Path, scene: &Scene) -> Result<(), WriteError> {
     let file =
         SceneFile { scene_from_world: scene.scene_from_world, aabb: scene.aabb, hull: scene.hull.clone() };
-    let text = serde_json::to_vec(&file)
-        .map_err(|e| WriteError::Content { path: path.into(), problem: e.to_string() })?;
+    let text = serde_json::to_vec(&file).map_err(|e| WriteError::content(path, e.to_string()))?;
     io::write_atomic(path, &text)
 }
 
 /// Reads what [`write_scene`] wrote; what could not have been written is refused with its key.
 pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
-    let value = io::read_json(path, &Limits::default())?;
-    let file: SceneFile = serde_json::from_value(value).map_err(|e| ReadError::Json {
-        path: path.into(),
-        line: 1,
-        column: 1,
-        problem: e.to_string(),
-    })?;
+    let file: SceneFile = io::read_typed(path, &Limits::default())?;
     let wrong = |key: &str, found: String, expected: &str| Err(ReadError::value(path, key, found, expected));
     if let Some((part, found, expected)) = file.scene_from_world.problem() {
         return wrong(&format!("scene_from_world.{part}"), found, expected);
@@ -91,11 +84,9 @@ struct CamerasFile {
 
 /// Reads the capture that [`cameras_json`] was written of; `root` is where its photographs were.
 pub(super) fn read_capture(path: &Path, root: &Path) -> Result<Capture, ReadError> {
-    let value = io::read_json(path, &Limits::default())?;
-    let wrong = |problem: String| ReadError::Json { path: path.into(), line: 1, column: 1, problem };
-    let file: CamerasFile = serde_json::from_value(value).map_err(|e| wrong(e.to_string()))?;
+    let file: CamerasFile = io::read_typed(path, &Limits::default())?;
     if file.views.is_empty() {
-        return Err(wrong("there are no views".into()));
+        return Err(ReadError::value(path, "views", "empty", "at least one view"));
     }
     Ok(Capture {
         root: root.into(),

@@ -106,7 +106,7 @@ impl Run {
         }
         // the last stage first: stopped halfway, no stage is left whose input is gone
         for (folder, _lock) in locks.iter().rev() {
-            io::remove_file(&folder.join("done.json"))?;
+            io::remove(&folder.join("done.json"))?;
             io::clear_folder(folder, LOCK, &has_record)?;
         }
         Ok(())

@@ -110,13 +110,7 @@ fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Result<Option<T>, ReadEr
     if !io::is_file(path) {
         return Ok(None);
     }
-    let value = io::read_json(path, &Limits::default())?;
-    serde_json::from_value(value).map(Some).map_err(|e| ReadError::Json {
-        path: path.into(),
-        line: 1,
-        column: 1,
-        problem: e.to_string(),
-    })
+    io::read_typed(path, &Limits::default()).map(Some)
 }
 
 /// Seconds since 1970; 0 if the clock stands before that.

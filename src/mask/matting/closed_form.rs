@@ -565,7 +565,7 @@ mod tests {
             return;
         }
         let limits = Limits::default();
-        let photo = read_photo(&folder.join("image.png"), None, &limits).unwrap().photo;
+        let photo = read_photo(&folder.join("image.png"), None, &limits).unwrap();
         let mask = read_gray(&folder.join("mask.png"), None, &limits).unwrap();
         let trimap = read_gray(&folder.join("trimap_k3_i3.png"), None, &limits).unwrap();
         for (name, epsilon) in [("1e-05", 1e-5), ("1e-07", 1e-7)] {

@@ -50,7 +50,7 @@ fn each_engine() -> Vec<(&'static str, Option<Runtime>)> {
 }
 
 fn picture(folder: &Path) -> Photo {
-    read_photo(&folder.join("image.png"), None, &Limits::default()).unwrap().photo
+    read_photo(&folder.join("image.png"), None, &Limits::default()).unwrap()
 }
 
 fn gray(path: &Path) -> Gray {
@@ -99,7 +99,7 @@ fn photographs_are_resized_as_pillow_does() {
     let Some(folder) = shared("sam_tiny") else { return };
     let (photo, reference) =
         (picture(&folder), read_photo(&folder.join("resized.png"), None, &Limits::default()));
-    let reference = reference.unwrap().photo;
+    let reference = reference.unwrap();
     let resized = resample::photo(&photo, 192, 256);
     let off: Vec<u8> =
         resized.iter().flatten().zip(reference.rgb.iter().flatten()).map(|(a, b)| a.abs_diff(*b)).collect();
@@ -111,7 +111,7 @@ fn photographs_are_resized_as_pillow_does() {
 #[test]
 fn the_encoder_sees_the_pixels_of_the_reference() {
     let Some(folder) = shared("sam_tiny") else { return };
-    let resized = read_photo(&folder.join("resized.png"), None, &Limits::default()).unwrap().photo;
+    let resized = read_photo(&folder.join("resized.png"), None, &Limits::default()).unwrap();
     let pixels = normalised(&resized.rgb, 192, 256, &IMAGENET);
     close(
         "pixel_values",

@@ -1,24 +1,44 @@
 //! What the camera files say, before any photograph is looked at.
 
-use super::{CaptureError, Split};
+use super::view::Split;
+use crate::Error;
 use crate::geom::{Camera, Distortion};
 use glam::{DMat3, DVec3};
+use serde::Serialize;
 use std::path::PathBuf;
 
 /// Everything a format's reader found.
 #[derive(Debug, Default)]
 pub(super) struct Listing {
-    pub frames: Vec<Frame>,
+    pub frames: Vec<CameraFrame>,
+    /// What the format was recognized by, and what else was found.
     pub reasons: Vec<String>,
     pub warnings: Vec<String>,
-    pub problems: Vec<CaptureError>,
+    pub problems: Vec<Error>,
+    /// How well each LLFF file agrees with the JSON beside it.
+    pub agreements: Vec<Agreement>,
     /// The world's up, where the dataset names it.
     pub up: Option<DVec3>,
 }
 
+/// How well two camera files agree.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Agreement {
+    /// The LLFF file.
+    pub poses: String,
+    /// How many cameras were compared.
+    pub cameras: usize,
+    /// Largest difference of positions, dataset units.
+    pub position: f64,
+    /// Largest angle between rotations, radians.
+    pub rotation: f64,
+    /// Largest relative difference of focal lengths.
+    pub focal: f64,
+}
+
 /// One camera as its file describes it.
 #[derive(Clone, Debug)]
-pub(super) struct Frame {
+pub(super) struct CameraFrame {
     /// The camera file.
     pub file: String,
     /// The photograph as written there.
@@ -28,7 +48,7 @@ pub(super) struct Frame {
     /// Its path relative to the capture.
     pub relative: PathBuf,
     pub split: Option<Split>,
-    pub lens: Lens,
+    pub intrinsics: Intrinsics,
     pub rotation: DMat3,
     pub position: DVec3,
     pub mask: Option<PathBuf>,
@@ -37,7 +57,7 @@ pub(super) struct Frame {
 
 /// Intrinsics as declared; complete only together with the photograph's size.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Lens {
+pub(super) struct Intrinsics {
     pub size: Option<(u32, u32)>,
     /// Focal lengths in pixels.
     pub focal: [Option<f64>; 2],
@@ -48,7 +68,7 @@ pub(super) struct Lens {
     pub distortion: Distortion,
 }
 
-impl Lens {
+impl Intrinsics {
     /// The camera of a picture of `size`. One focal length stands for both.
     pub fn camera(&self, size: (u32, u32), rotation: DMat3, position: DVec3) -> Result<Camera, String> {
         let side = [size.0 as f64, size.1 as f64];
@@ -66,29 +86,16 @@ impl Lens {
                 return Err(format!("the focal length `{name}` is {f}, it must be positive"));
             }
         }
-        let center = |k: usize| self.center[k].unwrap_or(0.5 * side[k]);
-        let camera = Camera {
-            width: size.0,
-            height: size.1,
-            fx,
-            fy,
-            cx: center(0),
-            cy: center(1),
-            distortion: self.distortion,
-            rotation,
-            position,
-        };
+        let [cx, cy] = [0, 1].map(|k| self.center[k].unwrap_or(0.5 * side[k]));
+        let (width, height) = size;
         // beyond a whole picture beside it, the intrinsics belong to another size
-        if (0..2).any(|k| !(center(k) > -side[k] && center(k) < 2.0 * side[k])) {
+        if [(cx, side[0]), (cy, side[1])].iter().any(|&(c, side)| !(c > -side && c < 2.0 * side)) {
             return Err(format!(
-                "the principal point ({}, {}) is far outside its {} × {} pixels",
-                center(0),
-                center(1),
-                size.0,
-                size.1
+                "the principal point ({cx}, {cy}) is far outside its {width} × {height} pixels"
             ));
         }
-        Ok(camera)
+        let distortion = self.distortion;
+        Ok(Camera { width, height, fx, fy, cx, cy, distortion, rotation, position })
     }
 }
 
@@ -99,10 +106,10 @@ mod tests {
     #[test]
     fn an_opening_angle_becomes_a_focal_length() {
         // 90° over 200 pixels: f = 100 / tan 45° = 100
-        let lens = Lens { angle: [Some(90f64.to_radians()), None], ..Lens::default() };
-        let c = lens.camera((200, 100), DMat3::IDENTITY, DVec3::ZERO).unwrap();
+        let intrinsics = Intrinsics { angle: [Some(90f64.to_radians()), None], ..Intrinsics::default() };
+        let c = intrinsics.camera((200, 100), DMat3::IDENTITY, DVec3::ZERO).unwrap();
         assert!((c.fx - 100.0).abs() < 1e-9 && c.fy == c.fx);
         assert_eq!((c.cx, c.cy), (100.0, 50.0));
-        assert!(Lens::default().camera((2, 2), DMat3::IDENTITY, DVec3::ZERO).is_err());
+        assert!(Intrinsics::default().camera((2, 2), DMat3::IDENTITY, DVec3::ZERO).is_err());
     }
 }

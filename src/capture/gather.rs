@@ -1,0 +1,284 @@
+//! From camera files to views: everything is checked but the pixels.
+
+use super::error::{in_frame, no_views, wrong_size};
+use super::frame::{CameraFrame, Listing};
+use super::masks::few;
+use super::names::CaptureFolder;
+use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
+use super::{foreign, llff, load, masks, names, transforms};
+use crate::io::{self, Limits, PictureInfo};
+use crate::{Error, Result};
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+use std::collections::HashMap;
+use std::path::Path;
+
+/// Opens a capture, or returns the first thing that is wrong with it; [`super::inspect::inspect`] returns all.
+pub fn open(root: &Path, options: &CaptureOptions) -> Result<Capture> {
+    let (capture, listing) = gather(root, options);
+    match (listing.problems.into_iter().next(), capture) {
+        (Some(problem), _) => Err(problem),
+        (None, Some(capture)) => Ok(capture),
+        (None, None) => Err(no_views(root, "no frames")),
+    }
+}
+
+/// Returns whether a folder has camera files of a format that is read, whatever may be wrong with them.
+pub fn has_cameras(root: &Path) -> bool {
+    io::is_folder(root) && CameraFiles::find(root).is_some()
+}
+
+/// The files that describe the cameras.
+struct CameraFiles {
+    /// `transforms*.json`.
+    json: Vec<&'static str>,
+    /// `poses_bounds*.npy`: to check the JSON against, or alone.
+    poses: Vec<&'static str>,
+}
+
+impl CameraFiles {
+    fn find(root: &Path) -> Option<CameraFiles> {
+        let there = |names: &[&'static str]| -> Vec<&'static str> {
+            names.iter().copied().filter(|n| io::is_file(&root.join(n))).collect()
+        };
+        let mut json = there(&["transforms_train.json", "transforms_val.json", "transforms_test.json"]);
+        if !json.contains(&"transforms_train.json") {
+            json = there(&["transforms.json"]);
+        }
+        let mut poses = there(&["poses_bounds_train.npy", "poses_bounds_test.npy"]);
+        if poses.is_empty() {
+            poses = there(&["poses_bounds.npy"]);
+        }
+        (!json.is_empty() || !poses.is_empty()).then_some(CameraFiles { json, poses })
+    }
+
+    /// The format, and which files say so.
+    fn describe(&self) -> (&'static str, String) {
+        let quote = |names: &[&str]| names.iter().map(|n| format!("`{n}`")).collect::<Vec<_>>().join(", ");
+        let (json, poses) = (quote(&self.json), quote(&self.poses));
+        match (self.json.is_empty(), self.poses.is_empty()) {
+            (true, _) => ("LLFF poses", format!("cameras from {poses}, no JSON beside")),
+            (_, true) => ("transforms.json", format!("cameras from {json}")),
+            _ => ("transforms.json with LLFF poses", format!("cameras from {json}, checked against {poses}")),
+        }
+    }
+}
+
+/// A capture as far as one can be used, and everything that was found on the way, problems above all.
+pub(super) fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>, Listing) {
+    let mut listing = Listing::default();
+    let capture = match list(root, options, &mut listing) {
+        Ok((folder, format)) => build(&folder, format, &mut listing, options),
+        Err(problem) => {
+            listing.problems.push(problem);
+            None
+        }
+    };
+    (capture, listing)
+}
+
+/// Lists the frames of a capture and returns its folder and format.
+fn list(
+    root: &Path,
+    options: &CaptureOptions,
+    listing: &mut Listing,
+) -> Result<(CaptureFolder, &'static str)> {
+    let (downscale, unit_m) = (options.downscale, options.unit_m);
+    if downscale == 0 || !(unit_m > 0.0 && unit_m.is_finite()) {
+        return Err(Error::cannot(
+            format_args!("downscale {downscale} and unit {unit_m} m must be positive"),
+            "choose a whole factor of at least 1 and a positive unit",
+        ));
+    }
+    if io::is_file(root) {
+        return Err(foreign::explain_file(root));
+    } else if !io::is_folder(root) {
+        io::read_bytes(root, &Limits::default())?; // names what it is instead, or that it is not there
+    }
+    let files = CameraFiles::find(root).ok_or_else(|| foreign::explain(root))?;
+    let folder = CaptureFolder::new(root)?;
+    let (format, reason) = files.describe();
+    listing.reasons.push(reason);
+    if files.json.is_empty() {
+        if let Err(problem) = llff::list(&folder, &files.poses, options, listing) {
+            listing.problems.push(problem);
+        }
+    } else {
+        transforms::list(&folder, &files.json, options, listing);
+        if listing.problems.is_empty() {
+            llff::check(&folder, &files.poses, options, listing);
+        }
+    }
+    Ok((folder, format))
+}
+
+/// Frames with a photograph become views; what is wrong goes to the listing.
+fn build(
+    folder: &CaptureFolder,
+    format: &str,
+    listing: &mut Listing,
+    options: &CaptureOptions,
+) -> Option<Capture> {
+    let total = listing.frames.len();
+    let (frames, missing): (Vec<CameraFrame>, Vec<CameraFrame>) =
+        std::mem::take(&mut listing.frames).into_iter().partition(|f| f.photo.is_some());
+    let mut found = "the camera files list no frames".to_string();
+    if !missing.is_empty() {
+        let names = few(missing.iter().map(|f| f.name.as_str()));
+        found = format!("{} of {total} photographs are missing: {names}", missing.len());
+    }
+    if frames.is_empty() {
+        if !missing.is_empty() || listing.problems.is_empty() {
+            listing.problems.push(no_views(folder.root(), &found));
+        }
+        return None;
+    } else if !missing.is_empty() {
+        listing.warnings.push(format!("{found}; their views are left out"));
+    }
+
+    let (common, names) = names::view_names(&frames);
+    check_names(&frames, &names, listing);
+    let infos: Vec<_> = frames
+        .par_iter()
+        .map(|f| io::picture_info(f.photo.as_deref().unwrap_or(Path::new("")), &options.limits))
+        .collect();
+    let (mut turned, mut views, mut kept) = (Vec::new(), Vec::new(), Vec::new());
+    for ((frame, name), info) in frames.into_iter().zip(names).zip(infos) {
+        let view = info.map_err(Error::from).and_then(|i| Ok((i, view(folder, &frame, name, &i, options)?)));
+        match view {
+            Ok((info, view)) => {
+                if info.exif > 1 && info.size(Some(view.declared)) == (info.width, info.height) {
+                    turned.push(view.name.clone());
+                }
+                views.push(view);
+                kept.push((frame, info));
+            }
+            Err(problem) => listing.problems.push(problem),
+        }
+    }
+    if !turned.is_empty() {
+        listing.warnings.push(format!(
+            "{} photographs ask to be turned (EXIF) but are used as stored, as their cameras expect: {}",
+            turned.len(),
+            few(turned.iter().map(String::as_str))
+        ));
+    }
+    if views.is_empty() {
+        return None;
+    }
+    name_splits(&mut views, &kept, listing);
+    if let Err(problem) = masks::choose(folder, &common, &mut views, &kept, options, listing) {
+        listing.problems.push(problem);
+    }
+    let root = folder.root();
+    Some(Capture {
+        root: root.into(),
+        name: root.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned()),
+        format: format.into(),
+        reasons: std::mem::take(&mut listing.reasons),
+        up: up(&views, listing.up, options),
+        views,
+        unit_m: options.unit_m,
+        warnings: std::mem::take(&mut listing.warnings),
+    })
+}
+
+/// Views of one name are a problem, names that differ only in case a warning.
+fn check_names(frames: &[CameraFrame], names: &[String], listing: &mut Listing) {
+    let mut seen: HashMap<&str, &str> = HashMap::new();
+    let mut folded: HashMap<String, &str> = HashMap::new();
+    for (CameraFrame { file, name: second, .. }, name) in frames.iter().zip(names) {
+        if let Some(first) = seen.insert(name, second) {
+            listing.problems.push(Error::cannot(
+                format_args!("`{file}`: `{first}` and `{second}` would both be called `{name}`"),
+                "rename one of the photographs, or remove one frame",
+            ));
+        } else if let Some(twin) = folded.insert(name.to_lowercase(), name) {
+            listing.warnings.push(format!(
+                "the views `{twin}` and `{name}` differ only in case; on some disks their results would share a file"
+            ));
+        }
+    }
+}
+
+fn view(
+    folder: &CaptureFolder,
+    frame: &CameraFrame,
+    name: String,
+    info: &PictureInfo,
+    options: &CaptureOptions,
+) -> Result<View> {
+    let d = options.downscale;
+    let (w, h) = frame.intrinsics.size.unwrap_or((info.width, info.height));
+    let declared = (w, h);
+    let target = (w / d, h / d);
+    let problem = |problem: String| in_frame(&frame.file, &frame.name, problem);
+    if target.0 == 0 || target.1 == 0 {
+        return Err(problem(format!("nothing is left of {w} × {h} pixels after dividing by {d}")));
+    }
+    let photo = frame.photo.clone().unwrap_or_default();
+    let full = frame.intrinsics.camera(declared, frame.rotation, frame.position).map_err(problem)?;
+    let (camera, photo_size) = if info.size(Some(declared)) == declared {
+        (load::downscaled(&full, d), declared)
+    } else if info.size(Some(target)) == target {
+        (full.resized(target.0, target.1), target) // the photographs are already smaller
+    } else {
+        let found = info.size(Some(declared));
+        return Err(wrong_size(&folder.shown(&photo), found, declared, &frame.file, d));
+    };
+    Ok(View {
+        name,
+        camera,
+        split: frame.split.unwrap_or(Split::Train),
+        photo,
+        mask: ViewMask::None,
+        mask_meaning: options.mask_meaning,
+        valid: None,
+        region: None,
+        downscale: d,
+        photo_size,
+        declared,
+        declared_by: frame.file.clone(),
+    })
+}
+
+/// Named splits are kept; otherwise every 8th view in name order, starting with the first, is held out.
+fn name_splits(views: &mut [View], kept: &[(CameraFrame, PictureInfo)], listing: &mut Listing) {
+    if kept.iter().any(|(f, _)| f.split.is_some()) {
+        if !views.iter().any(|v| v.split == Split::Train) {
+            listing.warnings.push("no view is marked for training".into());
+        }
+        if !views.iter().any(|v| v.split == Split::Test) {
+            listing.warnings.push("no view is held out for testing".into());
+        }
+        return;
+    }
+    if views.len() < 4 {
+        listing.warnings.push(format!("all {} views are trained on, none is held out", views.len()));
+        return;
+    }
+    let mut order: Vec<usize> = (0..views.len()).collect();
+    order.sort_by(|&a, &b| views[a].name.cmp(&views[b].name));
+    for (rank, i) in order.into_iter().enumerate() {
+        views[i].split = if rank % 8 == 0 { Split::Test } else { Split::Train };
+    }
+    listing.reasons.push("no splits are named: every 8th view in name order is held out for testing".into());
+}
+
+fn up(views: &[View], named: Option<DVec3>, options: &CaptureOptions) -> Vec3 {
+    if let Some(up) = options.up.and_then(Vec3::try_normalize) {
+        return up;
+    }
+    if let Some(up) = named {
+        return up.normalize().as_vec3();
+    }
+    let mean: DVec3 = views.iter().map(|v| v.camera.rotation.y_axis).sum();
+    // cameras whose ups cancel say nothing; +Y is what most formats mean
+    let mean = mean.try_normalize().unwrap_or(DVec3::Y);
+    let axes = [DVec3::X, DVec3::Y, DVec3::Z];
+    axes.iter()
+        .flat_map(|&a| [a, -a])
+        .find(|a| a.dot(mean) > 20f64.to_radians().cos())
+        .unwrap_or(mean)
+        .as_vec3()
+}

@@ -1,0 +1,142 @@
+//! A capture and its views, as they are used from here on.
+
+use crate::config::MaskMeaning;
+use crate::geom::Camera;
+use crate::io::Limits;
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// What a view is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Split {
+    /// Learned from.
+    Train,
+    /// Watched while learning.
+    Val,
+    /// Held out for the numbers.
+    Test,
+}
+
+/// Where the head mask of one view is.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ViewMask {
+    /// There is none.
+    None,
+    /// The photograph's own alpha channel.
+    Alpha,
+    /// A picture beside it.
+    File(PathBuf),
+}
+
+impl From<Option<PathBuf>> for ViewMask {
+    fn from(file: Option<PathBuf>) -> ViewMask {
+        file.map_or(ViewMask::None, ViewMask::File)
+    }
+}
+
+/// Which masks to look for.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum MaskChoice {
+    /// The first that is there: alpha, `mask_path`, `vit_mask/`, `masks/NAME.png`, `masks/NAME.jpg.png`.
+    #[default]
+    Auto,
+    /// Only the photographs' alpha.
+    Alpha,
+    /// Only this folder, relative to the capture.
+    Folder(String),
+    /// None, even if there are some.
+    None,
+}
+
+/// How to open a capture.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CaptureOptions {
+    /// Whole factor by which photographs are averaged down, at least 1.
+    pub downscale: u32,
+    /// Which masks to use.
+    pub masks: MaskChoice,
+    /// What they mean.
+    pub mask_meaning: MaskMeaning,
+    /// Metres per dataset unit.
+    pub unit_m: f64,
+    /// The world's up direction; found from the dataset when absent.
+    pub up: Option<Vec3>,
+    /// What is refused for its size.
+    pub limits: Limits,
+}
+
+impl Default for CaptureOptions {
+    fn default() -> CaptureOptions {
+        CaptureOptions {
+            downscale: 1,
+            masks: MaskChoice::Auto,
+            mask_meaning: MaskMeaning::Empty,
+            unit_m: 1.0,
+            up: None,
+            limits: Limits::default(),
+        }
+    }
+}
+
+/// A folder of photographs of one head, understood.
+#[derive(Clone, Debug, Serialize)]
+pub struct Capture {
+    /// The folder.
+    pub root: PathBuf,
+    /// Its name.
+    pub name: String,
+    /// The format, in words.
+    pub format: String,
+    /// Why it is taken for that, and what else was found: one sentence each.
+    pub reasons: Vec<String>,
+    /// Every view with a photograph, in the dataset's order, splits one after the other.
+    pub views: Vec<View>,
+    /// Unit vector up in the world: given by the options, else by the dataset (`up`), else the mean of
+    /// the cameras' up vectors; the mean is snapped to a world axis within 20°, because datasets are
+    /// nearly always aligned and an export is then turned by exactly 90°.
+    pub up: Vec3,
+    /// Metres per dataset unit.
+    pub unit_m: f64,
+    /// What a person should know; nothing here stops the work.
+    pub warnings: Vec<String>,
+}
+
+/// One photograph with its camera.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct View {
+    /// The photograph's path below the folder common to all, without ending: `024`, `left/07`.
+    pub name: String,
+    /// Its camera, at the size after downscaling.
+    pub camera: Camera,
+    /// What it is for.
+    pub split: Split,
+    /// The photograph.
+    pub photo: PathBuf,
+    /// Where its head mask is.
+    pub mask: ViewMask,
+    /// What the mask means.
+    pub mask_meaning: MaskMeaning,
+    /// Which pixels are usable (`.npy` or picture).
+    pub valid: Option<PathBuf>,
+    /// The region that metrics look at (`face_masks/NAME.png`).
+    pub region: Option<PathBuf>,
+    /// Factor from the declared size to the camera's.
+    pub downscale: u32,
+    /// Size of the stored photograph after any EXIF turn: `declared`, or the camera's if it is already
+    /// reduced.
+    pub photo_size: (u32, u32),
+    /// Size the cameras were calibrated for, before downscaling.
+    pub declared: (u32, u32),
+    /// The file that declares it.
+    pub declared_by: String,
+}
+
+impl Capture {
+    /// The views of one split.
+    pub fn split(&self, split: Split) -> impl Iterator<Item = &View> {
+        self.views.iter().filter(move |v| v.split == split)
+    }
+}
