@@ -6,7 +6,7 @@ use super::masks::few;
 use super::names::CaptureFolder;
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use super::{foreign, llff, load, masks, names, transforms};
-use crate::io::{self, Limits, PictureInfo};
+use crate::io::{self, PictureInfo};
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -67,22 +67,27 @@ impl CameraFiles {
 /// A capture as far as one can be used, and everything that was found on the way, problems above all.
 pub(super) fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>, Listing) {
     let mut listing = Listing::default();
-    let capture = match list(root, options, &mut listing) {
-        Ok((folder, format)) => build(&folder, format, &mut listing, options),
-        Err(problem) => {
-            listing.problems.push(problem);
-            None
+    let capture = open_folder(root, options).map(|(folder, files)| {
+        let (format, reason) = files.describe();
+        listing.reasons.push(reason);
+        if files.json.is_empty() {
+            listing.problems.extend(llff::list(&folder, &files.poses, &mut listing).err());
+        } else {
+            transforms::list(&folder, &files.json, &mut listing);
+            if listing.problems.is_empty() {
+                llff::check(&folder, &files.poses, &mut listing);
+            }
         }
-    };
+        build(&folder, format, &mut listing)
+    });
+    let capture = capture.unwrap_or_else(|problem| {
+        listing.problems.push(problem);
+        None
+    });
     (capture, listing)
 }
 
-/// Lists the frames of a capture and returns its folder and format.
-fn list(
-    root: &Path,
-    options: &CaptureOptions,
-    listing: &mut Listing,
-) -> Result<(CaptureFolder, &'static str)> {
+fn open_folder<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<(CaptureFolder<'a>, CameraFiles)> {
     let (downscale, unit_m) = (options.downscale, options.unit_m);
     if downscale == 0 || !(unit_m > 0.0 && unit_m.is_finite()) {
         return Err(Error::cannot(
@@ -93,43 +98,26 @@ fn list(
     if io::is_file(root) {
         return Err(foreign::explain_file(root));
     } else if !io::is_folder(root) {
-        io::read_bytes(root, &Limits::default())?; // names what it is instead, or that it is not there
+        io::read_bytes(root, &options.limits)?; // names what it is instead, or that it is not there
     }
     let files = CameraFiles::find(root).ok_or_else(|| foreign::explain(root))?;
-    let folder = CaptureFolder::new(root)?;
-    let (format, reason) = files.describe();
-    listing.reasons.push(reason);
-    if files.json.is_empty() {
-        if let Err(problem) = llff::list(&folder, &files.poses, options, listing) {
-            listing.problems.push(problem);
-        }
-    } else {
-        transforms::list(&folder, &files.json, options, listing);
-        if listing.problems.is_empty() {
-            llff::check(&folder, &files.poses, options, listing);
-        }
-    }
-    Ok((folder, format))
+    Ok((CaptureFolder::new(root, options)?, files))
 }
 
 /// Frames with a photograph become views; what is wrong goes to the listing.
-fn build(
-    folder: &CaptureFolder,
-    format: &str,
-    listing: &mut Listing,
-    options: &CaptureOptions,
-) -> Option<Capture> {
+fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<Capture> {
+    let CaptureFolder { root, options, .. } = *folder;
     let total = listing.frames.len();
     let (frames, missing): (Vec<CameraFrame>, Vec<CameraFrame>) =
         std::mem::take(&mut listing.frames).into_iter().partition(|f| f.photo.is_some());
     let mut found = "the camera files list no frames".to_string();
     if !missing.is_empty() {
-        let names = few(missing.iter().map(|f| f.name.as_str()));
+        let names = few(missing.iter().map(|f| &f.name));
         found = format!("{} of {total} photographs are missing: {names}", missing.len());
     }
     if frames.is_empty() {
         if !missing.is_empty() || listing.problems.is_empty() {
-            listing.problems.push(no_views(folder.root(), &found));
+            listing.problems.push(no_views(root, &found));
         }
         return None;
     } else if !missing.is_empty() {
@@ -144,7 +132,7 @@ fn build(
         .collect();
     let (mut turned, mut views, mut kept) = (Vec::new(), Vec::new(), Vec::new());
     for ((frame, name), info) in frames.into_iter().zip(names).zip(infos) {
-        let view = info.map_err(Error::from).and_then(|i| Ok((i, view(folder, &frame, name, &i, options)?)));
+        let view = info.map_err(Error::from).and_then(|i| Ok((i, view(folder, &frame, name, &i)?)));
         match view {
             Ok((info, view)) => {
                 if info.exif > 1 && info.size(Some(view.declared)) == (info.width, info.height) {
@@ -160,23 +148,22 @@ fn build(
         listing.warnings.push(format!(
             "{} photographs ask to be turned (EXIF) but are used as stored, as their cameras expect: {}",
             turned.len(),
-            few(turned.iter().map(String::as_str))
+            few(turned)
         ));
     }
     if views.is_empty() {
         return None;
     }
     name_splits(&mut views, &kept, listing);
-    if let Err(problem) = masks::choose(folder, &common, &mut views, &kept, options, listing) {
+    if let Err(problem) = masks::choose(folder, &common, &mut views, &kept, listing) {
         listing.problems.push(problem);
     }
-    let root = folder.root();
     Some(Capture {
         root: root.into(),
         name: root.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned()),
         format: format.into(),
         reasons: std::mem::take(&mut listing.reasons),
-        up: up(&views, listing.up, options),
+        up: up(&views, listing.up),
         views,
         unit_m: options.unit_m,
         warnings: std::mem::take(&mut listing.warnings),
@@ -201,14 +188,8 @@ fn check_names(frames: &[CameraFrame], names: &[String], listing: &mut Listing) 
     }
 }
 
-fn view(
-    folder: &CaptureFolder,
-    frame: &CameraFrame,
-    name: String,
-    info: &PictureInfo,
-    options: &CaptureOptions,
-) -> Result<View> {
-    let d = options.downscale;
+fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &PictureInfo) -> Result<View> {
+    let d = folder.options.downscale;
     let (w, h) = frame.intrinsics.size.unwrap_or((info.width, info.height));
     let declared = (w, h);
     let target = (w / d, h / d);
@@ -232,7 +213,7 @@ fn view(
         split: frame.split.unwrap_or(Split::Train),
         photo,
         mask: ViewMask::None,
-        mask_meaning: options.mask_meaning,
+        mask_meaning: folder.options.mask_meaning,
         valid: None,
         region: None,
         downscale: d,
@@ -245,11 +226,9 @@ fn view(
 /// Named splits are kept; otherwise every 8th view in name order, starting with the first, is held out.
 fn name_splits(views: &mut [View], kept: &[(CameraFrame, PictureInfo)], listing: &mut Listing) {
     if kept.iter().any(|(f, _)| f.split.is_some()) {
-        if !views.iter().any(|v| v.split == Split::Train) {
-            listing.warnings.push("no view is marked for training".into());
-        }
-        if !views.iter().any(|v| v.split == Split::Test) {
-            listing.warnings.push("no view is held out for testing".into());
+        let wanted = [(Split::Train, "marked for training"), (Split::Test, "held out for testing")];
+        for (_, text) in wanted.iter().filter(|(split, _)| !views.iter().any(|v| v.split == *split)) {
+            listing.warnings.push(format!("no view is {text}"));
         }
         return;
     }
@@ -265,20 +244,14 @@ fn name_splits(views: &mut [View], kept: &[(CameraFrame, PictureInfo)], listing:
     listing.reasons.push("no splits are named: every 8th view in name order is held out for testing".into());
 }
 
-fn up(views: &[View], named: Option<DVec3>, options: &CaptureOptions) -> Vec3 {
-    if let Some(up) = options.up.and_then(Vec3::try_normalize) {
-        return up;
-    }
+fn up(views: &[View], named: Option<DVec3>) -> Vec3 {
     if let Some(up) = named {
         return up.normalize().as_vec3();
     }
     let mean: DVec3 = views.iter().map(|v| v.camera.rotation.y_axis).sum();
     // cameras whose ups cancel say nothing; +Y is what most formats mean
     let mean = mean.try_normalize().unwrap_or(DVec3::Y);
-    let axes = [DVec3::X, DVec3::Y, DVec3::Z];
-    axes.iter()
-        .flat_map(|&a| [a, -a])
-        .find(|a| a.dot(mean) > 20f64.to_radians().cos())
-        .unwrap_or(mean)
-        .as_vec3()
+    let axes = [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|a| [a, -a]);
+    let near = axes.into_iter().find(|a| a.dot(mean) > 20f64.to_radians().cos());
+    near.unwrap_or(mean).as_vec3()
 }

@@ -174,7 +174,7 @@ fn cameras(capture: &Capture, out: &mut Inspection) {
         out.warnings.push(format!(
             "the lens distortion folds over in the corners of {} views, whose pixels there are not used: {}",
             folded.len(),
-            few(folded.into_iter())
+            few(folded)
         ));
     }
 }
@@ -216,7 +216,7 @@ fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> 
     }
     out.problems.extend(grouped(&unreadable));
     for (finding, views) in kinds {
-        let (n, list) = (views.len(), few(views.into_iter()));
+        let (n, list) = (views.len(), few(views));
         out.warnings.push(format!("the mask {finding} in {n} views: {list}"));
     }
     out.masks = covered.len();

@@ -9,7 +9,7 @@ use super::error::{in_file, in_frame};
 use super::frame::{Agreement, CameraFrame, Intrinsics, Listing};
 use super::names::CaptureFolder;
 use super::pose;
-use super::view::{CaptureOptions, Split};
+use super::view::Split;
 use crate::io::{self, NpyValues};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
@@ -29,13 +29,14 @@ struct PoseRow {
     focal: f64,
 }
 
-fn read(folder: &CaptureFolder, file: &str, options: &CaptureOptions) -> Result<Vec<PoseRow>> {
+fn read(folder: &CaptureFolder, file: &str) -> Result<Vec<PoseRow>> {
+    let limits = &folder.options.limits;
     let problem = |text: String| in_file(file, text, "an LLFF file has one row of 17 numbers per photograph");
-    let npy = io::read_npy(&folder.camera_file(file)?, &options.limits)?;
+    let npy = io::read_npy(&folder.camera_file(file)?, limits)?;
     let (NpyValues::Number(values), [rows, 17]) = (&npy.values, &npy.shape[..]) else {
         return Err(problem(format!("its shape is {:?}, not (photographs, 17)", npy.shape)));
     };
-    if *rows == 0 || *rows > options.limits.views {
+    if *rows == 0 || *rows > limits.views {
         return Err(problem(format!("it has {rows} rows")));
     }
     let hint = "correct that row; columns are down, right, backwards, position, (height, width, focal)";
@@ -66,12 +67,12 @@ fn split_of(file: &str) -> Option<Split> {
 
 /// Compares each LLFF file with the frames of its split. Rows carry no names, so they are paired with the
 /// frames in the JSON's order or in name order, whichever fits better.
-pub(super) fn check(folder: &CaptureFolder, files: &[&str], options: &CaptureOptions, listing: &mut Listing) {
+pub(super) fn check(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) {
     for &file in files {
         let split = split_of(file);
         let frames: Vec<&CameraFrame> =
             listing.frames.iter().filter(|f| split.is_none() || f.split == split).collect();
-        match read(folder, file, options).and_then(|rows| compare(file, &rows, &frames)) {
+        match read(folder, file).and_then(|rows| compare(file, &rows, &frames)) {
             Ok(a) => {
                 listing.reasons.push(format!(
                     "`{file}` agrees with the JSON about {} cameras within {:.1e} units, {:.1e}°, {:.1e} of the \
@@ -157,22 +158,17 @@ fn difference(row: &PoseRow, frame: &CameraFrame) -> [f64; 3] {
 }
 
 /// Lists the frames of LLFF files alone, pairing rows with photographs in name order.
-pub(super) fn list(
-    folder: &CaptureFolder,
-    files: &[&str],
-    options: &CaptureOptions,
-    listing: &mut Listing,
-) -> Result<()> {
+pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) -> Result<()> {
     let mut sets = Vec::new();
     for &file in files {
-        sets.push((file, read(folder, file, options)?));
+        sets.push((file, read(folder, file)?));
     }
     let problem = |file: &str, text: String| {
         let hint =
             "put one photograph per row into `images/` (or `images_train/`, `images_test/`), in name order";
         in_file(file, text, hint)
     };
-    let named = |suffix| photographs(folder, suffix, options.downscale);
+    let named = |suffix| photographs(folder, suffix);
 
     // folders per split first; else one folder whose count says which files it belongs to
     let (shared, train, test) = (named("")?.unwrap_or_default(), named("_train")?, named("_test")?);
@@ -206,7 +202,7 @@ pub(super) fn list(
             return Err(problem(file, format!("it has {} rows for {} photographs", rows.len(), names.len())));
         }
         for (row, name) in rows.iter().zip(names) {
-            let (relative, photo) = folder.photo(file, &name, 1)?;
+            let (relative, photo) = folder.photo(file, &name)?;
             let PoseRow { rotation, position, size, focal } = *row;
             let intrinsics =
                 Intrinsics { size: Some(size), focal: [Some(focal); 2], ..Intrinsics::default() };
@@ -231,15 +227,16 @@ pub(super) fn list(
 
 /// The photographs in `images` + `suffix`, or in that folder of pictures already reduced, in name order; `None`
 /// without such a folder.
-fn photographs(folder: &CaptureFolder, suffix: &str, downscale: u32) -> Result<Option<Vec<String>>> {
+fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String>>> {
+    let downscale = folder.options.downscale;
     let mut names = vec![format!("images{suffix}")];
     if downscale > 1 {
         names.extend([format!("images{suffix}_{downscale}"), format!("images{suffix}_{downscale}x")]);
     }
-    let Some(name) = names.into_iter().find(|n| io::is_folder(&folder.root().join(n))) else {
+    let Some(name) = names.into_iter().find(|n| io::is_folder(&folder.root.join(n))) else {
         return Ok(None);
     };
-    let mut files = io::list_files(&folder.root().join(&name))?;
+    let mut files = io::list_files(&folder.root.join(&name))?;
     files.retain(|n| {
         let ending = n.rsplit_once('.').map_or("", |(_, e)| e).to_ascii_lowercase();
         matches!(ending.as_str(), "png" | "jpg" | "jpeg")

@@ -5,18 +5,15 @@ use super::names::CaptureFolder;
 use super::view::{Capture, CaptureOptions, MaskChoice, Split, View, ViewMask};
 use crate::config::MaskMeaning;
 use crate::image::Gray;
-use crate::io::{self, PictureInfo};
+use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Names for a message: at most six, then how many more.
-pub(super) fn few<'a>(names: impl Iterator<Item = &'a str>) -> String {
-    let names: Vec<&str> = names.collect();
-    let mut text = names.iter().take(6).map(|n| format!("`{n}`")).collect::<Vec<_>>().join(", ");
-    if names.len() > 6 {
-        text += &format!(" and {} more", names.len() - 6);
-    }
-    text
+pub(super) fn few(names: impl IntoIterator<Item = impl AsRef<str>>) -> String {
+    let names: Vec<String> = names.into_iter().map(|n| format!("`{}`", n.as_ref())).collect();
+    let text = names[..names.len().min(6)].join(", ");
+    if names.len() > 6 { format!("{text} and {} more", names.len() - 6) } else { text }
 }
 
 /// Decides where masks come from, once for the whole capture, and finds valid masks and regions.
@@ -27,7 +24,6 @@ pub(super) fn choose(
     common: &Path,
     views: &mut [View],
     kept: &[(CameraFrame, PictureInfo)],
-    options: &CaptureOptions,
     listing: &mut Listing,
 ) -> Result<()> {
     let root = Path::new("");
@@ -36,13 +32,14 @@ pub(super) fn choose(
         views.iter().map(|v| Ok(first_of(folder, bases, &names(v))?.into())).collect()
     };
     let alpha = |listing: &mut Listing| -> Result<(String, Vec<ViewMask>)> {
-        let is_mask = kept.iter().any(|(_, info)| info.alpha) && !all_opaque(views, kept, options, listing)?;
+        let is_mask = kept.iter().any(|(_, info)| info.alpha)
+            && !all_opaque(views, kept, &folder.options.limits, listing)?;
         let source =
             |info: &PictureInfo| if is_mask && info.alpha { ViewMask::Alpha } else { ViewMask::None };
         let sources = kept.iter().map(|(_, info)| source(info)).collect();
         Ok(("the alpha channel of the photographs".into(), sources))
     };
-    let candidates = match &options.masks {
+    let candidates = match &folder.options.masks {
         MaskChoice::None => Vec::new(),
         MaskChoice::Alpha => vec![alpha(listing)?],
         MaskChoice::Folder(name) => {
@@ -79,13 +76,13 @@ pub(super) fn choose(
             if n < views.len() {
                 let without = views.iter().filter(|v| v.mask == ViewMask::None).map(|v| v.name.as_str());
                 let mut text = format!("{} views have no mask: {}", views.len() - n, few(without));
-                if options.mask_meaning == MaskMeaning::Empty {
+                if folder.options.mask_meaning == MaskMeaning::Empty {
                     text += "; what is learned with masks learns nothing from them";
                 }
                 listing.warnings.push(text);
             }
         }
-        None => match &options.masks {
+        None => match &folder.options.masks {
             MaskChoice::None => listing.reasons.push("masks are not used, as asked".into()),
             MaskChoice::Auto => listing.reasons.push("no masks are beside the photographs".into()),
             MaskChoice::Alpha => {
@@ -133,7 +130,7 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> 
          no visual hull to start from"
             .into()
     } else if options.mask_meaning == MaskMeaning::Empty && 2 * missing > total {
-        let named = few(without.into_iter());
+        let named = few(without);
         format!("{missing} of {total} photographs that are learned from have no head mask: {named}")
     } else {
         return Ok(());
@@ -177,11 +174,11 @@ fn full_name(view: &View) -> String {
 fn all_opaque(
     views: &[View],
     kept: &[(CameraFrame, PictureInfo)],
-    options: &CaptureOptions,
+    limits: &Limits,
     listing: &mut Listing,
 ) -> Result<bool> {
     for (view, _) in views.iter().zip(kept).filter(|(_, (_, info))| info.alpha).take(3) {
-        let photo = io::read_photo(&view.photo, Some(view.photo_size), &options.limits)?;
+        let photo = io::read_photo(&view.photo, Some(view.photo_size), limits)?;
         if photo.alpha.is_some_and(|a| a.iter().any(|&v| v != 255)) {
             return Ok(false);
         }

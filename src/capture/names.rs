@@ -2,30 +2,30 @@
 
 use super::error::outside;
 use super::frame::CameraFrame;
+use super::view::CaptureOptions;
 use crate::{Result, io};
 use std::path::{Component, Path, PathBuf};
 
 /// What may be missing at the end of a photograph's name.
 const ENDINGS: [&str; 7] = ["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"];
 
-/// The capture's folder, as given and without links.
-pub(super) struct CaptureFolder {
-    root: PathBuf,
+/// The folder of a capture that is being opened.
+pub(super) struct CaptureFolder<'a> {
+    /// As given.
+    pub root: &'a Path,
+    /// Without links.
     real: PathBuf,
+    pub options: &'a CaptureOptions,
 }
 
-impl CaptureFolder {
-    pub fn new(root: &Path) -> Result<CaptureFolder> {
-        Ok(CaptureFolder { root: root.into(), real: io::real_path(root)? })
-    }
-
-    pub fn root(&self) -> &Path {
-        &self.root
+impl CaptureFolder<'_> {
+    pub fn new<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<CaptureFolder<'a>> {
+        Ok(CaptureFolder { root, real: io::real_path(root)?, options })
     }
 
     /// A path relative to the capture, for messages.
     pub fn shown(&self, path: &Path) -> String {
-        path.strip_prefix(&self.root).unwrap_or(path).to_string_lossy().into_owned()
+        path.strip_prefix(self.root).unwrap_or(path).to_string_lossy().into_owned()
     }
 
     /// The path below the capture that `name` means. `\` counts as a separator, since tools on Windows
@@ -39,7 +39,7 @@ impl CaptureFolder {
         let mut path = Path::new(&text);
         if path.is_absolute() {
             path = path
-                .strip_prefix(&self.root)
+                .strip_prefix(self.root)
                 .or_else(|_| path.strip_prefix(&self.real))
                 .map_err(|_| outside())?;
         } else if text.as_bytes().get(1) == Some(&b':') {
@@ -75,9 +75,10 @@ impl CaptureFolder {
     }
 
     /// The photograph that `name` means, with its path below the capture: the very name, else with a
-    /// usual ending, else in the folder of pictures already reduced by `downscale`
+    /// usual ending, else in the folder of pictures already reduced by `options.downscale`
     /// (`images_4/`, `images_4x/`).
-    pub fn photo(&self, file: &str, name: &str, downscale: u32) -> Result<(PathBuf, Option<PathBuf>)> {
+    pub fn photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
+        let downscale = self.options.downscale;
         let wanted = self.relative(file, name)?;
         let mut candidates = vec![wanted.clone()];
         let mut parts = wanted.components();
@@ -132,7 +133,8 @@ mod tests {
     #[test]
     fn names_stay_inside_the_capture_however_they_are_written() {
         let dir = tempfile::tempdir().unwrap();
-        let folder = CaptureFolder::new(dir.path()).unwrap();
+        let options = CaptureOptions::default();
+        let folder = CaptureFolder::new(dir.path(), &options).unwrap();
         let good = [
             ("./images/a.png", "images/a.png"),
             ("images/../b/./c", "b/c"),
@@ -156,7 +158,8 @@ mod tests {
         let (dir, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         std::fs::write(other.path().join("a.png"), b"x").unwrap();
         std::os::unix::fs::symlink(other.path().join("a.png"), dir.path().join("a.png")).unwrap();
-        let folder = CaptureFolder::new(dir.path()).unwrap();
-        assert!(folder.photo("t.json", "a.png", 1).unwrap_err().to_string().contains("outside the capture"));
+        let options = CaptureOptions::default();
+        let folder = CaptureFolder::new(dir.path(), &options).unwrap();
+        assert!(folder.photo("t.json", "a.png").unwrap_err().to_string().contains("outside the capture"));
     }
 }

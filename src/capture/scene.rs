@@ -71,24 +71,27 @@ impl Hull {
     }
 }
 
+/// Mask values over this may be head; low, so that soft hair is not carved away.
+const THRESHOLD: u8 = 12;
+
+/// Masks that a cell must touch; no more than there are.
+const LEAST_VIEWS: usize = 3;
+
+/// Cells of air around the hull.
+const MARGIN_CELLS: usize = 2;
+
 /// How the box is found.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneOptions {
     /// Cells per axis of the hull.
     pub resolution: usize,
-    /// Mask values over this may be head; low, so that soft hair is not carved away.
-    pub threshold: u8,
-    /// Masks that a cell must touch; no more than there are.
-    pub least_views: usize,
-    /// Cells of air around the hull.
-    pub margin_cells: usize,
     /// Names of the views for messages; numbers where absent.
     pub names: Vec<String>,
 }
 
 impl Default for SceneOptions {
     fn default() -> SceneOptions {
-        SceneOptions { resolution: 128, threshold: 12, least_views: 3, margin_cells: 2, names: Vec::new() }
+        SceneOptions { resolution: 128, names: Vec::new() }
     }
 }
 
@@ -114,9 +117,9 @@ pub fn fit(
     let (mut white, mut empty, mut used) = (Vec::new(), Vec::new(), Vec::new());
     for (i, mask) in masks.iter().enumerate() {
         let Some(mask) = mask else { continue };
-        if mask.values.iter().all(|&v| v <= options.threshold) {
+        if mask.values.iter().all(|&v| v <= THRESHOLD) {
             empty.push(name(i));
-        } else if mask.values.iter().all(|&v| v > options.threshold) {
+        } else if mask.values.iter().all(|&v| v > THRESHOLD) {
             white.push(name(i));
         } else {
             used.push(i);
@@ -150,11 +153,11 @@ pub fn fit(
     let center = aim(&some, &aims)?;
     let silhouettes: Vec<SilhouetteTable> = used
         .iter()
-        .filter_map(|&i| Some(SilhouetteTable::new(i, &cameras[i], masks[i].as_ref()?, options.threshold)))
+        .filter_map(|&i| Some(SilhouetteTable::new(i, &cameras[i], masks[i].as_ref()?, THRESHOLD)))
         .collect();
-    let least = options.least_views.min(used.len());
+    let least = LEAST_VIEWS.min(used.len());
     let core = used.len().div_ceil(3).max(least);
-    let margin = options.margin_cells as f64;
+    let margin = MARGIN_CELLS as f64;
 
     let mut cube = Cube { center, half: first_half(&some, center), n: 64.min(options.resolution) };
     let mut grown = 0;
@@ -225,7 +228,7 @@ pub fn fit(
         }
     }
     // nothing of the hull outside the box, air included
-    let air = options.margin_cells;
+    let air = MARGIN_CELLS;
     for (i, cell) in kept.iter_mut().enumerate() {
         let at = [i / (cube.n * cube.n), i / cube.n % cube.n, i % cube.n];
         *cell &= at.iter().zip(&extent).all(|(&v, &(lo, hi))| v + air >= lo && v <= hi + air);

@@ -8,7 +8,7 @@ use super::error::{in_file, in_frame};
 use super::frame::{CameraFrame, Intrinsics, Listing};
 use super::names::CaptureFolder;
 use super::pose;
-use super::view::{CaptureOptions, Split};
+use super::view::Split;
 use crate::Result;
 use crate::geom::Distortion;
 use crate::io::{self, ReadError};
@@ -24,8 +24,7 @@ type Object = Map<String, Value>;
 const FOCAL: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// The other keys that may stand at the top for all frames.
-const SHARED: [&str; 14] =
-    ["w", "h", "cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "is_fisheye", "camera_model"];
+const SHARED: &str = "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 is_fisheye camera_model";
 
 /// What is read at the top of a file, besides frames and intrinsics.
 #[derive(Default, Deserialize)]
@@ -50,7 +49,8 @@ impl TopKeys {
 }
 
 /// What is read of a frame, intrinsics from the top included.
-#[derive(Deserialize)]
+#[derive(Default, Deserialize)]
+#[serde(default)]
 struct FrameKeys {
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,
@@ -65,23 +65,14 @@ struct FrameKeys {
     camera_angle_y: Option<f64>,
     cx: Option<f64>,
     cy: Option<f64>,
-    #[serde(default)]
     k1: f64,
-    #[serde(default)]
     k2: f64,
-    #[serde(default)]
     k3: f64,
-    #[serde(default)]
     k4: f64,
-    #[serde(default)]
     k5: f64,
-    #[serde(default)]
     k6: f64,
-    #[serde(default)]
     p1: f64,
-    #[serde(default)]
     p2: f64,
-    #[serde(default)]
     is_fisheye: bool,
     camera_model: Option<String>,
 }
@@ -90,40 +81,41 @@ impl FrameKeys {
     fn read(top: &Object, entry: &Value) -> Result<FrameKeys, String> {
         let own = entry.as_object().ok_or("it is not a JSON object")?;
         let own_focal = FOCAL.iter().any(|key| own.contains_key(*key));
-        let shared = SHARED.iter().chain(FOCAL.iter().filter(|_| !own_focal));
-        let shared = shared.filter_map(|key| top.get_key_value(*key));
+        let shared = SHARED.split(' ').chain(FOCAL.into_iter().filter(|_| !own_focal));
+        let shared = shared.filter_map(|key| top.get_key_value(key));
         let is_given = |(_, value): &(&String, &Value)| !value.is_null();
         let merged: Object = (shared.filter(is_given).chain(own.iter().filter(is_given)))
             .map(|(key, value)| (key.clone(), value.clone()))
             .collect();
+        if !merged.contains_key("file_path") {
+            return Err("it has no `file_path`".into());
+        } else if !merged.contains_key("transform_matrix") {
+            return Err("it has no `transform_matrix`".into());
+        }
         io::typed(&Value::Object(merged))
             .map_err(|[key, found, expected]| format!("its `{key}` is {found}, expected {expected}"))
     }
 }
 
 /// Lists the frames of `files`, in order; everything wrong goes to the listing's problems.
-pub(super) fn list(folder: &CaptureFolder, files: &[&str], options: &CaptureOptions, listing: &mut Listing) {
+pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) {
     for file in files {
-        if let Err(problem) = list_file(folder, file, options, listing) {
+        if let Err(problem) = list_file(folder, file, listing) {
             listing.problems.push(problem);
         }
     }
-    let (found, limit) = (listing.frames.len() as u64, options.limits.views as u64);
+    let (found, limit) = (listing.frames.len() as u64, folder.options.limits.views as u64);
     if found > limit {
-        let problem = ReadError::too_large(folder.root(), "the number of views", found, limit);
+        let problem = ReadError::too_large(folder.root, "the number of views", found, limit);
         listing.problems.push(problem.into());
         listing.frames.clear();
     }
 }
 
-fn list_file(
-    folder: &CaptureFolder,
-    file: &str,
-    options: &CaptureOptions,
-    listing: &mut Listing,
-) -> Result<()> {
+fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
+    let limits = &folder.options.limits;
     let path = folder.camera_file(file)?;
-    let value = io::read_json(&path, &options.limits)?;
+    let value = io::read_json(&path, limits)?;
     let Some(top) = value.as_object() else {
         return Err(in_file(file, "it is not a JSON object", "it must begin with `{`"));
     };
@@ -135,7 +127,7 @@ fn list_file(
         let hint = "it must describe at least one photograph";
         return Err(in_file(file, "its list `frames` is empty", hint));
     }
-    let (found, limit) = (frames.len() as u64, options.limits.views as u64);
+    let (found, limit) = (frames.len() as u64, limits.views as u64);
     if found > limit {
         return Err(ReadError::too_large(&path, "the number of frames", found, limit).into());
     }
@@ -165,7 +157,7 @@ fn list_file(
                 upper_rows(&keys.transform_matrix).and_then(|rows| pose::pose(&rows)).map_err(problem)?;
             let split = named_split(keys.split.as_deref(), split).map_err(problem)?;
             let intrinsics = intrinsics(&keys, &mut ignored).map_err(problem)?;
-            let (relative, photo) = folder.photo(file, &keys.file_path, options.downscale)?;
+            let (relative, photo) = folder.photo(file, &keys.file_path)?;
             let beside = |name: &Option<String>| match name {
                 Some(name) => folder.file(file, &folder.relative(file, name)?),
                 None => Ok(None),

@@ -62,8 +62,6 @@ pub struct CaptureOptions {
     pub mask_meaning: MaskMeaning,
     /// Metres per dataset unit.
     pub unit_m: f64,
-    /// The world's up direction; found from the dataset when absent.
-    pub up: Option<Vec3>,
     /// What is refused for its size.
     pub limits: Limits,
 }
@@ -75,7 +73,6 @@ impl Default for CaptureOptions {
             masks: MaskChoice::Auto,
             mask_meaning: MaskMeaning::Empty,
             unit_m: 1.0,
-            up: None,
             limits: Limits::default(),
         }
     }
@@ -94,7 +91,7 @@ pub struct Capture {
     pub reasons: Vec<String>,
     /// Every view with a photograph, in the dataset's order, splits one after the other.
     pub views: Vec<View>,
-    /// Unit vector up in the world: given by the options, else by the dataset (`up`), else the mean of
+    /// Unit vector up in the world: given by the dataset (`up`), else the mean of
     /// the cameras' up vectors; the mean is snapped to a world axis within 20°, because datasets are
     /// nearly always aligned and an export is then turned by exactly 90°.
     pub up: Vec3,
