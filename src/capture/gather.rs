@@ -71,7 +71,8 @@ pub(super) fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>,
         let (format, reason) = files.describe();
         listing.reasons.push(reason);
         if files.json.is_empty() {
-            listing.problems.extend(llff::list(&folder, &files.poses, &mut listing).err());
+            let listed = llff::list(&folder, &files.poses, &mut listing);
+            listing.problems.extend(listed.err());
         } else {
             transforms::list(&folder, &files.json, &mut listing);
             if listing.problems.is_empty() {

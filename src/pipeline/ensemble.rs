@@ -11,7 +11,7 @@ use super::render::{Meshes, Renderer, cameras};
 use super::surface::Fields;
 use super::{Line, pictures, tiles};
 use crate::capture::scene::Scene;
-use crate::capture::{MaskMeaning, MaskSource, View};
+use crate::capture::{MaskMeaning, View, ViewMask};
 use crate::config::{Background, Config, EnsembleConfig, MaskUse, Method, called};
 use crate::ensemble::{self, EnsembleError, Fit, Member, Members, Target, Tile, blend};
 use crate::image::{Gray, Image, Photo};
@@ -155,7 +155,7 @@ fn members<'i>(line: &Line, views: &'i [Image]) -> Result<Members<'i>> {
 
 /// Was the field learned with masks?
 fn knows_masks(line: &Line, method: Method) -> bool {
-    let has_mask = |v: &View| v.mask != MaskSource::None && v.mask_meaning == MaskMeaning::Empty;
+    let has_mask = |v: &View| v.mask != ViewMask::None && v.mask_meaning == MaskMeaning::Empty;
     let used = match method {
         Method::Baseline | Method::Tface => line.config.radiance(method.stage()).masks != MaskUse::None,
         Method::Volume | Method::Raycast | Method::Textured => true,

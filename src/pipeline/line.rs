@@ -4,8 +4,8 @@ use super::clicks::{Clicks, clicks};
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::Scene;
-use crate::capture::{self, Capture, CaptureError, CaptureOptions, MaskChoice};
-use crate::config::{Config, MaskMeaning, MaskSource, RenderConfig, Stage};
+use crate::capture::{self, Capture, CaptureOptions, MaskChoice};
+use crate::config::{Config, MaskSource, RenderConfig, Stage};
 use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
 use crate::{Error, Result};
@@ -69,7 +69,7 @@ impl<'a> Line<'a> {
         if clicks.is_some() {
             // what later stages read is what the stage `mask` makes
             for view in &mut capture.views {
-                view.mask = capture::MaskSource::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
+                view.mask = capture::ViewMask::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
             }
         }
         Ok(Line { capture, config, run, digest, path: None, imports, gone, synthetic, clicks })
@@ -153,10 +153,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
             MaskSource::Alpha => MaskChoice::Alpha,
             MaskSource::None => MaskChoice::None,
         },
-        mask_meaning: match config.mask.meaning {
-            MaskMeaning::Empty => capture::MaskMeaning::Empty,
-            MaskMeaning::Ignore => capture::MaskMeaning::Ignore,
-        },
+        mask_meaning: config.mask.meaning,
         unit_m: c.unit_m,
         ..CaptureOptions::default()
     }
@@ -170,7 +167,7 @@ fn capture_digest(capture: &Capture) -> Result<String> {
         .map(|view| {
             let mut text = format!("{} {:?} {:?} {}", view.name, view.split, view.camera, view.downscale);
             let mask = match &view.mask {
-                capture::MaskSource::File(path) => Some(path),
+                capture::ViewMask::File(path) => Some(path),
                 _ => None,
             };
             for path in [Some(&view.photo), mask, view.valid.as_ref(), view.region.as_ref()] {
@@ -213,12 +210,11 @@ fn imports(config: &Config, run: &Run) -> Result<Vec<Import>> {
 fn remembered(
     config: &Config,
     run: &Run,
-    error: CaptureError,
+    error: Error,
 ) -> Result<(Capture, String, Option<Clicks>, Option<String>)> {
     let root = Path::new(&config.capture.path);
-    let is_there = io::is_folder(root) && !matches!(error, CaptureError::NotACapture { .. });
-    if is_there || !io::is_file(&run.path("config.toml")) {
-        return Err(error.into());
+    if capture::has_cameras(root) || !io::is_file(&run.path("config.toml")) {
+        return Err(error);
     }
     let problem = error.to_string();
     let record = read_record(&run.path(Stage::Mask)).ok().flatten().ok_or_else(|| gone(&problem))?;
