@@ -14,11 +14,11 @@ mod process;
 use clicked::{Clicked, mean_worst, overlap, read};
 use process::{cpu_s, peak_gib};
 use tiface::geom::Camera;
-use tiface::image::{Gray, Photo};
-use tiface::mask::consistency::{ConsistencyOptions, ConsistencyView, check_consistency};
-use tiface::mask::grabcut::{GrabcutOptions, grabcut};
-use tiface::mask::propagate::{PropagateOptions, PropagateView, propagate};
-use tiface::mask::{Click, CutError};
+use tiface::image::Photo;
+use tiface::mask::Click;
+use tiface::mask::consistency::{ConsistencyView, check_consistency};
+use tiface::mask::grabcut::grabcut;
+use tiface::mask::propagate::{PropagateView, propagate};
 
 fn main() {
     let times = if std::env::args().any(|a| a == "large") { 8 } else { 1 };
@@ -40,8 +40,7 @@ fn table(name: &str, c: &Clicked, times: u32) {
     let alone: Vec<f64> = (0..c.views.len())
         .filter(|&i| !c.clicks[i].is_empty())
         .map(|i| {
-            let cut = grabcut(&c.views[i].name, &c.photos[i], &c.clicks[i], &GrabcutOptions::default())
-                .expect("a mask");
+            let cut = grabcut(&c.views[i].name, &c.photos[i], &c.clicks[i]).expect("a mask");
             overlap(&cut.mask, &c.truth[i])
         })
         .collect();
@@ -62,17 +61,17 @@ fn table(name: &str, c: &Clicked, times: u32) {
         .collect();
     let start = cpu_s();
     let load = |i: usize| Ok(enlarged(&c.photos[i], times));
-    let masks = propagate::<CutError, _>(&views, load, &PropagateOptions::default()).expect("masks");
+    let masks = propagate(&views, load).expect("masks");
     let s = cpu_s() - start;
-    let overlaps: Vec<f64> = masks.views.iter().zip(&c.truth).map(|(m, t)| overlap(&m.mask, t)).collect();
+    let overlaps: Vec<f64> = masks.masks.iter().zip(&c.truth).map(|(m, t)| overlap(m, t)).collect();
     row("all views", &overlaps, s);
     masks.warnings.iter().for_each(|w| println!("  {w}"));
 
     let start = cpu_s();
-    let check: Vec<ConsistencyView> = (c.views.iter().zip(&masks.views))
-        .map(|(v, m)| ConsistencyView { name: &v.name, camera: &v.camera, mask: Some::<&Gray>(&m.mask) })
+    let check: Vec<ConsistencyView> = (c.views.iter().zip(&masks.masks))
+        .map(|(v, m)| ConsistencyView { name: &v.name, camera: &v.camera, mask: Some(m) })
         .collect();
-    let found = check_consistency(&check, &ConsistencyOptions::default()).expect("a comparison");
+    let found = check_consistency(&check).expect("a comparison");
     println!("{name:10} check          {} conflicts, {:.2} CPU s", found.conflicts.len(), cpu_s() - start);
 }
 

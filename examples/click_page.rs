@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 use tiface::capture::{self, CaptureOptions};
 use tiface::io::{self, Limits};
-use tiface::mask::annotation::{PageOptions, page_of};
+use tiface::mask::annotation::page_of;
 use tiface::mask::prompts::{Prompts, read_prompts};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -26,7 +26,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let capture = capture::open(&folder, &CaptureOptions::default())?;
     let clicks = folder.join("prompts.json");
     let prompts = if io::is_file(&clicks) { read_prompts(&clicks, &limits)? } else { Prompts::default() };
-    let page = page_of(&capture, &prompts, &PageOptions::default(), &limits)?;
+    let page = page_of(&capture, &prompts, &limits)?;
     io::write_atomic(&out, page.as_bytes())?;
     println!("{}: {} photographs, {} bytes", out.display(), capture.views.len(), page.len());
     Ok(())

@@ -30,7 +30,6 @@ mod march;
 mod mask;
 mod mesh;
 mod metrics;
-mod networks;
 mod page;
 mod parts;
 mod path;

@@ -10,7 +10,7 @@ use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 use tiface::io::{Limits, read_gray};
 use tiface::mask::Click;
 use tiface::mask::distance::squared_distance;
-use tiface::mask::prompts::{Frame, Prompts};
+use tiface::mask::prompts::{PhotoPrompts, Prompts};
 
 fn worked(output: &Output) {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -37,7 +37,7 @@ fn capture(folder: &Path) {
                 deepest(&avoid, &mut clicks, head);
             }
         }
-        Frame { file_path: format!("images/{view}.png"), points: clicks }
+        PhotoPrompts { file_path: format!("images/{view}.png"), points: clicks }
     };
     let prompts = Prompts { frames: ["000", "003", "006"].map(frame).to_vec() };
     prompts.write(&folder.join("prompts.json")).unwrap();

@@ -107,46 +107,6 @@ table! {
         /// How often the square is applied each way (the paper: 5).
         iterations: u32, 0.0..=1000.0 => 5;
     }
-    constants {
-        /// Rows that are cut.
-        cut_px: u32 => 512;
-        /// Gaussians of a mixture.
-        gaussians: usize => 5;
-        /// γ of the cut.
-        smoothness: f64 => 50.0;
-        /// λ/γ of the cut.
-        certainty: f64 => 9.0;
-        /// Rounds of fitting and cutting.
-        cut_rounds: usize => 8;
-        /// Radius of what a click makes certain, share of the height.
-        seed_radius: f32 => 0.012;
-        /// Width of the margins at the borders, share of the height.
-        border_margin: f32 => 0.012;
-        /// How far down the border margins at the sides reach, share of the height.
-        border_sides: f32 => 0.6;
-        /// Cells along each side of the carved cube.
-        carve_cells: usize => 112;
-        /// Rounds of carving and cutting.
-        carve_rounds: usize => 3;
-        /// Distance from the hull's silhouette to definite background, share of the height.
-        carve_outside: f32 => 0.012;
-        /// Depth of the core, share of the deepest cell.
-        carve_core: f64 => 0.55;
-        /// Votes against a cell that are forgiven.
-        carve_most_negative: usize => 2;
-        /// Share of the views that must keep a cell.
-        carve_least_positive: f64 => 0.1;
-        /// ε of closed-form matting.
-        epsilon: f64 => 1e-5;
-        /// Weight of definite pixels.
-        constraint_weight: f64 => 100.0;
-        /// Weight by which unknown pixels are held to the hard mask.
-        prior_weight: f64 => 3e-3;
-        /// Alphas below become 0.
-        lowest: f32 => 0.02;
-        /// Alphas above become 1.
-        highest: f32 => 0.98;
-    }
 }
 
 impl MaskConfig {

@@ -209,7 +209,6 @@ impl Config {
     /// With the constants of its preset, which are not read from text.
     fn keep_constants(self) -> Config {
         Config {
-            mask: self.mask.keep_constants(self.preset),
             tface: self.tface.keep_constants(self.preset),
             iface: self.iface.keep_constants(self.preset),
             mesh: self.mesh.keep_constants(self.preset),

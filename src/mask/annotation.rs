@@ -6,9 +6,10 @@
 
 use super::prompts::{Prompts, file_path};
 use super::scale::{reduce_photo, working_size};
+use crate::Result;
 use crate::capture::{Capture, View};
 use crate::image::Photo;
-use crate::io::{self, Limits, ReadError, WriteError};
+use crate::io::{self, Limits};
 use crate::report::{base64, escape};
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -16,46 +17,12 @@ use std::path::Path;
 
 const TEMPLATE: &str = include_str!("annotation.html");
 
-/// How photographs are put into the page.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct PageOptions {
-    /// Longest side at most, pixels.
-    pub side: u32,
-    /// JPEG quality, 1 to 100.
-    pub quality: u8,
-    /// Photographs at most; of more, evenly spread ones are shown.
-    pub most_views: usize,
-}
-
-impl Default for PageOptions {
-    fn default() -> PageOptions {
-        PageOptions { side: 1024, quality: 85, most_views: 200 }
-    }
-}
-
-/// Why there is no page.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum PageError {
-    /// A photograph could not be read.
-    #[error(transparent)]
-    Read(#[from] ReadError),
-    /// A photograph could not be coded as JPEG.
-    #[error(transparent)]
-    Write(#[from] WriteError),
-}
-
-crate::error::error_from!(PageError, Cannot);
-
-impl PageError {
-    /// The way out.
-    pub fn hint(&self) -> String {
-        match self {
-            PageError::Read(e) => e.hint(),
-            PageError::Write(e) => e.hint(),
-        }
-    }
-}
+/// Longest side of a photograph in the page, pixels.
+const SIDE_PX: u32 = 1024;
+/// JPEG quality of the photographs, 1 to 100.
+const QUALITY: u8 = 85;
+/// Photographs at most; of more, those with clicks and evenly spread ones are shown.
+const MOST_VIEWS: usize = 200;
 
 /// A photograph in the page.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -69,40 +36,31 @@ pub struct PageView {
 }
 
 impl PageView {
-    /// Reduces and codes a photograph; `size` is what clicks on it are counted in.
-    pub fn new(
-        file_path: String,
-        size: (u32, u32),
-        photo: &Photo,
-        options: &PageOptions,
-    ) -> Result<PageView, PageError> {
-        let small = reduce_photo(photo, working_size(photo.width, photo.height, options.side.max(1)));
-        let jpeg = io::jpeg_bytes(&small, options.quality, Path::new(&file_path))?;
+    /// Codes a photograph, reduced to at most `side` pixels; `size` is what clicks on it are counted in.
+    fn new(file_path: String, size: (u32, u32), photo: &Photo, side: u32) -> Result<PageView> {
+        let small = reduce_photo(photo, working_size(photo.width, photo.height, side));
+        let jpeg = io::jpeg_bytes(&small, QUALITY, Path::new(&file_path))?;
         Ok(PageView { file_path, size, jpeg })
     }
 }
 
-/// The page of a capture, with clicks that are there already. Only views that `prompts` names and evenly spread
-/// others are shown when there are more than [`PageOptions::most_views`].
-pub fn page_of(
-    capture: &Capture,
-    prompts: &Prompts,
-    options: &PageOptions,
-    limits: &Limits,
-) -> Result<String, PageError> {
+/// Returns the page of a capture, with clicks that are there already.
+///
+/// # Errors
+/// When a photograph cannot be read.
+pub fn page_of(capture: &Capture, prompts: &Prompts, limits: &Limits) -> Result<String> {
     let clicked = prompts.clicks("prompts.json", capture).unwrap_or_default();
     let clicked = |i: usize| clicked.get(i).is_some_and(|points| !points.is_empty());
-    let chosen = evenly(capture.views.len(), options.most_views, clicked);
+    let chosen = evenly(capture.views.len(), MOST_VIEWS, clicked);
     let read = |view: &View| {
         let photo = io::read_photo(&view.photo, Some(view.photo_size), limits)?;
-        PageView::new(file_path(capture, view), view.declared, &photo, options)
+        PageView::new(file_path(capture, view), view.declared, &photo, SIDE_PX)
     };
     let mut views = Vec::with_capacity(chosen.len());
     // a few at a time: photographs are large
     for few in chosen.chunks(rayon::current_num_threads().max(1)) {
-        let made: Vec<Result<PageView, PageError>> =
-            few.par_iter().map(|&i| read(&capture.views[i])).collect();
-        for view in made {
+        let coded: Vec<Result<PageView>> = few.par_iter().map(|&i| read(&capture.views[i])).collect();
+        for view in coded {
             views.push(view?);
         }
     }
@@ -142,7 +100,7 @@ fn inside_script(value: &Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::super::Click;
-    use super::super::prompts::Frame;
+    use super::super::prompts::PhotoPrompts;
     use super::*;
 
     const HOSTILE: &str = "images/</script><script>alert(1)</script>&\u{2028}\"__DATA__.png";
@@ -160,7 +118,7 @@ mod tests {
     #[test]
     fn names_cannot_leave_the_element_they_are_in() {
         let points = vec![Click { x: 3.0, y: 4.0, head: true }];
-        let prompts = Prompts { frames: vec![Frame { file_path: HOSTILE.into(), points }] };
+        let prompts = Prompts { frames: vec![PhotoPrompts { file_path: HOSTILE.into(), points }] };
         let page = page("<b>__DATA__</b>", &[view(HOSTILE), view("b.jpg")], &prompts);
         // the two scripts of the template and nothing else
         assert_eq!(page.matches("<script").count(), 2);
@@ -199,8 +157,7 @@ mod tests {
     #[test]
     fn photographs_are_reduced_and_coded() {
         let photo = Photo { width: 64, height: 32, rgb: vec![[200, 100, 50]; 2048], alpha: None };
-        let options = PageOptions { side: 16, ..PageOptions::default() };
-        let view = PageView::new("a.png".into(), (640, 320), &photo, &options).unwrap();
+        let view = PageView::new("a.png".into(), (640, 320), &photo, 16).unwrap();
         let small = io::parse_photo(&view.jpeg, Path::new("a"), &Limits::default()).unwrap();
         assert_eq!((small.width, small.height, view.size), (16, 8, (640, 320)));
         assert!(
@@ -209,6 +166,6 @@ mod tests {
             small.rgb[40]
         );
         let none = Photo { width: 0, height: 0, rgb: vec![], alpha: None };
-        assert!(PageView::new("a".into(), (1, 1), &none, &options).is_err());
+        assert!(PageView::new("a".into(), (1, 1), &none, 16).is_err());
     }
 }

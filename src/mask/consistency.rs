@@ -9,46 +9,29 @@
 //! Nothing but masks and cameras is needed, so masks a person brought are checked the same way.
 
 use super::distance::squared_distance;
-use super::error::CutError;
-use super::hull;
-use crate::capture::carve::{Cube, Projector};
+use super::hull::{self, ViewFrame};
+use super::scale::resize_hard;
+use crate::Result;
+use crate::capture::carve::Cube;
 use crate::geom::Camera;
 use crate::image::Gray;
 use glam::Vec2;
 use rayon::prelude::*;
 
-/// How masks are checked against each other.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ConsistencyOptions {
-    /// Rows that masks are reduced to.
-    pub rows: u32,
-    /// Cells along each side of the cube.
-    pub cells: usize,
-    /// Half side of the cube, in half heights of the frames at the point they look at.
-    pub cube: f64,
-    /// How many reduced pixels beside a mask, beyond the footprint of a cell, nothing is ruled out yet.
-    pub slack_px: f32,
-    /// Conflicts of a view, in whole masks, below which it is never named.
-    pub threshold: f64,
-    /// … and from which it always is.
-    pub certain_threshold: f64,
-    /// Between the two it is named when its conflict is this many times the mean.
-    pub stand_out: f64,
-}
-
-impl Default for ConsistencyOptions {
-    fn default() -> ConsistencyOptions {
-        ConsistencyOptions {
-            rows: 160,
-            cells: 128,
-            cube: 1.6,
-            slack_px: 1.0,
-            threshold: 0.005,
-            certain_threshold: 0.05,
-            stand_out: 4.0,
-        }
-    }
-}
+/// Rows that masks are reduced to.
+const ROWS: u32 = 160;
+/// Cells along each side of the cube.
+const CELLS: usize = 128;
+/// Half side of the cube, in half heights of the frames at the point they look at.
+const CUBE: f64 = 1.6;
+/// How many reduced pixels beside a mask, beyond the footprint of a cell, nothing is ruled out yet.
+const SLACK_PX: f32 = 1.0;
+/// Conflicts of a view, in whole masks, below which it is never named …
+const THRESHOLD: f64 = 0.005;
+/// … and from which it always is.
+const CERTAIN_THRESHOLD: f64 = 0.05;
+/// Between the two it is named when its conflict is this many times the mean.
+const STAND_OUT: f64 = 4.0;
 
 /// A view with its mask.
 #[derive(Clone, Copy, Debug)]
@@ -86,40 +69,43 @@ pub struct Consistency {
 }
 
 /// Compares the masks of all views. Fewer than two masks have nothing to disagree about.
-pub fn check_consistency(
-    views: &[ConsistencyView],
-    options: &ConsistencyOptions,
-) -> Result<Consistency, CutError> {
+///
+/// # Errors
+/// When the cameras stand at one place or look in one direction.
+pub fn check_consistency(views: &[ConsistencyView]) -> Result<Consistency> {
+    check_at(ROWS, CELLS, views)
+}
+
+fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consistency> {
     let used: Vec<usize> =
         (0..views.len()).filter(|&i| views[i].mask.is_some_and(|m| !m.values.is_empty())).collect();
     if used.len() < 2 {
         return Ok(Consistency { masks: used.len(), ..Consistency::default() });
     }
     let cameras: Vec<Camera> = used.iter().map(|&i| views[i].camera.clone()).collect();
-    let cube = hull::cube(&cameras, options.cells.max(8), options.cube)?;
-    let silhouettes: Vec<Silhouette> = (used.par_iter())
-        .filter_map(|&i| Some(Silhouette::new(views[i].camera, views[i].mask?, &cube, options)))
+    let cube = hull::cube(&cameras, cells, CUBE)?;
+    let claims: Vec<Claims> = used
+        .par_iter()
+        .filter_map(|&i| Some(Claims::new(views[i].camera, views[i].mask?, &cube, rows)))
         .collect();
-    let space = Space::new(cube, &silhouettes);
-    let mut active = vec![true; silhouettes.len()];
+    let votes = Votes::count(cube, &claims);
+    let mut active = vec![true; claims.len()];
     let mut conflicts = Vec::new();
     loop {
-        let conflict = Conflicts::of(&space, &silhouettes, &active);
+        let conflict = Conflicts::of(&votes, &claims, &active);
         let left = active.iter().filter(|a| **a).count();
         // of equals the first
-        let worst = (0..silhouettes.len())
+        let worst = (0..claims.len())
             .filter(|&i| active[i])
             .rev()
             .max_by(|&a, &b| conflict.credit[a].total_cmp(&conflict.credit[b]))
-            .filter(|&i| conflict.names(i, left, options));
+            .filter(|&i| conflict.names(i, left));
         let Some(worst) = worst.filter(|_| left >= 2) else {
-            let total: f64 =
-                (0..silhouettes.len()).filter(|&i| active[i]).map(|i| conflict.too_much[i]).sum();
-            return Ok(Consistency { masks: silhouettes.len(), conflicts, left: total / left.max(1) as f64 });
+            let total: f64 = (0..claims.len()).filter(|&i| active[i]).map(|i| conflict.too_much[i]).sum();
+            return Ok(Consistency { masks: claims.len(), conflicts, left: total / left.max(1) as f64 });
         };
         // of two masks nothing says which is wrong
-        let named =
-            if left == 2 { (0..silhouettes.len()).filter(|&i| active[i]).collect() } else { vec![worst] };
+        let named = if left == 2 { (0..claims.len()).filter(|&i| active[i]).collect() } else { vec![worst] };
         for i in named {
             active[i] = false;
             let (much, little) = (conflict.too_much[i], conflict.too_little(i));
@@ -147,96 +133,52 @@ fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String
     format!("the mask of view `{view}` {parts}{which}")
 }
 
-/// A reduced mask and what it rules out.
-struct Silhouette {
+/// What a reduced mask claims: where the head is, and where it cannot be.
+struct Claims {
     camera: Camera,
-    projector: Projector,
-    width: usize,
-    height: usize,
+    frame: ViewFrame,
     /// Pixels so far beside the mask that a cell there is ruled out.
     beside: Vec<bool>,
     on: Vec<bool>,
     /// Pixels well inside the mask, whose rays must meet something.
-    claims: Vec<usize>,
+    inner: Vec<usize>,
 }
 
-impl Silhouette {
-    fn new(camera: &Camera, mask: &Gray, cube: &Cube, options: &ConsistencyOptions) -> Silhouette {
-        let height = options.rows.clamp(16, mask.height.max(16));
+impl Claims {
+    fn new(camera: &Camera, mask: &Gray, cube: &Cube, rows: u32) -> Claims {
+        let height = rows.clamp(16, mask.height.max(16));
         let width = ((mask.width as f64 * height as f64 / mask.height as f64).round() as u32).max(1);
         let camera = camera.resized(width, height);
-        let on = reduced(mask, width as usize, height as usize);
+        let on: Vec<bool> = resize_hard(mask, (width, height)).values.iter().map(|&v| v > 127).collect();
         let (w, h) = (width as usize, height as usize);
         let off: Vec<bool> = on.iter().map(|o| !o).collect();
         // half the diagonal of a cell where the cube's middle is
         let footprint = cube.radius() * camera.fy / camera.position.distance(cube.center);
-        let slack = footprint as f32 + options.slack_px;
+        let slack = footprint as f32 + SLACK_PX;
         let beside = squared_distance(&on, w, h).iter().map(|&d| d > slack * slack).collect();
         // an all-white mask is infinitely far from its outside
-        let inner = squared_distance(&off, w, h);
-        let claims = (0..w * h).filter(|&i| inner[i] > options.slack_px * options.slack_px).collect();
-        Silhouette { projector: Projector::new(&camera), camera, width: w, height: h, beside, on, claims }
+        let depth = squared_distance(&off, w, h);
+        let inner = (0..w * h).filter(|&i| depth[i] > SLACK_PX * SLACK_PX).collect();
+        Claims { frame: ViewFrame::new(&camera), camera, beside, on, inner }
     }
 }
 
-/// Head where at least half of the area is masked.
-fn reduced(mask: &Gray, width: usize, height: usize) -> Vec<bool> {
-    let (w, h) = (mask.width as usize, mask.height as usize);
-    let span = |i: usize, to: usize, from: usize| {
-        let first = i * from / to;
-        first..((i + 1) * from).div_ceil(to).clamp(first + 1, from)
-    };
-    let mut on = Vec::with_capacity(width * height);
-    for y in 0..height {
-        let rows = span(y, height, h);
-        for x in 0..width {
-            let columns = span(x, width, w);
-            let head = |v: usize| mask.values[v * w..][columns.clone()].iter().filter(|&&m| m > 127).count();
-            let sum: usize = rows.clone().map(head).sum();
-            on.push(2 * sum >= rows.len() * columns.len());
-        }
-    }
-    on
-}
-
-/// Who says what about every cell: bits of views, `words` to a cell.
-struct Space {
+/// Which views vote against and for every cell: bits of views, `words` of them against and as many for.
+struct Votes {
     cube: Cube,
     words: usize,
-    /// Views that rule the cell out.
-    no: Vec<u64>,
-    /// Views that have it on the head.
-    yes: Vec<u64>,
+    bits: Vec<u64>,
 }
 
-impl Space {
-    fn new(cube: Cube, silhouettes: &[Silhouette]) -> Space {
-        let (n, words) = (cube.n, silhouettes.len().div_ceil(64));
-        let slabs: Vec<(Vec<u64>, Vec<u64>)> = (0..n)
-            .into_par_iter()
-            .map(|x| {
-                let (mut no, mut yes) = (vec![0u64; n * n * words], vec![0u64; n * n * words]);
-                for (p, silhouette) in silhouettes.iter().enumerate() {
-                    for i in 0..n * n {
-                        let Some((u, v, _)) = silhouette.projector.project(cube.cell_center(x, i / n, i % n))
-                        else {
-                            continue;
-                        };
-                        if u < 0.0 || v < 0.0 || u >= silhouette.width as f64 || v >= silhouette.height as f64
-                        {
-                            continue;
-                        }
-                        let pixel = v as usize * silhouette.width + u as usize;
-                        let at = i * words + p / 64;
-                        no[at] |= (silhouette.beside[pixel] as u64) << (p % 64);
-                        yes[at] |= (silhouette.on[pixel] as u64) << (p % 64);
-                    }
-                }
-                (no, yes)
-            })
-            .collect();
-        let (no, yes): (Vec<_>, Vec<_>) = slabs.into_iter().unzip();
-        Space { cube, words, no: no.concat(), yes: yes.concat() }
+impl Votes {
+    fn count(cube: Cube, claims: &[Claims]) -> Votes {
+        let words = claims.len().div_ceil(64);
+        let frames: Vec<&ViewFrame> = claims.iter().map(|c| &c.frame).collect();
+        let bits = hull::vote(&cube, &frames, 2 * words, |cell: &mut [u64], k, pixel| {
+            cell[k / 64] |= (claims[k].beside[pixel] as u64) << (k % 64);
+            cell[words + k / 64] |= (claims[k].on[pixel] as u64) << (k % 64);
+        });
+        Votes { cube, words, bits }
     }
 }
 
@@ -252,24 +194,20 @@ struct Conflicts {
 }
 
 impl Conflicts {
-    fn of(space: &Space, silhouettes: &[Silhouette], active: &[bool]) -> Conflicts {
-        let count = silhouettes.len();
-        let mut mask = vec![0u64; space.words];
+    fn of(votes: &Votes, claims: &[Claims], active: &[bool]) -> Conflicts {
+        let count = claims.len();
+        let mut mask = vec![0u64; votes.words];
         for i in (0..count).filter(|&i| active[i]) {
             mask[i / 64] |= 1 << (i % 64);
         }
         // cells as what they cost: how many active views rule them out, and how many have them on the head
-        let bits = |set: &[u64], i: usize| -> u32 {
-            (0..space.words).map(|k| (set[i * space.words + k] & mask[k]).count_ones()).sum()
-        };
-        let cells = space.cube.n.pow(3);
-        let costs: Vec<(u16, u16)> = (0..cells)
-            .into_par_iter()
-            .map(|i| (bits(&space.no, i) as u16, bits(&space.yes, i) as u16))
-            .collect();
+        let ones = |set: &[u64]| set.iter().zip(&mask).map(|(s, m)| (s & m).count_ones() as u16).sum::<u16>();
+        let cells = votes.bits.par_chunks_exact(2 * votes.words);
+        let costs: Vec<(u16, u16)> =
+            cells.map(|cell| (ones(&cell[..votes.words]), ones(&cell[votes.words..]))).collect();
         let found: Vec<Option<(f64, Vec<f64>)>> = (0..count)
             .into_par_iter()
-            .map(|j| active[j].then(|| open_claims(space, &silhouettes[j], &costs, &mask, count)))
+            .map(|j| active[j].then(|| open_claims(votes, &claims[j], &costs, &mask, count)))
             .collect();
         let others = (active.iter().filter(|a| **a).count().max(2) - 1) as f64;
         let zero = || vec![0.0; count];
@@ -288,11 +226,11 @@ impl Conflicts {
 
     /// Is a view's part in the conflict large, or at least unlike that of the others? Of `left` views a single
     /// wrong one has half of all credit, so few views can stand out less.
-    fn names(&self, i: usize, left: usize, options: &ConsistencyOptions) -> bool {
+    fn names(&self, i: usize, left: usize) -> bool {
         let mean = self.credit.iter().sum::<f64>() / left as f64;
-        let times = if left == 2 { 0.0 } else { (left as f64 / 6.0).max(1.2).min(options.stand_out) };
+        let times = if left == 2 { 0.0 } else { (left as f64 / 6.0).max(1.2).min(STAND_OUT) };
         let own = self.credit[i];
-        own > options.certain_threshold || (own > options.threshold && own > times * mean)
+        own > CERTAIN_THRESHOLD || (own > THRESHOLD && own > times * mean)
     }
 
     /// Mean share that a view takes away from the others.
@@ -304,24 +242,24 @@ impl Conflicts {
 /// The share of a view's claims that nothing explains, and the views that rule out the best point of each such
 /// ray: `k` of them share a claim in equal parts.
 fn open_claims(
-    space: &Space,
-    silhouette: &Silhouette,
+    votes: &Votes,
+    claims: &Claims,
     costs: &[(u16, u16)],
     mask: &[u64],
     count: usize,
 ) -> (f64, Vec<f64>) {
     let mut takers = vec![0.0; count];
     let (mut open, mut asked) = (0usize, 0usize);
-    for &pixel in &silhouette.claims {
-        let (x, y) = (pixel % silhouette.width, pixel / silhouette.width);
-        let Some((cost, cell)) = best_on_ray(space, &silhouette.camera, x, y, costs) else { continue };
+    for &pixel in &claims.inner {
+        let (x, y) = (pixel % claims.frame.width, pixel / claims.frame.width);
+        let Some((cost, cell)) = best_on_ray(&votes.cube, &claims.camera, x, y, costs) else { continue };
         asked += 1;
         if cost == 0 {
             continue;
         }
         open += 1;
         for i in 0..count {
-            let bit = space.no[cell * space.words + i / 64] & mask[i / 64] & (1 << (i % 64));
+            let bit = votes.bits[2 * cell * votes.words + i / 64] & mask[i / 64] & (1 << (i % 64));
             if bit != 0 {
                 takers[i] += 1.0 / cost as f64;
             }
@@ -335,16 +273,16 @@ fn open_claims(
 /// The cell on a pixel's ray that fewest views rule out, of those that another view has on the head if there are
 /// any; of equals the one that most have there. Nothing when no other view looks at the ray within the cube.
 fn best_on_ray(
-    space: &Space,
+    cube: &Cube,
     camera: &Camera,
     x: usize,
     y: usize,
     costs: &[(u16, u16)],
 ) -> Option<(u16, usize)> {
     let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
-    let (n, cell) = (space.cube.n, space.cube.cell());
+    let (n, cell) = (cube.n, cube.cell());
     // in cells from the cube's corner
-    let origin = (camera.position - space.cube.center + space.cube.half) / cell;
+    let origin = (camera.position - cube.center + cube.half) / cell;
     let direction = ray.direction.as_dvec3();
     let (mut begin, mut end) = (0.0f64, f64::INFINITY);
     for a in 0..3 {
@@ -438,11 +376,7 @@ mod tests {
             .zip(masks)
             .map(|(camera, m)| ConsistencyView { name: "v", camera, mask: Some(m) })
             .collect();
-        check_consistency(
-            &views,
-            &ConsistencyOptions { rows: 128, cells: 64, ..ConsistencyOptions::default() },
-        )
-        .unwrap()
+        check_at(128, 64, &views).unwrap()
     }
 
     fn shifted(mask: &Gray, by: usize) -> Gray {
@@ -506,6 +440,6 @@ mod tests {
     fn masks_are_reduced_by_area() {
         // 4 x 2 to 2 x 1: left block three of four masked, right block one
         let mask = Gray { width: 4, height: 2, values: vec![255, 255, 0, 0, 255, 0, 0, 200] };
-        assert_eq!(reduced(&mask, 2, 1), [true, false]);
+        assert_eq!(resize_hard(&mask, (2, 1)).values, [255, 0]);
     }
 }

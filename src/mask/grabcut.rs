@@ -11,26 +11,39 @@
 
 pub mod maxflow;
 pub mod mixture;
-mod options;
 pub(super) mod seeds;
-
-pub use self::options::GrabcutOptions;
 
 use self::maxflow::PixelGraph;
 use self::mixture::{Mixture, Rgb};
 use self::seeds::Seed;
 use super::click::Click;
 use super::components::{fill_holes, keep_with_seeds, open};
-use super::error::CutError;
 use super::scale::reduce_to_rows;
 use crate::image::{Gray, Photo};
+use crate::{Error, Result};
 
+/// Rows of the working size; larger photographs are averaged down to it.
+pub(super) const ROWS: u32 = 512;
+/// Gaussians per mixture (Rother, Kolmogorov, Blake 2004, §3.1).
+const GAUSSIANS: usize = 5;
+/// γ: what an edge between equal colors costs (§2.2 of the same).
+const SMOOTHNESS: f64 = 50.0;
+/// λ/γ: what contradicting a click or border margin costs.
+const CERTAINTY: f64 = 9.0;
+/// Rounds of fitting and cutting from clicks.
+pub(super) const ROUNDS: usize = 8;
+/// Holes up to this share of the picture are filled.
+const HOLE: f64 = 0.01;
+/// Around the outline, what colors leave open counts as ambiguous within this share of the height.
+const OUTLINE: f32 = 0.023;
+/// Seed of the k-means start.
+const SEED: u64 = 42;
 /// Whole-number capacities per unit of energy.
 const UNIT: f64 = 1000.0;
 
 /// A hard mask at the working size.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Cut {
+pub struct HardMask {
     /// 255 head, 0 background.
     pub mask: Gray,
     /// Share of the picture, 0..=1, that lies near the outline and has a colour that fits both sides.
@@ -40,22 +53,34 @@ pub struct Cut {
 }
 
 /// Cuts the head out of one photograph. `view` is its name in messages; clicks are pixels of `photo`.
-pub fn grabcut(
-    view: &str,
-    photo: &Photo,
-    clicks: &[Click],
-    options: &GrabcutOptions,
-) -> Result<Cut, CutError> {
+///
+/// # Errors
+/// When clicks lie outside, contradict each other or name no head, and when nothing of the clicked head is left.
+pub fn grabcut(view: &str, photo: &Photo, clicks: &[Click]) -> Result<HardMask> {
+    cut_at(ROWS, view, photo, clicks)
+}
+
+fn cut_at(rows: u32, view: &str, photo: &Photo, clicks: &[Click]) -> Result<HardMask> {
     seeds::check(view, clicks, photo.width, photo.height)?;
-    let (grabcut, mut warnings) = Grabcut::new(view, photo, clicks, options);
-    let (head, models) = grabcut.cut_from_clicks(options);
-    let head = grabcut.finish(head, options);
+    let small = reduce_to_rows(photo, rows);
+    let (grabcut, mut warnings) =
+        Grabcut::new(view, small, (photo.width, photo.height), clicks, seeds::BORDER_MARGIN);
+    let (head, models) = grabcut.cut_from_clicks();
+    let head = grabcut.finish(head);
     if !head.contains(&true) {
-        return Err(CutError::Empty { view: view.into() });
+        return Err(empty(view));
     }
-    let ambiguous = models.map_or(1.0, |m| grabcut.ambiguous(&head, &m, options));
+    let ambiguous = models.map_or(1.0, |m| grabcut.ambiguous(&head, &m));
     warnings.extend(grabcut.warnings(view, &head));
-    Ok(Cut { mask: grabcut.gray(&head), ambiguous, warnings })
+    Ok(HardMask { mask: grabcut.gray(&head), ambiguous, warnings })
+}
+
+/// The error for a view in which nothing of the clicked head was left.
+pub(super) fn empty(view: &str) -> Error {
+    Error::cannot(
+        format!("view `{view}`: the cut left nothing of the head"),
+        "click more of the head: its face, hair and each part of the garment, and the background beside it",
+    )
 }
 
 /// The colours of both sides.
@@ -67,12 +92,16 @@ pub(super) struct Models {
 
 impl Models {
     /// From k-means over both sides; `None` when one has no pixel.
-    pub fn fit(head: &[Rgb], background: &[Rgb], options: &GrabcutOptions) -> Option<Models> {
-        let count = options.gaussians.clamp(1, 16);
+    pub fn fit(head: &[Rgb], background: &[Rgb]) -> Option<Models> {
         Some(Models {
-            head: Mixture::fit(head, count, options.seed)?,
-            background: Mixture::fit(background, count, options.seed)?,
+            head: Mixture::fit(head, GAUSSIANS, SEED)?,
+            background: Mixture::fit(background, GAUSSIANS, SEED)?,
         })
+    }
+
+    /// Each side measured anew.
+    pub fn refit(&self, head: &[Rgb], background: &[Rgb]) -> Models {
+        Models { head: self.head.refit(head), background: self.background.refit(background) }
     }
 
     /// `ln p(c | head) − ln p(c | background)`.
@@ -98,50 +127,34 @@ pub(super) struct Grabcut {
 const FORWARD: [(usize, isize, isize); 4] = [(0, 1, 0), (2, 0, 1), (4, 1, 1), (6, -1, 1)];
 
 impl Grabcut {
-    /// Reduces a photograph and draws what its clicks make certain; also warnings about the clicks.
+    /// Draws what clicks make certain on a photograph that is reduced to its working size from `size`, in whose pixels
+    /// the clicks are; also warnings about the clicks. The border margin is a share of the height.
     pub fn new(
         view: &str,
-        photo: &Photo,
-        clicks: &[Click],
-        options: &GrabcutOptions,
-    ) -> (Grabcut, Vec<String>) {
-        let small = reduce_to_rows(photo, options.rows.max(16));
-        Grabcut::reduced(view, small, (photo.width, photo.height), clicks, options)
-    }
-
-    /// The same for a photograph that is reduced already, from `size`, in whose pixels the clicks are.
-    pub fn reduced(
-        view: &str,
-        small: Photo,
+        photo: Photo,
         size: (u32, u32),
         clicks: &[Click],
-        options: &GrabcutOptions,
+        margin: f32,
     ) -> (Grabcut, Vec<String>) {
-        let clicks: Vec<Click> = clicks.iter().map(|c| c.moved(size, (small.width, small.height))).collect();
-        let (width, height) = (small.width as usize, small.height as usize);
-        let (seeds, warnings) = seeds::from_clicks(view, &clicks, width, height, options);
-        let edges = edges(&small, options.smoothness);
-        (Grabcut { photo: small, width, height, clicks, seeds, edges }, warnings)
+        let clicks: Vec<Click> = clicks.iter().map(|c| c.moved(size, (photo.width, photo.height))).collect();
+        let (width, height) = (photo.width as usize, photo.height as usize);
+        let (seeds, warnings) = seeds::from_clicks(view, &clicks, width, height, margin);
+        let edges = edges(&photo);
+        (Grabcut { photo, width, height, clicks, seeds, edges }, warnings)
     }
 
-    /// GrabCut from the clicks: labels and the colours they end with.
-    pub fn cut_from_clicks(&self, options: &GrabcutOptions) -> (Vec<bool>, Option<Models>) {
-        let start = seeds::start(&self.seeds, &self.clicks, self.width, self.height, options);
-        let mut head = start.head;
-        let mut models: Option<Models> = None;
-        for _ in 0..options.rounds.max(1) {
-            let (inside, mut outside) = self.colors(&head);
-            if models.is_none() {
-                outside = self.colors(&start.not_far).1;
+    /// GrabCut from the clicks: labels and the colors they end with.
+    pub fn cut_from_clicks(&self) -> (Vec<bool>, Option<Models>) {
+        let skeleton = seeds::skeleton(&self.seeds, &self.clicks, self.width, self.height);
+        let [mut head, not_far] = seeds::start(&self.seeds, &skeleton, self.width, self.height);
+        let mut models = Models::fit(&self.colors(&head).0, &self.colors(&not_far).1);
+        for round in 0..ROUNDS {
+            if round > 0 {
+                let (inside, outside) = self.colors(&head);
+                models = models.map(|m| m.refit(&inside, &outside));
             }
-            models = match models {
-                None => Models::fit(&inside, &outside, options),
-                Some(m) => {
-                    Some(Models { head: m.head.refit(&inside), background: m.background.refit(&outside) })
-                }
-            };
             let Some(m) = &models else { break };
-            let labels = self.min_cut(&self.seeds, m, options);
+            let labels = self.min_cut(m);
             let settled = labels == head;
             head = labels;
             if settled {
@@ -158,13 +171,13 @@ impl Grabcut {
         (of(true).collect(), of(false).collect())
     }
 
-    /// One smallest cut under given colours.
-    pub fn min_cut(&self, seeds: &[Seed], models: &Models, options: &GrabcutOptions) -> Vec<bool> {
-        let certain = (options.certainty * options.smoothness * UNIT) as i32;
+    /// One smallest cut under given colors.
+    pub fn min_cut(&self, models: &Models) -> Vec<bool> {
+        let certain = (CERTAINTY * SMOOTHNESS * UNIT) as i32;
         let mut graph = PixelGraph::new(self.width, self.height);
         for (i, edge) in self.edges.iter().enumerate() {
             let (x, y) = (i % self.width, i / self.width);
-            let (as_head, as_background) = match seeds[i] {
+            let (as_head, as_background) = match self.seeds[i] {
                 Seed::Head => (0, certain),
                 Seed::Background => (certain, 0),
                 Seed::Unknown => {
@@ -184,27 +197,27 @@ impl Grabcut {
     }
 
     /// Pieces without a click go, small holes are filled, threads are opened.
-    pub fn finish(&self, mut head: Vec<bool>, options: &GrabcutOptions) -> Vec<bool> {
+    pub fn finish(&self, mut head: Vec<bool>) -> Vec<bool> {
         let clicked: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Head).collect();
         keep_with_seeds(&mut head, &clicked, self.width, self.height);
-        let mut smooth = self.smooth(head, options);
+        let mut smooth = self.smooth(head);
         // opening may part what a thread held together
         keep_with_seeds(&mut smooth, &clicked, self.width, self.height);
         smooth
     }
 
     /// Small holes are filled, threads are opened.
-    pub fn smooth(&self, mut head: Vec<bool>, options: &GrabcutOptions) -> Vec<bool> {
+    pub fn smooth(&self, mut head: Vec<bool>) -> Vec<bool> {
         let background: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Background).collect();
-        let largest = (options.hole * (self.width * self.height) as f64) as usize;
+        let largest = (HOLE * (self.width * self.height) as f64) as usize;
         fill_holes(&mut head, &background, self.width, self.height, largest);
         open(&head, self.width, self.height)
     }
 
     /// Share of the picture near the outline whose colour does not tell the sides apart.
-    pub fn ambiguous(&self, head: &[bool], models: &Models, options: &GrabcutOptions) -> f64 {
+    pub fn ambiguous(&self, head: &[bool], models: &Models) -> f64 {
         let (w, h) = (self.width, self.height);
-        let radius = options.band * h as f32;
+        let radius = OUTLINE * h as f32;
         let near = |side: bool| {
             let marked: Vec<bool> = head.iter().map(|&m| m == side).collect();
             super::distance::grow(&marked, w, h, radius)
@@ -244,7 +257,7 @@ impl Grabcut {
 }
 
 /// `γ exp(−β ‖Δ‖²) / distance` to the four neighbours ahead; 0 where there is none.
-fn edges(photo: &Photo, smoothness: f64) -> Vec<[i32; 4]> {
+fn edges(photo: &Photo) -> Vec<[i32; 4]> {
     let (w, h) = (photo.width as usize, photo.height as usize);
     let square = |i: usize, step: (usize, isize, isize)| -> Option<u32> {
         let (x, y) = ((i % w) as isize + step.1, (i / w) as isize + step.2);
@@ -269,7 +282,7 @@ fn edges(photo: &Photo, smoothness: f64) -> Vec<[i32; 4]> {
         .map(|i| {
             FORWARD.map(|step| {
                 let length = if step.1 != 0 && step.2 != 0 { std::f64::consts::SQRT_2 } else { 1.0 };
-                let weight = |d: u32| (UNIT * smoothness * (-beta * d as f64).exp() / length) as i32;
+                let weight = |d: u32| (UNIT * SMOOTHNESS * (-beta * d as f64).exp() / length) as i32;
                 square(i, step).map_or(0, weight)
             })
         })
@@ -318,7 +331,7 @@ mod tests {
     #[test]
     fn a_disc_of_two_colours_is_cut_out_among_lamps() {
         let (photo, truth) = head(1.0);
-        let cut = grabcut("a", &photo, &clicks(1.0), &GrabcutOptions::default()).unwrap();
+        let cut = grabcut("a", &photo, &clicks(1.0)).unwrap();
         assert!(overlap(&cut.mask, &truth) > 0.985, "{}", overlap(&cut.mask, &truth));
         assert!(cut.warnings.is_empty() && cut.ambiguous < 0.03, "{:?} {}", cut.warnings, cut.ambiguous);
     }
@@ -326,9 +339,7 @@ mod tests {
     #[test]
     fn a_large_photograph_is_cut_at_the_working_size() {
         let (photo, truth) = head(3.0);
-        let cut =
-            grabcut("a", &photo, &clicks(3.0), &GrabcutOptions { rows: 128, ..GrabcutOptions::default() })
-                .unwrap();
+        let cut = cut_at(128, "a", &photo, &clicks(3.0)).unwrap();
         assert_eq!((cut.mask.width, cut.mask.height), (96, 128));
         let large = super::super::scale::resize_hard(&cut.mask, (photo.width, photo.height));
         assert!(overlap(&large, &truth) > 0.97, "{}", overlap(&large, &truth));
@@ -337,11 +348,11 @@ mod tests {
     #[test]
     fn the_same_clicks_cut_the_same_mask_and_flat_pictures_do_not_fail() {
         let (photo, _) = head(1.0);
-        let run = || grabcut("a", &photo, &clicks(1.0), &GrabcutOptions::default());
+        let run = || grabcut("a", &photo, &clicks(1.0));
         assert_eq!(run(), run());
         let flat = Photo { rgb: vec![[9, 9, 9]; photo.rgb.len()], ..photo };
         // nothing tells head from background: whatever comes, it holds the clicks or says so
-        if let Ok(cut) = grabcut("a", &flat, &clicks(1.0), &GrabcutOptions::default()) {
+        if let Ok(cut) = grabcut("a", &flat, &clicks(1.0)) {
             assert!(cut.ambiguous > 0.0);
         }
     }
@@ -349,7 +360,7 @@ mod tests {
     #[test]
     fn photographs_of_one_row_or_of_nothing_are_refused_by_name() {
         let photo = Photo { width: 100, height: 1, rgb: vec![[0; 3]; 100], alpha: None };
-        let e = grabcut("a", &photo, &[Click { x: 1.0, y: 0.0, head: true }], &GrabcutOptions::default());
-        assert!(matches!(e, Err(CutError::TooSmall { width: 100, height: 1, .. })));
+        let e = grabcut("a", &photo, &[Click { x: 1.0, y: 0.0, head: true }]);
+        assert!(e.unwrap_err().to_string().contains("a photograph of 100 × 1 pixels is too small"));
     }
 }

@@ -3,18 +3,64 @@
 //! A mask votes for a cell when the cell's centre falls on the head, against it when it falls beside, and not at
 //! all outside its frame: there nothing was seen. A set of cells is drawn back into any view by its surface.
 
-use super::error::CutError;
 use crate::capture::carve::{Cube, Projector, meeting_point};
 use crate::geom::Camera;
 use crate::image::Gray;
+use crate::{Error, Result};
 use glam::DVec3;
 use rayon::prelude::*;
 
+/// The frame of a picture: which of its pixels shows a point.
+pub(super) struct ViewFrame {
+    projector: Projector,
+    pub width: usize,
+    pub height: usize,
+}
+
+impl ViewFrame {
+    /// The camera's whole picture.
+    pub fn new(camera: &Camera) -> ViewFrame {
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        ViewFrame { projector: Projector::new(camera), width, height }
+    }
+
+    /// The pixel that shows a point; `None` outside the frame.
+    fn pixel(&self, point: DVec3) -> Option<usize> {
+        let (x, y, _) = self.projector.project(point)?;
+        let inside = x >= 0.0 && y >= 0.0 && x < self.width as f64 && y < self.height as f64;
+        inside.then(|| y as usize * self.width + x as usize)
+    }
+}
+
+/// Lets every frame vote on every cell: `vote(values of the cell, which frame, its pixel there)`.
+///
+/// # Shapes
+///
+/// - output: `[n, n, n, values]` with x outermost
+pub(super) fn vote<T: Copy + Default + Send>(
+    cube: &Cube,
+    frames: &[&ViewFrame],
+    values: usize,
+    vote: impl Fn(&mut [T], usize, usize) + Sync,
+) -> Vec<T> {
+    let n = cube.n;
+    let slab = |x: usize| {
+        let mut slab = vec![T::default(); n * n * values];
+        for (k, frame) in frames.iter().enumerate() {
+            for (i, cell) in slab.chunks_exact_mut(values).enumerate() {
+                if let Some(pixel) = frame.pixel(cube.cell_center(x, i / n, i % n)) {
+                    vote(cell, k, pixel);
+                }
+            }
+        }
+        slab
+    };
+    (0..n).into_par_iter().map(slab).collect::<Vec<_>>().concat()
+}
+
 /// A hard mask with its camera.
 pub(super) struct Voter {
-    projector: Projector,
-    width: usize,
-    height: usize,
+    frame: ViewFrame,
     head: Vec<bool>,
 }
 
@@ -22,60 +68,34 @@ impl Voter {
     /// Takes a mask for the camera's whole picture, at whatever size it is; head from 128.
     pub fn new(camera: &Camera, mask: &Gray) -> Voter {
         Voter {
-            projector: Projector::new(&camera.resized(mask.width, mask.height)),
-            width: mask.width as usize,
-            height: mask.height as usize,
+            frame: ViewFrame::new(&camera.resized(mask.width, mask.height)),
             head: mask.values.iter().map(|&v| v > 127).collect(),
         }
     }
-
-    /// Is the point on the head? Nothing outside the frame.
-    fn says(&self, point: DVec3) -> Option<bool> {
-        let (x, y, _) = self.projector.project(point)?;
-        let inside = x >= 0.0 && y >= 0.0 && x < self.width as f64 && y < self.height as f64;
-        inside.then(|| self.head[y as usize * self.width + x as usize])
-    }
 }
 
-/// Votes about every cell, `[n, n, n]` with x outermost.
-pub(super) struct Votes {
-    pub yes: Vec<u16>,
-    pub no: Vec<u16>,
+/// How many masks vote against and for every cell: `[n, n, n]` with x outermost.
+pub(super) fn count(cube: &Cube, voters: &[Voter]) -> Vec<[u16; 2]> {
+    let frames: Vec<&ViewFrame> = voters.iter().map(|v| &v.frame).collect();
+    vote(cube, &frames, 1, |cell: &mut [[u16; 2]], k, pixel| cell[0][voters[k].head[pixel] as usize] += 1)
 }
 
-impl Votes {
-    /// Asks every voter about every cell.
-    pub fn count(cube: &Cube, voters: &[Voter]) -> Votes {
-        let n = cube.n;
-        let slabs: Vec<(Vec<u16>, Vec<u16>)> = (0..n)
-            .into_par_iter()
-            .map(|x| {
-                let (mut yes, mut no) = (vec![0u16; n * n], vec![0u16; n * n]);
-                for w in voters {
-                    for i in 0..n * n {
-                        match w.says(cube.cell_center(x, i / n, i % n)) {
-                            Some(true) => yes[i] += 1,
-                            Some(false) => no[i] += 1,
-                            None => {}
-                        }
-                    }
-                }
-                (yes, no)
-            })
-            .collect();
-        let (yes, no): (Vec<_>, Vec<_>) = slabs.into_iter().unzip();
-        Votes { yes: yes.concat(), no: no.concat() }
-    }
-
-    /// The cells with at most `no` votes against and at least `yes` for them.
-    pub fn cells(&self, no: usize, yes: usize) -> Vec<bool> {
-        self.yes.iter().zip(&self.no).map(|(&y, &n)| n as usize <= no && y as usize >= yes).collect()
-    }
+/// The cells with at most `most_negative` votes against and at least `least_positive` for them.
+pub(super) fn cells(votes: &[[u16; 2]], most_negative: usize, least_positive: usize) -> Vec<bool> {
+    votes.iter().map(|&[no, yes]| no as usize <= most_negative && yes as usize >= least_positive).collect()
 }
 
 /// The cube around the point the cameras look at, `margin` times as high as their frames are there.
-pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube, CutError> {
-    let alike = |how| CutError::CamerasAlike { cameras: cameras.len(), how };
+pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
+    let alike = |how: &str| {
+        Error::cannot(
+            format!(
+                "the {} cameras {how}, so clicks cannot be propagated from one view to another",
+                cameras.len()
+            ),
+            "click every view, or check that each frame has its own pose and cameras look from different sides",
+        )
+    };
     let axes: Vec<(DVec3, DVec3)> = cameras.iter().map(|c| (c.position, -c.rotation.z_axis)).collect();
     let center = meeting_point(&axes).ok_or_else(|| alike("look in one direction"))?;
     let reach = |c: &Camera| c.position.distance(center) * c.height as f64 / (2.0 * c.fy);
@@ -190,7 +210,7 @@ mod tests {
         // frames are 80 · 10 / 200 = 4 high at the middle
         assert!(cube.center.length() < 1e-9 && (cube.half - 3.0).abs() < 1e-9);
         let alike = super::cube(&cameras()[..1], 16, 1.5).unwrap_err();
-        assert!(matches!(alike, CutError::CamerasAlike { cameras: 1, .. }));
+        assert!(alike.to_string().starts_with("the 1 cameras "), "{alike}");
     }
 
     #[test]
@@ -198,16 +218,16 @@ mod tests {
         let cameras = cameras();
         let cube = cube(&cameras, 48, 1.0).unwrap();
         let voters: Vec<Voter> = cameras.iter().map(|c| Voter::new(c, &square(20))).collect();
-        let votes = Votes::count(&cube, &voters);
-        let cells = votes.cells(0, 2);
+        let votes = count(&cube, &voters);
+        let box_cells = cells(&votes, 0, 2);
         // a box of 2 units has 24 cells of 1/12 along each side; perspective moves its walls by a cell or two
-        let count = cells.iter().filter(|c| **c).count() as f64;
+        let count = box_cells.iter().filter(|c| **c).count() as f64;
         assert!((count.cbrt() - 24.0).abs() < 2.0, "{count}");
-        let drawn = silhouette(&cube, &cells, &cameras[0]);
+        let drawn = silhouette(&cube, &box_cells, &cameras[0]);
         let wrong = (drawn.iter().zip(&square(20).values)).filter(|(d, s)| **d != (**s == 255)).count();
         assert!(wrong < 2 * 4 * 40, "{wrong}"); // two pixels along the outline
         // one forgiven vote lets all cells in that one view keeps: two beams
-        assert!(votes.cells(1, 0).iter().filter(|c| **c).count() as f64 > 2.0 * count);
+        assert!(cells(&votes, 1, 0).iter().filter(|c| **c).count() as f64 > 2.0 * count);
     }
 
     #[test]

@@ -6,124 +6,61 @@
 //! ```
 //!
 //! The opacity is found at a working size, since the band of a photograph of 3000 × 4096 would hold millions of
-//! pixels and its outline is no sharper than the lens. Whoever has another way to find it (a matting network)
-//! takes [`Working`] and gives back its alphas.
+//! pixels and its outline is no sharper than the lens: by closed-form matting, or by a network of the caller's.
 
 pub mod closed_form;
 pub mod trimap;
 
 use self::closed_form::{ClosedFormOptions, closed_form};
-use self::trimap::{Band, HEAD, OUTSIDE, UNKNOWN, trimap, unknown_share};
+use self::trimap::{HEAD, OUTSIDE, UNKNOWN, UnknownBand, trimap, unknown_share};
 use super::scale::{enlarge, reduce_photo, resize_hard, working_size};
 use crate::image::{Gray, Photo};
+use crate::{Error, Result};
 
-/// Every constant on the way from a hard mask to an alpha.
+/// Alphas below become 0.
+const LOWEST: f32 = 0.02;
+/// Alphas above become 1.
+const HIGHEST: f32 = 0.98;
+/// A band that is a larger share of the picture is worth a warning.
+const MOST_UNKNOWN: f64 = 0.3;
+
+/// How a hard mask is made soft.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SoftenOptions {
     /// Longest side of the working picture at most, pixels.
     pub side: u32,
     /// Width of the unknown band.
-    pub band: Band,
-    /// How its opacity is found.
-    pub closed_form: ClosedFormOptions,
-    /// Alphas below become 0.
-    pub lowest: f32,
-    /// Alphas above become 1.
-    pub highest: f32,
-    /// A band that is a larger share of the picture is worth a warning.
-    pub most_unknown: f64,
+    pub band: UnknownBand,
 }
 
 impl Default for SoftenOptions {
     fn default() -> SoftenOptions {
-        SoftenOptions {
-            side: 1024,
-            band: Band::default(),
-            closed_form: ClosedFormOptions::default(),
-            lowest: 0.02,
-            highest: 0.98,
-            most_unknown: 0.3,
-        }
-    }
-}
-
-/// Why no alpha was made.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum AlphaError {
-    /// The mask is not one of this photograph.
-    #[error(
-        "the mask is {} × {} pixels, but its photograph is {} × {}",
-        mask.0, mask.1, photo.0, photo.1
-    )]
-    Size {
-        /// Width and height of the mask.
-        mask: (u32, u32),
-        /// Width and height of the photograph.
-        photo: (u32, u32),
-    },
-    /// An option makes no sense.
-    #[error("the matting option `{name}` is {found}; expected {expected}")]
-    Option {
-        /// Which.
-        name: &'static str,
-        /// Its value.
-        found: String,
-        /// What can be used.
-        expected: &'static str,
-    },
-}
-
-crate::error::error_from!(AlphaError, Cannot);
-
-impl AlphaError {
-    /// The way out.
-    pub fn hint(&self) -> String {
-        match self {
-            AlphaError::Size { .. } => {
-                "make the mask from this very photograph; it may be smaller, but of the same proportions"
-                    .into()
-            }
-            AlphaError::Option { expected, .. } => format!("choose {expected}"),
-        }
+        SoftenOptions { side: 1024, band: UnknownBand::default() }
     }
 }
 
 impl SoftenOptions {
     /// Names the first option that makes no sense.
-    pub fn check(&self) -> Result<(), AlphaError> {
-        let wrong = |name, found: String, expected| Err(AlphaError::Option { name, found, expected });
-        let share = |v: f32| (0.0..=1.0).contains(&v);
-        match self.band {
-            Band::Squares { kernel, iterations } if !(1..=1000).contains(&kernel) || iterations > 1000 => {
-                let found = format!("{kernel} × {kernel} ones, {iterations} times");
-                return wrong("band", found, "a kernel of 1 to 1000 pixels and up to 1000 iterations");
-            }
-            Band::Discs { share: s } if !share(s) => {
-                return wrong("band", s.to_string(), "a share of the height, 0 to 1");
-            }
-            _ => {}
-        }
+    fn check(&self) -> Result<()> {
+        let wrong = |name: &str, found: String, expected: &str| {
+            let message = format!("the matting option `{name}` is {found}; expected {expected}");
+            Err(Error::cannot(message, format!("choose {expected}")))
+        };
         if self.side < 16 {
             return wrong("side", self.side.to_string(), "at least 16 pixels");
         }
-        let positive = [
-            ("closed_form.epsilon", self.closed_form.epsilon),
-            ("closed_form.constraint_weight", self.closed_form.constraint_weight),
-            ("closed_form.tolerance", self.closed_form.tolerance),
-        ];
-        if let Some((name, value)) = positive.into_iter().find(|(_, v)| !(*v > 0.0 && v.is_finite())) {
-            return wrong(name, value.to_string(), "a positive number");
+        match self.band {
+            UnknownBand::Squares { kernel, iterations }
+                if !(1..=1000).contains(&kernel) || iterations > 1000 =>
+            {
+                let found = format!("{kernel} × {kernel} ones, {iterations} times");
+                wrong("band", found, "a kernel of 1 to 1000 pixels and up to 1000 iterations")
+            }
+            UnknownBand::Discs { share } if !(0.0..=1.0).contains(&share) => {
+                wrong("band", share.to_string(), "a share of the height, 0 to 1")
+            }
+            _ => Ok(()),
         }
-        let hold = self.closed_form.prior_weight;
-        if !(hold >= 0.0 && hold.is_finite()) {
-            return wrong("closed_form.prior_weight", hold.to_string(), "a number of at least 0");
-        }
-        if !(share(self.lowest) && share(self.highest) && self.lowest <= self.highest) {
-            let found = format!("{} to {}", self.lowest, self.highest);
-            return wrong("lowest and highest", found, "two numbers of 0 to 1, the lower first");
-        }
-        Ok(())
     }
 
     /// Bytes needed at most beside the photograph and the mask themselves, for one photograph of this size:
@@ -135,107 +72,108 @@ impl SoftenOptions {
     }
 }
 
-/// A photograph at the size it is worked on, with its hard mask and the band between.
-#[derive(Clone, Debug)]
-pub struct Working {
-    /// The photograph, reduced.
-    pub photo: Photo,
-    /// Its hard mask: 0 or 255.
-    pub mask: Gray,
-    /// Its trimap: 0, 128, 255.
-    pub trimap: Gray,
-    /// Width and height of the photograph itself.
-    pub size: (u32, u32),
-}
-
-impl Working {
-    /// Reduces a photograph, brings its mask (head where it is 128 or more; of any size with the photograph's
-    /// proportions, since cuts are made smaller still) to the same size and finds the band.
-    pub fn new(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Working, AlphaError> {
-        options.check()?;
-        let size = (photo.width, photo.height);
-        let working = working_size(photo.width, photo.height, options.side);
-        let given = (mask.width, mask.height);
-        // sides of w s and h s, each rounded by up to half a pixel
-        let across = |a: u32, b: u32| a as u64 * b as u64;
-        let apart = across(given.0, size.1).abs_diff(across(given.1, size.0));
-        if given.0 == 0 || given.1 == 0 || apart > size.0.max(size.1) as u64 {
-            return Err(AlphaError::Size { mask: given, photo: size });
-        }
-        let mask = resize_hard(mask, working);
-        let trimap = trimap(&mask, options.band);
-        Ok(Working { photo: reduce_photo(photo, working), mask, trimap, size })
-    }
-
-    /// Brings alphas of the working size to the photograph's, as 8 bit.
-    pub fn finish(&self, alpha: &[f32], options: &SoftenOptions) -> Gray {
-        let working = (self.photo.width, self.photo.height);
-        enlarge(alpha, working, self.size, options.lowest, options.highest)
-    }
-
-    /// What a person should know about the band, whoever finds its opacity.
-    pub fn warnings(&self, options: &SoftenOptions) -> Vec<String> {
-        let mut warnings = Vec::new();
-        let band = unknown_share(&self.trimap);
-        if band > options.most_unknown {
-            warnings.push(format!(
-                "{:.0} % of the picture are unknown: the mask is ragged or full of holes; a click on what it missed helps",
-                100.0 * band
-            ));
-        }
-        if band > 0.0 && !self.trimap.values.contains(&HEAD) {
-            warnings.push("no pixel is definitely head: the mask is thinner than the unknown band".into());
-        }
-        if band > 0.0 && !self.trimap.values.contains(&OUTSIDE) {
-            warnings
-                .push("no pixel is definitely outside: the mask leaves less than the unknown band".into());
-        }
-        warnings
-    }
-}
-
 /// A soft alpha, and what was unknown.
-#[derive(Clone, Debug)]
-pub struct Softened {
+#[derive(Clone, Debug, PartialEq)]
+pub struct SoftMask {
     /// At the photograph's size.
     pub alpha: Gray,
     /// At the working size: 0, 128, 255.
     pub trimap: Gray,
-    /// Share of the picture that was unknown.
-    pub band_share: f64,
     /// What a person should know, one sentence each.
     pub warnings: Vec<String>,
 }
 
-/// The soft alpha of a photograph from its hard mask, which has the photograph's proportions. Where closed-form
-/// matting finds no solution the band stays hard, with a warning.
-pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Softened, AlphaError> {
-    let working = Working::new(photo, mask, options)?;
-    let mut warnings = working.warnings(options);
-    let Working { photo, mask, trimap, .. } = &working;
-    let hard = || mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect();
-    let sides_known = trimap.values.contains(&HEAD) && trimap.values.contains(&OUTSIDE);
-    let alpha = if !sides_known && trimap.values.contains(&UNKNOWN) {
-        // tied to one side only, everything would become that side
-        hard()
-    } else {
-        closed_form(photo, mask, trimap, &options.closed_form).map_or_else(
-            |why| {
-                warnings.push(format!("closed-form matting found no alpha, so the mask stays hard: {why}"));
-                hard()
-            },
-            |matte| matte.alpha,
-        )
+/// Returns the soft alpha of a photograph from its hard mask (head where it is 128 or more), which may be smaller but
+/// has the photograph's proportions. Where closed-form matting finds no solution the band stays hard, with a warning.
+///
+/// # Errors
+/// When the mask has other proportions than the photograph, or an option makes no sense.
+pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<SoftMask> {
+    soften_with(photo, mask, options, |_, _| Ok(None))
+}
+
+/// [`soften`] with another way to find the opacity: `network` takes the working photograph and its trimap, and returns an
+/// alpha of each pixel or `None` to leave it to closed-form matting. What is definite in the trimap stays.
+pub fn soften_with(
+    photo: &Photo,
+    mask: &Gray,
+    options: &SoftenOptions,
+    network: impl FnOnce(&Photo, &Gray) -> Result<Option<Vec<f32>>>,
+) -> Result<SoftMask> {
+    options.check()?;
+    let size = (photo.width, photo.height);
+    let working = working_size(photo.width, photo.height, options.side);
+    // sides of w s and h s, each rounded by up to half a pixel
+    let across = |a: u32, b: u32| a as u64 * b as u64;
+    let apart = across(mask.width, size.1).abs_diff(across(mask.height, size.0));
+    if mask.width == 0 || mask.height == 0 || apart > size.0.max(size.1) as u64 {
+        let (w, h) = (mask.width, mask.height);
+        return Err(Error::cannot(
+            format!("the mask is {w} × {h} pixels, but its photograph is {} × {}", size.0, size.1),
+            "make the mask from this very photograph; it may be smaller, but of the same proportions",
+        ));
+    }
+    let (photo, mask) = (reduce_photo(photo, working), resize_hard(mask, working));
+    let trimap = trimap(&mask, options.band);
+    let mut warnings = band_warnings(&trimap);
+    let alpha = match network(&photo, &trimap)? {
+        Some(mut alpha) => {
+            // the network takes the trimap for a hint
+            for (a, &t) in alpha.iter_mut().zip(&trimap.values).filter(|(_, t)| **t != UNKNOWN) {
+                *a = if t == HEAD { 1.0 } else { 0.0 };
+            }
+            alpha
+        }
+        None => solved(&photo, &mask, &trimap, &ClosedFormOptions::default(), &mut warnings),
     };
-    let alpha = working.finish(&alpha, options);
-    let band_share = unknown_share(trimap);
-    Ok(Softened { alpha, trimap: working.trimap, band_share, warnings })
+    let alpha = enlarge(&alpha, working, size, LOWEST, HIGHEST);
+    Ok(SoftMask { alpha, trimap, warnings })
+}
+
+/// The alpha by closed-form matting, else the hard mask.
+fn solved(
+    photo: &Photo,
+    mask: &Gray,
+    trimap: &Gray,
+    options: &ClosedFormOptions,
+    warnings: &mut Vec<String>,
+) -> Vec<f32> {
+    let has = |value: u8| trimap.values.contains(&value);
+    // tied to one side only, everything would become that side
+    if !has(UNKNOWN) || (has(HEAD) && has(OUTSIDE)) {
+        match closed_form(photo, mask, trimap, options) {
+            Ok(matte) => return matte.alpha,
+            Err(why) => {
+                warnings.push(format!("closed-form matting found no alpha, so the mask stays hard: {why}"));
+            }
+        }
+    }
+    mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect()
+}
+
+/// What a person should know about the band, whoever finds its opacity.
+fn band_warnings(trimap: &Gray) -> Vec<String> {
+    let mut warnings = Vec::new();
+    let band = unknown_share(trimap);
+    if band > MOST_UNKNOWN {
+        warnings.push(format!(
+            "{:.0} % of the picture are unknown: the mask is ragged or full of holes; a click on what it missed helps",
+            100.0 * band
+        ));
+    }
+    if band > 0.0 && !trimap.values.contains(&HEAD) {
+        warnings.push("no pixel is definitely head: the mask is thinner than the unknown band".into());
+    }
+    if band > 0.0 && !trimap.values.contains(&OUTSIDE) {
+        warnings.push("no pixel is definitely outside: the mask leaves less than the unknown band".into());
+    }
+    warnings
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::distance;
-    use super::super::scale::reduce_gray;
+    use super::super::scale::resize_gray;
     use super::*;
     use crate::io::{Limits, read_gray, read_photo};
 
@@ -273,7 +211,7 @@ mod tests {
         let (before, after) = (error(&mask.values, &truth), error(&soft.alpha.values, &truth));
         assert!(after < 0.02 * before, "{after:.2e} of {before:.2e}");
         // discs of 4.6 pixels each way around a circle of 2π · 60: about 3470 of 32000 pixels
-        assert!((0.09..0.13).contains(&soft.band_share), "{}", soft.band_share);
+        assert!((0.09..0.13).contains(&unknown_share(&soft.trimap)), "{}", unknown_share(&soft.trimap));
     }
 
     #[test]
@@ -287,9 +225,9 @@ mod tests {
             (error(&hard(&truth, 320, 400).values, &truth), error(&full.alpha.values, &truth));
         assert!(after < 0.1 * before, "{after:.2e} of {before:.2e}");
         // a mask that has the working size already is taken as it is; a smaller one is brought to it
-        let small = soften(&photo, &reduce_gray(&hard(&truth, 320, 400), (160, 200)), &options).unwrap();
+        let small = soften(&photo, &resize_gray(&hard(&truth, 320, 400), (160, 200)), &options).unwrap();
         assert_eq!(full.alpha, small.alpha);
-        let tiny = soften(&photo, &reduce_gray(&hard(&truth, 320, 400), (53, 67)), &options).unwrap();
+        let tiny = soften(&photo, &resize_gray(&hard(&truth, 320, 400), (53, 67)), &options).unwrap();
         assert!(error(&tiny.alpha.values, &truth) < 0.1 * before);
     }
 
@@ -297,11 +235,11 @@ mod tests {
     fn without_rounds_the_mask_stays_hard_and_says_so() {
         let (photo, truth) = disc(80, 100);
         let mask = hard(&truth, 80, 100);
-        let mut options = SoftenOptions::default();
-        options.closed_form.rounds = 0;
-        let soft = soften(&photo, &mask, &options).unwrap();
-        assert_eq!(soft.alpha, mask);
-        assert!(soft.warnings[0].contains("stays hard") && soft.warnings.len() == 1, "{:?}", soft.warnings);
+        let options = ClosedFormOptions { rounds: 0, ..ClosedFormOptions::default() };
+        let mut warnings = Vec::new();
+        let alpha = solved(&photo, &mask, &trimap(&mask, UnknownBand::default()), &options, &mut warnings);
+        assert!(alpha.iter().zip(&mask.values).all(|(a, &m)| *a == m as f32 / 255.0));
+        assert!(warnings[0].contains("stays hard") && warnings.len() == 1, "{warnings:?}");
     }
 
     #[test]
@@ -311,7 +249,7 @@ mod tests {
         let options = SoftenOptions::default();
         for value in [0, 255] {
             let soft = soften(&photo, &gray(vec![value; 64 * 80]), &options).unwrap();
-            assert!(soft.alpha.values.iter().all(|&a| a == value) && soft.band_share == 0.0);
+            assert!(soft.alpha.values.iter().all(|&a| a == value) && unknown_share(&soft.trimap) == 0.0);
         }
         // a line one pixel wide is all band: it stays as it is, where a tie to one side would lose it
         let line = gray((0..64 * 80).map(|i| if i % 64 == 30 { 255 } else { 0 }).collect());
@@ -330,16 +268,8 @@ mod tests {
         let options = SoftenOptions::default();
         for (options, name) in [
             (SoftenOptions { side: 0, ..options }, "side"),
-            (SoftenOptions { band: Band::Discs { share: f32::NAN }, ..options }, "band"),
-            (SoftenOptions { band: Band::Squares { kernel: 0, iterations: 1 }, ..options }, "band"),
-            (SoftenOptions { lowest: 0.9, highest: 0.1, ..options }, "lowest"),
-            (
-                SoftenOptions {
-                    closed_form: ClosedFormOptions { epsilon: 0.0, ..options.closed_form },
-                    ..options
-                },
-                "closed_form.epsilon",
-            ),
+            (SoftenOptions { band: UnknownBand::Discs { share: f32::NAN }, ..options }, "band"),
+            (SoftenOptions { band: UnknownBand::Squares { kernel: 0, iterations: 1 }, ..options }, "band"),
         ] {
             let error = soften(&photo, &mask, &options).unwrap_err();
             assert!(error.to_string().contains(name) && error.hint().starts_with("choose"), "{error}");
@@ -347,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn three_megapixels_of_a_light_stage_need_less_than_two_gigabytes() {
+    fn twelve_megapixels_need_less_than_two_gigabytes() {
         // 3000 × 4096 alphas, and 335 bytes for each of 750 × 1024 pixels: 270 MB
         let bytes = SoftenOptions::default().memory_bytes(3000, 4096);
         assert_eq!(bytes, 3000 * 4096 + 335 * 750 * 1024);

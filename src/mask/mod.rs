@@ -12,7 +12,6 @@
 mod click;
 mod components;
 pub mod distance;
-mod error;
 mod hull;
 pub mod scale;
 
@@ -29,8 +28,10 @@ pub mod consistency;
 pub mod matting;
 #[cfg(feature = "matting")]
 pub mod networks;
+#[cfg(not(feature = "matting"))]
+#[path = "no_networks.rs"]
+pub mod networks;
 
 pub mod sheet;
 
 pub use click::Click;
-pub use error::CutError;

@@ -11,8 +11,9 @@
 
 use super::click::Click;
 use crate::capture::{Capture, View};
-use crate::io::{self, Limits, ReadError, WriteError};
-use serde_json::{Map, Number, Value, json};
+use crate::io::{self, Limits};
+use crate::{Error, Result};
+use serde_json::{Number, Value, json};
 use std::path::{Component, Path};
 
 /// What the writer puts into `convention`.
@@ -25,85 +26,51 @@ const LONGEST_NAME: usize = 4096;
 /// Hundred thousand views with ten points each stay below this.
 const MOST_BYTES: u64 = 64 << 20;
 
+/// The suggested fix for a file of another shape.
+const SHAPE: &str = "write `{\"frames\": [{\"file_path\": …, \"points\": [{\"x\": …, \"y\": …, \"label\": 1}]}]}`, or \
+                     click anew on the page that `tiface mask CAPTURE --page` writes";
+
 /// The clicks of a `prompts.json`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Prompts {
     /// Photographs, in the file's order; none twice.
-    pub frames: Vec<Frame>,
+    pub frames: Vec<PhotoPrompts>,
 }
 
 /// The clicks on one photograph.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Frame {
+pub struct PhotoPrompts {
     /// The photograph below the capture, with `/` between folders, with or without its ending.
     pub file_path: String,
     /// Its clicks, in the order they were made.
     pub points: Vec<Click>,
 }
 
-/// What is wrong with a file of clicks.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum PromptsError {
-    /// It could not be read.
-    #[error(transparent)]
-    Read(#[from] ReadError),
-    /// It could not be written.
-    #[error(transparent)]
-    Write(#[from] WriteError),
-    /// Something in it makes no sense.
-    #[error("`{file}`, {place}: {problem}")]
-    Content {
-        /// The file.
-        file: String,
-        /// Where in it: `frames[2].points[0].x`.
-        place: String,
-        /// What is wrong, and what was expected.
-        problem: String,
-        /// The way out.
-        hint: String,
-    },
-    /// A point of the command line makes no sense.
-    #[error("the point `{text}`: {problem}")]
-    Point {
-        /// As written.
-        text: String,
-        /// What is wrong.
-        problem: String,
-    },
-}
-
-crate::error::error_from!(PromptsError, Cannot);
-
-impl PromptsError {
-    /// The way out.
-    pub fn hint(&self) -> String {
-        match self {
-            PromptsError::Read(e) => e.hint(),
-            PromptsError::Write(e) => e.hint(),
-            PromptsError::Content { hint, .. } => hint.clone(),
-            PromptsError::Point { .. } => {
-                "write column, row and label: `181,288,1` for the head, `32,51,0` for what is not".into()
-            }
-        }
-    }
-}
-
 /// Reads a `prompts.json`.
-pub fn read_prompts(path: &Path, limits: &Limits) -> Result<Prompts, PromptsError> {
-    let limits = Limits { json_bytes: limits.json_bytes.min(MOST_BYTES), ..limits.clone() };
-    parse(&path.to_string_lossy(), &io::read_json(path, &limits)?, &limits)
+///
+/// # Errors
+/// When the file cannot be read or something in it makes no sense; the message names the file and the place in it.
+pub fn read_prompts(path: &Path, limits: &Limits) -> Result<Prompts> {
+    parse(path, &io::read_json(path, &at_most(limits))?, limits)
 }
 
 /// [`read_prompts`] on bytes; `path` is only for messages.
-pub fn parse_prompts(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Prompts, PromptsError> {
-    let limits = Limits { json_bytes: limits.json_bytes.min(MOST_BYTES), ..limits.clone() };
-    parse(&path.to_string_lossy(), &io::parse_json(path, bytes, &limits)?, &limits)
+pub fn parse_prompts(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Prompts> {
+    parse(path, &io::parse_json(path, bytes, &at_most(limits))?, limits)
+}
+
+fn at_most(limits: &Limits) -> Limits {
+    Limits { json_bytes: limits.json_bytes.min(MOST_BYTES), ..limits.clone() }
 }
 
 /// One click as written on a command line: `x,y,label`.
-pub fn parse_point(text: &str) -> Result<Click, PromptsError> {
-    let wrong = |problem: String| PromptsError::Point { text: shown(text), problem };
+pub fn parse_point(text: &str) -> Result<Click> {
+    let wrong = |problem: String| {
+        Error::cannot(
+            format!("the point `{}`: {problem}", shown(text)),
+            "write column, row and label: `181,288,1` for the head, `32,51,0` for what is not",
+        )
+    };
     let parts: Vec<&str> = text.split(',').map(str::trim).collect();
     let [x, y, label] = parts[..] else {
         return Err(wrong(format!("expected three values `x,y,label`, found {}", parts.len())));
@@ -111,7 +78,7 @@ pub fn parse_point(text: &str) -> Result<Click, PromptsError> {
     let number = |name: &str, text: &str| {
         let value = text.parse::<f64>().ok().filter(|v| v.is_finite());
         let value = value.ok_or_else(|| wrong(format!("{name} is `{}`, not a number", shown(text))))?;
-        within(value).map_err(|problem| wrong(format!("{name} {problem}")))
+        coordinate(value).map_err(|problem| wrong(format!("{name} {problem}")))
     };
     let head = match label {
         "1" => true,
@@ -122,11 +89,11 @@ pub fn parse_point(text: &str) -> Result<Click, PromptsError> {
 }
 
 /// A coordinate that some photograph may have.
-fn within(value: f64) -> Result<f32, String> {
-    if (-0.5..1e6).contains(&value) {
-        return Ok(value as f32);
+fn coordinate(value: f64) -> Result<f32, String> {
+    match (-0.5..1e6).contains(&value) {
+        true => Ok(value as f32),
+        false => Err(format!("is {value}, outside every photograph")),
     }
-    Err(format!("is {value}, outside every photograph"))
 }
 
 /// A text from a stranger, for a message: short and on one line.
@@ -137,97 +104,84 @@ fn shown(text: &str) -> String {
 }
 
 /// A JSON value of the wrong kind, for a message.
-fn kind(value: &Value) -> String {
+fn kind(value: Option<&Value>, none: &str) -> String {
     match value {
-        Value::Array(_) => "a list".into(),
-        Value::Object(_) => "an object".into(),
-        Value::String(s) => format!("the text `{}`", shown(s)),
-        other => other.to_string(),
+        None => none.into(),
+        Some(Value::Array(_)) => "a list".into(),
+        Some(Value::Object(_)) => "an object".into(),
+        Some(Value::String(s)) => format!("the text `{}`", shown(s)),
+        Some(other) => other.to_string(),
     }
 }
 
-fn parse(file: &str, value: &Value, limits: &Limits) -> Result<Prompts, PromptsError> {
-    let content = |place: &str, problem: String, hint: &str| PromptsError::Content {
-        file: file.into(),
-        place: place.into(),
-        problem,
-        hint: hint.into(),
-    };
-    let wrong = |place: &str, problem, hint: &str| Err(content(place, problem, hint));
-    let shape = "write `{\"frames\": [{\"file_path\": …, \"points\": [{\"x\": …, \"y\": …, \"label\": 1}]}]}`, or \
-                 click anew on the page that `tiface mask CAPTURE --page` writes";
+/// What is wrong at a place of a file.
+fn wrong(file: &str, place: &str, problem: String, hint: &str) -> Error {
+    Error::cannot(format!("`{file}`, {place}: {problem}"), hint)
+}
+
+fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
+    let file = path.to_string_lossy();
+    let wrong = |place: &str, problem, hint: &str| wrong(&file, place, problem, hint);
     let Some(frames) = value.get("frames") else {
-        let found = if value.is_object() { "it has none".into() } else { format!("it is {}", kind(value)) };
-        return wrong("at the top", format!("expected an object with a list `frames`, but {found}"), shape);
+        let found =
+            if value.is_object() { "it has none".into() } else { format!("it is {}", kind(Some(value), "")) };
+        let problem = format!("expected an object with a list `frames`, but {found}");
+        return Err(wrong("at the top", problem, SHAPE));
     };
-    let Some(frames) = frames.as_array() else {
-        return wrong("`frames`", format!("expected a list, found {}", kind(frames)), shape);
-    };
+    let problem = || format!("expected a list, found {}", kind(Some(frames), ""));
+    let frames = frames.as_array().ok_or_else(|| wrong("`frames`", problem(), SHAPE))?;
     if frames.is_empty() {
-        return wrong("`frames`", "it is empty: nothing was clicked on".into(), shape);
+        return Err(wrong("`frames`", "it is empty: nothing was clicked on".into(), SHAPE));
     }
     if frames.len() > limits.views {
         let problem = format!("it has {} entries, the limit is {}", frames.len(), limits.views);
-        return wrong("`frames`", problem, "keep the photographs that were clicked on");
+        return Err(wrong("`frames`", problem, "keep the photographs that were clicked on"));
     }
     let mut prompts = Prompts::default();
     let mut seen = std::collections::HashMap::new();
     for (i, entry) in frames.iter().enumerate() {
         let place = format!("`frames[{i}]`");
-        let Some(name) = entry.get("file_path").and_then(Value::as_str) else {
-            let found = entry.get("file_path").map_or("nothing".into(), kind);
-            return wrong(&place, format!("expected a text `file_path`, found {found}"), shape);
+        let missing = |what: &str, key: &str| {
+            let problem = format!("expected {what} `{key}`, found {}", kind(entry.get(key), "nothing"));
+            wrong(&place, problem, SHAPE)
         };
-        let file_path = match below(name) {
-            Ok(path) => path,
-            Err(why) => {
-                let problem = format!("its `file_path` `{}` {why}", shown(name));
-                return wrong(
-                    &place,
-                    problem,
-                    "name the photograph as the camera file does: `images/010.png`",
-                );
-            }
-        };
+        let name = entry.get("file_path").and_then(Value::as_str);
+        let name = name.ok_or_else(|| missing("a text", "file_path"))?;
+        let file_path = below(name).map_err(|why| {
+            let problem = format!("its `file_path` `{}` {why}", shown(name));
+            wrong(&place, problem, "name the photograph as the camera file does: `images/010.png`")
+        })?;
         if let Some(first) = seen.insert(file_path.clone(), i) {
             let problem = format!("`{}` was clicked on in `frames[{first}]` already", shown(&file_path));
-            return wrong(&place, problem, "put all points of a photograph into one frame");
+            return Err(wrong(&place, problem, "put all points of a photograph into one frame"));
         }
-        let Some(points) = entry.get("points").and_then(Value::as_array) else {
-            let found = entry.get("points").map_or("nothing".into(), kind);
-            return wrong(&place, format!("expected a list `points`, found {found}"), shape);
-        };
+        let points = entry.get("points").and_then(Value::as_array);
+        let points = points.ok_or_else(|| missing("a list", "points"))?;
         if points.len() > MOST_POINTS {
             let problem = format!("it has {} points, the limit is {MOST_POINTS}", points.len());
-            return wrong(&place, problem, "a dozen clicks are enough");
+            return Err(wrong(&place, problem, "a dozen clicks are enough"));
         }
-        let mut clicks = Vec::with_capacity(points.len());
-        for (j, point) in points.iter().enumerate() {
-            let inside = |key: &str| format!("`frames[{i}].points[{j}]{key}`");
-            let number = |key: &str| -> Result<f32, PromptsError> {
-                let found = point.get(key);
-                let value = match found.and_then(Value::as_f64) {
-                    Some(v) => within(v),
-                    None => Err(format!("is {}, not a number", found.map_or("missing".into(), kind))),
+        let click = |(j, point): (usize, &Value)| -> Result<Click> {
+            let wrong = |key: &str, problem: String| {
+                let place = format!("`frames[{i}].points[{j}].{key}`");
+                wrong(&place, format!("it {problem}"), "correct that point, or remove it")
+            };
+            let found = |key: &str| kind(point.get(key), "missing");
+            let number = |key: &str| {
+                let value = match point.get(key).and_then(Value::as_f64) {
+                    Some(v) => coordinate(v),
+                    None => Err(format!("is {}, not a number", found(key))),
                 };
-                let place = inside(&format!(".{key}"));
-                value.map_err(|problem| {
-                    content(&place, format!("it {problem}"), "correct that point, or remove it")
-                })
+                value.map_err(|problem| wrong(key, problem))
             };
             let (x, y) = (number("x")?, number("y")?);
-            let head = match point.get("label").map(|v| (v.as_f64(), v)) {
-                Some((Some(1.0), _)) => true,
-                Some((Some(0.0), _)) => false,
-                found => {
-                    let found = found.map_or("missing".into(), |(_, v)| kind(v));
-                    let problem = format!("it is {found}; known are 1 (head) and 0 (not head)");
-                    return wrong(&inside(".label"), problem, "correct that point, or remove it");
-                }
-            };
-            clicks.push(Click { x, y, head });
-        }
-        prompts.frames.push(Frame { file_path, points: clicks });
+            let label = point.get("label").and_then(Value::as_f64).filter(|l| [0.0, 1.0].contains(l));
+            let problem = || format!("is {}; known are 1 (head) and 0 (not head)", found("label"));
+            let label = label.ok_or_else(|| wrong("label", problem()))?;
+            Ok(Click { x, y, head: label == 1.0 })
+        };
+        let points = points.iter().enumerate().map(click).collect::<Result<_>>()?;
+        prompts.frames.push(PhotoPrompts { file_path, points });
     }
     Ok(prompts)
 }
@@ -298,9 +252,12 @@ impl Photographed<'_> {
 
 impl Prompts {
     /// The clicks of each view of a capture, parallel to its `views`, in pixel indices of its camera's picture;
-    /// none where nothing was clicked. `file` is for messages. Errors: a photograph that is no view, two names of one
-    /// view, a point beside the photograph, a view without any click on the head.
-    pub fn clicks(&self, file: &str, capture: &Capture) -> Result<Vec<Vec<Click>>, PromptsError> {
+    /// none where nothing was clicked. `file` is for messages.
+    ///
+    /// # Errors
+    /// For a photograph that is no view, two names of one view, a point beside the photograph, a view without any click
+    /// on the head.
+    pub fn clicks(&self, file: &str, capture: &Capture) -> Result<Vec<Vec<Click>>> {
         let of = |view| Photographed {
             path: file_path(capture, view),
             name: &view.name,
@@ -311,55 +268,49 @@ impl Prompts {
         self.of_photographs(file, &capture.views.iter().map(of).collect::<Vec<_>>())
     }
 
-    fn of_photographs(&self, file: &str, photos: &[Photographed]) -> Result<Vec<Vec<Click>>, PromptsError> {
+    fn of_photographs(&self, file: &str, photos: &[Photographed]) -> Result<Vec<Vec<Click>>> {
         let mut clicks = vec![Vec::new(); photos.len()];
         let mut by = vec![None; photos.len()];
         for (i, frame) in self.frames.iter().enumerate() {
-            let wrong = |place: String, problem: String, hint: String| {
-                Err(PromptsError::Content { file: file.into(), place, problem, hint })
-            };
             let place = format!("`frames[{i}]`");
             let name = shown(&frame.file_path);
             let exact = photos.iter().position(|p| p.path == frame.file_path);
-            let Some(view) = exact.or_else(|| photos.iter().position(|p| p.is_called(&frame.file_path)))
-            else {
-                let first =
+            let called = || photos.iter().position(|p| p.is_called(&frame.file_path));
+            let view = exact.or_else(called).ok_or_else(|| {
+                let such =
                     photos.first().map_or(String::new(), |p| format!(", such as `{}`", shown(&p.path)));
-                let problem = format!("`{name}` is no photograph of this capture");
-                return wrong(place, problem, format!("name one of its {} photographs{first}", photos.len()));
-            };
+                let hint = format!("name one of its {} photographs{such}", photos.len());
+                wrong(file, &place, format!("`{name}` is no photograph of this capture"), &hint)
+            })?;
             if let Some(first) = by[view].replace(i) {
                 let problem = format!("`{name}` is the photograph of `frames[{first}]`");
-                return wrong(place, problem, "put all points of a photograph into one frame".into());
-            }
-            if frame.points.is_empty() {
-                continue;
+                return Err(wrong(file, &place, problem, "put all points of a photograph into one frame"));
             }
             let photo = &photos[view];
             let (w, h) = photo.size;
-            for (j, click) in frame.points.iter().enumerate() {
-                let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;
-                if !(inside(click.x, w) && inside(click.y, h)) {
-                    let problem = format!(
-                        "({}, {}) lies outside `{name}`, which is {w} × {h} pixels",
-                        click.x, click.y
-                    );
-                    let hint =
-                        "click on the full-size photograph: x from 0 to width − 1, y from 0 to height − 1";
-                    return wrong(format!("`frames[{i}].points[{j}]`"), problem, hint.into());
-                }
-                // pixel i of the reduced picture averages pixels d i to d i + d − 1; what fills no block is dropped
-                let scaled = |v: f32, side: u32| {
-                    let d = photo.downscale.max(1) as f32;
-                    ((v + 0.5) / d - 0.5).min(side as f32 - 1.0)
-                };
-                let (x, y) = (scaled(click.x, photo.reduced.0), scaled(click.y, photo.reduced.1));
-                clicks[view].push(Click { x, y, ..*click });
+            let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;
+            if let Some(j) = frame.points.iter().position(|c| !(inside(c.x, w) && inside(c.y, h))) {
+                let Click { x, y, .. } = frame.points[j];
+                let place = format!("`frames[{i}].points[{j}]`");
+                let problem = format!("({x}, {y}) lies outside `{name}`, which is {w} × {h} pixels");
+                let hint = "click on the full-size photograph: x from 0 to width − 1, y from 0 to height − 1";
+                return Err(wrong(file, &place, problem, hint));
             }
-            if !frame.points.iter().any(|p| p.head) {
+            if !frame.points.is_empty() && !frame.points.iter().any(|p| p.head) {
                 let problem = format!("no point of `{name}` is on the head (label 1)");
-                return wrong(place, problem, "add a click on face and hair, or remove the frame".into());
+                return Err(wrong(
+                    file,
+                    &place,
+                    problem,
+                    "add a click on face and hair, or remove the frame",
+                ));
             }
+            // pixel i of the reduced picture averages pixels d i to d i + d − 1; what fills no block is dropped
+            let d = photo.downscale.max(1) as f32;
+            let scaled = |v: f32, side: u32| ((v + 0.5) / d - 0.5).min(side as f32 - 1.0);
+            let (rw, rh) = photo.reduced;
+            let reduced = |c: &Click| Click { x: scaled(c.x, rw), y: scaled(c.y, rh), ..*c };
+            clicks[view] = frame.points.iter().map(reduced).collect();
         }
         Ok(clicks)
     }
@@ -370,14 +321,8 @@ impl Prompts {
             true => Some(Number::from(v as i64)),
             false => Number::from_f64(v as f64),
         };
-        let point = |click: &Click| {
-            let mut point = Map::new();
-            point.insert("x".into(), number(click.x).map_or(Value::Null, Value::Number));
-            point.insert("y".into(), number(click.y).map_or(Value::Null, Value::Number));
-            point.insert("label".into(), json!(click.head as u8));
-            Value::Object(point)
-        };
-        let frame = |frame: &Frame| {
+        let point = |c: &Click| json!({"x": number(c.x), "y": number(c.y), "label": c.head as u8});
+        let frame = |frame: &PhotoPrompts| {
             let points: Vec<Value> = frame.points.iter().map(point).collect();
             json!({"file_path": frame.file_path, "points": points})
         };
@@ -385,7 +330,7 @@ impl Prompts {
     }
 
     /// Writes a `prompts.json`.
-    pub fn write(&self, path: &Path) -> Result<(), PromptsError> {
+    pub fn write(&self, path: &Path) -> Result<()> {
         let text = format!("{:#}\n", self.to_json());
         Ok(io::write_atomic(path, text.as_bytes())?)
     }
@@ -395,7 +340,7 @@ impl Prompts {
 mod tests {
     use super::*;
 
-    fn parsed(text: &str) -> Result<Prompts, PromptsError> {
+    fn parsed(text: &str) -> Result<Prompts> {
         parse_prompts(Path::new("p.json"), text.as_bytes(), &Limits::default())
     }
 
@@ -425,7 +370,8 @@ mod tests {
         let path = dir.path().join("prompts.json");
         let click = |x, y, head| Click { x, y, head };
         let points = vec![click(181.0, 288.0, true), click(0.5, 51.25, false)];
-        let prompts = Prompts { frames: vec![Frame { file_path: "images/a </script>.png".into(), points }] };
+        let prompts =
+            Prompts { frames: vec![PhotoPrompts { file_path: "images/a </script>.png".into(), points }] };
         prompts.write(&path).unwrap();
         assert_eq!(read_prompts(&path, &Limits::default()).unwrap(), prompts);
         let text = std::fs::read_to_string(&path).unwrap();
@@ -486,11 +432,12 @@ mod tests {
         let error = parse_prompts(Path::new("p.json"), two.as_bytes(), &few).unwrap_err();
         assert!(error.to_string().contains("2 entries, the limit is 1"), "{error}");
         for text in [one("a", r#"[{"x": NaN}]"#), one("a", r#"[{"x": 1e999}]"#), "{".into(), String::new()] {
-            assert!(matches!(parsed(&text), Err(PromptsError::Read(_))), "{text}");
+            let error = parsed(&text).unwrap_err();
+            assert!(error.to_string().contains("p.json") && !error.hint().is_empty(), "{text}: {error}");
         }
         let tight = Limits { json_bytes: 10, ..Limits::default() };
         let error = parse_prompts(Path::new("p.json"), one("a", POINT).as_bytes(), &tight).unwrap_err();
-        assert!(matches!(error, PromptsError::Read(ReadError::TooLarge { limit: 10, .. })), "{error}");
+        assert!(error.to_string().contains("p.json") && error.to_string().contains("10"), "{error}");
     }
 
     #[test]

@@ -116,25 +116,27 @@ pub fn reduce_to_rows(photo: &Photo, rows: u32) -> Photo {
     Photo { width: size.0, height: size.1, rgb: bytes.as_chunks::<3>().0.to_vec(), alpha: None }
 }
 
-/// A mask averaged down to `size`, which is nowhere larger than its own.
-pub fn reduce_gray(gray: &Gray, size: (u32, u32)) -> Gray {
+/// A grey picture at another size: averaged where it is larger in both directions, else interpolated.
+pub fn resize_gray(gray: &Gray, size: (u32, u32)) -> Gray {
     let from = (gray.width, gray.height);
     if size == from {
         return gray.clone();
     }
-    Gray { width: size.0, height: size.1, values: average(&gray.values, 1, from, size, Scale::Coded) }
+    if from.0 >= size.0 && from.1 >= size.1 {
+        return Gray {
+            width: size.0,
+            height: size.1,
+            values: average(&gray.values, 1, from, size, Scale::Coded),
+        };
+    }
+    let values: Vec<f32> = gray.values.iter().map(|&v| v as f32 / 255.0).collect();
+    enlarge(&values, from, size, 0.0, 1.0)
 }
 
-/// A hard mask (head where it is 128 or more) at another size, 255 or 0: averaged down, or up by bilinear
-/// interpolation, and cut at one half. Its outline is smooth where copied pixels would make stairs.
+/// A mask (head where it is 128 or more) at another size, 255 or 0: resized and cut at one half. Its outline is smooth
+/// where copied pixels would make stairs.
 pub fn resize_hard(mask: &Gray, size: (u32, u32)) -> Gray {
-    let from = (mask.width, mask.height);
-    let mut resized = if from.0 >= size.0 && from.1 >= size.1 {
-        reduce_gray(mask, size)
-    } else {
-        let head: Vec<f32> = mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect();
-        enlarge(&head, from, size, 0.0, 1.0)
-    };
+    let mut resized = resize_gray(mask, size);
     resized.values.iter_mut().for_each(|v| *v = if *v >= 128 { 255 } else { 0 });
     resized
 }
@@ -153,19 +155,32 @@ pub fn harden(alpha: f32, lowest: f32, highest: f32) -> f32 {
 /// bit. Values that are no numbers become 0.
 pub fn enlarge(alpha: &[f32], from: (u32, u32), size: (u32, u32), lowest: f32, highest: f32) -> Gray {
     assert_eq!(alpha.len(), from.0 as usize * from.1 as usize);
-    let across: Vec<_> = (0..size.0).map(|x| between(x, from.0, size.0)).collect();
-    let width = from.0 as usize;
-    let mut values = vec![0; size.0 as usize * size.1 as usize];
-    values.par_chunks_mut(size.0 as usize).enumerate().for_each(|(y, row)| {
-        let (above, below, v) = between(y as u32, from.1, size.1);
-        let (above, below) = (&alpha[above * width..][..width], &alpha[below * width..][..width]);
+    let coded = |v: f32| quantise(harden(v, lowest, highest));
+    Gray { width: size.0, height: size.1, values: bilinear(alpha, from.0, from, size, coded) }
+}
+
+/// A field of `from` (width, height) at the pixel centres of `to`, each value given to `with`; edges are repeated. Rows
+/// of `values` are `stride` apart, so the upper left `from` of a larger field can be taken.
+pub(super) fn bilinear<T: Copy + Default + Send>(
+    values: &[f32],
+    stride: u32,
+    from: (u32, u32),
+    to: (u32, u32),
+    with: impl Fn(f32) -> T + Sync,
+) -> Vec<T> {
+    let across: Vec<_> = (0..to.0).map(|x| between(x, from.0, to.0)).collect();
+    let (width, stride) = (to.0 as usize, stride as usize);
+    let mut out = vec![T::default(); width * to.1 as usize];
+    out.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
+        let (above, below, v) = between(y as u32, from.1, to.1);
+        let (above, below) = (&values[above * stride..], &values[below * stride..]);
         for (value, &(left, right, u)) in row.iter_mut().zip(&across) {
             let top = above[left] + u * (above[right] - above[left]);
             let bottom = below[left] + u * (below[right] - below[left]);
-            *value = quantise(harden(top + v * (bottom - top), lowest, highest));
+            *value = with(top + v * (bottom - top));
         }
     });
-    Gray { width: size.0, height: size.1, values }
+    out
 }
 
 /// The two neighbours of pixel `i` of `to` among `from`, and how far it is from the first to the second.
@@ -196,10 +211,10 @@ mod tests {
     fn halving_averages_blocks_and_a_broken_factor_shares_pixels() {
         // (10 + 20 + 30 + 41) / 4 = 25.25 → 25; (0 + 255 + 255 + 0) / 4 = 127.5 → 128
         let four = gray(4, 2, &[10, 20, 0, 255, 30, 41, 255, 0]);
-        assert_eq!(reduce_gray(&four, (2, 1)).values, [25, 128]);
+        assert_eq!(resize_gray(&four, (2, 1)).values, [25, 128]);
         // three to two: (1 · 0 + ½ · 90) / 1.5 = 30 and (½ · 90 + 1 · 30) / 1.5 = 50
-        assert_eq!(reduce_gray(&gray(3, 1, &[0, 90, 30]), (2, 1)).values, [30, 50]);
-        assert_eq!(reduce_gray(&gray(1, 3, &[0, 90, 30]), (1, 2)).values, [30, 50]);
+        assert_eq!(resize_gray(&gray(3, 1, &[0, 90, 30]), (2, 1)).values, [30, 50]);
+        assert_eq!(resize_gray(&gray(1, 3, &[0, 90, 30]), (1, 2)).values, [30, 50]);
     }
 
     #[test]
@@ -214,7 +229,7 @@ mod tests {
     fn an_even_picture_stays_even_at_any_factor() {
         let photo = gray(101, 67, &[77; 101 * 67]);
         for size in [(100, 66), (33, 20), (1, 1), (7, 67)] {
-            assert!(reduce_gray(&photo, size).values.iter().all(|&v| v == 77), "{size:?}");
+            assert!(resize_gray(&photo, size).values.iter().all(|&v| v == 77), "{size:?}");
         }
     }
 
@@ -225,6 +240,13 @@ mod tests {
         assert_eq!(large.values, [0, 64, 191, 255]);
         let tall = enlarge(&[0.0, 1.0], (1, 2), (1, 4), 0.0, 1.0);
         assert_eq!(tall.values, [0, 64, 191, 255]);
+        assert_eq!(bilinear(&[0.0, 1.0], 2, (2, 1), (4, 1), |v| v), [0.0, 0.25, 0.75, 1.0]);
+    }
+
+    #[test]
+    fn a_field_is_cut_before_it_is_resized() {
+        // of rows of three, only the first two columns count: the third, 9, must not bleed in
+        assert_eq!(bilinear(&[0.0, 1.0, 9.0], 3, (2, 1), (4, 1), |v| v), [0.0, 0.25, 0.75, 1.0]);
     }
 
     #[test]

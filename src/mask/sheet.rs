@@ -6,10 +6,11 @@
 
 use super::annotation::evenly;
 use super::matting::trimap::{UNKNOWN, unknown_share};
-use super::scale::{reduce_gray, reduce_photo, working_size};
+use super::scale::{reduce_photo, resize_gray, working_size};
+use crate::Result;
 use crate::capture::{coverage, findings};
 use crate::image::{Gray, Photo};
-use crate::io::{self, WriteError};
+use crate::io;
 use crate::report::{base64, escape};
 use std::fmt::Write;
 use std::path::Path;
@@ -29,7 +30,7 @@ const FOOT: &str = "</body></html>\n";
 
 /// One view of a sheet.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Tile {
+pub struct SheetView {
     /// The view's name.
     pub name: String,
     /// The photograph, reduced, with outline and band, as a JPEG file.
@@ -42,12 +43,12 @@ pub struct Tile {
     pub suspicions: Vec<String>,
 }
 
-impl Tile {
+impl SheetView {
     /// Draws the mask of a view over its photograph and says what makes the mask suspicious by itself; the mask and
     /// the trimap may have other sizes than the photograph.
-    pub fn new(name: &str, photo: &Photo, alpha: &Gray, trimap: Option<&Gray>) -> Result<Tile, WriteError> {
+    pub fn new(name: &str, photo: &Photo, alpha: &Gray, trimap: Option<&Gray>) -> Result<SheetView> {
         let picture = overlaid(photo, alpha, trimap, PICTURE_PX);
-        Ok(Tile {
+        Ok(SheetView {
             name: name.into(),
             jpeg: io::jpeg_bytes(&picture, 85, Path::new(name))?,
             coverage: coverage(alpha),
@@ -63,26 +64,13 @@ fn overlaid(photo: &Photo, alpha: &Gray, trimap: Option<&Gray>, side: u32) -> Ph
     let mut picture = reduce_photo(photo, size);
     if let Some(trimap) = trimap {
         let values = trimap.values.iter().map(|&v| if v == UNKNOWN { 255 } else { 0 }).collect();
-        let unknown = brought_to(&Gray { values, ..*trimap }, size);
+        let unknown = resize_gray(&Gray { values, ..*trimap }, size);
         for (pixel, &u) in picture.rgb.iter_mut().zip(&unknown.values) {
             *pixel = mixed(*pixel, BAND, u as f32 / 255.0 * 0.4);
         }
     }
-    outline(&mut picture, &brought_to(alpha, size));
+    outline(&mut picture, &resize_gray(alpha, size));
     picture
-}
-
-/// A grey picture at another size: averaged where it is larger, else its nearest pixels.
-fn brought_to(gray: &Gray, size: (u32, u32)) -> Gray {
-    if gray.width >= size.0 && gray.height >= size.1 {
-        return reduce_gray(gray, size);
-    }
-    let at = |i: u32, to: u32, from: u32| (i as u64 * from as u64 / to as u64) as usize;
-    let pixel = |i: u32| {
-        let (x, y) = (at(i % size.0, size.0, gray.width), at(i / size.0, size.1, gray.height));
-        gray.values[y * gray.width as usize + x]
-    };
-    Gray { width: size.0, height: size.1, values: (0..size.0 * size.1).map(pixel).collect() }
 }
 
 fn mixed(a: [u8; 3], b: [u8; 3], share: f32) -> [u8; 3] {
@@ -109,7 +97,7 @@ fn outline(picture: &mut Photo, mask: &Gray) {
 
 /// The sheet of these views, in their order, as a page of its own. When there are more than fit, suspicious ones
 /// and evenly spread others are shown, and a last line says so.
-pub fn sheet(tiles: &[Tile]) -> String {
+pub fn sheet(views: &[SheetView]) -> String {
     let mut out = String::from(HEAD);
     out += "<style>.masks{display:flex;flex-wrap:wrap;gap:.5rem}.masks figure{margin:0;padding:4px;\
             border:4px solid transparent;max-width:320px;font-size:.85rem;overflow-wrap:anywhere}\
@@ -117,26 +105,26 @@ pub fn sheet(tiles: &[Tile]) -> String {
             .masks img{display:block;height:auto;max-width:100%}</style>\n\
             <p>The outline of each mask is cyan, unknown pixels are yellow; framed in red is what a person should look \
             at.</p>\n<div class=\"masks\">\n";
-    let shown = evenly(tiles.len(), MOST, |i| !tiles[i].suspicions.is_empty());
-    for tile in shown.iter().map(|&i| &tiles[i]) {
-        let odd = if tile.suspicions.is_empty() { "" } else { " class=\"odd\"" };
-        let (name, jpeg, covered) = (escape(&tile.name), base64(&tile.jpeg), 100.0 * tile.coverage);
+    let shown = evenly(views.len(), MOST, |i| !views[i].suspicions.is_empty());
+    for view in shown.iter().map(|&i| &views[i]) {
+        let odd = if view.suspicions.is_empty() { "" } else { " class=\"odd\"" };
+        let (name, jpeg, covered) = (escape(&view.name), base64(&view.jpeg), 100.0 * view.coverage);
         let _ = write!(
             out,
             "<figure{odd}><img alt=\"{name}\" src=\"data:image/jpeg;base64,{jpeg}\"><figcaption><b>{name}</b><br>\
              head {covered:.1} %"
         );
-        if let Some(unknown) = tile.unknown {
+        if let Some(unknown) = view.unknown {
             let _ = write!(out, ", unknown {:.1} %", 100.0 * unknown);
         }
-        for why in &tile.suspicions {
+        for why in &view.suspicions {
             let _ = write!(out, "<br><span class=\"why\">{}</span>", escape(why));
         }
         out += "</figcaption></figure>\n";
     }
     out += "</div>\n";
-    if shown.len() < tiles.len() {
-        let _ = writeln!(out, "<p>{} of {} views.</p>", shown.len(), tiles.len());
+    if shown.len() < views.len() {
+        let _ = writeln!(out, "<p>{} of {} views.</p>", shown.len(), views.len());
     }
     out + FOOT
 }
@@ -172,10 +160,10 @@ mod tests {
         // 20 wide, 40 high, open at the lower border: 40 + 40 + 20 less two shared corners
         assert_eq!(count(&picture, OUTLINE), 98);
         assert_eq!(count(&picture, [40; 3]), 40 + 40 + 20);
-        let tile = Tile::new("a", &photo(60, 80), &bust(), None).unwrap();
+        let view = SheetView::new("a", &photo(60, 80), &bust(), None).unwrap();
         // 800 of 4800 pixels
-        assert!((tile.coverage - 1.0 / 6.0).abs() < 1e-12 && tile.suspicions.is_empty());
-        assert!(tile.unknown.is_none());
+        assert!((view.coverage - 1.0 / 6.0).abs() < 1e-12 && view.suspicions.is_empty());
+        assert!(view.unknown.is_none());
     }
 
     #[test]
@@ -190,15 +178,15 @@ mod tests {
             let picture = overlaid(&photo(60, 80), &alpha, Some(&trimap), 320);
             // columns 20 to 39 but the rim at 30 and the dark one at 29: 100 + 0.4 (255 − 100) = 162
             assert_eq!(count(&picture, [162, 140, 60]), 18 * 80, "{scale}");
-            let tile = Tile::new("a", &photo(60, 80), &alpha, Some(&trimap)).unwrap();
-            assert!((tile.unknown.unwrap() - 1.0 / 3.0).abs() < 1e-9);
+            let view = SheetView::new("a", &photo(60, 80), &alpha, Some(&trimap)).unwrap();
+            assert!((view.unknown.unwrap() - 1.0 / 3.0).abs() < 1e-9);
         }
     }
 
     #[test]
     fn suspicious_views_are_framed_and_say_why_and_names_cannot_end_the_page() {
-        let fine = Tile::new("a", &photo(60, 80), &bust(), None).unwrap();
-        let mut odd = Tile::new("<b>\"&", &photo(60, 80), &gray(60, 80, |_, _| 255), None).unwrap();
+        let fine = SheetView::new("a", &photo(60, 80), &bust(), None).unwrap();
+        let mut odd = SheetView::new("<b>\"&", &photo(60, 80), &gray(60, 80, |_, _| 255), None).unwrap();
         odd.suspicions.push("disagrees".into());
         assert_eq!(odd.suspicions, ["is white everywhere", "disagrees"]);
         let page = sheet(&[fine.clone(), odd]);
@@ -213,10 +201,10 @@ mod tests {
 
     #[test]
     fn a_sheet_of_very_many_views_says_what_it_leaves_out_and_keeps_the_suspicious() {
-        let mut tiles = vec![Tile::new("a", &photo(6, 8), &bust(), None).unwrap(); MOST + 100];
-        tiles.iter_mut().for_each(|t| t.suspicions.clear());
-        tiles[MOST + 99].suspicions.push("odd".into());
-        let page = sheet(&tiles);
+        let mut views = vec![SheetView::new("a", &photo(6, 8), &bust(), None).unwrap(); MOST + 100];
+        views.iter_mut().for_each(|t| t.suspicions.clear());
+        views[MOST + 99].suspicions.push("odd".into());
+        let page = sheet(&views);
         assert_eq!(page.matches("<figure").count(), MOST);
         assert!(page.contains("class=\"odd\"") && page.contains("<p>500 of 600 views.</p>"));
         assert!(!sheet(&[]).contains("<figure"));
@@ -224,7 +212,7 @@ mod tests {
 
     #[test]
     fn a_part_of_a_sheet_has_its_pictures_and_no_page_around_them() {
-        let page = sheet(&[Tile::new("a", &photo(60, 80), &bust(), None).unwrap()]);
+        let page = sheet(&[SheetView::new("a", &photo(60, 80), &bust(), None).unwrap()]);
         let part = part(&page).unwrap();
         assert!(part.contains("<figure>") && !part.contains("<html") && !part.contains("</body>"));
         assert_eq!(super::part("another page"), None);

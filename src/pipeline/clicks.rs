@@ -4,164 +4,135 @@
 //! clicks → cut (GrabCut, or SAM) → propagated through the cameras → band → matting (closed form, ViTMatte) → alpha
 //! ```
 
-use super::networks::Networks;
 use crate::capture::{Capture, Split};
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
-use crate::mask::grabcut::{GrabcutOptions, grabcut};
-use crate::mask::matting::closed_form::ClosedFormOptions;
-use crate::mask::matting::trimap::Band;
-use crate::mask::matting::{SoftenOptions, Working, soften};
-use crate::mask::prompts;
-use crate::mask::propagate::{Masks, PropagateOptions, PropagateView, ViewMask, propagate};
-use crate::mask::{Click, CutError, distance, scale};
+use crate::mask::grabcut::grabcut;
+use crate::mask::matting::trimap::UnknownBand;
+use crate::mask::matting::{SoftMask, SoftenOptions, soften_with};
+use crate::mask::networks::Networks;
+use crate::mask::prompts::{self, PhotoPrompts, Prompts};
+use crate::mask::propagate::{PropagateView, propagate};
+use crate::mask::{Click, distance, scale};
 use crate::run::{Fingerprint, StageDir};
 use crate::{Error, Result};
 use rayon::prelude::*;
+use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::Path;
 
+/// Memory that photographs worked on side by side may take without networks, bytes.
+const MOST_BYTES: u64 = 3 << 29;
+
 /// The clicks that masks are made from.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Clicks {
+pub(super) struct MaskPrompts {
     /// Of each view, in pixels of its camera.
-    pub of: Vec<Vec<Click>>,
+    pub clicks: Vec<Vec<Click>>,
     /// The file they came from, byte for byte; empty without one.
     pub file: Vec<u8>,
-    /// What shapes the masks beside the settings: clicks and network files.
+    /// What shapes the masks beside the settings: digests of clicks and network files.
     pub inputs: Vec<(&'static str, String)>,
 }
 
 /// What of the clicks comes from files, as `inputs` names them.
 const INPUTS: [&str; 4] = ["clicks", "sam", "sam_decoder", "vitmatte"];
 
-impl Clicks {
-    /// What a stage's record holds of clicks that are no longer there: their digests.
-    pub fn remembered(inputs: &BTreeMap<String, String>) -> Clicks {
-        let input = |name: &'static str| Some((name, inputs.get(name)?.clone()));
-        Clicks { of: Vec::new(), file: Vec::new(), inputs: INPUTS.into_iter().filter_map(input).collect() }
-    }
-}
-
-/// A mask that was made.
-pub(super) struct Made {
-    /// Soft alpha at the size of the camera.
-    pub alpha: Gray,
-    /// Where it is unknown, at the size that was worked on.
-    pub trimap: Gray,
-    /// Share of the picture that is unknown.
-    pub unknown: f64,
-}
-
-/// The clicks that a configuration means, checked against the capture; `None` if masks are not made from clicks.
-///
-/// `kept` is the copy of the clicks that the run keeps, for when the file is gone.
-pub(super) fn clicks(config: &MaskConfig, capture: &Capture, kept: &Path) -> Result<Option<Clicks>> {
-    if !config.clicked() {
-        return Ok(None);
-    }
-    let mut file = Vec::new();
-    let of = if config.prompts.is_empty() {
-        let clicks = config.point.iter().map(|p| prompts::parse_point(p)).collect::<Result<Vec<_>, _>>();
-        let view = match config.view.as_str() {
-            "" => capture.views.iter().find(|v| v.split == Split::Train).or(capture.views.first()),
-            name => capture.views.iter().find(|v| v.name == name),
-        };
-        let Some(view) = view else {
-            return Err(Error::cannot(
-                format!("there is no view `{}`", config.view),
-                "`tiface inspect CAPTURE --json` lists them; names have no ending",
-            ));
-        };
-        let frame = prompts::Frame { file_path: prompts::file_path(capture, view), points: clicks? };
-        prompts::Prompts { frames: vec![frame] }.clicks("mask.point", capture)
-    } else {
-        let named = Path::new(&config.prompts);
-        let path = if !io::is_file(named) && io::is_file(kept) { kept } else { named };
-        file = io::read_bytes(path, &Limits::default())?;
-        let read = prompts::parse_prompts(path, &file, &Limits::default());
-        read.and_then(|prompts| prompts.clicks(&path.to_string_lossy(), capture))
-    }?;
-    if of.iter().all(Vec::is_empty) {
-        return Err(Error::cannot(
-            format!("`{}` holds no click on a photograph of this capture", config.prompts),
-            "click on a few photographs: `tiface mask CAPTURE --page`",
-        ));
-    }
-    let mut inputs = vec![("clicks", Fingerprint::of_bytes(format!("{of:?}").as_bytes()))];
-    for (name, path) in files(config) {
-        let mut digest = Networks::digest(path)?;
-        // what says how a picture is prepared for the network lies beside it
-        for sidecar in ["preprocessor_config.json", "../preprocessor_config.json"] {
-            let sidecar = path.with_file_name(sidecar);
-            if io::is_file(&sidecar) {
-                digest += &Networks::digest(&sidecar)?;
-            }
+impl MaskPrompts {
+    /// The clicks that a configuration means, checked against the capture; `None` if masks are not made from clicks.
+    ///
+    /// `kept` is the copy of the clicks that the run keeps, for when the file is gone.
+    pub fn open(config: &MaskConfig, capture: &Capture, kept: &Path) -> Result<Option<MaskPrompts>> {
+        if !config.clicked() {
+            return Ok(None);
         }
-        inputs.push((name, digest));
+        let mut file = Vec::new();
+        let clicks = if config.prompts.is_empty() {
+            let points = config.point.iter().map(|p| prompts::parse_point(p)).collect::<Result<_>>()?;
+            let view = match config.view.as_str() {
+                "" => capture.views.iter().find(|v| v.split == Split::Train).or(capture.views.first()),
+                name => capture.views.iter().find(|v| v.name == name),
+            };
+            let view = view.ok_or_else(|| {
+                Error::cannot(
+                    format!("there is no view `{}`", config.view),
+                    "`tiface inspect CAPTURE --json` lists them; names have no ending",
+                )
+            })?;
+            let frame = PhotoPrompts { file_path: prompts::file_path(capture, view), points };
+            Prompts { frames: vec![frame] }.clicks("mask.point", capture)?
+        } else {
+            let named = Path::new(&config.prompts);
+            let path = if !io::is_file(named) && io::is_file(kept) { kept } else { named };
+            file = io::read_bytes(path, &Limits::default())?;
+            let prompts = prompts::parse_prompts(path, &file, &Limits::default())?;
+            prompts.clicks(&path.to_string_lossy(), capture)?
+        };
+        if clicks.iter().all(Vec::is_empty) {
+            return Err(Error::cannot(
+                format!("`{}` holds no click on a photograph of this capture", config.prompts),
+                "click on a few photographs: `tiface mask CAPTURE --page`",
+            ));
+        }
+        let mut inputs = vec![("clicks", Fingerprint::of_bytes(format!("{clicks:?}").as_bytes()))];
+        for (name, path) in network_files(config) {
+            let mut digest = digest(path)?;
+            // what says how a picture is prepared for the network lies beside it
+            for sidecar in ["preprocessor_config.json", "../preprocessor_config.json"] {
+                let sidecar = path.with_file_name(sidecar);
+                if io::is_file(&sidecar) {
+                    digest += &self::digest(&sidecar)?;
+                }
+            }
+            inputs.push((name, digest));
+        }
+        Ok(Some(MaskPrompts { clicks, file, inputs }))
     }
-    Ok(Some(Clicks { of, file, inputs }))
+
+    /// What a stage's record holds of clicks that are no longer there: their digests.
+    pub fn remembered(inputs: &BTreeMap<String, String>) -> MaskPrompts {
+        let input = |name: &'static str| Some((name, inputs.get(name)?.clone()));
+        let inputs = INPUTS.into_iter().filter_map(input).collect();
+        MaskPrompts { clicks: Vec::new(), file: Vec::new(), inputs }
+    }
 }
 
 /// The network files that will be used, by their key in `[mask]`.
-pub(super) fn files(config: &MaskConfig) -> Vec<(&'static str, &Path)> {
-    let mut files = Vec::new();
-    if config.with_sam() {
-        files.extend([("sam", config.sam.as_str()), ("sam_decoder", config.sam_decoder.as_str())]);
-    }
-    if config.with_vitmatte() {
-        files.push(("vitmatte", config.vitmatte.as_str()));
-    }
-    files.into_iter().map(|(name, path)| (name, Path::new(path))).collect()
+fn network_files(config: &MaskConfig) -> impl Iterator<Item = (&'static str, &Path)> {
+    let sam = [("sam", &config.sam), ("sam_decoder", &config.sam_decoder)];
+    let files = sam.map(|file| config.with_sam().then_some(file)).into_iter();
+    let files = files.chain([config.with_vitmatte().then_some(("vitmatte", &config.vitmatte))]);
+    files.flatten().map(|(name, path)| (name, Path::new(path)))
 }
 
-fn grabcut_options(c: &MaskConfig) -> GrabcutOptions {
-    GrabcutOptions {
-        rows: c.cut_px,
-        seed_radius: c.seed_radius,
-        border_margin: c.border_margin,
-        border_sides: c.border_sides,
-        gaussians: c.gaussians,
-        smoothness: c.smoothness,
-        certainty: c.certainty,
-        rounds: c.cut_rounds,
-        band: c.band,
-        ..GrabcutOptions::default()
-    }
+fn digest(path: &Path) -> Result<String> {
+    let limits = Limits { file_bytes: 2 << 30, ..Limits::default() };
+    Ok(Fingerprint::of_bytes(&io::read_bytes(path, &limits)?))
 }
 
-fn propagate_options(c: &MaskConfig) -> PropagateOptions {
-    PropagateOptions {
-        cut: grabcut_options(c),
-        cells: c.carve_cells,
-        outside: c.carve_outside,
-        core: c.carve_core,
-        most_negative: c.carve_most_negative,
-        least_positive: c.carve_least_positive,
-        rounds: c.carve_rounds,
-        ..PropagateOptions::default()
-    }
+fn soften_options(config: &MaskConfig) -> SoftenOptions {
+    let band = match config.kernel {
+        0 => UnknownBand::Discs { share: config.band },
+        kernel => UnknownBand::Squares { kernel, iterations: config.iterations },
+    };
+    SoftenOptions { side: config.side_px, band }
 }
 
-fn soften_options(c: &MaskConfig) -> SoftenOptions {
-    let defaults = SoftenOptions::default();
-    SoftenOptions {
-        side: c.side_px,
-        band: match c.kernel {
-            0 => Band::Discs { share: c.band },
-            kernel => Band::Squares { kernel, iterations: c.iterations },
-        },
-        closed_form: ClosedFormOptions {
-            epsilon: c.epsilon,
-            constraint_weight: c.constraint_weight,
-            prior_weight: c.prior_weight,
-            ..defaults.closed_form
-        },
-        lowest: c.lowest,
-        highest: c.highest,
-        ..defaults
-    }
+/// How many photographs of a size may be worked on side by side.
+fn photos_at_once(
+    networks: Option<&Networks>,
+    (width, height): (u32, u32),
+    soft: &SoftenOptions,
+    config: &MaskConfig,
+) -> usize {
+    let threads = rayon::current_num_threads();
+    let memory = (config.memory_gib * (1u64 << 30) as f64) as u64;
+    // photograph, alpha and equations
+    let bytes = soft.memory_bytes(width, height) + 8 * u64::from(width) * u64::from(height);
+    let built_in = (memory.min(MOST_BYTES) / bytes.max(1)).clamp(1, threads as u64) as usize;
+    let (w, h) = scale::working_size(width, height, soft.side);
+    networks.map_or(built_in, |n| n.photos_at_once(w, h, threads).min(built_in))
 }
 
 fn photo(capture: &Capture, view: usize, dir: &StageDir) -> Result<Photo> {
@@ -169,147 +140,101 @@ fn photo(capture: &Capture, view: usize, dir: &StageDir) -> Result<Photo> {
     Ok(capture.views[view].load_photo(&Limits::default())?)
 }
 
-/// Masks of all views from clicks on some.
+/// Makes masks of all views from clicks on some, gives them to `keep` in order, and returns a record of the networks
+/// that were used.
 pub(super) fn make_masks(
     capture: &Capture,
-    clicks: &Clicks,
+    prompts: &MaskPrompts,
     config: &MaskConfig,
     dir: &StageDir,
-    keep: &mut dyn FnMut(usize, &Photo, Made) -> Result<()>,
-) -> Result<Networks> {
+    keep: &mut dyn FnMut(usize, &Photo, SoftMask) -> Result<()>,
+) -> Result<Value> {
     let networks = Networks::open(config)?;
-    // a file that the engine cannot run is refused before the work
-    let sizes: std::collections::BTreeSet<_> =
-        capture.views.iter().map(|v| (v.camera.width, v.camera.height)).collect();
-    let largest = sizes.into_iter().max_by_key(|&(w, h)| u64::from(w) * u64::from(h)).unwrap_or((1, 1));
-    networks.prepare(scale::working_size(largest.0, largest.1, config.side_px))?;
-    for file in networks.files() {
-        dir.note(&file);
+    let networks = networks.as_ref();
+    let sizes = capture.views.iter().map(|v| (v.camera.width, v.camera.height));
+    let largest = sizes.max_by_key(|&(w, h)| (u64::from(w) * u64::from(h), w)).unwrap_or((1, 1));
+    if let Some(networks) = networks {
+        // a file that the engine cannot run is refused before the work
+        let (w, h) = scale::working_size(largest.0, largest.1, config.side_px);
+        networks.prepare(w, h)?;
+        networks.files().iter().for_each(|file| dir.note(&file.to_string()));
     }
-    let hard = hard(capture, clicks, config, dir)?;
+    let hard = hard_masks(capture, &prompts.clicks, dir)?;
     let soft = soften_options(config);
     let total = hard.len();
-    let at_once = networks.at_once(largest, &soft, config);
+    let at_once = photos_at_once(networks, largest, &soft, config);
     for start in (0..total).step_by(at_once) {
-        let made: Vec<Result<(Photo, Made, Vec<String>)>> = (start..(start + at_once).min(total))
+        let some = start..(start + at_once).min(total);
+        let masks: Vec<Result<(Photo, SoftMask)>> = some
             .into_par_iter()
             .map(|i| {
                 let photo = photo(capture, i, dir)?;
-                let (made, warnings) = alpha(&networks, &photo, &hard[i], &clicks.of[i], &soft)?;
-                Ok((photo, made, warnings))
+                let mask = soft_mask(networks, &photo, &hard[i], &prompts.clicks[i], &soft)?;
+                Ok((photo, mask))
             })
             .collect();
-        for (i, made) in (start..).zip(made) {
-            let (photo, made, warnings) = made?;
+        for (i, found) in (start..).zip(masks) {
+            let (photo, mask) = found?;
             let name = &capture.views[i].name;
-            warnings.iter().for_each(|w| dir.warn(&format!("view `{name}`: {w}")));
-            keep(i, &photo, made)?;
+            mask.warnings.iter().for_each(|w| dir.warn(&format!("view `{name}`: {w}")));
+            keep(i, &photo, mask)?;
         }
         dir.step((start + at_once).min(total), total)?;
     }
-    Ok(networks)
+    Ok(networks.map_or(json!([]), |n| json!(n.files())))
 }
 
 /// Hard masks of all views.
-fn hard(capture: &Capture, clicks: &Clicks, config: &MaskConfig, dir: &StageDir) -> Result<Vec<ViewMask>> {
+fn hard_masks(capture: &Capture, clicks: &[Vec<Click>], dir: &StageDir) -> Result<Vec<Gray>> {
     let views = &capture.views;
-    let masks = if let [view] = &views[..] {
-        let found = grabcut(&view.name, &photo(capture, 0, dir)?, &clicks.of[0], &grabcut_options(config));
-        let found = found?;
-        Masks {
-            views: vec![ViewMask { mask: found.mask, ambiguous: found.ambiguous }],
-            warnings: found.warnings,
-        }
+    let (masks, warnings) = if let [view] = &views[..] {
+        let found = grabcut(&view.name, &photo(capture, 0, dir)?, &clicks[0])?;
+        (vec![found.mask], found.warnings)
     } else {
-        let views: Vec<PropagateView> = views
-            .iter()
-            .zip(&clicks.of)
-            .map(|(v, clicks)| PropagateView {
-                name: &v.name,
-                camera: &v.camera,
-                clicks,
-                // held-out photographs shape nothing but their own masks
-                votes: v.split == Split::Train,
-            })
-            .collect();
-        let load = |i| photo(capture, i, dir).map_err(Unpropagated::Load);
-        propagate(&views, load, &propagate_options(config)).map_err(|e| match e {
-            Unpropagated::Load(e) => e,
-            Unpropagated::Cut(e) => e.into(),
-        })?
+        let view = |(v, clicks)| {
+            let v: &crate::capture::View = v;
+            // held-out photographs shape nothing but their own masks
+            PropagateView { name: &v.name, camera: &v.camera, clicks, votes: v.split == Split::Train }
+        };
+        let views: Vec<PropagateView> =
+            views.iter().zip(clicks.iter().map(Vec::as_slice)).map(view).collect();
+        let found = propagate(&views, |i| photo(capture, i, dir))?;
+        (found.masks, found.warnings)
     };
-    masks.warnings.iter().for_each(|w| dir.warn(w));
-    Ok(masks.views)
+    warnings.iter().for_each(|w| dir.warn(w));
+    Ok(masks)
 }
 
 /// One view's alpha.
-fn alpha(
-    networks: &Networks,
+fn soft_mask(
+    networks: Option<&Networks>,
     photo: &Photo,
-    hard: &ViewMask,
+    hard: &Gray,
     clicks: &[Click],
     soft: &SoftenOptions,
-) -> Result<(Made, Vec<String>)> {
+) -> Result<SoftMask> {
+    let Some(networks) = networks else { return soften_with(photo, hard, soft, |_, _| Ok(None)) };
     let mut warnings = Vec::new();
-    let segmented = match networks.has_sam() {
-        true => {
-            let size = scale::working_size(photo.width, photo.height, soft.side);
-            let small = scale::reduce_photo(photo, size);
-            let chosen = if clicks.is_empty() {
-                propagated_clicks(&hard.mask, size)
-            } else {
-                clicks.iter().map(|c| c.moved((photo.width, photo.height), size)).collect()
-            };
-            let (mask, score) = networks.segment(&small, &chosen)?;
-            if !mask.values.contains(&255) {
-                warnings.push("SAM found nothing of the head; the built-in cut stands in".into());
-                None
-            } else {
-                if score < 0.7 {
-                    warnings.push(format!("SAM gives its mask only {score:.2} of 1; look at it"));
-                }
-                Some(mask)
+    let size = scale::working_size(photo.width, photo.height, soft.side);
+    let chosen = match clicks {
+        [] => propagated_clicks(hard, size),
+        own => own.iter().map(|c| c.moved((photo.width, photo.height), size)).collect(),
+    };
+    let mut mask = hard;
+    let segmented = networks.segment(&scale::reduce_photo(photo, size), &chosen)?;
+    if let Some((found, score)) = &segmented {
+        if !found.values.contains(&255) {
+            warnings.push("SAM found nothing of the head; the built-in cut stands in".into());
+        } else {
+            mask = found;
+            if *score < 0.7 {
+                warnings.push(format!("SAM gives its mask only {score:.2} of 1; look at it"));
             }
         }
-        false => None,
-    };
-    let mask = segmented.as_ref().unwrap_or(&hard.mask);
-    let failed = |e: crate::mask::matting::AlphaError| {
-        let hint = e.hint();
-        Error::cannot(e, hint)
-    };
-    let made = if networks.has_vitmatte() {
-        let working = Working::new(photo, mask, soft).map_err(failed)?;
-        warnings.extend(working.warnings(soft));
-        let mut alpha = networks.alpha(&working.photo, &working.trimap)?;
-        // the network takes the trimap for a hint; what is definite stays
-        for (a, t) in alpha.iter_mut().zip(&working.trimap.values) {
-            match t {
-                0 => *a = 0.0,
-                255 => *a = 1.0,
-                _ => {}
-            }
-        }
-        let share = crate::mask::matting::trimap::unknown_share(&working.trimap);
-        Made { alpha: working.finish(&alpha, soft), trimap: working.trimap, unknown: share }
-    } else {
-        let done = soften(photo, mask, soft).map_err(failed)?;
-        warnings.extend(done.warnings);
-        Made { alpha: done.alpha, trimap: done.trimap, unknown: done.band_share }
-    };
-    Ok((made, warnings))
-}
-
-/// Why clicks could not be propagated.
-enum Unpropagated {
-    Load(Error),
-    Cut(CutError),
-}
-
-impl From<CutError> for Unpropagated {
-    fn from(e: CutError) -> Unpropagated {
-        Unpropagated::Cut(e)
     }
+    let mut found = soften_with(photo, mask, soft, |photo, trimap| networks.alpha(photo, trimap))?;
+    warnings.append(&mut found.warnings);
+    Ok(SoftMask { warnings, ..found })
 }
 
 /// Clicks for a view that nobody clicked: the deepest places of the mask that was propagated to it, each outside the
@@ -344,30 +269,6 @@ pub(super) fn propagated_clicks(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Preset;
-
-    #[test]
-    fn defaults_are_those_of_the_modules() {
-        let c = MaskConfig::preset(Preset::Standard);
-        let propagate = PropagateOptions::default();
-        let cut = &propagate.cut;
-        assert_eq!((c.cut_px, c.gaussians, c.smoothness), (cut.rows, cut.gaussians, cut.smoothness));
-        assert_eq!((c.certainty, c.cut_rounds, c.seed_radius), (cut.certainty, cut.rounds, cut.seed_radius));
-        assert_eq!((c.border_margin, c.border_sides), (cut.border_margin, cut.border_sides));
-        assert_eq!((c.carve_cells, c.carve_rounds), (propagate.cells, propagate.rounds));
-        assert_eq!((c.carve_outside, c.carve_core), (propagate.outside, propagate.core));
-        assert_eq!(
-            (c.carve_most_negative, c.carve_least_positive),
-            (propagate.most_negative, propagate.least_positive)
-        );
-        let soften = SoftenOptions::default();
-        assert_eq!((c.side_px, c.lowest, c.highest), (soften.side, soften.lowest, soften.highest));
-        let closed = &soften.closed_form;
-        assert_eq!(
-            (c.epsilon, c.constraint_weight, c.prior_weight),
-            (closed.epsilon, closed.constraint_weight, closed.prior_weight)
-        );
-    }
 
     #[test]
     fn propagated_clicks_lie_deep_inside_and_far_outside() {

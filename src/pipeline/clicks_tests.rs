@@ -9,7 +9,7 @@ use crate::capture::{self, CaptureOptions, Split};
 use crate::config::{Config, MaskSource, Preset};
 use crate::image::Gray;
 use crate::io::{self, Limits};
-use crate::mask::prompts::{Frame, Prompts, file_path};
+use crate::mask::prompts::{PhotoPrompts, Prompts, file_path};
 use crate::run::{Run, Stop};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -22,7 +22,7 @@ fn clicked(dir: &Path) -> (Config, Vec<Gray>) {
     let capture = capture::open(&root, &CaptureOptions::default()).unwrap();
     let truth: Vec<Gray> =
         capture.views.iter().map(|v| v.load_mask(&Limits::default()).unwrap().unwrap()).collect();
-    let frame = |i: usize| Frame {
+    let frame = |i: usize| PhotoPrompts {
         file_path: file_path(&capture, &capture.views[i]),
         points: propagated_clicks(&truth[i], (120, 160)),
     };
@@ -225,7 +225,7 @@ fn held_out_photographs_shape_only_their_own_masks() {
     let mask = held_out.load_mask(&Limits::default()).unwrap().unwrap();
     let mut prompts =
         crate::mask::prompts::read_prompts(Path::new(&config.mask.prompts), &Limits::default()).unwrap();
-    prompts.frames.push(Frame {
+    prompts.frames.push(PhotoPrompts {
         file_path: file_path(&capture, held_out),
         points: propagated_clicks(&mask, (120, 160)),
     });

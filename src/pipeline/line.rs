@@ -1,6 +1,6 @@
 //! A capture, its configuration and its run: what every stage works on.
 
-use super::clicks::{Clicks, clicks};
+use super::clicks::MaskPrompts;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::Scene;
@@ -29,7 +29,7 @@ pub struct Line<'a> {
     /// Is the capture the demo head, whose surface is known?
     pub(super) synthetic: bool,
     /// What masks are made from, if not found.
-    pub(super) clicks: Option<Clicks>,
+    pub(super) clicks: Option<MaskPrompts>,
 }
 
 /// A checkpoint that a stage takes instead of learning.
@@ -60,7 +60,8 @@ impl<'a> Line<'a> {
                         capture.name = "demo".into();
                     }
                     let digest = capture_digest(&capture)?;
-                    let clicks = clicks(&config.mask, &capture, &run.path(Stage::Mask).join(mask::CLICKS))?;
+                    let kept = run.path(Stage::Mask).join(mask::CLICKS);
+                    let clicks = MaskPrompts::open(&config.mask, &capture, &kept)?;
                     (capture, digest, clicks, None)
                 }
             };
@@ -211,7 +212,7 @@ fn remembered(
     config: &Config,
     run: &Run,
     error: Error,
-) -> Result<(Capture, String, Option<Clicks>, Option<String>)> {
+) -> Result<(Capture, String, Option<MaskPrompts>, Option<String>)> {
     let root = Path::new(&config.capture.path);
     if capture::has_cameras(root) || !io::is_file(&run.path("config.toml")) {
         return Err(error);
@@ -221,7 +222,7 @@ fn remembered(
     let capture = scene_file::read_capture(&run.path("cameras.json"), root).map_err(|_| gone(&problem))?;
     let mut inputs = record.fingerprint.inputs;
     let digest = inputs.remove("capture").unwrap_or_default();
-    let clicks = config.mask.clicked().then(|| Clicks::remembered(&inputs));
+    let clicks = config.mask.clicked().then(|| MaskPrompts::remembered(&inputs));
     Ok((capture, digest, clicks, Some(problem)))
 }
 

@@ -1,6 +1,6 @@
 //! Stage `mask`: which pixels are the head, and where that puts it in space.
 
-use super::clicks::{Clicks, make_masks};
+use super::clicks::{MaskPrompts, make_masks};
 use super::scene_file;
 use crate::Result;
 use crate::capture::scene::{self, Scene, SceneOptions};
@@ -8,9 +8,12 @@ use crate::capture::{self, Capture, Split};
 use crate::config::{MaskConfig, MaskMeaning};
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
-use crate::mask::consistency::{ConsistencyOptions, ConsistencyView, check_consistency};
-use crate::mask::sheet::{Tile, sheet};
-use crate::mask::{prompts, scale};
+use crate::mask::annotation::page_of;
+use crate::mask::consistency::{ConsistencyView, check_consistency};
+use crate::mask::matting::trimap::unknown_share;
+use crate::mask::prompts::read_prompts;
+use crate::mask::scale;
+use crate::mask::sheet::{SheetView, sheet};
 use crate::run::StageDir;
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -29,26 +32,26 @@ const PLACED_PX: u32 = 1024;
 const MOST_COMPARED: usize = 256;
 
 /// Masks as they were found or made.
-struct Masked {
+#[derive(Default)]
+struct CaptureMasks {
+    /// Of each view, as small as is enough to compare them.
     masks: Vec<Option<Gray>>,
-    /// The views for the contact sheet, those with masks.
-    tiles: Vec<Tile>,
-    /// Which view each tile shows.
-    shown: Vec<usize>,
-    /// The stage's record of how they were made.
-    made: Value,
+    /// The views that have masks, for the contact sheet, each with its number.
+    sheet: Vec<(usize, SheetView)>,
+    /// How they were made, for the stage's record.
+    record: Value,
 }
 
 /// Finds the masks beside the photographs, or makes them from clicks: the masks as pictures, a sheet of them, and the
 /// box and hull they leave (`scene.json`).
 pub(super) fn mask(
     capture: &Capture,
-    clicks: Option<&Clicks>,
+    prompts: Option<&MaskPrompts>,
     config: &MaskConfig,
     dir: &StageDir,
 ) -> Result<Value> {
-    let Masked { masks, mut tiles, shown, made } = match clicks {
-        Some(clicks) => masks_from_clicks(capture, clicks, config, dir)?,
+    let CaptureMasks { masks, sheet: mut views, record } = match prompts {
+        Some(prompts) => masks_from_clicks(capture, prompts, config, dir)?,
         None => masks_of_capture(capture, dir)?,
     };
     let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
@@ -61,17 +64,15 @@ pub(super) fn mask(
     let silhouettes = config.meaning == MaskMeaning::Empty;
     let conflicts = if silhouettes { conflicts(capture, &masks) } else { Vec::new() };
     as_warnings(&conflicts, coverage.len()).iter().for_each(|text| dir.warn(text));
-    for (view, _) in &conflicts {
-        if let Some(k) = shown.iter().position(|v| v == view) {
-            tiles[k].suspicions.push("disagrees with the others".into());
-        }
+    for (_, view) in views.iter_mut().filter(|(i, _)| conflicts.iter().any(|(view, _)| view == i)) {
+        view.suspicions.push("disagrees with the others".into());
     }
-    if !tiles.is_empty() {
-        io::write_atomic(&dir.folder().join(SHEET), sheet(&tiles).as_bytes())?;
+    let views: Vec<SheetView> = views.into_iter().map(|(_, view)| view).collect();
+    if !views.is_empty() {
+        io::write_atomic(&dir.folder().join(SHEET), sheet(&views).as_bytes())?;
     }
-    let suspicious: Vec<&str> =
-        tiles.iter().filter(|t| !t.suspicions.is_empty()).map(|t| t.name.as_str()).collect();
-    let suspicious = json!(suspicious);
+    let suspicious = views.iter().filter(|v| !v.suspicions.is_empty()).map(|v| &v.name);
+    let suspicious: Vec<&String> = suspicious.collect();
     // what a mask calls "not looked at" may still hold head
     let scene = place(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), dir)?;
     scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
@@ -81,7 +82,7 @@ pub(super) fn mask(
         "masks": coverage.len(),
         "coverage": covered,
         "suspicious": suspicious,
-        "made": made,
+        "made": record,
         "box": scene::world_box(&scene),
     }))
 }
@@ -100,32 +101,27 @@ fn write_mask(folder: &Path, view: &str, mask: &Gray) -> Result<()> {
 }
 
 /// The masks that lie beside the photographs.
-fn masks_of_capture(capture: &Capture, dir: &StageDir) -> Result<Masked> {
+fn masks_of_capture(capture: &Capture, dir: &StageDir) -> Result<CaptureMasks> {
     let limits = Limits::default();
     let total = capture.views.len();
-    let mut out =
-        Masked { masks: Vec::with_capacity(total), tiles: vec![], shown: vec![], made: Value::Null };
+    let mut out = CaptureMasks::default();
     // a few at a time: decoding is what takes time, and photographs are large
     for (i, views) in capture.views.chunks(8).enumerate() {
         let loaded: Vec<Result<_>> = views
             .par_iter()
             .map(|v| {
                 let Some(mask) = v.load_mask(&limits)? else { return Ok(None) };
-                let photo = v.load_photo(&limits)?;
-                let tile = Tile::new(&v.name, &photo, &mask, None);
-                Ok(Some((mask, tile)))
+                let view = SheetView::new(&v.name, &v.load_photo(&limits)?, &mask, None)?;
+                Ok(Some((mask, view)))
             })
             .collect();
         for (k, found) in loaded.into_iter().enumerate() {
-            let view = 8 * i + k;
-            let found: Option<(Gray, Result<Tile, _>)> = found?;
-            let Some((mask, tile)) = found else {
+            let Some((mask, view)) = found? else {
                 out.masks.push(None);
                 continue;
             };
-            write_mask(dir.folder(), &capture.views[view].name, &mask)?;
-            out.tiles.push(tile?);
-            out.shown.push(view);
+            write_mask(dir.folder(), &view.name, &mask)?;
+            out.sheet.push((8 * i + k, view));
             out.masks.push(Some(for_placing(&mask)));
         }
         dir.step((8 * (i + 1)).min(total), total)?;
@@ -136,30 +132,29 @@ fn masks_of_capture(capture: &Capture, dir: &StageDir) -> Result<Masked> {
 /// Masks made from clicks.
 fn masks_from_clicks(
     capture: &Capture,
-    clicks: &Clicks,
+    prompts: &MaskPrompts,
     config: &MaskConfig,
     dir: &StageDir,
-) -> Result<Masked> {
-    let mut out = Masked { masks: vec![], tiles: vec![], shown: vec![], made: Value::Null };
+) -> Result<CaptureMasks> {
+    let mut out = CaptureMasks::default();
     let mut unknown = 0.0;
-    let networks = make_masks(capture, clicks, config, dir, &mut |view, photo: &Photo, made| {
-        let name = &capture.views[view].name;
-        write_mask(dir.folder(), name, &made.alpha)?;
-        out.tiles.push(Tile::new(name, photo, &made.alpha, Some(&made.trimap))?);
-        out.shown.push(view);
-        out.masks.push(Some(for_placing(&made.alpha)));
-        unknown += made.unknown;
+    let networks = make_masks(capture, prompts, config, dir, &mut |i, photo: &Photo, soft| {
+        let name = &capture.views[i].name;
+        write_mask(dir.folder(), name, &soft.alpha)?;
+        out.sheet.push((i, SheetView::new(name, photo, &soft.alpha, Some(&soft.trimap))?));
+        out.masks.push(Some(for_placing(&soft.alpha)));
+        unknown += unknown_share(&soft.trimap);
         Ok(())
     })?;
     if !config.prompts.is_empty() {
-        io::write_atomic(&dir.folder().join(CLICKS), &clicks.file)?;
+        io::write_atomic(&dir.folder().join(CLICKS), &prompts.file)?;
     }
-    let clicked = clicks.of.iter().filter(|c| !c.is_empty()).count();
-    out.made = json!({
+    let clicked = prompts.clicks.iter().filter(|c| !c.is_empty()).count();
+    out.record = json!({
         "clicked_views": clicked,
-        "clicks": clicks.of.iter().map(Vec::len).sum::<usize>(),
+        "clicks": prompts.clicks.iter().map(Vec::len).sum::<usize>(),
         "unknown": unknown / out.masks.len().max(1) as f64,
-        "networks": networks.record(),
+        "networks": networks,
     });
     Ok(out)
 }
@@ -195,7 +190,7 @@ fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> 
             mask: mask.as_ref().filter(|_| i.is_multiple_of(every)),
         })
         .collect();
-    match check_consistency(&views, &ConsistencyOptions::default()) {
+    match check_consistency(&views) {
         // less than that is a matter of pixels
         Ok(found) => (found.conflicts.into_iter())
             .filter(|d| d.too_much.max(d.too_little) >= 0.005)
@@ -219,7 +214,7 @@ fn as_warnings(conflicts: &[(usize, String)], masks: usize) -> Vec<String> {
 
 /// A mask at a size that is enough to place the head and to compare masks.
 fn for_placing(mask: &Gray) -> Gray {
-    scale::reduce_gray(mask, scale::working_size(mask.width, mask.height, PLACED_PX))
+    scale::resize_gray(mask, scale::working_size(mask.width, mask.height, PLACED_PX))
 }
 
 /// What the masks of a capture say against each other, a sentence for each that a person should look at. What cannot
@@ -244,9 +239,6 @@ pub fn disagreements(root: &Path, options: &capture::CaptureOptions) -> Vec<Stri
 /// An annotation page; `prompts` are clicks that are there already.
 pub fn click_page(capture: &Capture, prompts: Option<&Path>) -> Result<String> {
     let limits = Limits::default();
-    let known = match prompts {
-        Some(file) => prompts::read_prompts(file, &limits),
-        None => Ok(prompts::Prompts::default()),
-    };
-    Ok(crate::mask::annotation::page_of(capture, &known?, &Default::default(), &limits)?)
+    let prompts = prompts.map(|file| read_prompts(file, &limits)).transpose()?;
+    page_of(capture, &prompts.unwrap_or_default(), &limits)
 }

@@ -5,6 +5,7 @@
 //! covariance are measured anew. A covariance always gains what 8-bit rounding and sensor noise leave at least,
 //! so that one flat colour is no singular Gaussian.
 
+use crate::geom::cofactors;
 use crate::kernel::rng;
 
 /// A colour in coded 0..=255.
@@ -145,10 +146,10 @@ impl Gaussian {
             c(9, 2, 2).max(0.0) + LEAST_VARIANCE,
         );
         let (xy, xz, yz) = (c(5, 0, 1), c(6, 0, 2), c(8, 1, 2));
-        let (a, b, d) = (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy);
+        let (cofactors, det) = cofactors([xx, xy, xz, yy, yz, zz]);
         // the floor on the diagonal keeps it above LEAST_VARIANCE³ up to rounding
-        let det = (xx * a + xy * b + xz * d).max(0.5 * LEAST_VARIANCE.powi(3));
-        let precision = [a, b, d, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy].map(|v| v / det);
+        let det = det.max(0.5 * LEAST_VARIANCE.powi(3));
+        let precision = cofactors.map(|v| v / det);
         let weight = n / total as f64;
         let offset = weight.ln() - 0.5 * (det.ln() + 3.0 * std::f64::consts::TAU.ln());
         Gaussian { weight, mean, precision, offset }

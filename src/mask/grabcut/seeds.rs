@@ -4,10 +4,25 @@
 //! and the upper part of both sides. Everything else starts as head when it is nearer to the head's clicks, joined
 //! by a line, than to definite background: this Voronoi start follows the size of the head, which no fixed radius does.
 
-use super::options::GrabcutOptions;
 use crate::mask::click::Click;
 use crate::mask::distance::squared_distance;
-use crate::mask::error::CutError;
+use crate::{Error, Result};
+
+/// Radius of what a click makes certain, share of the picture's height.
+const SEED_RADIUS: f32 = 0.012;
+/// … and at least this many working pixels.
+const LEAST_SEED_RADIUS_PX: f32 = 4.0;
+/// Width of the border margins along top and sides that are certainly background, share of the height.
+pub(in crate::mask) const BORDER_MARGIN: f32 = 0.012;
+/// How far down the border margins at the sides reach, share of the height; shoulders may touch the rest.
+const BORDER_SIDES: f32 = 0.6;
+/// Radius of the discs around head clicks in the start, share of the height.
+const START_RADIUS: f32 = 0.06;
+/// Width of the line that joins head clicks in the start, share of the height.
+const START_LINE: f32 = 0.02;
+/// The background's first colors come from pixels this many times nearer to definite background than to the head's
+/// clicks; what lies between would teach it the colors of hair.
+const START_APART: f32 = 2.0;
 
 /// What is certain about a pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -18,47 +33,63 @@ pub(in crate::mask) enum Seed {
 }
 
 /// Checks the clicks on a photograph of `width` × `height` pixels, before anything is computed.
-pub(in crate::mask) fn check(view: &str, clicks: &[Click], width: u32, height: u32) -> Result<(), CutError> {
+pub(in crate::mask) fn check(view: &str, clicks: &[Click], width: u32, height: u32) -> Result<()> {
     check_size(view, width, height)?;
-    let view = || view.to_string();
     if clicks.is_empty() {
-        return Err(CutError::NoClicks { view: view() });
+        return Err(no_clicks(view));
     }
-    for (i, c) in clicks.iter().enumerate() {
-        // a pixel index of 0 is the pixel's centre, so the picture reaches half a pixel farther
-        let inside = |v: f32, size: u32| v >= -0.5 && v <= size as f32 - 0.5;
-        if !(inside(c.x, width) && inside(c.y, height)) {
-            return Err(CutError::OutsidePhoto {
-                view: view(),
-                number: i + 1,
-                x: c.x,
-                y: c.y,
-                width,
-                height,
-            });
-        }
+    // a pixel index of 0 is the pixel's centre, so the picture reaches half a pixel farther
+    let inside = |v: f32, size: u32| v >= -0.5 && v <= size as f32 - 0.5;
+    if let Some(i) = clicks.iter().position(|c| !(inside(c.x, width) && inside(c.y, height))) {
+        let (n, Click { x, y, .. }) = (i + 1, clicks[i]);
+        return Err(Error::cannot(
+            format!(
+                "view `{view}`: click {n} at ({x}, {y}) is outside the photograph of {width} × {height} pixels"
+            ),
+            "coordinates are pixels of the photograph as stored, x right and y down from the top left; were the \
+             clicks made on a photograph of another size?",
+        ));
     }
     if clicks.iter().all(|c| !c.head) {
-        return Err(CutError::NoHead { view: view(), clicks: clicks.len() });
+        let n = clicks.len();
+        return Err(Error::cannot(
+            format!("view `{view}`: all {n} clicks are on the background, none is on the head"),
+            "add clicks on the face, the hair and the garment: label 1 is the head, 0 the background",
+        ));
     }
     let pixel = |c: &Click| (c.x.round().max(0.0) as u32, c.y.round().max(0.0) as u32);
     for (i, a) in clicks.iter().enumerate() {
-        for (j, b) in clicks.iter().enumerate().skip(i + 1) {
-            if a.head != b.head && pixel(a) == pixel(b) {
-                let (x, y) = pixel(a);
-                return Err(CutError::Contradiction { view: view(), first: i + 1, second: j + 1, x, y });
-            }
+        let contradicts = |b: &Click| a.head != b.head && pixel(a) == pixel(b);
+        if let Some(j) = clicks.iter().skip(i + 1).position(contradicts) {
+            let (first, second, (x, y)) = (i + 1, i + j + 2, pixel(a));
+            return Err(Error::cannot(
+                format!(
+                    "view `{view}`: clicks {first} and {second} call the same pixel ({x}, {y}) head and background"
+                ),
+                "remove the wrong one of the two clicks",
+            ));
         }
     }
     Ok(())
 }
 
+/// The error for a view without clicks.
+pub(in crate::mask) fn no_clicks(view: &str) -> Error {
+    Error::cannot(
+        format!("view `{view}` has no clicks"),
+        "click the face, the hair and each part of the garment (label 1), and twice the background (label 0)",
+    )
+}
+
 /// Two sides need some pixels each.
-pub(in crate::mask) fn check_size(view: &str, width: u32, height: u32) -> Result<(), CutError> {
-    if width < 16 || height < 16 {
-        return Err(CutError::TooSmall { view: view.into(), width, height });
+pub(in crate::mask) fn check_size(view: &str, width: u32, height: u32) -> Result<()> {
+    if width >= 16 && height >= 16 {
+        return Ok(());
     }
-    Ok(())
+    Err(Error::cannot(
+        format!("view `{view}`: a photograph of {width} × {height} pixels is too small to be cut"),
+        "give a photograph of at least 16 × 16 pixels",
+    ))
 }
 
 /// Marks the pixels whose centre is within `radius` of the segment from `a` to `b`.
@@ -82,17 +113,17 @@ fn draw(marked: &mut [bool], width: usize, height: usize, a: (f32, f32), b: (f32
     }
 }
 
-/// What is certain from the clicks: `[height · width]`, and warnings about clicks in each other's way.
+/// What is certain from the clicks, with a border margin of this share of the height: `[height · width]`, and warnings
+/// about clicks in each other's way.
 pub(in crate::mask) fn from_clicks(
     view: &str,
     clicks: &[Click],
     width: usize,
     height: usize,
-    options: &GrabcutOptions,
+    margin: f32,
 ) -> (Vec<Seed>, Vec<String>) {
-    let h = height as f32;
-    let mut seeds = border(width, height, options);
-    let radius = (options.seed_radius * h).max(options.seed_radius_least_px);
+    let mut seeds = border(width, height, margin);
+    let radius = (SEED_RADIUS * height as f32).max(LEAST_SEED_RADIUS_PX);
     let mut warnings = Vec::new();
     // where discs of both kinds overlap the nearer click is believed
     let mut nearest = vec![f32::INFINITY; width * height];
@@ -135,9 +166,9 @@ pub(in crate::mask) fn from_clicks(
 }
 
 /// The margins along the borders where no head is expected.
-pub(in crate::mask) fn border(width: usize, height: usize, options: &GrabcutOptions) -> Vec<Seed> {
-    let margin = (options.border_margin * height as f32).ceil() as usize;
-    let sides = (options.border_sides * height as f32) as usize;
+fn border(width: usize, height: usize, margin: f32) -> Vec<Seed> {
+    let margin = (margin * height as f32).ceil() as usize;
+    let sides = (BORDER_SIDES * height as f32) as usize;
     (0..width * height)
         .map(|i| {
             let (x, y) = (i % width, i / width);
@@ -150,46 +181,39 @@ pub(in crate::mask) fn border(width: usize, height: usize, options: &GrabcutOpti
         .collect()
 }
 
-/// Where a cut starts from, each `[height · width]`.
-pub(in crate::mask) struct Start {
-    /// Is the pixel nearer to the head's clicks than to definite background?
-    pub head: Vec<bool>,
-    /// False where the pixel is so much nearer to definite background that its colour is taken for the background's.
-    pub not_far: Vec<bool>,
-}
-
-/// The Voronoi start.
-pub(in crate::mask) fn start(
-    seeds: &[Seed],
-    clicks: &[Click],
-    width: usize,
-    height: usize,
-    options: &GrabcutOptions,
-) -> Start {
+/// The head's clicks as discs, joined by a line in their order: what the start measures distances from.
+pub(in crate::mask) fn skeleton(seeds: &[Seed], clicks: &[Click], width: usize, height: usize) -> Vec<bool> {
     let h = height as f32;
     let mut skeleton: Vec<bool> = seeds.iter().map(|k| *k == Seed::Head).collect();
     let head: Vec<(f32, f32)> = clicks.iter().filter(|c| c.head).map(|c| (c.x, c.y)).collect();
     for &p in &head {
-        draw(&mut skeleton, width, height, p, p, options.start_radius * h);
+        draw(&mut skeleton, width, height, p, p, START_RADIUS * h);
     }
     for pair in head.windows(2) {
-        draw(&mut skeleton, width, height, pair[0], pair[1], 0.5 * options.start_line * h);
+        draw(&mut skeleton, width, height, pair[0], pair[1], 0.5 * START_LINE * h);
     }
+    skeleton
+}
+
+/// The Voronoi start, twice `[height · width]`: whether a pixel is nearer to the skeleton than to definite background,
+/// and false where it is so much nearer to definite background that its color is taken for the background's.
+pub(in crate::mask) fn start(
+    seeds: &[Seed],
+    skeleton: &[bool],
+    width: usize,
+    height: usize,
+) -> [Vec<bool>; 2] {
     let background: Vec<bool> = seeds.iter().map(|k| *k == Seed::Background).collect();
-    let to_head = squared_distance(&skeleton, width, height);
+    let to_head = squared_distance(skeleton, width, height);
     let to_background = squared_distance(&background, width, height);
-    let nearer = |times: f32| -> Vec<bool> {
-        seeds
-            .iter()
-            .zip(to_head.iter().zip(&to_background))
-            .map(|(k, (head, background))| match k {
-                Seed::Head => true,
-                Seed::Background => false,
-                Seed::Unknown => *head < times * times * background,
-            })
-            .collect()
-    };
-    Start { head: nearer(1.0), not_far: nearer(options.start_apart) }
+    [1.0, START_APART].map(|times: f32| {
+        let nearer = |i: usize| match seeds[i] {
+            Seed::Head => true,
+            Seed::Background => false,
+            Seed::Unknown => to_head[i] < times * times * to_background[i],
+        };
+        (0..seeds.len()).map(nearer).collect()
+    })
 }
 
 #[cfg(test)]
@@ -204,22 +228,23 @@ mod tests {
     fn clicks_that_cannot_be_used_are_named() {
         let check = |clicks: &[Click]| check("007", clicks, 40, 30);
         assert_eq!(check(&[click(39.4, 29.4, true), click(-0.4, 0.0, false)]), Ok(()));
-        assert_eq!(check(&[]), Err(CutError::NoClicks { view: "007".into() }));
-        assert_eq!(check(&[click(1.0, 1.0, false)]), Err(CutError::NoHead { view: "007".into(), clicks: 1 }));
+        let refused = |clicks: &[Click], message: &str| {
+            let e = check(clicks).unwrap_err();
+            assert!(e.to_string().contains(message) && !e.hint().is_empty(), "{e}");
+        };
+        refused(&[], "view `007` has no clicks");
+        refused(&[click(1.0, 1.0, false)], "view `007`: all 1 clicks are on the background");
         for (x, y) in [(40.0, 3.0), (3.0, 30.0), (-1.0, 3.0), (f32::NAN, 3.0), (f32::INFINITY, 3.0)] {
-            let e = check(&[click(1.0, 1.0, true), click(x, y, false)]).unwrap_err();
-            assert!(matches!(e, CutError::OutsidePhoto { number: 2, .. }), "{e}");
+            refused(&[click(1.0, 1.0, true), click(x, y, false)], "click 2 at");
         }
-        let e = check(&[click(4.2, 5.0, true), click(9.0, 9.0, true), click(4.0, 5.3, false)]).unwrap_err();
-        assert!(matches!(e, CutError::Contradiction { first: 1, second: 3, x: 4, y: 5, .. }), "{e}");
-        assert!(!e.hint().is_empty());
+        let clicks = [click(4.2, 5.0, true), click(9.0, 9.0, true), click(4.0, 5.3, false)];
+        refused(&clicks, "clicks 1 and 3 call the same pixel (4, 5)");
     }
 
     #[test]
     fn clicks_close_together_share_their_discs_and_are_warned_about() {
-        let options = GrabcutOptions { border_margin: 0.0, ..GrabcutOptions::default() };
         let clicks = [click(10.0, 10.0, true), click(15.0, 10.0, false)];
-        let (seeds, warnings) = from_clicks("a", &clicks, 40, 30, &options);
+        let (seeds, warnings) = from_clicks("a", &clicks, 40, 30, 0.0);
         // discs of 4 pixels, 5 apart: 12 is nearer to the head, 13 to the background
         assert_eq!((seeds[10 * 40 + 12], seeds[10 * 40 + 13]), (Seed::Head, Seed::Background));
         assert_eq!((seeds[10 * 40 + 6], seeds[10 * 40 + 5]), (Seed::Head, Seed::Unknown));
@@ -228,16 +253,11 @@ mod tests {
     }
 
     #[test]
-    fn the_start_reaches_half_way_to_the_stage() {
-        let options = GrabcutOptions {
-            start_radius: 0.0,
-            start_line: 0.0,
-            border_margin: 0.0,
-            ..GrabcutOptions::default()
-        };
+    fn the_start_reaches_half_way_to_the_background() {
         let clicks = [click(10.0, 15.0, true), click(30.0, 15.0, false)];
-        let (seeds, _) = from_clicks("a", &clicks, 41, 31, &options);
-        let Start { head, not_far } = start(&seeds, &clicks, 41, 31, &options);
+        let (seeds, _) = from_clicks("a", &clicks, 41, 31, 0.0);
+        let discs: Vec<bool> = seeds.iter().map(|k| *k == Seed::Head).collect();
+        let [head, not_far] = start(&seeds, &discs, 41, 31);
         assert!(head[15 * 41 + 19] && !head[15 * 41 + 20] && head[0] && !head[40]);
         // between the discs of 4 pixels 12 are free; twice as far from one as from the other at two thirds
         assert!(not_far[15 * 41 + 21] && !not_far[15 * 41 + 23]);
@@ -245,8 +265,7 @@ mod tests {
 
     #[test]
     fn border_margins_leave_the_lower_sides_open() {
-        let options = GrabcutOptions { border_margin: 0.05, border_sides: 0.6, ..GrabcutOptions::default() };
-        let seeds = border(50, 100, &options);
+        let seeds = border(50, 100, 0.05);
         let at = |x: usize, y: usize| seeds[y * 50 + x] == Seed::Background;
         assert!(
             at(25, 4) && !at(25, 5) && at(4, 59) && at(45, 59) && !at(5, 59) && !at(0, 60) && !at(25, 99)

@@ -26,6 +26,7 @@ use super::trimap::{HEAD, UNKNOWN};
 use crate::geom::cofactors;
 use crate::image::{Gray, Photo};
 use crate::kernel::cg::{self, dot};
+use crate::{Error, Result};
 
 /// How the opacity of the band is solved for.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -65,39 +66,12 @@ pub struct Matte {
     pub unknowns: usize,
 }
 
-/// Why there is no solution.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum Unsolved {
-    /// The rounds were not enough, or the numbers ran away.
-    #[error("the residual is still {residual:.1e} after {rounds} rounds, not {tolerance:.0e}")]
-    Rounds {
-        /// How many were made.
-        rounds: usize,
-        /// What is left, against the right-hand side.
-        residual: f64,
-        /// What was asked for.
-        tolerance: f64,
-    },
-    /// No 3 × 3 window fits.
-    #[error("the picture is narrower than the windows of 3 × 3")]
-    Small,
-}
-
 /// Neighbours that come before a pixel, in raster order: (columns, rows).
+#[rustfmt::skip]
 const BEFORE: [(i32, i32); 12] = [
-    (-2, -2),
-    (-1, -2),
-    (0, -2),
-    (1, -2),
-    (2, -2),
-    (-2, -1),
-    (-1, -1),
-    (0, -1),
-    (1, -1),
-    (2, -1),
-    (-2, 0),
-    (-1, 0),
+    (-2, -2), (-1, -2), (0, -2), (1, -2), (2, -2),
+    (-2, -1), (-1, -1), (0, -1), (1, -1), (2, -1),
+    (-2, 0), (-1, 0),
 ];
 
 /// A symmetric matrix with the stencil of two pixels each way, over the pixels that take part.
@@ -126,7 +100,7 @@ impl Stencil {
 
     /// `L` of `A ≈ L Lᵀ` with the pattern of `A`. An incomplete factor can fail where a whole one cannot, so the
     /// diagonal is raised until it does not (Manteuffel 1980).
-    fn factor(&self) -> Factor<'_> {
+    fn factor(&self) -> IncompleteCholesky<'_> {
         let shared = shared_neighbours();
         let mut raised = 0.0;
         loop {
@@ -137,9 +111,14 @@ impl Stencil {
         }
     }
 
-    fn factor_raised(&self, raised: f64, shared: &[Vec<(usize, usize)>; 12]) -> Option<Factor<'_>> {
+    fn factor_raised(
+        &self,
+        raised: f64,
+        shared: &[Vec<(usize, usize)>; 12],
+    ) -> Option<IncompleteCholesky<'_>> {
         let n = self.diagonal.len();
-        let mut factor = Factor { inverse: vec![0.0; n], lower: vec![[0.0; 12]; n], column: &self.column };
+        let mut factor =
+            IncompleteCholesky { inverse: vec![0.0; n], lower: vec![[0.0; 12]; n], column: &self.column };
         for i in 0..n {
             let mut row = self.lower[i];
             let mut pivot = raised * self.diagonal[i];
@@ -166,14 +145,14 @@ impl Stencil {
 }
 
 /// An incomplete Cholesky factor with the pattern of its matrix.
-struct Factor<'a> {
+struct IncompleteCholesky<'a> {
     /// One over the diagonal.
     inverse: Vec<f64>,
     lower: Vec<[f64; 12]>,
     column: &'a [[u32; 12]],
 }
 
-impl Factor<'_> {
+impl IncompleteCholesky<'_> {
     /// Solves `L Lᵀ z = r`.
     fn solve(&self, r: &[f64], z: &mut [f64]) {
         for i in 0..r.len() {
@@ -204,13 +183,31 @@ fn shared_neighbours() -> [Vec<(usize, usize)>; 12] {
     })
 }
 
-/// Alpha of a photograph from its hard mask (head at 128 and more) and trimap; all of one size.
-pub fn closed_form(
-    photo: &Photo,
-    mask: &Gray,
-    trimap: &Gray,
-    options: &ClosedFormOptions,
-) -> Result<Matte, Unsolved> {
+/// Returns the alpha of a photograph from its hard mask (head at 128 and more) and trimap (0, 128, 255); all of one size.
+///
+/// # Errors
+/// When the rounds are not enough or the numbers run away, and when no 3 × 3 window fits into the picture.
+///
+/// # Examples
+///
+/// A dark half and a bright one, the columns where they meet unknown:
+///
+/// ```
+/// use tiface::image::{Gray, Photo};
+/// use tiface::mask::matting::closed_form::{ClosedFormOptions, closed_form};
+///
+/// let row: Vec<[u8; 3]> = [20, 20, 70, 170, 220, 220].map(|v| [v, v, v / 2]).into();
+/// let photo = Photo { width: 6, height: 4, rgb: row.repeat(4), alpha: None };
+/// let gray = |row: [u8; 6]| Gray { width: 6, height: 4, values: row.repeat(4) };
+/// let (mask, trimap) = (gray([0, 0, 0, 255, 255, 255]), gray([0, 0, 128, 128, 255, 255]));
+///
+/// let options = ClosedFormOptions { prior_weight: 0.0, ..ClosedFormOptions::default() };
+/// let matte = closed_form(&photo, &mask, &trimap, &options)?;
+/// // alpha is linear in color: (70 − 20) / 200 and (170 − 20) / 200
+/// assert!((matte.alpha[2] - 0.25).abs() < 0.01 && (matte.alpha[3] - 0.75).abs() < 0.01);
+/// # Ok::<(), tiface::Error>(())
+/// ```
+pub fn closed_form(photo: &Photo, mask: &Gray, trimap: &Gray, options: &ClosedFormOptions) -> Result<Matte> {
     assert_eq!((photo.width, photo.height), (mask.width, mask.height));
     assert_eq!((photo.width, photo.height), (trimap.width, trimap.height));
     let definite = |v: u8| if v == HEAD { 1.0 } else { 0.0 };
@@ -219,7 +216,7 @@ pub fn closed_form(
         return Ok(Matte { alpha, rounds: 0, unknowns: 0 });
     }
     if photo.width < 3 || photo.height < 3 {
-        return Err(Unsolved::Small);
+        return Err(unsolved("the picture is narrower than the windows of 3 × 3".into()));
     }
     let (mut matrix, pixels) = assemble(photo, trimap, options.epsilon);
     let mut right = vec![0.0; pixels.len()];
@@ -321,19 +318,18 @@ fn window(colours: &[[u8; 3]; 9], epsilon: f64) -> ([[f64; 3]; 9], [[f64; 3]; 9]
         covariance(1, 2),
         covariance(2, 2) + more,
     ];
-    let inverse = inverted(symmetric);
+    let (cofactors, determinant) = cofactors(symmetric);
+    let inverse = cofactors.map(|c| c / determinant);
     (difference, difference.map(|d| product(&inverse, d)))
-}
-
-/// The inverse of a symmetric matrix, each as `xx xy xz yy yz zz`.
-fn inverted(matrix: [f64; 6]) -> [f64; 6] {
-    let (cofactors, determinant) = cofactors(matrix);
-    cofactors.map(|c| c / determinant)
 }
 
 /// A symmetric matrix `xx xy xz yy yz zz` times a vector.
 fn product([xx, xy, xz, yy, yz, zz]: &[f64; 6], [x, y, z]: [f64; 3]) -> [f64; 3] {
     [xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z]
+}
+
+fn unsolved(why: String) -> Error {
+    Error::cannot(why, "keep the hard mask, or widen the unknown region")
 }
 
 /// Preconditioned conjugate gradients from the start in `x`; returns the rounds made.
@@ -342,7 +338,7 @@ fn conjugate_gradients(
     right: &[f64],
     x: &mut [f64],
     options: &ClosedFormOptions,
-) -> Result<usize, Unsolved> {
+) -> Result<usize> {
     let scale = dot(right, right).sqrt();
     if scale == 0.0 {
         x.fill(0.0); // no definite head beside the band: alpha 0 satisfies everything
@@ -360,7 +356,10 @@ fn conjugate_gradients(
     let (times, solve) =
         (|p: &[f64], ap: &mut [f64]| matrix.times(p, ap), |r: &[f64], z: &mut [f64]| factor.solve(r, z));
     let rounds = cg::conjugate_gradients(x, start, times, solve, done);
-    if residual <= tolerance { Ok(rounds) } else { Err(Unsolved::Rounds { rounds, residual, tolerance }) }
+    if residual <= tolerance {
+        return Ok(rounds);
+    }
+    Err(unsolved(format!("the residual is still {residual:.1e} after {rounds} rounds, not {tolerance:.0e}")))
 }
 
 #[cfg(test)]
@@ -538,7 +537,7 @@ mod tests {
         let (photo, trimap) = small(40, 30);
         let options = ClosedFormOptions { rounds: 2, ..PUBLISHED };
         let error = closed_form(&photo, &cut(&trimap), &trimap, &options).unwrap_err();
-        assert!(matches!(error, Unsolved::Rounds { rounds: 2, residual, .. } if residual > 1e-7), "{error}");
+        assert!(error.to_string().contains("after 2 rounds, not 1e-7"), "{error}");
     }
 
     #[test]
@@ -548,7 +547,8 @@ mod tests {
         let matte = closed_form(&photo, &cut(&trimap), &trimap, &PUBLISHED).unwrap();
         assert!(matte.alpha.iter().zip(&trimap.values).all(|(&a, &v)| a == v as f32 / 255.0));
         let (photo, trimap) = small(12, 2);
-        assert_eq!(closed_form(&photo, &cut(&trimap), &trimap, &PUBLISHED), Err(Unsolved::Small));
+        let error = closed_form(&photo, &cut(&trimap), &trimap, &PUBLISHED).unwrap_err();
+        assert!(error.to_string().contains("narrower than the windows"), "{error}");
         let (photo, mut trimap) = small(12, 10);
         trimap.values.fill(UNKNOWN);
         let matte = closed_form(&photo, &cut(&trimap), &trimap, &PUBLISHED).unwrap();

@@ -20,7 +20,7 @@ pub const OUTSIDE: u8 = 0;
 
 /// How wide the unknown band is.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Band {
+pub enum UnknownBand {
     /// `kernel × kernel` ones applied `iterations` times each way.
     Squares {
         /// Side of the square, pixels; with an even one the band lies half a pixel to the lower right.
@@ -35,24 +35,24 @@ pub enum Band {
     },
 }
 
-impl Default for Band {
+impl Default for UnknownBand {
     /// 2.3 % of the height: 24 pixels of 1024, about what the published squares, 10 wide and
     /// five times, make of them.
-    fn default() -> Band {
-        Band::Discs { share: 0.023 }
+    fn default() -> UnknownBand {
+        UnknownBand::Discs { share: 0.023 }
     }
 }
 
 /// The trimap of a mask, which is head where it is 128 or more.
-pub fn trimap(mask: &Gray, band: Band) -> Gray {
+pub fn trimap(mask: &Gray, band: UnknownBand) -> Gray {
     let (width, height) = (mask.width as usize, mask.height as usize);
     let head: Vec<bool> = mask.values.iter().map(|&v| v >= 128).collect();
     let (definite, maybe) = match band {
-        Band::Squares { kernel, iterations } => (
+        UnknownBand::Squares { kernel, iterations } => (
             erode(&head, width, height, kernel, iterations),
             dilate(&head, width, height, kernel, iterations),
         ),
-        Band::Discs { share } => {
+        UnknownBand::Discs { share } => {
             let radius = share * height as f32;
             (distance::shrink(&head, width, height, radius), distance::grow(&head, width, height, radius))
         }
@@ -86,37 +86,33 @@ pub fn dilate(marked: &[bool], width: usize, height: usize, kernel: u32, iterati
     let before = (kernel / 2).saturating_mul(iterations);
     let behind = (kernel - 1 - kernel / 2).saturating_mul(iterations);
     let mut rows = vec![false; marked.len()];
-    let mut seen = Vec::new();
-    for (row, out) in marked.chunks_exact(width.max(1)).zip(rows.chunks_exact_mut(width.max(1))) {
-        windows(row.iter().copied(), before, behind, &mut seen, |x, any| out[x] = any);
-    }
+    dilate_lines(marked, &mut rows, (height, width), (width, 1), before, behind);
     let mut all = vec![false; marked.len()];
-    for x in 0..width {
-        let column = (0..height).map(|y| rows[y * width + x]);
-        windows(column, before, behind, &mut seen, |y, any| all[y * width + x] = any);
-    }
+    dilate_lines(&rows, &mut all, (width, height), (1, width), before, behind);
     all
 }
 
-/// For each place of a line: is anything marked from `before` places before it to `behind` places behind?
-fn windows(
-    line: impl Iterator<Item = bool>,
+/// Along each of `lines` of `length` places: is anything marked from `before` places before to `behind` places behind?
+/// Steps are those from line to line and from place to place.
+fn dilate_lines(
+    marked: &[bool],
+    out: &mut [bool],
+    (lines, length): (usize, usize),
+    (line_step, step): (usize, usize),
     before: usize,
     behind: usize,
-    seen: &mut Vec<u32>,
-    mut put: impl FnMut(usize, bool),
 ) {
-    seen.clear();
-    seen.push(0);
-    let mut count = 0;
-    seen.extend(line.map(|m| {
-        count += m as u32;
-        count
-    }));
-    let n = seen.len() - 1;
-    for i in 0..n {
-        let (from, to) = (i.saturating_sub(before), i.saturating_add(behind).saturating_add(1).min(n));
-        put(i, seen[to] > seen[from]);
+    let mut seen = vec![0u32; length + 1];
+    for line in 0..lines {
+        let at = |i: usize| line * line_step + i * step;
+        for i in 0..length {
+            seen[i + 1] = seen[i] + marked[at(i)] as u32;
+        }
+        for i in 0..length {
+            let (from, to) =
+                (i.saturating_sub(before), i.saturating_add(behind).saturating_add(1).min(length));
+            out[at(i)] = seen[to] > seen[from];
+        }
     }
 }
 
@@ -177,7 +173,7 @@ mod tests {
         // the lower half of 8 × 20 is head: rows 10 and on; 10 % of 20 rows are 2 pixels each way
         let mask =
             Gray { width: 8, height: 20, values: (0..160).map(|i| if i < 80 { 0 } else { 255 }).collect() };
-        let tri = trimap(&mask, Band::Discs { share: 0.1 });
+        let tri = trimap(&mask, UnknownBand::Discs { share: 0.1 });
         let rows: Vec<u8> = (0..20).map(|y| tri.values[y * 8 + 3]).collect();
         assert!(rows[..8].iter().all(|&v| v == 0) && rows[8..12].iter().all(|&v| v == 128), "{rows:?}");
         assert!(rows[12..].iter().all(|&v| v == 255), "{rows:?}");
@@ -196,7 +192,7 @@ mod tests {
         let read = |name: &str| read_gray(&folder.join(name), None, &Limits::default()).unwrap();
         let mask = read("mask.png");
         for (kernel, iterations) in [(10, 5), (3, 3), (4, 2), (5, 1)] {
-            let ours = trimap(&mask, Band::Squares { kernel, iterations });
+            let ours = trimap(&mask, UnknownBand::Squares { kernel, iterations });
             assert!(ours == read(&format!("trimap_k{kernel}_i{iterations}.png")), "{kernel} {iterations}");
         }
     }

@@ -13,46 +13,44 @@
 //! an engine that runs out of memory ends the process; the built-in one is kept from arrays beyond a limit.)
 
 mod contract;
-mod error;
 mod ort;
 mod seam;
 mod tract;
 
-pub use self::contract::{Contract, Port};
-pub use self::error::MaskNetworkError;
-pub use self::ort::Runtime;
-pub(super) use self::seam::Array;
+pub(super) use self::contract::{Contract, Role};
+pub(super) use self::ort::Runtime;
+pub use self::seam::NetworkFile;
+pub(super) use self::seam::{NetworkArray, file_error};
 
-use self::error::shown;
-use self::seam::{guarded, hexadecimal};
+use self::contract::Port;
+use self::seam::{guarded, one_line};
 use crate::io::{self, Limits};
-use std::path::{Path, PathBuf};
+use crate::{Error, Result};
+use std::path::Path;
 use tract_onnx::prelude::Framework;
 
-/// What bounds a session.
-#[derive(Clone, Debug)]
-pub(super) struct SessionLimits {
-    /// Bytes of a network's file.
-    pub file_bytes: u64,
-    /// Bytes of the largest single array the built-in engine may plan.
+/// Bytes of a network's file at most; a Protocol Buffers message cannot be larger.
+const MOST_FILE_BYTES: u64 = 2 << 30;
+
+/// What runs networks, and within which bounds.
+pub(super) struct Engines {
+    /// ONNX Runtime; without it tract runs the files.
+    pub runtime: Option<Runtime>,
+    /// Bytes of the largest single array that tract may plan.
     pub array_bytes: u64,
-    /// Threads of ONNX Runtime inside one run; 0: as many as it likes.
+    /// Threads of ONNX Runtime inside one run; 0: as many as it likes. tract uses one.
     pub threads: usize,
 }
 
 enum Engine {
-    Tract(Box<tract::Model>),
-    Ort(ort::Model),
+    Tract(Box<tract::TractModel>),
+    Ort(ort::OrtModel),
 }
 
 /// A network ready to run.
 pub(super) struct Session {
     /// Its file.
-    pub path: PathBuf,
-    /// Bytes of the file.
-    pub bytes: u64,
-    /// SHA-256 of the file, in hexadecimal.
-    pub sha256: String,
+    pub file: NetworkFile,
     /// What it takes, in the file's order.
     pub inputs: Vec<Port>,
     /// Which network it is.
@@ -61,24 +59,20 @@ pub(super) struct Session {
 }
 
 impl Session {
-    /// Reads, recognises and loads a file; with `runtime` ONNX Runtime runs it, else tract.
-    pub(super) fn open(
-        path: &Path,
-        runtime: Option<&Runtime>,
-        limits: &SessionLimits,
-    ) -> Result<Session, MaskNetworkError> {
-        let wrong = |problem: String, hint| MaskNetworkError::file(path, problem, hint);
-        let bytes = io::read_bytes(path, &Limits { file_bytes: limits.file_bytes, ..Limits::default() })?;
+    /// Reads, recognises and loads a file, which must be of a form of this role.
+    pub(super) fn open(role: Role, path: &Path, engines: &Engines) -> Result<Session> {
+        let bytes = io::read_bytes(path, &Limits { file_bytes: MOST_FILE_BYTES, ..Limits::default() })?;
         if names_another_file(&bytes) {
-            return Err(wrong(
-                "is refused: its weights lie in another file".into(),
+            return Err(file_error(
+                path,
+                "is refused: its weights lie in another file",
                 "take a file that holds its weights itself; `onnx.save(onnx.load(FILE), NEW)` in Python makes one",
             ));
         }
         let read = || tract_onnx::onnx().proto_model_for_read(&mut &bytes[..]).map_err(|e| format!("{e:#}"));
         let not_onnx = |why: String| {
             let hint = "copy the file again; a broken download, or the web page around it, looks like this";
-            wrong(format!("is not a sound ONNX file: {}", shown(&why)), hint)
+            file_error(path, &format!("is not a sound ONNX file: {}", one_line(&why)), hint)
         };
         let proto = guarded(read).map_err(not_onnx)?;
         let graph = proto.graph.as_ref().ok_or_else(|| not_onnx("it holds no graph".into()))?;
@@ -88,45 +82,30 @@ impl Session {
         let inputs: Vec<Port> = inputs.map(Port::new).collect();
         let outputs: Vec<Port> = graph.output.iter().map(Port::new).collect();
         let contract = contract::recognise(&inputs, &outputs).map_err(|why| {
-            wrong(
-                format!("is no SAM or ViTMatte network: {why}"),
+            file_error(
+                path,
+                &format!("is no SAM or ViTMatte network: {why}"),
                 "give a SAM encoder and its decoder, or a ViTMatte network, exported with transformers or by SAM's \
                  own script",
             )
         })?;
-        let engine = match runtime {
-            None => guarded(|| tract::Model::load(&proto, contract.outputs(), limits.array_bytes))
+        let (key, named) = role.words();
+        if contract.role() != role {
+            let hint = format!("give the file where a {contract} is asked for");
+            return Err(file_error(path, &format!("is a {contract}, but was given as {named}"), hint));
+        }
+        let outputs = contract.outputs();
+        let engine = match &engines.runtime {
+            None => guarded(|| tract::TractModel::load(&proto, outputs, engines.array_bytes))
                 .map(|model| Engine::Tract(Box::new(model))),
             Some(runtime) => {
-                guarded(|| ort::Model::load(runtime, &bytes, contract.outputs(), limits.threads))
-                    .map(Engine::Ort)
+                guarded(|| ort::OrtModel::load(runtime, &bytes, outputs, engines.threads)).map(Engine::Ort)
             }
         };
-        let engine = engine.map_err(|problem| engine_error(path, runtime.is_some(), "load", &problem))?;
-        let sha256 = hexadecimal(&bytes);
-        Ok(Session { path: path.into(), bytes: bytes.len() as u64, sha256, inputs, contract, engine })
-    }
-
-    /// Opens a file that must be of one of these forms.
-    pub(super) fn open_as(
-        given_as: &str,
-        is_one: fn(Contract) -> bool,
-        path: &Path,
-        runtime: Option<&Runtime>,
-        limits: &SessionLimits,
-    ) -> Result<Session, MaskNetworkError> {
-        let session = Session::open(path, runtime, limits)?;
-        if is_one(session.contract) {
-            return Ok(session);
-        }
-        let is = session.contract.to_string();
-        let hint = format!("give the file where a {is} is asked for");
-        Err(MaskNetworkError::file(path, format!("is a {is}, but was given as {given_as}"), &hint))
-    }
-
-    /// Name and version of the engine.
-    pub(super) fn engine(&self) -> &'static str {
-        if self.runs_alone() { ort::NAME } else { tract::NAME }
+        let engine = engine.map_err(|e| engine_error(path, engines.runtime.is_some(), "load", &e))?;
+        let name = if engines.runtime.is_some() { ort::NAME } else { tract::NAME };
+        let file = NetworkFile::new(key, path, &bytes, contract, name);
+        Ok(Session { file, inputs, contract, engine })
     }
 
     /// Does one run at a time use all threads? tract runs several side by side, each on one thread.
@@ -135,7 +114,7 @@ impl Session {
     }
 
     /// Feeds the inputs by name; gives the outputs of its form, every number of them finite.
-    pub(super) fn run(&self, inputs: &[(&str, Array)]) -> Result<Vec<Array>, MaskNetworkError> {
+    pub(super) fn run(&self, inputs: &[(&str, NetworkArray)]) -> Result<Vec<NetworkArray>> {
         let run = || {
             let mut fed = Vec::new();
             for port in &self.inputs {
@@ -147,7 +126,7 @@ impl Session {
                 Engine::Ort(model) => model.run(&fed),
             }
         };
-        let given = guarded(run).map_err(|e| engine_error(&self.path, self.runs_alone(), "run", &e))?;
+        let given = guarded(run).map_err(|e| engine_error(&self.file.path, self.runs_alone(), "run", &e))?;
         let names = self.contract.outputs();
         if given.len() != names.len() {
             return Err(self.unusable(names[0], "the engine left outputs out"));
@@ -165,8 +144,9 @@ impl Session {
     }
 
     /// The output is not as its form promises.
-    pub(super) fn unusable(&self, output: &str, problem: impl Into<String>) -> MaskNetworkError {
-        MaskNetworkError::Output { path: self.path.clone(), output: output.into(), problem: problem.into() }
+    pub(super) fn unusable(&self, output: &str, problem: impl std::fmt::Display) -> Error {
+        let hint = "take the network's file from its publisher again; its weights or its graph are damaged";
+        file_error(&self.file.path, &format!("gave an unusable `{output}`: {problem}"), hint)
     }
 
     /// Extent of one axis of an input, where the file fixes it.
@@ -184,7 +164,7 @@ fn names_another_file(bytes: &[u8]) -> bool {
         || bytes.windows(9).any(|w| w == b"EPContext")
 }
 
-fn engine_error(path: &Path, runtime: bool, doing: &'static str, problem: &str) -> MaskNetworkError {
+fn engine_error(path: &Path, runtime: bool, doing: &str, problem: &str) -> Error {
     let (engine, hint) = match runtime {
         true => (ort::NAME, "take a newer ONNX Runtime, or the float32 file from its publisher again"),
         false => (
@@ -193,10 +173,8 @@ fn engine_error(path: &Path, runtime: bool, doing: &'static str, problem: &str) 
              cannot: name its library, 1.17 or later (`pip install onnxruntime` brings one)",
         ),
     };
-    MaskNetworkError::Engine { path: path.into(), engine, doing, problem: shown(problem), hint }
+    Error::cannot(format!("{engine} cannot {doing} `{}`: {}", path.display(), one_line(problem)), hint)
 }
 
-#[cfg(test)]
-pub(super) mod made;
 #[cfg(test)]
 pub(super) mod tests;

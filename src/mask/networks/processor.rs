@@ -3,9 +3,10 @@
 //! Looked for in the folder of the network's file, and in the folder above when that is called `onnx`, which is
 //! how public collections lie. A file of the other network's processor is not obeyed.
 
-use super::onnx::MaskNetworkError;
+use super::onnx::file_error;
+use crate::Result;
 use crate::io::{self, Limits};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Mean and standard deviation of ImageNet's colours in 0..1: what SAM and ViTMatte were trained with.
 pub(super) const IMAGENET: Normal = Normal { mean: [0.485, 0.456, 0.406], std: [0.229, 0.224, 0.225] };
@@ -27,11 +28,9 @@ impl Normal {
 }
 
 /// What a processor file says.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Processor {
-    /// The file.
-    pub path: PathBuf,
-    /// How it normalises.
+    /// How it normalizes.
     pub normal: Normal,
     /// Side of the padded square (`pad_size`, else `size.longest_edge`), where it is said.
     pub side: Option<usize>,
@@ -39,7 +38,7 @@ pub(super) struct Processor {
 
 /// The processor file of the network at `network`, unless there is none or it is of another network than
 /// `kind` ("sam", "vitmatte").
-pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>, MaskNetworkError> {
+pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>> {
     const NAME: &str = "preprocessor_config.json";
     let folder = network.parent().unwrap_or(Path::new(""));
     let mut places = vec![folder.join(NAME)];
@@ -58,9 +57,9 @@ pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>, Ma
     }
     let wrong = |problem: String| {
         let hint = "take the processor file of the same export, or remove it: then the network's published numbers hold";
-        MaskNetworkError::file(&path, format!("is unusable: {problem}"), hint)
+        file_error(&path, &format!("is unusable: {problem}"), hint)
     };
-    let three = |key: &str, usual: [f64; 3], sound: fn(f64) -> bool| -> Result<[f64; 3], MaskNetworkError> {
+    let three = |key: &str, usual: [f64; 3], sound: fn(f64) -> bool| -> Result<[f64; 3]> {
         let value = &json[key];
         if value.is_null() {
             return Ok(usual);
@@ -81,7 +80,7 @@ pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>, Ma
         }
         Some(side) => usize::try_from(side).ok(),
     };
-    Ok(Some(Processor { path: path.clone(), normal: Normal { mean, std }, side }))
+    Ok(Some(Processor { normal: Normal { mean, std }, side }))
 }
 
 #[cfg(test)]
@@ -89,7 +88,7 @@ mod tests {
     use super::*;
     use std::fs;
 
-    fn at(text: &str, kind: &str) -> Result<Option<Processor>, MaskNetworkError> {
+    fn at(text: &str, kind: &str) -> Result<Option<Processor>> {
         let dir = tempfile::tempdir().unwrap();
         fs::write(dir.path().join("preprocessor_config.json"), text).unwrap();
         beside(&dir.path().join("x.onnx"), kind)
@@ -121,9 +120,9 @@ mod tests {
             r#"{"pad_size": {"height": 1000}}"#,
         ] {
             let error = at(text, "sam").unwrap_err();
-            assert!(matches!(error, MaskNetworkError::File { .. }), "{error}");
+            assert!(error.to_string().contains("preprocessor_config.json` is unusable"), "{error}");
         }
-        assert!(matches!(at("{", "sam"), Err(MaskNetworkError::Read(_))));
+        assert!(at("{", "sam").unwrap_err().to_string().contains("preprocessor_config.json"));
     }
 
     #[test]

@@ -9,11 +9,14 @@
 //! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label −1 at the
 //! end when no box is given. S and the embedding's width are read from the files.
 
-use super::onnx::{Array, Contract, MaskNetworkError, Runtime, Session, SessionLimits};
+use super::onnx::{Contract, Engines, NetworkArray, Role, Session, file_error};
 use super::processor::{self, IMAGENET, Normal};
-use super::resample;
 use crate::image::{Gray, Photo};
 use crate::mask::click::Click;
+use crate::mask::scale::bilinear;
+use crate::{Error, Result};
+use image::RgbImage;
+use image::imageops::{self, FilterType};
 use std::path::Path;
 
 /// Pixels of the photograph under one cell of the embedding.
@@ -37,7 +40,7 @@ pub(super) struct Sam {
 /// What the encoder makes of a photograph, and how the photograph lay in the square.
 pub(super) struct Embedding {
     /// `image_embeddings`, and for the split export `image_positional_embeddings`.
-    arrays: Vec<Array>,
+    arrays: Vec<NetworkArray>,
     /// Width and height inside the square.
     new: (usize, usize),
     /// Width and height of the photograph.
@@ -55,49 +58,43 @@ pub(super) struct Candidates {
 }
 
 impl Sam {
-    pub(super) fn open(
-        encoder: &Path,
-        decoder: &Path,
-        runtime: Option<&Runtime>,
-        limits: &SessionLimits,
-    ) -> Result<Sam, MaskNetworkError> {
-        let encodes = |c| matches!(c, Contract::SamEncoder | Contract::OriginalEncoder { .. });
-        let decodes = |c| matches!(c, Contract::SamDecoder { .. } | Contract::OriginalDecoder);
-        let encoder = Session::open_as("the SAM encoder", encodes, encoder, runtime, limits)?;
-        let decoder = Session::open_as("the SAM decoder", decodes, decoder, runtime, limits)?;
+    pub(super) fn open(encoder: &Path, decoder: &Path, engines: &Engines) -> Result<Sam> {
+        let mut encoder = Session::open(Role::Sam, encoder, engines)?;
+        let mut decoder = Session::open(Role::SamDecoder, decoder, engines)?;
         let mismatch = |problem: String| {
-            let problem = format!("does not fit to `{}`: {problem}", decoder.path.display());
-            MaskNetworkError::file(&encoder.path, problem, "take encoder and decoder from the same export")
+            let problem = format!("does not fit to `{}`: {problem}", decoder.file.path.display());
+            Err(file_error(&encoder.file.path, &problem, "take encoder and decoder from the same export"))
         };
         if matches!(encoder.contract, Contract::OriginalEncoder { .. })
             && matches!(decoder.contract, Contract::SamDecoder { .. })
         {
-            return Err(mismatch(format!("the decoder wants `{POSITION}`, which the encoder does not give")));
+            return mismatch(format!("the decoder wants `{POSITION}`, which the encoder does not give"));
         }
-        let processor = processor::beside(&encoder.path, "sam")?;
+        let processor = processor::beside(&encoder.file.path, "sam")?;
         let takes = &encoder.inputs[0];
+        if takes.extent(2).zip(takes.extent(3)).is_some_and(|(rows, columns)| rows != columns) {
+            return mismatch(format!("the encoder's input {} is not square", takes.shape_in_words()));
+        }
         let fixed = match encoder.contract {
             Contract::OriginalEncoder { picture: true } => None,
             _ => takes.extent(2).or(takes.extent(3)),
         };
-        if takes.extent(2).zip(takes.extent(3)).is_some_and(|(rows, columns)| rows != columns) {
-            return Err(mismatch(format!("the encoder's input {} is not square", takes.shape_in_words())));
-        }
         let grid = decoder.input_extent(EMBEDDING, 2).or(decoder.input_extent(EMBEDDING, 3));
         let side = fixed
             .or(processor.as_ref().and_then(|p| p.side))
             .or(grid.map(|g| g.saturating_mul(CELL)))
             .unwrap_or(USUAL_SIDE);
         if !side.is_multiple_of(CELL) || !(64..=4096).contains(&side) {
-            return Err(mismatch(format!(
-                "the side is {side} pixels, expected a multiple of 16 from 64 to 4096"
-            )));
+            return mismatch(format!("the side is {side} pixels, expected a multiple of 16 from 64 to 4096"));
         }
         if let Some(grid) = grid.filter(|g| g.saturating_mul(CELL) != side) {
             let cells = side / CELL;
-            return Err(mismatch(format!(
+            return mismatch(format!(
                 "the encoder makes {cells} × {cells} cells, the decoder takes {grid} × {grid}"
-            )));
+            ));
+        }
+        for session in [&mut encoder, &mut decoder] {
+            session.file.contract += &format!(", {side} pixels a side");
         }
         let normal = processor.map_or(IMAGENET, |p| p.normal);
         Ok(Sam { encoder, decoder, side, normal })
@@ -111,17 +108,17 @@ impl Sam {
     }
 
     /// The photograph as the encoder takes it.
-    pub(super) fn pixels(&self, photo: &Photo) -> Array {
+    pub(super) fn pixels(&self, photo: &Photo) -> NetworkArray {
         let (w, h) = self.fitted(photo.width as usize, photo.height as usize);
-        let rgb = resample::photo(photo, w, h);
+        let rgb = resized(photo, w, h);
         if let Contract::OriginalEncoder { picture: true } = self.encoder.contract {
-            return Array::new(&[h, w, 3], rgb.iter().flatten().map(|&v| f32::from(v)).collect());
+            return NetworkArray::new(&[h, w, 3], rgb.iter().flatten().map(|&v| f32::from(v)).collect());
         }
         normalised(&rgb, w, self.side, &self.normal)
     }
 
     /// Runs the encoder.
-    pub(super) fn embed(&self, photo: &Photo) -> Result<Embedding, MaskNetworkError> {
+    pub(super) fn embed(&self, photo: &Photo) -> Result<Embedding> {
         let old = (photo.width as usize, photo.height as usize);
         let pixels = self.pixels(photo);
         let names = self.encoder.contract.outputs();
@@ -141,7 +138,11 @@ impl Sam {
     }
 
     /// The decoder's inputs for these clicks.
-    pub(super) fn prompt(&self, embedding: &Embedding, clicks: &[Click]) -> Vec<(&'static str, Array)> {
+    pub(super) fn prompt(
+        &self,
+        embedding: &Embedding,
+        clicks: &[Click],
+    ) -> Vec<(&'static str, NetworkArray)> {
         let (new, old) = (embedding.new, embedding.old);
         let (sx, sy) = (new.0 as f64 / old.0 as f64, new.1 as f64 / old.1 as f64);
         let placed = |c: &Click| [(f64::from(c.x) * sx) as f32, (f64::from(c.y) * sy) as f32];
@@ -151,12 +152,15 @@ impl Sam {
         let n = clicks.len();
         if let Contract::SamDecoder { labels } = self.decoder.contract {
             let mut inputs = vec![
-                ("input_points", Array::new(&[1, 1, n, 2], points)),
+                ("input_points", NetworkArray::new(&[1, 1, n, 2], points)),
                 (EMBEDDING, array(0)),
                 (POSITION, array(1)),
             ];
             if labels {
-                inputs.push(("input_labels", Array::new(&[1, 1, n], clicks.iter().map(label).collect())));
+                inputs.push((
+                    "input_labels",
+                    NetworkArray::new(&[1, 1, n], clicks.iter().map(label).collect()),
+                ));
             }
             return inputs;
         }
@@ -166,24 +170,20 @@ impl Sam {
         let quarter = self.side / 4;
         vec![
             (EMBEDDING, array(0)),
-            ("point_coords", Array::new(&[1, n + 1, 2], points)),
-            ("point_labels", Array::new(&[1, n + 1], labels)),
-            ("mask_input", Array::new(&[1, 1, quarter, quarter], vec![0.0; quarter * quarter])),
-            ("has_mask_input", Array::new(&[1], vec![0.0])),
-            ("orig_im_size", Array::new(&[2], vec![old.1 as f32, old.0 as f32])),
+            ("point_coords", NetworkArray::new(&[1, n + 1, 2], points)),
+            ("point_labels", NetworkArray::new(&[1, n + 1], labels)),
+            ("mask_input", NetworkArray::new(&[1, 1, quarter, quarter], vec![0.0; quarter * quarter])),
+            ("has_mask_input", NetworkArray::new(&[1], vec![0.0])),
+            ("orig_im_size", NetworkArray::new(&[2], vec![old.1 as f32, old.0 as f32])),
         ]
     }
 
     /// Runs the decoder.
-    pub(super) fn decode(
-        &self,
-        embedding: &Embedding,
-        clicks: &[Click],
-    ) -> Result<Candidates, MaskNetworkError> {
+    pub(super) fn decode(&self, embedding: &Embedding, clicks: &[Click]) -> Result<Candidates> {
         self.check(clicks, embedding.old)?;
         let names = self.decoder.contract.outputs();
         let given = self.decoder.run(&self.prompt(embedding, clicks))?;
-        let [scores, logits] = <[Array; 2]>::try_from(given)
+        let [scores, logits] = <[NetworkArray; 2]>::try_from(given)
             .map_err(|_| self.decoder.unusable(names[0], "the engine left it out"))?;
         let quarter = self.side / 4;
         let split = matches!(self.decoder.contract, Contract::SamDecoder { .. });
@@ -207,12 +207,11 @@ impl Sam {
     pub(super) fn on_photo(&self, embedding: &Embedding, candidates: &Candidates, which: usize) -> Vec<f32> {
         let quarter = self.side / 4;
         let small = &candidates.logits[which * quarter * quarter..][..quarter * quarter];
-        let square = resample::field(small, quarter, (quarter, quarter), (self.side, self.side));
-        resample::field(&square, self.side, embedding.new, embedding.old)
+        enlarged(small, quarter, self.side, embedding.new, embedding.old)
     }
 
     /// The hard mask (0 or 255) and its score.
-    pub(super) fn segment(&self, photo: &Photo, clicks: &[Click]) -> Result<(Gray, f32), MaskNetworkError> {
+    pub(super) fn segment(&self, photo: &Photo, clicks: &[Click]) -> Result<(Gray, f32)> {
         // before the slow part
         self.check(clicks, (photo.width as usize, photo.height as usize))?;
         let embedding = self.embed(photo)?;
@@ -223,9 +222,9 @@ impl Sam {
         Ok((mask, candidates.scores[candidates.best]))
     }
 
-    fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<(), MaskNetworkError> {
+    fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<()> {
         let fault = |problem: String, hint: &str| {
-            Err(MaskNetworkError::asked(format!("the clicks cannot be used: {problem}"), hint))
+            Err(Error::cannot(format!("the clicks cannot be used: {problem}"), hint))
         };
         if !clicks.iter().any(|c| c.head) {
             return fault("none of them is on the head".into(), "click at least the face and the hair");
@@ -246,7 +245,7 @@ impl Sam {
         if self.decoder.contract == (Contract::SamDecoder { labels: false })
             && let Some(i) = clicks.iter().position(|c| !c.head)
         {
-            let file = self.decoder.path.display();
+            let file = self.decoder.file.path.display();
             return fault(
                 format!("number {} is on the background, but `{file}` takes no labels", i + 1),
                 "use a decoder with `input_labels`, or leave the clicks on the background out",
@@ -256,8 +255,31 @@ impl Sam {
     }
 }
 
+/// The photograph's colors at `width` × `height`, antialiased bilinear, as SAM's processors resize.
+pub(super) fn resized(photo: &Photo, width: usize, height: usize) -> Vec<[u8; 3]> {
+    let picture = RgbImage::from_raw(photo.width, photo.height, photo.rgb.as_flattened().to_vec());
+    let resized =
+        imageops::resize(&picture.unwrap_or_default(), width as u32, height as u32, FilterType::Triangle);
+    resized.as_chunks::<3>().0.to_vec()
+}
+
+/// Logits of `quarter` × `quarter` at the `side` of the square, then without its padding at the photograph's size: both
+/// bilinear, as PyTorch's without antialiasing.
+pub(super) fn enlarged(
+    logits: &[f32],
+    quarter: usize,
+    side: usize,
+    new: (usize, usize),
+    old: (usize, usize),
+) -> Vec<f32> {
+    let size = |(w, h): (usize, usize)| (w as u32, h as u32);
+    let (quarter, side) = (quarter as u32, side as u32);
+    let square = bilinear(logits, quarter, (quarter, quarter), (side, side), |v| v);
+    bilinear(&square, side, size(new), size(old), |v| v)
+}
+
 /// `[1, 3, side, side]`: normalised colours in the upper left, zeros right and below.
-pub(super) fn normalised(rgb: &[[u8; 3]], width: usize, side: usize, normal: &Normal) -> Array {
+pub(super) fn normalised(rgb: &[[u8; 3]], width: usize, side: usize, normal: &Normal) -> NetworkArray {
     let mut values = vec![0.0; 3 * side * side];
     for (i, colour) in rgb.iter().enumerate() {
         let at = i / width * side + i % width;
@@ -265,7 +287,7 @@ pub(super) fn normalised(rgb: &[[u8; 3]], width: usize, side: usize, normal: &No
             values[c * side * side + at] = normal.apply(colour[c], c);
         }
     }
-    Array::new(&[1, 3, side, side], values)
+    NetworkArray::new(&[1, 3, side, side], values)
 }
 
 /// The first of the highest scores from `begin` on.
@@ -286,6 +308,19 @@ fn best_of_original(scores: &[f32], clicks: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn halving_averages_over_a_triangle_four_pixels_wide() {
+        // new pixel 0 lies at 1, reach 2: old 0.5, 1.5, 2.5 weigh 0.75, 0.75, 0.25 of 1.75
+        // 0 · 0.43 + 70 · 0.43 + 140 · 0.14 = 50; new pixel 1 mirrors it: 0.25, 0.75, 0.75 → 160
+        let line = |values: &[u8]| {
+            let rgb = values.iter().map(|&v| [v; 3]).collect();
+            Photo { width: values.len() as u32, height: 1, rgb, alpha: None }
+        };
+        assert_eq!(resized(&line(&[0, 70, 140, 210]), 2, 1), [[50; 3], [160; 3]]);
+        // quarter pixels, the edge repeated
+        assert_eq!(resized(&line(&[0, 100]), 4, 1), [[0; 3], [25; 3], [75; 3], [100; 3]]);
+    }
 
     #[test]
     fn the_best_of_four_depends_on_how_many_clicks_there_were() {

@@ -3,26 +3,27 @@
 //! Tolerances are those of the vectors' own description: 1e-4 for embeddings, masks and logits, 5e-5 for scores
 //! and alphas, 1e-6 for normalised pixels, 2 of 255 and a mean of 0.3 for resized pictures, 1 % of mask pixels.
 
-use super::onnx::tests::{engines, shared};
-use super::onnx::{Array, MaskNetworkError, Runtime, Session, SessionLimits, made};
+use super::Networks;
+use super::onnx::tests::{config, engines, made, shared};
+use super::onnx::{Engines, NetworkArray, Role, Runtime, Session};
 use super::processor::IMAGENET;
-use super::sam::{Sam, normalised};
+use super::sam::{Sam, enlarged, normalised, resized};
 use super::vitmatte::VitMatte;
-use super::{NetworkFiles, NetworkOptions, Networks};
-use super::{VitMatteColours, resample};
+use crate::Result;
+use crate::config::{MaskConfig, VitmatteColors};
 use crate::image::{Gray, Photo};
 use crate::io::{Limits, NpyValues, read_gray, read_json, read_npy, read_photo};
 use crate::mask::Click;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-fn array(path: &Path) -> Array {
+fn array(path: &Path) -> NetworkArray {
     let npy = read_npy(path, &Limits::default()).unwrap();
     let NpyValues::Number(values) = npy.values else { panic!("{} holds booleans", path.display()) };
-    Array::new(&npy.shape, values.iter().map(|&v| v as f32).collect())
+    NetworkArray::new(&npy.shape, values.iter().map(|&v| v as f32).collect())
 }
 
-fn numbers(array: &Array) -> &[f32] {
+fn numbers(array: &NetworkArray) -> &[f32] {
     &array.values
 }
 
@@ -34,17 +35,20 @@ fn close(what: &str, engine: &str, found: &[f32], expected: &[f32], tolerance: f
     assert!(worst <= tolerance, "{what} on {engine}: {worst} > {tolerance}");
 }
 
-fn limits() -> SessionLimits {
-    SessionLimits { file_bytes: 1 << 30, array_bytes: 1 << 32, threads: 0 }
+fn built_in() -> Engines {
+    Engines { runtime: None, array_bytes: 1 << 32, threads: 0 }
 }
 
 /// Each engine with its name.
-fn each_engine() -> Vec<(&'static str, Option<Runtime>)> {
+fn each_engine() -> Vec<(&'static str, Engines)> {
     engines()
         .iter()
         .map(|engine| match engine {
-            None => ("tract", None),
-            Some(path) => ("ONNX Runtime", Some(Runtime::load(path).unwrap())),
+            None => ("tract", built_in()),
+            Some(path) => {
+                let runtime = Some(Runtime::load(path).unwrap());
+                ("ONNX Runtime", Engines { runtime, ..built_in() })
+            }
         })
         .collect()
 }
@@ -74,17 +78,24 @@ const DECODER: &str = "prompt_encoder_mask_decoder.onnx";
 const NO_LABELS: &str = "prompt_encoder_mask_decoder_nolabels.onnx";
 const ORIGINAL: &str = "sam_decoder_multi.onnx";
 
-fn sam(folder: &Path, decoder: &str, runtime: Option<&Runtime>) -> Result<Sam, MaskNetworkError> {
-    Sam::open(&folder.join("vision_encoder.onnx"), &folder.join(decoder), runtime, &limits())
+fn sam(folder: &Path, decoder: &str, engines: &Engines) -> Result<Sam> {
+    Sam::open(&folder.join("vision_encoder.onnx"), &folder.join(decoder), engines)
 }
 
-fn sam_files(folder: &Path, decoder: &str, onnxruntime: &Option<PathBuf>) -> NetworkFiles {
-    NetworkFiles {
-        sam: Some(folder.join("vision_encoder.onnx")),
-        sam_decoder: Some(folder.join(decoder)),
-        onnxruntime: onnxruntime.clone(),
-        ..NetworkFiles::default()
+fn text(path: PathBuf) -> String {
+    path.to_str().unwrap().into()
+}
+
+fn sam_files(folder: &Path, decoder: &str, onnxruntime: &Option<PathBuf>) -> MaskConfig {
+    MaskConfig {
+        sam: text(folder.join("vision_encoder.onnx")),
+        sam_decoder: text(folder.join(decoder)),
+        ..config(onnxruntime)
     }
+}
+
+fn opened(config: &MaskConfig) -> Networks {
+    Networks::open(config).unwrap().expect("files are named")
 }
 
 /// Share of pixels on which two masks differ.
@@ -100,7 +111,7 @@ fn photographs_are_resized_as_pillow_does() {
     let (photo, reference) =
         (picture(&folder), read_photo(&folder.join("resized.png"), None, &Limits::default()));
     let reference = reference.unwrap();
-    let resized = resample::photo(&photo, 192, 256);
+    let resized = resized(&photo, 192, 256);
     let off: Vec<u8> =
         resized.iter().flatten().zip(reference.rgb.iter().flatten()).map(|(a, b)| a.abs_diff(*b)).collect();
     let (worst, sum) = (off.iter().max().unwrap(), off.iter().map(|&v| f64::from(v)).sum::<f64>());
@@ -121,7 +132,7 @@ fn the_encoder_sees_the_pixels_of_the_reference() {
         1e-6,
     );
     // the file's own side and processor are obeyed: 256, not 1024
-    let sam = sam(&folder, DECODER, None).unwrap();
+    let sam = sam(&folder, DECODER, &built_in()).unwrap();
     assert_eq!((sam.side, sam.fitted(150, 200)), (256, (192, 256)));
 }
 
@@ -129,9 +140,9 @@ fn the_encoder_sees_the_pixels_of_the_reference() {
 fn sam_gives_the_reference_from_the_stored_inputs() {
     let Some(folder) = shared("sam_tiny") else { return };
     let at = |name: &str| array(&folder.join(name));
-    for (engine, runtime) in each_engine() {
-        let open = |name: &str| Session::open(&folder.join(name), runtime.as_ref(), &limits()).unwrap();
-        let encoder = open("vision_encoder.onnx");
+    for (engine, engines) in each_engine() {
+        let open = |role, name: &str| Session::open(role, &folder.join(name), &engines).unwrap();
+        let encoder = open(Role::Sam, "vision_encoder.onnx");
         let names = ["image_embeddings", "image_positional_embeddings"];
         let given = encoder.run(&[("pixel_values", at("pixel_values.npy"))]).unwrap();
         for (name, output) in names.iter().zip(&given) {
@@ -146,7 +157,7 @@ fn sam_gives_the_reference_from_the_stored_inputs() {
             if prefix.is_empty() {
                 inputs.push(("input_labels", at("input_labels.npy")));
             }
-            let given = open(file).run(&inputs).unwrap();
+            let given = open(Role::SamDecoder, file).run(&inputs).unwrap();
             for (name, tolerance, output) in
                 [("iou_scores", 5e-5, &given[0]), ("pred_masks", 1e-4, &given[1])]
             {
@@ -154,14 +165,14 @@ fn sam_gives_the_reference_from_the_stored_inputs() {
                 close(&name, engine, &output.values, numbers(&at(&format!("{name}.npy"))), tolerance);
             }
         }
-        let decoder = open(ORIGINAL);
+        let decoder = open(Role::SamDecoder, ORIGINAL);
         for (prefix, has) in [("meta_", 0.0), ("meta_with_mask_", 1.0)] {
             let inputs = [
                 (names[0], at("image_embeddings.npy")),
                 ("point_coords", at("meta_point_coords.npy")),
                 ("point_labels", at("meta_point_labels.npy")),
                 ("mask_input", at("meta_mask_input.npy")),
-                ("has_mask_input", Array::new(&[1], vec![has])),
+                ("has_mask_input", NetworkArray::new(&[1], vec![has])),
                 ("orig_im_size", at("meta_orig_im_size.npy")),
             ];
             let given = decoder.run(&inputs).unwrap();
@@ -183,10 +194,7 @@ fn logits_reach_the_photograph_as_in_the_reference() {
     {
         let small = array(&folder.join(small));
         let found: Vec<f32> = (0..count)
-            .flat_map(|i| {
-                let square = resample::field(&numbers(&small)[i * 4096..][..4096], 64, (64, 64), (256, 256));
-                resample::field(&square, 256, (192, 256), (150, 200))
-            })
+            .flat_map(|i| enlarged(&numbers(&small)[i * 4096..][..4096], 64, 256, (192, 256), (150, 200)))
             .collect();
         close(large, "no engine", &found, numbers(&array(&folder.join(large))), 1e-4);
     }
@@ -197,9 +205,8 @@ fn clicks_become_the_mask_of_the_reference_end_to_end() {
     let Some(folder) = shared("sam_tiny") else { return };
     let (photo, clicks) = (picture(&folder), clicks(&folder));
     for engine in engines() {
-        let networks =
-            Networks::open(&sam_files(&folder, DECODER, &engine), &NetworkOptions::default()).unwrap();
-        let (mask, score) = networks.segment(&photo, &clicks).unwrap();
+        let networks = opened(&sam_files(&folder, DECODER, &engine));
+        let (mask, score) = networks.segment(&photo, &clicks).unwrap().unwrap();
         let off = differing(&mask, &gray(&folder.join("mask.png")));
         println!("{engine:?}: mask differs on {:.3} % of the pixels, score {score}", 100.0 * off);
         assert!(off <= 0.01);
@@ -215,8 +222,8 @@ fn the_original_decoder_gets_the_padding_point_once_and_gives_the_first_of_four_
     let (photo, clicks) = (picture(&folder), clicks(&folder));
     let reference = array(&folder.join("meta_masks.npy"));
     let coords = array(&folder.join("meta_point_coords.npy"));
-    for (engine, runtime) in each_engine() {
-        let sam = sam(&folder, ORIGINAL, runtime.as_ref()).unwrap();
+    for (engine, engines) in each_engine() {
+        let sam = sam(&folder, ORIGINAL, &engines).unwrap();
         let embedding = sam.embed(&photo).unwrap();
         // the prompt holds four clicks and one padding point, as the stored one
         let prompt = sam.prompt(&embedding, &clicks);
@@ -241,7 +248,7 @@ fn the_original_decoder_gets_the_padding_point_once_and_gives_the_first_of_four_
 fn a_decoder_without_labels_takes_clicks_on_the_head_and_no_others() {
     let Some(folder) = shared("sam_tiny") else { return };
     let (photo, clicks) = (picture(&folder), clicks(&folder));
-    let sam = sam(&folder, NO_LABELS, None).unwrap();
+    let sam = sam(&folder, NO_LABELS, &built_in()).unwrap();
     let Err(error) = sam.segment(&photo, &clicks) else { panic!("the background was taken for head") };
     assert!(error.to_string().contains("number 4 is on the background"), "{error}");
     assert!(error.hint().contains("input_labels"));
@@ -252,7 +259,7 @@ fn a_decoder_without_labels_takes_clicks_on_the_head_and_no_others() {
 fn clicks_that_make_no_sense_are_named() {
     let Some(folder) = shared("sam_tiny") else { return };
     let photo = picture(&folder);
-    let sam = sam(&folder, DECODER, None).unwrap();
+    let sam = sam(&folder, DECODER, &built_in()).unwrap();
     let head = |x: f32, y: f32| Click { x, y, head: true };
     for (clicks, word) in [
         (vec![], "none of them is on the head"),
@@ -264,29 +271,26 @@ fn clicks_that_make_no_sense_are_named() {
         (vec![head(5.0, 5.0); 257], "there are 257"),
     ] {
         let Err(error) = sam.segment(&photo, &clicks) else { panic!("{word}") };
-        assert!(
-            matches!(error, MaskNetworkError::Asked { .. }) && error.to_string().contains(word),
-            "{error}"
-        );
+        let said = error.to_string();
+        assert!(said.starts_with("the clicks cannot be used") && said.contains(word), "{said}");
     }
 }
 
 #[test]
 fn odd_sizes_and_a_single_row_of_pixels_get_a_mask_of_their_own_size() {
     let Some(folder) = shared("sam_tiny") else { return };
-    let files = NetworkFiles {
-        vitmatte: shared("vitmatte_tiny").map(|f| f.join("model.onnx")),
-        ..sam_files(&folder, DECODER, &None)
-    };
-    let networks = Networks::open(&files, &NetworkOptions::default()).unwrap();
+    let vitmatte = shared("vitmatte_tiny").map_or(String::new(), |f| text(f.join("model.onnx")));
+    let has_vitmatte = !vitmatte.is_empty();
+    let networks = opened(&MaskConfig { vitmatte, ..sam_files(&folder, DECODER, &None) });
     for (width, height) in [(151, 97), (97, 151), (333, 1), (1, 1), (257, 256)] {
         let rgb = (0..width * height).map(|i| [(i % 255) as u8; 3]).collect();
         let photo = Photo { width, height, rgb, alpha: None };
         let click = Click { x: (width - 1) as f32, y: (height - 1) as f32, head: true };
-        let (mask, _) = networks.segment(&photo, &[click]).unwrap();
+        let (mask, _) = networks.segment(&photo, &[click]).unwrap().unwrap();
         assert_eq!((mask.width, mask.height, mask.values.len()), (width, height, (width * height) as usize));
         assert!(mask.values.iter().all(|&v| v == 0 || v == 255));
-        assert_eq!(networks.alpha(&photo, &mask).unwrap().len(), (width * height) as usize);
+        let alpha = networks.alpha(&photo, &mask).unwrap();
+        assert_eq!(alpha.map(|a| a.len()), has_vitmatte.then_some((width * height) as usize));
     }
 }
 
@@ -298,11 +302,11 @@ fn both_encoders_of_the_original_form_feed_the_original_decoder() {
     let rgb: Vec<[u8; 3]> = (0..256 * 256).map(|i| [(i % 256) as u8, (i / 256) as u8, 40]).collect();
     let photo = Photo { width: 256, height: 256, rgb, alpha: None };
     let click = Click { x: 120.0, y: 130.0, head: true };
-    for (engine, runtime) in each_engine() {
+    for (engine, engines) in each_engine() {
         for picture in [true, false] {
             let path = dir.path().join(format!("encoder_{picture}.onnx"));
             fs::write(&path, made::original_encoder(picture, 256, 32)).unwrap();
-            let sam = Sam::open(&path, &folder.join(ORIGINAL), runtime.as_ref(), &limits()).unwrap();
+            let sam = Sam::open(&path, &folder.join(ORIGINAL), &engines).unwrap();
             assert_eq!(sam.side, 256);
             let pixels = sam.pixels(&photo);
             let shape: &[usize] = if picture { &[256, 256, 3] } else { &[1, 3, 256, 256] };
@@ -329,7 +333,7 @@ fn encoder_and_decoder_that_do_not_fit_are_named_together() {
         path
     };
     let decoder = |name: &str| folder.join(name);
-    let open = |e: &Path, d: &Path| Sam::open(e, d, None, &limits());
+    let open = |e: &Path, d: &Path| Sam::open(e, d, &built_in());
     let Err(error) = open(&encoder(false, 256, 32), &decoder(DECODER)) else { panic!("no position") };
     assert!(error.to_string().contains("image_positional_embeddings"), "{error}");
     let Err(error) = open(&encoder(false, 512, 32), &decoder(ORIGINAL)) else { panic!("512 is not 256") };
@@ -344,16 +348,15 @@ fn encoder_and_decoder_that_do_not_fit_are_named_together() {
     // each in the other's place
     let swapped = open(&decoder(DECODER), &decoder("vision_encoder.onnx"));
     assert!(swapped.is_err_and(|e| e.to_string().contains("was given as the SAM encoder")));
-    let alone = NetworkFiles { sam: Some(decoder("vision_encoder.onnx")), ..NetworkFiles::default() };
-    let alone = Networks::open(&alone, &NetworkOptions::default());
+    let alone = Networks::open(&MaskConfig { sam: text(decoder("vision_encoder.onnx")), ..config(&None) });
     assert!(alone.is_err_and(|e| e.to_string().contains("no file was given")));
 }
 
 #[test]
 fn vitmatte_gives_the_reference_from_the_stored_inputs() {
     let Some(folder) = shared("vitmatte_tiny") else { return };
-    for (engine, runtime) in each_engine() {
-        let open = |name: &str| Session::open(&folder.join(name), runtime.as_ref(), &limits());
+    for (engine, engines) in each_engine() {
+        let open = |name: &str| Session::open(Role::VitMatte, &folder.join(name), &engines);
         let session = open("model.onnx").unwrap();
         for kind in ["", "_imagenet", "_random_160x224", "_random_96x128"] {
             let pixels = array(&folder.join(format!("pixel_values{kind}.npy")));
@@ -371,8 +374,7 @@ fn vitmatte_gives_the_reference_from_the_stored_inputs() {
                 }
                 Err(error) => {
                     println!("{engine}: {error}; {}", error.hint());
-                    assert!(runtime.is_none(), "{error}");
-                    assert!(matches!(error, MaskNetworkError::Engine { .. }));
+                    assert!(engines.runtime.is_none(), "{error}");
                     assert!(error.to_string().ends_with("Reshape: Reshape volume mismatch"), "{error}");
                     assert!(error.hint().contains("name its library"));
                 }
@@ -389,16 +391,16 @@ fn vitmatte_is_shown_the_colours_of_each_convention() {
     let alone = dir.path().join("model.onnx");
     fs::copy(folder.join("model.onnx"), &alone).unwrap();
     let beside = folder.join("model.onnx");
-    let (imagenet, transformers) = (VitMatteColours::ImageNet, VitMatteColours::Transformers);
     for (path, set, kind) in [
-        (&beside, None, ""),
-        (&alone, None, "_imagenet"),
-        (&beside, Some(imagenet), "_imagenet"),
-        (&alone, Some(transformers), ""),
+        (&beside, VitmatteColors::Auto, ""),
+        (&alone, VitmatteColors::Auto, "_imagenet"),
+        (&beside, VitmatteColors::Imagenet, "_imagenet"),
+        (&alone, VitmatteColors::Half, ""),
     ] {
-        for (engine, runtime) in each_engine() {
-            let network = VitMatte::open(path, runtime.as_ref(), &limits(), set).unwrap();
-            assert_eq!(network.colours() == imagenet, kind == "_imagenet");
+        for (engine, engines) in each_engine() {
+            let network = VitMatte::open(path, &engines, set).unwrap();
+            let recorded = &network.session.file.contract;
+            assert_eq!(recorded.ends_with("colours as in the original code"), kind == "_imagenet");
             let padded = network.padded(150, 200).unwrap();
             assert_eq!(padded, (160, 224));
             let pixels = network.pixels(&photo, &trimap, padded);
@@ -417,9 +419,9 @@ fn vitmatte_is_shown_the_colours_of_each_convention() {
 fn the_record_names_each_file_with_its_size_and_its_hash() {
     let (Some(folder), Some(matte)) = (shared("sam_tiny"), shared("vitmatte_tiny")) else { return };
     for engine in engines() {
-        let vitmatte = Some(matte.join("model.onnx"));
-        let files = NetworkFiles { vitmatte, ..sam_files(&folder, DECODER, &engine) };
-        let networks = Networks::open(&files, &NetworkOptions::default()).unwrap();
+        let vitmatte = text(matte.join("model.onnx"));
+        let files = MaskConfig { vitmatte, memory_gib: 8.0, ..sam_files(&folder, DECODER, &engine) };
+        let networks = opened(&files);
         let record = networks.files();
         let roles: Vec<_> = record.iter().map(|f| f.role).collect();
         assert_eq!(roles[..3], ["sam", "sam_decoder", "vitmatte"]);
@@ -429,9 +431,10 @@ fn the_record_names_each_file_with_its_size_and_its_hash() {
         for file in record {
             println!("{file:?}");
         }
-        let at_once = networks.photos_at_once(384, 512, 8 << 30, 2);
+        let at_once = networks.photos_at_once(384, 512, 2);
         assert_eq!(at_once, if engine.is_some() { 1 } else { 2 });
-        assert_eq!(networks.photos_at_once(384, 512, 1, 2), 1);
+        let tight = opened(&MaskConfig { memory_gib: 1e-9, ..files });
+        assert_eq!(tight.photos_at_once(384, 512, 2), 1);
         networks.prepare(150, 200).unwrap();
     }
 }
@@ -441,19 +444,16 @@ fn photographs_side_by_side_get_what_they_get_alone() {
     let (Some(folder), Some(matte)) = (shared("sam_tiny"), shared("vitmatte_tiny")) else { return };
     let (photo, clicks, trimap) = (picture(&folder), clicks(&folder), gray(&matte.join("trimap.png")));
     for engine in engines() {
-        let vitmatte = Some(matte.join("model.onnx"));
-        let files = NetworkFiles { vitmatte, ..sam_files(&folder, DECODER, &engine) };
         let made = |threads: usize| {
-            let options = NetworkOptions { threads, ..NetworkOptions::default() };
-            let networks = Networks::open(&files, &options).unwrap();
+            let runtime = engine.as_ref().map(|path| Runtime::load(path).unwrap());
+            let engines = Engines { runtime, threads, ..built_in() };
+            let sam = sam(&folder, DECODER, &engines).unwrap();
+            let vitmatte = VitMatte::open(&matte.join("model.onnx"), &engines, VitmatteColors::Auto).unwrap();
             std::thread::scope(|scope| {
                 let each: Vec<_> = (0..3)
                     .map(|_| {
                         scope.spawn(|| {
-                            (
-                                networks.segment(&photo, &clicks).unwrap(),
-                                networks.alpha(&photo, &trimap).unwrap(),
-                            )
+                            (sam.segment(&photo, &clicks).unwrap(), vitmatte.alpha(&photo, &trimap).unwrap())
                         })
                     })
                     .collect();
@@ -468,16 +468,15 @@ fn photographs_side_by_side_get_what_they_get_alone() {
 #[test]
 fn a_photograph_beyond_the_memory_limit_is_refused_before_it_is_run() {
     let Some(folder) = shared("vitmatte_tiny") else { return };
-    let files = NetworkFiles { vitmatte: Some(folder.join("model.onnx")), ..NetworkFiles::default() };
-    let networks = Networks::open(&files, &NetworkOptions::default()).unwrap();
+    let networks = opened(&MaskConfig { vitmatte: text(folder.join("model.onnx")), ..config(&None) });
     // 3000 × 4096 is 48 128 cells, and 48 bytes for each pair of them 104 GiB
     let error = networks.prepare(3000, 4096).unwrap_err();
     assert!(error.to_string().contains("GiB") && error.hint().contains("1024"), "{error}");
     networks.prepare(64, 64).unwrap();
     let photo = Photo { width: 4, height: 4, rgb: vec![[0; 3]; 16], alpha: None };
     let trimap = Gray { width: 4, height: 3, values: vec![0; 12] };
-    assert!(matches!(networks.alpha(&photo, &trimap), Err(MaskNetworkError::Asked { .. })));
-    assert!(matches!(networks.segment(&photo, &[]), Err(MaskNetworkError::Asked { .. })));
+    assert!(networks.alpha(&photo, &trimap).is_err_and(|e| e.to_string().contains("its trimap 4 × 3")));
+    assert_eq!(networks.segment(&photo, &[]), Ok(None));
 }
 
 #[test]

@@ -9,59 +9,42 @@
 //!
 //! The file `preprocessor_config.json` beside the network means the second; without it, the first.
 
-use super::onnx::{Array, Contract, MaskNetworkError, Runtime, Session, SessionLimits};
+use super::onnx::{Engines, NetworkArray, Role, Session};
 use super::processor::{self, IMAGENET, Normal};
+use crate::config::VitmatteColors;
 use crate::image::{Gray, Photo};
+use crate::{Error, Result};
 use std::path::Path;
 
 /// The picture is padded to a multiple of this: 16 pixels a token, halved once more in the detail head.
 const STEP: usize = 32;
 
-/// How ViTMatte is shown colours and the trimap.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum VitMatteColours {
-    /// As in the original code: ImageNet's mean and deviation; the trimap is exactly 0, 0.5 or 1.
-    ImageNet,
-    /// As in transformers' processor: 0.5 and 0.5; the trimap divided by 255.
-    Transformers,
-}
-
 /// A ViTMatte network.
 pub(super) struct VitMatte {
     pub(super) session: Session,
     normal: Normal,
-    colours: VitMatteColours,
+    /// Is it shown the thirds of the original code, or the trimap over 255?
+    thirds: bool,
 }
 
 impl VitMatte {
-    /// Opens the file; `colours` overrides what lies beside it.
-    pub(super) fn open(
-        path: &Path,
-        runtime: Option<&Runtime>,
-        limits: &SessionLimits,
-        colours: Option<VitMatteColours>,
-    ) -> Result<VitMatte, MaskNetworkError> {
-        let is_one = |c| c == Contract::VitMatte;
-        let session = Session::open_as("the ViTMatte network", is_one, path, runtime, limits)?;
+    /// Opens the file; `colors` may override what lies beside it.
+    pub(super) fn open(path: &Path, engines: &Engines, colors: VitmatteColors) -> Result<VitMatte> {
+        let mut session = Session::open(Role::VitMatte, path, engines)?;
         let half = Normal { mean: [0.5; 3], std: [0.5; 3] };
-        let (colours, normal) = match colours {
-            Some(VitMatteColours::ImageNet) => (VitMatteColours::ImageNet, IMAGENET),
-            Some(VitMatteColours::Transformers) => (VitMatteColours::Transformers, half),
-            None => match processor::beside(path, "vitmatte")? {
-                Some(processor) => (VitMatteColours::Transformers, processor.normal),
-                None => (VitMatteColours::ImageNet, IMAGENET),
-            },
+        let normal = match colors {
+            VitmatteColors::Imagenet => None,
+            VitmatteColors::Half => Some(half),
+            VitmatteColors::Auto => processor::beside(path, "vitmatte")?.map(|p| p.normal),
         };
-        Ok(VitMatte { session, normal, colours })
-    }
-
-    /// Which convention is obeyed.
-    pub(super) fn colours(&self) -> VitMatteColours {
-        self.colours
+        let thirds = normal.is_none();
+        let how = if thirds { "as in the original code" } else { "as in transformers" };
+        session.file.contract += &format!(", colours {how}");
+        Ok(VitMatte { session, normal: normal.unwrap_or(IMAGENET), thirds })
     }
 
     /// Width and height with padding: the multiple of 32 that holds the photograph, or what the file fixes.
-    pub(super) fn padded(&self, width: usize, height: usize) -> Result<(usize, usize), MaskNetworkError> {
+    pub(super) fn padded(&self, width: usize, height: usize) -> Result<(usize, usize)> {
         let fit = |old: usize, axis: usize| match self.session.input_extent("pixel_values", axis) {
             None => Some(old.next_multiple_of(STEP)),
             Some(fixed) => (fixed >= old && fixed % STEP == 0).then_some(fixed),
@@ -69,8 +52,9 @@ impl VitMatte {
         match (fit(width, 3), fit(height, 2)) {
             (Some(w), Some(h)) => Ok((w, h)),
             _ => {
-                let (file, shape) = (self.session.path.display(), self.session.inputs[0].shape_in_words());
-                Err(MaskNetworkError::asked(
+                let (file, shape) =
+                    (self.session.file.path.display(), self.session.inputs[0].shape_in_words());
+                Err(Error::cannot(
                     format!("the photograph has {width} × {height} pixels, but `{file}` takes only {shape}"),
                     "use the network's file that leaves width and height open",
                 ))
@@ -79,7 +63,7 @@ impl VitMatte {
     }
 
     /// Colours and trimap as the network takes them: `[1, 4, h, w]`, zeros right and below.
-    pub(super) fn pixels(&self, photo: &Photo, trimap: &Gray, padded: (usize, usize)) -> Array {
+    pub(super) fn pixels(&self, photo: &Photo, trimap: &Gray, padded: (usize, usize)) -> NetworkArray {
         let (w, h) = padded;
         let plane = w * h;
         let mut values = vec![0.0; 4 * plane];
@@ -89,19 +73,19 @@ impl VitMatte {
             for c in 0..3 {
                 values[c * plane + at] = self.normal.apply(colour[c], c);
             }
-            values[3 * plane + at] = match (self.colours, t) {
-                (VitMatteColours::Transformers, t) => f32::from(t) / 255.0,
-                // the original code's thirds: a trimap may come from anywhere
-                (VitMatteColours::ImageNet, 0..85) => 0.0,
-                (VitMatteColours::ImageNet, 85..170) => 0.5,
-                (VitMatteColours::ImageNet, _) => 1.0,
+            values[3 * plane + at] = match t {
+                t if !self.thirds => f32::from(t) / 255.0,
+                // a trimap may come from anywhere
+                0..85 => 0.0,
+                85..170 => 0.5,
+                _ => 1.0,
             };
         }
-        Array::new(&[1, 4, h, w], values)
+        NetworkArray::new(&[1, 4, h, w], values)
     }
 
     /// Alpha in 0..=1 of each pixel, `[height · width]`, as the network says it: no cutting near 0 and 1.
-    pub(super) fn alpha(&self, photo: &Photo, trimap: &Gray) -> Result<Vec<f32>, MaskNetworkError> {
+    pub(super) fn alpha(&self, photo: &Photo, trimap: &Gray) -> Result<Vec<f32>> {
         let (width, height) = (photo.width as usize, photo.height as usize);
         let (w, h) = self.padded(width, height)?;
         let pixels = self.pixels(photo, trimap, (w, h));

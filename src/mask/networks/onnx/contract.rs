@@ -1,6 +1,6 @@
 //! Which network a file is, by its inputs and outputs and never by its name.
 
-use super::error::shown;
+use super::seam::one_line;
 use std::fmt;
 use tract_onnx::pb;
 
@@ -9,9 +9,30 @@ const F32: i32 = 1;
 /// ONNX's number for 64-bit integers.
 pub(super) const I64: i32 = 7;
 
+/// What a file is named for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::mask::networks) enum Role {
+    /// SAM's image encoder.
+    Sam,
+    /// SAM's prompt encoder and mask decoder.
+    SamDecoder,
+    /// ViTMatte.
+    VitMatte,
+}
+
+impl Role {
+    /// The setting that names the file, and the words for it.
+    pub(super) fn words(self) -> (&'static str, &'static str) {
+        match self {
+            Role::Sam => ("sam", "the SAM encoder"),
+            Role::SamDecoder => ("sam_decoder", "the SAM decoder"),
+            Role::VitMatte => ("vitmatte", "the ViTMatte network"),
+        }
+    }
+}
+
 /// The form of a network: how it is fed and what it answers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[non_exhaustive]
 pub enum Contract {
     /// SAM's image encoder as transformers exports it.
     SamEncoder,
@@ -71,6 +92,15 @@ const FORMS: &[Form] = &[
 impl Contract {
     fn form(self) -> &'static Form {
         FORMS.iter().find(|f| f.contract == self).unwrap_or(&FORMS[0])
+    }
+
+    /// What a network of this form can be named for.
+    pub(super) fn role(self) -> Role {
+        match self {
+            Contract::SamEncoder | Contract::OriginalEncoder { .. } => Role::Sam,
+            Contract::SamDecoder { .. } | Contract::OriginalDecoder => Role::SamDecoder,
+            Contract::VitMatte => Role::VitMatte,
+        }
     }
 
     /// The outputs that are asked for, in order.
@@ -140,7 +170,7 @@ pub(super) fn recognise(inputs: &[Port], outputs: &[Port]) -> Result<Contract, S
         ports.iter().map(|p| format!("{} {}", p.name, p.shape_in_words())).collect::<Vec<_>>().join(", ")
     };
     let why = near.unwrap_or("its inputs and outputs are those of no known form".into());
-    Err(shown(&format!("{why} ({} → {})", side(inputs), side(outputs))))
+    Err(one_line(&format!("{why} ({} → {})", side(inputs), side(outputs))))
 }
 
 /// What keeps these from being exactly the inputs wanted.

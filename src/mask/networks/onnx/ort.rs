@@ -1,8 +1,8 @@
 //! The engine that the user brings: an ONNX Runtime library, loaded from the path named and nowhere else.
 
 use super::contract::I64;
-use super::error::{MaskNetworkError, shown};
-use super::seam::{Array, Fed, guarded, hexadecimal};
+use super::seam::{Fed, NetworkArray, NetworkFile, file_error, guarded, one_line};
+use crate::Result;
 use crate::io::{self, Limits};
 use ort::environment::Environment;
 use ort::logging::LogLevel;
@@ -21,11 +21,7 @@ static LOADED: Mutex<Option<Runtime>> = Mutex::new(None);
 #[derive(Clone)]
 pub struct Runtime {
     /// The library as the user named it.
-    pub path: PathBuf,
-    /// Bytes of the library.
-    pub bytes: u64,
-    /// SHA-256 of the library, in hexadecimal.
-    pub sha256: String,
+    pub file: NetworkFile,
     /// The library without links.
     real: PathBuf,
     environment: Environment,
@@ -37,66 +33,58 @@ impl Runtime {
     /// # Errors
     /// When there is no such file, when it is no ONNX Runtime of 1.17 or later, or when this process
     /// already holds another one.
-    pub fn load(path: &Path) -> Result<Runtime, MaskNetworkError> {
+    pub fn load(path: &Path) -> Result<Runtime> {
         let real = io::real_path(path)?;
-        let wrong = |problem: String, hint| {
-            let problem = format!("cannot be used as ONNX Runtime: {}", shown(&problem));
-            MaskNetworkError::file(path, problem, hint)
+        let wrong = |problem: String, hint: &str| {
+            file_error(path, &format!("cannot be used as ONNX Runtime: {}", one_line(&problem)), hint)
         };
         let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(runtime) = loaded.as_ref() {
             if runtime.real == real {
                 return Ok(runtime.clone());
             }
-            let problem = format!("this process already runs `{}`", runtime.path.display());
+            let problem = format!("this process already runs `{}`", runtime.file.path.display());
             return Err(wrong(problem, "start the program anew for another library"));
         }
-        let library = io::read_bytes(path, &Limits::default())?;
         // also keeps a text file from the system's loader, whose words few understand
-        let environment = guarded(|| {
-            let builder = ort::init_from(&real).map_err(|e| e.to_string())?;
+        let library = io::read_bytes(path, &Limits::default())?;
+        let load = || -> Result<Environment, String> {
             let to_log: ort::logging::LoggerFunction = Arc::new(|_, _, _, _, message: &str| {
                 tracing::debug!(target: "onnxruntime", "{message}");
             });
-            let environment = builder
-                .with_name("tiface")
-                .with_telemetry(false)
-                .with_logger(to_log)
-                .build()
-                .map_err(|e| e.to_string())?;
+            let builder = ort::init_from(&real).map_err(|e| e.to_string())?.with_name("tiface");
+            let environment = builder.with_telemetry(false).with_logger(to_log).build();
+            let environment = environment.map_err(|e| e.to_string())?;
             environment.set_log_level(LogLevel::Error);
             Ok(environment)
-        })
-        .map_err(|problem| {
+        };
+        let environment = guarded(load).map_err(|problem| {
             wrong(problem, "name a libonnxruntime of 1.17 or later for this machine (`pip install onnxruntime` brings one)")
         })?;
-        let bytes = library.len() as u64;
-        let runtime = Runtime { path: path.into(), bytes, sha256: hexadecimal(&library), real, environment };
+        // what the library says of itself
+        let version = guarded(|| Ok(ort::info().to_string())).unwrap_or_default();
+        let file = NetworkFile::new("onnxruntime", path, &library, "library", version);
+        let runtime = Runtime { file, real, environment };
         *loaded = Some(runtime.clone());
         Ok(runtime)
-    }
-
-    /// What the library says of itself.
-    pub fn version(&self) -> String {
-        guarded(|| Ok(ort::info().to_string())).unwrap_or_default()
     }
 }
 
 /// A network in ONNX Runtime.
-pub(super) struct Model {
+pub(super) struct OrtModel {
     // its bindings allow one run at a time; the run itself spreads over the threads
     session: Mutex<ort::session::Session>,
     outputs: &'static [&'static str],
 }
 
-impl Model {
+impl OrtModel {
     /// Loads a network from memory. `outputs`: those that will be asked for.
     pub(super) fn load(
         runtime: &Runtime,
         bytes: &[u8],
         outputs: &'static [&'static str],
         threads: usize,
-    ) -> Result<Model, String> {
+    ) -> Result<OrtModel, String> {
         let session = || -> Result<ort::session::Session, ort::Error> {
             let mut builder = ort::session::Session::builder(&runtime.environment)?
                 .with_intra_threads(threads)?
@@ -105,13 +93,13 @@ impl Model {
             builder.commit_from_memory(bytes)
         };
         let session = Mutex::new(session().map_err(|e| e.to_string())?);
-        Ok(Model { session, outputs })
+        Ok(OrtModel { session, outputs })
     }
 
     /// One run.
-    pub(super) fn run(&self, fed: &Fed) -> Result<Vec<Array>, String> {
+    pub(super) fn run(&self, fed: &Fed) -> Result<Vec<NetworkArray>, String> {
         let mut session = self.session.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut run = || -> Result<Vec<Array>, ort::Error> {
+        let mut run = || -> Result<Vec<NetworkArray>, ort::Error> {
             let mut inputs: Vec<(&str, SessionInputValue<'_>)> = Vec::new();
             for (port, array) in fed {
                 let value = match port.kind {
@@ -127,7 +115,7 @@ impl Model {
             for value in self.outputs.iter().filter_map(|name| given.get(name)) {
                 let (shape, values) = value.try_extract_tensor::<f32>()?;
                 let shape = shape.iter().map(|&d| usize::try_from(d).unwrap_or(0)).collect();
-                found.push(Array { shape, values: values.to_vec() });
+                found.push(NetworkArray { shape, values: values.to_vec() });
             }
             Ok(found)
         };

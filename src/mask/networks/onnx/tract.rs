@@ -4,7 +4,7 @@
 //! (0.2 to 1 s for public networks) and kept, since the photographs of a capture share their size.
 
 use super::contract::{I64, Port};
-use super::seam::{Array, Fed};
+use super::seam::{Fed, NetworkArray};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use tract_onnx::pb;
@@ -17,19 +17,23 @@ pub(super) const NAME: &str = "tract 0.23.9";
 /// Plans kept of one file. Each holds its own packed weights.
 const KEPT_PLANS: usize = 4;
 
-type Plan = Arc<TypedRunnableModel>;
+type Runnable = Arc<TypedRunnableModel>;
 
 /// A parsed file and its plans by the shapes of its inputs.
-pub(super) struct Model {
+pub(super) struct TractModel {
     parsed: InferenceModel,
     array_bytes: u64,
-    plans: Mutex<HashMap<Vec<Vec<usize>>, Plan>>,
+    plans: Mutex<HashMap<Vec<Vec<usize>>, Runnable>>,
 }
 
-impl Model {
+impl TractModel {
     /// Takes the graph of a file; shapes that it states for inner arrays are not trusted, exporters write wrong
     /// ones. `outputs`: those that will be asked for. `array_bytes`: bytes of the largest array that may be planned.
-    pub(super) fn load(proto: &pb::ModelProto, outputs: &[&str], array_bytes: u64) -> Result<Model, String> {
+    pub(super) fn load(
+        proto: &pb::ModelProto,
+        outputs: &[&str],
+        array_bytes: u64,
+    ) -> Result<TractModel, String> {
         let read = || -> TractResult<InferenceModel> {
             let onnx = tract_onnx::onnx().with_ignore_output_shapes(true).with_ignore_value_info(true);
             let mut parsed = onnx.model_for_proto_model(proto)?;
@@ -40,11 +44,11 @@ impl Model {
             Ok(parsed)
         };
         let parsed = read().map_err(|e| sentence(&e))?;
-        Ok(Model { parsed, array_bytes, plans: Mutex::default() })
+        Ok(TractModel { parsed, array_bytes, plans: Mutex::default() })
     }
 
     /// The plan for these shapes, made when there is none yet.
-    fn plan(&self, fed: &Fed) -> TractResult<Plan> {
+    fn plan(&self, fed: &Fed) -> TractResult<Runnable> {
         let key: Vec<Vec<usize>> = fed.iter().map(|(_, array)| array.shape.clone()).collect();
         // held while planning: photographs that come together wait for the one plan they share
         let mut plans = self.plans.lock().unwrap_or_else(PoisonError::into_inner);
@@ -99,10 +103,10 @@ impl Model {
     }
 
     /// One run.
-    pub(super) fn run(&self, fed: &Fed) -> Result<Vec<Array>, String> {
-        let run = || -> TractResult<Vec<Array>> {
+    pub(super) fn run(&self, fed: &Fed) -> Result<Vec<NetworkArray>, String> {
+        let run = || -> TractResult<Vec<NetworkArray>> {
             let plan = self.plan(fed)?;
-            let value = |(port, array): &(&Port, &Array)| -> TractResult<TValue> {
+            let value = |(port, array): &(&Port, &NetworkArray)| -> TractResult<TValue> {
                 let made = match port.kind {
                     I64 => Tensor::from_shape(&array.shape, &array.integers())?,
                     _ => Tensor::from_shape(&array.shape, &array.values)?,
@@ -110,9 +114,9 @@ impl Model {
                 Ok(made.into_tvalue())
             };
             let given = plan.run(fed.iter().map(value).collect::<TractResult<TVec<_>>>()?)?;
-            let array = |value: &TValue| -> TractResult<Array> {
+            let array = |value: &TValue| -> TractResult<NetworkArray> {
                 let view = value.to_plain_array_view::<f32>()?;
-                Ok(Array { shape: view.shape().to_vec(), values: view.iter().copied().collect() })
+                Ok(NetworkArray { shape: view.shape().to_vec(), values: view.iter().copied().collect() })
             };
             given.iter().map(array).collect()
         };

@@ -1,0 +1,51 @@
+//! What stands for SAM and ViTMatte in a build without the feature `matting`: none can be opened.
+
+use super::click::Click;
+use crate::config::MaskConfig;
+use crate::image::{Gray, Photo};
+use crate::{Error, Result};
+
+/// Networks, of which there are none in this build.
+#[derive(Clone, Copy, Debug)]
+pub enum Networks {}
+
+impl Networks {
+    /// Returns `None` where the configuration uses no network.
+    ///
+    /// # Errors
+    /// When it uses one.
+    pub fn open(config: &MaskConfig) -> Result<Option<Networks>> {
+        if !config.with_sam() && !config.with_vitmatte() {
+            return Ok(None);
+        }
+        Err(Error::cannot(
+            "this build cannot run networks, but SAM or ViTMatte is named",
+            "build with `--features matting`, or leave the files out: clicks work without them",
+        ))
+    }
+
+    /// What was loaded.
+    pub fn files(&self) -> &[String] {
+        match *self {}
+    }
+
+    /// Runs the networks once.
+    pub fn prepare(&self, _width: u32, _height: u32) -> Result<()> {
+        match *self {}
+    }
+
+    /// How many photographs may be run side by side.
+    pub fn photos_at_once(&self, _width: u32, _height: u32, _threads: usize) -> usize {
+        match *self {}
+    }
+
+    /// SAM's mask.
+    pub fn segment(&self, _photo: &Photo, _clicks: &[Click]) -> Result<Option<(Gray, f32)>> {
+        match *self {}
+    }
+
+    /// ViTMatte's alpha.
+    pub fn alpha(&self, _photo: &Photo, _trimap: &Gray) -> Result<Option<Vec<f32>>> {
+        match *self {}
+    }
+}
