@@ -11,16 +11,14 @@
 //! taken in bands of fixed size and fixed order: any number of threads gives the same bits.
 
 mod blend;
-mod error;
 mod fit;
 mod members;
 mod simplex;
 mod tiles;
 
 pub use blend::blend;
-pub use error::EnsembleError;
 pub use fit::{Fit, MAX_MEMBERS, weigh};
-pub use members::{Member, Members, Target};
+pub use members::{BlendTarget, Member, Members, shares_hint};
 pub use tiles::{Tile, tiles};
 
 /// The paper's §5: baseline, T-Face, I-Face.

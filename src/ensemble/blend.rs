@@ -1,7 +1,8 @@
 //! Blending with given weights: `Σ_k w_k · clamp(I_k, 0, 1)`, alpha like colour (the paper's §5).
 
-use super::members::normalised;
-use super::{EnsembleError, Members};
+use super::Members;
+use super::members::normalized;
+use crate::Result;
 use crate::image::Image;
 use rayon::prelude::*;
 
@@ -10,8 +11,27 @@ use rayon::prelude::*;
 /// Weights are shares: finite, from 0 up, with sum 1. A sum beside 1 by at most 0.001 is taken as
 /// rounding and divided out; beyond that it is an error, since the blend would be darker or brighter
 /// than its members.
-pub fn blend(members: &Members, weights: &[f32]) -> Result<Image, EnsembleError> {
-    let weights = normalised(weights, members.count())?;
+///
+/// # Errors
+/// When there is not one weight for each member, or a weight or their sum is no share.
+///
+/// # Examples
+///
+/// ```
+/// use tiface::ensemble::{Member, Members, blend};
+/// use tiface::image::Image;
+///
+/// let flat = |v: f32| Image { data: vec![v; 2 * 2 * 4], ..Image::new(2, 2, 4) };
+/// let (tface, iface) = (flat(0.2), flat(0.6));
+/// let member = |name, image| Member { name, image, masked: true };
+/// let members = Members::new(&[member("tface", &tface), member("iface", &iface)])?;
+/// let blended = blend(&members, &[0.75, 0.25])?;
+/// // 0.75 · 0.2 + 0.25 · 0.6
+/// assert!((blended.pixel(1, 1)[0] - 0.3).abs() < 1e-6);
+/// # Ok::<(), tiface::Error>(())
+/// ```
+pub fn blend(members: &Members, weights: &[f32]) -> Result<Image> {
+    let weights = normalized(weights, members.count())?;
     let (width, height) = members.size();
     let mut out = Image::new(width, height, 4);
     let row = width.max(1) as usize;

@@ -4,8 +4,9 @@
 //! fit needs from the pixels is the matrix `D_kl = Σ ρ · e_k · e_l` over head pixels (counted ρ
 //! each) and channels: the squared error is `wᵀDw`, and no large numbers cancel in it.
 
-use super::members::{in_bands, normalised};
-use super::{EnsembleError, Members, Target, simplex};
+use super::members::{in_bands, no_members, normalized};
+use super::{BlendTarget, Members, simplex};
+use crate::{Error, Result};
 
 /// The most members a fit can weigh.
 pub const MAX_MEMBERS: usize = 8;
@@ -25,11 +26,14 @@ pub struct Fit {
 
 impl Fit {
     /// Of no views yet. At most [`MAX_MEMBERS`] members.
-    pub fn new(members: usize) -> Result<Fit, EnsembleError> {
+    pub fn new(members: usize) -> Result<Fit> {
         match members {
-            0 => Err(EnsembleError::NoMembers),
+            0 => Err(no_members()),
             1..=MAX_MEMBERS => Ok(Fit::empty(members)),
-            found => Err(EnsembleError::TooManyMembers { found }),
+            found => Err(Error::cannot(
+                format!("{found} members cannot be fitted, at most {MAX_MEMBERS}"),
+                "blend them with weights of your own, or fit fewer",
+            )),
         }
     }
 
@@ -38,7 +42,7 @@ impl Fit {
     }
 
     /// Adds one view, or a part of it. Cut the members as they will be cut when they are blended.
-    pub fn add(&mut self, members: &Members, target: &Target) -> Result<(), EnsembleError> {
+    pub fn add(&mut self, members: &Members, target: &BlendTarget) -> Result<()> {
         self.same_members(members.count())?;
         members.check(target)?;
         let bands = in_bands(members.pixels(), |band| {
@@ -51,7 +55,7 @@ impl Fit {
     }
 
     /// Adds the views of another. The last bits depend on the order, nothing else does.
-    pub fn merge(&mut self, other: &Fit) -> Result<(), EnsembleError> {
+    pub fn merge(&mut self, other: &Fit) -> Result<()> {
         self.same_members(other.members)?;
         self.sum(other);
         Ok(())
@@ -62,10 +66,11 @@ impl Fit {
         self.pixels
     }
 
-    /// The weights: `argmin wᵀDw`, `w ≥ 0`, `Σ w = 1`. Members that are alike share alike.
-    pub fn solve(&self) -> Result<Vec<f32>, EnsembleError> {
+    /// The weights: `argmin wᵀDw`, `w ≥ 0`, `Σ w = 1`; `None` where no pixel counts. Members that are alike share
+    /// alike.
+    pub fn solve(&self) -> Option<Vec<f32>> {
         if self.pixels <= 0.0 {
-            return Err(EnsembleError::NoPixels);
+            return None;
         }
         let m = self.members;
         // far below what 8 bits can tell; it decides only between members that are the same
@@ -74,16 +79,18 @@ impl Fit {
         let mut h = self.products.clone();
         (0..m).for_each(|k| h[k * m + k] += ridge);
         let weights = simplex::least(&h, &vec![0.0; m]);
-        Ok(weights[..m].iter().map(|w| *w as f32).collect())
+        Some(weights[..m].iter().map(|w| *w as f32).collect())
     }
 
     /// PSNR of the blend with these weights over the counted pixels of all views together, dB.
     ///
     /// Before 8-bit rounding, and one mean over all pixels, where `metrics` takes one for each view.
     /// `None` without pixels or without any error.
-    pub fn psnr(&self, weights: &[f32]) -> Result<Option<f64>, EnsembleError> {
-        let weights = normalised(weights, self.members)?;
-        Ok(decibels(self.error(&weights), self.pixels))
+    pub fn psnr(&self, weights: &[f32]) -> Result<Option<f64>> {
+        let weights = normalized(weights, self.members)?;
+        // a number unless there are no pixels or no error
+        let decibels = -10.0 * (self.error(&weights) / (3.0 * self.pixels)).log10();
+        Ok(decibels.is_finite().then_some(decibels))
     }
 
     /// wᵀDw.
@@ -93,16 +100,22 @@ impl Fit {
         (0..m).map(|k| weights[k] as f64 * row(k)).sum()
     }
 
-    fn same_members(&self, found: usize) -> Result<(), EnsembleError> {
-        let expected = self.members;
-        if found == expected { Ok(()) } else { Err(EnsembleError::Members { found, expected }) }
+    fn same_members(&self, found: usize) -> Result<()> {
+        if found == self.members {
+            return Ok(());
+        }
+        Err(Error::cannot(
+            format!("there are {found} members, expected {}", self.members),
+            "give every view the same members, in the same order",
+        ))
     }
 
     #[inline]
     fn count(&mut self, weight: f64, errors: &[[f64; 3]]) {
         for (k, a) in errors.iter().enumerate() {
             for (l, b) in errors.iter().enumerate() {
-                self.products[k * self.members + l] += weight * dot(a, b);
+                let dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+                self.products[k * self.members + l] += weight * dot;
             }
         }
         self.pixels += weight;
@@ -115,41 +128,27 @@ impl Fit {
 }
 
 /// The weights of least squared error over several views; all of one member where that member alone is no
-/// worse on views that had no say, each judged with the weights of the others.
-pub fn weigh(views: &[Fit]) -> Result<Vec<f32>, EnsembleError> {
-    let Some(first) = views.first() else { return Err(EnsembleError::NoPixels) };
-    let merged = |left_out: Option<usize>| {
+/// worse on views that had no say, each judged with the weights of the others. `None` where no pixel counts.
+pub fn weigh(views: &[Fit]) -> Result<Option<Vec<f32>>> {
+    let Some(first) = views.first() else { return Ok(None) };
+    let merged = |left_out: Option<usize>| -> Result<Fit> {
         let mut all = Fit::empty(first.members);
         let kept = views.iter().enumerate().filter(|(i, _)| Some(*i) != left_out);
         kept.map(|(_, view)| view).try_for_each(|view| all.merge(view))?;
         Ok(all)
     };
     let all = merged(None)?;
-    let weights = all.solve()?;
+    let Some(weights) = all.solve() else { return Ok(None) };
     let mut unseen = 0.0;
     for (i, view) in views.iter().enumerate().filter(|(_, view)| view.pixels > 0.0) {
-        match merged(Some(i))?.solve() {
-            Ok(others) => unseen += view.error(&others),
-            // the only view with a pixel: nothing can judge it
-            Err(EnsembleError::NoPixels) => return Ok(weights),
-            Err(e) => return Err(e),
-        }
+        // the only view with a pixel: nothing can judge it
+        let Some(others) = merged(Some(i))?.solve() else { return Ok(Some(weights)) };
+        unseen += view.error(&others);
     }
     let alone = |k: usize| all.products[k * all.members + k];
     let best = (0..all.members).min_by(|&a, &b| alone(a).total_cmp(&alone(b)));
-    Ok(match best.filter(|&k| unseen >= alone(k)) {
+    Ok(Some(match best.filter(|&k| unseen >= alone(k)) {
         Some(best) => (0..all.members).map(|k| if k == best { 1.0 } else { 0.0 }).collect(),
         None => weights,
-    })
-}
-
-#[inline]
-fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-/// `−10 log10(error / (3 · pixels))`, if it is a number.
-fn decibels(error: f64, pixels: f64) -> Option<f64> {
-    let value = -10.0 * (error / (3.0 * pixels)).log10();
-    value.is_finite().then_some(value)
+    }))
 }

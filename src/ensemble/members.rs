@@ -1,7 +1,7 @@
 //! The renders of one view, checked once, and how their pixels are read.
 
-use super::EnsembleError;
 use crate::image::{Gray, Image, Photo};
+use crate::{Error, Result};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -16,13 +16,13 @@ pub struct Member<'a> {
     pub name: &'a str,
     /// RGBA, sRGB-coded over black (premultiplied); alpha = opacity.
     pub image: &'a Image,
-    /// Was it trained with masks? One that was not shows the stage behind the head too.
+    /// Was it trained with masks? One that was not shows the background too.
     pub masked: bool,
 }
 
 /// What the members should have shown.
 #[derive(Clone, Copy, Debug)]
-pub struct Target<'a> {
+pub struct BlendTarget<'a> {
     /// The photograph over black: its colours multiplied by the mask.
     pub photo: &'a Photo,
     /// How much a pixel counts, 255 = once, 0 = not at all: the mask, or the mask from half on, and
@@ -43,26 +43,31 @@ impl<'a> Members<'a> {
     ///
     /// A pixel that is not finite is an error, here and so in every fit: it comes from a member that
     /// has diverged, of which no other pixel should be trusted.
-    pub fn new(list: &[Member<'a>]) -> Result<Members<'a>, EnsembleError> {
-        let Some(first) = list.first() else { return Err(EnsembleError::NoMembers) };
+    pub fn new(list: &[Member<'a>]) -> Result<Members<'a>> {
+        let first = list.first().ok_or_else(no_members)?;
         let expected = (first.image.width, first.image.height);
         for member in list {
-            let what = || format!("the view of member `{}`", member.name);
-            same_size(what, (member.image.width, member.image.height), expected)?;
-            channels(what, member.image, 4)?;
-            all_finite(member.name, member.image)?;
+            let Member { name, image, .. } = member;
+            same_size(&format!("the view of member `{name}`"), (image.width, image.height), expected)?;
+            if image.channels != 4 {
+                return Err(Error::cannot(
+                    format!("the view of member `{name}` has {} channels, expected 4", image.channels),
+                    "members are RGBA renders: render the view again",
+                ));
+            }
+            all_finite(name, image)?;
         }
         Ok(Members { list: list.to_vec(), cut: None })
     }
 
     /// Cuts the members that were trained without masks to the head.
     ///
-    /// They fill the frame, and a blend would show a ghost of the stage at their weight. Colour and
+    /// They fill the frame, and a blend would show a ghost of the background at their weight. Colour and
     /// alpha are multiplied by the mean opacity of the masked members, averaged with their
     /// `weights` (alike if those are all 0); where the head is opaque nothing changes. Without
     /// masked members there is nothing to cut by, and nothing is cut.
-    pub fn cut(mut self, weights: &[f32]) -> Result<Members<'a>, EnsembleError> {
-        let weights = normalised(weights, self.list.len())?;
+    pub fn cut(mut self, weights: &[f32]) -> Result<Members<'a>> {
+        let weights = normalized(weights, self.list.len())?;
         let shares = |of: &dyn Fn(usize) -> f32| -> Option<Vec<f32>> {
             let of = |k: usize| if self.list[k].masked { of(k) } else { 0.0 };
             let sum: f32 = (0..self.list.len()).map(of).sum();
@@ -102,16 +107,16 @@ impl<'a> Members<'a> {
     }
 
     /// Is the target one of this view?
-    pub(super) fn check(&self, target: &Target) -> Result<(), EnsembleError> {
+    pub(super) fn check(&self, target: &BlendTarget) -> Result<()> {
         let (photo, weight) = (target.photo, target.weight);
-        same_size(|| "the photograph".into(), (photo.width, photo.height), self.size())?;
-        same_size(|| "the weight map".into(), (weight.width, weight.height), self.size())
+        same_size("the photograph", (photo.width, photo.height), self.size())?;
+        same_size("the weight map", (weight.width, weight.height), self.size())
     }
 
     /// Calls `with(i, weight, member − photo)` for the pixels that count. Errors: `[members]`, RGB.
     pub(super) fn errors(
         &self,
-        target: &Target,
+        target: &BlendTarget,
         pixels: Range<usize>,
         mut with: impl FnMut(usize, f64, &[[f64; 3]]),
     ) {
@@ -133,48 +138,63 @@ pub(super) fn in_bands<T: Send>(pixels: usize, band: impl Fn(Range<usize>) -> T 
     (0..BANDS).into_par_iter().map(|b| band(b * pixels / BANDS..(b + 1) * pixels / BANDS)).collect()
 }
 
+/// The error where there is nothing to blend.
+pub(super) fn no_members() -> Error {
+    Error::cannot("there are no members to blend", "name at least one member whose views are rendered")
+}
+
 /// Weights that have a sum of 1 exactly. More than 0.001 beside it is no rounding but a mistake.
-pub(super) fn normalised(weights: &[f32], members: usize) -> Result<Vec<f32>, EnsembleError> {
-    if weights.len() != members {
-        return Err(EnsembleError::WeightCount { found: weights.len(), expected: members });
+pub(super) fn normalized(weights: &[f32], members: usize) -> Result<Vec<f32>> {
+    let found = weights.len();
+    if found != members {
+        return Err(Error::cannot(
+            format!("there are {found} weights for {members} members"),
+            "write one weight for each member, in their order",
+        ));
     }
     if let Some(index) = weights.iter().position(|w| !(w.is_finite() && *w >= 0.0)) {
-        return Err(EnsembleError::Weight { index, value: weights[index] });
+        return Err(Error::cannot(
+            format!("weight {} is {}, expected a finite number from 0 up", index + 1, weights[index]),
+            "a weight is the share of a member, from 0 to 1",
+        ));
     }
     let sum: f64 = weights.iter().map(|w| *w as f64).sum();
     if (sum - 1.0).abs() > 1e-3 {
-        return Err(EnsembleError::WeightSum { weights: weights.to_vec(), sum });
+        return Err(Error::cannot(format!("the weights sum to {sum}, expected 1"), shares_hint(weights)));
     }
     Ok(weights.iter().map(|w| (*w as f64 / sum) as f32).collect())
 }
 
-pub(super) fn same_size(
-    what: impl Fn() -> String,
-    found: (u32, u32),
-    expected: (u32, u32),
-) -> Result<(), EnsembleError> {
-    if found == expected { Ok(()) } else { Err(EnsembleError::Size { what: what(), found, expected }) }
+/// The suggested fix for weights whose sum is not 1.
+pub fn shares_hint(weights: &[f32]) -> String {
+    let sum: f64 = weights.iter().map(|w| *w as f64).sum();
+    if sum <= 0.0 {
+        return "give at least one member a weight above 0".into();
+    }
+    let shares: Vec<String> = weights.iter().map(|w| format!("{:.4}", *w as f64 / sum)).collect();
+    format!("the same shares with sum 1 are {}", shares.join(", "))
 }
 
-pub(super) fn channels(
-    what: impl Fn() -> String,
-    image: &Image,
-    expected: usize,
-) -> Result<(), EnsembleError> {
-    let found = image.channels;
-    if found == expected { Ok(()) } else { Err(EnsembleError::Channels { what: what(), found, expected }) }
+fn same_size(what: &str, found: (u32, u32), expected: (u32, u32)) -> Result<()> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(Error::cannot(
+        format!("{what} is {} × {} pixels, expected {} × {}", found.0, found.1, expected.0, expected.1),
+        "render the members again, all at the size of the photograph",
+    ))
 }
 
-pub(super) fn all_finite(member: &str, image: &Image) -> Result<(), EnsembleError> {
-    let bad = |i: &usize| image.data[4 * i..4 * i + 4].iter().any(|v| !v.is_finite());
-    let found = in_bands(image.data.len() / 4, |band| {
-        let mut wrong = band.filter(bad);
-        let first = wrong.next();
-        (first, wrong.count() + first.is_some() as usize)
-    });
-    let Some(first) = found.iter().find_map(|f| f.0) else { return Ok(()) };
-    let width = image.width as usize;
-    let first = ((first % width) as u32, (first / width) as u32);
-    let pixels = found.iter().map(|f| f.1).sum();
-    Err(EnsembleError::NotFinite { member: member.into(), pixels, first })
+fn all_finite(member: &str, image: &Image) -> Result<()> {
+    let finite = |pixel: &[f32]| pixel.iter().all(|v| v.is_finite());
+    let pixels = image.data.par_chunks_exact(4);
+    let Some(first) = pixels.clone().position_first(|pixel| !finite(pixel)) else { return Ok(()) };
+    let wrong = pixels.filter(|pixel| !finite(pixel)).count();
+    let (column, row) = (first % image.width as usize, first / image.width as usize);
+    Err(Error::cannot(
+        format!(
+            "member `{member}`: {wrong} pixels are not finite, the first in column {column} of row {row}"
+        ),
+        "its training has probably diverged: train that member again, or leave it out",
+    ))
 }

@@ -6,7 +6,7 @@
 
 use super::annotation::evenly;
 use super::matting::trimap::{UNKNOWN, unknown_share};
-use super::scale::{reduce_photo, resize_gray, working_size};
+use super::scale::{reduce_photo, resize_gray, resize_hard, working_size};
 use crate::Result;
 use crate::capture::{coverage, findings};
 use crate::image::{Gray, Photo};
@@ -64,7 +64,10 @@ fn overlaid(photo: &Photo, alpha: &Gray, trimap: Option<&Gray>, side: u32) -> Ph
     let mut picture = reduce_photo(photo, size);
     if let Some(trimap) = trimap {
         let values = trimap.values.iter().map(|&v| if v == UNKNOWN { 255 } else { 0 }).collect();
-        let unknown = resize_gray(&Gray { values, ..*trimap }, size);
+        let unknown = Gray { values, ..*trimap };
+        // a smaller one keeps its width
+        let resize = if trimap.width < size.0 { resize_hard } else { resize_gray };
+        let unknown = resize(&unknown, size);
         for (pixel, &u) in picture.rgb.iter_mut().zip(&unknown.values) {
             *pixel = mixed(*pixel, BAND, u as f32 / 255.0 * 0.4);
         }

@@ -13,7 +13,7 @@ use super::{Line, pictures, tiles};
 use crate::capture::scene::Scene;
 use crate::capture::{MaskMeaning, View, ViewMask};
 use crate::config::{Background, Config, EnsembleConfig, MaskUse, Method, called};
-use crate::ensemble::{self, EnsembleError, Fit, Member, Members, Target, Tile, blend};
+use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
 use crate::image::{Gray, Image, Photo};
 use crate::io::{self, Limits};
 use crate::render::RenderedView;
@@ -89,8 +89,7 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
         return wrong("ensemble.weights", problem, hint);
     }
     if found > 0 && (sum - 1.0).abs() > 1e-3 {
-        let hint = EnsembleError::WeightSum { weights: shares(c), sum }.hint();
-        return wrong("ensemble.weights", format!("sum to {sum}, expected 1"), &hint);
+        return wrong("ensemble.weights", format!("sum to {sum}, expected 1"), &shares_hint(&shares(c)));
     }
     if !config.render.float {
         let problem = "is false, but members are blended in float".into();
@@ -195,16 +194,13 @@ fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Resul
                 dir.check_stop()?; // what it holds then is not whole
                 images.push(view.map_or_else(|| Image::new(tile.side, tile.side, 4), |view| view.color));
             }
-            sum.add(&members(line, &images)?, &Target { photo: &photo, weight: &weight })?;
+            sum.add(&members(line, &images)?, &BlendTarget { photo: &photo, weight: &weight })?;
         }
         sums.push(sum);
     }
-    let weights = match ensemble::weigh(&sums) {
-        Err(EnsembleError::NoPixels) => {
-            dir.warn("no square of capture.tiles shows the head: the members are blended alike");
-            return Ok((shares(c), Value::Null));
-        }
-        weights => weights?,
+    let Some(weights) = ensemble::weigh(&sums)? else {
+        dir.warn("no square of capture.tiles shows the head: the members are blended alike");
+        return Ok((shares(c), Value::Null));
     };
     let mut all = Fit::new(c.members.len())?;
     sums.iter().try_for_each(|sum| all.merge(sum))?;

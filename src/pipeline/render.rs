@@ -19,7 +19,7 @@ use crate::config::Method;
 use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
 use crate::io;
 use crate::render::path::{NamedCamera, orbit};
-use crate::render::{LobePictures, RaycastOptions, RenderedView, Texture, raycast, raycast_hits};
+use crate::render::{LobePictures, MeshTexture, RaycastOptions, RenderedView, raycast};
 use crate::run::StageDir;
 use crate::{Error, Monitor, Result};
 use serde_json::{Map, Value, json};
@@ -118,7 +118,7 @@ fn textured(line: &Line) -> Result<(Product, Pictures)> {
 struct TexturedMesh<'a> {
     mesh: &'a Mesh,
     bvh: Bvh,
-    texture: Texture<'a>,
+    texture: MeshTexture<'a>,
 }
 
 impl<'a> TexturedMesh<'a> {
@@ -129,7 +129,7 @@ impl<'a> TexturedMesh<'a> {
             scale: &l.scale,
             turned: l.asset_from_world * world_from_scene,
         });
-        let texture = Texture::new(mesh, &pictures.atlas, &pictures.color, lobes.as_ref());
+        let texture = MeshTexture::new(mesh, &pictures.atlas, &pictures.color, lobes.as_ref());
         TexturedMesh { mesh, bvh: Bvh::new(mesh), texture }
     }
 }
@@ -165,6 +165,7 @@ impl<'a> Renderer<'a> {
 
     /// The view of a camera in scene coordinates, over nothing.
     pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>> {
+        let options = RaycastOptions { samples: self.samples, world_from_scene: self.world_from_scene };
         Ok(match (method, &self.whole) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
@@ -178,23 +179,19 @@ impl<'a> Renderer<'a> {
             (Method::Volume, _) => self.fields.surface()?.volume(camera, &self.world_from_scene),
             (Method::Raycast, Some((Whole { mesh, cap }, bvh))) => {
                 let field = self.fields.surface()?;
-                let world_from_scene = self.world_from_scene;
-                let options = RaycastOptions { background: None, samples: self.samples, world_from_scene };
-                Some(raycast(bvh, mesh, camera, &options, |points, normals, directions| {
-                    let mut colors = field.color(points, normals, directions);
+                Some(raycast(bvh, mesh, camera, &options, |hits| {
+                    let mut colors = field.color(&hits.points, &hits.normals, &hits.directions);
                     // what the field says of a cap is of the body's inside
                     if let Some(cap) = cap {
-                        cap.recolor(points, &mut colors);
+                        cap.recolor(&hits.points, &mut colors);
                     }
                     colors
                 }))
             }
             (Method::Raycast, None) => None,
             (Method::Textured, _) => self.product.as_ref().map(|product| {
-                let world_from_scene = self.world_from_scene;
-                let options = RaycastOptions { background: None, samples: self.samples, world_from_scene };
-                raycast_hits(&product.bvh, product.mesh, camera, &options, |s| {
-                    product.texture.colors(s, camera)
+                raycast(&product.bvh, product.mesh, camera, &options, |hits| {
+                    product.texture.colors(hits, camera)
                 })
             }),
         })

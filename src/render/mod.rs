@@ -4,5 +4,5 @@ pub mod path;
 mod raycast;
 mod texture;
 
-pub use raycast::{RaycastOptions, RenderedView, Struck, raycast, raycast_hits};
-pub use texture::{LobePictures, Texture};
+pub use raycast::{RayHits, RaycastOptions, RenderedView, raycast};
+pub use texture::{LobePictures, MeshTexture};

@@ -6,6 +6,7 @@
 //! with `--orientation-method none --center-method none --auto-scale-poses False`.
 
 use crate::geom::{Aabb, Camera, Distortion};
+use crate::{Error, Result};
 use glam::{BVec3, DMat3, DVec3, Vec3};
 use serde::Deserialize;
 
@@ -24,47 +25,21 @@ pub struct NamedCamera {
     pub camera: Camera,
 }
 
-/// Why text is not a camera path.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum PathError {
-    /// Not JSON, or not of these kinds.
-    #[error("not a camera path: {what}")]
-    Format {
-        /// What the parser said.
-        what: String,
-    },
-    /// No cameras, or too many.
-    #[error("{found} cameras, expected 1 to {MAX_CAMERAS}")]
-    Count {
-        /// How many there are.
-        found: usize,
-    },
-    /// One camera is wrong.
-    #[error("camera {index}: {what}")]
-    Camera {
-        /// Which one, from 0.
-        index: usize,
-        /// Expected and found.
-        what: String,
-    },
-    /// An orbit needs cameras to copy, and an up direction.
-    #[error("no orbit: {what}")]
-    Orbit {
-        /// What is missing.
-        what: &'static str,
-    },
+/// The error for a file that is no camera path.
+fn not_a_path(message: String) -> Error {
+    Error::cannot(message, "export a camera path from nerfstudio's viewer, or give a transforms.json")
 }
 
-crate::error::error_from!(PathError, Cannot);
+fn no_orbit(what: &str) -> Error {
+    let hint = "give a capture with at least one camera and an `up` direction";
+    Error::cannot(format!("no orbit: {what}"), hint)
+}
 
-impl PathError {
-    /// The way out.
-    pub fn hint(&self) -> &'static str {
-        match self {
-            PathError::Orbit { .. } => "give a capture with at least one camera and an `up` direction",
-            _ => "export a camera path from nerfstudio's viewer, or give a transforms.json",
-        }
+/// Checks how many cameras there are.
+fn check_count(found: usize) -> Result<()> {
+    match found {
+        1..=MAX_CAMERAS => Ok(()),
+        _ => Err(not_a_path(format!("{found} cameras, expected 1 to {MAX_CAMERAS}"))),
     }
 }
 
@@ -77,17 +52,34 @@ const FILLED: f64 = 0.95;
 /// farther away, in the same direction, that every picture shows all of `bounds`. It begins where the mean
 /// direction of the cameras is. Lens and picture size are those of the first camera, without
 /// distortion and with the middle of the picture as principal point.
-pub fn orbit(
-    cameras: &[Camera],
-    bounds: Aabb,
-    up: Vec3,
-    count: usize,
-) -> Result<Vec<NamedCamera>, PathError> {
-    let like = cameras.first().ok_or(PathError::Orbit { what: "there are no cameras" })?;
-    let up = up.as_dvec3().try_normalize().ok_or(PathError::Orbit { what: "`up` has no direction" })?;
-    if count == 0 || count > MAX_CAMERAS {
-        return Err(PathError::Count { found: count });
-    }
+///
+/// # Errors
+/// When there is no camera to copy, `up` has no direction, `count` is 0 or beyond 100,000, or the cameras stand on the
+/// axis of the circle.
+///
+/// # Examples
+///
+/// ```
+/// use glam::{DMat3, DVec3, Vec3};
+/// use tiface::geom::{Aabb, Camera, Distortion};
+/// use tiface::render::path::orbit;
+///
+/// let front = Camera {
+///     width: 400, height: 300, fx: 500.0, fy: 500.0, cx: 200.0, cy: 150.0,
+///     distortion: Distortion::default(), rotation: DMat3::IDENTITY, position: DVec3::new(0.0, 0.0, 4.0),
+/// };
+/// let head = Aabb { min: Vec3::splat(-0.5), max: Vec3::splat(0.5) };
+/// let path = orbit(&[front], head, Vec3::Y, 8)?;
+/// assert_eq!((path.len(), path[0].name.as_str()), (8, "0001"));
+/// // a quarter of the circle on, at the same height and distance
+/// let (first, third) = (path[0].camera.position, path[2].camera.position);
+/// assert!(first.dot(third).abs() < 1e-9 && (first.length() - third.length()).abs() < 1e-9);
+/// # Ok::<(), tiface::Error>(())
+/// ```
+pub fn orbit(cameras: &[Camera], bounds: Aabb, up: Vec3, count: usize) -> Result<Vec<NamedCamera>> {
+    let like = cameras.first().ok_or_else(|| no_orbit("there are no cameras"))?;
+    let up = up.as_dvec3().try_normalize().ok_or_else(|| no_orbit("`up` has no direction"))?;
+    check_count(count)?;
     let center = bounds.center().as_dvec3();
     let (mut height, mut radius, mut toward) = (0.0, 0.0, DVec3::ZERO);
     for camera in cameras {
@@ -98,7 +90,7 @@ pub fn orbit(
         toward += flat.normalize_or_zero();
     }
     if !(radius.is_finite() && height.is_finite() && radius > 0.0) {
-        return Err(PathError::Orbit { what: "the cameras stand on the axis of the circle" });
+        return Err(no_orbit("the cameras stand on the axis of the circle"));
     }
     // cameras all around have no mean direction: any will do
     let start = if toward.length() > 1e-6 { toward.normalize() } else { up.any_orthonormal_vector() };
@@ -122,7 +114,7 @@ pub fn orbit(
             distance = distance.max(p.z + (p.x.abs() * reach_x).max(p.y.abs() * reach_y));
         }
     }
-    let made = rotations.iter().enumerate().map(|(i, &rotation)| {
+    let path = rotations.iter().enumerate().map(|(i, &rotation)| {
         let camera = Camera {
             cx: like.width as f64 / 2.0,
             cy: like.height as f64 / 2.0,
@@ -133,38 +125,38 @@ pub fn orbit(
         };
         NamedCamera { name: format!("{:0digits$}", i + 1), camera }
     });
-    Ok(made.collect())
+    Ok(path.collect())
 }
 
 #[derive(Deserialize)]
-struct File {
-    camera_path: Option<Vec<Key>>,
+struct PathFile {
+    camera_path: Option<Vec<PathKey>>,
     render_width: Option<f64>,
     render_height: Option<f64>,
     camera_type: Option<String>,
-    frames: Option<Vec<Frame>>,
+    frames: Option<Vec<TransformsFrame>>,
     #[serde(flatten)]
-    lens: Lens,
+    lens: Intrinsics,
 }
 
 #[derive(Deserialize)]
-struct Key {
+struct PathKey {
     camera_to_world: Vec<f64>,
     /// Vertical, degrees.
     fov: Option<f64>,
 }
 
 #[derive(Deserialize)]
-struct Frame {
+struct TransformsFrame {
     transform_matrix: Vec<Vec<f64>>,
     file_path: Option<String>,
     #[serde(flatten)]
-    lens: Lens,
+    lens: Intrinsics,
 }
 
 /// Intrinsics as `transforms.json` has them, for all frames or for one.
 #[derive(Deserialize, Clone, Copy)]
-struct Lens {
+struct Intrinsics {
     w: Option<f64>,
     h: Option<f64>,
     fl_x: Option<f64>,
@@ -182,35 +174,38 @@ struct Lens {
 
 /// Cameras from the text of a nerfstudio camera path or a `transforms.json`. What the file does not
 /// say about the lens is taken from `like`.
-pub fn from_json(text: &str, like: &Camera) -> Result<Vec<NamedCamera>, PathError> {
+///
+/// # Errors
+/// When the text is neither, holds no cameras or too many, or one of them is wrong.
+pub fn from_json(text: &str, like: &Camera) -> Result<Vec<NamedCamera>> {
     let text = text.trim_start_matches('\u{feff}');
-    let file: File = serde_json::from_str(text).map_err(|e| PathError::Format { what: e.to_string() })?;
-    let found = match (&file.camera_path, &file.frames) {
-        (Some(path), _) => path.len(),
-        (None, Some(frames)) => frames.len(),
+    let file: PathFile =
+        serde_json::from_str(text).map_err(|e| not_a_path(format!("not a camera path: {e}")))?;
+    let cameras: Vec<(Option<String>, Result<Camera, String>)> = match (&file.camera_path, &file.frames) {
+        (Some(keys), _) => {
+            check_count(keys.len())?;
+            keys.iter().map(|key| (None, from_key(&file, key, like))).collect()
+        }
+        (None, Some(frames)) => {
+            check_count(frames.len())?;
+            frames.iter().map(|frame| (stem(frame), from_frame(&file.lens, frame, like))).collect()
+        }
         (None, None) => {
-            return Err(PathError::Format { what: "there is neither `camera_path` nor `frames`".into() });
+            let problem = "not a camera path: there is neither `camera_path` nor `frames`";
+            return Err(not_a_path(problem.into()));
         }
     };
-    if found == 0 || found > MAX_CAMERAS {
-        return Err(PathError::Count { found });
-    }
-    let digits = found.to_string().len().max(4);
-    let cameras = (0..found).map(|index| {
-        let wrong = |what: String| PathError::Camera { index, what };
-        let (camera, name) = match (&file.camera_path, &file.frames) {
-            (Some(path), _) => (from_key(&file, &path[index], like), None),
-            (None, Some(frames)) => (from_frame(&file.lens, &frames[index], like), stem(&frames[index])),
-            (None, None) => (Err("is missing".into()), None),
-        };
+    let digits = cameras.len().to_string().len().max(4);
+    let cameras = cameras.into_iter().enumerate().map(|(index, (name, camera))| {
         let name = name.unwrap_or_else(|| format!("{:0digits$}", index + 1));
-        Ok(NamedCamera { name, camera: camera.map_err(wrong)? })
+        let camera = camera.map_err(|what| not_a_path(format!("camera {index}: {what}")))?;
+        Ok(NamedCamera { name, camera })
     });
     cameras.collect()
 }
 
 /// The photograph's name; nothing that could lead out of a folder.
-fn stem(frame: &Frame) -> Option<String> {
+fn stem(frame: &TransformsFrame) -> Option<String> {
     let last = frame.file_path.as_deref()?.rsplit(['/', '\\']).next()?;
     let stem = match last.rsplit_once('.') {
         Some((stem, _)) if !stem.is_empty() => stem,
@@ -219,7 +214,7 @@ fn stem(frame: &Frame) -> Option<String> {
     (!["", ".", ".."].contains(&stem)).then(|| stem.to_string())
 }
 
-fn from_key(file: &File, key: &Key, like: &Camera) -> Result<Camera, String> {
+fn from_key(file: &PathFile, key: &PathKey, like: &Camera) -> Result<Camera, String> {
     if let Some(kind) = file.camera_type.as_deref().filter(|k| *k != "perspective") {
         return Err(format!("is of type `{kind}`, expected `perspective`"));
     }
@@ -249,9 +244,9 @@ fn from_key(file: &File, key: &Key, like: &Camera) -> Result<Camera, String> {
     })
 }
 
-fn from_frame(shared: &Lens, frame: &Frame, like: &Camera) -> Result<Camera, String> {
+fn from_frame(shared: &Intrinsics, frame: &TransformsFrame, like: &Camera) -> Result<Camera, String> {
     let own = &frame.lens;
-    let value = |name: &str, of: fn(&Lens) -> Option<f64>| match of(own).or(of(shared)) {
+    let value = |name: &str, of: fn(&Intrinsics) -> Option<f64>| match of(own).or(of(shared)) {
         Some(v) if !v.is_finite() => Err(format!("`{name}` is {v}, expected a finite number")),
         other => Ok(other),
     };
@@ -277,7 +272,7 @@ fn from_frame(shared: &Lens, frame: &Frame, like: &Camera) -> Result<Camera, Str
     let center = |given: Option<f64>, size: u32, other: f64| {
         given.unwrap_or(if known { size as f64 / 2.0 } else { other })
     };
-    let coefficient = |name: &str, of: fn(&Lens) -> Option<f64>, other: f64| -> Result<f64, String> {
+    let coefficient = |name: &str, of: fn(&Intrinsics) -> Option<f64>, other: f64| -> Result<f64, String> {
         Ok(value(name, of)?.unwrap_or(if known { 0.0 } else { other }))
     };
     let bend = like.distortion;

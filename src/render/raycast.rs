@@ -17,11 +17,9 @@ const BATCH: usize = 8192;
 /// Depth change over one pixel, in pixel footprints, from which on it is an edge: tan 84°.
 const JUMP: f32 = 10.0;
 
-/// How to look.
+/// How rays are cast.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RaycastOptions {
-    /// sRGB-coded colour behind the mesh; `None` leaves alpha.
-    pub background: Option<[f32; 3]>,
     /// Rays along each side of a pixel on an edge; 1 leaves edges hard.
     pub samples: u32,
     /// From the mesh's coordinates (in which the camera stands too) to those of depth and normals.
@@ -30,7 +28,7 @@ pub struct RaycastOptions {
 
 impl Default for RaycastOptions {
     fn default() -> RaycastOptions {
-        RaycastOptions { background: None, samples: 2, world_from_scene: Similarity::IDENTITY }
+        RaycastOptions { samples: 2, world_from_scene: Similarity::IDENTITY }
     }
 }
 
@@ -46,46 +44,54 @@ pub struct RenderedView {
     pub normal: Image,
 }
 
+/// What rays met, for whoever colors it. All `[n]`.
+#[derive(Clone, Debug, Default)]
+pub struct RayHits {
+    /// Where, in the mesh's coordinates.
+    pub points: Vec<Vec3>,
+    /// Unit normals: the vertices' interpolated, or the triangle's own where there are none.
+    pub normals: Vec<Vec3>,
+    /// Unit directions, away from the camera.
+    pub directions: Vec<Vec3>,
+    /// Triangle, weights of its corners and distance.
+    pub hits: Vec<Hit>,
+    /// Which pixel each belongs to.
+    pixels: Vec<usize>,
+}
+
 /// Casts the rays of a camera at a mesh.
 ///
-/// `color` is asked for batches of hit points and answers sRGB-coded colours in 0..=1, one a point;
-/// what it does not answer is black. It runs on several threads at once.
+/// `color` is given batches of hits and returns sRGB-coded colors in 0..=1, one a hit, `[n, 3]`; what it leaves out is
+/// black. It runs on several threads at once.
 ///
-/// # Shapes
+/// # Examples
 ///
-/// - `color`: points `[n, 3]` in the mesh's coordinates, unit normals `[n, 3]` (vertex normals
-///   interpolated, the triangle's own where there are none), unit view directions `[n, 3]`, away from
-///   the camera; gives `[n, 3]`.
+/// A triangle before a camera at the origin's front, painted by its normal:
+///
+/// ```
+/// use glam::{DMat3, DVec3, Vec3};
+/// use tiface::geom::{Bvh, Camera, Distortion, Mesh};
+/// use tiface::render::{RaycastOptions, raycast};
+///
+/// let positions = vec![Vec3::new(-3.0, -3.0, 0.0), Vec3::new(3.0, -3.0, 0.0), Vec3::new(0.0, 3.0, 0.0)];
+/// let mesh = Mesh { positions, triangles: vec![[0, 1, 2]], ..Mesh::default() };
+/// let camera = Camera {
+///     width: 20, height: 10, fx: 10.0, fy: 10.0, cx: 10.0, cy: 5.0,
+///     distortion: Distortion::default(), rotation: DMat3::IDENTITY, position: DVec3::new(0.0, 0.0, 2.0),
+/// };
+/// let view = raycast(&Bvh::new(&mesh), &mesh, &camera, &RaycastOptions::default(), |hits| {
+///     hits.normals.iter().map(|n| n.to_array().map(|v| v.abs())).collect()
+/// });
+/// // blue where the normal is +Z, two units away
+/// assert_eq!(view.color.pixel(10, 5), [0.0, 0.0, 1.0, 1.0]);
+/// assert_eq!(view.depth.pixel(10, 5), [2.0]);
+/// ```
 pub fn raycast(
     bvh: &Bvh,
     mesh: &Mesh,
     camera: &Camera,
     options: &RaycastOptions,
-    color: impl Fn(&[Vec3], &[Vec3], &[Vec3]) -> Vec<[f32; 3]> + Sync,
-) -> RenderedView {
-    raycast_hits(bvh, mesh, camera, options, |s: &Struck| color(s.points, s.normals, s.directions))
-}
-
-/// What rays met, for whoever colours it. All `[n]`.
-#[derive(Clone, Copy, Debug)]
-pub struct Struck<'a> {
-    /// Where, in the mesh's coordinates.
-    pub points: &'a [Vec3],
-    /// Unit normals: the vertices' interpolated, or the triangle's own.
-    pub normals: &'a [Vec3],
-    /// Unit directions, away from the camera.
-    pub directions: &'a [Vec3],
-    /// Triangle, weights of its corners and distance.
-    pub hits: &'a [Hit],
-}
-
-/// [`raycast`] for colours that need to know the triangle, as those of a texture do.
-pub fn raycast_hits(
-    bvh: &Bvh,
-    mesh: &Mesh,
-    camera: &Camera,
-    options: &RaycastOptions,
-    color: impl Fn(&Struck) -> Vec<[f32; 3]> + Sync,
+    color: impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync,
 ) -> RenderedView {
     let (width, height) = (camera.width, camera.height);
     let mut view = RenderedView {
@@ -104,32 +110,22 @@ pub fn raycast_hits(
         .par_chunks_mut(rows * w * 4)
         .zip(view.depth.data.par_chunks_mut(rows * w))
         .zip(view.normal.data.par_chunks_mut(rows * w * 3));
+    let caster = Raycaster { bvh, mesh, camera, options };
     bands.enumerate().for_each(|(band, ((rgba, depth), normal))| {
-        let look = Look { bvh, mesh, camera, options };
-        look.band(band * rows, rgba.as_chunks_mut().0, depth, normal.as_chunks_mut().0, &color);
+        caster.band(band * rows, rgba.as_chunks_mut().0, depth, normal.as_chunks_mut().0, &color);
     });
     view
 }
 
 /// Everything a band of rows needs.
-struct Look<'a> {
+struct Raycaster<'a> {
     bvh: &'a Bvh,
     mesh: &'a Mesh,
     camera: &'a Camera,
     options: &'a RaycastOptions,
 }
 
-/// Points to be coloured, and the pixel each belongs to.
-#[derive(Default)]
-struct Queue {
-    points: Vec<Vec3>,
-    normals: Vec<Vec3>,
-    directions: Vec<Vec3>,
-    hits: Vec<Hit>,
-    pixel: Vec<usize>,
-}
-
-impl Look<'_> {
+impl Raycaster<'_> {
     /// Fills the rows from `top` on, as many as the slices hold.
     fn band(
         &self,
@@ -137,7 +133,7 @@ impl Look<'_> {
         rgba: &mut [[f32; 4]],
         depth: &mut [f32],
         normal: &mut [[f32; 3]],
-        color: &(impl Fn(&Struck) -> Vec<[f32; 3]> + Sync),
+        color: &(impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync),
     ) {
         let w = self.camera.width as usize;
         let rows = rgba.len() / w;
@@ -154,7 +150,7 @@ impl Look<'_> {
         } else {
             Vec::new()
         };
-        let mut queue = Queue::default();
+        let mut queue = RayHits::default();
         for i in 0..rgba.len() {
             let (x, y) = (i % w, i / w);
             if let Some((ray, hit)) = &centers[i] {
@@ -177,20 +173,11 @@ impl Look<'_> {
             } else {
                 self.enqueue(&mut queue, i, &centers[i], 1.0, rgba);
             }
-            if queue.pixel.len() >= BATCH {
-                self.shade(&mut queue, n, rgba, color);
+            if queue.pixels.len() >= BATCH {
+                shade(&mut queue, rgba, color);
             }
         }
-        self.shade(&mut queue, n, rgba, color);
-        if let Some(background) = self.options.background {
-            for pixel in rgba {
-                let through = 1.0 - pixel[3];
-                for c in 0..3 {
-                    pixel[c] += through * background[c];
-                }
-                pixel[3] = 1.0;
-            }
-        }
+        shade(&mut queue, rgba, color);
     }
 
     /// The first hit through a picture position, with its ray.
@@ -230,7 +217,7 @@ impl Look<'_> {
     /// Counts the hit into the pixel's alpha and queues it for its colour.
     fn enqueue(
         &self,
-        queue: &mut Queue,
+        queue: &mut RayHits,
         pixel: usize,
         found: &Option<(Ray, Hit)>,
         weight: f32,
@@ -243,40 +230,28 @@ impl Look<'_> {
         queue.normals.push(self.normal(hit));
         queue.directions.push(ray.direction);
         queue.hits.push(*hit);
-        queue.pixel.push(pixel);
+        queue.pixels.push(pixel);
     }
+}
 
-    /// Colours everything queued. A pixel's samples are in one queue, and share its alpha evenly.
-    fn shade(
-        &self,
-        queue: &mut Queue,
-        n: usize,
-        rgba: &mut [[f32; 4]],
-        color: &(impl Fn(&Struck) -> Vec<[f32; 3]> + Sync),
-    ) {
-        if queue.pixel.is_empty() {
-            return;
-        }
-        let colors = color(&Struck {
-            points: &queue.points,
-            normals: &queue.normals,
-            directions: &queue.directions,
-            hits: &queue.hits,
-        });
-        for group in
-            (0..queue.pixel.len()).collect::<Vec<_>>().chunk_by(|&a, &b| queue.pixel[a] == queue.pixel[b])
-        {
-            let out = &mut rgba[queue.pixel[group[0]]];
-            let weight = out[3] / group.len() as f32;
-            debug_assert!(group.len() <= n * n);
-            for c in group.iter().filter_map(|&k| colors.get(k)) {
-                for channel in 0..3 {
-                    out[channel] += weight * c[channel].clamp(0.0, 1.0);
-                }
+/// Colors everything queued. A pixel's samples are in one queue, and share its alpha evenly.
+fn shade(queue: &mut RayHits, rgba: &mut [[f32; 4]], color: &(impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync)) {
+    if queue.pixels.is_empty() {
+        return;
+    }
+    let colors = color(queue);
+    let mut start = 0;
+    for group in queue.pixels.chunk_by(|a, b| a == b) {
+        let out = &mut rgba[group[0]];
+        let weight = out[3] / group.len() as f32;
+        for c in colors.iter().skip(start).take(group.len()) {
+            for channel in 0..3 {
+                out[channel] += weight * c[channel].clamp(0.0, 1.0);
             }
         }
-        *queue = Queue::default();
+        start += group.len();
     }
+    *queue = RayHits::default();
 }
 
 #[cfg(test)]
@@ -301,8 +276,8 @@ mod tests {
         }
     }
 
-    fn red(points: &[Vec3], _: &[Vec3], _: &[Vec3]) -> Vec<[f32; 3]> {
-        vec![[1.0, 0.5, 0.0]; points.len()]
+    fn red(hits: &RayHits) -> Vec<[f32; 3]> {
+        vec![[1.0, 0.5, 0.0]; hits.points.len()]
     }
 
     #[test]
@@ -317,10 +292,6 @@ mod tests {
         let hard = RaycastOptions { samples: 1, ..Default::default() };
         let hard = raycast(&bvh, &mesh, &camera(20, 8), &hard, red);
         assert!(hard.color.data.as_chunks::<4>().0.iter().all(|p| p[3] == 0.0 || p[3] == 1.0));
-        let white = RaycastOptions { background: Some([1.0; 3]), ..Default::default() };
-        let white = raycast(&bvh, &mesh, &camera(20, 8), &white, red);
-        assert_eq!(white.color.pixel(9, 4), [1.0, 1.0, 1.0, 1.0]);
-        assert_eq!(white.color.pixel(10, 4), [1.0, 0.75, 0.5, 1.0]);
     }
 
     #[test]
@@ -350,8 +321,8 @@ mod tests {
         mesh.positions.extend(near.positions.iter().map(|p| *p + Vec3::Z));
         mesh.triangles.push([3, 4, 5]);
         // the near edge, at 3 away, crosses pixel 10 (0..0.03) in its middle
-        let color = |p: &[Vec3], _: &[Vec3], _: &[Vec3]| -> Vec<[f32; 3]> {
-            p.iter().map(|p| if p.z > 0.5 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] }).collect()
+        let color = |hits: &RayHits| -> Vec<[f32; 3]> {
+            hits.points.iter().map(|p| if p.z > 0.5 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] }).collect()
         };
         let view = raycast(&Bvh::new(&mesh), &mesh, &camera(20, 8), &RaycastOptions::default(), color);
         assert_eq!(view.color.pixel(10, 4), [0.5, 0.5, 0.0, 1.0]);
@@ -362,9 +333,9 @@ mod tests {
     fn vertex_normals_are_interpolated_and_directions_are_unit() {
         let mut mesh = half_plane(-10.0);
         mesh.normals = vec![Vec3::X; 3];
-        let color = |_: &[Vec3], n: &[Vec3], d: &[Vec3]| -> Vec<[f32; 3]> {
-            assert!(d.iter().all(|d| (d.length() - 1.0).abs() < 1e-5 && d.z < 0.0));
-            n.iter().map(|n| n.to_array()).collect()
+        let color = |hits: &RayHits| -> Vec<[f32; 3]> {
+            assert!(hits.directions.iter().all(|d| (d.length() - 1.0).abs() < 1e-5 && d.z < 0.0));
+            hits.normals.iter().map(|n| n.to_array()).collect()
         };
         let view = raycast(&Bvh::new(&mesh), &mesh, &camera(6, 6), &RaycastOptions::default(), color);
         assert!((view.color.pixel(3, 3)[0] - 1.0).abs() < 1e-6 && view.color.pixel(3, 3)[2] < 1e-6);
@@ -375,8 +346,8 @@ mod tests {
         // taller than one band of 8192 pixels
         let mesh = half_plane(0.02);
         let bvh = Bvh::new(&mesh);
-        let color = |p: &[Vec3], _: &[Vec3], _: &[Vec3]| -> Vec<[f32; 3]> {
-            p.iter().map(|p| [p.x.abs() % 1.0, p.y.abs() % 1.0, 0.3]).collect()
+        let color = |hits: &RayHits| -> Vec<[f32; 3]> {
+            hits.points.iter().map(|p| [p.x.abs() % 1.0, p.y.abs() % 1.0, 0.3]).collect()
         };
         let look = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

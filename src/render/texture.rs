@@ -4,7 +4,7 @@
 //! covers: of three texels by their share where the number is odd (Guthe and Heckbert, *Non-power-of-two
 //! mipmapping*, 2005), so that no level is shifted against another.
 
-use super::raycast::Struck;
+use super::raycast::RayHits;
 use crate::geom::{Atlas, Camera, Mesh};
 use crate::image::{Photo, linear_from_srgb, srgb_from_linear};
 use crate::kernel::sphharm;
@@ -22,25 +22,30 @@ pub struct LobePictures<'a> {
 }
 
 /// A texture ready to be looked up.
-pub struct Texture<'a> {
+pub struct MeshTexture<'a> {
     atlas: &'a Atlas,
     /// Linear colour and then the lobes, level by level; interleaved channels.
-    levels: Vec<Level>,
+    levels: Vec<MipLevel>,
     channels: usize,
     turned: Mat3,
     /// Texels per unit of length, per triangle.
     density: Vec<f32>,
 }
 
-struct Level {
+struct MipLevel {
     width: usize,
     height: usize,
     data: Vec<f32>,
 }
 
-impl<'a> Texture<'a> {
+impl<'a> MeshTexture<'a> {
     /// Prepares the pictures of a mesh; `color` and the lobes have one size of the atlas's shape.
-    pub fn new(mesh: &Mesh, atlas: &'a Atlas, color: &Photo, lobes: Option<&LobePictures>) -> Texture<'a> {
+    pub fn new(
+        mesh: &Mesh,
+        atlas: &'a Atlas,
+        color: &Photo,
+        lobes: Option<&LobePictures>,
+    ) -> MeshTexture<'a> {
         let table: [f32; 256] = std::array::from_fn(|i| linear_from_srgb(i as f32 / 255.0));
         let pictures = lobes.map_or(&[][..], |l| l.pictures);
         let channels = 3 + 3 * pictures.len();
@@ -52,7 +57,7 @@ impl<'a> Texture<'a> {
                 data.extend(picture.rgb[i].map(|b| (f32::from(b) - 128.0) * scale));
             }
         }
-        let mut levels = vec![Level { width: color.width as usize, height: color.height as usize, data }];
+        let mut levels = vec![MipLevel { width: color.width as usize, height: color.height as usize, data }];
         while levels[levels.len() - 1].width.min(levels[levels.len() - 1].height) > 1 {
             levels.push(levels[levels.len() - 1].halved(channels));
         }
@@ -64,18 +69,18 @@ impl<'a> Texture<'a> {
                 if space > 0.0 { (texels / space).sqrt() } else { 0.0 }
             })
             .collect();
-        Texture { atlas, levels, channels, turned: lobes.map_or(Mat3::IDENTITY, |l| l.turned), density }
+        MeshTexture { atlas, levels, channels, turned: lobes.map_or(Mat3::IDENTITY, |l| l.turned), density }
     }
 
     /// sRGB-coded colours of what rays of a camera met.
-    pub fn colors(&self, struck: &Struck, camera: &Camera) -> Vec<[f32; 3]> {
+    pub fn colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         let forward = camera.forward();
         let mut values = vec![0f32; self.channels];
         let one = |(i, hit): (usize, &crate::geom::Hit)| {
             let corners = self.atlas.triangles[hit.triangle as usize].map(|c| self.atlas.uvs[c as usize]);
             let uv = (1.0 - hit.u - hit.v) * corners[0] + hit.u * corners[1] + hit.v * corners[2];
             // a pixel's width on a plane across the view; slanted surfaces stay sharp rather than blur
-            let footprint = hit.t * struck.directions[i].dot(forward) / camera.fx.abs() as f32;
+            let footprint = hit.t * hits.directions[i].dot(forward) / camera.fx.abs() as f32;
             let texels = footprint * self.density[hit.triangle as usize];
             let level = texels.max(1.0).log2().round().clamp(0.0, (self.levels.len() - 1) as f32);
             self.levels[level as usize].look_up(uv, &mut values);
@@ -83,18 +88,18 @@ impl<'a> Texture<'a> {
             if self.channels == 3 {
                 return base;
             }
-            let d = self.turned * -struck.directions[i];
+            let d = self.turned * -hits.directions[i];
             let lobes = values[3..].as_chunks::<3>().0;
             let more = sphharm::combine(lobes, d.to_array());
             std::array::from_fn(|k| (base[k] + more[k]).clamp(0.0, 1.0))
         };
-        struck.hits.iter().enumerate().map(one).collect()
+        hits.hits.iter().enumerate().map(one).collect()
     }
 }
 
-impl Level {
+impl MipLevel {
     /// Half the texels each way.
-    fn halved(&self, channels: usize) -> Level {
+    fn halved(&self, channels: usize) -> MipLevel {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
         let (across, down) = (shares(self.width, width), shares(self.height, height));
         let mut data = vec![0f32; width * height * channels];
@@ -106,7 +111,7 @@ impl Level {
                 }
             }
         }
-        Level { width, height, data }
+        MipLevel { width, height, data }
     }
 
     /// Bilinear, clamped at the borders.
@@ -143,7 +148,7 @@ fn shares(from: usize, n: usize) -> Vec<[(usize, f32); 3]> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::raycast::{RaycastOptions, raycast_hits};
+    use super::super::raycast::{RaycastOptions, raycast};
     use super::*;
     use crate::geom::Bvh;
     use glam::Vec3;
@@ -164,17 +169,16 @@ mod tests {
         (mesh, atlas, Photo { width: 4, height: 4, rgb, alpha: None })
     }
 
-    fn view(texture: &Texture, mesh: &Mesh, camera: &Camera) -> Vec<[f32; 4]> {
+    fn view(texture: &MeshTexture, mesh: &Mesh, camera: &Camera) -> Vec<[f32; 4]> {
         let bvh = Bvh::new(mesh);
-        let seen =
-            raycast_hits(&bvh, mesh, camera, &RaycastOptions::default(), |s| texture.colors(s, camera));
+        let seen = raycast(&bvh, mesh, camera, &RaycastOptions::default(), |s| texture.colors(s, camera));
         seen.color.data.as_chunks::<4>().0.to_vec()
     }
 
     #[test]
     fn texels_appear_where_they_lie() {
         let (mesh, atlas, photo) = square();
-        let texture = Texture::new(&mesh, &atlas, &photo, None);
+        let texture = MeshTexture::new(&mesh, &atlas, &photo, None);
         // 8 × 8 pixels over the square: focal 8 at distance 2 shows 2 units
         let pixels = view(&texture, &mesh, &Camera::above(8, 8, 8.0, 2.0));
         let near = |p: [f32; 4], c: [f32; 4]| p.iter().zip(c).all(|(a, b)| (a - b).abs() < 1e-4);
@@ -185,7 +189,7 @@ mod tests {
 
     #[test]
     fn levels_of_any_size_lie_where_the_picture_lies() {
-        let row = |data: &[f32]| Level { width: data.len(), height: 1, data: data.to_vec() };
+        let row = |data: &[f32]| MipLevel { width: data.len(), height: 1, data: data.to_vec() };
         // five texels in halves of 2.5: (1 + 2 + 0.5 · 4) / 2.5 and (0.5 · 4 + 8 + 16) / 2.5
         let half = row(&[1.0, 2.0, 4.0, 8.0, 16.0]).halved(1);
         assert_eq!((half.width, half.height), (2, 1));
@@ -194,7 +198,7 @@ mod tests {
         assert_eq!(row(&[1.0, 3.0, 5.0, 9.0]).halved(1).data, [2.0, 7.0]);
         // a bright spot keeps its place and its light on every level: 23 by 37 texels, the spot at (5, 30)
         let (width, height) = (23, 37);
-        let mut level = Level { width, height, data: vec![0.0; width * height] };
+        let mut level = MipLevel { width, height, data: vec![0.0; width * height] };
         level.data[30 * width + 5] = 1.0;
         while level.width.min(level.height) > 1 {
             level = level.halved(1);
@@ -215,7 +219,7 @@ mod tests {
     fn from_afar_the_mean_of_the_light_is_seen() {
         let (mesh, atlas, mut photo) = square();
         photo.rgb.iter_mut().enumerate().for_each(|(i, c)| *c = [255 * ((i + i / 4) % 2) as u8; 3]);
-        let texture = Texture::new(&mesh, &atlas, &photo, None);
+        let texture = MeshTexture::new(&mesh, &atlas, &photo, None);
         // 2 pixels over the square: every pixel is the mean of 2 × 2 texels, linear 0.5, coded 0.735
         for p in view(&texture, &mesh, &Camera::above(2, 2, 2.0, 2.0)) {
             assert!((p[0] - srgb_from_linear(0.5)).abs() < 1e-3, "{p:?}");
@@ -231,7 +235,7 @@ mod tests {
         let pictures = [flat(128), flat(128), flat(128), flat(255)];
         let scale = [0.1, 0.1, 0.1, 0.2];
         let lobes = LobePictures { pictures: &pictures, scale: &scale, turned: Mat3::IDENTITY };
-        let texture = Texture::new(&mesh, &atlas, &photo, Some(&lobes));
+        let texture = MeshTexture::new(&mesh, &atlas, &photo, Some(&lobes));
         let pixels = view(&texture, &mesh, &Camera::above(9, 9, 9.0, 2.0));
         let middle = pixels[40];
         assert!((middle[0] - 128.0 / 255.0).abs() < 1e-3);
