@@ -56,7 +56,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     if let Some(folder) = dump {
         std::fs::create_dir_all(&folder)?;
-        std::fs::write(folder.join("mesh.ply"), tiface::mesh::files::to_ply(&mesh)?)?;
+        let ply = tiface::mesh::files::to_ply(&mesh, None, &Default::default())?;
+        std::fs::write(folder.join("mesh.ply"), &ply.files[0].1)?;
         write_rays(&folder.join("primary.f32"), &primary)?;
         write_rays(&folder.join("random.f32"), &random)?;
     }

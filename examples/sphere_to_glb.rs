@@ -13,11 +13,19 @@ use tiface::mesh::files::{ExportOptions, check, to_glb, to_obj, to_ply};
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = PathBuf::from(std::env::args().nth(1).unwrap_or_else(|| ".".into()));
     let mesh = ball(64, 0.1, Vec3::new(0.3, -0.2, 1.6));
-    let options = ExportOptions { name: "sphere".into(), up: Vec3::Z, ..ExportOptions::default() };
+    let options = ExportOptions {
+        name: "sphere".into(),
+        stem: "sphere".into(),
+        up: Vec3::Z,
+        ..ExportOptions::default()
+    };
     std::fs::create_dir_all(&folder)?;
-    std::fs::write(folder.join("sphere.glb"), to_glb(&mesh, &options)?)?;
-    std::fs::write(folder.join("sphere.obj"), to_obj(&mesh, &options)?)?;
-    std::fs::write(folder.join("sphere.ply"), to_ply(&mesh)?)?;
+    std::fs::write(folder.join("sphere.glb"), to_glb(&mesh, None, &options)?)?;
+    for (name, bytes) in
+        [to_obj(&mesh, None, &options)?, to_ply(&mesh, None, &options)?].iter().flat_map(|e| &e.files)
+    {
+        std::fs::write(folder.join(name), bytes)?;
+    }
     print!("{}", check(&mesh, 1.0));
     Ok(())
 }

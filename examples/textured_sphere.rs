@@ -1,34 +1,30 @@
-//! Writes a textured ball, 20 cm across, as a GLB, an OBJ and a PLY, and as GLBs with everything else.
+//! Writes a textured ball, 20 cm across, as a GLB, an OBJ and a PLY, and as a GLB with everything else.
 //!
 //! `cargo run --no-default-features --example textured_sphere -- FOLDER`
 //!
 //! A map of the world: u runs around, v from pole to pole, so one meridian is a seam. `tools/readers`
 //! opens all of them with other people's programs.
 
-use glam::{Vec2, Vec3};
+use glam::{Mat3, Vec2, Vec3};
 use std::f32::consts::{PI, TAU};
 use tiface::geom::{Atlas, Mesh};
 use tiface::image::Photo;
-use tiface::mesh::files::{ExportOptions, Lobe, TextureOptions, Textured};
-use tiface::mesh::files::{textured_to_glb, textured_to_obj, textured_to_ply};
+use tiface::mesh::files::{ExportOptions, HeadTexture, Lobes, to_glb, to_obj, to_ply};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = std::path::PathBuf::from(std::env::args().nth(1).unwrap_or_else(|| ".".into()));
     let (mesh, atlas) = globe(32, 0.1, Vec3::new(0.3, -0.2, 1.6));
     let color = picture(|x, y| [x as u8, 2 * y as u8, if (x / 16 + y / 16) % 2 == 0 { 40 } else { 220 }]);
     let (flat, gloss) = (picture(|_, _| [128, 128, 255]), picture(|x, _| [(x / 4) as u8; 3]));
-    let options = ExportOptions { name: "globe".into(), up: Vec3::Z, ..ExportOptions::default() };
-    let plain = Textured::new(&mesh, &atlas, &color);
-    let lobes = vec![Lobe { name: "gloss".into(), picture: &gloss }];
-    let rich = Textured { normal: Some(&flat), lobes, ..plain.clone() };
-    let texture = TextureOptions { stem: "globe".into(), ..TextureOptions::default() };
-    let mut files = textured_to_glb(&plain, &options, &texture)?.files;
-    files.extend(textured_to_obj(&plain, &options, &texture)?.files);
-    files.extend(textured_to_ply(&plain, &texture)?.files);
-    let texture = TextureOptions { stem: "globe_rich".into(), ..texture };
-    files.extend(textured_to_glb(&rich, &options, &texture)?.files);
-    let texture = TextureOptions { stem: "globe_quantized".into(), quantize: true, ..texture };
-    files.extend(textured_to_glb(&rich, &options, &texture)?.files);
+    let options =
+        ExportOptions { name: "globe".into(), stem: "globe".into(), up: Vec3::Z, ..ExportOptions::default() };
+    let plain = HeadTexture::new(atlas, color);
+    let lobes = Lobes { pictures: vec![gloss], scale: vec![0.5], asset_from_world: Mat3::IDENTITY };
+    let rich = HeadTexture { normal: Some(flat), lobes: Some(lobes), ..plain.clone() };
+    let mut files = to_obj(&mesh, Some(&plain), &options)?.files;
+    files.extend(to_ply(&mesh, Some(&plain), &options)?.files);
+    files.push(("globe.glb".into(), to_glb(&mesh, Some(&plain), &options)?));
+    files.push(("globe_rich.glb".into(), to_glb(&mesh, Some(&rich), &options)?));
     std::fs::create_dir_all(&folder)?;
     Ok(files.iter().try_for_each(|(name, bytes)| std::fs::write(folder.join(name), bytes))?)
 }

@@ -31,11 +31,9 @@ mod mask;
 mod mesh;
 mod metrics;
 mod page;
-mod parts;
 mod path;
 mod pictures;
 mod plan;
-mod product;
 mod render;
 mod scene_file;
 mod surface;
@@ -48,13 +46,12 @@ pub use learn::TrainedFields;
 pub use line::{Line, capture_options, feasible};
 pub use march::Seen;
 pub use mask::{click_page, disagreements};
-pub use product::{Lobes, Pictures, Product};
+pub use mesh::export_head;
 pub use surface::{Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
 
 use crate::Result;
 use crate::run::Done;
-use line::unusable;
 
 /// Completes every stage that `until` needs, and itself, and writes the report.
 pub fn reconstruct(line: &Line, until: Stage) -> Result<Vec<(Stage, Done)>> {
@@ -76,7 +73,7 @@ pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> 
         Stage::Mask => mask::mask(capture, line.clicks.as_ref(), &config.mask, dir),
         Stage::Baseline | Stage::Tface => learn::radiance(stage, capture, &line.scene()?, config, dir),
         Stage::Iface => learn::distance(capture, &line.scene()?, config, dir),
-        Stage::Mesh => line.mesh(&line.scene()?, fields.surface()?, dir),
+        Stage::Mesh => mesh::mesh(capture, &line.scene()?, fields.surface()?, config, dir),
         Stage::Render => render::render(line, &line.scene()?, fields, dir),
         Stage::Ensemble => ensemble::ensemble(line, &line.scene()?, fields, dir),
         Stage::Metrics => metrics::metrics(line, dir),

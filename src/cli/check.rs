@@ -6,11 +6,10 @@ use super::stdout::print;
 use crate::capture::{self, CaptureOptions, Split};
 use crate::geom::{Bvh, Camera};
 use crate::io::{self, Limits};
-use crate::mesh::files::{CheckReport, RequireError, check_around};
-use crate::mesh::files::{ReadMesh, Texture, picture_of_mtl, read_placed, read_whole, weld};
-use crate::mesh::files::{UvReport, uv_check};
+use crate::mesh::files::{CheckReport, UvReport, check_around, uv_check};
+use crate::mesh::files::{PictureSource, ReadMesh, ReadOptions, picture_of_mtl, read_with, weld};
 use crate::metrics::distance::{Distances, one_way, seen_one_way};
-use crate::{Error, Result};
+use crate::{Error, ErrorKind, Result};
 use serde::Serialize;
 use std::fmt::{self, Display};
 use std::path::Path;
@@ -63,7 +62,7 @@ impl Display for Against {
 }
 
 #[derive(Serialize)]
-struct Whole<'a> {
+struct CheckJson<'a> {
     #[serde(flatten)]
     report: &'a CheckReport,
     /// Why the texture was not looked at.
@@ -73,47 +72,30 @@ struct Whole<'a> {
     against: Option<&'a Against>,
 }
 
-fn load(path: &Path) -> Result<ReadMesh> {
-    let bytes = io::read_bytes(path, &Limits::default())?;
-    Ok(read_placed(&bytes, path)?)
+fn load(path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
+    read_with(&io::read_bytes(path, &Limits::default())?, path, options)
 }
 
 /// A texture of unknown size is measured as if it had this many texels along each side.
 const UNKNOWN_PX: u32 = 1024;
 
-/// What is known of a texture.
-#[derive(Default)]
-struct Textured {
-    /// Is there a picture?
-    is_there: Option<bool>,
-    /// The texture coordinates, measured.
-    uv: Option<UvReport>,
-    /// Why it was not looked at.
-    problem: Option<String>,
-}
-
-/// The mesh and its texture. One that cannot be understood is no reason not to check the mesh.
-fn load_whole(path: &Path) -> Result<(ReadMesh, Textured)> {
-    let bytes = io::read_bytes(path, &Limits::default())?;
-    let whole = match read_whole(&bytes, path) {
-        Ok(whole) => whole,
-        Err(e) => return Ok((load(path)?, Textured { problem: Some(e.to_string()), ..Textured::default() })),
+/// Returns whether there is a picture, and the texture coordinates, measured.
+fn check_texture(found: &ReadMesh, path: &Path) -> (bool, Option<UvReport>) {
+    let beside = match &found.picture {
+        Some(PictureSource::Beside(name)) => Some(name.clone()),
+        Some(PictureSource::Material(mtl)) => picture_of_material(&path.with_file_name(mtl)),
+        Some(PictureSource::Inside(_)) | None => None,
     };
-    let beside = match &whole.texture {
-        Some(Texture::Beside(name)) => Some(name.clone()),
-        Some(Texture::Material(mtl)) => picture_of_material(&path.with_file_name(mtl)),
-        Some(Texture::Inside(_)) | None => None,
-    };
-    let is_there = beside.is_some() || matches!(whole.texture, Some(Texture::Inside(_)));
-    let uv = whole.atlas.clone().map(|mut atlas| {
+    let is_there = beside.is_some() || matches!(found.picture, Some(PictureSource::Inside(_)));
+    let uv = found.atlas.clone().map(|mut atlas| {
         if atlas.width == 0 || atlas.height == 0 {
             let info =
                 beside.and_then(|name| io::picture_info(&path.with_file_name(name), &Limits::default()).ok());
             (atlas.width, atlas.height) = info.map_or((UNKNOWN_PX, UNKNOWN_PX), |i| i.size(None));
         }
-        uv_check(&weld(&whole.mesh), &atlas)
+        uv_check(&weld(&found.mesh), &atlas)
     });
-    Ok((whole, Textured { is_there: Some(is_there), uv, problem: None }))
+    (is_there, uv)
 }
 
 /// The name of the picture that a material file gives.
@@ -129,17 +111,28 @@ pub(super) fn run(
     seen_by: Option<&Path>,
 ) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
-    let (found, Textured { is_there, uv, problem }) = load_whole(path)?;
+    // a texture that cannot be understood is no reason not to check the mesh
+    let (found, problem) = match load(path, &ReadOptions::default()) {
+        Ok(found) => (found, None),
+        Err(e) => (load(path, &ReadOptions::SURFACE)?, Some(e.to_string())),
+    };
     let unit_m = config.capture.unit_m;
-    let report = CheckReport { uv, has_texture: is_there, ..check_around(&found.mesh, found.origin, unit_m) };
+    let mut report = check_around(&found.mesh, found.origin, unit_m);
+    if problem.is_none() {
+        let (is_there, uv) = check_texture(&found, path);
+        (report.has_texture, report.uv) = (Some(is_there), uv);
+    }
     let bars: Vec<&str> = require.iter().map(String::as_str).collect();
     let passed = report.require(&bars);
-    if let Err(e @ RequireError::Unknown { .. }) = &passed {
-        return Err(Error::usage(e.to_string(), e.hint()));
+    if let Err(e) = &passed
+        && e.kind() == ErrorKind::Usage
+    {
+        return passed;
     }
     let against = against.map(|other| compare(&found, other, seen_by, unit_m)).transpose()?;
     let text = if common.json {
-        let whole = Whole { report: &report, texture_problem: problem.as_deref(), against: against.as_ref() };
+        let whole =
+            CheckJson { report: &report, texture_problem: problem.as_deref(), against: against.as_ref() };
         format!("{}\n", serde_json::to_string(&whole).unwrap_or_default())
     } else {
         let uv = match (&report.uv, &problem) {
@@ -150,13 +143,12 @@ pub(super) fn run(
         format!("{report}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
     };
     print(&text)?;
-    passed.map_err(|e| Error::below(e.to_string(), e.hint()))?;
-    Ok(())
+    passed
 }
 
 fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Result<Against> {
     let ReadMesh { mesh, origin, .. } = found;
-    let ReadMesh { mesh: mut truth, origin: elsewhere, .. } = load(other)?;
+    let ReadMesh { mesh: mut truth, origin: elsewhere, .. } = load(other, &ReadOptions::SURFACE)?;
     // both around one origin
     let way = elsewhere - origin;
     truth.positions.iter_mut().for_each(|p| *p = (p.as_dvec3() + way).as_vec3());

@@ -6,7 +6,7 @@
 use super::target::DEMO_CAPTURE;
 use crate::config::MeshFormat;
 use crate::io;
-use crate::pipeline::{Line, Stage};
+use crate::pipeline::{Line, Stage, export_head};
 use crate::run::Run;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -100,8 +100,7 @@ impl Out {
         match self {
             Out::File(file, ending) if let Some(format) = mesh_format(ending) => {
                 let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
-                let exported =
-                    line.read_product()?.files(format, &line.export(), line.mesh_config(), stem)?;
+                let exported = export_head(line, format, stem)?;
                 exported.warnings.iter().for_each(|w| run.warn("mesh", w));
                 let files = exported.files;
                 // the mesh names its pictures: it comes last, and under the name that was asked for

@@ -72,8 +72,6 @@ table! {
         texture_format: TextureFormat => TextureFormat::Png;
         /// Also keep the baked colour as head.exr, scene-linear: true or false.
         exr: bool => false;
-        /// 16-bit coordinates in the GLB: half the size, misread by trimesh and open3d.
-        quantize: bool => false;
         /// Files to write, a list of glb, obj, ply.
         format: Vec<MeshFormat> => vec![MeshFormat::Glb];
         /// Coordinates of the files: dataset, or head (+Y up, face towards +Z, centred).

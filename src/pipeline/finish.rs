@@ -1,14 +1,15 @@
 //! From the whole extraction to what an artist opens: simplified, laid out, baked.
 
-use super::product::{Lobes, Pictures, Product};
-use super::{Line, Surface, export};
-use crate::capture::Split;
+use super::Export;
+use super::export::center;
+use super::surface::ClosedSurface;
 use crate::capture::scene::Scene;
+use crate::config::MeshConfig;
 use crate::geom::{Camera, Mesh};
 use crate::image::{Image, Photo, quantise, srgb_from_linear};
 use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, bake, tangent_space};
-use crate::mesh::files::tangents;
-use crate::mesh::{AtlasConfig, Cap, Patches, SimplifyConfig, atlas, simplify};
+use crate::mesh::files::{HeadMesh, HeadTexture, Lobes, tangents};
+use crate::mesh::{AtlasConfig, SimplifyConfig, atlas, simplify};
 use crate::{Monitor, Result};
 use glam::{Mat3, Vec3};
 use serde_json::{Map, Value, json};
@@ -16,125 +17,86 @@ use serde_json::{Map, Value, json};
 /// How far the true surface may lie from a triangle, in cells: the chords of large triangles and half a cell.
 pub(super) const REACH: f32 = 2.5;
 
-/// The product, what is to be kept beside it, and what happened.
-pub(super) struct Finished {
+/// The head mesh, what is to be kept beside it, and what happened.
+pub(super) struct FinishedHead {
     /// What an artist opens.
-    pub product: Product,
+    pub head: HeadMesh,
     /// The baked colour, linear.
     pub linear: Option<Image>,
     /// A report per step.
     pub report: Map<String, Value>,
-    /// What a person should hear about.
+    /// What a person should know.
     pub warnings: Vec<String>,
 }
 
-/// What closes a surface where the field's own zero does not.
-#[derive(Clone, Copy)]
-pub(super) struct Closing<'a> {
-    /// Where the frames cut the body.
-    pub cap: Option<&'a Cap>,
-    /// Where handles were cut.
-    pub patches: Option<&'a Patches>,
-}
-
-impl Line<'_> {
-    /// Finishes a surface in scene coordinates, extracted with cells of `cell`.
-    pub(super) fn finish(
-        &self,
-        surface: &Mesh,
-        Closing { cap, patches }: Closing,
-        cell: f32,
-        scene: &Scene,
-        field: &dyn Surface,
-        monitor: &dyn Monitor,
-    ) -> Result<Finished> {
-        let c = &self.config.mesh;
-        let mut report = Map::new();
-        let mut warnings = Vec::new();
-        let mut mesh = surface.clone();
-        // on an open surface the field's own zero ends at the opening, which the closed one holds as well
-        let gradient = |points: &[Vec3]| {
-            let (mut values, mut gradients) = field.sdf_gradient(points);
-            if let Some(cap) = cap {
-                cap.close(points, &mut values, &mut gradients);
-            }
-            if let Some(patches) = patches {
-                patches.close(points, &mut values, &mut gradients);
-            }
-            (values, gradients)
+/// Finishes a surface in scene coordinates, extracted with cells of `cell`, for cameras in scene coordinates.
+pub(super) fn finish(
+    surface: &Mesh,
+    cell: f32,
+    closed: &ClosedSurface,
+    cameras: &[Camera],
+    scene: &Scene,
+    export: &Export,
+    c: &MeshConfig,
+    monitor: &dyn Monitor,
+) -> Result<FinishedHead> {
+    let (mut report, mut warnings) = (Map::new(), Vec::new());
+    let mut mesh = surface.clone();
+    let gradient = |points: &[Vec3]| closed.sdf_gradient(points);
+    let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
+    if fewer || c.max_error > 0.0 {
+        let config = SimplifyConfig {
+            triangles: c.triangles as usize,
+            error: c.max_error * cell,
+            ..SimplifyConfig::default()
         };
-        let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
-        if fewer || c.max_error > 0.0 {
-            let config = SimplifyConfig {
-                triangles: c.triangles as usize,
-                error: c.max_error * cell,
-                ..SimplifyConfig::default()
-            };
-            let done = simplify(&mut mesh, Some(&gradient), &config, monitor)?;
-            warnings.extend(done.warnings(&config));
-            report.insert("simplify".into(), json!(done));
-        }
-        let world_from_scene = scene.scene_from_world.inverse();
-        if c.texture_px == 0 {
-            let product = Product { mesh, world_from_scene, pictures: None };
-            return Ok(Finished { product, linear: None, report, warnings });
-        }
-
-        let export = self.export();
-        let centre = export::centre(surface, &world_from_scene);
-        let front = export.front(centre).map(|d| scene.scene_from_world.direction(d));
-        let config = AtlasConfig { size_px: c.texture_px, gutter_px: c.gutter_px, front };
-        let (laid, done) = atlas(&mesh, &config, monitor)?;
-        warnings.extend(done.warnings());
-        report.insert("atlas".into(), json!(done));
-
-        // as `Product::files` turns it
-        let asset_from_world = export.asset_from_world(&mesh, &world_from_scene);
-        let config = BakeConfig {
-            side: c.texture_samples,
-            gutter_px: c.gutter_px,
-            reach: REACH * cell,
-            lobes: c.lobes,
-            normals: c.normal_map,
-            turned: asset_from_world * world_from_scene.rotation_f32(),
-        };
-        let colors = |p: &[Vec3], n: &[Vec3], counts: &[u32], d: &[Vec3]| {
-            let mut colors = field.colors(p, n, counts, d);
-            if let Some(cap) = cap {
-                let mut at = 0;
-                for (p, &count) in p.iter().zip(counts) {
-                    let own = at..at + count as usize;
-                    at = own.end;
-                    if cap.holds(*p) {
-                        let color = cap.color(*p);
-                        colors[own].fill(color);
-                    }
-                }
-            }
-            colors
-        };
-        let learned = Learned { gradient: &gradient, colors: &colors };
-        let train = self.capture.split(Split::Train);
-        let cameras: Vec<Camera> = train.map(|v| v.camera.transformed(&scene.scene_from_world)).collect();
-        let baked = bake(&mesh, &laid, &learned, &cameras, &config, monitor)?;
-        report.insert("bake".into(), json!(baked.report));
-        let color = coded(&baked.color);
-        report.insert("seam_step_255".into(), json!(Seams::new(&mesh, &laid).step(&color)));
-
-        let normal = match &baked.normal {
-            Some(normals) => match tangents(&mesh, &laid) {
-                Ok(tangents) => Some(tangent_space(&mesh, &laid, &tangents, normals, c.gutter_px)),
-                Err(e) => {
-                    warnings.push(format!("the mesh has no normal map: {e}"));
-                    None
-                }
-            },
-            None => None,
-        };
-        let pictures = Pictures { atlas: laid, color, normal, lobes: lobes(&baked, asset_from_world) };
-        let product = Product { mesh, world_from_scene, pictures: Some(pictures) };
-        Ok(Finished { product, linear: c.exr.then_some(baked.color), report, warnings })
+        let done = simplify(&mut mesh, Some(&gradient), &config, monitor)?;
+        warnings.extend(done.warnings(&config));
+        report.insert("simplify".into(), json!(done));
     }
+    let world_from_scene = scene.scene_from_world.inverse();
+    if c.texture_px == 0 {
+        let head = HeadMesh { mesh, world_from_scene, texture: None };
+        return Ok(FinishedHead { head, linear: None, report, warnings });
+    }
+
+    let front = export.front(center(surface, &world_from_scene));
+    let front = front.map(|d| scene.scene_from_world.direction(d));
+    let config = AtlasConfig { size_px: c.texture_px, gutter_px: c.gutter_px, front };
+    let (layout, done) = atlas(&mesh, &config, monitor)?;
+    warnings.extend(done.warnings());
+    report.insert("atlas".into(), json!(done));
+
+    // as `Export::files` turns it
+    let asset_from_world = export.asset_from_world(&mesh, &world_from_scene);
+    let config = BakeConfig {
+        side: c.texture_samples,
+        gutter_px: c.gutter_px,
+        reach: REACH * cell,
+        lobes: c.lobes,
+        normals: c.normal_map,
+        turned: asset_from_world * world_from_scene.rotation_f32(),
+    };
+    let colors = |p: &[Vec3], n: &[Vec3], counts: &[u32], d: &[Vec3]| closed.colors(p, n, counts, d);
+    let learned = Learned { gradient: &gradient, colors: &colors };
+    let baked = bake(&mesh, &layout, &learned, cameras, &config, monitor)?;
+    report.insert("bake".into(), json!(baked.report));
+    let color = coded(&baked.color);
+    report.insert("seam_step_255".into(), json!(Seams::new(&mesh, &layout).step(&color)));
+
+    let mut normal = None;
+    if let Some(normals) = &baked.normal {
+        match tangents(&mesh, &layout) {
+            Ok(tangents) => {
+                normal = Some(tangent_space(&mesh, &layout, &tangents, normals, c.gutter_px));
+            }
+            Err(e) => warnings.push(format!("the mesh has no normal map: {e}")),
+        }
+    }
+    let lobes = lobes(&baked, asset_from_world);
+    let texture = Some(HeadTexture { atlas: layout, color, normal, lobes });
+    let head = HeadMesh { mesh, world_from_scene, texture };
+    Ok(FinishedHead { head, linear: c.exr.then_some(baked.color), report, warnings })
 }
 
 /// Linear colour as a picture, rounded to nearest.

@@ -296,7 +296,7 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
         let mm = world_from_scene.scale * config.capture.unit_m * 1000.0;
         let summary = complete(&line, Stage::Mesh, &Drilled(Exact { world_from_scene })).unwrap().summary;
         digests.push(line.plan(Stage::Mesh).fingerprint.digest());
-        let (handles, product) = (&summary["handles"], line.read_product().unwrap().mesh);
+        let (handles, product) = (&summary["handles"], super::mesh::head_mesh(&line).unwrap().mesh);
         let left = handles["left"].as_u64().unwrap() as usize;
         let lengths = |key: &str| handles[key].as_array().unwrap().len();
         counts.push((lengths("cut_mm") + lengths("filled_mm"), left));

@@ -1,5 +1,6 @@
 //! Stage `metrics`: every view, of every member and of the blends, against its photograph.
 
+use super::mesh::surface_in_world;
 use super::truth::against_truth;
 use super::{Line, pictures};
 use crate::capture::{LoadedView, View};
@@ -86,7 +87,7 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     }
     if line.synthetic && line.order(Stage::Metrics).contains(&Stage::Mesh) {
         let points = line.config.metrics.surface_points as usize;
-        let truth = against_truth(&line.read_mesh()?, points);
+        let truth = against_truth(&surface_in_world(line)?, points);
         out.insert("truth_percent_of_head".into(), json!(truth));
     }
     let value = Value::Object(out);

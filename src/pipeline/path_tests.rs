@@ -247,14 +247,14 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
     let run = quiet(dir.path());
     let first = Line::open(&config, &run, false).unwrap();
     evaluate(&first);
-    let (before, export) = (files(run.dir()), first.export());
+    let (before, export) = (files(run.dir()), Export::new(first.capture(), &config));
     std::fs::rename(&root, dir.path().join("moved")).unwrap();
 
     let line = Line::open(&config, &run, false).unwrap();
     assert_eq!(evaluate(&line), [true; 4]);
     assert!(line.outlook(Stage::Metrics).is_ok());
     assert!(before == files(run.dir()));
-    let again = line.export();
+    let again = Export::new(line.capture(), &config);
     assert_eq!((again.name, again.up, again.cameras), (export.name, export.up, export.cameras));
 
     // there is work: nothing is removed or written before it is known that it cannot be done

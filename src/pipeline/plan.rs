@@ -192,7 +192,7 @@ impl Line<'_> {
             }
             Stage::Mesh => {
                 settings.insert("capture.unit_m".into(), config.capture.unit_m.to_string());
-                settings.insert("format of mesh/parts".into(), super::parts::FORMAT.into());
+                settings.insert("format of mesh/parts".into(), crate::mesh::files::FORMAT.into());
                 // a few triangles per cell of a closed surface, three formats and the parts
                 let c = &config.mesh;
                 needs_bytes += (c.resolution as u64).pow(2) * 12 * 130;

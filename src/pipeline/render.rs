@@ -8,9 +8,8 @@
 //!
 //! These are the held-out views. Those of other cameras lie in a folder of their own, `render/paths/`.
 
-use super::parts::Whole;
+use super::mesh::{extracted_surface, head_mesh};
 use super::path::{CameraPath, cameras_of};
-use super::product::{Pictures, Product};
 use super::surface::Fields;
 use super::{Line, march::march, pictures};
 use crate::capture::Split;
@@ -18,6 +17,7 @@ use crate::capture::scene::{self, Scene};
 use crate::config::Method;
 use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
 use crate::io;
+use crate::mesh::files::{ExtractedSurface, HeadMesh, HeadTexture};
 use crate::render::path::{NamedCamera, orbit};
 use crate::render::{LobePictures, MeshTexture, RaycastOptions, RenderedView, raycast};
 use crate::run::StageDir;
@@ -89,29 +89,29 @@ pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
 
 /// The meshes that some methods show.
 pub(super) struct Meshes {
-    whole: Option<Whole>,
-    product: Option<(Product, Pictures)>,
+    extracted: Option<ExtractedSurface>,
+    head: Option<(HeadMesh, HeadTexture)>,
 }
 
 impl Meshes {
     /// Those that `methods` show, as they lie in the run.
     pub fn load(line: &Line, methods: &[Method]) -> Result<Meshes> {
-        let whole = methods.contains(&Method::Raycast).then(|| line.read_whole()).transpose()?;
-        let product = methods.contains(&Method::Textured).then(|| textured(line)).transpose()?;
-        Ok(Meshes { whole, product })
+        let extracted = methods.contains(&Method::Raycast).then(|| extracted_surface(line)).transpose()?;
+        let head = methods.contains(&Method::Textured).then(|| textured(line)).transpose()?;
+        Ok(Meshes { extracted, head })
     }
 }
 
-/// The product and its texture, which it must have.
-fn textured(line: &Line) -> Result<(Product, Pictures)> {
-    let mut product = line.read_product()?;
-    let pictures = product.pictures.take().ok_or_else(|| {
+/// The head mesh and its texture, which it must have.
+fn textured(line: &Line) -> Result<(HeadMesh, HeadTexture)> {
+    let mut head = head_mesh(line)?;
+    let texture = head.texture.take().ok_or_else(|| {
         Error::cannot(
             "the mesh has no texture to be shown",
             "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
         )
     })?;
-    Ok((product, pictures))
+    Ok((head, texture))
 }
 
 /// A mesh with its texture and what rays need to find it.
@@ -122,14 +122,14 @@ struct TexturedMesh<'a> {
 }
 
 impl<'a> TexturedMesh<'a> {
-    fn new(product: &'a Product, pictures: &'a Pictures) -> TexturedMesh<'a> {
-        let (mesh, world_from_scene) = (&product.mesh, product.world_from_scene.rotation_f32());
-        let lobes = pictures.lobes.as_ref().map(|l| LobePictures {
+    fn new(head: &'a HeadMesh, texture: &'a HeadTexture) -> TexturedMesh<'a> {
+        let (mesh, world_from_scene) = (&head.mesh, head.world_from_scene.rotation_f32());
+        let lobes = texture.lobes.as_ref().map(|l| LobePictures {
             pictures: &l.pictures,
             scale: &l.scale,
             turned: l.asset_from_world * world_from_scene,
         });
-        let texture = MeshTexture::new(mesh, &pictures.atlas, &pictures.color, lobes.as_ref());
+        let texture = MeshTexture::new(mesh, &texture.atlas, &texture.color, lobes.as_ref());
         TexturedMesh { mesh, bvh: Bvh::new(mesh), texture }
     }
 }
@@ -137,8 +137,8 @@ impl<'a> TexturedMesh<'a> {
 /// Makes views by any method.
 pub(super) struct Renderer<'a> {
     fields: &'a dyn Fields,
-    whole: Option<(&'a Whole, Bvh)>,
-    product: Option<TexturedMesh<'a>>,
+    extracted: Option<(&'a ExtractedSurface, Bvh)>,
+    textured: Option<TexturedMesh<'a>>,
     samples: u32,
     world_from_scene: Similarity,
     monitor: &'a dyn Monitor,
@@ -155,8 +155,8 @@ impl<'a> Renderer<'a> {
     ) -> Renderer<'a> {
         Renderer {
             fields,
-            whole: meshes.whole.as_ref().map(|w| (w, Bvh::new(&w.mesh))),
-            product: meshes.product.as_ref().map(|(product, pictures)| TexturedMesh::new(product, pictures)),
+            extracted: meshes.extracted.as_ref().map(|s| (s, Bvh::new(&s.mesh))),
+            textured: meshes.head.as_ref().map(|(head, texture)| TexturedMesh::new(head, texture)),
             samples,
             world_from_scene: scene.scene_from_world.inverse(),
             monitor,
@@ -166,7 +166,7 @@ impl<'a> Renderer<'a> {
     /// The view of a camera in scene coordinates, over nothing.
     pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>> {
         let options = RaycastOptions { samples: self.samples, world_from_scene: self.world_from_scene };
-        Ok(match (method, &self.whole) {
+        Ok(match (method, &self.extracted) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
                 // a large view takes minutes: nobody who asks to stop waits for the rest of it
@@ -177,7 +177,7 @@ impl<'a> Renderer<'a> {
                 Some(march(camera, &self.world_from_scene, false, see))
             }
             (Method::Volume, _) => self.fields.surface()?.volume(camera, &self.world_from_scene),
-            (Method::Raycast, Some((Whole { mesh, cap }, bvh))) => {
+            (Method::Raycast, Some((ExtractedSurface { mesh, cap }, bvh))) => {
                 let field = self.fields.surface()?;
                 Some(raycast(bvh, mesh, camera, &options, |hits| {
                     let mut colors = field.color(&hits.points, &hits.normals, &hits.directions);
@@ -189,7 +189,7 @@ impl<'a> Renderer<'a> {
                 }))
             }
             (Method::Raycast, None) => None,
-            (Method::Textured, _) => self.product.as_ref().map(|product| {
+            (Method::Textured, _) => self.textured.as_ref().map(|product| {
                 raycast(&product.bvh, product.mesh, camera, &options, |hits| {
                     product.texture.colors(hits, camera)
                 })
@@ -258,12 +258,12 @@ mod tests {
         let cap = Cap { bounds: Aabb::SCENE, near: 1e-4, ring: vec![skin] };
         let camera = Camera::above(8, 8, 8.0, 4.0);
         let look = |cap: Option<Cap>| {
-            let whole = Whole { mesh: mesh.clone(), cap };
-            let bvh = Bvh::new(&whole.mesh);
+            let surface = ExtractedSurface { mesh: mesh.clone(), cap };
+            let bvh = Bvh::new(&surface.mesh);
             let renderer = Renderer {
                 fields: &Red,
-                whole: Some((&whole, bvh)),
-                product: None,
+                extracted: Some((&surface, bvh)),
+                textured: None,
                 samples: 1,
                 world_from_scene: Similarity::IDENTITY,
                 monitor: &Quiet,

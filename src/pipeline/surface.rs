@@ -4,6 +4,7 @@ use super::march::Seen;
 use crate::Result;
 use crate::config::Stage;
 use crate::geom::{Camera, Ray, Similarity};
+use crate::mesh::{Cap, Patches};
 use crate::render::RenderedView;
 use glam::Vec3;
 
@@ -26,6 +27,52 @@ pub trait Surface: Sync {
     /// The view of a camera in scene coordinates by marching through the field itself; depth and
     /// normals in the world. `None` for what is only a surface.
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView>;
+}
+
+/// A surface with what closes it where the field's own zero does not.
+pub(super) struct ClosedSurface<'a> {
+    pub field: &'a dyn Surface,
+    /// Where the frames cut the body.
+    pub cap: Option<&'a Cap>,
+    /// Where handles were cut.
+    pub patches: Option<&'a Patches>,
+}
+
+impl ClosedSurface<'_> {
+    /// As [`Surface::sdf_gradient`]: on an open surface the field's own zero ends at the opening, which the closed
+    /// one holds as well.
+    pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        let (mut values, mut gradients) = self.field.sdf_gradient(points);
+        if let Some(cap) = self.cap {
+            cap.close(points, &mut values, &mut gradients);
+        }
+        if let Some(patches) = self.patches {
+            patches.close(points, &mut values, &mut gradients);
+        }
+        (values, gradients)
+    }
+
+    /// As [`Surface::colors`], the cap in its own colour.
+    pub fn colors(
+        &self,
+        points: &[Vec3],
+        normals: &[Vec3],
+        counts: &[u32],
+        directions: &[Vec3],
+    ) -> Vec<[f32; 3]> {
+        let mut colors = self.field.colors(points, normals, counts, directions);
+        if let Some(cap) = self.cap {
+            let mut rest = &mut colors[..];
+            for (p, &count) in points.iter().zip(counts) {
+                let (own, after) = rest.split_at_mut(count as usize);
+                rest = after;
+                if cap.holds(*p) {
+                    own.fill(cap.color(*p));
+                }
+            }
+        }
+        colors
+    }
 }
 
 /// A field that is looked at by marching rays through it.

@@ -12,6 +12,7 @@
 use super::uv_check::{UvReport, bound};
 use super::weld::places;
 use crate::geom::{Aabb, Boxes, DBox, EFFORT, Mesh, Sets, intersect, share_out};
+use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -83,42 +84,17 @@ pub struct CheckReport {
     pub uv: Option<UvReport>,
 }
 
-/// A bar that was not reached, or that does not exist.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
-pub enum RequireError {
-    /// Below the bar.
-    #[error("not {bar}: {found}")]
-    Below {
-        /// What was required.
-        bar: String,
-        /// What was found instead.
-        found: String,
-    },
-    /// No such bar.
-    #[error("there is no requirement `{bar}`")]
-    Unknown {
-        /// What was asked for.
-        bar: String,
-    },
-}
-
-impl RequireError {
-    /// The way out.
-    pub fn hint(&self) -> String {
-        match self {
-            RequireError::Below { .. } => "`tiface check` without `--require` prints the whole report".into(),
-            RequireError::Unknown { .. } => format!("known are {}", BARS.join(", ")),
-        }
-    }
-}
-
 /// What [`CheckReport::require`] understands.
 pub const BARS: [&str; 5] = ["watertight", "manifold", "one-piece", "no-self-intersections", "sound-uv"];
 
 impl CheckReport {
-    /// Checks the named bars; the first one missed is the error. See [`BARS`].
-    pub fn require(&self, bars: &[&str]) -> Result<(), RequireError> {
+    /// Checks the named bars; see [`BARS`].
+    ///
+    /// # Errors
+    ///
+    /// The first bar missed, as [`ErrorKind::BelowBar`](crate::ErrorKind::BelowBar); or one that does not exist, as
+    /// [`ErrorKind::Usage`](crate::ErrorKind::Usage).
+    pub fn require(&self, bars: &[&str]) -> Result<()> {
         for &bar in bars {
             let missed = match bar {
                 "watertight" => (!self.closed).then(|| {
@@ -151,10 +127,14 @@ impl CheckReport {
                         )
                     }),
                 },
-                _ => return Err(RequireError::Unknown { bar: bar.into() }),
+                _ => {
+                    let hint = format!("known are {}", BARS.join(", "));
+                    return Err(Error::usage(format!("there is no requirement `{bar}`"), hint));
+                }
             };
             if let Some(found) = missed {
-                return Err(RequireError::Below { bar: bar.into(), found });
+                let hint = "`tiface check` without `--require` prints the whole report";
+                return Err(Error::below(format!("not {bar}: {found}"), hint));
             }
         }
         Ok(())
@@ -397,6 +377,7 @@ fn self_intersections(mesh: &Mesh, faces: &[([u32; 3], u32)]) -> (usize, usize) 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ErrorKind;
 
     /// A box from `low` to `high`, wound outward.
     fn cuboid(low: Vec3, high: Vec3) -> Mesh {
@@ -449,8 +430,9 @@ mod tests {
         m.triangles.pop();
         let r = check(&m, 1.0);
         assert_eq!((r.boundary_edges, r.closed, r.manifold, r.genus), (3, false, true, None));
+        let missed = r.require(&["manifold", "watertight"]).unwrap_err();
         assert!(
-            matches!(r.require(&["manifold", "watertight"]), Err(RequireError::Below { bar, .. }) if bar == "watertight")
+            missed.kind() == ErrorKind::BelowBar && missed.to_string().starts_with("not watertight: 3 open")
         );
         let mut m = cuboid(Vec3::ZERO, Vec3::ONE);
         m.triangles[0].swap(0, 1);
@@ -538,6 +520,7 @@ mod tests {
         let r = check(&m, 1.0);
         assert_eq!((r.invalid, r.closed, r.bad_normals), (2, false, 2));
         assert_eq!(check(&Mesh::default(), 1.0).pieces, 0);
-        assert!(matches!(r.require(&["shiny"]), Err(RequireError::Unknown { .. })));
+        let unknown = r.require(&["shiny"]).unwrap_err();
+        assert!(unknown.kind() == ErrorKind::Usage && unknown.hint().contains("one-piece"), "{unknown}");
     }
 }

@@ -8,91 +8,77 @@
 //! A mesh far from the origin needs more digits than f32 has: its positions are written with as many as
 //! hold a billionth of its size, for readers that keep f64.
 
-use super::export::{ExportError, ExportOptions, Ready, ready};
-use super::textured::{Exported, TextureOptions, Textured, encode, left_out, prepare, safe_name};
+use super::file_mesh::{ExportOptions, ExportedFiles, FileMesh, encode, safe_name};
+use super::file_mesh::{distance_warning, left_out};
+use super::texture::HeadTexture;
+use crate::Result;
 use crate::geom::{Aabb, Mesh};
 use std::io::Write;
 
-/// The mesh as the bytes of an `.obj` file, coloured by its vertices.
+/// Returns a mesh as an `.obj`, with a texture also its `.mtl` and its picture, which must lie in one folder; without
+/// one it is coloured by its vertices.
 ///
 /// # Errors
 ///
-/// [`ExportError`] when there is nothing to write, the mesh is damaged, or an option makes no sense.
-pub fn to_obj(mesh: &Mesh, options: &ExportOptions) -> Result<Vec<u8>, ExportError> {
-    let mesh = ready(mesh, &options.file_from_mesh()?)?;
-    let header = concat!("# tiface ", env!("CARGO_PKG_VERSION"), ": metres, +Y up, sRGB vertex colours\n");
-    let mut out = header.as_bytes().to_vec();
-    let mut write = || -> std::io::Result<()> {
-        writeln!(out, "o {}", safe_name(&options.name))?;
-        write_vertices(&mut out, &mesh)?;
-        for [a, b, c] in mesh.triangles.iter().map(|t| t.map(|i| i as u64 + 1)) {
-            if mesh.normals.is_empty() {
-                writeln!(out, "f {a} {b} {c}")?;
-            } else {
-                writeln!(out, "f {a}//{a} {b}//{b} {c}//{c}")?;
-            }
-        }
-        Ok(())
-    };
-    write().expect("writing to memory does not fail");
-    Ok(out)
+/// There is nothing to write, the mesh is damaged, texture and mesh do not belong together, or an option makes no
+/// sense.
+pub fn to_obj(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOptions) -> Result<ExportedFiles> {
+    let file_from_mesh = options.file_from_mesh()?;
+    let mut file = FileMesh::new(mesh, texture, &file_from_mesh)?;
+    let (stem, name) = (safe_name(&options.stem), safe_name(&options.name));
+    let mut files = Vec::new();
+    if let Some(texture) = texture {
+        file.colors = Vec::new(); // some readers multiply them into the texture
+        let (picture, ending) = encode("base colour", &texture.color, options.jpeg_quality)?;
+        let mtl = format!(
+            "{GENERATOR}\nnewmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {stem}.{ending}\n"
+        );
+        files.push((format!("{stem}.mtl"), mtl.into_bytes()));
+        files.push((format!("{stem}.{ending}"), picture));
+    }
+    let mut out = Vec::new();
+    write(&mut out, &file, &stem, &name).expect("writing to memory does not fail");
+    files.insert(0, (format!("{stem}.obj"), out));
+    let mut warnings = left_out(texture, "obj");
+    warnings.extend(distance_warning(mesh, &file_from_mesh, "obj"));
+    Ok(ExportedFiles { files, warnings })
 }
 
-/// The mesh as an `.obj`, its `.mtl` and its picture, which must lie in one folder.
-///
-/// # Errors
-///
-/// [`ExportError`] when mesh, atlas and pictures do not belong together, before there are any bytes;
-/// else as [`to_obj`].
-pub fn textured_to_obj(
-    textured: &Textured,
-    options: &ExportOptions,
-    texture: &TextureOptions,
-) -> Result<Exported, ExportError> {
-    let prepared = prepare(textured, &options.file_from_mesh()?)?;
-    let mut mesh = prepared.ready;
-    mesh.colors = Vec::new(); // some readers multiply them into the texture
-    let (stem, name) = (safe_name(&texture.stem), safe_name(&options.name));
-    let (picture, ending) = encode("base colour", textured.color, texture.picture)?;
-    let generator = concat!("# tiface ", env!("CARGO_PKG_VERSION"));
-    let mut out = Vec::new();
-    let mut write = || -> std::io::Result<()> {
-        writeln!(out, "{generator}: metres, +Y up\nmtllib {stem}.mtl\no {name}")?;
-        write_vertices(&mut out, &mesh)?;
-        for uv in &prepared.uvs {
-            // OBJ's v runs up
-            writeln!(out, "vt {} {}", Short(uv.x), Short(1.0 - uv.y))?;
-        }
+const GENERATOR: &str = concat!("# tiface ", env!("CARGO_PKG_VERSION"));
+
+fn write(out: &mut Vec<u8>, file: &FileMesh, stem: &str, name: &str) -> std::io::Result<()> {
+    let textured = !file.corners.is_empty();
+    if textured {
+        writeln!(out, "{GENERATOR}: metres, +Y up\nmtllib {stem}.mtl\no {name}")?;
+    } else {
+        writeln!(out, "{GENERATOR}: metres, +Y up, sRGB vertex colours\no {name}")?;
+    }
+    write_vertices(out, file)?;
+    for uv in &file.uvs {
+        // OBJ's v runs up
+        writeln!(out, "vt {} {}", Short(uv.x), Short(1.0 - uv.y))?;
+    }
+    if textured {
         writeln!(out, "usemtl {name}")?;
-        for (vertices, corners) in mesh.triangles.iter().zip(&prepared.corners) {
-            write!(out, "f")?;
-            for (v, t) in vertices.map(|i| i as u64 + 1).iter().zip(corners.map(|i| i as u64 + 1)) {
-                if mesh.normals.is_empty() {
-                    write!(out, " {v}/{t}")?;
-                } else {
-                    write!(out, " {v}/{t}/{v}")?;
-                }
+    }
+    for (t, triangle) in file.triangles.iter().enumerate() {
+        write!(out, "f")?;
+        for (k, v) in triangle.map(|i| u64::from(i) + 1).into_iter().enumerate() {
+            let uv = file.corners.get(t).map(|c| u64::from(c[k]) + 1);
+            match (uv, file.normals.is_empty()) {
+                (None, true) => write!(out, " {v}")?,
+                (None, false) => write!(out, " {v}//{v}")?,
+                (Some(uv), true) => write!(out, " {v}/{uv}")?,
+                (Some(uv), false) => write!(out, " {v}/{uv}/{v}")?,
             }
-            writeln!(out)?;
         }
-        Ok(())
-    };
-    write().expect("writing to memory does not fail");
-    let mtl = format!(
-        "{generator}\nnewmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {stem}.{ending}\n"
-    );
-    let files = vec![
-        (format!("{stem}.obj"), out),
-        (format!("{stem}.mtl"), mtl.into_bytes()),
-        (format!("{stem}.{ending}"), picture),
-    ];
-    let mut warnings = Vec::new();
-    left_out(textured, "obj", &mut warnings);
-    Ok(Exported { files, warnings })
+        writeln!(out)?;
+    }
+    Ok(())
 }
 
 /// `v` with colours where there are any, then `vn`.
-fn write_vertices(out: &mut Vec<u8>, mesh: &Ready) -> std::io::Result<()> {
+fn write_vertices(out: &mut Vec<u8>, mesh: &FileMesh) -> std::io::Result<()> {
     out.reserve(mesh.positions.len() * 60 + mesh.triangles.len() * 30);
     let size = Aabb::around(mesh.positions.iter().copied()).size().max_element();
     let digits = (9.0 - size.log10()).ceil().clamp(0.0, 45.0) as usize;
@@ -131,8 +117,8 @@ impl std::fmt::Display for Short {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::files::textured::tests::tetrahedron;
-    use crate::mesh::files::{Texture, picture_of_mtl, read, read_whole};
+    use crate::mesh::files::file_mesh::tests::tetrahedron;
+    use crate::mesh::files::{PictureSource, ReadOptions, picture_of_mtl, read, read_with};
     use glam::Vec3;
     use std::path::Path;
 
@@ -145,7 +131,7 @@ mod tests {
             triangles: vec![[0, 1, 2]],
         };
         let options = ExportOptions { up: Vec3::Z, name: "two\nlines".into(), ..Default::default() };
-        let obj = String::from_utf8(to_obj(&mesh, &options).unwrap()).unwrap();
+        let obj = String::from_utf8(to_obj(&mesh, None, &options).unwrap().files.remove(0).1).unwrap();
         // z becomes y; −y, the normal, becomes z
         let expected = "o two_lines\nv 0 0 0 1 0.5 0.25\nv 1 0 0 0 0 0\nv 0 1e-7 0 1 0 0.1\n\
                         vn 0 0 1\nvn 0 0 1\nvn 0 0 1\nf 1//1 2//2 3//3\n";
@@ -160,17 +146,17 @@ mod tests {
             triangles: vec![[0, 1, 2], [3, 4, 5]],
             ..Mesh::default()
         };
-        let obj = to_obj(&mesh, &ExportOptions::default()).unwrap();
-        assert_eq!(read(&obj, Path::new("a.obj")).unwrap(), mesh);
+        let obj = to_obj(&mesh, None, &ExportOptions::default()).unwrap();
+        assert_eq!(read(&obj.files[0].1, Path::new("a.obj")).unwrap(), mesh);
     }
 
     #[test]
     fn a_textured_obj_stays_closed_and_names_its_files_plainly() {
-        let (mesh, atlas, color) = tetrahedron();
-        let texture = TextureOptions { stem: "my head".into(), ..Default::default() };
-        let textured = Textured { normal: Some(&color), ..Textured::new(&mesh, &atlas, &color) };
-        let options = ExportOptions { name: "Büste 7".into(), ..Default::default() };
-        let out = textured_to_obj(&textured, &options, &texture).unwrap();
+        let (mesh, texture) = tetrahedron();
+        let texture = HeadTexture { normal: Some(texture.color.clone()), ..texture };
+        let options =
+            ExportOptions { name: "Büste 7".into(), stem: "my head".into(), ..ExportOptions::default() };
+        let out = to_obj(&mesh, Some(&texture), &options).unwrap();
         let names: Vec<&str> = out.files.iter().map(|(name, _)| name.as_str()).collect();
         assert_eq!(names, ["my_head.obj", "my_head.mtl", "my_head.png"]);
         assert!(out.warnings[0].contains("normal map"));
@@ -184,10 +170,10 @@ mod tests {
         assert!(mtl.ends_with("Ka 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd my_head.png\n"));
         let picture = picture_of_mtl(&out.files[1].1, Path::new("my_head.mtl")).unwrap();
         assert_eq!(picture.as_deref(), Some("my_head.png"));
-        let back = read_whole(&out.files[0].1, Path::new("a.obj")).unwrap();
-        assert_eq!(back.texture, Some(Texture::Material("my_head.mtl".into())));
+        let back = read_with(&out.files[0].1, Path::new("a.obj"), &ReadOptions::default()).unwrap();
+        assert_eq!(back.picture, Some(PictureSource::Material("my_head.mtl".into())));
         assert!(back.mesh.is_closed() && back.mesh.colors.is_empty());
         let read_atlas = back.atlas.unwrap();
-        assert_eq!((&read_atlas.uvs, &read_atlas.triangles), (&atlas.uvs, &atlas.triangles));
+        assert_eq!((&read_atlas.uvs, &read_atlas.triangles), (&texture.atlas.uvs, &texture.atlas.triangles));
     }
 }

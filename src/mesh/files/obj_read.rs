@@ -4,17 +4,18 @@
 //! Written here because the reader the ecosystem has splits vertices by object, takes index 0 for
 //! "none", and multiplies unchecked indices.
 
-use super::read::{Limits, Parsed, ReadMeshError, Source, Texture};
+use super::source::{ParsedMesh, PictureSource, ReadOptions, Source};
 use crate::geom::{Atlas, Mesh};
+use crate::{Error, Result};
 use glam::{DVec3, Vec2, Vec3};
 use std::borrow::Cow;
 use std::path::Path;
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     let mut positions: Vec<DVec3> = Vec::new();
     let mut mesh = Mesh::default();
     let mut atlas = Atlas::default();
-    let mut all_mapped = source.textures;
+    let mut all_mapped = source.options.texture;
     // the coordinates of the face at hand
     let mut mapped: Vec<u32> = Vec::new();
     let (mut library, mut material) = (None, None);
@@ -46,7 +47,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError
                 };
                 normals.push(DVec3::new(x, y, z).as_vec3());
             }
-            "vt" if source.textures => {
+            "vt" if source.options.texture => {
                 let numbers = floats(words, &broken)?;
                 let [u, v, ..] = numbers[..] else {
                     return Err(broken(format!("{} numbers, expected u v", numbers.len())));
@@ -54,11 +55,11 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError
                 source.allow(atlas.uvs.len() + 1, 0)?;
                 atlas.uvs.push(Vec2::new(u as f32, 1.0 - v as f32));
             }
-            "mtllib" if source.textures && library.is_none() => {
+            "mtllib" if source.options.texture && library.is_none() => {
                 let at = format!("line {number}");
                 library = Some(source.bare_name(at, line.strip_prefix("mtllib").unwrap_or(""))?);
             }
-            "usemtl" if source.textures => {
+            "usemtl" if source.options.texture => {
                 let name = words.collect::<Vec<_>>().join(" ");
                 if !mesh.triangles.is_empty() && material.as_ref() != Some(&name) {
                     return Err(source.unsupported(format!("line {number}"), "a mesh with several materials"));
@@ -72,7 +73,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError
                     let mut parts = word.split('/');
                     let vertex = resolve(parts.next().unwrap_or(""), positions.len(), "vertices", &broken)?;
                     let uv = parts.next().unwrap_or("");
-                    if source.textures && !uv.is_empty() {
+                    if source.options.texture && !uv.is_empty() {
                         mapped.push(resolve(uv, atlas.uvs.len(), "texture coordinates", &broken)?);
                     }
                     let normal = match parts.next() {
@@ -114,8 +115,8 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError
     if normals_agree && !normal_of.contains(&u32::MAX) {
         mesh.normals = normal_of.iter().map(|&n| normals[n as usize].normalize_or_zero()).collect();
     }
-    let texture = library.map(Texture::Material);
-    Ok(Parsed { positions, mesh, atlas: all_mapped.then_some(atlas), texture })
+    let picture = library.map(PictureSource::Material);
+    Ok(ParsedMesh { positions, mesh, atlas: all_mapped.then_some(atlas), picture })
 }
 
 /// The lines with their numbers. One that ends with a backslash goes on in the next, under its own number; what is
@@ -143,10 +144,10 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
 ///
 /// # Errors
 ///
-/// [`ReadMeshError::Unsupported`] when it lies in another folder or behind an address, when it comes
-/// with options, or when there are several.
-pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>, ReadMeshError> {
-    let source = Source { path, format: "MTL", limits: &Limits::default(), textures: true };
+/// It lies in another folder or behind an address, comes
+/// with options, or there are several.
+pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>> {
+    let source = Source { path, format: "MTL", options: &ReadOptions::default() };
     let mut found: Option<String> = None;
     for (number, line) in bytes.split(|&b| b == b'\n').enumerate() {
         let line = String::from_utf8_lossy(line.trim_ascii());
@@ -166,10 +167,7 @@ pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>, ReadM
     Ok(found)
 }
 
-fn floats<'a>(
-    words: impl Iterator<Item = &'a str>,
-    broken: &impl Fn(String) -> ReadMeshError,
-) -> Result<Vec<f64>, ReadMeshError> {
+fn floats<'a>(words: impl Iterator<Item = &'a str>, broken: &impl Fn(String) -> Error) -> Result<Vec<f64>> {
     words
         .take_while(|w| !w.starts_with('#'))
         .map(|w| match w.parse::<f64>() {
@@ -180,12 +178,7 @@ fn floats<'a>(
 }
 
 /// One-based from the start, or negative from the end, to zero-based.
-fn resolve(
-    text: &str,
-    count: usize,
-    what: &str,
-    broken: &impl Fn(String) -> ReadMeshError,
-) -> Result<u32, ReadMeshError> {
+fn resolve(text: &str, count: usize, what: &str, broken: &impl Fn(String) -> Error) -> Result<u32> {
     let index = match text.parse::<i64>() {
         Ok(i) if i > 0 => Some(i - 1),
         Ok(i) if i < 0 => (count as i64).checked_add(i),

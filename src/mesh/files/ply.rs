@@ -4,66 +4,42 @@
 //! GLB). Colours are 8-bit and sRGB-coded, as every reader takes them. Positions are `float`, or `double` where
 //! the mesh lies so far from the origin that f32 would show.
 //!
-//! PLY has one index for everything. [`to_ply`] keeps vertices whole, so the surface stays closed:
-//! this is the file that later stages read. [`textured_to_ply`] splits vertices at seams for the sake
+//! PLY has one index for everything. Without a texture vertices stay whole, and so the surface closed:
+//! this is the file that later stages read. With one they are split at seams for the sake
 //! of `s t` (v up, Blender's and trimesh's spelling) and names its picture in a comment, as MeshLab
 //! does; weld equal positions to close it again.
 
-use super::export::{ExportError, ready};
-use super::textured::{
-    Exported, Split, TextureOptions, Textured, encode, left_out, prepare, safe_name, split,
-};
-use crate::geom::{Mesh, Similarity};
+use super::file_mesh::{ExportOptions, ExportedFiles, FileMesh, encode, safe_name};
+use super::file_mesh::{distance_warning, left_out};
+use super::texture::HeadTexture;
+use crate::Result;
+use crate::geom::Mesh;
 use crate::image::quantise;
-use glam::DVec3;
 
-/// The mesh as the bytes of a `.ply` file, coloured by its vertices.
+/// Returns a mesh as a `.ply`, coloured by its vertices; with a texture split at seams, and its picture beside it. Of
+/// the options `up` and `unit_m` do not matter.
 ///
 /// # Errors
 ///
-/// [`ExportError`] when there is nothing to write or the mesh is damaged.
-pub fn to_ply(mesh: &Mesh) -> Result<Vec<u8>, ExportError> {
-    placed_to_ply(mesh, &Similarity::IDENTITY)
+/// There is nothing to write, the mesh is damaged, or texture and mesh do not belong together.
+pub fn to_ply(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOptions) -> Result<ExportedFiles> {
+    let world_from_mesh = &options.world_from_mesh;
+    let file = FileMesh::new(mesh, texture, world_from_mesh)?.split(false);
+    let stem = safe_name(&options.stem);
+    let mut files = Vec::new();
+    if let Some(texture) = texture {
+        let (picture, ending) = encode("base colour", &texture.color, options.jpeg_quality)?;
+        files.push((format!("{stem}.{ending}"), picture));
+    }
+    let ply = bytes(&file, files.first().map(|(name, _)| name.as_str()));
+    files.insert(0, (format!("{stem}.ply"), ply));
+    let mut warnings = left_out(texture, "ply");
+    warnings.extend(distance_warning(mesh, world_from_mesh, "ply"));
+    Ok(ExportedFiles { files, warnings })
 }
 
-/// [`to_ply`] of a mesh in coordinates of its own.
-///
-/// # Errors
-///
-/// As [`to_ply`].
-pub fn placed_to_ply(mesh: &Mesh, world_from_mesh: &Similarity) -> Result<Vec<u8>, ExportError> {
-    let ready = ready(mesh, world_from_mesh)?;
-    let translation = ready.translation;
-    let shape = Split {
-        positions: ready.positions,
-        normals: ready.normals,
-        colors: ready.colors,
-        triangles: ready.triangles,
-        ..Split::default()
-    };
-    Ok(bytes(&shape, translation, None))
-}
-
-/// The mesh as a `.ply`, split at seams, with its vertex colours too, and its picture beside it.
-///
-/// # Errors
-///
-/// [`ExportError`] when mesh, atlas and pictures do not belong together, before there are any bytes;
-/// else as [`to_ply`].
-pub fn textured_to_ply(textured: &Textured, texture: &TextureOptions) -> Result<Exported, ExportError> {
-    let prepared = prepare(textured, &Similarity::IDENTITY)?;
-    let (picture, ending) = encode("base colour", textured.color, texture.picture)?;
-    let stem = safe_name(&texture.stem);
-    let name = format!("{stem}.{ending}");
-    let ply = bytes(&split(&prepared, None), prepared.ready.translation, Some(&name));
-    let files = vec![(format!("{stem}.ply"), ply), (name.clone(), picture)];
-    let mut warnings = Vec::new();
-    left_out(textured, "ply", &mut warnings);
-    Ok(Exported { files, warnings })
-}
-
-fn bytes(mesh: &Split, translation: DVec3, picture: Option<&str>) -> Vec<u8> {
-    let far = translation != DVec3::ZERO;
+fn bytes(mesh: &FileMesh, picture: Option<&str>) -> Vec<u8> {
+    let far = mesh.is_far();
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     header += concat!("comment tiface ", env!("CARGO_PKG_VERSION"), "\n");
     header += "comment dataset world, dataset units; vertex colours are sRGB\n";
@@ -93,7 +69,7 @@ fn bytes(mesh: &Split, translation: DVec3, picture: Option<&str>) -> Vec<u8> {
     out.reserve(mesh.positions.len() * if far { 47 } else { 35 } + mesh.triangles.len() * 13);
     for (i, p) in mesh.positions.iter().enumerate() {
         if far {
-            out.extend((translation + p.as_dvec3()).to_array().iter().flat_map(|v| v.to_le_bytes()));
+            out.extend(mesh.place(*p).to_array().iter().flat_map(|v| v.to_le_bytes()));
         } else {
             out.extend(p.to_array().iter().flat_map(|v| v.to_le_bytes()));
         }
@@ -114,8 +90,8 @@ fn bytes(mesh: &Split, translation: DVec3, picture: Option<&str>) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::files::textured::tests::tetrahedron;
-    use crate::mesh::files::{Texture, read, read_whole, weld};
+    use crate::mesh::files::file_mesh::tests::tetrahedron;
+    use crate::mesh::files::{PictureSource, ReadOptions, read, read_with, weld};
     use glam::Vec3;
     use std::path::Path;
 
@@ -127,23 +103,25 @@ mod tests {
             colors: vec![[0.0, 1.0, 0.2]; 3], // 0.2 is 51/255
             triangles: vec![[0, 1, 2], [2, 1, 0]],
         };
-        let ply = to_ply(&mesh).unwrap();
+        let bytes = |mesh: &Mesh| to_ply(mesh, None, &ExportOptions::default()).unwrap().files.remove(0).1;
+        let ply = bytes(&mesh);
         assert_eq!(read(&ply, Path::new("a.ply")).unwrap(), mesh);
         let bare = Mesh { normals: vec![], colors: vec![], ..mesh };
-        let ply = to_ply(&bare).unwrap();
+        let ply = bytes(&bare);
         assert_eq!(read(&ply, Path::new("a.ply")).unwrap(), bare);
-        assert_eq!(to_ply(&Mesh::default()), Err(ExportError::Empty));
+        let e = to_ply(&Mesh::default(), None, &ExportOptions::default()).unwrap_err();
+        assert!(e.to_string().contains("no triangles"), "{e}");
     }
 
     #[test]
     fn a_textured_ply_is_split_and_closes_when_welded() {
-        let (mesh, atlas, color) = tetrahedron();
-        let textured = Textured::new(&mesh, &atlas, &color);
-        let out = textured_to_ply(&textured, &TextureOptions::default()).unwrap();
+        let (mesh, texture) = tetrahedron();
+        let atlas = &texture.atlas;
+        let out = to_ply(&mesh, Some(&texture), &ExportOptions::default()).unwrap();
         let names: Vec<&str> = out.files.iter().map(|(name, _)| name.as_str()).collect();
         assert_eq!(names, ["head.ply", "head.png"]);
-        let back = read_whole(&out.files[0].1, Path::new("a.ply")).unwrap();
-        assert_eq!(back.texture, Some(Texture::Beside("head.png".into())));
+        let back = read_with(&out.files[0].1, Path::new("a.ply"), &ReadOptions::default()).unwrap();
+        assert_eq!(back.picture, Some(PictureSource::Beside("head.png".into())));
         let read_atlas = back.atlas.unwrap();
         for t in 0..4 {
             assert_eq!(back.mesh.corners(t), mesh.corners(t));

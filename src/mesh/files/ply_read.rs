@@ -1,6 +1,7 @@
 //! PLY → mesh: text and both binary orders, any scalar types, any line ends, polygons fanned, strips cut up.
 
-use super::read::{Parsed, ReadMeshError, Source, Texture};
+use super::source::{ParsedMesh, PictureSource, Source};
+use crate::Result;
 use crate::geom::Atlas;
 use glam::{DVec3, Vec2, Vec3};
 
@@ -73,10 +74,10 @@ struct Element {
     properties: Vec<Property>,
 }
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     let Header { order, elements, start, picture } = header(bytes, source)?;
     let mut body = Body { bytes, at: start, order, source };
-    let mut out = Parsed::default();
+    let mut out = ParsedMesh::default();
     let mut uvs = None;
     for element in &elements {
         body.check(element)?;
@@ -102,7 +103,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<Parsed, ReadMeshError
         }
     }
     out.atlas = uvs.map(|uvs| Atlas { uvs, triangles: out.mesh.triangles.clone(), width: 0, height: 0 });
-    out.texture = picture.map(Texture::Beside);
+    out.picture = picture.map(PictureSource::Beside);
     Ok(out)
 }
 
@@ -115,7 +116,7 @@ struct Header {
     picture: Option<String>,
 }
 
-fn header(bytes: &[u8], source: Source) -> Result<Header, ReadMeshError> {
+fn header(bytes: &[u8], source: Source) -> Result<Header> {
     let (mut order, mut elements, mut at) = (None, Vec::<Element>::new(), 0);
     let mut picture = None;
     // All lines end as the first one does: what follows the last may be any byte, a line feed too.
@@ -135,7 +136,7 @@ fn header(bytes: &[u8], source: Source) -> Result<Header, ReadMeshError> {
         at += length + ending.len();
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         match words[..] {
-            ["comment", "TextureFile", ref name @ ..] if source.textures => {
+            ["comment", "TextureFile", ref name @ ..] if source.options.texture => {
                 let name = source.bare_name(format!("header line {number}"), &name.join(" "))?;
                 if picture.as_ref().is_some_and(|p| *p != name) {
                     return Err(source.unsupported(format!("header line {number}"), "a second texture"));
@@ -198,7 +199,7 @@ struct Body<'a> {
 
 impl Body<'_> {
     /// Can the bytes that remain hold this element at all? Asked before anything is reserved.
-    fn check(&self, element: &Element) -> Result<(), ReadMeshError> {
+    fn check(&self, element: &Element) -> Result<()> {
         let sizes = element.properties.iter().map(|p| match self.order {
             Order::Text => 1, // one digit; the spaces are extra
             _ => p.length.unwrap_or(p.item).size(),
@@ -215,7 +216,7 @@ impl Body<'_> {
         Ok(())
     }
 
-    fn next(&mut self, scalar: Scalar) -> Result<f64, ReadMeshError> {
+    fn next(&mut self, scalar: Scalar) -> Result<f64> {
         let at = self.at;
         let broken = |what: String| self.source.broken(format!("byte {at}"), what);
         if self.order == Order::Text {
@@ -251,11 +252,7 @@ impl Body<'_> {
     }
 
     /// Calls `take` with the value, or with each value of a list.
-    fn each(
-        &mut self,
-        property: &Property,
-        mut take: impl FnMut(f64) -> Result<(), ReadMeshError>,
-    ) -> Result<(), ReadMeshError> {
+    fn each(&mut self, property: &Property, mut take: impl FnMut(f64) -> Result<()>) -> Result<()> {
         let Some(length) = property.length else {
             let value = self.next(property.item)?;
             return take(value);
@@ -278,11 +275,7 @@ impl Body<'_> {
 }
 
 /// Adds the vertices; their texture coordinates come back, if wanted and there.
-fn vertices(
-    body: &mut Body,
-    element: &Element,
-    out: &mut Parsed,
-) -> Result<Option<Vec<Vec2>>, ReadMeshError> {
+fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<Option<Vec<Vec2>>> {
     let source = body.source;
     source.allow(element.count, 0)?;
     let slot = |name: &str| element.properties.iter().position(|p| p.name == name && p.length.is_none());
@@ -296,7 +289,7 @@ fn vertices(
     let (normal, color) = (triple(["nx", "ny", "nz"]), triple(["red", "green", "blue"]));
     let spellings = [["s", "t"], ["u", "v"], ["texture_u", "texture_v"]];
     let uv = spellings.into_iter().find_map(|names| match names.map(slot) {
-        [Some(s), Some(t)] if source.textures => Some([s, t]),
+        [Some(s), Some(t)] if source.options.texture => Some([s, t]),
         _ => None,
     });
     let mut uvs = uv.map(|_| Vec::new());
@@ -337,7 +330,7 @@ fn vertices(
     Ok(uvs)
 }
 
-fn faces(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> Result<(), ReadMeshError> {
+fn faces(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> Result<()> {
     let source = body.source;
     source.allow(0, element.count)?;
     let mut corners: Vec<u32> = Vec::new();
@@ -356,7 +349,7 @@ fn faces(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> R
 }
 
 /// Each corner makes a triangle with the two before it, wound the other way every other time; −1 starts anew.
-fn strips(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> Result<(), ReadMeshError> {
+fn strips(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> Result<()> {
     let source = body.source;
     for i in 0..element.count {
         let mut strip: Vec<u32> = Vec::new();
@@ -384,11 +377,7 @@ fn strips(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> 
 }
 
 /// Passes the values of the next row's list of corners to `take`.
-fn lists(
-    body: &mut Body,
-    element: &Element,
-    mut take: impl FnMut(f64) -> Result<(), ReadMeshError>,
-) -> Result<(), ReadMeshError> {
+fn lists(body: &mut Body, element: &Element, mut take: impl FnMut(f64) -> Result<()>) -> Result<()> {
     let is_list =
         |p: &Property| p.length.is_some() && ["vertex_indices", "vertex_index"].contains(&p.name.as_str());
     let Some(list) = element.properties.iter().position(is_list) else {

@@ -5,30 +5,25 @@
 //! carries the same ones: `TANGENT` holds the direction of growing u and a sign w, and the bitangent
 //! `w · (n × t)` points up the picture (towards smaller v, since our v runs down).
 
-use super::export::ExportError;
-use super::textured::check_atlas;
+use super::faults::{check_atlas, check_indices, wrong_length};
+use crate::Result;
 use crate::geom::{Atlas, Mesh};
 use bevy_mikktspace::{Geometry, TangentSpace, generate_tangents};
 use glam::{Vec2, Vec3, Vec4};
 
-/// The tangent at each corner of each triangle: `xyz` unit, `w` ±1. Corners of a vertex agree within
+/// Returns the tangent at each corner of each triangle: `xyz` unit, `w` ±1. Corners of a vertex agree within
 /// a chart.
 ///
 /// # Errors
 ///
-/// [`ExportError`] when the atlas does not belong to the mesh, or the mesh has no normals.
-pub fn tangents(mesh: &Mesh, atlas: &Atlas) -> Result<Vec<[Vec4; 3]>, ExportError> {
+/// The atlas does not belong to the mesh, or the mesh has no normals.
+pub fn tangents(mesh: &Mesh, atlas: &Atlas) -> Result<Vec<[Vec4; 3]>> {
     check_atlas(mesh, atlas)?;
-    let vertices = mesh.positions.len();
-    if mesh.normals.len() != vertices {
-        let found = mesh.normals.len();
-        return Err(ExportError::Length { what: "normals", found, expected: vertices });
+    let (found, vertices) = (mesh.normals.len(), mesh.positions.len());
+    if found != vertices {
+        return Err(wrong_length(found, "normals", vertices));
     }
-    for (triangle, t) in mesh.triangles.iter().enumerate() {
-        if let Some(&index) = t.iter().find(|&&i| i as usize >= vertices) {
-            return Err(ExportError::Index { triangle, index, vertices });
-        }
-    }
+    check_indices(mesh)?;
     Ok(of(&mesh.positions, &mesh.normals, &mesh.triangles, &atlas.uvs, &atlas.triangles))
 }
 
@@ -41,13 +36,13 @@ pub(super) fn of(
     corners: &[[u32; 3]],
 ) -> Vec<[Vec4; 3]> {
     let found = vec![[Vec4::ZERO; 3]; triangles.len()];
-    let mut corners = Corners { positions, normals, triangles, uvs, corners, found };
-    // it fails only for a mesh where no triangle has an area; what stays 0 is mended below
-    let _ = generate_tangents(&mut corners);
-    let mut found = corners.found;
+    let mut input = TangentInput { positions, normals, triangles, uvs, corners, found };
+    // it fails only for a mesh where no triangle has an area; what stays 0 is repaired below
+    let _ = generate_tangents(&mut input);
+    let mut found = input.found;
     for (tangents, vertices) in found.iter_mut().zip(triangles) {
         for (tangent, &vertex) in tangents.iter_mut().zip(vertices) {
-            *tangent = mended(*tangent, normals[vertex as usize]);
+            *tangent = repaired(*tangent, normals[vertex as usize]);
         }
     }
     found
@@ -55,7 +50,7 @@ pub(super) fn of(
 
 /// Unit and across the normal, whatever came: triangles without area in the texture have no
 /// direction of their own.
-fn mended(tangent: Vec4, normal: Vec3) -> Vec4 {
+fn repaired(tangent: Vec4, normal: Vec3) -> Vec4 {
     let across = tangent.truncate().reject_from(normal);
     let unit = if tangent.is_finite() && across.length() > 1e-4 {
         // twice: the first leaves rounding of the f32 that `reject_from` divides by
@@ -66,7 +61,7 @@ fn mended(tangent: Vec4, normal: Vec3) -> Vec4 {
     (unit + Vec3::ZERO).extend(if tangent.w < 0.0 { -1.0 } else { 1.0 })
 }
 
-struct Corners<'a> {
+struct TangentInput<'a> {
     positions: &'a [Vec3],
     normals: &'a [Vec3],
     triangles: &'a [[u32; 3]],
@@ -75,7 +70,7 @@ struct Corners<'a> {
     found: Vec<[Vec4; 3]>,
 }
 
-impl Geometry for Corners<'_> {
+impl Geometry for TangentInput<'_> {
     fn num_faces(&self) -> usize {
         self.triangles.len()
     }
@@ -144,6 +139,6 @@ mod tests {
     fn a_mesh_without_normals_has_no_tangents() {
         let (mut mesh, atlas) = square(false);
         mesh.normals.clear();
-        assert!(matches!(tangents(&mesh, &atlas), Err(ExportError::Length { what: "normals", .. })));
+        assert_eq!(tangents(&mesh, &atlas).unwrap_err().to_string(), "0 normals for 4 vertices");
     }
 }

@@ -1,0 +1,207 @@
+//! The head mesh: what an artist opens, and what the stages after this one find of it.
+//!
+//! ```text
+//! geometry.safetensors             the mesh, and where it lies in its texture
+//! color.png normal.png lobe_K.png  the pictures of its texture
+//! ```
+
+use super::stored::{StoredTensors, damaged, floats, format, geometry, indices};
+use super::texture::{HeadTexture, Lobes};
+use crate::Result;
+use crate::geom::{Atlas, Mesh, Similarity};
+use crate::image::Photo;
+use crate::io::{self, Limits, ReadError, TensorValues};
+use glam::{Mat3, Vec2};
+use std::path::Path;
+
+const FILE: &str = "geometry.safetensors";
+
+/// Most functions of a spherical-harmonic colour.
+const MOST_LOBES: usize = 16;
+
+/// A simplified mesh with its texture.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeadMesh {
+    /// The surface in scene coordinates; without a texture it has colours at its vertices.
+    pub mesh: Mesh,
+    /// Where the scene sits in the dataset's world.
+    pub world_from_scene: Similarity,
+    /// Its texture, if it has one.
+    pub texture: Option<HeadTexture>,
+}
+
+impl HeadMesh {
+    /// Writes it into a folder, which is made if need be.
+    ///
+    /// # Errors
+    ///
+    /// The folder cannot be written to.
+    pub fn save(&self, folder: &Path) -> Result<()> {
+        io::create_folder(folder)?;
+        let mut tensors = geometry(&self.mesh);
+        let Similarity { scale, rotation, translation } = self.world_from_scene;
+        let mut place = vec![scale];
+        place.extend(rotation.to_cols_array());
+        place.extend(translation.to_array());
+        tensors.push(("world_from_scene".into(), vec![place.len()], TensorValues::F64(place)));
+        let mut metadata = format();
+        if let Some(texture) = &self.texture {
+            tensors.push(floats::<2>("uvs", bytemuck::cast_slice(&texture.atlas.uvs)));
+            tensors.push(indices("uv_triangles", &texture.atlas.triangles));
+            let write = |name: &str, photo: &Photo| {
+                io::write_png_rgb(&folder.join(name), photo.width, photo.height, &photo.rgb)
+            };
+            write("color.png", &texture.color)?;
+            if let Some(normal) = &texture.normal {
+                write("normal.png", normal)?;
+                metadata.insert("normal".into(), "normal.png".into());
+            }
+            if let Some(lobes) = &texture.lobes {
+                for (k, picture) in lobes.pictures.iter().enumerate() {
+                    write(&format!("lobe_{k}.png"), picture)?;
+                }
+                tensors.push(floats::<1>("lobe_scale", bytemuck::cast_slice(&lobes.scale)));
+                tensors.push(floats("asset_from_world", &lobes.asset_from_world.to_cols_array_2d()));
+            }
+        }
+        Ok(io::write_tensors(&folder.join(FILE), &tensors, &metadata)?)
+    }
+
+    /// Reads it back.
+    ///
+    /// # Errors
+    ///
+    /// Files are missing, damaged or of another version; the suggested fix is to make them again.
+    pub fn load(folder: &Path) -> Result<HeadMesh> {
+        let mut stored = StoredTensors::open(&folder.join(FILE))?;
+        let (mesh, world_from_scene) = (stored.mesh()?, stored.similarity("world_from_scene")?);
+        let texture = stored.contains("uvs").then(|| load_texture(folder, &mut stored, &mesh)).transpose()?;
+        Ok(HeadMesh { mesh, world_from_scene, texture })
+    }
+}
+
+fn load_texture(folder: &Path, stored: &mut StoredTensors, mesh: &Mesh) -> Result<HeadTexture> {
+    let color = load_photo(folder, "color.png", None)?;
+    let (width, height) = (color.width, color.height);
+    let uvs: Vec<Vec2> = stored.rows::<2>("uvs")?.into_iter().map(Vec2::from).collect();
+    let triangles = stored.indices("uv_triangles", uvs.len())?;
+    if triangles.len() != mesh.triangles.len() {
+        return Err(stored.missing("uv_triangles"));
+    }
+    let mut texture = HeadTexture::new(Atlas { uvs, triangles, width, height }, color);
+    let size = Some((width, height));
+    if stored.metadata.contains_key("normal") {
+        texture.normal = Some(load_photo(folder, "normal.png", size)?);
+    }
+    if stored.contains("lobe_scale") {
+        let scale = stored.rows::<1>("lobe_scale")?.into_flattened();
+        let turned = stored.rows::<3>("asset_from_world")?;
+        let &[x, y, z] = &turned[..] else { return Err(stored.missing("asset_from_world")) };
+        if scale.len() > MOST_LOBES {
+            return Err(stored.missing("lobe_scale"));
+        }
+        let pictures = (0..scale.len()).map(|k| load_photo(folder, &format!("lobe_{k}.png"), size));
+        let (pictures, asset_from_world) =
+            (pictures.collect::<Result<_>>()?, Mat3::from_cols(x.into(), y.into(), z.into()));
+        texture.lobes = Some(Lobes { pictures, scale, asset_from_world });
+    }
+    Ok(texture)
+}
+
+/// A picture of the texture; all have the size of the first.
+fn load_photo(folder: &Path, name: &str, size: Option<(u32, u32)>) -> Result<Photo> {
+    let path = folder.join(name);
+    let photo = io::read_photo(&path, size, &Limits::default()).map_err(damaged)?;
+    let (w, h) = (photo.width, photo.height);
+    match size.filter(|size| *size != (w, h)) {
+        None => Ok(photo),
+        Some(size) => {
+            let expected = format!("{} × {}, as `color.png`", size.0, size.1);
+            Err(damaged(ReadError::value(&path, "size", format!("{w} × {h} pixels"), expected)))
+        }
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use glam::{DMat3, DVec3, Vec3};
+
+    /// A tetrahedron far away, with everything.
+    pub fn head() -> HeadMesh {
+        let at = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)];
+        let mesh = Mesh {
+            positions: at.map(|(x, y, z)| Vec3::new(x, y, z)).to_vec(),
+            normals: vec![Vec3::Z; 4],
+            colors: vec![[0.5; 3]; 4],
+            triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+        };
+        let photo = |b: u8| Photo { width: 8, height: 8, rgb: vec![[b, 1, 2]; 64], alpha: None };
+        let atlas = Atlas {
+            uvs: vec![Vec2::ZERO, Vec2::X, Vec2::ONE],
+            triangles: vec![[0, 1, 2]; 4],
+            width: 8,
+            height: 8,
+        };
+        let lobes = Lobes {
+            pictures: (0..4).map(|k| photo(100 + k)).collect(),
+            scale: vec![0.1, 0.2, 0.3, 0.4],
+            asset_from_world: Mat3::from_rotation_x(0.5),
+        };
+        let texture = HeadTexture { atlas, color: photo(9), normal: Some(photo(128)), lobes: Some(lobes) };
+        let world_from_scene = Similarity {
+            scale: 0.125,
+            rotation: DMat3::from_rotation_x(0.3),
+            translation: DVec3::new(5e6, -3e6, 2e5),
+        };
+        HeadMesh { mesh, world_from_scene, texture: Some(texture) }
+    }
+
+    #[test]
+    fn parts_are_read_back_as_they_were() {
+        let dir = tempfile::tempdir().unwrap();
+        let whole = head();
+        whole.save(dir.path()).unwrap();
+        assert_eq!(HeadMesh::load(dir.path()).unwrap(), whole);
+        let bare = HeadMesh { texture: None, ..whole };
+        bare.save(dir.path()).unwrap();
+        assert_eq!(HeadMesh::load(dir.path()).unwrap(), bare);
+    }
+
+    /// A picture of another size than the texture.
+    fn odd() -> Photo {
+        Photo { width: 3, height: 1, rgb: vec![[1, 2, 3]; 3], alpha: None }
+    }
+
+    #[test]
+    fn damaged_and_older_parts_are_named_with_a_fix() {
+        let dir = tempfile::tempdir().unwrap();
+        let error = |change: &dyn Fn(&mut HeadMesh)| {
+            let mut head = head();
+            change(&mut head);
+            head.save(dir.path()).unwrap();
+            let error = HeadMesh::load(dir.path()).unwrap_err();
+            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+            error.to_string()
+        };
+        assert!(error(&|p| p.mesh.triangles[2] = [0, 1, 9]).contains("`triangles`"));
+        assert!(error(&|p| p.mesh.normals.truncate(2)).contains("`normals`"));
+        assert!(error(&|p| p.mesh.triangles.clear()).contains("`triangles`"));
+        assert!(error(&|p| p.world_from_scene.scale = -1.0).contains("`world_from_scene.scale` is -1"));
+        assert!(error(&|p| p.world_from_scene.scale = 0.0).contains("`world_from_scene.scale`"));
+        assert!(
+            error(&|p| p.world_from_scene.rotation.x_axis *= -1.0).contains("`world_from_scene.rotation`")
+        );
+        assert!(error(&|p| p.texture.as_mut().unwrap().normal = Some(odd())).contains("`size`"));
+        assert!(error(&|p| p.texture.as_mut().unwrap().atlas.triangles.truncate(1)).contains("uv_triangles"));
+        let old = std::collections::BTreeMap::from([("format".to_owned(), "tiface-mesh-1".to_owned())]);
+        io::write_tensors(&dir.path().join("geometry.safetensors"), &geometry(&head().mesh), &old).unwrap();
+        for error in [
+            HeadMesh::load(dir.path()).unwrap_err(),
+            HeadMesh::load(&dir.path().join("nothing")).unwrap_err(),
+        ] {
+            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+        }
+        assert!(HeadMesh::load(dir.path()).unwrap_err().to_string().contains("`tiface-mesh-1`"));
+    }
+}
