@@ -1,11 +1,41 @@
 //! Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel views.
 //!
+//! ```
+//! use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+//! use tiface::config::{Config, Preset};
+//! use tiface::pipeline::{Line, Stage, reconstruct};
+//! use tiface::run::Run;
+//!
+//! // a small analytic head in the place of photographs
+//! let folder = tempfile::tempdir()?;
+//! let options = SyntheticOptions { width: 48, height: 60, train: 10, test: 1, seed: 1 };
+//! write_capture(folder.path(), &options)?;
+//!
+//! let mut config = Config::preset(Preset::Draft);
+//! config.capture.path = folder.path().display().to_string();
+//! (config.iface.steps, config.iface.rays, config.iface.samples) = (30, 128, 2048);
+//! (config.mesh.resolution, config.mesh.triangles, config.mesh.texture_px) = (48, 2000, 128);
+//!
+//! let run = Run::quiet(&folder.path().join("run"));
+//! let line = Line::open(&config, &run)?;
+//! let done = reconstruct(&line, Stage::Mesh)?;
+//!
+//! let (stage, mesh) = &done[2];
+//! assert_eq!((*stage, &mesh.summary["closed"]), (Stage::Mesh, &true.into()));
+//! assert!(run.path("mesh/head.glb").is_file());
+//! # Ok::<(), tiface::Error>(())
+//! ```
+//!
 //! The line, one word per stage: **capture** (what was photographed, from where) → **mask** (which
 //! pixels are the head) → **baseline**, **tface** (radiance fields without and with masks), **iface** (a
 //! learned signed distance) → **mesh** (its zero level set, closed) → **render** (views by volume rendering and by
-//! ray casting) → **ensemble** (they become one) → **metrics**.
+//! ray casting) → **ensemble** (they become one) → **metrics**. [`pipeline`] is that line as functions; every stage
+//! leaves a folder of plain files in the [`run`], and is skipped when it is done.
 //!
-//! Modules are declared in the order of that line; what they share stands first.
+//! Modules are declared in the order of that line; what they share stands first. The parts can be used alone:
+//! [`mesh`] meshes any signed distance and needs no field, [`capture`] reads eight kinds of datasets, [`io`] opens every
+//! file within limits. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file and
+//! place, and a suggested fix.
 
 pub mod error;
 pub mod geom;

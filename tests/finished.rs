@@ -109,3 +109,28 @@ fn a_finished_run_outlives_its_capture_and_single_stages() {
     assert!(text(&o).contains("--set capture.path="), "{}", text(&o));
     assert!(before == files(&run));
 }
+
+#[test]
+fn a_finished_run_needs_its_imported_checkpoint_no_more() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    let import = dir.path().join("official.th");
+    std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.th"), &import).unwrap();
+    let import = format!("tface.import={}", import.display());
+    // the evaluation of a new run is as `--set` has it, whatever the first command renders
+    let words = ["render", "head", "--preset", "draft", "--cameras", "train", "--with", "tface"];
+    let settings = ["--set", &import, "--set", "render.background=white", "--set", "render.method=tface"];
+    worked(&tiface(dir.path(), &[&words[..], &settings].concat()));
+    let run = dir.path().join("runs/head");
+    let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
+    assert!(config.contains("background = \"white\"") && config.contains("cameras = \"test\""), "{config}");
+
+    std::fs::rename(dir.path().join("official.th"), dir.path().join("moved.th")).unwrap();
+    let again = worked(&tiface(dir.path(), &["tface", "runs/head"]));
+    assert!(again.contains("tface: already done"), "{again}");
+    let before = files(&run);
+    let anew = tiface(dir.path(), &["tface", "runs/head", "--fresh", "tface"]);
+    assert!(anew.status.code() == Some(1) && text(&anew).contains("official.th"), "{}", text(&anew));
+    assert!(before == files(&run), "something was removed");
+}

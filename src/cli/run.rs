@@ -47,8 +47,10 @@ pub(super) fn run(session: &Session, command: &LineCommand) -> Result<()> {
     }
     let bars = require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>>>()?;
     let run = Run::open(&target.run, stop.clone(), screen.clone());
-    // the demo's own runs are recognised when their stages are run one by one, too
-    let mut line = Line::open(&config, &run, is_demo(&config, &run))?;
+    let mut line = Line::open(&config, &run)?;
+    if is_demo(&config, &run) {
+        line = line.of_demo();
+    }
     if let Some(path) = path {
         line = line.along(path)?;
     }
@@ -133,7 +135,7 @@ fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
     Ok(RenderConfig { cameras: "test".into(), ..config.render })
 }
 
-/// Was this run made by `tiface demo`?
+/// Was this run made by `tiface demo`, also when its stages are run one by one?
 fn is_demo(config: &Config, run: &Run) -> bool {
     let made = run.path(DEMO_CAPTURE);
     io::real_path(&made).is_ok_and(|made| made == Path::new(&config.capture.path))

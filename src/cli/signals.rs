@@ -29,7 +29,7 @@ pub(super) fn listen(session: &Session) -> Result<()> {
     }
     let (stop, screen) = (session.stop.clone(), session.screen.clone());
     let heed = move || {
-        let mut heard = Heard::default();
+        let mut heard = FirstSignal::default();
         loop {
             std::thread::sleep(LOOK);
             let signal = match last.swap(0, Ordering::SeqCst) {
@@ -67,9 +67,9 @@ enum Answer {
 
 /// When the first signal came.
 #[derive(Default)]
-struct Heard(Option<Instant>);
+struct FirstSignal(Option<Instant>);
 
-impl Heard {
+impl FirstSignal {
     fn at(&mut self, now: Instant, signal: Option<ErrorKind>) -> Option<Answer> {
         let Some(first) = self.0 else {
             self.0 = signal.map(|_| now);
@@ -91,7 +91,7 @@ mod tests {
     #[test]
     fn a_signal_repeated_within_a_second_is_one_and_a_later_one_ends_at_once() {
         let start = Instant::now();
-        let mut heard = Heard::default();
+        let mut heard = FirstSignal::default();
         let mut at = |ms, signal| heard.at(start + Duration::from_millis(ms), signal);
         let (term, int) = (Some(ErrorKind::Terminated), Some(ErrorKind::Interrupted));
         assert_eq!(at(0, None), None);

@@ -30,7 +30,7 @@ pub use iface::IfaceConfig;
 pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors};
 pub use mesh::{Genus, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 pub use metrics::MetricsConfig;
-pub use render::{Background, Method, NAMES, PictureFormat, RenderConfig, called};
+pub use render::{Method, NAMES, PictureFormat, RenderConfig, ViewBackground, called};
 pub use source::Sources;
 pub use stage::Stage;
 pub use vm::{DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};

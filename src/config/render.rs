@@ -70,7 +70,7 @@ pub enum PictureFormat {
 /// What stands behind the head.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Background {
+pub enum ViewBackground {
     /// Black.
     Black,
     /// White.
@@ -99,7 +99,7 @@ table! {
         /// png (8-bit sRGB) or exr (float, with depth and normals).
         format: PictureFormat => PictureFormat::Png;
         /// Behind the head: black, white or none (real alpha).
-        background: Background => Background::None;
+        background: ViewBackground => ViewBackground::None;
         /// Keep every view in float, too, in METHOD/float: what is blended. true or false.
         float: bool => true;
     }

@@ -3,16 +3,14 @@
 use super::clicks::propagated_clicks;
 use super::tests::NoFields;
 use super::*;
-use crate::Quiet;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::capture::{self, CaptureOptions, Split};
 use crate::config::{Config, MaskSource, Preset};
 use crate::image::Gray;
 use crate::io::{self, Limits};
 use crate::mask::prompts::{PhotoPrompts, Prompts, file_path};
-use crate::run::{Run, Stop};
+use crate::run::Run;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 /// A synthetic capture, clicks on three of its views at the deepest places of the true masks, and those masks.
 fn clicked(dir: &Path) -> (Config, Vec<Gray>) {
@@ -34,7 +32,7 @@ fn clicked(dir: &Path) -> (Config, Vec<Gray>) {
 }
 
 fn run(dir: &Path, name: &str) -> Run {
-    Run::open(&dir.join(name), Stop::new(), Arc::new(Quiet))
+    Run::quiet(&dir.join(name))
 }
 
 fn iou(a: &Gray, b: &Gray) -> f64 {
@@ -50,7 +48,7 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
     let dir = tempfile::tempdir().unwrap();
     let (config, truth) = clicked(dir.path());
     let run = run(dir.path(), "run");
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     line.remember(Stage::Mask).unwrap();
     let done = complete(&line, Stage::Mask, &NoFields).unwrap();
     assert_eq!(done.summary["masks"], 10);
@@ -72,15 +70,15 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
     std::fs::rename(&config.mask.prompts, &moved).unwrap();
     let mut config = config;
     config.mask.prompts = moved.to_str().unwrap().into();
-    assert!(complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
+    assert!(complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
     // and the run outlives the file
     let text = std::fs::read_to_string(&moved).unwrap();
     std::fs::remove_file(&moved).unwrap();
-    assert!(complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
+    assert!(complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
     let mut prompts: serde_json::Value = serde_json::from_str(&text).unwrap();
     prompts["frames"][0]["points"].as_array_mut().unwrap().pop();
     std::fs::write(&moved, prompts.to_string()).unwrap();
-    let error = complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap_err();
+    let error = complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     assert!(error.to_string().contains("clicks"), "{error}");
 }
 
@@ -92,7 +90,7 @@ fn clicks_that_make_no_sense_end_before_anything_is_written() {
         let mut config = good.clone();
         change(&mut config);
         let run = run(dir.path(), "refused");
-        let error = Line::open(&config, &run, false).err().expect("an error");
+        let error = Line::open(&config, &run).err().expect("an error");
         assert!(!error.hint().is_empty() && !run.dir().exists());
         error.to_string()
     };
@@ -129,7 +127,7 @@ fn a_network_that_is_no_network_is_refused_in_one_sentence() {
     let (mut config, _) = clicked(dir.path());
     config.mask.vitmatte = config.mask.prompts.clone();
     let run = run(dir.path(), "run");
-    let error = complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap_err();
+    let error = complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     let expected = if cfg!(feature = "matting") { "prompts.json" } else { "this build cannot run networks" };
     assert!(error.to_string().contains(expected), "{error}");
     assert!(!run.path("mask/done.json").exists());
@@ -153,7 +151,7 @@ fn networks_cut_and_soften_and_are_recorded() {
     config.mask.sam = file("sam_tiny/vision_encoder.onnx");
     config.mask.sam_decoder = file("sam_tiny/prompt_encoder_mask_decoder.onnx");
     let run = run(dir.path(), "run");
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     // a mask of noise may leave no hull to place the head by: then that is what is said
     match complete(&line, Stage::Mask, &NoFields) {
         Ok(done) => {
@@ -188,7 +186,7 @@ fn three_clicked_photographs_of_a_light_stage_mask_them_all() {
         config.mask.prompts = root.join("prompts.json").to_str().unwrap().into();
         config.mask.band = band;
         let run = run(dir.path(), name);
-        let line = Line::open(&config, &run, false).unwrap();
+        let line = Line::open(&config, &run).unwrap();
         assert_eq!(
             complete(&line, Stage::Mask, &NoFields).unwrap().summary["suspicious"],
             serde_json::json!([])
@@ -232,7 +230,7 @@ fn held_out_photographs_shape_only_their_own_masks() {
     prompts.write(Path::new(&config.mask.prompts)).unwrap();
     let masks = |name: &str| -> Vec<Vec<u8>> {
         let run = run(dir.path(), name);
-        let line = Line::open(&config, &run, false).unwrap();
+        let line = Line::open(&config, &run).unwrap();
         complete(&line, Stage::Mask, &NoFields).unwrap();
         let train = line.capture().views.iter().filter(|v| v.split == Split::Train);
         train.map(|v| v.load_mask(&Limits::default()).unwrap().unwrap().values).collect()
@@ -247,6 +245,6 @@ fn held_out_photographs_shape_only_their_own_masks() {
     prompts.frames.drain(..3);
     prompts.write(Path::new(&config.mask.prompts)).unwrap();
     let run = run(dir.path(), "alone");
-    let error = complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap_err();
+    let error = complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     assert!(error.to_string().contains("held-out"), "{error}");
 }

@@ -12,7 +12,7 @@ use super::surface::Fields;
 use super::{Line, pictures, tiles};
 use crate::capture::scene::Scene;
 use crate::capture::{MaskMeaning, View, ViewMask};
-use crate::config::{Background, Config, EnsembleConfig, MaskUse, Method, called};
+use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, called};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
 use crate::image::{Gray, Image, Photo};
 use crate::io::{self, Limits};
@@ -219,7 +219,7 @@ fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Resul
 /// What the members should have shown of a view, and where that counts.
 fn target(view: &View) -> Result<(Photo, Gray)> {
     let loaded = view.load(&Limits::default())?;
-    let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), Background::None);
+    let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), ViewBackground::None);
     let (width, height) = (photo.width, photo.height);
     let inside = |of: &Option<Gray>, i: usize| of.as_ref().is_none_or(|m| m.values[i] >= INSIDE);
     let counts = |i: usize| if inside(&loaded.mask, i) && inside(&loaded.valid, i) { 255 } else { 0 };

@@ -4,7 +4,7 @@ use super::tests::{NoFields, quiet, words};
 use super::*;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::capture::{Split, View};
-use crate::config::{Background, Config, Method, Preset};
+use crate::config::{Config, Method, Preset, ViewBackground};
 use crate::geom::{Camera, Ray};
 use crate::image::{Image, quantise};
 use crate::io;
@@ -53,7 +53,7 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     let paper = Config::preset(Preset::Paper);
     (config.ensemble, config.render.method) = (paper.ensemble, paper.render.method);
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     complete(&line, Stage::Mask, &NoFields).unwrap();
     let names: Vec<String> = line.capture().split(Split::Test).map(|v| v.name.clone()).collect();
     for name in &names {
@@ -96,7 +96,7 @@ impl ByHeart {
         let scene = line.scene().unwrap();
         let learned = |view: &View| {
             let loaded = view.load(&io::Limits::default()).unwrap();
-            let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), Background::None);
+            let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), ViewBackground::None);
             let mut image = flat([0.0, 0.0, 0.0, 1.0]);
             for (p, rgb) in image.data.as_chunks_mut::<4>().0.iter_mut().zip(&photo.rgb) {
                 (0..3).for_each(|k| p[k] = rgb[k] as f32 / 255.0 + off);
@@ -146,7 +146,7 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
         config.ensemble.members = vec![Method::Tface, Method::Baseline];
         config.metrics.surface_points = 100;
         let run = quiet(dir.path());
-        let line = Line::open(&config, &run, false).unwrap();
+        let line = Line::open(&config, &run).unwrap();
         complete(&line, Stage::Mask, &NoFields).unwrap();
         // what is rendered of test views says the opposite: had they a say, the worse member would win
         let names: Vec<String> = line.capture().split(Split::Test).map(|v| v.name.clone()).collect();
@@ -182,7 +182,7 @@ fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
     let blind = |config: &Config| -> Vec<usize> {
-        let line = Line::open(config, &run, false).unwrap();
+        let line = Line::open(config, &run).unwrap();
         if !run.path("mask/scene.json").exists() {
             complete(&line, Stage::Mask, &NoFields).unwrap();
         }
@@ -211,7 +211,7 @@ fn what_cannot_be_blended_is_said_before_anything_is_learned() {
     let error = |change: &dyn Fn(&mut Config)| {
         let mut config = base.clone();
         change(&mut config);
-        let line = Line::open(&config, &run, false).unwrap();
+        let line = Line::open(&config, &run).unwrap();
         let e = line.remember(Stage::Metrics).unwrap_err();
         assert_eq!(e.kind(), ErrorKind::Usage);
         assert!(!run.path("config.toml").exists());
@@ -234,7 +234,7 @@ fn what_cannot_be_blended_is_said_before_anything_is_learned() {
     let mut config = base.clone();
     config.render.method = vec![Method::Volume];
     config.ensemble.members.clear();
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     assert_eq!(words(&line.order(Stage::Metrics)), "mask iface render metrics");
     line.remember(Stage::Metrics).unwrap();
 }

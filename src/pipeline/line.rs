@@ -47,18 +47,14 @@ impl<'a> Line<'a> {
     ///
     /// The capture of a run that is done may lie somewhere else by now: its cameras are then those that the run
     /// remembers, and nothing can be worked on ([`Line::remember`]).
-    pub fn open(config: &'a Config, run: &'a Run, synthetic: bool) -> Result<Line<'a>> {
+    pub fn open(config: &'a Config, run: &'a Run) -> Result<Line<'a>> {
         feasible(config)?;
         let options = capture_options(config);
         let (mut capture, digest, clicks, gone) =
             match capture::open(Path::new(&config.capture.path), &options) {
                 Err(e) => remembered(config, run, e)?,
-                Ok(mut capture) => {
+                Ok(capture) => {
                     capture::require_masks(&capture, &options)?;
-                    if synthetic {
-                        // its folder is called after what it holds
-                        capture.name = "demo".into();
-                    }
                     let digest = capture_digest(&capture)?;
                     let kept = run.path(Stage::Mask).join(mask::CLICKS);
                     let clicks = MaskPrompts::open(&config.mask, &capture, &kept)?;
@@ -73,7 +69,14 @@ impl<'a> Line<'a> {
                 view.mask = capture::ViewMask::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
             }
         }
-        Ok(Line { capture, config, run, digest, path: None, imports, gone, synthetic, clicks })
+        Ok(Line { capture, config, run, digest, path: None, imports, gone, synthetic: false, clicks })
+    }
+
+    /// Returns the line of the demo head, whose surface is known: the metrics compare the mesh with it.
+    pub fn of_demo(mut self) -> Line<'a> {
+        self.synthetic = true;
+        self.capture.name = "demo".into(); // its folder is called after what it holds
+        self
     }
 
     /// Returns the line whose stage `render` makes views of `render.cameras` in a folder of their own, and not those

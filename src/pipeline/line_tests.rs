@@ -4,16 +4,15 @@ use super::tests::{NoFields, quiet, words};
 use super::*;
 use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticHead, SyntheticOptions, write_capture};
-use crate::config::{Background, Config, Genus, MaskSource, MeshFormat, MeshFrame, Method, Preset};
+use crate::config::{Config, Genus, MaskSource, MeshFormat, MeshFrame, Method, Preset, ViewBackground};
 use crate::geom::{Camera, Similarity};
 use crate::io::{self, Limits};
 use crate::render::RenderedView;
 use crate::run::{Run, Stop};
-use crate::{ErrorKind, Quiet, Result};
+use crate::{ErrorKind, Result};
 use glam::Vec3;
 use serde_json::json;
 use std::path::Path;
-use std::sync::Arc;
 
 /// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little brighter seen
 /// from one side.
@@ -95,12 +94,12 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     config.mesh.resolution = 128;
     config.mesh.format = vec![MeshFormat::Glb];
     config.metrics.surface_points = 4000;
-    config.render.background = Background::None;
+    config.render.background = ViewBackground::None;
     config.render.method = vec![Method::Raycast, Method::Volume];
     config.ensemble.members = vec![Method::Raycast];
     config.ensemble.weights = vec![1.0];
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run, true).unwrap();
+    let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
     line.remember(Stage::Metrics).unwrap();
     assert_eq!(complete(&line, Stage::Mask, &NoFields).unwrap().summary["masks"], 14);
     let scene = line.scene().unwrap();
@@ -156,7 +155,7 @@ fn the_textured_head_looks_like_the_field_it_was_baked_from() {
     config.mesh.triangles = 8000;
     config.mesh.texture_px = 512;
     config.mesh.format = vec![MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply];
-    config.render.background = Background::None;
+    config.render.background = ViewBackground::None;
     config.render.method = vec![Method::Raycast, Method::Textured];
     config.ensemble.members = Vec::new();
     let mut errors = Vec::new();
@@ -165,7 +164,7 @@ fn the_textured_head_looks_like_the_field_it_was_baked_from() {
         config.mesh.normal_map = lobes > 0;
         config.mesh.frame = frame;
         let run = quiet(&dir.path().join(errors.len().to_string()));
-        let line = Line::open(&config, &run, true).unwrap();
+        let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
         line.remember(Stage::Render).unwrap();
         complete(&line, Stage::Mask, &NoFields).unwrap();
         let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
@@ -210,7 +209,7 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     config.render.method = vec![Method::Textured];
     config.ensemble.members = Vec::new();
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run, true).unwrap();
+    let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
     line.remember(Stage::Render).unwrap();
     complete(&line, Stage::Mask, &NoFields).unwrap();
     let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
@@ -221,7 +220,7 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     let error = complete(&line, Stage::Render, &exact).unwrap_err();
     assert!(error.hint().contains("--texture"), "{error}");
     config.mesh.lobes = 1;
-    let error = Line::open(&config, &run, true).err().unwrap();
+    let error = Line::open(&config, &run).map(Line::of_demo).err().unwrap();
     assert!(error.to_string().contains("mesh.lobes") && error.hint().contains("texture_px"), "{error}");
 }
 
@@ -288,8 +287,8 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
         config.mesh.triangles = 3000;
         config.mesh.texture_px = 0;
         config.mesh.genus = genus;
-        let run = Run::open(&dir.path().join(format!("{genus:?}")), Stop::new(), Arc::new(Quiet));
-        let line = Line::open(&config, &run, true).unwrap();
+        let run = Run::quiet(&dir.path().join(format!("{genus:?}")));
+        let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
         line.remember(Stage::Mesh).unwrap();
         complete(&line, Stage::Mask, &NoFields).unwrap();
         let world_from_scene = line.scene().unwrap().scene_from_world.inverse();
@@ -344,17 +343,17 @@ fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
     capture(dir.path(), 4, 3);
     let mut config = draft(dir.path());
     config.render.method = vec![Method::Tface];
-    config.render.background = Background::White;
+    config.render.background = ViewBackground::White;
     let run = quiet(dir.path());
-    complete(&Line::open(&config, &run, false).unwrap(), Stage::Mask, &NoFields).unwrap();
+    complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
     let interrupted = Fog(0.into(), Some(run.stop().clone()));
-    let e = complete(&Line::open(&config, &run, false).unwrap(), Stage::Render, &interrupted).unwrap_err();
+    let e = complete(&Line::open(&config, &run).unwrap(), Stage::Render, &interrupted).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::Interrupted);
     let made = |run: &Run| io::list_files(&run.path("render/tface")).map_or(0, |f| f.len());
     assert_eq!(made(&run), 1);
     let run = quiet(dir.path());
     let rest = Fog(0.into(), None);
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     assert_eq!(complete(&line, Stage::Render, &rest).unwrap().summary["cameras"], 3);
     assert_eq!((made(&run), rest.0.into_inner()), (3, 2));
     // half a grey of 0.5 over white is 0.25 + 0.5; in float it is as it was
@@ -380,12 +379,12 @@ fn a_run_without_masks_stops_before_anything_is_written_unless_told_to_go_on() {
     }
     let run = quiet(dir.path());
     let mut config = draft(&root);
-    let e = Line::open(&config, &run, false).err().unwrap();
+    let e = Line::open(&config, &run).err().unwrap();
     assert!(e.to_string().contains("head mask") && e.kind() == ErrorKind::Cannot, "{e}");
     assert!(e.hint().contains("--page") && e.hint().contains("--set mask.source=none"), "{}", e.hint());
     assert!(!run.dir().exists());
     config.mask.source = MaskSource::None;
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     line.remember(Stage::Mask).unwrap();
     assert_eq!(complete(&line, Stage::Mask, &NoFields).unwrap().summary["masks"], 0);
 }
@@ -398,7 +397,7 @@ fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
     let mut config = draft(&root);
     config.render.method = vec![Method::Tface];
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     complete(&line, Stage::Mask, &NoFields).unwrap();
     let path = run.path("mask/scene.json");
     let mut value = io::read_json(&path, &Limits::default()).unwrap();
@@ -428,7 +427,7 @@ fn a_command_runs_what_its_stage_needs_and_nothing_else() {
         if !methods.is_empty() {
             config.render.method = methods.to_vec();
         }
-        words(&Line::open(&config, &run, false).unwrap().order(until))
+        words(&Line::open(&config, &run).unwrap().order(until))
     };
     assert_eq!(order(Stage::Baseline, &[]), "mask baseline");
     assert_eq!(order(Stage::Tface, &[]), "mask tface");
@@ -459,7 +458,7 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
     let digests = |change: &dyn Fn(&mut Config)| -> Vec<String> {
         let mut config = draft(dir.path());
         change(&mut config);
-        let line = Line::open(&config, &run, false).unwrap();
+        let line = Line::open(&config, &run).unwrap();
         Stage::ALL.iter().map(|s| line.plan(*s).fingerprint.digest()).collect()
     };
     let base = digests(&|_| {});
@@ -501,7 +500,7 @@ fn what_is_not_rendered_does_not_shape_the_views() {
         let mut config = draft(dir.path());
         config.render.method = vec![Method::Tface];
         change(&mut config);
-        Line::open(&config, &run, false).unwrap().plan(Stage::Render).fingerprint
+        Line::open(&config, &run).unwrap().plan(Stage::Render).fingerprint
     };
     let base = render(&|_| {});
     assert_eq!(base.inputs.keys().map(String::as_str).collect::<Vec<_>>(), ["mask", "tface"]);

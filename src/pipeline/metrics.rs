@@ -4,7 +4,7 @@ use super::mesh::surface_in_world;
 use super::truth::against_truth;
 use super::{Line, pictures};
 use crate::capture::{LoadedView, View};
-use crate::config::{Background, RenderConfig, Stage};
+use crate::config::{RenderConfig, Stage, ViewBackground};
 use crate::image::{Gray, Image};
 use crate::io::{self, Limits};
 use crate::metrics::{Metrics, ViewMetrics, compare};
@@ -35,8 +35,8 @@ pub(super) struct Comparable<'a> {
     float: PathBuf,
 }
 
-/// Figures of one picture.
-struct Figures {
+/// ViewFigures of one picture.
+struct ViewFigures {
     head: ViewMetrics,
     region: Option<ViewMetrics>,
     /// Sum of opacity² over the pixels without any head, and how many those are.
@@ -95,7 +95,7 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     Ok(means(&value))
 }
 
-fn figures(picture: &Comparable, config: &RenderConfig) -> Result<Figures> {
+fn figures(picture: &Comparable, config: &RenderConfig) -> Result<ViewFigures> {
     let background = config.background;
     let loaded = picture.view.load(&Limits::default())?;
     let render = pictures::read(&picture.file, config.format)?;
@@ -107,16 +107,16 @@ fn figures(picture: &Comparable, config: &RenderConfig) -> Result<Figures> {
     // a picture over a background is opaque; what it was before is in the float view
     let outside = if io::is_file(&picture.float) {
         square_opacity_outside(&pictures::read_float(&picture.float)?, &loaded)
-    } else if background == Background::None {
+    } else if background == ViewBackground::None {
         square_opacity_outside(&render, &loaded)
     } else {
         None
     };
-    Ok(Figures { head, region, outside })
+    Ok(ViewFigures { head, region, outside })
 }
 
 /// One set's part of the file.
-fn entry(figures: Vec<Figures>) -> Value {
+fn entry(figures: Vec<ViewFigures>) -> Value {
     let (mut heads, mut regions, mut outside) = (Vec::new(), Vec::new(), (0.0, 0));
     for f in figures {
         heads.push(f.head);

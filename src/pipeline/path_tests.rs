@@ -3,7 +3,7 @@
 use super::tests::{NoFields, quiet, words};
 use super::*;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
-use crate::config::{Background, Config, Method, PictureFormat, Preset, RenderConfig};
+use crate::config::{Config, Method, PictureFormat, Preset, RenderConfig, ViewBackground};
 use crate::io;
 use crate::{ErrorKind, Result};
 use serde_json::Value;
@@ -44,7 +44,7 @@ fn turn(config: &Config, cameras: &str) -> RenderConfig {
     RenderConfig {
         cameras: cameras.into(),
         method: vec![Method::Tface],
-        background: Background::White,
+        background: ViewBackground::White,
         orbit_views: 3,
         ..config.render.clone()
     }
@@ -89,7 +89,7 @@ fn camera_paths_never_touch_the_evaluations_views() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    let open = || Line::open(&config, &run, false).unwrap();
+    let open = || Line::open(&config, &run).unwrap();
     assert_eq!(evaluate(&open()), [false; 4]);
     let before = files(run.dir());
     assert!(before.iter().any(|(path, _)| path.ends_with("metrics/metrics.json")));
@@ -129,12 +129,12 @@ fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    let line = || Line::open(&config, &run, false).unwrap();
+    let line = || Line::open(&config, &run).unwrap();
     evaluate(&line());
     let orbit = turn(&config, "orbit");
     complete(&line().along(orbit.clone()).unwrap(), Stage::Render, &Fog).unwrap();
     complete(&line().along(turn(&config, "train")).unwrap(), Stage::Render, &Fog).unwrap();
-    let black = line().along(RenderConfig { background: Background::Black, ..orbit.clone() }).unwrap();
+    let black = line().along(RenderConfig { background: ViewBackground::Black, ..orbit.clone() }).unwrap();
     let e = black.remember(Stage::Render).unwrap_err();
     assert!(e.to_string().contains("render.background: was \"white\", is \"black\""), "{e}");
     assert!(e.hint().contains("`--fresh render`") && e.hint().contains("nothing else"), "{}", e.hint());
@@ -152,6 +152,24 @@ fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
 }
 
 #[test]
+fn views_of_a_path_whose_records_cannot_be_read_are_made_anew_with_any_field() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = config(&dir.path().join("head"));
+    let run = quiet(dir.path());
+    evaluate(&Line::open(&config, &run).unwrap());
+    let line = Line::open(&config, &run).unwrap().along(turn(&config, "orbit")).unwrap();
+    complete(&line, Stage::Render, &Fog).unwrap();
+    let orbit = "render/paths/orbit".to_string();
+    let is_out_of_date = |stage| line.out_of_date(stage).unwrap().contains(&orbit);
+    assert!(is_out_of_date(Stage::Tface) && !is_out_of_date(Stage::Iface));
+    // the finished record says it as well
+    std::fs::write(run.path(&orbit).join("status.json"), "{").unwrap();
+    assert!(is_out_of_date(Stage::Tface) && !is_out_of_date(Stage::Iface));
+    std::fs::write(run.path(&orbit).join("done.json"), "{").unwrap();
+    assert!(is_out_of_date(Stage::Iface));
+}
+
+#[test]
 fn a_file_of_cameras_is_read_before_anything_is_learned() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
@@ -159,7 +177,7 @@ fn a_file_of_cameras_is_read_before_anything_is_learned() {
     let path = dir.path().join("path.json");
     let along = |text: &str| {
         std::fs::write(&path, text).unwrap();
-        let line = Line::open(&config, &run, false).unwrap();
+        let line = Line::open(&config, &run).unwrap();
         let line = line.along(turn(&config, path.to_str().unwrap()))?;
         Ok::<_, crate::Error>(line.views().to_owned())
     };
@@ -179,9 +197,9 @@ fn a_method_that_is_not_asked_for_is_not_called_changed() {
     let dir = tempfile::tempdir().unwrap();
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Line::open(&config, &run, false).unwrap());
+    evaluate(&Line::open(&config, &run).unwrap());
     config.render.method = vec![Method::Tface];
-    let e = Line::open(&config, &run, false).unwrap().remember(Stage::Render).unwrap_err().to_string();
+    let e = Line::open(&config, &run).unwrap().remember(Stage::Render).unwrap_err().to_string();
     assert!(e.contains("render.method: was [\"baseline\", \"tface\"], is [\"tface\"]"), "{e}");
     assert!(
         e.contains("baseline: was part of it, is not asked for now") && !e.contains("has changed"),
@@ -195,7 +213,7 @@ fn an_evaluation_of_other_cameras_than_the_held_out_ones_is_refused_with_the_way
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
     config.render.cameras = "orbit".into();
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     let e = line.remember(Stage::Metrics).unwrap_err();
     assert!(e.to_string().starts_with("`render.cameras` is orbit") && e.kind() == ErrorKind::Usage, "{e}");
     assert!(
@@ -213,7 +231,7 @@ fn nothing_to_judge_is_an_error_and_no_empty_file() {
     config.render.method.clear();
     config.ensemble.members.clear();
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     complete(&line, Stage::Mask, &NoFields).unwrap();
     complete(&line, Stage::Render, &Fog).unwrap();
     let e = complete(&line, Stage::Metrics, &NoFields).unwrap_err();
@@ -225,14 +243,14 @@ fn a_stage_command_does_not_shrink_the_report_of_a_finished_run() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     evaluate(&line);
     let page = || std::fs::read_to_string(run.path("report.html")).unwrap();
     let whole = page();
     assert_eq!(whole.matches("<h2>mask</h2>").count() + whole.matches("<h2>metrics</h2>").count(), 2);
     std::fs::remove_file(run.path("report.html")).unwrap();
     // as a later command on one stage leaves it
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     line.remember(Stage::Mask).unwrap();
     complete(&line, Stage::Mask, &NoFields).unwrap();
     page::write_report(&line).unwrap();
@@ -245,12 +263,12 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
     let root = dir.path().join("head");
     let config = config(&root);
     let run = quiet(dir.path());
-    let first = Line::open(&config, &run, false).unwrap();
+    let first = Line::open(&config, &run).unwrap();
     evaluate(&first);
     let (before, export) = (files(run.dir()), Export::new(first.capture(), &config));
     std::fs::rename(&root, dir.path().join("moved")).unwrap();
 
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     assert_eq!(evaluate(&line), [true; 4]);
     assert!(line.outlook(Stage::Metrics).is_ok());
     assert!(before == files(run.dir()));
@@ -260,7 +278,7 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
     // there is work: nothing is removed or written before it is known that it cannot be done
     for e in [
         line.fresh(Stage::Metrics, Stage::Metrics).unwrap_err(),
-        Line::open(&config, &run, false)
+        Line::open(&config, &run)
             .unwrap()
             .along(turn(&config, "orbit"))
             .unwrap()
@@ -272,15 +290,15 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
     }
     assert!(before == files(run.dir()));
     std::fs::remove_file(run.path("mask/done.json")).unwrap();
-    let e = Line::open(&config, &run, false).err().unwrap();
+    let e = Line::open(&config, &run).err().unwrap();
     assert!(e.hint().contains("--set capture.path="), "{e}");
 
     // and that way out is one
     let mut moved = config.clone();
     moved.capture.path = dir.path().join("moved").to_str().unwrap().into();
-    assert_eq!(evaluate(&Line::open(&moved, &run, false).unwrap()), [false, true, true, true]);
+    assert_eq!(evaluate(&Line::open(&moved, &run).unwrap()), [false, true, true, true]);
     // where there is no run, it is the capture that is wrong
-    let e = Line::open(&config, &quiet(&dir.path().join("new")), false).err().unwrap();
+    let e = Line::open(&config, &quiet(&dir.path().join("new"))).err().unwrap();
     assert!(!e.hint().contains("capture.path"), "{e}");
 }
 
@@ -290,14 +308,14 @@ fn a_finished_run_that_cannot_be_written_is_still_done() {
     let dir = tempfile::tempdir().unwrap();
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Line::open(&config, &run, false).unwrap());
+    evaluate(&Line::open(&config, &run).unwrap());
     // a folder in the place of a file cannot be written by anybody
     for file in ["config.toml", "cameras.json", "report.html"] {
         std::fs::remove_file(run.path(file)).unwrap();
         std::fs::create_dir(run.path(file)).unwrap();
     }
     config.device = "cpu".into();
-    let line = Line::open(&config, &run, false).unwrap();
+    let line = Line::open(&config, &run).unwrap();
     line.remember(Stage::Metrics).unwrap();
     let done = reconstruct(&line, Stage::Metrics).unwrap();
     assert!(done.len() == 6 && done.iter().all(|(_, stage)| stage.skipped), "{done:?}");
@@ -311,12 +329,12 @@ fn a_command_that_is_refused_clears_nothing_with_fresh() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Line::open(&config, &run, false).unwrap());
+    evaluate(&Line::open(&config, &run).unwrap());
     let before = files(run.dir());
     let refused = |change: &dyn Fn(&mut Config)| {
         let mut config = config.clone();
         change(&mut config);
-        let line = Line::open(&config, &run, false).unwrap();
+        let line = Line::open(&config, &run).unwrap();
         line.fresh(Stage::Render, Stage::Metrics).unwrap_err().to_string()
     };
     // what has no member, other cameras, and a field of other settings that is not made anew

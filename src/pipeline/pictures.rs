@@ -1,18 +1,18 @@
 //! Rendered views as files, and back.
 
 use crate::Result;
-use crate::config::{Background, PictureFormat};
+use crate::config::{PictureFormat, ViewBackground};
 use crate::image::{Gray, Image, Photo, linear_from_srgb, quantise, srgb_from_linear};
 use crate::io::{self, Limits, ReadError, WriteError};
 use crate::render::RenderedView;
 use std::path::{Path, PathBuf};
 
 /// Colour behind the head, sRGB-coded; `None` leaves alpha.
-pub(super) fn behind(background: Background) -> Option<[f32; 3]> {
+pub(super) fn behind(background: ViewBackground) -> Option<[f32; 3]> {
     match background {
-        Background::Black => Some([0.0; 3]),
-        Background::White => Some([1.0; 3]),
-        Background::None => None,
+        ViewBackground::Black => Some([0.0; 3]),
+        ViewBackground::White => Some([1.0; 3]),
+        ViewBackground::None => None,
     }
 }
 
@@ -160,7 +160,7 @@ pub(super) fn read(file: &Path, format: PictureFormat) -> Result<Image, ReadErro
 
 /// The photograph as the render should look: cut out by its mask and laid over the same
 /// background. Without a mask it stays as it is.
-pub(super) fn expected(photo: &Photo, mask: Option<&Gray>, background: Background) -> Photo {
+pub(super) fn expected(photo: &Photo, mask: Option<&Gray>, background: ViewBackground) -> Photo {
     let Some(mask) = mask else { return photo.clone() };
     let behind = behind(background).unwrap_or([0.0; 3]);
     let mix = |c: u8, b: f32, m: u8| {
@@ -234,7 +234,7 @@ mod tests {
         let photo = Photo { width: 2, height: 1, rgb: vec![[200; 3], [200; 3]], alpha: None };
         let mask = Gray { width: 2, height: 1, values: vec![255, 51] };
         // 51/255 = 0.2: 0.2 · 200 = 40 over black, 40 + 0.8 · 255 = 244 over white
-        assert_eq!(expected(&photo, Some(&mask), Background::None).rgb, [[200; 3], [40; 3]]);
-        assert_eq!(expected(&photo, Some(&mask), Background::White).rgb, [[200; 3], [244; 3]]);
+        assert_eq!(expected(&photo, Some(&mask), ViewBackground::None).rgb, [[200; 3], [40; 3]]);
+        assert_eq!(expected(&photo, Some(&mask), ViewBackground::White).rgb, [[200; 3], [244; 3]]);
     }
 }

@@ -1,10 +1,9 @@
 //! What the tests of the line share.
 
 use super::{Fields, Radiance, Stage, Surface};
-use crate::run::{Run, Stop};
-use crate::{Quiet, Result};
+use crate::Result;
+use crate::run::Run;
 use std::path::Path;
-use std::sync::Arc;
 
 /// Fields that nobody may ask for.
 pub(super) struct NoFields;
@@ -21,7 +20,7 @@ impl Fields for NoFields {
 
 /// A run in `dir/run` that reports nothing.
 pub(super) fn quiet(dir: &Path) -> Run {
-    Run::open(&dir.join("run"), Stop::new(), Arc::new(Quiet))
+    Run::quiet(&dir.join("run"))
 }
 
 /// The words of stages, with spaces.

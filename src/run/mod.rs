@@ -62,6 +62,11 @@ impl Run {
         Run { dir: dir.into(), stop, observer }
     }
 
+    /// The run in `dir`, which reports nothing and never stops.
+    pub fn quiet(dir: &Path) -> Run {
+        Run::open(dir, Stop::new(), Arc::new(Quiet))
+    }
+
     /// The folder of the run.
     pub fn dir(&self) -> &Path {
         &self.dir

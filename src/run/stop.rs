@@ -8,17 +8,17 @@ use std::time::{Duration, Instant};
 
 /// A request to stop, shared between whoever hears signals and everything that computes.
 #[derive(Clone, Default)]
-pub struct Stop(Arc<Inner>);
+pub struct Stop(Arc<StopState>);
 
 #[derive(Default)]
-struct Inner {
+struct StopState {
     /// 0 or the exit code.
     code: AtomicU8,
-    work: Mutex<Work>,
+    current: Mutex<CurrentStage>,
 }
 
 #[derive(Default)]
-struct Work {
+struct CurrentStage {
     /// The stage at work, and whether it saves what it has when asked to stop.
     stage: Option<(Arc<Progress>, bool)>,
     /// When a stage began or ended last.
@@ -60,11 +60,11 @@ impl Stop {
     /// Nothing is lost by it that a stop would have kept: files are written aside and renamed, and only learning can
     /// go on in the middle of a stage.
     pub fn abandon(&self, patience: Duration) -> Option<Error> {
-        let work = self.lock();
-        if work.since.is_some_and(|t| t.elapsed() < patience) {
+        let current = self.current();
+        if current.since.is_some_and(|t| t.elapsed() < patience) {
             return None;
         }
-        match &work.stage {
+        match &current.stage {
             Some((progress, saves)) if *saves && progress.has_stepped() => None,
             Some((progress, _)) => {
                 progress.stopped();
@@ -76,18 +76,19 @@ impl Stop {
     }
 
     pub(super) fn at_work(&self, progress: &Arc<Progress>, saves: bool) -> AtWork<'_> {
-        *self.lock() = Work { stage: Some((progress.clone(), saves)), since: Some(Instant::now()) };
+        *self.current() =
+            CurrentStage { stage: Some((progress.clone(), saves)), since: Some(Instant::now()) };
         AtWork(self)
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, Work> {
-        self.0.work.lock().unwrap_or_else(PoisonError::into_inner)
+    fn current(&self) -> std::sync::MutexGuard<'_, CurrentStage> {
+        self.0.current.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Drop for AtWork<'_> {
     fn drop(&mut self) {
-        *self.0.lock() = Work { stage: None, since: Some(Instant::now()) };
+        *self.0.current() = CurrentStage { stage: None, since: Some(Instant::now()) };
     }
 }
 
