@@ -589,6 +589,13 @@ fn crooked_plys_are_named_errors() {
         (b"ply\nformat ascii 1.0".to_vec(), "the header has no end"),
         (ply_of("format ascii 1.0\nelement vertex 0\nproperty float x\n", b""), "has no x, y, z"),
         (
+            ply_of(
+                &format!("format ascii 1.0\nelement vertex 1\n{xyz}element vertex 1\n{xyz}"),
+                b"0 0 0 0 0 0",
+            ),
+            "element `vertex`: comes twice",
+        ),
+        (
             ply_of(&format!("format ascii 1.0\nelement tristrips 1\n{list}"), b"3 0 1 2"),
             "triangle 0: index 0, but there are 0 vertices",
         ),

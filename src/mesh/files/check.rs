@@ -11,7 +11,7 @@
 
 use super::uv_check::{UvReport, bound};
 use super::weld::places;
-use crate::geom::{Aabb, Boxes, DBox, EFFORT, Mesh, Sets, intersect, share_out};
+use crate::geom::{Aabb, Boxes, DBox, EFFORT, Mesh, intersect, share_out, topology};
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -193,17 +193,38 @@ impl fmt::Display for CheckReport {
 }
 
 /// Examines a mesh whose coordinates are `unit_m` metres each. Never panics, whatever the mesh.
+///
+/// # Examples
+///
+/// ```
+/// use glam::Vec3;
+/// use tiface::geom::Mesh;
+/// use tiface::mesh::files::check;
+///
+/// let mut tetrahedron = Mesh {
+///     positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z],
+///     triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+///     ..Mesh::default()
+/// };
+/// let report = check(&tetrahedron, 1.0);
+/// assert!(report.closed && report.genus == Some(0));
+/// assert!(report.require(&["watertight", "one-piece", "no-self-intersections"]).is_ok());
+///
+/// tetrahedron.triangles.pop();
+/// let report = check(&tetrahedron, 1.0);
+/// assert_eq!((report.closed, report.boundary_edges, report.genus), (false, 3, None));
+/// ```
 pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
     check_around(mesh, DVec3::ZERO, unit_m)
 }
 
 /// [`check`] of a mesh whose positions are relative to `origin`.
 pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
-    let (weld, welded_vertices) = places(mesh);
+    let (weld, welded) = places(mesh);
     let valid =
         |t: &[u32; 3]| t.iter().all(|&i| mesh.positions.get(i as usize).is_some_and(|p| p.is_finite()));
-    // Triangles that are still triangles after welding, by their welded corners.
-    let mut faces: Vec<([u32; 3], u32)> = Vec::with_capacity(mesh.triangles.len());
+    // Triangles that are still triangles after welding: their welded corners, and which they are.
+    let (mut faces, mut sources) = (Vec::new(), Vec::new());
     let (mut invalid, mut degenerate, mut slivers, mut volume) = (0, 0, 0, 0.0);
     let mut bounds = Aabb::EMPTY;
     for (i, t) in mesh.triangles.iter().enumerate() {
@@ -225,33 +246,31 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
         }
         let w = t.map(|i| weld[i as usize]);
         if w[0] != w[1] && w[1] != w[2] && w[2] != w[0] {
-            faces.push((w, i as u32));
+            faces.push(w);
+            sources.push(i as u32);
         }
     }
-    let topology = Topology::of(&faces, welded_vertices);
-    let closed = !faces.is_empty()
-        && invalid == 0
-        && topology.boundary_edges + topology.flipped_edges + topology.nonmanifold_edges == 0;
-    let manifold = topology.nonmanifold_edges + topology.nonmanifold_vertices == 0;
+    let topology = topology(&welded, &faces);
+    let closed = topology.closed && invalid == 0;
     let bad_normal = |n: &&glam::Vec3| (n.length() - 1.0).abs() > UNIT || n.is_nan();
     let [low, high] = [bounds.min, bounds.max].map(|p| if bounds.is_empty() { Vec3::ZERO } else { p });
     let [low, high] = [low, high].map(|p| p.as_dvec3() + origin);
     let count = mesh.positions.len();
-    let (self_intersections, self_intersections_left) = self_intersections(mesh, &faces);
+    let (self_intersections, self_intersections_left) = self_intersections(mesh, &faces, &sources);
     CheckReport {
         vertices: count,
         triangles: mesh.triangles.len(),
-        welded_vertices,
+        welded_vertices: welded.len(),
         invalid,
         closed,
         boundary_edges: topology.boundary_edges,
-        flipped_edges: topology.flipped_edges,
-        nonmanifold_edges: topology.nonmanifold_edges,
-        nonmanifold_vertices: topology.nonmanifold_vertices,
-        manifold,
+        flipped_edges: topology.misoriented_edges,
+        nonmanifold_edges: topology.non_manifold_edges,
+        nonmanifold_vertices: topology.non_manifold_vertices,
+        manifold: topology.manifold,
         pieces: topology.pieces,
         euler: topology.euler,
-        genus: (closed && manifold).then_some(topology.pieces as i64 - topology.euler / 2),
+        genus: topology.genus.filter(|_| closed),
         self_intersections,
         self_intersections_left,
         slivers,
@@ -268,76 +287,18 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
     }
 }
 
-#[derive(Default)]
-struct Topology {
-    boundary_edges: usize,
-    flipped_edges: usize,
-    nonmanifold_edges: usize,
-    nonmanifold_vertices: usize,
-    pieces: usize,
-    euler: i64,
-}
-
-impl Topology {
-    fn of(faces: &[([u32; 3], u32)], vertices: usize) -> Topology {
-        // (lower vertex, higher vertex, face, corner of the lower, corner of the higher)
-        let mut edges: Vec<(u32, u32, u32, u8, u8)> = Vec::with_capacity(3 * faces.len());
-        for (f, (t, _)) in faces.iter().enumerate() {
-            for k in 0..3u8 {
-                let n = (k + 1) % 3;
-                let (a, b) = (t[k as usize], t[n as usize]);
-                edges.push(if a < b { (a, b, f as u32, k, n) } else { (b, a, f as u32, n, k) });
-            }
-        }
-        edges.par_sort_unstable();
-        let mut found = Topology::default();
-        // Corners of one fan, joined across edges.
-        let mut fans = Sets::new(3 * faces.len());
-        let mut parts = Sets::new(vertices);
-        let mut count = 0i64;
-        for group in edges.chunk_by(|a, b| (a.0, a.1) == (b.0, b.1)) {
-            count += 1;
-            parts.join(group[0].0, group[0].1);
-            for pair in group.windows(2) {
-                fans.join(3 * pair[0].2 + pair[0].3 as u32, 3 * pair[1].2 + pair[1].3 as u32);
-                fans.join(3 * pair[0].2 + pair[0].4 as u32, 3 * pair[1].2 + pair[1].4 as u32);
-            }
-            // the edge runs from its lower vertex when the higher corner follows the lower
-            let rising = |e: &(u32, u32, u32, u8, u8)| (e.3 + 1) % 3 == e.4;
-            match group {
-                [_] => found.boundary_edges += 1,
-                [a, b] => found.flipped_edges += (rising(a) == rising(b)) as usize,
-                _ => found.nonmanifold_edges += 1,
-            }
-        }
-        // fans per vertex: corners that are their own representative
-        let mut fan_count = vec![0u32; vertices];
-        for (f, (t, _)) in faces.iter().enumerate() {
-            for k in 0..3 {
-                let corner = 3 * f as u32 + k as u32;
-                fan_count[t[k] as usize] += (fans.find(corner) == corner) as u32;
-            }
-        }
-        found.nonmanifold_vertices = fan_count.iter().filter(|&&n| n > 1).count();
-        let used: Vec<u32> = (0..vertices as u32).filter(|&v| fan_count[v as usize] > 0).collect();
-        found.pieces = used.iter().filter(|&&v| parts.find(v) == v).count();
-        found.euler = used.len() as i64 - count + faces.len() as i64;
-        found
-    }
-}
-
 /// What comparing two triangles costs, in comparisons of boxes.
 const COMPARING: usize = 16;
 
 /// How many triangles pass through or lie on another one, and how many more were not compared with all they might.
-fn self_intersections(mesh: &Mesh, faces: &[([u32; 3], u32)]) -> (usize, usize) {
+fn self_intersections(mesh: &Mesh, faces: &[[u32; 3]], sources: &[u32]) -> (usize, usize) {
     // Triangles over the same corners lie on each other, and one of them stands for all: a shape shown twice in
     // one place is no more work than shown once.
     let mut sorted: Vec<([u32; 3], u32)> = (0..faces.len() as u32)
         .into_par_iter()
         .filter_map(|f| {
-            let (mut ids, t) = faces[f as usize];
-            let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
+            let mut ids = faces[f as usize];
+            let [a, b, c] = mesh.corners(sources[f as usize]).map(|p| p.as_dvec3());
             ids.sort_unstable();
             ((b - a).cross(c - a) != DVec3::ZERO).then_some((ids, f))
         })
@@ -346,13 +307,13 @@ fn self_intersections(mesh: &Mesh, faces: &[([u32; 3], u32)]) -> (usize, usize) 
     let mut found = 0;
     let (mut facets, mut alone) = (Vec::new(), Vec::new());
     for copies in sorted.chunk_by(|a, b| a.0 == b.0) {
-        let (ids, t) = faces[copies[0].1 as usize];
+        let face = copies[0].1 as usize;
         if copies.len() > 1 {
             found += copies.len();
         } else {
             alone.push(facets.len());
         }
-        facets.push((mesh.corners(t).map(|p| p.as_dvec3()), ids));
+        facets.push((mesh.corners(sources[face]).map(|p| p.as_dvec3()), faces[face]));
     }
     let boxes = Boxes::new(facets.iter().map(|f| DBox::around(f.0)));
     let shared = share_out(alone.len(), EFFORT, |i, effort| {

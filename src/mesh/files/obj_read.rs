@@ -1,122 +1,140 @@
 //! OBJ → mesh: `v` with optional colours, `vt`, `vn`, `f` in all its spellings; the rest is passed over.
 //! And `map_Kd` of the `.mtl` beside it.
 //!
-//! Written here because the reader the ecosystem has splits vertices by object, takes index 0 for
-//! "none", and multiplies unchecked indices.
+//! Written here because `tobj` 4 names no line in its errors, refuses lines that go on in the next and comments
+//! after a face, takes NaN for a number, passes over faces of two corners and splits vertices by object.
 
 use super::source::{ParsedMesh, PictureSource, ReadOptions, Source};
+use crate::Result;
 use crate::geom::{Atlas, Mesh};
-use crate::{Error, Result};
 use glam::{DVec3, Vec2, Vec3};
 use std::borrow::Cow;
+use std::fmt::Display;
 use std::path::Path;
 
+/// The mesh as it grows.
+#[derive(Default)]
+struct Obj {
+    positions: Vec<DVec3>,
+    /// Colours and triangles.
+    mesh: Mesh,
+    normals: Vec<Vec3>,
+    /// Which normal each vertex was used with, if any.
+    normal_of: Vec<Option<u32>>,
+    /// Did a vertex get two normals, as on a crease, or none?
+    creased: bool,
+    atlas: Atlas,
+    /// Does a face lack texture coordinates?
+    bare: bool,
+    library: Option<String>,
+    material: Option<String>,
+}
+
 pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
-    let mut positions: Vec<DVec3> = Vec::new();
-    let mut mesh = Mesh::default();
-    let mut atlas = Atlas::default();
-    let mut all_mapped = source.options.texture;
-    // the coordinates of the face at hand
-    let mut mapped: Vec<u32> = Vec::new();
-    let (mut library, mut material) = (None, None);
-    let mut normals: Vec<Vec3> = Vec::new();
-    // which normal each vertex was used with; `u32::MAX` for none yet
-    let mut normal_of: Vec<u32> = Vec::new();
-    let mut normals_agree = true;
-    let mut corners: Vec<u32> = Vec::new();
+    let mut obj = Obj::default();
     for (number, line) in lines(bytes) {
-        let broken = |what: String| source.broken(format!("line {number}"), what);
-        let mut words = line.split_ascii_whitespace();
-        match words.next().unwrap_or("") {
-            "v" => {
-                let numbers = floats(words, &broken)?;
-                let [x, y, z, rest @ ..] = &numbers[..] else {
-                    return Err(broken(format!("{} numbers, expected x y z", numbers.len())));
-                };
-                source.allow(positions.len() + 1, 0)?;
-                positions.push(DVec3::new(*x, *y, *z));
-                normal_of.push(u32::MAX);
-                if let [r, g, b] = rest {
-                    mesh.colors.push([*r, *g, *b].map(|c| c.clamp(0.0, 1.0) as f32));
-                }
-            }
-            "vn" => {
-                let numbers = floats(words, &broken)?;
-                let [x, y, z] = numbers[..] else {
-                    return Err(broken(format!("{} numbers, expected x y z", numbers.len())));
-                };
-                normals.push(DVec3::new(x, y, z).as_vec3());
-            }
-            "vt" if source.options.texture => {
-                let numbers = floats(words, &broken)?;
-                let [u, v, ..] = numbers[..] else {
-                    return Err(broken(format!("{} numbers, expected u v", numbers.len())));
-                };
-                source.allow(atlas.uvs.len() + 1, 0)?;
-                atlas.uvs.push(Vec2::new(u as f32, 1.0 - v as f32));
-            }
-            "mtllib" if source.options.texture && library.is_none() => {
-                let at = format!("line {number}");
-                library = Some(source.bare_name(at, line.strip_prefix("mtllib").unwrap_or(""))?);
-            }
-            "usemtl" if source.options.texture => {
-                let name = words.collect::<Vec<_>>().join(" ");
-                if !mesh.triangles.is_empty() && material.as_ref() != Some(&name) {
-                    return Err(source.unsupported(format!("line {number}"), "a mesh with several materials"));
-                }
-                material = Some(name);
-            }
-            "f" => {
-                corners.clear();
-                mapped.clear();
-                for word in words.take_while(|w| !w.starts_with('#')) {
-                    let mut parts = word.split('/');
-                    let vertex = resolve(parts.next().unwrap_or(""), positions.len(), "vertices", &broken)?;
-                    let uv = parts.next().unwrap_or("");
-                    if source.options.texture && !uv.is_empty() {
-                        mapped.push(resolve(uv, atlas.uvs.len(), "texture coordinates", &broken)?);
-                    }
-                    let normal = match parts.next() {
-                        // some programs name normals that they do not write
-                        Some(text) if !text.is_empty() && !normals.is_empty() => {
-                            resolve(text, normals.len(), "normals", &broken)?
-                        }
-                        _ => u32::MAX,
-                    };
-                    let known = &mut normal_of[vertex as usize];
-                    // a crease: one vertex, several normals
-                    normals_agree &= normal != u32::MAX
-                        && (*known == u32::MAX || normals[*known as usize] == normals[normal as usize]);
-                    *known = normal;
-                    corners.push(vertex);
-                }
-                if corners.len() < 3 {
-                    return Err(broken(format!(
-                        "a face with {} corners, expected at least 3",
-                        corners.len()
-                    )));
-                }
-                source.allow(0, mesh.triangles.len() + corners.len() - 2)?;
-                let fan = |c: &[u32], out: &mut Vec<[u32; 3]>| {
-                    out.extend(c.windows(2).skip(1).map(|w| [c[0], w[0], w[1]]));
-                };
-                fan(&corners, &mut mesh.triangles);
-                all_mapped &= mapped.len() == corners.len();
-                if all_mapped {
-                    fan(&mapped, &mut atlas.triangles);
-                }
-            }
-            _ => {}
-        }
+        obj.line(&line, &source, &format_args!("line {number}"))?;
     }
+    let Obj { positions, mut mesh, normals, normal_of, atlas, .. } = obj;
     if mesh.colors.len() != positions.len() {
         mesh.colors.clear();
     }
-    if normals_agree && !normal_of.contains(&u32::MAX) {
-        mesh.normals = normal_of.iter().map(|&n| normals[n as usize].normalize_or_zero()).collect();
+    if !obj.creased {
+        let normals = normal_of.iter().map(|n| n.map(|n| normals[n as usize].normalize_or_zero()));
+        mesh.normals = normals.collect::<Option<_>>().unwrap_or_default();
     }
-    let picture = library.map(PictureSource::Material);
-    Ok(ParsedMesh { positions, mesh, atlas: all_mapped.then_some(atlas), picture })
+    let atlas = (source.options.texture && !obj.bare).then_some(atlas);
+    Ok(ParsedMesh { positions, mesh, atlas, picture: obj.library.map(PictureSource::Material) })
+}
+
+impl Obj {
+    fn line(&mut self, line: &str, source: &Source, at: &dyn Display) -> Result<()> {
+        let mut words = line.split_ascii_whitespace().take_while(|w| !w.starts_with('#'));
+        let few = |numbers: &[f64], expected: &str| {
+            source.broken(at, format!("{} numbers, expected {expected}", numbers.len()))
+        };
+        match words.next().unwrap_or("") {
+            "v" => {
+                let numbers = floats(words, source, at)?;
+                let [x, y, z, rest @ ..] = &numbers[..] else { return Err(few(&numbers, "x y z")) };
+                source.allow(self.positions.len() + 1, 0)?;
+                self.positions.push(DVec3::new(*x, *y, *z));
+                self.normal_of.push(None);
+                if let [r, g, b] = rest {
+                    self.mesh.colors.push([*r, *g, *b].map(|c| c.clamp(0.0, 1.0) as f32));
+                }
+            }
+            "vn" => {
+                let numbers = floats(words, source, at)?;
+                let [x, y, z] = numbers[..] else { return Err(few(&numbers, "x y z")) };
+                self.normals.push(DVec3::new(x, y, z).as_vec3());
+            }
+            "vt" if source.options.texture => {
+                let numbers = floats(words, source, at)?;
+                let [u, v, ..] = numbers[..] else { return Err(few(&numbers, "u v")) };
+                source.allow(self.atlas.uvs.len() + 1, 0)?;
+                self.atlas.uvs.push(Vec2::new(u as f32, 1.0 - v as f32));
+            }
+            "mtllib" if source.options.texture && self.library.is_none() => {
+                let name = line.strip_prefix("mtllib").unwrap_or("");
+                self.library = Some(source.bare_name(at, name)?);
+            }
+            "usemtl" if source.options.texture => {
+                let name = words.collect::<Vec<_>>().join(" ");
+                if !self.mesh.triangles.is_empty() && self.material.as_ref() != Some(&name) {
+                    return Err(source.unsupported(at, "a mesh with several materials"));
+                }
+                self.material = Some(name);
+            }
+            "f" => self.face(words, source, at)?,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn face<'w>(
+        &mut self,
+        words: impl Iterator<Item = &'w str>,
+        source: &Source,
+        at: &dyn Display,
+    ) -> Result<()> {
+        let (mut corners, mut mapped) = (Vec::new(), Vec::new());
+        for word in words {
+            let mut parts = word.split('/');
+            let mut part = || parts.next().unwrap_or("");
+            let vertex = resolve(part(), self.positions.len(), "vertices", source, at)?;
+            let (uv, normal) = (part(), part());
+            if source.options.texture && !uv.is_empty() {
+                mapped.push(resolve(uv, self.atlas.uvs.len(), "texture coordinates", source, at)?);
+            }
+            let known = &mut self.normal_of[vertex as usize];
+            // some programs name normals that they do not write
+            if normal.is_empty() || self.normals.is_empty() {
+                (self.creased, *known) = (true, None);
+            } else {
+                let normal = resolve(normal, self.normals.len(), "normals", source, at)?;
+                let value = self.normals[normal as usize];
+                self.creased |= known.is_some_and(|known| self.normals[known as usize] != value);
+                *known = Some(normal);
+            }
+            corners.push(vertex);
+        }
+        if corners.len() < 3 {
+            return Err(
+                source.broken(at, format!("a face with {} corners, expected at least 3", corners.len()))
+            );
+        }
+        source.allow(0, self.mesh.triangles.len() + corners.len() - 2)?;
+        let fan = |c: &[u32], out: &mut Vec<[u32; 3]>| {
+            out.extend(c.windows(2).skip(1).map(|w| [c[0], w[0], w[1]]));
+        };
+        fan(&corners, &mut self.mesh.triangles);
+        self.bare |= mapped.len() != corners.len();
+        if !self.bare {
+            fan(&mapped, &mut self.atlas.triangles);
+        }
+        Ok(())
+    }
 }
 
 /// The lines with their numbers. One that ends with a backslash goes on in the next, under its own number; what is
@@ -167,25 +185,27 @@ pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>> {
     Ok(found)
 }
 
-fn floats<'a>(words: impl Iterator<Item = &'a str>, broken: &impl Fn(String) -> Error) -> Result<Vec<f64>> {
-    words
-        .take_while(|w| !w.starts_with('#'))
-        .map(|w| match w.parse::<f64>() {
-            Ok(v) if (v as f32).is_finite() => Ok(v),
-            _ => Err(broken(format!("`{}` is not a finite number", w.chars().take(40).collect::<String>()))),
-        })
-        .collect()
+fn floats<'w>(words: impl Iterator<Item = &'w str>, source: &Source, at: &dyn Display) -> Result<Vec<f64>> {
+    let float = |w: &str| match w.parse::<f64>() {
+        Ok(v) if (v as f32).is_finite() => Ok(v),
+        _ => Err(source.broken(at, format!("`{}` is not a finite number", start(w)))),
+    };
+    words.map(float).collect()
 }
 
 /// One-based from the start, or negative from the end, to zero-based.
-fn resolve(text: &str, count: usize, what: &str, broken: &impl Fn(String) -> Error) -> Result<u32> {
+fn resolve(text: &str, count: usize, what: &str, source: &Source, at: &dyn Display) -> Result<u32> {
     let index = match text.parse::<i64>() {
         Ok(i) if i > 0 => Some(i - 1),
         Ok(i) if i < 0 => (count as i64).checked_add(i),
         _ => None,
     };
     index.filter(|&i| (0..count as i64).contains(&i)).map(|i| i as u32).ok_or_else(|| {
-        let text: String = text.chars().take(40).collect();
-        broken(format!("index `{text}`, but there are {count} {what} so far"))
+        source.broken(at, format!("index `{}`, but there are {count} {what} so far", start(text)))
     })
+}
+
+/// As much of a word as a message can show.
+fn start(word: &str) -> String {
+    word.chars().take(40).collect()
 }

@@ -1,4 +1,6 @@
 //! PLY → mesh: text and both binary orders, any scalar types, any line ends, polygons fanned, strips cut up.
+//!
+//! Written here because `ply-rs-bw` 4 refuses carriage returns as line ends and several rows of text in one line.
 
 use super::source::{ParsedMesh, PictureSource, Source};
 use crate::Result;
@@ -83,13 +85,10 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
         body.check(element)?;
         match element.name.as_str() {
             "vertex" => uvs = vertices(&mut body, element, &mut out)?,
-            "face" => faces(&mut body, element, &mut out.mesh.triangles)?,
-            "tristrips" => strips(&mut body, element, &mut out.mesh.triangles)?,
+            "face" | "tristrips" => triangles(&mut body, element, &mut out.mesh.triangles)?,
             _ => {
                 for _ in 0..element.count {
-                    for property in &element.properties {
-                        body.each(property, |_| Ok(()))?;
-                    }
+                    element.properties.iter().try_for_each(|p| body.values(p, None))?;
                 }
             }
         }
@@ -97,9 +96,8 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     let count = out.positions.len();
     for (i, t) in out.mesh.triangles.iter().enumerate() {
         if let Some(v) = t.iter().find(|&&v| v as usize >= count) {
-            return Err(
-                source.broken(format!("triangle {i}"), format!("index {v}, but there are {count} vertices"))
-            );
+            let what = format!("index {v}, but there are {count} vertices");
+            return Err(source.broken(format!("triangle {i}"), what));
         }
     }
     out.atlas = uvs.map(|uvs| Atlas { uvs, triangles: out.mesh.triangles.clone(), width: 0, height: 0 });
@@ -251,24 +249,29 @@ impl Body<'_> {
         })
     }
 
-    /// Calls `take` with the value, or with each value of a list.
-    fn each(&mut self, property: &Property, mut take: impl FnMut(f64) -> Result<()>) -> Result<()> {
-        let Some(length) = property.length else {
-            let value = self.next(property.item)?;
-            return take(value);
-        };
-        let at = self.at;
-        let length = self.next(length)?;
-        let size = if self.order == Order::Text { 1 } else { property.item.size() };
-        // negative and fractional lengths fail here too
-        if length.fract() != 0.0 || !(0.0..=((self.bytes.len() - self.at) / size) as f64).contains(&length) {
-            return Err(self
-                .source
-                .broken(format!("byte {at}"), format!("a list of {length} values does not fit")));
+    /// Reads the value of a property, or the values of its list, in place of what was in `out`.
+    fn values(&mut self, property: &Property, mut out: Option<&mut Vec<f64>>) -> Result<()> {
+        let mut count = 1;
+        if let Some(length) = property.length {
+            let at = self.at;
+            let length = self.next(length)?;
+            let size = if self.order == Order::Text { 1 } else { property.item.size() };
+            let most = ((self.bytes.len() - self.at) / size) as f64;
+            // negative and fractional lengths fail here too
+            if length.fract() != 0.0 || !(0.0..=most).contains(&length) {
+                let what = format!("a list of {length} values does not fit");
+                return Err(self.source.broken(format!("byte {at}"), what));
+            }
+            count = length as usize;
         }
-        for _ in 0..length as usize {
+        if let Some(out) = &mut out {
+            out.clear();
+            // even strips of one triangle each need but four values for it
+            self.source.allow(0, count.saturating_sub(2) / 4)?;
+        }
+        for _ in 0..count {
             let value = self.next(property.item)?;
-            take(value)?;
+            out.iter_mut().for_each(|out| out.push(value));
         }
         Ok(())
     }
@@ -278,6 +281,9 @@ impl Body<'_> {
 fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<Option<Vec<Vec2>>> {
     let source = body.source;
     source.allow(element.count, 0)?;
+    if !out.positions.is_empty() {
+        return Err(source.broken("element `vertex`", "comes twice"));
+    }
     let slot = |name: &str| element.properties.iter().position(|p| p.name == name && p.length.is_none());
     let triple = |names: [&str; 3]| match names.map(slot) {
         [Some(a), Some(b), Some(c)] => Some([a, b, c]),
@@ -294,12 +300,11 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<
     });
     let mut uvs = uv.map(|_| Vec::new());
     let mut row = vec![0.0; element.properties.len()];
+    let mut values = Vec::new();
     for i in 0..element.count {
         for (k, property) in element.properties.iter().enumerate() {
-            body.each(property, |v| {
-                row[k] = v;
-                Ok(())
-            })?;
+            body.values(property, Some(&mut values))?;
+            row[k] = values.last().copied().unwrap_or(0.0); // lists are none of the slots
         }
         let vector = |at: [usize; 3]| DVec3::from(at.map(|k| row[k]));
         let position = vector(xyz);
@@ -330,66 +335,47 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<
     Ok(uvs)
 }
 
-fn faces(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> Result<()> {
-    let source = body.source;
-    source.allow(0, element.count)?;
-    let mut corners: Vec<u32> = Vec::new();
-    for i in 0..element.count {
-        corners.clear();
-        lists(body, element, |v| {
-            corners.push(index(v).ok_or_else(|| {
-                source.broken(format!("face {i}"), format!("index {v}, expected a whole number from 0"))
-            })?);
-            Ok(())
-        })?;
-        source.allow(0, triangles.len() + corners.len().saturating_sub(2))?;
-        triangles.extend(corners.windows(2).skip(1).map(|w| [corners[0], w[0], w[1]]));
-    }
-    Ok(())
-}
-
-/// Each corner makes a triangle with the two before it, wound the other way every other time; −1 starts anew.
-fn strips(body: &mut Body, element: &Element, triangles: &mut Vec<[u32; 3]>) -> Result<()> {
-    let source = body.source;
-    for i in 0..element.count {
-        let mut strip: Vec<u32> = Vec::new();
-        lists(body, element, |v| {
-            if v == -1.0 {
-                strip.clear();
-                return Ok(());
-            }
-            let next = index(v).ok_or_else(|| {
-                source.broken(format!("strip {i}"), format!("index {v}, expected a whole number from −1"))
-            })?;
-            strip.push(next);
-            if let [.., a, b, c] = strip[..] {
-                source.allow(0, triangles.len() + 1)?;
-                let turned = strip.len().is_multiple_of(2);
-                // corners that repeat only carry the strip on
-                if a != b && b != c && c != a {
-                    triangles.push(if turned { [b, a, c] } else { [a, b, c] });
-                }
-            }
-            Ok(())
-        })?;
-    }
-    Ok(())
-}
-
-/// Passes the values of the next row's list of corners to `take`.
-fn lists(body: &mut Body, element: &Element, mut take: impl FnMut(f64) -> Result<()>) -> Result<()> {
+/// Adds the triangles of polygons, which are fanned, or of strips.
+fn triangles(body: &mut Body, element: &Element, out: &mut Vec<[u32; 3]>) -> Result<()> {
+    let (source, strips) = (body.source, element.name == "tristrips");
     let is_list =
         |p: &Property| p.length.is_some() && ["vertex_indices", "vertex_index"].contains(&p.name.as_str());
     let Some(list) = element.properties.iter().position(is_list) else {
         let what = "has no list `vertex_indices`";
-        return Err(body.source.broken(format!("element `{}`", element.name), what));
+        return Err(source.broken(format!("element `{}`", element.name), what));
     };
-    for (k, property) in element.properties.iter().enumerate() {
-        body.each(property, |v| if k == list { take(v) } else { Ok(()) })?;
+    source.allow(0, if strips { 0 } else { element.count })?;
+    let mut values = Vec::new();
+    for i in 0..element.count {
+        for (k, property) in element.properties.iter().enumerate() {
+            body.values(property, (k == list).then_some(&mut values))?;
+            if k != list {
+                continue;
+            }
+            let wrong = |v: &&f64| v.fract() != 0.0 || !(0.0..4294967295.0).contains(*v);
+            if let Some(v) = values.iter().find(|v| wrong(v) && !(strips && **v == -1.0)) {
+                let (name, least) = if strips { ("strip", "−1") } else { ("face", "0") };
+                let what = format!("index {v}, expected a whole number from {least}");
+                return Err(source.broken(format!("{name} {i}"), what));
+            }
+            source.allow(0, out.len() + values.len().saturating_sub(2))?;
+            if strips {
+                values.split(|&v| v == -1.0).for_each(|strip| cut_up(strip, out));
+            } else {
+                out.extend(values.windows(2).skip(1).map(|w| [values[0], w[0], w[1]].map(|v| v as u32)));
+            }
+        }
     }
     Ok(())
 }
 
-fn index(v: f64) -> Option<u32> {
-    (v.fract() == 0.0 && (0.0..4294967295.0).contains(&v)).then_some(v as u32)
+/// Each corner of a strip makes a triangle with the two before it, wound the other way every other time.
+fn cut_up(strip: &[f64], out: &mut Vec<[u32; 3]>) {
+    for (k, w) in strip.windows(3).enumerate() {
+        let [a, b, c] = [w[0], w[1], w[2]].map(|v| v as u32);
+        // corners that repeat only carry the strip on
+        if a != b && b != c && c != a {
+            out.push(if k % 2 == 1 { [b, a, c] } else { [a, b, c] });
+        }
+    }
 }

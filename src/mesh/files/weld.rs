@@ -4,46 +4,47 @@ use crate::geom::Mesh;
 use glam::Vec3;
 use std::collections::HashMap;
 
-/// For each vertex the number of its position, in order of first use, and how many there are: files with a
+/// Returns for each vertex the number of its position, in order of first use, and those positions: files with a
 /// texture repeat vertices at seams. −0 is 0.
-pub(super) fn places(mesh: &Mesh) -> (Vec<u32>, usize) {
+pub(super) fn places(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
     let mut numbers: HashMap<[u32; 3], u32> = HashMap::with_capacity(mesh.positions.len());
+    let mut welded = Vec::new();
     let place = |p: &Vec3| {
-        let next = numbers.len() as u32;
-        // −0 + 0 is 0
-        *numbers.entry((p + Vec3::ZERO).to_array().map(f32::to_bits)).or_insert(next)
+        let p = p + Vec3::ZERO; // −0 + 0 is 0
+        *numbers.entry(p.to_array().map(f32::to_bits)).or_insert_with(|| {
+            welded.push(p);
+            welded.len() as u32 - 1
+        })
     };
     let places = mesh.positions.iter().map(place).collect();
-    (places, numbers.len())
+    (places, welded)
 }
 
-/// The mesh with equal positions merged, −0 being 0. Triangles keep their number and order, so an atlas
+/// Returns the mesh with equal positions merged, −0 being 0. Triangles keep their number and order, so an atlas
 /// stays parallel to them; those that fold are kept too.
 ///
 /// A merged vertex has the colour of its first copy, and their common normal; copies that disagree, as
 /// on creases, get the unit of their sum.
 pub fn weld(mesh: &Mesh) -> Mesh {
-    let (new, _) = places(mesh);
-    let mut out = Mesh::default();
-    let mut creased = Vec::new();
+    let (new, positions) = places(mesh);
+    let mut creased = vec![false; positions.len()];
+    let mut out = Mesh { positions, ..Mesh::default() };
+    let mut first = 0;
     for (i, &number) in new.iter().enumerate() {
-        if number as usize == out.positions.len() {
-            out.positions.push(mesh.positions[i] + Vec3::ZERO);
+        let number = number as usize;
+        if number == first {
+            first += 1;
             out.colors.extend(mesh.colors.get(i));
             out.normals.extend(mesh.normals.get(i));
-            creased.push(false);
-        } else if let Some(&n) = mesh.normals.get(i) {
-            let (sum, creased) = (&mut out.normals[number as usize], &mut creased[number as usize]);
-            if *creased || *sum != n {
-                *sum += n;
-                *creased = true;
-            }
+        } else if let Some(&n) = mesh.normals.get(i)
+            && (creased[number] || out.normals[number] != n)
+        {
+            out.normals[number] += n;
+            creased[number] = true;
         }
     }
-    for (normal, creased) in out.normals.iter_mut().zip(creased) {
-        if creased {
-            *normal = normal.normalize_or_zero();
-        }
+    for (normal, _) in out.normals.iter_mut().zip(creased).filter(|(_, creased)| *creased) {
+        *normal = normal.normalize_or_zero();
     }
     out.triangles = mesh.triangles.iter().map(|t| t.map(|i| new[i as usize])).collect();
     out
