@@ -42,7 +42,6 @@ mod truth;
 
 pub use crate::config::Stage;
 pub use export::Export;
-pub use learn::TrainedFields;
 pub use line::{Line, capture_options, feasible};
 pub use march::Seen;
 pub use mask::{click_page, disagreements};
@@ -55,7 +54,7 @@ use crate::run::Done;
 
 /// Completes every stage that `until` needs, and itself, and writes the report.
 pub fn reconstruct(line: &Line, until: Stage) -> Result<Vec<(Stage, Done)>> {
-    let fields = TrainedFields::new(line);
+    let fields = learn::trained_fields(line);
     let mut done = Vec::new();
     for stage in line.order(until) {
         done.push((stage, complete(line, stage, &fields)?));

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::fmt::Write;
 
-/// The text without what moves cursors, colours or turns lines around, as JSON would write it, so that JSON stays the
+/// The text without what moves cursors, colors or turns lines around, as JSON would write it, so that JSON stays the
 /// same. Lines and tabs stay.
 pub(super) fn plain(text: &str) -> Cow<'_, str> {
     escaped(text, |c| acts(c) && c != '\n' && c != '\t')

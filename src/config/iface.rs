@@ -20,7 +20,7 @@ pub enum OccupancyRule {
 pub enum Background {
     /// Black for target and render.
     Black,
-    /// One random colour per ray, the same for target and render.
+    /// One random color per ray, the same for target and render.
     #[default]
     Random,
 }
@@ -90,7 +90,7 @@ table! {
         start_levels: usize => 6, 6, 16;
         /// One more level every so many steps (0: all at once).
         level_every: u64 => 100, 250, 0;
-        /// Does the colour network read the hash features beside the geometry network's outputs?
+        /// Does the color network read the hash features beside the geometry network's outputs?
         color_skip: bool => true, true, false;
         /// Half edge of the field's box.
         radius: f32 => 1.0, 1.0, 0.3;
@@ -109,12 +109,12 @@ table! {
         table_decay: f64 => 0.0, 0.0, 0.01;
         /// Update only rows of the table that a sample touched.
         touched_rows: bool => true, true, false;
-        /// Weight of the squared colour error.
+        /// Weight of the squared color error.
         rgb_mse: f64 => 10.0;
-        /// Weight of the absolute colour error.
+        /// Weight of the absolute color error.
         rgb_l1: f64 => 0.0;
-        /// Weight of the squared colour error of single samples, Σ w ‖c − target‖² on rays that are all head. The
-        /// blend alone leaves each sample's colour free, and a mesh shows a single one.
+        /// Weight of the squared color error of single samples, Σ w ‖c − target‖² on rays that are all head. The
+        /// blend alone leaves each sample's color free, and a mesh shows a single one.
         rgb_sample: f64 => 3.0, 3.0, 0.0;
         /// Scale of the sparsity term, mean exp(−scale · |sdf|).
         sparsity_scale: f64 => 50.0, 50.0, 1.0;
@@ -143,8 +143,8 @@ table! {
         /// Start with a gradient of length one. The published start is a unit sphere of the networks' own
         /// coordinates, and so has gradients of 1 / radius.
         unit_start: bool => true, true, false;
-        /// Start the features that go to the colour network apart from each other. The published start gives
-        /// all thirteen the sdf's own weights, and colour is learned late.
+        /// Start the features that go to the color network apart from each other. The published start gives
+        /// all thirteen the sdf's own weights, and color is learned late.
         spread_features: bool => true, true, false;
         /// What a pixel with a soft mask should look like.
         foreground: Foreground => Foreground::Estimated, Foreground::Estimated, Foreground::Photo;

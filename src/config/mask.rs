@@ -36,7 +36,7 @@ pub enum MaskMeaning {
 pub enum CutMethod {
     /// SAM where its files are named, else GrabCut.
     Auto,
-    /// Graph cuts over colour mixtures, built in.
+    /// Graph cuts over color mixtures, built in.
     Grabcut,
     /// The network of `mask.sam` and `mask.sam_decoder`.
     Sam,

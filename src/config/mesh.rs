@@ -62,7 +62,7 @@ table! {
         triangles: u32, 0.0..=1e8 => 50_000;
         /// Largest distance of the product from the field's surface, in cells; 0 sets no limit.
         max_error: f32, 0.0..=100.0 => 0.0;
-        /// Texels along each side of the texture; 0: colours at the vertices.
+        /// Texels along each side of the texture; 0: colors at the vertices.
         texture_px: u32, 0.0..=16384.0 => 1024, 2048, 2048;
         /// Degree of view-dependent lobes in the GLB: 0 (none), 1 or 2.
         lobes: u32, 0.0..=2.0 => 0;
@@ -70,7 +70,7 @@ table! {
         normal_map: bool => false;
         /// How pictures are stored with the mesh: png or jpeg.
         texture_format: TextureFormat => TextureFormat::Png;
-        /// Also keep the baked colour as head.exr, scene-linear: true or false.
+        /// Also keep the baked color as head.exr, scene-linear: true or false.
         exr: bool => false;
         /// Files to write, a list of glb, obj, ply.
         format: Vec<MeshFormat> => vec![MeshFormat::Glb];
@@ -99,7 +99,7 @@ impl MeshConfig {
         u64::from(self.texture_px).pow(2)
     }
 
-    /// Pictures of a texture: colour, normals, lobes.
+    /// Pictures of a texture: color, normals, lobes.
     pub fn pictures(&self) -> u64 {
         let lobes = if self.lobes == 0 { 0 } else { (u64::from(self.lobes) + 1).pow(2) };
         1 + u64::from(self.normal_map) + lobes

@@ -15,9 +15,9 @@ pub enum Method {
     /// I-Face's field, marched and composited.
     #[serde(alias = "iface")]
     Volume,
-    /// Rays cast at I-Face's whole mesh, learned colour where they hit.
+    /// Rays cast at I-Face's whole mesh, learned color where they hit.
     Raycast,
-    /// Rays cast at the product, colour from its texture: what a viewer of `head.glb` sees.
+    /// Rays cast at the product, color from its texture: what a viewer of `head.glb` sees.
     Textured,
 }
 
@@ -86,7 +86,7 @@ table! {
         /// Cameras of `tiface render`: test (held-out views); train, orbit or a file (transforms.json or a nerfstudio
         /// camera path) into a folder of their own. Blend and metrics are always of test.
         cameras: String => "test".into();
-        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh, learned colour) and textured
+        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh, learned color) and textured
         /// (head.glb, as a viewer shows it).
         method: Vec<Method>
             => vec![Method::Tface, Method::Volume, Method::Raycast],

@@ -37,7 +37,7 @@ pub enum VmBackground {
     Reference,
     /// Black for both.
     Black,
-    /// One random colour per ray, the same for both.
+    /// One random color per ray, the same for both.
     Random,
 }
 
@@ -133,11 +133,11 @@ table! {
         density_shift: f64 => -10.0;
         /// Optical lengths are scene lengths times density times this. Published are 25 in a world whose box is 3.3
         /// units long; the scene's is 2. Denser matter sets a thinner surface, and fewer samples of a ray need a
-        /// colour, but from 200 on hair hardens.
+        /// color, but from 200 on hair hardens.
         distance_scale: f64 => 100.0, 100.0, 40.0;
         /// March step as a share of the distance of vertices. Half as many samples as published, at the same quality.
         step_ratio: f64 => 1.0, 1.0, 0.5;
-        /// Colour is asked only of samples with more weight.
+        /// Color is asked only of samples with more weight.
         weight_threshold: f64 => 1e-3, 1e-3, 1e-4;
         /// A ray ends where less than this of its light is left.
         stop: f64 => 1e-3, 1e-3, 0.0;

@@ -7,9 +7,10 @@
 //!
 //! The weights are fitted on the squares of the training photographs that no field learned from, unless they are given.
 
+use super::line::Line;
 use super::render::{Meshes, Renderer, cameras};
 use super::surface::Fields;
-use super::{Line, pictures, tiles};
+use super::{pictures, tiles};
 use crate::capture::scene::Scene;
 use crate::capture::{MaskMeaning, View, ViewMask};
 use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, called};

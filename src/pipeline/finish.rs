@@ -1,7 +1,6 @@
 //! From the whole extraction to what an artist opens: simplified, laid out, baked.
 
-use super::Export;
-use super::export::center;
+use super::export::{Export, center};
 use super::surface::ClosedSurface;
 use crate::capture::scene::Scene;
 use crate::config::MeshConfig;
@@ -21,7 +20,7 @@ pub(super) const REACH: f32 = 2.5;
 pub(super) struct FinishedHead {
     /// What an artist opens.
     pub head: HeadMesh,
-    /// The baked colour, linear.
+    /// The baked color, linear.
     pub linear: Option<Image>,
     /// A report per step.
     pub report: Map<String, Value>,
@@ -99,7 +98,7 @@ pub(super) fn finish(
     Ok(FinishedHead { head, linear: c.exr.then_some(baked.color), report, warnings })
 }
 
-/// Linear colour as a picture, rounded to nearest.
+/// Linear color as a picture, rounded to nearest.
 fn coded(image: &Image) -> Photo {
     let texel = |c: &[f32; 3]| c.map(|v| quantise(srgb_from_linear(v)));
     let rgb = image.data.as_chunks::<3>().0.iter().map(texel).collect();

@@ -1,7 +1,8 @@
 //! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
 
+use super::line::Line;
 use super::surface::{Fields, Radiance, Surface};
-use super::{Line, tiles};
+use super::tiles;
 use crate::capture::scene::Scene;
 use crate::capture::{Capture, View};
 use crate::config::{Config, MaskUse, Stage};
@@ -120,18 +121,16 @@ fn device_failure(e: impl std::error::Error + Send + Sync + 'static) -> Error {
 }
 
 /// The fields as they lie in the run, each loaded when it is first asked for.
-pub struct TrainedFields<'l> {
+struct TrainedFields<'l> {
     line: &'l Line<'l>,
     iface: OnceCell<IFace>,
     tface: OnceCell<FieldMean>,
     baseline: OnceCell<FieldMean>,
 }
 
-impl<'l> TrainedFields<'l> {
-    /// Of a line; nothing is loaded yet.
-    pub fn new(line: &'l Line<'l>) -> TrainedFields<'l> {
-        TrainedFields { line, iface: OnceCell::new(), tface: OnceCell::new(), baseline: OnceCell::new() }
-    }
+/// Returns the fields as they lie in the run; nothing is loaded yet.
+pub(super) fn trained_fields<'l>(line: &'l Line<'l>) -> impl Fields {
+    TrainedFields { line, iface: OnceCell::new(), tface: OnceCell::new(), baseline: OnceCell::new() }
 }
 
 impl Fields for TrainedFields<'_> {

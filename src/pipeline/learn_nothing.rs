@@ -1,6 +1,6 @@
 //! In the place of `learn` in a build without the feature `cpu`: no field is learned or loaded.
 
-use super::Line;
+use super::line::Line;
 use super::surface::{Fields, Radiance, Surface};
 use crate::capture::Capture;
 use crate::capture::scene::Scene;
@@ -21,17 +21,13 @@ pub(super) fn radiance(_: Stage, _: &Capture, _: &Scene, _: &Config, _: &StageDi
     no_fields()
 }
 
-/// No fields.
-pub struct TrainedFields;
+struct NoFields;
 
-impl TrainedFields {
-    /// Of a line.
-    pub fn new(_: &Line) -> TrainedFields {
-        TrainedFields
-    }
+pub(super) fn trained_fields(_: &Line) -> impl Fields {
+    NoFields
 }
 
-impl Fields for TrainedFields {
+impl Fields for NoFields {
     fn surface(&self) -> Result<&dyn Surface> {
         no_fields()
     }

@@ -313,7 +313,7 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
     assert_ne!(digests[0], digests[1]);
 }
 
-/// A radiance field that is one colour, and counts the views it was asked for.
+/// A radiance field that is one color, and counts the views it was asked for.
 struct Fog(std::sync::atomic::AtomicUsize, Option<Stop>);
 
 impl Radiance for Fog {

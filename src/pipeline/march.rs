@@ -10,10 +10,10 @@ use rayon::prelude::*;
 /// Rays marched together: some megabytes, and enough for any number of threads.
 const BAND: usize = 1 << 16;
 
-/// What one ray saw; colour is premultiplied by opacity (over black).
+/// What one ray saw; color is premultiplied by opacity (over black).
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Seen {
-    /// sRGB-coded colour, premultiplied.
+    /// sRGB-coded color, premultiplied.
     pub color: [f32; 3],
     /// 0..=1.
     pub opacity: f32,

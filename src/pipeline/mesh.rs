@@ -1,14 +1,15 @@
 //! Stage `mesh`: the zero level set of the learned distance, closed, in the dataset's world; and what an artist opens.
 //!
 //! ```text
-//! mesh/surface.ply   the whole extraction with colours at its vertices, in the dataset's world
+//! mesh/surface.ply   the whole extraction with colors at its vertices, in the dataset's world
 //!      parts         the same and the head mesh, for the stages after this one
 //!      head.glb …    the head mesh as files
 //! ```
 
+use super::export::Export;
 use super::finish::{FinishedHead, REACH, finish};
+use super::line::Line;
 use super::surface::{ClosedSurface, Surface};
-use super::{Export, Line};
 use crate::Result;
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, Split};
@@ -57,7 +58,7 @@ pub(super) fn mesh(
     };
     write_files(&to_ply(&surface, None, &in_world)?, dir.folder())?;
     let surface_triangles = surface.triangles.len();
-    // vertices have the colour seen straight; textures and rays that of the cameras, and so their cap
+    // vertices have the color seen straight; textures and rays that of the cameras, and so their cap
     let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
     if let Some(cap) = cap.as_mut() {
         let learned = Learned {
@@ -100,7 +101,7 @@ pub(super) fn mesh(
     }))
 }
 
-/// The whole surface with colours at its vertices, closed where the training cameras stop looking.
+/// The whole surface with colors at its vertices, closed where the training cameras stop looking.
 fn extract(
     scene: &Scene,
     field: &dyn Surface,
@@ -121,7 +122,7 @@ fn extract(
     };
     let hull = scene.hull.as_ref().map(|hull| |p: Vec3| hull.contains(p));
     let inside_hull = hull.as_ref().map(|f| f as &(dyn Fn(Vec3) -> bool + Sync));
-    // the colour of a vertex is what is seen looking straight at it
+    // the color of a vertex is what is seen looking straight at it
     let color = |points: &[Vec3], normals: &[Vec3]| {
         let directions: Vec<Vec3> = normals.iter().map(|n| -*n).collect();
         field.color(points, normals, &directions)

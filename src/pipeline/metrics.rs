@@ -1,8 +1,9 @@
 //! Stage `metrics`: every view, of every member and of the blends, against its photograph.
 
+use super::line::Line;
 use super::mesh::surface_in_world;
+use super::pictures;
 use super::truth::against_truth;
-use super::{Line, pictures};
 use crate::capture::{LoadedView, View};
 use crate::config::{RenderConfig, Stage, ViewBackground};
 use crate::image::{Gray, Image};

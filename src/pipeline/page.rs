@@ -1,6 +1,6 @@
 //! `report.html`, from what lies in the run.
 
-use super::Line;
+use super::line::Line;
 use super::metrics::{Comparable, comparable, picture_sets};
 use crate::Result;
 use crate::config::{PictureFormat, Stage, called};

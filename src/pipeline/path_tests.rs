@@ -9,7 +9,7 @@ use crate::{ErrorKind, Result};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// Radiance fields that are one colour; others may not be asked for.
+/// Radiance fields that are one color; others may not be asked for.
 struct Fog;
 
 impl Radiance for Fog {

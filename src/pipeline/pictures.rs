@@ -7,7 +7,7 @@ use crate::io::{self, Limits, ReadError, WriteError};
 use crate::render::RenderedView;
 use std::path::{Path, PathBuf};
 
-/// Colour behind the head, sRGB-coded; `None` leaves alpha.
+/// Color behind the head, sRGB-coded; `None` leaves alpha.
 pub(super) fn behind(background: ViewBackground) -> Option<[f32; 3]> {
     match background {
         ViewBackground::Black => Some([0.0; 3]),
@@ -36,7 +36,7 @@ pub(super) fn files(folder: &Path, name: &str, float: Option<&Path>, format: Pic
     files
 }
 
-/// Puts coded colour over a background: the result is opaque.
+/// Puts coded color over a background: the result is opaque.
 pub(super) fn over(view: &mut RenderedView, background: [f32; 3]) {
     for p in view.color.data.as_chunks_mut::<4>().0 {
         let open = 1.0 - p[3];
@@ -103,7 +103,7 @@ pub(super) fn float_path(folder: &Path, name: &str) -> PathBuf {
     path(folder, name, PictureFormat::Exr)
 }
 
-/// Writes a view as it is: 32-bit coded colour over black, opacity, and depth in world units.
+/// Writes a view as it is: 32-bit coded color over black, opacity, and depth in world units.
 pub(super) fn write_float(folder: &Path, name: &str, view: &RenderedView) -> Result<(), WriteError> {
     let file = float_path(folder, name);
     io::create_folder(file.parent().unwrap_or(folder))?;
@@ -114,7 +114,7 @@ pub(super) fn write_float(folder: &Path, name: &str, view: &RenderedView) -> Res
     io::write_exr(&file, view.color.width, view.color.height, &channels)
 }
 
-/// Reads what [`write_float`] wrote, bit by bit: the colour (RGBA over black).
+/// Reads what [`write_float`] wrote, bit by bit: the color (RGBA over black).
 pub(super) fn read_float(file: &Path) -> Result<Image, ReadError> {
     let read = io::read_exr(file, &[&CODED[..4]], &Limits::default())?;
     if read.replaced > 0 {
@@ -126,13 +126,13 @@ pub(super) fn read_float(file: &Path) -> Result<Image, ReadError> {
     Ok(read.image)
 }
 
-/// Coded colour no longer multiplied by alpha.
+/// Coded color no longer multiplied by alpha.
 fn straight([r, g, b, a]: [f32; 4]) -> [f32; 4] {
     let k = if a > 0.0 { 1.0 / a } else { 0.0 };
     [r * k, g * k, b * k, a]
 }
 
-/// Reads a view as it was written: RGBA, coded colour premultiplied over black.
+/// Reads a view as it was written: RGBA, coded color premultiplied over black.
 pub(super) fn read(file: &Path, format: PictureFormat) -> Result<Image, ReadError> {
     let limits = Limits::default();
     match format {
@@ -188,7 +188,7 @@ mod tests {
             depth: Image::new(2, 1, 1),
             normal: Image::new(2, 1, 3),
         };
-        // half covered, straight colour (0.8, 0.4, 0.2); the other pixel empty
+        // half covered, straight color (0.8, 0.4, 0.2); the other pixel empty
         view.color.pixel_mut(0, 0).copy_from_slice(&[0.4, 0.2, 0.1, 0.5]);
         view.depth.pixel_mut(0, 0)[0] = 1.234;
         for format in [PictureFormat::Png, PictureFormat::Exr] {

@@ -1,7 +1,7 @@
 //! What each stage builds on, and so what shapes it: known before anything runs.
 
-use super::Line;
 use super::ensemble::can_blend;
+use super::line::Line;
 use super::path::{CameraPath, PATHS};
 use crate::capture::{Split, View};
 use crate::config::{Config, Stage, VmConfig};

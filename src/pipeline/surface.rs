@@ -8,7 +8,7 @@ use crate::mesh::{Cap, Patches};
 use crate::render::RenderedView;
 use glam::Vec3;
 
-/// A coloured signed distance in scene coordinates.
+/// A colored signed distance in scene coordinates.
 pub trait Surface: Sync {
     /// Signed distance, negative inside. `[n, 3]` → `[n]`.
     fn sdf(&self, points: &[Vec3]) -> Vec<f32>;
@@ -16,11 +16,11 @@ pub trait Surface: Sync {
     /// Signed distance and its gradient. `[n, 3]` → `[n]`, `[n, 3]`.
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>);
 
-    /// sRGB-coded colour of surface points with unit normals, seen along unit directions, away from the
+    /// sRGB-coded color of surface points with unit normals, seen along unit directions, away from the
     /// camera. All `[n, 3]`.
     fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]>;
 
-    /// The same, point `i` seen along `counts[i]` directions, all in one list: one colour a direction.
+    /// The same, point `i` seen along `counts[i]` directions, all in one list: one color a direction.
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], directions: &[Vec3])
     -> Vec<[f32; 3]>;
 
@@ -52,7 +52,7 @@ impl ClosedSurface<'_> {
         (values, gradients)
     }
 
-    /// As [`Surface::colors`], the cap in its own colour.
+    /// As [`Surface::colors`], the cap in its own color.
     pub fn colors(
         &self,
         points: &[Vec3],

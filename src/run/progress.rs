@@ -9,7 +9,7 @@ use crate::{Monitor, Result};
 use serde::{Serialize, Serializer};
 use serde_json::{Map, Value};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// What happens in a run, for whoever shows it.
@@ -86,17 +86,17 @@ pub(super) struct Progress {
     start: Instant,
     /// Seconds that earlier processes worked.
     before_s: f64,
-    state: Mutex<Pace>,
+    state: Mutex<(Status, Pace)>,
 }
 
+#[derive(Default)]
 struct Pace {
-    status: Status,
     /// The step and moment the rate is measured from.
     mark: Option<(u64, Instant)>,
     shown: Option<Instant>,
     logged: Option<Instant>,
     saved: Option<Instant>,
-    /// A status that cannot be written is told once, not once a second.
+    /// A status that cannot be written is reported once, not once a second.
     complained: bool,
     /// Has this process done a step?
     stepped: bool,
@@ -120,25 +120,13 @@ impl Progress {
         observer: Arc<dyn Observer>,
         status: Status,
     ) -> Progress {
-        let before_s = status.elapsed_s;
-        let pace = Pace {
-            status,
-            mark: None,
-            shown: None,
-            logged: None,
-            saved: None,
-            complained: false,
-            stepped: false,
-        };
-        Progress {
-            stage: stage.into(),
-            folder,
-            stop,
-            observer,
-            start: Instant::now(),
-            before_s,
-            state: Mutex::new(pace),
-        }
+        let (before_s, start) = (status.elapsed_s, Instant::now());
+        let state = Mutex::new((status, Pace::default()));
+        Progress { stage: stage.into(), folder, stop, observer, start, before_s, state }
+    }
+
+    fn state(&self) -> MutexGuard<'_, (Status, Pace)> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub fn stage(&self) -> &str {
@@ -151,9 +139,9 @@ impl Progress {
 
     /// Changes the status and writes it now.
     pub fn save(&self, change: impl FnOnce(&mut Status)) -> Result<(), io::WriteError> {
-        let mut pace = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        change(&mut pace.status);
-        self.write(&mut pace)
+        let (status, pace) = &mut *self.state();
+        change(status);
+        self.write(status, pace)
     }
 
     /// The status of a stage that was stopped; failing to write it changes nothing about that.
@@ -166,7 +154,7 @@ impl Progress {
 
     /// Has this process done a step of the stage?
     pub fn has_stepped(&self) -> bool {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner).stepped
+        self.state().1.stepped
     }
 
     pub fn note(&self, text: &str) {
@@ -177,11 +165,11 @@ impl Progress {
         self.observer.event(&Event::Warning { stage: &self.stage, text });
     }
 
-    fn write(&self, pace: &mut Pace) -> Result<(), io::WriteError> {
+    fn write(&self, status: &mut Status, pace: &mut Pace) -> Result<(), io::WriteError> {
         pace.saved = Some(Instant::now());
-        pace.status.elapsed_s = self.elapsed_s();
-        pace.status.updated = now();
-        let text = serde_json::to_string_pretty(&pace.status).unwrap_or_default();
+        status.elapsed_s = self.elapsed_s();
+        status.updated = now();
+        let text = serde_json::to_string_pretty(status).unwrap_or_default();
         io::write_atomic(&self.folder.join("status.json"), format!("{text}\n").as_bytes())
     }
 
@@ -200,22 +188,21 @@ impl Progress {
 
 impl Monitor for Progress {
     fn step(&self, step: u64, steps: u64, values: &[(&str, f64)]) {
-        let mut pace = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let (status, pace) = &mut *self.state();
         let now = Instant::now();
         let (from, since) = *pace.mark.get_or_insert((step, now));
         let seconds = now.duration_since(since).as_secs_f64();
         if seconds > 0.2 && step > from {
             let fresh = (step - from) as f64 / seconds;
-            if pace.status.rate.is_none() || now.duration_since(since) >= WINDOW {
-                pace.status.rate = Some(pace.status.rate.map_or(fresh, |old| 0.5 * old + 0.5 * fresh));
+            if status.rate.is_none() || now.duration_since(since) >= WINDOW {
+                status.rate = Some(status.rate.map_or(fresh, |old| 0.5 * old + 0.5 * fresh));
                 pace.mark = Some((step, now));
             }
         }
         pace.stepped = true;
-        pace.status.step = step;
-        pace.status.steps = steps;
-        pace.status.eta_s =
-            pace.status.rate.filter(|r| *r > 0.0).map(|r| steps.saturating_sub(step) as f64 / r);
+        status.step = step;
+        status.steps = steps;
+        status.eta_s = status.rate.filter(|r| *r > 0.0).map(|r| steps.saturating_sub(step) as f64 / r);
 
         let last = step >= steps;
         let mut trouble = None;
@@ -224,7 +211,7 @@ impl Monitor for Progress {
             trouble = self.log(step, steps, values).err();
         }
         if due(pace.saved, SAVE) {
-            trouble = self.write(&mut pace).err().or(trouble);
+            trouble = self.write(status, pace).err().or(trouble);
         }
         if let Some(e) = trouble
             && !pace.complained
@@ -234,7 +221,7 @@ impl Monitor for Progress {
         }
         if last || due(pace.shown, SHOW) {
             pace.shown = Some(now);
-            let (rate, eta_s) = (pace.status.rate, pace.status.eta_s);
+            let (rate, eta_s) = (status.rate, status.eta_s);
             let stage = self.stage.as_str();
             self.observer.event(&Event::Progress { stage, step, steps, rate, eta_s, values });
         }
