@@ -23,7 +23,7 @@
 //! let (stage, mesh) = &done[2];
 //! assert_eq!((*stage, &mesh.summary["closed"]), (Stage::Mesh, &true.into()));
 //! assert!(run.path("mesh/head.glb").is_file());
-//! # Ok::<(), tiface::Error>(())
+//! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
 //! The line, one word per stage: **capture** (what was photographed, from where) → **mask** (which

@@ -217,6 +217,19 @@ impl Config {
     }
 
     /// The configuration that `sources` describe, or the first thing wrong with them.
+    ///
+    /// ```
+    /// use tiface::config::{Config, Preset, Sources};
+    ///
+    /// let set = |text: &str| Sources { set: vec![text.into()], ..Sources::default() };
+    /// let config = Config::resolve(&set("mesh.resolution=300"))?;
+    /// assert_eq!((config.preset, config.mesh.resolution), (Preset::Standard, 300));
+    ///
+    /// let error = Config::resolve(&set("mesh.resolutoin=300")).unwrap_err();
+    /// assert_eq!(error.to_string(), "`--set mesh.resolutoin=300`: there is no key `mesh.resolutoin`");
+    /// assert!(error.hint().starts_with("did you mean `mesh.resolution`?"));
+    /// # Ok::<(), tiface::Error>(())
+    /// ```
     pub fn resolve(sources: &Sources) -> Result<Config> {
         source::resolve(sources)
     }

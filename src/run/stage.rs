@@ -89,6 +89,24 @@ impl Run {
     /// Sees to it that a stage is complete: skips it if it is, else lets `work` do it and records
     /// the figures it returns.
     ///
+    /// ```
+    /// use tiface::run::{Fingerprint, Plan, Run};
+    ///
+    /// let folder = tempfile::tempdir()?;
+    /// let run = Run::quiet(folder.path());
+    /// let plan = |steps: u32| {
+    ///     let fingerprint = Fingerprint::default().setting("iface.steps", steps);
+    ///     Plan { name: "iface", fingerprint, device: "cpu", needs_bytes: 0, saves: true }
+    /// };
+    /// let done = run.stage(plan(5), |_| Ok(29.5.into()))?;
+    /// assert_eq!((done.summary.as_f64(), done.skipped), (Some(29.5), false));
+    /// assert!(run.stage(plan(5), |_| unreachable!())?.skipped);
+    /// // other settings are neither computed nor passed over in silence
+    /// let error = run.stage(plan(6), |_| unreachable!()).unwrap_err();
+    /// assert!(error.to_string().contains("iface.steps: was 5, is 6"));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
     /// Exit code 75 if another process holds the stage, 1 if it was done or begun with another
     /// fingerprint or if the disk has too little room. `work` leaves the stage's files in
     /// [`StageDir::folder`], complete and durable, before it returns.
