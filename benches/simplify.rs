@@ -105,7 +105,7 @@ fn head(n: usize) -> Mesh {
     Mesh { positions: surface.positions, triangles: surface.triangles, ..Mesh::default() }
 }
 
-fn measure(n: usize, triangles: usize, rounds: usize) {
+fn measure(n: usize, triangles: usize) {
     let input = head(n);
     show(&format!("head {n}³"), None, &input);
     let ways = [
@@ -114,7 +114,7 @@ fn measure(n: usize, triangles: usize, rounds: usize) {
         ("with it, nearest", true, VertexPlacement::Nearest),
     ];
     for (name, with, placement) in ways {
-        let config = SimplifyConfig { triangles, rounds, placement, ..SimplifyConfig::default() };
+        let config = SimplifyConfig { triangles, placement, ..SimplifyConfig::default() };
         let (mut best, mut mesh) = ((f64::INFINITY, 0.0), Mesh::default());
         for _ in 0..RUNS {
             mesh = input.clone();
@@ -134,7 +134,6 @@ fn main() {
     let args: Vec<String> = std::env::args().skip(1).filter(|a| a != "--bench").collect();
     let words: Vec<&str> = args.iter().map(String::as_str).collect();
     let number = |s: &str| s.parse::<usize>().expect("a number");
-    let rounds = SimplifyConfig::default().rounds;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread pool");
     pool.install(|| match words[..] {
         ["--write", n, path] => {
@@ -154,11 +153,10 @@ fn main() {
             };
             show("read", None, &mesh);
         }
-        [n, target] => measure(number(n), number(target), rounds),
-        [n, target, "--rounds", rounds] => measure(number(n), number(target), number(rounds)),
+        [n, target] => measure(number(n), number(target)),
         _ => {
-            measure(245, 40_000, rounds);
-            measure(388, 100_000, rounds);
+            measure(245, 40_000);
+            measure(388, 100_000);
         }
     });
 }

@@ -45,8 +45,6 @@ pub(crate) struct Shared<T> {
     pub(crate) found: Vec<T>,
     /// Who ran short, in order.
     pub(crate) unfinished: Vec<usize>,
-    /// What was spent on all together.
-    pub(crate) spent: usize,
 }
 
 /// Does `work` for each item, with `each` to spend on average and no more than that on all.
@@ -55,35 +53,32 @@ pub(crate) fn share_out<T: Send>(
     each: usize,
     work: impl Fn(usize, &mut Effort) -> T + Sync,
 ) -> Shared<T> {
-    let mut total = each.saturating_mul(items.max(ALWAYS));
-    let go = |i: usize, share: usize| {
-        let mut effort = Effort::of(share);
-        let found = work(i, &mut effort);
-        (found, share - effort.left, effort.short)
-    };
-    let first: Vec<(T, usize, bool)> = (0..items).into_par_iter().map(|i| go(i, each)).collect();
-    let mut shared = Shared { found: Vec::with_capacity(items), unfinished: Vec::new(), spent: 0 };
-    for (i, (found, spent, short)) in first.into_iter().enumerate() {
-        shared.found.push(found);
-        shared.spent += spent;
-        if short {
-            shared.unfinished.push(i);
-        }
-    }
-    // once more from the start, with what is left over
-    total = total.saturating_sub(shared.spent);
-    let share = total / shared.unfinished.len().max(1);
-    if share > each {
-        let again: Vec<(T, usize, bool)> = shared.unfinished.par_iter().map(|&i| go(i, share)).collect();
-        for (i, (found, spent, short)) in std::mem::take(&mut shared.unfinished).into_iter().zip(again) {
-            shared.found[i] = found;
-            shared.spent += spent;
-            if short {
-                shared.unfinished.push(i);
+    let total = each.saturating_mul(items.max(ALWAYS));
+    let mut found: Vec<Option<T>> = (0..items).map(|_| None).collect();
+    let (mut unfinished, mut share, mut spent): (Vec<usize>, _, _) = ((0..items).collect(), each, 0);
+    // a second time from the start, with what the others left over
+    for _ in 0..2 {
+        let run = |&i: &usize| {
+            let mut effort = Effort::of(share);
+            (work(i, &mut effort), share - effort.left, effort.short)
+        };
+        let runs: Vec<(T, usize, bool)> = unfinished.par_iter().map(run).collect();
+        let mut short = Vec::new();
+        for (i, (result, cost, ran_short)) in unfinished.into_iter().zip(runs) {
+            found[i] = Some(result);
+            spent += cost;
+            if ran_short {
+                short.push(i);
             }
         }
+        unfinished = short;
+        let left = total.saturating_sub(spent) / unfinished.len().max(1);
+        if unfinished.is_empty() || left <= each {
+            break;
+        }
+        share = left;
     }
-    shared
+    Shared { found: found.into_iter().flatten().collect(), unfinished }
 }
 
 /// A box along the axes.
@@ -243,6 +238,8 @@ mod tests {
         let work = |_: usize, effort: &mut Effort| (0..200_000).take_while(|_| effort.spend(1)).count();
         let shared = share_out(3, 10, work);
         assert_eq!(shared.unfinished, [0, 1, 2]);
-        assert!(shared.spent <= 10 * ALWAYS && shared.found.iter().all(|&n| n > 100_000));
+        assert!(
+            shared.found.iter().sum::<usize>() <= 10 * ALWAYS && shared.found.iter().all(|&n| n > 100_000)
+        );
     }
 }

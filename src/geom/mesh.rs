@@ -78,6 +78,23 @@ impl Mesh {
         sum / 6.0
     }
 
+    /// Drops vertices no triangle uses.
+    pub(crate) fn drop_unused_vertices(&mut self) {
+        let mut to = vec![u32::MAX; self.positions.len()];
+        self.triangles.iter().flatten().for_each(|&v| to[v as usize] = 0);
+        for (next, slot) in to.iter_mut().filter(|s| **s == 0).enumerate() {
+            *slot = next as u32;
+        }
+        self.triangles.iter_mut().flatten().for_each(|v| *v = to[*v as usize]);
+        fn pick<T>(of: &mut Vec<T>, to: &[u32]) {
+            let mut slots = to.iter();
+            of.retain(|_| slots.next().is_some_and(|&s| s != u32::MAX));
+        }
+        pick(&mut self.positions, &to);
+        pick(&mut self.normals, &to);
+        pick(&mut self.colors, &to);
+    }
+
     /// The same mesh in another coordinate system.
     pub fn transformed(&self, b_from_a: &Similarity) -> Mesh {
         Mesh {

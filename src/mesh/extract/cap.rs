@@ -113,7 +113,7 @@ impl Cap {
         let capped: Vec<bool> = mesh.positions.iter().map(|&p| self.holds(p)).collect();
         mesh.triangles.retain(|t| !t.iter().all(|&i| capped[i as usize]));
         let removed = before - mesh.triangles.len();
-        super::clean::compact(mesh);
+        mesh.drop_unused_vertices();
         removed
     }
 

@@ -117,7 +117,7 @@ pub fn clean(mesh: &mut Mesh, keep_share: f64) -> Result<CleanReport> {
     }
     let mut of = piece_of.iter();
     mesh.triangles.retain(|_| of.next().is_some_and(|&p| keep[p as usize]));
-    compact(mesh);
+    mesh.drop_unused_vertices();
     Ok(report)
 }
 
@@ -218,23 +218,6 @@ fn is_within(point: Vec3, mesh: &Mesh, piece_of: &[u32], keep: &[bool]) -> bool 
         })
         .sum();
     angle.abs() > std::f64::consts::TAU
-}
-
-/// Drops vertices no triangle uses.
-pub(super) fn compact(mesh: &mut Mesh) {
-    let mut to = vec![u32::MAX; mesh.positions.len()];
-    mesh.triangles.iter().flatten().for_each(|&v| to[v as usize] = 0);
-    for (next, slot) in to.iter_mut().filter(|s| **s == 0).enumerate() {
-        *slot = next as u32;
-    }
-    mesh.triangles.iter_mut().flatten().for_each(|v| *v = to[*v as usize]);
-    fn pick<T>(of: &mut Vec<T>, to: &[u32]) {
-        let mut slots = to.iter();
-        of.retain(|_| slots.next().is_some_and(|&s| s != u32::MAX));
-    }
-    pick(&mut mesh.positions, &to);
-    pick(&mut mesh.normals, &to);
-    pick(&mut mesh.colors, &to);
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 mod cap;
 mod clean;
+mod grid;
 mod handles;
 mod holes;
 mod loops;
@@ -15,9 +16,10 @@ mod verify;
 
 pub use cap::{Cap, Skin};
 pub use clean::{CleanReport, clean};
+pub use grid::NodeGrid;
 pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};
-pub use sparse::{NodeGrid, Sparse, sparse};
+pub use sparse::{Sparse, sparse};
 pub use verify::Verified;
 
 use super::input::{answered, evaluate, setting};

@@ -14,63 +14,12 @@
 //! outside the hull, without asking the field. Waves of a flood that starts everywhere are few
 //! and large, so that the field is asked thousands of points at a time.
 
+use super::grid::NodeGrid;
 use super::marching::LevelSet;
 use super::sparse_blocks::Blocks;
-use crate::geom::Aabb;
 use crate::mesh::input::{answered, setting};
-use crate::{Error, Monitor, Result};
-use glam::{DVec3, Vec3};
-
-/// Cubic cells over a box.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct NodeGrid {
-    /// Nodes along x, y, z.
-    pub dims: [usize; 3],
-    /// Node (0, 0, 0).
-    pub origin: Vec3,
-    /// Cell edge.
-    pub spacing: f32,
-}
-
-impl NodeGrid {
-    /// `resolution` cells along the longest side; along the others as many as cover the box, the
-    /// surplus split between both ends.
-    ///
-    /// # Errors
-    ///
-    /// An empty or unbounded box, a resolution outside 2..=8192.
-    pub fn fit(bounds: Aabb, resolution: usize) -> Result<NodeGrid> {
-        let size = bounds.size();
-        if bounds.is_empty() || !size.is_finite() || !bounds.center().is_finite() || size.min_element() <= 0.0
-        {
-            let Aabb { min, max } = bounds;
-            let message = format!("the box to mesh in, {min} to {max}, is empty or not finite");
-            return Err(Error::cannot(message, "check the scene box of the capture"));
-        }
-        setting((2..=8192).contains(&resolution), "resolution", "2..=8192", resolution)?;
-        let spacing = size.max_element() / resolution as f32;
-        // A side a rounding error longer than n cells is n cells long.
-        let cells = size.to_array().map(|s| ((s / spacing - 1e-3).ceil() as usize).max(2));
-        let half = DVec3::from(cells.map(|c| 0.5 * c as f64 * f64::from(spacing)));
-        let origin = (bounds.center().as_dvec3() - half).as_vec3();
-        Ok(NodeGrid { dims: cells.map(|c| c + 1), origin, spacing })
-    }
-
-    /// Where a node lies.
-    pub fn point(&self, node: [usize; 3]) -> Vec3 {
-        let n = DVec3::new(node[0] as f64, node[1] as f64, node[2] as f64);
-        (self.origin.as_dvec3() + n * f64::from(self.spacing)).as_vec3()
-    }
-
-    /// Number of nodes.
-    pub fn nodes(&self) -> usize {
-        self.dims.iter().product()
-    }
-
-    fn on_border(&self, node: [usize; 3]) -> bool {
-        (0..3).any(|a| node[a] == 0 || node[a] + 1 == self.dims[a])
-    }
-}
+use crate::{Monitor, Result};
+use glam::Vec3;
 
 /// A surface and what it cost.
 #[derive(Clone, Debug, Default)]
@@ -434,6 +383,7 @@ impl Flood<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geom::Aabb;
     use crate::mesh::{Volume, marching};
     use crate::monitor::{Quiet, Stopping};
 

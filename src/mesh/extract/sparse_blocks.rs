@@ -5,9 +5,9 @@
 //! vertex on a block's border has one owner and one index: the block's first plus a count of bits before
 //! it. Nothing is merged by distance.
 
+use super::grid::NodeGrid;
 use super::marching::{LevelSet, cell_point, edge_point, largest_neighbour, sided};
 use super::marching_cell::{CASES, CellSurface, EDGES, INNER, crossed, crossing, resolve};
-use super::sparse::NodeGrid;
 use crate::Result;
 use crate::mesh::input::few_enough;
 use glam::Vec3;

@@ -1,7 +1,7 @@
 //! Did the sparse extraction lose anything? The dense grid knows.
 
+use super::grid::NodeGrid;
 use super::marching::{Volume, marching};
-use super::sparse::NodeGrid;
 use crate::{Monitor, Result};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};

@@ -18,8 +18,8 @@ pub struct Learned<'a> {
     pub colors: &'a (dyn Fn(&[Vec3], &[Vec3], &[u32], &[Vec3]) -> Vec<[f32; 3]> + Sync),
 }
 
-/// Points of the surface with their unit normals.
-pub struct Points {
+/// SurfacePoints of the surface with their unit normals.
+pub struct SurfacePoints {
     /// Where they are.
     pub positions: Vec<Vec3>,
     /// Unit normals, pointing out.
@@ -29,11 +29,11 @@ pub struct Points {
 /// Moves points of the flat triangles onto the field's zero along their interpolated normals, at most `reach`
 /// far, and gives them the field's normals. A point from where the field's zero is not met stays as it is, with
 /// its interpolated normal.
-pub fn settle(flat: &Points, reach: f32, learned: &Learned) -> Points {
+pub fn settle(flat: &SurfacePoints, reach: f32, learned: &Learned) -> SurfacePoints {
     let n = flat.positions.len();
     let mut offset = vec![0f32; n];
     let mut start = vec![f32::INFINITY; n];
-    let mut points = Points { positions: flat.positions.clone(), normals: flat.normals.clone() };
+    let mut points = SurfacePoints { positions: flat.positions.clone(), normals: flat.normals.clone() };
     for step in 0..3 {
         let (values, gradients) = (learned.gradient)(&points.positions);
         for i in 0..n {
@@ -61,7 +61,7 @@ pub fn settle(flat: &Points, reach: f32, learned: &Learned) -> Points {
 }
 
 /// Who sees points: the training cameras, with the mesh in the way.
-pub struct Eyes<'a> {
+pub struct Visibility<'a> {
     /// The cameras, in the mesh's coordinates.
     pub cameras: &'a [Camera],
     /// The mesh that hides.
@@ -75,7 +75,7 @@ const STAND_INS: usize = 3;
 
 /// Directions to the cameras that see each point, all in one list.
 #[derive(Default)]
-pub struct Seen {
+pub struct ViewDirections {
     /// Does any camera see point `i`? Else its directions are those of the cameras that come nearest to it.
     pub known: Vec<bool>,
     /// Directions of point `i`.
@@ -86,15 +86,26 @@ pub struct Seen {
     pub weights: Vec<f32>,
 }
 
-impl Eyes<'_> {
+impl Visibility<'_> {
     /// The cameras that see each point: in the frame, at most 75 degrees from its normal, nothing between.
     ///
     /// Angles are those to the mesh's own normals and lines of sight start from the mesh (`flat`): the field's
     /// normals are rough, and a camera must not come and go from texel to texel. A point that no camera sees is
     /// looked at from where the cameras stand that face it most: those are directions that the field has
     /// learned colours for, unlike the one straight at it.
-    pub fn seen(&self, points: &Points, flat: &Points) -> Seen {
-        let each: Vec<(bool, Vec<(Vec3, f32)>)> = (0..points.positions.len())
+    /// Without any camera, each point is looked at straight.
+    pub fn directions(&self, points: &SurfacePoints, flat: &SurfacePoints) -> ViewDirections {
+        let n = points.positions.len();
+        if self.cameras.is_empty() {
+            let directions = points.normals.clone();
+            return ViewDirections {
+                known: vec![false; n],
+                counts: vec![1; n],
+                directions,
+                weights: vec![1.0; n],
+            };
+        }
+        let each: Vec<(bool, Vec<(Vec3, f32)>)> = (0..n)
             .into_par_iter()
             .with_min_len(256)
             .map(|i| {
@@ -131,7 +142,7 @@ impl Eyes<'_> {
                 (false, nearest.into_iter().map(|(d, cos)| (d, cos.max(0.0).powi(2) + 1e-3)).collect())
             })
             .collect();
-        let mut seen = Seen::default();
+        let mut seen = ViewDirections::default();
         for (known, list) in each {
             seen.known.push(known);
             seen.counts.push(list.len() as u32);
@@ -150,19 +161,6 @@ fn in_frame(camera: &Camera, p: Vec3) -> bool {
     camera.project(p).is_some_and(|(at, _)| (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y))
 }
 
-impl Seen {
-    /// Each of `points` looked at straight.
-    pub fn head_on(points: &Points) -> Seen {
-        let n = points.positions.len();
-        Seen {
-            known: vec![false; n],
-            counts: vec![1; n],
-            directions: points.normals.clone(),
-            weights: vec![1.0; n],
-        }
-    }
-}
-
 /// Colours of points: what the cameras that see them see on average, and how it changes between them.
 pub struct Shades {
     /// `[n]` linear colour.
@@ -175,7 +173,13 @@ pub struct Shades {
 
 /// Shades points. `functions` lobes are fitted in the coordinates that `turned` rotates to, where cameras see a
 /// point; 0 for none.
-pub fn shade(points: &Points, seen: Seen, learned: &Learned, functions: usize, turned: glam::Mat3) -> Shades {
+pub fn shade(
+    points: &SurfacePoints,
+    seen: ViewDirections,
+    learned: &Learned,
+    functions: usize,
+    turned: glam::Mat3,
+) -> Shades {
     let n = points.positions.len();
     let away: Vec<Vec3> = seen.directions.iter().map(|d| -*d).collect();
     let colors = (learned.colors)(&points.positions, &points.normals, &seen.counts, &away);
@@ -221,12 +225,9 @@ pub fn seen_colors(
     cameras: &[Camera],
     reach: f32,
 ) -> Vec<[f32; 3]> {
-    let points = Points { positions: positions.to_vec(), normals: normals.to_vec() };
+    let points = SurfacePoints { positions: positions.to_vec(), normals: normals.to_vec() };
     let bvh = Bvh::new(mesh);
-    let seen = match cameras {
-        [] => Seen::head_on(&points),
-        cameras => Eyes { cameras, bvh: &bvh, clearance: 0.5 * reach }.seen(&points, &points),
-    };
+    let seen = Visibility { cameras, bvh: &bvh, clearance: 0.5 * reach }.directions(&points, &points);
     let shades = shade(&points, seen, learned, 0, glam::Mat3::IDENTITY);
     shades.linear.into_iter().map(|c| c.map(srgb_from_linear)).collect()
 }
@@ -239,9 +240,9 @@ mod tests {
         p.iter().map(|p| (p.length() - 0.5, p.normalize_or_zero())).unzip()
     }
 
-    fn flat(points: &[Vec3]) -> Points {
+    fn flat(points: &[Vec3]) -> SurfacePoints {
         let normals = points.iter().map(|p| p.normalize()).collect();
-        Points { positions: points.to_vec(), normals }
+        SurfacePoints { positions: points.to_vec(), normals }
     }
 
     #[test]
@@ -268,14 +269,14 @@ mod tests {
         };
         let bvh = Bvh::new(&hiding);
         let cameras = [Camera::above(100, 100, 100.0, 4.0)];
-        let eyes = Eyes { cameras: &cameras, bvh: &bvh, clearance: 1e-3 };
+        let eyes = Visibility { cameras: &cameras, bvh: &bvh, clearance: 1e-3 };
         let at = |x: f32, n: Vec3| (Vec3::new(x, 0.0, 0.0), n);
         let tilted = |degrees: f32| Vec3::new(degrees.to_radians().sin(), 0.0, degrees.to_radians().cos());
         // free, hidden, turned away, 80 degrees off, outside the frame (50 / 100 · 4 = 2)
         let all =
             [at(0.5, Vec3::Z), at(-0.5, Vec3::Z), at(0.5, -Vec3::Z), at(0.5, tilted(80.0)), at(2.1, Vec3::Z)];
         let (positions, normals) = all.into_iter().unzip();
-        let points = Points { positions, normals };
+        let points = SurfacePoints { positions, normals };
         // blue where x > 0: all that the one camera sees of the first point
         let colors = |p: &[Vec3], _: &[Vec3], _: &[u32], d: &[Vec3]| -> Vec<[f32; 3]> {
             assert_eq!(d.len(), p.len());
@@ -287,7 +288,7 @@ mod tests {
             panic!("one colour a point")
         };
         assert!((first[1] - 4.0 / 16.25f32.sqrt()).abs() < 1e-3 && first[2] > 0.999, "{first:?}");
-        let seen = eyes.seen(&points, &points);
+        let seen = eyes.directions(&points, &points);
         assert_eq!(seen.known, [true, false, false, false, false]);
         // the others are looked at from where the one camera stands
         assert_eq!(seen.counts, [1; 5]);
@@ -302,10 +303,15 @@ mod tests {
             d.iter().map(|d| [f32::from(d.x < 0.0), 0.5, 0.0]).collect::<Vec<_>>()
         };
         let learned = Learned { gradient: &sphere_gradient, colors: &colors };
-        let points = Points { positions: vec![Vec3::Z; 2], normals: vec![Vec3::Z; 2] };
+        let points = SurfacePoints { positions: vec![Vec3::Z; 2], normals: vec![Vec3::Z; 2] };
         let side = |x: f32| Vec3::new(x, 0.0, 1.0).normalize();
         let directions = vec![side(1.0), side(-1.0), side(1.0)];
-        let seen = Seen { known: vec![true, false], counts: vec![2, 1], directions, weights: vec![0.5; 3] };
+        let seen = ViewDirections {
+            known: vec![true, false],
+            counts: vec![2, 1],
+            directions,
+            weights: vec![0.5; 3],
+        };
         let shades = shade(&points, seen, &learned, 4, glam::Mat3::IDENTITY);
         assert!((shades.linear[0][0] - 0.5).abs() < 1e-6);
         assert!((shades.linear[0][1] - linear_from_srgb(0.5)).abs() < 1e-6);
@@ -316,7 +322,10 @@ mod tests {
         let towards = |x: f32| crate::kernel::sphharm::combine(&shades.lobes[..4], side(x).to_array())[0];
         assert!(towards(1.0) > 0.1 && towards(-1.0) < -0.3, "{} {}", towards(1.0), towards(-1.0));
         assert_eq!(shades.lobes[4..], [[0.0; 3]; 4]);
-        let straight = shade(&points, Seen::head_on(&points), &learned, 0, glam::Mat3::IDENTITY);
+        let bvh = Bvh::new(&Mesh::default());
+        let nobody = Visibility { cameras: &[], bvh: &bvh, clearance: 0.0 };
+        let straight = nobody.directions(&points, &points);
+        let straight = shade(&points, straight, &learned, 0, glam::Mat3::IDENTITY);
         assert_eq!(straight.linear[0][0], 0.0);
     }
 }

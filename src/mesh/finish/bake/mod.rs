@@ -20,13 +20,13 @@ pub use detail::tangent_space;
 pub use light::{Learned, seen_colors};
 pub use seams::Seams;
 
-use crate::geom::{Atlas, Bvh, Camera, Mesh};
+use crate::geom::{Atlas, Bvh, Camera, Mesh, area_vector};
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::mesh::input::setting;
 use crate::{Monitor, Result};
 use cover::{Bands, Sample};
 use glam::{Mat3, Vec3};
-use light::{Eyes, Points, settle, shade};
+use light::{SurfacePoints, Visibility, settle, shade};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -67,7 +67,7 @@ pub struct BakeReport {
     pub size: [u32; 2],
     /// Share of texels that a chart covers, 0..=1.
     pub covered: f64,
-    /// Points of the surface that were looked at.
+    /// SurfacePoints of the surface that were looked at.
     pub samples: usize,
     /// Share of the samples that at least one camera sees.
     pub seen: f64,
@@ -82,7 +82,7 @@ pub struct BakeReport {
 /// Rows baked together.
 const ROWS: u32 = 32;
 
-/// Points handed to the field at once.
+/// SurfacePoints handed to the field at once.
 const BATCH: usize = 1 << 17;
 
 /// Bakes a texture for `mesh` with normals, laid out by `atlas`, from the field it was extracted from.
@@ -106,19 +106,24 @@ pub fn bake(
     let mut lobes = vec![Image::new(width, height, 3); functions];
     let mut normal = config.normals.then(|| Image::new(width, height, 3));
     let mut covered = vec![false; width as usize * height as usize];
-    let mut totals = Totals::default();
+    let (mut samples, mut visible, mut views, mut moved) = (0, 0, 0, 0.0);
     let bvh = Bvh::new(mesh);
-    let eyes = Eyes { cameras, bvh: &bvh, clearance: 0.5 * config.reach };
+    let eyes = Visibility { cameras, bvh: &bvh, clearance: 0.5 * config.reach };
     let bands = Bands::new(atlas, ROWS);
     for band in 0..bands.len() {
-        let samples = bands.samples(atlas, band, config.side);
-        for own in whole_texels(&samples) {
+        let all = bands.samples(atlas, band, config.side);
+        for own in whole_texels(&all) {
             monitor.check_stop()?;
             let flat = on_triangles(mesh, own);
             let points = settle(&flat, config.reach, learned);
-            let seen =
-                if cameras.is_empty() { light::Seen::head_on(&points) } else { eyes.seen(&points, &flat) };
-            totals.add(&seen, &flat, &points);
+            let seen = eyes.directions(&points, &flat);
+            samples += own.len();
+            for (_, &count) in seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known) {
+                visible += 1;
+                views += count as usize;
+            }
+            let ways = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
+            moved += ways.sum::<f64>();
             let shades = shade(&points, seen, learned, functions, config.turned);
             let mut i = 0;
             for texel in own.chunk_by(|a, b| a.texel == b.texel) {
@@ -149,7 +154,7 @@ pub fn bake(
                 i = all.end;
             }
         }
-        monitor.step(band as u64 + 1, bands.len() as u64, &[("texels", totals.samples as f64)]);
+        monitor.step(band as u64 + 1, bands.len() as u64, &[("texels", samples as f64)]);
     }
     fill::fill(&mut color, &covered, config.gutter_px);
     lobes.iter_mut().for_each(|l| fill::fill(l, &covered, config.gutter_px));
@@ -159,7 +164,16 @@ pub fn bake(
     if let Some(normal) = &mut normal {
         fill::fill(normal, &covered, config.gutter_px);
     }
-    let report = totals.report([width, height], &covered, begin.elapsed().as_secs_f64());
+    let share = |a: f64, b: usize| if b > 0 { a / b as f64 } else { 0.0 };
+    let report = BakeReport {
+        size: [width, height],
+        covered: share(covered.iter().filter(|&&c| c).count() as f64, covered.len()),
+        samples,
+        seen: share(visible as f64, samples),
+        views: share(views as f64, visible),
+        moved: share(moved, samples),
+        seconds: begin.elapsed().as_secs_f64(),
+    };
     Ok(Baked { color, lobes, normal, report })
 }
 
@@ -183,55 +197,16 @@ fn whole_texels(samples: &[Sample]) -> impl Iterator<Item = &[Sample]> {
 }
 
 /// Positions and interpolated normals of samples.
-fn on_triangles(mesh: &Mesh, samples: &[Sample]) -> Points {
+fn on_triangles(mesh: &Mesh, samples: &[Sample]) -> SurfacePoints {
     let mix = |values: &[Vec3], s: &Sample| {
         let [a, b, c] = mesh.triangles[s.triangle as usize].map(|i| values[i as usize]);
         (1.0 - s.u - s.v) * a + s.u * b + s.v * c
     };
-    let face = |s: &Sample| {
-        let [a, b, c] = mesh.corners(s.triangle);
-        (b - a).cross(c - a).normalize_or(Vec3::Z)
-    };
-    let normal = |s: &Sample| match mesh.normals.is_empty() {
-        true => face(s),
-        false => mix(&mesh.normals, s).normalize_or(face(s)),
-    };
-    Points {
+    let face = |s: &Sample| area_vector(mesh.corners(s.triangle)).normalize_or(Vec3::Z);
+    let normal = |s: &Sample| mix(&mesh.normals, s).normalize_or(face(s));
+    SurfacePoints {
         positions: samples.iter().map(|s| mix(&mesh.positions, s)).collect(),
         normals: samples.iter().map(normal).collect(),
-    }
-}
-
-/// Sums for the report.
-#[derive(Default)]
-struct Totals {
-    samples: usize,
-    seen: usize,
-    views: usize,
-    moved: f64,
-}
-
-impl Totals {
-    fn add(&mut self, seen: &light::Seen, flat: &Points, points: &Points) {
-        self.samples += seen.counts.len();
-        let known = || seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known);
-        self.seen += known().count();
-        self.views += known().map(|(_, &c)| c as usize).sum::<usize>();
-        let moved = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
-        self.moved += moved.sum::<f64>();
-    }
-
-    fn report(&self, size: [u32; 2], covered: &[bool], seconds: f64) -> BakeReport {
-        let share = |a: f64, b: usize| if b > 0 { a / b as f64 } else { 0.0 };
-        BakeReport {
-            size,
-            covered: share(covered.iter().filter(|&&c| c).count() as f64, covered.len()),
-            samples: self.samples,
-            seen: share(self.seen as f64, self.samples),
-            views: share(self.views as f64, self.seen),
-            moved: share(self.moved, self.samples),
-            seconds,
-        }
     }
 }
 

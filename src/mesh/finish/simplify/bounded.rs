@@ -44,7 +44,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         if next.triangles.len() == before {
             break;
         }
-        settle(&mut next, &fixed, field, task, VertexPlacement::OnSurface, true, report)?;
+        settle(&mut next, &fixed, field, task, VertexPlacement::OnSurface, report)?;
         let errors = measure(&next, task, report)?;
         let found = worst(&errors);
         let after = next.triangles.len();
@@ -71,7 +71,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
     if good.normals.is_empty() {
         // nothing may go: the mesh as it came, with normals
         let fixed = vec![true; good.positions.len()];
-        settle(&mut good, &fixed, field, task, VertexPlacement::OnSurface, true, report)?;
+        settle(&mut good, &fixed, field, task, VertexPlacement::OnSurface, report)?;
     }
     Ok(good)
 }

@@ -5,8 +5,9 @@
 //! with a border taken as joined to one vertex more, the same holds of edges. The triangles that stay
 //! may not turn by more than 60° nor become worse than a quality of 0.05, unless they were worse.
 
-use super::quadric::{Freedom, PlaneQuadric, best, lean_of};
-use super::rings::{BORDER, HELD, NONE, Rings};
+use super::hold::{BORDER, HELD};
+use super::quadric::{Freedom, PlaneQuadric, best, lean};
+use super::rings::{NONE, Rings};
 use crate::geom::shape;
 use glam::Vec3;
 
@@ -63,9 +64,7 @@ impl Star {
             return false;
         }
         for &t in rings.ring(a) {
-            let triangle = rings.triangles[t as usize];
-            let k = rings.corner_of(t, a);
-            let (from, to) = (triangle[(k + 1) % 3], triangle[(k + 2) % 3]);
+            let (from, to) = rings.opposite(t, a);
             for w in [from, to] {
                 if self.marks[w as usize] != near_a && w != b {
                     self.marks[w as usize] = near_a;
@@ -93,9 +92,7 @@ impl Star {
         let spans = |s: &FanTriangle| [s.from, s.to] == opposite || [s.to, s.from] == opposite;
         let mut closes = false;
         for &t in rings.ring(b) {
-            let triangle = rings.triangles[t as usize];
-            let k = rings.corner_of(t, b);
-            let (from, to) = (triangle[(k + 1) % 3], triangle[(k + 2) % 3]);
+            let (from, to) = rings.opposite(t, b);
             if from == a || to == a {
                 continue;
             }
@@ -138,7 +135,7 @@ impl Star {
                     return false;
                 }
             }
-            self.leans.push(lean_of(area));
+            self.leans.push(lean(area));
         }
         true
     }

@@ -62,15 +62,11 @@ impl Cells {
         (c.z as usize * self.dims.y as usize + c.y as usize) * self.dims.x as usize + c.x as usize
     }
 
-    fn for_each(&self, low: IVec3, high: IVec3, mut visit: impl FnMut(IVec3, usize)) {
-        for z in low.z..=high.z {
-            for y in low.y..=high.y {
-                for x in low.x..=high.x {
-                    let c = IVec3::new(x, y, z);
-                    visit(c, self.number(c));
-                }
-            }
-        }
+    /// The cells of a box of cells, with their numbers.
+    fn between(self, low: IVec3, high: IVec3) -> impl Iterator<Item = (IVec3, usize)> {
+        let row = move |y, z| (low.x..=high.x).map(move |x| IVec3::new(x, y, z));
+        let layer = move |z| (low.y..=high.y).flat_map(move |y| row(y, z));
+        (low.z..=high.z).flat_map(layer).map(move |c| (c, self.number(c)))
     }
 }
 
@@ -178,12 +174,12 @@ impl Sheets {
     pub(super) fn enter(&mut self, t: u32, bounds: Aabb, before: Option<Aabb>) {
         let cells = self.cells;
         let old = before.map(|b| (cells.cell(b.min), cells.cell(b.max)));
-        cells.for_each(cells.cell(bounds.min), cells.cell(bounds.max), |c, i| {
+        for (c, i) in cells.between(cells.cell(bounds.min), cells.cell(bounds.max)) {
             if old.is_none_or(|(low, high)| c.cmplt(low).any() || c.cmpgt(high).any()) {
                 self.links.push((t, self.heads[i]));
                 self.heads[i] = self.links.len() as u32 - 1;
             }
-        });
+        }
     }
 
     /// Would these triangles, in the place of `instead`, meet others or one another?
@@ -208,23 +204,19 @@ impl Sheets {
             return false;
         };
         let (low, high) = (self.cells.cell(bounds.min), self.cells.cell(bounds.max));
-        for z in low.z..=high.z {
-            for y in low.y..=high.y {
-                for x in low.x..=high.x {
-                    let mut link = self.heads[self.cells.number(IVec3::new(x, y, z))];
-                    while link != NONE {
-                        let (t, before) = self.links[link as usize];
-                        link = before;
-                        let ids = rings.triangles[t as usize];
-                        if self.seen[t as usize] == self.query || ids[0] == NONE {
-                            continue;
-                        }
-                        self.seen[t as usize] = self.query;
-                        let other = Facet::new(ids, rings.corners(t));
-                        if facets.iter().any(|f| f.meets(&other)) {
-                            return true;
-                        }
-                    }
+        for (_, i) in self.cells.between(low, high) {
+            let mut link = self.heads[i];
+            while link != NONE {
+                let (t, before) = self.links[link as usize];
+                link = before;
+                let ids = rings.triangles[t as usize];
+                if self.seen[t as usize] == self.query || ids[0] == NONE {
+                    continue;
+                }
+                self.seen[t as usize] = self.query;
+                let other = Facet::new(ids, rings.corners(t));
+                if facets.iter().any(|f| f.meets(&other)) {
+                    return true;
                 }
             }
         }

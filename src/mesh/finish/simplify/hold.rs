@@ -4,50 +4,20 @@
 //! triangles form more than one fan, the link condition says nothing. Such vertices stay as they are,
 //! so that a mesh with a flaw keeps the flaw and gets no others.
 
-use super::rings::{BORDER, HELD, Rings};
-use rayon::prelude::*;
+/// Has an edge with one triangle.
+pub(super) const BORDER: u8 = 1;
+/// Takes part in no collapse and does not move.
+pub(super) const HELD: u8 = 2;
 
-/// Up to here looking through the sides beats sorting them.
-const FEW: usize = 16;
-
-/// For every vertex [`BORDER`] or [`HELD`] or neither.
-pub(super) fn held(rings: &Rings) -> Vec<u8> {
-    (0..rings.positions.len() as u32)
-        .into_par_iter()
-        .map_init(Vec::new, |sides, v| {
-            sides.clear();
-            sides.extend(rings.ring(v).iter().map(|&t| {
-                let (triangle, k) = (rings.triangles[t as usize], rings.corner_of(t, v));
-                (triangle[(k + 1) % 3], triangle[(k + 2) % 3])
-            }));
-            kind(sides)
-        })
-        .collect()
-}
-
-/// What a vertex is, by the sides opposite to it, each from one neighbour to the next: one closed walk
-/// through all of them is the inside of a surface, one open walk its border.
-fn kind(sides: &mut [(u32, u32)]) -> u8 {
+/// What a vertex is, [`BORDER`] or [`HELD`] or neither, by the sides opposite to it, each from one neighbour to the
+/// next: one closed walk through all of them is the inside of a surface, one open walk its border.
+pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
+    sides.sort_unstable();
+    let after = |w: u32| sides.binary_search_by_key(&w, |side| side.0).ok();
     if sides.is_empty() {
         return 0;
     }
-    let many = sides.len() > FEW;
-    if many {
-        sides.sort_unstable();
-    }
-    let after = |w: u32| {
-        if many {
-            sides.binary_search_by_key(&w, |side| side.0).ok()
-        } else {
-            sides.iter().position(|side| side.0 == w)
-        }
-    };
-    let twice = if many {
-        sides.windows(2).any(|pair| pair[0].0 == pair[1].0)
-    } else {
-        (1..sides.len()).any(|i| sides[..i].iter().any(|side| side.0 == sides[i].0))
-    };
-    if twice {
+    if sides.windows(2).any(|pair| pair[0].0 == pair[1].0) {
         return HELD;
     }
     // A walk from anywhere either comes back, or ends at a border.

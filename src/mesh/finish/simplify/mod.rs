@@ -36,7 +36,7 @@ use crate::{Monitor, Result};
 use bounded::bounded;
 use crossing::crossings;
 use glam::Vec3;
-use round::{CrossingSearch, Task, rounds};
+use round::{CrossingSearch, Task, counted};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -59,9 +59,6 @@ pub struct SimplifyConfig {
     pub error: f32,
     /// Where vertices lie in the end; with an `error` always on the zero.
     pub placement: VertexPlacement,
-    /// Rounds of collapses, after each of which the field is asked; 1..=16. More than one takes the worst
-    /// error down a little in strong simplifications, at the price of asking more. Not for `error`.
-    pub rounds: usize,
     /// Most points in one call of the field; at least 1.
     pub batch: usize,
 }
@@ -72,7 +69,6 @@ impl Default for SimplifyConfig {
             triangles: 200_000,
             error: 0.0,
             placement: VertexPlacement::default(),
-            rounds: 1,
             batch: 1 << 16,
         }
     }
@@ -82,7 +78,6 @@ impl SimplifyConfig {
     fn check(&self) -> Result<()> {
         setting(self.error >= 0.0 && self.error.is_finite(), "error", "0 or more", self.error)?;
         setting(self.triangles > 0 || self.error > 0.0, "triangles", "at least 1, or an `error`", 0)?;
-        setting((1..=16).contains(&self.rounds), "rounds", "1..=16", self.rounds)?;
         setting(self.batch > 0, "batch", "at least 1", 0)
     }
 }
@@ -191,7 +186,7 @@ pub fn simplify(
         out = if config.error > 0.0 {
             bounded(mesh, &task, &mut report)?
         } else {
-            rounds(mesh, &task, &mut report)?
+            counted(mesh, &task, &mut report)?
         };
         let found = crossings(&out.positions, &out.triangles);
         report.self_intersections = found.len();

@@ -25,39 +25,28 @@ const REACH: f64 = 1.5;
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct PlaneQuadric([f32; 6]);
 
-/// `√A n` (up to √2) of a triangle, whose outer product is its share of a [`PlaneQuadric`]; zero for one
-/// without area.
-pub(super) fn lean(a: Vec3, b: Vec3, c: Vec3) -> Vec3 {
-    lean_of((b - a).cross(c - a))
-}
-
-/// The same from twice the area vector.
-pub(super) fn lean_of(area: Vec3) -> Vec3 {
+/// `√A n` (up to √2) of a triangle from twice its area vector, whose outer product is its share of a
+/// [`PlaneQuadric`]; zero for one without area.
+pub(super) fn lean(area: Vec3) -> Vec3 {
     let length = area.length();
     if length > 0.0 { area / length.sqrt() } else { Vec3::ZERO }
+}
+
+/// The outer product of a vector with itself.
+#[inline]
+fn outer(s: Vec3) -> [f32; 6] {
+    [s.x * s.x, s.x * s.y, s.x * s.z, s.y * s.y, s.y * s.z, s.z * s.z]
 }
 
 impl PlaneQuadric {
     #[inline]
     pub(super) fn add(&mut self, s: Vec3) {
-        let m = &mut self.0;
-        m[0] += s.x * s.x;
-        m[1] += s.x * s.y;
-        m[2] += s.x * s.z;
-        m[3] += s.y * s.y;
-        m[4] += s.y * s.z;
-        m[5] += s.z * s.z;
+        self.0.iter_mut().zip(outer(s)).for_each(|(m, p)| *m += p);
     }
 
     #[inline]
     pub(super) fn subtract(&mut self, s: Vec3) {
-        let m = &mut self.0;
-        m[0] -= s.x * s.x;
-        m[1] -= s.x * s.y;
-        m[2] -= s.x * s.z;
-        m[3] -= s.y * s.y;
-        m[4] -= s.y * s.z;
-        m[5] -= s.z * s.z;
+        self.0.iter_mut().zip(outer(s)).for_each(|(m, p)| *m -= p);
     }
 
     #[inline]
@@ -184,7 +173,7 @@ mod tests {
     fn nothing_around_is_no_reason_to_divide_by_zero() {
         let none = PlaneQuadric::default();
         assert_eq!(best(Vec3::ZERO, &none, Vec3::X, &none, Freedom::Free), (Vec3::new(0.5, 0.0, 0.0), 0.0));
-        assert_eq!(lean(Vec3::X, Vec3::X, Vec3::Y), Vec3::ZERO);
+        assert_eq!(lean(Vec3::ZERO), Vec3::ZERO);
         assert_eq!(solve([1.0, 0.0, 0.0, 1e-3, 0.0, 1e-7], DVec3::ONE), None);
     }
 

@@ -4,15 +4,12 @@
 //! to the pool's end. A collapse of (a, b) gives b's triangles to a and drops the one or two that held
 //! the edge; nothing else in the mesh changes its number.
 
-use super::hold::held;
+use super::hold::{BORDER, HELD, kind};
 use super::quadric::{PlaneQuadric, lean};
-use crate::geom::Mesh;
+use crate::geom::{Mesh, area_vector};
 use glam::Vec3;
+use rayon::prelude::*;
 
-/// Has an edge with one triangle.
-pub(super) const BORDER: u8 = 1;
-/// Takes part in no collapse and does not move.
-pub(super) const HELD: u8 = 2;
 /// Another sheet of the surface is near: collapses look for intersections.
 pub(super) const CROWDED: u8 = 4;
 
@@ -84,7 +81,14 @@ impl Rings {
                 place.len += 1;
             }
         }
-        rings.flags = held(&rings);
+        rings.flags = (0..n as u32)
+            .into_par_iter()
+            .map_init(Vec::new, |sides, v| {
+                sides.clear();
+                sides.extend(rings.ring(v).iter().map(|&t| rings.opposite(t, v)));
+                kind(sides)
+            })
+            .collect();
         rings.measure();
         rings
     }
@@ -117,26 +121,24 @@ impl Rings {
 
     /// Which corner of a triangle is this vertex? 2 if neither of the first two.
     pub(super) fn corner_of(&self, t: u32, v: u32) -> usize {
-        let triangle = &self.triangles[t as usize];
-        if triangle[0] == v {
-            0
-        } else if triangle[1] == v {
-            1
-        } else {
-            2
-        }
+        self.triangles[t as usize][..2].iter().position(|&w| w == v).unwrap_or(2)
+    }
+
+    /// The other two corners of a triangle, in order.
+    pub(super) fn opposite(&self, t: u32, v: u32) -> (u32, u32) {
+        let (triangle, k) = (self.triangles[t as usize], self.corner_of(t, v));
+        (triangle[(k + 1) % 3], triangle[(k + 2) % 3])
     }
 
     /// Leans and spreads of everything, from the positions as they are now.
-    pub(super) fn measure(&mut self) {
+    fn measure(&mut self) {
         self.spreads.fill(PlaneQuadric::default());
         for t in 0..self.triangles.len() {
             let triangle = self.triangles[t];
             if triangle[0] == NONE {
                 continue;
             }
-            let [a, b, c] = triangle.map(|v| self.positions[v as usize]);
-            let s = lean(a, b, c);
+            let s = lean(area_vector(self.corners(t as u32)));
             self.leans[t] = s;
             for v in triangle {
                 self.spreads[v as usize].add(s);
@@ -159,9 +161,8 @@ impl Rings {
             if self.flags[v as usize] & BORDER == 0 {
                 continue;
             }
-            let triangle = self.triangles[t as usize];
-            let k = self.corner_of(t, v);
-            for w in [triangle[(k + 1) % 3], triangle[(k + 2) % 3]] {
+            let (p, q) = self.opposite(t, v);
+            for w in [p, q] {
                 if self.flags[w as usize] & BORDER != 0 && self.shared(v, w) == 1 {
                     let edge = self.positions[w as usize] - at;
                     spread.add(BORDER_WEIGHT.sqrt() * s.normalize_or_zero().cross(edge));
@@ -172,7 +173,7 @@ impl Rings {
     }
 
     /// How many triangles hold both vertices.
-    pub(super) fn shared(&self, v: u32, w: u32) -> usize {
+    fn shared(&self, v: u32, w: u32) -> usize {
         self.ring(v).iter().filter(|&&t| self.triangles[t as usize].contains(&w)).count()
     }
 

@@ -242,7 +242,6 @@ fn random_surfaces_keep_their_topology_and_never_cross_themselves() {
             let config = SimplifyConfig {
                 triangles: (before.triangles.len() / share).max(4),
                 placement: if seed % 2 == 0 { VertexPlacement::Nearest } else { VertexPlacement::OnSurface },
-                rounds: 1 + (seed % 3) as usize,
                 ..SimplifyConfig::default()
             };
             let field = (seed % 4 < 3).then_some(&field as &Field);
@@ -385,7 +384,6 @@ fn a_mesh_that_is_none_and_a_bad_field_are_named_errors_and_change_nothing() {
     fails(&sound, Some(&short), &to(100), "and answered 1");
     fails(&sound, None, &to(0), "`mesh.triangles` is 0");
     fails(&sound, None, &SimplifyConfig { error: f32::NAN, ..to(9) }, "`mesh.error` is NaN");
-    fails(&sound, None, &SimplifyConfig { rounds: 0, ..to(9) }, "`mesh.rounds` is 0");
     fails(&sound, None, &SimplifyConfig { batch: 0, ..to(9) }, "`mesh.batch` is 0");
     // a field without numbers moves nothing, and the mesh stays sound
     let nothing = |p: &[Vec3]| -> Answer { (vec![f32::NAN; p.len()], vec![Vec3::NAN; p.len()]) };
