@@ -80,6 +80,18 @@ pub struct Closest {
 
 /// A tree of boxes over the triangles of a mesh.
 ///
+/// ```
+/// use glam::Vec3;
+/// use tiface::geom::{Bvh, Mesh, Ray};
+///
+/// let positions = vec![Vec3::ZERO, 2.0 * Vec3::X, 2.0 * Vec3::Y];
+/// let bvh = Bvh::new(&Mesh { positions, triangles: vec![[0, 1, 2]], ..Mesh::default() });
+/// let ray = Ray { origin: Vec3::new(0.5, 0.5, 3.0), direction: -Vec3::Z, t_min: 0.0, t_max: f32::INFINITY };
+/// let hit = bvh.closest_hit(&ray).unwrap();
+/// assert_eq!((hit.t, hit.u, hit.v), (3.0, 0.25, 0.25));
+/// assert_eq!(bvh.closest_point(-Vec3::X).unwrap().point, Vec3::ZERO);
+/// ```
+///
 /// Holds its own copy of the corners, so the mesh may go. Triangles with a corner that is not finite,
 /// or with an index out of range, are left out. Degenerate ones are never hit, but can be nearest.
 pub struct Bvh {

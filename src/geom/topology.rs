@@ -126,6 +126,17 @@ pub(crate) fn fans(triangles: &[[u32; 3]], sides: &[(u64, u32)]) -> Sets {
 }
 
 /// Analyses a mesh. Indices must lie below `positions.len()`.
+///
+/// ```
+/// use glam::Vec3;
+/// use tiface::geom::topology;
+///
+/// let corners = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
+/// let tetrahedron = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
+/// let found = topology(&corners, &tetrahedron);
+/// assert_eq!((found.closed, found.euler, found.genus), (true, 2, Some(0)));
+/// assert_eq!(topology(&corners, &tetrahedron[1..]).boundary_edges, 3);
+/// ```
 pub fn topology(positions: &[Vec3], triangles: &[[u32; 3]]) -> Topology {
     let mut out = Topology {
         triangles: triangles.len(),

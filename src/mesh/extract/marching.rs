@@ -10,6 +10,7 @@
 
 use super::marching_bits::{Bits, crossings, for_each_active};
 use super::marching_cell::{CASES, CellSurface, INNER, crossing, resolve};
+use crate::geom::Mesh;
 use crate::mesh::input::few_enough;
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
@@ -42,6 +43,13 @@ pub struct LevelSet {
     pub first_non_finite: Option<[usize; 3]>,
     /// Inside nodes on the outer faces that were taken as outside to close the surface.
     pub capped: usize,
+}
+
+impl LevelSet {
+    /// Returns the surface alone.
+    pub fn into_mesh(self) -> Mesh {
+        Mesh { positions: self.positions, triangles: self.triangles, ..Mesh::default() }
+    }
 }
 
 /// The zero level set of a volume.

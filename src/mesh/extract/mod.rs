@@ -170,6 +170,21 @@ impl MeshReport {
 /// The mesh is closed (capped where the field leaves the box), its vertices moved onto the field's zero,
 /// its normals the field's gradient. Handles with a loop no longer than `options.longest_handle` are gone.
 ///
+/// ```
+/// use glam::Vec3;
+/// use tiface::geom::Aabb;
+/// use tiface::mesh::{ExtractOptions, extract};
+///
+/// let sdf = |points: &[Vec3]| points.iter().map(|p| p.length() - 0.7).collect::<Vec<f32>>();
+/// let gradient = |points: &[Vec3]| (sdf(points), points.iter().map(|p| p.normalize_or_zero()).collect());
+/// let color = |points: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; points.len()];
+/// let options = ExtractOptions { resolution: 32, ..ExtractOptions::default() };
+/// let (mesh, report) = extract(sdf, gradient, color, Aabb::SCENE, None, &options, &tiface::Quiet)?;
+/// assert!(mesh.is_closed() && report.topology.genus == Some(0));
+/// assert!(mesh.positions.iter().all(|p| (p.length() - 0.7).abs() < 1e-3));
+/// # Ok::<(), tiface::Error>(())
+/// ```
+///
 /// # Errors
 ///
 /// A box or option out of range, a field without a surface, answers of the wrong length, a request to stop.
@@ -216,8 +231,7 @@ pub fn extract(
         verified,
         ..MeshReport::default()
     };
-    let mut mesh =
-        Mesh { positions: found.surface.positions, triangles: found.surface.triangles, ..Mesh::default() };
+    let mut mesh = found.surface.into_mesh();
     progress(&[("nodes", found.evaluated as f64), ("triangles", mesh.triangles.len() as f64)])?;
 
     report.clean = clean(&mut mesh, options.keep_share)?;

@@ -73,6 +73,26 @@ impl AtlasReport {
 
 /// Lays a mesh into a square texture. Meant for closed meshes of up to some 200,000 triangles; others work too.
 ///
+/// ```
+/// use glam::Vec3;
+/// use tiface::geom::Mesh;
+/// use tiface::mesh::{AtlasConfig, atlas};
+///
+/// let mesh = Mesh {
+///     positions: vec![Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z],
+///     normals: vec![Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z],
+///     triangles: vec![
+///         [0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5],
+///     ],
+///     ..Mesh::default()
+/// };
+/// let config = AtlasConfig { size_px: 128, gutter_px: 2, front: None };
+/// let (atlas, report) = atlas(&mesh, &config, &tiface::Quiet)?;
+/// assert_eq!(atlas.triangles.len(), 8);
+/// assert!(report.uv.is_sound() && report.uv.overlapping == 0);
+/// # Ok::<(), tiface::Error>(())
+/// ```
+///
 /// # Errors
 ///
 /// A configuration out of range; a mesh without triangles, with an index out of range or a vertex that is not

@@ -69,7 +69,11 @@ pub(super) fn pack(
             chart.outline().into_iter().map(|(a, b)| [at(a), at(b)]).collect()
         })
         .collect();
-    let mut order = by_size(&outlines);
+    // charts from the one with the largest box to the smallest
+    let size = |(low, high): (DVec2, DVec2)| (high - low).element_sum();
+    let sizes: Vec<f64> = outlines.iter().map(|o| size(bounds(o, DVec2::X))).collect();
+    let mut order: Vec<usize> = (0..charts.len()).collect();
+    order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
     let turns = (16_000 / charts.len()).clamp(4, TURNS) / 4 * 4;
     let cells = CELLS.min(room);
     let mut used = USED;
@@ -104,18 +108,6 @@ pub(super) fn pack(
         used *= 0.7;
     }
     Err(too_small())
-}
-
-/// Charts from the one with the largest box to the smallest.
-fn by_size(outlines: &[Vec<[DVec2; 2]>]) -> Vec<usize> {
-    let size = |outline: &[[DVec2; 2]]| {
-        let (low, high) = bounds(outline, DVec2::X);
-        (high - low).element_sum()
-    };
-    let sizes: Vec<f64> = outlines.iter().map(|o| size(o)).collect();
-    let mut order: Vec<usize> = (0..outlines.len()).collect();
-    order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
-    order
 }
 
 fn bounds(outline: &[[DVec2; 2]], turn: DVec2) -> (DVec2, DVec2) {

@@ -87,6 +87,32 @@ const BATCH: usize = 1 << 17;
 
 /// Bakes a texture for `mesh` with normals, laid out by `atlas`, from the field it was extracted from.
 ///
+/// ```
+/// use glam::{Mat3, Vec3};
+/// use tiface::geom::Mesh;
+/// use tiface::mesh::bake::{BakeConfig, Learned, bake};
+/// use tiface::mesh::{AtlasConfig, atlas};
+///
+/// let mesh = Mesh {
+///     positions: vec![Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z],
+///     normals: vec![Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z],
+///     triangles: vec![
+///         [0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5],
+///     ],
+///     ..Mesh::default()
+/// };
+/// let (atlas, _) = atlas(&mesh, &AtlasConfig { size_px: 64, gutter_px: 2, front: None }, &tiface::Quiet)?;
+/// // a ball that shows sRGB-coded 0.5 from everywhere
+/// let gradient = |points: &[Vec3]| points.iter().map(|p| (p.length() - 1.0, p.normalize_or_zero())).unzip();
+/// let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]| vec![[0.5; 3]; directions.len()];
+/// let learned = Learned { gradient: &gradient, colors: &colors };
+/// let config =
+///     BakeConfig { side: 2, gutter_px: 2, reach: 0.5, lobes: 0, normals: false, turned: Mat3::IDENTITY };
+/// let baked = bake(&mesh, &atlas, &learned, &[], &config, &tiface::Quiet)?;
+/// assert!(baked.color.data.iter().all(|v| (v - 0.2140).abs() < 1e-3)); // linear
+/// # Ok::<(), tiface::Error>(())
+/// ```
+///
 /// # Errors
 ///
 /// A side of no or too many samples, a request to stop.

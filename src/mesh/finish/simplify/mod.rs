@@ -151,6 +151,22 @@ const MANY: usize = 1000;
 /// Topology never changes; borders stay borders. Vertices of edges with more than two triangles, or of
 /// several fans, are not touched. The same bytes for any number of threads.
 ///
+/// ```
+/// use glam::Vec3;
+/// use tiface::mesh::{SimplifyConfig, Volume, marching, simplify};
+///
+/// // the distance to a ball at 32³ nodes
+/// let at = |i: usize| i as f32 - 15.5;
+/// let distance = |i: usize| Vec3::new(at(i % 32), at(i / 32 % 32), at(i / 1024)).length() - 12.0;
+/// let values: Vec<f32> = (0..32 * 32 * 32).map(distance).collect();
+/// let volume = Volume { dims: [32; 3], values: &values, origin: Vec3::ZERO, spacing: Vec3::ONE };
+/// let mut mesh = marching(&volume, true)?.into_mesh();
+/// let config = SimplifyConfig { triangles: 500, ..SimplifyConfig::default() };
+/// simplify(&mut mesh, None, &config, &tiface::Quiet)?;
+/// assert!(mesh.triangles.len() <= 500 && mesh.is_closed());
+/// # Ok::<(), tiface::Error>(())
+/// ```
+///
 /// # Errors
 ///
 /// A setting out of range, a mesh with a coordinate that is not finite or an index out of range, a field that answers
