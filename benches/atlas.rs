@@ -47,7 +47,7 @@ fn main() {
                 "{} triangles, {size_px}²{towards}: {best:.2} CPU s, of it {check:.2} the check",
                 uv.triangles
             );
-            println!("mended {}, fall-back {:?}", report.mended, report.fallback);
+            println!("repaired {}, fall-back {:?}", report.repaired, report.fallback);
             println!("seams facing +z      {:.2} × √area", seams_facing(&mesh, &atlas, Vec3::Z));
             println!("{uv}");
         }

@@ -41,7 +41,7 @@ const STACK: usize = 64;
 /// Four boxes and what is in them. An absent child has an inside-out box, which nothing meets.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
-struct Node {
+struct WideNode {
     /// `[low, high][axis]`, one lane a child.
     bounds: [[Vec4; 3]; 2],
     child: [u32; 4],
@@ -95,7 +95,7 @@ pub struct Closest {
 /// Holds its own copy of the corners, so the mesh may go. Triangles with a corner that is not finite,
 /// or with an index out of range, are left out. Degenerate ones are never hit, but can be nearest.
 pub struct Bvh {
-    nodes: Vec<Node>,
+    nodes: Vec<WideNode>,
     leaves: Vec<Leaf>,
     bounds: Aabb,
     /// Largest absolute coordinate.
@@ -333,8 +333,9 @@ impl Bvh {
     }
 }
 
-impl Node {
-    const EMPTY: Node = Node { bounds: [[Vec4::INFINITY; 3], [Vec4::NEG_INFINITY; 3]], child: [0; 4] };
+impl WideNode {
+    const EMPTY: WideNode =
+        WideNode { bounds: [[Vec4::INFINITY; 3], [Vec4::NEG_INFINITY; 3]], child: [0; 4] };
 }
 
 /// Pushes the children named in `hits` so that the nearest one is popped first.

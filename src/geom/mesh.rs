@@ -13,7 +13,7 @@ pub struct Mesh {
     pub positions: Vec<Vec3>,
     /// Unit vertex normals, pointing out.
     pub normals: Vec<Vec3>,
-    /// Vertex colours, sRGB-coded, 0..=1.
+    /// Vertex colors, sRGB-coded, 0..=1.
     pub colors: Vec<[f32; 3]>,
     /// Vertex indices, three a triangle.
     pub triangles: Vec<[u32; 3]>,

@@ -27,5 +27,5 @@ pub(crate) use overlap::{THOROUGH, overlaps, shared_area, turn};
 pub use ray::{Hit, Ray};
 pub use similarity::Similarity;
 pub(crate) use symmetric::cofactors;
-pub(crate) use topology::{Sets, fans, sorted_sides};
+pub(crate) use topology::{Sets, fans, side_ends, sorted_sides};
 pub use topology::{Topology, topology};

@@ -2,7 +2,8 @@
 //!
 //! Two triangles share area unless a side of one of them has the whole other one on its far side: the
 //! separating axes of convex polygons in the plane. Each decision is the sign of an orientation determinant
-//! of f32 coordinates, exact after Shewchuk (1997). So triangles that share a side or a corner, or merely touch, never count.
+//! of f32 coordinates, exact after Shewchuk (1997). So triangles that share a side or a corner, or merely touch, never
+//! count.
 
 use crate::geom::{Boxes, DBox, share_out};
 use glam::{DVec2, Vec2};

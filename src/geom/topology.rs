@@ -105,11 +105,17 @@ pub(crate) fn sorted_sides(triangles: &[[u32; 3]]) -> Vec<(u64, u32)> {
     sides
 }
 
+/// The vertices at which the side of a corner starts and ends.
+pub(crate) fn side_ends(triangles: &[[u32; 3]], corner: u32) -> (u32, u32) {
+    let (t, k) = (triangles[corner as usize / 3], corner as usize % 3);
+    (t[k], t[(k + 1) % 3])
+}
+
 /// For every corner, the set of corners reached from it around its vertex across edges with exactly two
 /// triangles. A vertex with one set has one fan.
 pub(crate) fn fans(triangles: &[[u32; 3]], sides: &[(u64, u32)]) -> Sets {
     let mut fans = Sets::new(3 * triangles.len());
-    let vertex = |c: u32| triangles[c as usize / 3][c as usize % 3];
+    let vertex = |c: u32| side_ends(triangles, c).0;
     let after = |c: u32| c / 3 * 3 + (c % 3 + 1) % 3;
     for run in sides.chunk_by(|a, b| a.0 == b.0) {
         if let [(_, a), (_, b)] = *run {
@@ -163,7 +169,7 @@ pub fn topology(positions: &[Vec3], triangles: &[[u32; 3]]) -> Topology {
     let sides = sorted_sides(triangles);
     for run in sides.chunk_by(|a, b| a.0 == b.0) {
         out.edges += 1;
-        let forward = |c: u32| triangles[c as usize / 3][c as usize % 3] == (run[0].0 >> 32) as u32;
+        let forward = |c: u32| side_ends(triangles, c).0 == (run[0].0 >> 32) as u32;
         match run {
             [_] => out.boundary_edges += 1,
             [a, b] => out.misoriented_edges += usize::from(forward(a.1) == forward(b.1)),

@@ -1,9 +1,10 @@
 //! Stage: a surface an artist can open. The zero level set of a signed distance becomes a closed mesh.
 //!
-//! [`marching`] meshes a dense grid, [`sparse`] asks a field only near its surface, [`clean`] keeps the
-//! head and drops the dust, `handles` makes it simple, [`extract`] is all of it, with normals and colours; [`Cap`] closes what the frames
-//! cut. [`simplify`], [`atlas`] and [`bake`] make of it what an artist opens; [`files`] its
-//! files.
+//! - `extract`: [`marching`] meshes a dense grid, [`sparse`] evaluates a field only near its surface, [`clean`] keeps the
+//!   head and drops the dust; [`extract`] is all of it, with normals and colors, and takes small handles away. [`Cap`]
+//!   closes what the frames cut.
+//! - `finish`: [`simplify`], [`atlas`] and [`bake`] make of it what an artist opens.
+//! - [`files`]: GLB, OBJ and PLY in and out, and whether a mesh is sound.
 
 mod extract;
 pub mod files;

@@ -1,6 +1,6 @@
 //! From the builder's binary tree to the wide one that rays walk.
 
-use super::{Bvh, GROWTH, LEAF, Leaf, Node};
+use super::{Bvh, GROWTH, LEAF, Leaf, WideNode};
 use crate::geom::{Aabb, Mesh};
 use glam::Vec4;
 use obvhs::bvh2::Bvh2;
@@ -35,7 +35,7 @@ impl Bvh {
         let grown = (GROWTH * self.reach).max(f32::MIN_POSITIVE);
         // Work: which of our nodes stands for which of theirs, and how deep it is.
         let mut work = vec![(0usize, 0usize, 1usize)];
-        self.nodes.push(Node::EMPTY);
+        self.nodes.push(WideNode::EMPTY);
         let mut depth = 1;
         while let Some((ours, theirs, level)) = work.pop() {
             depth = depth.max(level);
@@ -60,7 +60,7 @@ impl Bvh {
                     if tree.nodes[n].is_leaf() { members(n).collect() } else { Vec::new() };
                 self.nodes[ours].child[lane] = match triangles.len() {
                     0 => {
-                        self.nodes.push(Node::EMPTY);
+                        self.nodes.push(WideNode::EMPTY);
                         work.push((self.nodes.len() - 1, n, level + 1));
                         self.nodes.len() as u32 - 1
                     }
@@ -89,7 +89,7 @@ impl Bvh {
     /// More than four triangles in one of the builder's leaves: a chain of nodes, three leaves each.
     fn add_crowd(&mut self, mesh: &Mesh, triangles: &[u32], grown: f32) -> u32 {
         let ours = self.nodes.len();
-        self.nodes.push(Node::EMPTY);
+        self.nodes.push(WideNode::EMPTY);
         let (here, rest) = triangles.split_at(triangles.len().min(12));
         let mut parts: Vec<&[u32]> = here.chunks(4).collect();
         if !rest.is_empty() {

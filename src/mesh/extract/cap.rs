@@ -1,8 +1,8 @@
 //! The cap that closes a surface where the box ends: neck and shoulders that the frames cut.
 //!
 //! The closed field `max(f, d)`, with `d` the signed distance to the box, has the cap in its zero set: what
-//! holds vertices on a field, or moves samples onto it, then treats skin and cap alike. The learned colour within
-//! the body is no colour of anything, so the cap is painted from the skin around it: inverse-distance weights
+//! holds vertices on a field, or moves samples onto it, then treats skin and cap alike. The learned color within
+//! the body is no color of anything, so the cap is painted from the skin around it: inverse-distance weights
 //! (Shepard 1968) of the ring where it begins, which meets the skin without an edge.
 
 use crate::geom::{Aabb, Mesh};
@@ -12,7 +12,7 @@ use rayon::prelude::*;
 /// Skin vertices kept of a ring: enough for one every few millimetres.
 const RING: usize = 512;
 
-/// Where a surface is capped, and with which colours.
+/// Where a surface is capped, and with which colors.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cap {
     /// The box of the extraction.
@@ -72,7 +72,7 @@ impl Cap {
         (p - self.bounds.min).min_element() < self.near || (self.bounds.max - p).min_element() < self.near
     }
 
-    /// The colour of a point of the cap.
+    /// The color of a point of the cap.
     pub fn color(&self, p: Vec3) -> [f32; 3] {
         let (mut sum, mut total) = ([0f64; 3], 0f64);
         for Skin { position, color, .. } in &self.ring {
@@ -92,7 +92,7 @@ impl Cap {
         });
     }
 
-    /// Gives the ring other colours, made from its points and their normals.
+    /// Gives the ring other colors, made from its points and their normals.
     pub fn shade(&mut self, colors: impl FnOnce(&[Vec3], &[Vec3]) -> Vec<[f32; 3]>) {
         let (points, normals): (Vec<Vec3>, Vec<Vec3>) =
             self.ring.iter().map(|s| (s.position, s.normal)).unzip();
@@ -100,7 +100,7 @@ impl Cap {
         self.ring.iter_mut().zip(colors).for_each(|(skin, color)| skin.color = color);
     }
 
-    /// Gives those of the points that lie on the cap its colour instead.
+    /// Gives those of the points that lie on the cap its color instead.
     pub fn recolor(&self, points: &[Vec3], colors: &mut [[f32; 3]]) {
         for (p, color) in points.iter().zip(colors).filter(|(p, _)| self.holds(**p)) {
             *color = self.color(*p);
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cap_takes_the_colours_of_the_skin_around_it() {
+    fn the_cap_takes_the_colors_of_the_skin_around_it() {
         let (mesh, cap) = column();
         let on: Vec<usize> = (0..mesh.positions.len()).filter(|&i| cap.holds(mesh.positions[i])).collect();
         assert!(on.len() > 100);
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ring_of_another_colour_colours_the_cap_and_nothing_else() {
+    fn a_ring_of_another_color_colors_the_cap_and_nothing_else() {
         let (_, mut cap) = column();
         cap.shade(|points, normals| {
             assert!(normals.iter().all(|n| (n.length() - 1.0).abs() < 1e-3 && n.y.abs() < 0.1));

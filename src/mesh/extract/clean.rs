@@ -41,7 +41,7 @@ pub struct CleanReport {
     pub turned: bool,
 }
 
-/// Cleans a mesh in place; normals and colours, if any, follow their vertices.
+/// Cleans a mesh in place; normals and colors, if any, follow their vertices.
 ///
 /// Keeps the piece of largest volume and, besides it, pieces of at least `keep_share` of its volume
 /// (1 keeps only the largest) unless they lie within a kept one. Inner shells, of negative volume, always

@@ -11,7 +11,7 @@
 //!
 //! The words have 64 bits: two classes are taken for one by an accident of 1 in 10¹⁹, and then a handle stays.
 
-use crate::geom::{Sets, sorted_sides};
+use crate::geom::{Sets, side_ends, sorted_sides};
 use crate::kernel::rng::mix;
 use crate::{Monitor, Result};
 use glam::Vec3;
@@ -57,7 +57,7 @@ impl<'a> LoopFinder<'a> {
     /// `None` for a surface that is not closed or wound inconsistently; every vertex must have one fan.
     pub(super) fn new(positions: &'a [Vec3], triangles: &'a [[u32; 3]]) -> Option<LoopFinder<'a>> {
         let mut twin = vec![NONE; 3 * triangles.len()];
-        let start = |c: u32| triangles[c as usize / 3][c as usize % 3];
+        let start = |c: u32| side_ends(triangles, c).0;
         for run in sorted_sides(triangles).chunk_by(|a, b| a.0 == b.0) {
             let [(_, a), (_, b)] = *run else { return None };
             if start(a) == start(b) {
@@ -76,11 +76,11 @@ impl<'a> LoopFinder<'a> {
     }
 
     fn start(&self, side: u32) -> u32 {
-        self.triangles[side as usize / 3][side as usize % 3]
+        side_ends(self.triangles, side).0
     }
 
     pub(super) fn end(&self, side: u32) -> u32 {
-        self.triangles[side as usize / 3][(side as usize % 3 + 1) % 3]
+        side_ends(self.triangles, side).1
     }
 
     /// The sides that start at a vertex, counter-clockwise from a given one.

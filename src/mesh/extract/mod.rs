@@ -1,4 +1,4 @@
-//! The stage: from a signed distance to a closed mesh with normals and colours.
+//! The stage: from a signed distance to a closed mesh with normals and colors.
 
 mod cap;
 mod clean;
@@ -357,11 +357,11 @@ mod tests {
     }
 
     #[test]
-    fn a_sphere_comes_out_round_coloured_and_closed() {
+    fn a_sphere_comes_out_round_colored_and_closed() {
         let (mesh, report) = mesh_of(|p| p.length() - 0.7, &coarse()).unwrap();
         assert!(report.topology.is_solid());
         assert_eq!((report.topology.euler, report.topology.pieces), (2, 1));
-        // On the surface to a thousandth of a cell; normals and colours radial.
+        // On the surface to a thousandth of a cell; normals and colors radial.
         for (i, p) in mesh.positions.iter().enumerate() {
             assert!((p.length() - 0.7).abs() < 1e-3 * report.cell_size);
             assert!(mesh.normals[i].distance(p.normalize()) < 1e-3);

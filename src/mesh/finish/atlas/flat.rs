@@ -1,6 +1,6 @@
 //! Charts: triangles laid flat, before they have a place in the texture.
 
-use crate::geom::{Mesh, Sets};
+use crate::geom::{Mesh, Sets, side_ends, sorted_sides};
 use glam::DVec2;
 use std::collections::HashMap;
 
@@ -50,33 +50,19 @@ impl Flat {
 
     /// Sides that border on no other triangle of the chart.
     pub fn outline(&self) -> Vec<(u32, u32)> {
-        let mut sides: Vec<(u32, u32, bool)> = Vec::with_capacity(3 * self.corners.len());
-        for t in &self.corners {
-            for k in 0..3 {
-                let (a, b) = (t[k], t[(k + 1) % 3]);
-                sides.push((a.min(b), a.max(b), a < b));
-            }
-        }
-        sides.sort_unstable();
-        let runs = sides.chunk_by(|p, q| (p.0, p.1) == (q.0, q.1)).filter(|run| run.len() == 1);
-        runs.map(|run| if run[0].2 { (run[0].0, run[0].1) } else { (run[0].1, run[0].0) }).collect()
+        let sides = sorted_sides(&self.corners);
+        let alone = sides.chunk_by(|a, b| a.0 == b.0).filter(|run| run.len() == 1);
+        alone.map(|run| side_ends(&self.corners, run[0].1)).collect()
     }
 
     /// The parts that hang together across sides, without the triangles that are not to be `kept`. Parts that
     /// meet in a corner only no longer share it.
     pub fn parts(&self, kept: impl Fn(usize) -> bool) -> Vec<Flat> {
-        let mut sides: Vec<(u32, u32, u32)> = Vec::with_capacity(3 * self.corners.len());
-        for (k, t) in self.corners.iter().enumerate().filter(|&(k, _)| kept(k)) {
-            for e in 0..3 {
-                let (a, b) = (t[e], t[(e + 1) % 3]);
-                sides.push((a.min(b), a.max(b), k as u32));
-            }
-        }
-        sides.sort_unstable();
         let mut sets = Sets::new(self.corners.len());
-        for pair in sides.windows(2) {
-            if (pair[0].0, pair[0].1) == (pair[1].0, pair[1].1) {
-                sets.join(pair[0].2, pair[1].2);
+        for run in sorted_sides(&self.corners).chunk_by(|a, b| a.0 == b.0) {
+            let mut members = run.iter().map(|side| side.1 / 3).filter(|&k| kept(k as usize));
+            if let Some(first) = members.next() {
+                members.for_each(|k| sets.join(first, k));
             }
         }
         let mut parts: Vec<Flat> = Vec::new();

@@ -40,7 +40,7 @@ pub struct AtlasReport {
     /// Why every triangle became a half square of its own; none when charts were possible.
     pub fallback: Option<String>,
     /// Triangles that would have been flipped, overlapping or without area, and got a small chart of their own.
-    pub mended: usize,
+    pub repaired: usize,
     /// Half the distance that charts keep, in texels: as configured, less only for the fall-back.
     pub gutter_px: f64,
     /// Length of the seams that look along `front` within 45 degrees, over √area.
@@ -61,10 +61,10 @@ impl AtlasReport {
                 "every triangle has a piece of the texture of its own, {gutter:.1} texels of gutter: {reason}"
             ));
         }
-        if self.mended > 0 {
+        if self.repaired > 0 {
             out.push(format!(
                 "{} triangles could not stay in their chart and got one of their own",
-                self.mended
+                self.repaired
             ));
         }
         out
@@ -140,7 +140,7 @@ fn atlas_by(
         monitor.step(STEPS, STEPS, &[("charts", uv.charts as f64), ("used", uv.used)]);
         let report = AtlasReport {
             fallback,
-            mended: repaired,
+            repaired: repaired,
             gutter_px,
             seams_facing: config.front.map(|front| seams_facing(mesh, &atlas, front)),
             uv,

@@ -4,7 +4,7 @@
 //! A chart is a way to number the corners of triangles: coordinates that fold nowhere on the smooth copy fold
 //! nowhere on the surface. The copy has no creases and pores, divides along short lines, and lies flat in large pieces.
 
-use crate::geom::{Mesh, sorted_sides};
+use crate::geom::{Mesh, side_ends, sorted_sides};
 use glam::Vec3;
 
 /// The same triangles after `rounds` of smoothing; a border is smoothed along itself.
@@ -12,9 +12,7 @@ pub(super) fn smoothed(mesh: &Mesh, rounds: usize) -> Mesh {
     let (mut inner, mut rim) = (Vec::new(), Vec::new());
     let mut on_rim = vec![false; mesh.positions.len()];
     for run in sorted_sides(&mesh.triangles).chunk_by(|a, b| a.0 == b.0) {
-        let side = run[0].1 as usize;
-        let t = mesh.triangles[side / 3];
-        let ends = (t[side % 3], t[(side + 1) % 3]);
+        let ends = side_ends(&mesh.triangles, run[0].1);
         if run.len() == 2 {
             inner.push(ends);
         } else {

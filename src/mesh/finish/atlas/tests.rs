@@ -70,7 +70,7 @@ fn a_closed_sphere_is_laid_in_few_charts_with_little_stretch() {
     let mesh = sphere(40, 80);
     assert!(mesh.is_closed());
     let (_, r) = laid(&mesh, &config(512));
-    assert!(r.fallback.is_none() && r.mended == 0, "{r:?}");
+    assert!(r.fallback.is_none() && r.repaired == 0, "{r:?}");
     assert!((2..=12).contains(&r.uv.charts), "{}", r.uv);
     assert!(r.uv.area_stretch < 1.03 && r.uv.angle_stretch_p99 < 1.05 && r.uv.used > 0.5, "{}", r.uv);
     assert_eq!(r.gutter_px, 4.0);
@@ -113,12 +113,12 @@ fn needles_get_a_place_of_their_own_where_they_are_too_thin() {
     });
     let (_, r) = laid(&mesh, &config(512));
     assert!(r.fallback.is_none(), "{r:?}");
-    assert_eq!(r.mended, 40);
+    assert_eq!(r.repaired, 40);
     assert!(r.warnings()[0].contains("40 triangles"));
     // Long and thin, but not without width.
     let needles = sheet(1, 200, [false, false], |u, v| Vec3::new(u, 0.002 * v * 200.0, 0.0));
     let (_, r) = laid(&needles, &config(512));
-    assert!(r.fallback.is_none() && r.mended == 0, "{r:?}");
+    assert!(r.fallback.is_none() && r.repaired == 0, "{r:?}");
 }
 
 #[test]
@@ -150,7 +150,7 @@ fn triangles_without_area_do_not_spoil_a_mesh() {
     mesh.triangles.extend([[0, 0, 1], [3, 4, 3], [7, 7, 7]]);
     let (_, r) = laid(&mesh, &config(512));
     // a triangle as thin as the pole's may go with them
-    assert!((3..=8).contains(&r.mended) && r.fallback.is_none(), "{r:?}");
+    assert!((3..=8).contains(&r.repaired) && r.fallback.is_none(), "{r:?}");
     // and alone
     mesh.triangles = vec![[0, 0, 1], [7, 7, 7]];
     let (_, r) = laid(&mesh, &config(64));

@@ -124,7 +124,7 @@ fn cover(
                 let at = corners[0] + u * (corners[1] - corners[0]) + v * (corners[2] - corners[0]);
                 let off = (at - center).abs().max_element();
                 // the nearest point by distance may lie just outside a touched texel: half a texel of grace
-                // would colour texels that nothing touches, so only those within the square count
+                // would color texels that nothing touches, so only those within the square count
                 if off <= 0.5 {
                     touching.push((off, Sample { texel, triangle: t, u, v }));
                 }

@@ -2,7 +2,7 @@
 //!
 //! Filtering and mip maps read beyond a chart's border. The nearest `gutter` texels repeat the chart's own
 //! (nearest covered texel), all else is filled by pull and push over a pyramid (Gortler et al. 1996), so that
-//! every mip level of every chart sees its own colours. ([`super::Seams`] then moves the texels next to a seam a little.)
+//! every mip level of every chart sees its own colors. ([`super::Seams`] then moves the texels next to a seam a little.)
 
 use crate::image::Image;
 
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn mip_levels_of_a_chart_keep_its_colour() {
+    fn mip_levels_of_a_chart_keep_its_color() {
         let (mut image, covered) = charts();
         fill(&mut image, &covered, 8);
         // level 3: a texel is the mean of 8 × 8; columns 16..24 hold the red chart's border and its gutter

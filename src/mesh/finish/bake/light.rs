@@ -1,4 +1,4 @@
-//! What colour a point of the surface has: where exactly it lies, which cameras see it, what they see.
+//! What color a point of the surface has: where exactly it lies, which cameras see it, what they see.
 
 use super::lobes;
 use crate::geom::{Bvh, Camera, Mesh, Ray};
@@ -6,15 +6,15 @@ use crate::image::{linear_from_srgb, srgb_from_linear};
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Cosine of the steepest angle at which a camera still tells the colour of a point: 75 degrees.
+/// Cosine of the steepest angle at which a camera still tells the color of a point: 75 degrees.
 const STEEPEST: f32 = 0.258_819;
 
 /// The learned field in the mesh's coordinates.
 pub struct Learned<'a> {
     /// Signed distance and its gradient. `[n, 3]` → `[n]`, `[n, 3]`.
     pub gradient: &'a (dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync),
-    /// sRGB-coded colours of points `[n, 3]` with unit normals `[n, 3]`, point `i` seen along `counts[i]` unit
-    /// directions away from the camera, all in one list: one colour a direction.
+    /// sRGB-coded colors of points `[n, 3]` with unit normals `[n, 3]`, point `i` seen along `counts[i]` unit
+    /// directions away from the camera, all in one list: one color a direction.
     pub colors: &'a (dyn Fn(&[Vec3], &[Vec3], &[u32], &[Vec3]) -> Vec<[f32; 3]> + Sync),
 }
 
@@ -92,7 +92,7 @@ impl Visibility<'_> {
     /// Angles are those to the mesh's own normals and lines of sight start from the mesh (`flat`): the field's
     /// normals are rough, and a camera must not come and go from texel to texel. A point that no camera sees is
     /// looked at from where the cameras stand that face it most: those are directions that the field has
-    /// learned colours for, unlike the one straight at it.
+    /// learned colors for, unlike the one straight at it.
     /// Without any camera, each point is looked at straight.
     pub fn directions(&self, points: &SurfacePoints, flat: &SurfacePoints) -> ViewDirections {
         let n = points.positions.len();
@@ -161,9 +161,9 @@ fn in_frame(camera: &Camera, p: Vec3) -> bool {
     camera.project(p).is_some_and(|(at, _)| (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y))
 }
 
-/// Colours of points: what the cameras that see them see on average, and how it changes between them.
+/// Colors of points: what the cameras that see them see on average, and how it changes between them.
 pub struct Shades {
-    /// `[n]` linear colour.
+    /// `[n]` linear color.
     pub linear: Vec<[f32; 3]>,
     /// `[n, functions]` lobes; empty without.
     pub lobes: Vec<[f32; 3]>,
@@ -215,7 +215,7 @@ pub fn shade(
     Shades { linear, lobes: fitted, seen: seen.known }
 }
 
-/// sRGB-coded colours of points of a mesh with their normals, as its texture would have them: the mean over the
+/// sRGB-coded colors of points of a mesh with their normals, as its texture would have them: the mean over the
 /// cameras that see them. `reach` as in [`super::BakeConfig`].
 pub fn seen_colors(
     mesh: &Mesh,
@@ -285,7 +285,7 @@ mod tests {
         let learned = Learned { gradient: &sphere_gradient, colors: &colors };
         let [first] = seen_colors(&hiding, &[at(0.5, Vec3::Z).0], &[Vec3::Z], &learned, &cameras, 2e-3)[..]
         else {
-            panic!("one colour a point")
+            panic!("one color a point")
         };
         assert!((first[1] - 4.0 / 16.25f32.sqrt()).abs() < 1e-3 && first[2] > 0.999, "{first:?}");
         let seen = eyes.directions(&points, &points);
@@ -297,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_are_averaged_in_linear_light_by_weight() {
+    fn colors_are_averaged_in_linear_light_by_weight() {
         // coded 0 and 1 with equal weights: linear 0.5, coded 0.735
         let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], d: &[Vec3]| {
             d.iter().map(|d| [f32::from(d.x < 0.0), 0.5, 0.0]).collect::<Vec<_>>()

@@ -1,6 +1,6 @@
-//! View-dependent colour in a few numbers a texel: real spherical harmonics of the direction to the viewer.
+//! View-dependent color in a few numbers a texel: real spherical harmonics of the direction to the viewer.
 //!
-//! A texel's colour seen from direction `d` is `base + Σ_k L_k Y_k(d)`, sRGB-coded, with `Y` up to degree 1 (4
+//! A texel's color seen from direction `d` is `base + Σ_k L_k Y_k(d)`, sRGB-coded, with `Y` up to degree 1 (4
 //! functions) or 2 (9) in the order and signs of [`sh16`]; [`crate::kernel::sphharm::combine`] sums them. `base` is what an ordinary viewer shows. The
 //! coefficients minimise, over the cameras that see the point,
 //!
@@ -17,7 +17,7 @@ use glam::Vec3;
 /// Most functions: degree 2.
 pub const MOST: usize = 9;
 
-/// Weight of the ridge term: colours of a light stage change by a few percent of their range over a quarter of a
+/// Weight of the ridge term: colors of a light stage change by a few percent of their range over a quarter of a
 /// turn, their noise is about as large.
 const RIDGE: f64 = 0.02;
 
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn a_colour_that_is_linear_in_the_direction_comes_back() {
+    fn a_color_that_is_linear_in_the_direction_comes_back() {
         let d = directions(200);
         let truth = |d: &Vec3| [0.5 + 0.1 * d.x, 0.4 - 0.05 * d.y, 0.3 + 0.02 * d.z];
         let colors: Vec<_> = d.iter().map(truth).collect();

@@ -1,13 +1,13 @@
-//! Learned colour becomes texels.
+//! Learned color becomes texels.
 //!
 //! Every texel that a chart covers is looked at through several samples (`cover`); each sample moves onto the
 //! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
 //! they see in linear light (`light`). What the cameras see differently can be kept as a few lobes a texel
 //! ([`lobes`]), and the field's normal as a picture of normals
-//! ([`tangent_space`]). Gaps are filled by `fill`; colour and lobes are then made to agree along seams by [`Seams`].
+//! ([`tangent_space`]). Gaps are filled by `fill`; color and lobes are then made to agree along seams by [`Seams`].
 //!
 //! The picture is baked in bands of rows, so that samples never lie in memory together: twelve bytes a texel for
-//! colour, normals and each lobe are what it takes.
+//! color, normals and each lobe are what it takes.
 
 mod cover;
 mod detail;
@@ -50,7 +50,7 @@ pub struct BakeConfig {
 /// A baked texture; every picture has the atlas's size.
 #[derive(Clone, Debug)]
 pub struct Baked {
-    /// Linear colour, 3 channels.
+    /// Linear color, 3 channels.
     pub color: Image,
     /// Lobes of [`lobes`], 3 channels each, sRGB-coded differences; one picture a function.
     pub lobes: Vec<Image>,
@@ -290,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn every_texel_has_the_colour_of_its_point_on_the_true_surface() {
+    fn every_texel_has_the_color_of_its_point_on_the_true_surface() {
         let (mesh, atlas) = sphere(128, 64);
         let paint = |p: Vec3| (0.5 + 0.8 * p).to_array();
         let colors = |p: &[Vec3], _: &[Vec3], counts: &[u32], _: &[Vec3]| -> Vec<[f32; 3]> {

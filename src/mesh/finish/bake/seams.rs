@@ -1,4 +1,4 @@
-//! Both sides of a seam show the same colour.
+//! Both sides of a seam show the same color.
 //!
 //! Charts sample the surface with different grids of texels, so their bilinear pictures differ along a common edge
 //! by what lies between texels: little on skin, much across the hard edge of a painted brow. [`Seams::even`] moves the
@@ -12,7 +12,7 @@ use glam::Vec2;
 use std::collections::HashMap;
 
 /// What a texel's change costs beside a difference along one texel of a seam: little enough that what is left of a
-/// step is below the rounding to bytes, enough that a texel which hardly matters to a seam keeps its colour.
+/// step is below the rounding to bytes, enough that a texel which hardly matters to a seam keeps its color.
 const STIFFNESS: f64 = 0.02;
 
 /// Points along each texel of a seam at which its sides are held together: each texel is looked at.
@@ -63,7 +63,7 @@ impl Seams {
         Seams { edges, width: atlas.width, height: atlas.height }
     }
 
-    /// Mean difference of the colours that both sides show at the same points of the surface, bilinear, in
+    /// Mean difference of the colors that both sides show at the same points of the surface, bilinear, in
     /// 255ths of the coded range, over points and channels; 0 where there is no seam.
     ///
     /// `color` has the atlas's size.

@@ -140,7 +140,7 @@ const ATTEMPTS: usize = 4;
 /// With more crossings than this, finding the vertices near them costs more than looking everywhere.
 const MANY: usize = 1000;
 
-/// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colours
+/// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colors
 /// follow their vertices. A mesh that has no more triangles than asked stays as it is.
 ///
 /// `field` answers values (negative inside) and gradients, at most `config.batch` points a call, from one

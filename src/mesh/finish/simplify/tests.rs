@@ -335,7 +335,7 @@ fn an_error_is_kept_with_and_without_a_field() {
 }
 
 #[test]
-fn colours_follow_their_place() {
+fn colors_follow_their_place() {
     let mut mesh = mesh_of(ball, 24);
     mesh.colors = mesh.positions.iter().map(|p| (0.5 * *p + 0.5).to_array()).collect();
     mesh.normals = mesh.positions.iter().map(|p| p.normalize()).collect();
