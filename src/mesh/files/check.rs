@@ -96,43 +96,37 @@ impl CheckReport {
     /// [`ErrorKind::Usage`](crate::ErrorKind::Usage).
     pub fn require(&self, bars: &[&str]) -> Result<()> {
         for &bar in bars {
-            let missed = match bar {
-                "watertight" => (!self.closed).then(|| {
+            let (reached, found) = match bar {
+                "watertight" => (
+                    self.closed,
                     format!(
                         "{} open edges, {} wound alike, {} in more than two triangles, {} invalid triangles",
                         self.boundary_edges, self.flipped_edges, self.nonmanifold_edges, self.invalid
-                    )
-                }),
-                "manifold" => (!self.manifold).then(|| {
+                    ),
+                ),
+                "manifold" => (
+                    self.manifold,
                     format!(
                         "{} edges in more than two triangles, {} vertices with several fans",
                         self.nonmanifold_edges, self.nonmanifold_vertices
-                    )
-                }),
-                "one-piece" => (self.pieces != 1).then(|| format!("{} pieces", self.pieces)),
+                    ),
+                ),
+                "one-piece" => (self.pieces == 1, format!("{} pieces", self.pieces)),
                 "no-self-intersections" => {
                     let (found, left) = (self.self_intersections, self.self_intersections_left);
-                    (found + left > 0).then(|| {
-                        let (least, left) = bound("at least ", left, "triangles");
-                        format!("{least}{found} triangles intersect others{left}")
-                    })
+                    let (least, rest) = bound("at least ", left, "triangles");
+                    (found + left == 0, format!("{least}{found} triangles intersect others{rest}"))
                 }
                 "sound-uv" => match &self.uv {
-                    None => Some("no texture coordinates".into()),
-                    Some(uv) => (!uv.is_sound()).then(|| {
-                        let (least, left) = bound("at least ", uv.overlaps_left, "triangles");
-                        format!(
-                            "{least}{} triangles overlap{left}, {} flipped, {} without area, {} outside, {} invalid",
-                            uv.overlapping, uv.flipped, uv.zero_area, uv.outside, uv.invalid
-                        )
-                    }),
+                    None => (false, "no texture coordinates".into()),
+                    Some(uv) => (uv.is_sound(), uv.faults()),
                 },
                 _ => {
                     let hint = format!("known are {}", BARS.join(", "));
                     return Err(Error::usage(format!("there is no requirement `{bar}`"), hint));
                 }
             };
-            if let Some(found) = missed {
+            if !reached {
                 let hint = "`tiface check` without `--require` prints the whole report";
                 return Err(Error::below(format!("not {bar}: {found}"), hint));
             }
@@ -143,43 +137,20 @@ impl CheckReport {
 
 impl fmt::Display for CheckReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let CheckReport {
+            vertices, welded_vertices, triangles, invalid, boundary_edges, flipped_edges, ..
+        } = self;
+        let CheckReport {
+            nonmanifold_edges, nonmanifold_vertices, pieces, euler, slivers, degenerate, ..
+        } = self;
+        let CheckReport { self_intersections, volume_l, bad_normals, size_m: [x, y, z], .. } = self;
         let yes = |b: bool| if b { "yes" } else { "NO" };
-        let mut row = |name: &str, value: String| writeln!(f, "{name:<20} {value}");
-        row("vertices", format!("{} ({} after welding)", self.vertices, self.welded_vertices))?;
-        row("triangles", self.triangles.to_string())?;
-        row(
-            "watertight",
-            format!(
-                "{} ({} open edges, {} wound alike)",
-                yes(self.closed),
-                self.boundary_edges,
-                self.flipped_edges
-            ),
-        )?;
-        row(
-            "manifold",
-            format!(
-                "{} ({} edges, {} vertices)",
-                yes(self.manifold),
-                self.nonmanifold_edges,
-                self.nonmanifold_vertices
-            ),
-        )?;
+        let [watertight, manifold, normals] = [self.closed, self.manifold, self.has_normals].map(yes);
         let genus = self.genus.map_or("undefined".into(), |g| g.to_string());
-        row("pieces", format!("{} (Euler {}, genus {genus})", self.pieces, self.euler))?;
         let (least, left) = bound("at least ", self.self_intersections_left, "triangles");
-        row("self-intersecting", format!("{least}{} triangles{left}", self.self_intersections))?;
-        row(
-            "slivers",
-            format!("{} triangles, {} without area, {} invalid", self.slivers, self.degenerate, self.invalid),
-        )?;
-        let [x, y, z] = self.size_m;
-        row("size", format!("{x:.4} × {y:.4} × {z:.4} m"))?;
         let (low, high) = (DVec3::from(self.min), DVec3::from(self.max));
         // a millionth of its size
         let digits = (6.0 - (high - low).max_element().log10()).ceil().clamp(0.0, 45.0) as usize;
-        row("box", format!("{low:.digits$} to {high:.digits$}"))?;
-        row("volume", format!("{:.4} litres", self.volume_l))?;
         let colors = match (self.has_texture, self.has_colors) {
             (Some(true), true) => "yes, a texture and at the vertices",
             (Some(true), false) => "yes, a texture",
@@ -187,8 +158,23 @@ impl fmt::Display for CheckReport {
             (Some(false), false) => "NO",
             (None, false) => "NO, not at the vertices",
         };
-        row("colours", colors.into())?;
-        row("normals", format!("{} ({} not of unit length)", yes(self.has_normals), self.bad_normals))
+        write!(
+            f,
+            "\
+vertices             {vertices} ({welded_vertices} after welding)
+triangles            {triangles}
+watertight           {watertight} ({boundary_edges} open edges, {flipped_edges} wound alike)
+manifold             {manifold} ({nonmanifold_edges} edges, {nonmanifold_vertices} vertices)
+pieces               {pieces} (Euler {euler}, genus {genus})
+self-intersecting    {least}{self_intersections} triangles{left}
+slivers              {slivers} triangles, {degenerate} without area, {invalid} invalid
+size                 {x:.4} × {y:.4} × {z:.4} m
+box                  {low:.digits$} to {high:.digits$}
+volume               {volume_l:.4} litres
+colours              {colors}
+normals              {normals} ({bad_normals} not of unit length)
+"
+        )
     }
 }
 

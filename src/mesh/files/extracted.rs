@@ -4,7 +4,7 @@ use super::stored::{StoredTensors, floats, format, geometry};
 use crate::Result;
 use crate::geom::{Aabb, Mesh};
 use crate::io;
-use crate::mesh::{Cap, Skin};
+use crate::mesh::extract::{Cap, Skin};
 use std::path::Path;
 
 const FILE: &str = "surface.safetensors";

@@ -22,7 +22,7 @@
 //! ```
 
 use super::file_mesh::{ExportOptions, FileMesh, encode};
-use super::glb_document::{Document, info};
+use super::glb_document::{GlbDocument, info};
 use super::texture::{HeadTexture, Lobes};
 use crate::Result;
 use crate::geom::Mesh;
@@ -64,7 +64,7 @@ use std::collections::BTreeMap;
 pub fn to_glb(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOptions) -> Result<Vec<u8>> {
     let file = FileMesh::new(mesh, texture, &options.file_from_mesh()?)?;
     let mut file = file.split(texture.is_some_and(|t| t.normal.is_some()));
-    let mut document = Document::default();
+    let mut document = GlbDocument::default();
     let mut main = material(options, options.name.clone());
     let mut lobes = Vec::new();
     if let Some(texture) = texture {
@@ -97,7 +97,7 @@ fn lobe_name(k: usize) -> String {
 
 /// One material for each lobe, offered by the primitive as variants.
 fn variants(
-    document: &mut Document,
+    document: &mut GlbDocument,
     lobes: &[Index<json::Texture>],
     options: &ExportOptions,
 ) -> mesh::KhrMaterialsVariants {
@@ -150,7 +150,7 @@ fn material(options: &ExportOptions, name: String) -> Material {
 
 /// Puts the mesh under its material and packs the file.
 fn finish(
-    mut document: Document,
+    mut document: GlbDocument,
     file: &FileMesh,
     material: Index<Material>,
     variants: Option<mesh::KhrMaterialsVariants>,
@@ -195,7 +195,7 @@ fn finish(
 
 type Attributes = BTreeMap<json::validation::Checked<Semantic>, Index<json::Accessor>>;
 
-fn attributes(document: &mut Document, file: &FileMesh) -> Attributes {
+fn attributes(document: &mut GlbDocument, file: &FileMesh) -> Attributes {
     let mut attributes = BTreeMap::from([(Valid(Semantic::Positions), document.positions(&file.positions))]);
     if !file.normals.is_empty() {
         attributes.insert(Valid(Semantic::Normals), document.floats(&file.normals));

@@ -17,7 +17,7 @@ use gltf::json::{Accessor, Image, Index, Root, Texture, Value};
 const SHORT_INDICES: usize = 65_535;
 
 #[derive(Default)]
-pub(super) struct Document {
+pub(super) struct GlbDocument {
     pub root: Root,
     pub bin: Vec<u8>,
     /// A node, and where it stands in f64: gltf-json's own translations are f32, and print as numbers that read
@@ -25,7 +25,7 @@ pub(super) struct Document {
     pub far: Option<(Index<gltf::json::Node>, DVec3)>,
 }
 
-impl Document {
+impl GlbDocument {
     /// A view of bytes at a multiple of four.
     fn view(&mut self, bytes: &[u8], target: Option<Target>) -> Index<gltf::json::buffer::View> {
         let view = self.root.push(gltf::json::buffer::View {
@@ -134,7 +134,7 @@ impl Document {
             extensions: None,
             extras: Default::default(),
         });
-        let Document { root, bin, far } = self;
+        let GlbDocument { root, bin, far } = self;
         let json = match far {
             None => root.to_vec(),
             Some((node, at)) => serde_json::to_value(&root).and_then(|mut json| {

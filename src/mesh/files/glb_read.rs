@@ -33,19 +33,19 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     if let Some(extension) = root.extensions_required.iter().find(|e| !is_harmless(e)) {
         return Err(source.unsupported("`extensionsRequired`", format!("`{extension}`")));
     }
-    let document = Document { root: &root, bin: glb.bin.as_deref().unwrap_or_default(), source };
+    let reader = GlbReader { root: &root, bin: glb.bin.as_deref().unwrap_or_default(), source };
     let mut gathered = Primitives::default();
     if root.nodes.is_empty() {
         for mesh in 0..root.meshes.len() as u32 {
-            document.add(Index::new(mesh), DMat4::IDENTITY, &mut gathered)?;
+            reader.add(Index::new(mesh), DMat4::IDENTITY, &mut gathered)?;
         }
     }
     let mut seen = vec![false; root.nodes.len()];
     let mut stack: Vec<(Index<Node>, DMat4)> =
-        document.roots()?.into_iter().rev().map(|n| (n, DMat4::IDENTITY)).collect();
+        reader.roots()?.into_iter().rev().map(|n| (n, DMat4::IDENTITY)).collect();
     while let Some((index, parent)) = stack.pop() {
         let at = || format!("node {index}");
-        let node: &Node = document.get("node", index)?;
+        let node: &Node = reader.get("node", index)?;
         if std::mem::replace(&mut seen[index.value()], true) {
             return Err(source.broken(at(), "is reached twice: nodes must form a tree"));
         }
@@ -54,11 +54,11 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
             return Err(source.broken(at(), "its transform is not finite"));
         }
         if let Some(mesh) = node.mesh {
-            document.add(mesh, matrix, &mut gathered)?;
+            reader.add(mesh, matrix, &mut gathered)?;
         }
         stack.extend(node.children.iter().flatten().rev().map(|&c| (c, matrix)));
     }
-    document.finish(gathered)
+    reader.finish(gathered)
 }
 
 /// The JSON chunk and the binary one.
@@ -112,13 +112,13 @@ struct Primitives {
     textures: BTreeSet<Option<u32>>,
 }
 
-struct Document<'a> {
+struct GlbReader<'a> {
     root: &'a Root,
     bin: &'a [u8],
     source: Source<'a>,
 }
 
-impl<'a> Document<'a> {
+impl<'a> GlbReader<'a> {
     /// What an index names.
     fn get<T>(&self, what: &str, index: Index<T>) -> Result<&'a T>
     where

@@ -82,33 +82,43 @@ impl UvReport {
         self.overlaps_left == 0
             && self.invalid + self.overlapping + self.flipped + self.zero_area + self.outside == 0
     }
+
+    /// What stands in the way of being sound, for a person.
+    pub(super) fn faults(&self) -> String {
+        let UvReport { overlapping, flipped, zero_area, outside, invalid, .. } = self;
+        let (least, left) = bound("at least ", self.overlaps_left, "triangles");
+        format!(
+            "{least}{overlapping} triangles overlap{left}, {flipped} flipped, {zero_area} without area, \
+             {outside} outside, {invalid} invalid"
+        )
+    }
 }
 
 impl fmt::Display for UvReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut row = |name: &str, value: String| writeln!(f, "{name:<20} {value}");
-        row("charts", format!("{} ({} mirrored)", self.charts, self.mirrored_charts))?;
-        row("seams", format!("{:.2} × √area", self.seam_length))?;
-        row("stretch", format!("{:.4}", self.stretch))?;
-        let [m, a, b] = [self.area_stretch, self.area_stretch_median, self.area_stretch_p99];
-        row("area stretch", format!("mean {m:.4}, median {a:.4}, 99 % below {b:.4}"))?;
-        let [a, b] = [self.angle_stretch_median, self.angle_stretch_p99];
-        row("angle stretch", format!("median {a:.4}, 99 % below {b:.4}"))?;
-        row("used", format!("{:.1} %", 100.0 * self.used))?;
-        let (least, left) = bound("at least ", self.overlaps_left, "triangles");
-        let (n, px) = (self.overlapping, self.overlap_px);
-        row("overlapping", format!("{least}{n} triangles, {px:.3} texels{left}"))?;
-        row(
-            "broken",
-            format!(
-                "{} flipped, {} without area, {} outside, {} invalid",
-                self.flipped, self.zero_area, self.outside, self.invalid
-            ),
-        )?;
+        let UvReport { charts, mirrored_charts, seam_length, stretch, overlapping, overlap_px, .. } = self;
+        let UvReport { flipped, zero_area, outside, invalid, border_distance_px: border, .. } = self;
+        let UvReport { area_stretch, area_stretch_median, area_stretch_p99, .. } = self;
+        let UvReport { angle_stretch_median, angle_stretch_p99, .. } = self;
+        let used = 100.0 * self.used;
+        let (least, rest) = bound("at least ", self.overlaps_left, "triangles");
         let (most, left) = bound("at most ", self.chart_distance_left, "sides of charts");
         let apart =
             self.chart_distance_px.map_or("one chart".into(), |d| format!("{most}{d:.2} texels{left}"));
-        row("apart", format!("{apart}, from the border {:.2} texels", self.border_distance_px))
+        write!(
+            f,
+            "\
+charts               {charts} ({mirrored_charts} mirrored)
+seams                {seam_length:.2} × √area
+stretch              {stretch:.4}
+area stretch         mean {area_stretch:.4}, median {area_stretch_median:.4}, 99 % below {area_stretch_p99:.4}
+angle stretch        median {angle_stretch_median:.4}, 99 % below {angle_stretch_p99:.4}
+used                 {used:.1} %
+overlapping          {least}{overlapping} triangles, {overlap_px:.3} texels{rest}
+broken               {flipped} flipped, {zero_area} without area, {outside} outside, {invalid} invalid
+apart                {apart}, from the border {border:.2} texels
+"
+        )
     }
 }
 
