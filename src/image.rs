@@ -1,7 +1,7 @@
 //! Pictures in memory: 8-bit photographs and float renders.
 //!
-//! The fields learn and render **sRGB-coded** colour, as the published system does, so a render
-//! here is coded too and meets linear light only at the edge (EXR, glTF vertex colours, filtering).
+//! The fields learn and render **sRGB-coded** color, as the published system does, so a render
+//! here is coded too and meets linear light only at the edge (EXR, glTF vertex colors, filtering).
 
 /// sRGB-coded from linear (IEC 61966-2-1), any value clamped to 0..=1.
 pub fn srgb_from_linear(c: f32) -> f32 {
@@ -22,9 +22,9 @@ pub struct Photo {
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// `[height · width]` colours.
+    /// `[height · width]` colors.
     pub rgb: Vec<[u8; 3]>,
-    /// `[height · width]` alpha of an RGBA file (straight: colour not multiplied); `None` without.
+    /// `[height · width]` alpha of an RGBA file (straight: color not multiplied); `None` without.
     pub alpha: Option<Vec<u8>>,
 }
 
@@ -41,7 +41,7 @@ pub struct Gray {
 
 /// A float picture with `channels` interleaved values a pixel, row-major, top row first.
 ///
-/// Renders are RGBA: sRGB-coded colour over black (premultiplied), alpha = opacity. Depth has one
+/// Renders are RGBA: sRGB-coded color over black (premultiplied), alpha = opacity. Depth has one
 /// channel, normals three.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {

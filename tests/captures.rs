@@ -7,7 +7,7 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use tiface::capture::inspect::inspect;
 use tiface::capture::scene::{self, Scene, SceneOptions};
-use tiface::capture::{self, Capture, CaptureOptions, MaskChoice, MaskMeaning, Split, ViewMask};
+use tiface::capture::{self, Capture, CaptureOptions, MaskMeaning, MaskSource, Split, ViewMask};
 use tiface::geom::Camera;
 use tiface::image::Gray;
 use tiface::io::Limits;
@@ -127,9 +127,13 @@ fn a_downscaled_view_has_the_camera_of_its_pixels() {
 fn masks_can_be_left_out_named_or_mean_not_looked_at() {
     let Some(root) = folder("nefertiti") else { return };
     let with = |o: CaptureOptions| capture::open(&root, &o).unwrap();
-    let none = with(CaptureOptions { masks: MaskChoice::None, ..Default::default() });
+    let none = with(CaptureOptions { masks: MaskSource::None, ..Default::default() });
     assert!(none.views.iter().all(|v| v.mask == ViewMask::None));
-    let named = with(CaptureOptions { masks: MaskChoice::Folder("face_masks".into()), ..Default::default() });
+    let named = with(CaptureOptions {
+        masks: MaskSource::Folder,
+        mask_dir: "face_masks".into(),
+        ..Default::default()
+    });
     assert!(matches!(&named.views[3].mask, ViewMask::File(p) if p.ends_with("face_masks/003.png")));
     let ignore = with(CaptureOptions { mask_meaning: MaskMeaning::Ignore, ..Default::default() });
     let loaded = ignore.views[0].load(&Limits::default()).unwrap();
@@ -146,7 +150,7 @@ fn inspecting_a_sound_capture_finds_it_sound() {
             let found = inspect(&root, &options);
             assert!(!found.is_sound() && found.problems.len() == 1, "{:?}", found.problems);
             assert!(found.problems[0].hint.contains("--page"), "{:?}", found.problems);
-            options.masks = MaskChoice::None; // as asked
+            options.masks = MaskSource::None; // as asked
         }
         let found = inspect(&root, &options);
         eprintln!("{found}");

@@ -6,7 +6,7 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tiface::capture::inspect::inspect;
-use tiface::capture::{self, CaptureOptions, MaskChoice, MaskMeaning, Split, ViewMask};
+use tiface::capture::{self, CaptureOptions, MaskMeaning, MaskSource, Split, ViewMask};
 use tiface::io::{self, Limits, NpyValues, ReadError, TensorValues};
 
 /// The channel of depth.
@@ -1073,11 +1073,11 @@ fn photographs_without_masks_do_not_pass_inspection() {
         "{warnings:?}"
     );
     // told to go on without, or what is not masked is looked at as it is
-    assert_eq!(problem(&masked(&[]), &CaptureOptions { masks: MaskChoice::None, ..default.clone() }), None);
+    assert_eq!(problem(&masked(&[]), &CaptureOptions { masks: MaskSource::None, ..default.clone() }), None);
     let ignore = CaptureOptions { mask_meaning: MaskMeaning::Ignore, ..default.clone() };
     assert_eq!(problem(&masked(&[1]), &ignore), None);
     // a folder that was named, and holds none
-    let named = CaptureOptions { masks: MaskChoice::Folder("mattes".into()), ..default };
+    let named = CaptureOptions { masks: MaskSource::Folder, mask_dir: "mattes".into(), ..default };
     assert!(problem(&masked(&[1, 2, 3, 4]), &named).is_some());
     // clicks that lie there are the shortest way
     let dir = masked(&[]);

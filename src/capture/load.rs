@@ -1,7 +1,7 @@
 //! One view's pixels: photograph and masks at the camera's size.
 //!
 //! Downscaling by `d` averages `d × d` blocks and drops the last columns and rows that fill no block,
-//! so that every intrinsic is divided by exactly `d`. Colour is averaged in linear light, as a sensor
+//! so that every intrinsic is divided by exactly `d`. Color is averaged in linear light, as a sensor
 //! with larger pixels would, weighted by alpha where there is one.
 
 use super::error::wrong_size;
@@ -188,7 +188,7 @@ fn average_photo(photo: &Photo, d: u32) -> Photo {
                     plain[k] += c;
                 }
             }
-            // where nothing is opaque the colour cannot be seen; its plain mean keeps edges clean
+            // where nothing is opaque the color cannot be seen; its plain mean keeps edges clean
             let mean = |k: usize| if weight > 0 { sum[k] / weight as f32 } else { plain[k] / n };
             rgb.push([0, 1, 2].map(|k| quantise(srgb_from_linear(mean(k)))));
             if let Some(alpha) = &mut alpha {
@@ -204,7 +204,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_block_of_black_and_white_becomes_the_grey_of_half_the_light() {
+    fn a_block_of_black_and_white_becomes_the_gray_of_half_the_light() {
         // linear mean of 0, 1, 0, 1 is 0.5; sRGB of 0.5 is 0.7354 → 188
         let rgb = vec![[0; 3], [255; 3], [0; 3], [255; 3]];
         let half = average_photo(&Photo { width: 2, height: 2, rgb, alpha: None }, 2);

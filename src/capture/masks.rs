@@ -2,8 +2,8 @@
 
 use super::frame::{CameraFrame, Listing};
 use super::names::CaptureFolder;
-use super::view::{Capture, CaptureOptions, MaskChoice, Split, View, ViewMask};
-use crate::config::MaskMeaning;
+use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
+use crate::config::{MaskMeaning, MaskSource};
 use crate::image::Gray;
 use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
@@ -39,19 +39,20 @@ pub(super) fn choose(
         let sources = kept.iter().map(|(_, info)| source(info)).collect();
         Ok(("the alpha channel of the photographs".into(), sources))
     };
-    let candidates = match &folder.options.masks {
-        MaskChoice::None => Vec::new(),
-        MaskChoice::Alpha => vec![alpha(listing)?],
-        MaskChoice::Folder(name) => {
-            let inside = folder.relative("mask folder", name)?;
+    let CaptureOptions { masks, mask_dir, .. } = folder.options;
+    let candidates = match masks {
+        MaskSource::None | MaskSource::Clicks => Vec::new(),
+        MaskSource::Alpha => vec![alpha(listing)?],
+        _ if *masks == MaskSource::Folder || !mask_dir.is_empty() => {
+            let inside = folder.relative("mask folder", mask_dir)?;
             let names = |v: &View| {
                 let stem = &v.name;
                 [format!("{stem}.png"), full_name(v) + ".png", format!("{stem}.jpg"), format!("{stem}.jpeg")]
                     .into()
             };
-            vec![(format!("`{name}/`"), files(&[&inside], &names)?)]
+            vec![(format!("`{mask_dir}/`"), files(&[&inside], &names)?)]
         }
-        MaskChoice::Auto => {
+        _ => {
             let named = kept.iter().map(|(f, _)| f.mask.clone().into()).collect();
             let in_folder = |text: &str, name: &dyn Fn(&View) -> String| -> Result<_> {
                 Ok((format!("`{text}`"), files(&beside, &|v| vec![name(v)])?))
@@ -82,15 +83,15 @@ pub(super) fn choose(
                 listing.warnings.push(text);
             }
         }
-        None => match &folder.options.masks {
-            MaskChoice::None => listing.reasons.push("masks are not used, as asked".into()),
-            MaskChoice::Auto => listing.reasons.push("no masks are beside the photographs".into()),
-            MaskChoice::Alpha => {
+        None => match masks {
+            MaskSource::None | MaskSource::Clicks => {
+                listing.reasons.push("masks are not used, as asked".into())
+            }
+            MaskSource::Alpha => {
                 listing.warnings.push("no photograph has a mask in its alpha channel".into())
             }
-            MaskChoice::Folder(name) => {
-                listing.warnings.push(format!("the mask folder `{name}` holds no mask for any view"));
-            }
+            _ if mask_dir.is_empty() => listing.reasons.push("no masks are beside the photographs".into()),
+            _ => listing.warnings.push(format!("the mask folder `{mask_dir}` holds no mask for any view")),
         },
     }
 
@@ -115,10 +116,10 @@ pub(super) fn choose(
 }
 
 /// Are the head masks there that `options` ask for? Without, everything the cameras see would be learned as the head:
-/// whoever wants that says so with [`MaskChoice::None`]. Held-out views need none, and of the others at least half must
+/// whoever wants that says so with [`MaskSource::None`]. Held-out views need none, and of the others at least half must
 /// have one.
 pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> {
-    if options.masks == MaskChoice::None {
+    if matches!(options.masks, MaskSource::None | MaskSource::Clicks) {
         return Ok(());
     }
     let train: Vec<&View> = capture.split(Split::Train).collect();

@@ -37,9 +37,9 @@ mod transforms;
 mod view;
 mod well_seen;
 
-pub use crate::config::MaskMeaning;
+pub use crate::config::{MaskMeaning, MaskSource};
 pub use gather::{has_cameras, open};
 pub use load::LoadedView;
 pub use masks::{coverage, findings, require_masks};
-pub use view::{Capture, CaptureOptions, MaskChoice, Split, View, ViewMask};
+pub use view::{Capture, CaptureOptions, Split, View, ViewMask};
 pub use well_seen::well_seen;

@@ -99,6 +99,19 @@ impl Default for SceneOptions {
 ///
 /// `masks[i]` belongs to `cameras[i]`; a view without one does not carve. Masks may have another size than
 /// their camera. Empty and all-white masks are left out with a warning.
+///
+/// ```
+/// use tiface::capture::scene::{self, SceneOptions};
+/// use tiface::capture::synthetic::{SyntheticHead, SyntheticOptions, cameras};
+///
+/// // without masks: where the cameras look
+/// let cameras: Vec<_> = cameras(&SyntheticOptions::default()).into_iter().map(|(camera, _)| camera).collect();
+/// let (scene, warnings) = scene::fit(&cameras, &vec![None; cameras.len()], &SceneOptions::default())?;
+/// assert!(warnings.is_empty() && scene.hull.is_none());
+/// let (found, head) = (scene::world_box(&scene), SyntheticHead.bounds());
+/// assert!(found.contains(head.min) && found.contains(head.max));
+/// # Ok::<(), tiface::Error>(())
+/// ```
 pub fn fit(
     cameras: &[Camera],
     masks: &[Option<Gray>],

@@ -1,4 +1,4 @@
-//! The demo capture: an analytic head photographed on a small light stage, with exact truth.
+//! The demo capture: an analytic head photographed among the lamps of a small light stage, with exact truth.
 //!
 //! Written in the layout of a real capture (`images/`, `masks/`, `transforms.json`), so that the
 //! whole line runs on it unchanged; and its surface is a formula ([`SyntheticHead`]), so that what
@@ -11,7 +11,7 @@ mod noise;
 mod photograph;
 mod shape;
 
-pub use shape::{Material, SyntheticHead};
+pub use shape::SyntheticHead;
 
 use crate::geom::{Camera, Distortion};
 use crate::{Error, Result, io};
@@ -161,19 +161,11 @@ fn transforms(cameras: &[(Camera, bool)], split: Option<bool>) -> Value {
 }
 
 fn readme(options: &SyntheticOptions) -> String {
-    let SyntheticOptions { width, height, train, test, seed } = options;
-    format!(
-        "# A synthetic head\n\n\
-        {train} training and {test} held-out views, {width} × {height} pixels, 8-bit sRGB, seed {seed}. Made by\n\
-        `tiface demo`: no person was photographed, and the surface is a formula.\n\n\
-        - `images/NNN.png`: photographs in front of a dark stage with visible lamps; diffuse light, shadows,\n  \
-        shine that moves with the camera, a little grain.\n\
-        - `masks/NNN.png`: share of each pixel covered by the bust, 0..255, soft at the outline and in loose hair.\n\
-        - `face_masks/NNN.png`: 255 where mostly head (face, ears, hair), without neck and garment.\n\
-        - `transforms.json` (all views with their split), `transforms_train.json`, `transforms_test.json`.\n\n\
-        World: right-handed, metres, +Z up, the face looks along −Y; chin to crown 0.25 m. `transform_matrix` is\n\
-        camera-to-world with OpenGL axes (the camera looks along −Z). Pixel centres lie at +0.5.\n"
-    )
+    let &SyntheticOptions { width, height, train, test, seed } = options;
+    let text = include_str!("synthetic/README.md");
+    let values = [("{width}", width as u64), ("{height}", height.into()), ("{train}", train as u64)];
+    let values = values.into_iter().chain([("{test}", test as u64), ("{seed}", seed)]);
+    values.fold(text.to_string(), |text, (key, value)| text.replace(key, &value.to_string()))
 }
 
 #[cfg(test)]
@@ -208,7 +200,7 @@ mod tests {
             let most = near.map(|i| a.mask.values[i]).max().unwrap();
             assert!(most > 0, "{p} lands on an empty pixel {pixel}");
         }
-        // the border is stage, the middle is head
+        // the border is background, the middle is head
         assert_eq!(a.mask.values[0], 0);
         assert_eq!(a.mask.values[40 * 64 + 32], 255);
         // both kinds of soft values occur: the outline is not a staircase

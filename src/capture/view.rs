@@ -1,6 +1,6 @@
 //! A capture and its views, as they are used from here on.
 
-use crate::config::MaskMeaning;
+use crate::config::{MaskMeaning, MaskSource};
 use crate::geom::Camera;
 use crate::io::Limits;
 use glam::Vec3;
@@ -37,27 +37,15 @@ impl From<Option<PathBuf>> for ViewMask {
     }
 }
 
-/// Which masks to look for.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub enum MaskChoice {
-    /// The first that is there: alpha, `mask_path`, `vit_mask/`, `masks/NAME.png`, `masks/NAME.jpg.png`.
-    #[default]
-    Auto,
-    /// Only the photographs' alpha.
-    Alpha,
-    /// Only this folder, relative to the capture.
-    Folder(String),
-    /// None, even if there are some.
-    None,
-}
-
 /// How to open a capture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureOptions {
     /// Whole factor by which photographs are averaged down, at least 1.
     pub downscale: u32,
-    /// Which masks to use.
-    pub masks: MaskChoice,
+    /// Which masks to use: those that are there, unless told otherwise; none with [`MaskSource::Clicks`].
+    pub masks: MaskSource,
+    /// The only folder of masks, relative to the capture; empty to look beside the photographs.
+    pub mask_dir: String,
     /// What they mean.
     pub mask_meaning: MaskMeaning,
     /// Metres per dataset unit.
@@ -70,7 +58,8 @@ impl Default for CaptureOptions {
     fn default() -> CaptureOptions {
         CaptureOptions {
             downscale: 1,
-            masks: MaskChoice::Auto,
+            masks: MaskSource::Auto,
+            mask_dir: String::new(),
             mask_meaning: MaskMeaning::Empty,
             unit_m: 1.0,
             limits: Limits::default(),

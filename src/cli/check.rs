@@ -155,8 +155,8 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     let empty = |e: &Path| Error::cannot(format!("`{}` has no surface to measure", e.display()), "");
     let bvh = Bvh::new(&truth);
     let mm = |d| Millimetres::new(d, unit_m);
-    let whole = one_way(mesh, &bvh, POINTS, |_| true).ok_or_else(|| empty(other))?;
-    let back = one_way(&truth, &Bvh::new(mesh), POINTS, |_| true).ok_or_else(|| empty(other))?;
+    let whole = one_way(mesh, &bvh, POINTS).ok_or_else(|| empty(other))?;
+    let back = one_way(&truth, &Bvh::new(mesh), POINTS).ok_or_else(|| empty(other))?;
     let seen = match seen_by {
         None => None,
         Some(root) => {

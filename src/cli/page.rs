@@ -27,7 +27,7 @@ pub(super) fn run(session: &Session, path: Option<&Path>, prompts: Option<&Path>
         known => Path::new(known),
     };
     // photographs are clicked on whether or not they have masks
-    let options = capture::CaptureOptions { masks: capture::MaskChoice::None, ..capture_options(&config) };
+    let options = capture::CaptureOptions { masks: capture::MaskSource::None, ..capture_options(&config) };
     let capture = capture::open(root, &options)?;
     // the capture's own clicks are a help: what is wrong with them does not keep anybody from clicking
     let own = capture.root.join("prompts.json");

@@ -110,6 +110,25 @@ impl Camera {
 
     /// Picture position and distance along the viewing axis of a world point; `None` behind the
     /// camera.
+    ///
+    /// ```
+    /// use glam::{DMat3, DVec3, Vec2, Vec3};
+    /// use tiface::geom::{Camera, Distortion};
+    ///
+    /// // two units before the origin, looking along -Z
+    /// let (rotation, position) = (DMat3::IDENTITY, DVec3::new(0.0, 0.0, 2.0));
+    /// let (fx, fy, cx, cy) = (100.0, 100.0, 40.0, 30.0);
+    /// let distortion = Distortion::default();
+    /// let camera = Camera { width: 80, height: 60, fx, fy, cx, cy, distortion, rotation, position };
+    ///
+    /// let (pixel, depth) = camera.project(Vec3::new(0.5, 0.25, 0.0)).unwrap();
+    /// assert_eq!((pixel, depth), (Vec2::new(65.0, 17.5), 2.0)); // y points down in pictures
+    /// assert_eq!(camera.project(Vec3::new(0.0, 0.0, 3.0)), None);
+    /// // the ray through that pixel meets the point again
+    /// let ray = camera.ray(pixel).unwrap();
+    /// let t = 2.0 / -ray.direction.z;
+    /// assert!((ray.origin + t * ray.direction).distance(Vec3::new(0.5, 0.25, 0.0)) < 1e-6);
+    /// ```
     pub fn project(&self, point: Vec3) -> Option<(Vec2, f32)> {
         let p = self.rotation.transpose() * (point.as_dvec3() - self.position);
         if p.z >= -1e-9 {

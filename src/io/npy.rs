@@ -41,6 +41,25 @@ pub fn read_npy(path: &Path, limits: &Limits) -> Result<Npy, ReadError> {
 }
 
 /// [`read_npy`] on bytes; `path` is only for messages.
+///
+/// ```
+/// use tiface::io::{Limits, NpyValues, parse_npy};
+///
+/// let header = "{'descr': '<f4', 'fortran_order': False, 'shape': (2, 1), }";
+/// let mut file = b"\x93NUMPY\x01\x00".to_vec();
+/// file.extend((header.len() as u16).to_le_bytes());
+/// file.extend(header.as_bytes());
+/// file.extend([0.5f32, -2.0].map(f32::to_le_bytes).as_flattened());
+///
+/// let array = parse_npy("a.npy".as_ref(), &file, &Limits::default())?;
+/// assert_eq!(array.shape, [2, 1]);
+/// assert_eq!(array.values, NpyValues::Number(vec![0.5, -2.0]));
+///
+/// file.pop(); // cut short
+/// let error = parse_npy("a.npy".as_ref(), &file, &Limits::default()).unwrap_err();
+/// assert!(error.to_string().contains("shape [2, 1] of `<f4` needs 8 bytes, 7 follow"));
+/// # Ok::<(), tiface::io::ReadError>(())
+/// ```
 pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, ReadError> {
     let bad = |offset: usize, problem: String| ReadError::damaged(path, "npy", Some(offset as u64), problem);
     if !bytes.starts_with(MAGIC) {

@@ -2,7 +2,7 @@
 //!
 //! The content decides the format. Sizes are checked before anything is decoded, and the frame of the
 //! file (PNG chunks, JPEG segments) is walked to its end first: decoders forgive a missing tail and
-//! fill it with grey, which would then be learned as a face. One damage passes: a baseline JPEG whose scan was
+//! fill it with gray, which would then be learned as a face. One damage passes: a baseline JPEG whose scan was
 //! cut and closed again with a proper end marker, since only decoding each code could tell.
 
 use super::error::ReadError;
@@ -47,228 +47,221 @@ fn is_turned(exif: u8, stored: (u32, u32), expected: Option<(u32, u32)>) -> bool
     (5..=8).contains(&exif) && expected == Some(turned) && stored != turned
 }
 
-fn is_png(path: &Path, bytes: &[u8]) -> Result<bool, ReadError> {
-    let other = match bytes {
-        [0x89, b'P', b'N', b'G', 0x0D, 0x0A, 0x1A, 0x0A, ..] => return Ok(true),
-        [0xFF, 0xD8, 0xFF, ..] => return Ok(false),
-        [b'G', b'I', b'F', b'8', ..] => "a GIF picture",
-        [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P', ..] => "a WebP picture",
-        [b'I', b'I', 42, 0, ..] | [b'M', b'M', 0, 42, ..] => "a TIFF or camera raw picture",
-        [_, _, _, _, b'f', b't', b'y', b'p', ..] => "a HEIF or AVIF picture or a film",
-        [0x76, 0x2F, 0x31, 0x01, ..] => "an OpenEXR picture",
-        [b'B', b'M', ..] => "a BMP picture",
-        _ => {
-            let problem = "its first bytes are those of neither";
-            return Err(ReadError::damaged(path, "PNG or JPEG", Some(0), problem));
-        }
-    };
-    Err(ReadError::unsupported(path, other, "convert it to PNG or JPEG"))
-}
-
 /// The size, alpha and orientation of a PNG or JPEG file, from its header only.
 pub fn picture_info(path: &Path, limits: &Limits) -> Result<PictureInfo, ReadError> {
     let (file, length) = open(path)?;
     if length == 0 {
         return Err(ReadError::Empty { path: path.into() });
     }
-    // a header with EXIF, colour profile and thumbnail stays below this; else the whole file is read
+    // a header with EXIF, color profile and thumbnail stays below this; else the whole file is read
     let mut head = Vec::new();
     file.take(1 << 18).read_to_end(&mut head).map_err(|e| ReadError::io(path, e))?;
-    match header(path, &head, limits) {
-        Err(_) if (head.len() as u64) < length => header(path, &read_bytes(path, limits)?, limits),
+    match parse_picture_info(&head, path, limits) {
+        Err(_) if (head.len() as u64) < length => {
+            parse_picture_info(&read_bytes(path, limits)?, path, limits)
+        }
         other => other,
     }
 }
 
-fn header(path: &Path, bytes: &[u8], limits: &Limits) -> Result<PictureInfo, ReadError> {
-    if is_png(path, bytes)? {
-        png_decoder(path, bytes, limits).map(|(_, info)| info)
-    } else {
-        jpeg_decoder(path, bytes, limits).map(|(_, info)| info)
-    }
+/// [`picture_info`] of a picture that lies inside another file. `path` is for messages only.
+pub fn parse_picture_info(bytes: &[u8], path: &Path, limits: &Limits) -> Result<PictureInfo, ReadError> {
+    let file = PictureFile { path, bytes, limits };
+    if file.is_png()? { Ok(file.png_decoder()?.1) } else { Ok(file.jpeg_decoder()?.1) }
 }
 
-fn png(path: &Path, problem: impl ToString) -> ReadError {
-    ReadError::damaged(path, "PNG", None, problem.to_string())
-}
-
-fn jpeg(path: &Path, problem: impl Into<String>) -> ReadError {
-    ReadError::damaged(path, "JPEG", None, problem)
-}
-
-fn check_size(path: &Path, width: u32, height: u32, bytes_px: u64, limits: &Limits) -> Result<(), ReadError> {
-    limits.check_side(path, width.max(height).into())?;
-    limits.check_decoded(path, (width as u64 * height as u64).saturating_mul(bytes_px))
+/// The bytes of a picture that is being read.
+#[derive(Clone, Copy)]
+struct PictureFile<'a> {
+    path: &'a Path,
+    bytes: &'a [u8],
+    limits: &'a Limits,
 }
 
 type Png<'a> = PngDecoder<Cursor<&'a [u8]>>;
-
-fn png_decoder<'a>(
-    path: &Path,
-    bytes: &'a [u8],
-    limits: &Limits,
-) -> Result<(Png<'a>, PictureInfo), ReadError> {
-    let be = |at: usize| bytes.get(at..at + 4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
-    // width and height of IHDR, which must come first: checked before the decoder reserves a row
-    if let (Some(width), Some(height)) = (be(16), be(20)) {
-        check_size(path, width, height, 8, limits)?;
-    }
-    let mut allowed = image::Limits::no_limits();
-    allowed.max_image_width = Some(limits.side_px);
-    allowed.max_image_height = Some(limits.side_px);
-    allowed.max_alloc = Some(limits.decoded_bytes);
-    let mut decoder = PngDecoder::with_limits(Cursor::new(bytes), allowed).map_err(|e| png(path, e))?;
-    let (width, height) = decoder.dimensions();
-    let exif = decoder.orientation().map_or(1, Orientation::to_exif);
-    let alpha = decoder.color_type().has_alpha();
-    Ok((decoder, PictureInfo { width, height, alpha, exif }))
-}
-
 type Jpeg<'a> = zune_jpeg::JpegDecoder<ZCursor<&'a [u8]>>;
 
-fn jpeg_decoder<'a>(
-    path: &Path,
-    bytes: &'a [u8],
-    limits: &Limits,
-) -> Result<(Jpeg<'a>, PictureInfo), ReadError> {
-    // strict: a photograph with damaged data is an error, not a picture with grey blocks
-    let options = DecoderOptions::default()
-        .set_strict_mode(true)
-        .set_max_width(usize::from(u16::MAX))
-        .set_max_height(usize::from(u16::MAX));
-    let mut decoder = Jpeg::new_with_options(ZCursor::new(bytes), options);
-    decoder.decode_headers().map_err(|e| jpeg(path, format!("{e:?}")))?;
-    let (Some((width, height)), Some(space)) = (decoder.dimensions(), decoder.input_colorspace()) else {
-        return Err(jpeg(path, "it has no frame header"));
-    };
-    check_size(path, width as u32, height as u32, 3, limits)?;
-    let out = match space {
-        ColorSpace::Luma => ColorSpace::Luma,
-        ColorSpace::RGB | ColorSpace::YCbCr => ColorSpace::RGB,
-        other => {
-            let hint = "export the photograph in sRGB; print colors (CMYK) have no single meaning here";
-            return Err(ReadError::unsupported(path, format!("a JPEG in {other:?} colors"), hint));
-        }
-    };
-    decoder.set_options(options.jpeg_set_out_colorspace(out));
-    let exif =
-        decoder.exif().and_then(|chunk| Orientation::from_exif_chunk(chunk)).map_or(1, Orientation::to_exif);
-    let info = PictureInfo { width: width as u32, height: height as u32, alpha: false, exif };
-    Ok((decoder, info))
-}
-
-/// Walks the chunks of a PNG to `IEND` and returns the bytes of picture data.
-fn walk_png(path: &Path, bytes: &[u8]) -> Result<u64, ReadError> {
-    let bad = |at: usize, problem: &str| ReadError::damaged(path, "PNG", Some(at as u64), problem);
-    let (mut at, mut data) = (8, 0u64);
-    loop {
-        let Some(head) = bytes.get(at..at + 8) else {
-            return Err(bad(bytes.len(), "it ends before its last chunk (`IEND`)"));
-        };
-        let length = u32::from_be_bytes([head[0], head[1], head[2], head[3]]) as usize;
-        if bytes.len() - at - 8 < length.saturating_add(4) {
-            return Err(bad(at, "a chunk reaches beyond the end of the file"));
-        }
-        match &head[4..] {
-            b"IDAT" => data += length as u64,
-            b"IEND" => return Ok(data),
-            _ => {}
-        }
-        at += 12 + length;
+impl<'a> PictureFile<'a> {
+    fn png(self, at: impl Into<Option<u64>>, problem: impl ToString) -> ReadError {
+        ReadError::damaged(self.path, "PNG", at, problem.to_string())
     }
-}
 
-/// Walks the segments of a JPEG to the end-of-image marker and returns the most pixels its picture data can hold: a
-/// block of 64 takes a bit at least, and without progression a second one for its end.
-fn walk_jpeg(path: &Path, bytes: &[u8]) -> Result<u64, ReadError> {
-    let bad = |at: usize, problem: &str| ReadError::damaged(path, "JPEG", Some(at as u64), problem);
-    let mut at = 2;
-    let (mut scanned, mut data, mut progressive) = (false, 0, false);
-    loop {
-        // between segments and inside a scan: forward to the next 0xFF that begins a marker
-        let Some(step) = bytes[at.min(bytes.len())..]
-            .windows(2)
-            .position(|w| w[0] == 0xFF && !matches!(w[1], 0x00 | 0xFF | 0xD0..=0xD7))
-        else {
-            return Err(bad(bytes.len(), "it ends before the end-of-image marker: cut short"));
-        };
-        at += step;
-        data += if scanned { step as u64 } else { 0 };
-        let marker = bytes[at + 1];
-        match marker {
-            0xD9 if scanned => return Ok(data * if progressive { 8 * 64 } else { 4 * 64 }),
-            0xD9 => return Err(bad(at, "it holds no picture data")),
-            0x01 | 0xD8 => at += 2,
+    fn jpeg(self, at: impl Into<Option<u64>>, problem: impl Into<String>) -> ReadError {
+        ReadError::damaged(self.path, "JPEG", at, problem)
+    }
+
+    fn is_png(self) -> Result<bool, ReadError> {
+        let other = match self.bytes {
+            [0x89, b'P', b'N', b'G', 0x0D, 0x0A, 0x1A, 0x0A, ..] => return Ok(true),
+            [0xFF, 0xD8, 0xFF, ..] => return Ok(false),
+            [b'G', b'I', b'F', b'8', ..] => "a GIF picture",
+            [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P', ..] => "a WebP picture",
+            [b'I', b'I', 42, 0, ..] | [b'M', b'M', 0, 42, ..] => "a TIFF or camera raw picture",
+            [_, _, _, _, b'f', b't', b'y', b'p', ..] => "a HEIF or AVIF picture or a film",
+            [0x76, 0x2F, 0x31, 0x01, ..] => "an OpenEXR picture",
+            [b'B', b'M', ..] => "a BMP picture",
             _ => {
-                let Some(l) = bytes.get(at + 2..at + 4) else {
-                    return Err(bad(bytes.len(), "it ends inside a segment: cut short"));
-                };
-                scanned |= marker == 0xDA;
-                progressive |= marker == 0xC2;
-                at += 2 + u16::from_be_bytes([l[0], l[1]]) as usize;
+                let problem = "its first bytes are those of neither";
+                return Err(ReadError::damaged(self.path, "PNG or JPEG", Some(0), problem));
+            }
+        };
+        Err(ReadError::unsupported(self.path, other, "convert it to PNG or JPEG"))
+    }
+
+    fn check_size(self, width: u32, height: u32, bytes_px: u64) -> Result<(), ReadError> {
+        self.limits.check_side(self.path, width.max(height).into())?;
+        self.limits.check_decoded(self.path, (width as u64 * height as u64).saturating_mul(bytes_px))
+    }
+
+    fn png_decoder(self) -> Result<(Png<'a>, PictureInfo), ReadError> {
+        let be = |at: usize| self.bytes.get(at..)?.first_chunk().map(|b| u32::from_be_bytes(*b));
+        // width and height of IHDR, which must come first: checked before the decoder reserves a row, for the 8
+        // bytes that a pixel takes at most
+        if let (Some(width), Some(height)) = (be(16), be(20)) {
+            self.check_size(width, height, 8)?;
+        }
+        let mut allowed = image::Limits::no_limits();
+        allowed.max_image_width = Some(self.limits.side_px);
+        allowed.max_image_height = Some(self.limits.side_px);
+        allowed.max_alloc = Some(self.limits.decoded_bytes);
+        let decoder = PngDecoder::with_limits(Cursor::new(self.bytes), allowed);
+        let mut decoder = decoder.map_err(|e| self.png(None, e))?;
+        let (width, height) = decoder.dimensions();
+        let exif = decoder.orientation().map_or(1, Orientation::to_exif);
+        let alpha = decoder.color_type().has_alpha();
+        Ok((decoder, PictureInfo { width, height, alpha, exif }))
+    }
+
+    fn jpeg_decoder(self) -> Result<(Jpeg<'a>, PictureInfo), ReadError> {
+        // strict: a photograph with damaged data is an error, not a picture with gray blocks
+        let options = DecoderOptions::default()
+            .set_strict_mode(true)
+            .set_max_width(usize::from(u16::MAX))
+            .set_max_height(usize::from(u16::MAX));
+        let mut decoder = Jpeg::new_with_options(ZCursor::new(self.bytes), options);
+        decoder.decode_headers().map_err(|e| self.jpeg(None, format!("{e:?}")))?;
+        let (Some((width, height)), Some(space)) = (decoder.dimensions(), decoder.input_colorspace()) else {
+            return Err(self.jpeg(None, "it has no frame header"));
+        };
+        let (width, height) = (width as u32, height as u32);
+        self.check_size(width, height, 3)?;
+        let out = match space {
+            ColorSpace::Luma => ColorSpace::Luma,
+            ColorSpace::RGB | ColorSpace::YCbCr => ColorSpace::RGB,
+            other => {
+                let hint = "export the photograph in sRGB; print colors (CMYK) have no single meaning here";
+                return Err(ReadError::unsupported(self.path, format!("a JPEG in {other:?} colors"), hint));
+            }
+        };
+        decoder.set_options(options.jpeg_set_out_colorspace(out));
+        let turn = decoder.exif().and_then(|chunk| Orientation::from_exif_chunk(chunk));
+        let exif = turn.map_or(1, Orientation::to_exif);
+        Ok((decoder, PictureInfo { width, height, alpha: false, exif }))
+    }
+
+    /// Walks the chunks of a PNG to `IEND` and returns the bytes of picture data.
+    fn walk_png(self) -> Result<u64, ReadError> {
+        let bytes = self.bytes;
+        let (mut at, mut data) = (8, 0u64);
+        loop {
+            let Some(head) = bytes.get(at..at + 8) else {
+                return Err(self.png(bytes.len() as u64, "it ends before its last chunk (`IEND`)"));
+            };
+            let length = u32::from_be_bytes([head[0], head[1], head[2], head[3]]) as usize;
+            if bytes.len() - at - 8 < length.saturating_add(4) {
+                return Err(self.png(at as u64, "a chunk reaches beyond the end of the file"));
+            }
+            match &head[4..] {
+                b"IDAT" => data += length as u64,
+                b"IEND" => return Ok(data),
+                _ => {}
+            }
+            at += 12 + length;
+        }
+    }
+
+    /// Walks the segments of a JPEG to the end-of-image marker and returns the most pixels its picture data can hold:
+    /// a block of 64 takes a bit at least, and without progression a second one for its end.
+    fn walk_jpeg(self) -> Result<u64, ReadError> {
+        let bytes = self.bytes;
+        let end = |problem: &str| self.jpeg(bytes.len() as u64, problem);
+        let mut at = 2;
+        let (mut scanned, mut data, mut progressive) = (false, 0, false);
+        loop {
+            // between segments and inside a scan: forward to the next 0xFF that begins a marker
+            let Some(step) = bytes[at.min(bytes.len())..]
+                .windows(2)
+                .position(|w| w[0] == 0xFF && !matches!(w[1], 0x00 | 0xFF | 0xD0..=0xD7))
+            else {
+                return Err(end("it ends before the end-of-image marker: cut short"));
+            };
+            at += step;
+            data += if scanned { step as u64 } else { 0 };
+            let marker = bytes[at + 1];
+            match marker {
+                0xD9 if scanned => return Ok(data * if progressive { 8 * 64 } else { 4 * 64 }),
+                0xD9 => return Err(self.jpeg(at as u64, "it holds no picture data")),
+                0x01 | 0xD8 => at += 2,
+                _ => {
+                    let Some(l) = bytes.get(at + 2..at + 4) else {
+                        return Err(end("it ends inside a segment: cut short"));
+                    };
+                    scanned |= marker == 0xDA;
+                    progressive |= marker == 0xC2;
+                    at += 2 + u16::from_be_bytes([l[0], l[1]]) as usize;
+                }
             }
         }
     }
-}
 
-fn decode(
-    bytes: &[u8],
-    path: &Path,
-    expected: Option<(u32, u32)>,
-    limits: &Limits,
-) -> Result<Photo, ReadError> {
-    let (mut picture, exif) = if is_png(path, bytes)? {
-        decode_png(bytes, path, limits)?
-    } else {
-        decode_jpeg(bytes, path, limits)?
-    };
-    if is_turned(exif, (picture.width(), picture.height()), expected)
-        && let Some(orientation) = Orientation::from_exif(exif)
-    {
-        picture.apply_orientation(orientation);
+    fn decode_png(self) -> Result<(DynamicImage, PictureInfo), ReadError> {
+        let data = self.walk_png()?;
+        let (decoder, info) = self.png_decoder()?;
+        // deflate cannot shrink by more than 1032: a small file that claims more is lying
+        let (width, height, bits) = (info.width, info.height, decoder.original_color_type().bits_per_pixel());
+        if width as u64 * height as u64 * bits as u64 / 8 / 1032 > data {
+            let problem = format!("{width} × {height} pixels cannot come from its {data} bytes of data");
+            return Err(self.png(None, problem));
+        }
+        Ok((DynamicImage::from_decoder(decoder).map_err(|e| self.png(None, e))?, info))
     }
-    let (width, height) = (picture.width(), picture.height());
-    let color = picture.color();
-    let pixels: Vec<[u8; 4]> = if color.has_color() {
-        picture.into_rgba8().pixels().map(|p| p.0).collect()
-    } else {
-        picture.into_luma_alpha8().pixels().map(|p| [p[0], p[0], p[0], p[1]]).collect()
-    };
-    let alpha = color.has_alpha().then(|| pixels.iter().map(|p| p[3]).collect());
-    Ok(Photo { width, height, rgb: pixels.into_iter().map(|[r, g, b, _]| [r, g, b]).collect(), alpha })
-}
 
-fn decode_png(bytes: &[u8], path: &Path, limits: &Limits) -> Result<(DynamicImage, u8), ReadError> {
-    let data = walk_png(path, bytes)?;
-    let (decoder, PictureInfo { width, height, exif, .. }) = png_decoder(path, bytes, limits)?;
-    check_size(path, width, height, decoder.color_type().bytes_per_pixel() as u64, limits)?;
-    // deflate cannot shrink by more than 1032: a small file that claims more is lying
-    let claimed = width as u64 * height as u64 * decoder.original_color_type().bits_per_pixel() as u64 / 8;
-    if claimed / 1032 > data {
-        return Err(png(
-            path,
-            format!("{width} × {height} pixels cannot come from its {data} bytes of data"),
-        ));
+    fn decode_jpeg(self) -> Result<(DynamicImage, PictureInfo), ReadError> {
+        let most = self.walk_jpeg()?;
+        let (mut decoder, info) = self.jpeg_decoder()?;
+        let (width, height) = (info.width, info.height);
+        let claimed = u64::from(width) * u64::from(height);
+        if claimed > most {
+            let problem =
+                format!("{width} × {height} pixels cannot come from its picture data, enough for {most}");
+            return Err(self.jpeg(None, problem));
+        }
+        let pixels = decoder.decode().map_err(|e| self.jpeg(None, format!("{e:?}")))?;
+        let picture = match pixels.len() as u64 / claimed.max(1) {
+            1 => image::GrayImage::from_raw(width, height, pixels).map(DynamicImage::from),
+            _ => image::RgbImage::from_raw(width, height, pixels).map(DynamicImage::from),
+        };
+        let problem = "the decoder returned another number of pixels than the header names";
+        Ok((picture.ok_or_else(|| self.jpeg(None, problem))?, info))
     }
-    Ok((DynamicImage::from_decoder(decoder).map_err(|e| png(path, e))?, exif))
-}
 
-fn decode_jpeg(bytes: &[u8], path: &Path, limits: &Limits) -> Result<(DynamicImage, u8), ReadError> {
-    let most = walk_jpeg(path, bytes)?;
-    let (mut decoder, PictureInfo { width, height, exif, .. }) = jpeg_decoder(path, bytes, limits)?;
-    let claimed = u64::from(width) * u64::from(height);
-    if claimed > most {
-        let problem =
-            format!("{width} × {height} pixels cannot come from its picture data, enough for {most}");
-        return Err(jpeg(path, problem));
+    fn decode(self, expected: Option<(u32, u32)>) -> Result<Photo, ReadError> {
+        let (mut picture, info) = if self.is_png()? { self.decode_png()? } else { self.decode_jpeg()? };
+        if is_turned(info.exif, (info.width, info.height), expected)
+            && let Some(orientation) = Orientation::from_exif(info.exif)
+        {
+            picture.apply_orientation(orientation);
+        }
+        let (width, height, color) = (picture.width(), picture.height(), picture.color());
+        let pixels: Vec<[u8; 4]> = if color.has_color() {
+            picture.into_rgba8().pixels().map(|p| p.0).collect()
+        } else {
+            picture.into_luma_alpha8().pixels().map(|p| [p[0], p[0], p[0], p[1]]).collect()
+        };
+        let alpha = color.has_alpha().then(|| pixels.iter().map(|p| p[3]).collect());
+        let rgb = pixels.into_iter().map(|[r, g, b, _]| [r, g, b]).collect();
+        Ok(Photo { width, height, rgb, alpha })
     }
-    let pixels = decoder.decode().map_err(|e| jpeg(path, format!("{e:?}")))?;
-    let picture = match pixels.len() as u64 / claimed.max(1) {
-        1 => image::GrayImage::from_raw(width, height, pixels).map(DynamicImage::from),
-        _ => image::RgbImage::from_raw(width, height, pixels).map(DynamicImage::from),
-    };
-    let problem = "the decoder returned another number of pixels than the header names";
-    Ok((picture.ok_or_else(|| jpeg(path, problem))?, exif))
 }
 
 /// Reads a photograph: PNG (gray, palette, color, 8 or 16 bit, with or without alpha) or JPEG (gray or
@@ -277,18 +270,13 @@ fn decode_jpeg(bytes: &[u8], path: &Path, limits: &Limits) -> Result<(DynamicIma
 /// `expected` is the size its cameras were calibrated for, if declared: a quarter turn that EXIF asks for is
 /// applied only if it leads to that size. Another size is not an error here.
 pub fn read_photo(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> Result<Photo, ReadError> {
-    decode(&read_bytes(path, limits)?, path, expected, limits)
+    PictureFile { path, bytes: &read_bytes(path, limits)?, limits }.decode(expected)
 }
 
 /// A picture that lies inside another file, as [`read_photo`] would read it from one of its own.
 /// `path` is for messages only.
 pub fn parse_photo(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Photo, ReadError> {
-    decode(bytes, path, None, limits)
-}
-
-/// [`picture_info`] of a picture that lies inside another file. `path` is for messages only.
-pub fn parse_picture_info(bytes: &[u8], path: &Path, limits: &Limits) -> Result<PictureInfo, ReadError> {
-    header(path, bytes, limits)
+    PictureFile { path, bytes, limits }.decode(None)
 }
 
 /// Reads a mask: the gray channel; of a picture with alpha that is not opaque everywhere, the alpha;
@@ -333,12 +321,12 @@ pub fn write_png_rgba(path: &Path, width: u32, height: u32, rgba: &[[u8; 4]]) ->
     write_png(path, width, height, rgba.as_flattened(), ExtendedColorType::Rgba8)
 }
 
-/// Writes an 8-bit grey PNG.
+/// Writes an 8-bit gray PNG.
 pub fn write_png_gray(path: &Path, gray: &Gray) -> Result<(), WriteError> {
     write_png(path, gray.width, gray.height, &gray.values, ExtendedColorType::L8)
 }
 
-/// Writes a 16-bit grey PNG (depth in millimetres).
+/// Writes a 16-bit gray PNG (depth in millimetres).
 pub fn write_png_gray16(path: &Path, width: u32, height: u32, values: &[u16]) -> Result<(), WriteError> {
     // the encoder takes native byte order and swaps itself
     write_png(path, width, height, bytemuck::cast_slice(values), ExtendedColorType::L16)
@@ -396,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mask_with_an_opaque_alpha_channel_is_read_from_its_colour() {
+    fn a_mask_with_an_opaque_alpha_channel_is_read_from_its_color() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.png");
         write_png_rgba(&path, 2, 1, &[[255, 255, 255, 255], [0, 0, 0, 255]]).unwrap();

@@ -2,7 +2,7 @@
 //!
 //! Points are spread evenly by area over one mesh, always at the same places, and their nearest
 //! points on the other are found. Both directions are needed: what is missing shows in one, what is
-//! too much in the other. Chamfer distance here is the mean of the two mean distances (not squared).
+//! too much in the other.
 
 use crate::geom::{Bvh, Camera, Mesh, Ray};
 use glam::Vec3;
@@ -24,38 +24,9 @@ pub struct Distances {
     pub max: f64,
 }
 
-/// Distances in both directions.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct MeshDistance {
-    /// From the first mesh to the second: how wrong what is there is.
-    pub a_to_b: Distances,
-    /// From the second to the first: how much of it is missed.
-    pub b_to_a: Distances,
-    /// Mean of the two means.
-    pub chamfer: f64,
-}
-
-/// Distances between two meshes, from `samples` points on each; only points that `keep` accepts
-/// count. `None` when a mesh has no area or no point is kept.
-pub fn between(
-    a: &Mesh,
-    b: &Mesh,
-    samples: usize,
-    keep: impl Fn(Vec3) -> bool + Sync,
-) -> Option<MeshDistance> {
-    let a_to_b = one_way(a, &Bvh::new(b), samples, &keep)?;
-    let b_to_a = one_way(b, &Bvh::new(a), samples, &keep)?;
-    Some(MeshDistance { a_to_b, b_to_a, chamfer: 0.5 * (a_to_b.mean + b_to_a.mean) })
-}
-
-/// Distances from points on `from` to the surface `to`.
-pub fn one_way(
-    from: &Mesh,
-    to: &Bvh,
-    samples: usize,
-    keep: impl Fn(Vec3) -> bool + Sync,
-) -> Option<Distances> {
-    distances(sample(from, samples).into_par_iter().filter(|p| keep(*p)).collect(), to)
+/// Distances from `samples` points on `from` to the surface `to`; `None` when a mesh has no area.
+pub fn one_way(from: &Mesh, to: &Bvh, samples: usize) -> Option<Distances> {
+    distances(sample(from, samples), to)
 }
 
 fn distances(points: Vec<Vec3>, to: &Bvh) -> Option<Distances> {
@@ -171,13 +142,16 @@ mod tests {
         }
     }
 
+    /// From the first to the second, and back.
+    fn both_ways(a: &Mesh, b: &Mesh, samples: usize) -> Option<[Distances; 2]> {
+        Some([one_way(a, &Bvh::new(b), samples)?, one_way(b, &Bvh::new(a), samples)?])
+    }
+
     #[test]
     fn parallel_sheets_are_their_gap_apart() {
-        let d = between(&sheet(0.0), &sheet(0.25), 1000, |_| true).unwrap();
-        for way in [d.a_to_b, d.b_to_a] {
+        for way in both_ways(&sheet(0.0), &sheet(0.25), 1000).unwrap() {
             assert_eq!((way.samples, way.mean, way.median, way.p90, way.max), (1000, 0.25, 0.25, 0.25, 0.25));
         }
-        assert_eq!(d.chamfer, 0.25);
     }
 
     #[test]
@@ -187,13 +161,11 @@ mod tests {
             positions: whole.positions.iter().map(|p| Vec3::new(p.x * 0.5, p.y, p.z)).collect(),
             ..whole.clone()
         };
-        let d = between(&half, &whole, 20_000, |_| true).unwrap();
-        assert!(d.a_to_b.max < 1e-6);
+        let [there, back] = both_ways(&half, &whole, 20_000).unwrap();
+        assert!(there.max < 1e-6);
         // half of the points are at 0, the rest at x − 1: mean ∫₀¹ x dx / 2 = 0.25, 90 % at 0.8
-        assert!((d.b_to_a.mean - 0.25).abs() < 1e-3, "{d:?}");
-        assert!((d.b_to_a.p90 - 0.8).abs() < 1e-2 && d.b_to_a.max <= 1.0, "{d:?}");
-        let near = between(&half, &whole, 20_000, |p| p.x < 1.0).unwrap();
-        assert!(near.chamfer < 1e-6 && near.b_to_a.samples < 10_100);
+        assert!((back.mean - 0.25).abs() < 1e-3, "{back:?}");
+        assert!((back.p90 - 0.8).abs() < 1e-2 && back.max <= 1.0, "{back:?}");
     }
 
     #[test]
@@ -212,9 +184,8 @@ mod tests {
 
     #[test]
     fn nothing_has_no_distance() {
-        assert!(between(&Mesh::default(), &sheet(0.0), 10, |_| true).is_none());
-        assert!(between(&sheet(0.0), &Mesh::default(), 10, |_| true).is_none());
-        assert!(between(&sheet(0.0), &sheet(0.0), 10, |_| false).is_none());
+        assert!(both_ways(&Mesh::default(), &sheet(0.0), 10).is_none());
+        assert!(one_way(&sheet(0.0), &Bvh::new(&Mesh::default()), 10).is_none());
     }
 
     #[test]

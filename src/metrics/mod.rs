@@ -4,6 +4,19 @@
 //! 1/255 first. Figures are in f64, averaged per image, then over images. A figure that has no value
 //! (no pixels in the mask, an image smaller than the window, no difference at all) is `None`, `null`
 //! in the JSON, and does not take part in the mean.
+//!
+//! ```
+//! use tiface::image::Image;
+//! use tiface::metrics::{psnr, ssim_valid};
+//!
+//! let black = Image::new(16, 16, 3);
+//! let mut gray = black.clone();
+//! gray.data.fill(0.1);
+//! // an error of 0.1 everywhere: -10 log10(0.01) = 20 dB
+//! assert!((psnr(&black, &gray, None).unwrap() - 20.0).abs() < 1e-4);
+//! assert_eq!(psnr(&gray, &gray, None), None); // no difference at all
+//! assert!(ssim_valid(&black, &gray).unwrap() < 0.1);
+//! ```
 
 pub mod distance;
 mod psnr;
@@ -125,7 +138,7 @@ pub fn compare(
     })
 }
 
-/// The colours after a trip through 8 bits; values that are not a number become 0.
+/// The colors after a trip through 8 bits; values that are not a number become 0.
 fn rounded(image: &Image) -> Image {
     let mut out = Image::new(image.width, image.height, 3);
     for (o, i) in out.data.as_chunks_mut::<3>().0.iter_mut().zip(image.data.chunks_exact(image.channels)) {

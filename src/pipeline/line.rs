@@ -4,7 +4,7 @@ use super::clicks::MaskPrompts;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::Scene;
-use crate::capture::{self, Capture, CaptureOptions, MaskChoice};
+use crate::capture::{self, Capture, CaptureOptions};
 use crate::config::{Config, MaskSource, RenderConfig, Stage};
 use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
@@ -149,14 +149,8 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
     let c = &config.capture;
     CaptureOptions {
         downscale: c.downscale,
-        masks: match config.mask.source {
-            _ if config.mask.clicked() => MaskChoice::None,
-            MaskSource::Clicks => MaskChoice::None,
-            MaskSource::Auto if c.mask_dir.is_empty() => MaskChoice::Auto,
-            MaskSource::Auto | MaskSource::Folder => MaskChoice::Folder(c.mask_dir.clone()),
-            MaskSource::Alpha => MaskChoice::Alpha,
-            MaskSource::None => MaskChoice::None,
-        },
+        masks: if config.mask.clicked() { MaskSource::Clicks } else { config.mask.source },
+        mask_dir: c.mask_dir.clone(),
         mask_meaning: config.mask.meaning,
         unit_m: c.unit_m,
         ..CaptureOptions::default()

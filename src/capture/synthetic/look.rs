@@ -1,12 +1,12 @@
-//! How the demo head and its stage look: albedo, lamps, shine, and the dark room behind.
+//! How the demo head and its background look: albedo, lamps, shine, and the dark room behind.
 //!
-//! All colours here are linear light. Four far lamps light the head (two of them with shadows)
-//! over an even glow from the many lamps of the stage; shine is Blinn–Phong, so it moves with the
-//! camera. What is *seen* of the stage is a lattice of small round lamps on struts: bright clutter
+//! All colors here are linear light. Four far lamps light the head (two of them with shadows)
+//! over an even glow from the many lamps around; shine is Blinn–Phong, so it moves with the
+//! camera. What is *seen* behind it is a lattice of small round lamps on struts: bright clutter
 //! that a reconstruction must not take for the head.
 
 use super::noise::{cloud, noise};
-use super::shape::{EYE, EYE_RADIUS, Material, OFFSET, combed, lower_lip, smooth, upper_lip};
+use super::shape::{EYE, EYE_RADIUS, HeadMaterial, OFFSET, combed, lower_lip, smooth, upper_lip};
 use glam::Vec3;
 
 /// A far lamp: unit direction towards it, its light, whether it throws a shadow.
@@ -32,20 +32,20 @@ pub(super) fn lamps() -> [Lamp; 4] {
     ]
 }
 
-/// Surface colour and shine at a point.
-pub(super) struct Surface {
+/// How a surface reflects light at a point.
+pub(super) struct Reflectance {
     pub albedo: Vec3,
     /// Strength and exponent of the shine.
     pub shine: (f32, f32),
 }
 
 /// The surface at `q` (head coordinates) made of `material`.
-pub(super) fn surface(q: Vec3, material: Material) -> Surface {
+pub(super) fn reflectance(q: Vec3, material: HeadMaterial) -> Reflectance {
     match material {
-        Material::Skin => Surface { albedo: skin(q), shine: (0.10, 22.0) },
-        Material::Eye => Surface { albedo: eye(q), shine: (0.55, 160.0) },
-        Material::Hair => Surface { albedo: hair(q), shine: (0.07, 14.0) },
-        Material::Garment => Surface { albedo: garment(q), shine: (0.01, 8.0) },
+        HeadMaterial::Skin => Reflectance { albedo: skin(q), shine: (0.10, 22.0) },
+        HeadMaterial::Eye => Reflectance { albedo: eye(q), shine: (0.55, 160.0) },
+        HeadMaterial::Hair => Reflectance { albedo: hair(q), shine: (0.07, 14.0) },
+        HeadMaterial::Garment => Reflectance { albedo: garment(q), shine: (0.01, 8.0) },
     }
 }
 
@@ -110,10 +110,7 @@ fn eye(q: Vec3) -> Vec3 {
 }
 
 fn hair(q: Vec3) -> Vec3 {
-    let (direction, reach) = combed(q);
-    let bend = 1.2 * noise(q * 28.0);
-    let (sin, cos) = (0.35 * bend + 4.0 * reach).sin_cos();
-    let turned = glam::Vec2::new(cos, sin).rotate(direction);
+    let (turned, _) = combed(q);
     let strand =
         0.6 * noise((turned * 26.0).extend(q.z * 22.0)) + 0.4 * noise((turned * 60.0).extend(q.z * 30.0));
     Vec3::new(0.105, 0.054, 0.026) * (0.45 + 1.15 * strand)
@@ -129,31 +126,31 @@ fn garment(q: Vec3) -> Vec3 {
 }
 
 /// Radius of the sphere of lamps around the head, metres.
-pub(super) const STAGE_RADIUS: f32 = 1.7;
+pub(super) const LAMP_RADIUS: f32 = 1.7;
 
-/// What a ray that misses the head sees of the stage.
-pub(super) fn stage(origin: Vec3, direction: Vec3) -> Vec3 {
+/// What a ray that misses the head sees.
+pub(super) fn background(origin: Vec3, direction: Vec3) -> Vec3 {
     // the far wall: |o + t·d| = R
     let o = origin - OFFSET;
     let b = o.dot(direction);
-    let t = -b + (b * b - o.length_squared() + STAGE_RADIUS * STAGE_RADIUS).max(0.0).sqrt();
+    let t = -b + (b * b - o.length_squared() + LAMP_RADIUS * LAMP_RADIUS).max(0.0).sqrt();
     let p = o + t * direction;
 
     // rows of lamps every 20 degrees, staggered; struts join the rows
     let step = 20f32.to_radians();
-    let latitude = (p.z / STAGE_RADIUS).clamp(-1.0, 1.0).asin();
+    let latitude = (p.z / LAMP_RADIUS).clamp(-1.0, 1.0).asin();
     let row = (latitude / step).round();
-    let around = STAGE_RADIUS * (row * step).cos();
-    let in_row = ((around / STAGE_RADIUS * 18.0).round()).max(1.0);
+    let around = LAMP_RADIUS * (row * step).cos();
+    let in_row = ((around / LAMP_RADIUS * 18.0).round()).max(1.0);
     let turn = std::f32::consts::TAU / in_row;
     let stagger = 0.5 * (row.rem_euclid(2.0));
     let place = ((p.y.atan2(p.x)) / turn - stagger).round() + stagger;
     let (sin, cos) = (place * turn).sin_cos();
-    let lamp = Vec3::new(around * cos, around * sin, STAGE_RADIUS * (row * step).sin());
+    let lamp = Vec3::new(around * cos, around * sin, LAMP_RADIUS * (row * step).sin());
     let near = p.distance(lamp);
     let glow = smooth(0.034, 0.024, near) + 0.10 * (-(near / 0.07).powi(2)).exp();
 
-    let off_row = STAGE_RADIUS * (latitude - row * step).abs();
+    let off_row = LAMP_RADIUS * (latitude - row * step).abs();
     let upright = around * (p.y.atan2(p.x) - place * turn).abs();
     let strut = smooth(0.012, 0.006, off_row).max(smooth(0.009, 0.004, upright));
     let wall = 0.0035 + 0.002 * cloud(p * 3.0);

@@ -8,7 +8,7 @@ pub(super) fn unit(seed: u64, a: u32, b: u32) -> f32 {
     (mix(key) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// SplitMix64's finaliser (Steele, Lea and Flood 2014).
+/// SplitMix64's finalizer (Steele, Lea and Flood 2014).
 fn mix(mut z: u64) -> u64 {
     z = z.wrapping_add(0x9E37_79B9_7F4A_7C15);
     z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -32,16 +32,15 @@ pub(super) fn noise(p: Vec3) -> f32 {
     let f = p - floor;
     let t = f * f * (3.0 - 2.0 * f);
     let i: IVec3 = floor.as_ivec3();
-    let edge = |y: i32, z: i32| {
-        let (a, b) = (lattice(i.x, i.y + y, i.z + z), lattice(i.x + 1, i.y + y, i.z + z));
-        a + (b - a) * t.x
-    };
-    let face = |z: i32| {
-        let (a, b) = (edge(0, z), edge(1, z));
-        a + (b - a) * t.y
-    };
-    let (a, b) = (face(0), face(1));
-    a + (b - a) * t.z
+    trilinear(t, |[x, y, z]| lattice(i.x + x, i.y + y, i.z + z))
+}
+
+/// Between the corners (0 or 1 along each axis) of a cell, at `t` inside it.
+pub(super) fn trilinear(t: Vec3, corner: impl Fn([i32; 3]) -> f32) -> f32 {
+    let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
+    let edge = |y, z| mix(corner([0, y, z]), corner([1, y, z]), t.x);
+    let face = |z| mix(edge(0, z), edge(1, z), t.y);
+    mix(face(0), face(1), t.z)
 }
 
 /// Three octaves of [`noise`], 0..=1.

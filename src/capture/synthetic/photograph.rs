@@ -3,8 +3,8 @@
 //! A grid of distances sampled once lets rays and shadows stride through empty air for the price
 //! of a lookup; the exact function is only asked close to the surface.
 
-use super::look::{Lamp, lamps, stage, surface};
-use super::noise::{noise, unit};
+use super::look::{Lamp, background, lamps, reflectance};
+use super::noise::{noise, trilinear, unit};
 use super::shape::{OFFSET, SyntheticHead, parts};
 use crate::geom::{Aabb, Camera};
 use crate::image::{Gray, Photo, quantise, srgb_from_linear};
@@ -12,7 +12,7 @@ use glam::{UVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
 /// One picture with its masks.
-pub(super) struct Picture {
+pub(super) struct SyntheticPhoto {
     pub photo: Photo,
     /// Share of each pixel that the bust covers.
     pub mask: Gray,
@@ -23,13 +23,13 @@ pub(super) struct Picture {
 /// Everything that does not change from picture to picture.
 pub(super) struct Studio {
     head: SyntheticHead,
-    coarse: Coarse,
+    grid: DistanceGrid,
     lamps: [Lamp; 4],
 }
 
 /// What one ray brings back.
 #[derive(Clone, Copy, Default)]
-struct Seen {
+struct RayLight {
     /// Linear light, multiplied by `alpha`.
     color: Vec3,
     alpha: f32,
@@ -43,38 +43,38 @@ const GRAIN: f32 = 0.004;
 
 impl Studio {
     pub fn new() -> Studio {
-        Studio { head: SyntheticHead, coarse: Coarse::new(&SyntheticHead), lamps: lamps() }
+        Studio { head: SyntheticHead, grid: DistanceGrid::new(&SyntheticHead), lamps: lamps() }
     }
 
     /// Photographs the head. `seed` makes the grain; everything else follows from the camera.
-    pub fn photograph(&self, camera: &Camera, seed: u64) -> Picture {
+    pub fn photograph(&self, camera: &Camera, seed: u64) -> SyntheticPhoto {
         let (w, h) = (camera.width, camera.height);
         let pixels: Vec<([u8; 3], u8, u8)> =
             (0..w * h).into_par_iter().map(|i| self.pixel(camera, i % w, i / w, seed)).collect();
-        Picture {
+        SyntheticPhoto {
             photo: Photo { width: w, height: h, rgb: pixels.iter().map(|p| p.0).collect(), alpha: None },
             mask: Gray { width: w, height: h, values: pixels.iter().map(|p| p.1).collect() },
             region: Gray { width: w, height: h, values: pixels.iter().map(|p| p.2).collect() },
         }
     }
 
-    /// Colour, mask and region of one pixel: 2 × 2 rays, 4 × 4 more where the outline crosses it.
+    /// Color, mask and region of one pixel: 2 × 2 rays, 4 × 4 more where the outline crosses it.
     fn pixel(&self, camera: &Camera, x: u32, y: u32, seed: u64) -> ([u8; 3], u8, u8) {
         let average = |side: u32| {
-            let mut sum = Seen::default();
+            let mut sum = RayLight::default();
             for k in 0..side * side {
                 let inside = Vec2::new((k % side) as f32 + 0.5, (k / side) as f32 + 0.5) / side as f32;
                 let Some(ray) = camera.ray(Vec2::new(x as f32, y as f32) + inside) else { continue };
                 let seen = self.look(ray.origin, ray.direction);
                 sum.color += seen.color;
                 if seen.alpha < 1.0 {
-                    sum.color += (1.0 - seen.alpha) * stage(ray.origin, ray.direction);
+                    sum.color += (1.0 - seen.alpha) * background(ray.origin, ray.direction);
                 }
                 sum.alpha += seen.alpha;
                 sum.head += seen.head;
             }
             let n = (side * side) as f32;
-            Seen { color: sum.color / n, alpha: sum.alpha / n, head: sum.head / n }
+            RayLight { color: sum.color / n, alpha: sum.alpha / n, head: sum.head / n }
         };
         let mut seen = average(2);
         if seen.alpha > 0.0 && seen.alpha < 1.0 {
@@ -90,16 +90,16 @@ impl Studio {
     }
 
     /// Follows one ray to the head.
-    fn look(&self, origin: Vec3, direction: Vec3) -> Seen {
-        let Some((enter, leave)) = self.coarse.bounds.intersect(origin, direction) else {
-            return Seen::default();
+    fn look(&self, origin: Vec3, direction: Vec3) -> RayLight {
+        let Some((enter, leave)) = self.grid.bounds.intersect(origin, direction) else {
+            return RayLight::default();
         };
         let mut t = enter.max(0.0);
         let mut closest = (f32::INFINITY, t); // nearest miss, for loose hairs
         let mut before: Option<(f32, f32)> = None; // the exact distance one step ago
         while t < leave {
             let p = origin + t * direction;
-            let air = self.coarse.air(p);
+            let air = self.grid.air(p);
             if air > 0.002 {
                 before = None;
                 t += air;
@@ -113,7 +113,7 @@ impl Studio {
                 };
                 let p = origin + t * direction;
                 let head = if self.head.is_head(p) { 1.0 } else { 0.0 };
-                return Seen { color: self.shade(p, direction), alpha: 1.0, head };
+                return RayLight { color: self.shade(p, direction), alpha: 1.0, head };
             }
             if d < closest.0 {
                 closest = (d, t);
@@ -137,26 +137,26 @@ impl Studio {
     }
 
     /// A ray that just missed the hair meets some of its fringe of single hairs.
-    fn loose_hair(&self, p: Vec3, miss: f32, direction: Vec3) -> Seen {
+    fn loose_hair(&self, p: Vec3, miss: f32, direction: Vec3) -> RayLight {
         if miss > FUZZ {
-            return Seen::default();
+            return RayLight::default();
         }
         let q = p - OFFSET;
         let parts = parts(q);
         if parts.hair > parts.skin.min(parts.garment) {
-            return Seen::default();
+            return RayLight::default();
         }
         let fade = 1.0 - miss / FUZZ;
         let alpha = 0.75 * fade * fade * (0.25 + 0.75 * noise(q * 900.0));
-        Seen { color: alpha * self.shade(p, direction), alpha, head: alpha }
+        RayLight { color: alpha * self.shade(p, direction), alpha, head: alpha }
     }
 
     /// Light leaving `p` against `direction`.
     fn shade(&self, p: Vec3, direction: Vec3) -> Vec3 {
         let (normal, material) = self.head.normal_and_material(p);
-        let surface = surface(p - OFFSET, material);
+        let surface = reflectance(p - OFFSET, material);
         let open = self.openness(p, normal);
-        // the even light of the stage, a little stronger from above
+        // the even light of the many lamps, a little stronger from above
         let mut light = Vec3::new(0.30, 0.30, 0.31) * open * (0.85 + 0.15 * normal.z);
         let mut shine = 0.0;
         for lamp in &self.lamps {
@@ -183,7 +183,7 @@ impl Studio {
         let mut closed = 0.0;
         let mut weight = 1.0;
         for step in [0.004, 0.009, 0.018, 0.034] {
-            closed += weight * (step - self.coarse.distance(p + step * normal)).max(0.0) / step;
+            closed += weight * (step - self.grid.distance(p + step * normal)).max(0.0) / step;
             weight *= 0.7;
         }
         (1.0 - 0.42 * closed).clamp(0.15, 1.0)
@@ -191,10 +191,10 @@ impl Studio {
 
     /// Share of a lamp seen from `p`: 0 behind something, soft beside it.
     fn clearance(&self, p: Vec3, towards: Vec3) -> f32 {
-        let Some((_, leave)) = self.coarse.bounds.intersect(p, towards) else { return 1.0 };
+        let Some((_, leave)) = self.grid.bounds.intersect(p, towards) else { return 1.0 };
         let (mut t, mut open) = (0.006f32, 1.0f32);
         while t < leave {
-            let d = self.coarse.distance(p + t * towards);
+            let d = self.grid.distance(p + t * towards);
             open = open.min(10.0 * d / t + 0.25);
             if open <= 0.0 {
                 return 0.0;
@@ -207,7 +207,7 @@ impl Studio {
 }
 
 /// Distances on a lattice of 3 mm cells.
-struct Coarse {
+struct DistanceGrid {
     bounds: Aabb,
     size: UVec3,
     values: Vec<f32>,
@@ -215,8 +215,8 @@ struct Coarse {
 
 const CELL: f32 = 0.003;
 
-impl Coarse {
-    fn new(head: &SyntheticHead) -> Coarse {
+impl DistanceGrid {
+    fn new(head: &SyntheticHead) -> DistanceGrid {
         let bounds = head.bounds().grown(2.0 * CELL);
         let size = (bounds.size() / CELL).ceil().as_uvec3() + 2;
         let values = (0..size.x * size.y * size.z)
@@ -226,7 +226,7 @@ impl Coarse {
                 head.sdf(bounds.min + CELL * at.as_vec3())
             })
             .collect();
-        Coarse { bounds, size, values }
+        DistanceGrid { bounds, size, values }
     }
 
     /// Trilinear distance; outside the lattice that of its border.
@@ -234,17 +234,10 @@ impl Coarse {
         let g = ((p - self.bounds.min) / CELL).clamp(Vec3::ZERO, self.size.as_vec3() - 1.001);
         let i = g.as_uvec3();
         let f = g - i.as_vec3();
-        let row = |y: u32, z: u32| {
-            let k = ((i.z + z) * self.size.y + i.y + y) * self.size.x + i.x;
-            let (a, b) = (self.values[k as usize], self.values[k as usize + 1]);
-            a + (b - a) * f.x
-        };
-        let face = |z: u32| {
-            let (a, b) = (row(0, z), row(1, z));
-            a + (b - a) * f.y
-        };
-        let (a, b) = (face(0), face(1));
-        a + (b - a) * f.z
+        trilinear(f, |corner| {
+            let [x, y, z] = corner.map(|c| c as u32);
+            self.values[(((i.z + z) * self.size.y + i.y + y) * self.size.x + i.x + x) as usize]
+        })
     }
 
     /// A stride that surely meets nothing: the slope is at most 1, so the trilinear value errs by
@@ -256,18 +249,18 @@ impl Coarse {
 
 #[cfg(test)]
 mod tests {
-    use super::super::shape::Material;
+    use super::super::shape::HeadMaterial;
     use super::*;
 
     #[test]
     fn strides_through_the_air_stop_short_of_the_surface() {
         let studio = Studio::new();
-        let bounds = studio.coarse.bounds;
+        let bounds = studio.grid.bounds;
         let surface = SyntheticHead.surface_points(3000, 8);
         for i in 0..3000 {
             let p = bounds.min + Vec3::from_array([0, 1, 2].map(|k| unit(3, i, k))) * bounds.size();
             let nearest = surface.iter().map(|s| s.distance(p)).fold(f32::INFINITY, f32::min);
-            assert!(studio.coarse.air(p) < nearest, "{p}: {} over {nearest}", studio.coarse.air(p));
+            assert!(studio.grid.air(p) < nearest, "{p}: {} over {nearest}", studio.grid.air(p));
         }
     }
 
@@ -280,6 +273,6 @@ mod tests {
         let t =
             (0..1000).map(|i| i as f32 * 1e-3).find(|&t| studio.head.sdf(eye - Vec3::Y + t * Vec3::Y) < 1e-4);
         let p = eye - Vec3::Y + t.unwrap() * Vec3::Y;
-        assert_eq!(studio.head.material(p), Material::Eye);
+        assert_eq!(parts(p - OFFSET).material(), HeadMaterial::Eye);
     }
 }

@@ -14,7 +14,7 @@ pub struct SyntheticHead;
 
 /// What the surface is made of at a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Material {
+pub(super) enum HeadMaterial {
     /// Face, ears, neck.
     Skin,
     /// An eyeball between the lids.
@@ -27,7 +27,7 @@ pub enum Material {
 
 /// The unscaled distance to each material.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Parts {
+pub(super) struct MaterialDistances {
     pub skin: f32,
     pub eye: f32,
     pub hair: f32,
@@ -77,7 +77,7 @@ impl SyntheticHead {
 
     /// Normal and material of a surface point for the price of four evaluations, the normal by
     /// one-sided differences: good enough to look at, not to measure with.
-    pub(super) fn normal_and_material(&self, p: Vec3) -> (Vec3, Material) {
+    pub(super) fn normal_and_material(&self, p: Vec3) -> (Vec3, HeadMaterial) {
         const H: f32 = 2e-4;
         let q = p - OFFSET;
         let here = parts(q);
@@ -102,11 +102,6 @@ impl SyntheticHead {
         above_jaw(p - OFFSET)
     }
 
-    /// What lies nearest to `p`.
-    pub fn material(&self, p: Vec3) -> Material {
-        parts(p - OFFSET).material()
-    }
-
     /// `count` points on the surface, the same for the same `seed`: random points of the box,
     /// pulled onto the surface by Newton steps. Denser on strongly curved parts.
     pub fn surface_points(&self, count: usize, seed: u64) -> Vec<Vec3> {
@@ -129,23 +124,23 @@ impl SyntheticHead {
     }
 }
 
-impl Parts {
+impl MaterialDistances {
     /// The union of all materials; skin and hair meet without a crack.
     pub fn whole(&self) -> f32 {
         union(self.skin.min(self.eye), self.hair, 0.002).min(self.garment)
     }
 
-    fn material(&self) -> Material {
-        let Parts { skin, eye, hair, garment } = *self;
+    pub fn material(&self) -> HeadMaterial {
+        let MaterialDistances { skin, eye, hair, garment } = *self;
         let nearest = skin.min(eye).min(hair).min(garment);
         if nearest == garment {
-            Material::Garment
+            HeadMaterial::Garment
         } else if nearest == hair {
-            Material::Hair
+            HeadMaterial::Hair
         } else if nearest == eye {
-            Material::Eye
+            HeadMaterial::Eye
         } else {
-            Material::Skin
+            HeadMaterial::Skin
         }
     }
 }
@@ -156,10 +151,10 @@ fn above_jaw(q: Vec3) -> bool {
 }
 
 /// Distances to every material at `q`, head coordinates.
-pub(super) fn parts(q: Vec3) -> Parts {
+pub(super) fn parts(q: Vec3) -> MaterialDistances {
     let s = Vec3::new(q.x.abs(), q.y, q.z); // the features are symmetric, the hair is not
     let skull = ellipsoid(q - Vec3::new(0.0, 0.020, 0.043), Vec3::new(0.0745, 0.094, 0.085));
-    Parts {
+    MaterialDistances {
         skin: skin(q, s, skull),
         eye: sphere(s - EYE, EYE_RADIUS),
         hair: hair(q, skull),
@@ -295,19 +290,18 @@ fn fringe(q: Vec3) -> f32 {
     0.011 * (slant - 0.5)
 }
 
-/// Polar coordinates about the whorl: `(cos φ, sin φ)` and distance from it, metres.
+/// Where strands run from the whorl, as a unit vector that is the same along each, and the distance from it, metres.
 pub(super) fn combed(q: Vec3) -> (Vec2, f32) {
     let from_whorl = Vec2::new(q.x + 0.010, q.y - 0.055);
     let reach = from_whorl.length();
-    (from_whorl / reach.max(1e-4), reach)
+    let bend = 1.2 * noise(q * 28.0);
+    let (sin, cos) = (0.35 * bend + 4.0 * reach).sin_cos();
+    (Vec2::new(cos, sin).rotate(from_whorl / reach.max(1e-4)), reach)
 }
 
 /// Clumps of hair running away from the whorl, metres outward, 0 at the whorl itself.
 fn strands(q: Vec3) -> f32 {
-    let (direction, reach) = combed(q);
-    let bend = 1.2 * noise(q * 28.0);
-    let (sin, cos) = (0.35 * bend + 4.0 * reach).sin_cos();
-    let turned = Vec2::new(cos, sin).rotate(direction);
+    let (turned, reach) = combed(q);
     let amount = (reach / 0.05).min(1.0);
     let broad = noise((turned * 5.0).extend(q.z * 14.0));
     let fine = noise((turned * 14.0).extend(q.z * 20.0 + 7.0));
@@ -423,8 +417,8 @@ mod tests {
     #[test]
     fn every_material_shows() {
         let shown: Vec<_> =
-            SyntheticHead.surface_points(6000, 2).into_iter().map(|p| SyntheticHead.material(p)).collect();
-        for material in [Material::Skin, Material::Eye, Material::Hair, Material::Garment] {
+            SyntheticHead.surface_points(6000, 2).into_iter().map(|p| parts(p - OFFSET).material()).collect();
+        for material in [HeadMaterial::Skin, HeadMaterial::Eye, HeadMaterial::Hair, HeadMaterial::Garment] {
             assert!(shown.contains(&material), "{material:?}");
         }
     }
