@@ -5,10 +5,10 @@
 //! RAYON_NUM_THREADS=1 cargo bench --bench iface_step
 //! ```
 //!
-//! The published networks: no colour skip, one sharpness (a whole draft takes a seventh more CPU time with both).
+//! The published networks: no color skip, one sharpness (a whole draft takes a seventh more CPU time with both).
 //!
 //! 32 768 samples (256 rays of 128), 16 levels of 2 features, tables of 2¹⁹ entries, base 16, growth
-//! 1.447; colour, mask and eikonal losses, backward to every parameter, AdamW. CPU time (user + system of
+//! 1.447; color, mask and eikonal losses, backward to every parameter, AdamW. CPU time (user + system of
 //! the process) is what is compared: it does not depend on what else the machine does.
 
 mod process;
@@ -16,6 +16,7 @@ mod process;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use process::cpu_s;
 use std::sync::Arc;
+use tiface::field::parameters::Parameter;
 use tiface::field::{self, ops};
 use tiface::kernel::adam::{AdamStep, adam};
 use tiface::kernel::hash;
@@ -117,15 +118,14 @@ fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 5]) {
     lap(3);
 }
 
-/// The step as training runs it: burn modules, losses in tensors, fused operations.
-fn fused(i: &Input, device: &Device, table: &mut [Option<Tensor<2>>; 3], flat: &Tensor<1>) {
+/// The step as training runs it: losses in tensors, fused operations.
+fn fused(i: &Input, device: &Device, table: &mut Parameter, flat: &Tensor<1>) {
     let t = |v: &[[f32; 3]]| -> Tensor<2> {
         field::tensor(bytemuck::cast_slice(v).to_vec(), [v.len(), 3], device).autodiff()
     };
     let one = |v: &[f32]| -> Tensor<1> { field::tensor(v.to_vec(), [v.len()], device).autodiff() };
-    let p = table[0].take().expect("kept").autodiff().require_grad();
     let inv_s = one(&[20.0]).require_grad();
-    let out = ops::sdf_field(p.clone(), flat.clone(), t(&i.x), t(&i.d), i.shape.clone());
+    let out = ops::sdf_field(table.flat(), flat.clone(), t(&i.x), t(&i.d), i.shape.clone());
     let bundle = ops::RaySamples {
         direction: t(&i.directions),
         t: one(&i.t),
@@ -136,10 +136,7 @@ fn fused(i: &Input, device: &Device, table: &mut [Option<Tensor<2>>; 3], flat: &
     let composed = ops::neus(out.clone(), inv_s, bundle, 0.5);
     let loss = losses(composed, out.narrow(1, 1, 3));
     let mut grads = loss.backward();
-    let g = p.grad_remove(&mut grads).expect("the table took part");
-    let [_, m, v] = [0, 1, 2].map(|k| table[k].take());
-    let (p, m, v) = ops::adam_step(p.inner(), m.expect("kept"), v.expect("kept"), g, STEP);
-    *table = [Some(p), Some(m), Some(v)];
+    table.update(&mut grads, STEP);
 }
 
 fn losses(composed: Tensor<2>, gradient: Tensor<2>) -> Tensor<1> {
@@ -274,7 +271,7 @@ fn main() {
         println!("{name} {ms:7.1} CPU ms: {:.0} k samples per core-second", N as f64 / ms);
         ms
     };
-    let mut table = tables();
+    let mut table = Parameter::new("table", &[2 * entries], i.table.clone(), &device);
     let step = time("training step    ", repeat, &mut || fused(&i, &device, &mut table, &flat));
     let mut table = tables();
     let q = plain_input(&i, &device);

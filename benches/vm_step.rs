@@ -6,7 +6,7 @@
 //! ```
 //!
 //! The published settings for heads: density 16, 4, 4, appearance 48, 12, 12 channels, basis 72 → 27, decoder
-//! 30 → 128 → 128 → 3, 4096 rays, step ratio 0.5; colour and mask loss, total variation of both grids,
+//! 30 → 128 → 128 → 3, 4096 rays, step ratio 0.5; color and mask loss, total variation of both grids,
 //! backward to every parameter, Adam. Ours is the step as training runs it: fused operations, empty space
 //! skipped before the field is touched. Plain is the published algorithm in burn tensors on the same device,
 //! the whole batch at once as published; `pieces` is the same with 512 rays at a time and gradients added up,
@@ -23,7 +23,6 @@ mod plain;
 #[path = "vm_step/scene.rs"]
 mod scene;
 
-use burn::module::Param;
 use burn::tensor::{Device, Tensor};
 use plain::{Counts, Plain};
 use process::{cpu_s, peak_gib};
@@ -32,7 +31,7 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use tiface::field::ops::{self, GridPenalty, VmBatch};
-use tiface::field::optimizer::{Moments, update};
+use tiface::field::parameters::Parameter;
 use tiface::field::{tensor, values};
 use tiface::kernel::adam::AdamStep;
 use tiface::kernel::vm::{self, Penalty};
@@ -57,7 +56,7 @@ const GRID: AdamStep = AdamStep {
 };
 const NETWORK: AdamStep = AdamStep { lr: 1e-8, ..GRID };
 
-/// Colour and mask losses of the rays `own`, as their part of the whole batch's. `out` is `[own, 5]`.
+/// Color and mask losses of the rays `own`, as their part of the whole batch's. `out` is `[own, 5]`.
 pub fn losses(out: Tensor<2>, s: &Scene, own: Range<usize>, device: &Device) -> Tensor<1> {
     let (n, all) = (own.len(), s.rays.len());
     let target: Tensor<2> = tensor(s.target[3 * own.start..3 * own.end].to_vec(), [n, 3], device).autodiff();
@@ -70,8 +69,7 @@ pub fn losses(out: Tensor<2>, s: &Scene, own: Range<usize>, device: &Device) -> 
 
 /// The step as training runs it.
 struct Ours {
-    params: [Param<Tensor<1>>; 3],
-    moments: [Moments<1>; 3],
+    parameters: [Parameter; 3],
     batch: Arc<VmBatch>,
     penalties: [Arc<GridPenalty>; 2],
 }
@@ -81,21 +79,19 @@ impl Ours {
         let mut field = s.field.clone();
         field.mask = field.mask.filter(|_| masked);
         let penalty = Penalty { tv, ..Penalty::default() };
-        let param =
-            |v: &Vec<f32>| Param::from_tensor(tensor(v.clone(), [v.len()], device).autodiff().require_grad());
-        let all = [&s.density, &s.color, &s.network];
+        let parameter = |(name, v): (_, &Vec<f32>)| Parameter::new(name, &[v.len()], v.clone(), device);
+        let all = [("density", &s.density), ("color", &s.color), ("network", &s.network)];
         Ours {
-            params: all.map(param),
-            moments: all.map(|v| Moments::zeros([v.len()], device)),
+            parameters: all.map(parameter),
             penalties: [field.density, field.color].map(|grid| Arc::new(GridPenalty { grid, penalty })),
             batch: Arc::new(VmBatch::new(Arc::new(field), s.rays.clone())),
         }
     }
 
     fn forward(&self) -> Tensor<2> {
-        let [density, color, network] = [0, 1, 2].map(|i| self.params[i].val());
-        let density = ops::penalised(density, self.penalties[0].clone());
-        let color = ops::penalised(color, self.penalties[1].clone());
+        let [density, color, network] = self.parameters.each_ref().map(|p| p.flat());
+        let density = ops::penalized(density, self.penalties[0].clone());
+        let color = ops::penalized(color, self.penalties[1].clone());
         ops::vm_render(density, color, network, self.batch.clone())
     }
 
@@ -107,8 +103,8 @@ impl Ours {
         let mut gradients = loss.backward();
         drop(loss);
         let backward = cpu_s();
-        for (i, step) in [GRID, GRID, NETWORK].into_iter().enumerate() {
-            update(&mut self.params[i], &mut self.moments[i], &mut gradients, step);
+        for (p, step) in self.parameters.iter_mut().zip([GRID, GRID, NETWORK]) {
+            p.update(&mut gradients, step);
         }
         let adam = cpu_s();
         for (part, s) in parts.iter_mut().zip([forward - start, backward - forward, adam - backward]) {
@@ -119,13 +115,13 @@ impl Ours {
 
 /// Both ways must give the same rays and gradients: no error above a thousandth of the largest value.
 ///
-/// A sample's gradient jumps where its weight passes the colour threshold, its feature passes zero or a hidden
+/// A sample's gradient jumps where its weight passes the color threshold, its feature passes zero or a hidden
 /// unit its kink, so `s` must have no ray on which rounding decides such a case.
 fn compare(s: &Scene, masked: bool, tv: f32, device: &Device, plain: (Tensor<2>, Vec<Tensor<2>>)) {
     let ours = Ours::new(s, masked, tv, device);
     let out = ours.forward();
     let gradients = losses(out.clone(), s, 0..s.rays.len(), device).backward();
-    let own = [0, 1, 2].map(|i| values(ours.params[i].val().grad(&gradients).expect("took part")));
+    let own = ours.parameters.each_ref().map(|p| values(p.flat().grad(&gradients).expect("took part")));
     let wanted = plain::flat(&plain.1);
     let column = |t: &Tensor<2>, c: Range<usize>| values(t.clone().narrow(1, c.start, c.len()));
     let out = out.inner();
@@ -170,11 +166,11 @@ fn time_ours(s: &Scene, masked: bool, repeat: usize, device: &Device) -> (f64, S
     let f = &s.field;
     let penalty = Penalty { tv: TV, ..Penalty::default() };
     let (mut a, mut b) = (vec![0.0; s.density.len()], vec![0.0; s.color.len()]);
-    vm::penalise(&f.color, &penalty, &s.color, &mut b);
+    vm::penalize(&f.color, &penalty, &s.color, &mut b);
     let start = cpu_s();
     for _ in 0..repeat {
-        vm::penalise(&f.density, &penalty, &s.density, &mut a);
-        vm::penalise(&f.color, &penalty, &s.color, &mut b);
+        vm::penalize(&f.density, &penalty, &s.density, &mut a);
+        vm::penalize(&f.color, &penalty, &s.color, &mut b);
     }
     let penalty = 1e3 * (cpu_s() - start) / repeat as f64;
     let [forward, backward, adam] = parts.map(|p| 1e3 * p / repeat as f64);
@@ -227,7 +223,7 @@ fn regime(name: &str, size: [usize; 3], peak: f32, repeat: usize, device: &Devic
     let per = |n: u64| n as f64 / RAYS as f64;
     println!(
         "  a ray: {} lattice steps, {:.1} in the box, {:.1} in the mask, {:.1} looked up until its light is exactly 0 \
-         ({:.1} % skipped), {:.1} colours",
+         ({:.1} % skipped), {:.1} colors",
         s.field.lattice.samples,
         per(lattice),
         per(counts.density as u64),
@@ -236,7 +232,7 @@ fn regime(name: &str, size: [usize; 3], peak: f32, repeat: usize, device: &Devic
         per(color)
     );
     println!(
-        "  plain counts: {} in the box, {} densities, {} colours",
+        "  plain counts: {} in the box, {} densities, {} colors",
         counts.inside, counts.density, counts.color
     );
     rate("ours", ours, lattice as f64, &parts);

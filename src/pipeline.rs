@@ -41,9 +41,9 @@ mod tiles;
 mod truth;
 
 pub use crate::config::Stage;
+pub use crate::geom::RayResult;
 pub use export::Export;
 pub use line::{Line, capture_options, feasible};
-pub use march::Seen;
 pub use mask::{click_page, disagreements};
 pub use mesh::export_head;
 pub use surface::{Fields, Radiance, Surface};

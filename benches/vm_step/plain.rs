@@ -25,7 +25,7 @@ pub struct Counts {
     pub inside: usize,
     /// Those whose density was evaluated.
     pub density: usize,
-    /// Those whose colour was.
+    /// Those whose color was.
     pub color: usize,
 }
 
@@ -141,7 +141,7 @@ impl Plain {
         Marched { direction, t, flat, ids, feature, weight }
     }
 
-    /// Colours `[m, 3]` where they are seen, with both hidden layers before their relu `[m, hidden]`.
+    /// Colors `[m, 3]` where they are seen, with both hidden layers before their relu `[m, hidden]`.
     fn decode(&self, s: &Scene, marched: &Marched) -> (Tensor<1, Int>, [Tensor<2>; 3]) {
         let [r, k] = marched.weight.dims();
         let seen = marched.weight.clone().inner().greater_elem(s.field.shading.weight_threshold);
@@ -171,7 +171,7 @@ impl Plain {
         Tensor::cat(vec![color, weight.sum_dim(1), depth], 1)
     }
 
-    /// Rays with a sample so near the colour threshold, no density, or a hidden unit's kink that rounding
+    /// Rays with a sample so near the color threshold, no density, or a hidden unit's kink that rounding
     /// decides what its gradient is.
     pub fn undecided(&self, s: &Scene, device: &Device) -> Vec<bool> {
         // the finer the grid, the more a rounded position moves a feature
@@ -229,7 +229,7 @@ impl Plain {
         })
     }
 
-    /// Output `[rays, 5]` and the gradient of every leaf, of colour and mask losses and `tv` times the total
+    /// Output `[rays, 5]` and the gradient of every leaf, of color and mask losses and `tv` times the total
     /// variation of both grids. Rays go in pieces of `chunk`, their gradients are added up.
     pub fn gradients(
         &self,

@@ -1,7 +1,8 @@
 //! A field with the content of a head, and rays of cameras around it; everything from fixed seeds.
 
+use tiface::kernel::march::MarchRay;
 use tiface::kernel::rng;
-use tiface::kernel::vm::mask::{BoxMask, Lattice, VmRay};
+use tiface::kernel::vm::mask::{BoxMask, Lattice};
 use tiface::kernel::vm::{self, DecoderShape, Grid, PLANE_AXES, Shading, VmField};
 
 /// Extent of the published box, world units.
@@ -20,7 +21,7 @@ pub struct Scene {
     pub density: Vec<f32>,
     pub color: Vec<f32>,
     pub network: Vec<f32>,
-    pub rays: Vec<VmRay>,
+    pub rays: Vec<MarchRay>,
     /// `[rays, 3]`
     pub target: Vec<f32>,
     /// `[rays]`: 1 where the matte is empty, else 0.
@@ -120,7 +121,7 @@ fn alpha_mask(s: &Scene) -> BoxMask {
 }
 
 /// Rays of 24 cameras on a dome, 3.5 half extents from the box's middle, that meet the box.
-fn batch(count: usize) -> (Vec<VmRay>, Vec<f32>, Vec<f32>) {
+fn batch(count: usize) -> (Vec<MarchRay>, Vec<f32>, Vec<f32>) {
     let mut rays = Vec::with_capacity(count);
     let (mut target, mut background) = (Vec::new(), Vec::new());
     let half = EXTENT.map(|e| 0.5 * e);
@@ -139,7 +140,7 @@ fn batch(count: usize) -> (Vec<VmRay>, Vec<f32>, Vec<f32>) {
         let toward: [f32; 3] = std::array::from_fn(|a| aim[a] - origin[a]);
         let length = toward.iter().map(|c| c * c).sum::<f32>().sqrt();
         let direction = toward.map(|c| c / length);
-        let ray = VmRay { origin, direction, jitter: u(3) };
+        let ray = MarchRay { origin, direction, jitter: u(3) };
         let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
         for a in 0..3 {
             let (p, q) = ((-half[a] - origin[a]) / direction[a], (half[a] - origin[a]) / direction[a]);

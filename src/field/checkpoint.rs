@@ -1,12 +1,28 @@
-//! Checkpoints of a training on disk: two files take turns, so that the newest complete one is never
-//! replaced before its successor is there, and one that fails its checks falls back to the other.
+//! Checkpoints: everything a training needs to go on, in one safetensors file, for every field.
+//!
+//! Tensors by name (`model.`, `first.` and `second.` for the optimizer's moments, and what else a field keeps)
+//! stand beside a header of texts: `format`, `identity` (what shaped the training: settings, inputs, seed),
+//! `finished`, `step` and what else a field counts. Two files take turns, so that the newest complete one is
+//! never replaced before its successor is there, and one that fails its checks falls back to the other.
 
-use crate::io::{ReadError, TensorValues, WriteError, is_file, remove, rename, write_tensors};
+use crate::io::{
+    Limits, ReadError, TensorValues, Tensors, is_file, read_tensors, remove, rename, write_tensors,
+};
+use crate::{Error, Result};
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
-/// Where the newest checkpoint of a stage folder lies.
+/// The checkpoint of one training, in memory.
+#[derive(Debug)]
+pub struct Checkpoint {
+    path: PathBuf,
+    stage: &'static str,
+    tensors: BTreeMap<String, (Vec<usize>, TensorValues)>,
+    header: BTreeMap<String, String>,
+}
+
+/// Returns the path of a stage folder's newest checkpoint.
 pub fn newest(dir: &Path) -> PathBuf {
     dir.join("checkpoint.safetensors")
 }
@@ -15,108 +31,227 @@ fn previous(dir: &Path) -> PathBuf {
     dir.join("checkpoint.previous.safetensors")
 }
 
-/// Writes the next checkpoint; the newest becomes the previous one.
-pub fn save(
-    dir: &Path,
-    tensors: &[(String, Vec<usize>, TensorValues)],
-    metadata: &BTreeMap<String, String>,
-) -> Result<(), WriteError> {
-    let path = newest(dir);
-    let next = dir.join("checkpoint.next.safetensors");
-    write_tensors(&next, tensors, metadata)?;
-    if is_file(&path) {
-        rename(&path, &previous(dir))?;
-    }
-    rename(&next, &path)
-}
-
 /// Removes the older checkpoint: training is complete, the newest is all anyone needs.
-pub fn finish(dir: &Path) -> Result<(), WriteError> {
-    remove(&previous(dir))
+pub fn finish(dir: &Path) -> Result<()> {
+    Ok(remove(&previous(dir))?)
 }
 
-/// A whole number of a checkpoint's metadata. One that no training can have written counts as damage: the
-/// checkpoint before it is taken.
-pub fn number(
-    path: &Path,
-    metadata: &BTreeMap<String, String>,
-    key: &str,
-    range: RangeInclusive<u64>,
-) -> Result<u64, ReadError> {
-    let expected = || format!("a whole number from {} to {}", range.start(), range.end());
-    let Some(text) = metadata.get(key) else {
-        return Err(ReadError::value(path, key, "missing", expected()));
-    };
-    match text.parse().ok().filter(|n| range.contains(n)) {
-        Some(n) => Ok(n),
-        None => Err(ReadError::value(path, key, format!("`{text}`"), expected())),
+/// What to do where neither checkpoint of a stage can be taken.
+fn afresh(stage: &str) -> String {
+    format!("start the stage afresh with `--fresh {stage}`")
+}
+
+fn unreadable(e: ReadError, stage: &str) -> Error {
+    let hint = if matches!(e, ReadError::Io { .. }) { e.hint() } else { afresh(stage) };
+    Error::cannot(e, hint)
+}
+
+impl Checkpoint {
+    /// Returns a checkpoint without tensors. `stage` is the table of the settings, for messages; `identity`
+    /// names what shaped the training.
+    pub fn new(stage: &'static str, format: &str, identity: &str) -> Checkpoint {
+        let mut empty =
+            Checkpoint { path: PathBuf::new(), stage, tensors: BTreeMap::new(), header: BTreeMap::new() };
+        empty.set("format", format);
+        empty.set("identity", identity);
+        empty
     }
-}
 
-/// The running mean of the squared colour error, kept bit by bit.
-pub fn mean_square(path: &Path, metadata: &BTreeMap<String, String>) -> Result<f64, ReadError> {
-    let key = "mean_square";
-    let value = f64::from_bits(number(path, metadata, key, 0..=u64::MAX)?);
-    if value.is_finite() && value >= 0.0 {
-        return Ok(value);
+    /// Reads one file of this format.
+    pub fn read(path: &Path, stage: &'static str, format: &str) -> Result<Checkpoint> {
+        let content = read_tensors(path, &Limits::default()).map_err(|e| unreadable(e, stage))?;
+        Checkpoint::understand(path, stage, format, content)
     }
-    Err(ReadError::value(path, key, value, "the bits of a finite number, 0 or more"))
-}
 
-/// Mean squares of gradients, of which roots are taken.
-pub fn second_moments(path: &Path, name: &str, values: Vec<f32>) -> Result<Vec<f32>, ReadError> {
-    match values.iter().position(|v| *v < 0.0) {
-        None => Ok(values),
-        Some(i) => {
-            let found = format!("{} at index {i}", values[i]);
-            Err(ReadError::value(path, format!("tensor {name}"), found, "numbers, 0 or more"))
+    fn understand(
+        path: &Path,
+        stage: &'static str,
+        format: &str,
+        (tensors, header): Tensors,
+    ) -> Result<Checkpoint> {
+        let file = Checkpoint { path: path.into(), stage, tensors, header };
+        match file.text("format")? {
+            found if found == format => Ok(file),
+            found => Err(file.wrong(format!("format is `{found}`, this build reads `{format}`"))),
+        }
+    }
+
+    /// Sets an entry of the header.
+    pub fn set(&mut self, key: &str, value: impl ToString) {
+        self.header.insert(key.into(), value.to_string());
+    }
+
+    /// Adds a tensor.
+    pub fn put(&mut self, name: &str, shape: &[usize], values: TensorValues) {
+        self.tensors.insert(name.into(), (shape.to_vec(), values));
+    }
+
+    /// Adds a tensor of floats.
+    pub fn put_floats(&mut self, name: &str, shape: &[usize], values: Vec<f32>) {
+        self.put(name, shape, TensorValues::F32(values));
+    }
+
+    /// Adds a vector of whole numbers.
+    pub fn put_words(&mut self, name: &str, values: Vec<u64>) {
+        self.put(name, &[values.len()], TensorValues::U64(values));
+    }
+
+    /// Writes it as the newest of a stage folder; the one that was becomes the previous one.
+    pub fn save(self, dir: &Path) -> Result<()> {
+        let path = newest(dir);
+        let next = dir.join("checkpoint.next.safetensors");
+        let tensors: Vec<_> = self.tensors.into_iter().map(|(name, (shape, v))| (name, shape, v)).collect();
+        write_tensors(&next, &tensors, &self.header)?;
+        if is_file(&path) {
+            rename(&path, &previous(dir))?;
+        }
+        Ok(rename(&next, &path)?)
+    }
+
+    /// Returns the error that it does not belong to the model that reads it.
+    pub fn wrong(&self, reason: String) -> Error {
+        Error::cannot(format!("`{}`: {reason}", self.path.display()), afresh(self.stage))
+    }
+
+    /// Returns an entry of the header.
+    pub fn text(&self, key: &str) -> Result<&str> {
+        let text = self.header.get(key).map(|text| text.as_str());
+        text.ok_or_else(|| self.wrong(format!("its metadata has no `{key}`")))
+    }
+
+    /// Returns a whole number of the header; one that no training can have written is an error.
+    pub fn number(&self, key: &str, range: RangeInclusive<u64>) -> Result<u64> {
+        let found = self.header.get(key);
+        found.and_then(|text| text.parse().ok()).filter(|n| range.contains(n)).ok_or_else(|| {
+            let found = found.map_or("missing".into(), |text| format!("`{text}`"));
+            let expected = format!("a whole number from {} to {}", range.start(), range.end());
+            self.unexpected(key, found, expected)
+        })
+    }
+
+    fn unexpected(&self, key: &str, found: impl ToString, expected: impl Into<String>) -> Error {
+        Error::cannot(ReadError::value(&self.path, key, found, expected), afresh(self.stage))
+    }
+
+    /// Returns whether it holds a tensor.
+    pub fn has(&self, name: &str) -> bool {
+        self.tensors.contains_key(name)
+    }
+
+    /// Takes a tensor of floats of exactly this shape out of it.
+    pub fn floats(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
+        match self.tensors.remove(name) {
+            None => Err(self.wrong(format!("tensor `{name}` is missing"))),
+            Some((found, _)) if found != shape => {
+                Err(self.wrong(format!("tensor `{name}` has shape {found:?}, expected {shape:?}")))
+            }
+            Some((_, TensorValues::F32(values))) => Ok(values),
+            Some(_) => Err(self.wrong(format!("tensor `{name}` is not f32"))),
+        }
+    }
+
+    /// Takes a tensor of numbers that are never negative, as mean squares are, of which roots are taken.
+    pub fn squares(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
+        let values = self.floats(name, shape)?;
+        match values.iter().position(|v| *v < 0.0) {
+            None => Ok(values),
+            Some(i) => {
+                let found = format!("{} at index {i}", values[i]);
+                Err(self.unexpected(&format!("tensor {name}"), found, "numbers, 0 or more"))
+            }
+        }
+    }
+
+    /// Takes a vector of whole numbers out of it.
+    pub fn words(&mut self, name: &str) -> Result<Vec<u64>> {
+        match self.tensors.remove(name) {
+            Some((_, TensorValues::U64(values))) => Ok(values),
+            _ => Err(self.wrong(format!("tensor `{name}` is missing or of another type"))),
         }
     }
 }
 
-/// The way out where neither checkpoint of a stage can be read.
-pub fn way_out(e: &ReadError, stage: &str) -> String {
-    match e {
-        ReadError::Io { .. } => e.hint(),
-        _ => format!("start the stage afresh with `--fresh {stage}`"),
+/// How far a training has come.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Progress {
+    /// Optimizer steps done.
+    pub step: u64,
+    /// Running mean of the squared color error, for the PSNR that is shown.
+    pub mean_square: f64,
+    /// Mixed into the seed: 1 after a step that diverged, so that other rays are drawn.
+    pub salt: u64,
+}
+
+impl Progress {
+    /// PSNR of the last batches, dB.
+    pub fn psnr(&self) -> f64 {
+        -10.0 * self.mean_square.max(1e-12).log10()
+    }
+
+    /// Puts it into a checkpoint; the running mean bit by bit.
+    pub fn save(&self, into: &mut Checkpoint, finished: bool) {
+        into.set("step", self.step);
+        into.set("mean_square", self.mean_square.to_bits());
+        into.set("salt", self.salt);
+        into.set("finished", u64::from(finished));
+    }
+
+    /// Takes it out of a checkpoint of a training of `steps`, and whether that was finished.
+    pub fn restore(from: &Checkpoint, steps: u64) -> Result<(Progress, bool)> {
+        // the format's first writers knew no `finished`
+        let finished = from.header.contains_key("finished") && from.number("finished", 0..=1)? == 1;
+        // a finished one may have no moments to go on with
+        let step = from.number("step", if finished { steps } else { 0 }..=steps)?;
+        let key = "mean_square";
+        let mean_square = f64::from_bits(from.number(key, 0..=u64::MAX)?);
+        if !mean_square.is_finite() || mean_square < 0.0 {
+            let expected = "the bits of a finite number, 0 or more";
+            return Err(from.unexpected(key, mean_square, expected));
+        }
+        Ok((Progress { step, mean_square, salt: from.number("salt", 0..=1)? }, finished))
     }
 }
 
-/// The newest readable checkpoint of a stage folder, with what was wrong with a newer one; `None` where
-/// there is none at all.
-///
-/// `read` reads one file; `read_error` is the [`ReadError`] in one of its errors, if that is what it is.
-pub fn restore<S, E: std::fmt::Display + From<WriteError>>(
+/// Takes the newest checkpoint of a stage folder that `read` accepts, with what was wrong with a newer one;
+/// `None` where there is none at all. One of another identity is refused.
+pub fn restore<T>(
     dir: &Path,
-    read: impl Fn(&Path) -> Result<S, E>,
-    read_error: impl Fn(&E) -> Option<&ReadError>,
-) -> Result<Option<(S, Vec<String>)>, E> {
+    stage: &'static str,
+    format: &str,
+    identity: &str,
+    mut read: impl FnMut(&mut Checkpoint) -> Result<T>,
+) -> Result<Option<(T, Vec<String>)>> {
     let mut warnings = Vec::new();
     let mut failure = None;
     for path in [newest(dir), previous(dir)] {
         if !is_file(&path) {
             continue;
         }
-        match read(&path) {
+        let content = match read_tensors(&path, &Limits::default()) {
+            // a disk that does not answer is no damaged file: nothing may be lost over it
+            Err(e @ (ReadError::Io { .. } | ReadError::TooLarge { .. })) => return Err(unreadable(e, stage)),
+            content => content.map_err(|e| unreadable(e, stage)),
+        };
+        let state = content.and_then(|content| {
+            let mut file = Checkpoint::understand(&path, stage, format, content)?;
+            if file.text("identity")? != identity {
+                return Err(file.wrong("it was trained with other settings or inputs".into()));
+            }
+            read(&mut file)
+        });
+        match state {
             Ok(state) => {
-                // a damaged newest one must not take this one's place at the next save
-                if path != newest(dir) && failure.as_ref().and_then(&read_error).is_some() {
+                // one that cannot be taken must not take this one's place at the next save
+                if failure.is_some() {
                     remove(&newest(dir))?;
                 }
                 return Ok(Some((state, warnings)));
             }
             Err(e) => {
-                // a disk that does not answer is no damaged file: nothing may be lost over it
-                if matches!(read_error(&e), Some(ReadError::Io { .. } | ReadError::TooLarge { .. })) {
-                    return Err(e);
-                }
                 warnings.push(format!("{e}; falling back to the checkpoint before it"));
                 failure.get_or_insert(e);
             }
         }
     }
-    match failure {
-        Some(e) => Err(e),
-        None => Ok(None),
-    }
+    failure.map_or(Ok(None), Err)
 }

@@ -5,15 +5,15 @@
 //! [`super::autodiff`]: it may have associated types, which the macro could not see.
 
 use crate::kernel::adam::{self, AdamStep};
+use crate::kernel::march::MarchRay;
 use crate::kernel::mlp::Weights;
 use crate::kernel::neus::{self, Rays};
-use crate::kernel::sdf::{self, Activations, FieldShape};
-use crate::kernel::vm::mask::VmRay;
-use crate::kernel::vm::{self, DecoderWeights, Grid, Penalty, Rendered, VmField};
+use crate::kernel::sdf::{self, FieldShape};
+use crate::kernel::vm::{self, DecoderWeights, Grid, Penalty, VmField};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Dispatch, Flex, TensorMetadata, backend_extension};
 use burn::tensor::{DType, Int, Tensor, TensorData};
-use std::fmt::Debug;
+use std::fmt::{self, Debug};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -48,8 +48,8 @@ pub trait FieldOps: Backend {
         batch: Arc<VmBatch>,
     ) -> FloatTensor<Self>;
 
-    /// See [`penalised`].
-    fn penalised(x: FloatTensor<Self>, penalty: Arc<GridPenalty>) -> FloatTensor<Self>;
+    /// See [`penalized`].
+    fn penalized(x: FloatTensor<Self>, penalty: Arc<GridPenalty>) -> FloatTensor<Self>;
 
     /// See [`adam_step`].
     fn adam_step(
@@ -61,49 +61,54 @@ pub trait FieldOps: Backend {
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
 }
 
-/// What only concrete backends have: forwards that keep what the backward needs.
+/// The backward of one evaluated operation: from the gradient of its output to those of its `N` inputs.
+///
+/// It owns what the forward kept on its device, and gives that up when it is applied.
+pub struct Pullback<B: Backend, const N: usize>(Arc<Mutex<Option<BoxedPullback<B, N>>>>);
+
+type BoxedPullback<B, const N: usize> = Box<dyn FnOnce(FloatTensor<B>) -> [FloatTensor<B>; N] + Send>;
+
+/// The output of an operation, and its backward.
+pub type Evaluated<B, const N: usize> = (FloatTensor<B>, Pullback<B, N>);
+
+impl<B: Backend, const N: usize> Pullback<B, N> {
+    /// Wraps the backward.
+    pub fn new(backward: impl FnOnce(FloatTensor<B>) -> [FloatTensor<B>; N] + Send + 'static) -> Self {
+        Pullback(Arc::new(Mutex::new(Some(Box::new(backward)))))
+    }
+
+    /// Returns the gradients of the inputs.
+    pub fn apply(&self, g: FloatTensor<B>) -> [FloatTensor<B>; N] {
+        let backward = self.0.lock().expect("no panic while it is locked").take();
+        backward.expect("a graph is walked back once")(g)
+    }
+}
+
+impl<B: Backend, const N: usize> Clone for Pullback<B, N> {
+    fn clone(&self) -> Self {
+        Pullback(self.0.clone())
+    }
+}
+
+impl<B: Backend, const N: usize> Debug for Pullback<B, N> {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("Pullback")
+    }
+}
+
+/// What only concrete backends have: forwards that come with their backward.
 pub trait FieldKernels: FieldOps {
-    /// Kept by [`FieldKernels::sdf_field_forward`].
-    type SavedField: Clone + Send + Debug + 'static;
-    /// Kept by [`FieldKernels::neus_forward`].
-    type SavedRays: Clone + Send + Debug + 'static;
-    /// Kept by [`FieldKernels::vm_render_forward`].
-    type SavedVm: Clone + Send + Debug + 'static;
-
-    /// [`vm_render`] that remembers.
-    fn vm_render_forward(
-        density: FloatTensor<Self>,
-        color: FloatTensor<Self>,
-        network: FloatTensor<Self>,
-        batch: Arc<VmBatch>,
-    ) -> (FloatTensor<Self>, Self::SavedVm);
-
-    /// Gradients by density, appearance and network.
-    fn vm_render_backward(
-        saved: Self::SavedVm,
-        g: FloatTensor<Self>,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
-
-    /// The gradient `g` of the values `x` with the penalty's own added.
-    fn penalise(x: FloatTensor<Self>, g: FloatTensor<Self>, penalty: &GridPenalty) -> FloatTensor<Self>;
-
-    /// [`sdf_field`] that remembers.
-    fn sdf_field_forward(
+    /// [`sdf_field`]; gradients by table and weights.
+    fn evaluate_sdf_field(
         table: FloatTensor<Self>,
         weights: FloatTensor<Self>,
         x: FloatTensor<Self>,
         direction: FloatTensor<Self>,
         shape: Arc<FieldShape>,
-    ) -> (FloatTensor<Self>, Self::SavedField);
+    ) -> Evaluated<Self, 2>;
 
-    /// Gradients by table and weights.
-    fn sdf_field_backward(
-        saved: Self::SavedField,
-        g: FloatTensor<Self>,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>);
-
-    /// [`neus()`] that remembers.
-    fn neus_forward(
+    /// [`neus()`]; gradients by field and `inv_s`.
+    fn evaluate_neus(
         field: FloatTensor<Self>,
         inv_s: FloatTensor<Self>,
         direction: FloatTensor<Self>,
@@ -111,21 +116,29 @@ pub trait FieldKernels: FieldOps {
         dt: FloatTensor<Self>,
         offsets: IntTensor<Self>,
         anneal: f32,
-    ) -> (FloatTensor<Self>, Self::SavedRays);
+    ) -> Evaluated<Self, 2>;
 
-    /// Gradients by field and `inv_s`.
-    fn neus_backward(saved: Self::SavedRays, g: FloatTensor<Self>) -> (FloatTensor<Self>, FloatTensor<Self>);
+    /// [`vm_render`]; gradients by density, appearance and network.
+    fn evaluate_vm_render(
+        density: FloatTensor<Self>,
+        color: FloatTensor<Self>,
+        network: FloatTensor<Self>,
+        batch: Arc<VmBatch>,
+    ) -> Evaluated<Self, 3>;
+
+    /// [`penalized`]; the gradient with the penalty's own added.
+    fn evaluate_penalized(x: FloatTensor<Self>, penalty: Arc<GridPenalty>) -> Evaluated<Self, 1>;
 }
 
 /// The fused signed-distance field: see [`crate::kernel::sdf`].
 ///
 /// # Shapes
 ///
-/// - table: `[entries, 2]`; weights: `[P]` as [`crate::kernel::mlp::Layout`] describes
+/// - table: `[2 · entries]`; weights: `[P]` as [`crate::kernel::mlp::Layout`] describes
 /// - x: `[n, 3]` in the field's box; direction: `[n, 3]` unit
 /// - output: `[n, 8]` = sdf, ∇sdf (3), rgb (3), ln of the local sharpness's share; differentiable by table and weights
 pub fn sdf_field(
-    table: Tensor<2>,
+    table: Tensor<1>,
     weights: Tensor<1>,
     x: Tensor<2>,
     direction: Tensor<2>,
@@ -177,21 +190,21 @@ pub struct VmBatch {
     /// Grids, box, lattice and mask.
     pub field: Arc<VmField>,
     /// `[rays]`
-    pub rays: Vec<VmRay>,
+    pub rays: Vec<MarchRay>,
     /// Filled by the forward: densities looked up.
     pub density_samples: AtomicU64,
-    /// Filled by the forward: colours decoded.
+    /// Filled by the forward: colors decoded.
     pub color_samples: AtomicU64,
 }
 
 impl VmBatch {
     /// A batch that nothing is known about yet.
-    pub fn new(field: Arc<VmField>, rays: Vec<VmRay>) -> VmBatch {
+    pub fn new(field: Arc<VmField>, rays: Vec<MarchRay>) -> VmBatch {
         VmBatch { field, rays, density_samples: AtomicU64::new(0), color_samples: AtomicU64::new(0) }
     }
 }
 
-/// A regulariser of one grid.
+/// A regularizer of one grid.
 #[derive(Clone, Copy, Debug)]
 pub struct GridPenalty {
     /// Layout of the values.
@@ -218,10 +231,9 @@ pub fn vm_render(density: Tensor<1>, color: Tensor<1>, network: Tensor<1>, batch
 /// The same values; whoever asks for their gradient gets the penalty's added to it.
 ///
 /// That is the loss with the penalty in it, without a second gradient of the size of the grid to be made
-/// and summed. The penalty's value is not part of any loss tensor: see
-/// [`crate::kernel::vm::total_variation`].
-pub fn penalised(x: Tensor<1>, penalty: Arc<GridPenalty>) -> Tensor<1> {
-    Tensor::from_dispatch(<Dispatch as FieldOps>::penalised(x.into_dispatch(), penalty))
+/// and summed. The penalty's value is not part of any loss tensor.
+pub fn penalized(x: Tensor<1>, penalty: Arc<GridPenalty>) -> Tensor<1> {
+    Tensor::from_dispatch(<Dispatch as FieldOps>::penalized(x.into_dispatch(), penalty))
 }
 
 /// One fused AdamW step: weights, first and second moments after it. In place where the tensors are
@@ -249,6 +261,11 @@ fn flex(values: Vec<f32>, shape: impl Into<Vec<usize>>) -> FlexTensor {
     FlexTensor::from_data(TensorData::new(values, shape.into()))
 }
 
+fn vector(values: Vec<f32>) -> FlexTensor {
+    let n = values.len();
+    flex(values, [n])
+}
+
 /// The tensor with its values in order at the start of its storage, copied only if they are not.
 fn contiguous(t: FlexTensor) -> FlexTensor {
     if t.is_contiguous() && t.layout().start_offset() == 0 { t } else { t.to_contiguous() }
@@ -262,15 +279,15 @@ fn rows<const N: usize>(t: &FlexTensor) -> &[[f32; N]] {
     bytemuck::cast_slice(slice(t))
 }
 
-/// Gradient buffers that are all zero and wait for the next step. The optimiser leaves a gradient zero
+/// Gradient buffers that are all zero and wait for the next step. The optimizer leaves a gradient zero
 /// where it touched it, so a step never pays for clearing the whole table.
 static ZEROED: Mutex<Vec<FlexTensor>> = Mutex::new(Vec::new());
 
-fn take_zeroed(shape: &[usize]) -> FlexTensor {
+fn take_zeroed(len: usize) -> FlexTensor {
     let mut free = ZEROED.lock().expect("no panic while the pool is locked");
-    match free.iter().position(|t| t.shape().to_vec() == shape) {
+    match free.iter().position(|t| t.shape().num_elements() == len) {
         Some(i) => free.swap_remove(i),
-        None => flex(vec![0.0; shape.iter().product()], shape),
+        None => vector(vec![0.0; len]),
     }
 }
 
@@ -287,6 +304,14 @@ fn give_back_zeroed(t: FlexTensor) {
     }
 }
 
+fn integers(t: IntTensor<Flex>) -> Vec<i32> {
+    let t = if t.is_contiguous() { t } else { t.to_contiguous() };
+    match t.dtype() {
+        DType::I32 => t.as_slice::<i32>().expect("contiguous").to_vec(),
+        _ => t.into_data().iter::<i64>().map(|v| v as i32).collect(),
+    }
+}
+
 impl FieldOps for Flex {
     fn sdf_field(
         table: FlexTensor,
@@ -295,7 +320,7 @@ impl FieldOps for Flex {
         direction: FlexTensor,
         shape: Arc<FieldShape>,
     ) -> FlexTensor {
-        Self::sdf_field_forward(table, weights, x, direction, shape).0
+        Self::evaluate_sdf_field(table, weights, x, direction, shape).0
     }
 
     fn neus(
@@ -307,7 +332,7 @@ impl FieldOps for Flex {
         offsets: IntTensor<Self>,
         anneal: f32,
     ) -> FlexTensor {
-        Self::neus_forward(field, inv_s, direction, t, dt, offsets, anneal).0
+        Self::evaluate_neus(field, inv_s, direction, t, dt, offsets, anneal).0
     }
 
     fn vm_render(
@@ -316,10 +341,10 @@ impl FieldOps for Flex {
         network: FlexTensor,
         batch: Arc<VmBatch>,
     ) -> FlexTensor {
-        Self::vm_render_forward(density, color, network, batch).0
+        Self::evaluate_vm_render(density, color, network, batch).0
     }
 
-    fn penalised(x: FlexTensor, _: Arc<GridPenalty>) -> FlexTensor {
+    fn penalized(x: FlexTensor, _: Arc<GridPenalty>) -> FlexTensor {
         x
     }
 
@@ -337,128 +362,29 @@ impl FieldOps for Flex {
     }
 }
 
-/// What the CPU keeps of a field evaluation.
-#[derive(Debug)]
-pub struct SavedField {
-    activations: Activations,
-    weights: Weights,
-    table: Vec<usize>,
-}
-
-/// What the CPU keeps of a compositing.
-#[derive(Clone, Debug)]
-pub struct SavedRays {
-    field: FlexTensor,
-    inv_s: f32,
-    direction: FlexTensor,
-    t: FlexTensor,
-    dt: FlexTensor,
-    offsets: Arc<Vec<i32>>,
-    anneal: f32,
-}
-
-impl SavedRays {
-    fn rays(&self) -> Rays<'_> {
-        Rays {
-            offsets: &self.offsets,
-            direction: rows(&self.direction),
-            t: slice(&self.t),
-            dt: slice(&self.dt),
-        }
-    }
-}
-
-/// What the CPU keeps of rays through a vector-matrix field.
-#[derive(Debug)]
-pub struct SavedVm {
-    density: FlexTensor,
-    color_len: usize,
-    weights: DecoderWeights,
-    batch: Arc<VmBatch>,
-    /// Taken by the backward, which works in its buffers.
-    rendered: Mutex<Option<Rendered>>,
-}
-
-fn integers(t: IntTensor<Flex>) -> Vec<i32> {
-    let t = if t.is_contiguous() { t } else { t.to_contiguous() };
-    match t.dtype() {
-        DType::I32 => t.as_slice::<i32>().expect("contiguous").to_vec(),
-        _ => t.into_data().iter::<i64>().map(|v| v as i32).collect(),
-    }
-}
-
 impl FieldKernels for Flex {
-    type SavedField = Arc<SavedField>;
-    type SavedRays = SavedRays;
-    type SavedVm = Arc<SavedVm>;
-
-    fn vm_render_forward(
-        density: FlexTensor,
-        color: FlexTensor,
-        network: FlexTensor,
-        batch: Arc<VmBatch>,
-    ) -> (FlexTensor, Self::SavedVm) {
-        let [density, color, network] = [density, color, network].map(contiguous);
-        let weights = DecoderWeights::new(batch.field.decoder, slice(&network));
-        let mut rendered = vm::render(&batch.field, slice(&density), slice(&color), &weights, &batch.rays);
-        batch.density_samples.store(rendered.density_samples, Ordering::Relaxed);
-        batch.color_samples.store(rendered.color_samples, Ordering::Relaxed);
-        let out = flex(std::mem::take(&mut rendered.out), [batch.rays.len(), vm::RAY_WIDTH]);
-        let color_len = color.shape().num_elements();
-        let rendered = Mutex::new(Some(rendered));
-        (out, Arc::new(SavedVm { density, color_len, weights, batch, rendered }))
-    }
-
-    fn vm_render_backward(saved: Self::SavedVm, g: FlexTensor) -> (FlexTensor, FlexTensor, FlexTensor) {
-        let g = contiguous(g);
-        let rendered = saved.rendered.lock().expect("no panic while it is locked").take();
-        let rendered = rendered.expect("a graph is walked back once");
-        let mut g_density = take_zeroed(&[saved.density.shape().num_elements()]);
-        let mut g_color = take_zeroed(&[saved.color_len]);
-        let flat = vm::backward(
-            &saved.batch.field,
-            slice(&saved.density),
-            &saved.weights,
-            rendered,
-            slice(&g),
-            g_density.storage_mut::<f32>(),
-            g_color.storage_mut::<f32>(),
-        );
-        let n = flat.len();
-        (g_density, g_color, flex(flat, [n]))
-    }
-
-    fn penalise(x: FlexTensor, g: FlexTensor, penalty: &GridPenalty) -> FlexTensor {
-        let [x, mut g] = [x, g].map(contiguous);
-        vm::penalise(&penalty.grid, &penalty.penalty, slice(&x), g.storage_mut::<f32>());
-        g
-    }
-
-    fn sdf_field_forward(
+    fn evaluate_sdf_field(
         table: FlexTensor,
         weights: FlexTensor,
         x: FlexTensor,
         direction: FlexTensor,
         shape: Arc<FieldShape>,
-    ) -> (FlexTensor, Self::SavedField) {
+    ) -> Evaluated<Self, 2> {
         let [table, weights, x, direction] = [table, weights, x, direction].map(contiguous);
         let weights = Weights::new(shape.layout(), slice(&weights));
         let activations = sdf::forward(&shape, rows(&table), &weights, rows(&x), rows(&direction));
         let out = flex(activations.output().to_vec(), [x.shape()[0], sdf::WIDTH]);
-        let saved = SavedField { activations, weights, table: table.shape().to_vec() };
-        (out, Arc::new(saved))
+        let table = table.shape().num_elements();
+        let backward = move |g| {
+            let mut g_table = take_zeroed(table);
+            let entries = bytemuck::cast_slice_mut(g_table.storage_mut::<f32>());
+            let flat = sdf::backward(&activations, &weights, slice(&contiguous(g)), entries);
+            [g_table, vector(flat)]
+        };
+        (out, Pullback::new(backward))
     }
 
-    fn sdf_field_backward(saved: Self::SavedField, g: FlexTensor) -> (FlexTensor, FlexTensor) {
-        let g = contiguous(g);
-        let mut g_table = take_zeroed(&saved.table);
-        let entries: &mut [[f32; 2]] = bytemuck::cast_slice_mut(g_table.storage_mut::<f32>());
-        let flat = sdf::backward(&saved.activations, &saved.weights, slice(&g), entries);
-        let n = flat.len();
-        (g_table, flex(flat, [n]))
-    }
-
-    fn neus_forward(
+    fn evaluate_neus(
         field: FlexTensor,
         inv_s: FlexTensor,
         direction: FlexTensor,
@@ -466,20 +392,59 @@ impl FieldKernels for Flex {
         dt: FlexTensor,
         offsets: IntTensor<Self>,
         anneal: f32,
-    ) -> (FlexTensor, Self::SavedRays) {
+    ) -> Evaluated<Self, 2> {
         let [field, inv_s, direction, t, dt] = [field, inv_s, direction, t, dt].map(contiguous);
         let inv_s = slice(&inv_s)[0];
-        let offsets = Arc::new(integers(offsets));
-        let saved = SavedRays { field, inv_s, direction, t, dt, offsets, anneal };
-        let out = neus::forward(saved.rays(), slice(&saved.field), inv_s, anneal);
-        (flex(out, [saved.offsets.len() - 1, neus::RAY_WIDTH]), saved)
+        let offsets = integers(offsets);
+        let rays = Rays { offsets: &offsets, direction: rows(&direction), t: slice(&t), dt: slice(&dt) };
+        let out = neus::forward(rays, slice(&field), inv_s, anneal);
+        let out = flex(out, [offsets.len() - 1, neus::RAY_WIDTH]);
+        let backward = move |g| {
+            let rays = Rays { offsets: &offsets, direction: rows(&direction), t: slice(&t), dt: slice(&dt) };
+            let (g_field, g_s) = neus::backward(rays, slice(&field), inv_s, anneal, slice(&contiguous(g)));
+            let samples = g_field.len() / sdf::WIDTH;
+            [flex(g_field, [samples, sdf::WIDTH]), vector(vec![g_s])]
+        };
+        (out, Pullback::new(backward))
     }
 
-    fn neus_backward(saved: Self::SavedRays, g: FlexTensor) -> (FlexTensor, FlexTensor) {
-        let g = contiguous(g);
-        let (g_field, g_s) =
-            neus::backward(saved.rays(), slice(&saved.field), saved.inv_s, saved.anneal, slice(&g));
-        let samples = g_field.len() / sdf::WIDTH;
-        (flex(g_field, [samples, sdf::WIDTH]), flex(vec![g_s], [1]))
+    fn evaluate_vm_render(
+        density: FlexTensor,
+        color: FlexTensor,
+        network: FlexTensor,
+        batch: Arc<VmBatch>,
+    ) -> Evaluated<Self, 3> {
+        let [density, color, network] = [density, color, network].map(contiguous);
+        let weights = DecoderWeights::new(batch.field.decoder, slice(&network));
+        let mut rendered = vm::render(&batch.field, slice(&density), slice(&color), &weights, &batch.rays);
+        batch.density_samples.store(rendered.density_samples, Ordering::Relaxed);
+        batch.color_samples.store(rendered.color_samples, Ordering::Relaxed);
+        let out = flex(std::mem::take(&mut rendered.out), [batch.rays.len(), vm::RAY_WIDTH]);
+        let color_len = color.shape().num_elements();
+        let backward = move |g| {
+            let mut g_density = take_zeroed(density.shape().num_elements());
+            let mut g_color = take_zeroed(color_len);
+            let flat = vm::backward(
+                &batch.field,
+                slice(&density),
+                &weights,
+                rendered,
+                slice(&contiguous(g)),
+                g_density.storage_mut::<f32>(),
+                g_color.storage_mut::<f32>(),
+            );
+            [g_density, g_color, vector(flat)]
+        };
+        (out, Pullback::new(backward))
+    }
+
+    fn evaluate_penalized(x: FlexTensor, penalty: Arc<GridPenalty>) -> Evaluated<Self, 1> {
+        let values = x.clone();
+        let backward = move |g| {
+            let [x, mut g] = [values, g].map(contiguous);
+            vm::penalize(&penalty.grid, &penalty.penalty, slice(&x), g.storage_mut::<f32>());
+            [g]
+        };
+        (x, Pullback::new(backward))
     }
 }

@@ -3,7 +3,7 @@
 //! A pixel farther from the mask than the visual hull's cells reach meets no sample and teaches
 //! nothing, so only the mask and a margin around it are drawn. Photographs stay 8 bit.
 
-use super::dark_stage;
+use super::background;
 use crate::config::iface::Foreground;
 use crate::geom::Camera;
 use crate::image::{Gray, Photo};
@@ -69,7 +69,7 @@ impl<'a> Pixels<'a> {
         let over_black = views
             .par_iter()
             .map(|v| match (&v.mask, foreground) {
-                (Some(mask), Foreground::Estimated) => dark_stage::over_black(&v.photo, mask),
+                (Some(mask), Foreground::Estimated) => background::over_black(&v.photo, mask),
                 _ => Vec::new(),
             })
             .collect();

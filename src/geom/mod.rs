@@ -24,7 +24,7 @@ pub(crate) use intersect::intersect;
 pub use mesh::Mesh;
 pub(crate) use mesh::{area_vector, shape};
 pub(crate) use overlap::{THOROUGH, overlaps, shared_area, turn};
-pub use ray::{Hit, Ray};
+pub use ray::{Hit, Ray, RayResult};
 pub use similarity::Similarity;
 pub(crate) use symmetric::cofactors;
 pub(crate) use topology::{Sets, fans, side_ends, sorted_sides};

@@ -22,6 +22,19 @@ impl Ray {
     }
 }
 
+/// What a ray through a radiance field or a scene came to; color is premultiplied by opacity (over black).
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RayResult {
+    /// sRGB-coded color, premultiplied.
+    pub color: [f32; 3],
+    /// Sum of weights, 0..=1.
+    pub opacity: f32,
+    /// Expected distance along the ray, scene units; 0 where nothing was met.
+    pub depth: f32,
+    /// Expected normal in the scene, unit length or zero; zero where nobody asks for one.
+    pub normal: Vec3,
+}
+
 /// What a ray met on a triangle mesh: `p = (1 − u − v)·a + u·b + v·c`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {

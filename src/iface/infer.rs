@@ -1,31 +1,20 @@
-//! A trained field, asked from outside: distances, normals, colours, volume renders.
+//! A trained field, evaluated: distances, normals, colors, volume renders.
 
-use super::checkpoint::{self, State};
 use super::model::shape;
-use super::train::march_step;
-use super::{IfaceError, occupancy::Occupancy};
+use super::occupancy::Occupancy;
+use super::schedule::march_step;
+use super::state::{FORMAT, SdfState};
+use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field;
-use crate::geom::Ray;
-use crate::kernel::march::{self, Bitmask, MarchRay};
+use crate::field::checkpoint::{self, Checkpoint, Progress};
+use crate::geom::{Ray, RayResult};
+use crate::kernel::march::{Bitmask, MarchRay, Samples};
 use crate::kernel::mlp::Weights;
 use crate::kernel::neus::{self, Rays};
 use crate::kernel::sdf::{self, FieldShape};
 use glam::Vec3;
 use std::path::Path;
-
-/// What a volume-rendered ray saw; colour is premultiplied by opacity (over black).
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct VolumeRay {
-    /// sRGB-coded colour, premultiplied.
-    pub color: [f32; 3],
-    /// Sum of weights, 0..=1.
-    pub opacity: f32,
-    /// Expected distance along the ray, scene units; 0 where nothing was met.
-    pub depth: f32,
-    /// Expected normal, unit length or zero.
-    pub normal: Vec3,
-}
 
 /// Samples evaluated together in a volume render.
 const SAMPLES: usize = 1 << 16;
@@ -41,17 +30,11 @@ pub struct IFace {
 }
 
 impl IFace {
-    pub(super) fn new(config: &IfaceConfig, state: &State) -> IFace {
+    pub(super) fn new(config: &IfaceConfig, state: SdfState) -> IFace {
         let shape = shape(config);
-        let weights = Weights::new(shape.layout(), &field::values(state.model.weights().inner()));
-        let mut face = IFace {
-            config: config.clone(),
-            table: field::values(state.model.table.val().inner()),
-            weights,
-            inv_s: field::values(state.model.inv_s().inner())[0].clamp(1e-6, 1e6),
-            occupancy: state.occupancy.clone(),
-            shape,
-        };
+        let (table, weights) = state.model.on_host(&shape);
+        let (inv_s, occupancy) = (state.model.sharpness(), state.occupancy);
+        let mut face = IFace { config: config.clone(), shape, table, weights, inv_s, occupancy };
         if config.occupancy == OccupancyRule::Band {
             // the surface moved since the last update
             let mut occupancy = face.occupancy.clone();
@@ -62,11 +45,12 @@ impl IFace {
         face
     }
 
-    /// From the checkpoint in a stage folder. `config` and `hull` are those it was trained with.
-    pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&Bitmask>) -> Result<IFace, IfaceError> {
-        let device = field::device("cpu")?;
-        let state = checkpoint::read(&checkpoint::newest(dir), config, hull, None, &device)?;
-        Ok(IFace::new(config, &state))
+    /// Loads the field from the checkpoint in a stage folder. `config` and `hull` are those it was trained with.
+    pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&Bitmask>) -> Result<IFace> {
+        let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
+        Progress::restore(&file, config.steps)?;
+        let state = SdfState::restore(config, hull, &mut file, &field::device("cpu")?)?;
+        Ok(IFace::new(config, state))
     }
 
     /// Sharpness of the trained surface where it is sharpest, per scene unit.
@@ -101,13 +85,8 @@ impl IFace {
         all.into_iter().map(|(f, n)| (f / self.config.radius, Vec3::from(n))).unzip()
     }
 
-    /// sRGB-coded colour of surface points with unit `normals`, seen along unit `directions` (away from the
-    /// camera).
-    pub fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
-        self.shaded(points, normals, None, directions)
-    }
-
-    /// The same, point `i` seen along `counts[i]` directions, all in one list: one colour a direction.
+    /// sRGB-coded color of surface points with unit `normals`, point `i` seen along `counts[i]` unit `directions`
+    /// (away from the camera), all in one list: one color a direction.
     pub fn colors(
         &self,
         points: &[Vec3],
@@ -115,29 +94,19 @@ impl IFace {
         counts: &[u32],
         directions: &[Vec3],
     ) -> Vec<[f32; 3]> {
-        self.shaded(points, normals, Some(counts), directions)
-    }
-
-    fn shaded(
-        &self,
-        points: &[Vec3],
-        normals: &[Vec3],
-        counts: Option<&[u32]>,
-        directions: &[Vec3],
-    ) -> Vec<[f32; 3]> {
         let arrays = |v: &[Vec3]| -> Vec<[f32; 3]> { v.iter().map(|v| v.to_array()).collect() };
         let (x, normals, directions) = (self.scaled(points), arrays(normals), arrays(directions));
-        sdf::colors(&self.shape, self.table(), &self.weights, &x, &normals, counts, &directions)
+        sdf::colors(&self.shape, self.table(), &self.weights, &x, &normals, Some(counts), &directions)
     }
 
     /// Volume render of rays in scene coordinates: the reference every faster view is compared with.
-    pub fn render(&self, rays: &[Ray]) -> Vec<VolumeRay> {
+    pub fn render(&self, rays: &[Ray]) -> Vec<RayResult> {
         /// Rays marched together.
         const PASS: usize = 1 << 13;
         rays.chunks(PASS).flat_map(|rays| self.render_pass(rays)).collect()
     }
 
-    fn render_pass(&self, rays: &[Ray]) -> Vec<VolumeRay> {
+    fn render_pass(&self, rays: &[Ray]) -> Vec<RayResult> {
         let config = &self.config;
         let radius = config.radius;
         let dt = march_step(config, self.inv_s);
@@ -149,9 +118,7 @@ impl IFace {
                 jitter: 0.0,
             })
             .collect();
-        let solid = (config.occupancy == OccupancyRule::Band).then_some(&self.occupancy.solid);
-        let limit = (3.6 * radius / dt) as usize + 2;
-        let samples = march::march(&self.occupancy.occupied, solid, radius, dt, &marched, limit);
+        let samples = self.occupancy.march(config, dt, &marched);
         // pieces of whole rays with a bounded number of samples: a sample costs some two kilobytes
         let mut out = Vec::with_capacity(rays.len());
         let mut first = 0;
@@ -166,13 +133,7 @@ impl IFace {
     }
 
     /// Composites rays `first..first + rays.len()` of a march.
-    fn composite(
-        &self,
-        rays: &[MarchRay],
-        samples: &march::Samples,
-        first: usize,
-        dt: f32,
-    ) -> Vec<VolumeRay> {
+    fn composite(&self, rays: &[MarchRay], samples: &Samples, first: usize, dt: f32) -> Vec<RayResult> {
         let radius = self.config.radius;
         let offsets = &samples.offsets[first..=first + rays.len()];
         let start = offsets[0] as usize;
@@ -193,7 +154,7 @@ impl IFace {
         let bundle = Rays { offsets: &offsets, direction: &direction, t, dt: &steps };
         neus::forward(bundle, field.output(), self.inv_s, 1.0)
             .chunks_exact(neus::RAY_WIDTH)
-            .map(|o| VolumeRay {
+            .map(|o| RayResult {
                 color: [o[0], o[1], o[2]],
                 opacity: o[3],
                 depth: if o[3] > 0.0 { o[4] / o[3] / radius } else { 0.0 },

@@ -1,6 +1,6 @@
-//! What a training step of I-Face minimises: colour, mask, eikonal and sparsity losses, as TI-Face names them.
+//! What a training step of I-Face minimises: color, mask, eikonal and sparsity losses, as TI-Face names them.
 
-use super::model::Model;
+use super::model::SdfModel;
 use super::schedule;
 use crate::config::iface::{Background, IfaceConfig};
 use crate::field::pixels::Batch;
@@ -14,7 +14,7 @@ use std::sync::Arc;
 pub struct Losses {
     /// The weighted sum that is minimised.
     pub total: Tensor<1>,
-    /// Mean squared error of the colours of rays that met a sample.
+    /// Mean squared error of the colors of rays that met a sample.
     pub rgb: Tensor<1>,
     /// Binary cross entropy of opacity and mask; none where there is no mask.
     pub mask: Option<Tensor<1>>,
@@ -26,7 +26,7 @@ pub struct Losses {
 
 /// A batch of pixels and the samples along their rays.
 pub struct Marched<'a> {
-    /// Rays with colour and alpha of their pixels.
+    /// Rays with color and alpha of their pixels.
     pub batch: &'a Batch,
     /// Where along the rays the field is asked.
     pub samples: march::Samples,
@@ -41,10 +41,10 @@ pub struct Marched<'a> {
 /// # Shapes
 ///
 /// `marched` holds `[rays]` pixels and `[n]` samples; the field is asked at `[n, 3]` and answers `[n, 8]` (distance,
-/// gradient, colour, softness); composited, that is `[rays, 8]`.
+/// gradient, color, softness); composited, that is `[rays, 8]`.
 pub fn losses(
     config: &IfaceConfig,
-    model: &Model,
+    model: &SdfModel,
     shape: &Arc<FieldShape>,
     marched: Marched,
     (seed, step): (u64, u64),
@@ -82,7 +82,7 @@ pub fn losses(
     let background: Tensor<2> =
         field::tensor(background.into_iter().flatten().collect(), [rays, 3], device).autodiff();
     let target: Tensor<2> = field::tensor(target, [rays, 3], device).autodiff();
-    // rays that are all head, and their colour: background plays no part
+    // rays that are all head, and their color: background plays no part
     let full: Vec<f32> = batch.alpha.iter().map(|&a| f32::from(a > 0.999)).collect();
     let all_head = full.iter().sum::<f32>();
     let full: Tensor<2> = field::tensor(full, [rays, 1], device).autodiff();
@@ -112,7 +112,7 @@ pub fn losses(
     });
     let color = composed.narrow(1, 0, 3) + background * (opacity.clone().neg() + 1.0);
 
-    // colour over the rays that met something; the others are constant
+    // color over the rays that met something; the others are constant
     let counted: f32 = has_samples.iter().sum();
     let met: Tensor<2> = field::tensor(has_samples, [rays, 1], device).autodiff();
     let error = (color - target) * met;

@@ -1,7 +1,7 @@
 //! Which cells of the box may hold surface.
 
 use crate::config::iface::{IfaceConfig, OccupancyRule};
-use crate::kernel::march::Bitmask;
+use crate::kernel::march::{self, Bitmask, MarchRay, Samples};
 use crate::kernel::{neus, rng};
 use rayon::prelude::*;
 
@@ -208,6 +208,13 @@ impl Occupancy {
         for i in 0..total {
             self.occupied.set(i, self.allowed.get(i) && self.history[i] > threshold);
         }
+    }
+
+    /// Marches rays through the cells that may hold surface, with steps of `dt`.
+    pub fn march(&self, config: &IfaceConfig, dt: f32, rays: &[MarchRay]) -> Samples {
+        let solid = (config.occupancy == OccupancyRule::Band).then_some(&self.solid);
+        let limit = (3.6 * config.radius / dt) as usize + 2;
+        march::march(&self.occupied, solid, config.radius, dt, rays, limit)
     }
 
     /// Share of all cells that are marched through.

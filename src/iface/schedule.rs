@@ -1,8 +1,8 @@
-//! What changes with the step: learning rate, rays per step, active levels.
+//! What changes with the step: learning rate, rays per step, active levels, march step.
 
-use crate::config::iface::IfaceConfig;
+use crate::config::iface::{IfaceConfig, OccupancyRule};
 
-/// Learning-rate factor at optimiser step `n`: linear from 1 % over `warmup`, then exponential down to
+/// Learning-rate factor at optimizer step `n`: linear from 1 % over `warmup`, then exponential down to
 /// `lr_final` at `steps`.
 pub fn learning_rate(config: &IfaceConfig, n: u64) -> f64 {
     let (n, warmup, steps) = (n as f64, config.warmup as f64, config.steps as f64);
@@ -35,6 +35,15 @@ pub fn active_levels(config: &IfaceConfig, step: u64) -> usize {
 /// Share of the hard cosine in the alpha at a step: 0 → 1 over `anneal_end`.
 pub fn anneal(config: &IfaceConfig, step: u64) -> f32 {
     if config.anneal_end == 0 { 1.0 } else { (step as f32 / config.anneal_end as f32).min(1.0) }
+}
+
+/// Returns the march step at a sharpness.
+pub fn march_step(config: &IfaceConfig, inv_s: f32) -> f32 {
+    match config.occupancy {
+        // nerfacc's constant 1.732 where √3 is meant, kept for the published step length
+        OccupancyRule::Nerfacc => 1.732 * 2.0 * config.radius / config.samples_per_ray as f32,
+        OccupancyRule::Band => (config.march / inv_s).min(config.max_step).max(config.min_step),
+    }
 }
 
 #[cfg(test)]

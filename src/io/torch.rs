@@ -119,8 +119,8 @@ pub fn parse_torch(path: &Path, bytes: &[u8], limits: &Limits) -> Result<TorchVa
     let Some(pickle) = archive.get("data.pkl") else {
         return Err(ReadError::damaged(path, FORMAT, None, "the archive holds no `data.pkl`"));
     };
-    let graph = pickle::run(path, pickle)?;
-    tree::build(path, &graph, &archive, limits)
+    let (heap, root) = pickle::run(path, pickle)?;
+    tree::build(path, (&heap, root), &archive, limits)
 }
 
 /// Bytes from a file as they may stand in a message: short, and without control characters.

@@ -44,12 +44,12 @@ impl Bitmask {
     }
 }
 
-/// What marching one ray needs.
-#[derive(Clone, Copy, Debug)]
+/// A ray in a field's coordinates, as training and rendering march it.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MarchRay {
-    /// Start, in the grid's coordinates.
+    /// Start.
     pub origin: [f32; 3],
-    /// Unit direction.
+    /// Direction, unit here; a vector-matrix field takes any length, and its `t` counts in it.
     pub direction: [f32; 3],
     /// Offset of the lattice in 0..1 steps (0 without jitter).
     pub jitter: f32,

@@ -7,6 +7,7 @@ pub mod adam;
 pub mod cg;
 pub mod hash;
 pub mod march;
+pub mod matrix;
 pub mod mlp;
 pub mod neus;
 pub mod pool;

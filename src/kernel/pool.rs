@@ -44,6 +44,18 @@ impl Buffer {
     }
 }
 
+/// Cuts buffers, whose rows are `widths` floats, into pieces of so many rows: each call gives the next piece of
+/// every buffer, an empty one behind a buffer's end.
+pub fn pieces<'a, const N: usize>(
+    buffers: [&'a mut Buffer; N],
+    widths: [usize; N],
+    rows: usize,
+) -> impl FnMut() -> [&'a mut [f32]; N] {
+    let mut widths = widths.into_iter();
+    let mut cut = buffers.map(|b| b.chunks_mut(rows * widths.next().unwrap_or(1)));
+    move || cut.each_mut().map(|c| c.next().unwrap_or_default())
+}
+
 impl Drop for Buffer {
     fn drop(&mut self) {
         let v = std::mem::take(&mut self.0);

@@ -1,4 +1,4 @@
-//! The fused signed-distance field: hash features → sdf, its spatial gradient, colour; and backward.
+//! The fused signed-distance field: hash features → sdf, its spatial gradient, color; and backward.
 //!
 //! With `F` the hash features, `J = dF/dx`, `u = [F, x]`, `w` row 0 of `W2`:
 //!
@@ -8,7 +8,7 @@
 //! ```
 //!
 //! Autodiff is first order only, so `n` is an *output* and the backward includes everything that used
-//! it (NeuS alpha, colour, eikonal). Given `g_o` and `g_n`:
+//! it (NeuS alpha, color, eikonal). Given `g_o` and `g_n`:
 //!
 //! ```text
 //! g_q = [J g_n, g_n]     g_a = W1 g_q     g_W1 += a g_qᵀ + g_z uᵀ     g_w += g_a ⊙ s
@@ -26,7 +26,7 @@ use super::hash::{self, Level};
 use super::mlp::{
     COLOR_INPUTS, HIDDEN, Layout, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
 };
-use super::pool::Buffer;
+use super::pool::{Buffer, pieces};
 use super::simd::{exp, gemm, ln_1p, sigmoid};
 use super::sphharm::sh16;
 use crate::dispatch;
@@ -39,7 +39,7 @@ mod infer;
 pub use backward::backward;
 pub use infer::{colors, gradients, softness, values};
 
-/// Values per sample of the field's output: sdf, gradient (3), colour (3), logarithm of the local sharpness as a
+/// Values per sample of the field's output: sdf, gradient (3), color (3), logarithm of the local sharpness as a
 /// share of the sharpest (0 where it is global).
 pub const WIDTH: usize = 8;
 
@@ -52,7 +52,7 @@ pub struct FieldShape {
     pub radius: f32,
     /// Hash levels that take part (the rest read as zero): coarse-to-fine training.
     pub active: usize,
-    /// Does the colour network read the hash features too?
+    /// Does the color network read the hash features too?
     pub color_skip: bool,
     /// ln of how many times softer than its sharpest the surface may be; 0: one sharpness everywhere.
     pub soften: f32,
@@ -91,7 +91,7 @@ pub struct Activations {
     q: Buffer,        // [levels, n, 2]
     u: Buffer,        // [np, kp]; np = n rounded up to whole tiles
     h: Buffer,        // [np, 64]
-    c0: Buffer,       // [np, cp] colour inputs
+    c0: Buffer,       // [np, cp] color inputs
     c1: Buffer,       // [np, 64]
     c2: Buffer,       // [np, 64]
     out: Buffer,      // [n, 8]
@@ -148,7 +148,7 @@ impl<'a> Inputs<'a> {
 }
 
 /// A piece of the forward: `n` samples starting at `start` of all, storage already cut to it.
-struct ForwardTask<'a> {
+struct SdfForwardTask<'a> {
     inputs: Inputs<'a>,
     direction: Option<&'a [[f32; 3]]>,
     jacobian: &'a [f32],
@@ -177,7 +177,7 @@ fn activate<const F: bool>(z: &mut [f32], s: &mut [f32], b: &[f32]) {
 }
 
 #[inline(always)]
-fn forward_body<const F: bool>(t: &mut ForwardTask, w: &Weights) {
+fn forward_body<const F: bool>(t: &mut SdfForwardTask, w: &Weights) {
     let (kp, ci) = (w.layout.padded(), w.layout.color_padded());
     let inputs = &t.inputs;
     let first = 2 * inputs.levels;
@@ -193,10 +193,10 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &Weights) {
         inputs.fill(u, kp, base, rows);
         let u = &*u;
         let h = &mut t.h[base * HIDDEN..][..TILE * HIDDEN];
-        gemm::<F>((TILE, HIDDEN, kp), u, (kp, 1), &w.w1t, HIDDEN, h, HIDDEN, false);
+        gemm::<F>((TILE, HIDDEN, kp), u, (kp, 1), &w.w1.t, HIDDEN, h, HIDDEN, false);
         activate::<F>(h, &mut s, &w.b1);
         let out16 = OUTPUTS_PADDED;
-        gemm::<F>((TILE, out16, HIDDEN), h, (HIDDEN, 1), &w.w2t, out16, &mut o, out16, false);
+        gemm::<F>((TILE, out16, HIDDEN), h, (HIDDEN, 1), &w.w2.t, out16, &mut o, out16, false);
         for row in o.chunks_exact_mut(out16) {
             for j in 0..out16 {
                 row[j] += w.b2[j];
@@ -205,11 +205,11 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &Weights) {
         // a = w ⊙ s in place, then q = a W1
         for row in s.chunks_exact_mut(HIDDEN) {
             for j in 0..HIDDEN {
-                row[j] *= w.w2[j];
+                row[j] *= w.w2.m[j];
             }
         }
         let q = &mut t.q[base * kp..][..TILE * kp];
-        gemm::<F>((TILE, kp, HIDDEN), &s, (HIDDEN, 1), &w.w1, kp, q, kp, false);
+        gemm::<F>((TILE, kp, HIDDEN), &s, (HIDDEN, 1), &w.w1.m, kp, q, kp, false);
         let mut n = [[0f32; 3]; TILE];
         for r in 0..rows {
             n[r] = std::array::from_fn(|a| q[r * kp + first + a] * inputs.inv_radius);
@@ -234,14 +234,8 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &Weights) {
             }
             c0[rows * ci..].fill(0.0);
             let c1 = &mut t.c1[base * HIDDEN..][..TILE * HIDDEN];
-            let inner = (TILE, HIDDEN, ci);
-            gemm::<F>(inner, c0, (ci, 1), &w.c1t, HIDDEN, c1, HIDDEN, false);
-            c1.iter_mut().for_each(|v| *v = v.max(0.0));
             let c2 = &mut t.c2[base * HIDDEN..][..TILE * HIDDEN];
-            gemm::<F>((TILE, HIDDEN, HIDDEN), c1, (HIDDEN, 1), &w.c2t, HIDDEN, c2, HIDDEN, false);
-            c2.iter_mut().for_each(|v| *v = v.max(0.0));
-            let last = (TILE, RGB_PADDED, HIDDEN);
-            gemm::<F>(last, c2, (HIDDEN, 1), &w.c3t, RGB_PADDED, &mut rgb, RGB_PADDED, false);
+            color_layers::<F>(w, c0, c1, c2, &mut rgb);
             rgb.iter_mut().for_each(|v| *v = sigmoid::<F>(*v));
         }
         for r in 0..rows {
@@ -252,9 +246,20 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &Weights) {
     }
 }
 
-dispatch! { fn forward_task / forward_body(t: &mut ForwardTask, w: &Weights) }
+dispatch! { fn forward_task / forward_body(t: &mut SdfForwardTask, w: &Weights) }
 
-/// What follows the first [`COLOR_INPUTS`] of a row: the hash features, if the colour network reads them, and zeros.
+/// The color network on a tile of inputs, before its last activation.
+#[inline(always)]
+fn color_layers<const F: bool>(w: &Weights, c0: &[f32], c1: &mut [f32], c2: &mut [f32], rgb: &mut [f32]) {
+    let ci = w.layout.color_padded();
+    gemm::<F>((TILE, HIDDEN, ci), c0, (ci, 1), &w.c1.t, HIDDEN, c1, HIDDEN, false);
+    c1.iter_mut().for_each(|v| *v = v.max(0.0));
+    gemm::<F>((TILE, HIDDEN, HIDDEN), c1, (HIDDEN, 1), &w.c2.t, HIDDEN, c2, HIDDEN, false);
+    c2.iter_mut().for_each(|v| *v = v.max(0.0));
+    gemm::<F>((TILE, RGB_PADDED, HIDDEN), c2, (HIDDEN, 1), &w.c3.t, RGB_PADDED, rgb, RGB_PADDED, false);
+}
+
+/// What follows the first [`COLOR_INPUTS`] of a row: the hash features, if the color network reads them, and zeros.
 #[inline(always)]
 fn skip(layout: Layout, u: &[f32], row: &mut [f32]) {
     let count = layout.color_inputs() - COLOR_INPUTS;
@@ -269,7 +274,7 @@ fn unit(v: [f32; 3]) -> [f32; 3] {
     v.map(|c| c / length)
 }
 
-/// Sdf, gradient and colour at points, and what the backward needs.
+/// Sdf, gradient and color at points, and what the backward needs.
 ///
 /// # Shapes
 ///
@@ -318,36 +323,21 @@ fn run(
     let mut c1 = Buffer::scratch(if color { np * HIDDEN } else { 0 });
     let mut c2 = Buffer::scratch(if color { np * HIDDEN } else { 0 });
     let mut out = Buffer::scratch(n * WIDTH);
-    // chunks_mut on an empty buffer gives no items, which would end the zip: give it width instead
-    let piece = |width: usize| CHUNK * width;
-    let mut tasks: Vec<ForwardTask> = Vec::with_capacity(n.div_ceil(CHUNK));
-    {
-        let mut us = u.chunks_mut(piece(kp));
-        let mut qs = qr.chunks_mut(piece(kp));
-        let mut hs = h.chunks_mut(piece(HIDDEN));
-        let mut c0s = c0.chunks_mut(piece(ci));
-        let mut c1s = c1.chunks_mut(piece(HIDDEN));
-        let mut c2s = c2.chunks_mut(piece(HIDDEN));
-        let mut outs = out.chunks_mut(piece(WIDTH));
-        for start in (0..n).step_by(CHUNK) {
-            let count = CHUNK.min(n - start);
-            tasks.push(ForwardTask {
-                inputs: Inputs::new(shape, x, &value, start..start + count),
-                direction: direction.map(|d| &d[start..start + count]),
-                jacobian: &jacobian,
-                soften: shape.soften,
-                u: us.next().unwrap_or_default(),
-                h: hs.next().unwrap_or_default(),
-                q: qs.next().unwrap_or_default(),
-                c0: c0s.next().unwrap_or_default(),
-                c1: c1s.next().unwrap_or_default(),
-                c2: c2s.next().unwrap_or_default(),
-                out: outs.next().unwrap_or_default(),
-            });
-        }
-    }
+    let widths = [kp, kp, HIDDEN, ci, HIDDEN, HIDDEN, WIDTH];
+    let mut cut = pieces([&mut u, &mut qr, &mut h, &mut c0, &mut c1, &mut c2, &mut out], widths, CHUNK);
+    let mut tasks: Vec<SdfForwardTask> = (0..n)
+        .step_by(CHUNK)
+        .map(|start| {
+            let own = start..(start + CHUNK).min(n);
+            let direction = direction.map(|d| &d[own.clone()]);
+            let inputs = Inputs::new(shape, x, &value, own);
+            let [u, q, h, c0, c1, c2, out] = cut();
+            let soften = shape.soften;
+            SdfForwardTask { inputs, direction, jacobian: &jacobian, soften, u, h, q, c0, c1, c2, out }
+        })
+        .collect();
     tasks.par_iter_mut().for_each(|t| forward_task(t, weights));
-    drop(tasks);
+    drop((tasks, cut));
     drop(value);
     // the scatter reads q level by level
     let mut q = Buffer::scratch(levels * n * 2);

@@ -108,14 +108,14 @@ impl ByHeart {
 }
 
 impl Radiance for ByHeart {
-    fn see(&self, rays: &[Ray], _: Vec3) -> Vec<Seen> {
+    fn see(&self, rays: &[Ray], _: Vec3) -> Vec<RayResult> {
         self.asked.fetch_add(rays.len(), std::sync::atomic::Ordering::Relaxed);
         let see = |ray: &Ray| {
             let own = |(camera, _): &&(Camera, Image)| camera.position.as_vec3().distance(ray.origin) < 1e-5;
             let (camera, image) = self.views.iter().find(own).unwrap();
             let (at, _) = camera.project(ray.origin + ray.direction).unwrap();
             let p = image.pixel(at.x as u32, at.y as u32);
-            Seen { color: [p[0], p[1], p[2]], opacity: 1.0, ..Seen::default() }
+            RayResult { color: [p[0], p[1], p[2]], opacity: 1.0, ..RayResult::default() }
         };
         rays.iter().map(see).collect()
     }

@@ -8,13 +8,14 @@ use crate::capture::{Capture, View};
 use crate::config::{Config, MaskUse, Stage};
 use crate::ensemble::Tile;
 use crate::field::pixels::TrainView;
-use crate::iface::{self, IFace, IfaceError};
+use crate::field::training::Session;
+use crate::iface::{self, IFace};
 use crate::image::Gray;
 use crate::io::Limits;
 use crate::kernel::march::Bitmask;
 use crate::run::StageDir;
-use crate::tface::{self, FieldMean, TfaceError};
-use crate::{Error, ErrorKind, Result};
+use crate::tface::{self, FieldMean};
+use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::cell::OnceCell;
@@ -23,11 +24,9 @@ use std::path::Path;
 /// Learns the signed distance of the stage `iface` from the masked photographs; goes on from its last checkpoint.
 pub(super) fn distance(capture: &Capture, scene: &Scene, config: &Config, dir: &StageDir) -> Result<Value> {
     let views = train_views(capture, scene, config, true)?;
-    let (hull, device) = (bitmask(scene), config.device.as_str());
-    let (folder, identity, monitor) = (dir.folder(), dir.identity(), dir.monitor());
-    let trained =
-        iface::train(&views, hull.as_ref(), &config.iface, config.seed, device, folder, identity, monitor);
-    let (_, report) = trained.map_err(iface_failure)?;
+    let hull = bitmask(scene);
+    let (_, report) =
+        iface::train(&views, hull.as_ref(), &config.iface, &session(Stage::Iface, config, dir))?;
     report.warnings.iter().for_each(|w| dir.warn(w));
     Ok(json!(report))
 }
@@ -41,24 +40,30 @@ pub(super) fn radiance(
     dir: &StageDir,
 ) -> Result<Value> {
     let c = config.radiance(stage);
-    let (folder, identity, monitor) = (dir.folder(), dir.identity(), dir.monitor());
-    let failed = |e| tface_failure(stage, e);
+    let session = session(stage, config, dir);
     if !c.import.is_empty() {
         let (file, place) = (Path::new(&c.import), &scene.scene_from_world);
-        tface::import_th(file, c.import_scale, place, folder, identity).map_err(failed)?;
+        tface::import_th(file, c.import_scale, place, &session)?;
         return Ok(json!({"imported": c.import}));
     }
     // without masks nothing may know the head's outline nor what that carves; only the box stays
     let masked = c.masks != MaskUse::None;
     let views = train_views(capture, scene, config, masked)?;
     let hull = bitmask(scene).filter(|_| masked);
-    let (bounds, seed, device) = (scene.aabb, config.seed, config.device.as_str());
-    let name = stage.word();
-    let trained =
-        tface::train(name, &views, bounds, hull.as_ref(), &c, seed, device, folder, identity, monitor);
-    let report = trained.map_err(failed)?;
+    let report = tface::train(&views, scene.aabb, hull.as_ref(), &c, &session)?;
     report.warnings.iter().for_each(|w| dir.warn(w));
     Ok(json!(report))
+}
+
+fn session<'a>(stage: Stage, config: &'a Config, dir: &'a StageDir) -> Session<'a> {
+    Session {
+        stage: stage.word(),
+        seed: config.seed,
+        device: &config.device,
+        dir: dir.folder(),
+        identity: dir.identity(),
+        monitor: dir.monitor(),
+    }
 }
 
 /// The photographs that are learned from, in the scene. Pixels of `capture.tiles` count as not valid.
@@ -92,34 +97,6 @@ fn bitmask(scene: &Scene) -> Option<Bitmask> {
     Some(Bitmask { resolution: hull.resolution, bits: hull.bits.clone() })
 }
 
-fn iface_failure(e: IfaceError) -> Error {
-    match e {
-        IfaceError::Stopped { .. } => Error::stopped(e),
-        IfaceError::Device(_) => device_failure(e),
-        e => {
-            let hint = e.hint().unwrap_or_default();
-            Error::cannot(e, hint)
-        }
-    }
-}
-
-fn tface_failure(stage: Stage, e: TfaceError) -> Error {
-    match e {
-        TfaceError::Stopped { .. } => Error::stopped(e),
-        TfaceError::Device(_) => device_failure(e),
-        e => {
-            let hint = e.hint(stage.word()).unwrap_or_default();
-            let settings = matches!(e, TfaceError::Settings { .. });
-            let kind = if settings { ErrorKind::Usage } else { ErrorKind::Cannot };
-            Error::new(kind, e).with_hint(hint)
-        }
-    }
-}
-
-fn device_failure(e: impl std::error::Error + Send + Sync + 'static) -> Error {
-    Error::usage(e, "choose another with `--device`")
-}
-
 /// The fields as they lie in the run, each loaded when it is first asked for.
 struct TrainedFields<'l> {
     line: &'l Line<'l>,
@@ -138,7 +115,7 @@ impl Fields for TrainedFields<'_> {
         let Line { run, config, .. } = self.line;
         let load = || {
             let hull = bitmask(&self.line.scene()?);
-            IFace::load(&run.path(Stage::Iface), &config.iface, hull.as_ref()).map_err(iface_failure)
+            IFace::load(&run.path(Stage::Iface), &config.iface, hull.as_ref())
         };
         once(&self.iface, load).map(|f| f as &dyn Surface)
     }
@@ -147,7 +124,7 @@ impl Fields for TrainedFields<'_> {
         let Line { run, config, .. } = self.line;
         let load = || {
             let count = config.radiance(stage).learned();
-            FieldMean::load(&run.path(stage), count).map_err(|e| tface_failure(stage, e))
+            FieldMean::load(stage.word(), &run.path(stage), count)
         };
         let cell = if stage == Stage::Baseline { &self.baseline } else { &self.tface };
         once(cell, load).map(|f| f as &dyn Radiance)

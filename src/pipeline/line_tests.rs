@@ -32,25 +32,13 @@ impl Surface for Exact {
         (self.sdf(points), points.iter().map(gradient).collect())
     }
 
-    fn color(&self, points: &[Vec3], _: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
+    fn colors(&self, points: &[Vec3], _: &[Vec3], counts: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
         let paint = |(p, d): (&Vec3, &Vec3)| {
             let stripes = (9.0 * *p).to_array().map(f32::sin);
             [0.6 + 0.1 * stripes[0] - 0.05 * d.x, 0.5 + 0.1 * stripes[1], 0.4 + 0.1 * stripes[2]]
         };
-        points.iter().zip(directions).map(paint).collect()
-    }
-
-    fn colors(
-        &self,
-        points: &[Vec3],
-        normals: &[Vec3],
-        counts: &[u32],
-        directions: &[Vec3],
-    ) -> Vec<[f32; 3]> {
-        let each = |v: &[Vec3]| -> Vec<Vec3> {
-            v.iter().zip(counts).flat_map(|(v, &n)| std::iter::repeat_n(*v, n as usize)).collect()
-        };
-        self.color(&each(points), &each(normals), directions)
+        let each = points.iter().zip(counts).flat_map(|(p, &n)| std::iter::repeat_n(p, n as usize));
+        each.zip(directions).map(paint).collect()
     }
 
     fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {
@@ -251,10 +239,6 @@ impl Surface for Drilled {
         values.into_iter().zip(gradients).zip(points).map(drilled).unzip()
     }
 
-    fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
-        self.0.color(points, normals, directions)
-    }
-
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], d: &[Vec3]) -> Vec<[f32; 3]> {
         self.0.colors(points, normals, counts, d)
     }
@@ -317,12 +301,12 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
 struct Fog(std::sync::atomic::AtomicUsize, Option<Stop>);
 
 impl Radiance for Fog {
-    fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<Seen> {
+    fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
         let views = self.0.fetch_add(1, std::sync::atomic::Ordering::SeqCst) + 1;
         if let Some(stop) = self.1.as_ref().filter(|_| views == 2) {
             stop.request(ErrorKind::Interrupted);
         }
-        vec![Seen { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..Seen::default() }; rays.len()]
+        vec![RayResult { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..RayResult::default() }; rays.len()]
     }
 }
 

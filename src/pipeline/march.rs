@@ -1,27 +1,14 @@
 //! Views by marching rays through a field, a band of rows at a time: a photograph of twelve megapixels
 //! has room for its picture, not for a ray and what it saw in every pixel.
 
-use crate::geom::{Camera, Ray, Similarity};
+use crate::geom::{Camera, Ray, RayResult, Similarity};
 use crate::image::Image;
 use crate::render::RenderedView;
-use glam::{Vec2, Vec3};
+use glam::Vec2;
 use rayon::prelude::*;
 
 /// Rays marched together: some megabytes, and enough for any number of threads.
 const BAND: usize = 1 << 16;
-
-/// What one ray saw; color is premultiplied by opacity (over black).
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Seen {
-    /// sRGB-coded color, premultiplied.
-    pub color: [f32; 3],
-    /// 0..=1.
-    pub opacity: f32,
-    /// Expected distance along the ray, scene units.
-    pub depth: f32,
-    /// Expected normal in the scene, unit length or zero.
-    pub normal: Vec3,
-}
 
 /// The view of a camera in scene coordinates; depth and normals in the world.
 ///
@@ -32,7 +19,7 @@ pub(super) fn march(
     camera: &Camera,
     world_from_scene: &Similarity,
     with_normals: bool,
-    see: impl Fn(&[Ray]) -> Vec<Seen>,
+    see: impl Fn(&[Ray]) -> Vec<RayResult>,
 ) -> RenderedView {
     let (w, h) = (camera.width, camera.height);
     let sized = |wanted: bool| if wanted { (w, h) } else { (0, 0) };
@@ -73,6 +60,7 @@ pub(super) fn march(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::Vec3;
     use std::cell::Cell;
 
     fn camera(width: u32, height: u32) -> Camera {
@@ -83,9 +71,9 @@ mod tests {
     fn a_large_view_is_marched_in_bands_and_every_pixel_is_its_own() {
         let largest = Cell::new(0);
         // the plane z = 0, all opaque on the left, a quarter on the right
-        let see = |rays: &[Ray]| -> Vec<Seen> {
+        let see = |rays: &[Ray]| -> Vec<RayResult> {
             largest.set(largest.get().max(rays.len()));
-            let one = |ray: &Ray| Seen {
+            let one = |ray: &Ray| RayResult {
                 color: [0.5, 0.25, 0.0],
                 opacity: if ray.direction.x < 0.0 { 1.0 } else { 0.25 },
                 depth: -ray.origin.z / ray.direction.z,

@@ -13,8 +13,8 @@ use std::path::{Path, PathBuf};
 struct Fog;
 
 impl Radiance for Fog {
-    fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<Seen> {
-        vec![Seen { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..Seen::default() }; rays.len()]
+    fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
+        vec![RayResult { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..RayResult::default() }; rays.len()]
     }
 }
 

@@ -232,10 +232,6 @@ mod tests {
             panic!("no distance is asked for")
         }
 
-        fn color(&self, points: &[Vec3], _: &[Vec3], _: &[Vec3]) -> Vec<[f32; 3]> {
-            vec![[1.0, 0.0, 0.0]; points.len()]
-        }
-
         fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
             vec![[1.0, 0.0, 0.0]; directions.len()]
         }

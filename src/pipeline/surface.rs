@@ -1,9 +1,8 @@
 //! What the later stages need of a learned field, and of anything else that can stand in for it.
 
-use super::march::Seen;
 use crate::Result;
 use crate::config::Stage;
-use crate::geom::{Camera, Ray, Similarity};
+use crate::geom::{Camera, Ray, RayResult, Similarity};
 use crate::mesh::{Cap, Patches};
 use crate::render::RenderedView;
 use glam::Vec3;
@@ -16,13 +15,15 @@ pub trait Surface: Sync {
     /// Signed distance and its gradient. `[n, 3]` → `[n]`, `[n, 3]`.
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>);
 
-    /// sRGB-coded color of surface points with unit normals, seen along unit directions, away from the
-    /// camera. All `[n, 3]`.
-    fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]>;
-
-    /// The same, point `i` seen along `counts[i]` directions, all in one list: one color a direction.
+    /// sRGB-coded color of surface points `[n, 3]` with unit normals `[n, 3]`, point `i` seen along `counts[i]` unit
+    /// directions, away from the camera, all in one list: one color a direction.
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], directions: &[Vec3])
     -> Vec<[f32; 3]>;
+
+    /// The same, every point seen along one direction.
+    fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        self.colors(points, normals, &vec![1; points.len()], directions)
+    }
 
     /// The view of a camera in scene coordinates by marching through the field itself; depth and
     /// normals in the world. `None` for what is only a surface.
@@ -79,7 +80,7 @@ impl ClosedSurface<'_> {
 pub trait Radiance: Sync {
     /// What rays in scene coordinates see, of a camera that looks along the unit vector `forward`; normals
     /// are not asked for. `[n]` → `[n]`.
-    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<Seen>;
+    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult>;
 }
 
 /// The trained fields, each loaded when it is first asked for.
@@ -101,10 +102,6 @@ impl Surface for crate::iface::IFace {
         self.sdf_gradient(points)
     }
 
-    fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
-        self.color(points, normals, directions)
-    }
-
     fn colors(
         &self,
         points: &[Vec3],
@@ -116,28 +113,13 @@ impl Surface for crate::iface::IFace {
     }
 
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView> {
-        let see = |rays: &[Ray]| -> Vec<Seen> {
-            let seen = |v: crate::iface::VolumeRay| Seen {
-                color: v.color,
-                opacity: v.opacity,
-                depth: v.depth,
-                normal: v.normal,
-            };
-            self.render(rays).into_iter().map(seen).collect()
-        };
-        Some(super::march::march(camera, world_from_scene, true, see))
+        Some(super::march::march(camera, world_from_scene, true, |rays| self.render(rays)))
     }
 }
 
 #[cfg(feature = "cpu")]
 impl Radiance for crate::tface::FieldMean {
-    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<Seen> {
-        let seen = |p: crate::tface::VmPixel| Seen {
-            color: p.color,
-            opacity: p.opacity,
-            depth: p.depth,
-            normal: Vec3::ZERO,
-        };
-        self.render(rays, forward).into_iter().map(seen).collect()
+    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
+        self.render(rays, forward)
     }
 }

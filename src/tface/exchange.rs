@@ -3,16 +3,17 @@
 //! Their world is the dataset's, scaled: `field = k · world`, k = 1 / 0.3 for the published loader, which also
 //! scales ray directions to depth 1 ([`Placement::depth_directions`]). Ours is the scene's box.
 
-use super::TfaceError;
-use super::checkpoint::{self, FieldRecord};
-use super::infer::{Placement, TFace};
+use super::infer::TFace;
+use super::record::{FORMAT, FieldRecord, NAMES, Placement};
 use super::th::{self, Activation, VmCheckpoint};
+use crate::field::checkpoint::{self, Checkpoint};
+use crate::field::training::Session;
 use crate::geom::Similarity;
 use crate::io::Limits;
 use crate::kernel::vm::mask::BoxMask;
 use crate::kernel::vm::{DecoderShape, Factor, Grid, Shading};
+use crate::{Error, Result};
 use std::path::Path;
-use std::sync::Arc;
 
 /// `[c, h, w]` to `[h, w, c]`.
 fn channel_last(f: &Factor, values: &[f32]) -> Vec<f32> {
@@ -26,33 +27,35 @@ fn flat(grid: &Grid, planes: &[Vec<f32>; 3], lines: &[Vec<f32>; 3]) -> Vec<f32> 
     planes.chain(lines).flatten().collect()
 }
 
+/// What a published checkpoint is, rendered where `placement` says; without one its coordinates are the scene's.
 fn record_of(c: &VmCheckpoint, placement: Option<Placement>) -> FieldRecord {
-    let decoder = DecoderShape {
-        channels: c.color_rank.iter().sum(),
-        features: c.app_dim,
-        hidden: c.hidden,
-        view_frequencies: c.view_frequencies,
-        feature_frequencies: c.feature_frequencies,
-    };
-    let shading = Shading {
-        softplus: c.activation == Activation::Softplus,
-        shift: c.density_shift,
-        distance_scale: c.distance_scale,
-        weight_threshold: c.weight_threshold,
-        stop: 0.0,
-    };
-    let mut record = FieldRecord::new(c.density_rank, c.color_rank, decoder, shading, c.step_ratio)
-        .between(c.near_far[0], c.near_far[1]);
-    record.mask_threshold = c.alpha_mask_threshold;
-    match placement {
-        Some(placement) => record.placed(placement),
-        None => record,
+    FieldRecord {
+        density_rank: c.density_rank,
+        color_rank: c.color_rank,
+        decoder: DecoderShape {
+            channels: c.color_rank.iter().sum(),
+            features: c.app_dim,
+            hidden: c.hidden,
+            view_frequencies: c.view_frequencies,
+            feature_frequencies: c.feature_frequencies,
+        },
+        shading: Shading {
+            softplus: c.activation == Activation::Softplus,
+            shift: c.density_shift,
+            distance_scale: c.distance_scale,
+            weight_threshold: c.weight_threshold,
+            stop: 0.0,
+        },
+        step_ratio: c.step_ratio,
+        near: c.near_far[0],
+        far: c.near_far[1],
+        mask_threshold: c.alpha_mask_threshold,
+        placement,
     }
 }
 
-/// A published checkpoint as a field; without a placement its coordinates are taken as the scene's.
-fn field_of(c: &VmCheckpoint, placement: Option<Placement>) -> (TFace, FieldRecord) {
-    let record = record_of(c, placement);
+/// A published checkpoint as a field.
+fn field_of(c: &VmCheckpoint, record: &FieldRecord) -> TFace {
     let mask = c.mask.as_ref().map(|m| {
         let [nz, ny, nx] = m.shape;
         let vertices: Vec<bool> =
@@ -64,18 +67,12 @@ fn field_of(c: &VmCheckpoint, placement: Option<Placement>) -> (TFace, FieldReco
     let color = flat(&field.color, &c.color_planes, &c.color_lines);
     let [(w1, b1), (w2, b2), (w3, b3)] = &c.mlp;
     let network = [&c.basis, w1, b1, w2, b2, w3, b3].map(|m| m.as_slice()).concat();
-    (TFace::from_parts(Arc::new(field), density, color, network, placement), record)
+    TFace::from_parts(field, [density, color, network], record.placement)
 }
 
 /// Takes a published checkpoint as the result of a stage: reads it, places it in the scene and writes it into
-/// the stage folder `dir`. `scale` is the length of a dataset unit in the checkpoint's world.
-pub fn import_th(
-    path: &Path,
-    scale: f64,
-    scene_from_world: &Similarity,
-    dir: &Path,
-    identity: &str,
-) -> Result<TFace, TfaceError> {
+/// the session's folder. `scale` is the length of a dataset unit in the checkpoint's world.
+pub fn import_th(path: &Path, scale: f64, scene_from_world: &Similarity, session: &Session) -> Result<TFace> {
     let c = th::read_th(path, &Limits::default())?;
     // field = scale · world = scale · (scene − t) / s
     let s = scene_from_world;
@@ -85,13 +82,22 @@ pub fn import_th(
         offset: (s.translation * -k).as_vec3().to_array(),
         depth_directions: true,
     };
+    let unsound = |why: &str| Error::cannot(format!("the field cannot be exchanged: {why}"), "");
     if c.grid_size.iter().any(|&n| n > 1 << 16) {
-        return Err(TfaceError::Exchange("its grid has more than 65536 nodes along an axis"));
+        return Err(unsound("its grid has more than 65536 nodes along an axis"));
     }
-    let (record, placed) = (record_of(&c, Some(placement)), Some(placement));
-    record.sound().map_err(TfaceError::Exchange)?;
-    let (face, record) = field_of(&c, placed);
-    checkpoint::save_field(dir, &face, record, identity)?;
+    let record = record_of(&c, Some(placement));
+    record.sound().map_err(unsound)?;
+    let face = field_of(&c, &record);
+    let mut file = Checkpoint::new(session.stage, FORMAT, session.identity);
+    file.set("finished", 1);
+    let l = &face.field.lattice;
+    record.save([l.min, l.max], face.field.density.size, face.field.mask.as_ref(), &mut file);
+    for (name, values) in NAMES.iter().zip(&face.values) {
+        file.put_floats(&format!("model.{name}"), &[values.len()], values.clone());
+    }
+    file.save(session.dir)?;
+    checkpoint::finish(session.dir)?;
     Ok(face)
 }
 

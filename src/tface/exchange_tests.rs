@@ -1,9 +1,11 @@
 //! Published checkpoints rendered by our kernels, and where our own files hold their arrays.
 
 use super::*;
+use crate::Quiet;
+use crate::field::ball::session;
 use crate::geom::Ray;
 use crate::io::{TensorValues, read_tensors};
-use crate::kernel::vm::mask::VmRay;
+use crate::kernel::march::MarchRay;
 use crate::kernel::vm::{DecoderWeights, RAY_WIDTH, render};
 use glam::{DVec3, Vec3};
 use serde_json::Value;
@@ -21,17 +23,17 @@ fn three(v: &Value) -> [f32; 3] {
 #[test]
 fn an_imported_checkpoint_renders_as_the_published_arithmetic_does() {
     let checkpoint = th::read_th(&reference("vm_g5.th"), &Limits::default()).unwrap();
-    let (face, _) = field_of(&checkpoint, None);
+    let face = field_of(&checkpoint, &record_of(&checkpoint, None));
     let want: Value = serde_json::from_slice(&std::fs::read(reference("vm_g5.json")).unwrap()).unwrap();
-    let weights = DecoderWeights::new(face.field.decoder, &face.network);
+    let weights = DecoderWeights::new(face.field.decoder, &face.values[2]);
     assert_eq!(face.field.lattice.samples, 17);
-    let mut open = (*face.field).clone();
+    let mut open = face.field.clone();
     open.mask = None;
     let mut compared = 0;
     for ray in want["rays"].as_array().unwrap() {
-        let vm = VmRay { origin: three(&ray["origin"]), direction: three(&ray["direction"]), jitter: 0.0 };
-        for (field, key) in [(&open, "without_mask"), (&*face.field, "with_mask")] {
-            let out = render(field, &face.density, &face.color, &weights, &[vm]).out;
+        let vm = MarchRay { origin: three(&ray["origin"]), direction: three(&ray["direction"]), jitter: 0.0 };
+        for (field, key) in [(&open, "without_mask"), (&face.field, "with_mask")] {
+            let out = render(field, &face.values[0], &face.values[1], &weights, &[vm]).out;
             let black = three(&ray[key]["black"]);
             let opacity = ray[key]["opacity"].as_f64().unwrap() as f32;
             for c in 0..3 {
@@ -52,16 +54,18 @@ fn an_imported_checkpoint_renders_as_the_published_arithmetic_does() {
 fn an_imported_field_renders_in_the_scene_as_in_its_own_world() {
     let dir = tempfile::tempdir().unwrap();
     let scene = Similarity::scale_translate(2.5, DVec3::new(0.3, -0.2, 0.1));
-    let face = import_th(&reference("vm_g5.th"), 1.0 / 0.3, &scene, dir.path(), "x").unwrap();
+    let face =
+        import_th(&reference("vm_g5.th"), 1.0 / 0.3, &scene, &session("tface", dir.path(), "x", &Quiet))
+            .unwrap();
     // a ray of the published loader, written in the scene: world = field · 0.3, directions of depth 1
     let (origin, direction) = (Vec3::new(0.1, -0.2, 4.5), Vec3::new(0.02, 0.05, -1.0));
     let in_scene = |p: Vec3| scene.point(p * 0.3);
     let ray =
         Ray { origin: in_scene(origin), direction: direction.normalize(), t_min: 0.0, t_max: f32::INFINITY };
     let seen = face.render(&[ray], Vec3::NEG_Z)[0];
-    let weights = DecoderWeights::new(face.field.decoder, &face.network);
-    let vm = VmRay { origin: origin.to_array(), direction: direction.to_array(), jitter: 0.0 };
-    let want = render(&face.field, &face.density, &face.color, &weights, &[vm]).out;
+    let weights = DecoderWeights::new(face.field.decoder, &face.values[2]);
+    let vm = MarchRay { origin: origin.to_array(), direction: direction.to_array(), jitter: 0.0 };
+    let want = render(&face.field, &face.values[0], &face.values[1], &weights, &[vm]).out;
     for c in 0..3 {
         assert!((seen.color[c] - want[c]).abs() < 1e-5, "{seen:?} {want:?}");
     }
@@ -74,7 +78,7 @@ fn an_imported_field_renders_in_the_scene_as_in_its_own_world() {
 fn our_own_file_holds_the_published_arrays_where_the_page_says() {
     let dir = tempfile::tempdir().unwrap();
     let path = reference("vm_g5.th");
-    import_th(&path, 1.0 / 0.3, &Similarity::IDENTITY, dir.path(), "x").unwrap();
+    import_th(&path, 1.0 / 0.3, &Similarity::IDENTITY, &session("tface", dir.path(), "x", &Quiet)).unwrap();
     let there = th::read_th(&path, &Limits::default()).unwrap();
     let (tensors, metadata) = read_tensors(&checkpoint::newest(dir.path()), &Limits::default()).unwrap();
     let ours = |name: &str| match tensors.iter().find(|(n, ..)| *n == name).map(|(_, (_, v))| v) {

@@ -1,20 +1,19 @@
 //! Between steps: the alpha mask is rebuilt, the box shrinks, the grids become finer.
 
-use super::state::{State, grids, no_moments, param, read, upsampled_voxels};
+use super::state::{VmState, grids, upsampled_voxels};
 use crate::config::VmConfig;
 use crate::kernel::vm::mask::BoxMask;
 use crate::kernel::vm::{cropped, density_at, resized, size_for};
-use burn::tensor::Device;
 use rayon::prelude::*;
 
 /// Most vertices of an alpha mask; a finer grid keeps the mask's size (published).
 const MASK_VERTICES: usize = 256 * 256 * 256;
 
-/// Rebuilds the alpha mask and, the first time, shrinks the box to it. False if nothing is left.
+/// Rebuilds the alpha mask after `step` steps and, the first time, shrinks the box to it. False if nothing is left.
 ///
 /// The published mask leaves the distance scale out of its alpha (`1 − exp(−σ · step)`), which makes it
 /// that much stricter than rendering; kept, and `mask_threshold` is in these terms.
-pub fn update_mask(state: &mut State, config: &VmConfig, device: &Device) -> bool {
+pub fn update_mask(state: &mut VmState, config: &VmConfig, step: u64) -> bool {
     let size = match &state.mask {
         Some(mask) if state.masked && state.size.iter().product::<usize>() >= MASK_VERTICES => {
             mask.size().map(|n| n - 1)
@@ -27,15 +26,15 @@ pub fn update_mask(state: &mut State, config: &VmConfig, device: &Device) -> boo
     state.mask = Some(BoxMask::from_vertices(low, high, size, &kept));
     if !state.masked {
         state.masked = true;
-        shrink(state, config, size, first, last, device);
+        shrink(state, config, size, [first, last], step);
     }
     true
 }
 
 /// Vertices with enough alpha, and those beside them. `(x · ny + y) · nz + z`.
-fn occupied_vertices(state: &State, config: &VmConfig, size: [usize; 3]) -> Vec<bool> {
+fn occupied_vertices(state: &VmState, config: &VmConfig, size: [usize; 3]) -> Vec<bool> {
     let field = state.field(config, false);
-    let density = read(&state.density);
+    let density = state.parameters[0].values();
     let [low, high] = state.bounds;
     let least = -(1.0 - config.mask_threshold as f32).ln() / field.lattice.step;
     let slab = size[1] * size[2];
@@ -90,15 +89,14 @@ fn extent(kept: &[bool], size: [usize; 3]) -> Option<([usize; 3], [usize; 3])> {
     (low[0] != usize::MAX).then_some((low, high))
 }
 
-/// Crops the grids to the vertices `first..=last` of a mask of `size` vertices. The optimiser starts again: its
+/// Crops the grids to the vertices `first..=last` of a mask of `size` vertices. The optimizer starts again: its
 /// moments belong to planes of another size.
 fn shrink(
-    state: &mut State,
+    state: &mut VmState,
     config: &VmConfig,
     size: [usize; 3],
-    first: [usize; 3],
-    last: [usize; 3],
-    device: &Device,
+    [first, last]: [[usize; 3]; 2],
+    step: u64,
 ) {
     let [low, high] = state.bounds;
     let (mut from, mut to) = ([0; 3], [0; 3]);
@@ -115,36 +113,36 @@ fn shrink(
     }
     let unit: [f32; 3] = std::array::from_fn(|a| (high[a] - low[a]) / (state.size[a] - 1) as f32);
     let (density, color) = grids(config, state.size);
-    let (kept, density) = cropped(&density, &read(&state.density), from, to);
-    let (_, color) = cropped(&color, &read(&state.color), from, to);
+    let (kept, density) = cropped(&density, &state.parameters[0].values(), from, to);
+    let (_, color) = cropped(&color, &state.parameters[1].values(), from, to);
     state.bounds = [
         std::array::from_fn(|a| low[a] + unit[a] * from[a] as f32),
         std::array::from_fn(|a| low[a] + unit[a] * (to[a] - 1) as f32),
     ];
     state.size = kept.size;
-    replace(state, density, color, device);
+    replace(state, density, color, step);
 }
 
-/// Makes the grids finer after upsampling `which` (from 0) is due.
-pub fn upsample(state: &mut State, config: &VmConfig, which: usize, device: &Device) {
+/// Makes the grids finer where, after `step` steps, upsampling `which` (from 0) is due.
+pub fn upsample(state: &mut VmState, config: &VmConfig, which: usize, step: u64) {
     let voxels = upsampled_voxels(config)[which];
     let extent = std::array::from_fn(|a| state.bounds[1][a] - state.bounds[0][a]);
     let size = size_for(extent, voxels);
     let (old_density, old_color) = grids(config, state.size);
     let (new_density, new_color) = grids(config, size);
-    let density = resized(&old_density, &read(&state.density), &new_density);
-    let color = resized(&old_color, &read(&state.color), &new_color);
+    let density = resized(&old_density, &state.parameters[0].values(), &new_density);
+    let color = resized(&old_color, &state.parameters[1].values(), &new_color);
     state.size = size;
-    replace(state, density, color, device);
+    replace(state, density, color, step);
     if config.lr_reset {
-        state.reset = state.step;
+        state.reset = step;
     }
 }
 
-fn replace(state: &mut State, density: Vec<f32>, color: Vec<f32>, device: &Device) {
-    let network = state.network.val().dims()[0];
-    state.moments = no_moments([density.len(), color.len(), network], device);
-    state.moments_from = state.step;
-    state.density = param(density, device);
-    state.color = param(color, device);
+fn replace(state: &mut VmState, density: Vec<f32>, color: Vec<f32>, step: u64) {
+    let [d, c, network] = &mut state.parameters;
+    d.replace(density);
+    c.replace(color);
+    network.forget_moments();
+    state.moments_from = step;
 }

@@ -14,14 +14,14 @@
 //! Decay of the weights, smaller random numbers at the start, dropped channels, rays anywhere in a pixel, a running
 //! mean of the weights and stronger smoothing all leave one field where it is, or below.
 
-use super::train::{self, TrainReport};
-use super::{TFace, TfaceError, VmPixel};
-use crate::Monitor;
-use crate::config::VmConfig;
-use crate::field::pixels::TrainView;
-use crate::geom::{Aabb, Ray};
-use crate::io;
+use super::TFace;
+use super::train::{self, TfaceReport, train_one};
+use crate::config::{MaskUse, VmConfig, VmStart};
+use crate::field::pixels::{Pixels, TrainView};
+use crate::field::training::{self, Session};
+use crate::geom::{Aabb, Ray, RayResult};
 use crate::kernel::march::Bitmask;
+use crate::{Monitor, Result, io};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 
@@ -31,15 +31,15 @@ pub struct FieldMean {
 }
 
 impl FieldMean {
-    /// From the checkpoints in a stage folder.
-    pub fn load(dir: &Path, count: usize) -> Result<FieldMean, TfaceError> {
-        let fields = (0..count).map(|i| TFace::load(&folder(dir, i))).collect::<Result<_, _>>()?;
+    /// Loads `count` fields from the checkpoints in a folder of `stage`.
+    pub fn load(stage: &'static str, dir: &Path, count: usize) -> Result<FieldMean> {
+        let fields = (0..count).map(|i| TFace::load(stage, &folder(dir, i))).collect::<Result<_>>()?;
         Ok(FieldMean { fields })
     }
 
     /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
-    /// vector `forward`: mean colour (premultiplied, coded) and opacity; depth by opacity.
-    pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<VmPixel> {
+    /// vector `forward`: mean color (premultiplied, coded) and opacity; depth by opacity.
+    pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         let Some((first, others)) = self.fields.split_first() else { return Vec::new() };
         let mut seen = first.render(rays, forward);
         if others.is_empty() {
@@ -68,43 +68,56 @@ fn folder(dir: &Path, i: usize) -> PathBuf {
     if i == 0 { dir.to_owned() } else { dir.join(format!("field_{}", i + 1)) }
 }
 
-/// Trains `config.fields` fields one after the other, saving checkpoints into the stage folder `dir` and continuing
+/// Trains `config.fields` fields one after the other, saving checkpoints into the session's folder and continuing
 /// from those that lie there.
 ///
-/// `stage` is `tface` or `baseline`, the table of the settings, for messages. `views` have their cameras in scene
-/// coordinates; `bounds` is the scene's tight box; `hull` the masks' visual hull over [-1, 1]³. `identity` names
-/// settings and inputs: a checkpoint of another identity is refused.
+/// `views` have their cameras in scene coordinates; `bounds` is the scene's tight box; `hull` the masks' visual hull
+/// over [-1, 1]³.
 pub fn train(
-    stage: &'static str,
     views: &[TrainView],
     bounds: Aabb,
     hull: Option<&Bitmask>,
     config: &VmConfig,
-    seed: u64,
-    device: &str,
-    dir: &Path,
-    identity: &str,
-    monitor: &dyn Monitor,
-) -> Result<TrainReport, TfaceError> {
+    session: &Session,
+) -> Result<TfaceReport> {
+    train::check(session.stage, config)?;
+    let views = train::masked_as_configured(views, config.masks);
+    let hull = hull.filter(|_| config.start == VmStart::Hull && config.masks != MaskUse::None);
+    // rays that meet the hull, grown by the cells around it
+    let reach = hull.map_or(f32::INFINITY, |h| 4.0 * 2.0 / h.resolution.min(128) as f32);
+    let pixels = Pixels::new(&views, reach, 1.0, config.foreground, config.whole_frame);
+    if pixels.count() == 0 {
+        return Err(training::no_pixels());
+    }
+    let bounds = [bounds.min.to_array(), bounds.max.to_array()];
     let fields = config.learned();
-    let steps = fields as u64 * config.steps;
-    let mut whole: Option<TrainReport> = None;
+    let mut whole: Option<TfaceReport> = None;
     for i in 0..fields {
         let before = i as u64 * config.steps;
-        if monitor.stop() {
-            return Err(TfaceError::Stopped { step: before, steps });
+        if session.monitor.stop() {
+            return Err(training::stopped(before, fields as u64 * config.steps));
         }
-        let folder = folder(dir, i);
-        let identity = if i == 0 { identity.to_owned() } else { format!("{identity} {}", i + 1) };
+        let folder = folder(session.dir, i);
+        let identity =
+            if i == 0 { session.identity.into() } else { format!("{} {}", session.identity, i + 1) };
         io::create_folder(&folder)?;
-        // far from the seeds that people count through
-        let seed = seed ^ (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        let part = Part { monitor, field: i + 1, fields, before };
-        let trained =
-            train::train(stage, views, bounds, hull, config, seed, device, &folder, &identity, &part);
-        let mut report = trained.map_err(|e| e.of_field(i + 1, fields))?;
-        if fields > 1 {
-            report.warnings.iter_mut().for_each(|w| *w = format!("field {} of {fields}: {w}", i + 1));
+        let part = Part { monitor: session.monitor, field: i + 1, fields, before };
+        let own = Session {
+            // far from the seeds that people count through
+            seed: session.seed ^ (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15),
+            dir: &folder,
+            identity: &identity,
+            monitor: &part,
+            ..*session
+        };
+        let several = (fields > 1).then(|| format!("field {} of {fields}", i + 1));
+        let trained = train_one(&pixels, bounds, hull, config, &own);
+        let mut report = trained.map_err(|e| match &several {
+            Some(which) if !e.kind().is_stop() => e.within(which),
+            _ => e,
+        })?;
+        if let Some(which) = several {
+            report.warnings.iter_mut().for_each(|w| *w = format!("{which}: {w}"));
         }
         whole = Some(match whole {
             None => report,
@@ -141,7 +154,7 @@ mod tests {
     use super::*;
     use crate::Quiet;
     use crate::config::Preset;
-    use crate::field::ball::{StopAfter, hull, temporary, views};
+    use crate::field::ball::{StopAfter, hull, session, temporary, views};
     use std::sync::Mutex;
 
     const BOX: Aabb = Aabb { min: Vec3::splat(-0.8), max: Vec3::splat(0.8) };
@@ -178,7 +191,7 @@ mod tests {
         let dir = temporary();
         let (views, hull, heard) = (views(), hull(), Heard::default());
         let learn = |dir: &Path, monitor: &dyn Monitor| {
-            train("tface", &views, BOX, Some(&hull), &config(), 3, "cpu", dir, "ball", monitor)
+            train(&views, BOX, Some(&hull), &config(), &session("tface", dir, "ball", monitor))
         };
         let report = learn(dir.path(), &heard).unwrap();
         let heard = heard.0.into_inner().unwrap();
@@ -193,8 +206,9 @@ mod tests {
                 Ray { origin, direction: -Vec3::Z, t_min: 0.0, t_max: f32::INFINITY }
             })
             .collect();
-        let see = |fields: usize| FieldMean::load(dir.path(), fields).unwrap().render(&rays, -Vec3::Z);
-        let second = TFace::load(&dir.path().join("field_2")).unwrap().render(&rays, -Vec3::Z);
+        let see =
+            |fields: usize| FieldMean::load("tface", dir.path(), fields).unwrap().render(&rays, -Vec3::Z);
+        let second = TFace::load("tface", &dir.path().join("field_2")).unwrap().render(&rays, -Vec3::Z);
         let (one, both) = (see(1), see(2));
         assert!(one != second);
         for ((a, b), mean) in one.iter().zip(&second).zip(&both) {
@@ -211,12 +225,13 @@ mod tests {
         let files = ["checkpoint.safetensors", "field_2/checkpoint.safetensors"];
         let bytes = |dir: &Path| files.map(|f| std::fs::read(dir.join(f)).unwrap());
         assert_eq!(learn(dir.path(), &Quiet).unwrap().rays, 0);
-        assert!(matches!(FieldMean::load(dir.path(), 3), Err(TfaceError::Read(_))));
+        let missing = FieldMean::load("tface", dir.path(), 3).err().unwrap().to_string();
+        assert!(missing.contains("field_3") && missing.contains("cannot be read"), "{missing}");
 
         // stopped in the second field, it goes on there
         let again = temporary();
         let end = learn(again.path(), &StopAfter::new(50));
-        assert!(matches!(end, Err(TfaceError::Stopped { .. })));
+        assert!(end.unwrap_err().kind().is_stop());
         let rest = Heard::default();
         learn(again.path(), &rest).unwrap();
         let rest = rest.0.into_inner().unwrap();
@@ -230,10 +245,11 @@ mod tests {
         let dir = temporary();
         let (views, hull) = (views(), hull());
         let learn =
-            || train("tface", &views, BOX, Some(&hull), &config(), 3, "cpu", dir.path(), "ball", &Quiet);
+            || train(&views, BOX, Some(&hull), &config(), &session("tface", dir.path(), "ball", &Quiet));
         learn().unwrap();
         let name = "checkpoint.safetensors";
         std::fs::copy(dir.path().join(name), dir.path().join("field_2").join(name)).unwrap();
-        assert!(matches!(learn(), Err(TfaceError::Checkpoint { .. })));
+        let refused = learn().unwrap_err();
+        assert!(refused.to_string().contains("other settings") && refused.hint().contains("--fresh tface"));
     }
 }

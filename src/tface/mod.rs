@@ -5,10 +5,6 @@
 //! on photographs as they are; only its box still comes from the masks.
 
 #[cfg(feature = "cpu")]
-mod checkpoint;
-#[cfg(feature = "cpu")]
-mod error;
-#[cfg(feature = "cpu")]
 mod exchange;
 #[cfg(feature = "cpu")]
 mod grow;
@@ -17,18 +13,18 @@ mod infer;
 #[cfg(feature = "cpu")]
 mod mean;
 #[cfg(feature = "cpu")]
+mod record;
+#[cfg(feature = "cpu")]
 mod state;
 pub mod th;
 #[cfg(feature = "cpu")]
 mod train;
 
 #[cfg(feature = "cpu")]
-pub use error::TfaceError;
-#[cfg(feature = "cpu")]
 pub use exchange::import_th;
 #[cfg(feature = "cpu")]
-pub use infer::{TFace, VmPixel};
+pub use infer::TFace;
 #[cfg(feature = "cpu")]
 pub use mean::{FieldMean, train};
 #[cfg(feature = "cpu")]
-pub use train::TrainReport;
+pub use train::TfaceReport;

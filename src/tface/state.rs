@@ -1,46 +1,33 @@
 //! What is learned, and the grid it lives on.
 
+use super::record::{FieldRecord, NAMES, geometry};
+use crate::Result;
 use crate::config::{DensityActivation, VmConfig};
-use crate::field;
-use crate::field::optimizer::Moments;
+use crate::field::checkpoint::Checkpoint;
+use crate::field::parameters::Parameter;
 use crate::kernel::march::Bitmask;
 use crate::kernel::rng;
-use crate::kernel::vm::mask::{BoxMask, Lattice};
-use crate::kernel::vm::{
-    DecoderShape, Grid, Shading, VmField, samples_across, size_for, step_size, voxel_schedule,
-};
-use burn::module::Param;
-use burn::tensor::{Device, Tensor};
+use crate::kernel::vm::mask::BoxMask;
+use crate::kernel::vm::{DecoderShape, Grid, Shading, VmField, size_for, voxel_schedule};
+use burn::tensor::Device;
 use std::sync::Arc;
 
 /// Training between two steps.
-pub struct State {
+pub struct VmState {
     /// Lower and upper corner of the grid, scene units.
     pub bounds: [[f32; 3]; 2],
     /// Vertices along each axis.
     pub size: [usize; 3],
-    /// Flat planes and lines of the density.
-    pub density: Param<Tensor<1>>,
-    /// Flat planes and lines of the appearance.
-    pub color: Param<Tensor<1>>,
-    /// Flat decoder weights.
-    pub network: Param<Tensor<1>>,
-    /// Optimiser, in the order of the three.
-    pub moments: [Moments<1>; 3],
+    /// Flat planes and lines of the density, those of the appearance, flat decoder weights.
+    pub parameters: [Parameter; 3],
     /// Cells that may hold anything; all without.
     pub mask: Option<BoxMask>,
-    /// Optimiser steps done.
-    pub step: u64,
     /// Step at which the learning rates last started.
     pub reset: u64,
     /// Step at which the moments last started: whenever the grids change their size.
     pub moments_from: u64,
     /// Has the alpha mask been rebuilt at least once?
     pub masked: bool,
-    /// Running mean of the squared colour error, for the PSNR that is shown.
-    pub mean_square: f64,
-    /// Mixed into the seed: 1 after a restore from a diverged step, so that other rays are drawn.
-    pub salt: u64,
 }
 
 fn triple(list: &[usize]) -> [usize; 3] {
@@ -61,22 +48,6 @@ pub fn decoder(config: &VmConfig) -> DecoderShape {
         view_frequencies: config.view_frequencies,
         feature_frequencies: config.feature_frequencies,
     }
-}
-
-/// A trainable parameter of these values.
-pub fn param(values: Vec<f32>, device: &Device) -> Param<Tensor<1>> {
-    let n = values.len();
-    Param::from_tensor(field::tensor(values, [n], device).autodiff().require_grad())
-}
-
-/// The parameter's values on the host.
-pub fn read(param: &Param<Tensor<1>>) -> Vec<f32> {
-    field::values(param.val().inner())
-}
-
-/// Fresh moments for parameters of these lengths.
-pub fn no_moments(lengths: [usize; 3], device: &Device) -> [Moments<1>; 3] {
-    lengths.map(|n| Moments::zeros([n], device))
 }
 
 /// Planes and lines 0.1 N(0, 1); matrices and biases U(±1/√fan_in), the last bias 0: as published.
@@ -109,65 +80,70 @@ fn hull_mask(hull: &Bitmask) -> BoxMask {
     })
 }
 
-impl State {
-    /// The start, before any step.
+impl VmState {
+    /// Returns the start, before any step.
     pub fn new(
         config: &VmConfig,
         seed: u64,
         bounds: [[f32; 3]; 2],
         hull: Option<&Bitmask>,
         device: &Device,
-    ) -> State {
+    ) -> VmState {
         let extent = std::array::from_fn(|a| bounds[1][a] - bounds[0][a]);
         let size = size_for(extent, config.voxels_start);
-        let [density, color, network] = start_values(config, size, seed);
-        State {
-            bounds,
-            size,
-            moments: no_moments([density.len(), color.len(), network.len()], device),
-            density: param(density, device),
-            color: param(color, device),
-            network: param(network, device),
-            mask: hull.map(hull_mask),
-            step: 0,
-            reset: 0,
-            moments_from: 0,
-            masked: false,
-            mean_square: 0.0,
-            salt: 0,
-        }
+        let mut names = NAMES.into_iter();
+        let parameters = start_values(config, size, seed)
+            .map(|values| Parameter::new(names.next().unwrap_or_default(), &[values.len()], values, device));
+        let mask = hull.map(hull_mask);
+        VmState { bounds, size, parameters, mask, reset: 0, moments_from: 0, masked: false }
     }
 
     /// Is every weight a finite number? A NaN in a relu density has neither weight nor gradient: no loss
     /// would tell, and total variation would spread it.
     pub fn is_finite(&self) -> bool {
-        [&self.density, &self.color, &self.network].iter().all(|p| read(p).iter().all(|v| v.is_finite()))
+        self.parameters.iter().all(|p| p.is_finite())
     }
 
-    /// The field as the kernels see it. In training a ray has `‖size‖ / ratio` samples, else as many as the
+    /// Returns the field as the kernels see it. In training a ray has `‖size‖ / ratio` samples, else as many as the
     /// box's diagonal needs; both as published.
     pub fn field(&self, config: &VmConfig, training: bool) -> Arc<VmField> {
+        let mut field = FieldRecord::of(config).field(self.bounds, self.size, self.mask.clone());
+        if training {
+            let vertices = self.size.iter().map(|&n| (n * n) as f32).sum::<f32>().sqrt();
+            field.lattice.samples = ((vertices / config.step_ratio as f32) as usize).min(1_000_000);
+        }
+        Arc::new(field)
+    }
+
+    /// Puts the state into a checkpoint. The optimizer's moments are left out of a finished one: nobody goes on
+    /// from it.
+    pub fn save(&self, config: &VmConfig, into: &mut Checkpoint, finished: bool) {
+        FieldRecord::of(config).save(self.bounds, self.size, self.mask.as_ref(), into);
+        self.parameters.iter().for_each(|p| p.save(into, !finished));
+        into.set("reset", self.reset);
+        into.set("moments_from", self.moments_from);
+        into.set("masked", u64::from(self.masked));
+    }
+
+    /// Takes the state after `step` out of a checkpoint; sizes and types must be exactly the configured model's.
+    pub fn restore(
+        &mut self,
+        config: &VmConfig,
+        from: &mut Checkpoint,
+        step: u64,
+        finished: bool,
+    ) -> Result<()> {
+        (self.reset, self.moments_from) =
+            (from.number("reset", 0..=step)?, from.number("moments_from", 0..=step)?);
+        self.masked = from.number("masked", 0..=1)? == 1;
+        (self.bounds, self.size, self.mask) = geometry(from)?;
         let (density, color) = grids(config, self.size);
-        let extent: [f32; 3] = std::array::from_fn(|a| self.bounds[1][a] - self.bounds[0][a]);
-        let ratio = config.step_ratio as f32;
-        let step = step_size(extent, self.size, ratio);
-        let vertices = self.size.iter().map(|&n| (n * n) as f32).sum::<f32>().sqrt();
-        let samples = if training { (vertices / ratio) as usize } else { samples_across(extent, step) };
-        Arc::new(VmField {
-            density,
-            color,
-            decoder: decoder(config),
-            lattice: Lattice {
-                min: self.bounds[0],
-                max: self.bounds[1],
-                step,
-                samples: samples.min(1_000_000),
-                near: 0.0,
-                far: 1e6,
-            },
-            shading: shading(config),
-            mask: self.mask.clone(),
-        })
+        let lengths = [density.len(), color.len(), decoder(config).len()];
+        for (p, len) in self.parameters.iter_mut().zip(lengths) {
+            p.replace(vec![0.0; len]);
+            p.restore(from, !finished)?;
+        }
+        Ok(())
     }
 }
 

@@ -1,9 +1,9 @@
 //! Checkpoints of the published T-Face and TensoRF code (`.th`), read.
 //!
 //! A dictionary of `kwargs` (what the Python constructor takes), `state_dict` (planes, lines, basis and the
-//! colour network) and, once an alpha mask was made, `alphaMask.shape`, `.mask` (packed bits, the highest
+//! color network) and, once an alpha mask was made, `alphaMask.shape`, `.mask` (packed bits, the highest
 //! first) and `.aabb`. Plane i spans the axes `(0,1)`, `(0,2)`, `(1,2)` as width and height, line i the one
-//! that is left: `TensorVMSplit` of TensoRF (Chen et al. 2022). Optimiser and schedule are not in the file.
+//! that is left: `TensorVMSplit` of TensoRF (Chen et al. 2022). Optimizer and schedule are not in the file.
 //!
 //! # Where our own files hold the same
 //!
@@ -32,8 +32,9 @@
 mod table;
 
 use self::table::{MAX_COUNT, Table, about, about_tensor, integer};
-use crate::io::{self, Limits, ReadError, TorchNumbers, TorchValue};
-use std::path::{Path, PathBuf};
+use crate::io::{self, Limits, TorchNumbers, TorchValue};
+use crate::{Error, Result};
+use std::path::Path;
 
 /// Width and height of plane i.
 const PLANE_AXES: [[usize; 2]; 3] = [[0, 1], [0, 2], [1, 2]];
@@ -60,7 +61,7 @@ pub struct VmCheckpoint {
     pub alpha_mask_threshold: f32,
     /// Factor on the length of a step.
     pub distance_scale: f32,
-    /// Weight above which a sample gets a colour.
+    /// Weight above which a sample gets a color.
     pub weight_threshold: f32,
     /// From density feature to density.
     pub activation: Activation,
@@ -68,13 +69,13 @@ pub struct VmCheckpoint {
     pub near_far: [f32; 2],
     /// Step over the mean distance of nodes.
     pub step_ratio: f32,
-    /// Frequencies of positions; unused by the colour network that is read.
+    /// Frequencies of positions; unused by the color network that is read.
     pub position_frequencies: usize,
     /// Frequencies of view directions.
     pub view_frequencies: usize,
     /// Frequencies of appearance features.
     pub feature_frequencies: usize,
-    /// Width of the colour network.
+    /// Width of the color network.
     pub hidden: usize,
     /// `[C, H, W]`: `[rank, nodes of the second axis, nodes of the first]`.
     pub density_planes: [Vec<f32>; 3],
@@ -113,7 +114,7 @@ pub enum Activation {
 }
 
 impl VmCheckpoint {
-    /// Width of the colour network's input: features, direction, and sine and cosine of both.
+    /// Width of the color network's input: features, direction, and sine and cosine of both.
     pub fn inputs(&self) -> usize {
         self.app_dim * (1 + 2 * self.feature_frequencies) + 3 * (1 + 2 * self.view_frequencies)
     }
@@ -131,79 +132,33 @@ impl VmCheckpoint {
     }
 }
 
-/// Why a checkpoint could not be taken.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum ThError {
-    /// The file itself.
-    #[error(transparent)]
-    Read(#[from] ReadError),
-    /// An entry that is missing, of another type, or does not fit the others.
-    #[error("`{}`: `{key}` is {found}, expected {expected}", path.display())]
-    Content {
-        /// The file.
-        path: PathBuf,
-        /// The entry, with the dictionary it stands in.
-        key: String,
-        /// What is there.
-        found: String,
-        /// What must be there.
-        expected: String,
-    },
-    /// A decomposition into lines alone.
-    #[error("`{}` holds a CP field (lines without planes), only the vector–matrix field is read", path.display())]
-    Cp {
-        /// The file.
-        path: PathBuf,
-    },
-    /// Another colour network.
-    #[error("`{}` finds colors by shadingMode `{found}`, only `MLP_Fea` is read", path.display())]
-    Shading {
-        /// The file.
-        path: PathBuf,
-        /// The mode.
-        found: String,
-    },
-}
-
-crate::error::error_from!(ThError, Cannot);
-
-impl ThError {
-    /// The way out.
-    pub fn hint(&self) -> String {
-        match self {
-            ThError::Read(error) => error.hint(),
-            ThError::Content { .. } => {
-                "give a `.th` file as `TensorVMSplit.save` writes it; other checkpoints have other entries"
-                    .into()
-            }
-            ThError::Cp { .. } => "train again with `--model_name TensorVMSplit`".into(),
-            ThError::Shading { .. } => "train again with `--shadingMode MLP_Fea`, as T-Face does".into(),
-        }
-    }
-}
-
 /// Reads a published checkpoint; nothing in it is executed ([`io::parse_torch`]). Every shape is compared
 /// with the sizes in `kwargs`, every number must be finite, and an entry without a meaning is an error.
-pub fn read_th(path: &Path, limits: &Limits) -> Result<VmCheckpoint, ThError> {
+pub fn read_th(path: &Path, limits: &Limits) -> Result<VmCheckpoint> {
     understand(path, &io::read_torch(path, limits)?)
 }
 
 /// [`read_th`] on bytes; `path` is only for messages.
-pub fn from_bytes(bytes: &[u8], path: &Path, limits: &Limits) -> Result<VmCheckpoint, ThError> {
+pub fn from_bytes(bytes: &[u8], path: &Path, limits: &Limits) -> Result<VmCheckpoint> {
     understand(path, &io::parse_torch(path, bytes, limits)?)
 }
 
-fn understand(path: &Path, root: &TorchValue) -> Result<VmCheckpoint, ThError> {
+fn understand(path: &Path, root: &TorchValue) -> Result<VmCheckpoint> {
     let root = Table { path, name: "", values: root };
     let kwargs = root.table("kwargs")?;
     let state = root.table("state_dict")?;
     if state.values.get("density_plane.0").is_none() && state.values.get("density_line.0").is_some() {
-        return Err(ThError::Cp { path: path.into() });
+        let what = "a CP field (lines without planes), only the vector–matrix field is read";
+        let message = format!("`{}` holds {what}", path.display());
+        return Err(Error::cannot(message, "train again with `--model_name TensorVMSplit`"));
     }
     let shading = kwargs.text("shadingMode")?;
     if shading != "MLP_Fea" {
-        return Err(ThError::Shading { path: path.into(), found: shading.escape_debug().take(80).collect() });
+        let found: String = shading.escape_debug().take(80).collect();
+        return Err(Error::cannot(
+            format!("`{}` finds colors by shadingMode `{found}`, only `MLP_Fea` is read", path.display()),
+            "train again with `--shadingMode MLP_Fea`, as T-Face does",
+        ));
     }
     let activation = match kwargs.text("fea2denseAct")? {
         "relu" => Activation::Relu,
@@ -267,7 +222,7 @@ fn understand(path: &Path, root: &TorchValue) -> Result<VmCheckpoint, ThError> {
     Ok(vm)
 }
 
-fn mask(root: &Table) -> Result<VmMask, ThError> {
+fn mask(root: &Table) -> Result<VmMask> {
     let expected = "(1, 1, nz, ny, nx), each 2 or more";
     let shape: Option<Vec<usize>> =
         root.items("alphaMask.shape")?.iter().map(|v| integer(v).filter(|&n| n <= MAX_COUNT)).collect();

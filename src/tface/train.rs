@@ -1,35 +1,32 @@
-//! The training loop of the stages `baseline` and `tface`.
+//! One training step of the stages `baseline` and `tface`; the loop around it is [`crate::field::training`]'s.
 
-use super::TfaceError;
-use super::checkpoint;
 use super::grow::{update_mask, upsample};
-use super::state::State;
-use crate::Monitor;
-use crate::config::{MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
+use super::record::FORMAT;
+use super::state::VmState;
+use crate::config::{MaskLoss, MaskUse, VmBackground, VmConfig};
 use crate::field;
+use crate::field::checkpoint::{Checkpoint, Progress};
 use crate::field::ops::{self, GridPenalty, VmBatch};
-use crate::field::optimizer::update;
 use crate::field::pixels::{Batch, Pixels, TrainView};
-use crate::geom::Aabb;
+use crate::field::training::{self, Learner, Session, StepError, StepReport};
 use crate::image::Gray;
 use crate::kernel::adam::AdamStep;
 use crate::kernel::march::Bitmask;
 use crate::kernel::rng;
-use crate::kernel::vm::mask::VmRay;
-use crate::kernel::vm::{Penalty, RAY_WIDTH};
+use crate::kernel::vm::{Penalty, RAY_WIDTH, VmField};
+use crate::{Error, Result};
 use burn::tensor::{Device, Tensor};
 use serde::Serialize;
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// What training did.
 #[derive(Clone, Debug, Serialize)]
-pub struct TrainReport {
+pub struct TfaceReport {
     /// Fields learned.
     pub fields: usize,
-    /// Optimiser steps of each field.
+    /// Optimizer steps of each field.
     pub steps: u64,
     /// Seconds in this process (less than the whole when resumed).
     pub seconds: f64,
@@ -45,18 +42,18 @@ pub struct TrainReport {
     pub lattice_samples: u64,
     /// Those whose density was looked up.
     pub density_samples: u64,
-    /// Those whose colour was decoded.
+    /// Those whose color was decoded.
     pub color_samples: u64,
     /// Oddities on the way.
     pub warnings: Vec<String>,
 }
 
-impl TrainReport {
+impl TfaceReport {
     /// With what another field's training did.
-    pub(super) fn and(self, other: TrainReport) -> TrainReport {
+    pub(super) fn and(self, other: TfaceReport) -> TfaceReport {
         let fields = self.fields + other.fields;
         let mean = |a: f64, b: f64| (a * self.fields as f64 + b * other.fields as f64) / fields as f64;
-        TrainReport {
+        TfaceReport {
             fields,
             steps: self.steps,
             seconds: self.seconds + other.seconds,
@@ -81,140 +78,36 @@ struct Counts {
     color: u64,
 }
 
-/// Figures of one step on the host.
-struct Figures {
-    rgb: f32,
-    mask: f32,
-    outside: Option<f32>,
-}
-
-struct Trainer<'a> {
+struct VmTraining<'a> {
     config: &'a VmConfig,
-    seed: u64,
+    session: Session<'a>,
     device: Device,
-    pixels: Pixels<'a>,
-    state: State,
+    pixels: &'a Pixels<'a>,
+    state: VmState,
     counts: Counts,
 }
 
-/// Trains one field until `config.steps`, saving checkpoints into its own folder `dir` and continuing from the one
-/// that lies there; a finished one is left as it is. Arguments as in [`super::mean::train`].
-pub fn train(
-    stage: &'static str,
-    views: &[TrainView],
-    bounds: Aabb,
+/// Trains one field in `bounds` until `config.steps`, saving checkpoints into the session's folder and continuing
+/// from the one that lies there; a finished one is left as it is.
+pub(super) fn train_one(
+    pixels: &Pixels,
+    bounds: [[f32; 3]; 2],
     hull: Option<&Bitmask>,
     config: &VmConfig,
-    seed: u64,
-    device: &str,
-    dir: &Path,
-    identity: &str,
-    monitor: &dyn Monitor,
-) -> Result<TrainReport, TfaceError> {
-    let device = field::device(device)?;
+    session: &Session,
+) -> Result<TfaceReport> {
+    let device = field::device(session.device)?;
     let began = Instant::now();
-    check(stage, config)?;
-    let restored = checkpoint::restore(dir, config, identity, &device)?;
-    if let Some((state, warnings)) = &restored
-        && state.step == config.steps
-    {
-        checkpoint::finish(dir)?;
-        monitor.step(config.steps, config.steps, &[]);
-        return Ok(report(config, state, Counts::default(), began, warnings.clone()));
-    }
-    let views = masked_as_configured(views, config.masks);
-    let hull = hull.filter(|_| config.start == VmStart::Hull && config.masks != MaskUse::None);
-    // rays that meet the hull, grown by the cells around it
-    let reach = hull.map_or(f32::INFINITY, |h| 4.0 * 2.0 / h.resolution.min(128) as f32);
-    let pixels = Pixels::new(&views, reach, 1.0, config.foreground, config.whole_frame);
-    if pixels.count() == 0 {
-        return Err(TfaceError::NoPixels);
-    }
-    let mut warnings = Vec::new();
-    let bounds = [bounds.min.to_array(), bounds.max.to_array()];
-    let fresh = || State::new(config, seed, bounds, hull, &device);
-    let state = match restored {
-        Some((state, notes)) => {
-            warnings.extend(notes);
-            state
-        }
-        None => fresh(),
-    };
-    let mut trainer =
-        Trainer { config, seed, device: device.clone(), pixels, state, counts: Counts::default() };
-    let mut saved = Instant::now();
-    let mut diverged_before = trainer.state.salt > 0;
-    let mut density = 0;
-    while trainer.state.step < config.steps {
-        let step = trainer.state.step;
-        let every = Duration::from_secs_f64(config.checkpoint_s);
-        let result = trainer.step().and_then(|figures| {
-            let saving = saved.elapsed() > every || monitor.stop() || trainer.state.step == config.steps;
-            // a poisoned field must not take the place of a good checkpoint
-            if saving && !trainer.state.is_finite() { Err(("grid", f32::NAN)) } else { Ok(figures) }
-        });
-        match result {
-            Ok(figures) => {
-                let old = trainer.state.mean_square;
-                let keep = if old == 0.0 { 0.0 } else { 0.98 };
-                trainer.state.mean_square = keep * old + (1.0 - keep) * figures.rgb as f64;
-                if !trainer.after(step) {
-                    return Err(TfaceError::Empty { step, threshold: config.mask_threshold });
-                }
-                let mut shown = vec![
-                    ("rgb", figures.rgb as f64),
-                    ("mask", figures.mask as f64),
-                    ("psnr", -10.0 * trainer.state.mean_square.max(1e-12).log10()),
-                    ("samples", (trainer.counts.density - density) as f64),
-                ];
-                if let Some(outside) = figures.outside {
-                    shown.push(("outside", outside as f64));
-                }
-                density = trainer.counts.density;
-                monitor.step(step + 1, config.steps, &shown);
-            }
-            Err((term, value)) => {
-                if diverged_before {
-                    return Err(TfaceError::Diverged { term, value, step });
-                }
-                diverged_before = true;
-                warnings.push(format!(
-                    "the {term} loss became {value} at step {step}; went back to the last checkpoint once"
-                ));
-                trainer.state = match checkpoint::restore(dir, config, identity, &device)? {
-                    Some((state, _)) => state,
-                    None => fresh(),
-                };
-                // other rays, or the same step would break in the same way
-                trainer.state.salt = 1;
-            }
-        }
-        if monitor.stop() {
-            checkpoint::save(dir, &trainer.state, config, identity, false)?;
-            return Err(TfaceError::Stopped { step: trainer.state.step, steps: config.steps });
-        }
-        if saved.elapsed() > every {
-            checkpoint::save(dir, &trainer.state, config, identity, false)?;
-            saved = Instant::now();
-        }
-    }
-    checkpoint::save(dir, &trainer.state, config, identity, true)?;
-    checkpoint::finish(dir)?;
-    Ok(report(config, &trainer.state, trainer.counts, began, warnings))
-}
-
-fn report(
-    config: &VmConfig,
-    state: &State,
-    counts: Counts,
-    began: Instant,
-    warnings: Vec<String>,
-) -> TrainReport {
-    TrainReport {
+    let state = VmState::new(config, session.seed, bounds, hull, &device);
+    let mut learner =
+        VmTraining { config, session: *session, device, pixels, state, counts: Counts::default() };
+    let (progress, warnings) = training::train(&mut learner, session, config.steps, config.checkpoint_s)?;
+    let VmTraining { state, counts, .. } = learner;
+    Ok(TfaceReport {
         fields: 1,
         steps: config.steps,
         seconds: began.elapsed().as_secs_f64(),
-        train_psnr: -10.0 * state.mean_square.max(1e-12).log10(),
+        train_psnr: progress.psnr(),
         occupied: state.mask.as_ref().map_or(1.0, |m| m.share()),
         size: state.size,
         rays: counts.rays,
@@ -222,12 +115,15 @@ fn report(
         density_samples: counts.density,
         color_samples: counts.color,
         warnings,
-    }
+    })
 }
 
 /// What ranges of single keys cannot say.
-fn check(stage: &'static str, config: &VmConfig) -> Result<(), TfaceError> {
-    let wrong = |key, problem: &str| Err(TfaceError::Settings { stage, key, problem: problem.into() });
+pub(super) fn check(stage: &str, config: &VmConfig) -> Result<()> {
+    let wrong = |key: &str, problem: &str| {
+        let hint = format!("`tiface config --explain {stage}.{key}` says what it means");
+        Err(Error::usage(format!("`{stage}.{key}` {problem}"), hint))
+    };
     for (key, rank) in [("density_rank", &config.density_rank), ("color_rank", &config.color_rank)] {
         if rank.len() != 3 || rank.iter().all(|&r| r == 0) {
             return wrong(key, "needs three numbers, not all 0: channels of the planes xy, xz, yz");
@@ -259,7 +155,7 @@ fn tv_fade(config: &VmConfig, step: u64) -> f64 {
 }
 
 /// The views with their masks as the setting wants them.
-fn masked_as_configured(views: &[TrainView], masks: MaskUse) -> Vec<TrainView> {
+pub(super) fn masked_as_configured(views: &[TrainView], masks: MaskUse) -> Vec<TrainView> {
     let change = |mask: &Gray| match masks {
         MaskUse::None => None,
         MaskUse::Soft => Some(mask.clone()),
@@ -279,43 +175,65 @@ fn masked_as_configured(views: &[TrainView], masks: MaskUse) -> Vec<TrainView> {
         .collect()
 }
 
-impl Trainer<'_> {
-    /// One optimiser step. The error names a loss that is not finite; nothing was updated then.
-    fn step(&mut self) -> Result<Figures, (&'static str, f32)> {
+impl Learner for VmTraining<'_> {
+    const FORMAT: &'static str = FORMAT;
+    const RATES: [&'static str; 2] = ["lr_grid", "lr_network"];
+
+    fn step(&mut self, progress: &Progress) -> Result<StepReport, StepError> {
         let config = self.config;
-        let step = self.state.step;
-        let seed = self.seed ^ self.state.salt << 32;
-        let batch = self.pixels.draw(seed, step, config.rays, true);
-        let rays: Vec<VmRay> = batch
-            .rays
-            .iter()
-            .map(|r| VmRay { origin: r.origin, direction: r.direction, jitter: r.jitter })
-            .collect();
+        let step = progress.step;
+        let seed = self.session.seed ^ progress.salt << 32;
+        let mut batch = self.pixels.draw(seed, step, config.rays, true);
         let field = self.state.field(config, true);
+        let rays = std::mem::take(&mut batch.rays);
         self.counts.rays += rays.len() as u64;
         self.counts.lattice += rays.iter().map(|r| field.lattice.points(r)).sum::<u64>();
         let vm = Arc::new(VmBatch::new(field.clone(), rays));
-        let (density, color) = self.penalised(&field, step);
-        let out = ops::vm_render(density, color, self.state.network.val(), vm.clone());
-        self.counts.density += vm.density_samples.load(Ordering::Relaxed);
+        let (density, color) = self.penalized(&field, step);
+        let out = ops::vm_render(density, color, self.state.parameters[2].flat(), vm.clone());
+        let looked_up = vm.density_samples.load(Ordering::Relaxed);
+        self.counts.density += looked_up;
         self.counts.color += vm.color_samples.load(Ordering::Relaxed);
 
         let (total, rgb, mask, outside) = self.losses(out, &batch, step, seed);
-        let value = |t: &Tensor<1>| field::values(t.clone().inner())[0];
-        let figures = Figures { rgb: value(&rgb), mask: mask.as_ref().map_or(0.0, value), outside };
-        for (term, value) in [("rgb", figures.rgb), ("mask", figures.mask)] {
+        let value = |t: Tensor<1>| field::values(t.inner())[0];
+        let (rgb, mask) = (value(rgb), mask.map_or(0.0, value));
+        for (term, value) in [("rgb", rgb), ("mask", mask)] {
             if !value.is_finite() {
-                return Err((term, value));
+                return Err(self.not_finite(term, value, step));
             }
         }
-        drop((rgb, mask));
         self.descend(total, step)?;
-        self.state.step += 1;
-        Ok(figures)
+        self.grow(step)?;
+        let mut figures = vec![("rgb", rgb as f64), ("mask", mask as f64), ("samples", looked_up as f64)];
+        figures.extend(outside.map(|outside| ("outside", outside as f64)));
+        Ok(StepReport { square_error: Some(rgb), figures })
     }
 
-    /// Both grids with their regularisers attached.
-    fn penalised(&self, field: &Arc<crate::kernel::vm::VmField>, step: u64) -> (Tensor<1>, Tensor<1>) {
+    fn save(&self, progress: &Progress, into: &mut Checkpoint, finished: bool) -> Result<(), StepError> {
+        if !self.state.is_finite() {
+            return Err(self.not_finite("grid", f32::NAN, progress.step));
+        }
+        self.state.save(self.config, into, finished);
+        Ok(())
+    }
+
+    fn restore(&mut self, from: Option<(&mut Checkpoint, &Progress, bool)>) -> Result<(), StepError> {
+        if let Some((from, progress, finished)) = from {
+            self.state.restore(self.config, from, progress.step, finished)?;
+        }
+        Ok(())
+    }
+}
+
+impl VmTraining<'_> {
+    fn not_finite(&self, term: &'static str, value: f32, step: u64) -> StepError {
+        let lr = self.config.lr_network * learning_rate(self.config, step - self.state.reset);
+        StepError::NotFinite { term, value, lr }
+    }
+
+    /// Both grids with their regularizers attached.
+    fn penalized(&self, field: &VmField, step: u64) -> (Tensor<1>, Tensor<1>) {
         let config = self.config;
         let faded = tv_fade(config, step);
         let tv = |weight: f64| (0.01 * weight * faded) as f32;
@@ -324,15 +242,15 @@ impl Trainer<'_> {
         let of_density = Penalty { tv: tv(config.tv_density), l1, ortho };
         let of_color = Penalty { tv: tv(config.tv_color), l1: 0.0, ortho };
         let attach = |p: Tensor<1>, grid, penalty: Penalty| {
-            if penalty.is_zero() { p } else { ops::penalised(p, Arc::new(GridPenalty { grid, penalty })) }
+            if penalty.is_zero() { p } else { ops::penalized(p, Arc::new(GridPenalty { grid, penalty })) }
         };
         (
-            attach(self.state.density.val(), field.density, of_density),
-            attach(self.state.color.val(), field.color, of_color),
+            attach(self.state.parameters[0].flat(), field.density, of_density),
+            attach(self.state.parameters[1].flat(), field.color, of_color),
         )
     }
 
-    /// Total, colour and mask losses; mean opacity² of the batch's background rays.
+    /// Total, color and mask losses; mean opacity² of the batch's background rays.
     fn losses(
         &self,
         out: Tensor<2>,
@@ -342,7 +260,7 @@ impl Trainer<'_> {
     ) -> (Tensor<1>, Tensor<1>, Option<Tensor<1>>, Option<f32>) {
         let config = self.config;
         let device = &self.device;
-        let n = batch.rays.len();
+        let n = batch.alpha.len();
         let stream = step << 4;
         let opacity = out.clone().narrow(1, 3, 1); // [n, 1]
         let mut color = out.clone().narrow(1, 0, 3); // [n, 3]
@@ -401,44 +319,55 @@ impl Trainer<'_> {
 
     /// Backward and Adam. Nothing is updated where the decoder's gradient is not finite; the grids are looked
     /// at before every checkpoint.
-    fn descend(&mut self, loss: Tensor<1>, step: u64) -> Result<(), (&'static str, f32)> {
+    fn descend(&mut self, loss: Tensor<1>, step: u64) -> Result<(), StepError> {
         let config = self.config;
-        let state = &mut self.state;
         let mut gradients = loss.backward();
         drop(loss);
-        let network = state.network.val().grad(&gradients);
-        if network.is_some_and(|g| field::values(g).iter().any(|g| !g.is_finite())) {
-            return Err(("gradient of the", f32::NAN));
+        if !self.state.parameters[2].has_finite_gradient(&gradients) {
+            return Err(self.not_finite("gradient of the", f32::NAN, step));
         }
-        let since = step - state.reset;
-        let factor = learning_rate(config, since);
+        let factor = learning_rate(config, step - self.state.reset);
         let grid = AdamStep {
             lr: (config.lr_grid * factor) as f32,
             beta1: 0.9,
             beta2: 0.99,
             epsilon: 1e-8,
             weight_decay: 0.0,
-            step: step - state.moments_from + 1,
+            step: step - self.state.moments_from + 1,
             skip_zero: false,
         };
         let network = AdamStep { lr: (config.lr_network * factor) as f32, ..grid };
-        let [density, color, weights] = &mut state.moments;
-        update(&mut state.density, density, &mut gradients, grid);
-        update(&mut state.color, color, &mut gradients, grid);
-        update(&mut state.network, weights, &mut gradients, network);
+        for (p, step) in self.state.parameters.iter_mut().zip([grid, grid, network]) {
+            p.update(&mut gradients, step);
+        }
         Ok(())
     }
 
-    /// What is due after the optimiser step of iteration `step`; false if the field has become empty.
-    fn after(&mut self, step: u64) -> bool {
+    /// Rebuilds the mask and refines the grids where that is due after step `step`.
+    fn grow(&mut self, step: u64) -> Result<(), StepError> {
         let config = self.config;
-        if config.mask_steps.contains(&step) && !update_mask(&mut self.state, config, &self.device) {
-            return false;
+        let masking = config.mask_steps.contains(&step);
+        let upsampling = config.upsample_steps.iter().position(|&s| s == step);
+        // what is not finite would be spread, or taken for empty
+        if (masking || upsampling.is_some()) && !self.state.is_finite() {
+            return Err(self.not_finite("grid", f32::NAN, step));
         }
-        if let Some(which) = config.upsample_steps.iter().position(|&s| s == step) {
-            upsample(&mut self.state, config, which, &self.device);
+        if masking && !update_mask(&mut self.state, config, step + 1) {
+            let (stage, threshold) = (self.session.stage, config.mask_threshold);
+            return Err(StepError::Failed(Error::cannot(
+                format!(
+                    "the field is empty at step {step}: no vertex of the alpha mask is above {threshold:e}"
+                ),
+                format!(
+                    "look at the masks and poses with `tiface inspect`; lower {stage}.mask_threshold and \
+                     {stage}.mask_weight"
+                ),
+            )));
         }
-        true
+        if let Some(which) = upsampling {
+            upsample(&mut self.state, config, which, step + 1);
+        }
+        Ok(())
     }
 }
 

@@ -1,13 +1,17 @@
 //! Training on an analytic ball: does it learn, resume, guard and stop?
 
 use super::*;
-use crate::Quiet;
-use crate::config::{DensityActivation, Preset};
-use crate::field::ball::{BALL, StopAfter, hull, negative, says, tampered, temporary, views};
-use crate::io::Tensors;
+use crate::config::{DensityActivation, Preset, VmStart};
+use crate::field::ball::{
+    BALL, bytes, hull, negative, refuses, resumes, says, session, tampered, temporary, views,
+};
+use crate::field::checkpoint;
+use crate::geom::Aabb;
 use crate::kernel::vm::size_for;
-use crate::tface::TFace;
+use crate::tface::{TFace, train};
+use crate::{Monitor, Quiet};
 use glam::{Vec2, Vec3};
+use std::path::Path;
 
 const BOX: Aabb = Aabb { min: Vec3::splat(-0.8), max: Vec3::splat(0.8) };
 
@@ -26,17 +30,17 @@ fn config() -> VmConfig {
     }
 }
 
-fn run(config: &VmConfig, dir: &Path, monitor: &dyn Monitor) -> Result<TrainReport, TfaceError> {
-    train("tface", &views(), BOX, Some(&hull()), config, 3, "cpu", dir, "ball", monitor)
+fn run(config: &VmConfig, dir: &Path, monitor: &dyn Monitor) -> Result<TfaceReport> {
+    train(&views(), BOX, Some(&hull()), config, &session("baseline", dir, "ball", monitor))
 }
 
 #[test]
 fn a_ball_is_learned_from_eight_views() {
     let dir = temporary();
     let report = run(&config(), dir.path(), &Quiet).unwrap();
-    let face = TFace::load(dir.path()).unwrap();
+    let face = TFace::load("tface", dir.path()).unwrap();
     assert!(report.train_psnr > 20.0, "{report:?}");
-    // colour is asked of a part of the densities, and those of a part of the lattice
+    // color is asked of a part of the densities, and those of a part of the lattice
     assert!(report.color_samples < report.density_samples && report.density_samples < report.lattice_samples);
     // the box has shrunk around a ball of 0.6 and its first guesses are finer now
     assert!(report.size.iter().all(|n| (24..40).contains(n)), "{report:?}");
@@ -56,70 +60,36 @@ fn a_ball_is_learned_from_eight_views() {
 fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
     // two upsamplings, two masks and the shrinking box lie before, between and after the stops
     let config = VmConfig { steps: 60, upsample_steps: vec![10, 25], mask_steps: vec![10, 30], ..config() };
-    let undisturbed = temporary();
-    run(&config, undisturbed.path(), &Quiet).unwrap();
-    let stopped = temporary();
-    for _ in 0..5 {
-        let end = run(&config, stopped.path(), &StopAfter::new(11));
-        assert!(matches!(end, Err(TfaceError::Stopped { steps: 60, .. })));
-    }
-    // a checkpoint cut short by a crash: the one before it is taken
-    let bytes = |dir: &Path| std::fs::read(checkpoint::newest(dir)).unwrap();
-    let whole = bytes(stopped.path());
-    std::fs::write(checkpoint::newest(stopped.path()), &whole[..whole.len() / 2]).unwrap();
-    run(&config, stopped.path(), &Quiet).unwrap();
-    assert_eq!(bytes(undisturbed.path()), bytes(stopped.path()));
-    assert!(!stopped.path().join("checkpoint.previous.safetensors").exists());
+    resumes(&|dir, monitor| run(&config, dir, monitor).map(|r| r.warnings), 5);
 }
 
 #[test]
 fn a_hostile_checkpoint_is_named_and_the_one_before_it_is_taken() {
     let config = VmConfig { steps: 9, upsample_steps: vec![5], mask_steps: vec![5], ..config() };
-    let begun = temporary();
-    for _ in 0..2 {
-        assert!(run(&config, begun.path(), &StopAfter::new(3)).is_err());
-    }
-    let undisturbed = temporary();
-    run(&config, undisturbed.path(), &Quiet).unwrap();
-    let bytes = |dir: &Path| std::fs::read(checkpoint::newest(dir)).unwrap();
     let infinite = f64::INFINITY.to_bits().to_string();
-    let rows: [(&str, &dyn Fn(&mut Tensors)); 8] = [
-        ("`step`", &says("step", "18446744073709551615")),
-        ("`mean_square`", &says("mean_square", &infinite)),
-        ("`reset`", &says("reset", "7")),
-        ("`moments_from`", &says("moments_from", "18446744073709551615")),
-        ("second.color", &negative("second.color")),
-        ("`masked`", &says("masked", "2")),
-        ("`salt`", &says("salt", "9")),
-        // it would go on without moments
-        ("`step`", &says("finished", "1")),
-    ];
-    for (i, (key, change)) in rows.iter().enumerate() {
-        let dir = temporary();
-        for file in std::fs::read_dir(begun.path()).unwrap().map(|f| f.unwrap()) {
-            std::fs::copy(file.path(), dir.path().join(file.file_name())).unwrap();
-        }
-        tampered(dir.path(), change);
-        if i % 4 == 0 {
-            let report = run(&config, dir.path(), &Quiet).unwrap();
-            let told = |w: &String| w.contains(key) && w.contains("falling back");
-            assert!(report.warnings.iter().any(told), "{:?}", report.warnings);
-            assert_eq!(bytes(undisturbed.path()), bytes(dir.path()));
-        } else {
-            // nothing before it to take
-            std::fs::remove_file(dir.path().join("checkpoint.previous.safetensors")).unwrap();
-            let e = run(&config, dir.path(), &Quiet).unwrap_err();
-            assert!(e.to_string().contains(key) && e.to_string().contains("checkpoint.safetensors"), "{e}");
-            assert_eq!(e.hint("baseline").unwrap(), "start the stage afresh with `--fresh baseline`");
-        }
-    }
+    refuses(
+        &|dir, monitor| run(&config, dir, monitor).map(|r| r.warnings),
+        3,
+        "baseline",
+        &[
+            ("`step`", &says("step", "18446744073709551615")),
+            ("`mean_square`", &says("mean_square", &infinite)),
+            ("`reset`", &says("reset", "7")),
+            ("`moments_from`", &says("moments_from", "18446744073709551615")),
+            ("second.color", &negative("second.color")),
+            ("`masked`", &says("masked", "2")),
+            ("`salt`", &says("salt", "9")),
+            // it would go on without moments
+            ("`step`", &says("finished", "1")),
+        ],
+    );
 }
 
 #[test]
 fn a_hostile_description_of_a_field_is_refused_before_it_is_rendered() {
     let dir = temporary();
     run(&VmConfig { steps: 2, ..config() }, dir.path(), &Quiet).unwrap();
-    let whole = std::fs::read(checkpoint::newest(dir.path())).unwrap();
+    let whole = bytes(dir.path());
     for (key, value) in [
         ("density_rank", "[18446744073709551615,1,1]"),
         ("color_rank", "[0,0,0]"),
@@ -139,9 +109,10 @@ fn a_hostile_description_of_a_field_is_refused_before_it_is_rendered() {
             field[key] = serde_json::from_str(value).unwrap();
             metadata.insert("field".into(), field.to_string());
         });
-        let e = TFace::load(dir.path()).err().unwrap_or_else(|| panic!("{key} = {value} is accepted"));
+        let e =
+            TFace::load("tface", dir.path()).err().unwrap_or_else(|| panic!("{key} = {value} is accepted"));
         assert!(e.to_string().contains("checkpoint.safetensors"), "{key}: {e}");
-        assert!(e.hint("tface").unwrap().contains("--fresh tface"), "{key}: {e}");
+        assert!(e.hint().contains("--fresh tface"), "{key}: {e}");
     }
 }
 
@@ -198,23 +169,22 @@ fn published_rates_are_reproduced() {
 fn upsampling_starts_the_rates_again_from_the_next_step() {
     let device = crate::field::device("cpu").unwrap();
     let config = config();
-    let mut state = State::new(&config, 1, [[-1.0; 3], [1.0; 3]], None, &device);
+    let mut state = VmState::new(&config, 1, [[-1.0; 3], [1.0; 3]], None, &device);
     assert_eq!(state.size, [16; 3]);
-    state.step = 2001;
-    upsample(&mut state, &config, 1, &device);
+    upsample(&mut state, &config, 1, 2001);
     assert_eq!((state.size, state.reset), (size_for([2.0; 3], 28 * 28 * 28), 2001));
 }
 
 #[test]
 fn a_diverging_run_restores_once_and_then_names_term_and_step() {
     let dir = temporary();
-    // softplus, or every density would die before a colour breaks
+    // softplus, or every density would die before a color breaks
     let activation = DensityActivation::Softplus;
     let config = VmConfig { lr_grid: 1e38, lr_network: 1e38, activation, mask_steps: vec![], ..config() };
-    match run(&config, dir.path(), &Quiet).err() {
-        Some(TfaceError::Diverged { term, value, .. }) => assert!(!value.is_finite() && !term.is_empty()),
-        other => panic!("expected divergence, got {other:?}"),
-    }
+    let e = run(&config, dir.path(), &Quiet).err().unwrap();
+    let message = e.to_string();
+    assert!(message.contains("NaN at step") || message.contains("inf at step"), "{message}");
+    assert!(message.contains("again after restoring") && e.hint().contains("baseline.lr_grid"), "{e:?}");
 }
 
 #[test]
@@ -222,22 +192,24 @@ fn impossible_settings_and_empty_masks_are_named() {
     let dir = temporary();
     let message = |config: &VmConfig| run(config, dir.path(), &Quiet).err().unwrap().to_string();
     let cases = [
-        (VmConfig { density_rank: vec![4, 4], ..config() }, "`tface.density_rank` needs three numbers"),
-        (VmConfig { upsample_steps: vec![9, 5], ..config() }, "`tface.upsample_steps` must rise"),
-        (VmConfig { hidden: 30, ..config() }, "`tface.hidden` must be a multiple of 8"),
-        (VmConfig { voxels_final: 100, ..config() }, "`tface.voxels_final` is less"),
+        (VmConfig { density_rank: vec![4, 4], ..config() }, "`baseline.density_rank` needs three numbers"),
+        (VmConfig { upsample_steps: vec![9, 5], ..config() }, "`baseline.upsample_steps` must rise"),
+        (VmConfig { hidden: 30, ..config() }, "`baseline.hidden` must be a multiple of 8"),
+        (VmConfig { voxels_final: 100, ..config() }, "`baseline.voxels_final` is less"),
     ];
     for (config, want) in cases {
         assert!(message(&config).starts_with(want), "{}", message(&config));
     }
     let mut empty = views();
     empty.iter_mut().for_each(|v| v.mask.as_mut().unwrap().values.fill(0));
-    let end = train("tface", &empty, BOX, Some(&hull()), &config(), 3, "cpu", dir.path(), "e", &Quiet);
-    assert!(matches!(end, Err(TfaceError::NoPixels)));
+    let end = train(&empty, BOX, Some(&hull()), &config(), &session("tface", dir.path(), "e", &Quiet));
+    assert!(end.unwrap_err().to_string().starts_with("no training view has a pixel"));
     // a hull without a cell: the first alpha mask has nothing to keep
     let nothing = Bitmask::filled(32, false);
-    let end = train("tface", &views(), BOX, Some(&nothing), &config(), 3, "cpu", dir.path(), "n", &Quiet);
-    assert!(matches!(end, Err(TfaceError::Empty { step: 40, .. })));
+    let end = train(&views(), BOX, Some(&nothing), &config(), &session("tface", dir.path(), "n", &Quiet));
+    let e = end.unwrap_err();
+    assert!(e.to_string().starts_with("the field is empty at step 40"), "{e}");
+    assert!(e.hint().contains("tface.mask_threshold"), "{e:?}");
 }
 
 #[test]
@@ -246,7 +218,7 @@ fn a_checkpoint_of_other_settings_is_refused() {
     let config = VmConfig { steps: 2, ..config() };
     run(&config, dir.path(), &Quiet).unwrap();
     let views = views();
-    let again = train("tface", &views, BOX, Some(&hull()), &config, 3, "cpu", dir.path(), "other", &Quiet);
+    let again = train(&views, BOX, Some(&hull()), &config, &session("tface", dir.path(), "other", &Quiet));
     let message = again.err().unwrap().to_string();
     assert!(message.contains("checkpoint.safetensors") && message.contains("other settings"), "{message}");
 }

@@ -5,7 +5,7 @@
 //! remembered is counted together: a pickle cannot make more than [`MAX_VALUES`] of it.
 
 use super::super::ReadError;
-use super::objects::{Global, Node};
+use super::objects::{Global, Heap, Id, Object};
 use super::{FORMAT, shown};
 use std::collections::HashMap;
 use std::ops::Range;
@@ -14,37 +14,26 @@ use std::path::Path;
 /// Values of one checkpoint; a field has some hundreds.
 pub(super) const MAX_VALUES: usize = 1 << 18;
 
-/// Index of a node.
-pub(super) type Id = u32;
-
-/// Every object of a pickle, and the one that is the result.
-pub(super) struct Graph<'a> {
-    pub(super) pickle: &'a [u8],
-    pub(super) nodes: Vec<Node>,
-    pub(super) root: Id,
-}
-
-/// Runs the whole pickle.
-pub(super) fn run<'a>(path: &Path, pickle: &'a [u8]) -> Result<Graph<'a>, ReadError> {
+/// Runs the whole pickle; gives its objects and the one that is the result.
+pub(super) fn run<'a>(path: &Path, pickle: &'a [u8]) -> Result<(Heap<'a>, Id), ReadError> {
     let mut machine = Machine {
         path,
-        pickle,
+        heap: Heap::new(pickle),
         at: 0,
         opcode: 0,
         stack: Vec::new(),
         marks: Vec::new(),
         memo: HashMap::new(),
-        nodes: Vec::new(),
         spent: 0,
     };
     while machine.step()? {}
     let root = machine.pop()?;
-    Ok(Graph { pickle, nodes: machine.nodes, root })
+    Ok((machine.heap, root))
 }
 
-pub(super) struct Machine<'a, 'p> {
+struct Machine<'a, 'p> {
     path: &'p Path,
-    pub(super) pickle: &'a [u8],
+    heap: Heap<'a>,
     at: usize,
     /// Where the opcode being run stands.
     opcode: usize,
@@ -52,7 +41,6 @@ pub(super) struct Machine<'a, 'p> {
     /// Heights of the stack.
     marks: Vec<usize>,
     memo: HashMap<u32, Id>,
-    pub(super) nodes: Vec<Node>,
     spent: usize,
 }
 
@@ -76,20 +64,20 @@ impl<'a> Machine<'a, '_> {
             }
             b'0' => drop(self.pop()?),
             b'1' => drop(self.since_mark()?),
-            b'N' => self.push(Node::None)?,
-            0x88 => self.push(Node::Bool(true))?,
-            0x89 => self.push(Node::Bool(false))?,
+            b'N' => self.push(Object::None)?,
+            0x88 => self.push(Object::Bool(true))?,
+            0x89 => self.push(Object::Bool(false))?,
             b'K' => self.int(1)?,
             b'M' => self.int(2)?,
             b'J' => {
                 let value = self.word(4)? as u32 as i32;
-                self.push(Node::Int(value as i64))?;
+                self.push(Object::Int(value as i64))?;
             }
             0x8a => self.long(1)?,
             0x8b => self.long(4)?,
             b'G' => {
                 let bits = self.word(8)?.swap_bytes(); // big-endian, unlike all the others
-                self.push(Node::Float(f64::from_bits(bits)))?;
+                self.push(Object::Float(f64::from_bits(bits)))?;
             }
             b'X' => self.text(4)?,
             0x8c => self.text(1)?,
@@ -97,12 +85,12 @@ impl<'a> Machine<'a, '_> {
             b'B' => self.bytes(4)?,
             b'C' => self.bytes(1)?,
             0x8e | 0x96 => self.bytes(8)?,
-            b'}' => self.push(Node::Dict { ordered: false, pairs: Vec::new() })?,
-            b']' => self.push(Node::List(Vec::new()))?,
-            b')' => self.push(Node::Tuple(Vec::new()))?,
+            b'}' => self.push(Object::Dict { ordered: false, pairs: Vec::new() })?,
+            b']' => self.push(Object::List(Vec::new()))?,
+            b')' => self.push(Object::Tuple(Vec::new()))?,
             b't' => {
                 let items = self.since_mark()?;
-                self.push(Node::Tuple(items))?;
+                self.push(Object::Tuple(items))?;
             }
             0x85..=0x87 => {
                 let mut items = Vec::new();
@@ -110,7 +98,7 @@ impl<'a> Machine<'a, '_> {
                     items.push(self.pop()?);
                 }
                 items.reverse();
-                self.push(Node::Tuple(items))?;
+                self.push(Object::Tuple(items))?;
             }
             b'a' => {
                 let item = self.pop()?;
@@ -129,11 +117,13 @@ impl<'a> Machine<'a, '_> {
                 let items = self.since_mark()?;
                 self.set(items)?;
             }
-            b'q' => self.remember(1)?,
-            b'r' => self.remember(4)?,
-            0x94 => {
-                let key = self.memo.len() as u32;
-                self.remember_as(key)?;
+            b'q' | b'r' | 0x94 => {
+                let key = match opcode {
+                    b'q' => self.word(1)? as u32,
+                    b'r' => self.word(4)? as u32,
+                    _ => self.memo.len() as u32,
+                };
+                self.remember(key)?;
             }
             b'h' => self.recall(1)?,
             b'j' => self.recall(4)?,
@@ -145,25 +135,27 @@ impl<'a> Machine<'a, '_> {
             0x93 => {
                 let name = self.pop()?;
                 let module = self.pop()?;
-                let (Node::Str(module), Node::Str(name)) = (self.node(module), self.node(name)) else {
+                let pickle = self.heap.pickle;
+                let (Object::Str(module), Object::Str(name)) = (self.heap.get(module), self.heap.get(name))
+                else {
                     return Err(self.bad("the name of a Python object is not text".into()));
                 };
-                self.global(&self.pickle[module.clone()], &self.pickle[name.clone()])?;
+                self.global(&pickle[module.clone()], &pickle[name.clone()])?;
             }
             b'R' => {
                 let arguments = self.pop()?;
                 let callable = self.pop()?;
-                let made = self.reduce(callable, arguments)?;
-                self.put(made)?;
+                let result = self.heap.reduce(callable, arguments).map_err(|e| self.bad(e))?;
+                self.put(result)?;
             }
             b'b' => {
                 let state = self.pop()?;
                 let target = self.top()?;
-                self.build(target, state)?;
+                self.heap.build(target, state).map_err(|e| self.bad(e))?;
             }
             b'Q' => {
                 let about = self.pop()?;
-                let storage = self.storage(about)?;
+                let storage = self.heap.storage(about).map_err(|e| self.bad(e))?;
                 self.push(storage)?;
             }
             other => {
@@ -174,7 +166,7 @@ impl<'a> Machine<'a, '_> {
         Ok(true)
     }
 
-    pub(super) fn bad(&self, problem: String) -> ReadError {
+    fn bad(&self, problem: String) -> ReadError {
         let problem = format!("{problem}, at byte {} of `data.pkl`", self.opcode);
         ReadError::damaged(self.path, FORMAT, None, problem)
     }
@@ -188,10 +180,6 @@ impl<'a> Machine<'a, '_> {
                    it should not be loaded with Python before its source is known"
                     .into(),
         }
-    }
-
-    pub(super) fn node(&self, id: Id) -> &Node {
-        &self.nodes[id as usize] // ids are only made by `push`
     }
 
     /// Every push, mark and memory costs one.
@@ -209,15 +197,9 @@ impl<'a> Machine<'a, '_> {
         Ok(())
     }
 
-    pub(super) fn push(&mut self, node: Node) -> Result<(), ReadError> {
-        let id = self.add(node);
+    fn push(&mut self, object: Object) -> Result<(), ReadError> {
+        let id = self.heap.add(object);
         self.put(id)
-    }
-
-    /// A node that is not on the stack; at most one per opcode.
-    pub(super) fn add(&mut self, node: Node) -> Id {
-        self.nodes.push(node);
-        (self.nodes.len() - 1) as Id
     }
 
     fn top(&self) -> Result<Id, ReadError> {
@@ -243,8 +225,8 @@ impl<'a> Machine<'a, '_> {
 
     fn append(&mut self, items: Vec<Id>) -> Result<(), ReadError> {
         let list = self.top()?;
-        match &mut self.nodes[list as usize] {
-            Node::List(old) => old.extend(items),
+        match self.heap.get_mut(list) {
+            Object::List(old) => old.extend(items),
             _ => return Err(self.bad("something is appended to what is no list".into())),
         }
         Ok(())
@@ -253,8 +235,8 @@ impl<'a> Machine<'a, '_> {
     fn set(&mut self, items: Vec<Id>) -> Result<(), ReadError> {
         let dict = self.top()?;
         let (pairs, rest) = items.as_chunks::<2>();
-        match &mut self.nodes[dict as usize] {
-            Node::Dict { pairs: old, .. } if rest.is_empty() => {
+        match self.heap.get_mut(dict) {
+            Object::Dict { pairs: old, .. } if rest.is_empty() => {
                 old.extend(pairs.iter().map(|&[k, v]| (k, v)))
             }
             _ => return Err(self.bad("keys and values are set in what is no dictionary".into())),
@@ -262,12 +244,7 @@ impl<'a> Machine<'a, '_> {
         Ok(())
     }
 
-    fn remember(&mut self, width: usize) -> Result<(), ReadError> {
-        let key = self.word(width)? as u32;
-        self.remember_as(key)
-    }
-
-    fn remember_as(&mut self, key: u32) -> Result<(), ReadError> {
+    fn remember(&mut self, key: u32) -> Result<(), ReadError> {
         self.spend()?;
         let id = self.top()?;
         self.memo.insert(key, id);
@@ -284,7 +261,7 @@ impl<'a> Machine<'a, '_> {
 
     fn global(&mut self, module: &[u8], name: &[u8]) -> Result<(), ReadError> {
         match Global::named(module, name) {
-            Some(global) => self.push(Node::Global(global)),
+            Some(global) => self.push(Object::Global(global)),
             None => {
                 let (module, name) = (shown(module), shown(name));
                 let at = self.opcode;
@@ -295,7 +272,7 @@ impl<'a> Machine<'a, '_> {
     }
 
     fn range(&mut self, length: u64) -> Result<Range<usize>, ReadError> {
-        let left = self.pickle.len() - self.at;
+        let left = self.heap.pickle.len() - self.at;
         if length > left as u64 {
             return Err(self.bad(format!("{length} bytes should follow, {left} do")));
         }
@@ -306,7 +283,7 @@ impl<'a> Machine<'a, '_> {
 
     fn take(&mut self, length: u64) -> Result<&'a [u8], ReadError> {
         let range = self.range(length)?;
-        Ok(&self.pickle[range])
+        Ok(&self.heap.pickle[range])
     }
 
     /// A little-endian number of up to 8 bytes.
@@ -316,7 +293,7 @@ impl<'a> Machine<'a, '_> {
     }
 
     fn line(&mut self) -> Result<&'a [u8], ReadError> {
-        let rest = &self.pickle[self.at..];
+        let rest = &self.heap.pickle[self.at..];
         match rest.iter().take(1024).position(|&b| b == b'\n') {
             Some(end) => {
                 self.at += end + 1;
@@ -328,7 +305,7 @@ impl<'a> Machine<'a, '_> {
 
     fn int(&mut self, width: usize) -> Result<(), ReadError> {
         let value = self.word(width)?;
-        self.push(Node::Int(value as i64))
+        self.push(Object::Int(value as i64))
     }
 
     /// Two's complement of as many bytes as the file says; none is 0.
@@ -340,21 +317,21 @@ impl<'a> Machine<'a, '_> {
         let spare = 64 - 8 * length as u32;
         let word = self.word(length)?;
         let value = if length == 0 { 0 } else { ((word << spare) as i64) >> spare };
-        self.push(Node::Int(value))
+        self.push(Object::Int(value))
     }
 
     fn text(&mut self, width: usize) -> Result<(), ReadError> {
         let length = self.word(width)?;
         let range = self.range(length)?;
-        if std::str::from_utf8(&self.pickle[range.clone()]).is_err() {
+        if std::str::from_utf8(&self.heap.pickle[range.clone()]).is_err() {
             return Err(self.bad("text that is not UTF-8".into()));
         }
-        self.push(Node::Str(range))
+        self.push(Object::Str(range))
     }
 
     fn bytes(&mut self, width: usize) -> Result<(), ReadError> {
         let length = self.word(width)?;
         let range = self.range(length)?;
-        self.push(Node::Bytes(range))
+        self.push(Object::Bytes(range))
     }
 }

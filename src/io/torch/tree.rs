@@ -1,8 +1,8 @@
 //! From the objects of a pickle to a tree of values; here the numbers are read from their storages.
 
 use super::super::{Limits, ReadError};
-use super::objects::{Array, Kind, Node, NumpyType, View};
-use super::pickle::{Graph, Id, MAX_VALUES};
+use super::objects::{Heap, Id, NumberType, NumpyArray, NumpyType, Object, StridedTensor};
+use super::pickle::MAX_VALUES;
 use super::zip::Archive;
 use super::{FORMAT, TorchNumbers, TorchTensor, TorchValue, shown};
 use std::borrow::Cow;
@@ -18,7 +18,7 @@ const MAX_GROWTH: u64 = 9;
 /// The tree below the pickle's result.
 pub(super) fn build(
     path: &Path,
-    graph: &Graph,
+    (heap, root): (&Heap, Id),
     archive: &Archive,
     limits: &Limits,
 ) -> Result<TorchValue, ReadError> {
@@ -26,13 +26,13 @@ pub(super) fn build(
     // torch writes the order of its machine since 2.1; before, only little-endian machines wrote
     let big = archive.get("byteorder") == Some(b"big");
     let seen = HashMap::new();
-    let mut builder = Builder { path, graph, archive, big, seen, values: 0, bytes_left };
-    builder.value(graph.root, 0)
+    let mut builder = Builder { path, heap, archive, big, seen, values: 0, bytes_left };
+    builder.value(root, 0)
 }
 
 struct Builder<'a> {
     path: &'a Path,
-    graph: &'a Graph<'a>,
+    heap: &'a Heap<'a>,
     archive: &'a Archive,
     big: bool,
     /// What was decoded, by node: a shared object is one here too.
@@ -54,15 +54,15 @@ impl<'a> Builder<'a> {
         if depth > MAX_DEPTH {
             return Err(self.bad(format!("its objects are nested deeper than {MAX_DEPTH}")));
         }
-        let graph = self.graph;
-        Ok(match &graph.nodes[id as usize] {
-            Node::None => TorchValue::None,
-            Node::Bool(value) => TorchValue::Bool(*value),
-            Node::Int(value) => TorchValue::Int(*value),
-            Node::Float(value) => TorchValue::Float(*value),
-            Node::List(items) => TorchValue::List(self.items(items, depth)?),
-            Node::Tuple(items) => TorchValue::Tuple(self.items(items, depth)?),
-            Node::Dict { ordered, pairs } => {
+        let heap = self.heap;
+        Ok(match heap.get(id) {
+            Object::None => TorchValue::None,
+            Object::Bool(value) => TorchValue::Bool(*value),
+            Object::Int(value) => TorchValue::Int(*value),
+            Object::Float(value) => TorchValue::Float(*value),
+            Object::List(items) => TorchValue::List(self.items(items, depth)?),
+            Object::Tuple(items) => TorchValue::Tuple(self.items(items, depth)?),
+            Object::Dict { ordered, pairs } => {
                 let mut keys = HashSet::new();
                 let mut out = Vec::new();
                 for &(key, value) in pairs {
@@ -77,10 +77,10 @@ impl<'a> Builder<'a> {
                 }
                 if *ordered { TorchValue::OrderedDict(out) } else { TorchValue::Dict(out) }
             }
-            Node::Global(_) | Node::Storage { .. } | Node::Dtype(_) => {
+            Object::Global(_) | Object::Storage { .. } | Object::Dtype(_) => {
                 return Err(self.bad("a class, a storage or a type stands where a value should"));
             }
-            Node::Array(None) => return Err(self.bad("a numpy array without its values")),
+            Object::Array(None) => return Err(self.bad("a numpy array without its values")),
             leaf => {
                 if let Some(value) = self.seen.get(&id) {
                     return Ok(value.clone());
@@ -96,16 +96,16 @@ impl<'a> Builder<'a> {
         items.iter().map(|&id| self.value(id, depth + 1)).collect()
     }
 
-    fn leaf(&mut self, node: &Node) -> Result<TorchValue, ReadError> {
+    fn leaf(&mut self, node: &Object) -> Result<TorchValue, ReadError> {
         match node {
-            Node::Str(range) => {
+            Object::Str(range) => {
                 self.spend(range.len())?;
-                let text = std::str::from_utf8(&self.graph.pickle[range.clone()]);
+                let text = std::str::from_utf8(&self.heap.pickle[range.clone()]);
                 Ok(TorchValue::Str(text.map_err(|e| self.bad(e.to_string()))?.into()))
             }
-            Node::Tensor(view) => Ok(TorchValue::Tensor(Arc::new(self.tensor(view)?))),
-            Node::Array(Some(array)) => Ok(TorchValue::Array(Arc::new(self.array(array)?))),
-            Node::Scalar(number, data) => self.scalar(*number, *data),
+            Object::Tensor(view) => Ok(TorchValue::Tensor(Arc::new(self.tensor(view)?))),
+            Object::Array(Some(array)) => Ok(TorchValue::Array(Arc::new(self.array(array)?))),
+            Object::Scalar(number, data) => self.scalar(*number, *data),
             other => {
                 let bytes = self.bytes(other)?;
                 Ok(TorchValue::Bytes(bytes.into()))
@@ -124,14 +124,14 @@ impl<'a> Builder<'a> {
     }
 
     /// The bytes of a bytes object.
-    fn bytes(&mut self, node: &Node) -> Result<Cow<'a, [u8]>, ReadError> {
-        let pickle = self.graph.pickle;
+    fn bytes(&mut self, node: &Object) -> Result<Cow<'a, [u8]>, ReadError> {
+        let pickle = self.heap.pickle;
         match node {
-            Node::Bytes(range) => {
+            Object::Bytes(range) => {
                 self.spend(range.len())?;
                 Ok(Cow::Borrowed(&pickle[range.clone()]))
             }
-            Node::Latin1(range) => {
+            Object::Latin1(range) => {
                 self.spend(range.len())?;
                 let text = std::str::from_utf8(&pickle[range.clone()]).unwrap_or_default();
                 let narrow: Result<Vec<u8>, _> = text.chars().map(|c| u8::try_from(c as u32)).collect();
@@ -141,12 +141,12 @@ impl<'a> Builder<'a> {
         }
     }
 
-    fn tensor(&mut self, view: &View) -> Result<TorchTensor, ReadError> {
-        let Node::Storage { kind, key, count } = &self.graph.nodes[view.storage as usize] else {
+    fn tensor(&mut self, view: &StridedTensor) -> Result<TorchTensor, ReadError> {
+        let Object::Storage { kind, key, count } = self.heap.get(view.storage) else {
             return Err(self.bad("a tensor without a storage"));
         };
-        let name = shown(&self.graph.pickle[key.clone()]);
-        let entry = format!("data/{}", String::from_utf8_lossy(&self.graph.pickle[key.clone()]));
+        let name = shown(&self.heap.pickle[key.clone()]);
+        let entry = format!("data/{}", String::from_utf8_lossy(&self.heap.pickle[key.clone()]));
         let Some(data) = self.archive.get(&entry) else {
             return Err(self.bad(format!("the storage `data/{name}` is missing")));
         };
@@ -183,8 +183,8 @@ impl<'a> Builder<'a> {
         Ok(TorchTensor { shape: shape.clone(), values })
     }
 
-    fn array(&mut self, array: &Array) -> Result<TorchTensor, ReadError> {
-        let data = self.bytes(&self.graph.nodes[array.data as usize])?;
+    fn array(&mut self, array: &NumpyArray) -> Result<TorchTensor, ReadError> {
+        let data = self.bytes(self.heap.get(array.data))?;
         let shape = &array.shape;
         let size = array.number.kind.size();
         let count = shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
@@ -201,7 +201,7 @@ impl<'a> Builder<'a> {
             for k in 1..shape.len() {
                 strides[k] = strides[k - 1] * shape[k - 1];
             }
-            let view = View { storage: 0, offset: 0, shape: shape.clone(), strides };
+            let view = StridedTensor { storage: 0, offset: 0, shape: shape.clone(), strides };
             gather(&data, array.number, &view, count)
         } else {
             read(&data, array.number)
@@ -210,11 +210,11 @@ impl<'a> Builder<'a> {
     }
 
     fn scalar(&mut self, number: NumpyType, data: Id) -> Result<TorchValue, ReadError> {
-        let data = self.bytes(&self.graph.nodes[data as usize])?;
+        let data = self.bytes(self.heap.get(data))?;
         if data.len() != number.kind.size() {
             return Err(self.bad(format!("a numpy number has {} bytes", data.len())));
         }
-        if number.kind == Kind::F64 {
+        if number.kind == NumberType::F64 {
             return Ok(TorchValue::Float(double(&data, number.big)));
         }
         Ok(match read(&data, number) {
@@ -226,10 +226,10 @@ impl<'a> Builder<'a> {
     }
 }
 
-fn decoded_size(kind: Kind) -> usize {
+fn decoded_size(kind: NumberType) -> usize {
     match kind {
-        Kind::F16 | Kind::F32 | Kind::F64 => 4,
-        Kind::U8 | Kind::Bool => 1,
+        NumberType::F16 | NumberType::F32 | NumberType::F64 => 4,
+        NumberType::U8 | NumberType::Bool => 1,
         _ => 8,
     }
 }
@@ -245,7 +245,7 @@ fn is_row_major(shape: &[usize], strides: &[usize]) -> bool {
 }
 
 /// The values of a view in reading order; every index was proved to be inside.
-fn gather(data: &[u8], number: NumpyType, view: &View, count: usize) -> TorchNumbers {
+fn gather(data: &[u8], number: NumpyType, view: &StridedTensor, count: usize) -> TorchNumbers {
     let size = number.kind.size();
     let mut ordered = Vec::with_capacity(count * size);
     let mut index = vec![0; view.shape.len()];
@@ -269,17 +269,17 @@ fn gather(data: &[u8], number: NumpyType, view: &View, count: usize) -> TorchNum
 fn read(data: &[u8], number: NumpyType) -> TorchNumbers {
     let big = number.big;
     match number.kind {
-        Kind::F16 => TorchNumbers::F32(each(data, big, |b| half::f16::from_le_bytes(b).to_f32())),
-        Kind::F32 => TorchNumbers::F32(each(data, big, f32::from_le_bytes)),
-        Kind::F64 => TorchNumbers::F32(each(data, big, |b| f64::from_le_bytes(b) as f32)),
-        Kind::I8 => TorchNumbers::I64(each(data, big, |b| i8::from_le_bytes(b) as i64)),
-        Kind::I16 => TorchNumbers::I64(each(data, big, |b| i16::from_le_bytes(b) as i64)),
-        Kind::I32 => TorchNumbers::I64(each(data, big, |b| i32::from_le_bytes(b) as i64)),
-        Kind::I64 => TorchNumbers::I64(each(data, big, i64::from_le_bytes)),
-        Kind::U16 => TorchNumbers::I64(each(data, big, |b| u16::from_le_bytes(b) as i64)),
-        Kind::U32 => TorchNumbers::I64(each(data, big, |b| u32::from_le_bytes(b) as i64)),
-        Kind::U8 => TorchNumbers::U8(data.to_vec()),
-        Kind::Bool => TorchNumbers::Bool(data.iter().map(|&b| b != 0).collect()),
+        NumberType::F16 => TorchNumbers::F32(each(data, big, |b| half::f16::from_le_bytes(b).to_f32())),
+        NumberType::F32 => TorchNumbers::F32(each(data, big, f32::from_le_bytes)),
+        NumberType::F64 => TorchNumbers::F32(each(data, big, |b| f64::from_le_bytes(b) as f32)),
+        NumberType::I8 => TorchNumbers::I64(each(data, big, |b| i8::from_le_bytes(b) as i64)),
+        NumberType::I16 => TorchNumbers::I64(each(data, big, |b| i16::from_le_bytes(b) as i64)),
+        NumberType::I32 => TorchNumbers::I64(each(data, big, |b| i32::from_le_bytes(b) as i64)),
+        NumberType::I64 => TorchNumbers::I64(each(data, big, i64::from_le_bytes)),
+        NumberType::U16 => TorchNumbers::I64(each(data, big, |b| u16::from_le_bytes(b) as i64)),
+        NumberType::U32 => TorchNumbers::I64(each(data, big, |b| u32::from_le_bytes(b) as i64)),
+        NumberType::U8 => TorchNumbers::U8(data.to_vec()),
+        NumberType::Bool => TorchNumbers::Bool(data.iter().map(|&b| b != 0).collect()),
     }
 }
 

@@ -4,24 +4,24 @@ use super::{Activations, CHUNK, WIDTH};
 use crate::dispatch;
 use crate::kernel::hash;
 use crate::kernel::mlp::{
-    COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, WeightGradients, Weights,
+    COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, SdfGradients, TILE, Weights,
 };
 use crate::kernel::pool::Buffer;
 use crate::kernel::simd::{exp, gemm};
 use rayon::prelude::*;
 
 /// A piece of the backward.
-struct BackwardTask<'a> {
+struct SdfBackwardTask<'a> {
     start: usize,
     n: usize,
     g_out: &'a [f32],
     g_value: &'a mut [f32],       // [n, 2L], row-major, turned afterwards
     g_normal: &'a mut [[f32; 3]], // [n, 3]
-    gradients: WeightGradients,
+    gradients: SdfGradients,
 }
 
 #[inline(always)]
-fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weights) {
+fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &Weights) {
     let (kp, ci) = (w.layout.padded(), w.layout.color_padded());
     let levels = a.shape.levels.len();
     let features = 2 * levels;
@@ -51,7 +51,7 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
         let g_out = &t.g_out[tile * TILE * WIDTH..][..rows * WIDTH];
         let out = &a.out[base * WIDTH..][..rows * WIDTH];
 
-        // colour network; rows beyond the last sample carry zero gradients and vanish
+        // color network; rows beyond the last sample carry zero gradients and vanish
         g_pre.fill(0.0);
         for r in 0..rows {
             for c in 0..3 {
@@ -60,17 +60,17 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
             }
         }
         gemm::<F>((4, HIDDEN, TILE), &g_pre, (1, RGB_PADDED), c2, HIDDEN, &mut g.c3, HIDDEN, true);
-        gemm::<F>((TILE, HIDDEN, 3), &g_pre, (RGB_PADDED, 1), &w.c3, HIDDEN, &mut g_c2, HIDDEN, false);
+        gemm::<F>((TILE, HIDDEN, 3), &g_pre, (RGB_PADDED, 1), &w.c3.m, HIDDEN, &mut g_c2, HIDDEN, false);
         for i in 0..TILE * HIDDEN {
             g_c2[i] = if c2[i] > 0.0 { g_c2[i] } else { 0.0 };
         }
         gemm::<F>((HIDDEN, HIDDEN, TILE), &g_c2, (1, HIDDEN), c1, HIDDEN, &mut g.c2, HIDDEN, true);
-        gemm::<F>((TILE, HIDDEN, HIDDEN), &g_c2, (HIDDEN, 1), &w.c2, HIDDEN, &mut g_c1, HIDDEN, false);
+        gemm::<F>((TILE, HIDDEN, HIDDEN), &g_c2, (HIDDEN, 1), &w.c2.m, HIDDEN, &mut g_c1, HIDDEN, false);
         for i in 0..TILE * HIDDEN {
             g_c1[i] = if c1[i] > 0.0 { g_c1[i] } else { 0.0 };
         }
         gemm::<F>((HIDDEN, ci, TILE), &g_c1, (1, HIDDEN), c0, ci, &mut g.c1, ci, true);
-        gemm::<F>((TILE, ci, HIDDEN), &g_c1, (HIDDEN, 1), &w.c1, ci, &mut g_c0, ci, false);
+        gemm::<F>((TILE, ci, HIDDEN), &g_c1, (HIDDEN, 1), &w.c1.m, ci, &mut g_c0, ci, false);
 
         // outputs of the geometry network and the spatial gradient
         g_o.fill(0.0);
@@ -111,12 +111,12 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
         {
             for j in 0..HIDDEN {
                 s[j] = 1.0 - exp::<F>(-100.0 * row[j]);
-                a[j] = s[j] * w.w2[j];
+                a[j] = s[j] * w.w2.m[j];
             }
         }
-        gemm::<F>((TILE, HIDDEN, kp), &g_q, (kp, 1), &w.w1t, HIDDEN, &mut g_a, HIDDEN, false);
+        gemm::<F>((TILE, HIDDEN, kp), &g_q, (kp, 1), &w.w1.t, HIDDEN, &mut g_a, HIDDEN, false);
         let (go, op) = (&g_o, OUTPUTS_PADDED);
-        gemm::<F>((TILE, HIDDEN, OUTPUTS), go, (op, 1), &w.w2, HIDDEN, &mut g_z, HIDDEN, false);
+        gemm::<F>((TILE, HIDDEN, OUTPUTS), go, (op, 1), &w.w2.m, HIDDEN, &mut g_z, HIDDEN, false);
         gemm::<F>((op, HIDDEN, TILE), go, (1, op), h, HIDDEN, &mut g.w2, HIDDEN, true);
         for r in 0..rows {
             for j in 0..op {
@@ -126,7 +126,7 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
             let (s, g_a, g_z) = (&s[row.clone()], &g_a[row.clone()], &mut g_z[row]);
             for j in 0..HIDDEN {
                 g.w2[j] += g_a[j] * s[j];
-                g_z[j] = s[j] * (g_z[j] + 100.0 * g_a[j] * w.w2[j] * (1.0 - s[j]));
+                g_z[j] = s[j] * (g_z[j] + 100.0 * g_a[j] * w.w2.m[j] * (1.0 - s[j]));
                 g.b1[j] += g_z[j];
             }
         }
@@ -134,7 +134,7 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
         gemm::<F>((HIDDEN, kp, TILE), &weighted, (1, HIDDEN), &g_q, kp, &mut g.w1, kp, true);
         gemm::<F>((HIDDEN, kp, TILE), &g_z, (1, HIDDEN), u, kp, &mut g.w1, kp, true);
         let wide = (TILE, features_padded, HIDDEN);
-        gemm::<F>(wide, &g_z, (HIDDEN, 1), &w.w1, kp, &mut g_u, kp, false);
+        gemm::<F>(wide, &g_z, (HIDDEN, 1), &w.w1.m, kp, &mut g_u, kp, false);
         for r in 0..rows {
             let own = &mut t.g_value[(tile * TILE + r) * features..][..features];
             own.copy_from_slice(&g_u[r * kp..][..features]);
@@ -146,7 +146,7 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, a: &Activations, w: &Weigh
     }
 }
 
-dispatch! { fn backward_task / backward_body(t: &mut BackwardTask, a: &Activations, w: &Weights) }
+dispatch! { fn backward_task / backward_body(t: &mut SdfBackwardTask, a: &Activations, w: &Weights) }
 
 /// Gradients of a loss with respect to table and network weights.
 ///
@@ -167,18 +167,18 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
     let features = 2 * levels;
     let mut g_value = Buffer::scratch(n * features);
     let mut g_normal = vec![[0f32; 3]; n];
-    let mut tasks: Vec<BackwardTask> = g_value
+    let mut tasks: Vec<SdfBackwardTask> = g_value
         .chunks_mut(CHUNK * features)
         .zip(g_normal.chunks_mut(CHUNK))
         .zip(g_out.chunks(CHUNK * WIDTH))
         .enumerate()
-        .map(|(i, ((g_value, g_normal), g_out))| BackwardTask {
+        .map(|(i, ((g_value, g_normal), g_out))| SdfBackwardTask {
             start: i * CHUNK,
             n: g_normal.len(),
             g_out,
             g_value,
             g_normal,
-            gradients: WeightGradients::zeros(layout),
+            gradients: SdfGradients::zeros(layout),
         })
         .collect();
     tasks.par_iter_mut().for_each(|t| backward_task(t, a, w));

@@ -1,6 +1,6 @@
 //! The signed-distance field asked, not trained: nothing is kept for a backward.
 
-use super::{CHUNK, FieldShape, Inputs, WIDTH, run, skip, softened};
+use super::{CHUNK, FieldShape, Inputs, WIDTH, color_layers, run, skip, softened};
 use crate::dispatch;
 use crate::kernel::hash;
 use crate::kernel::mlp::{
@@ -30,12 +30,12 @@ fn value_body<const F: bool>(t: &mut ValueTask, w: &Weights) {
     let samples = t.inputs.x.len();
     let mut u = vec![0f32; TILE * kp];
     let mut h = [0f32; TILE * HIDDEN];
-    let w2 = &w.w2[t.output * HIDDEN..][..HIDDEN];
+    let w2 = &w.w2.m[t.output * HIDDEN..][..HIDDEN];
     for tile in 0..samples.div_ceil(TILE) {
         let base = tile * TILE;
         let rows = TILE.min(samples - base);
         t.inputs.fill(&mut u, kp, base, rows);
-        gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1t, HIDDEN, &mut h, HIDDEN, false);
+        gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
         for r in 0..rows {
             let row = &h[r * HIDDEN..][..HIDDEN];
             let mut sum = [0f32; 8];
@@ -100,7 +100,7 @@ struct ColorTask<'a> {
     rgb: &'a mut [[f32; 3]],
 }
 
-/// The colour network on a tile whose inputs are filled; colours in the first `rows` of `out`.
+/// The color network on a tile whose inputs are filled; colors in the first `rows` of `out`.
 struct Shader {
     c0: Vec<f32>, // [TILE, cp]
     c1: [f32; TILE * HIDDEN],
@@ -111,14 +111,8 @@ struct Shader {
 impl Shader {
     #[inline(always)]
     fn run<const F: bool>(&mut self, w: &Weights, out: &mut [[f32; 3]]) {
-        let ci = w.layout.color_padded();
         let Shader { c0, c1, c2, rgb } = self;
-        gemm::<F>((TILE, HIDDEN, ci), c0, (ci, 1), &w.c1t, HIDDEN, c1, HIDDEN, false);
-        c1.iter_mut().for_each(|v| *v = v.max(0.0));
-        gemm::<F>((TILE, HIDDEN, HIDDEN), c1, (HIDDEN, 1), &w.c2t, HIDDEN, c2, HIDDEN, false);
-        c2.iter_mut().for_each(|v| *v = v.max(0.0));
-        let last = (TILE, RGB_PADDED, HIDDEN);
-        gemm::<F>(last, c2, (HIDDEN, 1), &w.c3t, RGB_PADDED, rgb, RGB_PADDED, false);
+        color_layers::<F>(w, c0, c1, c2, rgb);
         for (r, out) in out.iter_mut().enumerate() {
             *out = std::array::from_fn(|c| sigmoid::<F>(rgb[r * RGB_PADDED + c]));
         }
@@ -144,14 +138,14 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
         let base = tile * TILE;
         let rows = TILE.min(samples - base);
         task.inputs.fill(&mut u, kp, base, rows);
-        gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1t, HIDDEN, &mut h, HIDDEN, false);
+        gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
         for row in h.chunks_exact_mut(HIDDEN) {
             for j in 0..HIDDEN {
                 row[j] = softplus::<F>(row[j] + w.b1[j]);
             }
         }
         let op = OUTPUTS_PADDED;
-        gemm::<F>((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2t, op, &mut o, op, false);
+        gemm::<F>((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2.t, op, &mut o, op, false);
         for r in 0..rows {
             for _ in 0..task.counts.map_or(1, |c| c[base + r]) {
                 let row = &mut shader.c0[waiting * ci..][..ci];
@@ -174,7 +168,7 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
 
 dispatch! { fn color_task / color_body(task: &mut ColorTask, w: &Weights) }
 
-/// Colour of points whose unit normals are known (of a mesh's surface), point `i` seen along `counts[i]` unit
+/// Color of points whose unit normals are known (of a mesh's surface), point `i` seen along `counts[i]` unit
 /// directions (one each without a list): no gradient is computed, a third of the work of [`super::forward`], and
 /// the geometry network is asked once a point.
 ///
@@ -227,7 +221,7 @@ pub fn colors(
     rgb
 }
 
-/// Signed distance and gradient, no colour: `[n, 3]` → `[n]` pairs.
+/// Signed distance and gradient, no color: `[n, 3]` → `[n]` pairs.
 pub fn gradients(
     shape: &FieldShape,
     table: &[[f32; 2]],

@@ -7,7 +7,7 @@ fn field() -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
     shaped(false)
 }
 
-/// The same, with or without the colour skip.
+/// The same, with or without the color skip.
 fn shaped(color_skip: bool) -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
     let levels = hash::levels(5, 4, 1.8, 9);
     let shape =
@@ -245,7 +245,7 @@ fn one_thread_and_many_give_the_same_bytes() {
 }
 
 #[test]
-fn colours_along_many_directions_are_those_of_each() {
+fn colors_along_many_directions_are_those_of_each() {
     let (shape, table, flat) = field();
     let (x, d) = points(3 * 5000);
     let w = Weights::new(shape.layout(), &flat);

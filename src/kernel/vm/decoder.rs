@@ -1,4 +1,4 @@
-//! The colour decoder of TensoRF ("MLP_Fea"): basis matrix, encodings, two hidden layers.
+//! The color decoder of TensoRF ("MLP_Fea"): basis matrix, encodings, two hidden layers.
 //!
 //! ```text
 //! a = B · products                                         [features]
@@ -9,21 +9,24 @@
 use super::gather::Spread;
 use super::{Cell, Grid};
 use crate::dispatch;
-use crate::kernel::pool::Buffer;
+use crate::kernel::matrix::{Matrix, add_to, padded, split};
+use crate::kernel::pool::{Buffer, pieces};
 use crate::kernel::simd::{gemm, sigmoid};
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 /// Samples a tile: its activations stay in the second-level cache.
 const TILE: usize = 64;
 /// Samples a task handles: fixed, so that sums do not depend on the number of threads.
 const CHUNK: usize = 16 * TILE;
-/// Colour channels as stored in tiles.
+/// Color channels as stored in tiles.
 const RGB: usize = 8;
 
 /// Sizes of the decoder.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DecoderShape {
-    /// Channels of the appearance grid.
+    /// Channels of the appearance grid, which says them.
+    #[serde(skip)]
     pub channels: usize,
     /// Outputs of the basis matrix (published: 27).
     pub features: usize,
@@ -74,36 +77,13 @@ impl DecoderShape {
 #[derive(Debug)]
 pub struct DecoderWeights {
     shape: DecoderShape,
-    basis: Vec<f32>,   // [fp, cp]
-    basis_t: Vec<f32>, // [cp, fp]
-    w1: Vec<f32>,      // [h, ip]
-    w1t: Vec<f32>,     // [ip, h]
+    basis: Matrix, // [fp, cp]
+    w1: Matrix,    // [h, ip]
     b1: Vec<f32>,
-    w2: Vec<f32>,
-    w2t: Vec<f32>,
+    w2: Matrix, // [h, h]
     b2: Vec<f32>,
-    w3: Vec<f32>,  // [8, h]
-    w3t: Vec<f32>, // [h, 8]
-    b3: Vec<f32>,  // [8]
-}
-
-/// `[rows, columns]` → `[padded_rows, padded_columns]` with zeros around.
-fn padded(m: &[f32], rows: usize, columns: usize, to: (usize, usize)) -> Vec<f32> {
-    let mut p = vec![0.0; to.0 * to.1];
-    for r in 0..rows {
-        p[r * to.1..r * to.1 + columns].copy_from_slice(&m[r * columns..(r + 1) * columns]);
-    }
-    p
-}
-
-fn transposed(m: &[f32], rows: usize, columns: usize) -> Vec<f32> {
-    let mut t = vec![0.0; rows * columns];
-    for r in 0..rows {
-        for c in 0..columns {
-            t[c * rows + r] = m[r * columns + c];
-        }
-    }
-    t
+    w3: Matrix,   // [8, h]
+    b3: Vec<f32>, // [8]
 }
 
 impl DecoderWeights {
@@ -111,30 +91,18 @@ impl DecoderWeights {
     pub fn new(shape: DecoderShape, flat: &[f32]) -> DecoderWeights {
         assert_eq!(flat.len(), shape.len(), "network weights do not fit the decoder");
         assert!(shape.hidden.is_multiple_of(8), "hidden layers are a multiple of 8 wide");
-        let mut rest = flat;
-        let [basis, w1, b1, w2, b2, w3, b3] = shape.shapes().map(|(o, i)| {
-            let (own, tail) = rest.split_at(o * i);
-            rest = tail;
-            own
-        });
-        let (h, cp, fp, ip) =
-            (shape.hidden, shape.products_padded(), shape.features_padded(), shape.inputs_padded());
-        let basis = padded(basis, shape.features, shape.channels, (fp, cp));
-        let w1 = padded(w1, h, shape.inputs(), (h, ip));
-        let w3 = padded(w3, 3, h, (RGB, h));
+        let shapes = shape.shapes();
+        let [basis, w1, b1, w2, b2, w3, b3] = split(flat, shapes);
+        let h = shape.hidden;
         DecoderWeights {
             shape,
-            basis_t: transposed(&basis, fp, cp),
-            basis,
-            w1t: transposed(&w1, h, ip),
-            w1,
+            basis: Matrix::new(basis, shapes[0], (shape.features_padded(), shape.products_padded())),
+            w1: Matrix::new(w1, shapes[1], (h, shape.inputs_padded())),
             b1: b1.to_vec(),
-            w2t: transposed(w2, h, h),
-            w2: w2.to_vec(),
+            w2: Matrix::new(w2, shapes[3], (h, h)),
             b2: b2.to_vec(),
-            w3t: transposed(&w3, RGB, h),
-            w3,
-            b3: padded(b3, 1, 3, (1, RGB)),
+            w3: Matrix::new(w3, shapes[5], (RGB, h)),
+            b3: padded(b3, RGB),
         }
     }
 
@@ -157,7 +125,7 @@ pub(super) struct Decoded {
     pub rgb: Vec<[f32; 3]>,
 }
 
-struct ForwardTask<'a> {
+struct DecodeTask<'a> {
     cells: &'a [Cell],
     direction: &'a [[f32; 3]],
     planes: &'a mut [f32],
@@ -199,7 +167,7 @@ fn relu(rows: &mut [f32], bias: &[f32]) {
 }
 
 #[inline(always)]
-fn forward_body<const F: bool>(t: &mut ForwardTask, w: &DecoderWeights, lookup: &super::gather::Lookup) {
+fn forward_body<const F: bool>(t: &mut DecodeTask, w: &DecoderWeights, lookup: &super::gather::Lookup) {
     let s = &w.shape;
     let (h, cp, fp, ip) = (s.hidden, s.products_padded(), s.features_padded(), s.inputs_padded());
     let n = t.cells.len();
@@ -218,19 +186,19 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &DecoderWeights, lookup: 
             }
         }
         products[rows * cp..].fill(0.0);
-        gemm::<F>((TILE, fp, cp), &products, (cp, 1), &w.basis_t, fp, &mut features, fp, false);
+        gemm::<F>((TILE, fp, cp), &products, (cp, 1), &w.basis.t, fp, &mut features, fp, false);
         let inputs = &mut t.inputs[base * ip..][..TILE * ip];
         for r in 0..rows {
             encode(s, &features[r * fp..], t.direction[base + r], &mut inputs[r * ip..][..ip]);
         }
         inputs[rows * ip..].fill(0.0);
         let h1 = &mut t.h1[base * h..][..TILE * h];
-        gemm::<F>((TILE, h, ip), inputs, (ip, 1), &w.w1t, h, h1, h, false);
+        gemm::<F>((TILE, h, ip), inputs, (ip, 1), &w.w1.t, h, h1, h, false);
         relu(h1, &w.b1);
         let h2 = &mut t.h2[base * h..][..TILE * h];
-        gemm::<F>((TILE, h, h), h1, (h, 1), &w.w2t, h, h2, h, false);
+        gemm::<F>((TILE, h, h), h1, (h, 1), &w.w2.t, h, h2, h, false);
         relu(h2, &w.b2);
-        gemm::<F>((TILE, RGB, h), h2, (h, 1), &w.w3t, RGB, &mut out, RGB, false);
+        gemm::<F>((TILE, RGB, h), h2, (h, 1), &w.w3.t, RGB, &mut out, RGB, false);
         for r in 0..rows {
             for c in 0..3 {
                 t.rgb[base + r][c] = sigmoid::<F>(out[r * RGB + c] + w.b3[c]);
@@ -240,10 +208,10 @@ fn forward_body<const F: bool>(t: &mut ForwardTask, w: &DecoderWeights, lookup: 
 }
 
 dispatch! {
-    fn forward_task / forward_body(t: &mut ForwardTask, w: &DecoderWeights, lookup: &super::gather::Lookup)
+    fn forward_task / forward_body(t: &mut DecodeTask, w: &DecoderWeights, lookup: &super::gather::Lookup)
 }
 
-/// Colours of samples in the appearance grid `values`, seen along `direction`.
+/// Colors of samples in the appearance grid `values`, seen along `direction`.
 pub(super) fn decode(
     grid: &Grid,
     values: &[f32],
@@ -263,31 +231,23 @@ pub(super) fn decode(
     let mut h1 = Buffer::scratch(np * h);
     let mut h2 = Buffer::scratch(np * h);
     let mut rgb = vec![[0f32; 3]; n];
-    let mut tasks: Vec<ForwardTask> = cells
+    let mut cut = pieces([&mut planes, &mut lines, &mut inputs, &mut h1, &mut h2], [cp, cp, ip, h, h], CHUNK);
+    let mut tasks: Vec<DecodeTask> = cells
         .chunks(CHUNK)
         .zip(direction.chunks(CHUNK))
-        .zip(planes.chunks_mut(CHUNK * cp).zip(lines.chunks_mut(CHUNK * cp)))
-        .zip(inputs.chunks_mut(CHUNK * ip))
-        .zip(h1.chunks_mut(CHUNK * h).zip(h2.chunks_mut(CHUNK * h)))
         .zip(rgb.chunks_mut(CHUNK))
-        .map(|(((((cells, direction), (planes, lines)), inputs), (h1, h2)), rgb)| ForwardTask {
-            cells,
-            direction,
-            planes,
-            lines,
-            inputs,
-            h1,
-            h2,
-            rgb,
+        .map(|((cells, direction), rgb)| {
+            let [planes, lines, inputs, h1, h2] = cut();
+            DecodeTask { cells, direction, planes, lines, inputs, h1, h2, rgb }
         })
         .collect();
     tasks.par_iter_mut().for_each(|t| forward_task(t, w, &lookup));
-    drop(tasks);
+    drop((tasks, cut));
     Decoded { cells, planes, lines, inputs, h1, h2, rgb }
 }
 
 /// Gradients of the matrices as tiles accumulate them (padded).
-struct WeightGradients {
+struct DecoderGradients {
     basis: Vec<f32>, // [fp, cp]
     w1: Vec<f32>,    // [h, ip]
     b1: Vec<f32>,
@@ -297,10 +257,10 @@ struct WeightGradients {
     b3: [f32; 3],
 }
 
-impl WeightGradients {
-    fn zeros(s: &DecoderShape) -> WeightGradients {
+impl DecoderGradients {
+    fn zeros(s: &DecoderShape) -> DecoderGradients {
         let h = s.hidden;
-        WeightGradients {
+        DecoderGradients {
             basis: vec![0.0; s.features_padded() * s.products_padded()],
             w1: vec![0.0; h * s.inputs_padded()],
             b1: vec![0.0; h],
@@ -312,21 +272,21 @@ impl WeightGradients {
     }
 
     fn add_to(&self, s: &DecoderShape, flat: &mut [f32]) {
-        let strides = [s.products_padded(), s.inputs_padded(), 1, s.hidden, 1, s.hidden, 1];
-        let parts: [&[f32]; 7] = [&self.basis, &self.w1, &self.b1, &self.w2, &self.b2, &self.w3, &self.b3];
-        let mut at = 0;
-        for (((rows, columns), stride), part) in s.shapes().into_iter().zip(strides).zip(parts) {
-            for r in 0..rows {
-                for c in 0..columns {
-                    flat[at + r * columns + c] += part[r * stride + c];
-                }
-            }
-            at += rows * columns;
-        }
+        let h = s.hidden;
+        let parts: [(&[f32], usize); 7] = [
+            (&self.basis, s.products_padded()),
+            (&self.w1, s.inputs_padded()),
+            (&self.b1, 1),
+            (&self.w2, h),
+            (&self.b2, 1),
+            (&self.w3, h),
+            (&self.b3, 1),
+        ];
+        add_to(flat, &s.shapes(), &parts);
     }
 }
 
-struct BackwardTask<'a> {
+struct DecodeBackwardTask<'a> {
     start: usize,
     n: usize,
     g_rgb: &'a [[f32; 3]],
@@ -336,7 +296,7 @@ struct BackwardTask<'a> {
     h1: &'a [f32],
     h2: &'a [f32],
     rgb: &'a [[f32; 3]],
-    gradients: WeightGradients,
+    gradients: DecoderGradients,
 }
 
 /// g where the activation let something through; adds the column sums to `bias`.
@@ -351,7 +311,7 @@ fn through_relu(g: &mut [f32], h: &[f32], bias: &mut [f32]) {
 }
 
 #[inline(always)]
-fn backward_body<const F: bool>(t: &mut BackwardTask, w: &DecoderWeights) {
+fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) {
     let s = &w.shape;
     let (h, cp, fp, ip) = (s.hidden, s.products_padded(), s.features_padded(), s.inputs_padded());
     let g = &mut t.gradients;
@@ -377,13 +337,13 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, w: &DecoderWeights) {
             }
         }
         gemm::<F>((4, h, TILE), &g_pre, (1, RGB), h2, h, &mut g.w3, h, true);
-        gemm::<F>((TILE, h, 3), &g_pre, (RGB, 1), &w.w3, h, &mut g_h2, h, false);
+        gemm::<F>((TILE, h, 3), &g_pre, (RGB, 1), &w.w3.m, h, &mut g_h2, h, false);
         through_relu(&mut g_h2, h2, &mut g.b2);
         gemm::<F>((h, h, TILE), &g_h2, (1, h), h1, h, &mut g.w2, h, true);
-        gemm::<F>((TILE, h, h), &g_h2, (h, 1), &w.w2, h, &mut g_h1, h, false);
+        gemm::<F>((TILE, h, h), &g_h2, (h, 1), &w.w2.m, h, &mut g_h1, h, false);
         through_relu(&mut g_h1, h1, &mut g.b1);
         gemm::<F>((h, ip, TILE), &g_h1, (1, h), inputs, ip, &mut g.w1, ip, true);
-        gemm::<F>((TILE, ip, h), &g_h1, (h, 1), &w.w1, ip, &mut g_in, ip, false);
+        gemm::<F>((TILE, ip, h), &g_h1, (h, 1), &w.w1.m, ip, &mut g_in, ip, false);
         // back through the features' encoding; nothing asks for the direction's gradient
         g_features.fill(0.0);
         let (f, k) = (s.features, s.feature_frequencies);
@@ -408,7 +368,7 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, w: &DecoderWeights) {
         }
         products[rows * cp..].fill(0.0);
         gemm::<F>((fp, cp, TILE), &g_features, (1, fp), &products, cp, &mut g.basis, cp, true);
-        gemm::<F>((TILE, cp, fp), &g_features, (fp, 1), &w.basis, cp, &mut g_products, cp, false);
+        gemm::<F>((TILE, cp, fp), &g_features, (fp, 1), &w.basis.m, cp, &mut g_products, cp, false);
         for r in 0..rows {
             let (p, l) = (&mut t.planes[(base + r) * cp..][..cp], &mut t.lines[(base + r) * cp..][..cp]);
             for c in 0..cp {
@@ -420,7 +380,7 @@ fn backward_body<const F: bool>(t: &mut BackwardTask, w: &DecoderWeights) {
     }
 }
 
-dispatch! { fn backward_task / backward_body(t: &mut BackwardTask, w: &DecoderWeights) }
+dispatch! { fn backward_task / backward_body(t: &mut DecodeBackwardTask, w: &DecoderWeights) }
 
 /// Adds the gradients by the appearance grid to `g_values` and returns those of the flat weights.
 pub(super) fn decode_backward(
@@ -434,7 +394,7 @@ pub(super) fn decode_backward(
     let n = decoded.cells.len();
     let (h, cp, ip) = (s.hidden, s.products_padded(), s.inputs_padded());
     let d = &mut decoded;
-    let mut tasks: Vec<BackwardTask> = d
+    let mut tasks: Vec<DecodeBackwardTask> = d
         .planes
         .chunks_mut(CHUNK * cp)
         .zip(d.lines.chunks_mut(CHUNK * cp))
@@ -443,7 +403,7 @@ pub(super) fn decode_backward(
             let start = i * CHUNK;
             let count = CHUNK.min(n - start);
             let all = count.next_multiple_of(TILE);
-            BackwardTask {
+            DecodeBackwardTask {
                 start,
                 n: count,
                 g_rgb: &g_rgb[start..start + count],
@@ -453,7 +413,7 @@ pub(super) fn decode_backward(
                 h1: &d.h1[start * h..(start + all) * h],
                 h2: &d.h2[start * h..(start + all) * h],
                 rgb: &d.rgb[start..start + count],
-                gradients: WeightGradients::zeros(s),
+                gradients: DecoderGradients::zeros(s),
             }
         })
         .collect();

@@ -5,6 +5,8 @@
 //! corners are asked once, so here cells are stored, and a ray steps over empty ones *before* the field is
 //! touched. Sample positions `t = entry + step · (k + jitter)` do not depend on the mask.
 
+use crate::kernel::march::MarchRay;
+
 /// Cells of a box, one bit each, cell `(x · ny + y) · nz + z`; and blocks of cells that are all empty.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BoxMask {
@@ -133,17 +135,6 @@ impl BoxMask {
     }
 }
 
-/// A ray to be rendered, in the field's coordinates.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct VmRay {
-    /// Start.
-    pub origin: [f32; 3],
-    /// Direction; the decoder sees it as it is, and `t` counts in its lengths.
-    pub direction: [f32; 3],
-    /// Offset of the lattice in 0..1 steps (0 outside training).
-    pub jitter: f32,
-}
-
 /// The lattice of a box: entry, step and how many samples a ray has.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lattice {
@@ -163,7 +154,7 @@ pub struct Lattice {
 
 impl Lattice {
     /// Lattice points of a ray inside the box: what a renderer that skips nothing evaluates.
-    pub fn points(&self, ray: &VmRay) -> u64 {
+    pub fn points(&self, ray: &MarchRay) -> u64 {
         match self.crossing(ray) {
             Some((enter, leave)) => {
                 let inside = (leave - enter.clamp(self.near, self.far)) / self.step;
@@ -175,7 +166,7 @@ impl Lattice {
 
     /// Where a ray enters and leaves the box; zero components of its direction count as 1e-6, as published.
     #[inline(always)]
-    fn crossing(&self, ray: &VmRay) -> Option<(f32, f32)> {
+    fn crossing(&self, ray: &MarchRay) -> Option<(f32, f32)> {
         let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
         for a in 0..3 {
             let d = if ray.direction[a] == 0.0 { 1e-6 } else { ray.direction[a] };
@@ -195,7 +186,7 @@ impl Lattice {
 pub struct Walk<'a> {
     lattice: &'a Lattice,
     mask: Option<&'a BoxMask>,
-    ray: VmRay,
+    ray: MarchRay,
     start: f32,
     leave: f32,
     /// Next point.
@@ -210,7 +201,7 @@ pub struct Walk<'a> {
 impl<'a> Walk<'a> {
     /// Before the first point; without any for a ray that misses.
     #[inline(always)]
-    pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &VmRay) -> Walk<'a> {
+    pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &MarchRay) -> Walk<'a> {
         let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
         let (enter, leave) = crossing.unwrap_or((0.0, 0.0));
         let start = enter.clamp(lattice.near, lattice.far) + ray.jitter * lattice.step;

@@ -20,8 +20,8 @@ mod resize;
 
 pub use decoder::{DecoderShape, DecoderWeights};
 pub use gather::Cell;
-pub use penalty::{Penalty, ortho, penalise, total_variation};
-pub use render::{RAY_WIDTH, RayBatch, Rendered, Shading, VmField, backward, density_at, render};
+pub use penalty::{Penalty, penalize};
+pub use render::{RAY_WIDTH, Rendered, Shading, VmField, backward, density_at, render};
 pub use resize::{cropped, resized};
 
 /// Axes (width, height) of each term's plane; x, y, z are 0, 1, 2.
@@ -136,6 +136,7 @@ pub fn voxel_schedule(first: u64, last: u64, steps: usize) -> Vec<u64> {
 }
 
 #[cfg(test)]
+#[path = "fixture_tests.rs"]
 pub(crate) mod fixture;
 #[cfg(test)]
 mod tests;

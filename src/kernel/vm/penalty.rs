@@ -77,7 +77,7 @@ fn rows_body<const F: bool>(task: &mut Row) {
     }
 }
 
-dispatch! { fn penalise_rows / rows_body(task: &mut Row) }
+dispatch! { fn penalize_rows / rows_body(task: &mut Row) }
 
 /// −1, 0 or 1, zero for zero: the derivative torch gives |x|.
 #[inline(always)]
@@ -86,13 +86,13 @@ fn sign(x: f32) -> f32 {
 }
 
 /// 2 / count of differences along height and width, times two for the formula's leading factor.
-fn tv_factors(f: &Factor) -> [f64; 2] {
+pub(super) fn tv_factors(f: &Factor) -> [f64; 2] {
     let (h, w, c) = (f.height as f64, f.width as f64, f.channels.max(1) as f64);
     [2.0 / (c * (h - 1.0) * w), 2.0 / (c * h * (w - 1.0))]
 }
 
 /// Adds the gradient of the weighted terms to `gradient`. Both slices are laid out as `grid`.
-pub fn penalise(grid: &Grid, penalty: &Penalty, values: &[f32], gradient: &mut [f32]) {
+pub fn penalize(grid: &Grid, penalty: &Penalty, values: &[f32], gradient: &mut [f32]) {
     assert!(values.len() == grid.len() && gradient.len() == grid.len());
     let mut rest = gradient;
     if penalty.tv != 0.0 || penalty.l1 != 0.0 {
@@ -117,7 +117,7 @@ pub fn penalise(grid: &Grid, penalty: &Penalty, values: &[f32], gradient: &mut [
                 });
             }
         }
-        tasks.par_iter_mut().for_each(penalise_rows);
+        tasks.par_iter_mut().for_each(penalize_rows);
         for i in 0..3 {
             let f = grid.line(i);
             let (own, tail) = std::mem::take(&mut rest).split_at_mut(f.len());
@@ -139,7 +139,7 @@ pub fn penalise(grid: &Grid, penalty: &Penalty, values: &[f32], gradient: &mut [
 }
 
 /// Σ_n L[a, n] L[b, n] for all pairs of channels, `[c, c]`.
-fn gram(f: &Factor, line: &[f32]) -> Vec<f64> {
+pub(super) fn gram(f: &Factor, line: &[f32]) -> Vec<f64> {
     let c = f.channels;
     let mut gram = vec![0f64; c * c];
     for v in line.chunks_exact(c.max(1)) {
@@ -166,42 +166,4 @@ fn ortho_gradient(f: &Factor, line: &[f32], weight: f32, gradient: &mut [f32]) {
             }
         }
     }
-}
-
-/// Σ over the three planes of TV.
-pub fn total_variation(grid: &Grid, values: &[f32]) -> f64 {
-    (0..3)
-        .map(|i| {
-            let f = grid.plane(i);
-            let x = &values[f.range()];
-            let (pitch, n) = (f.width * f.channels, f.channels);
-            let square = |a: f32, b: f32| (a as f64 - b as f64).powi(2);
-            let mut sums = [0f64; 2];
-            for y in 0..f.height {
-                for k in 0..pitch {
-                    let at = y * pitch + k;
-                    if y > 0 {
-                        sums[0] += square(x[at], x[at - pitch]);
-                    }
-                    if k >= n {
-                        sums[1] += square(x[at], x[at - n]);
-                    }
-                }
-            }
-            let [kh, kw] = tv_factors(&f);
-            sums[0] * kh + sums[1] * kw
-        })
-        .sum()
-}
-
-/// Orthogonality of one line.
-pub fn ortho(grid: &Grid, values: &[f32], term: usize) -> f64 {
-    let f = grid.line(term);
-    let c = f.channels;
-    if c < 2 {
-        return 0.0;
-    }
-    let gram = gram(&f, &values[f.range()]);
-    let off: f64 = (0..c * c).filter(|i| i / c != i % c).map(|i| gram[i].abs()).sum();
-    off / (c * (c - 1)) as f64
 }

@@ -10,18 +10,20 @@
 
 use super::decoder::{self, Decoded, DecoderWeights};
 use super::gather::{self, Cell, Lookup, Spread};
-use super::mask::{BoxMask, Lattice, VmRay, Walk};
+use super::mask::{BoxMask, Lattice, Walk};
 use super::{DecoderShape, Grid};
 use crate::dispatch;
+use crate::kernel::march::MarchRay;
 use crate::kernel::pool::Buffer;
 use crate::kernel::simd::{exp, ln_1p};
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 /// Values of a rendered ray: rgb over black (3), opacity, Σ w t.
 pub const RAY_WIDTH: usize = 5;
 
 /// From features to densities and on to weights.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Shading {
     /// Softplus of `feature + shift`, else relu of the feature.
     pub softplus: bool,
@@ -29,7 +31,7 @@ pub struct Shading {
     pub shift: f32,
     /// Optical lengths are steps times this.
     pub distance_scale: f32,
-    /// Colour is asked only where the weight is above this.
+    /// Color is asked only where the weight is above this.
     pub weight_threshold: f32,
     /// A ray ends where less than this of its light is left; 0 never does.
     pub stop: f32,
@@ -64,7 +66,7 @@ pub struct VmField {
     pub density: Grid,
     /// Planes and lines of the appearance; same size.
     pub color: Grid,
-    /// The colour decoder.
+    /// The color decoder.
     pub decoder: DecoderShape,
     /// Box, step and number of samples.
     pub lattice: Lattice,
@@ -76,7 +78,7 @@ pub struct VmField {
 
 impl VmField {
     #[inline(always)]
-    fn cell(&self, ray: &VmRay, t: f32) -> Cell {
+    fn cell(&self, ray: &MarchRay, t: f32) -> Cell {
         let l = &self.lattice;
         let mut unit = [0f32; 3];
         for a in 0..3 {
@@ -85,9 +87,6 @@ impl VmField {
         Cell::new(self.density.size, unit)
     }
 }
-
-/// Rays of a batch.
-pub type RayBatch = [VmRay];
 
 /// A density sample that has a say.
 #[derive(Clone, Copy, Debug)]
@@ -105,7 +104,7 @@ pub struct Rendered {
     pub out: Vec<f32>,
     /// Samples whose density was looked up.
     pub density_samples: u64,
-    /// Samples whose colour was decoded.
+    /// Samples whose color was decoded.
     pub color_samples: u64,
     kept: Vec<Kept>,
     cells: Vec<Cell>,
@@ -120,7 +119,7 @@ pub struct Rendered {
 const RAYS: usize = 32;
 
 struct MarchTask<'a> {
-    rays: &'a [VmRay],
+    rays: &'a [MarchRay],
     kept: Vec<Kept>,
     cells: Vec<Cell>,
     counts: Vec<u32>,
@@ -168,7 +167,7 @@ pub fn render(
     density: &[f32],
     color: &[f32],
     decoder: &DecoderWeights,
-    rays: &RayBatch,
+    rays: &[MarchRay],
 ) -> Rendered {
     let lookup = Lookup::new(&field.density, density);
     assert_eq!(lookup.size(), field.color.size);

@@ -1,11 +1,51 @@
 use super::fixture::{color, decoder, density, field, grid, network};
-use super::mask::{BoxMask, Lattice, VmRay, Walk};
+use super::mask::{BoxMask, Lattice, Walk};
+use super::penalty::{gram, tv_factors};
 use super::*;
+use crate::kernel::march::MarchRay;
 use crate::kernel::rng;
 
 /// A point given as -1..=1 along each axis of the fixture's box.
 fn at(u: [f32; 3]) -> [f32; 3] {
     [u[0] * 1.5, u[1] * 1.67, u[2]]
+}
+
+/// Σ over the three planes of TV.
+fn total_variation(grid: &Grid, values: &[f32]) -> f64 {
+    (0..3)
+        .map(|i| {
+            let f = grid.plane(i);
+            let x = &values[f.range()];
+            let (pitch, n) = (f.width * f.channels, f.channels);
+            let square = |a: f32, b: f32| (a as f64 - b as f64).powi(2);
+            let mut sums = [0f64; 2];
+            for y in 0..f.height {
+                for k in 0..pitch {
+                    let at = y * pitch + k;
+                    if y > 0 {
+                        sums[0] += square(x[at], x[at - pitch]);
+                    }
+                    if k >= n {
+                        sums[1] += square(x[at], x[at - n]);
+                    }
+                }
+            }
+            let [kh, kw] = tv_factors(&f);
+            sums[0] * kh + sums[1] * kw
+        })
+        .sum()
+}
+
+/// Orthogonality of one line.
+fn ortho(grid: &Grid, values: &[f32], term: usize) -> f64 {
+    let f = grid.line(term);
+    let c = f.channels;
+    if c < 2 {
+        return 0.0;
+    }
+    let gram = gram(&f, &values[f.range()]);
+    let off: f64 = (0..c * c).filter(|i| i / c != i % c).map(|i| gram[i].abs()).sum();
+    off / (c * (c - 1)) as f64
 }
 
 #[test]
@@ -23,8 +63,8 @@ fn rendered_rays_have_the_published_values() {
     assert!((f.lattice.step - 0.2918889).abs() < 1e-7);
     let weights = DecoderWeights::new(decoder(), &network());
     let rays = [
-        VmRay { origin: [0.1, -0.2, 4.5], direction: [0.02, 0.05, -1.0], jitter: 0.0 },
-        VmRay { origin: [0.3, 0.4, 4.2], direction: [-0.1, 0.02, -1.0], jitter: 0.0 },
+        MarchRay { origin: [0.1, -0.2, 4.5], direction: [0.02, 0.05, -1.0], jitter: 0.0 },
+        MarchRay { origin: [0.3, 0.4, 4.2], direction: [-0.1, 0.02, -1.0], jitter: 0.0 },
     ];
     let out = render(&f, &density(), &color(), &weights, &rays).out;
     // rgb over black, over white, depth with the published code's extra (1 − opacity) d_z
@@ -96,7 +136,7 @@ fn voxel_counts_and_sizes_are_the_published_ones() {
 }
 
 /// The same field written plainly in f64, from the formulas: loss = Σ g · out.
-fn plain(f: &VmField, x: &[f64], rays: &[VmRay], g: &[f32]) -> f64 {
+fn plain(f: &VmField, x: &[f64], rays: &[MarchRay], g: &[f32]) -> f64 {
     let (nd, nc) = (f.density.len(), f.color.len());
     let (density, rest) = x.split_at(nd);
     let (color, network) = rest.split_at(nc);
@@ -204,10 +244,10 @@ fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
     let density: Vec<f32> = normal(1, f.density.len(), 0.4).iter().map(|v| v + 0.2).collect();
     let color = normal(2, f.color.len(), 0.7);
     let network = normal(3, f.decoder.len(), 0.5);
-    let rays: Vec<VmRay> = (0..24)
+    let rays: Vec<MarchRay> = (0..24)
         .map(|i| {
             let u = |k: u64| rng::uniform(seed, 4, 8 * i + k) - 0.5;
-            VmRay {
+            MarchRay {
                 origin: [2.0 * u(0), 2.0 * u(1), 4.6],
                 direction: [0.3 * u(2), 0.3 * u(3), -1.0],
                 jitter: u(4) + 0.5,
@@ -258,7 +298,7 @@ fn penalty_gradients_agree_with_finite_differences() {
     let x: Vec<f32> = (0..grid.len()).map(|i| rng::normal(7, 1, i as u64)).collect();
     let penalty = Penalty { tv: 0.7, l1: 0.3, ortho: 0.2 };
     let mut g = vec![0.0; grid.len()];
-    penalise(&grid, &penalty, &x, &mut g);
+    penalize(&grid, &penalty, &x, &mut g);
     let value = |x: &[f32]| -> f64 {
         let l1: f64 = (0..3)
             .flat_map(|i| [grid.plane(i), grid.line(i)])
@@ -277,7 +317,7 @@ fn penalty_gradients_agree_with_finite_differences() {
     }
     // alone, too
     let mut only = vec![0.0; grid.len()];
-    penalise(&grid, &Penalty { ortho: 0.2, ..Penalty::default() }, &x, &mut only);
+    penalize(&grid, &Penalty { ortho: 0.2, ..Penalty::default() }, &x, &mut only);
     let f = grid.line(0);
     assert!(only[..f.start].iter().all(|&g| g == 0.0) && only[f.range()].iter().any(|&g| g != 0.0));
 }
@@ -299,7 +339,7 @@ fn a_mask_removes_samples_and_moves_none() {
     for i in 0..50 {
         let u = |k: u64| rng::uniform(9, 1, 8 * i + k) - 0.5;
         let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(0), 0.8 * u(1), -1.0] };
-        let ray = VmRay { origin: [u(2), u(3), 3.0], direction, jitter: u(4) + 0.5 };
+        let ray = MarchRay { origin: [u(2), u(3), 3.0], direction, jitter: u(4) + 0.5 };
         let points = |mask: Option<&BoxMask>| {
             let mut walk = Walk::new(&lattice, mask, &ray);
             std::iter::from_fn(|| walk.advance()).collect::<Vec<f32>>()
@@ -363,7 +403,7 @@ fn hidden_samples_change_a_ray_by_less_than_what_is_left_of_its_light() {
     f.lattice.step = 0.02;
     f.lattice.samples = 300;
     let weights = DecoderWeights::new(decoder(), &network());
-    let ray = [VmRay { origin: [0.1, -0.2, 4.5], direction: [0.02, 0.05, -1.0], jitter: 0.0 }];
+    let ray = [MarchRay { origin: [0.1, -0.2, 4.5], direction: [0.02, 0.05, -1.0], jitter: 0.0 }];
     let all = render(&f, &density(), &color(), &weights, &ray);
     f.shading.stop = 1e-3;
     let some = render(&f, &density(), &color(), &weights, &ray);

@@ -1,7 +1,7 @@
 //! Entries of a checkpoint's dictionaries, each taken as what it must be or named in an error.
 
-use super::ThError;
 use crate::io::{TorchNumbers, TorchTensor, TorchValue};
+use crate::{Error, Result};
 use std::path::Path;
 
 /// Grid sizes, ranks, widths and frequencies beyond this are nonsense.
@@ -15,12 +15,15 @@ pub(super) struct Table<'a> {
 }
 
 impl<'a> Table<'a> {
-    pub(super) fn wrong(&self, key: &str, found: String, expected: &str) -> ThError {
+    pub(super) fn wrong(&self, key: &str, found: String, expected: &str) -> Error {
         let key = if self.name.is_empty() { key.to_string() } else { format!("{}.{key}", self.name) };
-        ThError::Content { path: self.path.into(), key, found, expected: expected.into() }
+        Error::cannot(
+            format!("`{}`: `{key}` is {found}, expected {expected}", self.path.display()),
+            "give a `.th` file as `TensorVMSplit.save` writes it; other checkpoints have other entries",
+        )
     }
 
-    pub(super) fn get(&self, key: &str) -> Result<&'a TorchValue, ThError> {
+    pub(super) fn get(&self, key: &str) -> Result<&'a TorchValue> {
         self.values.get(key).ok_or_else(|| self.wrong(key, "missing".into(), "an entry"))
     }
 
@@ -32,7 +35,7 @@ impl<'a> Table<'a> {
         pairs.iter().map(|(key, _)| &**key)
     }
 
-    pub(super) fn table(&self, key: &'a str) -> Result<Table<'a>, ThError> {
+    pub(super) fn table(&self, key: &'a str) -> Result<Table<'a>> {
         match self.get(key)? {
             values @ (TorchValue::Dict(_) | TorchValue::OrderedDict(_)) => {
                 Ok(Table { path: self.path, name: key, values })
@@ -41,21 +44,21 @@ impl<'a> Table<'a> {
         }
     }
 
-    pub(super) fn text(&self, key: &str) -> Result<&'a str, ThError> {
+    pub(super) fn text(&self, key: &str) -> Result<&'a str> {
         match self.get(key)? {
             TorchValue::Str(text) => Ok(text),
             other => Err(self.wrong(key, about(other), "text")),
         }
     }
 
-    pub(super) fn items(&self, key: &str) -> Result<&'a [TorchValue], ThError> {
+    pub(super) fn items(&self, key: &str) -> Result<&'a [TorchValue]> {
         match self.get(key)? {
             TorchValue::List(items) | TorchValue::Tuple(items) => Ok(items),
             other => Err(self.wrong(key, about(other), "a list")),
         }
     }
 
-    pub(super) fn number(&self, key: &str, least: f32) -> Result<f32, ThError> {
+    pub(super) fn number(&self, key: &str, least: f32) -> Result<f32> {
         let value = self.get(key)?;
         match float(value) {
             Some(x) if x.is_finite() && x >= least => Ok(x),
@@ -64,14 +67,14 @@ impl<'a> Table<'a> {
         }
     }
 
-    pub(super) fn count(&self, key: &str, least: usize) -> Result<usize, ThError> {
+    pub(super) fn count(&self, key: &str, least: usize) -> Result<usize> {
         let value = self.get(key)?;
         integer(value)
             .filter(|n| (least..=MAX_COUNT).contains(n))
             .ok_or_else(|| self.wrong(key, about(value), &format!("an integer from {least} to {MAX_COUNT}")))
     }
 
-    pub(super) fn counts(&self, key: &str, least: usize) -> Result<[usize; 3], ThError> {
+    pub(super) fn counts(&self, key: &str, least: usize) -> Result<[usize; 3]> {
         let items = self.items(key)?;
         let counts: Option<Vec<usize>> =
             items.iter().map(|v| integer(v).filter(|n| (least..=MAX_COUNT).contains(n))).collect();
@@ -82,7 +85,7 @@ impl<'a> Table<'a> {
         })
     }
 
-    pub(super) fn near_far(&self, key: &str) -> Result<[f32; 2], ThError> {
+    pub(super) fn near_far(&self, key: &str) -> Result<[f32; 2]> {
         let items = self.items(key)?;
         match items.iter().map(float).collect::<Option<Vec<f32>>>().as_deref() {
             Some(&[near, far]) if near >= 0.0 && near < far && far.is_finite() => Ok([near, far]),
@@ -90,7 +93,7 @@ impl<'a> Table<'a> {
         }
     }
 
-    pub(super) fn aabb(&self, key: &str) -> Result<[[f32; 3]; 2], ThError> {
+    pub(super) fn aabb(&self, key: &str) -> Result<[[f32; 3]; 2]> {
         let values = self.floats(key, &[2, 3])?;
         let corners = [[0, 1, 2], [3, 4, 5]].map(|corner| corner.map(|i: usize| values[i]));
         if (0..3).all(|axis| corners[0][axis] < corners[1][axis]) {
@@ -100,7 +103,7 @@ impl<'a> Table<'a> {
     }
 
     /// Finite values of a tensor of exactly this shape.
-    pub(super) fn floats(&self, key: &str, shape: &[usize]) -> Result<Vec<f32>, ThError> {
+    pub(super) fn floats(&self, key: &str, shape: &[usize]) -> Result<Vec<f32>> {
         let expected = || format!("a tensor of floats of shape {shape:?}");
         let tensor = match self.get(key)? {
             TorchValue::Tensor(tensor) | TorchValue::Array(tensor) => tensor,

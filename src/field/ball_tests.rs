@@ -1,11 +1,13 @@
 //! An analytic ball to train on: what the tests of learned fields share.
 
+use super::checkpoint::newest;
 use super::pixels::TrainView;
-use crate::Monitor;
+use super::training::Session;
 use crate::geom::{Camera, Distortion};
 use crate::image::{Gray, Photo};
 use crate::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
 use crate::kernel::march::Bitmask;
+use crate::{Monitor, Quiet, Result};
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -73,6 +75,16 @@ pub fn temporary() -> tempfile::TempDir {
     tempfile::tempdir().expect("a temporary folder")
 }
 
+/// A training on the CPU from seed 3.
+pub fn session<'a>(
+    stage: &'static str,
+    dir: &'a Path,
+    identity: &'a str,
+    monitor: &'a dyn Monitor,
+) -> Session<'a> {
+    Session { stage, seed: 3, device: "cpu", dir, identity, monitor }
+}
+
 /// Asks to stop after so many steps.
 pub struct StopAfter(AtomicU64);
 
@@ -93,16 +105,16 @@ impl Monitor for StopAfter {
 
 /// Writes the newest checkpoint of a stage folder again, with a change.
 pub fn tampered(dir: &Path, change: impl FnOnce(&mut Tensors)) {
-    let path = super::checkpoint::newest(dir);
+    let path = newest(dir);
     let mut all = read_tensors(&path, &Limits::default()).unwrap();
     change(&mut all);
     let tensors: Vec<_> = all.0.into_iter().map(|(name, (shape, values))| (name, shape, values)).collect();
     write_tensors(&path, &tensors, &all.1).unwrap();
 }
 
-/// A change that makes a number of the metadata this one.
+/// A change that makes a number of the header this one.
 pub fn says(key: &str, value: &str) -> impl Fn(&mut Tensors) {
-    move |(_, metadata)| drop(metadata.insert(key.into(), value.into()))
+    move |(_, header)| drop(header.insert(key.into(), value.into()))
 }
 
 /// A change that makes the first value of a tensor negative.
@@ -110,5 +122,56 @@ pub fn negative(name: &str) -> impl Fn(&mut Tensors) {
     move |(tensors, _)| match &mut tensors.get_mut(name).unwrap().1 {
         TensorValues::F32(values) => values[0] = -1.0,
         other => panic!("{name}: {other:?}"),
+    }
+}
+
+/// A training that returns its warnings.
+pub type Run<'a> = &'a dyn Fn(&Path, &dyn Monitor) -> Result<Vec<String>>;
+
+/// The newest checkpoint's bytes.
+pub fn bytes(dir: &Path) -> Vec<u8> {
+    std::fs::read(newest(dir)).unwrap()
+}
+
+/// A training that is stopped `stops` times after 11 steps, and whose newest checkpoint is then cut short by a
+/// crash, gives the bytes of an undisturbed one.
+pub fn resumes(run: Run, stops: usize) {
+    let (undisturbed, stopped) = (temporary(), temporary());
+    run(undisturbed.path(), &Quiet).unwrap();
+    for _ in 0..stops {
+        assert!(run(stopped.path(), &StopAfter::new(11)).unwrap_err().kind().is_stop());
+    }
+    let whole = bytes(stopped.path());
+    std::fs::write(newest(stopped.path()), &whole[..whole.len() / 2]).unwrap();
+    run(stopped.path(), &Quiet).unwrap();
+    assert_eq!(bytes(undisturbed.path()), bytes(stopped.path()));
+    assert!(!stopped.path().join("checkpoint.previous.safetensors").exists());
+}
+
+/// Each changed checkpoint of a training that was stopped twice is named by what is wrong with it, and the one
+/// before it is taken; where there is none, the error says how to start afresh.
+pub fn refuses(run: Run, stop_after: u64, stage: &str, rows: &[(&str, &dyn Fn(&mut Tensors))]) {
+    let (begun, undisturbed) = (temporary(), temporary());
+    for _ in 0..2 {
+        assert!(run(begun.path(), &StopAfter::new(stop_after)).is_err());
+    }
+    run(undisturbed.path(), &Quiet).unwrap();
+    for (i, (key, change)) in rows.iter().enumerate() {
+        let dir = temporary();
+        for file in std::fs::read_dir(begun.path()).unwrap().map(|f| f.unwrap()) {
+            std::fs::copy(file.path(), dir.path().join(file.file_name())).unwrap();
+        }
+        tampered(dir.path(), change);
+        if i % 4 == 0 {
+            let warnings = run(dir.path(), &Quiet).unwrap();
+            assert!(warnings.iter().any(|w| w.contains(key) && w.contains("falling back")), "{warnings:?}");
+            assert_eq!(bytes(undisturbed.path()), bytes(dir.path()));
+        } else {
+            // nothing before it to take
+            std::fs::remove_file(dir.path().join("checkpoint.previous.safetensors")).unwrap();
+            let e = run(dir.path(), &Quiet).unwrap_err();
+            assert!(e.to_string().contains(key) && e.to_string().contains("checkpoint.safetensors"), "{e}");
+            assert_eq!(e.hint(), format!("start the stage afresh with `--fresh {stage}`"));
+        }
     }
 }

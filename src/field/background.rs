@@ -10,9 +10,9 @@ use crate::image::{Gray, Photo, linear_from_srgb, quantise, srgb_from_linear};
 /// Half edge of the window that collects stage pixels, as a share of the picture's height.
 const WINDOW: f32 = 0.02;
 
-/// Colours over black for every pixel: the photograph where the mask is full, black where it is empty.
+/// Colors over black for every pixel: the photograph where the mask is full, black where it is empty.
 ///
-/// No channel exceeds the mask's alpha, so that colour never asks for more than the mask's opacity.
+/// No channel exceeds the mask's alpha, so that color never asks for more than the mask's opacity.
 pub fn over_black(photo: &Photo, mask: &Gray) -> Vec<[u8; 3]> {
     let (w, h) = (photo.width as usize, photo.height as usize);
     let linear: [f32; 256] = std::array::from_fn(|i| linear_from_srgb(i as f32 / 255.0));
