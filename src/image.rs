@@ -61,6 +61,11 @@ impl Image {
         Image { width, height, channels, data: vec![0.0; width as usize * height as usize * channels] }
     }
 
+    /// The values of channel `k`, one a pixel.
+    pub fn channel(&self, k: usize) -> Vec<f32> {
+        self.data.iter().skip(k).step_by(self.channels).copied().collect()
+    }
+
     /// The values of one pixel.
     pub fn pixel(&self, x: u32, y: u32) -> &[f32] {
         let i = (y as usize * self.width as usize + x as usize) * self.channels;

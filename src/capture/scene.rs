@@ -21,7 +21,7 @@ use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
 /// The head's box and how it sits in the world.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Scene {
     /// Scale and translation, no rotation: the box's longest side fills [-1, 1], to within a tenth.
     pub scene_from_world: Similarity,

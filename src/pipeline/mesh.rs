@@ -142,8 +142,7 @@ fn write_files(exported: &ExportedFiles, folder: &Path) -> Result<()> {
 }
 
 fn write_exr(linear: &Image, path: &Path) -> Result<()> {
-    let plane = |k: usize| linear.data.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>();
-    let [r, g, b] = [plane(0), plane(1), plane(2)];
+    let [r, g, b] = [0, 1, 2].map(|k| linear.channel(k));
     let channels = [("R", &r[..]), ("G", &g[..]), ("B", &b[..])];
     Ok(io::write_exr(path, linear.width, linear.height, &channels)?)
 }

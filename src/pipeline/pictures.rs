@@ -72,17 +72,13 @@ pub(super) fn write(
             io::write_png_gray16(&depth, w, h, &mm)
         }
         PictureFormat::Exr => {
-            let linear: Vec<[f32; 4]> = pixels
-                .iter()
-                .map(|&p| {
-                    let [r, g, b, a] = straight(p);
-                    [linear_from_srgb(r) * a, linear_from_srgb(g) * a, linear_from_srgb(b) * a, a]
-                })
-                .collect();
-            let of = |k: usize| linear.iter().map(|p| p[k]).collect::<Vec<f32>>();
-            let normal = |k: usize| view.normal.data.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>();
-            let (r, g, b, a) = (of(0), of(1), of(2), of(3));
-            let (x, y, z) = (normal(0), normal(1), normal(2));
+            let mut linear = view.color.clone();
+            for p in linear.data.as_chunks_mut::<4>().0 {
+                let [r, g, b, a] = straight(*p);
+                *p = [linear_from_srgb(r) * a, linear_from_srgb(g) * a, linear_from_srgb(b) * a, a];
+            }
+            let [r, g, b, a] = [0, 1, 2, 3].map(|k| linear.channel(k));
+            let [x, y, z] = [0, 1, 2].map(|k| view.normal.channel(k));
             let mut channels: Vec<(&str, &[f32])> = vec![("R", &r), ("G", &g), ("B", &b), ("A", &a)];
             if !view.depth.data.is_empty() {
                 channels.push(("Z", &view.depth.data));
@@ -107,8 +103,7 @@ pub(super) fn float_path(folder: &Path, name: &str) -> PathBuf {
 pub(super) fn write_float(folder: &Path, name: &str, view: &RenderedView) -> Result<(), WriteError> {
     let file = float_path(folder, name);
     io::create_folder(file.parent().unwrap_or(folder))?;
-    let of = |k: usize| view.color.data.iter().skip(k).step_by(4).copied().collect::<Vec<f32>>();
-    let color = [of(0), of(1), of(2), of(3)];
+    let color = [0, 1, 2, 3].map(|k| view.color.channel(k));
     let all = CODED.iter().copied().zip(color.iter().chain([&view.depth.data]).map(Vec::as_slice));
     let channels: Vec<(&str, &[f32])> = all.filter(|(_, values)| !values.is_empty()).collect();
     io::write_exr(&file, view.color.width, view.color.height, &channels)

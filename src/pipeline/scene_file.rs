@@ -3,46 +3,37 @@
 use crate::Result;
 use crate::capture::scene::{Hull, Scene};
 use crate::capture::{Capture, View};
-use crate::geom::{Aabb, Similarity};
+use crate::geom::Aabb;
 use crate::io::{self, Limits, ReadError, WriteError};
 use glam::Vec3;
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 use serde_json::json;
 use std::path::Path;
 
 /// Cells along an axis of a hull, at most: the stage makes 128.
 const MOST_CELLS: usize = 1024;
 
-#[derive(Serialize, Deserialize)]
-struct SceneFile {
-    scene_from_world: Similarity,
-    aabb: Aabb,
-    hull: Option<Hull>,
-}
-
 /// Writes a scene with its hull.
 pub(super) fn write_scene(path: &Path, scene: &Scene) -> Result<(), WriteError> {
-    let file =
-        SceneFile { scene_from_world: scene.scene_from_world, aabb: scene.aabb, hull: scene.hull.clone() };
-    let text = serde_json::to_vec(&file).map_err(|e| WriteError::content(path, e.to_string()))?;
+    let text = serde_json::to_vec(scene).map_err(|e| WriteError::content(path, e.to_string()))?;
     io::write_atomic(path, &text)
 }
 
 /// Reads what [`write_scene`] wrote; what could not have been written is refused with its key.
 pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
-    let file: SceneFile = io::read_typed(path, &Limits::default())?;
+    let scene: Scene = io::read_typed(path, &Limits::default())?;
     let wrong = |key: &str, found: String, expected: &str| Err(ReadError::value(path, key, found, expected));
-    if let Some((part, found, expected)) = file.scene_from_world.problem() {
+    if let Some((part, found, expected)) = scene.scene_from_world.problem() {
         return wrong(&format!("scene_from_world.{part}"), found, expected);
     }
-    let Aabb { min, max } = file.aabb;
+    let Aabb { min, max } = scene.aabb;
     if !(min.cmplt(max).all()
         && Aabb::SCENE.grown(1e-3).contains(min)
         && Aabb::SCENE.grown(1e-3).contains(max))
     {
         return wrong("aabb", format!("{min} to {max}"), "a box within -1 and 1, its lowest corner first");
     }
-    if let Some(Hull { resolution, bits }) = &file.hull {
+    if let Some(Hull { resolution, bits }) = &scene.hull {
         if !(2..=MOST_CELLS).contains(resolution) {
             return wrong("hull.resolution", resolution.to_string(), &format!("2 to {MOST_CELLS}"));
         }
@@ -55,7 +46,7 @@ pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
             return wrong("hull.bits", "0 everywhere".into(), "at least one cell of the head");
         }
     }
-    Ok(Scene { scene_from_world: file.scene_from_world, aabb: file.aabb, hull: file.hull })
+    Ok(scene)
 }
 
 /// The text of `cameras.json`: every view with split, intrinsics and pose, and how the scene sits in
