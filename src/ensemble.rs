@@ -7,7 +7,7 @@
 //! from ([`tiles`]), never on test views.
 //!
 //! A fit gathers sums view by view, so a capture never has to be in memory. Everything is
-//! sRGB-coded colour over black (premultiplied), and nothing is rounded to 8 bits here. Sums are
+//! sRGB-coded color over black (premultiplied), and nothing is rounded to 8 bits here. Sums are
 //! taken in bands of fixed size and fixed order: any number of threads gives the same bits.
 
 mod blend;

@@ -1,4 +1,4 @@
-//! Blending with given weights: `Σ_k w_k · clamp(I_k, 0, 1)`, alpha like colour (the paper's §5).
+//! Blending with given weights: `Σ_k w_k · clamp(I_k, 0, 1)`, alpha like color (the paper's §5).
 
 use super::Members;
 use super::members::normalized;
@@ -112,7 +112,7 @@ mod tests {
         near(ghost.pixel(0, 0), [0.08, 0.08, 0.08, 0.1]);
         let out = blend(&members.cut(&PAPER_WEIGHTS).unwrap(), &PAPER_WEIGHTS).unwrap();
         near(out.pixel(0, 0), [0.0; 4]);
-        // opacity (0.6·0.5 + 0.3·0.8)/0.9 = 0.6; colour 0.1·0.8·0.6 + 0.6·0.2 + 0.3·0.4 = 0.288,
+        // opacity (0.6·0.5 + 0.3·0.8)/0.9 = 0.6; color 0.1·0.8·0.6 + 0.6·0.2 + 0.3·0.4 = 0.288,
         // alpha 0.1·0.6 + 0.6·0.5 + 0.3·0.8 = 0.6
         near(out.pixel(1, 0), [0.288, 0.288, 0.288, 0.6]);
         near(out.pixel(2, 0), [0.65, 0.65, 0.65, 1.0]);

@@ -24,7 +24,7 @@ fn everywhere() -> Gray {
     Gray { width: SIZE, height: SIZE, values: vec![255; PIXELS] }
 }
 
-/// A colour from 0.3 to 0.7.
+/// A color from 0.3 to 0.7.
 fn color(seed: u64, i: usize, j: usize) -> f32 {
     0.3 + 0.4 * uniform(seed, j as u64, i as u64)
 }

@@ -23,7 +23,7 @@ pub struct Member<'a> {
 /// What the members should have shown.
 #[derive(Clone, Copy, Debug)]
 pub struct BlendTarget<'a> {
-    /// The photograph over black: its colours multiplied by the mask.
+    /// The photograph over black: its colors multiplied by the mask.
     pub photo: &'a Photo,
     /// How much a pixel counts, 255 = once, 0 = not at all: the mask, or the mask from half on, and
     /// 0 where the photograph is not valid.
@@ -62,7 +62,7 @@ impl<'a> Members<'a> {
 
     /// Cuts the members that were trained without masks to the head.
     ///
-    /// They fill the frame, and a blend would show a ghost of the background at their weight. Colour and
+    /// They fill the frame, and a blend would show a ghost of the background at their weight. Color and
     /// alpha are multiplied by the mean opacity of the masked members, averaged with their
     /// `weights` (alike if those are all 0); where the head is opaque nothing changes. Without
     /// masked members there is nothing to cut by, and nothing is cut.

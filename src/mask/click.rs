@@ -3,9 +3,9 @@
 /// One click of a person on a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Click {
-    /// Column, as a pixel index: 0 is the centre of the leftmost pixels (`prompts.json`'s convention).
+    /// Column, as a pixel index: 0 is the center of the leftmost pixels (`prompts.json`'s convention).
     pub x: f32,
-    /// Row, as a pixel index: 0 is the centre of the top pixels.
+    /// Row, as a pixel index: 0 is the center of the top pixels.
     pub y: f32,
     /// Is the head there?
     pub head: bool,
@@ -25,7 +25,7 @@ mod tests {
 
     #[test]
     fn clicks_keep_their_place() {
-        // the first of four pixels has its centre at 1/8 of the width, which is a quarter into the first of two
+        // the first of four pixels has its center at 1/8 of the width, which is a quarter into the first of two
         let moved = Click { x: 0.0, y: 3.0, head: true }.moved((4, 4), (2, 2));
         assert_eq!((moved.x, moved.y), (-0.25, 1.25));
     }

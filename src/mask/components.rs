@@ -1,15 +1,17 @@
 //! Connected pieces of a binary picture: keeping some, filling holes, smoothing with a 3 × 3 square.
 
+use crate::image::Gray;
+
 /// Pieces that hang together, numbered from 1 in the order of their first pixel; 0 where `marked` is not.
-pub(super) struct Pieces {
+struct Pieces {
     /// `[height · width]`.
-    pub label: Vec<u32>,
+    label: Vec<u32>,
     /// Pixels of each piece; entry 0 counts the rest.
-    pub size: Vec<usize>,
+    size: Vec<usize>,
 }
 
 /// Finds pieces, over edges only (`corners` false) or over corners too.
-pub(super) fn pieces(marked: &[bool], width: usize, height: usize, corners: bool) -> Pieces {
+fn pieces(marked: &[bool], width: usize, height: usize, corners: bool) -> Pieces {
     let mut label = vec![0u32; marked.len()];
     let mut size = vec![marked.iter().filter(|m| !**m).count()];
     let mut stack = Vec::new();
@@ -38,15 +40,21 @@ pub(super) fn pieces(marked: &[bool], width: usize, height: usize, corners: bool
     Pieces { label, size }
 }
 
-/// Takes away every piece without a pixel of `seeds`.
-pub(super) fn keep_with_seeds(marked: &mut [bool], seeds: &[bool], width: usize, height: usize) {
+/// Takes away every piece of less than `least` pixels without one of `seeds`.
+pub(super) fn keep_pieces(marked: &mut [bool], seeds: &[bool], least: f64, width: usize, height: usize) {
     let found = pieces(marked, width, height, true);
-    let mut wanted = vec![false; found.size.len()];
+    let mut wanted: Vec<bool> = found.size.iter().map(|&s| s as f64 >= least).collect();
     for (i, &seed) in seeds.iter().enumerate() {
         wanted[found.label[i] as usize] |= seed;
     }
     wanted[0] = false;
     marked.iter_mut().zip(&found.label).for_each(|(m, &l)| *m = wanted[l as usize]);
+}
+
+/// Labels as a picture: 255 where marked.
+pub(super) fn gray(marked: &[bool], width: usize, height: usize) -> Gray {
+    let values = marked.iter().map(|&m| if m { 255 } else { 0 }).collect();
+    Gray { width: width as u32, height: height as u32, values }
 }
 
 /// Fills what is enclosed, does not touch the border, has at most `largest` pixels and none of `never`.
@@ -104,7 +112,7 @@ mod tests {
     fn only_pieces_with_a_seed_stay() {
         let (mut m, w, h) = picture(&["##..#", "##..#", "....."]);
         let (seeds, ..) = picture(&["#....", ".....", "..#.."]);
-        keep_with_seeds(&mut m, &seeds, w, h);
+        keep_pieces(&mut m, &seeds, f64::INFINITY, w, h);
         assert_eq!(m, picture(&["##...", "##...", "....."]).0);
     }
 

@@ -137,7 +137,7 @@ mod tests {
     fn growing_makes_discs_and_shrinking_takes_the_rim_but_not_at_the_border() {
         let mut one = vec![false; 49];
         one[24] = true;
-        // within 2 pixels of the centre: 13 lattice points
+        // within 2 pixels of the center: 13 lattice points
         assert_eq!(grow(&one, 7, 7, 2.0).iter().filter(|&&m| m).count(), 13);
         // the left half of 6 x 4 loses its right column only
         let half: Vec<bool> = (0..24).map(|i| i % 6 < 3).collect();

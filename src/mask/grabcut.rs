@@ -1,13 +1,13 @@
 //! Clicks → hard mask: GrabCut (Rother, Kolmogorov, Blake 2004) from a Voronoi start.
 //!
-//! Head and background are mixtures of colours, learned from the labels that the last round gave; a round's labels are
+//! Head and background are mixtures of colors, learned from the labels that the last round gave; a round's labels are
 //! the smallest cut of
 //!
 //! ```text
 //! E = Σ_p −ln p(c_p | label) + γ Σ_pq exp(−β ‖c_p − c_q‖²) / |p − q| · [labels differ],  β = 1 / (2 ⟨‖Δ‖²⟩)
 //! ```
 //!
-//! over 8 neighbours. At the end only pieces with a click stay, small holes are filled and threads are opened.
+//! over 8 neighbors. At the end only pieces with a click stay, small holes are filled and threads are opened.
 
 pub mod maxflow;
 pub mod mixture;
@@ -17,7 +17,7 @@ use self::maxflow::PixelGraph;
 use self::mixture::{Mixture, Rgb};
 use self::seeds::Seed;
 use super::click::Click;
-use super::components::{fill_holes, keep_with_seeds, open};
+use super::components::{fill_holes, gray, keep_pieces, open};
 use super::scale::reduce_to_rows;
 use crate::image::{Gray, Photo};
 use crate::{Error, Result};
@@ -46,7 +46,7 @@ const UNIT: f64 = 1000.0;
 pub struct HardMask {
     /// 255 head, 0 background.
     pub mask: Gray,
-    /// Share of the picture, 0..=1, that lies near the outline and has a colour that fits both sides.
+    /// Share of the picture, 0..=1, that lies near the outline and has a color that fits both sides.
     pub ambiguous: f64,
     /// What a person should look at.
     pub warnings: Vec<String>,
@@ -66,13 +66,13 @@ fn cut_at(rows: u32, view: &str, photo: &Photo, clicks: &[Click]) -> Result<Hard
     let (grabcut, mut warnings) =
         Grabcut::new(view, small, (photo.width, photo.height), clicks, seeds::BORDER_MARGIN);
     let (head, models) = grabcut.cut_from_clicks();
-    let head = grabcut.finish(head);
+    let head = grabcut.finish_clicked(head);
     if !head.contains(&true) {
         return Err(empty(view));
     }
     let ambiguous = models.map_or(1.0, |m| grabcut.ambiguous(&head, &m));
     warnings.extend(grabcut.warnings(view, &head));
-    Ok(HardMask { mask: grabcut.gray(&head), ambiguous, warnings })
+    Ok(HardMask { mask: gray(&head, grabcut.width, grabcut.height), ambiguous, warnings })
 }
 
 /// The error for a view in which nothing of the clicked head was left.
@@ -83,7 +83,7 @@ pub(super) fn empty(view: &str) -> Error {
     )
 }
 
-/// The colours of both sides.
+/// The colors of both sides.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Models {
     pub head: Mixture,
@@ -119,7 +119,7 @@ pub(super) struct Grabcut {
     pub clicks: Vec<Click>,
     /// `[height · width]`.
     pub seeds: Vec<Seed>,
-    /// What telling a pixel from its right, lower, lower right and lower left neighbour costs.
+    /// What telling a pixel from its right, lower, lower right and lower left neighbor costs.
     edges: Vec<[i32; 4]>,
 }
 
@@ -164,7 +164,7 @@ impl Grabcut {
         (head, models)
     }
 
-    /// Colours of the pixels inside and outside a mask.
+    /// Colors of the pixels inside and outside a mask.
     pub fn colors(&self, head: &[bool]) -> (Vec<Rgb>, Vec<Rgb>) {
         let of =
             |side: bool| self.photo.rgb.iter().zip(head).filter(move |(_, h)| **h == side).map(|(c, _)| *c);
@@ -196,25 +196,31 @@ impl Grabcut {
         graph.cut().0
     }
 
-    /// Pieces without a click go, small holes are filled, threads are opened.
-    pub fn finish(&self, mut head: Vec<bool>) -> Vec<bool> {
+    /// Pieces without a click that are smaller than `least` pixels go, small holes are filled, threads are opened.
+    pub fn finish(&self, mut head: Vec<bool>, least: f64) -> Vec<bool> {
         let clicked: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Head).collect();
-        keep_with_seeds(&mut head, &clicked, self.width, self.height);
-        let mut smooth = self.smooth(head);
+        keep_pieces(&mut head, &clicked, least, self.width, self.height);
+        self.smooth(head)
+    }
+
+    /// As [`Grabcut::finish`], and every piece needs a click.
+    pub fn finish_clicked(&self, head: Vec<bool>) -> Vec<bool> {
+        let mut smooth = self.finish(head, f64::INFINITY);
+        let clicked: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Head).collect();
         // opening may part what a thread held together
-        keep_with_seeds(&mut smooth, &clicked, self.width, self.height);
+        keep_pieces(&mut smooth, &clicked, f64::INFINITY, self.width, self.height);
         smooth
     }
 
     /// Small holes are filled, threads are opened.
-    pub fn smooth(&self, mut head: Vec<bool>) -> Vec<bool> {
+    fn smooth(&self, mut head: Vec<bool>) -> Vec<bool> {
         let background: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Background).collect();
         let largest = (HOLE * (self.width * self.height) as f64) as usize;
         fill_holes(&mut head, &background, self.width, self.height, largest);
         open(&head, self.width, self.height)
     }
 
-    /// Share of the picture near the outline whose colour does not tell the sides apart.
+    /// Share of the picture near the outline whose color does not tell the sides apart.
     pub fn ambiguous(&self, head: &[bool], models: &Models) -> f64 {
         let (w, h) = (self.width, self.height);
         let radius = OUTLINE * h as f32;
@@ -248,15 +254,9 @@ impl Grabcut {
         }
         found
     }
-
-    /// Labels as a picture.
-    pub fn gray(&self, head: &[bool]) -> Gray {
-        let values = head.iter().map(|&h| if h { 255 } else { 0 }).collect();
-        Gray { width: self.photo.width, height: self.photo.height, values }
-    }
 }
 
-/// `γ exp(−β ‖Δ‖²) / distance` to the four neighbours ahead; 0 where there is none.
+/// `γ exp(−β ‖Δ‖²) / distance` to the four neighbors ahead; 0 where there is none.
 fn edges(photo: &Photo) -> Vec<[i32; 4]> {
     let (w, h) = (photo.width as usize, photo.height as usize);
     let square = |i: usize, step: (usize, isize, isize)| -> Option<u32> {
@@ -294,7 +294,7 @@ mod tests {
     use super::*;
     use crate::kernel::rng;
 
-    /// A noisy disc of two skin-like colours on a dark background with bright lamps; `scale` enlarges everything.
+    /// A noisy disc of two skin-like colors on a dark background with bright lamps; `scale` enlarges everything.
     fn head(scale: f32) -> (Photo, Vec<bool>) {
         let (width, height) = ((96.0 * scale) as u32, (128.0 * scale) as u32);
         let mut truth = Vec::new();
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disc_of_two_colours_is_cut_out_among_lamps() {
+    fn a_disc_of_two_colors_is_cut_out_among_lamps() {
         let (photo, truth) = head(1.0);
         let cut = grabcut("a", &photo, &clicks(1.0)).unwrap();
         assert!(overlap(&cut.mask, &truth) > 0.985, "{}", overlap(&cut.mask, &truth));

@@ -1,6 +1,6 @@
 //! What masks of several views say about space: votes for every cell of a cube, and their silhouettes.
 //!
-//! A mask votes for a cell when the cell's centre falls on the head, against it when it falls beside, and not at
+//! A mask votes for a cell when the cell's center falls on the head, against it when it falls beside, and not at
 //! all outside its frame: there nothing was seen. A set of cells is drawn back into any view by its surface.
 
 use crate::capture::carve::{Cube, Projector, meeting_point};
@@ -171,7 +171,7 @@ pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
     depth.iter().map(|&d| d > 0 && d as f64 > share * deepest).collect()
 }
 
-/// Neighbours of a cell over faces, or over corners too.
+/// Neighbors of a cell over faces, or over corners too.
 fn around([x, y, z]: [usize; 3], n: usize, corners: bool) -> impl Iterator<Item = usize> {
     let span = move |v: usize| v.saturating_sub(1)..(v + 2).min(n);
     span(x).flat_map(move |u| span(y).flat_map(move |v| span(z).map(move |w| (u, v, w)))).filter_map(

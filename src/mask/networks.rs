@@ -4,7 +4,7 @@
 //! photograph + clicks ── segment ── hard mask        photograph + trimap ── alpha ── soft alpha
 //! ```
 //!
-//! Files are recognised by their inputs and outputs, looked through before an engine sees them, and recorded
+//! Files are recognized by their inputs and outputs, looked through before an engine sees them, and recorded
 //! with size and SHA-256. Nothing is downloaded, and nothing is read but the files named, the processor
 //! file beside a network, and the ONNX Runtime library when one is named.
 

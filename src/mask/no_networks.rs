@@ -7,14 +7,16 @@ use crate::{Error, Result};
 
 /// Networks, of which there are none in this build.
 #[derive(Clone, Copy, Debug)]
-pub enum Networks {}
+pub enum NoNetworks {}
 
-impl Networks {
+pub use self::NoNetworks as Networks;
+
+impl NoNetworks {
     /// Returns `None` where the configuration uses no network.
     ///
     /// # Errors
     /// When it uses one.
-    pub fn open(config: &MaskConfig) -> Result<Option<Networks>> {
+    pub fn open(config: &MaskConfig) -> Result<Option<NoNetworks>> {
         if !config.with_sam() && !config.with_vitmatte() {
             return Ok(None);
         }

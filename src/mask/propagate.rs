@@ -1,16 +1,16 @@
 //! A few clicked views → a mask for every view, through the seeds cameras.
 //!
-//! 1. The clicked views are cut by themselves; from all of them together the colours of head and background are learned
+//! 1. The clicked views are cut by themselves; from all of them together the colors of head and background are learned
 //!    once, and frozen.
 //! 2. The masks so far carve a cube of cells: the visual hull, which the head cannot leave.
 //! 3. In each view what lies outside the hull's silhouette is definite background and what the hull's core covers is definite
-//!    head; between them the frozen colours cut.
+//!    head; between them the frozen colors cut.
 //! 4. All masks carve again, each cell forgiven a few votes against it, and 3 is repeated.
 //!
 //! The hull is an outer bound: it excludes and never includes, but for its core.
 
 use super::click::Click;
-use super::components::pieces;
+use super::components::gray;
 use super::distance::{grow, shrink};
 use super::grabcut::mixture::Rgb;
 use super::grabcut::seeds::{self, Seed};
@@ -138,9 +138,9 @@ fn reduced(view: &PropagateView, photo: Photo) -> Result<Photo> {
 
 /// What the clicked views gave.
 struct ClickedViews {
-    /// Colours of all clicked views together.
+    /// Colors of all clicked views together.
     models: Models,
-    /// Per view: its labels and own colours, where it was clicked.
+    /// Per view: its labels and own colors, where it was clicked.
     own: Vec<Option<(Vec<bool>, Models)>>,
 }
 
@@ -161,14 +161,14 @@ impl Propagation<'_> {
         Grabcut::new(v.name, photo.clone(), (v.camera.width, v.camera.height), v.clicks, margin)
     }
 
-    /// Cuts the clicked views by themselves and learns the common colours.
+    /// Cuts the clicked views by themselves and learns the common colors.
     fn clicked(&mut self, clicked: &[usize]) -> Result<ClickedViews> {
         let found: Vec<_> = clicked
             .par_iter()
             .map(|&i| {
                 let (grabcut, warnings) = self.grabcut(i, true);
                 let (head, models) = grabcut.cut_from_clicks();
-                let head = grabcut.finish(head);
+                let head = grabcut.finish_clicked(head);
                 let models = models.filter(|_| head.contains(&true) && head.contains(&false));
                 (head, models, warnings)
             })
@@ -180,7 +180,7 @@ impl Propagation<'_> {
             let Some(models) = models else {
                 return Err(grabcut::empty(self.views[i].name));
             };
-            // what is held out teaches no other view its colours
+            // what is held out teaches no other view its colors
             if self.views[i].votes {
                 for (color, &h) in self.photos[i].rgb.iter().zip(&head) {
                     if h { inside.push(*color) } else { outside.push(*color) }
@@ -203,7 +203,9 @@ impl Propagation<'_> {
     /// Carves and cuts in turn.
     fn run(mut self, start: ClickedViews) -> HardMasks {
         let mut masks: Vec<Option<Gray>> = (start.own.iter().zip(&self.photos))
-            .map(|(own, photo)| own.as_ref().map(|(head, _)| gray(photo, head)))
+            .map(|(own, photo)| {
+                own.as_ref().map(|(head, _)| gray(head, photo.width as usize, photo.height as usize))
+            })
             .collect();
         let mut ambiguous = vec![0.0; self.views.len()];
         for round in 0..ROUNDS {
@@ -274,23 +276,10 @@ impl Propagation<'_> {
             }
         }
         let head = grabcut.min_cut(models);
-        let head = self.finish(&grabcut, head);
+        // the hull has left only what can be head: large pieces need no click
+        let head = grabcut.finish(head, PIECE * (w * h) as f64);
         let ambiguous = if round + 1 == ROUNDS { grabcut.ambiguous(&head, models) } else { 0.0 };
-        (grabcut.gray(&head), ambiguous)
-    }
-
-    /// As [`Grabcut::finish`], but pieces need no click: the hull has left only what can be head.
-    fn finish(&self, grabcut: &Grabcut, mut head: Vec<bool>) -> Vec<bool> {
-        let (w, h) = (grabcut.width, grabcut.height);
-        let found = pieces(&head, w, h, true);
-        let least = PIECE * (w * h) as f64;
-        let mut wanted: Vec<bool> = found.size.iter().map(|&s| s as f64 >= least).collect();
-        for (seeds, &l) in grabcut.seeds.iter().zip(&found.label) {
-            wanted[l as usize] |= *seeds == Seed::Head;
-        }
-        wanted[0] = false;
-        head.iter_mut().zip(&found.label).for_each(|(m, &l)| *m = wanted[l as usize]);
-        grabcut.smooth(head)
+        (gray(&head, w, h), ambiguous)
     }
 
     /// What looks wrong about the finished masks.
@@ -308,17 +297,12 @@ impl Propagation<'_> {
             }
             if ambiguous[i] > 0.05 {
                 self.warnings.push(format!(
-                    "view `{view}`: {:.0} % of the picture may be head or background by its colour; click there",
+                    "view `{view}`: {:.0} % of the picture may be head or background by its color; click there",
                     100.0 * ambiguous[i]
                 ));
             }
         }
     }
-}
-
-fn gray(photo: &Photo, head: &[bool]) -> Gray {
-    let values = head.iter().map(|&h| if h { 255 } else { 0 }).collect();
-    Gray { width: photo.width, height: photo.height, values }
 }
 
 #[cfg(test)]
@@ -347,7 +331,7 @@ mod tests {
             .collect()
     }
 
-    /// A ball of two colours before a dark background with lamps, and which pixels are the ball.
+    /// A ball of two colors before a dark background with lamps, and which pixels are the ball.
     fn photo(camera: &Camera, stream: u64) -> (Photo, Vec<bool>) {
         let mut truth = Vec::new();
         let rgb = (0..72 * 96u32)
@@ -386,7 +370,7 @@ mod tests {
     }
 
     #[test]
-    fn lamps_of_the_heads_own_colour_are_left_out_of_views_nobody_clicked() {
+    fn lamps_of_the_heads_own_color_are_left_out_of_views_nobody_clicked() {
         let masks = run(&[0, 3]).unwrap();
         for (i, mask) in masks.masks.iter().enumerate() {
             let truth = photo(&ring()[i], i as u64).1;

@@ -1,9 +1,9 @@
 //! Pictures made smaller before the mask is cut, and alphas made large again afterwards.
 //!
 //! Smaller is the area average of coded values (what the networks were trained on, and what keeps the
-//! matting equation `I = α F + (1 − α) B` true in the space it is solved in); for a cut, whose colours only tell
+//! matting equation `I = α F + (1 − α) B` true in the space it is solved in); for a cut, whose colors only tell
 //! two sides apart, it is taken in linear light. Larger is bilinear between
-//! pixel centres: column `x` of `W` looks at `(x + ½) w / W − ½` of `w`.
+//! pixel centers: column `x` of `W` looks at `(x + ½) w / W − ½` of `w`.
 
 use crate::image::{Gray, Photo, linear_from_srgb, quantise, srgb_from_linear};
 use rayon::prelude::*;
@@ -42,7 +42,7 @@ fn shares(from: u32, to: u32) -> Vec<Share> {
 /// What bytes stand for while they are averaged.
 #[derive(Clone, Copy, PartialEq)]
 enum Scale {
-    /// Themselves: coded colours, masks.
+    /// Themselves: coded colors, masks.
     Coded,
     /// Linear light, as a coarser sensor would have seen it.
     Light,
@@ -116,7 +116,7 @@ pub fn reduce_to_rows(photo: &Photo, rows: u32) -> Photo {
     Photo { width: size.0, height: size.1, rgb: bytes.as_chunks::<3>().0.to_vec(), alpha: None }
 }
 
-/// A grey picture at another size: averaged where it is larger in both directions, else interpolated.
+/// A gray picture at another size: averaged where it is larger in both directions, else interpolated.
 pub fn resize_gray(gray: &Gray, size: (u32, u32)) -> Gray {
     let from = (gray.width, gray.height);
     if size == from {
@@ -159,7 +159,7 @@ pub fn enlarge(alpha: &[f32], from: (u32, u32), size: (u32, u32), lowest: f32, h
     Gray { width: size.0, height: size.1, values: bilinear(alpha, from.0, from, size, coded) }
 }
 
-/// A field of `from` (width, height) at the pixel centres of `to`, each value given to `with`; edges are repeated. Rows
+/// A field of `from` (width, height) at the pixel centers of `to`, each value given to `with`; edges are repeated. Rows
 /// of `values` are `stride` apart, so the upper left `from` of a larger field can be taken.
 pub(super) fn bilinear<T: Copy + Default + Send>(
     values: &[f32],
@@ -183,7 +183,7 @@ pub(super) fn bilinear<T: Copy + Default + Send>(
     out
 }
 
-/// The two neighbours of pixel `i` of `to` among `from`, and how far it is from the first to the second.
+/// The two neighbors of pixel `i` of `to` among `from`, and how far it is from the first to the second.
 fn between(i: u32, from: u32, to: u32) -> (usize, usize, f32) {
     let at = ((i as f64 + 0.5) * from as f64 / to as f64 - 0.5).clamp(0.0, (from - 1) as f64);
     let first = at as usize;
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_and_alpha_of_a_photograph_are_averaged_apart() {
+    fn colors_and_alpha_of_a_photograph_are_averaged_apart() {
         let photo =
             Photo { width: 2, height: 1, rgb: vec![[0, 10, 200], [100, 30, 100]], alpha: Some(vec![0, 50]) };
         let small = reduce_photo(&photo, (1, 1));
@@ -235,7 +235,7 @@ mod tests {
 
     #[test]
     fn doubling_puts_new_centres_a_quarter_from_the_old() {
-        // centres of the four at −¼, ¼, ¾, 5/4 of the two: 0, ¼, ¾, 1
+        // centers of the four at −¼, ¼, ¾, 5/4 of the two: 0, ¼, ¾, 1
         let large = enlarge(&[0.0, 1.0], (2, 1), (4, 1), 0.0, 1.0);
         assert_eq!(large.values, [0, 64, 191, 255]);
         let tall = enlarge(&[0.0, 1.0], (1, 2), (1, 4), 0.0, 1.0);

@@ -9,6 +9,7 @@ use crate::geom::{Aabb, Camera, Distortion};
 use crate::{Error, Result};
 use glam::{BVec3, DMat3, DVec3, Vec3};
 use serde::Deserialize;
+use serde_json::{Map, Value};
 
 /// Most cameras in one file.
 const MAX_CAMERAS: usize = 100_000;
@@ -131,12 +132,11 @@ pub fn orbit(cameras: &[Camera], bounds: Aabb, up: Vec3, count: usize) -> Result
 #[derive(Deserialize)]
 struct PathFile {
     camera_path: Option<Vec<PathKey>>,
-    render_width: Option<f64>,
-    render_height: Option<f64>,
     camera_type: Option<String>,
     frames: Option<Vec<TransformsFrame>>,
+    /// Size of the pictures, and intrinsics for all frames.
     #[serde(flatten)]
-    lens: Intrinsics,
+    numbers: Map<String, Value>,
 }
 
 #[derive(Deserialize)]
@@ -150,26 +150,9 @@ struct PathKey {
 struct TransformsFrame {
     transform_matrix: Vec<Vec<f64>>,
     file_path: Option<String>,
+    /// Intrinsics of its own.
     #[serde(flatten)]
-    lens: Intrinsics,
-}
-
-/// Intrinsics as `transforms.json` has them, for all frames or for one.
-#[derive(Deserialize, Clone, Copy)]
-struct Intrinsics {
-    w: Option<f64>,
-    h: Option<f64>,
-    fl_x: Option<f64>,
-    fl_y: Option<f64>,
-    cx: Option<f64>,
-    cy: Option<f64>,
-    k1: Option<f64>,
-    k2: Option<f64>,
-    k3: Option<f64>,
-    p1: Option<f64>,
-    p2: Option<f64>,
-    camera_angle_x: Option<f64>,
-    camera_angle_y: Option<f64>,
+    numbers: Map<String, Value>,
 }
 
 /// Cameras from the text of a nerfstudio camera path or a `transforms.json`. What the file does not
@@ -188,7 +171,7 @@ pub fn from_json(text: &str, like: &Camera) -> Result<Vec<NamedCamera>> {
         }
         (None, Some(frames)) => {
             check_count(frames.len())?;
-            frames.iter().map(|frame| (stem(frame), from_frame(&file.lens, frame, like))).collect()
+            frames.iter().map(|frame| (stem(frame), from_frame(&file.numbers, frame, like))).collect()
         }
         (None, None) => {
             let problem = "not a camera path: there is neither `camera_path` nor `frames`";
@@ -218,8 +201,8 @@ fn from_key(file: &PathFile, key: &PathKey, like: &Camera) -> Result<Camera, Str
     if let Some(kind) = file.camera_type.as_deref().filter(|k| *k != "perspective") {
         return Err(format!("is of type `{kind}`, expected `perspective`"));
     }
-    let width = side("render_width", file.render_width, like.width)?;
-    let height = side("render_height", file.render_height, like.height)?;
+    let width = side(&[&file.numbers], "render_width", like.width)?;
+    let height = side(&[&file.numbers], "render_height", like.height)?;
     let m = &key.camera_to_world;
     if m.len() != 16 && m.len() != 12 {
         return Err(format!("`camera_to_world` has {} numbers, expected 16", m.len()));
@@ -244,60 +227,50 @@ fn from_key(file: &PathFile, key: &PathKey, like: &Camera) -> Result<Camera, Str
     })
 }
 
-fn from_frame(shared: &Intrinsics, frame: &TransformsFrame, like: &Camera) -> Result<Camera, String> {
-    let own = &frame.lens;
-    let value = |name: &str, of: fn(&Intrinsics) -> Option<f64>| match of(own).or(of(shared)) {
-        Some(v) if !v.is_finite() => Err(format!("`{name}` is {v}, expected a finite number")),
-        other => Ok(other),
-    };
-    let width = side("w", value("w", |l| l.w)?, like.width)?;
-    let height = side("h", value("h", |l| l.h)?, like.height)?;
-    let angle = |name: &str, a: Option<f64>, size: u32| match a {
-        Some(a) if a > 0.0 && a < 3.1 => Ok(Some(size as f64 / 2.0 / (a / 2.0).tan())),
-        Some(a) => Err(format!("`{name}` is {a}, expected radians between 0 and π")),
-        None => Ok(None),
-    };
-    let focal_x = value("fl_x", |l| l.fl_x)?;
-    let focal_x = focal_x.or(angle("camera_angle_x", value("camera_angle_x", |l| l.camera_angle_x)?, width)?);
-    let focal_y = value("fl_y", |l| l.fl_y)?;
-    let focal_y =
-        focal_y.or(angle("camera_angle_y", value("camera_angle_y", |l| l.camera_angle_y)?, height)?);
-    let copied = like.resized(width, height);
-    let fx = focal_x.or(focal_y).unwrap_or(copied.fx);
-    let fy = focal_y.or(focal_x).unwrap_or(copied.fy);
-    if !(fx > 0.0 && fy > 0.0) {
-        return Err(format!("focal lengths {fx} and {fy}, expected pixels above 0"));
+fn from_frame(shared: &Map<String, Value>, frame: &TransformsFrame, like: &Camera) -> Result<Camera, String> {
+    let objects = [&frame.numbers, shared];
+    let width = side(&objects, "w", like.width)?;
+    let height = side(&objects, "h", like.height)?;
+    let focal =
+        |length: &str, angle: &str, size: u32| match (number(&objects, length)?, number(&objects, angle)?) {
+            (Some(length), _) => Ok(Some(length)),
+            (None, Some(a)) if a > 0.0 && a < 3.1 => Ok(Some(size as f64 / 2.0 / (a / 2.0).tan())),
+            (None, Some(a)) => Err(format!("`{angle}` is {a}, expected radians between 0 and π")),
+            (None, None) => Ok(None),
+        };
+    let (fx, fy) = (focal("fl_x", "camera_angle_x", width)?, focal("fl_y", "camera_angle_y", height)?);
+    let mut camera = like.resized(width, height);
+    if fx.or(fy).is_some() {
+        // a lens of its own: what it does not say is in the middle and without distortion
+        (camera.cx, camera.cy) = (width as f64 / 2.0, height as f64 / 2.0);
+        camera.distortion = Distortion::default();
     }
-    let known = focal_x.or(focal_y).is_some();
-    let center = |given: Option<f64>, size: u32, other: f64| {
-        given.unwrap_or(if known { size as f64 / 2.0 } else { other })
-    };
-    let coefficient = |name: &str, of: fn(&Intrinsics) -> Option<f64>, other: f64| -> Result<f64, String> {
-        Ok(value(name, of)?.unwrap_or(if known { 0.0 } else { other }))
-    };
-    let bend = like.distortion;
+    (camera.fx, camera.fy) = (fx.or(fy).unwrap_or(camera.fx), fy.or(fx).unwrap_or(camera.fy));
+    if !(camera.fx > 0.0 && camera.fy > 0.0) {
+        return Err(format!("focal lengths {} and {}, expected pixels above 0", camera.fx, camera.fy));
+    }
+    let Camera { cx, cy, distortion: Distortion { k1, k2, k3, p1, p2 }, .. } = &mut camera;
+    for (name, value) in [("cx", cx), ("cy", cy), ("k1", k1), ("k2", k2), ("k3", k3), ("p1", p1), ("p2", p2)]
+    {
+        *value = number(&objects, name)?.unwrap_or(*value);
+    }
     let (rotation, position) = pose(&frame.transform_matrix)?;
-    Ok(Camera {
-        width,
-        height,
-        fx,
-        fy,
-        cx: center(value("cx", |l| l.cx)?, width, copied.cx),
-        cy: center(value("cy", |l| l.cy)?, height, copied.cy),
-        distortion: Distortion {
-            k1: coefficient("k1", |l| l.k1, bend.k1)?,
-            k2: coefficient("k2", |l| l.k2, bend.k2)?,
-            k3: coefficient("k3", |l| l.k3, bend.k3)?,
-            p1: coefficient("p1", |l| l.p1, bend.p1)?,
-            p2: coefficient("p2", |l| l.p2, bend.p2)?,
-        },
-        rotation,
-        position,
-    })
+    Ok(Camera { rotation, position, ..camera })
 }
 
-fn side(name: &str, given: Option<f64>, other: u32) -> Result<u32, String> {
-    match given {
+/// The number of this name in the first object that has one.
+fn number(objects: &[&Map<String, Value>], name: &str) -> Result<Option<f64>, String> {
+    match objects.iter().filter_map(|o| o.get(name)).find(|v| !v.is_null()) {
+        None => Ok(None),
+        Some(v) => {
+            let number = v.as_f64().filter(|v| v.is_finite());
+            number.map(Some).ok_or_else(|| format!("`{name}` is {v}, expected a finite number"))
+        }
+    }
+}
+
+fn side(objects: &[&Map<String, Value>], name: &str, other: u32) -> Result<u32, String> {
+    match number(objects, name)? {
         None => Ok(other),
         Some(v) if v.fract() == 0.0 && (1.0..=MAX_SIDE as f64).contains(&v) => Ok(v as u32),
         Some(v) => Err(format!("`{name}` is {v}, expected 1 to {MAX_SIDE} pixels")),

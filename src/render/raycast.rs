@@ -1,17 +1,17 @@
-//! A view of a mesh: one ray through each pixel's centre, the learned colour where it hits.
+//! A view of a mesh: one ray through each pixel's center, the learned color where it hits.
 //!
 //! Hard edges would leave stairs, so pixels on an edge are looked at again. Rays through the pixel
 //! corners tell which: some hit and some miss, or depth jumps by more than a surface seen at 84°
 //! would within one pixel. Such a pixel becomes the mean of `samples × samples` rays; what misses
 //! counts as transparent black. The mean is of sRGB-coded values, as everywhere in a render here:
-//! the fields composite coded colour, so alpha does too.
+//! the fields composite coded color, so alpha does too.
 
 use crate::geom::{Bvh, Camera, Hit, Mesh, Ray, Similarity};
 use crate::image::Image;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-/// Pixels worked on at once by one thread: bounds memory, and feeds the colour network well.
+/// Pixels worked on at once by one thread: bounds memory, and feeds the color network well.
 const BATCH: usize = 8192;
 
 /// Depth change over one pixel, in pixel footprints, from which on it is an edge: tan 84°.
@@ -35,11 +35,11 @@ impl Default for RaycastOptions {
 /// What one camera sees.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RenderedView {
-    /// RGBA: sRGB-coded colour premultiplied over black, and coverage.
+    /// RGBA: sRGB-coded color premultiplied over black, and coverage.
     pub color: Image,
-    /// One channel: distance along the viewing axis in world units at the pixel's centre; 0 = nothing.
+    /// One channel: distance along the viewing axis in world units at the pixel's center; 0 = nothing.
     pub depth: Image,
-    /// Three channels: unit normal in the world at the pixel's centre; 0 = nothing. No pixels at all where
+    /// Three channels: unit normal in the world at the pixel's center; 0 = nothing. No pixels at all where
     /// the method knows no normals.
     pub normal: Image,
 }
@@ -214,7 +214,7 @@ impl Raycaster<'_> {
         (b - a).cross(c - a).normalize_or_zero()
     }
 
-    /// Counts the hit into the pixel's alpha and queues it for its colour.
+    /// Counts the hit into the pixel's alpha and queues it for its color.
     fn enqueue(
         &self,
         queue: &mut RayHits,

@@ -1,4 +1,4 @@
-//! Colours from a texture: mip-mapped, filtered in linear light, with lobes for what depends on the view.
+//! Colors from a texture: mip-mapped, filtered in linear light, with lobes for what depends on the view.
 //!
 //! A level has half the texels of the one before, rounded down, each the mean of the part of the picture that it
 //! covers: of three texels by their share where the number is odd (Guthe and Heckbert, *Non-power-of-two
@@ -10,7 +10,7 @@ use crate::image::{Photo, linear_from_srgb, srgb_from_linear};
 use crate::kernel::sphharm;
 use glam::{Mat3, Vec2};
 
-/// View-dependent colour beside a base colour: one picture per spherical-harmonic function, in the order of
+/// View-dependent color beside a base color: one picture per spherical-harmonic function, in the order of
 /// [`sphharm::sh16`]. A byte `b` of picture `k` stands for the sRGB-coded difference `(b − 128) / 127 · scale[k]`.
 pub struct LobePictures<'a> {
     /// Pictures of the atlas's size.
@@ -24,7 +24,7 @@ pub struct LobePictures<'a> {
 /// A texture ready to be looked up.
 pub struct MeshTexture<'a> {
     atlas: &'a Atlas,
-    /// Linear colour and then the lobes, level by level; interleaved channels.
+    /// Linear color and then the lobes, level by level; interleaved channels.
     levels: Vec<MipLevel>,
     channels: usize,
     turned: Mat3,
@@ -72,7 +72,7 @@ impl<'a> MeshTexture<'a> {
         MeshTexture { atlas, levels, channels, turned: lobes.map_or(Mat3::IDENTITY, |l| l.turned), density }
     }
 
-    /// sRGB-coded colours of what rays of a camera met.
+    /// sRGB-coded colors of what rays of a camera met.
     pub fn colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         let forward = camera.forward();
         let mut values = vec![0f32; self.channels];

@@ -1,6 +1,6 @@
 //! The smallest cut of a picture's pixels into two sets (Boykov & Kolmogorov 2004).
 //!
-//! Pixels are nodes joined to their 8 neighbours and to two terminals, *head* and *stage*. A labelling costs
+//! Pixels are nodes joined to their 8 neighbors and to two terminals, *head* and *background*. A labelling costs
 //!
 //! ```text
 //! E = Σ_p cost of p's label + Σ_pq w_pq · [p and q have different labels]
@@ -12,10 +12,10 @@
 
 use std::collections::VecDeque;
 
-/// Steps to the 8 neighbours; `d ^ 1` is the way back.
+/// Steps to the 8 neighbors; `d ^ 1` is the way back.
 const STEPS: [(isize, isize); 8] = [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (-1, 1), (1, -1)];
 
-/// A parent that is no neighbour: the tree's own terminal.
+/// A parent that is no neighbor: the tree's own terminal.
 const TERMINAL: u8 = 8;
 /// Torn off, waiting for adoption.
 const ORPHAN: u8 = 9;
@@ -23,7 +23,7 @@ const ORPHAN: u8 = 9;
 const FREE: u8 = 10;
 
 const HEAD: u8 = 1;
-const STAGE: u8 = 2;
+const BACKGROUND: u8 = 2;
 
 /// A picture's graph: capacities in, labels out.
 ///
@@ -32,9 +32,9 @@ pub struct PixelGraph {
     width: usize,
     height: usize,
     steps: [isize; 8],
-    /// What still flows from a node to each neighbour.
+    /// What still flows from a node to each neighbor.
     residual: Vec<[i32; 8]>,
-    /// Positive: what the head terminal still gives; negative: what the stage terminal still takes.
+    /// Positive: what the head terminal still gives; negative: what the background terminal still takes.
     terminal: Vec<i32>,
     tree: Vec<u8>,
     parent: Vec<u8>,
@@ -82,23 +82,23 @@ impl PixelGraph {
     }
 
     /// What each label of a pixel costs; adds to what was said before. Costs are not negative.
-    pub fn add_costs(&mut self, x: usize, y: usize, as_head: i32, as_stage: i32) {
+    pub fn add_costs(&mut self, x: usize, y: usize, as_head: i32, as_background: i32) {
         let i = self.node(x, y);
         // whatever both labels pay is paid anyway; the rest hangs on one terminal
-        self.flow += as_head.min(as_stage) as i64;
+        self.flow += as_head.min(as_background) as i64;
         let before = self.terminal[i];
-        let give = as_stage as i64 + before.max(0) as i64;
+        let give = as_background as i64 + before.max(0) as i64;
         let take = as_head as i64 + (-before).max(0) as i64;
-        self.flow += give.min(take) - as_head.min(as_stage) as i64;
+        self.flow += give.min(take) - as_head.min(as_background) as i64;
         self.terminal[i] = (give - take).clamp(-(i32::MAX as i64), i32::MAX as i64) as i32;
     }
 
-    /// What it costs to tell a pixel from its neighbour; `direction` 0 right, 2 below, 4 below right, 6 below
-    /// left. The neighbour must be in the picture.
+    /// What it costs to tell a pixel from its neighbor; `direction` 0 right, 2 below, 4 below right, 6 below
+    /// left. The neighbor must be in the picture.
     pub fn join(&mut self, x: usize, y: usize, direction: usize, weight: i32) {
         let (dx, dy) = STEPS[direction];
         let (u, v) = (x.wrapping_add_signed(dx), y.wrapping_add_signed(dy));
-        assert!(direction < 8 && u < self.width && v < self.height, "no neighbour {direction} of ({x}, {y})");
+        assert!(direction < 8 && u < self.width && v < self.height, "no neighbor {direction} of ({x}, {y})");
         let i = self.node(x, y);
         let j = self.step(i, direction);
         self.residual[i][direction] += weight;
@@ -113,7 +113,7 @@ impl PixelGraph {
             for x in 0..self.width {
                 let i = self.node(x, y);
                 if self.terminal[i] != 0 {
-                    self.tree[i] = if self.terminal[i] > 0 { HEAD } else { STAGE };
+                    self.tree[i] = if self.terminal[i] > 0 { HEAD } else { BACKGROUND };
                     self.parent[i] = TERMINAL;
                     self.depth[i] = 1;
                     self.activate(i);
@@ -148,7 +148,7 @@ impl PixelGraph {
         }
     }
 
-    /// Can flow run between `p` and its neighbour in the sense of `p`'s tree, away from the root?
+    /// Can flow run between `p` and its neighbor in the sense of `p`'s tree, away from the root?
     fn open(&self, p: usize, direction: usize, q: usize) -> bool {
         if self.tree[p] == HEAD {
             self.residual[p][direction] > 0
@@ -157,7 +157,7 @@ impl PixelGraph {
         }
     }
 
-    /// Takes free neighbours into `p`'s tree; ends with the first edge from the head's tree to the stage's.
+    /// Takes free neighbors into `p`'s tree; ends with the first edge from the head's tree to the background's.
     fn grow(&mut self, p: usize) -> Option<(usize, usize)> {
         if self.parent[p] == FREE {
             return None;
@@ -185,57 +185,44 @@ impl PixelGraph {
         None
     }
 
-    /// Saturates the path through the edge from `head_end`, in the head's tree, to its neighbour in the stage's.
-    fn augment(&mut self, head_end: usize, direction: usize) {
-        let stage_end = self.step(head_end, direction);
-        let mut least = self.residual[head_end][direction];
-        let mut p = head_end;
-        while self.parent[p] != TERMINAL {
-            let up = self.parent[p] as usize;
-            let q = self.step(p, up);
-            least = least.min(self.residual[q][up ^ 1]);
-            p = q;
-        }
-        least = least.min(self.terminal[p]);
-        p = stage_end;
-        while self.parent[p] != TERMINAL {
-            let up = self.parent[p] as usize;
-            least = least.min(self.residual[p][up]);
-            p = self.step(p, up);
-        }
-        least = least.min(-self.terminal[p]);
+    /// The edge that carries flow between a node and its parent: the node it leaves, and in which direction.
+    fn edge_to_parent(&self, p: usize) -> (usize, usize) {
+        let up = self.parent[p] as usize;
+        if self.tree[p] == HEAD { (self.step(p, up), up ^ 1) } else { (p, up) }
+    }
 
-        self.residual[head_end][direction] -= least;
-        self.residual[stage_end][direction ^ 1] += least;
-        p = head_end;
-        while self.parent[p] != TERMINAL {
-            let up = self.parent[p] as usize;
-            let q = self.step(p, up);
-            self.residual[p][up] += least;
-            self.residual[q][up ^ 1] -= least;
-            if self.residual[q][up ^ 1] == 0 {
+    fn push(&mut self, from: usize, direction: usize, flow: i32) {
+        let to = self.step(from, direction);
+        self.residual[from][direction] -= flow;
+        self.residual[to][direction ^ 1] += flow;
+    }
+
+    /// Saturates the path through the edge from `head_end`, in the head's tree, to its neighbor in the background's.
+    fn augment(&mut self, head_end: usize, direction: usize) {
+        let ends = [head_end, self.step(head_end, direction)];
+        let mut least = self.residual[head_end][direction];
+        for mut p in ends {
+            while self.parent[p] != TERMINAL {
+                let (from, direction) = self.edge_to_parent(p);
+                least = least.min(self.residual[from][direction]);
+                p = self.step(p, self.parent[p] as usize);
+            }
+            least = least.min(self.terminal[p].abs());
+        }
+        self.push(head_end, direction, least);
+        for mut p in ends {
+            while self.parent[p] != TERMINAL {
+                let (from, direction) = self.edge_to_parent(p);
+                self.push(from, direction, least);
+                if self.residual[from][direction] == 0 {
+                    self.tear(p);
+                }
+                p = self.step(p, self.parent[p] as usize);
+            }
+            self.terminal[p] -= least * self.terminal[p].signum();
+            if self.terminal[p] == 0 {
                 self.tear(p);
             }
-            p = q;
-        }
-        self.terminal[p] -= least;
-        if self.terminal[p] == 0 {
-            self.tear(p);
-        }
-        p = stage_end;
-        while self.parent[p] != TERMINAL {
-            let up = self.parent[p] as usize;
-            let q = self.step(p, up);
-            self.residual[q][up ^ 1] += least;
-            self.residual[p][up] -= least;
-            if self.residual[p][up] == 0 {
-                self.tear(p);
-            }
-            p = q;
-        }
-        self.terminal[p] += least;
-        if self.terminal[p] == 0 {
-            self.tear(p);
         }
         self.flow += least as i64;
     }
@@ -295,7 +282,7 @@ impl PixelGraph {
         self.tree[p] = 0;
     }
 
-    /// May flow run between the root and `p` through its neighbour `q` in this direction?
+    /// May flow run between the root and `p` through its neighbor `q` in this direction?
     fn feeds(&self, q: usize, p: usize, direction: usize) -> bool {
         if self.tree[p] == HEAD {
             self.residual[q][direction ^ 1] > 0

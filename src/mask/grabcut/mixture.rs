@@ -1,14 +1,14 @@
-//! Colours of one thing as a mixture of Gaussians with full covariances, in coded RGB 0..=255.
+//! Colors of one thing as a mixture of Gaussians with full covariances, in coded RGB 0..=255.
 //!
 //! `p(c) = Σ_k w_k · N(c; μ_k, Σ_k)`. It starts from seeded k-means (Arthur & Vassilvitskii 2007) and is refitted
-//! as in GrabCut (Rother, Kolmogorov, Blake 2004): every colour goes to its likeliest Gaussian, whose mean and
+//! as in GrabCut (Rother, Kolmogorov, Blake 2004): every color goes to its likeliest Gaussian, whose mean and
 //! covariance are measured anew. A covariance always gains what 8-bit rounding and sensor noise leave at least,
-//! so that one flat colour is no singular Gaussian.
+//! so that one flat color is no singular Gaussian.
 
 use crate::geom::cofactors;
 use crate::kernel::rng;
 
-/// A colour in coded 0..=255.
+/// A color in coded 0..=255.
 pub type Rgb = [u8; 3];
 
 /// What every variance gains, in squared steps of 8 bit: a standard deviation of one step.
@@ -19,28 +19,28 @@ const STREAM: u64 = 0x6d_6978_7475_7265;
 
 #[derive(Clone, Debug, PartialEq)]
 struct Gaussian {
-    /// Share of the colours; 0 where none is left.
+    /// Share of the colors; 0 where none is left.
     weight: f64,
     mean: [f64; 3],
     /// Inverse covariance: xx, xy, xz, yy, yz, zz.
     precision: [f64; 6],
-    /// `ln w − ½ ln |2πΣ|`; minus infinity without colours.
+    /// `ln w − ½ ln |2πΣ|`; minus infinity without colors.
     offset: f64,
 }
 
-/// A mixture of Gaussians over colours.
+/// A mixture of Gaussians over colors.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mixture {
     gaussians: Vec<Gaussian>,
 }
 
 impl Mixture {
-    /// Fits `count` Gaussians to colours: k-means from a seeded start, then one measurement. `None` without
-    /// colours. Fewer distinct colours than Gaussians leave some without weight.
+    /// Fits `count` Gaussians to colors: k-means from a seeded start, then one measurement. `None` without
+    /// colors. Fewer distinct colors than Gaussians leave some without weight.
     pub fn fit(colors: &[Rgb], count: usize, seed: u64) -> Option<Mixture> {
         let first = colors.get(rng::below(seed, STREAM, 0, colors.len().max(1) as u64) as usize)?;
         let mut centers = vec![first.map(f64::from)];
-        // k-means++ : the next centre is drawn with the squared distance to the nearest one as its chance
+        // k-means++ : the next center is drawn with the squared distance to the nearest one as its chance
         let mut nearest = vec![f64::INFINITY; colors.len()];
         while centers.len() < count {
             let last = centers[centers.len() - 1];
@@ -86,7 +86,7 @@ impl Mixture {
         Some(Mixture::measure(colors, &member, centers.len()))
     }
 
-    /// Sends every colour to its likeliest Gaussian and measures these anew; unchanged without colours.
+    /// Sends every color to its likeliest Gaussian and measures these anew; unchanged without colors.
     pub fn refit(&self, colors: &[Rgb]) -> Mixture {
         if colors.is_empty() {
             return self.clone();
@@ -131,7 +131,7 @@ impl Mixture {
 }
 
 impl Gaussian {
-    /// From the number of colours, their sums and the sums of their products.
+    /// From the number of colors, their sums and the sums of their products.
     fn measure(s: &[u64; 10], total: usize) -> Gaussian {
         let n = s[0] as f64;
         if s[0] == 0 {
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn flat_and_few_colours_leave_finite_likelihoods() {
+    fn flat_and_few_colors_leave_finite_likelihoods() {
         for colors in [vec![[7, 7, 7]; 50], vec![[0, 0, 0], [255, 255, 255]], vec![[1, 2, 3]]] {
             let m = Mixture::fit(&colors, 5, 1).unwrap();
             for c in [[0, 0, 0], [255, 255, 255], [7, 7, 7], [0, 255, 0]] {
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_of_colours_is_no_singular_covariance() {
+    fn a_line_of_colors_is_no_singular_covariance() {
         // red = green = blue: the covariance has rank one before the floor
         let colors: Vec<Rgb> = (0..=255).map(|i| [i, i, i]).collect();
         let m = Mixture::fit(&colors, 1, 1).unwrap();

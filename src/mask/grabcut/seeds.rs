@@ -38,7 +38,7 @@ pub(in crate::mask) fn check(view: &str, clicks: &[Click], width: u32, height: u
     if clicks.is_empty() {
         return Err(no_clicks(view));
     }
-    // a pixel index of 0 is the pixel's centre, so the picture reaches half a pixel farther
+    // a pixel index of 0 is the pixel's center, so the picture reaches half a pixel farther
     let inside = |v: f32, size: u32| v >= -0.5 && v <= size as f32 - 0.5;
     if let Some(i) = clicks.iter().position(|c| !(inside(c.x, width) && inside(c.y, height))) {
         let (n, Click { x, y, .. }) = (i + 1, clicks[i]);
@@ -92,7 +92,7 @@ pub(in crate::mask) fn check_size(view: &str, width: u32, height: u32) -> Result
     ))
 }
 
-/// Marks the pixels whose centre is within `radius` of the segment from `a` to `b`.
+/// Marks the pixels whose center is within `radius` of the segment from `a` to `b`.
 fn draw(marked: &mut [bool], width: usize, height: usize, a: (f32, f32), b: (f32, f32), radius: f32) {
     let range = |u: f32, v: f32, size: usize| {
         let first = (u.min(v) - radius).floor().clamp(0.0, size as f32) as usize;

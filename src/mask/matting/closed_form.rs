@@ -1,25 +1,25 @@
 //! Closed-form matting (Levin, Lischinski, Weiss 2008): the opacity of the unknown band from the photograph.
 //!
-//! Where colours of head and background each lie on a line within every 3 × 3 window, alpha is an affine function
-//! of colour there. How far it is from one, over all windows, is a quadratic form `αᵀ L α` with
+//! Where colors of head and background each lie on a line within every 3 × 3 window, alpha is an affine function
+//! of color there. How far it is from one, over all windows, is a quadratic form `αᵀ L α` with
 //!
 //! ```text
 //! L_ij = Σ_w  δ_ij − (1 + (I_i − μ_w)ᵀ (Σ_w + ε/9 · 1)⁻¹ (I_j − μ_w)) / 9
 //! ```
 //!
-//! (their equation 12; `I` coded colour in 0..=1). Definite pixels are tied to their value with a weight, and
+//! (their equation 12; `I` coded color in 0..=1). Definite pixels are tied to their value with a weight, and
 //! `(L + D) α = D b` is solved by conjugate gradients, preconditioned by an incomplete Cholesky factor with
 //! the pattern of `L` itself.
 //!
 //! Beyond the paper, unknown pixels are held to the hard mask by a weight far below the tie. Where the photograph
-//! says what alpha is, that changes little; where colours of head and background agree (dark hair before a dark background),
+//! says what alpha is, that changes little; where colors of head and background agree (dark hair before a dark background),
 //! alpha stays near the cut instead of bleeding through the band. Measured on three views each of two heads, mean
 //! squared error without and with it: hard masks cut from clicks 2.9 and 3.0, 2.7 and 2.1 of 1000; true ones 2.3 and
 //! 1.6, 1.6 and 1.2; 2 pixels too wide 2.8 and 2.7, 1.4 and 1.3; 2 too narrow 2.0 and 1.7, 1.8 and 1.8. Rounds of
 //! conjugate gradients fall from 70 to 42.
 //!
 //! Only windows that hold an unknown pixel are assembled, so work and memory follow the band, not the picture:
-//! about 310 bytes for each of its pixels and their neighbours within two. A row has 25 entries; being
+//! about 310 bytes for each of its pixels and their neighbors within two. A row has 25 entries; being
 //! symmetric, 12 before the diagonal are kept.
 
 use super::trimap::{HEAD, UNKNOWN};
@@ -31,7 +31,7 @@ use crate::{Error, Result};
 /// How the opacity of the band is solved for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClosedFormOptions {
-    /// Noise of colours, added to their covariance; squared colour differences of 0..=1.
+    /// Noise of colors, added to their covariance; squared color differences of 0..=1.
     pub epsilon: f64,
     /// Weight with which definite pixels are tied to their value.
     pub constraint_weight: f64,
@@ -66,7 +66,7 @@ pub struct Matte {
     pub unknowns: usize,
 }
 
-/// Neighbours that come before a pixel, in raster order: (columns, rows).
+/// Neighbors that come before a pixel, in raster order: (columns, rows).
 #[rustfmt::skip]
 const BEFORE: [(i32, i32); 12] = [
     (-2, -2), (-1, -2), (0, -2), (1, -2), (2, -2),
@@ -77,9 +77,9 @@ const BEFORE: [(i32, i32); 12] = [
 /// A symmetric matrix with the stencil of two pixels each way, over the pixels that take part.
 struct Stencil {
     diagonal: Vec<f64>,
-    /// Entries before the diagonal, as [`BEFORE`]; 0 where that neighbour takes no part.
+    /// Entries before the diagonal, as [`BEFORE`]; 0 where that neighbor takes no part.
     lower: Vec<[f64; 12]>,
-    /// Which row each neighbour is; the row itself where it takes no part.
+    /// Which row each neighbor is; the row itself where it takes no part.
     column: Vec<[u32; 12]>,
 }
 
@@ -101,7 +101,7 @@ impl Stencil {
     /// `L` of `A ≈ L Lᵀ` with the pattern of `A`. An incomplete factor can fail where a whole one cannot, so the
     /// diagonal is raised until it does not (Manteuffel 1980).
     fn factor(&self) -> IncompleteCholesky<'_> {
-        let shared = shared_neighbours();
+        let shared = shared_neighbors();
         let mut raised = 0.0;
         loop {
             if let Some(factor) = self.factor_raised(1.0 + raised, &shared) {
@@ -158,7 +158,7 @@ impl IncompleteCholesky<'_> {
         for i in 0..r.len() {
             let mut sum = r[i];
             for (&l, &j) in self.lower[i].iter().zip(&self.column[i]) {
-                sum -= l * z[j as usize]; // a missing neighbour is the row itself, with entry 0
+                sum -= l * z[j as usize]; // a missing neighbor is the row itself, with entry 0
             }
             z[i] = sum * self.inverse[i];
         }
@@ -172,8 +172,8 @@ impl IncompleteCholesky<'_> {
     }
 }
 
-/// For each neighbour `s`: pairs (slot of the row, slot of that neighbour) that mean the same pixel, before it.
-fn shared_neighbours() -> [Vec<(usize, usize)>; 12] {
+/// For each neighbor `s`: pairs (slot of the row, slot of that neighbor) that mean the same pixel, before it.
+fn shared_neighbors() -> [Vec<(usize, usize)>; 12] {
     std::array::from_fn(|s| {
         let pairs = (0..s).filter_map(|a| {
             let wanted = (BEFORE[a].0 - BEFORE[s].0, BEFORE[a].1 - BEFORE[s].1);
@@ -246,13 +246,13 @@ fn assemble(photo: &Photo, trimap: &Gray, epsilon: f64) -> (Stencil, Vec<u32>) {
     const NONE: u32 = u32::MAX;
     let (width, height) = (photo.width as usize, photo.height as usize);
     let unknown = |i: usize| trimap.values[i] == UNKNOWN;
-    let mut centres = Vec::new();
+    let mut centers = Vec::new();
     let mut row_of = vec![NONE; width * height];
     for y in 1..height - 1 {
         for x in 1..width - 1 {
             let window = [y - 1, y, y + 1].map(|y| y * width + x);
             if window.iter().any(|&i| unknown(i - 1) || unknown(i) || unknown(i + 1)) {
-                centres.push(window[1] as u32);
+                centers.push(window[1] as u32);
                 window.iter().for_each(|&i| row_of[i - 1..=i + 1].fill(0));
             }
         }
@@ -282,9 +282,9 @@ fn assemble(photo: &Photo, trimap: &Gray, epsilon: f64) -> (Stencil, Vec<u32>) {
     };
     let slots: [[usize; 9]; 9] =
         std::array::from_fn(|a| std::array::from_fn(|b| if b < a { slot(a, b) } else { 0 }));
-    for &centre in &centres {
-        let centre = centre as usize;
-        let at: [usize; 9] = std::array::from_fn(|k| centre + (k / 3) * width + k % 3 - width - 1);
+    for &center in &centers {
+        let center = center as usize;
+        let at: [usize; 9] = std::array::from_fn(|k| center + (k / 3) * width + k % 3 - width - 1);
         let (difference, scaled) = window(&at.map(|i| photo.rgb[i]), epsilon);
         let rows = at.map(|i| row_of[i] as usize);
         for a in 0..9 {
@@ -303,9 +303,9 @@ fn assemble(photo: &Photo, trimap: &Gray, epsilon: f64) -> (Stencil, Vec<u32>) {
     (matrix, pixels)
 }
 
-/// Colours of a window less their mean, `d`, and `(Σ + ε/9 · 1)⁻¹ d`.
-fn window(colours: &[[u8; 3]; 9], epsilon: f64) -> ([[f64; 3]; 9], [[f64; 3]; 9]) {
-    let coded = colours.map(|c| c.map(|v| v as f64 / 255.0));
+/// Colors of a window less their mean, `d`, and `(Σ + ε/9 · 1)⁻¹ d`.
+fn window(colors: &[[u8; 3]; 9], epsilon: f64) -> ([[f64; 3]; 9], [[f64; 3]; 9]) {
+    let coded = colors.map(|c| c.map(|v| v as f64 / 255.0));
     let mean: [f64; 3] = std::array::from_fn(|k| coded.iter().map(|c| c[k]).sum::<f64>() / 9.0);
     let difference = coded.map(|c| [c[0] - mean[0], c[1] - mean[1], c[2] - mean[2]]);
     let covariance = |i: usize, j: usize| difference.iter().map(|d| d[i] * d[j]).sum::<f64>() / 9.0;
@@ -367,7 +367,7 @@ mod tests {
     use super::*;
     use crate::io::{Limits, NpyValues, read_gray, read_npy, read_photo};
 
-    /// Photograph with two colours that meet softly, and noise; trimap unknown in the middle.
+    /// Photograph with two colors that meet softly, and noise; trimap unknown in the middle.
     fn small(width: usize, height: usize) -> (Photo, Gray) {
         let mut state = 3u64;
         let mut noise = || {
@@ -412,10 +412,10 @@ mod tests {
         for cy in 1..h - 1 {
             for cx in 1..w - 1 {
                 let at: Vec<usize> = (0..9).map(|k| (cy + k / 3 - 1) * w + cx + k % 3 - 1).collect();
-                let colour = |i: usize| photo.rgb[i].map(|v| v as f64 / 255.0);
+                let color = |i: usize| photo.rgb[i].map(|v| v as f64 / 255.0);
                 let mean: Vec<f64> =
-                    (0..3).map(|k| at.iter().map(|&i| colour(i)[k]).sum::<f64>() / 9.0).collect();
-                let off = |i: usize| glam::DVec3::from_array(std::array::from_fn(|k| colour(i)[k] - mean[k]));
+                    (0..3).map(|k| at.iter().map(|&i| color(i)[k]).sum::<f64>() / 9.0).collect();
+                let off = |i: usize| glam::DVec3::from_array(std::array::from_fn(|k| color(i)[k] - mean[k]));
                 let mut cov = glam::DMat3::ZERO;
                 for &i in &at {
                     let d = off(i);

@@ -1,4 +1,4 @@
-//! ONNX networks in a session: a file is read once, recognised, and run by one of two engines.
+//! ONNX networks in a session: a file is read once, recognized, and run by one of two engines.
 //!
 //! | engine | when | what it runs |
 //! | --- | --- | --- |
@@ -48,7 +48,7 @@ enum Engine {
 }
 
 /// A network ready to run.
-pub(super) struct Session {
+pub(super) struct NetworkSession {
     /// Its file.
     pub file: NetworkFile,
     /// What it takes, in the file's order.
@@ -58,9 +58,9 @@ pub(super) struct Session {
     engine: Engine,
 }
 
-impl Session {
-    /// Reads, recognises and loads a file, which must be of a form of this role.
-    pub(super) fn open(role: Role, path: &Path, engines: &Engines) -> Result<Session> {
+impl NetworkSession {
+    /// Reads, recognizes and loads a file, which must be of a form of this role.
+    pub(super) fn open(role: Role, path: &Path, engines: &Engines) -> Result<NetworkSession> {
         let bytes = io::read_bytes(path, &Limits { file_bytes: MOST_FILE_BYTES, ..Limits::default() })?;
         if names_another_file(&bytes) {
             return Err(file_error(
@@ -81,7 +81,7 @@ impl Session {
         let inputs = graph.input.iter().filter(|p| !weights.contains(&p.name));
         let inputs: Vec<Port> = inputs.map(Port::new).collect();
         let outputs: Vec<Port> = graph.output.iter().map(Port::new).collect();
-        let contract = contract::recognise(&inputs, &outputs).map_err(|why| {
+        let contract = contract::recognize(&inputs, &outputs).map_err(|why| {
             file_error(
                 path,
                 &format!("is no SAM or ViTMatte network: {why}"),
@@ -105,7 +105,7 @@ impl Session {
         let engine = engine.map_err(|e| engine_error(path, engines.runtime.is_some(), "load", &e))?;
         let name = if engines.runtime.is_some() { ort::NAME } else { tract::NAME };
         let file = NetworkFile::new(key, path, &bytes, contract, name);
-        Ok(Session { file, inputs, contract, engine })
+        Ok(NetworkSession { file, inputs, contract, engine })
     }
 
     /// Does one run at a time use all threads? tract runs several side by side, each on one thread.

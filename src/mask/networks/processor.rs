@@ -8,10 +8,10 @@ use crate::Result;
 use crate::io::{self, Limits};
 use std::path::Path;
 
-/// Mean and standard deviation of ImageNet's colours in 0..1: what SAM and ViTMatte were trained with.
+/// Mean and standard deviation of ImageNet's colors in 0..1: what SAM and ViTMatte were trained with.
 pub(super) const IMAGENET: Normal = Normal { mean: [0.485, 0.456, 0.406], std: [0.229, 0.224, 0.225] };
 
-/// How colours become numbers: `(c / 255 − mean) / std`.
+/// How colors become numbers: `(c / 255 − mean) / std`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Normal {
     /// Of red, green, blue in 0..1.
@@ -21,9 +21,24 @@ pub(super) struct Normal {
 }
 
 impl Normal {
-    /// One channel of one pixel.
-    pub(super) fn apply(&self, value: u8, channel: usize) -> f32 {
-        ((f64::from(value) / 255.0 - self.mean[channel]) / self.std[channel]) as f32
+    /// Planes `[channels, height, width]`: normalized colors of a picture `from` wide in the upper left of the first three,
+    /// zeros elsewhere.
+    pub(super) fn planes(
+        &self,
+        rgb: &[[u8; 3]],
+        from: usize,
+        (width, height): (usize, usize),
+        channels: usize,
+    ) -> Vec<f32> {
+        let mut planes = vec![0.0; channels * width * height];
+        for (i, color) in rgb.iter().enumerate() {
+            let at = i / from * width + i % from;
+            for c in 0..3 {
+                let coded = f64::from(color[c]) / 255.0;
+                planes[c * width * height + at] = ((coded - self.mean[c]) / self.std[c]) as f32;
+            }
+        }
+        planes
     }
 }
 
@@ -69,7 +84,7 @@ pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>> {
         <[f64; 3]>::try_from(numbers)
             .ok()
             .filter(|n| n.iter().all(|&v| sound(v)) && value.as_array().is_some_and(|a| a.len() == 3))
-            .ok_or_else(|| wrong(format!("`{key}` is {value}, expected three numbers of colours in 0..1")))
+            .ok_or_else(|| wrong(format!("`{key}` is {value}, expected three numbers of colors in 0..1")))
     };
     let mean = three("image_mean", IMAGENET.mean, |v| (0.0..=1.0).contains(&v))?;
     let std = three("image_std", IMAGENET.std, |v| (1e-3..=1.0).contains(&v))?;
@@ -95,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn the_side_and_the_colours_are_read() {
+    fn the_side_and_the_colors_are_read() {
         let text =
             r#"{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.25], "pad_size": {"height": 256}}"#;
         let found = at(text, "sam").unwrap().unwrap();

@@ -1,7 +1,7 @@
 //! SAM: from clicks to a hard mask, with the files of a user (Kirillov et al. 2023; SlimSAM, MobileSAM).
 //!
 //! ```text
-//! photograph ── longest side to S, normalise, pad to S × S ── encoder ── embedding ─┐
+//! photograph ── longest side to S, normalize, pad to S × S ── encoder ── embedding ─┐
 //! clicks ────── times S / longest side ─────────────────────────────────── decoder ─┴─ S/4 × S/4 logits
 //!               logits ── bilinear to S × S ── cut the padding off ── bilinear to the photograph ── > 0
 //! ```
@@ -9,7 +9,7 @@
 //! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label −1 at the
 //! end when no box is given. S and the embedding's width are read from the files.
 
-use super::onnx::{Contract, Engines, NetworkArray, Role, Session, file_error};
+use super::onnx::{Contract, Engines, NetworkArray, NetworkSession, Role, file_error};
 use super::processor::{self, IMAGENET, Normal};
 use crate::image::{Gray, Photo};
 use crate::mask::click::Click;
@@ -30,8 +30,8 @@ const POSITION: &str = "image_positional_embeddings";
 
 /// An encoder and a decoder that fit together.
 pub(super) struct Sam {
-    pub(super) encoder: Session,
-    pub(super) decoder: Session,
+    pub(super) encoder: NetworkSession,
+    pub(super) decoder: NetworkSession,
     /// S: the side of the square the encoder sees.
     pub(super) side: usize,
     normal: Normal,
@@ -59,8 +59,8 @@ pub(super) struct Candidates {
 
 impl Sam {
     pub(super) fn open(encoder: &Path, decoder: &Path, engines: &Engines) -> Result<Sam> {
-        let mut encoder = Session::open(Role::Sam, encoder, engines)?;
-        let mut decoder = Session::open(Role::SamDecoder, decoder, engines)?;
+        let mut encoder = NetworkSession::open(Role::Sam, encoder, engines)?;
+        let mut decoder = NetworkSession::open(Role::SamDecoder, decoder, engines)?;
         let mismatch = |problem: String| {
             let problem = format!("does not fit to `{}`: {problem}", decoder.file.path.display());
             Err(file_error(&encoder.file.path, &problem, "take encoder and decoder from the same export"))
@@ -114,7 +114,7 @@ impl Sam {
         if let Contract::OriginalEncoder { picture: true } = self.encoder.contract {
             return NetworkArray::new(&[h, w, 3], rgb.iter().flatten().map(|&v| f32::from(v)).collect());
         }
-        normalised(&rgb, w, self.side, &self.normal)
+        normalized(&rgb, w, self.side, &self.normal)
     }
 
     /// Runs the encoder.
@@ -278,16 +278,9 @@ pub(super) fn enlarged(
     bilinear(&square, side, size(new), size(old), |v| v)
 }
 
-/// `[1, 3, side, side]`: normalised colours in the upper left, zeros right and below.
-pub(super) fn normalised(rgb: &[[u8; 3]], width: usize, side: usize, normal: &Normal) -> NetworkArray {
-    let mut values = vec![0.0; 3 * side * side];
-    for (i, colour) in rgb.iter().enumerate() {
-        let at = i / width * side + i % width;
-        for c in 0..3 {
-            values[c * side * side + at] = normal.apply(colour[c], c);
-        }
-    }
-    NetworkArray::new(&[1, 3, side, side], values)
+/// `[1, 3, side, side]`: normalized colors in the upper left, zeros right and below.
+pub(super) fn normalized(rgb: &[[u8; 3]], width: usize, side: usize, normal: &Normal) -> NetworkArray {
+    NetworkArray::new(&[1, 3, side, side], normal.planes(rgb, width, (side, side), 3))
 }
 
 /// The first of the highest scores from `begin` on.
@@ -332,9 +325,9 @@ mod tests {
     }
 
     #[test]
-    fn normalised_colours_lie_in_the_corner_and_zeros_around_them() {
+    fn normalized_colors_lie_in_the_corner_and_zeros_around_them() {
         // 2 × 1 pixels in a square of 3: red (255 − 0.485 · 255) / (0.229 · 255) = 2.2489
-        let tensor = normalised(&[[255, 0, 0], [0, 0, 0]], 2, 3, &IMAGENET);
+        let tensor = normalized(&[[255, 0, 0], [0, 0, 0]], 2, 3, &IMAGENET);
         let values = tensor.values;
         assert!((values[0] - 2.248_908).abs() < 1e-5 && (values[1] + 2.117_904).abs() < 1e-5);
         assert_eq!(values[2..9], [0.0; 7]);

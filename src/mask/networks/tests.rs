@@ -1,13 +1,13 @@
 //! SAM and ViTMatte against the stored inputs and outputs of the reference, on every engine there is.
 //!
 //! Tolerances are those of the vectors' own description: 1e-4 for embeddings, masks and logits, 5e-5 for scores
-//! and alphas, 1e-6 for normalised pixels, 2 of 255 and a mean of 0.3 for resized pictures, 1 % of mask pixels.
+//! and alphas, 1e-6 for normalized pixels, 2 of 255 and a mean of 0.3 for resized pictures, 1 % of mask pixels.
 
 use super::Networks;
 use super::onnx::tests::{config, engines, made, shared};
-use super::onnx::{Engines, NetworkArray, Role, Runtime, Session};
+use super::onnx::{Engines, NetworkArray, NetworkSession, Role, Runtime};
 use super::processor::IMAGENET;
-use super::sam::{Sam, enlarged, normalised, resized};
+use super::sam::{Sam, enlarged, normalized, resized};
 use super::vitmatte::VitMatte;
 use crate::Result;
 use crate::config::{MaskConfig, VitmatteColors};
@@ -123,7 +123,7 @@ fn photographs_are_resized_as_pillow_does() {
 fn the_encoder_sees_the_pixels_of_the_reference() {
     let Some(folder) = shared("sam_tiny") else { return };
     let resized = read_photo(&folder.join("resized.png"), None, &Limits::default()).unwrap();
-    let pixels = normalised(&resized.rgb, 192, 256, &IMAGENET);
+    let pixels = normalized(&resized.rgb, 192, 256, &IMAGENET);
     close(
         "pixel_values",
         "no engine",
@@ -141,7 +141,7 @@ fn sam_gives_the_reference_from_the_stored_inputs() {
     let Some(folder) = shared("sam_tiny") else { return };
     let at = |name: &str| array(&folder.join(name));
     for (engine, engines) in each_engine() {
-        let open = |role, name: &str| Session::open(role, &folder.join(name), &engines).unwrap();
+        let open = |role, name: &str| NetworkSession::open(role, &folder.join(name), &engines).unwrap();
         let encoder = open(Role::Sam, "vision_encoder.onnx");
         let names = ["image_embeddings", "image_positional_embeddings"];
         let given = encoder.run(&[("pixel_values", at("pixel_values.npy"))]).unwrap();
@@ -313,9 +313,9 @@ fn both_encoders_of_the_original_form_feed_the_original_decoder() {
             assert_eq!(pixels.shape, shape);
             // cell (1, 0) spans columns 16..32: mean red 23.5, of rows 0..16: mean green 7.5; channel 1 weighs 3, 4, 5 of 96
             let given = sam.encoder.run(&[("input_image", pixels)]).unwrap();
-            let colour =
+            let color =
                 |v: f64, c: usize| if picture { v } else { (v / 255.0 - IMAGENET.mean[c]) / IMAGENET.std[c] };
-            let expected = (3.0 * colour(23.5, 0) + 4.0 * colour(7.5, 1) + 5.0 * colour(40.0, 2)) / 96.0;
+            let expected = (3.0 * color(23.5, 0) + 4.0 * color(7.5, 1) + 5.0 * color(40.0, 2)) / 96.0;
             close("cell (1, 0)", engine, &[given[0].values[256 + 1]], &[expected as f32], 1e-5);
             let (mask, score) = sam.segment(&photo, &[click]).unwrap();
             assert!(mask.values.len() == 65536 && score.is_finite());
@@ -356,7 +356,7 @@ fn encoder_and_decoder_that_do_not_fit_are_named_together() {
 fn vitmatte_gives_the_reference_from_the_stored_inputs() {
     let Some(folder) = shared("vitmatte_tiny") else { return };
     for (engine, engines) in each_engine() {
-        let open = |name: &str| Session::open(Role::VitMatte, &folder.join(name), &engines);
+        let open = |name: &str| NetworkSession::open(Role::VitMatte, &folder.join(name), &engines);
         let session = open("model.onnx").unwrap();
         for kind in ["", "_imagenet", "_random_160x224", "_random_96x128"] {
             let pixels = array(&folder.join(format!("pixel_values{kind}.npy")));
@@ -384,7 +384,7 @@ fn vitmatte_gives_the_reference_from_the_stored_inputs() {
 }
 
 #[test]
-fn vitmatte_is_shown_the_colours_of_each_convention() {
+fn vitmatte_is_shown_the_colors_of_each_convention() {
     let Some(folder) = shared("vitmatte_tiny") else { return };
     let (photo, trimap) = (picture(&folder), gray(&folder.join("trimap.png")));
     let dir = tempfile::tempdir().unwrap();
@@ -400,7 +400,7 @@ fn vitmatte_is_shown_the_colours_of_each_convention() {
         for (engine, engines) in each_engine() {
             let network = VitMatte::open(path, &engines, set).unwrap();
             let recorded = &network.session.file.contract;
-            assert_eq!(recorded.ends_with("colours as in the original code"), kind == "_imagenet");
+            assert_eq!(recorded.ends_with("colors as in the original code"), kind == "_imagenet");
             let padded = network.padded(150, 200).unwrap();
             assert_eq!(padded, (160, 224));
             let pixels = network.pixels(&photo, &trimap, padded);

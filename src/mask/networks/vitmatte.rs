@@ -1,15 +1,15 @@
 //! ViTMatte: from a trimap to a soft alpha, with a file of the user (Yao et al. 2024).
 //!
-//! The network sees four channels, colour and trimap, at a multiple of 32 pixels. Two conventions exist:
+//! The network sees four channels, color and trimap, at a multiple of 32 pixels. Two conventions exist:
 //!
-//! | | colours | unknown |
+//! | | colors | unknown |
 //! | --- | --- | --- |
 //! | original code | ImageNet's mean and deviation | exactly 0.5 |
 //! | transformers | 0.5 and 0.5 (or as its file says) | 128 / 255 |
 //!
 //! The file `preprocessor_config.json` beside the network means the second; without it, the first.
 
-use super::onnx::{Engines, NetworkArray, Role, Session};
+use super::onnx::{Engines, NetworkArray, NetworkSession, Role};
 use super::processor::{self, IMAGENET, Normal};
 use crate::config::VitmatteColors;
 use crate::image::{Gray, Photo};
@@ -21,7 +21,7 @@ const STEP: usize = 32;
 
 /// A ViTMatte network.
 pub(super) struct VitMatte {
-    pub(super) session: Session,
+    pub(super) session: NetworkSession,
     normal: Normal,
     /// Is it shown the thirds of the original code, or the trimap over 255?
     thirds: bool,
@@ -30,7 +30,7 @@ pub(super) struct VitMatte {
 impl VitMatte {
     /// Opens the file; `colors` may override what lies beside it.
     pub(super) fn open(path: &Path, engines: &Engines, colors: VitmatteColors) -> Result<VitMatte> {
-        let mut session = Session::open(Role::VitMatte, path, engines)?;
+        let mut session = NetworkSession::open(Role::VitMatte, path, engines)?;
         let half = Normal { mean: [0.5; 3], std: [0.5; 3] };
         let normal = match colors {
             VitmatteColors::Imagenet => None,
@@ -39,7 +39,7 @@ impl VitMatte {
         };
         let thirds = normal.is_none();
         let how = if thirds { "as in the original code" } else { "as in transformers" };
-        session.file.contract += &format!(", colours {how}");
+        session.file.contract += &format!(", colors {how}");
         Ok(VitMatte { session, normal: normal.unwrap_or(IMAGENET), thirds })
     }
 
@@ -62,18 +62,14 @@ impl VitMatte {
         }
     }
 
-    /// Colours and trimap as the network takes them: `[1, 4, h, w]`, zeros right and below.
+    /// Colors and trimap as the network takes them: `[1, 4, h, w]`, zeros right and below.
     pub(super) fn pixels(&self, photo: &Photo, trimap: &Gray, padded: (usize, usize)) -> NetworkArray {
         let (w, h) = padded;
-        let plane = w * h;
-        let mut values = vec![0.0; 4 * plane];
         let width = photo.width as usize;
-        for (i, (colour, &t)) in photo.rgb.iter().zip(&trimap.values).enumerate() {
+        let mut values = self.normal.planes(&photo.rgb, width, padded, 4);
+        for (i, &t) in trimap.values.iter().enumerate() {
             let at = i / width * w + i % width;
-            for c in 0..3 {
-                values[c * plane + at] = self.normal.apply(colour[c], c);
-            }
-            values[3 * plane + at] = match t {
+            values[3 * w * h + at] = match t {
                 t if !self.thirds => f32::from(t) / 255.0,
                 // a trimap may come from anywhere
                 0..85 => 0.0,

@@ -43,7 +43,7 @@ pub enum Contract {
     },
     /// SAM's or MobileSAM's image encoder for the original decoder.
     OriginalEncoder {
-        /// Does it take the picture `[H,W,3]` in 0..255, and normalise and pad inside?
+        /// Does it take the picture `[H,W,3]` in 0..255, and normalize and pad inside?
         picture: bool,
     },
     /// The original SAM decoder export.
@@ -54,6 +54,7 @@ pub enum Contract {
 
 struct Form {
     contract: Contract,
+    role: Role,
     name: &'static str,
     /// Name ("" for any), numbers and extents (0 for any) of each input.
     inputs: &'static [(&'static str, i32, &'static [usize])],
@@ -67,25 +68,25 @@ const POINTS: (&str, i32, &[usize]) = ("input_points", F32, &[0, 0, 0, 2]);
 /// A file is the first of these whose inputs and outputs it has.
 #[rustfmt::skip]
 const FORMS: &[Form] = &[
-    Form { contract: Contract::VitMatte, name: "ViTMatte network",
+    Form { contract: Contract::VitMatte, role: Role::VitMatte, name: "ViTMatte network",
         inputs: &[("pixel_values", F32, &[0, 4, 0, 0])], outputs: &["alphas"] },
-    Form { contract: Contract::SamDecoder { labels: true }, name: "SAM decoder (split export)",
+    Form { contract: Contract::SamDecoder { labels: true }, role: Role::SamDecoder, name: "SAM decoder (split export)",
         inputs: &[POINTS, ("input_labels", I64, &[0, 0, 0]), EMBEDDING, POSITION],
         outputs: &["iou_scores", "pred_masks"] },
-    Form { contract: Contract::SamDecoder { labels: false }, name: "SAM decoder (split export, without labels)",
+    Form { contract: Contract::SamDecoder { labels: false }, role: Role::SamDecoder, name: "SAM decoder (split export, without labels)",
         inputs: &[POINTS, EMBEDDING, POSITION], outputs: &["iou_scores", "pred_masks"] },
-    Form { contract: Contract::OriginalDecoder, name: "SAM decoder (original form)",
+    Form { contract: Contract::OriginalDecoder, role: Role::SamDecoder, name: "SAM decoder (original form)",
         inputs: &[EMBEDDING, ("point_coords", F32, &[0, 0, 2]), ("point_labels", F32, &[0, 0]),
             ("mask_input", F32, &[0, 1, 0, 0]), ("has_mask_input", F32, &[1]), ("orig_im_size", F32, &[2])],
         outputs: &["iou_predictions", "low_res_masks"] },
-    Form { contract: Contract::SamEncoder, name: "SAM encoder (split export)",
+    Form { contract: Contract::SamEncoder, role: Role::Sam, name: "SAM encoder (split export)",
         inputs: &[("pixel_values", F32, &[0, 3, 0, 0])],
         outputs: &["image_embeddings", "image_positional_embeddings"] },
-    Form { contract: Contract::OriginalEncoder { picture: true },
+    Form { contract: Contract::OriginalEncoder { picture: true }, role: Role::Sam,
         name: "SAM encoder (original form, takes the picture)",
         inputs: &[("", F32, &[0, 0, 3])], outputs: &["image_embeddings"] },
-    Form { contract: Contract::OriginalEncoder { picture: false },
-        name: "SAM encoder (original form, takes normalised numbers)",
+    Form { contract: Contract::OriginalEncoder { picture: false }, role: Role::Sam,
+        name: "SAM encoder (original form, takes normalized numbers)",
         inputs: &[("", F32, &[1, 3, 0, 0])], outputs: &["image_embeddings"] },
 ];
 
@@ -96,11 +97,7 @@ impl Contract {
 
     /// What a network of this form can be named for.
     pub(super) fn role(self) -> Role {
-        match self {
-            Contract::SamEncoder | Contract::OriginalEncoder { .. } => Role::Sam,
-            Contract::SamDecoder { .. } | Contract::OriginalDecoder => Role::SamDecoder,
-            Contract::VitMatte => Role::VitMatte,
-        }
+        self.form().role
     }
 
     /// The outputs that are asked for, in order.
@@ -157,7 +154,7 @@ fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
 }
 
 /// The form of a file with these inputs and outputs, or why it is none.
-pub(super) fn recognise(inputs: &[Port], outputs: &[Port]) -> Result<Contract, String> {
+pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, String> {
     let mut near = None;
     let gives = |name: &&str| outputs.iter().any(|p| p.name == **name);
     for form in FORMS.iter().filter(|f| f.outputs.iter().all(gives)) {
@@ -207,31 +204,31 @@ mod tests {
         Port { name: name.into(), kind, dims: Some(dims) }
     }
 
-    fn recognised(inputs: Vec<Port>, outputs: &[&str]) -> Result<Contract, String> {
-        recognise(&inputs, &outputs.iter().map(|n| port(n, F32, &[])).collect::<Vec<_>>())
+    fn recognized(inputs: Vec<Port>, outputs: &[&str]) -> Result<Contract, String> {
+        recognize(&inputs, &outputs.iter().map(|n| port(n, F32, &[])).collect::<Vec<_>>())
     }
 
     #[test]
     fn both_original_encoders_are_told_by_their_axes() {
-        let of = |dims: &[usize]| recognised(vec![port("x", F32, dims)], &["image_embeddings"]);
+        let of = |dims: &[usize]| recognized(vec![port("x", F32, dims)], &["image_embeddings"]);
         assert_eq!(of(&[0, 0, 3]), Ok(Contract::OriginalEncoder { picture: true }));
         assert_eq!(of(&[1, 3, 1024, 1024]), Ok(Contract::OriginalEncoder { picture: false }));
         assert!(of(&[1, 4, 64, 64]).unwrap_err().contains("[1, 4, 64, 64]"));
         let two = vec![port("x", F32, &[0, 0, 3]), port("y", F32, &[0, 0, 3])];
-        assert!(recognised(two, &["image_embeddings"]).unwrap_err().contains("`y`"));
+        assert!(recognized(two, &["image_embeddings"]).unwrap_err().contains("`y`"));
     }
 
     #[test]
     fn half_precision_inputs_and_unknown_inputs_are_named() {
         let half = vec![port("pixel_values", 10, &[0, 4, 0, 0])];
-        assert!(recognised(half, &["alphas"]).unwrap_err().contains("float16"));
+        assert!(recognized(half, &["alphas"]).unwrap_err().contains("float16"));
         let more = vec![port("pixel_values", F32, &[0, 4, 0, 0]), port("style", F32, &[1])];
-        assert!(recognised(more, &["alphas"]).unwrap_err().contains("`style`"));
+        assert!(recognized(more, &["alphas"]).unwrap_err().contains("`style`"));
     }
 
     #[test]
     fn an_encoder_with_the_channels_of_vitmatte_is_neither() {
         let odd = vec![port("pixel_values", F32, &[0, 3, 0, 0])];
-        assert!(recognised(odd, &["alphas"]).unwrap_err().contains("expected [any, 4, any, any]"));
+        assert!(recognized(odd, &["alphas"]).unwrap_err().contains("expected [any, 4, any, any]"));
     }
 }

@@ -18,7 +18,7 @@ pub struct NetworkFile {
     pub bytes: u64,
     /// Its SHA-256 in hexadecimal.
     pub sha256: String,
-    /// What it was recognised as, and how it is fed.
+    /// What it was recognized as, and how it is fed.
     pub contract: String,
     /// What runs it; of the library, what it says of itself.
     pub engine: String,
