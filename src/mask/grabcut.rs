@@ -56,6 +56,24 @@ pub struct HardMask {
 ///
 /// # Errors
 /// When clicks lie outside, contradict each other or name no head, and when nothing of the clicked head is left.
+///
+/// # Examples
+///
+/// A bright square on a dark picture, from one click on it and one beside it:
+///
+/// ```
+/// use tiface::image::Photo;
+/// use tiface::mask::Click;
+/// use tiface::mask::grabcut::grabcut;
+///
+/// let inside = |i: u32| (16..48).contains(&(i % 64)) && (16..48).contains(&(i / 64));
+/// let rgb = (0..64 * 64).map(|i| if inside(i) { [200, 160, 140] } else { [15, 15, 20] }).collect();
+/// let photo = Photo { width: 64, height: 64, rgb, alpha: None };
+/// let clicks = [(32.0, 32.0, true), (4.0, 32.0, false)].map(|(x, y, head)| Click { x, y, head });
+/// let cut = grabcut("example", &photo, &clicks)?;
+/// assert!((0..64 * 64).all(|i| (cut.mask.values[i as usize] == 255) == inside(i)));
+/// # Ok::<(), tiface::Error>(())
+/// ```
 pub fn grabcut(view: &str, photo: &Photo, clicks: &[Click]) -> Result<HardMask> {
     cut_at(ROWS, view, photo, clicks)
 }

@@ -13,6 +13,7 @@ use super::click::Click;
 use crate::capture::{Capture, View};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
+use serde::Deserialize;
 use serde_json::{Number, Value, json};
 use std::path::{Component, Path};
 
@@ -103,33 +104,39 @@ fn shown(text: &str) -> String {
     plain.replace("\\'", "'").replace("\\\"", "\"") + cut
 }
 
-/// A JSON value of the wrong kind, for a message.
-fn kind(value: Option<&Value>, none: &str) -> String {
-    match value {
-        None => none.into(),
-        Some(Value::Array(_)) => "a list".into(),
-        Some(Value::Object(_)) => "an object".into(),
-        Some(Value::String(s)) => format!("the text `{}`", shown(s)),
-        Some(other) => other.to_string(),
-    }
-}
-
 /// What is wrong at a place of a file.
 fn wrong(file: &str, place: &str, problem: String, hint: &str) -> Error {
     Error::cannot(format!("`{file}`, {place}: {problem}"), hint)
 }
 
+/// The file as it is written; unknown keys are passed over.
+#[derive(Deserialize)]
+struct PromptsFile {
+    frames: Vec<PhotoEntry>,
+}
+
+#[derive(Deserialize)]
+struct PhotoEntry {
+    file_path: String,
+    points: Vec<PointEntry>,
+}
+
+#[derive(Deserialize)]
+struct PointEntry {
+    x: f64,
+    y: f64,
+    label: f64,
+}
+
 fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
     let file = path.to_string_lossy();
     let wrong = |place: &str, problem, hint: &str| wrong(&file, place, problem, hint);
-    let Some(frames) = value.get("frames") else {
-        let found =
-            if value.is_object() { "it has none".into() } else { format!("it is {}", kind(Some(value), "")) };
-        let problem = format!("expected an object with a list `frames`, but {found}");
-        return Err(wrong("at the top", problem, SHAPE));
-    };
-    let problem = || format!("expected a list, found {}", kind(Some(frames), ""));
-    let frames = frames.as_array().ok_or_else(|| wrong("`frames`", problem(), SHAPE))?;
+    if !value.is_object() {
+        return Err(wrong("at the top", "expected an object with a list `frames`".into(), SHAPE));
+    }
+    let PromptsFile { frames } = io::typed(value).map_err(|[key, found, expected]| {
+        wrong(&format!("`{key}`"), format!("it is {}, expected {expected}", shown(&found)), SHAPE)
+    })?;
     if frames.is_empty() {
         return Err(wrong("`frames`", "it is empty: nothing was clicked on".into(), SHAPE));
     }
@@ -139,48 +146,33 @@ fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
     }
     let mut prompts = Prompts::default();
     let mut seen = std::collections::HashMap::new();
-    for (i, entry) in frames.iter().enumerate() {
+    for (i, entry) in frames.into_iter().enumerate() {
         let place = format!("`frames[{i}]`");
-        let missing = |what: &str, key: &str| {
-            let problem = format!("expected {what} `{key}`, found {}", kind(entry.get(key), "nothing"));
-            wrong(&place, problem, SHAPE)
-        };
-        let name = entry.get("file_path").and_then(Value::as_str);
-        let name = name.ok_or_else(|| missing("a text", "file_path"))?;
-        let file_path = below(name).map_err(|why| {
-            let problem = format!("its `file_path` `{}` {why}", shown(name));
+        let file_path = below(&entry.file_path).map_err(|why| {
+            let problem = format!("its `file_path` `{}` {why}", shown(&entry.file_path));
             wrong(&place, problem, "name the photograph as the camera file does: `images/010.png`")
         })?;
         if let Some(first) = seen.insert(file_path.clone(), i) {
             let problem = format!("`{}` was clicked on in `frames[{first}]` already", shown(&file_path));
             return Err(wrong(&place, problem, "put all points of a photograph into one frame"));
         }
-        let points = entry.get("points").and_then(Value::as_array);
-        let points = points.ok_or_else(|| missing("a list", "points"))?;
-        if points.len() > MOST_POINTS {
-            let problem = format!("it has {} points, the limit is {MOST_POINTS}", points.len());
+        if entry.points.len() > MOST_POINTS {
+            let problem = format!("it has {} points, the limit is {MOST_POINTS}", entry.points.len());
             return Err(wrong(&place, problem, "a dozen clicks are enough"));
         }
-        let click = |(j, point): (usize, &Value)| -> Result<Click> {
+        let click = |(j, point): (usize, &PointEntry)| -> Result<Click> {
             let wrong = |key: &str, problem: String| {
                 let place = format!("`frames[{i}].points[{j}].{key}`");
                 wrong(&place, format!("it {problem}"), "correct that point, or remove it")
             };
-            let found = |key: &str| kind(point.get(key), "missing");
-            let number = |key: &str| {
-                let value = match point.get(key).and_then(Value::as_f64) {
-                    Some(v) => coordinate(v),
-                    None => Err(format!("is {}, not a number", found(key))),
-                };
-                value.map_err(|problem| wrong(key, problem))
-            };
-            let (x, y) = (number("x")?, number("y")?);
-            let label = point.get("label").and_then(Value::as_f64).filter(|l| [0.0, 1.0].contains(l));
-            let problem = || format!("is {}; known are 1 (head) and 0 (not head)", found("label"));
-            let label = label.ok_or_else(|| wrong("label", problem()))?;
-            Ok(Click { x, y, head: label == 1.0 })
+            let number = |key: &str, value: f64| coordinate(value).map_err(|problem| wrong(key, problem));
+            let (x, y) = (number("x", point.x)?, number("y", point.y)?);
+            match point.label {
+                0.0 | 1.0 => Ok(Click { x, y, head: point.label == 1.0 }),
+                other => Err(wrong("label", format!("is {other}; known are 1 (head) and 0 (not head)"))),
+            }
         };
-        let points = points.iter().enumerate().map(click).collect::<Result<_>>()?;
+        let points = entry.points.iter().enumerate().map(click).collect::<Result<_>>()?;
         prompts.frames.push(PhotoPrompts { file_path, points });
     }
     Ok(prompts)
@@ -385,16 +377,16 @@ mod tests {
     fn whatever_is_wrong_is_named_with_its_place() {
         let twice = format!("{{\"frames\": [{}, {}]}}", frame("a.png", POINT), frame("./a.png", POINT));
         let cases = [
-            ("[]".into(), "at the top", "it is a list"),
-            ("{\"frame\": []}".into(), "at the top", "it has none"),
-            ("{\"frames\": 3}".into(), "`frames`", "found 3"),
+            ("[]".into(), "at the top", "expected an object"),
+            ("{\"frame\": []}".into(), "`frames`", "missing"),
+            ("{\"frames\": 3}".into(), "`frames`", "is integer `3`"),
             ("{\"frames\": []}".into(), "`frames`", "is empty"),
-            ("{\"frames\": [7]}".into(), "`frames[0]`", "`file_path`, found nothing"),
-            ("{\"frames\": [{\"file_path\": 7}]}".into(), "`frames[0]`", "`file_path`, found 7"),
-            ("{\"frames\": [{\"file_path\": \"a\"}]}".into(), "`frames[0]`", "`points`, found nothing"),
-            (one("a", "{}"), "`frames[0]`", "`points`, found an object"),
-            (one("a", "[1]"), "`frames[0].points[0].x`", "missing"),
-            (one("a", r#"[{"x": "3", "y": 4, "label": 1}]"#), "points[0].x`", "the text `3`"),
+            ("{\"frames\": [7]}".into(), "`frames[0]`", "is integer `7`"),
+            ("{\"frames\": [{\"file_path\": 7}]}".into(), "`frames[0].file_path`", "is integer `7`"),
+            ("{\"frames\": [{\"file_path\": \"a\"}]}".into(), "`frames[0].points`", "missing"),
+            (one("a", "{}"), "`frames[0].points`", "is map"),
+            (one("a", "[1]"), "`frames[0].points[0]`", "is integer `1`"),
+            (one("a", r#"[{"x": "3", "y": 4, "label": 1}]"#), "points[0].x`", "is string \"3\""),
             (one("a", r#"[{"x": 3, "y": null, "label": 1}]"#), "points[0].y`", "null"),
             (one("a", r#"[{"x": 3, "y": 4}]"#), "points[0].label`", "missing"),
             (one("a", r#"[{"x": 3, "y": 4, "label": 2}]"#), "points[0].label`", "it is 2"),

@@ -7,12 +7,13 @@
 use super::annotation::evenly;
 use super::matting::trimap::{UNKNOWN, unknown_share};
 use super::scale::{reduce_photo, resize_gray, resize_hard, working_size};
-use crate::Result;
 use crate::capture::{coverage, findings};
 use crate::image::{Gray, Photo};
 use crate::io;
-use crate::report::{base64, escape};
-use std::fmt::Write;
+use crate::report::base64;
+use crate::{Error, ErrorKind, Result};
+use minijinja::{Environment, context};
+use serde::Serialize;
 use std::path::Path;
 
 const OUTLINE: [u8; 3] = [0, 230, 255];
@@ -21,24 +22,18 @@ const BAND: [u8; 3] = [255, 200, 0];
 const PICTURE_PX: u32 = 320;
 /// Pictures on a sheet at most, about 10 MB of them.
 const MOST: usize = 500;
-/// What stands before the grid on a page of its own.
-const HEAD: &str = "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
-    <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>Masks · tiface</title>\n\
-    <style>body{font:15px/1.5 system-ui,sans-serif;margin:1rem;background:#181818;color:#e1e1e1}</style>\
-    </head><body>\n";
-const FOOT: &str = "</body></html>\n";
+/// What encloses the sheet on a page of its own.
+const MARKS: [&str; 2] = ["<!-- sheet -->", "<!-- end of the sheet -->"];
 
 /// One view of a sheet.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SheetView {
     /// The view's name.
     pub name: String,
-    /// The photograph, reduced, with outline and band, as a JPEG file.
-    pub jpeg: Vec<u8>,
-    /// Share of the picture that is head, 0..=1.
-    pub coverage: f64,
-    /// Share that is unknown, where that is known.
-    pub unknown: Option<f64>,
+    /// The photograph, reduced, with outline and band: a `data:` address.
+    pub picture: String,
+    /// How much of the picture is head and, where that is known, unknown: in words.
+    pub shares: String,
     /// Why a person should look.
     pub suspicions: Vec<String>,
 }
@@ -47,12 +42,12 @@ impl SheetView {
     /// Draws the mask of a view over its photograph and says what makes the mask suspicious by itself; the mask and
     /// the trimap may have other sizes than the photograph.
     pub fn new(name: &str, photo: &Photo, alpha: &Gray, trimap: Option<&Gray>) -> Result<SheetView> {
-        let picture = overlaid(photo, alpha, trimap, PICTURE_PX);
+        let picture = io::jpeg_bytes(&overlaid(photo, alpha, trimap, PICTURE_PX), 85, Path::new(name))?;
+        let unknown = trimap.map(|t| format!(", unknown {:.1} %", 100.0 * unknown_share(t)));
         Ok(SheetView {
             name: name.into(),
-            jpeg: io::jpeg_bytes(&picture, 85, Path::new(name))?,
-            coverage: coverage(alpha),
-            unknown: trimap.map(unknown_share),
+            picture: format!("data:image/jpeg;base64,{}", base64(&picture)),
+            shares: format!("head {:.1} %{}", 100.0 * coverage(alpha), unknown.unwrap_or_default()),
             suspicions: findings(alpha).into_iter().map(String::from).collect(),
         })
     }
@@ -98,43 +93,21 @@ fn outline(picture: &mut Photo, mask: &Gray) {
     }
 }
 
-/// The sheet of these views, in their order, as a page of its own. When there are more than fit, suspicious ones
-/// and evenly spread others are shown, and a last line says so.
-pub fn sheet(views: &[SheetView]) -> String {
-    let mut out = String::from(HEAD);
-    out += "<style>.masks{display:flex;flex-wrap:wrap;gap:.5rem}.masks figure{margin:0;padding:4px;\
-            border:4px solid transparent;max-width:320px;font-size:.85rem;overflow-wrap:anywhere}\
-            .masks figure.odd{border-color:#ff463c}.masks .why{color:#ff463c}\
-            .masks img{display:block;height:auto;max-width:100%}</style>\n\
-            <p>The outline of each mask is cyan, unknown pixels are yellow; framed in red is what a person should look \
-            at.</p>\n<div class=\"masks\">\n";
+/// Returns the sheet of these views, in their order, as a page of its own. When there are more than fit, suspicious
+/// ones and evenly spread others are shown, and a last line says so.
+pub fn sheet(views: &[SheetView]) -> Result<String> {
     let shown = evenly(views.len(), MOST, |i| !views[i].suspicions.is_empty());
-    for view in shown.iter().map(|&i| &views[i]) {
-        let odd = if view.suspicions.is_empty() { "" } else { " class=\"odd\"" };
-        let (name, jpeg, covered) = (escape(&view.name), base64(&view.jpeg), 100.0 * view.coverage);
-        let _ = write!(
-            out,
-            "<figure{odd}><img alt=\"{name}\" src=\"data:image/jpeg;base64,{jpeg}\"><figcaption><b>{name}</b><br>\
-             head {covered:.1} %"
-        );
-        if let Some(unknown) = view.unknown {
-            let _ = write!(out, ", unknown {:.1} %", 100.0 * unknown);
-        }
-        for why in &view.suspicions {
-            let _ = write!(out, "<br><span class=\"why\">{}</span>", escape(why));
-        }
-        out += "</figcaption></figure>\n";
-    }
-    out += "</div>\n";
-    if shown.len() < views.len() {
-        let _ = writeln!(out, "<p>{} of {} views.</p>", shown.len(), views.len());
-    }
-    out + FOOT
+    let shown: Vec<&SheetView> = shown.into_iter().map(|i| &views[i]).collect();
+    let mut pages = Environment::new();
+    pages.set_trim_blocks(true);
+    let page = pages.template_from_named_str("sheet.html", include_str!("sheet.html"));
+    let page = page.and_then(|page| page.render(context! { views => shown, total => views.len() }));
+    page.map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
 /// What a [`sheet`] shows, without the page around it: for a page with more.
 pub fn part(sheet: &str) -> Option<&str> {
-    sheet.strip_prefix(HEAD)?.strip_suffix(FOOT)
+    Some(sheet.split_once(MARKS[0])?.1.split_once(MARKS[1])?.0)
 }
 
 #[cfg(test)]
@@ -165,8 +138,7 @@ mod tests {
         assert_eq!(count(&picture, [40; 3]), 40 + 40 + 20);
         let view = SheetView::new("a", &photo(60, 80), &bust(), None).unwrap();
         // 800 of 4800 pixels
-        assert!((view.coverage - 1.0 / 6.0).abs() < 1e-12 && view.suspicions.is_empty());
-        assert!(view.unknown.is_none());
+        assert_eq!((view.shares.as_str(), view.suspicions.len()), ("head 16.7 %", 0));
     }
 
     #[test]
@@ -182,7 +154,7 @@ mod tests {
             // columns 20 to 39 but the rim at 30 and the dark one at 29: 100 + 0.4 (255 − 100) = 162
             assert_eq!(count(&picture, [162, 140, 60]), 18 * 80, "{scale}");
             let view = SheetView::new("a", &photo(60, 80), &alpha, Some(&trimap)).unwrap();
-            assert!((view.unknown.unwrap() - 1.0 / 3.0).abs() < 1e-9);
+            assert_eq!(view.shares, "head 50.0 %, unknown 33.3 %");
         }
     }
 
@@ -192,14 +164,14 @@ mod tests {
         let mut odd = SheetView::new("<b>\"&", &photo(60, 80), &gray(60, 80, |_, _| 255), None).unwrap();
         odd.suspicions.push("disagrees".into());
         assert_eq!(odd.suspicions, ["is white everywhere", "disagrees"]);
-        let page = sheet(&[fine.clone(), odd]);
+        let page = sheet(&[fine.clone(), odd]).unwrap();
         assert_eq!(page.matches("<figure").count(), 2);
         assert_eq!(page.matches("<figure class=\"odd\">").count(), 1);
         assert!(page.contains("<b>&lt;b&gt;&quot;&amp;</b>") && !page.contains("<b><b>"), "{page}");
         assert!(
             page.contains("is white everywhere") && page.contains("head 16.7 %") && !page.contains("http")
         );
-        assert_eq!(sheet(&[fine]).matches("class=\"odd\"").count(), 0);
+        assert_eq!(sheet(&[fine]).unwrap().matches("class=\"odd\"").count(), 0);
     }
 
     #[test]
@@ -207,15 +179,15 @@ mod tests {
         let mut views = vec![SheetView::new("a", &photo(6, 8), &bust(), None).unwrap(); MOST + 100];
         views.iter_mut().for_each(|t| t.suspicions.clear());
         views[MOST + 99].suspicions.push("odd".into());
-        let page = sheet(&views);
+        let page = sheet(&views).unwrap();
         assert_eq!(page.matches("<figure").count(), MOST);
         assert!(page.contains("class=\"odd\"") && page.contains("<p>500 of 600 views.</p>"));
-        assert!(!sheet(&[]).contains("<figure"));
+        assert!(!sheet(&[]).unwrap().contains("<figure"));
     }
 
     #[test]
     fn a_part_of_a_sheet_has_its_pictures_and_no_page_around_them() {
-        let page = sheet(&[SheetView::new("a", &photo(60, 80), &bust(), None).unwrap()]);
+        let page = sheet(&[SheetView::new("a", &photo(60, 80), &bust(), None).unwrap()]).unwrap();
         let part = part(&page).unwrap();
         assert!(part.contains("<figure>") && !part.contains("<html") && !part.contains("</body>"));
         assert_eq!(super::part("another page"), None);

@@ -69,7 +69,7 @@ pub(super) fn mask(
     }
     let views: Vec<SheetView> = views.into_iter().map(|(_, view)| view).collect();
     if !views.is_empty() {
-        io::write_atomic(&dir.folder().join(SHEET), sheet(&views).as_bytes())?;
+        io::write_atomic(&dir.folder().join(SHEET), sheet(&views)?.as_bytes())?;
     }
     let suspicious = views.iter().filter(|v| !v.suspicions.is_empty()).map(|v| &v.name);
     let suspicious: Vec<&String> = suspicious.collect();

@@ -22,7 +22,7 @@ pub(super) use self::ort::Runtime;
 pub use self::seam::NetworkFile;
 pub(super) use self::seam::{NetworkArray, file_error};
 
-use self::contract::Port;
+use self::contract::{Port, in_words};
 use self::seam::{guarded, one_line};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
@@ -141,6 +141,17 @@ impl NetworkSession {
             }
         }
         Ok(given)
+    }
+
+    /// Checks the extents of an output, `None` where any will do.
+    pub(super) fn expect(&self, output: usize, found: &NetworkArray, dims: &[Option<usize>]) -> Result<()> {
+        let fits =
+            |(found, expected): (&usize, &Option<usize>)| *found > 0 && expected.is_none_or(|e| e == *found);
+        if found.shape.len() == dims.len() && found.shape.iter().zip(dims).all(fits) {
+            return Ok(());
+        }
+        let problem = format!("it is {:?}, expected {}", found.shape, in_words(dims.iter().copied()));
+        Err(self.unusable(self.contract.outputs()[output], problem))
     }
 
     /// The output is not as its form promises.

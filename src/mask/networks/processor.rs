@@ -6,6 +6,8 @@
 use super::onnx::file_error;
 use crate::Result;
 use crate::io::{self, Limits};
+use serde::Deserialize;
+use serde_json::Value;
 use std::path::Path;
 
 /// Mean and standard deviation of ImageNet's colors in 0..1: what SAM and ViTMatte were trained with.
@@ -51,6 +53,19 @@ pub(super) struct Processor {
     pub side: Option<usize>,
 }
 
+/// The file; sizes have many forms, of which two are read.
+#[derive(Default, Deserialize)]
+#[serde(default)]
+struct ProcessorFile {
+    image_processor_type: Option<String>,
+    feature_extractor_type: Option<String>,
+    processor_class: Option<String>,
+    image_mean: Option<[f64; 3]>,
+    image_std: Option<[f64; 3]>,
+    pad_size: Value,
+    size: Value,
+}
+
 /// The processor file of the network at `network`, unless there is none or it is of another network than
 /// `kind` ("sam", "vitmatte").
 pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>> {
@@ -61,40 +76,32 @@ pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>> {
         places.extend(folder.parent().map(|above| above.join(NAME)));
     }
     let Some(path) = places.into_iter().find(|p| io::is_file(p)) else { return Ok(None) };
-    let json = io::read_json(&path, &Limits { json_bytes: 1 << 20, ..Limits::default() })?;
-    let says = ["image_processor_type", "feature_extractor_type", "processor_class"]
-        .into_iter()
-        .filter_map(|key| json[key].as_str())
-        .map(str::to_lowercase)
-        .collect::<Vec<_>>();
-    if !says.is_empty() && !says.iter().any(|s| s.starts_with(kind)) {
-        return Ok(None);
-    }
     let wrong = |problem: String| {
         let hint = "take the processor file of the same export, or remove it: then the network's published numbers hold";
         file_error(&path, &format!("is unusable: {problem}"), hint)
     };
-    let three = |key: &str, usual: [f64; 3], sound: fn(f64) -> bool| -> Result<[f64; 3]> {
-        let value = &json[key];
-        if value.is_null() {
-            return Ok(usual);
+    let json = io::read_json(&path, &Limits { json_bytes: 1 << 20, ..Limits::default() })?;
+    let file: ProcessorFile = io::typed(&json)
+        .map_err(|[key, found, expected]| wrong(format!("`{key}` is {found}, expected {expected}")))?;
+    let types = [file.image_processor_type, file.feature_extractor_type, file.processor_class];
+    let mut types = types.into_iter().flatten().map(|name| name.to_lowercase()).peekable();
+    if types.peek().is_some() && !types.any(|name| name.starts_with(kind)) {
+        return Ok(None);
+    }
+    let three = |key: &str, numbers: Option<[f64; 3]>, usual: [f64; 3], least: f64| {
+        let numbers = numbers.unwrap_or(usual);
+        match numbers.iter().all(|v| (least..=1.0).contains(v)) {
+            true => Ok(numbers),
+            false => Err(wrong(format!("`{key}` is {numbers:?}, expected three numbers of colors in 0..1"))),
         }
-        let numbers: Vec<f64> =
-            value.as_array().into_iter().flatten().filter_map(serde_json::Value::as_f64).collect();
-        <[f64; 3]>::try_from(numbers)
-            .ok()
-            .filter(|n| n.iter().all(|&v| sound(v)) && value.as_array().is_some_and(|a| a.len() == 3))
-            .ok_or_else(|| wrong(format!("`{key}` is {value}, expected three numbers of colors in 0..1")))
     };
-    let mean = three("image_mean", IMAGENET.mean, |v| (0.0..=1.0).contains(&v))?;
-    let std = three("image_std", IMAGENET.std, |v| (1e-3..=1.0).contains(&v))?;
-    let side = match json["pad_size"]["height"].as_u64().or(json["size"]["longest_edge"].as_u64()) {
-        None => None,
-        Some(side) if kind == "sam" && (side % 16 != 0 || !(64..=4096).contains(&side)) => {
-            return Err(wrong(format!("the side is {side}, expected a multiple of 16 from 64 to 4096")));
-        }
-        Some(side) => usize::try_from(side).ok(),
-    };
+    let mean = three("image_mean", file.image_mean, IMAGENET.mean, 0.0)?;
+    let std = three("image_std", file.image_std, IMAGENET.std, 1e-3)?;
+    let side = file.pad_size["height"].as_u64().or(file.size["longest_edge"].as_u64());
+    if let Some(side) = side.filter(|side| kind == "sam" && (side % 16 != 0 || !(64..=4096).contains(side))) {
+        return Err(wrong(format!("the side is {side}, expected a multiple of 16 from 64 to 4096")));
+    }
+    let side = side.and_then(|side| usize::try_from(side).ok());
     Ok(Some(Processor { normal: Normal { mean, std }, side }))
 }
 

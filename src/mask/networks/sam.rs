@@ -121,18 +121,10 @@ impl Sam {
     pub(super) fn embed(&self, photo: &Photo) -> Result<Embedding> {
         let old = (photo.width as usize, photo.height as usize);
         let pixels = self.pixels(photo);
-        let names = self.encoder.contract.outputs();
         let arrays = self.encoder.run(&[(&self.encoder.inputs[0].name, pixels)])?;
-        let cells = self.side / CELL;
-        let depth = self.decoder.input_extent(EMBEDDING, 1);
-        for (name, array) in names.iter().zip(&arrays) {
-            let fits = matches!(array.shape[..], [1, d, r, c]
-                if d > 0 && r == cells && c == cells && depth.is_none_or(|depth| depth == d));
-            if !fits {
-                let depth = depth.map_or("any".into(), |d| d.to_string());
-                let problem = format!("it is {:?}, expected [1, {depth}, {cells}, {cells}]", array.shape);
-                return Err(self.encoder.unusable(name, problem));
-            }
+        let (cells, depth) = (Some(self.side / CELL), self.decoder.input_extent(EMBEDDING, 1));
+        for (i, array) in arrays.iter().enumerate() {
+            self.encoder.expect(i, array, &[Some(1), depth, cells, cells])?;
         }
         Ok(Embedding { arrays, new: self.fitted(old.0, old.1), old })
     }
@@ -181,23 +173,18 @@ impl Sam {
     /// Runs the decoder.
     pub(super) fn decode(&self, embedding: &Embedding, clicks: &[Click]) -> Result<Candidates> {
         self.check(clicks, embedding.old)?;
-        let names = self.decoder.contract.outputs();
         let given = self.decoder.run(&self.prompt(embedding, clicks))?;
         let [scores, logits] = <[NetworkArray; 2]>::try_from(given)
-            .map_err(|_| self.decoder.unusable(names[0], "the engine left it out"))?;
-        let quarter = self.side / 4;
+            .map_err(|_| self.decoder.unusable("masks", "the engine left outputs out"))?;
         let split = matches!(self.decoder.contract, Contract::SamDecoder { .. });
-        let lead: &[usize] = if split { &[1, 1] } else { &[1] };
-        let n = scores.shape.last().copied().unwrap_or(0);
-        if n == 0 || scores.shape[..scores.shape.len() - 1] != *lead {
-            let problem = format!("it is {:?}, expected {lead:?} and a number for each mask", scores.shape);
-            return Err(self.decoder.unusable(names[0], problem));
-        }
-        let expected: Vec<usize> = lead.iter().copied().chain([n, quarter, quarter]).collect();
-        if logits.shape != expected {
-            let problem = format!("it is {:?}, expected {expected:?}", logits.shape);
-            return Err(self.decoder.unusable(names[1], problem));
-        }
+        let lead = if split { vec![Some(1); 2] } else { vec![Some(1)] };
+        let quarter = Some(self.side / 4);
+        self.decoder.expect(0, &scores, &[&lead[..], &[None]].concat())?;
+        self.decoder.expect(
+            1,
+            &logits,
+            &[&lead[..], &[Some(scores.values.len()), quarter, quarter]].concat(),
+        )?;
         let best =
             if split { highest(&scores.values, 0) } else { best_of_original(&scores.values, clicks.len()) };
         Ok(Candidates { scores: scores.values, logits: logits.values, best })

@@ -87,10 +87,7 @@ impl VitMatte {
         let pixels = self.pixels(photo, trimap, (w, h));
         let given = self.session.run(&[("pixel_values", pixels)])?;
         let alphas = &given[0];
-        if alphas.shape != [1, 1, h, w] {
-            let problem = format!("it is {:?}, expected [1, 1, {h}, {w}]", alphas.shape);
-            return Err(self.session.unusable("alphas", problem));
-        }
+        self.session.expect(0, alphas, &[Some(1), Some(1), Some(h), Some(w)])?;
         if let Some(v) = alphas.values.iter().find(|v| !(-0.01..=1.01).contains(*v)) {
             return Err(self.session.unusable("alphas", format!("it holds {v}, expected 0 to 1")));
         }

@@ -148,7 +148,8 @@ impl Port {
     }
 }
 
-fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
+/// `[1, 3, any, any]`.
+pub(super) fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
     let each: Vec<String> = dims.map(|d| d.map_or("any".into(), |d| d.to_string())).collect();
     format!("[{}]", each.join(", "))
 }
