@@ -1,4 +1,6 @@
-//! One click of a person on a photograph.
+//! One click of a person on a photograph, and what must hold of all clicks on one.
+
+use crate::{Error, Result};
 
 /// One click of a person on a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,14 +21,84 @@ impl Click {
     }
 }
 
+/// Checks the clicks on a photograph of `width` × `height` pixels, before anything is computed; `subject` is
+/// what messages call it.
+pub(super) fn check(subject: &str, clicks: &[Click], width: u32, height: u32) -> Result<()> {
+    if clicks.is_empty() {
+        return Err(no_clicks(subject));
+    }
+    // a pixel index of 0 is the pixel's center, so the picture reaches half a pixel farther
+    let inside = |v: f32, size: u32| v >= -0.5 && v <= size as f32 - 0.5;
+    if let Some(i) = clicks.iter().position(|c| !(inside(c.x, width) && inside(c.y, height))) {
+        let (n, Click { x, y, .. }) = (i + 1, clicks[i]);
+        return Err(Error::cannot(
+            format!(
+                "{subject}: click {n} at ({x}, {y}) is outside the photograph of {width} × {height} pixels"
+            ),
+            "coordinates are pixels of the photograph as stored, x right and y down from the top left; were the \
+             clicks made on a photograph of another size?",
+        ));
+    }
+    if clicks.iter().all(|c| !c.head) {
+        let n = clicks.len();
+        return Err(Error::cannot(
+            format!("{subject}: all {n} clicks are on the background, none is on the head"),
+            "add clicks on the face, the hair and the garment: label 1 is the head, 0 the background",
+        ));
+    }
+    let pixel = |c: &Click| (c.x.round().max(0.0) as u32, c.y.round().max(0.0) as u32);
+    for (i, a) in clicks.iter().enumerate() {
+        let contradicts = |b: &Click| a.head != b.head && pixel(a) == pixel(b);
+        if let Some(j) = clicks.iter().skip(i + 1).position(contradicts) {
+            let (first, second, (x, y)) = (i + 1, i + j + 2, pixel(a));
+            return Err(Error::cannot(
+                format!(
+                    "{subject}: clicks {first} and {second} call the same pixel ({x}, {y}) head and background"
+                ),
+                "remove the wrong one of the two clicks",
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// The error for a photograph without clicks.
+pub(super) fn no_clicks(subject: &str) -> Error {
+    Error::cannot(
+        format!("{subject} has no clicks"),
+        "click the face, the hair and each part of the garment (label 1), and twice the background (label 0)",
+    )
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn click(x: f32, y: f32, head: bool) -> Click {
+        Click { x, y, head }
+    }
 
     #[test]
     fn clicks_keep_their_place() {
         // the first of four pixels has its center at 1/8 of the width, which is a quarter into the first of two
         let moved = Click { x: 0.0, y: 3.0, head: true }.moved((4, 4), (2, 2));
         assert_eq!((moved.x, moved.y), (-0.25, 1.25));
+    }
+
+    #[test]
+    fn clicks_that_cannot_be_used_are_named() {
+        let check = |clicks: &[Click]| check("view `007`", clicks, 40, 30);
+        assert_eq!(check(&[click(39.4, 29.4, true), click(-0.4, 0.0, false)]), Ok(()));
+        let refused = |clicks: &[Click], message: &str| {
+            let e = check(clicks).unwrap_err();
+            assert!(e.to_string().contains(message) && !e.hint().is_empty(), "{e}");
+        };
+        refused(&[], "view `007` has no clicks");
+        refused(&[click(1.0, 1.0, false)], "view `007`: all 1 clicks are on the background");
+        for (x, y) in [(40.0, 3.0), (3.0, 30.0), (-1.0, 3.0), (f32::NAN, 3.0), (f32::INFINITY, 3.0)] {
+            refused(&[click(1.0, 1.0, true), click(x, y, false)], "click 2 at");
+        }
+        let clicks = [click(4.2, 5.0, true), click(9.0, 9.0, true), click(4.0, 5.3, false)];
+        refused(&clicks, "clicks 1 and 3 call the same pixel (4, 5)");
     }
 }

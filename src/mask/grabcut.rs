@@ -16,7 +16,7 @@ pub(super) mod seeds;
 use self::maxflow::PixelGraph;
 use self::mixture::{Mixture, Rgb};
 use self::seeds::Seed;
-use super::click::Click;
+use super::click::{self, Click};
 use super::components::{fill_holes, gray, keep_pieces, open};
 use super::scale::reduce_to_rows;
 use crate::image::{Gray, Photo};
@@ -79,7 +79,8 @@ pub fn grabcut(view: &str, photo: &Photo, clicks: &[Click]) -> Result<HardMask> 
 }
 
 fn cut_at(rows: u32, view: &str, photo: &Photo, clicks: &[Click]) -> Result<HardMask> {
-    seeds::check(view, clicks, photo.width, photo.height)?;
+    seeds::check_size(view, photo.width, photo.height)?;
+    click::check(&format!("view `{view}`"), clicks, photo.width, photo.height)?;
     let small = reduce_to_rows(photo, rows);
     let (grabcut, mut warnings) =
         Grabcut::new(view, small, (photo.width, photo.height), clicks, seeds::BORDER_MARGIN);

@@ -9,7 +9,7 @@
 //!
 //! The hull is an outer bound: it excludes and never includes, but for its core.
 
-use super::click::Click;
+use super::click::{self, Click};
 use super::components::gray;
 use super::distance::{grow, shrink};
 use super::grabcut::mixture::Rgb;
@@ -90,7 +90,7 @@ where
 {
     let clicked: Vec<usize> = (0..views.len()).filter(|&i| !views[i].clicks.is_empty()).collect();
     if clicked.is_empty() {
-        return Err(seeds::no_clicks(views.first().map_or("", |v| v.name)));
+        return Err(click::no_clicks(&format!("view `{}`", views.first().map_or("", |v| v.name))));
     }
     if !clicked.iter().any(|&i| views[i].votes) {
         let names: Vec<&str> = clicked.iter().map(|&i| views[i].name).collect();
@@ -104,7 +104,7 @@ where
     }
     for &i in &clicked {
         let v = &views[i];
-        seeds::check(v.name, v.clicks, v.camera.width, v.camera.height)?;
+        click::check(&format!("view `{}`", v.name), v.clicks, v.camera.width, v.camera.height)?;
     }
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
     let cube = hull::cube(&cameras, cells, CUBE)?;

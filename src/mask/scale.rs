@@ -39,34 +39,23 @@ fn shares(from: u32, to: u32) -> Vec<Share> {
         .collect()
 }
 
-/// What bytes stand for while they are averaged.
-#[derive(Clone, Copy, PartialEq)]
-enum Scale {
-    /// Themselves: coded colors, masks.
-    Coded,
-    /// Linear light, as a coarser sensor would have seen it.
-    Light,
+/// What bytes stand for while they are averaged, and back.
+struct Coding {
+    value: fn(u8) -> f32,
+    byte: fn(f32) -> u8,
 }
 
-impl Scale {
-    fn value(self, byte: u8) -> f32 {
-        match self {
-            Scale::Coded => byte as f32,
-            Scale::Light => linear_from_srgb(byte as f32 / 255.0),
-        }
-    }
-
-    fn byte(self, value: f32) -> u8 {
-        match self {
-            Scale::Coded => (value + 0.5) as u8,
-            Scale::Light => quantise(srgb_from_linear(value)),
-        }
-    }
-}
+/// Themselves: coded colors, masks.
+const CODED: Coding = Coding { value: |byte| byte as f32, byte: |value| (value + 0.5) as u8 };
+/// Linear light, as a coarser sensor would have seen it.
+const LIGHT: Coding = Coding {
+    value: |byte| linear_from_srgb(byte as f32 / 255.0),
+    byte: |value| quantise(srgb_from_linear(value)),
+};
 
 /// `channels` interleaved bytes a pixel, averaged. Rows are computed apart, each in a fixed order.
-fn average(bytes: &[u8], channels: usize, from: (u32, u32), to: (u32, u32), scale: Scale) -> Vec<u8> {
-    let values: Vec<f32> = (0..=255).map(|b| scale.value(b)).collect();
+fn average(bytes: &[u8], channels: usize, from: (u32, u32), to: (u32, u32), coding: Coding) -> Vec<u8> {
+    let values: Vec<f32> = (0..=255).map(coding.value).collect();
     assert!(to.0 >= 1 && to.1 >= 1 && to.0 <= from.0 && to.1 <= from.1, "only smaller pictures are made");
     let (across, down) = (shares(from.0, to.0), shares(from.1, to.1));
     let stride = from.0 as usize * channels;
@@ -83,7 +72,7 @@ fn average(bytes: &[u8], channels: usize, from: (u32, u32), to: (u32, u32), scal
                 for (c, value) in pixel.iter_mut().enumerate() {
                     let part = share.weights.iter().enumerate();
                     let sum: f32 = part.map(|(k, w)| w * column[(share.first + k) * channels + c]).sum();
-                    *value = scale.byte(sum);
+                    *value = (coding.byte)(sum);
                 }
             }
         },
@@ -97,9 +86,9 @@ pub fn reduce_photo(photo: &Photo, size: (u32, u32)) -> Photo {
     if size == from {
         return photo.clone();
     }
-    let bytes = average(photo.rgb.as_flattened(), 3, from, size, Scale::Coded);
+    let bytes = average(photo.rgb.as_flattened(), 3, from, size, CODED);
     let rgb = bytes.as_chunks::<3>().0.to_vec();
-    let alpha = photo.alpha.as_ref().map(|a| average(a, 1, from, size, Scale::Coded));
+    let alpha = photo.alpha.as_ref().map(|a| average(a, 1, from, size, CODED));
     Photo { width: size.0, height: size.1, rgb, alpha }
 }
 
@@ -112,7 +101,7 @@ pub fn reduce_to_rows(photo: &Photo, rows: u32) -> Photo {
     }
     let width = (photo.width as f64 * rows as f64 / photo.height as f64).round() as u32;
     let size = (width.max(1), rows);
-    let bytes = average(photo.rgb.as_flattened(), 3, from, size, Scale::Light);
+    let bytes = average(photo.rgb.as_flattened(), 3, from, size, LIGHT);
     Photo { width: size.0, height: size.1, rgb: bytes.as_chunks::<3>().0.to_vec(), alpha: None }
 }
 
@@ -123,11 +112,7 @@ pub fn resize_gray(gray: &Gray, size: (u32, u32)) -> Gray {
         return gray.clone();
     }
     if from.0 >= size.0 && from.1 >= size.1 {
-        return Gray {
-            width: size.0,
-            height: size.1,
-            values: average(&gray.values, 1, from, size, Scale::Coded),
-        };
+        return Gray { width: size.0, height: size.1, values: average(&gray.values, 1, from, size, CODED) };
     }
     let values: Vec<f32> = gray.values.iter().map(|&v| v as f32 / 255.0).collect();
     enlarge(&values, from, size, 0.0, 1.0)

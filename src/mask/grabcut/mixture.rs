@@ -63,15 +63,9 @@ impl Mixture {
         for _ in 0..10 {
             let mut sums = vec![[0.0; 4]; centers.len()];
             for (m, c) in member.iter_mut().zip(colors) {
-                let mut best = (f64::INFINITY, 0);
-                for (k, center) in centers.iter().enumerate() {
-                    let d = square_distance(c, center);
-                    if d < best.0 {
-                        best = (d, k);
-                    }
-                }
-                *m = best.1 as u8;
-                let s = &mut sums[best.1];
+                let best = first_largest(centers.iter().map(|center| -square_distance(c, center)));
+                *m = best as u8;
+                let s = &mut sums[best];
                 for a in 0..3 {
                     s[a] += c[a] as f64;
                 }
@@ -108,14 +102,7 @@ impl Mixture {
     }
 
     fn likeliest(&self, color: &Rgb) -> usize {
-        let mut best = (f64::NEG_INFINITY, 0);
-        for (k, g) in self.gaussians.iter().enumerate() {
-            let l = g.log_density(color);
-            if l > best.0 {
-                best = (l, k);
-            }
-        }
-        best.1
+        first_largest(self.gaussians.iter().map(|g| g.log_density(color)))
     }
 
     /// `ln p(color)`, per cubic step of 8 bit; always finite.
@@ -162,6 +149,17 @@ impl Gaussian {
         let square = x * (xx * x + 2.0 * (xy * y + xz * z)) + y * (yy * y + 2.0 * yz * z) + z * zz * z;
         self.offset - 0.5 * square
     }
+}
+
+/// Which value is the largest, of equals the first.
+fn first_largest(values: impl Iterator<Item = f64>) -> usize {
+    let mut best = (f64::NEG_INFINITY, 0);
+    for (k, value) in values.enumerate() {
+        if value > best.0 {
+            best = (value, k);
+        }
+    }
+    best.1
 }
 
 fn square_distance(color: &Rgb, center: &[f64; 3]) -> f64 {

@@ -89,7 +89,7 @@ impl NetworkSession {
                  own script",
             )
         })?;
-        let (key, named) = role.words();
+        let Role(key, named) = role;
         if contract.role() != role {
             let hint = format!("give the file where a {contract} is asked for");
             return Err(file_error(path, &format!("is a {contract}, but was given as {named}"), hint));

@@ -12,7 +12,7 @@
 use super::onnx::{Contract, Engines, NetworkArray, NetworkSession, Role, file_error};
 use super::processor::{self, IMAGENET, Normal};
 use crate::image::{Gray, Photo};
-use crate::mask::click::Click;
+use crate::mask::click::{self, Click};
 use crate::mask::scale::bilinear;
 use crate::{Error, Result};
 use image::RgbImage;
@@ -59,8 +59,8 @@ pub(super) struct Candidates {
 
 impl Sam {
     pub(super) fn open(encoder: &Path, decoder: &Path, engines: &Engines) -> Result<Sam> {
-        let mut encoder = NetworkSession::open(Role::Sam, encoder, engines)?;
-        let mut decoder = NetworkSession::open(Role::SamDecoder, decoder, engines)?;
+        let mut encoder = NetworkSession::open(Role::SAM, encoder, engines)?;
+        let mut decoder = NetworkSession::open(Role::SAM_DECODER, decoder, engines)?;
         let mismatch = |problem: String| {
             let problem = format!("does not fit to `{}`: {problem}", decoder.file.path.display());
             Err(file_error(&encoder.file.path, &problem, "take encoder and decoder from the same export"))
@@ -210,35 +210,22 @@ impl Sam {
     }
 
     fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<()> {
-        let fault = |problem: String, hint: &str| {
-            Err(Error::cannot(format!("the clicks cannot be used: {problem}"), hint))
-        };
-        if !clicks.iter().any(|c| c.head) {
-            return fault("none of them is on the head".into(), "click at least the face and the hair");
-        }
+        click::check("the photograph", clicks, width as u32, height as u32)?;
         if clicks.len() > MAX_CLICKS {
-            let hint = format!("keep the {MAX_CLICKS} that matter most");
-            return fault(format!("there are {} on one photograph", clicks.len()), &hint);
+            return Err(Error::cannot(
+                format!("the photograph has {} clicks, the limit is {MAX_CLICKS}", clicks.len()),
+                format!("keep the {MAX_CLICKS} that matter most"),
+            ));
         }
-        let inside = |v: f32, end: usize| v >= -0.5 && f64::from(v) <= end as f64 - 0.5;
-        if let Some(i) = clicks.iter().position(|c| !inside(c.x, width) || !inside(c.y, height)) {
-            let c = clicks[i];
-            let at = format!("number {} at ({}, {})", i + 1, c.x, c.y);
-            return fault(
-                format!("{at} lies outside the photograph of {width} × {height} pixels"),
-                "clicks are pixels of this photograph, 0 at its left and upper edge",
-            );
-        }
-        if self.decoder.contract == (Contract::SamDecoder { labels: false })
-            && let Some(i) = clicks.iter().position(|c| !c.head)
-        {
-            let file = self.decoder.file.path.display();
-            return fault(
-                format!("number {} is on the background, but `{file}` takes no labels", i + 1),
+        let behind = clicks.iter().position(|c| !c.head);
+        match behind.filter(|_| self.decoder.contract == (Contract::SamDecoder { labels: false })) {
+            None => Ok(()),
+            Some(i) => Err(file_error(
+                &self.decoder.file.path,
+                &format!("takes no labels, but click {} is on the background", i + 1),
                 "use a decoder with `input_labels`, or leave the clicks on the background out",
-            );
+            )),
         }
-        Ok(())
     }
 }
 

@@ -30,7 +30,7 @@ pub(super) struct VitMatte {
 impl VitMatte {
     /// Opens the file; `colors` may override what lies beside it.
     pub(super) fn open(path: &Path, engines: &Engines, colors: VitmatteColors) -> Result<VitMatte> {
-        let mut session = NetworkSession::open(Role::VitMatte, path, engines)?;
+        let mut session = NetworkSession::open(Role::VITMATTE, path, engines)?;
         let half = Normal { mean: [0.5; 3], std: [0.5; 3] };
         let normal = match colors {
             VitmatteColors::Imagenet => None,

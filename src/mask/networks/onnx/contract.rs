@@ -9,26 +9,14 @@ const F32: i32 = 1;
 /// ONNX's number for 64-bit integers.
 pub(super) const I64: i32 = 7;
 
-/// What a file is named for.
+/// What a file is named for: the setting that names it, and the words for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::mask::networks) enum Role {
-    /// SAM's image encoder.
-    Sam,
-    /// SAM's prompt encoder and mask decoder.
-    SamDecoder,
-    /// ViTMatte.
-    VitMatte,
-}
+pub(in crate::mask::networks) struct Role(pub(super) &'static str, pub(super) &'static str);
 
 impl Role {
-    /// The setting that names the file, and the words for it.
-    pub(super) fn words(self) -> (&'static str, &'static str) {
-        match self {
-            Role::Sam => ("sam", "the SAM encoder"),
-            Role::SamDecoder => ("sam_decoder", "the SAM decoder"),
-            Role::VitMatte => ("vitmatte", "the ViTMatte network"),
-        }
-    }
+    pub const SAM: Role = Role("sam", "the SAM encoder");
+    pub const SAM_DECODER: Role = Role("sam_decoder", "the SAM decoder");
+    pub const VITMATTE: Role = Role("vitmatte", "the ViTMatte network");
 }
 
 /// The form of a network: how it is fed and what it answers.
@@ -68,24 +56,24 @@ const POINTS: (&str, i32, &[usize]) = ("input_points", F32, &[0, 0, 0, 2]);
 /// A file is the first of these whose inputs and outputs it has.
 #[rustfmt::skip]
 const FORMS: &[Form] = &[
-    Form { contract: Contract::VitMatte, role: Role::VitMatte, name: "ViTMatte network",
+    Form { contract: Contract::VitMatte, role: Role::VITMATTE, name: "ViTMatte network",
         inputs: &[("pixel_values", F32, &[0, 4, 0, 0])], outputs: &["alphas"] },
-    Form { contract: Contract::SamDecoder { labels: true }, role: Role::SamDecoder, name: "SAM decoder (split export)",
+    Form { contract: Contract::SamDecoder { labels: true }, role: Role::SAM_DECODER, name: "SAM decoder (split export)",
         inputs: &[POINTS, ("input_labels", I64, &[0, 0, 0]), EMBEDDING, POSITION],
         outputs: &["iou_scores", "pred_masks"] },
-    Form { contract: Contract::SamDecoder { labels: false }, role: Role::SamDecoder, name: "SAM decoder (split export, without labels)",
+    Form { contract: Contract::SamDecoder { labels: false }, role: Role::SAM_DECODER, name: "SAM decoder (split export, without labels)",
         inputs: &[POINTS, EMBEDDING, POSITION], outputs: &["iou_scores", "pred_masks"] },
-    Form { contract: Contract::OriginalDecoder, role: Role::SamDecoder, name: "SAM decoder (original form)",
+    Form { contract: Contract::OriginalDecoder, role: Role::SAM_DECODER, name: "SAM decoder (original form)",
         inputs: &[EMBEDDING, ("point_coords", F32, &[0, 0, 2]), ("point_labels", F32, &[0, 0]),
             ("mask_input", F32, &[0, 1, 0, 0]), ("has_mask_input", F32, &[1]), ("orig_im_size", F32, &[2])],
         outputs: &["iou_predictions", "low_res_masks"] },
-    Form { contract: Contract::SamEncoder, role: Role::Sam, name: "SAM encoder (split export)",
+    Form { contract: Contract::SamEncoder, role: Role::SAM, name: "SAM encoder (split export)",
         inputs: &[("pixel_values", F32, &[0, 3, 0, 0])],
         outputs: &["image_embeddings", "image_positional_embeddings"] },
-    Form { contract: Contract::OriginalEncoder { picture: true }, role: Role::Sam,
+    Form { contract: Contract::OriginalEncoder { picture: true }, role: Role::SAM,
         name: "SAM encoder (original form, takes the picture)",
         inputs: &[("", F32, &[0, 0, 3])], outputs: &["image_embeddings"] },
-    Form { contract: Contract::OriginalEncoder { picture: false }, role: Role::Sam,
+    Form { contract: Contract::OriginalEncoder { picture: false }, role: Role::SAM,
         name: "SAM encoder (original form, takes normalized numbers)",
         inputs: &[("", F32, &[1, 3, 0, 0])], outputs: &["image_embeddings"] },
 ];
