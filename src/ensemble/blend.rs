@@ -99,7 +99,7 @@ mod tests {
 
     #[test]
     fn a_member_without_masks_is_cut_to_the_head() {
-        // pixel 0: the stage; 1: hair, half opaque in T-Face, 0.8 in I-Face; 2: skin
+        // pixel 0: the background; 1: hair, half opaque in T-Face, 0.8 in I-Face; 2: skin
         let baseline = flat(3, 1, [0.8, 0.8, 0.8, 1.0]);
         let (mut tface, mut iface) = (Image::new(3, 1, 4), Image::new(3, 1, 4));
         tface.data[4..8].copy_from_slice(&[0.2, 0.2, 0.2, 0.5]);

@@ -50,14 +50,14 @@ impl Fit {
             members.errors(target, band, |_, weight, errors| sums.count(weight, errors));
             sums
         });
-        bands.iter().for_each(|b| self.sum(b));
-        Ok(())
+        bands.iter().try_for_each(|band| self.merge(band))
     }
 
     /// Adds the views of another. The last bits depend on the order, nothing else does.
     pub fn merge(&mut self, other: &Fit) -> Result<()> {
         self.same_members(other.members)?;
-        self.sum(other);
+        self.products.iter_mut().zip(&other.products).for_each(|(a, b)| *a += b);
+        self.pixels += other.pixels;
         Ok(())
     }
 
@@ -119,11 +119,6 @@ impl Fit {
             }
         }
         self.pixels += weight;
-    }
-
-    fn sum(&mut self, other: &Fit) {
-        self.products.iter_mut().zip(&other.products).for_each(|(a, b)| *a += b);
-        self.pixels += other.pixels;
     }
 }
 

@@ -139,7 +139,7 @@ fn solved(
     warnings: &mut Vec<String>,
 ) -> Vec<f32> {
     let has = |value: u8| trimap.values.contains(&value);
-    // tied to one side only, everything would become that side
+    // constrained to one side only, everything would become that side
     if !has(UNKNOWN) || (has(HEAD) && has(OUTSIDE)) {
         match closed_form(photo, mask, trimap, options) {
             Ok(matte) => return matte.alpha,

@@ -84,7 +84,7 @@ impl NetworkSession {
         let contract = contract::recognize(&inputs, &outputs).map_err(|why| {
             file_error(
                 path,
-                &format!("is no SAM or ViTMatte network: {why}"),
+                &format!("is no SAM or ViTMatte network: {}", one_line(&why)),
                 "give a SAM encoder and its decoder, or a ViTMatte network, exported with transformers or by SAM's \
                  own script",
             )

@@ -1,6 +1,5 @@
 //! Which network a file is, by its inputs and outputs and never by its name.
 
-use super::seam::one_line;
 use std::fmt;
 use tract_onnx::pb;
 
@@ -156,7 +155,7 @@ pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, S
         ports.iter().map(|p| format!("{} {}", p.name, p.shape_in_words())).collect::<Vec<_>>().join(", ")
     };
     let why = near.unwrap_or("its inputs and outputs are those of no known form".into());
-    Err(one_line(&format!("{why} ({} → {})", side(inputs), side(outputs))))
+    Err(format!("{why} ({} → {})", side(inputs), side(outputs)))
 }
 
 /// What keeps these from being exactly the inputs wanted.
