@@ -80,7 +80,7 @@ impl Image {
 }
 
 /// Coded 0..=1 to 8 bit, rounded to nearest (the published code truncates).
-pub fn quantise(c: f32) -> u8 {
+pub fn quantize(c: f32) -> u8 {
     (c.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
 }
 
@@ -92,7 +92,7 @@ mod tests {
     fn srgb_goes_there_and_back_for_every_byte() {
         for i in 0..=255u8 {
             let s = i as f32 / 255.0;
-            assert_eq!(quantise(srgb_from_linear(linear_from_srgb(s))), i);
+            assert_eq!(quantize(srgb_from_linear(linear_from_srgb(s))), i);
         }
     }
 }

@@ -9,7 +9,7 @@ use super::view::{View, ViewMask};
 use crate::Result;
 use crate::config::MaskMeaning;
 use crate::geom::Camera;
-use crate::image::{Gray, Photo, linear_from_srgb, quantise, srgb_from_linear};
+use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::io::{self, Limits, NpyValues};
 use std::path::Path;
 
@@ -190,7 +190,7 @@ fn average_photo(photo: &Photo, d: u32) -> Photo {
             }
             // where nothing is opaque the color cannot be seen; its plain mean keeps edges clean
             let mean = |k: usize| if weight > 0 { sum[k] / weight as f32 } else { plain[k] / n };
-            rgb.push([0, 1, 2].map(|k| quantise(srgb_from_linear(mean(k)))));
+            rgb.push([0, 1, 2].map(|k| quantize(srgb_from_linear(mean(k)))));
             if let Some(alpha) = &mut alpha {
                 alpha.push((weight as f32 / n + 0.5) as u8);
             }

@@ -1,7 +1,7 @@
 //! Fits of the blend: known weights are found again, and scarce data change little.
 
 use super::*;
-use crate::image::{Gray, Image, Photo, quantise};
+use crate::image::{Gray, Image, Photo, quantize};
 use crate::kernel::rng::{normal, uniform};
 
 const SIZE: u32 = 64;
@@ -16,7 +16,7 @@ fn view(color: impl Fn(usize, usize) -> f32) -> Image {
 }
 
 fn photo(color: impl Fn(usize, usize) -> f32) -> Photo {
-    let rgb = (0..PIXELS).map(|i| std::array::from_fn(|j| quantise(color(i, j)))).collect();
+    let rgb = (0..PIXELS).map(|i| std::array::from_fn(|j| quantize(color(i, j)))).collect();
     Photo { width: SIZE, height: SIZE, rgb, alpha: None }
 }
 

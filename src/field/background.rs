@@ -5,7 +5,7 @@
 //! stage's light `B` is estimated from the pixels nearby that are all stage, and taken away:
 //! `target over black = coded(α F) = coded(photo − (1 − α) B)`, which is what a render over black shows.
 
-use crate::image::{Gray, Photo, linear_from_srgb, quantise, srgb_from_linear};
+use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 
 /// Half edge of the window that collects stage pixels, as a share of the picture's height.
 const WINDOW: f32 = 0.02;
@@ -41,7 +41,7 @@ pub fn over_black(photo: &Photo, mask: &Gray) -> Vec<[u8; 3]> {
         out[p] = std::array::from_fn(|c| {
             let stage = if weight > 0.0 { sum[c] / weight } else { 0.0 };
             let head = linear[photo.rgb[p][c] as usize] - (1.0 - alpha) * stage;
-            quantise(srgb_from_linear(head.max(0.0)).min(alpha))
+            quantize(srgb_from_linear(head.max(0.0)).min(alpha))
         });
     }
     out
@@ -54,7 +54,7 @@ mod tests {
     #[test]
     fn the_light_of_the_stage_is_taken_out_of_a_mixed_pixel() {
         // a row: stage (linear 0.5), mixed half and half, head (linear 0.2)
-        let coded = |l: f32| quantise(srgb_from_linear(l));
+        let coded = |l: f32| quantize(srgb_from_linear(l));
         let rgb = [0.5, 0.5, 0.35, 0.2, 0.2].map(|l| [coded(l); 3]).to_vec();
         let photo = Photo { width: 5, height: 1, rgb, alpha: None };
         let mask = Gray { width: 5, height: 1, values: vec![0, 0, 128, 255, 255] };

@@ -5,7 +5,7 @@
 //! two sides apart, it is taken in linear light. Larger is bilinear between
 //! pixel centers: column `x` of `W` looks at `(x + ½) w / W − ½` of `w`.
 
-use crate::image::{Gray, Photo, linear_from_srgb, quantise, srgb_from_linear};
+use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use rayon::prelude::*;
 
 /// The size of a picture brought down to at most `side` pixels on its longest side; never larger than it is.
@@ -50,7 +50,7 @@ const CODED: Coding = Coding { value: |byte| byte as f32, byte: |value| (value +
 /// Linear light, as a coarser sensor would have seen it.
 const LIGHT: Coding = Coding {
     value: |byte| linear_from_srgb(byte as f32 / 255.0),
-    byte: |value| quantise(srgb_from_linear(value)),
+    byte: |value| quantize(srgb_from_linear(value)),
 };
 
 /// `channels` interleaved bytes a pixel, averaged. Rows are computed apart, each in a fixed order.
@@ -140,7 +140,7 @@ pub fn harden(alpha: f32, lowest: f32, highest: f32) -> f32 {
 /// bit. Values that are no numbers become 0.
 pub fn enlarge(alpha: &[f32], from: (u32, u32), size: (u32, u32), lowest: f32, highest: f32) -> Gray {
     assert_eq!(alpha.len(), from.0 as usize * from.1 as usize);
-    let coded = |v: f32| quantise(harden(v, lowest, highest));
+    let coded = |v: f32| quantize(harden(v, lowest, highest));
     Gray { width: size.0, height: size.1, values: bilinear(alpha, from.0, from, size, coded) }
 }
 
@@ -262,7 +262,7 @@ mod tests {
         // three rows into two: rows 0 and half of 1, half of 1 and 2
         let rgb = vec![[255, 0, 0], [0, 0, 255], [0, 0, 255]];
         let small = reduce_to_rows(&Photo { width: 1, height: 3, rgb, alpha: None }, 2);
-        let coded = |v: f32| quantise(srgb_from_linear(v));
+        let coded = |v: f32| quantize(srgb_from_linear(v));
         assert_eq!((small.width, small.height), (1, 2));
         assert_eq!(small.rgb, [[coded(2.0 / 3.0), 0, coded(1.0 / 3.0)], [0, 0, 255]]);
     }

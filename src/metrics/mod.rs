@@ -25,7 +25,7 @@ mod ssim;
 pub use psnr::psnr;
 pub use ssim::{ssim_reflect_map, ssim_valid};
 
-use crate::image::{Gray, Image, Photo, quantise};
+use crate::image::{Gray, Image, Photo, quantize};
 use crate::{Error, Result};
 use serde::Serialize;
 
@@ -142,7 +142,7 @@ pub fn compare(
 fn rounded(image: &Image) -> Image {
     let mut out = Image::new(image.width, image.height, 3);
     for (o, i) in out.data.as_chunks_mut::<3>().0.iter_mut().zip(image.data.chunks_exact(image.channels)) {
-        *o = [i[0], i[1], i[2]].map(|v| quantise(v) as f32 / 255.0);
+        *o = [i[0], i[1], i[2]].map(|v| quantize(v) as f32 / 255.0);
     }
     out
 }

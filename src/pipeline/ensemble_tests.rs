@@ -6,7 +6,7 @@ use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::capture::{Split, View};
 use crate::config::{Config, Method, Preset, ViewBackground};
 use crate::geom::{Camera, Ray};
-use crate::image::{Image, quantise};
+use crate::image::{Image, quantize};
 use crate::io;
 use crate::render::RenderedView;
 use crate::run::Run;
@@ -78,7 +78,7 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     assert_eq!(done.summary["views"], 2);
     // 0.1 · 0.2 + 0.6 · 0.402 + 0.3 · 0.601 = 0.4415 → 112.58 → 113; bytes blended would give
     // 0.1 · 51 + 0.6 · 103 + 0.3 · 153 = 112.8, and truncated 112
-    assert_eq!(quantise(0.4415), 113);
+    assert_eq!(quantize(0.4415), 113);
     assert_eq!(pixel(&run, &format!("ensemble/{}.png", names[1]), 77), [113; 3]);
     let weights = io::read_json(&run.path("ensemble/weights.json"), &io::Limits::default()).unwrap();
     assert_eq!((&weights["weights"], &weights["fitted"]), (&json!([0.1f32, 0.6f32, 0.3f32]), &json!(null)));

@@ -5,7 +5,7 @@ use super::surface::ClosedSurface;
 use crate::capture::scene::Scene;
 use crate::config::MeshConfig;
 use crate::geom::{Camera, Mesh};
-use crate::image::{Image, Photo, quantise, srgb_from_linear};
+use crate::image::{Image, Photo, quantize, srgb_from_linear};
 use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, bake, tangent_space};
 use crate::mesh::files::{HeadMesh, HeadTexture, Lobes, tangents};
 use crate::mesh::{AtlasConfig, SimplifyConfig, atlas, simplify};
@@ -100,7 +100,7 @@ pub(super) fn finish(
 
 /// Linear color as a picture, rounded to nearest.
 fn coded(image: &Image) -> Photo {
-    let texel = |c: &[f32; 3]| c.map(|v| quantise(srgb_from_linear(v)));
+    let texel = |c: &[f32; 3]| c.map(|v| quantize(srgb_from_linear(v)));
     let rgb = image.data.as_chunks::<3>().0.iter().map(texel).collect();
     Photo { width: image.width, height: image.height, rgb, alpha: None }
 }

@@ -2,7 +2,7 @@
 
 use crate::Result;
 use crate::config::{PictureFormat, ViewBackground};
-use crate::image::{Gray, Image, Photo, linear_from_srgb, quantise, srgb_from_linear};
+use crate::image::{Gray, Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::io::{self, Limits, ReadError, WriteError};
 use crate::render::RenderedView;
 use std::path::{Path, PathBuf};
@@ -60,7 +60,7 @@ pub(super) fn write(
     let pixels = view.color.data.as_chunks::<4>().0;
     match format {
         PictureFormat::Png => {
-            let rgba: Vec<[u8; 4]> = pixels.iter().map(|&p| straight(p).map(quantise)).collect();
+            let rgba: Vec<[u8; 4]> = pixels.iter().map(|&p| straight(p).map(quantize)).collect();
             io::write_png_rgba(&file, w, h, &rgba)?;
             if view.depth.data.is_empty() {
                 return Ok(());
@@ -160,7 +160,7 @@ pub(super) fn expected(photo: &Photo, mask: Option<&Gray>, background: ViewBackg
     let behind = behind(background).unwrap_or([0.0; 3]);
     let mix = |c: u8, b: f32, m: u8| {
         let a = m as f32 / 255.0;
-        quantise(a * c as f32 / 255.0 + (1.0 - a) * b)
+        quantize(a * c as f32 / 255.0 + (1.0 - a) * b)
     };
     let rgb = photo
         .rgb

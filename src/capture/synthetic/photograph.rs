@@ -7,7 +7,7 @@ use super::look::{Lamp, background, lamps, reflectance};
 use super::noise::{noise, trilinear, unit};
 use super::shape::{OFFSET, SyntheticHead, parts};
 use crate::geom::{Aabb, Camera};
-use crate::image::{Gray, Photo, quantise, srgb_from_linear};
+use crate::image::{Gray, Photo, quantize, srgb_from_linear};
 use glam::{UVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
@@ -84,9 +84,9 @@ impl Studio {
             let draw = |n| unit(seed, y * camera.width + x, 4 * k as u32 + n) - 0.5;
             // four uniform numbers of variance 1/12 each: nearly normal with variance 1/3
             let grain = (draw(0) + draw(1) + draw(2) + draw(3)) * 3f32.sqrt() * GRAIN;
-            quantise(srgb_from_linear(seen.color[k]) + grain)
+            quantize(srgb_from_linear(seen.color[k]) + grain)
         });
-        (color, quantise(seen.alpha), if seen.alpha > 0.5 && seen.head > 0.5 { 255 } else { 0 })
+        (color, quantize(seen.alpha), if seen.alpha > 0.5 && seen.head > 0.5 { 255 } else { 0 })
     }
 
     /// Follows one ray to the head.

@@ -14,7 +14,7 @@ use super::file_mesh::{distance_warning, left_out};
 use super::texture::HeadTexture;
 use crate::Result;
 use crate::geom::Mesh;
-use crate::image::quantise;
+use crate::image::quantize;
 
 /// Returns a mesh as a `.ply`, coloured by its vertices; with a texture split at seams, and its picture beside it. Of
 /// the options `up` and `unit_m` do not matter.
@@ -74,7 +74,7 @@ fn bytes(mesh: &FileMesh, picture: Option<&str>) -> Vec<u8> {
             out.extend(p.to_array().iter().flat_map(|v| v.to_le_bytes()));
         }
         out.extend(mesh.normals.get(i).iter().flat_map(|n| n.to_array()).flat_map(f32::to_le_bytes));
-        out.extend(mesh.colors.get(i).into_iter().flatten().map(|&c| quantise(c)));
+        out.extend(mesh.colors.get(i).into_iter().flatten().map(|&c| quantize(c)));
         if let Some(uv) = mesh.uvs.get(i) {
             out.extend_from_slice(&uv.x.to_le_bytes());
             out.extend_from_slice(&(1.0 - uv.y).to_le_bytes());

@@ -332,7 +332,7 @@ mod tests {
         let learned = Learned { gradient: &gradient, colors: &colors };
         let baked = bake(&mesh, &atlas, &learned, &ring(), &config(), &Quiet).unwrap();
         let rgb = baked.color.data.as_chunks::<3>().0.iter();
-        let rgb = rgb.map(|c| c.map(|v| crate::image::quantise(srgb_from_linear(v)))).collect();
+        let rgb = rgb.map(|c| c.map(|v| crate::image::quantize(srgb_from_linear(v)))).collect();
         let step = Seams::new(&mesh, &atlas).step(&crate::image::Photo {
             width: 256,
             height: 128,
