@@ -1,6 +1,6 @@
 //! `tiface demo`: the line on a synthetic head made on the spot.
 
-use super::Session;
+use super::invocation::Invocation;
 use super::out::Out;
 use super::run::{LineCommand, run as run_line};
 use super::screen::duration;
@@ -21,8 +21,8 @@ baseline.steps = 600
 baseline.rays = 2048
 ";
 
-pub(super) fn run(session: &Session) -> Result<()> {
-    let common = session.common;
+pub(super) fn run(invocation: &Invocation) -> Result<()> {
+    let common = invocation.common;
     let run = common.run.clone().unwrap_or_else(|| PathBuf::from("runs/demo"));
     let capture = run.join(DEMO_CAPTURE);
     // repeated without options, the demo goes on as it was begun
@@ -35,23 +35,23 @@ pub(super) fn run(session: &Session) -> Result<()> {
     if !io::is_file(&capture.join("transforms.json")) {
         if common.dry_run {
             let text = format!("would photograph a synthetic head into `{}`", capture.display());
-            session.screen.note("capture", &text);
+            invocation.screen.note("capture", &text);
             return Ok(());
         }
-        photograph(&capture, session)?;
+        photograph(&capture, invocation)?;
     }
     let target = RunTarget { capture: Some(io::real_path(&capture)?), saved, run, guessed: false };
     let (product, until) = ("run", Stage::Metrics);
-    run_line(session, &LineCommand { product, until, target, require: &[], keys: Vec::new(), fallback })
+    run_line(invocation, &LineCommand { product, until, target, require: &[], keys: Vec::new(), fallback })
 }
 
-fn photograph(capture: &Path, session: &Session) -> Result<()> {
+fn photograph(capture: &Path, invocation: &Invocation) -> Result<()> {
     let options = SyntheticOptions::default();
     let views = options.train + options.test;
-    session.screen.note("capture", &format!("photographing a synthetic head from {views} sides"));
+    invocation.screen.note("capture", &format!("photographing a synthetic head from {views} sides"));
     let start = Instant::now();
     io::create_folder(capture)?;
     write_capture(capture, &options)?;
-    session.screen.note("capture", &format!("done in {}", duration(start.elapsed().as_secs_f64())));
+    invocation.screen.note("capture", &format!("done in {}", duration(start.elapsed().as_secs_f64())));
     Ok(())
 }

@@ -9,6 +9,7 @@ mod completions;
 mod config;
 mod demo;
 mod inspect;
+mod invocation;
 mod options;
 mod out;
 mod page;
@@ -25,13 +26,13 @@ use crate::pipeline::Stage;
 use crate::run::Stop;
 use crate::{Error, Result};
 use clap::{Args, CommandFactory, Parser, Subcommand};
+use invocation::Invocation;
 use options::{Common, KeyOption};
 use out::Out;
 use run::LineCommand;
 use screen::Screen;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
 use target::RunTarget;
 
 const EXAMPLES: &str = "\
@@ -328,16 +329,6 @@ learned from (capture.tiles): the blend follows the better member.")]
     },
 }
 
-/// What every command works with.
-struct Session<'a> {
-    /// The options that every command shares.
-    common: &'a Common,
-    /// Where people see what happens.
-    screen: Arc<Screen>,
-    /// Set when somebody asks to stop.
-    stop: Stop,
-}
-
 /// Parses the command line, does what it says, and gives the exit code.
 pub fn main() -> ExitCode {
     let Cli { command, common } = match Cli::try_parse() {
@@ -348,13 +339,13 @@ pub fn main() -> ExitCode {
             return ExitCode::from(e.exit_code() as u8);
         }
     };
-    let session = Session { common: &common, screen: Screen::new(&common), stop: Stop::new() };
+    let invocation = Invocation { common: &common, screen: Screen::new(&common), stop: Stop::new() };
     common.log();
     let makes_nothing = |command: &str| Out::none(common.out.as_deref(), command);
-    let ended = signals::listen(&session).and_then(|()| match &command {
-        Command::Demo => demo::run(&session),
+    let ended = signals::listen(&invocation).and_then(|()| match &command {
+        Command::Demo => demo::run(&invocation),
         Command::Mask { place, clicks, page: true } => {
-            page::run(&session, place.path.as_deref(), clicks.prompts.as_deref())
+            page::run(&invocation, place.path.as_deref(), clicks.prompts.as_deref())
         }
         Command::Inspect { capture } => {
             makes_nothing("inspect").and_then(|()| inspect::run(&common, capture))
@@ -367,12 +358,12 @@ pub fn main() -> ExitCode {
         Command::Completions { shell } => {
             makes_nothing("completions").and_then(|()| completions::run(*shell, &mut Cli::command()))
         }
-        stages => run::run(&session, &stages.on_line(&common)?),
+        stages => run::run(&invocation, &stages.on_line(&common)?),
     });
     ExitCode::from(match ended {
         Ok(()) => 0,
         Err(error) => {
-            session.screen.error(&error);
+            invocation.screen.error(&error);
             error.kind().code()
         }
     })

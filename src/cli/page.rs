@@ -1,6 +1,6 @@
 //! `tiface mask --page`: one file to click on in a browser.
 
-use super::Session;
+use super::invocation::Invocation;
 use super::out::Out;
 use super::stdout::print;
 use crate::capture;
@@ -12,8 +12,8 @@ use std::path::{Path, PathBuf};
 
 /// Writes the page for a capture. Clicks that are there already, `prompts` or the capture's own `prompts.json`, are in
 /// it.
-pub(super) fn run(session: &Session, path: Option<&Path>, prompts: Option<&Path>) -> Result<()> {
-    let (common, screen) = (session.common, &session.screen);
+pub(super) fn run(invocation: &Invocation, path: Option<&Path>, prompts: Option<&Path>) -> Result<()> {
+    let (common, screen) = (invocation.common, &invocation.screen);
     let asked = Out::find(common.out.as_deref(), "page")?;
     let Some(path) = path else {
         return Err(Error::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));

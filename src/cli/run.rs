@@ -1,7 +1,7 @@
 //! `tiface run` and the commands of single stages: the line, up to a stage.
 
-use super::Session;
 use super::bar::Bar;
+use super::invocation::Invocation;
 use super::options::{Common, KeyOption};
 use super::out::Out;
 use super::stdout::print;
@@ -32,8 +32,8 @@ pub(super) struct LineCommand<'a> {
 }
 
 /// Completes the stages that a command needs, and puts its product where it was asked for.
-pub(super) fn run(session: &Session, command: &LineCommand) -> Result<()> {
-    let Session { common, screen, stop } = session;
+pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> {
+    let Invocation { common, screen, stop } = invocation;
     let LineCommand { product, until, target, require, .. } = command;
     let out = Out::find(common.out.as_deref(), product)?;
     if target.guessed {

@@ -3,7 +3,7 @@
 //! The first signal asks to stop. What comes within a second of it is the same request, made twice as GNU `timeout`
 //! does; a later one ends the process at once.
 
-use super::Session;
+use super::invocation::Invocation;
 use crate::{Error, ErrorKind, Result};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::{flag, low_level};
@@ -20,14 +20,14 @@ const PATIENCE: Duration = Duration::from_millis(500);
 /// Signals so close to the first are one with it.
 const ONE: Duration = Duration::from_secs(1);
 
-/// Listens until the process ends; requests go to the session's `stop`.
-pub(super) fn listen(session: &Session) -> Result<()> {
+/// Listens until the process ends; requests go to the invocation's `stop`.
+pub(super) fn listen(invocation: &Invocation) -> Result<()> {
     let cannot = |e: std::io::Error| Error::cannot(format!("signals cannot be handled: {e}"), "");
     let last = Arc::new(AtomicUsize::new(0));
     for (signal, exit) in [(SIGINT, ErrorKind::Interrupted), (SIGTERM, ErrorKind::Terminated)] {
         flag::register_usize(signal, last.clone(), exit.code().into()).map_err(cannot)?;
     }
-    let (stop, screen) = (session.stop.clone(), session.screen.clone());
+    let (stop, screen) = (invocation.stop.clone(), invocation.screen.clone());
     let heed = move || {
         let mut heard = FirstSignal::default();
         loop {
