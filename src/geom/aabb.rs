@@ -44,12 +44,12 @@ impl Aabb {
         0.5 * (self.min + self.max)
     }
 
-    /// Does it hold no point?
+    /// Returns whether it holds no point.
     pub fn is_empty(self) -> bool {
         self.min.cmpgt(self.max).any()
     }
 
-    /// Is `point` inside or on the border?
+    /// Returns whether `point` is inside or on the border.
     pub fn contains(self, point: Vec3) -> bool {
         point.cmpge(self.min).all() && point.cmple(self.max).all()
     }

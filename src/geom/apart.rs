@@ -15,7 +15,7 @@ pub(crate) struct OutlineSide {
 }
 
 /// How far charts are apart.
-pub(crate) struct Apart {
+pub(crate) struct ChartDistance {
     /// The smallest distance between sides of different charts, at most as far as was asked for; none when there
     /// are no two charts.
     pub distance: Option<f64>,
@@ -24,9 +24,9 @@ pub(crate) struct Apart {
 }
 
 /// The smallest distance between sides of different charts, up to `farthest`, beyond which it is given as that.
-pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> Apart {
+pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDistance {
     if sides.iter().all(|s| s.chart == sides[0].chart) {
-        return Apart { distance: None, left: 0 };
+        return ChartDistance { distance: None, left: 0 };
     }
     let span = |s: &OutlineSide| DBox::around([s.from, s.to].map(|p| p.extend(0.0)));
     let boxes = Boxes::new(sides.iter().map(span));
@@ -57,7 +57,7 @@ pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> Apart {
     });
     let least = shared.found.into_iter().fold(bound, f64::min);
     // nothing is nearer than touching
-    Apart { distance: Some(least), left: if least > 0.0 { shared.unfinished.len() } else { 0 } }
+    ChartDistance { distance: Some(least), left: if least > 0.0 { shared.unfinished.len() } else { 0 } }
 }
 
 /// How many that follow each other in the tree are compared first.
@@ -90,7 +90,7 @@ mod tests {
     }
 
     fn nearest(sides: &[OutlineSide], farthest: f64) -> Option<f64> {
-        let Apart { distance, left } = nearest_charts(sides, farthest);
+        let ChartDistance { distance, left } = nearest_charts(sides, farthest);
         assert_eq!(left, 0);
         distance
     }

@@ -26,7 +26,7 @@ impl Effort {
         Effort { left, short: false }
     }
 
-    /// Was too little left for something?
+    /// Returns whether too little was left for something.
     pub(crate) fn ran_short(&self) -> bool {
         self.short
     }

@@ -147,7 +147,7 @@ impl Bvh {
         self.bounds
     }
 
-    /// Are there no triangles?
+    /// Returns whether there are no triangles.
     pub fn is_empty(&self) -> bool {
         self.nodes.is_empty()
     }
@@ -160,7 +160,7 @@ impl Bvh {
         self.cast::<false>(ray)
     }
 
-    /// Is there anything along the ray with `t_min <= t <= t_max`?
+    /// Returns whether there is anything along the ray with `t_min <= t <= t_max`.
     pub fn any_hit(&self, ray: &Ray) -> bool {
         self.cast::<true>(ray).is_some()
     }

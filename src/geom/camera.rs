@@ -23,7 +23,7 @@ pub struct Distortion {
 }
 
 impl Distortion {
-    /// Does it do nothing?
+    /// Returns whether it does nothing.
     pub fn is_none(&self) -> bool {
         *self == Distortion::default()
     }

@@ -2,7 +2,7 @@
 
 use glam::{DVec2, DVec3};
 
-/// Do two triangles meet in more than the corners they share?
+/// Returns whether two triangles meet in more than the corners they share.
 pub(crate) fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u32; 3]) -> bool {
     let shared = |ids: [u32; 3], others: [u32; 3]| ids.map(|i| others.contains(&i));
     let (in_p, in_q) = (shared(p_ids, q_ids), shared(q_ids, p_ids));
@@ -26,7 +26,7 @@ pub(crate) fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u
     count < 2 && (crosses(p, in_p, q) || crosses(q, in_q, p))
 }
 
-/// Does the segment go from one side of the triangle to the other, through it or its border?
+/// Whether the segment goes from one side of the triangle to the other, through it or its border.
 fn pierces(from: DVec3, to: DVec3, [a, b, c]: [DVec3; 3]) -> bool {
     if orient(a, b, c, from) * orient(a, b, c, to) >= 0 {
         return false;
@@ -46,7 +46,7 @@ fn orient(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> i32 {
     if det.abs() <= 1e-15 * permanent { 0 } else { det.signum() as i32 }
 }
 
-/// Do two triangles of one plane share area? Not if a side of either separates them.
+/// Whether two triangles of one plane share area: not if a side of either separates them.
 fn overlap_in_plane(p: [DVec3; 3], q: [DVec3; 3]) -> bool {
     let normal = (p[1] - p[0]).cross(p[2] - p[0]).abs();
     let flat = |v: DVec3| {

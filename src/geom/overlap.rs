@@ -16,7 +16,7 @@ pub(crate) fn turn(a: Vec2, b: Vec2, c: Vec2) -> i32 {
     i32::from(area > 0.0) - i32::from(area < 0.0)
 }
 
-/// Do two triangles, neither without area, share area?
+/// Returns whether two triangles, neither without area, share area.
 pub(crate) fn share_area(p: [Vec2; 3], q: [Vec2; 3]) -> bool {
     let separates = |a: [Vec2; 3], b: [Vec2; 3]| {
         let inner = turn(a[0], a[1], a[2]);

@@ -20,7 +20,7 @@ impl Similarity {
     pub const IDENTITY: Similarity =
         Similarity { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
-    /// Is it one at all? What is wrong else: a part, what it is, and what it should be.
+    /// Returns what is wrong with it, if anything: a part, what it is, and what it should be.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         // beyond that the way back is lost in f64
         if !(1e-12..=1e12).contains(&self.scale) {

@@ -67,7 +67,7 @@ impl Cap {
         Some(Cap { ring, ..cap })
     }
 
-    /// Does a point lie on the box's faces?
+    /// Returns whether a point lies on the box's faces.
     pub fn holds(&self, p: Vec3) -> bool {
         (p - self.bounds.min).min_element() < self.near || (self.bounds.max - p).min_element() < self.near
     }
@@ -86,10 +86,7 @@ impl Cap {
 
     /// Paints the mesh's cap.
     pub fn paint(&self, mesh: &mut Mesh) {
-        let Mesh { positions, colors, .. } = mesh;
-        colors.par_iter_mut().zip(&*positions).filter(|(_, p)| self.holds(**p)).for_each(|(c, &p)| {
-            *c = self.color(p);
-        });
+        self.recolor(&mesh.positions, &mut mesh.colors);
     }
 
     /// Gives the ring other colors, made from its points and their normals.
@@ -102,9 +99,8 @@ impl Cap {
 
     /// Gives those of the points that lie on the cap its color instead.
     pub fn recolor(&self, points: &[Vec3], colors: &mut [[f32; 3]]) {
-        for (p, color) in points.iter().zip(colors).filter(|(p, _)| self.holds(**p)) {
-            *color = self.color(*p);
-        }
+        let on_cap = points.par_iter().zip(colors).filter(|(p, _)| self.holds(**p));
+        on_cap.for_each(|(p, color)| *color = self.color(*p));
     }
 
     /// Takes the cap off: an opening for those who fit something to it. Returns the triangles removed.

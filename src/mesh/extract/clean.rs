@@ -201,7 +201,7 @@ fn split_fans(mesh: &mut Mesh, report: &mut CleanReport) {
     }
 }
 
-/// Does the point lie within the kept pieces? Winding number: the sum of solid angles over 4π.
+/// Whether the point lies within the kept pieces, by its winding number: the sum of solid angles over 4π.
 fn is_within(point: Vec3, mesh: &Mesh, piece_of: &[u32], keep: &[bool]) -> bool {
     let p = point.as_dvec3();
     let angle: f64 = mesh

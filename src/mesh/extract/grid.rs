@@ -51,7 +51,7 @@ impl NodeGrid {
         self.dims.iter().product()
     }
 
-    /// Does a node lie on the outer faces?
+    /// Returns whether a node lies on the outer faces.
     pub(super) fn on_border(&self, node: [usize; 3]) -> bool {
         (0..3).any(|a| node[a] == 0 || node[a] + 1 == self.dims[a])
     }

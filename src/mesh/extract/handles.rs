@@ -3,7 +3,7 @@
 //! A surface is cut along a short loop that does not separate it (`loops`), both rims are drawn apart by half an
 //! edge and each is closed by the triangulation of least area. That takes away exactly one handle and
 //! changes nothing else: where the loop goes around matter it is cut, where it goes around air that is
-//! filled, and the two are told apart only by which side of the new triangles is out.
+//! filled, and the two differ only in which side of the new triangles is out.
 //!
 //! Of the loops of a handle the field chooses: that over whose disc it is least to be overcome, `∫ |f|`. A thin
 //! strand has little matter to cut and a narrow slit little air to fill, however long the slit is. The
@@ -197,7 +197,7 @@ impl<'a> Surgery<'a> {
         }
     }
 
-    /// Cuts along a rim and closes both sides. Was matter cut, or else a hole filled? `None` if it cannot be
+    /// Cuts along a rim and closes both sides. Returns whether matter was cut, or else a hole filled; `None` if it cannot be
     /// done, or not in one with what has been done already.
     fn along(&mut self, disc: &Disc) -> Option<bool> {
         let class = self.basis.iter().fold(disc.rim.class, |word, b| word.min(word ^ b));
@@ -258,7 +258,7 @@ impl<'a> Surgery<'a> {
         Some(CutPlan { moved, at_rims, caps: left.chain(right).collect() })
     }
 
-    /// Is no triangle turned over, flat, or in the way of another?
+    /// Whether no triangle is turned over, flat, or in the way of another.
     fn fits(&self, cut: &CutPlan) -> bool {
         let corners = |t: [u32; 3]| {
             t.map(|v| cut.moved.get(&v).copied().unwrap_or_else(|| self.next.positions[v as usize]))

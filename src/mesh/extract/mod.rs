@@ -37,7 +37,7 @@ use verify::dense_triangles;
 pub struct ExtractOptions {
     /// Cells along the longest side of the box; 2..=8192.
     pub resolution: usize,
-    /// Every how many cells the field is asked first: 2, 4 or 8. Smaller finds smaller loose pieces.
+    /// Every how many cells the field is evaluated first: 2, 4 or 8. Smaller finds smaller loose pieces.
     pub coarse_step: usize,
     /// Most points in one call of the field; at least 1.
     pub batch: usize,
@@ -95,7 +95,7 @@ pub struct MeshReport {
     pub cell_size: f32,
     /// Lower and upper corner of the grid: where caps lie.
     pub grid: [[f32; 3]; 2],
-    /// Nodes the field was asked for.
+    /// Nodes at which the field was evaluated.
     pub nodes_evaluated: usize,
     /// The same as a share of all nodes, 0..=1.
     pub share_evaluated: f64,
@@ -107,7 +107,7 @@ pub struct MeshReport {
     pub non_finite: usize,
     /// Inside nodes on the faces of the box, where the surface was capped.
     pub capped: usize,
-    /// The dense extraction beside this one, if `verify` was asked.
+    /// The dense extraction beside this one, with `verify`.
     pub verified: Option<Verified>,
     /// What cleaning removed.
     pub clean: CleanReport,
@@ -115,7 +115,7 @@ pub struct MeshReport {
     pub off_surface_before: f64,
     /// The same after.
     pub off_surface_after: f64,
-    /// Vertices that some step moved less than asked, because a face would have been spoiled.
+    /// Vertices that some step moved less than the field wanted, because a face would have been spoiled.
     pub held_back: usize,
     /// Handles that were cut, filled or left.
     #[serde(default)]
@@ -135,7 +135,7 @@ impl MeshReport {
         Aabb { min, max }
     }
 
-    /// What a person should hear about, one sentence each; `cap`: has the cap stayed?
+    /// Returns what a person should know, one sentence each; `cap`: has the cap stayed?
     pub fn warnings(&self, cap: bool) -> Vec<String> {
         let mut out = Vec::new();
         if self.capped > 0 {

@@ -1,4 +1,4 @@
-//! The zero level set of a field that is expensive to ask: only nodes near the surface are evaluated.
+//! The zero level set of a field that is expensive to evaluate: only nodes near the surface are evaluated.
 //!
 //! 1. Every `coarse_step`-th node of the grid, along each axis, is evaluated (every 8th: 0.2 %).
 //! 2. Coarse edges that change sign are bisected down to one crossed grid edge each. Coarse cells
@@ -11,8 +11,8 @@
 //!
 //! A piece that lies between coarse nodes and whose neighbours' values do not betray it is missed: take
 //! a finer coarse step for that. Nodes on the outer faces of the grid count as outside; so do nodes for
-//! outside the hull, without asking the field. Waves of a flood that starts everywhere are few
-//! and large, so that the field is asked thousands of points at a time.
+//! outside the hull, without evaluating the field. Waves of a flood that starts everywhere are few
+//! and large, so that the field is evaluated at thousands of points at a time.
 
 use super::grid::NodeGrid;
 use super::marching::LevelSet;
@@ -26,9 +26,9 @@ use glam::Vec3;
 pub struct Sparse {
     /// The closed surface; empty when no piece was met.
     pub surface: LevelSet,
-    /// Nodes the field was asked for.
+    /// Nodes at which the field was evaluated.
     pub evaluated: usize,
-    /// Nodes that counted as outside without being asked.
+    /// Nodes that counted as outside without being evaluated.
     pub skipped: usize,
     /// 99th percentile of the field's gradient norm over coarse nodes.
     pub gradient_norm: f32,
@@ -69,7 +69,7 @@ pub fn sparse(
         cells: Vec::new(),
         out: Sparse { range: (f32::INFINITY, f32::NEG_INFINITY), ..Sparse::default() },
     };
-    flood.ask_coarse()?;
+    flood.evaluate_coarse()?;
     let edges = flood.coarse_crossings();
     flood.bisect(edges)?;
     flood.spread()?;
@@ -100,7 +100,7 @@ struct Flood<'a> {
     batch: usize,
     monitor: &'a dyn Monitor,
     lattice: [usize; 3],
-    /// `[z, y, x]` over the lattice: NaN where not asked (border) or not a number: outside.
+    /// `[z, y, x]` over the lattice: NaN where not evaluated (border) or not a number: outside.
     coarse: Vec<f32>,
     blocks: Blocks,
     /// Nodes marked as known whose value is still to come.
@@ -112,7 +112,7 @@ struct Flood<'a> {
 
 impl Flood<'_> {
     /// Values at nodes, outside ones without asking. Order as given.
-    fn ask(&mut self, nodes: &[[usize; 3]]) -> Result<Vec<f32>> {
+    fn evaluate(&mut self, nodes: &[[usize; 3]]) -> Result<Vec<f32>> {
         let mut values = Vec::with_capacity(nodes.len());
         for nodes in nodes.chunks(self.batch.max(1)) {
             self.monitor.check_stop()?;
@@ -147,11 +147,11 @@ impl Flood<'_> {
         (0..nz).flat_map(move |z| (0..ny).flat_map(move |y| (0..nx).map(move |x| [x, y, z])))
     }
 
-    fn ask_coarse(&mut self) -> Result<()> {
+    fn evaluate_coarse(&mut self) -> Result<()> {
         let step = self.coarse_step;
         let nodes: Vec<[usize; 3]> =
             self.lattice_points().map(|l| l.map(|c| c * step)).filter(|&n| !self.grid.on_border(n)).collect();
-        let values = self.ask(&nodes)?;
+        let values = self.evaluate(&nodes)?;
         for (n, v) in nodes.iter().zip(values) {
             let i = self.lattice_index(n.map(|c| c / step));
             self.coarse[i] = v;
@@ -178,7 +178,7 @@ impl Flood<'_> {
         Ok(())
     }
 
-    /// Is a lattice node inside? What was not asked is not.
+    /// Is a lattice node inside? What was not evaluated is not.
     fn coarse_inside(&self, at: [usize; 3]) -> bool {
         self.coarse[self.lattice_index(at)] < 0.0
     }
@@ -237,7 +237,7 @@ impl Flood<'_> {
         Ok(())
     }
 
-    /// The lattice's value of a node, where it has been asked.
+    /// The lattice's value of a node, where it has been evaluated.
     fn lattice_value(&self, node: [usize; 3]) -> Option<f32> {
         let step = self.coarse_step;
         (node.iter().all(|c| c % step == 0) && !self.grid.on_border(node))
@@ -259,7 +259,7 @@ impl Flood<'_> {
             let value = self.lattice_value(n).unwrap_or(f32::NAN);
             self.blocks.set(n, value, true);
         }
-        let values = self.ask(&new)?;
+        let values = self.evaluate(&new)?;
         for (&n, v) in new.iter().zip(values) {
             self.blocks.set(n, v, !self.grid.on_border(n));
         }
@@ -340,7 +340,7 @@ impl Flood<'_> {
             }
         }
         let middles: Vec<[usize; 3]> = near.iter().map(|(c, _)| c.map(|x| x + half)).collect();
-        let values = self.ask(&middles)?;
+        let values = self.evaluate(&middles)?;
         let mut found = Vec::new();
         let mut eighths = Vec::new();
         for ((&(corner, inside), &middle), &v) in near.iter().zip(&middles).zip(&values) {
@@ -354,7 +354,7 @@ impl Flood<'_> {
             }
         }
         let nodes: Vec<[usize; 3]> = eighths.iter().map(|e| e.0).collect();
-        let values = self.ask(&nodes)?;
+        let values = self.evaluate(&nodes)?;
         found.extend(eighths.iter().zip(values).filter(|(e, v)| (*v < 0.0) != e.2).map(|(e, _)| *e));
 
         // From each find walk to the coarse corner along the axes; one of the three legs changes sign.

@@ -9,7 +9,7 @@
 //! away from the mean of their chart, and each of them costs a gutter and a seam.
 
 use super::flat::Flat;
-use super::library::{Flattened, STRETCHED, flatten};
+use super::library::{ChartSet, STRETCHED, flatten};
 use super::patch::{NONE, neighbours, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
@@ -41,7 +41,7 @@ const STRETCH: f64 = 1.05;
 const SPLITS: usize = 3;
 
 /// Divides a mesh and lays it flat.
-pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<Flattened> {
+pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<ChartSet> {
     let beside = neighbours(mesh);
     let smooth = smoothed(mesh, SMOOTHING);
     let mut best = flatten(&smooth, None, STRETCHED, monitor)?;
@@ -118,7 +118,7 @@ fn uncovered(chart: Flat) -> Vec<Flat> {
 }
 
 /// One number a triangle, from 0: its chart, or the neighbour that this joined.
-fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &Flattened) -> Vec<u32> {
+fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
     let count = mesh.triangles.len();
     // a triangle without a chart is a region of its own until it joins one
     let mut label = vec![NONE; count];
@@ -200,14 +200,14 @@ mod tests {
         Mesh { positions: positions.collect(), triangles: triangles.collect(), ..Mesh::default() }
     }
 
-    fn charts(mesh: &Mesh, label: impl Fn(u32) -> u32) -> Flattened {
+    fn charts(mesh: &Mesh, label: impl Fn(u32) -> u32) -> ChartSet {
         let mut of: Vec<Flat> = Vec::new();
         for t in 0..mesh.triangles.len() as u32 {
             let l = label(t) as usize;
             of.resize(of.len().max(l + 1), Flat::default());
             of[l].triangles.push(t);
         }
-        Flattened { charts: of, without: Vec::new() }
+        ChartSet { charts: of, without: Vec::new() }
     }
 
     #[test]

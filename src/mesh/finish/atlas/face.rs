@@ -6,7 +6,7 @@
 //! out of the way. The rest is divided as any surface.
 
 use super::divide::divide;
-use super::library::{Flattened, STRETCHED, flatten};
+use super::library::{ChartSet, STRETCHED, flatten};
 use super::patch::{NONE, neighbours, part, straighten, stretch};
 use super::relax::relax;
 use super::smooth::smoothed;
@@ -38,7 +38,7 @@ const STRETCH: f64 = 1.05;
 const FACE_STRETCHED: f32 = 2.0 * STRETCHED;
 
 /// Divides a mesh, with its face in one chart if there is a way.
-pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<Flattened> {
+pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<ChartSet> {
     for inside in caps(mesh, front.normalize()).take(TRIES) {
         let (face, number) = part(mesh, |t| inside[t as usize]);
         let whole = vec![0; face.triangles.len()];

@@ -7,7 +7,7 @@ use super::divide::divide;
 use super::face::divide_around;
 use super::flat::{Flat, height};
 use super::layout::{AtlasConfig, AtlasLayout, STEPS};
-use super::library::Flattened;
+use super::library::ChartSet;
 use super::pack::{ChartPose, pack};
 use super::patch::{neighbours, part};
 use super::planar::planar;
@@ -29,7 +29,7 @@ pub(super) fn by_charts(mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor
     flat.iter().flat_map(|f| &f.triangles).for_each(|&t| taken[t as usize] = true);
     let (rest, number) = part(mesh, |t| !taken[t as usize]);
     let mut flattened = match config.front {
-        _ if rest.triangles.is_empty() => Flattened::default(),
+        _ if rest.triangles.is_empty() => ChartSet::default(),
         Some(front) => divide_around(&rest, front, monitor)?,
         None => divide(&rest, monitor)?,
     }

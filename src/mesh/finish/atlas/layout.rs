@@ -1,4 +1,4 @@
-//! What is asked of a way to lay out a mesh, and what it returns.
+//! The size and gutter of an atlas, and its layout before it is checked.
 
 use crate::Result;
 use crate::geom::Atlas;

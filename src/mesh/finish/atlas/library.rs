@@ -18,14 +18,14 @@ pub(super) const STRETCHED: f32 = 4.0;
 
 /// The charts of a mesh, and the triangles that got none because they have no area.
 #[derive(Default)]
-pub(super) struct Flattened {
+pub(super) struct ChartSet {
     pub charts: Vec<Flat>,
     pub without: Vec<u32>,
 }
 
-impl Flattened {
+impl ChartSet {
     /// The same for a mesh in which triangle `t` is `number[t]`.
-    pub fn renumbered(mut self, number: &[u32]) -> Flattened {
+    pub fn renumbered(mut self, number: &[u32]) -> ChartSet {
         let triangles = self.charts.iter_mut().flat_map(|c| &mut c.triangles).chain(&mut self.without);
         triangles.for_each(|t| *t = number[*t as usize]);
         self
@@ -40,7 +40,7 @@ pub(super) fn flatten(
     labels: Option<&[u32]>,
     most_stretched: f32,
     monitor: &dyn Monitor,
-) -> Result<Flattened> {
+) -> Result<ChartSet> {
     let (positions, indices, uvs) = divided(mesh, labels);
     let area: f64 = (0..mesh.triangles.len() as u32).map(|t| mesh.area(t)).sum();
     if !(area > 0.0 && area.is_finite()) {
@@ -99,7 +99,7 @@ fn divided(mesh: &Mesh, labels: Option<&[u32]>) -> (Vec<[f32; 3]>, Vec<u32>, Opt
     (positions, indices, Some(uvs))
 }
 
-fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<Flattened> {
+fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<ChartSet> {
     let mut charts: Vec<Flat> = Vec::new();
     let mut without = Vec::new();
     let mut number_of: HashMap<u32, u32> = HashMap::new();
@@ -138,7 +138,7 @@ fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<Flattened> {
         flat.triangles.push(t as u32);
         flat.corners.push(corner);
     }
-    Ok(Flattened { charts, without })
+    Ok(ChartSet { charts, without })
 }
 
 /// Why there will be no charts.

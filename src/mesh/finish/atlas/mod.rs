@@ -52,7 +52,7 @@ pub struct AtlasReport {
 }
 
 impl AtlasReport {
-    /// What a person should know, in sentences.
+    /// Returns what a person should know, one sentence each.
     pub fn warnings(&self) -> Vec<String> {
         let mut out = Vec::new();
         if let Some(reason) = &self.fallback {

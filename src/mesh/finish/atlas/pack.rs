@@ -40,7 +40,7 @@ impl ChartPose {
 }
 
 /// A chart as drawn in one direction.
-struct Drawn {
+struct TurnedMask {
     mask: Mask,
     turn: DVec2,
     /// Lowest coordinates of the turned chart.
@@ -98,7 +98,7 @@ pub(super) fn pack(
         if let Some((drawn, layout, side, reach)) = found {
             let cell = room / side as f64;
             let place = |(chart, &(turn, x, y)): (usize, &(usize, usize, usize))| {
-                let Drawn { turn, low, .. } = drawn[chart][turn];
+                let TurnedMask { turn, low, .. } = drawn[chart][turn];
                 // The page begins a gutter from the border, the chart its reach from its shape's corner.
                 let corner = (DVec2::new(x as f64, y as f64) + reach) * cell + gutter_px;
                 ChartPose { turn, scale: scale * cell, offset: corner - low * (scale * cell) }
@@ -116,12 +116,12 @@ fn bounds(outline: &[[DVec2; 2]], turn: DVec2) -> (DVec2, DVec2) {
 }
 
 /// Each chart in each direction, `scale` cells a unit.
-fn draw(outlines: &[Vec<[DVec2; 2]>], scale: f64, reach: f64, turns: usize) -> Vec<Vec<Drawn>> {
+fn draw(outlines: &[Vec<[DVec2; 2]>], scale: f64, reach: f64, turns: usize) -> Vec<Vec<TurnedMask>> {
     let drawn = |outline: &[[DVec2; 2]], k: usize| {
         let turn = DVec2::from_angle(std::f64::consts::TAU * k as f64 / turns as f64);
         let (low, high) = bounds(outline, turn);
         let sides: Vec<_> = outline.iter().map(|s| s.map(|p| (turn.rotate(p) - low) * scale)).collect();
-        Drawn { mask: Mask::of(&sides, (high - low) * scale, reach), turn, low }
+        TurnedMask { mask: Mask::of(&sides, (high - low) * scale, reach), turn, low }
     };
     outlines.par_iter().map(|outline| (0..turns).map(|k| drawn(outline, k)).collect()).collect()
 }
@@ -129,7 +129,7 @@ fn draw(outlines: &[Vec<[DVec2; 2]>], scale: f64, reach: f64, turns: usize) -> V
 /// The smallest side found at which everything fits, from `start` on, at most `most`; `order` becomes the one that
 /// did it.
 fn smallest(
-    drawn: &[Vec<Drawn>],
+    drawn: &[Vec<TurnedMask>],
     order: &mut Vec<usize>,
     start: usize,
     most: usize,
@@ -171,13 +171,13 @@ fn smallest(
 }
 
 /// Places charts one after the other on a square of `side` cells.
-fn lay_out(drawn: &[Vec<Drawn>], order: &[usize], side: usize) -> Option<CellPlaces> {
+fn lay_out(drawn: &[Vec<TurnedMask>], order: &[usize], side: usize) -> Option<CellPlaces> {
     let mut page = Page::new(side);
     let mut layout = vec![(0, 0, 0); drawn.len()];
     for &chart in order {
         let mut limit = usize::MAX;
         let mut place = None;
-        for (turn, Drawn { mask, .. }) in drawn[chart].iter().enumerate() {
+        for (turn, TurnedMask { mask, .. }) in drawn[chart].iter().enumerate() {
             if let Some((x, y)) = page.find(mask, limit) {
                 limit = y + mask.height;
                 place = Some((turn, x, y));

@@ -23,7 +23,7 @@ const MEMORY: usize = 5;
 const REST: f64 = 4.01;
 
 /// The surface's side of a triangle, as the energy needs it.
-struct Rest {
+struct RestTriangle {
     /// Its corners, into the chart's points.
     corners: [u32; 3],
     area: f64,
@@ -44,7 +44,7 @@ pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
         let area = (0.5 * u.cross(v).length()).max(5e-7 * u.length_squared().max(v.length_squared()));
         whole += area;
         let half = 0.5 / area;
-        rest.push(Rest {
+        rest.push(RestTriangle {
             corners,
             area,
             g11: half * u.length_squared(),
@@ -63,7 +63,7 @@ pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
     descend(&rest, &mut flat.points, rounds, whole);
 }
 
-fn energy(rest: &[Rest], points: &[DVec2], slope: Option<&mut [DVec2]>) -> f64 {
+fn energy(rest: &[RestTriangle], points: &[DVec2], slope: Option<&mut [DVec2]>) -> f64 {
     let mut sum = 0.0;
     let mut slope = slope;
     if let Some(s) = slope.as_deref_mut() {
@@ -95,7 +95,7 @@ fn energy(rest: &[Rest], points: &[DVec2], slope: Option<&mut [DVec2]>) -> f64 {
 }
 
 /// How far along `step` the first triangle loses its area.
-fn reach(rest: &[Rest], points: &[DVec2], step: &[DVec2]) -> f64 {
+fn reach(rest: &[RestTriangle], points: &[DVec2], step: &[DVec2]) -> f64 {
     let mut nearest = f64::INFINITY;
     for r in rest {
         let [i, j, k] = r.corners.map(|c| c as usize);
@@ -132,7 +132,7 @@ fn dot(a: &[DVec2], b: &[DVec2]) -> f64 {
 }
 
 /// L-BFGS (Nocedal & Wright, algorithm 7.4) with steps that halve until the energy falls enough (Armijo).
-fn descend(rest: &[Rest], points: &mut Vec<DVec2>, rounds: usize, area: f64) {
+fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: f64) {
     let n = points.len();
     let mut slope = vec![DVec2::ZERO; n];
     let mut now = energy(rest, points, Some(&mut slope));
@@ -226,7 +226,7 @@ mod tests {
         (mesh, flat)
     }
 
-    fn rest_of(mesh: &Mesh, flat: &Flat) -> Vec<Rest> {
+    fn rest_of(mesh: &Mesh, flat: &Flat) -> Vec<RestTriangle> {
         let mut alone = flat.clone();
         relax(mesh, &mut alone, 0);
         flat.triangles
@@ -237,7 +237,7 @@ mod tests {
                 let (u, v) = (b - a, c - a);
                 let area = 0.5 * u.cross(v).length();
                 let g = |x: f64| 0.5 * x / area;
-                Rest {
+                RestTriangle {
                     corners,
                     area,
                     g11: g(u.length_squared()),
@@ -267,7 +267,7 @@ mod tests {
         let (mesh, flat) = quarter();
         let rest = rest_of(&mesh, &flat);
         // one triangle mapped by singular values 2 and ½: ½ · (4 + ¼) · 2 = 4.25 with area ½
-        let one = Rest { corners: [0, 1, 2], area: 0.5, g11: 1.0, g22: 1.0, g12: 0.0 };
+        let one = RestTriangle { corners: [0, 1, 2], area: 0.5, g11: 1.0, g22: 1.0, g12: 0.0 };
         let points = [DVec2::ZERO, DVec2::new(2.0, 0.0), DVec2::new(0.0, 0.5)];
         assert!((energy(&[one], &points, None) - 4.25).abs() < 1e-12);
         let mut slope = vec![DVec2::ZERO; flat.points.len()];
@@ -305,7 +305,7 @@ mod tests {
 
     #[test]
     fn the_reach_ends_where_the_first_triangle_has_no_area() {
-        let one = Rest { corners: [0, 1, 2], area: 0.5, g11: 1.0, g22: 1.0, g12: 0.0 };
+        let one = RestTriangle { corners: [0, 1, 2], area: 0.5, g11: 1.0, g22: 1.0, g12: 0.0 };
         let points = [DVec2::ZERO, DVec2::X, DVec2::Y];
         let step = [DVec2::ZERO, DVec2::ZERO, DVec2::new(0.0, -0.25)];
         // the height falls by a quarter a unit

@@ -76,7 +76,7 @@ const STAND_INS: usize = 3;
 /// Directions to the cameras that see each point, all in one list.
 #[derive(Default)]
 pub struct ViewDirections {
-    /// Does any camera see point `i`? Else its directions are those of the cameras that come nearest to it.
+    /// Whether any camera sees point `i`; else its directions are those of the cameras that come nearest to it.
     pub known: Vec<bool>,
     /// Directions of point `i`.
     pub counts: Vec<u32>,
@@ -155,7 +155,7 @@ impl Visibility<'_> {
     }
 }
 
-/// Is a point within a camera's picture?
+/// Whether a point is within a camera's picture.
 fn in_frame(camera: &Camera, p: Vec3) -> bool {
     let (w, h) = (camera.width as f32, camera.height as f32);
     camera.project(p).is_some_and(|(at, _)| (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y))
@@ -167,7 +167,7 @@ pub struct Shades {
     pub linear: Vec<[f32; 3]>,
     /// `[n, functions]` lobes; empty without.
     pub lobes: Vec<[f32; 3]>,
-    /// `[n]` does any camera see it?
+    /// `[n]` whether any camera sees it.
     pub seen: Vec<bool>,
 }
 

@@ -114,7 +114,7 @@ impl Star {
         true
     }
 
-    /// Would the triangles that stay be sound with the new vertex at `x`?
+    /// Returns whether the triangles that stay would be sound with the new vertex at `x`.
     pub(super) fn fits(&mut self, rings: &Rings, x: Vec3) -> bool {
         self.leans.clear();
         let mut worst = None;

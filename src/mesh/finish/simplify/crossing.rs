@@ -86,7 +86,7 @@ impl Facet {
         Facet { ids, p, area: (p[1] - p[0]).cross(p[2] - p[0]), bounds: Aabb::around(corners) }
     }
 
-    /// Do the two meet in more than common corners? Triangles without area never do.
+    /// Returns whether the two meet in more than common corners; triangles without area never do.
     fn meets(&self, other: &Facet) -> bool {
         let (a, b) = (&self.bounds, &other.bounds);
         if a.min.cmpgt(b.max).any() || b.min.cmpgt(a.max).any() {
@@ -96,7 +96,7 @@ impl Facet {
         // than their rounding.
         let size = (a.max.max(b.max) - a.min.min(b.min)).length();
         let unsure = 1e-14 * f64::from(size).powi(3);
-        if self.lets_go(other, unsure) || other.lets_go(self, unsure) {
+        if self.is_clear_of(other, unsure) || other.is_clear_of(self, unsure) {
             return false;
         }
         self.area != DVec3::ZERO
@@ -104,8 +104,8 @@ impl Facet {
             && intersect(self.p, self.ids, other.p, other.ids)
     }
 
-    /// Does the other one lie strictly on one side, but for common corners?
-    fn lets_go(&self, other: &Facet, unsure: f64) -> bool {
+    /// Whether the other one lies strictly on one side, but for common corners.
+    fn is_clear_of(&self, other: &Facet, unsure: f64) -> bool {
         let (mut above, mut below) = (false, false);
         for k in 0..3 {
             if self.ids.contains(&other.ids[k]) {
@@ -182,7 +182,7 @@ impl Sheets {
         }
     }
 
-    /// Would these triangles, in the place of `instead`, meet others or one another?
+    /// Returns whether these triangles, in the place of `instead`, would meet others or one another.
     pub(super) fn would_cross(
         &mut self,
         rings: &Rings,

@@ -4,7 +4,7 @@
 //! collapse keeps the link condition, turns no triangle by more than 60° and leaves none thinner than
 //! the thinnest it found (`collapse`), so a closed manifold stays one, of the same genus.
 //!
-//! The field is a network: thousands of points a call are cheap, single ones are not. So it is asked
+//! The field is a network: thousands of points a call are cheap, single ones are not. So it is evaluated
 //! between rounds of collapses: at the vertices and in the middles of triangles, in one batch each (`fit`).
 //! Vertices go to its zero, or where their triangles lie nearest to it, and from there the next round
 //! measures its planes. With an error to keep, a batch at the middles of triangles and edges tells how
@@ -99,9 +99,9 @@ pub struct SimplifyReport {
     pub held: usize,
     /// Triangles with a repeated vertex, left out.
     pub degenerate: usize,
-    /// Vertices that moved less than the field asked, because a triangle would have been spoiled.
+    /// Vertices that moved less than the field wanted, because a triangle would have been spoiled.
     pub held_back: usize,
-    /// Points the field was asked at.
+    /// Points at which the field was evaluated.
     pub asked: usize,
     /// How often the work began anew because of self-intersections.
     pub again: usize,
@@ -115,7 +115,7 @@ pub struct SimplifyReport {
 }
 
 impl SimplifyReport {
-    /// What a person should hear about, one sentence each.
+    /// Returns what a person should know, one sentence each.
     pub fn warnings(&self, config: &SimplifyConfig) -> Vec<String> {
         let mut out = Vec::new();
         if config.triangles > 0 && self.after > config.triangles && config.error == 0.0 {

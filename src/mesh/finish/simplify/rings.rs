@@ -119,7 +119,7 @@ impl Rings {
         (0..self.triangles.len() as u32).filter(|&t| self.triangles[t as usize][0] != NONE)
     }
 
-    /// Which corner of a triangle is this vertex? 2 if neither of the first two.
+    /// Returns which corner of a triangle a vertex is; 2 if neither of the first two.
     pub(super) fn corner_of(&self, t: u32, v: u32) -> usize {
         self.triangles[t as usize][..2].iter().position(|&w| w == v).unwrap_or(2)
     }

@@ -33,7 +33,7 @@ pub(super) enum CrossingSearch<'a> {
 }
 
 impl CrossingSearch<'_> {
-    /// Is a collapse here to be tested?
+    /// Returns whether a collapse here is to be tested.
     fn at(&self, p: Vec3) -> bool {
         match self {
             CrossingSearch::Nowhere => false,
