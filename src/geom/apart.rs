@@ -1,6 +1,6 @@
 //! How far the charts of an atlas are apart.
 
-use crate::geom::{Boxes, DBox, EFFORT, share_out};
+use super::boxes::{Boxes, DBox, EFFORT, share_out};
 use glam::DVec2;
 
 /// A piece of a chart's outline, in texels.

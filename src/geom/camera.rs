@@ -3,7 +3,8 @@
 //! Camera axes are OpenGL's (+X right, +Y up, looking along −Z). A pixel's centre is at +0.5 and
 //! (0, 0) is the top-left corner of the picture.
 
-use super::{Ray, Similarity};
+use super::ray::Ray;
+use super::similarity::Similarity;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 

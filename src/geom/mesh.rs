@@ -1,7 +1,8 @@
 //! A triangle mesh with what the pipeline attaches to its vertices.
 
+use super::aabb::Aabb;
+use super::similarity::Similarity;
 use super::topology::topology;
-use super::{Aabb, Similarity};
 use glam::Vec3;
 
 /// Triangles over shared vertices, counter-clockwise seen from outside.

@@ -5,7 +5,7 @@
 //! of f32 coordinates, exact after Shewchuk (1997). So triangles that share a side or a corner, or merely touch, never
 //! count.
 
-use crate::geom::{Boxes, DBox, share_out};
+use super::boxes::{Boxes, DBox, share_out};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 

@@ -8,6 +8,9 @@ use crate::geom::Atlas;
 use glam::Vec2;
 use std::ops::Range;
 
+/// Rows baked together.
+pub const ROWS: u32 = 32;
+
 /// One sample of a texel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sample {

@@ -3,7 +3,7 @@
 //! A texel holds `(x, y, z)` with `n = x t + y b + z m`, where `m` is the mesh's interpolated normal, `t` its
 //! tangent along u and `b = w · m × t` its bitangent up the picture (MikkTSpace, Mikkelsen 2008; OpenGL's +Y).
 
-use super::cover::Bands;
+use super::cover::{Bands, ROWS};
 use super::fill::fill;
 use crate::geom::{Atlas, Mesh};
 use crate::image::{Image, Photo};
@@ -22,7 +22,7 @@ pub fn tangent_space(
     let (width, height) = (atlas.width, atlas.height);
     let mut out = Image::new(width, height, 3);
     let mut covered = vec![false; width as usize * height as usize];
-    let bands = Bands::new(atlas, super::ROWS);
+    let bands = Bands::new(atlas, ROWS);
     for band in 0..bands.len() {
         for group in bands.samples(atlas, band, 1).chunk_by(|a, b| a.texel == b.texel) {
             let s = group[0];

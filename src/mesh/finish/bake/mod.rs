@@ -24,7 +24,7 @@ use crate::geom::{Atlas, Bvh, Camera, Mesh, area_vector};
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::mesh::input::setting;
 use crate::{Monitor, Result};
-use cover::{Bands, Sample};
+use cover::{Bands, ROWS, Sample};
 use glam::{Mat3, Vec3};
 use light::{SurfacePoints, Visibility, settle, shade};
 use serde::{Deserialize, Serialize};
@@ -78,9 +78,6 @@ pub struct BakeReport {
     /// How long it took.
     pub seconds: f64,
 }
-
-/// Rows baked together.
-const ROWS: u32 = 32;
 
 /// SurfacePoints handed to the field at once.
 const BATCH: usize = 1 << 17;

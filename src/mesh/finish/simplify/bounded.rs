@@ -5,8 +5,8 @@
 //! is measured: at corners, middles of edges and of triangles. A round that went too far is undone and
 //! repeated with a smaller part. A ball takes 2.2 to 2.4 times the fewest triangles that would do.
 
+use super::options::{SimplifyReport, VertexPlacement};
 use super::round::{Task, prepare, reduce, settle};
-use super::{SimplifyReport, VertexPlacement};
 use crate::Result;
 use crate::geom::Mesh;
 use crate::mesh::input::evaluate;
