@@ -26,7 +26,7 @@ pub use json::{parse_json, read_json, read_typed, typed};
 pub use limits::Limits;
 pub use npy::{Npy, NpyValues, parse_npy, read_npy};
 pub use pictures::{
-    PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, read_gray, read_photo,
+    PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, png_bytes, read_gray, read_photo,
     write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
 };
 pub use read::read_bytes;

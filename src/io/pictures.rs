@@ -291,13 +291,13 @@ pub fn read_gray(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> 
     Ok(Gray { width, height, values })
 }
 
-fn write_png(
+fn png(
     path: &Path,
     width: u32,
     height: u32,
     bytes: &[u8],
     color: ExtendedColorType,
-) -> Result<(), WriteError> {
+) -> Result<Vec<u8>, WriteError> {
     let content = |problem: String| WriteError::content(path, problem);
     let needed = width as u64 * height as u64 * color.bits_per_pixel() as u64 / 8;
     if needed != bytes.len() as u64 || needed == 0 {
@@ -308,7 +308,22 @@ fn write_png(
     PngEncoder::new_with_quality(&mut out, CompressionType::Default, FilterType::Adaptive)
         .write_image(bytes, width, height, color)
         .map_err(|e| content(e.to_string()))?;
-    write_atomic(path, &out)
+    Ok(out)
+}
+
+fn write_png(
+    path: &Path,
+    width: u32,
+    height: u32,
+    bytes: &[u8],
+    color: ExtendedColorType,
+) -> Result<(), WriteError> {
+    write_atomic(path, &png(path, width, height, bytes, color)?)
+}
+
+/// A photograph as the bytes of a PNG file, without its alpha. `path` is for messages only.
+pub fn png_bytes(photo: &Photo, path: &Path) -> Result<Vec<u8>, WriteError> {
+    png(path, photo.width, photo.height, photo.rgb.as_flattened(), ExtendedColorType::Rgb8)
 }
 
 /// Writes an 8-bit RGB PNG, sRGB-coded.

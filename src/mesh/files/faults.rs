@@ -61,7 +61,7 @@ pub(super) fn wrong_option(what: &str, found: impl ToString, expected: &str) -> 
     Error::cannot(format!("`{what}` is {}, expected {expected}", found.to_string()), hint)
 }
 
-/// A picture that does not fit its own size, the atlas, or its encoder.
+/// A picture that does not fit its own size or the atlas.
 pub(super) fn wrong_picture(what: &str, found: String, expected: &str) -> Error {
     let hint = "bake it again, for this atlas";
     Error::cannot(format!("the {what} is {found}, expected {expected}"), hint)

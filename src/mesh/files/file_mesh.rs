@@ -12,17 +12,15 @@
 //! everything, so there vertices are split where corners disagree. The copies are bit-identical in
 //! position and normal: welding equal positions closes the surface again.
 
-use super::faults::{check_atlas, check_indices, not_finite, wrong_length, wrong_option, wrong_picture};
+use super::faults::{check_atlas, check_indices, not_finite, wrong_length, wrong_option};
 use super::tangents;
 use super::texture::HeadTexture;
 use crate::geom::{Mesh, Similarity};
 use crate::image::Photo;
-use crate::{Error, Result};
+use crate::{Error, Result, io};
 use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
-use image::codecs::jpeg::JpegEncoder;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
 use std::collections::HashMap;
+use std::path::Path;
 
 /// How a mesh leaves the dataset's world, and what its files are called.
 #[derive(Clone, Debug, PartialEq)]
@@ -282,25 +280,12 @@ pub(super) fn encode(
     picture: &Photo,
     jpeg_quality: Option<u8>,
 ) -> Result<(Vec<u8>, &'static str)> {
-    let (rgb, w, h) = (picture.rgb.as_flattened(), picture.width, picture.height);
-    let mut bytes = Vec::new();
-    let (done, ending) = match jpeg_quality {
-        None => {
-            let encoder =
-                PngEncoder::new_with_quality(&mut bytes, CompressionType::Default, FilterType::Adaptive);
-            (encoder.write_image(rgb, w, h, ExtendedColorType::Rgb8), "png")
-        }
-        Some(quality) => {
-            if !(1..=100).contains(&quality) {
-                return Err(wrong_option("quality", quality, "1 to 100"));
-            }
-            let encoder = JpegEncoder::new_with_quality(&mut bytes, quality);
-            (encoder.write_image(rgb, w, h, ExtendedColorType::Rgb8), "jpg")
-        }
-    };
-    let found = |e| format!("{w} × {h} pixels: {e}");
-    done.map_err(|e| wrong_picture(what, found(e), &format!("something a .{ending} can hold")))?;
-    Ok((bytes, ending))
+    let name = Path::new(what); // of no file yet
+    match jpeg_quality {
+        None => Ok((io::png_bytes(picture, name)?, "png")),
+        Some(quality @ 1..=100) => Ok((io::jpeg_bytes(picture, quality, name)?, "jpg")),
+        Some(quality) => Err(wrong_option("quality", quality, "1 to 100")),
+    }
 }
 
 /// A name, of a file too, that every reader of OBJ and MTL understands.

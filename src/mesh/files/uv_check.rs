@@ -12,7 +12,10 @@
 //! Texels are square even where the texture is not: all of it is measured in texels.
 
 use super::weld::places;
-use crate::geom::{Atlas, EFFORT, Mesh, OutlineSide, Sets, nearest_charts, overlaps, shared_area, turn};
+use crate::geom::{
+    Atlas, EFFORT, Mesh, OutlineSide, Sets, nearest_charts, overlaps, shared_area, side_ends, sorted_sides,
+    turn,
+};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -142,9 +145,8 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
     let each = || (0..common).filter(|&t| valid[t]);
 
     let joined = Joined::of(mesh, atlas, &valid);
-    let surface = joined.surface;
     report.charts = each().filter(|&t| joined.chart[t] == t as u32).count();
-    report.seam_length = if surface > 0.0 { joined.seams / surface.sqrt() } else { 0.0 };
+    report.seam_length = joined.seam_length(|_, _| true);
 
     let area = |t: usize| {
         let [a, b, c] = px(t);
@@ -220,9 +222,7 @@ pub fn seams_facing(mesh: &Mesh, atlas: &Atlas, front: Vec3) -> f64 {
     };
     let faces =
         |n: Vec3| n.normalize_or_zero().dot(front.normalize_or_zero()) > std::f32::consts::FRAC_1_SQRT_2;
-    let facing = joined.cuts.iter().filter(|(a, b, _)| faces(normal(*a) + normal(*b)));
-    let length = facing.fold(0.0, |sum, c| sum + c.2);
-    if joined.surface > 0.0 { length / joined.surface.sqrt() } else { 0.0 }
+    joined.seam_length(|a, b| faces(normal(a) + normal(b)))
 }
 
 /// Which triangles the texture joins.
@@ -233,48 +233,44 @@ struct Joined {
     rims: Vec<u32>,
     /// Edges of the surface where its texture is cut: the two sides and the length.
     cuts: Vec<(u32, u32, f64)>,
-    /// Length of all of them.
-    seams: f64,
     /// Area of the surface.
     surface: f64,
 }
 
 impl Joined {
+    /// Length of the cuts between those sides, over √area.
+    fn seam_length(&self, between: impl Fn(u32, u32) -> bool) -> f64 {
+        let kept = self.cuts.iter().filter(|(a, b, _)| between(*a, *b));
+        let length = kept.fold(0.0, |sum, cut| sum + cut.2);
+        if self.surface > 0.0 { length / self.surface.sqrt() } else { 0.0 }
+    }
+
     fn of(mesh: &Mesh, atlas: &Atlas, valid: &[bool]) -> Joined {
         let (weld, _) = places(mesh);
-        // + 0 makes −0 and 0 equal
-        let uv = |c: u32, k: u32| {
-            let t = c as usize / 3;
-            atlas.uvs[atlas.triangles[t][(c as usize + k as usize) % 3] as usize] + 0.0
-        };
-        let mut sides: Vec<(u64, u32)> = (0..valid.len())
-            .into_par_iter()
-            .filter(|&t| valid[t])
-            .flat_map_iter(|t| {
-                let v = mesh.triangles[t].map(|i| u64::from(weld[i as usize]));
-                (0..3).map(move |k| {
-                    let (a, b) = (v[k], v[(k + 1) % 3]);
-                    (a.min(b) << 32 | a.max(b), (3 * t + k) as u32)
-                })
-            })
-            .collect();
-        sides.par_sort_unstable();
-        let mut sets = Sets::new(valid.len());
-        let (mut rims, mut cuts, mut seams) = (Vec::new(), Vec::new(), 0.0);
-        let mut keyed: Vec<([[u32; 2]; 2], u32)> = Vec::new();
+        let welded = |i: u32| weld.get(i as usize).copied().unwrap_or(0); // of invalid triangles anything
+        let faces: Vec<[u32; 3]> = mesh.triangles[..valid.len()].iter().map(|t| t.map(welded)).collect();
+        let mut sides = sorted_sides(&faces);
+        sides.retain(|&(_, c)| valid[c as usize / 3]);
+        let corner = |c: u32| (c as usize / 3, c as usize % 3);
         // Corner k of a triangle is followed by k + 1 of the same one.
         let next = |c: u32| c / 3 * 3 + (c + 1) % 3;
-        let vertex = |c: u32| weld[mesh.triangles[c as usize / 3][c as usize % 3] as usize];
+        let uv = |c: u32| {
+            let (t, k) = corner(c);
+            atlas.uvs[atlas.triangles[t][k] as usize] + 0.0 // makes −0 and 0 equal
+        };
+        let mut sets = Sets::new(valid.len());
+        let (mut rims, mut cuts) = (Vec::new(), Vec::new());
+        let mut keyed: Vec<([[u32; 2]; 2], u32)> = Vec::new();
         for run in sides.chunk_by(|a, b| a.0 == b.0) {
             let low = (run[0].0 >> 32) as u32;
             let ends = |c: u32| {
-                let (from, to) = (uv(c / 3 * 3, c % 3), uv(next(c) / 3 * 3, next(c) % 3));
-                if vertex(c) == low { (from, to) } else { (to, from) }
+                let (from, to) = (uv(c), uv(next(c)));
+                if side_ends(&faces, c).0 == low { [from, to] } else { [to, from] }
             };
             // sides with equal ends belong together, however many meet in this edge
             keyed.clear();
             let bits = |p: Vec2| p.to_array().map(f32::to_bits);
-            keyed.extend(run.iter().map(|&(_, c)| (<[Vec2; 2]>::from(ends(c)).map(bits), c)));
+            keyed.extend(run.iter().map(|&(_, c)| (ends(c).map(bits), c)));
             keyed.sort_unstable();
             let mut single = None;
             for group in keyed.chunk_by(|a, b| a.0 == b.0) {
@@ -287,15 +283,13 @@ impl Joined {
             let other = |a: u32| run.iter().map(|r| r.1).find(|&b| b != a);
             let cut = single.and_then(|a| other(a).map(|b| (a, b)));
             if let Some((a, b)) = cut {
-                let [p, q] = [a, next(a)]
-                    .map(|c| mesh.positions[mesh.triangles[c as usize / 3][c as usize % 3] as usize]);
-                let length = p.as_dvec3().distance(q.as_dvec3());
-                cuts.push((a, b, length));
-                seams += length;
+                let [p, q] =
+                    [a, next(a)].map(corner).map(|(t, k)| mesh.positions[mesh.triangles[t][k] as usize]);
+                cuts.push((a, b, p.as_dvec3().distance(q.as_dvec3())));
             }
         }
         let surface = (0..valid.len()).filter(|&t| valid[t]).map(|t| twice_area(mesh, t) / 2.0).sum();
-        Joined { chart: (0..valid.len() as u32).map(|t| sets.find(t)).collect(), rims, cuts, seams, surface }
+        Joined { chart: (0..valid.len() as u32).map(|t| sets.find(t)).collect(), rims, cuts, surface }
     }
 }
 
