@@ -3,7 +3,6 @@
 //! ```text
 //! cargo bench --bench simplify                           202 k to 40 k triangles, 506 k to 100 k
 //! cargo bench --bench simplify -- 245 40000              one of them: nodes along an axis, target
-//! cargo bench --bench simplify -- 245 40000 --rounds 3   with another number of rounds
 //! cargo bench --bench simplify -- --write 245 head       the input as head.vertices, head.triangles
 //! cargo bench --bench simplify -- --read a.vertices a.triangles   the accuracy of another tool's result
 //! ```
