@@ -14,6 +14,7 @@
 //! let mut config = Config::preset(Preset::Draft);
 //! config.capture.path = folder.path().display().to_string();
 //! (config.iface.steps, config.iface.rays, config.iface.samples) = (30, 128, 2048);
+//! (config.iface.levels, config.iface.log2_table) = (8, 12);
 //! (config.mesh.resolution, config.mesh.triangles, config.mesh.texture_px) = (48, 2000, 128);
 //!
 //! let run = Run::quiet(&folder.path().join("run"));
