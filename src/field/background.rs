@@ -1,13 +1,13 @@
-//! The photograph as it would be with the stage switched off.
+//! Foreground estimation: the photograph as it would be over black.
 //!
-//! Where the mask is soft, a photograph mixes head and stage: `photo = α F + (1 − α) B` in linear light. The
-//! published target `α · photo` darkens the head twice there and keeps part of the stage's light. Here the
-//! stage's light `B` is estimated from the pixels nearby that are all stage, and taken away:
+//! Where the mask is soft, a photograph mixes head and background: `photo = α F + (1 − α) B` in linear light. The
+//! published target `α · photo` darkens the head twice there and keeps part of the background's light. Here the
+//! background `B` is estimated from the pixels nearby that are all background, and taken away:
 //! `target over black = coded(α F) = coded(photo − (1 − α) B)`, which is what a render over black shows.
 
 use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 
-/// Half edge of the window that collects stage pixels, as a share of the picture's height.
+/// Half edge of the window that collects background pixels, as a share of the picture's height.
 const WINDOW: f32 = 0.02;
 
 /// Colors over black for every pixel: the photograph where the mask is full, black where it is empty.
@@ -20,11 +20,11 @@ pub fn over_black(photo: &Photo, mask: &Gray) -> Vec<[u8; 3]> {
     let mut out: Vec<[u8; 3]> =
         photo.rgb.iter().zip(&mask.values).map(|(rgb, &a)| if a == 255 { *rgb } else { [0; 3] }).collect();
     let reach = ((WINDOW * h as f32).ceil() as usize).max(2);
-    // large photographs are looked at every few pixels: the stage is smooth
+    // large photographs are looked at every few pixels: the background is smooth
     let stride = (reach / 16).max(1);
     for p in soft {
         let (x, y) = (p % w, p / w);
-        // nearer stage pixels count more; a window without any leaves the stage black
+        // nearer background pixels count more; a window without any leaves it black
         let (mut sum, mut weight) = ([0f32; 3], 0f32);
         for v in (y.saturating_sub(reach)..(y + reach + 1).min(h)).step_by(stride) {
             for u in (x.saturating_sub(reach)..(x + reach + 1).min(w)).step_by(stride) {
@@ -39,8 +39,8 @@ pub fn over_black(photo: &Photo, mask: &Gray) -> Vec<[u8; 3]> {
         }
         let alpha = mask.values[p] as f32 / 255.0;
         out[p] = std::array::from_fn(|c| {
-            let stage = if weight > 0.0 { sum[c] / weight } else { 0.0 };
-            let head = linear[photo.rgb[p][c] as usize] - (1.0 - alpha) * stage;
+            let background = if weight > 0.0 { sum[c] / weight } else { 0.0 };
+            let head = linear[photo.rgb[p][c] as usize] - (1.0 - alpha) * background;
             quantize(srgb_from_linear(head.max(0.0)).min(alpha))
         });
     }
@@ -52,8 +52,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_light_of_the_stage_is_taken_out_of_a_mixed_pixel() {
-        // a row: stage (linear 0.5), mixed half and half, head (linear 0.2)
+    fn the_light_of_the_background_is_taken_out_of_a_mixed_pixel() {
+        // a row: background (linear 0.5), mixed half and half, head (linear 0.2)
         let coded = |l: f32| quantize(srgb_from_linear(l));
         let rgb = [0.5, 0.5, 0.35, 0.2, 0.2].map(|l| [coded(l); 3]).to_vec();
         let photo = Photo { width: 5, height: 1, rgb, alpha: None };

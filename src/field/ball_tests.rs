@@ -2,7 +2,7 @@
 
 use super::checkpoint::newest;
 use super::pixels::TrainView;
-use super::training::Session;
+use super::training::TrainingSession;
 use crate::geom::{Camera, Distortion};
 use crate::image::{Gray, Photo};
 use crate::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
@@ -81,8 +81,8 @@ pub fn session<'a>(
     dir: &'a Path,
     identity: &'a str,
     monitor: &'a dyn Monitor,
-) -> Session<'a> {
-    Session { stage, seed: 3, device: "cpu", dir, identity, monitor }
+) -> TrainingSession<'a> {
+    TrainingSession { stage, seed: 3, device: "cpu", dir, identity, monitor }
 }
 
 /// Asks to stop after so many steps.

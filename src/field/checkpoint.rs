@@ -173,7 +173,7 @@ impl Checkpoint {
 
 /// How far a training has come.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Progress {
+pub struct TrainingProgress {
     /// Optimizer steps done.
     pub step: u64,
     /// Running mean of the squared color error, for the PSNR that is shown.
@@ -182,7 +182,7 @@ pub struct Progress {
     pub salt: u64,
 }
 
-impl Progress {
+impl TrainingProgress {
     /// PSNR of the last batches, dB.
     pub fn psnr(&self) -> f64 {
         -10.0 * self.mean_square.max(1e-12).log10()
@@ -197,7 +197,7 @@ impl Progress {
     }
 
     /// Takes it out of a checkpoint of a training of `steps`, and whether that was finished.
-    pub fn restore(from: &Checkpoint, steps: u64) -> Result<(Progress, bool)> {
+    pub fn restore(from: &Checkpoint, steps: u64) -> Result<(TrainingProgress, bool)> {
         // the format's first writers knew no `finished`
         let finished = from.header.contains_key("finished") && from.number("finished", 0..=1)? == 1;
         // a finished one may have no moments to go on with
@@ -208,7 +208,7 @@ impl Progress {
             let expected = "the bits of a finite number, 0 or more";
             return Err(from.unexpected(key, mean_square, expected));
         }
-        Ok((Progress { step, mean_square, salt: from.number("salt", 0..=1)? }, finished))
+        Ok((TrainingProgress { step, mean_square, salt: from.number("salt", 0..=1)? }, finished))
     }
 }
 

@@ -191,36 +191,20 @@ fn drawable(view: &TrainView, reach: Reach) -> (u32, u32, u32, u32, Vec<u64>) {
 
 /// Pixels with a non-zero value within a square of half edge `margin`: two one-dimensional passes.
 fn dilated(values: &[u8], w: usize, h: usize, margin: usize) -> Vec<bool> {
-    let spread = |line: &mut dyn FnMut(usize) -> bool, n: usize| -> Vec<bool> {
-        let mut out = vec![false; n];
-        let mut last: Option<usize> = None;
-        let source: Vec<bool> = (0..n).map(&mut *line).collect();
-        for i in 0..n {
-            if source[i] {
-                last = Some(i);
+    let mut near: Vec<bool> = values.iter().map(|&v| v > 0).collect();
+    for (lines, step, n, stride) in [(h, w, w, 1), (w, 1, h, w)] {
+        for first in (0..lines).map(|line| line * step) {
+            // a marked pixel reaches as far ahead as it does behind; what is done is not done again
+            let marked: Vec<usize> = (0..n).filter(|i| near[first + i * stride]).collect();
+            let mut done = 0;
+            for i in marked {
+                let end = (i + margin + 1).min(n);
+                (i.saturating_sub(margin).max(done)..end).for_each(|k| near[first + k * stride] = true);
+                done = end;
             }
-            out[i] |= last.is_some_and(|l| i - l <= margin);
-        }
-        let mut next: Option<usize> = None;
-        for i in (0..n).rev() {
-            if source[i] {
-                next = Some(i);
-            }
-            out[i] |= next.is_some_and(|l| l - i <= margin);
-        }
-        out
-    };
-    let mut rows = Vec::with_capacity(w * h);
-    for y in 0..h {
-        rows.extend(spread(&mut |x| values[y * w + x] > 0, w));
-    }
-    let mut out = vec![false; w * h];
-    for x in 0..w {
-        for (y, v) in spread(&mut |y| rows[y * w + x], h).into_iter().enumerate() {
-            out[y * w + x] = v;
         }
     }
-    out
+    near
 }
 
 #[cfg(test)]

@@ -9,14 +9,14 @@
 //! A field says what a step is. What it keeps between steps (rays, samples, parameters, moments) stays on its
 //! device; only the named figures of a step come to the host, and the whole state when a checkpoint is due.
 
-use super::checkpoint::{self, Checkpoint, Progress};
+use super::checkpoint::{self, Checkpoint, TrainingProgress};
 use crate::{Error, Monitor, Result};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 /// What a training is given besides its photographs and settings.
 #[derive(Clone, Copy)]
-pub struct Session<'a> {
+pub struct TrainingSession<'a> {
     /// The stage, which is the table of its settings: `iface`, `tface` or `baseline`.
     pub stage: &'static str,
     /// Seed of every random number.
@@ -68,26 +68,31 @@ pub trait Learner {
     const RATES: [&'static str; 2];
 
     /// Makes the optimizer step after `progress.step`.
-    fn step(&mut self, progress: &Progress) -> Result<StepReport, StepError>;
+    fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError>;
 
     /// Puts everything needed to go on into a checkpoint; of a finished one only the result is asked.
-    fn save(&self, progress: &Progress, into: &mut Checkpoint, finished: bool) -> Result<(), StepError>;
+    fn save(
+        &self,
+        progress: &TrainingProgress,
+        into: &mut Checkpoint,
+        finished: bool,
+    ) -> Result<(), StepError>;
 
     /// Takes up a checkpoint's state, or the one before the first step.
-    fn restore(&mut self, from: Option<(&mut Checkpoint, &Progress, bool)>) -> Result<(), StepError>;
+    fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError>;
 }
 
 /// Trains until `steps`, saving a checkpoint every `checkpoint_s` seconds. A finished training is left as it is.
 /// Returns how far it came and oddities on the way.
 pub fn train<L: Learner>(
     learner: &mut L,
-    session: &Session,
+    session: &TrainingSession,
     steps: u64,
     checkpoint_s: f64,
-) -> Result<(Progress, Vec<String>)> {
+) -> Result<(TrainingProgress, Vec<String>)> {
     let every = Duration::from_secs_f64(checkpoint_s);
-    let &Session { stage, identity, dir, monitor, .. } = session;
-    let save = |learner: &L, progress: &Progress, finished: bool| -> Result<(), StepError> {
+    let &TrainingSession { stage, identity, dir, monitor, .. } = session;
+    let save = |learner: &L, progress: &TrainingProgress, finished: bool| -> Result<(), StepError> {
         let mut into = Checkpoint::new(stage, L::FORMAT, identity);
         progress.save(&mut into, finished);
         // a poisoned field must not take the place of a good checkpoint
@@ -96,7 +101,7 @@ pub fn train<L: Learner>(
     };
     let restore = |learner: &mut L| {
         checkpoint::restore(dir, stage, L::FORMAT, identity, |file| {
-            let (progress, finished) = Progress::restore(file, steps)?;
+            let (progress, finished) = TrainingProgress::restore(file, steps)?;
             let taken = learner.restore(Some((file, &progress, finished)));
             taken.map_err(|e| failure::<L>(e, stage, progress.step))?;
             Ok(progress)
@@ -105,7 +110,7 @@ pub fn train<L: Learner>(
     let (mut progress, mut warnings) = match restore(learner)? {
         Some(restored) => restored,
         None => {
-            let progress = Progress::default();
+            let progress = TrainingProgress::default();
             // a training that breaks early goes back to here
             let started = learner.restore(None).and_then(|()| save(learner, &progress, false));
             started.map_err(|e| failure::<L>(e, stage, 0))?;
@@ -147,7 +152,7 @@ pub fn train<L: Learner>(
                 };
                 warnings.extend(notes);
                 // other rays, or the same step would break in the same way
-                progress = Progress { salt: 1, ..restored };
+                progress = TrainingProgress { salt: 1, ..restored };
             }
             Err(e) => return Err(failure::<L>(e, stage, step)),
         }

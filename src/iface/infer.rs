@@ -7,7 +7,7 @@ use super::state::{FORMAT, SdfState};
 use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field;
-use crate::field::checkpoint::{self, Checkpoint, Progress};
+use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
 use crate::geom::{Ray, RayResult};
 use crate::kernel::march::{Bitmask, MarchRay, Samples};
 use crate::kernel::mlp::Weights;
@@ -48,7 +48,7 @@ impl IFace {
     /// Loads the field from the checkpoint in a stage folder. `config` and `hull` are those it was trained with.
     pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&Bitmask>) -> Result<IFace> {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
-        Progress::restore(&file, config.steps)?;
+        TrainingProgress::restore(&file, config.steps)?;
         let state = SdfState::restore(config, hull, &mut file, &field::device("cpu")?)?;
         Ok(IFace::new(config, state))
     }
@@ -140,14 +140,7 @@ impl IFace {
         let t = &samples.t[start..offsets[rays.len()] as usize];
         let offsets: Vec<i32> = offsets.iter().map(|&o| o - start as i32).collect();
         let n = t.len();
-        let mut x = Vec::with_capacity(n);
-        let mut d = Vec::with_capacity(n);
-        for (r, ray) in rays.iter().enumerate() {
-            for &t in &t[offsets[r] as usize..offsets[r + 1] as usize] {
-                x.push(std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]));
-                d.push(ray.direction);
-            }
-        }
+        let (x, d) = samples.points(rays, first);
         let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
         let direction: Vec<[f32; 3]> = rays.iter().map(|r| r.direction).collect();
         let steps = vec![dt; n];

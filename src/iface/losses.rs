@@ -52,16 +52,8 @@ pub fn losses(
 ) -> Losses {
     let Marched { batch, samples, dt, masked } = marched;
     let (n, rays) = (samples.t.len(), batch.rays.len());
-    let mut x = vec![0f32; 3 * n];
-    let mut d = vec![0f32; 3 * n];
-    for (r, ray) in batch.rays.iter().enumerate() {
-        for s in samples.offsets[r] as usize..samples.offsets[r + 1] as usize {
-            for a in 0..3 {
-                x[3 * s + a] = ray.origin[a] + samples.t[s] * ray.direction[a];
-                d[3 * s + a] = ray.direction[a];
-            }
-        }
-    }
+    let (x, d) = samples.points(&batch.rays, 0);
+    let rows = |v: Vec<[f32; 3]>| field::tensor(v.into_flattened(), [n, 3], device);
     let directions: Vec<f32> = batch.rays.iter().flat_map(|r| r.direction).collect();
     // target and render over the same background, whatever it is
     let background: Vec<[f32; 3]> = match config.background {
@@ -89,7 +81,7 @@ pub fn losses(
     let head: Tensor<2> =
         field::tensor(batch.color.iter().flatten().copied().collect(), [rays, 3], device).autodiff();
 
-    let out = model.field(shape, field::tensor(x, [n, 3], device), field::tensor(d, [n, 3], device)); // [n, 8]
+    let out = model.field(shape, rows(x), rows(d)); // [n, 8]
     let bundle = ops::RaySamples {
         direction: field::tensor(directions, [rays, 3], device).autodiff(),
         dt: field::tensor(vec![dt; n], [n], device).autodiff(),

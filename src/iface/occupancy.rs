@@ -35,23 +35,6 @@ fn resampled(hull: &Bitmask, resolution: usize) -> Bitmask {
     out
 }
 
-/// `mask` and every cell that touches one of its cells.
-fn grown(mask: &Bitmask) -> Bitmask {
-    let n = mask.resolution;
-    let mut out = mask.clone();
-    // one axis after the other: together all 26 neighbours
-    for stride in [1, n, n * n] {
-        let before = out.clone();
-        for i in 0..n * n * n {
-            let at = i / stride % n;
-            if (at > 0 && before.get(i - stride)) || (at + 1 < n && before.get(i + stride)) {
-                out.set(i, true);
-            }
-        }
-    }
-    out
-}
-
 impl Occupancy {
     /// Starts with all cells of the hull; all cells where there is none. The `band` rule adds one layer of
     /// cells: a surface learned a hair outside the hull would otherwise be entered from behind, and show as
@@ -66,7 +49,7 @@ impl Occupancy {
             None => Bitmask::filled(r, true),
         };
         let allowed = match config.occupancy {
-            OccupancyRule::Band => grown(&allowed),
+            OccupancyRule::Band => allowed.grown(),
             OccupancyRule::Nerfacc => allowed,
         };
         let history = match config.occupancy {

@@ -8,9 +8,9 @@ use super::schedule::{self, march_step};
 use super::state::{FORMAT, SdfState};
 use crate::config::iface::{IfaceConfig, OccupancyRule, Start};
 use crate::field;
-use crate::field::checkpoint::{Checkpoint, Progress};
+use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::pixels::{Batch, Pixels, TrainView};
-use crate::field::training::{self, Learner, Session, StepError, StepReport};
+use crate::field::training::{self, Learner, StepError, StepReport, TrainingSession};
 use crate::kernel::adam::AdamStep;
 use crate::kernel::march::{self, Bitmask};
 use crate::kernel::rng;
@@ -59,7 +59,7 @@ fn shorten(batch: &mut Batch, samples: &mut march::Samples, most: usize) {
 
 struct SdfTraining<'a> {
     config: &'a IfaceConfig,
-    session: Session<'a>,
+    session: TrainingSession<'a>,
     hull: Option<&'a Bitmask>,
     device: Device,
     shape: FieldShape,
@@ -76,7 +76,7 @@ pub fn train(
     views: &[TrainView],
     hull: Option<&Bitmask>,
     config: &IfaceConfig,
-    session: &Session,
+    session: &TrainingSession,
 ) -> Result<(IFace, IfaceReport)> {
     let device = field::device(session.device)?;
     let began = Instant::now();
@@ -109,7 +109,7 @@ impl Learner for SdfTraining<'_> {
     const FORMAT: &'static str = FORMAT;
     const RATES: [&'static str; 2] = ["lr_network", "lr_table"];
 
-    fn step(&mut self, progress: &Progress) -> Result<StepReport, StepError> {
+    fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError> {
         let config = self.config;
         let step = progress.step;
         let seed = self.session.seed ^ progress.salt << 32;
@@ -163,12 +163,12 @@ impl Learner for SdfTraining<'_> {
         Ok(StepReport { square_error, figures })
     }
 
-    fn save(&self, _: &Progress, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {
+    fn save(&self, _: &TrainingProgress, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {
         self.state.save(into);
         Ok(())
     }
 
-    fn restore(&mut self, from: Option<(&mut Checkpoint, &Progress, bool)>) -> Result<(), StepError> {
+    fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
         if let Some((from, ..)) = from {
             self.state = SdfState::restore(self.config, self.hull, from, &self.device)?;
         } else if let (Start::Hull, Some(hull)) = (self.config.start, self.hull) {

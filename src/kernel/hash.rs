@@ -113,6 +113,51 @@ fn axis_weights<const F: bool>(f: [f32; 3]) -> [[f32; 8]; 3] {
     w
 }
 
+/// Features of samples; with `J` their derivatives too.
+#[inline(always)]
+fn gather_samples<const F: bool, const J: bool>(
+    level: &Level,
+    table: &[[f32; 2]],
+    x01: &[[f32; 3]],
+    world: f32,
+    value: &mut [[f32; 2]],
+    jacobian: &mut [[f32; 6]],
+) {
+    let slope = level.scale * world;
+    assert!(table.len() >= level.entries as usize);
+    for (s, p) in x01.iter().enumerate() {
+        let (index, f) = cell::<F>(level, *p);
+        let w = axis_weights::<F>(f);
+        let (mut e0, mut e1) = ([0f32; 8], [0f32; 8]);
+        for k in 0..8 {
+            // SAFETY: `cell` gives indices below `level.entries`, asserted above.
+            let e = unsafe { table.get_unchecked(index[k] as usize) };
+            (e0[k], e1[k]) = (e[0], e[1]);
+        }
+        let mut v = [0f32; 2];
+        let mut j = [0f32; 6];
+        for k in 0..8 {
+            let (yz, xz, xy) = (w[1][k] * w[2][k], w[0][k] * w[2][k], w[0][k] * w[1][k]);
+            let weight = xy * w[2][k];
+            v[0] = fma::<F>(weight, e0[k], v[0]);
+            v[1] = fma::<F>(weight, e1[k], v[1]);
+            if J {
+                let (dx, dy, dz) = (SX[k] * yz, SY[k] * xz, SZ[k] * xy);
+                j[0] = fma::<F>(dx, e0[k], j[0]);
+                j[1] = fma::<F>(dy, e0[k], j[1]);
+                j[2] = fma::<F>(dz, e0[k], j[2]);
+                j[3] = fma::<F>(dx, e1[k], j[3]);
+                j[4] = fma::<F>(dy, e1[k], j[4]);
+                j[5] = fma::<F>(dz, e1[k], j[5]);
+            }
+        }
+        value[s] = v;
+        if J {
+            jacobian[s] = j.map(|d| d * slope);
+        }
+    }
+}
+
 #[inline(always)]
 fn gather_body<const F: bool>(
     level: &Level,
@@ -122,53 +167,9 @@ fn gather_body<const F: bool>(
     value: &mut [[f32; 2]],
     jacobian: Option<&mut [[f32; 6]]>,
 ) {
-    let slope = level.scale * world;
-    assert!(table.len() >= level.entries as usize);
     match jacobian {
-        None => {
-            for (s, p) in x01.iter().enumerate() {
-                let (index, f) = cell::<F>(level, *p);
-                let w = axis_weights::<F>(f);
-                let mut v = [0f32; 2];
-                for k in 0..8 {
-                    // SAFETY: `cell` gives indices below `level.entries`, asserted above.
-                    let e = unsafe { table.get_unchecked(index[k] as usize) };
-                    let weight = w[0][k] * w[1][k] * w[2][k];
-                    v[0] = fma::<F>(weight, e[0], v[0]);
-                    v[1] = fma::<F>(weight, e[1], v[1]);
-                }
-                value[s] = v;
-            }
-        }
-        Some(jacobian) => {
-            for (s, p) in x01.iter().enumerate() {
-                let (index, f) = cell::<F>(level, *p);
-                let w = axis_weights::<F>(f);
-                let (mut e0, mut e1) = ([0f32; 8], [0f32; 8]);
-                for k in 0..8 {
-                    // SAFETY: as above.
-                    let e = unsafe { table.get_unchecked(index[k] as usize) };
-                    (e0[k], e1[k]) = (e[0], e[1]);
-                }
-                let mut v = [0f32; 2];
-                let mut j = [0f32; 6];
-                for k in 0..8 {
-                    let (yz, xz, xy) = (w[1][k] * w[2][k], w[0][k] * w[2][k], w[0][k] * w[1][k]);
-                    let weight = xy * w[2][k];
-                    let (dx, dy, dz) = (SX[k] * yz, SY[k] * xz, SZ[k] * xy);
-                    v[0] = fma::<F>(weight, e0[k], v[0]);
-                    v[1] = fma::<F>(weight, e1[k], v[1]);
-                    j[0] = fma::<F>(dx, e0[k], j[0]);
-                    j[1] = fma::<F>(dy, e0[k], j[1]);
-                    j[2] = fma::<F>(dz, e0[k], j[2]);
-                    j[3] = fma::<F>(dx, e1[k], j[3]);
-                    j[4] = fma::<F>(dy, e1[k], j[4]);
-                    j[5] = fma::<F>(dz, e1[k], j[5]);
-                }
-                value[s] = v;
-                jacobian[s] = j.map(|d| d * slope);
-            }
-        }
+        None => gather_samples::<F, false>(level, table, x01, world, value, &mut []),
+        Some(jacobian) => gather_samples::<F, true>(level, table, x01, world, value, jacobian),
     }
 }
 

@@ -37,6 +37,23 @@ impl Bitmask {
         }
     }
 
+    /// These cells and every cell that touches one of them.
+    pub fn grown(&self) -> Bitmask {
+        let n = self.resolution;
+        let mut out = self.clone();
+        // one axis after the other: together all 26 neighbors
+        for stride in [1, n, n * n] {
+            let before = out.clone();
+            for i in 0..n * n * n {
+                let at = i / stride % n;
+                if (at > 0 && before.get(i - stride)) || (at + 1 < n && before.get(i + stride)) {
+                    out.set(i, true);
+                }
+            }
+        }
+        out
+    }
+
     /// How many cells are occupied.
     pub fn count(&self) -> usize {
         let cells = self.resolution.pow(3);
@@ -62,6 +79,18 @@ pub struct Samples {
     pub offsets: Vec<i32>,
     /// `[samples]` midpoints.
     pub t: Vec<f32>,
+}
+
+impl Samples {
+    /// Positions of the samples of `rays`, which start at ray `first` of all, and their directions.
+    pub fn points(&self, rays: &[MarchRay], first: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
+        let own = |(r, ray): (usize, &MarchRay)| {
+            let MarchRay { origin: o, direction: d, .. } = *ray;
+            let span = self.offsets[first + r] as usize..self.offsets[first + r + 1] as usize;
+            self.t[span].iter().map(move |t| (std::array::from_fn(|a| o[a] + t * d[a]), d))
+        };
+        rays.iter().enumerate().flat_map(own).unzip()
+    }
 }
 
 /// Marches one ray, calling `emit` with the midpoint of every step whose cell is occupied, until

@@ -8,7 +8,7 @@ use crate::capture::{Capture, View};
 use crate::config::{Config, MaskUse, Stage};
 use crate::ensemble::Tile;
 use crate::field::pixels::TrainView;
-use crate::field::training::Session;
+use crate::field::training::TrainingSession;
 use crate::iface::{self, IFace};
 use crate::image::Gray;
 use crate::io::Limits;
@@ -55,8 +55,8 @@ pub(super) fn radiance(
     Ok(json!(report))
 }
 
-fn session<'a>(stage: Stage, config: &'a Config, dir: &'a StageDir) -> Session<'a> {
-    Session {
+fn session<'a>(stage: Stage, config: &'a Config, dir: &'a StageDir) -> TrainingSession<'a> {
+    TrainingSession {
         stage: stage.word(),
         seed: config.seed,
         device: &config.device,

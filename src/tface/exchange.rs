@@ -7,7 +7,7 @@ use super::infer::TFace;
 use super::record::{FORMAT, FieldRecord, NAMES, Placement};
 use super::th::{self, Activation, VmCheckpoint};
 use crate::field::checkpoint::{self, Checkpoint};
-use crate::field::training::Session;
+use crate::field::training::TrainingSession;
 use crate::geom::Similarity;
 use crate::io::Limits;
 use crate::kernel::vm::mask::BoxMask;
@@ -72,7 +72,12 @@ fn field_of(c: &VmCheckpoint, record: &FieldRecord) -> TFace {
 
 /// Takes a published checkpoint as the result of a stage: reads it, places it in the scene and writes it into
 /// the session's folder. `scale` is the length of a dataset unit in the checkpoint's world.
-pub fn import_th(path: &Path, scale: f64, scene_from_world: &Similarity, session: &Session) -> Result<TFace> {
+pub fn import_th(
+    path: &Path,
+    scale: f64,
+    scene_from_world: &Similarity,
+    session: &TrainingSession,
+) -> Result<TFace> {
     let c = th::read_th(path, &Limits::default())?;
     // field = scale · world = scale · (scene − t) / s
     let s = scene_from_world;

@@ -1,6 +1,7 @@
 //! Between steps: the alpha mask is rebuilt, the box shrinks, the grids become finer.
 
-use super::state::{VmState, grids, upsampled_voxels};
+use super::record::grids;
+use super::state::{VmState, upsampled_voxels};
 use crate::config::VmConfig;
 use crate::kernel::vm::mask::BoxMask;
 use crate::kernel::vm::{cropped, density_at, resized, size_for};

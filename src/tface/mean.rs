@@ -18,7 +18,7 @@ use super::TFace;
 use super::train::{self, TfaceReport, train_one};
 use crate::config::{MaskUse, VmConfig, VmStart};
 use crate::field::pixels::{Pixels, TrainView};
-use crate::field::training::{self, Session};
+use crate::field::training::{self, TrainingSession};
 use crate::geom::{Aabb, Ray, RayResult};
 use crate::kernel::march::Bitmask;
 use crate::{Monitor, Result, io};
@@ -78,7 +78,7 @@ pub fn train(
     bounds: Aabb,
     hull: Option<&Bitmask>,
     config: &VmConfig,
-    session: &Session,
+    session: &TrainingSession,
 ) -> Result<TfaceReport> {
     train::check(session.stage, config)?;
     let views = train::masked_as_configured(views, config.masks);
@@ -102,7 +102,7 @@ pub fn train(
             if i == 0 { session.identity.into() } else { format!("{} {}", session.identity, i + 1) };
         io::create_folder(&folder)?;
         let part = Part { monitor: session.monitor, field: i + 1, fields, before };
-        let own = Session {
+        let own = TrainingSession {
             // far from the seeds that people count through
             seed: session.seed ^ (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15),
             dir: &folder,

@@ -1,8 +1,7 @@
 //! A field as it lies in a checkpoint: what it is besides its values, and where its grid lies.
 
-use super::state::{decoder, grids, shading};
 use crate::Result;
-use crate::config::VmConfig;
+use crate::config::{DensityActivation, VmConfig};
 use crate::field::checkpoint::Checkpoint;
 use crate::kernel::vm::mask::{BoxMask, Lattice};
 use crate::kernel::vm::{DecoderShape, Grid, Shading, VmField, samples_across, step_size};
@@ -24,6 +23,37 @@ pub struct Placement {
     /// Ray directions are scaled to depth 1 along the optical axis before the decoder sees them, and steps are
     /// so much longer off the axis: what the published ILSH loader does.
     pub depth_directions: bool,
+}
+
+fn triple(list: &[usize]) -> [usize; 3] {
+    [list[0], list[1], list[2]]
+}
+
+/// Grids of a size: density, appearance.
+pub fn grids(config: &VmConfig, size: [usize; 3]) -> (Grid, Grid) {
+    (Grid { size, rank: triple(&config.density_rank) }, Grid { size, rank: triple(&config.color_rank) })
+}
+
+/// The decoder that a configuration describes.
+pub fn decoder(config: &VmConfig) -> DecoderShape {
+    DecoderShape {
+        channels: config.color_rank.iter().sum(),
+        features: config.features,
+        hidden: config.hidden,
+        view_frequencies: config.view_frequencies,
+        feature_frequencies: config.feature_frequencies,
+    }
+}
+
+/// From features to weights, as configured.
+fn shading(config: &VmConfig) -> Shading {
+    Shading {
+        softplus: config.activation == DensityActivation::Softplus,
+        shift: config.density_shift as f32,
+        distance_scale: config.distance_scale as f32,
+        weight_threshold: config.weight_threshold as f32,
+        stop: config.stop as f32,
+    }
 }
 
 /// What a field is besides its values: enough to render it without the settings it was made with.

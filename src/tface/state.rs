@@ -1,14 +1,14 @@
 //! What is learned, and the grid it lives on.
 
-use super::record::{FieldRecord, NAMES, geometry};
+use super::record::{FieldRecord, NAMES, decoder, geometry, grids};
 use crate::Result;
-use crate::config::{DensityActivation, VmConfig};
+use crate::config::VmConfig;
 use crate::field::checkpoint::Checkpoint;
 use crate::field::parameters::Parameter;
 use crate::kernel::march::Bitmask;
 use crate::kernel::rng;
 use crate::kernel::vm::mask::BoxMask;
-use crate::kernel::vm::{DecoderShape, Grid, Shading, VmField, size_for, voxel_schedule};
+use crate::kernel::vm::{VmField, size_for, voxel_schedule};
 use burn::tensor::Device;
 use std::sync::Arc;
 
@@ -28,26 +28,6 @@ pub struct VmState {
     pub moments_from: u64,
     /// Has the alpha mask been rebuilt at least once?
     pub masked: bool,
-}
-
-fn triple(list: &[usize]) -> [usize; 3] {
-    [list[0], list[1], list[2]]
-}
-
-/// Grids of a size: density, appearance.
-pub fn grids(config: &VmConfig, size: [usize; 3]) -> (Grid, Grid) {
-    (Grid { size, rank: triple(&config.density_rank) }, Grid { size, rank: triple(&config.color_rank) })
-}
-
-/// The decoder that a configuration describes.
-pub fn decoder(config: &VmConfig) -> DecoderShape {
-    DecoderShape {
-        channels: config.color_rank.iter().sum(),
-        features: config.features,
-        hidden: config.hidden,
-        view_frequencies: config.view_frequencies,
-        feature_frequencies: config.feature_frequencies,
-    }
 }
 
 /// Planes and lines 0.1 N(0, 1); matrices and biases U(±1/√fan_in), the last bias 0: as published.
@@ -72,12 +52,8 @@ fn start_values(config: &VmConfig, size: [usize; 3], seed: u64) -> [Vec<f32>; 3]
 }
 
 /// The hull as cells, one cell wider all around.
-fn hull_mask(hull: &Bitmask) -> BoxMask {
-    let r = hull.resolution;
-    let near = |c: usize| c.saturating_sub(1)..(c + 2).min(r);
-    BoxMask::new([-1.0; 3], [1.0; 3], [r; 3], |[x, y, z]| {
-        near(x).any(|x| near(y).any(|y| near(z).any(|z| hull.get((x * r + y) * r + z))))
-    })
+fn hull_mask(hull: &Bitmask) -> Option<BoxMask> {
+    BoxMask::from_bits([-1.0; 3], [1.0; 3], [hull.resolution; 3], hull.grown().bits)
 }
 
 impl VmState {
@@ -94,7 +70,7 @@ impl VmState {
         let mut names = NAMES.into_iter();
         let parameters = start_values(config, size, seed)
             .map(|values| Parameter::new(names.next().unwrap_or_default(), &[values.len()], values, device));
-        let mask = hull.map(hull_mask);
+        let mask = hull.and_then(hull_mask);
         VmState { bounds, size, parameters, mask, reset: 0, moments_from: 0, masked: false }
     }
 
@@ -144,17 +120,6 @@ impl VmState {
             p.restore(from, !finished)?;
         }
         Ok(())
-    }
-}
-
-/// From features to weights, as configured.
-pub fn shading(config: &VmConfig) -> Shading {
-    Shading {
-        softplus: config.activation == DensityActivation::Softplus,
-        shift: config.density_shift as f32,
-        distance_scale: config.distance_scale as f32,
-        weight_threshold: config.weight_threshold as f32,
-        stop: config.stop as f32,
     }
 }
 

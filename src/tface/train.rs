@@ -5,10 +5,10 @@ use super::record::FORMAT;
 use super::state::VmState;
 use crate::config::{MaskLoss, MaskUse, VmBackground, VmConfig};
 use crate::field;
-use crate::field::checkpoint::{Checkpoint, Progress};
+use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::ops::{self, GridPenalty, VmBatch};
 use crate::field::pixels::{Batch, Pixels, TrainView};
-use crate::field::training::{self, Learner, Session, StepError, StepReport};
+use crate::field::training::{self, Learner, StepError, StepReport, TrainingSession};
 use crate::image::Gray;
 use crate::kernel::adam::AdamStep;
 use crate::kernel::march::Bitmask;
@@ -80,7 +80,7 @@ struct Counts {
 
 struct VmTraining<'a> {
     config: &'a VmConfig,
-    session: Session<'a>,
+    session: TrainingSession<'a>,
     device: Device,
     pixels: &'a Pixels<'a>,
     state: VmState,
@@ -94,7 +94,7 @@ pub(super) fn train_one(
     bounds: [[f32; 3]; 2],
     hull: Option<&Bitmask>,
     config: &VmConfig,
-    session: &Session,
+    session: &TrainingSession,
 ) -> Result<TfaceReport> {
     let device = field::device(session.device)?;
     let began = Instant::now();
@@ -179,7 +179,7 @@ impl Learner for VmTraining<'_> {
     const FORMAT: &'static str = FORMAT;
     const RATES: [&'static str; 2] = ["lr_grid", "lr_network"];
 
-    fn step(&mut self, progress: &Progress) -> Result<StepReport, StepError> {
+    fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError> {
         let config = self.config;
         let step = progress.step;
         let seed = self.session.seed ^ progress.salt << 32;
@@ -210,7 +210,12 @@ impl Learner for VmTraining<'_> {
         Ok(StepReport { square_error: Some(rgb), figures })
     }
 
-    fn save(&self, progress: &Progress, into: &mut Checkpoint, finished: bool) -> Result<(), StepError> {
+    fn save(
+        &self,
+        progress: &TrainingProgress,
+        into: &mut Checkpoint,
+        finished: bool,
+    ) -> Result<(), StepError> {
         if !self.state.is_finite() {
             return Err(self.not_finite("grid", f32::NAN, progress.step));
         }
@@ -218,7 +223,7 @@ impl Learner for VmTraining<'_> {
         Ok(())
     }
 
-    fn restore(&mut self, from: Option<(&mut Checkpoint, &Progress, bool)>) -> Result<(), StepError> {
+    fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
         if let Some((from, progress, finished)) = from {
             self.state.restore(self.config, from, progress.step, finished)?;
         }

@@ -11,7 +11,7 @@ const MAX_RANK: usize = 16;
 
 /// One object of a pickle. Text and bytes are places in it.
 #[derive(Debug)]
-pub(super) enum Object {
+pub(super) enum PickleObject {
     None,
     Bool(bool),
     Int(i64),
@@ -157,7 +157,7 @@ impl Global {
 /// Every object of a pickle; they refer to each other by index.
 pub(super) struct Heap<'a> {
     pub(super) pickle: &'a [u8],
-    objects: Vec<Object>,
+    objects: Vec<PickleObject>,
 }
 
 impl<'a> Heap<'a> {
@@ -165,26 +165,26 @@ impl<'a> Heap<'a> {
         Heap { pickle, objects: Vec::new() }
     }
 
-    pub(super) fn get(&self, id: Id) -> &Object {
+    pub(super) fn get(&self, id: Id) -> &PickleObject {
         &self.objects[id as usize] // ids are only made by `add`
     }
 
-    pub(super) fn get_mut(&mut self, id: Id) -> &mut Object {
+    pub(super) fn get_mut(&mut self, id: Id) -> &mut PickleObject {
         &mut self.objects[id as usize]
     }
 
     /// At most one per opcode.
-    pub(super) fn add(&mut self, object: Object) -> Id {
+    pub(super) fn add(&mut self, object: PickleObject) -> Id {
         self.objects.push(object);
         (self.objects.len() - 1) as Id
     }
 
     /// What calling `callable` with `arguments` would give, as data.
     pub(super) fn reduce(&mut self, callable: Id, arguments: Id) -> Result<Id, String> {
-        let &Object::Global(global) = self.get(callable) else {
+        let &PickleObject::Global(global) = self.get(callable) else {
             return Err("something is called that is no function".into());
         };
-        let Object::Tuple(given) = self.get(arguments) else {
+        let PickleObject::Tuple(given) = self.get(arguments) else {
             return Err(format!("{global:?} is called without a tuple of arguments"));
         };
         if given.len() > MAX_RANK {
@@ -195,35 +195,37 @@ impl<'a> Heap<'a> {
             (Global::RebuildTensor, [storage, offset, shape, strides, ..]) => {
                 self.tensor(*storage, *offset, *shape, *strides)
             }
-            (Global::RebuildParameter, [data, ..]) if matches!(self.get(*data), Object::Tensor(_)) => {
+            (Global::RebuildParameter, [data, ..]) if matches!(self.get(*data), PickleObject::Tensor(_)) => {
                 return Ok(*data);
             }
-            (Global::OrderedDict, []) => Some(Object::Dict { ordered: true, pairs: Vec::new() }),
+            (Global::OrderedDict, []) => Some(PickleObject::Dict { ordered: true, pairs: Vec::new() }),
             (Global::Size, [sizes]) => match self.get(*sizes) {
-                Object::Tuple(_) => return Ok(*sizes),
+                PickleObject::Tuple(_) => return Ok(*sizes),
                 _ => None,
             },
             (Global::Reconstruct, [class, ..])
-                if matches!(self.get(*class), Object::Global(Global::NdArray)) =>
+                if matches!(self.get(*class), PickleObject::Global(Global::NdArray)) =>
             {
-                Some(Object::Array(None))
+                Some(PickleObject::Array(None))
             }
             (Global::FromBuffer, [data, number, shape, order]) => {
                 self.array(*shape, *number, matches!(self.text_of(*order), Some(b"F")), *data)
             }
             (Global::Dtype, [code, ..]) => match self.text_of(*code).map(|c| (NumberType::of_numpy(c), c)) {
-                Some((Some(kind), _)) => Some(Object::Dtype(NumpyType { kind, big: false })),
+                Some((Some(kind), _)) => Some(PickleObject::Dtype(NumpyType { kind, big: false })),
                 Some((None, code)) => {
                     return Err(format!("numpy's type `{}` is not read", super::shown(code)));
                 }
                 None => None,
             },
             (Global::Scalar, [number, data]) => match self.get(*number) {
-                Object::Dtype(number) => Some(Object::Scalar(*number, *data)),
+                PickleObject::Dtype(number) => Some(PickleObject::Scalar(*number, *data)),
                 _ => None,
             },
             (Global::Encode, [text, coding]) => match (self.get(*text), self.text_of(*coding)) {
-                (Object::Str(text), Some(b"latin1" | b"latin-1")) => Some(Object::Latin1(text.clone())),
+                (PickleObject::Str(text), Some(b"latin1" | b"latin-1")) => {
+                    Some(PickleObject::Latin1(text.clone()))
+                }
                 _ => None,
             },
             _ => None,
@@ -237,21 +239,21 @@ impl<'a> Heap<'a> {
     /// Gives `target` its state, as `__setstate__` would.
     pub(super) fn build(&mut self, target: Id, state: Id) -> Result<(), String> {
         let items = match self.get(state) {
-            Object::Tuple(items) if items.len() <= MAX_RANK => items.clone(),
+            PickleObject::Tuple(items) if items.len() <= MAX_RANK => items.clone(),
             _ => Vec::new(),
         };
         let made = match self.get(target) {
             // `_metadata`, which `state_dict()` hangs on its dictionary, says nothing about values
-            Object::Dict { .. } => return Ok(()),
-            Object::Array(None) => match items[..] {
+            PickleObject::Dict { .. } => return Ok(()),
+            PickleObject::Array(None) => match items[..] {
                 [_, shape, number, fortran, data] => {
-                    self.array(shape, number, matches!(self.get(fortran), Object::Bool(true)), data)
+                    self.array(shape, number, matches!(self.get(fortran), PickleObject::Bool(true)), data)
                 }
                 _ => None,
             },
-            Object::Dtype(number) => match items.get(1).and_then(|&order| self.text_of(order)) {
-                Some(b"<" | b"|" | b"=") => Some(Object::Dtype(NumpyType { big: false, ..*number })),
-                Some(b">") => Some(Object::Dtype(NumpyType { big: true, ..*number })),
+            PickleObject::Dtype(number) => match items.get(1).and_then(|&order| self.text_of(order)) {
+                Some(b"<" | b"|" | b"=") => Some(PickleObject::Dtype(NumpyType { big: false, ..*number })),
+                Some(b">") => Some(PickleObject::Dtype(NumpyType { big: true, ..*number })),
                 _ => None,
             },
             _ => None,
@@ -266,14 +268,16 @@ impl<'a> Heap<'a> {
     }
 
     /// `('storage', class, key, device, count)`; the device does not matter here.
-    pub(super) fn storage(&self, about: Id) -> Result<Object, String> {
+    pub(super) fn storage(&self, about: Id) -> Result<PickleObject, String> {
         let found = match self.get(about) {
-            Object::Tuple(items) => match items[..] {
+            PickleObject::Tuple(items) => match items[..] {
                 [tag, class, key, _, count] if self.text_of(tag) == Some(b"storage") => {
                     match (self.get(class), self.get(key), self.count(count)) {
-                        (&Object::Global(Global::Storage(kind)), Object::Str(key), Some(count)) => {
-                            Some(Object::Storage { kind, key: key.clone(), count })
-                        }
+                        (
+                            &PickleObject::Global(Global::Storage(kind)),
+                            PickleObject::Str(key),
+                            Some(count),
+                        ) => Some(PickleObject::Storage { kind, key: key.clone(), count }),
                         _ => None,
                     }
                 }
@@ -284,42 +288,49 @@ impl<'a> Heap<'a> {
         found.ok_or_else(|| "a reference to something that is no storage of numbers".into())
     }
 
-    fn tensor(&self, storage: Id, offset: Id, shape: Id, strides: Id) -> Option<Object> {
-        let Object::Storage { .. } = self.get(storage) else { return None };
+    fn tensor(&self, storage: Id, offset: Id, shape: Id, strides: Id) -> Option<PickleObject> {
+        let PickleObject::Storage { .. } = self.get(storage) else { return None };
         let (shape, mut strides) = (self.counts(shape)?, self.counts(strides)?);
         // no step is ever taken along an extent of 1, so its stride may be anything
         strides.iter_mut().zip(&shape).filter(|(_, size)| **size < 2).for_each(|(stride, _)| *stride = 0);
         let offset = self.count(offset)?;
         let view = StridedTensor { storage, offset, shape, strides };
-        (view.shape.len() == view.strides.len()).then(|| Object::Tensor(Box::new(view)))
+        (view.shape.len() == view.strides.len()).then(|| PickleObject::Tensor(Box::new(view)))
     }
 
-    fn array(&self, shape: Id, number: Id, fortran: bool, data: Id) -> Option<Object> {
-        let (&Object::Dtype(number), Object::Bytes(_) | Object::Latin1(_)) =
+    fn array(&self, shape: Id, number: Id, fortran: bool, data: Id) -> Option<PickleObject> {
+        let (&PickleObject::Dtype(number), PickleObject::Bytes(_) | PickleObject::Latin1(_)) =
             (self.get(number), self.get(data))
         else {
             return None;
         };
-        Some(Object::Array(Some(Box::new(NumpyArray { shape: self.counts(shape)?, number, fortran, data }))))
+        Some(PickleObject::Array(Some(Box::new(NumpyArray {
+            shape: self.counts(shape)?,
+            number,
+            fortran,
+            data,
+        }))))
     }
 
     fn text_of(&self, id: Id) -> Option<&[u8]> {
         match self.get(id) {
-            Object::Str(range) => Some(&self.pickle[range.clone()]),
+            PickleObject::Str(range) => Some(&self.pickle[range.clone()]),
             _ => None,
         }
     }
 
     fn count(&self, id: Id) -> Option<usize> {
         match *self.get(id) {
-            Object::Int(value) => usize::try_from(value).ok(),
+            PickleObject::Int(value) => usize::try_from(value).ok(),
             _ => None,
         }
     }
 
     fn counts(&self, id: Id) -> Option<Vec<usize>> {
         match self.get(id) {
-            Object::Tuple(items) if items.len() <= MAX_RANK => items.iter().map(|&i| self.count(i)).collect(),
+            PickleObject::Tuple(items) if items.len() <= MAX_RANK => {
+                items.iter().map(|&i| self.count(i)).collect()
+            }
             _ => None,
         }
     }

@@ -5,7 +5,7 @@
 //! remembered is counted together: a pickle cannot make more than [`MAX_VALUES`] of it.
 
 use super::super::ReadError;
-use super::objects::{Global, Heap, Id, Object};
+use super::objects::{Global, Heap, Id, PickleObject};
 use super::{FORMAT, shown};
 use std::collections::HashMap;
 use std::ops::Range;
@@ -64,20 +64,20 @@ impl<'a> Machine<'a, '_> {
             }
             b'0' => drop(self.pop()?),
             b'1' => drop(self.since_mark()?),
-            b'N' => self.push(Object::None)?,
-            0x88 => self.push(Object::Bool(true))?,
-            0x89 => self.push(Object::Bool(false))?,
+            b'N' => self.push(PickleObject::None)?,
+            0x88 => self.push(PickleObject::Bool(true))?,
+            0x89 => self.push(PickleObject::Bool(false))?,
             b'K' => self.int(1)?,
             b'M' => self.int(2)?,
             b'J' => {
                 let value = self.word(4)? as u32 as i32;
-                self.push(Object::Int(value as i64))?;
+                self.push(PickleObject::Int(value as i64))?;
             }
             0x8a => self.long(1)?,
             0x8b => self.long(4)?,
             b'G' => {
                 let bits = self.word(8)?.swap_bytes(); // big-endian, unlike all the others
-                self.push(Object::Float(f64::from_bits(bits)))?;
+                self.push(PickleObject::Float(f64::from_bits(bits)))?;
             }
             b'X' => self.text(4)?,
             0x8c => self.text(1)?,
@@ -85,12 +85,12 @@ impl<'a> Machine<'a, '_> {
             b'B' => self.bytes(4)?,
             b'C' => self.bytes(1)?,
             0x8e | 0x96 => self.bytes(8)?,
-            b'}' => self.push(Object::Dict { ordered: false, pairs: Vec::new() })?,
-            b']' => self.push(Object::List(Vec::new()))?,
-            b')' => self.push(Object::Tuple(Vec::new()))?,
+            b'}' => self.push(PickleObject::Dict { ordered: false, pairs: Vec::new() })?,
+            b']' => self.push(PickleObject::List(Vec::new()))?,
+            b')' => self.push(PickleObject::Tuple(Vec::new()))?,
             b't' => {
                 let items = self.since_mark()?;
-                self.push(Object::Tuple(items))?;
+                self.push(PickleObject::Tuple(items))?;
             }
             0x85..=0x87 => {
                 let mut items = Vec::new();
@@ -98,7 +98,7 @@ impl<'a> Machine<'a, '_> {
                     items.push(self.pop()?);
                 }
                 items.reverse();
-                self.push(Object::Tuple(items))?;
+                self.push(PickleObject::Tuple(items))?;
             }
             b'a' => {
                 let item = self.pop()?;
@@ -136,7 +136,8 @@ impl<'a> Machine<'a, '_> {
                 let name = self.pop()?;
                 let module = self.pop()?;
                 let pickle = self.heap.pickle;
-                let (Object::Str(module), Object::Str(name)) = (self.heap.get(module), self.heap.get(name))
+                let (PickleObject::Str(module), PickleObject::Str(name)) =
+                    (self.heap.get(module), self.heap.get(name))
                 else {
                     return Err(self.bad("the name of a Python object is not text".into()));
                 };
@@ -197,7 +198,7 @@ impl<'a> Machine<'a, '_> {
         Ok(())
     }
 
-    fn push(&mut self, object: Object) -> Result<(), ReadError> {
+    fn push(&mut self, object: PickleObject) -> Result<(), ReadError> {
         let id = self.heap.add(object);
         self.put(id)
     }
@@ -226,7 +227,7 @@ impl<'a> Machine<'a, '_> {
     fn append(&mut self, items: Vec<Id>) -> Result<(), ReadError> {
         let list = self.top()?;
         match self.heap.get_mut(list) {
-            Object::List(old) => old.extend(items),
+            PickleObject::List(old) => old.extend(items),
             _ => return Err(self.bad("something is appended to what is no list".into())),
         }
         Ok(())
@@ -236,7 +237,7 @@ impl<'a> Machine<'a, '_> {
         let dict = self.top()?;
         let (pairs, rest) = items.as_chunks::<2>();
         match self.heap.get_mut(dict) {
-            Object::Dict { pairs: old, .. } if rest.is_empty() => {
+            PickleObject::Dict { pairs: old, .. } if rest.is_empty() => {
                 old.extend(pairs.iter().map(|&[k, v]| (k, v)))
             }
             _ => return Err(self.bad("keys and values are set in what is no dictionary".into())),
@@ -261,7 +262,7 @@ impl<'a> Machine<'a, '_> {
 
     fn global(&mut self, module: &[u8], name: &[u8]) -> Result<(), ReadError> {
         match Global::named(module, name) {
-            Some(global) => self.push(Object::Global(global)),
+            Some(global) => self.push(PickleObject::Global(global)),
             None => {
                 let (module, name) = (shown(module), shown(name));
                 let at = self.opcode;
@@ -305,7 +306,7 @@ impl<'a> Machine<'a, '_> {
 
     fn int(&mut self, width: usize) -> Result<(), ReadError> {
         let value = self.word(width)?;
-        self.push(Object::Int(value as i64))
+        self.push(PickleObject::Int(value as i64))
     }
 
     /// Two's complement of as many bytes as the file says; none is 0.
@@ -317,7 +318,7 @@ impl<'a> Machine<'a, '_> {
         let spare = 64 - 8 * length as u32;
         let word = self.word(length)?;
         let value = if length == 0 { 0 } else { ((word << spare) as i64) >> spare };
-        self.push(Object::Int(value))
+        self.push(PickleObject::Int(value))
     }
 
     fn text(&mut self, width: usize) -> Result<(), ReadError> {
@@ -326,12 +327,12 @@ impl<'a> Machine<'a, '_> {
         if std::str::from_utf8(&self.heap.pickle[range.clone()]).is_err() {
             return Err(self.bad("text that is not UTF-8".into()));
         }
-        self.push(Object::Str(range))
+        self.push(PickleObject::Str(range))
     }
 
     fn bytes(&mut self, width: usize) -> Result<(), ReadError> {
         let length = self.word(width)?;
         let range = self.range(length)?;
-        self.push(Object::Bytes(range))
+        self.push(PickleObject::Bytes(range))
     }
 }

@@ -1,7 +1,7 @@
 //! From the objects of a pickle to a tree of values; here the numbers are read from their storages.
 
 use super::super::{Limits, ReadError};
-use super::objects::{Heap, Id, NumberType, NumpyArray, NumpyType, Object, StridedTensor};
+use super::objects::{Heap, Id, NumberType, NumpyArray, NumpyType, PickleObject, StridedTensor};
 use super::pickle::MAX_VALUES;
 use super::zip::Archive;
 use super::{FORMAT, TorchNumbers, TorchTensor, TorchValue, shown};
@@ -56,13 +56,13 @@ impl<'a> Builder<'a> {
         }
         let heap = self.heap;
         Ok(match heap.get(id) {
-            Object::None => TorchValue::None,
-            Object::Bool(value) => TorchValue::Bool(*value),
-            Object::Int(value) => TorchValue::Int(*value),
-            Object::Float(value) => TorchValue::Float(*value),
-            Object::List(items) => TorchValue::List(self.items(items, depth)?),
-            Object::Tuple(items) => TorchValue::Tuple(self.items(items, depth)?),
-            Object::Dict { ordered, pairs } => {
+            PickleObject::None => TorchValue::None,
+            PickleObject::Bool(value) => TorchValue::Bool(*value),
+            PickleObject::Int(value) => TorchValue::Int(*value),
+            PickleObject::Float(value) => TorchValue::Float(*value),
+            PickleObject::List(items) => TorchValue::List(self.items(items, depth)?),
+            PickleObject::Tuple(items) => TorchValue::Tuple(self.items(items, depth)?),
+            PickleObject::Dict { ordered, pairs } => {
                 let mut keys = HashSet::new();
                 let mut out = Vec::new();
                 for &(key, value) in pairs {
@@ -77,10 +77,10 @@ impl<'a> Builder<'a> {
                 }
                 if *ordered { TorchValue::OrderedDict(out) } else { TorchValue::Dict(out) }
             }
-            Object::Global(_) | Object::Storage { .. } | Object::Dtype(_) => {
+            PickleObject::Global(_) | PickleObject::Storage { .. } | PickleObject::Dtype(_) => {
                 return Err(self.bad("a class, a storage or a type stands where a value should"));
             }
-            Object::Array(None) => return Err(self.bad("a numpy array without its values")),
+            PickleObject::Array(None) => return Err(self.bad("a numpy array without its values")),
             leaf => {
                 if let Some(value) = self.seen.get(&id) {
                     return Ok(value.clone());
@@ -96,16 +96,16 @@ impl<'a> Builder<'a> {
         items.iter().map(|&id| self.value(id, depth + 1)).collect()
     }
 
-    fn leaf(&mut self, node: &Object) -> Result<TorchValue, ReadError> {
+    fn leaf(&mut self, node: &PickleObject) -> Result<TorchValue, ReadError> {
         match node {
-            Object::Str(range) => {
+            PickleObject::Str(range) => {
                 self.spend(range.len())?;
                 let text = std::str::from_utf8(&self.heap.pickle[range.clone()]);
                 Ok(TorchValue::Str(text.map_err(|e| self.bad(e.to_string()))?.into()))
             }
-            Object::Tensor(view) => Ok(TorchValue::Tensor(Arc::new(self.tensor(view)?))),
-            Object::Array(Some(array)) => Ok(TorchValue::Array(Arc::new(self.array(array)?))),
-            Object::Scalar(number, data) => self.scalar(*number, *data),
+            PickleObject::Tensor(view) => Ok(TorchValue::Tensor(Arc::new(self.tensor(view)?))),
+            PickleObject::Array(Some(array)) => Ok(TorchValue::Array(Arc::new(self.array(array)?))),
+            PickleObject::Scalar(number, data) => self.scalar(*number, *data),
             other => {
                 let bytes = self.bytes(other)?;
                 Ok(TorchValue::Bytes(bytes.into()))
@@ -124,14 +124,14 @@ impl<'a> Builder<'a> {
     }
 
     /// The bytes of a bytes object.
-    fn bytes(&mut self, node: &Object) -> Result<Cow<'a, [u8]>, ReadError> {
+    fn bytes(&mut self, node: &PickleObject) -> Result<Cow<'a, [u8]>, ReadError> {
         let pickle = self.heap.pickle;
         match node {
-            Object::Bytes(range) => {
+            PickleObject::Bytes(range) => {
                 self.spend(range.len())?;
                 Ok(Cow::Borrowed(&pickle[range.clone()]))
             }
-            Object::Latin1(range) => {
+            PickleObject::Latin1(range) => {
                 self.spend(range.len())?;
                 let text = std::str::from_utf8(&pickle[range.clone()]).unwrap_or_default();
                 let narrow: Result<Vec<u8>, _> = text.chars().map(|c| u8::try_from(c as u32)).collect();
@@ -142,7 +142,7 @@ impl<'a> Builder<'a> {
     }
 
     fn tensor(&mut self, view: &StridedTensor) -> Result<TorchTensor, ReadError> {
-        let Object::Storage { kind, key, count } = self.heap.get(view.storage) else {
+        let PickleObject::Storage { kind, key, count } = self.heap.get(view.storage) else {
             return Err(self.bad("a tensor without a storage"));
         };
         let name = shown(&self.heap.pickle[key.clone()]);

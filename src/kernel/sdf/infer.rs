@@ -17,24 +17,18 @@ fn softplus<const F: bool>(v: f32) -> f32 {
     v.max(0.0) + 0.01 * ln_1p::<F>(exp::<F>(-(100.0 * v).abs()))
 }
 
-struct ValueTask<'a> {
-    inputs: Inputs<'a>,
-    /// Which of the geometry network's outputs.
-    output: usize,
-    values: &'a mut [f32],
-}
-
+/// One of the geometry network's outputs.
 #[inline(always)]
-fn value_body<const F: bool>(t: &mut ValueTask, w: &Weights) {
+fn value_body<const F: bool>(inputs: &Inputs, output: usize, values: &mut [f32], w: &Weights) {
     let kp = w.layout.padded();
-    let samples = t.inputs.x.len();
+    let samples = inputs.x.len();
     let mut u = vec![0f32; TILE * kp];
     let mut h = [0f32; TILE * HIDDEN];
-    let w2 = &w.w2.m[t.output * HIDDEN..][..HIDDEN];
+    let w2 = &w.w2.m[output * HIDDEN..][..HIDDEN];
     for tile in 0..samples.div_ceil(TILE) {
         let base = tile * TILE;
         let rows = TILE.min(samples - base);
-        t.inputs.fill(&mut u, kp, base, rows);
+        inputs.fill(&mut u, kp, base, rows);
         gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
         for r in 0..rows {
             let row = &h[r * HIDDEN..][..HIDDEN];
@@ -42,12 +36,14 @@ fn value_body<const F: bool>(t: &mut ValueTask, w: &Weights) {
             for j in 0..HIDDEN {
                 sum[j % 8] += softplus::<F>(row[j] + w.b1[j]) * w2[j];
             }
-            t.values[base + r] = sum.iter().sum::<f32>() + w.b2[t.output];
+            values[base + r] = sum.iter().sum::<f32>() + w.b2[output];
         }
     }
 }
 
-dispatch! { fn value_task / value_body(t: &mut ValueTask, w: &Weights) }
+dispatch! {
+    fn value_task / value_body(inputs: &Inputs, output: usize, values: &mut [f32], w: &Weights)
+}
 
 /// Signed distance alone: a quarter of the work of [`super::forward`]. `[n, 3]` → `[n]`.
 pub fn values(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
@@ -84,8 +80,7 @@ fn output(
         let value = &value[..];
         values.par_chunks_mut(CHUNK).enumerate().for_each(|(i, values)| {
             let own = i * CHUNK..i * CHUNK + values.len();
-            let inputs = Inputs::new(shape, x, value, own);
-            value_task(&mut ValueTask { inputs, output, values }, weights);
+            value_task(&Inputs::new(shape, x, value, own), output, values, weights);
         });
     }
     values

@@ -78,11 +78,11 @@ pub struct VmField {
 
 impl VmField {
     #[inline(always)]
-    fn cell(&self, ray: &MarchRay, t: f32) -> Cell {
+    fn cell(&self, p: [f32; 3]) -> Cell {
         let l = &self.lattice;
         let mut unit = [0f32; 3];
         for a in 0..3 {
-            unit[a] = (ray.origin[a] + t * ray.direction[a] - l.min[a]) / (l.max[a] - l.min[a]);
+            unit[a] = (p[a] - l.min[a]) / (l.max[a] - l.min[a]);
         }
         Cell::new(self.density.size, unit)
     }
@@ -135,7 +135,7 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
         let mut transmittance = 1f32;
         let mut walk = Walk::new(&field.lattice, field.mask.as_ref(), ray);
         while let Some(t) = walk.advance() {
-            let cell = field.cell(ray, t);
+            let cell = field.cell(std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]));
             let feature = lookup.sum::<F>(&cell);
             task.looked_up += 1;
             if !s.softplus && feature <= 0.0 {
@@ -230,19 +230,17 @@ pub fn render(
     Rendered { out, density_samples, color_samples, kept, cells, offsets, colored, decoded }
 }
 
-struct SpreadTask<'a> {
-    cells: &'a [Cell],
-    gradient: &'a [f32],
-    planes: &'a mut [f32],
-    lines: &'a mut [f32],
-    channels: usize,
-}
-
 #[inline(always)]
-fn factors_body<const F: bool>(task: &mut SpreadTask, lookup: &Lookup) {
-    let n = task.channels;
-    for (i, (cell, &g)) in task.cells.iter().zip(task.gradient).enumerate() {
-        let (p, l) = (&mut task.planes[i * n..][..n], &mut task.lines[i * n..][..n]);
+fn factors_body<const F: bool>(
+    cells: &[Cell],
+    gradient: &[f32],
+    planes: &mut [f32],
+    lines: &mut [f32],
+    n: usize,
+    lookup: &Lookup,
+) {
+    for (i, (cell, &g)) in cells.iter().zip(gradient).enumerate() {
+        let (p, l) = (&mut planes[i * n..][..n], &mut lines[i * n..][..n]);
         lookup.factors::<F>(cell, p, l);
         for (p, l) in p.iter_mut().zip(l) {
             (*p, *l) = (g * *l, g * *p);
@@ -250,7 +248,11 @@ fn factors_body<const F: bool>(task: &mut SpreadTask, lookup: &Lookup) {
     }
 }
 
-dispatch! { fn factor_gradients / factors_body(task: &mut SpreadTask, lookup: &Lookup) }
+dispatch! {
+    fn factor_gradients / factors_body(
+        cells: &[Cell], gradient: &[f32], planes: &mut [f32], lines: &mut [f32], n: usize, lookup: &Lookup,
+    )
+}
 
 /// Gradients of a rendered batch: adds those of the grids to `g_density` and `g_color`, returns those of
 /// the decoder's flat weights. `g` is `[rays, 5]`, by [`Rendered::out`].
@@ -297,50 +299,33 @@ pub fn backward(
     let mut planes = Buffer::scratch(cells.len() * n);
     let mut lines = Buffer::scratch(cells.len() * n);
     const CHUNK: usize = 1024;
-    let mut tasks: Vec<SpreadTask> = planes
-        .chunks_mut(CHUNK * n)
-        .zip(lines.chunks_mut(CHUNK * n))
-        .zip(cells.chunks(CHUNK).zip(g_feature.chunks(CHUNK)))
-        .map(|((planes, lines), (cells, gradient))| SpreadTask {
-            cells,
-            gradient,
-            planes,
-            lines,
-            channels: n,
-        })
-        .collect();
-    tasks.par_iter_mut().for_each(|task| factor_gradients(task, &lookup));
-    drop(tasks);
+    planes
+        .par_chunks_mut(CHUNK * n)
+        .zip(lines.par_chunks_mut(CHUNK * n))
+        .zip(cells.par_chunks(CHUNK).zip(g_feature.par_chunks(CHUNK)))
+        .for_each(|((p, l), (cells, g))| factor_gradients(cells, g, p, l, n, &lookup));
     let spread = Spread { cells: &cells, planes: &planes, lines: &lines, stride: n };
     gather::scatter(&field.density, &spread, g_density);
     decoder::decode_backward(&field.color, decoder, decoded, &g_rgb, g_color)
 }
 
-struct DensityTask<'a> {
-    points: &'a [[f32; 3]],
-    out: &'a mut [f32],
-}
-
 #[inline(always)]
-fn density_body<const F: bool>(task: &mut DensityTask, field: &VmField, lookup: &Lookup) {
-    let l = &field.lattice;
-    for (p, out) in task.points.iter().zip(task.out.iter_mut()) {
-        let mut unit = [0f32; 3];
-        for a in 0..3 {
-            unit[a] = (p[a] - l.min[a]) / (l.max[a] - l.min[a]);
-        }
-        *out = field.shading.density::<F>(lookup.sum::<F>(&Cell::new(field.density.size, unit)));
+fn density_body<const F: bool>(points: &[[f32; 3]], out: &mut [f32], field: &VmField, lookup: &Lookup) {
+    for (p, out) in points.iter().zip(out) {
+        *out = field.shading.density::<F>(lookup.sum::<F>(&field.cell(*p)));
     }
 }
 
-dispatch! { fn density_points / density_body(task: &mut DensityTask, field: &VmField, lookup: &Lookup) }
+dispatch! {
+    fn density_points / density_body(points: &[[f32; 3]], out: &mut [f32], field: &VmField, lookup: &Lookup)
+}
 
 /// Densities at points of the field's box, the mask not asked. `[n, 3]` → `[n]`.
 pub fn density_at(field: &VmField, density: &[f32], points: &[[f32; 3]]) -> Vec<f32> {
     let lookup = Lookup::new(&field.density, density);
     let mut out = vec![0f32; points.len()];
-    out.par_chunks_mut(1024).zip(points.par_chunks(1024)).for_each(|(out, points)| {
-        density_points(&mut DensityTask { points, out }, field, &lookup);
-    });
+    out.par_chunks_mut(1024)
+        .zip(points.par_chunks(1024))
+        .for_each(|(out, points)| density_points(points, out, field, &lookup));
     out
 }
