@@ -228,7 +228,7 @@ impl Conflicts {
     /// wrong one has half of all credit, so few views can stand out less.
     fn names(&self, i: usize, left: usize) -> bool {
         let mean = self.credit.iter().sum::<f64>() / left as f64;
-        let times = if left == 2 { 0.0 } else { (left as f64 / 6.0).max(1.2).min(STAND_OUT) };
+        let times = if left == 2 { 0.0 } else { (left as f64 / 6.0).clamp(1.2, STAND_OUT) };
         let own = self.credit[i];
         own > CERTAIN_THRESHOLD || (own > THRESHOLD && own > times * mean)
     }

@@ -137,7 +137,7 @@ fn photos_at_once(
 
 fn photo(capture: &Capture, view: usize, dir: &StageDir) -> Result<Photo> {
     dir.check_stop()?;
-    Ok(capture.views[view].load_photo(&Limits::default())?)
+    capture.views[view].load_photo(&Limits::default())
 }
 
 /// Makes masks of all views from clicks on some, gives them to `keep` in order, and returns a record of the networks

@@ -140,7 +140,7 @@ fn atlas_by(
         monitor.step(STEPS, STEPS, &[("charts", uv.charts as f64), ("used", uv.used)]);
         let report = AtlasReport {
             fallback,
-            repaired: repaired,
+            repaired,
             gutter_px,
             seams_facing: config.front.map(|front| seams_facing(mesh, &atlas, front)),
             uv,

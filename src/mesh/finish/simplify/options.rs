@@ -46,7 +46,7 @@ impl SimplifyConfig {
     }
 }
 
-/// What [`simplify`] did.
+/// What [`simplify`](super::simplify) did.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SimplifyReport {
     /// Triangles given.
