@@ -17,8 +17,6 @@ mod mesh;
 mod metrics;
 mod render;
 mod source;
-#[cfg(test)]
-mod source_tests;
 mod stage;
 mod table;
 mod vm;
@@ -320,6 +318,8 @@ fn show(value: &Value) -> String {
     }
 }
 
+#[cfg(test)]
+mod source_tests;
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -125,6 +125,14 @@ pub fn negative(name: &str) -> impl Fn(&mut Tensors) {
     }
 }
 
+/// A change that gives a vector of whole numbers these values.
+pub fn words(name: &str, values: [u64; 3]) -> impl Fn(&mut Tensors) {
+    move |(tensors, _)| match &mut tensors.get_mut(name).unwrap().1 {
+        TensorValues::U64(words) => words.copy_from_slice(&values),
+        other => panic!("{name}: {other:?}"),
+    }
+}
+
 /// A training that returns its warnings.
 pub type Run<'a> = &'a dyn Fn(&Path, &dyn Monitor) -> Result<Vec<String>>;
 

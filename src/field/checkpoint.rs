@@ -232,26 +232,29 @@ pub fn restore<T>(
             Err(e @ (ReadError::Io { .. } | ReadError::TooLarge { .. })) => return Err(unreadable(e, stage)),
             content => content.map_err(|e| unreadable(e, stage)),
         };
-        let state = content.and_then(|content| {
-            let mut file = Checkpoint::understand(&path, stage, format, content)?;
-            if file.text("identity")? != identity {
-                return Err(file.wrong("it was trained with other settings or inputs".into()));
+        let whole = content.is_ok();
+        let opened = content.and_then(|content| {
+            let file = Checkpoint::understand(&path, stage, format, content)?;
+            match file.text("identity")? {
+                found if found == identity => Ok(file),
+                _ => Err(file.wrong("it was trained with other settings or inputs".into())),
             }
-            read(&mut file)
         });
-        match state {
+        // one of another training, or of another release, is sound
+        let damaged = !whole || opened.is_ok();
+        match opened.and_then(|mut file| read(&mut file)) {
             Ok(state) => {
-                // one that cannot be taken must not take this one's place at the next save
-                if failure.is_some() {
+                // a damaged newest one must not take this one's place at the next save
+                if matches!(failure, Some((_, true))) {
                     remove(&newest(dir))?;
                 }
                 return Ok(Some((state, warnings)));
             }
             Err(e) => {
                 warnings.push(format!("{e}; falling back to the checkpoint before it"));
-                failure.get_or_insert(e);
+                failure.get_or_insert((e, damaged));
             }
         }
     }
-    failure.map_or(Ok(None), Err)
+    failure.map_or(Ok(None), |(e, _)| Err(e))
 }

@@ -7,9 +7,6 @@
 
 pub mod autodiff;
 mod background;
-#[cfg(test)]
-#[path = "ball_tests.rs"]
-pub(crate) mod ball;
 pub mod checkpoint;
 pub mod ops;
 pub mod parameters;
@@ -44,3 +41,7 @@ pub fn tensor<const D: usize>(values: Vec<f32>, shape: [usize; D], device: &Devi
 pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().try_into_vec::<f32>().expect("float tensors of this crate are f32")
 }
+
+#[cfg(test)]
+#[path = "ball_tests.rs"]
+pub(crate) mod ball;

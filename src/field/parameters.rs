@@ -44,6 +44,11 @@ impl Parameter {
             .reshape::<D, [usize; D]>(self.shape.clone().try_into().expect("a shape of D extents"))
     }
 
+    /// Returns its shape.
+    pub fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
     /// How many values there are.
     pub fn len(&self) -> usize {
         self.shape.iter().product()
@@ -104,16 +109,21 @@ impl Parameter {
         }
     }
 
-    /// Takes the values out of a checkpoint, and the moments with them.
-    pub fn restore(&mut self, from: &mut Checkpoint, with_moments: bool) -> Result<()> {
-        let (device, n) = (self.moments[0].device(), self.len());
-        let values = from.floats(&format!("model.{}", self.name), &self.shape)?;
+    /// Takes the values out of a checkpoint, and the moments with them unless nobody goes on from it. `shape` is
+    /// what they must have there; nothing is reserved by it.
+    pub fn restore(&mut self, shape: &[usize], from: &mut Checkpoint, with_moments: bool) -> Result<()> {
+        let device = self.moments[0].device();
+        let values = from.floats(&format!("model.{}", self.name), shape)?;
+        let n = values.len();
+        self.moments = if with_moments {
+            let first = from.floats(&format!("first.{}", self.name), shape)?;
+            let second = from.squares(&format!("second.{}", self.name), shape)?;
+            [first, second].map(|m| tensor(m, [n], &device))
+        } else {
+            [(); 2].map(|_| Tensor::zeros([1], &device))
+        };
         self.value = leaf(tensor(values, [n], &device));
-        if with_moments {
-            let first = from.floats(&format!("first.{}", self.name), &self.shape)?;
-            let second = from.squares(&format!("second.{}", self.name), &self.shape)?;
-            self.moments = [first, second].map(|m| tensor(m, [n], &device));
-        }
+        self.shape = shape.to_vec();
         Ok(())
     }
 }

@@ -6,8 +6,8 @@
 //!                                   → finish
 //! ```
 //!
-//! A field says what a step is. What it keeps between steps (rays, samples, parameters, moments) stays on its
-//! device; only the named figures of a step come to the host, and the whole state when a checkpoint is due.
+//! A field says what a step is and where it keeps what it needs between steps (rays, samples, parameters, moments):
+//! the loop sees named figures after a step, and the whole state when a checkpoint is due, and nothing else.
 
 use super::checkpoint::{self, Checkpoint, TrainingProgress};
 use crate::{Error, Monitor, Result};
@@ -103,7 +103,7 @@ pub fn train<L: Learner>(
         checkpoint::restore(dir, stage, L::FORMAT, identity, |file| {
             let (progress, finished) = TrainingProgress::restore(file, steps)?;
             let taken = learner.restore(Some((file, &progress, finished)));
-            taken.map_err(|e| failure::<L>(e, stage, progress.step))?;
+            taken.map_err(|e| failure::<L>(e, stage, progress.step, false))?;
             Ok(progress)
         })
     };
@@ -113,7 +113,7 @@ pub fn train<L: Learner>(
             let progress = TrainingProgress::default();
             // a training that breaks early goes back to here
             let started = learner.restore(None).and_then(|()| save(learner, &progress, false));
-            started.map_err(|e| failure::<L>(e, stage, 0))?;
+            started.map_err(|e| failure::<L>(e, stage, 0, false))?;
             (progress, Vec::new())
         }
     };
@@ -154,7 +154,7 @@ pub fn train<L: Learner>(
                 // other rays, or the same step would break in the same way
                 progress = TrainingProgress { salt: 1, ..restored };
             }
-            Err(e) => return Err(failure::<L>(e, stage, step)),
+            Err(e) => return Err(failure::<L>(e, stage, step, went_back)),
         }
     }
     checkpoint::finish(dir)?;
@@ -174,16 +174,14 @@ pub fn no_pixels() -> Error {
     )
 }
 
-fn failure<L: Learner>(e: StepError, stage: &str, step: u64) -> Error {
+fn failure<L: Learner>(e: StepError, stage: &str, step: u64, went_back: bool) -> Error {
     match e {
         StepError::Failed(e) => e,
         StepError::NotFinite { term, value, lr } => {
             let [a, b] = L::RATES;
+            let again = if went_back { ", and was again after restoring the last checkpoint" } else { "" };
             Error::cannot(
-                format!(
-                    "the {term} loss is {value} at step {step} (learning rate {lr:.2e}), and was again after \
-                     restoring the last checkpoint"
-                ),
+                format!("the {term} loss is {value} at step {step} (learning rate {lr:.2e}){again}"),
                 format!("lower {stage}.{a} and {stage}.{b}, or start again with another --seed"),
             )
         }

@@ -97,7 +97,7 @@ impl SdfModel {
     /// Takes the model out of a checkpoint.
     pub fn restore(config: &IfaceConfig, from: &mut Checkpoint, device: &Device) -> Result<SdfModel> {
         let mut model = SdfModel::new(config, 0, device);
-        model.0.iter_mut().try_for_each(|p| p.restore(from, true))?;
+        model.0.iter_mut().try_for_each(|p| p.restore(&p.shape().to_vec(), from, true))?;
         Ok(model)
     }
 
@@ -140,5 +140,27 @@ impl SdfModel {
     /// Evaluates the field at points: see [`ops::sdf_field`].
     pub fn field(&self, shape: &Arc<FieldShape>, x: Tensor<2>, direction: Tensor<2>) -> Tensor<2> {
         ops::sdf_field(self.table(), self.weights(), x.autodiff(), direction.autodiff(), shape.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+    use crate::kernel::sdf;
+
+    #[test]
+    fn the_start_is_a_sphere_of_half_the_box_with_unit_gradient() {
+        let config = IfaceConfig { log2_table: 12, levels: 6, ..IfaceConfig::preset(Preset::Draft) };
+        let shape = shape(&config);
+        let (table, w) = SdfModel::new(&config, 7, &Device::flex()).on_host(&shape);
+        let x = [[0.5, 0.0, 0.0], [0.0, -0.9, 0.0], [0.3, 0.3, 0.3]];
+        for ((sdf, n), x) in sdf::gradients(&shape, bytemuck::cast_slice(&table), &w, &x).iter().zip(x) {
+            let r = (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]).sqrt();
+            let slope = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
+            // 64 random directions approximate the norm to some ten percent
+            assert!((sdf - (r - 0.5)).abs() < 0.2, "{sdf} at {r}");
+            assert!((slope - 1.0).abs() < 0.4, "{slope}");
+        }
     }
 }

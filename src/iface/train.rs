@@ -274,7 +274,8 @@ impl SdfTraining<'_> {
             let factor = 0.1f64.powf(step as f64 / STEPS as f64) * ((step + 1) as f64 / 20.0).min(1.0);
             self.descend(loss, factor, step + 1, ("hull", GEOMETRY))?;
             if self.session.monitor.stop() {
-                return Err(StepError::Failed(training::stopped(0, config.steps)));
+                let kept = "before the first step: the fit to the hull starts again";
+                return Err(StepError::Failed(Error::stopped(kept)));
             }
         }
         // training starts with its own moments

@@ -116,8 +116,7 @@ impl VmState {
         let (density, color) = grids(config, self.size);
         let lengths = [density.len(), color.len(), decoder(config).len()];
         for (p, len) in self.parameters.iter_mut().zip(lengths) {
-            p.replace(vec![0.0; len]);
-            p.restore(from, !finished)?;
+            p.restore(&[len], from, !finished)?;
         }
         Ok(())
     }

@@ -3,7 +3,7 @@
 use super::*;
 use crate::config::{DensityActivation, Preset, VmStart};
 use crate::field::ball::{
-    BALL, bytes, hull, negative, refuses, resumes, says, session, tampered, temporary, views,
+    BALL, bytes, hull, negative, refuses, resumes, says, session, tampered, temporary, views, words,
 };
 use crate::field::checkpoint;
 use crate::geom::Aabb;
@@ -78,6 +78,9 @@ fn a_hostile_checkpoint_is_named_and_the_one_before_it_is_taken() {
             ("`moments_from`", &says("moments_from", "18446744073709551615")),
             ("second.color", &negative("second.color")),
             ("`masked`", &says("masked", "2")),
+            // compared with what the file holds before anything of that size is reserved
+            ("`model.density` has shape", &words("size", [1 << 16; 3])),
+            ("`size`", &words("size", [1, 8, 8])),
             ("`salt`", &says("salt", "9")),
             // it would go on without moments
             ("`step`", &says("finished", "1")),

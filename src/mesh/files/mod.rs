@@ -30,8 +30,6 @@ pub(crate) use file_mesh::turn_to_y_up;
 pub use file_mesh::{ExportOptions, ExportedFiles};
 pub use glb::to_glb;
 pub use head::HeadMesh;
-#[cfg(test)]
-pub(crate) use head::tests::head as test_head;
 pub use obj::to_obj;
 pub use obj_read::picture_of_mtl;
 pub use ply::to_ply;
@@ -42,3 +40,6 @@ pub use tangents::tangents;
 pub use texture::{HeadTexture, Lobes};
 pub use uv_check::{NO_AREA_PX, UvReport, seams_facing, uv_check};
 pub use weld::weld;
+
+#[cfg(test)]
+pub(crate) use head::tests::head as test_head;
