@@ -22,7 +22,10 @@ fn tetrahedron() -> Mesh {
 
 /// A GLB of a document and bytes, sizes right.
 fn glb(document: &Value, bin: &[u8]) -> Vec<u8> {
-    let mut json = document.to_string().into_bytes();
+    glb_of(document.to_string().into_bytes(), bin)
+}
+
+fn glb_of(mut json: Vec<u8>, bin: &[u8]) -> Vec<u8> {
     json.resize(json.len().next_multiple_of(4), b' ');
     let total = 28 + json.len() + bin.len();
     let mut out = b"glTF".to_vec();
@@ -124,7 +127,7 @@ fn crooked_glbs_are_named_errors() {
             ),
             "accessor 0: a sparse accessor is not supported",
         ),
-        (with("/accessors/0/sparse", json!({"count": 1})), "the JSON chunk"),
+        (with("/accessors/0/sparse", json!({"count": 1})), "accessor 0: a sparse accessor is not supported"),
         (with("/accessors/0/bufferView", json!(9)), "buffer view 9: is named, but there are only 2"),
         (with("/accessors/0/bufferView", Value::Null), "has no buffer view"),
         (with("/accessors/1/count", json!(11)), "11 indices are not whole triangles"),
@@ -150,7 +153,7 @@ fn crooked_glbs_are_named_errors() {
         ),
         (with("/nodes/0/children", json!([7])), "node 7: is named, but there are only 1"),
         (with("/nodes/0/mesh", json!(3)), "mesh 3: is named"),
-        (with("/nodes/0/scale", json!([1e300, 1e300, 1e300])), "the JSON chunk: number out of range"),
+        (with("/nodes/0/scale", json!([1e300, 1e300, 1e300])), "not finite once its node has moved it"),
         (
             with(
                 "/nodes",
@@ -169,7 +172,8 @@ fn crooked_glbs_are_named_errors() {
             "`KHR_draco_mesh_compression` is not supported",
         ),
         (glb(&json!({"asset": {"version": "2.0"}}), &[]), "holds no triangles"),
-        (glb(&json!({}), &[]), "the JSON chunk: missing field `asset`"),
+        (glb(&json!({}), &[]), "holds no triangles"),
+        (with("/meshes/0/primitives/0/indices", json!(1u64 << 32)), "the JSON chunk"),
         (b"glTF".to_vec(), "the file ends inside a header"),
         (b"glTF\x01\0\0\0\x20\0\0\0".to_vec(), "glTF version 1"),
         (b"glTF\x02\0\0\0\xff\xff\xff\xff".to_vec(), "says 4294967295 bytes, but the file has 12"),
@@ -180,6 +184,57 @@ fn crooked_glbs_are_named_errors() {
         let found = message(&bytes);
         assert!(found.contains(expected), "expected {expected:?}, found {found:?}");
     }
+}
+
+#[test]
+fn what_is_not_read_of_a_glb_cannot_refuse_it() {
+    let odd = json!([{"odd": [true, null]}, 7]);
+    let mut d = document();
+    for name in ["animations", "skins", "cameras", "samplers", "extensions", "asset", "extras"] {
+        d[name] = odd.clone();
+    }
+    // an empty scene beside the one that counts; targets, weights and names of strange types
+    d["scenes"] = json!([{"nodes": [0], "name": 3}, {}]);
+    d["accessors"][0]["min"] = odd.clone();
+    d["meshes"][0]["weights"] = odd.clone();
+    d["meshes"][0]["primitives"][0]["targets"] = odd.clone();
+    d["meshes"][0]["primitives"][0]["extensions"] = odd.clone();
+    d["bufferViews"][0]["target"] = odd.clone();
+    d["materials"] = json!([{"alphaMode": odd, "pbrMetallicRoughness": {"baseColorFactor": odd}}]);
+    assert_eq!(message(&glb(&d, &bin())), "read 4 triangles");
+    assert!(message(&with("/scenes/0", json!({}))).contains("holds no triangles"));
+}
+
+#[test]
+fn nodes_far_from_the_origin_keep_their_distance() {
+    // f32 has steps of a half at 4 500 000: both nodes would stand at the same place, or half a unit apart
+    for x in ["translation", "matrix"] {
+        let node = |at: f64| {
+            let matrix = json!([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, at, 0, 0, 1]);
+            let place = if x == "matrix" { matrix } else { json!([at, 0, 0]) };
+            json!({"mesh": 0, x: place})
+        };
+        let mut d = document();
+        d["nodes"] = json!([node(4_500_000.1), node(4_500_000.4)]);
+        d["scenes"][0]["nodes"] = json!([0, 1]);
+        let found = read_whole(&glb(&d, &bin()), Path::new("a")).unwrap();
+        // a corner at 0 of both: 0.3 apart, and the first 4 500 000.1 from the origin
+        let [first, second] = [0, 4].map(|v| found.mesh.positions[v].as_dvec3() + found.origin);
+        assert!((first.x - 4_500_000.1).abs() < 1e-6, "{first}");
+        assert!((second.x - first.x - 0.3).abs() < 1e-6, "{first} {second}");
+    }
+}
+
+#[test]
+fn json_that_would_fill_the_memory_is_refused_before_it_is_parsed() {
+    let many = |item: &str, count: usize| {
+        let json = format!("{{\"materials\": [{item}{}]}}", format!(",{item}").repeat(count - 1));
+        glb_of(json.into_bytes(), &[])
+    };
+    // the document and its list are two more
+    assert!(message(&many("{}", (1 << 20) - 2)).contains("holds no triangles"));
+    assert!(message(&many("{}", (1 << 20) - 1)).contains("1048577 and 2097151, more than 1048576 objects"));
+    assert!(message(&many("0", 4 << 20)).contains("or 4194304 values"));
 }
 
 #[test]
@@ -277,7 +332,7 @@ fn png(width: u32, height: u32) -> Vec<u8> {
         [&(data.len() as u32).to_be_bytes()[..], &whole, &sum].concat()
     };
     let size = [width.to_be_bytes(), height.to_be_bytes()].concat();
-    // one grey pixel, stored: filter 0, value 7; Adler-32 of (0, 7) is 1 + 0 + 7 = 8, and 1 + 8 = 9
+    // one gray pixel, stored: filter 0, value 7; Adler-32 of (0, 7) is 1 + 0 + 7 = 8, and 1 + 8 = 9
     let data = [0x78, 0x01, 1, 2, 0, 0xfd, 0xff, 0, 7, 0, 9, 0, 8];
     [
         &b"\x89PNG\r\n\x1a\n"[..],
@@ -408,6 +463,7 @@ fn crooked_textures_are_named_errors_but_leave_the_surface_readable() {
             "`KHR_texture_transform` is not supported",
         ),
         ("/textures/0/source", json!(4), "image 4: is named, but there are only 1"),
+        ("/textures/0/source", Value::Null, "texture 0: a texture without a PNG or JPEG of its own"),
         ("/textures/0", json!({}), "texture 0: a texture without a PNG or JPEG of its own"),
         ("/images/0/bufferView", json!(4), "buffer view 4: is named, but there are only 4"),
         ("/images/0/bufferView", Value::Null, "image 0: has no buffer view"),
@@ -489,7 +545,7 @@ fn names_of_textures_never_leave_the_folder() {
     assert_eq!(mtl("newmtl a\r\nmap_Kd ./my head.png\r\n"), Ok(Some("my head.png".into())));
     assert_eq!(mtl("newmtl a\nmap_Kdx a.png"), Ok(None));
     assert!(mtl("map_Kd -s 2 2 2 a.png").unwrap_err().contains("a texture with options"));
-    assert!(mtl("map_Kd a.png\nmap_Kd b.png").unwrap_err().contains("several base colours"));
+    assert!(mtl("map_Kd a.png\nmap_Kd b.png").unwrap_err().contains("several base colors"));
 }
 
 #[test]
@@ -499,7 +555,7 @@ fn several_materials_have_no_single_atlas() {
     d["meshes"][0]["primitives"].as_array_mut().unwrap().push(primitive);
     assert_eq!(whole_message(&glb(&d, &bin)), "read, texture true"); // one texture, twice
     d["meshes"][0]["primitives"][1]["material"] = Value::Null;
-    assert!(whole_message(&glb(&d, &bin)).contains("a mesh with several base colours is not supported"));
+    assert!(whole_message(&glb(&d, &bin)).contains("a mesh with several base colors is not supported"));
     let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\nusemtl b\nf 1 2 3\n";
     assert!(whole_message(obj.as_bytes()).contains("line 6: a mesh with several materials"));
 }
@@ -643,6 +699,23 @@ fn triangle_strips_of_a_ply_are_cut_into_triangles() {
     );
     // 0 1 2, then 2 1 3 the other way round; then 2 3 3 and 3 3 4, which are none; a lone corner is none either
     assert_eq!(read(&bytes, Path::new("a")).unwrap().triangles, [[0, 1, 2], [2, 1, 3]]);
+}
+
+#[test]
+fn restarts_and_repeated_corners_of_strips_are_no_triangles() {
+    // 100 × "0 1 2 −1 2 2 2 −1": eight values and one triangle each
+    let strip = " 0 1 2 -1 2 2 2 -1".repeat(100);
+    let bytes = ply_of(
+        "format ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+         element tristrips 1\nproperty list int int vertex_indices\n",
+        format!("0 0 0  1 0 0  0 1 0\n800{strip}\n").as_bytes(),
+    );
+    let most = |triangles| {
+        let limits = ReadOptions { triangles, ..ReadOptions::default() };
+        read_with(&bytes, Path::new("a"), &limits)
+    };
+    assert_eq!(most(100).unwrap().mesh.triangles.len(), 100);
+    assert_eq!(most(99).unwrap_err().to_string(), "`a` has more than 99 triangles");
 }
 
 #[test]

@@ -70,9 +70,9 @@ pub struct CheckReport {
     pub size_m: [f64; 3],
     /// Enclosed volume in litres; negative when wound inward, meaningless when open.
     pub volume_l: f64,
-    /// Does every vertex have a colour?
+    /// Does every vertex have a color?
     pub has_colors: bool,
-    /// Does a picture give it its colours? For those who have read it: [`check`] knows only the mesh.
+    /// Does a picture give it its colors? For those who have read it: [`check`] knows only the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub has_texture: Option<bool>,
     /// Does every vertex have a normal?
@@ -171,7 +171,7 @@ slivers              {slivers} triangles, {degenerate} without area, {invalid} i
 size                 {x:.4} × {y:.4} × {z:.4} m
 box                  {low:.digits$} to {high:.digits$}
 volume               {volume_l:.4} litres
-colours              {colors}
+colors               {colors}
 normals              {normals} ({bad_normals} not of unit length)
 "
         )
@@ -390,6 +390,18 @@ mod tests {
         m.triangles.push([0, 1, 8]);
         let r = check(&m, 1.0);
         assert_eq!((r.nonmanifold_edges, r.boundary_edges, r.manifold), (1, 2, false));
+    }
+
+    #[test]
+    fn the_ends_of_an_edge_of_three_triangles_are_not_manifold() {
+        let m = Mesh {
+            positions: vec![Vec3::ZERO, Vec3::Z, Vec3::X, Vec3::Y, -Vec3::X],
+            triangles: vec![[0, 1, 2], [0, 1, 3], [0, 1, 4]],
+            ..Mesh::default()
+        };
+        // nothing says which two of the three go on into each other: each is a fan of its own at both ends
+        let r = check(&m, 1.0);
+        assert_eq!((r.nonmanifold_edges, r.nonmanifold_vertices, r.boundary_edges), (1, 2, 6));
     }
 
     #[test]

@@ -34,11 +34,11 @@ pub struct ExportOptions {
     pub up: Vec3,
     /// Metres per dataset unit.
     pub unit_m: f64,
-    /// Do the colours already contain the light? Then viewers should not light them again.
+    /// Do the colors already contain the light? Then viewers should not light them again.
     pub unlit: bool,
     /// From the mesh's own coordinates into the dataset's world.
     pub world_from_mesh: Similarity,
-    /// Quality, 1..=100, of colours stored as JPEG: smaller, and a little wrong. `None` stores PNG, which is
+    /// Quality, 1..=100, of colors stored as JPEG: smaller, and a little wrong. `None` stores PNG, which is
     /// lossless; normal maps are always PNG.
     pub jpeg_quality: Option<u8>,
 }
@@ -239,7 +239,7 @@ pub(super) fn distance_warning(mesh: &Mesh, file_from_mesh: &Similarity, ending:
 
 /// Gives every normal that is zero or not finite the area-weighted mean of its faces, or +Y.
 fn repair_normals(normals: &mut [Vec3], positions: &[Vec3], triangles: &[[u32; 3]]) {
-    // turned and normalised before: unit or zero, or NaN
+    // turned and normalized before: unit or zero, or NaN
     let bad: Vec<bool> = normals.iter().map(|n| *n == Vec3::ZERO || n.is_nan()).collect();
     if !bad.contains(&true) {
         return;
@@ -460,7 +460,7 @@ pub(super) mod tests {
         }
         assert_eq!(
             message(&|t| t.color.rgb.truncate(31)),
-            "the base colour is 31 pixels for 8 × 4, expected one for each, and at least one"
+            "the base color is 31 pixels for 8 × 4, expected one for each, and at least one"
         );
         let square = Photo { width: 1, height: 1, rgb: vec![[0; 3]], alpha: None };
         assert!(message(&|t| t.color = square.clone()).contains("the shape of its atlas, 8 × 4"));

@@ -1,26 +1,25 @@
-//! GLB → mesh: all triangles of the default scene, moved to where their nodes put them, and their base colour.
+//! GLB → mesh: all triangles of the default scene, moved to where their nodes put them, and their base color.
 //!
-//! `gltf` takes the file apart; what the document names is checked here before it is used, since the checks of
-//! `gltf` panic on an index that is out of range and refuse 16-bit coordinates. Only what lies in the file is read:
-//! buffers with an address are refused, whatever it is.
+//! `gltf` takes the file apart; what the document names is checked here before it is used. Only what lies in the file
+//! is read: buffers with an address are refused, whatever it is.
 
+use super::glb_json::{GlbNode, GlbPrimitive, GlbRoot, GlbTextureUse};
 use super::source::{ParsedMesh, PictureSource, Source};
 use crate::geom::{Atlas, Mesh};
 use crate::image::srgb_from_linear;
 use crate::{Result, io};
-use glam::{DMat3, DMat4, DQuat, DVec3, Vec2};
+use glam::{DMat3, DMat4, DVec3, Vec2};
 use gltf::Glb;
 use gltf::json::accessor::{ComponentType as C, GenericComponentType, Type};
-use gltf::json::mesh::{Mode, Primitive, Semantic};
+use gltf::json::mesh::{Mode, Semantic};
 use gltf::json::validation::Checked::{Invalid, Valid};
-use gltf::json::{self, Accessor, Index, Node, Root, buffer, texture};
 use std::collections::BTreeSet;
 
 /// What allows 8 and 16 bits in more attributes.
 const QUANTIZED: &str = "KHR_mesh_quantization";
 const SHORTENED: [C; 5] = [C::F32, C::I8, C::U8, C::I16, C::U16];
 
-/// Extensions that leave shape and colour attributes alone, or that are read.
+/// Extensions that leave shape and color attributes alone, or that are read.
 fn is_harmless(extension: &str) -> bool {
     extension.starts_with("KHR_materials_")
         || extension == QUANTIZED
@@ -29,7 +28,7 @@ fn is_harmless(extension: &str) -> bool {
 
 pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     let glb = chunks(bytes, source)?;
-    let root: Root = serde_json::from_slice(&glb.json).map_err(|e| source.broken("the JSON chunk", e))?;
+    let root = GlbRoot::parse(&glb.json, source)?;
     if let Some(extension) = root.extensions_required.iter().find(|e| !is_harmless(e)) {
         return Err(source.unsupported("`extensionsRequired`", format!("`{extension}`")));
     }
@@ -37,26 +36,20 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     let mut gathered = Primitives::default();
     if root.nodes.is_empty() {
         for mesh in 0..root.meshes.len() as u32 {
-            reader.add(Index::new(mesh), DMat4::IDENTITY, &mut gathered)?;
+            reader.add(mesh, DMat4::IDENTITY, &mut gathered)?;
         }
     }
-    let mut seen = vec![false; root.nodes.len()];
-    let mut stack: Vec<(Index<Node>, DMat4)> =
-        reader.roots()?.into_iter().rev().map(|n| (n, DMat4::IDENTITY)).collect();
-    while let Some((index, parent)) = stack.pop() {
-        let at = || format!("node {index}");
-        let node: &Node = reader.get("node", index)?;
-        if std::mem::replace(&mut seen[index.value()], true) {
-            return Err(source.broken(at(), "is reached twice: nodes must form a tree"));
-        }
-        let matrix = parent * local(node);
+    let mut tree = NodeStack { reached: vec![false; root.nodes.len()], nodes: Vec::new() };
+    reader.push(&reader.roots()?, DMat4::IDENTITY, &mut tree)?;
+    while let Some((index, node, parent)) = tree.nodes.pop() {
+        let matrix = parent * node.parent_from_node();
         if !matrix.is_finite() {
-            return Err(source.broken(at(), "its transform is not finite"));
+            return Err(source.broken(format!("node {index}"), "its transform is not finite"));
         }
         if let Some(mesh) = node.mesh {
             reader.add(mesh, matrix, &mut gathered)?;
         }
-        stack.extend(node.children.iter().flatten().rev().map(|&c| (c, matrix)));
+        reader.push(&node.children, matrix, &mut tree)?;
     }
     reader.finish(gathered)
 }
@@ -82,22 +75,13 @@ fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
     Ok(glb)
 }
 
-fn local(node: &Node) -> DMat4 {
-    if let Some(matrix) = node.matrix {
-        return DMat4::from_cols_array(&matrix.map(f64::from));
-    }
-    let q = node.rotation.unwrap_or_default().0.map(f64::from);
-    let q = DQuat::from_array(q);
-    let q = if q.length() > 0.0 { q / q.length() } else { DQuat::IDENTITY };
-    let vector = |v: [f32; 3]| DVec3::from(v.map(f64::from));
-    DMat4::from_scale_rotation_translation(
-        node.scale.map_or(DVec3::ONE, vector),
-        q,
-        node.translation.map_or(DVec3::ZERO, vector),
-    )
+/// The nodes that were reached and not yet read, with their parents' transforms. Each comes once.
+struct NodeStack<'a> {
+    reached: Vec<bool>,
+    nodes: Vec<(u32, &'a GlbNode, DMat4)>,
 }
 
-/// The mesh as it grows. Normals, colours and texture coordinates survive only if every part has them.
+/// The mesh as it grows. Normals, colors and texture coordinates survive only if every part has them.
 #[derive(Default)]
 struct Primitives {
     positions: Vec<DVec3>,
@@ -108,26 +92,36 @@ struct Primitives {
     /// One for each vertex.
     uvs: Vec<Vec2>,
     bare_uvs: bool,
-    /// The base colours of the parts; `None` for a part without.
+    /// The base colors of the parts; `None` for a part without.
     textures: BTreeSet<Option<u32>>,
 }
 
 struct GlbReader<'a> {
-    root: &'a Root,
+    root: &'a GlbRoot,
     bin: &'a [u8],
     source: Source<'a>,
 }
 
 impl<'a> GlbReader<'a> {
     /// What an index names.
-    fn get<T>(&self, what: &str, index: Index<T>) -> Result<&'a T>
-    where
-        Root: AsRef<[T]>,
-    {
-        let all: &'a [T] = self.root.as_ref();
-        let (at, count) = (format!("{what} {index}"), all.len());
-        let found = all.get(index.value());
-        found.ok_or_else(|| self.source.broken(at, format!("is named, but there are only {count}")))
+    fn get<T>(&self, what: &str, all: &'a [T], index: u32) -> Result<&'a T> {
+        all.get(index as usize).ok_or_else(|| {
+            let count = all.len();
+            self.source.broken(format!("{what} {index}"), format!("is named, but there are only {count}"))
+        })
+    }
+
+    /// Puts nodes on the stack, the first on top.
+    fn push(&self, nodes: &[u32], parent: DMat4, tree: &mut NodeStack<'a>) -> Result<()> {
+        for &index in nodes.iter().rev() {
+            let node = self.get("node", &self.root.nodes, index)?;
+            if std::mem::replace(&mut tree.reached[index as usize], true) {
+                let what = "is reached twice: nodes must form a tree";
+                return Err(self.source.broken(format!("node {index}"), what));
+            }
+            tree.nodes.push((index, node, parent));
+        }
+        Ok(())
     }
 
     fn finish(&self, gathered: Primitives) -> Result<ParsedMesh> {
@@ -148,32 +142,33 @@ impl<'a> GlbReader<'a> {
         let mut textures = textures.into_iter();
         let (first, second) = (textures.next().flatten(), textures.next());
         if second.is_some() {
-            return Err(self.source.unsupported("`materials`", "a mesh with several base colours"));
+            return Err(self.source.unsupported("`materials`", "a mesh with several base colors"));
         }
-        let picture = first.map(|texture| self.picture(Index::new(texture), out.atlas.as_mut()));
+        let picture = first.map(|texture| self.picture(texture, out.atlas.as_mut()));
         out.picture = picture.transpose()?;
         Ok(out)
     }
 
-    fn roots(&self) -> Result<Vec<Index<Node>>> {
-        let Root { scenes, scene, nodes, .. } = self.root;
-        match (scenes.get(scene.map_or(0, |s| s.value())), scene) {
+    fn roots(&self) -> Result<Vec<u32>> {
+        let GlbRoot { scenes, scene, nodes, .. } = self.root;
+        match (scenes.get(scene.unwrap_or(0) as usize), scene) {
             (Some(scene), _) => Ok(scene.nodes.clone()),
             (None, Some(index)) => {
                 Err(self.source.broken("`scene`", format!("{index} of {} scenes", scenes.len())))
             }
             (None, None) => {
-                let children = nodes.iter().flat_map(|n| n.children.iter().flatten());
-                let children: BTreeSet<usize> = children.map(|c| c.value()).collect();
-                let all = 0..nodes.len();
-                Ok(all.filter(|n| !children.contains(n)).map(|n| Index::new(n as u32)).collect())
+                let mut is_root = vec![true; nodes.len()];
+                for &child in nodes.iter().flat_map(|n| &n.children) {
+                    is_root.get_mut(child as usize).into_iter().for_each(|slot| *slot = false);
+                }
+                Ok((0..nodes.len() as u32).filter(|&n| is_root[n as usize]).collect())
             }
         }
     }
 
     /// Adds every triangle of a glTF mesh.
-    fn add(&self, index: Index<json::Mesh>, matrix: DMat4, out: &mut Primitives) -> Result<()> {
-        let mesh: &json::Mesh = self.get("mesh", index)?;
+    fn add(&self, index: u32, matrix: DMat4, out: &mut Primitives) -> Result<()> {
+        let mesh = self.get("mesh", &self.root.meshes, index)?;
         for (k, primitive) in mesh.primitives.iter().enumerate() {
             let at = format!("mesh {index}, primitive {k}");
             match primitive.mode {
@@ -192,7 +187,7 @@ impl<'a> GlbReader<'a> {
     fn add_triangles(
         &self,
         at: &str,
-        primitive: &Primitive,
+        primitive: &GlbPrimitive,
         matrix: DMat4,
         out: &mut Primitives,
     ) -> Result<()> {
@@ -242,7 +237,7 @@ impl<'a> GlbReader<'a> {
         match attribute(Semantic::Normals, &[Type::Vec3], short)? {
             None => out.bare_normals = true,
             Some((normals, _)) => {
-                // the inverse transpose, up to a factor that normalising removes, also for singular matrices
+                // the inverse transpose, up to a factor that normalizing removes, also for singular matrices
                 let cofactor = DMat3::from_cols(
                     linear.y_axis.cross(linear.z_axis),
                     linear.z_axis.cross(linear.x_axis),
@@ -260,7 +255,7 @@ impl<'a> GlbReader<'a> {
         }
         if source.options.texture {
             let info = self.base_color(primitive.material)?;
-            out.textures.insert(info.map(|i| i.index.value() as u32));
+            out.textures.insert(info.map(|i| i.index));
             let set = info.map_or(0, |i| i.tex_coord);
             match attribute(Semantic::TexCoords(set), &[Type::Vec2], &SHORTENED)? {
                 Some((uvs, _)) => {
@@ -280,15 +275,15 @@ impl<'a> GlbReader<'a> {
         Ok(())
     }
 
-    /// All numbers of an accessor, flat, and how many an element has; normalised integers become −1..=1. Finite.
-    fn numbers(&self, index: Index<Accessor>, kinds: &[Type], components: &[C]) -> Result<(Vec<f64>, usize)> {
+    /// All numbers of an accessor, flat, and how many an element has; normalized integers become −1..=1. Finite.
+    fn numbers(&self, index: u32, kinds: &[Type], components: &[C]) -> Result<(Vec<f64>, usize)> {
         let source = self.source;
-        let accessor: &Accessor = self.get("accessor", index)?;
+        let accessor = self.get("accessor", &self.root.accessors, index)?;
         let at = format!("accessor {index}");
         if accessor.sparse.is_some() {
             return Err(source.unsupported(at, "a sparse accessor"));
         }
-        let (width, component) = match (accessor.type_, accessor.component_type) {
+        let (width, component) = match (accessor.kind, accessor.component_type) {
             (Valid(kind), Valid(GenericComponentType(c)))
                 if kinds.contains(&kind) && components.contains(&c) =>
             {
@@ -306,7 +301,7 @@ impl<'a> GlbReader<'a> {
                 return Err(source.broken(at, what));
             }
         };
-        let (count, offset) = (accessor.count.0, accessor.byte_offset.unwrap_or_default().0);
+        let (count, offset) = (accessor.count, accessor.byte_offset);
         if count == 0 {
             return Err(source.broken(at, "has count 0, expected at least 1"));
         }
@@ -349,34 +344,33 @@ impl<'a> GlbReader<'a> {
     }
 
     /// The bytes of a buffer view, and the stride it gives its elements.
-    fn view(&self, index: Index<buffer::View>) -> Result<(&'a [u8], Option<usize>)> {
+    fn view(&self, index: u32) -> Result<(&'a [u8], Option<usize>)> {
         let source = self.source;
-        let view: &buffer::View = self.get("buffer view", index)?;
+        let view = self.get("buffer view", &self.root.buffer_views, index)?;
         let broken = |what: String| source.broken(format!("buffer view {index}"), what);
-        let buffer: &json::Buffer =
-            self.root.get(view.buffer).ok_or_else(|| broken(format!("names buffer {}", view.buffer)))?;
-        if buffer.uri.is_some() || view.buffer.value() != 0 {
+        let buffer = self.root.buffers.get(view.buffer as usize);
+        let buffer = buffer.ok_or_else(|| broken(format!("names buffer {}", view.buffer)))?;
+        if buffer.uri.is_some() || view.buffer != 0 {
             let at = format!("buffer {}", view.buffer);
             return Err(source.unsupported(at, "a buffer outside the file"));
         }
-        let (length, found) = (buffer.byte_length.0, self.bin.len());
+        let (length, found) = (buffer.byte_length, self.bin.len());
         if length > found as u64 {
             return Err(source.broken("buffer 0", format!("{length} bytes, but the file holds {found}")));
         }
-        let (start, bytes) = (view.byte_offset.unwrap_or_default().0, view.byte_length.0);
+        let (start, bytes) = (view.byte_offset, view.byte_length);
         match start.checked_add(bytes).filter(|&end| end <= length) {
-            Some(end) => Ok((&self.bin[start as usize..end as usize], view.byte_stride.map(|s| s.0))),
+            Some(end) => Ok((&self.bin[start as usize..end as usize], view.byte_stride)),
             None => Err(broken(format!("{bytes} bytes from {start} do not fit into a buffer of {length}"))),
         }
     }
 
-    /// The base colour texture of a material, if it has one.
-    fn base_color(&self, material: Option<Index<json::Material>>) -> Result<Option<&'a texture::Info>> {
+    /// The base color texture of a material, if it has one.
+    fn base_color(&self, material: Option<u32>) -> Result<Option<&'a GlbTextureUse>> {
         let Some(index) = material else { return Ok(None) };
-        let material: &json::Material = self.get("material", index)?;
+        let material = self.get("material", &self.root.materials, index)?;
         let info = material.pbr_metallic_roughness.base_color_texture.as_ref();
-        let extensions = info.and_then(|i| i.extensions.as_ref());
-        if extensions.is_some_and(|e| e.texture_transform.is_some()) {
+        if info.is_some_and(|i| i.extensions.transform.is_some()) {
             return Err(self.source.unsupported(format!("material {index}"), "`KHR_texture_transform`"));
         }
         Ok(info)
@@ -384,15 +378,13 @@ impl<'a> GlbReader<'a> {
 
     /// The picture behind a texture, and its size in the atlas. Its header is checked against the
     /// limits for pictures; it is not decoded.
-    fn picture(&self, texture: Index<json::Texture>, atlas: Option<&mut Atlas>) -> Result<PictureSource> {
+    fn picture(&self, texture: u32, atlas: Option<&mut Atlas>) -> Result<PictureSource> {
         let source = self.source;
-        let index = self.get("texture", texture)?.source;
-        if index.value() == u32::MAX as usize {
-            // as `gltf` says that there is none
-            return Err(source
-                .unsupported(format!("texture {texture}"), "a texture without a PNG or JPEG of its own"));
-        }
-        let image: &json::Image = self.get("image", index)?;
+        let Some(index) = self.get("texture", &self.root.textures, texture)?.source else {
+            let at = format!("texture {texture}");
+            return Err(source.unsupported(at, "a texture without a PNG or JPEG of its own"));
+        };
+        let image = self.get("image", &self.root.images, index)?;
         let at = format!("image {index}");
         if image.uri.is_some() {
             return Err(source.unsupported(at, "a picture outside the file"));
@@ -413,26 +405,4 @@ fn names<T: std::fmt::Debug>(all: &[T]) -> String {
     let names: Vec<String> = all.iter().map(|v| format!("{v:?}")).collect();
     let (last, rest) = names.split_last().expect("something is always allowed");
     if rest.is_empty() { last.clone() } else { format!("{} or {last}", rest.join(", ")) }
-}
-
-/// Not a test of reading (those are in `tests/hostile_mesh.rs`), but of where nodes put things.
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use gltf::json::scene::UnitQuaternion;
-
-    #[test]
-    fn translation_rotation_and_scale_apply_in_gltf_order() {
-        let half = std::f32::consts::FRAC_1_SQRT_2;
-        let node = Node {
-            translation: Some([10.0, 0.0, 0.0]),
-            rotation: Some(UnitQuaternion([0.0, 0.0, half, half])), // a quarter turn about z: x → y
-            scale: Some([2.0, 1.0, 1.0]),
-            ..Node::default()
-        };
-        // (1, 0, 0) → scaled (2, 0, 0) → turned (0, 2, 0) → moved (10, 2, 0)
-        let p = local(&node).transform_point3(DVec3::X);
-        assert!(p.distance(DVec3::new(10.0, 2.0, 0.0)) < 1e-6);
-        assert_eq!(local(&Node::default()), DMat4::IDENTITY);
-    }
 }

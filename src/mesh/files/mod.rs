@@ -10,6 +10,7 @@ mod faults;
 mod file_mesh;
 mod glb;
 mod glb_document;
+mod glb_json;
 mod glb_read;
 mod head;
 mod obj;

@@ -1,4 +1,4 @@
-//! OBJ → mesh: `v` with optional colours, `vt`, `vn`, `f` in all its spellings; the rest is passed over.
+//! OBJ → mesh: `v` with optional colors, `vt`, `vn`, `f` in all its spellings; the rest is passed over.
 //! And `map_Kd` of the `.mtl` beside it.
 //!
 //! Written here because `tobj` 4 names no line in its errors, refuses lines that go on in the next and comments
@@ -16,7 +16,7 @@ use std::path::Path;
 #[derive(Default)]
 struct Obj {
     positions: Vec<DVec3>,
-    /// Colours and triangles.
+    /// Colors and triangles.
     mesh: Mesh,
     normals: Vec<Vec3>,
     /// Which normal each vertex was used with, if any.
@@ -158,7 +158,7 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
     })
 }
 
-/// The bare name of the picture that a `.mtl` file gives as its base colour (`map_Kd`), if any.
+/// The bare name of the picture that a `.mtl` file gives as its base color (`map_Kd`), if any.
 ///
 /// # Errors
 ///
@@ -178,7 +178,7 @@ pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>> {
         }
         let name = source.bare_name(at.as_str(), name)?;
         if found.as_ref().is_some_and(|f| *f != name) {
-            return Err(source.unsupported(at, "a mesh with several base colours"));
+            return Err(source.unsupported(at, "a mesh with several base colors"));
         }
         found = Some(name);
     }

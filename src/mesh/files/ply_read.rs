@@ -53,7 +53,7 @@ impl Scalar {
         }
     }
 
-    /// What white is, for colours.
+    /// What white is, for colors.
     fn white(self) -> f64 {
         match self {
             Scalar::U8 => 255.0,
@@ -88,7 +88,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
             "face" | "tristrips" => triangles(&mut body, element, &mut out.mesh.triangles)?,
             _ => {
                 for _ in 0..element.count {
-                    element.properties.iter().try_for_each(|p| body.values(p, None))?;
+                    element.properties.iter().try_for_each(|p| body.each(p, |_| Ok(())))?;
                 }
             }
         }
@@ -249,8 +249,8 @@ impl Body<'_> {
         })
     }
 
-    /// Reads the value of a property, or the values of its list, in place of what was in `out`.
-    fn values(&mut self, property: &Property, mut out: Option<&mut Vec<f64>>) -> Result<()> {
+    /// Calls `take` with the value of a property, or with each value of its list.
+    fn each(&mut self, property: &Property, mut take: impl FnMut(f64) -> Result<()>) -> Result<()> {
         let mut count = 1;
         if let Some(length) = property.length {
             let at = self.at;
@@ -264,14 +264,9 @@ impl Body<'_> {
             }
             count = length as usize;
         }
-        if let Some(out) = &mut out {
-            out.clear();
-            // even strips of one triangle each need but four values for it
-            self.source.allow(0, count.saturating_sub(2) / 4)?;
-        }
         for _ in 0..count {
             let value = self.next(property.item)?;
-            out.iter_mut().for_each(|out| out.push(value));
+            take(value)?;
         }
         Ok(())
     }
@@ -300,11 +295,13 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<
     });
     let mut uvs = uv.map(|_| Vec::new());
     let mut row = vec![0.0; element.properties.len()];
-    let mut values = Vec::new();
     for i in 0..element.count {
         for (k, property) in element.properties.iter().enumerate() {
-            body.values(property, Some(&mut values))?;
-            row[k] = values.last().copied().unwrap_or(0.0); // lists are none of the slots
+            // lists are none of the slots
+            body.each(property, |v| {
+                row[k] = v;
+                Ok(())
+            })?;
         }
         let vector = |at: [usize; 3]| DVec3::from(at.map(|k| row[k]));
         let position = vector(xyz);
@@ -319,7 +316,7 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<
         if let Some(color) = color {
             let coded = color.map(|k| ((row[k] / element.properties[k].item.white()) as f32).clamp(0.0, 1.0));
             if coded.iter().any(|c| c.is_nan()) {
-                return Err(source.broken(format!("vertex {i}"), "its colour is not a number"));
+                return Err(source.broken(format!("vertex {i}"), "its color is not a number"));
             }
             out.mesh.colors.push(coded);
         }
@@ -335,7 +332,8 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<
     Ok(uvs)
 }
 
-/// Adds the triangles of polygons, which are fanned, or of strips.
+/// Adds the triangles of polygons, which are fanned, or of strips: there each corner makes a triangle with the two
+/// before it, wound the other way every other time, and −1 starts anew.
 fn triangles(body: &mut Body, element: &Element, out: &mut Vec<[u32; 3]>) -> Result<()> {
     let (source, strips) = (body.source, element.name == "tristrips");
     let is_list =
@@ -345,37 +343,36 @@ fn triangles(body: &mut Body, element: &Element, out: &mut Vec<[u32; 3]>) -> Res
         return Err(source.broken(format!("element `{}`", element.name), what));
     };
     source.allow(0, if strips { 0 } else { element.count })?;
-    let mut values = Vec::new();
     for i in 0..element.count {
-        for (k, property) in element.properties.iter().enumerate() {
-            body.values(property, (k == list).then_some(&mut values))?;
-            if k != list {
-                continue;
+        // how many corners there were, and the two that the next one makes a triangle with
+        let (mut corners, mut pair) = (0, [0, 0]);
+        let mut corner = |v: f64| {
+            if strips && v == -1.0 {
+                corners = 0;
+                return Ok(());
             }
-            let wrong = |v: &&f64| v.fract() != 0.0 || !(0.0..4294967295.0).contains(*v);
-            if let Some(v) = values.iter().find(|v| wrong(v) && !(strips && **v == -1.0)) {
+            if v.fract() != 0.0 || !(0.0..4294967295.0).contains(&v) {
                 let (name, least) = if strips { ("strip", "−1") } else { ("face", "0") };
                 let what = format!("index {v}, expected a whole number from {least}");
                 return Err(source.broken(format!("{name} {i}"), what));
             }
-            source.allow(0, out.len() + values.len().saturating_sub(2))?;
-            if strips {
-                values.split(|&v| v == -1.0).for_each(|strip| cut_up(strip, out));
-            } else {
-                out.extend(values.windows(2).skip(1).map(|w| [values[0], w[0], w[1]].map(|v| v as u32)));
+            let ([a, b], c) = (pair, v as u32);
+            corners += 1;
+            // corners of a strip that repeat only carry it on
+            if corners > 2 && !(strips && (a == b || b == c || c == a)) {
+                source.allow(0, out.len() + 1)?;
+                out.push(if strips && corners % 2 == 0 { [b, a, c] } else { [a, b, c] });
             }
+            pair = match corners {
+                1 => [c, c],
+                2 => [a, c],
+                _ => [if strips { b } else { a }, c],
+            };
+            Ok(())
+        };
+        for (k, property) in element.properties.iter().enumerate() {
+            body.each(property, |v| if k == list { corner(v) } else { Ok(()) })?;
         }
     }
     Ok(())
-}
-
-/// Each corner of a strip makes a triangle with the two before it, wound the other way every other time.
-fn cut_up(strip: &[f64], out: &mut Vec<[u32; 3]>) {
-    for (k, w) in strip.windows(3).enumerate() {
-        let [a, b, c] = [w[0], w[1], w[2]].map(|v| v as u32);
-        // corners that repeat only carry the strip on
-        if a != b && b != c && c != a {
-            out.push(if k % 2 == 1 { [b, a, c] } else { [a, b, c] });
-        }
-    }
 }

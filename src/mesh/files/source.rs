@@ -14,7 +14,7 @@ pub struct ReadOptions {
     pub vertices: usize,
     /// Most triangles, after polygons are fanned.
     pub triangles: usize,
-    /// Most bytes of JSON in a GLB, each of which may become a hundred in memory.
+    /// Most bytes of JSON in a GLB. Of them, at most 2²⁰ may be objects or arrays, and 2²² values.
     pub json: usize,
     /// Also the texture? Else it is passed over, sound or not.
     pub texture: bool,
@@ -23,7 +23,7 @@ pub struct ReadOptions {
 impl ReadOptions {
     /// Everything, of a file that a machine can hold.
     pub const DEFAULT: ReadOptions =
-        ReadOptions { vertices: 30_000_000, triangles: 30_000_000, json: 16 << 20, texture: true };
+        ReadOptions { vertices: 30_000_000, triangles: 30_000_000, json: 64 << 20, texture: true };
 
     /// The surface alone.
     pub const SURFACE: ReadOptions = ReadOptions { texture: false, ..ReadOptions::DEFAULT };
@@ -35,7 +35,7 @@ impl Default for ReadOptions {
     }
 }
 
-/// Where the base colour of a file is.
+/// Where the base color of a file is.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PictureSource {
     /// In the file: PNG or JPEG, for [`crate::io::parse_photo`]. Its header is within the limits for

@@ -11,7 +11,7 @@ use glam::Mat3;
 pub struct HeadTexture {
     /// Where the triangles lie in the pictures.
     pub atlas: Atlas,
-    /// Base colour, sRGB-coded; its alpha is not written.
+    /// Base color, sRGB-coded; its alpha is not written.
     pub color: Photo,
     /// Normals in tangent space: linear, +X along u, +Y up the picture (OpenGL), for the tangents of
     /// [`super::tangents()`]. GLB only.
@@ -20,7 +20,7 @@ pub struct HeadTexture {
     pub lobes: Option<Lobes>,
 }
 
-/// View-dependent colour of a texture: spherical harmonics of the direction to the viewer.
+/// View-dependent color of a texture: spherical harmonics of the direction to the viewer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lobes {
     /// One picture a spherical-harmonic function; a byte `b` is `(b − 128) / 127 · scale`.
@@ -32,7 +32,7 @@ pub struct Lobes {
 }
 
 impl HeadTexture {
-    /// Returns a texture of a base colour alone.
+    /// Returns a texture of a base color alone.
     pub fn new(atlas: Atlas, color: Photo) -> HeadTexture {
         HeadTexture { atlas, color, normal: None, lobes: None }
     }
@@ -44,7 +44,7 @@ impl HeadTexture {
 
     /// Every picture is whole, and of the atlas's shape; its scale is free.
     pub(super) fn check_pictures(&self) -> Result<()> {
-        self.check("base colour", &self.color)?;
+        self.check("base color", &self.color)?;
         self.normal.as_ref().map_or(Ok(()), |normal| self.check("normal map", normal))?;
         let mut lobes = self.lobe_pictures().iter().enumerate();
         lobes.try_for_each(|(k, picture)| self.check(&format!("texture `lobe {k}`"), picture))

@@ -1,0 +1,206 @@
+//! What is read of a GLB's JSON: the surface, where its nodes put it, and its base color.
+//!
+//! Nothing else in the file can refuse it, and numbers are f64: a node may stand kilometres from the origin, where
+//! the f32 of `gltf-json` are half a metre apart.
+
+use super::source::Source;
+use crate::Result;
+use glam::{DMat4, DQuat, DVec3};
+use gltf::json::accessor::{GenericComponentType, Type};
+use gltf::json::mesh::{Mode, Semantic};
+use gltf::json::validation::Checked;
+use serde::Deserialize;
+use serde::de::IgnoredAny;
+use std::collections::BTreeMap;
+
+/// Most objects and arrays. One takes two bytes of JSON and up to 144 in memory, and twice that while a list grows.
+const MOST_NESTED: usize = 1 << 20;
+/// Most values. A key with an index takes six bytes of JSON and up to a hundred in memory.
+const MOST_VALUES: usize = 4 << 20;
+
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "camelCase", default)]
+pub(super) struct GlbRoot {
+    pub accessors: Vec<GlbAccessor>,
+    pub buffer_views: Vec<GlbView>,
+    pub buffers: Vec<GlbBuffer>,
+    pub meshes: Vec<GlbMesh>,
+    pub nodes: Vec<GlbNode>,
+    pub scenes: Vec<GlbScene>,
+    pub scene: Option<u32>,
+    pub extensions_required: Vec<String>,
+    pub materials: Vec<GlbMaterial>,
+    pub textures: Vec<GlbTexture>,
+    pub images: Vec<GlbImage>,
+}
+
+impl GlbRoot {
+    /// The document, with memory bounded before it is parsed.
+    pub fn parse(json: &[u8], source: Source) -> Result<GlbRoot> {
+        let at = "the JSON chunk";
+        // those in strings count too: they are few where a file is no attack
+        let count = |marks: &[u8]| json.iter().filter(|b| marks.contains(b)).count();
+        let (nested, values) = (count(b"{["), count(b"{[,"));
+        if nested > MOST_NESTED || values > MOST_VALUES {
+            let most = format!("more than {MOST_NESTED} objects and arrays or {MOST_VALUES} values");
+            return Err(source.broken(at, format!("{nested} and {values}, {most}")));
+        }
+        serde_json::from_slice(json).map_err(|e| source.broken(at, e))
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct GlbAccessor {
+    pub buffer_view: Option<u32>,
+    #[serde(default)]
+    pub byte_offset: u64,
+    pub component_type: Checked<GenericComponentType>,
+    pub count: u64,
+    #[serde(rename = "type")]
+    pub kind: Checked<Type>,
+    #[serde(default)]
+    pub normalized: bool,
+    pub sparse: Option<IgnoredAny>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct GlbView {
+    pub buffer: u32,
+    #[serde(default)]
+    pub byte_offset: u64,
+    pub byte_length: u64,
+    pub byte_stride: Option<usize>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct GlbBuffer {
+    pub byte_length: u64,
+    pub uri: Option<IgnoredAny>,
+}
+
+#[derive(Deserialize)]
+pub(super) struct GlbMesh {
+    pub primitives: Vec<GlbPrimitive>,
+}
+
+#[derive(Deserialize)]
+pub(super) struct GlbPrimitive {
+    pub attributes: BTreeMap<Checked<Semantic>, u32>,
+    pub indices: Option<u32>,
+    #[serde(default)]
+    pub mode: Checked<Mode>,
+    pub material: Option<u32>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+pub(super) struct GlbNode {
+    pub mesh: Option<u32>,
+    pub children: Vec<u32>,
+    matrix: Option<Box<[f64; 16]>>,
+    translation: Option<[f64; 3]>,
+    rotation: Option<[f64; 4]>,
+    scale: Option<[f64; 3]>,
+}
+
+impl GlbNode {
+    /// From the node's coordinates to its parent's.
+    pub fn parent_from_node(&self) -> DMat4 {
+        if let Some(matrix) = &self.matrix {
+            return DMat4::from_cols_array(matrix);
+        }
+        let q = DQuat::from_array(self.rotation.unwrap_or([0.0, 0.0, 0.0, 1.0]));
+        let q = if q.length() > 0.0 { q / q.length() } else { DQuat::IDENTITY };
+        DMat4::from_scale_rotation_translation(
+            self.scale.map_or(DVec3::ONE, DVec3::from),
+            q,
+            self.translation.map_or(DVec3::ZERO, DVec3::from),
+        )
+    }
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+pub(super) struct GlbScene {
+    pub nodes: Vec<u32>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "camelCase", default)]
+pub(super) struct GlbMaterial {
+    pub pbr_metallic_roughness: GlbPbr,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "camelCase", default)]
+pub(super) struct GlbPbr {
+    pub base_color_texture: Option<GlbTextureUse>,
+}
+
+/// A texture as a material names it.
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct GlbTextureUse {
+    pub index: u32,
+    #[serde(default)]
+    pub tex_coord: u32,
+    #[serde(default)]
+    pub extensions: GlbTextureExtensions,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+pub(super) struct GlbTextureExtensions {
+    #[serde(rename = "KHR_texture_transform")]
+    pub transform: Option<IgnoredAny>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+pub(super) struct GlbTexture {
+    pub source: Option<u32>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "camelCase", default)]
+pub(super) struct GlbImage {
+    pub buffer_view: Option<u32>,
+    pub uri: Option<IgnoredAny>,
+}
+
+/// Not a test of reading (those are in `tests/hostile_mesh.rs`), but of where nodes put things.
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn translation_rotation_and_scale_apply_in_gltf_order() {
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        let node = GlbNode {
+            translation: Some([10.0, 0.0, 0.0]),
+            rotation: Some([0.0, 0.0, half, half]), // a quarter turn about z: x → y
+            scale: Some([2.0, 1.0, 1.0]),
+            ..GlbNode::default()
+        };
+        // (1, 0, 0) → scaled (2, 0, 0) → turned (0, 2, 0) → moved (10, 2, 0)
+        let p = node.parent_from_node().transform_point3(DVec3::X);
+        assert!(p.distance(DVec3::new(10.0, 2.0, 0.0)) < 1e-12);
+        assert_eq!(GlbNode::default().parent_from_node(), DMat4::IDENTITY);
+    }
+
+    #[test]
+    fn a_full_document_takes_a_few_hundred_megabytes() {
+        let largest = [
+            size_of::<GlbAccessor>(),
+            size_of::<GlbView>(),
+            size_of::<GlbMesh>(),
+            size_of::<GlbPrimitive>(),
+            size_of::<GlbNode>(),
+            size_of::<GlbMaterial>(),
+        ];
+        assert!(largest.iter().all(|&size| size <= 144), "{largest:?}");
+    }
+}
