@@ -1,4 +1,4 @@
-//! Writes a coloured ball, 20 cm across, as sphere.glb, sphere.obj and sphere.ply.
+//! Writes a colored ball, 20 cm across, as sphere.glb, sphere.obj and sphere.ply.
 //!
 //! `cargo run --no-default-features --example sphere_to_glb -- FOLDER`
 //!
@@ -30,7 +30,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// Rings between two poles; colour is where a point lies. The top is a little longer, so that a
+/// Rings between two poles; color is where a point lies. The top is a little longer, so that a
 /// wrong turn shows in the box.
 fn ball(rings: u32, radius: f32, center: Vec3) -> Mesh {
     let around = 2 * rings;

@@ -60,7 +60,7 @@ fn the_effective_configuration_is_printed_and_accepted_again() {
 }
 
 #[test]
-fn a_folder_that_is_no_capture_ends_with_1_and_a_way_out() {
+fn a_folder_that_is_no_capture_ends_with_1_and_a_hint() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::create_dir(dir.path().join("empty")).unwrap();
     for words in [["run", "empty"], ["inspect", "empty"], ["run", "absent"]] {
@@ -161,18 +161,18 @@ fn a_head_far_from_the_origin_is_checked_and_measured_like_one_near_it() {
 }
 
 #[test]
-fn a_textured_mesh_has_its_colours_from_a_texture() {
+fn a_textured_mesh_has_its_colors_from_a_texture() {
     let dir = tempfile::tempdir().unwrap();
     let obj = "mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n";
     std::fs::write(dir.path().join("t.obj"), obj).unwrap();
-    // a material of one colour is no texture
-    for (mtl, colours, json) in [
-        ("newmtl a\nKd 1 1 1\n", "colours              NO\n", "\"has_texture\":false"),
-        ("newmtl a\nmap_Kd t.png\n", "colours              yes, a texture\n", "\"has_texture\":true"),
+    // a material of one color is no texture
+    for (mtl, colors, json) in [
+        ("newmtl a\nKd 1 1 1\n", "colors               NO\n", "\"has_texture\":false"),
+        ("newmtl a\nmap_Kd t.png\n", "colors               yes, a texture\n", "\"has_texture\":true"),
     ] {
         std::fs::write(dir.path().join("t.mtl"), mtl).unwrap();
         let o = tiface(dir.path(), &["check", "t.obj"]);
-        assert!(out(&o).contains(colours), "{}", out(&o));
+        assert!(out(&o).contains(colors), "{}", out(&o));
         let o = tiface(dir.path(), &["check", "t.obj", "--json"]);
         assert!(out(&o).contains(json), "{}", out(&o));
     }

@@ -185,7 +185,7 @@ fn the_bytes_do_not_depend_on_the_number_of_threads() {
     let grid = NodeGrid::fit(Aabb::SCENE, 70).unwrap();
     let few = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| ask(fields::gyroid, &grid).surface)
+        pool.install(|| extracted(fields::gyroid, &grid).surface)
     };
     assert_eq!(few(1), few(3));
 }
@@ -396,7 +396,7 @@ fn the_head_has_the_area_and_volume_of_another_marching_cubes() {
 
 // ---- few evaluations ----
 
-fn ask(field: fn(Vec3) -> f32, grid: &NodeGrid) -> Sparse {
+fn extracted(field: fn(Vec3) -> f32, grid: &NodeGrid) -> Sparse {
     sparse(&fields::batch(field), None, grid, 8, 1 << 16, &tiface::Quiet).unwrap()
 }
 
@@ -404,7 +404,7 @@ fn ask(field: fn(Vec3) -> f32, grid: &NodeGrid) -> Sparse {
 fn cost(field: fn(Vec3) -> f32, cells: usize) -> (f64, i64) {
     let grid = NodeGrid::fit(Aabb::SCENE, cells).unwrap();
     let start = std::time::Instant::now();
-    let few = ask(field, &grid);
+    let few = extracted(field, &grid);
     let seconds = start.elapsed().as_secs_f64();
     let (values, h) = fields::grid(field, cells + 1);
     let volume =
@@ -459,7 +459,7 @@ fn a_head_at_512_needs_a_hundredth_of_the_nodes() {
 fn a_head_at_1024_fits_in_half_a_gigabyte() {
     let grid = NodeGrid::fit(Aabb::SCENE, 1024).unwrap();
     let start = std::time::Instant::now();
-    let few = ask(fields::head, &grid);
+    let few = extracted(fields::head, &grid);
     println!(
         "1024³: {:.3} % evaluated, {} triangles, {:.2} s",
         100.0 * few.evaluated as f64 / grid.nodes() as f64,
@@ -486,7 +486,7 @@ fn fields_of_any_slope_and_offset_lose_nothing() {
     assert_eq!(cost(steep, 64).1, 0);
     assert_eq!(cost(saturated, 64).1, 0);
     let grid = NodeGrid::fit(Aabb::SCENE, 32).unwrap();
-    assert!(ask(|_| 0.5, &grid).surface.triangles.is_empty());
+    assert!(extracted(|_| 0.5, &grid).surface.triangles.is_empty());
     assert!(ball(Vec3::ZERO) < 0.0);
 }
 

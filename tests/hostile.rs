@@ -44,7 +44,7 @@ fn jpeg(width: u32, height: u32) -> Vec<u8> {
     out
 }
 
-/// A JPEG of one even colour written by hand: `components` without subsampling, every coefficient 0.
+/// A JPEG of one even color written by hand: `components` without subsampling, every coefficient 0.
 /// Huffman tables have the single code `0`, for "no difference" (DC) and "end of block" (AC).
 fn flat_jpeg(width: u16, height: u16, components: u8, progressive: bool) -> Vec<u8> {
     let mut b = vec![0xFF, 0xD8, 0xFF, 0xDB, 0, 67, 0];
@@ -334,7 +334,7 @@ fn a_picture_with_a_wrong_checksum_or_damaged_data_is_an_error() {
 }
 
 #[test]
-fn grey_palette_and_sixteen_bit_pictures_are_accepted_and_cmyk_is_refused() {
+fn gray_palette_and_sixteen_bit_pictures_are_accepted_and_cmyk_is_refused() {
     use image::{ExtendedColorType, ImageEncoder};
     let encode = |bytes: &[u8], color| {
         let mut out = Vec::new();

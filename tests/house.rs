@@ -18,7 +18,7 @@ const SOCIABLE: &[&str] = &["ground", "shared", "pipeline", "cli"];
 struct Source {
     module: String,
     path: PathBuf,
-    /// Lines of code with their numbers: no comments, nothing from the tests at the foot.
+    /// Lines of code with their numbers: no comments, nothing of the tests.
     lines: Vec<(usize, String)>,
 }
 
@@ -54,12 +54,29 @@ fn read(src: &Path, path: &Path) -> Option<Source> {
         return None;
     }
     let text = fs::read_to_string(path).unwrap();
-    let code = text.lines().enumerate().take_while(|(_, line)| line.trim() != "#[cfg(test)]");
-    let lines = code
+    let lines = without_tests(&text)
+        .into_iter()
         .filter(|(_, line)| !line.trim_start().starts_with("//"))
         .map(|(i, line)| (i + 1, line.split(" // ").next().unwrap_or_default().to_string()))
         .collect();
     Some(Source { module, path: below.to_path_buf(), lines })
+}
+
+/// The numbered lines of a formatted file without the items under `#[cfg(test)]`, wherever they stand.
+fn without_tests(text: &str) -> Vec<(usize, &str)> {
+    let indent = |line: &str| line.len() - line.trim_start().len();
+    let mut lines = text.lines().enumerate();
+    let mut kept = Vec::new();
+    while let Some((i, line)) = lines.next() {
+        if line.trim() != "#[cfg(test)]" {
+            kept.push((i, line));
+            continue;
+        }
+        // an item ends where a line as far in as its attribute ends it
+        let ends = |l: &str| !l.is_empty() && indent(l) == indent(line) && l.ends_with([';', '}', ',']);
+        lines.find(|(_, l)| ends(l));
+    }
+    kept
 }
 
 /// Modules of this crate named on a line: `crate::geom::Ray`, `use crate::{geom, image::Photo}`.
@@ -163,4 +180,12 @@ fn names_are_found_in_every_way_to_write_them() {
     assert_eq!(named("use crate::{geom::{Aabb, Ray}, image::Photo, run};"), ["geom", "image", "run"]);
     assert_eq!(named("    let x = crate::io::read(crate::run::Quiet);"), ["io", "run"]);
     assert!(named("use super::geom;").is_empty());
+}
+
+#[test]
+fn only_the_items_under_the_attribute_are_tests() {
+    let text = "use a;\n#[cfg(test)]\nmod tests;\nuse b;\n#[cfg(test)]\n#[path = \"c\"]\nmod c {\n    use d;\n}\nuse e;\n\
+                impl F {\n    #[cfg(test)]\n    fn g(\n        h: I,\n    ) -> J {\n        k;\n    }\n\n    fn l() {}\n}";
+    let kept: Vec<&str> = without_tests(text).into_iter().map(|(_, line)| line.trim()).collect();
+    assert_eq!(kept, ["use a;", "use b;", "use e;", "impl F {", "", "fn l() {}", "}"]);
 }

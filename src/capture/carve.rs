@@ -68,7 +68,7 @@ impl Projector {
     }
 }
 
-/// One view's mask, ready to be asked about rectangles.
+/// One view's mask, as sums over rectangles.
 pub(super) struct SilhouetteTable {
     /// Which view this is.
     pub view: usize,

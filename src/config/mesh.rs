@@ -80,7 +80,7 @@ table! {
     constants {
         /// Components with less than this share of the largest one's area are dropped: a head is one piece.
         keep_share: f64 => 1.0;
-        /// Every how many cells the field is asked first.
+        /// Every how many cells the field is evaluated first.
         coarse_step: u32 => 8;
         /// Newton steps that pull vertices onto the zero level of the field.
         newton_steps: u32 => 2;

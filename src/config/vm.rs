@@ -137,7 +137,7 @@ table! {
         distance_scale: f64 => 100.0, 100.0, 40.0;
         /// March step as a share of the distance of vertices. Half as many samples as published, at the same quality.
         step_ratio: f64 => 1.0, 1.0, 0.5;
-        /// Color is asked only of samples with more weight.
+        /// Color is evaluated only of samples with more weight.
         weight_threshold: f64 => 1e-3, 1e-3, 1e-4;
         /// A ray ends where less than this of its light is left.
         stop: f64 => 1e-3, 1e-3, 0.0;

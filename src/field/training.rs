@@ -70,7 +70,7 @@ pub trait Learner {
     /// Makes the optimizer step after `progress.step`.
     fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError>;
 
-    /// Puts everything needed to go on into a checkpoint; of a finished one only the result is asked.
+    /// Puts everything needed to go on into a checkpoint; of a finished one only the result is read.
     fn save(
         &self,
         progress: &TrainingProgress,

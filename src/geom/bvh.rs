@@ -235,7 +235,7 @@ impl Bvh {
     fn cast<const ANY: bool>(&self, ray: &Ray) -> Option<Hit> {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("bmi1") {
-            // SAFETY: the machine has both features, asked just above.
+            // SAFETY: the machine has both features, detected just above.
             return unsafe { self.cast_avx2::<ANY>(ray) };
         }
         self.walk::<ANY>(ray)

@@ -8,7 +8,7 @@ use super::similarity::Similarity;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
-/// OpenCV radial (k) and tangential (p) coefficients on normalised coordinates.
+/// OpenCV radial (k) and tangential (p) coefficients on normalized coordinates.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Distortion {
     /// r² coefficient.
@@ -29,7 +29,7 @@ impl Distortion {
         *self == Distortion::default()
     }
 
-    /// Ideal normalised coordinates (OpenCV: y down) to distorted ones.
+    /// Ideal normalized coordinates (OpenCV: y down) to distorted ones.
     pub fn apply(&self, x: f64, y: f64) -> (f64, f64) {
         let r2 = x * x + y * y;
         let radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3));
@@ -39,7 +39,7 @@ impl Distortion {
         )
     }
 
-    /// Distorted normalised coordinates back to ideal ones: Newton on [`Distortion::apply`] with its
+    /// Distorted normalized coordinates back to ideal ones: Newton on [`Distortion::apply`] with its
     /// exact Jacobian. `None` where the model folds over (no ideal point maps there).
     pub fn undo(&self, xd: f64, yd: f64) -> Option<(f64, f64)> {
         if self.is_none() {

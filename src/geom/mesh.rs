@@ -48,9 +48,11 @@ impl Mesh {
         0.5 * (b - a).cross(c - a).length()
     }
 
-    /// Watertight: every edge shared by exactly two triangles, oppositely wound.
+    /// Watertight: every edge shared by exactly two triangles, oppositely wound. False where an index is out of range.
     pub fn is_closed(&self) -> bool {
-        topology(&self.positions, &self.triangles).closed
+        let count = self.positions.len();
+        let in_range = self.triangles.as_flattened().iter().all(|&v| (v as usize) < count);
+        in_range && topology(&self.positions, &self.triangles).closed
     }
 
     /// Unit vertex normals, weighted by the angles of the triangles at each vertex (Thürmer, Wüthrich 1998); +z
@@ -154,5 +156,8 @@ mod tests {
         m.triangles.remove(0);
         assert!(!m.is_closed());
         assert!(!Mesh::default().is_closed());
+        let mut m = tetrahedron();
+        m.positions.pop();
+        assert!(!m.is_closed());
     }
 }

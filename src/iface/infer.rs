@@ -79,7 +79,7 @@ impl IFace {
         f
     }
 
-    /// Signed distance and its gradient (not normalised).
+    /// Signed distance and its gradient (not normalized).
     pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let all = sdf::gradients(&self.shape, self.table(), &self.weights, &self.scaled(points));
         all.into_iter().map(|(f, n)| (f / self.config.radius, Vec3::from(n))).unzip()

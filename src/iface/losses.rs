@@ -1,4 +1,4 @@
-//! What a training step of I-Face minimises: color, mask, eikonal and sparsity losses, as TI-Face names them.
+//! What a training step of I-Face minimizes: color, mask, eikonal and sparsity losses, as TI-Face names them.
 
 use super::model::SdfModel;
 use super::schedule;
@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 /// Named losses of one step, `[1]` each, for the log and for naming the one that broke.
 pub struct Losses {
-    /// The weighted sum that is minimised.
+    /// The weighted sum that is minimized.
     pub total: Tensor<1>,
     /// Mean squared error of the colors of rays that met a sample.
     pub rgb: Tensor<1>,
@@ -28,7 +28,7 @@ pub struct Losses {
 pub struct Marched<'a> {
     /// Rays with color and alpha of their pixels.
     pub batch: &'a Batch,
-    /// Where along the rays the field is asked.
+    /// Where along the rays the field is evaluated.
     pub samples: march::Samples,
     /// Length of a march step, in the field's units.
     pub dt: f32,
@@ -40,7 +40,7 @@ pub struct Marched<'a> {
 ///
 /// # Shapes
 ///
-/// `marched` holds `[rays]` pixels and `[n]` samples; the field is asked at `[n, 3]` and answers `[n, 8]` (distance,
+/// `marched` holds `[rays]` pixels and `[n]` samples; the field is evaluated at `[n, 3]`, to `[n, 8]` (distance,
 /// gradient, color, softness); composited, that is `[rays, 8]`.
 pub fn losses(
     config: &IfaceConfig,

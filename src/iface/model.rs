@@ -39,7 +39,7 @@ pub fn shape(config: &IfaceConfig) -> FieldShape {
 
 /// The named start values of every parameter, in the order of [`SdfModel`].
 ///
-/// Sphere initialisation of NeuS' geometry network: `sdf ≈ ‖x / radius‖ − ½` times `radius` for the
+/// Sphere initialization of NeuS' geometry network: `sdf ≈ ‖x / radius‖ − ½` times `radius` for the
 /// band presets, so that the initial gradient has length one; the published code leaves the factor out
 /// and starts with gradients of 1 / radius.
 pub fn initial(config: &IfaceConfig, seed: u64) -> [(&'static str, Vec<usize>, Vec<f32>); 11] {

@@ -101,7 +101,7 @@ impl Occupancy {
                 f[i] = value;
             }
         }
-        // sharpness is asked only where the softest surface would reach
+        // sharpness is evaluated only where the softest surface would reach
         let mut band = vec![config.band / inv_s + half_diagonal; r * r * r];
         if config.soften > 1.0 {
             let near: Vec<usize> = cells.iter().copied().filter(|&i| f[i].abs() < widest).collect();

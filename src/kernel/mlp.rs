@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! geometry  [x 3, hash 2L] ─ 64 ─ softplus₁₀₀ ─ 13     out[0] is the sdf, all 13 go to the color
-//! color    [13, SH 16, normal 3 (, hash 2L)] ─ 64 ─ relu ─ 64 ─ relu ─ 3 ─ sigmoid      no biases
+//! color     [13, SH 16, normal 3 (, hash 2L)] ─ 64 ─ relu ─ 64 ─ relu ─ 3 ─ sigmoid      no biases
 //! ```
 //!
 //! With the color skip (not published) the color network reads the hash features themselves too: twelve numbers

@@ -5,30 +5,39 @@ use crate::{Error, Monitor, Result};
 use glam::Vec3;
 use std::fmt::Display;
 
-/// Refuses a setting that is not `ok`.
-pub(super) fn setting(ok: bool, key: &str, expected: &str, found: impl Display) -> Result<()> {
-    if ok { Ok(()) } else { Err(Error::cannot(format!("`mesh.{key}` is {found}, expected {expected}"), "")) }
+/// Refuses a setting that is not `ok`. `name` is that of the parameter or field, or of the configuration's key where
+/// there is one.
+pub(super) fn setting(ok: bool, name: &str, expected: &str, found: impl Display) -> Result<()> {
+    if ok { Ok(()) } else { Err(Error::cannot(format!("`{name}` is {found}, expected {expected}"), "")) }
+}
+
+fn damaged(what: String) -> Error {
+    Error::cannot(what, "the mesh is damaged: export it again, or remove these vertices and triangles")
+}
+
+/// Refuses vertices that are not finite, whether or not a triangle names them.
+pub(super) fn finite(mesh: &Mesh) -> Result<()> {
+    let Some(first) = mesh.positions.iter().position(|p| !p.is_finite()) else { return Ok(()) };
+    Err(not_finite(mesh, first))
+}
+
+fn not_finite(mesh: &Mesh, first: usize) -> Error {
+    let count = mesh.positions.iter().filter(|p| !p.is_finite()).count();
+    damaged(format!(
+        "{count} vertices of the mesh have a coordinate that is not finite, the first is vertex {first}"
+    ))
 }
 
 /// Refuses triangles over vertices that are not there or not finite.
 pub(super) fn sound(mesh: &Mesh) -> Result<()> {
-    let damaged = |what| {
-        let hint = "the mesh is damaged: export it again, or remove these vertices and triangles";
-        Err(Error::cannot(what, hint))
-    };
     let vertices = mesh.positions.len();
     for (i, &v) in mesh.triangles.as_flattened().iter().enumerate() {
         match mesh.positions.get(v as usize) {
             None => {
                 let t = i / 3;
-                return damaged(format!("triangle {t} names vertex {v}, but the mesh has {vertices}"));
+                return Err(damaged(format!("triangle {t} names vertex {v}, but the mesh has {vertices}")));
             }
-            Some(p) if !p.is_finite() => {
-                let count = mesh.positions.iter().filter(|p| !p.is_finite()).count();
-                return damaged(format!(
-                    "{count} vertices of the mesh have a coordinate that is not finite, the first is vertex {v}"
-                ));
-            }
+            Some(p) if !p.is_finite() => return Err(not_finite(mesh, v as usize)),
             _ => {}
         }
     }
@@ -49,7 +58,7 @@ pub(super) fn answered(what: &str, points: usize, answers: usize) -> Result<()> 
     if points == answers {
         return Ok(());
     }
-    let message = format!("the {what} was asked at {points} points and answered {answers}");
+    let message = format!("the {what} was evaluated at {points} points and returned {answers} values");
     Err(Error::cannot(message, "a field must return one value a point, in order"))
 }
 

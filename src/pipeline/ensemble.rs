@@ -25,7 +25,7 @@ use serde_json::{Map, Value, json};
 /// A mask and a valid mask count from here on, as in `metrics`.
 const INSIDE: u8 = 128;
 
-/// Blends one picture per camera of `render`. `fields` are only asked if weights are to be fitted.
+/// Blends one picture per camera of `render`. `fields` are only evaluated if weights are to be fitted.
 pub(super) fn ensemble(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<Value> {
     let Config { ensemble: c, render, capture, .. } = line.config;
     can_blend(line.config)?;

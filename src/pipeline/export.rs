@@ -63,7 +63,7 @@ impl Export {
                 Ok(ExportedFiles { files: vec![(format!("{stem}.glb"), bytes)], warnings: Vec::new() })
             }
             MeshFormat::Obj => to_obj(mesh, texture.as_ref(), &options),
-            // the dataset's world whatever the frame, and colours at the vertices: one index, so the surface stays
+            // the dataset's world whatever the frame, and colors at the vertices: one index, so the surface stays
             // closed for whoever reads it
             MeshFormat::Ply => {
                 to_ply(mesh, None, &ExportOptions { world_from_mesh: *world_from_scene, ..options })
@@ -281,7 +281,7 @@ mod tests {
             let bytes = &ply.files[0].1;
             let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
             assert!(String::from_utf8_lossy(&bytes[..end]).contains("property double x\n"));
-            // three doubles, a normal, a colour
+            // three doubles, a normal, a color
             for (row, &p) in bytes[end..].chunks(24 + 12 + 3).zip(&mesh.positions) {
                 let v = row.as_chunks::<8>().0;
                 let found =

@@ -340,7 +340,7 @@ fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
     let line = Line::open(&config, &run).unwrap();
     assert_eq!(complete(&line, Stage::Render, &rest).unwrap().summary["cameras"], 3);
     assert_eq!((made(&run), rest.0.into_inner()), (3, 2));
-    // half a grey of 0.5 over white is 0.25 + 0.5; in float it is as it was
+    // half a gray of 0.5 over white is 0.25 + 0.5; in float it is as it was
     let name = line.capture().split(Split::Test).next().unwrap().name.clone();
     let shown = pictures::read(&run.path(format!("render/tface/{name}.png")), config.render.format).unwrap();
     assert_eq!(shown.pixel(3, 3), [191.0 / 255.0, 191.0 / 255.0, 191.0 / 255.0, 1.0]);

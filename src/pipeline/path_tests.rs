@@ -115,7 +115,7 @@ fn camera_paths_never_touch_the_evaluations_views() {
     }
     assert!(run.path("render/paths/orbit/done.json").is_file());
     assert_eq!(io::list_folders(&run.path("render/paths")).unwrap().len(), 3);
-    // half a grey of 0.5 over white
+    // half a gray of 0.5 over white
     let shown = pictures::read(&run.path("render/paths/orbit/tface/0001.png"), PictureFormat::Png).unwrap();
     assert_eq!(shown.pixel(3, 3)[0], 191.0 / 255.0);
 

@@ -46,7 +46,7 @@ fn occupied_vertices(state: &VmState, config: &VmConfig, size: [usize; 3]) -> Ve
         let mut index = Vec::with_capacity(slab);
         for i in 0..slab {
             let p = [at(0, x), at(1, i / size[2]), at(2, i % size[2])];
-            // what the mask before has emptied stays empty: only the rest is asked
+            // what the mask before has emptied stays empty: only the rest is evaluated
             if state.mask.as_ref().is_none_or(|m| m.contains(p)) {
                 points.push(p);
                 index.push(i);

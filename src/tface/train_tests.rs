@@ -40,7 +40,7 @@ fn a_ball_is_learned_from_eight_views() {
     let report = run(&config(), dir.path(), &Quiet).unwrap();
     let face = TFace::load("tface", dir.path()).unwrap();
     assert!(report.train_psnr > 20.0, "{report:?}");
-    // color is asked of a part of the densities, and those of a part of the lattice
+    // color is evaluated of a part of the densities, and those of a part of the lattice
     assert!(report.color_samples < report.density_samples && report.density_samples < report.lattice_samples);
     // the box has shrunk around a ball of 0.6 and its first guesses are finer now
     assert!(report.size.iter().all(|n| (24..40).contains(n)), "{report:?}");

@@ -12,7 +12,7 @@ The world is that of the GLB (glTF: +Y up). The camera's axes are OpenGL's: +X r
 along -Z. `fl_y` defaults to `fl_x`, the principal point to the middle. Lens distortion is not rendered:
 undistort the photograph.
 
-Colours come out as they are stored: every surface emits its base colour, and the picture is written in
+Colors come out as they are stored: every surface emits its base color, and the picture is written in
 sRGB without tone mapping, straight alpha, transparent where nothing is. Cycles on the CPU.
 """
 
@@ -28,7 +28,7 @@ BLENDER_FROM_GLTF = mathutils.Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0),
 
 
 def emit(found):
-    """Makes a material of nothing but its base colour: a texture, else vertex colours, else grey."""
+    """Makes a material of nothing but its base color: a texture, else vertex colors, else gray."""
     materials = [m for m in found.data.materials if m] or [bpy.data.materials.new("bare")]
     found.data.materials.clear()
     for material in materials:

@@ -81,7 +81,7 @@ def picture_of(image):
 
 
 def shown_picture(material):
-    """The picture that reaches the surface as its colour, and whether light plays a part."""
+    """The picture that reaches the surface as its color, and whether light plays a part."""
     nodes = material.node_tree.nodes
     kinds = {node.type for node in nodes}
     unlit = bool(kinds & {"EMISSION", "BACKGROUND"}) and "BSDF_PRINCIPLED" not in kinds
@@ -122,7 +122,7 @@ def main():
             bad.append("not closed")
         if not volume > 0:
             bad.append(f"volume {volume}")
-        # a PLY may have colours at its vertices in the texture's place
+        # a PLY may have colors at its vertices in the texture's place
         bare = ending == ".ply" and b"TextureFile" not in path.read_bytes()[:4096]
         if textured and not bare and not found.data.uv_layers:
             bad.append("no texture coordinates")

@@ -6,7 +6,7 @@
 The .obj and .ply are looked for beside the .glb. GLB and OBJ are +Y up; PLY is in the dataset's world,
 whose up direction is --up and whose unit is --unit-m metres. In every reader and every file: the same
 bounds to 1e-6 of the size, closed after welding equal positions, positive volume. Files without a
-texture: colours present and alike. Files with one: its pixels are those of the .png beside them, and
+texture: colors present and alike. Files with one: its pixels are those of the .png beside them, and
 texture coordinates agree corner by corner, save where a reader drops them (open3d does in PLY), which
 is said. Exits 1 after printing every disagreement.
 """
@@ -24,7 +24,7 @@ import trimesh
 from axes import turn_to_y_up
 
 
-class Seen(typing.NamedTuple):
+class LoadedMesh(typing.NamedTuple):
     """What a reader made of a file."""
 
     vertices: numpy.ndarray
@@ -53,7 +53,7 @@ def with_trimesh(path):
     if colors is not None:
         scale = 255.0 if numpy.issubdtype(colors.dtype, numpy.integer) else 1.0
         colors = numpy.asarray(colors)[:, :3] / scale
-    return Seen(trimesh.transform_points(mesh.vertices, matrix), mesh.faces, colors, uvs, picture)
+    return LoadedMesh(trimesh.transform_points(mesh.vertices, matrix), mesh.faces, colors, uvs, picture)
 
 
 def with_open3d(path):
@@ -63,7 +63,7 @@ def with_open3d(path):
     uvs = numpy.asarray(mesh.triangle_uvs).reshape(-1, 3, 2) if mesh.has_triangle_uvs() else None
     pictures = [numpy.asarray(t) for t in mesh.textures if not t.is_empty()]
     picture = pictures[0][::-1, :, :3] if pictures else None  # open3d keeps the lowest row first
-    return Seen(numpy.asarray(mesh.vertices), faces, colors, uvs, picture)
+    return LoadedMesh(numpy.asarray(mesh.vertices), faces, colors, uvs, picture)
 
 
 def closed_and_volume(vertices, faces):
@@ -82,33 +82,33 @@ def linear(coded):
     return numpy.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
 
 
-def colors_wrong(path, seen, expected):
-    """Mean colours against the PLY's; in a GLB they are stored in linear light."""
-    if seen.colors is None or seen.colors.std(axis=0).max() < 0.01:
-        return ["no colours"]
+def colors_wrong(path, loaded, expected):
+    """Mean colors against the PLY's; in a GLB they are stored in linear light."""
+    if loaded.colors is None or loaded.colors.std(axis=0).max() < 0.01:
+        return ["no colors"]
     mean = (linear(expected) if path.suffix == ".glb" else expected).mean(axis=0)
-    if abs(seen.colors.mean(axis=0) - mean).max() > 0.01:
-        return [f"mean colour {seen.colors.mean(axis=0)}, expected {mean}"]
+    if abs(loaded.colors.mean(axis=0) - mean).max() > 0.01:
+        return [f"mean color {loaded.colors.mean(axis=0)}, expected {mean}"]
     return []
 
 
-def texture_wrong(path, reader, seen, expected_uvs):
+def texture_wrong(path, reader, loaded, expected_uvs):
     if path.suffix == ".ply" and reader is with_open3d:
         print("    open3d drops texture coordinates from PLY, as it always does")
         return []
-    if seen.uvs is None:
+    if loaded.uvs is None:
         return ["no texture coordinates"]
     wrong = []
     if expected_uvs is not None:
-        apart = abs(seen.uvs - expected_uvs).max() if seen.uvs.shape == expected_uvs.shape else numpy.inf
+        apart = abs(loaded.uvs - expected_uvs).max() if loaded.uvs.shape == expected_uvs.shape else numpy.inf
         print(f"    texture coordinates differ by {apart:.1e}")
         if apart > 1e-6:
             wrong.append(f"texture coordinates differ by {apart}")
     truth = numpy.asarray(PIL.Image.open(path.with_suffix(".png")))
-    if seen.picture is None:
+    if loaded.picture is None:
         wrong.append("no picture")
-    elif not numpy.array_equal(seen.picture, truth):
-        wrong.append(f"picture {seen.picture.shape} is not that of {path.with_suffix('.png').name}")
+    elif not numpy.array_equal(loaded.picture, truth):
+        wrong.append(f"picture {loaded.picture.shape} is not that of {path.with_suffix('.png').name}")
     else:
         print(f"    picture {truth.shape[1]} x {truth.shape[0]} equal to the pixel")
     return wrong
@@ -131,8 +131,8 @@ def main():
             continue
         for reader in [with_trimesh, with_open3d]:
             name = f"{path.name} in {reader.__name__[5:]}"
-            seen = reader(path)
-            vertices, faces = seen.vertices, seen.faces
+            loaded = reader(path)
+            vertices, faces = loaded.vertices, loaded.faces
             placed = vertices @ turn.T if ending == ".ply" else vertices
             low, high = placed.min(axis=0), placed.max(axis=0)
             closed, volume = closed_and_volume(numpy.asarray(vertices), numpy.asarray(faces))
@@ -142,8 +142,8 @@ def main():
             apart = max(abs(low - expected[0]).max(), abs(high - expected[1]).max()) / size
             print(
                 f"{name:24} {len(vertices)} vertices {len(faces)} triangles  bounds differ by {apart:.1e}"
-                f"  closed {closed}  volume {volume:.9f}  colours {seen.colors is not None}"
-                f"  texture {seen.uvs is not None}"
+                f"  closed {closed}  volume {volume:.9f}  colors {loaded.colors is not None}"
+                f"  texture {loaded.uvs is not None}"
             )
             bad = []
             if apart > 1e-6:
@@ -153,14 +153,14 @@ def main():
             if not volume > 0:
                 bad.append(f"volume {volume}")
             if textured and ending == ".ply" and b"TextureFile" not in path.read_bytes()[:4096]:
-                # closed as it is, with colours at its vertices in the texture's place
-                bad += [] if seen.colors is not None else ["neither a texture nor colours"]
+                # closed as it is, with colors at its vertices in the texture's place
+                bad += [] if loaded.colors is not None else ["neither a texture nor colors"]
             elif textured:
-                bad += texture_wrong(path, reader, seen, uvs)
+                bad += texture_wrong(path, reader, loaded, uvs)
             else:
-                bad += colors_wrong(path, seen, ply_colors)
+                bad += colors_wrong(path, loaded, ply_colors)
             if uvs is None:
-                uvs = seen.uvs
+                uvs = loaded.uvs
             wrong += [f"{name}: {line}" for line in bad]
     for line in wrong:
         print("WRONG", line)

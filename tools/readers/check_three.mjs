@@ -134,7 +134,7 @@ for (const glb of process.argv.slice(2)) {
     check(name, apart <= 1e-6 * longest, `its box differs by ${apart}`);
     check(name, f.closed, "not closed");
     check(name, f.volume > 0, `volume ${f.volume}`);
-    // a PLY may have colours at its vertices in the texture's place
+    // a PLY may have colors at its vertices in the texture's place
     if (ending === "ply" && f.bare) continue;
     check(name, f.uvs.length === expected.uvs.length && f.uvs.length > 0, `${f.uvs.length} texture coordinates`);
     check(name, uv <= 1e-6, `texture coordinates differ by ${uv}`);

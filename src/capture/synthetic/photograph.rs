@@ -1,7 +1,7 @@
 //! Takes one picture of the demo head: sphere tracing, light, supersampled coverage.
 //!
 //! A grid of distances sampled once lets rays and shadows stride through empty air for the price
-//! of a lookup; the exact function is only asked close to the surface.
+//! of a lookup; the exact function is only evaluated close to the surface.
 
 use super::look::{Lamp, background, lamps, reflectance};
 use super::noise::{noise, trilinear, unit};

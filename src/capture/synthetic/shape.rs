@@ -164,7 +164,7 @@ pub(super) fn parts(q: Vec3) -> MaterialDistances {
 
 fn skin(q: Vec3, s: Vec3, skull: f32) -> f32 {
     let mut d = skull;
-    // each part is asked only where its blend can reach
+    // each part is evaluated only where its blend can reach
     if q.z > -0.165 {
         let face = ellipsoid(q - Vec3::new(0.0, -0.030, -0.026), Vec3::new(0.059, 0.063, 0.090));
         d = union(d, face, 0.03);

@@ -1,4 +1,4 @@
-//! The signed-distance field asked, not trained: nothing is kept for a backward.
+//! The signed-distance field evaluated, not trained: nothing is kept for a backward.
 
 use super::{CHUNK, FieldShape, Inputs, WIDTH, color_layers, run, skip, softened};
 use crate::dispatch;
@@ -165,7 +165,7 @@ dispatch! { fn color_task / color_body(task: &mut ColorTask, w: &Weights) }
 
 /// Color of points whose unit normals are known (of a mesh's surface), point `i` seen along `counts[i]` unit
 /// directions (one each without a list): no gradient is computed, a third of the work of [`super::forward`], and
-/// the geometry network is asked once a point.
+/// the geometry network is evaluated once a point.
 ///
 /// # Shapes
 ///

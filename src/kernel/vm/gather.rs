@@ -123,7 +123,7 @@ macro_rules! in_pieces {
     }};
 }
 
-/// A set of planes and lines, ready to be asked.
+/// A set of planes and lines, prepared for lookups.
 pub(super) struct Lookup<'a> {
     terms: [Term<'a>; 3],
     size: [usize; 3],

@@ -2,7 +2,7 @@
 //!
 //! TensoRF's alpha mask (Chen et al. 2022, §4.3; `alphaMask` of the published code) marks vertices and is
 //! looked up trilinearly: a point is kept if any vertex around it is. That is the same as cells whose
-//! corners are asked once, so here cells are stored, and a ray steps over empty ones *before* the field is
+//! corners are evaluated once, so here cells are stored, and a ray steps over empty ones *before* the field is
 //! touched. Sample positions `t = entry + step · (k + jitter)` do not depend on the mask.
 
 use crate::kernel::march::MarchRay;
@@ -26,7 +26,7 @@ fn bit(bits: &[u64], i: usize) -> bool {
 }
 
 impl BoxMask {
-    /// From cells asked one by one.
+    /// From cells evaluated one by one.
     pub fn new(
         min: [f32; 3],
         max: [f32; 3],

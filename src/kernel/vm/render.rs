@@ -31,7 +31,7 @@ pub struct Shading {
     pub shift: f32,
     /// Optical lengths are steps times this.
     pub distance_scale: f32,
-    /// Color is asked only where the weight is above this.
+    /// Color is evaluated only where the weight is above this.
     pub weight_threshold: f32,
     /// A ray ends where less than this of its light is left; 0 never does.
     pub stop: f32,
@@ -320,7 +320,7 @@ dispatch! {
     fn density_points / density_body(points: &[[f32; 3]], out: &mut [f32], field: &VmField, lookup: &Lookup)
 }
 
-/// Densities at points of the field's box, the mask not asked. `[n, 3]` → `[n]`.
+/// Densities at points of the field's box, without the mask. `[n, 3]` → `[n]`.
 pub fn density_at(field: &VmField, density: &[f32], points: &[[f32; 3]]) -> Vec<f32> {
     let lookup = Lookup::new(&field.density, density);
     let mut out = vec![0f32; points.len()];

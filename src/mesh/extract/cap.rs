@@ -35,7 +35,7 @@ pub struct Skin {
 }
 
 impl Cap {
-    /// A cap without a ring, to ask where it lies.
+    /// A cap without a ring, for queries of where it lies.
     pub(super) fn bare(bounds: Aabb, cell: f32) -> Cap {
         Cap { bounds, near: cell / 256.0, ring: Vec::new() }
     }
@@ -76,7 +76,7 @@ impl Cap {
     pub fn color(&self, p: Vec3) -> [f32; 3] {
         let (mut sum, mut total) = ([0f64; 3], 0f64);
         for Skin { position, color, .. } in &self.ring {
-            // the fourth power keeps the middle from being grey of everything
+            // the fourth power keeps the middle from being gray of everything
             let w = 1.0 / f64::from(position.distance_squared(p)).max(1e-18).powi(2);
             total += w;
             (0..3).for_each(|k| sum[k] += w * f64::from(color[k]));

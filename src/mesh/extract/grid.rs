@@ -31,7 +31,7 @@ impl NodeGrid {
             let message = format!("the box to mesh in, {min} to {max}, is empty or not finite");
             return Err(Error::cannot(message, "check the scene box of the capture"));
         }
-        setting((2..=8192).contains(&resolution), "resolution", "2..=8192", resolution)?;
+        setting((2..=8192).contains(&resolution), "mesh.resolution", "2..=8192", resolution)?;
         let spacing = size.max_element() / resolution as f32;
         // A side a rounding error longer than n cells is n cells long.
         let cells = size.to_array().map(|s| ((s / spacing - 1e-3).ceil() as usize).max(2));

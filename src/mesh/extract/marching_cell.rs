@@ -52,7 +52,7 @@ pub(super) struct CellSurface {
 pub(super) struct Case {
     /// How many of `triangles` are used.
     pub count: u8,
-    /// The values matter: ask [`resolve`].
+    /// The values matter: see [`resolve`].
     pub ambiguous: bool,
     /// Up to five triangles of edge codes.
     pub triangles: [[u8; 3]; 5],
@@ -126,7 +126,7 @@ struct Loops {
 }
 
 impl Loops {
-    /// `joined` is asked for every ambiguous face: are its inside corners connected across it?
+    /// `joined` is called for every ambiguous face: are its inside corners connected across it?
     fn trace(case: u8, mut joined: impl FnMut(&[u8; 4]) -> bool) -> Loops {
         let mut next = [255u8; 12];
         for face in &FACES {

@@ -78,11 +78,21 @@ impl ExtractOptions {
     /// The ranges that no later step looks at.
     fn check(&self) -> Result<()> {
         let share = 0.0..=1.0;
-        setting(self.batch > 0, "batch", "at least 1", self.batch)?;
-        setting((0.0..=1.0).contains(&self.keep_share), "keep_share", "0..=1", self.keep_share)?;
-        setting(self.newton_steps <= 8, "newton_steps", "0..=8", self.newton_steps)?;
-        setting(share.contains(&self.relax), "relax", "0..=1", self.relax)?;
-        setting(share.contains(&self.longest_handle), "longest_handle", "0..=1", self.longest_handle)
+        setting(self.batch > 0, "ExtractOptions::batch", "at least 1", self.batch)?;
+        setting(
+            (0.0..=1.0).contains(&self.keep_share),
+            "ExtractOptions::keep_share",
+            "0..=1",
+            self.keep_share,
+        )?;
+        setting(self.newton_steps <= 8, "ExtractOptions::newton_steps", "0..=8", self.newton_steps)?;
+        setting(share.contains(&self.relax), "ExtractOptions::relax", "0..=1", self.relax)?;
+        setting(
+            share.contains(&self.longest_handle),
+            "ExtractOptions::longest_handle",
+            "0..=1",
+            self.longest_handle,
+        )
     }
 }
 
@@ -99,7 +109,7 @@ pub struct MeshReport {
     pub nodes_evaluated: usize,
     /// The same as a share of all nodes, 0..=1.
     pub share_evaluated: f64,
-    /// Nodes outside the hull, taken as outside without asking.
+    /// Nodes outside the hull, taken as outside without being evaluated.
     pub nodes_outside_hull: usize,
     /// 99th percentile of the field's gradient norm over coarse nodes; 1 for a true distance.
     pub gradient_norm: f32,
@@ -298,20 +308,20 @@ fn check_surface(found: &Sparse) -> Result<()> {
         |what: String, hint: &str| Err(Error::cannot(format!("no surface: the field is {what}"), hint));
     if smallest > largest && nodes > 0 {
         return none(
-            format!("NaN or infinite at all {nodes} nodes asked"),
+            format!("NaN or infinite at all {nodes} nodes evaluated"),
             "training diverged: resume `iface` from an earlier checkpoint",
         );
     }
     if largest < 0.0 && found.skipped == 0 && found.surface.non_finite == 0 && nodes > 0 {
         return none(
-            format!("negative at all {nodes} nodes asked (largest {largest:.3e}), everything is inside"),
+            format!("negative at all {nodes} nodes evaluated (largest {largest:.3e}), everything is inside"),
             "the field may be inverted (negative must be inside), untrained, or the box may lie within the head",
         );
     }
     // with an empty hull nothing is evaluated: then the smallest is infinite
     if found.surface.triangles.is_empty() {
         return none(
-            format!("positive at all {nodes} nodes asked (smallest {smallest:.3e}), nothing is inside"),
+            format!("positive at all {nodes} nodes evaluated (smallest {smallest:.3e}), nothing is inside"),
             "train `iface` longer, check that the box holds the head, or raise `mesh.resolution` for small pieces",
         );
     }
@@ -419,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_without_a_surface_is_a_named_error_with_a_way_out() {
+    fn a_field_without_a_surface_is_a_named_error_with_a_hint() {
         let err = |f: fn(Vec3) -> f32| mesh_of(f, &coarse()).unwrap_err();
         let all = [
             (err(|_| 1.0), "nothing is inside"),
@@ -435,8 +445,13 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_configuration_names_its_key() {
+    fn a_bad_option_is_named() {
         let bad = ExtractOptions { keep_share: 2.0, ..coarse() };
-        assert!(mesh_of(|p| p.length() - 0.5, &bad).unwrap_err().to_string().contains("keep_share"));
+        assert!(
+            mesh_of(|p| p.length() - 0.5, &bad)
+                .unwrap_err()
+                .to_string()
+                .contains("`ExtractOptions::keep_share` is 2")
+        );
     }
 }

@@ -111,7 +111,7 @@ struct Flood<'a> {
 }
 
 impl Flood<'_> {
-    /// Values at nodes, outside ones without asking. Order as given.
+    /// Values at nodes, outside ones without evaluating them. Order as given.
     fn evaluate(&mut self, nodes: &[[usize; 3]]) -> Result<Vec<f32>> {
         let mut values = Vec::with_capacity(nodes.len());
         for nodes in nodes.chunks(self.batch.max(1)) {
@@ -121,9 +121,9 @@ impl Flood<'_> {
             let mut batch = vec![self.grid.spacing; points.len()];
             let inside = |p: Vec3| self.inside_hull.is_none_or(|inside| inside(p));
             let keep: Vec<usize> = (0..points.len()).filter(|&i| inside(points[i])).collect();
-            let asked: Vec<Vec3> = keep.iter().map(|&i| points[i]).collect();
-            let answer = if asked.is_empty() { Vec::new() } else { (self.field)(&asked) };
-            answered("signed distance", asked.len(), answer.len())?;
+            let evaluated: Vec<Vec3> = keep.iter().map(|&i| points[i]).collect();
+            let answer = if evaluated.is_empty() { Vec::new() } else { (self.field)(&evaluated) };
+            answered("signed distance", evaluated.len(), answer.len())?;
             for (&i, &v) in keep.iter().zip(&answer) {
                 batch[i] = v;
                 if v.is_finite() {
@@ -131,8 +131,8 @@ impl Flood<'_> {
                     self.out.range = (low.min(v), high.max(v));
                 }
             }
-            self.out.evaluated += asked.len();
-            self.out.skipped += points.len() - asked.len();
+            self.out.evaluated += evaluated.len();
+            self.out.skipped += points.len() - evaluated.len();
             values.extend(batch);
         }
         Ok(values)
@@ -212,7 +212,7 @@ impl Flood<'_> {
             n
         };
         for s in &spans {
-            // A border end may not have been asked: it matters as a neighbour of the last node.
+            // A border end may not have been evaluated: it matters as a neighbour of the last node.
             for c in [s.low, s.high] {
                 self.want(at(s, c));
             }
@@ -393,8 +393,8 @@ mod tests {
 
     fn both(field: impl Fn(Vec3) -> f32, bounds: Aabb, resolution: usize) -> (Sparse, LevelSet) {
         let grid = NodeGrid::fit(bounds, resolution).unwrap();
-        let ask = |p: &[Vec3]| p.iter().map(|&p| field(p)).collect::<Vec<_>>();
-        let few = sparse(&ask, None, &grid, 8, 1 << 16, &Quiet).unwrap();
+        let evaluate = |p: &[Vec3]| p.iter().map(|&p| field(p)).collect::<Vec<_>>();
+        let few = sparse(&evaluate, None, &grid, 8, 1 << 16, &Quiet).unwrap();
         let mut values = Vec::new();
         for k in 0..grid.dims[2] {
             for j in 0..grid.dims[1] {
@@ -481,15 +481,15 @@ mod tests {
     }
 
     #[test]
-    fn a_skipped_half_is_never_asked_and_the_rest_is_closed_there() {
+    fn a_skipped_half_is_never_evaluated_and_the_rest_is_closed_there() {
         let grid = NodeGrid::fit(Aabb::SCENE, 48).unwrap();
         let field = ball(Vec3::ZERO, 0.6);
-        let ask = |p: &[Vec3]| {
+        let evaluate = |p: &[Vec3]| {
             assert!(p.iter().all(|p| p.x <= 0.1));
             p.iter().map(|&p| field(p)).collect::<Vec<_>>()
         };
         let inside = |p: Vec3| p.x <= 0.1;
-        let s = sparse(&ask, Some(&inside), &grid, 8, 1 << 16, &Quiet).unwrap();
+        let s = sparse(&evaluate, Some(&inside), &grid, 8, 1 << 16, &Quiet).unwrap();
         let mesh = crate::geom::Mesh {
             positions: s.surface.positions,
             triangles: s.surface.triangles,
@@ -502,10 +502,10 @@ mod tests {
     #[test]
     fn a_stop_and_a_short_answer_are_errors() {
         let grid = NodeGrid::fit(Aabb::SCENE, 16).unwrap();
-        let ask = |p: &[Vec3]| vec![1.0; p.len()];
-        assert!(sparse(&ask, None, &grid, 8, 64, &Stopping).unwrap_err().kind().is_stop());
+        let evaluate = |p: &[Vec3]| vec![1.0; p.len()];
+        assert!(sparse(&evaluate, None, &grid, 8, 64, &Stopping).unwrap_err().kind().is_stop());
         let short = |p: &[Vec3]| vec![1.0; p.len() - 1];
         let error = sparse(&short, None, &grid, 8, 1 << 16, &Quiet).unwrap_err().to_string();
-        assert!(error.contains("asked at 1 points and answered 0"), "{error}");
+        assert!(error.contains("evaluated at 1 points and returned 0"), "{error}");
     }
 }

@@ -12,7 +12,7 @@ const FILE: &str = "surface.safetensors";
 /// The whole zero level set of a field, in scene coordinates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExtractedSurface {
-    /// Without colours: those of rays are the field's.
+    /// Without colors: those of rays are the field's.
     pub mesh: Mesh,
     /// What closes it where the box ends.
     pub cap: Option<Cap>,

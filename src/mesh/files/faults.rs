@@ -44,7 +44,7 @@ pub(super) fn check_atlas(mesh: &Mesh, atlas: &Atlas) -> Result<()> {
     }
 }
 
-/// Normals or colours for some vertices only.
+/// Normals or colors for some vertices only.
 pub(super) fn wrong_length(found: usize, what: &str, vertices: usize) -> Error {
     Error::cannot(format!("{found} {what} for {vertices} vertices"), DAMAGED)
 }

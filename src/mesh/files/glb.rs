@@ -1,24 +1,24 @@
 //! A mesh as GLB: glTF 2.0, binary, one file (Khronos, *glTF 2.0 Specification*).
 //!
-//! Right-handed, +Y up, metres, counter-clockwise. Colours that already hold the light are marked
+//! Right-handed, +Y up, metres, counter-clockwise. Colors that already hold the light are marked
 //! `KHR_materials_unlit`, beside a rough non-metal for viewers that do not know it.
 //!
-//! Colour is either the vertices' own or a texture's, never both, since viewers multiply them:
-//! `COLOR_0` is **linear** light, while our vertex colours and pictures are sRGB-coded. Pictures lie in
+//! Color is either the vertices' own or a texture's, never both, since viewers multiply them:
+//! `COLOR_0` is **linear** light, while our vertex colors and pictures are sRGB-coded. Pictures lie in
 //! the file. A mesh far from the origin is written around its middle, which its node carries in f64: its shape
 //! is as exact as that of any other.
 //!
 //! # Textures that depend on the view
 //!
 //! A texture that nothing refers to may be dropped by any tool, and the Khronos validator says so for
-//! one that is named in `extras` alone. So each lobe is the base colour of a material of its own, which
+//! one that is named in `extras` alone. So each lobe is the base color of a material of its own, which
 //! the primitive offers as a variant (`KHR_materials_variants`). Viewers show the first material
 //! unless somebody asks for a variant, and those that know nothing of variants always do. The first
 //! material says how to use them:
 //!
 //! ```json
 //! "extras": { "tiface": { "lobes": [ { "name": "lobe 0", "texture": 1, "material": 1, "variant": 0 } ],
-//!   "view_dependent_color": { …how their bytes become a colour… } } }
+//!   "view_dependent_color": { …how their bytes become a color… } } }
 //! ```
 
 use super::file_mesh::{ExportOptions, FileMesh, encode};
@@ -37,7 +37,7 @@ use serde_json::{Value, json};
 use std::collections::BTreeMap;
 
 /// Returns a mesh as the bytes of a `.glb` file, with the pictures of its texture inside; without a texture it is
-/// coloured by its vertices.
+/// colored by its vertices.
 ///
 /// # Errors
 ///
@@ -223,7 +223,7 @@ mod tests {
     use crate::mesh::files::{PictureSource, ReadOptions, read, read_with, weld};
     use std::path::Path;
 
-    /// A strip of `vertices` points on a helix, coloured.
+    /// A strip of `vertices` points on a helix, colored.
     fn strip(vertices: u32) -> Mesh {
         let at = |i: u32| Vec3::new((i as f32 * 0.1).cos(), i as f32 * 1e-3, (i as f32 * 0.1).sin());
         Mesh {
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn a_texture_replaces_the_vertex_colours_and_reads_back_exactly() {
+    fn a_texture_replaces_the_vertex_colors_and_reads_back_exactly() {
         let (mesh, texture) = tetrahedron();
         let (atlas, options) = (&texture.atlas, ExportOptions::default());
         let glb = to_glb(&mesh, Some(&texture), &options).unwrap();

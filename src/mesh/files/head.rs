@@ -16,13 +16,13 @@ use std::path::Path;
 
 const FILE: &str = "geometry.safetensors";
 
-/// Most functions of a spherical-harmonic colour.
+/// Most functions of a spherical-harmonic color.
 const MOST_LOBES: usize = 16;
 
 /// A simplified mesh with its texture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeadMesh {
-    /// The surface in scene coordinates; without a texture it has colours at its vertices.
+    /// The surface in scene coordinates; without a texture it has colors at its vertices.
     pub mesh: Mesh,
     /// Where the scene sits in the dataset's world.
     pub world_from_scene: Similarity,

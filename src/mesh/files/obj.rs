@@ -2,7 +2,7 @@
 //!
 //! Numbers are the shortest that read back as the same f32, which is never more than nine
 //! significant digits. `v`, `vt` and `vn` are indexed apart, so a surface that is closed stays closed
-//! whatever its seams. Colour is `v x y z r g b`, sRGB-coded, or a picture that a `.mtl` beside it
+//! whatever its seams. Color is `v x y z r g b`, sRGB-coded, or a picture that a `.mtl` beside it
 //! names; never both.
 //!
 //! A mesh far from the origin needs more digits than f32 has: its positions are written with as many as
@@ -16,7 +16,7 @@ use crate::geom::{Aabb, Mesh};
 use std::io::Write;
 
 /// Returns a mesh as an `.obj`, with a texture also its `.mtl` and its picture, which must lie in one folder; without
-/// one it is coloured by its vertices.
+/// one it is colored by its vertices.
 ///
 /// # Errors
 ///
@@ -29,7 +29,7 @@ pub fn to_obj(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOption
     let mut files = Vec::new();
     if let Some(texture) = texture {
         file.colors = Vec::new(); // some readers multiply them into the texture
-        let (picture, ending) = encode("base colour", &texture.color, options.jpeg_quality)?;
+        let (picture, ending) = encode("base color", &texture.color, options.jpeg_quality)?;
         let mtl = format!(
             "{GENERATOR}\nnewmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {stem}.{ending}\n"
         );
@@ -77,7 +77,7 @@ fn write(out: &mut Vec<u8>, file: &FileMesh, stem: &str, name: &str) -> std::io:
     Ok(())
 }
 
-/// `v` with colours where there are any, then `vn`.
+/// `v` with colors where there are any, then `vn`.
 fn write_vertices(out: &mut Vec<u8>, mesh: &FileMesh) -> std::io::Result<()> {
     out.reserve(mesh.positions.len() * 60 + mesh.triangles.len() * 30);
     let size = Aabb::around(mesh.positions.iter().copied()).size().max_element();
@@ -123,7 +123,7 @@ mod tests {
     use std::path::Path;
 
     #[test]
-    fn a_coloured_triangle_is_these_lines() {
+    fn a_colored_triangle_is_these_lines() {
         let mesh = Mesh {
             positions: vec![Vec3::ZERO, Vec3::X, Vec3::new(0.0, 0.0, 1e-7)],
             normals: vec![-Vec3::Y; 3],

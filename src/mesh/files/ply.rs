@@ -1,7 +1,7 @@
 //! A mesh as PLY: binary little endian, in the dataset's own world.
 //!
 //! No turn and no unit: PLY says nothing of either, and Blender does not turn it (it does turn OBJ and
-//! GLB). Colours are 8-bit and sRGB-coded, as every reader takes them. Positions are `float`, or `double` where
+//! GLB). Colors are 8-bit and sRGB-coded, as every reader takes them. Positions are `float`, or `double` where
 //! the mesh lies so far from the origin that f32 would show.
 //!
 //! PLY has one index for everything. Without a texture vertices stay whole, and so the surface closed:
@@ -16,7 +16,7 @@ use crate::Result;
 use crate::geom::Mesh;
 use crate::image::quantize;
 
-/// Returns a mesh as a `.ply`, coloured by its vertices; with a texture split at seams, and its picture beside it. Of
+/// Returns a mesh as a `.ply`, colored by its vertices; with a texture split at seams, and its picture beside it. Of
 /// the options `up` and `unit_m` do not matter.
 ///
 /// # Errors
@@ -28,7 +28,7 @@ pub fn to_ply(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOption
     let stem = safe_name(&options.stem);
     let mut files = Vec::new();
     if let Some(texture) = texture {
-        let (picture, ending) = encode("base colour", &texture.color, options.jpeg_quality)?;
+        let (picture, ending) = encode("base color", &texture.color, options.jpeg_quality)?;
         files.push((format!("{stem}.{ending}"), picture));
     }
     let ply = bytes(&file, files.first().map(|(name, _)| name.as_str()));

@@ -27,14 +27,14 @@ pub struct ReadMesh {
     /// of the picture in the file, else 0 × 0. Coordinates are finite; in files of others they may
     /// leave 0..=1, where a texture repeats.
     pub atlas: Option<Atlas>,
-    /// The base colour.
+    /// The base color.
     pub picture: Option<PictureSource>,
 }
 
 /// Returns the mesh in the bytes of a `.glb`, `.ply` or `.obj` file, in the file's own coordinates, rounded to f32:
 /// for a mesh far from the origin see [`read_with`].
 ///
-/// `path` is for messages only. Colours come back sRGB-coded; normals only when every vertex has
+/// `path` is for messages only. Colors come back sRGB-coded; normals only when every vertex has
 /// one. Polygons are fanned. Nothing is welded or repaired. Textures are passed over, sound or not.
 ///
 /// # Errors

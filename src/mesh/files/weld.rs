@@ -23,7 +23,7 @@ pub(super) fn places(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
 /// Returns the mesh with equal positions merged, −0 being 0. Triangles keep their number and order, so an atlas
 /// stays parallel to them; those that fold are kept too.
 ///
-/// A merged vertex has the colour of its first copy, and their common normal; copies that disagree, as
+/// A merged vertex has the color of its first copy, and their common normal; copies that disagree, as
 /// on creases, get the unit of their sum.
 pub fn weld(mesh: &Mesh) -> Mesh {
     let (new, positions) = places(mesh);
@@ -66,7 +66,7 @@ mod tests {
         assert_eq!(welded.positions, [Vec3::ZERO, Vec3::X, Vec3::Y]);
         assert_eq!(welded.triangles, [[0, 1, 2], [0, 2, 1]]);
         assert_eq!(welded.colors, [[0.0; 3], [1.0; 3], [2.0; 3]]);
-        // x + y, normalised
+        // x + y, normalized
         let half = std::f32::consts::FRAC_1_SQRT_2;
         assert_eq!(&welded.normals[..2], [Vec3::Z; 2]);
         assert!(welded.normals[2].distance(Vec3::new(half, half, 0.0)) < 1e-6);

@@ -29,11 +29,16 @@ impl Default for AtlasConfig {
 
 impl AtlasConfig {
     pub(super) fn check(&self) -> Result<()> {
-        setting((16..=16384).contains(&self.size_px), "size_px", "16..=16384", self.size_px)?;
+        setting((16..=16384).contains(&self.size_px), "AtlasConfig::size_px", "16..=16384", self.size_px)?;
         let narrow = self.gutter_px <= 256.min(self.size_px / 8);
-        setting(narrow, "gutter_px", "0..=256 and at most an eighth of the texture's side", self.gutter_px)?;
+        setting(
+            narrow,
+            "AtlasConfig::gutter_px",
+            "0..=256 and at most an eighth of the texture's side",
+            self.gutter_px,
+        )?;
         let front = self.front.unwrap_or(Vec3::Z);
-        setting(front.is_finite() && front != Vec3::ZERO, "front", "a direction", front)
+        setting(front.is_finite() && front != Vec3::ZERO, "AtlasConfig::front", "a direction", front)
     }
 }
 

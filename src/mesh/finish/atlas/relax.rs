@@ -1,5 +1,5 @@
 //! Makes a flat chart keep the sizes and angles of its surface: symmetric Dirichlet energy (Smith & Schaefer 2015,
-//! "Bijective parameterization with free boundaries"), minimised by L-BFGS from a chart without folds.
+//! "Bijective parameterization with free boundaries"), minimized by L-BFGS from a chart without folds.
 //!
 //! Of a triangle with area `A`, and `a` in the chart, whose map has the singular values `σ₁`, `σ₂`:
 //!

@@ -158,7 +158,7 @@ fn triangles_without_area_do_not_spoil_a_mesh() {
 }
 
 #[test]
-fn a_mesh_that_cannot_be_textured_is_a_named_error_with_a_way_out() {
+fn a_mesh_that_cannot_be_textured_is_a_named_error_with_a_hint() {
     let good = sphere(4, 6);
     let error = |mesh: &Mesh, config: &AtlasConfig| atlas(mesh, config, &Quiet).unwrap_err();
     let mut nan = good.clone();

@@ -18,7 +18,7 @@ pub struct Learned<'a> {
     pub colors: &'a (dyn Fn(&[Vec3], &[Vec3], &[u32], &[Vec3]) -> Vec<[f32; 3]> + Sync),
 }
 
-/// SurfacePoints of the surface with their unit normals.
+/// Points of the surface with their unit normals.
 pub struct SurfacePoints {
     /// Where they are.
     pub positions: Vec<Vec3>,

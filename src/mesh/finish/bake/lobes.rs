@@ -2,7 +2,7 @@
 //!
 //! A texel's color seen from direction `d` is `base + Σ_k L_k Y_k(d)`, sRGB-coded, with `Y` up to degree 1 (4
 //! functions) or 2 (9) in the order and signs of [`sh16`]; [`crate::kernel::sphharm::combine`] sums them. `base` is what an ordinary viewer shows. The
-//! coefficients minimise, over the cameras that see the point,
+//! coefficients minimize, over the cameras that see the point,
 //!
 //! ```text
 //! Σ_i w_i ‖base + Σ_k L_k Y_k(d_i) − c_i‖² + λ Σ_i w_i Σ_k ‖L_k‖²

@@ -67,7 +67,7 @@ pub struct BakeReport {
     pub size: [u32; 2],
     /// Share of texels that a chart covers, 0..=1.
     pub covered: f64,
-    /// SurfacePoints of the surface that were looked at.
+    /// Points of the surface that were looked at.
     pub samples: usize,
     /// Share of the samples that at least one camera sees.
     pub seen: f64,
@@ -79,7 +79,7 @@ pub struct BakeReport {
     pub seconds: f64,
 }
 
-/// SurfacePoints handed to the field at once.
+/// Points handed to the field at once.
 const BATCH: usize = 1 << 17;
 
 /// Bakes a texture for `mesh` with normals, laid out by `atlas`, from the field it was extracted from.
@@ -122,7 +122,7 @@ pub fn bake(
     monitor: &dyn Monitor,
 ) -> Result<Baked> {
     let begin = Instant::now();
-    setting((1..=8).contains(&config.side), "texture_samples", "1..=8", config.side)?;
+    setting((1..=8).contains(&config.side), "BakeConfig::side", "1..=8", config.side)?;
     let (width, height) = (atlas.width, atlas.height);
     let functions = if config.lobes == 0 { 0 } else { lobes::count(config.lobes.min(2)) };
     let mut color = Image::new(width, height, 3);

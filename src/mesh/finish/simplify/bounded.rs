@@ -53,7 +53,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
             ROUNDS as u64,
             &[("triangles", after as f64), ("worst", f64::from(found))],
         );
-        // An input that is farther off than asked may at least not become worse.
+        // An input that is farther off than `error` may at least not become worse.
         if found > error.max(report.worst.unwrap_or(0.0)) {
             undone += 1;
             part *= 0.6;

@@ -2,7 +2,7 @@
 //!
 //! - Newton: `p −= f g / |g|²`, twice, each step cut at half the mean length of the vertex's edges.
 //! - Fit: with every vertex on the surface the triangles are chords, all on one side of a curve. Offsets
-//!   `δ` along the gradients minimise `∫ (d + Σ φᵢ δᵢ)²`, where `d` is the distance of the triangles to
+//!   `δ` along the gradients minimize `∫ (d + Σ φᵢ δᵢ)²`, where `d` is the distance of the triangles to
 //!   the surface and `φ` the hat functions: `M δ = −∫ d φᵢ`, `M` the mass matrix of the mesh, solved by
 //!   conjugate gradients. That takes out three quarters of the error on a sphere.
 //!

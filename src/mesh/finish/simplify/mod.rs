@@ -34,7 +34,7 @@ mod round;
 pub use options::{SimplifyConfig, SimplifyReport, VertexPlacement};
 
 use crate::geom::Mesh;
-use crate::mesh::input::{Field, few_enough, sound};
+use crate::mesh::input::{Field, few_enough, finite, sound};
 use crate::{Monitor, Result};
 use bounded::bounded;
 use crossing::crossings;
@@ -49,9 +49,9 @@ const ATTEMPTS: usize = 4;
 const MANY: usize = 1000;
 
 /// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colors
-/// follow their vertices. A mesh that has no more triangles than asked stays as it is.
+/// follow their vertices. A mesh that has no more triangles than `config.triangles` stays as it is.
 ///
-/// `field` answers values (negative inside) and gradients, at most `config.batch` points a call, from one
+/// `field` returns values (negative inside) and gradients, at most `config.batch` points a call, from one
 /// thread. With it, vertices end as `config.placement` says and normals are its gradient; without it, or
 /// where the gradient is shorter than 1e-6, normals are angle-weighted. Without it the `error` is kept
 /// by adding up how far each collapse strays from the planes before it, which is cautious.
@@ -77,8 +77,8 @@ const MANY: usize = 1000;
 ///
 /// # Errors
 ///
-/// A setting out of range, a mesh with a coordinate that is not finite or an index out of range, a field that answers
-/// with the wrong length, a request to stop. The mesh is then as it was.
+/// A setting out of range, a mesh with a coordinate that is not finite or an index out of range, a field that returns
+/// the wrong number of values, a request to stop. The mesh is then as it was.
 pub fn simplify(
     mesh: &mut Mesh,
     field: Option<&Field>,
@@ -87,6 +87,7 @@ pub fn simplify(
 ) -> Result<SimplifyReport> {
     let begin = Instant::now();
     config.check()?;
+    finite(mesh)?;
     sound(mesh)?;
     // corners are numbered by 32 bits, and rings grow in their pool
     few_enough(mesh.positions.len() as u64, 16 * mesh.triangles.len() as u64)?;

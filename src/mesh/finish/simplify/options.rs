@@ -40,9 +40,19 @@ impl Default for SimplifyConfig {
 
 impl SimplifyConfig {
     pub(super) fn check(&self) -> Result<()> {
-        setting(self.error >= 0.0 && self.error.is_finite(), "error", "0 or more", self.error)?;
-        setting(self.triangles > 0 || self.error > 0.0, "triangles", "at least 1, or an `error`", 0)?;
-        setting(self.batch > 0, "batch", "at least 1", 0)
+        setting(
+            self.error >= 0.0 && self.error.is_finite(),
+            "SimplifyConfig::error",
+            "0 or more",
+            self.error,
+        )?;
+        setting(
+            self.triangles > 0 || self.error > 0.0,
+            "SimplifyConfig::triangles",
+            "at least 1, or an `error`",
+            0,
+        )?;
+        setting(self.batch > 0, "SimplifyConfig::batch", "at least 1", 0)
     }
 }
 

@@ -378,13 +378,16 @@ fn a_mesh_that_is_none_and_a_bad_field_are_named_errors_and_change_nothing() {
         "1 vertices of the mesh have a coordinate that is not finite, the first is vertex 5",
     );
     let mut bad = sound.clone();
+    bad.positions.push(Vec3::INFINITY); // no triangle names it
+    fails(&bad, None, &to(4), "1 vertices of the mesh have a coordinate that is not finite");
+    let mut bad = sound.clone();
     bad.triangles[3][1] = 1 << 20;
     fails(&bad, None, &to(4), "triangle 3 names vertex 1048576");
     let short = |_: &[Vec3]| -> Answer { (vec![0.0], vec![Vec3::X]) };
-    fails(&sound, Some(&short), &to(100), "and answered 1");
-    fails(&sound, None, &to(0), "`mesh.triangles` is 0");
-    fails(&sound, None, &SimplifyConfig { error: f32::NAN, ..to(9) }, "`mesh.error` is NaN");
-    fails(&sound, None, &SimplifyConfig { batch: 0, ..to(9) }, "`mesh.batch` is 0");
+    fails(&sound, Some(&short), &to(100), "and returned 1");
+    fails(&sound, None, &to(0), "`SimplifyConfig::triangles` is 0");
+    fails(&sound, None, &SimplifyConfig { error: f32::NAN, ..to(9) }, "`SimplifyConfig::error` is NaN");
+    fails(&sound, None, &SimplifyConfig { batch: 0, ..to(9) }, "`SimplifyConfig::batch` is 0");
     // a field without numbers moves nothing, and the mesh stays sound
     let nothing = |p: &[Vec3]| -> Answer { (vec![f32::NAN; p.len()], vec![Vec3::NAN; p.len()]) };
     let mut mesh = sound.clone();
