@@ -55,12 +55,18 @@ use crate::run::Done;
 /// Completes every stage that `until` needs, and itself, and writes the report.
 pub fn reconstruct(line: &Line, until: Stage) -> Result<Vec<(Stage, Done)>> {
     let fields = learn::trained_fields(line);
+    let order = line.order(until);
+    // refused before masks are made for it
+    #[cfg(not(feature = "cpu"))]
+    if order.iter().any(|stage| stage.learns() && !line.run.is_done(&line.plan(*stage))) {
+        return learn::no_fields();
+    }
     let mut done = Vec::new();
-    for stage in line.order(until) {
+    for stage in order {
         done.push((stage, complete(line, stage, &fields)?));
     }
     let idle = done.iter().all(|(_, stage)| stage.skipped);
-    line.unless_idle(idle, page::write_report(line))?;
+    page::write_report(line, idle)?;
     Ok(done)
 }
 
@@ -68,6 +74,9 @@ pub fn reconstruct(line: &Line, until: Stage) -> Result<Vec<(Stage, Done)>> {
 /// learned; they are only asked for by a stage that has something to do.
 pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> {
     let Line { capture, config, run, .. } = line;
+    if stage == Stage::Ensemble {
+        ensemble::can_blend(config)?;
+    }
     let done = run.stage(line.plan(stage), |dir| match stage {
         Stage::Mask => mask::mask(capture, line.clicks.as_ref(), &config.mask, dir),
         Stage::Baseline | Stage::Tface => learn::radiance(stage, capture, &line.scene()?, config, dir),

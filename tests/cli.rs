@@ -29,6 +29,8 @@ fn help_and_version_end_with_0_and_nonsense_with_2() {
         assert_eq!(code(&tiface(dir.path(), words)), 2, "{words:?}");
     }
     assert!(out(&tiface(dir.path(), &["--help"])).contains("Exit codes"));
+    let o = tiface(dir.path(), &["run", "head", "--fresh", "tfaec"]);
+    assert!(code(&o) == 2 && err(&o).contains("mask, baseline, tface, iface, mesh, render"), "{}", err(&o));
 }
 
 #[test]

@@ -130,6 +130,10 @@ fn a_finished_run_needs_its_imported_checkpoint_no_more() {
     let again = worked(&tiface(dir.path(), &["tface", "runs/head"]));
     assert!(again.contains("tface: already done"), "{again}");
     let before = files(&run);
+    // another file that does not exist is not what the stage took
+    let typo = tiface(dir.path(), &["tface", "runs/head", "--set", "tface.import=typo.th"]);
+    assert!(typo.status.code() == Some(1) && text(&typo).contains("typo.th"), "{}", text(&typo));
+    assert!(before == files(&run), "the wrong path was written");
     let anew = tiface(dir.path(), &["tface", "runs/head", "--fresh", "tface"]);
     assert!(anew.status.code() == Some(1) && text(&anew).contains("official.th"), "{}", text(&anew));
     assert!(before == files(&run), "something was removed");

@@ -38,6 +38,7 @@ pub(super) struct Common {
     pub seed: Option<u64>,
     /// Recompute a stage and what follows
     #[arg(long, global = true, value_name = "STAGE")]
+    #[arg(value_parser = PossibleValuesParser::new(Stage::ALL.map(Stage::word)).try_map(|word| word.parse::<Stage>()))]
     pub fresh: Option<Stage>,
     /// Say what would be done, and do nothing
     #[arg(long, global = true)]

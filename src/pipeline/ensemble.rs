@@ -28,7 +28,6 @@ const INSIDE: u8 = 128;
 /// Blends one picture per camera of `render`. `fields` are only evaluated if weights are to be fitted.
 pub(super) fn ensemble(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<Value> {
     let Config { ensemble: c, render, capture, .. } = line.config;
-    can_blend(line.config)?;
     let cameras = cameras(line, scene)?;
     let (weights, fitted) = match c.weights.is_empty() {
         true => fit(line, scene, fields, dir)?,

@@ -9,7 +9,8 @@ use crate::run::StageDir;
 use crate::{Error, Result};
 use serde_json::Value;
 
-fn no_fields<T>() -> Result<T> {
+/// The error of this build for whatever needs a field.
+pub(super) fn no_fields<T>() -> Result<T> {
     Err(Error::cannot("this build cannot learn fields", "build with the feature `cpu`, which is the default"))
 }
 

@@ -5,12 +5,13 @@ use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, CaptureOptions};
-use crate::config::{Config, MaskSource, RenderConfig, Stage};
+use crate::config::{Config, MaskSource, RenderConfig, Sources, Stage};
 use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::fmt::Display;
+use std::io::ErrorKind::NotFound;
 use std::path::Path;
 
 /// A capture, its configuration and its run folder.
@@ -103,7 +104,7 @@ impl<'a> Line<'a> {
         }
         let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
         let cameras = scene_file::cameras_json(&self.capture, &scene);
-        self.unless_idle(idle, self.run.write("cameras.json", &cameras))
+        self.write("cameras.json", &cameras, idle)
     }
 
     /// How the views of the stage `render` are made: those of the path, if there is one.
@@ -121,10 +122,10 @@ impl<'a> Line<'a> {
         lost.next().map_or(Ok(()), Err)
     }
 
-    /// A file of the run itself that cannot be written is no failure where nothing is left to do: a run that is done
-    /// may lie where nobody may write.
-    pub(super) fn unless_idle(&self, idle: bool, written: Result<()>) -> Result<()> {
-        match written {
+    /// Writes a file of the run itself. That it cannot be written is no failure where nothing is left to do: a run
+    /// that is done may lie where nobody may write.
+    pub(super) fn write(&self, name: &str, bytes: &[u8], idle: bool) -> Result<()> {
+        match self.run.write(name, bytes) {
             Err(e) if idle => {
                 self.run.warn("run", &format!("{e}; all that was asked for is done"));
                 Ok(())
@@ -180,22 +181,34 @@ fn capture_digest(capture: &Capture) -> Result<String> {
     Ok(Fingerprint::of_bytes(format!("{} {}", capture.up, views.join("\n")).as_bytes()))
 }
 
-fn file_digest(path: &Path) -> Result<String> {
+fn file_digest(path: &Path) -> Result<String, io::ReadError> {
     Ok(Fingerprint::of_bytes(&io::read_bytes(path, &Limits::default())?))
 }
 
-/// The checkpoints that the configuration names. A stage that took one needs it no more.
+/// The checkpoints that the configuration names. A stage that took one needs it no more: one that is no longer where
+/// the run found it has the digest that the stage's record holds.
 fn imports(config: &Config, run: &Run) -> Result<Vec<Import>> {
     let named = [(Stage::Baseline, &config.baseline.import), (Stage::Tface, &config.tface.import)];
     let open = |(stage, file): (Stage, &String)| match file_digest(Path::new(file)) {
         Ok(digest) => Ok(Import { stage, digest, gone: None }),
         Err(e) => {
+            let missing = matches!(&e, io::ReadError::Io { source, .. } if source.kind() == NotFound);
             let record = read_record(&run.path(stage)).ok().flatten();
+            let record = record.filter(|_| missing && saved_import(run, stage).as_ref() == Some(file));
             let digest = record.and_then(|r| r.fingerprint.inputs.get("import").cloned());
+            let e = Error::from(e);
             digest.map(|digest| Import { stage, digest, gone: Some(e.clone()) }).ok_or(e)
         }
     };
     named.into_iter().filter(|(_, file)| !file.is_empty()).map(open).collect()
+}
+
+/// The checkpoint that a stage took when the run was last worked on, if the run says so.
+fn saved_import(run: &Run, stage: Stage) -> Option<String> {
+    let bytes = io::read_bytes(&run.path("config.toml"), &Limits::default()).ok()?;
+    let file = ("config.toml".to_owned(), String::from_utf8(bytes).ok()?);
+    let saved = Config::resolve(&Sources { files: vec![file], ..Sources::default() }).ok()?;
+    Some(if stage == Stage::Baseline { saved.baseline.import } else { saved.tface.import })
 }
 
 /// What a run remembers of a capture that is no longer there: its cameras, its digest, the clicks' digests, and why it
@@ -234,7 +247,7 @@ fn gone(problem: &str) -> Error {
 /// A file that a stage of this run made cannot be used: the suggested fix is to make it again.
 pub(super) fn unusable(e: io::ReadError, stage: impl Display) -> Error {
     match &e {
-        io::ReadError::Io { source, .. } if source.kind() != std::io::ErrorKind::NotFound => e.into(),
+        io::ReadError::Io { source, .. } if source.kind() != NotFound => e.into(),
         _ => Error::cannot(&e, format!("make it again: repeat the command with `--fresh {stage}`")),
     }
 }

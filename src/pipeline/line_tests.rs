@@ -124,7 +124,7 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     for stage in [Stage::Mask, Stage::Mesh, Stage::Render, Stage::Ensemble, Stage::Metrics] {
         assert!(complete(&line, stage, &NoFields).unwrap().skipped);
     }
-    page::write_report(&line).unwrap();
+    page::write_report(&line, false).unwrap();
     let page = String::from_utf8(bytes("report.html")).unwrap();
     assert!(page.contains("<figcaption>blend (ensemble)</figcaption>") && run.path("cameras.json").is_file());
     assert!(bytes("mesh/head.glb").starts_with(b"glTF"));
@@ -349,7 +349,7 @@ fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
 }
 
 #[test]
-fn a_run_without_masks_stops_before_anything_is_written_unless_told_to_go_on() {
+fn a_run_without_masks_stops_before_anything_is_written_unless_masks_are_declined() {
     let dir = tempfile::tempdir().unwrap();
     let root = dir.path().join("head");
     capture(&root, 4, 1);

@@ -22,7 +22,7 @@ const LEARNED: [(Stage, &[&str]); 3] = [
 const MOST_BYTES: usize = 48 << 20;
 
 /// Writes `report.html`, of every stage that is done; without the photographs it stays as it is.
-pub(super) fn write_report(line: &Line) -> Result<()> {
+pub(super) fn write_report(line: &Line, idle: bool) -> Result<()> {
     if line.gone.is_some() {
         return Ok(());
     }
@@ -50,7 +50,7 @@ pub(super) fn write_report(line: &Line) -> Result<()> {
         left_out,
         settings: line.config.to_toml(),
     };
-    line.run.write("report.html", report::html(&page)?.as_bytes())
+    line.write("report.html", report::html(&page)?.as_bytes(), idle)
 }
 
 /// The views with their pictures, and how many found no room beside as many `bytes` as there are already.

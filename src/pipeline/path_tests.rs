@@ -59,7 +59,7 @@ fn evaluate(line: &Line) -> Vec<bool> {
         line.run.stage(line.plan(stage), |_| Ok(Value::Null)).unwrap();
     }
     let rest = [Stage::Render, Stage::Ensemble, Stage::Metrics].map(skipped);
-    page::write_report(line).unwrap();
+    page::write_report(line, false).unwrap();
     [&[mask], &rest[..]].concat()
 }
 
@@ -105,7 +105,7 @@ fn camera_paths_never_touch_the_evaluations_views() {
         for again in [false, true] {
             line.remember(Stage::Render).unwrap();
             let done = complete(&line, Stage::Render, &Fog).unwrap();
-            page::write_report(&line).unwrap();
+            page::write_report(&line, false).unwrap();
             assert_eq!((done.skipped, &done.summary["cameras"]), (again, &Value::from(views)), "{cameras}");
         }
         let folder = run.path(line.views());
@@ -253,7 +253,7 @@ fn a_stage_command_does_not_shrink_the_report_of_a_finished_run() {
     let line = Line::open(&config, &run).unwrap();
     line.remember(Stage::Mask).unwrap();
     complete(&line, Stage::Mask, &NoFields).unwrap();
-    page::write_report(&line).unwrap();
+    page::write_report(&line, false).unwrap();
     assert!(page() == whole);
 }
 

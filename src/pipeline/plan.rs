@@ -72,8 +72,7 @@ impl Line<'_> {
         let order = self.order(until).into_iter();
         let left: Vec<Stage> = order.filter(|stage| !self.run.is_done(&self.plan(*stage))).collect();
         self.require_inputs(&left)?;
-        let written = self.run.write("config.toml", self.config.to_toml().as_bytes());
-        self.unless_idle(left.is_empty(), written)
+        self.write("config.toml", self.config.to_toml().as_bytes(), left.is_empty())
     }
 
     /// Folders below the run that are out of date when a stage is made anew, in the order of the line: its own, those
