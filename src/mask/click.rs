@@ -23,7 +23,32 @@ impl Click {
 
 /// Checks the clicks on a photograph of `width` × `height` pixels, before anything is computed; `subject` is
 /// what messages call it.
+///
+/// # Errors
+/// As [`check_places`], or when two clicks call the same pixel head and background.
 pub(super) fn check(subject: &str, clicks: &[Click], width: u32, height: u32) -> Result<()> {
+    check_places(subject, clicks, width, height)?;
+    let pixel = |c: &Click| (c.x.round().max(0.0) as u32, c.y.round().max(0.0) as u32);
+    for (i, a) in clicks.iter().enumerate() {
+        let contradicts = |b: &Click| a.head != b.head && pixel(a) == pixel(b);
+        if let Some(j) = clicks.iter().skip(i + 1).position(contradicts) {
+            let (first, second, (x, y)) = (i + 1, i + j + 2, pixel(a));
+            return Err(Error::cannot(
+                format!(
+                    "{subject}: clicks {first} and {second} call the same pixel ({x}, {y}) head and background"
+                ),
+                "remove the wrong one of the two clicks",
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// The part of [`check`] that also holds on a reduced photograph, where clicks may fall together.
+///
+/// # Errors
+/// Without clicks, without one on the head, and for one outside the photograph.
+pub(super) fn check_places(subject: &str, clicks: &[Click], width: u32, height: u32) -> Result<()> {
     if clicks.is_empty() {
         return Err(no_clicks(subject));
     }
@@ -45,19 +70,6 @@ pub(super) fn check(subject: &str, clicks: &[Click], width: u32, height: u32) ->
             format!("{subject}: all {n} clicks are on the background, none is on the head"),
             "add clicks on the face, the hair and the garment: label 1 is the head, 0 the background",
         ));
-    }
-    let pixel = |c: &Click| (c.x.round().max(0.0) as u32, c.y.round().max(0.0) as u32);
-    for (i, a) in clicks.iter().enumerate() {
-        let contradicts = |b: &Click| a.head != b.head && pixel(a) == pixel(b);
-        if let Some(j) = clicks.iter().skip(i + 1).position(contradicts) {
-            let (first, second, (x, y)) = (i + 1, i + j + 2, pixel(a));
-            return Err(Error::cannot(
-                format!(
-                    "{subject}: clicks {first} and {second} call the same pixel ({x}, {y}) head and background"
-                ),
-                "remove the wrong one of the two clicks",
-            ));
-        }
     }
     Ok(())
 }
@@ -100,5 +112,7 @@ mod tests {
         }
         let clicks = [click(4.2, 5.0, true), click(9.0, 9.0, true), click(4.0, 5.3, false)];
         refused(&clicks, "clicks 1 and 3 call the same pixel (4, 5)");
+        // on a reduced photograph that is no contradiction
+        assert_eq!(check_places("view `007`", &clicks, 40, 30), Ok(()));
     }
 }

@@ -83,18 +83,21 @@ impl Networks {
     /// SAM's hard mask (0 or 255) of what was clicked, and how good SAM thinks it is (estimated IoU); `None` without SAM.
     ///
     /// # Errors
-    /// Without a click on the head, with one outside the photograph or, for a decoder without labels, on the
-    /// background; when the network fails or gives what its form does not promise.
+    /// For a photograph whose size is not that of its colors, without a click on the head, with one outside the
+    /// photograph or, for a decoder without labels, on the background; when the network fails or gives what its form does not promise.
     pub fn segment(&self, photo: &Photo, clicks: &[Click]) -> Result<Option<(Gray, f32)>> {
-        self.sam.as_ref().map(|sam| sam.segment(photo, clicks)).transpose()
+        let Some(sam) = &self.sam else { return Ok(None) };
+        check_size(photo)?;
+        sam.segment(photo, clicks).map(Some)
     }
 
     /// ViTMatte's alpha in 0..=1 of each pixel, `[height · width]`, where the trimap (0, 128, 255) is a help
     /// and not a bound: values are as the network gives them. `None` without ViTMatte.
     pub fn alpha(&self, photo: &Photo, trimap: &Gray) -> Result<Option<Vec<f32>>> {
         let Some(vitmatte) = &self.vitmatte else { return Ok(None) };
+        check_size(photo)?;
         let (w, h) = (photo.width, photo.height);
-        if (trimap.width, trimap.height) != (w, h) {
+        if (trimap.width, trimap.height) != (w, h) || trimap.values.len() != photo.rgb.len() {
             let (tw, th) = (trimap.width, trimap.height);
             return Err(Error::cannot(
                 format!("the photograph has {w} × {h} pixels, but its trimap {tw} × {th}"),
@@ -154,6 +157,16 @@ impl Networks {
             "make the masks at a longest side of 1024 pixels, or raise the limit",
         ))
     }
+}
+
+/// Checks that a photograph has pixels, and a color for each.
+fn check_size(photo: &Photo) -> Result<()> {
+    let pixels = u64::from(photo.width) * u64::from(photo.height);
+    if pixels == 0 || pixels != photo.rgb.len() as u64 {
+        let problem = format!("{} × {} pixels, but {} colors", photo.width, photo.height, photo.rgb.len());
+        return Err(Error::cannot(problem, "read the photograph again"));
+    }
+    Ok(())
 }
 
 #[cfg(test)]

@@ -169,7 +169,8 @@ pub(super) fn make_masks(
             .into_par_iter()
             .map(|i| {
                 let photo = photo(capture, i, dir)?;
-                let mask = soft_mask(networks, &photo, &hard[i], &prompts.clicks[i], &soft)?;
+                let mask = soft_mask(networks, &photo, &hard[i], &prompts.clicks[i], &soft);
+                let mask = mask.map_err(|e| e.within(format!("view `{}`", capture.views[i].name)))?;
                 Ok((photo, mask))
             })
             .collect();

@@ -57,9 +57,6 @@ pub(super) struct Processor {
 #[derive(Default, Deserialize)]
 #[serde(default)]
 struct ProcessorFile {
-    image_processor_type: Option<String>,
-    feature_extractor_type: Option<String>,
-    processor_class: Option<String>,
     image_mean: Option<[f64; 3]>,
     image_std: Option<[f64; 3]>,
     pad_size: Value,
@@ -81,13 +78,13 @@ pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>> {
         file_error(&path, &format!("is unusable: {problem}"), hint)
     };
     let json = io::read_json(&path, &Limits { json_bytes: 1 << 20, ..Limits::default() })?;
-    let file: ProcessorFile = io::typed(&json)
-        .map_err(|[key, found, expected]| wrong(format!("`{key}` is {found}, expected {expected}")))?;
-    let types = [file.image_processor_type, file.feature_extractor_type, file.processor_class];
-    let mut types = types.into_iter().flatten().map(|name| name.to_lowercase()).peekable();
+    let types = ["image_processor_type", "feature_extractor_type", "processor_class"];
+    let mut types = types.into_iter().filter_map(|key| json[key].as_str()).map(str::to_lowercase).peekable();
     if types.peek().is_some() && !types.any(|name| name.starts_with(kind)) {
         return Ok(None);
     }
+    let file: ProcessorFile = io::typed(&json)
+        .map_err(|[key, found, expected]| wrong(format!("`{key}` is {found}, expected {expected}")))?;
     let three = |key: &str, numbers: Option<[f64; 3]>, usual: [f64; 3], least: f64| {
         let numbers = numbers.unwrap_or(usual);
         match numbers.iter().all(|v| (least..=1.0).contains(v)) {
@@ -130,6 +127,10 @@ mod tests {
         let text = r#"{"image_processor_type": "SamImageProcessor", "image_mean": [0.1, 0.1, 0.1]}"#;
         assert_eq!(at(text, "vitmatte").unwrap(), None);
         assert!(at(text, "sam").unwrap().is_some());
+        // whatever else it holds
+        let text =
+            r#"{"image_processor_type": "SegformerImageProcessor", "processor_class": 3, "image_std": "no"}"#;
+        assert_eq!(at(text, "sam").unwrap(), None);
     }
 
     #[test]

@@ -210,7 +210,8 @@ impl Sam {
     }
 
     fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<()> {
-        click::check("the photograph", clicks, width as u32, height as u32)?;
+        // contradictions are looked for at the size that was clicked on: reduced, two clicks may share a pixel
+        click::check_places("the photograph", clicks, width as u32, height as u32)?;
         if clicks.len() > MAX_CLICKS {
             return Err(Error::cannot(
                 format!("the photograph has {} clicks, the limit is {MAX_CLICKS}", clicks.len()),
@@ -231,9 +232,9 @@ impl Sam {
 
 /// The photograph's colors at `width` × `height`, antialiased bilinear, as SAM's processors resize.
 pub(super) fn resized(photo: &Photo, width: usize, height: usize) -> Vec<[u8; 3]> {
-    let picture = RgbImage::from_raw(photo.width, photo.height, photo.rgb.as_flattened().to_vec());
-    let resized =
-        imageops::resize(&picture.unwrap_or_default(), width as u32, height as u32, FilterType::Triangle);
+    let picture = RgbImage::from_raw(photo.width, photo.height, photo.rgb.as_flattened().to_vec())
+        .expect("as many colors as pixels, as checked");
+    let resized = imageops::resize(&picture, width as u32, height as u32, FilterType::Triangle);
     resized.as_chunks::<3>().0.to_vec()
 }
 

@@ -274,6 +274,9 @@ fn clicks_that_make_no_sense_are_named() {
         let said = error.to_string();
         assert!(said.contains("the photograph") && said.contains(word), "{said}");
     }
+    // two clicks that fell together when the photograph was reduced
+    let pair = [head(5.2, 5.0), Click { head: false, ..head(4.9, 5.0) }];
+    sam.segment(&photo, &pair).unwrap();
 }
 
 #[test]
@@ -477,6 +480,15 @@ fn a_photograph_beyond_the_memory_limit_is_refused_before_it_is_run() {
     let trimap = Gray { width: 4, height: 3, values: vec![0; 12] };
     assert!(networks.alpha(&photo, &trimap).is_err_and(|e| e.to_string().contains("its trimap 4 × 3")));
     assert_eq!(networks.segment(&photo, &[]), Ok(None));
+    // a photograph that is not as large as it says
+    let photo = Photo { height: 5, ..photo };
+    let trimap = Gray { width: 4, height: 5, values: vec![0; 20] };
+    assert!(
+        networks.alpha(&photo, &trimap).is_err_and(|e| e.to_string().contains("4 × 5 pixels, but 16 colors"))
+    );
+    let photo = Photo { height: 4, ..photo };
+    let trimap = Gray { width: 4, height: 4, values: vec![0; 12] };
+    assert!(networks.alpha(&photo, &trimap).is_err_and(|e| e.to_string().contains("its trimap 4 × 4")));
 }
 
 #[test]
