@@ -1027,6 +1027,34 @@ fn a_problem_of_every_frame_is_one_line_with_a_count() {
     assert!(counts.starts_with(&[6, 1, 3]), "{found}");
 }
 
+#[test]
+fn each_broken_camera_file_is_a_problem_of_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    for file in ["transforms_train.json", "transforms_test.json"] {
+        fs::write(dir.path().join(file), r#"{"frames": []}"#).unwrap();
+    }
+    let found = inspect(dir.path(), &CaptureOptions::default());
+    for file in ["transforms_train.json", "transforms_test.json"] {
+        let what = format!("`{file}`: its list `frames` is empty");
+        assert!(found.problems.iter().any(|p| p.what == what && p.count == 1), "{found}");
+    }
+}
+
+#[test]
+fn null_and_lenient_keys_of_another_type_count_as_absent() {
+    let top = "{\"up\": null, \"train_filenames\": null, \"val_filenames\": null, \"is_fisheye\": \"no\", ";
+    let frame = "{\"camera_model\": 3, \"face_mask_path\": 7, \"file";
+    let plain = open(&capture_with(sound, 9)).unwrap();
+    for up in ["null", "\"z\"", "[0, \"z\", 1]"] {
+        let top = top.replacen("null", up, 1);
+        let dir = capture_with(|f| sound(f).replacen('{', &top, 1).replace("{\"file", frame), 9);
+        let found = open(&dir).unwrap();
+        let cameras =
+            |c: &capture::Capture| c.views.iter().map(|v| (v.camera.clone(), v.split)).collect::<Vec<_>>();
+        assert_eq!((found.up, cameras(&found)), (plain.up, cameras(&plain)), "{up}");
+    }
+}
+
 /// A capture of nine photographs, seven of them to learn from, with masks of these.
 fn masked(views: &[usize]) -> TempDir {
     let dir = capture_with(sound, 9);

@@ -101,8 +101,8 @@ pub(super) fn explain(root: &Path) -> Error {
         None => not_a_capture(
             root,
             "it holds neither `transforms.json`, `transforms_train.json` nor `poses_bounds*.npy`",
-            "give the folder that holds one of them; of COLMAP, Metashape, RealityCapture, Polycam, NeuS, DTU, \
-             H3DS, NeRSemble, Multiface, FaceScape, photographs alone and a video, the way there is told",
+            "give the folder that holds one of them; given data of COLMAP, Metashape, RealityCapture, Polycam, NeuS, DTU, \
+             H3DS, NeRSemble, Multiface, FaceScape, photographs alone or a video, this command says how to convert it",
         ),
     }
 }

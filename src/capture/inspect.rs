@@ -26,7 +26,7 @@ pub struct Problem {
     pub count: usize,
 }
 
-/// One entry for all that have the same problem but for the frame or file, and the numbers in it.
+/// One entry for all that have the same problem but for the frame or picture, and the numbers in it.
 fn grouped(all: &[Error]) -> Vec<Problem> {
     let mut problems: Vec<Problem> = Vec::new();
     let mut first: HashMap<(String, String), usize> = HashMap::new();
@@ -41,12 +41,13 @@ fn grouped(all: &[Error]) -> Vec<Problem> {
     problems
 }
 
-/// A message without its digits and what it quotes as the name of a file or frame.
+/// A message without its digits and what it quotes as the name of a frame or of a file that is no camera file.
 fn without_names(message: &str) -> String {
     let mut before = "";
     let mut rest = String::new();
     for (i, part) in message.split('`').enumerate() {
-        let is_name = i % 2 == 1 && (before.ends_with("frame ") || part.contains(['.', '/', '\\']));
+        let is_file = part.contains(['.', '/', '\\']) && !part.ends_with(".json") && !part.ends_with(".npy");
+        let is_name = i % 2 == 1 && (before.ends_with("frame ") || is_file);
         if !is_name {
             rest.extend(part.chars().filter(|c| !c.is_ascii_digit()));
         }

@@ -2,7 +2,7 @@
 //!
 //! Poses are camera-to-world with OpenGL axes in all three. Intrinsics may stand at the top or in each
 //! frame; a frame's own win. Unknown keys are ignored, `null` counts as absent; known ones of the wrong type are
-//! errors.
+//! errors, but for [`LENIENT`] and `up`, which count as absent as well.
 
 use super::error::{in_file, in_frame};
 use super::frame::{CameraFrame, Intrinsics, Listing};
@@ -26,15 +26,21 @@ const FOCAL: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 /// The other keys that may stand at the top for all frames.
 const SHARED: &str = "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 is_fisheye camera_model";
 
-/// What is read at the top of a file, besides frames and intrinsics.
+/// Keys that count as absent where their value is of another type, and whether it is of theirs.
+const LENIENT: [(&str, fn(&Value) -> bool); 3] = [
+    ("is_fisheye", Value::is_boolean),
+    ("camera_model", Value::is_string),
+    ("face_mask_path", Value::is_string),
+];
+
+/// What is read at the top of a file, besides frames, intrinsics and `up`.
 #[derive(Default, Deserialize)]
 #[serde(default)]
 struct TopKeys {
-    up: Option<[f64; 3]>,
     // nerfstudio's splits
-    train_filenames: HashSet<String>,
-    val_filenames: HashSet<String>,
-    test_filenames: HashSet<String>,
+    train_filenames: Option<HashSet<String>>,
+    val_filenames: Option<HashSet<String>>,
+    test_filenames: Option<HashSet<String>>,
 }
 
 impl TopKeys {
@@ -44,7 +50,8 @@ impl TopKeys {
             (&self.val_filenames, Split::Val),
             (&self.test_filenames, Split::Test),
         ];
-        lists.iter().find(|(names, _)| names.contains(name)).map(|(_, split)| *split)
+        let has = |names: &Option<HashSet<String>>| names.as_ref().is_some_and(|names| names.contains(name));
+        lists.iter().find(|(names, _)| has(names)).map(|(_, split)| *split)
     }
 }
 
@@ -83,7 +90,10 @@ impl FrameKeys {
         let own_focal = FOCAL.iter().any(|key| own.contains_key(*key));
         let shared = SHARED.split(' ').chain(FOCAL.into_iter().filter(|_| !own_focal));
         let shared = shared.filter_map(|key| top.get_key_value(key));
-        let is_given = |(_, value): &(&String, &Value)| !value.is_null();
+        let is_given = |(key, value): &(&String, &Value)| match LENIENT.iter().find(|(name, _)| key == name) {
+            Some((_, is_usable)) => is_usable(value),
+            None => !value.is_null(),
+        };
         let merged: Object = (shared.filter(is_given).chain(own.iter().filter(is_given)))
             .map(|(key, value)| (key.clone(), value.clone()))
             .collect();
@@ -132,14 +142,18 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
         return Err(ReadError::too_large(&path, "the number of frames", found, limit).into());
     }
     let about: TopKeys = io::typed(&value).map_err(|[key, found, expected]| {
-        in_file(file, format_args!("`{key}` is {found}, expected {expected}"), "correct that key")
+        in_file(file, format_args!("`{key}` is {found}, expected {expected}"), "list file names there")
     })?;
     if top.contains_key("applied_transform") || top.contains_key("applied_scale") {
         listing.reasons.push(format!(
             "`{file}` says its world was moved (`applied_transform`): results come out in the moved world"
         ));
     }
-    listing.up = listing.up.or(about.up.and_then(|up| DVec3::from(up).try_normalize()));
+    let up = top.get("up").and_then(|up| match io::typed::<Vec<f64>>(up).ok()?.as_slice() {
+        &[x, y, z, ..] => DVec3::new(x, y, z).try_normalize(),
+        _ => None,
+    });
+    listing.up = listing.up.or(up);
     let split_of_file = match file {
         "transforms_train.json" => Some(Split::Train),
         "transforms_val.json" => Some(Split::Val),
@@ -316,6 +330,6 @@ mod tests {
             &Object::new(),
             &serde_json::json!({"file_path": "a", "transform_matrix": [[1, "x"]]}),
         );
-        assert_eq!(text.err().unwrap(), "its `transform_matrix[0][1]` is string \"x\", expected f64");
+        assert_eq!(text.err().unwrap(), "its `transform_matrix[0][1]` is \"x\", expected a number");
     }
 }

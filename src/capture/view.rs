@@ -42,7 +42,7 @@ impl From<Option<PathBuf>> for ViewMask {
 pub struct CaptureOptions {
     /// Whole factor by which photographs are averaged down, at least 1.
     pub downscale: u32,
-    /// Which masks to use: those that are there, unless told otherwise; none with [`MaskSource::Clicks`].
+    /// Which masks to use: those that are there, unless another source is set; none with [`MaskSource::Clicks`].
     pub masks: MaskSource,
     /// The only folder of masks, relative to the capture; empty to look beside the photographs.
     pub mask_dir: String,

@@ -22,7 +22,7 @@ pub fn read_typed<T: DeserializeOwned>(path: &Path, limits: &Limits) -> Result<T
         .map_err(|[key, found, expected]| ReadError::value(path, key, found, expected))
 }
 
-/// A JSON value as a value of a type, or the key that does not fit, what stands there and what could.
+/// A JSON value as a value of a type, or the key that does not fit, what stands there and what could, in plain words.
 pub fn typed<'v, T: Deserialize<'v>>(value: &'v Value) -> Result<T, [String; 3]> {
     serde_path_to_error::deserialize(value).map_err(|e| {
         let (key, text) = (e.path().to_string(), e.inner().to_string());
@@ -32,8 +32,34 @@ pub fn typed<'v, T: Deserialize<'v>>(value: &'v Value) -> Result<T, [String; 3]>
         }
         let (found, expected) = text.split_once(", expected ").unwrap_or((&text, "another value"));
         let found = found.trim_start_matches("invalid type: ").trim_start_matches("invalid value: ");
-        [key, found.into(), expected.into()]
+        [key, in_plain_words(found), in_plain_words(expected)]
     })
+}
+
+/// What serde calls a value or a type, for people who know neither Rust nor serde.
+fn in_plain_words(serde: &str) -> String {
+    let value = |kind: &str| serde.strip_prefix(kind)?.strip_prefix(" `")?.strip_suffix('`');
+    if let Some(value) = ["integer", "floating point", "boolean"].into_iter().find_map(value) {
+        return value.into();
+    }
+    if let Some(text) = serde.strip_prefix("string \"") {
+        return format!("\"{text}");
+    }
+    let count = ["an array of length ", "invalid length "].into_iter().find_map(|p| serde.strip_prefix(p));
+    if let Some(count) = count {
+        return format!("a list of {count}");
+    }
+    match serde {
+        "f32" | "f64" => "a number",
+        "u8" | "u16" | "u32" | "u64" | "usize" | "i8" | "i16" | "i32" | "i64" | "isize" => "a whole number",
+        "a boolean" => "true or false",
+        "a string" => "text",
+        "sequence" | "a sequence" => "a list",
+        "map" | "a map" => "an object",
+        other if other.starts_with("struct ") => "an object",
+        other => other,
+    }
+    .into()
 }
 
 /// The value in `bytes`; `path` is only for messages.
@@ -197,6 +223,24 @@ mod tests {
         let error = parse(&nested(65)).unwrap_err();
         assert!(error.to_string().contains("nested too deeply"), "{error}");
         assert!(parse(&nested(1_000_000)).is_err());
+    }
+
+    #[test]
+    fn a_value_of_another_type_is_named_in_plain_words() {
+        fn refused<T: DeserializeOwned>(text: &str) -> String {
+            let Err([key, found, expected]) = typed::<T>(&parse(text).unwrap()) else {
+                panic!("{text} fits")
+            };
+            format!("{key}: {found}, not {expected}")
+        }
+        type Named<T> = std::collections::BTreeMap<String, T>;
+        assert_eq!(refused::<Named<f32>>(r#"{"a": "wide"}"#), r#"a: "wide", not a number"#);
+        assert_eq!(refused::<Named<u32>>(r#"{"a": -1}"#), "a: -1, not a whole number");
+        assert_eq!(refused::<Named<usize>>(r#"{"a": 2.5}"#), "a: 2.5, not a whole number");
+        assert_eq!(refused::<Named<bool>>(r#"{"a": {}}"#), "a: an object, not true or false");
+        assert_eq!(refused::<Vec<String>>("[[]]"), "[0]: a list, not text");
+        assert_eq!(refused::<Named<Vec<f64>>>(r#"{"a": true}"#), "a: true, not a list");
+        assert_eq!(refused::<Named<[f64; 3]>>(r#"{"a": [1]}"#), "a: a list of 1, not a list of 3");
     }
 
     #[test]

@@ -14,7 +14,9 @@ use crate::capture::{Capture, View};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 use serde_json::{Number, Value, json};
+use std::collections::BTreeMap;
 use std::path::{Component, Path};
 
 /// What the writer puts into `convention`.
@@ -30,6 +32,9 @@ const MOST_BYTES: u64 = 64 << 20;
 /// The suggested fix for a file of another shape.
 const SHAPE: &str = "write `{\"frames\": [{\"file_path\": …, \"points\": [{\"x\": …, \"y\": …, \"label\": 1}]}]}`, or \
                      click anew on the page that `tiface mask CAPTURE --page` writes";
+
+/// The suggested fix for a point that is none.
+const POINT_HINT: &str = "correct that point, or remove it";
 
 /// The clicks of a `prompts.json`.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -131,11 +136,13 @@ struct PointEntry {
 fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
     let file = path.to_string_lossy();
     let wrong = |place: &str, problem, hint: &str| wrong(&file, place, problem, hint);
-    if !value.is_object() {
-        return Err(wrong("at the top", "expected an object with a list `frames`".into(), SHAPE));
+    if let Err([_, found, _]) = io::typed::<BTreeMap<String, IgnoredAny>>(value) {
+        let problem = format!("expected an object with a list `frames`, but it is {}", shown(&found));
+        return Err(wrong("at the top", problem, SHAPE));
     }
     let PromptsFile { frames } = io::typed(value).map_err(|[key, found, expected]| {
-        wrong(&format!("`{key}`"), format!("it is {}, expected {expected}", shown(&found)), SHAPE)
+        let hint = if key.contains(".points[") { POINT_HINT } else { SHAPE };
+        wrong(&format!("`{key}`"), format!("it is {}, expected {expected}", shown(&found)), hint)
     })?;
     if frames.is_empty() {
         return Err(wrong("`frames`", "it is empty: nothing was clicked on".into(), SHAPE));
@@ -163,7 +170,7 @@ fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
         let click = |(j, point): (usize, &PointEntry)| -> Result<Click> {
             let wrong = |key: &str, problem: String| {
                 let place = format!("`frames[{i}].points[{j}].{key}`");
-                wrong(&place, format!("it {problem}"), "correct that point, or remove it")
+                wrong(&place, format!("it {problem}"), POINT_HINT)
             };
             let number = |key: &str, value: f64| coordinate(value).map_err(|problem| wrong(key, problem));
             let (x, y) = (number("x", point.x)?, number("y", point.y)?);
@@ -377,16 +384,16 @@ mod tests {
     fn whatever_is_wrong_is_named_with_its_place() {
         let twice = format!("{{\"frames\": [{}, {}]}}", frame("a.png", POINT), frame("./a.png", POINT));
         let cases = [
-            ("[]".into(), "at the top", "expected an object"),
+            ("[]".into(), "at the top", "expected an object with a list `frames`, but it is a list"),
             ("{\"frame\": []}".into(), "`frames`", "missing"),
-            ("{\"frames\": 3}".into(), "`frames`", "is integer `3`"),
+            ("{\"frames\": 3}".into(), "`frames`", "is 3, expected a list"),
             ("{\"frames\": []}".into(), "`frames`", "is empty"),
-            ("{\"frames\": [7]}".into(), "`frames[0]`", "is integer `7`"),
-            ("{\"frames\": [{\"file_path\": 7}]}".into(), "`frames[0].file_path`", "is integer `7`"),
+            ("{\"frames\": [7]}".into(), "`frames[0]`", "is 7"),
+            ("{\"frames\": [{\"file_path\": 7}]}".into(), "`frames[0].file_path`", "is 7, expected text"),
             ("{\"frames\": [{\"file_path\": \"a\"}]}".into(), "`frames[0].points`", "missing"),
-            (one("a", "{}"), "`frames[0].points`", "is map"),
-            (one("a", "[1]"), "`frames[0].points[0]`", "is integer `1`"),
-            (one("a", r#"[{"x": "3", "y": 4, "label": 1}]"#), "points[0].x`", "is string \"3\""),
+            (one("a", "{}"), "`frames[0].points`", "is an object, expected a list"),
+            (one("a", "[1]"), "`frames[0].points[0]`", "is 1"),
+            (one("a", r#"[{"x": "3", "y": 4, "label": 1}]"#), "points[0].x`", "is \"3\", expected a number"),
             (one("a", r#"[{"x": 3, "y": null, "label": 1}]"#), "points[0].y`", "null"),
             (one("a", r#"[{"x": 3, "y": 4}]"#), "points[0].label`", "missing"),
             (one("a", r#"[{"x": 3, "y": 4, "label": 2}]"#), "points[0].label`", "it is 2"),
