@@ -40,6 +40,9 @@ impl ErrorKind {
 /// A result whose error is [`Error`] unless said otherwise.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
+/// What a stop leaves that comes between steps, for [`Error::stopped`].
+pub(crate) const COMPLETE_IS_KEPT: &str = "what is complete is kept";
+
 /// An error: its kind, a message that names file and place, and a suggested fix.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Error {
@@ -73,6 +76,16 @@ impl Error {
     /// [`ErrorKind::Interrupted`] until whoever heard the signal says which one it was.
     pub fn stopped(kept: impl Display) -> Error {
         Error { hint: "repeat the command to continue".into(), ..Error::new(ErrorKind::Interrupted, kept) }
+    }
+
+    /// Returns the error that only carries the kind: what is wrong has been printed, and nothing is to be added.
+    pub fn already_printed(kind: ErrorKind) -> Error {
+        Error::new(kind, "")
+    }
+
+    /// Returns whether this is [`Error::already_printed`].
+    pub fn is_printed(&self) -> bool {
+        self.message.is_empty()
     }
 
     /// What a caller can do about it.
@@ -130,6 +143,7 @@ mod tests {
         let e = Error::usage("is not a number", "write one").within("`iface.steps`");
         assert_eq!((e.kind().code(), e.hint()), (2, "write one"));
         assert_eq!(e.to_string(), "`iface.steps`: is not a number");
+        assert!(Error::already_printed(ErrorKind::BelowBar).is_printed() && !e.is_printed());
         assert!(Error::stopped("x").kind().is_stop() && !e.kind().is_stop());
     }
 }

@@ -34,7 +34,7 @@
 //! leaves a folder of plain files in the [`run`], and is skipped when it is done.
 //!
 //! Modules are declared in the order of that line; what they share stands first. The parts can be used alone:
-//! [`mesh`] meshes any signed distance and needs no field, [`capture`] reads eight kinds of datasets, [`io`] opens every
+//! [`mesh`] meshes any signed distance and needs no field, [`capture`] reads `transforms*.json` and LLFF and says of other datasets what they are, [`io`] opens every
 //! file within limits. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file and
 //! place, and a suggested fix.
 

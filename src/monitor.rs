@@ -1,5 +1,6 @@
 //! How a long computation reports progress and learns that it should stop.
 
+use crate::error::COMPLETE_IS_KEPT;
 use crate::{Error, Result};
 
 /// Progress out, stop request in.
@@ -15,7 +16,7 @@ pub trait Monitor: Send + Sync {
 
     /// Returns an error once someone has asked to stop.
     fn check_stop(&self) -> Result<()> {
-        if self.stop() { Err(Error::stopped("what is complete is kept")) } else { Ok(()) }
+        if self.stop() { Err(Error::stopped(COMPLETE_IS_KEPT)) } else { Ok(()) }
     }
 }
 

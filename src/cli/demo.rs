@@ -28,7 +28,7 @@ pub(super) fn run(invocation: &Invocation) -> Result<()> {
     // repeated without options, the demo goes on as it was begun
     let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
     let fallback = Some((Preset::Draft, SHORTER));
-    // what is wrong with the command line is told before the head is photographed
+    // what is wrong with the command line is reported before the head is photographed
     Out::find(common.out.as_deref(), "run")?;
     feasible(&common.resolve(saved.as_deref(), fallback, &[])?)?;
     // the cameras are written last: where they are, everything is

@@ -4,7 +4,7 @@ use super::options::Common;
 use super::stdout::print;
 use crate::capture::inspect::inspect;
 use crate::pipeline::{capture_options, disagreements};
-use crate::{Error, Result};
+use crate::{Error, ErrorKind, Result};
 use std::path::Path;
 
 pub(super) fn run(common: &Common, capture: &Path) -> Result<()> {
@@ -18,6 +18,5 @@ pub(super) fn run(common: &Common, capture: &Path) -> Result<()> {
         format!("{found}\n")
     };
     print(&text)?;
-    // what is wrong has been printed
-    if found.is_sound() { Ok(()) } else { Err(Error::cannot("", "")) }
+    if found.is_sound() { Ok(()) } else { Err(Error::already_printed(ErrorKind::Cannot)) }
 }

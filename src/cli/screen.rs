@@ -64,10 +64,10 @@ impl Screen {
     /// The error and the suggested fix, once; who asked to stop gets no error.
     pub fn error(&self, error: &Error) {
         self.end();
-        let (message, hint) = (error.to_string(), error.hint());
-        if message.is_empty() {
-            return; // the command has printed what is wrong
+        if error.is_printed() {
+            return;
         }
+        let (message, hint) = (error.to_string(), error.hint());
         let asked = error.kind().is_stop();
         if self.json {
             let event = if asked { "stopped" } else { "error" };

@@ -9,7 +9,7 @@ table! {
     keys {
         /// A published .th checkpoint to take instead of training; empty to train.
         import: String => String::new();
-        /// Optimiser steps.
+        /// Optimizer steps.
         steps: u64, 1.0..=1e7 => 1500, 2000, 50_000;
         /// Rays per step: fewer than T-Face has, for whole frames cost several times a head.
         rays: usize, 1.0..=1_048_576.0 => 4096, 8192, 4096;

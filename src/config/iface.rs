@@ -51,7 +51,7 @@ table! {
     /// Settings of the stage `iface`. Lengths are in field units: the scene's box is `[-radius, radius]³`.
     pub struct IfaceConfig;
     keys {
-        /// Optimiser steps.
+        /// Optimizer steps.
         steps: u64, 1.0..=1e7 => 3000, 8000, 20_000;
         /// Rays per step at the start.
         rays: usize, 1.0..=1_048_576.0 => 1024, 1024, 256;

@@ -138,13 +138,13 @@ impl MaskConfig {
     /// What the ranges of single keys cannot say: a key, its problem, and a suggested fix.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         let given = !self.prompts.is_empty() || !self.point.is_empty();
-        let say = |key, problem: &str, hint| Some((key, problem.to_owned(), hint));
+        let problem = |key, problem: &str, hint| Some((key, problem.to_owned(), hint));
         if !self.prompts.is_empty() && !self.point.is_empty() {
-            return say("mask.point", "is given beside `mask.prompts`", "give one of them");
+            return problem("mask.point", "is given beside `mask.prompts`", "give one of them");
         }
         match self.source {
             MaskSource::Clicks if !given => {
-                return say(
+                return problem(
                     "mask.source",
                     "is clicks, but there are none",
                     "name a file: `--prompts prompts.json`",
@@ -152,14 +152,14 @@ impl MaskConfig {
             }
             MaskSource::Alpha | MaskSource::Folder | MaskSource::None if given => {
                 let hint = "leave out the clicks, or set `mask.source` to clicks";
-                return say("mask.source", "does not make masks, but clicks are given", hint);
+                return problem("mask.source", "does not make masks, but clicks are given", hint);
             }
             _ => {}
         }
         let networks = [&self.sam, &self.sam_decoder, &self.vitmatte];
         if !self.clicked() && networks.iter().any(|file| !file.is_empty()) {
             let hint = "give clicks: `--prompts prompts.json`";
-            return say(
+            return problem(
                 "mask.sam",
                 "or `mask.vitmatte` names a network, but there are no clicks to start from",
                 hint,
@@ -167,17 +167,17 @@ impl MaskConfig {
         }
         if self.clicked() && self.meaning == MaskMeaning::Ignore {
             let hint = "set `mask.meaning` to empty: clicks say what is head";
-            return say("mask.meaning", "is ignore, but masks are made from clicks", hint);
+            return problem("mask.meaning", "is ignore, but masks are made from clicks", hint);
         }
         if self.with_sam() && (self.sam.is_empty() || self.sam_decoder.is_empty()) {
             let hint = "name both files: `--sam encoder.onnx --sam-decoder decoder.onnx`";
-            return say("mask.cut", "needs both `mask.sam` and `mask.sam_decoder`", hint);
+            return problem("mask.cut", "needs both `mask.sam` and `mask.sam_decoder`", hint);
         }
         if !self.sam_decoder.is_empty() && self.sam.is_empty() {
-            return say("mask.sam_decoder", "is named without `mask.sam`", "name SAM's encoder too");
+            return problem("mask.sam_decoder", "is named without `mask.sam`", "name SAM's encoder too");
         }
         if self.matting == MattingMethod::Vitmatte && self.vitmatte.is_empty() {
-            return say(
+            return problem(
                 "mask.matting",
                 "is vitmatte, but no file is named",
                 "name it: `--vitmatte model.onnx`",

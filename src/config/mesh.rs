@@ -74,7 +74,7 @@ table! {
         exr: bool => false;
         /// Files to write, a list of glb, obj, ply.
         format: Vec<MeshFormat> => vec![MeshFormat::Glb];
-        /// Coordinates of the files: dataset, or head (+Y up, face towards +Z, centred).
+        /// Coordinates of the files: dataset, or head (+Y up, face towards +Z, centered).
         frame: MeshFrame => MeshFrame::Dataset;
     }
     constants {
@@ -84,7 +84,7 @@ table! {
         coarse_step: u32 => 8;
         /// Newton steps that pull vertices onto the zero level of the field.
         newton_steps: u32 => 2;
-        /// How far vertices slide towards the middle of their neighbours with the first step.
+        /// How far vertices slide towards the middle of their neighbors with the first step.
         relax: f32 => 0.5;
         /// Samples along each side of a texel.
         texture_samples: u32 => 2;

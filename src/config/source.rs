@@ -19,15 +19,15 @@ pub struct Sources {
     pub options: Vec<(String, String, String)>,
 }
 
-/// A value as given, before its type is known to fit.
-enum Given {
+/// A value as written, before its type is known to fit.
+enum RawValue {
     Toml(Value),
     /// From `--set`, where words need no quotes and lists no brackets.
     Text(String),
 }
 
 /// A key, its value, and where that was given, as a message begins.
-type Assignment = (String, Given, String);
+type Assignment = (String, RawValue, String);
 
 pub(super) fn resolve(sources: &Sources) -> Result<Config> {
     let mut given: Vec<Assignment> = Vec::new();
@@ -39,17 +39,17 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config> {
         let Some((key, value)) = set.split_once('=') else {
             return Err(not_toml(&place, "expected KEY=VALUE"));
         };
-        given.push((key.trim().into(), Given::Text(value.trim().into()), place));
+        given.push((key.trim().into(), RawValue::Text(value.trim().into()), place));
     }
     for (typed, key, value) in &sources.options {
-        given.push((key.clone(), Given::Text(value.clone()), format!("`{typed}`")));
+        given.push((key.clone(), RawValue::Text(value.clone()), format!("`{typed}`")));
     }
 
     // the preset comes first whatever line it stands on; what it means is checked by `assign` below
     let named = given.iter().rfind(|(key, ..)| key == "preset").and_then(|(_, value, _)| {
         let word = match value {
-            Given::Toml(value) => value.as_str()?,
-            Given::Text(text) => text.trim_matches('"'),
+            RawValue::Toml(value) => value.as_str()?,
+            RawValue::Text(text) => text.trim_matches('"'),
         };
         word.parse().ok()
     });
@@ -91,7 +91,7 @@ fn read_file(name: &str, text: &str, given: &mut Vec<Assignment>) -> Result<()> 
     for (offset, key) in found {
         // a key with a dot inside quotes is no key of ours
         let value = lookup(&plain, &key).ok_or_else(|| unknown(&key).within(place(offset)))?;
-        given.push((key, Given::Toml(value.clone()), place(offset)));
+        given.push((key, RawValue::Toml(value.clone()), place(offset)));
     }
     Ok(())
 }
@@ -113,13 +113,13 @@ fn is_table(name: &str) -> bool {
 }
 
 /// `config` with one key changed.
-fn assign(config: &Config, key: &str, given: Given) -> Result<Config> {
+fn assign(config: &Config, key: &str, given: RawValue) -> Result<Config> {
     let mut root = config.to_table();
     let known = all_keys().find(|(name, _)| name == key);
     let (Some((_, about)), Some(old)) = (known, lookup(&root, key)) else { return Err(unknown(key)) };
     let found = match &given {
-        Given::Toml(value) => show(value),
-        Given::Text(text) => format!("`{text}`"),
+        RawValue::Toml(value) => show(value),
+        RawValue::Text(text) => format!("`{text}`"),
     };
     let Some(value) = fit(old, given) else {
         return Err(wrong(key, &format!(" is {}, found {found}", kind(old))));
@@ -142,18 +142,18 @@ fn assign(config: &Config, key: &str, given: Given) -> Result<Config> {
 }
 
 /// `given` as a value of the same type as `old`, if it can be one.
-fn fit(old: &Value, given: Given) -> Option<Value> {
+fn fit(old: &Value, given: RawValue) -> Option<Value> {
     let parsed = match (&given, old) {
-        (Given::Toml(value), _) => value.clone(),
-        (Given::Text(text), Value::String(_)) => {
+        (RawValue::Toml(value), _) => value.clone(),
+        (RawValue::Text(text), Value::String(_)) => {
             let quoted = text.len() >= 2 && text.starts_with('"') && text.ends_with('"');
             return Some(Value::String(if quoted { text[1..text.len() - 1].into() } else { text.clone() }));
         }
-        (Given::Text(text), Value::Array(_)) if !text.starts_with('[') => {
+        (RawValue::Text(text), Value::Array(_)) if !text.starts_with('[') => {
             let items = text.split(',').map(str::trim).filter(|t| !t.is_empty());
             return Some(Value::Array(items.map(|t| scalar(t).unwrap_or(Value::String(t.into()))).collect()));
         }
-        (Given::Text(text), _) => scalar(text)?,
+        (RawValue::Text(text), _) => scalar(text)?,
     };
     match (old, parsed) {
         (Value::Float(_), Value::Integer(i)) => Some(Value::Float(i as f64)),

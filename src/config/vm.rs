@@ -74,7 +74,7 @@ table! {
         /// Fields learned one after the other from different random numbers; their mean is what is seen. Only one
         /// where import names a file. Two are worth more than one of twice the rays, in the same time.
         fields: usize, 1.0..=16.0 => 1, 2, 1;
-        /// Optimiser steps of each field. Few steps of many rays are worth more than many of few.
+        /// Optimizer steps of each field. Few steps of many rays are worth more than many of few.
         steps: u64, 1.0..=1e7 => 1500, 2000, 50_000;
         /// Rays per step.
         rays: usize, 1.0..=1_048_576.0 => 8192, 8192, 4096;

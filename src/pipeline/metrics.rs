@@ -36,7 +36,7 @@ pub(super) struct Comparable<'a> {
     float: PathBuf,
 }
 
-/// ViewFigures of one picture.
+/// Figures of one picture.
 struct ViewFigures {
     head: ViewMetrics,
     region: Option<ViewMetrics>,

@@ -5,7 +5,7 @@ use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Everything that shapes the result of a stage. Kept whole, not only hashed, so that a difference
-/// can be told key by key.
+/// can be named key by key.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Fingerprint {
     /// Version of the stage's files; raised when their meaning changes.
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn a_value_that_moves_between_neighbours_changes_the_digest() {
+    fn a_value_that_moves_between_neighbors_changes_the_digest() {
         let a = Fingerprint::default().setting("ab", "c");
         let b = Fingerprint::default().setting("a", "bc");
         assert_ne!(a.digest(), b.digest());

@@ -60,7 +60,7 @@ impl StageDir {
 
     /// An error if somebody asked to stop.
     pub fn check_stop(&self) -> Result<()> {
-        if self.progress.stop() { Err(Error::stopped("what is complete is kept")) } else { Ok(()) }
+        self.progress.check_stop()
     }
 
     /// Reports something worth knowing.
@@ -185,7 +185,7 @@ impl Run {
     /// differences if not; an empty folder agrees with everything. An error, too, if what lies there was made by
     /// no stage.
     pub fn agrees(&self, plan: &Plan) -> Result<()> {
-        // a record that cannot be read counts as none, and is told when the stage is worked on
+        // a record that cannot be read counts as none, and is reported when the stage is worked on
         if let Ok(Some(record)) = read_record(&self.path(plan.name)) {
             return same(plan, &record.fingerprint, true);
         }
@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn leftovers_are_removed_under_the_lock_and_told() {
+    fn leftovers_are_removed_under_the_lock_and_reported() {
         struct Warnings(Mutex<Vec<String>>);
         impl Observer for Warnings {
             fn event(&self, event: &Event) {
@@ -452,9 +452,9 @@ mod tests {
         let run = Run::open(dir.path(), Stop::new(), seen.clone());
         run.stage(plan(5), work).unwrap();
         assert!(!dir.path().join("iface/views/.a.png.99.tmp").exists());
-        let told = seen.0.lock().unwrap();
-        assert!(told.iter().any(|t| t.contains("1 half-written")), "{told:?}");
-        assert!(told.iter().any(|t| t.contains("done.json")), "{told:?}");
+        let warnings = seen.0.lock().unwrap();
+        assert!(warnings.iter().any(|t| t.contains("1 half-written")), "{warnings:?}");
+        assert!(warnings.iter().any(|t| t.contains("done.json")), "{warnings:?}");
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! A request to stop, and what is at work meanwhile.
 
 use super::progress::Progress;
+use crate::error::COMPLETE_IS_KEPT;
 use crate::{Error, ErrorKind};
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -69,7 +70,7 @@ impl Stop {
             Some((progress, _)) => {
                 progress.stopped();
                 let stage = format!("stage `{}`", progress.stage());
-                Some(self.error("what is complete is kept").within(stage))
+                Some(self.error(COMPLETE_IS_KEPT).within(stage))
             }
             None => Some(self.error("before its end").with_hint("")),
         }

@@ -2,6 +2,7 @@
 //! until none folds.
 
 use super::flat::Flat;
+use crate::error::COMPLETE_IS_KEPT;
 use crate::geom::Mesh;
 use crate::{Error, Monitor, Result};
 use glam::DVec2;
@@ -66,7 +67,7 @@ pub(super) fn flatten(
     let call = || uvunwrap::generate_with_progress(&[input], &options, |_| !monitor.stop());
     let answer = match catch_unwind(AssertUnwindSafe(call)) {
         Ok(Ok(answer)) => answer,
-        Ok(Err(uvunwrap::Error::Cancelled)) => return Err(Error::stopped("what is complete is kept")),
+        Ok(Err(uvunwrap::Error::Cancelled)) => return Err(Error::stopped(COMPLETE_IS_KEPT)),
         Ok(Err(error)) => return Err(unusable(format!("uvunwrap: {error}"))),
         Err(panic) => return Err(unusable(format!("uvunwrap panicked: {}", words(&*panic)))),
     };
