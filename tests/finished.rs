@@ -82,7 +82,7 @@ fn a_turntable_leaves_the_finished_run_as_it_is() {
     assert!(before == files(&run), "the turntable has changed the run");
     assert!(worked(&tiface(dir.path(), &["run", "runs/head"])).contains("metrics: already done"));
     assert!(before == files(&run));
-    // and what has been made of other cameras is told of
+    // and what has been made of other cameras is reported
     assert!(worked(&tiface(dir.path(), &["status", "runs/head"])).contains("render/paths/orbit done in"));
     let anew = ["render", "runs/head", "--cameras", "orbit", "--format", "exr", "--fresh", "render"];
     assert!(

@@ -772,7 +772,7 @@ fn a_size_that_is_not_the_declared_one_says_the_factor() {
     assert_eq!(c.views[0].load(&limits()).unwrap().photo.rgb.len(), 48);
 }
 
-/// A folder with these files, `/` at the end for folders, and what opening it says: the message and the way out.
+/// A folder with these files, `/` at the end for folders, and what opening it prints: the message and the suggested fix.
 fn unread(names: &[(&str, &[u8])]) -> (String, String) {
     let dir = tempfile::tempdir().unwrap();
     for (name, bytes) in names {

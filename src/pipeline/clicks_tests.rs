@@ -133,7 +133,7 @@ fn a_network_that_is_no_network_is_refused_in_one_sentence() {
     assert!(!run.path("mask/done.json").exists());
 }
 
-/// Random weights mean nothing; that they are asked, and told of in the record, is what is looked at.
+/// Random weights mean nothing; that they are run, and named in the record, is what is looked at.
 #[cfg(feature = "matting")]
 #[test]
 fn networks_cut_and_soften_and_are_recorded() {

@@ -293,7 +293,7 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
     let e = Line::open(&config, &run).err().unwrap();
     assert!(e.hint().contains("--set capture.path="), "{e}");
 
-    // and that way out is one
+    // and the suggested fix is one
     let mut moved = config.clone();
     moved.capture.path = dir.path().join("moved").to_str().unwrap().into();
     assert_eq!(evaluate(&Line::open(&moved, &run).unwrap()), [false, true, true, true]);
