@@ -97,7 +97,10 @@ impl SdfModel {
     /// Takes the model out of a checkpoint.
     pub fn restore(config: &IfaceConfig, from: &mut Checkpoint, device: &Device) -> Result<SdfModel> {
         let mut model = SdfModel::new(config, 0, device);
-        model.0.iter_mut().try_for_each(|p| p.restore(&p.shape().to_vec(), from, true))?;
+        for p in &mut model.0 {
+            let shape = p.shape().to_vec();
+            p.restore(&shape, from, true)?;
+        }
         Ok(model)
     }
 
