@@ -13,6 +13,8 @@ pub struct Report {
     pub title: String,
     /// Stage and the rows of its figures ([`leaves`]).
     pub summaries: Vec<(String, Vec<(String, String)>)>,
+    /// How near each kind of picture is to the photographs: the heading, then a row each; may be empty.
+    pub quality: Vec<Vec<String>>,
     /// The masks over their photographs: a part of a page, already escaped.
     pub masks: String,
     /// Lines over training steps.
@@ -173,6 +175,7 @@ mod tests {
                 "mesh".into(),
                 leaves(&json!({"closed": true, "report": {"volume": 0.25}, "p": null})),
             )],
+            quality: [["", "edge"], ["head & neck", "21.02"]].map(|r| r.map(String::from).to_vec()).to_vec(),
             masks: "<figure>mask</figure>".into(),
             curves: vec![Curve { name: "psnr".into(), points: vec![(0.0, 1.0), (2.0, 3.0)] }],
             rows: vec![ViewRow {
@@ -188,6 +191,8 @@ mod tests {
         .unwrap();
         assert!(page.contains("<h1>&lt;head&gt;</h1>") && !page.contains("http"));
         assert!(page.contains("<td>report.volume</td><td>0.2500</td>"));
+        assert!(page.contains("<tr><th></th><th>edge</th></tr>"), "{page}");
+        assert!(page.contains("<tr><td>head &amp; neck</td><td>21.02</td></tr>"), "{page}");
         assert!(page.contains("points=\"0.0,160.0 420.0,0.0\""), "{page}");
         assert!(page.contains("<td>p</td><td>–</td>") && page.contains("<pre>[mesh]</pre>"));
         assert!(page.contains("<p>3 more views lie in"));

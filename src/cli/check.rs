@@ -12,6 +12,7 @@ use crate::metrics::distance::{Distances, one_way, seen_one_way};
 use crate::{Error, ErrorKind, Result};
 use serde::Serialize;
 use std::fmt::{self, Display};
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 /// Points spread over each surface.
@@ -25,8 +26,23 @@ struct Against {
     /// From what three or more training cameras see, and that part's share of the area.
     #[serde(skip_serializing_if = "Option::is_none")]
     seen: Option<(Millimetres, f64)>,
+    /// From what so many training cameras see, and the shares: how far a distance can be trusted.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    by_views: Vec<ByViews>,
     /// From the other surface to the mesh: what is missed.
     back: Millimetres,
+}
+
+/// The parts of a surface by how many cameras see them.
+const VIEWS: [(&str, RangeInclusive<u32>); 5] =
+    [("0", 0..=0), ("1", 1..=1), ("2", 2..=2), ("3 or 4", 3..=4), ("5 or more", 5..=u32::MAX)];
+
+#[derive(Serialize)]
+struct ByViews {
+    views: &'static str,
+    share: f64,
+    #[serde(flatten)]
+    distance: Millimetres,
 }
 
 #[derive(Serialize)]
@@ -56,6 +72,9 @@ impl Display for Against {
         writeln!(f, "distance to the other   {}", self.whole)?;
         if let Some((seen, share)) = &self.seen {
             writeln!(f, "  where 3 cameras look  {seen} ({:.0} % of the area)", 100.0 * share)?;
+        }
+        for ByViews { views, share, distance } in &self.by_views {
+            writeln!(f, "  seen by {views:<9}     {distance} ({:.0} %)", 100.0 * share)?;
         }
         writeln!(f, "distance back           {}", self.back)
     }
@@ -157,14 +176,16 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     let mm = |d| Millimetres::new(d, unit_m);
     let whole = one_way(mesh, &bvh, POINTS).ok_or_else(|| empty(other))?;
     let back = one_way(&truth, &Bvh::new(mesh), POINTS).ok_or_else(|| empty(other))?;
-    let seen = match seen_by {
-        None => None,
-        Some(root) => {
-            let capture = capture::open(root, &CaptureOptions::default())?;
-            let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
-            let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| moved(&v.camera)).collect();
-            seen_one_way(mesh, &bvh, POINTS, &cameras, 3).map(|(d, share)| (mm(d), share))
-        }
-    };
-    Ok(Against { whole: mm(whole), seen, back: mm(back) })
+    let (mut seen, mut by_views) = (None, Vec::new());
+    if let Some(root) = seen_by {
+        let capture = capture::open(root, &CaptureOptions::default())?;
+        let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
+        let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| moved(&v.camera)).collect();
+        let ranges: Vec<_> = [3..=u32::MAX].into_iter().chain(VIEWS.map(|(_, range)| range)).collect();
+        let mut parts = seen_one_way(mesh, &bvh, POINTS, &cameras, &ranges).into_iter();
+        seen = parts.next().flatten().map(|(d, share)| (mm(d), share));
+        let named = parts.zip(VIEWS).filter_map(|(part, (views, _))| Some((part?, views)));
+        by_views = named.map(|((d, share), views)| ByViews { views, share, distance: mm(d) }).collect();
+    }
+    Ok(Against { whole: mm(whole), seen, by_views, back: mm(back) })
 }

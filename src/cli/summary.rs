@@ -63,6 +63,7 @@ fn judgement(metrics: &Value) -> Vec<String> {
                 "{} against held-out photographs: PSNR {psnr:.2} dB{ssim}, {region}",
                 called(set)
             ));
+            lines.extend(in_parts(&metrics[set]["parts"]["mean"]));
         }
     }
     let truth = &metrics["truth_percent_of_head"];
@@ -76,6 +77,19 @@ fn judgement(metrics: &Value) -> Vec<String> {
     lines
 }
 
+/// Where a set is right: one line of what is known.
+fn in_parts(mean: &Value) -> Option<String> {
+    let of = |key: &str| mean[key].as_f64();
+    let db = [("opaque", "psnr_opaque"), ("edge", "psnr_edge"), ("skin", "psnr_skin"), ("hair", "psnr_hair")];
+    let known = db.into_iter().filter_map(|(word, key)| Some(format!("{word} {:.2}", of(key)?)));
+    let mut parts: Vec<String> = known.collect();
+    if let (Some(missing), Some(extra)) = (of("missing"), of("extra")) {
+        let cap = of("psnr_cap").map(|db| format!(" (at most {db:.1} dB)")).unwrap_or_default();
+        parts.push(format!("{missing:.0} pixels missing and {extra:.0} too many a view{cap}"));
+    }
+    (!parts.is_empty()).then(|| format!("  {}", parts.join(", ")))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -84,14 +98,18 @@ mod tests {
     #[test]
     fn the_judgement_names_what_was_measured() {
         let lines = judgement(&json!({
-            "raycast": {"head": {"mean": {"psnr_masked": 28.123, "ssim_masked": 0.91}}},
+            "raycast": {
+                "head": {"mean": {"psnr_masked": 28.123, "ssim_masked": 0.91}},
+                "parts": {"mean": {"psnr_edge": 21.016, "missing": 1416.4, "extra": 257.0, "psnr_cap": 32.1}},
+            },
             "ensemble": {"head": {"mean": {"psnr_masked": 30.0}}},
             "truth_percent_of_head": {"accuracy_mean": 0.312, "accuracy_p90": 0.7},
         }));
-        assert_eq!(lines.len(), 3);
+        assert_eq!(lines.len(), 4);
         assert!(lines[0].starts_with("I-Face's mesh (raycast) against"), "{}", lines[0]);
         assert!(lines[0].contains("PSNR 28.12 dB, SSIM 0.9100"), "{}", lines[0]);
-        assert!(lines[1].starts_with("blend (ensemble)") && lines[1].contains("30.00 dB"), "{}", lines[1]);
-        assert!(lines[2].contains("0.312 % of head height"), "{}", lines[2]);
+        assert_eq!(lines[1], "  edge 21.02, 1416 pixels missing and 257 too many a view (at most 32.1 dB)");
+        assert!(lines[2].starts_with("blend (ensemble)") && lines[2].contains("30.00 dB"), "{}", lines[2]);
+        assert!(lines[3].contains("0.312 % of head height"), "{}", lines[3]);
     }
 }

@@ -8,6 +8,7 @@ use crate::geom::{Bvh, Camera, Mesh, Ray};
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::Serialize;
+use std::ops::RangeInclusive;
 
 /// Distances from one surface to another, in the units of the meshes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -106,21 +107,24 @@ pub fn seen_by(mesh: &Mesh, bvh: &Bvh, cameras: &[Camera], points: &[(Vec3, u32)
         .collect()
 }
 
-/// Distances from `from` to `to` over the part that at least `least` cameras see, and that part's share of
-/// the area. `None` where nothing is seen.
+/// Distances from `from` to `to` over the parts that so many cameras see, and each part's share of the area, in
+/// the order of `views`. `None` for a part that is empty.
 pub fn seen_one_way(
     from: &Mesh,
     to: &Bvh,
     samples: usize,
     cameras: &[Camera],
-    least: u32,
-) -> Option<(Distances, f64)> {
+    views: &[RangeInclusive<u32>],
+) -> Vec<Option<(Distances, f64)>> {
     let points = sample_triangles(from, samples);
     let seen = seen_by(from, &Bvh::new(from), cameras, &points);
-    let kept: Vec<Vec3> =
-        points.iter().zip(seen).filter(|(_, s)| *s >= least).map(|((p, _), _)| *p).collect();
-    let share = kept.len() as f64 / points.len().max(1) as f64;
-    Some((distances(kept, to)?, share))
+    let part = |range: &RangeInclusive<u32>| {
+        let kept = points.iter().zip(&seen).filter(|(_, seen)| range.contains(seen));
+        let kept: Vec<Vec3> = kept.map(|((p, _), _)| *p).collect();
+        let share = kept.len() as f64 / points.len().max(1) as f64;
+        Some((distances(kept, to)?, share))
+    };
+    views.iter().map(part).collect()
 }
 
 #[cfg(test)]
@@ -197,10 +201,16 @@ mod tests {
         mesh.positions.extend(&upper.positions);
         mesh.triangles.extend(upper.triangles.iter().map(|t| t.map(|i| i + 4)));
         let camera = Camera { position: DVec3::new(2.0, 0.5, 100.0), ..Camera::above(100, 100, 1000.0, 0.0) };
-        let (d, share) = seen_one_way(&mesh, &Bvh::new(&sheet(0.0)), 6000, &[camera], 1).unwrap();
+        let parts =
+            seen_one_way(&mesh, &Bvh::new(&sheet(0.0)), 6000, &[camera], &[1..=u32::MAX, 0..=0, 2..=2]);
+        let (d, share) = parts[0].unwrap();
         // area 2 · 2 + 2 = 6 … the lower sheet is 4 × 1, the upper 2 × 1: seen 2 + 2 of 6
         assert!((share - 4.0 / 6.0).abs() < 0.01, "{share}");
         // the upper sheet lies 1 above, the free half up to 2 beyond the end at x = 2: mean (1 + 1) / 2
         assert!((d.mean - 1.0).abs() < 0.02 && (d.max - 2.0).abs() < 0.05, "{d:?}");
+        // what nobody sees is the rest, and lies on the other; nothing is seen twice
+        let (hidden, rest) = parts[1].unwrap();
+        assert!((rest - 2.0 / 6.0).abs() < 0.01 && hidden.mean < 0.01, "{hidden:?}");
+        assert!(parts[2].is_none());
     }
 }

@@ -19,9 +19,11 @@
 //! ```
 
 pub mod distance;
+mod parts;
 mod psnr;
 mod ssim;
 
+pub use parts::{Masks, PartMetrics, ToneSamples, Tones, parts};
 pub use psnr::psnr;
 pub use ssim::{ssim_reflect_map, ssim_valid};
 
@@ -115,11 +117,7 @@ pub fn compare(
     if !(3..=4).contains(&render.channels) {
         return problem(format!("the render has {} channels, expected 3 or 4", render.channels));
     }
-    let ours = rounded(render);
-    let mut theirs = Image::new(photo.width, photo.height, 3);
-    for (out, rgb) in theirs.data.as_chunks_mut::<3>().0.iter_mut().zip(&photo.rgb) {
-        *out = rgb.map(|v| v as f32 / 255.0);
-    }
+    let (ours, theirs) = (rounded(render), picture(photo));
     let inside: Option<Vec<bool>> = mask.map(|m| {
         let usable = |i: usize| valid.is_none_or(|v| v.values[i] >= INSIDE);
         (0..m.values.len()).map(|i| m.values[i] >= INSIDE && usable(i)).collect()
@@ -143,6 +141,15 @@ fn rounded(image: &Image) -> Image {
     let mut out = Image::new(image.width, image.height, 3);
     for (o, i) in out.data.as_chunks_mut::<3>().0.iter_mut().zip(image.data.chunks_exact(image.channels)) {
         *o = [i[0], i[1], i[2]].map(|v| quantize(v) as f32 / 255.0);
+    }
+    out
+}
+
+/// A photograph as a picture of floats.
+fn picture(photo: &Photo) -> Image {
+    let mut out = Image::new(photo.width, photo.height, 3);
+    for (o, rgb) in out.data.as_chunks_mut::<3>().0.iter_mut().zip(&photo.rgb) {
+        *o = rgb.map(|v| v as f32 / 255.0);
     }
     out
 }

@@ -6,9 +6,9 @@ use super::pictures;
 use super::truth::against_truth;
 use crate::capture::{LoadedView, View};
 use crate::config::{RenderConfig, Stage, ViewBackground};
-use crate::image::{Gray, Image};
+use crate::image::Gray;
 use crate::io::{self, Limits};
-use crate::metrics::{Metrics, ViewMetrics, compare};
+use crate::metrics::{Masks, Metrics, PartMetrics, ToneSamples, Tones, ViewMetrics, compare, parts};
 use crate::run::StageDir;
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -40,6 +40,7 @@ pub(super) struct Comparable<'a> {
 struct ViewFigures {
     head: ViewMetrics,
     region: Option<ViewMetrics>,
+    parts: PartMetrics,
     /// Sum of opacity² over the pixels without any head, and how many those are.
     outside: Option<(f64, u64)>,
 }
@@ -66,15 +67,16 @@ pub(super) fn comparable<'l>(line: &'l Line, set: &PictureSet) -> Vec<Comparable
 }
 
 /// Writes `metrics.json`: every rendered or blended view against its photograph, inside the mask and inside the
-/// capture's region of interest; how much of it is in the way outside; and the mesh against the truth where it is
-/// known.
+/// capture's region of interest, and part by part (opaque pixels, outline, skin, hair, what is covered); how much of
+/// it is in the way outside; and the mesh against the truth where it is known.
 pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     let mut out = Map::new();
     let sets = picture_sets(line);
-    for (i, set) in sets.iter().enumerate() {
-        let pictures = comparable(line, set);
-        let figures =
-            pictures.par_iter().map(|p| figures(p, &line.config.render)).collect::<Result<Vec<_>>>()?;
+    let judged: Vec<Vec<Comparable>> = sets.iter().map(|set| comparable(line, set)).collect();
+    let tones = tones(&judged)?;
+    for (i, (set, pictures)) in sets.iter().zip(&judged).enumerate() {
+        let figures = pictures.par_iter().map(|p| figures(p, &line.config.render, tones.as_ref()));
+        let figures = figures.collect::<Result<Vec<_>>>()?;
         if !figures.is_empty() {
             out.insert(set.name.clone(), entry(figures));
         }
@@ -96,7 +98,26 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     Ok(means(&value))
 }
 
-fn figures(picture: &Comparable, config: &RenderConfig) -> Result<ViewFigures> {
+/// What skin and hair look like in the photographs that any set has a picture of.
+fn tones(judged: &[Vec<Comparable>]) -> Result<Option<Tones>> {
+    let mut views: Vec<&View> = judged.iter().flatten().map(|c| c.view).collect();
+    views.sort_by_key(|v| &v.name);
+    views.dedup_by_key(|v| &v.name);
+    let samples = |view: &&View| -> Result<Option<ToneSamples>> {
+        let loaded = view.load(&Limits::default())?;
+        Ok(masks(&loaded).and_then(|m| ToneSamples::of(&loaded.photo, m)))
+    };
+    let found = views.par_iter().map(samples).collect::<Result<Vec<_>>>()?;
+    let sum = found.into_iter().flatten().reduce(|a, b| a.and(&b));
+    Ok(sum.and_then(|s| s.tones()))
+}
+
+fn masks(loaded: &LoadedView) -> Option<Masks<'_>> {
+    let (valid, region) = (loaded.valid.as_ref(), loaded.region.as_ref());
+    loaded.mask.as_ref().map(|mask| Masks { mask, valid, region })
+}
+
+fn figures(picture: &Comparable, config: &RenderConfig, tones: Option<&Tones>) -> Result<ViewFigures> {
     let background = config.background;
     let loaded = picture.view.load(&Limits::default())?;
     let render = pictures::read(&picture.file, config.format)?;
@@ -106,20 +127,24 @@ fn figures(picture: &Comparable, config: &RenderConfig) -> Result<ViewFigures> {
     let region = loaded.region.as_ref().map(|r| against(Some(r))).transpose()?;
     let head = against(loaded.mask.as_ref())?;
     // a picture over a background is opaque; what it was before is in the float view
-    let outside = if io::is_file(&picture.float) {
-        square_opacity_outside(&pictures::read_float(&picture.float)?, &loaded)
-    } else if background == ViewBackground::None {
-        square_opacity_outside(&render, &loaded)
-    } else {
-        None
+    let before = match io::is_file(&picture.float) {
+        true => Some(pictures::read_float(&picture.float)?),
+        false => None,
     };
-    Ok(ViewFigures { head, region, outside })
+    let open = before.as_ref().or((background == ViewBackground::None).then_some(&render));
+    let opacity = open.map(|image| image.channel(3));
+    let behind = pictures::behind(background).unwrap_or([0.0; 3]);
+    let parts = masks(&loaded).map(|m| parts(&render, &photo, m, opacity.as_deref(), behind, tones));
+    let parts = parts.unwrap_or_default();
+    let outside = opacity.and_then(|opacity| square_opacity_outside(&opacity, &loaded));
+    Ok(ViewFigures { head, region, parts, outside })
 }
 
 /// One set's part of the file.
 fn entry(figures: Vec<ViewFigures>) -> Value {
-    let (mut heads, mut regions, mut outside) = (Vec::new(), Vec::new(), (0.0, 0));
+    let (mut heads, mut regions, mut parts, mut outside) = (Vec::new(), Vec::new(), Vec::new(), (0.0, 0));
     for f in figures {
+        parts.push(f.parts);
         heads.push(f.head);
         regions.extend(f.region);
         let (sum, pixels) = f.outside.unwrap_or_default();
@@ -130,6 +155,10 @@ fn entry(figures: Vec<ViewFigures>) -> Value {
     if !regions.is_empty() {
         entry.insert("region".into(), json!(Metrics::new(regions)));
     }
+    if parts.iter().any(|p| *p != PartMetrics::default()) {
+        // in the order of the head's views, which name them
+        entry.insert("parts".into(), json!({"mean": PartMetrics::mean(&parts), "views": parts}));
+    }
     if outside.1 > 0 {
         entry.insert("mean_square_opacity_outside".into(), (outside.0 / outside.1 as f64).into());
     }
@@ -138,12 +167,12 @@ fn entry(figures: Vec<ViewFigures>) -> Value {
 
 /// Sum of opacity² over the valid pixels of which the mask says that no head is there, and how many
 /// there are; `None` without a mask. What floats before the background shows here.
-fn square_opacity_outside(render: &Image, loaded: &LoadedView) -> Option<(f64, u64)> {
+fn square_opacity_outside(opacity: &[f32], loaded: &LoadedView) -> Option<(f64, u64)> {
     let mask = loaded.mask.as_ref()?;
     let valid = |i: usize| loaded.valid.as_ref().is_none_or(|v| v.values[i] > 0);
-    let alpha = render.data.as_chunks::<4>().0.iter().map(|p| p[3] as f64);
-    let counted = alpha.zip(&mask.values).enumerate().filter(|(i, (_, m))| **m == NOTHING && valid(*i));
-    Some(counted.fold((0.0, 0), |(sum, n), (_, (a, _))| (sum + a * a, n + 1)))
+    let counted =
+        opacity.iter().zip(&mask.values).enumerate().filter(|(i, (_, m))| **m == NOTHING && valid(*i));
+    Some(counted.fold((0.0, 0), |(sum, n), (_, (a, _))| (sum + (*a as f64).powi(2), n + 1)))
 }
 
 /// The part of a metrics file worth a line: means, without the single views.
@@ -164,10 +193,7 @@ mod tests {
 
     #[test]
     fn opacity_before_the_background_counts_squared_and_only_where_no_head_is() {
-        let mut render = Image::new(4, 1, 4);
-        for (x, a) in [0.5, 1.0, 0.1, 0.9].into_iter().enumerate() {
-            render.pixel_mut(x as u32, 0)[3] = a;
-        }
+        let render = [0.5, 1.0, 0.1, 0.9];
         let gray = |values: [u8; 4]| Some(Gray { width: 4, height: 1, values: values.to_vec() });
         let photo = Photo { width: 4, height: 1, rgb: vec![[0; 3]; 4], alpha: None };
         // a hair of head in pixel 1, pixel 3 not valid: 0.5² + 0.1² = 0.26 over two pixels

@@ -44,6 +44,7 @@ pub(super) fn write_report(line: &Line, idle: bool) -> Result<()> {
     let page = Report {
         title: line.capture.name.clone(),
         summaries: Stage::ALL.into_iter().filter_map(|stage| summary(line, stage)).collect(),
+        quality: quality(line),
         masks: crate::mask::sheet::part(&sheet).unwrap_or_default().into(),
         curves,
         rows,
@@ -85,13 +86,44 @@ fn rows(line: &Line, mut bytes: usize) -> Result<(Vec<ViewRow>, usize)> {
     Ok((rows, left_out))
 }
 
-/// The figures of a stage that is done.
+/// The figures of a stage that is done; those of pictures have a table of their own.
 fn summary(line: &Line, stage: Stage) -> Option<(String, Vec<(String, String)>)> {
-    let figures = match read_record(&line.run.path(stage)).ok()??.summary {
-        Value::Object(sets) if stage == Stage::Metrics => {
-            sets.iter().map(|(set, figures)| (called(set), figures.clone())).collect()
-        }
-        other => other,
+    let mut figures = read_record(&line.run.path(stage)).ok()??.summary;
+    if let (Stage::Metrics, Value::Object(sets)) = (stage, &mut figures) {
+        sets.retain(|_, set| set.get("head").is_none());
+    }
+    let rows = report::leaves(&figures);
+    (!rows.is_empty()).then(|| (stage.to_string(), rows))
+}
+
+/// What the table of pictures shows: a heading, where it stands in `metrics.json`, and how many digits.
+const QUALITY: [(&str, &str, usize); 12] = [
+    ("PSNR", "/head/mean/psnr_masked", 2),
+    ("SSIM", "/head/mean/ssim_masked", 4),
+    ("whole frame", "/head/mean/psnr", 2),
+    ("region", "/region/mean/psnr_masked", 2),
+    ("opaque", "/parts/mean/psnr_opaque", 2),
+    ("edge", "/parts/mean/psnr_edge", 2),
+    ("skin", "/parts/mean/psnr_skin", 2),
+    ("hair", "/parts/mean/psnr_hair", 2),
+    ("missing", "/parts/mean/missing", 0),
+    ("extra", "/parts/mean/extra", 0),
+    ("at most", "/parts/mean/psnr_cap", 2),
+    ("opacity² outside", "/mean_square_opacity_outside", 4),
+];
+
+/// A row for every kind of picture that was judged, below the heading; nothing where none was.
+fn quality(line: &Line) -> Vec<Vec<String>> {
+    let record = read_record(&line.run.path(Stage::Metrics)).ok().flatten();
+    let Some(Value::Object(sets)) = record.map(|done| done.summary) else { return Vec::new() };
+    let row = |(set, figures): (&String, &Value)| {
+        figures.get("head")?;
+        let figure = |(_, path, digits): (&str, &str, usize)| {
+            let value = figures.pointer(path).and_then(Value::as_f64);
+            value.map_or("–".into(), |v| format!("{v:.digits$}"))
+        };
+        Some([called(set)].into_iter().chain(QUALITY.map(figure)).collect())
     };
-    Some((stage.to_string(), report::leaves(&figures)))
+    let heading = [""].into_iter().chain(QUALITY.map(|(name, ..)| name)).map(String::from).collect();
+    [heading].into_iter().chain(sets.iter().filter_map(row)).collect()
 }

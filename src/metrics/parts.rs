@@ -1,0 +1,410 @@
+//! Where a picture is right: parts of the head judged apart, and what of it is covered.
+//!
+//! | part | pixels |
+//! | --- | --- |
+//! | opaque | the mask is 1 (alpha ≥ 0.999): neither background nor partial coverage has a say |
+//! | edge | within 3 pixels of the mask's 0.5 contour, on either side of it; the frame's border is no contour |
+//! | skin, hair | of the region of interest, where [`Tones`] tells them apart |
+//!
+//! Covered is where the render's opacity is at least 0.5. Head pixels that are not are missing, covered ones
+//! without head are extra; [`PartMetrics::psnr_cap`] is what a picture with the photograph's own colors in
+//! every covered pixel would reach over the mask.
+
+use super::{INSIDE, picture, rounded};
+use crate::image::{Gray, Image, Photo};
+use serde::Serialize;
+
+/// Half of the band around the mask's contour, pixels.
+const EDGE_PX: usize = 3;
+
+/// What belongs to one photograph; all of one size.
+#[derive(Clone, Copy)]
+pub struct Masks<'a> {
+    /// Soft alpha of the head.
+    pub mask: &'a Gray,
+    /// Where the photograph can be used; everywhere without it.
+    pub valid: Option<&'a Gray>,
+    /// Face, ears and hair, without neck and garment.
+    pub region: Option<&'a Gray>,
+}
+
+impl Masks<'_> {
+    fn is_valid(&self, i: usize) -> bool {
+        self.valid.is_none_or(|v| v.values[i] >= INSIDE)
+    }
+
+    fn all(&self, holds: impl Fn(usize, u8) -> bool) -> Vec<bool> {
+        self.mask.values.iter().enumerate().map(|(i, &m)| self.is_valid(i) && holds(i, m)).collect()
+    }
+}
+
+/// Figures of one view, or their means over views.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct PartMetrics {
+    /// Over the opaque pixels, dB.
+    pub psnr_opaque: Option<f64>,
+    /// Along the outline, dB.
+    pub psnr_edge: Option<f64>,
+    /// Over the region's skin, dB.
+    pub psnr_skin: Option<f64>,
+    /// Over the region's hair, its soft rim included, dB.
+    pub psnr_hair: Option<f64>,
+    /// Pixels of the head that are not covered.
+    pub missing: Option<f64>,
+    /// Covered pixels without head.
+    pub extra: Option<f64>,
+    /// Masked PSNR that coverage allows, dB; `None` also where nothing is missing.
+    pub psnr_cap: Option<f64>,
+}
+
+impl PartMetrics {
+    /// Means over the views that have a value, figure by figure.
+    pub fn mean(views: &[PartMetrics]) -> PartMetrics {
+        let mean = |of: fn(&PartMetrics) -> Option<f64>| {
+            let values: Vec<f64> = views.iter().filter_map(of).collect();
+            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+        };
+        PartMetrics {
+            psnr_opaque: mean(|v| v.psnr_opaque),
+            psnr_edge: mean(|v| v.psnr_edge),
+            psnr_skin: mean(|v| v.psnr_skin),
+            psnr_hair: mean(|v| v.psnr_hair),
+            missing: mean(|v| v.missing),
+            extra: mean(|v| v.extra),
+            psnr_cap: mean(|v| v.psnr_cap),
+        }
+    }
+}
+
+/// Judges a render, over the background it was made for, part by part.
+///
+/// `expected` is the photograph over the same background, `behind` that background's color (sRGB-coded),
+/// `opacity` the render's alpha if it is known, `[height · width]`. Sizes agree, as [`super::compare`] makes sure.
+pub fn parts(
+    render: &Image,
+    expected: &Photo,
+    masks: Masks,
+    opacity: Option<&[f32]>,
+    behind: [f32; 3],
+    tones: Option<&Tones>,
+) -> PartMetrics {
+    let (ours, theirs) = (rounded(render), picture(expected));
+    let psnr = |inside: &[bool]| super::psnr(&ours, &theirs, Some(inside));
+    let (skin, hair) = match tones.and_then(|t| t.split(expected, masks)) {
+        Some((skin, hair)) => (psnr(&skin), psnr(&hair)),
+        None => (None, None),
+    };
+    let mut found = PartMetrics {
+        psnr_opaque: psnr(&masks.all(|_, m| m == u8::MAX)),
+        psnr_edge: psnr(&edge(masks)),
+        psnr_skin: skin,
+        psnr_hair: hair,
+        ..PartMetrics::default()
+    };
+    if let Some(opacity) = opacity {
+        let covered = |i: usize| opacity[i] >= 0.5;
+        let count = |of: Vec<bool>| of.into_iter().filter(|x| *x).count() as f64;
+        let missing = masks.all(|i, m| m >= INSIDE && !covered(i));
+        // the best that can be shown: the photograph where something is, the background where nothing is
+        let mut best = theirs.clone();
+        for (p, _) in best.data.as_chunks_mut::<3>().0.iter_mut().zip(&missing).filter(|(_, m)| **m) {
+            *p = behind;
+        }
+        found.psnr_cap = super::psnr(&best, &theirs, Some(&masks.all(|_, m| m >= INSIDE)));
+        found.missing = Some(count(missing));
+        found.extra = Some(count(masks.all(|i, m| m < INSIDE && covered(i))));
+    }
+    found
+}
+
+/// The band around the mask's contour.
+fn edge(masks: Masks) -> Vec<bool> {
+    let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
+    let rest: Vec<bool> = head.iter().map(|h| !h).collect();
+    let [to_head, to_rest] = [&head, &rest].map(|set| near(set, masks.mask.width as usize, EDGE_PX));
+    masks.all(|i, _| to_head[i] && to_rest[i])
+}
+
+/// The pixels of a set and those whose centers are within `radius` of one of its centers.
+fn near(set: &[bool], width: usize, radius: usize) -> Vec<bool> {
+    let mut out = set.to_vec();
+    let height = set.len() / width.max(1);
+    for (i, _) in set.iter().enumerate().filter(|(_, s)| **s) {
+        let (x, y) = (i % width, i / width);
+        // a pixel inside the set adds nothing that those at its rim do not
+        let rim = (x > 0 && !set[i - 1])
+            || (x + 1 < width && !set[i + 1])
+            || (y > 0 && !set[i - width])
+            || (y + 1 < height && !set[i + width]);
+        if !rim {
+            continue;
+        }
+        for v in y.saturating_sub(radius)..(y + radius + 1).min(height) {
+            let half = (radius * radius - v.abs_diff(y).pow(2)).isqrt();
+            out[v * width + x.saturating_sub(half)..v * width + (x + half + 1).min(width)].fill(true);
+        }
+    }
+    out
+}
+
+/// Around a soft rim this many pixels of opaque head are the hair's, and along a hard rim the skin's.
+const SAMPLE_PX: usize = 6;
+
+/// Nearer than this to a soft rim an outline is not taken for skin's.
+const APART_PX: usize = 10;
+
+/// The share of each kind among the samples that is needed to tell them apart.
+const LEAST_SHARE: f64 = 0.05;
+
+/// Colors of skin and of hair, as a capture itself shows them.
+///
+/// Where a mask is soft over more than the one pixel of an antialiased outline (a pixel whose eight neighbors
+/// are all soft, too), hair is in front of the background: opaque pixels of the region beside it are samples of
+/// hair, those along the other outlines samples of skin. Every opaque pixel of the region then goes to the kind
+/// whose median is nearer, counted in that kind's own median deviations. Brows and lips go with the hair where
+/// they are as dark. Without soft rims (a shaven head, a bust, hard masks), without hard ones, or with hair of
+/// the skin's color nothing is told apart.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tones {
+    skin: Tone,
+    hair: Tone,
+}
+
+/// Median and median deviation of each channel, in 1/255.
+#[derive(Clone, Debug, PartialEq)]
+struct Tone {
+    median: [f64; 3],
+    deviation: [f64; 3],
+}
+
+/// How often each value of each channel occurs in the samples of skin, and of hair.
+#[derive(Clone)]
+pub struct ToneSamples([[[u64; 256]; 3]; 2]);
+
+impl ToneSamples {
+    /// Collects those of one photograph (not cut out); `None` without a region of interest.
+    pub fn of(photo: &Photo, masks: Masks) -> Option<ToneSamples> {
+        let (region, width) = (masks.region?, masks.mask.width as usize);
+        let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
+        let rest: Vec<bool> = head.iter().map(|h| !h).collect();
+        let soft = soft_rim(masks.mask);
+        let [beside, far] = [SAMPLE_PX, APART_PX].map(|px| near(&soft, width, px));
+        let rim = near(&rest, width, 1);
+        let hard: Vec<bool> =
+            (0..rim.len()).map(|i| rim[i] && head[i] && !far[i] && region.values[i] >= INSIDE).collect();
+        let along = near(&hard, width, SAMPLE_PX);
+        let opaque = masks.all(|i, m| m == u8::MAX && region.values[i] >= INSIDE);
+        let mut counts = [[[0; 256]; 3]; 2];
+        for (i, rgb) in photo.rgb.iter().enumerate().filter(|(i, _)| opaque[*i]) {
+            let kinds = [along[i] && !far[i], beside[i]];
+            for (kind, _) in counts.iter_mut().zip(kinds).filter(|(_, is)| *is) {
+                kind.iter_mut().zip(rgb).for_each(|(channel, &v)| channel[v as usize] += 1);
+            }
+        }
+        Some(ToneSamples(counts))
+    }
+
+    /// Those of two photographs together.
+    pub fn and(mut self, other: &ToneSamples) -> ToneSamples {
+        let counts = self.0.as_flattened_mut().as_flattened_mut();
+        counts.iter_mut().zip(other.0.as_flattened().as_flattened()).for_each(|(a, b)| *a += b);
+        self
+    }
+
+    /// Returns the two kinds, if these samples tell them apart.
+    pub fn tones(&self) -> Option<Tones> {
+        let [skin, hair] = [0, 1].map(|kind| self.0[kind][0].iter().sum::<u64>());
+        if (skin.min(hair) as f64) <= LEAST_SHARE * (skin + hair) as f64 {
+            return None;
+        }
+        let [skin, hair] = [0, 1].map(|kind| Tone::of(&self.0[kind]));
+        let apart = (0..3)
+            .any(|c| (skin.median[c] - hair.median[c]).abs() > 2.0 * (skin.deviation[c] + hair.deviation[c]));
+        apart.then_some(Tones { skin, hair })
+    }
+}
+
+impl Tone {
+    fn of(counts: &[[u64; 256]; 3]) -> Tone {
+        let median = counts.each_ref().map(median);
+        let deviation = std::array::from_fn(|c| {
+            let mut away = [0; 256];
+            let distance = |v: usize| v.abs_diff(median[c]);
+            counts[c].iter().enumerate().for_each(|(v, n)| away[distance(v)] += n);
+            self::median(&away).max(1) as f64
+        });
+        Tone { median: median.map(|m| m as f64), deviation }
+    }
+
+    fn distance(&self, rgb: [u8; 3]) -> f64 {
+        (0..3).map(|c| (rgb[c] as f64 - self.median[c]).abs() / self.deviation[c]).sum()
+    }
+}
+
+/// The least value that half of the samples do not exceed.
+fn median(counts: &[u64; 256]) -> usize {
+    let (total, mut sum) = (counts.iter().sum::<u64>(), 0);
+    let at = |n: &u64| {
+        sum += n;
+        2 * sum >= total
+    };
+    counts.iter().position(at).unwrap_or(0)
+}
+
+impl Tones {
+    /// Returns skin and hair of one photograph, of which opaque pixels keep their colors; `None` without a region.
+    fn split(&self, photo: &Photo, masks: Masks) -> Option<(Vec<bool>, Vec<bool>)> {
+        let region = masks.region?;
+        let fringe = near(&soft_rim(masks.mask), masks.mask.width as usize, 1);
+        let dark = |i: usize| self.hair.distance(photo.rgb[i]) < self.skin.distance(photo.rgb[i]);
+        let of = |i: usize, m: u8| region.values[i] >= INSIDE && m == u8::MAX;
+        let skin = masks.all(|i, m| of(i, m) && !dark(i));
+        let rim = |i: usize, m: u8| region.values[i] >= INSIDE && m < u8::MAX && fringe[i];
+        Some((skin, masks.all(|i, m| of(i, m) && dark(i) || rim(i, m))))
+    }
+}
+
+/// Pixels where the mask and all eight neighbors (those within the frame) are neither 0 nor 1.
+fn soft_rim(mask: &Gray) -> Vec<bool> {
+    let (w, h) = (mask.width as usize, mask.height as usize);
+    let soft = |x: usize, y: usize| !matches!(mask.values[y * w + x], 0 | u8::MAX);
+    let all = |x: usize, y: usize| {
+        let columns = x.saturating_sub(1)..(x + 2).min(w);
+        (y.saturating_sub(1)..(y + 2).min(h)).all(|v| columns.clone().all(|u| soft(u, v)))
+    };
+    (0..w * h).map(|i| all(i % w, i / w)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gray(width: u32, values: Vec<u8>) -> Gray {
+        Gray { width, height: values.len() as u32 / width, values }
+    }
+
+    fn only(mask: &Gray) -> Masks<'_> {
+        Masks { mask, valid: None, region: None }
+    }
+
+    /// Returns a photograph and a render of a row of gray values of 1/255.
+    fn rows(photo: &[u8], render: &[u8]) -> (Photo, Image) {
+        let width = photo.len() as u32;
+        let mut image = Image::new(width, 1, 4);
+        for (p, &v) in image.data.as_chunks_mut::<4>().0.iter_mut().zip(render) {
+            *p = [v as f32 / 255.0; 4];
+        }
+        (Photo { width, height: 1, rgb: photo.iter().map(|&v| [v; 3]).collect(), alpha: None }, image)
+    }
+
+    fn close(found: Option<f64>, expected: f64) {
+        assert!((found.unwrap() - expected).abs() < 1e-3, "{found:?}, expected {expected}");
+    }
+
+    #[test]
+    fn soft_pixels_are_no_opaque_ones_and_the_edge_has_both_sides() {
+        // head ends between pixels 3 and 4; three pixels on each side are the edge: 1 to 6
+        let mask = gray(10, vec![255, 255, 255, 200, 100, 0, 0, 0, 0, 0]);
+        let (photo, render) = rows(&[102; 10], &[51, 102, 102, 0, 102, 102, 153, 0, 0, 0]);
+        let found = parts(&render, &photo, only(&mask), None, [0.0; 3], None);
+        // opaque 0, 1, 2: errors 0.2, 0, 0 → −10 log10(0.04 / 3) = 18.7506
+        close(found.psnr_opaque, 18.7506);
+        // edge 1 … 6: errors 0.4 and 0.2 → −10 log10((0.16 + 0.04) / 6) = 14.7712
+        close(found.psnr_edge, 14.7712);
+        assert_eq!((found.psnr_skin, found.missing, found.psnr_cap), (None, None, None));
+        let valid = gray(10, vec![255, 255, 255, 0, 255, 255, 255, 255, 255, 255]);
+        let masks = Masks { valid: Some(&valid), ..only(&mask) };
+        // without pixel 3: 0.04 over five → 20.9691
+        close(parts(&render, &photo, masks, None, [0.0; 3], None).psnr_edge, 20.9691);
+    }
+
+    #[test]
+    fn the_frame_is_no_outline() {
+        let mask = gray(4, vec![255; 16]);
+        assert!(edge(only(&mask)).iter().all(|e| !e));
+    }
+
+    #[test]
+    fn what_is_missing_limits_the_figure_and_what_is_extra_is_counted() {
+        let mask = gray(5, vec![255, 255, 255, 255, 0]);
+        let (photo, render) = rows(&[102, 102, 102, 102, 0], &[102; 5]);
+        let opacity = [1.0, 0.5, 0.49, 1.0, 0.7];
+        let over_black = parts(&render, &photo, only(&mask), Some(&opacity), [0.0; 3], None);
+        assert_eq!((over_black.missing, over_black.extra), (Some(1.0), Some(1.0)));
+        // one of four pixels shows black for 0.4: −10 log10(0.16 / 4) = 13.9794
+        close(over_black.psnr_cap, 13.9794);
+        // … and white: −10 log10(0.36 / 4) = 10.4576
+        let over_white = parts(&render, &photo, only(&mask), Some(&opacity), [1.0; 3], None);
+        close(over_white.psnr_cap, 10.4576);
+        let whole = parts(&render, &photo, only(&mask), Some(&[1.0; 5]), [0.0; 3], None);
+        assert_eq!((whole.missing, whole.psnr_cap), (Some(0.0), None));
+    }
+
+    #[test]
+    fn near_is_a_disc() {
+        let mut set = vec![false; 49];
+        set[24] = true; // (3, 3) of 7 × 7
+        let disc = near(&set, 7, 2);
+        // radius 2: 1 + 3 + 5 + 3 + 1
+        assert_eq!(disc.iter().filter(|d| **d).count(), 13);
+        assert!(disc[22] && disc[10] && !disc[9], "(1, 3) and (3, 1), not (2, 1)");
+        assert!(near(&[true; 49], 7, 2).iter().all(|d| *d));
+    }
+
+    /// A capture of one photograph, 40 × 20: background above, below it a soft rim of hair on the left half and a
+    /// hard outline of skin on the right; the lowest rows are neck.
+    fn head(hair: [u8; 3], skin: [u8; 3]) -> (Photo, Gray, Gray) {
+        let (w, h) = (40, 20);
+        let mask = |x: usize, y: usize| match (x < w / 2, y) {
+            (true, 0..3) | (false, 0..6) => 0,
+            (true, 3..6) => 60 * (y - 2) as u8,
+            _ => 255,
+        };
+        let all = || (0..w * h).map(|i| (i % w, i / w));
+        let color = |(x, _): (usize, usize)| if x < w / 2 { hair } else { skin };
+        let region = all().map(|(_, y)| if y < 16 { 255 } else { 0 }).collect();
+        let photo = Photo { width: 40, height: 20, rgb: all().map(color).collect(), alpha: None };
+        (photo, gray(40, all().map(|(x, y)| mask(x, y)).collect()), gray(40, region))
+    }
+
+    #[test]
+    fn a_soft_rim_shows_the_color_of_hair_and_a_hard_one_that_of_skin() {
+        let (photo, mask, region) = head([60, 40, 30], [200, 150, 140]);
+        let masks = Masks { region: Some(&region), ..only(&mask) };
+        let samples = ToneSamples::of(&photo, masks).unwrap();
+        let tones = samples.clone().and(&samples).tones().unwrap();
+        assert_eq!((tones.hair.median, tones.skin.median), ([60.0, 40.0, 30.0], [200.0, 150.0, 140.0]));
+        let (skin, hair) = tones.split(&photo, masks).unwrap();
+        let count = |set: &[bool]| set.iter().filter(|s| **s).count();
+        // opaque rows 6 to 15 of 20 columns each; hair has its rim, too: row 4 up to column 18 has soft neighbors
+        // only, and what touches it is in rows 3 to 5 up to there, and column 19 of row 4
+        assert_eq!((count(&skin), count(&hair)), (200, 200 + 3 * 19 + 1));
+        assert!(skin[10 * 40 + 30] && hair[10 * 40 + 10] && hair[4 * 40 + 5] && !skin[17 * 40 + 30]);
+        let render = Image::new(40, 20, 4);
+        let found = parts(&render, &photo, masks, None, [0.0; 3], Some(&tones));
+        // black for skin: (200² + 150² + 140²) / (3 · 255²) = 0.42086 → 3.7586 dB
+        close(found.psnr_skin, 3.7586);
+        // for hair: (60² + 40² + 30²) / (3 · 255²) = 0.031270 → 15.0487 dB
+        close(found.psnr_hair, 15.0487);
+    }
+
+    #[test]
+    fn without_a_soft_rim_or_a_difference_nothing_is_told_apart() {
+        let (photo, mut mask, region) = head([60, 40, 30], [200, 150, 140]);
+        let same = Photo { rgb: vec![[90; 3]; 800], ..photo.clone() };
+        let masks = Masks { region: Some(&region), ..only(&mask) };
+        assert_eq!(ToneSamples::of(&same, masks).unwrap().tones(), None);
+        assert!(ToneSamples::of(&photo, only(&mask)).is_none());
+        mask.values.iter_mut().for_each(|m| *m = if *m >= 128 { 255 } else { 0 });
+        let masks = Masks { region: Some(&region), ..only(&mask) };
+        assert_eq!(ToneSamples::of(&photo, masks).unwrap().tones(), None);
+    }
+
+    #[test]
+    fn means_are_over_the_views_that_have_a_figure() {
+        let one = PartMetrics { missing: Some(10.0), psnr_cap: Some(30.0), ..PartMetrics::default() };
+        let two = PartMetrics { missing: Some(0.0), ..PartMetrics::default() };
+        let mean = PartMetrics::mean(&[one, two]);
+        assert_eq!((mean.missing, mean.psnr_cap, mean.psnr_edge), (Some(5.0), Some(30.0), None));
+    }
+}
