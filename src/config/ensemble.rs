@@ -10,7 +10,8 @@ table! {
         /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb); an empty list
         /// for no blend.
         members: Vec<Method>
-            => vec![Method::Tface, Method::Volume], vec![Method::Tface, Method::Volume],
+            => vec![Method::Tface, Method::Volume, Method::Raycast],
+            vec![Method::Tface, Method::Volume, Method::Raycast],
             vec![Method::Baseline, Method::Tface, Method::Volume];
         /// The share of each member, in their order, together 1; an empty list fits them on capture.tiles.
         weights: Vec<f64>, 0.0..=1.0 => Vec::new(), Vec::new(), vec![0.1, 0.6, 0.3];
@@ -31,7 +32,7 @@ mod tests {
     #[test]
     fn weights_are_fitted_unless_they_are_given_and_iface_is_a_word_for_volume() {
         let c = set(&[]);
-        assert_eq!(c.ensemble.members, [Method::Tface, Method::Volume]);
+        assert_eq!(c.ensemble.members, [Method::Tface, Method::Volume, Method::Raycast]);
         assert!(c.ensemble.weights.is_empty() && c.capture.tiles > 0.0);
         assert!(!c.render.method.contains(&Method::Baseline));
         let c = set(&["preset=paper"]);

@@ -35,6 +35,16 @@ pub enum Genus {
     Simple,
 }
 
+/// Where the colors of the mesh come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ColorSource {
+    /// Fitted to the photographs; the network's where nobody looks.
+    Photographs,
+    /// The color network's (published).
+    Network,
+}
+
 /// How a texture is stored inside or beside a mesh.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -62,9 +72,11 @@ table! {
         triangles: u32, 0.0..=1e8 => 50_000;
         /// Largest distance of the product from the field's surface, in cells; 0 sets no limit.
         max_error: f32, 0.0..=100.0 => 0.0;
+        /// Where colors come from: photographs (fitted to them, as good as they are) or network (published).
+        color: ColorSource => ColorSource::Photographs, ColorSource::Photographs, ColorSource::Network;
         /// Texels along each side of the texture; 0: colors at the vertices.
         texture_px: u32, 0.0..=16384.0 => 1024, 2048, 2048;
-        /// Degree of view-dependent lobes in the GLB: 0 (none), 1 or 2.
+        /// Degree of view-dependent lobes in the GLB, 0 (none), 1 or 2: at most, where photographs tell.
         lobes: u32, 0.0..=2.0 => 0;
         /// A tangent-space map of the field's normals in the GLB: true or false.
         normal_map: bool => false;

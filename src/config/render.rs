@@ -94,8 +94,8 @@ table! {
             vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast];
         /// Views of an orbit around the head.
         orbit_views: u32, 1.0..=10_000.0 => 36;
-        /// Rays along each side of a pixel on an edge of the mesh.
-        samples: u32, 1.0..=8.0 => 1, 2, 2;
+        /// Rays along each side of a pixel that shows the mesh; twice as many on its edges.
+        samples: u32, 1.0..=8.0 => 2;
         /// png (8-bit sRGB) or exr (float, with depth and normals).
         format: PictureFormat => PictureFormat::Png;
         /// Behind the head: black, white or none (real alpha).

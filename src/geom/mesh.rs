@@ -1,6 +1,7 @@
 //! A triangle mesh with what the pipeline attaches to its vertices.
 
 use super::aabb::Aabb;
+use super::ray::Hit;
 use super::similarity::Similarity;
 use super::topology::topology;
 use glam::Vec3;
@@ -79,6 +80,17 @@ impl Mesh {
             })
             .sum();
         sum / 6.0
+    }
+
+    /// Returns the color of a point of a triangle, interpolated between its vertices; black without colors.
+    pub fn color_at(&self, hit: &Hit) -> [f32; 3] {
+        let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
+        let mut out = [0f32; 3];
+        for (&vertex, w) in self.triangles[hit.triangle as usize].iter().zip(weights) {
+            let own = self.colors.get(vertex as usize).unwrap_or(&[0.0; 3]);
+            (0..3).for_each(|k| out[k] += w * own[k]);
+        }
+        out
     }
 
     /// Drops vertices no triangle uses.

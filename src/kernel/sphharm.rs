@@ -1,5 +1,16 @@
 //! Real spherical harmonics up to degree 3 (16 values): the view-direction encoding of Instant-NGP.
 
+/// The first function: it is the same in every direction.
+pub const Y0: f32 = 0.282_094_79;
+
+/// Functions up to degree 2.
+pub const MOST_OF_DEGREE_2: usize = 9;
+
+/// Returns how many functions there are up to a degree.
+pub fn functions(degree: u32) -> usize {
+    ((degree + 1) * (degree + 1)) as usize
+}
+
 /// The 16 basis functions at the unit direction `d`, in the order and with the signs of
 /// tiny-cuda-nn's degree-4 encoding.
 #[inline(always)]
@@ -7,7 +18,7 @@ pub fn sh16([x, y, z]: [f32; 3]) -> [f32; 16] {
     let (xy, yz, xz) = (x * y, y * z, x * z);
     let (x2, y2, z2) = (x * x, y * y, z * z);
     [
-        0.282_094_79,
+        Y0,
         -0.488_602_51 * y,
         0.488_602_51 * z,
         -0.488_602_51 * x,

@@ -17,5 +17,6 @@ pub use extract::{
     Skin, Sparse, Verified, Volume, clean, extract, marching, sparse,
 };
 pub use finish::{
-    AtlasConfig, AtlasReport, SimplifyConfig, SimplifyReport, VertexPlacement, atlas, bake, simplify,
+    Appearance, AppearanceReport, AtlasConfig, AtlasReport, Colors, Photograph, SimplifyConfig,
+    SimplifyReport, VertexPlacement, atlas, bake, fit_appearance, simplify,
 };

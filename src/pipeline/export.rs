@@ -42,7 +42,7 @@ impl Export {
 
     /// Returns a head mesh as the files of a format, the mesh first. `stem` names them.
     pub(super) fn files(&self, head: &HeadMesh, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
-        let HeadMesh { mesh, world_from_scene, texture } = head;
+        let HeadMesh { mesh, world_from_scene, texture, .. } = head;
         let (up, world_from_mesh) = match self.frame {
             MeshFrame::Dataset => (self.up, *world_from_scene),
             MeshFrame::Head => (Vec3::Y, self.head_from_mesh(mesh, world_from_scene)),

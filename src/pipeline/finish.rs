@@ -3,12 +3,12 @@
 use super::export::{Export, center};
 use super::surface::ClosedSurface;
 use crate::capture::scene::Scene;
-use crate::config::MeshConfig;
+use crate::config::{ColorSource, MeshConfig};
 use crate::geom::{Camera, Mesh};
-use crate::image::{Image, Photo, quantize, srgb_from_linear};
-use crate::mesh::bake::{BakeConfig, Baked, Learned, Seams, bake, tangent_space};
+use crate::image::{Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
+use crate::mesh::bake::{BakeConfig, Learned, Seams, bake, bake_harmonics, complete, tangent_space};
 use crate::mesh::files::{HeadMesh, HeadTexture, Lobes, tangents};
-use crate::mesh::{AtlasConfig, SimplifyConfig, atlas, simplify};
+use crate::mesh::{AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, simplify};
 use crate::{Monitor, Result};
 use glam::{Mat3, Vec3};
 use serde_json::{Map, Value, json};
@@ -28,12 +28,15 @@ pub(super) struct FinishedHead {
     pub warnings: Vec<String>,
 }
 
-/// Finishes a surface in scene coordinates, extracted with cells of `cell`, for cameras in scene coordinates.
+/// Cameras that the network's colors are taken from where photographs say the rest.
+const FALLBACK_VIEWS: usize = 3;
+
+/// Finishes a surface in scene coordinates, extracted with cells of `cell`; cameras are in scene coordinates, too.
 pub(super) fn finish(
     surface: &Mesh,
     cell: f32,
     closed: &ClosedSurface,
-    cameras: &[Camera],
+    photographs: &[Photograph],
     scene: &Scene,
     export: &Export,
     c: &MeshConfig,
@@ -54,8 +57,21 @@ pub(super) fn finish(
         report.insert("simplify".into(), json!(done));
     }
     let world_from_scene = scene.scene_from_world.inverse();
+    // as `Export::files` turns it
+    let asset_from_world = export.asset_from_world(&mesh, &world_from_scene);
+    let turned = asset_from_world * world_from_scene.rotation_f32();
+    let most = if c.lobes > 0 { c.lobes } else { 2 };
+    let photographs_say = c.color == ColorSource::Photographs;
     if c.texture_px == 0 {
-        let head = HeadMesh { mesh, world_from_scene, texture: None };
+        let mut harmonics = None;
+        if photographs_say
+            && let Some(fitted) = fit_appearance(&mesh, Colors::Vertices, photographs, most, turned, monitor)?
+        {
+            report.insert("appearance".into(), json!(fitted.report));
+            mesh.colors = fitted.vertices;
+            harmonics = fitted.harmonics;
+        }
+        let head = HeadMesh { mesh, world_from_scene, texture: None, harmonics };
         return Ok(FinishedHead { head, linear: None, report, warnings });
     }
 
@@ -66,20 +82,37 @@ pub(super) fn finish(
     warnings.extend(done.warnings());
     report.insert("atlas".into(), json!(done));
 
-    // as `Export::files` turns it
-    let asset_from_world = export.asset_from_world(&mesh, &world_from_scene);
+    let cameras: Vec<Camera> = photographs.iter().map(|p| p.camera.clone()).collect();
     let config = BakeConfig {
-        side: c.texture_samples,
+        // what photographs are to say need not be said exactly
+        side: if photographs_say { 1 } else { c.texture_samples },
+        views: if photographs_say { FALLBACK_VIEWS } else { usize::MAX },
         gutter_px: c.gutter_px,
         reach: REACH * cell,
-        lobes: c.lobes,
+        lobes: if photographs_say { 0 } else { c.lobes },
         normals: c.normal_map,
-        turned: asset_from_world * world_from_scene.rotation_f32(),
+        turned,
     };
     let colors = |p: &[Vec3], n: &[Vec3], counts: &[u32], d: &[Vec3]| closed.colors(p, n, counts, d);
     let learned = Learned { gradient: &gradient, colors: &colors };
-    let baked = bake(&mesh, &layout, &learned, cameras, &config, monitor)?;
+    let mut baked = bake(&mesh, &layout, &learned, &cameras, &config, monitor)?;
     report.insert("bake".into(), json!(baked.report));
+    let mut harmonics = None;
+    if photographs_say {
+        let mut image = baked.color.clone();
+        image.data.iter_mut().for_each(|v| *v = srgb_from_linear(*v));
+        let colors = Colors::Texels(&layout, &image);
+        if let Some(fitted) = fit_appearance(&mesh, colors, photographs, most, turned, monitor)? {
+            report.insert("appearance".into(), json!(fitted.report));
+            let (texels, known) = fitted.texels;
+            image.data = texels.into_flattened();
+            complete(&mut image, &known, c.gutter_px, &Seams::new(&mesh, &layout));
+            image.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
+            baked.color = image;
+            mesh.colors = fitted.vertices;
+            harmonics = fitted.harmonics;
+        }
+    }
     let color = coded(&baked.color);
     report.insert("seam_step_255".into(), json!(Seams::new(&mesh, &layout).step(&color)));
 
@@ -92,9 +125,12 @@ pub(super) fn finish(
             Err(e) => warnings.push(format!("the mesh has no normal map: {e}")),
         }
     }
-    let lobes = lobes(&baked, asset_from_world);
+    if let Some(harmonics) = harmonics.as_ref().filter(|_| c.lobes > 0) {
+        baked.lobes = bake_harmonics(&mesh, &layout, harmonics, c.gutter_px);
+    }
+    let lobes = lobes(&baked.lobes, asset_from_world);
     let texture = Some(HeadTexture { atlas: layout, color, normal, lobes });
-    let head = HeadMesh { mesh, world_from_scene, texture };
+    let head = HeadMesh { mesh, world_from_scene, texture, harmonics };
     Ok(FinishedHead { head, linear: c.exr.then_some(baked.color), report, warnings })
 }
 
@@ -107,12 +143,12 @@ fn coded(image: &Image) -> Photo {
 
 /// Lobes as pictures. Each is scaled by what all but a thousandth of its texels keep within: a few wild texels
 /// must not cost the others their precision.
-fn lobes(baked: &Baked, asset_from_world: Mat3) -> Option<Lobes> {
-    if baked.lobes.is_empty() {
+fn lobes(images: &[Image], asset_from_world: Mat3) -> Option<Lobes> {
+    if images.is_empty() {
         return None;
     }
     let (mut pictures, mut scale) = (Vec::new(), Vec::new());
-    for image in &baked.lobes {
+    for image in images {
         let mut sizes: Vec<f32> = image.data.iter().map(|v| v.abs()).collect();
         let at = (sizes.len() as f64 * 0.999) as usize;
         let most = if sizes.is_empty() { 0.0 } else { *sizes.select_nth_unstable_by(at, f32::total_cmp).1 };

@@ -4,19 +4,16 @@ use super::line::Line;
 use super::surface::{Fields, Radiance, Surface};
 use super::tiles;
 use crate::capture::scene::Scene;
-use crate::capture::{Capture, View};
+use crate::capture::{Capture, LoadedView};
 use crate::config::{Config, MaskUse, Stage};
-use crate::ensemble::Tile;
 use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
+use crate::geom::Camera;
 use crate::iface::{self, IFace};
-use crate::image::Gray;
-use crate::io::Limits;
 use crate::kernel::march::Bitmask;
 use crate::run::StageDir;
 use crate::tface::{self, FieldMean};
 use crate::{Error, Result};
-use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::cell::OnceCell;
 use std::path::Path;
@@ -73,23 +70,14 @@ pub(super) fn train_views(
     config: &Config,
     masked: bool,
 ) -> Result<Vec<TrainView>> {
-    let view = |(view, tiles): &(&View, Vec<Tile>)| {
-        let loaded = view.load(&Limits::default())?;
-        let (width, height) = (loaded.photo.width, loaded.photo.height);
-        let mut valid = loaded.valid;
-        for tile in tiles {
-            let all = || Gray { width, height, values: vec![255; loaded.photo.rgb.len()] };
-            let values = &mut valid.get_or_insert_with(all).values;
-            tile.pixels(width).for_each(|i| values[i] = 0);
-        }
-        Ok(TrainView {
-            camera: view.camera.transformed(&scene.scene_from_world),
-            photo: loaded.photo,
-            mask: loaded.mask.filter(|_| masked),
-            valid,
-        })
+    let views = tiles::training_views(capture, scene, config)?.into_iter();
+    let view = |(camera, loaded): (Camera, LoadedView)| TrainView {
+        camera,
+        photo: loaded.photo,
+        mask: loaded.mask.filter(|_| masked),
+        valid: loaded.valid,
     };
-    tiles::held_out_tiles(capture, config).par_iter().map(view).collect()
+    Ok(views.map(view).collect())
 }
 
 fn bitmask(scene: &Scene) -> Option<Bitmask> {

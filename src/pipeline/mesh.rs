@@ -10,6 +10,7 @@ use super::export::Export;
 use super::finish::{FinishedHead, REACH, finish};
 use super::line::Line;
 use super::surface::{ClosedSurface, Surface};
+use super::tiles;
 use crate::Result;
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, Split};
@@ -19,7 +20,7 @@ use crate::image::Image;
 use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
-use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshReport, Patches};
+use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshReport, Patches, Photograph};
 use crate::run::StageDir;
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
@@ -59,7 +60,8 @@ pub(super) fn mesh(
     write_files(&to_ply(&surface, None, &in_world)?, dir.folder())?;
     let surface_triangles = surface.triangles.len();
     // vertices have the color seen straight; textures and rays that of the cameras, and so their cap
-    let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
+    let views = tiles::training_views(capture, scene, config)?;
+    let cameras: Vec<Camera> = views.iter().map(|v| v.0.clone()).collect();
     if let Some(cap) = cap.as_mut() {
         let learned = Learned {
             gradient: &|p| field.sdf_gradient(p),
@@ -68,8 +70,18 @@ pub(super) fn mesh(
         let reach = REACH * report.cell_size;
         cap.shade(|p, n| seen_colors(&surface, p, n, &learned, &cameras, reach));
     }
+    let photographs: Vec<Photograph> = views
+        .iter()
+        .map(|(camera, view)| Photograph {
+            camera,
+            photo: &view.photo,
+            mask: view.mask.as_ref(),
+            valid: view.valid.as_ref(),
+        })
+        .collect();
     let closed = ClosedSurface { field, cap: cap.as_ref(), patches: patches.as_ref() };
-    let finished = finish(&surface, report.cell_size, &closed, &cameras, scene, &export, c, dir.monitor())?;
+    let finished =
+        finish(&surface, report.cell_size, &closed, &photographs, scene, &export, c, dir.monitor())?;
     let FinishedHead { head, linear, report: steps, warnings } = finished;
     warnings.iter().for_each(|w| dir.warn(w));
 

@@ -16,12 +16,12 @@ use super::pictures;
 use super::surface::Fields;
 use crate::capture::Split;
 use crate::capture::scene::{self, Scene};
-use crate::config::Method;
-use crate::geom::{Bvh, Camera, Mesh, Ray, Similarity};
+use crate::config::{ColorSource, Method};
+use crate::geom::{Bvh, Camera, Ray, Similarity};
 use crate::io;
-use crate::mesh::files::{ExtractedSurface, HeadMesh, HeadTexture};
+use crate::mesh::files::{ExtractedSurface, HeadMesh};
 use crate::render::path::{NamedCamera, orbit};
-use crate::render::{LobePictures, MeshTexture, RaycastOptions, RenderedView, raycast};
+use crate::render::{LobePictures, MeshTexture, RayHits, RaycastOptions, RenderedView, raycast};
 use crate::run::StageDir;
 use crate::{Error, Monitor, Result};
 use serde_json::{Map, Value, json};
@@ -92,47 +92,66 @@ pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
 /// The meshes that some methods show.
 pub(super) struct Meshes {
     extracted: Option<ExtractedSurface>,
-    head: Option<(HeadMesh, HeadTexture)>,
+    head: Option<HeadMesh>,
 }
 
 impl Meshes {
     /// Those that `methods` show, as they lie in the run.
     pub fn load(line: &Line, methods: &[Method]) -> Result<Meshes> {
-        let extracted = methods.contains(&Method::Raycast).then(|| extracted_surface(line)).transpose()?;
-        let head = methods.contains(&Method::Textured).then(|| textured(line)).transpose()?;
+        let (raycast, textured) = (methods.contains(&Method::Raycast), methods.contains(&Method::Textured));
+        // fitted colors lie on the head mesh, the network's wherever rays meet a surface
+        let fitted = line.config.mesh.color == ColorSource::Photographs;
+        let extracted = (raycast && !fitted).then(|| extracted_surface(line)).transpose()?;
+        let head = (textured || raycast && fitted).then(|| head_mesh(line)).transpose()?;
+        if textured && head.as_ref().is_some_and(|head| head.texture.is_none()) {
+            return Err(Error::cannot(
+                "the mesh has no texture to be shown",
+                "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
+            ));
+        }
         Ok(Meshes { extracted, head })
     }
 }
 
-/// The head mesh and its texture, which it must have.
-fn textured(line: &Line) -> Result<(HeadMesh, HeadTexture)> {
-    let mut head = head_mesh(line)?;
-    let texture = head.texture.take().ok_or_else(|| {
-        Error::cannot(
-            "the mesh has no texture to be shown",
-            "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
-        )
-    })?;
-    Ok((head, texture))
-}
-
-/// A mesh with its texture and what rays need to find it.
-struct TexturedMesh<'a> {
-    mesh: &'a Mesh,
+/// The head mesh and what rays need to find it.
+struct VisibleHead<'a> {
+    head: &'a HeadMesh,
     bvh: Bvh,
-    texture: MeshTexture<'a>,
+    /// What a viewer shows of its texture.
+    shown: Option<MeshTexture<'a>>,
+    /// Base color alone.
+    base: Option<MeshTexture<'a>>,
 }
 
-impl<'a> TexturedMesh<'a> {
-    fn new(head: &'a HeadMesh, texture: &'a HeadTexture) -> TexturedMesh<'a> {
+impl<'a> VisibleHead<'a> {
+    fn new(head: &'a HeadMesh) -> VisibleHead<'a> {
         let (mesh, world_from_scene) = (&head.mesh, head.world_from_scene.rotation_f32());
-        let lobes = texture.lobes.as_ref().map(|l| LobePictures {
-            pictures: &l.pictures,
-            scale: &l.scale,
-            turned: l.asset_from_world * world_from_scene,
-        });
-        let texture = MeshTexture::new(mesh, &texture.atlas, &texture.color, lobes.as_ref());
-        TexturedMesh { mesh, bvh: Bvh::new(mesh), texture }
+        let texture = |lobes: bool| {
+            let texture = head.texture.as_ref()?;
+            let lobes = texture.lobes.as_ref().filter(|_| lobes).map(|l| LobePictures {
+                pictures: &l.pictures,
+                scale: &l.scale,
+                turned: l.asset_from_world * world_from_scene,
+            });
+            Some(MeshTexture::new(mesh, &texture.atlas, &texture.color, lobes.as_ref()))
+        };
+        VisibleHead { head, bvh: Bvh::new(mesh), shown: texture(true), base: texture(false) }
+    }
+
+    /// sRGB-coded colors of what rays met, with all that is known of them.
+    fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
+        let mesh = &self.head.mesh;
+        let mut colors = match &self.base {
+            Some(texture) => texture.colors(hits, camera, samples),
+            None => hits.hits.iter().map(|hit| mesh.color_at(hit)).collect(),
+        };
+        if let Some(harmonics) = &self.head.harmonics {
+            for ((color, hit), &direction) in colors.iter_mut().zip(&hits.hits).zip(&hits.directions) {
+                let more = harmonics.seen_along(direction, hit, mesh.triangles[hit.triangle as usize]);
+                (0..3).for_each(|k| color[k] = (color[k] + more[k]).clamp(0.0, 1.0));
+            }
+        }
+        colors
     }
 }
 
@@ -140,14 +159,14 @@ impl<'a> TexturedMesh<'a> {
 pub(super) struct Renderer<'a> {
     fields: &'a dyn Fields,
     extracted: Option<(&'a ExtractedSurface, Bvh)>,
-    textured: Option<TexturedMesh<'a>>,
+    head: Option<VisibleHead<'a>>,
     samples: u32,
     world_from_scene: Similarity,
     monitor: &'a dyn Monitor,
 }
 
 impl<'a> Renderer<'a> {
-    /// Of these fields and meshes; `samples` rays along each side of a pixel on an edge of a mesh.
+    /// Of these fields and meshes; `samples` rays along each side of a pixel that shows a mesh.
     pub fn new(
         scene: &Scene,
         fields: &'a dyn Fields,
@@ -158,7 +177,7 @@ impl<'a> Renderer<'a> {
         Renderer {
             fields,
             extracted: meshes.extracted.as_ref().map(|s| (s, Bvh::new(&s.mesh))),
-            textured: meshes.head.as_ref().map(|(head, texture)| TexturedMesh::new(head, texture)),
+            head: meshes.head.as_ref().map(VisibleHead::new),
             samples,
             world_from_scene: scene.scene_from_world.inverse(),
             monitor,
@@ -167,7 +186,8 @@ impl<'a> Renderer<'a> {
 
     /// The view of a camera in scene coordinates, over nothing.
     pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>> {
-        let options = RaycastOptions { samples: self.samples, world_from_scene: self.world_from_scene };
+        let samples = self.samples;
+        let options = RaycastOptions { samples, world_from_scene: self.world_from_scene };
         Ok(match (method, &self.extracted) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
@@ -190,11 +210,15 @@ impl<'a> Renderer<'a> {
                     colors
                 }))
             }
-            (Method::Raycast, None) => None,
-            (Method::Textured, _) => self.textured.as_ref().map(|product| {
-                raycast(&product.bvh, product.mesh, camera, &options, |hits| {
-                    product.texture.colors(hits, camera)
+            (Method::Raycast, None) => self.head.as_ref().map(|visible| {
+                raycast(&visible.bvh, &visible.head.mesh, camera, &options, |hits| {
+                    visible.colors(hits, camera, samples)
                 })
+            }),
+            (Method::Textured, _) => self.head.as_ref().and_then(|visible| {
+                let texture = visible.shown.as_ref()?;
+                let color = |hits: &RayHits| texture.colors(hits, camera, samples);
+                Some(raycast(&visible.bvh, &visible.head.mesh, camera, &options, color))
             }),
         })
     }
@@ -206,7 +230,7 @@ mod tests {
     use super::*;
     use crate::Quiet;
     use crate::config::Stage;
-    use crate::geom::Aabb;
+    use crate::geom::{Aabb, Mesh};
     use crate::mesh::{Cap, Skin};
     use glam::Vec3;
 
@@ -261,7 +285,7 @@ mod tests {
             let renderer = Renderer {
                 fields: &Red,
                 extracted: Some((&surface, bvh)),
-                textured: None,
+                head: None,
                 samples: 1,
                 world_from_scene: Similarity::IDENTITY,
                 monitor: &Quiet,

@@ -1,10 +1,8 @@
-//! A view of a mesh: one ray through each pixel's center, the learned color where it hits.
+//! A view of a mesh: the mean of `samples × samples` rays through each pixel, colored where they hit.
 //!
-//! Hard edges would leave stairs, so pixels on an edge are looked at again. Rays through the pixel
-//! corners tell which: some hit and some miss, or depth jumps by more than a surface seen at 84°
-//! would within one pixel. Such a pixel becomes the mean of `samples × samples` rays; what misses
-//! counts as transparent black. The mean is of sRGB-coded values, as everywhere in a render here:
-//! the fields composite coded color, so alpha does too.
+//! On an edge that would leave stairs: where some rays hit and some miss, or depth jumps by more than a surface seen
+//! at 84° would within one pixel, there are twice as many each way. What misses counts as transparent black. The mean
+//! is of sRGB-coded values, as everywhere in a render here: the fields composite coded color, so alpha does too.
 
 use crate::geom::{Bvh, Camera, Hit, Mesh, Ray, Similarity};
 use crate::image::Image;
@@ -20,7 +18,7 @@ const JUMP: f32 = 10.0;
 /// How rays are cast.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RaycastOptions {
-    /// Rays along each side of a pixel on an edge; 1 leaves edges hard.
+    /// Rays along each side of a pixel; twice as many on an edge. 1 is one ray everywhere.
     pub samples: u32,
     /// From the mesh's coordinates (in which the camera stands too) to those of depth and normals.
     pub world_from_scene: Similarity,
@@ -136,48 +134,41 @@ impl Raycaster<'_> {
         color: &(impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync),
     ) {
         let w = self.camera.width as usize;
-        let rows = rgba.len() / w;
         let n = self.options.samples.max(1) as usize;
-        let centers: Vec<Option<(Ray, Hit)>> =
-            (0..rgba.len()).map(|i| self.cast((i % w) as f32 + 0.5, (top + i / w) as f32 + 0.5)).collect();
-        let corners: Vec<f32> = if n > 1 {
-            (0..(w + 1) * (rows + 1))
-                .map(|i| {
-                    let found = self.cast((i % (w + 1)) as f32, (top + i / (w + 1)) as f32);
-                    found.map_or(0.0, |(ray, hit)| self.depth(&ray, &hit))
-                })
-                .collect()
-        } else {
-            Vec::new()
-        };
         let mut queue = RayHits::default();
+        let mut found = Vec::with_capacity(4 * n * n);
         for i in 0..rgba.len() {
-            let (x, y) = (i % w, i / w);
-            if let Some((ray, hit)) = &centers[i] {
+            let (x, y) = ((i % w) as f32, (top + i / w) as f32);
+            let center = self.cast(x + 0.5, y + 0.5);
+            if let Some((ray, hit)) = &center {
                 depth[i] = self.depth(ray, hit) * self.options.world_from_scene.scale as f32;
-                let n = self.options.world_from_scene.direction(self.normal(hit));
-                normal[i] = n.normalize_or_zero().to_array();
+                let up = self.options.world_from_scene.direction(self.normal(hit));
+                normal[i] = up.normalize_or_zero().to_array();
             }
-            let at = y * (w + 1) + x;
-            let on_edge = n > 1 && {
-                let around = [at, at + 1, at + w + 1, at + w + 2].map(|k| corners[k]);
-                let center = centers[i].as_ref().map_or(0.0, |(ray, hit)| self.depth(ray, hit));
-                self.is_edge(around, center)
-            };
-            if on_edge {
-                for k in 0..n * n {
-                    let sub = |k: usize| (k as f32 + 0.5) / n as f32;
-                    let found = self.cast(x as f32 + sub(k % n), (top + y) as f32 + sub(k / n));
-                    self.enqueue(&mut queue, i, &found, 1.0 / (n * n) as f32, rgba);
-                }
+            found.clear();
+            if n == 1 {
+                found.push(center);
             } else {
-                self.enqueue(&mut queue, i, &centers[i], 1.0, rgba);
+                self.cast_grid(x, y, n, &mut found);
+                if self.is_edge(&found) {
+                    found.clear();
+                    self.cast_grid(x, y, 2 * n, &mut found);
+                }
+            }
+            for one in &found {
+                self.enqueue(&mut queue, i, one, 1.0 / found.len() as f32, rgba);
             }
             if queue.pixels.len() >= BATCH {
                 shade(&mut queue, rgba, color);
             }
         }
         shade(&mut queue, rgba, color);
+    }
+
+    /// Casts `n × n` rays through the pixel at a corner.
+    fn cast_grid(&self, x: f32, y: f32, n: usize, found: &mut Vec<Option<(Ray, Hit)>>) {
+        let sub = |k: usize| (k as f32 + 0.5) / n as f32;
+        found.extend((0..n * n).map(|k| self.cast(x + sub(k % n), y + sub(k / n))));
     }
 
     /// The first hit through a picture position, with its ray.
@@ -191,10 +182,12 @@ impl Raycaster<'_> {
         hit.t * ray.direction.dot(self.camera.forward())
     }
 
-    fn is_edge(&self, corners: [f32; 4], center: f32) -> bool {
-        let (mut low, mut high) = (center, center);
-        for d in corners {
-            (low, high) = (low.min(d), high.max(d));
+    /// Returns whether some of a pixel's rays miss and others hit, or meet far apart.
+    fn is_edge(&self, found: &[Option<(Ray, Hit)>]) -> bool {
+        let (mut low, mut high) = (f32::INFINITY, 0f32);
+        for one in found {
+            let depth = one.as_ref().map_or(0.0, |(ray, hit)| self.depth(ray, hit));
+            (low, high) = (low.min(depth), high.max(depth));
         }
         // 0 is a miss; a pixel's footprint is depth / focal length
         (low == 0.0) != (high == 0.0) || high - low > JUMP * low / self.camera.fx.abs() as f32

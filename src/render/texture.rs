@@ -72,15 +72,16 @@ impl<'a> MeshTexture<'a> {
         MeshTexture { atlas, levels, channels, turned: lobes.map_or(Mat3::IDENTITY, |l| l.turned), density }
     }
 
-    /// sRGB-coded colors of what rays of a camera met.
-    pub fn colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
+    /// Returns the sRGB-coded colors of what rays of a camera met, `samples` of them along each side of a pixel.
+    pub fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
         let forward = camera.forward();
         let mut values = vec![0f32; self.channels];
         let one = |(i, hit): (usize, &crate::geom::Hit)| {
             let corners = self.atlas.triangles[hit.triangle as usize].map(|c| self.atlas.uvs[c as usize]);
             let uv = (1.0 - hit.u - hit.v) * corners[0] + hit.u * corners[1] + hit.v * corners[2];
-            // a pixel's width on a plane across the view; slanted surfaces stay sharp rather than blur
-            let footprint = hit.t * hits.directions[i].dot(forward) / camera.fx.abs() as f32;
+            // a ray's share of a pixel on a plane across the view; slanted surfaces stay sharp rather than blur
+            let footprint =
+                hit.t * hits.directions[i].dot(forward) / (camera.fx.abs() as f32 * samples as f32);
             let texels = footprint * self.density[hit.triangle as usize];
             let level = texels.max(1.0).log2().round().clamp(0.0, (self.levels.len() - 1) as f32);
             self.levels[level as usize].look_up(uv, &mut values);
@@ -169,9 +170,10 @@ mod tests {
         (mesh, atlas, Photo { width: 4, height: 4, rgb, alpha: None })
     }
 
-    fn view(texture: &MeshTexture, mesh: &Mesh, camera: &Camera) -> Vec<[f32; 4]> {
+    fn view(texture: &MeshTexture, mesh: &Mesh, camera: &Camera, samples: u32) -> Vec<[f32; 4]> {
         let bvh = Bvh::new(mesh);
-        let seen = raycast(&bvh, mesh, camera, &RaycastOptions::default(), |s| texture.colors(s, camera));
+        let options = RaycastOptions { samples, ..RaycastOptions::default() };
+        let seen = raycast(&bvh, mesh, camera, &options, |s| texture.colors(s, camera, samples));
         seen.color.data.as_chunks::<4>().0.to_vec()
     }
 
@@ -180,7 +182,7 @@ mod tests {
         let (mesh, atlas, photo) = square();
         let texture = MeshTexture::new(&mesh, &atlas, &photo, None);
         // 8 × 8 pixels over the square: focal 8 at distance 2 shows 2 units
-        let pixels = view(&texture, &mesh, &Camera::above(8, 8, 8.0, 2.0));
+        let pixels = view(&texture, &mesh, &Camera::above(8, 8, 8.0, 2.0), 2);
         let near = |p: [f32; 4], c: [f32; 4]| p.iter().zip(c).all(|(a, b)| (a - b).abs() < 1e-4);
         assert!(near(pixels[0], [1.0, 0.0, 0.0, 1.0]) && near(pixels[7], [0.0, 1.0, 0.0, 1.0]));
         // the last row's left texel is 180 / 255 blue
@@ -221,7 +223,7 @@ mod tests {
         photo.rgb.iter_mut().enumerate().for_each(|(i, c)| *c = [255 * ((i + i / 4) % 2) as u8; 3]);
         let texture = MeshTexture::new(&mesh, &atlas, &photo, None);
         // 2 pixels over the square: every pixel is the mean of 2 × 2 texels, linear 0.5, coded 0.735
-        for p in view(&texture, &mesh, &Camera::above(2, 2, 2.0, 2.0)) {
+        for p in view(&texture, &mesh, &Camera::above(2, 2, 2.0, 2.0), 1) {
             assert!((p[0] - srgb_from_linear(0.5)).abs() < 1e-3, "{p:?}");
         }
     }
@@ -236,7 +238,7 @@ mod tests {
         let scale = [0.1, 0.1, 0.1, 0.2];
         let lobes = LobePictures { pictures: &pictures, scale: &scale, turned: Mat3::IDENTITY };
         let texture = MeshTexture::new(&mesh, &atlas, &photo, Some(&lobes));
-        let pixels = view(&texture, &mesh, &Camera::above(9, 9, 9.0, 2.0));
+        let pixels = view(&texture, &mesh, &Camera::above(9, 9, 9.0, 2.0), 1);
         let middle = pixels[40];
         assert!((middle[0] - 128.0 / 255.0).abs() < 1e-3);
         // the leftmost pixel is seen from the right: its direction to the viewer has x = 0.889 / √(4 + 0.79)

@@ -8,7 +8,7 @@
 use super::stored::{StoredTensors, damaged, floats, format, geometry, indices};
 use super::texture::{HeadTexture, Lobes};
 use crate::Result;
-use crate::geom::{Atlas, Mesh, Similarity};
+use crate::geom::{Atlas, Harmonics, Mesh, Similarity};
 use crate::image::Photo;
 use crate::io::{self, Limits, ReadError, TensorValues};
 use glam::{Mat3, Vec2};
@@ -28,6 +28,8 @@ pub struct HeadMesh {
     pub world_from_scene: Similarity,
     /// Its texture, if it has one.
     pub texture: Option<HeadTexture>,
+    /// What views of it add to its base color, if photographs told.
+    pub harmonics: Option<Harmonics>,
 }
 
 impl HeadMesh {
@@ -44,6 +46,13 @@ impl HeadMesh {
         place.extend(rotation.to_cols_array());
         place.extend(translation.to_array());
         tensors.push(("world_from_scene".into(), vec![place.len()], TensorValues::F64(place)));
+        if let Some(harmonics) = &self.harmonics {
+            let count = harmonics.functions;
+            let values = harmonics.coefficients.as_flattened().to_vec();
+            let shape = vec![harmonics.coefficients.len() / count, count, 3];
+            tensors.push(("harmonics".into(), shape, TensorValues::F32(values)));
+            tensors.push(floats("harmonics_from_scene", &harmonics.turned.to_cols_array_2d()));
+        }
         let mut metadata = format();
         if let Some(texture) = &self.texture {
             tensors.push(floats::<2>("uvs", bytemuck::cast_slice(&texture.atlas.uvs)));
@@ -76,7 +85,9 @@ impl HeadMesh {
         let mut stored = StoredTensors::open(&folder.join(FILE))?;
         let (mesh, world_from_scene) = (stored.mesh()?, stored.similarity("world_from_scene")?);
         let texture = stored.contains("uvs").then(|| load_texture(folder, &mut stored, &mesh)).transpose()?;
-        Ok(HeadMesh { mesh, world_from_scene, texture })
+        let harmonics =
+            stored.contains("harmonics").then(|| load_harmonics(&mut stored, &mesh)).transpose()?;
+        Ok(HeadMesh { mesh, world_from_scene, texture, harmonics })
     }
 }
 
@@ -106,6 +117,17 @@ fn load_texture(folder: &Path, stored: &mut StoredTensors, mesh: &Mesh) -> Resul
         texture.lobes = Some(Lobes { pictures, scale, asset_from_world });
     }
     Ok(texture)
+}
+
+fn load_harmonics(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Harmonics> {
+    let (functions, coefficients) = stored.per_vertex("harmonics", mesh.positions.len())?;
+    let &[x, y, z] = &stored.rows::<3>("harmonics_from_scene")?[..] else {
+        return Err(stored.missing("harmonics_from_scene"));
+    };
+    if functions > MOST_LOBES {
+        return Err(stored.missing("harmonics"));
+    }
+    Ok(Harmonics { functions, coefficients, turned: Mat3::from_cols(x.into(), y.into(), z.into()) })
 }
 
 /// A picture of the texture; all have the size of the first.
@@ -154,7 +176,9 @@ pub(super) mod tests {
             rotation: DMat3::from_rotation_x(0.3),
             translation: DVec3::new(5e6, -3e6, 2e5),
         };
-        HeadMesh { mesh, world_from_scene, texture: Some(texture) }
+        let coefficients = (0..16).map(|i| [0.1 * i as f32, -0.2, 0.3]).collect();
+        let harmonics = Some(Harmonics { functions: 4, coefficients, turned: Mat3::from_rotation_y(0.2) });
+        HeadMesh { mesh, world_from_scene, texture: Some(texture), harmonics }
     }
 
     #[test]
@@ -163,7 +187,7 @@ pub(super) mod tests {
         let whole = head();
         whole.save(dir.path()).unwrap();
         assert_eq!(HeadMesh::load(dir.path()).unwrap(), whole);
-        let bare = HeadMesh { texture: None, ..whole };
+        let bare = HeadMesh { texture: None, harmonics: None, ..whole };
         bare.save(dir.path()).unwrap();
         assert_eq!(HeadMesh::load(dir.path()).unwrap(), bare);
     }
@@ -194,6 +218,8 @@ pub(super) mod tests {
         );
         assert!(error(&|p| p.texture.as_mut().unwrap().normal = Some(odd())).contains("`size`"));
         assert!(error(&|p| p.texture.as_mut().unwrap().atlas.triangles.truncate(1)).contains("uv_triangles"));
+        let cut = |p: &mut HeadMesh| p.harmonics.as_mut().unwrap().coefficients.truncate(12);
+        assert!(error(&cut).contains("`harmonics`"));
         let old = std::collections::BTreeMap::from([("format".to_owned(), "tiface-mesh-1".to_owned())]);
         io::write_tensors(&dir.path().join("geometry.safetensors"), &geometry(&head().mesh), &old).unwrap();
         for error in [

@@ -94,6 +94,18 @@ impl StoredTensors {
         }
     }
 
+    /// `[vertices, n, 3]` numbers, and `n`.
+    pub fn per_vertex(&mut self, name: &str, vertices: usize) -> Result<(usize, Vec<[f32; 3]>)> {
+        match self.tensors.remove(name) {
+            Some((shape, TensorValues::F32(v)))
+                if shape.len() == 3 && shape[0] == vertices && shape[1] > 0 && shape[2] == 3 =>
+            {
+                Ok((shape[1], v.as_chunks::<3>().0.to_vec()))
+            }
+            _ => Err(self.missing(name)),
+        }
+    }
+
     /// `[n, 3]` numbers.
     pub fn vectors(&mut self, name: &str) -> Result<Vec<Vec3>> {
         Ok(self.rows(name)?.into_iter().map(Vec3::from).collect())

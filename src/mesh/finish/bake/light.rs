@@ -68,6 +68,8 @@ pub struct Visibility<'a> {
     pub bvh: &'a Bvh,
     /// How far in front of the flat triangle a line of sight starts, so that it does not meet its own triangle.
     pub clearance: f32,
+    /// Cameras of a point at most: those that look at it most directly.
+    pub most: usize,
 }
 
 /// Cameras that stand in for those that see a point, where none does.
@@ -132,7 +134,11 @@ impl Visibility<'_> {
                     };
                     (!self.bvh.any_hit(&ray)).then_some((direction, cos * cos))
                 };
-                let list: Vec<_> = self.cameras.iter().zip(&all).filter_map(sees).collect();
+                let mut list: Vec<_> = self.cameras.iter().zip(&all).filter_map(sees).collect();
+                if list.len() > self.most {
+                    list.sort_by(|a, b| b.1.total_cmp(&a.1));
+                    list.truncate(self.most);
+                }
                 if !list.is_empty() || all.is_empty() {
                     return (!list.is_empty(), list);
                 }
@@ -227,7 +233,8 @@ pub fn seen_colors(
 ) -> Vec<[f32; 3]> {
     let points = SurfacePoints { positions: positions.to_vec(), normals: normals.to_vec() };
     let bvh = Bvh::new(mesh);
-    let seen = Visibility { cameras, bvh: &bvh, clearance: 0.5 * reach }.directions(&points, &points);
+    let seen = Visibility { cameras, bvh: &bvh, clearance: 0.5 * reach, most: usize::MAX }
+        .directions(&points, &points);
     let shades = shade(&points, seen, learned, 0, glam::Mat3::IDENTITY);
     shades.linear.into_iter().map(|c| c.map(srgb_from_linear)).collect()
 }
@@ -269,7 +276,7 @@ mod tests {
         };
         let bvh = Bvh::new(&hiding);
         let cameras = [Camera::above(100, 100, 100.0, 4.0)];
-        let eyes = Visibility { cameras: &cameras, bvh: &bvh, clearance: 1e-3 };
+        let eyes = Visibility { cameras: &cameras, bvh: &bvh, clearance: 1e-3, most: 8 };
         let at = |x: f32, n: Vec3| (Vec3::new(x, 0.0, 0.0), n);
         let tilted = |degrees: f32| Vec3::new(degrees.to_radians().sin(), 0.0, degrees.to_radians().cos());
         // free, hidden, turned away, 80 degrees off, outside the frame (50 / 100 · 4 = 2)
@@ -323,7 +330,7 @@ mod tests {
         assert!(towards(1.0) > 0.1 && towards(-1.0) < -0.3, "{} {}", towards(1.0), towards(-1.0));
         assert_eq!(shades.lobes[4..], [[0.0; 3]; 4]);
         let bvh = Bvh::new(&Mesh::default());
-        let nobody = Visibility { cameras: &[], bvh: &bvh, clearance: 0.0 };
+        let nobody = Visibility { cameras: &[], bvh: &bvh, clearance: 0.0, most: 8 };
         let straight = nobody.directions(&points, &points);
         let straight = shade(&points, straight, &learned, 0, glam::Mat3::IDENTITY);
         assert_eq!(straight.linear[0][0], 0.0);

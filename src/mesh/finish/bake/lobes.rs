@@ -11,20 +11,12 @@
 //! Cameras see a point from one side only, so that without the ridge term λ the functions would be free to grow
 //! where nobody looks.
 
-use crate::kernel::sphharm::sh16;
+use crate::kernel::sphharm::{MOST_OF_DEGREE_2 as MOST, sh16};
 use glam::Vec3;
-
-/// Most functions: degree 2.
-pub const MOST: usize = 9;
 
 /// Weight of the ridge term: colors of a light stage change by a few percent of their range over a quarter of a
 /// turn, their noise is about as large.
 const RIDGE: f64 = 0.02;
-
-/// How many functions there are up to a degree.
-pub fn count(degree: u32) -> usize {
-    ((degree + 1) * (degree + 1)) as usize
-}
 
 /// Coefficients `[functions][rgb]` that best turn `base` into `colors` seen from `directions` (unit, towards the
 /// viewer) with `weights`. Zero where there is nothing to fit.
@@ -32,7 +24,7 @@ pub fn count(degree: u32) -> usize {
 /// # Shapes
 ///
 /// - directions, weights, colors: `[n]`; base and colors sRGB-coded
-/// - out: `[count(degree)]`, at most [`MOST`]
+/// - out: `[functions]`, at most [`MOST`]
 pub fn fit(base: [f32; 3], directions: &[Vec3], weights: &[f32], colors: &[[f32; 3]], out: &mut [[f32; 3]]) {
     let n = out.len();
     out.fill([0.0; 3]);
@@ -84,7 +76,7 @@ pub fn fit(base: [f32; 3], directions: &[Vec3], weights: &[f32], colors: &[[f32;
 mod tests {
     use super::*;
     use crate::kernel::rng;
-    use crate::kernel::sphharm::combine;
+    use crate::kernel::sphharm::{combine, functions};
 
     fn add(coefficients: &[[f32; 3]], d: Vec3) -> [f32; 3] {
         combine(coefficients, d.to_array())
@@ -117,7 +109,7 @@ mod tests {
         let colors: Vec<[f32; 3]> = d.iter().map(|d| [0.4 + 0.2 * d.x * d.y + 0.1 * d.z; 3]).collect();
         let error = |degree: u32| -> f32 {
             let mut out = [[0f32; 3]; MOST];
-            let out = &mut out[..count(degree)];
+            let out = &mut out[..functions(degree)];
             fit([0.4; 3], &d, &vec![1.0; 60], &colors, out);
             d.iter().zip(&colors).map(|(d, c)| (0.4 + add(out, *d)[0] - c[0]).powi(2)).sum()
         };

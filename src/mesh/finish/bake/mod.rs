@@ -20,8 +20,9 @@ pub use detail::tangent_space;
 pub use light::{Learned, seen_colors};
 pub use seams::Seams;
 
-use crate::geom::{Atlas, Bvh, Camera, Mesh, area_vector};
+use crate::geom::{Atlas, Bvh, Camera, Harmonics, Mesh, area_vector};
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
+use crate::kernel::sphharm::functions;
 use crate::mesh::input::setting;
 use crate::{Monitor, Result};
 use cover::{Bands, ROWS, Sample};
@@ -39,6 +40,8 @@ pub struct BakeConfig {
     pub gutter_px: u32,
     /// How far a sample may lie from the true surface: the simplification's error and half a cell.
     pub reach: f32,
+    /// Cameras that a sample is seen by at most: those that look at it most directly.
+    pub views: usize,
     /// Degree of the lobes, 1 or 2; 0 for none.
     pub lobes: u32,
     /// Also bake the field's normals.
@@ -104,7 +107,7 @@ const BATCH: usize = 1 << 17;
 /// let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]| vec![[0.5; 3]; directions.len()];
 /// let learned = Learned { gradient: &gradient, colors: &colors };
 /// let config =
-///     BakeConfig { side: 2, gutter_px: 2, reach: 0.5, lobes: 0, normals: false, turned: Mat3::IDENTITY };
+///     BakeConfig { side: 2, gutter_px: 2, reach: 0.5, views: 8, lobes: 0, normals: false, turned: Mat3::IDENTITY };
 /// let baked = bake(&mesh, &atlas, &learned, &[], &config, &tiface::Quiet)?;
 /// assert!(baked.color.data.iter().all(|v| (v - 0.2140).abs() < 1e-3)); // linear
 /// # Ok::<(), tiface::Error>(())
@@ -124,14 +127,14 @@ pub fn bake(
     let begin = Instant::now();
     setting((1..=8).contains(&config.side), "BakeConfig::side", "1..=8", config.side)?;
     let (width, height) = (atlas.width, atlas.height);
-    let functions = if config.lobes == 0 { 0 } else { lobes::count(config.lobes.min(2)) };
+    let count = if config.lobes == 0 { 0 } else { functions(config.lobes.min(2)) };
     let mut color = Image::new(width, height, 3);
-    let mut lobes = vec![Image::new(width, height, 3); functions];
+    let mut lobes = vec![Image::new(width, height, 3); count];
     let mut normal = config.normals.then(|| Image::new(width, height, 3));
     let mut covered = vec![false; width as usize * height as usize];
     let (mut samples, mut visible, mut views, mut moved) = (0, 0, 0, 0.0);
     let bvh = Bvh::new(mesh);
-    let eyes = Visibility { cameras, bvh: &bvh, clearance: 0.5 * config.reach };
+    let eyes = Visibility { cameras, bvh: &bvh, clearance: 0.5 * config.reach, most: config.views };
     let bands = Bands::new(atlas, ROWS);
     for band in 0..bands.len() {
         let all = bands.samples(atlas, band, config.side);
@@ -147,7 +150,7 @@ pub fn bake(
             }
             let ways = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
             moved += ways.sum::<f64>();
-            let shades = shade(&points, seen, learned, functions, config.turned);
+            let shades = shade(&points, seen, learned, count, config.turned);
             let mut i = 0;
             for texel in own.chunk_by(|a, b| a.texel == b.texel) {
                 let at = texel[0].texel as usize;
@@ -168,7 +171,7 @@ pub fn bake(
                 let put = |image: &mut Image, v: [f32; 3]| image.data[3 * at..3 * at + 3].copy_from_slice(&v);
                 put(&mut color, mean(&|s| shades.linear[s]));
                 for (k, image) in lobes.iter_mut().enumerate() {
-                    put(image, mean(&|s| shades.lobes[s * functions + k]));
+                    put(image, mean(&|s| shades.lobes[s * count + k]));
                 }
                 if let Some(image) = &mut normal {
                     let n = Vec3::from(mean(&|s| points.normals[s].to_array()));
@@ -179,11 +182,10 @@ pub fn bake(
         }
         monitor.step(band as u64 + 1, bands.len() as u64, &[("texels", samples as f64)]);
     }
-    fill::fill(&mut color, &covered, config.gutter_px);
-    lobes.iter_mut().for_each(|l| fill::fill(l, &covered, config.gutter_px));
     let seams = Seams::new(mesh, atlas);
+    fill::fill(&mut color, &covered, config.gutter_px);
     seams.even(&mut color, srgb_from_linear, linear_from_srgb);
-    lobes.iter_mut().for_each(|l| seams.even(l, |v| v, |v| v));
+    lobes.iter_mut().for_each(|l| complete(l, &covered, config.gutter_px, &seams));
     if let Some(normal) = &mut normal {
         fill::fill(normal, &covered, config.gutter_px);
     }
@@ -198,6 +200,37 @@ pub fn bake(
         seconds: begin.elapsed().as_secs_f64(),
     };
     Ok(Baked { color, lobes, normal, report })
+}
+
+/// Fills a picture of 3 channels between its charts, of which the `known` texels lie in one, and makes it agree along
+/// seams.
+pub fn complete(image: &mut Image, known: &[bool], gutter_px: u32, seams: &Seams) {
+    fill::fill(image, known, gutter_px);
+    seams.even(image, |v| v, |v| v);
+}
+
+/// Draws harmonics at the vertices of a mesh into the texels of its atlas: a picture a function, complete.
+pub fn bake_harmonics(mesh: &Mesh, atlas: &Atlas, harmonics: &Harmonics, gutter_px: u32) -> Vec<Image> {
+    let (width, height, count) = (atlas.width, atlas.height, harmonics.functions);
+    let mut pictures = vec![Image::new(width, height, 3); count];
+    let mut known = vec![false; width as usize * height as usize];
+    let bands = Bands::new(atlas, ROWS);
+    for sample in (0..bands.len()).flat_map(|band| bands.samples(atlas, band, 1)) {
+        let at = sample.texel as usize;
+        let weights = [1.0 - sample.u - sample.v, sample.u, sample.v];
+        known[at] = true;
+        for (k, picture) in pictures.iter_mut().enumerate() {
+            let mut sum = [0f32; 3];
+            for (&vertex, w) in mesh.triangles[sample.triangle as usize].iter().zip(weights) {
+                let own = harmonics.coefficients[vertex as usize * count + k];
+                (0..3).for_each(|c| sum[c] += w * own[c]);
+            }
+            picture.data[3 * at..3 * at + 3].copy_from_slice(&sum);
+        }
+    }
+    let seams = Seams::new(mesh, atlas);
+    pictures.iter_mut().for_each(|p| complete(p, &known, gutter_px, &seams));
+    pictures
 }
 
 /// Pieces of at most [`BATCH`] samples (or one texel) that end between texels.
@@ -283,7 +316,15 @@ mod tests {
     }
 
     fn config() -> BakeConfig {
-        BakeConfig { side: 2, gutter_px: 4, reach: 0.02, lobes: 0, normals: false, turned: Mat3::IDENTITY }
+        BakeConfig {
+            side: 2,
+            gutter_px: 4,
+            reach: 0.02,
+            views: usize::MAX,
+            lobes: 0,
+            normals: false,
+            turned: Mat3::IDENTITY,
+        }
     }
 
     #[test]
