@@ -219,13 +219,13 @@ fn what_cannot_be_blended_is_said_before_anything_is_learned() {
     };
     let (text, hint) = error(&|c| c.render.method = vec![Method::Volume]);
     assert_eq!(text, "`ensemble.members` names tface, which render.method does not make");
-    assert!(hint.contains("tiface render RUN --fresh render --with volume,tface"), "{hint}");
+    assert!(hint.contains("tiface render RUN --fresh render --with volume,tface,raycast"), "{hint}");
     let (text, hint) = error(&|c| c.capture.tiles = 0.0);
     assert_eq!(text, "`ensemble.weights` is empty, but there is nothing to fit them on: capture.tiles is 0");
     assert!(hint.contains("capture.tiles=0.04"), "{hint}");
-    let (text, _) = error(&|c| c.ensemble.weights = vec![0.1, 0.6, 0.3]);
-    assert_eq!(text, "`ensemble.weights` has 3 weights for 2 members");
-    let (text, hint) = error(&|c| c.ensemble.weights = vec![1.0, 3.0]);
+    let (text, _) = error(&|c| c.ensemble.weights = vec![0.4, 0.6]);
+    assert_eq!(text, "`ensemble.weights` has 2 weights for 3 members");
+    let (text, hint) = error(&|c| c.ensemble.weights = vec![1.0, 3.0, 0.0]);
     assert_eq!(text, "`ensemble.weights` sum to 4, expected 1");
     assert!(hint.contains("0.2500, 0.7500"), "{hint}");
     let (text, _) = error(&|c| c.render.float = false);
