@@ -9,19 +9,15 @@ use super::scene::Scene;
 use crate::geom::{Aabb, Camera};
 use glam::{DVec3, Vec3};
 
-/// Share of the cameras whose frame a slab's median cell must be in: the share of the masks that draws the
-/// scene's box. On `lps` a fifth kept 10 cm of shoulders that were off by 2 cm.
-const SHARE: f64 = 1.0 / 3.0;
-
 /// The part of the scene's box, in scene coordinates, whose outermost slabs of hull cells are, in the
-/// median, inside the frames of a third of the cameras (three at least). `cameras` are in the world; only the
-/// face that looks most downward moves (`up` is a world direction): frames cut heads below, and a body whose
-/// shoulders end in walls left and right looks like a box.
+/// median, inside the frames of a `share` of the cameras, 0..=1 (three at least). `cameras` are in the world;
+/// only the face that looks most downward moves (`up` is a world direction): frames cut heads below, and a body
+/// whose shoulders end in walls left and right looks like a box.
 ///
 /// Without a hull, and where every slab is seen, the whole box.
-pub fn well_seen(scene: &Scene, cameras: &[Camera], up: Vec3) -> Aabb {
+pub fn well_seen(scene: &Scene, cameras: &[Camera], up: Vec3, share: f64) -> Aabb {
     let Some(hull) = &scene.hull else { return scene.aabb };
-    let least = ((SHARE * cameras.len() as f64).ceil() as usize).max(3).min(cameras.len());
+    let least = ((share * cameras.len() as f64).ceil() as usize).max(3).min(cameras.len());
     let projectors: Vec<Projector> = cameras.iter().map(Projector::new).collect();
     let world_from_scene = scene.scene_from_world.inverse();
     let r = hull.resolution;
@@ -105,14 +101,25 @@ mod tests {
         // half the frame at distance 3, the nearest: 50 / 200 · 3 = 0.75; at 4: 1.0; median cells are in
         let wide: Vec<Camera> =
             cameras(0.0).into_iter().map(|c| Camera { fx: 80.0, fy: 80.0, ..c }).collect();
-        assert_eq!(well_seen(&scene(), &wide, Vec3::Y), Aabb::SCENE);
+        assert_eq!(well_seen(&scene(), &wide, Vec3::Y, 1.0 / 3.0), Aabb::SCENE);
     }
 
     #[test]
     fn a_body_that_the_frames_cut_below_ends_where_they_end() {
         // one unit up: the frame reaches from about 0 to 2 on the axis, so the lower half is not seen
-        let part = well_seen(&scene(), &cameras(1.0), Vec3::Y);
+        let part = well_seen(&scene(), &cameras(1.0), Vec3::Y, 1.0 / 3.0);
         assert_eq!((part.max, part.min.x, part.min.z), (Vec3::ONE, -1.0, -1.0));
         assert!(part.min.y > -0.3 && part.min.y < 0.3, "{part:?}");
+    }
+
+    #[test]
+    fn fewer_cameras_keep_more_of_a_body() {
+        // five cameras look one unit higher than the other three, whose frames reach farther down
+        let split: Vec<Camera> =
+            cameras(1.5).into_iter().take(5).chain(cameras(0.5).into_iter().skip(5)).collect();
+        let low = |share: f64| well_seen(&scene(), &split, Vec3::Y, share).min.y;
+        // three of eight are the least of either share; more than half are those that look higher
+        assert_eq!(low(0.25), low(0.375));
+        assert!(low(0.25) + 0.5 < low(0.6), "{} {}", low(0.25), low(0.6));
     }
 }

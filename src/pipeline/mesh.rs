@@ -140,7 +140,7 @@ fn extract(
         field.color(points, normals, &directions)
     };
     // below the frames' border the surface is a guess: close the mesh where enough cameras look
-    let kept = capture::well_seen(scene, cameras, up);
+    let kept = capture::well_seen(scene, cameras, up, c.seen_by);
     let (sdf, gradient) = (|p: &[Vec3]| field.sdf(p), |p: &[Vec3]| field.sdf_gradient(p));
     mesh::extract(sdf, gradient, color, kept, inside_hull, &config, dir.monitor())
 }
