@@ -3,12 +3,13 @@
 use super::options::Common;
 use super::plain::one_line;
 use super::stdout::print;
-use crate::capture::{self, CaptureOptions, Split};
+use crate::capture::{self, CaptureOptions, Split, View};
 use crate::geom::{Bvh, Camera};
 use crate::io::{self, Limits};
 use crate::mesh::files::{CheckReport, UvReport, check_around, uv_check};
 use crate::mesh::files::{PictureSource, ReadMesh, ReadOptions, picture_of_mtl, read_with, weld};
-use crate::metrics::distance::{Distances, one_way, seen_one_way};
+use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
+use crate::metrics::{Masks, Tones};
 use crate::{Error, ErrorKind, Result};
 use serde::Serialize;
 use std::fmt::{self, Display};
@@ -31,6 +32,18 @@ struct Against {
     by_views: Vec<ByViews>,
     /// From the other surface to the mesh: what is missed.
     back: Millimetres,
+    /// ... and back from its skin and its hair where three or more training cameras look, with the signed median
+    /// (negative where the mesh is inside), where the photographs tell them apart.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    parts: Vec<Part>,
+}
+
+#[derive(Serialize)]
+struct Part {
+    part: &'static str,
+    signed_median: f64,
+    #[serde(flatten)]
+    distance: Millimetres,
 }
 
 /// The parts of a surface by how many cameras see them.
@@ -76,7 +89,11 @@ impl Display for Against {
         for ByViews { views, share, distance } in &self.by_views {
             writeln!(f, "  seen by {views:<9}     {distance} ({:.0} %)", 100.0 * share)?;
         }
-        writeln!(f, "distance back           {}", self.back)
+        writeln!(f, "distance back           {}", self.back)?;
+        for Part { part, signed_median, distance } in &self.parts {
+            writeln!(f, "  {part}, 3 cameras look  {distance}, signed median {signed_median:+.3} mm")?;
+        }
+        Ok(())
     }
 }
 
@@ -176,16 +193,42 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     let mm = |d| Millimetres::new(d, unit_m);
     let whole = one_way(mesh, &bvh, POINTS).ok_or_else(|| empty(other))?;
     let back = one_way(&truth, &Bvh::new(mesh), POINTS).ok_or_else(|| empty(other))?;
-    let (mut seen, mut by_views) = (None, Vec::new());
+    let (mut seen, mut by_views, mut parts) = (None, Vec::new(), Vec::new());
     if let Some(root) = seen_by {
         let capture = capture::open(root, &CaptureOptions::default())?;
         let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
-        let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| moved(&v.camera)).collect();
+        let views: Vec<&View> = capture.split(Split::Train).collect();
+        let cameras: Vec<Camera> = views.iter().map(|v| moved(&v.camera)).collect();
         let ranges: Vec<_> = [3..=u32::MAX].into_iter().chain(VIEWS.map(|(_, range)| range)).collect();
-        let mut parts = seen_one_way(mesh, &bvh, POINTS, &cameras, &ranges).into_iter();
-        seen = parts.next().flatten().map(|(d, share)| (mm(d), share));
-        let named = parts.zip(VIEWS).filter_map(|(part, (views, _))| Some((part?, views)));
+        let mut found = seen_one_way(mesh, &bvh, POINTS, &cameras, &ranges).into_iter();
+        seen = found.next().flatten().map(|(d, share)| (mm(d), share));
+        let named = found.zip(VIEWS).filter_map(|(part, (views, _))| Some((part?, views)));
         by_views = named.map(|((d, share), views)| ByViews { views, share, distance: mm(d) }).collect();
+        let kinds = skin_and_hair(&views)?;
+        if !kinds.is_empty() {
+            let kind = |i: usize, [x, y]: [u32; 2]| {
+                kinds[i].get(y as usize * cameras[i].width as usize + x as usize).copied().flatten()
+            };
+            let found = kinds_one_way(&truth, &Bvh::new(mesh), POINTS, &cameras, kind);
+            let named = found.into_iter().zip(["skin", "hair"]).filter_map(|(d, part)| Some((d?, part)));
+            let part =
+                |((d, signed), part)| Part { part, signed_median: 1e3 * unit_m * signed, distance: mm(d) };
+            parts = named.map(part).collect();
+        }
     }
-    Ok(Against { whole: mm(whole), seen, by_views, back: mm(back) })
+    Ok(Against { whole: mm(whole), seen, by_views, back: mm(back), parts })
+}
+
+/// Skin and hair of each photograph, row by row: 0, 1, or neither. Empty where they are not told apart.
+fn skin_and_hair(views: &[&View]) -> Result<Vec<Vec<Option<usize>>>> {
+    // photographs are read only where they can say something
+    let able = views.iter().any(|v| v.region.is_some());
+    let Some(tones) = able.then(|| Tones::of(views)).transpose()?.flatten() else { return Ok(Vec::new()) };
+    let kinds = |view: &&View| -> Result<Vec<Option<usize>>> {
+        let loaded = view.load(&Limits::default())?;
+        let split = Masks::of(&loaded).and_then(|masks| tones.split(&loaded.photo, masks));
+        let kind = |(skin, hair): (&bool, &bool)| skin.then_some(0).or(hair.then_some(1));
+        Ok(split.map_or(Vec::new(), |(skin, hair)| skin.iter().zip(&hair).map(kind).collect()))
+    };
+    views.iter().map(kinds).collect()
 }

@@ -297,7 +297,8 @@ learned from (capture.tiles): the blend follows the better member.")]
         /// Also the distance to this surface, in the same coordinates (so a PLY: a GLB is turned +Y up)
         #[arg(long, value_name = "MESH")]
         against: Option<PathBuf>,
-        /// ... and the distance over the part that three or more of this capture's training cameras see
+        /// ... and the distance over the part that three or more of this capture's training cameras see, by how many
+        /// see it, and back from skin and hair
         #[arg(long, value_name = "CAPTURE", requires = "against")]
         seen_by: Option<PathBuf>,
     },

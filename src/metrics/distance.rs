@@ -80,31 +80,89 @@ pub fn sample_triangles(mesh: &Mesh, count: usize) -> Vec<(Vec3, u32)> {
 /// limit of texture baking too): flatter views tell little.
 const LEAST_COSINE: f32 = 0.26;
 
-/// How many cameras see each point of a mesh: inside the frame, not steeper than 75°, nothing in between.
+/// How many cameras see a point, and what they take it for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sight {
+    /// So many cameras see it: inside the frame, not steeper than 75°, nothing in between.
+    pub cameras: u32,
+    /// So many of those take it for the first kind, and for the second.
+    pub kinds: [u32; 2],
+}
+
+impl Sight {
+    /// Three or more cameras see the point, and more than half of them take it for this kind.
+    pub fn is(&self, kind: usize) -> bool {
+        self.cameras >= 3 && 2 * self.kinds[kind] > self.cameras
+    }
+}
+
+/// Returns what the cameras see of points of a mesh; `kind` says what a camera (its index) has at a pixel (column,
+/// row), 0 or 1, if it is either.
 ///
-/// Where fewer than three do (a cap below the frames' border, the inside of a nostril, the underside of a
+/// Where fewer than three cameras look (a cap below the frames' border, the inside of a nostril, the underside of a
 /// bust) photographs do not determine the surface, and its distance to the truth says nothing about a method.
-pub fn seen_by(mesh: &Mesh, bvh: &Bvh, cameras: &[Camera], points: &[(Vec3, u32)]) -> Vec<u32> {
+pub fn sights(
+    mesh: &Mesh,
+    bvh: &Bvh,
+    cameras: &[Camera],
+    points: &[(Vec3, u32)],
+    kind: impl Fn(usize, [u32; 2]) -> Option<usize> + Sync,
+) -> Vec<Sight> {
     let lift = 1e-4 * mesh.bounds().size().max_element();
-    let sees = |camera: &Camera, p: Vec3, normal: Vec3| {
-        let inside = camera.project(p).is_some_and(|(q, _)| {
-            q.x >= 0.0 && q.y >= 0.0 && q.x <= camera.width as f32 && q.y <= camera.height as f32
-        });
+    let pixel = |camera: &Camera, p: Vec3, normal: Vec3| {
+        let (q, _) = camera.project(p)?;
+        let inside = q.x >= 0.0 && q.y >= 0.0 && q.x <= camera.width as f32 && q.y <= camera.height as f32;
         let way = camera.position.as_vec3() - p;
         let distance = way.length();
         let direction = way / distance;
-        inside
+        let sees = inside
             && direction.dot(normal) > LEAST_COSINE
-            && !bvh.any_hit(&Ray { origin: p + lift * normal, direction, t_min: 0.0, t_max: distance })
+            && !bvh.any_hit(&Ray { origin: p + lift * normal, direction, t_min: 0.0, t_max: distance });
+        let last = [camera.width, camera.height].map(|n| n.saturating_sub(1));
+        sees.then(|| [(q.x as u32).min(last[0]), (q.y as u32).min(last[1])])
     };
-    points
-        .par_iter()
-        .map(|&(p, t)| {
-            let [a, b, c] = mesh.corners(t);
-            let normal = (b - a).cross(c - a).normalize_or_zero();
-            cameras.iter().filter(|camera| sees(camera, p, normal)).count() as u32
-        })
-        .collect()
+    let sight = |&(p, t): &(Vec3, u32)| {
+        let mut sight = Sight::default();
+        for (i, camera) in cameras.iter().enumerate() {
+            let Some(pixel) = pixel(camera, p, normal(mesh, t)) else { continue };
+            sight.cameras += 1;
+            if let Some(kind) = kind(i, pixel) {
+                sight.kinds[kind] += 1;
+            }
+        }
+        sight
+    };
+    points.par_iter().map(sight).collect()
+}
+
+fn normal(mesh: &Mesh, triangle: u32) -> Vec3 {
+    let [a, b, c] = mesh.corners(triangle);
+    (b - a).cross(c - a).normalize_or_zero()
+}
+
+/// Distances from `from` to `to` over the parts that the cameras take for either kind ([`Sight::is`]), with the
+/// median of the signed ones: positive where `to` is outside. `None` for a part that is empty.
+pub fn kinds_one_way(
+    from: &Mesh,
+    to: &Bvh,
+    samples: usize,
+    cameras: &[Camera],
+    kind: impl Fn(usize, [u32; 2]) -> Option<usize> + Sync,
+) -> [Option<(Distances, f64)>; 2] {
+    let points = sample_triangles(from, samples);
+    let sights = sights(from, &Bvh::new(from), cameras, &points, kind);
+    [0, 1].map(|kind| {
+        let part: Vec<(Vec3, u32)> =
+            points.iter().zip(&sights).filter(|(_, s)| s.is(kind)).map(|(p, _)| *p).collect();
+        let signed = |&(p, t): &(Vec3, u32)| {
+            let closest = to.closest_point(p)?;
+            Some(closest.distance.copysign((closest.point - p).dot(normal(from, t))))
+        };
+        let mut signed: Vec<f32> = part.par_iter().filter_map(signed).collect();
+        signed.par_sort_unstable_by(f32::total_cmp);
+        let median = *signed.get(signed.len().div_ceil(2).checked_sub(1)?)? as f64;
+        Some((distances(part.into_iter().map(|(p, _)| p).collect(), to)?, median))
+    })
 }
 
 /// Distances from `from` to `to` over the parts that so many cameras see, and each part's share of the area, in
@@ -117,9 +175,9 @@ pub fn seen_one_way(
     views: &[RangeInclusive<u32>],
 ) -> Vec<Option<(Distances, f64)>> {
     let points = sample_triangles(from, samples);
-    let seen = seen_by(from, &Bvh::new(from), cameras, &points);
+    let seen = sights(from, &Bvh::new(from), cameras, &points, |_, _| None);
     let part = |range: &RangeInclusive<u32>| {
-        let kept = points.iter().zip(&seen).filter(|(_, seen)| range.contains(seen));
+        let kept = points.iter().zip(&seen).filter(|(_, seen)| range.contains(&seen.cameras));
         let kept: Vec<Vec3> = kept.map(|((p, _), _)| *p).collect();
         let share = kept.len() as f64 / points.len().max(1) as f64;
         Some((distances(kept, to)?, share))
@@ -212,5 +270,31 @@ mod tests {
         let (hidden, rest) = parts[1].unwrap();
         assert!((rest - 2.0 / 6.0).abs() < 0.01 && hidden.mean < 0.01, "{hidden:?}");
         assert!(parts[2].is_none());
+    }
+
+    #[test]
+    fn a_part_is_what_most_of_three_cameras_take_it_for() {
+        // four cameras above the middle: all call the left half the first kind; of the right half two say the second,
+        // which is no majority, but beyond x = 1.5 three do
+        let camera =
+            |x: f64| Camera { position: DVec3::new(x, 0.5, 100.0), ..Camera::above(100, 100, 4000.0, 0.0) };
+        let cameras = [0.8, 0.9, 1.1, 1.2].map(camera);
+        let x = |i: usize, [column, _]: [u32; 2]| {
+            // 4000 / 100 = 40 pixels a unit around column 50
+            cameras[i].position.x + (column as f64 + 0.5 - 50.0) / 40.0
+        };
+        let kind = |i: usize, pixel: [u32; 2]| match x(i, pixel) {
+            x if x < 1.0 => Some(0),
+            x if i < 2 || (i < 3 && x > 1.5) => Some(1),
+            _ => None,
+        };
+        let [left, right] = kinds_one_way(&sheet(0.0), &Bvh::new(&sheet(-0.25)), 20_000, &cameras, kind);
+        let ((left, below), (right, _)) = (left.unwrap(), right.unwrap());
+        assert!((left.samples as f64 / 20_000.0 - 0.5).abs() < 0.02, "{left:?}");
+        assert!((right.samples as f64 / 20_000.0 - 0.25).abs() < 0.02, "{right:?}");
+        // the other sheet is inside, a quarter below
+        assert_eq!((left.median, below), (0.25, -0.25));
+        let two = kinds_one_way(&sheet(0.0), &Bvh::new(&sheet(-0.25)), 100, &cameras[..2], kind);
+        assert_eq!(two, [None, None]);
     }
 }

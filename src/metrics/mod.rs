@@ -23,7 +23,7 @@ mod parts;
 mod psnr;
 mod ssim;
 
-pub use parts::{Masks, PartMetrics, ToneSamples, Tones, parts};
+pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr::psnr;
 pub use ssim::{ssim_reflect_map, ssim_valid};
 

@@ -11,7 +11,11 @@
 //! every covered pixel would reach over the mask.
 
 use super::{INSIDE, picture, rounded};
+use crate::Result;
+use crate::capture::{LoadedView, View};
 use crate::image::{Gray, Image, Photo};
+use crate::io::Limits;
+use rayon::prelude::*;
 use serde::Serialize;
 
 /// Half of the band around the mask's contour, pixels.
@@ -29,6 +33,12 @@ pub struct Masks<'a> {
 }
 
 impl Masks<'_> {
+    /// Those of a view; `None` without a mask of the head.
+    pub fn of(view: &LoadedView) -> Option<Masks<'_>> {
+        let (valid, region) = (view.valid.as_ref(), view.region.as_ref());
+        view.mask.as_ref().map(|mask| Masks { mask, valid, region })
+    }
+
     fn is_valid(&self, i: usize) -> bool {
         self.valid.is_none_or(|v| v.values[i] >= INSIDE)
     }
@@ -179,11 +189,11 @@ struct Tone {
 
 /// How often each value of each channel occurs in the samples of skin, and of hair.
 #[derive(Clone)]
-pub struct ToneSamples([[[u64; 256]; 3]; 2]);
+struct ToneSamples([[[u64; 256]; 3]; 2]);
 
 impl ToneSamples {
     /// Collects those of one photograph (not cut out); `None` without a region of interest.
-    pub fn of(photo: &Photo, masks: Masks) -> Option<ToneSamples> {
+    fn of(photo: &Photo, masks: Masks) -> Option<ToneSamples> {
         let (region, width) = (masks.region?, masks.mask.width as usize);
         let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
         let rest: Vec<bool> = head.iter().map(|h| !h).collect();
@@ -205,14 +215,14 @@ impl ToneSamples {
     }
 
     /// Those of two photographs together.
-    pub fn and(mut self, other: &ToneSamples) -> ToneSamples {
+    fn and(mut self, other: &ToneSamples) -> ToneSamples {
         let counts = self.0.as_flattened_mut().as_flattened_mut();
         counts.iter_mut().zip(other.0.as_flattened().as_flattened()).for_each(|(a, b)| *a += b);
         self
     }
 
     /// Returns the two kinds, if these samples tell them apart.
-    pub fn tones(&self) -> Option<Tones> {
+    fn tones(&self) -> Option<Tones> {
         let [skin, hair] = [0, 1].map(|kind| self.0[kind][0].iter().sum::<u64>());
         if (skin.min(hair) as f64) <= LEAST_SHARE * (skin + hair) as f64 {
             return None;
@@ -252,8 +262,19 @@ fn median(counts: &[u64; 256]) -> usize {
 }
 
 impl Tones {
-    /// Returns skin and hair of one photograph, of which opaque pixels keep their colors; `None` without a region.
-    fn split(&self, photo: &Photo, masks: Masks) -> Option<(Vec<bool>, Vec<bool>)> {
+    /// Learns them from photographs; `None` where those do not tell skin and hair apart.
+    pub fn of(views: &[&View]) -> Result<Option<Tones>> {
+        let samples = |view: &&View| -> Result<Option<ToneSamples>> {
+            let loaded = view.load(&Limits::default())?;
+            Ok(Masks::of(&loaded).and_then(|masks| ToneSamples::of(&loaded.photo, masks)))
+        };
+        let found = views.par_iter().map(samples).collect::<Result<Vec<_>>>()?;
+        let sum = found.into_iter().flatten().reduce(|a, b| a.and(&b));
+        Ok(sum.and_then(|s| s.tones()))
+    }
+
+    /// Returns skin and hair of one photograph, in whole or cut out; `None` without a region.
+    pub fn split(&self, photo: &Photo, masks: Masks) -> Option<(Vec<bool>, Vec<bool>)> {
         let region = masks.region?;
         let fringe = near(&soft_rim(masks.mask), masks.mask.width as usize, 1);
         let dark = |i: usize| self.hair.distance(photo.rgb[i]) < self.skin.distance(photo.rgb[i]);

@@ -8,7 +8,7 @@ use crate::capture::{LoadedView, View};
 use crate::config::{RenderConfig, Stage, ViewBackground};
 use crate::image::Gray;
 use crate::io::{self, Limits};
-use crate::metrics::{Masks, Metrics, PartMetrics, ToneSamples, Tones, ViewMetrics, compare, parts};
+use crate::metrics::{Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, parts};
 use crate::run::StageDir;
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -73,7 +73,10 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     let mut out = Map::new();
     let sets = picture_sets(line);
     let judged: Vec<Vec<Comparable>> = sets.iter().map(|set| comparable(line, set)).collect();
-    let tones = tones(&judged)?;
+    let mut views: Vec<&View> = judged.iter().flatten().map(|c| c.view).collect();
+    views.sort_by_key(|v| &v.name);
+    views.dedup_by_key(|v| &v.name);
+    let tones = Tones::of(&views)?;
     for (i, (set, pictures)) in sets.iter().zip(&judged).enumerate() {
         let figures = pictures.par_iter().map(|p| figures(p, &line.config.render, tones.as_ref()));
         let figures = figures.collect::<Result<Vec<_>>>()?;
@@ -98,25 +101,6 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     Ok(means(&value))
 }
 
-/// What skin and hair look like in the photographs that any set has a picture of.
-fn tones(judged: &[Vec<Comparable>]) -> Result<Option<Tones>> {
-    let mut views: Vec<&View> = judged.iter().flatten().map(|c| c.view).collect();
-    views.sort_by_key(|v| &v.name);
-    views.dedup_by_key(|v| &v.name);
-    let samples = |view: &&View| -> Result<Option<ToneSamples>> {
-        let loaded = view.load(&Limits::default())?;
-        Ok(masks(&loaded).and_then(|m| ToneSamples::of(&loaded.photo, m)))
-    };
-    let found = views.par_iter().map(samples).collect::<Result<Vec<_>>>()?;
-    let sum = found.into_iter().flatten().reduce(|a, b| a.and(&b));
-    Ok(sum.and_then(|s| s.tones()))
-}
-
-fn masks(loaded: &LoadedView) -> Option<Masks<'_>> {
-    let (valid, region) = (loaded.valid.as_ref(), loaded.region.as_ref());
-    loaded.mask.as_ref().map(|mask| Masks { mask, valid, region })
-}
-
 fn figures(picture: &Comparable, config: &RenderConfig, tones: Option<&Tones>) -> Result<ViewFigures> {
     let background = config.background;
     let loaded = picture.view.load(&Limits::default())?;
@@ -134,7 +118,7 @@ fn figures(picture: &Comparable, config: &RenderConfig, tones: Option<&Tones>) -
     let open = before.as_ref().or((background == ViewBackground::None).then_some(&render));
     let opacity = open.map(|image| image.channel(3));
     let behind = pictures::behind(background).unwrap_or([0.0; 3]);
-    let parts = masks(&loaded).map(|m| parts(&render, &photo, m, opacity.as_deref(), behind, tones));
+    let parts = Masks::of(&loaded).map(|m| parts(&render, &photo, m, opacity.as_deref(), behind, tones));
     let parts = parts.unwrap_or_default();
     let outside = opacity.and_then(|opacity| square_opacity_outside(&opacity, &loaded));
     Ok(ViewFigures { head, region, parts, outside })

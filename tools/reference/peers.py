@@ -159,9 +159,12 @@ class Tones:
         apart = abs(tones.median[0] - tones.median[1]) > 2 * (tones.deviation[0] + tones.deviation[1])
         return tones if apart.any() else None
 
-    def is_hair(self, color):
-        skin, hair = [(abs(color - m) / d).sum(-1) for m, d in zip(self.median, self.deviation)]
-        return hair < skin
+    def split(self, view):
+        """Skin and hair of a view with a region; hair has its soft rim."""
+        skin, hair = [(abs(view.color - m) / d).sum(-1) for m, d in zip(self.median, self.deviation)]
+        region, opaque = view.region >= INSIDE, view.mask == 255
+        rim = ~opaque & near(soft_rim(view.mask), 1)
+        return region & opaque & ~(hair < skin), region & (opaque & (hair < skin) | rim)
 
 
 # surfaces
@@ -282,10 +285,7 @@ def pictures(surface, test, tones):
             row["opaque"] = psnr(square, v.mask == 255)
             row["edge"] = psnr(square, near(head, EDGE_PX) & near(~head, EDGE_PX))
             if tones and v.region is not None:
-                region, opaque, hair = v.region >= INSIDE, v.mask == 255, tones.is_hair(v.color)
-                rim = ~opaque & near(soft_rim(v.mask), 1)
-                row["skin"] = psnr(square, region & opaque & ~hair)
-                row["hair"] = psnr(square, region & (opaque & hair | rim))
+                row["skin"], row["hair"] = [psnr(square, part) for part in tones.split(v)]
         rows.append(row)
     mean = {}
     for key in rows[0]:
@@ -301,17 +301,18 @@ class Truth:
         self.surface = Surface(path)
         self.points, self.normals = self.surface.sample()
         self.seen = numpy.zeros(POINTS, int)
-        votes = numpy.zeros((2, POINTS))  # skin, hair
+        regions = all(v.region is not None for v in train)
+        names = ["skin", "hair"] if tones else ["region"] if regions else []
+        votes = {name: numpy.zeros(POINTS) for name in names}
         for v in train:
             i, y, x = self.surface.seen_by(v, self.points, self.normals)
             self.seen[i] += 1
-            if tones and v.region is not None:
-                known = (v.region[y, x] >= INSIDE) & (v.mask[y, x] == 255)
-                hair = tones.is_hair(v.color[y, x])
-                votes[0, i[known & ~hair]] += 1
-                votes[1, i[known & hair]] += 1
+            if v.region is not None:
+                parts = tones.split(v) if tones else [v.region >= INSIDE]
+                for name, part in zip(names, parts):
+                    votes[name][i] += part[y, x]
         # of the views that see a point, more than half have to agree
-        self.skin, self.hair = [(self.seen >= 3) & (vote > self.seen / 2) for vote in votes]
+        self.parts = {name: (self.seen >= 3) & (vote > self.seen / 2) for name, vote in votes.items()}
 
     def distances(self, surface, train):
         """In thousandths of the capture's unit: millimetres of a capture in metres."""
@@ -329,7 +330,7 @@ class Truth:
             return numpy.median(values[which]) if which.any() else numpy.nan
 
         out = {"mean": numpy.mean(there), "median": numpy.median(there)}
-        for name, which in (("skin", self.skin), ("hair", self.hair)):
+        for name, which in self.parts.items():
             out[name], out[name + "_signed"] = median(back, which), median(signed, which)
         by = (self.seen == 1, self.seen == 2, (self.seen == 3) | (self.seen == 4), self.seen >= 5)
         out["by_views"] = [median(back, which) for which in by]
@@ -376,7 +377,7 @@ def main():
         if truth:
             d = truth.distances(surface, train)
             row.append(("3 cameras, mean / median", f"{text(d, 'mean')} / {text(d, 'median')}"))
-            for kind in ("skin", "hair") if tones else ():
+            for kind in truth.parts:
                 row.append((f"{kind} (signed)", f"{text(d, kind)} ({text(d, kind + '_signed', sign=True)})"))
             by = [format(v, ".2f") if numpy.isfinite(v) else "–" for v in d["by_views"]]
             seen.append([("seen by", name), *zip(("1", "2", "3 or 4", "5 or more"), by)])
