@@ -9,9 +9,9 @@
 //!
 //! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before the fit, `W` the
 //! shares of the nodes under the pixel's rays (visibility and footprint in one), `Y_k` real spherical harmonics of the
-//! direction to the viewer and `∇` the difference between neighboring nodes. `D` is the cosine between view and surface
-//! where the head alone fills the pixel, by the mask and by all rays, and else 0: what is behind the head never
-//! bleeds in. All values are sRGB-coded, as the metrics are.
+//! direction to the viewer and `∇` the difference between neighboring nodes. `D` is the root of the cosine between view
+//! and surface where the head alone fills the pixel, by the mask and by all rays, and else 0: what is behind the head
+//! never bleeds in. All values are sRGB-coded, as the metrics are.
 //!
 //! It is solved twice. The diffuse color (one function) has the finest nodes there are, and is what every viewer
 //! shows. What depends on the view is smooth over the surface, so that the vertices carry it, as a difference to the
@@ -45,12 +45,12 @@ const LEFT_OUT: u32 = 6;
 const MOST_GAIN: f32 = 1.25;
 
 /// Smoothness of the diffuse color over texels.
-const TEXELS: Smoothness = Smoothness { constant: 0.3, others: 0.0, ridge: 0.0 };
+const TEXELS: Smoothness = Smoothness { constant: 0.25, others: 0.0, ridge: 0.0 };
 
 /// Candidates for the smoothness of what depends on the view, over vertices: skin wants the first, hair the second.
 const VERTICES: [Smoothness; 2] = [
-    Smoothness { constant: 0.004, others: 0.01, ridge: 4e-5 },
-    Smoothness { constant: 0.04, others: 0.1, ridge: 4e-4 },
+    Smoothness { constant: 0.02, others: 0.05, ridge: 8e-6 },
+    Smoothness { constant: 0.25, others: 0.75, ridge: 1e-4 },
 ];
 
 /// Fitted colors.

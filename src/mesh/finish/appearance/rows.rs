@@ -45,7 +45,7 @@ pub struct Rows {
     pub photo: Vec<[f32; 3]>,
     /// Unit directions to the viewer, turned to the coordinates of the harmonics.
     pub directions: Vec<Vec3>,
-    /// How much a row counts, 0..=1: the cosine between view and surface.
+    /// How much a row counts, 0..=1: the root of the cosine between view and surface.
     pub weight: Vec<f32>,
     /// Photograph of each row.
     pub view: Vec<u32>,
@@ -116,7 +116,7 @@ impl Rows {
             };
             self.photo.push(photo.rgb[at].map(|b| f32::from(b) / 255.0));
             self.directions.push(turned * -ray.direction);
-            self.weight.push(cosine.clamp(0.0, 1.0));
+            self.weight.push(cosine.clamp(0.0, 1.0).sqrt());
             self.view.push(v);
         }
     }

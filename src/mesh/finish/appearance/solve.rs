@@ -12,15 +12,17 @@ const TOLERANCE: f64 = 1e-8;
 /// The most steps of conjugate gradients.
 const STEPS: usize = 30;
 
-/// Weights of what keeps a fit smooth: of squares of differences between neighboring nodes and of the values
-/// themselves, against one pixel. They are multiplied by the pixels that there are a node.
+/// Weights of what keeps a fit smooth, against the square of one pixel's error.
+///
+/// On a surface the sum of squared differences is the same however fine the nodes are: its weight says how many pixels
+/// there are, on average, in the area over which a fit is smoothed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Smoothness {
-    /// Differences of constant terms.
+    /// Squares of differences between neighbors, of constant terms.
     pub constant: f32,
-    /// Differences of all other terms.
+    /// The same of all other terms.
     pub others: f32,
-    /// Squares of all other terms.
+    /// Squares of all other terms themselves, for each pixel there is a node on average.
     pub ridge: f32,
 }
 
@@ -84,8 +86,8 @@ impl System<'_> {
             weight: &weight,
             harmonics,
             count,
-            constant: [per_node * constant, 0.0],
-            others: [per_node * others, per_node * ridge],
+            constant: [constant, 0.0],
+            others: [others, per_node * ridge],
         };
         let right: Vec<[f32; 3]> = target.iter().zip(&weight).map(|(t, w)| t.map(|t| w * t)).collect();
         let mut residual = vec![0f64; self.nodes.len() * count * 3];
