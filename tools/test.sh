@@ -108,7 +108,8 @@ readers_agree() {
 
 train_demo() {
   "$target/release/tiface" demo --run "$scratch/demo" --preset draft --set iface.steps=600 \
-    --set tface.steps=400 --set baseline.steps=200 --set mesh.resolution=128 --set mesh.format=glb,obj,ply
+    --set tface.steps=400 --set baseline.steps=200 --set mesh.resolution=128 --set mesh.format=glb,obj,ply \
+    --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured
 }
 
 step "independent readers are here" readers
@@ -132,7 +133,7 @@ browser=yes
 printf '\n== a browser is here\n'
 if ! browser_is_here; then
   browser=no
-  results+=("SKIPPED the page to click on: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it")
+  results+=("SKIPPED the page to click on, and lobes in three.js: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it")
 fi
 mkdir -p "$scratch/click"
 step "the page to click on is written" example click_page "$scratch/click/page.html"
@@ -152,6 +153,12 @@ if [ $demo = yes ]; then
   step "the demo head is reconstructed" train_demo
   readers_agree "the demo head" "$scratch/demo/mesh/head.glb" --up 0 0 1
   step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$scratch/demo/mesh/head.glb"
+  if [ $browser = yes ]; then
+    step "three.js shows its lobes" node tools/readers/check_lobes.mjs "$scratch/demo"
+  fi
+  if [ $blender = yes ]; then
+    step "Blender shows its lobes" .venv-blender/bin/python tools/readers/check_lobes.py "$scratch/demo"
+  fi
 else
   results+=("SKIPPED the demo head, as asked by --no-demo")
 fi

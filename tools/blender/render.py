@@ -1,7 +1,7 @@
 """Renders a GLB with Blender, without a window, from a given camera: to lay beside a photograph.
 
     python3.11 -m venv .venv-blender && .venv-blender/bin/pip install -r tools/readers/requirements-blender.txt
-    .venv-blender/bin/python tools/blender/render.py head.glb camera.json out.png [--samples 16]
+    .venv-blender/bin/python tools/blender/render.py head.glb camera.json out.png [--samples 16] [--lobes]
 
 camera.json, lengths in metres and pixels:
 
@@ -12,8 +12,9 @@ The world is that of the GLB (glTF: +Y up). The camera's axes are OpenGL's: +X r
 along -Z. `fl_y` defaults to `fl_x`, the principal point to the middle. Lens distortion is not rendered:
 undistort the photograph.
 
-Colors come out as they are stored: every surface emits its base color, and the picture is written in
-sRGB without tone mapping, straight alpha, transparent where nothing is. Cycles on the CPU.
+Colors come out as they are stored: every surface emits its base color, with `--lobes` that of the view
+(tools/blender/lobes.py), and the picture is written in sRGB without tone mapping, straight alpha, transparent where
+nothing is. Cycles on the CPU.
 """
 
 import argparse
@@ -23,6 +24,8 @@ import sys
 
 import bpy
 import mathutils
+
+from lobes import add_lobes
 
 BLENDER_FROM_GLTF = mathutils.Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 
@@ -79,12 +82,17 @@ def main():
     arguments.add_argument("camera", type=pathlib.Path)
     arguments.add_argument("out", type=pathlib.Path)
     arguments.add_argument("--samples", type=int, default=16)
+    arguments.add_argument("--lobes", action="store_true", help="colors that change with the view")
     arguments = arguments.parse_args()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.import_scene.gltf(filepath=str(arguments.glb.resolve()))
     for found in bpy.context.scene.objects:
-        if found.type == "MESH":
+        if found.type != "MESH":
+            continue
+        if not arguments.lobes:
             emit(found)
+        elif not add_lobes(found, arguments.glb):
+            sys.exit(f"{arguments.glb} holds no lobes")
     scene = bpy.context.scene
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(camera)
