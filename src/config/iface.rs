@@ -80,6 +80,9 @@ table! {
         eikonal: f64, 0.0..=1e6 => 0.1;
         /// Weight of the sparsity term, the mean of exp(-scale * |sdf|).
         sparsity: f64, 0.0..=1e6 => 0.0, 0.0, 0.5;
+        /// Weight of the distance to points on which several photographs agree, found by stereo on the surface half-way
+        /// through training; 0: none (published).
+        stereo: f64, 0.0..=1e6 => 0.02, 0.02, 0.0;
         /// Cells per axis of the occupancy grid.
         occupancy_resolution: usize, 8.0..=1024.0 => 160, 160, 128;
         /// Seconds between checkpoints.
@@ -128,6 +131,8 @@ table! {
         occupancy_every: u64 => 50, 50, 16;
         /// Half width of the band in units of 1 / local sharpness.
         band: f32 => 4.0, 4.0, 6.0;
+        /// When stereo is looked for, as a share of the steps: the surface is good to a pixel or two by then.
+        stereo_at: f64 => 0.6;
         /// March step in units of 1 / inv_s, the sharpest (`band` rule).
         march: f32 => 1.0;
         /// Shortest march step of the `band` rule.
@@ -162,6 +167,7 @@ mod tests {
         assert_eq!((p.steps, p.rays, p.max_rays, p.samples), (20_000, 256, 8192, 262_144));
         assert_eq!((p.levels, p.base_resolution, p.log2_table), (16, 32, 19));
         assert_eq!((p.mask, p.eikonal, p.sparsity, p.sparsity_scale), (0.1, 0.1, 0.5, 1.0));
+        assert_eq!(p.stereo, 0.0);
         assert_eq!((p.weight_decay, p.table_decay, p.lr_variance), (0.01, 0.01, 0.001));
         assert_eq!((p.color_skip, p.soften), (false, 1.0));
     }

@@ -7,45 +7,60 @@ use crate::geom::{Camera, Distortion};
 use crate::image::{Gray, Photo};
 use crate::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
 use crate::kernel::march::Bitmask;
+use crate::kernel::rng;
 use crate::{Monitor, Quiet, Result};
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-const SIZE: u32 = 40;
 /// Its radius.
 pub const BALL: f32 = 0.6;
 
 /// A red and green ball in front of a blue wall, seen from eight sides.
 pub fn views() -> Vec<TrainView> {
+    let color = |p: Vec3| if p.y > 0.0 { [200, 40, 30] } else { [40, 180, 60] };
     (0..8)
-        .map(|i| view(i as f64 * std::f64::consts::TAU / 8.0, if i % 2 == 0 { 0.4 } else { -0.4 }))
+        .map(|i| view(40, i as f64 * std::f64::consts::TAU / 8.0, if i % 2 == 0 { 0.4 } else { -0.4 }, color))
         .collect()
 }
 
-fn view(azimuth: f64, elevation: f64) -> TrainView {
+/// A ball with waves of some pixels all over it, seen from twelve sides, nine of them from before it.
+pub fn textured_views() -> Vec<TrainView> {
+    let waves = |p: Vec3| {
+        let wave = |i: u64| {
+            let [x, y, z] = [0, 1, 2].map(|k| 90.0 * rng::uniform(5, i, k) - 45.0);
+            (p.dot(Vec3::new(x, y, z)) + i as f32).sin()
+        };
+        [(128.0 + 12.0 * (0..9).map(wave).sum::<f32>()) as u8; 3]
+    };
+    let before = (0..9).map(|i| (0.4 * (i % 3) as f64 - 0.4, 0.4 * (i / 3) as f64 - 0.4));
+    let behind = (2..5).map(|i| (i as f64 * std::f64::consts::TAU / 6.0, 0.3));
+    before.chain(behind).map(|(azimuth, elevation)| view(80, azimuth, elevation, waves)).collect()
+}
+
+fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8; 3]) -> TrainView {
     let rotation = DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-elevation);
     let camera = Camera {
-        width: SIZE,
-        height: SIZE,
-        fx: 60.0,
-        fy: 60.0,
-        cx: 20.0,
-        cy: 20.0,
+        width: size,
+        height: size,
+        fx: 1.5 * size as f64,
+        fy: 1.5 * size as f64,
+        cx: 0.5 * size as f64,
+        cy: 0.5 * size as f64,
         distortion: Distortion::default(),
         rotation,
         position: rotation * DVec3::new(0.0, 0.0, 3.0),
     };
     let mut rgb = Vec::new();
     let mut alpha = Vec::new();
-    for y in 0..SIZE {
-        for x in 0..SIZE {
+    for y in 0..size {
+        for x in 0..size {
             let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).unwrap();
             let b = ray.origin.dot(ray.direction);
             let discriminant = b * b - ray.origin.length_squared() + BALL * BALL;
             if discriminant > 0.0 {
                 let p = ray.at(-b - discriminant.sqrt());
-                rgb.push(if p.y > 0.0 { [200, 40, 30] } else { [40, 180, 60] });
+                rgb.push(color(p));
                 alpha.push(255);
             } else {
                 rgb.push([30, 30, 220]);
@@ -55,8 +70,8 @@ fn view(azimuth: f64, elevation: f64) -> TrainView {
     }
     TrainView {
         camera,
-        photo: Photo { width: SIZE, height: SIZE, rgb, alpha: None },
-        mask: Some(Gray { width: SIZE, height: SIZE, values: alpha }),
+        photo: Photo { width: size, height: size, rgb, alpha: None },
+        mask: Some(Gray { width: size, height: size, values: alpha }),
         valid: None,
     }
 }

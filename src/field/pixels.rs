@@ -88,6 +88,11 @@ impl<'a> Pixels<'a> {
         Pixels { views, over_black, drawable, cumulative, radius, masked, published }
     }
 
+    /// The photographs.
+    pub fn views(&self) -> &'a [TrainView] {
+        self.views
+    }
+
     /// Drawable pixels of all views.
     pub fn count(&self) -> u64 {
         self.cumulative.last().copied().unwrap_or(0)

@@ -2,6 +2,7 @@
 
 use super::model::SdfModel;
 use super::schedule;
+use super::stereo::SurfacePoint;
 use crate::config::iface::{Background, IfaceConfig};
 use crate::field::pixels::Batch;
 use crate::field::{self, ops};
@@ -9,6 +10,10 @@ use crate::kernel::sdf::FieldShape;
 use crate::kernel::{march, rng};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use std::sync::Arc;
+
+/// Distance from a stereo point, in pixels, up to which the loss is square and beyond which it is linear: about the
+/// error of such points.
+const KNEE: f64 = 0.15;
 
 /// Named losses of one step, `[1]` each, for the log and for naming the one that broke.
 pub struct Losses {
@@ -22,6 +27,8 @@ pub struct Losses {
     pub eikonal: Tensor<1>,
     /// Mean of exp(−β |f|) over the samples.
     pub sparsity: Option<Tensor<1>>,
+    /// Weighted mean distance from points that photographs agree on, in pixels, below [`KNEE`] squared.
+    pub stereo: Option<Tensor<1>>,
 }
 
 /// A batch of pixels and the samples along their rays.
@@ -30,6 +37,8 @@ pub struct Marched<'a> {
     pub batch: &'a Batch,
     /// Where along the rays the field is evaluated.
     pub samples: march::Samples,
+    /// Points that the surface should pass through, some of all.
+    pub stereo: Vec<SurfacePoint>,
     /// Length of a march step, in the field's units.
     pub dt: f32,
     /// Do the photographs have masks?
@@ -50,10 +59,14 @@ pub fn losses(
     (seed, step): (u64, u64),
     device: &Device,
 ) -> Losses {
-    let Marched { batch, samples, dt, masked } = marched;
+    let Marched { batch, samples, stereo, dt, masked } = marched;
     let (n, rays) = (samples.t.len(), batch.rays.len());
-    let (x, d) = samples.points(&batch.rays, 0);
-    let rows = |v: Vec<[f32; 3]>| field::tensor(v.into_flattened(), [n, 3], device);
+    // samples of rays first, then the points: one pass of the field for both
+    let (mut x, mut d) = samples.points(&batch.rays, 0);
+    let points = stereo.len();
+    x.extend(stereo.iter().map(|p| p.position));
+    d.resize(n + points, [0.0, 0.0, 1.0]); // their color is not looked at
+    let rows = |v: Vec<[f32; 3]>| field::tensor(v.into_flattened(), [n + points, 3], device);
     let directions: Vec<f32> = batch.rays.iter().flat_map(|r| r.direction).collect();
     // target and render over the same background, whatever it is
     let background: Vec<[f32; 3]> = match config.background {
@@ -81,7 +94,8 @@ pub fn losses(
     let head: Tensor<2> =
         field::tensor(batch.color.iter().flatten().copied().collect(), [rays, 3], device).autodiff();
 
-    let out = model.field(shape, rows(x), rows(d)); // [n, 8]
+    let all = model.field(shape, rows(x), rows(d)); // [n + points, 8]
+    let out = if points > 0 { all.clone().narrow(0, 0, n) } else { all.clone() }; // [n, 8]
     let bundle = ops::RaySamples {
         direction: field::tensor(directions, [rays, 3], device).autodiff(),
         dt: field::tensor(vec![dt; n], [n], device).autodiff(),
@@ -134,5 +148,16 @@ pub fn losses(
     if let Some(sparsity) = &sparsity {
         total = total + sparsity.clone() * config.sparsity;
     }
-    Losses { total, rgb, mask, eikonal, sparsity }
+    let stereo = (points > 0).then(|| {
+        let column = |value: fn(&SurfacePoint) -> f32| -> Tensor<2> {
+            field::tensor(stereo.iter().map(value).collect(), [points, 1], device).autodiff()
+        };
+        let off = all.narrow(0, n, points).narrow(1, 0, 1) / column(|p| p.footprint);
+        let loss = (off.square() + KNEE * KNEE).sqrt() - KNEE;
+        (loss * column(|p| p.weight)).mean()
+    });
+    if let Some(stereo) = &stereo {
+        total = total + stereo.clone() * config.stereo;
+    }
+    Losses { total, rgb, mask, eikonal, sparsity, stereo }
 }

@@ -4,8 +4,9 @@
 //! (Wang et al. 2021) renders it; color, mask, eikonal and sparsity losses train it (I-Face of
 //! TI-Face, ICCV 2023 View Synthesis Challenge for Human Heads). The `paper` preset follows the
 //! published system; the others start from the masks' visual hull, sample only a band around the
-//! surface, let the surface be softer in hair than on skin (Wang et al. 2023, "Adaptive Shells"), and
-//! show the color network the hash features themselves.
+//! surface, let the surface be softer in hair than on skin (Wang et al. 2023, "Adaptive Shells"), show the color
+//! network the hash features themselves, and hold the surface to points that stereo finds on it half-way (Fu et al.
+//! 2022, "Geo-NeuS", use points of a reconstruction as zero set).
 
 mod hull_start;
 mod infer;
@@ -14,6 +15,7 @@ mod model;
 mod occupancy;
 mod schedule;
 mod state;
+mod stereo;
 mod train;
 
 pub use infer::IFace;

@@ -37,6 +37,11 @@ pub fn anneal(config: &IfaceConfig, step: u64) -> f32 {
     if config.anneal_end == 0 { 1.0 } else { (step as f32 / config.anneal_end as f32).min(1.0) }
 }
 
+/// The step at which stereo is looked for; none where it has no weight.
+pub fn stereo_step(config: &IfaceConfig) -> Option<u64> {
+    (config.stereo > 0.0).then_some((config.steps as f64 * config.stereo_at) as u64)
+}
+
 /// Returns the march step at a sharpness.
 pub fn march_step(config: &IfaceConfig, inv_s: f32) -> f32 {
     match config.occupancy {

@@ -2,6 +2,7 @@
 
 use super::model::SdfModel;
 use super::occupancy::Occupancy;
+use super::stereo::SurfacePoint;
 use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::checkpoint::Checkpoint;
@@ -19,6 +20,8 @@ pub struct SdfState {
     pub occupancy: Occupancy,
     /// Rays of the next step.
     pub rays: usize,
+    /// Points on which photographs agree, once they are found.
+    pub stereo: Vec<SurfacePoint>,
 }
 
 impl SdfState {
@@ -28,6 +31,7 @@ impl SdfState {
             model: SdfModel::new(config, seed, device),
             occupancy: Occupancy::new(config, hull),
             rays: config.rays,
+            stereo: Vec::new(),
         }
     }
 
@@ -39,6 +43,11 @@ impl SdfState {
         into.put_words("occupancy.solid", o.solid.bits.clone());
         if !o.history.is_empty() {
             into.put_floats("occupancy.history", &[o.history.len()], o.history.clone());
+        }
+        if !self.stereo.is_empty() {
+            let rows = self.stereo.iter().flat_map(|p| p.row()).collect();
+            into.put_floats("stereo", &[self.stereo.len(), SurfacePoint::WIDTH], rows);
+            into.set("stereo", self.stereo.len());
         }
         into.set("rays", self.rays);
     }
@@ -65,6 +74,12 @@ impl SdfState {
             mask.bits = bits;
         }
         let most = config.rays.max(config.max_rays) as u64;
-        Ok(SdfState { model, occupancy, rays: from.number("rays", 1..=most)? as usize })
+        let mut stereo = Vec::new();
+        if from.has("stereo") {
+            let count = from.number("stereo", 1..=1 << 32)? as usize;
+            let rows = from.floats("stereo", &[count, SurfacePoint::WIDTH])?;
+            stereo.extend(rows.chunks_exact(SurfacePoint::WIDTH).map(SurfacePoint::of_row));
+        }
+        Ok(SdfState { model, occupancy, rays: from.number("rays", 1..=most)? as usize, stereo })
     }
 }

@@ -6,6 +6,7 @@ use super::losses::{Marched, losses};
 use super::model::{GEOMETRY, shape};
 use super::schedule::{self, march_step};
 use super::state::{FORMAT, SdfState};
+use super::stereo::{self, HostField, SurfacePoint};
 use crate::config::iface::{IfaceConfig, OccupancyRule, Start};
 use crate::field;
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
@@ -43,6 +44,9 @@ const LOST_AFTER: u64 = 20;
 
 /// A batch keeps at most so many times the sample budget: the ray count lags behind when cells come back.
 const MOST_BUDGETS: usize = 4;
+
+/// Stereo points of a step: some percent of its samples.
+const STEREO_POINTS: u64 = 1024;
 
 /// Drops the last rays of a batch until at most `most` samples are left (one ray always stays).
 fn shorten(batch: &mut Batch, samples: &mut march::Samples, most: usize) {
@@ -122,6 +126,9 @@ impl Learner for SdfTraining<'_> {
         if step.is_multiple_of(config.occupancy_every) || (band && level_came) {
             self.update_occupancy(&shape, (seed, step), inv_s, dt);
         }
+        if schedule::stereo_step(config) == Some(step) {
+            self.find_stereo(&shape);
+        }
         let mut batch = self.pixels.draw(seed, step, self.state.rays, config.jitter);
         let mut samples = self.state.occupancy.march(config, dt, &batch.rays);
         let n = samples.t.len();
@@ -136,15 +143,21 @@ impl Learner for SdfTraining<'_> {
                 "look at the masks and poses with `tiface inspect`; lower iface.lr_network",
             )));
         }
-        let (mut square_error, mut terms) = (None, [0f32; 4]);
+        let (mut square_error, mut terms) = (None, [0f32; 5]);
         // nothing in sight of these rays: no gradient, but the schedule goes on
         if n > 0 {
-            let marched = Marched { batch: &batch, samples, dt, masked: self.pixels.masked };
+            let stereo = self.draw_stereo(seed, step);
+            let marched = Marched { batch: &batch, samples, stereo, dt, masked: self.pixels.masked };
             let losses = losses(config, &self.state.model, &shape, marched, (seed, step), &self.device);
             let read = |t: &Tensor<1>| field::values(t.clone().inner())[0];
-            terms =
-                [Some(&losses.rgb), losses.mask.as_ref(), Some(&losses.eikonal), losses.sparsity.as_ref()]
-                    .map(|term| term.map_or(0.0, read));
+            terms = [
+                Some(&losses.rgb),
+                losses.mask.as_ref(),
+                Some(&losses.eikonal),
+                losses.sparsity.as_ref(),
+                losses.stereo.as_ref(),
+            ]
+            .map(|term| term.map_or(0.0, read));
             square_error = Some(terms[0]);
             let factor = schedule::learning_rate(config, step);
             for (term, value) in TERMS.into_iter().zip(terms) {
@@ -179,7 +192,7 @@ impl Learner for SdfTraining<'_> {
 }
 
 /// Names of the losses.
-const TERMS: [&str; 4] = ["rgb", "mask", "eikonal", "sparsity"];
+const TERMS: [&str; 5] = ["rgb", "mask", "eikonal", "sparsity", "stereo"];
 
 impl SdfTraining<'_> {
     /// Returns the field's shape at a step (levels come in one by one).
@@ -193,6 +206,20 @@ impl SdfTraining<'_> {
         let distances = |x: &[[f32; 3]]| sdf::values(shape, table, &weights, x);
         let soft = |x: &[[f32; 3]]| sdf::softness(shape, table, &weights, x);
         self.state.occupancy.update(self.config, at, inv_s, dt, distances, soft);
+    }
+
+    /// Looks for points that photographs agree on, around the surface as it is.
+    fn find_stereo(&mut self, shape: &FieldShape) {
+        let (table, weights) = self.state.model.on_host(shape);
+        let field = HostField { shape, table: bytemuck::cast_slice(&table), weights: &weights };
+        self.state.stereo = stereo::points(self.pixels.views(), self.config, &field, &self.state.occupancy);
+    }
+
+    /// Some of the points, a function of seed and step alone.
+    fn draw_stereo(&self, seed: u64, step: u64) -> Vec<SurfacePoint> {
+        let all = &self.state.stereo;
+        let count = if all.is_empty() { 0 } else { STEREO_POINTS };
+        (0..count).map(|i| all[rng::below(seed, step << 4 | 12, i, all.len() as u64) as usize]).collect()
     }
 
     /// Backward and AdamW of the first `count` parameters, each group at its own rate. Nothing is updated where a

@@ -2,7 +2,10 @@
 
 use super::*;
 use crate::config::Preset;
-use crate::field::ball::{BALL, hull, negative, refuses, resumes, says, session, tampered, temporary, views};
+use crate::field::ball::{
+    BALL, hull, negative, refuses, resumes, says, session, tampered, temporary, textured_views, views,
+};
+use crate::field::checkpoint::{self, Checkpoint};
 use crate::{Monitor, Quiet};
 use glam::{Vec2, Vec3};
 use std::path::Path;
@@ -54,6 +57,30 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
         train(&views, Some(&hull), &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
     };
     resumes(&run, 3);
+}
+
+#[test]
+fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
+    let (views, hull) = (textured_views(), hull());
+    let config = IfaceConfig { steps: 100, ..config() };
+    let run = |dir: &Path, monitor: &dyn Monitor| {
+        train(&views, Some(&hull), &config, &session("iface", dir, "waves", monitor)).map(|(_, r)| r.warnings)
+    };
+    resumes(&run, 8);
+    let dir = temporary();
+    run(dir.path(), &Quiet).unwrap();
+    let mut file = Checkpoint::read(&checkpoint::newest(dir.path()), "iface", FORMAT).unwrap();
+    let state = SdfState::restore(&config, Some(&hull), &mut file, &field::device("cpu").unwrap()).unwrap();
+    // a pixel is 2.4 / 120 = 0.02
+    let off = |p: &SurfacePoint| (Vec3::from(p.position).length() - BALL).abs();
+    let mut off: Vec<f32> = state.stereo.iter().map(off).collect();
+    off.sort_by(f32::total_cmp);
+    assert!(
+        off.len() > 100 && off[off.len() / 2] < 0.005,
+        "{} points, {:?}",
+        off.len(),
+        off.get(off.len() / 2)
+    );
 }
 
 #[test]

@@ -15,4 +15,5 @@ pub mod rng;
 pub mod sdf;
 pub mod simd;
 pub mod sphharm;
+pub mod stereo;
 pub mod vm;

@@ -1,0 +1,313 @@
+//! Points of the surface that several photographs agree on, found from the field as it is.
+//!
+//! Rays meet the field's zero set; points spread over it are moved along their normals until all photographs that see
+//! them show the same there ([`crate::kernel::stereo`]). Hair is left out: stereo finds its strands some millimeters
+//! inside of where its outline is.
+
+use super::occupancy::Occupancy;
+use crate::config::iface::IfaceConfig;
+use crate::field::pixels::TrainView;
+use crate::geom::Camera;
+use crate::kernel::march::MarchRay;
+use crate::kernel::mlp::Weights;
+use crate::kernel::sdf::{self, FieldShape};
+use crate::kernel::stereo::{self, StereoPoint, StereoView, Surfel};
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+
+/// Pixels between the rays.
+const STRIDE: usize = 4;
+
+/// Softest place that is looked at, the logarithm of its sharpness as a share of the sharpest: half as sharp.
+const SOFTEST: f32 = -std::f32::consts::LN_2;
+
+/// A point that the surface should pass through, in field coordinates.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SurfacePoint {
+    /// Where.
+    pub position: [f32; 3],
+    /// Length of a pixel there.
+    pub footprint: f32,
+    /// How much it counts, at most 1.
+    pub weight: f32,
+}
+
+impl SurfacePoint {
+    /// Numbers of a point in a checkpoint.
+    pub const WIDTH: usize = 5;
+
+    /// Returns its numbers.
+    pub fn row(&self) -> [f32; Self::WIDTH] {
+        let [x, y, z] = self.position;
+        [x, y, z, self.footprint, self.weight]
+    }
+
+    /// Returns the point of these [`SurfacePoint::WIDTH`] numbers.
+    pub fn of_row(row: &[f32]) -> SurfacePoint {
+        SurfacePoint { position: [row[0], row[1], row[2]], footprint: row[3], weight: row[4] }
+    }
+}
+
+/// The field on the host.
+pub struct HostField<'a> {
+    /// Its shape.
+    pub shape: &'a FieldShape,
+    /// Hash table.
+    pub table: &'a [[f32; 2]],
+    /// Network weights.
+    pub weights: &'a Weights,
+}
+
+impl HostField<'_> {
+    /// Distances at points in field coordinates.
+    fn values(&self, x: &[[f32; 3]]) -> Vec<f32> {
+        sdf::values(self.shape, self.table, self.weights, x)
+    }
+
+    /// Points in field coordinates moved onto the zero set nearby, with their unit normals.
+    fn project(&self, mut x: Vec<[f32; 3]>) -> Vec<(Vec3, Option<Vec3>)> {
+        /// Gradients have lengths of about one, and points start within a pixel or two.
+        const ROUNDS: usize = 2;
+        for _ in 0..ROUNDS {
+            let gradients = sdf::gradients(self.shape, self.table, self.weights, &x);
+            for (x, (f, n)) in x.iter_mut().zip(gradients) {
+                let square: f32 = n.iter().map(|n| n * n).sum();
+                (0..3).for_each(|a| x[a] -= f * n[a] / square.max(0.25));
+            }
+        }
+        let gradients = sdf::gradients(self.shape, self.table, self.weights, &x);
+        x.into_iter()
+            .zip(gradients)
+            .map(|(x, (_, n))| (Vec3::from(x), Vec3::from(n).try_normalize()))
+            .collect()
+    }
+}
+
+/// The zero set as the cameras see it, and points spread over it, in scene units.
+fn surface(
+    views: &[TrainView],
+    config: &IfaceConfig,
+    field: &HostField,
+    occupancy: &Occupancy,
+) -> (Vec<StereoView>, Vec<Surfel>) {
+    let (seen, found): (Vec<StereoView>, Vec<Vec<[f32; 3]>>) =
+        views.iter().map(|view| first_crossings(view, config, field, occupancy)).unzip();
+    let radius = config.radius;
+    let mut spread = Vec::new();
+    for (v, x) in found.into_iter().enumerate() {
+        let soft = sdf::softness(field.shape, field.table, field.weights, &x);
+        let hard: Vec<[f32; 3]> =
+            x.into_iter().zip(soft).filter(|(_, soft)| *soft >= SOFTEST).map(|(x, _)| x).collect();
+        let normals = sdf::gradients(field.shape, field.table, field.weights, &hard);
+        let own = |(x, (_, n)): (&[f32; 3], &(f32, [f32; 3]))| {
+            let normal = Vec3::from(*n).try_normalize()?;
+            let surfel = Surfel { position: Vec3::from(*x) / radius, normal };
+            let footprint = stereo::owned(&seen, v, &surfel)?;
+            // four in the place of one, two pixels apart
+            let axis = normal.any_orthonormal_vector();
+            let other = normal.cross(axis);
+            let at =
+                |a: f32, b: f32| ((surfel.position + footprint * (a * axis + b * other)) * radius).to_array();
+            Some([at(-1.0, -1.0), at(1.0, -1.0), at(-1.0, 1.0), at(1.0, 1.0)])
+        };
+        let four: Vec<[[f32; 3]; 4]> = hard.par_iter().zip(&normals).filter_map(own).collect();
+        spread.extend(four.into_flattened());
+    }
+    let surfels = field
+        .project(spread)
+        .into_iter()
+        .filter_map(|(x, normal)| Some(Surfel { position: x / radius, normal: normal? }));
+    (seen, surfels.collect())
+}
+
+/// A view for stereo with its depths, and where its rays meet the zero set first, in field coordinates.
+fn first_crossings(
+    view: &TrainView,
+    config: &IfaceConfig,
+    field: &HostField,
+    occupancy: &Occupancy,
+) -> (StereoView, Vec<[f32; 3]>) {
+    /// A patch around a usable pixel, its size and a margin, lies in the head.
+    const MARGIN: usize = 5;
+    /// Samples of a ray that are evaluated together.
+    const AHEAD: usize = 6;
+    let Reduced { camera, gray, whole, partly } = Reduced::new(view);
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    let usable = eroded(whole, w, h, MARGIN);
+    let (columns, rows) = (w.div_ceil(STRIDE), h.div_ceil(STRIDE));
+    let middle = |i: usize| {
+        ((i % columns * STRIDE + STRIDE / 2).min(w - 1), (i / columns * STRIDE + STRIDE / 2).min(h - 1))
+    };
+    let pixels: Vec<(usize, MarchRay)> = (0..columns * rows)
+        .into_par_iter()
+        .filter_map(|i| {
+            let (x, y) = middle(i);
+            if !partly[y * w + x] {
+                return None;
+            }
+            let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
+            let origin = (ray.origin * config.radius).to_array();
+            Some((i, MarchRay { origin, direction: ray.direction.to_array(), jitter: 0.0 }))
+        })
+        .collect();
+    let rays: Vec<MarchRay> = pixels.iter().map(|p| p.1).collect();
+    let samples = occupancy.march(config, config.min_step * config.radius, &rays);
+    let at = |r: usize, t: f32| std::array::from_fn(|a| rays[r].origin[a] + t * rays[r].direction[a]);
+    // the first step from outside to inside, some samples of every ray after the others
+    let mut crossing = vec![None; rays.len()];
+    let mut going: Vec<(usize, usize, f32)> =
+        (0..rays.len()).map(|r| (r, samples.offsets[r] as usize, f32::NAN)).collect();
+    while !going.is_empty() {
+        let piece = |&(r, k, _): &(usize, usize, f32)| k..(k + AHEAD).min(samples.offsets[r + 1] as usize);
+        let x: Vec<[f32; 3]> =
+            going.iter().flat_map(|g| piece(g).map(|k| at(g.0, samples.t[k])).collect::<Vec<_>>()).collect();
+        let mut f = field.values(&x).into_iter();
+        going.retain_mut(|g| {
+            let span = piece(g);
+            let mut before = g.2;
+            for (k, f) in span.clone().zip(f.by_ref().take(span.len()).collect::<Vec<_>>()) {
+                if before > 0.0 && f <= 0.0 && crossing[g.0].is_none() {
+                    let (near, far) = (samples.t[k - 1], samples.t[k]);
+                    crossing[g.0] = Some(near + (far - near) * before / (before - f));
+                }
+                before = f;
+            }
+            (g.1, g.2) = (span.end, before);
+            crossing[g.0].is_none() && span.end < samples.offsets[g.0 + 1] as usize
+        });
+    }
+    let mut depth = vec![f32::INFINITY; columns * rows];
+    let mut found = Vec::new();
+    for (r, t) in crossing.into_iter().enumerate() {
+        let (i, Some(t)) = (pixels[r].0, t) else { continue };
+        let x = at(r, t);
+        let Some((_, z)) = camera.project(Vec3::from(x) / config.radius) else { continue };
+        depth[i] = z;
+        let (column, row) = middle(i);
+        if usable[row * w + column] {
+            found.push(x);
+        }
+    }
+    (StereoView { camera, gray, usable, cell: STRIDE, depth }, found)
+}
+
+/// A photograph at the size that stereo looks at.
+struct Reduced {
+    camera: Camera,
+    /// Brightness, white is 1.
+    gray: Vec<f32>,
+    /// Is all of the pixel head, and to be learned from?
+    whole: Vec<bool>,
+    /// Is half of a part of it head?
+    partly: Vec<bool>,
+}
+
+impl Reduced {
+    fn new(view: &TrainView) -> Reduced {
+        /// Longest side in pixels, up to twice: a surface that is half trained is right to a few of these, and a
+        /// tenth of one is all that is asked for.
+        const SIDE: u32 = 512;
+        let (w, h) = (view.camera.width, view.camera.height);
+        let factor = (w.max(h) / SIDE).clamp(1, w.min(h).max(1));
+        let (width, height) = (w / factor, h / factor);
+        let camera = view.camera.part(0, 0, width * factor, height * factor).resized(width, height);
+        let head = |p: usize| view.mask.as_ref().map_or(255, |m| m.values[p]);
+        let valid = |p: usize| view.valid.as_ref().is_none_or(|m| m.values[p] != 0);
+        let luma = |[r, g, b]: [u8; 3]| (0.299 * r as f32 + 0.587 * g as f32 + 0.114 * b as f32) / 255.0;
+        let (k, across) = (factor as usize, width as usize);
+        let one = |i: usize| {
+            let (x, y) = (i % across * k, i / across * k);
+            let (mut gray, mut whole, mut partly) = (0.0, true, false);
+            for p in (0..k * k).map(|j| (y + j / k) * w as usize + x + j % k) {
+                gray += luma(view.photo.rgb[p]);
+                whole &= head(p) == 255 && valid(p);
+                partly |= head(p) >= 128;
+            }
+            (gray / (k * k) as f32, (whole, partly))
+        };
+        let pixels = across * height as usize;
+        let (gray, (whole, partly)) = (0..pixels).into_par_iter().with_min_len(4096).map(one).unzip();
+        Reduced { camera, gray, whole, partly }
+    }
+}
+
+/// Returns points that photographs agree on: a function of these arguments alone, whatever the threads.
+pub fn points(
+    views: &[TrainView],
+    config: &IfaceConfig,
+    field: &HostField,
+    occupancy: &Occupancy,
+) -> Vec<SurfacePoint> {
+    let (seen, surfels) = surface(views, config, field, occupancy);
+    let found = stereo::matches(&seen, &surfels);
+    let Some(footprint) = found.iter().map(|p| p.footprint).min_by(f32::total_cmp) else { return Vec::new() };
+    let point = |p: StereoPoint| SurfacePoint {
+        position: (p.position * config.radius).to_array(),
+        footprint: p.footprint * config.radius,
+        weight: 1.0 / (1.0 + p.sigma * p.sigma),
+    };
+    stereo::confirmed(&found, 2.0 * footprint).into_iter().map(point).collect()
+}
+
+/// Where a whole square of half edge `margin` is set.
+fn eroded(mut set: Vec<bool>, w: usize, h: usize, margin: usize) -> Vec<bool> {
+    for (lines, step, n, stride) in [(h, w, w, 1), (w, 1, h, w)] {
+        for first in (0..lines).map(|line| line * step) {
+            // so many set ones in a row, up to here
+            let mut run = 0;
+            let runs: Vec<usize> = (0..n)
+                .map(|i| {
+                    run = if set[first + i * stride] { run + 1 } else { 0 };
+                    run
+                })
+                .collect();
+            for i in 0..n {
+                set[first + i * stride] = runs.get(i + margin).is_some_and(|&r| r > 2 * margin);
+            }
+        }
+    }
+    set
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::{Gray, Photo};
+
+    #[test]
+    fn eroding_leaves_pixels_whose_whole_square_is_set() {
+        // 7 × 5, one hole at (1, 2): with a margin of 1 columns 3 to 5 of rows 1 to 3 are left
+        let mut set = vec![true; 35];
+        set[2 * 7 + 1] = false;
+        let left = eroded(set, 7, 5, 1);
+        let expected = |i: usize| (3..=5).contains(&(i % 7)) && (1..=3).contains(&(i / 7));
+        assert!((0..35).all(|i| left[i] == expected(i)), "{left:?}");
+        assert!(eroded(vec![true; 6], 3, 2, 2).iter().all(|set| !set));
+    }
+
+    #[test]
+    fn a_large_photograph_is_averaged_and_a_pixel_is_head_where_all_of_it_is() {
+        // 1031 / 512: two by two; the last column is left out
+        let (w, h) = (1031, 6);
+        let mut view = TrainView {
+            camera: Camera::above(w, h, 500.0, 3.0),
+            photo: Photo { width: w, height: h, rgb: vec![[51; 3]; 1031 * 6], alpha: None },
+            mask: Some(Gray { width: w, height: h, values: vec![255; 1031 * 6] }),
+            valid: Some(Gray { width: w, height: h, values: vec![255; 1031 * 6] }),
+        };
+        view.photo.rgb[1031 + 3] = [255; 3]; // one of four of pixel (1, 0)
+        view.mask.as_mut().unwrap().values[1031 * 2] = 254; // of pixel (0, 1)
+        view.mask.as_mut().unwrap().values[..2].fill(0); // half of pixel (0, 0)
+        view.valid.as_mut().unwrap().values[1031 * 5 + 1029] = 0; // of pixel (514, 2)
+        let small = Reduced::new(&view);
+        assert_eq!((small.camera.width, small.camera.height, small.gray.len()), (515, 3, 515 * 3));
+        // (3 · 0.2 + 1) / 4
+        assert!((small.gray[1] - 0.4).abs() < 1e-6 && (small.gray[2] - 0.2).abs() < 1e-6);
+        let not_whole: Vec<usize> = (0..515 * 3).filter(|&i| !small.whole[i]).collect();
+        assert_eq!(not_whole, [0, 515, 515 * 2 + 514]);
+        assert!(small.partly.iter().all(|&partly| partly));
+        // the middle of a pixel is the corner that its four share
+        let (ray, same) = (small.camera.ray(Vec2::splat(0.5)).unwrap(), view.camera.ray(Vec2::ONE).unwrap());
+        assert!((ray.direction - same.direction).length() < 1e-6);
+    }
+}

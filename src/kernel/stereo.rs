@@ -1,0 +1,595 @@
+//! Stereo on a surface that is nearly right: how far along its normal each point should move.
+//!
+//! A small patch of the surface's tangent plane is looked up in every photograph that sees it. Moved along its
+//! normal to where the surface is, it shows the same in all of them, but for brightness and contrast. With patches
+//! `p_v` of mean 0 and length 1, the mean correlation of all pairs is
+//!
+//! ```text
+//! score(d) = (‖Σ p_v(d)‖² − V) / (V (V − 1))          σ² = (1 − score) / −score″
+//! ```
+//!
+//! which treats all photographs alike, as Furukawa, Ponce 2010, "Accurate, Dense, and Robust Multiview Stereopsis",
+//! measure photo-consistency. Displacements are tried in steps that move no two patches by more than a part of a
+//! pixel against each other; parabolas refine the peak, and the patch's tilt with it. Photographs that do not fit
+//! the others (a highlight, an occluder) are left out once. A peak counts when it is inside the range and alone, when
+//! `σ`, the error that noise and the peak's width allow, is small, and when neighbors agree with it: in hair they
+//! rarely do.
+
+use crate::geom::Camera;
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+use std::collections::HashMap;
+
+/// Samples from a patch's center to its edge, a pixel apart.
+const HALF: i32 = 4;
+
+/// Samples of a patch.
+const PATCH: usize = (2 * HALF as usize + 1).pow(2);
+
+/// Photographs that a point is compared in, the most frontal ones.
+const MOST_VIEWS: usize = 8;
+
+/// Photographs that must agree.
+const LEAST_VIEWS: usize = 4;
+
+/// Flattest view, as the cosine between normal and direction to the camera.
+const LEAST_COSINE: f32 = 0.4;
+
+/// Most that neighboring hypotheses move one patch against another, pixels.
+const STEP: f32 = 0.4;
+
+/// How far a point is searched to both sides, in pixel footprints: a field that is half trained is that good.
+const REACH: f32 = 5.0;
+
+/// Standard deviation below which a patch shows nothing, of a white of 1: a rounding error of 8 bits has 0.3 / 255.
+const LEAST_CONTRAST: f32 = 0.8 / 255.0;
+
+/// Correlation of a photograph with the better half of the others below which it is left out.
+const LEAST_FIT: f32 = 0.3;
+
+/// Mean correlation of a point that counts.
+const LEAST_SCORE: f32 = 0.4;
+
+/// How much lower any other peak must be.
+const MARGIN: f32 = 0.05;
+
+/// Rounds of shift and tilt that refine a peak.
+const ROUNDS: usize = 2;
+
+/// Tilt that is tried to both sides, as a slope.
+const TILT: f32 = 0.15;
+
+/// Steepest tilt against the surface as it was.
+const MOST_TILT: f32 = 0.6;
+
+/// Largest σ of a point that counts, in pixel footprints.
+const MOST_SIGMA: f32 = 1.5;
+
+/// One photograph and what is known of the surface in it.
+pub struct StereoView {
+    /// Its camera.
+    pub camera: Camera,
+    /// `[height, width]` brightness, white is 1.
+    pub gray: Vec<f32>,
+    /// `[height, width]` may a patch's center lie here?
+    pub usable: Vec<bool>,
+    /// Edge of the cells of `depth`, pixels.
+    pub cell: usize,
+    /// `[⌈height / cell⌉, ⌈width / cell⌉]` distance of the surface along the viewing axis in the middle of each cell;
+    /// infinite where there is none.
+    pub depth: Vec<f32>,
+}
+
+/// A point of the surface as it is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Surfel {
+    /// Where.
+    pub position: Vec3,
+    /// Unit normal, outward.
+    pub normal: Vec3,
+}
+
+/// A point where the photographs agree.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StereoPoint {
+    /// Where.
+    pub position: Vec3,
+    /// Unit normal.
+    pub normal: Vec3,
+    /// Length of a pixel there.
+    pub footprint: f32,
+    /// The error to expect, in footprints, up to a common factor.
+    pub sigma: f32,
+}
+
+/// How a patch projects into one photograph, as a function of its displacement along the normal.
+#[derive(Clone, Copy)]
+struct Projected {
+    view: usize,
+    center: Vec2,
+    /// Pixels per footprint of displacement, and the quadratic term.
+    slope: Vec2,
+    bend: Vec2,
+    /// Pixels per sample along both axes of the patch.
+    axes: [Vec2; 2],
+}
+
+/// Displacement of a patch in footprints, and its slope along both axes.
+#[derive(Clone, Copy, Default)]
+struct Place {
+    shift: f32,
+    tilt: Vec2,
+}
+
+impl Projected {
+    fn new(view: usize, camera: &Camera, s: &Surfel, axes: [Vec3; 2], footprint: f32) -> Option<Projected> {
+        let at = |p: Vec3| camera.project(p).map(|(q, _)| q);
+        let center = at(s.position)?;
+        let reach = REACH * footprint * s.normal;
+        let (before, after) = (at(s.position - reach)?, at(s.position + reach)?);
+        let span = HALF as f32;
+        let mut pixels = [Vec2::ZERO; 2];
+        for (pixels, axis) in pixels.iter_mut().zip(axes) {
+            let to_edge = span * footprint * axis;
+            *pixels = (at(s.position + to_edge)? - at(s.position - to_edge)?) / (2.0 * span);
+        }
+        Some(Projected {
+            view,
+            center,
+            slope: (after - before) / (2.0 * REACH),
+            bend: (after + before - 2.0 * center) / (2.0 * REACH * REACH),
+            axes: pixels,
+        })
+    }
+
+    /// Looks the patch up: brightness with mean 0 and length 1. False, and zeros, where it leaves the picture or shows
+    /// nothing.
+    fn look_up(&self, view: &StereoView, place: Place, patch: &mut [f32; PATCH]) -> bool {
+        let center = self.center + place.shift * (self.slope + place.shift * self.bend) - 0.5;
+        let [a, b] = [0, 1].map(|k| self.axes[k] + place.tilt[k] * self.slope);
+        let (w, h) = (view.camera.width as usize, view.camera.height as usize);
+        let extent = HALF as f32 * (a.abs() + b.abs());
+        let (low, high) = (center - extent, center + extent);
+        // a little inside: sums of steps round
+        let inside = low.min_element() >= 0.01 && high.x < w as f32 - 1.01 && high.y < h as f32 - 1.01;
+        if !inside {
+            patch.fill(0.0);
+            return false;
+        }
+        let (mut k, mut sum) = (0, 0f32);
+        for j in -HALF..=HALF {
+            let row = center + j as f32 * b;
+            for i in -HALF..=HALF {
+                let (x, y) = (row.x + i as f32 * a.x, row.y + i as f32 * a.y);
+                let (cx, cy) = (x as usize, y as usize);
+                let (fx, fy) = (x - cx as f32, y - cy as f32);
+                let at = cy * w + cx;
+                let (top, bottom) = (&view.gray[at..at + 2], &view.gray[at + w..at + w + 2]);
+                let (t, u) = (top[0] + fx * (top[1] - top[0]), bottom[0] + fx * (bottom[1] - bottom[0]));
+                patch[k] = t + fy * (u - t);
+                sum += patch[k];
+                k += 1;
+            }
+        }
+        let mean = sum / PATCH as f32;
+        let mut square = 0f32;
+        for v in patch.iter_mut() {
+            *v -= mean;
+            square += *v * *v;
+        }
+        let shows = square >= LEAST_CONTRAST * LEAST_CONTRAST * PATCH as f32;
+        let scale = if shows { 1.0 / square.sqrt() } else { 0.0 };
+        patch.iter_mut().for_each(|v| *v *= scale);
+        shows
+    }
+}
+
+/// A surfel in the photographs that see it.
+struct Matching<'a> {
+    views: &'a [StereoView],
+    seen: Vec<Projected>,
+    patches: Vec<[f32; PATCH]>,
+}
+
+impl Matching<'_> {
+    /// Mean correlation of all pairs.
+    fn score(&mut self, place: Place) -> f32 {
+        let mut sum = [0f32; PATCH];
+        let mut shown = 0;
+        for (p, patch) in self.seen.iter().zip(&mut self.patches) {
+            shown += i32::from(p.look_up(&self.views[p.view], place, patch));
+            (0..PATCH).for_each(|k| sum[k] += patch[k]);
+        }
+        let n = self.seen.len() as f32;
+        let square: f32 = sum.iter().map(|s| s * s).sum();
+        (square - shown as f32) / (n * (n - 1.0))
+    }
+
+    /// Leaves photographs out that do not fit the others at a place. Returns whether all fitted.
+    fn keep_fitting(&mut self, place: Place) -> bool {
+        self.score(place);
+        let n = self.seen.len();
+        let fits = |v: usize| {
+            let with = |w: usize| (0..PATCH).map(|k| self.patches[v][k] * self.patches[w][k]).sum::<f32>();
+            // the better half of the others: an outlier among them should not condemn this one
+            let mut others: Vec<f32> = (0..n).filter(|&w| w != v).map(with).collect();
+            others.sort_by(|a, b| b.total_cmp(a));
+            let best = &others[..others.len().div_ceil(2)];
+            best.iter().sum::<f32>() / best.len() as f32 >= LEAST_FIT
+        };
+        let kept: Vec<Projected> = (0..n).filter(|&v| fits(v)).map(|v| self.seen[v]).collect();
+        self.patches.truncate(kept.len());
+        self.seen = kept;
+        self.seen.len() == n
+    }
+
+    /// The shift of the highest peak over the range, and the step between shifts. `None` where it is not inside or not
+    /// alone, or where the views are too much alike to tell.
+    fn search(&mut self) -> Option<(f32, f32)> {
+        let mut widest = 0f32;
+        for (i, a) in self.seen.iter().enumerate() {
+            for b in &self.seen[..i] {
+                widest = widest.max(a.slope.distance(b.slope));
+            }
+        }
+        let steps = (REACH * widest / STEP).ceil();
+        if !(2.0..=64.0).contains(&steps) {
+            return None;
+        }
+        let (n, step) = (steps as i32, REACH / steps);
+        let scores: Vec<f32> =
+            (-n..=n).map(|k| self.score(Place { shift: k as f32 * step, ..Place::default() })).collect();
+        let best = (0..scores.len()).max_by(|&a, &b| scores[a].total_cmp(&scores[b]))?;
+        if best == 0 || best + 1 == scores.len() {
+            return None;
+        }
+        let rival = (1..scores.len() - 1)
+            .filter(|&k| k.abs_diff(best) > 2 && scores[k] >= scores[k - 1] && scores[k] >= scores[k + 1])
+            .map(|k| scores[k])
+            .fold(f32::NEG_INFINITY, f32::max);
+        (rival < scores[best] - MARGIN).then_some(((best as i32 - n) as f32 * step, step))
+    }
+
+    /// The peak near a shift, with its score and second derivative.
+    fn refine(&mut self, shift: f32, mut step: f32) -> Option<(Place, f32, f32)> {
+        let mut place = Place { shift, ..Place::default() };
+        for _ in 0..ROUNDS {
+            let around = [-step, 0.0, step].map(|d| self.score(Place { shift: place.shift + d, ..place }));
+            place.shift += step * toward(around);
+            step = (0.6 * step).max(0.1);
+            for k in 0..2 {
+                let around = [-TILT, 0.0, TILT].map(|d| {
+                    let mut tilt = place.tilt;
+                    tilt[k] += d;
+                    self.score(Place { tilt, ..place })
+                });
+                place.tilt[k] = (place.tilt[k] + TILT * toward(around)).clamp(-MOST_TILT, MOST_TILT);
+            }
+        }
+        // the tilt moved the peak a little
+        let around = [-step, 0.0, step].map(|d| self.score(Place { shift: place.shift + d, ..place }));
+        place.shift += step * toward(around);
+        let around = [-step, 0.0, step].map(|d| self.score(Place { shift: place.shift + d, ..place }));
+        let (offset, score, curvature) = parabola(around, step)?;
+        place.shift += offset;
+        Some((place, score, curvature))
+    }
+}
+
+/// How many steps to go from the middle of three values towards their peak, one at most.
+fn toward([before, middle, after]: [f32; 3]) -> f32 {
+    let (slope, curvature) = (0.5 * (after - before), 2.0 * middle - before - after);
+    if curvature > 1e-6 { (slope / curvature).clamp(-1.0, 1.0) } else { slope.signum() }
+}
+
+/// The peak of the parabola through three values one `step` apart, whose middle is the highest: its offset from the
+/// middle, its value and its negative second derivative.
+fn parabola([before, middle, after]: [f32; 3], step: f32) -> Option<(f32, f32, f32)> {
+    let curvature = 2.0 * middle - before - after;
+    if before > middle || after > middle || curvature <= 1e-6 {
+        return None;
+    }
+    let offset = 0.5 * (after - before) / curvature;
+    Some((offset * step, middle + 0.25 * (after - before) * offset, curvature / (step * step)))
+}
+
+/// Views that see a surfel, most frontal first.
+fn seen_by(views: &[StereoView], s: &Surfel) -> Vec<usize> {
+    let sees = |view: &StereoView| {
+        let way = view.camera.position.as_vec3() - s.position;
+        let cosine = way.normalize().dot(s.normal);
+        let (pixel, depth) = view.camera.project(s.position).filter(|_| cosine >= LEAST_COSINE)?;
+        let (w, h) = (view.camera.width as usize, view.camera.height as usize);
+        if !(pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < w as f32 && pixel.y < h as f32) {
+            return None;
+        }
+        let (x, y) = (pixel.x as usize, pixel.y as usize);
+        let nearest = view.depth[y / view.cell * w.div_ceil(view.cell) + x / view.cell];
+        // a cell's depth differs from the point's by the surface's slope, and hypotheses go as far
+        let reach = (REACH + 1.5 * view.cell as f32) * depth / view.camera.fx as f32;
+        (view.usable[y * w + x] && depth <= nearest + reach).then_some(cosine)
+    };
+    let mut seen: Vec<(f32, usize)> =
+        views.iter().enumerate().filter_map(|(v, view)| Some((sees(view)?, v))).collect();
+    seen.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    seen.into_iter().map(|(_, v)| v).collect()
+}
+
+/// Length of a pixel of a camera at a point.
+fn footprint(camera: &Camera, point: Vec3) -> Option<f32> {
+    camera.project(point).map(|(_, depth)| depth / camera.fx as f32)
+}
+
+/// Length of a pixel at a surfel, where `view` is the most frontal of the views that see it and enough of them do:
+/// of all views that find a place one keeps it.
+pub fn owned(views: &[StereoView], view: usize, s: &Surfel) -> Option<f32> {
+    let seen = seen_by(views, s);
+    if seen.len() < LEAST_VIEWS || seen[0] != view {
+        return None;
+    }
+    footprint(&views[view].camera, s.position)
+}
+
+fn match_one(views: &[StereoView], s: &Surfel) -> Option<StereoPoint> {
+    let seen = seen_by(views, s);
+    if seen.len() < LEAST_VIEWS {
+        return None;
+    }
+    let footprint = footprint(&views[seen[0]].camera, s.position)?;
+    let first = s.normal.any_orthonormal_vector();
+    let axes = [first, s.normal.cross(first)];
+    let seen: Vec<Projected> = seen
+        .into_iter()
+        .take(MOST_VIEWS)
+        .filter_map(|v| Projected::new(v, &views[v].camera, s, axes, footprint))
+        .collect();
+    let mut matching = Matching { views, patches: vec![[0f32; PATCH]; seen.len()], seen };
+    let (mut shift, mut step) = matching.search()?;
+    if !matching.keep_fitting(Place { shift, ..Place::default() }) {
+        if matching.seen.len() < LEAST_VIEWS {
+            return None;
+        }
+        (shift, step) = matching.search()?;
+    }
+    let (place, score, curvature) = matching.refine(shift, step)?;
+    let sigma = ((1.0 - score).max(0.0) / curvature).sqrt();
+    if score < LEAST_SCORE || sigma > MOST_SIGMA || place.shift.abs() > REACH {
+        return None;
+    }
+    Some(StereoPoint {
+        position: s.position + place.shift * footprint * s.normal,
+        normal: (s.normal - place.tilt.x * axes[0] - place.tilt.y * axes[1]).normalize(),
+        footprint,
+        sigma,
+    })
+}
+
+/// Points where the photographs agree, in the order of `surfels`; many have none.
+pub fn matches(views: &[StereoView], surfels: &[Surfel]) -> Vec<StereoPoint> {
+    surfels.par_iter().with_min_len(64).filter_map(|s| match_one(views, s)).collect()
+}
+
+/// Those of `points` that half of their neighbors confirm; the points lie about `spacing` apart.
+pub fn confirmed(points: &[StereoPoint], spacing: f32) -> Vec<StereoPoint> {
+    /// Neighbors are within so many spacings.
+    const NEAR: f32 = 2.5;
+    /// How far a neighbor's plane may pass the point, in footprints.
+    const AGREE: f32 = 0.5;
+    /// Neighbors that a point must have.
+    const LEAST: u32 = 4;
+    let near = NEAR * spacing;
+    let cell = |p: Vec3| (p / near).floor().to_array().map(|c| c as i32);
+    let mut cells: HashMap<[i32; 3], Vec<u32>> = HashMap::new();
+    for (i, p) in points.iter().enumerate() {
+        cells.entry(cell(p.position)).or_default().push(i as u32);
+    }
+    let is_confirmed = |i: usize, p: &StereoPoint| {
+        let [x, y, z] = cell(p.position);
+        let (mut neighbors, mut agree) = (0, 0);
+        for k in 0..27 {
+            for &j in cells.get(&[x + k % 3 - 1, y + k / 3 % 3 - 1, z + k / 9 - 1]).into_iter().flatten() {
+                let q = &points[j as usize];
+                let way = p.position - q.position;
+                // not the other side of a thin part
+                if j as usize == i || way.length() > near || p.normal.dot(q.normal) < 0.5 {
+                    continue;
+                }
+                neighbors += 1;
+                let off = way.dot((p.normal + q.normal).normalize());
+                agree += u32::from(off.abs() < AGREE * p.footprint);
+            }
+        }
+        neighbors >= LEAST && 2 * agree >= neighbors
+    };
+    points
+        .par_iter()
+        .enumerate()
+        .with_min_len(256)
+        .filter(|(i, p)| is_confirmed(*i, p))
+        .map(|(_, p)| *p)
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::rng;
+    use glam::{DMat3, DVec3};
+
+    const SIZE: usize = 96;
+
+    /// Looks at the origin from a direction, 3 away: a pixel there is 3 / 150 = 0.02 long.
+    fn looking(from: DVec3) -> Camera {
+        let back = from.normalize();
+        let right = DVec3::Y.cross(back).normalize();
+        let rotation = DMat3::from_cols(right, back.cross(right), back);
+        Camera { rotation, position: 3.0 * back, ..Camera::above(SIZE as u32, SIZE as u32, 150.0, 0.0) }
+    }
+
+    fn cameras() -> Vec<Camera> {
+        let at = |i: usize| {
+            let a = i as f64 * std::f64::consts::TAU / 6.0;
+            looking(DVec3::new(0.5 * a.cos(), 0.5 * a.sin(), 1.0))
+        };
+        (0..6).map(at).chain([looking(DVec3::new(0.05, 0.0, 1.0))]).collect()
+    }
+
+    /// Waves of four to twelve pixels in all directions.
+    fn texture(seed: u64, p: Vec3) -> f32 {
+        let wave = |i: u64| {
+            let (angle, phase) = (6.28 * rng::uniform(seed, 1, i), 6.28 * rng::uniform(seed, 2, i));
+            let length = 0.02 * (4.0 + 8.0 * rng::uniform(seed, 3, i));
+            (6.28 / length * (p.x * angle.cos() + p.y * angle.sin()) + phase).sin()
+        };
+        0.4 + 0.03 * (0..12).map(wave).sum::<f32>()
+    }
+
+    /// Photographs of `color` on the surface whose height over (x, y) is `height`, with noise, gain and offset.
+    fn photographs(
+        cameras: &[Camera],
+        height: impl Fn(f32, f32) -> f32,
+        color: impl Fn(usize, Vec3) -> f32,
+    ) -> Vec<StereoView> {
+        let view = |(v, camera): (usize, &Camera)| {
+            let mut depth = Vec::new();
+            let gray = (0..SIZE * SIZE)
+                .map(|i| {
+                    let (x, y) = (i % SIZE, i / SIZE);
+                    let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).unwrap();
+                    // the surface is flat enough to find by going up and down
+                    let mut p = ray.at(-ray.origin.z / ray.direction.z);
+                    for _ in 0..20 {
+                        p = ray.at((height(p.x, p.y) - ray.origin.z) / ray.direction.z);
+                    }
+                    if x % 4 == 2 && y % 4 == 2 {
+                        depth.push(camera.project(p).unwrap().1);
+                    }
+                    let noise = rng::normal(9, v as u64, i as u64) / 255.0;
+                    (0.7 + 0.1 * v as f32) * color(v, p) + 0.02 * v as f32 + noise
+                })
+                .collect();
+            StereoView { camera: camera.clone(), gray, usable: vec![true; SIZE * SIZE], cell: 4, depth }
+        };
+        cameras.iter().enumerate().map(view).collect()
+    }
+
+    /// Points two pixels apart on a sheet that lies `off` pixels above the plane and is tilted against it.
+    fn surfels(off: f32) -> Vec<Surfel> {
+        let normal = Vec3::new(0.1, -0.08, 1.0).normalize();
+        let at =
+            |i: usize| Vec3::new((i % 15) as f32 * 0.04 - 0.28, (i / 15) as f32 * 0.04 - 0.28, off * 0.02);
+        (0..225).map(|i| Surfel { position: at(i), normal }).collect()
+    }
+
+    /// Half of the errors in pixels are at most this, and so many points there are.
+    fn median(points: &[StereoPoint], height: impl Fn(f32, f32) -> f32) -> (f32, usize) {
+        let off = |p: &StereoPoint| ((p.position.z - height(p.position.x, p.position.y)) / 0.02).abs();
+        let mut off: Vec<f32> = points.iter().map(off).collect();
+        off.sort_by(f32::total_cmp);
+        (off.get(off.len() / 2).copied().unwrap_or(f32::NAN), off.len())
+    }
+
+    #[test]
+    fn a_plane_is_found_to_a_tenth_of_a_pixel_whatever_gain_and_offset() {
+        let cameras = cameras();
+        let views = photographs(&cameras, |_, _| 0.0, |_, p| texture(1, p));
+        for off in [-2.0, 1.5] {
+            let found = matches(&views, &surfels(off));
+            let (error, count) = median(&found, |_, _| 0.0);
+            assert!(count > 200 && error < 0.05, "{count} points, {error} px");
+            // tilted onto the plane: the start is 7 degrees off
+            let upright = found.iter().filter(|p| p.normal.z > 0.9986).count();
+            assert!(upright > 180, "{upright} within 3 degrees");
+            let kept = confirmed(&found, 0.04);
+            assert!(kept.len() > 190 && kept.iter().all(|p| p.position.z.abs() < 0.01), "{}", kept.len());
+        }
+    }
+
+    #[test]
+    fn a_curved_surface_is_found_too() {
+        // a sphere of radius 2, 100 pixels; a flat patch lies some 0.1 pixels inside it
+        let height = |x: f32, y: f32| (4.0 - x * x - y * y).sqrt() - 2.0;
+        let cameras = cameras();
+        let views = photographs(&cameras, height, |_, p| texture(2, p));
+        let surfels: Vec<Surfel> = surfels(1.0)
+            .iter()
+            .map(|s| {
+                let (x, y) = (s.position.x, s.position.y);
+                let normal = Vec3::new(x, y, height(x, y) + 2.0).normalize();
+                Surfel { position: Vec3::new(x, y, height(x, y)) + 0.02 * normal, normal }
+            })
+            .collect();
+        let (error, count) = median(&matches(&views, &surfels), height);
+        assert!(count > 200 && error < 0.12, "{count} points, {error} px");
+    }
+
+    #[test]
+    fn without_texture_or_with_another_in_every_photograph_nothing_is_found() {
+        let cameras = cameras();
+        let flat = photographs(&cameras, |_, _| 0.0, |_, _| 0.5);
+        let others = photographs(&cameras, |_, _| 0.0, |v, p| texture(10 + v as u64, p));
+        for views in [flat, others] {
+            assert_eq!(confirmed(&matches(&views, &surfels(0.5)), 0.04), []);
+        }
+    }
+
+    #[test]
+    fn a_photograph_of_something_else_is_left_out() {
+        let cameras = cameras();
+        let views = photographs(&cameras, |_, _| 0.0, |v, p| texture(if v == 2 { 7 } else { 1 }, p));
+        let (error, count) = median(&matches(&views, &surfels(1.5)), |_, _| 0.0);
+        assert!(count > 150 && error < 0.06, "{count} points, {error} px");
+        // with four of seven too few are left, but where one fits by chance
+        let views =
+            photographs(&cameras, |_, _| 0.0, |v, p| texture(if v > 2 { 7 + v as u64 } else { 1 }, p));
+        let left = confirmed(&matches(&views, &surfels(1.5)), 0.04).len();
+        assert!(left < 22, "{left} of 225");
+    }
+
+    #[test]
+    fn a_point_is_seen_where_nothing_lies_before_it_and_owned_by_the_most_frontal_view() {
+        let cameras = cameras();
+        let mut views = photographs(&cameras, |_, _| 0.0, |_, p| texture(1, p));
+        let s = Surfel { position: Vec3::ZERO, normal: Vec3::Z };
+        assert_eq!(seen_by(&views, &s).len(), 7);
+        assert_eq!(seen_by(&views, &s)[0], 6);
+        // a pixel is 3 / 150
+        assert!((owned(&views, 6, &s).unwrap() - 0.02).abs() < 1e-4);
+        assert_eq!(owned(&views, 0, &s), None);
+        // something 0.5 before it; the tolerance is 5 + 6 pixels, 0.22
+        views[6].depth.iter_mut().for_each(|d| *d -= 0.5);
+        assert!(!seen_by(&views, &s).contains(&6));
+        // a pixel that may not be used
+        views[3].usable.fill(false);
+        assert_eq!(seen_by(&views, &s).len(), 5);
+        // turned away
+        assert!(seen_by(&views, &Surfel { normal: -Vec3::Z, ..s }).is_empty());
+    }
+
+    #[test]
+    fn a_point_that_its_neighbors_contradict_is_dropped() {
+        let point = |i: usize| StereoPoint {
+            position: Vec3::new((i % 5) as f32, (i / 5) as f32, if i == 12 { 2.0 } else { 0.0 }),
+            normal: Vec3::Z,
+            footprint: 0.5,
+            sigma: 0.5,
+        };
+        let all: Vec<StereoPoint> = (0..25).map(point).collect();
+        let kept = confirmed(&all, 1.0);
+        assert_eq!(kept.len(), 24);
+        assert!(kept.iter().all(|p| p.position.z == 0.0));
+        // alone nothing is confirmed
+        assert_eq!(confirmed(&all[..3], 1.0), []);
+    }
+
+    #[test]
+    fn the_peak_of_a_parabola() {
+        // 1 − (x − 0.25)² at −1, 0, 1
+        assert_eq!(toward([-0.5625, 0.9375, 0.4375]), 0.25);
+        assert_eq!(toward([0.0, 0.5, 0.9]), 1.0);
+        let (offset, value, curvature) = parabola([-0.5625, 0.9375, 0.4375], 1.0).unwrap();
+        assert_eq!((offset, value, curvature), (0.25, 1.0, 2.0));
+        assert_eq!(parabola([0.0, 0.5, 0.6], 1.0), None);
+        assert_eq!(parabola([0.5, 0.5, 0.5], 1.0), None);
+    }
+}
