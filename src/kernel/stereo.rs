@@ -415,6 +415,7 @@ mod tests {
     use super::*;
     use crate::kernel::rng;
     use glam::{DMat3, DVec3};
+    use std::f32::consts::TAU;
 
     const SIZE: usize = 96;
 
@@ -428,7 +429,7 @@ mod tests {
 
     fn cameras() -> Vec<Camera> {
         let at = |i: usize| {
-            let a = i as f64 * std::f64::consts::TAU / 6.0;
+            let a = i as f64 * f64::from(TAU) / 6.0;
             looking(DVec3::new(0.5 * a.cos(), 0.5 * a.sin(), 1.0))
         };
         (0..6).map(at).chain([looking(DVec3::new(0.05, 0.0, 1.0))]).collect()
@@ -437,9 +438,9 @@ mod tests {
     /// Waves of four to twelve pixels in all directions.
     fn texture(seed: u64, p: Vec3) -> f32 {
         let wave = |i: u64| {
-            let (angle, phase) = (6.28 * rng::uniform(seed, 1, i), 6.28 * rng::uniform(seed, 2, i));
+            let (angle, phase) = (TAU * rng::uniform(seed, 1, i), TAU * rng::uniform(seed, 2, i));
             let length = 0.02 * (4.0 + 8.0 * rng::uniform(seed, 3, i));
-            (6.28 / length * (p.x * angle.cos() + p.y * angle.sin()) + phase).sin()
+            (TAU / length * (p.x * angle.cos() + p.y * angle.sin()) + phase).sin()
         };
         0.4 + 0.03 * (0..12).map(wave).sum::<f32>()
     }
