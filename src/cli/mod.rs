@@ -255,14 +255,14 @@ the held-out views, their blend and the metrics alone; --fresh render then makes
         #[arg(long)]
         background: Option<String>,
     },
-    /// Stage: blend the views of T-Face and I-Face, or of others
+    /// Stage: blend the views of T-Face, I-Face and its mesh, or of others
     #[command(after_long_help = "Examples:
   tiface ensemble runs/002_00
   tiface ensemble runs/002_00 --fresh ensemble --members tface,volume --weights 0.6,0.4
   tiface ensemble captures/002_00 --members tface,raycast
 
-Without --weights, they are fitted on small squares of the training photographs that no field
-learned from (capture.tiles): the blend follows the better member.")]
+Without --weights, they are fitted on small squares of the training photographs that nothing
+learned from (capture.tiles): the blend follows the better members.")]
     Ensemble {
         #[command(flatten)]
         place: CaptureOrRun,

@@ -14,7 +14,7 @@ table! {
         unit_m: f64, 1e-6..=1e6 => 1.0;
         /// Folder of masks inside the capture, named like the photographs; empty to look for one.
         mask_dir: String => String::new();
-        /// Share of the training photographs' pixels that no field learns from, in small squares, so that the weights
+        /// Share of the training photographs' pixels that nothing learns from, in small squares, so that the weights
         /// of the blend can be fitted there; 0: none.
         tiles: f64, 0.0..=0.25 => 0.04, 0.04, 0.0;
     }

@@ -80,8 +80,8 @@ table! {
         eikonal: f64, 0.0..=1e6 => 0.1;
         /// Weight of the sparsity term, the mean of exp(-scale * |sdf|).
         sparsity: f64, 0.0..=1e6 => 0.0, 0.0, 0.5;
-        /// Weight of the distance to points on which several photographs agree, found by stereo on the surface half-way
-        /// through training; 0: none (published).
+        /// Weight of the distance to points on which several photographs agree, found by stereo on the surface after 0.6
+        /// of the steps; 0: none (published).
         stereo: f64, 0.0..=1e6 => 0.02, 0.02, 0.0;
         /// Cells per axis of the occupancy grid.
         occupancy_resolution: usize, 8.0..=1024.0 => 160, 160, 128;

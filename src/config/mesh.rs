@@ -76,7 +76,7 @@ table! {
         color: ColorSource => ColorSource::Photographs, ColorSource::Photographs, ColorSource::Network;
         /// Texels along each side of the texture; 0: colors at the vertices.
         texture_px: u32, 0.0..=16384.0 => 1024, 2048, 2048;
-        /// Degree of view-dependent lobes in the GLB, 0 (none), 1 or 2: at most, where photographs tell.
+        /// Degree of view-dependent lobes in the GLB, 0 (none), 1 or 2; no view of the mesh has more then.
         lobes: u32, 0.0..=2.0 => 0;
         /// A tangent-space map of the field's normals in the GLB: true or false.
         normal_map: bool => false;
@@ -102,7 +102,7 @@ table! {
         newton_steps: u32 => 2;
         /// How far vertices slide towards the middle of their neighbors with the first step.
         relax: f32 => 0.5;
-        /// Samples along each side of a texel.
+        /// Samples along each side of a texel, where colors are the network's.
         texture_samples: u32 => 2;
         /// Texels that repeat a chart's border around it; charts lie twice as far apart.
         gutter_px: u32 => 8;
@@ -142,10 +142,12 @@ impl MeshConfig {
         }
         // held as floats while they are baked
         let pictures = self.pictures();
-        let gib = (self.texels() * 21 * pictures) >> 30;
+        // and what a fit knows of each texel
+        let fit = if self.color == ColorSource::Photographs { 250 } else { 0 };
+        let gib = (self.texels() * (21 * pictures + fit)) >> 30;
         (gib > 16).then(|| {
-            let problem = format!("is {px}: {pictures} pictures of that size take {gib} GiB to bake");
-            ("mesh.texture_px", problem, "lower it, or `mesh.lobes`")
+            let problem = format!("is {px}: {pictures} pictures of that size take {gib} GiB to make");
+            ("mesh.texture_px", problem, "lower it, or `mesh.lobes`, or set `mesh.color=network`")
         })
     }
 }

@@ -15,7 +15,8 @@ pub enum Method {
     /// I-Face's field, marched and composited.
     #[serde(alias = "iface")]
     Volume,
-    /// Rays cast at I-Face's whole mesh, learned color where they hit.
+    /// Rays cast at I-Face's mesh with all that is known of its color: the head mesh with colors fitted to the
+    /// photographs, or the whole extraction with those of the network, by `mesh.color`.
     Raycast,
     /// Rays cast at the product, color from its texture: what a viewer of `head.glb` sees.
     Textured,
@@ -86,8 +87,8 @@ table! {
         /// Cameras of `tiface render`: test (held-out views); train, orbit or a file (transforms.json or a nerfstudio
         /// camera path) into a folder of their own. Blend and metrics are always of test.
         cameras: String => "test".into();
-        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh, learned color) and textured
-        /// (head.glb, as a viewer shows it).
+        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with all that is known of its color)
+        /// and textured (head.glb, as a viewer shows it).
         method: Vec<Method>
             => vec![Method::Tface, Method::Volume, Method::Raycast],
             vec![Method::Tface, Method::Volume, Method::Raycast],

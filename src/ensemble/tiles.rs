@@ -1,4 +1,4 @@
-//! Squares of the training photographs that no field learns from: what the weights are fitted on.
+//! Squares of the training photographs that nothing learns from: what the weights are fitted on.
 //!
 //! Whole views would be missed by the fields; a few squares of each are not, since other views show the
 //! same skin. They are large enough that what is in them cannot be guessed from the pixels around.

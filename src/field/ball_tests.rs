@@ -157,8 +157,8 @@ pub fn bytes(dir: &Path) -> Vec<u8> {
 }
 
 /// A training that is stopped `stops` times after 11 steps, and whose newest checkpoint is then cut short by a
-/// crash, gives the bytes of an undisturbed one.
-pub fn resumes(run: Run, stops: usize) {
+/// crash, gives the bytes of an undisturbed one, whose folder is returned.
+pub fn resumes(run: Run, stops: usize) -> tempfile::TempDir {
     let (undisturbed, stopped) = (temporary(), temporary());
     run(undisturbed.path(), &Quiet).unwrap();
     for _ in 0..stops {
@@ -169,6 +169,7 @@ pub fn resumes(run: Run, stops: usize) {
     run(stopped.path(), &Quiet).unwrap();
     assert_eq!(bytes(undisturbed.path()), bytes(stopped.path()));
     assert!(!stopped.path().join("checkpoint.previous.safetensors").exists());
+    undisturbed
 }
 
 /// Each changed checkpoint of a training that was stopped twice is named by what is wrong with it, and the one

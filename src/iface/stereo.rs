@@ -151,7 +151,7 @@ fn first_crossings(
         })
         .collect();
     let rays: Vec<MarchRay> = pixels.iter().map(|p| p.1).collect();
-    let samples = occupancy.march(config, config.min_step * config.radius, &rays);
+    let samples = occupancy.march(config, config.min_step, &rays);
     let at = |r: usize, t: f32| std::array::from_fn(|a| rays[r].origin[a] + t * rays[r].direction[a]);
     // the first step from outside to inside, some samples of every ray after the others
     let mut crossing = vec![None; rays.len()];
@@ -240,7 +240,13 @@ pub fn points(
 ) -> Vec<SurfacePoint> {
     let (seen, surfels) = surface(views, config, field, occupancy);
     let found = stereo::matches(&seen, &surfels);
-    let Some(footprint) = found.iter().map(|p| p.footprint).min_by(f32::total_cmp) else { return Vec::new() };
+    // the middle one: a few photographs may be taken from near by
+    let mut footprints: Vec<f32> = found.iter().map(|p| p.footprint).collect();
+    let middle = footprints.len() / 2;
+    if footprints.is_empty() {
+        return Vec::new();
+    }
+    let footprint = *footprints.select_nth_unstable_by(middle, f32::total_cmp).1;
     let point = |p: StereoPoint| SurfacePoint {
         position: (p.position * config.radius).to_array(),
         footprint: p.footprint * config.radius,

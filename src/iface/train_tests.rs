@@ -62,18 +62,19 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
 #[test]
 fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
     let (views, hull) = (textured_views(), hull());
-    let config = IfaceConfig { steps: 100, ..config() };
+    let config = IfaceConfig { steps: 40, ..config() };
     let run = |dir: &Path, monitor: &dyn Monitor| {
         train(&views, Some(&hull), &config, &session("iface", dir, "waves", monitor)).map(|(_, r)| r.warnings)
     };
-    resumes(&run, 8);
-    let dir = temporary();
-    run(dir.path(), &Quiet).unwrap();
-    let mut file = Checkpoint::read(&checkpoint::newest(dir.path()), "iface", FORMAT).unwrap();
-    let state = SdfState::restore(&config, Some(&hull), &mut file, &field::device("cpu").unwrap()).unwrap();
+    // stopped before step 24, at which points are found, and after it
+    let dir = resumes(&run, 3);
+    let state = |config: &IfaceConfig, dir: &Path| {
+        let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT).unwrap();
+        SdfState::restore(config, Some(&hull), &mut file, &field::device("cpu").unwrap()).unwrap()
+    };
     // a pixel is 2.4 / 120 = 0.02
     let off = |p: &SurfacePoint| (Vec3::from(p.position).length() - BALL).abs();
-    let mut off: Vec<f32> = state.stereo.iter().map(off).collect();
+    let mut off: Vec<f32> = state(&config, dir.path()).stereo.iter().map(off).collect();
     off.sort_by(f32::total_cmp);
     assert!(
         off.len() > 100 && off[off.len() / 2] < 0.005,
@@ -81,6 +82,9 @@ fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
         off.len(),
         off.get(off.len() / 2)
     );
+    let (none, dir) = (IfaceConfig { stereo: 0.0, steps: 4, start: Start::Sphere, ..config }, temporary());
+    train(&views, Some(&hull), &none, &session("iface", dir.path(), "waves", &Quiet)).unwrap();
+    assert!(state(&none, dir.path()).stereo.is_empty());
 }
 
 #[test]

@@ -142,8 +142,8 @@ impl Projected {
         })
     }
 
-    /// Looks the patch up: brightness with mean 0 and length 1. False, and zeros, where it leaves the picture or shows
-    /// nothing.
+    /// Looks the patch up: brightness with mean 0 and length 1. False, and zeros, where it leaves the picture or its
+    /// usable part, or shows nothing.
     fn look_up(&self, view: &StereoView, place: Place, patch: &mut [f32; PATCH]) -> bool {
         let center = self.center + place.shift * (self.slope + place.shift * self.bend) - 0.5;
         let [a, b] = [0, 1].map(|k| self.axes[k] + place.tilt[k] * self.slope);
@@ -152,7 +152,9 @@ impl Projected {
         let (low, high) = (center - extent, center + extent);
         // a little inside: sums of steps round
         let inside = low.min_element() >= 0.01 && high.x < w as f32 - 1.01 && high.y < h as f32 - 1.01;
-        if !inside {
+        // moved, a patch may come to lie on what is not head or not to be looked at
+        let middle = (center + 0.5).as_uvec2();
+        if !inside || !view.usable[middle.y as usize * w + middle.x as usize] {
             patch.fill(0.0);
             return false;
         }
@@ -343,6 +345,9 @@ fn match_one(views: &[StereoView], s: &Surfel) -> Option<StereoPoint> {
         .take(MOST_VIEWS)
         .filter_map(|v| Projected::new(v, &views[v].camera, s, axes, footprint))
         .collect();
+    if seen.len() < LEAST_VIEWS {
+        return None;
+    }
     let mut matching = Matching { views, patches: vec![[0f32; PATCH]; seen.len()], seen };
     let (mut shift, mut step) = matching.search()?;
     if !matching.keep_fitting(Place { shift, ..Place::default() }) {

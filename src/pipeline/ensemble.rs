@@ -5,7 +5,7 @@
 //!          weights.json   the weights, and what they gain where they were fitted
 //! ```
 //!
-//! The weights are fitted on the squares of the training photographs that no field learned from, unless they are given.
+//! The weights are fitted on the squares of the training photographs that nothing learned from, unless they are given.
 
 use super::line::Line;
 use super::render::{Meshes, Renderer, cameras};

@@ -36,6 +36,7 @@ pub(super) fn finish(
     surface: &Mesh,
     cell: f32,
     closed: &ClosedSurface,
+    cameras: &[Camera],
     photographs: &[Photograph],
     scene: &Scene,
     export: &Export,
@@ -61,7 +62,11 @@ pub(super) fn finish(
     let asset_from_world = export.asset_from_world(&mesh, &world_from_scene);
     let turned = asset_from_world * world_from_scene.rotation_f32();
     let most = if c.lobes > 0 { c.lobes } else { 2 };
-    let photographs_say = c.color == ColorSource::Photographs;
+    let fits = c.color == ColorSource::Photographs;
+    let photographs_say = fits && photographs.iter().any(|p| p.head_pixels() > 0);
+    if fits && !photographs_say {
+        warnings.push("no photograph shows the head alone: the mesh has the colors of the network".into());
+    }
     if c.texture_px == 0 {
         let mut harmonics = None;
         if photographs_say
@@ -82,7 +87,6 @@ pub(super) fn finish(
     warnings.extend(done.warnings());
     report.insert("atlas".into(), json!(done));
 
-    let cameras: Vec<Camera> = photographs.iter().map(|p| p.camera.clone()).collect();
     let config = BakeConfig {
         // what photographs are to say need not be said exactly
         side: if photographs_say { 1 } else { c.texture_samples },
@@ -95,7 +99,7 @@ pub(super) fn finish(
     };
     let colors = |p: &[Vec3], n: &[Vec3], counts: &[u32], d: &[Vec3]| closed.colors(p, n, counts, d);
     let learned = Learned { gradient: &gradient, colors: &colors };
-    let mut baked = bake(&mesh, &layout, &learned, &cameras, &config, monitor)?;
+    let mut baked = bake(&mesh, &layout, &learned, cameras, &config, monitor)?;
     report.insert("bake".into(), json!(baked.report));
     let mut harmonics = None;
     if photographs_say {

@@ -4,9 +4,12 @@ use super::tests::{NoFields, quiet, words};
 use super::*;
 use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticHead, SyntheticOptions, write_capture};
-use crate::config::{Config, Genus, MaskSource, MeshFormat, MeshFrame, Method, Preset, ViewBackground};
+use crate::config::{
+    ColorSource, Config, Genus, MaskSource, MeshFormat, MeshFrame, Method, Preset, ViewBackground,
+};
 use crate::geom::{Camera, Similarity};
 use crate::io::{self, Limits};
+use crate::metrics::compare;
 use crate::render::RenderedView;
 use crate::run::{Run, Stop};
 use crate::{ErrorKind, Result};
@@ -147,7 +150,10 @@ fn the_textured_head_looks_like_the_field_it_was_baked_from() {
     config.render.method = vec![Method::Raycast, Method::Textured];
     config.ensemble.members = Vec::new();
     let mut errors = Vec::new();
-    for (lobes, frame) in [(0, MeshFrame::Dataset), (1, MeshFrame::Dataset), (1, MeshFrame::Head)] {
+    let network = [(0, MeshFrame::Dataset), (1, MeshFrame::Dataset), (1, MeshFrame::Head)];
+    let all = network.map(|(lobes, frame)| (ColorSource::Network, lobes, frame));
+    for (color, lobes, frame) in all.into_iter().chain([(ColorSource::Photographs, 1, MeshFrame::Head)]) {
+        config.mesh.color = color;
         config.mesh.lobes = lobes;
         config.mesh.normal_map = lobes > 0;
         config.mesh.frame = frame;
@@ -167,6 +173,18 @@ fn the_textured_head_looks_like_the_field_it_was_baked_from() {
         let picture = |method: &str| {
             pictures::read(&run.path(format!("render/{method}/012.png")), config.render.format).unwrap()
         };
+        // by the photographs: what rays show is what a viewer shows, and near the photograph
+        if color == ColorSource::Photographs {
+            let view = line.capture.views.iter().find(|v| v.name == "012").unwrap();
+            let photo = view.load(&Limits::default()).unwrap();
+            let figures = |method: &str| {
+                compare("012", &picture(method), &photo.photo, photo.mask.as_ref(), None).unwrap()
+            };
+            let [raycast, textured] = ["raycast", "textured"].map(|m| figures(m).psnr_masked.unwrap());
+            assert!(raycast > 28.0 && (raycast - textured).abs() < 0.3, "{raycast} {textured}");
+            assert!(mesh["steps"]["appearance"]["psnr"][1].as_f64().unwrap() > 30.0, "{mesh}");
+            continue;
+        }
         let (whole, textured) = (picture("raycast"), picture("textured"));
         let (mut sum, mut n) = (0.0, 0);
         for (a, b) in whole.data.as_chunks::<4>().0.iter().zip(textured.data.as_chunks::<4>().0) {

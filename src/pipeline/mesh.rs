@@ -14,7 +14,7 @@ use super::tiles;
 use crate::Result;
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, Split};
-use crate::config::{Config, Genus, MeshConfig, MeshFormat};
+use crate::config::{ColorSource, Config, Genus, MeshConfig, MeshFormat};
 use crate::geom::{Camera, Mesh, Similarity};
 use crate::image::Image;
 use crate::io::{self, Limits};
@@ -60,8 +60,11 @@ pub(super) fn mesh(
     write_files(&to_ply(&surface, None, &in_world)?, dir.folder())?;
     let surface_triangles = surface.triangles.len();
     // vertices have the color seen straight; textures and rays that of the cameras, and so their cap
-    let views = tiles::training_views(capture, scene, config)?;
-    let cameras: Vec<Camera> = views.iter().map(|v| v.0.clone()).collect();
+    let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
+    let views = match c.color {
+        ColorSource::Photographs => tiles::training_views(capture, scene, config)?,
+        ColorSource::Network => Vec::new(),
+    };
     if let Some(cap) = cap.as_mut() {
         let learned = Learned {
             gradient: &|p| field.sdf_gradient(p),
@@ -80,8 +83,17 @@ pub(super) fn mesh(
         })
         .collect();
     let closed = ClosedSurface { field, cap: cap.as_ref(), patches: patches.as_ref() };
-    let finished =
-        finish(&surface, report.cell_size, &closed, &photographs, scene, &export, c, dir.monitor())?;
+    let finished = finish(
+        &surface,
+        report.cell_size,
+        &closed,
+        &cameras,
+        &photographs,
+        scene,
+        &export,
+        c,
+        dir.monitor(),
+    )?;
     let FinishedHead { head, linear, report: steps, warnings } = finished;
     warnings.iter().for_each(|w| dir.warn(w));
 

@@ -93,6 +93,8 @@ pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
 pub(super) struct Meshes {
     extracted: Option<ExtractedSurface>,
     head: Option<HeadMesh>,
+    /// Is the head shown as a viewer shows it, and with all that is known of its color?
+    shown: [bool; 2],
 }
 
 impl Meshes {
@@ -109,7 +111,7 @@ impl Meshes {
                 "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
             ));
         }
-        Ok(Meshes { extracted, head })
+        Ok(Meshes { extracted, head, shown: [textured, raycast && fitted] })
     }
 }
 
@@ -124,7 +126,7 @@ struct VisibleHead<'a> {
 }
 
 impl<'a> VisibleHead<'a> {
-    fn new(head: &'a HeadMesh) -> VisibleHead<'a> {
+    fn new(head: &'a HeadMesh, shown: [bool; 2]) -> VisibleHead<'a> {
         let (mesh, world_from_scene) = (&head.mesh, head.world_from_scene.rotation_f32());
         let texture = |lobes: bool| {
             let texture = head.texture.as_ref()?;
@@ -135,7 +137,9 @@ impl<'a> VisibleHead<'a> {
             });
             Some(MeshTexture::new(mesh, &texture.atlas, &texture.color, lobes.as_ref()))
         };
-        VisibleHead { head, bvh: Bvh::new(mesh), shown: texture(true), base: texture(false) }
+        let [shown, base] = [(shown[0], true), (shown[1], false)]
+            .map(|(is_shown, lobes)| is_shown.then(|| texture(lobes)).flatten());
+        VisibleHead { head, bvh: Bvh::new(mesh), shown, base }
     }
 
     /// sRGB-coded colors of what rays met, with all that is known of them.
@@ -177,7 +181,7 @@ impl<'a> Renderer<'a> {
         Renderer {
             fields,
             extracted: meshes.extracted.as_ref().map(|s| (s, Bvh::new(&s.mesh))),
-            head: meshes.head.as_ref().map(VisibleHead::new),
+            head: meshes.head.as_ref().map(|head| VisibleHead::new(head, meshes.shown)),
             samples,
             world_from_scene: scene.scene_from_world.inverse(),
             monitor,

@@ -15,7 +15,7 @@
 //!
 //! It is solved twice. The diffuse color (one function) has the finest nodes there are, and is what every viewer
 //! shows. What depends on the view is smooth over the surface, so that the vertices carry it, as a difference to the
-//! diffuse color. What no photograph shows follows its neighbors, so that the colors of before show through.
+//! diffuse color. What no photograph shows follows its neighbors some nodes far, and keeps its color beyond.
 
 mod nodes;
 mod rows;
@@ -75,7 +75,7 @@ pub struct AppearanceReport {
     pub seen: f64,
     /// Degree of what depends on the view.
     pub degree: u32,
-    /// Weight of its smoothness.
+    /// Weight of its smoothness, if its degree is above 0.
     pub smoothness: f32,
     /// PSNR of photographs left out, dB: diffuse, then per candidate (degree, smoothness, PSNR).
     pub left_out: Vec<(u32, f32, f64)>,
@@ -95,8 +95,8 @@ pub enum Colors<'a> {
     Vertices,
 }
 
-/// Fits colors to photographs. What depends on the view has degree `most` (0, 1 or 2) at most; the degree and its
-/// smoothness are those that show photographs best that were left out of a first fit.
+/// Fits colors to photographs, whose masks have their sizes; vertices have colors. What depends on the view has degree
+/// `most` at most, and 2; the degree and its smoothness are those that show photographs best that were left out of a first fit.
 ///
 /// Returns `None` where no photograph shows the head.
 ///
@@ -111,7 +111,7 @@ pub fn fit(
     turned: Mat3,
     monitor: &dyn Monitor,
 ) -> Result<Option<Appearance>> {
-    let begin = Instant::now();
+    let (begin, most) = (Instant::now(), most.min(2));
     let head: usize = photographs.iter().map(Photograph::head_pixels).sum();
     let stride = (head as f64 / PIXELS as f64).sqrt().ceil().max(1.0) as u32;
     let rows = Rows::new(mesh, &Bvh::new(mesh), photographs, stride, turned);
@@ -132,7 +132,8 @@ pub fn fit(
         Colors::Vertices => VERTICES[0],
     };
     monitor.check_stop()?;
-    let choice = choose(&rows.quarter(), &vertices, (&fine, &before, &smooth), photographs.len(), most);
+    let fine_start = (&fine, &before[..], &smooth);
+    let choice = choose(&rows.quarter(), &vertices, fine_start, photographs.len(), most, monitor)?;
     let Choice { degree, smoothness, gains, left_out } = choice;
     monitor.check_stop()?;
 
@@ -162,7 +163,8 @@ pub fn fit(
         Colors::Vertices => (Default::default(), own),
         Colors::Texels(_, image) => (fine.onto(&own, image), fine.at_corners(mesh, &own)),
     };
-    let of_all = gains.iter().flatten().copied();
+    let shown = |v: &usize| rows.view.binary_search(&(*v as u32)).is_ok();
+    let of_all = (0..gains.len()).filter(shown).flat_map(|v| gains[v]);
     report = AppearanceReport {
         pixels: rows.len(),
         seen,
@@ -191,7 +193,8 @@ fn choose(
     (fine, before, smooth): (&Nodes, &[[f32; 3]], &Smoothness),
     photographs: usize,
     most: u32,
-) -> Choice {
+    monitor: &dyn Monitor,
+) -> Result<Choice> {
     let all = |_: u32| true;
     let held = |v: u32| v % LEFT_OUT == LEFT_OUT / 2;
     let ones = vec![[1f32; 3]; photographs];
@@ -205,6 +208,7 @@ fn choose(
     let (count, mut gains) = (functions(most.min(1)), ones.clone());
     for _ in 0..2 {
         let target = of_fine.missing(&photo(rows, &gains), before, 1);
+        monitor.check_stop()?;
         let x = of_vertices.solve(&target, count, &VERTICES[0], &all);
         gains = gains_of(rows, &of_vertices.missing(&start, &x, count), photographs);
     }
@@ -218,18 +222,19 @@ fn choose(
     let mut candidates: Vec<(u32, Smoothness, f64)> = Vec::new();
     candidates.push((0, VERTICES[1], judge(&rest)));
     for (degree, smoothness) in (1..=most).flat_map(|d| VERTICES.map(|s| (d, s))) {
+        monitor.check_stop()?;
         let x = of_vertices.solve(&rest, functions(degree), &smoothness, &|v| !held(v));
         let error = of_vertices.missing(&rest, &x, functions(degree));
         candidates.push((degree, smoothness, judge(&error)));
     }
     let left_out = candidates.iter().map(|(d, s, db)| (*d, s.others, *db)).collect();
     // where there is nothing to judge by, the careful one
-    let enough = (0..photographs as u32).any(held) && photographs > 2;
+    let enough = (0..photographs as u32).any(held);
     let best = match enough {
         true => candidates.iter().fold(&candidates[0], |best, c| if c.2 > best.2 { c } else { best }),
         false => &candidates[0],
     };
-    Choice { degree: best.0, smoothness: best.1, gains, left_out }
+    Ok(Choice { degree: best.0, smoothness: best.1, gains, left_out })
 }
 
 /// The photographs' pixels with gains, `[rows]`.

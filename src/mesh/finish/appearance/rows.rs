@@ -9,6 +9,9 @@ use rayon::prelude::*;
 /// Rays along each side of a pixel.
 const SIDE: u32 = 2;
 
+/// Mask from which on a pixel shows the head alone: matting and lossy masks rarely say 255 everywhere.
+const OPAQUE: u8 = 250;
+
 /// Rays of a pixel.
 const RAYS: usize = (SIDE * SIDE) as usize;
 
@@ -29,7 +32,7 @@ impl Photograph<'_> {
     /// Returns whether a pixel shows the head alone. Soft pixels show what is behind the head, too, and would paint
     /// the outline with it.
     fn is_head(&self, at: usize) -> bool {
-        self.mask.is_none_or(|m| m.values[at] == 255) && self.valid.is_none_or(|v| v.values[at] > 0)
+        self.mask.is_none_or(|m| m.values[at] >= OPAQUE) && self.valid.is_none_or(|v| v.values[at] > 0)
     }
 
     /// Returns how many pixels show the head alone.

@@ -1,8 +1,8 @@
-//! Learned color becomes texels.
+//! Learned color becomes texels: all of it, or what photographs are to improve on.
 //!
 //! Every texel that a chart covers is looked at through several samples (`cover`); each sample moves onto the
 //! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
-//! they see in linear light (`light`). What the cameras see differently can be kept as a few lobes a texel
+//! they see in linear light (`light`), or those of them that look most directly. What the cameras see differently can be kept as a few lobes a texel
 //! ([`lobes`]), and the field's normal as a picture of normals
 //! ([`tangent_space`]). Gaps are filled by `fill`; color and lobes are then made to agree along seams by [`Seams`].
 //!
