@@ -62,22 +62,22 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
 #[test]
 fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
     let (views, hull) = (textured_views(), hull());
-    let config = IfaceConfig { steps: 40, ..config() };
+    let config = IfaceConfig { steps: 70, ..config() };
     let run = |dir: &Path, monitor: &dyn Monitor| {
         train(&views, Some(&hull), &config, &session("iface", dir, "waves", monitor)).map(|(_, r)| r.warnings)
     };
-    // stopped before step 24, at which points are found, and after it
-    let dir = resumes(&run, 3);
+    // stopped before step 42, at which points are found, and after it
+    let dir = resumes(&run, 5);
     let state = |config: &IfaceConfig, dir: &Path| {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT).unwrap();
         SdfState::restore(config, Some(&hull), &mut file, &field::device("cpu").unwrap()).unwrap()
     };
-    // a pixel is 2.4 / 120 = 0.02
+    // a pixel is 2.4 / 120 = 0.02, and a flat patch of 9 on a ball of 25 lies some 0.2 of one inside
     let off = |p: &SurfacePoint| (Vec3::from(p.position).length() - BALL).abs();
     let mut off: Vec<f32> = state(&config, dir.path()).stereo.iter().map(off).collect();
     off.sort_by(f32::total_cmp);
     assert!(
-        off.len() > 100 && off[off.len() / 2] < 0.005,
+        off.len() > 100 && off[off.len() / 2] < 0.007,
         "{} points, {:?}",
         off.len(),
         off.get(off.len() / 2)

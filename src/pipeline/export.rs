@@ -198,7 +198,7 @@ mod tests {
         assert!(mesh.is_closed());
         let mut far = test_head();
         far.texture.as_mut().unwrap().atlas.triangles = vec![[0, 1, 2]; mesh.triangles.len()];
-        far.mesh = mesh.clone();
+        (far.mesh, far.harmonics) = (mesh.clone(), None);
         // as it is when it has been kept for a while
         let dir = tempfile::tempdir().unwrap();
         far.save(dir.path()).unwrap();

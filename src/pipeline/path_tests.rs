@@ -247,7 +247,10 @@ fn a_stage_command_does_not_shrink_the_report_of_a_finished_run() {
     evaluate(&line);
     let page = || std::fs::read_to_string(run.path("report.html")).unwrap();
     let whole = page();
-    assert_eq!(whole.matches("<h2>mask</h2>").count() + whole.matches("<h2>metrics</h2>").count(), 2);
+    assert_eq!(
+        whole.matches("<h2>mask</h2>").count() + whole.matches("<h2>Against the photographs</h2>").count(),
+        2
+    );
     std::fs::remove_file(run.path("report.html")).unwrap();
     // as a later command on one stage leaves it
     let line = Line::open(&config, &run).unwrap();
