@@ -34,6 +34,7 @@ mod page;
 mod path;
 mod pictures;
 mod plan;
+mod preview;
 mod render;
 mod scene_file;
 mod surface;
@@ -46,6 +47,7 @@ pub use export::Export;
 pub use line::{Line, capture_options, feasible};
 pub use mask::{click_page, disagreements};
 pub use mesh::export_head;
+pub use preview::{Preview, PreviewPicture, PreviewRenderer};
 pub use surface::{Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
 

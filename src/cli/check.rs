@@ -7,7 +7,7 @@ use crate::capture::{self, CaptureOptions, Split, View};
 use crate::geom::{Bvh, Camera};
 use crate::io::{self, Limits};
 use crate::mesh::files::{CheckReport, UvReport, check_around, uv_check};
-use crate::mesh::files::{PictureSource, ReadMesh, ReadOptions, picture_of_mtl, read_with, weld};
+use crate::mesh::files::{PictureSource, ReadMesh, ReadOptions, picture_beside, read_with, weld};
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
 use crate::{Error, ErrorKind, Result};
@@ -117,26 +117,16 @@ const UNKNOWN_PX: u32 = 1024;
 
 /// Returns whether there is a picture, and the texture coordinates, measured.
 fn check_texture(found: &ReadMesh, path: &Path) -> (bool, Option<UvReport>) {
-    let beside = match &found.picture {
-        Some(PictureSource::Beside(name)) => Some(name.clone()),
-        Some(PictureSource::Material(mtl)) => picture_of_material(&path.with_file_name(mtl)),
-        Some(PictureSource::Inside(_)) | None => None,
-    };
+    let beside = picture_beside(found.picture.as_ref(), path).ok().flatten();
     let is_there = beside.is_some() || matches!(found.picture, Some(PictureSource::Inside(_)));
     let uv = found.atlas.clone().map(|mut atlas| {
         if atlas.width == 0 || atlas.height == 0 {
-            let info =
-                beside.and_then(|name| io::picture_info(&path.with_file_name(name), &Limits::default()).ok());
+            let info = beside.and_then(|file| io::picture_info(&file, &Limits::default()).ok());
             (atlas.width, atlas.height) = info.map_or((UNKNOWN_PX, UNKNOWN_PX), |i| i.size(None));
         }
         uv_check(&weld(&found.mesh), &atlas)
     });
     (is_there, uv)
-}
-
-/// The name of the picture that a material file gives.
-fn picture_of_material(mtl: &Path) -> Option<String> {
-    picture_of_mtl(&io::read_bytes(mtl, &Limits::default()).ok()?, mtl).ok()?
 }
 
 pub(super) fn run(

@@ -14,6 +14,7 @@ mod options;
 mod out;
 mod page;
 mod plain;
+mod preview;
 mod run;
 mod screen;
 mod signals;
@@ -29,6 +30,7 @@ use clap::{Args, CommandFactory, Parser, Subcommand};
 use invocation::Invocation;
 use options::{Common, KeyOption};
 use out::Out;
+use preview::PreviewOptions;
 use run::LineCommand;
 use screen::Screen;
 use std::path::PathBuf;
@@ -281,6 +283,12 @@ learned from (capture.tiles): the blend follows the better members.")]
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
+    /// A picture of a run's mesh, or of any .glb, .obj or .ply
+    #[command(after_long_help = "Examples:
+  tiface preview runs/002_00                    three quarters of the head, 1024 pixels, as a PNG
+  tiface preview scan.ply --light matcap --size 512 --out scan.png
+  tiface preview head.glb --light normals --background black")]
+    Preview(PreviewOptions),
     /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates, size
     #[command(after_long_help = "Examples:
   tiface check head.glb
@@ -353,6 +361,7 @@ pub fn main() -> ExitCode {
         }
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
+        Command::Preview(options) => preview::run(&invocation, options),
         Command::Status { runs } => makes_nothing("status").and_then(|()| status::run(&common, runs)),
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),

@@ -27,6 +27,7 @@ fn endings(product: &str) -> &'static [&'static str] {
         "mesh" => &["glb", "obj", "ply"],
         "metrics" => &["json"],
         "page" => &["html"],
+        "preview" => &["png"],
         _ => &[],
     }
 }

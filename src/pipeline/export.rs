@@ -71,13 +71,9 @@ impl Export {
         }
     }
 
-    /// Where the face of a head at `center` looks, a unit vector of the world across `up`: taken to be where most
-    /// cameras stand. `None` where they stand all around.
+    /// Where the face of a head at `center` looks: see [`front`].
     pub fn front(&self, center: DVec3) -> Option<Vec3> {
-        let up = self.up.as_dvec3().normalize_or(DVec3::Y);
-        let across = |c: &DVec3| (c - center).reject_from_normalized(up).normalize_or_zero();
-        let towards: DVec3 = self.cameras.iter().map(across).sum();
-        (towards.length() > 1e-3).then(|| towards.normalize().as_vec3())
+        front(self.up, &self.cameras, center)
     }
 
     /// The turn that brings up to +Y and the face of a head at `center` towards +Z.
@@ -108,6 +104,15 @@ impl Export {
             MeshFrame::Head => self.head_from_world(center(mesh, world_from_mesh)).as_mat3(),
         }
     }
+}
+
+/// Where the face of a head at `center` looks, a unit vector of the world across `up`: taken to be where most `cameras`
+/// stand. `None` where they stand all around.
+pub(super) fn front(up: Vec3, cameras: &[DVec3], center: DVec3) -> Option<Vec3> {
+    let up = up.as_dvec3().normalize_or(DVec3::Y);
+    let across = |c: &DVec3| (c - center).reject_from_normalized(up).normalize_or_zero();
+    let towards: DVec3 = cameras.iter().map(across).sum();
+    (towards.length() > 1e-3).then(|| towards.normalize().as_vec3())
 }
 
 /// The middle of a mesh's box, in the world.

@@ -122,7 +122,7 @@ pub(super) fn read_float(file: &Path) -> Result<Image, ReadError> {
 }
 
 /// Coded color no longer multiplied by alpha.
-fn straight([r, g, b, a]: [f32; 4]) -> [f32; 4] {
+pub(super) fn straight([r, g, b, a]: [f32; 4]) -> [f32; 4] {
     let k = if a > 0.0 { 1.0 / a } else { 0.0 };
     [r * k, g * k, b * k, a]
 }

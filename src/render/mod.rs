@@ -1,8 +1,12 @@
 //! Stage · ways to make a view.
 
+mod look;
 pub mod path;
+mod raster;
 mod raycast;
 mod texture;
 
+pub use look::{Look, Surface};
+pub use raster::{RasterOptions, RasterView, raster};
 pub use raycast::{RayHits, RaycastOptions, RenderedView, raycast};
 pub use texture::{LobePictures, MeshTexture};

@@ -1,0 +1,160 @@
+//! Pictures of a mesh to look at: of a run's head, or of a file that anybody wrote.
+
+use super::export::{center as center_of, front as front_of};
+use super::pictures::{behind, over, straight};
+use super::scene_file::read_capture;
+use crate::config::ViewBackground;
+use crate::geom::{Atlas, Camera, Distortion};
+use crate::image::quantize;
+use crate::io;
+use crate::mesh::files::{HeadMesh, OpenedMesh, open_mesh};
+use crate::render::path::{NamedCamera, orbit};
+use crate::render::{LobePictures, Look, MeshTexture, RasterOptions, RasterView, Surface, raster};
+use crate::{Error, Result};
+use glam::{DMat3, DVec3, Vec3};
+use std::path::Path;
+
+/// The lens of a preview: the distance at which a picture shows as much as it is wide. A long one, as for portraits.
+const FOCAL: f64 = 2.5;
+
+/// A mesh that can be shown.
+pub struct Preview {
+    head: HeadMesh,
+    /// Where its triangles would lie in a texture that it does not have.
+    bare_atlas: Option<Atlas>,
+    /// Unit, in the mesh's coordinates, across each other.
+    up: Vec3,
+    front: Vec3,
+    /// What of it cannot be shown.
+    pub warnings: Vec<String>,
+}
+
+impl Preview {
+    /// Returns the head of a run as the stage `mesh` left it. Its photographs are not opened, and no stage is disturbed.
+    ///
+    /// # Errors
+    ///
+    /// The run has no mesh yet, or it is damaged.
+    pub fn of_run(run: &Path) -> Result<Preview> {
+        if !io::is_file(&run.join("mesh/done.json")) {
+            let what = format!("the run `{}` has no mesh yet", run.display());
+            return Err(Error::cannot(what, format!("make one: `tiface mesh {}`", run.display())));
+        }
+        let head = HeadMesh::load(&run.join("mesh/parts"))?;
+        let capture = read_capture(&run.join("cameras.json"), Path::new(""))?;
+        let to_scene = head.world_from_scene.rotation_f32().transpose();
+        let center = center_of(&head.mesh, &head.world_from_scene);
+        let eyes: Vec<DVec3> = capture.views.iter().map(|v| v.camera.position).collect();
+        let front = front_of(capture.up, &eyes, center);
+        let up = to_scene * capture.up.normalize_or(Vec3::Y);
+        let front = front.map_or_else(|| up.any_orthonormal_vector(), |f| to_scene * f);
+        Ok(Preview { head, bare_atlas: None, up, front, warnings: Vec::new() })
+    }
+
+    /// Returns the mesh in a `.glb`, `.obj` or `.ply` file. `up` is where its up is, +Y for most; its front is then +Z, or
+    /// −Y where +Z is up, as in Blender.
+    ///
+    /// # Errors
+    ///
+    /// The file cannot be read, or has no surface.
+    pub fn of_file(path: &Path, up: Vec3) -> Result<Preview> {
+        let OpenedMesh { head, bare_atlas, warnings } = open_mesh(path)?;
+        let front = if up.z.abs() > 0.5 { Vec3::NEG_Y } else { Vec3::Z };
+        Ok(Preview { head, bare_atlas, up, front, warnings })
+    }
+
+    /// What is shown where nobody asks for a look: its color if it has one, else its shape.
+    pub fn look(&self) -> Look {
+        let is_colored = self.head.texture.is_some() || !self.head.mesh.colors.is_empty();
+        if is_colored { Look::Unlit } else { Look::Studio }
+    }
+
+    /// Does it say where its triangles lie in a texture?
+    pub fn has_uvs(&self) -> bool {
+        self.head.texture.is_some() || self.bare_atlas.is_some()
+    }
+
+    /// Returns `count` cameras on a circle around the mesh, in its coordinates, so far away that square pictures of `side`
+    /// pixels show all of it. The first stands `turn` radians from the front towards the mesh's left, and all of them
+    /// `tilt` radians above.
+    pub fn around(&self, turn: f64, tilt: f64, side: u32, count: usize) -> Result<Vec<NamedCamera>> {
+        let (up, front) = (self.up.as_dvec3(), self.front.as_dvec3());
+        let level = front * turn.cos() + up.cross(front) * turn.sin();
+        let (mut up, mut toward) = (up, level * tilt.cos() + up * tilt.sin());
+        if tilt.cos() < 1e-3 {
+            // from above: the front is below
+            (up, toward) = (-level, up);
+        }
+        let bounds = self.head.mesh.bounds();
+        let reach = 0.5 * f64::from(bounds.size().length());
+        let side_px = f64::from(side);
+        let like = Camera {
+            width: side,
+            height: side,
+            fx: FOCAL * side_px,
+            fy: FOCAL * side_px,
+            cx: 0.5 * side_px,
+            cy: 0.5 * side_px,
+            distortion: Distortion::default(),
+            rotation: DMat3::IDENTITY,
+            position: bounds.center().as_dvec3() + reach * toward,
+        };
+        orbit(&[like], bounds, up.as_vec3(), count)
+    }
+
+    /// Prepares it for pictures.
+    pub fn renderer(&self) -> PreviewRenderer<'_> {
+        let HeadMesh { mesh, world_from_scene, texture, .. } = &self.head;
+        let texture = texture.as_ref().map(|texture| {
+            let lobes = texture.lobes.as_ref().map(|l| LobePictures {
+                pictures: &l.pictures,
+                scale: &l.scale,
+                turned: l.asset_from_world * world_from_scene.rotation_f32(),
+            });
+            MeshTexture::new(mesh, &texture.atlas, &texture.color, lobes.as_ref())
+        });
+        PreviewRenderer { preview: self, texture }
+    }
+}
+
+/// A picture to look at, 8 bit, sRGB-coded with straight alpha.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PreviewPicture {
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// `[height · width]` pixels.
+    pub rgba: Vec<[u8; 4]>,
+}
+
+/// Makes pictures of a mesh.
+pub struct PreviewRenderer<'a> {
+    preview: &'a Preview,
+    texture: Option<MeshTexture<'a>>,
+}
+
+impl PreviewRenderer<'_> {
+    /// What a camera in the mesh's coordinates sees.
+    pub fn view(&self, camera: &Camera, look: Look) -> RasterView {
+        let Preview { head, bare_atlas, .. } = self.preview;
+        let surface = Surface {
+            mesh: &head.mesh,
+            texture: self.texture.as_ref(),
+            atlas: head.texture.as_ref().map(|t| &t.atlas).or(bare_atlas.as_ref()),
+            harmonics: head.harmonics.as_ref(),
+        };
+        let options = RasterOptions { world_from_scene: head.world_from_scene, ..RasterOptions::default() };
+        raster(&head.mesh, camera, &options, |hits| surface.shown(look, hits, camera))
+    }
+
+    /// The same as a picture, over a color or over nothing.
+    pub fn picture(&self, camera: &Camera, look: Look, background: ViewBackground) -> PreviewPicture {
+        let mut view = self.view(camera, look).view;
+        if let Some(color) = behind(background) {
+            over(&mut view, color);
+        }
+        let rgba = view.color.data.as_chunks::<4>().0.iter().map(|&p| straight(p).map(quantize)).collect();
+        PreviewPicture { width: view.color.width, height: view.color.height, rgba }
+    }
+}

@@ -1,0 +1,160 @@
+//! How a mesh is shown to people: as it is colored, or so that its shape, its normals or its texture coordinates are seen.
+
+use super::raycast::RayHits;
+use super::texture::MeshTexture;
+use crate::geom::{Atlas, Camera, Harmonics, Mesh};
+use crate::image::{linear_from_srgb, srgb_from_linear};
+use glam::{Vec2, Vec3};
+
+/// What a surface without any color of its own has, sRGB-coded.
+const GRAY: [f32; 3] = [0.8; 3];
+
+/// Squares of the chequer along each side of a texture.
+const SQUARES: f32 = 32.0;
+
+/// Lamps that follow the camera: where they are (right, up, to the viewer; not unit), and how bright. Key, fill and rim.
+const LAMPS: [([f32; 3], f32); 3] =
+    [([-0.6, 0.7, 0.8], 0.75), ([0.9, 0.1, 0.6], 0.25), ([0.3, 0.8, -0.8], 0.3)];
+
+/// Light from everywhere.
+const AMBIENT: f32 = 0.18;
+
+/// Half the width of a line of the wireframe, pixels.
+const LINE: f32 = 0.6;
+
+/// What is shown of a surface.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Look {
+    /// Its color under three lamps.
+    Studio,
+    /// Its color, as it is stored.
+    Unlit,
+    /// Its normals as the camera sees them: right red, up green, to the viewer blue.
+    Normals,
+    /// Its shape, as if made of clay.
+    Matcap,
+    /// Where it lies in its texture: a chequer.
+    Uv,
+    /// Its triangles.
+    Wire,
+}
+
+impl Look {
+    /// All of them.
+    pub const ALL: [Look; 6] = [Look::Studio, Look::Unlit, Look::Normals, Look::Matcap, Look::Uv, Look::Wire];
+
+    /// The word of the command line.
+    pub fn word(self) -> &'static str {
+        ["studio", "unlit", "normals", "matcap", "uv", "wire"][self as usize]
+    }
+}
+
+/// A surface with all that is known of its color.
+#[derive(Clone, Copy)]
+pub struct Surface<'a> {
+    /// The triangles, with their normals, and colors at their vertices.
+    pub mesh: &'a Mesh,
+    /// Its texture.
+    pub texture: Option<&'a MeshTexture<'a>>,
+    /// Where it lies in a texture, whether or not there is one.
+    pub atlas: Option<&'a Atlas>,
+    /// What depends on the view, where there is no texture.
+    pub harmonics: Option<&'a Harmonics>,
+}
+
+impl Surface<'_> {
+    /// sRGB-coded colors of what is seen through the pixels of a camera.
+    pub fn colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
+        if let Some(texture) = self.texture {
+            return texture.colors(hits, camera, 1);
+        }
+        let mesh = self.mesh;
+        let bare = mesh.colors.is_empty();
+        let color = |(hit, &direction)| {
+            let color = if bare { GRAY } else { mesh.color_at(hit) };
+            match self.harmonics {
+                None => color,
+                Some(h) => {
+                    let more = h.seen_along(direction, hit, mesh.triangles[hit.triangle as usize]);
+                    std::array::from_fn(|k| (color[k] + more[k]).clamp(0.0, 1.0))
+                }
+            }
+        };
+        hits.hits.iter().zip(&hits.directions).map(color).collect()
+    }
+
+    /// The same as a look shows it.
+    pub fn shown(&self, look: Look, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
+        let from_world = camera.rotation.transpose().as_mat3();
+        // as the camera sees them; of a surface seen from behind the side that is seen
+        let normals = || {
+            hits.normals
+                .iter()
+                .zip(&hits.directions)
+                .map(move |(&n, &d)| from_world * if n.dot(d) > 0.0 { -n } else { n })
+        };
+        match look {
+            Look::Unlit => self.colors(hits, camera),
+            Look::Studio => {
+                self.colors(hits, camera).into_iter().zip(normals()).map(|(c, n)| lit(c, n)).collect()
+            }
+            Look::Normals => normals().map(|n| (0.5 + 0.5 * n).to_array()).collect(),
+            Look::Matcap => normals().map(clay).collect(),
+            Look::Uv => (0..hits.hits.len()).map(|i| self.chequer(hits, i)).collect(),
+            Look::Wire => {
+                let on_line = |(i, n): (usize, Vec3)| {
+                    let shade = 0.75 + 0.25 * n.z;
+                    let line = self.line(hits, i, camera);
+                    [0.93, 0.94, 0.96].map(|c: f32| shade * c * (1.0 - line) + 0.12 * line)
+                };
+                normals().enumerate().map(on_line).collect()
+            }
+        }
+    }
+
+    fn uv(&self, hits: &RayHits, i: usize) -> Option<Vec2> {
+        let (atlas, hit) = (self.atlas?, &hits.hits[i]);
+        let [a, b, c] = atlas.corners(hit.triangle);
+        Some((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c)
+    }
+
+    /// A chequer that runs from red to green along u and from dark to light along v (down the texture).
+    fn chequer(&self, hits: &RayHits, i: usize) -> [f32; 3] {
+        let size = self.atlas.map_or(Vec2::ONE, |a| Vec2::new(a.width as f32, a.height as f32));
+        let Some(uv) = self.uv(hits, i) else { return GRAY };
+        let at = uv * size;
+        let texel = at / size.max_element() * SQUARES;
+        let dark = (texel.x.floor() + texel.y.floor()).rem_euclid(2.0) > 0.5;
+        let within = uv / size.max(Vec2::ONE);
+        let c = [within.x, 1.0 - within.x, within.y].map(|v| 0.35 + 0.6 * v.rem_euclid(1.0));
+        c.map(|v| if dark { 0.55 * v } else { v })
+    }
+
+    /// How much of a line of the wireframe is at a point, 0..=1.
+    fn line(&self, hits: &RayHits, i: usize, camera: &Camera) -> f32 {
+        let hit = &hits.hits[i];
+        let [a, b, c] = self.mesh.corners(hit.triangle);
+        let pixel = hit.t * hits.directions[i].dot(camera.forward()) / camera.fx.abs() as f32;
+        let area = (b - a).cross(c - a).length();
+        // the distance to a side is the share of the corner across times its height
+        let sides = [(1.0 - hit.u - hit.v, c - b), (hit.u, c - a), (hit.v, b - a)];
+        let nearest = sides.iter().map(|(share, side)| share * area / side.length().max(1e-20));
+        (LINE + 0.5 - nearest.fold(f32::INFINITY, f32::min) / pixel.max(1e-20)).clamp(0.0, 1.0)
+    }
+}
+
+/// A color under the lamps; `n` as the camera sees it.
+fn lit(color: [f32; 3], n: Vec3) -> [f32; 3] {
+    let lamps = LAMPS.iter().map(|(at, power)| power * n.dot(Vec3::from(*at).normalize()).max(0.0));
+    let light = AMBIENT + lamps.sum::<f32>();
+    color.map(|c| srgb_from_linear(linear_from_srgb(c) * light))
+}
+
+/// A clay that is warm in the light and cool in the shade, with a soft shine.
+fn clay(n: Vec3) -> [f32; 3] {
+    let toward = |i: usize| n.dot(Vec3::from(LAMPS[i].0).normalize());
+    let key = (0.5 + 0.5 * toward(0)).powi(2);
+    let shine = 0.25 * toward(0).max(0.0).powi(24);
+    let rim = 0.15 * (1.0 - n.z.clamp(0.0, 1.0)).powi(3);
+    [0.80, 0.62, 0.52].map(|c: f32| srgb_from_linear(c * (0.08 + 0.9 * key) + shine + rim))
+}
