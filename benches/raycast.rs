@@ -5,7 +5,10 @@
 //! rays there, so that `tools/reference/embree.py DIR` can time Embree on them. A mesh of one's own
 //! comes after `--mesh`, as .ply, .obj or .glb.
 
+mod head;
+
 use glam::{DMat3, DVec3, Vec2, Vec3};
+use head::head;
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -73,35 +76,6 @@ fn best_of(times: usize, mut run: impl FnMut()) -> f64 {
             start.elapsed().as_secs_f64()
         })
         .fold(f64::INFINITY, f64::min)
-}
-
-/// A wrinkled ball with a nose: a cube's six n × n grids blown up, 12 n² triangles.
-fn head(n: usize) -> Mesh {
-    let mut mesh = Mesh::default();
-    for side in 0..6 {
-        let (axis, sign) = (side % 3, if side < 3 { 1.0 } else { -1.0 });
-        let first = mesh.positions.len() as u32;
-        for j in 0..=n {
-            for i in 0..=n {
-                let (a, b) = (2.0 * i as f32 / n as f32 - 1.0, 2.0 * j as f32 / n as f32 - 1.0);
-                let mut d = [0.0; 3];
-                (d[axis], d[(axis + 1) % 3], d[(axis + 2) % 3]) = (sign, a, b);
-                let d = Vec3::from(d).normalize();
-                let nose = 0.15 * (-(d - Vec3::Z).length_squared() * 40.0).exp();
-                let wrinkles = 0.01 * (40.0 * d.x).sin() * (33.0 * d.y).sin() + 0.004 * (150.0 * d.z).sin();
-                mesh.positions.push(Vec3::new(0.7, 0.9, 0.75) * d * (1.0 + nose + wrinkles));
-            }
-        }
-        for j in 0..n as u32 {
-            for i in 0..n as u32 {
-                let at = |i: u32, j: u32| first + j * (n as u32 + 1) + i;
-                let (a, b, c, d) = (at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1));
-                let faces = [[a, b, c], [a, c, d]];
-                mesh.triangles.extend(faces.map(|f| if sign > 0.0 { f } else { [f[0], f[2], f[1]] }));
-            }
-        }
-    }
-    mesh
 }
 
 fn primary_rays(bounds: Aabb) -> Vec<Ray> {

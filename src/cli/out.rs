@@ -28,6 +28,7 @@ fn endings(product: &str) -> &'static [&'static str] {
         "metrics" => &["json"],
         "page" => &["html"],
         "preview" => &["png"],
+        "turntable" => &io::ANIMATIONS,
         _ => &[],
     }
 }

@@ -4,6 +4,7 @@
 //! compared with the bytes that are there before anything is reserved; content, not the ending of the
 //! name, decides the format; only regular files are opened. Writers go through [`write_atomic`].
 
+mod animation;
 mod error;
 mod exr;
 mod folder;
@@ -17,6 +18,7 @@ mod torch;
 mod write;
 
 pub use self::exr::{ExrImage, read_exr, write_exr};
+pub use animation::{ANIMATIONS, Animation, write_animation};
 pub use error::ReadError;
 pub use folder::{
     Lock, LockError, any_file, append, clear_folder, create_folder, exists, free_bytes, is_file, is_folder,

@@ -66,7 +66,8 @@ pub(super) fn cameras_of(capture: &Capture, split: Split) -> Vec<NamedCamera> {
     capture.split(split).map(named).collect()
 }
 
-fn cameras_of_file(file: &str, bytes: &[u8], like: &Camera) -> Result<Vec<NamedCamera>> {
+/// The cameras in the bytes of a file, each of a name of its own.
+pub(super) fn cameras_of_file(file: &str, bytes: &[u8], like: &Camera) -> Result<Vec<NamedCamera>> {
     let cameras = from_json(&String::from_utf8_lossy(bytes), like)?;
     let mut names: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();
     names.sort_unstable();

@@ -1,17 +1,20 @@
 //! Pictures of a mesh to look at: of a run's head, or of a file that anybody wrote.
 
 use super::export::{center as center_of, front as front_of};
+use super::path::cameras_of_file;
 use super::pictures::{behind, over, straight};
 use super::scene_file::read_capture;
+use crate::capture::{Split, View};
 use crate::config::ViewBackground;
 use crate::geom::{Atlas, Camera, Distortion};
 use crate::image::quantize;
-use crate::io;
+use crate::io::{self, Limits};
 use crate::mesh::files::{HeadMesh, OpenedMesh, open_mesh};
 use crate::render::path::{NamedCamera, orbit};
 use crate::render::{LobePictures, Look, MeshTexture, RasterOptions, RasterView, Surface, raster};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3, Vec3};
+use rayon::prelude::*;
 use std::path::Path;
 
 /// The lens of a preview: the distance at which a picture shows as much as it is wide. A long one, as for portraits.
@@ -25,6 +28,8 @@ pub struct Preview {
     /// Unit, in the mesh's coordinates, across each other.
     up: Vec3,
     front: Vec3,
+    /// The photographs' cameras in the world, of a run.
+    cameras: Vec<(Split, NamedCamera)>,
     /// What of it cannot be shown.
     pub warnings: Vec<String>,
 }
@@ -48,7 +53,9 @@ impl Preview {
         let front = front_of(capture.up, &eyes, center);
         let up = to_scene * capture.up.normalize_or(Vec3::Y);
         let front = front.map_or_else(|| up.any_orthonormal_vector(), |f| to_scene * f);
-        Ok(Preview { head, bare_atlas: None, up, front, warnings: Vec::new() })
+        let named = |v: View| (v.split, NamedCamera { name: v.name, camera: v.camera });
+        let cameras = capture.views.into_iter().map(named).collect();
+        Ok(Preview { head, bare_atlas: None, up, front, cameras, warnings: Vec::new() })
     }
 
     /// Returns the mesh in a `.glb`, `.obj` or `.ply` file. `up` is where its up is, +Y for most; its front is then +Z, or
@@ -60,7 +67,7 @@ impl Preview {
     pub fn of_file(path: &Path, up: Vec3) -> Result<Preview> {
         let OpenedMesh { head, bare_atlas, warnings } = open_mesh(path)?;
         let front = if up.z.abs() > 0.5 { Vec3::NEG_Y } else { Vec3::Z };
-        Ok(Preview { head, bare_atlas, up, front, warnings })
+        Ok(Preview { head, bare_atlas, up, front, cameras: Vec::new(), warnings })
     }
 
     /// What is shown where nobody asks for a look: its color if it has one, else its shape.
@@ -102,6 +109,29 @@ impl Preview {
         orbit(&[like], bounds, up.as_vec3(), count)
     }
 
+    /// Returns the cameras that `--cameras` names, in the mesh's coordinates: `train`, `test` (of a run) or a file (a
+    /// nerfstudio camera path or a transforms.json, in the world).
+    pub fn cameras(&self, which: &str, side: u32) -> Result<Vec<NamedCamera>> {
+        let scene_from_world = self.head.world_from_scene.inverse();
+        let split =
+            [("train", Split::Train), ("test", Split::Test)].into_iter().find(|(word, _)| *word == which);
+        let cameras = match split {
+            Some((_, split)) => {
+                self.cameras.iter().filter(|(s, _)| *s == split).map(|(_, camera)| camera.clone()).collect()
+            }
+            None => {
+                let like = self.around(0.0, 0.0, side, 1)?.remove(0).camera;
+                cameras_of_file(which, &io::read_bytes(Path::new(which), &Limits::default())?, &like)?
+            }
+        };
+        if cameras.is_empty() {
+            let what = format!("there are no cameras of `--cameras {which}`");
+            return Err(Error::cannot(what, "name a file of cameras, or a run that has such photographs"));
+        }
+        let moved = |c: NamedCamera| NamedCamera { camera: c.camera.transformed(&scene_from_world), ..c };
+        Ok(cameras.into_iter().map(moved).collect())
+    }
+
     /// Prepares it for pictures.
     pub fn renderer(&self) -> PreviewRenderer<'_> {
         let HeadMesh { mesh, world_from_scene, texture, .. } = &self.head;
@@ -128,6 +158,25 @@ pub struct PreviewPicture {
     pub rgba: Vec<[u8; 4]>,
 }
 
+impl PreviewPicture {
+    /// Pictures of one size side by side, so many in a row.
+    pub fn sheet(pictures: &[PreviewPicture], columns: usize) -> PreviewPicture {
+        let Some(PreviewPicture { width, height, .. }) = pictures.first() else {
+            return PreviewPicture { width: 0, height: 0, rgba: Vec::new() };
+        };
+        let (w, h) = (*width as usize, *height as usize);
+        let (across, rows) = (w * columns, pictures.len().div_ceil(columns));
+        let mut rgba = vec![[0; 4]; across * rows * h];
+        for (i, picture) in pictures.iter().enumerate() {
+            let corner = i / columns * h * across + i % columns * w;
+            for (y, row) in picture.rgba.chunks(w).enumerate() {
+                rgba[corner + y * across..][..w].copy_from_slice(row);
+            }
+        }
+        PreviewPicture { width: across as u32, height: (rows * h) as u32, rgba }
+    }
+}
+
 /// Makes pictures of a mesh.
 pub struct PreviewRenderer<'a> {
     preview: &'a Preview,
@@ -144,8 +193,27 @@ impl PreviewRenderer<'_> {
             atlas: head.texture.as_ref().map(|t| &t.atlas).or(bare_atlas.as_ref()),
             harmonics: head.harmonics.as_ref(),
         };
-        let options = RasterOptions { world_from_scene: head.world_from_scene, ..RasterOptions::default() };
+        let options = RasterOptions {
+            normals: false,
+            world_from_scene: head.world_from_scene,
+            ..RasterOptions::default()
+        };
         raster(&head.mesh, camera, &options, |hits| surface.shown(look, hits, camera))
+    }
+
+    /// Many of them, made side by side.
+    pub fn pictures(
+        &self,
+        shots: &[(Camera, Look)],
+        background: ViewBackground,
+        stop: impl Fn() -> bool + Sync,
+    ) -> Vec<PreviewPicture> {
+        // a picture uses one thread where there are many of them
+        let picture = |(camera, look): &(Camera, Look)| match stop() {
+            true => PreviewPicture { width: 0, height: 0, rgba: Vec::new() },
+            false => self.picture(camera, *look, background),
+        };
+        shots.par_iter().map(picture).collect()
     }
 
     /// The same as a picture, over a color or over nothing.

@@ -20,7 +20,10 @@ const LAMPS: [([f32; 3], f32); 3] =
 const AMBIENT: f32 = 0.18;
 
 /// Half the width of a line of the wireframe, pixels.
-const LINE: f32 = 0.6;
+const LINE: f32 = 0.4;
+
+/// Triangles lower than so many pixels have fainter lines.
+const FADED: f32 = 8.0;
 
 /// What is shown of a surface.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -114,19 +117,16 @@ impl Surface<'_> {
 
     fn uv(&self, hits: &RayHits, i: usize) -> Option<Vec2> {
         let (atlas, hit) = (self.atlas?, &hits.hits[i]);
-        let [a, b, c] = atlas.corners(hit.triangle);
+        let [a, b, c] = atlas.triangles[hit.triangle as usize].map(|i| atlas.uvs[i as usize]);
         Some((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c)
     }
 
     /// A chequer that runs from red to green along u and from dark to light along v (down the texture).
     fn chequer(&self, hits: &RayHits, i: usize) -> [f32; 3] {
-        let size = self.atlas.map_or(Vec2::ONE, |a| Vec2::new(a.width as f32, a.height as f32));
         let Some(uv) = self.uv(hits, i) else { return GRAY };
-        let at = uv * size;
-        let texel = at / size.max_element() * SQUARES;
-        let dark = (texel.x.floor() + texel.y.floor()).rem_euclid(2.0) > 0.5;
-        let within = uv / size.max(Vec2::ONE);
-        let c = [within.x, 1.0 - within.x, within.y].map(|v| 0.35 + 0.6 * v.rem_euclid(1.0));
+        let square = (uv * SQUARES).floor();
+        let dark = (square.x + square.y).rem_euclid(2.0) > 0.5;
+        let c = [uv.x, 1.0 - uv.x, uv.y].map(|v| 0.35 + 0.6 * v.rem_euclid(1.0));
         c.map(|v| if dark { 0.55 * v } else { v })
     }
 
@@ -138,8 +138,11 @@ impl Surface<'_> {
         let area = (b - a).cross(c - a).length();
         // the distance to a side is the share of the corner across times its height
         let sides = [(1.0 - hit.u - hit.v, c - b), (hit.u, c - a), (hit.v, b - a)];
-        let nearest = sides.iter().map(|(share, side)| share * area / side.length().max(1e-20));
-        (LINE + 0.5 - nearest.fold(f32::INFINITY, f32::min) / pixel.max(1e-20)).clamp(0.0, 1.0)
+        let heights = sides.map(|(share, side)| (share, area / side.length().max(1e-20) / pixel.max(1e-20)));
+        let nearest = heights.iter().map(|(share, height)| share * height).fold(f32::INFINITY, f32::min);
+        let low = heights.iter().map(|(_, height)| *height).fold(f32::INFINITY, f32::min);
+        // lines of triangles as small as pixels would leave nothing but lines
+        (LINE + 0.5 - nearest).clamp(0.0, 1.0) * (low / FADED).clamp(0.2, 1.0)
     }
 }
 

@@ -16,10 +16,11 @@ mod tile;
 use super::raycast::{RayHits, RenderedView};
 use crate::geom::{Camera, Hit, Mesh, Similarity};
 use crate::image::Image;
-use glam::Vec3;
+use glam::{DVec3, Mat3, Vec3};
 use project::{Bins, Lens, Rays};
 use rayon::prelude::*;
-use tile::{GRID, NOTHING, SAMPLES, TILE, Tile, UNIT};
+use std::array::from_fn;
+use tile::{CENTER, GRID, NOTHING, SAMPLES, TILE, Tile, UNIT};
 
 /// Depth change over one pixel, in pixel footprints, from which on a surface ends: tan 84°, as for rays.
 const JUMP: f32 = 10.0;
@@ -29,13 +30,15 @@ const JUMP: f32 = 10.0;
 pub struct RasterOptions {
     /// Are triangles seen from behind left out? Of a closed mesh nobody misses them.
     pub cull: bool,
+    /// Is the picture of normals made? Else it has no pixels.
+    pub normals: bool,
     /// From the mesh's coordinates (in which the camera stands too) to those of depth and normals.
     pub world_from_scene: Similarity,
 }
 
 impl Default for RasterOptions {
     fn default() -> RasterOptions {
-        RasterOptions { cull: false, world_from_scene: Similarity::IDENTITY }
+        RasterOptions { cull: false, normals: true, world_from_scene: Similarity::IDENTITY }
     }
 }
 
@@ -44,8 +47,13 @@ impl Default for RasterOptions {
 pub struct RasterView {
     /// Color, depth and normals, as of a ray caster.
     pub view: RenderedView,
-    /// `[height · width]` triangles at the centers of the pixels; `None` where there is none.
-    pub triangles: Vec<Option<u32>>,
+    /// `[height · width]` triangles at the centers of the pixels, [`RasterView::NOTHING`] where there is none.
+    pub triangles: Vec<u32>,
+}
+
+impl RasterView {
+    /// Stands for no triangle.
+    pub const NOTHING: u32 = NOTHING;
 }
 
 /// Rasterises a mesh.
@@ -72,7 +80,7 @@ pub struct RasterView {
 /// // blue where the normal is +Z, two units away
 /// assert_eq!(seen.view.color.pixel(10, 5), [0.0, 0.0, 1.0, 1.0]);
 /// assert_eq!(seen.view.depth.pixel(10, 5), [2.0]);
-/// assert_eq!(seen.triangles[5 * 20 + 10], Some(0));
+/// assert_eq!(seen.triangles[5 * 20 + 10], 0);
 /// ```
 pub fn raster(
     mesh: &Mesh,
@@ -84,30 +92,36 @@ pub fn raster(
     let mut view = RenderedView {
         color: Image::new(width, height, 4),
         depth: Image::new(width, height, 1),
-        normal: Image::new(width, height, 3),
+        normal: if options.normals { Image::new(width, height, 3) } else { Image::new(0, 0, 3) },
     };
-    let mut triangles = vec![None; width as usize * height as usize];
+    let mut triangles = vec![NOTHING; width as usize * height as usize];
     let lens = if triangles.is_empty() { None } else { Lens::new(camera, mesh, options.cull) };
     let Some(lens) = lens else { return RasterView { view, triangles } };
     let bins = lens.bin(mesh);
     let w = width as usize;
+    // no rows of a picture that is not made
+    let mut normal_rows: Vec<&mut [f32]> = view.normal.data.chunks_mut(TILE * w * 3).collect();
+    normal_rows.resize_with((height as usize).div_ceil(TILE), Default::default);
     let rows = view
         .color
         .data
         .par_chunks_mut(TILE * w * 4)
         .zip(view.depth.data.par_chunks_mut(TILE * w))
-        .zip(view.normal.data.par_chunks_mut(TILE * w * 3))
+        .zip(normal_rows)
         .zip(triangles.par_chunks_mut(TILE * w));
     let painter = Painter {
         mesh,
         camera,
-        options,
-        origin: camera.position.as_vec3(),
+        origin: camera.position.as_vec3().as_dvec3(),
+        forward: camera.forward(),
+        scale: options.world_from_scene.scale as f32,
+        world_from_mesh: options.world_from_scene.rotation_f32(),
         rays: Rays::new(camera),
         jump: JUMP / camera.fx.abs() as f32,
         smooth: mesh.normals.len() == mesh.positions.len(),
     };
-    rows.enumerate().for_each_init(Tile::new, |tile, (row, (((rgba, depth), normal), triangles))| {
+    let start = || (Tile::new(), Queue::default());
+    rows.enumerate().for_each_init(start, |(tile, queue), (row, (((rgba, depth), normal), triangles))| {
         let out = &mut Band {
             top: row * TILE,
             rgba: rgba.as_chunks_mut().0,
@@ -115,31 +129,36 @@ pub fn raster(
             normal: normal.as_chunks_mut().0,
             triangles,
         };
-        let across = w.div_ceil(TILE);
+        let (across, height) = (w.div_ceil(TILE), out.depth.len() / w);
         for column in 0..across {
             let left = column * TILE;
-            tile.move_to(left, out.top, TILE.min(w - left), out.depth.len() / w);
-            if draw(tile, &bins, row * across + column) {
-                painter.paint(tile, left, out, &color);
+            let index = row * across + column;
+            if bins.iter().all(|b| b.of(index).len() == 0) {
+                continue;
             }
+            let size = [TILE.min(w - left), height];
+            tile.move_to(left, out.top, size[0], size[1]);
+            draw(tile, &bins, index);
+            painter.paint(tile, left, size, out, queue);
+            queue.shade(out.rgba, &color);
         }
     });
     RasterView { view, triangles }
 }
 
-/// Draws what a tile holds: first what faces the camera, which hides most of the rest. Returns whether there was anything.
-fn draw(tile: &mut Tile, bins: &[Bins], index: usize) -> bool {
-    let mut any = false;
+crate::dispatch! {
+    /// Draws what a tile holds: first what faces the camera, which hides most of the rest.
+    fn draw / draw_faces(tile: &mut Tile, bins: &[Bins], index: usize)
+}
+
+#[inline(always)]
+fn draw_faces<const F: bool>(tile: &mut Tile, bins: &[Bins], index: usize) {
     for back in [false, true] {
         for face in bins.iter().flat_map(|b| b.of(index)).filter(|face| face.back == back) {
             tile.draw(face);
-            any = true;
         }
-        if any && !back {
-            tile.look_up_farthest();
-        }
+        tile.look_up_farthest();
     }
-    any
 }
 
 /// Some rows of the pictures that are made.
@@ -148,15 +167,18 @@ struct Band<'a> {
     rgba: &'a mut [[f32; 4]],
     depth: &'a mut [f32],
     normal: &'a mut [[f32; 3]],
-    triangles: &'a mut [Option<u32>],
+    triangles: &'a mut [u32],
 }
 
 /// Turns what a tile knows into pixels.
 struct Painter<'a> {
     mesh: &'a Mesh,
     camera: &'a Camera,
-    options: &'a RasterOptions,
-    origin: Vec3,
+    origin: DVec3,
+    forward: Vec3,
+    /// From the mesh's units to those of depth.
+    scale: f32,
+    world_from_mesh: Mat3,
     rays: Rays<'a>,
     /// Change of depth over one pixel, as a share of it, from which on a surface ends.
     jump: f32,
@@ -164,99 +186,84 @@ struct Painter<'a> {
 }
 
 impl Painter<'_> {
+    /// Writes what is known of a tile's pixels, and queues what is to be colored.
     fn paint(
         &self,
         tile: &Tile,
         left: usize,
+        [width, height]: [usize; 2],
         out: &mut Band,
-        color: &(impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync),
+        queue: &mut Queue,
     ) {
         let w = self.camera.width as usize;
-        let world = &self.options.world_from_scene;
-        let (scale, forward) = (world.scale as f32, self.camera.forward());
-        let mut queue = RayHits::default();
-        // pixel and share of it of each
-        let mut shares = Vec::new();
-        for i in 0..TILE * TILE {
-            let (x, y) = (left + i % TILE, i / TILE);
-            let center = tile.center_triangle[i];
-            let covered = tile.triangle[i].map(|t| t != NOTHING);
-            if center == NOTHING && covered == [false; SAMPLES] {
+        for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
+            let (i, pixel) = (y * TILE + x, y * w + left + x);
+            let seen: [u32; SAMPLES + 1] = from_fn(|s| tile.triangle[s][i]);
+            if seen == [NOTHING; SAMPLES + 1] {
                 continue;
             }
-            let pixel = y * w + x;
-            let at = ((x as f32), (out.top + y) as f32);
-            let mut left_over = covered;
-            let enqueue = |triangle: u32, at: (f32, f32), inverse_depth: f32, left: &mut [bool; SAMPLES]| {
-                // samples of the same surface are colored together
-                let near = |s: usize| {
-                    let other = tile.inverse_depth[i][s];
-                    (other - inverse_depth).abs() <= self.jump * inverse_depth.min(other)
-                };
-                let own: [bool; SAMPLES] = std::array::from_fn(|s| left[s] && near(s));
-                let count = own.iter().filter(|&&own| own).count();
-                (0..SAMPLES).for_each(|s| left[s] &= !own[s]);
-                (count, self.meet(triangle, at))
-            };
-            if center != NOTHING {
-                let (count, met) =
-                    enqueue(center, (at.0 + 0.5, at.1 + 0.5), tile.center_inverse_depth[i], &mut left_over);
-                if let Some(met) = met {
-                    out.depth[pixel] = met.hit.t * met.direction.dot(forward) * scale;
-                    out.normal[pixel] = world.direction(met.normal).normalize_or_zero().to_array();
-                    out.triangles[pixel] = Some(center);
-                    met.push(count, pixel, &mut queue, &mut shares);
+            // samples of the same surface are colored together, first those of the one at the center
+            let mut left_over: [bool; SAMPLES] = from_fn(|s| seen[s] != NOTHING);
+            for s in [CENTER, 0, 1, 2, 3] {
+                if seen[s] == NOTHING || (s != CENTER && !left_over[s]) {
+                    continue;
                 }
-            }
-            for s in 0..SAMPLES {
-                if left_over[s] {
-                    let place = [GRID[s].0, GRID[s].1].map(|v| v as f32 / UNIT as f32);
-                    let (count, met) = enqueue(
-                        tile.triangle[i][s],
-                        (at.0 + place[0], at.1 + place[1]),
-                        tile.inverse_depth[i][s],
-                        &mut left_over,
-                    );
-                    if let Some(met) = met {
-                        met.push(count, pixel, &mut queue, &mut shares);
+                let own = tile.inverse_depth[s][i];
+                let mut count = 0;
+                for (k, left) in left_over.iter_mut().enumerate().filter(|(_, left)| **left) {
+                    let other = tile.inverse_depth[k][i];
+                    if (other - own).abs() <= self.jump * own.min(other) {
+                        (*left, count) = (false, count + 1);
                     }
                 }
+                let [px, py] = [GRID[s].0, GRID[s].1].map(|v| v as f32 / UNIT as f32);
+                let Some(direction) = self.rays.through((left + x) as f32 + px, (out.top + y) as f32 + py)
+                else {
+                    continue;
+                };
+                let met = self.meet(seen[s], direction);
+                if s == CENTER {
+                    out.depth[pixel] = met.hit.t * direction.dot(self.forward) * self.scale;
+                    if let Some(normal) = out.normal.get_mut(pixel) {
+                        *normal = (self.world_from_mesh * met.normal).to_array();
+                    }
+                    out.triangles[pixel] = seen[s];
+                }
+                if count > 0 {
+                    queue.push(met, pixel, count as f32 / SAMPLES as f32);
+                }
             }
-        }
-        let colors = color(&queue);
-        for (k, (pixel, weight)) in shares.into_iter().enumerate() {
-            let c = colors.get(k).unwrap_or(&[0.0; 3]);
-            let p = &mut out.rgba[pixel];
-            *p = [p[0] + weight * c[0], p[1] + weight * c[1], p[2] + weight * c[2], p[3] + weight];
         }
     }
 
     /// Where the ray through a place of the picture meets a triangle, or passes it most closely: samples lie in snapped
     /// triangles.
     #[inline(always)]
-    fn meet(&self, triangle: u32, (x, y): (f32, f32)) -> Option<Met> {
-        let direction = self.rays.through(x, y)?;
-        let [a, b, c] = self.mesh.corners(triangle);
-        // Möller and Trumbore, without its bounds
-        let (ab, ac, from) = (b - a, c - a, self.origin - a);
-        let p = direction.cross(ac);
-        let q = from.cross(ab);
+    fn meet(&self, triangle: u32, direction: Vec3) -> Met {
+        let corners = self.mesh.triangles[triangle as usize].map(|v| v as usize);
+        let [a, b, c] = corners.map(|v| self.mesh.positions[v].as_dvec3());
+        // Möller and Trumbore, without its bounds; in f64 for what is seen edge-on
+        let (ab, ac, from, along) = (b - a, c - a, self.origin - a, direction.as_dvec3());
+        let p = along.cross(ac);
         let over = 1.0 / ab.dot(p);
-        let (u, v) = (from.dot(p) * over, direction.dot(q) * over);
-        let (u, v) =
-            if u.is_finite() && v.is_finite() { (u.max(0.0), v.max(0.0)) } else { (1.0 / 3.0, 1.0 / 3.0) };
-        let shrink = 1.0 / (u + v).max(1.0);
-        let (u, v) = (u * shrink, v * shrink);
-        let along = u * ab + v * ac;
-        let t = (along - from).dot(direction);
-        let flat = || ab.cross(ac).normalize_or_zero();
+        let (mut u, mut v) = (from.dot(p) * over, along.dot(from.cross(ab)) * over);
+        if !(u >= 0.0 && v >= 0.0 && u + v <= 1.0) {
+            // an edge-on triangle has no place of its own
+            (u, v) = if (u + v).is_finite() { (u.max(0.0), v.max(0.0)) } else { (1.0 / 3.0, 1.0 / 3.0) };
+            let shrink = 1.0 / (u + v).max(1.0);
+            (u, v) = (u * shrink, v * shrink);
+        }
+        let point = a + u * ab + v * ac;
+        let t = (point - self.origin).dot(along) as f32;
+        let (u, v) = (u as f32, v as f32);
+        let flat = || ab.cross(ac).normalize_or_zero().as_vec3();
         let normal = if self.smooth {
-            let [a, b, c] = self.mesh.triangles[triangle as usize].map(|i| self.mesh.normals[i as usize]);
-            ((1.0 - u - v) * a + u * b + v * c).try_normalize().unwrap_or_else(flat)
+            let [a, b, c] = corners.map(|v| self.mesh.normals[v]);
+            (a + u * (b - a) + v * (c - a)).try_normalize().unwrap_or_else(flat)
         } else {
             flat()
         };
-        Some(Met { point: a + along, normal, direction, hit: Hit { t, triangle, u, v } })
+        Met { point: point.as_vec3(), normal, direction, hit: Hit { t, triangle, u, v } }
     }
 }
 
@@ -268,17 +275,37 @@ struct Met {
     hit: Hit,
 }
 
-impl Met {
-    /// Queues it for its color, as what `count` samples of a pixel show.
+/// What waits for its color, with its pixel and its share of it.
+#[derive(Default)]
+struct Queue {
+    hits: RayHits,
+    shares: Vec<(usize, f32)>,
+}
+
+impl Queue {
     #[inline(always)]
-    fn push(self, count: usize, pixel: usize, queue: &mut RayHits, shares: &mut Vec<(usize, f32)>) {
-        if count == 0 {
-            return;
+    fn push(&mut self, met: Met, pixel: usize, share: f32) {
+        self.hits.points.push(met.point);
+        self.hits.normals.push(met.normal);
+        self.hits.directions.push(met.direction);
+        self.hits.hits.push(met.hit);
+        self.shares.push((pixel, share));
+    }
+
+    /// Colors everything queued.
+    fn shade(&mut self, rgba: &mut [[f32; 4]], color: &(impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync)) {
+        let colors = color(&self.hits);
+        for (k, (pixel, share)) in self.shares.drain(..).enumerate() {
+            let c = colors.get(k).unwrap_or(&[0.0; 3]);
+            let p = &mut rgba[pixel];
+            *p = [p[0] + share * c[0], p[1] + share * c[1], p[2] + share * c[2], p[3] + share];
         }
-        queue.points.push(self.point);
-        queue.normals.push(self.normal);
-        queue.directions.push(self.direction);
-        queue.hits.push(self.hit);
-        shares.push((pixel, count as f32 / SAMPLES as f32));
+        self.hits.points.clear();
+        self.hits.normals.clear();
+        self.hits.directions.clear();
+        self.hits.hits.clear();
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -62,7 +62,7 @@ pub(super) struct Bins {
 
 impl Bins {
     /// The faces of a tile in the order of their triangles.
-    pub fn of(&self, tile: usize) -> impl Iterator<Item = &Face> {
+    pub fn of(&self, tile: usize) -> impl ExactSizeIterator<Item = &Face> {
         let (from, to) = (self.starts[tile] as usize, self.starts[tile + 1] as usize);
         self.order[from..to].iter().map(|&face| &self.faces[face as usize])
     }
@@ -328,14 +328,14 @@ pub(super) fn reach(face: &Face) -> ((i32, i32), (i32, i32)) {
 pub(super) struct Rays<'a> {
     camera: &'a Camera,
     /// Of a lens that bends nothing: through the picture's corner, and a pixel on in x and y.
-    straight: Option<[Vec3; 3]>,
+    straight: Option<[DVec3; 3]>,
 }
 
 impl<'a> Rays<'a> {
     pub fn new(camera: &'a Camera) -> Rays<'a> {
         let c = camera;
         let straight = c.distortion.is_none().then(|| {
-            let through = |x: f64, y: f64, z: f64| (c.rotation * DVec3::new(x, y, z)).as_vec3();
+            let through = |x: f64, y: f64, z: f64| c.rotation * DVec3::new(x, y, z);
             [
                 through(-c.cx / c.fx, c.cy / c.fy, -1.0),
                 through(1.0 / c.fx, 0.0, 0.0),
@@ -349,7 +349,10 @@ impl<'a> Rays<'a> {
     #[inline(always)]
     pub fn through(&self, x: f32, y: f32) -> Option<Vec3> {
         match self.straight {
-            Some([corner, right, down]) => Some((corner + x * right + y * down).normalize()),
+            Some([corner, right, down]) => {
+                // as a ray caster does it: rounded once
+                Some((corner + f64::from(x) * right + f64::from(y) * down).normalize().as_vec3())
+            }
             None => self.camera.ray(Vec2::new(x, y)).map(|ray| ray.direction),
         }
     }

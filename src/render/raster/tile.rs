@@ -5,18 +5,17 @@
 //! triangles that share an edge leave no sample between them out and hit none twice.
 
 use super::project::{Corner, Face, area, reach};
-use std::array::from_fn;
-use std::ops::{Add, BitOr};
+use std::ops::{Add, BitOr, Mul, Sub};
 
 /// Pixels along each side of a tile.
 pub(super) const TILE: usize = 32;
 
-/// Pixels along each side of a block, of which the farthest depth is known.
-const BLOCK: usize = 8;
-const BLOCKS: usize = TILE / BLOCK;
+/// Pixels of a row that are worked on at once, and along each side of a block of which the farthest depth is known.
+const LANES: usize = 8;
+const BLOCKS: usize = TILE / LANES;
 
 /// After so many faces the farthest depths are looked up again.
-const REFRESH: usize = 64;
+const REFRESH: usize = 256;
 
 /// Parts of a pixel.
 pub(super) const UNIT: i32 = 256;
@@ -24,8 +23,12 @@ pub(super) const UNIT: i32 = 256;
 /// Samples of a pixel's coverage.
 pub(super) const SAMPLES: usize = 4;
 
-/// Where they lie in a pixel: a rotated grid, in which no two share a row or a column.
-pub(super) const GRID: [(i32, i32); SAMPLES] = [(96, 32), (224, 96), (32, 160), (160, 224)];
+/// Where they lie in a pixel: a rotated grid, in which no two share a row or a column; and last, of what is seen there but
+/// does not count, the center.
+pub(super) const GRID: [(i32, i32); SAMPLES + 1] = [(96, 32), (224, 96), (32, 160), (160, 224), (128, 128)];
+
+/// The center in [`GRID`].
+pub(super) const CENTER: usize = SAMPLES;
 
 /// The first and the last place of a sample in a row.
 pub(super) const FIRST: i32 = 32;
@@ -43,29 +46,24 @@ pub(super) struct Tile {
     top: i32,
     width: i32,
     height: i32,
-    /// One over depth at the samples of each pixel, 0 where there is nothing.
-    pub inverse_depth: [[f32; SAMPLES]; TILE * TILE],
-    pub triangle: [[u32; SAMPLES]; TILE * TILE],
-    /// The same at the pixels' centers.
-    pub center_inverse_depth: [f32; TILE * TILE],
-    pub center_triangle: [u32; TILE * TILE],
+    /// One over depth at each place of [`GRID`] in each pixel, 0 where there is nothing.
+    pub inverse_depth: [[f32; TILE * TILE]; SAMPLES + 1],
+    pub triangle: [[u32; TILE * TILE]; SAMPLES + 1],
     /// The smallest inverse depth in each block.
     farthest: [f32; BLOCKS * BLOCKS],
     drawn: usize,
 }
 
 impl Tile {
-    /// With nothing in it, its first pixel at (0, 0).
+    /// With nothing in it, of no size.
     pub fn new() -> Box<Tile> {
         Box::new(Tile {
             left: 0,
             top: 0,
             width: 0,
             height: 0,
-            inverse_depth: [[0.0; SAMPLES]; TILE * TILE],
-            triangle: [[NOTHING; SAMPLES]; TILE * TILE],
-            center_inverse_depth: [0.0; TILE * TILE],
-            center_triangle: [NOTHING; TILE * TILE],
+            inverse_depth: [[0.0; TILE * TILE]; SAMPLES + 1],
+            triangle: [[NOTHING; TILE * TILE]; SAMPLES + 1],
             farthest: [0.0; BLOCKS * BLOCKS],
             drawn: 0,
         })
@@ -75,10 +73,8 @@ impl Tile {
     pub fn move_to(&mut self, left: usize, top: usize, width: usize, height: usize) {
         (self.left, self.top, self.width, self.height) =
             (left as i32, top as i32, width as i32, height as i32);
-        self.inverse_depth.fill([0.0; SAMPLES]);
-        self.triangle.fill([NOTHING; SAMPLES]);
-        self.center_inverse_depth.fill(0.0);
-        self.center_triangle.fill(NOTHING);
+        self.inverse_depth.as_flattened_mut().fill(0.0);
+        self.triangle.as_flattened_mut().fill(NOTHING);
         self.farthest.fill(0.0);
         self.drawn = 0;
     }
@@ -92,21 +88,19 @@ impl Tile {
         if left > right || top > bottom {
             return;
         }
+        let (columns, rows) = ((left - self.left, right - self.left), (top - self.top, bottom - self.top));
         let [a, b, c] = face.corners;
         let nearest = a.inverse_depth.max(b.inverse_depth).max(c.inverse_depth);
-        let block = |p: i32, start: i32| (p - start) as usize / BLOCK;
-        let hidden = (block(top, self.top)..=block(bottom, self.top)).all(|y| {
-            (block(left, self.left)..=block(right, self.left))
-                .all(|x| nearest <= self.farthest[y * BLOCKS + x])
-        });
-        if hidden {
+        let blocks = |(from, to): (i32, i32)| from as usize / LANES..=to as usize / LANES;
+        let is_hidden = |y: usize| blocks(columns).all(|x| nearest <= self.farthest[y * BLOCKS + x]);
+        if blocks(rows).all(is_hidden) {
             return;
         }
         let wide = |a: i32, b: i32, c: i32| a.max(b).max(c) - a.min(b).min(c);
         if wide(a.x, b.x, c.x).max(wide(a.y, b.y, c.y)) <= SMALL {
-            self.fill::<i32>(face, nearest, left, right, top, bottom);
+            self.fill::<i32>(face, nearest, columns, rows);
         } else {
-            self.fill::<i64>(face, nearest, left, right, top, bottom);
+            self.fill::<i64>(face, nearest, columns, rows);
         }
         self.drawn += 1;
         if self.drawn.is_multiple_of(REFRESH) {
@@ -115,121 +109,144 @@ impl Tile {
     }
 
     /// Looks up how far away the farthest sample of each block is.
+    #[inline(always)]
     pub fn look_up_farthest(&mut self) {
         for (k, farthest) in self.farthest.iter_mut().enumerate() {
-            let first = k / BLOCKS * BLOCK * TILE + k % BLOCKS * BLOCK;
-            let mut low = [f32::INFINITY; SAMPLES];
-            for row in (0..BLOCK).map(|row| first + row * TILE) {
-                for samples in &self.inverse_depth[row..row + BLOCK] {
-                    (0..SAMPLES).for_each(|s| low[s] = low[s].min(samples[s]));
-                }
-                for &center in &self.center_inverse_depth[row..row + BLOCK] {
-                    low[0] = low[0].min(center);
+            let first = (k / BLOCKS * TILE + k % BLOCKS) * LANES;
+            let mut low = [f32::INFINITY; LANES];
+            for depths in &self.inverse_depth {
+                for row in depths[first..].chunks(TILE).take(LANES) {
+                    for l in 0..LANES {
+                        low[l] = if row[l] < low[l] { row[l] } else { low[l] };
+                    }
                 }
             }
             *farthest = low.into_iter().fold(f32::INFINITY, f32::min);
         }
     }
 
-    /// Draws the pixels of a face in these columns and rows.
+    /// Draws the pixels of a face in these columns and rows of the tile, and whatever lies beside them.
     #[inline(always)]
-    fn fill<T: Whole>(&mut self, face: &Face, nearest: f32, left: i32, right: i32, top: i32, bottom: i32) {
+    fn fill<T: Whole>(&mut self, face: &Face, nearest: f32, columns: (i32, i32), rows: (i32, i32)) {
         let [a, b, c] = face.corners;
-        let center = (left * UNIT + UNIT / 2, top * UNIT + UNIT / 2);
-        let edges = [(a, b), (b, c), (c, a)].map(|(p, q)| Edge::<T>::new(p, q, center));
+        let groups = columns.0 as usize / LANES..=columns.1 as usize / LANES;
+        let left = *groups.start() as i32 * LANES as i32;
+        // the first pixel of the first group
+        let (x, y) = ((self.left + left) * UNIT, (self.top + rows.0) * UNIT);
+        let edges =
+            [Edge::<T>::new(a, b, (x, y)), Edge::<T>::new(b, c, (x, y)), Edge::<T>::new(c, a, (x, y))];
         let farthest = a.inverse_depth.min(b.inverse_depth).min(c.inverse_depth);
         // one over depth is linear on the picture
         let over = 1.0 / area(face.corners) as f32;
-        let to = |p: Corner| ((p.x - a.x) as f32, (p.y - a.y) as f32, p.inverse_depth - a.inverse_depth);
-        let ((bx, by, bw), (cx, cy, cw)) = (to(b), to(c));
+        let (bx, by, bw) = ((b.x - a.x) as f32, (b.y - a.y) as f32, b.inverse_depth - a.inverse_depth);
+        let (cx, cy, cw) = ((c.x - a.x) as f32, (c.y - a.y) as f32, c.inverse_depth - a.inverse_depth);
         let (dx, dy) = ((bw * cy - cw * by) * over, (cw * bx - bw * cx) * over);
-        let first = a.inverse_depth + dx * (center.0 - a.x) as f32 + dy * (center.1 - a.y) as f32;
-        let offset: [f32; SAMPLES] =
-            from_fn(|s| dx * (GRID[s].0 - UNIT / 2) as f32 + dy * (GRID[s].1 - UNIT / 2) as f32);
-        let mut rows = edges.each_ref().map(|e| e.first);
-        for y in top..=bottom {
-            let mut at = rows;
-            let row = (y - self.top) as usize * TILE;
-            let row_depth = first + dy * ((y - top) * UNIT) as f32;
-            for x in left..=right {
-                let outside = (at[0] + edges[0].most) | (at[1] + edges[1].most) | (at[2] + edges[2].most);
-                if outside >= T::ZERO {
-                    let i = row + (x - self.left) as usize;
-                    let w = row_depth + dx * ((x - left) * UNIT) as f32;
-                    let (depths, triangles) = (&mut self.inverse_depth[i], &mut self.triangle[i]);
-                    for s in 0..SAMPLES {
-                        let inside = (at[0] + edges[0].offset[s])
-                            | (at[1] + edges[1].offset[s])
-                            | (at[2] + edges[2].offset[s]);
-                        // a sliver's slope is unreliable: it is no nearer and no farther than its corners
-                        let w = (w + offset[s]).max(farthest).min(nearest);
-                        let visible = (inside >= T::ZERO) & (w > depths[s]);
-                        depths[s] = if visible { w } else { depths[s] };
-                        triangles[s] = if visible { face.triangle } else { triangles[s] };
-                    }
-                    let w = w.max(farthest).min(nearest);
-                    if (at[0] | at[1] | at[2]) >= T::ZERO && w > self.center_inverse_depth[i] {
-                        self.center_inverse_depth[i] = w;
-                        self.center_triangle[i] = face.triangle;
-                    }
+        let mut slope = [0f32; LANES];
+        for l in 0..LANES {
+            slope[l] = dx * (l as i32 * UNIT) as f32;
+        }
+        for row in rows.0..=rows.1 {
+            let down = row - rows.0;
+            for group in groups.clone() {
+                let right = group as i32 * LANES as i32 - left;
+                let mut at = [T::from(0); 3];
+                for k in 0..3 {
+                    at[k] = edges[k].first + edges[k].right * T::from(right) + edges[k].down * T::from(down);
                 }
-                (0..3).for_each(|k| at[k] = at[k] + edges[k].right);
+                let most = (at[0] + edges[0].most) | (at[1] + edges[1].most) | (at[2] + edges[2].most);
+                if most.sign() != 0 {
+                    continue;
+                }
+                let first = row as usize * TILE + group * LANES;
+                for s in 0..=SAMPLES {
+                    let (px, py) = (x + right * UNIT + GRID[s].0 - a.x, y + down * UNIT + GRID[s].1 - a.y);
+                    let w = a.inverse_depth + dx * px as f32 + dy * py as f32;
+                    let (Some(depths), Some(triangles)) = (
+                        self.inverse_depth[s][first..].first_chunk_mut::<LANES>(),
+                        self.triangle[s][first..].first_chunk_mut::<LANES>(),
+                    ) else {
+                        continue;
+                    };
+                    // all in whole numbers, which compilers turn into vectors: those of positive floats are in their
+                    // order; and stored as a whole, since storing parts of vectors is slow on some machines
+                    let (old_depths, old_triangles) = (*depths, *triangles);
+                    let (mut new_depths, mut new_triangles) = ([0f32; LANES], [0u32; LANES]);
+                    for l in 0..LANES {
+                        let outside = (at[0] + edges[0].offset[s] + edges[0].lanes[l])
+                            | (at[1] + edges[1].offset[s] + edges[1].lanes[l])
+                            | (at[2] + edges[2].offset[s] + edges[2].lanes[l]);
+                        // a sliver's slope is unreliable: it is no nearer and no farther than its corners
+                        let new = (w + slope[l]).max(farthest).min(nearest).to_bits() as i32;
+                        let (old, triangle) = (old_depths[l].to_bits() as i32, old_triangles[l]);
+                        let best = old.max(new & !outside.sign());
+                        let visible = ((old - best) >> 31) as u32;
+                        new_depths[l] = f32::from_bits(best as u32);
+                        new_triangles[l] =
+                            triangle.wrapping_add(face.triangle.wrapping_sub(triangle) & visible);
+                    }
+                    (*depths, *triangles) = (new_depths, new_triangles);
+                }
             }
-            (0..3).for_each(|k| rows[k] = rows[k] + edges[k].down);
         }
     }
 }
 
 /// A whole number in which edge functions are computed.
-trait Whole: Copy + PartialOrd + Add<Output = Self> + BitOr<Output = Self> {
-    const ZERO: Self;
-    /// One that is known to fit.
-    fn from_i64(value: i64) -> Self;
+trait Whole:
+    Copy + From<i32> + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + BitOr<Output = Self>
+{
+    /// −1 of what is negative, else 0.
+    fn sign(self) -> i32;
 }
 
 impl Whole for i32 {
-    const ZERO: i32 = 0;
-
-    fn from_i64(value: i64) -> i32 {
-        value as i32
+    #[inline(always)]
+    fn sign(self) -> i32 {
+        self >> 31
     }
 }
 
 impl Whole for i64 {
-    const ZERO: i64 = 0;
-
-    fn from_i64(value: i64) -> i64 {
-        value
+    #[inline(always)]
+    fn sign(self) -> i32 {
+        (self >> 63) as i32
     }
 }
 
 /// The function of an edge: not negative on the side of the face.
 struct Edge<T> {
-    /// At the first pixel's center.
+    /// At the corner of the first pixel.
     first: T,
     /// A pixel on.
     right: T,
     down: T,
-    /// From a pixel's center to its samples, and the largest of these, the center's own among them.
-    offset: [T; SAMPLES],
+    /// From a pixel's corner to the places of [`GRID`].
+    offset: [T; SAMPLES + 1],
+    /// So many pixels on.
+    lanes: [T; LANES],
+    /// No place in these pixels has more than that.
     most: T,
 }
 
 impl<T: Whole> Edge<T> {
     #[inline(always)]
     fn new(a: Corner, b: Corner, (x, y): (i32, i32)) -> Edge<T> {
-        let (dx, dy) = (i64::from(b.x - a.x), i64::from(b.y - a.y));
+        let (dx, dy) = (T::from(b.x - a.x), T::from(b.y - a.y));
         // a sample on the edge belongs to the face below a top one or right of a left one
-        let own = dy < 0 || (dy == 0 && dx > 0);
-        let first = dx * i64::from(y - a.y) - dy * i64::from(x - a.x) - i64::from(!own);
-        let offset: [i64; SAMPLES] =
-            GRID.map(|(x, y)| dx * i64::from(y - UNIT / 2) - dy * i64::from(x - UNIT / 2));
-        Edge {
-            first: T::from_i64(first),
-            right: T::from_i64(-dy * i64::from(UNIT)),
-            down: T::from_i64(dx * i64::from(UNIT)),
-            offset: offset.map(T::from_i64),
-            most: T::from_i64(offset.into_iter().fold(0, i64::max)),
+        let own = b.y < a.y || (b.y == a.y && b.x > a.x);
+        let first = dx * T::from(y - a.y) - dy * T::from(x - a.x) - T::from(i32::from(!own));
+        let (right, down) = (T::from(0) - dy * T::from(UNIT), dx * T::from(UNIT));
+        let (mut offset, mut lanes) = ([T::from(0); SAMPLES + 1], [T::from(0); LANES]);
+        for s in 0..=SAMPLES {
+            offset[s] = dx * T::from(GRID[s].1) - dy * T::from(GRID[s].0);
         }
+        for l in 0..LANES {
+            lanes[l] = right * T::from(l as i32);
+        }
+        // at the corner of the pixels that is farthest inside
+        let farthest =
+            |slope: T, most: i32| if slope.sign() != 0 { T::from(0) } else { slope * T::from(most) };
+        let most = farthest(T::from(0) - dy, LANES as i32 * UNIT) + farthest(dx, UNIT);
+        Edge { first, right, down, offset, lanes, most }
     }
 }

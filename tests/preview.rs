@@ -1,0 +1,134 @@
+//! `tiface preview` as a user sees it, of files that others write.
+#![cfg(feature = "cpu")]
+
+mod command;
+
+use command::tiface;
+use image::{AnimationDecoder, RgbaImage};
+use std::io::Cursor;
+use std::path::Path;
+use std::process::Output;
+
+/// A tetrahedron without normals, texture coordinates and colors.
+const OBJ: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+
+/// The same as PLY, red at all vertices.
+const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n\
+    property uchar red\nproperty uchar green\nproperty uchar blue\nelement face 4\n\
+    property list uchar int vertex_indices\nend_header\n0 0 0 255 0 0\n1 0 0 255 0 0\n0 1 0 255 0 0\n0 0 1 255 0 0\n\
+    3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n";
+
+fn code(output: &Output) -> i32 {
+    output.status.code().unwrap()
+}
+
+fn err(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn folder() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("a.obj"), OBJ).unwrap();
+    std::fs::write(dir.path().join("b.ply"), PLY).unwrap();
+    dir
+}
+
+fn picture(file: &Path) -> RgbaImage {
+    image::load_from_memory(&std::fs::read(file).unwrap()).unwrap().into_rgba8()
+}
+
+#[test]
+fn a_file_becomes_a_picture_with_alpha_around_it() {
+    let dir = folder();
+    let o = tiface(dir.path(), &["preview", "b.ply", "--size", "64", "--json"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    assert!(String::from_utf8_lossy(&o.stdout).contains("\"preview\":\"b_preview.png\""));
+    let seen = picture(&dir.path().join("b_preview.png"));
+    assert_eq!(seen.dimensions(), (64, 64));
+    // its colors as they are, in the middle; nothing in the corner
+    assert_eq!((seen.get_pixel(32, 36).0, seen.get_pixel(0, 0).0), ([255, 0, 0, 255], [0; 4]));
+    // without colors lamps show the shape, over what was asked for
+    let words = ["preview", "a.obj", "--size", "64", "--background", "white", "--out", "c.png"];
+    assert_eq!(code(&tiface(dir.path(), &words)), 0);
+    let seen = picture(&dir.path().join("c.png"));
+    let [r, g, b, a] = seen.get_pixel(32, 36).0;
+    assert!(r == g && g == b && a == 255 && (40..250).contains(&r), "{r} {g} {b}");
+    assert_eq!(seen.get_pixel(0, 0).0, [255; 4]);
+}
+
+#[test]
+fn a_turntable_turns_and_a_sheet_has_eight_pictures() {
+    let dir = folder();
+    let turn = |out: &str| {
+        let words = ["preview", "b.ply", "--turntable", "--frames", "4", "--size", "48", "--out", out];
+        let o = tiface(dir.path(), &words);
+        assert_eq!(code(&o), 0, "{out}: {}", err(&o));
+    };
+    turn("turn.png");
+    turn("turn.gif");
+    turn("frames/");
+    let bytes = std::fs::read(dir.path().join("turn.png")).unwrap();
+    let decoder = image::codecs::png::PngDecoder::new(Cursor::new(&bytes)).unwrap().apng().unwrap();
+    let frames = decoder.into_frames().collect_frames().unwrap();
+    assert_eq!(frames.len(), 4);
+    assert_eq!(frames[2].buffer(), &picture(&dir.path().join("frames/0003.png")));
+    assert_ne!(frames[0].buffer(), frames[1].buffer());
+    assert!(std::fs::read(dir.path().join("turn.gif")).unwrap().starts_with(b"GIF89a"));
+    let o = tiface(dir.path(), &["preview", "b.ply", "--sheet", "--size", "40", "--out", "new/"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    assert_eq!(picture(&dir.path().join("new/b_sheet.png")).dimensions(), (160, 80));
+}
+
+#[test]
+fn what_cannot_be_shown_is_said() {
+    let dir = folder();
+    std::fs::create_dir(dir.path().join("empty")).unwrap();
+    std::fs::write(dir.path().join("points.obj"), "v 0 0 0\nv 1 0 0\n").unwrap();
+    std::fs::write(dir.path().join("lost.obj"), format!("mtllib lost.mtl\nvt 0 0\n{OBJ}")).unwrap();
+    for (words, expected, text) in [
+        (&["preview", "a.obj", "--light", "uv"][..], 1, "has no texture coordinates"),
+        (&["preview", "absent.glb"], 1, "absent.glb"),
+        (&["preview", "points.obj"], 1, "holds no triangles"),
+        (&["preview", "a.obj", "--out", "a.jpg"], 2, "makes no such file"),
+        (&["preview", "a.obj", "--out", "a.gif"], 2, "makes no such file"),
+        (&["preview", "a.obj", "--size", "0"], 2, "--size"),
+        (&["preview", "a.obj", "--cameras", "test"], 1, "there are no cameras"),
+        (&["preview", "empty"], 1, "has no mesh yet"),
+        // shown all the same
+        (&["preview", "lost.obj", "--size", "32"], 0, "shown without its texture"),
+    ] {
+        let o = tiface(dir.path(), words);
+        assert_eq!(code(&o), expected, "{words:?}: {}", err(&o));
+        assert!(err(&o).contains(text), "{words:?}: {}", err(&o));
+    }
+}
+
+#[test]
+#[cfg(unix)]
+fn a_film_goes_through_ffmpeg_or_says_that_there_is_none() {
+    use std::os::unix::fs::PermissionsExt;
+    use std::process::Command;
+    let dir = folder();
+    let bin = dir.path().join("bin");
+    std::fs::create_dir(&bin).unwrap();
+    let film = |path: &Path| {
+        let words = ["preview", "b.ply", "--turntable", "--frames", "3", "--size", "16", "--out", "a.mp4"];
+        Command::new(env!("CARGO_BIN_EXE_tiface"))
+            .args(words)
+            .current_dir(dir.path())
+            .env("XDG_CONFIG_HOME", dir.path())
+            .env("PATH", path)
+            .output()
+            .unwrap()
+    };
+    let o = film(&bin);
+    assert!(code(&o) == 1 && err(&o).contains("`ffmpeg` cannot be started"), "{}", err(&o));
+    assert!(!dir.path().join("a.mp4").exists());
+    // one that keeps what it is given
+    let script = "#!/bin/sh\nfor file; do :; done\n/bin/cat > \"$file\"\n";
+    std::fs::write(bin.join("ffmpeg"), script).unwrap();
+    std::fs::set_permissions(bin.join("ffmpeg"), std::fs::Permissions::from_mode(0o755)).unwrap();
+    let o = film(&bin);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    assert_eq!(std::fs::read(dir.path().join("a.mp4")).unwrap().len(), 3 * 16 * 16 * 3);
+}
