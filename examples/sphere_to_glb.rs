@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         ..ExportOptions::default()
     };
     std::fs::create_dir_all(&folder)?;
-    std::fs::write(folder.join("sphere.glb"), to_glb(&mesh, None, &options)?)?;
+    std::fs::write(folder.join("sphere.glb"), to_glb(&mesh, None, None, &options)?)?;
     for (name, bytes) in
         [to_obj(&mesh, None, &options)?, to_ply(&mesh, None, &options)?].iter().flat_map(|e| &e.files)
     {

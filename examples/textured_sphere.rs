@@ -1,4 +1,4 @@
-//! Writes a textured ball, 20 cm across, as a GLB, an OBJ and a PLY, and as a GLB with everything else.
+//! Writes a textured ball, 20 cm across, as a GLB, an OBJ and a PLY, and as GLBs with everything else.
 //!
 //! `cargo run --no-default-features --example textured_sphere -- FOLDER`
 //!
@@ -7,7 +7,7 @@
 
 use glam::{Mat3, Vec2, Vec3};
 use std::f32::consts::{PI, TAU};
-use tiface::geom::{Atlas, Mesh};
+use tiface::geom::{Atlas, Mesh, ShellLayer, Shells};
 use tiface::image::Photo;
 use tiface::mesh::files::{ExportOptions, HeadTexture, Lobes, to_glb, to_obj, to_ply};
 
@@ -23,8 +23,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let rich = HeadTexture { normal: Some(flat), lobes: Some(lobes), ..plain.clone() };
     let mut files = to_obj(&mesh, Some(&plain), &options)?.files;
     files.extend(to_ply(&mesh, Some(&plain), &options)?.files);
-    files.push(("globe.glb".into(), to_glb(&mesh, Some(&plain), &options)?));
-    files.push(("globe_rich.glb".into(), to_glb(&mesh, Some(&rich), &options)?));
+    files.push(("globe.glb".into(), to_glb(&mesh, Some(&plain), None, &options)?));
+    files.push(("globe_rich.glb".into(), to_glb(&mesh, Some(&rich), None, &options)?));
+    // two layers, a hundredth and a thirtieth of the ball outside, around its equator
+    let equator: Vec<f32> = mesh.normals.iter().map(|n| (1.0 - 4.0 * n.z.abs()).max(0.0)).collect();
+    let layer = |offset: f32, alpha: f32| ShellLayer {
+        offsets: equator.iter().map(|e| offset * e).collect(),
+        alphas: equator.iter().map(|e| alpha * e).collect(),
+    };
+    let soft = Shells { layers: vec![layer(0.001, 0.6), layer(0.003, 0.3)] };
+    files.push(("globe_soft.glb".into(), to_glb(&mesh, Some(&plain), Some(&soft), &options)?));
     std::fs::create_dir_all(&folder)?;
     Ok(files.iter().try_for_each(|(name, bytes)| std::fs::write(folder.join(name), bytes))?)
 }

@@ -70,7 +70,7 @@ fn read_whole(bytes: &[u8], path: &Path) -> tiface::Result<ReadMesh> {
 /// The mesh as a GLB, an OBJ and a PLY.
 fn files(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOptions) -> [Vec<u8>; 3] {
     let [obj, ply] = [to_obj, to_ply].map(|to| to(mesh, texture, options).unwrap().files.remove(0).1);
-    [to_glb(mesh, texture, options).unwrap(), obj, ply]
+    [to_glb(mesh, texture, None, options).unwrap(), obj, ply]
 }
 
 fn message(bytes: &[u8]) -> String {

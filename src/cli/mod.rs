@@ -223,6 +223,9 @@ from different sides. The other views follow from the cameras.")]
         /// Degree of view-dependent color in the GLB: 0, 1 or 2
         #[arg(long, value_name = "DEGREE")]
         lobes: Option<String>,
+        /// Around soft outlines: shells (translucent layers, where they help) or none
+        #[arg(long, value_name = "KIND")]
+        hair: Option<String>,
         /// Put the detail that simplification takes into a normal map; the GLB's material is lit then
         #[arg(long)]
         normal_map: bool,
@@ -389,13 +392,14 @@ impl Command {
             Command::Baseline(place) => (place, Stage::Baseline, Vec::new()),
             Command::Tface(place) => (place, Stage::Tface, Vec::new()),
             Command::Iface(place) => (place, Stage::Iface, Vec::new()),
-            Command::Mesh { place, format, frame, triangles, texture, lobes, normal_map, no_cap } => {
+            Command::Mesh { place, format, frame, triangles, texture, lobes, hair, normal_map, no_cap } => {
                 let keys = key_options([
                     ("--format", "mesh.format", format.as_deref()),
                     ("--frame", "mesh.frame", frame.as_deref()),
                     ("--triangles", "mesh.triangles", triangles.as_deref()),
                     ("--texture", "mesh.texture_px", texture.as_deref()),
                     ("--lobes", "mesh.lobes", lobes.as_deref()),
+                    ("--hair", "mesh.hair", hair.as_deref()),
                     ("--normal-map", "mesh.normal_map", on(*normal_map, "true")),
                     ("--no-cap", "mesh.cap", on(*no_cap, "false")),
                 ]);

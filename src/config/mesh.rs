@@ -45,6 +45,16 @@ pub enum ColorSource {
     Network,
 }
 
+/// What is around the mesh where the head is softer than a surface.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Hair {
+    /// Translucent layers, where photographs that were left out look better with them.
+    Shells,
+    /// Nothing.
+    None,
+}
+
 /// How a texture is stored inside or beside a mesh.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -78,6 +88,8 @@ table! {
         texture_px: u32, 0.0..=16384.0 => 1024, 2048, 2048;
         /// Degree of view-dependent lobes in the GLB, 0 (none), 1 or 2; no view of the mesh has more then.
         lobes: u32, 0.0..=2.0 => 0;
+        /// Around soft outlines, as of hair: shells (translucent layers, where they help) or none.
+        hair: Hair => Hair::Shells, Hair::Shells, Hair::None;
         /// A tangent-space map of the field's normals in the GLB: true or false.
         normal_map: bool => false;
         /// How pictures are stored with the mesh: png or jpeg.

@@ -79,6 +79,13 @@ impl IFace {
         f
     }
 
+    /// Local sharpness of the surface, per scene unit: opacity at a distance `f` outside is σ(−f · sharpness). `[n]`
+    /// points → `[n]`.
+    pub fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
+        let soft = sdf::softness(&self.shape, self.table(), &self.weights, &self.scaled(points));
+        soft.iter().map(|soft| self.inv_s() * soft.exp()).collect()
+    }
+
     /// Signed distance and its gradient (not normalized).
     pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let all = sdf::gradients(&self.shape, self.table(), &self.weights, &self.scaled(points));

@@ -8,6 +8,7 @@ use super::occupancy::Occupancy;
 use crate::config::iface::IfaceConfig;
 use crate::field::pixels::TrainView;
 use crate::geom::Camera;
+use crate::image::eroded;
 use crate::kernel::march::MarchRay;
 use crate::kernel::mlp::Weights;
 use crate::kernel::sdf::{self, FieldShape};
@@ -255,41 +256,10 @@ pub fn points(
     stereo::confirmed(&found, 2.0 * footprint).into_iter().map(point).collect()
 }
 
-/// Where a whole square of half edge `margin` is set.
-fn eroded(mut set: Vec<bool>, w: usize, h: usize, margin: usize) -> Vec<bool> {
-    for (lines, step, n, stride) in [(h, w, w, 1), (w, 1, h, w)] {
-        for first in (0..lines).map(|line| line * step) {
-            // so many set ones in a row, up to here
-            let mut run = 0;
-            let runs: Vec<usize> = (0..n)
-                .map(|i| {
-                    run = if set[first + i * stride] { run + 1 } else { 0 };
-                    run
-                })
-                .collect();
-            for i in 0..n {
-                set[first + i * stride] = runs.get(i + margin).is_some_and(|&r| r > 2 * margin);
-            }
-        }
-    }
-    set
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::image::{Gray, Photo};
-
-    #[test]
-    fn eroding_leaves_pixels_whose_whole_square_is_set() {
-        // 7 × 5, one hole at (1, 2): with a margin of 1 columns 3 to 5 of rows 1 to 3 are left
-        let mut set = vec![true; 35];
-        set[2 * 7 + 1] = false;
-        let left = eroded(set, 7, 5, 1);
-        let expected = |i: usize| (3..=5).contains(&(i % 7)) && (1..=3).contains(&(i / 7));
-        assert!((0..35).all(|i| left[i] == expected(i)), "{left:?}");
-        assert!(eroded(vec![true; 6], 3, 2, 2).iter().all(|set| !set));
-    }
 
     #[test]
     fn a_large_photograph_is_averaged_and_a_pixel_is_head_where_all_of_it_is() {

@@ -17,6 +17,6 @@ pub use extract::{
     Skin, Sparse, Verified, Volume, clean, extract, marching, sparse,
 };
 pub use finish::{
-    Appearance, AppearanceReport, AtlasConfig, AtlasReport, Colors, Photograph, SimplifyConfig,
-    SimplifyReport, VertexPlacement, atlas, bake, fit_appearance, simplify,
+    Appearance, AppearanceReport, AtlasConfig, AtlasReport, Colors, Photograph, ShellsReport, SimplifyConfig,
+    SimplifyReport, VertexPlacement, atlas, bake, fit_appearance, fit_shells, simplify,
 };

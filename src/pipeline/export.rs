@@ -42,7 +42,7 @@ impl Export {
 
     /// Returns a head mesh as the files of a format, the mesh first. `stem` names them.
     pub(super) fn files(&self, head: &HeadMesh, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
-        let HeadMesh { mesh, world_from_scene, texture, .. } = head;
+        let HeadMesh { mesh, world_from_scene, texture, shells, .. } = head;
         let (up, world_from_mesh) = match self.frame {
             MeshFrame::Dataset => (self.up, *world_from_scene),
             MeshFrame::Head => (Vec3::Y, self.head_from_mesh(mesh, world_from_scene)),
@@ -59,7 +59,7 @@ impl Export {
         };
         match format {
             MeshFormat::Glb => {
-                let bytes = to_glb(mesh, texture.as_ref(), &options)?;
+                let bytes = to_glb(mesh, texture.as_ref(), shells.as_ref(), &options)?;
                 Ok(ExportedFiles { files: vec![(format!("{stem}.glb"), bytes)], warnings: Vec::new() })
             }
             MeshFormat::Obj => to_obj(mesh, texture.as_ref(), &options),
@@ -203,7 +203,7 @@ mod tests {
         assert!(mesh.is_closed());
         let mut far = test_head();
         far.texture.as_mut().unwrap().atlas.triangles = vec![[0, 1, 2]; mesh.triangles.len()];
-        (far.mesh, far.harmonics) = (mesh.clone(), None);
+        (far.mesh, far.harmonics, far.shells) = (mesh.clone(), None, None);
         // as it is when it has been kept for a while
         let dir = tempfile::tempdir().unwrap();
         far.save(dir.path()).unwrap();

@@ -3,12 +3,14 @@
 use super::export::{Export, center};
 use super::surface::ClosedSurface;
 use crate::capture::scene::Scene;
-use crate::config::{ColorSource, MeshConfig};
+use crate::config::{ColorSource, Hair, MeshConfig};
 use crate::geom::{Camera, Mesh};
 use crate::image::{Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::mesh::bake::{BakeConfig, Learned, Seams, bake, bake_harmonics, complete, tangent_space};
 use crate::mesh::files::{HeadMesh, HeadTexture, Lobes, tangents};
-use crate::mesh::{AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, simplify};
+use crate::mesh::{
+    AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
+};
 use crate::{Monitor, Result};
 use glam::{Mat3, Vec3};
 use serde_json::{Map, Value, json};
@@ -67,6 +69,13 @@ pub(super) fn finish(
     if fits && !photographs_say {
         warnings.push("no photograph shows the head alone: the mesh has the colors of the network".into());
     }
+    let mut shells = None;
+    if c.hair == Hair::Shells {
+        let (found, done) =
+            fit_shells(&mesh, &closed.field.sharpness(&mesh.positions), photographs, monitor)?;
+        report.insert("shells".into(), json!(done));
+        shells = found;
+    }
     if c.texture_px == 0 {
         let mut harmonics = None;
         if photographs_say
@@ -76,7 +85,7 @@ pub(super) fn finish(
             mesh.colors = fitted.vertices;
             harmonics = fitted.harmonics;
         }
-        let head = HeadMesh { mesh, world_from_scene, texture: None, harmonics };
+        let head = HeadMesh { mesh, world_from_scene, texture: None, harmonics, shells };
         return Ok(FinishedHead { head, linear: None, report, warnings });
     }
 
@@ -134,7 +143,7 @@ pub(super) fn finish(
     }
     let lobes = lobes(&baked.lobes, asset_from_world);
     let texture = Some(HeadTexture { atlas: layout, color, normal, lobes });
-    let head = HeadMesh { mesh, world_from_scene, texture, harmonics };
+    let head = HeadMesh { mesh, world_from_scene, texture, harmonics, shells };
     Ok(FinishedHead { head, linear: c.exr.then_some(baked.color), report, warnings })
 }
 

@@ -35,6 +35,10 @@ impl Surface for Exact {
         (self.sdf(points), points.iter().map(gradient).collect())
     }
 
+    fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
+        vec![1e4; points.len()]
+    }
+
     fn colors(&self, points: &[Vec3], _: &[Vec3], counts: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
         let paint = |(p, d): (&Vec3, &Vec3)| {
             let stripes = (9.0 * *p).to_array().map(f32::sin);
@@ -255,6 +259,10 @@ impl Surface for Drilled {
             if tunnel > f { (tunnel, slope) } else { (f, g) }
         };
         values.into_iter().zip(gradients).zip(points).map(drilled).unzip()
+    }
+
+    fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
+        self.0.sharpness(points)
     }
 
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], d: &[Vec3]) -> Vec<[f32; 3]> {

@@ -14,7 +14,7 @@ use super::tiles;
 use crate::Result;
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, Split};
-use crate::config::{ColorSource, Config, Genus, MeshConfig, MeshFormat};
+use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, MeshFormat};
 use crate::geom::{Camera, Mesh, Similarity};
 use crate::image::Image;
 use crate::io::{self, Limits};
@@ -62,8 +62,8 @@ pub(super) fn mesh(
     // vertices have the color seen straight; textures and rays that of the cameras, and so their cap
     let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
     let views = match c.color {
-        ColorSource::Photographs => tiles::training_views(capture, scene, config)?,
-        ColorSource::Network => Vec::new(),
+        ColorSource::Network if c.hair == Hair::None => Vec::new(),
+        _ => tiles::training_views(capture, scene, config)?,
     };
     if let Some(cap) = cap.as_mut() {
         let learned = Learned {

@@ -17,7 +17,7 @@ use super::surface::Fields;
 use crate::capture::Split;
 use crate::capture::scene::{self, Scene};
 use crate::config::{ColorSource, Method};
-use crate::geom::{Bvh, Camera, Ray, Similarity};
+use crate::geom::{Bvh, Camera, Ray, ShellCaster, Similarity};
 use crate::io;
 use crate::mesh::files::{ExtractedSurface, HeadMesh};
 use crate::render::path::{NamedCamera, orbit};
@@ -119,6 +119,7 @@ impl Meshes {
 struct VisibleHead<'a> {
     head: &'a HeadMesh,
     bvh: Bvh,
+    shells: Option<ShellCaster<'a>>,
     /// What a viewer shows of its texture.
     shown: Option<MeshTexture<'a>>,
     /// Base color alone.
@@ -139,7 +140,18 @@ impl<'a> VisibleHead<'a> {
         };
         let [shown, base] = [(shown[0], true), (shown[1], false)]
             .map(|(is_shown, lobes)| is_shown.then(|| texture(lobes)).flatten());
-        VisibleHead { head, bvh: Bvh::new(mesh), shown, base }
+        let shells = head.shells.as_ref().map(|shells| ShellCaster::new(mesh, shells));
+        VisibleHead { head, bvh: Bvh::new(mesh), shells, shown, base }
+    }
+
+    /// A view with its soft layers, in these colors.
+    fn view(
+        &self,
+        camera: &Camera,
+        options: &RaycastOptions,
+        color: impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync,
+    ) -> RenderedView {
+        raycast(&self.bvh, &self.head.mesh, self.shells.as_ref(), camera, options, color)
     }
 
     /// sRGB-coded colors of what rays met, with all that is known of them.
@@ -205,7 +217,7 @@ impl<'a> Renderer<'a> {
             (Method::Volume, _) => self.fields.surface()?.volume(camera, &self.world_from_scene),
             (Method::Raycast, Some((ExtractedSurface { mesh, cap }, bvh))) => {
                 let field = self.fields.surface()?;
-                Some(raycast(bvh, mesh, camera, &options, |hits| {
+                Some(raycast(bvh, mesh, None, camera, &options, |hits| {
                     let mut colors = field.color(&hits.points, &hits.normals, &hits.directions);
                     // what the field says of a cap is of the body's inside
                     if let Some(cap) = cap {
@@ -214,15 +226,13 @@ impl<'a> Renderer<'a> {
                     colors
                 }))
             }
-            (Method::Raycast, None) => self.head.as_ref().map(|visible| {
-                raycast(&visible.bvh, &visible.head.mesh, camera, &options, |hits| {
-                    visible.colors(hits, camera, samples)
-                })
-            }),
+            (Method::Raycast, None) => self
+                .head
+                .as_ref()
+                .map(|visible| visible.view(camera, &options, |hits| visible.colors(hits, camera, samples))),
             (Method::Textured, _) => self.head.as_ref().and_then(|visible| {
                 let texture = visible.shown.as_ref()?;
-                let color = |hits: &RayHits| texture.colors(hits, camera, samples);
-                Some(raycast(&visible.bvh, &visible.head.mesh, camera, &options, color))
+                Some(visible.view(camera, &options, |hits| texture.colors(hits, camera, samples)))
             }),
         })
     }
@@ -258,6 +268,10 @@ mod tests {
 
         fn sdf_gradient(&self, _: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
             panic!("no distance is asked for")
+        }
+
+        fn sharpness(&self, _: &[Vec3]) -> Vec<f32> {
+            panic!("no sharpness is asked for")
         }
 
         fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {

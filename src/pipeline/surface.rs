@@ -15,6 +15,10 @@ pub trait Surface: Sync {
     /// Signed distance and its gradient. `[n, 3]` → `[n]`, `[n, 3]`.
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>);
 
+    /// Local sharpness, per scene unit: the opacity at a distance `f` outside the surface is σ(−f · sharpness).
+    /// `[n, 3]` → `[n]`.
+    fn sharpness(&self, points: &[Vec3]) -> Vec<f32>;
+
     /// sRGB-coded color of surface points `[n, 3]` with unit normals `[n, 3]`, point `i` seen along `counts[i]` unit
     /// directions, away from the camera, all in one list: one color a direction.
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], directions: &[Vec3])
@@ -100,6 +104,10 @@ impl Surface for crate::iface::IFace {
 
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         self.sdf_gradient(points)
+    }
+
+    fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
+        self.sharpness(points)
     }
 
     fn colors(

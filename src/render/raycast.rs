@@ -4,7 +4,7 @@
 //! at 84° would within one pixel, there are twice as many each way. What misses counts as transparent black. The mean
 //! is of sRGB-coded values, as everywhere in a render here: the fields composite coded color, so alpha does too.
 
-use crate::geom::{Bvh, Camera, Hit, Mesh, Ray, Similarity};
+use crate::geom::{Bvh, Camera, Hit, Mesh, Ray, ShellCaster, Similarity};
 use crate::image::Image;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
@@ -53,8 +53,8 @@ pub struct RayHits {
     pub directions: Vec<Vec3>,
     /// Triangle, weights of its corners and distance.
     pub hits: Vec<Hit>,
-    /// Which pixel each belongs to.
-    pixels: Vec<usize>,
+    /// Which pixel each belongs to, and its share of it.
+    pixels: Vec<(usize, f32)>,
 }
 
 /// Casts the rays of a camera at a mesh.
@@ -77,7 +77,7 @@ pub struct RayHits {
 ///     width: 20, height: 10, fx: 10.0, fy: 10.0, cx: 10.0, cy: 5.0,
 ///     distortion: Distortion::default(), rotation: DMat3::IDENTITY, position: DVec3::new(0.0, 0.0, 2.0),
 /// };
-/// let view = raycast(&Bvh::new(&mesh), &mesh, &camera, &RaycastOptions::default(), |hits| {
+/// let view = raycast(&Bvh::new(&mesh), &mesh, None, &camera, &RaycastOptions::default(), |hits| {
 ///     hits.normals.iter().map(|n| n.to_array().map(|v| v.abs())).collect()
 /// });
 /// // blue where the normal is +Z, two units away
@@ -87,6 +87,7 @@ pub struct RayHits {
 pub fn raycast(
     bvh: &Bvh,
     mesh: &Mesh,
+    shells: Option<&ShellCaster>,
     camera: &Camera,
     options: &RaycastOptions,
     color: impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync,
@@ -108,7 +109,7 @@ pub fn raycast(
         .par_chunks_mut(rows * w * 4)
         .zip(view.depth.data.par_chunks_mut(rows * w))
         .zip(view.normal.data.par_chunks_mut(rows * w * 3));
-    let caster = Raycaster { bvh, mesh, camera, options };
+    let caster = Raycaster { bvh, mesh, shells, camera, options };
     bands.enumerate().for_each(|(band, ((rgba, depth), normal))| {
         caster.band(band * rows, rgba.as_chunks_mut().0, depth, normal.as_chunks_mut().0, &color);
     });
@@ -119,6 +120,7 @@ pub fn raycast(
 struct Raycaster<'a> {
     bvh: &'a Bvh,
     mesh: &'a Mesh,
+    shells: Option<&'a ShellCaster<'a>>,
     camera: &'a Camera,
     options: &'a RaycastOptions,
 }
@@ -140,7 +142,7 @@ impl Raycaster<'_> {
         for i in 0..rgba.len() {
             let (x, y) = ((i % w) as f32, (top + i / w) as f32);
             let center = self.cast(x + 0.5, y + 0.5);
-            if let Some((ray, hit)) = &center {
+            if let Some((ray, Some(hit))) = &center {
                 depth[i] = self.depth(ray, hit) * self.options.world_from_scene.scale as f32;
                 let up = self.options.world_from_scene.direction(self.normal(hit));
                 normal[i] = up.normalize_or_zero().to_array();
@@ -166,15 +168,15 @@ impl Raycaster<'_> {
     }
 
     /// Casts `n × n` rays through the pixel at a corner.
-    fn cast_grid(&self, x: f32, y: f32, n: usize, found: &mut Vec<Option<(Ray, Hit)>>) {
+    fn cast_grid(&self, x: f32, y: f32, n: usize, found: &mut Vec<Met>) {
         let sub = |k: usize| (k as f32 + 0.5) / n as f32;
         found.extend((0..n * n).map(|k| self.cast(x + sub(k % n), y + sub(k / n))));
     }
 
-    /// The first hit through a picture position, with its ray.
-    fn cast(&self, x: f32, y: f32) -> Option<(Ray, Hit)> {
+    /// What a ray through a picture position meets: the first hit of the mesh, and the layers before it.
+    fn cast(&self, x: f32, y: f32) -> Met {
         let ray = self.camera.ray(Vec2::new(x, y))?;
-        Some((ray, self.bvh.closest_hit(&ray)?))
+        Some((ray, self.bvh.closest_hit(&ray)))
     }
 
     /// Distance along the viewing axis, in the mesh's units.
@@ -183,10 +185,13 @@ impl Raycaster<'_> {
     }
 
     /// Returns whether some of a pixel's rays miss and others hit, or meet far apart.
-    fn is_edge(&self, found: &[Option<(Ray, Hit)>]) -> bool {
+    fn is_edge(&self, found: &[Met]) -> bool {
         let (mut low, mut high) = (f32::INFINITY, 0f32);
         for one in found {
-            let depth = one.as_ref().map_or(0.0, |(ray, hit)| self.depth(ray, hit));
+            let depth = match one {
+                Some((ray, Some(hit))) => self.depth(ray, hit),
+                _ => 0.0,
+            };
             (low, high) = (low.min(depth), high.max(depth));
         }
         // 0 is a miss; a pixel's footprint is depth / focal length
@@ -207,42 +212,43 @@ impl Raycaster<'_> {
         (b - a).cross(c - a).normalize_or_zero()
     }
 
-    /// Counts the hit into the pixel's alpha and queues it for its color.
-    fn enqueue(
-        &self,
-        queue: &mut RayHits,
-        pixel: usize,
-        found: &Option<(Ray, Hit)>,
-        weight: f32,
-        rgba: &mut [[f32; 4]],
-    ) {
-        let Some((ray, hit)) = found else { return };
-        rgba[pixel][3] += weight;
-        let [a, b, c] = self.mesh.corners(hit.triangle);
-        queue.points.push((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c);
-        queue.normals.push(self.normal(hit));
-        queue.directions.push(ray.direction);
-        queue.hits.push(*hit);
-        queue.pixels.push(pixel);
+    /// Counts what a ray met into the pixel's alpha and queues it for its color.
+    fn enqueue(&self, queue: &mut RayHits, pixel: usize, met: &Met, weight: f32, rgba: &mut [[f32; 4]]) {
+        let Some((ray, hit)) = met else { return };
+        let mut left = weight;
+        let mut push = |hit: &Hit, weight: f32| {
+            rgba[pixel][3] += weight;
+            let [a, b, c] = self.mesh.corners(hit.triangle);
+            queue.points.push((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c);
+            queue.normals.push(self.normal(hit));
+            queue.directions.push(ray.direction);
+            queue.hits.push(*hit);
+            queue.pixels.push((pixel, weight));
+        };
+        if let Some(shells) = self.shells {
+            shells.cast(ray, hit.map_or(ray.t_max, |hit| hit.t), |_, hit, alpha| {
+                push(&hit, left * alpha);
+                left *= 1.0 - alpha;
+            });
+        }
+        if let Some(hit) = hit {
+            push(hit, left);
+        }
     }
 }
 
-/// Colors everything queued. A pixel's samples are in one queue, and share its alpha evenly.
+/// A ray, and where it met the mesh first.
+type Met = Option<(Ray, Option<Hit>)>;
+
+/// Colors everything queued.
 fn shade(queue: &mut RayHits, rgba: &mut [[f32; 4]], color: &(impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync)) {
     if queue.pixels.is_empty() {
         return;
     }
-    let colors = color(queue);
-    let mut start = 0;
-    for group in queue.pixels.chunk_by(|a, b| a == b) {
-        let out = &mut rgba[group[0]];
-        let weight = out[3] / group.len() as f32;
-        for c in colors.iter().skip(start).take(group.len()) {
-            for channel in 0..3 {
-                out[channel] += weight * c[channel].clamp(0.0, 1.0);
-            }
+    for ((pixel, weight), c) in queue.pixels.iter().zip(color(queue)) {
+        for channel in 0..3 {
+            rgba[*pixel][channel] += weight * c[channel].clamp(0.0, 1.0);
         }
-        start += group.len();
     }
     *queue = RayHits::default();
 }
@@ -250,6 +256,7 @@ fn shade(queue: &mut RayHits, rgba: &mut [[f32; 4]], color: &(impl Fn(&RayHits) 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geom::{ShellLayer, Shells};
     use glam::{DMat3, DVec3};
 
     fn camera(width: u32, height: u32) -> Camera {
@@ -278,12 +285,12 @@ mod tests {
         // pixel 10 spans x = 0..1 pixel right of the axis: 0..0.04 at distance 4. The edge is at 0.02.
         let mesh = half_plane(0.02);
         let bvh = Bvh::new(&mesh);
-        let view = raycast(&bvh, &mesh, &camera(20, 8), &RaycastOptions::default(), red);
+        let view = raycast(&bvh, &mesh, None, &camera(20, 8), &RaycastOptions::default(), red);
         assert_eq!(view.color.pixel(9, 4), [0.0, 0.0, 0.0, 0.0]);
         assert_eq!(view.color.pixel(10, 4), [0.5, 0.25, 0.0, 0.5]);
         assert_eq!(view.color.pixel(11, 4), [1.0, 0.5, 0.0, 1.0]);
         let hard = RaycastOptions { samples: 1, ..Default::default() };
-        let hard = raycast(&bvh, &mesh, &camera(20, 8), &hard, red);
+        let hard = raycast(&bvh, &mesh, None, &camera(20, 8), &hard, red);
         assert!(hard.color.data.as_chunks::<4>().0.iter().all(|p| p[3] == 0.0 || p[3] == 1.0));
     }
 
@@ -298,7 +305,7 @@ mod tests {
             },
             ..Default::default()
         };
-        let view = raycast(&Bvh::new(&mesh), &mesh, &camera(20, 8), &options, red);
+        let view = raycast(&Bvh::new(&mesh), &mesh, None, &camera(20, 8), &options, red);
         // the plane is 4 away along the axis for every pixel, 10 in the world
         for (d, n) in view.depth.data.iter().zip(view.normal.data.as_chunks::<3>().0) {
             assert!((d - 10.0).abs() < 1e-4);
@@ -317,7 +324,7 @@ mod tests {
         let color = |hits: &RayHits| -> Vec<[f32; 3]> {
             hits.points.iter().map(|p| if p.z > 0.5 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] }).collect()
         };
-        let view = raycast(&Bvh::new(&mesh), &mesh, &camera(20, 8), &RaycastOptions::default(), color);
+        let view = raycast(&Bvh::new(&mesh), &mesh, None, &camera(20, 8), &RaycastOptions::default(), color);
         assert_eq!(view.color.pixel(10, 4), [0.5, 0.5, 0.0, 1.0]);
         assert_eq!(view.color.pixel(9, 4), [0.0, 1.0, 0.0, 1.0]);
     }
@@ -330,7 +337,7 @@ mod tests {
             assert!(hits.directions.iter().all(|d| (d.length() - 1.0).abs() < 1e-5 && d.z < 0.0));
             hits.normals.iter().map(|n| n.to_array()).collect()
         };
-        let view = raycast(&Bvh::new(&mesh), &mesh, &camera(6, 6), &RaycastOptions::default(), color);
+        let view = raycast(&Bvh::new(&mesh), &mesh, None, &camera(6, 6), &RaycastOptions::default(), color);
         assert!((view.color.pixel(3, 3)[0] - 1.0).abs() < 1e-6 && view.color.pixel(3, 3)[2] < 1e-6);
     }
 
@@ -344,11 +351,41 @@ mod tests {
         };
         let look = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| raycast(&bvh, &mesh, &camera(150, 200), &RaycastOptions::default(), color))
+            pool.install(|| raycast(&bvh, &mesh, None, &camera(150, 200), &RaycastOptions::default(), color))
         };
         assert_eq!(look(1), look(3));
-        let nothing =
-            raycast(&Bvh::new(&Mesh::default()), &mesh, &camera(10, 10), &RaycastOptions::default(), red);
+        let nothing = raycast(
+            &Bvh::new(&Mesh::default()),
+            &mesh,
+            None,
+            &camera(10, 10),
+            &RaycastOptions::default(),
+            red,
+        );
         assert!(nothing.color.data.iter().chain(&nothing.depth.data).all(|v| *v == 0.0));
+    }
+
+    #[test]
+    fn layers_are_blended_over_the_mesh_and_beyond_it() {
+        // the half plane x > 0 and two layers before all of it, moved by 0.1 and 0.2, that end half a unit further left
+        let mut mesh = half_plane(0.0);
+        mesh.normals = vec![Vec3::Z; mesh.positions.len()];
+        let wide = half_plane(-0.5);
+        let moved = |by: f32| {
+            let offsets = vec![by; mesh.positions.len()];
+            ShellLayer { offsets, alphas: vec![0.5; mesh.positions.len()] }
+        };
+        let shells = Shells { layers: vec![moved(0.1), moved(0.2)] };
+        let source = Mesh { normals: mesh.normals.clone(), ..wide };
+        let caster = ShellCaster::new(&source, &shells);
+        let red = |hits: &RayHits| vec![[1.0, 0.0, 0.0]; hits.hits.len()];
+        let options = RaycastOptions { samples: 1, ..RaycastOptions::default() };
+        let view = raycast(&Bvh::new(&mesh), &mesh, Some(&caster), &camera(40, 8), &options, red);
+        // all of it where the mesh is behind; 1 − ½ · ½ where only the layers are; nothing beyond. A pixel is 0.04 wide.
+        assert_eq!(view.color.pixel(30, 4), [1.0, 0.0, 0.0, 1.0]);
+        assert_eq!(view.color.pixel(15, 4), [0.75, 0.0, 0.0, 0.75]);
+        assert_eq!(view.color.pixel(4, 4), [0.0; 4]);
+        // depth is that of the mesh
+        assert_eq!((view.depth.pixel(30, 4), view.depth.pixel(15, 4)), (&[4.0][..], &[0.0][..]));
     }
 }

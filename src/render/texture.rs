@@ -173,7 +173,7 @@ mod tests {
     fn view(texture: &MeshTexture, mesh: &Mesh, camera: &Camera, samples: u32) -> Vec<[f32; 4]> {
         let bvh = Bvh::new(mesh);
         let options = RaycastOptions { samples, ..RaycastOptions::default() };
-        let seen = raycast(&bvh, mesh, camera, &options, |s| texture.colors(s, camera, samples));
+        let seen = raycast(&bvh, mesh, None, camera, &options, |s| texture.colors(s, camera, samples));
         seen.color.data.as_chunks::<4>().0.to_vec()
     }
 

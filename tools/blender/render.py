@@ -57,6 +57,28 @@ def emit(found):
         found.data.materials.append(material)
 
 
+def soften(found):
+    """Soft layers emit their base color through their opacity, outwards alone: Cycles draws both sides of a face."""
+    emit(found)
+    for material in found.data.materials:
+        tree = material.node_tree
+        emission = next(node for node in tree.nodes if node.type == "EMISSION")
+        out = next(node for node in tree.nodes if node.type == "OUTPUT_MATERIAL")
+        opacity = tree.nodes.new("ShaderNodeVertexColor")
+        opacity.layer_name = found.data.color_attributes[0].name
+        inside = tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]
+        outwards = tree.nodes.new("ShaderNodeMath")
+        outwards.operation = "SUBTRACT"
+        tree.links.new(opacity.outputs["Alpha"], outwards.inputs[0])
+        tree.links.new(inside, outwards.inputs[1])
+        outwards.use_clamp = True
+        mix = tree.nodes.new("ShaderNodeMixShader")
+        tree.links.new(outwards.outputs[0], mix.inputs[0])
+        tree.links.new(tree.nodes.new("ShaderNodeBsdfTransparent").outputs[0], mix.inputs[1])
+        tree.links.new(emission.outputs[0], mix.inputs[2])
+        tree.links.new(mix.outputs[0], out.inputs["Surface"])
+
+
 def place(camera, given):
     width, height = given["w"], given["h"]
     fl_x = given["fl_x"]
@@ -89,7 +111,9 @@ def main():
     for found in bpy.context.scene.objects:
         if found.type != "MESH":
             continue
-        if not arguments.lobes:
+        if found.parent is not None and found.parent.type == "MESH":
+            soften(found)
+        elif not arguments.lobes:
             emit(found)
         elif not add_lobes(found, arguments.glb):
             sys.exit(f"{arguments.glb} holds no lobes")
@@ -104,6 +128,7 @@ def main():
     scene.cycles.use_denoising = False
     scene.cycles.use_adaptive_sampling = False
     scene.cycles.max_bounces = 0
+    scene.cycles.transparent_max_bounces = 16
     scene.cycles.pixel_filter_type = "BOX"
     scene.cycles.filter_width = 1.0
     scene.render.film_transparent = True

@@ -38,7 +38,8 @@ def box_of(header):
     accessor = header["accessors"][header["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
     unit = 65535.0 if accessor.get("normalized") else 1.0
     corners = numpy.array([accessor["min"], accessor["max"]], float) / unit
-    node = header["nodes"][0]
+    (root,) = header["scenes"][0]["nodes"]
+    node = header["nodes"][root]
     return corners * node.get("scale", [1, 1, 1]) + node.get("translation", [0, 0, 0])
 
 
@@ -46,7 +47,10 @@ def opened(path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     operator = {".glb": bpy.ops.import_scene.gltf, ".obj": bpy.ops.wm.obj_import, ".ply": bpy.ops.wm.ply_import}
     operator[path.suffix](filepath=str(path))
-    (found,) = [o for o in bpy.context.scene.objects if o.type == "MESH"]
+    # soft layers are a child that can be hidden
+    (found,) = [o for o in bpy.context.scene.objects if o.type == "MESH" and o.parent is None]
+    for layers in found.children:
+        print(f"    {layers.name}: {len(layers.data.polygons)} triangles around it")
     return found
 
 

@@ -114,6 +114,18 @@ function psnr(a, b) {
   return { db: 10 * Math.log10(255 ** 2 / (sum / n)), share: n / 3 / (a.data.length / 4) };
 }
 
+/** The same of the pixels that the head covers in part: its outline, and what is soft around it. Over black. */
+function outline(a, b) {
+  let [sum, n] = [0, 0];
+  for (let i = 0; i < a.data.length; i += 4) {
+    const [p, q] = [a.data[i + 3], b.data[i + 3]];
+    if (![p, q].some((alpha) => alpha > 0 && alpha < 255)) continue;
+    for (let k = 0; k < 3; k++) sum += ((a.data[i + k] * p - b.data[i + k] * q) / 255) ** 2;
+    n += 3;
+  }
+  return 10 * Math.log10(255 ** 2 / (sum / n));
+}
+
 const described = JSON.parse(await readFile(path.join(run, "cameras.json"), "utf8"));
 const folder = path.join(run, "render/textured");
 const rendered = new Set(await readdir(folder));
@@ -158,7 +170,7 @@ try {
     const picture = Object.fromEntries(Object.entries(bytes).map(([which, png]) => [which, PNG.sync.read(png)]));
     const [lobes, base] = [psnr(picture.three, picture.tiface), psnr(picture.base, picture.tiface)];
     console.log(`view ${name}: three.js is ${lobes.db.toFixed(1)} dB from tiface, its base color ${base.db.toFixed(1)} dB,` +
-      ` over ${(100 * lobes.share).toFixed(0)} % of the picture`);
+      ` over ${(100 * lobes.share).toFixed(0)} % of the picture; ${outline(picture.three, picture.tiface).toFixed(1)} dB at its outline`);
     check(name, lobes.share > 0.02, "the head is not in the picture");
     check(name, lobes.db > least && lobes.db > base.db, `expected more than ${least} dB, and more than the base color`);
     if (values.save) {

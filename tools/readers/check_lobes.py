@@ -44,6 +44,13 @@ def psnr(a, b):
     return 10 * numpy.log10(255**2 / ((a - b)[both][:, :3] ** 2).mean()), both.mean()
 
 
+def outline(a, b):
+    """The same of the pixels that the head covers in part: its outline, and what is soft around it. Over black."""
+    partly = ((a[..., 3] > 0) & (a[..., 3] < 255)) | ((b[..., 3] > 0) & (b[..., 3] < 255))
+    over = [p[..., :3] * p[..., 3:] / 255 for p in (a, b)]
+    return 10 * numpy.log10(255**2 / ((over[0] - over[1])[partly] ** 2).mean())
+
+
 def main():
     arguments = argparse.ArgumentParser()
     arguments.add_argument("run", type=pathlib.Path)
@@ -70,10 +77,11 @@ def main():
                 subprocess.run(
                     [sys.executable, RENDER, arguments.run / "mesh/head.glb", camera, target, "--samples",
                      str(arguments.samples), *option], check=True, stdout=subprocess.DEVNULL)
-                found[which] = psnr(picture_of(target), picture_of(folder / f"{name}.png"))
-            said = ", ".join(f"{which} {db:.1f} dB" for which, (db, _) in found.items())
-            lobes, share = found["blender"]
-            print(f"view {name}: {said} from tiface, over {100 * share:.0f} % of the picture")
+                pictures = picture_of(target), picture_of(folder / f"{name}.png")
+                found[which] = (*psnr(*pictures), outline(*pictures))
+            said = ", ".join(f"{which} {db:.1f} dB" for which, (db, *_) in found.items())
+            lobes, share, rim = found["blender"]
+            print(f"view {name}: {said} from tiface, over {100 * share:.0f} % of the picture; {rim:.1f} dB at its outline")
             if share < 0.02:
                 wrong.append(f"{name}: the head is not in the picture")
             if not lobes > LEAST:

@@ -8,7 +8,7 @@
 // over aloud. In each: the same box to 1e-6 of its size (PLY: of the dataset's world, which may be
 // turned, so its sorted sides), closed after welding equal positions, positive volume, texture
 // coordinates that agree corner by corner. The GLB's picture is the .png to the pixel, and its
-// material is unlit. Exits 1 after printing every disagreement.
+// material is unlit. Soft layers are drawn outwards, blended. Exits 1 after printing every disagreement.
 
 import { readFile } from "node:fs/promises";
 import { existsSync } from "node:fs";
@@ -64,9 +64,16 @@ function facts(geometry, matrix, flipped) {
   return { box: new Box3().setFromPoints(corners), closed, volume, uvs, triangles: count / 3 };
 }
 
+/** The mesh, and the soft layers around it in the order in which they are drawn. */
+const meshesOf = (object) => {
+  const [meshes, layers] = [[], []];
+  object.traverse((o) => o.isMesh && (o.material.transparent ? layers : meshes).push(o));
+  // objects at the same distance are drawn in the order of their numbers
+  return { meshes, layers: layers.sort((a, b) => a.id - b.id) };
+};
+
 const only = (object) => {
-  const meshes = [];
-  object.traverse((o) => o.isMesh && meshes.push(o));
+  const { meshes } = meshesOf(object);
   if (meshes.length !== 1) throw new Error(`${meshes.length} meshes, expected 1`);
   return meshes[0];
 };
@@ -84,6 +91,19 @@ for (const glb of process.argv.slice(2)) {
   check(`${short}.glb`, material.type === "MeshBasicMaterial", `material ${material.type}, expected an unlit one`);
   check(`${short}.glb`, material.map?.image, "no picture");
   check(`${short}.glb`, material.map?.wrapS === 1001 && material.map?.minFilter === 1008, "sampler not clamped and mip-mapped");
+  const { layers } = meshesOf(scene);
+  if (layers.length) console.log(`${short}.glb has ${layers.length} soft layers`);
+  const radius = (o) => {
+    o.geometry.computeBoundingBox();
+    return o.geometry.boundingBox.getSize(new Vector3()).length();
+  };
+  layers.forEach((layer, k) => {
+    const { material: soft } = layer;
+    check(`${short}.glb`, !soft.depthWrite && soft.side === 0 && soft.vertexColors && soft.map === material.map,
+      `layer ${k} is not blended over what it is around, with its picture and one side`);
+    check(`${short}.glb`, layer.geometry.getAttribute("color")?.itemSize === 4, `layer ${k} has no opacity`);
+    check(`${short}.glb`, k === 0 || radius(layer) > radius(layers[k - 1]), `layer ${k} is not around the one before`);
+  });
   const picture = `${stem}.png`;
   if (existsSync(picture)) {
     const expected = PNG.sync.read(await readFile(picture));

@@ -15,7 +15,7 @@
 use super::faults::{check_atlas, check_indices, not_finite, wrong_length, wrong_option};
 use super::tangents;
 use super::texture::HeadTexture;
-use crate::geom::{Mesh, Similarity};
+use crate::geom::{Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Photo;
 use crate::{Error, Result, io};
 use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
@@ -85,6 +85,8 @@ pub(super) struct FileMesh {
     pub normals: Vec<Vec3>,
     /// sRGB-coded, or empty.
     pub colors: Vec<[f32; 3]>,
+    /// Which vertex of the mesh each is.
+    pub source: Vec<u32>,
     /// Without those that use a vertex twice.
     pub triangles: Vec<[u32; 3]>,
     /// Texture coordinates, 0..=1; empty without a texture. + 0, so that equal coordinates are equal bytes.
@@ -146,7 +148,8 @@ impl FileMesh {
             uvs = texture.atlas.uvs.iter().map(|&uv| uv + Vec2::ZERO).collect();
         }
         let (colors, tangents) = (mesh.colors.clone(), Vec::new());
-        Ok(FileMesh { positions, normals, colors, triangles, uvs, corners, tangents, translation })
+        let source = (0..vertices as u32).collect();
+        Ok(FileMesh { positions, normals, colors, source, triangles, uvs, corners, tangents, translation })
     }
 
     /// Does f32 lose visible precision where this mesh lies?
@@ -172,6 +175,7 @@ impl FileMesh {
             positions: Vec::new(),
             normals: Vec::new(),
             colors: Vec::new(),
+            source: Vec::new(),
             triangles: Vec::with_capacity(self.triangles.len()),
             uvs: Vec::new(),
             corners: Vec::new(),
@@ -188,6 +192,7 @@ impl FileMesh {
                 let next = out.positions.len() as u32;
                 let key = (vertex, uv.to_array().map(f32::to_bits), bits);
                 triangle[k] = *known.entry(key).or_insert_with(|| {
+                    out.source.push(vertex);
                     let vertex = vertex as usize;
                     out.positions.push(self.positions[vertex]);
                     out.normals.extend(self.normals.get(vertex));
@@ -200,6 +205,48 @@ impl FileMesh {
             out.triangles.push(triangle);
         }
         out
+    }
+}
+
+impl FileMesh {
+    /// The part of this mesh that has these soft layers. Of a mesh that has been split.
+    pub fn under(&self, shells: &Shells) -> FileMesh {
+        let mut out = FileMesh {
+            positions: Vec::new(),
+            normals: Vec::new(),
+            colors: Vec::new(),
+            source: Vec::new(),
+            triangles: Vec::new(),
+            uvs: Vec::new(),
+            corners: Vec::new(),
+            tangents: Vec::new(),
+            translation: self.translation,
+        };
+        let mut known = vec![u32::MAX; self.positions.len()];
+        let of_mesh = |t: &[u32; 3]| t.map(|v| self.source[v as usize]);
+        let has = |t: &&[u32; 3]| shells.layers.iter().any(|layer| layer.has(&of_mesh(t)));
+        for triangle in self.triangles.iter().filter(has) {
+            out.triangles.push(triangle.map(|v| {
+                let v = v as usize;
+                if known[v] == u32::MAX {
+                    known[v] = out.positions.len() as u32;
+                    out.source.push(self.source[v]);
+                    out.positions.push(self.positions[v]);
+                    out.normals.extend(self.normals.get(v));
+                    out.colors.extend(self.colors.get(v));
+                    out.uvs.extend(self.uvs.get(v));
+                }
+                known[v]
+            }));
+        }
+        out
+    }
+
+    /// Positions of a layer over this part of a mesh: `scale` leads from lengths of the mesh to those of the file.
+    pub fn moved(&self, layer: &ShellLayer, scale: f32) -> Vec<Vec3> {
+        let offset = |v: &u32| scale * layer.offsets[*v as usize];
+        let each = self.positions.iter().zip(&self.normals).zip(&self.source);
+        each.map(|((p, n), source)| *p + offset(source) * *n).collect()
     }
 }
 

@@ -8,6 +8,13 @@
 //! the file. A mesh far from the origin is written around its middle, which its node carries in f64: its shape
 //! is as exact as that of any other.
 //!
+//! # Soft layers
+//!
+//! Layers around the mesh ([`Shells`]) are a mesh of their own, a child of the mesh's node that anybody can hide: one
+//! primitive each, the innermost first, blended, with the mesh's base color times the alpha of `COLOR_0`, their back
+//! faces not drawn. glTF knows no order of drawing: they look right where primitives are drawn as they stand in the
+//! file, after all that is opaque. Their material says `"extras": { "tiface": { "soft_layers": 2 } }`.
+//!
 //! # Textures that depend on the view
 //!
 //! A texture that nothing refers to may be dropped by any tool, and the Khronos validator says so for
@@ -25,8 +32,8 @@ use super::file_mesh::{ExportOptions, FileMesh, encode};
 use super::glb_document::{GlbDocument, info};
 use super::texture::{HeadTexture, Lobes};
 use crate::Result;
-use crate::geom::Mesh;
-use crate::image::{Photo, linear_from_srgb};
+use crate::geom::{Mesh, Shells};
+use crate::image::{Photo, linear_from_srgb, quantize};
 use glam::Vec3;
 use gltf::json::extensions::{material, mesh, root, scene::khr_materials_variants::Variant};
 use gltf::json::material::{NormalTexture, PbrMetallicRoughness, StrengthFactor};
@@ -57,12 +64,18 @@ use std::collections::BTreeMap;
 ///     triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
 ///     ..Mesh::default()
 /// };
-/// let glb = to_glb(&tetrahedron, None, &ExportOptions::default())?;
+/// let glb = to_glb(&tetrahedron, None, None, &ExportOptions::default())?;
 /// assert_eq!(read(&glb, Path::new("a.glb"))?, tetrahedron);
 /// # Ok::<(), tiface::Error>(())
 /// ```
-pub fn to_glb(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOptions) -> Result<Vec<u8>> {
-    let file = FileMesh::new(mesh, texture, &options.file_from_mesh()?)?;
+pub fn to_glb(
+    mesh: &Mesh,
+    texture: Option<&HeadTexture>,
+    shells: Option<&Shells>,
+    options: &ExportOptions,
+) -> Result<Vec<u8>> {
+    let file_from_mesh = options.file_from_mesh()?;
+    let file = FileMesh::new(mesh, texture, &file_from_mesh)?;
     let mut file = file.split(texture.is_some_and(|t| t.normal.is_some()));
     let mut document = GlbDocument::default();
     let mut main = material(options, options.name.clone());
@@ -88,7 +101,74 @@ pub fn to_glb(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOption
     }
     let main = document.root.push(main);
     let variants = (!lobes.is_empty()).then(|| variants(&mut document, &lobes, options));
-    finish(document, &file, main, variants, options)
+    let layers = match shells {
+        Some(shells) if !file.normals.is_empty() => {
+            let scale = file_from_mesh.scale as f32;
+            let texture =
+                document.root.materials[main.value()].pbr_metallic_roughness.base_color_texture.clone();
+            soft_layers(&mut document, &file, (shells, scale), texture, options)
+        }
+        _ => None,
+    };
+    finish(document, &file, main, variants, layers, options)
+}
+
+/// Soft layers as a glTF mesh; see the head of this file. `None` where nothing of them shows.
+fn soft_layers(
+    document: &mut GlbDocument,
+    file: &FileMesh,
+    (shells, scale): (&Shells, f32),
+    texture: Option<json::texture::Info>,
+    options: &ExportOptions,
+) -> Option<json::Mesh> {
+    let name = format!("{} soft layers", options.name);
+    let mut soft = material(options, name.clone());
+    soft.pbr_metallic_roughness.base_color_texture = texture;
+    soft.alpha_mode = Valid(json::material::AlphaMode::Blend);
+    soft.extras = extras(json!({"soft_layers": shells.layers.len()}));
+    let part = file.under(shells);
+    if part.triangles.is_empty() {
+        return None;
+    }
+    // all but places and opacity is the same for all layers; who lights nothing needs no normals
+    let indices = document.indices(&part.triangles, part.positions.len());
+    let uvs = (!part.uvs.is_empty()).then(|| document.floats(&part.uvs));
+    let normals = (!options.unlit).then(|| document.floats(&part.normals));
+    let white = [1.0; 3];
+    let mut primitives = Vec::new();
+    for layer in &shells.layers {
+        let color = |(v, source): (usize, &u32)| {
+            let [r, g, b] = part.colors.get(v).map_or(white, |c| c.map(linear_from_srgb));
+            [r, g, b, layer.alphas[*source as usize]].map(quantize)
+        };
+        let colors: Vec<[u8; 4]> = part.source.iter().enumerate().map(color).collect();
+        let mut attributes = BTreeMap::from([
+            (Valid(Semantic::Positions), document.positions(&part.moved(layer, scale))),
+            (Valid(Semantic::Colors(0)), document.bytes(&colors)),
+        ]);
+        attributes.extend(uvs.map(|uvs| (Valid(Semantic::TexCoords(0)), uvs)));
+        attributes.extend(normals.map(|normals| (Valid(Semantic::Normals), normals)));
+        primitives.push(primitive(attributes, indices));
+    }
+    let material = document.root.push(soft);
+    primitives.iter_mut().for_each(|p| p.material = Some(material));
+    Some(mesh(primitives, name))
+}
+
+fn mesh(primitives: Vec<Primitive>, name: String) -> json::Mesh {
+    json::Mesh { primitives, name: Some(name), weights: None, extensions: None, extras: Default::default() }
+}
+
+fn primitive(attributes: Attributes, indices: Index<json::Accessor>) -> Primitive {
+    Primitive {
+        attributes,
+        indices: Some(indices),
+        material: None,
+        mode: Valid(Mode::Triangles),
+        extensions: None,
+        extras: Default::default(),
+        targets: None,
+    }
 }
 
 fn lobe_name(k: usize) -> String {
@@ -130,6 +210,11 @@ fn lobe_notes(lobes: &Lobes, textures: &[Index<json::Texture>]) -> json::Extras 
         "color": "base colour + sum of decoded lobes times basis, all sRGB-coded",
     });
     let notes = json!({"view_dependent_color": model, "lobes": list.collect::<Vec<Value>>()});
+    extras(notes)
+}
+
+/// Notes of ours on a material.
+fn extras(notes: Value) -> json::Extras {
     let text = json!({ "tiface": notes }).to_string();
     Some(json::extras::RawValue::from_string(text).expect("a value is valid JSON"))
 }
@@ -154,6 +239,7 @@ fn finish(
     file: &FileMesh,
     material: Index<Material>,
     variants: Option<mesh::KhrMaterialsVariants>,
+    layers: Option<json::Mesh>,
     options: &ExportOptions,
 ) -> Result<Vec<u8>> {
     let name = Some(options.name.clone());
@@ -163,22 +249,18 @@ fn finish(
     let root = &mut document.root;
     root.asset.generator = Some(concat!("tiface ", env!("CARGO_PKG_VERSION")).into());
     let primitive = Primitive {
-        attributes,
-        indices: Some(indices),
         material: Some(material),
-        mode: Valid(Mode::Triangles),
         extensions: variants.map(|v| mesh::Primitive { khr_materials_variants: Some(v) }),
-        extras: Default::default(),
-        targets: None,
+        ..primitive(attributes, indices)
     };
-    let mesh = root.push(json::Mesh {
-        primitives: vec![primitive],
-        name: name.clone(),
-        weights: None,
-        extensions: None,
-        extras: Default::default(),
-    });
+    let mesh = root.push(mesh(vec![primitive], options.name.clone()));
     let node = root.push(json::Node { name, translation, mesh: Some(mesh), ..Default::default() });
+    if let Some(layers) = layers {
+        let name = layers.name.clone();
+        let mesh = Some(root.push(layers));
+        let child = root.push(json::Node { name, mesh, ..Default::default() });
+        root.nodes[node.value()].children = Some(vec![child]);
+    }
     root.scene = Some(root.push(json::Scene {
         nodes: vec![node],
         name: None,
@@ -242,7 +324,7 @@ mod tests {
     #[test]
     fn what_is_written_reads_back() {
         let mesh = strip(100);
-        let glb = to_glb(&mesh, None, &ExportOptions::default()).unwrap();
+        let glb = to_glb(&mesh, None, None, &ExportOptions::default()).unwrap();
         let back = read(&glb, Path::new("a.glb")).unwrap();
         assert_eq!(
             (&back.positions, &back.normals, &back.triangles),
@@ -260,7 +342,7 @@ mod tests {
     #[test]
     fn indices_grow_to_four_bytes_at_65535_vertices() {
         for (vertices, component) in [(65_534, 5123), (65_535, 5125), (65_536, 5125)] {
-            let glb = to_glb(&strip(vertices), None, &ExportOptions::default()).unwrap();
+            let glb = to_glb(&strip(vertices), None, None, &ExportOptions::default()).unwrap();
             let json = json_of(&glb);
             let at = json["meshes"][0]["primitives"][0]["indices"].as_u64().unwrap() as usize;
             assert_eq!(json["accessors"][at]["componentType"], component);
@@ -277,7 +359,7 @@ mod tests {
             };
         let mut mesh = strip(10);
         mesh.positions[3] = Vec3::new(0.1, 0.2, 0.3);
-        let glb = to_glb(&mesh, None, &options).unwrap();
+        let glb = to_glb(&mesh, None, None, &options).unwrap();
         assert_eq!(&glb[..4], b"glTF");
         assert_eq!(u32::from_le_bytes(glb[8..12].try_into().unwrap()) as usize, glb.len());
         assert_eq!(glb.len() % 4, 0);
@@ -295,7 +377,7 @@ mod tests {
         assert!(back.positions[3].distance(Vec3::new(1e-4, 3e-4, -2e-4)) < 1e-10);
         let max: Vec<f64> = serde_json::from_value(json["accessors"][0]["max"].clone()).unwrap();
         assert_eq!(max[0] as f32, back.bounds().max.x);
-        let lit = to_glb(&mesh, None, &ExportOptions { unlit: false, ..options }).unwrap();
+        let lit = to_glb(&mesh, None, None, &ExportOptions { unlit: false, ..options }).unwrap();
         assert!(json_of(&lit).get("extensionsUsed").is_none());
     }
 
@@ -305,7 +387,7 @@ mod tests {
         for p in &mut mesh.positions {
             *p += Vec3::new(0.0, 10_000.0, 0.0);
         }
-        let glb = to_glb(&mesh, None, &ExportOptions::default()).unwrap();
+        let glb = to_glb(&mesh, None, None, &ExportOptions::default()).unwrap();
         assert!((json_of(&glb)["nodes"][0]["translation"][1].as_f64().unwrap() - 10_000.0).abs() < 1.0);
         let back = read(&glb, Path::new("a.glb")).unwrap();
         assert!(back.positions.iter().zip(&mesh.positions).all(|(a, b)| a.distance(*b) < 1e-3));
@@ -315,7 +397,7 @@ mod tests {
     fn a_texture_replaces_the_vertex_colors_and_reads_back_exactly() {
         let (mesh, texture) = tetrahedron();
         let (atlas, options) = (&texture.atlas, ExportOptions::default());
-        let glb = to_glb(&mesh, Some(&texture), &options).unwrap();
+        let glb = to_glb(&mesh, Some(&texture), None, &options).unwrap();
         let json = json_of(&glb);
         let attributes = json["meshes"][0]["primitives"][0]["attributes"].as_object().unwrap();
         assert_eq!(attributes.keys().collect::<Vec<_>>(), ["NORMAL", "POSITION", "TEXCOORD_0"]);
@@ -332,7 +414,7 @@ mod tests {
         }
         assert!(!back.mesh.is_closed() && weld(&back.mesh).is_closed());
         assert_eq!(weld(&back.mesh).positions.len(), 4);
-        assert_eq!(glb, to_glb(&mesh, Some(&texture), &options).unwrap());
+        assert_eq!(glb, to_glb(&mesh, Some(&texture), None, &options).unwrap());
     }
 
     #[test]
@@ -344,7 +426,7 @@ mod tests {
         texture.lobes =
             Some(Lobes { pictures, scale: vec![0.5, 0.25], asset_from_world: glam::Mat3::IDENTITY });
         let jpeg = ExportOptions { jpeg_quality: Some(90), ..ExportOptions::default() };
-        let glb = to_glb(&mesh, Some(&texture), &jpeg).unwrap();
+        let glb = to_glb(&mesh, Some(&texture), None, &jpeg).unwrap();
         let json = json_of(&glb);
         let primitive = &json["meshes"][0]["primitives"][0];
         assert!(primitive["attributes"]["TANGENT"].is_number());
@@ -366,7 +448,44 @@ mod tests {
 
     #[test]
     fn an_empty_mesh_is_an_error() {
-        let e = to_glb(&Mesh::default(), None, &ExportOptions::default()).unwrap_err();
+        let e = to_glb(&Mesh::default(), None, None, &ExportOptions::default()).unwrap_err();
         assert!(e.to_string().contains("no triangles"), "{e}");
+    }
+
+    #[test]
+    fn soft_layers_are_a_mesh_of_their_own_that_no_reader_of_ours_takes_for_the_surface() {
+        let head = crate::mesh::files::test_head();
+        let options = ExportOptions { unit_m: 0.5, ..ExportOptions::default() };
+        let bare = to_glb(&head.mesh, head.texture.as_ref(), None, &options).unwrap();
+        let glb = to_glb(&head.mesh, head.texture.as_ref(), head.shells.as_ref(), &options).unwrap();
+        let surface = |glb: &[u8]| read(glb, Path::new("a.glb")).unwrap();
+        assert_eq!(surface(&glb), surface(&bare));
+        let json = json_of(&glb);
+        // whoever takes the first mesh or node takes the head
+        assert_eq!(json["nodes"][0]["children"], json!([1]));
+        assert_eq!((&json["nodes"][1]["mesh"], &json["scenes"][0]["nodes"]), (&json!(1), &json!([0])));
+        let layers = json["meshes"][1]["primitives"].as_array().unwrap();
+        assert_eq!(layers.len(), 2);
+        for layer in layers {
+            let material = &json["materials"][layer["material"].as_u64().unwrap() as usize];
+            assert_eq!(
+                (&material["alphaMode"], &material["extras"]["tiface"]["soft_layers"]),
+                (&json!("BLEND"), &json!(2))
+            );
+            assert_eq!(material["pbrMetallicRoughness"]["baseColorTexture"]["index"], 0);
+            assert_ne!(material["doubleSided"], true);
+            assert_eq!(
+                json["accessors"][layer["attributes"]["COLOR_0"].as_u64().unwrap() as usize]["type"],
+                "VEC4"
+            );
+        }
+        // vertex 2 stands at y = 1, which is half a metre here, its normal is +z and the first layer lies 0.3 before it
+        let part = FileMesh::new(&head.mesh, None, &options.file_from_mesh().unwrap())
+            .unwrap()
+            .under(head.shells.as_ref().unwrap());
+        let at = part.source.iter().position(|&v| v == 2).unwrap();
+        let moved = part.moved(&head.shells.unwrap().layers[0], 0.5);
+        assert!(moved[at].distance(Vec3::new(0.0, 0.5, 0.15)) < 1e-6);
+        assert_eq!(part.triangles.len(), 4);
     }
 }

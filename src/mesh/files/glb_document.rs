@@ -72,6 +72,14 @@ impl GlbDocument {
         self.accessor(view, values.len(), ComponentType::F32, vector(size_of::<T>() / 4))
     }
 
+    /// Vectors of four bytes, 0..=255 for 0..=1.
+    pub fn bytes(&mut self, values: &[[u8; 4]]) -> Index<Accessor> {
+        let view = self.view(bytes_of(values), Some(Target::ArrayBuffer));
+        let accessor = self.accessor(view, values.len(), ComponentType::U8, Type::Vec4);
+        self.root.accessors.last_mut().expect("it was added just now").normalized = true;
+        accessor
+    }
+
     /// Positions, which must say their bounds.
     pub fn positions(&mut self, values: &[Vec3]) -> Index<Accessor> {
         let bounds = Aabb::around(values.iter().copied());

@@ -132,6 +132,14 @@ pub(super) struct GlbScene {
 #[serde(rename_all = "camelCase", default)]
 pub(super) struct GlbMaterial {
     pub pbr_metallic_roughness: GlbPbr,
+    pub extras: serde_json::Value,
+}
+
+impl GlbMaterial {
+    /// Does it say that it is of the soft layers around a mesh?
+    pub fn is_soft_layer(&self) -> bool {
+        self.extras["tiface"]["soft_layers"].is_u64()
+    }
 }
 
 #[derive(Deserialize, Default)]

@@ -171,6 +171,11 @@ impl<'a> GlbReader<'a> {
         let mesh = self.get("mesh", &self.root.meshes, index)?;
         for (k, primitive) in mesh.primitives.iter().enumerate() {
             let at = format!("mesh {index}, primitive {k}");
+            // soft layers are around the surface, not of it
+            let material = primitive.material.and_then(|m| self.root.materials.get(m as usize));
+            if material.is_some_and(|m| m.is_soft_layer()) {
+                continue;
+            }
             match primitive.mode {
                 Valid(Mode::Triangles) => self.add_triangles(&at, primitive, matrix, out)?,
                 Valid(mode @ (Mode::TriangleStrip | Mode::TriangleFan)) => {

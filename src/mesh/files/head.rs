@@ -8,7 +8,7 @@
 use super::stored::{StoredTensors, damaged, floats, format, geometry, indices};
 use super::texture::{HeadTexture, Lobes};
 use crate::Result;
-use crate::geom::{Atlas, Harmonics, Mesh, Similarity};
+use crate::geom::{Atlas, Harmonics, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Photo;
 use crate::io::{self, Limits, ReadError, TensorValues};
 use glam::{Mat3, Vec2};
@@ -30,6 +30,8 @@ pub struct HeadMesh {
     pub texture: Option<HeadTexture>,
     /// What views of it add to its base color, if photographs told.
     pub harmonics: Option<Harmonics>,
+    /// Soft layers around it, if they show more of the head.
+    pub shells: Option<Shells>,
 }
 
 impl HeadMesh {
@@ -52,6 +54,14 @@ impl HeadMesh {
             let shape = vec![harmonics.coefficients.len() / count, count, 3];
             tensors.push(("harmonics".into(), shape, TensorValues::F32(values)));
             tensors.push(floats("harmonics_from_scene", &harmonics.turned.to_cols_array_2d()));
+        }
+        if let Some(Shells { layers }) = &self.shells {
+            let tensor = |name: &str, values: &dyn Fn(&ShellLayer) -> Vec<f32>| {
+                let all: Vec<f32> = layers.iter().flat_map(values).collect();
+                (name.into(), vec![layers.len(), self.mesh.positions.len()], TensorValues::F32(all))
+            };
+            tensors.push(tensor("shell_offsets", &|layer| layer.offsets.clone()));
+            tensors.push(tensor("shell_alphas", &|layer| layer.alphas.clone()));
         }
         let mut metadata = format();
         if let Some(texture) = &self.texture {
@@ -87,7 +97,8 @@ impl HeadMesh {
         let texture = stored.contains("uvs").then(|| load_texture(folder, &mut stored, &mesh)).transpose()?;
         let harmonics =
             stored.contains("harmonics").then(|| load_harmonics(&mut stored, &mesh)).transpose()?;
-        Ok(HeadMesh { mesh, world_from_scene, texture, harmonics })
+        let shells = stored.contains("shell_alphas").then(|| load_shells(&mut stored, &mesh)).transpose()?;
+        Ok(HeadMesh { mesh, world_from_scene, texture, harmonics, shells })
     }
 }
 
@@ -128,6 +139,20 @@ fn load_harmonics(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Harmonics> 
         return Err(stored.missing("harmonics"));
     }
     Ok(Harmonics { functions, coefficients, turned: Mat3::from_cols(x.into(), y.into(), z.into()) })
+}
+
+fn load_shells(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Shells> {
+    let vertices = mesh.positions.len();
+    if mesh.normals.len() != vertices {
+        return Err(stored.missing("normals"));
+    }
+    let (offsets, alphas) =
+        (stored.each_of(vertices, "shell_offsets")?, stored.each_of(vertices, "shell_alphas")?);
+    if offsets.len() != alphas.len() || !alphas.iter().flatten().all(|a| (0.0..=1.0).contains(a)) {
+        return Err(stored.missing("shell_alphas"));
+    }
+    let layer = |(offsets, alphas)| ShellLayer { offsets, alphas };
+    Ok(Shells { layers: offsets.into_iter().zip(alphas).map(layer).collect() })
 }
 
 /// A picture of the texture; all have the size of the first.
@@ -178,7 +203,10 @@ pub(super) mod tests {
         };
         let coefficients = (0..16).map(|i| [0.1 * i as f32, -0.2, 0.3]).collect();
         let harmonics = Some(Harmonics { functions: 4, coefficients, turned: Mat3::from_rotation_y(0.2) });
-        HeadMesh { mesh, world_from_scene, texture: Some(texture), harmonics }
+        let layer = ShellLayer { offsets: vec![0.1, 0.2, 0.3, 0.0], alphas: vec![0.5, 0.25, 1.0, 0.0] };
+        let shells =
+            Some(Shells { layers: vec![layer.clone(), ShellLayer { offsets: vec![0.5; 4], ..layer }] });
+        HeadMesh { mesh, world_from_scene, texture: Some(texture), harmonics, shells }
     }
 
     #[test]
@@ -187,7 +215,7 @@ pub(super) mod tests {
         let whole = head();
         whole.save(dir.path()).unwrap();
         assert_eq!(HeadMesh::load(dir.path()).unwrap(), whole);
-        let bare = HeadMesh { texture: None, harmonics: None, ..whole };
+        let bare = HeadMesh { texture: None, harmonics: None, shells: None, ..whole };
         bare.save(dir.path()).unwrap();
         assert_eq!(HeadMesh::load(dir.path()).unwrap(), bare);
     }
@@ -220,6 +248,8 @@ pub(super) mod tests {
         assert!(error(&|p| p.texture.as_mut().unwrap().atlas.triangles.truncate(1)).contains("uv_triangles"));
         let cut = |p: &mut HeadMesh| p.harmonics.as_mut().unwrap().coefficients.truncate(12);
         assert!(error(&cut).contains("`harmonics`"));
+        let opaque = |p: &mut HeadMesh| p.shells.as_mut().unwrap().layers[1].alphas[2] = 1.5;
+        assert!(error(&opaque).contains("`shell_alphas`"));
         let old = std::collections::BTreeMap::from([("format".to_owned(), "tiface-mesh-1".to_owned())]);
         io::write_tensors(&dir.path().join("geometry.safetensors"), &geometry(&head().mesh), &old).unwrap();
         for error in [

@@ -74,7 +74,7 @@ pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
     };
     let world_from_scene = Similarity { translation: origin, ..Similarity::IDENTITY };
     Ok(OpenedMesh {
-        head: HeadMesh { mesh, world_from_scene, texture, harmonics: None },
+        head: HeadMesh { mesh, world_from_scene, texture, harmonics: None, shells: None },
         bare_atlas,
         warnings,
     })

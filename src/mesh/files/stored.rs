@@ -106,6 +106,16 @@ impl StoredTensors {
         }
     }
 
+    /// `[n, count]` numbers, a list for each of the `n`.
+    pub fn each_of(&mut self, count: usize, name: &str) -> Result<Vec<Vec<f32>>> {
+        match self.tensors.remove(name) {
+            Some((shape, TensorValues::F32(v))) if shape.len() == 2 && shape[1] == count && count > 0 => {
+                Ok(v.chunks_exact(count).map(<[f32]>::to_vec).collect())
+            }
+            _ => Err(self.missing(name)),
+        }
+    }
+
     /// `[n, 3]` numbers.
     pub fn vectors(&mut self, name: &str) -> Result<Vec<Vec3>> {
         Ok(self.rows(name)?.into_iter().map(Vec3::from).collect())

@@ -21,6 +21,7 @@ mod nodes;
 mod rows;
 mod solve;
 
+pub(super) use nodes::Nodes;
 pub use rows::Photograph;
 
 use crate::geom::{Atlas, Bvh, Harmonics, Mesh};
@@ -28,7 +29,6 @@ use crate::image::Image;
 use crate::kernel::sphharm::{Y0, functions};
 use crate::{Monitor, Result};
 use glam::Mat3;
-use nodes::Nodes;
 use rayon::prelude::*;
 use rows::Rows;
 use serde::Serialize;

@@ -2,7 +2,7 @@
 
 use super::nodes::Nodes;
 use crate::geom::{Bvh, Camera, Hit, Mesh};
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, eroded};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
 
@@ -33,6 +33,17 @@ impl Photograph<'_> {
     /// the outline with it.
     fn is_head(&self, at: usize) -> bool {
         self.mask.is_none_or(|m| m.values[at] >= OPAQUE) && self.valid.is_none_or(|v| v.values[at] > 0)
+    }
+
+    /// Returns the usable pixels within `margin` pixels of the mask's outline.
+    pub(crate) fn outline(&self, margin: usize) -> Vec<usize> {
+        let Some(mask) = self.mask else { return Vec::new() };
+        let (w, h) = (mask.width as usize, mask.height as usize);
+        let side =
+            |head: bool| eroded(mask.values.iter().map(|&m| (m >= 128) == head).collect(), w, h, margin);
+        let (inside, outside) = (side(true), side(false));
+        let usable = |at: &usize| self.valid.is_none_or(|v| v.values[*at] > 0);
+        (0..w * h).filter(|&at| !inside[at] && !outside[at]).filter(usable).collect()
     }
 
     /// Returns how many pixels show the head alone.

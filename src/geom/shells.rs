@@ -1,0 +1,141 @@
+//! Translucent layers around a mesh: what is softer than a surface, as the outline of hair is.
+
+use super::bvh::Bvh;
+use super::mesh::Mesh;
+use super::ray::{Hit, Ray};
+use glam::Vec3;
+
+/// Layers around a mesh with normals, the innermost first: they are drawn in this order, after the mesh, and only where
+/// they face the viewer.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Shells {
+    /// The layers.
+    pub layers: Vec<ShellLayer>,
+}
+
+/// A layer: triangles of the mesh, those with a vertex that is not transparent, moved along the normals of their
+/// vertices. It has the mesh's colors.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ShellLayer {
+    /// How far along its normal each vertex of the mesh is moved, in the mesh's units.
+    pub offsets: Vec<f32>,
+    /// Opacity at each vertex of the mesh, 0..=1.
+    pub alphas: Vec<f32>,
+}
+
+impl ShellLayer {
+    /// Returns whether a triangle of these vertices belongs to the layer.
+    pub fn has(&self, triangle: &[u32; 3]) -> bool {
+        triangle.iter().any(|&v| self.alphas[v as usize] > 0.0)
+    }
+
+    /// Returns the opacity at a point of a triangle of these vertices.
+    pub fn alpha(&self, hit: &Hit, triangle: [u32; 3]) -> f32 {
+        let [a, b, c] = triangle.map(|v| self.alphas[v as usize]);
+        (1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c
+    }
+
+    /// Returns the positions of the layer's vertices, those of `mesh` moved.
+    pub fn positions(&self, mesh: &Mesh) -> Vec<Vec3> {
+        let moved = |((p, n), offset): ((&Vec3, &Vec3), &f32)| *p + *n * *offset;
+        mesh.positions.iter().zip(&mesh.normals).zip(&self.offsets).map(moved).collect()
+    }
+}
+
+/// Layers to be met by rays.
+pub struct ShellCaster<'a> {
+    mesh: &'a Mesh,
+    layers: Vec<LayerCaster<'a>>,
+}
+
+struct LayerCaster<'a> {
+    layer: &'a ShellLayer,
+    surface: Mesh,
+    bvh: Bvh,
+    /// Triangle of the mesh that each of the surface's is.
+    source: Vec<u32>,
+}
+
+impl<'a> ShellCaster<'a> {
+    /// Returns the layers around a mesh, ready for rays.
+    pub fn new(mesh: &'a Mesh, shells: &'a Shells) -> ShellCaster<'a> {
+        let caster = |layer: &'a ShellLayer| {
+            let mut surface = Mesh { positions: layer.positions(mesh), ..Mesh::default() };
+            let mut source = Vec::new();
+            for (t, triangle) in mesh.triangles.iter().enumerate().filter(|(_, t)| layer.has(t)) {
+                surface.triangles.push(*triangle);
+                source.push(t as u32);
+            }
+            let bvh = Bvh::new(&surface);
+            LayerCaster { layer, surface, bvh, source }
+        };
+        ShellCaster { mesh, layers: shells.layers.iter().map(caster).collect() }
+    }
+
+    /// Calls `meet` for each layer whose outside a ray meets before `end`, the outermost first: with its index, the
+    /// place of the mesh that it shows there, and its opacity.
+    pub fn cast(&self, ray: &Ray, end: f32, mut meet: impl FnMut(usize, Hit, f32)) {
+        for (k, LayerCaster { layer, surface, bvh, source }) in self.layers.iter().enumerate().rev() {
+            let mut ahead = *ray;
+            ahead.t_max = ahead.t_max.min(end);
+            while let Some(hit) = bvh.closest_hit(&ahead) {
+                let [a, b, c] = surface.corners(hit.triangle);
+                if (b - a).cross(c - a).dot(ray.direction) < 0.0 {
+                    let hit = Hit { triangle: source[hit.triangle as usize], ..hit };
+                    meet(k, hit, layer.alpha(&hit, self.mesh.triangles[hit.triangle as usize]));
+                    break;
+                }
+                // the inner side is not drawn; on by some steps of f32
+                ahead.t_min = hit.t + 1e-6 * hit.t.max(1e-3);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A square in z = 0 facing +z, vertices 0..4; its last vertex is transparent in both layers.
+    fn square() -> (Mesh, Shells) {
+        let at = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
+        let mesh = Mesh {
+            positions: at.map(|(x, y)| Vec3::new(x, y, 0.0)).to_vec(),
+            normals: vec![Vec3::Z; 4],
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            ..Mesh::default()
+        };
+        let layer = |offset: f32, alpha: f32| ShellLayer {
+            offsets: vec![offset; 4],
+            alphas: vec![0.0, alpha, 0.0, 0.0],
+        };
+        (mesh, Shells { layers: vec![layer(0.1, 0.8), layer(0.3, 0.4)] })
+    }
+
+    fn ray(from: Vec3, to: Vec3) -> Ray {
+        Ray { origin: from, direction: (to - from).normalize(), t_min: 0.0, t_max: f32::INFINITY }
+    }
+
+    #[test]
+    fn a_ray_meets_the_outermost_layer_first_and_none_behind_its_end() {
+        let (mesh, shells) = square();
+        let caster = ShellCaster::new(&mesh, &shells);
+        let met = |ray: &Ray, end: f32| {
+            let mut met = Vec::new();
+            caster.cast(ray, end, |layer, hit, alpha| met.push((layer, hit.triangle, hit.t, alpha)));
+            met
+        };
+        // half way from vertex 0 to vertex 1 and a quarter up: weights 3/8, 1/2 and 1/8
+        let down = ray(Vec3::new(0.25, -0.75, 1.0), Vec3::new(0.25, -0.75, 0.0));
+        let all = met(&down, f32::INFINITY);
+        assert_eq!(all.iter().map(|m| (m.0, m.1)).collect::<Vec<_>>(), [(1, 0), (0, 0)]);
+        assert!((all[0].2 - 0.7).abs() < 1e-6 && (all[1].2 - 0.9).abs() < 1e-6, "{all:?}");
+        assert!((all[0].3 - 0.4 * 0.5).abs() < 1e-6 && (all[1].3 - 0.8 * 0.5).abs() < 1e-6, "{all:?}");
+        assert_eq!(met(&down, 0.8).len(), 1);
+        // the other triangle has no vertex that shows, and from behind nothing does
+        assert!(met(&ray(Vec3::new(-0.5, 0.5, 1.0), Vec3::new(-0.5, 0.5, 0.0)), f32::INFINITY).is_empty());
+        assert!(
+            met(&ray(Vec3::new(0.25, -0.75, -1.0), Vec3::new(0.25, -0.75, 0.0)), f32::INFINITY).is_empty()
+        );
+    }
+}
