@@ -100,7 +100,7 @@ fn differences(mesh: &Mesh, camera: &Camera) -> (f64, f32, f64) {
     };
     let bvh = Bvh::new(mesh);
     let seen = raster(mesh, camera, &RasterOptions::default(), color);
-    let cast = raycast(&bvh, mesh, camera, &RaycastOptions::default(), color);
+    let cast = raycast(&bvh, mesh, None, camera, &RaycastOptions::default(), color);
     let (mut other, mut depth) = (0, 0f32);
     for (i, &triangle) in seen.triangles.iter().enumerate() {
         let at = Vec2::new((i as u32 % camera.width) as f32 + 0.5, (i as u32 / camera.width) as f32 + 0.5);
