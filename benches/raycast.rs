@@ -12,7 +12,7 @@ use head::head;
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use tiface::geom::{Aabb, Bvh, Camera, Distortion, Mesh, Ray};
+use tiface::geom::{Aabb, Bvh, Camera, Distortion, Ray};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);
