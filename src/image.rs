@@ -3,6 +3,11 @@
 //! The fields learn and render **sRGB-coded** color, as the published system does, so a render
 //! here is coded too and meets linear light only at the edge (EXR, glTF vertex colors, filtering).
 
+mod reduce;
+
+pub(crate) use reduce::{CODED, LIGHT, average};
+pub use reduce::{reduce_photo, working_size};
+
 /// sRGB-coded from linear (IEC 61966-2-1), any value clamped to 0..=1.
 pub fn srgb_from_linear(c: f32) -> f32 {
     let c = c.clamp(0.0, 1.0);

@@ -47,6 +47,7 @@ pub use export::Export;
 pub use line::{Line, capture_options, feasible};
 pub use mask::{click_page, disagreements};
 pub use mesh::export_head;
+pub use page::{head_page, renew_report, viewer_of_file};
 pub use preview::{Preview, PreviewPicture, PreviewRenderer};
 pub use surface::{Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};

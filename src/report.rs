@@ -1,93 +1,252 @@
-//! `report.html`: one file to look at, nothing loaded from elsewhere. What it looks like stands in `report/page.html`.
+//! Pages to look at, one file each, nothing loaded from elsewhere: `report.html` of a run, a page of many runs, the head
+//! to turn, a run while it works. What they look like stands in `report/*.html`.
+//!
+//! Everything that comes from outside is escaped by the templates; only what this module made itself (drawings,
+//! pictures, JSON) goes in as it is.
 
+mod chart;
+mod live;
+mod runs;
+mod serve;
+
+pub use chart::{Chart, Curve, charts};
+pub use live::serve_run;
+pub use runs::{RunRow, runs_html};
+pub use serve::{Answer, Server};
+
+use crate::config::Stage;
 use crate::{Error, ErrorKind, Result};
 use base64::prelude::{BASE64_STANDARD, Engine};
-use minijinja::Environment;
+use minijinja::{Environment, context};
 use serde::Serialize;
-use serde_json::Value;
+use serde_json::{Value, json};
+
+/// Of the page: what all of them share.
+const STYLE: &str = include_str!("report/style.css");
+
+/// The stages that learn, and what of their `log.jsonl` is drawn.
+pub const LEARNED: [(Stage, &[&str]); 3] = [
+    (Stage::Baseline, &["psnr", "samples"]),
+    (Stage::Tface, &["psnr", "mask", "outside"]),
+    (Stage::Iface, &["psnr", "eikonal", "inv_s"]),
+];
+
+/// The error that is drawn brightest: a fifth of the range of a color.
+pub const MOST_ERROR: f32 = 0.2;
+
+/// Colors of errors from none to [`MOST_ERROR`], even steps: dark to bright, also in gray.
+pub const HEAT: [[u8; 3]; 6] =
+    [[0, 0, 4], [66, 10, 104], [147, 38, 103], [221, 81, 58], [252, 165, 10], [252, 255, 164]];
 
 /// What a report shows.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Report {
     /// Of the page: the capture's name.
     pub title: String,
-    /// Stage and the rows of its figures ([`leaves`]).
-    pub summaries: Vec<(String, Vec<(String, String)>)>,
-    /// How near each kind of picture is to the photographs: the heading, then a row each; may be empty.
+    /// The run in a line: preset, seed, time, version.
+    pub facts: Vec<String>,
+    /// The head to turn.
+    pub viewer: Option<Viewer>,
+    /// How good and how costly each way to make a picture is.
+    pub table: MethodTable,
+    /// How near each kind of picture is to the photographs, part by part: the heading, then a row each; may be empty.
     pub quality: Vec<Vec<String>>,
+    /// Photographs with what was rendered for them.
+    pub views: Vec<ViewRow>,
+    /// Files of the views that found no room, relative to the page.
+    pub left_out: Vec<String>,
     /// The masks over their photographs: a part of a page, already escaped.
     pub masks: String,
-    /// Lines over training steps.
-    pub curves: Vec<Curve>,
-    /// Photographs with what was rendered for them.
-    pub rows: Vec<ViewRow>,
-    /// Views that found no room.
-    pub left_out: usize,
+    /// Figures over training steps, each a part of a page.
+    pub charts: Vec<String>,
+    /// Where time went: stage, words, share of the longest in percent.
+    pub times: Vec<(String, String, f64)>,
+    /// Settings that are not the preset's: key, value, the preset's.
+    pub changes: Vec<[String; 3]>,
+    /// What a person should know.
+    pub warnings: Vec<String>,
+    /// The command that repeats the run.
+    pub repeat: String,
+    /// Stage and the rows of its figures ([`leaves`]).
+    pub summaries: Vec<(String, Vec<(String, String)>)>,
     /// The configuration as TOML.
     pub settings: String,
 }
 
-/// A figure over steps.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[serde(into = "Chart")]
-pub struct Curve {
-    /// Its name.
-    pub name: String,
-    /// Step and value, in order.
-    pub points: Vec<(f64, f64)>,
+/// A table of ways to make a picture, the best of each column marked.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct MethodTable {
+    /// Of the columns.
+    pub headings: Vec<String>,
+    /// Name, and a cell for each column: words, and whether it is the best.
+    pub rows: Vec<(String, Vec<(String, bool)>)>,
 }
 
-/// The pictures of one view: the photograph and what was made for it.
+impl MethodTable {
+    /// Of columns (heading, digits, and whether more is better, less is, or neither) and rows of figures.
+    pub fn new(
+        columns: &[(&str, usize, Option<bool>)],
+        rows: Vec<(String, Vec<Option<f64>>)>,
+    ) -> MethodTable {
+        let best = |k: usize, more: bool| {
+            let all = rows.iter().filter_map(|(_, row)| row[k]);
+            all.reduce(|a, b| if (b > a) == more { b } else { a })
+        };
+        let best: Vec<Option<f64>> =
+            columns.iter().enumerate().map(|(k, (_, _, more))| more.and_then(|m| best(k, m))).collect();
+        let cell = |(k, value): (usize, &Option<f64>)| match value {
+            Some(v) => (format!("{v:.*}", columns[k].1), rows.len() > 1 && best[k] == Some(*v)),
+            None => ("–".into(), false),
+        };
+        let row = |(name, row): &(String, Vec<Option<f64>>)| {
+            (name.clone(), row.iter().enumerate().map(cell).collect())
+        };
+        let headings = columns.iter().map(|(name, ..)| name.to_string()).collect();
+        MethodTable { headings, rows: rows.iter().map(row).collect() }
+    }
+}
+
+/// A head to turn.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Viewer {
+    /// What it is called.
+    pub name: String,
+    /// How it differs from the file: a sentence, or nothing.
+    pub note: String,
+    /// Where photographs were taken from.
+    pub cameras: Vec<ViewerCamera>,
+    /// Where the face looks, in the file's coordinates; any length.
+    pub front: [f32; 3],
+    /// The bytes of a GLB.
+    #[serde(skip)]
+    pub glb: Vec<u8>,
+}
+
+/// Where a photograph was taken from, in the coordinates of the file; without distortion.
+#[derive(Clone, Debug, Serialize)]
+pub struct ViewerCamera {
+    /// The view's name.
+    pub name: String,
+    /// Pixels in a row and rows, and the intrinsics in such pixels.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Focal length along x.
+    pub fx: f64,
+    /// Focal length along y.
+    pub fy: f64,
+    /// Principal point from the left edge.
+    pub cx: f64,
+    /// Principal point from the top edge.
+    pub cy: f64,
+    /// Where it stood.
+    pub position: [f64; 3],
+    /// Right, up and backwards.
+    pub axes: [[f64; 3]; 3],
+    /// The `id` of its photograph in the page; empty without.
+    pub picture: String,
+}
+
+impl Viewer {
+    /// The part of a page that shows it; [`VIEWER_SCRIPT`] makes it work.
+    fn html(&self) -> Result<String> {
+        let data = json!({"cameras": self.cameras, "front": self.front, "most": MOST_ERROR, "heat": HEAT});
+        // no name can end the script that holds it
+        let data = data.to_string().replace('<', "\\u003c");
+        let glb = base64(&self.glb);
+        fill(include_str!("report/viewer.html"), context! { viewer => self, data, glb })
+    }
+}
+
+const VIEWER_SCRIPT: &str = include_str!("report/viewer.js");
+
+/// The pictures of one view.
 #[derive(Clone, Debug, Serialize)]
 pub struct ViewRow {
     /// The view's name.
     pub name: String,
-    /// The photograph first.
-    pub pictures: Vec<CaptionedPicture>,
+    /// Pixels in a row of the pictures.
+    pub width: u32,
+    /// Their rows.
+    pub height: u32,
+    /// The photograph: a `data:` address.
+    pub photo: String,
+    /// What was made for it.
+    pub pictures: Vec<ViewPicture>,
 }
 
-/// A picture inside the page.
+/// A picture of a view.
 #[derive(Clone, Debug, Serialize)]
-pub struct CaptionedPicture {
-    caption: String,
-    url: String,
+pub struct ViewPicture {
+    /// The word of who made it.
+    pub method: String,
+    /// What a person calls that.
+    pub title: String,
+    /// The picture: a `data:` address.
+    pub picture: String,
+    /// How far it is from the photograph, in the colors of [`HEAT`].
+    pub error: String,
+    /// Masked PSNR, words.
+    pub psnr: String,
+    /// The full picture, relative to the page.
+    pub file: String,
 }
 
-impl CaptionedPicture {
-    /// Of the bytes of a PNG or JPEG file.
-    pub fn new(caption: String, file: &[u8]) -> CaptionedPicture {
-        let kind = if file.starts_with(&[0xFF, 0xD8]) { "jpeg" } else { "png" };
-        CaptionedPicture { caption, url: format!("data:image/{kind};base64,{}", base64(file)) }
-    }
-}
-
-/// The named figures of a `log.jsonl` over its steps. Lines that are not JSON (cut short by a crash)
-/// are passed over; a step logged twice, before and after an interruption, counts the second time.
-pub fn curves(log: &str, names: &[&str]) -> Vec<Curve> {
-    let mut curves: Vec<Curve> =
-        names.iter().map(|n| Curve { name: n.to_string(), points: Vec::new() }).collect();
-    for line in log.lines() {
-        let Ok(Value::Object(entry)) = serde_json::from_str(line) else { continue };
-        let Some(step) = entry.get("step").and_then(Value::as_f64) else { continue };
-        for curve in &mut curves {
-            if let Some(value) = entry.get(&curve.name).and_then(Value::as_f64) {
-                while curve.points.last().is_some_and(|(s, _)| *s >= step) {
-                    curve.points.pop();
-                }
-                curve.points.push((step, value));
-            }
+/// Returns the page of a run.
+pub fn html(report: &Report) -> Result<String> {
+    let viewer = report.viewer.as_ref().map(Viewer::html).transpose()?;
+    let mut methods: Vec<(&str, &str)> = Vec::new();
+    for picture in report.views.iter().flat_map(|v| &v.pictures) {
+        if methods.iter().all(|(word, _)| *word != picture.method) {
+            methods.push((&picture.method, &picture.title));
         }
     }
-    curves.retain(|c| c.points.len() > 1);
-    curves
+    fill(
+        include_str!("report/page.html"),
+        context! {
+            style => STYLE, script => include_str!("report/page.js"), viewer_script => VIEWER_SCRIPT,
+            viewer, methods, heat => heat(), most => (MOST_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
+        },
+    )
 }
 
-/// Returns the page.
-pub fn html(report: &Report) -> Result<String> {
+/// Returns the page of a head alone.
+pub fn viewer_html(viewer: &Viewer, views: &[ViewRow]) -> Result<String> {
+    fill(
+        include_str!("report/head.html"),
+        context! {
+            style => STYLE, viewer_script => VIEWER_SCRIPT, title => viewer.name, viewer => viewer.html()?, views
+        },
+    )
+}
+
+/// The colors of errors as CSS.
+fn heat() -> String {
+    let colors: Vec<String> = HEAT.iter().map(|[r, g, b]| format!("rgb({r} {g} {b})")).collect();
+    format!("linear-gradient(to right, {})", colors.join(", "))
+}
+
+fn fill(template: &str, context: minijinja::Value) -> Result<String> {
     let mut pages = Environment::new();
     pages.set_trim_blocks(true);
-    let page = pages.template_from_named_str("page.html", include_str!("report/page.html"));
-    page.and_then(|page| page.render(report)).map_err(|e| Error::new(ErrorKind::Bug, e))
+    // the name says that it is HTML, so that everything is escaped
+    let page = pages.template_from_named_str("page.html", template);
+    page.and_then(|page| page.render(context)).map_err(|e| Error::new(ErrorKind::Bug, e))
+}
+
+/// A picture file, PNG or JPEG, as a `data:` address.
+pub fn picture_url(file: &[u8]) -> String {
+    let kind = if file.starts_with(&[0xFF, 0xD8]) { "jpeg" } else { "png" };
+    format!("data:image/{kind};base64,{}", base64(file))
+}
+
+/// A path as an address relative to the page: whatever could mean something else there is coded (RFC 3986).
+pub fn link(path: &str) -> String {
+    let byte = |b: u8| match b {
+        b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' | b'/' => (b as char).to_string(),
+        other => format!("%{other:02X}"),
+    };
+    path.bytes().map(byte).collect()
 }
 
 /// Leaves of a JSON value with dotted names, as a person reads them; lists in one row.
@@ -108,36 +267,15 @@ pub fn leaves(value: &Value) -> Vec<(String, String)> {
     map.iter().flat_map(inner).collect()
 }
 
-/// A curve as the page draws it, 420 by 160, with its range in words.
-#[derive(Serialize)]
-struct Chart {
-    name: String,
-    points: String,
-    lowest: String,
-    highest: String,
-    first: String,
-    last: String,
-}
-
-impl From<Curve> for Chart {
-    fn from(Curve { name, points }: Curve) -> Chart {
-        let span = |values: &mut dyn Iterator<Item = f64>| {
-            values.fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)))
-        };
-        let (x0, x1) = span(&mut points.iter().map(|p| p.0));
-        let (y0, y1) = span(&mut points.iter().map(|p| p.1));
-        let scale = |v: f64, lo: f64, hi: f64| if hi > lo { (v - lo) / (hi - lo) } else { 0.5 };
-        let point = |(x, y): &(f64, f64)| {
-            format!("{:.1},{:.1}", 420.0 * scale(*x, x0, x1), 160.0 * (1.0 - scale(*y, y0, y1)))
-        };
-        Chart {
-            name,
-            points: points.iter().map(point).collect::<Vec<_>>().join(" "),
-            lowest: format!("{y0:.4}"),
-            highest: format!("{y1:.4}"),
-            first: format!("{x0:.0}"),
-            last: format!("{x1:.0}"),
-        }
+/// `8.2 s`, `2 min 25 s`, `3 h 07 min`.
+pub fn duration(seconds: f64) -> String {
+    let s = seconds.max(0.0);
+    let whole = s.round() as u64;
+    match whole {
+        0..10 => format!("{s:.1} s"),
+        10..60 => format!("{whole} s"),
+        60..3600 => format!("{} min {:02} s", whole / 60, whole % 60),
+        _ => format!("{} h {:02} min", whole / 3600, whole % 3600 / 60),
     }
 }
 
@@ -154,50 +292,107 @@ pub(crate) fn base64(bytes: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use serde_json::json;
 
-    #[test]
-    fn a_log_written_through_an_interruption_gives_one_line() {
-        let log = r#"{"step":1,"psnr":10.0}
-{"step":9,"psnr":20.0}
-{"st
-{"step":5,"psnr":15.0}
-"#;
-        let found = curves(log, &["psnr", "absent"]);
-        assert_eq!(found, [Curve { name: "psnr".into(), points: vec![(1.0, 10.0), (5.0, 15.0)] }]);
+    const HOSTILE: &str = "<img src=x onerror=alert(1)>\"'</script>";
+
+    fn camera() -> ViewerCamera {
+        let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let (name, picture) = (HOSTILE.into(), "photo-0".into());
+        let (fx, fy, cx, cy) = (9.0, 9.0, 2.0, 3.0);
+        ViewerCamera { name, width: 4, height: 6, fx, fy, cx, cy, position: [0.0; 3], axes, picture }
     }
 
-    #[test]
-    fn the_page_holds_everything_and_escapes_names() {
-        let page = html(&Report {
-            title: "<head>".into(),
+    fn report() -> Report {
+        let viewer = Viewer {
+            name: HOSTILE.into(),
+            cameras: vec![camera()],
+            front: [0.0, 0.0, 1.0],
+            glb: vec![1],
+            ..Viewer::default()
+        };
+        let picture = ViewPicture {
+            method: "tface".into(),
+            title: "T-Face".into(),
+            picture: picture_url(&[0xFF, 0xD8, 1]),
+            error: picture_url(&[2]),
+            psnr: "33.1".into(),
+            file: format!("render/tface/{HOSTILE}.png"),
+        };
+        let photo = picture_url(&[1]);
+        Report {
+            title: HOSTILE.into(),
+            viewer: Some(viewer),
+            table: MethodTable::new(
+                &[("PSNR", 2, Some(true)), ("s", 1, Some(false)), ("triangles", 0, None)],
+                vec![
+                    ("a".into(), vec![Some(30.0), Some(2.0), None]),
+                    ("b".into(), vec![Some(31.0), None, Some(9.0)]),
+                ],
+            ),
+            quality: [["", "edge"], ["head & neck", "21.02"]].map(|r| r.map(String::from).to_vec()).to_vec(),
+            views: vec![ViewRow {
+                name: HOSTILE.into(),
+                width: 4,
+                height: 6,
+                photo,
+                pictures: vec![picture],
+            }],
+            left_out: vec![HOSTILE.into()],
+            masks: "<figure>mask</figure>".into(),
+            charts: vec!["<figure>chart</figure>".into()],
+            times: vec![("iface".into(), "8.0 s".into(), 100.0)],
+            changes: vec![[HOSTILE.into(), "1".into(), "2".into()]],
+            warnings: vec![HOSTILE.into()],
+            repeat: HOSTILE.into(),
             summaries: vec![(
                 "mesh".into(),
                 leaves(&json!({"closed": true, "report": {"volume": 0.25}, "p": null})),
             )],
-            quality: [["", "edge"], ["head & neck", "21.02"]].map(|r| r.map(String::from).to_vec()).to_vec(),
-            masks: "<figure>mask</figure>".into(),
-            curves: vec![Curve { name: "psnr".into(), points: vec![(0.0, 1.0), (2.0, 3.0)] }],
-            rows: vec![ViewRow {
-                name: "012".into(),
-                pictures: vec![
-                    CaptionedPicture::new("photograph".into(), &[0xFF, 0xD8, 1]),
-                    CaptionedPicture::new("ensemble".into(), &[1]),
-                ],
-            }],
-            left_out: 3,
-            settings: "[mesh]".into(),
-        })
-        .unwrap();
-        assert!(page.contains("<h1>&lt;head&gt;</h1>") && !page.contains("http"));
-        assert!(page.contains("<td>report.volume</td><td>0.2500</td>"));
-        assert!(page.contains("<tr><th></th><th>edge</th></tr>"), "{page}");
-        assert!(page.contains("<tr><td>head &amp; neck</td><td>21.02</td></tr>"), "{page}");
-        assert!(page.contains("points=\"0.0,160.0 420.0,0.0\""), "{page}");
-        assert!(page.contains("<td>p</td><td>–</td>") && page.contains("<pre>[mesh]</pre>"));
-        assert!(page.contains("<p>3 more views lie in"));
-        assert!(page.contains("<h2>Masks</h2>\n<figure>mask</figure>"));
-        assert!(page.contains("<h3>012</h3>") && page.contains("<figcaption>ensemble</figcaption>"));
+            settings: HOSTILE.into(),
+            ..Report::default()
+        }
+    }
+
+    #[test]
+    fn the_page_holds_everything_and_escapes_whatever_comes_from_outside() {
+        let page = html(&report()).unwrap();
+        assert!(!page.contains("<img src=x") && !page.contains("//cdn") && !page.contains("http:"), "{page}");
+        assert_eq!(page.matches("</script>").count(), page.matches("<script").count());
+        assert!(page.contains("<td>report.volume</td><td>0.2500</td>") && page.contains("<td>–</td>"));
+        assert!(page.contains("<tr><td>head &amp; neck</td><td>21.02</td></tr>"));
+        assert!(page.contains("<figure>mask</figure>") && page.contains("<figure>chart</figure>"));
         assert!(page.contains("data:image/jpeg;base64,/9gB") && page.contains("data:image/png;base64,AQ=="));
+        assert!(page.contains("<h1>&lt;img src=x onerror=alert(1)&gt;"));
+    }
+
+    #[test]
+    fn a_head_alone_has_its_page() {
+        let report = report();
+        let page = viewer_html(report.viewer.as_ref().unwrap(), &report.views).unwrap();
+        assert!(!page.contains("<img src=x") && page.contains("id=\"photo-0\"") && page.contains("AQ=="));
+    }
+
+    #[test]
+    fn the_best_of_a_column_is_marked_by_what_is_better_there() {
+        let MethodTable { headings, rows } = report().table;
+        assert_eq!(headings, ["PSNR", "s", "triangles"]);
+        let cells = |k: usize| rows.iter().map(|(_, r)| (r[k].0.as_str(), r[k].1)).collect::<Vec<_>>();
+        assert_eq!(cells(0), [("30.00", false), ("31.00", true)]);
+        assert_eq!(cells(1), [("2.0", true), ("–", false)]);
+        assert_eq!(cells(2), [("–", false), ("9", false)]);
+    }
+
+    #[test]
+    fn a_link_is_a_path_and_nothing_else() {
+        assert_eq!(link("render/tface/a b.png"), "render/tface/a%20b.png");
+        assert_eq!(link("javascript:x#?%ü"), "javascript%3Ax%23%3F%25%C3%BC");
+    }
+
+    #[test]
+    fn times_are_short() {
+        assert_eq!(
+            [8.24, 59.6, 145.0, 11_220.0].map(duration),
+            ["8.2 s", "1 min 00 s", "2 min 25 s", "3 h 07 min"]
+        );
     }
 }

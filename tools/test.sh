@@ -112,6 +112,14 @@ train_demo() {
     --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured
 }
 
+# The pages of the demo head, as a person opens them.
+demo_pages() {
+  "$target/release/tiface" preview "$scratch/demo" --size 512 --out "$scratch/demo/preview.png" &&
+    "$target/release/tiface" report "$scratch/demo" "$scratch/demo/capture" --out "$scratch/demo/runs.html" &&
+    node tools/page/check_report.mjs "$scratch/demo" &&
+    node tools/page/check_watch.mjs "$target/release/tiface" "$scratch/demo"
+}
+
 step "independent readers are here" readers
 step "format" cargo fmt --all -- --check
 # Everything is checked once with all features, and the default ones and the core alone (no burn) by themselves;
@@ -133,7 +141,7 @@ browser=yes
 printf '\n== a browser is here\n'
 if ! browser_is_here; then
   browser=no
-  results+=("SKIPPED the page to click on, and lobes in three.js: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it")
+  results+=("SKIPPED the page to click on, reports, and lobes in three.js: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it")
 fi
 mkdir -p "$scratch/click"
 step "the page to click on is written" example click_page "$scratch/click/page.html"
@@ -161,6 +169,7 @@ if [ $demo = yes ]; then
   readers_agree "the demo head" "$scratch/demo/mesh/head.glb" --up 0 0 1
   step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$scratch/demo/mesh/head.glb"
   if [ $browser = yes ]; then
+    step "a browser opens its pages" demo_pages
     step "three.js shows its lobes" node tools/readers/check_lobes.mjs "$scratch/demo"
   fi
   if [ $blender = yes ]; then

@@ -3,13 +3,13 @@
 use super::invocation::Invocation;
 use super::out::Out;
 use super::run::{LineCommand, run as run_line};
-use super::screen::duration;
 use super::target::{DEMO_CAPTURE, RunTarget};
 use crate::Result;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::Preset;
 use crate::io;
 use crate::pipeline::{Stage, feasible};
+use crate::report::duration;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 

@@ -15,6 +15,7 @@ mod out;
 mod page;
 mod plain;
 mod preview;
+mod report;
 mod run;
 mod screen;
 mod signals;
@@ -22,6 +23,7 @@ mod status;
 mod stdout;
 mod summary;
 mod target;
+mod viewer;
 
 use crate::pipeline::Stage;
 use crate::run::Stop;
@@ -290,6 +292,8 @@ learned from (capture.tiles): the blend follows the better members.")]
     #[command(after_long_help = "Examples:
   tiface preview runs/002_00                    three quarters of the head, 1024 pixels, as a PNG
   tiface preview scan.ply --light matcap --size 512 --out scan.png
+  tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
+  tiface preview runs/002_00 --watch            a run while it works, in a browser on this machine
   tiface preview head.glb --light normals --background black")]
     Preview(PreviewOptions),
     /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates, size
@@ -312,6 +316,15 @@ learned from (capture.tiles): the blend follows the better members.")]
         /// see it, and back from skin and hair
         #[arg(long, value_name = "CAPTURE", requires = "against")]
         seen_by: Option<PathBuf>,
+    },
+    /// The page of a run made anew, or one page of many runs
+    #[command(after_long_help = "Examples:
+  tiface report runs/002_00                     its report.html, from what lies there
+  tiface report runs/* --out fleet.html         all of them in a table, with links to each
+  tiface report runs/* --json                   the same figures, an object for each run")]
+    Report {
+        /// Run folders; without any, all under runs/
+        runs: Vec<PathBuf>,
     },
     /// Stages, progress, time left and last error of one or many runs
     #[command(after_long_help = "Examples:
@@ -366,6 +379,7 @@ pub fn main() -> ExitCode {
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
         Command::Preview(options) => preview::run(&invocation, options),
         Command::Status { runs } => makes_nothing("status").and_then(|()| status::run(&common, runs)),
+        Command::Report { runs } => report::run(&invocation, runs),
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),
         Command::Completions { shell } => {

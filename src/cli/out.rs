@@ -26,7 +26,7 @@ fn endings(product: &str) -> &'static [&'static str] {
         "run" => &["glb", "obj", "ply", "json"],
         "mesh" => &["glb", "obj", "ply"],
         "metrics" => &["json"],
-        "page" => &["html"],
+        "page" | "report" => &["html"],
         "preview" => &["png"],
         "turntable" => &io::ANIMATIONS,
         _ => &[],

@@ -6,6 +6,7 @@ use super::invocation::Invocation;
 use super::out::Out;
 use super::stdout::{print, print_as_is};
 use super::target::RunTarget;
+use super::viewer;
 use crate::config::ViewBackground;
 use crate::geom::Camera;
 use crate::io::{self, Animation};
@@ -56,6 +57,12 @@ pub(super) struct PreviewOptions {
     #[arg(long, value_name = "AXIS", default_value = "y", allow_hyphen_values = true)]
     #[arg(value_parser = PossibleValuesParser::new(["x", "-x", "y", "-y", "z", "-z"]).map(|word| axis(&word)))]
     up: Vec3,
+    /// Write a page to turn it in a browser: one file, no program or network needed
+    #[arg(long, conflicts_with_all = ["turntable", "sheet", "cameras"])]
+    page: bool,
+    /// Serve a run on this machine while it works: stages, curves, newest views; until Ctrl-C
+    #[arg(long, conflicts_with_all = ["page", "turntable", "sheet", "cameras"])]
+    watch: bool,
 }
 
 fn look(word: &str) -> Look {
@@ -145,6 +152,14 @@ impl Kind {
 
 pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
+    if options.watch {
+        Out::none(common.out.as_deref(), "preview --watch")?;
+        return viewer::watch(invocation, options.path.as_deref());
+    }
+    if options.page {
+        let asked = Out::find(common.out.as_deref(), "page")?;
+        return viewer::page(invocation, options.path.as_deref(), options.up, asked.as_ref());
+    }
     let kind = Kind::of(options);
     let asked = Out::find(common.out.as_deref(), if kind.is_moving() { "turntable" } else { "preview" })?;
     let (preview, name) = open(invocation, options)?;

@@ -136,7 +136,7 @@ fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
 }
 
 /// Was this run made by `tiface demo`, also when its stages are run one by one?
-fn is_demo(config: &Config, run: &Run) -> bool {
+pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
     let made = run.path(DEMO_CAPTURE);
     io::real_path(&made).is_ok_and(|made| made == Path::new(&config.capture.path))
 }

@@ -2,10 +2,11 @@
 
 use super::options::Common;
 use super::plain::one_line;
-use super::screen::{duration, figure};
+use super::screen::figure;
 use super::stdout::print;
 use crate::io;
 use crate::pipeline::Stage;
+use crate::report::duration;
 use crate::run::{Record, State, Status, read_record, read_status};
 use crate::{Error, Result};
 use serde_json::json;

@@ -260,6 +260,16 @@ impl Config {
             .collect()
     }
 
+    /// The keys whose values are not those of the preset: full name, value, the preset's value, as in TOML.
+    pub fn changes(&self) -> Vec<[String; 3]> {
+        let (own, preset) = (self.to_table(), Config::preset(self.preset).to_table());
+        let change = |(name, _): (String, &Key)| {
+            let [own, preset] = [&own, &preset].map(|t| lookup(t, &name).map(show).unwrap_or_default());
+            (own != preset).then_some([name, own, preset])
+        };
+        all_keys().filter_map(change).collect()
+    }
+
     fn to_table(&self) -> Table {
         match Value::try_from(self) {
             Ok(Value::Table(table)) => table,
@@ -323,6 +333,15 @@ mod source_tests;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_differs_from_the_preset_is_listed() {
+        let mut config = Config::preset(Preset::Draft);
+        assert!(config.changes().is_empty());
+        (config.seed, config.iface.lr_table) = (7, 0.1);
+        let expected = [["seed", "7", "42"], ["iface.lr_table", "0.1", "0.01"]].map(|c| c.map(String::from));
+        assert_eq!(config.changes(), expected);
+    }
 
     #[test]
     fn every_field_has_a_documented_key_and_every_key_a_field() {

@@ -127,6 +127,11 @@ pub fn list_folders(path: &Path) -> Result<Vec<PathBuf>, ReadError> {
     Ok(folders)
 }
 
+/// How many bytes a file has; `None` if it is not there.
+pub fn file_size(path: &Path) -> Option<u64> {
+    fs::metadata(path).ok().filter(|m| m.is_file()).map(|m| m.len())
+}
+
 /// When a file was last changed; `None` if it is not there or the system does not say.
 pub fn modified(path: &Path) -> Option<SystemTime> {
     fs::metadata(path).and_then(|m| m.modified()).ok()

@@ -21,8 +21,8 @@ pub use self::exr::{ExrImage, read_exr, write_exr};
 pub use animation::{ANIMATIONS, Animation, write_animation};
 pub use error::ReadError;
 pub use folder::{
-    Lock, LockError, any_file, append, clear_folder, create_folder, exists, free_bytes, is_file, is_folder,
-    is_link, is_writable, list_files, list_folders, modified, real_path,
+    Lock, LockError, any_file, append, clear_folder, create_folder, exists, file_size, free_bytes, is_file,
+    is_folder, is_link, is_writable, list_files, list_folders, modified, real_path,
 };
 pub use json::{parse_json, read_json, read_typed, typed};
 pub use limits::Limits;

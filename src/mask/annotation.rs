@@ -5,10 +5,9 @@
 //! JSON in which no character can end the element that holds it.
 
 use super::prompts::{Prompts, file_path};
-use super::scale::{reduce_photo, working_size};
 use crate::Result;
 use crate::capture::{Capture, View};
-use crate::image::Photo;
+use crate::image::{Photo, reduce_photo, working_size};
 use crate::io::{self, Limits};
 use crate::report::{base64, escape};
 use rayon::prelude::*;

@@ -13,8 +13,8 @@ pub mod trimap;
 
 use self::closed_form::{ClosedFormOptions, closed_form};
 use self::trimap::{HEAD, OUTSIDE, UNKNOWN, UnknownBand, trimap, unknown_share};
-use super::scale::{enlarge, reduce_photo, resize_hard, working_size};
-use crate::image::{Gray, Photo};
+use super::scale::{enlarge, resize_hard};
+use crate::image::{Gray, Photo, reduce_photo, working_size};
 use crate::{Error, Result};
 
 /// Alphas below become 0.

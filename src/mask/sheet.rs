@@ -6,9 +6,9 @@
 
 use super::annotation::evenly;
 use super::matting::trimap::{UNKNOWN, unknown_share};
-use super::scale::{reduce_photo, resize_gray, resize_hard, working_size};
+use super::scale::{resize_gray, resize_hard};
 use crate::capture::{coverage, findings};
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, reduce_photo, working_size};
 use crate::io;
 use crate::report::base64;
 use crate::{Error, ErrorKind, Result};
@@ -105,9 +105,18 @@ pub fn sheet(views: &[SheetView]) -> Result<String> {
     page.map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
-/// What a [`sheet`] shows, without the page around it: for a page with more.
-pub fn part(sheet: &str) -> Option<&str> {
-    Some(sheet.split_once(MARKS[0])?.1.split_once(MARKS[1])?.0)
+/// What a [`sheet`] shows, without the page around it: for a page with more, in about `most` bytes. Where not all views
+/// have room, suspicious ones and evenly spread others stay.
+pub fn part(sheet: &str, most: usize) -> Option<String> {
+    let inside = sheet.split_once(MARKS[0])?.1.split_once(MARKS[1])?.0;
+    let (head, rest) = inside.split_once("<figure")?;
+    let (figures, tail) = rest.rsplit_once("</figure>")?;
+    let figures: Vec<&str> =
+        figures.split("<figure").map(|f| f.trim_end().trim_end_matches("</figure>")).collect();
+    let room = most.saturating_mul(figures.len()) / inside.len();
+    let shown = evenly(figures.len(), room, |i| figures[i].starts_with(" class=\"odd\""));
+    let shown: Vec<String> = shown.into_iter().map(|i| format!("<figure{}</figure>\n", figures[i])).collect();
+    Some(format!("{head}{}{}", shown.concat(), tail.trim_start()))
 }
 
 #[cfg(test)]
@@ -188,8 +197,24 @@ mod tests {
     #[test]
     fn a_part_of_a_sheet_has_its_pictures_and_no_page_around_them() {
         let page = sheet(&[SheetView::new("a", &photo(60, 80), &bust(), None).unwrap()]).unwrap();
-        let part = part(&page).unwrap();
+        let part = part(&page, usize::MAX).unwrap();
         assert!(part.contains("<figure>") && !part.contains("<html") && !part.contains("</body>"));
-        assert_eq!(super::part("another page"), None);
+        assert_eq!(super::part("another page", usize::MAX), None);
+    }
+
+    #[test]
+    fn a_part_with_little_room_keeps_what_is_suspicious() {
+        let mut views = vec![SheetView::new("a", &photo(60, 80), &bust(), None).unwrap(); 8];
+        views.iter_mut().for_each(|v| v.suspicions.clear());
+        views[5].suspicions.push("odd".into());
+        let page = sheet(&views).unwrap();
+        let whole = part(&page, usize::MAX).unwrap();
+        for (room, figures) in [(usize::MAX, 8), (whole.len() / 2, 3), (0, 0)] {
+            let part = part(&page, room).unwrap();
+            let found = (part.matches("<figure").count(), part.matches("</figure>").count());
+            assert!(found.0 == found.1 && found.0.abs_diff(figures) <= 1, "{found:?} of {figures}");
+            assert_eq!(part.contains("class=\"odd\""), figures > 0);
+            assert!(part.trim_end().ends_with("</div>"));
+        }
     }
 }

@@ -6,7 +6,7 @@
 
 use crate::capture::{Capture, Split};
 use crate::config::MaskConfig;
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, reduce_photo, working_size};
 use crate::io::{self, Limits};
 use crate::mask::grabcut::grabcut;
 use crate::mask::matting::trimap::UnknownBand;
@@ -14,7 +14,7 @@ use crate::mask::matting::{SoftMask, SoftenOptions, soften_with};
 use crate::mask::networks::Networks;
 use crate::mask::prompts::{self, PhotoPrompts, Prompts};
 use crate::mask::propagate::{PropagateView, propagate};
-use crate::mask::{Click, distance, scale};
+use crate::mask::{Click, distance};
 use crate::run::{Fingerprint, StageDir};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -131,7 +131,7 @@ fn photos_at_once(
     // photograph, alpha and equations
     let bytes = soft.memory_bytes(width, height) + 8 * u64::from(width) * u64::from(height);
     let built_in = (memory.min(MOST_BYTES) / bytes.max(1)).clamp(1, threads as u64) as usize;
-    let (w, h) = scale::working_size(width, height, soft.side);
+    let (w, h) = working_size(width, height, soft.side);
     networks.map_or(built_in, |n| n.photos_at_once(w, h, threads).min(built_in))
 }
 
@@ -155,7 +155,7 @@ pub(super) fn make_masks(
     let largest = sizes.max_by_key(|&(w, h)| (u64::from(w) * u64::from(h), w)).unwrap_or((1, 1));
     if let Some(networks) = networks {
         // a file that the engine cannot run is refused before the work
-        let (w, h) = scale::working_size(largest.0, largest.1, config.side_px);
+        let (w, h) = working_size(largest.0, largest.1, config.side_px);
         networks.prepare(w, h)?;
         networks.files().iter().for_each(|file| dir.note(&file.to_string()));
     }
@@ -216,13 +216,13 @@ fn soft_mask(
 ) -> Result<SoftMask> {
     let Some(networks) = networks else { return soften_with(photo, hard, soft, |_, _| Ok(None)) };
     let mut warnings = Vec::new();
-    let size = scale::working_size(photo.width, photo.height, soft.side);
+    let size = working_size(photo.width, photo.height, soft.side);
     let chosen = match clicks {
         [] => propagated_clicks(hard, size),
         own => own.iter().map(|c| c.moved((photo.width, photo.height), size)).collect(),
     };
     let mut mask = hard;
-    let segmented = networks.segment(&scale::reduce_photo(photo, size), &chosen)?;
+    let segmented = networks.segment(&reduce_photo(photo, size), &chosen)?;
     if let Some((found, score)) = &segmented {
         if !found.values.contains(&255) {
             warnings.push("SAM found nothing of the head; the built-in cut stands in".into());

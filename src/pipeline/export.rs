@@ -71,7 +71,7 @@ impl Export {
         }
     }
 
-    /// Where the face of a head at `center` looks: see [`front`].
+    /// Where the face of a head at `center` looks: see `front`.
     pub fn front(&self, center: DVec3) -> Option<Vec3> {
         front(self.up, &self.cameras, center)
     }
@@ -95,6 +95,16 @@ impl Export {
             (low, high) = (low.min(q), high.max(q));
         }
         Similarity { translation: turned.translation - 0.5 * (low + high), ..turned }
+    }
+
+    /// From the dataset's world to the coordinates of GLB and OBJ files, metres.
+    pub(super) fn file_from_world(&self, head: &HeadMesh) -> Result<Similarity> {
+        let HeadMesh { mesh, world_from_scene, .. } = head;
+        let turned = match self.frame {
+            MeshFrame::Dataset => Similarity { rotation: turn_to_y_up(self.up)?, ..Similarity::IDENTITY },
+            MeshFrame::Head => self.head_from_mesh(mesh, world_from_scene).after(&world_from_scene.inverse()),
+        };
+        Ok(Similarity { scale: self.unit_m, ..Similarity::IDENTITY }.after(&turned))
     }
 
     /// The turn from the dataset's world to the coordinates of GLB and OBJ files.
@@ -229,8 +239,12 @@ mod tests {
             let notes =
                 String::from_utf8_lossy(&glb.files[0].1).contains("\"extras\":{\"tiface\":{\"lobes\":[{");
             assert_eq!(notes, head.texture.is_some());
+            let file_from_world = export.file_from_world(head).unwrap();
             for (found, t) in corners.iter().zip(0..) {
                 let expected = mesh.corners(t).map(exact);
+                // whoever looks at the file finds the world there
+                let there = file_from_world.point_f64(expected[0]) - translation;
+                assert!(there.distance(found[0].as_dvec3()) < close, "{there}");
                 for (p, e) in found.iter().zip(expected) {
                     // z up: (x, y, z) becomes (x, z, −y)
                     let e = DVec3::new(e.x, e.z, -e.y) - translation;
@@ -249,11 +263,13 @@ mod tests {
             let front = ((export.cameras[0] - centre) * DVec3::new(1.0, 1.0, 0.0)).normalize();
             let axes = [DVec3::Z.cross(front), DVec3::Z, front];
             let turned = |p: Vec3| DVec3::from(axes.map(|a| a.dot(exact(p) - place.translation)));
+            let file_from_world = export.file_from_world(head).unwrap();
             let all = || mesh.positions.iter().map(|&p| turned(p));
             let middle = 0.5 * (all().reduce(DVec3::min).unwrap() + all().reduce(DVec3::max).unwrap());
             for (found, t) in corners.iter().zip(0..) {
                 for (p, e) in found.iter().zip(mesh.corners(t)) {
                     assert!(p.as_dvec3().distance(turned(e) - middle) < close, "{p}");
+                    assert!(file_from_world.point_f64(exact(e)).distance(p.as_dvec3()) < close, "{p}");
                 }
             }
             assert!(

@@ -133,7 +133,10 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     }
     page::write_report(&line, false).unwrap();
     let page = String::from_utf8(bytes("report.html")).unwrap();
-    assert!(page.contains("<figcaption>blend (ensemble)</figcaption>") && run.path("cameras.json").is_file());
+    assert!(page.contains("alt=\"012 by blend (ensemble)\"") && run.path("cameras.json").is_file());
+    // the head to turn, and where the held-out photograph was taken from
+    assert!(page.contains("class=\"viewer-glb\">Z2xURg") && page.contains("\"name\":\"012\""));
+    assert!(page.len() < 8_000_000, "{}", page.len());
     assert!(bytes("mesh/head.glb").starts_with(b"glTF"));
 }
 

@@ -6,13 +6,13 @@ use crate::Result;
 use crate::capture::scene::{self, Scene, SceneOptions};
 use crate::capture::{self, Capture, Split};
 use crate::config::{MaskConfig, MaskMeaning};
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, working_size};
 use crate::io::{self, Limits};
 use crate::mask::annotation::page_of;
 use crate::mask::consistency::{ConsistencyView, check_consistency};
 use crate::mask::matting::trimap::unknown_share;
 use crate::mask::prompts::read_prompts;
-use crate::mask::scale;
+use crate::mask::scale::resize_gray;
 use crate::mask::sheet::{SheetView, sheet};
 use crate::run::StageDir;
 use rayon::prelude::*;
@@ -214,7 +214,7 @@ fn as_warnings(conflicts: &[(usize, String)], masks: usize) -> Vec<String> {
 
 /// A mask at a size that is enough to place the head and to compare masks.
 fn for_placing(mask: &Gray) -> Gray {
-    scale::resize_gray(mask, scale::working_size(mask.width, mask.height, PLACED_PX))
+    resize_gray(mask, working_size(mask.width, mask.height, PLACED_PX))
 }
 
 /// What the masks of a capture say against each other, a sentence for each that a person should look at. What cannot

@@ -1,94 +1,135 @@
-//! `report.html`, from what lies in the run.
+//! `report.html`, from what lies in the run: the head to turn, views beside their photographs, figures, times, settings.
+//!
+//! The page stays below eight megabytes, so that it opens at once and can be sent: pictures are small copies, with links to
+//! those beside the page; of many views and masks some are shown.
+
+mod methods;
+mod viewer;
+mod views;
+
+pub use viewer::{head_page, viewer_of_file};
 
 use super::line::Line;
-use super::metrics::{Comparable, comparable, picture_sets};
 use crate::Result;
-use crate::config::{PictureFormat, Stage, called};
+use crate::config::Stage;
 use crate::io::{self, Limits};
-use crate::report::{self, CaptionedPicture, Curve, Report, ViewRow};
-use crate::run::read_record;
+use crate::report::{self, LEARNED, Report, Viewer, duration};
+use crate::run::{Record, read_record};
 use serde_json::Value;
 use std::path::Path;
 
-/// The stages that learn, and what of their `log.jsonl` is drawn.
-const LEARNED: [(Stage, &[&str]); 3] = [
-    (Stage::Baseline, &["psnr", "samples"]),
-    (Stage::Tface, &["psnr", "mask", "outside", "samples"]),
-    (Stage::Iface, &["psnr", "eikonal", "inv_s"]),
-];
-
-/// A page with more bytes of pictures than this is no pleasure in a browser; further views are only
-/// counted.
-const MOST_BYTES: usize = 48 << 20;
+/// Bytes of a page without its fixed parts.
+const MOST_BYTES: usize = 7_600_000;
+/// Of them, for the masks.
+const MASK_BYTES: usize = 800_000;
 
 /// Writes `report.html`, of every stage that is done; without the photographs it stays as it is.
 pub(super) fn write_report(line: &Line, idle: bool) -> Result<()> {
-    if line.gone.is_some() {
+    if line.gone.is_some() || idle && is_current(line) {
         return Ok(());
     }
-    let limits = Limits::default();
-    let text = |file: &Path| -> Result<String> {
-        if !io::is_file(file) {
-            return Ok(String::new());
-        }
-        Ok(String::from_utf8_lossy(&io::read_bytes(file, &limits)?).into_owned())
-    };
-    let sheet = text(&line.run.path(Stage::Mask).join(super::mask::SHEET))?;
-    let (rows, left_out) = rows(line, sheet.len())?;
-    let mut curves = Vec::new();
-    for (stage, names) in LEARNED {
-        let log = text(&line.run.path(stage).join("log.jsonl"))?;
-        let found = report::curves(&log, names).into_iter();
-        curves.extend(found.map(|c| Curve { name: format!("{stage} {}", c.name), ..c }));
-    }
-    let page = Report {
-        title: line.capture.name.clone(),
-        summaries: Stage::ALL.into_iter().filter_map(|stage| summary(line, stage)).collect(),
-        quality: quality(line),
-        masks: crate::mask::sheet::part(&sheet).unwrap_or_default().into(),
-        curves,
-        rows,
-        left_out,
-        settings: line.config.to_toml(),
-    };
-    line.write("report.html", report::html(&page)?.as_bytes(), idle)
+    line.write("report.html", page(line)?.as_bytes(), idle)
 }
 
-/// The views with their pictures, and how many found no room beside as many `bytes` as there are already.
-fn rows(line: &Line, mut bytes: usize) -> Result<(Vec<ViewRow>, usize)> {
-    let sets = match line.config.render.format {
-        PictureFormat::Png => picture_sets(line),
-        PictureFormat::Exr => Vec::new(), // browsers show none
-    };
-    let sets: Vec<_> = sets.iter().map(|set| (set.name.as_str(), comparable(line, set))).collect();
-    let (mut rows, mut left_out) = (Vec::new(), 0);
-    for view in &line.capture.views {
-        let own = |(name, set): &(&'_ str, Vec<Comparable>)| {
-            let picture = set.iter().find(|c| c.view.name == view.name)?;
-            Some((name.to_string(), picture.file.clone()))
-        };
-        let files: Vec<_> = sets.iter().filter_map(own).collect();
-        if files.is_empty() {
-            continue;
-        }
-        if bytes > MOST_BYTES {
-            left_out += 1;
-            continue;
-        }
-        let mut pictures = Vec::new();
-        for (word, file) in [("photograph".into(), view.photo.clone())].into_iter().chain(files) {
-            let picture = io::read_bytes(&file, &Limits::default())?;
-            bytes += picture.len();
-            pictures.push(CaptionedPicture::new(called(&word), &picture));
-        }
-        rows.push(ViewRow { name: view.name.clone(), pictures });
+/// Is the report newer than every stage and the settings? Making it opens all pictures.
+fn is_current(line: &Line) -> bool {
+    let time = |name: &str| io::modified(&line.run.path(name));
+    let report = time("report.html").filter(|_| io::is_file(&line.run.path("report.html")));
+    let records = Stage::ALL.map(|stage| time(&format!("{stage}/done.json")));
+    report.is_some_and(|report| records.into_iter().flatten().chain(time("config.toml")).all(|t| t < report))
+}
+
+/// Writes the report of a run anew, from what lies in it.
+///
+/// # Errors
+///
+/// The photographs are no longer there, or a file of the run is damaged.
+pub fn renew_report(line: &Line) -> Result<()> {
+    line.require_inputs(&[Stage::Metrics])?;
+    line.run.write("report.html", page(line)?.as_bytes())
+}
+
+fn page(line: &Line) -> Result<String> {
+    let sheet = text(&line.run.path(Stage::Mask).join(super::mask::SHEET))?;
+    let masks = crate::mask::sheet::part(&sheet, MASK_BYTES).unwrap_or_default();
+    let found = viewer::viewer(line)?;
+    let glb = found.as_ref().map_or(0, |(v, _)| v.glb.len().div_ceil(3) * 4);
+    let (views, left_out) = views::rows(line, MOST_BYTES.saturating_sub(masks.len() + glb))?;
+    let viewer = found.map(|(viewer, file_from_world)| Viewer {
+        cameras: viewer::cameras(line, &views, &file_from_world),
+        ..viewer
+    });
+    let mut charts = Vec::new();
+    for (stage, names) in LEARNED {
+        let log = text(&line.run.path(stage).join("log.jsonl"))?;
+        charts.extend(report::charts(stage.word(), &log, names).iter().map(report::Chart::html));
     }
-    Ok((rows, left_out))
+    let records: Vec<(Stage, Record)> = Stage::ALL
+        .into_iter()
+        .filter_map(|stage| Some((stage, read_record(&line.run.path(stage)).ok()??)))
+        .collect();
+    let longest = records.iter().map(|(_, r)| r.elapsed_s).fold(1e-3, f64::max);
+    let time = |(stage, r): &(Stage, Record)| {
+        (stage.to_string(), duration(r.elapsed_s), (100.0 * r.elapsed_s / longest * 10.0).round() / 10.0)
+    };
+    report::html(&Report {
+        title: line.capture.name.clone(),
+        facts: facts(line, &records),
+        viewer,
+        table: methods::table(line),
+        quality: methods::quality(line),
+        views,
+        left_out,
+        masks,
+        charts,
+        times: records.iter().map(time).collect(),
+        changes: line.config.changes(),
+        warnings: warnings(line, &records),
+        repeat: format!("tiface run {} --config config.toml --run again", quoted(&line.config.capture.path)),
+        summaries: records.iter().filter_map(summary).collect(),
+        settings: line.config.to_toml(),
+    })
+}
+
+/// A file as text; empty if it is not there.
+fn text(file: &Path) -> Result<String> {
+    if !io::is_file(file) {
+        return Ok(String::new());
+    }
+    Ok(String::from_utf8_lossy(&io::read_bytes(file, &Limits::default())?).into_owned())
+}
+
+fn facts(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
+    use crate::capture::Split::{Test, Train};
+    let [train, test] = [Train, Test].map(|split| line.capture.split(split).count());
+    let mut facts = vec![
+        format!("{train} photographs to learn from, {test} held out"),
+        format!("preset {}", line.config.preset.name()),
+        format!("seed {}", line.config.seed),
+    ];
+    if let Some((_, last)) = records.last() {
+        facts.push(duration(records.iter().map(|(_, r)| r.elapsed_s).sum()));
+        facts.push(format!("tiface {}", last.version));
+    }
+    facts
+}
+
+/// What stages and the capture say that a person should know.
+fn warnings(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
+    let mut all = line.capture.warnings.clone();
+    for (stage, record) in records {
+        let said = record.summary["warnings"].as_array().into_iter().flatten().filter_map(Value::as_str);
+        all.extend(said.map(|w| format!("{stage}: {w}")));
+        if record.summary["closed"] == false {
+            all.push(format!("{stage}: the surface is not watertight"));
+        }
+    }
+    all
 }
 
 /// The figures of a stage that is done; those of pictures have a table of their own.
-fn summary(line: &Line, stage: Stage) -> Option<(String, Vec<(String, String)>)> {
-    let mut figures = read_record(&line.run.path(stage)).ok()??.summary;
+fn summary((stage, record): &(Stage, Record)) -> Option<(String, Vec<(String, String)>)> {
+    let mut figures = record.summary.clone();
     if let (Stage::Metrics, Value::Object(sets)) = (stage, &mut figures) {
         sets.retain(|_, set| set.get("head").is_none());
     }
@@ -96,34 +137,23 @@ fn summary(line: &Line, stage: Stage) -> Option<(String, Vec<(String, String)>)>
     (!rows.is_empty()).then(|| (stage.to_string(), rows))
 }
 
-/// What the table of pictures shows: a heading, where it stands in `metrics.json`, and how many digits.
-const QUALITY: [(&str, &str, usize); 12] = [
-    ("PSNR", "/head/mean/psnr_masked", 2),
-    ("SSIM", "/head/mean/ssim_masked", 4),
-    ("whole frame", "/head/mean/psnr", 2),
-    ("region", "/region/mean/psnr_masked", 2),
-    ("opaque", "/parts/mean/psnr_opaque", 2),
-    ("edge", "/parts/mean/psnr_edge", 2),
-    ("skin", "/parts/mean/psnr_skin", 2),
-    ("hair", "/parts/mean/psnr_hair", 2),
-    ("missing", "/parts/mean/missing", 0),
-    ("extra", "/parts/mean/extra", 0),
-    ("at most", "/parts/mean/psnr_cap", 2),
-    ("opacity² outside", "/mean_square_opacity_outside", 4),
-];
+/// A word as a shell takes it.
+fn quoted(word: &str) -> String {
+    let plain = |c: char| c.is_alphanumeric() || "/._-+=:@,".contains(c);
+    match !word.is_empty() && word.chars().all(plain) && !word.starts_with('-') {
+        true => word.into(),
+        false => format!("'{}'", word.replace('\'', r"'\''")),
+    }
+}
 
-/// A row for every kind of picture that was judged, below the heading; nothing where none was.
-fn quality(line: &Line) -> Vec<Vec<String>> {
-    let record = read_record(&line.run.path(Stage::Metrics)).ok().flatten();
-    let Some(Value::Object(sets)) = record.map(|done| done.summary) else { return Vec::new() };
-    let row = |(set, figures): (&String, &Value)| {
-        figures.get("head")?;
-        let figure = |(_, path, digits): (&str, &str, usize)| {
-            let value = figures.pointer(path).and_then(Value::as_f64);
-            value.map_or("–".into(), |v| format!("{v:.digits$}"))
-        };
-        Some([called(set)].into_iter().chain(QUALITY.map(figure)).collect())
-    };
-    let heading = [""].into_iter().chain(QUALITY.map(|(name, ..)| name)).map(String::from).collect();
-    [heading].into_iter().chain(sets.iter().filter_map(row)).collect()
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shell_takes_a_quoted_path_as_one_word() {
+        assert_eq!(quoted("/data/002_00"), "/data/002_00");
+        assert_eq!(quoted("a b; rm -rf 'x'"), r"'a b; rm -rf '\''x'\'''");
+        assert_eq!((quoted("-x"), quoted("")), ("'-x'".into(), "''".into()));
+    }
 }

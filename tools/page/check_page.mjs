@@ -4,19 +4,14 @@
 //     npm ci --prefix tools/readers
 //     node tools/page/check_page.mjs DIR/page.html
 //
-// The browser is /usr/bin/chromium, or what CHROMIUM names; screenshots go beside the page. Checked: what
-// is saved holds the pixels that were clicked, in all three sizes of the picture; right click, Shift, touch and
-// keyboard; undo, redo, removing; opening a file, also a senseless one; a file name made to break the page;
+// Screenshots go beside the page. Checked: what is saved holds the pixels that were clicked, in all three sizes of the
+// picture; right click, Shift, touch and keyboard; undo, redo, removing; opening a file, also a senseless one; a file name made to break the page;
 // that nothing is asked of a network. Exits 1 after printing every disagreement.
 
-import { createRequire } from "node:module";
-import { mkdtemp, readFile, rm, writeFile } from "node:fs/promises";
-import { tmpdir } from "node:os";
+import { readFile, writeFile } from "node:fs/promises";
 import path from "node:path";
 import { pathToFileURL } from "node:url";
-
-const require = createRequire(new URL("../readers/package.json", import.meta.url));
-const { chromium } = require("playwright-core");
+import { browser, checks } from "./browser.mjs";
 
 const [given] = process.argv.slice(2);
 if (!given) {
@@ -26,30 +21,8 @@ if (!given) {
 const file = path.resolve(given);
 const beside = (ending) => file.replace(/\.html$/, "") + ending;
 
-let wrong = 0;
-const check = (name, right, what = "") => {
-  console.log(`${right ? "ok   " : "WRONG"} ${name}${right ? "" : `: ${what}`}`);
-  if (!right) wrong += 1;
-};
-const same = (name, found, expected) =>
-  check(name, JSON.stringify(found) === JSON.stringify(expected),
-    `expected ${JSON.stringify(expected)}, found ${JSON.stringify(found)}`);
-
-const profile = await mkdtemp(path.join(tmpdir(), "click-page-"));
-const args = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-  "--disable-component-update", "--disable-sync"];
-const open = async (name, settings = {}) => {
-  const context = await chromium.launchPersistentContext(path.join(profile, name), {
-    executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium", headless: true, args,
-    viewport: { width: 1280, height: 800 }, acceptDownloads: true, ...settings });
-  const page = context.pages()[0] ?? await context.newPage();
-  const asked = [], errors = [];
-  page.on("request", (r) => { if (!/^(file|data|blob):/.test(r.url())) asked.push(r.url()); });
-  page.on("pageerror", (e) => errors.push(e.message));
-  page.on("console", (m) => { if (m.type() === "error") errors.push(m.text()); });
-  page.on("dialog", (d) => { errors.push(`dialog: ${d.message()}`); d.accept(); });
-  return { context, page, asked, errors };
-};
+const all = checks(), { check, same } = all;
+const { open, close, folder: profile } = await browser();
 const shape = (page) => page.evaluate(() => JSON.parse(document.getElementById("data").textContent).views
   .map(({ file_path, width, height }) => ({ file_path, width, height })));
 /** The middle of a pixel of the original photograph, in the window. */
@@ -182,7 +155,7 @@ try {
   same("the page has no errors by touch", phone.errors, []);
   await phone.context.close();
 } finally {
-  await rm(profile, { recursive: true, force: true });
+  await close();
 }
-console.log(wrong ? `${wrong} disagreements` : "the page does what it should");
-process.exit(wrong ? 1 : 0);
+console.log(all.wrong ? `${all.wrong} disagreements` : "the page does what it should");
+process.exit(all.wrong ? 1 : 0);

@@ -34,28 +34,20 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     }
     let reader = GlbReader { root: &root, bin: glb.bin.as_deref().unwrap_or_default(), source };
     let mut gathered = Primitives::default();
-    if root.nodes.is_empty() {
-        for mesh in 0..root.meshes.len() as u32 {
-            reader.add(mesh, DMat4::IDENTITY, &mut gathered)?;
+    reader.each_part(|part| {
+        // soft layers are around the surface, not of it
+        let material = part.primitive.material.and_then(|m| root.materials.get(m as usize));
+        if material.is_some_and(|m| m.is_soft_layer()) {
+            Ok(())
+        } else {
+            reader.add_triangles(part, &mut gathered)
         }
-    }
-    let mut tree = NodeStack { reached: vec![false; root.nodes.len()], nodes: Vec::new() };
-    reader.push(&reader.roots()?, DMat4::IDENTITY, &mut tree)?;
-    while let Some((index, node, parent)) = tree.nodes.pop() {
-        let matrix = parent * node.parent_from_node();
-        if !matrix.is_finite() {
-            return Err(source.broken(format!("node {index}"), "its transform is not finite"));
-        }
-        if let Some(mesh) = node.mesh {
-            reader.add(mesh, matrix, &mut gathered)?;
-        }
-        reader.push(&node.children, matrix, &mut tree)?;
-    }
+    })?;
     reader.finish(gathered)
 }
 
 /// The JSON chunk and the binary one.
-fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
+pub(super) fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
     let word = |at: usize| bytes.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
     let (Some(version), Some(total)) = (word(4), word(8)) else {
         return Err(source.broken(format!("byte {}", bytes.len()), "the file ends inside a header"));
@@ -81,25 +73,36 @@ struct NodeStack<'a> {
     nodes: Vec<(u32, &'a GlbNode, DMat4)>,
 }
 
+/// Triangles of the default scene, where their node puts them.
+pub(super) struct GlbPart<'a> {
+    /// Where in the file, for messages.
+    at: String,
+    /// The triangles and their material.
+    pub primitive: &'a GlbPrimitive,
+    matrix: DMat4,
+}
+
 /// The mesh as it grows. Normals, colors and texture coordinates survive only if every part has them.
 #[derive(Default)]
-struct Primitives {
-    positions: Vec<DVec3>,
+pub(super) struct Primitives {
+    pub positions: Vec<DVec3>,
     /// The rest of it.
-    mesh: Mesh,
+    pub mesh: Mesh,
+    /// Of the vertices' colors; those of parts that have any.
+    pub alphas: Vec<f32>,
     bare_normals: bool,
     bare_colors: bool,
     /// One for each vertex.
-    uvs: Vec<Vec2>,
+    pub uvs: Vec<Vec2>,
     bare_uvs: bool,
     /// The base colors of the parts; `None` for a part without.
     textures: BTreeSet<Option<u32>>,
 }
 
-struct GlbReader<'a> {
-    root: &'a GlbRoot,
-    bin: &'a [u8],
-    source: Source<'a>,
+pub(super) struct GlbReader<'a> {
+    pub root: &'a GlbRoot,
+    pub bin: &'a [u8],
+    pub source: Source<'a>,
 }
 
 impl<'a> GlbReader<'a> {
@@ -125,7 +128,8 @@ impl<'a> GlbReader<'a> {
     }
 
     fn finish(&self, gathered: Primitives) -> Result<ParsedMesh> {
-        let Primitives { positions, mut mesh, bare_normals, bare_colors, uvs, bare_uvs, textures } = gathered;
+        let Primitives { positions, mut mesh, bare_normals, bare_colors, uvs, bare_uvs, textures, .. } =
+            gathered;
         if bare_normals {
             mesh.normals.clear();
         }
@@ -166,18 +170,40 @@ impl<'a> GlbReader<'a> {
         }
     }
 
-    /// Adds every triangle of a glTF mesh.
-    fn add(&self, index: u32, matrix: DMat4, out: &mut Primitives) -> Result<()> {
+    /// Gives `visit` all parts with triangles, in the order of the scene.
+    pub fn each_part(&self, mut visit: impl FnMut(&GlbPart<'a>) -> Result<()>) -> Result<()> {
+        let root = self.root;
+        if root.nodes.is_empty() {
+            for mesh in 0..root.meshes.len() as u32 {
+                self.parts_of(mesh, DMat4::IDENTITY, &mut visit)?;
+            }
+        }
+        let mut tree = NodeStack { reached: vec![false; root.nodes.len()], nodes: Vec::new() };
+        self.push(&self.roots()?, DMat4::IDENTITY, &mut tree)?;
+        while let Some((index, node, parent)) = tree.nodes.pop() {
+            let matrix = parent * node.parent_from_node();
+            if !matrix.is_finite() {
+                return Err(self.source.broken(format!("node {index}"), "its transform is not finite"));
+            }
+            if let Some(mesh) = node.mesh {
+                self.parts_of(mesh, matrix, &mut visit)?;
+            }
+            self.push(&node.children, matrix, &mut tree)?;
+        }
+        Ok(())
+    }
+
+    fn parts_of(
+        &self,
+        index: u32,
+        matrix: DMat4,
+        visit: &mut impl FnMut(&GlbPart<'a>) -> Result<()>,
+    ) -> Result<()> {
         let mesh = self.get("mesh", &self.root.meshes, index)?;
         for (k, primitive) in mesh.primitives.iter().enumerate() {
             let at = format!("mesh {index}, primitive {k}");
-            // soft layers are around the surface, not of it
-            let material = primitive.material.and_then(|m| self.root.materials.get(m as usize));
-            if material.is_some_and(|m| m.is_soft_layer()) {
-                continue;
-            }
             match primitive.mode {
-                Valid(Mode::Triangles) => self.add_triangles(&at, primitive, matrix, out)?,
+                Valid(Mode::Triangles) => visit(&GlbPart { at, primitive, matrix })?,
                 Valid(mode @ (Mode::TriangleStrip | Mode::TriangleFan)) => {
                     let feature = format!("primitive mode {} (strips and fans)", mode.as_gl_enum());
                     return Err(self.source.unsupported(at, feature));
@@ -189,14 +215,9 @@ impl<'a> GlbReader<'a> {
         Ok(())
     }
 
-    fn add_triangles(
-        &self,
-        at: &str,
-        primitive: &GlbPrimitive,
-        matrix: DMat4,
-        out: &mut Primitives,
-    ) -> Result<()> {
-        let source = self.source;
+    /// Adds every triangle of a part.
+    pub fn add_triangles(&self, part: &GlbPart, out: &mut Primitives) -> Result<()> {
+        let (GlbPart { at, primitive, matrix }, source) = (part, self.source);
         let of = |semantic: Semantic| primitive.attributes.get(&Valid(semantic)).copied();
         let position = of(Semantic::Positions).ok_or_else(|| source.broken(at, "there is no `POSITION`"))?;
         let short: &[C] =
@@ -219,7 +240,7 @@ impl<'a> GlbReader<'a> {
         let first = out.positions.len();
         source.allow(first + count, out.mesh.triangles.len() + indices.len() / 3)?;
 
-        let linear = DMat3::from_mat4(matrix);
+        let linear = DMat3::from_mat4(*matrix);
         let mirrored = linear.determinant() < 0.0;
         for p in positions.as_chunks::<3>().0 {
             let moved = matrix.transform_point3(DVec3::from(*p));
@@ -254,9 +275,12 @@ impl<'a> GlbReader<'a> {
         }
         match attribute(Semantic::Colors(0), &[Type::Vec3, Type::Vec4], &[C::F32, C::U8, C::U16])? {
             None => out.bare_colors = true,
-            Some((colors, width)) => out.mesh.colors.extend(
-                colors.chunks_exact(width).map(|c| [c[0], c[1], c[2]].map(|v| srgb_from_linear(v as f32))),
-            ),
+            Some((colors, width)) => {
+                let each = || colors.chunks_exact(width);
+                let coded = |c: &[f64]| [c[0], c[1], c[2]].map(|v| srgb_from_linear(v as f32));
+                out.mesh.colors.extend(each().map(coded));
+                out.alphas.extend(each().filter_map(|c| c.get(3)).map(|&a| a as f32));
+            }
         }
         if source.options.texture {
             let info = self.base_color(primitive.material)?;
@@ -371,7 +395,7 @@ impl<'a> GlbReader<'a> {
     }
 
     /// The base color texture of a material, if it has one.
-    fn base_color(&self, material: Option<u32>) -> Result<Option<&'a GlbTextureUse>> {
+    pub fn base_color(&self, material: Option<u32>) -> Result<Option<&'a GlbTextureUse>> {
         let Some(index) = material else { return Ok(None) };
         let material = self.get("material", &self.root.materials, index)?;
         let info = material.pbr_metallic_roughness.base_color_texture.as_ref();
@@ -383,7 +407,7 @@ impl<'a> GlbReader<'a> {
 
     /// The picture behind a texture, and its size in the atlas. Its header is checked against the
     /// limits for pictures; it is not decoded.
-    fn picture(&self, texture: u32, atlas: Option<&mut Atlas>) -> Result<PictureSource> {
+    pub fn picture(&self, texture: u32, atlas: Option<&mut Atlas>) -> Result<PictureSource> {
         let source = self.source;
         let Some(index) = self.get("texture", &self.root.textures, texture)?.source else {
             let at = format!("texture {texture}");

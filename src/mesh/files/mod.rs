@@ -5,6 +5,7 @@
 //! this one read.
 
 mod check;
+mod compact;
 mod extracted;
 mod faults;
 mod file_mesh;
@@ -27,6 +28,7 @@ mod uv_check;
 mod weld;
 
 pub use check::{BARS, CheckReport, check, check_around};
+pub use compact::compact_glb;
 pub use extracted::ExtractedSurface;
 pub(crate) use file_mesh::turn_to_y_up;
 pub use file_mesh::{ExportOptions, ExportedFiles};

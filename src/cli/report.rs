@@ -1,0 +1,84 @@
+//! `tiface report`: the page of a run made anew, or one page of many runs.
+
+use super::invocation::Invocation;
+use super::out::Out;
+use super::run::is_demo;
+use super::stdout::print;
+use super::target::RunTarget;
+use crate::io;
+use crate::pipeline::{Line, renew_report};
+use crate::report::{RunRow, runs_html};
+use crate::run::Run;
+use crate::{Error, Result};
+use rayon::prelude::*;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+pub(super) fn run(invocation: &Invocation, runs: &[PathBuf]) -> Result<()> {
+    let common = invocation.common;
+    let asked = Out::find(common.out.as_deref(), "report")?;
+    let all = if runs.is_empty() { io::list_folders(Path::new("runs"))? } else { runs.to_vec() };
+    match &all[..] {
+        [] => Err(Error::cannot("there are no runs under `runs/`", "name a run folder")),
+        [one] => renew(invocation, one, asked.as_ref()),
+        all => many(invocation, all, asked.as_ref()),
+    }
+}
+
+/// Writes the page of one run, and a copy where it was asked for.
+fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()> {
+    let common = invocation.common;
+    let target = RunTarget::find(common, Some(path))?;
+    let Some(saved) = &target.saved else {
+        return Err(Error::usage(format!("`{}` is no run", path.display()), "name the folder of a run"));
+    };
+    let config = common.resolve(Some(saved), None, &[])?;
+    let run = Run::open(&target.run, invocation.stop.clone(), invocation.screen.clone());
+    let mut line = Line::open(&config, &run)?;
+    if is_demo(&config, &run) {
+        line = line.of_demo();
+    }
+    let mut page = run.path("report.html");
+    if common.dry_run {
+        invocation.screen.note("report", &format!("would write `{}`", page.display()));
+        return Ok(());
+    }
+    renew_report(&line)?;
+    if let Some(out) = asked {
+        let copy = out.file("report.html");
+        io::write_atomic(&copy, &io::read_bytes(&page, &io::Limits::default())?)?;
+        page = copy;
+    }
+    told(invocation, &page)
+}
+
+/// Writes the page of many runs.
+fn many(invocation: &Invocation, runs: &[PathBuf], asked: Option<&Out>) -> Result<()> {
+    let page = asked.map_or_else(|| PathBuf::from("runs.html"), |out| out.file("runs.html"));
+    if let Some(wrong) = runs.iter().find(|run| !io::is_folder(run)) {
+        return Err(Error::cannot(format!("`{}` is not a folder", wrong.display()), "name run folders"));
+    }
+    if invocation.common.dry_run {
+        invocation.screen.note("report", &format!("would write `{}`", page.display()));
+        return Ok(());
+    }
+    let folder = page.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    io::create_folder(folder)?;
+    let rows: Vec<RunRow> = runs.par_iter().map(|run| RunRow::read(run, folder)).collect();
+    io::write_atomic(&page, runs_html(&rows)?.as_bytes())?;
+    if invocation.common.json {
+        let line = |row: RunRow| format!("{}\n", json!(RunRow { picture: String::new(), ..row }));
+        print(&rows.into_iter().map(line).collect::<String>())?;
+    }
+    told(invocation, &page)
+}
+
+/// Says where the page is.
+fn told(invocation: &Invocation, page: &Path) -> Result<()> {
+    let common = invocation.common;
+    match (common.json, common.quiet) {
+        (true, _) => print(&format!("{}\n", json!({"event": "result", "report": page}))),
+        (false, true) => Ok(()),
+        (false, false) => print(&format!("report    {}\n", page.display())),
+    }
+}

@@ -1,0 +1,86 @@
+//! `tiface preview --page` and `--watch`: a head to turn in a browser, and a run to look at while it works.
+
+use super::invocation::Invocation;
+use super::out::Out;
+use super::run::is_demo;
+use super::stdout::print;
+use super::target::RunTarget;
+use crate::io;
+use crate::pipeline::{Line, head_page, viewer_of_file};
+use crate::report::{Server, serve_run};
+use crate::run::Run;
+use crate::{Error, Result};
+use glam::Vec3;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+/// Writes the page of a mesh file whose up is `up`, or of the head of a run with its photographs.
+pub(super) fn page(
+    invocation: &Invocation,
+    path: Option<&Path>,
+    up: Vec3,
+    asked: Option<&Out>,
+) -> Result<()> {
+    let (common, screen) = (invocation.common, &invocation.screen);
+    let named = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let (name, html): (String, Box<dyn FnOnce() -> Result<String>>) =
+        match path.filter(|path| !io::is_folder(path)) {
+            Some(file) => (named(file), Box::new(|| viewer_of_file(file, up))),
+            None => {
+                let (target, config) = target(invocation, path)?;
+                let name = io::real_path(&target.run).map_or_else(|_| "run".into(), |run| named(&run));
+                let html = move || {
+                    let run = Run::open(&target.run, invocation.stop.clone(), screen.clone());
+                    let line = Line::open(&config, &run)?;
+                    head_page(&if is_demo(&config, &run) { line.of_demo() } else { line })
+                };
+                (name, Box::new(html))
+            }
+        };
+    let file = format!("{name}_preview.html");
+    let file = asked.map_or_else(|| PathBuf::from(&file), |out| out.file(&file));
+    if common.dry_run {
+        screen.note("preview", &format!("would write a page to `{}`", file.display()));
+        return Ok(());
+    }
+    let html = html()?;
+    if let Some(Out::Folder(folder)) = asked {
+        io::create_folder(folder)?;
+    }
+    io::write_atomic(&file, html.as_bytes())?;
+    if common.json {
+        print(&format!("{}\n", json!({"event": "result", "preview": [file]})))?;
+    } else if !common.quiet {
+        print(&format!("preview   {} (open it in a browser)\n", file.display()))?;
+    }
+    Ok(())
+}
+
+/// Serves the page of a run until somebody stops it.
+pub(super) fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
+    let common = invocation.common;
+    let (target, _) = target(invocation, path)?;
+    let server = Server::open()?;
+    let url = server.url();
+    if common.json {
+        print(&format!("{}\n", json!({"event": "serving", "run": target.run, "url": url})))?;
+    } else {
+        print(&format!("watch     {url}\n          of `{}`, until Ctrl-C\n", target.run.display()))?;
+    }
+    serve_run(&server, &target.run, &|| invocation.stop.requested().is_some());
+    Err(invocation.stop.error("nothing was changed"))
+}
+
+/// The run that is meant, and its configuration.
+fn target(invocation: &Invocation, path: Option<&Path>) -> Result<(RunTarget, crate::config::Config)> {
+    let target = RunTarget::find(invocation.common, path)?;
+    let Some(saved) = &target.saved else {
+        let what = format!("`{}` is no run", path.unwrap_or(Path::new(".")).display());
+        return Err(Error::usage(what, "name the folder of a run, or a .glb, .obj or .ply file"));
+    };
+    if target.guessed {
+        invocation.screen.note("run", &format!("using `{}`", target.run.display()));
+    }
+    let config = invocation.common.resolve(Some(saved), None, &[])?;
+    Ok((target, config))
+}

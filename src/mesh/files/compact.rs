@@ -1,0 +1,330 @@
+//! A GLB as small as a page wants it: for a screen, not for an artist.
+//!
+//! What is not seen goes: other scenes, normal maps, tangents, pictures that nothing shows. Positions become 16 bit of
+//! the longest side (a head: steps of 8 µm), normals 8 bit, texture coordinates 16 bit (`KHR_mesh_quantization`); the
+//! base color becomes a JPEG of at most [`COLOR_PX`] texels along a side, the functions of view-dependent color, which
+//! are smooth, of [`LOBE_PX`]. A picture with alpha stays as it is. Parts keep their order, for those that are
+//! blended are drawn in it.
+//!
+//! Heads of 50,000 triangles, 1,024² texels and four lobes (`draft`): 4.3 and 4.5 MB become 1.2 and 1.2 MB.
+
+use super::glb_json::GlbRoot;
+use super::glb_read::{GlbReader, Primitives, chunks};
+use super::source::{PictureSource, ReadOptions, Source};
+use crate::image::{Photo, linear_from_srgb, reduce_photo, working_size};
+use crate::io::{self, Limits};
+use crate::{Error, ErrorKind, Result};
+use glam::DVec3;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Longest side of a base color.
+const COLOR_PX: u32 = 2048;
+/// Longest side of a function of view-dependent color.
+const LOBE_PX: u32 = 512;
+/// Errors of this JPEG are below those of the texture: 40 dB.
+const QUALITY: u8 = 88;
+
+/// Returns a smaller copy of a GLB, +Y up, with everything that a viewer shows of its default scene: triangles, base
+/// colors, colors that depend on the view. `path` is for messages only.
+///
+/// # Errors
+///
+/// As [`super::read()`]; and when a picture is broken, or the mesh uses what a page does not show.
+pub fn compact_glb(bytes: &[u8], path: &Path) -> Result<Vec<u8>> {
+    let source = Source { path, format: "GLB", options: &ReadOptions::DEFAULT };
+    let glb = chunks(bytes, source)?;
+    let root = GlbRoot::parse(&glb.json, source)?;
+    let looks: Looks = serde_json::from_slice(&glb.json).map_err(|e| source.broken("`materials`", e))?;
+    let reader = GlbReader { root: &root, bin: glb.bin.as_deref().unwrap_or_default(), source };
+    let (mut parts, mut file) = (Vec::new(), Packed::default());
+    let mut triangles = 0;
+    reader.each_part(|part| {
+        let mut own = Primitives::default();
+        reader.add_triangles(part, &mut own)?;
+        triangles += own.mesh.triangles.len();
+        source.allow(own.positions.len(), triangles)?;
+        parts.push((own, part.primitive.material));
+        Ok(())
+    })?;
+    parts.retain(|(part, _)| !part.mesh.triangles.is_empty());
+    if parts.is_empty() {
+        let what = format!("`{}` holds no triangles", path.display());
+        return Err(Error::cannot(what, "export a surface, not points or curves"));
+    }
+    let all = || parts.iter().flat_map(|(part, _)| part.positions.iter().copied());
+    let low = all().reduce(DVec3::min).unwrap_or_default();
+    let size = (all().reduce(DVec3::max).unwrap_or_default() - low).max_element();
+    let size = if size > 0.0 { size } else { 1.0 };
+    let mut primitives = Vec::new();
+    for (part, material) in &parts {
+        let material = material.map(|m| file.material(m, &looks, &reader)).transpose()?;
+        primitives.push(file.primitive(part, material, low, size));
+    }
+    let mut document = json!({
+        "asset": {"version": "2.0", "generator": concat!("tiface ", env!("CARGO_PKG_VERSION"))},
+        "extensionsUsed": ["KHR_mesh_quantization"], "extensionsRequired": ["KHR_mesh_quantization"],
+        "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "translation": low.to_array(), "scale": [size, size, size]}],
+        "meshes": [{"primitives": primitives}],
+        "accessors": file.accessors, "bufferViews": file.views, "buffers": [{"byteLength": file.bin.len()}],
+    });
+    for (key, list) in [("materials", file.materials), ("textures", file.textures), ("images", file.images)] {
+        if !list.is_empty() {
+            document[key] = list.into();
+        }
+    }
+    let mut json = document.to_string().into_bytes();
+    json.resize(json.len().next_multiple_of(4), b' ');
+    let header = gltf::binary::Header { magic: *b"glTF", version: 2, length: 0 };
+    gltf::Glb { header, json: json.into(), bin: Some(file.bin.into()) }
+        .to_vec()
+        .map_err(|e| Error::new(ErrorKind::Bug, e))
+}
+
+/// How the parts of a file look.
+#[derive(Deserialize)]
+struct Looks {
+    #[serde(default)]
+    materials: Vec<Value>,
+}
+
+/// A file as it grows.
+#[derive(Default)]
+struct Packed {
+    bin: Vec<u8>,
+    views: Vec<Value>,
+    accessors: Vec<Value>,
+    images: Vec<Value>,
+    textures: Vec<Value>,
+    materials: Vec<Value>,
+    /// New numbers of the file's textures, with the side they were made for, and of its materials.
+    known: (BTreeMap<(u32, u32), usize>, BTreeMap<u32, usize>),
+}
+
+impl Packed {
+    fn view(&mut self, bytes: &[u8], stride: Option<usize>) -> usize {
+        let mut view = json!({"buffer": 0, "byteOffset": self.bin.len(), "byteLength": bytes.len()});
+        if let Some(stride) = stride {
+            view["byteStride"] = stride.into();
+        }
+        self.bin.extend_from_slice(bytes);
+        self.bin.resize(self.bin.len().next_multiple_of(4), 0);
+        self.views.push(view);
+        self.views.len() - 1
+    }
+
+    /// Numbers, `stride` bytes for each element.
+    fn accessor(&mut self, bytes: &[u8], stride: usize, component: u32, kind: &str) -> usize {
+        let attribute = kind != "SCALAR";
+        let view = self.view(bytes, attribute.then_some(stride));
+        self.accessors.push(json!({
+            "bufferView": view, "componentType": component, "type": kind, "count": bytes.len() / stride,
+            "normalized": attribute,
+        }));
+        self.accessors.len() - 1
+    }
+
+    fn primitive(&mut self, part: &Primitives, material: Option<usize>, low: DVec3, size: f64) -> Value {
+        let place = |p: &DVec3| ((*p - low) / size * 65535.0).to_array().map(|v| v.round() as u16);
+        let places: Vec<[u16; 3]> = part.positions.iter().map(place).collect();
+        let wide: Vec<[u16; 4]> = places.iter().map(|&[x, y, z]| [x, y, z, 0]).collect();
+        let position = self.accessor(bytemuck::cast_slice(&wide), 8, 5123, "VEC3");
+        let bound = |pick: fn(u16, u16) -> u16| {
+            places.iter().copied().reduce(|a, b| [0, 1, 2].map(|k| pick(a[k], b[k]))).unwrap_or_default()
+        };
+        self.accessors[position]["min"] = json!(bound(u16::min));
+        self.accessors[position]["max"] = json!(bound(u16::max));
+        let mut attributes = json!({"POSITION": position});
+        let (vertices, mesh) = (places.len(), &part.mesh);
+        if mesh.normals.len() == vertices {
+            let normal = |n: &glam::Vec3| {
+                let [x, y, z] = (*n * 127.0).round().to_array().map(|v| v as i8);
+                [x, y, z, 0]
+            };
+            let normals: Vec<[i8; 4]> = mesh.normals.iter().map(normal).collect();
+            attributes["NORMAL"] = self.accessor(bytemuck::cast_slice(&normals), 4, 5120, "VEC3").into();
+        }
+        if part.uvs.len() == vertices {
+            let inside = part.uvs.iter().all(|uv| (0.0..=1.0).contains(&uv.x) && (0.0..=1.0).contains(&uv.y));
+            attributes["TEXCOORD_0"] = if inside {
+                let uv = |uv: &glam::Vec2| uv.to_array().map(|v| (v * 65535.0).round() as u16);
+                let uvs: Vec<[u16; 2]> = part.uvs.iter().map(uv).collect();
+                self.accessor(bytemuck::cast_slice(&uvs), 4, 5123, "VEC2").into()
+            } else {
+                let at = self.accessor(bytemuck::cast_slice(&part.uvs), 8, 5126, "VEC2");
+                self.accessors[at]["normalized"] = false.into();
+                at.into()
+            };
+        }
+        if mesh.colors.len() == vertices {
+            let short = |v: f32| (v * 65535.0).round() as u16;
+            let color = |(i, c): (usize, &[f32; 3])| {
+                let [r, g, b] = c.map(|v| short(linear_from_srgb(v)));
+                [r, g, b, short(*part.alphas.get(i).unwrap_or(&1.0))]
+            };
+            let colors: Vec<[u16; 4]> = mesh.colors.iter().enumerate().map(color).collect();
+            attributes["COLOR_0"] = self.accessor(bytemuck::cast_slice(&colors), 8, 5123, "VEC4").into();
+        }
+        let corners = mesh.triangles.as_flattened();
+        let indices = if vertices <= 65_535 {
+            let short: Vec<u16> = corners.iter().map(|&i| i as u16).collect();
+            self.accessor(bytemuck::cast_slice(&short), 2, 5123, "SCALAR")
+        } else {
+            self.accessor(bytemuck::cast_slice(corners), 4, 5125, "SCALAR")
+        };
+        let mut primitive = json!({"attributes": attributes, "indices": indices});
+        if let Some(material) = material {
+            primitive["material"] = material.into();
+        }
+        primitive
+    }
+
+    /// The new number of a material.
+    fn material(&mut self, index: u32, looks: &Looks, reader: &GlbReader) -> Result<usize> {
+        if let Some(&known) = self.known.1.get(&index) {
+            return Ok(known);
+        }
+        let texture = reader.base_color(Some(index))?.map(|texture| texture.index);
+        let old = looks.materials.get(index as usize).unwrap_or(&Value::Null);
+        let mut new = json!({"pbrMetallicRoughness": {}});
+        for key in ["alphaMode", "alphaCutoff"] {
+            if let Some(value) = old.get(key) {
+                new[key] = value.clone();
+            }
+        }
+        let pbr = &mut new["pbrMetallicRoughness"];
+        if let Some(factor) = old.pointer("/pbrMetallicRoughness/baseColorFactor") {
+            pbr["baseColorFactor"] = factor.clone();
+        }
+        if let Some(texture) = texture {
+            pbr["baseColorTexture"] = json!({"index": self.texture(texture, COLOR_PX, reader)?});
+        }
+        if let Some(notes) = old.pointer("/extras/tiface").filter(|notes| notes["lobes"].is_array()) {
+            let mut notes = notes.clone();
+            for lobe in notes["lobes"].as_array_mut().into_iter().flatten() {
+                let texture = lobe["texture"].as_u64().and_then(|t| u32::try_from(t).ok());
+                let Some(texture) = texture else {
+                    return Err(reader
+                        .source
+                        .broken(format!("material {index}"), "a lobe without a texture"));
+                };
+                *lobe = json!({"texture": self.texture(texture, LOBE_PX, reader)?});
+            }
+            new["extras"] = json!({ "tiface": notes });
+        }
+        self.materials.push(new);
+        self.known.1.insert(index, self.materials.len() - 1);
+        Ok(self.materials.len() - 1)
+    }
+
+    /// The new number of a texture with at most `side` texels along a side.
+    fn texture(&mut self, index: u32, side: u32, reader: &GlbReader) -> Result<usize> {
+        if let Some(&known) = self.known.0.get(&(index, side)) {
+            return Ok(known);
+        }
+        let path = reader.source.path;
+        let PictureSource::Inside(bytes) = reader.picture(index, None)? else {
+            return Err(reader.source.unsupported(format!("texture {index}"), "a picture outside the file"));
+        };
+        let photo = io::parse_photo(&bytes, path, &Limits::default())?;
+        let clear = photo.alpha.as_ref().is_some_and(|alpha| alpha.iter().any(|&a| a < 255));
+        let (bytes, mime) = if clear { (bytes, "image/png") } else { smaller(bytes, &photo, side, path)? };
+        let view = self.view(&bytes, None);
+        self.images.push(json!({"bufferView": view, "mimeType": mime}));
+        self.textures.push(json!({"source": self.images.len() - 1}));
+        self.known.0.insert((index, side), self.textures.len() - 1);
+        Ok(self.textures.len() - 1)
+    }
+}
+
+/// A picture as a JPEG, unless it is smaller as it is.
+fn smaller(bytes: Vec<u8>, photo: &Photo, side: u32, path: &Path) -> Result<(Vec<u8>, &'static str)> {
+    let size = working_size(photo.width, photo.height, side);
+    let jpeg = io::jpeg_bytes(&reduce_photo(photo, size), QUALITY, path)?;
+    let mime = if bytes.starts_with(&[0xFF, 0xD8]) { "image/jpeg" } else { "image/png" };
+    let keep = bytes.len() <= jpeg.len() && size == (photo.width, photo.height);
+    Ok(if keep { (bytes, mime) } else { (jpeg, "image/jpeg") })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::files::file_mesh::tests::tetrahedron;
+    use crate::mesh::files::{ExportOptions, Lobes, read, read_with, to_glb};
+
+    #[test]
+    fn a_small_copy_has_its_shape_colors_and_lobes_and_drops_what_is_not_seen() {
+        let (mesh, mut texture) = tetrahedron();
+        texture.normal = Some(texture.color.clone());
+        let pictures = vec![texture.color.clone(); 4];
+        texture.lobes = Some(Lobes {
+            pictures,
+            scale: vec![0.5, 0.25, 0.1, 0.2],
+            asset_from_world: glam::Mat3::IDENTITY,
+        });
+        let glb = to_glb(&mesh, Some(&texture), None, &ExportOptions::default()).unwrap();
+        let path = Path::new("a.glb");
+        let small = compact_glb(&glb, path).unwrap();
+        let back = read_with(&small, path, &ReadOptions::default()).unwrap();
+        let whole = read_with(&glb, path, &ReadOptions::default()).unwrap();
+        assert_eq!(back.mesh.triangles.len(), 4);
+        // half a step of 16 bits of the longest side, 1, and a byte of a normal
+        let near = |a: glam::Vec3, b: glam::Vec3, far: f32| a.distance(b) <= far;
+        for t in 0..4 {
+            let corners = back.mesh.corners(t).into_iter().zip(whole.mesh.corners(t));
+            assert!(corners.into_iter().all(|(a, b)| near(a, b, 2e-5)));
+        }
+        let normals = back.mesh.normals.iter().zip(&whole.mesh.normals);
+        assert!(normals.into_iter().all(|(a, b)| near(*a, *b, 0.01)));
+        let text = String::from_utf8_lossy(&small).into_owned();
+        assert_eq!(text.matches("{\"source\":").count(), 5); // base color and lobes: no normal map
+        assert!(text.contains("\"scale\":[0.5,0.25,0.1") && !text.contains("KHR_materials_variants"));
+        // a second time it stays what it is
+        assert_eq!(read(&compact_glb(&small, path).unwrap(), path).unwrap(), read(&small, path).unwrap());
+        assert!(compact_glb(&glb[..40], path).is_err() && compact_glb(b"glTF", path).is_err());
+    }
+
+    #[test]
+    fn soft_layers_stay_in_their_order_with_their_alphas() {
+        let head = crate::mesh::files::test_head();
+        let options = ExportOptions::default();
+        let glb = to_glb(&head.mesh, head.texture.as_ref(), head.shells.as_ref(), &options).unwrap();
+        let small = compact_glb(&glb, Path::new("a.glb")).unwrap();
+        let source = Source { path: Path::new("a.glb"), format: "GLB", options: &ReadOptions::DEFAULT };
+        let chunks = chunks(&small, source).unwrap();
+        let json: Value = serde_json::from_slice(&chunks.json).unwrap();
+        let parts = json["meshes"][0]["primitives"].as_array().unwrap();
+        let mode =
+            |p: &Value| json["materials"][p["material"].as_u64().unwrap() as usize]["alphaMode"].clone();
+        assert_eq!(parts.iter().map(mode).collect::<Vec<_>>(), [Value::Null, json!("BLEND"), json!("BLEND")]);
+        // one base color for all of them, and four lobes
+        assert_eq!(json["textures"].as_array().unwrap().len(), 5);
+        let root = GlbRoot::parse(&chunks.json, source).unwrap();
+        let reader = GlbReader { root: &root, bin: chunks.bin.as_deref().unwrap(), source };
+        let mut alphas = Vec::new();
+        let gather = |part: &_| {
+            let mut own = Primitives::default();
+            reader.add_triangles(part, &mut own).map(|()| alphas.push(own.alphas))
+        };
+        reader.each_part(gather).unwrap();
+        assert!(alphas[0].is_empty() && alphas[1].iter().any(|a| (a - 0.25).abs() < 1e-4), "{alphas:?}");
+    }
+
+    #[test]
+    fn a_mesh_far_away_and_its_colors_keep_their_digits() {
+        let (mut mesh, _) = tetrahedron();
+        mesh.positions.iter_mut().for_each(|p| p.x += 4096.0);
+        mesh.colors = (0..4).map(|i| [0.2 * i as f32, 0.5, 1.0]).collect();
+        let path = Path::new("a.glb");
+        let glb = to_glb(&mesh, None, None, &ExportOptions::default()).unwrap();
+        let back = read(&compact_glb(&glb, path).unwrap(), path).unwrap();
+        let whole = read(&glb, path).unwrap();
+        for (a, b) in back.colors.as_flattened().iter().zip(whole.colors.as_flattened()) {
+            assert!((a - b).abs() < 1e-3, "{a} {b}");
+        }
+        assert!(back.positions.iter().zip(&whole.positions).all(|(a, b)| a.distance(*b) < 1e-3));
+    }
+}
