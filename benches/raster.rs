@@ -47,7 +47,8 @@ fn main() {
     }
     let seen = raster(&mesh, &camera, &both, |hits| texture.colors(hits, &camera, 1));
     let options = RaycastOptions::default();
-    let cast = raycast(&Bvh::new(&mesh), &mesh, None, &camera, &options, |hits| texture.colors(hits, &camera, 2));
+    let cast =
+        raycast(&Bvh::new(&mesh), &mesh, None, &camera, &options, |hits| texture.colors(hits, &camera, 2));
     let square = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
     let error: f64 = seen.view.color.data.iter().zip(&cast.color.data).map(square).sum();
     println!("{:.1} dB from the ray caster's", -10.0 * (error / cast.color.data.len() as f64).log10());

@@ -52,7 +52,8 @@ fn depth_and_normals_of_the_scans_are_those_of_the_captures() {
         };
         for view in from_json(&json, &like).unwrap().iter().take(3) {
             let hard = RaycastOptions { samples: 1, ..RaycastOptions::default() };
-            let ours = raycast(&bvh, &mesh, None, &view.camera, &hard, |hits| vec![[1.0; 3]; hits.points.len()]);
+            let ours =
+                raycast(&bvh, &mesh, None, &view.camera, &hard, |hits| vec![[1.0; 3]; hits.points.len()]);
             let depth = channels(&folder.join("depth").join(format!("{}.exr", view.name)), &["Z"]);
             let normal =
                 channels(&folder.join("normals").join(format!("{}.exr", view.name)), &["R", "G", "B"]);
