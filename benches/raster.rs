@@ -41,11 +41,11 @@ fn main() {
         [("front faces", &cull, &camera), ("both sides", &both, &camera), ("bent lens", &both, &bent)]
     {
         let textured =
-            cost(|| raster(&mesh, camera, options, |hits| texture.colors(hits, camera, 1)).view.color);
+            cost(|| raster(&mesh, camera, options, |hits| texture.smooth_colors(hits, camera)).view.color);
         let bare = cost(|| raster(&mesh, camera, options, |_| Vec::new()).view.color);
         println!("{name:12} {textured:6.1} CPU ms textured, {bare:6.1} without a texture");
     }
-    let seen = raster(&mesh, &camera, &both, |hits| texture.colors(hits, &camera, 1));
+    let seen = raster(&mesh, &camera, &both, |hits| texture.smooth_colors(hits, &camera));
     let options = RaycastOptions::default();
     let cast =
         raycast(&Bvh::new(&mesh), &mesh, None, &camera, &options, |hits| texture.colors(hits, &camera, 2));

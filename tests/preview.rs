@@ -18,6 +18,55 @@ const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\npr
     property list uchar int vertex_indices\nend_header\n0 0 0 255 0 0\n1 0 0 255 0 0\n0 1 0 255 0 0\n0 0 1 255 0 0\n\
     3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n";
 
+/// Two triangles of one mesh, each of a material with a color: the left one red, the right one green (linear 0.5).
+fn two_materials() -> Vec<u8> {
+    let corners = [
+        [-1.0f32, 0.0, 0.0],
+        [0.0, 0.0, 0.0],
+        [-0.5, 1.0, 0.0],
+        [0.0, 0.0, 0.0],
+        [1.0, 0.0, 0.0],
+        [0.5, 1.0, 0.0],
+    ];
+    let bin: Vec<u8> = corners.as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
+    let accessor = |view: u32| serde_json::json!({"bufferView": view, "componentType": 5126, "count": 3, "type": "VEC3", "min": [-1, 0, 0], "max": [1, 1, 0]});
+    let part = |k: u32| serde_json::json!({"attributes": {"POSITION": k}, "material": k});
+    let material = |color: [f32; 4]| serde_json::json!({"pbrMetallicRoughness": {"baseColorFactor": color}});
+    let json = serde_json::json!({
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": 72}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 36}],
+        "accessors": [accessor(0), accessor(1)],
+        "materials": [material([1.0, 0.0, 0.0, 1.0]), material([0.0, 0.5, 0.0, 1.0])],
+        "meshes": [{"primitives": [part(0), part(1)]}],
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+    });
+    let mut json = json.to_string().into_bytes();
+    json.resize(json.len().next_multiple_of(4), b' ');
+    let mut out = b"glTF".to_vec();
+    let total = 12 + 8 + json.len() + 8 + bin.len();
+    [2, total as u32, json.len() as u32].iter().for_each(|v| out.extend(v.to_le_bytes()));
+    out.extend(b"JSON");
+    out.extend(&json);
+    out.extend((bin.len() as u32).to_le_bytes());
+    out.extend(b"BIN\0");
+    out.extend(&bin);
+    out
+}
+
+#[test]
+fn materials_without_textures_give_their_colors() {
+    let dir = folder();
+    std::fs::write(dir.path().join("two.glb"), two_materials()).unwrap();
+    let o = tiface(dir.path(), &["preview", "two.glb", "--size", "64"]);
+    assert!(code(&o) == 0 && err(&o).is_empty(), "{}", err(&o));
+    let seen = picture(&dir.path().join("two_preview.png"));
+    let has = |color: [u8; 4]| seen.pixels().any(|p| p.0 == color);
+    // linear 0.5 is 188 in sRGB
+    assert!(has([255, 0, 0, 255]) && has([0, 188, 0, 255]));
+}
+
 fn code(output: &Output) -> i32 {
     output.status.code().unwrap()
 }

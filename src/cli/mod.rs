@@ -251,8 +251,8 @@ the held-out views, their blend and the metrics alone; --fresh render then makes
         /// transforms.json), into a folder of their own
         #[arg(long, value_name = "WHICH")]
         cameras: Option<String>,
-        /// Any of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured
-        /// (head.glb, as a viewer shows it), with commas
+        /// Any of baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
+        /// (head.glb, as a viewer shows it) and raster (the same, rasterised), with commas
         #[arg(long = "with", value_name = "LIST")]
         method: Option<String>,
         /// png or exr
@@ -273,7 +273,8 @@ learned from (capture.tiles): the blend follows the better members.")]
     Ensemble {
         #[command(flatten)]
         place: CaptureOrRun,
-        /// Whose views: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured (head.glb)
+        /// Whose views: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured and raster
+        /// (head.glb)
         #[arg(long, value_name = "LIST")]
         members: Option<String>,
         /// Their shares, in that order, together 1 [default: fitted]
@@ -291,10 +292,12 @@ learned from (capture.tiles): the blend follows the better members.")]
     /// A picture of a run's mesh, or of any .glb, .obj or .ply
     #[command(after_long_help = "Examples:
   tiface preview runs/002_00                    three quarters of the head, 1024 pixels, as a PNG
-  tiface preview scan.ply --light matcap --size 512 --out scan.png
+  tiface preview scan.ply --light matcap --up z --out scan.png
+  tiface preview head.glb --sheet               from all sides, with wireframe, normals and texture coordinates
+  tiface preview runs/002_00 --turntable --out turn.gif     .png is animated, too; .mp4 needs ffmpeg
+  tiface preview runs/002_00 --cameras test --out views/    as the held-out photographs
   tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
-  tiface preview runs/002_00 --watch            a run while it works, in a browser on this machine
-  tiface preview head.glb --light normals --background black")]
+  tiface preview runs/002_00 --watch            a run while it works, in a browser on this machine")]
     Preview(PreviewOptions),
     /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates, size
     #[command(after_long_help = "Examples:

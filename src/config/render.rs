@@ -20,16 +20,19 @@ pub enum Method {
     Raycast,
     /// Rays cast at the product, color from its texture: what a viewer of `head.glb` sees.
     Textured,
+    /// The same, rasterised: in a hundredth of the time.
+    Raster,
 }
 
 /// Pictures that are judged, in the order of the line: their word in folders, the configuration and
-/// `metrics.json`, and what they are called. The first five are those of [`Method`].
-pub const NAMES: [(&str, &str); 6] = [
+/// `metrics.json`, and what they are called. All but the last are those of [`Method`].
+pub const NAMES: [(&str, &str); 7] = [
     ("baseline", "baseline"),
     ("tface", "T-Face"),
     ("volume", "I-Face"),
     ("raycast", "I-Face's mesh"),
     ("textured", "head.glb"),
+    ("raster", "head.glb, rasterised"),
     ("ensemble", "blend"),
 ];
 
@@ -53,7 +56,7 @@ impl Method {
             Method::Baseline => Stage::Baseline,
             Method::Tface => Stage::Tface,
             Method::Volume => Stage::Iface,
-            Method::Raycast | Method::Textured => Stage::Mesh,
+            Method::Raycast | Method::Textured | Method::Raster => Stage::Mesh,
         }
     }
 }
@@ -87,8 +90,8 @@ table! {
         /// Cameras of `tiface render`: test (held-out views); train, orbit or a file (transforms.json or a nerfstudio
         /// camera path) into a folder of their own. Blend and metrics are always of test.
         cameras: String => "test".into();
-        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with all that is known of its color)
-        /// and textured (head.glb, as a viewer shows it).
+        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with all that is known of its color),
+        /// textured (head.glb, as a viewer shows it) and raster (the same, rasterised).
         method: Vec<Method>
             => vec![Method::Tface, Method::Volume, Method::Raycast],
             vec![Method::Tface, Method::Volume, Method::Raycast],
@@ -120,7 +123,8 @@ mod tests {
 
     #[test]
     fn every_picture_has_one_word_and_one_name() {
-        let methods = [Method::Baseline, Method::Tface, Method::Volume, Method::Raycast, Method::Textured];
+        use Method::*;
+        let methods = [Baseline, Tface, Volume, Raycast, Textured, Raster];
         for (method, (word, _)) in methods.into_iter().zip(NAMES) {
             // the word of the folder is the word of the configuration
             assert_eq!((serde_json::json!(method), method.folder()), (serde_json::json!(word), word));

@@ -157,7 +157,7 @@ fn knows_masks(line: &Line, method: Method) -> bool {
     let has_mask = |v: &View| v.mask != ViewMask::None && v.mask_meaning == MaskMeaning::Empty;
     let used = match method {
         Method::Baseline | Method::Tface => line.config.radiance(method.stage()).masks != MaskUse::None,
-        Method::Volume | Method::Raycast | Method::Textured => true,
+        Method::Volume | Method::Raycast | Method::Textured | Method::Raster => true,
     };
     used && line.capture.views.iter().any(has_mask)
 }

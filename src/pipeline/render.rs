@@ -21,7 +21,9 @@ use crate::geom::{Bvh, Camera, Ray, ShellCaster, Similarity};
 use crate::io;
 use crate::mesh::files::{ExtractedSurface, HeadMesh};
 use crate::render::path::{NamedCamera, orbit};
-use crate::render::{LobePictures, MeshTexture, RayHits, RaycastOptions, RenderedView, raycast};
+use crate::render::{
+    LobePictures, MeshTexture, RasterOptions, RayHits, RaycastOptions, RenderedView, Surface, raster, raycast,
+};
 use crate::run::StageDir;
 use crate::{Error, Monitor, Result};
 use serde_json::{Map, Value, json};
@@ -101,17 +103,18 @@ impl Meshes {
     /// Those that `methods` show, as they lie in the run.
     pub fn load(line: &Line, methods: &[Method]) -> Result<Meshes> {
         let (raycast, textured) = (methods.contains(&Method::Raycast), methods.contains(&Method::Textured));
+        let raster = methods.contains(&Method::Raster);
         // fitted colors lie on the head mesh, the network's wherever rays meet a surface
         let fitted = line.config.mesh.color == ColorSource::Photographs;
         let extracted = (raycast && !fitted).then(|| extracted_surface(line)).transpose()?;
-        let head = (textured || raycast && fitted).then(|| head_mesh(line)).transpose()?;
+        let head = (textured || raster || raycast && fitted).then(|| head_mesh(line)).transpose()?;
         if textured && head.as_ref().is_some_and(|head| head.texture.is_none()) {
             return Err(Error::cannot(
                 "the mesh has no texture to be shown",
                 "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
             ));
         }
-        Ok(Meshes { extracted, head, shown: [textured, raycast && fitted] })
+        Ok(Meshes { extracted, head, shown: [textured || raster, raycast && fitted] })
     }
 }
 
@@ -233,6 +236,13 @@ impl<'a> Renderer<'a> {
             (Method::Textured, _) => self.head.as_ref().and_then(|visible| {
                 let texture = visible.shown.as_ref()?;
                 Some(visible.view(camera, &options, |hits| texture.colors(hits, camera, samples)))
+            }),
+            (Method::Raster, _) => self.head.as_ref().map(|VisibleHead { head, shown, .. }| {
+                let options =
+                    RasterOptions { world_from_scene: self.world_from_scene, ..RasterOptions::default() };
+                let (mesh, harmonics) = (&head.mesh, head.harmonics.as_ref());
+                let surface = Surface { mesh, texture: shown.as_ref(), atlas: None, harmonics };
+                raster(mesh, camera, &options, |hits| surface.colors(hits, camera)).view
             }),
         })
     }

@@ -69,7 +69,7 @@ impl Surface<'_> {
     /// sRGB-coded colors of what is seen through the pixels of a camera.
     pub fn colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         if let Some(texture) = self.texture {
-            return texture.colors(hits, camera, 1);
+            return texture.smooth_colors(hits, camera);
         }
         let mesh = self.mesh;
         let bare = mesh.colors.is_empty();

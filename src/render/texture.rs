@@ -9,6 +9,7 @@ use crate::geom::{Atlas, Camera, Mesh};
 use crate::image::{Photo, linear_from_srgb, srgb_from_linear};
 use crate::kernel::sphharm;
 use glam::{Mat3, Vec2};
+use std::sync::OnceLock;
 
 /// View-dependent color beside a base color: one picture per spherical-harmonic function, in the order of
 /// [`sphharm::sh16`]. A byte `b` of picture `k` stands for the sRGB-coded difference `(b − 128) / 127 · scale[k]`.
@@ -27,9 +28,40 @@ pub struct MeshTexture<'a> {
     /// Linear color and then the lobes, level by level; interleaved channels.
     levels: Vec<MipLevel>,
     channels: usize,
+    /// Do coordinates leave the picture? It is then repeated.
+    repeats: bool,
     turned: Mat3,
     /// Texels per unit of length, per triangle.
     density: Vec<f32>,
+}
+
+/// The level for so many texels a pixel, and how far it is on the way to the next: the base-2 logarithm, its fraction by
+/// the chord's parabola (off by 0.009).
+fn mip_level(texels: f32, levels: usize) -> (usize, f32) {
+    let bits = texels.max(1.0).to_bits();
+    let (level, m) = ((bits >> 23) as usize - 127, f32::from_bits(bits & 0x7f_ffff | 0x3f80_0000) - 1.0);
+    if level + 1 < levels { (level, m + 0.34 * m * (1.0 - m)) } else { (levels - 1, 0.0) }
+}
+
+/// Steps of [`srgb_table`]: straight lines between them are off by 2e-5 at most.
+const SRGB_STEPS: usize = 4096;
+
+/// sRGB-coded from linear.
+#[inline(always)]
+fn coded(linear: f32) -> f32 {
+    let table = srgb_table();
+    let at = linear.clamp(0.0, 1.0) * (SRGB_STEPS as f32 - 1.0);
+    let k = at as usize;
+    table[k] + (at - k as f32) * (table[k + 1] - table[k])
+}
+
+/// sRGB-coded from linear, and the last value once more.
+fn srgb_table() -> &'static [f32; SRGB_STEPS + 1] {
+    static TABLE: OnceLock<Box<[f32; SRGB_STEPS + 1]>> = OnceLock::new();
+    TABLE.get_or_init(|| {
+        let value = |i: usize| srgb_from_linear(i.min(SRGB_STEPS - 1) as f32 / (SRGB_STEPS - 1) as f32);
+        Box::new(std::array::from_fn(value))
+    })
 }
 
 struct MipLevel {
@@ -48,7 +80,8 @@ impl<'a> MeshTexture<'a> {
     ) -> MeshTexture<'a> {
         let table: [f32; 256] = std::array::from_fn(|i| linear_from_srgb(i as f32 / 255.0));
         let pictures = lobes.map_or(&[][..], |l| l.pictures);
-        let channels = 3 + 3 * pictures.len();
+        // filled up, so that a texel is whole vectors
+        let channels = (3 + 3 * pictures.len()).next_multiple_of(4);
         let mut data = Vec::with_capacity(color.rgb.len() * channels);
         for (i, c) in color.rgb.iter().enumerate() {
             data.extend(c.map(|b| table[b as usize]));
@@ -56,6 +89,7 @@ impl<'a> MeshTexture<'a> {
                 let scale = lobes.map_or(0.0, |l| l.scale[k]) / 127.0;
                 data.extend(picture.rgb[i].map(|b| (f32::from(b) - 128.0) * scale));
             }
+            data.resize((i + 1) * channels, 0.0);
         }
         let mut levels = vec![MipLevel { width: color.width as usize, height: color.height as usize, data }];
         while levels[levels.len() - 1].width.min(levels[levels.len() - 1].height) > 1 {
@@ -69,7 +103,48 @@ impl<'a> MeshTexture<'a> {
                 if space > 0.0 { (texels / space).sqrt() } else { 0.0 }
             })
             .collect();
-        MeshTexture { atlas, levels, channels, turned: lobes.map_or(Mat3::IDENTITY, |l| l.turned), density }
+        let inside = |uv: &Vec2| uv.cmpge(Vec2::ZERO).all() && uv.cmple(Vec2::ONE).all();
+        let repeats = !atlas.uvs.iter().all(inside);
+        MeshTexture {
+            atlas,
+            levels,
+            channels,
+            repeats,
+            turned: lobes.map_or(Mat3::IDENTITY, |l| l.turned),
+            density,
+        }
+    }
+
+    /// Returns the sRGB-coded colors of what is seen through the pixels of a camera, between two levels (trilinear).
+    pub fn smooth_colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
+        let (forward, per_pixel) = (camera.forward(), 1.0 / camera.fx.abs() as f32);
+        let mut values = vec![0f32; 2 * self.channels];
+        let mut one = |i: usize| {
+            let hit = &hits.hits[i];
+            let corners = self.atlas.triangles[hit.triangle as usize].map(|c| self.atlas.uvs[c as usize]);
+            let mut uv = (1.0 - hit.u - hit.v) * corners[0] + hit.u * corners[1] + hit.v * corners[2];
+            if self.repeats {
+                uv -= uv.floor();
+            }
+            let footprint = hit.t * hits.directions[i].dot(forward) * per_pixel;
+            let texels = footprint * self.density[hit.triangle as usize];
+            let (fine, share) = mip_level(texels, self.levels.len());
+            let coarse = (fine + 1).min(self.levels.len() - 1);
+            if self.channels == 4 {
+                // as many channels as the compiler knows of
+                let (mut a, mut b) = ([0f32; 4], [0f32; 4]);
+                self.levels[fine].look_up(uv, &mut a);
+                self.levels[coarse].look_up(uv, &mut b);
+                return std::array::from_fn(|k| coded(a[k] + share * (b[k] - a[k])));
+            }
+            let (a, b) = values.split_at_mut(self.channels);
+            self.levels[fine].look_up(uv, a);
+            self.levels[coarse].look_up(uv, b);
+            a.iter_mut().zip(b).for_each(|(a, b)| *a += share * (*b - *a));
+            let more = sphharm::combine(a[3..].as_chunks().0, (self.turned * -hits.directions[i]).to_array());
+            std::array::from_fn(|k| (coded(a[k]) + more[k]).clamp(0.0, 1.0))
+        };
+        (0..hits.hits.len()).map(&mut one).collect()
     }
 
     /// Returns the sRGB-coded colors of what rays of a camera met, `samples` of them along each side of a pixel.
@@ -86,7 +161,7 @@ impl<'a> MeshTexture<'a> {
             let level = texels.max(1.0).log2().round().clamp(0.0, (self.levels.len() - 1) as f32);
             self.levels[level as usize].look_up(uv, &mut values);
             let base: [f32; 3] = std::array::from_fn(|k| srgb_from_linear(values[k]));
-            if self.channels == 3 {
+            if self.channels == 4 {
                 return base;
             }
             let d = self.turned * -hits.directions[i];
@@ -116,10 +191,11 @@ impl MipLevel {
     }
 
     /// Bilinear, clamped at the borders.
+    #[inline(always)]
     fn look_up(&self, uv: Vec2, out: &mut [f32]) {
         let at = |u: f32, n: usize| {
             let p = (u * n as f32 - 0.5).clamp(0.0, (n - 1) as f32);
-            (p as usize, (p as usize + 1).min(n - 1), p.fract())
+            (p as usize, (p as usize + 1).min(n - 1), p - p as usize as f32)
         };
         let (x0, x1, fx) = at(uv.x, self.width);
         let (y0, y1, fy) = at(uv.y, self.height);
@@ -149,6 +225,7 @@ fn shares(from: usize, n: usize) -> Vec<[(usize, f32); 3]> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::raster::{RasterOptions, raster};
     use super::super::raycast::{RaycastOptions, raycast};
     use super::*;
     use crate::geom::Bvh;
@@ -245,5 +322,42 @@ mod tests {
         let x = 8.0 / 9.0 / (4.0f32 + 64.0 / 81.0).sqrt();
         assert!((pixels[36][0] - (128.0 / 255.0 - 0.2 * 0.4886 * x)).abs() < 1e-3, "{:?}", pixels[36]);
         assert!((pixels[36][1] - 128.0 / 255.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn between_two_levels_both_are_seen() {
+        let (mesh, atlas, mut photo) = square();
+        photo.rgb.iter_mut().enumerate().for_each(|(i, c)| *c = [255 * ((i + i / 4) % 2) as u8; 3]);
+        let texture = MeshTexture::new(&mesh, &atlas, &photo, None);
+        let seen = |texture: &MeshTexture, side: u32| {
+            let camera = Camera::above(side, side, f64::from(side), 2.0);
+            let options = RasterOptions::default();
+            let seen = raster(&mesh, &camera, &options, |hits| texture.smooth_colors(hits, &camera));
+            seen.view.color.data.as_chunks::<4>().0.to_vec()
+        };
+        // four texels on two pixels: the level of means, linear 0.5
+        assert!(seen(&texture, 2).iter().all(|p| (p[0] - srgb_from_linear(0.5)).abs() < 1e-3));
+        // as many pixels as texels: the texels themselves
+        let each = seen(&texture, 4);
+        assert!(each.iter().enumerate().all(|(i, p)| (p[0] - ((i + i / 4) % 2) as f32).abs() < 1e-3));
+        // a texture that is used outside of its picture is repeated: shifted by a whole picture it is the same
+        let shifted =
+            Atlas { uvs: atlas.uvs.iter().map(|uv| uv + Vec2::new(3.0, -2.0)).collect(), ..atlas.clone() };
+        let again = seen(&MeshTexture::new(&mesh, &shifted, &photo, None), 4);
+        assert!(again.iter().zip(&each).all(|(a, b)| (a[0] - b[0]).abs() < 1e-3));
+    }
+
+    #[test]
+    fn levels_follow_the_logarithm() {
+        for texels in [0.3f32, 1.0, 1.2, 1.5, 2.0, 3.1, 7.9, 16.0] {
+            let (level, share) = mip_level(texels, 10);
+            assert!((level as f32 + share - texels.max(1.0).log2()).abs() < 0.01, "{texels}");
+        }
+        assert_eq!(mip_level(1e9, 4), (3, 0.0));
+        let coded: f32 = (0..=1000)
+            .map(|i| i as f32 / 1000.0)
+            .map(|v| (coded(v) - srgb_from_linear(v)).abs())
+            .fold(0.0, f32::max);
+        assert!(coded < 5e-5, "{coded}");
     }
 }

@@ -146,6 +146,8 @@ impl GlbMaterial {
 #[serde(rename_all = "camelCase", default)]
 pub(super) struct GlbPbr {
     pub base_color_texture: Option<GlbTextureUse>,
+    /// Linear, what colors and texture are multiplied with.
+    pub base_color_factor: Option<[f32; 4]>,
 }
 
 /// A texture as a material names it.

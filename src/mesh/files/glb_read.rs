@@ -6,7 +6,7 @@
 use super::glb_json::{GlbNode, GlbPrimitive, GlbRoot, GlbTextureUse};
 use super::source::{ParsedMesh, PictureSource, Source};
 use crate::geom::{Atlas, Mesh};
-use crate::image::srgb_from_linear;
+use crate::image::{linear_from_srgb, srgb_from_linear};
 use crate::{Result, io};
 use glam::{DMat3, DMat4, DVec3, Vec2};
 use gltf::Glb;
@@ -82,7 +82,8 @@ pub(super) struct GlbPart<'a> {
     matrix: DMat4,
 }
 
-/// The mesh as it grows. Normals, colors and texture coordinates survive only if every part has them.
+/// The mesh as it grows. Normals, colors and texture coordinates survive only if every part has them; or colors if a
+/// material without a texture gives one.
 #[derive(Default)]
 pub(super) struct Primitives {
     pub positions: Vec<DVec3>,
@@ -92,6 +93,8 @@ pub(super) struct Primitives {
     pub alphas: Vec<f32>,
     bare_normals: bool,
     bare_colors: bool,
+    /// Has a material without a texture given a color?
+    tinted: bool,
     /// One for each vertex.
     pub uvs: Vec<Vec2>,
     bare_uvs: bool,
@@ -128,12 +131,21 @@ impl<'a> GlbReader<'a> {
     }
 
     fn finish(&self, gathered: Primitives) -> Result<ParsedMesh> {
-        let Primitives { positions, mut mesh, bare_normals, bare_colors, uvs, bare_uvs, textures, .. } =
-            gathered;
+        let Primitives {
+            positions,
+            mut mesh,
+            bare_normals,
+            bare_colors,
+            tinted,
+            uvs,
+            bare_uvs,
+            textures,
+            ..
+        } = gathered;
         if bare_normals {
             mesh.normals.clear();
         }
-        if bare_colors {
+        if bare_colors && !tinted {
             mesh.colors.clear();
         }
         let mut out = ParsedMesh { positions, mesh, ..ParsedMesh::default() };
@@ -274,12 +286,27 @@ impl<'a> GlbReader<'a> {
             }
         }
         match attribute(Semantic::Colors(0), &[Type::Vec3, Type::Vec4], &[C::F32, C::U8, C::U16])? {
-            None => out.bare_colors = true,
+            None => {
+                out.bare_colors = true;
+                out.mesh.colors.resize(first + count, [1.0; 3]);
+            }
             Some((colors, width)) => {
                 let each = || colors.chunks_exact(width);
                 let coded = |c: &[f64]| [c[0], c[1], c[2]].map(|v| srgb_from_linear(v as f32));
                 out.mesh.colors.extend(each().map(coded));
                 out.alphas.extend(each().filter_map(|c| c.get(3)).map(|&a| a as f32));
+            }
+        }
+        let material = primitive.material.and_then(|m| self.root.materials.get(m as usize));
+        let pbr = material.map(|m| &m.pbr_metallic_roughness).filter(|pbr| pbr.base_color_texture.is_none());
+        if let Some([r, g, b, _]) = pbr.and_then(|pbr| pbr.base_color_factor)
+            && [r, g, b] != [1.0; 3]
+            && [r, g, b].iter().all(|v| v.is_finite())
+        {
+            out.tinted = true;
+            for color in &mut out.mesh.colors[first..] {
+                let tint = |c: f32, f: f32| srgb_from_linear(linear_from_srgb(c) * f);
+                *color = [tint(color[0], r), tint(color[1], g), tint(color[2], b)];
             }
         }
         if source.options.texture {
