@@ -5,6 +5,7 @@
 //! triangles that share an edge leave no sample between them out and hit none twice.
 
 use super::project::{Corner, Face, area, reach};
+use std::hint::black_box;
 use std::ops::{Add, BitOr, Mul, Sub};
 
 /// Pixels along each side of a tile.
@@ -167,22 +168,26 @@ impl Tile {
                     ) else {
                         continue;
                     };
-                    // all in whole numbers, which compilers turn into vectors: those of positive floats are in their
-                    // order; and stored as a whole, since storing parts of vectors is slow on some machines
+                    // all in whole numbers, which compilers turn into vectors: those of positive floats are in their order
                     let (old_depths, old_triangles) = (*depths, *triangles);
                     let (mut new_depths, mut new_triangles) = ([0f32; LANES], [0u32; LANES]);
+                    let mut visible = [0u32; LANES];
                     for l in 0..LANES {
                         let outside = (at[0] + edges[0].offset[s] + edges[0].lanes[l])
                             | (at[1] + edges[1].offset[s] + edges[1].lanes[l])
                             | (at[2] + edges[2].offset[s] + edges[2].lanes[l]);
                         // a sliver's slope is unreliable: it is no nearer and no farther than its corners
                         let new = (w + slope[l]).max(farthest).min(nearest).to_bits() as i32;
-                        let (old, triangle) = (old_depths[l].to_bits() as i32, old_triangles[l]);
+                        let old = old_depths[l].to_bits() as i32;
                         let best = old.max(new & !outside.sign());
-                        let visible = ((old - best) >> 31) as u32;
                         new_depths[l] = f32::from_bits(best as u32);
+                        visible[l] = ((old - best) >> 31) as u32;
+                    }
+                    // hidden, lest compilers store the lanes that changed alone: some machines are slow at that
+                    let visible = black_box(visible);
+                    for l in 0..LANES {
                         new_triangles[l] =
-                            triangle.wrapping_add(face.triangle.wrapping_sub(triangle) & visible);
+                            old_triangles[l] ^ ((old_triangles[l] ^ face.triangle) & visible[l]);
                     }
                     (*depths, *triangles) = (new_depths, new_triangles);
                 }
