@@ -9,6 +9,7 @@ use super::{ops, tensor, values};
 use crate::Result;
 use crate::kernel::adam::AdamStep;
 use burn::tensor::{Device, Gradients, Tensor};
+use std::ops::RangeInclusive;
 
 /// A trainable array, flat on its device, and the optimizer's moments of it.
 pub struct Parameter {
@@ -86,6 +87,13 @@ impl Parameter {
         let (p, m, v) = ops::adam_step(p, m, v, g, step);
         self.moments = [m, v];
         self.value = leaf(p);
+    }
+
+    /// Moves values that left a range to its ends.
+    pub fn keep_within(&mut self, range: RangeInclusive<f32>) {
+        let device = self.value.device();
+        let value = std::mem::replace(&mut self.value, Tensor::zeros([1], &device)).inner();
+        self.value = leaf(value.clamp(*range.start(), *range.end()));
     }
 
     /// Makes the moments zero, as before the first step.

@@ -19,6 +19,7 @@ use crate::kernel::sdf::{self, FieldShape};
 use crate::{Error, Result};
 use burn::tensor::{Device, Tensor};
 use serde::Serialize;
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -194,6 +195,10 @@ impl Learner for SdfTraining<'_> {
 /// Names of the losses.
 const TERMS: [&str; 5] = ["rgb", "mask", "eikonal", "sparsity", "stereo"];
 
+/// Where the variance stays: `inv_s = exp(10 v)` within what the kernels compute with, 1e-6..=1e6. Beyond, its gradient
+/// would be zero, or infinite, and the surface would stay as sharp for ever.
+const VARIANCE: RangeInclusive<f32> = -1.38..=1.38;
+
 impl SdfTraining<'_> {
     /// Returns the field's shape at a step (levels come in one by one).
     fn shape_at(&self, step: u64) -> Arc<FieldShape> {
@@ -262,6 +267,9 @@ impl SdfTraining<'_> {
                 _ => of_network,
             };
             p.update(&mut gradients, step);
+            if p.name == "variance" {
+                p.keep_within(VARIANCE);
+            }
         }
         Ok(())
     }

@@ -71,6 +71,10 @@ pub fn occupancy(sdf: f32, half: f32, inv_s: f32) -> f32 {
     alpha_of(sdf, -1.0, 2.0 * half, inv_s.clamp(1e-6, 1e6), 1.0).alpha
 }
 
+/// Gradients of the field up to this length have no direction that could be learned: what comes back through their unit
+/// normal would be of no size that means anything, up to 1e12.
+pub const SHORTEST: f32 = 1e-6;
+
 fn normal_of(field: &[f32]) -> ([f32; 3], f32) {
     let n = [field[1], field[2], field[3]];
     let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt().max(1e-12);
@@ -195,8 +199,10 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
                     }
                 }
                 let along = dot(*normal, g_normal);
-                for c in 0..3 {
-                    out[1 + c] = (g_normal[c] - normal[c] * along) / length;
+                if *length > SHORTEST {
+                    for c in 0..3 {
+                        out[1 + c] = (g_normal[c] - normal[c] * along) / length;
+                    }
                 }
             }
             g_s
@@ -228,6 +234,35 @@ mod tests {
         {
             let got = occupancy(sdf, 0.5 * dt, s);
             assert!((got - want).abs() < 5e-7, "{got} {want}");
+        }
+    }
+
+    #[test]
+    fn extreme_fields_have_finite_opacities_and_bounded_gradients() {
+        let offsets = [0, 4];
+        let (direction, t, dt) = ([[0.6, 0.0, -0.8]], [1.0, 1.1, 1.2, 1.3], [1e-9, 0.05, 3.0, 1e3]);
+        let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let g = [1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0];
+        for inv_s in [0.0, 1e-9, 1e-6, 1.0, 1e6, 1e9, f32::INFINITY] {
+            for sdf in [0.0, 1e-30, -1e-6, 1.0, -1e3, 1e20] {
+                for slope in [0.0, 1e-30, 1e-12, 2e-6, 1.0, 1e6] {
+                    let sample = |k: usize| [sdf, slope, -0.5 * slope, 0.0, 0.5, 0.5, 0.5, -(k as f32)];
+                    let field: Vec<f32> = (0..4).flat_map(sample).collect();
+                    let seen = forward(rays, &field, inv_s, 1.0);
+                    assert!(
+                        seen.iter().all(|v| v.is_finite() && v.abs() < 2.0),
+                        "{inv_s} {sdf} {slope} {seen:?}"
+                    );
+                    let (g_field, g_s) = backward(rays, &field, inv_s, 1.0, &g);
+                    let all = || g_field.iter().chain([&g_s]);
+                    assert!(all().all(|v| v.is_finite()), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
+                    // 3 · 1e6, the unit normal's 1 / SHORTEST, and 1e3 · 1e6 by the length of an interval
+                    assert!(all().all(|v| v.abs() < 1e10), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
+                    if slope < SHORTEST {
+                        assert!(g_field.as_chunks::<8>().0.iter().all(|g| g[1..4] == [0.0; 3]));
+                    }
+                }
+            }
         }
     }
 

@@ -6,6 +6,7 @@ use crate::kernel::hash;
 use crate::kernel::mlp::{
     COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, SdfGradients, TILE, Weights,
 };
+use crate::kernel::neus::SHORTEST;
 use crate::kernel::pool::Buffer;
 use crate::kernel::simd::{exp, gemm};
 use rayon::prelude::*;
@@ -90,8 +91,10 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
             let unit: [f32; 3] = std::array::from_fn(|k| raw[k] / length);
             let gn = &from_color[OUTPUTS + 16..COLOR_INPUTS];
             let along = unit[0] * gn[0] + unit[1] * gn[1] + unit[2] * gn[2];
-            let n: [f32; 3] =
-                std::array::from_fn(|k| g_out[r * WIDTH + 1 + k] + (gn[k] - unit[k] * along) / length);
+            let n: [f32; 3] = std::array::from_fn(|k| {
+                let turned = if length > SHORTEST { (gn[k] - unit[k] * along) / length } else { 0.0 };
+                g_out[r * WIDTH + 1 + k] + turned
+            });
             t.g_normal[tile * TILE + r] = n;
             for k in 0..3 {
                 g_q[r * kp + features + k] = n[k] * inv_radius;
