@@ -46,10 +46,9 @@ fn mip_level(texels: f32, levels: usize) -> (usize, f32) {
 /// Steps of [`srgb_table`]: straight lines between them are off by 2e-5 at most.
 const SRGB_STEPS: usize = 4096;
 
-/// sRGB-coded from linear.
+/// sRGB-coded from linear, by [`srgb_table`].
 #[inline(always)]
-fn coded(linear: f32) -> f32 {
-    let table = srgb_table();
+fn coded(table: &[f32; SRGB_STEPS + 1], linear: f32) -> f32 {
     let at = linear.clamp(0.0, 1.0) * (SRGB_STEPS as f32 - 1.0);
     let k = at as usize;
     table[k] + (at - k as f32) * (table[k + 1] - table[k])
@@ -118,6 +117,7 @@ impl<'a> MeshTexture<'a> {
     /// Returns the sRGB-coded colors of what is seen through the pixels of a camera, between two levels (trilinear).
     pub fn smooth_colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         let (forward, per_pixel) = (camera.forward(), 1.0 / camera.fx.abs() as f32);
+        let table = srgb_table(); // asked for once
         let mut values = vec![0f32; 2 * self.channels];
         let mut one = |i: usize| {
             let hit = &hits.hits[i];
@@ -135,14 +135,14 @@ impl<'a> MeshTexture<'a> {
                 let (mut a, mut b) = ([0f32; 4], [0f32; 4]);
                 self.levels[fine].look_up(uv, &mut a);
                 self.levels[coarse].look_up(uv, &mut b);
-                return std::array::from_fn(|k| coded(a[k] + share * (b[k] - a[k])));
+                return std::array::from_fn(|k| coded(table, a[k] + share * (b[k] - a[k])));
             }
             let (a, b) = values.split_at_mut(self.channels);
             self.levels[fine].look_up(uv, a);
             self.levels[coarse].look_up(uv, b);
             a.iter_mut().zip(b).for_each(|(a, b)| *a += share * (*b - *a));
             let more = sphharm::combine(a[3..].as_chunks().0, (self.turned * -hits.directions[i]).to_array());
-            std::array::from_fn(|k| (coded(a[k]) + more[k]).clamp(0.0, 1.0))
+            std::array::from_fn(|k| (coded(table, a[k]) + more[k]).clamp(0.0, 1.0))
         };
         (0..hits.hits.len()).map(&mut one).collect()
     }
@@ -356,7 +356,7 @@ mod tests {
         assert_eq!(mip_level(1e9, 4), (3, 0.0));
         let coded: f32 = (0..=1000)
             .map(|i| i as f32 / 1000.0)
-            .map(|v| (coded(v) - srgb_from_linear(v)).abs())
+            .map(|v| (coded(srgb_table(), v) - srgb_from_linear(v)).abs())
             .fold(0.0, f32::max);
         assert!(coded < 5e-5, "{coded}");
     }
