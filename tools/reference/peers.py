@@ -173,6 +173,10 @@ class Tones:
 class Surface:
     def __init__(self, path):
         scene = trimesh.load(path, process=False)
+        if isinstance(scene, trimesh.Scene):  # translucent layers are around the surface, not of it
+            soft = [name for name, g in scene.geometry.items()
+                    if getattr(getattr(g.visual, "material", None), "alphaMode", None) == "BLEND"]
+            scene.delete_geometry(soft)
         mesh = scene.to_mesh() if isinstance(scene, trimesh.Scene) else scene
         if not len(getattr(mesh, "faces", ())):
             sys.exit(f"{path}: no triangles")
