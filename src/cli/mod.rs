@@ -252,7 +252,7 @@ the held-out views, their blend and the metrics alone; --fresh render then makes
         #[arg(long, value_name = "WHICH")]
         cameras: Option<String>,
         /// Any of baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
-        /// (head.glb, as a viewer shows it) and raster (the same, rasterised), with commas
+        /// (head.glb, as a viewer shows it) and raster (the same, rasterized), with commas
         #[arg(long = "with", value_name = "LIST")]
         method: Option<String>,
         /// png or exr

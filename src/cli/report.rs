@@ -17,7 +17,11 @@ use std::path::{Path, PathBuf};
 pub(super) fn run(invocation: &Invocation, runs: &[PathBuf]) -> Result<()> {
     let common = invocation.common;
     let asked = Out::find(common.out.as_deref(), "report")?;
-    let all = if runs.is_empty() { io::list_folders(Path::new("runs"))? } else { runs.to_vec() };
+    let all = match (runs, &common.run) {
+        ([], Some(run)) => vec![run.clone()],
+        ([], None) => io::list_folders(Path::new("runs"))?,
+        _ => runs.to_vec(),
+    };
     match &all[..] {
         [] => Err(Error::cannot("there are no runs under `runs/`", "name a run folder")),
         [one] => renew(invocation, one, asked.as_ref()),
@@ -46,6 +50,9 @@ fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()
     renew_report(&line)?;
     if let Some(out) = asked {
         let copy = out.file("report.html");
+        if let Some(folder) = copy.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+            io::create_folder(folder)?;
+        }
         io::write_atomic(&copy, &io::read_bytes(&page, &io::Limits::default())?)?;
         page = copy;
     }

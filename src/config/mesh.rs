@@ -88,7 +88,8 @@ table! {
         texture_px: u32, 0.0..=16384.0 => 1024, 2048, 2048;
         /// Degree of view-dependent lobes in the GLB, 0 (none), 1 or 2; no view of the mesh has more then.
         lobes: u32, 0.0..=2.0 => 0;
-        /// Around soft outlines, as of hair: shells (translucent layers, where they help) or none.
+        /// Around soft outlines, as of hair: shells (translucent layers in the GLB, where they help) or none. raycast
+        /// shows them with `mesh.color=photographs`.
         hair: Hair => Hair::Shells, Hair::Shells, Hair::None;
         /// A tangent-space map of the field's normals in the GLB: true or false.
         normal_map: bool => false;

@@ -20,7 +20,7 @@ pub enum Method {
     Raycast,
     /// Rays cast at the product, color from its texture: what a viewer of `head.glb` sees.
     Textured,
-    /// The same, rasterised: in a hundredth of the time.
+    /// The same, rasterized in a hundredth of the time, without soft layers.
     Raster,
 }
 
@@ -32,7 +32,7 @@ pub const NAMES: [(&str, &str); 7] = [
     ("volume", "I-Face"),
     ("raycast", "I-Face's mesh"),
     ("textured", "head.glb"),
-    ("raster", "head.glb, rasterised"),
+    ("raster", "head.glb, rasterized"),
     ("ensemble", "blend"),
 ];
 
@@ -91,7 +91,7 @@ table! {
         /// camera path) into a folder of their own. Blend and metrics are always of test.
         cameras: String => "test".into();
         /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with all that is known of its color),
-        /// textured (head.glb, as a viewer shows it) and raster (the same, rasterised).
+        /// textured (head.glb, as a viewer shows it) and raster (the same, rasterized, without soft layers).
         method: Vec<Method>
             => vec![Method::Tface, Method::Volume, Method::Raycast],
             vec![Method::Tface, Method::Volume, Method::Raycast],

@@ -57,7 +57,11 @@ struct LayerCaster<'a> {
 }
 
 impl<'a> ShellCaster<'a> {
-    /// Returns the layers around a mesh, ready for rays.
+    /// Returns the layers around a mesh with normals, ready for rays.
+    ///
+    /// # Panics
+    ///
+    /// A layer has not one offset and one alpha for each vertex.
     pub fn new(mesh: &'a Mesh, shells: &'a Shells) -> ShellCaster<'a> {
         let caster = |layer: &'a ShellLayer| {
             let mut surface = Mesh { positions: layer.positions(mesh), ..Mesh::default() };

@@ -79,6 +79,14 @@ pub(super) fn read_capture(path: &Path, root: &Path) -> Result<Capture, ReadErro
     if file.views.is_empty() {
         return Err(ReadError::value(path, "views", "empty", "at least one view"));
     }
+    for (k, view) in file.views.iter().enumerate() {
+        // pictures are written under these names
+        let leads_out = view.name.split(['/', '\\']).any(|part| ["", ".", ".."].contains(&part));
+        if leads_out || view.name.contains('\0') {
+            let key = format!("views[{k}].name");
+            return Err(ReadError::value(path, key, &view.name, "the name of a file in a folder"));
+        }
+    }
     Ok(Capture {
         root: root.into(),
         name: file.capture,
@@ -162,6 +170,37 @@ mod tests {
         for key in ["scene_from_world", "aabb"] {
             let e = after(&|v| drop(v.as_object_mut().unwrap().remove(key))).unwrap_err();
             assert!(e.to_string().contains(key) && e.to_string().contains("scene.json"), "{e}");
+        }
+    }
+
+    #[test]
+    fn names_of_views_that_lead_out_of_a_folder_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("cameras.json");
+        let named = |name: &str| {
+            let camera = crate::geom::Camera::above(4, 4, 4.0, 3.0);
+            let view = View {
+                name: name.into(),
+                split: crate::capture::Split::Test,
+                camera,
+                photo: "photo.png".into(),
+                mask: crate::capture::ViewMask::None,
+                mask_meaning: crate::config::MaskMeaning::Empty,
+                valid: None,
+                region: None,
+                downscale: 1,
+                photo_size: (4, 4),
+                declared: (4, 4),
+                declared_by: String::new(),
+            };
+            let value =
+                json!({"capture": "a", "format": "b", "up": [0, 0, 1], "unit_m": 1.0, "views": [view]});
+            std::fs::write(&path, value.to_string()).unwrap();
+            read_capture(&path, Path::new(""))
+        };
+        assert_eq!(named("a/b 1").unwrap().views.len(), 1);
+        for name in ["../../a", "/a", "a/../b", "a//b", "..\\a", ".", "", "a\0"] {
+            assert!(named(name).unwrap_err().to_string().contains("views[0].name"), "{name:?}");
         }
     }
 }

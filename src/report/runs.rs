@@ -45,7 +45,7 @@ pub struct RunRow {
     pub megabytes: Option<f64>,
     /// Work of all stages.
     pub seconds: f64,
-    /// Days since 1970 when its last stage ended, with their fraction.
+    /// When its last stage ended, in seconds since 1970.
     pub finished: u64,
 }
 

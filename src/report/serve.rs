@@ -11,8 +11,10 @@ use std::net::{Ipv4Addr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// A request and its answer may take so long each.
+/// A request may take so long, and an answer so long without any of it going.
 const PATIENCE: Duration = Duration::from_secs(5);
+/// An answer may take so long.
+const LONGEST: Duration = Duration::from_secs(60);
 /// A request may be so long.
 const HEADER_BYTES: usize = 8192;
 /// So many connections at a time; a browser opens six.
@@ -166,14 +168,18 @@ fn is_slow(e: &std::io::Error) -> bool {
     matches!(e.kind(), Io::WouldBlock | Io::TimedOut | Io::Interrupted)
 }
 
-/// Sends all of it, unless that takes too long.
+/// Sends all of it, unless nothing of it goes for some time, all of it takes too long, or a stop is asked for.
 fn send(stream: &mut TcpStream, mut bytes: &[u8], stop: &dyn Fn() -> bool) -> std::io::Result<()> {
     let begin = Instant::now();
+    let mut moved = begin;
     while !bytes.is_empty() {
+        if stop() || moved.elapsed() > PATIENCE || begin.elapsed() > LONGEST {
+            return Err(Io::TimedOut.into());
+        }
         match stream.write(bytes) {
             Ok(0) => return Err(Io::WriteZero.into()),
-            Ok(n) => bytes = &bytes[n..],
-            Err(e) if is_slow(&e) && begin.elapsed() < PATIENCE && !stop() => {}
+            Ok(n) => (bytes, moved) = (&bytes[n..], Instant::now()),
+            Err(e) if is_slow(&e) => {}
             Err(e) => return Err(e),
         }
     }

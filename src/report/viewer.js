@@ -241,7 +241,7 @@ class Painter {
       cutoff: material.alphaMode === "MASK" ? material.alphaCutoff ?? 0.5 : -1,
       factor: pbr.baseColorFactor ?? [1, 1, 1, 1], texture: pbr.baseColorTexture?.index, lobes,
       scale: notes?.view_dependent_color?.scale ?? [], pictures: [], count: indices?.count ?? attributes.POSITION.count };
-    part.shader = this.program(`${part.texture} ${lobes.length}`, VERTEX, fragment(this.known, part.texture !== undefined, lobes.length));
+    part.shader = this.program(`${part.texture !== undefined} ${lobes.length}`, VERTEX, fragment(this.known, part.texture !== undefined, lobes.length));
     part.whole = this.vertices(part, false);
     return part;
   }
@@ -283,8 +283,11 @@ class Painter {
     gl.texImage2D(gl.TEXTURE_2D, 0, light ? gl.SRGB8_ALPHA8 : gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, bitmap);
     gl.generateMipmap(gl.TEXTURE_2D);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    // coordinates that leave the picture are kept as floats; a head's atlas ends at its edge
+    const repeats = this.parts.some((p) => p.attributes.TEXCOORD_0?.componentType === gl.FLOAT);
+    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) {
+      gl.texParameteri(gl.TEXTURE_2D, side, repeats ? gl.REPEAT : gl.CLAMP_TO_EDGE);
+    }
     return texture;
   }
 

@@ -40,12 +40,13 @@ pub fn compact_glb(bytes: &[u8], path: &Path) -> Result<Vec<u8>> {
     let looks: Looks = serde_json::from_slice(&glb.json).map_err(|e| source.broken("`materials`", e))?;
     let reader = GlbReader { root: &root, bin: glb.bin.as_deref().unwrap_or_default(), source };
     let (mut parts, mut file) = (Vec::new(), Packed::default());
-    let mut triangles = 0;
+    let (mut vertices, mut triangles) = (0, 0);
     reader.each_part(|part| {
         let mut own = Primitives::default();
         reader.add_triangles(part, &mut own)?;
+        vertices += own.positions.len();
         triangles += own.mesh.triangles.len();
-        source.allow(own.positions.len(), triangles)?;
+        source.allow(vertices, triangles)?;
         parts.push((own, part.primitive.material));
         Ok(())
     })?;
@@ -169,7 +170,7 @@ impl Packed {
                 at.into()
             };
         }
-        if mesh.colors.len() == vertices {
+        if part.is_colored() {
             let short = |v: f32| (v * 65535.0).round() as u16;
             let alpha = |i: usize| *part.alphas.get(i).unwrap_or(&1.0);
             let color = |(i, c): (usize, &[f32; 3])| {
@@ -217,8 +218,15 @@ impl Packed {
         if let Some(factor) = old.pointer("/pbrMetallicRoughness/baseColorFactor") {
             pbr["baseColorFactor"] = factor.clone();
         }
-        if let Some(texture) = texture {
-            pbr["baseColorTexture"] = json!({"index": self.texture(texture, COLOR_PX, reader)?});
+        match texture {
+            Some(texture) => {
+                pbr["baseColorTexture"] = json!({"index": self.texture(texture, COLOR_PX, reader)?});
+            }
+            // the vertices have been multiplied with it
+            None => {
+                let alpha = pbr["baseColorFactor"][3].as_f64().unwrap_or(1.0);
+                pbr["baseColorFactor"] = json!([1.0, 1.0, 1.0, alpha]);
+            }
         }
         if let Some(notes) = old.pointer("/extras/tiface").filter(|notes| notes["lobes"].is_array()) {
             let mut notes = notes.clone();
@@ -355,5 +363,28 @@ mod tests {
             assert!((a - b).abs() < 1e-3, "{a} {b}");
         }
         assert!(back.positions.iter().zip(&whole.positions).all(|(a, b)| a.distance(*b) < 1e-3));
+    }
+
+    #[test]
+    fn what_has_no_colors_of_its_own_gets_none_and_a_tint_counts_once() {
+        let (mut mesh, _) = tetrahedron();
+        mesh.colors.clear();
+        let path = Path::new("a.glb");
+        let glb = to_glb(&mesh, None, None, &ExportOptions::default()).unwrap();
+        assert!(read(&compact_glb(&glb, path).unwrap(), path).unwrap().colors.is_empty());
+        // (0.25, 0.5, 1) linear, over white
+        let source = Source { path, format: "GLB", options: &ReadOptions::DEFAULT };
+        let chunks = chunks(&glb, source).unwrap();
+        let mut json: Value = serde_json::from_slice(&chunks.json).unwrap();
+        json["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = json!([0.25, 0.5, 1.0, 0.5]);
+        let mut text = json.to_string().into_bytes();
+        text.resize(text.len().next_multiple_of(4), b' ');
+        let bin = chunks.bin.unwrap();
+        let header = gltf::binary::Header { magic: *b"glTF", version: 2, length: 0 };
+        let tinted = gltf::Glb { header, json: text.into(), bin: Some(bin) }.to_vec().unwrap();
+        let small = compact_glb(&tinted, path).unwrap();
+        let found = read(&small, path).unwrap().colors[0];
+        let expected = [0.25, 0.5, 1.0].map(crate::image::srgb_from_linear);
+        assert!((0..3).all(|k| (found[k] - expected[k]).abs() < 1e-3), "{found:?}");
     }
 }

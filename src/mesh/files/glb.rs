@@ -28,6 +28,7 @@
 //!   "view_dependent_color": { …how their bytes become a color… } } }
 //! ```
 
+use super::faults::wrong_length;
 use super::file_mesh::{ExportOptions, FileMesh, encode};
 use super::glb_document::{GlbDocument, info};
 use super::texture::{HeadTexture, Lobes};
@@ -75,6 +76,13 @@ pub fn to_glb(
     options: &ExportOptions,
 ) -> Result<Vec<u8>> {
     let file_from_mesh = options.file_from_mesh()?;
+    for layer in shells.iter().flat_map(|shells| &shells.layers) {
+        for (what, found) in [("offsets", layer.offsets.len()), ("alphas", layer.alphas.len())] {
+            if found != mesh.positions.len() {
+                return Err(wrong_length(found, what, mesh.positions.len()));
+            }
+        }
+    }
     let file = FileMesh::new(mesh, texture, &file_from_mesh)?;
     let mut file = file.split(texture.is_some_and(|t| t.normal.is_some()));
     let mut document = GlbDocument::default();

@@ -146,8 +146,17 @@ impl GlbMaterial {
 #[serde(rename_all = "camelCase", default)]
 pub(super) struct GlbPbr {
     pub base_color_texture: Option<GlbTextureUse>,
-    /// Linear, what colors and texture are multiplied with.
-    pub base_color_factor: Option<[f32; 4]>,
+    /// What colors and texture are multiplied with, whatever stands there.
+    pub base_color_factor: serde_json::Value,
+}
+
+impl GlbPbr {
+    /// Linear red, green and blue that colors are multiplied with, if that says something.
+    pub fn tint(&self) -> Option<[f32; 3]> {
+        let [r, g, b] = [0, 1, 2].map(|k| self.base_color_factor[k].as_f64().map(|v| v as f32));
+        let tint = [r?, g?, b?];
+        (tint.iter().all(|v| v.is_finite()) && tint != [1.0; 3]).then_some(tint)
+    }
 }
 
 /// A texture as a material names it.

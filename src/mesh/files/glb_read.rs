@@ -102,6 +102,13 @@ pub(super) struct Primitives {
     textures: BTreeSet<Option<u32>>,
 }
 
+impl Primitives {
+    /// Do its vertices have colors or opacity of their own?
+    pub fn is_colored(&self) -> bool {
+        !self.bare_colors || self.tinted
+    }
+}
+
 pub(super) struct GlbReader<'a> {
     pub root: &'a GlbRoot,
     pub bin: &'a [u8],
@@ -299,10 +306,7 @@ impl<'a> GlbReader<'a> {
         }
         let material = primitive.material.and_then(|m| self.root.materials.get(m as usize));
         let pbr = material.map(|m| &m.pbr_metallic_roughness).filter(|pbr| pbr.base_color_texture.is_none());
-        if let Some([r, g, b, _]) = pbr.and_then(|pbr| pbr.base_color_factor)
-            && [r, g, b] != [1.0; 3]
-            && [r, g, b].iter().all(|v| v.is_finite())
-        {
+        if let Some([r, g, b]) = pbr.and_then(|pbr| pbr.tint()) {
             out.tinted = true;
             for color in &mut out.mesh.colors[first..] {
                 let tint = |c: f32, f: f32| srgb_from_linear(linear_from_srgb(c) * f);

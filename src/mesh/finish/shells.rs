@@ -92,7 +92,9 @@ pub fn fit(
     if outlines.rows() == 0 {
         return Ok((None, report));
     }
-    let left_out = |view: u32| view as usize % LEFT_OUT == LEFT_OUT - 1;
+    // of a few photographs the last
+    let every = LEFT_OUT.min(photographs.len());
+    let left_out = |view: u32| every > 1 && view as usize % every == every - 1;
     let first = outlines.fit(&field, &nodes, &|view| !left_out(view));
     let errors = [None, Some(&field), Some(&first)].map(|s| outlines.error(s, &left_out));
     report.left_out = errors;

@@ -39,8 +39,14 @@ impl Photograph<'_> {
     pub(crate) fn outline(&self, margin: usize) -> Vec<usize> {
         let Some(mask) = self.mask else { return Vec::new() };
         let (w, h) = (mask.width as usize, mask.height as usize);
-        let side =
-            |head: bool| eroded(mask.values.iter().map(|&m| (m >= 128) == head).collect(), w, h, margin);
+        // beyond its border a mask goes on as it is there
+        let (wide, high) = (w + 2 * margin, h + 2 * margin);
+        let inner = |at: usize, n: usize| at.clamp(margin, margin + n - 1) - margin;
+        let side = |head: bool| {
+            let of = |i: usize| (mask.values[inner(i / wide, h) * w + inner(i % wide, w)] >= 128) == head;
+            let set = eroded((0..wide * high).map(of).collect(), wide, high, margin);
+            (0..w * h).map(|i| set[(i / w + margin) * wide + i % w + margin]).collect::<Vec<bool>>()
+        };
         let (inside, outside) = (side(true), side(false));
         let usable = |at: &usize| self.valid.is_none_or(|v| v.values[*at] > 0);
         (0..w * h).filter(|&at| !inside[at] && !outside[at]).filter(usable).collect()

@@ -1,7 +1,7 @@
 //! Which texels a triangle covers, and where on the triangle their samples lie.
 //!
 //! Every texel is looked at through `side × side` regularly spaced points. A texel that a triangle touches
-//! without meeting any point still belongs to it (conservative rasterisation): its one sample is the
+//! without meeting any point still belongs to it (conservative rasterization): its one sample is the
 //! triangle's point nearest to the texel's centre. Triangles thinner than a texel are never lost.
 
 use crate::geom::Atlas;
