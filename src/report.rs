@@ -229,9 +229,12 @@ fn heat() -> String {
 fn fill(template: &str, context: minijinja::Value) -> Result<String> {
     let mut pages = Environment::new();
     pages.set_trim_blocks(true);
+    let parts =
+        [("top.html", include_str!("report/top.html")), ("charts.html", include_str!("report/charts.html"))];
+    let parts = parts.into_iter().try_for_each(|(name, part)| pages.add_template(name, part));
     // the name says that it is HTML, so that everything is escaped
     let page = pages.template_from_named_str("page.html", template);
-    page.and_then(|page| page.render(context)).map_err(|e| Error::new(ErrorKind::Bug, e))
+    parts.and(page).and_then(|page| page.render(context)).map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
 /// A picture file, PNG or JPEG, as a `data:` address.

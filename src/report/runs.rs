@@ -165,7 +165,10 @@ pub fn runs_html(rows: &[RunRow]) -> Result<String> {
     let cells: Vec<_> = rows.iter().map(cells).collect();
     let done = rows.iter().filter(|row| row.done).count();
     let script = include_str!("runs.js");
-    fill(include_str!("runs.html"), context! { style => STYLE, script, rows, cells, done })
+    fill(
+        include_str!("runs.html"),
+        context! { style => STYLE, script, title => format!("{} runs", rows.len()), rows, cells, done },
+    )
 }
 
 #[cfg(test)]

@@ -5,8 +5,7 @@ use crate::Result;
 use crate::image::Photo;
 use crate::io;
 use crate::pipeline::PreviewPicture;
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+use crate::report::base64;
 use std::fmt::Write;
 use std::path::Path;
 
@@ -56,7 +55,7 @@ pub(super) fn shown(picture: &PreviewPicture) -> Result<String> {
             let rgb = rgba.iter().map(|&p| over_black(p)).collect();
             let photo = Photo { width, height, rgb, alpha: None };
             let png = io::png_bytes(&photo, Path::new("preview"))?;
-            let coded = STANDARD.encode(&png);
+            let coded = base64(&png);
             if protocol == Protocol::Iterm {
                 format!("\x1b]1337;File=inline=1;size={}:{coded}\x07\n", png.len())
             } else {

@@ -152,6 +152,20 @@ impl FileMesh {
         Ok(FileMesh { positions, normals, colors, source, triangles, uvs, corners, tangents, translation })
     }
 
+    fn empty(translation: DVec3) -> FileMesh {
+        FileMesh {
+            positions: Vec::new(),
+            normals: Vec::new(),
+            colors: Vec::new(),
+            source: Vec::new(),
+            triangles: Vec::new(),
+            uvs: Vec::new(),
+            corners: Vec::new(),
+            tangents: Vec::new(),
+            translation,
+        }
+    }
+
     /// Does f32 lose visible precision where this mesh lies?
     pub fn is_far(&self) -> bool {
         self.translation != DVec3::ZERO
@@ -171,17 +185,7 @@ impl FileMesh {
         }
         let tangents = with_tangents
             .then(|| tangents::of(&self.positions, &self.normals, &self.triangles, &self.uvs, &self.corners));
-        let mut out = FileMesh {
-            positions: Vec::new(),
-            normals: Vec::new(),
-            colors: Vec::new(),
-            source: Vec::new(),
-            triangles: Vec::with_capacity(self.triangles.len()),
-            uvs: Vec::new(),
-            corners: Vec::new(),
-            tangents: Vec::new(),
-            translation: self.translation,
-        };
+        let mut out = FileMesh::empty(self.translation);
         let mut known: HashMap<(u32, [u32; 2], [u32; 4]), u32> = HashMap::with_capacity(self.positions.len());
         for (t, (vertices, corner)) in self.triangles.iter().zip(&self.corners).enumerate() {
             let mut triangle = [0; 3];
@@ -206,22 +210,10 @@ impl FileMesh {
         }
         out
     }
-}
 
-impl FileMesh {
     /// The part of this mesh that has these soft layers. Of a mesh that has been split.
     pub fn under(&self, shells: &Shells) -> FileMesh {
-        let mut out = FileMesh {
-            positions: Vec::new(),
-            normals: Vec::new(),
-            colors: Vec::new(),
-            source: Vec::new(),
-            triangles: Vec::new(),
-            uvs: Vec::new(),
-            corners: Vec::new(),
-            tangents: Vec::new(),
-            translation: self.translation,
-        };
+        let mut out = FileMesh::empty(self.translation);
         let mut known = vec![u32::MAX; self.positions.len()];
         let of_mesh = |t: &[u32; 3]| t.map(|v| self.source[v as usize]);
         let has = |t: &&[u32; 3]| shells.layers.iter().any(|layer| layer.has(&of_mesh(t)));
