@@ -19,6 +19,8 @@
 //! be done, and a finished stage is skipped without loading anything. The device is not part of it: it
 //! decides how fast a field is learned, not what it is.
 
+#[cfg(feature = "cpu")]
+mod bench;
 mod clicks;
 mod ensemble;
 mod export;
@@ -43,6 +45,8 @@ mod truth;
 
 pub use crate::config::Stage;
 pub use crate::geom::RayResult;
+#[cfg(feature = "cpu")]
+pub use bench::{Bench, SWEEPS};
 pub use export::Export;
 pub use line::{Line, capture_options, feasible};
 pub use mask::{click_page, disagreements};
@@ -82,8 +86,9 @@ pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> 
     }
     let done = run.stage(line.plan(stage), |dir| match stage {
         Stage::Mask => mask::mask(capture, line.clicks.as_ref(), &config.mask, dir),
-        Stage::Baseline | Stage::Tface => learn::radiance(stage, capture, &line.scene()?, config, dir),
-        Stage::Iface => learn::distance(capture, &line.scene()?, config, dir),
+        Stage::Baseline | Stage::Tface | Stage::Iface => {
+            learn::learn(stage, capture, &line.scene()?, config, dir)
+        }
         Stage::Mesh => mesh::mesh(capture, &line.scene()?, fields.surface()?, config, dir),
         Stage::Render => render::render(line, &line.scene()?, fields, dir),
         Stage::Ensemble => ensemble::ensemble(line, &line.scene()?, fields, dir),

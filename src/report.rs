@@ -4,6 +4,7 @@
 //! Everything that comes from outside is escaped by the templates; only what this module made itself (drawings,
 //! pictures, JSON) goes in as it is.
 
+pub mod bench;
 mod chart;
 mod live;
 mod runs;
@@ -237,9 +238,13 @@ fn fill(template: &str, context: minijinja::Value) -> Result<String> {
     parts.and(page).and_then(|page| page.render(context)).map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
-/// A picture file, PNG or JPEG, as a `data:` address.
+/// A picture file, PNG, JPEG or SVG, as a `data:` address.
 pub fn picture_url(file: &[u8]) -> String {
-    let kind = if file.starts_with(&[0xFF, 0xD8]) { "jpeg" } else { "png" };
+    let kind = match file {
+        [0xFF, 0xD8, ..] => "jpeg",
+        [b'<', ..] => "svg+xml",
+        _ => "png",
+    };
     format!("data:image/{kind};base64,{}", base64(file))
 }
 

@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// The demo's pictures are small, and it should end while its user still looks.
-const SHORTER: &str = "\
+pub(super) const SHORTER: &str = "\
 tface.steps = 800
 tface.rays = 2048
 baseline.steps = 600

@@ -4,6 +4,7 @@
 //! ([`crate::ErrorKind`]).
 
 mod bar;
+mod bench;
 mod check;
 mod completions;
 mod config;
@@ -28,6 +29,7 @@ mod viewer;
 use crate::pipeline::Stage;
 use crate::run::Stop;
 use crate::{Error, Result};
+use bench::BenchOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
 use invocation::Invocation;
 use options::{Common, KeyOption};
@@ -299,6 +301,15 @@ learned from (capture.tiles): the blend follows the better members.")]
   tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
   tiface preview runs/002_00 --watch            a run while it works, in a browser on this machine")]
     Preview(PreviewOptions),
+    /// Speed against error of each decision, measured on this machine: tables, plots, a page
+    #[command(after_long_help = "Examples:
+  tiface bench                                  all of it on the demo head, a quarter of an hour on two cores
+  tiface bench captures/002_00 --sweep steps,render
+  tiface bench runs/002_00 --sweep extraction,triangles,texture --truth truth.ply
+  tiface bench --out bench/new/ --compare bench/demo/bench.json    what got slower or worse since then
+
+Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep.")]
+    Bench(BenchOptions),
     /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates, size
     #[command(after_long_help = "Examples:
   tiface check head.glb
@@ -381,6 +392,7 @@ pub fn main() -> ExitCode {
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
         Command::Preview(options) => preview::run(&invocation, options),
+        Command::Bench(options) => bench::run(&invocation, options),
         Command::Status { runs } => makes_nothing("status").and_then(|()| status::run(&common, runs)),
         Command::Report { runs } => report::run(&invocation, runs),
         Command::Config { place, explain } => makes_nothing("config")

@@ -18,49 +18,52 @@ use serde_json::{Value, json};
 use std::cell::OnceCell;
 use std::path::Path;
 
-/// Learns the signed distance of the stage `iface` from the masked photographs; goes on from its last checkpoint.
-pub(super) fn distance(capture: &Capture, scene: &Scene, config: &Config, dir: &StageDir) -> Result<Value> {
-    let views = train_views(capture, scene, config, true)?;
-    let hull = bitmask(scene);
-    let (_, report) =
-        iface::train(&views, hull.as_ref(), &config.iface, &session(Stage::Iface, config, dir))?;
-    report.warnings.iter().for_each(|w| dir.warn(w));
-    Ok(json!(report))
-}
-
-/// Learns, or imports, the radiance field of the stage `baseline` or `tface`: the same learning with other settings.
-pub(super) fn radiance(
+/// Learns, or imports, the field of a stage that learns; goes on from its last checkpoint.
+pub(super) fn learn(
     stage: Stage,
     capture: &Capture,
     scene: &Scene,
     config: &Config,
     dir: &StageDir,
 ) -> Result<Value> {
-    let c = config.radiance(stage);
-    let session = session(stage, config, dir);
-    if !c.import.is_empty() {
-        let (file, place) = (Path::new(&c.import), &scene.scene_from_world);
-        tface::import_th(file, c.import_scale, place, &session)?;
-        return Ok(json!({"imported": c.import}));
-    }
-    // without masks nothing may know the head's outline nor what that carves; only the box stays
-    let masked = c.masks != MaskUse::None;
-    let views = train_views(capture, scene, config, masked)?;
-    let hull = bitmask(scene).filter(|_| masked);
-    let report = tface::train(&views, scene.aabb, hull.as_ref(), &c, &session)?;
-    report.warnings.iter().for_each(|w| dir.warn(w));
-    Ok(json!(report))
-}
-
-fn session<'a>(stage: Stage, config: &'a Config, dir: &'a StageDir) -> TrainingSession<'a> {
-    TrainingSession {
+    let session = TrainingSession {
         stage: stage.word(),
         seed: config.seed,
         device: &config.device,
         dir: dir.folder(),
         identity: dir.identity(),
         monitor: dir.monitor(),
+    };
+    let (report, warnings) = train(stage, capture, scene, config, &session)?;
+    warnings.iter().for_each(|w| dir.warn(w));
+    Ok(report)
+}
+
+/// Learns, or imports, the field of a stage in a session. Returns its report, and what a person should know.
+pub(super) fn train(
+    stage: Stage,
+    capture: &Capture,
+    scene: &Scene,
+    config: &Config,
+    session: &TrainingSession,
+) -> Result<(Value, Vec<String>)> {
+    let hull = bitmask(scene);
+    if stage == Stage::Iface {
+        let views = train_views(capture, scene, config, true)?;
+        let (_, report) = iface::train(&views, hull.as_ref(), &config.iface, session)?;
+        return Ok((json!(report), report.warnings));
     }
+    // `baseline` and `tface` are the same learning with other settings
+    let c = config.radiance(stage);
+    if !c.import.is_empty() {
+        tface::import_th(Path::new(&c.import), c.import_scale, &scene.scene_from_world, session)?;
+        return Ok((json!({"imported": c.import}), Vec::new()));
+    }
+    // without masks nothing may know the head's outline nor what that carves; only the box stays
+    let masked = c.masks != MaskUse::None;
+    let views = train_views(capture, scene, config, masked)?;
+    let report = tface::train(&views, scene.aabb, hull.as_ref().filter(|_| masked), &c, session)?;
+    Ok((json!(report), report.warnings))
 }
 
 /// The photographs that are learned from, in the scene. Pixels of `capture.tiles` count as not valid.

@@ -14,11 +14,7 @@ pub(super) fn no_fields<T>() -> Result<T> {
     Err(Error::cannot("this build cannot learn fields", "build with the feature `cpu`, which is the default"))
 }
 
-pub(super) fn distance(_: &Capture, _: &Scene, _: &Config, _: &StageDir) -> Result<Value> {
-    no_fields()
-}
-
-pub(super) fn radiance(_: Stage, _: &Capture, _: &Scene, _: &Config, _: &StageDir) -> Result<Value> {
+pub(super) fn learn(_: Stage, _: &Capture, _: &Scene, _: &Config, _: &StageDir) -> Result<Value> {
     no_fields()
 }
 

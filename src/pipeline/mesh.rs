@@ -11,9 +11,8 @@ use super::finish::{FinishedHead, REACH, finish};
 use super::line::Line;
 use super::surface::{ClosedSurface, Surface};
 use super::tiles;
-use crate::Result;
 use crate::capture::scene::Scene;
-use crate::capture::{self, Capture, Split};
+use crate::capture::{self, Capture, LoadedView, Split};
 use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, MeshFormat};
 use crate::geom::{Camera, Mesh, Similarity};
 use crate::image::Image;
@@ -22,6 +21,7 @@ use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshReport, Patches, Photograph};
 use crate::run::StageDir;
+use crate::{Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -39,7 +39,7 @@ pub(super) fn mesh(
     let (world_from_scene, export) = (scene.scene_from_world.inverse(), Export::new(capture, config));
     let mm = world_from_scene.scale * config.capture.unit_m * 1000.0;
     let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
-    let (mut surface, report) = extract(scene, field, &cameras, capture.up, c, dir)?;
+    let (mut surface, report) = extract(scene, field, &cameras, capture.up, c, dir.monitor())?;
     report.warnings(c.cap).iter().for_each(|w| dir.warn(w));
     report.handles.warning(mm).iter().for_each(|w| dir.warn(w));
     let patches = Patches::of(&surface, &report.handles);
@@ -73,15 +73,7 @@ pub(super) fn mesh(
         let reach = REACH * report.cell_size;
         cap.shade(|p, n| seen_colors(&surface, p, n, &learned, &cameras, reach));
     }
-    let photographs: Vec<Photograph> = views
-        .iter()
-        .map(|(camera, view)| Photograph {
-            camera,
-            photo: &view.photo,
-            mask: view.mask.as_ref(),
-            valid: view.valid.as_ref(),
-        })
-        .collect();
+    let photographs = photographs(&views);
     let closed = ClosedSurface { field, cap: cap.as_ref(), patches: patches.as_ref() };
     let finished = finish(
         &surface,
@@ -125,14 +117,27 @@ pub(super) fn mesh(
     }))
 }
 
+/// Loaded views as what colors are fitted to.
+pub(super) fn photographs(views: &[(Camera, LoadedView)]) -> Vec<Photograph<'_>> {
+    views
+        .iter()
+        .map(|(camera, view)| Photograph {
+            camera,
+            photo: &view.photo,
+            mask: view.mask.as_ref(),
+            valid: view.valid.as_ref(),
+        })
+        .collect()
+}
+
 /// The whole surface with colors at its vertices, closed where the training cameras stop looking.
-fn extract(
+pub(super) fn extract(
     scene: &Scene,
     field: &dyn Surface,
     cameras: &[Camera],
     up: Vec3,
     c: &MeshConfig,
-    dir: &StageDir,
+    monitor: &dyn Monitor,
 ) -> Result<(Mesh, MeshReport)> {
     let config = mesh::ExtractOptions {
         resolution: c.resolution as usize,
@@ -154,7 +159,7 @@ fn extract(
     // below the frames' border the surface is a guess: close the mesh where enough cameras look
     let kept = capture::well_seen(scene, cameras, up, c.seen_by);
     let (sdf, gradient) = (|p: &[Vec3]| field.sdf(p), |p: &[Vec3]| field.sdf_gradient(p));
-    mesh::extract(sdf, gradient, color, kept, inside_hull, &config, dir.monitor())
+    mesh::extract(sdf, gradient, color, kept, inside_hull, &config, monitor)
 }
 
 /// The mesh names the others: it comes last.

@@ -116,6 +116,12 @@ impl Meshes {
         }
         Ok(Meshes { extracted, head, shown: [textured || raster, raycast && fitted] })
     }
+
+    /// A head mesh, to be shown as a viewer shows it and with all that is known of its color.
+    #[cfg(feature = "cpu")]
+    pub fn of_head(head: HeadMesh, shown: [bool; 2]) -> Meshes {
+        Meshes { extracted: None, head: Some(head), shown }
+    }
 }
 
 /// The head mesh and what rays need to find it.

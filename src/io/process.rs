@@ -1,0 +1,59 @@
+//! What this process has cost so far, and what it runs on, as far as the system says.
+
+/// Returns the seconds of all threads of this process, user and system; those by the clock where the system does not
+/// say.
+pub fn cpu_seconds() -> f64 {
+    #[cfg(unix)]
+    {
+        let time = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+        time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
+    }
+    #[cfg(not(unix))]
+    {
+        use std::time::Instant;
+        static START: std::sync::LazyLock<Instant> = std::sync::LazyLock::new(Instant::now);
+        START.elapsed().as_secs_f64()
+    }
+}
+
+/// Returns the most memory that this process has had since [`forget_peak_memory`], bytes; `None` where the system does
+/// not say.
+pub fn peak_memory() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
+    line.split_whitespace().next()?.parse::<u64>().ok().map(|kib| kib << 10)
+}
+
+/// Lets [`peak_memory`] begin anew, where the system can.
+pub fn forget_peak_memory() {
+    // 5: the peak becomes what is held now (proc_pid_clear_refs(5))
+    let _ = std::fs::write("/proc/self/clear_refs", "5");
+}
+
+/// Returns what the system calls its processor; empty where it does not say.
+pub fn processor() -> String {
+    let all = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let line = all.lines().find_map(|l| l.strip_prefix("model name"));
+    line.map_or(String::new(), |l| l.trim_start_matches([' ', '\t', ':']).to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Instant;
+
+    #[test]
+    fn work_costs_cpu_time_and_memory_shows_as_a_peak() {
+        let before = cpu_seconds();
+        let start = Instant::now();
+        while start.elapsed().as_millis() < 30 {
+            std::hint::black_box((0..1000).sum::<u64>());
+        }
+        assert!(cpu_seconds() > before);
+        if let Some(before) = peak_memory() {
+            let held = vec![1u8; 256 << 20];
+            std::hint::black_box(&held);
+            assert!(peak_memory().unwrap() >= before.max(256 << 20));
+        }
+    }
+}

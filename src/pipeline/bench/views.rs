@@ -1,0 +1,45 @@
+//! Ways to make a view.
+
+use super::surface::Finisher;
+use super::{Bench, meter, sweep};
+use crate::config::{Hair, MeshConfig, Method, Stage};
+use crate::pipeline::render::{Meshes, Renderer};
+use crate::report::bench::{Measure, Row, Seconds, Sweep};
+use crate::{Quiet, Result};
+
+impl Bench<'_> {
+    /// Each method, a view.
+    pub(super) fn render(&self) -> Result<Sweep> {
+        let fields = self.fields(&[Stage::Iface, Stage::Tface])?;
+        let c = MeshConfig { lobes: 2, hair: Hair::Shells, ..self.config().mesh.clone() };
+        let head = Finisher::new(self, &fields, &c)?.finish(self, &c)?;
+        let triangles = head.mesh.triangles.len();
+        let meshes = Meshes::of_head(head, [true, true]);
+        let samples = self.config().render.samples;
+        let renderer = Renderer::new(&self.scene, &fields, &meshes, samples, &Quiet);
+        let camera = &self.line.capture.views[0].camera;
+        let note = format!(
+            "A view of {} × {} pixels; the mesh has {triangles} triangles and view-dependent colors of degree 2.",
+            camera.width, camera.height
+        );
+        let measures = vec![Measure::more("PSNR, dB", 2, 0.05)];
+        let mut sweep = sweep("render", "Render method", note, measures);
+        let methods = [Method::Tface, Method::Volume, Method::Raycast, Method::Textured, Method::Raster];
+        let all = meter::in_turn(methods.len(), |i| {
+            self.check_stop()?;
+            self.judge.render(&self.scene, &renderer, methods[i])
+        })?;
+        for (method, mut m) in methods.into_iter().zip(all) {
+            let each = 1.0 / self.judge.count() as f64;
+            for round in &mut m.rounds {
+                let Seconds { wall, cpu } = round.work;
+                round.work = Seconds { wall: each * wall, cpu: each * cpu };
+            }
+            let figures = vec![self.judge.psnr(m.result)?];
+            let (rounds, memory_mib) = (m.rounds, m.memory);
+            let (series, choice) = (String::new(), method.folder().into());
+            sweep.rows.push(Row { series, choice, rounds, parts: false, memory_mib, figures });
+        }
+        Ok(sweep)
+    }
+}
