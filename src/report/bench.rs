@@ -115,6 +115,9 @@ pub struct Sweep {
     pub rows: Vec<Row>,
 }
 
+/// Heading of the choices.
+const CHOICE: &str = "choice";
+
 impl Sweep {
     /// Which rows no other row beats in CPU time and the first measure together: the Pareto front.
     pub fn front(&self) -> Vec<bool> {
@@ -130,9 +133,10 @@ impl Sweep {
         places.iter().map(|p| p.is_some_and(|p| !all().any(|&other| beats(other, p)))).collect()
     }
 
-    /// Headings and cells of its table; the first cell of a row says with a star whether it is on the front.
+    /// Headings and cells of its table, and whether a row is on the front. The first column is the series, if there are
+    /// any; then the choice.
     fn table(&self) -> (Vec<String>, Vec<(bool, Vec<String>)>) {
-        let mut headings: Vec<String> = ["", "choice", "CPU", "wall", "memory, MiB"].map(String::from).into();
+        let mut headings: Vec<String> = ["", CHOICE, "CPU", "wall", "memory, MiB"].map(String::from).into();
         headings.extend(self.measures.iter().map(|m| m.name.clone()));
         let rows = self.rows.iter().zip(self.front()).map(|(row, front)| {
             let Seconds { wall, cpu } = row.seconds();
@@ -144,7 +148,12 @@ impl Sweep {
             cells.extend(self.measures.iter().zip(&row.figures).map(figure));
             (front, cells)
         });
-        (headings, rows.collect())
+        let mut rows: Vec<(bool, Vec<String>)> = rows.collect();
+        if rows.iter().all(|(_, cells)| cells[0].is_empty()) {
+            headings.remove(0);
+            rows.iter_mut().for_each(|(_, cells)| drop(cells.remove(0)));
+        }
+        (headings, rows)
     }
 }
 
@@ -281,7 +290,8 @@ impl BenchResult {
             let _ = writeln!(out, "\n{} ({})\n{}", sweep.title, sweep.name, sweep.note);
             let all: Vec<Vec<String>> =
                 [headings].into_iter().chain(rows.iter().map(|r| r.1.clone())).collect();
-            for (i, line) in aligned(&all, 2).into_iter().enumerate() {
+            let words = if all[0][0] == CHOICE { 1 } else { 2 };
+            for (i, line) in aligned(&all, words).into_iter().enumerate() {
                 let star = if i > 0 && rows[i - 1].0 { '*' } else { ' ' };
                 let _ = writeln!(out, "{star} {line}");
             }
@@ -313,7 +323,8 @@ impl BenchResult {
             out += &line(&vec!["---".into(); headings.len()]);
             for (front, mut cells) in rows {
                 if front {
-                    cells[1] = format!("**{}**", cells[1]);
+                    let choice = headings.iter().position(|h| h == CHOICE).unwrap_or(0);
+                    cells[choice] = format!("**{}**", cells[choice]);
                 }
                 out += &line(&cells);
             }
@@ -345,7 +356,8 @@ impl BenchResult {
                 let (headings, rows) = sweep.table();
                 let plot = plots.iter().find(|(name, _)| *name == sweep.name);
                 let plot = plot.map(|(_, svg)| picture_url(svg.as_bytes()));
-                context! { title => sweep.title, note => sweep.note, headings, rows, plot }
+                let words = if headings[0] == CHOICE { 1 } else { 2 };
+                context! { title => sweep.title, note => sweep.note, headings, rows, plot, words }
             })
             .collect();
         let stability: Vec<_> = self.stability.iter().map(|row| (row.holds(), row.cells())).collect();

@@ -7,7 +7,7 @@ use crate::image::Gray;
 use crate::io::Limits;
 use crate::mask::Click;
 use crate::pipeline::clicks::{MaskPrompts, make_masks, propagated_clicks};
-use crate::report::bench::{Measure, Row, Seconds, Sweep};
+use crate::report::bench::{Measure, Row, Sweep};
 use crate::run::{Fingerprint, Plan};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -71,23 +71,17 @@ impl Bench<'_> {
                         Ok(())
                     })
                 });
-                m.result?;
-                measured = Some((found, m.rounds, m.memory));
+                let m = m.whole()?;
+                measured = Some((found, m.row("", word, truth.len(), Vec::new())));
                 Ok(Value::Null)
             })?;
-            let Some((found, mut rounds, memory_mib)) = measured else {
+            let Some((found, row)) = measured else {
                 return Err(Error::cannot("these masks were made before", "choose an empty --out"));
             };
-            let each = 1.0 / truth.len() as f64;
-            for round in &mut rounds {
-                let Seconds { wall, cpu } = round.work;
-                round.work = Seconds { wall: each * wall, cpu: each * cpu };
-            }
             let shares: Vec<f64> = found.iter().zip(&truth).map(|(a, b)| iou(a, b)).collect();
             let mean = shares.iter().sum::<f64>() / shares.len().max(1) as f64;
             let figures = vec![Some(mean), shares.iter().copied().reduce(f64::min)];
-            let (series, choice) = (String::new(), word.into());
-            sweep.rows.push(Row { series, choice, rounds, parts: false, memory_mib, figures });
+            sweep.rows.push(Row { figures, ..row });
         }
         Ok(Some(sweep))
     }

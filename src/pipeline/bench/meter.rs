@@ -1,7 +1,7 @@
 //! Times of work beside those of a fixed piece of arithmetic.
 
 use crate::io::{cpu_seconds, forget_peak_memory, peak_memory};
-use crate::report::bench::{Round, Seconds};
+use crate::report::bench::{Round, Row, Seconds};
 use rayon::prelude::*;
 use std::hint::black_box;
 use std::time::Instant;
@@ -62,6 +62,36 @@ pub(super) struct Measured<T> {
     pub memory: Option<f64>,
 }
 
+impl<T> Measured<T> {
+    /// The row of a choice that was measured as a whole, or of one of `pieces` equal pieces of it.
+    pub fn row(
+        &self,
+        series: &str,
+        choice: impl Into<String>,
+        pieces: usize,
+        figures: Vec<Option<f64>>,
+    ) -> Row {
+        let each = 1.0 / pieces.max(1) as f64;
+        let part = |s: Seconds| Seconds { wall: each * s.wall, cpu: each * s.cpu };
+        Row {
+            series: series.into(),
+            choice: choice.into(),
+            rounds: self.rounds.iter().map(|r| Round { work: part(r.work), ..*r }).collect(),
+            parts: false,
+            memory_mib: self.memory,
+            figures,
+        }
+    }
+}
+
+impl<T, E> Measured<Result<T, E>> {
+    /// What went well, or the error.
+    pub fn whole(self) -> Result<Measured<T>, E> {
+        let Measured { result, rounds, memory } = self;
+        Ok(Measured { result: result?, rounds, memory })
+    }
+}
+
 /// Returns what `work` returns, its time and its memory, once.
 pub(super) fn once<T>(work: impl FnOnce() -> T) -> Measured<T> {
     forget_peak_memory();
@@ -77,8 +107,7 @@ pub(super) fn in_turn<T, E>(
 ) -> Result<Vec<Measured<T>>, E> {
     let mut all: Vec<Measured<T>> = Vec::with_capacity(pieces);
     for i in 0..pieces {
-        let Measured { result, rounds, memory } = once(|| work(i));
-        all.push(Measured { result: result?, rounds, memory });
+        all.push(once(|| work(i)).whole()?);
     }
     for _ in 1..ROUNDS {
         for (i, measured) in all.iter_mut().enumerate() {

@@ -46,12 +46,10 @@ impl Bench<'_> {
         })?;
         let mut bounds = None;
         for (resolution, m) in RESOLUTIONS.into_iter().zip(sparse) {
-            let Extracted { mesh, report, .. } = m.result;
+            let Extracted { mesh, report, .. } = &m.result;
             bounds = Some(report.bounds());
-            let figures = self.off(&mesh, field, report.nodes_evaluated);
-            let (rounds, memory_mib) = (m.rounds, m.memory);
-            let (series, choice) = ("sparse (ours)".into(), resolution.to_string());
-            sweep.rows.push(Row { series, choice, rounds, parts: false, memory_mib, figures });
+            let figures = self.off(mesh, field, report.nodes_evaluated);
+            sweep.rows.push(m.row("sparse (ours)", resolution.to_string(), 1, figures));
         }
         let Some(bounds) = bounds else { return Ok(sweep) };
         for (series, with) in
@@ -67,11 +65,9 @@ impl Bench<'_> {
                 Ok::<_, crate::Error>((mesh, grid.nodes()))
             })?;
             for (resolution, m) in dense.into_iter().zip(all) {
-                let (mesh, nodes) = m.result;
-                let figures = self.off(&mesh, field, nodes);
-                let (rounds, memory_mib) = (m.rounds, m.memory);
-                let (series, choice) = (series.into(), resolution.to_string());
-                sweep.rows.push(Row { series, choice, rounds, parts: false, memory_mib, figures });
+                let (mesh, nodes) = &m.result;
+                let figures = self.off(mesh, field, *nodes);
+                sweep.rows.push(m.row(series, resolution.to_string(), 1, figures));
             }
         }
         Ok(sweep)
@@ -127,9 +123,7 @@ impl Bench<'_> {
             let off = values.iter().zip(&gradients).map(|(f, g)| f64::from(f.abs() / g.length().max(0.05)));
             let mean = off.sum::<f64>() / points.len().max(1) as f64 * self.mm();
             let figures = vec![Some(mean), self.judge.off_truth(&m.result, &self.scene)];
-            let (rounds, memory_mib) = (m.rounds, m.memory);
-            let (series, choice) = (String::new(), triangles.to_string());
-            sweep.rows.push(Row { series, choice, rounds, parts: false, memory_mib, figures });
+            sweep.rows.push(m.row("", triangles.to_string(), 1, figures));
         }
         Ok(sweep)
     }
@@ -168,15 +162,15 @@ impl Bench<'_> {
         }
         for (series, choice, c) in choices {
             self.check_stop()?;
-            let m = meter::once(|| finisher.finish(self, &c));
-            let head = m.result?;
+            let m = meter::once(|| finisher.finish(self, &c)).whole()?;
+            let row = m.row(series, choice, 1, Vec::new());
+            let head = m.result;
             let triangles = head.mesh.triangles.len() as f64;
             let meshes = Meshes::of_head(head, [true, false]);
             let renderer = Renderer::new(&self.scene, &fields, &meshes, 2, &Quiet);
             let views = self.judge.render(&self.scene, &renderer, Method::Textured)?;
             let figures = vec![self.judge.psnr(views)?, Some(triangles)];
-            let (rounds, memory_mib) = (m.rounds, m.memory);
-            sweep.rows.push(Row { series: series.into(), choice, rounds, parts: false, memory_mib, figures });
+            sweep.rows.push(Row { figures, ..row });
         }
         Ok(sweep)
     }

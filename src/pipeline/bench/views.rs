@@ -4,7 +4,7 @@ use super::surface::Finisher;
 use super::{Bench, meter, sweep};
 use crate::config::{Hair, MeshConfig, Method, Stage};
 use crate::pipeline::render::{Meshes, Renderer};
-use crate::report::bench::{Measure, Row, Seconds, Sweep};
+use crate::report::bench::{Measure, Row, Sweep};
 use crate::{Quiet, Result};
 
 impl Bench<'_> {
@@ -29,16 +29,9 @@ impl Bench<'_> {
             self.check_stop()?;
             self.judge.render(&self.scene, &renderer, methods[i])
         })?;
-        for (method, mut m) in methods.into_iter().zip(all) {
-            let each = 1.0 / self.judge.count() as f64;
-            for round in &mut m.rounds {
-                let Seconds { wall, cpu } = round.work;
-                round.work = Seconds { wall: each * wall, cpu: each * cpu };
-            }
-            let figures = vec![self.judge.psnr(m.result)?];
-            let (rounds, memory_mib) = (m.rounds, m.memory);
-            let (series, choice) = (String::new(), method.folder().into());
-            sweep.rows.push(Row { series, choice, rounds, parts: false, memory_mib, figures });
+        for (method, m) in methods.into_iter().zip(all) {
+            let row = m.row("", method.folder(), self.judge.count(), Vec::new());
+            sweep.rows.push(Row { figures: vec![self.judge.psnr(m.result)?], ..row });
         }
         Ok(sweep)
     }

@@ -57,9 +57,13 @@ fn draw(sweep: &Sweep, out: &mut String) -> std::result::Result<(), Box<dyn std:
         .margin(12)
         .x_label_area_size(44)
         .y_label_area_size(64)
-        .build_cartesian_2d((left..right).log_scale(), (y0 - margin)..(y1 + margin))?;
+        .build_cartesian_2d(
+            (left..right).log_scale().with_key_points(ticks(left, right)),
+            (y0 - margin)..(y1 + margin),
+        )?;
     let measure = &sweep.measures[0];
-    let better = if measure.more_is_better == Some(true) { "more is better" } else { "less is better" };
+    let more = measure.more_is_better == Some(true);
+    let better = if more { "more is better" } else { "less is better" };
     chart
         .configure_mesh()
         .light_line_style(WHITE)
@@ -94,7 +98,8 @@ fn draw(sweep: &Sweep, out: &mut String) -> std::result::Result<(), Box<dyn std:
     if series.len() > 1 {
         chart
             .configure_series_labels()
-            .position(SeriesLabelPosition::LowerRight)
+            // away from where time buys most
+            .position(if more { SeriesLabelPosition::LowerRight } else { SeriesLabelPosition::UpperRight })
             .label_font(("sans-serif", 13))
             .background_style(WHITE.mix(0.85))
             .border_style(RGBColor(226, 226, 226))
@@ -104,8 +109,34 @@ fn draw(sweep: &Sweep, out: &mut String) -> std::result::Result<(), Box<dyn std:
     Ok(())
 }
 
+/// Times to name between two of them: 1, 2 and 5 of each decade, or all digits where those are few.
+fn ticks(from: f64, to: f64) -> Vec<f64> {
+    let (first, last) = (from.log10().floor() as i32, to.log10().ceil() as i32);
+    let of = |digits: &[i32]| -> Vec<f64> {
+        let decade = |k: i32| digits.iter().map(move |d| f64::from(*d) * 10f64.powi(k));
+        (first..=last).flat_map(decade).filter(|t| (from..=to).contains(t)).collect()
+    };
+    let few = of(&[1, 2, 5]);
+    if few.len() > 2 { few } else { of(&[1, 2, 3, 4, 5, 6, 7, 8, 9]) }
+}
+
 /// Three digits that count.
 fn short(value: f64) -> String {
-    let digits = (2 - value.abs().max(1e-12).log10().floor() as i32).clamp(0, 6) as usize;
+    if value.abs() < 1e-9 {
+        return "0".into();
+    }
+    let digits = (2 - value.abs().log10().floor() as i32).clamp(0, 6) as usize;
     format!("{value:.digits$}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn axes_name_round_times_and_short_values() {
+        assert_eq!(ticks(0.015, 0.6), [0.02, 0.05, 0.1, 0.2, 0.5]);
+        assert_eq!(ticks(0.11, 0.28), [0.2], "nothing rounder lies there");
+        assert_eq!([0.0, 0.0412, 33.3, 1234.0].map(short), ["0", "0.0412", "33.3", "1234"]);
+    }
 }
