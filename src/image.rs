@@ -48,7 +48,7 @@ pub struct Gray {
 ///
 /// Renders are RGBA: sRGB-coded color over black (premultiplied), alpha = opacity. Depth has one
 /// channel, normals three.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Image {
     /// Pixels per row.
     pub width: u32,
@@ -82,6 +82,11 @@ impl Image {
         let i = (y as usize * self.width as usize + x as usize) * self.channels;
         &mut self.data[i..i + self.channels]
     }
+}
+
+/// A pixel with straight alpha as it is over black.
+pub fn over_black([r, g, b, a]: [u8; 4]) -> [u8; 3] {
+    [r, g, b].map(|v| ((u16::from(v) * u16::from(a) + 127) / 255) as u8)
 }
 
 /// Coded 0..=1 to 8 bit, rounded to nearest (the published code truncates).

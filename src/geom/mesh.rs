@@ -82,6 +82,14 @@ impl Mesh {
         sum / 6.0
     }
 
+    /// Returns the unit normal of a point of a triangle, interpolated between its vertices; `None` without normals, or where
+    /// they cancel.
+    pub fn normal_at(&self, hit: &Hit) -> Option<Vec3> {
+        let corners = self.triangles[hit.triangle as usize];
+        let [a, b, c] = corners.map(|v| self.normals.get(v as usize).copied().unwrap_or_default());
+        ((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c).try_normalize()
+    }
+
     /// Returns the color of a point of a triangle, interpolated between its vertices; black without colors.
     pub fn color_at(&self, hit: &Hit) -> [f32; 3] {
         let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];

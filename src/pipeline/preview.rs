@@ -6,19 +6,25 @@ use super::pictures::{behind, over, straight};
 use super::scene_file::read_capture;
 use crate::capture::{Split, View};
 use crate::config::ViewBackground;
-use crate::geom::{Atlas, Camera, Distortion};
-use crate::image::quantize;
+use crate::geom::{Atlas, Camera, Distortion, Similarity};
+use crate::image::{Image, quantize};
 use crate::io::{self, Limits};
 use crate::mesh::files::{HeadMesh, OpenedMesh, open_mesh};
 use crate::render::path::{NamedCamera, orbit};
-use crate::render::{LobePictures, Look, MeshTexture, RasterOptions, RasterView, Surface, raster};
+use crate::render::{
+    LobePictures, Look, MeshTexture, RasterLayers, RasterOptions, RasterView, Surface, raster_into,
+};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3, Vec3};
 use rayon::prelude::*;
+use std::ops::Range;
 use std::path::Path;
 
 /// The lens of a preview: the distance at which a picture shows as much as it is wide. A long one, as for portraits.
 const FOCAL: f64 = 2.5;
+
+/// Sizes of a mesh whose squares and cubes are no trouble to 32-bit floats.
+const SIZES: Range<f64> = 1e-9..1e9;
 
 /// A mesh that can be shown.
 pub struct Preview {
@@ -65,7 +71,8 @@ impl Preview {
     ///
     /// The file cannot be read, or has no surface.
     pub fn of_file(path: &Path, up: Vec3) -> Result<Preview> {
-        let OpenedMesh { head, bare_atlas, warnings } = open_mesh(path)?;
+        let OpenedMesh { mut head, bare_atlas, warnings } = open_mesh(path)?;
+        at_hand(&mut head, path)?;
         let front = if up.z.abs() > 0.5 { Vec3::NEG_Y } else { Vec3::Z };
         Ok(Preview { head, bare_atlas, up, front, cameras: Vec::new(), warnings })
     }
@@ -134,7 +141,8 @@ impl Preview {
 
     /// Prepares it for pictures.
     pub fn renderer(&self) -> PreviewRenderer<'_> {
-        let HeadMesh { mesh, world_from_scene, texture, .. } = &self.head;
+        let HeadMesh { mesh, world_from_scene, texture, shells, .. } = &self.head;
+        let layers = shells.as_ref().map(|shells| RasterLayers::new(mesh, shells));
         let texture = texture.as_ref().map(|texture| {
             let lobes = texture.lobes.as_ref().map(|l| LobePictures {
                 pictures: &l.pictures,
@@ -143,7 +151,7 @@ impl Preview {
             });
             MeshTexture::new(mesh, &texture.atlas, &texture.color, lobes.as_ref())
         });
-        PreviewRenderer { preview: self, texture }
+        PreviewRenderer { preview: self, texture, layers }
     }
 }
 
@@ -180,12 +188,13 @@ impl PreviewPicture {
 /// Makes pictures of a mesh.
 pub struct PreviewRenderer<'a> {
     preview: &'a Preview,
-    texture: Option<MeshTexture<'a>>,
+    texture: Option<MeshTexture>,
+    layers: Option<RasterLayers<'a>>,
 }
 
 impl PreviewRenderer<'_> {
-    /// What a camera in the mesh's coordinates sees.
-    pub fn view(&self, camera: &Camera, look: Look) -> RasterView {
+    /// What a camera in the mesh's coordinates sees, in the memory of an earlier view.
+    fn view(&self, seen: &mut RasterView, camera: &Camera, look: Look) {
         let Preview { head, bare_atlas, .. } = self.preview;
         let surface = Surface {
             mesh: &head.mesh,
@@ -195,10 +204,12 @@ impl PreviewRenderer<'_> {
         };
         let options = RasterOptions {
             normals: false,
+            bare_hits: look.is_bare(),
             world_from_scene: head.world_from_scene,
             ..RasterOptions::default()
         };
-        raster(&head.mesh, camera, &options, |hits| surface.shown(look, hits, camera))
+        let layers = self.layers.as_ref().filter(|_| look.has_layers());
+        raster_into(seen, &head.mesh, layers, camera, &options, |hits| surface.shown(look, hits, camera));
     }
 
     /// Many of them, made side by side.
@@ -209,20 +220,49 @@ impl PreviewRenderer<'_> {
         stop: impl Fn() -> bool + Sync,
     ) -> Vec<PreviewPicture> {
         // a picture uses one thread where there are many of them
-        let picture = |(camera, look): &(Camera, Look)| match stop() {
+        let picture = |seen: &mut RasterView, (camera, look): &(Camera, Look)| match stop() {
             true => PreviewPicture { width: 0, height: 0, rgba: Vec::new() },
-            false => self.picture(camera, *look, background),
+            false => self.picture(seen, camera, *look, background),
         };
-        shots.par_iter().map(picture).collect()
+        shots.par_iter().map_init(RasterView::default, picture).collect()
     }
 
-    /// The same as a picture, over a color or over nothing.
-    pub fn picture(&self, camera: &Camera, look: Look, background: ViewBackground) -> PreviewPicture {
-        let mut view = self.view(camera, look).view;
+    /// One of them, over a color or over nothing.
+    fn picture(
+        &self,
+        seen: &mut RasterView,
+        camera: &Camera,
+        look: Look,
+        background: ViewBackground,
+    ) -> PreviewPicture {
+        self.view(seen, camera, look);
         if let Some(color) = behind(background) {
-            over(&mut view, color);
+            over(&mut seen.view, color);
         }
-        let rgba = view.color.data.as_chunks::<4>().0.iter().map(|&p| straight(p).map(quantize)).collect();
-        PreviewPicture { width: view.color.width, height: view.color.height, rgba }
+        let Image { width, height, data, .. } = &seen.view.color;
+        let rgba = data.as_chunks::<4>().0.iter().map(|&p| straight(p).map(quantize)).collect();
+        PreviewPicture { width: *width, height: *height, rgba }
     }
+}
+
+/// Brings a mesh as large or as small as hardly a number can say to a size at hand.
+fn at_hand(head: &mut HeadMesh, path: &Path) -> Result<()> {
+    let corner = |pick: fn(f64, f64) -> f64| {
+        let all = head.mesh.positions.iter().map(|p| p.as_dvec3());
+        all.reduce(|a, b| DVec3::new(pick(a.x, b.x), pick(a.y, b.y), pick(a.z, b.z))).unwrap_or_default()
+    };
+    let (low, high) = (corner(f64::min), corner(f64::max));
+    let size = (high - low).max_element();
+    if size == 0.0 {
+        let what = format!("all points of `{}` lie at one place", path.display());
+        return Err(Error::cannot(what, "it has no surface to show"));
+    }
+    if !SIZES.contains(&size) {
+        let center = 0.5 * (low + high);
+        head.mesh.positions.iter_mut().for_each(|p| *p = ((p.as_dvec3() - center) / size).as_vec3());
+        let own = &head.world_from_scene;
+        let translation = own.point_f64(center);
+        head.world_from_scene = Similarity { scale: own.scale * size, translation, ..*own };
+    }
+    Ok(())
 }

@@ -22,7 +22,8 @@ use crate::io;
 use crate::mesh::files::{ExtractedSurface, HeadMesh};
 use crate::render::path::{NamedCamera, orbit};
 use crate::render::{
-    LobePictures, MeshTexture, RasterOptions, RayHits, RaycastOptions, RenderedView, Surface, raster, raycast,
+    LobePictures, MeshTexture, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView, Surface,
+    raster, raycast,
 };
 use crate::run::StageDir;
 use crate::{Error, Monitor, Result};
@@ -129,10 +130,11 @@ struct VisibleHead<'a> {
     head: &'a HeadMesh,
     bvh: Bvh,
     shells: Option<ShellCaster<'a>>,
+    layers: Option<RasterLayers<'a>>,
     /// What a viewer shows of its texture.
-    shown: Option<MeshTexture<'a>>,
+    shown: Option<MeshTexture>,
     /// Base color alone.
-    base: Option<MeshTexture<'a>>,
+    base: Option<MeshTexture>,
 }
 
 impl<'a> VisibleHead<'a> {
@@ -150,7 +152,8 @@ impl<'a> VisibleHead<'a> {
         let [shown, base] = [(shown[0], true), (shown[1], false)]
             .map(|(is_shown, lobes)| is_shown.then(|| texture(lobes)).flatten());
         let shells = head.shells.as_ref().map(|shells| ShellCaster::new(mesh, shells));
-        VisibleHead { head, bvh: Bvh::new(mesh), shells, shown, base }
+        let layers = head.shells.as_ref().map(|shells| RasterLayers::new(mesh, shells));
+        VisibleHead { head, bvh: Bvh::new(mesh), shells, layers, shown, base }
     }
 
     /// A view with its soft layers, in these colors.
@@ -243,12 +246,15 @@ impl<'a> Renderer<'a> {
                 let texture = visible.shown.as_ref()?;
                 Some(visible.view(camera, &options, |hits| texture.colors(hits, camera, samples)))
             }),
-            (Method::Raster, _) => self.head.as_ref().map(|VisibleHead { head, shown, .. }| {
-                let options =
-                    RasterOptions { world_from_scene: self.world_from_scene, ..RasterOptions::default() };
+            (Method::Raster, _) => self.head.as_ref().map(|VisibleHead { head, layers, shown, .. }| {
+                let options = RasterOptions {
+                    world_from_scene: self.world_from_scene,
+                    bare_hits: true,
+                    ..RasterOptions::default()
+                };
                 let (mesh, harmonics) = (&head.mesh, head.harmonics.as_ref());
                 let surface = Surface { mesh, texture: shown.as_ref(), atlas: None, harmonics };
-                raster(mesh, camera, &options, |hits| surface.colors(hits, camera)).view
+                raster(mesh, layers.as_ref(), camera, &options, |hits| surface.colors(hits, camera)).view
             }),
         })
     }

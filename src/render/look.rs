@@ -46,6 +46,16 @@ impl Look {
     /// All of them.
     pub const ALL: [Look; 6] = [Look::Studio, Look::Unlit, Look::Normals, Look::Matcap, Look::Uv, Look::Wire];
 
+    /// Are soft layers seen with it? They have a color and no shape of their own.
+    pub fn has_layers(self) -> bool {
+        matches!(self, Look::Studio | Look::Unlit)
+    }
+
+    /// Does it take no more than the color of a place, which is known without its point and normal?
+    pub fn is_bare(self) -> bool {
+        matches!(self, Look::Unlit | Look::Uv)
+    }
+
     /// The word of the command line.
     pub fn word(self) -> &'static str {
         ["studio", "unlit", "normals", "matcap", "uv", "wire"][self as usize]
@@ -58,7 +68,7 @@ pub struct Surface<'a> {
     /// The triangles, with their normals, and colors at their vertices.
     pub mesh: &'a Mesh,
     /// Its texture.
-    pub texture: Option<&'a MeshTexture<'a>>,
+    pub texture: Option<&'a MeshTexture>,
     /// Where it lies in a texture, whether or not there is one.
     pub atlas: Option<&'a Atlas>,
     /// What depends on the view, where there is no texture.

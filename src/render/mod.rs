@@ -7,6 +7,6 @@ mod raycast;
 mod texture;
 
 pub use look::{Look, Surface};
-pub use raster::{RasterOptions, RasterView, raster};
+pub use raster::{RasterLayers, RasterOptions, RasterView, raster, raster_into};
 pub use raycast::{RayHits, RaycastOptions, RenderedView, raycast};
 pub use texture::{LobePictures, MeshTexture};

@@ -5,22 +5,27 @@
 //!    edges stay shared, which a picture that is bent afterwards could not promise.
 //! 2. In each tile the nearest triangle is found at the center of every pixel and at four samples around it (`tile`).
 //! 3. What is seen is colored once a pixel, and again for each surface that ends within the pixel. The ray through the
-//!    pixel is met with its triangle as a ray caster would do it, so depth and attributes do not depend on the snapping.
+//!    pixel is met with its triangle as a ray caster would do it, so depth and attributes do not depend on the snapping
+//!    (`paint`).
+//!
+//! Translucent layers are drawn each into a tile of its own, where the mesh does not hide it, and blended sample by sample,
+//! the outermost first.
 //!
 //! Coverage is that of the four samples; what is not covered is transparent black. Every tile is made by one thread in the
 //! order of the triangles: same mesh, same picture.
 
+mod paint;
 mod project;
 mod tile;
 
 use super::raycast::{RayHits, RenderedView};
-use crate::geom::{Camera, Hit, Mesh, Similarity};
+use crate::geom::{Camera, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Image;
-use glam::{DVec3, Mat3, Vec3};
-use project::{Bins, Lens, Rays};
+use glam::Vec3;
+use paint::{Band, Batch, Painter, Part, Queue, Sheet, straight_rays};
+use project::{Bins, Faces, Lens};
 use rayon::prelude::*;
-use std::array::from_fn;
-use tile::{CENTER, GRID, NOTHING, SAMPLES, TILE, Tile, UNIT};
+use tile::{NOTHING, SAMPLES, TILE, Tile};
 
 /// Depth change over one pixel, in pixel footprints, from which on a surface ends: tan 84°, as for rays.
 const JUMP: f32 = 10.0;
@@ -32,18 +37,20 @@ pub struct RasterOptions {
     pub cull: bool,
     /// Is the picture of normals made? Else it has no pixels.
     pub normals: bool,
+    /// Are hits given to be colored without points and normals? Those who look them up in a texture need none.
+    pub bare_hits: bool,
     /// From the mesh's coordinates (in which the camera stands too) to those of depth and normals.
     pub world_from_scene: Similarity,
 }
 
 impl Default for RasterOptions {
     fn default() -> RasterOptions {
-        RasterOptions { cull: false, normals: true, world_from_scene: Similarity::IDENTITY }
+        RasterOptions { cull: false, normals: true, bare_hits: false, world_from_scene: Similarity::IDENTITY }
     }
 }
 
 /// What one camera sees, and which triangles.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct RasterView {
     /// Color, depth and normals, as of a ray caster.
     pub view: RenderedView,
@@ -56,7 +63,7 @@ impl RasterView {
     pub const NOTHING: u32 = NOTHING;
 }
 
-/// Rasterizes a mesh.
+/// Rasterizes a mesh, with translucent layers around it if there are any.
 ///
 /// `color` is given batches of what is seen and returns sRGB-coded colors in 0..=1, one a hit, `[n, 3]`; what it leaves
 /// out is black. It runs on several threads at once.
@@ -74,7 +81,7 @@ impl RasterView {
 ///     width: 20, height: 10, fx: 10.0, fy: 10.0, cx: 10.0, cy: 5.0,
 ///     distortion: Distortion::default(), rotation: DMat3::IDENTITY, position: DVec3::new(0.0, 0.0, 2.0),
 /// };
-/// let seen = raster(&mesh, &camera, &RasterOptions::default(), |hits| {
+/// let seen = raster(&mesh, None, &camera, &RasterOptions::default(), |hits| {
 ///     hits.normals.iter().map(|n| n.to_array().map(|v| v.abs())).collect()
 /// });
 /// // blue where the normal is +Z, two units away
@@ -84,66 +91,149 @@ impl RasterView {
 /// ```
 pub fn raster(
     mesh: &Mesh,
+    layers: Option<&RasterLayers>,
     camera: &Camera,
     options: &RasterOptions,
     color: impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync,
 ) -> RasterView {
+    let mut view = RasterView::default();
+    raster_into(&mut view, mesh, layers, camera, options, color);
+    view
+}
+
+/// Translucent layers around a mesh, ready to be rasterized.
+pub struct RasterLayers<'a> {
+    /// The innermost first.
+    layers: Vec<RasterLayer<'a>>,
+}
+
+struct RasterLayer<'a> {
+    layer: &'a ShellLayer,
+    positions: Vec<Vec3>,
+    /// Triangles that show, and which of the mesh's they are.
+    triangles: Vec<[u32; 3]>,
+    ids: Vec<u32>,
+}
+
+impl<'a> RasterLayers<'a> {
+    /// Returns the layers around a mesh with normals.
+    ///
+    /// # Panics
+    ///
+    /// A layer has not one offset and one alpha for each vertex.
+    pub fn new(mesh: &Mesh, shells: &'a Shells) -> RasterLayers<'a> {
+        let layer = |layer: &'a ShellLayer| {
+            let shown = mesh.triangles.iter().enumerate().filter(|(_, t)| layer.has(t));
+            let (ids, triangles) = shown.map(|(id, t)| (id as u32, *t)).unzip();
+            RasterLayer { layer, positions: layer.positions(mesh), triangles, ids }
+        };
+        RasterLayers { layers: shells.layers.iter().map(layer).collect() }
+    }
+}
+
+/// Rasterizes a mesh as [`raster`] does, into the memory of an earlier view.
+pub fn raster_into(
+    seen: &mut RasterView,
+    mesh: &Mesh,
+    layers: Option<&RasterLayers>,
+    camera: &Camera,
+    options: &RasterOptions,
+    color: impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync,
+) {
     let (width, height) = (camera.width, camera.height);
-    let mut view = RenderedView {
-        color: Image::new(width, height, 4),
-        depth: Image::new(width, height, 1),
-        normal: if options.normals { Image::new(width, height, 3) } else { Image::new(0, 0, 3) },
+    let RasterView { view, triangles } = seen;
+    let normals = if options.normals { [width, height] } else { [0, 0] };
+    // of pictures that are new every pixel is 0
+    let mut is_clear = true;
+    for (image, [width, height], channels) in [
+        (&mut view.color, [width, height], 4),
+        (&mut view.depth, [width, height], 1),
+        (&mut view.normal, normals, 3),
+    ] {
+        if (image.width, image.height, image.channels) == (width, height, channels) {
+            is_clear = false;
+        } else {
+            *image = Image::new(width, height, channels);
+        }
+    }
+    triangles.resize(width as usize * height as usize, NOTHING);
+    let clear = |out: &mut Band| {
+        if !is_clear {
+            out.rgba.fill([0.0; 4]);
+            out.depth.fill(0.0);
+            out.normal.fill([0.0; 3]);
+        }
+        out.triangles.fill(NOTHING);
     };
-    let mut triangles = vec![NOTHING; width as usize * height as usize];
-    let lens = if triangles.is_empty() { None } else { Lens::new(camera, mesh, options.cull) };
-    let Some(lens) = lens else { return RasterView { view, triangles } };
-    let bins = lens.bin(mesh);
     let w = width as usize;
     // no rows of a picture that is not made
-    let mut normal_rows: Vec<&mut [f32]> = view.normal.data.chunks_mut(TILE * w * 3).collect();
+    let mut normal_rows: Vec<&mut [f32]> = view.normal.data.chunks_mut((TILE * w * 3).max(1)).collect();
     normal_rows.resize_with((height as usize).div_ceil(TILE), Default::default);
     let rows = view
         .color
         .data
-        .par_chunks_mut(TILE * w * 4)
-        .zip(view.depth.data.par_chunks_mut(TILE * w))
+        .par_chunks_mut((TILE * w * 4).max(1))
+        .zip(view.depth.data.par_chunks_mut((TILE * w).max(1)))
         .zip(normal_rows)
-        .zip(triangles.par_chunks_mut(TILE * w));
-    let painter = Painter {
-        mesh,
-        camera,
-        origin: camera.position.as_vec3().as_dvec3(),
-        forward: camera.forward(),
-        scale: options.world_from_scene.scale as f32,
-        world_from_mesh: options.world_from_scene.rotation_f32(),
-        rays: Rays::new(camera),
-        jump: JUMP / camera.fx.abs() as f32,
-        smooth: mesh.normals.len() == mesh.positions.len(),
-    };
-    let start = || (Tile::new(), Queue::default());
-    rows.enumerate().for_each_init(start, |(tile, queue), (row, (((rgba, depth), normal), triangles))| {
-        let out = &mut Band {
+        .zip(triangles.par_chunks_mut((TILE * w).max(1)))
+        .enumerate()
+        .map(|(row, (((rgba, depth), normal), triangles))| Band {
             top: row * TILE,
             rgba: rgba.as_chunks_mut().0,
             depth,
             normal: normal.as_chunks_mut().0,
             triangles,
-        };
+        });
+    let lens = if w == 0 || height == 0 { None } else { Lens::new(camera, mesh) };
+    let Some(lens) = lens else { return rows.for_each(|mut out| clear(&mut out)) };
+    let core =
+        Faces { positions: &mesh.positions, triangles: &mesh.triangles, ids: None, cull: options.cull };
+    let mut sheets = vec![(lens.bin(&core), Sheet { positions: &mesh.positions, layer: None })];
+    for layer in layers.iter().flat_map(|l| &l.layers) {
+        let RasterLayer { layer, positions, triangles, ids } = layer;
+        let faces = Faces { positions, triangles, ids: Some(ids), cull: true };
+        sheets.push((lens.bin(&faces), Sheet { positions, layer: Some(layer) }));
+    }
+    let painter = Painter {
+        mesh,
+        camera,
+        origin: camera.position.as_vec3(),
+        forward: camera.forward(),
+        scale: options.world_from_scene.scale as f32,
+        world_from_mesh: options.world_from_scene.rotation_f32(),
+        straight: straight_rays(camera),
+        jump: JUMP / camera.fx.abs() as f32,
+        bare: options.bare_hits,
+        color,
+    };
+    let start = || (Tile::new(), Vec::new(), Batch::new(), Queue::default());
+    rows.for_each_init(start, |(tile, over, batch, queue), mut out| {
+        let out = &mut out;
+        clear(out);
         let (across, height) = (w.div_ceil(TILE), out.depth.len() / w);
         for column in 0..across {
-            let left = column * TILE;
-            let index = row * across + column;
-            if bins.iter().all(|b| b.of(index).len() == 0) {
+            let index = out.top / TILE * across + column;
+            let has = |bins: &[Bins]| bins.iter().any(|b| b.of(index).len() > 0);
+            if !sheets.iter().any(|(bins, _)| has(bins)) {
                 continue;
             }
-            let size = [TILE.min(w - left), height];
-            tile.move_to(left, out.top, size[0], size[1]);
-            draw(tile, &bins, index);
-            painter.paint(tile, left, size, out, queue);
-            queue.shade(out.rgba, &color);
+            let part = Part { left: column * TILE, width: TILE.min(w - column * TILE), height };
+            tile.move_to(part.left, out.top, part.width, part.height);
+            let (core, own) = &sheets[0];
+            draw(tile, core, index);
+            let mut light = Vec::new();
+            for (bins, sheet) in sheets[1..].iter().rev().filter(|(bins, _)| has(bins)) {
+                if over.is_empty() {
+                    over.push(Tile::new());
+                }
+                light.resize(TILE * TILE, [1.0; SAMPLES]);
+                over[0].behind(tile);
+                draw(&mut over[0], bins, index);
+                painter.paint(&over[0], sheet, &mut light, part, out, batch, queue);
+            }
+            painter.paint(tile, own, &mut light, part, out, batch, queue);
         }
     });
-    RasterView { view, triangles }
 }
 
 crate::dispatch! {
@@ -153,157 +243,17 @@ crate::dispatch! {
 
 #[inline(always)]
 fn draw_faces<const F: bool>(tile: &mut Tile, bins: &[Bins], index: usize) {
-    for back in [false, true] {
-        for face in bins.iter().flat_map(|b| b.of(index)).filter(|face| face.back == back) {
+    let mut has_backs = false;
+    for face in bins.iter().flat_map(|b| b.of(index)) {
+        if face.back {
+            has_backs = true;
+        } else {
             tile.draw(face);
         }
+    }
+    if has_backs {
         tile.look_up_farthest();
-    }
-}
-
-/// Some rows of the pictures that are made.
-struct Band<'a> {
-    top: usize,
-    rgba: &'a mut [[f32; 4]],
-    depth: &'a mut [f32],
-    normal: &'a mut [[f32; 3]],
-    triangles: &'a mut [u32],
-}
-
-/// Turns what a tile knows into pixels.
-struct Painter<'a> {
-    mesh: &'a Mesh,
-    camera: &'a Camera,
-    origin: DVec3,
-    forward: Vec3,
-    /// From the mesh's units to those of depth.
-    scale: f32,
-    world_from_mesh: Mat3,
-    rays: Rays<'a>,
-    /// Change of depth over one pixel, as a share of it, from which on a surface ends.
-    jump: f32,
-    smooth: bool,
-}
-
-impl Painter<'_> {
-    /// Writes what is known of a tile's pixels, and queues what is to be colored.
-    fn paint(
-        &self,
-        tile: &Tile,
-        left: usize,
-        [width, height]: [usize; 2],
-        out: &mut Band,
-        queue: &mut Queue,
-    ) {
-        let w = self.camera.width as usize;
-        for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
-            let (i, pixel) = (y * TILE + x, y * w + left + x);
-            let seen: [u32; SAMPLES + 1] = from_fn(|s| tile.triangle[s][i]);
-            if seen == [NOTHING; SAMPLES + 1] {
-                continue;
-            }
-            // samples of the same surface are colored together, first those of the one at the center
-            let mut left_over: [bool; SAMPLES] = from_fn(|s| seen[s] != NOTHING);
-            for s in [CENTER, 0, 1, 2, 3] {
-                if seen[s] == NOTHING || (s != CENTER && !left_over[s]) {
-                    continue;
-                }
-                let own = tile.inverse_depth[s][i];
-                let mut count = 0;
-                for (k, left) in left_over.iter_mut().enumerate().filter(|(_, left)| **left) {
-                    let other = tile.inverse_depth[k][i];
-                    if (other - own).abs() <= self.jump * own.min(other) {
-                        (*left, count) = (false, count + 1);
-                    }
-                }
-                let [px, py] = [GRID[s].0, GRID[s].1].map(|v| v as f32 / UNIT as f32);
-                let Some(direction) = self.rays.through((left + x) as f32 + px, (out.top + y) as f32 + py)
-                else {
-                    continue;
-                };
-                let met = self.meet(seen[s], direction);
-                if s == CENTER {
-                    out.depth[pixel] = met.hit.t * direction.dot(self.forward) * self.scale;
-                    if let Some(normal) = out.normal.get_mut(pixel) {
-                        *normal = (self.world_from_mesh * met.normal).to_array();
-                    }
-                    out.triangles[pixel] = seen[s];
-                }
-                if count > 0 {
-                    queue.push(met, pixel, count as f32 / SAMPLES as f32);
-                }
-            }
-        }
-    }
-
-    /// Where the ray through a place of the picture meets a triangle, or passes it most closely: samples lie in snapped
-    /// triangles.
-    #[inline(always)]
-    fn meet(&self, triangle: u32, direction: Vec3) -> Met {
-        let corners = self.mesh.triangles[triangle as usize].map(|v| v as usize);
-        let [a, b, c] = corners.map(|v| self.mesh.positions[v].as_dvec3());
-        // Möller and Trumbore, without its bounds; in f64 for what is seen edge-on
-        let (ab, ac, from, along) = (b - a, c - a, self.origin - a, direction.as_dvec3());
-        let p = along.cross(ac);
-        let over = 1.0 / ab.dot(p);
-        let (mut u, mut v) = (from.dot(p) * over, along.dot(from.cross(ab)) * over);
-        if !(u >= 0.0 && v >= 0.0 && u + v <= 1.0) {
-            // an edge-on triangle has no place of its own
-            (u, v) = if (u + v).is_finite() { (u.max(0.0), v.max(0.0)) } else { (1.0 / 3.0, 1.0 / 3.0) };
-            let shrink = 1.0 / (u + v).max(1.0);
-            (u, v) = (u * shrink, v * shrink);
-        }
-        let point = a + u * ab + v * ac;
-        let t = (point - self.origin).dot(along) as f32;
-        let (u, v) = (u as f32, v as f32);
-        let flat = || ab.cross(ac).normalize_or_zero().as_vec3();
-        let normal = if self.smooth {
-            let [a, b, c] = corners.map(|v| self.mesh.normals[v]);
-            (a + u * (b - a) + v * (c - a)).try_normalize().unwrap_or_else(flat)
-        } else {
-            flat()
-        };
-        Met { point: point.as_vec3(), normal, direction, hit: Hit { t, triangle, u, v } }
-    }
-}
-
-/// What a ray met.
-struct Met {
-    point: Vec3,
-    normal: Vec3,
-    direction: Vec3,
-    hit: Hit,
-}
-
-/// What waits for its color, with its pixel and its share of it.
-#[derive(Default)]
-struct Queue {
-    hits: RayHits,
-    shares: Vec<(usize, f32)>,
-}
-
-impl Queue {
-    #[inline(always)]
-    fn push(&mut self, met: Met, pixel: usize, share: f32) {
-        self.hits.points.push(met.point);
-        self.hits.normals.push(met.normal);
-        self.hits.directions.push(met.direction);
-        self.hits.hits.push(met.hit);
-        self.shares.push((pixel, share));
-    }
-
-    /// Colors everything queued.
-    fn shade(&mut self, rgba: &mut [[f32; 4]], color: &(impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync)) {
-        let colors = color(&self.hits);
-        for (k, (pixel, share)) in self.shares.drain(..).enumerate() {
-            let c = colors.get(k).unwrap_or(&[0.0; 3]);
-            let p = &mut rgba[pixel];
-            *p = [p[0] + share * c[0], p[1] + share * c[1], p[2] + share * c[2], p[3] + share];
-        }
-        self.hits.points.clear();
-        self.hits.normals.clear();
-        self.hits.directions.clear();
-        self.hits.hits.clear();
+        bins.iter().flat_map(|b| b.of(index)).filter(|face| face.back).for_each(|face| tile.draw(face));
     }
 }
 

@@ -31,7 +31,7 @@ impl Default for RaycastOptions {
 }
 
 /// What one camera sees.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderedView {
     /// RGBA: sRGB-coded color premultiplied over black, and coverage.
     pub color: Image,
@@ -200,13 +200,8 @@ impl Raycaster<'_> {
 
     /// The shading normal of a hit.
     fn normal(&self, hit: &Hit) -> Vec3 {
-        let t = self.mesh.triangles[hit.triangle as usize];
-        if self.mesh.normals.len() == self.mesh.positions.len() {
-            let [a, b, c] = t.map(|i| self.mesh.normals[i as usize]);
-            let n = ((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c).try_normalize();
-            if let Some(n) = n {
-                return n;
-            }
+        if let Some(n) = self.mesh.normal_at(hit) {
+            return n;
         }
         let [a, b, c] = self.mesh.corners(hit.triangle);
         (b - a).cross(c - a).normalize_or_zero()

@@ -3,12 +3,17 @@
 //! A level has half the texels of the one before, rounded down, each the mean of the part of the picture that it
 //! covers: of three texels by their share where the number is odd (Guthe and Heckbert, *Non-power-of-two
 //! mipmapping*, 2005), so that no level is shifted against another.
+//!
+//! Texels are whole numbers of 16 bits, half as large as floats and finer than any picture of 8: what they stand for is
+//! computed once a place, after the filter.
 
 use super::raycast::RayHits;
-use crate::geom::{Atlas, Camera, Mesh};
+use crate::geom::{Atlas, Camera, Hit, Mesh};
 use crate::image::{Photo, linear_from_srgb, srgb_from_linear};
 use crate::kernel::sphharm;
-use glam::{Mat3, Vec2};
+use glam::{Mat3, Vec2, Vec3, Vec4};
+use rayon::prelude::*;
+use std::array::from_fn;
 use std::sync::OnceLock;
 
 /// View-dependent color beside a base color: one picture per spherical-harmonic function, in the order of
@@ -23,24 +28,61 @@ pub struct LobePictures<'a> {
 }
 
 /// A texture ready to be looked up.
-pub struct MeshTexture<'a> {
-    atlas: &'a Atlas,
-    /// Linear color and then the lobes, level by level; interleaved channels.
+pub struct MeshTexture {
+    /// `[levels, height, width, groups]`: linear color and then the lobes.
+    texels: Vec<Texel>,
     levels: Vec<MipLevel>,
-    channels: usize,
+    /// Groups of four channels a texel.
+    groups: usize,
+    /// What a step of each channel stands for, and what 0 does; of the lobes.
+    scale: Vec<Vec4>,
+    offset: Vec<Vec4>,
     /// Do coordinates leave the picture? It is then repeated.
     repeats: bool,
     turned: Mat3,
-    /// Texels per unit of length, per triangle.
-    density: Vec<f32>,
+    triangles: Vec<TexturedTriangle>,
 }
+
+/// Where a triangle lies in the texture.
+#[derive(Clone, Copy)]
+struct TexturedTriangle {
+    /// Its first corner, and from there to the others.
+    first: Vec2,
+    right: Vec2,
+    down: Vec2,
+    /// Texels per unit of length.
+    density: f32,
+}
+
+/// Four channels of a texel.
+type Texel = [u16; 4];
+
+/// Steps of a base color's channel from 0 to 1.
+const STEPS: f32 = 65535.0;
+
+/// Steps of a lobe's channel between two bytes.
+const LOBE_STEPS: u16 = 257;
+
+/// A picture of a texture.
+#[derive(Clone, Copy)]
+struct MipLevel {
+    /// The place of its first texel among those of all levels.
+    first: u32,
+    width: f32,
+    height: f32,
+}
+
+/// Hits that are looked up together.
+const LANES: usize = 8;
 
 /// The level for so many texels a pixel, and how far it is on the way to the next: the base-2 logarithm, its fraction by
 /// the chord's parabola (off by 0.009).
+#[inline(always)]
 fn mip_level(texels: f32, levels: usize) -> (usize, f32) {
     let bits = texels.max(1.0).to_bits();
-    let (level, m) = ((bits >> 23) as usize - 127, f32::from_bits(bits & 0x7f_ffff | 0x3f80_0000) - 1.0);
-    if level + 1 < levels { (level, m + 0.34 * m * (1.0 - m)) } else { (levels - 1, 0.0) }
+    let (level, m) = ((bits >> 23) - 127, f32::from_bits(bits & 0x7f_ffff | 0x3f80_0000) - 1.0);
+    let last = levels as u32 - 1;
+    (level.min(last) as usize, if level < last { m + 0.34 * m * (1.0 - m) } else { 0.0 })
 }
 
 /// Steps of [`srgb_table`]: straight lines between them are off by 2e-5 at most.
@@ -50,8 +92,8 @@ const SRGB_STEPS: usize = 4096;
 #[inline(always)]
 fn coded(table: &[f32; SRGB_STEPS + 1], linear: f32) -> f32 {
     let at = linear.clamp(0.0, 1.0) * (SRGB_STEPS as f32 - 1.0);
-    let k = at as usize;
-    table[k] + (at - k as f32) * (table[k + 1] - table[k])
+    let k = at as i32 as usize & (SRGB_STEPS - 1);
+    table[k] + (at - k as i32 as f32) * (table[k + 1] - table[k])
 }
 
 /// sRGB-coded from linear, and the last value once more.
@@ -59,154 +101,242 @@ fn srgb_table() -> &'static [f32; SRGB_STEPS + 1] {
     static TABLE: OnceLock<Box<[f32; SRGB_STEPS + 1]>> = OnceLock::new();
     TABLE.get_or_init(|| {
         let value = |i: usize| srgb_from_linear(i.min(SRGB_STEPS - 1) as f32 / (SRGB_STEPS - 1) as f32);
-        Box::new(std::array::from_fn(value))
+        Box::new(from_fn(value))
     })
 }
 
-struct MipLevel {
-    width: usize,
-    height: usize,
-    data: Vec<f32>,
-}
-
-impl<'a> MeshTexture<'a> {
+impl MeshTexture {
     /// Prepares the pictures of a mesh; `color` and the lobes have one size of the atlas's shape.
-    pub fn new(
-        mesh: &Mesh,
-        atlas: &'a Atlas,
-        color: &Photo,
-        lobes: Option<&LobePictures>,
-    ) -> MeshTexture<'a> {
-        let table: [f32; 256] = std::array::from_fn(|i| linear_from_srgb(i as f32 / 255.0));
+    pub fn new(mesh: &Mesh, atlas: &Atlas, color: &Photo, lobes: Option<&LobePictures>) -> MeshTexture {
+        let table: [u16; 256] = from_fn(|i| (linear_from_srgb(i as f32 / 255.0) * STEPS).round() as u16);
         let pictures = lobes.map_or(&[][..], |l| l.pictures);
         // filled up, so that a texel is whole vectors
-        let channels = (3 + 3 * pictures.len()).next_multiple_of(4);
-        let mut data = Vec::with_capacity(color.rgb.len() * channels);
-        for (i, c) in color.rgb.iter().enumerate() {
-            data.extend(c.map(|b| table[b as usize]));
+        let groups = (3 + 3 * pictures.len()).div_ceil(4);
+        let (mut width, mut height) = (color.width as usize, color.height as usize);
+        let mut texels = Vec::with_capacity((width * height / 3 * 4 + 2 * (width + height)) * groups);
+        texels.resize(width * height * groups, [0; 4]);
+        texels.par_chunks_exact_mut(groups).zip(&color.rgb).enumerate().for_each(|(i, (texel, c))| {
+            let texel = texel.as_flattened_mut();
+            (0..3).for_each(|k| texel[k] = table[c[k] as usize]);
             for (k, picture) in pictures.iter().enumerate() {
-                let scale = lobes.map_or(0.0, |l| l.scale[k]) / 127.0;
-                data.extend(picture.rgb[i].map(|b| (f32::from(b) - 128.0) * scale));
+                let own = &mut texel[3 + 3 * k..][..3];
+                (0..3).for_each(|c| own[c] = u16::from(picture.rgb[i][c]) * LOBE_STEPS);
             }
-            data.resize((i + 1) * channels, 0.0);
+        });
+        let (mut scale, mut offset) = (vec![Vec4::splat(1.0 / STEPS); groups], vec![Vec4::ZERO; groups]);
+        for channel in 3..3 + 3 * pictures.len() {
+            let step = lobes.map_or(0.0, |l| l.scale[channel / 3 - 1]) / 127.0;
+            scale[channel / 4][channel % 4] = step / f32::from(LOBE_STEPS);
+            offset[channel / 4][channel % 4] = -128.0 * step;
         }
-        let mut levels = vec![MipLevel { width: color.width as usize, height: color.height as usize, data }];
-        while levels[levels.len() - 1].width.min(levels[levels.len() - 1].height) > 1 {
-            levels.push(levels[levels.len() - 1].halved(channels));
+        let level = |first: usize, width: usize, height: usize| MipLevel {
+            first: (first / groups) as u32,
+            width: width as f32,
+            height: height as f32,
+        };
+        let (mut levels, mut first) = (vec![level(0, width, height)], 0);
+        while width.min(height) > 1 {
+            let half = halved(&texels[first..], [width, height], groups);
+            first = texels.len();
+            texels.extend(half);
+            (width, height) = (width / 2, height / 2);
+            levels.push(level(first, width, height));
         }
-        let density = (0..mesh.triangles.len() as u32)
-            .map(|t| {
-                let [a, b, c] = mesh.corners(t);
-                let [p, q, r] = atlas.corners(t);
-                let (space, texels) = ((b - a).cross(c - a).length(), (q - p).perp_dot(r - p).abs());
-                if space > 0.0 { (texels / space).sqrt() } else { 0.0 }
-            })
-            .collect();
+        let size = Vec2::new(color.width as f32, color.height as f32);
+        let triangle = |t: u32| {
+            let [a, b, c] = mesh.corners(t);
+            let [first, p, q] = atlas.triangles[t as usize].map(|i| atlas.uvs[i as usize]);
+            let (right, down) = (p - first, q - first);
+            let texels = (right * size).perp_dot(down * size).abs();
+            let space = (b - a).cross(c - a).length();
+            let density = if space > 0.0 { (texels / space).sqrt() } else { 0.0 };
+            TexturedTriangle { first, right, down, density }
+        };
         let inside = |uv: &Vec2| uv.cmpge(Vec2::ZERO).all() && uv.cmple(Vec2::ONE).all();
-        let repeats = !atlas.uvs.iter().all(inside);
         MeshTexture {
-            atlas,
+            texels,
             levels,
-            channels,
-            repeats,
+            groups,
+            scale,
+            offset,
+            repeats: !atlas.uvs.iter().all(inside),
             turned: lobes.map_or(Mat3::IDENTITY, |l| l.turned),
-            density,
+            triangles: (0..mesh.triangles.len() as u32).map(triangle).collect(),
         }
+    }
+
+    /// Are there lobes, so that directions matter?
+    pub fn has_lobes(&self) -> bool {
+        self.groups > 1
     }
 
     /// Returns the sRGB-coded colors of what is seen through the pixels of a camera, between two levels (trilinear).
     pub fn smooth_colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
-        let (forward, per_pixel) = (camera.forward(), 1.0 / camera.fx.abs() as f32);
-        let table = srgb_table(); // asked for once
-        let mut values = vec![0f32; 2 * self.channels];
-        let mut one = |i: usize| {
-            let hit = &hits.hits[i];
-            let corners = self.atlas.triangles[hit.triangle as usize].map(|c| self.atlas.uvs[c as usize]);
-            let mut uv = (1.0 - hit.u - hit.v) * corners[0] + hit.u * corners[1] + hit.v * corners[2];
-            if self.repeats {
-                uv -= uv.floor();
-            }
-            let footprint = hit.t * hits.directions[i].dot(forward) * per_pixel;
-            let texels = footprint * self.density[hit.triangle as usize];
-            let (fine, share) = mip_level(texels, self.levels.len());
-            let coarse = (fine + 1).min(self.levels.len() - 1);
-            if self.channels == 4 {
-                // as many channels as the compiler knows of
-                let (mut a, mut b) = ([0f32; 4], [0f32; 4]);
-                self.levels[fine].look_up(uv, &mut a);
-                self.levels[coarse].look_up(uv, &mut b);
-                return std::array::from_fn(|k| coded(table, a[k] + share * (b[k] - a[k])));
-            }
-            let (a, b) = values.split_at_mut(self.channels);
-            self.levels[fine].look_up(uv, a);
-            self.levels[coarse].look_up(uv, b);
-            a.iter_mut().zip(b).for_each(|(a, b)| *a += share * (*b - *a));
-            let more = sphharm::combine(a[3..].as_chunks().0, (self.turned * -hits.directions[i]).to_array());
-            std::array::from_fn(|k| (coded(table, a[k]) + more[k]).clamp(0.0, 1.0))
-        };
-        (0..hits.hits.len()).map(&mut one).collect()
+        let mut colors = Vec::with_capacity(hits.hits.len());
+        smooth(self, hits, camera, &mut colors);
+        colors
     }
 
     /// Returns the sRGB-coded colors of what rays of a camera met, `samples` of them along each side of a pixel.
     pub fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
         let forward = camera.forward();
-        let mut values = vec![0f32; self.channels];
-        let one = |(i, hit): (usize, &crate::geom::Hit)| {
-            let corners = self.atlas.triangles[hit.triangle as usize].map(|c| self.atlas.uvs[c as usize]);
-            let uv = (1.0 - hit.u - hit.v) * corners[0] + hit.u * corners[1] + hit.v * corners[2];
+        let mut values = vec![Vec4::ZERO; self.groups];
+        let one = |(i, hit): (usize, &Hit)| {
+            let (uv, density) = self.place(hit);
             // a ray's share of a pixel on a plane across the view; slanted surfaces stay sharp rather than blur
             let footprint =
                 hit.t * hits.directions[i].dot(forward) / (camera.fx.abs() as f32 * samples as f32);
-            let texels = footprint * self.density[hit.triangle as usize];
-            let level = texels.max(1.0).log2().round().clamp(0.0, (self.levels.len() - 1) as f32);
-            self.levels[level as usize].look_up(uv, &mut values);
-            let base: [f32; 3] = std::array::from_fn(|k| srgb_from_linear(values[k]));
-            if self.channels == 4 {
-                return base;
-            }
-            let d = self.turned * -hits.directions[i];
-            let lobes = values[3..].as_chunks::<3>().0;
-            let more = sphharm::combine(lobes, d.to_array());
-            std::array::from_fn(|k| (base[k] + more[k]).clamp(0.0, 1.0))
+            let level =
+                (footprint * density).max(1.0).log2().round().clamp(0.0, (self.levels.len() - 1) as f32);
+            self.look_up(&self.levels[level as usize], uv, &mut values);
+            let base: [f32; 3] = from_fn(|k| srgb_from_linear(values[0][k] / STEPS));
+            self.with_lobes(base, &mut values, hits.directions[i])
         };
         hits.hits.iter().enumerate().map(one).collect()
     }
+
+    /// Where a hit lies in the picture, and how many texels a unit of length is there.
+    #[inline(always)]
+    fn place(&self, hit: &Hit) -> (Vec2, f32) {
+        let TexturedTriangle { first, right, down, density } = self.triangles[hit.triangle as usize];
+        let uv = first + hit.u * right + hit.v * down;
+        (if self.repeats { uv - uv.floor() } else { uv }, density)
+    }
+
+    /// Bilinear, in steps.
+    fn look_up(&self, level: &MipLevel, uv: Vec2, out: &mut [Vec4]) {
+        let (texels, f) = around(level, uv.x, uv.y);
+        for (g, out) in out.iter_mut().enumerate() {
+            *out = bilinear(texels.map(|t| floats(self.texels[t as usize * self.groups + g])), f);
+        }
+    }
+
+    /// A base color with what its looked-up lobes add along a direction.
+    #[inline(always)]
+    fn with_lobes(&self, base: [f32; 3], values: &mut [Vec4], direction: Vec3) -> [f32; 3] {
+        if self.groups == 1 {
+            return base;
+        }
+        for (v, (scale, offset)) in values.iter_mut().zip(self.scale.iter().zip(&self.offset)) {
+            *v = *v * *scale + *offset;
+        }
+        let lobes = bytemuck::cast_slice::<Vec4, f32>(values)[3..].as_chunks::<3>().0;
+        let more = sphharm::combine(lobes, (self.turned * -direction).to_array());
+        from_fn(|k| (base[k] + more[k]).clamp(0.0, 1.0))
+    }
 }
 
-impl MipLevel {
-    /// Half the texels each way.
-    fn halved(&self, channels: usize) -> MipLevel {
-        let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
-        let (across, down) = (shares(self.width, width), shares(self.height, height));
-        let mut data = vec![0f32; width * height * channels];
-        for (texel, out) in data.chunks_exact_mut(channels).enumerate() {
-            for &(y, wy) in &down[texel / width] {
-                for &(x, wx) in across[texel % width].iter().filter(|(_, wx)| wx * wy > 0.0) {
-                    let own = &self.data[(y * self.width + x) * channels..][..channels];
-                    out.iter_mut().zip(own).for_each(|(sum, v)| *sum += wx * wy * v);
+crate::dispatch! {
+    /// Colors between two levels.
+    fn smooth / smooth_all(texture: &MeshTexture, hits: &RayHits, camera: &Camera, colors: &mut Vec<[f32; 3]>)
+}
+
+#[inline(always)]
+fn smooth_all<const F: bool>(
+    texture: &MeshTexture,
+    hits: &RayHits,
+    camera: &Camera,
+    colors: &mut Vec<[f32; 3]>,
+) {
+    let (forward, per_pixel) = (camera.forward(), 1.0 / camera.fx.abs() as f32);
+    let table = srgb_table(); // asked for once
+    let last = texture.levels.len() - 1;
+    let mut values = vec![Vec4::ZERO; texture.groups];
+    for (hits, directions) in hits.hits.chunks(LANES).zip(hits.directions.chunks(LANES)) {
+        let (mut u, mut v, mut texels) = ([0f32; LANES], [0f32; LANES], [1f32; LANES]);
+        for (l, (hit, direction)) in hits.iter().zip(directions).enumerate() {
+            let (uv, density) = texture.place(hit);
+            (u[l], v[l]) = (uv.x, uv.y);
+            texels[l] = hit.t * direction.dot(forward) * per_pixel * density;
+        }
+        let (mut level, mut share) = ([0; LANES], [0f32; LANES]);
+        for l in 0..LANES {
+            (level[l], share[l]) = mip_level(texels[l], last + 1);
+        }
+        let (fine, coarse) =
+            (level.map(|l| texture.levels[l]), level.map(|l| texture.levels[(l + 1).min(last)]));
+        let (mut at, mut way) = ([[[0u32; 4]; LANES]; 2], [[Vec2::ZERO; LANES]; 2]);
+        for l in 0..LANES {
+            (at[0][l], way[0][l]) = around(&fine[l], u[l], v[l]);
+            (at[1][l], way[1][l]) = around(&coarse[l], u[l], v[l]);
+        }
+        let mut base = [[0f32; LANES]; 3];
+        if texture.groups == 1 {
+            for l in 0..LANES {
+                let texel = |level: usize, k: usize| floats(texture.texels[at[level][l][k] as usize]);
+                let a = bilinear(from_fn(|k| texel(0, k)), way[0][l]);
+                let b = bilinear(from_fn(|k| texel(1, k)), way[1][l]);
+                let linear = (a + share[l] * (b - a)) * (1.0 / STEPS);
+                (base[0][l], base[1][l], base[2][l]) = (linear.x, linear.y, linear.z);
+            }
+            for values in &mut base {
+                for l in 0..LANES {
+                    values[l] = coded(table, values[l]);
                 }
             }
+            colors.extend((0..hits.len()).map(|l| base.map(|values| values[l])));
+            continue;
         }
-        MipLevel { width, height, data }
+        for (l, direction) in directions.iter().enumerate() {
+            for (g, value) in values.iter_mut().enumerate() {
+                let texel = |level: usize, k: usize| {
+                    floats(texture.texels[at[level][l][k] as usize * texture.groups + g])
+                };
+                let a = bilinear(from_fn(|k| texel(0, k)), way[0][l]);
+                let b = bilinear(from_fn(|k| texel(1, k)), way[1][l]);
+                *value = a + share[l] * (b - a);
+            }
+            let base = from_fn(|k| coded(table, values[0][k] / STEPS));
+            colors.push(texture.with_lobes(base, &mut values, *direction));
+        }
     }
+}
 
-    /// Bilinear, clamped at the borders.
-    #[inline(always)]
-    fn look_up(&self, uv: Vec2, out: &mut [f32]) {
-        let at = |u: f32, n: usize| {
-            let p = (u * n as f32 - 0.5).clamp(0.0, (n - 1) as f32);
-            (p as usize, (p as usize + 1).min(n - 1), p - p as usize as f32)
-        };
-        let (x0, x1, fx) = at(uv.x, self.width);
-        let (y0, y1, fy) = at(uv.y, self.height);
-        let channels = out.len();
-        let texel = |x: usize, y: usize| &self.data[(y * self.width + x) * channels..][..channels];
-        let (a, b, c, d) = (texel(x0, y0), texel(x1, y0), texel(x0, y1), texel(x1, y1));
-        for k in 0..channels {
-            let (top, bottom) = (a[k] + fx * (b[k] - a[k]), c[k] + fx * (d[k] - c[k]));
-            out[k] = top + fy * (bottom - top);
+/// Four numbers of 16 bits as floats.
+#[inline(always)]
+fn floats(t: Texel) -> Vec4 {
+    Vec4::new(f32::from(t[0]), f32::from(t[1]), f32::from(t[2]), f32::from(t[3]))
+}
+
+/// Half the texels each way of a picture of so many across and down.
+fn halved(texels: &[Texel], [across, down]: [usize; 2], groups: usize) -> Vec<Texel> {
+    let (width, height) = ((across / 2).max(1), (down / 2).max(1));
+    let (columns, rows) = (shares(across, width), shares(down, height));
+    let mut half = vec![[0; 4]; width * height * groups];
+    half.par_chunks_exact_mut(width * groups).zip(&rows).for_each(|(row, own)| {
+        for (out, columns) in row.chunks_exact_mut(groups).zip(&columns) {
+            for (g, out) in out.iter_mut().enumerate() {
+                let mut sum = Vec4::splat(0.5);
+                for &(y, wy) in own {
+                    for &(x, wx) in columns.iter().filter(|(_, wx)| wx * wy > 0.0) {
+                        sum += wx * wy * floats(texels[(y * across + x) * groups + g]);
+                    }
+                }
+                *out = sum.to_array().map(|v| v as u16);
+            }
         }
-    }
+    });
+    half
+}
+
+/// The four texels around a place of a level, clamped at its borders, and how far it is on the way between them.
+#[inline(always)]
+fn around(level: &MipLevel, u: f32, v: f32) -> ([u32; 4], Vec2) {
+    let at = |u: f32, n: f32| {
+        let p = (u * n - 0.5).max(0.0).min(n - 1.0);
+        (p as i32, (p + 1.0).min(n - 1.0) as i32, p - p as i32 as f32)
+    };
+    let (x0, x1, fx) = at(u, level.width);
+    let (y0, y1, fy) = at(v, level.height);
+    let (top, bottom) = (y0 * level.width as i32, y1 * level.width as i32);
+    let texel = |row: i32, x: i32| level.first + (row + x) as u32;
+    ([texel(top, x0), texel(top, x1), texel(bottom, x0), texel(bottom, x1)], Vec2::new(fx, fy))
+}
+
+#[inline(always)]
+fn bilinear([a, b, c, d]: [Vec4; 4], f: Vec2) -> Vec4 {
+    let (top, bottom) = (a + f.x * (b - a), c + f.x * (d - c));
+    top + f.y * (bottom - top)
 }
 
 /// The texels under each of `n` equal parts of a row of `from`, which has two to three a part, with their shares.
@@ -229,7 +359,6 @@ mod tests {
     use super::super::raycast::{RaycastOptions, raycast};
     use super::*;
     use crate::geom::Bvh;
-    use glam::Vec3;
 
     /// A square from −1 to 1 at z = 0, its texture 4 × 4 from red (left) to green (right).
     fn square() -> (Mesh, Atlas, Photo) {
@@ -268,26 +397,33 @@ mod tests {
 
     #[test]
     fn levels_of_any_size_lie_where_the_picture_lies() {
-        let row = |data: &[f32]| MipLevel { width: data.len(), height: 1, data: data.to_vec() };
-        // five texels in halves of 2.5: (1 + 2 + 0.5 · 4) / 2.5 and (0.5 · 4 + 8 + 16) / 2.5
-        let half = row(&[1.0, 2.0, 4.0, 8.0, 16.0]).halved(1);
-        assert_eq!((half.width, half.height), (2, 1));
-        assert!((half.data[0] - 2.0).abs() < 1e-6 && (half.data[1] - 10.4).abs() < 1e-6, "{:?}", half.data);
-        assert_eq!(row(&[3.0, 6.0, 0.0]).halved(1).data, [3.0]);
-        assert_eq!(row(&[1.0, 3.0, 5.0, 9.0]).halved(1).data, [2.0, 7.0]);
+        let row = |row: &[u16]| {
+            let texels: Vec<Texel> = row.iter().map(|v| [*v; 4]).collect();
+            halved(&texels, [row.len(), 1], 1).iter().map(|t| t[3]).collect::<Vec<_>>()
+        };
+        // five texels in halves of 2.5: (100 + 200 + 0.5 · 400) / 2.5 and (0.5 · 400 + 800 + 1600) / 2.5
+        assert_eq!(row(&[100, 200, 400, 800, 1600]), [200, 1040]);
+        assert_eq!(row(&[3, 6, 0]), [3]);
+        assert_eq!(row(&[1, 3, 5, 9]), [2, 7]);
+        assert_eq!(row(&[65535, 65535, 0, 1]), [65535, 1]);
         // a bright spot keeps its place and its light on every level: 23 by 37 texels, the spot at (5, 30)
-        let (width, height) = (23, 37);
-        let mut level = MipLevel { width, height, data: vec![0.0; width * height] };
-        level.data[30 * width + 5] = 1.0;
-        while level.width.min(level.height) > 1 {
-            level = level.halved(1);
-            let (w, h) = (level.width as f32, level.height as f32);
+        let (mut width, mut height) = (23, 37);
+        let mut texels = vec![[0; 4]; width * height];
+        texels[30 * width + 5] = [65535; 4];
+        while width.min(height) > 1 {
+            texels = halved(&texels, [width, height], 1);
+            (width, height) = (width / 2, height / 2);
+            let (w, h) = (width as f32, height as f32);
             let mut sums = [0f32; 3];
-            for (i, v) in level.data.iter().enumerate() {
-                let at = [(i % level.width) as f32 + 0.5, (i / level.width) as f32 + 0.5];
-                [1.0, at[0] / w, at[1] / h].iter().zip(&mut sums).for_each(|(x, sum)| *sum += x * v);
+            for (i, [v, ..]) in texels.iter().enumerate() {
+                let at = [(i % width) as f32 + 0.5, (i / width) as f32 + 0.5];
+                [1.0, at[0] / w, at[1] / h]
+                    .iter()
+                    .zip(&mut sums)
+                    .for_each(|(x, sum)| *sum += x * f32::from(*v));
             }
-            assert!((sums[0] / (w * h) * 851.0 - 1.0).abs() < 1e-4, "{w} {h}");
+            // four texels at the end, each rounded
+            assert!((sums[0] / (w * h) * 851.0 / 65535.0 - 1.0).abs() < 0.02, "{w} {h}");
             // within half a texel of the level
             assert!((sums[1] / sums[0] - 5.5 / 23.0).abs() < 0.5 / w, "{w}: {}", sums[1] / sums[0]);
             assert!((sums[2] / sums[0] - 30.5 / 37.0).abs() < 0.5 / h, "{h}: {}", sums[2] / sums[0]);
@@ -332,7 +468,7 @@ mod tests {
         let seen = |texture: &MeshTexture, side: u32| {
             let camera = Camera::above(side, side, f64::from(side), 2.0);
             let options = RasterOptions::default();
-            let seen = raster(&mesh, &camera, &options, |hits| texture.smooth_colors(hits, &camera));
+            let seen = raster(&mesh, None, &camera, &options, |hits| texture.smooth_colors(hits, &camera));
             seen.view.color.data.as_chunks::<4>().0.to_vec()
         };
         // four texels on two pixels: the level of means, linear 0.5

@@ -3,7 +3,7 @@
 
 use super::tile::{FIRST, LAST, TILE, UNIT};
 use crate::geom::{Camera, Mesh};
-use glam::{DVec3, Mat3, Vec2, Vec3};
+use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
 
 /// Triangles that are binned together: what comes out does not depend on how many threads there are.
@@ -79,13 +79,21 @@ pub(super) struct Lens<'a> {
     mirrored: bool,
     across: usize,
     down: usize,
-    /// Are triangles seen from behind left out?
-    cull: bool,
+}
+
+/// Triangles to be sorted into tiles.
+pub(super) struct Faces<'a> {
+    pub positions: &'a [Vec3],
+    pub triangles: &'a [[u32; 3]],
+    /// What each of them is called; `None`: by its index.
+    pub ids: Option<&'a [u32]>,
+    /// Are those seen from behind left out?
+    pub cull: bool,
 }
 
 impl<'a> Lens<'a> {
     /// `None` where no pixel has a ray.
-    pub fn new(camera: &'a Camera, mesh: &Mesh, cull: bool) -> Option<Lens<'a>> {
+    pub fn new(camera: &'a Camera, mesh: &Mesh) -> Option<Lens<'a>> {
         let origin = camera.position.as_vec3();
         let bounds = mesh.bounds();
         let far = (bounds.min - origin).abs().max((bounds.max - origin).abs()).length();
@@ -127,15 +135,14 @@ impl<'a> Lens<'a> {
             mirrored: (camera.fx < 0.0) != (camera.fy < 0.0),
             across: tiles(camera.width),
             down: tiles(camera.height),
-            cull,
         })
     }
 
-    /// Sorts all triangles of a mesh into tiles, rows of tiles one after the other.
-    pub fn bin(&self, mesh: &Mesh) -> Vec<Bins> {
+    /// Sorts triangles into tiles, rows of tiles one after the other.
+    pub fn bin(&self, all: &Faces) -> Vec<Bins> {
         let straight = self.camera.distortion.is_none();
         let corners: Vec<Corner> = if straight {
-            mesh.positions
+            all.positions
                 .par_iter()
                 .with_min_len(CHUNK)
                 .map(|&p| self.corner(self.ideal(p), FARTHEST))
@@ -143,19 +150,20 @@ impl<'a> Lens<'a> {
         } else {
             Vec::new()
         };
-        let chunks = mesh.triangles.par_chunks(CHUNK).enumerate();
+        let chunks = all.triangles.par_chunks(CHUNK).enumerate();
         let bin = |(chunk, triangles): (usize, &[[u32; 3]])| {
             let mut faces = Vec::with_capacity(triangles.len());
             for (i, t) in triangles.iter().enumerate() {
-                let triangle = (chunk * CHUNK + i) as u32;
+                let index = chunk * CHUNK + i;
+                let triangle = all.ids.map_or(index as u32, |ids| ids[index]);
                 if straight {
                     let face = t.map(|v| corners[v as usize]);
                     if face.iter().all(|c| c.inverse_depth > 0.0) {
-                        self.add(face, triangle, &mut faces);
+                        self.add(face, triangle, all.cull, &mut faces);
                         continue;
                     }
                 }
-                self.cut(t.map(|v| self.inside(mesh.positions[v as usize])), triangle, &mut faces);
+                self.cut(t.map(|v| self.inside(all.positions[v as usize])), triangle, all.cull, &mut faces);
             }
             self.sort(faces)
         };
@@ -200,7 +208,7 @@ impl<'a> Lens<'a> {
     /// Cuts a triangle, given in the camera, to what the picture shows, and adds what is left.
     ///
     /// A new corner is computed from the end of its edge that is kept, so both triangles at an edge get the same one.
-    fn cut(&self, triangle: [Vec3; 3], id: u32, out: &mut Vec<Face>) {
+    fn cut(&self, triangle: [Vec3; 3], id: u32, cull: bool, out: &mut Vec<Face>) {
         let [left, right, top, bottom] = self.seen;
         let planes: [(Vec3, f32); 5] = [
             (Vec3::Z, self.near),
@@ -233,13 +241,13 @@ impl<'a> Lens<'a> {
         let ideal = |p: &Vec3| Vec3::new(p.x, p.y, 1.0) / p.z.max(self.near);
         let polygon: Vec<Vec3> = polygon.iter().map(ideal).collect();
         for k in 2..polygon.len() {
-            self.bend([polygon[0], polygon[k - 1], polygon[k]], id, out);
+            self.bend([polygon[0], polygon[k - 1], polygon[k]], id, cull, out);
         }
     }
 
     /// Adds a triangle, halved until its edges are where the lens puts them. Whether an edge is halved depends on its
     /// ends alone, so the triangles at both sides agree.
-    fn bend(&self, [a, b, c]: [Vec3; 3], id: u32, out: &mut Vec<Face>) {
+    fn bend(&self, [a, b, c]: [Vec3; 3], id: u32, cull: bool, out: &mut Vec<Face>) {
         let mut pieces = vec![([a, b, c], 0)];
         while let Some((piece, depth)) = pieces.pop() {
             let off = |k: usize| {
@@ -259,7 +267,7 @@ impl<'a> Lens<'a> {
                 _ => {
                     let corners = piece.map(|p| self.corner(p, CUT));
                     if corners.iter().all(|c| c.inverse_depth > 0.0) {
-                        self.add(corners, id, out);
+                        self.add(corners, id, cull, out);
                     }
                 }
             }
@@ -267,11 +275,11 @@ impl<'a> Lens<'a> {
     }
 
     #[inline(always)]
-    fn add(&self, [a, b, c]: [Corner; 3], triangle: u32, out: &mut Vec<Face>) {
+    fn add(&self, [a, b, c]: [Corner; 3], triangle: u32, cull: bool, out: &mut Vec<Face>) {
         let area = area([a, b, c]);
         // y runs down: what is counter-clockwise from outside is so on the picture, and its area is negative
         let back = (area > 0) != self.mirrored;
-        if area == 0 || (back && self.cull) {
+        if area == 0 || (back && cull) {
             return;
         }
         out.push(Face { corners: if area > 0 { [a, b, c] } else { [a, c, b] }, triangle, back });
@@ -322,38 +330,4 @@ pub(super) fn reach(face: &Face) -> ((i32, i32), (i32, i32)) {
         ((low - LAST + UNIT - 1).div_euclid(UNIT), (high - FIRST).div_euclid(UNIT))
     };
     (span(a.x, b.x, c.x), span(a.y, b.y, c.y))
-}
-
-/// The rays of a camera through its pixels, as unit directions.
-pub(super) struct Rays<'a> {
-    camera: &'a Camera,
-    /// Of a lens that bends nothing: through the picture's corner, and a pixel on in x and y.
-    straight: Option<[DVec3; 3]>,
-}
-
-impl<'a> Rays<'a> {
-    pub fn new(camera: &'a Camera) -> Rays<'a> {
-        let c = camera;
-        let straight = c.distortion.is_none().then(|| {
-            let through = |x: f64, y: f64, z: f64| c.rotation * DVec3::new(x, y, z);
-            [
-                through(-c.cx / c.fx, c.cy / c.fy, -1.0),
-                through(1.0 / c.fx, 0.0, 0.0),
-                through(0.0, -1.0 / c.fy, 0.0),
-            ]
-        });
-        Rays { camera, straight }
-    }
-
-    /// `None` where the lens folds over.
-    #[inline(always)]
-    pub fn through(&self, x: f32, y: f32) -> Option<Vec3> {
-        match self.straight {
-            Some([corner, right, down]) => {
-                // as a ray caster does it: rounded once
-                Some((corner + f64::from(x) * right + f64::from(y) * down).normalize().as_vec3())
-            }
-            None => self.camera.ray(Vec2::new(x, y)).map(|ray| ray.direction),
-        }
-    }
 }

@@ -1,6 +1,7 @@
 use super::project::{Corner, Face, area};
+use super::tile::UNIT;
 use super::*;
-use crate::geom::{Bvh, Distortion};
+use crate::geom::{Bvh, Distortion, ShellCaster};
 use crate::kernel::rng;
 use crate::render::{RaycastOptions, raycast};
 use glam::{DMat3, DVec3, Vec2};
@@ -84,10 +85,12 @@ fn a_million_shared_edges_leave_no_gap_and_hit_no_sample_twice() {
 fn a_closed_mesh_covers_every_sample_from_both_sides() {
     // twice 30,000 shared edges through projection and binning: what its front covers, its back covers, too
     let (mesh, camera) = (ball(60), camera(300));
-    let front = raster(&mesh, &camera, &RasterOptions { cull: true, ..RasterOptions::default() }, white);
+    let front =
+        raster(&mesh, None, &camera, &RasterOptions { cull: true, ..RasterOptions::default() }, white);
     let mut inside_out = mesh.clone();
     inside_out.triangles.iter_mut().for_each(|t| t.swap(1, 2));
-    let back = raster(&inside_out, &camera, &RasterOptions { cull: true, ..RasterOptions::default() }, white);
+    let back =
+        raster(&inside_out, None, &camera, &RasterOptions { cull: true, ..RasterOptions::default() }, white);
     assert_eq!(front.view.color, back.view.color);
     assert!(front.triangles.iter().zip(&back.triangles).all(|(a, b)| (*a == NOTHING) == (*b == NOTHING)));
 }
@@ -99,7 +102,7 @@ fn differences(mesh: &Mesh, camera: &Camera) -> (f64, f32, f64) {
         hits.points.iter().map(wave).collect()
     };
     let bvh = Bvh::new(mesh);
-    let seen = raster(mesh, camera, &RasterOptions::default(), color);
+    let seen = raster(mesh, None, camera, &RasterOptions::default(), color);
     let cast = raycast(&bvh, mesh, None, camera, &RaycastOptions::default(), color);
     let (mut other, mut depth) = (0, 0f32);
     for (i, &triangle) in seen.triangles.iter().enumerate() {
@@ -135,6 +138,48 @@ fn it_sees_what_the_ray_caster_sees() {
 }
 
 #[test]
+fn layers_are_blended_as_the_ray_caster_blends_them() {
+    let mut mesh = ball(24);
+    mesh.normals = mesh.angle_weighted_normals();
+    let layer = |k: usize| ShellLayer {
+        offsets: mesh.positions.iter().map(|p| 0.04 * k as f32 * (1.0 + 0.3 * (8.0 * p.x).sin())).collect(),
+        // none at all below
+        alphas: mesh.positions.iter().map(|p| (0.6 * p.y + 0.1 * k as f32).clamp(0.0, 0.9)).collect(),
+    };
+    let shells = Shells { layers: [1, 2, 3].map(layer).to_vec() };
+    let camera = camera(300);
+    let color = |hits: &RayHits| -> Vec<[f32; 3]> {
+        hits.points.iter().map(|p| [0.5 + 0.4 * (5.0 * p.x).sin(), 0.5 + 0.4 * p.y, 0.6]).collect()
+    };
+    let (layers, caster) = (RasterLayers::new(&mesh, &shells), ShellCaster::new(&mesh, &shells));
+    let options = RasterOptions::default();
+    let bare = raster(&mesh, None, &camera, &options, color);
+    let seen = raster(&mesh, Some(&layers), &camera, &options, color);
+    let bvh = Bvh::new(&mesh);
+    let cast = raycast(&bvh, &mesh, Some(&caster), &camera, &RaycastOptions::default(), color);
+    let psnr = |a: &Image, b: &Image| {
+        let error: f64 = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+        -10.0 * (error / a.data.len() as f64).log10()
+    };
+    let (with, without) = (psnr(&seen.view.color, &cast.color), psnr(&bare.view.color, &cast.color));
+    assert!(with > 43.0 && without < with - 10.0, "{with:.1} {without:.1}");
+    // depth, normals and triangles are the mesh's, and no sample has more than all of its light
+    assert!(seen.view.depth == bare.view.depth && seen.triangles == bare.triangles);
+    assert!(seen.view.color.channel(3).iter().all(|a| *a <= 1.0 + 1e-5));
+    // in memory of another view nothing is left of that
+    let mut again = raster(&mesh, Some(&layers), &Camera { cx: 40.0, ..camera.clone() }, &options, color);
+    raster_into(&mut again, &mesh, Some(&layers), &camera, &options, color);
+    assert_eq!(again, seen);
+    // and who needs neither points nor normals gets none
+    let flat = |hits: &RayHits| {
+        assert!(hits.points.is_empty() && hits.normals.is_empty());
+        vec![[1.0; 3]; hits.hits.len()]
+    };
+    let bare = raster(&mesh, None, &camera, &RasterOptions { bare_hits: true, ..options }, flat);
+    assert_eq!(bare.view.color, raster(&mesh, None, &camera, &options, white).view.color);
+}
+
+#[test]
 fn what_reaches_behind_the_camera_is_cut() {
     // a floor one below the camera, from far before it to far behind it
     let at = [(-1e4, -1e4), (1e4, -1e4), (1e4, 1e4), (-1e4, 1e4)];
@@ -145,7 +190,7 @@ fn what_reaches_behind_the_camera_is_cut() {
     };
     for distortion in [Distortion::default(), Distortion { k1: -0.1, ..Distortion::default() }] {
         let camera = Camera { distortion, ..Camera::above(64, 64, 64.0, 0.0) };
-        let seen = raster(&mesh, &camera, &RasterOptions::default(), white);
+        let seen = raster(&mesh, None, &camera, &RasterOptions::default(), white);
         // below the horizon, in the middle of the picture, all; above it nothing
         let alpha = |x, y| seen.view.color.pixel(x, y)[3];
         assert!((0..64).all(|x| (0..31).all(|y| alpha(x, y) == 0.0) && (33..64).all(|y| alpha(x, y) == 1.0)));
@@ -167,12 +212,13 @@ fn the_nearer_surface_hides_the_other_and_backs_can_be_left_out() {
         ..Mesh::default()
     };
     let camera = Camera::above(40, 40, 40.0, 4.0);
-    let at =
-        |cull| raster(&mesh, &camera, &RasterOptions { cull, ..RasterOptions::default() }, white).triangles;
+    let at = |cull| {
+        raster(&mesh, None, &camera, &RasterOptions { cull, ..RasterOptions::default() }, white).triangles
+    };
     let middle = 20 * 40 + 22;
     assert!(at(false)[middle] >= 2 && at(true)[middle] < 2);
     // coverage: the near square spans 40 / 3 pixels each way: a border pixel is covered in part
-    let view = raster(&mesh, &camera, &RasterOptions::default(), white).view;
+    let view = raster(&mesh, None, &camera, &RasterOptions::default(), white).view;
     let alpha: f32 = view.color.channel(3).iter().sum();
     assert!((alpha - (80.0f32 / 3.0).powi(2)).abs() < 20.0, "{alpha}");
 }
@@ -182,14 +228,14 @@ fn threads_leave_no_trace() {
     let (mesh, camera) = (ball(30), camera(200));
     let view = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| raster(&mesh, &camera, &RasterOptions::default(), white))
+        pool.install(|| raster(&mesh, None, &camera, &RasterOptions::default(), white))
     };
     assert_eq!(view(1), view(3));
     // slivers, points and nothing at all are no triangles
     let mut flat = mesh.clone();
     flat.triangles = vec![[0, 0, 1], [2, 2, 2]];
     for mesh in [flat, Mesh::default()] {
-        let seen = raster(&mesh, &camera, &RasterOptions::default(), white);
+        let seen = raster(&mesh, None, &camera, &RasterOptions::default(), white);
         assert!(
             seen.triangles.iter().all(|&t| t == NOTHING) && seen.view.color.data.iter().all(|v| *v == 0.0)
         );

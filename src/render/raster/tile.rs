@@ -5,15 +5,20 @@
 //! triangles that share an edge leave no sample between them out and hit none twice.
 
 use super::project::{Corner, Face, area, reach};
+use std::array::from_fn;
 use std::hint::black_box;
 use std::ops::{Add, BitOr, Mul, Sub};
 
 /// Pixels along each side of a tile.
 pub(super) const TILE: usize = 32;
 
-/// Pixels of a row that are worked on at once, and along each side of a block of which the farthest depth is known.
+/// Places in a pixel that are worked on at once.
 const LANES: usize = 8;
-const BLOCKS: usize = TILE / LANES;
+
+/// Pixels of a row that are asked at once whether a large face can be there, and along each side of a block of which the
+/// farthest depth is known.
+const BLOCK: usize = 8;
+const BLOCKS: usize = TILE / BLOCK;
 
 /// After so many faces the farthest depths are looked up again.
 const REFRESH: usize = 256;
@@ -24,9 +29,10 @@ pub(super) const UNIT: i32 = 256;
 /// Samples of a pixel's coverage.
 pub(super) const SAMPLES: usize = 4;
 
-/// Where they lie in a pixel: a rotated grid, in which no two share a row or a column; and last, of what is seen there but
-/// does not count, the center.
-pub(super) const GRID: [(i32, i32); SAMPLES + 1] = [(96, 32), (224, 96), (32, 160), (160, 224), (128, 128)];
+/// Where they lie in a pixel: a rotated grid, in which no two share a row or a column; and then, of what is seen there but
+/// does not count, the center, in all lanes that are left over.
+pub(super) const GRID: [(i32, i32); LANES] =
+    [(96, 32), (224, 96), (32, 160), (160, 224), (128, 128), (128, 128), (128, 128), (128, 128)];
 
 /// The center in [`GRID`].
 pub(super) const CENTER: usize = SAMPLES;
@@ -42,16 +48,17 @@ pub(super) const NOTHING: u32 = u32::MAX;
 const SMALL: i32 = 64 * UNIT;
 
 /// The nearest triangles of a tile.
+#[repr(C, align(64))]
 pub(super) struct Tile {
+    /// One over depth at each place of [`GRID`] in each pixel, 0 where there is nothing.
+    pub inverse_depth: [[f32; LANES]; TILE * TILE],
+    pub triangle: [[u32; LANES]; TILE * TILE],
+    /// The smallest inverse depth in each block.
+    farthest: [f32; BLOCKS * BLOCKS],
     left: i32,
     top: i32,
     width: i32,
     height: i32,
-    /// One over depth at each place of [`GRID`] in each pixel, 0 where there is nothing.
-    pub inverse_depth: [[f32; TILE * TILE]; SAMPLES + 1],
-    pub triangle: [[u32; TILE * TILE]; SAMPLES + 1],
-    /// The smallest inverse depth in each block.
-    farthest: [f32; BLOCKS * BLOCKS],
     drawn: usize,
 }
 
@@ -59,13 +66,13 @@ impl Tile {
     /// With nothing in it, of no size.
     pub fn new() -> Box<Tile> {
         Box::new(Tile {
+            inverse_depth: [[0.0; LANES]; TILE * TILE],
+            triangle: [[NOTHING; LANES]; TILE * TILE],
+            farthest: [0.0; BLOCKS * BLOCKS],
             left: 0,
             top: 0,
             width: 0,
             height: 0,
-            inverse_depth: [[0.0; TILE * TILE]; SAMPLES + 1],
-            triangle: [[NOTHING; TILE * TILE]; SAMPLES + 1],
-            farthest: [0.0; BLOCKS * BLOCKS],
             drawn: 0,
         })
     }
@@ -77,6 +84,15 @@ impl Tile {
         self.inverse_depth.as_flattened_mut().fill(0.0);
         self.triangle.as_flattened_mut().fill(NOTHING);
         self.farthest.fill(0.0);
+        self.drawn = 0;
+    }
+
+    /// Empties it, but for the depth of what another tile holds in the same part of the picture.
+    pub fn behind(&mut self, other: &Tile) {
+        self.inverse_depth = other.inverse_depth;
+        self.triangle.as_flattened_mut().fill(NOTHING);
+        self.farthest.fill(0.0);
+        (self.left, self.top, self.width, self.height) = (other.left, other.top, other.width, other.height);
         self.drawn = 0;
     }
 
@@ -92,7 +108,7 @@ impl Tile {
         let (columns, rows) = ((left - self.left, right - self.left), (top - self.top, bottom - self.top));
         let [a, b, c] = face.corners;
         let nearest = a.inverse_depth.max(b.inverse_depth).max(c.inverse_depth);
-        let blocks = |(from, to): (i32, i32)| from as usize / LANES..=to as usize / LANES;
+        let blocks = |(from, to): (i32, i32)| from as usize / BLOCK..=to as usize / BLOCK;
         let is_hidden = |y: usize| blocks(columns).all(|x| nearest <= self.farthest[y * BLOCKS + x]);
         if blocks(rows).all(is_hidden) {
             return;
@@ -113,12 +129,12 @@ impl Tile {
     #[inline(always)]
     pub fn look_up_farthest(&mut self) {
         for (k, farthest) in self.farthest.iter_mut().enumerate() {
-            let first = (k / BLOCKS * TILE + k % BLOCKS) * LANES;
+            let first = (k / BLOCKS * TILE + k % BLOCKS) * BLOCK;
             let mut low = [f32::INFINITY; LANES];
-            for depths in &self.inverse_depth {
-                for row in depths[first..].chunks(TILE).take(LANES) {
+            for row in self.inverse_depth[first..].chunks(TILE).take(BLOCK) {
+                for depths in &row[..BLOCK] {
                     for l in 0..LANES {
-                        low[l] = if row[l] < low[l] { row[l] } else { low[l] };
+                        low[l] = if depths[l] < low[l] { depths[l] } else { low[l] };
                     }
                 }
             }
@@ -126,70 +142,57 @@ impl Tile {
         }
     }
 
-    /// Draws the pixels of a face in these columns and rows of the tile, and whatever lies beside them.
+    /// Draws the pixels of a face in these columns and rows of the tile.
     #[inline(always)]
     fn fill<T: Whole>(&mut self, face: &Face, nearest: f32, columns: (i32, i32), rows: (i32, i32)) {
         let [a, b, c] = face.corners;
-        let groups = columns.0 as usize / LANES..=columns.1 as usize / LANES;
-        let left = *groups.start() as i32 * LANES as i32;
-        // the first pixel of the first group
-        let (x, y) = ((self.left + left) * UNIT, (self.top + rows.0) * UNIT);
-        let edges =
-            [Edge::<T>::new(a, b, (x, y)), Edge::<T>::new(b, c, (x, y)), Edge::<T>::new(c, a, (x, y))];
+        // the first pixel
+        let (x, y) = ((self.left + columns.0) * UNIT, (self.top + rows.0) * UNIT);
+        let [e, f, g] = [(a, b), (b, c), (c, a)].map(|(p, q)| Edge::<T>::new(p, q, (x, y)));
         let farthest = a.inverse_depth.min(b.inverse_depth).min(c.inverse_depth);
         // one over depth is linear on the picture
         let over = 1.0 / area(face.corners) as f32;
         let (bx, by, bw) = ((b.x - a.x) as f32, (b.y - a.y) as f32, b.inverse_depth - a.inverse_depth);
         let (cx, cy, cw) = ((c.x - a.x) as f32, (c.y - a.y) as f32, c.inverse_depth - a.inverse_depth);
         let (dx, dy) = ((bw * cy - cw * by) * over, (cw * bx - bw * cx) * over);
-        let mut slope = [0f32; LANES];
-        for l in 0..LANES {
-            slope[l] = dx * (l as i32 * UNIT) as f32;
-        }
-        for row in rows.0..=rows.1 {
-            let down = row - rows.0;
-            for group in groups.clone() {
-                let right = group as i32 * LANES as i32 - left;
-                let mut at = [T::from(0); 3];
-                for k in 0..3 {
-                    at[k] = edges[k].first + edges[k].right * T::from(right) + edges[k].down * T::from(down);
-                }
-                let most = (at[0] + edges[0].most) | (at[1] + edges[1].most) | (at[2] + edges[2].most);
-                if most.sign() != 0 {
+        let first: [f32; LANES] = from_fn(|s| {
+            let (px, py) = (x + GRID[s].0 - a.x, y + GRID[s].1 - a.y);
+            a.inverse_depth + dx * px as f32 + dy * py as f32
+        });
+        let count = (columns.1 - columns.0 + 1) as usize;
+        for down in 0..=rows.1 - rows.0 {
+            let row = (rows.0 + down) as usize * TILE + columns.0 as usize;
+            let [er, fr, gr] = [&e, &f, &g].map(|edge| edge.down * T::from(down));
+            let wr = dy * (down * UNIT) as f32;
+            for from in (0..count).step_by(BLOCK) {
+                let right = T::from(from as i32);
+                let most = |edge: &Edge<T>, at: T| at + edge.right * right + edge.most;
+                if count > BLOCK && (most(&e, er) | most(&f, fr) | most(&g, gr)).sign() != 0 {
                     continue;
                 }
-                let first = row as usize * TILE + group * LANES;
-                for s in 0..=SAMPLES {
-                    let (px, py) = (x + right * UNIT + GRID[s].0 - a.x, y + down * UNIT + GRID[s].1 - a.y);
-                    let w = a.inverse_depth + dx * px as f32 + dy * py as f32;
-                    let (Some(depths), Some(triangles)) = (
-                        self.inverse_depth[s][first..].first_chunk_mut::<LANES>(),
-                        self.triangle[s][first..].first_chunk_mut::<LANES>(),
-                    ) else {
-                        continue;
-                    };
+                for column in from..count.min(from + BLOCK) {
+                    let right = T::from(column as i32);
+                    let (et, ft, gt) = (er + e.right * right, fr + f.right * right, gr + g.right * right);
+                    let w = wr + dx * (column as i32 * UNIT) as f32;
+                    let (depths, triangles) =
+                        (&mut self.inverse_depth[row + column], &mut self.triangle[row + column]);
                     // all in whole numbers, which compilers turn into vectors: those of positive floats are in their order
                     let (old_depths, old_triangles) = (*depths, *triangles);
-                    let (mut new_depths, mut new_triangles) = ([0f32; LANES], [0u32; LANES]);
                     let mut visible = [0u32; LANES];
                     for l in 0..LANES {
-                        let outside = (at[0] + edges[0].offset[s] + edges[0].lanes[l])
-                            | (at[1] + edges[1].offset[s] + edges[1].lanes[l])
-                            | (at[2] + edges[2].offset[s] + edges[2].lanes[l]);
+                        let outside = (et + e.at[l]) | (ft + f.at[l]) | (gt + g.at[l]);
                         // a sliver's slope is unreliable: it is no nearer and no farther than its corners
-                        let new = (w + slope[l]).max(farthest).min(nearest).to_bits() as i32;
+                        let new = (w + first[l]).max(farthest).min(nearest).to_bits() as i32;
                         let old = old_depths[l].to_bits() as i32;
                         let best = old.max(new & !outside.sign());
-                        new_depths[l] = f32::from_bits(best as u32);
+                        depths[l] = f32::from_bits(best as u32);
                         visible[l] = ((old - best) >> 31) as u32;
                     }
-                    // hidden, lest compilers store the lanes that changed alone: some machines are slow at that
-                    let visible = black_box(visible);
+                    // the place hidden, lest compilers store the lanes that changed alone: some machines are slow at that
+                    let triangles = black_box(triangles);
                     for l in 0..LANES {
-                        new_triangles[l] =
-                            old_triangles[l] ^ ((old_triangles[l] ^ face.triangle) & visible[l]);
+                        triangles[l] = old_triangles[l] ^ ((old_triangles[l] ^ face.triangle) & visible[l]);
                     }
-                    (*depths, *triangles) = (new_depths, new_triangles);
                 }
             }
         }
@@ -220,16 +223,12 @@ impl Whole for i64 {
 
 /// The function of an edge: not negative on the side of the face.
 struct Edge<T> {
-    /// At the corner of the first pixel.
-    first: T,
+    /// At the places of [`GRID`] in the first pixel.
+    at: [T; LANES],
     /// A pixel on.
     right: T,
     down: T,
-    /// From a pixel's corner to the places of [`GRID`].
-    offset: [T; SAMPLES + 1],
-    /// So many pixels on.
-    lanes: [T; LANES],
-    /// No place in these pixels has more than that.
+    /// No place in that pixel and those of its block to the right has more than that.
     most: T,
 }
 
@@ -240,18 +239,11 @@ impl<T: Whole> Edge<T> {
         // a sample on the edge belongs to the face below a top one or right of a left one
         let own = b.y < a.y || (b.y == a.y && b.x > a.x);
         let first = dx * T::from(y - a.y) - dy * T::from(x - a.x) - T::from(i32::from(!own));
-        let (right, down) = (T::from(0) - dy * T::from(UNIT), dx * T::from(UNIT));
-        let (mut offset, mut lanes) = ([T::from(0); SAMPLES + 1], [T::from(0); LANES]);
-        for s in 0..=SAMPLES {
-            offset[s] = dx * T::from(GRID[s].1) - dy * T::from(GRID[s].0);
-        }
-        for l in 0..LANES {
-            lanes[l] = right * T::from(l as i32);
-        }
+        let at = from_fn(|s| first + dx * T::from(GRID[s].1) - dy * T::from(GRID[s].0));
         // at the corner of the pixels that is farthest inside
         let farthest =
             |slope: T, most: i32| if slope.sign() != 0 { T::from(0) } else { slope * T::from(most) };
-        let most = farthest(T::from(0) - dy, LANES as i32 * UNIT) + farthest(dx, UNIT);
-        Edge { first, right, down, offset, lanes, most }
+        let most = first + farthest(T::from(0) - dy, BLOCK as i32 * UNIT) + farthest(dx, UNIT);
+        Edge { at, right: T::from(0) - dy * T::from(UNIT), down: dx * T::from(UNIT), most }
     }
 }
