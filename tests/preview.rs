@@ -91,7 +91,7 @@ fn a_file_becomes_a_picture_with_alpha_around_it() {
     let dir = folder();
     let o = tiface(dir.path(), &["preview", "b.ply", "--size", "64", "--json"]);
     assert_eq!(code(&o), 0, "{}", err(&o));
-    assert!(String::from_utf8_lossy(&o.stdout).contains("\"preview\":\"b_preview.png\""));
+    assert!(String::from_utf8_lossy(&o.stdout).contains("\"preview\":[\"b_preview.png\"]"));
     let seen = picture(&dir.path().join("b_preview.png"));
     assert_eq!(seen.dimensions(), (64, 64));
     // its colors as they are, in the middle; nothing in the corner
@@ -103,6 +103,27 @@ fn a_file_becomes_a_picture_with_alpha_around_it() {
     let [r, g, b, a] = seen.get_pixel(32, 36).0;
     assert!(r == g && g == b && a == 255 && (40..250).contains(&r), "{r} {g} {b}");
     assert_eq!(seen.get_pixel(0, 0).0, [255; 4]);
+}
+
+#[test]
+fn a_mesh_of_any_size_looks_the_same() {
+    let dir = folder();
+    let scaled = |factor: &str| {
+        PLY.replace("1 0 0 255", &format!("{factor} 0 0 255"))
+            .replace("0 1 0 255", &format!("0 {factor} 0 255"))
+            .replace("0 0 1 255", &format!("0 0 {factor} 255"))
+    };
+    let seen = ["1", "1e30", "1e-30"].map(|factor| {
+        std::fs::write(dir.path().join("s.ply"), scaled(factor)).unwrap();
+        let o = tiface(dir.path(), &["preview", "s.ply", "--size", "64"]);
+        assert_eq!(code(&o), 0, "{factor}: {}", err(&o));
+        picture(&dir.path().join("s_preview.png"))
+    });
+    for other in &seen[1..] {
+        let differ = seen[0].pixels().zip(other.pixels()).filter(|(a, b)| a != b).count();
+        // the center is rounded elsewhere
+        assert!(differ < 40, "{differ}");
+    }
 }
 
 #[test]
@@ -133,6 +154,7 @@ fn what_cannot_be_shown_is_said() {
     let dir = folder();
     std::fs::create_dir(dir.path().join("empty")).unwrap();
     std::fs::write(dir.path().join("points.obj"), "v 0 0 0\nv 1 0 0\n").unwrap();
+    std::fs::write(dir.path().join("dot.obj"), "v 3 3 3\nv 3 3 3\nv 3 3 3\nf 1 2 3\n").unwrap();
     std::fs::write(dir.path().join("lost.obj"), format!("mtllib lost.mtl\nvt 0 0\n{OBJ}")).unwrap();
     for (words, expected, text) in [
         (&["preview", "a.obj", "--light", "uv"][..], 1, "has no texture coordinates"),
@@ -141,6 +163,11 @@ fn what_cannot_be_shown_is_said() {
         (&["preview", "a.obj", "--out", "a.jpg"], 2, "makes no such file"),
         (&["preview", "a.obj", "--out", "a.gif"], 2, "makes no such file"),
         (&["preview", "a.obj", "--size", "0"], 2, "--size"),
+        (&["preview", "dot.obj"], 1, "lie at one place"),
+        // nothing is ignored in silence
+        (&["preview", "a.obj", "--frames", "9"], 2, "--turntable"),
+        (&["preview", "a.obj", "--page", "--size", "64"], 2, "--size"),
+        (&["preview", "empty", "--up", "z"], 2, "a run knows where up is"),
         (&["preview", "a.obj", "--cameras", "test"], 1, "there are no cameras"),
         (&["preview", "empty"], 1, "has no mesh yet"),
         // shown all the same

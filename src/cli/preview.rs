@@ -1,5 +1,6 @@
 //! `tiface preview`: pictures of a mesh to look at.
 
+mod label;
 mod terminal;
 
 use super::invocation::Invocation;
@@ -38,6 +39,7 @@ pub(super) struct PreviewOptions {
     turntable: bool,
     /// Frames of a turntable
     #[arg(long, value_name = "N", default_value_t = 36, value_parser = clap::value_parser!(u32).range(2..=3600))]
+    #[arg(requires = "turntable")]
     frames: u32,
     /// Front, both sides, back, top, wireframe, normals and texture coordinates, on one sheet
     #[arg(long, conflicts_with = "cameras")]
@@ -53,15 +55,16 @@ pub(super) struct PreviewOptions {
     #[arg(long, value_name = "COLOR", default_value = "none")]
     #[arg(value_parser = PossibleValuesParser::new(["black", "white", "none"]).map(|word| background(&word)))]
     background: ViewBackground,
-    /// Where up is in a file: x, -x, y, -y, z or -z
-    #[arg(long, value_name = "AXIS", default_value = "y", allow_hyphen_values = true)]
+    /// Where up is in a file: x, -x, y, -y, z or -z [default: y]; a run knows it
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     #[arg(value_parser = PossibleValuesParser::new(["x", "-x", "y", "-y", "z", "-z"]).map(|word| axis(&word)))]
-    up: Vec3,
+    up: Option<Vec3>,
     /// Write a page to turn it in a browser: one file, no program or network needed
-    #[arg(long, conflicts_with_all = ["turntable", "sheet", "cameras"])]
+    #[arg(long, conflicts_with_all = ["turntable", "sheet", "cameras", "light", "size", "background", "frames"])]
     page: bool,
     /// Serve a run on this machine while it works: stages, curves, newest views; until Ctrl-C
-    #[arg(long, conflicts_with_all = ["page", "turntable", "sheet", "cameras"])]
+    #[arg(long, conflicts_with_all = ["turntable", "sheet", "cameras", "light", "size", "background", "frames"])]
+    #[arg(conflicts_with_all = ["page", "up"])]
     watch: bool,
 }
 
@@ -95,20 +98,23 @@ const ABOVE: f64 = 0.1;
 /// Frames of an animation a second.
 const RATE: u16 = 12;
 
-/// The sheet: so far to the side of the front, so far above, and as what; `None` is as the colors are.
-const SHEET: [(f64, f64, Option<Look>); 8] = [
-    (0.0, 0.0, None),
-    (FRAC_PI_2, 0.0, None),
-    (-FRAC_PI_2, 0.0, None),
-    (PI, 0.0, None),
-    (0.0, FRAC_PI_2, None),
-    (THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Wire)),
-    (THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Normals)),
-    (THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Uv)),
+/// The sheet: what is called so, so far to the side of the front, so far above, and as what; `None` is as the colors are.
+const SHEET: [(&str, f64, f64, Option<Look>); 8] = [
+    ("FRONT", 0.0, 0.0, None),
+    ("LEFT", FRAC_PI_2, 0.0, None),
+    ("RIGHT", -FRAC_PI_2, 0.0, None),
+    ("BACK", PI, 0.0, None),
+    ("TOP", 0.0, FRAC_PI_2, None),
+    ("WIRE", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Wire)),
+    ("NORMALS", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Normals)),
+    ("UV", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Uv)),
 ];
 
 /// Columns of the sheet.
 const COLUMNS: usize = 4;
+
+/// Pixels of pictures that are made side by side: 1 GiB while they are floats.
+const AT_ONCE_PX: u64 = 1 << 25;
 
 /// What is made, and its name in `--out`, in the name of a file of its own and in messages.
 #[derive(Clone, Copy, PartialEq)]
@@ -180,23 +186,87 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
     if let Some(folder) = shown.parent().filter(|f| !f.as_os_str().is_empty()) {
         io::create_folder(folder)?;
     }
-    let pictures =
-        preview.renderer().pictures(&shots, options.background, || invocation.stop.requested().is_some());
-    if invocation.stop.requested().is_some() {
-        return Err(invocation.stop.error("nothing was written"));
-    }
-    let pictures =
-        if kind == Kind::Sheet { vec![PreviewPicture::sheet(&pictures, COLUMNS)] } else { pictures };
-    write(&place, &names, &pictures)?;
+    let mut first = None;
+    let files = make(&preview, &place, kind, &names, &shots, options.background, invocation, &mut first)?;
     if common.json {
-        print(&format!("{}\n", json!({"event": "result", "preview": shown, "pictures": pictures.len()})))?;
+        print(&format!("{}\n", json!({"event": "result", "preview": files})))?;
     } else if !common.quiet {
-        if std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()) {
-            print_as_is(&terminal::shown(&pictures[0])?)?;
+        if std::io::stdout().is_terminal()
+            && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
+            && let Some(picture) = &first
+        {
+            print_as_is(&terminal::shown(picture)?)?;
         }
         print(&format!("preview   {}\n", shown.display()))?;
     }
     Ok(())
+}
+
+/// Makes the pictures and writes them, few at once: as one, an animation, or a folder of pictures of these names. Returns
+/// the files, and the first picture in `first`.
+fn make(
+    preview: &Preview,
+    place: &Out,
+    kind: Kind,
+    names: &[String],
+    shots: &[(Camera, Look)],
+    background: ViewBackground,
+    invocation: &Invocation,
+    first: &mut Option<PreviewPicture>,
+) -> Result<Vec<PathBuf>> {
+    let is_stopped = || invocation.stop.requested().is_some();
+    let renderer = preview.renderer();
+    let size = |(camera, _): &(Camera, Look)| (camera.width, camera.height);
+    let (width, height) = size(&shots[0]);
+    let largest = shots.iter().map(size).map(|(w, h)| u64::from(w) * u64::from(h)).max().unwrap_or(1);
+    let mut some = |shots: &[(Camera, Look)]| {
+        let pictures = renderer.pictures(shots, background, is_stopped);
+        if is_stopped() {
+            return Err(invocation.stop.error("nothing was finished"));
+        }
+        first.get_or_insert_with(|| pictures[0].clone());
+        Ok(pictures)
+    };
+    let at_once = (AT_ONCE_PX / largest.max(1)).clamp(1, 32) as usize;
+    match place {
+        Out::File(file, _) if kind == Kind::Sheet => {
+            let mut pictures = some(shots)?;
+            pictures.iter_mut().zip(names).for_each(|(picture, name)| label::write(picture, name));
+            let sheet = PreviewPicture::sheet(&pictures, COLUMNS);
+            io::write_png_rgba(file, sheet.width, sheet.height, &sheet.rgba)?;
+            *first = Some(sheet);
+            Ok(vec![file.clone()])
+        }
+        Out::File(file, ending) if shots.len() > 1 || ending != "png" => {
+            if shots.iter().any(|shot| size(shot) != (width, height)) {
+                let what = "the pictures of these cameras have several sizes, and an animation has one";
+                return Err(Error::cannot(what, "end --out in `/` for a folder of pictures"));
+            }
+            let mut frames = shots.chunks(at_once).flat_map(|shots| match some(shots) {
+                Ok(pictures) => pictures.into_iter().map(|p| Ok(p.rgba)).collect(),
+                Err(e) => vec![Err(e)],
+            });
+            let animation = Animation { width, height, count: shots.len() as u32, rate: RATE };
+            io::write_animation(file, ending, &animation, &mut frames)?;
+            Ok(vec![file.clone()])
+        }
+        Out::File(file, _) => {
+            let picture = some(shots)?.swap_remove(0);
+            io::write_png_rgba(file, width, height, &picture.rgba)?;
+            Ok(vec![file.clone()])
+        }
+        Out::Folder(folder) => {
+            let files: Vec<PathBuf> = names.iter().map(|name| folder.join(format!("{name}.png"))).collect();
+            for (files, shots) in files.chunks(at_once).zip(shots.chunks(at_once)) {
+                let pictures = some(shots)?;
+                files.par_iter().zip(&pictures).try_for_each(|(file, picture)| {
+                    io::create_folder(file.parent().unwrap_or(folder))?;
+                    io::write_png_rgba(file, picture.width, picture.height, &picture.rgba)
+                })?;
+            }
+            Ok(files)
+        }
+    }
 }
 
 /// What is photographed, by name.
@@ -215,16 +285,15 @@ fn shots(
             preview.cameras(options.cameras.as_deref().unwrap_or_default(), size.unwrap_or(1024))?
         }
         Kind::Sheet => {
-            let mut shots = Vec::new();
-            for (turn, tilt, own) in SHEET {
+            let (mut names, mut shots) = (Vec::new(), Vec::new());
+            for (name, turn, tilt, own) in SHEET {
                 // what has no texture coordinates shows its shape there
-                let own = own.map(|l| if l == Look::Uv && !preview.has_uvs() { Look::Matcap } else { l });
-                shots.push((
-                    around(turn, tilt, size.unwrap_or(512), 1)?.remove(0).camera,
-                    own.unwrap_or(look),
-                ));
+                let is_shape = own == Some(Look::Uv) && !preview.has_uvs();
+                let own = if is_shape { Look::Matcap } else { own.unwrap_or(look) };
+                shots.push((around(turn, tilt, size.unwrap_or(512), 1)?.remove(0).camera, own));
+                names.push(if is_shape { "SHAPE" } else { name }.to_string());
             }
-            return Ok((Vec::new(), shots));
+            return Ok((names, shots));
         }
     };
     let fitted = |c: &Camera| match size.filter(|_| kind == Kind::Cameras) {
@@ -239,33 +308,13 @@ fn shots(
     Ok((cameras.into_iter().map(|c| c.name).collect(), shots))
 }
 
-/// Writes one picture, an animation, or a folder of pictures of these names.
-fn write(place: &Out, names: &[String], pictures: &[PreviewPicture]) -> Result<()> {
-    let PreviewPicture { width, height, .. } = pictures[0];
-    match place {
-        Out::File(file, ending) if pictures.len() > 1 || ending != "png" => {
-            if pictures.iter().any(|p| (p.width, p.height) != (width, height)) {
-                let what = "the pictures of these cameras have several sizes, and an animation has one";
-                return Err(Error::cannot(what, "end --out in `/` for a folder of pictures"));
-            }
-            let frames: Vec<Vec<[u8; 4]>> = pictures.iter().map(|p| p.rgba.clone()).collect();
-            io::write_animation(file, ending, &Animation { width, height, frames: &frames, rate: RATE })
-        }
-        Out::File(file, _) => Ok(io::write_png_rgba(file, width, height, &pictures[0].rgba)?),
-        Out::Folder(folder) => names.par_iter().zip(pictures).try_for_each(|(name, picture)| {
-            let file = folder.join(format!("{name}.png"));
-            io::create_folder(file.parent().unwrap_or(folder))?;
-            Ok(io::write_png_rgba(&file, picture.width, picture.height, &picture.rgba)?)
-        }),
-    }
-}
-
 /// What is shown, and what it is called.
 fn open(invocation: &Invocation, options: &PreviewOptions) -> Result<(Preview, String)> {
     let named = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     match options.path.as_deref().filter(|path| !io::is_folder(path)) {
-        Some(file) => Ok((Preview::of_file(file, options.up)?, named(file))),
+        Some(file) => Ok((Preview::of_file(file, options.up.unwrap_or(Vec3::Y))?, named(file))),
         None => {
+            viewer::no_up(options.up)?;
             let target = RunTarget::find(invocation.common, options.path.as_deref())?;
             if target.guessed {
                 invocation.screen.note("run", &format!("using `{}`", target.run.display()));

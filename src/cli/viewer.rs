@@ -18,15 +18,23 @@ use std::path::{Path, PathBuf};
 pub(super) fn page(
     invocation: &Invocation,
     path: Option<&Path>,
-    up: Vec3,
+    up: Option<Vec3>,
     asked: Option<&Out>,
 ) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
     let named = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let (name, html): (String, Box<dyn FnOnce() -> Result<String>>) =
         match path.filter(|path| !io::is_folder(path)) {
-            Some(file) => (named(file), Box::new(|| viewer_of_file(file, up))),
+            Some(file) => {
+                let html = move || {
+                    let (html, warnings) = viewer_of_file(file, up.unwrap_or(Vec3::Y))?;
+                    warnings.iter().for_each(|w| screen.note("preview: warning", w));
+                    Ok(html)
+                };
+                (named(file), Box::new(html))
+            }
             None => {
+                no_up(up)?;
                 let (target, config) = target(invocation, path)?;
                 let name = io::real_path(&target.run).map_or_else(|_| "run".into(), |run| named(&run));
                 let html = move || {
@@ -56,10 +64,22 @@ pub(super) fn page(
     Ok(())
 }
 
+/// Refuses an axis for a run, which knows where up is.
+pub(super) fn no_up(up: Option<Vec3>) -> Result<()> {
+    match up {
+        Some(_) => Err(Error::usage("`--up` is of files: a run knows where up is", "leave it out")),
+        None => Ok(()),
+    }
+}
+
 /// Serves the page of a run until somebody stops it.
 pub(super) fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     let common = invocation.common;
     let (target, _) = target(invocation, path)?;
+    if common.dry_run {
+        invocation.screen.note("preview", &format!("would serve `{}` on this machine", target.run.display()));
+        return Ok(());
+    }
     let server = Server::open()?;
     let url = server.url();
     if common.json {

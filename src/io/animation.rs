@@ -3,6 +3,7 @@
 use super::read::read_bytes;
 use super::write::{WriteError, write_atomic};
 use super::{Limits, ReadError};
+use crate::image::over_black;
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::io::Write;
@@ -11,16 +12,23 @@ use std::process::{Command, Stdio};
 
 /// Frames of one size, shown over and over.
 #[derive(Clone, Copy, Debug)]
-pub struct Animation<'a> {
+pub struct Animation {
     /// Pixels per row.
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// `[height · width]` pixels each, sRGB-coded with straight alpha.
-    pub frames: &'a [Vec<[u8; 4]>],
+    /// How many there are.
+    pub count: u32,
     /// Frames a second, 1 to 100.
     pub rate: u16,
 }
+
+/// A frame after the other, so that few of them are in memory: `[height · width]` pixels each, sRGB-coded with straight
+/// alpha.
+pub type Frames<'a> = &'a mut dyn Iterator<Item = Result<Vec<[u8; 4]>>>;
+
+/// Frames of a GIF whose colors are chosen at once.
+const AT_ONCE: usize = 8;
 
 /// The endings of [`write_animation`].
 pub const ANIMATIONS: [&str; 3] = ["png", "gif", "mp4"];
@@ -30,32 +38,44 @@ pub const ANIMATIONS: [&str; 3] = ["png", "gif", "mp4"];
 ///
 /// # Errors
 ///
-/// The file cannot be written, the frames cannot be stored so, or there is no working `ffmpeg` for an MP4.
-pub fn write_animation(path: &Path, ending: &str, animation: &Animation) -> Result<()> {
+/// The file cannot be written, the frames cannot be stored so, or there is no working `ffmpeg` for an MP4; or a frame is an
+/// error, which is handed on. Nothing is written then.
+pub fn write_animation(path: &Path, ending: &str, animation: &Animation, frames: Frames) -> Result<()> {
+    let mut failed = None;
+    // up to the first that fails
+    let mut good = frames.map_while(|frame| frame.map_err(|e| failed = Some(e)).ok());
+    let content = |problem: String| WriteError::content(path, problem).into();
     let bytes = match ending {
-        "png" => png_bytes(animation).map_err(|e| WriteError::content(path, e.to_string()))?,
-        "gif" => gif_bytes(animation).map_err(|e| WriteError::content(path, e.to_string()))?,
-        _ => mp4_bytes(animation)?,
+        "png" => png_bytes(animation, &mut good).map_err(|e| content(e.to_string())),
+        "gif" => gif_bytes(animation, &mut good).map_err(|e| content(e.to_string())),
+        _ => mp4_bytes(animation, &mut good),
     };
-    Ok(write_atomic(path, &bytes)?)
+    match failed {
+        Some(e) => Err(e),
+        None => Ok(write_atomic(path, &bytes?)?),
+    }
 }
 
-fn png_bytes(animation: &Animation) -> Result<Vec<u8>, png::EncodingError> {
+type Good<'a> = &'a mut dyn Iterator<Item = Vec<[u8; 4]>>;
+
+fn png_bytes(animation: &Animation, frames: Good) -> Result<Vec<u8>, png::EncodingError> {
     let mut out = Vec::new();
     let mut encoder = png::Encoder::new(&mut out, animation.width, animation.height);
     encoder.set_color(png::ColorType::Rgba);
     encoder.set_depth(png::BitDepth::Eight);
     // a third larger than the default in a tenth of the time
     encoder.set_compression(png::Compression::Fast);
-    encoder.set_animated(animation.frames.len() as u32, 0)?;
+    encoder.set_animated(animation.count, 0)?;
     encoder.set_frame_delay(1, animation.rate)?;
     let mut writer = encoder.write_header()?;
-    animation.frames.iter().try_for_each(|frame| writer.write_image_data(frame.as_flattened()))?;
+    for frame in frames {
+        writer.write_image_data(frame.as_flattened())?;
+    }
     writer.finish()?;
     Ok(out)
 }
 
-fn gif_bytes(animation: &Animation) -> Result<Vec<u8>, gif::EncodingError> {
+fn gif_bytes(animation: &Animation, frames: Good) -> Result<Vec<u8>, gif::EncodingError> {
     let (width, height) = (animation.width as u16, animation.height as u16);
     let frame = |pixels: &Vec<[u8; 4]>| {
         let solid = |&[r, g, b, a]: &[u8; 4]| if a < 128 { [0; 4] } else { [r, g, b, 255] };
@@ -66,16 +86,22 @@ fn gif_bytes(animation: &Animation) -> Result<Vec<u8>, gif::EncodingError> {
         frame.dispose = gif::DisposalMethod::Background;
         frame
     };
-    let frames: Vec<gif::Frame> = animation.frames.par_iter().map(frame).collect();
     let mut out = Vec::new();
     let mut encoder = gif::Encoder::new(&mut out, width, height, &[])?;
     encoder.set_repeat(gif::Repeat::Infinite)?;
-    frames.iter().try_for_each(|frame| encoder.write_frame(frame))?;
+    loop {
+        let some: Vec<Vec<[u8; 4]>> = frames.take(AT_ONCE).collect();
+        if some.is_empty() {
+            break;
+        }
+        let some: Vec<gif::Frame> = some.par_iter().map(frame).collect();
+        some.iter().try_for_each(|frame| encoder.write_frame(frame))?;
+    }
     drop(encoder);
     Ok(out)
 }
 
-fn mp4_bytes(animation: &Animation) -> Result<Vec<u8>> {
+fn mp4_bytes(animation: &Animation, frames: Good) -> Result<Vec<u8>> {
     let failed = |problem: String| {
         let hint = "install ffmpeg with libx264, or end --out in .gif, .png or / instead";
         Error::cannot(format!("no film was made: {problem}"), hint)
@@ -110,9 +136,8 @@ fn mp4_bytes(animation: &Animation) -> Result<Vec<u8>> {
         .spawn()
         .map_err(|e| failed(format!("`ffmpeg` cannot be started: {e}")))?;
     if let Some(mut input) = ffmpeg.stdin.take() {
-        let over = |v: u8, a: u8| (u16::from(v) * u16::from(a) / 255) as u8;
-        for frame in animation.frames {
-            let rgb: Vec<u8> = frame.iter().flat_map(|&[r, g, b, a]| [r, g, b].map(|v| over(v, a))).collect();
+        for frame in frames {
+            let rgb: Vec<u8> = frame.into_iter().flat_map(over_black).collect();
             if input.write_all(&rgb).is_err() {
                 break; // it has ended: what it says of that is told below
             }
@@ -138,8 +163,8 @@ mod tests {
     #[test]
     fn frames_come_back_in_their_order() {
         let frames = [[255, 0, 0, 255], [0, 255, 0, 128], [0, 0, 0, 0]].map(|p| vec![p; 12]);
-        let animation = Animation { width: 4, height: 3, frames: &frames, rate: 10 };
-        let bytes = png_bytes(&animation).unwrap();
+        let animation = Animation { width: 4, height: 3, count: 3, rate: 10 };
+        let bytes = png_bytes(&animation, &mut frames.iter().cloned()).unwrap();
         let decoder = PngDecoder::new(Cursor::new(&bytes)).unwrap().apng().unwrap();
         let found = decoder.into_frames().collect_frames().unwrap();
         assert_eq!(found.len(), 3);
@@ -149,7 +174,7 @@ mod tests {
         }
         let mut options = gif::DecodeOptions::new();
         options.set_color_output(gif::ColorOutput::RGBA);
-        let bytes = gif_bytes(&animation).unwrap();
+        let bytes = gif_bytes(&animation, &mut frames.iter().cloned()).unwrap();
         let mut decoder = options.read_info(&bytes[..]).unwrap();
         let mut colors = Vec::new();
         while let Some(frame) = decoder.read_next_frame().unwrap() {
@@ -157,5 +182,17 @@ mod tests {
             colors.push(frame.buffer[..4].to_vec());
         }
         assert_eq!(colors, [vec![255, 0, 0, 255], vec![0, 255, 0, 255], vec![0, 0, 0, 0]]);
+    }
+
+    #[test]
+    fn a_frame_that_fails_leaves_no_file() {
+        let dir = tempfile::tempdir().unwrap();
+        let animation = Animation { width: 2, height: 1, count: 3, rate: 10 };
+        for ending in ["png", "gif"] {
+            let file = dir.path().join(ending);
+            let mut frames = [Ok(vec![[9; 4]; 2]), Err(Error::cannot("stopped", "go on"))].into_iter();
+            let error = write_animation(&file, ending, &animation, &mut frames).unwrap_err();
+            assert!(error.to_string().contains("stopped") && !file.exists(), "{ending}: {error}");
+        }
     }
 }

@@ -19,7 +19,7 @@ mod torch;
 mod write;
 
 pub use self::exr::{ExrImage, read_exr, write_exr};
-pub use animation::{ANIMATIONS, Animation, write_animation};
+pub use animation::{ANIMATIONS, Animation, Frames, write_animation};
 pub use error::ReadError;
 pub use folder::{
     Lock, LockError, any_file, append, clear_folder, create_folder, exists, file_size, free_bytes, is_file,

@@ -3,7 +3,7 @@
 use super::{STYLE, duration, fill, link, picture_url};
 use crate::Result;
 use crate::config::{Config, NAMES, Sources, Stage, called};
-use crate::image::{Photo, quantize, reduce_photo, working_size};
+use crate::image::{over_black, reduce_photo, working_size};
 use crate::io::{self, Limits};
 use crate::run::{Record, State, read_record, read_status};
 use minijinja::context;
@@ -130,14 +130,11 @@ fn picture(run: &Path) -> Option<String> {
     };
     let file = folders.filter_map(first).next()?;
     let photo = io::read_photo(&file, None, &Limits::default()).ok()?;
-    let small = over_black(reduce_photo(&photo, working_size(photo.width, photo.height, PICTURE_PX)));
+    let mut small = reduce_photo(&photo, working_size(photo.width, photo.height, PICTURE_PX));
+    for (c, a) in small.rgb.iter_mut().zip(small.alpha.take().unwrap_or_default()) {
+        *c = over_black([c[0], c[1], c[2], a]);
+    }
     Some(picture_url(&io::jpeg_bytes(&small, 78, &file).ok()?))
-}
-
-fn over_black(photo: Photo) -> Photo {
-    let Some(alpha) = &photo.alpha else { return photo };
-    let dim = |(c, a): (&[u8; 3], &u8)| c.map(|v| quantize(v as f32 / 255.0 * *a as f32 / 255.0));
-    Photo { rgb: photo.rgb.iter().zip(alpha).map(dim).collect(), alpha: None, ..photo }
 }
 
 /// The way from a folder to a file; the file itself where one of them is not there.

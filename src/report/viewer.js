@@ -354,8 +354,13 @@ class Painter {
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.enable(gl.CULL_FACE);
     gl.depthMask(false);
-    // they have color, but no shape
-    if (mode < 2) this.shells.forEach(paint);
+    // they have color, but no shape; unless there is nothing else
+    const alone = mode >= 2 && !this.solid.length;
+    if (alone) {
+      gl.depthMask(true);
+      gl.disable(gl.BLEND);
+    }
+    if (mode < 2 || alone) this.shells.forEach(paint);
     gl.depthMask(true);
     gl.bindVertexArray(null);
   }

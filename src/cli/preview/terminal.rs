@@ -2,7 +2,7 @@
 //! iTerm2, as Sixel, else as half-blocks of 24-bit color.
 
 use crate::Result;
-use crate::image::Photo;
+use crate::image::{CODED, Photo, average, over_black};
 use crate::io;
 use crate::pipeline::PreviewPicture;
 use crate::report::base64;
@@ -65,28 +65,22 @@ pub(super) fn shown(picture: &PreviewPicture) -> Result<String> {
     })
 }
 
-fn over_black([r, g, b, a]: [u8; 4]) -> [u8; 3] {
-    [r, g, b].map(|v| (u16::from(v) * u16::from(a) / 255) as u8)
-}
-
 /// At most so wide; each pixel the mean of those it covers.
 fn smaller(picture: &PreviewPicture, most: u32) -> PreviewPicture {
     let width = picture.width.min(most);
     let height = (u64::from(picture.height) * u64::from(width) / u64::from(picture.width)).max(1) as u32;
-    let part = |i: u32, to: u32, from: u32| i * from / to..((i + 1) * from / to).max(i * from / to + 1);
-    let mean = |x: u32, y: u32| {
-        let (mut sum, mut alpha, mut count) = ([0u32; 3], 0, 0);
-        for v in part(y, height, picture.height) {
-            for u in part(x, width, picture.width) {
-                let [r, g, b, a] = picture.rgba[(v * picture.width + u) as usize].map(u32::from);
-                sum = [sum[0] + r * a, sum[1] + g * a, sum[2] + b * a];
-                (alpha, count) = (alpha + a, count + 1);
-            }
-        }
-        let [r, g, b] = sum.map(|s| (s / alpha.max(1)) as u8);
-        [r, g, b, (alpha / count) as u8]
+    // what is transparent has no color that counts
+    let over = |&p: &[u8; 4]| {
+        let [r, g, b] = over_black(p);
+        [r, g, b, p[3]]
     };
-    let rgba = (0..height).flat_map(|y| (0..width).map(move |x| mean(x, y))).collect();
+    let bytes: Vec<u8> = picture.rgba.iter().flat_map(over).collect();
+    let small = average(&bytes, 4, (picture.width, picture.height), (width, height), CODED);
+    let straight = |&[r, g, b, a]: &[u8; 4]| {
+        let [r, g, b] = [r, g, b].map(|v| (u32::from(v) * 255 / u32::from(a.max(1))).min(255) as u8);
+        [r, g, b, a]
+    };
+    let rgba = small.as_chunks::<4>().0.iter().map(straight).collect();
     PreviewPicture { width, height, rgba }
 }
 
@@ -185,7 +179,7 @@ mod tests {
         assert_eq!(blocks(&picture), format!("{first} \x1b[38;2;0;0;255m\u{2580}\x1b[0m\n"));
         // halves: red and nothing above nothing and nothing is red of half the opacity
         let four = PreviewPicture { width: 2, height: 2, rgba: vec![red, red, none, none] };
-        assert_eq!(smaller(&four, 1).rgba, [[255, 0, 0, 127]]);
+        assert_eq!(smaller(&four, 1).rgba, [[255, 0, 0, 128]]);
     }
 
     #[test]

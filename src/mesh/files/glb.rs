@@ -94,7 +94,7 @@ pub fn to_glb(
             let (bytes, ending) = encode(name, picture, quality)?;
             Ok(document.texture(name, &bytes, ending))
         };
-        let color = picture("base colour", &texture.color, options.jpeg_quality)?;
+        let color = picture("base color", &texture.color, options.jpeg_quality)?;
         main.pbr_metallic_roughness.base_color_texture = Some(info(color));
         if let Some(map) = &texture.normal {
             let index = picture("normal map", map, None)?;
@@ -215,7 +215,7 @@ fn lobe_notes(lobes: &Lobes, textures: &[Index<json::Texture>]) -> json::Extras 
         "functions": lobes.pictures.len(),
         "scale": lobes.scale,
         "decode": "(byte - 128) / 127 * scale",
-        "color": "base colour + sum of decoded lobes times basis, all sRGB-coded",
+        "color": "base color + sum of decoded lobes times basis, all sRGB-coded",
     });
     let notes = json!({"view_dependent_color": model, "lobes": list.collect::<Vec<Value>>()});
     extras(notes)

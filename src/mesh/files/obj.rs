@@ -51,7 +51,7 @@ fn write(out: &mut Vec<u8>, file: &FileMesh, stem: &str, name: &str) -> std::io:
     if textured {
         writeln!(out, "{GENERATOR}: metres, +Y up\nmtllib {stem}.mtl\no {name}")?;
     } else {
-        writeln!(out, "{GENERATOR}: metres, +Y up, sRGB vertex colours\no {name}")?;
+        writeln!(out, "{GENERATOR}: metres, +Y up, sRGB vertex colors\no {name}")?;
     }
     write_vertices(out, file)?;
     for uv in &file.uvs {

@@ -42,7 +42,7 @@ fn bytes(mesh: &FileMesh, picture: Option<&str>) -> Vec<u8> {
     let far = mesh.is_far();
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     header += concat!("comment tiface ", env!("CARGO_PKG_VERSION"), "\n");
-    header += "comment dataset world, dataset units; vertex colours are sRGB\n";
+    header += "comment dataset world, dataset units; vertex colors are sRGB\n";
     if let Some(name) = picture {
         header += &format!("comment TextureFile {name}\n");
     }

@@ -15,6 +15,7 @@ use crate::report::{ViewRow, Viewer, ViewerCamera, viewer_html};
 use crate::run::read_record;
 use crate::{Error, Quiet};
 use glam::Vec3;
+use std::cell::RefCell;
 use std::path::Path;
 
 /// Bytes of a mesh inside a page at most: 200,000 triangles with a texture.
@@ -83,24 +84,36 @@ pub fn head_page(line: &Line) -> Result<String> {
     viewer_html(&viewer, &rows)
 }
 
-/// Returns a page with the mesh of a GLB, OBJ or PLY file to turn. `up` is where its up is.
+/// Returns a page with the mesh of a GLB, OBJ or PLY file to turn, and what of it cannot be shown. `up` is where its up is.
 ///
 /// # Errors
 ///
 /// The file cannot be read, or shows what a page cannot.
-pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<String> {
+pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<(String, Vec<String>)> {
     let bytes = io::read_bytes(path, &Limits::default())?;
-    let open = || Ok(open_mesh(path)?.head);
+    let warnings = RefCell::new(Vec::new());
+    let open = || {
+        let opened = open_mesh(path)?;
+        warnings.replace(opened.warnings);
+        Ok(opened.head)
+    };
     let as_glb = |head: &HeadMesh| {
         let options =
             ExportOptions { world_from_mesh: head.world_from_scene, up, ..ExportOptions::default() };
         to_glb(&head.mesh, head.texture.as_ref(), head.shells.as_ref(), &options)
     };
     // as it is, with all that a GLB can say, unless it must be turned
-    let glb = if bytes.starts_with(b"glTF") && up == Vec3::Y { bytes } else { as_glb(&open()?)? };
+    let is_glb = bytes.starts_with(b"glTF");
+    let glb = if is_glb && up == Vec3::Y { bytes } else { as_glb(&open()?)? };
+    if is_glb && up != Vec3::Y {
+        let what =
+            "turned by `--up`, it has lost its soft layers and what depends on the view, if there were any";
+        warnings.borrow_mut().push(what.into());
+    }
     let (glb, note) = small(&glb, path, open, as_glb)?;
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    viewer_html(&Viewer { name, note, front: [0.0, 0.0, 1.0], glb, cameras: Vec::new() }, &[])
+    let html = viewer_html(&Viewer { name, note, front: [0.0, 0.0, 1.0], glb, cameras: Vec::new() }, &[])?;
+    Ok((html, warnings.into_inner()))
 }
 
 /// A copy for a page, and how it differs. Of one that is too large, `head` gives the mesh and `as_glb` the file again.
