@@ -59,12 +59,28 @@ print(*glob.glob(i.find_spec("onnxruntime").submodule_search_locations[0] + "/ca
 }
 
 # Tests skip aloud what a machine cannot give; here those lines are shown again, so that nobody
-# takes a skipped test for a passed one. One build serves them all: with the networks, on both engines.
+# takes a skipped test for a passed one. One build serves them all: with the networks, on both engines, and with the
+# kernels of GPUs.
 tests() {
-  cargo test --release --features matting --no-fail-fast -- --nocapture 2>&1 | tee "$scratch/tests.log"
+  cargo test --release --features matting,wgpu --no-fail-fast -- --nocapture 2>&1 | tee "$scratch/tests.log"
   local ended=${PIPESTATUS[0]}
   grep -h '^skipped:' "$scratch/tests.log" | sort -u > "$scratch/skipped"
   return "$ended"
+}
+
+# A Vulkan in software for the kernels of GPUs, rather than whichever adapter is here; left out aloud where apt cannot
+# get it.
+vulkan_is_here() {
+  driver() { find /usr/share/vulkan/icd.d -name 'lvp_icd*.json' 2> /dev/null | head -n 1; }
+  if [ -z "$(driver)" ] && command -v apt-get > /dev/null; then
+    local sudo=
+    [ "$(id -u)" = 0 ] || sudo=sudo
+    $sudo apt-get update -qq && $sudo apt-get install -y -qq --no-install-recommends mesa-vulkan-drivers > /dev/null
+  fi
+  [ -n "$(driver)" ] || return
+  VK_DRIVER_FILES=$(driver)
+  export VK_DRIVER_FILES
+  echo "$VK_DRIVER_FILES"
 }
 
 example() { "$target/release/examples/$1" "$2"; }
@@ -128,8 +144,12 @@ step "lints, all features" cargo clippy --release --all-targets --all-features -
 step "lints, default features" cargo clippy --release -- -D warnings
 step "lints, without the learned fields" cargo clippy --release --no-default-features --lib -- -D warnings
 step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --all-features --no-deps
-step "build" cargo build --release --features matting --bins --examples --benches
+step "build" cargo build --release --features matting,wgpu --bins --examples --benches
 step "ONNX Runtime is here" onnx_runtime
+printf '\n== Vulkan is here\n'
+if ! vulkan_is_here; then
+  results+=("SKIPPED a Vulkan in software for the kernels of GPUs: apt cannot install mesa-vulkan-drivers")
+fi
 step "tests" tests
 blender=yes
 printf '\n== Blender is here\n'

@@ -5,6 +5,8 @@
 
 pub mod adam;
 pub mod cg;
+#[cfg(feature = "wgpu")]
+pub mod gpu;
 pub mod hash;
 pub mod march;
 pub mod matrix;

@@ -1,0 +1,473 @@
+//! The hash encoding of [`crate::kernel::hash`]: features with Jacobian, and their scatter.
+
+use super::device::{Atomics, Buffer, Device};
+use crate::kernel::hash::Level;
+use cubecl::prelude::*;
+
+/// Samples a group of threads handles.
+const GROUP: u32 = 256;
+
+/// Words that describe a level: scale, resolution, entries, offset, whether it is hashed.
+const LEVEL: usize = 5;
+
+/// Steps that the bound on a sum is counted in: what is left up to 2³¹ takes the rounding of 10⁸ terms.
+const MOST: f32 = 2e9;
+
+/// The cell of a position at a level: its lowest corner and the position inside it.
+#[derive(CubeType)]
+struct Cell {
+    low_x: u32,
+    low_y: u32,
+    low_z: u32,
+    fx: f32,
+    fy: f32,
+    fz: f32,
+}
+
+/// The cell of sample `s`.
+#[cube]
+fn cell(levels: &[u32], level: usize, x: &[f32], s: usize, capacity: usize, world: f32) -> Cell {
+    let scale = f32::reinterpret(levels[level * LEVEL]);
+    let px = fma(scale, x[s] * world + 0.5f32, 0.5f32);
+    let py = fma(scale, x[capacity + s] * world + 0.5f32, 0.5f32);
+    let pz = fma(scale, x[2 * capacity + s] * world + 0.5f32, 0.5f32);
+    let (lx, ly, lz) = (px.floor(), py.floor(), pz.floor());
+    Cell {
+        low_x: u32::cast_from(i32::cast_from(lx)),
+        low_y: u32::cast_from(i32::cast_from(ly)),
+        low_z: u32::cast_from(i32::cast_from(lz)),
+        fx: px - lx,
+        fy: py - ly,
+        fz: pz - lz,
+    }
+}
+
+/// The entry of a corner: bit 0 of `k` says +1 along x, bit 1 along y, bit 2 along z.
+#[cube]
+fn entry(levels: &[u32], level: usize, cell: &Cell, #[comptime] k: u32) -> usize {
+    let (x, y, z) = (cell.low_x + (k & 1), cell.low_y + ((k >> 1) & 1), cell.low_z + (k >> 2));
+    let entries = levels[level * LEVEL + 2];
+    let r = levels[level * LEVEL + 1];
+    let own = if levels[level * LEVEL + 4] == 1 {
+        (x ^ (y * 2_654_435_761u32) ^ (z * 805_459_861u32)) & (entries - 1)
+    } else {
+        (x + r * (y + r * z)) % entries
+    };
+    (levels[level * LEVEL + 3] + own) as usize
+}
+
+/// The weight of a corner along one axis.
+#[cube]
+fn along(f: f32, #[comptime] up: bool) -> f32 {
+    if up { 0.5f32 + (f - 0.5f32) } else { 0.5f32 - (f - 0.5f32) }
+}
+
+/// The slope of that weight, times `v`.
+#[cube]
+fn signed(v: f32, #[comptime] up: bool) -> f32 {
+    if up { v } else { -v }
+}
+
+/// Features of all levels, planes `[2 · levels, capacity]`, and their slopes `[2 · levels · 3, capacity]`. Samples
+/// from `count[0]` on read zero.
+#[cube(launch)]
+fn gather(
+    table: &[Vector<f32, Const<2>>],
+    levels: &[u32],
+    x: &[f32],
+    count: &[u32],
+    value: &mut [f32],
+    jacobian: &mut [f32],
+    capacity: u32,
+    world: f32,
+    #[comptime] slopes: bool,
+) {
+    let capacity = capacity as usize;
+    let s = ABSOLUTE_POS_X as usize;
+    let level = CUBE_POS_Y as usize;
+    if s < capacity {
+        let mut v = Vector::<f32, Const<2>>::new(0.0f32);
+        let mut jx = Vector::<f32, Const<2>>::new(0.0f32);
+        let mut jy = Vector::<f32, Const<2>>::new(0.0f32);
+        let mut jz = Vector::<f32, Const<2>>::new(0.0f32);
+        if s < count[0] as usize {
+            let cell = cell(levels, level, x, s, capacity, world);
+            let slope = f32::reinterpret(levels[level * LEVEL]) * world;
+            #[unroll]
+            for k in 0..8u32 {
+                let (ux, uy, uz) = comptime!((k & 1 == 1, k & 2 == 2, k & 4 == 4));
+                let e = table[entry(levels, level, &cell, k)];
+                let (wx, wy, wz) = (along(cell.fx, ux), along(cell.fy, uy), along(cell.fz, uz));
+                v += e * Vector::new(wx * wy * wz);
+                if slopes {
+                    jx += e * Vector::new(signed(wy * wz * slope, ux));
+                    jy += e * Vector::new(signed(wx * wz * slope, uy));
+                    jz += e * Vector::new(signed(wx * wy * slope, uz));
+                }
+            }
+        }
+        #[unroll]
+        for f in 0..2usize {
+            let plane = 2 * level + f;
+            value[plane * capacity + s] = v.extract(f);
+            if slopes {
+                jacobian[3 * plane * capacity + s] = jx.extract(f);
+                jacobian[(3 * plane + 1) * capacity + s] = jy.extract(f);
+                jacobian[(3 * plane + 2) * capacity + s] = jz.extract(f);
+            }
+        }
+    }
+}
+
+/// A word that threads add floats to.
+#[cube]
+trait Sum: Send + Sync + 'static {
+    /// What lies in memory.
+    type Word: CubePrimitive;
+
+    /// Adds `v`, where words count it in steps of `1 / unit`.
+    fn add(word: &Atomic<Self::Word>, v: f32, unit: f32);
+}
+
+/// [`Atomics::Native`].
+struct Native;
+/// [`Atomics::Exchange`].
+struct Exchange;
+/// [`Atomics::Fixed`].
+struct Fixed;
+
+#[cube]
+impl Sum for Native {
+    type Word = f32;
+
+    fn add(word: &Atomic<f32>, v: f32, _unit: f32) {
+        word.fetch_add(v);
+    }
+}
+
+#[cube]
+impl Sum for Exchange {
+    type Word = u32;
+
+    fn add(word: &Atomic<u32>, v: f32, _unit: f32) {
+        let mut seen = word.load();
+        let mut waiting = true;
+        while waiting {
+            let found = word.compare_exchange_weak(seen, u32::reinterpret(f32::reinterpret(seen) + v));
+            waiting = found != seen;
+            seen = found;
+        }
+    }
+}
+
+#[cube]
+impl Sum for Fixed {
+    type Word = i32;
+
+    fn add(word: &Atomic<i32>, v: f32, unit: f32) {
+        word.fetch_add(i32::cast_from((v * unit).round()));
+    }
+}
+
+/// Adds to the table what [`crate::kernel::hash::scatter`] adds.
+#[cube(launch)]
+fn scatter<S: Sum>(
+    gradient: &[Atomic<S::Word>],
+    levels: &[u32],
+    x: &[f32],
+    count: &[u32],
+    g_value: &[f32],
+    q: &[f32],
+    g_normal: &[f32],
+    units: &[f32],
+    capacity: u32,
+    world: f32,
+) {
+    let capacity = capacity as usize;
+    let s = ABSOLUTE_POS_X as usize;
+    let level = CUBE_POS_Y as usize;
+    if s < count[0] as usize {
+        let cell = cell(levels, level, x, s, capacity, world);
+        let slope = f32::reinterpret(levels[level * LEVEL]) * world;
+        let nx = g_normal[s] * slope;
+        let ny = g_normal[capacity + s] * slope;
+        let nz = g_normal[2 * capacity + s] * slope;
+        let plane = 2 * level * capacity + s;
+        let (g0, g1, q0, q1) = (g_value[plane], g_value[plane + capacity], q[plane], q[plane + capacity]);
+        let unit = units[level];
+        #[unroll]
+        for k in 0..8u32 {
+            let (ux, uy, uz) = comptime!((k & 1 == 1, k & 2 == 2, k & 4 == 4));
+            let (wx, wy, wz) = (along(cell.fx, ux), along(cell.fy, uy), along(cell.fz, uz));
+            let w = wx * wy * wz;
+            let d = signed(nx * (wy * wz), ux) + signed(ny * (wx * wz), uy) + signed(nz * (wx * wy), uz);
+            let e = 2 * entry(levels, level, &cell, k);
+            S::add(&gradient[e], g0 * w + q0 * d, unit);
+            S::add(&gradient[e + 1], g1 * w + q1 * d, unit);
+        }
+    }
+}
+
+/// Steps per 1 in which a level's sums are counted, from a bound on them: the sum of all that is added, as if it
+/// went to one entry. One group of threads a level; in a fixed order.
+#[cube(launch)]
+fn bound(
+    levels: &[u32],
+    count: &[u32],
+    g_value: &[f32],
+    q: &[f32],
+    g_normal: &[f32],
+    units: &mut [f32],
+    capacity: u32,
+    world: f32,
+) {
+    let capacity = capacity as usize;
+    let level = CUBE_POS_X as usize;
+    let unit = UNIT_POS as usize;
+    let slope = f32::reinterpret(levels[level * LEVEL]) * world;
+    let mut own = 0.0f32;
+    for s in range_stepped(unit, count[0] as usize, GROUP as usize) {
+        let n = g_normal[s].abs() + g_normal[capacity + s].abs() + g_normal[2 * capacity + s].abs();
+        let plane = 2 * level * capacity + s;
+        let g = max(g_value[plane].abs(), g_value[plane + capacity].abs());
+        own += g + max(q[plane].abs(), q[plane + capacity].abs()) * n * slope;
+    }
+    let mut sums = Shared::<[f32]>::new_slice(GROUP as usize);
+    sums[unit] = own;
+    sync_cube();
+    if unit == 0 {
+        let mut all = 0.0f32;
+        for i in 0..GROUP as usize {
+            all += sums[i];
+        }
+        units[level] = MOST / max(all, 1e-30f32);
+    }
+}
+
+/// Whole numbers become floats, in place.
+#[cube(launch)]
+fn settle(gradient: &mut [u32], levels: &[u32], units: &[f32]) {
+    let level = CUBE_POS_Y as usize;
+    let first = 2 * levels[level * LEVEL + 3] as usize;
+    let end = first + 2 * levels[level * LEVEL + 2] as usize;
+    let i = first + ABSOLUTE_POS_X as usize;
+    if i < end {
+        gradient[i] = u32::reinterpret(f32::cast_from(i32::reinterpret(gradient[i])) / units[level]);
+    }
+}
+
+/// A hash grid on a device.
+pub struct Grid {
+    levels: Buffer,
+    units: Buffer,
+    active: usize,
+    /// Entries of the largest level.
+    largest: usize,
+    /// d x01 / d position.
+    world: f32,
+}
+
+impl Grid {
+    /// Of these levels, all of them active, over `[-radius, radius]³`.
+    pub fn new(device: &Device, levels: &[Level], radius: f32) -> Grid {
+        let words = |l: &Level| {
+            [l.scale.to_bits(), l.resolution, l.entries, l.offset as u32, u32::from(l.is_hashed())]
+        };
+        Grid {
+            levels: device.upload(&levels.iter().flat_map(words).collect::<Vec<u32>>()),
+            units: device.zeros(levels.len()),
+            active: levels.len(),
+            largest: levels.iter().map(|l| l.entries as usize).max().unwrap_or(0),
+            world: 0.5 / radius,
+        }
+    }
+
+    /// Writes features and, where asked for, their Jacobian by position.
+    ///
+    /// # Shapes
+    ///
+    /// - table: `[entries, 2]`; x: planes `[3, capacity]`; count: `[1]`, the samples there are
+    /// - value: planes `[2 · levels, capacity]`; jacobian: planes `[2 · levels · 3, capacity]`, zeros behind the last
+    ///   sample
+    pub fn gather(
+        &self,
+        device: &Device,
+        table: &Buffer,
+        x: &Buffer,
+        count: &Buffer,
+        value: &Buffer,
+        jacobian: Option<&Buffer>,
+    ) {
+        let capacity = x.words() / 3;
+        gather::launch(
+            device.launch(),
+            CubeCount::Static((capacity as u32).div_ceil(GROUP), self.active as u32, 1),
+            CubeDim::new_1d(GROUP),
+            table.arg(),
+            self.levels.arg(),
+            x.arg(),
+            count.arg(),
+            value.arg(),
+            jacobian.unwrap_or(value).arg(),
+            capacity as u32,
+            self.world,
+            jacobian.is_some(),
+        );
+    }
+
+    /// Adds the gradient of the table, zero before: see [`crate::kernel::hash::scatter`]. With [`Atomics::Fixed`] once
+    /// a step.
+    ///
+    /// # Shapes
+    ///
+    /// - gradient: `[entries, 2]`; x, g_normal: planes `[3, capacity]`; g_value, q: planes `[2 · levels, capacity]`
+    pub fn scatter(
+        &self,
+        device: &Device,
+        gradient: &Buffer,
+        x: &Buffer,
+        count: &Buffer,
+        g_value: &Buffer,
+        q: &Buffer,
+        g_normal: &Buffer,
+    ) {
+        let capacity = x.words() / 3;
+        let dim = CubeDim::new_1d(GROUP);
+        let fixed = device.atomics() == Atomics::Fixed;
+        if fixed {
+            bound::launch(
+                device.launch(),
+                CubeCount::new_1d(self.active as u32),
+                dim,
+                self.levels.arg(),
+                count.arg(),
+                g_value.arg(),
+                q.arg(),
+                g_normal.arg(),
+                self.units.arg(),
+                capacity as u32,
+                self.world,
+            );
+        }
+        let launch = match device.atomics() {
+            Atomics::Native => scatter::launch::<Native>,
+            Atomics::Exchange => scatter::launch::<Exchange>,
+            Atomics::Fixed => scatter::launch::<Fixed>,
+        };
+        launch(
+            device.launch(),
+            CubeCount::Static((capacity as u32).div_ceil(GROUP), self.active as u32, 1),
+            dim,
+            gradient.arg(),
+            self.levels.arg(),
+            x.arg(),
+            count.arg(),
+            g_value.arg(),
+            q.arg(),
+            g_normal.arg(),
+            self.units.arg(),
+            capacity as u32,
+            self.world,
+        );
+        if fixed {
+            let count = CubeCount::Static((2 * self.largest as u32).div_ceil(GROUP), self.active as u32, 1);
+            settle::launch(device.launch(), count, dim, gradient.arg(), self.levels.arg(), self.units.arg());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::tests::{agree, device, devices, planes};
+    use super::*;
+    use crate::kernel::hash;
+    use crate::kernel::rng;
+
+    const SAMPLES: usize = 1000;
+    const CAPACITY: usize = 1024;
+    const RADIUS: f32 = 2.0;
+
+    /// The published grid but for its size, and samples anywhere in the box. Positions and scales have few digits, so
+    /// that their products are the same whether fused with what is added or not.
+    fn grid() -> (Vec<Level>, Vec<[f32; 2]>, Vec<[f32; 3]>) {
+        let mut levels = hash::levels(16, 16, 1.447, 12);
+        levels.iter_mut().for_each(|l| l.scale = l.scale.round());
+        let table =
+            (0..hash::entries(&levels)).map(|i| [(i as f32 * 0.73).sin(), (i as f32 * 0.31).cos()]).collect();
+        let at = |i: usize| rng::below(1, 2, i as u64, 1025) as f32 / 256.0 - RADIUS;
+        (levels, table, (0..SAMPLES).map(|i| [at(3 * i), at(3 * i + 1), at(3 * i + 2)]).collect())
+    }
+
+    fn inside(x: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        x.iter().map(|p| p.map(|c| c * (0.5 / RADIUS) + 0.5)).collect()
+    }
+
+    fn filled<const W: usize>(stream: u64) -> Vec<[f32; W]> {
+        let at = |i: usize| rng::normal(1, stream, i as u64);
+        (0..SAMPLES).map(|s| std::array::from_fn(|k| at(W * s + k))).collect()
+    }
+
+    #[test]
+    fn features_and_slopes_are_those_of_the_cpu() {
+        let Some(device) = device() else { return };
+        let (levels, table, x) = grid();
+        let n = levels.len();
+        let mut value = vec![[0f32; 2]; n * SAMPLES];
+        let mut jacobian = vec![[0f32; 6]; n * SAMPLES];
+        hash::gather(&levels, &table, &inside(&x), 0.5 / RADIUS, &mut value, Some(&mut jacobian));
+        let want = |l: usize| &value[l * SAMPLES..][..SAMPLES];
+        let want: Vec<f32> = (0..n).flat_map(|l| planes(want(l), CAPACITY)).collect();
+        let slopes: Vec<f32> =
+            (0..n).flat_map(|l| planes(&jacobian[l * SAMPLES..][..SAMPLES], CAPACITY)).collect();
+
+        let on = Grid::new(&device, &levels, RADIUS);
+        let (table, x) = (device.upload(&table), device.upload(&planes(&x, CAPACITY)));
+        let (v, j) = (device.scratch(want.len()), device.scratch(slopes.len()));
+        let count = device.upload(&[SAMPLES as u32]);
+        on.gather(&device, &table, &x, &count, &v, Some(&j));
+        let (value, jacobian) = (device.read::<f32>(&v), device.read::<f32>(&j));
+        for l in 0..n {
+            let span = |planes: usize| l * planes * CAPACITY..(l + 1) * planes * CAPACITY;
+            agree("hash features", &value[span(2)], &want[span(2)], 1e-5);
+            agree("hash slopes", &jacobian[span(6)], &slopes[span(6)], 1e-5);
+        }
+        on.gather(&device, &table, &x, &count, &v, None);
+        assert_eq!(device.read::<f32>(&v), value);
+    }
+
+    #[test]
+    fn the_scatter_is_that_of_the_cpu_however_it_adds() {
+        let (levels, table, x) = grid();
+        let n = levels.len();
+        let pair = |stream: u64| -> Vec<[f32; 2]> {
+            (0..n as u64).flat_map(|l| filled::<2>(100 * stream + l)).collect()
+        };
+        let (g, q, normal) = (pair(1), pair(2), filled::<3>(5));
+        let mut want = vec![[0f32; 2]; table.len()];
+        hash::scatter(&levels, &mut want, &inside(&x), 0.5 / RADIUS, &g, &q, &normal);
+        for device in devices() {
+            let on = Grid::new(&device, &levels, RADIUS);
+            let x = device.upload(&planes(&x, CAPACITY));
+            let count = device.upload(&[SAMPLES as u32]);
+            let level_planes = |v: &[[f32; 2]]| -> Vec<f32> {
+                (0..n).flat_map(|l| planes(&v[l * SAMPLES..][..SAMPLES], CAPACITY)).collect()
+            };
+            let (g, q) = (device.upload(&level_planes(&g)), device.upload(&level_planes(&q)));
+            let normal = device.upload(&planes(&normal, CAPACITY));
+            let once = || {
+                let gradient = device.zeros(2 * table.len());
+                on.scatter(&device, &gradient, &x, &count, &g, &q, &normal);
+                device.read::<f32>(&gradient)
+            };
+            let got = once();
+            for l in &levels {
+                let span = 2 * l.offset..2 * (l.offset + l.entries as usize);
+                let want = want[l.offset..][..l.entries as usize].as_flattened();
+                agree(&format!("{:?} scatter", device.atomics()), &got[span], want, 1e-5);
+            }
+            if device.atomics() == Atomics::Fixed {
+                assert_eq!(got, once(), "whole numbers add to the same in any order");
+            }
+        }
+    }
+}

@@ -1,0 +1,14 @@
+//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal and DX12. Each is the twin of a kernel of [`super`].
+//!
+//! Values of samples lie plane by plane, `[channels, capacity]`: neighboring threads read neighboring words, and a
+//! plane is read four samples at a time. `capacity` is a multiple of [`mlp::TILE`](super::mlp::TILE); how many samples
+//! there really are is a count in a buffer that a kernel before wrote, so that nobody waits to read it back. Weights
+//! and tables lie as on the CPU.
+//!
+//! Sums of many threads into one place are atomic, and [`Atomics`] says how. All else is summed in a fixed order.
+
+mod device;
+mod hash;
+
+pub use device::{Atomics, Buffer, Device};
+pub use hash::Grid;
