@@ -358,4 +358,4 @@ impl Activations {
 }
 
 #[cfg(test)]
-mod tests;
+pub(in crate::kernel) mod tests;

@@ -4,7 +4,7 @@ use bytemuck::Pod;
 use cubecl::device::{WgpuBackend, WgpuDevice, WgpuDeviceKind};
 use cubecl::features::AtomicUsage;
 use cubecl::ir::{ElemType, FloatKind, Type};
-use cubecl::prelude::{BufferArg, Client};
+use cubecl::prelude::{BufferArg, Client, CubeCount};
 use cubecl::server::Handle;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -126,6 +126,14 @@ impl Device {
     }
 }
 
+/// So many groups of threads, beyond 65,535 in two dimensions: a kernel uses its position among all and ignores
+/// those that are too many.
+pub(super) fn groups(count: usize) -> CubeCount {
+    const MOST: usize = 65_535;
+    let rows = count.div_ceil(MOST).max(1);
+    CubeCount::Static(count.div_ceil(rows) as u32, rows as u32, 1)
+}
+
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
@@ -152,7 +160,7 @@ pub(super) mod tests {
     pub fn agree(what: &str, got: &[f32], want: &[f32], tolerance: f32) {
         assert_eq!(got.len(), want.len(), "{what}");
         let mean = want.iter().map(|v| v.abs()).sum::<f32>() / want.len().max(1) as f32;
-        let error = |(g, w): (&f32, &f32)| (g - w).abs() / w.abs().max(mean);
+        let error = |(g, w): (&f32, &f32)| (g - w).abs() / w.abs().max(mean).max(f32::MIN_POSITIVE);
         let worst =
             got.iter().zip(want).map(error).fold(0f32, |a, b| if b > a || b.is_nan() { b } else { a });
         println!("{what}: {worst:.1e} of {tolerance:.0e}");
@@ -176,5 +184,14 @@ pub(super) mod tests {
         assert_eq!(device.read::<u32>(&device.zeros(5)), [0; 5]);
         assert_eq!(device.counts(), (0, 2));
         println!("{} adds floats: {:?}", device.name(), device.atomics());
+    }
+
+    #[test]
+    fn many_groups_lie_in_two_dimensions() {
+        let size = |n: usize| match groups(n) {
+            CubeCount::Static(x, y, z) => [x, y, z],
+            _ => [0; 3],
+        };
+        assert_eq!([size(1), size(65_535), size(65_536)], [[1, 1, 1], [65_535, 1, 1], [32_768, 2, 1]]);
     }
 }

@@ -2,6 +2,7 @@
 
 use super::device::{Atomics, Buffer, Device};
 use crate::kernel::hash::Level;
+use crate::kernel::sdf::FieldShape;
 use cubecl::prelude::*;
 
 /// Samples a group of threads handles.
@@ -69,7 +70,7 @@ fn signed(v: f32, #[comptime] up: bool) -> f32 {
 }
 
 /// Features of all levels, planes `[2 · levels, capacity]`, and their slopes `[2 · levels · 3, capacity]`. Samples
-/// from `count[0]` on read zero.
+/// from `count[0]` on and levels from `active` on read zero.
 #[cube(launch)]
 fn gather(
     table: &[Vector<f32, Const<2>>],
@@ -79,6 +80,7 @@ fn gather(
     value: &mut [f32],
     jacobian: &mut [f32],
     capacity: u32,
+    active: u32,
     world: f32,
     #[comptime] slopes: bool,
 ) {
@@ -90,7 +92,7 @@ fn gather(
         let mut jx = Vector::<f32, Const<2>>::new(0.0f32);
         let mut jy = Vector::<f32, Const<2>>::new(0.0f32);
         let mut jz = Vector::<f32, Const<2>>::new(0.0f32);
-        if s < count[0] as usize {
+        if s < count[0] as usize && level < active as usize {
             let cell = cell(levels, level, x, s, capacity, world);
             let slope = f32::reinterpret(levels[level * LEVEL]) * world;
             #[unroll]
@@ -260,6 +262,7 @@ fn settle(gradient: &mut [u32], levels: &[u32], units: &[f32]) {
 pub struct Grid {
     levels: Buffer,
     units: Buffer,
+    count: usize,
     active: usize,
     /// Entries of the largest level.
     largest: usize,
@@ -268,18 +271,26 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// Of these levels, all of them active, over `[-radius, radius]³`.
-    pub fn new(device: &Device, levels: &[Level], radius: f32) -> Grid {
+    /// The grid of a field.
+    pub fn new(device: &Device, shape: &FieldShape) -> Grid {
+        let levels = &shape.levels;
         let words = |l: &Level| {
             [l.scale.to_bits(), l.resolution, l.entries, l.offset as u32, u32::from(l.is_hashed())]
         };
         Grid {
             levels: device.upload(&levels.iter().flat_map(words).collect::<Vec<u32>>()),
             units: device.zeros(levels.len()),
-            active: levels.len(),
+            count: levels.len(),
+            active: shape.active,
             largest: levels.iter().map(|l| l.entries as usize).max().unwrap_or(0),
-            world: 0.5 / radius,
+            world: 0.5 / shape.radius,
         }
+    }
+
+    /// How many of the levels take part from now on.
+    pub fn activate(&mut self, levels: usize) {
+        assert!(levels <= self.count);
+        self.active = levels;
     }
 
     /// Writes features and, where asked for, their Jacobian by position.
@@ -301,7 +312,7 @@ impl Grid {
         let capacity = x.words() / 3;
         gather::launch(
             device.launch(),
-            CubeCount::Static((capacity as u32).div_ceil(GROUP), self.active as u32, 1),
+            CubeCount::Static((capacity as u32).div_ceil(GROUP), self.count as u32, 1),
             CubeDim::new_1d(GROUP),
             table.arg(),
             self.levels.arg(),
@@ -310,6 +321,7 @@ impl Grid {
             value.arg(),
             jacobian.unwrap_or(value).arg(),
             capacity as u32,
+            self.active as u32,
             self.world,
             jacobian.is_some(),
         );
@@ -389,13 +401,23 @@ mod tests {
 
     /// The published grid but for its size, and samples anywhere in the box. Positions and scales have few digits, so
     /// that their products are the same whether fused with what is added or not.
-    fn grid() -> (Vec<Level>, Vec<[f32; 2]>, Vec<[f32; 3]>) {
+    fn grid() -> (Vec<hash::Level>, Vec<[f32; 2]>, Vec<[f32; 3]>) {
         let mut levels = hash::levels(16, 16, 1.447, 12);
         levels.iter_mut().for_each(|l| l.scale = l.scale.round());
         let table =
             (0..hash::entries(&levels)).map(|i| [(i as f32 * 0.73).sin(), (i as f32 * 0.31).cos()]).collect();
         let at = |i: usize| rng::below(1, 2, i as u64, 1025) as f32 / 256.0 - RADIUS;
         (levels, table, (0..SAMPLES).map(|i| [at(3 * i), at(3 * i + 1), at(3 * i + 2)]).collect())
+    }
+
+    fn shape(levels: &[hash::Level]) -> FieldShape {
+        FieldShape {
+            levels: levels.to_vec(),
+            radius: RADIUS,
+            active: levels.len(),
+            color_skip: false,
+            soften: 0.0,
+        }
     }
 
     fn inside(x: &[[f32; 3]]) -> Vec<[f32; 3]> {
@@ -420,7 +442,7 @@ mod tests {
         let slopes: Vec<f32> =
             (0..n).flat_map(|l| planes(&jacobian[l * SAMPLES..][..SAMPLES], CAPACITY)).collect();
 
-        let on = Grid::new(&device, &levels, RADIUS);
+        let on = Grid::new(&device, &shape(&levels));
         let (table, x) = (device.upload(&table), device.upload(&planes(&x, CAPACITY)));
         let (v, j) = (device.scratch(want.len()), device.scratch(slopes.len()));
         let count = device.upload(&[SAMPLES as u32]);
@@ -446,7 +468,7 @@ mod tests {
         let mut want = vec![[0f32; 2]; table.len()];
         hash::scatter(&levels, &mut want, &inside(&x), 0.5 / RADIUS, &g, &q, &normal);
         for device in devices() {
-            let on = Grid::new(&device, &levels, RADIUS);
+            let on = Grid::new(&device, &shape(&levels));
             let x = device.upload(&planes(&x, CAPACITY));
             let count = device.upload(&[SAMPLES as u32]);
             let level_planes = |v: &[[f32; 2]]| -> Vec<f32> {

@@ -9,6 +9,9 @@
 
 mod device;
 mod hash;
+mod sdf;
+mod tile;
 
 pub use device::{Atomics, Buffer, Device};
 pub use hash::Grid;
+pub use sdf::Sdf;

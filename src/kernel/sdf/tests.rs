@@ -159,15 +159,33 @@ fn levels_that_are_not_active_read_as_zero() {
     }
 }
 
-/// Worst and median relative error of the gradients by a selection of parameters.
 #[test]
 fn the_backward_agrees_with_f64_finite_differences_second_order_included() {
     for skip in [false, true] {
-        backward_agrees(skip);
+        backward_agrees(skip, |case| {
+            let w = Weights::new(case.shape.layout(), case.flat);
+            let a = forward(case.shape, case.table, &w, case.x, case.direction);
+            let mut g_table = vec![[0f32; 2]; case.table.len()];
+            (backward(&a, &w, case.g_out, &mut g_table), g_table)
+        });
     }
 }
 
-fn backward_agrees(color_skip: bool) {
+/// What a backward is asked for: gradients by weights and table of a loss whose gradient by the output is `g_out`.
+pub(in crate::kernel) struct BackwardCase<'a> {
+    pub shape: &'a FieldShape,
+    pub table: &'a [[f32; 2]],
+    pub flat: &'a [f32],
+    pub x: &'a [[f32; 3]],
+    pub direction: &'a [[f32; 3]],
+    pub g_out: &'a [f32],
+}
+
+/// Asserts the worst and median relative error of the gradients by a selection of parameters.
+pub(in crate::kernel) fn backward_agrees(
+    color_skip: bool,
+    gradients: impl FnOnce(BackwardCase) -> (Vec<f32>, Vec<[f32; 2]>),
+) {
     let (shape, table, flat) = shaped(color_skip);
     let (x, d) = points(90);
     let w = Weights::new(shape.layout(), &flat);
@@ -185,8 +203,14 @@ fn backward_agrees(color_skip: bool) {
             }
         }
     }
-    let mut g_table = vec![[0f32; 2]; table.len()];
-    let g_flat = backward(&a, &w, &g_out, &mut g_table);
+    let (g_flat, g_table) = gradients(BackwardCase {
+        shape: &shape,
+        table: &table,
+        flat: &flat,
+        x: &x,
+        direction: &d,
+        g_out: &g_out,
+    });
 
     let table64: Vec<[f64; 2]> = table.iter().map(|e| [e[0] as f64, e[1] as f64]).collect();
     let flat64 = wide(&flat);
