@@ -7,11 +7,17 @@
 //!
 //! Sums of many threads into one place are atomic, and [`Atomics`] says how. All else is summed in a fixed order.
 
+mod adam;
 mod device;
 mod hash;
+mod march;
+mod neus;
 mod sdf;
 mod tile;
 
+pub use adam::adam;
 pub use device::{Atomics, Buffer, Device};
 pub use hash::Grid;
+pub use march::{Occupancy, Samples};
+pub use neus::{Neus, Rays};
 pub use sdf::Sdf;

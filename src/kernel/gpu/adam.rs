@@ -1,0 +1,99 @@
+//! The optimizer of [`crate::kernel::adam`].
+
+use super::device::{Buffer, Device, groups};
+use crate::kernel::adam::AdamStep;
+use cubecl::prelude::*;
+
+const UNITS: u32 = 256;
+
+#[cube(launch)]
+fn adam_kernel(
+    p: &mut [f32],
+    m: &mut [f32],
+    v: &mut [f32],
+    g: &mut [f32],
+    lr: f32,
+    beta1: f32,
+    beta2: f32,
+    epsilon: f32,
+    keep: f32,
+    c1: f32,
+    c2: f32,
+    #[comptime] skip_zero: bool,
+) {
+    let i = ABSOLUTE_POS;
+    if i < p.len() {
+        let own = g[i];
+        if !skip_zero || own != 0.0f32 {
+            let m1 = fma(beta1, m[i], (1.0f32 - beta1) * own);
+            let v1 = fma(beta2, v[i], (1.0f32 - beta2) * own * own);
+            p[i] = fma(p[i], keep, -lr * (m1 * c1) / ((v1 * c2).sqrt() + epsilon));
+            m[i] = m1;
+            v[i] = v1;
+            g[i] = 0.0f32;
+        }
+    }
+}
+
+/// One AdamW step in place, all four `[n]`; the gradient is left zero.
+pub fn adam(device: &Device, p: &Buffer, m: &Buffer, v: &Buffer, g: &Buffer, step: &AdamStep) {
+    assert!([m, v, g].iter().all(|b| b.words() == p.words()));
+    let correction = |beta: f32| (1.0 / (1.0 - (beta as f64).powf(step.step as f64))) as f32;
+    adam_kernel::launch(
+        device.launch(),
+        groups(p.words().div_ceil(UNITS as usize)),
+        CubeDim::new_1d(UNITS),
+        p.arg(),
+        m.arg(),
+        v.arg(),
+        g.arg(),
+        step.lr,
+        step.beta1,
+        step.beta2,
+        step.epsilon,
+        1.0 - step.lr * step.weight_decay,
+        correction(step.beta1),
+        correction(step.beta2),
+        step.skip_zero,
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::tests::{agree, device};
+    use super::*;
+    use crate::kernel::{adam, rng};
+
+    #[test]
+    fn steps_are_those_of_the_cpu_with_and_without_idle_weights() {
+        let Some(device) = device() else { return };
+        let n = 1000;
+        for skip_zero in [true, false] {
+            let mut step = AdamStep {
+                lr: 0.01,
+                beta1: 0.9,
+                beta2: 0.99,
+                epsilon: 1e-15,
+                weight_decay: 0.02,
+                step: 0,
+                skip_zero,
+            };
+            let mut p: Vec<f32> = (0..n).map(|i| rng::normal(1, 1, i)).collect();
+            let (mut m, mut v) = (vec![0f32; p.len()], vec![0f32; p.len()]);
+            let there = [&p, &m, &v].map(|b| device.upload(b));
+            for k in 0..5 {
+                step.step += 1;
+                // a third of the weights rests in each step, others have gradients of any size
+                let size = |i: u64| 10f32.powi(i as i32 % 12 - 8) * rng::normal(2, k, i);
+                let mut g: Vec<f32> = (0..n).map(|i| if (i + k) % 3 == 0 { 0.0 } else { size(i) }).collect();
+                let own = device.upload(&g);
+                super::adam(&device, &there[0], &there[1], &there[2], &own, &step);
+                adam::adam(&mut p, &mut m, &mut v, &mut g, &step);
+                assert_eq!(device.read::<f32>(&own), g);
+            }
+            for (what, (got, want)) in ["p", "m", "v"].iter().zip(there.iter().zip([&p, &m, &v])) {
+                agree(&format!("adam {what}"), &device.read::<f32>(got), want, 1e-5);
+            }
+        }
+    }
+}

@@ -1,0 +1,421 @@
+//! NeuS compositing of ragged rays: see [`crate::kernel::neus`]. A thread takes a ray.
+
+use super::device::{Buffer, Device, groups};
+use crate::kernel::neus::{RAY_WIDTH, SHORTEST};
+use cubecl::prelude::*;
+
+const UNITS: u32 = 64;
+
+/// ε of the opacity.
+const EPSILON: f32 = 1e-5;
+
+/// Opacity of one sample, and what its derivative needs.
+#[derive(CubeType)]
+struct Sample {
+    alpha: f32,
+    clipped: bool,
+    previous: f32,
+    next: f32,
+    half: f32,
+    ic_by_cos: f32,
+    sharp: f32,
+    nx: f32,
+    ny: f32,
+    nz: f32,
+    length: f32,
+}
+
+#[cube]
+fn sigmoid(v: f32) -> f32 {
+    1.0f32 / (1.0f32 + (-v).exp())
+}
+
+/// Sample `s` of a ray along `d`.
+#[cube]
+fn sample(
+    field: &[f32],
+    plane: usize,
+    s: usize,
+    dt: f32,
+    dx: f32,
+    dy: f32,
+    dz: f32,
+    inv_s: f32,
+    anneal: f32,
+) -> Sample {
+    let (x, y, z) = (field[plane + s], field[2 * plane + s], field[3 * plane + s]);
+    let length = max((x * x + y * y + z * z).sqrt(), 1e-12f32);
+    let (nx, ny, nz) = (x / length, y / length, z / length);
+    let cos = dx * nx + dy * ny + dz * nz;
+    let (soft, hard) = (0.5f32 - 0.5f32 * cos, -cos);
+    let ic = -(max(soft, 0.0f32) * (1.0f32 - anneal) + max(hard, 0.0f32) * anneal);
+    let by_soft = select(soft > 0.0f32, 0.5f32 * (1.0f32 - anneal), 0.0f32);
+    let by_hard = select(hard > 0.0f32, anneal, 0.0f32);
+    let sharp = clamp(inv_s * field[7 * plane + s].exp(), 1e-6f32, 1e6f32);
+    let half = 0.5f32 * ic * dt;
+    let previous = sigmoid((field[s] - half) * sharp);
+    let next = sigmoid((field[s] + half) * sharp);
+    let raw = (previous - next + EPSILON) / (previous + EPSILON);
+    let alpha = clamp(raw, 0.0f32, 1.0f32);
+    Sample {
+        alpha,
+        clipped: raw != alpha,
+        previous,
+        next,
+        half,
+        ic_by_cos: by_soft + by_hard,
+        sharp,
+        nx,
+        ny,
+        nz,
+        length,
+    }
+}
+
+/// Composites; writes too how much light each sample receives.
+#[cube(launch)]
+fn forward(
+    offsets: &[u32],
+    direction: &[f32],
+    t: &[f32],
+    dt: &[f32],
+    field: &[f32],
+    inv_s: &[f32],
+    out: &mut [f32],
+    light: &mut [f32],
+    anneal: f32,
+) {
+    let rays = direction.len() / 3;
+    let plane = t.len();
+    let r = ABSOLUTE_POS;
+    if r < rays {
+        let inv_s = clamp(inv_s[0], 1e-6f32, 1e6f32);
+        let (dx, dy, dz) = (direction[r], direction[rays + r], direction[2 * rays + r]);
+        let mut transmittance = 1.0f32;
+        let mut red = 0.0f32;
+        let mut green = 0.0f32;
+        let mut blue = 0.0f32;
+        let mut opacity = 0.0f32;
+        let mut depth = 0.0f32;
+        let mut nx = 0.0f32;
+        let mut ny = 0.0f32;
+        let mut nz = 0.0f32;
+        for s in (offsets[r] as usize)..(offsets[r + 1] as usize) {
+            let a = sample(field, plane, s, dt[s], dx, dy, dz, inv_s, anneal);
+            let w = transmittance * a.alpha;
+            red += w * field[4 * plane + s];
+            green += w * field[5 * plane + s];
+            blue += w * field[6 * plane + s];
+            opacity += w;
+            depth += w * t[s];
+            nx += w * a.nx;
+            ny += w * a.ny;
+            nz += w * a.nz;
+            light[s] = transmittance;
+            transmittance *= 1.0f32 - a.alpha;
+        }
+        out[r] = red;
+        out[rays + r] = green;
+        out[2 * rays + r] = blue;
+        out[3 * rays + r] = opacity;
+        out[4 * rays + r] = depth;
+        out[5 * rays + r] = nx;
+        out[6 * rays + r] = ny;
+        out[7 * rays + r] = nz;
+    }
+}
+
+/// Gradients by the field's output, and by `ln inv_s` of each ray.
+#[cube(launch)]
+fn backward(
+    offsets: &[u32],
+    direction: &[f32],
+    t: &[f32],
+    dt: &[f32],
+    field: &[f32],
+    inv_s: &[f32],
+    light: &[f32],
+    g_out: &[f32],
+    g_field: &mut [f32],
+    g_ln: &mut [f32],
+    anneal: f32,
+) {
+    let rays = direction.len() / 3;
+    let plane = t.len();
+    let r = ABSOLUTE_POS;
+    if r < rays {
+        let inv_s = clamp(inv_s[0], 1e-6f32, 1e6f32);
+        let (dx, dy, dz) = (direction[r], direction[rays + r], direction[2 * rays + r]);
+        let (g0, g1, g2, g3) = (g_out[r], g_out[rays + r], g_out[2 * rays + r], g_out[3 * rays + r]);
+        let (g4, g5) = (g_out[4 * rays + r], g_out[5 * rays + r]);
+        let (g6, g7) = (g_out[6 * rays + r], g_out[7 * rays + r]);
+        let (begin, end) = (offsets[r] as usize, offsets[r + 1] as usize);
+        let mut behind = 0.0f32; // Σ_{j>k} w_j worth_j
+        let mut sum = 0.0f32;
+        for k in 0..end - begin {
+            let s = end - 1 - k;
+            let a = sample(field, plane, s, dt[s], dx, dy, dz, inv_s, anneal);
+            let worth = g0 * field[4 * plane + s]
+                + g1 * field[5 * plane + s]
+                + g2 * field[6 * plane + s]
+                + g3
+                + g4 * t[s]
+                + g5 * a.nx
+                + g6 * a.ny
+                + g7 * a.nz;
+            let transmittance = light[s];
+            let w = transmittance * a.alpha;
+            g_field[4 * plane + s] = w * g0;
+            g_field[5 * plane + s] = w * g1;
+            g_field[6 * plane + s] = w * g2;
+            let g_alpha = transmittance * worth - behind / max(1.0f32 - a.alpha, 1e-10f32);
+            behind += w * worth;
+            // by the unit normal: as composited, and through the cosine
+            let mut g_cos = 0.0f32;
+            let mut g_sdf = 0.0f32;
+            let mut ln = 0.0f32;
+            if !a.clipped {
+                let d = a.previous + EPSILON;
+                // α = (P − N + ε)/(P + ε): ∂P = N/(P+ε)², ∂N = −1/(P+ε)
+                let g_p = g_alpha * a.next / (d * d) * a.previous * (1.0f32 - a.previous);
+                let g_q = -g_alpha / d * a.next * (1.0f32 - a.next);
+                g_sdf = (g_p + g_q) * a.sharp;
+                ln = (g_p * (field[s] - a.half) + g_q * (field[s] + a.half)) * a.sharp;
+                g_cos = (g_q - g_p) * a.sharp * 0.5f32 * dt[s] * a.ic_by_cos;
+            }
+            g_field[s] = g_sdf;
+            g_field[7 * plane + s] = ln;
+            sum += ln;
+            let (nx, ny, nz) = (w * g5 + g_cos * dx, w * g6 + g_cos * dy, w * g7 + g_cos * dz);
+            let along = a.nx * nx + a.ny * ny + a.nz * nz;
+            let share = select(a.length > SHORTEST, 1.0f32 / a.length, 0.0f32);
+            g_field[plane + s] = (nx - a.nx * along) * share;
+            g_field[2 * plane + s] = (ny - a.ny * along) * share;
+            g_field[3 * plane + s] = (nz - a.nz * along) * share;
+        }
+        g_ln[r] = sum;
+    }
+}
+
+/// The gradient by `inv_s` from that of the rays by its logarithm, in a fixed order; zero where it was clamped.
+#[cube(launch)]
+fn sharpness(g_ln: &[f32], inv_s: &[f32], g_inv_s: &mut [f32]) {
+    let unit = UNIT_POS as usize;
+    let mut own = 0.0f32;
+    for r in range_stepped(unit, g_ln.len(), UNITS as usize) {
+        own += g_ln[r];
+    }
+    let mut sums = Shared::<[f32]>::new_slice(UNITS as usize);
+    sums[unit] = own;
+    sync_cube();
+    if unit == 0 {
+        let mut all = 0.0f32;
+        for i in 0..UNITS as usize {
+            all += sums[i];
+        }
+        let s = inv_s[0];
+        g_inv_s[0] = select(s >= 1e-6f32 && s <= 1e6f32, all / s, 0.0f32);
+    }
+}
+
+/// The ragged samples of a batch of rays on a device, sorted by ray and then by `t`.
+#[derive(Clone, Copy)]
+pub struct Rays<'a> {
+    /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
+    pub offsets: &'a Buffer,
+    /// Planes `[3, rays]`, unit directions.
+    pub direction: &'a Buffer,
+    /// `[capacity]` midpoints.
+    pub t: &'a Buffer,
+    /// `[capacity]` lengths.
+    pub dt: &'a Buffer,
+}
+
+/// Compositing of up to so many rays and samples.
+pub struct Neus {
+    out: Buffer,
+    light: Buffer,
+    g_field: Buffer,
+    g_ln: Buffer,
+}
+
+impl Neus {
+    /// For so many rays and up to `capacity` samples.
+    pub fn new(device: &Device, rays: usize, capacity: usize) -> Neus {
+        Neus {
+            out: device.scratch(RAY_WIDTH * rays),
+            light: device.scratch(capacity),
+            g_field: device.scratch(RAY_WIDTH * capacity),
+            g_ln: device.scratch(rays),
+        }
+    }
+
+    /// Composites: planes `[8, rays]` of the field's planes `[8, capacity]`; inv_s: `[1]`.
+    pub fn forward(
+        &self,
+        device: &Device,
+        rays: Rays,
+        field: &Buffer,
+        inv_s: &Buffer,
+        anneal: f32,
+    ) -> &Buffer {
+        forward::launch(
+            device.launch(),
+            groups(self.g_ln.words().div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            rays.offsets.arg(),
+            rays.direction.arg(),
+            rays.t.arg(),
+            rays.dt.arg(),
+            field.arg(),
+            inv_s.arg(),
+            self.out.arg(),
+            self.light.arg(),
+            anneal,
+        );
+        &self.out
+    }
+
+    /// Gradients by the field's output, planes `[8, capacity]` that count only where samples are, and by `inv_s`, of the
+    /// last forward.
+    pub fn backward(
+        &self,
+        device: &Device,
+        rays: Rays,
+        field: &Buffer,
+        inv_s: &Buffer,
+        anneal: f32,
+        g_out: &Buffer,
+        g_inv_s: &Buffer,
+    ) -> &Buffer {
+        let dim = CubeDim::new_1d(UNITS);
+        backward::launch(
+            device.launch(),
+            groups(self.g_ln.words().div_ceil(UNITS as usize)),
+            dim,
+            rays.offsets.arg(),
+            rays.direction.arg(),
+            rays.t.arg(),
+            rays.dt.arg(),
+            field.arg(),
+            inv_s.arg(),
+            self.light.arg(),
+            g_out.arg(),
+            self.g_field.arg(),
+            self.g_ln.arg(),
+            anneal,
+        );
+        let one = CubeCount::new_single();
+        sharpness::launch(device.launch(), one, dim, self.g_ln.arg(), inv_s.arg(), g_inv_s.arg());
+        &self.g_field
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::tests::{agree, device, planes};
+    use super::*;
+    use crate::kernel::sdf::WIDTH;
+    use crate::kernel::{neus, rng};
+
+    /// Runs both and returns (device, CPU): rays' values, gradients by field, by inv_s.
+    type Found = (Vec<f32>, Vec<f32>, f32);
+
+    fn both(
+        device: &Device,
+        rays: neus::Rays,
+        field: &[[f32; WIDTH]],
+        inv_s: f32,
+        anneal: f32,
+        g: &[[f32; RAY_WIDTH]],
+    ) -> [Found; 2] {
+        let (n, count) = (field.len(), rays.direction.len());
+        let on = Neus::new(device, count, n);
+        let (offsets, direction) =
+            (device.upload(rays.offsets), device.upload(&planes(rays.direction, count)));
+        let (t, dt) = (device.upload(rays.t), device.upload(rays.dt));
+        let there = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let (on_field, on_s) = (device.upload(&planes(field, n)), device.upload(&[inv_s]));
+        let out = device.read(on.forward(device, there, &on_field, &on_s, anneal));
+        let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros(1));
+        let g_field = device.read(on.backward(device, there, &on_field, &on_s, anneal, &g_out, &g_s));
+        let (flat, g) = (field.as_flattened(), g.as_flattened());
+        let want: Vec<f32> = neus::forward(rays, flat, inv_s, anneal);
+        let (want_field, want_s) = neus::backward(rays, flat, inv_s, anneal, g);
+        let turned = |v: &[f32], n: usize| planes::<8>(v.as_chunks().0, n);
+        [(out, g_field, device.read::<f32>(&g_s)[0]), (turned(&want, count), turned(&want_field, n), want_s)]
+    }
+
+    #[test]
+    fn rays_and_gradients_are_those_of_the_cpu() {
+        let Some(device) = device() else { return };
+        // ragged rays, some empty, some through a surface
+        let counts: Vec<usize> = (0..200).map(|r| [0, 1, 7, 40, 90][r % 5]).collect();
+        let mut offsets = vec![0i32];
+        counts.iter().for_each(|&c| offsets.push(offsets.last().unwrap() + c as i32));
+        let n = *offsets.last().unwrap() as usize;
+        let normal = |stream: u64, i: usize| rng::normal(3, stream, i as u64);
+        let direction: Vec<[f32; 3]> = (0..200)
+            .map(|r| {
+                let v = [0, 1, 2].map(|k| normal(1, 3 * r + k));
+                let length = v.iter().map(|c| c * c).sum::<f32>().sqrt();
+                v.map(|c| c / length)
+            })
+            .collect();
+        let mut field = Vec::new();
+        let mut t = Vec::new();
+        for (r, &c) in counts.iter().enumerate() {
+            for k in 0..c {
+                let i = field.len() * 8;
+                let sdf = 0.3 - 0.6 * (k as f32 + 0.5) / c as f32 + 0.01 * normal(2, i);
+                // mostly towards the camera
+                let along = |a: usize| -direction[r][a] + 0.5 * normal(2, i + 1 + a);
+                let color = |a: usize| rng::uniform(3, 4, (i + a) as u64);
+                let n = [along(0), along(1), along(2)];
+                field.push([sdf, n[0], n[1], n[2], color(0), color(1), color(2), -0.3 * color(3)]);
+                t.push(1.0 + 0.01 * k as f32);
+            }
+        }
+        let dt = vec![0.01f32; n];
+        let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let g: Vec<[f32; 8]> = (0..200).map(|r| std::array::from_fn(|k| normal(5, 8 * r + k))).collect();
+        for (inv_s, anneal) in [(20.0, 0.0), (60.0, 0.4), (200.0, 1.0)] {
+            let [got, want] = both(&device, rays, &field, inv_s, anneal, &g);
+            agree("rays", &got.0, &want.0, 1e-4);
+            for k in 0..8 {
+                // that by the sdf is a difference of nearly equal numbers, no better known on the CPU
+                let tolerance = if k == 0 { 2e-4 } else { 1e-4 };
+                let (got, want) = (&got.1[k * n..][..n], &want.1[k * n..][..n]);
+                agree(&format!("gradient by output {k}"), got, want, tolerance);
+            }
+            agree("gradient by inv_s", &[got.2], &[want.2], 1e-4);
+        }
+    }
+
+    #[test]
+    fn extreme_fields_have_finite_opacities_and_bounded_gradients() {
+        let Some(device) = device() else { return };
+        let offsets = [0, 4];
+        let (direction, t, dt) = ([[0.6, 0.0, -0.8]], [1.0, 1.1, 1.2, 1.3], [1e-9, 0.05, 3.0, 1e3]);
+        let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let g = [[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0]];
+        for inv_s in [0.0, 1e-6, 1.0, 1e6, 1e9] {
+            for sdf in [0.0, -1e-6, 1.0, -1e3, 1e20] {
+                for slope in [0.0, 1e-12, 2e-6, 1.0, 1e6] {
+                    let sample = |k: usize| [sdf, slope, -0.5 * slope, 0.0, 0.5, 0.5, 0.5, -(k as f32)];
+                    let field: Vec<[f32; 8]> = (0..4).map(sample).collect();
+                    let [(out, g_field, g_s), _] = both(&device, rays, &field, inv_s, 1.0, &g);
+                    assert!(
+                        out.iter().all(|v| v.is_finite() && v.abs() < 2.0),
+                        "{inv_s} {sdf} {slope} {out:?}"
+                    );
+                    let bounded = |v: &f32| v.is_finite() && v.abs() < 1e10;
+                    assert!(
+                        g_field.iter().chain([&g_s]).all(bounded),
+                        "{inv_s} {sdf} {slope} {g_field:?} {g_s}"
+                    );
+                }
+            }
+        }
+    }
+}
