@@ -658,7 +658,7 @@ fn hostile_json_is_refused_with_file_and_place() {
     says(&|_| r#"{"frames": [{}, 7]}"#.into(), &["#0", "file_path"]);
     says(&|f| sound(f).replace("transform_matrix", "pose"), &["images/0.png", "transform_matrix"]);
     says(&|f| sound(f).replace(r#""camera_angle_x": 0.8, "#, ""), &["images/0.png", "fl_x"]);
-    says(&|f| sound(f).replace("0.8,", r#"0.8, "camera_model": "OPENCV_FISHEYE","#), &["OPENCV_FISHEYE"]);
+    says(&|f| sound(f).replace("0.8,", r#"0.8, "camera_model": "EQUIRECTANGULAR","#), &["EQUIRECTANGULAR"]);
     says(&|f| sound(f).replace("[0,1,0,0]", "[0,-1,0,0]"), &["images/0.png", "mirrors"]);
     says(&|f| sound(f).replace("[0,1,0,0]", "[0,1.02,0,0]"), &["not orthonormal"]);
     says(&|f| sound(f).replace("[0,1,0,0]", "[0,0,0,0]"), &["singular"]);
@@ -794,26 +794,9 @@ fn unread(names: &[(&str, &[u8])]) -> (String, String) {
 fn formats_that_are_not_read_are_named_with_the_way_from_there() {
     let photo = png(4, 4);
     let picture = |name: &'static str| (name, &photo[..]);
-    let rows: [(&[(&str, &[u8])], &str, &str); 16] = [
+    let rows: [(&[(&str, &[u8])], &str, &str); 11] = [
         (&[picture("images/0.png"), ("a.psx", b"<")], "Metashape project (`a.psx`)", "Export Cameras"),
-        (
-            &[picture("images/0.png"), ("cams.xml", b"<document>\n<chunk label=\"1\">")],
-            "Metashape export (`cams.xml`)",
-            "`ns-process-data metashape --data ROOT/images --xml ROOT/cams.xml --output-dir NEW`",
-        ),
         (&[picture("0.png"), ("a.rcproj", b"x")], "RealityCapture project (`a.rcproj`)", "as CSV"),
-        (
-            &[picture("0.png"), ("reg.csv", b"#name,x,y,alt,heading,pitch,roll,f\n")],
-            "RealityCapture export (`reg.csv`)",
-            "realitycapture --data ROOT --csv ROOT/reg.csv",
-        ),
-        (&[("cameras_sphere.npz", b"PK"), picture("image/000.png")], "NeuS or DTU", "`world_mat_I`"),
-        (
-            &[("cameras.npz", b"PK"), ("full_head.obj", b"v")],
-            "an H3DS scene (`cameras.npz`)",
-            "`world_mat_I`",
-        ),
-        (&[("cameras.npz", b"PK"), ("image/", b"")], "an IDR scene", "`transform_matrix`"),
         (&[("calibration/camera_params.json", b"{}")], "NeRSemble", "`world_2_cam`"),
         (
             &[("KRT", b"400002"), ("images/", b"")],
@@ -826,7 +809,11 @@ fn formats_that_are_not_read_are_named_with_the_way_from_there() {
             "Polycam raw export (`keyframes`)",
             "polycam --data ROOT --output-dir NEW",
         ),
-        (&[("sparse/0/", b""), picture("images/0.jpg")], "COLMAP model (`sparse`)", "--skip-colmap"),
+        (
+            &[("sparse/0/", b""), picture("images/0.jpg")],
+            "an incomplete COLMAP project (`sparse`)",
+            "`colmap mapper`",
+        ),
         (
             &[picture("b.JPG"), picture("a.jpg")],
             "photographs without cameras (`a.jpg`)",
@@ -844,11 +831,24 @@ fn formats_that_are_not_read_are_named_with_the_way_from_there() {
     // other tools' XML and CSV are not theirs, and a list of parameters without photographs is nobody's
     let (message, hint) =
         unread(&[("a.xml", b"<svg/>"), ("b.csv", b"a,b\n"), ("params.json", b"{}"), ("notes.txt", b"x")]);
-    assert!(message.contains("neither `transforms.json`"), "{message}");
-    for format in
-        ["COLMAP", "Metashape", "RealityCapture", "Polycam", "NeRSemble", "Multiface", "FaceScape", "H3DS"]
-    {
+    for format in ["transforms.json", "LLFF", "COLMAP", "NeuS", "H3DS", "Metashape", "RealityCapture"] {
+        assert!(message.contains(format), "{message}");
+    }
+    assert!(
+        message.ends_with("nearest is `a.xml`, which has no `<chunk` as Metashape's cameras have"),
+        "{message}"
+    );
+    for format in ["Polycam", "NeRSemble", "Multiface", "FaceScape"] {
         assert!(hint.contains(format), "{hint}");
+    }
+    for (name, words) in [
+        ("transforms_all.json", "`transforms_all.json`: if it is one, call it `transforms.json`"),
+        ("poses.npy", "call it `poses_bounds.npy`"),
+        ("cams.npz", "call it `cameras_sphere.npz`"),
+        ("list.csv", "does not begin with `#name,x,y,alt`"),
+    ] {
+        let (message, _) = unread(&[(name, b"x")]);
+        assert!(message.contains(words), "{message}");
     }
 }
 

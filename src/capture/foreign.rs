@@ -1,80 +1,23 @@
 //! Formats that are recognized but not read, each by its telltale files, and the way from there to `transforms.json`.
 
+use super::entries::{FolderEntries, PHOTOGRAPHS, has_ending};
+use super::format::CameraFiles;
+use super::realitycapture;
 use crate::Error;
-use crate::io::{self, Limits};
+use crate::io;
 use std::fmt::Display;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// What a capture needs, one of them.
 const READ: [&str; 4] =
     ["transforms.json", "transforms_train.json", "poses_bounds.npy", "poses_bounds_train.npy"];
 
 const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
-const PHOTOGRAPHS: [&str; 8] = ["jpg", "jpeg", "png", "tif", "tiff", "heic", "webp", "bmp"];
 
 /// For datasets with cameras that no common tool converts.
 const BY_HAND: &str = "no common tool converts it: write `transforms.json` with `file_path`, `w`, `h`, `fl_x`, `fl_y`, \
                        `cx`, `cy` and `transform_matrix` for each photograph (camera to world, +Y up and looking along \
                        -Z: the second and third column of an OpenCV pose, negated)";
-
-/// What lies directly in a folder.
-struct FolderEntries {
-    root: PathBuf,
-    files: Vec<String>,
-    folders: Vec<String>,
-}
-
-impl FolderEntries {
-    /// Names that are not UTF-8 tell nothing, nor do those that cannot be listed.
-    fn of(root: &Path) -> FolderEntries {
-        let name = |p: &PathBuf| Some(p.file_name()?.to_str()?.to_owned());
-        let folders = io::list_folders(root).unwrap_or_default();
-        FolderEntries {
-            root: root.into(),
-            files: io::list_files(root).unwrap_or_default(),
-            folders: folders.iter().filter_map(name).collect(),
-        }
-    }
-
-    /// The first of these files or folders that is there.
-    fn any<'a>(&self, names: &[&'a str]) -> Option<&'a str> {
-        names.iter().copied().find(|n| self.files.iter().chain(&self.folders).any(|f| f == n))
-    }
-
-    /// The first file with one of these endings.
-    fn ending(&self, endings: &[&str]) -> Option<&String> {
-        self.files.iter().find(|f| has_ending(f, endings))
-    }
-
-    /// The first file with this ending whose beginning holds `words`.
-    fn holding(&self, ending: &str, words: &str) -> Option<&String> {
-        let limits = Limits { file_bytes: 64 << 20, ..Limits::default() };
-        let holds = |name: &&String| {
-            let bytes = io::read_bytes(&self.root.join(name), &limits).unwrap_or_default();
-            String::from_utf8_lossy(&bytes[..bytes.len().min(1 << 16)]).contains(words)
-        };
-        self.files.iter().filter(|f| has_ending(f, &[ending])).take(16).find(holds)
-    }
-
-    fn at(&self, name: &str) -> String {
-        self.root.join(name).display().to_string()
-    }
-
-    /// The folder of photographs, as far as one can tell.
-    fn photographs(&self) -> Option<PathBuf> {
-        let inside = ["images", "image", "input", "rgb", "photos"].into_iter();
-        let folders = inside.filter(|n| self.any(&[n]).is_some()).map(|n| self.root.join(n));
-        [self.root.clone()]
-            .into_iter()
-            .chain(folders)
-            .find(|f| FolderEntries::of(f).ending(&PHOTOGRAPHS).is_some())
-    }
-}
-
-fn has_ending(name: &str, endings: &[&str]) -> bool {
-    let found = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
-    endings.iter().any(|e| e.eq_ignore_ascii_case(found))
-}
 
 /// A command of nerfstudio, and what to do with what it writes.
 fn nerfstudio(kind: &str, data: impl Display, more: &str) -> String {
@@ -98,13 +41,42 @@ pub(super) fn explain(root: &Path) -> Error {
         Some((what, telltale, hint)) => {
             not_a_capture(root, format!("it looks like {what} (`{telltale}`); that is not read"), hint)
         }
-        None => not_a_capture(
-            root,
-            "it holds neither `transforms.json`, `transforms_train.json` nor `poses_bounds*.npy`",
-            "give the folder that holds one of them; given data of COLMAP, Metashape, RealityCapture, Polycam, NeuS, DTU, \
-             H3DS, NeRSemble, Multiface, FaceScape, photographs alone or a video, this command says how to convert it",
-        ),
+        None => {
+            let nearest = nearest(&found).map_or(String::new(), |n| format!("; nearest is {n}"));
+            let others = "Polycam, NeRSemble, Multiface, FaceScape, photographs alone or a video are named with the way from there";
+            not_a_capture(
+                root,
+                format!("it holds none of the camera files that are read: {LOOKED_FOR}{nearest}"),
+                format!("give the folder that holds one of them; {others}"),
+            )
+        }
     }
+}
+
+/// What is read, for who has none of it.
+const LOOKED_FOR: &str = "`transforms.json`, `transforms_train.json`, `poses_bounds*.npy` (LLFF), `cameras` and `images` as \
+                          `.bin` or `.txt` in `sparse/0`, `sparse` or here (COLMAP), `cameras_sphere.npz` or `cameras.npz` \
+                          (NeuS, IDR, H3DS), an `.xml` with `<chunk` (Metashape), a `.csv` that begins with `#name,x,y,alt` \
+                          or `.xmp` files with a pose (RealityCapture)";
+
+/// The file that looks most like one of those, and what it lacks.
+fn nearest(found: &FolderEntries) -> Option<String> {
+    let like = |ending: &str, word: &str| {
+        found.files.iter().find(|f| has_ending(f, &[ending]) && f.to_lowercase().contains(word))
+    };
+    let rename = |file: &String, to: &str| format!("`{file}`: if it is one, call it `{to}`");
+    like("json", "transform")
+        .or_else(|| found.holding("json", "transform_matrix"))
+        .map(|f| rename(f, "transforms.json"))
+        .or_else(|| like("npy", "poses").map(|f| rename(f, "poses_bounds.npy")))
+        .or_else(|| like("npz", "").map(|f| rename(f, "cameras_sphere.npz")))
+        .or_else(|| {
+            like("xml", "").map(|f| format!("`{f}`, which has no `<chunk` as Metashape's cameras have"))
+        })
+        .or_else(|| {
+            like("csv", "").map(|f| format!("`{f}`, which does not begin with `{}`", realitycapture::HEADER))
+        })
+        .or_else(|| like("xmp", "").map(|f| format!("`{f}`, which has nothing of RealityCapture's")))
 }
 
 /// Why a file is no capture.
@@ -125,28 +97,17 @@ fn from_video(file: &Path) -> String {
         + " (it needs COLMAP; a head must hold still while the camera moves)"
 }
 
-/// A folder inside that is a capture, with its camera file.
-fn nested(found: &FolderEntries) -> Option<(&str, &'static str)> {
-    let of = |name: &String| READ.into_iter().find(|file| io::is_file(&found.root.join(name).join(file)));
+/// A folder inside that is a capture, with its first camera file.
+fn nested(found: &FolderEntries) -> Option<(&str, String)> {
+    let of = |name: &String| CameraFiles::find(&found.root.join(name)).map(|files| files.first());
     found.folders.iter().take(1000).find_map(|name| Some((name.as_str(), of(name)?)))
 }
 
 /// What it looks like, by which file, and the way to `transforms.json`.
 fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
     let photographs = found.photographs();
-    let images = photographs.clone().unwrap_or_else(|| found.root.join("images")).display().to_string();
     let one = |what, telltale: &str, way| Some((what, telltale.to_owned(), way));
     let by_hand = |what, telltale, more: &str| one(what, telltale, format!("{BY_HAND}; {more}"));
-    let projections =
-        "its `world_mat_I` is the projection K [R|t] of photograph I, `mask/` can be named as `mask_path`";
-
-    if let Some(t) = found.any(&["cameras_sphere.npz"]) {
-        return by_hand("a NeuS or DTU scene", t, projections);
-    }
-    if let Some(t) = found.any(&["cameras.npz"]) {
-        let h3ds = found.any(&["full_head.obj", "regions", "landmarks.txt"]).is_some();
-        return by_hand(if h3ds { "an H3DS scene" } else { "an IDR scene" }, t, projections);
-    }
     if let Some(t) = found.any(&["KRT"]) {
         let moment =
             "it holds K, distortion and [R|t] of each camera; take one frame of one expression of `images/`";
@@ -166,32 +127,21 @@ fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
     if let Some(t) = found.any(&["keyframes"]) {
         return one("a Polycam raw export", t, nerfstudio("polycam", found.root.display(), ""));
     }
-    if let Some(t) = found.holding("xml", "<chunk") {
-        let way = nerfstudio("metashape", images, &format!(" --xml {}", found.at(t)));
-        return one("a Metashape export", t, way);
-    }
     if let Some(t) = found.ending(&["psx", "psz"]) {
-        let way = nerfstudio("metashape", images, " --xml cameras.xml");
-        let export = "export its cameras as XML (File, Export, Export Cameras)";
-        return one("a Metashape project", t, format!("{export}; {way}"));
-    }
-    if let Some(t) = found.holding("csv", "#name,x,y,alt") {
-        let way = nerfstudio("realitycapture", images, &format!(" --csv {}", found.at(t)));
-        return one("a RealityCapture export", t, way);
+        let way = "export its cameras as XML into this folder: File, Export, Export Cameras";
+        return one("a Metashape project", t, way.into());
     }
     if let Some(t) = found.ending(&["rcproj", "rsproj"]) {
-        let way = nerfstudio("realitycapture", images, " --csv cameras.csv");
-        let export = "export its registration as CSV, `Internal/External camera parameters`";
-        return one("a RealityCapture project", t, format!("{export}; {way}"));
+        let way = "export its registration as CSV (`Internal/External camera parameters`) into this folder, or its \
+                   metadata as XMP beside the photographs";
+        return one("a RealityCapture project", t, way.into());
     }
-    let colmap = ["sparse", "colmap", "cameras.bin", "cameras.txt", "images.bin", "database.db"];
+    let colmap =
+        ["sparse", "colmap", "cameras.bin", "cameras.txt", "images.bin", "images.txt", "database.db"];
     if let Some(t) = found.any(&colmap) {
-        let inside = ["sparse/0", "colmap/sparse/0", "sparse", "colmap"].map(|n| found.root.join(n));
-        let model = inside.into_iter().find(|p| io::is_folder(p)).unwrap_or_else(|| found.root.clone());
-        let model = io::real_path(&model).unwrap_or(model);
-        let way =
-            nerfstudio("images", images, &format!(" --skip-colmap --colmap-model-path {}", model.display()));
-        return one("a COLMAP model", t, way + "; so does instant-ngp's `colmap2nerf.py`");
+        let way = "its cameras and images files are missing: run `colmap mapper`, or copy `cameras.bin` and `images.bin` \
+                   (or `.txt`) into `sparse/0`";
+        return one("an incomplete COLMAP project", t, way.into());
     }
     if let Some(folder) = photographs {
         let first = FolderEntries::of(&folder).ending(&PHOTOGRAPHS).cloned().unwrap_or_default();

@@ -2,13 +2,13 @@
 
 use super::view::Split;
 use crate::Error;
-use crate::geom::{Camera, Distortion};
+use crate::geom::{Aabb, Camera, Distortion};
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 use std::path::PathBuf;
 
 /// Everything a format's reader found.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Listing {
     pub frames: Vec<CameraFrame>,
     /// What the format was recognized by, and what else was found.
@@ -19,6 +19,28 @@ pub(super) struct Listing {
     pub agreements: Vec<Agreement>,
     /// The world's up, where the dataset names it.
     pub up: Option<DVec3>,
+    /// Where the frames' own masks are from, in words.
+    pub masks_named: &'static str,
+    /// Where the dataset says the head is.
+    pub focus: Option<Aabb>,
+    /// Points on what was photographed.
+    pub points: Vec<DVec3>,
+}
+
+impl Default for Listing {
+    fn default() -> Listing {
+        Listing {
+            frames: Vec::new(),
+            reasons: Vec::new(),
+            warnings: Vec::new(),
+            problems: Vec::new(),
+            agreements: Vec::new(),
+            up: None,
+            masks_named: "`mask_path` of each frame",
+            focus: None,
+            points: Vec::new(),
+        }
+    }
 }
 
 /// How well two camera files agree.

@@ -1,11 +1,12 @@
 //! From camera files to views: everything is checked but the pixels.
 
 use super::error::{in_frame, no_views, wrong_size};
+use super::format::CameraFiles;
 use super::frame::{CameraFrame, Listing};
 use super::masks::few;
 use super::names::CaptureFolder;
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
-use super::{foreign, llff, load, masks, names, transforms};
+use super::{foreign, load, masks, names, scene};
 use crate::io::{self, PictureInfo};
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
@@ -28,57 +29,13 @@ pub fn has_cameras(root: &Path) -> bool {
     io::is_folder(root) && CameraFiles::find(root).is_some()
 }
 
-/// The files that describe the cameras.
-struct CameraFiles {
-    /// `transforms*.json`.
-    json: Vec<&'static str>,
-    /// `poses_bounds*.npy`: to check the JSON against, or alone.
-    poses: Vec<&'static str>,
-}
-
-impl CameraFiles {
-    fn find(root: &Path) -> Option<CameraFiles> {
-        let there = |names: &[&'static str]| -> Vec<&'static str> {
-            names.iter().copied().filter(|n| io::is_file(&root.join(n))).collect()
-        };
-        let mut json = there(&["transforms_train.json", "transforms_val.json", "transforms_test.json"]);
-        if !json.contains(&"transforms_train.json") {
-            json = there(&["transforms.json"]);
-        }
-        let mut poses = there(&["poses_bounds_train.npy", "poses_bounds_test.npy"]);
-        if poses.is_empty() {
-            poses = there(&["poses_bounds.npy"]);
-        }
-        (!json.is_empty() || !poses.is_empty()).then_some(CameraFiles { json, poses })
-    }
-
-    /// The format, and which files say so.
-    fn describe(&self) -> (&'static str, String) {
-        let quote = |names: &[&str]| names.iter().map(|n| format!("`{n}`")).collect::<Vec<_>>().join(", ");
-        let (json, poses) = (quote(&self.json), quote(&self.poses));
-        match (self.json.is_empty(), self.poses.is_empty()) {
-            (true, _) => ("LLFF poses", format!("cameras from {poses}, no JSON beside")),
-            (_, true) => ("transforms.json", format!("cameras from {json}")),
-            _ => ("transforms.json with LLFF poses", format!("cameras from {json}, checked against {poses}")),
-        }
-    }
-}
-
 /// A capture as far as one can be used, and everything that was found on the way, problems above all.
 pub(super) fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>, Listing) {
     let mut listing = Listing::default();
     let capture = open_folder(root, options).map(|(folder, files)| {
         let (format, reason) = files.describe();
         listing.reasons.push(reason);
-        if files.json.is_empty() {
-            let listed = llff::list(&folder, &files.poses, &mut listing);
-            listing.problems.extend(listed.err());
-        } else {
-            transforms::list(&folder, &files.json, &mut listing);
-            if listing.problems.is_empty() {
-                llff::check(&folder, &files.poses, &mut listing);
-            }
-        }
+        files.list(&folder, &mut listing);
         build(&folder, format, &mut listing)
     });
     let capture = capture.unwrap_or_else(|problem| {
@@ -165,6 +122,7 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         format: format.into(),
         reasons: std::mem::take(&mut listing.reasons),
         up: up(&views, listing.up),
+        focus: listing.focus.or_else(|| scene::around_points(&views, &listing.points)),
         views,
         unit_m: options.unit_m,
         warnings: std::mem::take(&mut listing.warnings),
@@ -224,7 +182,7 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
     })
 }
 
-/// Named splits are kept; otherwise every 8th view in name order, starting with the first, is held out.
+/// Named splits are kept; otherwise [`every_eighth`] view is held out.
 fn name_splits(views: &mut [View], kept: &[(CameraFrame, PictureInfo)], listing: &mut Listing) {
     if kept.iter().any(|(f, _)| f.split.is_some()) {
         let wanted = [(Split::Train, "marked for training"), (Split::Test, "held out for testing")];
@@ -237,15 +195,22 @@ fn name_splits(views: &mut [View], kept: &[(CameraFrame, PictureInfo)], listing:
         listing.warnings.push(format!("all {} views are trained on, none is held out", views.len()));
         return;
     }
-    let mut order: Vec<usize> = (0..views.len()).collect();
-    order.sort_by(|&a, &b| views[a].name.cmp(&views[b].name));
-    for (rank, i) in order.into_iter().enumerate() {
-        views[i].split = if rank % 8 == 0 { Split::Test } else { Split::Train };
-    }
+    let splits = every_eighth(views);
+    views.iter_mut().zip(splits).for_each(|(view, split)| view.split = split);
     listing.reasons.push("no splits are named: every 8th view in name order is held out for testing".into());
 }
 
-fn up(views: &[View], named: Option<DVec3>) -> Vec3 {
+/// The splits of a capture that names none: every 8th view in name order, starting with the first, is held out.
+pub(super) fn every_eighth(views: &[View]) -> Vec<Split> {
+    let mut order: Vec<usize> = (0..views.len()).collect();
+    order.sort_by(|&a, &b| views[a].name.cmp(&views[b].name));
+    let mut splits = vec![Split::Train; views.len()];
+    order.into_iter().step_by(8).for_each(|i| splits[i] = Split::Test);
+    splits
+}
+
+/// Up in the world: as the dataset says, else the mean of the cameras' ups.
+pub(super) fn up(views: &[View], named: Option<DVec3>) -> Vec3 {
     if let Some(up) = named {
         return up.normalize().as_vec3();
     }

@@ -10,6 +10,7 @@ use super::frame::{Agreement, CameraFrame, Intrinsics, Listing};
 use super::names::CaptureFolder;
 use super::pose;
 use super::view::Split;
+use crate::geom::Camera;
 use crate::io::{self, NpyValues};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
@@ -19,7 +20,7 @@ const POSITION_TOLERANCE: f64 = 1e-3;
 /// Radians; 0.1°.
 const ROTATION_TOLERANCE: f64 = 1.75e-3;
 /// Relative.
-const FOCAL_TOLERANCE: f64 = 1e-3;
+pub(super) const FOCAL_TOLERANCE: f64 = 1e-3;
 
 #[derive(Clone, Copy, Debug)]
 struct PoseRow {
@@ -244,6 +245,27 @@ fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String
     Ok(Some(files.into_iter().map(|n| format!("{name}/{n}")).collect()))
 }
 
+/// An LLFF file of cameras with one focal length each, and near and far.
+pub(super) fn write<'c>(cameras: impl ExactSizeIterator<Item = (&'c Camera, [f64; 2])>) -> Vec<u8> {
+    let shape = format!("({}, 17)", cameras.len());
+    let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}");
+    // NumPy's own files end their header with a newline on a multiple of 64
+    let padded = (10 + header.len() + 1).next_multiple_of(64) - 11;
+    let mut file = b"\x93NUMPY\x01\x00".to_vec();
+    file.extend((padded as u16 + 1).to_le_bytes());
+    file.extend(format!("{header:padded$}\n").into_bytes());
+    for (camera, bounds) in cameras {
+        let r = camera.rotation;
+        let size = [camera.height as f64, camera.width as f64, (camera.fx * camera.fy).sqrt()];
+        for k in 0..3 {
+            let line = [-r.y_axis[k], r.x_axis[k], r.z_axis[k], camera.position[k], size[k]];
+            line.iter().for_each(|v| file.extend(v.to_le_bytes()));
+        }
+        bounds.iter().for_each(|v| file.extend(v.to_le_bytes()));
+    }
+    file
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -273,6 +295,19 @@ mod tests {
             v[5 * k..5 * k + 5].copy_from_slice(&line);
         }
         v
+    }
+
+    #[test]
+    fn what_is_written_is_read_again() {
+        let f = frame("a", 0.3);
+        let camera = f.intrinsics.camera((4, 2), f.rotation, f.position).unwrap();
+        let bytes = write([(&camera, [0.5, 2.0]), (&camera, [0.5, 2.0])].into_iter());
+        let npy = io::parse_npy("p.npy".as_ref(), &bytes, &io::Limits::default()).unwrap();
+        assert_eq!(npy.shape, [2, 17]);
+        let NpyValues::Number(values) = npy.values else { panic!() };
+        assert_eq!(values[17..32], llff(&f)[..15]);
+        assert_eq!(values[32..], [0.5, 2.0]);
+        assert_eq!((bytes.len() - 2 * 17 * 8) % 64, 0);
     }
 
     #[test]

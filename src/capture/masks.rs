@@ -59,7 +59,7 @@ pub(super) fn choose(
             };
             vec![
                 alpha(listing)?,
-                ("`mask_path` of each frame".into(), named),
+                (listing.masks_named.into(), named),
                 in_folder("vit_mask/NAME.png", &|v| format!("vit_mask/{}.png", v.name))?,
                 in_folder("masks/NAME.png", &|v| format!("masks/{}.png", v.name))?,
                 in_folder("masks/NAME.jpg.png", &|v| format!("masks/{}.png", full_name(v)))?,

@@ -21,16 +21,24 @@
 //! ```
 
 pub(crate) mod carve;
+mod colmap;
+pub mod convert;
+mod entries;
 mod error;
 mod foreign;
+mod format;
 mod frame;
 mod gather;
 pub mod inspect;
+mod lens;
 mod llff;
 mod load;
 mod masks;
+mod metashape;
 mod names;
+mod neus;
 mod pose;
+mod realitycapture;
 pub mod scene;
 pub mod synthetic;
 mod transforms;

@@ -1,13 +1,24 @@
 //! Names in camera files: only what lies inside the capture is ever opened.
 
+use super::entries::{IMAGE_FOLDERS, PHOTOGRAPHS, has_ending};
 use super::error::outside;
 use super::frame::CameraFrame;
 use super::view::CaptureOptions;
 use crate::{Result, io};
+use glam::DMat3;
 use std::path::{Component, Path, PathBuf};
 
 /// What may be missing at the end of a photograph's name.
 const ENDINGS: [&str; 7] = ["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"];
+
+/// OpenCV's camera axes to ours: right, down, ahead to right, up, back.
+pub(super) const FLIP: DMat3 = DMat3::from_cols_array(&[1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0]);
+
+/// A photograph's name below its folder; absolute names stay as they are.
+pub(super) fn join(base: &str, name: &str) -> String {
+    let is_absolute = name.starts_with(['/', '\\']) || name.as_bytes().get(1) == Some(&b':');
+    if base.is_empty() || is_absolute { name.into() } else { format!("{base}/{name}") }
+}
 
 /// The folder of a capture that is being opened.
 pub(super) struct CaptureFolder<'a> {
@@ -72,6 +83,31 @@ impl CaptureFolder<'_> {
     /// A camera file directly in the capture.
     pub fn camera_file(&self, file: &str) -> Result<PathBuf> {
         self.file(file, Path::new(file))?.ok_or_else(|| outside(file, file))
+    }
+
+    /// The folder that photographs' names start from, where the format does not say: the one that has most of the
+    /// first of them.
+    pub fn image_folder<'n>(&self, names: impl Iterator<Item = &'n str>) -> &'static str {
+        let names: Vec<&str> = names.take(64).collect();
+        let there = |base: &str, name: &str| {
+            self.photo("", &join(base, name)).is_ok_and(|(_, photo)| photo.is_some())
+        };
+        let bases = IMAGE_FOLDERS.into_iter().chain([""]);
+        let counted = bases.map(|base| (base, names.iter().filter(|name| there(base, name)).count()));
+        counted.fold(("images", 0), |best, next| if next.1 > best.1 { next } else { best }).0
+    }
+
+    /// A mask that COLMAP itself would take (`masks/NAME.jpg.png`), or of the photograph's name without its ending.
+    pub fn mask_of(&self, file: &str, name: &str) -> Result<Option<PathBuf>> {
+        let stem =
+            if has_ending(name, &PHOTOGRAPHS) { Path::new(name).with_extension("") } else { name.into() };
+        for name in [format!("masks/{name}.png"), format!("masks/{}.png", stem.to_string_lossy())] {
+            let relative = self.relative(file, &name)?;
+            if let Some(path) = self.file(file, &relative)? {
+                return Ok(Some(path));
+            }
+        }
+        Ok(None)
     }
 
     /// The photograph that `name` means, with its path below the capture: the very name, else with a

@@ -10,10 +10,12 @@
 //! - the *hull* is everything inside that box that touches three masks: what one still may find there.
 //!
 //! Without masks: the box of the region that 40 % of the cameras have in their frame, no farther from the
-//! meeting point of the viewing axes than 0.6 of the cameras' median distance to it.
+//! meeting point of the viewing axes than 0.6 of the cameras' median distance to it; drawn tighter around points that
+//! the dataset has there, or the dataset's own box.
 
 use super::carve::{self, Cube, Projector, SilhouetteTable};
 use super::masks::few;
+use super::view::View;
 use crate::geom::{Aabb, Camera, Similarity};
 use crate::image::Gray;
 use crate::{Error, Result};
@@ -87,11 +89,13 @@ pub struct SceneOptions {
     pub resolution: usize,
     /// Names of the views for messages; numbers where absent.
     pub names: Vec<String>,
+    /// Where the dataset says the head is; used where fewer than two masks say it.
+    pub focus: Option<Aabb>,
 }
 
 impl Default for SceneOptions {
     fn default() -> SceneOptions {
-        SceneOptions { resolution: 128, names: Vec::new() }
+        SceneOptions { resolution: 128, names: Vec::new(), focus: None }
     }
 }
 
@@ -157,7 +161,7 @@ pub fn fit(
     }
     if used.len() < 2 {
         // one silhouette alone bounds nothing in depth
-        let scene = from_frusta(cameras)?;
+        let scene = from_frusta(cameras, options.focus)?;
         return Ok((scene, warnings));
     }
 
@@ -302,8 +306,48 @@ fn first_half(cameras: &[&Camera], center: DVec3) -> f64 {
     (1.2 * wide.fold(0.0, f64::max)).min(0.95 * nearest)
 }
 
+/// Points that a box needs to be drawn around them.
+const LEAST_POINTS: usize = 100;
+
+/// The box around points that lie where the cameras look, one in a hundred left out on each side, and a twentieth more;
+/// `None` for too few.
+pub(super) fn around_points(views: &[View], points: &[DVec3]) -> Option<Aabb> {
+    if points.len() < LEAST_POINTS {
+        return None;
+    }
+    let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
+    let seen = world_box(&from_frusta(&cameras, None).ok()?);
+    let within: Vec<Vec3> = points.iter().map(|p| p.as_vec3()).filter(|p| seen.contains(*p)).collect();
+    if within.len() < LEAST_POINTS {
+        return None;
+    }
+    let [x, y, z] = [0, 1, 2].map(|k| {
+        let mut along: Vec<f32> = within.iter().map(|p| p[k]).collect();
+        along.sort_by(f32::total_cmp);
+        (along[along.len() / 100], along[along.len() - 1 - along.len() / 100])
+    });
+    let (min, max) = (Vec3::new(x.0, y.0, z.0), Vec3::new(x.1, y.1, z.1));
+    let more = 0.05 * (max - min);
+    Some(Aabb { min: (min - more).max(seen.min), max: (max + more).min(seen.max) })
+}
+
+/// The scene of a box in the world, without a hull; `None` for a flat one.
+fn from_box(b: Aabb) -> Option<Scene> {
+    let (size, middle) = (b.size().as_dvec3(), b.center().as_dvec3());
+    let half = 0.5 * size.max_element();
+    if !(half.is_finite() && size.min_element() > 1e-3 * half) {
+        return None;
+    }
+    let reach = (0.5 * size / half).as_vec3();
+    let aabb = Aabb { min: -reach, max: reach };
+    Some(Scene { scene_from_world: scene_from(middle, half), aabb, hull: None })
+}
+
 /// The box without masks: see the module's text.
-fn from_frusta(cameras: &[Camera]) -> Result<Scene> {
+fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Scene> {
+    if let Some(scene) = focus.and_then(from_box) {
+        return Ok(scene);
+    }
     let some: Vec<&Camera> = cameras.iter().collect();
     let axes: Vec<_> = cameras.iter().map(|c| carve::ray_to(c, None)).collect();
     let center = aim(&some, &axes)?;
@@ -357,6 +401,7 @@ pub fn describe(scene: &Scene) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::synthetic;
     use super::*;
     use glam::DMat3;
 
@@ -407,6 +452,41 @@ mod tests {
 
     fn small() -> SceneOptions {
         SceneOptions { resolution: 64, ..SceneOptions::default() }
+    }
+
+    #[test]
+    fn points_draw_the_box_tighter_and_a_flat_box_is_no_scene() {
+        let options = synthetic::SyntheticOptions::default();
+        let cameras: Vec<Camera> =
+            synthetic::cameras(&options).into_iter().map(|(camera, _)| camera).collect();
+        let view = |camera: &Camera| View {
+            name: String::new(),
+            camera: camera.clone(),
+            split: super::super::view::Split::Train,
+            photo: Default::default(),
+            mask: super::super::view::ViewMask::None,
+            mask_meaning: crate::config::MaskMeaning::Empty,
+            valid: None,
+            region: None,
+            downscale: 1,
+            photo_size: (1, 1),
+            declared: (1, 1),
+            declared_by: String::new(),
+        };
+        let views: Vec<View> = cameras.iter().map(view).collect();
+        let mut points: Vec<DVec3> =
+            synthetic::SyntheticHead.surface_points(2000, 3).iter().map(|p| p.as_dvec3()).collect();
+        points.push(DVec3::splat(500.0)); // what else is in the pictures
+        points.push(DVec3::splat(f64::NAN));
+        let found = around_points(&views, &points).unwrap();
+        let truth = synthetic::SyntheticHead.bounds();
+        let off = (found.min - truth.min).abs().max((found.max - truth.max).abs());
+        assert!(off.max_element() < 0.1 * truth.size().max_element(), "{found:?} {truth:?}");
+        assert_eq!(around_points(&views, &points[..99]), None);
+        let options = SceneOptions { focus: Some(found), ..SceneOptions::default() };
+        let (scene, _) = fit(&cameras, &vec![None; cameras.len()], &options).unwrap();
+        assert!((world_box(&scene).min - found.min).abs().max_element() < 1e-3);
+        assert!(from_box(Aabb { min: Vec3::ZERO, max: Vec3::new(1.0, 1.0, 0.0) }).is_none());
     }
 
     #[test]

@@ -6,6 +6,7 @@
 
 use super::error::{in_file, in_frame};
 use super::frame::{CameraFrame, Intrinsics, Listing};
+use super::lens::{self, LensModel};
 use super::names::CaptureFolder;
 use super::pose;
 use super::view::Split;
@@ -24,7 +25,7 @@ type Object = Map<String, Value>;
 const FOCAL: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// The other keys that may stand at the top for all frames.
-const SHARED: &str = "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 is_fisheye camera_model";
+const SHARED: &str = "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega is_fisheye camera_model";
 
 /// Keys that count as absent where their value is of another type, and whether it is of theirs.
 const LENIENT: [(&str, fn(&Value) -> bool); 3] = [
@@ -80,6 +81,9 @@ struct FrameKeys {
     k6: f64,
     p1: f64,
     p2: f64,
+    sx1: f64,
+    sy1: f64,
+    omega: f64,
     is_fisheye: bool,
     camera_model: Option<String>,
 }
@@ -241,31 +245,8 @@ fn intrinsics(keys: &FrameKeys, ignored: &mut Vec<String>) -> Result<Intrinsics,
         _ => Ok(value.map(|v| v as u32)),
     };
     let model = keys.camera_model.as_deref().unwrap_or("OPENCV");
-    let model = if keys.is_fisheye { "OPENCV_FISHEYE (`is_fisheye`)" } else { model };
-    let &FrameKeys { k1, k2, k3, p1, p2, .. } = keys;
-    let mut distortion = Distortion { k1, k2, k3, p1, p2 };
-    let higher = [("k4", keys.k4), ("k5", keys.k5), ("k6", keys.k6)].into_iter().find(|(_, k)| *k != 0.0);
-    match model {
-        "OPENCV" | "FULL_OPENCV" | "SIMPLE_RADIAL" | "RADIAL" => {
-            if let Some((key, _)) = higher {
-                return Err(format!(
-                    "its lens has `{key}`, which is not supported; undistort the photographs first"
-                ));
-            }
-        }
-        "PINHOLE" | "SIMPLE_PINHOLE" | "PERSPECTIVE" => {
-            if !distortion.is_none() || higher.is_some() {
-                ignored.push(model.into());
-            }
-            distortion = Distortion::default();
-        }
-        other => {
-            return Err(format!(
-                "its camera model `{other}` is not supported (OPENCV, RADIAL and PINHOLE models are); \
-                 undistort the photographs first"
-            ));
-        }
-    }
+    let model = if keys.is_fisheye { "OPENCV_FISHEYE" } else { model };
+    let distortion = distortion(keys, model, ignored)?;
     let (w, h) = (side("w", keys.w)?, side("h", keys.h)?);
     if w.is_some() != h.is_some() {
         return Err("it has only one of `w` and `h`".into());
@@ -278,6 +259,36 @@ fn intrinsics(keys: &FrameKeys, ignored: &mut Vec<String>) -> Result<Intrinsics,
     }
     let (focal, center) = ([keys.fl_x, keys.fl_y], [keys.cx, keys.cy]);
     Ok(Intrinsics { size: w.zip(h), focal, angle, center, distortion })
+}
+
+/// The coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as well, and nerfstudio's
+/// perspective k4 is none that anybody else has.
+fn distortion(keys: &FrameKeys, model: &str, ignored: &mut Vec<String>) -> Result<Distortion, String> {
+    let &FrameKeys { k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1, omega, .. } = keys;
+    let given = Distortion { k1, k2, k3, p1, p2, k4, k5, k6, sx1, sy1, omega, ..Distortion::default() };
+    let parameters = match model {
+        "PERSPECTIVE" | "PINHOLE" | "SIMPLE_PINHOLE" => {
+            if !given.is_none() {
+                ignored.push(model.into());
+            }
+            return Ok(Distortion::default());
+        }
+        "OPENCV" | "RADIAL" | "SIMPLE_RADIAL" => "k1 k2 k3 p1 p2",
+        "FULL_OPENCV" => "k1 k2 k3 k4 k5 k6 p1 p2",
+        "OPENCV_FISHEYE" | "RADIAL_FISHEYE" | "SIMPLE_RADIAL_FISHEYE" => "k1 k2 k3 k4",
+        other => LensModel::named(other)?.parameters,
+    };
+    let all = "k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega".split(' ');
+    for key in all.filter(|key| !parameters.split(' ').any(|p| p == *key)) {
+        if *lens::coefficient(&mut { given }, key) != 0.0 {
+            return Err(format!(
+                "its lens has `{key}`, which its camera model `{model}` has not; undistort the photographs first"
+            ));
+        }
+    }
+    let distortion = Distortion { projection: lens::projection(model), ..given };
+    lens::check(&distortion)?;
+    Ok(distortion)
 }
 
 #[cfg(test)]
@@ -307,8 +318,9 @@ mod tests {
     #[test]
     fn lenses_that_are_not_supported_are_named() {
         for (top, word) in [
-            (r#"{"camera_model": "OPENCV_FISHEYE"}"#, "OPENCV_FISHEYE"),
-            (r#"{"is_fisheye": true}"#, "is_fisheye"),
+            (r#"{"camera_model": "OPENCV_FISHEYE", "p1": 0.1}"#, "OPENCV_FISHEYE"),
+            (r#"{"is_fisheye": true, "k5": 0.1}"#, "k5"),
+            (r#"{"camera_model": "FOV", "omega": 4.0}"#, "omega"),
             (r#"{"camera_model": "EQUIRECTANGULAR"}"#, "EQUIRECTANGULAR"),
             (r#"{"k4": 0.1}"#, "k4"),
             (r#"{"w": 10.5, "h": 3}"#, "10.5"),

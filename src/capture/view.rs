@@ -1,7 +1,7 @@
 //! A capture and its views, as they are used from here on.
 
 use crate::config::{MaskMeaning, MaskSource};
-use crate::geom::Camera;
+use crate::geom::{Aabb, Camera};
 use crate::io::Limits;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
@@ -84,6 +84,9 @@ pub struct Capture {
     /// the cameras' up vectors; the mean is snapped to a world axis within 20°, because datasets are
     /// nearly always aligned and an export is then turned by exactly 90°.
     pub up: Vec3,
+    /// Where the dataset says the head is, in the world; of use where no masks say it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub focus: Option<Aabb>,
     /// Metres per dataset unit.
     pub unit_m: f64,
     /// What a person should know; nothing here stops the work.

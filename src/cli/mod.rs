@@ -8,6 +8,7 @@ mod bench;
 mod check;
 mod completions;
 mod config;
+mod convert;
 mod demo;
 mod inspect;
 mod invocation;
@@ -162,6 +163,24 @@ enum Command {
     Inspect {
         /// A folder of photographs with cameras
         capture: PathBuf,
+    },
+    /// Write a capture's cameras in another format: transforms.json, COLMAP or LLFF
+    #[command(after_long_help = "Examples:
+  tiface convert captures/002_00 --to colmap
+  tiface convert scan --to transforms --out captures/scan
+  tiface convert captures/002_00 --to llff --link
+
+Photographs and masks are copied as they are; --link gives them a second name on the same disk instead, which
+takes no space: whoever changes one then changes both. The new folder must not be there, or be empty.")]
+    Convert {
+        /// A folder of photographs with cameras
+        capture: PathBuf,
+        /// transforms, colmap or llff
+        #[arg(long, value_name = "FORMAT")]
+        to: String,
+        /// Link photographs and masks instead of copying them
+        #[arg(long)]
+        link: bool,
     },
     /// Stage: which pixels are the head, and where that puts it
     #[command(after_long_help = "Examples:
@@ -389,6 +408,7 @@ pub fn main() -> ExitCode {
         Command::Inspect { capture } => {
             makes_nothing("inspect").and_then(|()| inspect::run(&common, capture))
         }
+        Command::Convert { capture, to, link } => convert::run(&invocation, capture, to, *link),
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
         Command::Preview(options) => preview::run(&invocation, options),

@@ -1,4 +1,4 @@
-//! Pinhole cameras with OpenCV distortion: pixel → ray and back.
+//! Cameras with a lens: pixel → ray and back.
 //!
 //! Camera axes are OpenGL's (+X right, +Y up, looking along −Z). A pixel's centre is at +0.5 and
 //! (0, 0) is the top-left corner of the picture.
@@ -8,8 +8,29 @@ use super::similarity::Similarity;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
-/// OpenCV radial (k) and tangential (p) coefficients on normalized coordinates.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+/// How a lens maps the angle θ from its axis to a radius, before coefficients bend it further.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Projection {
+    /// `r = tan θ`.
+    #[default]
+    Perspective,
+    /// Equidistant, `r = θ` (OpenCV's fisheye).
+    Fisheye,
+    /// `r = atan(2 tan θ tan(ω/2)) / ω` (Devernay and Faugeras, "Straight lines have to be straight").
+    Fov,
+}
+
+/// One model of a lens for all formats: OpenCV's coefficients on normalized coordinates.
+///
+/// With the projected point (u, v), r² = u² + v²:
+///
+/// - perspective: radial `(1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)` (OpenCV's rational model);
+/// - fisheye: radial `1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸`, where r is the angle θ;
+/// - both: tangential p1, p2 as in OpenCV and a thin prism (sx1, sy1) · r² (Weng, Cohen and Herniou).
+///
+/// Half of a sphere is the most that is seen: beyond 90° from the axis no ray is given.
+#[derive(Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Distortion {
     /// r² coefficient.
     pub k1: f64,
@@ -21,7 +42,56 @@ pub struct Distortion {
     pub p1: f64,
     /// Second tangential coefficient.
     pub p2: f64,
+    /// r² coefficient of the denominator; of a fisheye, the r⁸ coefficient.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub k4: f64,
+    /// r⁴ coefficient of the denominator; perspective only.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub k5: f64,
+    /// r⁶ coefficient of the denominator; perspective only.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub k6: f64,
+    /// Thin prism along x.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub sx1: f64,
+    /// Thin prism along y.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub sy1: f64,
+    /// ω of [`Projection::Fov`], radians, in 0..π.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub omega: f64,
+    /// What the coefficients bend.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub projection: Projection,
 }
+
+/// As it is written: digests of cameras are made of this.
+impl std::fmt::Debug for Distortion {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        let mut out = f.debug_struct("Distortion");
+        let plain = [("k1", self.k1), ("k2", self.k2), ("k3", self.k3), ("p1", self.p1), ("p2", self.p2)];
+        for (name, value) in &plain {
+            out.field(name, value);
+        }
+        let more = [("k4", self.k4), ("k5", self.k5), ("k6", self.k6), ("sx1", self.sx1), ("sy1", self.sy1)];
+        let more = more.into_iter().chain([("omega", self.omega)]).filter(|(_, value)| *value != 0.0);
+        for (name, value) in more {
+            out.field(name, &value);
+        }
+        if self.projection != Projection::default() {
+            out.field("projection", &self.projection);
+        }
+        out.finish()
+    }
+}
+
+/// What most lenses do not have is not written, so that their files stay as they were.
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
+}
+
+/// Angles from here on count as 90°: the tangent would be too large to be of use.
+const WIDEST: f64 = std::f64::consts::FRAC_PI_2 - 1e-3;
 
 impl Distortion {
     /// Returns whether it does nothing.
@@ -31,44 +101,114 @@ impl Distortion {
 
     /// Ideal normalized coordinates (OpenCV: y down) to distorted ones.
     pub fn apply(&self, x: f64, y: f64) -> (f64, f64) {
+        match self.projection {
+            Projection::Perspective => self.bend(x, y),
+            other => {
+                let scale = self.radius_over_tangent(other, x.hypot(y));
+                self.bend(scale * x, scale * y)
+            }
+        }
+    }
+
+    /// r / tan θ of a projection.
+    fn radius_over_tangent(&self, projection: Projection, tangent: f64) -> f64 {
+        let small = tangent < 1e-9;
+        match projection {
+            Projection::Perspective => 1.0,
+            Projection::Fisheye if small => 1.0,
+            Projection::Fisheye => tangent.atan() / tangent,
+            Projection::Fov if self.omega.abs() < 1e-6 => 1.0,
+            Projection::Fov => {
+                let spread = 2.0 * (0.5 * self.omega).tan();
+                if small { spread / self.omega } else { (spread * tangent).atan() / (self.omega * tangent) }
+            }
+        }
+    }
+
+    /// tan θ / r, the way back; `None` at 90° and beyond.
+    fn tangent_over_radius(&self, radius: f64) -> Option<f64> {
+        let small = radius < 1e-9;
+        match self.projection {
+            Projection::Perspective => Some(1.0),
+            Projection::Fisheye if small => Some(1.0),
+            Projection::Fisheye => (radius < WIDEST).then(|| radius.tan() / radius),
+            Projection::Fov if self.omega.abs() < 1e-6 => Some(1.0),
+            Projection::Fov => {
+                let spread = 2.0 * (0.5 * self.omega).tan();
+                let angle = (radius * self.omega).abs();
+                if small {
+                    return Some(self.omega / spread);
+                }
+                (angle < WIDEST).then(|| angle.tan() / (spread.abs() * radius))
+            }
+        }
+    }
+
+    /// The radial factor at r², and its derivative by r².
+    fn radial(&self, r2: f64) -> (f64, f64) {
+        if self.projection == Projection::Fisheye {
+            let factor = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)));
+            let slope = self.k1 + r2 * (2.0 * self.k2 + r2 * (3.0 * self.k3 + 4.0 * r2 * self.k4));
+            return (factor, slope);
+        }
+        let over = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3));
+        let over_slope = self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3);
+        let under = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6));
+        let under_slope = self.k4 + r2 * (2.0 * self.k5 + 3.0 * r2 * self.k6);
+        let factor = over / under;
+        (factor, (over_slope - factor * under_slope) / under)
+    }
+
+    /// What the coefficients do to a projected point.
+    fn bend(&self, x: f64, y: f64) -> (f64, f64) {
         let r2 = x * x + y * y;
-        let radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3));
+        let (radial, _) = self.radial(r2);
         (
-            x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),
-            y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y,
+            x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x) + self.sx1 * r2,
+            y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y + self.sy1 * r2,
         )
     }
 
-    /// Distorted normalized coordinates back to ideal ones: Newton on [`Distortion::apply`] with its
-    /// exact Jacobian. `None` where the model folds over (no ideal point maps there).
+    /// Distorted normalized coordinates back to ideal ones: Newton on the coefficients with their exact Jacobian,
+    /// whose result is checked, then the projection's inverse. `None` where the model folds over (no ideal point
+    /// maps there) and from 90° on.
     pub fn undo(&self, xd: f64, yd: f64) -> Option<(f64, f64)> {
         if self.is_none() {
             return Some((xd, yd));
         }
         let (mut x, mut y) = (xd, yd);
         for _ in 0..50 {
-            let (fx, fy) = self.apply(x, y);
+            let (fx, fy) = self.bend(x, y);
             let (ex, ey) = (fx - xd, fy - yd);
             let r2 = x * x + y * y;
-            let radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3));
-            let slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3));
-            let xx = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x;
+            let (radial, slope) = self.radial(r2);
+            let slope = 2.0 * slope;
+            let xx = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x + 2.0 * self.sx1 * x;
             let xy = x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y;
-            let yy = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x;
-            let det = xx * yy - xy * xy;
+            let yy = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x + 2.0 * self.sy1 * y;
+            // the thin prism alone makes the Jacobian unsymmetric
+            let (right, down) = (xy + 2.0 * self.sx1 * y, xy + 2.0 * self.sy1 * x);
+            let det = xx * yy - right * down;
             if det.is_nan() || det <= 1e-6 {
                 return None; // past the fold: the mapping is no longer one to one
             }
-            let (dx, dy) = ((yy * ex - xy * ey) / det, (xx * ey - xy * ex) / det);
+            let (dx, dy) = ((yy * ex - right * ey) / det, (xx * ey - down * ex) / det);
             (x, y) = (x - dx, y - dy);
             if dx.abs() + dy.abs() < 1e-12 {
                 break;
             }
         }
-        let (fx, fy) = self.apply(x, y);
-        ((fx - xd).abs() + (fy - yd).abs() < 1e-8).then_some((x, y))
+        let (fx, fy) = self.bend(x, y);
+        if (fx - xd).abs() + (fy - yd).abs() >= RESIDUAL {
+            return None;
+        }
+        let scale = self.tangent_over_radius(x.hypot(y))?;
+        Some((scale * x, scale * y))
     }
 }
+
+/// How near [`Distortion::undo`] must come; at a focal length of 10 000 pixels, 1e-6 of a pixel.
+const RESIDUAL: f64 = 1e-10;
 
 /// One camera: intrinsics in pixels of its own picture, pose in the dataset's world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -205,7 +345,7 @@ mod tests {
             fy: 160.0,
             cx: 101.0,
             cy: 48.0,
-            distortion: Distortion { k1: -0.1, k2: 0.02, k3: 0.0, p1: 0.001, p2: -0.002 },
+            distortion: Distortion { k1: -0.1, k2: 0.02, p1: 0.001, p2: -0.002, ..Distortion::default() },
             rotation: DMat3::from_rotation_y(0.4),
             position: DVec3::new(1.0, 2.0, 3.0),
         }
@@ -231,5 +371,106 @@ mod tests {
         assert!(p.x > 101.0 && p.y < 48.0);
         assert_eq!(depth, 2.0);
         assert!(c.project(Vec3::new(1.0, 2.0, 4.0)).is_none());
+    }
+
+    /// A lens of each kind, bent about as far as real ones are.
+    fn lenses() -> Vec<Distortion> {
+        let none = Distortion::default();
+        let fisheye = Distortion { projection: Projection::Fisheye, ..none };
+        vec![
+            Distortion { k1: -0.2, ..none },
+            Distortion { k1: -0.25, k2: 0.08, p1: 0.004, p2: -0.003, ..none },
+            Distortion {
+                k1: 0.3,
+                k2: -0.1,
+                k3: 0.02,
+                k4: 0.25,
+                k5: 0.05,
+                k6: 0.01,
+                p1: 1e-3,
+                p2: -2e-3,
+                ..none
+            },
+            Distortion { sx1: 3e-3, sy1: -2e-3, k1: 0.05, ..none },
+            fisheye,
+            Distortion { k1: -0.03, k2: 0.01, k3: -4e-3, k4: 6e-4, ..fisheye },
+            Distortion {
+                k1: 0.02,
+                k2: -5e-3,
+                k3: 1e-3,
+                k4: -2e-4,
+                p1: 1e-3,
+                p2: 2e-3,
+                sx1: 4e-3,
+                sy1: -1e-3,
+                ..fisheye
+            },
+            Distortion { projection: Projection::Fov, omega: 0.9, ..none },
+            Distortion { projection: Projection::Fov, omega: 0.0, ..none },
+        ]
+    }
+
+    #[test]
+    fn every_lens_is_undone_to_the_last_digits() {
+        for lens in lenses() {
+            for i in 0..400 {
+                let (x, y) = ((i % 20) as f64 / 19.0 * 1.6 - 0.8, (i / 20) as f64 / 19.0 * 1.6 - 0.8);
+                let (xd, yd) = lens.apply(x, y);
+                let (u, v) = lens.undo(xd, yd).unwrap();
+                assert!((u - x).abs() + (v - y).abs() < 1e-11, "{lens:?} at {x}, {y}: {u}, {v}");
+            }
+        }
+    }
+
+    #[test]
+    fn lenses_bend_as_worked_by_hand() {
+        let none = Distortion::default();
+        let near = |(a, b): (f64, f64), (c, d): (f64, f64)| (a - c).abs() + (b - d).abs() < 1e-12;
+        // at x = 1, y = 0: (1 + 0.1 + 0.02 + 0.003) / (1 + 0.2 + 0.03 + 0.004) + p2 · 3
+        let full = Distortion {
+            k1: 0.1,
+            k2: 0.02,
+            k3: 0.003,
+            k4: 0.2,
+            k5: 0.03,
+            k6: 0.004,
+            p1: 0.5,
+            p2: 0.25,
+            ..none
+        };
+        assert!(near(full.apply(1.0, 0.0), (1.123 / 1.234 + 0.75, 0.5)));
+        // 45° off the axis, θ = π/4
+        let angle = std::f64::consts::FRAC_PI_4;
+        let fisheye = Distortion { projection: Projection::Fisheye, k1: 0.1, sx1: 0.01, ..none };
+        let bent = angle * (1.0 + 0.1 * angle * angle);
+        assert!(near(fisheye.apply(0.0, 1.0), (0.01 * angle * angle, bent)));
+        // ω = 90°: tan(ω/2) = 1, so r = atan(2) / (π/2) at tan θ = 1
+        let fov = Distortion { projection: Projection::Fov, omega: 2.0 * angle, ..none };
+        assert!(near(fov.apply(1.0, 0.0), (2f64.atan() / (2.0 * angle), 0.0)));
+    }
+
+    #[test]
+    fn where_a_lens_folds_over_or_sees_backwards_there_is_no_ray() {
+        let none = Distortion::default();
+        // r (1 − 0.3 r²) is at most 2/3 · √(1/0.9) = 0.7027
+        let barrel = Distortion { k1: -0.3, ..none };
+        assert!(barrel.undo(0.70, 0.0).is_some() && barrel.undo(0.71, 0.0).is_none());
+        let fisheye = Distortion { projection: Projection::Fisheye, ..none };
+        assert!(fisheye.undo(1.56, 0.0).is_some() && fisheye.undo(1.58, 0.0).is_none());
+        assert!(barrel.undo(f64::NAN, 0.0).is_none() && fisheye.undo(f64::INFINITY, 0.0).is_none());
+    }
+
+    #[test]
+    fn a_plain_lens_is_written_as_it_always_was() {
+        let lens = Distortion { k1: 0.5, ..Distortion::default() };
+        let text = serde_json::to_string(&lens).unwrap();
+        assert_eq!(text, r#"{"k1":0.5,"k2":0.0,"k3":0.0,"p1":0.0,"p2":0.0}"#);
+        assert_eq!(format!("{lens:?}"), "Distortion { k1: 0.5, k2: 0.0, k3: 0.0, p1: 0.0, p2: 0.0 }");
+        let fov = Distortion { projection: Projection::Fov, omega: 0.9, ..lens };
+        assert!(format!("{fov:?}").ends_with("p2: 0.0, omega: 0.9, projection: Fov }"));
+        for lens in lenses() {
+            let text = serde_json::to_string(&lens).unwrap();
+            assert_eq!(serde_json::from_str::<Distortion>(&text).unwrap(), lens);
+        }
     }
 }

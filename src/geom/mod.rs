@@ -21,7 +21,7 @@ pub(crate) use apart::{OutlineSide, nearest_charts};
 pub use atlas::Atlas;
 pub(crate) use boxes::{Boxes, DBox, EFFORT, Effort, share_out};
 pub use bvh::{Bvh, Closest};
-pub use camera::{Camera, Distortion};
+pub use camera::{Camera, Distortion, Projection};
 pub use harmonics::Harmonics;
 pub(crate) use intersect::intersect;
 pub use mesh::Mesh;

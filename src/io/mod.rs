@@ -5,12 +5,14 @@
 //! name, decides the format; only regular files are opened. Writers go through [`write_atomic`].
 
 mod animation;
+mod archive;
 mod error;
 mod exr;
 mod folder;
 mod json;
 mod limits;
 mod npy;
+mod npz;
 mod pictures;
 mod process;
 mod read;
@@ -28,6 +30,7 @@ pub use folder::{
 pub use json::{parse_json, read_json, read_typed, typed};
 pub use limits::Limits;
 pub use npy::{Npy, NpyValues, parse_npy, read_npy};
+pub use npz::read_npz;
 pub use pictures::{
     PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, png_bytes, read_gray, read_photo,
     write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
@@ -36,4 +39,4 @@ pub use process::{cpu_seconds, forget_peak_memory, peak_memory, processor};
 pub use read::read_bytes;
 pub use tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
 pub use torch::{TorchNumbers, TorchTensor, TorchValue, parse_torch, read_torch};
-pub use write::{WriteError, remove, remove_leftovers, rename, write_atomic};
+pub use write::{WriteError, copy, hard_link, remove, remove_leftovers, rename, write_atomic};

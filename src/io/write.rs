@@ -47,6 +47,8 @@ impl WriteError {
             WriteError::Io { source, .. } => match source.kind() {
                 ErrorKind::NotFound => "create the folder first".into(),
                 ErrorKind::PermissionDenied => "choose a folder you may write to".into(),
+                ErrorKind::AlreadyExists => "name another file, or remove that one".into(),
+                ErrorKind::CrossesDevices => "links stay on one disk: copy instead, without `--link`".into(),
                 _ => "check the disk".into(),
             },
             WriteError::Content { .. } => "check the values that should be stored".into(),
@@ -70,6 +72,38 @@ impl WriteError {
 /// Replaces `path` by `bytes` in one step; a file that was there keeps its permissions.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     write_with(path, bytes, |file, bytes| file.write_all(bytes))
+}
+
+/// Copies a file to a name that nothing has, in one step; `from` may be a link.
+pub fn copy(from: &Path, to: &Path) -> Result<(), WriteError> {
+    let fail = |source| WriteError::Io { path: to.into(), source };
+    absent(to).map_err(fail)?;
+    let bytes = fs::metadata(from).map_or(0, |m| m.len() as usize);
+    let aside = to.with_file_name(aside_name(&to.file_name().unwrap_or_default().to_string_lossy()));
+    let result = (|| {
+        // where the disk can, the bytes are shared instead of copied
+        fs::copy(from, &aside)?;
+        File::open(&aside)?.sync_all()?;
+        fs::rename(&aside, to)
+    })();
+    result.map_err(|e| {
+        let _ = fs::remove_file(&aside); // the first error is the one to tell
+        WriteError::from_io(to, bytes, e)
+    })
+}
+
+/// Gives a file a second name that nothing has, on the same disk; where `from` is a link, what it leads to.
+pub fn hard_link(from: &Path, to: &Path) -> Result<(), WriteError> {
+    let linked = || fs::hard_link(fs::canonicalize(from)?, to);
+    linked().map_err(|source| WriteError::Io { path: to.into(), source })
+}
+
+fn absent(path: &Path) -> std::io::Result<()> {
+    match fs::symlink_metadata(path) {
+        Ok(_) => Err(std::io::Error::new(ErrorKind::AlreadyExists, "it is already there")),
+        Err(e) if e.kind() == ErrorKind::NotFound => Ok(()),
+        Err(e) => Err(e),
+    }
 }
 
 /// Gives a file another name in the same folder, replacing what had it, and syncs the folder.
@@ -217,6 +251,22 @@ mod tests {
         assert!(error.to_string().contains("a.txt") && error.hint().contains("8 bytes"));
         assert_eq!(fs::read(&path).unwrap(), b"old");
         assert_eq!(names(dir.path()), ["a.txt"]);
+    }
+
+    #[test]
+    fn copies_and_links_never_replace_what_is_there() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        fs::write(at("a"), b"old").unwrap();
+        copy(&at("a"), &at("b")).unwrap();
+        hard_link(&at("a"), &at("c")).unwrap();
+        for name in ["b", "c"] {
+            assert_eq!(fs::read(at(name)).unwrap(), b"old");
+            assert!(copy(&at("a"), &at(name)).unwrap_err().hint().contains("another file"));
+            assert!(hard_link(&at("a"), &at(name)).is_err());
+        }
+        assert!(copy(&at("none"), &at("d")).is_err());
+        assert_eq!(names(dir.path()), ["a", "b", "c"]);
     }
 
     #[test]

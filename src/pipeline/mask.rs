@@ -173,7 +173,7 @@ fn place(
             names.push(view.name.clone());
         }
     }
-    let options = SceneOptions { names, ..SceneOptions::default() };
+    let options = SceneOptions { names, focus: capture.focus, ..SceneOptions::default() };
     let (scene, warnings) = scene::fit(&cameras, &carving, &options)?;
     warnings.iter().for_each(|w| dir.warn(w));
     Ok(scene)

@@ -94,6 +94,7 @@ pub(super) fn read_capture(path: &Path, root: &Path) -> Result<Capture, ReadErro
         reasons: Vec::new(),
         views: file.views,
         up: file.up,
+        focus: None, // the scene is placed by now
         unit_m: file.unit_m,
         warnings: Vec::new(),
     })

@@ -249,7 +249,7 @@ fn from_frame(shared: &Map<String, Value>, frame: &TransformsFrame, like: &Camer
     if !(camera.fx > 0.0 && camera.fy > 0.0) {
         return Err(format!("focal lengths {} and {}, expected pixels above 0", camera.fx, camera.fy));
     }
-    let Camera { cx, cy, distortion: Distortion { k1, k2, k3, p1, p2 }, .. } = &mut camera;
+    let Camera { cx, cy, distortion: Distortion { k1, k2, k3, p1, p2, .. }, .. } = &mut camera;
     for (name, value) in [("cx", cx), ("cy", cy), ("k1", k1), ("k2", k2), ("k3", k3), ("p1", p1), ("p2", p2)]
     {
         *value = number(&objects, name)?.unwrap_or(*value);

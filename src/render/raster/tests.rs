@@ -125,7 +125,7 @@ fn it_sees_what_the_ray_caster_sees() {
     let mut mesh = ball(40);
     mesh.normals = mesh.angle_weighted_normals();
     let straight = camera(500);
-    let distortion = Distortion { k1: -0.25, k2: 0.08, k3: 0.0, p1: 0.004, p2: -0.003 };
+    let distortion = Distortion { k1: -0.25, k2: 0.08, p1: 0.004, p2: -0.003, ..Distortion::default() };
     let bent = Camera { distortion, ..straight.clone() };
     let most = 1e-5 * mesh.bounds().size().length();
     for (what, camera) in [("straight", &straight), ("bent", &bent)] {

@@ -1,0 +1,292 @@
+//! COLMAP's sparse models: `sparse/0`, `sparse`, the same below `colmap/`, or the folder itself.
+//!
+//! A pose takes the world to a camera whose axes point right, down and ahead, as a quaternion (w, x, y, z) and a
+//! translation; a pixel's center is at +0.5. The binary files are preferred to the text. Poses are complete in the
+//! images file, of rigs as well; where `rigs` and `frames` lie beside it (COLMAP 3.12), they must say the same.
+//! Points are optional, and say where the head is if no masks do.
+
+mod binary;
+mod model;
+mod text;
+mod write;
+
+use super::error::{in_file, in_frame};
+use super::frame::{CameraFrame, Listing};
+use super::masks::few;
+use super::names::{CaptureFolder, FLIP, join};
+use super::view::Split;
+use crate::Result;
+use crate::io::{self, ReadError};
+use glam::{DMat3, DQuat, DVec3};
+use model::{CAMERA, Image, Model, Rigid};
+use std::collections::{HashMap, HashSet};
+use std::path::{Path, PathBuf};
+
+pub(super) use write::files;
+
+/// Where models lie.
+pub(super) const FOLDERS: [&str; 5] = ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ""];
+
+/// How far rigs and frames may be from the images file, radians and the largest translation.
+const TOLERANCE: f64 = 1e-4;
+
+/// A model's folder below the capture, and how its files end.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct ModelFiles {
+    pub folder: &'static str,
+    pub ending: &'static str,
+}
+
+impl ModelFiles {
+    /// The first model of a folder.
+    pub fn find(root: &Path) -> Option<ModelFiles> {
+        let mut all =
+            FOLDERS.iter().flat_map(|&folder| ["bin", "txt"].map(|ending| ModelFiles { folder, ending }));
+        all.find(|m| ["cameras", "images"].iter().all(|kind| io::is_file(&root.join(m.name(kind)))))
+    }
+
+    /// The path of one of its files below the capture.
+    pub fn name(&self, kind: &str) -> String {
+        let slash = if self.folder.is_empty() { "" } else { "/" };
+        format!("{}{slash}{kind}.{}", self.folder, self.ending)
+    }
+
+    fn read(&self, folder: &CaptureFolder) -> Result<Model> {
+        let limits = &folder.options.limits;
+        let bytes = |kind: &str| -> Result<Option<(PathBuf, Vec<u8>)>> {
+            let name = self.name(kind);
+            match folder.file(&name, Path::new(&name))? {
+                Some(path) => Ok(Some((path.clone(), io::read_bytes(&path, limits)?))),
+                None => Ok(None),
+            }
+        };
+        let needed = |kind: &str| {
+            let missing = || in_file(&self.name(kind), "it is missing", "export the model again");
+            bytes(kind)?.ok_or_else(missing)
+        };
+        let (cameras, images) = (needed("cameras")?, needed("images")?);
+        let (rigs, frames, points) = (bytes("rigs")?, bytes("frames")?, bytes("points3D")?);
+        if self.ending == "bin" {
+            return binary::read(&cameras, &images, [&rigs, &frames, &points], limits);
+        }
+        let as_text = |kind: &str, (path, bytes): (PathBuf, Vec<u8>)| -> Result<(String, String)> {
+            let text = String::from_utf8(bytes).map_err(|e| {
+                let offset = e.utf8_error().valid_up_to() as u64;
+                ReadError::damaged(&path, "COLMAP", offset, "it is not UTF-8 text")
+            })?;
+            Ok((self.name(kind), text))
+        };
+        let optional = |kind, file: Option<_>| file.map(|file| as_text(kind, file)).transpose();
+        let (rigs, frames, points) =
+            (optional("rigs", rigs)?, optional("frames", frames)?, optional("points3D", points)?);
+        text::read(
+            &as_text("cameras", cameras)?,
+            &as_text("images", images)?,
+            [&rigs, &frames, &points],
+            limits,
+        )
+    }
+}
+
+/// Lists the images of a model, in the order of their numbers.
+pub(super) fn list(folder: &CaptureFolder, files: &ModelFiles, listing: &mut Listing) -> Result<()> {
+    let Model { cameras, mut images, rigs, frames, points } = files.read(folder)?;
+    let name_of = files.name("images");
+    if images.is_empty() {
+        return Err(in_file(
+            &name_of,
+            "it has no images",
+            "no photograph was registered: run the mapper again",
+        ));
+    }
+    images.sort_by_key(|image| image.id);
+    let mut seen = HashSet::new();
+    for image in &images {
+        if !seen.insert(image.id) {
+            let problem = format!("its number {} stands there twice", image.id);
+            listing.problems.push(in_frame(&name_of, &image.name, problem));
+        }
+    }
+    if let Some(points) = points {
+        let n = points.len();
+        listing.reasons.push(format!(
+            "{n} points of COLMAP lie beside the cameras: they bound the head where no masks do"
+        ));
+        listing.points = points;
+    }
+    let others = other_models(folder.root, files);
+    if !others.is_empty() {
+        let text = "only the first of several models is read; COLMAP made pieces that it could not join";
+        listing.warnings.push(format!("{text}: {} also lie there", few(others)));
+    }
+    check_rigs(files, &images, &rigs, &frames, listing)?;
+    let held_out = held_out(folder, files)?;
+    let base = folder.image_folder(images.iter().map(|image| image.name.as_str()));
+    for image in &images {
+        match frame(folder, &name_of, base, image, &cameras, held_out.as_ref()) {
+            Ok(frame) => listing.frames.push(frame),
+            Err(problem) => listing.problems.push(problem),
+        }
+    }
+    if let Some(names) = held_out {
+        let known: HashSet<&str> = images.iter().map(|i| i.name.as_str()).collect();
+        let strangers: Vec<&String> = names.iter().filter(|n| !known.contains(n.as_str())).collect();
+        if !strangers.is_empty() {
+            let mut strangers: Vec<&str> = strangers.iter().map(|s| s.as_str()).collect();
+            strangers.sort_unstable();
+            listing
+                .warnings
+                .push(format!("`test.txt` names photographs without a camera: {}", few(strangers)));
+        }
+    }
+    listing.masks_named = "`masks/`, named as COLMAP's images";
+    Ok(())
+}
+
+fn other_models(root: &Path, files: &ModelFiles) -> Vec<String> {
+    let Some(parent) = files.folder.strip_suffix("/0") else { return Vec::new() };
+    let numbered = |path: &PathBuf| {
+        let name = path.file_name()?.to_str()?;
+        let is_other = name != "0" && name.bytes().all(|b| b.is_ascii_digit());
+        is_other.then(|| format!("{parent}/{name}"))
+    };
+    io::list_folders(&root.join(parent)).unwrap_or_default().iter().filter_map(numbered).collect()
+}
+
+/// Names in `test.txt` beside the model, as 3D Gaussian splatting has them.
+fn held_out(folder: &CaptureFolder, files: &ModelFiles) -> Result<Option<HashSet<String>>> {
+    let name = ModelFiles { ending: "txt", ..files.clone() }.name("test");
+    let Some(path) = folder.file(&name, Path::new(&name))? else { return Ok(None) };
+    let bytes = io::read_bytes(&path, &folder.options.limits)?;
+    let text = String::from_utf8_lossy(&bytes);
+    let names = text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#'));
+    Ok(Some(names.map(str::to_owned).collect()))
+}
+
+fn frame(
+    folder: &CaptureFolder,
+    file: &str,
+    base: &str,
+    image: &Image,
+    cameras: &HashMap<u32, model::Camera>,
+    held_out: Option<&HashSet<String>>,
+) -> Result<CameraFrame> {
+    let problem = |text: String| in_frame(file, &image.name, text);
+    let camera = cameras.get(&image.camera);
+    let camera =
+        camera.ok_or_else(|| problem(format!("its camera {} is not in the cameras file", image.camera)))?;
+    let size = [camera.width, camera.height]
+        .map(|side| u32::try_from(side).ok().filter(|s| (1..=1_000_000).contains(s)));
+    let [Some(width), Some(height)] = size else {
+        return Err(problem(format!(
+            "its camera {} is of {} × {} pixels",
+            image.camera, camera.width, camera.height
+        )));
+    };
+    let intrinsics = camera.model.intrinsics((width, height), &camera.values);
+    let intrinsics = intrinsics.map_err(|text| problem(format!("camera {}: {text}", image.camera)))?;
+    let (rotation, position) = image.pose.camera_in_world().map_err(|text| problem(text.into()))?;
+    let (relative, photo) = folder.photo(file, &join(base, &image.name))?;
+    let split = held_out.map(|names| if names.contains(&image.name) { Split::Test } else { Split::Train });
+    let mask = folder.mask_of(file, &image.name)?;
+    let (file, name) = (file.to_string(), image.name.clone());
+    Ok(CameraFrame { file, name, photo, relative, split, intrinsics, rotation, position, mask, region: None })
+}
+
+impl Rigid {
+    /// Rotation and position of the camera, in our axes.
+    fn camera_in_world(&self) -> Result<(DMat3, DVec3), &'static str> {
+        let rotation = self.matrix()?;
+        let world_from_camera = rotation.transpose();
+        Ok((world_from_camera * FLIP, -(world_from_camera * self.translation)))
+    }
+
+    /// The rotation; quaternions of other lengths are brought to 1.
+    fn matrix(&self) -> Result<DMat3, &'static str> {
+        let [w, x, y, z] = self.quaternion;
+        let q = DQuat::from_xyzw(x, y, z, w);
+        let length = q.length();
+        if !(length.is_finite() && self.translation.is_finite()) {
+            return Err("its pose holds a number that is not finite");
+        }
+        if length < 1e-6 {
+            return Err("its quaternion is zero, which is no rotation");
+        }
+        // dividing a unit quaternion again would cost its last digit
+        let q = if (length - 1.0).abs() < 1e-15 { q } else { q / length };
+        Ok(DMat3::from_quat(q))
+    }
+
+    /// This one after `other`.
+    fn after(&self, other: &Rigid) -> Result<(DMat3, DVec3), &'static str> {
+        let (a, b) = (self.matrix()?, other.matrix()?);
+        Ok((a * b, a * other.translation + self.translation))
+    }
+}
+
+/// Rigs and frames, where they are given, must put each camera where its image is.
+fn check_rigs(
+    files: &ModelFiles,
+    images: &[Image],
+    rigs: &[model::Rig],
+    frames: &[model::Frame],
+    listing: &mut Listing,
+) -> Result<()> {
+    if rigs.is_empty() || frames.is_empty() {
+        return Ok(());
+    }
+    let file = files.name("frames");
+    let wrong = |text: String| {
+        in_file(&file, text, "remove the rigs and frames files: the images file says the same")
+    };
+    let known: HashMap<u32, &Image> = images.iter().map(|i| (i.id, i)).collect();
+    let by_id: HashMap<u32, &model::Rig> = rigs.iter().map(|r| (r.id, r)).collect();
+    let spread =
+        images.iter().map(|i| i.pose.translation.length()).filter(|l| l.is_finite()).fold(1e-9, f64::max);
+    let mut compared = 0;
+    for frame in frames {
+        let rig = by_id.get(&frame.rig);
+        let rig = rig.ok_or_else(|| {
+            wrong(format!("frame {} is of rig {}, which is not there", frame.id, frame.rig))
+        })?;
+        for &(kind, sensor, data) in &frame.data {
+            let Some(image) = known.get(&data).filter(|_| kind == CAMERA) else { continue };
+            let sensor_from_rig = match rig.sensors.iter().find(|s| (s.0, s.1) == (kind, sensor)) {
+                Some((_, _, Some(pose))) => *pose,
+                Some((_, _, None)) if rig.sensors[0].1 == sensor => Rigid::default(),
+                Some(_) => continue, // a sensor whose place in the rig is not known yet
+                None => {
+                    return Err(wrong(format!(
+                        "frame {} has sensor {sensor}, which rig {} has not",
+                        frame.id, rig.id
+                    )));
+                }
+            };
+            let named = |text: &str| wrong(format!("frame {}: {text}", frame.id));
+            let (rotation, translation) = sensor_from_rig.after(&frame.pose).map_err(named)?;
+            let own =
+                image.pose.matrix().map_err(|text| in_frame(&files.name("images"), &image.name, text))?;
+            let turned = (rotation - own).to_cols_array().iter().fold(0.0f64, |a, v| a.max(v.abs()));
+            let moved = translation.distance(image.pose.translation) / spread;
+            if !(turned <= TOLERANCE && moved <= TOLERANCE) {
+                return Err(wrong(format!(
+                    "frame {} and the images file disagree about `{}`: by {turned:.1e} in rotation, {moved:.1e} of the \
+                     largest translation",
+                    frame.id, image.name
+                )));
+            }
+            compared += 1;
+        }
+    }
+    let (n, all) = (rigs.len(), frames.len());
+    listing.reasons.push(format!("{all} frames of {n} rigs agree with {compared} images"));
+    Ok(())
+}
+
+/// A rotation and position of ours as COLMAP's quaternion (w, x, y, z) and translation.
+pub(super) fn pose_of(rotation: DMat3, position: DVec3) -> ([f64; 4], DVec3) {
+    let camera_from_world = (rotation * FLIP).transpose();
+    let q = DQuat::from_mat3(&camera_from_world).normalize();
+    let q = if q.w < 0.0 { -q } else { q };
+    ([q.w, q.x, q.y, q.z], -(camera_from_world * position))
+}

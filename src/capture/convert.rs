@@ -1,0 +1,308 @@
+//! A capture written again with cameras of another format: nothing is resampled, nothing that is there is touched.
+//!
+//! Photographs go to `images/`, head masks to `masks/`, valid pixels to `valid/` and regions to `face_masks/`, as
+//! they are; the camera files come last, so that a folder that has them is complete. What a format cannot say is an
+//! error where pictures would no longer fit their cameras, and a warning otherwise.
+
+use super::colmap;
+use super::gather::{every_eighth, up};
+use super::lens::LensModel;
+use super::llff;
+use super::scene::{self, SceneOptions};
+use super::view::{Capture, Split, View, ViewMask};
+use crate::geom::Camera;
+use crate::io::{self, Limits};
+use crate::{Error, Result};
+use serde::Serialize;
+use serde_json::{Map, Value, json};
+use std::path::{Path, PathBuf};
+
+/// A format that cameras can be written in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CameraFormat {
+    /// `transforms.json`, as nerfstudio and instant-ngp read it.
+    Transforms,
+    /// `sparse/0`, binary.
+    Colmap,
+    /// `poses_bounds.npy`.
+    Llff,
+}
+
+impl CameraFormat {
+    /// The format of this name: `transforms`, `colmap` or `llff`.
+    pub fn named(name: &str) -> Option<CameraFormat> {
+        match name {
+            "transforms" => Some(CameraFormat::Transforms),
+            "colmap" => Some(CameraFormat::Colmap),
+            "llff" => Some(CameraFormat::Llff),
+            _ => None,
+        }
+    }
+}
+
+/// What [`convert`] wrote.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Conversion {
+    /// Where.
+    pub folder: PathBuf,
+    /// How many views.
+    pub views: usize,
+    /// How many head masks, those in alpha channels left out.
+    pub masks: usize,
+    /// What the format could not say.
+    pub warnings: Vec<String>,
+}
+
+/// Where a view's pictures go, relative to the new capture.
+struct Place<'v> {
+    view: &'v View,
+    camera: Camera,
+    /// With its ending, `/` between, below the folder of photographs.
+    name: String,
+    photo: String,
+    mask: Option<String>,
+    valid: Option<String>,
+    region: Option<String>,
+}
+
+/// Writes `capture` into `folder`, which must be new or empty. Photographs and masks are copied, or hard-linked with
+/// `link`: then they cost no space, and who changes one changes the other.
+///
+/// # Errors
+///
+/// If the capture was opened reduced in size, the folder is not empty, or the format has no such lens.
+pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -> Result<Conversion> {
+    if let Some(view) = capture.views.iter().find(|v| v.photo_size != (v.camera.width, v.camera.height)) {
+        let message = format!("the photograph of `{}` would be converted reduced in size", view.name);
+        return Err(Error::cannot(
+            message,
+            "convert with `--set capture.downscale=1`: photographs are kept as they are",
+        ));
+    }
+    let occupied =
+        io::exists(folder) && (!io::is_folder(folder) || io::any_file(folder, &|_| false)?.is_some());
+    if occupied {
+        let message = format!("`{}` is not an empty folder", folder.display());
+        return Err(Error::cannot(message, "name a new one: nothing that is there is overwritten"));
+    }
+    let mut out = Conversion { folder: folder.into(), views: capture.views.len(), ..Conversion::default() };
+    let named_splits =
+        every_eighth(&capture.views) != capture.views.iter().map(|v| v.split).collect::<Vec<_>>();
+    let places: Vec<Place> = capture.views.iter().map(|v| place(v, to)).collect();
+    // what cannot be said is found before anything is written
+    let files = match to {
+        CameraFormat::Transforms => transforms(capture, &places, named_splits)?,
+        CameraFormat::Colmap => sparse(capture, &places, named_splits, &mut out.warnings)?,
+        CameraFormat::Llff => poses(capture, &places, named_splits, &mut out.warnings)?,
+    };
+    let put = |from: &Path, name: &str| -> Result<()> {
+        let target = folder.join(name);
+        io::create_folder(target.parent().unwrap_or(folder))?;
+        Ok(if link { io::hard_link(from, &target)? } else { io::copy(from, &target)? })
+    };
+    for place in &places {
+        put(&place.view.photo, &place.photo)?;
+        if let (ViewMask::File(from), Some(name)) = (&place.view.mask, &place.mask) {
+            out.masks += 1;
+            if from.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
+                put(from, name)?;
+            } else {
+                let target = folder.join(name);
+                io::create_folder(target.parent().unwrap_or(folder))?;
+                let gray = io::read_gray(from, Some(place.view.photo_size), &Limits::default())?;
+                io::write_png_gray(&target, &gray)?;
+            }
+        }
+        for (from, name) in [(&place.view.valid, &place.valid), (&place.view.region, &place.region)] {
+            if let (Some(from), Some(name)) = (from, name) {
+                put(from, name)?;
+            }
+        }
+    }
+    for (name, bytes) in files {
+        let path = folder.join(name);
+        io::create_folder(path.parent().unwrap_or(folder))?;
+        io::write_atomic(&path, &bytes)?;
+    }
+    Ok(out)
+}
+
+fn place(view: &View, to: CameraFormat) -> Place<'_> {
+    let ending =
+        |path: &Path| path.extension().map_or(String::new(), |e| format!(".{}", e.to_string_lossy()));
+    let stem = match to {
+        CameraFormat::Llff => view.name.replace('/', "_"), // rows are paired with what lies directly in the folder
+        _ => view.name.clone(),
+    };
+    let name = stem.clone() + &ending(&view.photo);
+    let mask = matches!(view.mask, ViewMask::File(_)).then(|| match to {
+        CameraFormat::Colmap => format!("masks/{name}.png"),
+        _ => format!("masks/{stem}.png"),
+    });
+    let beside =
+        |folder: &str, file: &Option<PathBuf>| file.as_ref().map(|f| format!("{folder}/{stem}{}", ending(f)));
+    Place {
+        view,
+        camera: Camera { width: view.declared.0, height: view.declared.1, ..view.camera.clone() },
+        photo: format!("images/{name}"),
+        name,
+        mask,
+        valid: beside("valid", &view.valid),
+        region: beside("face_masks", &view.region),
+    }
+}
+
+type Files = Vec<(String, Vec<u8>)>;
+
+/// What COLMAP's names call the lens, and all its numbers.
+fn lens(place: &Place) -> Result<Map<String, Value>> {
+    let camera = &place.camera;
+    let unknown = || {
+        let message = format!("no camera model has the lens of `{}`", place.view.name);
+        Error::cannot(message, "undistort the photographs first")
+    };
+    let (model, values) = LensModel::of(camera).ok_or_else(unknown)?;
+    let mut keys = Map::new();
+    keys.insert("camera_model".into(), model.name.into());
+    keys.insert("w".into(), camera.width.into());
+    keys.insert("h".into(), camera.height.into());
+    for (key, value) in model.parameters.split(' ').zip(values) {
+        let key = key.replace("fx", "fl_x").replace("fy", "fl_y");
+        keys.insert(key, value.into());
+    }
+    Ok(keys)
+}
+
+fn transforms(capture: &Capture, places: &[Place], named_splits: bool) -> Result<Files> {
+    let lenses: Vec<Map<String, Value>> = places.iter().map(lens).collect::<Result<_>>()?;
+    // readers that know one lens for all look for it at the top
+    let shared = lenses.iter().all(|l| *l == lenses[0]);
+    let frame = |(place, lens): (&Place, &Map<String, Value>)| {
+        let (r, p) = (place.camera.rotation, place.camera.position);
+        let row = |k: usize| json!([r.x_axis[k], r.y_axis[k], r.z_axis[k], p[k]]);
+        let mut frame = Map::new();
+        frame.insert("file_path".into(), place.photo.clone().into());
+        let pictures = [("mask_path", &place.mask), ("face_mask_path", &place.region)];
+        for (key, path) in pictures.into_iter().filter_map(|(key, path)| Some((key, path.clone()?))) {
+            frame.insert(key.into(), path.into());
+        }
+        if named_splits {
+            frame.insert("split".into(), json!(place.view.split));
+        }
+        if !shared {
+            frame.extend(lens.clone());
+        }
+        frame.insert("transform_matrix".into(), json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]));
+        Value::Object(frame)
+    };
+    let mut top = if shared { lenses[0].clone() } else { Map::new() };
+    // as the reader will find it, unless the dataset had named another
+    if up(&capture.views, None) != capture.up {
+        top.insert("up".into(), json!(capture.up.as_dvec3()));
+    }
+    top.insert("frames".into(), places.iter().zip(&lenses).map(frame).collect());
+    Ok(vec![("transforms.json".into(), format!("{:#}\n", Value::Object(top)).into_bytes())])
+}
+
+fn warn_up(capture: &Capture, format: &str, warnings: &mut Vec<String>) {
+    let guessed = up(&capture.views, None);
+    if guessed != capture.up {
+        warnings.push(format!(
+            "{format} does not say where up is: {} will be taken instead of {}",
+            guessed, capture.up
+        ));
+    }
+}
+
+fn sparse(
+    capture: &Capture,
+    places: &[Place],
+    named_splits: bool,
+    warnings: &mut Vec<String>,
+) -> Result<Files> {
+    warn_up(capture, "COLMAP", warnings);
+    let images: Vec<(String, &Camera)> = places.iter().map(|p| (p.name.clone(), &p.camera)).collect();
+    let hint = "undistort the photographs first";
+    let model = colmap::files(&images).map_err(|problem| Error::cannot(problem, hint))?;
+    let mut files: Files = Vec::new();
+    if named_splits {
+        let held_out = places.iter().filter(|p| p.view.split != Split::Train);
+        let names: String = held_out.map(|p| format!("{}\n", p.name)).collect();
+        if capture.split(Split::Val).next().is_some() {
+            warnings.push("COLMAP has no validation views: they are held out with those for testing".into());
+        }
+        files.push((
+            "sparse/0/test.txt".into(),
+            if names.is_empty() { b"# none\n".to_vec() } else { names.into() },
+        ));
+    }
+    files.extend(model.into_iter().map(|(name, bytes)| (format!("sparse/0/{name}"), bytes)));
+    Ok(files)
+}
+
+fn poses(
+    capture: &Capture,
+    places: &[Place],
+    named_splits: bool,
+    warnings: &mut Vec<String>,
+) -> Result<Files> {
+    warn_up(capture, "LLFF", warnings);
+    for place in places {
+        let c = &place.camera;
+        let (w, h) = (c.width as f64, c.height as f64);
+        let middle = (c.cx - 0.5 * w).abs().max((c.cy - 0.5 * h).abs());
+        let lost = if !c.distortion.is_none() {
+            "lens distortion".into()
+        } else if (c.fy / c.fx - 1.0).abs() > llff::FOCAL_TOLERANCE {
+            format!("two focal lengths, {} and {} pixels", c.fx, c.fy)
+        } else if middle > 0.5 {
+            format!("a principal point that is {middle:.2} pixels from the middle")
+        } else {
+            continue;
+        };
+        let message = format!("the camera of `{}` has {lost}, which LLFF cannot say", place.view.name);
+        let hint = "choose `--to colmap` or `--to transforms`, or undistort the photographs first";
+        return Err(Error::cannot(message, hint));
+    }
+    // rows carry no names: they are paired with the photographs in name order, training first
+    let sorted = |train: Option<bool>| {
+        let mut some: Vec<&Place> =
+            places.iter().filter(|p| train.is_none_or(|t| t == (p.view.split == Split::Train))).collect();
+        some.sort_by(|a, b| a.name.cmp(&b.name));
+        some
+    };
+    let bounds = bounds(places);
+    let rows = |places: &[&Place]| llff::write(places.iter().map(|p| (&p.camera, bounds(&p.camera))));
+    if !named_splits {
+        return Ok(vec![("poses_bounds.npy".into(), rows(&sorted(None)))]);
+    }
+    let (train, test) = (sorted(Some(true)), sorted(Some(false)));
+    if train.last().zip(test.first()).is_none_or(|(last, first)| last.name >= first.name) {
+        let message =
+            "LLFF can only hold out the last photographs in name order, and others are held out here";
+        return Err(Error::cannot(message, "choose `--to colmap` or `--to transforms`"));
+    }
+    if capture.split(Split::Val).next().is_some() {
+        warnings.push("LLFF has no validation views: they are held out with those for testing".into());
+    }
+    Ok(vec![("poses_bounds_test.npy".into(), rows(&test)), ("poses_bounds_train.npy".into(), rows(&train))])
+}
+
+/// Near and far of a camera: the box that most cameras see; LLFF's other readers sample between them.
+fn bounds(places: &[Place]) -> impl Fn(&Camera) -> [f64; 2] {
+    let cameras: Vec<Camera> = places.iter().map(|p| p.camera.clone()).collect();
+    let seen = scene::fit(&cameras, &vec![None; cameras.len()], &SceneOptions::default());
+    let seen = seen.ok().map(|(scene, _)| scene::world_box(&scene));
+    move |camera| {
+        let Some(b) = seen else { return [0.1, 10.0] };
+        let depth = |i: usize| {
+            let pick = |k: usize| if i >> k & 1 == 0 { b.min[k] } else { b.max[k] };
+            let corner = glam::Vec3::new(pick(0), pick(1), pick(2)).as_dvec3();
+            -camera.rotation.z_axis.dot(corner - camera.position)
+        };
+        let depths = (0..8).map(depth);
+        let (near, far) = depths.fold((f64::MAX, 0.0f64), |(near, far), d| (near.min(d), far.max(d)));
+        let near = near.max(1e-3 * far);
+        if far > 0.0 { [near, far] } else { [0.1, 10.0] }
+    }
+}
