@@ -275,6 +275,21 @@ pub fn leaves(value: &Value) -> Vec<(String, String)> {
     map.iter().flat_map(inner).collect()
 }
 
+/// What the figures of `metrics.json` were taken against, from its `truth`: a few words, or nothing where it says
+/// nothing.
+pub fn judged_by(truth: &Value) -> Option<String> {
+    let photographs = match truth["photographs"].as_str()? {
+        "photo" => "against photographs as they were taken",
+        _ => "against photographs cut out by their masks",
+    };
+    let masks = match truth["masks"].as_str()? {
+        "capture" => "inside the capture's masks",
+        "run" => "inside masks that this run made: others may judge otherwise",
+        _ => "without masks",
+    };
+    Some(format!("judged {photographs}, {masks}"))
+}
+
 /// `8.2 s`, `2 min 25 s`, `3 h 07 min`.
 pub fn duration(seconds: f64) -> String {
     let s = seconds.max(0.0);

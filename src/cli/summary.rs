@@ -4,6 +4,7 @@ use super::screen::figure;
 use crate::config::{NAMES, called};
 use crate::io;
 use crate::pipeline::Stage;
+use crate::report::judged_by;
 use crate::run::{Done, Run};
 use serde_json::Value;
 use std::path::PathBuf;
@@ -66,6 +67,7 @@ fn judgement(metrics: &Value) -> Vec<String> {
             lines.extend(in_parts(&metrics[set]["parts"]["mean"]));
         }
     }
+    lines.extend(judged_by(&metrics["truth"]));
     let truth = &metrics["truth_percent_of_head"];
     if let (Some(mean), Some(p90)) = (truth["accuracy_mean"].as_f64(), truth["accuracy_p90"].as_f64()) {
         lines.push(format!(
@@ -104,12 +106,17 @@ mod tests {
             },
             "ensemble": {"head": {"mean": {"psnr_masked": 30.0}}},
             "truth_percent_of_head": {"accuracy_mean": 0.312, "accuracy_p90": 0.7},
+            "truth": {"photographs": "photo", "masks": "run"},
         }));
-        assert_eq!(lines.len(), 4);
+        assert_eq!(lines.len(), 5);
         assert!(lines[0].starts_with("I-Face's mesh (raycast) against"), "{}", lines[0]);
         assert!(lines[0].contains("PSNR 28.12 dB, SSIM 0.9100"), "{}", lines[0]);
         assert_eq!(lines[1], "  edge 21.02, 1416 pixels missing and 257 too many a view (at most 32.1 dB)");
         assert!(lines[2].starts_with("blend (ensemble)") && lines[2].contains("30.00 dB"), "{}", lines[2]);
-        assert!(lines[3].contains("0.312 % of head height"), "{}", lines[3]);
+        assert_eq!(
+            lines[3],
+            "judged against photographs as they were taken, inside masks that this run made: others may judge otherwise"
+        );
+        assert!(lines[4].contains("0.312 % of head height"), "{}", lines[4]);
     }
 }

@@ -83,6 +83,33 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
 }
 
 #[test]
+fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_made() {
+    let dir = tempfile::tempdir().unwrap();
+    let (config, truth) = clicked(dir.path());
+    let run = run(dir.path(), "run");
+    let line = Line::open(&config, &run).unwrap();
+    complete(&line, Stage::Mask, &NoFields).unwrap();
+    assert_eq!(line.judges(), "capture");
+    for (view, truth) in line.capture().views.iter().zip(&truth) {
+        let judged = line.judged(view).load_mask(&Limits::default()).unwrap();
+        assert!(judged.as_ref() == Some(truth) && view.load_mask(&Limits::default()).unwrap() != judged);
+    }
+    let plan = line.plan(Stage::Metrics).fingerprint;
+    // other masks judge otherwise; without any the run's own have to, and say so
+    let masks = dir.path().join("head/masks");
+    std::fs::copy(masks.join("001.png"), masks.join("000.png")).unwrap();
+    let other = Line::open(&config, &run).unwrap();
+    assert!(
+        other.plan(Stage::Metrics).fingerprint.differences(&plan).iter().any(|d| d.contains("own masks"))
+    );
+    assert!(complete(&other, Stage::Mask, &NoFields).unwrap().skipped, "they shape nothing else");
+    std::fs::remove_dir_all(masks).unwrap();
+    let bare = Line::open(&config, &run).unwrap();
+    let view = &bare.capture().views[0];
+    assert_eq!((bare.judges(), bare.judged(view).mask), ("run", view.mask.clone()));
+}
+
+#[test]
 fn clicks_that_make_no_sense_end_before_anything_is_written() {
     let dir = tempfile::tempdir().unwrap();
     let (good, _) = clicked(dir.path());

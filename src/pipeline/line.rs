@@ -4,7 +4,7 @@ use super::clicks::MaskPrompts;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::Scene;
-use crate::capture::{self, Capture, CaptureOptions};
+use crate::capture::{self, Capture, CaptureOptions, View, ViewMask};
 use crate::config::{Config, MaskSource, RenderConfig, Sources, Stage};
 use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
@@ -31,6 +31,17 @@ pub struct Line<'a> {
     pub(super) synthetic: bool,
     /// What masks are made from, if not found.
     pub(super) clicks: Option<MaskPrompts>,
+    /// Where masks are made: those that the capture has all the same. Views are judged by them, for no run may shape what
+    /// it is judged by.
+    pub(super) own_masks: Option<OwnMasks>,
+}
+
+/// Masks that the capture has beside those that are made.
+pub(super) struct OwnMasks {
+    /// Of each view.
+    masks: Vec<ViewMask>,
+    /// Digest of all of them.
+    pub digest: String,
 }
 
 /// A checkpoint that a stage takes instead of learning.
@@ -62,15 +73,27 @@ impl<'a> Line<'a> {
                     (capture, digest, clicks, None)
                 }
             };
+        let own_masks = clicks.is_some().then(|| own_masks(&capture, &options)).transpose()?;
         let imports = imports(config, run)?;
         capture.warnings.iter().for_each(|warning| run.warn("capture", warning));
         if clicks.is_some() {
             // what later stages read is what the stage `mask` makes
             for view in &mut capture.views {
-                view.mask = capture::ViewMask::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
+                view.mask = ViewMask::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
             }
         }
-        Ok(Line { capture, config, run, digest, path: None, imports, gone, synthetic: false, clicks })
+        Ok(Line {
+            capture,
+            config,
+            run,
+            digest,
+            path: None,
+            imports,
+            gone,
+            synthetic: false,
+            clicks,
+            own_masks,
+        })
     }
 
     /// Returns the line of the demo head, whose surface is known: the metrics compare the mesh with it.
@@ -85,6 +108,23 @@ impl<'a> Line<'a> {
     pub fn along(self, render: RenderConfig) -> Result<Line<'a>> {
         let path = CameraPath::new(render, &self.capture)?;
         Ok(Line { path, ..self })
+    }
+
+    /// A view as it is judged: with the capture's own mask, if it has one.
+    pub(super) fn judged(&self, view: &View) -> View {
+        let place = self.capture.views.iter().position(|v| v.name == view.name);
+        let own = self.own_masks.as_ref().zip(place).map(|(own, i)| own.masks[i].clone());
+        View { mask: own.filter(|m| *m != ViewMask::None).unwrap_or(view.mask.clone()), ..view.clone() }
+    }
+
+    /// Whose masks say where figures count: `capture`, `run` (made by this run: others may judge otherwise) or `none`.
+    pub(super) fn judges(&self) -> &'static str {
+        let is_mask = |mask: &ViewMask| *mask != ViewMask::None;
+        match &self.own_masks {
+            Some(own) if !own.masks.iter().any(is_mask) => "run",
+            None if !self.capture.views.iter().any(|v| is_mask(&v.mask)) => "none",
+            _ => "capture",
+        }
     }
 
     /// The capture.
@@ -158,6 +198,23 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
     }
 }
 
+/// The masks that lie beside the photographs, though others are made.
+fn own_masks(capture: &Capture, options: &CaptureOptions) -> Result<OwnMasks> {
+    let options = CaptureOptions { masks: MaskSource::Auto, ..options.clone() };
+    // what cannot be opened with its masks can be worked on without
+    let found = capture::open(&capture.root, &options).map_or(Vec::new(), |c| c.views);
+    let mask =
+        |view: &View| found.iter().find(|v| v.name == view.name).map_or(ViewMask::None, |v| v.mask.clone());
+    let masks: Vec<ViewMask> = capture.views.iter().map(mask).collect();
+    let digests = masks.par_iter().map(|mask| match mask {
+        ViewMask::File(path) => Ok(file_digest(path)?),
+        // its photograph is part of the capture's digest
+        other => Ok(format!("{other:?}")),
+    });
+    let digests = digests.collect::<Result<Vec<String>>>()?;
+    Ok(OwnMasks { masks, digest: Fingerprint::of_bytes(digests.join(" ").as_bytes()) })
+}
+
 /// Digest of all that a capture means: cameras, splits and the bytes of every picture.
 fn capture_digest(capture: &Capture) -> Result<String> {
     let views = capture
@@ -166,7 +223,7 @@ fn capture_digest(capture: &Capture) -> Result<String> {
         .map(|view| {
             let mut text = format!("{} {:?} {:?} {}", view.name, view.split, view.camera, view.downscale);
             let mask = match &view.mask {
-                capture::ViewMask::File(path) => Some(path),
+                ViewMask::File(path) => Some(path),
                 _ => None,
             };
             for path in [Some(&view.photo), mask, view.valid.as_ref(), view.region.as_ref()] {

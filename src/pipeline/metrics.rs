@@ -5,7 +5,7 @@ use super::mesh::surface_in_world;
 use super::pictures;
 use super::truth::against_truth;
 use crate::capture::{LoadedView, View};
-use crate::config::{RenderConfig, Stage, ViewBackground};
+use crate::config::{Stage, TruthPhoto, ViewBackground};
 use crate::image::Gray;
 use crate::io::{self, Limits};
 use crate::metrics::{Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, parts};
@@ -73,12 +73,12 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     let mut out = Map::new();
     let sets = picture_sets(line);
     let judged: Vec<Vec<Comparable>> = sets.iter().map(|set| comparable(line, set)).collect();
-    let mut views: Vec<&View> = judged.iter().flatten().map(|c| c.view).collect();
-    views.sort_by_key(|v| &v.name);
-    views.dedup_by_key(|v| &v.name);
-    let tones = Tones::of(&views)?;
+    let mut views: Vec<View> = judged.iter().flatten().map(|c| line.judged(c.view)).collect();
+    views.sort_by(|a, b| a.name.cmp(&b.name));
+    views.dedup_by(|a, b| a.name == b.name);
+    let tones = Tones::of(&views.iter().collect::<Vec<_>>())?;
     for (i, (set, pictures)) in sets.iter().zip(&judged).enumerate() {
-        let figures = pictures.par_iter().map(|p| figures(p, &line.config.render, tones.as_ref()));
+        let figures = pictures.par_iter().map(|p| figures(line, p, tones.as_ref()));
         let figures = figures.collect::<Result<Vec<_>>>()?;
         if !figures.is_empty() {
             out.insert(set.name.clone(), entry(figures));
@@ -96,16 +96,21 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
         let truth = against_truth(&surface_in_world(line)?, points);
         out.insert("truth_percent_of_head".into(), json!(truth));
     }
+    out.insert("truth".into(), json!({"photographs": line.config.metrics.truth, "masks": line.judges()}));
     let value = Value::Object(out);
     io::write_atomic(&dir.folder().join("metrics.json"), format!("{value:#}\n").as_bytes())?;
     Ok(means(&value))
 }
 
-fn figures(picture: &Comparable, config: &RenderConfig, tones: Option<&Tones>) -> Result<ViewFigures> {
+fn figures(line: &Line, picture: &Comparable, tones: Option<&Tones>) -> Result<ViewFigures> {
+    let config = &line.config.render;
     let background = config.background;
-    let loaded = picture.view.load(&Limits::default())?;
+    let loaded = line.judged(picture.view).load(&Limits::default())?;
     let render = pictures::read(&picture.file, config.format)?;
-    let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
+    let photo = match line.config.metrics.truth {
+        TruthPhoto::Photo => loaded.photo.clone(),
+        TruthPhoto::Masked => pictures::expected(&loaded.photo, loaded.mask.as_ref(), background),
+    };
     let against =
         |mask: Option<&Gray>| compare(&picture.view.name, &render, &photo, mask, loaded.valid.as_ref());
     let region = loaded.region.as_ref().map(|r| against(Some(r))).transpose()?;

@@ -107,6 +107,9 @@ fn facts(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
         format!("preset {}", line.config.preset.name()),
         format!("seed {}", line.config.seed),
     ];
+    if let Some((_, done)) = records.iter().find(|(stage, _)| *stage == Stage::Metrics) {
+        facts.extend(crate::report::judged_by(&done.summary["truth"]));
+    }
     if let Some((_, last)) = records.last() {
         facts.push(duration(records.iter().map(|(_, r)| r.elapsed_s).sum()));
         facts.push(format!("tiface {}", last.version));

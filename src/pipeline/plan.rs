@@ -206,7 +206,9 @@ impl Line<'_> {
                 needs_bytes += self.pixels() * each * config.render.method.len().max(1) as u64 / 2;
             }
             Stage::Ensemble => needs_bytes += self.pixels() * 4,
-            Stage::Metrics => {}
+            Stage::Metrics => {
+                inputs.extend(self.own_masks.as_ref().map(|own| ("own masks", own.digest.clone())));
+            }
         }
         let mut fingerprint = Fingerprint::new(FORMAT, settings);
         for (name, digest) in inputs {
