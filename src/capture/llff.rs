@@ -247,23 +247,17 @@ fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String
 
 /// An LLFF file of cameras with one focal length each, and near and far.
 pub(super) fn write<'c>(cameras: impl ExactSizeIterator<Item = (&'c Camera, [f64; 2])>) -> Vec<u8> {
-    let shape = format!("({}, 17)", cameras.len());
-    let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}");
-    // NumPy's own files end their header with a newline on a multiple of 64
-    let padded = (10 + header.len() + 1).next_multiple_of(64) - 11;
-    let mut file = b"\x93NUMPY\x01\x00".to_vec();
-    file.extend((padded as u16 + 1).to_le_bytes());
-    file.extend(format!("{header:padded$}\n").into_bytes());
+    let (count, mut values) = (cameras.len(), Vec::new());
     for (camera, bounds) in cameras {
         let r = camera.rotation;
         let size = [camera.height as f64, camera.width as f64, (camera.fx * camera.fy).sqrt()];
         for k in 0..3 {
             let line = [-r.y_axis[k], r.x_axis[k], r.z_axis[k], camera.position[k], size[k]];
-            line.iter().for_each(|v| file.extend(v.to_le_bytes()));
+            line.iter().for_each(|v| values.extend(v.to_le_bytes()));
         }
-        bounds.iter().for_each(|v| file.extend(v.to_le_bytes()));
+        bounds.iter().for_each(|v| values.extend(v.to_le_bytes()));
     }
-    file
+    io::npy_bytes("<f8", &[count, 17], &values)
 }
 
 #[cfg(test)]

@@ -130,6 +130,20 @@ pub fn write_capture(dir: &Path, options: &SyntheticOptions) -> Result<()> {
     Ok(())
 }
 
+/// Writes `valid/NAME.npy` for every view of a capture: a border of so many pixels is not usable, as in the ILSH
+/// dataset, whose photographs are undistorted. To be written before the capture, whose cameras say that it is complete.
+pub fn write_borders(dir: &Path, options: &SyntheticOptions, border: u32) -> Result<()> {
+    let (w, h) = (options.width, options.height);
+    let inside = |v: u32, side: u32| v >= border && v < side.saturating_sub(border);
+    let usable = (0..h).flat_map(|y| (0..w).map(move |x| (inside(x, w) && inside(y, h)) as u8));
+    let bytes = io::npy_bytes("|b1", &[h as usize, w as usize], &usable.collect::<Vec<u8>>());
+    io::create_folder(&dir.join("valid"))?;
+    for i in 0..options.train + options.test {
+        io::write_atomic(&dir.join(format!("valid/{i:03}.npy")), &bytes)?;
+    }
+    Ok(())
+}
+
 /// The frames of one split (`Some(train)`), or all with their split named.
 fn transforms(cameras: &[(Camera, bool)], split: Option<bool>) -> Value {
     let frames: Vec<Value> = cameras
@@ -222,6 +236,11 @@ mod tests {
                 assert!(dir.path().join(frame[key].as_str().unwrap()).is_file());
             }
         }
+        write_borders(dir.path(), &SMALL, 5).unwrap();
+        let c = crate::capture::open(dir.path(), &Default::default()).unwrap();
+        let valid = c.views[6].load(&Default::default()).unwrap().valid.unwrap();
+        let usable = valid.values.iter().filter(|&&v| v == 255).count();
+        assert_eq!((usable, valid.values[5 * 64 + 5], valid.values[5 * 64 + 4]), (54 * 70, 255, 0));
         let none = SyntheticOptions { train: 0, ..SMALL };
         assert!(write_capture(dir.path(), &none).unwrap_err().to_string().contains("0 + 2 views"));
     }

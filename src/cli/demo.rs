@@ -4,12 +4,12 @@ use super::invocation::Invocation;
 use super::out::Out;
 use super::run::{LineCommand, run as run_line};
 use super::target::{DEMO_CAPTURE, RunTarget};
-use crate::Result;
-use crate::capture::synthetic::{SyntheticOptions, write_capture};
+use crate::capture::synthetic::{SyntheticOptions, write_borders, write_capture};
 use crate::config::Preset;
 use crate::io;
 use crate::pipeline::{Stage, feasible};
 use crate::report::duration;
+use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -21,8 +21,14 @@ baseline.steps = 600
 baseline.rays = 2048
 ";
 
-pub(super) fn run(invocation: &Invocation) -> Result<()> {
+pub(super) fn run(
+    invocation: &Invocation,
+    size: Option<&str>,
+    views: Option<usize>,
+    border: Option<u32>,
+) -> Result<()> {
     let common = invocation.common;
+    let options = photographs(size, views)?;
     let run = common.run.clone().unwrap_or_else(|| PathBuf::from("runs/demo"));
     let capture = run.join(DEMO_CAPTURE);
     // repeated without options, the demo goes on as it was begun
@@ -32,26 +38,57 @@ pub(super) fn run(invocation: &Invocation) -> Result<()> {
     Out::find(common.out.as_deref(), "run")?;
     feasible(&common.resolve(saved.as_deref(), fallback, &[])?)?;
     // the cameras are written last: where they are, everything is
-    if !io::is_file(&capture.join("transforms.json")) {
+    if io::is_file(&capture.join("transforms.json")) {
+        if size.is_some() || views.is_some() || border.is_some() {
+            let message = format!("the head in `{}` is photographed already", capture.display());
+            return Err(Error::usage(
+                message,
+                "leave out --size, --views and --border, or name another --run",
+            ));
+        }
+    } else {
         if common.dry_run {
             let text = format!("would photograph a synthetic head into `{}`", capture.display());
             invocation.screen.note("capture", &text);
             return Ok(());
         }
-        photograph(&capture, invocation)?;
+        photograph(&capture, &options, border, invocation)?;
     }
     let target = RunTarget { capture: Some(io::real_path(&capture)?), saved, run, guessed: false };
     let (product, until) = ("run", Stage::Metrics);
     run_line(invocation, &LineCommand { product, until, target, require: &[], keys: Vec::new(), fallback })
 }
 
-fn photograph(capture: &Path, invocation: &Invocation) -> Result<()> {
-    let options = SyntheticOptions::default();
+/// The default photographs, of another size or number.
+fn photographs(size: Option<&str>, views: Option<usize>) -> Result<SyntheticOptions> {
+    let mut options = SyntheticOptions::default();
+    if let Some(size) = size {
+        let sides = size.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+        (options.width, options.height) = sides.ok_or_else(|| {
+            Error::usage(format_args!("`--size {size}` is no size in pixels"), "write it as 3000x4096")
+        })?;
+    }
+    if let Some(views) = views {
+        options.test = (views / 4).max(1);
+        options.train = views.saturating_sub(options.test);
+    }
+    Ok(options)
+}
+
+fn photograph(
+    capture: &Path,
+    options: &SyntheticOptions,
+    border: Option<u32>,
+    invocation: &Invocation,
+) -> Result<()> {
     let views = options.train + options.test;
     invocation.screen.note("capture", &format!("photographing a synthetic head from {views} sides"));
     let start = Instant::now();
     io::create_folder(capture)?;
-    write_capture(capture, &options)?;
+    if let Some(border) = border {
+        write_borders(capture, options, border)?;
+    }
+    write_capture(capture, options)?;
     invocation.screen.note("capture", &format!("done in {}", duration(start.elapsed().as_secs_f64())));
     Ok(())
 }

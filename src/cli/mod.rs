@@ -153,8 +153,19 @@ enum Command {
     #[command(after_long_help = "Examples:
   tiface demo
   tiface demo --set iface.steps=500 --set tface.steps=500    a rougher head, sooner
-  tiface demo --run /tmp/demo --out head.glb    somewhere else, and the mesh beside it")]
-    Demo,
+  tiface demo --run /tmp/demo --out head.glb    somewhere else, and the mesh beside it
+  tiface demo --size 3000x4096 --views 24 --border 60 --run /tmp/full    as large as the ILSH dataset")]
+    Demo {
+        /// Pixels of each photograph [default: 256x320]
+        #[arg(long, value_name = "WxH")]
+        size: Option<String>,
+        /// Photographs, a quarter of them held out [default: 32]
+        #[arg(long, value_name = "N")]
+        views: Option<usize>,
+        /// Pixels along the edges that are marked as not usable [default: none]
+        #[arg(long, value_name = "PX")]
+        border: Option<u32>,
+    },
     /// What was found: format, cameras, masks, splits, problems; writes nothing
     #[command(after_long_help = "Examples:
   tiface inspect captures/002_00
@@ -401,7 +412,7 @@ pub fn main() -> ExitCode {
     common.log();
     let makes_nothing = |command: &str| Out::none(common.out.as_deref(), command);
     let ended = signals::listen(&invocation).and_then(|()| match &command {
-        Command::Demo => demo::run(&invocation),
+        Command::Demo { size, views, border } => demo::run(&invocation, size.as_deref(), *views, *border),
         Command::Mask { place, clicks, page: true } => {
             page::run(&invocation, place.path.as_deref(), clicks.prompts.as_deref())
         }

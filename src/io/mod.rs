@@ -29,7 +29,7 @@ pub use folder::{
 };
 pub use json::{parse_json, read_json, read_typed, typed};
 pub use limits::Limits;
-pub use npy::{Npy, NpyValues, parse_npy, read_npy};
+pub use npy::{Npy, NpyValues, npy_bytes, parse_npy, read_npy};
 pub use npz::read_npz;
 pub use pictures::{
     PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, png_bytes, read_gray, read_photo,

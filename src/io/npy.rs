@@ -124,6 +124,19 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
     Ok(Npy { shape, values })
 }
 
+/// The bytes of a `.npy` file of values that are in row-major order and of this type (`<f8`, `|b1`).
+pub fn npy_bytes(kind: &str, shape: &[usize], values: &[u8]) -> Vec<u8> {
+    let extents: String = shape.iter().map(|n| format!("{n}, ")).collect();
+    let header =
+        format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({}), }}", extents.trim_end());
+    // NumPy's own headers end with a newline on a multiple of 64
+    let padded = (MAGIC.len() + 4 + header.len() + 1).next_multiple_of(64) - MAGIC.len() - 5;
+    let mut file = [MAGIC, &[1, 0], &(padded as u16 + 1).to_le_bytes()].concat();
+    file.extend(format!("{header:padded$}\n").into_bytes());
+    file.extend(values);
+    file
+}
+
 /// Are the header's numbers plain ones, and can their product be held, with 1 for an extent of 0? The parser
 /// also knows sums, signs, hexadecimals and `1_000`, which no array needs.
 fn countable(header: &[u8]) -> bool {
@@ -239,6 +252,16 @@ mod tests {
         let data = [1, 4, 2, 5, 3, 6];
         let v = numbers("{'descr': '|u1', 'fortran_order': True, 'shape': (2, 3), }", &data);
         assert_eq!(v, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+    }
+
+    #[test]
+    fn what_is_written_is_read_again() {
+        for shape in [&[2, 3][..], &[6], &[1, 2, 3]] {
+            let bytes = npy_bytes("|u1", shape, &[1, 2, 3, 4, 5, 6]);
+            let array = parse(&bytes).unwrap();
+            assert_eq!((&array.shape[..], bytes.len()), (shape, 128 + 6));
+            assert_eq!(array.values, NpyValues::Number(vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]));
+        }
     }
 
     #[test]

@@ -235,7 +235,11 @@ fn capture_digest(capture: &Capture) -> Result<String> {
             Ok(text)
         })
         .collect::<Result<Vec<_>>>()?;
-    Ok(Fingerprint::of_bytes(format!("{} {}", capture.up, views.join("\n")).as_bytes()))
+    let mut text = format!("{} {}", capture.up, views.join("\n"));
+    if let Some(focus) = capture.focus {
+        text += &format!("\n{focus:?}");
+    }
+    Ok(Fingerprint::of_bytes(text.as_bytes()))
 }
 
 fn file_digest(path: &Path) -> Result<String, io::ReadError> {
