@@ -39,6 +39,7 @@ mod plan;
 mod preview;
 mod render;
 mod scene_file;
+mod stability;
 mod surface;
 mod tiles;
 mod truth;
@@ -53,6 +54,7 @@ pub use mask::{click_page, disagreements};
 pub use mesh::export_head;
 pub use page::{head_page, renew_report, viewer_of_file};
 pub use preview::{Preview, PreviewPicture, PreviewRenderer};
+pub use stability::{StabilityCase, stability};
 pub use surface::{Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
 

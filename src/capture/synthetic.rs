@@ -13,7 +13,7 @@ mod shape;
 
 pub use shape::SyntheticHead;
 
-use crate::geom::{Camera, Distortion};
+use crate::geom::{Camera, Distortion, Similarity};
 use crate::{Error, Result, io};
 use glam::{DMat3, DVec3};
 use photograph::Studio;
@@ -108,20 +108,34 @@ pub fn write_capture(dir: &Path, options: &SyntheticOptions) -> Result<()> {
             "ask for a size and number of views within these bounds",
         ));
     }
+    write_photographs(dir, &cameras(options), &Similarity::IDENTITY, seed, &readme(options))
+}
+
+/// Photographs the head with these cameras (all of the intrinsics of the first) and writes the capture folder `dir`,
+/// as [`write_capture`] does, in another world than the head's.
+pub(crate) fn write_photographs(
+    dir: &Path,
+    cameras: &[(Camera, bool)],
+    world_from_head: &Similarity,
+    seed: u64,
+    readme: &str,
+) -> Result<()> {
     let studio = Studio::new();
-    let cameras = cameras(options);
     for folder in ["images", "masks", "face_masks"] {
         io::create_folder(&dir.join(folder))?;
     }
     for (i, (camera, _)) in cameras.iter().enumerate() {
+        let (width, height) = (camera.width, camera.height);
         let picture = studio.photograph(camera, seed.wrapping_add(i as u64));
         let path = |folder: &str| dir.join(format!("{folder}/{i:03}.png"));
         io::write_png_rgb(&path("images"), width, height, &picture.photo.rgb)?;
         io::write_png_gray(&path("masks"), &picture.mask)?;
         io::write_png_gray(&path("face_masks"), &picture.region)?;
     }
+    let moved = |(camera, train): &(Camera, bool)| (camera.transformed(world_from_head), *train);
+    let cameras: Vec<(Camera, bool)> = cameras.iter().map(moved).collect();
     let text = |value: Value| format!("{value:#}\n").into_bytes();
-    io::write_atomic(&dir.join("README.md"), readme(options).as_bytes())?;
+    io::write_atomic(&dir.join("README.md"), readme.as_bytes())?;
     for split in [Some(true), Some(false)] {
         let name = if split == Some(true) { "transforms_train.json" } else { "transforms_test.json" };
         io::write_atomic(&dir.join(name), &text(transforms(&cameras, split)))?;

@@ -13,6 +13,7 @@ pub mod matrix;
 pub mod mlp;
 pub mod neus;
 pub mod pool;
+pub(crate) mod reference;
 pub mod rng;
 pub mod sdf;
 pub mod simd;

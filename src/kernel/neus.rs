@@ -215,6 +215,7 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernel::reference;
 
     #[test]
     fn alphas_match_the_published_values() {
@@ -266,35 +267,10 @@ mod tests {
         }
     }
 
-    /// The same formulas in f64, loss = Σ g · out.
+    /// Σ g · out of the formulas in f64.
     fn loss(rays: Rays, field: &[f64], inv_s: f64, anneal: f64, g: &[f32]) -> f64 {
-        let sigmoid = |x: f64| 1.0 / (1.0 + (-x).exp());
-        let mut total = 0.0;
-        for r in 0..rays.offsets.len() - 1 {
-            let mut out = [0f64; 8];
-            let mut transmittance = 1.0;
-            for s in rays.offsets[r] as usize..rays.offsets[r + 1] as usize {
-                let f = &field[s * 8..][..8];
-                let len = (f[1] * f[1] + f[2] * f[2] + f[3] * f[3]).sqrt();
-                let n = [f[1] / len, f[2] / len, f[3] / len];
-                let cos: f64 = (0..3).map(|c| rays.direction[r][c] as f64 * n[c]).sum();
-                let ic = -((0.5 - 0.5 * cos).max(0.0) * (1.0 - anneal) + (-cos).max(0.0) * anneal);
-                let half = 0.5 * ic * rays.dt[s] as f64;
-                let sharp = inv_s * f[7].exp();
-                let (p, q) = (sigmoid((f[0] - half) * sharp), sigmoid((f[0] + half) * sharp));
-                let a = ((p - q + 1e-5) / (p + 1e-5)).clamp(0.0, 1.0);
-                let w = transmittance * a;
-                for c in 0..3 {
-                    out[c] += w * f[4 + c];
-                    out[5 + c] += w * n[c];
-                }
-                out[3] += w;
-                out[4] += w * rays.t[s] as f64;
-                transmittance *= 1.0 - a;
-            }
-            total += (0..8).map(|k| out[k] * g[r * 8 + k] as f64).sum::<f64>();
-        }
-        total
+        let out = reference::neus::composite(rays, field, inv_s, anneal);
+        out.iter().zip(g).map(|(o, g)| o * *g as f64).sum()
     }
 
     #[test]
@@ -315,7 +291,7 @@ mod tests {
         let g: Vec<f32> = (0..24).map(|i| (i as f32 * 0.9).sin()).collect();
         let (inv_s, anneal) = (30f32, 0.4f32);
         let (g_field, g_s) = backward(rays, &field, inv_s, anneal, &g);
-        let wide: Vec<f64> = field.iter().map(|&v| v as f64).collect();
+        let wide = reference::wide(&field);
         let at = |f: &[f64], s: f64| loss(rays, f, s, anneal as f64, &g);
         let scale = g_field.iter().fold(0f32, |a, &b| a.max(b.abs())) as f64;
         for i in 0..96 {

@@ -1,6 +1,8 @@
-//! The fused field against an independent f64 model and its finite differences.
+//! The fused field against the f64 model of its formulas and its finite differences.
 
 use super::*;
+use crate::kernel::reference::sdf::field as model;
+use crate::kernel::reference::wide;
 
 /// A small field with lively weights.
 fn field() -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
@@ -26,79 +28,6 @@ fn points(n: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
     let x = (0..n).map(|i| [at(i, 1.7), at(i, 2.9), at(i, 0.83)]).collect();
     let d = (0..n).map(|i| unit([at(i, 0.7), at(i, 1.1) + 0.2, at(i, 2.3)])).collect();
     (x, d)
-}
-
-/// Independent model in f64: loops, no tiles, gradient of the sdf by the chain rule written out.
-fn model(shape: &FieldShape, table: &[[f64; 2]], flat: &[f64], x: [f32; 3], d: [f32; 3]) -> [f64; 8] {
-    let layout = shape.layout();
-    let mut start = 0;
-    let mats = layout.shapes().map(|(o, i)| {
-        start += o * i;
-        &flat[start - o * i..start]
-    });
-    let k = layout.inputs;
-    let r = shape.radius as f64;
-    let mut u = vec![0f64; k];
-    let mut du = vec![[0f64; 3]; k];
-    for a in 0..3 {
-        u[a] = x[a] as f64 / r;
-        du[a][a] = 1.0 / r;
-    }
-    for (l, level) in shape.levels.iter().enumerate() {
-        // cell and fraction from the f32 path (the same cell), weights in f64
-        let x01: [f32; 3] = std::array::from_fn(|a| x[a] * (0.5 / shape.radius) + 0.5);
-        let (index, _) = hash::cell::<true>(level, x01);
-        let f: [f64; 3] = std::array::from_fn(|a| {
-            let p = level.scale as f64 * (x[a] as f64 * (0.5 / r) + 0.5) + 0.5;
-            p - p.floor()
-        });
-        let slope = level.scale as f64 * 0.5 / r;
-        for c in 0..8 {
-            let bit = |a: usize| c >> a & 1 == 1;
-            let w: [f64; 3] = std::array::from_fn(|a| if bit(a) { f[a] } else { 1.0 - f[a] });
-            let e = table[level.offset + index[c] as usize];
-            for j in 0..2 {
-                u[3 + 2 * l + j] += w[0] * w[1] * w[2] * e[j];
-                for a in 0..3 {
-                    let sign = if bit(a) { 1.0 } else { -1.0 };
-                    du[3 + 2 * l + j][a] += sign * slope * w[(a + 1) % 3] * w[(a + 2) % 3] * e[j];
-                }
-            }
-        }
-    }
-    let mut o = [0f64; 13];
-    let mut n = [0f64; 3];
-    o.copy_from_slice(mats[3]);
-    for j in 0..64 {
-        let z: f64 = mats[1][j] + (0..k).map(|i| mats[0][j * k + i] * u[i]).sum::<f64>();
-        let h = if 100.0 * z > 40.0 { z } else { (100.0 * z).exp().ln_1p() / 100.0 };
-        let s = 1.0 / (1.0 + (-100.0 * z).exp());
-        for (c, o) in o.iter_mut().enumerate() {
-            *o += mats[2][c * 64 + j] * h;
-        }
-        for a in 0..3 {
-            n[a] += mats[2][j] * s * (0..k).map(|i| mats[0][j * k + i] * du[i][a]).sum::<f64>();
-        }
-    }
-    let len = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
-    let mut c0 = o.to_vec();
-    c0.extend(sh16(d).map(|v| v as f64));
-    c0.extend(n.map(|v| v / len));
-    if layout.color_skip {
-        c0.extend_from_slice(&u[3..]);
-    }
-    let dense = |m: &[f64], v: &[f64]| -> Vec<f64> {
-        m.chunks(v.len()).map(|row| row.iter().zip(v).map(|(a, b)| a * b).sum()).collect()
-    };
-    let relu = |v: Vec<f64>| v.into_iter().map(|x: f64| x.max(0.0)).collect::<Vec<_>>();
-    let rgb = dense(mats[6], &relu(dense(mats[5], &relu(dense(mats[4], &c0)))));
-    let sigmoid = |v: f64| 1.0 / (1.0 + (-v).exp());
-    let soft = -(shape.soften as f64) * sigmoid(o[12] - 2.0);
-    [o[0], n[0], n[1], n[2], sigmoid(rgb[0]), sigmoid(rgb[1]), sigmoid(rgb[2]), soft]
-}
-
-fn wide(flat: &[f32]) -> Vec<f64> {
-    flat.iter().map(|&v| v as f64).collect()
 }
 
 #[test]

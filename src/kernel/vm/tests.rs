@@ -3,7 +3,7 @@ use super::mask::{BoxMask, Lattice, Walk};
 use super::penalty::{gram, tv_factors};
 use super::*;
 use crate::kernel::march::MarchRay;
-use crate::kernel::rng;
+use crate::kernel::{reference, rng};
 
 /// A point given as -1..=1 along each axis of the fixture's box.
 fn at(u: [f32; 3]) -> [f32; 3] {
@@ -135,89 +135,9 @@ fn voxel_counts_and_sizes_are_the_published_ones() {
     assert!((step_size(extent, [331, 368, 220], 0.5) - 0.004554).abs() < 1e-6);
 }
 
-/// The same field written plainly in f64, from the formulas: loss = Σ g · out.
+/// Σ g · out of the formulas in f64.
 fn plain(f: &VmField, x: &[f64], rays: &[MarchRay], g: &[f32]) -> f64 {
-    let (nd, nc) = (f.density.len(), f.color.len());
-    let (density, rest) = x.split_at(nd);
-    let (color, network) = rest.split_at(nc);
-    let factors = |grid: &Grid, values: &[f64], p: [f64; 3]| -> Vec<f64> {
-        let l = &f.lattice;
-        let place = |a: usize| {
-            let u =
-                (p[a] - l.min[a] as f64) / (l.max[a] as f64 - l.min[a] as f64) * (grid.size[a] - 1) as f64;
-            let i = (u as usize).min(grid.size[a] - 2);
-            (i, u - i as f64)
-        };
-        let mut out = Vec::new();
-        for i in 0..3 {
-            let (pl, li) = (grid.plane(i), grid.line(i));
-            let ((x0, fx), (y0, fy)) = (place(PLANE_AXES[i].0), place(PLANE_AXES[i].1));
-            let (z0, fz) = place(LINE_AXIS[i]);
-            for c in 0..grid.rank[i] {
-                let at = |y: usize, x: usize| values[pl.start + (y * pl.width + x) * pl.channels + c];
-                let plane = (1.0 - fy) * ((1.0 - fx) * at(y0, x0) + fx * at(y0, x0 + 1))
-                    + fy * ((1.0 - fx) * at(y0 + 1, x0) + fx * at(y0 + 1, x0 + 1));
-                let line = (1.0 - fz) * values[li.start + z0 * li.channels + c]
-                    + fz * values[li.start + (z0 + 1) * li.channels + c];
-                out.push(plane * line);
-            }
-        }
-        out
-    };
-    let s = &f.decoder;
-    let mut m = Vec::new();
-    let mut rest = network;
-    for (o, i) in s.shapes() {
-        let (own, tail) = rest.split_at(o * i);
-        rest = tail;
-        m.push((own, o, i));
-    }
-    let times = |k: usize, v: &[f64]| -> Vec<f64> {
-        let (w, o, i) = m[k];
-        (0..o).map(|r| (0..i).map(|c| w[r * i + c] * v[c]).sum()).collect()
-    };
-    let decode = |products: &[f64], d: [f32; 3]| -> Vec<f64> {
-        let a = times(0, products);
-        let d = d.map(|v| v as f64);
-        let mut input = [a.clone(), d.to_vec()].concat();
-        for (v, n) in [(&a[..], s.feature_frequencies), (&d[..], s.view_frequencies)] {
-            for trig in [f64::sin, f64::cos] {
-                input.extend(v.iter().flat_map(|v| (0..n).map(move |k| trig(v * (1 << k) as f64))));
-            }
-        }
-        let layer = |k: usize, v: &[f64]| -> Vec<f64> {
-            times(k, v).iter().zip(m[k + 1].0).map(|(y, b)| y + b).collect()
-        };
-        let relu = |v: Vec<f64>| -> Vec<f64> { v.into_iter().map(|v| v.max(0.0)).collect() };
-        let h = relu(layer(3, &relu(layer(1, &input))));
-        layer(5, &h).into_iter().map(|y| 1.0 / (1.0 + (-y).exp())).collect()
-    };
-    let mut loss = 0.0;
-    for (r, ray) in rays.iter().enumerate() {
-        let mut light = 1.0;
-        let mut out = [0f64; RAY_WIDTH];
-        let mut walk = Walk::new(&f.lattice, f.mask.as_ref(), ray);
-        while let Some(t) = walk.advance() {
-            let p = std::array::from_fn(|a| ray.origin[a] as f64 + t as f64 * ray.direction[a] as f64);
-            let feature: f64 = factors(&f.density, density, p).iter().sum();
-            let sigma = if f.shading.softplus {
-                (1.0 + (feature + f.shading.shift as f64).exp()).ln()
-            } else {
-                feature.max(0.0)
-            };
-            let alpha = 1.0 - (-sigma * f.lattice.step as f64 * f.shading.distance_scale as f64).exp();
-            let w = light * alpha;
-            light *= 1.0 - alpha + 1e-10;
-            if w > f.shading.weight_threshold as f64 {
-                let c = decode(&factors(&f.color, color, p), ray.direction);
-                (0..3).for_each(|k| out[k] += w * c[k]);
-            }
-            out[3] += w;
-            out[4] += w * t as f64;
-        }
-        loss += (0..RAY_WIDTH).map(|k| g[r * RAY_WIDTH + k] as f64 * out[k]).sum::<f64>();
-    }
-    loss
+    reference::vm::render(f, x, rays).iter().zip(g).map(|(o, g)| o * *g as f64).sum()
 }
 
 fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
@@ -261,7 +181,7 @@ fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
     let (mut gd, mut gc) = (vec![0.0; density.len()], vec![0.0; color.len()]);
     let gn = backward(&f, &density, &weights, rendered, &g, &mut gd, &mut gc);
     let analytic: Vec<f32> = [gd, gc, gn].concat();
-    let mut x: Vec<f64> = [density, color, network].concat().iter().map(|&v| v as f64).collect();
+    let mut x: Vec<f64> = reference::wide(&[density, color, network].concat());
     let largest = analytic.iter().fold(0f32, |m, g| m.max(g.abs())) as f64;
     let mut errors = Vec::new();
     for k in 0..300u64 {
