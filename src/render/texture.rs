@@ -91,9 +91,10 @@ const SRGB_STEPS: usize = 4096;
 /// sRGB-coded from linear, by [`srgb_table`].
 #[inline(always)]
 fn coded(table: &[f32; SRGB_STEPS + 1], linear: f32) -> f32 {
-    let at = linear.clamp(0.0, 1.0) * (SRGB_STEPS as f32 - 1.0);
-    let k = at as i32 as usize & (SRGB_STEPS - 1);
-    table[k] + (at - k as i32 as f32) * (table[k + 1] - table[k])
+    let at = linear.max(0.0).min(1.0) * (SRGB_STEPS as f32 - 1.0);
+    let k = whole(at);
+    let (low, high) = (table[k as usize & (SRGB_STEPS - 1)], table[(k as usize & (SRGB_STEPS - 1)) + 1]);
+    low + (at - k as i32 as f32) * (high - low)
 }
 
 /// sRGB-coded from linear, and the last value once more.
@@ -322,15 +323,24 @@ fn halved(texels: &[Texel], [across, down]: [usize; 2], groups: usize) -> Vec<Te
 /// The four texels around a place of a level, clamped at its borders, and how far it is on the way between them.
 #[inline(always)]
 fn around(level: &MipLevel, u: f32, v: f32) -> ([u32; 4], Vec2) {
-    let at = |u: f32, n: f32| {
-        let p = (u * n - 0.5).max(0.0).min(n - 1.0);
-        (p as i32, (p + 1.0).min(n - 1.0) as i32, p - p as i32 as f32)
-    };
-    let (x0, x1, fx) = at(u, level.width);
-    let (y0, y1, fy) = at(v, level.height);
-    let (top, bottom) = (y0 * level.width as i32, y1 * level.width as i32);
-    let texel = |row: i32, x: i32| level.first + (row + x) as u32;
-    ([texel(top, x0), texel(top, x1), texel(bottom, x0), texel(bottom, x1)], Vec2::new(fx, fy))
+    let (x, y) = (
+        (u * level.width - 0.5).max(0.0).min(level.width - 1.0),
+        (v * level.height - 0.5).max(0.0).min(level.height - 1.0),
+    );
+    let (left, top) = (whole(x), whole(y));
+    let (right, bottom) = (whole((x + 1.0).min(level.width - 1.0)), whole((y + 1.0).min(level.height - 1.0)));
+    let width = whole(level.width);
+    let (above, below) = (level.first + top * width, level.first + bottom * width);
+    let way = Vec2::new(x - left as i32 as f32, y - top as i32 as f32);
+    ([above + left, above + right, below + left, below + right], way)
+}
+
+/// The whole part of a number, 0 of one below.
+#[inline(always)]
+fn whole(v: f32) -> u32 {
+    let v = v.max(0.0).min(1e9);
+    // SAFETY: it is a number in 0..2³¹: `max` makes 0 of what is none. A cast that asks for itself is no vector.
+    unsafe { v.to_int_unchecked::<i32>() as u32 }
 }
 
 #[inline(always)]
