@@ -83,8 +83,9 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
         return Ok(());
     }
     io::create_folder(&folder)?;
-    let scratch = tempfile::tempdir_in(&folder).map_err(|e| {
-        Error::cannot(format!("no scratch folder in `{}`: {e}", folder.display()), "choose another --out")
+    // where the system removes what a killed program leaves
+    let scratch = tempfile::tempdir().map_err(|e| {
+        Error::cannot(format!("there is no room for scratch files: {e}"), "name another place in TMPDIR")
     })?;
     if config.capture.path.is_empty() {
         screen.note("bench", "photographing a synthetic head");
@@ -108,7 +109,13 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
     let start = Instant::now();
     for (i, sweep) in chosen.iter().enumerate() {
         screen.note("bench", &format!("{sweep} ({} of {})", i + 1, chosen.len()));
-        if let Some(reason) = bench.measure(sweep, &mut result)? {
+        let measured = bench.measure(sweep, &mut result).map_err(|e| match stop.requested() {
+            Some(kind) if e.kind().is_stop() => {
+                Error::stopped("what was measured before is kept").with_kind(kind)
+            }
+            _ => e,
+        });
+        if let Some(reason) = measured? {
             screen.note("bench", &format!("{sweep} is left out: {reason}"));
         }
         write(&folder, &result, None)?;

@@ -20,14 +20,24 @@ use crate::config::{Config, MeshConfig};
 use crate::geom::{Camera, Mesh};
 use crate::io;
 use crate::mesh::{Cap, MeshReport, Patches};
-use crate::report::bench::{BenchResult, Machine, Measure, Sweep};
+use crate::report::bench::{BenchResult, Machine, Measure, StabilityRow, Sweep};
 use crate::run::Fingerprint;
-use crate::{Error, Monitor, Quiet, Result};
+use crate::{Error, Monitor, Result};
 use judge::Judge;
 
 /// What can be swept, in order; the last finds hard cases and has no times.
-pub const SWEEPS: [&str; 9] =
-    ["steps", "photographs", "hash", "devices", "extraction", "triangles", "texture", "render", "masks"];
+pub const SWEEPS: [&str; 10] = [
+    "steps",
+    "photographs",
+    "hash",
+    "devices",
+    "extraction",
+    "triangles",
+    "texture",
+    "render",
+    "masks",
+    "stability",
+];
 
 /// A capture whose decisions are measured.
 pub struct Bench<'l> {
@@ -37,6 +47,8 @@ pub struct Bench<'l> {
     finished: Option<&'l Line<'l>>,
     scene: Scene,
     judge: Judge<'l>,
+    /// Asks to stop when the user does.
+    watch: training::StopAt<'l>,
 }
 
 impl<'l> Bench<'l> {
@@ -53,7 +65,8 @@ impl<'l> Bench<'l> {
     ) -> Result<Bench<'l>> {
         complete(line, Stage::Mask, &learn::trained_fields(line))?;
         let (scene, judge) = (line.scene()?, Judge::new(line, truth)?);
-        Ok(Bench { line, finished, scene, judge })
+        let watch = training::StopAt::new(u64::MAX, line.run.stop());
+        Ok(Bench { line, finished, scene, judge, watch })
     }
 
     /// Nothing measured yet: machine, capture, and what shapes the figures.
@@ -84,6 +97,10 @@ impl<'l> Bench<'l> {
                 Some(sweep) => sweep,
                 None => return Ok(Some("this capture has no masks to compare with".into())),
             },
+            "stability" => {
+                into.stability = self.stability()?;
+                return Ok(None);
+            }
             other => {
                 let hint = format!("choose among {}", SWEEPS.join(", "));
                 return Err(Error::usage(format!("there is no sweep `{other}`"), hint));
@@ -93,13 +110,25 @@ impl<'l> Bench<'l> {
         Ok(None)
     }
 
+    fn stability(&self) -> Result<Vec<StabilityRow>> {
+        let scratch = self.line.run.path("stability");
+        let cases = super::stability(&scratch, self.monitor())?;
+        let row = |c: super::StabilityCase| StabilityRow {
+            group: c.group.into(),
+            case: c.case,
+            error: Some(c.error).filter(|e| e.is_finite()),
+            unit: c.unit.into(),
+            bound: c.bound,
+        };
+        Ok(cases.into_iter().map(row).collect())
+    }
+
     fn config(&self) -> &Config {
         self.line.config
     }
 
     fn monitor(&self) -> &dyn Monitor {
-        // what is asked to stop stops between measurements
-        &Quiet
+        &self.watch
     }
 
     fn check_stop(&self) -> Result<()> {

@@ -1,6 +1,7 @@
 //! From a field to what an artist opens: extraction, simplification, texture.
 
 use super::{Bench, Extracted, meter, off_truth, sweep};
+use crate::Result;
 use crate::capture::LoadedView;
 use crate::config::{ColorSource, Hair, MeshConfig, Method, Stage};
 use crate::geom::{Camera, Mesh};
@@ -14,7 +15,6 @@ use crate::pipeline::render::{Meshes, Renderer};
 use crate::pipeline::surface::{ClosedSurface, Fields, Surface};
 use crate::pipeline::tiles;
 use crate::report::bench::{Measure, Row, Sweep};
-use crate::{Quiet, Result};
 use glam::Vec3;
 
 /// Cells along the longest side.
@@ -114,7 +114,7 @@ impl Bench<'_> {
             self.check_stop()?;
             let mut mesh = mesh.clone();
             let config = SimplifyConfig { triangles: counts[i], ..SimplifyConfig::default() };
-            simplify(&mut mesh, Some(&gradient), &config, &Quiet)?;
+            simplify(&mut mesh, Some(&gradient), &config, self.monitor())?;
             Ok::<_, crate::Error>(mesh)
         })?;
         for (triangles, m) in counts.into_iter().zip(all) {
@@ -167,7 +167,7 @@ impl Bench<'_> {
             let head = m.result;
             let triangles = head.mesh.triangles.len() as f64;
             let meshes = Meshes::of_head(head, [true, false]);
-            let renderer = Renderer::new(&self.scene, &fields, &meshes, 2, &Quiet);
+            let renderer = Renderer::new(&self.scene, &fields, &meshes, 2, self.monitor());
             let views = self.judge.render(&self.scene, &renderer, Method::Textured)?;
             let figures = vec![self.judge.psnr(views)?, Some(triangles)];
             sweep.rows.push(Row { figures, ..row });
@@ -192,7 +192,7 @@ impl<'f> Finisher<'f> {
         if c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len() {
             let closed = extracted.closed(fields.surface()?);
             let config = SimplifyConfig { triangles: c.triangles as usize, ..SimplifyConfig::default() };
-            simplify(&mut mesh, Some(&|p: &[Vec3]| closed.sdf_gradient(p)), &config, &Quiet)?;
+            simplify(&mut mesh, Some(&|p: &[Vec3]| closed.sdf_gradient(p)), &config, bench.monitor())?;
         }
         let views = tiles::training_views(&bench.line.capture, &bench.scene, bench.config())?;
         Ok(Finisher { mesh, extracted, fields, views })
@@ -206,7 +206,8 @@ impl<'f> Finisher<'f> {
         let photographs = photographs(&self.views);
         let c = MeshConfig { triangles: 0, max_error: 0.0, ..c.clone() };
         let scene = &bench.scene;
-        let done = finish(&self.mesh, cell, &closed, &cameras, &photographs, scene, &export, &c, &Quiet)?;
+        let done =
+            finish(&self.mesh, cell, &closed, &cameras, &photographs, scene, &export, &c, bench.monitor())?;
         Ok(done.head)
     }
 }

@@ -30,10 +30,17 @@ const SHORTER: f64 = 0.05;
 const RESOLUTION: u32 = 192;
 
 /// Asks a training to stop at a step, or when the user asks.
-struct StopAt<'a> {
+pub(super) struct StopAt<'a> {
     at: u64,
     reached: AtomicU64,
     stop: &'a Stop,
+}
+
+impl<'a> StopAt<'a> {
+    /// No step is done yet.
+    pub fn new(at: u64, stop: &'a Stop) -> StopAt<'a> {
+        StopAt { at, reached: AtomicU64::new(0), stop }
+    }
 }
 
 impl Monitor for StopAt<'_> {
@@ -59,7 +66,7 @@ fn steps(config: &Config, stage: Stage) -> u64 {
 
 /// Trains a field of a line up to a step; goes on from where it is.
 fn train_until(line: &Line, stage: Stage, step: u64) -> Result<()> {
-    let monitor = StopAt { at: step, reached: AtomicU64::new(0), stop: line.run.stop() };
+    let monitor = StopAt::new(step, line.run.stop());
     let folder = line.run.path(stage);
     io::create_folder(&folder)?;
     let session = TrainingSession {

@@ -2,10 +2,10 @@
 
 use super::surface::Finisher;
 use super::{Bench, meter, sweep};
+use crate::Result;
 use crate::config::{Hair, MeshConfig, Method, Stage};
 use crate::pipeline::render::{Meshes, Renderer};
 use crate::report::bench::{Measure, Row, Sweep};
-use crate::{Quiet, Result};
 
 impl Bench<'_> {
     /// Each method, a view.
@@ -16,7 +16,7 @@ impl Bench<'_> {
         let triangles = head.mesh.triangles.len();
         let meshes = Meshes::of_head(head, [true, true]);
         let samples = self.config().render.samples;
-        let renderer = Renderer::new(&self.scene, &fields, &meshes, samples, &Quiet);
+        let renderer = Renderer::new(&self.scene, &fields, &meshes, samples, self.monitor());
         let camera = &self.line.capture.views[0].camera;
         let note = format!(
             "A view of {} × {} pixels; the mesh has {triangles} triangles and view-dependent colors of degree 2.",
