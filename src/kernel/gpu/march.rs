@@ -122,10 +122,8 @@ fn pass(
                     let far = min(border(gx, cx, dx), min(border(gy, cy, dy), border(gz, cz, dz)));
                     let skip = max((max(far, 0.0f32) / (scale * step)).ceil(), 1.0f32);
                     k += u32::cast_from(min(skip, 1e9f32));
-                    if has_solid {
-                        if bit(solid, i) {
-                            marching = false;
-                        }
+                    if has_solid && bit(solid, i) {
+                        marching = false;
                     }
                 }
             }

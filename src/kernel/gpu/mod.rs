@@ -10,14 +10,21 @@
 mod adam;
 mod device;
 mod hash;
+mod losses;
 mod march;
 mod neus;
+mod norm;
 mod sdf;
 mod tile;
 
 pub use adam::adam;
 pub use device::{Atomics, Buffer, Device};
 pub use hash::Grid;
+pub use losses::{LossWeights, Losses, Targets};
 pub use march::{Occupancy, Samples};
 pub use neus::{Neus, Rays};
+pub use norm::Norm;
 pub use sdf::Sdf;
+
+#[cfg(test)]
+mod step_tests;

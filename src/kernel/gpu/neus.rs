@@ -1,10 +1,17 @@
 //! NeuS compositing of ragged rays: see [`crate::kernel::neus`]. A thread takes a ray.
+//!
+//! Beside what the CPU composites stands `Σ w ‖c‖²`, of which, with color and opacity, a loss of each sample's own color
+//! is made: `Σ w ‖c − h‖² = Σ w ‖c‖² − 2 h · Σ w c + ‖h‖² Σ w`.
 
 use super::device::{Buffer, Device, groups};
-use crate::kernel::neus::{RAY_WIDTH, SHORTEST};
+use crate::kernel::neus::{self, SHORTEST};
+use crate::kernel::sdf::WIDTH;
 use cubecl::prelude::*;
 
 const UNITS: u32 = 64;
+
+/// Values per ray: rgb (3), opacity, Σ w t, Σ w n̂ (3), Σ w ‖c‖².
+pub const RAY_WIDTH: usize = neus::RAY_WIDTH + 1;
 
 /// ε of the opacity.
 const EPSILON: f32 = 1e-5;
@@ -100,12 +107,15 @@ fn forward(
         let mut nx = 0.0f32;
         let mut ny = 0.0f32;
         let mut nz = 0.0f32;
+        let mut squares = 0.0f32;
         for s in (offsets[r] as usize)..(offsets[r + 1] as usize) {
             let a = sample(field, plane, s, dt[s], dx, dy, dz, inv_s, anneal);
             let w = transmittance * a.alpha;
-            red += w * field[4 * plane + s];
-            green += w * field[5 * plane + s];
-            blue += w * field[6 * plane + s];
+            let (c0, c1, c2) = (field[4 * plane + s], field[5 * plane + s], field[6 * plane + s]);
+            red += w * c0;
+            green += w * c1;
+            blue += w * c2;
+            squares += w * (c0 * c0 + c1 * c1 + c2 * c2);
             opacity += w;
             depth += w * t[s];
             nx += w * a.nx;
@@ -122,6 +132,7 @@ fn forward(
         out[5 * rays + r] = nx;
         out[6 * rays + r] = ny;
         out[7 * rays + r] = nz;
+        out[8 * rays + r] = squares;
     }
 }
 
@@ -148,16 +159,18 @@ fn backward(
         let (dx, dy, dz) = (direction[r], direction[rays + r], direction[2 * rays + r]);
         let (g0, g1, g2, g3) = (g_out[r], g_out[rays + r], g_out[2 * rays + r], g_out[3 * rays + r]);
         let (g4, g5) = (g_out[4 * rays + r], g_out[5 * rays + r]);
-        let (g6, g7) = (g_out[6 * rays + r], g_out[7 * rays + r]);
+        let (g6, g7, g8) = (g_out[6 * rays + r], g_out[7 * rays + r], g_out[8 * rays + r]);
         let (begin, end) = (offsets[r] as usize, offsets[r + 1] as usize);
         let mut behind = 0.0f32; // Σ_{j>k} w_j worth_j
         let mut sum = 0.0f32;
         for k in 0..end - begin {
             let s = end - 1 - k;
             let a = sample(field, plane, s, dt[s], dx, dy, dz, inv_s, anneal);
-            let worth = g0 * field[4 * plane + s]
-                + g1 * field[5 * plane + s]
-                + g2 * field[6 * plane + s]
+            let (c0, c1, c2) = (field[4 * plane + s], field[5 * plane + s], field[6 * plane + s]);
+            let worth = g0 * c0
+                + g1 * c1
+                + g2 * c2
+                + g8 * (c0 * c0 + c1 * c1 + c2 * c2)
                 + g3
                 + g4 * t[s]
                 + g5 * a.nx
@@ -165,9 +178,9 @@ fn backward(
                 + g7 * a.nz;
             let transmittance = light[s];
             let w = transmittance * a.alpha;
-            g_field[4 * plane + s] = w * g0;
-            g_field[5 * plane + s] = w * g1;
-            g_field[6 * plane + s] = w * g2;
+            g_field[4 * plane + s] = w * (g0 + 2.0f32 * g8 * c0);
+            g_field[5 * plane + s] = w * (g1 + 2.0f32 * g8 * c1);
+            g_field[6 * plane + s] = w * (g2 + 2.0f32 * g8 * c2);
             let g_alpha = transmittance * worth - behind / max(1.0f32 - a.alpha, 1e-10f32);
             behind += w * worth;
             // by the unit normal: as composited, and through the cosine
@@ -214,7 +227,7 @@ fn sharpness(g_ln: &[f32], inv_s: &[f32], g_inv_s: &mut [f32]) {
             all += sums[i];
         }
         let s = inv_s[0];
-        g_inv_s[0] = select(s >= 1e-6f32 && s <= 1e6f32, all / s, 0.0f32);
+        g_inv_s[0] = select(clamp(s, 1e-6f32, 1e6f32) == s, all / s, 0.0f32);
     }
 }
 
@@ -245,12 +258,12 @@ impl Neus {
         Neus {
             out: device.scratch(RAY_WIDTH * rays),
             light: device.scratch(capacity),
-            g_field: device.scratch(RAY_WIDTH * capacity),
+            g_field: device.scratch(WIDTH * capacity),
             g_ln: device.scratch(rays),
         }
     }
 
-    /// Composites: planes `[8, rays]` of the field's planes `[8, capacity]`; inv_s: `[1]`.
+    /// Composites: planes `[9, rays]` of the field's planes `[8, capacity]`; inv_s: `[1]`.
     pub fn forward(
         &self,
         device: &Device,
@@ -315,8 +328,7 @@ impl Neus {
 mod tests {
     use super::super::device::tests::{agree, device, planes};
     use super::*;
-    use crate::kernel::sdf::WIDTH;
-    use crate::kernel::{neus, rng};
+    use crate::kernel::rng;
 
     /// Runs both and returns (device, CPU): rays' values, gradients by field, by inv_s.
     type Found = (Vec<f32>, Vec<f32>, f32);
@@ -339,11 +351,27 @@ mod tests {
         let out = device.read(on.forward(device, there, &on_field, &on_s, anneal));
         let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros(1));
         let g_field = device.read(on.backward(device, there, &on_field, &on_s, anneal, &g_out, &g_s));
-        let (flat, g) = (field.as_flattened(), g.as_flattened());
-        let want: Vec<f32> = neus::forward(rays, flat, inv_s, anneal);
-        let (want_field, want_s) = neus::backward(rays, flat, inv_s, anneal, g);
-        let turned = |v: &[f32], n: usize| planes::<8>(v.as_chunks().0, n);
-        [(out, g_field, device.read::<f32>(&g_s)[0]), (turned(&want, count), turned(&want_field, n), want_s)]
+        let flat = field.as_flattened();
+        // squared colors are composited as the CPU does it: as colors of a second field
+        let squared: Vec<[f32; WIDTH]> = field
+            .iter()
+            .map(|f| [f[0], f[1], f[2], f[3], f[4] * f[4], f[5] * f[5], f[6] * f[6], f[7]])
+            .collect();
+        let squared = squared.as_flattened();
+        let two = [flat, squared].map(|f| neus::forward(rays, f, inv_s, anneal));
+        let want: Vec<[f32; RAY_WIDTH]> = two[0]
+            .chunks(8)
+            .zip(two[1].chunks(8))
+            .map(|(a, b)| std::array::from_fn(|k| if k < 8 { a[k] } else { b[0] + b[1] + b[2] }))
+            .collect();
+        let g_first: Vec<f32> = g.iter().flat_map(|g| g[..8].to_vec()).collect();
+        let g_second: Vec<f32> = g.iter().flat_map(|g| [g[8], g[8], g[8], 0.0, 0.0, 0.0, 0.0, 0.0]).collect();
+        let (first, s1) = neus::backward(rays, flat, inv_s, anneal, &g_first);
+        let (second, s2) = neus::backward(rays, squared, inv_s, anneal, &g_second);
+        let chained = |i: usize| if (4..7).contains(&(i % 8)) { 2.0 * flat[i] } else { 1.0 };
+        let want_field: Vec<f32> = (0..flat.len()).map(|i| first[i] + chained(i) * second[i]).collect();
+        let want_field = planes::<WIDTH>(want_field.as_chunks().0, n);
+        [(out, g_field, device.read::<f32>(&g_s)[0]), (planes(&want, count), want_field, s1 + s2)]
     }
 
     #[test]
@@ -378,7 +406,8 @@ mod tests {
         }
         let dt = vec![0.01f32; n];
         let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
-        let g: Vec<[f32; 8]> = (0..200).map(|r| std::array::from_fn(|k| normal(5, 8 * r + k))).collect();
+        let g: Vec<[f32; RAY_WIDTH]> =
+            (0..200).map(|r| std::array::from_fn(|k| normal(5, RAY_WIDTH * r + k))).collect();
         for (inv_s, anneal) in [(20.0, 0.0), (60.0, 0.4), (200.0, 1.0)] {
             let [got, want] = both(&device, rays, &field, inv_s, anneal, &g);
             agree("rays", &got.0, &want.0, 1e-4);
@@ -398,7 +427,7 @@ mod tests {
         let offsets = [0, 4];
         let (direction, t, dt) = ([[0.6, 0.0, -0.8]], [1.0, 1.1, 1.2, 1.3], [1e-9, 0.05, 3.0, 1e3]);
         let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
-        let g = [[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0]];
+        let g = [[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]];
         for inv_s in [0.0, 1e-6, 1.0, 1e6, 1e9] {
             for sdf in [0.0, -1e-6, 1.0, -1e3, 1e20] {
                 for slope in [0.0, 1e-12, 2e-6, 1.0, 1e6] {

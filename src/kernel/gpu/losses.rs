@@ -1,0 +1,416 @@
+//! What a training step of the signed-distance field minimizes, and its gradients.
+//!
+//! With `C` and `O` a ray's color and opacity, `h` and `a` color (over black) and alpha of its pixel, `b` a background,
+//! `e = C + (1 − O) b − h − (1 − a) b`, and means over the rays that met a sample (rgb), over those that are all head
+//! (each sample's own color), over all rays (mask) and over the samples (the others):
+//!
+//! ```text
+//! rgb_mse · ⟨e²⟩ + rgb_l1 · ⟨|e|⟩ + rgb_sample · ⟨Σ w (c − h)²⟩ + mask · ⟨−a ln O − (1 − a) ln(1 − O)⟩
+//!   + eikonal · ⟨(‖∇f‖ − 1)²⟩ + sparsity · ⟨exp(−β |f|)⟩
+//! ```
+
+use super::device::{Buffer, Device, groups};
+use super::neus::RAY_WIDTH;
+use cubecl::prelude::*;
+
+const UNITS: u32 = 256;
+
+/// Terms of a ray: squared and absolute error, each sample's own color, mask.
+const RAY_TERMS: usize = 4;
+/// Terms of a sample: eikonal, sparsity.
+const SAMPLE_TERMS: usize = 2;
+
+/// Weights of the terms; β of the last.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LossWeights {
+    /// Of the squared error of the color.
+    pub rgb_mse: f32,
+    /// Of its absolute error.
+    pub rgb_l1: f32,
+    /// Of the squared error of each sample's own color.
+    pub rgb_sample: f32,
+    /// Of the cross entropy of opacity and alpha.
+    pub mask: f32,
+    /// Of the length of the sdf's gradient.
+    pub eikonal: f32,
+    /// Of closeness to the surface.
+    pub sparsity: f32,
+    /// β.
+    pub sparsity_scale: f32,
+}
+
+/// How many rays met a sample, and how many are all head. One group of threads.
+#[cube(launch)]
+fn tally(offsets: &[u32], alpha: &[f32], out: &mut [u32]) {
+    let unit = UNIT_POS as usize;
+    let mut met = 0u32;
+    let mut heads = 0u32;
+    for r in range_stepped(unit, alpha.len(), UNITS as usize) {
+        met += select(offsets[r + 1] > offsets[r], 1u32, 0u32);
+        heads += select(alpha[r] > 0.999f32, 1u32, 0u32);
+    }
+    let mut mets = Shared::<[u32]>::new_slice(UNITS as usize);
+    let mut all = Shared::<[u32]>::new_slice(UNITS as usize);
+    mets[unit] = met;
+    all[unit] = heads;
+    sync_cube();
+    if unit == 0 {
+        met = 0;
+        heads = 0;
+        for i in 0..UNITS as usize {
+            met += mets[i];
+            heads += all[i];
+        }
+        out[0] = met;
+        out[1] = heads;
+    }
+}
+
+/// Terms of rays, planes `[4, rays]`, and gradients by what was composited, planes `[9, rays]`.
+#[cube(launch)]
+fn of_rays(
+    composed: &[f32],
+    color: &[f32],
+    alpha: &[f32],
+    background: &[f32],
+    offsets: &[u32],
+    tally: &[u32],
+    g_out: &mut [f32],
+    terms: &mut [f32],
+    rgb_mse: f32,
+    rgb_l1: f32,
+    rgb_sample: f32,
+    mask: f32,
+) {
+    let rays = alpha.len();
+    let r = ABSOLUTE_POS;
+    if r < rays {
+        let (opacity, a) = (composed[3 * rays + r], alpha[r]);
+        let met = select(offsets[r + 1] > offsets[r], 1.0f32, 0.0f32);
+        let share = met / (3.0f32 * max(f32::cast_from(tally[0]), 1.0f32));
+        let head = select(a > 0.999f32, 1.0f32, 0.0f32) / (3.0f32 * max(f32::cast_from(tally[1]), 1.0f32));
+        let mut square = 0.0f32;
+        let mut absolute = 0.0f32;
+        let mut own = composed[8 * rays + r];
+        let mut g_opacity = 0.0f32;
+        for c in 0..3usize {
+            let (h, b, seen) = (color[c * rays + r], background[c * rays + r], composed[c * rays + r]);
+            let e = seen + (1.0f32 - opacity) * b - (h + (1.0f32 - a) * b);
+            square += e * e;
+            absolute += e.abs();
+            own += h * h * opacity - 2.0f32 * h * seen;
+            let sign = select(e > 0.0f32, 1.0f32, select(e < 0.0f32, -1.0f32, 0.0f32));
+            let g = (2.0f32 * e * rgb_mse + sign * rgb_l1) * share;
+            g_out[c * rays + r] = g - 2.0f32 * h * rgb_sample * head;
+            g_opacity += h * h * rgb_sample * head - b * g;
+        }
+        let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
+        let even = 1.0f32 / f32::cast_from(rays);
+        let cross = -(a * p.ln() + (1.0f32 - a) * (1.0f32 - p).ln()) * even;
+        let by_p = ((1.0f32 - a) / (1.0f32 - p) - a / p) * even * mask;
+        g_out[3 * rays + r] = g_opacity + select(p == opacity, by_p, 0.0f32);
+        for k in 4..8usize {
+            g_out[k * rays + r] = 0.0f32;
+        }
+        g_out[8 * rays + r] = rgb_sample * head;
+        terms[r] = square * share;
+        terms[rays + r] = absolute * share;
+        terms[2 * rays + r] = own * head;
+        terms[3 * rays + r] = cross;
+    }
+}
+
+/// Terms of samples, planes `[2, capacity]`; adds their gradients by the field's output.
+#[cube(launch)]
+fn of_samples(
+    field: &[f32],
+    count: &[u32],
+    g_field: &mut [f32],
+    terms: &mut [f32],
+    eikonal: f32,
+    sparsity: f32,
+    scale: f32,
+) {
+    let plane = terms.len() / SAMPLE_TERMS;
+    let s = ABSOLUTE_POS;
+    if s < count[0] as usize {
+        let even = 1.0f32 / f32::cast_from(count[0]);
+        let f = field[s];
+        let (x, y, z) = (field[plane + s], field[2 * plane + s], field[3 * plane + s]);
+        let length = (x * x + y * y + z * z + 1e-12f32).sqrt();
+        let off = length - 1.0f32;
+        let g = 2.0f32 * off / length * even * eikonal;
+        g_field[plane + s] += g * x;
+        g_field[2 * plane + s] += g * y;
+        g_field[3 * plane + s] += g * z;
+        let near = (-scale * f.abs()).exp() * even;
+        let sign = select(f > 0.0f32, 1.0f32, select(f < 0.0f32, -1.0f32, 0.0f32));
+        g_field[s] -= scale * sign * near * sparsity;
+        terms[s] = off * off * even;
+        terms[plane + s] = near;
+    }
+}
+
+/// Sums of the terms, in a fixed order. One group of threads a term.
+#[cube(launch)]
+fn sum(of_rays: &[f32], of_samples: &[f32], count: &[u32], out: &mut [f32]) {
+    let unit = UNIT_POS as usize;
+    let term = CUBE_POS_X as usize;
+    let mut own = 0.0f32;
+    if term < RAY_TERMS {
+        let rays = of_rays.len() / RAY_TERMS;
+        for r in range_stepped(unit, rays, UNITS as usize) {
+            own += of_rays[term * rays + r];
+        }
+    } else {
+        let plane = of_samples.len() / SAMPLE_TERMS;
+        for s in range_stepped(unit, count[0] as usize, UNITS as usize) {
+            own += of_samples[(term - RAY_TERMS) * plane + s];
+        }
+    }
+    let mut sums = Shared::<[f32]>::new_slice(UNITS as usize);
+    sums[unit] = own;
+    sync_cube();
+    if unit == 0 {
+        let mut all = 0.0f32;
+        for i in 0..UNITS as usize {
+            all += sums[i];
+        }
+        out[term] = all;
+    }
+}
+
+/// What pixels say about a batch of rays.
+#[derive(Clone, Copy)]
+pub struct Targets<'a> {
+    /// Planes `[3, rays]`, head over black.
+    pub color: &'a Buffer,
+    /// `[rays]`, 1 where there is no mask.
+    pub alpha: &'a Buffer,
+    /// Planes `[3, rays]`, what both are seen over.
+    pub background: &'a Buffer,
+}
+
+/// The losses of up to so many rays and samples.
+pub struct Losses {
+    weights: LossWeights,
+    tally: Buffer,
+    g_out: Buffer,
+    ray_terms: Buffer,
+    sample_terms: Buffer,
+    sums: Buffer,
+}
+
+impl Losses {
+    /// For so many rays and up to `capacity` samples.
+    pub fn new(device: &Device, weights: LossWeights, rays: usize, capacity: usize) -> Losses {
+        Losses {
+            weights,
+            tally: device.scratch(2),
+            g_out: device.scratch(RAY_WIDTH * rays),
+            ray_terms: device.scratch(RAY_TERMS * rays),
+            sample_terms: device.scratch(SAMPLE_TERMS * capacity),
+            sums: device.scratch(RAY_TERMS + SAMPLE_TERMS),
+        }
+    }
+
+    /// Gradients by what [`Neus::forward`](super::Neus::forward) composited, planes `[9, rays]`; offsets: `[rays + 1]`.
+    pub fn of_rays(&self, device: &Device, composed: &Buffer, targets: Targets, offsets: &Buffer) -> &Buffer {
+        let (w, dim) = (&self.weights, CubeDim::new_1d(UNITS));
+        let (alpha, tally) = (targets.alpha, &self.tally);
+        let one = CubeCount::new_single();
+        tally::launch(device.launch(), one, dim, offsets.arg(), alpha.arg(), tally.arg());
+        of_rays::launch(
+            device.launch(),
+            groups(alpha.words().div_ceil(UNITS as usize)),
+            dim,
+            composed.arg(),
+            targets.color.arg(),
+            alpha.arg(),
+            targets.background.arg(),
+            offsets.arg(),
+            tally.arg(),
+            self.g_out.arg(),
+            self.ray_terms.arg(),
+            w.rgb_mse,
+            w.rgb_l1,
+            w.rgb_sample,
+            w.mask,
+        );
+        &self.g_out
+    }
+
+    /// Adds the gradients of what is asked of each sample to those by the field's output, planes `[8, capacity]`.
+    pub fn of_samples(&self, device: &Device, field: &Buffer, count: &Buffer, g_field: &Buffer) {
+        let w = &self.weights;
+        of_samples::launch(
+            device.launch(),
+            groups((self.sample_terms.words() / SAMPLE_TERMS).div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            field.arg(),
+            count.arg(),
+            g_field.arg(),
+            self.sample_terms.arg(),
+            w.eikonal,
+            w.sparsity,
+            w.sparsity_scale,
+        );
+    }
+
+    /// The terms of the last step, unweighted, in the order of [`LossWeights`]; for steps whose losses are read.
+    pub fn sums(&self, device: &Device, count: &Buffer) -> &Buffer {
+        sum::launch(
+            device.launch(),
+            CubeCount::new_1d((RAY_TERMS + SAMPLE_TERMS) as u32),
+            CubeDim::new_1d(UNITS),
+            self.ray_terms.arg(),
+            self.sample_terms.arg(),
+            count.arg(),
+            self.sums.arg(),
+        );
+        &self.sums
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::tests::{agree, device, planes};
+    use super::super::neus::{Neus, Rays};
+    use super::*;
+    use crate::kernel::rng;
+
+    const WEIGHTS: LossWeights = LossWeights {
+        rgb_mse: 10.0,
+        rgb_l1: 0.7,
+        rgb_sample: 3.0,
+        mask: 0.5,
+        eikonal: 0.2,
+        sparsity: 0.3,
+        sparsity_scale: 4.0,
+    };
+    const ANNEAL: f64 = 0.4;
+    const STEP: f64 = 0.05;
+
+    struct Case {
+        offsets: Vec<u32>,
+        direction: Vec<[f32; 3]>,
+        color: Vec<[f32; 3]>,
+        alpha: Vec<f32>,
+        background: Vec<[f32; 3]>,
+        field: Vec<[f32; 8]>,
+    }
+
+    /// Five rays, one without samples; of pixels that are head, background and between.
+    fn case() -> Case {
+        let uniform = |stream: u64, i: usize| rng::uniform(9, stream, i as u64);
+        let rows =
+            |stream: u64| (0..5).map(|r| std::array::from_fn(|c| uniform(stream, 3 * r + c))).collect();
+        let alpha = vec![1.0, 0.0, 0.3, 1.0, 1.0];
+        let over_black = |r: usize| std::array::from_fn(|c| alpha[r] * uniform(2, 3 * r + c));
+        let sample = |i: usize| -> [f32; 8] {
+            let slope = [0, 1, 2].map(|c| 0.7 * rng::normal(9, 3, (3 * i + c) as u64));
+            let color = [0, 1, 2].map(|c| uniform(4, 3 * i + c));
+            let f = 0.15 - 0.06 * (i % 7) as f32 + 0.013;
+            [f, slope[0], slope[1], slope[2] + 0.5, color[0], color[1], color[2], -0.2 * uniform(5, i)]
+        };
+        Case {
+            offsets: vec![0, 6, 12, 12, 17, 24],
+            direction: vec![
+                [0.6, 0.0, -0.8],
+                [0.0, 0.0, 1.0],
+                [1.0, 0.0, 0.0],
+                [0.36, -0.48, 0.8],
+                [0.0, 0.6, -0.8],
+            ],
+            color: (0..5).map(over_black).collect(),
+            background: rows(6),
+            field: (0..24).map(sample).collect(),
+            alpha,
+        }
+    }
+
+    /// The terms in f64, and their weighted sum.
+    fn terms(case: &Case, field: &[f64], inv_s: f64) -> ([f64; 6], f64) {
+        let sigmoid = |x: f64| 1.0 / (1.0 + (-x).exp());
+        let mut t = [0f64; 6];
+        let (met, heads, n) = (4.0, 3.0, 24.0);
+        for r in 0..5 {
+            let mut transmittance = 1.0;
+            let (mut seen, mut opacity, mut own) = ([0f64; 3], 0.0, 0.0);
+            let h = case.color[r].map(f64::from);
+            for s in case.offsets[r] as usize..case.offsets[r + 1] as usize {
+                let f = &field[s * 8..][..8];
+                let length = (f[1] * f[1] + f[2] * f[2] + f[3] * f[3]).sqrt();
+                let cos = (0..3).map(|c| case.direction[r][c] as f64 * f[1 + c] / length).sum::<f64>();
+                let ic = -((0.5 - 0.5 * cos).max(0.0) * (1.0 - ANNEAL) + (-cos).max(0.0) * ANNEAL);
+                let (half, sharp) = (0.5 * ic * STEP, inv_s * f[7].exp());
+                let (p, q) = (sigmoid((f[0] - half) * sharp), sigmoid((f[0] + half) * sharp));
+                let alpha = ((p - q + 1e-5) / (p + 1e-5)).clamp(0.0, 1.0);
+                let w = transmittance * alpha;
+                (0..3).for_each(|c| seen[c] += w * f[4 + c]);
+                own += w * (0..3).map(|c| (f[4 + c] - h[c]).powi(2)).sum::<f64>();
+                opacity += w;
+                transmittance *= 1.0 - alpha;
+                t[4] += (length - 1.0).powi(2) / n;
+                t[5] += (-WEIGHTS.sparsity_scale as f64 * f[0].abs()).exp() / n;
+            }
+            let a = case.alpha[r] as f64;
+            if case.offsets[r + 1] > case.offsets[r] {
+                for c in 0..3 {
+                    let b = case.background[r][c] as f64;
+                    let e = seen[c] + (1.0 - opacity) * b - h[c] - (1.0 - a) * b;
+                    t[0] += e * e / (3.0 * met);
+                    t[1] += e.abs() / (3.0 * met);
+                }
+            }
+            if a == 1.0 {
+                t[2] += own / (3.0 * heads);
+            }
+            let p = opacity.clamp(1e-3, 1.0 - 1e-3);
+            t[3] -= (a * p.ln() + (1.0 - a) * (1.0 - p).ln()) / 5.0;
+        }
+        let w = WEIGHTS;
+        let weights = [w.rgb_mse, w.rgb_l1, w.rgb_sample, w.mask, w.eikonal, w.sparsity];
+        (t, t.iter().zip(weights).map(|(t, w)| t * w as f64).sum())
+    }
+
+    #[test]
+    fn losses_and_gradients_agree_with_f64_finite_differences() {
+        let Some(device) = device() else { return };
+        let case = case();
+        let inv_s = 30f32;
+        let up = |v: &[f32]| device.upload(v);
+        let (offsets, direction) = (device.upload(&case.offsets), up(&planes(&case.direction, 5)));
+        let (t, dt) = (up(&[1.0; 24]), up(&[STEP as f32; 24]));
+        let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let (field, sharp) = (up(&planes(&case.field, 24)), up(&[inv_s]));
+        let (color, background) = (up(&planes(&case.color, 5)), up(&planes(&case.background, 5)));
+        let alpha = up(&case.alpha);
+        let targets = Targets { color: &color, alpha: &alpha, background: &background };
+        let (neus, losses) = (Neus::new(&device, 5, 24), Losses::new(&device, WEIGHTS, 5, 24));
+        let (count, g_s) = (device.upload(&[24u32]), device.zeros(1));
+        let composed = neus.forward(&device, rays, &field, &sharp, ANNEAL as f32);
+        let g_out = losses.of_rays(&device, composed, targets, &offsets);
+        let g_field = neus.backward(&device, rays, &field, &sharp, ANNEAL as f32, g_out, &g_s);
+        losses.of_samples(&device, &field, &count, g_field);
+        let sums = losses.sums(&device, &count);
+        let (launches, readbacks) = device.counts();
+        println!(
+            "{launches} launches and {readbacks} readbacks of compositing and losses, forward and backward"
+        );
+
+        let wide: Vec<f64> = case.field.as_flattened().iter().map(|&v| v as f64).collect();
+        let want = terms(&case, &wide, inv_s as f64).0.map(|t| t as f32);
+        agree("losses", &device.read::<f32>(sums), &want, 1e-5);
+        let at = |i: usize, h: f64| {
+            let mut f = wide.clone();
+            f[i] += h;
+            terms(&case, &f, inv_s as f64).1
+        };
+        let slopes: Vec<f32> = (0..192).map(|i| ((at(i, 1e-6) - at(i, -1e-6)) / 2e-6) as f32).collect();
+        agree("gradients", &device.read::<f32>(g_field), &planes::<8>(slopes.as_chunks().0, 24), 1e-4);
+        let s = |h: f64| terms(&case, &wide, inv_s as f64 + h).1;
+        let slope = ((s(1e-4) - s(-1e-4)) / 2e-4) as f32;
+        agree("gradient by inv_s", &device.read::<f32>(&g_s), &[slope], 1e-4);
+    }
+}
