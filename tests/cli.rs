@@ -348,3 +348,30 @@ fn what_out_received_is_told_and_nothing_else_is_written_there() {
     assert_eq!(code(&o), 2, "{}", err(&o));
     assert!(!dir.path().join("runs/head/copy").exists());
 }
+
+#[test]
+fn a_capture_is_converted_into_a_new_folder_only() {
+    use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+    let dir = tempfile::tempdir().unwrap();
+    let small = SyntheticOptions { width: 16, height: 20, train: 4, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &small).unwrap();
+    let o = tiface(dir.path(), &["convert", "head", "--to", "colmap"]);
+    assert_eq!((code(&o), out(&o).trim()), (0, "head_colmap"), "{}", err(&o));
+    let o = tiface(
+        dir.path(),
+        &["convert", "head_colmap", "--to", "transforms", "--out", "back", "--json", "--link"],
+    );
+    assert!(code(&o) == 0 && out(&o).contains("\"views\":5"), "{} {}", out(&o), err(&o));
+    let o = tiface(dir.path(), &["convert", "back", "--to", "llff", "--dry-run"]);
+    assert!(code(&o) == 0 && !dir.path().join("back_llff").exists(), "{}", err(&o));
+    for (words, expected, text) in [
+        (&["convert", "head", "--to", "colmap"][..], 1, "is not an empty folder"),
+        (&["convert", "head", "--to", "nerf"], 2, "`--to nerf` is no format of cameras"),
+        (&["convert", "absent", "--to", "llff"], 1, "absent"),
+        (&["demo", "--size", "large"], 2, "`--size large` is no size in pixels"),
+        (&["demo", "--size", "9x9", "--run", "tiny"], 1, "9 × 9 pixels"),
+    ] {
+        let o = tiface(dir.path(), words);
+        assert!(code(&o) == expected && err(&o).contains(text), "{words:?}: {} {}", code(&o), err(&o));
+    }
+}
