@@ -100,6 +100,8 @@ pub(super) struct Primitives {
     bare_uvs: bool,
     /// The base colors of the parts; `None` for a part without.
     textures: BTreeSet<Option<u32>>,
+    /// What those of parts with a texture are multiplied with.
+    tints: Vec<Option<[f32; 3]>>,
 }
 
 impl Primitives {
@@ -147,6 +149,7 @@ impl<'a> GlbReader<'a> {
             uvs,
             bare_uvs,
             textures,
+            mut tints,
             ..
         } = gathered;
         if bare_normals {
@@ -164,11 +167,13 @@ impl<'a> GlbReader<'a> {
         }
         let mut textures = textures.into_iter();
         let (first, second) = (textures.next().flatten(), textures.next());
-        if second.is_some() {
+        tints.dedup();
+        if second.is_some() || tints.len() > 1 {
             return Err(self.source.unsupported("`materials`", "a mesh with several base colors"));
         }
         let picture = first.map(|texture| self.picture(texture, out.atlas.as_mut()));
         out.picture = picture.transpose()?;
+        out.tint = tints.first().copied().flatten();
         Ok(out)
     }
 
@@ -316,6 +321,9 @@ impl<'a> GlbReader<'a> {
         if source.options.texture {
             let info = self.base_color(primitive.material)?;
             out.textures.insert(info.map(|i| i.index));
+            if info.is_some() {
+                out.tints.push(material.and_then(|m| m.pbr_metallic_roughness.tint()));
+            }
             let set = info.map_or(0, |i| i.tex_coord);
             match attribute(Semantic::TexCoords(set), &[Type::Vec2], &SHORTENED)? {
                 Some((uvs, _)) => {

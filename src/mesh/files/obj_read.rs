@@ -44,7 +44,8 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
         mesh.normals = normals.collect::<Option<_>>().unwrap_or_default();
     }
     let atlas = (source.options.texture && !obj.bare).then_some(atlas);
-    Ok(ParsedMesh { positions, mesh, atlas, picture: obj.library.map(PictureSource::Material) })
+    let picture = obj.library.map(PictureSource::Material);
+    Ok(ParsedMesh { positions, mesh, atlas, picture, tint: None })
 }
 
 impl Obj {

@@ -7,7 +7,7 @@ use super::source::{PictureSource, ReadOptions};
 use super::texture::HeadTexture;
 use crate::Result;
 use crate::geom::{Atlas, Similarity};
-use crate::image::Photo;
+use crate::image::{Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::io::{self, Limits};
 use std::path::{Path, PathBuf};
 
@@ -55,11 +55,14 @@ pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
             found
         }
     };
-    let ReadMesh { mesh, origin, atlas, picture } = found;
-    let photo = open_picture(picture.as_ref(), path).unwrap_or_else(|e| {
+    let ReadMesh { mesh, origin, atlas, picture, tint } = found;
+    let mut photo = open_picture(picture.as_ref(), path).unwrap_or_else(|e| {
         warnings.push(format!("{e}; shown without its texture"));
         None
     });
+    if let (Some(photo), Some(tint)) = (&mut photo, tint) {
+        multiply(photo, tint);
+    }
     let (texture, bare_atlas) = match (atlas, photo) {
         (Some(atlas), Some(color)) => {
             let (width, height) = (color.width, color.height);
@@ -80,6 +83,17 @@ pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
     })
 }
 
+/// Multiplies the light of a picture.
+fn multiply(photo: &mut Photo, tint: [f32; 3]) {
+    let coded = |byte: u8, factor: f32| {
+        quantize(srgb_from_linear(linear_from_srgb(f32::from(byte) / 255.0) * factor))
+    };
+    for (channel, factor) in tint.into_iter().enumerate() {
+        let table: [u8; 256] = std::array::from_fn(|byte| coded(byte as u8, factor));
+        photo.rgb.iter_mut().for_each(|c| c[channel] = table[usize::from(c[channel])]);
+    }
+}
+
 fn open_picture(picture: Option<&PictureSource>, path: &Path) -> Result<Option<Photo>> {
     let limits = Limits::default();
     if let Some(PictureSource::Inside(bytes)) = picture {
@@ -87,4 +101,17 @@ fn open_picture(picture: Option<&PictureSource>, path: &Path) -> Result<Option<P
     }
     let beside = picture_beside(picture, path)?;
     Ok(beside.map(|file| io::read_photo(&file, None, &limits)).transpose()?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_tint_multiplies_light() {
+        let mut photo = Photo { width: 2, height: 1, rgb: vec![[255; 3], [188, 9, 0]], alpha: None };
+        multiply(&mut photo, [0.5, 1.0, 0.0]);
+        // linear 0.5 is 188, linear 0.25 is 137
+        assert_eq!(photo.rgb, [[188, 255, 0], [137, 9, 0]]);
+    }
 }

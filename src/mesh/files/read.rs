@@ -29,6 +29,8 @@ pub struct ReadMesh {
     pub atlas: Option<Atlas>,
     /// The base color.
     pub picture: Option<PictureSource>,
+    /// Linear red, green and blue that it is multiplied with, if the file says so.
+    pub tint: Option<[f32; 3]>,
 }
 
 /// Returns the mesh in the bytes of a `.glb`, `.ply` or `.obj` file, in the file's own coordinates, rounded to f32:
@@ -53,7 +55,7 @@ pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh> {
 /// As [`read`]; and when the texture is wanted but broken, lies outside the file and its folder, or when there are
 /// several.
 pub fn read_with(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
-    let ParsedMesh { positions, mut mesh, atlas, picture } = parse(bytes, path, options)?;
+    let ParsedMesh { positions, mut mesh, atlas, picture, tint } = parse(bytes, path, options)?;
     // the box of what is shown: loose vertices may be anywhere
     let corners = mesh.triangles.iter().flatten().map(|&i| positions[i as usize]);
     let (low, high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
@@ -63,7 +65,7 @@ pub fn read_with(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<Rea
     // −0 stays what it was
     let place = |p: &DVec3| if far { (p - origin).as_vec3() } else { p.as_vec3() };
     mesh.positions = positions.iter().map(place).collect::<Vec<Vec3>>();
-    Ok(ReadMesh { mesh, origin, atlas, picture })
+    Ok(ReadMesh { mesh, origin, atlas, picture, tint })
 }
 
 fn parse(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ParsedMesh> {

@@ -56,6 +56,8 @@ pub(super) struct ParsedMesh {
     pub mesh: Mesh,
     pub atlas: Option<Atlas>,
     pub picture: Option<PictureSource>,
+    /// Linear red, green and blue that the picture is multiplied with.
+    pub tint: Option<[f32; 3]>,
 }
 
 /// Which file is read, as what, and how much it may ask for.
