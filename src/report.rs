@@ -11,7 +11,7 @@ mod runs;
 mod serve;
 
 pub use chart::{Chart, Curve, charts};
-pub use live::serve_run;
+pub use live::{FieldView, serve_run};
 pub use runs::{RunRow, runs_html};
 pub use serve::{Answer, Server};
 

@@ -41,7 +41,8 @@ pub(super) struct PreviewOptions {
     #[arg(long, value_name = "N", default_value_t = 36, value_parser = clap::value_parser!(u32).range(2..=3600))]
     #[arg(requires = "turntable")]
     frames: u32,
-    /// Front, both sides, back, top, wireframe, normals and texture coordinates, on one sheet
+    /// Front, both sides, back, top, wireframe, normals and texture coordinates on one sheet; of a run also a held-out
+    /// photograph and how far the mesh is from it
     #[arg(long, conflicts_with = "cameras")]
     sheet: bool,
     /// Seen by the cameras of a file (a nerfstudio camera path or a transforms.json), or those of a run's photographs:
@@ -110,7 +111,7 @@ const SHEET: [(&str, f64, f64, Option<Look>); 8] = [
     ("UV", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Uv)),
 ];
 
-/// Columns of the sheet.
+/// Columns of the sheet; one more where a photograph and the errors against it are on it.
 const COLUMNS: usize = 4;
 
 /// Pixels of pictures that are made side by side: 1 GiB while they are floats.
@@ -230,9 +231,18 @@ fn make(
     let at_once = (AT_ONCE_PX / largest.max(1)).clamp(1, 32) as usize;
     match place {
         Out::File(file, _) if kind == Kind::Sheet => {
-            let mut pictures = some(shots)?;
-            pictures.iter_mut().zip(names).for_each(|(picture, name)| label::write(picture, name));
-            let sheet = PreviewPicture::sheet(&pictures, COLUMNS);
+            let (mut pictures, mut names, mut columns) = (some(shots)?, names.to_vec(), COLUMNS);
+            match renderer.against_photograph(width) {
+                Ok(Some(more)) => {
+                    pictures.extend(more);
+                    names.extend(["PHOTO", "ERROR"].map(String::from));
+                    columns += 1;
+                }
+                Ok(None) => {}
+                Err(e) => invocation.screen.note("preview", &format!("no errors against a photograph: {e}")),
+            }
+            pictures.iter_mut().zip(&names).for_each(|(picture, name)| label::write(picture, name));
+            let sheet = PreviewPicture::sheet(&pictures, columns);
             io::write_png_rgba(file, sheet.width, sheet.height, &sheet.rgba)?;
             *first = Some(sheet);
             Ok(vec![file.clone()])

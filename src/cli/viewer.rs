@@ -6,13 +6,16 @@ use super::run::is_demo;
 use super::stdout::print;
 use super::target::RunTarget;
 use crate::io;
-use crate::pipeline::{Line, head_page, viewer_of_file};
+use crate::pipeline::{Line, Stage, field_view, head_page, viewer_of_file};
 use crate::report::{Server, serve_run};
 use crate::run::Run;
 use crate::{Error, Result};
 use glam::Vec3;
 use serde_json::json;
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+use std::time::SystemTime;
 
 /// Writes the page of a mesh file whose up is `up`, or of the head of a run with its photographs.
 pub(super) fn page(
@@ -75,7 +78,7 @@ pub(super) fn no_up(up: Option<Vec3>) -> Result<()> {
 /// Serves the page of a run until somebody stops it.
 pub(super) fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     let common = invocation.common;
-    let (target, _) = target(invocation, path)?;
+    let (target, config) = target(invocation, path)?;
     if common.dry_run {
         invocation.screen.note("preview", &format!("would serve `{}` on this machine", target.run.display()));
         return Ok(());
@@ -87,7 +90,19 @@ pub(super) fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> 
     } else {
         print(&format!("watch     {url}\n          of `{}`, until Ctrl-C\n", target.run.display()))?;
     }
-    serve_run(&server, &target.run, &|| invocation.stop.requested().is_some());
+    // made once for each checkpoint, however many look
+    let made: Mutex<HashMap<Stage, (Option<SystemTime>, Vec<u8>)>> = Mutex::default();
+    let view = |stage: Stage| -> Option<Vec<u8>> {
+        let saved = io::modified(&target.run.join(stage).join("checkpoint.safetensors"));
+        let mut made = made.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, picture)) = made.get(&stage).filter(|(time, _)| *time == saved) {
+            return Some(picture.clone());
+        }
+        let picture = field_view(&target.run, &config, stage).ok()?;
+        made.insert(stage, (saved, picture.clone()));
+        Some(picture)
+    };
+    serve_run(&server, &target.run, &view, &|| invocation.stop.requested().is_some());
     Err(invocation.stop.error("nothing was changed"))
 }
 

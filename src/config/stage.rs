@@ -7,7 +7,7 @@ use std::path::Path;
 use std::str::FromStr;
 
 /// A stage of the line.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Stage {
     /// Which pixels are the head, and where that puts it in space.
     Mask,

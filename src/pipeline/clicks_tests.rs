@@ -104,6 +104,11 @@ fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_ma
     );
     assert!(complete(&other, Stage::Mask, &NoFields).unwrap().skipped, "they shape nothing else");
     std::fs::remove_dir_all(masks).unwrap();
+    for name in ["transforms.json", "transforms_train.json", "transforms_test.json"] {
+        let file = dir.path().join("head").join(name);
+        let text = std::fs::read_to_string(&file).unwrap();
+        std::fs::write(&file, text.replace("\"mask_path\"", "\"other\"")).unwrap();
+    }
     let bare = Line::open(&config, &run).unwrap();
     let view = &bare.capture().views[0];
     assert_eq!((bare.judges(), bare.judged(view).mask), ("run", view.mask.clone()));

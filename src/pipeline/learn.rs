@@ -1,6 +1,7 @@
 //! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
 
 use super::line::Line;
+use super::march::march;
 use super::surface::{Fields, Radiance, Surface};
 use super::tiles;
 use crate::capture::scene::Scene;
@@ -11,6 +12,7 @@ use crate::field::training::TrainingSession;
 use crate::geom::Camera;
 use crate::iface::{self, IFace};
 use crate::kernel::march::Bitmask;
+use crate::render::RenderedView;
 use crate::run::StageDir;
 use crate::tface::{self, FieldMean};
 use crate::{Error, Result};
@@ -120,6 +122,25 @@ impl Fields for TrainedFields<'_> {
         let cell = if stage == Stage::Baseline { &self.baseline } else { &self.tface };
         once(cell, load).map(|f| f as &dyn Radiance)
     }
+}
+
+/// What a camera in the scene sees of a field.
+pub(super) type FieldLook = Box<dyn Fn(&Camera) -> RenderedView>;
+
+/// Returns the field of a stage as the newest checkpoint in a run has it, finished or not: what a camera in the scene sees
+/// of it. Of several fields that are learned one after the other the first.
+pub(super) fn load_field(run: &Path, config: &Config, scene: &Scene, stage: Stage) -> Result<FieldLook> {
+    let (folder, world_from_scene) = (run.join(stage.word()), scene.scene_from_world.inverse());
+    if stage == Stage::Iface {
+        let field = IFace::load(&folder, &config.iface, bitmask(scene).as_ref())?;
+        return Ok(Box::new(move |camera| {
+            march(camera, &world_from_scene, false, |rays| field.render(rays))
+        }));
+    }
+    let field = FieldMean::load(stage.word(), &folder, 1)?;
+    Ok(Box::new(move |camera| {
+        march(camera, &world_from_scene, false, |rays| field.render(rays, camera.forward()))
+    }))
 }
 
 fn once<T>(cell: &OnceCell<T>, load: impl FnOnce() -> Result<T>) -> Result<&T> {

@@ -5,7 +5,7 @@
 
 mod methods;
 mod viewer;
-mod views;
+pub(super) mod views;
 
 pub use viewer::{head_page, viewer_of_file};
 

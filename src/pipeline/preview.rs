@@ -1,13 +1,14 @@
 //! Pictures of a mesh to look at: of a run's head, or of a file that anybody wrote.
 
 use super::export::{center as center_of, front as front_of};
+use super::page::views::{error, heat};
 use super::path::cameras_of_file;
-use super::pictures::{behind, over, straight};
+use super::pictures::{behind, expected, over, straight};
 use super::scene_file::read_capture;
 use crate::capture::{Split, View};
 use crate::config::ViewBackground;
 use crate::geom::{Atlas, Camera, Distortion, Similarity};
-use crate::image::{Image, quantize};
+use crate::image::{Image, quantize, reduce_photo, working_size};
 use crate::io::{self, Limits};
 use crate::mesh::files::{HeadMesh, OpenedMesh, open_mesh};
 use crate::render::path::{NamedCamera, orbit};
@@ -34,8 +35,8 @@ pub struct Preview {
     /// Unit, in the mesh's coordinates, across each other.
     up: Vec3,
     front: Vec3,
-    /// The photographs' cameras in the world, of a run.
-    cameras: Vec<(Split, NamedCamera)>,
+    /// The photographs of a run, their cameras in the world.
+    views: Vec<View>,
     /// What of it cannot be shown.
     pub warnings: Vec<String>,
 }
@@ -59,9 +60,7 @@ impl Preview {
         let front = front_of(capture.up, &eyes, center);
         let up = to_scene * capture.up.normalize_or(Vec3::Y);
         let front = front.map_or_else(|| up.any_orthonormal_vector(), |f| to_scene * f);
-        let named = |v: View| (v.split, NamedCamera { name: v.name, camera: v.camera });
-        let cameras = capture.views.into_iter().map(named).collect();
-        Ok(Preview { head, bare_atlas: None, up, front, cameras, warnings: Vec::new() })
+        Ok(Preview { head, bare_atlas: None, up, front, views: capture.views, warnings: Vec::new() })
     }
 
     /// Returns the mesh in a `.glb`, `.obj` or `.ply` file. `up` is where its up is, +Y for most; its front is then +Z, or
@@ -74,7 +73,7 @@ impl Preview {
         let OpenedMesh { mut head, bare_atlas, warnings } = open_mesh(path)?;
         at_hand(&mut head, path)?;
         let front = if up.z.abs() > 0.5 { Vec3::NEG_Y } else { Vec3::Z };
-        Ok(Preview { head, bare_atlas, up, front, cameras: Vec::new(), warnings })
+        Ok(Preview { head, bare_atlas, up, front, views: Vec::new(), warnings })
     }
 
     /// What is shown where nobody asks for a look: its color if it has one, else its shape.
@@ -124,7 +123,8 @@ impl Preview {
             [("train", Split::Train), ("test", Split::Test)].into_iter().find(|(word, _)| *word == which);
         let cameras = match split {
             Some((_, split)) => {
-                self.cameras.iter().filter(|(s, _)| *s == split).map(|(_, camera)| camera.clone()).collect()
+                let named = |v: &View| NamedCamera { name: v.name.clone(), camera: v.camera.clone() };
+                self.views.iter().filter(|v| v.split == split).map(named).collect()
             }
             None => {
                 let like = self.around(0.0, 0.0, side, 1)?.remove(0).camera;
@@ -210,6 +210,38 @@ impl PreviewRenderer<'_> {
         };
         let layers = self.layers.as_ref().filter(|_| look.has_layers());
         raster_into(seen, &head.mesh, layers, camera, &options, |hits| surface.shown(look, hits, camera));
+    }
+
+    /// The held-out photograph that looks at the face, cut out by its mask, and how far the mesh is from it in the colors
+    /// of errors, each in the middle of a square of `side` pixels; nothing where there is none.
+    ///
+    /// # Errors
+    ///
+    /// The photograph is no longer where it was, or cannot be read.
+    pub fn against_photograph(&self, side: u32) -> Result<Option<[PreviewPicture; 2]>> {
+        let Preview { head, views, front, .. } = self.preview;
+        let scene_from_world = head.world_from_scene.inverse();
+        let placed = |v: &View| v.camera.transformed(&scene_from_world);
+        let facing = |v: &View| -placed(v).forward().dot(*front);
+        let held_out = views.iter().filter(|v| v.split == Split::Test);
+        let Some(view) = held_out.max_by(|a, b| facing(a).total_cmp(&facing(b))) else { return Ok(None) };
+        let loaded = view.load(&Limits::default())?;
+        let black = ViewBackground::Black;
+        let (w, h) = working_size(loaded.photo.width, loaded.photo.height, side);
+        let photo = reduce_photo(&expected(&loaded.photo, loaded.mask.as_ref(), black), (w, h));
+        let ours =
+            self.picture(&mut RasterView::default(), &placed(view).resized(w, h), self.preview.look(), black);
+        let apart = ours.rgba.iter().zip(&photo.rgb).map(|(a, b)| error([a[0], a[1], a[2]], *b)[0]);
+        let heat = apart.map(|e| heat(f32::from(e) / 255.0)).collect();
+        let (left, top) = ((side - w) / 2, (side - h) / 2);
+        let framed = |rgb: Vec<[u8; 3]>| {
+            let mut rgba = vec![[0; 4]; (side * side) as usize];
+            for (i, [r, g, b]) in (0..).zip(rgb) {
+                rgba[((top + i / w) * side + left + i % w) as usize] = [r, g, b, 255];
+            }
+            PreviewPicture { width: side, height: side, rgba }
+        };
+        Ok(Some([framed(photo.rgb), framed(heat)]))
     }
 
     /// Many of them, made side by side.

@@ -25,12 +25,26 @@ struct StageRow {
     share: u64,
 }
 
-/// Serves a run until `stop`: `""` is the page, `live` the part of it that changes, and all else files of this run.
-pub fn serve_run(server: &Server, run: &Path, stop: &(dyn Fn() -> bool + Sync)) {
-    server.run(stop, &|path| answer(run, path));
+/// Makes a picture, a JPEG file, of the field that a stage of a run is learning; `None` where it cannot.
+pub type FieldView<'a> = &'a (dyn Fn(Stage) -> Option<Vec<u8>> + Sync);
+
+/// Serves a run until `stop`: `""` is the page, `live` the part of it that changes, `field/STAGE` a view of what a stage
+/// has learned so far, and all else files of this run.
+pub fn serve_run(server: &Server, run: &Path, view: FieldView, stop: &(dyn Fn() -> bool + Sync)) {
+    server.run(stop, &|path| answer(run, view, path));
 }
 
-fn answer(run: &Path, path: &str) -> Option<Answer> {
+/// The fields that are being learned and have a checkpoint: the stage, and when that was saved.
+fn learning(run: &Path) -> impl Iterator<Item = (Stage, SystemTime)> {
+    LEARNED.into_iter().filter_map(move |(stage, _)| {
+        let folder = run.join(stage);
+        let file = folder.join("checkpoint.safetensors");
+        let at_work = matches!(read_record(&folder), Ok(None)) && io::is_file(&file) && !io::is_link(&file);
+        at_work.then(|| io::modified(&file)).flatten().map(|time| (stage, time))
+    })
+}
+
+fn answer(run: &Path, view: FieldView, path: &str) -> Option<Answer> {
     let html = |page: Result<String>| {
         let text = page.unwrap_or_else(|e| format!("<p>{}</p>", super::escape(&e.to_string())));
         Some(Answer { kind: "text/html; charset=utf-8", body: text.into_bytes() })
@@ -38,6 +52,10 @@ fn answer(run: &Path, path: &str) -> Option<Answer> {
     match path {
         "" => html(page(run)),
         "live" => html(changing(run)),
+        path if path.starts_with("field/") => {
+            let (stage, _) = learning(run).find(|(stage, _)| path == format!("field/{stage}"))?;
+            Some(Answer { kind: "image/jpeg", body: view(stage)? })
+        }
         path => {
             let named =
                 pictures(run).into_iter().chain(PAGES.map(String::from)).find(|name| link(name) == path)?;
@@ -85,7 +103,13 @@ fn changing(run: &Path) -> Result<String> {
     let mut newest: Vec<(SystemTime, String)> = pictures(run).into_iter().map(|p| (time(&p), p)).collect();
     newest.sort_by(|a, b| b.cmp(a));
     newest.truncate(NEWEST);
-    let newest: Vec<(String, String)> = newest.into_iter().map(|(_, name)| (link(&name), name)).collect();
+    // with the time, so that no browser shows an older picture of the same name
+    let stamp = |time: SystemTime| time.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |t| t.as_millis());
+    let fields = learning(run).map(|(stage, time)| {
+        (format!("field/{stage}?{}", stamp(time)), format!("{stage}, as learned so far"))
+    });
+    let views = newest.into_iter().map(|(time, name)| (format!("{}?{}", link(&name), stamp(time)), name));
+    let newest: Vec<(String, String)> = fields.chain(views).collect();
     let report = io::is_file(&run.join("report.html"));
     fill(include_str!("live_part.html"), context! { stages, charts => drawn, newest, report })
 }
@@ -124,7 +148,10 @@ mod tests {
         std::fs::write(run.join("report.html"), "r").unwrap();
         std::fs::write(run.join("iface/log.jsonl"), "{\"step\":1,\"psnr\":9}\n{\"step\":2,\"psnr\":10}\n")
             .unwrap();
-        let get = |path: &str| answer(&run, path).map(|a| (a.kind, String::from_utf8(a.body).unwrap()));
+        let get = |path: &str| {
+            answer(&run, &|stage| Some(stage.word().into()), path)
+                .map(|a| (a.kind, String::from_utf8(a.body).unwrap()))
+        };
         let address = link(&format!("render/tface/{name}.png"));
         assert_eq!(get(&address), Some(("image/png", "p".into())));
         assert_eq!(get("report.html").unwrap().1, "r");
@@ -140,6 +167,12 @@ mod tests {
                 && !page.contains("<img src=x")
         );
         assert_eq!(get("live").unwrap().1.matches("<polyline").count(), 1);
+        // a field is looked at while it is learned, and no other stage is asked for
+        assert!(get("field/iface").is_none() && !page.contains("field/iface"));
+        std::fs::write(run.join("iface/checkpoint.safetensors"), "c").unwrap();
+        assert_eq!(get("field/iface"), Some(("image/jpeg", "iface".into())));
+        assert!(get("live").unwrap().1.contains("field&#x2f;iface?"));
+        assert_eq!((get("field/mesh"), get("field/tface"), get("field/../config.toml")), (None, None, None));
         #[cfg(unix)]
         {
             std::fs::write(dir.path().join("outside.png"), "o").unwrap();

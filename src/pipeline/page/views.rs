@@ -114,13 +114,13 @@ fn row(
 }
 
 /// The mean difference of the channels as a share of [`MOST_ERROR`], in all three channels.
-fn error(a: [u8; 3], b: [u8; 3]) -> [u8; 3] {
+pub(in crate::pipeline) fn error(a: [u8; 3], b: [u8; 3]) -> [u8; 3] {
     let sum: u32 = (0..3).map(|k| a[k].abs_diff(b[k]) as u32).sum();
     [quantize(sum as f32 / 3.0 / 255.0 / MOST_ERROR); 3]
 }
 
 /// The color of an error, 0..=1.
-fn heat(t: f32) -> [u8; 3] {
+pub(in crate::pipeline) fn heat(t: f32) -> [u8; 3] {
     let at = t.clamp(0.0, 1.0) * (HEAT.len() - 1) as f32;
     let k = (at as usize).min(HEAT.len() - 2);
     let mix = |c: usize| HEAT[k][c] as f32 + (at - k as f32) * (HEAT[k + 1][c] as f32 - HEAT[k][c] as f32);
