@@ -253,7 +253,9 @@ fn check_rigs(
             let Some(image) = known.get(&data).filter(|_| kind == CAMERA) else { continue };
             let sensor_from_rig = match rig.sensors.iter().find(|s| (s.0, s.1) == (kind, sensor)) {
                 Some((_, _, Some(pose))) => *pose,
-                Some((_, _, None)) if rig.sensors[0].1 == sensor => Rigid::default(),
+                Some((_, _, None)) if (rig.sensors[0].0, rig.sensors[0].1) == (kind, sensor) => {
+                    Rigid::default()
+                }
                 Some(_) => continue, // a sensor whose place in the rig is not known yet
                 None => {
                     return Err(wrong(format!(

@@ -86,9 +86,16 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -
         return Err(Error::cannot(message, "name a new one: nothing that is there is overwritten"));
     }
     let mut out = Conversion { folder: folder.into(), views: capture.views.len(), ..Conversion::default() };
-    let named_splits =
-        every_eighth(&capture.views) != capture.views.iter().map(|v| v.split).collect::<Vec<_>>();
     let places: Vec<Place> = capture.views.iter().map(|v| place(v, to)).collect();
+    let mut names: Vec<&str> = places.iter().map(|p| p.photo.as_str()).collect();
+    names.sort_unstable();
+    if let Some(twice) = names.windows(2).find(|n| n[0] == n[1]) {
+        let message = format!("two photographs would both be called `{}`", twice[0]);
+        return Err(Error::cannot(message, "rename one of them, or convert to another format"));
+    }
+    // readers hold out every 8th in the order of the new names
+    let renamed: Vec<View> = places.iter().map(|p| View { name: p.name.clone(), ..p.view.clone() }).collect();
+    let named_splits = every_eighth(&renamed) != capture.views.iter().map(|v| v.split).collect::<Vec<_>>();
     // what cannot be said is found before anything is written
     let files = match to {
         CameraFormat::Transforms => transforms(capture, &places, named_splits)?,
@@ -143,7 +150,8 @@ fn place(view: &View, to: CameraFormat) -> Place<'_> {
         |folder: &str, file: &Option<PathBuf>| file.as_ref().map(|f| format!("{folder}/{stem}{}", ending(f)));
     Place {
         view,
-        camera: Camera { width: view.declared.0, height: view.declared.1, ..view.camera.clone() },
+        // of the photograph as it lies there: the check above has seen to that
+        camera: view.camera.clone(),
         photo: format!("images/{name}"),
         name,
         mask,

@@ -91,12 +91,13 @@ fn aim(options: &SyntheticOptions, azimuth: f64, elevation: f64, distance: f64, 
     }
 }
 
-/// Photographs the head and writes the capture folder `dir`: `images/`, `masks/` (soft),
-/// `face_masks/` (binary), `transforms.json` with every view and its split, `transforms_train.json`,
-/// `transforms_test.json` and `README.md`. `transforms.json` comes last: a capture that has one is
-/// complete.
-pub fn write_capture(dir: &Path, options: &SyntheticOptions) -> Result<()> {
-    let &SyntheticOptions { width, height, train, test, seed } = options;
+/// Refuses what no capture can be made of: sides and numbers of views beyond bounds.
+///
+/// # Errors
+///
+/// It is so.
+pub fn check(options: &SyntheticOptions) -> Result<()> {
+    let &SyntheticOptions { width, height, train, test, .. } = options;
     let sides = 16..=4096;
     let views = train.saturating_add(test);
     if !sides.contains(&width) || !sides.contains(&height) || train == 0 || views > 999 {
@@ -108,7 +109,16 @@ pub fn write_capture(dir: &Path, options: &SyntheticOptions) -> Result<()> {
             "ask for a size and number of views within these bounds",
         ));
     }
-    write_photographs(dir, &cameras(options), &Similarity::IDENTITY, seed, &readme(options))
+    Ok(())
+}
+
+/// Photographs the head and writes the capture folder `dir`: `images/`, `masks/` (soft),
+/// `face_masks/` (binary), `transforms.json` with every view and its split, `transforms_train.json`,
+/// `transforms_test.json` and `README.md`. `transforms.json` comes last: a capture that has one is
+/// complete.
+pub fn write_capture(dir: &Path, options: &SyntheticOptions) -> Result<()> {
+    check(options)?;
+    write_photographs(dir, &cameras(options), &Similarity::IDENTITY, options.seed, &readme(options))
 }
 
 /// Photographs the head with these cameras (all of the intrinsics of the first) and writes the capture folder `dir`,

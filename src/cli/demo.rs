@@ -4,7 +4,7 @@ use super::invocation::Invocation;
 use super::out::Out;
 use super::run::{LineCommand, run as run_line};
 use super::target::{DEMO_CAPTURE, RunTarget};
-use crate::capture::synthetic::{SyntheticOptions, write_borders, write_capture};
+use crate::capture::synthetic::{SyntheticOptions, check, write_borders, write_capture};
 use crate::config::Preset;
 use crate::io;
 use crate::pipeline::{Stage, feasible};
@@ -84,6 +84,14 @@ fn photograph(
     let views = options.train + options.test;
     invocation.screen.note("capture", &format!("photographing a synthetic head from {views} sides"));
     let start = Instant::now();
+    check(options)?;
+    let narrow = options.width.min(options.height);
+    if let Some(border) = border.filter(|b| b.saturating_mul(2) >= narrow) {
+        return Err(Error::usage(
+            format!("`--border {border}` leaves nothing of a side of {narrow} pixels"),
+            "name less than half of it",
+        ));
+    }
     io::create_folder(capture)?;
     if let Some(border) = border {
         write_borders(capture, options, border)?;

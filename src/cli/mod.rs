@@ -325,7 +325,7 @@ learned from (capture.tiles): the blend follows the better members.")]
     #[command(after_long_help = "Examples:
   tiface preview runs/002_00                    three quarters of the head, 1024 pixels, as a PNG
   tiface preview scan.ply --light matcap --up z --out scan.png
-  tiface preview head.glb --sheet               from all sides, with wireframe, normals and texture coordinates
+  tiface preview runs/002_00 --sheet            from all sides, as wireframe, normals, texture coordinates, errors
   tiface preview runs/002_00 --turntable --out turn.gif     .png is animated, too; .mp4 needs ffmpeg
   tiface preview runs/002_00 --cameras test --out views/    as the held-out photographs
   tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
@@ -338,7 +338,8 @@ learned from (capture.tiles): the blend follows the better members.")]
   tiface bench runs/002_00 --sweep extraction,triangles,texture --truth truth.ply
   tiface bench --out bench/new/ --compare bench/demo/bench.json    what got slower or worse since then
 
-Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep.")]
+Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep. It exits with 3 if a hard
+case (stability) is not within its bound.")]
     Bench(BenchOptions),
     /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates, size
     #[command(after_long_help = "Examples:

@@ -111,6 +111,9 @@ const SHEET: [(&str, f64, f64, Option<Look>); 8] = [
     ("UV", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Uv)),
 ];
 
+/// Pixels along each side of a picture on a sheet, at most: all of them are held at once.
+const MOST_OF_SHEET: u32 = 2048;
+
 /// Columns of the sheet; one more where a photograph and the errors against it are on it.
 const COLUMNS: usize = 4;
 
@@ -168,6 +171,10 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
         return viewer::page(invocation, options.path.as_deref(), options.up, asked.as_ref());
     }
     let kind = Kind::of(options);
+    if kind == Kind::Sheet && options.size.is_some_and(|size| size > MOST_OF_SHEET) {
+        let what = format!("`--size` of a picture on a sheet is at most {MOST_OF_SHEET}");
+        return Err(Error::usage(what, "make larger pictures one by one"));
+    }
     let asked = Out::find(common.out.as_deref(), if kind.is_moving() { "turntable" } else { "preview" })?;
     let (preview, name) = open(invocation, options)?;
     preview.warnings.iter().for_each(|w| screen.note("preview: warning", w));

@@ -90,17 +90,21 @@ pub(super) fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> 
     } else {
         print(&format!("watch     {url}\n          of `{}`, until Ctrl-C\n", target.run.display()))?;
     }
-    // made once for each checkpoint, however many look
-    let made: Mutex<HashMap<Stage, (Option<SystemTime>, Vec<u8>)>> = Mutex::default();
+    // made once for each checkpoint, however many look and whether or not it can be read
+    let made: Mutex<HashMap<Stage, (Option<SystemTime>, Option<Vec<u8>>)>> = Mutex::default();
     let view = |stage: Stage| -> Option<Vec<u8>> {
         let saved = io::modified(&target.run.join(stage).join("checkpoint.safetensors"));
         let mut made = made.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, picture)) = made.get(&stage).filter(|(time, _)| *time == saved) {
-            return Some(picture.clone());
+            return picture.clone();
         }
-        let picture = field_view(&target.run, &config, stage).ok()?;
+        let picture = field_view(&target.run, &config, stage);
+        if let Err(e) = &picture {
+            invocation.screen.note("watch", &format!("no view of `{stage}`: {e}"));
+        }
+        let picture = picture.ok();
         made.insert(stage, (saved, picture.clone()));
-        Some(picture)
+        picture
     };
     serve_run(&server, &target.run, &view, &|| invocation.stop.requested().is_some());
     Err(invocation.stop.error("nothing was changed"))

@@ -82,8 +82,9 @@ pub fn copy(from: &Path, to: &Path) -> Result<(), WriteError> {
     let aside = to.with_file_name(aside_name(&to.file_name().unwrap_or_default().to_string_lossy()));
     let result = (|| {
         // where the disk can, the bytes are shared instead of copied
-        fs::copy(from, &aside)?;
-        File::open(&aside)?.sync_all()?;
+        let mut copied = File::create(&aside)?;
+        std::io::copy(&mut File::open(from)?, &mut copied)?;
+        copied.sync_all()?;
         fs::rename(&aside, to)
     })();
     result.map_err(|e| {

@@ -196,5 +196,5 @@ fn off_truth() -> Measure {
 
 /// One line per place where a sweep's words come together.
 fn sweep(name: &str, title: &str, note: String, measures: Vec<Measure>) -> Sweep {
-    Sweep { name: name.into(), title: title.into(), note, measures, rows: Vec::new() }
+    Sweep { name: name.into(), title: title.into(), note, measures, by_wall: false, rows: Vec::new() }
 }

@@ -4,7 +4,7 @@ use super::clicks::MaskPrompts;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::Scene;
-use crate::capture::{self, Capture, CaptureOptions, View, ViewMask};
+use crate::capture::{self, Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{Config, MaskSource, RenderConfig, Sources, Stage};
 use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
@@ -117,12 +117,16 @@ impl<'a> Line<'a> {
         View { mask: own.filter(|m| *m != ViewMask::None).unwrap_or(view.mask.clone()), ..view.clone() }
     }
 
-    /// Whose masks say where figures count: `capture`, `run` (made by this run: others may judge otherwise) or `none`.
+    /// Whose masks say where figures of held-out views count: `capture`, `run` (made by this run, for one of them at least:
+    /// others may judge otherwise) or `none`.
     pub(super) fn judges(&self) -> &'static str {
-        let is_mask = |mask: &ViewMask| *mask != ViewMask::None;
+        let held_out: Vec<&View> = self.capture.views.iter().filter(|v| v.split != Split::Train).collect();
+        let all: Vec<&View> = self.capture.views.iter().collect();
+        let judged = if held_out.is_empty() { all } else { held_out };
+        let is_own = |view: &&View| self.judged(view).mask != view.mask;
         match &self.own_masks {
-            Some(own) if !own.masks.iter().any(is_mask) => "run",
-            None if !self.capture.views.iter().any(|v| is_mask(&v.mask)) => "none",
+            Some(_) if !judged.iter().all(is_own) => "run",
+            None if judged.iter().all(|v| v.mask == ViewMask::None) => "none",
             _ => "capture",
         }
     }

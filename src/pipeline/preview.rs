@@ -223,8 +223,11 @@ impl PreviewRenderer<'_> {
         let scene_from_world = head.world_from_scene.inverse();
         let placed = |v: &View| v.camera.transformed(&scene_from_world);
         let facing = |v: &View| -placed(v).forward().dot(*front);
-        let held_out = views.iter().filter(|v| v.split == Split::Test);
-        let Some(view) = held_out.max_by(|a, b| facing(a).total_cmp(&facing(b))) else { return Ok(None) };
+        let of = |split: Split| views.iter().filter(|v| v.split == split).collect::<Vec<_>>();
+        let held_out = Some(of(Split::Test)).filter(|v| !v.is_empty()).unwrap_or_else(|| of(Split::Val));
+        let Some(view) = held_out.into_iter().max_by(|a, b| facing(a).total_cmp(&facing(b))) else {
+            return Ok(None);
+        };
         let loaded = view.load(&Limits::default())?;
         let black = ViewBackground::Black;
         let (w, h) = working_size(loaded.photo.width, loaded.photo.height, side);

@@ -59,6 +59,11 @@ impl Measure {
         Measure { name: name.into(), digits, more_is_better: Some(false), noise: (0.0, noise) }
     }
 
+    /// Differences from a value up to this one are noise.
+    fn noise_of(&self, value: f64) -> f64 {
+        self.noise.0.max(self.noise.1 * value.abs())
+    }
+
     /// A figure that is neither good nor bad.
     pub fn count(name: &str) -> Measure {
         Measure { name: name.into(), digits: 0, more_is_better: None, noise: (0.0, 0.0) }
@@ -111,26 +116,45 @@ pub struct Sweep {
     pub note: String,
     /// What the rows' figures are; the first is drawn over time.
     pub measures: Vec<Measure>,
+    /// Does the time by the clock decide? Else that of the CPU, which a busy machine leaves alone.
+    #[serde(default)]
+    pub by_wall: bool,
     /// The choices.
     pub rows: Vec<Row>,
 }
+
+/// Headings of the table of hard cases.
+const STABILITY: [&str; 5] = ["", "case", "error", "bound", "unit"];
 
 /// Heading of the choices.
 const CHOICE: &str = "choice";
 
 impl Sweep {
-    /// Which rows no other row beats in CPU time and the first measure together: the Pareto front.
+    /// The time of a row that decides: of the CPU, or by the clock.
+    fn time(&self, row: &Row) -> f64 {
+        let Seconds { wall, cpu } = row.seconds();
+        if self.by_wall { wall } else { cpu }
+    }
+
+    /// Which rows are better in the first measure, beyond its noise, than all that take less time: the Pareto front.
     pub fn front(&self) -> Vec<bool> {
-        let better = self.measures.first().and_then(|m| m.more_is_better);
-        let Some(more) = better else { return vec![false; self.rows.len()] };
-        let place = |row: &Row| Some((row.seconds().cpu, row.figures.first().copied()??));
-        let places: Vec<Option<(f64, f64)>> = self.rows.iter().map(place).collect();
-        let beats = |a: (f64, f64), b: (f64, f64)| {
-            let (no_worse, is_better) = if more { (a.1 >= b.1, a.1 > b.1) } else { (a.1 <= b.1, a.1 < b.1) };
-            a.0 <= b.0 && no_worse && (a.0 < b.0 || is_better)
+        let mut front = vec![false; self.rows.len()];
+        let Some((measure, more)) = self.measures.first().and_then(|m| Some((m, m.more_is_better?))) else {
+            return front;
         };
-        let all = || places.iter().flatten();
-        places.iter().map(|p| p.is_some_and(|p| !all().any(|&other| beats(other, p)))).collect()
+        let place = |(i, row): (usize, &Row)| Some((i, self.time(row), row.figures.first().copied()??));
+        let mut places: Vec<(usize, f64, f64)> = self.rows.iter().enumerate().filter_map(place).collect();
+        // of equal times the better first
+        let better_first = |a: f64, b: f64| if more { b.total_cmp(&a) } else { a.total_cmp(&b) };
+        places.sort_by(|a, b| a.1.total_cmp(&b.1).then(better_first(a.2, b.2)));
+        let mut best: Option<f64> = None;
+        for (i, _, figure) in places {
+            let gain = |best: f64| if more { figure - best } else { best - figure };
+            if best.is_none_or(|best| gain(best) > measure.noise_of(best)) {
+                (front[i], best) = (true, Some(figure));
+            }
+        }
+        front
     }
 
     /// Headings and cells of its table, and whether a row is on the front. The first column is the series, if there are
@@ -240,26 +264,27 @@ impl BenchResult {
     /// It is no such file, or of another format.
     pub fn parse(text: &str, name: &str) -> Result<BenchResult> {
         let hint = "name the bench.json that `tiface bench` wrote";
-        let result: BenchResult = serde_json::from_str(text)
-            .map_err(|e| Error::cannot(format!("`{name}` is no result of a bench: {e}"), hint))?;
+        let damaged = |e| Error::cannot(format!("`{name}` is no result of a bench: {e}"), hint);
+        let value: serde_json::Value = serde_json::from_str(text).map_err(damaged)?;
+        if let Some(other) = value["format"].as_u64().filter(|f| *f != u64::from(FORMAT)) {
+            return Err(Error::cannot(
+                format!("`{name}` has format {other} of results, this program knows {FORMAT}"),
+                "measure again with this program",
+            ));
+        }
+        let result: BenchResult = serde_json::from_value(value).map_err(damaged)?;
         let finite = result.sweeps.iter().flat_map(|s| &s.rows).all(|row| {
-            row.rounds.iter().all(|r| {
-                [r.work.wall, r.work.cpu, r.reference.wall, r.reference.cpu].iter().all(|t| *t >= 0.0)
+            row.rounds.iter().all(|Round { work, reference }| {
+                [work.wall, work.cpu].iter().all(|t| *t >= 0.0) && reference.wall > 0.0 && reference.cpu > 0.0
             })
         });
         let widths =
             result.sweeps.iter().all(|s| s.rows.iter().all(|row| row.figures.len() == s.measures.len()));
-        match result.format {
-            FORMAT if finite && widths => Ok(result),
-            FORMAT => Err(Error::cannot(
-                format!("`{name}` is damaged: times or figures are missing or negative"),
-                hint,
-            )),
-            other => Err(Error::cannot(
-                format!("`{name}` has format {other} of results, this program knows {FORMAT}"),
-                "measure again with this program",
-            )),
+        if !finite || !widths {
+            let what = format!("`{name}` is damaged: times or figures are missing, or no times");
+            return Err(Error::cannot(what, hint));
         }
+        Ok(result)
     }
 
     /// Refuses a result of another capture or of other settings: nothing in it compares.
@@ -268,6 +293,13 @@ impl BenchResult {
     ///
     /// It is one.
     pub fn comparable_with(&self, other: &BenchResult) -> Result<()> {
+        let [mine, theirs] = [self, other].map(|r| r.machine.threads);
+        if mine != theirs {
+            return Err(Error::cannot(
+                format!("the older result was measured on {mine} threads, this one is on {theirs}"),
+                format!("compare on as many: `RAYON_NUM_THREADS={mine}`"),
+            ));
+        }
         if self.identity == other.identity {
             return Ok(());
         }
@@ -301,7 +333,7 @@ impl BenchResult {
                 out,
                 "\nNumerical stability (stability)\nThe largest error of each hard case, and its bound."
             );
-            let rows: Vec<Vec<String>> = [["", "case", "error", "bound", "unit"].map(String::from).to_vec()]
+            let rows: Vec<Vec<String>> = [STABILITY.map(String::from).to_vec()]
                 .into_iter()
                 .chain(self.stability.iter().map(StabilityRow::cells))
                 .collect();
@@ -316,9 +348,12 @@ impl BenchResult {
     /// The tables as Markdown, one a sweep.
     pub fn markdown(&self) -> String {
         let mut out = String::new();
+        let line = |cells: &[String]| {
+            let cells: Vec<String> = cells.iter().map(|c| c.replace('|', "\\|")).collect();
+            format!("| {} |\n", cells.join(" | "))
+        };
         for sweep in &self.sweeps {
             let (headings, rows) = sweep.table();
-            let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
             let _ = write!(out, "\n**{}** {}\n\n{}", sweep.title, sweep.note, line(&headings));
             out += &line(&vec!["---".into(); headings.len()]);
             for (front, mut cells) in rows {
@@ -328,6 +363,12 @@ impl BenchResult {
                 }
                 out += &line(&cells);
             }
+        }
+        if !self.stability.is_empty() {
+            out += "\n**Numerical stability** The largest error of each hard case, and its bound.\n\n";
+            out += &line(&STABILITY.map(String::from));
+            out += &line(&STABILITY.map(|_| "---".into()));
+            self.stability.iter().for_each(|row| out += &line(&row.cells()));
         }
         out.trim_start().into()
     }
@@ -412,6 +453,7 @@ pub(super) mod tests {
             title: "Training <steps>".into(),
             note: "As measured.".into(),
             measures: vec![Measure::more("PSNR, dB", 2, 0.2)],
+            by_wall: false,
             rows,
         };
         let mut result = BenchResult::new(Machine::default(), "head & shoulders".into(), "id".into());
@@ -428,12 +470,19 @@ pub(super) mod tests {
             row("d", &[3.0], 31.0),
         ];
         let mut sweep = result(rows).sweeps.remove(0);
-        // b takes longer than a and is worse; c and d are equal, and neither beats the other
-        assert_eq!(sweep.front(), [true, false, true, true]);
+        // b takes longer than a and is worse; d is as good as c
+        assert_eq!(sweep.front(), [true, false, true, false]);
+        // 1 dB is not worth three times the time where it is noise
+        sweep.measures = vec![Measure::more("PSNR, dB", 2, 1.0)];
+        assert_eq!(sweep.front(), [true, false, false, false]);
         sweep.measures = vec![Measure::less("mm", 2, 0.0)];
         assert_eq!(sweep.front(), [true, true, false, false]);
         sweep.rows[1].figures = vec![None];
         assert_eq!(sweep.front(), [true, false, false, false]);
+        // by the clock, where that decides
+        sweep.rows[2].rounds[0].work.wall = 0.01;
+        sweep.by_wall = true;
+        assert_eq!(sweep.front(), [true, false, true, false]);
     }
 
     #[test]
@@ -442,6 +491,15 @@ pub(super) mod tests {
         assert_eq!(row.seconds(), Seconds { wall: 1.0, cpu: 2.0 });
         row.parts = true;
         assert_eq!(row.seconds(), Seconds { wall: 6.0, cpu: 12.0 });
+    }
+
+    #[test]
+    fn only_results_of_as_many_threads_compare() {
+        let mut other = result(Vec::new());
+        assert!(result(Vec::new()).comparable_with(&other).is_ok());
+        other.machine.threads = 16;
+        let error = result(Vec::new()).comparable_with(&other).unwrap_err();
+        assert!(error.to_string().contains("this one is on 16") && error.hint().contains("NUM_THREADS=0"));
     }
 
     #[test]
@@ -474,6 +532,7 @@ pub(super) mod tests {
         let text = result.text();
         assert!(text.contains("* field  c       1 min 40 s"), "{text}");
         assert!(text.contains("33.33") && text.contains("! g"), "{text}");
+        assert!(result.markdown().contains("| g | c | 2.00e0 | 1e0 | cells |"), "{}", result.markdown());
         assert!(result.markdown().contains("| field | **c** | 1 min 40 s | 50 s | – | 33.33 |"));
         let page = result.html(None).unwrap();
         assert!(page.contains("&lt;b&gt;") && !page.contains("<b>") && page.contains("data:image/svg+xml"));

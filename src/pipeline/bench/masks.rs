@@ -21,9 +21,12 @@ impl Bench<'_> {
     /// Masks from the same clicks, against the capture's own; `None` where it has none.
     pub(super) fn masks(&self) -> Result<Option<Sweep>> {
         let capture = &self.line.capture;
-        let truth: Vec<Option<Gray>> =
-            capture.views.par_iter().map(|v| v.load_mask(&Limits::default())).collect::<Result<_>>()?;
-        if self.config().mask.clicked() || truth.iter().any(Option::is_none) {
+        let truth: Vec<Option<Gray>> = capture
+            .views
+            .par_iter()
+            .map(|v| self.line.judged(v).load_mask(&Limits::default()))
+            .collect::<Result<_>>()?;
+        if self.line.judges() != "capture" || truth.iter().any(Option::is_none) {
             return Ok(None);
         }
         let truth: Vec<Gray> = truth.into_iter().flatten().collect();
@@ -76,7 +79,7 @@ impl Bench<'_> {
                 Ok(Value::Null)
             })?;
             let Some((found, row)) = measured else {
-                return Err(Error::cannot("these masks were made before", "choose an empty --out"));
+                return Err(Error::cannot("these masks were made before", ""));
             };
             let shares: Vec<f64> = found.iter().zip(&truth).map(|(a, b)| iou(a, b)).collect();
             let mean = shares.iter().sum::<f64>() / shares.len().max(1) as f64;

@@ -34,10 +34,10 @@ impl Bench<'_> {
     pub(super) fn extraction(&self) -> Result<Sweep> {
         let fields = self.fields(&[Stage::Iface])?;
         let field = fields.surface()?;
-        let note = "Ours evaluates the field near its surface and ends with Newton steps, cleaning and closing; the others \
+        let note = "Distances are medians. Ours evaluates the field near its surface and ends with Newton steps, cleaning and closing; the others \
                     evaluate every node and march. `isosurface` is that crate's marching cubes over the same values.";
         let measures =
-            vec![Measure::less("off the field, mm", 4, 0.03), off_truth(), Measure::count("evaluations")];
+            vec![Measure::less("off the field, mm", 4, 0.03), off_truth(), Measure::count("nodes evaluated")];
         let mut sweep = sweep("extraction", "Extraction", note.into(), measures);
         let config = |resolution| MeshConfig { resolution, ..self.config().mesh.clone() };
         let sparse = meter::in_turn(RESOLUTIONS.len(), |i| {
@@ -73,15 +73,19 @@ impl Bench<'_> {
         Ok(sweep)
     }
 
-    /// Median distance of a mesh to the field's zero and to the truth, mm, and how often the field was asked.
-    fn off(&self, mesh: &Mesh, field: &dyn Surface, evaluations: usize) -> Vec<Option<f64>> {
-        let points = distance::sample(mesh, POINTS);
-        let (values, gradients) = field.sdf_gradient(&points);
+    /// Distance of a mesh to the field's zero and to the truth, mm, and the nodes where the field was evaluated.
+    fn off(&self, mesh: &Mesh, field: &dyn Surface, nodes: usize) -> Vec<Option<f64>> {
+        let off = self.off_field(mesh, &|points| field.sdf_gradient(points));
+        vec![off, self.judge.off_truth(mesh, &self.scene), Some(nodes as f64)]
+    }
+
+    /// Median distance of a mesh to the zero of a field, to first order, mm.
+    fn off_field(&self, mesh: &Mesh, gradient: &dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>)) -> Option<f64> {
+        let (values, gradients) = gradient(&distance::sample(mesh, POINTS));
         let mut off: Vec<f32> =
             values.iter().zip(&gradients).map(|(f, g)| f.abs() / g.length().max(0.05)).collect();
         off.sort_by(f32::total_cmp);
-        let median = off.get(off.len() / 2).map(|d| f64::from(*d) * self.mm());
-        vec![median, self.judge.off_truth(mesh, &self.scene), Some(evaluations as f64)]
+        off.get(off.len() / 2).map(|d| f64::from(*d) * self.mm())
     }
 
     /// The field at every node; outside the hull it is outside.
@@ -105,7 +109,11 @@ impl Bench<'_> {
         let c = &self.config().mesh;
         let Extracted { mesh, cap, patches, .. } = self.extracted(&fields, c)?;
         let closed = ClosedSurface { field: fields.surface()?, cap: cap.as_ref(), patches: patches.as_ref() };
-        let note = format!("From {} triangles, extracted at {} cells.", mesh.triangles.len(), c.resolution);
+        let note = format!(
+            "From {} triangles, extracted at {} cells; distances are medians.",
+            mesh.triangles.len(),
+            c.resolution
+        );
         let measures = vec![Measure::less("off the field, mm", 4, 0.03), off_truth()];
         let mut sweep = sweep("triangles", "Triangles after simplification", note, measures);
         let counts: Vec<usize> = TRIANGLES.into_iter().filter(|n| *n < mesh.triangles.len()).collect();
@@ -118,11 +126,8 @@ impl Bench<'_> {
             Ok::<_, crate::Error>(mesh)
         })?;
         for (triangles, m) in counts.into_iter().zip(all) {
-            let points = distance::sample(&m.result, POINTS);
-            let (values, gradients) = closed.sdf_gradient(&points);
-            let off = values.iter().zip(&gradients).map(|(f, g)| f64::from(f.abs() / g.length().max(0.05)));
-            let mean = off.sum::<f64>() / points.len().max(1) as f64 * self.mm();
-            let figures = vec![Some(mean), self.judge.off_truth(&m.result, &self.scene)];
+            let off = self.off_field(&m.result, &|points| closed.sdf_gradient(points));
+            let figures = vec![off, self.judge.off_truth(&m.result, &self.scene)];
             sweep.rows.push(m.row("", triangles.to_string(), 1, figures));
         }
         Ok(sweep)

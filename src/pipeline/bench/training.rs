@@ -120,7 +120,8 @@ impl Bench<'_> {
     /// Both fields after shares of their training.
     pub(super) fn steps(&self) -> Result<Sweep> {
         let line = self.line;
-        let note = "One training of each field, looked at on its way; a time is that of all steps so far.";
+        let note = "One training of each field, looked at on its way; a time is that of all steps so far, with opening photographs and \
+                    checkpoint once for each look.";
         let mut sweep = sweep("steps", "Training steps", note.into(), vec![psnr(), off_truth()]);
         for (series, stage) in [("I-Face", Stage::Iface), ("T-Face", Stage::Tface)] {
             let all = steps(line.config, stage);
@@ -178,6 +179,8 @@ impl Bench<'_> {
     pub(super) fn devices(&self) -> Result<Sweep> {
         let note = format!("{} steps of I-Face: the same result, sooner.", self.short(SHORTER).iface.steps);
         let mut sweep = sweep("devices", "Devices", note, vec![psnr()]);
+        // more threads cost the same work and save waiting
+        sweep.by_wall = true;
         let all = rayon::current_num_threads();
         let mut counts: Vec<usize> =
             std::iter::successors(Some(1), |n| Some(2 * n)).take_while(|n| *n < all).collect();
@@ -185,8 +188,13 @@ impl Bench<'_> {
         for threads in counts {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
             let pool = pool.map_err(|e| Error::cannot(format!("no {threads} threads: {e}"), "try again"))?;
-            let mut row =
-                pool.install(|| self.row("CPU", format!("{threads} threads"), &self.short(SHORTER)))?;
+            let mut row = pool.install(|| {
+                self.row(
+                    "CPU",
+                    format!("{threads} {}", if threads == 1 { "thread" } else { "threads" }),
+                    &self.short(SHORTER),
+                )
+            })?;
             row.figures.truncate(1);
             sweep.rows.push(row);
         }
@@ -208,7 +216,7 @@ impl Bench<'_> {
     fn row(&self, series: &str, choice: String, config: &Config) -> Result<Row> {
         self.check_stop()?;
         let scratch = tempfile::tempdir_in(self.line.run.dir()).map_err(|e| {
-            Error::cannot(format!("no scratch folder: {e}"), "free space, or choose another --out")
+            Error::cannot(format!("no scratch folder: {e}"), "free space, or name another place in TMPDIR")
         })?;
         let run = Run::open(scratch.path(), self.line.run.stop().clone(), std::sync::Arc::new(Quiet));
         let mut line = Line::open(config, &run)?;

@@ -4,7 +4,7 @@
 //! `i` of the old result and round `i` of the new one give a ratio of ratios, which a slower or busier machine leaves
 //! where it is. The median of those pairs is the change; their spread says how far it can be trusted.
 
-use super::{BenchResult, Measure, Round, Row, median};
+use super::{BenchResult, Measure, Round, Row, StabilityRow, median};
 use serde::Serialize;
 use std::fmt::Write;
 
@@ -131,15 +131,27 @@ impl BenchResult {
                 out.unmatched.push(format!("{}, {} {} (old)", sweep.name, row.series, row.choice));
             }
         }
+        let named = |row: &StabilityRow| format!("{}: {}", row.group, row.case);
         for now in &self.stability {
-            let same = |r: &&super::StabilityRow| (&r.group, &r.case) == (&now.group, &now.case);
-            let (Some(was), Some(new)) = (old.stability.iter().find(same), now.error) else { continue };
-            let Some(old) = was.error else { continue };
-            // an error of rounding is what it is; beyond a tenth of its bound it is worth a word
-            let (change, noise) = (new - old, 0.1 * now.bound);
-            let worse = (change.abs() > noise).then_some(change > 0.0);
-            let (row, what) = (format!("{}: {}", now.group, now.case), format!("error, {}", now.unit));
+            let Some(was) = old.stability.iter().find(|r| named(r) == named(now)) else {
+                out.unmatched.push(format!("stability, {} (new)", named(now)));
+                continue;
+            };
+            let [old, new] = [was, now].map(|r| r.error.unwrap_or(f64::INFINITY));
+            // an error of rounding is what it is; a tenth of its bound is worth a word, and so is what no longer holds
+            let (change, noise) = (if old == new { 0.0 } else { new - old }, 0.1 * now.bound);
+            let worse = match (was.holds(), now.holds()) {
+                (true, false) => Some(true),
+                (false, true) => Some(false),
+                _ => (change.abs() > noise).then_some(change > 0.0),
+            };
+            let (row, what) = (named(now), format!("error, {}", now.unit));
             out.changes.push(Change { sweep: "stability".into(), row, what, old, new, change, noise, worse });
+        }
+        let gone = |r: &&StabilityRow| self.stability.iter().all(|now| named(now) != named(r));
+        if !self.stability.is_empty() {
+            let lost = old.stability.iter().filter(gone).map(|r| format!("stability, {} (old)", named(r)));
+            out.unmatched.extend(lost);
         }
         out
     }
@@ -159,7 +171,7 @@ fn time(old: &[Round], new: &[Round], units: fn(&Round) -> f64) -> (f64, f64, f6
 }
 
 fn figure(measure: &Measure, old: f64, new: f64) -> (f64, f64, f64, f64) {
-    (old, new, new - old, measure.noise.0.max(measure.noise.1 * old.abs()))
+    (old, new, new - old, measure.noise_of(old))
 }
 
 #[cfg(test)]
@@ -203,6 +215,22 @@ mod tests {
         assert_eq!(changes(&old, &wild)[0].1, None);
         let [one, other] = [1.0, 1.15].map(|t| result(vec![row("a", &[t], 30.0)]));
         assert_eq!(changes(&one, &other)[0].1, None);
+    }
+
+    #[test]
+    fn a_hard_case_that_no_longer_holds_is_worse_however_near_its_bound() {
+        let with = |error: Option<f64>| {
+            let mut result = result(Vec::new());
+            let (group, case, unit) = ("g".into(), "c".into(), "cells".into());
+            result.stability.push(StabilityRow { group, case, error, unit, bound: 1.0 });
+            result
+        };
+        let worse = |old, new| with(new).against(&with(old)).changes[0].worse;
+        assert_eq!(worse(Some(0.98), Some(1.01)), Some(true));
+        assert_eq!(worse(Some(0.5), None), Some(true));
+        assert_eq!(worse(None, Some(0.5)), Some(false));
+        assert_eq!((worse(None, None), worse(Some(0.5), Some(0.55))), (None, None));
+        assert_eq!(with(None).against(&result(Vec::new())).unmatched, ["stability, g: c (new)"]);
     }
 
     #[test]

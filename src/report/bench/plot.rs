@@ -32,7 +32,7 @@ fn draw(sweep: &Sweep, out: &mut String) -> std::result::Result<(), Box<dyn std:
         .zip(sweep.front())
         .enumerate()
         .filter_map(|(i, (row, front))| {
-            let (x, y) = (row.seconds().cpu.max(1e-7), row.figures.first().copied()??);
+            let (x, y) = (sweep.time(row).max(1e-7), row.figures.first().copied()??);
             y.is_finite().then_some((i, x, y, front))
         })
         .collect();
@@ -68,7 +68,7 @@ fn draw(sweep: &Sweep, out: &mut String) -> std::result::Result<(), Box<dyn std:
         .configure_mesh()
         .light_line_style(WHITE)
         .bold_line_style(RGBColor(226, 226, 226))
-        .x_desc("CPU seconds (fewer are better)")
+        .x_desc(if sweep.by_wall { "seconds (fewer are better)" } else { "CPU seconds (fewer are better)" })
         .y_desc(format!("{} ({better})", measure.name))
         .x_label_formatter(&|v| super::short_time(*v))
         .y_label_formatter(&|v| short(*v))
