@@ -24,7 +24,6 @@ mod bench;
 mod clicks;
 mod ensemble;
 mod export;
-#[cfg(feature = "cpu")]
 mod field_view;
 mod finish;
 #[cfg_attr(not(feature = "cpu"), path = "pipeline/learn_nothing.rs")]
@@ -51,7 +50,6 @@ pub use crate::geom::RayResult;
 #[cfg(feature = "cpu")]
 pub use bench::{Bench, SWEEPS};
 pub use export::Export;
-#[cfg(feature = "cpu")]
 pub use field_view::field_view;
 pub use line::{Line, capture_options, feasible};
 pub use mask::{click_page, disagreements};

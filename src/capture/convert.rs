@@ -105,7 +105,12 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -
     let put = |from: &Path, name: &str| -> Result<()> {
         let target = folder.join(name);
         io::create_folder(target.parent().unwrap_or(folder))?;
-        Ok(if link { io::hard_link(from, &target)? } else { io::copy(from, &target)? })
+        if link {
+            io::hard_link(from, &target)?;
+        } else {
+            io::copy(from, &target)?;
+        }
+        Ok(())
     };
     for place in &places {
         put(&place.view.photo, &place.photo)?;

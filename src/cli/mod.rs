@@ -4,6 +4,7 @@
 //! ([`crate::ErrorKind`]).
 
 mod bar;
+#[cfg(feature = "cpu")]
 mod bench;
 mod check;
 mod completions;
@@ -30,6 +31,7 @@ mod viewer;
 use crate::pipeline::Stage;
 use crate::run::Stop;
 use crate::{Error, Result};
+#[cfg(feature = "cpu")]
 use bench::BenchOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
 use invocation::Invocation;
@@ -332,6 +334,7 @@ learned from (capture.tiles): the blend follows the better members.")]
   tiface preview runs/002_00 --watch            a run while it works, in a browser on this machine")]
     Preview(PreviewOptions),
     /// Speed against error of each decision, measured on this machine: tables, plots, a page
+    #[cfg(feature = "cpu")]
     #[command(after_long_help = "Examples:
   tiface bench                                  all of it on the demo head, a quarter of an hour on two cores
   tiface bench captures/002_00 --sweep steps,render
@@ -424,6 +427,7 @@ pub fn main() -> ExitCode {
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
         Command::Preview(options) => preview::run(&invocation, options),
+        #[cfg(feature = "cpu")]
         Command::Bench(options) => bench::run(&invocation, options),
         Command::Status { runs } => makes_nothing("status").and_then(|()| status::run(&common, runs)),
         Command::Report { runs } => report::run(&invocation, runs),

@@ -5,9 +5,12 @@ use super::surface::{Fields, Radiance, Surface};
 use crate::capture::Capture;
 use crate::capture::scene::Scene;
 use crate::config::{Config, Stage};
+use crate::geom::Camera;
+use crate::render::RenderedView;
 use crate::run::StageDir;
 use crate::{Error, Result};
 use serde_json::Value;
+use std::path::Path;
 
 /// The error of this build for whatever needs a field.
 pub(super) fn no_fields<T>() -> Result<T> {
@@ -22,6 +25,13 @@ struct NoFields;
 
 pub(super) fn trained_fields(_: &Line) -> impl Fields {
     NoFields
+}
+
+/// What a camera in the scene sees of a field.
+pub(super) type FieldLook = Box<dyn Fn(&Camera) -> RenderedView>;
+
+pub(super) fn load_field(_: &Path, _: &Config, _: &Scene, _: Stage) -> Result<FieldLook> {
+    no_fields()
 }
 
 impl Fields for NoFields {

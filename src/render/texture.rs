@@ -89,6 +89,8 @@ fn mip_level(texels: f32, levels: usize) -> (usize, f32) {
 const SRGB_STEPS: usize = 4096;
 
 /// sRGB-coded from linear, by [`srgb_table`].
+// `clamp` would keep what is no number
+#[allow(clippy::manual_clamp)]
 #[inline(always)]
 fn coded(table: &[f32; SRGB_STEPS + 1], linear: f32) -> f32 {
     let at = linear.max(0.0).min(1.0) * (SRGB_STEPS as f32 - 1.0);
@@ -336,6 +338,8 @@ fn around(level: &MipLevel, u: f32, v: f32) -> ([u32; 4], Vec2) {
 }
 
 /// The whole part of a number, 0 of one below.
+// `clamp` would keep what is no number
+#[allow(clippy::manual_clamp)]
 #[inline(always)]
 fn whole(v: f32) -> u32 {
     let v = v.max(0.0).min(1e9);

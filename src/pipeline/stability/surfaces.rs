@@ -37,7 +37,7 @@ fn faults(mesh: &Mesh) -> f64 {
 fn volumes(cases: &mut Cases) {
     let u = |i: usize, k: u64| rng::uniform(11, k, i as u64);
     let pick = |i: usize, of: &[f32]| of[rng::below(12, 0, i as u64, of.len() as u64) as usize];
-    let checker = |i: usize| if (i % 17 + i / 17 % 17 + i / 289) % 2 == 0 { 1.0f32 } else { -1.0 };
+    let checker = |i: usize| if (i % 17 + i / 17 % 17 + i / 289).is_multiple_of(2) { 1.0f32 } else { -1.0 };
     let table: [(&str, &dyn Fn(usize) -> f32); 9] = [
         ("ones and exact zeros", &|i| pick(i, &[-1.0, 0.0, 1.0])),
         ("zeros of both signs", &|i| pick(i, &[-1.0, 0.0, -0.0])),

@@ -55,6 +55,8 @@ fn draw(sweep: &Sweep, out: &mut String) -> std::result::Result<(), Box<dyn std:
     let mut chart = ChartBuilder::on(&root)
         .caption(&sweep.title, ("sans-serif", 20))
         .margin(12)
+        // the last time may reach beyond the axis
+        .margin_right(40)
         .x_label_area_size(44)
         .y_label_area_size(64)
         .build_cartesian_2d(
