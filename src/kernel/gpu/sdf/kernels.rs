@@ -1,0 +1,447 @@
+//! What runs on the device: weights made ready, the networks forward, and backward one kernel a network.
+
+use super::super::tile::{
+    self, CHANNELS, LANES, at, gate, load, narrow, outer, product, put, save, sigmoid, sums,
+};
+use super::{NORMAL, Plan};
+use crate::kernel::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, SOFTNESS, TILE};
+use crate::kernel::neus::SHORTEST;
+use cubecl::prelude::*;
+
+type F4 = Vector<f32, Const<4>>;
+
+/// Weights in the orders in which they are read.
+#[cube(launch)]
+pub(super) fn prepare(flat: &[f32], map: &[u32], out: &mut [f32]) {
+    let i = ABSOLUTE_POS;
+    if i < out.len() {
+        let from = map[i] as usize;
+        out[i] = if from < flat.len() { flat[from] } else { 0.0f32 };
+    }
+}
+
+/// Sums of the groups' gradients, in the order of the groups.
+#[cube(launch)]
+pub(super) fn reduce(
+    partial: &[f32],
+    map: &[u32],
+    count: &[u32],
+    flat: &mut [f32],
+    size: u32,
+    #[comptime] summing: usize,
+) {
+    let i = ABSOLUTE_POS;
+    if i < flat.len() {
+        let tiles = (count[0] as usize).div_ceil(TILE);
+        let mut sum = 0.0f32;
+        for group in 0..min(tiles, summing) {
+            sum += partial[group * size as usize + map[i] as usize];
+        }
+        flat[i] = sum;
+    }
+}
+
+/// Writes the inputs of the geometry network to a tile.
+#[cube]
+fn geometry_inputs(
+    a: &mut [F4],
+    value: &[F4],
+    x: &[F4],
+    inv_radius: f32,
+    plane: usize,
+    here: usize,
+    row: usize,
+    column: usize,
+    #[comptime] features: usize,
+) {
+    for j in 0..4usize {
+        let c = column + 16 * j;
+        let mut v = F4::new(0.0f32);
+        if c < features {
+            v = value[c * plane + here];
+        } else if c < features + 3 {
+            v = x[(c - features) * plane + here] * F4::new(inv_radius);
+        }
+        a[at(c, row)] = v;
+    }
+}
+
+/// v / ‖v‖ and ‖v‖, as the CPU takes them.
+#[derive(CubeType)]
+struct Unit {
+    x: F4,
+    y: F4,
+    z: F4,
+    length: F4,
+}
+
+#[cube]
+fn unit(x: F4, y: F4, z: F4) -> Unit {
+    let length = max((x * x + y * y + z * z).sqrt(), F4::new(1e-12f32));
+    Unit { x: x / length, y: y / length, z: z / length, length }
+}
+
+/// Writes the inputs of the color network to a tile, after a thread's own output `o` of the geometry network and, for
+/// the one that writes it, the normal.
+#[cube]
+fn color_inputs(
+    a: &mut [F4],
+    o: F4,
+    normal: &Unit,
+    direction: &[F4],
+    value: &[F4],
+    plane: usize,
+    here: usize,
+    row: usize,
+    column: usize,
+    #[comptime] plan: Plan,
+) {
+    if column < OUTPUTS {
+        a[at(column, row)] = o;
+    }
+    if column == 13 {
+        let (x, y, z) = (direction[here], direction[plane + here], direction[2 * plane + here]);
+        harmonics(a, x, y, z, row);
+    }
+    if column == 14 {
+        a[at(NORMAL, row)] = normal.x;
+        a[at(NORMAL + 1, row)] = normal.y;
+        a[at(NORMAL + 2, row)] = normal.z;
+    }
+    if comptime!(plan.color > COLOR_INPUTS) {
+        for j in 0..2usize {
+            let c = column + 16 * j;
+            if c < comptime!(plan.color - COLOR_INPUTS) {
+                let mut v = F4::new(0.0f32);
+                if c < comptime!(plan.features) {
+                    v = value[c * plane + here];
+                }
+                a[at(COLOR_INPUTS + c, row)] = v;
+            }
+        }
+    }
+}
+
+/// [`crate::kernel::sphharm::sh16`].
+#[cube]
+fn harmonics(a: &mut [F4], x: F4, y: F4, z: F4, row: usize) {
+    let (xy, yz, xz) = (x * y, y * z, x * z);
+    let (x2, y2, z2) = (x * x, y * y, z * z);
+    let one = F4::new(1.0f32);
+    let five = one - F4::new(5.0f32) * z2;
+    a[at(13, row)] = F4::new(0.282_094_79f32);
+    a[at(14, row)] = y * F4::new(-0.488_602_51f32);
+    a[at(15, row)] = z * F4::new(0.488_602_51f32);
+    a[at(16, row)] = x * F4::new(-0.488_602_51f32);
+    a[at(17, row)] = xy * F4::new(1.092_548_4f32);
+    a[at(18, row)] = yz * F4::new(-1.092_548_4f32);
+    a[at(19, row)] = z2 * F4::new(0.946_174_7f32) - F4::new(0.315_391_57f32);
+    a[at(20, row)] = xz * F4::new(-1.092_548_4f32);
+    a[at(21, row)] = (x2 - y2) * F4::new(0.546_274_2f32);
+    a[at(22, row)] = y * (y2 - x2 * F4::new(3.0f32)) * F4::new(0.590_043_6f32);
+    a[at(23, row)] = xy * z * F4::new(2.890_611_4f32);
+    a[at(24, row)] = y * five * F4::new(0.457_045_8f32);
+    a[at(25, row)] = z * (F4::new(5.0f32) * z2 - F4::new(3.0f32)) * F4::new(0.373_176_34f32);
+    a[at(26, row)] = x * five * F4::new(0.457_045_8f32);
+    a[at(27, row)] = z * (x2 - y2) * F4::new(1.445_305_7f32);
+    a[at(28, row)] = x * (y2 * F4::new(3.0f32) - x2) * F4::new(0.590_043_6f32);
+}
+
+/// Writes sdf, ∇sdf, color and local sharpness, planes `[8, capacity]`, and what the backward needs.
+#[cube(launch_unchecked)]
+pub(super) fn forward(
+    w: &[F4],
+    value: &[F4],
+    jacobian: &[F4],
+    x: &[F4],
+    direction: &[F4],
+    count: &[u32],
+    q: &mut [F4],
+    h: &mut [F4],
+    o: &mut [F4],
+    c1: &mut [F4],
+    c2: &mut [F4],
+    out: &mut [F4],
+    inv_radius: f32,
+    soften: f32,
+    #[comptime] plan: Plan,
+) {
+    let rows = comptime!(plan.rows());
+    let features = comptime!(plan.features);
+    let plane = x.len() / 3;
+    let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
+    let tile = CUBE_POS;
+    let here = tile * LANES + row;
+    let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    if tile * TILE < count[0] as usize {
+        geometry_inputs(&mut a, value, x, inv_radius, plane, here, row, column, features);
+        sync_cube();
+        let z = product(&a, 0usize, w, comptime!(rows[0]), comptime!(plan.padded), row, column);
+        let active = tile::activate(&z, w[comptime!(rows[2] * LANES) + column]);
+        save(h, &active.h, plane, here, column, HIDDEN);
+        put(&mut b, &active.h, row, column);
+        sync_cube();
+        let own =
+            narrow(&b, w, comptime!(rows[3]), row, column, OUTPUTS) + w[comptime!(rows[4] * LANES) + column];
+        if column < OUTPUTS {
+            o[column * plane + here] = own;
+        }
+        let weighted = tile::weighted(&active.s, w[comptime!(rows[3] * LANES) + column]);
+        put(&mut a, &weighted, row, column);
+        sync_cube();
+        // q = a W1, and this thread's share of n = q_x + Jᵀ q_F
+        let own_q = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column);
+        save(q, &own_q, plane, here, column, features);
+        #[unroll]
+        for axis in 0..3usize {
+            let mut sum = F4::new(0.0f32);
+            #[unroll]
+            for j in 0..4usize {
+                let c = 4 * column + j;
+                let v = own_q.channel(j);
+                if c < features {
+                    sum += jacobian[(3 * c + axis) * plane + here] * v;
+                } else if c == features + axis {
+                    sum += v * F4::new(inv_radius);
+                }
+            }
+            b[at(16 * axis + column, row)] = sum;
+        }
+        sync_cube();
+        let mut nx = F4::new(0.0f32);
+        let mut ny = F4::new(0.0f32);
+        let mut nz = F4::new(0.0f32);
+        if column == 14 {
+            for c in 0..16usize {
+                nx += b[at(c, row)];
+                ny += b[at(16 + c, row)];
+                nz += b[at(32 + c, row)];
+            }
+            out[plane + here] = nx;
+            out[2 * plane + here] = ny;
+            out[3 * plane + here] = nz;
+        }
+        color_inputs(&mut a, own, &unit(nx, ny, nz), direction, value, plane, here, row, column, plan);
+        if column == 0 {
+            out[here] = own;
+        }
+        if column == SOFTNESS {
+            out[7 * plane + here] = sigmoid(own - F4::new(2.0f32)) * F4::new(-soften);
+        }
+        sync_cube();
+        let first =
+            tile::relu(&product(&a, 0usize, w, comptime!(rows[5]), comptime!(plan.color), row, column));
+        save(c1, &first, plane, here, column, HIDDEN);
+        put(&mut b, &first, row, column);
+        sync_cube();
+        let second = tile::relu(&product(&b, 0usize, w, comptime!(rows[7]), HIDDEN, row, column));
+        save(c2, &second, plane, here, column, HIDDEN);
+        put(&mut a, &second, row, column);
+        sync_cube();
+        let rgb = narrow(&a, w, comptime!(rows[9]), row, column, 3usize);
+        if column < 3 {
+            out[(4 + column) * plane + here] = sigmoid(rgb);
+        }
+    }
+}
+
+/// Samples from `samples` on count nothing.
+#[cube]
+fn masked(v: F4, first: usize, samples: usize) -> F4 {
+    let mut own = v;
+    #[unroll]
+    for i in 0..4usize {
+        if first + i >= samples {
+            own.insert(i, 0.0f32);
+        }
+    }
+    own
+}
+
+/// Backward of the color network: gradients of the geometry network's outputs and of the normal by sample, of the
+/// features that the color network reads itself, and of the weights by group.
+#[cube(launch_unchecked)]
+pub(super) fn color_backward(
+    w: &[F4],
+    value: &[F4],
+    direction: &[F4],
+    count: &[u32],
+    o: &[F4],
+    c1: &[F4],
+    c2: &[F4],
+    out: &[F4],
+    g_out: &[F4],
+    g_o: &mut [F4],
+    g_normal: &mut [F4],
+    g_value: &mut [F4],
+    partial: &mut [f32],
+    soften: f32,
+    #[comptime] plan: Plan,
+) {
+    let rows = comptime!(plan.rows());
+    let own = comptime!(plan.gradients());
+    let plane = direction.len() / 3;
+    let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
+    let samples = count[0] as usize;
+    let group = CUBE_POS;
+    let sum = group * comptime!(own[7] * CHANNELS);
+    let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
+        let here = tile * LANES + row;
+        let first = 4 * here;
+        let fresh = tile == group;
+        if column < 3 {
+            let y = out[(4 + column) * plane + here];
+            let g = masked(g_out[(4 + column) * plane + here], first, samples);
+            a[at(column, row)] = g * y * (F4::new(1.0f32) - y);
+        }
+        load(&mut b, c2, plane, here, row, column);
+        sync_cube();
+        let start = sum + comptime!(own[6] * CHANNELS);
+        outer(&a, 0usize, &b, 3usize, HIDDEN, partial, start, fresh, row, column);
+        let g_c2 = gate(&product(&a, 0usize, w, comptime!(rows[9]), 3usize, row, column), &b, row, column);
+        sync_cube();
+        put(&mut a, &g_c2, row, column);
+        load(&mut b, c1, plane, here, row, column);
+        sync_cube();
+        let start = sum + comptime!(own[5] * CHANNELS);
+        outer(&a, 0usize, &b, HIDDEN, HIDDEN, partial, start, fresh, row, column);
+        let g_c1 = gate(&product(&a, 0usize, w, comptime!(rows[8]), HIDDEN, row, column), &b, row, column);
+        sync_cube();
+        put(&mut a, &g_c1, row, column);
+        let n = unit(out[plane + here], out[2 * plane + here], out[3 * plane + here]);
+        let mut output = F4::new(0.0f32);
+        if column < OUTPUTS {
+            output = o[column * plane + here];
+        }
+        color_inputs(&mut b, output, &n, direction, value, plane, here, row, column, plan);
+        sync_cube();
+        let start = sum + comptime!(own[4] * CHANNELS);
+        outer(&a, 0usize, &b, HIDDEN, comptime!(plan.color), partial, start, fresh, row, column);
+        let g_c0 = product(&a, 0usize, w, comptime!(rows[6]), HIDDEN, row, column);
+        sync_cube();
+        put(&mut a, &g_c0, row, column);
+        sync_cube();
+        if column < OUTPUTS {
+            let mut g = a[at(column, row)];
+            if column == 0 {
+                g += masked(g_out[here], first, samples);
+            }
+            if column == SOFTNESS && soften > 0.0f32 {
+                // through −L σ: its slope is y (1 + y / L)
+                let y = out[7 * plane + here];
+                let own = masked(g_out[7 * plane + here], first, samples);
+                g += own * y * (F4::new(1.0f32) + y / F4::new(soften));
+            }
+            g_o[column * plane + here] = g;
+        }
+        if column == 14 {
+            // through n̂ = n / ‖n‖ too: (g − n̂ (n̂ · g)) / ‖n‖
+            let (gx, gy, gz) = (a[at(NORMAL, row)], a[at(NORMAL + 1, row)], a[at(NORMAL + 2, row)]);
+            let along = n.x * gx + n.y * gy + n.z * gz;
+            let zero = F4::new(0.0f32);
+            let one = F4::new(1.0f32);
+            let share = select_many(n.length.greater_than(&F4::new(SHORTEST)), one / n.length, zero);
+            g_normal[here] = masked(g_out[plane + here], first, samples) + (gx - n.x * along) * share;
+            g_normal[plane + here] =
+                masked(g_out[2 * plane + here], first, samples) + (gy - n.y * along) * share;
+            g_normal[2 * plane + here] =
+                masked(g_out[3 * plane + here], first, samples) + (gz - n.z * along) * share;
+        }
+        if comptime!(plan.skip) {
+            for j in 0..2usize {
+                let c = column + 16 * j;
+                if c < comptime!(plan.features) {
+                    g_value[c * plane + here] = a[at(COLOR_INPUTS + c, row)];
+                }
+            }
+        }
+        sync_cube();
+    }
+}
+
+/// Backward of the geometry network, both orders: gradients of the features by sample, and of the weights by group.
+#[cube(launch_unchecked)]
+pub(super) fn geometry_backward(
+    w: &[F4],
+    value: &[F4],
+    jacobian: &[F4],
+    x: &[F4],
+    count: &[u32],
+    h: &[F4],
+    g_o: &[F4],
+    g_normal: &[F4],
+    g_value: &mut [F4],
+    partial: &mut [f32],
+    inv_radius: f32,
+    #[comptime] plan: Plan,
+) {
+    let rows = comptime!(plan.rows());
+    let own = comptime!(plan.gradients());
+    let features = comptime!(plan.features);
+    let padded = comptime!(plan.padded);
+    let plane = x.len() / 3;
+    let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
+    let group = CUBE_POS;
+    let sum = group * comptime!(own[7] * CHANNELS);
+    let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    for tile in range_stepped(group, (count[0] as usize).div_ceil(TILE), CUBE_COUNT) {
+        let here = tile * LANES + row;
+        let fresh = tile == group;
+        // g_q in the first channels, g_o behind them
+        for j in 0..4usize {
+            let c = column + 16 * j;
+            let mut v = F4::new(0.0f32);
+            if c < features {
+                for axis in 0..3usize {
+                    v += jacobian[(3 * c + axis) * plane + here] * g_normal[axis * plane + here];
+                }
+            } else if c < features + 3 {
+                v = g_normal[(c - features) * plane + here] * F4::new(inv_radius);
+            } else if c >= padded && c < padded + OUTPUTS {
+                v = g_o[(c - padded) * plane + here];
+            }
+            b[at(c, row)] = v;
+        }
+        load(&mut a, h, plane, here, row, column);
+        sync_cube();
+        let g_a = product(&b, 0usize, w, comptime!(rows[0]), padded, row, column);
+        let from_o = product(&b, padded, w, comptime!(rows[3]), OUTPUTS, row, column);
+        let w0 = w[comptime!(rows[3] * LANES) + column];
+        let s = tile::slope(&tile::take(&a, row, column));
+        let start = sum + comptime!(own[2] * CHANNELS);
+        outer(&b, padded, &a, OUTPUTS, HIDDEN, partial, start, fresh, row, column);
+        sums(&b, padded, OUTPUTS, partial, sum + comptime!(own[3] * CHANNELS), fresh, row, column);
+        sync_cube();
+        put(&mut a, &tile::times(&g_a, &s), row, column);
+        sync_cube();
+        sums(&a, 0usize, HIDDEN, partial, start, false, row, column);
+        sync_cube();
+        put(&mut a, &tile::weighted(&s, w0), row, column);
+        sync_cube();
+        outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, fresh, row, column);
+        sync_cube();
+        put(&mut a, &tile::curved(&s, &from_o, &g_a, w0), row, column);
+        geometry_inputs(&mut b, value, x, inv_radius, plane, here, row, column, features);
+        sync_cube();
+        outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, false, row, column);
+        sums(&a, 0usize, HIDDEN, partial, sum + comptime!(own[1] * CHANNELS), fresh, row, column);
+        let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column);
+        #[unroll]
+        for j in 0..4usize {
+            let c = 4 * column + j;
+            if c < features {
+                let i = c * plane + here;
+                if comptime!(plan.skip) {
+                    g_value[i] += g_u.channel(j);
+                } else {
+                    g_value[i] = g_u.channel(j);
+                }
+            }
+        }
+        sync_cube();
+    }
+}

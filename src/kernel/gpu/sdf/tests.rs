@@ -1,0 +1,116 @@
+use super::super::device::tests::{agree, device, devices, planes};
+use super::*;
+use crate::kernel::mlp::Weights;
+use crate::kernel::{hash, rng, sdf};
+
+const SAMPLES: usize = 1000;
+const CAPACITY: usize = 1088; // one tile more than there are samples for
+
+/// A field with lively weights, samples in its box seen from anywhere, and gradients of its output. Positions and
+/// scales have few digits, so that the cells of all samples are found alike.
+struct Case {
+    shape: FieldShape,
+    table: Vec<[f32; 2]>,
+    flat: Vec<f32>,
+    x: Vec<[f32; 3]>,
+    direction: Vec<[f32; 3]>,
+    g_out: Vec<[f32; WIDTH]>,
+}
+
+fn case(levels: usize, color_skip: bool, active: usize) -> Case {
+    let mut levels = hash::levels(levels, 4, 1.4, 10);
+    levels.iter_mut().for_each(|l| l.scale = l.scale.round());
+    let soften = if color_skip { 1.5 } else { 0.0 };
+    let shape = FieldShape { levels, radius: 2.0, active, color_skip, soften };
+    let normal = |stream: u64, i: usize| rng::normal(7, stream, i as u64);
+    let table = (0..hash::entries(&shape.levels)).map(|i| [normal(1, 2 * i), normal(1, 2 * i + 1)]);
+    let at = |i: usize| rng::below(7, 2, i as u64, 1025) as f32 / 256.0 - 2.0;
+    let unit = |v: [f32; 3]| {
+        let length = v.iter().map(|c| c * c).sum::<f32>().sqrt();
+        v.map(|c| c / length)
+    };
+    Case {
+        table: table.map(|e| e.map(|v| 0.3 * v)).collect(),
+        flat: (0..shape.layout().len()).map(|i| 0.12 * normal(3, i)).collect(),
+        x: (0..SAMPLES).map(|i| [at(3 * i), at(3 * i + 1), at(3 * i + 2)]).collect(),
+        direction: (0..SAMPLES).map(|i| unit([0, 1, 2].map(|k| normal(4, 3 * i + k)))).collect(),
+        g_out: (0..SAMPLES).map(|i| std::array::from_fn(|k| normal(5, WIDTH * i + k))).collect(),
+        shape,
+    }
+}
+
+#[test]
+fn the_field_and_its_gradients_are_those_of_the_cpu() {
+    for (levels, skip, active) in [(16, false, 16), (5, true, 4)] {
+        let Case { shape, table, flat, x, direction, g_out } = case(levels, skip, active);
+        let weights = Weights::new(shape.layout(), &flat);
+        let a = sdf::forward(&shape, &table, &weights, &x, &direction);
+        let mut g_table = vec![[0f32; 2]; table.len()];
+        let g_flat = sdf::backward(&a, &weights, g_out.as_flattened(), &mut g_table);
+        for device in devices() {
+            let name = |what: &str| format!("{what}, {levels} levels, skip {skip}, {:?}", device.atomics());
+            let mut on = Sdf::new(&device, &shape, CAPACITY);
+            on.activate(active);
+            let [x, direction] = [&x, &direction].map(|v| device.upload(&planes(v, CAPACITY)));
+            let (table, flat) = (device.upload(&table), device.upload(&flat));
+            let count = device.upload(&[SAMPLES as u32]);
+            let out = device.read::<f32>(on.forward(&device, &table, &flat, &x, &direction, &count));
+            let rows: &[[f32; WIDTH]] = a.output().as_chunks().0;
+            for k in 0..WIDTH {
+                let want: Vec<f32> = rows.iter().map(|r| r[k]).collect();
+                agree(&name(&format!("output {k}")), &out[k * CAPACITY..][..SAMPLES], &want, 1e-4);
+            }
+            let mut g_planes = planes(&g_out, CAPACITY);
+            // behind the last sample nothing counts
+            (0..WIDTH).for_each(|k| g_planes[k * CAPACITY + SAMPLES] = f32::NAN);
+            let got_table = device.zeros(2 * g_table.len());
+            let got_flat = device.zeros(g_flat.len());
+            on.backward(&device, &x, &direction, &count, &device.upload(&g_planes), &got_table, &got_flat);
+            let mut start = 0;
+            for (o, i) in shape.layout().shapes() {
+                let span = start..start + o * i;
+                start += o * i;
+                agree(&name("weights"), &device.read::<f32>(&got_flat)[span.clone()], &g_flat[span], 1e-4);
+            }
+            agree(&name("table"), &device.read::<f32>(&got_table), g_table.as_flattened(), 1e-4);
+        }
+    }
+}
+
+#[test]
+fn the_gradients_agree_with_f64_finite_differences_second_order_included() {
+    for skip in [false, true] {
+        let Some(device) = device() else { return };
+        sdf::tests::backward_agrees(skip, |case| {
+            let capacity = case.x.len().next_multiple_of(TILE);
+            let on = Sdf::new(&device, case.shape, capacity);
+            let [x, direction] = [case.x, case.direction].map(|v| device.upload(&planes(v, capacity)));
+            let (table, flat) = (device.upload(case.table), device.upload(case.flat));
+            let count = device.upload(&[case.x.len() as u32]);
+            on.forward(&device, &table, &flat, &x, &direction, &count);
+            let g_out = device.upload(&planes(case.g_out.as_chunks::<WIDTH>().0, capacity));
+            let g_table = device.zeros(2 * case.table.len());
+            let g_flat = device.zeros(case.flat.len());
+            on.backward(&device, &x, &direction, &count, &g_out, &g_table, &g_flat);
+            (device.read(&g_flat), device.read::<f32>(&g_table).as_chunks().0.to_vec())
+        });
+    }
+}
+
+#[test]
+fn no_samples_give_no_gradient() {
+    let Some(device) = device() else { return };
+    let Case { shape, table, flat, x, direction, g_out } = case(5, false, 5);
+    let on = Sdf::new(&device, &shape, CAPACITY);
+    let [x, direction] = [&x, &direction].map(|v| device.upload(&planes(v, CAPACITY)));
+    let (entries, floats) = (table.len(), flat.len());
+    let (table, flat, count) = (device.upload(&table), device.upload(&flat), device.upload(&[0u32]));
+    on.forward(&device, &table, &flat, &x, &direction, &count);
+    let (g_table, g_flat) = (device.zeros(2 * entries), device.upload(&vec![1f32; floats]));
+    let g_out = device.upload(&planes(&g_out, CAPACITY));
+    on.backward(&device, &x, &direction, &count, &g_out, &g_table, &g_flat);
+    let zero = |b: &Buffer| device.read::<f32>(b).iter().all(|&v| v == 0.0);
+    assert!(zero(&g_table) && zero(&g_flat));
+    let (launches, readbacks) = device.counts();
+    println!("{launches} launches and {readbacks} readbacks of a field, forward and backward");
+}
