@@ -7,6 +7,8 @@ use super::background;
 use crate::config::iface::Foreground;
 use crate::geom::Camera;
 use crate::image::{Gray, Photo};
+#[cfg(feature = "wgpu")]
+use crate::kernel::gpu;
 use crate::kernel::march::MarchRay;
 use crate::kernel::rng;
 use glam::Vec2;
@@ -116,6 +118,42 @@ impl<'a> Pixels<'a> {
             batch.alpha.push(alpha);
         }
         batch
+    }
+
+    /// Copies the photographs to a device, where the same rays are drawn from them.
+    #[cfg(feature = "wgpu")]
+    pub fn on_device(&self, device: &gpu::Device, jitter: bool, background: bool) -> gpu::Photographs {
+        let drawing = gpu::Drawing { every: self.published, jitter, background };
+        let views: Vec<gpu::DrawnView> =
+            (0..self.views.len()).into_par_iter().map(|v| self.drawn(v)).collect();
+        gpu::Photographs::new(device, &views, self.radius, drawing)
+    }
+
+    /// The drawable part of a view, packed.
+    #[cfg(feature = "wgpu")]
+    fn drawn(&self, v: usize) -> gpu::DrawnView {
+        let view = &self.views[v];
+        let over_black = &self.over_black[v];
+        let (x0, y0, x1, y1, bits) = &self.drawable[v];
+        let [x, y, width, height] = if x0 > x1 { [0; 4] } else { [*x0, *y0, x1 - x0 + 1, y1 - y0 + 1] };
+        let mut pixels = Vec::with_capacity((width * height) as usize);
+        let mut drawable = vec![0u32; (width * height).div_ceil(32) as usize];
+        for row in y..y + height {
+            let first = row as usize * view.photo.width as usize;
+            for p in first + x as usize..first + (x + width) as usize {
+                let [r, g, b] = over_black.get(p).copied().unwrap_or(view.photo.rgb[p]);
+                let alpha = view.mask.as_ref().map_or(255, |m| m.values[p]);
+                drawable[pixels.len() / 32] |= ((bits[p >> 6] >> (p & 63) & 1) as u32) << (pixels.len() % 32);
+                pixels.push(u32::from_le_bytes([r, g, b, alpha]));
+            }
+        }
+        gpu::DrawnView {
+            camera: view.camera.clone(),
+            part: [x, y, width, height],
+            pixels,
+            over_black: !over_black.is_empty(),
+            drawable,
+        }
     }
 
     fn draw_one(&self, seed: u64, step: u64, i: u64, jitter: bool) -> Option<(MarchRay, [f32; 3], f32)> {
@@ -277,5 +315,65 @@ mod tests {
         // one pixel of 200 is head
         let head = batch.alpha.iter().filter(|&&a| a > 0.0).count();
         assert!((2..25).contains(&head), "{head}");
+    }
+
+    #[cfg(feature = "wgpu")]
+    #[test]
+    fn a_device_draws_the_same_rays() {
+        use crate::geom::{Distortion, Projection};
+        use crate::kernel::gpu::tests::{agree, device, planes};
+        let Some(device) = device() else { return };
+        let bent = |distortion: Distortion| {
+            let mut view = view();
+            view.camera.distortion = distortion;
+            view.camera.rotation = glam::DMat3::from_rotation_y(0.4) * glam::DMat3::from_rotation_x(-0.2);
+            view.mask.as_mut().unwrap().values.iter_mut().enumerate().for_each(|(i, v)| *v = 40 + i as u8);
+            view.valid =
+                Some(Gray { width: 20, height: 10, values: (0..200).map(|i| (i % 7 > 1) as u8).collect() });
+            view
+        };
+        let perspective = Distortion {
+            k1: -0.2,
+            k2: 0.05,
+            k4: 0.1,
+            p1: 0.01,
+            p2: -0.02,
+            sx1: 0.003,
+            ..Distortion::default()
+        };
+        let fisheye = Distortion { k1: 0.02, k4: -0.01, projection: Projection::Fisheye, ..perspective };
+        let fov = Distortion { omega: 0.9, projection: Projection::Fov, ..Distortion::default() };
+        let empty = TrainView { mask: None, ..view() };
+        let views = [view(), bent(perspective), empty, bent(fisheye), bent(fov)];
+        for (foreground, published) in [(Foreground::Estimated, false), (Foreground::Photo, true)] {
+            let pixels = Pixels::new(&views, 0.1, 0.3, foreground, published);
+            let there = pixels.on_device(&device, !published, true);
+            let batch = gpu::Batch::new(&device, 2050);
+            let (seed, step) = (77, 1 << 33);
+            there.draw(&device, (seed, step), &device.upload(&[2000u32]), &batch);
+            let want = pixels.draw(seed, step, 2000, !published);
+            let alive = device.read::<u32>(&batch.alive);
+            assert!(alive[2000..].iter().all(|&a| a == 0));
+            let kept: Vec<usize> = (0..2050).filter(|&r| alive[r] == 1).collect();
+            // published: pixels that are not valid leave a gap
+            assert_eq!((kept.len(), kept.len() < 2000), (want.rays.len(), published));
+            let take = |buffer: &gpu::Buffer, planes: usize| -> Vec<f32> {
+                let all = device.read::<f32>(buffer);
+                (0..planes)
+                    .flat_map(|k| kept.iter().map(move |r| (k, *r)))
+                    .map(|(k, r)| all[k * 2050 + r])
+                    .collect()
+            };
+            let n = want.rays.len();
+            let turned =
+                |f: fn(&MarchRay) -> [f32; 3]| planes(&want.rays.iter().map(f).collect::<Vec<_>>(), n);
+            agree("drawn origins", &take(&batch.origin, 3), &turned(|r| r.origin), 1e-6);
+            agree("drawn directions", &take(&batch.direction, 3), &turned(|r| r.direction), 1e-5);
+            agree("drawn colors", &take(&batch.color, 3), &planes(&want.color, n), 1e-6);
+            assert_eq!(take(&batch.alpha, 1), want.alpha);
+            assert_eq!(take(&batch.jitter, 1), want.rays.iter().map(|r| r.jitter).collect::<Vec<_>>());
+            let behind = device.read::<f32>(&batch.background);
+            assert_eq!(behind[2050 + 9], rng::uniform(seed, step << 4 | 3, 3 * 9 + 1));
+        }
     }
 }

@@ -6,8 +6,13 @@
 /// 64 random bits for a draw.
 #[inline]
 pub fn bits(seed: u64, stream: u64, index: u64) -> u64 {
-    mix(mix(mix(seed ^ 0x9e37_79b9_7f4a_7c15) ^ stream)
-        .wrapping_add(index.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
+    mix(of_stream(seed, stream).wrapping_add(index.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
+}
+
+/// What all draws of a stream share.
+#[inline]
+pub(crate) fn of_stream(seed: u64, stream: u64) -> u64 {
+    mix(mix(seed ^ 0x9e37_79b9_7f4a_7c15) ^ stream)
 }
 
 /// SplitMix64's finalizer: words that look random, the same every time.

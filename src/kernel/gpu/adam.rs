@@ -12,6 +12,8 @@ fn adam_kernel(
     m: &mut [f32],
     v: &mut [f32],
     g: &mut [f32],
+    count: &[u32],
+    broken: &[u32],
     lr: f32,
     beta1: f32,
     beta2: f32,
@@ -22,7 +24,7 @@ fn adam_kernel(
     #[comptime] skip_zero: bool,
 ) {
     let i = ABSOLUTE_POS;
-    if i < p.len() {
+    if i < p.len() && count[0] > 0 && broken[0] == 0 {
         let own = g[i];
         if !skip_zero || own != 0.0f32 {
             let m1 = fma(beta1, m[i], (1.0f32 - beta1) * own);
@@ -35,8 +37,17 @@ fn adam_kernel(
     }
 }
 
+/// Whether there is anything to step along.
+#[derive(Clone, Copy)]
+pub struct Gate<'a> {
+    /// `[1]` or more: how many samples there were; none: nothing is updated.
+    pub count: &'a Buffer,
+    /// `[1]`: not 0 once a gradient was not finite; nothing is updated from then on.
+    pub broken: &'a Buffer,
+}
+
 /// One AdamW step in place, all four `[n]`; the gradient is left zero.
-pub fn adam(device: &Device, p: &Buffer, m: &Buffer, v: &Buffer, g: &Buffer, step: &AdamStep) {
+pub fn adam(device: &Device, [p, m, v]: [&Buffer; 3], g: &Buffer, step: &AdamStep, gate: Gate) {
     assert!([m, v, g].iter().all(|b| b.words() == p.words()));
     let correction = |beta: f32| (1.0 / (1.0 - (beta as f64).powf(step.step as f64))) as f32;
     adam_kernel::launch(
@@ -47,6 +58,8 @@ pub fn adam(device: &Device, p: &Buffer, m: &Buffer, v: &Buffer, g: &Buffer, ste
         m.arg(),
         v.arg(),
         g.arg(),
+        gate.count.arg(),
+        gate.broken.arg(),
         step.lr,
         step.beta1,
         step.beta2,
@@ -87,7 +100,13 @@ mod tests {
                 let size = |i: u64| 10f32.powi(i as i32 % 12 - 8) * rng::normal(2, k, i);
                 let mut g: Vec<f32> = (0..n).map(|i| if (i + k) % 3 == 0 { 0.0 } else { size(i) }).collect();
                 let own = device.upload(&g);
-                super::adam(&device, &there[0], &there[1], &there[2], &own, &step);
+                let [p_there, m_there, v_there] = &there;
+                for (count, broken) in [(0, 0), (7, 1), (7, 0)] {
+                    // without samples, and behind a broken gradient, nothing happens
+                    let (count, broken) = (device.upload::<u32>(&[count]), device.upload::<u32>(&[broken]));
+                    let gate = Gate { count: &count, broken: &broken };
+                    super::adam(&device, [p_there, m_there, v_there], &own, &step, gate);
+                }
                 adam::adam(&mut p, &mut m, &mut v, &mut g, &step);
                 assert_eq!(device.read::<f32>(&own), g);
             }

@@ -135,7 +135,7 @@ pub(super) fn groups(count: usize) -> CubeCount {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(crate) mod tests {
     use super::*;
 
     /// A device to test on, a software one too; without any, says so.

@@ -10,6 +10,7 @@
 //! ```
 
 use super::device::{Buffer, Device, groups};
+use super::draw::Batch;
 use super::neus::RAY_WIDTH;
 use cubecl::prelude::*;
 
@@ -19,6 +20,8 @@ const UNITS: u32 = 256;
 const RAY_TERMS: usize = 4;
 /// Terms of a sample: eikonal, sparsity.
 const SAMPLE_TERMS: usize = 2;
+/// All of them, and that of points.
+pub(super) const TERMS: usize = RAY_TERMS + SAMPLE_TERMS + 1;
 
 /// Weights of the terms; β of the last.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -39,30 +42,37 @@ pub struct LossWeights {
     pub sparsity_scale: f32,
 }
 
-/// How many rays met a sample, and how many are all head. One group of threads.
+/// How many rays met a sample, how many are all head, and how many there are. One group of threads.
 #[cube(launch)]
-fn tally(offsets: &[u32], alpha: &[f32], out: &mut [u32]) {
+fn tally(offsets: &[u32], alpha: &[f32], alive: &[u32], out: &mut [u32]) {
     let unit = UNIT_POS as usize;
     let mut met = 0u32;
     let mut heads = 0u32;
+    let mut rays = 0u32;
     for r in range_stepped(unit, alpha.len(), UNITS as usize) {
+        rays += alive[r];
         met += select(offsets[r + 1] > offsets[r], 1u32, 0u32);
-        heads += select(alpha[r] > 0.999f32, 1u32, 0u32);
+        heads += select(alpha[r] > 0.999f32, alive[r], 0u32);
     }
     let mut mets = Shared::<[u32]>::new_slice(UNITS as usize);
+    let mut full = Shared::<[u32]>::new_slice(UNITS as usize);
     let mut all = Shared::<[u32]>::new_slice(UNITS as usize);
     mets[unit] = met;
-    all[unit] = heads;
+    full[unit] = heads;
+    all[unit] = rays;
     sync_cube();
     if unit == 0 {
         met = 0;
         heads = 0;
+        rays = 0;
         for i in 0..UNITS as usize {
             met += mets[i];
-            heads += all[i];
+            heads += full[i];
+            rays += all[i];
         }
         out[0] = met;
         out[1] = heads;
+        out[2] = rays;
     }
 }
 
@@ -73,6 +83,7 @@ fn of_rays(
     color: &[f32],
     alpha: &[f32],
     background: &[f32],
+    alive: &[u32],
     offsets: &[u32],
     tally: &[u32],
     g_out: &mut [f32],
@@ -86,9 +97,10 @@ fn of_rays(
     let r = ABSOLUTE_POS;
     if r < rays {
         let (opacity, a) = (composed[3 * rays + r], alpha[r]);
+        let there = f32::cast_from(alive[r]);
         let met = select(offsets[r + 1] > offsets[r], 1.0f32, 0.0f32);
         let share = met / (3.0f32 * max(f32::cast_from(tally[0]), 1.0f32));
-        let head = select(a > 0.999f32, 1.0f32, 0.0f32) / (3.0f32 * max(f32::cast_from(tally[1]), 1.0f32));
+        let head = select(a > 0.999f32, there, 0.0f32) / (3.0f32 * max(f32::cast_from(tally[1]), 1.0f32));
         let mut square = 0.0f32;
         let mut absolute = 0.0f32;
         let mut own = composed[8 * rays + r];
@@ -105,7 +117,7 @@ fn of_rays(
             g_opacity += h * h * rgb_sample * head - b * g;
         }
         let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
-        let even = 1.0f32 / f32::cast_from(rays);
+        let even = there / max(f32::cast_from(tally[2]), 1.0f32);
         let cross = -(a * p.ln() + (1.0f32 - a) * (1.0f32 - p).ln()) * even;
         let by_p = ((1.0f32 - a) / (1.0f32 - p) - a / p) * even * mask;
         g_out[3 * rays + r] = g_opacity + select(p == opacity, by_p, 0.0f32);
@@ -153,7 +165,7 @@ fn of_samples(
 
 /// Sums of the terms, in a fixed order. One group of threads a term.
 #[cube(launch)]
-fn sum(of_rays: &[f32], of_samples: &[f32], count: &[u32], out: &mut [f32]) {
+fn sum(of_rays: &[f32], of_samples: &[f32], of_points: &[f32], count: &[u32], out: &mut [f32]) {
     let unit = UNIT_POS as usize;
     let term = CUBE_POS_X as usize;
     let mut own = 0.0f32;
@@ -161,6 +173,10 @@ fn sum(of_rays: &[f32], of_samples: &[f32], count: &[u32], out: &mut [f32]) {
         let rays = of_rays.len() / RAY_TERMS;
         for r in range_stepped(unit, rays, UNITS as usize) {
             own += of_rays[term * rays + r];
+        }
+    } else if term == RAY_TERMS + SAMPLE_TERMS {
+        for p in range_stepped(unit, of_points.len(), UNITS as usize) {
+            own += of_points[p];
         }
     } else {
         let plane = of_samples.len() / SAMPLE_TERMS;
@@ -180,17 +196,6 @@ fn sum(of_rays: &[f32], of_samples: &[f32], count: &[u32], out: &mut [f32]) {
     }
 }
 
-/// What pixels say about a batch of rays.
-#[derive(Clone, Copy)]
-pub struct Targets<'a> {
-    /// Planes `[3, rays]`, head over black.
-    pub color: &'a Buffer,
-    /// `[rays]`, 1 where there is no mask.
-    pub alpha: &'a Buffer,
-    /// Planes `[3, rays]`, what both are seen over.
-    pub background: &'a Buffer,
-}
-
 /// The losses of up to so many rays and samples.
 pub struct Losses {
     weights: LossWeights,
@@ -206,28 +211,30 @@ impl Losses {
     pub fn new(device: &Device, weights: LossWeights, rays: usize, capacity: usize) -> Losses {
         Losses {
             weights,
-            tally: device.scratch(2),
+            tally: device.scratch(3),
             g_out: device.scratch(RAY_WIDTH * rays),
             ray_terms: device.scratch(RAY_TERMS * rays),
             sample_terms: device.scratch(SAMPLE_TERMS * capacity),
-            sums: device.scratch(RAY_TERMS + SAMPLE_TERMS),
+            sums: device.scratch(TERMS),
         }
     }
 
     /// Gradients by what [`Neus::forward`](super::Neus::forward) composited, planes `[9, rays]`; offsets: `[rays + 1]`.
-    pub fn of_rays(&self, device: &Device, composed: &Buffer, targets: Targets, offsets: &Buffer) -> &Buffer {
+    pub fn of_rays(&self, device: &Device, composed: &Buffer, batch: &Batch, offsets: &Buffer) -> &Buffer {
         let (w, dim) = (&self.weights, CubeDim::new_1d(UNITS));
-        let (alpha, tally) = (targets.alpha, &self.tally);
+        let Batch { color, alpha, background, alive, .. } = batch;
+        let tally = &self.tally;
         let one = CubeCount::new_single();
-        tally::launch(device.launch(), one, dim, offsets.arg(), alpha.arg(), tally.arg());
+        tally::launch(device.launch(), one, dim, offsets.arg(), alpha.arg(), alive.arg(), tally.arg());
         of_rays::launch(
             device.launch(),
             groups(alpha.words().div_ceil(UNITS as usize)),
             dim,
             composed.arg(),
-            targets.color.arg(),
+            color.arg(),
             alpha.arg(),
-            targets.background.arg(),
+            background.arg(),
+            alive.arg(),
             offsets.arg(),
             tally.arg(),
             self.g_out.arg(),
@@ -257,14 +264,16 @@ impl Losses {
         );
     }
 
-    /// The terms of the last step, unweighted, in the order of [`LossWeights`]; for steps whose losses are read.
-    pub fn sums(&self, device: &Device, count: &Buffer) -> &Buffer {
+    /// The terms of the last step, `[7]`, unweighted: in the order of [`LossWeights`], then those of points; for steps
+    /// whose losses are read.
+    pub fn sums(&self, device: &Device, count: &Buffer, of_points: &Buffer) -> &Buffer {
         sum::launch(
             device.launch(),
-            CubeCount::new_1d((RAY_TERMS + SAMPLE_TERMS) as u32),
+            CubeCount::new_1d(TERMS as u32),
             CubeDim::new_1d(UNITS),
             self.ray_terms.arg(),
             self.sample_terms.arg(),
+            of_points.arg(),
             count.arg(),
             self.sums.arg(),
         );
@@ -314,7 +323,7 @@ mod tests {
             [f, slope[0], slope[1], slope[2] + 0.5, color[0], color[1], color[2], -0.2 * uniform(5, i)]
         };
         Case {
-            offsets: vec![0, 6, 12, 12, 17, 24],
+            offsets: vec![0, 6, 12, 12, 17, 24, 24],
             direction: vec![
                 [0.6, 0.0, -0.8],
                 [0.0, 0.0, 1.0],
@@ -377,30 +386,40 @@ mod tests {
     #[test]
     fn losses_and_gradients_agree_with_f64_finite_differences() {
         let Some(device) = device() else { return };
-        let case = case();
+        let mut case = case();
+        // there is room for one ray more
+        case.direction.push([0.0; 3]);
+        case.color.push([9.0; 3]);
+        case.background.push([9.0; 3]);
+        case.alpha.push(1.0);
         let inv_s = 30f32;
         let up = |v: &[f32]| device.upload(v);
-        let (offsets, direction) = (device.upload(&case.offsets), up(&planes(&case.direction, 5)));
+        let (offsets, direction) = (device.upload(&case.offsets), up(&planes(&case.direction, 6)));
         let (t, dt) = (up(&[1.0; 24]), up(&[STEP as f32; 24]));
         let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
         let (field, sharp) = (up(&planes(&case.field, 24)), up(&[inv_s]));
-        let (color, background) = (up(&planes(&case.color, 5)), up(&planes(&case.background, 5)));
-        let alpha = up(&case.alpha);
-        let targets = Targets { color: &color, alpha: &alpha, background: &background };
-        let (neus, losses) = (Neus::new(&device, 5, 24), Losses::new(&device, WEIGHTS, 5, 24));
+        let batch = Batch {
+            color: up(&planes(&case.color, 6)),
+            background: up(&planes(&case.background, 6)),
+            alpha: up(&case.alpha),
+            alive: device.upload(&[1u32, 1, 1, 1, 1, 0]),
+            ..Batch::new(&device, 6)
+        };
+        let (neus, losses) = (Neus::new(&device, 6, 24), Losses::new(&device, WEIGHTS, 6, 24));
         let (count, g_s) = (device.upload(&[24u32]), device.zeros(1));
         let composed = neus.forward(&device, rays, &field, &sharp, ANNEAL as f32);
-        let g_out = losses.of_rays(&device, composed, targets, &offsets);
+        let g_out = losses.of_rays(&device, composed, &batch, &offsets);
         let g_field = neus.backward(&device, rays, &field, &sharp, ANNEAL as f32, g_out, &g_s);
         losses.of_samples(&device, &field, &count, g_field);
-        let sums = losses.sums(&device, &count);
+        let sums = losses.sums(&device, &count, &up(&[0.25, 0.5]));
         let (launches, readbacks) = device.counts();
         println!(
             "{launches} launches and {readbacks} readbacks of compositing and losses, forward and backward"
         );
 
         let wide: Vec<f64> = case.field.as_flattened().iter().map(|&v| v as f64).collect();
-        let want = terms(&case, &wide, inv_s as f64).0.map(|t| t as f32);
+        let mut want = terms(&case, &wide, inv_s as f64).0.map(|t| t as f32).to_vec();
+        want.push(0.75);
         agree("losses", &device.read::<f32>(sums), &want, 1e-5);
         let at = |i: usize, h: f64| {
             let mut f = wide.clone();

@@ -2,7 +2,8 @@
 //! are: a pass counts them, a prefix sum says where each ray's lie, a second pass writes them.
 
 use super::device::{Buffer, Device, groups};
-use crate::kernel::march::Bitmask;
+use super::draw::Batch;
+use super::occupancy::Occupancy;
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
@@ -58,15 +59,16 @@ fn pass(
     origin: &[f32],
     direction: &[f32],
     jitter: &[f32],
+    alive: &mut [u32],
     offsets: &[u32],
     counts: &mut [u32],
+    pitch: &[f32],
     t: &mut [f32],
     dt: &mut [f32],
     x: &mut [f32],
     toward: &mut [f32],
     resolution: u32,
     radius: f32,
-    step: f32,
     limit: u32,
     #[comptime] writes: bool,
     #[comptime] has_solid: bool,
@@ -82,16 +84,20 @@ fn pass(
         let span = clipped(span, oz, dz, radius);
         let top = i32::cast_from(resolution) - 1;
         let scale = 0.5f32 * f32::cast_from(resolution) / radius;
+        let step = pitch[0];
         let start = span.enter + jitter[r] * step;
         let mut first = 0usize;
         let mut most = limit;
         if writes {
             first = offsets[r] as usize;
             most = offsets[r + 1] - offsets[r];
+            if most < counts[r] {
+                alive[r] = 0;
+            }
         }
         let mut found = 0u32;
         let mut k = 0u32;
-        let mut marching = span.enter < span.leave && found < most;
+        let mut marching = span.enter < span.leave && found < most && alive[r] == 1;
         while marching {
             // t = start + (k + ½) · step for integer k: computed, never accumulated
             let at = start + (f32::cast_from(k) + 0.5f32) * step;
@@ -134,7 +140,7 @@ fn pass(
     }
 }
 
-/// Where each ray's samples begin, and how many there are. A ray whose samples, with those before, are more than there
+/// Where each ray's samples begin, how many there are, and how many there would be with more room. A ray whose samples, with those before, are more than there
 /// is room for gets none, and none behind it. One group of threads.
 #[cube(launch)]
 fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
@@ -165,8 +171,10 @@ fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
     fit[unit] = last;
     sync_cube();
     let mut most = 0u32;
+    let mut wanted = 0u32;
     for i in 0..UNITS as usize {
         most = max(most, fit[i]);
+        wanted += sums[i];
     }
     at = before;
     for r in begin..end {
@@ -176,6 +184,7 @@ fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
     if unit == 0 {
         offsets[rays] = most;
         total[0] = most;
+        total[1] = wanted;
     }
 }
 
@@ -183,7 +192,7 @@ fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
 pub struct Samples {
     /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Buffer,
-    /// `[1]`: how many there are.
+    /// `[2]`: how many there are, and how many there would be with more room.
     pub count: Buffer,
     /// `[capacity]` midpoints.
     pub t: Buffer,
@@ -196,31 +205,12 @@ pub struct Samples {
     counts: Buffer,
 }
 
-/// Which cells of a cubic grid over `[-radius, radius]³` may hold surface, and which are solid, on a device.
-pub struct Occupancy {
-    mask: Buffer,
-    solid: Option<Buffer>,
-    resolution: usize,
-    radius: f32,
-}
-
-impl Occupancy {
-    /// Of these masks.
-    pub fn new(device: &Device, mask: &Bitmask, solid: Option<&Bitmask>, radius: f32) -> Occupancy {
-        assert!(solid.is_none_or(|s| s.resolution == mask.resolution));
-        let words = |mask: &Bitmask| -> Buffer {
-            device.upload(&mask.bits.iter().flat_map(|&w| [w as u32, (w >> 32) as u32]).collect::<Vec<_>>())
-        };
-        Occupancy { mask: words(mask), solid: solid.map(words), resolution: mask.resolution, radius }
-    }
-}
-
 impl Samples {
     /// Room for so many rays and `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> Samples {
         Samples {
             offsets: device.zeros(rays + 1),
-            count: device.zeros(1),
+            count: device.zeros(2),
             t: device.zeros(capacity),
             dt: device.zeros(capacity),
             x: device.zeros(3 * capacity),
@@ -229,42 +219,39 @@ impl Samples {
         }
     }
 
-    /// Marches rays: see [`crate::kernel::march::march`]. Rays beyond the room there is get no samples.
-    ///
-    /// # Shapes
-    ///
-    /// - origin, direction: planes `[3, rays]`; jitter: `[rays]`
+    /// Marches rays with steps of `pitch`, `[1]`: see [`crate::kernel::march::march`]. Rays beyond the room there is are
+    /// none from then on. The last `apart` places are left free.
     pub fn march(
         &self,
         device: &Device,
         occupancy: &Occupancy,
-        origin: &Buffer,
-        direction: &Buffer,
-        jitter: &Buffer,
-        step: f32,
+        rays: &Batch,
+        pitch: &Buffer,
         limit: usize,
+        apart: usize,
     ) {
-        assert!(step.is_finite() && step > 0.0 && jitter.words() == self.counts.words());
+        assert!(rays.rays() == self.counts.words() && apart < self.t.words());
         let both = |writes: bool| {
             pass::launch(
                 device.launch(),
-                groups(jitter.words().div_ceil(UNITS as usize)),
+                groups(rays.rays().div_ceil(UNITS as usize)),
                 CubeDim::new_1d(UNITS),
                 occupancy.mask.arg(),
                 occupancy.solid.as_ref().unwrap_or(&occupancy.mask).arg(),
-                origin.arg(),
-                direction.arg(),
-                jitter.arg(),
+                rays.origin.arg(),
+                rays.direction.arg(),
+                rays.jitter.arg(),
+                rays.alive.arg(),
                 self.offsets.arg(),
                 self.counts.arg(),
+                pitch.arg(),
                 self.t.arg(),
                 self.dt.arg(),
                 self.x.arg(),
                 self.direction.arg(),
                 occupancy.resolution as u32,
                 occupancy.radius,
-                step,
-                limit as u32,
+                limit.min(u32::MAX as usize) as u32,
                 writes,
                 occupancy.solid.is_some(),
             );
@@ -277,7 +264,7 @@ impl Samples {
             self.counts.arg(),
             self.offsets.arg(),
             self.count.arg(),
-            self.t.words() as u32,
+            (self.t.words() - apart) as u32,
         );
         both(true);
     }
@@ -287,7 +274,7 @@ impl Samples {
 mod tests {
     use super::super::device::tests::{agree, device, planes};
     use super::*;
-    use crate::kernel::march::{MarchRay, march};
+    use crate::kernel::march::{Bitmask, MarchRay, march};
     use crate::kernel::rng;
 
     const RADIUS: f32 = 1.1;
@@ -325,15 +312,12 @@ mod tests {
         rays: &[MarchRay],
         capacity: usize,
         limit: usize,
-    ) -> Samples {
-        let samples = Samples::new(device, rays.len(), capacity);
-        let turned = |f: fn(&MarchRay) -> [f32; 3]| {
-            device.upload(&planes(&rays.iter().map(f).collect::<Vec<_>>(), rays.len()))
-        };
-        let jitter = device.upload(&rays.iter().map(|r| r.jitter).collect::<Vec<_>>());
-        let (origin, direction) = (turned(|r| r.origin), turned(|r| r.direction));
-        samples.march(device, occupancy, &origin, &direction, &jitter, STEP, limit);
-        samples
+    ) -> (Samples, Vec<u32>) {
+        // room for some that are not there
+        let samples = Samples::new(device, rays.len() + 5, capacity + 3);
+        let batch = Batch::of_rays(device, rays, rays.len() + 5);
+        samples.march(device, occupancy, &batch, &device.upload(&[STEP]), limit, 3);
+        (samples, device.read(&batch.alive))
     }
 
     #[test]
@@ -344,9 +328,10 @@ mod tests {
             let want = march(&mask, solid, RADIUS, STEP, &rays, limit);
             let n = want.t.len();
             let occupancy = Occupancy::new(&device, &mask, solid, RADIUS);
-            let got = on_device(&device, &occupancy, &rays, 1 << 16, limit);
-            assert_eq!(device.read::<u32>(&got.count), [n as u32]);
-            assert_eq!(device.read::<i32>(&got.offsets), want.offsets);
+            let (got, alive) = on_device(&device, &occupancy, &rays, (1 << 16) - 3, limit);
+            assert_eq!(device.read::<u32>(&got.count), [n as u32; 2]);
+            assert_eq!(device.read::<i32>(&got.offsets)[..=rays.len()], want.offsets);
+            assert!((0..alive.len()).all(|r| (alive[r] == 1) == (r < rays.len())));
             agree("marched t", &device.read::<f32>(&got.t)[..n], &want.t, 1e-5);
             let (x, d) = want.points(&rays, 0);
             agree("marched x", &device.read::<f32>(&got.x), &planes(&x, 1 << 16), 1e-5);
@@ -362,10 +347,14 @@ mod tests {
         let whole = march(&mask, None, RADIUS, STEP, &rays, 1000).offsets;
         let occupancy = Occupancy::new(&device, &mask, None, RADIUS);
         let room = whole[300] + 1; // the rays from 300 on, but for empty ones right there, do not fit
-        let got = on_device(&device, &occupancy, &rays, room as usize, 1000);
+        let (got, alive) = on_device(&device, &occupancy, &rays, room as usize, 1000);
         let fits = *whole.iter().filter(|&&o| o <= room).max().unwrap();
         let want: Vec<i32> = whole.iter().map(|&o| o.min(fits)).collect();
-        assert_eq!(device.read::<i32>(&got.offsets), want);
-        assert_eq!(device.read::<i32>(&got.count), [fits]);
+        assert_eq!(device.read::<i32>(&got.offsets)[..=rays.len()], want);
+        assert_eq!(device.read::<i32>(&got.count), [fits, whole[rays.len()]]);
+        // those that did not fit are no rays any more, those that meet nothing are
+        assert!(
+            (0..rays.len()).all(|r| (alive[r] == 1) == (whole[r + 1] <= fits || whole[r + 1] == whole[r]))
+        );
     }
 }

@@ -9,22 +9,34 @@
 
 mod adam;
 mod device;
+mod draw;
 mod hash;
 mod losses;
 mod march;
 mod neus;
 mod norm;
+mod occupancy;
+mod points;
+mod rng;
+mod schedule;
 mod sdf;
 mod tile;
 
-pub use adam::adam;
+pub use adam::{Gate, adam};
 pub use device::{Atomics, Buffer, Device};
+pub use draw::{Batch, Drawing, DrawnView, Photographs};
 pub use hash::Grid;
-pub use losses::{LossWeights, Losses, Targets};
-pub use march::{Occupancy, Samples};
+pub use losses::{LossWeights, Losses};
+pub use march::Samples;
 pub use neus::{Neus, Rays};
 pub use norm::Norm;
+pub use occupancy::{Band, Occupancy};
+pub use points::SurfacePoints;
+pub use schedule::{Pitch, RayBudget, Schedule};
 pub use sdf::Sdf;
+
+#[cfg(test)]
+pub(crate) use device::tests;
 
 #[cfg(test)]
 mod step_tests;

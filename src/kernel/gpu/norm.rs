@@ -30,6 +30,12 @@ fn length(raw: &[f32], pieces: &[u32], i: usize) -> f32 {
     select(pieces[i * PIECE + 1] == NONE, 1.0f32, max(sum.sqrt(), 1e-12f32))
 }
 
+/// By its bits: compilers may take for granted that floats are finite.
+#[cube]
+fn finite(v: f32) -> bool {
+    (u32::reinterpret(v) & 0x7f80_0000u32) != 0x7f80_0000u32
+}
+
 /// g of a piece, 1 where it has none.
 #[cube]
 fn scale(raw: &[f32], pieces: &[u32], i: usize) -> f32 {
@@ -75,6 +81,7 @@ fn backward(
     g_inv_s: &[f32],
     g_raw: &mut [f32],
     g_variance: &mut [f32],
+    broken: &mut [u32],
 ) {
     let i = ABSOLUTE_POS;
     if i < pieces.len() / PIECE {
@@ -90,13 +97,25 @@ fn backward(
             }
             along /= length;
             g_raw[at as usize] = along;
+            if !finite(along) {
+                broken[0] = 1;
+            }
         }
         for k in 0..count {
-            g_raw[from + k] = share * (g_flat[to + k] - along * raw[from + k] / length);
+            let own = share * (g_flat[to + k] - along * raw[from + k] / length);
+            g_raw[from + k] = own;
+            // all who write, write the same
+            if !finite(own) {
+                broken[0] = 1;
+            }
         }
     }
     if i == 0 {
-        g_variance[0] = 10.0f32 * inv_s[0] * g_inv_s[0];
+        let own = 10.0f32 * inv_s[0] * g_inv_s[0];
+        g_variance[0] = own;
+        if !finite(own) {
+            broken[0] = 1;
+        }
     }
 }
 
@@ -158,7 +177,8 @@ impl Norm {
         );
     }
 
-    /// Gradients by parameters and variance of those by weights and sharpness.
+    /// Gradients by parameters and variance of those by weights and sharpness; makes `broken`, `[1]`, 1 where one is not
+    /// finite. What breaks the gradient of the table passes through the layers above it.
     pub fn backward(
         &self,
         device: &Device,
@@ -166,6 +186,7 @@ impl Norm {
         inv_s: &Buffer,
         [g_flat, g_inv_s]: [&Buffer; 2],
         [g_raw, g_variance]: [&Buffer; 2],
+        broken: &Buffer,
     ) {
         backward::launch(
             device.launch(),
@@ -178,6 +199,7 @@ impl Norm {
             g_inv_s.arg(),
             g_raw.arg(),
             g_variance.arg(),
+            broken.arg(),
         );
     }
 }
@@ -234,7 +256,10 @@ mod tests {
         assert_eq!(device.read::<f32>(&variance), [0.25]);
         agree("sharpness", &device.read::<f32>(&inv_s), &[2.5f32.exp()], 1e-5);
         let (g_raw, g_variance) = (device.scratch(raw.len()), device.scratch(1));
-        norm.backward(&device, &there, &inv_s, [&g_flat, &g_inv_s], [&g_raw, &g_variance]);
+        let broken = device.zeros(1);
+        let into = [&g_raw, &g_variance];
+        norm.backward(&device, &there, &inv_s, [&g_flat, &g_inv_s], into, &broken);
+        assert_eq!(device.read::<u32>(&broken), [0]);
         agree("gradient by the variance", &device.read::<f32>(&g_variance), &[7.0 * 2.5f32.exp()], 1e-5);
         let loss =
             |raw: &[f64]| -> f64 { weights(layout, raw).iter().zip(&g).map(|(w, &g)| w * g as f64).sum() };
@@ -252,5 +277,12 @@ mod tests {
             })
             .collect();
         agree("gradient by the parameters", &some.iter().map(|&i| got[i]).collect::<Vec<_>>(), &slopes, 1e-5);
+        for (value, at) in [(f32::NAN, 0), (f32::INFINITY, layout.len() - 1)] {
+            let mut g = g.clone();
+            g[at] = value;
+            let broken = device.zeros(1);
+            norm.backward(&device, &there, &inv_s, [&device.upload(&g), &g_inv_s], into, &broken);
+            assert_eq!(device.read::<u32>(&broken), [1]);
+        }
     }
 }

@@ -99,27 +99,32 @@ fn train(device: &Device, steps: u64) -> Trained {
     let (variance, [m_s, v_s, g_s]) = (device.upload(&[0.3f32]), moments(1));
     let (flat, g_flat) = (device.zeros(shape.layout().len()), device.zeros(shape.layout().len()));
     let (inv_s, g_inv_s) = (device.zeros(1), device.zeros(1));
-    let background = device.zeros(3 * RAYS);
+    let pitch = device.upload(&[0.08f32]);
+    let (broken, no_points) = (device.zeros(1), device.zeros(1));
     let mut trained = Trained { launches: 0, first: vec![], last: vec![], table: vec![] };
     for step in 0..steps {
         let seen = pixels(step);
-        let (origin, toward) = (device.upload(&planes(&seen.origin, RAYS)), planes(&seen.direction, RAYS));
-        let (direction, jitter) = (device.upload(&toward), device.zeros(RAYS));
-        let (color, alpha) = (device.upload(&planes(&seen.color, RAYS)), device.upload(&seen.alpha));
+        let batch = Batch {
+            origin: device.upload(&planes(&seen.origin, RAYS)),
+            direction: device.upload(&planes(&seen.direction, RAYS)),
+            color: device.upload(&planes(&seen.color, RAYS)),
+            alpha: device.upload(&seen.alpha),
+            alive: device.upload(&[1u32; RAYS]),
+            ..Batch::new(device, RAYS)
+        };
         let (launches, readbacks) = device.counts();
 
         network.forward(device, &raw, &variance, [-1.38, 1.38], &flat, &inv_s);
-        samples.march(device, &occupancy, &origin, &direction, &jitter, 0.08, 64);
+        samples.march(device, &occupancy, &batch, &pitch, 64, 0);
         let Samples { offsets, count, t, dt, x, direction: along, .. } = &samples;
         let field = on.forward(device, &table, &flat, x, along, count);
-        let rays = Rays { offsets, direction: &direction, t, dt };
+        let rays = Rays { offsets, direction: &batch.direction, t, dt };
         let composed = neus.forward(device, rays, field, &inv_s, 1.0);
-        let targets = Targets { color: &color, alpha: &alpha, background: &background };
-        let g_out = losses.of_rays(device, composed, targets, offsets);
+        let g_out = losses.of_rays(device, composed, &batch, offsets);
         let g_field = neus.backward(device, rays, field, &inv_s, 1.0, g_out, &g_inv_s);
         losses.of_samples(device, field, count, g_field);
         on.backward(device, x, along, count, g_field, &g_table, &g_flat);
-        network.backward(device, &raw, &inv_s, [&g_flat, &g_inv_s], [&g_raw, &g_s]);
+        network.backward(device, &raw, &inv_s, [&g_flat, &g_inv_s], [&g_raw, &g_s], &broken);
         let of_network = AdamStep {
             lr: 2e-3,
             beta1: 0.9,
@@ -129,14 +134,16 @@ fn train(device: &Device, steps: u64) -> Trained {
             step: step + 1,
             skip_zero: false,
         };
-        adam(device, &raw, &m_raw, &v_raw, &g_raw, &of_network);
-        adam(device, &variance, &m_s, &v_s, &g_s, &of_network);
-        adam(device, &table, &m_table, &v_table, &g_table, &AdamStep { skip_zero: true, ..of_network });
+        let gate = Gate { count, broken: &broken };
+        adam(device, [&raw, &m_raw, &v_raw], &g_raw, &of_network, gate);
+        adam(device, [&variance, &m_s, &v_s], &g_s, &of_network, gate);
+        let of_table = AdamStep { skip_zero: true, ..of_network };
+        adam(device, [&table, &m_table, &v_table], &g_table, &of_table, gate);
 
         let after = device.counts();
         assert_eq!(after.1, readbacks, "a step reads nothing back");
         trained.launches = after.0 - launches;
-        trained.last = device.read(losses.sums(device, count));
+        trained.last = device.read(losses.sums(device, count, &no_points));
         if step == 0 {
             trained.first = trained.last.clone();
         }

@@ -1,0 +1,429 @@
+//! Random rays from photographs that lie on the device: 8 bits a channel, only the box around the pixels worth drawing.
+//!
+//! Which pixel a ray is drawn from is a function of seed, step and its number alone, the same as on the CPU.
+
+use super::device::{Buffer, Device, groups};
+use super::rng::{below, stream, uniform};
+use crate::geom::{Camera, Projection};
+use crate::kernel::march::MarchRay;
+use cubecl::prelude::*;
+
+const UNITS: u32 = 256;
+
+/// Words that describe a photograph: pixels drawable up to and with it, box, its first pixel, whether color is over
+/// black already, focal lengths, principal point, lens, rotation by columns, position.
+const VIEW: usize = 36;
+/// Where its camera's begin.
+const CAMERA: usize = 7;
+const LENS: usize = CAMERA + 4;
+const ROTATION: usize = LENS + 13;
+const POSITION: usize = ROTATION + 9;
+
+/// Tries to meet a pixel worth drawing in its box.
+const TRIES: u32 = 256;
+
+/// A photograph to draw from.
+pub struct DrawnView {
+    /// Its camera in scene coordinates.
+    pub camera: Camera,
+    /// Column and row where the box of pixels worth drawing begins, its width and height; no width: none.
+    pub part: [u32; 4],
+    /// The box's pixels, row by row: red, green, blue and alpha, from the lowest byte on.
+    pub pixels: Vec<u32>,
+    /// Is color of the head alone, over black? Else it is the photograph's, times alpha over black.
+    pub over_black: bool,
+    /// A bit a pixel of the box, from the lowest of 32 on: is it drawn?
+    pub drawable: Vec<u32>,
+}
+
+impl DrawnView {
+    fn words(&self, cumulative: u32, first: u32, radius: f32) -> [u32; VIEW] {
+        let (c, d) = (&self.camera, &self.camera.distortion);
+        let projection = match d.projection {
+            Projection::Perspective => 0u32,
+            Projection::Fisheye => 1,
+            Projection::Fov => 2,
+        };
+        let camera = [c.fx, c.fy, c.cx, c.cy].map(|v| v as f32);
+        let bends = [d.k1, d.k2, d.k3, d.k4, d.k5, d.k6, d.p1, d.p2, d.sx1, d.sy1, d.omega];
+        let mut words = vec![cumulative];
+        words.extend(self.part);
+        words.extend([first, u32::from(self.over_black)]);
+        words.extend(camera.map(f32::to_bits));
+        words.extend([projection, u32::from(d.is_none())]);
+        words.extend(bends.map(|v| (v as f32).to_bits()));
+        words.extend(c.rotation.to_cols_array().map(|v| (v as f32).to_bits()));
+        words.extend((c.position.as_vec3() * radius).to_array().map(f32::to_bits));
+        words.try_into().expect("as many words as a view has")
+    }
+}
+
+/// A float of a view.
+#[cube]
+fn number(views: &[u32], view: usize, i: usize) -> f32 {
+    f32::reinterpret(views[view + i])
+}
+
+/// A point of the picture's plane.
+#[derive(CubeType, Clone, Copy)]
+struct Point {
+    x: f32,
+    y: f32,
+    found: bool,
+}
+
+/// What the coefficients of a lens do to a projected point, and how that changes with it.
+#[derive(CubeType, Clone, Copy)]
+struct Bent {
+    x: f32,
+    y: f32,
+    xx: f32,
+    xy: f32,
+    yx: f32,
+    yy: f32,
+}
+
+#[cube]
+fn bend(views: &[u32], lens: usize, x: f32, y: f32) -> Bent {
+    let (k1, k2, k3) = (number(views, lens, 2), number(views, lens, 3), number(views, lens, 4));
+    let (k4, k5, k6) = (number(views, lens, 5), number(views, lens, 6), number(views, lens, 7));
+    let (p1, p2) = (number(views, lens, 8), number(views, lens, 9));
+    let (sx, sy) = (number(views, lens, 10), number(views, lens, 11));
+    let r2 = x * x + y * y;
+    let mut radial = 1.0f32 + r2 * (k1 + r2 * (k2 + r2 * k3));
+    let mut slope = k1 + r2 * (2.0f32 * k2 + 3.0f32 * r2 * k3);
+    if views[lens] == 1 {
+        radial += r2 * r2 * r2 * r2 * k4;
+        slope += 4.0f32 * r2 * r2 * r2 * k4;
+    } else {
+        let under = 1.0f32 + r2 * (k4 + r2 * (k5 + r2 * k6));
+        radial /= under;
+        slope = (slope - radial * (k4 + r2 * (2.0f32 * k5 + 3.0f32 * r2 * k6))) / under;
+    }
+    slope *= 2.0f32;
+    let cross = x * y * slope + 2.0f32 * p1 * x + 2.0f32 * p2 * y;
+    Bent {
+        x: x * radial + 2.0f32 * p1 * x * y + p2 * (r2 + 2.0f32 * x * x) + sx * r2,
+        y: y * radial + p1 * (r2 + 2.0f32 * y * y) + 2.0f32 * p2 * x * y + sy * r2,
+        xx: radial + x * x * slope + 2.0f32 * p1 * y + 6.0f32 * p2 * x + 2.0f32 * sx * x,
+        xy: cross + 2.0f32 * sx * y,
+        yx: cross + 2.0f32 * sy * x,
+        yy: radial + y * y * slope + 6.0f32 * p1 * y + 2.0f32 * p2 * x + 2.0f32 * sy * y,
+    }
+}
+
+/// The way back through a lens: see [`crate::geom::Distortion::undo`].
+#[cube]
+fn undo(views: &[u32], lens: usize, xd: f32, yd: f32) -> Point {
+    let mut x = xd;
+    let mut y = yd;
+    let mut found = true;
+    if views[lens + 1] == 0 {
+        for _ in 0..10u32 {
+            let at = bend(views, lens, x, y);
+            let (ex, ey) = (at.x - xd, at.y - yd);
+            let det = at.xx * at.yy - at.xy * at.yx;
+            found = found && det > 1e-6f32;
+            let over = 1.0f32 / max(det, 1e-6f32);
+            x -= (at.yy * ex - at.xy * ey) * over;
+            y -= (at.xx * ey - at.yx * ex) * over;
+        }
+        let at = bend(views, lens, x, y);
+        found = found && (at.x - xd).abs() + (at.y - yd).abs() < 1e-5f32;
+        // tan θ / r of the projection
+        let r = (x * x + y * y).sqrt();
+        let widest = 1.569_796_3f32;
+        let mut scale = 1.0f32;
+        if views[lens] == 1 {
+            found = found && r < widest;
+            if r > 1e-4f32 {
+                scale = min(r, widest).tan() / r;
+            }
+        }
+        let omega = number(views, lens, 12);
+        if views[lens] == 2 && omega.abs() > 1e-6f32 {
+            let spread = 2.0f32 * (0.5f32 * omega).tan().abs();
+            let angle = r * omega.abs();
+            found = found && angle < widest;
+            scale = omega.abs() / spread;
+            if angle > 1e-4f32 {
+                scale = min(angle, widest).tan() / (spread * r);
+            }
+        }
+        x *= scale;
+        y *= scale;
+    }
+    Point { x, y, found }
+}
+
+/// A channel of a pixel, 0 to 1.
+#[cube]
+fn channel(pixel: u32, #[comptime] shift: u32) -> f32 {
+    f32::cast_from((pixel >> shift) & 255) / 255.0f32
+}
+
+/// The view of a drawable pixel: the first whose running count is beyond it.
+#[cube]
+fn view_of(views: &[u32], which: u32) -> usize {
+    let mut low = 0usize;
+    let mut high = views.len() / VIEW;
+    while low < high {
+        let middle = (low + high) / 2;
+        if views[middle * VIEW] <= which {
+            low = middle + 1;
+        } else {
+            high = middle;
+        }
+    }
+    low
+}
+
+#[cube(launch)]
+fn draw_rays(
+    views: &[u32],
+    pixels: &[u32],
+    drawable: &[u32],
+    wanted: &[u32],
+    origin: &mut [f32],
+    direction: &mut [f32],
+    jitter: &mut [f32],
+    color: &mut [f32],
+    alpha: &mut [f32],
+    background: &mut [f32],
+    alive: &mut [u32],
+    view_high: u32,
+    view_low: u32,
+    pixel_high: u32,
+    pixel_low: u32,
+    shift_high: u32,
+    shift_low: u32,
+    behind_high: u32,
+    behind_low: u32,
+    #[comptime] every: bool,
+    #[comptime] shifted: bool,
+    #[comptime] random: bool,
+) {
+    let rays = jitter.len();
+    let r = ABSOLUTE_POS;
+    if r < rays {
+        let i = u32::cast_from(r);
+        let count = views.len() / VIEW;
+        let view = if every {
+            below(view_high, view_low, i, u32::cast_from(count)) as usize
+        } else {
+            view_of(views, below(view_high, view_low, i, views[(count - 1) * VIEW]))
+        };
+        let view = view * VIEW;
+        let (x0, y0, width, height) = (views[view + 1], views[view + 2], views[view + 3], views[view + 4]);
+        let mut found = false;
+        // rejection inside the box: a head fills most of it
+        let mut attempt = 0u32;
+        let mut last = 0u32;
+        if i < wanted[0] && width > 0 {
+            if every {
+                last = 1u32;
+            } else {
+                last = u32::cast_from(TRIES);
+            }
+        }
+        let mut x = 0.0f32;
+        let mut y = 0.0f32;
+        let mut at = 0usize;
+        while attempt < last {
+            let k = (i << 9) | (attempt << 1);
+            let column = below(pixel_high, pixel_low, k, width);
+            let row = below(pixel_high, pixel_low, k | 1, height);
+            attempt += 1;
+            at = (views[view + 5] + row * width + column) as usize;
+            if (drawable[at >> 5] >> u32::cast_from(at & 31)) & 1 == 1 {
+                let xd = (f32::cast_from(x0 + column) + 0.5f32 - number(views, view, CAMERA + 2))
+                    / number(views, view, CAMERA);
+                let yd = (f32::cast_from(y0 + row) + 0.5f32 - number(views, view, CAMERA + 3))
+                    / number(views, view, CAMERA + 1);
+                // pictures have y down
+                let d = undo(views, view + LENS, xd, yd);
+                x = d.x;
+                y = -d.y;
+                found = d.found;
+                last = select(found, 0u32, last);
+            }
+        }
+        let pixel = pixels[at];
+        let mut a = 0.0f32;
+        let mut share = 0.0f32;
+        if found {
+            a = channel(pixel, comptime!(24u32));
+            share = select(views[view + 6] == 1, 1.0f32, a);
+        }
+        alive[r] = select(found, 1u32, 0u32);
+        alpha[r] = a;
+        color[r] = share * channel(pixel, comptime!(0u32));
+        color[rays + r] = share * channel(pixel, comptime!(8u32));
+        color[2 * rays + r] = share * channel(pixel, comptime!(16u32));
+        // cameras look along −Z
+        let over = 1.0f32 / (x * x + y * y + 1.0f32).sqrt();
+        #[unroll]
+        for axis in 0..3usize {
+            let (right, up) =
+                (number(views, view, ROTATION + axis), number(views, view, ROTATION + 3 + axis));
+            let back = number(views, view, ROTATION + 6 + axis);
+            direction[axis * rays + r] = (right * x + up * y - back) * over;
+            origin[axis * rays + r] = number(views, view, POSITION + axis);
+        }
+        let mut shift = 0.0f32;
+        if shifted {
+            shift = uniform(shift_high, shift_low, i);
+        }
+        jitter[r] = shift;
+        #[unroll]
+        for c in 0..3u32 {
+            let mut behind = 0.0f32;
+            if random {
+                behind = uniform(behind_high, behind_low, 3 * i + c);
+            }
+            background[c as usize * rays + r] = behind;
+        }
+    }
+}
+
+/// Rays of a step, and what their pixels show.
+pub struct Batch {
+    /// Planes `[3, rays]`, where they start, in the field's coordinates.
+    pub origin: Buffer,
+    /// Planes `[3, rays]`, unit directions.
+    pub direction: Buffer,
+    /// `[rays]`: the part of a step that samples are shifted by.
+    pub jitter: Buffer,
+    /// Planes `[3, rays]`: the head over black, sRGB-coded, 0 to 1.
+    pub color: Buffer,
+    /// `[rays]`: soft alpha, 1 where there is no mask.
+    pub alpha: Buffer,
+    /// Planes `[3, rays]`: what both are seen over.
+    pub background: Buffer,
+    /// `[rays]`: 1 where there is a ray; the others have no samples and no part in any mean.
+    pub alive: Buffer,
+}
+
+impl Batch {
+    /// Room for so many rays, none of them there.
+    pub fn new(device: &Device, rays: usize) -> Batch {
+        Batch {
+            origin: device.zeros(3 * rays),
+            direction: device.zeros(3 * rays),
+            jitter: device.zeros(rays),
+            color: device.zeros(3 * rays),
+            alpha: device.zeros(rays),
+            background: device.zeros(3 * rays),
+            alive: device.zeros(rays),
+        }
+    }
+
+    /// These rays, up to as many as there is room for, that show nothing.
+    pub fn of_rays(device: &Device, rays: &[MarchRay], room: usize) -> Batch {
+        assert!(rays.len() <= room);
+        let mut planes = [vec![0f32; 3 * room], vec![0f32; 3 * room]];
+        let (mut jitter, mut alive) = (vec![0f32; room], vec![0u32; room]);
+        for (r, ray) in rays.iter().enumerate() {
+            for a in 0..3 {
+                planes[0][a * room + r] = ray.origin[a];
+                planes[1][a * room + r] = ray.direction[a];
+            }
+            (jitter[r], alive[r]) = (ray.jitter, 1);
+        }
+        Batch {
+            origin: device.upload(&planes[0]),
+            direction: device.upload(&planes[1]),
+            jitter: device.upload(&jitter),
+            alive: device.upload(&alive),
+            ..Batch::new(device, room)
+        }
+    }
+
+    /// How many rays there is room for.
+    pub fn rays(&self) -> usize {
+        self.jitter.words()
+    }
+}
+
+/// How rays are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Drawing {
+    /// Every photograph as often, any pixel of its box once: without a ray where that is not worth drawing.
+    pub every: bool,
+    /// Is each ray's first sample shifted by a random part of a step?
+    pub jitter: bool,
+    /// A random color behind each ray, else black.
+    pub background: bool,
+}
+
+/// Photographs on a device.
+pub struct Photographs {
+    views: Buffer,
+    pixels: Buffer,
+    drawable: Buffer,
+    drawing: Drawing,
+}
+
+impl Photographs {
+    /// Copies photographs there; the field's coordinates are the scene's times `radius`.
+    ///
+    /// # Panics
+    ///
+    /// Where no pixel is drawable, or 2³² pixels are.
+    pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: Drawing) -> Photographs {
+        let (mut views, mut pixels, mut drawable) = (Vec::new(), Vec::new(), Vec::new());
+        let mut cumulative = 0u32;
+        for view in seen {
+            let count = (view.part[2] * view.part[3]) as usize;
+            assert!(view.pixels.len() == count && view.drawable.len() == count.div_ceil(32));
+            let own: u32 = view.drawable.iter().map(|w| w.count_ones()).sum();
+            cumulative = cumulative.checked_add(own).expect("fewer than 2³² pixels");
+            let first = u32::try_from(pixels.len()).expect("fewer than 2³² pixels");
+            views.extend(view.words(cumulative, first, radius));
+            pixels.extend(&view.pixels);
+            drawable.extend(&view.drawable);
+            // bits of the next one begin with a word
+            pixels.resize(32 * drawable.len(), 0);
+        }
+        assert!(cumulative > 0, "no pixel is drawable");
+        let [views, pixels, drawable] = [views, pixels, drawable].map(|words| device.upload(&words));
+        Photographs { views, pixels, drawable, drawing }
+    }
+
+    /// Draws the rays of a step: a function of seed and step alone.
+    ///
+    /// # Shapes
+    ///
+    /// - wanted: `[1]`, how many rays; those of `into` behind them are none
+    pub fn draw(&self, device: &Device, (seed, step): (u64, u64), wanted: &Buffer, into: &Batch) {
+        let [view, pixel, shift, behind] = [0, 1, 2, 3].map(|k| stream(seed, step << 4 | k));
+        assert!(into.rays() < 1 << 22, "the number of a try has 32 bits");
+        draw_rays::launch(
+            device.launch(),
+            groups(into.rays().div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            self.views.arg(),
+            self.pixels.arg(),
+            self.drawable.arg(),
+            wanted.arg(),
+            into.origin.arg(),
+            into.direction.arg(),
+            into.jitter.arg(),
+            into.color.arg(),
+            into.alpha.arg(),
+            into.background.arg(),
+            into.alive.arg(),
+            view[0],
+            view[1],
+            pixel[0],
+            pixel[1],
+            shift[0],
+            shift[1],
+            behind[0],
+            behind[1],
+            self.drawing.every,
+            self.drawing.jitter,
+            self.drawing.background,
+        );
+    }
+}

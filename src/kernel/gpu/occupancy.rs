@@ -1,0 +1,249 @@
+//! Which cells may hold surface, looked at again on the device: the rule of a band around the zero set.
+
+use super::device::{Buffer, Device, groups};
+use super::sdf::Sdf;
+use crate::kernel::march::Bitmask;
+use cubecl::prelude::*;
+
+const UNITS: u32 = 256;
+
+#[cube]
+fn center(index: u32, cell: f32, radius: f32) -> f32 {
+    (f32::cast_from(index) + 0.5f32) * cell - radius
+}
+
+/// Centers of some of the cells.
+#[cube(launch)]
+fn centers(
+    cells: &[u32],
+    x: &mut [f32],
+    count: &mut [u32],
+    first: u32,
+    here: u32,
+    resolution: u32,
+    radius: f32,
+) {
+    let s = ABSOLUTE_POS;
+    let plane = x.len() / 3;
+    if s < here as usize {
+        let i = cells[first as usize + s];
+        let cell = 2.0f32 * radius / f32::cast_from(resolution);
+        x[s] = center(i / (resolution * resolution), cell, radius);
+        x[plane + s] = center(i / resolution % resolution, cell, radius);
+        x[2 * plane + s] = center(i % resolution, cell, radius);
+    }
+    if s == 0 {
+        count[0] = here;
+    }
+}
+
+/// How far from a cell's center the band reaches where the surface is as soft as `share` of the sharpest.
+#[cube]
+fn reach_at(band: f32, inv_s: f32, share: f32, half: f32) -> f32 {
+    band / (clamp(inv_s, 1e-6f32, 1e6f32) * share) + half
+}
+
+/// Keeps distance and reach of the cells that were evaluated; no reach but the least where softness does not matter.
+#[cube(launch)]
+fn keep(
+    cells: &[u32],
+    field: &[f32],
+    inv_s: &[f32],
+    value: &mut [f32],
+    reach: &mut [f32],
+    first: u32,
+    here: u32,
+    band: f32,
+    soften: f32,
+    half: f32,
+) {
+    let s = ABSOLUTE_POS;
+    if s < here as usize {
+        let plane = field.len() / 8;
+        let i = cells[first as usize + s] as usize;
+        let f = field[s];
+        let widest = reach_at(band, inv_s[0], 1.0f32 / soften, half);
+        let mut own = 0.0f32;
+        if soften > 1.0f32 && f.abs() < widest {
+            own = reach_at(band, inv_s[0], field[7 * plane + s].exp(), half);
+        }
+        value[i] = f;
+        reach[i] = own;
+    }
+}
+
+/// Decides about 32 cells a thread.
+#[cube(launch)]
+fn decide(
+    allowed: &[u32],
+    value: &[f32],
+    reach: &[f32],
+    inv_s: &[f32],
+    mask: &mut [u32],
+    solid: &mut [u32],
+    resolution: u32,
+    band: f32,
+    half: f32,
+) {
+    let word = ABSOLUTE_POS;
+    if word < mask.len() {
+        let least = reach_at(band, inv_s[0], 1.0f32, half);
+        let cells = resolution * resolution * resolution;
+        let mut kept = 0u32;
+        let mut deep = 0u32;
+        for bit in 0..32u32 {
+            let i = u32::cast_from(word) * 32 + bit;
+            if i < cells && (allowed[word] >> bit) & 1 == 1 {
+                let f = value[i as usize];
+                let mut widest = max(least, reach[i as usize]);
+                let mut crossed = false;
+                let mut stride = 1u32;
+                for _ in 0..3u32 {
+                    let at = i / stride % resolution;
+                    if at > 0 {
+                        let other = (i - stride) as usize;
+                        widest = max(widest, reach[other]);
+                        crossed = crossed || value[other] * f < 0.0f32;
+                    }
+                    if at + 1 < resolution {
+                        let other = (i + stride) as usize;
+                        widest = max(widest, reach[other]);
+                        crossed = crossed || value[other] * f < 0.0f32;
+                    }
+                    stride *= resolution;
+                }
+                if f.abs() < widest || crossed {
+                    kept |= 1u32 << bit;
+                } else if f < 0.0f32 {
+                    deep |= 1u32 << bit;
+                }
+            }
+        }
+        mask[word] = kept;
+        solid[word] = deep;
+    }
+}
+
+/// Which cells of a cubic grid over `[-radius, radius]³` may hold surface, and which are solid, on a device.
+pub struct Occupancy {
+    pub(super) mask: Buffer,
+    pub(super) solid: Option<Buffer>,
+    pub(super) resolution: usize,
+    pub(super) radius: f32,
+}
+
+fn words(mask: &Bitmask) -> Vec<u32> {
+    mask.bits.iter().flat_map(|&w| [w as u32, (w >> 32) as u32]).collect()
+}
+
+impl Occupancy {
+    /// Of these masks.
+    pub fn new(device: &Device, mask: &Bitmask, solid: Option<&Bitmask>, radius: f32) -> Occupancy {
+        assert!(solid.is_none_or(|s| s.resolution == mask.resolution));
+        let there = |mask: &Bitmask| device.upload(&words(mask));
+        Occupancy { mask: there(mask), solid: solid.map(there), resolution: mask.resolution, radius }
+    }
+
+    /// Waits for the device and reads both: the one to march through and the solid one, empty where there is none.
+    pub fn read(&self, device: &Device) -> [Bitmask; 2] {
+        let mut masks = [Bitmask::filled(self.resolution, false), Bitmask::filled(self.resolution, false)];
+        for (mask, there) in masks.iter_mut().zip([Some(&self.mask), self.solid.as_ref()]) {
+            let Some(there) = there else { continue };
+            let words = device.read::<u32>(there);
+            mask.bits = words.as_chunks().0.iter().map(|[a, b]| *a as u64 | (*b as u64) << 32).collect();
+        }
+        masks
+    }
+}
+
+/// The rule of a band around the zero set: see the update of `iface`'s occupancy on the CPU.
+pub struct Band {
+    cells: Buffer,
+    allowed: Buffer,
+    value: Buffer,
+    reach: Buffer,
+    count: Buffer,
+    units: f32,
+    soften: f32,
+}
+
+impl Band {
+    /// Never beyond `allowed`; `units` is the half width in units of 1 / sharpness, which may be `soften` times lower
+    /// than the sharpest.
+    pub fn new(device: &Device, allowed: &Bitmask, units: f32, soften: f32) -> Band {
+        let total = allowed.resolution.pow(3);
+        let cells: Vec<u32> = (0..total).filter(|&i| allowed.get(i)).map(|i| i as u32).collect();
+        Band {
+            cells: device.upload(&cells),
+            allowed: device.upload(&words(allowed)),
+            // no sign where nothing is asked
+            value: device.zeros(total),
+            reach: device.zeros(total),
+            count: device.zeros(2),
+            units,
+            soften,
+        }
+    }
+
+    /// Looks at the field again. `x` and `direction`, planes `[3, capacity]`, are written over; `inv_s` is `[1]`.
+    pub fn update(
+        &self,
+        device: &Device,
+        occupancy: &Occupancy,
+        field: &Sdf,
+        [table, flat, inv_s]: [&Buffer; 3],
+        [x, direction]: [&Buffer; 2],
+    ) {
+        let (resolution, radius) = (occupancy.resolution as u32, occupancy.radius);
+        let half = 0.5 * 3f32.sqrt() * 2.0 * radius / resolution as f32;
+        let dim = CubeDim::new_1d(UNITS);
+        let capacity = x.words() / 3;
+        let solid = occupancy.solid.as_ref().expect("the rule of a band knows the inside");
+        for first in (0..self.cells.words()).step_by(capacity) {
+            let here = capacity.min(self.cells.words() - first);
+            let over = groups(here.div_ceil(UNITS as usize));
+            centers::launch(
+                device.launch(),
+                over.clone(),
+                dim,
+                self.cells.arg(),
+                x.arg(),
+                self.count.arg(),
+                first as u32,
+                here as u32,
+                resolution,
+                radius,
+            );
+            let out = field.forward(device, table, flat, x, direction, &self.count);
+            keep::launch(
+                device.launch(),
+                over,
+                dim,
+                self.cells.arg(),
+                out.arg(),
+                inv_s.arg(),
+                self.value.arg(),
+                self.reach.arg(),
+                first as u32,
+                here as u32,
+                self.units,
+                self.soften,
+                half,
+            );
+        }
+        decide::launch(
+            device.launch(),
+            groups(occupancy.mask.words().div_ceil(UNITS as usize)),
+            dim,
+            self.allowed.arg(),
+            self.value.arg(),
+            self.reach.arg(),
+            inv_s.arg(),
+            occupancy.mask.arg(),
+            solid.arg(),
+            resolution,
+            self.units,
+            half,
+        );
+    }
+}

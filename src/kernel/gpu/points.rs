@@ -1,0 +1,223 @@
+//! Points that the surface should pass through, found by stereo: some of them are evaluated with the samples of each
+//! step, behind them.
+//!
+//! With `f` the distance at a point, `p` the length of a pixel there and `w` its weight, the mean over the points of a
+//! step of `w (√((f / p)² + k²) − k)`.
+
+use super::device::{Buffer, Device, groups};
+use super::march::Samples;
+use super::rng::{below, stream};
+use crate::kernel::sdf::WIDTH;
+use cubecl::prelude::*;
+
+const UNITS: u32 = 256;
+
+/// Numbers of a point: position, length of a pixel, weight.
+const ROW: usize = 5;
+
+#[cube(launch)]
+fn append(
+    rows: &[f32],
+    count: &[u32],
+    both: &mut [u32],
+    drawn: &mut [u32],
+    x: &mut [f32],
+    toward: &mut [f32],
+    of: u32,
+    points: u32,
+    high: u32,
+    low: u32,
+) {
+    let i = ABSOLUTE_POS;
+    let plane = x.len() / 3;
+    let first = count[0];
+    // a step without samples is none
+    let there = select(first > 0, points, 0u32);
+    if i < there as usize {
+        let which = below(high, low, u32::cast_from(i), of);
+        drawn[i] = which;
+        let s = first as usize + i;
+        #[unroll]
+        for axis in 0..3usize {
+            x[axis * plane + s] = rows[which as usize * ROW + axis];
+        }
+        // nobody looks at their color
+        toward[s] = 0.0f32;
+        toward[plane + s] = 0.0f32;
+        toward[2 * plane + s] = 1.0f32;
+    }
+    if i == 0 {
+        both[0] = first + there;
+    }
+}
+
+#[cube(launch)]
+fn of_points(
+    rows: &[f32],
+    drawn: &[u32],
+    count: &[u32],
+    both: &[u32],
+    field: &[f32],
+    g_field: &mut [f32],
+    terms: &mut [f32],
+    weight: f32,
+    knee: f32,
+) {
+    let i = ABSOLUTE_POS;
+    let plane = field.len() / comptime!(WIDTH);
+    let there = (both[0] - count[0]) as usize;
+    if i < terms.len() {
+        let mut term = 0.0f32;
+        if i < there {
+            let s = count[0] as usize + i;
+            let row = drawn[i] as usize * ROW;
+            let even = rows[row + 4] / f32::cast_from(there);
+            let pixel = 1.0f32 / rows[row + 3];
+            let off = field[s] * pixel;
+            let root = (off * off + knee * knee).sqrt();
+            term = even * (root - knee);
+            g_field[s] = weight * even * off / root * pixel;
+            #[unroll]
+            for k in 1..8usize {
+                g_field[k * plane + s] = 0.0f32;
+            }
+        }
+        terms[i] = term;
+    }
+}
+
+/// Points on a device, of which each step draws some.
+pub struct SurfacePoints {
+    rows: Buffer,
+    count: usize,
+    weight: f32,
+    knee: f32,
+    drawn: Buffer,
+    terms: Buffer,
+    both: Buffer,
+}
+
+impl SurfacePoints {
+    /// No points yet; up to `most` a step, of this weight, and a loss that is linear beyond `knee` pixels.
+    pub fn new(device: &Device, most: usize, weight: f32, knee: f32) -> SurfacePoints {
+        SurfacePoints {
+            rows: device.zeros(ROW),
+            count: 0,
+            weight,
+            knee,
+            drawn: device.zeros(most),
+            terms: device.zeros(most),
+            both: device.zeros(1),
+        }
+    }
+
+    /// These from now on: positions in field coordinates, length of a pixel there, weight.
+    pub fn put(&mut self, device: &Device, rows: &[[f32; ROW]]) {
+        self.count = rows.len();
+        if self.count > 0 {
+            self.rows = device.upload(rows);
+        }
+    }
+
+    /// How many samples of a step they may be.
+    pub fn most(&self) -> usize {
+        self.terms.words()
+    }
+
+    /// Draws some by seed and step, behind a step's samples, and returns how many there are with them, `[1]`.
+    pub fn append(&self, device: &Device, (seed, step): (u64, u64), samples: &Samples) -> &Buffer {
+        let [high, low] = stream(seed, step << 4 | 12);
+        append::launch(
+            device.launch(),
+            groups(self.most().div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            self.rows.arg(),
+            samples.count.arg(),
+            self.both.arg(),
+            self.drawn.arg(),
+            samples.x.arg(),
+            samples.direction.arg(),
+            self.count as u32,
+            if self.count > 0 { self.most() as u32 } else { 0 },
+            high,
+            low,
+        );
+        &self.both
+    }
+
+    /// Writes the gradients of a step's points by the field's output behind those of its samples, planes
+    /// `[8, capacity]`.
+    pub fn losses(&self, device: &Device, field: &Buffer, count: &Buffer, g_field: &Buffer) {
+        if self.count == 0 {
+            return;
+        }
+        of_points::launch(
+            device.launch(),
+            groups(self.most().div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            self.rows.arg(),
+            self.drawn.arg(),
+            count.arg(),
+            self.both.arg(),
+            field.arg(),
+            g_field.arg(),
+            self.terms.arg(),
+            self.weight,
+            self.knee,
+        );
+    }
+
+    /// What each point of the last step adds to the loss, unweighted.
+    pub fn terms(&self) -> &Buffer {
+        &self.terms
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::tests::{agree, device};
+    use super::*;
+    use crate::kernel::rng;
+
+    #[test]
+    fn points_stand_behind_the_samples_and_pull_the_surface() {
+        let Some(device) = device() else { return };
+        const PLANE: usize = 64;
+        let rows: Vec<[f32; 5]> =
+            (0..7).map(|i| [i as f32, 10.0 + i as f32, -1.0, 0.02 + 0.001 * i as f32, 0.5]).collect();
+        let mut points = SurfacePoints::new(&device, 20, 3.0, 0.15);
+        let mut samples = Samples::new(&device, 4, PLANE);
+        samples.count = device.upload(&[40u32, 40]);
+        // none are there yet
+        assert_eq!(device.read::<u32>(points.append(&device, (3, 9), &samples)), [40]);
+        points.put(&device, &rows);
+        assert_eq!(device.read::<u32>(points.append(&device, (3, 9), &samples)), [60]);
+        let which: Vec<usize> = (0..20).map(|i| rng::below(3, 9 << 4 | 12, i, 7) as usize).collect();
+        let x = device.read::<f32>(&samples.x);
+        let d = device.read::<f32>(&samples.direction);
+        for (i, &w) in which.iter().enumerate() {
+            let at = |v: &[f32]| [0, 1, 2].map(|a| v[a * PLANE + 40 + i]);
+            assert_eq!((at(&x), at(&d)), ([rows[w][0], rows[w][1], rows[w][2]], [0.0, 0.0, 1.0]));
+        }
+        let f: Vec<f32> = (0..20).map(|i| 0.03 * rng::normal(1, 1, i)).collect();
+        let mut field = vec![9f32; 8 * PLANE];
+        field[40..60].copy_from_slice(&f);
+        let (field, g) = (device.upload(&field), device.upload(&vec![7f32; 8 * PLANE]));
+        points.losses(&device, &field, &samples.count, &g);
+        let loss = |f: f64, row: &[f32; 5]| {
+            let off = f / row[3] as f64;
+            row[4] as f64 * ((off * off + 0.15 * 0.15).sqrt() - 0.15) / 20.0
+        };
+        let each = |i: usize, h: f64| loss(f[i] as f64 + h, &rows[which[i]]);
+        let want: Vec<f32> = (0..20).map(|i| each(i, 0.0) as f32).collect();
+        agree("points", &device.read::<f32>(points.terms()), &want, 1e-5);
+        let slope = |i: usize| (3.0 * (each(i, 1e-7) - each(i, -1e-7)) / 2e-7) as f32;
+        let g = device.read::<f32>(&g);
+        agree("points' gradients", &g[40..60], &(0..20).map(slope).collect::<Vec<_>>(), 1e-5);
+        // those of samples stay, the others' are none
+        assert!(g[..40].iter().all(|&g| g == 7.0) && g[PLANE + 40..PLANE + 60].iter().all(|&g| g == 0.0));
+        // a step without samples has no points
+        samples.count = device.upload(&[0u32, 0]);
+        assert_eq!(device.read::<u32>(points.append(&device, (3, 9), &samples)), [0]);
+    }
+}

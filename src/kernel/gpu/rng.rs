@@ -1,0 +1,100 @@
+//! The random numbers of [`crate::kernel::rng`], bit by bit: 64-bit words as two of 32 bits, which is what every adapter
+//! has.
+
+use crate::kernel::rng;
+use cubecl::prelude::*;
+
+/// A word of 64 bits.
+#[derive(CubeType, Clone, Copy)]
+pub(super) struct Wide {
+    pub high: u32,
+    pub low: u32,
+}
+
+/// The lower 64 bits of a product.
+#[cube]
+fn times(a: Wide, #[comptime] high: u32, #[comptime] low: u32) -> Wide {
+    Wide { high: u32::mul_hi(a.low, low) + a.low * high + a.high * low, low: a.low * low }
+}
+
+/// A word and itself, moved to the right by less than 32 bits, bit by bit exclusive.
+#[cube]
+fn folded(a: Wide, #[comptime] bits: u32) -> Wide {
+    Wide {
+        high: a.high ^ (a.high >> bits),
+        low: a.low ^ ((a.low >> bits) | (a.high << comptime!(32 - bits))),
+    }
+}
+
+/// 64 random bits for a draw of a stream that [`stream`] prepared.
+#[cube]
+pub(super) fn bits(high: u32, low: u32, index: u32) -> Wide {
+    let step = times(Wide { high: 0u32, low: index }, 0x9e37_79b9u32, 0x7f4a_7c15u32);
+    let sum = low + step.low;
+    let carry = select(sum < low, 1u32, 0u32);
+    let z = folded(Wide { high: high + step.high + carry, low: sum }, 30u32);
+    let z = folded(times(z, 0xbf58_476du32, 0x1ce4_e5b9u32), 27u32);
+    folded(times(z, 0x94d0_49bbu32, 0x1331_11ebu32), 31u32)
+}
+
+/// A uniform number in [0, 1).
+#[cube]
+pub(super) fn uniform(high: u32, low: u32, index: u32) -> f32 {
+    f32::cast_from(bits(high, low, index).high >> 8) / 16_777_216.0f32
+}
+
+/// A uniform integer in `0..n`, n > 0.
+#[cube]
+pub(super) fn below(high: u32, low: u32, index: u32, n: u32) -> u32 {
+    let drawn = bits(high, low, index);
+    let middle = drawn.high * n;
+    let sum = middle + u32::mul_hi(drawn.low, n);
+    u32::mul_hi(drawn.high, n) + select(sum < middle, 1u32, 0u32)
+}
+
+/// What all draws of a stream share, mixed once: high and low word.
+pub(super) fn stream(seed: u64, stream: u64) -> [u32; 2] {
+    let mixed = rng::of_stream(seed, stream);
+    [(mixed >> 32) as u32, mixed as u32]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::groups;
+    use super::super::device::tests::device;
+    use super::*;
+
+    #[cube(launch)]
+    fn draws(out: &mut [u32], high: u32, low: u32, n: u32) {
+        let i = ABSOLUTE_POS;
+        let count = out.len() / 4;
+        if i < count {
+            let index = u32::cast_from(i) * 7_919;
+            let all = bits(high, low, index);
+            out[i] = all.high;
+            out[count + i] = all.low;
+            out[2 * count + i] = below(high, low, index, n);
+            out[3 * count + i] = u32::reinterpret(uniform(high, low, index));
+        }
+    }
+
+    #[test]
+    fn every_bit_is_that_of_the_cpu() {
+        let Some(device) = device() else { return };
+        const COUNT: usize = 1 << 12;
+        for (seed, of, n) in [(0, 0, 1), (42, 1 << 40 | 3, 289_123_456), (u64::MAX, u64::MAX, u32::MAX)] {
+            let out = device.scratch(4 * COUNT);
+            let [high, low] = stream(seed, of);
+            let dim = CubeDim::new_1d(256);
+            draws::launch(device.launch(), groups(COUNT / 256), dim, out.arg(), high, low, n);
+            let out = device.read::<u32>(&out);
+            for i in 0..COUNT {
+                let index = 7_919 * i as u64;
+                let want = rng::bits(seed, of, index);
+                assert_eq!([out[i], out[COUNT + i]], [(want >> 32) as u32, want as u32]);
+                assert_eq!(out[2 * COUNT + i] as u64, rng::below(seed, of, index, n as u64));
+                assert_eq!(out[3 * COUNT + i], rng::uniform(seed, of, index).to_bits());
+            }
+        }
+    }
+}
