@@ -67,6 +67,11 @@ impl Error {
         Error { hint: hint.into(), ..Error::new(ErrorKind::Usage, message) }
     }
 
+    /// Returns an error of kind [`ErrorKind::NotNow`]; `hint` may be empty.
+    pub fn not_now(message: impl Display, hint: impl Into<String>) -> Error {
+        Error { hint: hint.into(), ..Error::new(ErrorKind::NotNow, message) }
+    }
+
     /// Returns an error of kind [`ErrorKind::BelowBar`]; `hint` may be empty.
     pub fn below(message: impl Display, hint: impl Into<String>) -> Error {
         Error { hint: hint.into(), ..Error::new(ErrorKind::BelowBar, message) }

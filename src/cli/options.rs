@@ -30,7 +30,7 @@ pub(super) struct Common {
     /// Set a key of the configuration; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// auto, cpu, wgpu:N or cuda:N
+    /// auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one
     #[arg(long, global = true, env = "TIFACE_DEVICE", hide_env = true)]
     pub device: Option<String>,
     /// Start of every random sequence

@@ -121,7 +121,7 @@ pub struct Config {
     pub preset: Preset,
     /// Start of every random sequence.
     pub seed: u64,
-    /// `auto`, `cpu`, `wgpu:N` or `cuda:N`.
+    /// `auto`, `cpu`, `wgpu`, `vulkan`, `metal` or `dx12`, with `:N` a numbered one.
     pub device: String,
     /// What was photographed.
     pub capture: CaptureConfig,
@@ -154,7 +154,10 @@ const ROOT_KEYS: &[Key] = &[
         0.0,
         i64::MAX as f64,
     ),
-    Key::word("device", "Where fields are learned: auto, cpu, wgpu:N or cuda:N."),
+    Key::word(
+        "device",
+        "Where fields are learned: auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one.",
+    ),
 ];
 
 /// Every table with its keys, in the order of the line; the first has no name.

@@ -132,7 +132,9 @@ fn assign(config: &Config, key: &str, given: RawValue) -> Result<Config> {
             return Err(wrong(key, &problem));
         }
         Some(word) if key == "device" && !is_device(word) => {
-            let problem = format!(": unknown device `{word}`, expected auto, cpu, wgpu:N or cuda:N");
+            let problem = format!(
+                ": unknown device `{word}`, expected auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one"
+            );
             return Err(wrong(key, &problem));
         }
         _ => put(&mut root, key, value),
@@ -187,8 +189,8 @@ fn check_range(key: &Key, value: &Value) -> Result<(), String> {
 
 fn is_device(word: &str) -> bool {
     match word.split_once(':') {
-        Some(("wgpu" | "cuda", n)) => n.parse::<u32>().is_ok(),
-        _ => matches!(word, "auto" | "cpu" | "wgpu" | "cuda"),
+        Some(("wgpu" | "vulkan" | "metal" | "dx12", n)) => n.parse::<u32>().is_ok(),
+        _ => matches!(word, "auto" | "cpu" | "wgpu" | "vulkan" | "metal" | "dx12"),
     }
 }
 

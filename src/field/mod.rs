@@ -8,28 +8,53 @@
 pub mod autodiff;
 mod background;
 pub mod checkpoint;
+#[cfg(feature = "wgpu")]
+pub mod devices;
 pub mod ops;
 pub mod parameters;
 pub mod pixels;
 pub mod training;
 
-use crate::{Error, Result};
+#[cfg(not(feature = "wgpu"))]
+use crate::Error;
+use crate::Result;
 use burn::tensor::{Device, Tensor, TensorData};
 
-/// Returns the device of a name: `auto` or `cpu`.
-pub fn device(name: &str) -> Result<Device> {
-    match name {
-        "auto" | "cpu" => Ok(Device::flex()),
-        other if other.starts_with("wgpu") || other.starts_with("cuda") => {
-            Err(unusable(other, "has no training kernels yet"))
-        }
-        other => Err(unusable(other, "is not known here")),
-    }
+/// Where a field is learned.
+pub enum Place {
+    /// The processor: see [`processor`].
+    Cpu,
+    /// A GPU.
+    #[cfg(feature = "wgpu")]
+    Gpu(devices::Gpu),
 }
 
-fn unusable(name: &str, why: &str) -> Error {
-    let problem = format!("device `{name}` {why}; this build trains on: cpu");
-    Error::usage(problem, "choose another with `--device`")
+/// Returns the processor as burn's device.
+pub fn processor() -> Device {
+    Device::flex()
+}
+
+/// Returns the place of a device's name: `auto`, `cpu`, `wgpu`, `vulkan`, `metal` or `dx12`, the GPUs with a number
+/// after a colon where there are several.
+///
+/// # Errors
+///
+/// Where this build or this machine does not have it.
+pub fn place(name: &str) -> Result<Place> {
+    match name {
+        "cpu" => Ok(Place::Cpu),
+        #[cfg(feature = "wgpu")]
+        "auto" => Ok(devices::best().map_or(Place::Cpu, Place::Gpu)),
+        #[cfg(not(feature = "wgpu"))]
+        "auto" => Ok(Place::Cpu),
+        #[cfg(feature = "wgpu")]
+        other => Ok(Place::Gpu(devices::open(other)?)),
+        #[cfg(not(feature = "wgpu"))]
+        other => {
+            let problem = format!("device `{other}`: this build learns on the processor alone");
+            Err(Error::usage(problem, "build with `--features wgpu`, or leave `--device` out"))
+        }
+    }
 }
 
 /// Returns a tensor of these values; takes the vector without copying.

@@ -65,6 +65,22 @@ impl Parameter {
         values(self.value.clone().inner())
     }
 
+    /// Returns values, running mean of the gradient and that of its square, on the host.
+    pub fn state(&self) -> [Vec<f32>; 3] {
+        let [first, second] = self.moments.each_ref().map(|m| values(m.clone()));
+        [self.values(), first, second]
+    }
+
+    /// Gives it these, as many as it has.
+    pub fn set(&mut self, state: [Vec<f32>; 3]) {
+        let device = self.moments[0].device();
+        let [value, first, second] = state.map(|v| {
+            assert_eq!(v.len(), self.len());
+            tensor(v, [self.len()], &device)
+        });
+        (self.value, self.moments) = (leaf(value), [first, second]);
+    }
+
     /// Is every value a finite number?
     pub fn is_finite(&self) -> bool {
         self.values().iter().all(|v| v.is_finite())

@@ -49,7 +49,7 @@ impl IFace {
     pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&Bitmask>) -> Result<IFace> {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
         TrainingProgress::restore(&file, config.steps)?;
-        let state = SdfState::restore(config, hull, &mut file, &field::device("cpu")?)?;
+        let state = SdfState::restore(config, hull, &mut file, &field::processor())?;
         Ok(IFace::new(config, state))
     }
 

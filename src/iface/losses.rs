@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 /// Distance from a stereo point, in pixels, up to which the loss is square and beyond which it is linear: about the
 /// error of such points.
-const KNEE: f64 = 0.15;
+pub(super) const KNEE: f64 = 0.15;
 
 /// Named losses of one step, `[1]` each, for the log and for naming the one that broke.
 pub struct Losses {

@@ -13,6 +13,8 @@ mod infer;
 mod losses;
 mod model;
 mod occupancy;
+#[cfg(feature = "wgpu")]
+mod on_device;
 mod schedule;
 mod state;
 mod stereo;

@@ -59,6 +59,11 @@ impl Occupancy {
         Occupancy { occupied: allowed.clone(), solid: Bitmask::filled(r, false), allowed, history }
     }
 
+    /// The cells that may ever be marched through.
+    pub fn allowed(&self) -> &Bitmask {
+        &self.allowed
+    }
+
     /// Looks at the field again. `sdf` evaluates points in field coordinates, `soft` the logarithm of the local
     /// sharpness as a share of `inv_s`; `step` is the march step.
     pub fn update(

@@ -4,14 +4,16 @@ use super::hull_start::HullDistance;
 use super::infer::IFace;
 use super::losses::{Marched, losses};
 use super::model::{GEOMETRY, shape};
+#[cfg(feature = "wgpu")]
+use super::on_device::OnDevice;
 use super::schedule::{self, march_step};
 use super::state::{FORMAT, SdfState};
 use super::stereo::{self, HostField, SurfacePoint};
 use crate::config::iface::{IfaceConfig, OccupancyRule, Start};
-use crate::field;
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::pixels::{Batch, Pixels, TrainView};
 use crate::field::training::{self, Learner, StepError, StepReport, TrainingSession};
+use crate::field::{self, Place};
 use crate::kernel::adam::AdamStep;
 use crate::kernel::march::{self, Bitmask};
 use crate::kernel::rng;
@@ -41,13 +43,13 @@ pub struct IfaceReport {
 }
 
 /// Steps in a row without a single sample after which nothing can bring the surface back.
-const LOST_AFTER: u64 = 20;
+pub(super) const LOST_AFTER: u64 = 20;
 
 /// A batch keeps at most so many times the sample budget: the ray count lags behind when cells come back.
-const MOST_BUDGETS: usize = 4;
+pub(super) const MOST_BUDGETS: usize = 4;
 
 /// Stereo points of a step: some percent of its samples.
-const STEREO_POINTS: u64 = 1024;
+pub(super) const STEREO_POINTS: u64 = 1024;
 
 /// Drops the last rays of a batch until at most `most` samples are left (one ray always stays).
 fn shorten(batch: &mut Batch, samples: &mut march::Samples, most: usize) {
@@ -62,16 +64,53 @@ fn shorten(batch: &mut Batch, samples: &mut march::Samples, most: usize) {
     batch.alpha.truncate(kept);
 }
 
-struct SdfTraining<'a> {
-    config: &'a IfaceConfig,
+/// A training on the CPU, and what one on a GPU begins and ends with.
+pub(super) struct SdfTraining<'a> {
+    pub config: &'a IfaceConfig,
     session: TrainingSession<'a>,
     hull: Option<&'a Bitmask>,
-    device: Device,
-    shape: FieldShape,
-    pixels: Pixels<'a>,
-    state: SdfState,
+    pub device: Device,
+    pub shape: FieldShape,
+    pub pixels: Pixels<'a>,
+    pub state: SdfState,
     /// Steps in a row that met no sample.
     blind: u64,
+}
+
+/// The error that rays meet nothing any more.
+pub(super) fn lost(step: u64) -> Error {
+    Error::cannot(
+        format!("the surface is lost at step {step}: no ray of {LOST_AFTER} steps met a sample"),
+        "look at the masks and poses with `tiface inspect`; lower iface.lr_network",
+    )
+}
+
+/// The optimizer's step of each group.
+pub(super) struct AdamSteps {
+    pub table: AdamStep,
+    pub network: AdamStep,
+    pub variance: AdamStep,
+}
+
+/// The optimizer's step number `step`, from 1, where learning rates are `factor` of their peak.
+pub(super) fn adam_steps(config: &IfaceConfig, factor: f64, step: u64) -> AdamSteps {
+    let network = AdamStep {
+        lr: (config.lr_network * factor) as f32,
+        beta1: 0.9,
+        beta2: 0.99,
+        epsilon: 1e-15,
+        weight_decay: config.weight_decay as f32,
+        step,
+        skip_zero: false,
+    };
+    let table = AdamStep {
+        lr: (config.lr_table * factor) as f32,
+        weight_decay: config.table_decay as f32,
+        skip_zero: config.touched_rows,
+        ..network
+    };
+    let variance = AdamStep { lr: (config.lr_variance * factor) as f32, ..network };
+    AdamSteps { table, network, variance }
 }
 
 /// Trains until `config.steps`, saving checkpoints and continuing from the one that lies in the session's folder.
@@ -83,22 +122,19 @@ pub fn train(
     config: &IfaceConfig,
     session: &TrainingSession,
 ) -> Result<(IFace, IfaceReport)> {
-    let device = field::device(session.device)?;
+    let place = field::place(session.device)?;
     let began = Instant::now();
-    // without a hull every ray may meet a sample; with one, cells reach some four beyond the outline
-    let reach = match hull {
-        Some(_) => 4.0 * 2.0 / config.occupancy_resolution.min(128) as f32,
-        None => f32::INFINITY,
+    let mut learner = SdfTraining::new(views, hull, config, session)?;
+    let (progress, warnings) = match place {
+        Place::Cpu => training::train(&mut learner, session, config.steps, config.checkpoint_s)?,
+        #[cfg(feature = "wgpu")]
+        Place::Gpu(gpu) => {
+            let mut there = OnDevice::new(learner, gpu.device);
+            let done = training::train(&mut there, session, config.steps, config.checkpoint_s)?;
+            learner = there.finish()?;
+            done
+        }
     };
-    let published = config.occupancy == OccupancyRule::Nerfacc;
-    let pixels = Pixels::new(views, reach, config.radius, config.foreground, published);
-    if pixels.count() == 0 {
-        return Err(training::no_pixels());
-    }
-    let state = SdfState::new(config, session.seed, hull, &device);
-    let shape = shape(config);
-    let mut learner = SdfTraining { config, session: *session, hull, device, shape, pixels, state, blind: 0 };
-    let (progress, warnings) = training::train(&mut learner, session, config.steps, config.checkpoint_s)?;
     let report = IfaceReport {
         steps: config.steps,
         seconds: began.elapsed().as_secs_f64(),
@@ -110,6 +146,31 @@ pub fn train(
     Ok((IFace::new(config, learner.state), report))
 }
 
+impl<'a> SdfTraining<'a> {
+    /// Before the first step.
+    pub fn new(
+        views: &'a [TrainView],
+        hull: Option<&'a Bitmask>,
+        config: &'a IfaceConfig,
+        session: &TrainingSession<'a>,
+    ) -> Result<SdfTraining<'a>> {
+        let device = field::processor();
+        // without a hull every ray may meet a sample; with one, cells reach some four beyond the outline
+        let reach = match hull {
+            Some(_) => 4.0 * 2.0 / config.occupancy_resolution.min(128) as f32,
+            None => f32::INFINITY,
+        };
+        let published = config.occupancy == OccupancyRule::Nerfacc;
+        let pixels = Pixels::new(views, reach, config.radius, config.foreground, published);
+        if pixels.count() == 0 {
+            return Err(training::no_pixels());
+        }
+        let state = SdfState::new(config, session.seed, hull, &device);
+        let shape = shape(config);
+        Ok(SdfTraining { config, session: *session, hull, device, shape, pixels, state, blind: 0 })
+    }
+}
+
 impl Learner for SdfTraining<'_> {
     const FORMAT: &'static str = FORMAT;
     const RATES: [&'static str; 2] = ["lr_network", "lr_table"];
@@ -117,14 +178,11 @@ impl Learner for SdfTraining<'_> {
     fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError> {
         let config = self.config;
         let step = progress.step;
-        let seed = self.session.seed ^ progress.salt << 32;
+        let seed = self.seed(progress);
         let shape = self.shape_at(step);
         let inv_s = self.state.model.sharpness();
         let dt = march_step(config, inv_s);
-        let band = config.occupancy == OccupancyRule::Band;
-        // a new level, and the end of the hull's fit, move the surface: look again at once
-        let level_came = config.level_every > 0 && step.is_multiple_of(config.level_every);
-        if step.is_multiple_of(config.occupancy_every) || (band && level_came) {
+        if self.looks_again(step) {
             self.update_occupancy(&shape, (seed, step), inv_s, dt);
         }
         if schedule::stereo_step(config) == Some(step) {
@@ -133,16 +191,12 @@ impl Learner for SdfTraining<'_> {
         let mut batch = self.pixels.draw(seed, step, self.state.rays, config.jitter);
         let mut samples = self.state.occupancy.march(config, dt, &batch.rays);
         let n = samples.t.len();
-        let floor = if band { 64 } else { 1 };
-        self.state.rays = schedule::next_rays(self.state.rays, n, config.samples, floor, config.max_rays);
+        self.state.rays = self.next_rays(self.state.rays, n);
         shorten(&mut batch, &mut samples, MOST_BUDGETS * config.samples);
         let n = samples.t.len();
         self.blind = if n == 0 { self.blind + 1 } else { 0 };
         if self.blind == LOST_AFTER {
-            return Err(StepError::Failed(Error::cannot(
-                format!("the surface is lost at step {step}: no ray of {LOST_AFTER} steps met a sample"),
-                "look at the masks and poses with `tiface inspect`; lower iface.lr_network",
-            )));
+            return Err(StepError::Failed(lost(step)));
         }
         let (mut square_error, mut terms) = (None, [0f32; 5]);
         // nothing in sight of these rays: no gradient, but the schedule goes on
@@ -193,19 +247,43 @@ impl Learner for SdfTraining<'_> {
 }
 
 /// Names of the losses.
-const TERMS: [&str; 5] = ["rgb", "mask", "eikonal", "sparsity", "stereo"];
+pub(super) const TERMS: [&str; 5] = ["rgb", "mask", "eikonal", "sparsity", "stereo"];
 
 /// Where the variance stays: `inv_s = exp(10 v)` within what the kernels compute with, 1e-6..=1e6. Beyond, its gradient
 /// would be zero, or infinite, and the surface would stay as sharp for ever.
-const VARIANCE: RangeInclusive<f32> = -1.38..=1.38;
+pub(super) const VARIANCE: RangeInclusive<f32> = -1.38..=1.38;
 
 impl SdfTraining<'_> {
+    /// The seed of a step: another one after a step that diverged.
+    pub fn seed(&self, progress: &TrainingProgress) -> u64 {
+        self.session.seed ^ progress.salt << 32
+    }
+
+    /// Are the cells to march through looked at before this step? A new level, and the end of the hull's fit, move the
+    /// surface: look again at once.
+    pub fn looks_again(&self, step: u64) -> bool {
+        let config = self.config;
+        let level_came = config.level_every > 0 && step.is_multiple_of(config.level_every);
+        step.is_multiple_of(config.occupancy_every) || (config.occupancy == OccupancyRule::Band && level_came)
+    }
+
+    /// The fewest rays of a step.
+    pub fn fewest_rays(&self) -> usize {
+        if self.config.occupancy == OccupancyRule::Band { 64 } else { 1 }
+    }
+
+    /// Rays of the next step, where this one's met so many samples.
+    pub fn next_rays(&self, rays: usize, samples: usize) -> usize {
+        schedule::next_rays(rays, samples, self.config.samples, self.fewest_rays(), self.config.max_rays)
+    }
+
     /// Returns the field's shape at a step (levels come in one by one).
-    fn shape_at(&self, step: u64) -> Arc<FieldShape> {
+    pub fn shape_at(&self, step: u64) -> Arc<FieldShape> {
         Arc::new(FieldShape { active: schedule::active_levels(self.config, step), ..self.shape.clone() })
     }
 
-    fn update_occupancy(&mut self, shape: &FieldShape, at: (u64, u64), inv_s: f32, dt: f32) {
+    /// Looks again at which cells may hold surface.
+    pub fn update_occupancy(&mut self, shape: &FieldShape, at: (u64, u64), inv_s: f32, dt: f32) {
         let (table, weights) = self.state.model.on_host(shape);
         let table: &[[f32; 2]] = bytemuck::cast_slice(&table);
         let distances = |x: &[[f32; 3]]| sdf::values(shape, table, &weights, x);
@@ -214,7 +292,7 @@ impl SdfTraining<'_> {
     }
 
     /// Looks for points that photographs agree on, around the surface as it is.
-    fn find_stereo(&mut self, shape: &FieldShape) {
+    pub fn find_stereo(&mut self, shape: &FieldShape) {
         let (table, weights) = self.state.model.on_host(shape);
         let field = HostField { shape, table: bytemuck::cast_slice(&table), weights: &weights };
         self.state.stereo = stereo::points(self.pixels.views(), self.config, &field, &self.state.occupancy);
@@ -244,27 +322,12 @@ impl SdfTraining<'_> {
         if !parameters[1..].iter().all(|p| p.has_finite_gradient(&gradients)) {
             return Err(StepError::NotFinite { term, value: f32::NAN, lr: config.lr_network * factor });
         }
-        let of_network = AdamStep {
-            lr: (config.lr_network * factor) as f32,
-            beta1: 0.9,
-            beta2: 0.99,
-            epsilon: 1e-15,
-            weight_decay: config.weight_decay as f32,
-            step: adam_step,
-            skip_zero: false,
-        };
-        let of_table = AdamStep {
-            lr: (config.lr_table * factor) as f32,
-            weight_decay: config.table_decay as f32,
-            skip_zero: config.touched_rows,
-            ..of_network
-        };
-        let of_variance = AdamStep { lr: (config.lr_variance * factor) as f32, ..of_network };
+        let steps = adam_steps(config, factor, adam_step);
         for p in parameters {
             let step = match p.name {
-                "table" => of_table,
-                "variance" => of_variance,
-                _ => of_network,
+                "table" => steps.table,
+                "variance" => steps.variance,
+                _ => steps.network,
             };
             p.update(&mut gradients, step);
             if p.name == "variance" {

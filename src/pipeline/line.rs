@@ -185,7 +185,7 @@ pub fn feasible(config: &Config) -> Result<()> {
         return Err(Error::usage(format!("`{key}` {problem}"), hint));
     }
     #[cfg(feature = "cpu")]
-    crate::field::device(&config.device)?;
+    crate::field::place(&config.device)?;
     Ok(())
 }
 

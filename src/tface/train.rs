@@ -4,11 +4,11 @@ use super::grow::{update_mask, upsample};
 use super::record::FORMAT;
 use super::state::VmState;
 use crate::config::{MaskLoss, MaskUse, VmBackground, VmConfig};
-use crate::field;
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::ops::{self, GridPenalty, VmBatch};
 use crate::field::pixels::{Batch, Pixels, TrainView};
 use crate::field::training::{self, Learner, StepError, StepReport, TrainingSession};
+use crate::field::{self, Place};
 use crate::image::Gray;
 use crate::kernel::adam::AdamStep;
 use crate::kernel::march::Bitmask;
@@ -96,7 +96,12 @@ pub(super) fn train_one(
     config: &VmConfig,
     session: &TrainingSession,
 ) -> Result<TfaceReport> {
-    let device = field::device(session.device)?;
+    let device = match field::place(session.device)? {
+        Place::Cpu => field::processor(),
+        // fields of this kind are learned on the processor for now
+        #[cfg(feature = "wgpu")]
+        Place::Gpu(_) => field::processor(),
+    };
     let began = Instant::now();
     let state = VmState::new(config, session.seed, bounds, hull, &device);
     let mut learner =

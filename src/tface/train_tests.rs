@@ -170,7 +170,7 @@ fn published_rates_are_reproduced() {
 
 #[test]
 fn upsampling_starts_the_rates_again_from_the_next_step() {
-    let device = crate::field::device("cpu").unwrap();
+    let device = crate::field::processor();
     let config = config();
     let mut state = VmState::new(&config, 1, [[-1.0; 3], [1.0; 3]], None, &device);
     assert_eq!(state.size, [16; 3]);

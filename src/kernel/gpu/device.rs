@@ -1,11 +1,12 @@
 //! A device, its memory, and what it was asked to do.
 
+use crate::{Error, Result};
 use bytemuck::Pod;
 use cubecl::device::{WgpuBackend, WgpuDevice, WgpuDeviceKind};
 use cubecl::features::AtomicUsage;
 use cubecl::ir::{ElemType, FloatKind, Type};
 use cubecl::prelude::{BufferArg, Client, CubeCount};
-use cubecl::server::Handle;
+use cubecl::server::{Handle, ServerError};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// How threads add to one float.
@@ -47,25 +48,56 @@ impl Buffer {
     }
 }
 
-impl Device {
-    /// The adapters of this machine, the fastest kind first; software ones only where asked for.
-    pub fn adapters(software: bool) -> Vec<cubecl::Device> {
-        use WgpuDeviceKind::{Cpu, DiscreteGpu, IntegratedGpu, VirtualGpu};
-        let kinds = [DiscreteGpu(0), IntegratedGpu(0), VirtualGpu(0), Cpu];
-        let apis = [WgpuBackend::Vulkan, WgpuBackend::Metal, WgpuBackend::Dx12];
-        let like =
-            |kind: &WgpuDeviceKind, api| cubecl::Device::from(WgpuDevice::new(kind.clone()).on(api)).to_id();
-        let wanted = kinds.iter().filter(|kind| software || **kind != Cpu);
-        wanted
-            .flat_map(|kind| apis.map(|api| cubecl::Device::enumerate(like(kind, api))))
-            .flatten()
-            .map(cubecl::Device::from_id)
-            .collect()
-    }
+/// What a device offers.
+#[derive(Clone, Copy, Debug)]
+pub struct DeviceLimits {
+    /// Bytes of memory; none where the driver does not say.
+    pub memory: Option<u64>,
+    /// Bytes of the largest buffer.
+    pub largest_buffer: u64,
+    /// Bytes of memory that a group of threads shares.
+    pub shared: usize,
+}
 
+/// A way to a GPU: an adapter as one API offers it.
+pub struct Adapter {
+    device: cubecl::Device,
+    /// `vulkan`, `metal` or `dx12`.
+    pub api: &'static str,
+    /// `discrete`, `integrated`, `virtual` or `software`.
+    pub kind: &'static str,
+    /// Does the processor do the work?
+    pub software: bool,
+}
+
+impl Adapter {
+    /// All of this machine, the fastest kind first.
+    pub fn all() -> Vec<Adapter> {
+        use WgpuDeviceKind::{Cpu, DiscreteGpu, IntegratedGpu, VirtualGpu};
+        let kinds = [
+            (DiscreteGpu(0), "discrete"),
+            (IntegratedGpu(0), "integrated"),
+            (VirtualGpu(0), "virtual"),
+            (Cpu, "software"),
+        ];
+        let apis =
+            [(WgpuBackend::Vulkan, "vulkan"), (WgpuBackend::Metal, "metal"), (WgpuBackend::Dx12, "dx12")];
+        let mut all = Vec::new();
+        for (like, kind) in kinds {
+            for (backend, api) in apis {
+                let id = cubecl::Device::from(WgpuDevice::new(like.clone()).on(backend)).to_id();
+                let found = cubecl::Device::enumerate(id).into_iter().map(cubecl::Device::from_id);
+                all.extend(found.map(|device| Adapter { device, api, kind, software: like == Cpu }));
+            }
+        }
+        all
+    }
+}
+
+impl Device {
     /// Opens an adapter, with the atomics it does best.
-    pub fn open(adapter: &cubecl::Device) -> Device {
-        let client = adapter.client();
+    pub fn open(adapter: &Adapter) -> Device {
+        let client = adapter.device.client();
         let float = Type::atomic(ElemType::Float(FloatKind::F32));
         let native = client.properties().atomic_type_usage(float).contains(AtomicUsage::Add);
         let atomics = if native { Atomics::Native } else { Atomics::Exchange };
@@ -75,6 +107,27 @@ impl Device {
     /// As the adapter names itself.
     pub fn name(&self) -> &str {
         &self.client.properties().identity.name
+    }
+
+    /// What the driver compiles for: other words after an update of it.
+    pub fn driver(&self) -> &str {
+        &self.client.properties().identity.fingerprint
+    }
+
+    /// Where the card is plugged in; none where there is no card.
+    pub fn card(&self) -> Option<String> {
+        let physical = self.client.properties().identity.physical.as_ref()?;
+        physical.pci_address.as_ref().map(|address| format!("{address:?}"))
+    }
+
+    /// What it offers.
+    pub fn limits(&self) -> DeviceLimits {
+        let properties = self.client.properties();
+        DeviceLimits {
+            memory: properties.memory.max_memory(),
+            largest_buffer: properties.memory.max_page_size,
+            shared: properties.hardware.max_shared_memory_size,
+        }
     }
 
     /// How this device adds.
@@ -108,10 +161,33 @@ impl Device {
     }
 
     /// Waits for the device and copies values back.
-    pub fn read<T: Pod>(&self, buffer: &Buffer) -> Vec<T> {
+    ///
+    /// # Errors
+    ///
+    /// Where the device does not answer, or could not do what was asked of it since the last call: it is lost, or has
+    /// no memory left. Of kind [`NotNow`](crate::ErrorKind::NotNow): nothing on the host is harmed.
+    pub fn fetch<T: Pod>(&self, buffer: &Buffer) -> Result<Vec<T>> {
         self.readbacks.fetch_add(1, Ordering::Relaxed);
-        let bytes = self.client.read_one_unchecked(buffer.handle.clone());
-        bytemuck::pod_collect_to_vec(&bytes[..buffer.words * 4])
+        let read = self.client.read_one(buffer.handle.clone());
+        let bytes = read.map_err(|e| self.failed(&e))?;
+        Ok(bytemuck::pod_collect_to_vec(&bytes[..buffer.words * 4]))
+    }
+
+    /// As [`Device::fetch`].
+    ///
+    /// # Panics
+    ///
+    /// Where that fails.
+    pub fn read<T: Pod>(&self, buffer: &Buffer) -> Vec<T> {
+        self.fetch(buffer).expect("the device answers")
+    }
+
+    fn failed(&self, why: &ServerError) -> Error {
+        let why = why.to_string();
+        let first = why.lines().next().unwrap_or_default();
+        let hint =
+            "repeat the command: it goes on from the last checkpoint; with less memory if that was short";
+        Error::not_now(format!("the device `{}` failed: {first}", self.name()), hint)
     }
 
     /// What the next launch runs on; counts it.
@@ -136,11 +212,14 @@ pub(super) fn groups(count: usize) -> CubeCount {
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use super::super::self_test::worst;
     use super::*;
+
+    pub(crate) use super::super::self_test::planes;
 
     /// A device to test on, a software one too; without any, says so.
     pub fn device() -> Option<Device> {
-        let found = Device::adapters(true).first().map(Device::open);
+        let found = Adapter::all().first().map(Device::open);
         if found.is_none() {
             println!("skipped: kernels on a GPU, for no adapter is here (Mesa's lavapipe would do)");
         }
@@ -159,21 +238,9 @@ pub(crate) mod tests {
     /// Asserts that two arrays agree to `tolerance` of the larger of a value and the mean magnitude.
     pub fn agree(what: &str, got: &[f32], want: &[f32], tolerance: f32) {
         assert_eq!(got.len(), want.len(), "{what}");
-        let mean = want.iter().map(|v| v.abs()).sum::<f32>() / want.len().max(1) as f32;
-        let error = |(g, w): (&f32, &f32)| (g - w).abs() / w.abs().max(mean).max(f32::MIN_POSITIVE);
-        let worst =
-            got.iter().zip(want).map(error).fold(0f32, |a, b| if b > a || b.is_nan() { b } else { a });
+        let worst = worst(got, want);
         println!("{what}: {worst:.1e} of {tolerance:.0e}");
         assert!(worst <= tolerance, "{what}: {worst:.1e}");
-    }
-
-    /// Rows `[n, W]` as planes `[W, capacity]`.
-    pub fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<f32> {
-        let mut out = vec![0.0; W * capacity];
-        for (i, row) in rows.iter().enumerate() {
-            (0..W).for_each(|k| out[k * capacity + i] = row[k]);
-        }
-        out
     }
 
     #[test]

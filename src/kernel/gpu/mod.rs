@@ -20,10 +20,11 @@ mod points;
 mod rng;
 mod schedule;
 mod sdf;
+mod self_test;
 mod tile;
 
 pub use adam::{Gate, adam};
-pub use device::{Atomics, Buffer, Device};
+pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits};
 pub use draw::{Batch, Drawing, DrawnView, Photographs};
 pub use hash::Grid;
 pub use losses::{LossWeights, Losses};
@@ -34,6 +35,7 @@ pub use occupancy::{Band, Occupancy};
 pub use points::SurfacePoints;
 pub use schedule::{Pitch, RayBudget, Schedule};
 pub use sdf::Sdf;
+pub use self_test::{Check, self_test};
 
 #[cfg(test)]
 pub(crate) use device::tests;

@@ -2,6 +2,7 @@
 
 use super::device::{Buffer, Device, groups};
 use super::sdf::Sdf;
+use crate::Result;
 use crate::kernel::march::Bitmask;
 use cubecl::prelude::*;
 
@@ -145,14 +146,14 @@ impl Occupancy {
     }
 
     /// Waits for the device and reads both: the one to march through and the solid one, empty where there is none.
-    pub fn read(&self, device: &Device) -> [Bitmask; 2] {
+    pub fn read(&self, device: &Device) -> Result<[Bitmask; 2]> {
         let mut masks = [Bitmask::filled(self.resolution, false), Bitmask::filled(self.resolution, false)];
         for (mask, there) in masks.iter_mut().zip([Some(&self.mask), self.solid.as_ref()]) {
             let Some(there) = there else { continue };
-            let words = device.read::<u32>(there);
+            let words = device.fetch::<u32>(there)?;
             mask.bits = words.as_chunks().0.iter().map(|[a, b]| *a as u64 | (*b as u64) << 32).collect();
         }
-        masks
+        Ok(masks)
     }
 }
 

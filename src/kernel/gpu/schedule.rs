@@ -1,6 +1,8 @@
 //! What a step takes from the one before it, without asking the host: how many rays, and how long a march step is.
 
 use super::device::{Buffer, Device};
+use super::losses::TERMS;
+use crate::Result;
 use cubecl::prelude::*;
 
 /// How long a march step is.
@@ -62,6 +64,47 @@ fn advance(
     }
 }
 
+/// Everything that the host asks for at once.
+#[cube(launch)]
+fn collect(
+    losses: &[f32],
+    variance: &[f32],
+    count: &[u32],
+    rays: &[u32],
+    blind: &[u32],
+    broken: &[u32],
+    out: &mut [u32],
+) {
+    let i = ABSOLUTE_POS;
+    if i < losses.len() {
+        out[i] = u32::reinterpret(losses[i]);
+    }
+    if i == 0 {
+        out[losses.len()] = u32::reinterpret(variance[0]);
+        out[losses.len() + 1] = count[1];
+        out[losses.len() + 2] = rays[0];
+        out[losses.len() + 3] = blind[0];
+        out[losses.len() + 4] = broken[0];
+    }
+}
+
+/// What a step came to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Figures {
+    /// Its losses, in the order of [`Losses::sums`](super::Losses::sums).
+    pub losses: [f32; TERMS],
+    /// NeuS' variance v behind it: the sharpness is exp(10 v).
+    pub variance: f32,
+    /// Samples, as many as there would have been with room for all.
+    pub samples: u32,
+    /// Rays.
+    pub rays: u32,
+    /// Steps in a row before it that met no sample.
+    pub blind: u32,
+    /// Was a gradient not finite, in this step or before?
+    pub broken: bool,
+}
+
 /// What a step takes from the one before it.
 pub struct Schedule {
     pitch_rule: Pitch,
@@ -71,7 +114,8 @@ pub struct Schedule {
     /// `[1]`: length of its march step.
     pub pitch: Buffer,
     /// `[1]`: steps in a row before it that met no sample.
-    pub blind: Buffer,
+    blind: Buffer,
+    figures: Buffer,
 }
 
 impl Schedule {
@@ -83,6 +127,7 @@ impl Schedule {
             rays: device.upload(&[rays as u32]),
             pitch: device.zeros(1),
             blind: device.zeros(1),
+            figures: device.zeros(TERMS + 5),
         }
     }
 
@@ -112,6 +157,39 @@ impl Schedule {
             u32::from(first),
         );
     }
+
+    /// Waits for the device; what the last step came to, in one readback.
+    pub fn figures(
+        &self,
+        device: &Device,
+        losses: &Buffer,
+        variance: &Buffer,
+        count: &Buffer,
+        broken: &Buffer,
+    ) -> Result<Figures> {
+        assert_eq!(losses.words(), TERMS);
+        collect::launch(
+            device.launch(),
+            CubeCount::new_single(),
+            CubeDim::new_1d(16),
+            losses.arg(),
+            variance.arg(),
+            count.arg(),
+            self.rays.arg(),
+            self.blind.arg(),
+            broken.arg(),
+            self.figures.arg(),
+        );
+        let words = device.fetch::<u32>(&self.figures)?;
+        Ok(Figures {
+            losses: std::array::from_fn(|i| f32::from_bits(words[i])),
+            variance: f32::from_bits(words[TERMS]),
+            samples: words[TERMS + 1],
+            rays: words[TERMS + 2],
+            blind: words[TERMS + 3],
+            broken: words[TERMS + 4] != 0,
+        })
+    }
 }
 
 #[cfg(test)]
@@ -138,16 +216,20 @@ mod tests {
         // without samples nothing changes, but is counted
         let none = device.upload(&[0u32, 0]);
         (0..3).for_each(|_| schedule.advance(&device, &device.upload(&[1e-3f32]), &none, false));
-        assert_eq!(
-            (device.read::<u32>(&schedule.rays)[0], device.read::<u32>(&schedule.blind)[0]),
-            (rays, 3)
-        );
+        let losses: [f32; TERMS] = std::array::from_fn(|i| i as f32);
+        let there = device.upload(&losses);
+        let figures = |count: &Buffer, broken: u32| {
+            schedule.figures(&device, &there, &inv_s, count, &device.upload(&[broken])).unwrap()
+        };
+        let (samples, blind) = (0, 3);
+        let want = Figures { losses, variance: 100.0, samples, rays, blind, broken: true };
+        assert_eq!(figures(&none, 1), want);
         assert_eq!(device.read::<f32>(&schedule.pitch), [0.05]);
         // few and many samples stay within the bounds
         for (wanted, want) in [(1u32, 8192), (u32::MAX, 7372)] {
             schedule.advance(&device, &inv_s, &device.upload(&[0, wanted]), false);
             assert_eq!(device.read::<u32>(&schedule.rays), [want]);
         }
-        assert_eq!(device.read::<u32>(&schedule.blind), [0]);
+        assert_eq!(figures(&none, 0).blind, 0);
     }
 }

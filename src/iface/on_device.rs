@@ -1,0 +1,350 @@
+//! Training of `iface` on a GPU: the step of [`super::train`] with nobody waiting for the device.
+//!
+//! Rays are drawn, marched, shaded, compared and applied there; the host asks for the figures of one step in
+//! [`READ_EVERY`]. What a checkpoint holds is the same as on the CPU, so that either goes on from it.
+
+use super::losses::KNEE;
+use super::model::SdfModel;
+use super::schedule;
+use super::state::{FORMAT, SdfState};
+use super::train::{LOST_AFTER, MOST_BUDGETS, STEREO_POINTS, SdfTraining, TERMS, VARIANCE, adam_steps, lost};
+use crate::Result;
+use crate::config::iface::{Background, IfaceConfig, OccupancyRule};
+use crate::field::checkpoint::{Checkpoint, TrainingProgress};
+use crate::field::parameters::Parameter;
+use crate::field::training::{Learner, StepError, StepReport};
+use crate::kernel::gpu::{
+    self, Band, Batch, Buffer, Device, Gate, LossWeights, Losses, Neus, Norm, Occupancy, Photographs, Pitch,
+    RayBudget, Rays, Samples, Schedule, Sdf, SurfacePoints,
+};
+use crate::kernel::mlp::TILE;
+
+/// Steps between two looks at losses and flags: what goes wrong is known that much later.
+const READ_EVERY: u64 = 50;
+
+/// Values, moments and gradient of one group of parameters.
+struct Group {
+    state: [Buffer; 3],
+    gradient: Buffer,
+}
+
+impl Group {
+    fn new(device: &Device, parts: &[Parameter]) -> Group {
+        let mut state = [Vec::new(), Vec::new(), Vec::new()];
+        for p in parts {
+            let values = p.state();
+            state.iter_mut().zip(values).for_each(|(all, own)| all.extend(own));
+        }
+        let gradient = device.zeros(state[0].len());
+        Group { state: state.map(|v| device.upload(&v)), gradient }
+    }
+
+    /// Gives parameters of these shapes what is there now.
+    fn read(&self, device: &Device, parts: &mut [Parameter]) -> Result<()> {
+        let [values, first, second] = &self.state;
+        let [values, first, second] = [device.fetch(values)?, device.fetch(first)?, device.fetch(second)?];
+        let mut at = 0;
+        for p in parts {
+            let own = at..at + p.len();
+            p.set([&values, &first, &second].map(|v: &Vec<f32>| v[own.clone()].to_vec()));
+            at = own.end;
+        }
+        Ok(())
+    }
+
+    fn value(&self) -> &Buffer {
+        &self.state[0]
+    }
+
+    fn parts(&self) -> [&Buffer; 3] {
+        self.state.each_ref()
+    }
+}
+
+/// What a training has on its device.
+struct There {
+    table: Group,
+    network: Group,
+    variance: Group,
+    flat: Buffer,
+    g_flat: Buffer,
+    inv_s: Buffer,
+    g_inv_s: Buffer,
+    broken: Buffer,
+    schedule: Schedule,
+    occupancy: Occupancy,
+    /// Has a step been made since?
+    stepped: bool,
+}
+
+pub(super) struct OnDevice<'a> {
+    /// What the CPU trains with; its state is older than that on the device.
+    host: SdfTraining<'a>,
+    device: Device,
+    photographs: Photographs,
+    batch: Batch,
+    samples: Samples,
+    points: SurfacePoints,
+    norm: Norm,
+    sdf: Sdf,
+    neus: Neus,
+    losses: Losses,
+    band: Option<Band>,
+    there: There,
+}
+
+impl<'a> OnDevice<'a> {
+    /// Moves a training to a device.
+    pub fn new(host: SdfTraining<'a>, device: Device) -> OnDevice<'a> {
+        let config = host.config;
+        let rays = config.rays.max(config.max_rays);
+        let points = if config.stereo > 0.0 { STEREO_POINTS as usize } else { 1 };
+        let capacity = (MOST_BUDGETS * config.samples + points).next_multiple_of(TILE);
+        let weights = LossWeights {
+            rgb_mse: config.rgb_mse as f32,
+            rgb_l1: config.rgb_l1 as f32,
+            rgb_sample: config.rgb_sample as f32,
+            mask: if host.pixels.masked { config.mask as f32 } else { 0.0 },
+            eikonal: config.eikonal as f32,
+            sparsity: config.sparsity as f32,
+            sparsity_scale: config.sparsity_scale as f32,
+        };
+        let random = config.background == Background::Random;
+        let allowed = host.state.occupancy.allowed();
+        let band = (config.occupancy == OccupancyRule::Band)
+            .then(|| Band::new(&device, allowed, config.band, config.soften as f32));
+        OnDevice {
+            photographs: host.pixels.on_device(&device, config.jitter, random),
+            batch: Batch::new(&device, rays),
+            samples: Samples::new(&device, rays, capacity),
+            points: SurfacePoints::new(&device, points, config.stereo as f32, KNEE as f32),
+            norm: Norm::new(&device, host.shape.layout()),
+            sdf: Sdf::new(&device, &host.shape, capacity),
+            neus: Neus::new(&device, rays, capacity),
+            losses: Losses::new(&device, weights, rays, capacity),
+            band,
+            there: There::new(&device, &host),
+            host,
+            device,
+        }
+    }
+
+    /// Ends the training on the device: what the CPU would have come to.
+    pub fn finish(mut self) -> Result<SdfTraining<'a>> {
+        self.host.state = self.pulled()?;
+        Ok(self.host)
+    }
+
+    /// Waits for the device; the state as it is there.
+    fn pulled(&self) -> Result<SdfState> {
+        let (host, there, config) = (&self.host, &self.there, self.host.config);
+        let mut model = SdfModel::new(config, 0, &host.device);
+        let [table, network @ .., variance] = &mut model.0;
+        there.table.read(&self.device, std::slice::from_mut(table))?;
+        there.network.read(&self.device, network)?;
+        there.variance.read(&self.device, std::slice::from_mut(variance))?;
+        variance.keep_within(VARIANCE);
+        let mut occupancy = host.state.occupancy.clone();
+        [occupancy.occupied, occupancy.solid] = there.occupancy.read(&self.device)?;
+        let mut rays = self.device.fetch::<u32>(&there.schedule.rays)?[0] as usize;
+        if there.stepped {
+            let wanted = self.device.fetch::<u32>(&self.samples.count)?[1] as usize;
+            rays = host.next_rays(rays, wanted);
+        }
+        Ok(SdfState { model, occupancy, rays, stereo: host.state.stereo.clone() })
+    }
+
+    /// Copies the host's state to the device.
+    fn push(&mut self) {
+        self.there = There::new(&self.device, &self.host);
+        self.push_points();
+    }
+
+    fn push_points(&mut self) {
+        let rows: Vec<[f32; 5]> = self.host.state.stereo.iter().map(|p| p.row()).collect();
+        self.points.put(&self.device, &rows);
+    }
+
+    fn update_occupancy(&mut self, (seed, step): (u64, u64)) -> Result<()> {
+        let there = &self.there;
+        if let Some(band) = &self.band {
+            let field = [there.table.value(), &there.flat, &there.inv_s];
+            let over = [&self.samples.x, &self.samples.direction];
+            band.update(&self.device, &there.occupancy, &self.sdf, field, over);
+            return Ok(());
+        }
+        // the published rule draws its cells by what is occupied: it looks at the field on the host
+        self.host.state = self.pulled()?;
+        let inv_s = self.host.state.model.sharpness();
+        let shape = self.host.shape_at(step);
+        let dt = schedule::march_step(self.host.config, inv_s);
+        self.host.update_occupancy(&shape, (seed, step), inv_s, dt);
+        self.there.occupancy = there_occupancy(&self.device, &self.host);
+        Ok(())
+    }
+
+    /// What the last step came to.
+    fn report(&self, lr: f64, step: u64) -> Result<StepReport, StepError> {
+        let there = &self.there;
+        let sums = self.losses.sums(&self.device, &self.samples.count, self.points.terms());
+        let count = &self.samples.count;
+        let figures =
+            there.schedule.figures(&self.device, sums, there.variance.value(), count, &there.broken)?;
+        let [mse, _, _, mask, eikonal, sparsity, stereo] = figures.losses;
+        let config = self.host.config;
+        let only = |weight: f64, value: f32| if weight > 0.0 { value } else { 0.0 };
+        let mask = only(if self.host.pixels.masked { config.mask } else { 0.0 }, mask);
+        let terms = [mse, mask, eikonal, only(config.sparsity, sparsity), only(config.stereo, stereo)];
+        if figures.broken {
+            let term = "gradient of the";
+            return Err(StepError::NotFinite { term, value: f32::NAN, lr });
+        }
+        if figures.blind as u64 >= LOST_AFTER {
+            return Err(StepError::Failed(lost(step)));
+        }
+        if figures.samples == 0 {
+            return Ok(StepReport { square_error: None, figures: Vec::new() });
+        }
+        for (term, value) in TERMS.into_iter().zip(terms) {
+            if !value.is_finite() {
+                return Err(StepError::NotFinite { term, value, lr });
+            }
+        }
+        let mut named: Vec<_> = TERMS.into_iter().zip(terms.map(|v| v as f64)).collect();
+        named.extend([
+            ("inv_s", (10.0 * figures.variance as f64).exp()),
+            ("rays", self.host.next_rays(figures.rays as usize, figures.samples as usize) as f64),
+            ("samples", figures.samples as f64),
+        ]);
+        Ok(StepReport { square_error: Some(mse), figures: named })
+    }
+
+    /// Launches the step; waits for nothing.
+    fn launch(&self, seed: (u64, u64), factor: f64) {
+        let device = &self.device;
+        let (there, config) = (&self.there, self.host.config);
+        let samples = &self.samples;
+        let (rays, offsets, count) = (&self.batch, &samples.offsets, &samples.count);
+        let step = seed.1;
+        there.schedule.advance(device, &there.inv_s, count, !there.stepped);
+        self.photographs.draw(device, seed, &there.schedule.rays, rays);
+        samples.march(device, &there.occupancy, rays, &there.schedule.pitch, usize::MAX, self.points.most());
+        let both = self.points.append(device, seed, samples);
+        let (x, toward) = (&samples.x, &samples.direction);
+        let field = self.sdf.forward(device, there.table.value(), &there.flat, x, toward, both);
+        let anneal = schedule::anneal(config, step);
+        let bundle = Rays { offsets, direction: &rays.direction, t: &samples.t, dt: &samples.dt };
+        let composed = self.neus.forward(device, bundle, field, &there.inv_s, anneal);
+        let g_out = self.losses.of_rays(device, composed, rays, offsets);
+        let g_field = self.neus.backward(device, bundle, field, &there.inv_s, anneal, g_out, &there.g_inv_s);
+        self.losses.of_samples(device, field, count, g_field);
+        self.points.losses(device, field, count, g_field);
+        let (table, network, variance) = (&there.table, &there.network, &there.variance);
+        self.sdf.backward(device, x, toward, both, g_field, &table.gradient, &there.g_flat);
+        let from = [&there.g_flat, &there.g_inv_s];
+        let into = [&network.gradient, &variance.gradient];
+        self.norm.backward(device, network.value(), &there.inv_s, from, into, &there.broken);
+        let gate = Gate { count, broken: &there.broken };
+        let steps = adam_steps(config, factor, step + 1);
+        for (group, step) in
+            [table, network, variance].into_iter().zip([steps.table, steps.network, steps.variance])
+        {
+            gpu::adam(device, group.parts(), &group.gradient, &step, gate);
+        }
+    }
+}
+
+fn there_occupancy(device: &Device, host: &SdfTraining) -> Occupancy {
+    let occupancy = &host.state.occupancy;
+    let solid = (host.config.occupancy == OccupancyRule::Band).then_some(&occupancy.solid);
+    Occupancy::new(device, &occupancy.occupied, solid, host.config.radius)
+}
+
+/// How march steps follow the sharpness: see [`schedule::march_step`].
+fn pitch(config: &IfaceConfig) -> Pitch {
+    match config.occupancy {
+        OccupancyRule::Nerfacc => Pitch::Constant(schedule::march_step(config, 1.0)),
+        OccupancyRule::Band => {
+            Pitch::OfSharpness { units: config.march, min: config.min_step, max: config.max_step }
+        }
+    }
+}
+
+impl There {
+    fn new(device: &Device, host: &SdfTraining) -> There {
+        let [table, network @ .., variance] = &host.state.model.0;
+        let flat = host.shape.layout().len();
+        let config = host.config;
+        let budget = RayBudget { samples: config.samples, min: host.fewest_rays(), max: config.max_rays };
+        There {
+            table: Group::new(device, std::slice::from_ref(table)),
+            network: Group::new(device, network),
+            variance: Group::new(device, std::slice::from_ref(variance)),
+            flat: device.zeros(flat),
+            g_flat: device.zeros(flat),
+            inv_s: device.zeros(1),
+            g_inv_s: device.zeros(1),
+            broken: device.zeros(1),
+            schedule: Schedule::new(device, pitch(config), budget, host.state.rays),
+            occupancy: there_occupancy(device, host),
+            stepped: false,
+        }
+    }
+}
+
+impl Learner for OnDevice<'_> {
+    const FORMAT: &'static str = FORMAT;
+    const RATES: [&'static str; 2] = SdfTraining::RATES;
+
+    fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError> {
+        let config = self.host.config;
+        let step = progress.step;
+        let seed = (self.host.seed(progress), step);
+        let factor = schedule::learning_rate(config, step);
+        self.sdf.activate(schedule::active_levels(config, step));
+        let range = [*VARIANCE.start(), *VARIANCE.end()];
+        let there = &self.there;
+        self.norm.forward(
+            &self.device,
+            there.network.value(),
+            there.variance.value(),
+            range,
+            &there.flat,
+            &there.inv_s,
+        );
+        if self.host.looks_again(step) {
+            self.update_occupancy(seed)?;
+        }
+        if schedule::stereo_step(config) == Some(step) {
+            self.host.state = self.pulled()?;
+            let shape = self.host.shape_at(step);
+            self.host.find_stereo(&shape);
+            self.push_points();
+        }
+        self.launch(seed, factor);
+        self.there.stepped = true;
+        if (step + 1).is_multiple_of(READ_EVERY) || step + 1 == config.steps {
+            return self.report(config.lr_network * factor, step);
+        }
+        Ok(StepReport { square_error: None, figures: Vec::new() })
+    }
+
+    fn save(&self, progress: &TrainingProgress, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {
+        let lr = self.host.config.lr_network * schedule::learning_rate(self.host.config, progress.step);
+        if self.device.fetch::<u32>(&self.there.broken)?[0] != 0 {
+            return Err(StepError::NotFinite { term: "gradient of the", value: f32::NAN, lr });
+        }
+        self.pulled()?.save(into);
+        Ok(())
+    }
+
+    fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
+        self.host.restore(from)?;
+        self.push();
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+#[path = "on_device_tests.rs"]
+mod tests;

@@ -1,0 +1,200 @@
+//! Training on a device against training on the CPU: an analytic ball.
+
+use super::{OnDevice, READ_EVERY};
+use crate::config::Preset;
+use crate::config::iface::{IfaceConfig, Start};
+use crate::field::ball::{StopAfter, hull, temporary, textured_views};
+use crate::field::checkpoint::TrainingProgress;
+use crate::field::pixels::TrainView;
+use crate::field::training::{Learner, TrainingSession};
+use crate::geom::Ray;
+use crate::iface::train::SdfTraining;
+use crate::iface::{IFace, IfaceReport, train};
+use crate::kernel::gpu::tests::device;
+use crate::{Monitor, Quiet, Result};
+use glam::Vec2;
+use std::path::Path;
+use std::sync::Mutex;
+
+fn config() -> IfaceConfig {
+    IfaceConfig {
+        steps: 200,
+        rays: 200,
+        max_rays: 512,
+        samples: 2048,
+        levels: 6,
+        log2_table: 12,
+        occupancy_resolution: 32,
+        level_every: 30,
+        anneal_end: 50,
+        warmup: 20,
+        min_step: 0.03,
+        ..IfaceConfig::preset(Preset::Draft)
+    }
+}
+
+/// Named figures of every step that has some.
+#[derive(Default)]
+struct Figures(Mutex<Vec<(u64, Vec<(String, f64)>)>>);
+
+impl Monitor for Figures {
+    fn step(&self, step: u64, _: u64, figures: &[(&str, f64)]) {
+        let named = figures.iter().map(|(name, value)| (name.to_string(), *value)).collect();
+        self.0.lock().unwrap().push((step, named));
+    }
+    fn stop(&self) -> bool {
+        false
+    }
+}
+
+fn on<'a>(device: &'a str, dir: &'a Path, monitor: &'a dyn Monitor) -> TrainingSession<'a> {
+    TrainingSession { stage: "iface", seed: 3, device, dir, identity: "ball", monitor }
+}
+
+fn learned(
+    views: &[TrainView],
+    config: &IfaceConfig,
+    session: &TrainingSession,
+) -> Result<(IFace, IfaceReport)> {
+    train(views, Some(&hull()), config, session)
+}
+
+/// Error of a view, dB.
+fn psnr(face: &IFace, view: &TrainView) -> f64 {
+    let (w, h) = (view.camera.width, view.camera.height);
+    let pixel = |i: u32| Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
+    let rays: Vec<Ray> = (0..w * h).map(|i| view.camera.ray(pixel(i)).unwrap()).collect();
+    let alpha = &view.mask.as_ref().unwrap().values;
+    let error = |(i, seen): (usize, &crate::geom::RayResult)| -> f64 {
+        let a = alpha[i] as f64 / 255.0;
+        (0..3).map(|c| (seen.color[c] as f64 - a * view.photo.rgb[i][c] as f64 / 255.0).powi(2)).sum()
+    };
+    let all: f64 = face.render(&rays).iter().enumerate().map(error).sum();
+    -10.0 * (all / (3 * w * h) as f64).log10()
+}
+
+#[test]
+fn losses_and_views_are_those_of_the_cpu() {
+    if device().is_none() {
+        return;
+    }
+    let views = textured_views();
+    let config = config();
+    let both = ["cpu", "wgpu:0"].map(|device| {
+        let (dir, figures) = (temporary(), Figures::default());
+        let (face, report) = learned(&views, &config, &on(device, dir.path(), &figures)).unwrap();
+        assert_eq!(report.warnings, Vec::<String>::new());
+        (psnr(&face, &views[4]), figures.0.into_inner().unwrap(), report)
+    });
+    let [(cpu, want, _), (there, got, _)] = both;
+    println!("{cpu:.2} dB on the CPU, {there:.2} dB on the device");
+    assert!((cpu - there).abs() < 0.2, "{cpu} {there}");
+    // what is minimized; single terms of single batches drift apart sooner, as they do between any two orders of sums
+    let total = |figures: &[(String, f64)]| -> f64 {
+        let weights = [
+            ("rgb", config.rgb_mse),
+            ("mask", config.mask),
+            ("eikonal", config.eikonal),
+            ("stereo", config.stereo),
+        ];
+        let value = |name: &str| figures.iter().find(|(n, _)| n == name).unwrap().1;
+        weights.into_iter().map(|(name, weight)| weight * value(name)).sum()
+    };
+    let mut looked = 0;
+    for (step, figures) in got.iter().filter(|(_, figures)| figures.len() > 1) {
+        let on_cpu = &want.iter().find(|(s, _)| s == step).unwrap().1;
+        println!("step {step}: {figures:.5?}, on the CPU {on_cpu:.5?}");
+        let (got, want) = (total(figures), total(on_cpu));
+        assert!((got - want).abs() <= 0.01 * want, "step {step}: {got} {want}");
+        looked += 1;
+    }
+    assert_eq!(looked, 4);
+}
+
+#[test]
+fn a_training_goes_on_there_and_back() {
+    if device().is_none() {
+        return;
+    }
+    let views = textured_views();
+    let config = IfaceConfig { steps: 90, start: Start::Sphere, ..config() };
+    let run =
+        |dir: &Path, device: &str, monitor: &dyn Monitor| learned(&views, &config, &on(device, dir, monitor));
+    let (alone, moved) = (temporary(), temporary());
+    let (want, _) = run(alone.path(), "cpu", &Quiet).unwrap();
+    // points are looked for at step 54
+    for (device, steps) in [("cpu", 20), ("wgpu:0", 20), ("cpu", 20), ("wgpu:0", 15)] {
+        let stopped = run(moved.path(), device, &StopAfter::new(steps)).err().unwrap();
+        assert!(stopped.to_string().contains("saved at step"), "{stopped}");
+    }
+    let (got, report) = run(moved.path(), "cpu", &Quiet).unwrap();
+    assert_eq!(report.warnings, Vec::<String>::new());
+    let (want, got) = (psnr(&want, &views[4]), psnr(&got, &views[4]));
+    println!("{want:.2} dB alone, {got:.2} dB on the CPU and the device in turn");
+    assert!((want - got).abs() < 0.2, "{want} {got}");
+}
+
+#[test]
+fn a_step_waits_for_nothing() {
+    if device().is_none() {
+        return;
+    }
+    let views = textured_views();
+    let config = IfaceConfig { start: Start::Sphere, stereo: 0.0, occupancy_every: 1 << 20, ..config() };
+    let config = IfaceConfig { level_every: 0, ..config };
+    let (hull, dir) = (hull(), temporary());
+    let session = on("wgpu:0", dir.path(), &Quiet);
+    let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
+    let mut there = OnDevice::new(host, device().unwrap());
+    there.restore(None).ok().unwrap();
+    let mut progress = TrainingProgress { step: 1, ..TrainingProgress::default() };
+    let before = there.device.counts();
+    for _ in 0..READ_EVERY {
+        there.step(&progress).ok().unwrap();
+        progress.step += 1;
+    }
+    let after = there.device.counts();
+    let (launches, readbacks) = (after.0 - before.0, after.1 - before.1);
+    println!("{launches} launches and {readbacks} readbacks in {READ_EVERY} steps");
+    assert!(launches as u64 <= 40 * READ_EVERY && readbacks <= 1, "{launches} {readbacks}");
+    // a look at the cells: more launches, but nothing is read
+    progress.step = 0;
+    there.step(&progress).ok().unwrap();
+    assert_eq!(there.device.counts().1, after.1);
+}
+
+#[test]
+fn cells_are_those_that_the_cpu_keeps() {
+    let Some(device) = device() else { return };
+    let views = textured_views();
+    let config = IfaceConfig { occupancy_resolution: 40, soften: 8.0, band: 0.3, ..config() };
+    let (hull, dir) = (hull(), temporary());
+    let session = on("wgpu:0", dir.path(), &Quiet);
+    let mut host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
+    host.restore(None).ok().unwrap();
+    let shape = host.shape_at(7);
+    let inv_s = host.state.model.sharpness();
+    host.update_occupancy(&shape, (3, 7), inv_s, 0.1);
+    let want = host.state.occupancy.clone();
+    let mut there = OnDevice::new(host, device);
+    there.sdf.activate(shape.active);
+    let own = &there.there;
+    let range = [-1.38, 1.38];
+    there.norm.forward(
+        &there.device,
+        own.network.value(),
+        own.variance.value(),
+        range,
+        &own.flat,
+        &own.inv_s,
+    );
+    there.update_occupancy((3, 7)).unwrap();
+    let [occupied, solid] = there.there.occupancy.read(&there.device).unwrap();
+    let differ = |a: &crate::kernel::march::Bitmask, b: &crate::kernel::march::Bitmask| {
+        (0..64_000).filter(|&i| a.get(i) != b.get(i)).count()
+    };
+    println!("{} cells to march, {} solid", want.occupied.count(), want.solid.count());
+    assert!(want.occupied.count() > 1000 && want.solid.count() > 100);
+    // those whose distance is the band's but for rounding
+    assert!(differ(&occupied, &want.occupied) <= 3 && differ(&solid, &want.solid) <= 3);
+}
