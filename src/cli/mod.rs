@@ -11,6 +11,8 @@ mod completions;
 mod config;
 mod convert;
 mod demo;
+#[cfg(feature = "cpu")]
+mod doctor;
 mod inspect;
 mod invocation;
 mod options;
@@ -395,6 +397,9 @@ case (stability) is not within its bound.")]
         #[arg(long, value_name = "KEY")]
         explain: Option<String>,
     },
+    /// What this machine can compute on: its GPUs, whether they compute right, which one `auto` takes
+    #[cfg(feature = "cpu")]
+    Doctor,
     /// Completions for a shell, on stdout
     Completions {
         /// bash, zsh, fish, powershell or elvish
@@ -433,6 +438,8 @@ pub fn main() -> ExitCode {
         Command::Report { runs } => report::run(&invocation, runs),
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),
+        #[cfg(feature = "cpu")]
+        Command::Doctor => makes_nothing("doctor").and_then(|()| doctor::run(&common)),
         Command::Completions { shell } => {
             makes_nothing("completions").and_then(|()| completions::run(*shell, &mut Cli::command()))
         }

@@ -18,7 +18,7 @@ pub struct Gpu {
     /// Why it was chosen.
     pub why: String,
     /// Nobody else's `auto` takes it while this is held; none where somebody else had it already.
-    _lock: Option<Lock>,
+    pub lock: Option<Lock>,
 }
 
 /// Opens the GPU of a name: an API (`wgpu` is any) and, after a colon, a number among its adapters. Without a number
@@ -41,7 +41,7 @@ pub fn open(name: &str) -> Result<Gpu> {
     let adapter = chosen.ok_or_else(|| missing(name, api, &adapters))?;
     let device = Device::open(adapter);
     let lock = Lock::take(&lock_file(&device)).ok();
-    Ok(Gpu { device, why: format!("named `{name}`"), _lock: lock })
+    Ok(Gpu { device, why: format!("named `{name}`"), lock })
 }
 
 fn missing(name: &str, api: &str, adapters: &[Adapter]) -> Error {
@@ -80,7 +80,7 @@ pub fn best() -> std::result::Result<Gpu, String> {
                     "the first GPU that is free and computes what the processor does ({})",
                     adapter.api
                 );
-                return Ok(Gpu { device, why, _lock: lock });
+                return Ok(Gpu { device, why, lock });
             }
             Err(why) => passed_over.push(format!("{name} {why}")),
         }
@@ -241,8 +241,8 @@ mod tests {
         let held = open("wgpu:0").unwrap();
         let again = open("wgpu:0").unwrap();
         // named, it is shared; but only one of them keeps it from others
-        assert!(held._lock.is_some() && again._lock.is_none());
+        assert!(held.lock.is_some() && again.lock.is_none());
         drop(held);
-        assert!(open("wgpu:0").unwrap()._lock.is_some());
+        assert!(open("wgpu:0").unwrap().lock.is_some());
     }
 }

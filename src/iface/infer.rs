@@ -8,13 +8,24 @@ use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field;
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
+#[cfg(feature = "wgpu")]
+use crate::field::{Place, devices::Gpu};
 use crate::geom::{Ray, RayResult};
+#[cfg(feature = "wgpu")]
+use crate::io::Lock;
+#[cfg(feature = "wgpu")]
+use crate::kernel::gpu::Evaluator;
 use crate::kernel::march::{Bitmask, MarchRay, Samples};
 use crate::kernel::mlp::Weights;
 use crate::kernel::neus::{self, Rays};
 use crate::kernel::sdf::{self, FieldShape};
 use glam::Vec3;
 use std::path::Path;
+#[cfg(feature = "wgpu")]
+use std::sync::{
+    Mutex,
+    atomic::{AtomicBool, Ordering},
+};
 
 /// Samples evaluated together in a volume render.
 const SAMPLES: usize = 1 << 16;
@@ -27,14 +38,41 @@ pub struct IFace {
     weights: Weights,
     inv_s: f32,
     occupancy: Occupancy,
+    /// The weights once more, as a device takes them.
+    #[cfg(feature = "wgpu")]
+    flat: Vec<f32>,
+    #[cfg(feature = "wgpu")]
+    there: Option<OnGpu>,
+}
+
+/// The field on a device, which answers instead of the processor until it fails.
+#[cfg(feature = "wgpu")]
+struct OnGpu {
+    evaluator: Mutex<Evaluator>,
+    /// Held while the field is.
+    _lock: Option<Lock>,
+    failed: AtomicBool,
 }
 
 impl IFace {
     pub(super) fn new(config: &IfaceConfig, state: SdfState) -> IFace {
         let shape = shape(config);
         let (table, weights) = state.model.on_host(&shape);
+        #[cfg(feature = "wgpu")]
+        let flat = field::values(state.model.weights().inner());
         let (inv_s, occupancy) = (state.model.sharpness(), state.occupancy);
-        let mut face = IFace { config: config.clone(), shape, table, weights, inv_s, occupancy };
+        let mut face = IFace {
+            config: config.clone(),
+            shape,
+            table,
+            weights,
+            inv_s,
+            occupancy,
+            #[cfg(feature = "wgpu")]
+            flat,
+            #[cfg(feature = "wgpu")]
+            there: None,
+        };
         if config.occupancy == OccupancyRule::Band {
             // the surface moved since the last update
             let mut occupancy = face.occupancy.clone();
@@ -53,6 +91,31 @@ impl IFace {
         Ok(IFace::new(config, state))
     }
 
+    /// Lets the GPU of a place answer, if it is one.
+    #[cfg(feature = "wgpu")]
+    pub fn on(mut self, place: Place) -> IFace {
+        let Place::Gpu(Gpu { device, lock, .. }) = place else { return self };
+        let band = self.config.occupancy == OccupancyRule::Band;
+        let masks = [Some(&self.occupancy.occupied), band.then_some(&self.occupancy.solid)];
+        let evaluator = Evaluator::new(device, &self.shape, &self.table, &self.flat, self.inv_s, masks);
+        let failed = AtomicBool::new(false);
+        self.there = Some(OnGpu { evaluator: Mutex::new(evaluator), _lock: lock, failed });
+        self
+    }
+
+    /// What the device answers; none where there is none, or where it failed: then the processor answers.
+    #[cfg(feature = "wgpu")]
+    fn ask<T>(&self, question: impl FnOnce(&mut Evaluator) -> Result<T>) -> Option<T> {
+        let there = self.there.as_ref().filter(|there| !there.failed.load(Ordering::Relaxed))?;
+        let mut evaluator = there.evaluator.lock().ok()?;
+        let answer = question(&mut evaluator);
+        if let Err(e) = &answer {
+            there.failed.store(true, Ordering::Relaxed);
+            tracing::warn!("{e}; the processor goes on");
+        }
+        answer.ok()
+    }
+
     /// Sharpness of the trained surface where it is sharpest, per scene unit.
     pub fn inv_s(&self) -> f32 {
         self.inv_s * self.config.radius
@@ -63,6 +126,10 @@ impl IFace {
     }
 
     fn raw_sdf(&self, x: &[[f32; 3]]) -> Vec<f32> {
+        #[cfg(feature = "wgpu")]
+        if let Some(mut planes) = self.ask(|there| there.outputs(x, None, None, 0..1)) {
+            return planes.swap_remove(0);
+        }
         sdf::values(&self.shape, self.table(), &self.weights, x)
     }
 
@@ -82,13 +149,25 @@ impl IFace {
     /// Local sharpness of the surface, per scene unit: opacity at a distance `f` outside is σ(−f · sharpness). `[n]`
     /// points → `[n]`.
     pub fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
-        let soft = sdf::softness(&self.shape, self.table(), &self.weights, &self.scaled(points));
+        let x = self.scaled(points);
+        #[cfg(feature = "wgpu")]
+        if let Some(planes) = self.ask(|there| there.outputs(&x, None, None, 7..8)) {
+            return planes[0].iter().map(|soft| self.inv_s() * soft.exp()).collect();
+        }
+        let soft = sdf::softness(&self.shape, self.table(), &self.weights, &x);
         soft.iter().map(|soft| self.inv_s() * soft.exp()).collect()
     }
 
     /// Signed distance and its gradient (not normalized).
     pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
-        let all = sdf::gradients(&self.shape, self.table(), &self.weights, &self.scaled(points));
+        let x = self.scaled(points);
+        #[cfg(feature = "wgpu")]
+        if let Some(planes) = self.ask(|there| there.outputs(&x, None, None, 0..4)) {
+            let [f, nx, ny, nz] = [0, 1, 2, 3].map(|k| &planes[k]);
+            let normal = |i: usize| Vec3::new(nx[i], ny[i], nz[i]);
+            return (f.iter().map(|f| f / self.config.radius).collect(), (0..x.len()).map(normal).collect());
+        }
+        let all = sdf::gradients(&self.shape, self.table(), &self.weights, &x);
         all.into_iter().map(|(f, n)| (f / self.config.radius, Vec3::from(n))).unzip()
     }
 
@@ -103,6 +182,18 @@ impl IFace {
     ) -> Vec<[f32; 3]> {
         let arrays = |v: &[Vec3]| -> Vec<[f32; 3]> { v.iter().map(|v| v.to_array()).collect() };
         let (x, normals, directions) = (self.scaled(points), arrays(normals), arrays(directions));
+        #[cfg(feature = "wgpu")]
+        if self.there.is_some() {
+            // a point with several directions is evaluated for each
+            let each: Vec<usize> =
+                (0..x.len()).flat_map(|i| std::iter::repeat_n(i, counts[i] as usize)).collect();
+            let [x, normals]: [Vec<[f32; 3]>; 2] =
+                [&x, &normals].map(|rows| each.iter().map(|&i| rows[i]).collect());
+            let asked = self.ask(|there| there.outputs(&x, Some(&directions), Some(&normals), 4..7));
+            if let Some(rgb) = asked {
+                return (0..each.len()).map(|i| [rgb[0][i], rgb[1][i], rgb[2][i]]).collect();
+            }
+        }
         sdf::colors(&self.shape, self.table(), &self.weights, &x, &normals, Some(counts), &directions)
     }
 
@@ -125,6 +216,10 @@ impl IFace {
                 jitter: 0.0,
             })
             .collect();
+        #[cfg(feature = "wgpu")]
+        if let Some(seen) = self.ask(|there| there.render(&marched, dt)) {
+            return seen.iter().map(|o| self.result(o)).collect();
+        }
         let samples = self.occupancy.march(config, dt, &marched);
         // pieces of whole rays with a bounded number of samples: a sample costs some two kilobytes
         let mut out = Vec::with_capacity(rays.len());
@@ -141,7 +236,6 @@ impl IFace {
 
     /// Composites rays `first..first + rays.len()` of a march.
     fn composite(&self, rays: &[MarchRay], samples: &Samples, first: usize, dt: f32) -> Vec<RayResult> {
-        let radius = self.config.radius;
         let offsets = &samples.offsets[first..=first + rays.len()];
         let start = offsets[0] as usize;
         let t = &samples.t[start..offsets[rays.len()] as usize];
@@ -154,12 +248,17 @@ impl IFace {
         let bundle = Rays { offsets: &offsets, direction: &direction, t, dt: &steps };
         neus::forward(bundle, field.output(), self.inv_s, 1.0)
             .chunks_exact(neus::RAY_WIDTH)
-            .map(|o| RayResult {
-                color: [o[0], o[1], o[2]],
-                opacity: o[3],
-                depth: if o[3] > 0.0 { o[4] / o[3] / radius } else { 0.0 },
-                normal: Vec3::new(o[5], o[6], o[7]).normalize_or_zero(),
-            })
+            .map(|o| self.result(o))
             .collect()
+    }
+
+    /// What a ray composited, in scene units.
+    fn result(&self, o: &[f32]) -> RayResult {
+        RayResult {
+            color: [o[0], o[1], o[2]],
+            opacity: o[3],
+            depth: if o[3] > 0.0 { o[4] / o[3] / self.config.radius } else { 0.0 },
+            normal: Vec3::new(o[5], o[6], o[7]).normalize_or_zero(),
+        }
     }
 }

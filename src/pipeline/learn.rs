@@ -8,6 +8,8 @@ use crate::capture::scene::Scene;
 use crate::capture::{Capture, LoadedView};
 use crate::config::{Config, MaskUse, Stage};
 use crate::field::pixels::TrainView;
+#[cfg(feature = "wgpu")]
+use crate::field::place;
 use crate::field::training::TrainingSession;
 use crate::geom::Camera;
 use crate::iface::{self, IFace};
@@ -108,7 +110,10 @@ impl Fields for TrainedFields<'_> {
         let Line { run, config, .. } = self.line;
         let load = || {
             let hull = bitmask(&self.line.scene()?);
-            IFace::load(&run.path(Stage::Iface), &config.iface, hull.as_ref())
+            let field = IFace::load(&run.path(Stage::Iface), &config.iface, hull.as_ref())?;
+            #[cfg(feature = "wgpu")]
+            let field = field.on(place(&config.device)?);
+            Ok(field)
         };
         once(&self.iface, load).map(|f| f as &dyn Surface)
     }

@@ -7,6 +7,7 @@ use cubecl::features::AtomicUsage;
 use cubecl::ir::{ElemType, FloatKind, Type};
 use cubecl::prelude::{BufferArg, Client, CubeCount};
 use cubecl::server::{Handle, ServerError};
+use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// How threads add to one float.
@@ -171,6 +172,13 @@ impl Device {
         let read = self.client.read_one(buffer.handle.clone());
         let bytes = read.map_err(|e| self.failed(&e))?;
         Ok(bytemuck::pod_collect_to_vec(&bytes[..buffer.words * 4]))
+    }
+
+    /// As [`Device::fetch`], some of a buffer's floats.
+    pub(super) fn fetch_part(&self, buffer: &Buffer, part: Range<usize>) -> Result<Vec<f32>> {
+        let behind = buffer.words - part.end;
+        let handle = buffer.handle.clone().offset_start(4 * part.start as u64).offset_end(4 * behind as u64);
+        self.fetch(&Buffer { handle, words: part.len() })
     }
 
     /// As [`Device::fetch`].

@@ -10,6 +10,7 @@
 mod adam;
 mod device;
 mod draw;
+mod evaluate;
 mod hash;
 mod losses;
 mod march;
@@ -26,6 +27,7 @@ mod tile;
 pub use adam::{Gate, adam};
 pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits};
 pub use draw::{Batch, Drawing, DrawnView, Photographs};
+pub use evaluate::Evaluator;
 pub use hash::Grid;
 pub use losses::{LossWeights, Losses};
 pub use march::Samples;

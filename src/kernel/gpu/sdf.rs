@@ -174,6 +174,20 @@ impl Sdf {
         direction: &Buffer,
         count: &Buffer,
     ) -> &Buffer {
+        self.shade(device, [table, flat], x, direction, None, count)
+    }
+
+    /// As [`Sdf::forward`]; where normals are given, planes `[3, capacity]`, color sees those, and the output has them in
+    /// place of the gradient.
+    pub fn shade(
+        &self,
+        device: &Device,
+        [table, flat]: [&Buffer; 2],
+        x: &Buffer,
+        direction: &Buffer,
+        normals: Option<&Buffer>,
+        count: &Buffer,
+    ) -> &Buffer {
         let dim = CubeDim::new_1d(UNITS);
         prepare::launch(
             device.launch(),
@@ -185,6 +199,7 @@ impl Sdf {
         );
         self.grid.gather(device, table, x, count, &self.value, Some(&self.jacobian));
         assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
+        assert!(normals.is_none_or(|n| n.words() == x.words()));
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
             forward::launch_unchecked(
@@ -196,6 +211,7 @@ impl Sdf {
                 self.jacobian.arg(),
                 x.arg(),
                 direction.arg(),
+                normals.unwrap_or(x).arg(),
                 count.arg(),
                 self.q.arg(),
                 self.h.arg(),
@@ -206,6 +222,7 @@ impl Sdf {
                 self.inv_radius,
                 self.soften,
                 self.plan,
+                normals.is_some(),
             );
         }
         &self.out

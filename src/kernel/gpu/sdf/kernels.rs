@@ -147,7 +147,8 @@ fn harmonics(a: &mut [F4], x: F4, y: F4, z: F4, row: usize) {
     a[at(28, row)] = x * (y2 * F4::new(3.0f32) - x2) * F4::new(0.590_043_6f32);
 }
 
-/// Writes sdf, ∇sdf, color and local sharpness, planes `[8, capacity]`, and what the backward needs.
+/// Writes sdf, ∇sdf, color and local sharpness, planes `[8, capacity]`, and what the backward needs; where normals are
+/// given, those in place of ∇sdf.
 #[cube(launch_unchecked)]
 pub(super) fn forward(
     w: &[F4],
@@ -155,6 +156,7 @@ pub(super) fn forward(
     jacobian: &[F4],
     x: &[F4],
     direction: &[F4],
+    normals: &[F4],
     count: &[u32],
     q: &mut [F4],
     h: &mut [F4],
@@ -165,6 +167,7 @@ pub(super) fn forward(
     inv_radius: f32,
     soften: f32,
     #[comptime] plan: Plan,
+    #[comptime] given: bool,
 ) {
     let rows = comptime!(plan.rows());
     let features = comptime!(plan.features);
@@ -213,10 +216,16 @@ pub(super) fn forward(
         let mut ny = F4::new(0.0f32);
         let mut nz = F4::new(0.0f32);
         if column == 14 {
-            for c in 0..16usize {
-                nx += b[at(c, row)];
-                ny += b[at(16 + c, row)];
-                nz += b[at(32 + c, row)];
+            if given {
+                nx = normals[here];
+                ny = normals[plane + here];
+                nz = normals[2 * plane + here];
+            } else {
+                for c in 0..16usize {
+                    nx += b[at(c, row)];
+                    ny += b[at(16 + c, row)];
+                    nz += b[at(32 + c, row)];
+                }
             }
             out[plane + here] = nx;
             out[2 * plane + here] = ny;

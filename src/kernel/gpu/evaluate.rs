@@ -1,0 +1,190 @@
+//! A trained signed-distance field on a device: what is asked of it after training, in batches that fill the device.
+
+use super::device::{Buffer, Device};
+use super::draw::Batch;
+use super::march::Samples;
+use super::neus::{self, Neus, Rays};
+use super::occupancy::Occupancy;
+use super::sdf::Sdf;
+use super::self_test::planes;
+use crate::Result;
+use crate::kernel::march::{Bitmask, MarchRay};
+use crate::kernel::neus::RAY_WIDTH;
+use crate::kernel::sdf::{FieldShape, WIDTH};
+use std::ops::Range;
+
+/// Samples evaluated together: some two hundred megabytes of memory.
+const CAPACITY: usize = 1 << 17;
+
+/// Rays marched together.
+const RAYS: usize = 1 << 14;
+
+/// A field and what its evaluation needs.
+pub struct Evaluator {
+    device: Device,
+    sdf: Sdf,
+    table: Buffer,
+    flat: Buffer,
+    inv_s: Buffer,
+    occupancy: Occupancy,
+    /// For volume renders, made for the first one.
+    rays: Option<(Samples, Neus)>,
+}
+
+impl Evaluator {
+    /// Of a field: its table, `[entries, 2]`, network weights, sharpness, and the cells to march through with those that
+    /// are solid.
+    pub fn new(
+        device: Device,
+        shape: &FieldShape,
+        table: &[f32],
+        flat: &[f32],
+        inv_s: f32,
+        [occupied, solid]: [Option<&Bitmask>; 2],
+    ) -> Evaluator {
+        let mut sdf = Sdf::new(&device, shape, CAPACITY);
+        sdf.activate(shape.active);
+        let everywhere = Bitmask::filled(2, true);
+        Evaluator {
+            table: device.upload(table),
+            flat: device.upload(flat),
+            inv_s: device.upload(&[inv_s]),
+            occupancy: Occupancy::new(&device, occupied.unwrap_or(&everywhere), solid, shape.radius),
+            sdf,
+            rays: None,
+            device,
+        }
+    }
+
+    /// Sdf, gradient (3), color (3) and logarithm of the local sharpness of points: the asked ones of these, a plane
+    /// `[n]` each.
+    ///
+    /// # Shapes
+    ///
+    /// - x, direction: `[n, 3]`; without directions color means nothing
+    /// - normal: `[n, 3]`, what color sees as normal; without it, that of the field
+    pub fn outputs(
+        &self,
+        x: &[[f32; 3]],
+        direction: Option<&[[f32; 3]]>,
+        normal: Option<&[[f32; 3]]>,
+        asked: Range<usize>,
+    ) -> Result<Vec<Vec<f32>>> {
+        let device = &self.device;
+        let mut out = vec![Vec::with_capacity(x.len()); asked.len()];
+        for first in (0..x.len()).step_by(CAPACITY) {
+            let span = first..(first + CAPACITY).min(x.len());
+            let there = |rows: &[[f32; 3]]| device.upload(&planes(&rows[span.clone()], CAPACITY));
+            let at = there(x);
+            let toward = direction.map(there);
+            let normal = normal.map(there);
+            let count = device.upload(&[span.len() as u32]);
+            let seen = self.sdf.shade(
+                device,
+                [&self.table, &self.flat],
+                &at,
+                toward.as_ref().unwrap_or(&at),
+                normal.as_ref(),
+                &count,
+            );
+            let all = device.fetch_part(seen, asked.start * CAPACITY..asked.end * CAPACITY)?;
+            for (own, plane) in out.iter_mut().zip(all.chunks_exact(CAPACITY)) {
+                own.extend_from_slice(&plane[..span.len()]);
+            }
+        }
+        Ok(out)
+    }
+
+    /// Volume render with steps of `pitch`: see [`crate::kernel::neus::forward`]. `[rays, 8]`.
+    pub fn render(&mut self, rays: &[MarchRay], pitch: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
+        let device = &self.device;
+        let pitch = device.upload(&[pitch]);
+        let made = || (Samples::new(device, RAYS, CAPACITY), Neus::new(device, RAYS, CAPACITY));
+        let (samples, neus) = self.rays.get_or_insert_with(made);
+        let mut out = Vec::with_capacity(rays.len());
+        while out.len() < rays.len() {
+            let own = &rays[out.len()..(out.len() + RAYS).min(rays.len())];
+            let batch = Batch::of_rays(device, own, RAYS);
+            samples.march(device, &self.occupancy, &batch, &pitch, usize::MAX, 0);
+            let (x, toward, count) = (&samples.x, &samples.direction, &samples.count);
+            let field = self.sdf.forward(device, &self.table, &self.flat, x, toward, count);
+            let bundle = Rays {
+                offsets: &samples.offsets,
+                direction: &batch.direction,
+                t: &samples.t,
+                dt: &samples.dt,
+            };
+            let seen: Vec<f32> = device.fetch(neus.forward(device, bundle, field, &self.inv_s, 1.0))?;
+            let alive: Vec<u32> = device.fetch(&batch.alive)?;
+            // those there was no room for come with the next ones
+            let done = alive[..own.len()].iter().position(|&a| a == 0).unwrap_or(own.len());
+            assert!(done > 0, "one ray has more samples than there is room for");
+            out.extend((0..done).map(|r| std::array::from_fn(|k| seen[k * RAYS + r])));
+        }
+        const { assert!(neus::RAY_WIDTH >= RAY_WIDTH && WIDTH == 8) };
+        Ok(out)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::tests::{agree, device};
+    use super::super::self_test::Case;
+    use super::*;
+    use crate::kernel::mlp::Weights;
+    use crate::kernel::{march, rng, sdf};
+
+    #[test]
+    fn what_is_asked_is_what_the_cpu_answers() {
+        let Some(device) = device() else { return };
+        let Case { shape, table, flat, x, direction, .. } = Case::new(700, 6, true, 6);
+        let weights = Weights::new(shape.layout(), &flat);
+        let flatten = |rows: Vec<[f32; 3]>| rows.into_flattened();
+        let mut mask = Bitmask::filled(8, true);
+        (0..512).step_by(3).for_each(|i| mask.set(i, false));
+        let mut there =
+            Evaluator::new(device, &shape, table.as_flattened(), &flat, 20.0, [Some(&mask), None]);
+
+        let got = there.outputs(&x, None, None, 0..4).unwrap();
+        let want = sdf::gradients(&shape, &table, &weights, &x);
+        agree("distances", &got[0], &want.iter().map(|w| w.0).collect::<Vec<_>>(), 1e-4);
+        for axis in 0..3 {
+            agree("slopes", &got[1 + axis], &want.iter().map(|w| w.1[axis]).collect::<Vec<_>>(), 1e-4);
+        }
+        let soft = there.outputs(&x, None, None, 7..8).unwrap();
+        agree("softness", &soft[0], &sdf::softness(&shape, &table, &weights, &x), 1e-4);
+        // any unit vectors as normals
+        let normal: Vec<[f32; 3]> = direction.iter().rev().copied().collect();
+        let got = there.outputs(&x, Some(&direction), Some(&normal), 4..7).unwrap();
+        let want = sdf::colors(&shape, &table, &weights, &x, &normal, None, &direction);
+        agree("colors", &got.concat(), &planes(&want, x.len()), 1e-4);
+
+        // more samples than there is room for: 20,000 rays of up to some 100
+        let rays: Vec<MarchRay> = (0..20_000)
+            .map(|i| {
+                let d = direction[i % 700];
+                let origin = std::array::from_fn(|a| -3.0 * d[a] + rng::normal(1, 2, (3 * i + a) as u64));
+                MarchRay { origin, direction: d, jitter: 0.0 }
+            })
+            .collect();
+        let got = there.render(&rays, 0.04).unwrap();
+        assert_eq!(got.len(), rays.len());
+        let some: Vec<usize> = (0..rays.len()).step_by(97).collect();
+        let few: Vec<MarchRay> = some.iter().map(|&r| rays[r]).collect();
+        let samples = march::march(&mask, None, shape.radius, 0.04, &few, usize::MAX);
+        let (x, d) = samples.points(&few, 0);
+        let field = sdf::forward(&shape, &table, &weights, &x, &d);
+        let along: Vec<[f32; 3]> = few.iter().map(|r| r.direction).collect();
+        let dt = vec![0.04; x.len()];
+        let bundle = crate::kernel::neus::Rays {
+            offsets: &samples.offsets,
+            direction: &along,
+            t: &samples.t,
+            dt: &dt,
+        };
+        let want = crate::kernel::neus::forward(bundle, field.output(), 20.0, 1.0);
+        let got: Vec<[f32; RAY_WIDTH]> = some.iter().map(|&r| got[r]).collect();
+        agree("renders", got.as_flattened(), &want, 1e-4);
+        assert!(flatten(x).len() > 20_000);
+    }
+}
