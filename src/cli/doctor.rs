@@ -102,3 +102,44 @@ impl Display for Examination {
         write!(f, "--device auto is {}", self.auto)
     }
 }
+
+/// What a step of I-Face as it is configured would take on GPUs by their data sheets.
+#[cfg(feature = "wgpu")]
+pub(super) fn model(common: &Common) -> Result<()> {
+    use crate::kernel::gpu::cost::{self, GPUS};
+    let config = common.resolve(None, None, &[])?.iface;
+    let shape = crate::iface::field_shape(&config);
+    let cost = cost::step_cost(&shape, config.samples, config.max_rays);
+    let memory = cost::memory(&shape, 4 * config.samples);
+    let predicted: Vec<Vec<f64>> =
+        GPUS.iter().map(|gpu| cost.iter().map(|kernel| cost::predict(kernel, gpu)).collect()).collect();
+    if common.json {
+        let rows: Vec<_> = GPUS
+            .iter()
+            .zip(&predicted)
+            .map(|(gpu, seconds)| serde_json::json!({"gpu": gpu, "seconds": seconds}))
+            .collect();
+        let all = serde_json::json!({"kernels": cost, "predicted": rows, "memory": memory});
+        return print(&format!("{all}\n"));
+    }
+    let mut text = format!(
+        "A prediction from data sheets, nothing here was measured.\n\nA step of I-Face, {} samples:\n{:<34} {:>8} {:>8} {:>9}\n",
+        config.samples, "", "MB", "GFLOP", "M atomics"
+    );
+    for k in &cost {
+        let [mb, gflop, atomics] = [k.bytes / 1e6, k.flops / 1e9, k.atomics / 1e6];
+        text += &format!("{:<34} {mb:>8.1} {gflop:>8.2} {atomics:>9.1}\n", k.name);
+    }
+    text += &format!("{:<34} {:>8} {:>8}  slowest\n", "\nGPU", "ms", "M/s");
+    for (gpu, seconds) in GPUS.iter().zip(&predicted) {
+        let all: f64 = seconds.iter().sum();
+        let slowest = (0..cost.len()).max_by(|&a, &b| seconds[a].total_cmp(&seconds[b])).unwrap_or(0);
+        let rate = config.samples as f64 / all / 1e6;
+        text += &format!("{:<33} {:>8.2} {rate:>8.1}  {}\n", gpu.name, 1e3 * all, cost[slowest].name);
+    }
+    text += &format!(
+        "\nIts memory: {:.2} GiB with room for four times the samples, without photographs.\n",
+        memory / (1u64 << 30) as f64
+    );
+    print(&text)
+}

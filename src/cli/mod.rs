@@ -399,7 +399,12 @@ case (stability) is not within its bound.")]
     },
     /// What this machine can compute on: its GPUs, whether they compute right, which one `auto` takes
     #[cfg(feature = "cpu")]
-    Doctor,
+    Doctor {
+        /// What a training step would take on GPUs by their data sheets: a prediction, not a measurement
+        #[cfg(feature = "wgpu")]
+        #[arg(long)]
+        model: bool,
+    },
     /// Completions for a shell, on stdout
     Completions {
         /// bash, zsh, fish, powershell or elvish
@@ -439,7 +444,16 @@ pub fn main() -> ExitCode {
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),
         #[cfg(feature = "cpu")]
-        Command::Doctor => makes_nothing("doctor").and_then(|()| doctor::run(&common)),
+        Command::Doctor {
+            #[cfg(feature = "wgpu")]
+            model,
+        } => makes_nothing("doctor").and_then(|()| {
+            #[cfg(feature = "wgpu")]
+            if *model {
+                return doctor::model(&common);
+            }
+            doctor::run(&common)
+        }),
         Command::Completions { shell } => {
             makes_nothing("completions").and_then(|()| completions::run(*shell, &mut Cli::command()))
         }

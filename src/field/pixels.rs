@@ -122,7 +122,12 @@ impl<'a> Pixels<'a> {
 
     /// Copies the photographs to a device, where the same rays are drawn from them.
     #[cfg(feature = "wgpu")]
-    pub fn on_device(&self, device: &gpu::Device, jitter: bool, background: bool) -> gpu::Photographs {
+    pub fn on_device(
+        &self,
+        device: &gpu::Device,
+        jitter: bool,
+        background: bool,
+    ) -> crate::Result<gpu::Photographs> {
         let drawing = gpu::Drawing { every: self.published, jitter, background };
         let views: Vec<gpu::DrawnView> =
             (0..self.views.len()).into_par_iter().map(|v| self.drawn(v)).collect();
@@ -347,7 +352,7 @@ mod tests {
         let views = [view(), bent(perspective), empty, bent(fisheye), bent(fov)];
         for (foreground, published) in [(Foreground::Estimated, false), (Foreground::Photo, true)] {
             let pixels = Pixels::new(&views, 0.1, 0.3, foreground, published);
-            let there = pixels.on_device(&device, !published, true);
+            let there = pixels.on_device(&device, !published, true).unwrap();
             let batch = gpu::Batch::new(&device, 2050);
             let (seed, step) = (77, 1 << 33);
             there.draw(&device, (seed, step), &device.upload(&[2000u32]), &batch);

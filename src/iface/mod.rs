@@ -21,4 +21,5 @@ mod stereo;
 mod train;
 
 pub use infer::IFace;
+pub use model::shape as field_shape;
 pub use train::{IfaceReport, train};

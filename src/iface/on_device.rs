@@ -8,7 +8,6 @@ use super::model::SdfModel;
 use super::schedule;
 use super::state::{FORMAT, SdfState};
 use super::train::{LOST_AFTER, MOST_BUDGETS, STEREO_POINTS, SdfTraining, TERMS, VARIANCE, adam_steps, lost};
-use crate::Result;
 use crate::config::iface::{Background, IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::parameters::Parameter;
@@ -17,7 +16,9 @@ use crate::kernel::gpu::{
     self, Band, Batch, Buffer, Device, Gate, LossWeights, Losses, Neus, Norm, Occupancy, Photographs, Pitch,
     RayBudget, Rays, Samples, Schedule, Sdf, SurfacePoints,
 };
+use crate::kernel::hash;
 use crate::kernel::mlp::TILE;
+use crate::{Error, Result};
 
 /// Steps between two looks at losses and flags: what goes wrong is known that much later.
 const READ_EVERY: u64 = 50;
@@ -95,11 +96,15 @@ pub(super) struct OnDevice<'a> {
 
 impl<'a> OnDevice<'a> {
     /// Moves a training to a device.
-    pub fn new(host: SdfTraining<'a>, device: Device) -> OnDevice<'a> {
+    ///
+    /// # Errors
+    ///
+    /// Where the device has too little memory.
+    pub fn new(host: SdfTraining<'a>, device: Device) -> Result<OnDevice<'a>> {
         let config = host.config;
         let rays = config.rays.max(config.max_rays);
         let points = if config.stereo > 0.0 { STEREO_POINTS as usize } else { 1 };
-        let capacity = (MOST_BUDGETS * config.samples + points).next_multiple_of(TILE);
+        let capacity = room(&host, &device, points)?;
         let weights = LossWeights {
             rgb_mse: config.rgb_mse as f32,
             rgb_l1: config.rgb_l1 as f32,
@@ -113,8 +118,8 @@ impl<'a> OnDevice<'a> {
         let allowed = host.state.occupancy.allowed();
         let band = (config.occupancy == OccupancyRule::Band)
             .then(|| Band::new(&device, allowed, config.band, config.soften as f32));
-        OnDevice {
-            photographs: host.pixels.on_device(&device, config.jitter, random),
+        Ok(OnDevice {
+            photographs: host.pixels.on_device(&device, config.jitter, random)?,
             batch: Batch::new(&device, rays),
             samples: Samples::new(&device, rays, capacity),
             points: SurfacePoints::new(&device, points, config.stereo as f32, KNEE as f32),
@@ -126,7 +131,7 @@ impl<'a> OnDevice<'a> {
             there: There::new(&device, &host),
             host,
             device,
-        }
+        })
     }
 
     /// Ends the training on the device: what the CPU would have come to.
@@ -252,6 +257,34 @@ impl<'a> OnDevice<'a> {
             gpu::adam(device, group.parts(), &group.gradient, &step, gate);
         }
     }
+}
+
+/// Samples that a step has room for: as many as on the CPU where the device's memory and buffers are large enough.
+fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<usize> {
+    /// Samples with their rays, compositing and losses.
+    const BESIDE: usize = 3 + 3 + 2 + 9 + 2;
+    /// What the driver and others keep for themselves.
+    const KEPT: u64 = 512 << 20;
+    let limits = device.limits();
+    let [words, widest] = Sdf::words_per_sample(&host.shape);
+    // values, moments and gradient; cells with distance, reach and bits
+    let cells = host.config.occupancy_resolution.pow(3) as u64;
+    let fixed = KEPT + 32 * hash::entries(&host.shape.levels) as u64 + 13 * cells;
+    let by_buffer = limits.largest_buffer / (4 * widest as u64);
+    let by_memory =
+        limits.memory.map_or(u64::MAX, |memory| memory.saturating_sub(fixed) / (4 * (words + BESIDE) as u64));
+    let wanted = (MOST_BUDGETS * host.config.samples + points) as u64;
+    let capacity = wanted.min(by_buffer).min(by_memory) as usize;
+    let least = host.config.samples + points;
+    if capacity < least {
+        let problem = format!(
+            "the device `{}` has room for {capacity} samples of a step, {least} are needed",
+            device.name()
+        );
+        return Err(Error::cannot(problem, format!("lower iface.samples ({})", host.config.samples)));
+    }
+    // the last tile is a whole one
+    Ok(if capacity as u64 == wanted { capacity.next_multiple_of(TILE) } else { capacity / TILE * TILE })
 }
 
 fn there_occupancy(device: &Device, host: &SdfTraining) -> Occupancy {

@@ -145,7 +145,7 @@ fn a_step_waits_for_nothing() {
     let (hull, dir) = (hull(), temporary());
     let session = on("wgpu:0", dir.path(), &Quiet);
     let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
-    let mut there = OnDevice::new(host, device().unwrap());
+    let mut there = OnDevice::new(host, device().unwrap()).unwrap();
     there.restore(None).ok().unwrap();
     let mut progress = TrainingProgress { step: 1, ..TrainingProgress::default() };
     let before = there.device.counts();
@@ -176,7 +176,7 @@ fn cells_are_those_that_the_cpu_keeps() {
     let inv_s = host.state.model.sharpness();
     host.update_occupancy(&shape, (3, 7), inv_s, 0.1);
     let want = host.state.occupancy.clone();
-    let mut there = OnDevice::new(host, device);
+    let mut there = OnDevice::new(host, device).unwrap();
     there.sdf.activate(shape.active);
     let own = &there.there;
     let range = [-1.38, 1.38];
@@ -197,4 +197,16 @@ fn cells_are_those_that_the_cpu_keeps() {
     assert!(want.occupied.count() > 1000 && want.solid.count() > 100);
     // those whose distance is the band's but for rounding
     assert!(differ(&occupied, &want.occupied) <= 3 && differ(&solid, &want.solid) <= 3);
+}
+
+#[test]
+fn a_device_with_too_little_room_is_refused_before_the_first_step() {
+    let Some(device) = device() else { return };
+    let views = textured_views();
+    let config = IfaceConfig { samples: 100_000_000, ..config() };
+    let (hull, dir) = (hull(), temporary());
+    let session = on("wgpu:0", dir.path(), &Quiet);
+    let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
+    let e = OnDevice::new(host, device).err().unwrap();
+    assert!(e.to_string().contains("has room for") && e.hint().contains("iface.samples"), "{e}");
 }

@@ -129,7 +129,7 @@ pub fn train(
         Place::Cpu => training::train(&mut learner, session, config.steps, config.checkpoint_s)?,
         #[cfg(feature = "wgpu")]
         Place::Gpu(gpu) => {
-            let mut there = OnDevice::new(learner, gpu.device);
+            let mut there = OnDevice::new(learner, gpu.device)?;
             let done = training::train(&mut there, session, config.steps, config.checkpoint_s)?;
             learner = there.finish()?;
             done

@@ -6,6 +6,7 @@ use super::device::{Buffer, Device, groups};
 use super::rng::{below, stream, uniform};
 use crate::geom::{Camera, Projection};
 use crate::kernel::march::MarchRay;
+use crate::{Error, Result};
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
@@ -367,10 +368,25 @@ pub struct Photographs {
 impl Photographs {
     /// Copies photographs there; the field's coordinates are the scene's times `radius`.
     ///
+    /// # Errors
+    ///
+    /// Where they do not fit into one buffer of the device.
+    ///
     /// # Panics
     ///
     /// Where no pixel is drawable, or 2³² pixels are.
-    pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: Drawing) -> Photographs {
+    pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: Drawing) -> Result<Photographs> {
+        let (needed, room) = (Photographs::bytes(seen), device.limits().largest_buffer);
+        if needed > room {
+            let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+            let problem = format!(
+                "the photographs take {} MiB of the device `{}`, whose buffers hold {} MiB",
+                mib(needed),
+                device.name(),
+                mib(room)
+            );
+            return Err(Error::cannot(problem, "use `--set capture.downscale=2`, or `--device cpu`"));
+        }
         let (mut views, mut pixels, mut drawable) = (Vec::new(), Vec::new(), Vec::new());
         let mut cumulative = 0u32;
         for view in seen {
@@ -387,7 +403,12 @@ impl Photographs {
         }
         assert!(cumulative > 0, "no pixel is drawable");
         let [views, pixels, drawable] = [views, pixels, drawable].map(|words| device.upload(&words));
-        Photographs { views, pixels, drawable, drawing }
+        Ok(Photographs { views, pixels, drawable, drawing })
+    }
+
+    /// Bytes of the pixels of these.
+    fn bytes(seen: &[DrawnView]) -> u64 {
+        seen.iter().map(|view| 4 * view.pixels.len().next_multiple_of(32) as u64).sum()
     }
 
     /// Draws the rays of a step: a function of seed and step alone.

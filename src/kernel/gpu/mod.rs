@@ -8,6 +8,7 @@
 //! Sums of many threads into one place are atomic, and [`Atomics`] says how. All else is summed in a fixed order.
 
 mod adam;
+pub mod cost;
 mod device;
 mod draw;
 mod evaluate;

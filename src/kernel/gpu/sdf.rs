@@ -153,6 +153,12 @@ impl Sdf {
         }
     }
 
+    /// Words of memory that a sample takes: all of them, and of the largest buffer.
+    pub fn words_per_sample(shape: &FieldShape) -> [usize; 2] {
+        let features = 2 * shape.levels.len();
+        [6 * features + 3 * HIDDEN + 2 * OUTPUTS + WIDTH + 3, 3 * features]
+    }
+
     /// How many of the levels take part from now on.
     pub fn activate(&mut self, levels: usize) {
         self.grid.activate(levels);
