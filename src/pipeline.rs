@@ -23,6 +23,8 @@
 mod bench;
 mod clicks;
 mod ensemble;
+#[cfg(feature = "cpu")]
+pub mod experiment;
 mod export;
 mod field_view;
 mod finish;
@@ -89,7 +91,7 @@ pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> 
         ensemble::can_blend(config)?;
     }
     let done = run.stage(line.plan(stage), |dir| match stage {
-        Stage::Mask => mask::mask(capture, line.clicks.as_ref(), &config.mask, dir),
+        Stage::Mask => mask::mask(capture, line.clicks.as_ref(), config, dir),
         Stage::Baseline | Stage::Tface | Stage::Iface => {
             learn::learn(stage, capture, &line.scene()?, config, dir)
         }

@@ -6,6 +6,7 @@
 
 pub mod bench;
 mod chart;
+pub mod experiment;
 mod live;
 mod runs;
 mod serve;

@@ -40,6 +40,7 @@ mod neus;
 mod pose;
 mod realitycapture;
 pub mod scene;
+pub mod scene_box;
 pub mod synthetic;
 mod transforms;
 mod view;

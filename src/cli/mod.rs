@@ -13,6 +13,8 @@ mod convert;
 mod demo;
 #[cfg(feature = "cpu")]
 mod doctor;
+#[cfg(feature = "cpu")]
+mod experiment;
 mod inspect;
 mod invocation;
 mod options;
@@ -36,6 +38,8 @@ use crate::{Error, Result};
 #[cfg(feature = "cpu")]
 use bench::BenchOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
+#[cfg(feature = "cpu")]
+use experiment::ExperimentOptions;
 use invocation::Invocation;
 use options::{Common, KeyOption};
 use out::Out;
@@ -346,6 +350,17 @@ learned from (capture.tiles): the blend follows the better members.")]
 Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep. It exits with 3 if a hard
 case (stability) is not within its bound.")]
     Bench(BenchOptions),
+    /// The paper's tables and ablations over captures, beside the published figures
+    #[cfg(feature = "cpu")]
+    #[command(after_long_help = "Examples:
+  tiface experiment captures/* --scale 0.1      all tables at a tenth of the effort
+  tiface experiment captures/002_00 --tables components,iface --out tables/
+  tiface experiment captures/* --dry-run        the runs that tables are made of, and which are done
+  tiface experiment captures/* --only 002_00/tface-ce    one of them, for a cluster; tables come with a last call
+  tiface experiment captures/* --published figures.csv   a line is: tface,l2-reference,masked,30.1
+
+Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md, .csv, .json and .html.")]
+    Experiment(ExperimentOptions),
     /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates, size
     #[command(after_long_help = "Examples:
   tiface check head.glb
@@ -439,6 +454,8 @@ pub fn main() -> ExitCode {
         Command::Preview(options) => preview::run(&invocation, options),
         #[cfg(feature = "cpu")]
         Command::Bench(options) => bench::run(&invocation, options),
+        #[cfg(feature = "cpu")]
+        Command::Experiment(options) => experiment::run(&invocation, options),
         Command::Status { runs } => makes_nothing("status").and_then(|()| status::run(&common, runs)),
         Command::Report { runs } => report::run(&invocation, runs),
         Command::Config { place, explain } => makes_nothing("config")

@@ -16,7 +16,7 @@ table! {
         /// The share of each member, in their order, together 1; an empty list fits them on capture.tiles.
         weights: Vec<f64>, 0.0..=1.0 => Vec::new(), Vec::new(), vec![0.1, 0.6, 0.3];
         /// Cut members trained without masks to the head, true or false; else the background shows.
-        cut: bool => true;
+        cut: bool => true, true, false;
     }
 }
 

@@ -36,6 +36,17 @@ pub enum Foreground {
     Estimated,
 }
 
+/// What the hash grid holds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FieldKind {
+    /// A signed distance (NeuS).
+    #[default]
+    Sdf,
+    /// A density (Instant-NeRF).
+    Density,
+}
+
 /// Where the surface starts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -51,6 +62,8 @@ table! {
     /// Settings of the stage `iface`. Lengths are in field units: the scene's box is `[-radius, radius]³`.
     pub struct IfaceConfig;
     keys {
+        /// What is learned: sdf (a signed distance, as NeuS) or density (Instant-NeRF, in preset paper and on the CPU).
+        field: FieldKind => FieldKind::Sdf;
         /// Optimizer steps.
         steps: u64, 1.0..=1e7 => 3000, 8000, 20_000;
         /// Rays per step at the start.
@@ -160,15 +173,31 @@ table! {
 mod tests {
     use super::*;
     use crate::config::Preset;
+    use crate::kernel::hash;
+    use crate::kernel::sdf::FieldShape;
 
+    /// What follows from the published settings, as the published code's own printout and arithmetic have it.
     #[test]
-    fn the_paper_preset_has_the_published_numbers() {
+    fn the_paper_preset_makes_the_published_grid_network_and_lattice() {
         let p = IfaceConfig::preset(Preset::Paper);
-        assert_eq!((p.steps, p.rays, p.max_rays, p.samples), (20_000, 256, 8192, 262_144));
-        assert_eq!((p.levels, p.base_resolution, p.log2_table), (16, 32, 19));
-        assert_eq!((p.mask, p.eikonal, p.sparsity, p.sparsity_scale), (0.1, 0.1, 0.5, 1.0));
-        assert_eq!(p.stereo, 0.0);
-        assert_eq!((p.weight_decay, p.table_decay, p.lr_variance), (0.01, 0.01, 0.001));
-        assert_eq!((p.color_skip, p.soften), (false, 1.0));
+        let levels = hash::levels(p.levels, p.base_resolution, p.growth, p.log2_table);
+        // 6,984,576 entries of two features; the first four levels are whole, all others 2^19 entries
+        assert_eq!(hash::entries(&levels), 6_984_576);
+        let side = |l: usize| levels[l].scale.ceil() as u32 + 1;
+        assert_eq!([0, 1, 2, 3, 4, 8, 15].map(side), [32, 43, 56, 74, 98, 295, 2049]);
+        // 3 + 32 inputs; geometry 35·64 + 64 + 64·13 + 13, color (64·32 + 64·64 + 3·64) of the published 7168, whose
+        // last layer is padded to 16
+        let shape =
+            FieldShape { levels, radius: p.radius, active: 16, color_skip: p.color_skip, soften: 0.0 };
+        assert_eq!(shape.layout().len(), 2240 + 64 + 832 + 13 + 7168 - 13 * 64);
+        // the cube's edge by 1024, with nerfacc's 1.732: 1.732 · 0.6 / 1024
+        let step = 1.732 * 2.0 * p.radius / p.samples_per_ray as f32;
+        assert!((step - 0.001_014_843_75).abs() < 1e-9, "{step}");
+        // the budget is what the first batch would have if no cell were empty
+        assert_eq!(p.samples, p.rays * p.samples_per_ray);
+        // inv_s starts at 20.0855
+        assert!(((10.0 * p.variance).exp() - 20.0855).abs() < 1e-4);
+        // nothing of what is not published
+        assert_eq!((p.stereo, p.rgb_sample, p.rgb_l1, p.soften, p.jitter), (0.0, 0.0, 0.0, 1.0, false));
     }
 }

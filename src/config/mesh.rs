@@ -73,19 +73,19 @@ table! {
         resolution: u32, 16.0..=4096.0 => 256, 512, 512;
         /// Handles, such as loops of hair: keep, or simple (cut or filled, up to a loop of 0.15 of the surface's
         /// longest side: about 45 mm on a head).
-        genus: Genus => Genus::Simple;
+        genus: Genus => Genus::Simple, Genus::Simple, Genus::Keep;
         /// Also evaluate the whole grid and report what the sparse extraction lost: slow.
         verify: bool => false;
         /// Close the surface where the frames cut the body: true or false.
-        cap: bool => true;
+        cap: bool => true, true, false;
         /// Triangles of the product; 0 keeps all of the extraction.
-        triangles: u32, 0.0..=1e8 => 50_000;
+        triangles: u32, 0.0..=1e8 => 50_000, 50_000, 0;
         /// Largest distance of the product from the field's surface, in cells; 0 sets no limit.
         max_error: f32, 0.0..=100.0 => 0.0;
         /// Where colors come from: photographs (fitted to them, as good as they are) or network (published).
         color: ColorSource => ColorSource::Photographs, ColorSource::Photographs, ColorSource::Network;
         /// Texels along each side of the texture; 0: colors at the vertices.
-        texture_px: u32, 0.0..=16384.0 => 1024, 2048, 2048;
+        texture_px: u32, 0.0..=16384.0 => 1024, 2048, 0;
         /// Degree of view-dependent lobes in the GLB, 0 (none), 1 or 2; no view of the mesh has more then.
         lobes: u32, 0.0..=2.0 => 0;
         /// Around soft outlines, as of hair: shells (translucent layers in the GLB, where they help) or none. raycast
@@ -103,6 +103,8 @@ table! {
         frame: MeshFrame => MeshFrame::Dataset;
     }
     constants {
+        /// Evaluate the whole grid, and leave what is found there as it is (published).
+        dense: bool => false, false, true;
         /// Components with less than this share of the largest one's area are dropped: a head is one piece.
         keep_share: f64 => 1.0;
         /// Share of the cameras that must have the median cell of a slab in their frames, or the body is cut off

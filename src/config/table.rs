@@ -44,7 +44,7 @@ macro_rules! table {
 
         pub(super) const KEYS: &[super::Key] = &[
             $(super::Key {
-                name: stringify!($key),
+                name: $crate::config::table::plain(stringify!($key)),
                 doc: concat!($($doc),+).trim_ascii_start(),
                 min: $crate::config::table::bound!(f64::NEG_INFINITY $(, $min)?),
                 max: $crate::config::table::bound!(f64::INFINITY $(, $max)?),
@@ -76,6 +76,17 @@ macro_rules! table {
             }
         })?
     };
+}
+
+/// The name of a field as it is written in TOML: without the mark of a word that is Rust's own.
+pub(super) const fn plain(field: &'static str) -> &'static str {
+    match field.as_bytes() {
+        [b'r', b'#', name @ ..] => match std::str::from_utf8(name) {
+            Ok(name) => name,
+            Err(_) => field,
+        },
+        _ => field,
+    }
 }
 
 /// The second value, else the first.

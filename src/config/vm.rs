@@ -13,6 +13,8 @@ pub enum MaskUse {
     None,
     /// Every pixel that is a little head is head (published).
     Binary,
+    /// Every pixel that is half head is head: what a cut without matting gives.
+    Hard,
     /// Soft alpha.
     Soft,
 }
@@ -25,7 +27,8 @@ pub enum MaskLoss {
     None,
     /// Mean of opacity² over rays that are all background (T-Face).
     L2,
-    /// Binary cross entropy of opacity and mask over all rays (the paper's ablation).
+    /// Binary cross entropy of opacity and mask over all rays, where every pixel that is a little head is head (the
+    /// paper's ablation).
     Ce,
 }
 
@@ -78,7 +81,7 @@ table! {
         steps: u64, 1.0..=1e7 => 1500, 2000, 50_000;
         /// Rays per step.
         rays: usize, 1.0..=1_048_576.0 => 8192, 8192, 4096;
-        /// What masks do to the photographs: none, binary (a little head is head) or soft.
+        /// What masks do to the photographs: none, binary (a little head is head), hard (half a head is) or soft.
         masks: MaskUse => MaskUse::Soft, MaskUse::Soft, MaskUse::Binary;
         /// How opacity is held to the mask: none, l2 (opacity² of background rays) or ce (cross entropy).
         mask_loss: MaskLoss => MaskLoss::L2;
@@ -115,8 +118,20 @@ table! {
         foreground: Foreground => Foreground::Photo;
         /// Cells at the start.
         start: VmStart => VmStart::Hull, VmStart::Hull, VmStart::Box;
-        /// Draw any pixel of the frames (published), not only those near the masks.
+        /// Draw as published: every valid pixel of the frames whose ray meets the box, in a random order without
+        /// repetition; else those near the masks, with repetition.
         whole_frame: bool => false, false, true;
+        /// Directions have depth 1, not length 1, so that steps are longer off the axis (published).
+        depth_directions: bool => false, false, true;
+        /// Half of the box's longest side in units of `distance_scale`, of the step that `mask_threshold` looks at and of
+        /// `near` and `far`; none: all of them are scene units. Published is a fixed box, 3.34 units long.
+        box_half: Option<f64> => None, None, Some(1.67);
+        /// Scene units in the unit that the alpha mask's step is counted in: see [`VmConfig::placed`].
+        alpha_unit: f64 => 1.0;
+        /// Rays enter the box between this depth and `far`: of the published box, and of no other.
+        near: f64 => 0.0, 0.0, 3.5;
+        /// See `near`.
+        far: f64 => 1e6, 1e6, 7.0;
         /// Smallest alpha of a grid step that is kept in the alpha mask.
         mask_threshold: f64 => 1e-4;
         /// Outputs of the basis matrix.
@@ -131,10 +146,9 @@ table! {
         activation: DensityActivation => DensityActivation::Relu;
         /// Added to the feature before softplus.
         density_shift: f64 => -10.0;
-        /// Optical lengths are scene lengths times density times this. Published are 25 in a world whose box is 3.3
-        /// units long; the scene's is 2. Denser matter sets a thinner surface, and fewer samples of a ray need a
-        /// color, but from 200 on hair hardens.
-        distance_scale: f64 => 100.0, 100.0, 40.0;
+        /// Optical lengths are lengths times density times this, in scene units or those of `box_half`. Denser matter sets
+        /// a thinner surface, and fewer samples of a ray need a color, but from 200 on hair hardens.
+        distance_scale: f64 => 100.0, 100.0, 25.0;
         /// March step as a share of the distance of vertices. Half as many samples as published, at the same quality.
         step_ratio: f64 => 1.0, 1.0, 0.5;
         /// Color is evaluated only of samples with more weight.
@@ -160,6 +174,33 @@ table! {
 }
 
 impl VmConfig {
+    /// Scene units in a unit of the optical constants, for a field in a box.
+    pub fn unit(&self, bounds: [[f32; 3]; 2]) -> f64 {
+        let half = (0..3).map(|a| 0.5 * f64::from(bounds[1][a] - bounds[0][a])).fold(0.0, f64::max);
+        self.box_half.map_or(1.0, |of| half / of)
+    }
+
+    /// The settings of a field that starts in a box, all lengths in scene units; done once, before the box shrinks.
+    ///
+    /// ```
+    /// # use tiface::config::{Preset, VmConfig};
+    /// // a box of the published shape, 1.002 dataset units long, in a scene whose unit that is: 25 / 0.3 = 83.3
+    /// let c = VmConfig::preset(Preset::Paper).placed([[-0.45, -0.501, -0.3], [0.45, 0.501, 0.3]]);
+    /// assert!((c.distance_scale - 25.0 / 0.3).abs() < 1e-4);
+    /// ```
+    pub fn placed(&self, bounds: [[f32; 3]; 2]) -> VmConfig {
+        let unit = self.unit(bounds);
+        let published = self.box_half.is_none() || (unit - 1.0).abs() < 1e-5;
+        VmConfig {
+            distance_scale: self.distance_scale / unit,
+            alpha_unit: unit,
+            near: if published { self.near } else { 0.0 },
+            far: if published { self.far } else { 1e6 },
+            box_half: None,
+            ..self.clone()
+        }
+    }
+
     /// How many fields there are in the end: at least one, and no more where it comes from a file.
     pub fn learned(&self) -> usize {
         if self.import.is_empty() { self.fields.max(1) } else { 1 }
@@ -170,16 +211,41 @@ impl VmConfig {
 mod tests {
     use super::*;
     use crate::config::{Config, Preset};
+    use crate::kernel::vm::{DecoderShape, Grid, size_for, voxel_schedule};
 
+    /// What follows from the published settings in the published box.
     #[test]
-    fn the_paper_preset_has_the_published_numbers() {
+    fn the_paper_preset_makes_the_published_grids_and_network() {
         let paper = Config::preset(Preset::Paper);
-        let p = paper.tface.clone();
-        assert_eq!((p.steps, p.rays, p.voxels_start, p.voxels_final), (50_000, 4096, 2_097_156, 27_000_000));
-        assert_eq!((p.density_rank, p.color_rank), (vec![16, 4, 4], vec![48, 12, 12]));
-        assert_eq!((p.mask_weight, p.mask_loss, p.background), (0.01, MaskLoss::L2, VmBackground::Reference));
-        let b = paper.baseline.field(&paper.tface);
-        assert_eq!((b.masks, b.mask_loss, b.steps), (MaskUse::None, MaskLoss::None, 50_000));
+        let p = &paper.tface;
+        let extent = [3.0, 3.34, 2.0];
+        let mut sizes = vec![size_for(extent, p.voxels_start)];
+        let finer = voxel_schedule(p.voxels_start, p.voxels_final, p.upsample_steps.len());
+        sizes.extend(finer.into_iter().map(|v| size_for(extent, v)));
+        assert_eq!((sizes[0], sizes[1], sizes[5]), ([141, 157, 94], [167, 186, 111], [331, 368, 220]));
+        // samples of a training ray: ‖N‖ / 0.5
+        let samples =
+            |n: [usize; 3]| (n.iter().map(|n| (n * n) as f64).sum::<f64>().sqrt() / p.step_ratio) as usize;
+        assert_eq!((samples(sizes[0]), samples(sizes[5])), (462, 1083));
+        // planes of 141 × 157, 141 × 94, 157 × 94 vertices with 16, 4, 4 channels, lines of 94, 157, 141
+        let triple = |list: &[usize]| [list[0], list[1], list[2]];
+        let density = Grid { size: sizes[0], rank: triple(&p.density_rank) };
+        let planes = 22_137 * 16 + 13_254 * 4 + 14_758 * 4;
+        assert_eq!(density.len(), planes + 94 * 16 + 157 * 4 + 141 * 4);
+        let color = Grid { size: sizes[0], rank: triple(&p.color_rank) };
+        assert_eq!(color.len(), 3 * density.len());
+        // 72 → 27; 30 → 128 → 128 → 3, with biases
+        let decoder = DecoderShape {
+            channels: color.channels(),
+            features: p.features,
+            hidden: p.hidden,
+            view_frequencies: p.view_frequencies,
+            feature_frequencies: p.feature_frequencies,
+        };
+        assert_eq!(decoder.len(), 72 * 27 + (30 * 128 + 128) + (128 * 128 + 128) + (128 * 3 + 3));
+        // the baseline is the same field on photographs as they are
+        let b = paper.baseline.field(p);
+        assert_eq!(VmConfig { masks: p.masks, mask_loss: p.mask_loss, ..b }, *p);
     }
 
     #[test]

@@ -5,7 +5,7 @@
 
 use super::background;
 use crate::config::iface::Foreground;
-use crate::geom::Camera;
+use crate::geom::{Camera, Ray};
 use crate::image::{Gray, Photo};
 #[cfg(feature = "wgpu")]
 use crate::kernel::gpu;
@@ -49,6 +49,16 @@ pub struct Pixels<'a> {
     /// Has any view a mask that says something?
     pub masked: bool,
     published: bool,
+    /// How pixels follow each other that are drawn without repetition.
+    order: Option<Order>,
+}
+
+/// Every drawable pixel once, then again in another order: TensoRF's sampler.
+struct Order {
+    /// Per view: drawable pixels before each word of its bits.
+    before: Vec<Vec<u32>>,
+    /// Directions have depth 1 in front of the camera, not length 1.
+    depth_directions: bool,
 }
 
 impl<'a> Pixels<'a> {
@@ -87,7 +97,51 @@ impl<'a> Pixels<'a> {
                 sum
             })
             .collect();
-        Pixels { views, over_black, drawable, cumulative, radius, masked, published }
+        Pixels { views, over_black, drawable, cumulative, radius, masked, published, order: None }
+    }
+
+    /// Pixels as TensoRF's code draws them: all valid ones whose ray meets the box `bounds` at any distance, in a random
+    /// order without repetition, which starts anew where fewer than a batch are left. With `depth_directions` rays
+    /// have directions of depth 1 before the camera, as in its loader of forward-facing captures.
+    ///
+    /// The order is a permutation that is computed, not stored: twenty-four photographs of twelve megapixels would have
+    /// a list of two gigabytes.
+    pub fn permuted(
+        views: &'a [TrainView],
+        foreground: Foreground,
+        bounds: [[f32; 3]; 2],
+        depth_directions: bool,
+    ) -> Pixels<'a> {
+        let mut pixels = Pixels::new(views, f32::INFINITY, 1.0, foreground, false);
+        pixels.drawable.par_iter_mut().zip(views).for_each(|((.., bits), view)| {
+            let width = view.photo.width as usize;
+            for (i, word) in bits.iter_mut().enumerate() {
+                let (mut rest, mut kept) = (*word, 0);
+                while rest != 0 {
+                    let bit = rest.trailing_zeros() as usize;
+                    rest &= rest - 1;
+                    let p = 64 * i + bit;
+                    let at = Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);
+                    let ray = view.camera.ray(at);
+                    kept |= u64::from(ray.is_some_and(|ray| meets(bounds, &ray))) << bit;
+                }
+                *word = kept;
+            }
+        });
+        let mut sum = 0;
+        let mut before = Vec::with_capacity(views.len());
+        for (total, (.., bits)) in pixels.cumulative.iter_mut().zip(&pixels.drawable) {
+            let mut own = 0u32;
+            let counted = |b: &u64| {
+                own += b.count_ones();
+                own - b.count_ones()
+            };
+            before.push(bits.iter().map(counted).collect());
+            sum += u64::from(own);
+            *total = sum;
+        }
+        pixels.order = Some(Order { before, depth_directions });
+        pixels
     }
 
     /// The photographs.
@@ -105,7 +159,10 @@ impl<'a> Pixels<'a> {
         let drawn: Vec<(MarchRay, [f32; 3], f32)> = (0..count)
             .into_par_iter()
             .with_min_len(256)
-            .filter_map(|i| self.draw_one(seed, step, i as u64, jitter))
+            .filter_map(|i| match &self.order {
+                Some(order) => self.draw_next(order, (seed, step), (i as u64, count as u64), jitter),
+                None => self.draw_one(seed, step, i as u64, jitter),
+            })
             .collect();
         let mut batch = Batch {
             rays: Vec::with_capacity(drawn.len()),
@@ -161,6 +218,48 @@ impl<'a> Pixels<'a> {
         }
     }
 
+    /// Pixel `i` of a batch of `count` in the order that all are gone through.
+    fn draw_next(
+        &self,
+        order: &Order,
+        (seed, step): (u64, u64),
+        (i, count): (u64, u64),
+        jitter: bool,
+    ) -> Option<(MarchRay, [f32; 3], f32)> {
+        let all = self.count();
+        let batches = (all / count).max(1);
+        let place = step % batches * count + i;
+        if place >= all {
+            return None; // a batch of more than there are
+        }
+        let which = permuted(rng::bits(seed, 13, step / batches), place, all);
+        let v = self.cumulative.partition_point(|&c| c <= which);
+        let rank = (which - if v > 0 { self.cumulative[v - 1] } else { 0 }) as u32;
+        let word = order.before[v].partition_point(|&b| b <= rank) - 1;
+        let mut bits = self.drawable[v].4[word];
+        (order.before[v][word]..rank).for_each(|_| bits &= bits - 1);
+        let p = 64 * word + bits.trailing_zeros() as usize;
+        let view = &self.views[v];
+        let width = view.photo.width as usize;
+        let ray = view.camera.ray(Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5))?;
+        let jitter = if jitter { rng::uniform(seed, (step << 4) + 2, i) } else { 0.0 };
+        let depth = if order.depth_directions { ray.direction.dot(view.camera.forward()) } else { 1.0 };
+        let (origin, direction) = (ray.origin.to_array(), (ray.direction / depth).to_array());
+        let (color, alpha) = self.seen(v, p);
+        Some((MarchRay { origin, direction, jitter }, color, alpha))
+    }
+
+    /// What pixel `p` of view `v` should show over black, and its alpha.
+    fn seen(&self, v: usize, p: usize) -> ([f32; 3], f32) {
+        let view = &self.views[v];
+        let alpha = view.mask.as_ref().map_or(1.0, |m| m.values[p] as f32 / 255.0);
+        let color = match self.over_black[v].get(p) {
+            Some(head) => head.map(|c| c as f32 / 255.0),
+            None => view.photo.rgb[p].map(|c| alpha * c as f32 / 255.0),
+        };
+        (color, alpha)
+    }
+
     fn draw_one(&self, seed: u64, step: u64, i: u64, jitter: bool) -> Option<(MarchRay, [f32; 3], f32)> {
         let stream = step << 4;
         let v = if self.published {
@@ -192,14 +291,39 @@ impl<'a> Pixels<'a> {
                 direction: ray.direction.to_array(),
                 jitter: shift,
             };
-            let alpha = view.mask.as_ref().map_or(1.0, |m| m.values[p] as f32 / 255.0);
-            let color = match self.over_black[v].get(p) {
-                Some(head) => head.map(|c| c as f32 / 255.0),
-                None => view.photo.rgb[p].map(|c| alpha * c as f32 / 255.0),
-            };
+            let (color, alpha) = self.seen(v, p);
             return Some((march, color, alpha));
         }
         None
+    }
+}
+
+/// Does the line of a ray meet a box? Zero components of its direction count as 1e-6, as published.
+fn meets([low, high]: [[f32; 3]; 2], ray: &Ray) -> bool {
+    let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
+    for a in 0..3 {
+        let d = if ray.direction[a] == 0.0 { 1e-6 } else { ray.direction[a] };
+        let (p, q) = ((low[a] - ray.origin[a]) / d, (high[a] - ray.origin[a]) / d);
+        (enter, leave) = (enter.max(p.min(q)), leave.min(p.max(q)));
+    }
+    leave > enter
+}
+
+/// Where `i` of `0..n` goes in a random order that `key` names: four rounds of a Feistel network over the next power of
+/// four, gone round again until it is within (Black and Rogaway 2002, "Ciphers with arbitrary finite domains").
+fn permuted(key: u64, i: u64, n: u64) -> u64 {
+    let half = (64 - (n - 1).leading_zeros()).div_ceil(2).max(1);
+    let low = (1u64 << half) - 1;
+    let mut x = i;
+    loop {
+        let (mut left, mut right) = (x >> half, x & low);
+        for round in 0..4 {
+            (left, right) = (right, left ^ (rng::bits(key, round, right) & low));
+        }
+        x = left << half | right;
+        if x < n {
+            return x;
+        }
     }
 }
 
@@ -307,6 +431,56 @@ mod tests {
         // alone it is drawn from everywhere
         let alone = [TrainView { mask: None, ..view() }];
         assert_eq!(Pixels::new(&alone, 0.1, 1.0, Foreground::Photo, false).count(), 200);
+    }
+
+    #[test]
+    fn a_permutation_has_every_number_once_and_another_order_for_every_key() {
+        for n in [1, 2, 3, 64, 65, 1000] {
+            let all = |key: u64| (0..n).map(|i| permuted(key, i, n)).collect::<Vec<u64>>();
+            let mut sorted = all(7);
+            sorted.sort_unstable();
+            assert_eq!(sorted, (0..n).collect::<Vec<u64>>());
+            assert!(n < 64 || all(7) != all(8));
+        }
+        // no order to be seen: neighbors are a third of 1000 apart on average
+        let all: Vec<u64> = (0..1000).map(|i| permuted(3, i, 1000)).collect();
+        let apart = all.windows(2).map(|w| w[0].abs_diff(w[1])).sum::<u64>() as f64 / 999.0;
+        assert!((apart - 333.0).abs() < 30.0, "{apart}");
+    }
+
+    #[test]
+    fn an_epoch_has_every_valid_pixel_that_meets_the_box_once_with_directions_of_depth_one() {
+        let mut one = view();
+        let mut valid = vec![255; 200];
+        valid[7 * 20 + 9] = 0;
+        one.valid = Some(Gray { width: 20, height: 10, values: valid });
+        let views = [one, view()];
+        // pixels are 1/20 apart at depth 1. The near face at z = 1 is 3 away: |x − 10| < 1.5 · 20 / 3 = 10 has all
+        // columns, |y − 5| < 0.4 · 20 / 3 = 2.67 the six rows with centers 0.5, 1.5 and 2.5 off the middle
+        let bounds = [[-1.5, -0.4, -1.0], [1.5, 0.4, 1.0]];
+        let pixels = Pixels::permuted(&views, Foreground::Photo, bounds, true);
+        assert_eq!(pixels.count(), 2 * 20 * 6 - 1);
+        // 239 pixels in batches of 50: four a round, and a tail that is left out
+        let mut seen = Vec::new();
+        for step in 0..4 {
+            let batch = pixels.draw(1, step, 50, false);
+            assert_eq!(batch.rays.len(), 50);
+            for (ray, color) in batch.rays.iter().zip(&batch.color) {
+                assert!((ray.direction[2] + 1.0).abs() < 1e-6, "{ray:?}");
+                let (x, y) = (ray.direction[0] * 20.0 + 9.5, 4.5 - ray.direction[1] * 20.0);
+                assert!((x - x.round()).abs() < 1e-4 && (2.0..=7.0).contains(&y.round()), "{x} {y}");
+                seen.push((y.round() as u64 * 20 + x.round() as u64, *color));
+            }
+        }
+        let count = |p: u64| seen.iter().filter(|(q, _)| *q == p).count();
+        assert!((0..200).all(|p| count(p) <= 2) && count(7 * 20 + 9) <= 1 && seen.len() == 200);
+        // pixel (8, 5), number 108, is head
+        let head = seen.iter().filter(|(p, _)| *p == 108);
+        assert!(head.clone().count() > 0 && head.clone().all(|(_, c)| (c[0] * 255.0 - 108.0).abs() < 1e-3));
+        let first = pixels.draw(1, 0, 50, false).rays;
+        assert!(first == pixels.draw(1, 0, 50, false).rays && first != pixels.draw(1, 4, 50, false).rays);
+        // more than there are: all of them, once
+        assert_eq!(pixels.draw(1, 9, 1000, false).rays.len(), 239);
     }
 
     #[test]

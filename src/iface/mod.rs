@@ -8,6 +8,7 @@
 //! network the hash features themselves, and hold the surface to points that stereo finds on it half-way (Fu et al.
 //! 2022, "Geo-NeuS", use points of a reconstruction as zero set).
 
+mod density;
 mod hull_start;
 mod infer;
 mod losses;
@@ -20,6 +21,7 @@ mod state;
 mod stereo;
 mod train;
 
+pub use density::{DensityField, train_density};
 pub use infer::IFace;
 pub use model::shape as field_shape;
 pub use train::{IfaceReport, train};

@@ -152,7 +152,24 @@ impl Occupancy {
         sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
         soft: impl Fn(&[[f32; 3]]) -> Vec<f32>,
     ) {
-        let r = config.occupancy_resolution;
+        let opacity = |points: &[[f32; 3]]| -> Vec<f32> {
+            let local = if config.soften > 1.0 { soft(points) } else { vec![0.0; points.len()] };
+            let each = sdf(points).into_par_iter().zip(local);
+            each.map(|(f, soft)| neus::occupancy(f, 0.5 * step, inv_s * soft.exp())).collect()
+        };
+        self.look((seed, n), config.radius, 1e-3, opacity);
+    }
+
+    /// nerfacc's rule for any opacity of a cell: what is above `threshold`, or above the mean where that is less, is
+    /// marched through.
+    pub fn look(
+        &mut self,
+        (seed, n): (u64, u64),
+        radius: f32,
+        threshold: f32,
+        opacity: impl Fn(&[[f32; 3]]) -> Vec<f32>,
+    ) {
+        let r = self.occupied.resolution;
         let total = r * r * r;
         let cells: Vec<usize> = if n < 256 {
             (0..total).collect()
@@ -168,7 +185,7 @@ impl Occupancy {
             };
             random.chain(some).collect()
         };
-        let cell = 2.0 * config.radius / r as f32;
+        let cell = 2.0 * radius / r as f32;
         let points: Vec<[f32; 3]> = cells
             .par_iter()
             .enumerate()
@@ -176,23 +193,18 @@ impl Occupancy {
                 let corner = [i / (r * r), i / r % r, i % r];
                 std::array::from_fn(|a| {
                     let jitter = rng::uniform(seed, n << 4 | 7, (3 * k + a) as u64);
-                    (corner[a] as f32 + jitter) * cell - config.radius
+                    (corner[a] as f32 + jitter) * cell - radius
                 })
             })
             .collect();
-        let local = if config.soften > 1.0 { soft(&points) } else { vec![0.0; points.len()] };
-        let opacity: Vec<f32> = sdf(&points)
-            .into_par_iter()
-            .zip(local)
-            .map(|(f, soft)| neus::occupancy(f, 0.5 * step, inv_s * soft.exp()))
-            .collect();
+        let opacity = opacity(&points);
         let decayed: Vec<(usize, f32)> =
             cells.iter().zip(&opacity).map(|(&i, &o)| (i, (0.95 * self.history[i]).max(o))).collect();
         for (i, o) in decayed {
             self.history[i] = o;
         }
         let mean = self.history.iter().map(|&v| v as f64).sum::<f64>() / total as f64;
-        let threshold = (mean as f32).min(1e-3);
+        let threshold = (mean as f32).min(threshold);
         for i in 0..total {
             self.occupied.set(i, self.allowed.get(i) && self.history[i] > threshold);
         }
@@ -252,6 +264,40 @@ mod tests {
         // the published rule knows no hull
         let config = IfaceConfig { occupancy: OccupancyRule::Nerfacc, ..config };
         assert_eq!(Occupancy::new(&config, Some(&hull)).occupied.count(), 16 * 16 * 16);
+    }
+
+    /// nerfacc 0.3.3 with I-Face's opacity: inv_s = e³, step 0.00101484375, of which 0.05 from the surface has 0.00546357
+    /// and 0.2 has 0.000370632.
+    #[test]
+    fn the_published_rule_decays_what_it_visits_and_keeps_what_is_above_the_mean_or_a_thousandth() {
+        let config = IfaceConfig { occupancy_resolution: 8, ..IfaceConfig::preset(Preset::Paper) };
+        let (inv_s, step) = (3f32.exp(), 0.001_014_843_75);
+        let all = |f: f32| move |p: &[[f32; 3]]| vec![f; p.len()];
+        let near = |a: f32, b: f64| (f64::from(a) - b).abs() < 2e-4 * b;
+        // below step 256 every cell is visited; 0.00546 is more than a thousandth
+        let mut o = Occupancy::new(&config, None);
+        o.update(&config, (1, 0), inv_s, step, all(0.05), even);
+        assert!(o.history.iter().all(|&h| near(h, 0.005_463_57)) && o.occupied.count() == 512);
+        // what is seen later is less than 0.95 of it
+        for k in 1..16u64 {
+            o.update(&config, (1, 16 * k), inv_s, step, all(0.2), even);
+            assert!(o.history.iter().all(|&h| near(h, 0.005_463_57 * 0.95f64.powi(k as i32))), "{k}");
+        }
+        // from then on a quarter anywhere and as many of the occupied, both with repetition: of 512 cells some
+        // 512 (1 − (1 − 1/512)²⁵⁶) = 201 fall once
+        let before = o.history[0];
+        o.update(&config, (1, 256), inv_s, step, all(0.2), even);
+        let fallen = o.history.iter().filter(|&&h| near(h, 0.95 * f64::from(before))).count();
+        let kept = o.history.iter().filter(|&&h| h == before).count();
+        assert!((180..225).contains(&fallen) && fallen + kept == 512, "{fallen} {kept}");
+        // one cell near the surface, 511 far: the mean, 0.00038, is the threshold
+        let corner = |p: &[[f32; 3]]| {
+            p.iter().map(|p| if p.iter().all(|&c| c < -0.225) { 0.05 } else { 0.2 }).collect()
+        };
+        let mut o = Occupancy::new(&config, None);
+        o.update(&config, (1, 0), inv_s, step, corner, even);
+        assert!(o.occupied.count() == 1 && o.occupied.get(0));
+        assert!(near(o.history[511], 3.706_32e-4) && near(o.history[0], 0.005_463_57));
     }
 
     #[test]

@@ -383,5 +383,8 @@ impl SdfTraining<'_> {
 }
 
 #[cfg(test)]
+#[path = "step_tests.rs"]
+mod step_tests;
+#[cfg(test)]
 #[path = "train_tests.rs"]
 mod tests;

@@ -159,21 +159,3 @@ fn empty_masks_and_unseen_boxes_do_not_crash() {
     let lost = "the surface is lost at step 19: no ray of 20 steps met a sample";
     assert_eq!(end.err().unwrap().to_string(), lost);
 }
-
-#[test]
-fn the_paper_preset_trains_too() {
-    let dir = temporary();
-    let views = views();
-    let config = IfaceConfig {
-        steps: 12,
-        levels: 4,
-        start_levels: 4,
-        log2_table: 10,
-        samples: 8192,
-        occupancy_resolution: 16,
-        samples_per_ray: 64,
-        ..IfaceConfig::preset(Preset::Paper)
-    };
-    let (face, report) = train(&views, None, &config, &session("iface", dir.path(), "p", &Quiet)).unwrap();
-    assert!(report.train_psnr.is_finite() && face.sdf(&[Vec3::ZERO])[0] < 0.0);
-}

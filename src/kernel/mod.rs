@@ -5,6 +5,7 @@
 
 pub mod adam;
 pub mod cg;
+pub mod density;
 #[cfg(feature = "wgpu")]
 pub mod gpu;
 pub mod hash;

@@ -1,8 +1,88 @@
 //! The formulas of the kernels once more, in f64, one sample after the other: what the fast ones are held against.
 
+#[cfg(test)]
+pub(crate) mod density;
 pub(crate) mod neus;
 pub(crate) mod sdf;
+#[cfg(test)]
+pub(crate) mod tape;
 pub(crate) mod vm;
+
+use std::iter::Sum;
+use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub};
+
+/// What the formulas are written in: f64, or a number that remembers how it came about, for exact gradients.
+pub(crate) trait Real:
+    Copy
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + Neg<Output = Self>
+    + AddAssign
+    + Sum
+{
+    /// A constant.
+    fn of(value: f64) -> Self;
+    /// What it is.
+    fn value(self) -> f64;
+    /// A function of it, of this value and this slope there.
+    fn map(self, value: f64, slope: f64) -> Self;
+
+    fn exp(self) -> Self {
+        let e = self.value().exp();
+        self.map(e, e)
+    }
+
+    #[cfg(test)]
+    fn ln(self) -> Self {
+        self.map(self.value().ln(), 1.0 / self.value())
+    }
+
+    fn ln_1p(self) -> Self {
+        self.map(self.value().ln_1p(), 1.0 / (1.0 + self.value()))
+    }
+
+    fn sqrt(self) -> Self {
+        let root = self.value().sqrt();
+        self.map(root, 0.5 / root)
+    }
+
+    fn sin(self) -> Self {
+        self.map(self.value().sin(), self.value().cos())
+    }
+
+    fn cos(self) -> Self {
+        self.map(self.value().cos(), -self.value().sin())
+    }
+
+    fn abs(self) -> Self {
+        self.map(self.value().abs(), if self.value() < 0.0 { -1.0 } else { 1.0 })
+    }
+
+    /// Within a range; flat beyond.
+    fn within(self, low: f64, high: f64) -> Self {
+        if (low..=high).contains(&self.value()) { self } else { Self::of(self.value().clamp(low, high)) }
+    }
+
+    fn relu(self) -> Self {
+        if self.value() > 0.0 { self } else { Self::of(0.0) }
+    }
+}
+
+impl Real for f64 {
+    fn of(value: f64) -> f64 {
+        value
+    }
+
+    fn value(self) -> f64 {
+        self
+    }
+
+    fn map(self, value: f64, _: f64) -> f64 {
+        value
+    }
+}
 
 /// The sixteen functions of [`sh16`](super::sphharm::sh16), their factors from the definition.
 pub(crate) fn harmonics([x, y, z]: [f64; 3]) -> [f64; 16] {
@@ -28,8 +108,9 @@ pub(crate) fn harmonics([x, y, z]: [f64; 3]) -> [f64; 16] {
     ]
 }
 
-fn sigmoid(x: f64) -> f64 {
-    1.0 / (1.0 + (-x).exp())
+fn sigmoid<R: Real>(x: R) -> R {
+    let s = 1.0 / (1.0 + (-x.value()).exp());
+    x.map(s, s * (1.0 - s))
 }
 
 /// Values as f64.

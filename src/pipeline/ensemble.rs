@@ -21,6 +21,7 @@ use crate::render::RenderedView;
 use crate::run::StageDir;
 use crate::{Error, Result};
 use serde_json::{Map, Value, json};
+use std::time::{Duration, Instant};
 
 /// A mask and a valid mask count from here on, as in `metrics`.
 const INSIDE: u8 = 128;
@@ -33,9 +34,12 @@ pub(super) fn ensemble(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &St
         true => fit(line, scene, fields, dir)?,
         false => (shares(c), Value::Null),
     };
+    let mut spent = Duration::ZERO;
     for (i, camera) in cameras.iter().enumerate() {
         let views = member_views(line, &camera.name)?;
+        let begin = Instant::now();
         let color = blend(&members(line, &views)?, &weights)?;
+        spent += begin.elapsed();
         let mut view = RenderedView { color, depth: Image::new(0, 0, 1), normal: Image::new(0, 0, 3) };
         if let Some(background) = pictures::behind(render.background) {
             pictures::over(&mut view, background);
@@ -46,6 +50,8 @@ pub(super) fn ensemble(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &St
     let mut summary = json!({"members": words(&c.members), "weights": weights, "fitted": fitted});
     io::write_atomic(&dir.folder().join("weights.json"), format!("{summary:#}\n").as_bytes())?;
     summary["views"] = json!(cameras.len());
+    // of the blend alone: its members' are in the stage `render`
+    summary["seconds_per_view"] = json!(spent.as_secs_f64() / cameras.len().max(1) as f64);
     Ok(summary)
 }
 

@@ -4,6 +4,7 @@ use super::clicks::MaskPrompts;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::Scene;
+use crate::capture::scene_box::SceneBox;
 use crate::capture::{self, Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{Config, MaskSource, RenderConfig, Sources, Stage};
 use crate::io::{self, Limits};
@@ -73,7 +74,8 @@ impl<'a> Line<'a> {
                     (capture, digest, clicks, None)
                 }
             };
-        let own_masks = clicks.is_some().then(|| own_masks(&capture, &options)).transpose()?;
+        let others = clicks.is_some() || config.mask.source == MaskSource::None;
+        let own_masks = others.then(|| own_masks(&capture, &options)).transpose()?;
         let imports = imports(config, run)?;
         capture.warnings.iter().for_each(|warning| run.warn("capture", warning));
         if clicks.is_some() {
@@ -125,8 +127,8 @@ impl<'a> Line<'a> {
         let judged = if held_out.is_empty() { all } else { held_out };
         let is_own = |view: &&View| self.judged(view).mask != view.mask;
         match &self.own_masks {
+            _ if judged.iter().all(|v| self.judged(v).mask == ViewMask::None) => "none",
             Some(_) if !judged.iter().all(is_own) => "run",
-            None if judged.iter().all(|v| v.mask == ViewMask::None) => "none",
             _ => "capture",
         }
     }
@@ -184,6 +186,7 @@ pub fn feasible(config: &Config) -> Result<()> {
     if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
         return Err(Error::usage(format!("`{key}` {problem}"), hint));
     }
+    SceneBox::parse(&config.capture.r#box)?;
     #[cfg(feature = "cpu")]
     crate::field::place(&config.device)?;
     Ok(())

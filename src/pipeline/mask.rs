@@ -4,8 +4,9 @@ use super::clicks::{MaskPrompts, make_masks};
 use super::scene_file;
 use crate::Result;
 use crate::capture::scene::{self, Scene, SceneOptions};
+use crate::capture::scene_box::{SceneBox, in_box};
 use crate::capture::{self, Capture, Split};
-use crate::config::{MaskConfig, MaskMeaning};
+use crate::config::{Config, MaskConfig, MaskMeaning, Preset};
 use crate::image::{Gray, Photo, working_size};
 use crate::io::{self, Limits};
 use crate::mask::annotation::page_of;
@@ -47,9 +48,18 @@ struct CaptureMasks {
 pub(super) fn mask(
     capture: &Capture,
     prompts: Option<&MaskPrompts>,
-    config: &MaskConfig,
+    whole: &Config,
     dir: &StageDir,
 ) -> Result<Value> {
+    let config = &whole.mask;
+    let wanted = SceneBox::parse(&whole.capture.r#box)?;
+    let networks = config.with_sam() && config.with_vitmatte();
+    if whole.preset == Preset::Paper && prompts.is_some() && !networks {
+        dir.warn(
+            "the published masks are SAM's, made soft by ViTMatte; without `mask.sam`, `mask.sam_decoder` and \
+             `mask.vitmatte` they are cut and softened by built-in methods",
+        );
+    }
     let CaptureMasks { masks, sheet: mut views, record } = match prompts {
         Some(prompts) => masks_from_clicks(capture, prompts, config, dir)?,
         None => masks_of_capture(capture, dir)?,
@@ -74,7 +84,7 @@ pub(super) fn mask(
     let suspicious = views.iter().filter(|v| !v.suspicions.is_empty()).map(|v| &v.name);
     let suspicious: Vec<&String> = suspicious.collect();
     // what a mask calls "not looked at" may still hold head
-    let scene = place(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), dir)?;
+    let scene = place(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), wanted, dir)?;
     scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
     let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;
     Ok(json!({
@@ -163,6 +173,7 @@ fn masks_from_clicks(
 fn place(
     capture: &Capture,
     silhouettes: impl Iterator<Item = Option<Gray>>,
+    wanted: SceneBox,
     dir: &StageDir,
 ) -> Result<Scene> {
     let (mut cameras, mut carving, mut names) = (Vec::new(), Vec::new(), Vec::new());
@@ -174,7 +185,7 @@ fn place(
         }
     }
     let options = SceneOptions { names, focus: capture.focus, ..SceneOptions::default() };
-    let (scene, warnings) = scene::fit(&cameras, &carving, &options)?;
+    let (scene, warnings) = in_box(|| scene::fit(&cameras, &carving, &options), wanted)?;
     warnings.iter().for_each(|w| dir.warn(w));
     Ok(scene)
 }

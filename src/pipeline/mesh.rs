@@ -14,7 +14,7 @@ use super::tiles;
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, LoadedView, Split};
 use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, MeshFormat};
-use crate::geom::{Camera, Mesh, Similarity};
+use crate::geom::{Aabb, Camera, Mesh, Similarity};
 use crate::image::Image;
 use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
@@ -43,7 +43,8 @@ pub(super) fn mesh(
     report.warnings(c.cap).iter().for_each(|w| dir.warn(w));
     report.handles.warning(mm).iter().for_each(|w| dir.warn(w));
     let patches = Patches::of(&surface, &report.handles);
-    let mut cap = Cap::of(&surface, report.bounds(), report.cell_size);
+    let cap = (!c.dense).then(|| Cap::of(&surface, report.bounds(), report.cell_size));
+    let mut cap = cap.flatten();
     if let Some(cap) = &cap {
         if c.cap {
             cap.paint(&mut surface);
@@ -139,6 +140,16 @@ pub(super) fn extract(
     c: &MeshConfig,
     monitor: &dyn Monitor,
 ) -> Result<(Mesh, MeshReport)> {
+    // the color of a vertex is what is seen looking straight at it
+    let color = |points: &[Vec3], normals: &[Vec3]| {
+        let directions: Vec<Vec3> = normals.iter().map(|n| -*n).collect();
+        field.color(points, normals, &directions)
+    };
+    let (sdf, gradient) = (|p: &[Vec3]| field.sdf(p), |p: &[Vec3]| field.sdf_gradient(p));
+    if c.dense {
+        let each = (c.resolution as usize, 1 << 16);
+        return mesh::extract_dense(sdf, gradient, color, Aabb::SCENE, each, monitor);
+    }
     let config = mesh::ExtractOptions {
         resolution: c.resolution as usize,
         coarse_step: c.coarse_step as usize,
@@ -151,14 +162,8 @@ pub(super) fn extract(
     };
     let hull = scene.hull.as_ref().map(|hull| |p: Vec3| hull.contains(p));
     let inside_hull = hull.as_ref().map(|f| f as &(dyn Fn(Vec3) -> bool + Sync));
-    // the color of a vertex is what is seen looking straight at it
-    let color = |points: &[Vec3], normals: &[Vec3]| {
-        let directions: Vec<Vec3> = normals.iter().map(|n| -*n).collect();
-        field.color(points, normals, &directions)
-    };
     // below the frames' border the surface is a guess: close the mesh where enough cameras look
     let kept = capture::well_seen(scene, cameras, up, c.seen_by);
-    let (sdf, gradient) = (|p: &[Vec3]| field.sdf(p), |p: &[Vec3]| field.sdf_gradient(p));
     mesh::extract(sdf, gradient, color, kept, inside_hull, &config, monitor)
 }
 

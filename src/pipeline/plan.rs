@@ -4,6 +4,7 @@ use super::ensemble::can_blend;
 use super::line::Line;
 use super::path::{CameraPath, PATHS};
 use crate::capture::{Split, View};
+use crate::config::iface::FieldKind;
 use crate::config::{Config, Stage, VmConfig};
 use crate::io;
 use crate::run::{Fingerprint, Plan, read_record, read_status};
@@ -154,6 +155,9 @@ impl Line<'_> {
                 settings.extend(config.values("capture"));
                 settings.remove("capture.path"); // where it lies does not matter, what it holds does
                 settings.remove("capture.tiles"); // masks are of whole photographs
+                if config.capture.r#box == "head" {
+                    settings.remove("capture.box"); // as in runs from before there was another
+                }
                 inputs.push(("capture", self.digest.clone()));
                 match &self.clicks {
                     // where clicks and networks lie does not matter either, nor how much memory they get
@@ -169,6 +173,9 @@ impl Line<'_> {
             }
             Stage::Iface => {
                 settings.remove("iface.checkpoint_s"); // how often is no matter of what
+                if config.iface.field == FieldKind::Sdf {
+                    settings.remove("iface.field"); // as in runs from before there was another
+                }
                 // weights and two moments, for two checkpoints and one being written
                 needs_bytes += (config.iface.levels as u64) << config.iface.log2_table.min(40) << 3 << 3;
             }

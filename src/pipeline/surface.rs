@@ -126,6 +126,30 @@ impl Surface for crate::iface::IFace {
 }
 
 #[cfg(feature = "cpu")]
+impl Surface for crate::iface::DensityField {
+    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+        self.sdf(points)
+    }
+
+    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        self.sdf_gradient(points)
+    }
+
+    /// None that is known.
+    fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
+        vec![f32::INFINITY; points.len()]
+    }
+
+    fn colors(&self, points: &[Vec3], _: &[Vec3], counts: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        self.colors(points, counts, directions)
+    }
+
+    fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView> {
+        Some(super::march::march(camera, world_from_scene, false, |rays| self.render(rays)))
+    }
+}
+
+#[cfg(feature = "cpu")]
 impl Radiance for crate::tface::FieldMean {
     fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         self.render(rays, forward)

@@ -85,11 +85,15 @@ pub fn train(
     let hull = hull.filter(|_| config.start == VmStart::Hull && config.masks != MaskUse::None);
     // rays that meet the hull, grown by the cells around it
     let reach = hull.map_or(f32::INFINITY, |h| 4.0 * 2.0 / h.resolution.min(128) as f32);
-    let pixels = Pixels::new(&views, reach, 1.0, config.foreground, config.whole_frame);
+    let bounds = [bounds.min.to_array(), bounds.max.to_array()];
+    let config = &config.placed(bounds);
+    let pixels = match config.whole_frame {
+        true => Pixels::permuted(&views, config.foreground, bounds, config.depth_directions),
+        false => Pixels::new(&views, reach, 1.0, config.foreground, false),
+    };
     if pixels.count() == 0 {
         return Err(training::no_pixels());
     }
-    let bounds = [bounds.min.to_array(), bounds.max.to_array()];
     let fields = config.learned();
     let mut whole: Option<TfaceReport> = None;
     for i in 0..fields {

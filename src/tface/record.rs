@@ -91,10 +91,14 @@ impl FieldRecord {
             decoder: decoder(config),
             shading: shading(config),
             step_ratio: config.step_ratio as f32,
-            near: 0.0,
-            far: 1e6,
+            near: config.near as f32,
+            far: config.far as f32,
             mask_threshold: config.mask_threshold as f32,
-            placement: None,
+            placement: config.depth_directions.then_some(Placement {
+                scale: 1.0,
+                offset: [0.0; 3],
+                depth_directions: true,
+            }),
         }
     }
 

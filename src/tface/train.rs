@@ -164,8 +164,9 @@ pub(super) fn masked_as_configured(views: &[TrainView], masks: MaskUse) -> Vec<T
     let change = |mask: &Gray| match masks {
         MaskUse::None => None,
         MaskUse::Soft => Some(mask.clone()),
-        MaskUse::Binary => {
-            let values = mask.values.iter().map(|&a| if a > 0 { 255 } else { 0 }).collect();
+        MaskUse::Binary | MaskUse::Hard => {
+            let least = if masks == MaskUse::Hard { 128 } else { 1 };
+            let values = mask.values.iter().map(|&a| if a >= least { 255 } else { 0 }).collect();
             Some(Gray { values, ..mask.clone() })
         }
     };
@@ -314,7 +315,8 @@ impl VmTraining<'_> {
                 (opacity.clone().square() * background).sum() / count as f64
             }),
             MaskLoss::Ce => Some({
-                let alpha: Tensor<2> = field::tensor(batch.alpha.clone(), [n, 1], device).autodiff();
+                let head: Vec<f32> = background.iter().map(|b| 1.0 - b).collect();
+                let alpha: Tensor<2> = field::tensor(head, [n, 1], device).autodiff();
                 let p = opacity.clone().clamp(1e-3, 1.0 - 1e-3);
                 let cross = alpha.clone() * p.clone().log() + (alpha.neg() + 1.0) * (p.neg() + 1.0).log();
                 cross.mean().neg()
@@ -381,6 +383,9 @@ impl VmTraining<'_> {
     }
 }
 
+#[cfg(test)]
+#[path = "step_tests.rs"]
+mod step_tests;
 #[cfg(test)]
 #[path = "train_tests.rs"]
 mod tests;

@@ -1,7 +1,7 @@
 //! Training on an analytic ball: does it learn, resume, guard and stop?
 
 use super::*;
-use crate::config::{DensityActivation, Preset, VmStart};
+use crate::config::{DensityActivation, Preset};
 use crate::field::ball::{
     BALL, bytes, hull, negative, refuses, resumes, says, session, tampered, temporary, views, words,
 };
@@ -116,43 +116,6 @@ fn a_hostile_description_of_a_field_is_refused_before_it_is_rendered() {
             TFace::load("tface", dir.path()).err().unwrap_or_else(|| panic!("{key} = {value} is accepted"));
         assert!(e.to_string().contains("checkpoint.safetensors"), "{key}: {e}");
         assert!(e.hint().contains("--fresh tface"), "{key}: {e}");
-    }
-}
-
-#[test]
-fn every_row_of_the_ablation_and_both_activations_train() {
-    for (masks, mask_loss) in [
-        (MaskUse::None, MaskLoss::None),
-        (MaskUse::Binary, MaskLoss::None),
-        (MaskUse::Soft, MaskLoss::None),
-        (MaskUse::Soft, MaskLoss::Ce),
-        (MaskUse::Soft, MaskLoss::L2),
-    ] {
-        for (background, activation) in [
-            (VmBackground::Reference, DensityActivation::Relu),
-            (VmBackground::Black, DensityActivation::Softplus),
-        ] {
-            let dir = temporary();
-            let config = VmConfig {
-                steps: 14,
-                upsample_steps: vec![5],
-                mask_steps: vec![5],
-                background,
-                activation,
-                start: VmStart::Box,
-                whole_frame: true,
-                l1_start: 1e-4,
-                ortho: 1e-3,
-                feature_frequencies: 1,
-                view_frequencies: 2,
-                density_shift: -1.0,
-                masks,
-                mask_loss,
-                ..config()
-            };
-            let report = run(&config, dir.path(), &Quiet).unwrap();
-            assert!(report.train_psnr > 1.0, "{masks:?} {mask_loss:?} {background:?} {report:?}");
-        }
     }
 }
 

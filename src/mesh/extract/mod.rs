@@ -2,6 +2,7 @@
 
 mod cap;
 mod clean;
+mod dense;
 mod grid;
 mod handles;
 mod holes;
@@ -16,6 +17,7 @@ mod verify;
 
 pub use cap::{Cap, Skin};
 pub use clean::{CleanReport, clean};
+pub use dense::extract_dense;
 pub use grid::NodeGrid;
 pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};

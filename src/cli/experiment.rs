@@ -1,0 +1,166 @@
+//! `tiface experiment`: the paper's tables over captures, beside what was published.
+
+use super::invocation::Invocation;
+use super::out::Out;
+use super::stdout::print;
+use crate::config::Config;
+use crate::io::{self, Limits};
+use crate::pipeline::Line;
+use crate::pipeline::experiment::{ORDERINGS, ROWS, TABLES, config, is_done, measured, runs, work};
+use crate::report::experiment::{Experiment, read_published};
+use crate::run::Run;
+use crate::{Error, Result};
+use clap::Args;
+use clap::builder::PossibleValuesParser;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+/// What is reproduced.
+#[derive(Args, Debug)]
+pub(super) struct ExperimentOptions {
+    /// Captures
+    #[arg(value_name = "CAPTURE", required = true)]
+    captures: Vec<PathBuf>,
+    /// Of these tables, with commas [default: all]
+    #[arg(long, value_name = "LIST", value_delimiter = ',', value_parser = PossibleValuesParser::new(TABLES.map(|t| t.0)))]
+    tables: Vec<String>,
+    /// A share of the published effort, 0.001 to 1
+    #[arg(long, value_name = "SHARE", default_value_t = 1.0)]
+    scale: f64,
+    /// Make this run alone, as named by --dry-run, and no tables; repeatable
+    #[arg(long, value_name = "CAPTURE/RUN")]
+    only: Vec<String>,
+    /// Figures of the publication: lines of table,row,measure,value
+    #[arg(long, value_name = "FILE")]
+    published: Option<PathBuf>,
+}
+
+/// A run of a capture.
+struct Task {
+    /// `capture/run`, also its folder below the experiment's.
+    name: String,
+    run: &'static str,
+    config: Config,
+}
+
+pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Result<()> {
+    let Invocation { common, screen, stop } = invocation;
+    if !(0.001..=1.0).contains(&options.scale) {
+        let found = format!("`--scale {}` is not within 0.001 and 1", options.scale);
+        return Err(Error::usage(
+            found,
+            "0.1 makes all tables of two captures in some two hours on two cores",
+        ));
+    }
+    let folder = match Out::find(common.out.as_deref(), "experiment")? {
+        Some(out) => out.file(""),
+        None => PathBuf::from("experiment"),
+    };
+    let is_asked =
+        |table: &&(&str, &str)| options.tables.is_empty() || options.tables.iter().any(|t| t == table.0);
+    let tables: Vec<(&str, &str)> = TABLES.iter().filter(is_asked).copied().collect();
+    let words: Vec<&str> = tables.iter().map(|t| t.0).collect();
+    let published = match &options.published {
+        Some(file) => {
+            let bytes = io::read_bytes(file, &Limits { file_bytes: 1 << 20, ..Limits::default() })?;
+            read_published(&String::from_utf8_lossy(&bytes), &ROWS, &file.display().to_string())?
+        }
+        None => Vec::new(),
+    };
+    let mut set = common.set.clone();
+    set.extend(common.device.iter().map(|d| format!("device={d}")));
+    set.extend(common.seed.iter().map(|s| format!("seed={s}")));
+    let mut captures: Vec<String> = Vec::new();
+    let mut tasks = Vec::new();
+    for path in &options.captures {
+        let real = io::real_path(path)?;
+        let name = real.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned());
+        if captures.contains(&name) {
+            return Err(Error::usage(
+                format!("two captures are called `{name}`"),
+                "rename one of the folders",
+            ));
+        }
+        let text = real.to_str().ok_or_else(|| {
+            Error::cannot(
+                format!("the path of the capture is not UTF-8: `{}`", real.display()),
+                "rename the folder",
+            )
+        })?;
+        for run in runs(&words) {
+            let mut config = config(run, options.scale, &set)?;
+            config.capture.path = text.into();
+            tasks.push(Task { name: format!("{name}/{run}"), run, config });
+        }
+        captures.push(name);
+    }
+    if let Some(wrong) = options.only.iter().find(|o| !tasks.iter().any(|t| t.name == **o)) {
+        let known: Vec<&str> = tasks.iter().map(|t| t.name.as_str()).collect();
+        return Err(Error::usage(
+            format!("there is no run `{wrong}`"),
+            format!("runs are {}", known.join(", ")),
+        ));
+    }
+    let chosen = |task: &&Task| options.only.is_empty() || options.only.contains(&task.name);
+    let open = |task: &Task| Run::open(&folder.join(&task.name), stop.clone(), screen.clone());
+    let mut failed = None;
+    for task in tasks.iter().filter(chosen) {
+        let run = open(task);
+        let line = Line::open(&task.config, &run).map_err(|e| e.within(&task.name))?;
+        if common.dry_run {
+            let state = if is_done(&line, task.run) { "done" } else { "to do" };
+            print(&format!("{:<32} {state}\n", task.name))?;
+            continue;
+        }
+        io::create_folder(run.dir())?;
+        screen.note("experiment", &task.name);
+        match work(&line, task.run) {
+            Err(e) if e.kind().is_stop() => return Err(e),
+            // a row that fails is a result; the others are made all the same
+            Err(e) => {
+                screen.note("experiment", &format!("{}: {e}", task.name));
+                failed.get_or_insert(e.within(&task.name));
+            }
+            Ok(()) => {}
+        }
+    }
+    if common.dry_run {
+        return Ok(());
+    }
+    if options.only.is_empty() {
+        let rows: Vec<_> = ROWS.into_iter().filter(|row| words.contains(&row.table)).collect();
+        let of = |capture: &String, row: &crate::report::experiment::ExperimentRow| {
+            let beside = format!("{capture}/{}", row.run);
+            measured(&Run::open(&folder.join(&beside), stop.clone(), screen.clone()), row, &beside)
+        };
+        let measured = rows.iter().map(|row| captures.iter().map(|c| of(c, row)).collect()).collect();
+        let orderings = ORDERINGS.into_iter().filter(|o| words.contains(&o.table)).collect();
+        let experiment =
+            Experiment { scale: options.scale, tables, rows, orderings, captures, measured, published };
+        write(&folder, &experiment)?;
+        if common.json {
+            let result = json!({"event": "result", "out": folder.join("experiment.json")});
+            print(&format!("{result}\n"))?;
+        } else if !common.quiet {
+            print(&format!(
+                "{}\nexperiment {}\n",
+                experiment.markdown(),
+                folder.join("experiment.html").display()
+            ))?;
+        }
+    }
+    failed.map_or(Ok(()), Err)
+}
+
+/// The tables in all forms; the JSON last, for whoever waits for it.
+fn write(folder: &Path, experiment: &Experiment) -> Result<()> {
+    for (name, text) in [
+        ("experiment.md", experiment.markdown()),
+        ("experiment.csv", experiment.csv()),
+        ("experiment.html", experiment.html()),
+        ("experiment.json", experiment.json()),
+    ] {
+        io::write_atomic(&folder.join(name), text.as_bytes())?;
+    }
+    Ok(())
+}

@@ -1,0 +1,156 @@
+//! Does Instant-NeRF step by its formulas, learn a ball, and go on where it stopped?
+
+use super::*;
+use crate::config::Preset;
+use crate::field::ball::{BALL, resumes, session, temporary, views};
+use crate::kernel::reference::tape::{AdamW, Stepped, Var, gradient};
+use crate::kernel::reference::{Real, density as plain, wide};
+use crate::{Monitor, Quiet};
+use glam::Vec2;
+
+fn config() -> IfaceConfig {
+    IfaceConfig {
+        steps: 150,
+        rays: 200,
+        max_rays: 400,
+        samples: 1 << 12,
+        levels: 4,
+        base_resolution: 4,
+        growth: 1.6,
+        log2_table: 9,
+        occupancy_resolution: 16,
+        samples_per_ray: 64,
+        ..IfaceConfig::preset(Preset::Paper)
+    }
+}
+
+/// The third step against the formulas in f64, parameter by parameter.
+#[test]
+fn a_step_is_the_one_of_its_formulas() {
+    let config = IfaceConfig { rays: 16, max_rays: 16, log2_table: 6, samples_per_ray: 30, ..config() };
+    let (dir, views) = (temporary(), views());
+    let session = session("iface", dir.path(), "step", &Quiet);
+    let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+    let mut state = DensityState::new(&config, session.seed);
+    // as if it had learned for a while: something to be seen, and not the same everywhere
+    let [table, network] = &mut state.parameters;
+    table[0].iter_mut().enumerate().for_each(|(i, v)| *v = rng::normal(5, 1, i as u64));
+    network[0].iter_mut().for_each(|v| *v *= 1.5);
+    let mut learner = DensityTraining { config: &config, session, shape: shape(&config), pixels, state };
+    let progress = |step: u64| TrainingProgress { step, ..TrainingProgress::default() };
+    for step in 0..2 {
+        assert!(learner.step(&progress(step)).is_ok());
+    }
+    let before = learner.state.parameters.clone();
+    let weights = learner.state.weights(&learner.shape);
+    let batch = learner.pixels.draw(3, 2, learner.state.rays, false);
+    let samples = learner.state.march(&config, &learner.shape, &weights, &batch.rays);
+    let n = samples.t.len();
+    assert!(n > 100, "{n} samples");
+    let dt = f64::from(march_step(&config, 0.0));
+    let of = Var::of;
+    let x: Vec<f64> = before.iter().flat_map(|p| wide(&p[0])).collect();
+    let mut terms = [0.0; 2];
+    let (_, slopes) = gradient(&x, |x| {
+        let (table, network) = x.split_at(before[0][0].len());
+        let table: Vec<[Var; 2]> = table.as_chunks::<2>().0.to_vec();
+        let (mut smooth, mut spread, mut met, mut last) = (of(0.0), of(0.0), 0.0, 0.0);
+        for (r, ray) in batch.rays.iter().enumerate() {
+            let own = samples.offsets[r] as usize..samples.offsets[r + 1] as usize;
+            if own.is_empty() {
+                continue;
+            }
+            (met, last) = (met + 1.0, (r + 1) as f64);
+            let (mut thickness, mut seen, mut w) = (of(0.0), [of(0.0); 3], Vec::new());
+            for &t in &samples.t[own.clone()] {
+                let p = std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]);
+                let (sigma, color) = plain::field(&learner.shape, &table, network, p, ray.direction);
+                let weight = (-thickness).exp() * (of(1.0) - (-sigma * of(dt)).exp());
+                thickness += sigma * of(dt);
+                (0..3).for_each(|k| seen[k] += weight * color[k]);
+                w.push(weight);
+            }
+            for (k, seen) in seen.into_iter().enumerate() {
+                let e = seen - of(batch.color[r][k].into());
+                smooth += e * e * of(0.5); // never as large as 1
+            }
+            let t: Vec<f64> = wide(&samples.t[own]);
+            for (i, a) in w.iter().enumerate() {
+                spread += *a * *a * of(dt / 3.0);
+                for (j, b) in w.iter().enumerate().take(i) {
+                    spread += *a * *b * of(2.0 * (t[i] - t[j]));
+                }
+            }
+        }
+        let (smooth, spread) = (smooth / of(3.0 * met), spread / of(last));
+        terms = [smooth.value(), spread.value()];
+        smooth + spread * of(0.001)
+    });
+    let Ok(report) = learner.step(&progress(2)) else { panic!("a finite step") };
+    for (name, want) in ["smooth", "distortion"].into_iter().zip(terms) {
+        let got = report.figures.iter().find(|(n, _)| *n == name).unwrap().1;
+        assert!((got - want).abs() < 1e-5 * want, "{name}: {got} {want}");
+    }
+    let mut start = 0;
+    for ((name, before), after) in NAMES.iter().zip(&before).zip(&learner.state.parameters) {
+        let own = &slopes[start..start + before[0].len()];
+        start += own.len();
+        let [value, first, second] = before.each_ref().map(|v| wide(v));
+        let (after, first_after) = (wide(&after[0]), wide(&after[1]));
+        let array = Stepped { value, moments: [first, second], after, first_after };
+        // no warm-up: the rate is the peak's until the first milestone
+        let mut errors = AdamW { lr: 0.01, epsilon: 1e-15, decay: 0.01, step: 3 }.errors(&array, own);
+        errors.sort_by(f64::total_cmp);
+        let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
+        println!("{} of {name}: median {median:.1e}, worst {worst:.1e}", errors.len());
+        assert!(worst <= 1e-3 && median <= 1e-5, "{name}: median {median:.1e}, worst {worst:.1e}");
+    }
+}
+
+#[test]
+fn rates_fall_to_a_third_at_the_published_milestones() {
+    let config = IfaceConfig::preset(Preset::Paper);
+    for (step, want) in [(0, 1.0), (9_999, 1.0), (10_000, 0.33), (15_000, 0.1089), (18_000, 0.035_937)] {
+        assert!((learning_rate(&config, step) - want).abs() < 1e-12, "{step}");
+    }
+    // 6,299,960 entries in the published grid
+    let published = IfaceConfig { base_resolution: 16, growth: 1.447_269_237_440_378, ..config };
+    assert_eq!(hash::entries(&shape(&published).levels), 6_299_960);
+}
+
+#[test]
+fn a_ball_is_learned_and_comes_back_from_its_checkpoint() {
+    let (dir, views, config) = (temporary(), views(), config());
+    let (field, report) =
+        train_density(&views, &config, &session("iface", dir.path(), "ball", &Quiet)).unwrap();
+    assert!(report.train_psnr > 15.0 && report.occupied < 0.9, "{report:?}");
+    let ray = |x: f32, y: f32| views[0].camera.ray(Vec2::new(x, y)).unwrap();
+    let rays = [ray(20.0, 20.0), ray(2.0, 20.0)];
+    let seen = field.render(&rays);
+    assert!(seen[0].opacity > 0.8 && seen[1].opacity < 0.3, "{seen:?}");
+    assert_eq!(DensityField::load(dir.path(), &config).unwrap().render(&rays), seen);
+    // outside nothing reaches the level, and the gradient is that of the values
+    assert!(field.sdf(&[Vec3::new(0.95, 0.95, 0.95)])[0] > 0.0);
+    let p = Vec3::new(0.0, 0.0, 0.9 * BALL);
+    let (value, slope) = field.sdf_gradient(&[p]);
+    let moved = field.sdf(&[p + 2e-3 * Vec3::Z, p - 2e-3 * Vec3::Z]);
+    assert!(
+        value == field.sdf(&[p])
+            && (slope[0].z - (moved[0] - moved[1]) / 4e-3).abs() < 1e-3 * slope[0].length()
+    );
+    let there = train_density(
+        &views,
+        &config,
+        &TrainingSession { device: "wgpu:0", ..session("iface", dir.path(), "b", &Quiet) },
+    );
+    assert!(there.err().unwrap().to_string().contains("no kernels"));
+}
+
+#[test]
+fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
+    let (views, config) = (views(), IfaceConfig { steps: 40, ..config() });
+    let run = |dir: &Path, monitor: &dyn Monitor| {
+        train_density(&views, &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
+    };
+    resumes(&run, 3);
+}

@@ -1,0 +1,360 @@
+//! The paper's tables: which runs they are made of, and what those came to. A row is a preset of settings; a run is made by
+//! the line like any other, and one that is done is not made again.
+
+use super::line::Line;
+use super::{Stage, complete, learn, reconstruct};
+use crate::config::iface::FieldKind;
+use crate::config::{
+    Config, MaskLoss, MaskSource, MaskUse, Method, Preset, Sources, TruthPhoto, VmBackground, VmConfig,
+};
+use crate::io::{self, Limits};
+use crate::report::experiment::{ExperimentRow, Measured, Ordering};
+use crate::run::{Run, read_record, read_status};
+use crate::{Error, Result};
+use serde_json::Value;
+
+/// The tables, by their word and heading.
+pub const TABLES: [(&str, &str); 4] = [
+    ("components", "Components"),
+    ("tface", "T-Face: masks and mask losses"),
+    ("iface", "I-Face: density, distance, mask, sparsity"),
+    ("leaderboard", "Whole systems"),
+];
+
+const fn row(
+    table: &'static str,
+    row: &'static str,
+    title: &'static str,
+    run: &'static str,
+    pictures: &'static str,
+) -> ExperimentRow {
+    ExperimentRow { table, row, title, run, pictures }
+}
+
+/// Every row of every table.
+pub const ROWS: [ExperimentRow; 21] = [
+    row("components", "baseline", "baseline (TensoRF)", "paper", "baseline"),
+    row("components", "iface", "I-Face", "paper", "volume"),
+    row("components", "tface", "T-Face", "paper", "tface"),
+    row("components", "ensemble", "ensemble", "paper", "ensemble"),
+    row("tface", "baseline-reference", "baseline", "paper", "baseline"),
+    row("tface", "sam-reference", "+ SAM mask (hard)", "tface-sam", "tface"),
+    row("tface", "mask-reference", "+ our mask", "tface-mask", "tface"),
+    row("tface", "ce-reference", "+ CE", "tface-ce", "tface"),
+    row("tface", "l2-reference", "+ L2 (T-Face)", "paper", "tface"),
+    row("tface", "baseline-one", "baseline, one background", "baseline-one", "baseline"),
+    row("tface", "sam-one", "+ SAM mask (hard), one background", "tface-sam-one", "tface"),
+    row("tface", "mask-one", "+ our mask (soft), one background", "tface-mask-one", "tface"),
+    row("tface", "ce-one", "+ CE, one background", "tface-ce-one", "tface"),
+    row("tface", "l2-one", "+ L2, one background", "tface-l2-one", "tface"),
+    row("iface", "nerf", "Instant-NeRF", "iface-nerf", "volume"),
+    row("iface", "bare", "Instant-NeuS", "iface-bare", "volume"),
+    row("iface", "mask", "+ mask", "iface-mask", "volume"),
+    row("iface", "sparsity", "+ mask + sparsity (I-Face)", "paper", "volume"),
+    row("leaderboard", "baseline", "baseline (TensoRF)", "paper", "baseline"),
+    row("leaderboard", "paper", "TI-Face as published", "paper", "ensemble"),
+    row("leaderboard", "standard", "preset standard", "standard", "ensemble"),
+];
+
+const fn more(table: &'static str, better: &'static str, worse: &'static str, by: &'static str) -> Ordering {
+    Ordering { table, better, worse, by, or_equal: false }
+}
+
+/// What the paper says of its rows.
+pub const ORDERINGS: [Ordering; 12] = [
+    more("components", "tface", "baseline", "masked"),
+    more("components", "iface", "baseline", "masked"),
+    more("components", "tface", "iface", "masked"),
+    more("components", "ensemble", "tface", "masked"),
+    more("tface", "mask-one", "sam-one", "masked"),
+    Ordering { or_equal: true, ..more("tface", "ce-one", "mask-one", "masked") },
+    more("tface", "l2-one", "ce-one", "masked"),
+    more("tface", "l2-reference", "baseline-reference", "masked"),
+    more("tface", "l2-one", "l2-reference", "masked"),
+    more("iface", "mask", "bare", "masked"),
+    more("iface", "sparsity", "mask", "masked"),
+    more("leaderboard", "paper", "baseline", "masked"),
+];
+
+/// The runs that some tables are made of, each once, in the order of the rows.
+pub fn runs(tables: &[&str]) -> Vec<&'static str> {
+    let mut out = Vec::new();
+    for row in ROWS.iter().filter(|row| tables.contains(&row.table)) {
+        if !out.contains(&row.run) {
+            out.push(row.run);
+        }
+    }
+    out
+}
+
+/// Does a run of I-Face's table have a surface, whose pieces are counted?
+fn has_surface(run: &str) -> bool {
+    run.starts_with("iface") || run == "paper"
+}
+
+/// Settings of a run, at a share of the published effort; `set` are `KEY=VALUE` on top of them.
+///
+/// A scale of 1 is the publication. Below, rays, voxels, samples and steps of I-Face are that share, steps of T-Face and
+/// the baseline its square (each costs more rays and samples, too), and warm-up and annealing follow the steps.
+///
+/// # Errors
+///
+/// An unknown run, or settings that are not allowed.
+pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
+    let preset = if run == "standard" { Preset::Standard } else { Preset::Paper };
+    let mut c = Config::preset(preset);
+    c.metrics.truth = TruthPhoto::Photo;
+    let shows = |c: &mut Config, method: Method| {
+        c.render.method = vec![method];
+        c.ensemble.members = Vec::new();
+        c.ensemble.weights = Vec::new();
+    };
+    let (own, one) = match run.strip_suffix("-one") {
+        Some(own) => (own, true),
+        None => (run, false),
+    };
+    let known = ROWS.iter().any(|row| row.run == run);
+    match own {
+        _ if !known => return Err(unknown(run)),
+        "paper" => c.render.method = vec![Method::Baseline, Method::Tface, Method::Volume],
+        "standard" => {}
+        "baseline" => shows(&mut c, Method::Baseline),
+        iface if iface.starts_with("iface") => {
+            shows(&mut c, Method::Volume);
+            c.iface.sparsity = 0.0;
+        }
+        _ => shows(&mut c, Method::Tface),
+    }
+    let t = &mut c.tface;
+    (t.masks, t.mask_loss) = match own {
+        "tface-sam" => (MaskUse::Hard, MaskLoss::None),
+        "tface-mask" => (MaskUse::Binary, MaskLoss::None),
+        "tface-ce" => (MaskUse::Binary, MaskLoss::Ce),
+        _ => (t.masks, t.mask_loss),
+    };
+    if one {
+        t.background = VmBackground::Random; // the baseline's is black then
+        if t.masks == MaskUse::Binary {
+            t.masks = MaskUse::Soft;
+        }
+    }
+    match own {
+        "iface-nerf" => {
+            c.iface.field = FieldKind::Density;
+            (c.iface.base_resolution, c.iface.growth) = (16, 1.447_269_237_440_378);
+            c.mesh.resolution = 256;
+        }
+        "iface-bare" => {
+            c.mask.source = MaskSource::None;
+            c.iface.mask = 0.0;
+        }
+        _ => {}
+    }
+    if scale < 1.0 {
+        shrink(&mut c, scale);
+    }
+    // as text, as everybody's settings are: ranges are looked at, and what is set wins
+    let sources = Sources {
+        preset: Some(preset),
+        files: vec![(format!("run `{run}`"), c.to_toml())],
+        set: set.to_vec(),
+        ..Sources::default()
+    };
+    let mut resolved = Config::resolve(&sources)?;
+    if scale < 1.0 && preset == Preset::Paper {
+        resolved.iface.warmup = (resolved.iface.steps / 40).max(1);
+        resolved.iface.anneal_end = resolved.iface.steps;
+    }
+    Ok(resolved)
+}
+
+fn unknown(run: &str) -> Error {
+    let known: Vec<&str> = runs(&TABLES.map(|t| t.0));
+    Error::usage(format!("no table has a run `{run}`"), format!("runs are {}", known.join(", ")))
+}
+
+/// Less effort of everything.
+fn shrink(c: &mut Config, scale: f64) {
+    let share = |n: u64, by: f64, least: u64| ((n as f64 * by).round() as u64).max(least.min(n));
+    let published = c.preset == Preset::Paper;
+    // our own presets have few steps of many rays as they are
+    let (of_steps, of_rays) = if published { (scale * scale, scale) } else { (scale.sqrt(), 1.0) };
+    let radiance = |t: &mut VmConfig| {
+        let before = t.steps;
+        t.steps = share(before, of_steps, 50);
+        t.rays = share(t.rays as u64, of_rays, 256) as usize;
+        if published {
+            t.voxels_start = share(t.voxels_start, scale, 8000);
+            t.voxels_final = share(t.voxels_final, scale, 27_000).max(t.voxels_start);
+        }
+        let ratio = t.steps as f64 / before as f64;
+        for list in [&mut t.upsample_steps, &mut t.mask_steps] {
+            list.iter_mut().for_each(|s| *s = (*s as f64 * ratio).round() as u64);
+            list.dedup();
+        }
+    };
+    radiance(&mut c.tface);
+    c.baseline.steps = share(c.baseline.steps, of_steps, 50);
+    c.baseline.rays = share(c.baseline.rays as u64, of_rays, 256) as usize;
+    let i = &mut c.iface;
+    i.steps = share(i.steps, if published { scale } else { scale.sqrt() }, 100);
+    if published {
+        i.samples = share(i.samples as u64, scale, 4096) as usize;
+        i.max_rays = share(i.max_rays as u64, scale, 256) as usize;
+        i.rays = i.rays.min(i.max_rays);
+        i.log2_table = ((f64::from(i.log2_table) + scale.log2()).round() as u32).clamp(14, i.log2_table);
+    }
+    c.mesh.resolution = share(c.mesh.resolution.into(), scale.sqrt(), 96) as u32;
+}
+
+/// Makes what is not done yet of a run. Whether I-Face's rows have a surface is a result: that there is none is no error.
+pub fn work(line: &Line, run: &str) -> Result<()> {
+    line.remember(Stage::Metrics)?;
+    reconstruct(line, Stage::Metrics)?;
+    if has_surface(run) {
+        let fields = learn::trained_fields(line);
+        match complete(line, Stage::Mesh, &fields) {
+            Err(e) if e.kind() != crate::ErrorKind::Cannot => return Err(e),
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// What a row came to in a run; `beside` is the path of the run's folder from the page.
+pub fn measured(run: &Run, row: &ExperimentRow, beside: &str) -> Measured {
+    let mut out = Measured::default();
+    let stages = Stage::ALL.into_iter().filter_map(|s| Some((s, read_status(&run.path(s)).ok()??)));
+    let failed = stages.filter_map(|(s, status)| Some(format!("stage `{s}`: {}", status.error?))).next();
+    let file = run.path("metrics/metrics.json");
+    let Ok(value) = io::read_json(&file, &Limits::default()) else {
+        out.problem = Some(failed.unwrap_or_else(|| "not made yet".into()));
+        return out;
+    };
+    let set = &value[row.pictures];
+    let list = |part: &str| set[part]["views"].as_array().cloned().unwrap_or_default();
+    let (heads, regions) = (list("head"), list("region"));
+    for head in &heads {
+        let name = head["name"].as_str().unwrap_or_default();
+        let region = regions.iter().find(|r| r["name"] == head["name"]);
+        let of = |key: &str| head[key].as_f64();
+        let region = region.and_then(|r| r["psnr_masked"].as_f64());
+        out.figures.push([of("psnr_masked"), of("psnr"), region, of("ssim_masked"), of("ssim")]);
+        out.views.push(name.into());
+    }
+    out.outside = set["mean_square_opacity_outside"].as_f64();
+    let summary =
+        |stage: Stage| read_record(&run.path(stage)).ok().flatten().map_or(Value::Null, |r| r.summary);
+    out.seconds = match row.pictures {
+        "ensemble" => summary(Stage::Ensemble)["seconds_per_view"].as_f64(),
+        method => summary(Stage::Render)["seconds_per_view"][method].as_f64(),
+    };
+    if row.table == "iface" && has_surface(row.run) {
+        out.pieces = summary(Stage::Mesh)["report"]["topology"]["pieces"].as_u64();
+        out.problem = failed.filter(|_| out.pieces.is_none());
+    }
+    if let Some(first) = out.views.first() {
+        let folder =
+            if row.pictures == "ensemble" { "ensemble".into() } else { format!("render/{}", row.pictures) };
+        out.picture = Some(format!("{beside}/{folder}/{first}.png"));
+    }
+    out
+}
+
+/// Is everything of a run made?
+pub fn is_done(line: &Line, run: &str) -> bool {
+    let mut order = line.order(Stage::Metrics);
+    order.extend(has_surface(run).then_some(Stage::Mesh));
+    order.into_iter().all(|stage| line.run.is_done(&line.plan(stage)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::synthetic::{SyntheticOptions, write_capture};
+
+    #[test]
+    fn every_row_has_a_run_whose_pictures_it_names() {
+        for row in ROWS {
+            let c = config(row.run, 1.0, &[]).unwrap();
+            let made = c.render.method.iter().any(|m| m.folder() == row.pictures);
+            let blended = row.pictures == "ensemble" && !c.ensemble.members.is_empty();
+            assert!(made || blended, "{row:?}");
+            assert_eq!(c.metrics.truth, TruthPhoto::Photo);
+            assert!(TABLES.iter().any(|t| t.0 == row.table));
+        }
+        for o in ORDERINGS {
+            for row in [o.better, o.worse] {
+                assert!(ROWS.iter().any(|r| r.table == o.table && r.row == row), "{o:?}");
+            }
+        }
+        assert_eq!(runs(&["components"]), ["paper"]);
+        assert_eq!(runs(&TABLES.map(|t| t.0)).len(), 13);
+        assert!(config("tface-best", 1.0, &[]).unwrap_err().hint().contains("tface-mask"));
+    }
+
+    #[test]
+    fn rows_differ_from_the_paper_by_what_their_names_say() {
+        let paper = config("paper", 1.0, &[]).unwrap();
+        assert_eq!(paper.tface, Config::preset(Preset::Paper).tface);
+        let t = |run: &str| config(run, 1.0, &[]).unwrap().tface;
+        assert_eq!(t("tface-ce"), VmConfig { mask_loss: MaskLoss::Ce, ..paper.tface.clone() });
+        assert_eq!(
+            t("tface-l2-one"),
+            VmConfig { background: VmBackground::Random, masks: MaskUse::Soft, ..paper.tface.clone() }
+        );
+        let hard = VmConfig { masks: MaskUse::Hard, mask_loss: MaskLoss::None, ..paper.tface.clone() };
+        assert_eq!(t("tface-sam"), hard);
+        let b = config("baseline-one", 1.0, &[]).unwrap().radiance(Stage::Baseline);
+        assert_eq!((b.background, b.masks), (VmBackground::Black, MaskUse::None));
+        let i = |run: &str| config(run, 1.0, &[]).unwrap();
+        assert_eq!((i("iface-mask").iface.sparsity, i("iface-mask").iface.mask), (0.0, 0.1));
+        assert_eq!((i("iface-bare").iface.mask, i("iface-bare").mask.source), (0.0, MaskSource::None));
+        assert_eq!(i("iface-nerf").iface.field, FieldKind::Density);
+    }
+
+    #[test]
+    fn less_effort_keeps_what_makes_a_row_and_settings_win() {
+        let c = config("paper", 0.1, &["tface.steps=77".into(), "seed=5".into()]).unwrap();
+        assert_eq!((c.tface.steps, c.baseline.steps, c.iface.steps, c.seed), (77, 500, 2000, 5));
+        assert_eq!((c.tface.rays, c.tface.voxels_final, c.iface.samples), (410, 2_700_000, 26_214));
+        assert_eq!((c.iface.warmup, c.iface.anneal_end, c.iface.log2_table), (50, 2000, 16));
+        // 2000, 3000, 4000, 5500 and 7000 of 50,000 steps, of 500
+        assert_eq!(c.tface.upsample_steps, [20, 30, 40, 55, 70]);
+        assert_eq!(config("paper", 1.0, &[]).unwrap().iface.warmup, 500);
+        assert!(config("paper", 0.1, &["tface.stepz=1".into()]).is_err());
+    }
+
+    /// Two rows of a tiny capture, made, read, and not made again.
+    #[test]
+    fn a_row_is_made_measured_and_not_made_again() {
+        let dir = tempfile::tempdir().unwrap();
+        let root = dir.path().join("head");
+        std::fs::create_dir_all(&root).unwrap();
+        write_capture(&root, &SyntheticOptions { width: 48, height: 64, train: 6, test: 2, seed: 1 })
+            .unwrap();
+        let less = ["tface.steps=12", "tface.rays=128", "tface.voxels_start=1000", "tface.voxels_final=2000"];
+        let less: Vec<String> = less
+            .iter()
+            .chain(&["tface.upsample_steps=6", "tface.mask_steps=6"])
+            .map(|s| s.to_string())
+            .collect();
+        let mut c = config("tface-ce-one", 0.01, &less).unwrap();
+        c.capture.path = root.to_str().unwrap().into();
+        let run = Run::quiet(&dir.path().join("run"));
+        let row = ROWS.iter().find(|r| r.row == "ce-one").unwrap();
+        assert_eq!(measured(&run, row, "x").problem.as_deref(), Some("not made yet"));
+        let line = Line::open(&c, &run).unwrap();
+        work(&line, row.run).unwrap();
+        assert!(is_done(&line, row.run));
+        let found = measured(&run, row, "head/run");
+        assert_eq!((found.views.len(), found.problem.clone()), (2, None));
+        assert!(found.figures.iter().all(|f| f[0].is_some() && f[1].is_some()) && found.seconds.is_some());
+        let picture = found.picture.unwrap();
+        assert!(run.dir().join(picture.strip_prefix("head/run/").unwrap()).is_file(), "{picture}");
+        let when = |file: &str| std::fs::metadata(run.path(file)).unwrap().modified().unwrap();
+        let before = when("tface/checkpoint.safetensors");
+        work(&line, row.run).unwrap();
+        assert_eq!(when("tface/checkpoint.safetensors"), before);
+    }
+}

@@ -1,0 +1,550 @@
+//! The paper's tables beside our figures: Markdown, CSV, JSON and a page.
+
+use super::{escape, link};
+use crate::kernel::rng;
+use crate::{Error, Result};
+use serde::Serialize;
+use std::fmt::Write;
+
+/// What is measured of a row, in the order of the columns: its word, its heading, digits, and whether more is better.
+pub const MEASURES: [(&str, &str, usize, bool); 6] = [
+    ("masked", "PSNR inside the mask, dB", 2, true),
+    ("full", "PSNR of the whole photograph, dB", 2, true),
+    ("region", "PSNR of face and hair, dB", 2, true),
+    ("masked_ssim", "SSIM inside the mask", 3, true),
+    ("full_ssim", "SSIM of the whole photograph", 3, true),
+    ("seconds", "seconds a view", 2, false),
+];
+
+/// Resamplings of an interval.
+const DRAWS: u64 = 1000;
+
+/// A row of a table: which run it comes from, and which of its pictures.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct ExperimentRow {
+    /// The table's word.
+    pub table: &'static str,
+    /// Its own.
+    pub row: &'static str,
+    /// What a person reads.
+    pub title: &'static str,
+    /// The run that makes it.
+    pub run: &'static str,
+    /// The pictures of that run that are judged.
+    pub pictures: &'static str,
+}
+
+/// One row of another is better, as the paper has it.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Ordering {
+    /// The table's word.
+    pub table: &'static str,
+    /// The better row.
+    pub better: &'static str,
+    /// The worse one, or one as good where `or_equal`.
+    pub worse: &'static str,
+    /// The measure by which.
+    pub by: &'static str,
+    /// May they be equal, within a twentieth of a decibel?
+    pub or_equal: bool,
+}
+
+/// One photograph's figures, in the order of [`MEASURES`]; the last is of the whole row.
+pub type ViewRow = [Option<f64>; 5];
+
+/// A row as a capture has it.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Measured {
+    /// Names of the photographs.
+    pub views: Vec<String>,
+    /// Figures of each.
+    pub figures: Vec<ViewRow>,
+    /// Time of a view.
+    pub seconds: Option<f64>,
+    /// Mean square of what is seen where nothing is.
+    pub outside: Option<f64>,
+    /// Pieces of the surface, where one was made.
+    pub pieces: Option<u64>,
+    /// Why there are no figures, or no surface.
+    pub problem: Option<String>,
+    /// A picture, by its path from the page.
+    pub picture: Option<String>,
+}
+
+impl Measured {
+    fn mean(&self, measure: usize) -> Option<f64> {
+        if measure == 5 {
+            return self.seconds;
+        }
+        let values: Vec<f64> = self.figures.iter().filter_map(|f| f[measure]).collect();
+        (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+    }
+}
+
+/// A figure of the publication.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Published {
+    /// The table's word.
+    pub table: String,
+    /// The row's.
+    pub row: String,
+    /// The measure's.
+    pub measure: String,
+    /// What it is.
+    pub value: f64,
+}
+
+/// Reads `table,row,measure,value` lines; the first may name them.
+///
+/// # Errors
+///
+/// A line of another form, or with a word that is none of `rows` and [`MEASURES`].
+pub fn read_published(text: &str, rows: &[ExperimentRow], file: &str) -> Result<Vec<Published>> {
+    let mut out = Vec::new();
+    for (i, line) in text.lines().enumerate() {
+        let parts: Vec<&str> = line.split(',').map(str::trim).collect();
+        if line.trim().is_empty() || (i == 0 && parts.first() == Some(&"table")) {
+            continue;
+        }
+        let read = match parts[..] {
+            [table, row, measure, value]
+                if rows.iter().any(|r| r.table == table && r.row == row)
+                    && MEASURES.iter().any(|m| m.0 == measure) =>
+            {
+                let finite = value.parse().ok().filter(|v: &f64| v.is_finite());
+                finite.map(|value| Published {
+                    table: table.into(),
+                    row: row.into(),
+                    measure: measure.into(),
+                    value,
+                })
+            }
+            _ => None,
+        };
+        out.push(read.ok_or_else(|| {
+            Error::cannot(
+                format!("`{file}`, line {}: `{line}` is no figure of a row", i + 1),
+                "write `table,row,measure,value`, as in `tface,l2-reference,masked,30.1`",
+            )
+        })?);
+    }
+    Ok(out)
+}
+
+/// All that was measured.
+#[derive(Clone, Debug, Serialize)]
+pub struct Experiment {
+    /// Of the published effort.
+    pub scale: f64,
+    /// The tables that were asked for: their word and heading.
+    pub tables: Vec<(&'static str, &'static str)>,
+    /// Their rows.
+    pub rows: Vec<ExperimentRow>,
+    /// What the paper says of them.
+    pub orderings: Vec<Ordering>,
+    /// Names of the captures.
+    pub captures: Vec<String>,
+    /// `[rows][captures]`
+    pub measured: Vec<Vec<Measured>>,
+    /// The publication's figures, as far as they are known.
+    pub published: Vec<Published>,
+}
+
+/// A mean with what 95 of 100 resamplings of the photographs keep within.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Interval {
+    /// Over captures, of the mean over photographs.
+    pub mean: f64,
+    /// The 2.5th percentile.
+    pub low: f64,
+    /// The 97.5th.
+    pub high: f64,
+}
+
+/// Mean over groups of the mean of each, and its interval by resampling within each group (Efron 1979, percentiles). The
+/// draws are those of a fixed seed.
+pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
+    let groups: Vec<&Vec<f64>> = groups.iter().filter(|g| !g.is_empty()).collect();
+    if groups.is_empty() {
+        return None;
+    }
+    let over = |mean_of: &dyn Fn(usize, &[f64]) -> f64| {
+        groups.iter().enumerate().map(|(i, g)| mean_of(i, g)).sum::<f64>() / groups.len() as f64
+    };
+    let mean = over(&|_, g| g.iter().sum::<f64>() / g.len() as f64);
+    let mut drawn: Vec<f64> = (0..DRAWS)
+        .map(|draw| {
+            over(&|i, g| {
+                let n = g.len() as u64;
+                let pick = |k: u64| g[rng::below(1, (i as u64) << 32 | draw, k, n) as usize];
+                (0..n).map(pick).sum::<f64>() / n as f64
+            })
+        })
+        .collect();
+    drawn.sort_by(f64::total_cmp);
+    let at = |share: f64| drawn[((DRAWS - 1) as f64 * share).round() as usize];
+    Some(Interval { mean, low: at(0.025), high: at(0.975) })
+}
+
+/// Does an ordering hold?
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Holds {
+    /// It does.
+    Yes,
+    /// It does not.
+    No,
+    /// A row is missing.
+    Unknown,
+}
+
+impl Experiment {
+    fn index(&self, table: &str, row: &str) -> Option<usize> {
+        self.rows.iter().position(|r| r.table == table && r.row == row)
+    }
+
+    /// Mean over the captures of a row.
+    fn mean(&self, row: usize, measure: usize) -> Option<f64> {
+        let values: Vec<f64> = self.measured[row].iter().filter_map(|m| m.mean(measure)).collect();
+        (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+    }
+
+    /// How much a row has more than another, photograph by photograph: `[captures][photographs]`.
+    fn differences(&self, row: usize, from: usize, measure: usize) -> Vec<Vec<f64>> {
+        let pair = |(a, b): (&Measured, &Measured)| {
+            let value = |m: &Measured, name: &String| {
+                m.views.iter().position(|v| v == name).and_then(|i| m.figures[i][measure])
+            };
+            a.views.iter().filter_map(|v| Some(value(a, v)? - value(b, v)?)).collect()
+        };
+        self.measured[row].iter().zip(&self.measured[from]).map(pair).collect()
+    }
+
+    /// Whether an ordering holds: for each capture, and on average.
+    pub fn holds(&self, ordering: &Ordering) -> (Vec<Holds>, Holds) {
+        let measure = MEASURES.iter().position(|m| m.0 == ordering.by).unwrap_or(0);
+        let rows = (self.index(ordering.table, ordering.better), self.index(ordering.table, ordering.worse));
+        let (Some(better), Some(worse)) = rows else {
+            return (vec![Holds::Unknown; self.captures.len()], Holds::Unknown);
+        };
+        let slack = if ordering.or_equal { 0.05 } else { 0.0 };
+        let judge = |a: Option<f64>, b: Option<f64>| match (a, b) {
+            (Some(a), Some(b)) if a + slack > b => Holds::Yes,
+            (Some(_), Some(_)) => Holds::No,
+            _ => Holds::Unknown,
+        };
+        let each = self.measured[better].iter().zip(&self.measured[worse]);
+        let each = each.map(|(a, b)| judge(a.mean(measure), b.mean(measure))).collect();
+        (each, judge(self.mean(better, measure), self.mean(worse, measure)))
+    }
+
+    fn published(&self, row: &ExperimentRow, measure: &str) -> Option<f64> {
+        let found =
+            self.published.iter().find(|p| p.table == row.table && p.row == row.row && p.measure == measure);
+        found.map(|p| p.value)
+    }
+
+    fn title(&self, table: &str, row: &str) -> &'static str {
+        self.index(table, row).map_or("", |i| self.rows[i].title)
+    }
+
+    /// Cells of a table: the heading, then a line for each row.
+    fn cells(&self, table: &str) -> Vec<Vec<String>> {
+        let mut heading = vec!["row".to_owned()];
+        for (word, title, ..) in MEASURES {
+            heading.push(title.into());
+            if self.published.iter().any(|p| p.table == table && p.measure == word) {
+                heading.push(format!("{title}, published"));
+            }
+        }
+        heading.push("more than the first row, dB (95 %)".into());
+        heading.push("seen where nothing is".into());
+        heading.push("pieces".into());
+        let mut out = vec![heading];
+        let dash = || "–".to_owned();
+        let first = self.rows.iter().position(|r| r.table == table);
+        for (i, row) in self.rows.iter().enumerate().filter(|(_, r)| r.table == table) {
+            let mut line = vec![row.title.to_owned()];
+            for (k, (word, _, digits, _)) in MEASURES.into_iter().enumerate() {
+                line.push(self.mean(i, k).map_or_else(dash, |v| format!("{v:.digits$}")));
+                if self.published.iter().any(|p| p.table == table && p.measure == word) {
+                    line.push(self.published(row, word).map_or_else(dash, |v| format!("{v:.digits$}")));
+                }
+            }
+            let more = first.filter(|f| *f != i).and_then(|f| bootstrap(&self.differences(i, f, 0)));
+            line.push(
+                more.map_or_else(dash, |m| format!("{:+.2} ({:+.2} to {:+.2})", m.mean, m.low, m.high)),
+            );
+            let outside: Vec<f64> = self.measured[i].iter().filter_map(|m| m.outside).collect();
+            let mean = outside.iter().sum::<f64>() / outside.len().max(1) as f64;
+            line.push(if outside.is_empty() { dash() } else { format!("{mean:.4}") });
+            let pieces: Vec<String> =
+                self.measured[i].iter().filter_map(|m| Some(m.pieces?.to_string())).collect();
+            line.push(if pieces.is_empty() { dash() } else { pieces.join(", ") });
+            out.push(line);
+        }
+        out
+    }
+
+    /// What is wrong with single rows, a sentence each.
+    fn problems(&self) -> Vec<String> {
+        let mut out = Vec::new();
+        for (row, measured) in self.rows.iter().zip(&self.measured) {
+            for (capture, m) in self.captures.iter().zip(measured) {
+                if let Some(problem) = &m.problem {
+                    let line = format!("{capture}, run `{}`: {problem}", row.run);
+                    if !out.contains(&line) {
+                        out.push(line);
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    /// The orderings as cells: the heading, then one line each.
+    fn verdicts(&self) -> Vec<Vec<String>> {
+        let mut out = vec![["by", "as published"].map(String::from).to_vec()];
+        out[0].extend(self.captures.iter().cloned());
+        out[0].push("on average".into());
+        let word = |h: &Holds| ["holds", "does not hold", "–"][*h as usize].to_owned();
+        for o in &self.orderings {
+            let sign = if o.or_equal { "≥" } else { ">" };
+            let (each, mean) = self.holds(o);
+            let claim = format!("{} {sign} {}", self.title(o.table, o.better), self.title(o.table, o.worse));
+            let mut line = vec![o.by.to_owned(), claim];
+            line.extend(each.iter().map(word));
+            line.push(word(&mean));
+            out.push(line);
+        }
+        out
+    }
+
+    fn about(&self) -> String {
+        let many = self.captures.len();
+        format!(
+            "{many} captures ({}), scale {} of the published effort. PSNR and SSIM are means over held-out photographs as \
+             they were taken, then over captures; masks are the captures' own. Intervals: {DRAWS} resamplings of the \
+             photographs.{}",
+            self.captures.join(", "),
+            self.scale,
+            if self.published.is_empty() {
+                " No published figures were given (`--published FILE`)."
+            } else {
+                ""
+            }
+        )
+    }
+
+    /// As Markdown.
+    pub fn markdown(&self) -> String {
+        let table = |cells: &[Vec<String>]| {
+            let mut out = String::new();
+            for (i, line) in cells.iter().enumerate() {
+                let _ = writeln!(out, "| {} |", line.join(" | "));
+                if i == 0 {
+                    let _ = writeln!(out, "|{}", " --- |".repeat(line.len()));
+                }
+            }
+            out
+        };
+        let mut out = format!("# The paper's experiment\n\n{}\n", self.about());
+        for (word, title) in &self.tables {
+            let _ = write!(out, "\n## {title}\n\n{}", table(&self.cells(word)));
+        }
+        let _ = write!(out, "\n## Orderings\n\n{}", table(&self.verdicts()));
+        let problems = self.problems();
+        if !problems.is_empty() {
+            let _ = write!(out, "\n## What is missing\n\n");
+            problems.iter().for_each(|p| out += &format!("- {p}\n"));
+        }
+        out
+    }
+
+    /// Every figure of every photograph, as comma-separated values.
+    pub fn csv(&self) -> String {
+        let quoted = |text: &str| {
+            let plain = !text.contains([',', '"', '\n']);
+            if plain { text.to_owned() } else { format!("\"{}\"", text.replace('"', "\"\"")) }
+        };
+        let mut out =
+            String::from("table,row,capture,photograph,masked,full,region,masked_ssim,full_ssim,seconds\n");
+        for (row, measured) in self.rows.iter().zip(&self.measured) {
+            for (capture, m) in self.captures.iter().zip(measured) {
+                for (view, figures) in m.views.iter().zip(&m.figures) {
+                    let numbers = figures.iter().chain([&m.seconds]);
+                    let numbers: Vec<String> =
+                        numbers.map(|v| v.map_or(String::new(), |v| v.to_string())).collect();
+                    let (capture, view) = (quoted(capture), quoted(view));
+                    let _ = writeln!(out, "{},{},{capture},{view},{}", row.table, row.row, numbers.join(","));
+                }
+            }
+        }
+        out
+    }
+
+    /// All of it, as JSON, with intervals and verdicts.
+    pub fn json(&self) -> String {
+        let mut value = serde_json::json!(self);
+        let rows: Vec<_> = (0..self.rows.len())
+            .map(|i| {
+                let means: serde_json::Map<String, serde_json::Value> = (MEASURES.iter().enumerate())
+                    .map(|(k, m)| (m.0.to_owned(), serde_json::json!(self.mean(i, k))))
+                    .collect();
+                let first = self.rows.iter().position(|r| r.table == self.rows[i].table).unwrap_or(i);
+                let more = bootstrap(&self.differences(i, first, 0));
+                serde_json::json!({"table": self.rows[i].table, "row": self.rows[i].row, "mean": means,
+                                   "masked_over_first": more})
+            })
+            .collect();
+        let verdicts: Vec<_> = (self.orderings.iter())
+            .map(|o| {
+                let (captures, mean) = self.holds(o);
+                serde_json::json!({"ordering": o, "captures": captures, "average": mean})
+            })
+            .collect();
+        value["means"] = rows.into();
+        value["verdicts"] = verdicts.into();
+        format!("{value:#}\n")
+    }
+
+    /// As a page, with a picture of every row and capture; pictures are named by their paths from the page.
+    pub fn html(&self) -> String {
+        let table = |cells: &[Vec<String>]| {
+            let mut out = String::from("<table>");
+            for (i, line) in cells.iter().enumerate() {
+                let tag = if i == 0 { "th" } else { "td" };
+                let cells: String = line.iter().map(|c| format!("<{tag}>{}</{tag}>", escape(c))).collect();
+                let _ = write!(out, "<tr>{cells}</tr>");
+            }
+            out + "</table>"
+        };
+        let mut out = format!(
+            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><link rel=\"icon\" href=\"data:,\">\
+             <title>experiment · tiface</title><style>\n{}\n.row img {{ max-height: 16rem; margin: 0 .5rem .5rem 0 }}\n\
+             </style></head><body>\n<h1>The paper's experiment</h1><p>{}</p>\n",
+            super::STYLE,
+            escape(&self.about())
+        );
+        for (word, title) in &self.tables {
+            let _ = writeln!(out, "<h2>{}</h2>{}", escape(title), table(&self.cells(word)));
+            for (row, measured) in self.rows.iter().zip(&self.measured).filter(|(r, _)| r.table == *word) {
+                let pictures: String = (self.captures.iter().zip(measured))
+                    .filter_map(|(capture, m)| {
+                        let address = escape(&link(m.picture.as_ref()?));
+                        Some(format!(
+                            "<img src=\"{address}\" alt=\"{} {}\">",
+                            escape(capture),
+                            escape(row.title)
+                        ))
+                    })
+                    .collect();
+                if !pictures.is_empty() {
+                    let _ =
+                        writeln!(out, "<h3>{}</h3><div class=\"row\">{pictures}</div>", escape(row.title));
+                }
+            }
+        }
+        let _ = writeln!(out, "<h2>Orderings</h2>{}", table(&self.verdicts()));
+        for problem in self.problems() {
+            let _ = writeln!(out, "<p>{}</p>", escape(&problem));
+        }
+        out + "</body></html>\n"
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ROWS: [ExperimentRow; 2] = [
+        ExperimentRow { table: "t", row: "a", title: "first <b>", run: "one", pictures: "tface" },
+        ExperimentRow { table: "t", row: "b", title: "second", run: "two", pictures: "tface" },
+    ];
+
+    fn measured(values: &[f64]) -> Measured {
+        Measured {
+            views: (0..values.len()).map(|i| format!("v{i}")).collect(),
+            figures: values.iter().map(|v| [Some(*v), None, None, None, None]).collect(),
+            seconds: Some(1.5),
+            ..Measured::default()
+        }
+    }
+
+    fn experiment() -> Experiment {
+        let ordering = Ordering { table: "t", better: "b", worse: "a", by: "masked", or_equal: false };
+        Experiment {
+            scale: 0.1,
+            tables: vec![("t", "A table")],
+            rows: ROWS.to_vec(),
+            orderings: vec![ordering, Ordering { better: "a", worse: "b", or_equal: true, ..ordering }],
+            captures: vec!["lps".into(), "x,y".into()],
+            measured: vec![
+                vec![measured(&[20.0, 22.0]), measured(&[30.0])],
+                vec![measured(&[21.0, 23.5]), measured(&[29.99])],
+            ],
+            published: vec![Published {
+                table: "t".into(),
+                row: "b".into(),
+                measure: "masked".into(),
+                value: 27.5,
+            }],
+        }
+    }
+
+    #[test]
+    fn orderings_are_judged_by_capture_and_on_average() {
+        let e = experiment();
+        // 22.25 > 21, 29.99 < 30; 26.12 > 25.5
+        assert_eq!(e.holds(&e.orderings[0]), (vec![Holds::Yes, Holds::No], Holds::Yes));
+        // a twentieth is as good
+        assert_eq!(e.holds(&e.orderings[1]), (vec![Holds::No, Holds::Yes], Holds::No));
+        let mut missing = e.clone();
+        missing.measured[1][0].figures.clear();
+        missing.measured[1][0].views.clear();
+        assert_eq!(missing.holds(&e.orderings[0]).0, [Holds::Unknown, Holds::No]);
+    }
+
+    #[test]
+    fn an_interval_holds_the_mean_and_is_the_same_every_time() {
+        let values: Vec<f64> = (0..100).map(|i| f64::from(i % 10)).collect();
+        let found = bootstrap(std::slice::from_ref(&values)).unwrap();
+        // mean 4.5, standard error 2.87 / 10: 95 % within 0.56
+        assert!((found.mean - 4.5).abs() < 1e-12 && (found.low - 3.94).abs() < 0.12, "{found:?}");
+        assert!((found.high - 5.06).abs() < 0.12 && bootstrap(&[values]) == Some(found), "{found:?}");
+        // captures count alike, however many photographs they have
+        let two = bootstrap(&[vec![1.0], vec![3.0; 50], Vec::new()]).unwrap();
+        assert_eq!(two, Interval { mean: 2.0, low: 2.0, high: 2.0 });
+        assert_eq!(bootstrap(&[Vec::new()]), None);
+    }
+
+    #[test]
+    fn tables_hold_means_differences_and_what_was_published_and_escape_names() {
+        let e = experiment();
+        let text = e.markdown();
+        // (21 + 30) / 2 and (22.25 + 29.99) / 2; on average (1.25 − 0.01) / 2 more
+        assert!(
+            text.contains("| first <b> | 25.50 | – |") && text.contains("| second | 26.12 | 27.50 |"),
+            "{text}"
+        );
+        assert!(text.contains("+0.62 ("), "{text}");
+        assert!(text.contains("| masked | second > first <b> | holds | does not hold | holds |"), "{text}");
+        assert!(e.csv().contains("t,a,\"x,y\",v0,30,,,,,1.5\n"), "{}", e.csv());
+        let page = e.html();
+        assert!(page.contains("first &lt;b&gt;") && !page.contains("first <b>"));
+        let value: serde_json::Value = serde_json::from_str(&e.json()).unwrap();
+        assert!((value["means"][1]["mean"]["masked"].as_f64().unwrap() - 26.12).abs() < 1e-9);
+        assert_eq!(value["verdicts"][0]["average"], "yes");
+    }
+
+    #[test]
+    fn published_figures_are_read_or_named() {
+        let read = |text: &str| read_published(text, &ROWS, "p.csv");
+        let found = read("table,row,measure,value\nt,b,masked,27.5\n\n").unwrap();
+        assert_eq!(found, experiment().published);
+        for bad in ["t,b,masked", "t,c,masked,1", "t,b,psnr,1", "t,b,masked,nan"] {
+            let e = read(bad).unwrap_err().to_string();
+            assert!(e.contains("`p.csv`, line 1") && e.contains(bad), "{e}");
+        }
+    }
+}
