@@ -1,0 +1,105 @@
+//! A whole run on a device, killed on the way and finished on the processor; on a software driver where nothing better
+//! is here.
+#![cfg(all(feature = "wgpu", feature = "cpu", unix))]
+
+mod command;
+
+use command::tiface;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::kernel::gpu::Adapter;
+
+/// Ends in a minute on a software driver, which compiles the kernels for the most part of it.
+const SMALL: [&str; 15] = [
+    "iface.steps=120",
+    "iface.rays=128",
+    "iface.max_rays=256",
+    "iface.samples=2048",
+    "iface.levels=6",
+    "iface.log2_table=12",
+    "iface.occupancy_resolution=32",
+    "iface.checkpoint_s=1",
+    "tface.steps=40",
+    "tface.rays=256",
+    "tface.voxels_start=4096",
+    "tface.voxels_final=4096",
+    "mesh.resolution=32",
+    "mesh.texture_px=64",
+    "render.samples=1",
+];
+
+fn words<'a>(device: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let mut words = vec!["run", "capture", "--run", "run", "--device", device];
+    for setting in SMALL {
+        words.extend(["--set", setting]);
+    }
+    words.extend_from_slice(more);
+    words
+}
+
+fn psnr(folder: &Path, method: &str) -> f64 {
+    let text = std::fs::read_to_string(folder.join("run/metrics/metrics.json")).unwrap();
+    let all: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let found = &all[method]["head"]["mean"]["psnr_masked"];
+    found.as_f64().unwrap_or_else(|| panic!("no PSNR of {method}: {text}"))
+}
+
+#[test]
+fn a_run_is_killed_on_the_device_goes_on_there_and_ends_on_the_processor() {
+    if Adapter::all().is_empty() {
+        println!("skipped: a run on a device, for no adapter is here (Mesa's lavapipe would do)");
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 48, height: 60, train: 8, test: 2, seed: 3 };
+    write_capture(&dir.path().join("capture"), &options).unwrap();
+    let checkpoint = dir.path().join("run/iface/checkpoint.safetensors");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_tiface"))
+        .args(words("wgpu:0", &[]))
+        .current_dir(dir.path())
+        .env("XDG_CONFIG_HOME", dir.path())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    // killed as soon as there is something to lose
+    let patience = Instant::now() + Duration::from_secs(900);
+    while !checkpoint.is_file() && child.try_wait().unwrap().is_none() {
+        assert!(Instant::now() < patience, "no checkpoint comes");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let said = |output: std::process::Output| {
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{text}");
+        text
+    };
+    said(tiface(dir.path(), &words("wgpu:0", &[])));
+    let (field, mesh) = (psnr(dir.path(), "volume"), psnr(dir.path(), "raycast"));
+    // the same fields, meshed, rendered and judged by the processor
+    let text = said(tiface(dir.path(), &words("cpu", &["--fresh", "mesh"])));
+    let (by_cpu, mesh_by_cpu) = (psnr(dir.path(), "volume"), psnr(dir.path(), "raycast"));
+    println!(
+        "volume {field:.2} dB on the device, {by_cpu:.2} on the processor; mesh {mesh:.2}, {mesh_by_cpu:.2}"
+    );
+    assert!((field - by_cpu).abs() < 0.01, "{field} {by_cpu}: {text}");
+    assert!((mesh - mesh_by_cpu).abs() < 0.2, "{mesh} {mesh_by_cpu}: {text}");
+}
+
+#[test]
+fn doctor_tells_what_is_here_and_what_is_not_here_is_refused_before_anything_is_made() {
+    let dir = tempfile::tempdir().unwrap();
+    let text = |output: &std::process::Output| String::from_utf8_lossy(&output.stdout).into_owned();
+    let model = tiface(dir.path(), &["doctor", "--model"]);
+    assert!(model.status.success() && text(&model).contains("A prediction"), "{model:?}");
+    assert!(text(&model).contains("H100") && text(&model).contains("scatter"));
+    let options = SyntheticOptions { width: 24, height: 24, train: 4, test: 1, seed: 3 };
+    write_capture(&dir.path().join("capture"), &options).unwrap();
+    let refused = tiface(dir.path(), &words("vulkan:77", &[]));
+    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(2), "{said}");
+    assert!(said.contains("vulkan:77") && said.contains("doctor") && !dir.path().join("run/tface").exists());
+}
