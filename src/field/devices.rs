@@ -88,6 +88,16 @@ pub fn best() -> std::result::Result<Gpu, String> {
     Err(if passed_over.is_empty() { "no GPU is here".into() } else { passed_over.join(", ") })
 }
 
+/// What learns where a device is named so, and why.
+pub fn chosen(name: &str) -> String {
+    let told = |gpu: Gpu| format!("{}: {}", gpu.device.name(), gpu.why);
+    match name {
+        "cpu" => "the processor".into(),
+        "auto" => best().map_or_else(|why| format!("the processor: {why}"), told),
+        other => open(other).map_or_else(|e| e.to_string(), told),
+    }
+}
+
 /// The lock of a device: the same for every API that leads to the same card.
 fn lock_file(device: &Device) -> PathBuf {
     let card = device.card().unwrap_or_else(|| device.name().to_string());

@@ -10,7 +10,7 @@ use crate::config::iface::FieldKind;
 use crate::config::{Config, MaskUse, Preset, Stage};
 use crate::field::pixels::TrainView;
 #[cfg(feature = "wgpu")]
-use crate::field::place;
+use crate::field::place as place_of;
 use crate::field::training::TrainingSession;
 use crate::geom::Camera;
 use crate::iface::{self, DensityField, IFace};
@@ -39,7 +39,12 @@ pub(super) fn learn(
         identity: dir.identity(),
         monitor: dir.monitor(),
     };
-    let (report, warnings) = train(stage, capture, scene, config, &session)?;
+    #[cfg(feature = "wgpu")]
+    let place = crate::field::devices::chosen(&config.device);
+    #[cfg(not(feature = "wgpu"))]
+    let place = "the processor";
+    let (mut report, warnings) = train(stage, capture, scene, config, &session)?;
+    report["device"] = json!(place);
     warnings.iter().for_each(|w| dir.warn(w));
     Ok(report)
 }
@@ -130,7 +135,7 @@ impl Fields for TrainedFields<'_> {
             let hull = bitmask(&self.line.scene()?);
             let field = IFace::load(&folder, &config.iface, hull.as_ref())?;
             #[cfg(feature = "wgpu")]
-            let field = field.on(place(&config.device)?);
+            let field = field.on(place_of(&config.device)?);
             Ok(Box::new(field))
         };
         once(&self.iface, load).map(|f| &**f)
