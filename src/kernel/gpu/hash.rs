@@ -1,6 +1,7 @@
 //! The hash encoding of [`crate::kernel::hash`]: features with Jacobian, and their scatter.
 
 use super::device::{Atomics, Buffer, Device};
+use super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::hash::Level;
 use crate::kernel::sdf::FieldShape;
 use cubecl::prelude::*;
@@ -10,9 +11,6 @@ const GROUP: u32 = 256;
 
 /// Words that describe a level: scale, resolution, entries, offset, whether it is hashed.
 const LEVEL: usize = 5;
-
-/// Steps that the bound on a sum is counted in: what is left up to 2³¹ takes the rounding of 10⁸ terms.
-const MOST: f32 = 2e9;
 
 /// The cell of a position at a level: its lowest corner and the position inside it.
 #[derive(CubeType)]
@@ -118,56 +116,6 @@ fn gather(
                 jacobian[(3 * plane + 2) * capacity + s] = jz.extract(f);
             }
         }
-    }
-}
-
-/// A word that threads add floats to.
-#[cube]
-trait Sum: Send + Sync + 'static {
-    /// What lies in memory.
-    type Word: CubePrimitive;
-
-    /// Adds `v`, where words count it in steps of `1 / unit`.
-    fn add(word: &Atomic<Self::Word>, v: f32, unit: f32);
-}
-
-/// [`Atomics::Native`].
-struct Native;
-/// [`Atomics::Exchange`].
-struct Exchange;
-/// [`Atomics::Fixed`].
-struct Fixed;
-
-#[cube]
-impl Sum for Native {
-    type Word = f32;
-
-    fn add(word: &Atomic<f32>, v: f32, _unit: f32) {
-        word.fetch_add(v);
-    }
-}
-
-#[cube]
-impl Sum for Exchange {
-    type Word = u32;
-
-    fn add(word: &Atomic<u32>, v: f32, _unit: f32) {
-        let mut seen = word.load();
-        let mut waiting = true;
-        while waiting {
-            let found = word.compare_exchange_weak(seen, u32::reinterpret(f32::reinterpret(seen) + v));
-            waiting = found != seen;
-            seen = found;
-        }
-    }
-}
-
-#[cube]
-impl Sum for Fixed {
-    type Word = i32;
-
-    fn add(word: &Atomic<i32>, v: f32, unit: f32) {
-        word.fetch_add(i32::cast_from((v * unit).round()));
     }
 }
 

@@ -13,7 +13,7 @@ const FAR: f32 = 1e30;
 
 /// A bit of a mask.
 #[cube]
-fn bit(mask: &[u32], i: u32) -> bool {
+pub(super) fn bit(mask: &[u32], i: u32) -> bool {
     (mask[(i >> 5) as usize] >> (i & 31)) & 1 == 1
 }
 
@@ -140,8 +140,7 @@ fn pass(
     }
 }
 
-/// Where each ray's samples begin, how many there are, and how many there would be with more room. A ray whose samples, with those before, are more than there
-/// is room for gets none, and none behind it. One group of threads.
+/// See [`prefix_sum`]. One group of threads.
 #[cube(launch)]
 fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
     let unit = UNIT_POS as usize;
@@ -186,6 +185,27 @@ fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
         total[0] = most;
         total[1] = wanted;
     }
+}
+
+/// Where each ray's samples begin, `[rays + 1]`, of their counts `[rays]`; and how many there are and would be with more
+/// room, `[2]`. A ray whose samples, with those before, are more than `capacity` gets none, and none behind it.
+pub(super) fn prefix_sum(
+    device: &Device,
+    counts: &Buffer,
+    offsets: &Buffer,
+    total: &Buffer,
+    capacity: usize,
+) {
+    assert_eq!(offsets.words(), counts.words() + 1);
+    scan::launch(
+        device.launch(),
+        CubeCount::new_single(),
+        CubeDim::new_1d(UNITS),
+        counts.arg(),
+        offsets.arg(),
+        total.arg(),
+        capacity as u32,
+    );
 }
 
 /// The samples of a batch of rays on a device.
@@ -257,15 +277,7 @@ impl Samples {
             );
         };
         both(false);
-        scan::launch(
-            device.launch(),
-            CubeCount::new_single(),
-            CubeDim::new_1d(UNITS),
-            self.counts.arg(),
-            self.offsets.arg(),
-            self.count.arg(),
-            (self.t.words() - apart) as u32,
-        );
+        prefix_sum(device, &self.counts, &self.offsets, &self.count, self.t.words() - apart);
         both(true);
     }
 }

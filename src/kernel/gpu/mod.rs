@@ -23,7 +23,9 @@ mod rng;
 mod schedule;
 mod sdf;
 mod self_test;
+mod sum;
 mod tile;
+mod vm;
 
 pub use adam::{Gate, adam};
 pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits};
@@ -39,6 +41,7 @@ pub use points::SurfacePoints;
 pub use schedule::{Pitch, RayBudget, Schedule};
 pub use sdf::Sdf;
 pub use self_test::{Check, self_test};
+pub use vm::{DeviceDecoder, DeviceGrid, Vm, VmValues};
 
 #[cfg(test)]
 pub(crate) use device::tests;

@@ -133,15 +133,16 @@ pub struct Occupancy {
     pub(super) radius: f32,
 }
 
-fn words(mask: &Bitmask) -> Vec<u32> {
-    mask.bits.iter().flat_map(|&w| [w as u32, (w >> 32) as u32]).collect()
+/// Bits as words of a device.
+pub(super) fn words(bits: &[u64]) -> Vec<u32> {
+    bits.iter().flat_map(|&w| [w as u32, (w >> 32) as u32]).collect()
 }
 
 impl Occupancy {
     /// Of these masks.
     pub fn new(device: &Device, mask: &Bitmask, solid: Option<&Bitmask>, radius: f32) -> Occupancy {
         assert!(solid.is_none_or(|s| s.resolution == mask.resolution));
-        let there = |mask: &Bitmask| device.upload(&words(mask));
+        let there = |mask: &Bitmask| device.upload(&words(&mask.bits));
         Occupancy { mask: there(mask), solid: solid.map(there), resolution: mask.resolution, radius }
     }
 
@@ -176,7 +177,7 @@ impl Band {
         let cells: Vec<u32> = (0..total).filter(|&i| allowed.get(i)).map(|i| i as u32).collect();
         Band {
             cells: device.upload(&cells),
-            allowed: device.upload(&words(allowed)),
+            allowed: device.upload(&words(&allowed.bits)),
             // no sign where nothing is asked
             value: device.zeros(total),
             reach: device.zeros(total),

@@ -1,23 +1,34 @@
-//! Products of tiles: 64 samples times up to 64 channels in workgroup memory, by 256 threads.
+//! Products of tiles in workgroup memory, by 256 threads.
 //!
-//! Four samples are a vector, and a tile is `[64 channels, 16 vectors]`. Thread `(row, column)`, 16 by 16, owns vector
-//! `row` of channels `4 column .. 4 column + 4`: a [`Block`]. Weights lie in rows of 64 floats, `[inputs, 64]`.
+//! Four samples are a vector, and a tile is so many `lanes` of vectors times [`channels`] of them: 64 samples times 64
+//! channels, or 32 times 128. Thread `(row, column)` owns vector `row` of channels `4 column .. 4 column + 4`: a
+//! [`Block`]. Weights lie in rows of as many floats as a tile has channels, `[inputs, channels]`.
 
 use cubecl::prelude::*;
 
 type F4 = Vector<f32, Const<4>>;
 
-/// Channels of a tile.
-pub const CHANNELS: usize = 64;
-/// Vectors of a tile's channel.
+/// Channels of a tile of [`LANES`].
+pub const CHANNELS: usize = channels(LANES);
+/// Vectors of a channel in a tile of 64 samples.
 pub const LANES: usize = 16;
 /// Threads that share a tile.
 pub const UNITS: u32 = 256;
 
+/// Threads that share a row, and vectors in a row of weights.
+pub const fn columns(lanes: usize) -> usize {
+    UNITS as usize / lanes
+}
+
+/// Channels of a tile.
+pub const fn channels(lanes: usize) -> usize {
+    4 * columns(lanes)
+}
+
 /// Where a channel's vector lies: neighboring channels in different banks, read along channels or along samples.
 #[cube]
-pub fn at(channel: usize, row: usize) -> usize {
-    channel * LANES + (row ^ (channel % LANES))
+pub fn at(channel: usize, row: usize, #[comptime] lanes: usize) -> usize {
+    channel * lanes + (row ^ (channel % lanes))
 }
 
 /// Four channels of a thread's vector of samples.
@@ -57,14 +68,15 @@ pub fn product(
     #[comptime] k: usize,
     row: usize,
     column: usize,
+    #[comptime] lanes: usize,
 ) -> Block {
     let mut c0 = F4::new(0.0f32);
     let mut c1 = F4::new(0.0f32);
     let mut c2 = F4::new(0.0f32);
     let mut c3 = F4::new(0.0f32);
     for p in 0..k {
-        let v = a[at(first + p, row)];
-        let m = w[(from + p) * LANES + column];
+        let v = a[at(first + p, row, lanes)];
+        let m = w[(from + p) * comptime!(columns(lanes)) + column];
         c0 += v * F4::new(m.extract(0usize));
         c1 += v * F4::new(m.extract(1usize));
         c2 += v * F4::new(m.extract(2usize));
@@ -73,7 +85,8 @@ pub fn product(
     Block::of(c0, c1, c2, c3)
 }
 
-/// Output `column` of a layer of few outputs from 64 channels; its weights are `[outputs, 64]`. Beyond the last, zero.
+/// Output `column` of a layer of few outputs from all channels; its weights are `[outputs, channels]`. Beyond the last,
+/// zero.
 #[cube]
 pub fn narrow(
     a: &[F4],
@@ -82,34 +95,55 @@ pub fn narrow(
     row: usize,
     column: usize,
     #[comptime] outputs: usize,
+    #[comptime] lanes: usize,
 ) -> F4 {
     let mut sum = F4::new(0.0f32);
     if column < outputs {
-        for p in 0..LANES {
-            let m = w[(from + column) * LANES + p];
+        for p in 0..comptime!(columns(lanes)) {
+            let m = w[(from + column) * comptime!(columns(lanes)) + p];
             #[unroll]
             for j in 0..4usize {
-                sum += a[at(4 * p + j, row)] * F4::new(m.extract(j));
+                sum += a[at(4 * p + j, row, lanes)] * F4::new(m.extract(j));
             }
         }
     }
     sum
 }
 
+/// Four vectors, one of each of four samples' four channels, as channels' vectors of samples; and back.
+#[cube]
+pub fn turned(b: &Block) -> Block {
+    Block::of(across(b, 0usize), across(b, 1usize), across(b, 2usize), across(b, 3usize))
+}
+
+#[cube]
+fn across(b: &Block, #[comptime] k: usize) -> F4 {
+    let mut v = F4::new(b.c0.extract(k));
+    v.insert(1usize, b.c1.extract(k));
+    v.insert(2usize, b.c2.extract(k));
+    v.insert(3usize, b.c3.extract(k));
+    v
+}
+
 /// Writes a thread's block to a tile.
 #[cube]
-pub fn put(a: &mut [F4], block: &Block, row: usize, column: usize) {
+pub fn put(a: &mut [F4], block: &Block, row: usize, column: usize, #[comptime] lanes: usize) {
     #[unroll]
     for j in 0..4usize {
-        a[at(4 * column + j, row)] = block.channel(j);
+        a[at(4 * column + j, row, lanes)] = block.channel(j);
     }
 }
 
 /// A thread's block of a tile.
 #[cube]
-pub fn take(a: &[F4], row: usize, column: usize) -> Block {
+pub fn take(a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> Block {
     let c = 4 * column;
-    Block::of(a[at(c, row)], a[at(c + 1, row)], a[at(c + 2, row)], a[at(c + 3, row)])
+    Block::of(
+        a[at(c, row, lanes)],
+        a[at(c + 1, row, lanes)],
+        a[at(c + 2, row, lanes)],
+        a[at(c + 3, row, lanes)],
+    )
 }
 
 /// Writes a thread's block to planes, its channels below `end`.
@@ -129,11 +163,11 @@ pub fn save(to: &mut [F4], block: &Block, plane: usize, here: usize, column: usi
 pub fn load(a: &mut [F4], from: &[F4], plane: usize, here: usize, row: usize, column: usize) {
     for j in 0..4usize {
         let c = column + 16 * j;
-        a[at(c, row)] = from[c * plane + here];
+        a[at(c, row, LANES)] = from[c * plane + here];
     }
 }
 
-/// Adds to a matrix of gradients, in rows of 64, `Σ_samples a[first + i] · b[j]`, `i < m` and `j < n`; the first time
+/// Adds to a matrix of gradients, in rows of all channels, `Σ_samples a[first + i] · b[j]`, `i < m` and `j < n`; the first time
 /// writes it.
 #[cube]
 pub fn outer(
@@ -147,31 +181,33 @@ pub fn outer(
     fresh: bool,
     row: usize,
     column: usize,
+    #[comptime] lanes: usize,
 ) {
-    for ii in 0..comptime!(m.div_ceil(16)) {
-        let i = row + 16 * ii;
+    let columns = comptime!(columns(lanes));
+    for ii in 0..comptime!(m.div_ceil(lanes)) {
+        let i = row + lanes * ii;
         if i < m {
             let mut s0 = 0.0f32;
             let mut s1 = 0.0f32;
             let mut s2 = 0.0f32;
             let mut s3 = 0.0f32;
-            for r in 0..LANES {
-                let v = a[at(first + i, r)];
-                s0 += v.dot(b[at(column, r)]);
-                s1 += v.dot(b[at(column + 16, r)]);
-                s2 += v.dot(b[at(column + 32, r)]);
-                s3 += v.dot(b[at(column + 48, r)]);
+            for r in 0..lanes {
+                let v = a[at(first + i, r, lanes)];
+                s0 += v.dot(b[at(column, r, lanes)]);
+                s1 += v.dot(b[at(column + columns, r, lanes)]);
+                s2 += v.dot(b[at(column + 2 * columns, r, lanes)]);
+                s3 += v.dot(b[at(column + 3 * columns, r, lanes)]);
             }
-            let here = start + i * CHANNELS + column;
+            let here = start + i * comptime!(channels(lanes)) + column;
             add(gradient, here, s0, fresh);
-            if comptime!(n > 16) {
-                add(gradient, here + 16, s1, fresh);
+            if comptime!(n > columns) {
+                add(gradient, here + columns, s1, fresh);
             }
-            if comptime!(n > 32) {
-                add(gradient, here + 32, s2, fresh);
+            if comptime!(n > 2 * columns) {
+                add(gradient, here + 2 * columns, s2, fresh);
             }
-            if comptime!(n > 48) {
-                add(gradient, here + 48, s3, fresh);
+            if comptime!(n > 3 * columns) {
+                add(gradient, here + 3 * columns, s3, fresh);
             }
         }
     }
@@ -188,14 +224,16 @@ pub fn sums(
     fresh: bool,
     row: usize,
     column: usize,
+    #[comptime] lanes: usize,
 ) {
     if row == 0 {
-        for jj in 0..comptime!(n.div_ceil(16)) {
-            let j = column + 16 * jj;
+        let columns = comptime!(columns(lanes));
+        for jj in 0..comptime!(n.div_ceil(columns)) {
+            let j = column + columns * jj;
             if j < n {
                 let mut sum = F4::new(0.0f32);
-                for r in 0..LANES {
-                    sum += a[at(first + j, r)];
+                for r in 0..lanes {
+                    sum += a[at(first + j, r, lanes)];
                 }
                 let all =
                     sum.extract(0usize) + sum.extract(1usize) + (sum.extract(2usize) + sum.extract(3usize));
@@ -231,8 +269,8 @@ pub fn relu(b: &Block) -> Block {
 
 /// `g` where the tile's own channels are above zero.
 #[cube]
-pub fn gate(g: &Block, a: &[F4], row: usize, column: usize) -> Block {
-    let v = take(a, row, column);
+pub fn gate(g: &Block, a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> Block {
+    let v = take(a, row, column, lanes);
     Block::of(gated(g.c0, v.c0), gated(g.c1, v.c1), gated(g.c2, v.c2), gated(g.c3, v.c3))
 }
 

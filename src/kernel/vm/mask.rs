@@ -19,7 +19,7 @@ pub struct BoxMask {
 }
 
 /// Cells along the edge of a block.
-const BLOCK: usize = 8;
+pub(in crate::kernel) const BLOCK: usize = 8;
 
 fn bit(bits: &[u64], i: usize) -> bool {
     bits[i >> 6] >> (i & 63) & 1 == 1
@@ -111,6 +111,12 @@ impl BoxMask {
     /// The cells' bits.
     pub fn bits(&self) -> &[u64] {
         &self.bits
+    }
+
+    /// Bits of blocks of 8³ cells that hold an occupied cell, in the order of cells.
+    #[cfg(feature = "wgpu")]
+    pub(in crate::kernel) fn blocks(&self) -> &[u64] {
+        &self.blocks
     }
 
     /// Share of cells that are occupied, 0..=1.

@@ -86,7 +86,7 @@ fn sign(x: f32) -> f32 {
 }
 
 /// 2 / count of differences along height and width, times two for the formula's leading factor.
-pub(super) fn tv_factors(f: &Factor) -> [f64; 2] {
+pub(in crate::kernel) fn tv_factors(f: &Factor) -> [f64; 2] {
     let (h, w, c) = (f.height as f64, f.width as f64, f.channels.max(1) as f64);
     [2.0 / (c * (h - 1.0) * w), 2.0 / (c * h * (w - 1.0))]
 }

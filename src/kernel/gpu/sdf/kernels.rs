@@ -62,7 +62,7 @@ fn geometry_inputs(
         } else if c < features + 3 {
             v = x[(c - features) * plane + here] * F4::new(inv_radius);
         }
-        a[at(c, row)] = v;
+        a[at(c, row, LANES)] = v;
     }
 }
 
@@ -97,16 +97,16 @@ fn color_inputs(
     #[comptime] plan: Plan,
 ) {
     if column < OUTPUTS {
-        a[at(column, row)] = o;
+        a[at(column, row, LANES)] = o;
     }
     if column == 13 {
         let (x, y, z) = (direction[here], direction[plane + here], direction[2 * plane + here]);
         harmonics(a, x, y, z, row);
     }
     if column == 14 {
-        a[at(NORMAL, row)] = normal.x;
-        a[at(NORMAL + 1, row)] = normal.y;
-        a[at(NORMAL + 2, row)] = normal.z;
+        a[at(NORMAL, row, LANES)] = normal.x;
+        a[at(NORMAL + 1, row, LANES)] = normal.y;
+        a[at(NORMAL + 2, row, LANES)] = normal.z;
     }
     if comptime!(plan.color > COLOR_INPUTS) {
         for j in 0..2usize {
@@ -116,7 +116,7 @@ fn color_inputs(
                 if c < comptime!(plan.features) {
                     v = value[c * plane + here];
                 }
-                a[at(COLOR_INPUTS + c, row)] = v;
+                a[at(COLOR_INPUTS + c, row, LANES)] = v;
             }
         }
     }
@@ -129,22 +129,22 @@ fn harmonics(a: &mut [F4], x: F4, y: F4, z: F4, row: usize) {
     let (x2, y2, z2) = (x * x, y * y, z * z);
     let one = F4::new(1.0f32);
     let five = one - F4::new(5.0f32) * z2;
-    a[at(13, row)] = F4::new(0.282_094_79f32);
-    a[at(14, row)] = y * F4::new(-0.488_602_51f32);
-    a[at(15, row)] = z * F4::new(0.488_602_51f32);
-    a[at(16, row)] = x * F4::new(-0.488_602_51f32);
-    a[at(17, row)] = xy * F4::new(1.092_548_4f32);
-    a[at(18, row)] = yz * F4::new(-1.092_548_4f32);
-    a[at(19, row)] = z2 * F4::new(0.946_174_7f32) - F4::new(0.315_391_57f32);
-    a[at(20, row)] = xz * F4::new(-1.092_548_4f32);
-    a[at(21, row)] = (x2 - y2) * F4::new(0.546_274_2f32);
-    a[at(22, row)] = y * (y2 - x2 * F4::new(3.0f32)) * F4::new(0.590_043_6f32);
-    a[at(23, row)] = xy * z * F4::new(2.890_611_4f32);
-    a[at(24, row)] = y * five * F4::new(0.457_045_8f32);
-    a[at(25, row)] = z * (F4::new(5.0f32) * z2 - F4::new(3.0f32)) * F4::new(0.373_176_34f32);
-    a[at(26, row)] = x * five * F4::new(0.457_045_8f32);
-    a[at(27, row)] = z * (x2 - y2) * F4::new(1.445_305_7f32);
-    a[at(28, row)] = x * (y2 * F4::new(3.0f32) - x2) * F4::new(0.590_043_6f32);
+    a[at(13, row, LANES)] = F4::new(0.282_094_79f32);
+    a[at(14, row, LANES)] = y * F4::new(-0.488_602_51f32);
+    a[at(15, row, LANES)] = z * F4::new(0.488_602_51f32);
+    a[at(16, row, LANES)] = x * F4::new(-0.488_602_51f32);
+    a[at(17, row, LANES)] = xy * F4::new(1.092_548_4f32);
+    a[at(18, row, LANES)] = yz * F4::new(-1.092_548_4f32);
+    a[at(19, row, LANES)] = z2 * F4::new(0.946_174_7f32) - F4::new(0.315_391_57f32);
+    a[at(20, row, LANES)] = xz * F4::new(-1.092_548_4f32);
+    a[at(21, row, LANES)] = (x2 - y2) * F4::new(0.546_274_2f32);
+    a[at(22, row, LANES)] = y * (y2 - x2 * F4::new(3.0f32)) * F4::new(0.590_043_6f32);
+    a[at(23, row, LANES)] = xy * z * F4::new(2.890_611_4f32);
+    a[at(24, row, LANES)] = y * five * F4::new(0.457_045_8f32);
+    a[at(25, row, LANES)] = z * (F4::new(5.0f32) * z2 - F4::new(3.0f32)) * F4::new(0.373_176_34f32);
+    a[at(26, row, LANES)] = x * five * F4::new(0.457_045_8f32);
+    a[at(27, row, LANES)] = z * (x2 - y2) * F4::new(1.445_305_7f32);
+    a[at(28, row, LANES)] = x * (y2 * F4::new(3.0f32) - x2) * F4::new(0.590_043_6f32);
 }
 
 /// Writes sdf, ∇sdf, color and local sharpness, planes `[8, capacity]`, and what the backward needs; where normals are
@@ -180,21 +180,21 @@ pub(super) fn forward(
     if tile * TILE < count[0] as usize {
         geometry_inputs(&mut a, value, x, inv_radius, plane, here, row, column, features);
         sync_cube();
-        let z = product(&a, 0usize, w, comptime!(rows[0]), comptime!(plan.padded), row, column);
+        let z = product(&a, 0usize, w, comptime!(rows[0]), comptime!(plan.padded), row, column, LANES);
         let active = tile::activate(&z, w[comptime!(rows[2] * LANES) + column]);
         save(h, &active.h, plane, here, column, HIDDEN);
-        put(&mut b, &active.h, row, column);
+        put(&mut b, &active.h, row, column, LANES);
         sync_cube();
-        let own =
-            narrow(&b, w, comptime!(rows[3]), row, column, OUTPUTS) + w[comptime!(rows[4] * LANES) + column];
+        let own = narrow(&b, w, comptime!(rows[3]), row, column, OUTPUTS, LANES)
+            + w[comptime!(rows[4] * LANES) + column];
         if column < OUTPUTS {
             o[column * plane + here] = own;
         }
         let weighted = tile::weighted(&active.s, w[comptime!(rows[3] * LANES) + column]);
-        put(&mut a, &weighted, row, column);
+        put(&mut a, &weighted, row, column, LANES);
         sync_cube();
         // q = a W1, and this thread's share of n = q_x + Jᵀ q_F
-        let own_q = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column);
+        let own_q = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
         save(q, &own_q, plane, here, column, features);
         #[unroll]
         for axis in 0..3usize {
@@ -209,7 +209,7 @@ pub(super) fn forward(
                     sum += v * F4::new(inv_radius);
                 }
             }
-            b[at(16 * axis + column, row)] = sum;
+            b[at(16 * axis + column, row, LANES)] = sum;
         }
         sync_cube();
         let mut nx = F4::new(0.0f32);
@@ -222,9 +222,9 @@ pub(super) fn forward(
                 nz = normals[2 * plane + here];
             } else {
                 for c in 0..16usize {
-                    nx += b[at(c, row)];
-                    ny += b[at(16 + c, row)];
-                    nz += b[at(32 + c, row)];
+                    nx += b[at(c, row, LANES)];
+                    ny += b[at(16 + c, row, LANES)];
+                    nz += b[at(32 + c, row, LANES)];
                 }
             }
             out[plane + here] = nx;
@@ -239,16 +239,24 @@ pub(super) fn forward(
             out[7 * plane + here] = sigmoid(own - F4::new(2.0f32)) * F4::new(-soften);
         }
         sync_cube();
-        let first =
-            tile::relu(&product(&a, 0usize, w, comptime!(rows[5]), comptime!(plan.color), row, column));
+        let first = tile::relu(&product(
+            &a,
+            0usize,
+            w,
+            comptime!(rows[5]),
+            comptime!(plan.color),
+            row,
+            column,
+            LANES,
+        ));
         save(c1, &first, plane, here, column, HIDDEN);
-        put(&mut b, &first, row, column);
+        put(&mut b, &first, row, column, LANES);
         sync_cube();
-        let second = tile::relu(&product(&b, 0usize, w, comptime!(rows[7]), HIDDEN, row, column));
+        let second = tile::relu(&product(&b, 0usize, w, comptime!(rows[7]), HIDDEN, row, column, LANES));
         save(c2, &second, plane, here, column, HIDDEN);
-        put(&mut a, &second, row, column);
+        put(&mut a, &second, row, column, LANES);
         sync_cube();
-        let rgb = narrow(&a, w, comptime!(rows[9]), row, column, 3usize);
+        let rgb = narrow(&a, w, comptime!(rows[9]), row, column, 3usize, LANES);
         if column < 3 {
             out[(4 + column) * plane + here] = sigmoid(rgb);
         }
@@ -304,22 +312,34 @@ pub(super) fn color_backward(
         if column < 3 {
             let y = out[(4 + column) * plane + here];
             let g = masked(g_out[(4 + column) * plane + here], first, samples);
-            a[at(column, row)] = g * y * (F4::new(1.0f32) - y);
+            a[at(column, row, LANES)] = g * y * (F4::new(1.0f32) - y);
         }
         load(&mut b, c2, plane, here, row, column);
         sync_cube();
         let start = sum + comptime!(own[6] * CHANNELS);
-        outer(&a, 0usize, &b, 3usize, HIDDEN, partial, start, fresh, row, column);
-        let g_c2 = gate(&product(&a, 0usize, w, comptime!(rows[9]), 3usize, row, column), &b, row, column);
+        outer(&a, 0usize, &b, 3usize, HIDDEN, partial, start, fresh, row, column, LANES);
+        let g_c2 = gate(
+            &product(&a, 0usize, w, comptime!(rows[9]), 3usize, row, column, LANES),
+            &b,
+            row,
+            column,
+            LANES,
+        );
         sync_cube();
-        put(&mut a, &g_c2, row, column);
+        put(&mut a, &g_c2, row, column, LANES);
         load(&mut b, c1, plane, here, row, column);
         sync_cube();
         let start = sum + comptime!(own[5] * CHANNELS);
-        outer(&a, 0usize, &b, HIDDEN, HIDDEN, partial, start, fresh, row, column);
-        let g_c1 = gate(&product(&a, 0usize, w, comptime!(rows[8]), HIDDEN, row, column), &b, row, column);
+        outer(&a, 0usize, &b, HIDDEN, HIDDEN, partial, start, fresh, row, column, LANES);
+        let g_c1 = gate(
+            &product(&a, 0usize, w, comptime!(rows[8]), HIDDEN, row, column, LANES),
+            &b,
+            row,
+            column,
+            LANES,
+        );
         sync_cube();
-        put(&mut a, &g_c1, row, column);
+        put(&mut a, &g_c1, row, column, LANES);
         let n = unit(out[plane + here], out[2 * plane + here], out[3 * plane + here]);
         let mut output = F4::new(0.0f32);
         if column < OUTPUTS {
@@ -328,13 +348,13 @@ pub(super) fn color_backward(
         color_inputs(&mut b, output, &n, direction, value, plane, here, row, column, plan);
         sync_cube();
         let start = sum + comptime!(own[4] * CHANNELS);
-        outer(&a, 0usize, &b, HIDDEN, comptime!(plan.color), partial, start, fresh, row, column);
-        let g_c0 = product(&a, 0usize, w, comptime!(rows[6]), HIDDEN, row, column);
+        outer(&a, 0usize, &b, HIDDEN, comptime!(plan.color), partial, start, fresh, row, column, LANES);
+        let g_c0 = product(&a, 0usize, w, comptime!(rows[6]), HIDDEN, row, column, LANES);
         sync_cube();
-        put(&mut a, &g_c0, row, column);
+        put(&mut a, &g_c0, row, column, LANES);
         sync_cube();
         if column < OUTPUTS {
-            let mut g = a[at(column, row)];
+            let mut g = a[at(column, row, LANES)];
             if column == 0 {
                 g += masked(g_out[here], first, samples);
             }
@@ -348,7 +368,8 @@ pub(super) fn color_backward(
         }
         if column == 14 {
             // through n̂ = n / ‖n‖ too: (g − n̂ (n̂ · g)) / ‖n‖
-            let (gx, gy, gz) = (a[at(NORMAL, row)], a[at(NORMAL + 1, row)], a[at(NORMAL + 2, row)]);
+            let (gx, gy, gz) =
+                (a[at(NORMAL, row, LANES)], a[at(NORMAL + 1, row, LANES)], a[at(NORMAL + 2, row, LANES)]);
             let along = n.x * gx + n.y * gy + n.z * gz;
             let zero = F4::new(0.0f32);
             let one = F4::new(1.0f32);
@@ -363,7 +384,7 @@ pub(super) fn color_backward(
             for j in 0..2usize {
                 let c = column + 16 * j;
                 if c < comptime!(plan.features) {
-                    g_value[c * plane + here] = a[at(COLOR_INPUTS + c, row)];
+                    g_value[c * plane + here] = a[at(COLOR_INPUTS + c, row, LANES)];
                 }
             }
         }
@@ -413,32 +434,32 @@ pub(super) fn geometry_backward(
             } else if c >= padded && c < padded + OUTPUTS {
                 v = g_o[(c - padded) * plane + here];
             }
-            b[at(c, row)] = v;
+            b[at(c, row, LANES)] = v;
         }
         load(&mut a, h, plane, here, row, column);
         sync_cube();
-        let g_a = product(&b, 0usize, w, comptime!(rows[0]), padded, row, column);
-        let from_o = product(&b, padded, w, comptime!(rows[3]), OUTPUTS, row, column);
+        let g_a = product(&b, 0usize, w, comptime!(rows[0]), padded, row, column, LANES);
+        let from_o = product(&b, padded, w, comptime!(rows[3]), OUTPUTS, row, column, LANES);
         let w0 = w[comptime!(rows[3] * LANES) + column];
-        let s = tile::slope(&tile::take(&a, row, column));
+        let s = tile::slope(&tile::take(&a, row, column, LANES));
         let start = sum + comptime!(own[2] * CHANNELS);
-        outer(&b, padded, &a, OUTPUTS, HIDDEN, partial, start, fresh, row, column);
-        sums(&b, padded, OUTPUTS, partial, sum + comptime!(own[3] * CHANNELS), fresh, row, column);
+        outer(&b, padded, &a, OUTPUTS, HIDDEN, partial, start, fresh, row, column, LANES);
+        sums(&b, padded, OUTPUTS, partial, sum + comptime!(own[3] * CHANNELS), fresh, row, column, LANES);
         sync_cube();
-        put(&mut a, &tile::times(&g_a, &s), row, column);
+        put(&mut a, &tile::times(&g_a, &s), row, column, LANES);
         sync_cube();
-        sums(&a, 0usize, HIDDEN, partial, start, false, row, column);
+        sums(&a, 0usize, HIDDEN, partial, start, false, row, column, LANES);
         sync_cube();
-        put(&mut a, &tile::weighted(&s, w0), row, column);
+        put(&mut a, &tile::weighted(&s, w0), row, column, LANES);
         sync_cube();
-        outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, fresh, row, column);
+        outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, fresh, row, column, LANES);
         sync_cube();
-        put(&mut a, &tile::curved(&s, &from_o, &g_a, w0), row, column);
+        put(&mut a, &tile::curved(&s, &from_o, &g_a, w0), row, column, LANES);
         geometry_inputs(&mut b, value, x, inv_radius, plane, here, row, column, features);
         sync_cube();
-        outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, false, row, column);
-        sums(&a, 0usize, HIDDEN, partial, sum + comptime!(own[1] * CHANNELS), fresh, row, column);
-        let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column);
+        outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, false, row, column, LANES);
+        sums(&a, 0usize, HIDDEN, partial, sum + comptime!(own[1] * CHANNELS), fresh, row, column, LANES);
+        let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
         #[unroll]
         for j in 0..4usize {
             let c = 4 * column + j;

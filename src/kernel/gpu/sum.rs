@@ -1,0 +1,56 @@
+//! Sums of many threads into one place: see [`Atomics`](super::Atomics).
+
+use cubecl::prelude::*;
+
+/// Steps that the bound on a sum is counted in: what is left up to 2³¹ takes the rounding of 10⁸ terms.
+pub const MOST: f32 = 2e9;
+
+/// A word that threads add floats to.
+#[cube]
+pub trait Sum: Send + Sync + 'static {
+    /// What lies in memory.
+    type Word: CubePrimitive;
+
+    /// Adds `v`, where words count it in steps of `1 / unit`.
+    fn add(word: &Atomic<Self::Word>, v: f32, unit: f32);
+}
+
+/// [`Atomics::Native`](super::Atomics::Native).
+pub struct Native;
+/// [`Atomics::Exchange`](super::Atomics::Exchange).
+pub struct Exchange;
+/// [`Atomics::Fixed`](super::Atomics::Fixed).
+pub struct Fixed;
+
+#[cube]
+impl Sum for Native {
+    type Word = f32;
+
+    fn add(word: &Atomic<f32>, v: f32, _unit: f32) {
+        word.fetch_add(v);
+    }
+}
+
+#[cube]
+impl Sum for Exchange {
+    type Word = u32;
+
+    fn add(word: &Atomic<u32>, v: f32, _unit: f32) {
+        let mut seen = word.load();
+        let mut waiting = true;
+        while waiting {
+            let found = word.compare_exchange_weak(seen, u32::reinterpret(f32::reinterpret(seen) + v));
+            waiting = found != seen;
+            seen = found;
+        }
+    }
+}
+
+#[cube]
+impl Sum for Fixed {
+    type Word = i32;
+
+    fn add(word: &Atomic<i32>, v: f32, unit: f32) {
+        word.fetch_add(i32::cast_from((v * unit).round()));
+    }
+}

@@ -1,0 +1,112 @@
+//! TensoRF's field of [`crate::kernel::vm`], whose modules hold the formulas: rays through it, and their gradients.
+//!
+//! Samples are marched first, all that the mask leaves; then their densities are looked up, weights are composited, and
+//! those worth a color are listed and decoded. The rays that the CPU ends early are marched on here, but what lies
+//! behind has neither weight nor gradient either.
+
+mod decoder;
+mod grid;
+mod march;
+mod rays;
+
+pub use decoder::DeviceDecoder;
+pub use grid::DeviceGrid;
+
+use super::device::{Buffer, Device};
+use super::draw::Batch;
+use crate::kernel::vm::VmField;
+use march::{DeviceLattice, VmSamples};
+use rays::Along;
+
+/// Samples of a tile, of which all rooms are a multiple.
+const TILE: usize = 64;
+
+/// A field on a device, and room for a batch of rays.
+pub struct Vm {
+    /// Planes and lines of the density.
+    pub density: DeviceGrid,
+    /// Planes and lines of the appearance.
+    pub color: DeviceGrid,
+    lattice: DeviceLattice,
+    decoder: DeviceDecoder,
+    samples: VmSamples,
+    along: Along,
+}
+
+/// The weights of a field on a device: planes and lines as [`DeviceGrid::upload`] lays them, the decoder's as the CPU's.
+#[derive(Clone, Copy)]
+pub struct VmValues<'a> {
+    /// Of the density.
+    pub density: &'a Buffer,
+    /// Of the appearance.
+    pub color: &'a Buffer,
+    /// Of the decoder.
+    pub network: &'a Buffer,
+}
+
+impl Vm {
+    /// For so many rays, whatever they meet; with room for gradients where it learns. The decoder must be one that
+    /// [`DeviceDecoder::knows`].
+    pub fn new(device: &Device, field: &VmField, rays: usize, learns: bool) -> Vm {
+        assert_eq!(field.density.size, field.color.size);
+        let lattice = DeviceLattice::new(device, field);
+        let capacity = (rays * lattice.most).next_multiple_of(TILE);
+        let color = DeviceGrid::new(device, field.color);
+        Vm {
+            density: DeviceGrid::new(device, field.density),
+            decoder: DeviceDecoder::new(device, &field.decoder, &color, capacity, learns),
+            color,
+            lattice,
+            samples: VmSamples::new(device, rays, capacity),
+            along: Along::new(device, field, rays, capacity, learns),
+        }
+    }
+
+    /// Renders rays, all that there is room for: planes `[5, rays]`, see [`crate::kernel::vm::RAY_WIDTH`].
+    pub fn render(&self, device: &Device, values: VmValues, rays: &Batch) -> &Buffer {
+        let (samples, along) = (&self.samples, &self.along);
+        self.decoder.prepare(device, values.network);
+        samples.march(device, &self.lattice, rays);
+        self.density.gather(device, values.density, &samples.place, &samples.count, &along.feature);
+        along.weigh(device, samples);
+        self.decoder.forward(device, &self.color, values.color, rays, samples, along);
+        along.composite(device, samples);
+        &along.out
+    }
+
+    /// Adds the gradients of planes and lines to those of `gradients`, and writes those of the decoder's weights: of the
+    /// rays of the last render, by what was composited, planes `[5, rays]`.
+    pub fn backward(
+        &self,
+        device: &Device,
+        values: VmValues,
+        rays: &Batch,
+        g_out: &Buffer,
+        gradients: VmValues,
+    ) {
+        let (samples, along) = (&self.samples, &self.along);
+        along.backward(device, samples, g_out);
+        let (place, count) = (&samples.place, &samples.count);
+        let g = &along.g_feature;
+        self.density.scatter(device, gradients.density, values.density, place, None, count, g);
+        self.decoder.backward(
+            device,
+            &self.color,
+            values.color,
+            rays,
+            samples,
+            along,
+            values.network,
+            gradients.color,
+            gradients.network,
+        );
+    }
+
+    /// How many samples were looked up and how many decoded, `[2]` each; and lattice points of each ray, `[rays]`.
+    pub fn counts(&self) -> [&Buffer; 3] {
+        [&self.samples.count, &self.along.count, &self.samples.points]
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,267 @@
+//! The color decoder of [`crate::kernel::vm`] without encodings, which is what is published.
+//!
+//! Between products and first layer lies nothing but two matrices; here they are one:
+//!
+//! ```text
+//! M = W1_features B     h1 = relu(M products + W1_direction d + b1)     h2 = relu(W2 h1 + b2)     rgb = sigmoid(W3 h2 + b3)
+//! g_B = W1_featuresᵀ g_M     g_W1_features = g_M Bᵀ
+//! ```
+//!
+//! A group of 256 threads takes 64 samples through all layers, or 32 where hidden layers are wider than 64. The backward
+//! takes them through once more: that costs less than to write down and read what lies between.
+
+mod kernels;
+
+use super::super::device::{Buffer, Device, groups};
+use super::super::draw::Batch;
+use super::super::tile;
+use super::grid::{DeviceGrid, NONE};
+use super::march::VmSamples;
+use super::rays::Along;
+use crate::kernel::vm::DecoderShape;
+use kernels::{backward, chain, forward, prepare, reduce};
+
+/// Groups that take tiles, one after the other, and sum gradients of weights, each over its own.
+const GROUPS: usize = 256;
+
+/// Samples whose gradients by products are there at once.
+const CHUNK: usize = 1 << 20;
+
+/// Where the matrices of a decoder stand, in rows of as many floats as a tile has channels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+struct Plan {
+    /// Vectors of each term's channels.
+    quads: [usize; 3],
+    /// Channels of the CPU.
+    channels: usize,
+    features: usize,
+    hidden: usize,
+    lanes: usize,
+}
+
+impl Plan {
+    /// Vectors of products.
+    fn products(&self) -> usize {
+        self.quads.iter().sum()
+    }
+
+    /// Inputs of the first layer: products, direction, 0.
+    fn inputs(&self) -> usize {
+        4 * self.products() + 4
+    }
+
+    /// Floats of a row.
+    fn width(&self) -> usize {
+        tile::channels(self.lanes)
+    }
+
+    /// Tiles that hold the inputs.
+    fn pieces(&self) -> usize {
+        self.inputs().div_ceil(self.width())
+    }
+
+    /// Inputs in a piece.
+    fn piece(&self, p: usize) -> usize {
+        (self.inputs() - p * self.width()).min(self.width())
+    }
+
+    /// First rows of `[M, W1_direction]ᵀ`, b1, W2ᵀ, b2, W3, b3, `[M, W1_direction]` (one piece after the other), W2, and
+    /// the end.
+    fn rows(&self) -> [usize; 9] {
+        let w = self.width();
+        let counts = [self.inputs(), 1, w, 1, 3, 1, self.pieces() * w, w];
+        std::array::from_fn(|i| counts[..i].iter().sum())
+    }
+
+    /// First rows of the gradients of `[M, W1_direction]` (one piece after the other), b1, W2, b2, W3, b3, and the end.
+    fn gradients(&self) -> [usize; 7] {
+        let w = self.width();
+        let counts = [self.pieces() * w, 1, w, 1, 3, 1];
+        std::array::from_fn(|i| counts[..i].iter().sum())
+    }
+
+    /// Where B, W1, b1, W2, b2, W3, b3 begin among the flat weights, and the end.
+    fn parts(&self) -> [usize; 8] {
+        let shape = DecoderShape {
+            channels: self.channels,
+            features: self.features,
+            hidden: self.hidden,
+            view_frequencies: 0,
+            feature_frequencies: 0,
+        };
+        let counts = shape.shapes().map(|(o, i)| o * i);
+        std::array::from_fn(|i| counts[..i].iter().sum())
+    }
+}
+
+/// A decoder on a device.
+pub struct DeviceDecoder {
+    plan: Plan,
+    /// The CPU's channel of each on the device, and the other way round.
+    real: Buffer,
+    padded: Buffer,
+    weights: Buffer,
+    /// Gradients by products, `[chunk, channels]`.
+    g_products: Buffer,
+    pub(super) chunk: usize,
+    capacity: usize,
+    partial: Buffer,
+    summed: Buffer,
+}
+
+impl DeviceDecoder {
+    /// Can a device decode this? Else what it cannot.
+    pub fn knows(shape: &DecoderShape) -> Result<(), &'static str> {
+        if shape.view_frequencies > 0 || shape.feature_frequencies > 0 {
+            return Err("encodings of directions or features");
+        }
+        if shape.hidden > 128 { Err("hidden layers wider than 128") } else { Ok(()) }
+    }
+
+    /// Of the products of a grid, for up to `capacity` samples; with room for gradients where it learns.
+    pub fn new(
+        device: &Device,
+        shape: &DecoderShape,
+        grid: &DeviceGrid,
+        capacity: usize,
+        learns: bool,
+    ) -> DeviceDecoder {
+        assert_eq!(DeviceDecoder::knows(shape), Ok(()));
+        let lanes = if shape.hidden > tile::channels(16) { 8 } else { 16 };
+        let (features, hidden, quads) = (shape.features, shape.hidden, grid.quads());
+        let plan = Plan { quads, channels: shape.channels, features, hidden, lanes };
+        let real = grid.channels();
+        let mut padded = vec![0u32; shape.channels];
+        for (c, &own) in real.iter().enumerate().filter(|(_, own)| **own != NONE) {
+            padded[own as usize] = c as u32;
+        }
+        let chunk = capacity.min(CHUNK);
+        let learned = |words: usize| device.scratch(if learns { words } else { 1 });
+        let gradients = plan.gradients()[6] * plan.width();
+        DeviceDecoder {
+            plan,
+            real: device.upload(&real),
+            padded: device.upload(&padded),
+            weights: device.scratch(plan.rows()[8] * plan.width()),
+            g_products: learned(chunk * 4 * plan.products()),
+            chunk,
+            capacity,
+            partial: learned(GROUPS * gradients),
+            summed: learned(gradients),
+        }
+    }
+
+    /// Makes the weights ready, as the CPU has them.
+    pub fn prepare(&self, device: &Device, flat: &Buffer) {
+        assert_eq!(flat.words(), self.plan.parts()[7]);
+        prepare::launch(
+            device.launch(),
+            groups(self.weights.words().div_ceil(tile::UNITS as usize)),
+            cubecl::prelude::CubeDim::new_1d(tile::UNITS),
+            flat.arg(),
+            self.real.arg(),
+            self.weights.arg(),
+            self.plan,
+        );
+    }
+
+    /// Colors of the samples worth one.
+    pub fn forward(
+        &self,
+        device: &Device,
+        grid: &DeviceGrid,
+        values: &Buffer,
+        rays: &Batch,
+        samples: &VmSamples,
+        along: &Along,
+    ) {
+        assert!(along.index.words() == self.capacity && values.words() == grid.len());
+        // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
+        unsafe {
+            forward::launch_unchecked(
+                device.launch(),
+                groups(self.capacity.div_ceil(4 * self.plan.lanes).min(8 * GROUPS)),
+                cubecl::prelude::CubeDim::new_1d(tile::UNITS),
+                self.weights.arg(),
+                values.arg(),
+                grid.words().arg(),
+                samples.place.arg(),
+                samples.ray.arg(),
+                rays.direction.arg(),
+                along.index.arg(),
+                along.count.arg(),
+                along.rgb.arg(),
+                self.plan,
+            );
+        }
+    }
+
+    /// Adds the gradient of planes and lines and writes that of the flat weights.
+    pub fn backward(
+        &self,
+        device: &Device,
+        grid: &DeviceGrid,
+        values: &Buffer,
+        rays: &Batch,
+        samples: &VmSamples,
+        along: &Along,
+        flat: &Buffer,
+        g_values: &Buffer,
+        g_flat: &Buffer,
+    ) {
+        assert!(along.index.words() == self.capacity && values.words() == grid.len());
+        let dim = cubecl::prelude::CubeDim::new_1d(tile::UNITS);
+        for from in (0..self.capacity).step_by(self.chunk) {
+            // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
+            unsafe {
+                backward::launch_unchecked(
+                    device.launch(),
+                    groups(self.summing()),
+                    dim,
+                    self.weights.arg(),
+                    values.arg(),
+                    grid.words().arg(),
+                    samples.place.arg(),
+                    samples.ray.arg(),
+                    rays.direction.arg(),
+                    along.index.arg(),
+                    along.count.arg(),
+                    along.g_pre.arg(),
+                    self.g_products.arg(),
+                    self.partial.arg(),
+                    from as u32,
+                    self.chunk as u32,
+                    self.plan,
+                );
+            }
+            let part = Some((&along.index, from, self.chunk));
+            let (place, count) = (&samples.place, &along.count);
+            grid.scatter(device, g_values, values, place, part, count, &self.g_products);
+        }
+        reduce::launch(
+            device.launch(),
+            groups(self.summed.words().div_ceil(tile::UNITS as usize)),
+            dim,
+            self.partial.arg(),
+            along.count.arg(),
+            self.summed.arg(),
+            4 * self.plan.lanes as u32,
+            self.summing() as u32,
+        );
+        chain::launch(
+            device.launch(),
+            groups(flat.words().div_ceil(tile::UNITS as usize)),
+            dim,
+            flat.arg(),
+            self.real.arg(),
+            self.padded.arg(),
+            self.summed.arg(),
+            g_flat.arg(),
+            self.plan,
+        );
+    }
+
+    fn summing(&self) -> usize {
+        GROUPS.min(self.chunk.div_ceil(4 * self.plan.lanes))
+    }
+}

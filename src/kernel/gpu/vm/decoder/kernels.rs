@@ -1,0 +1,448 @@
+//! What runs on the device: weights made ready, the layers forward and backward, gradients of the weights.
+
+use super::super::super::tile::{self, Block, at, gate, narrow, outer, product, put, sums, turned};
+use super::super::grid::{NONE, looked_up, term};
+use super::Plan;
+use cubecl::prelude::*;
+
+type F4 = Vector<f32, Const<4>>;
+
+/// `[M, W1_direction]` of hidden channel `h` and input `c`.
+#[cube]
+fn merged(flat: &[f32], real: &[u32], h: usize, c: usize, #[comptime] plan: Plan) -> f32 {
+    let parts = comptime!(plan.parts());
+    let (products, features) = comptime!((4 * plan.products(), plan.features));
+    let row = comptime!(parts[1]) + h * comptime!(features + 3);
+    let mut sum = 0.0f32;
+    if h < comptime!(plan.hidden) {
+        if c < products {
+            let own = real[c];
+            if own != NONE {
+                for f in 0..features {
+                    sum += flat[row + f] * flat[f * comptime!(plan.channels) + own as usize];
+                }
+            }
+        } else if c < comptime!(products + 3) {
+            sum = flat[row + features + c - products];
+        }
+    }
+    sum
+}
+
+/// A float of a matrix of `rows` times `columns` that begins at `start`, zero beside it.
+#[cube]
+fn beside(
+    flat: &[f32],
+    #[comptime] start: usize,
+    row: usize,
+    column: usize,
+    #[comptime] rows: usize,
+    #[comptime] columns: usize,
+) -> f32 {
+    let mut v = 0.0f32;
+    if row < rows && column < columns {
+        v = flat[start + row * columns + column];
+    }
+    v
+}
+
+/// Weights in the orders in which they are read.
+#[cube(launch)]
+pub(super) fn prepare(flat: &[f32], real: &[u32], out: &mut [f32], #[comptime] plan: Plan) {
+    let i = ABSOLUTE_POS;
+    if i < out.len() {
+        let rows = comptime!(plan.rows());
+        let parts = comptime!(plan.parts());
+        let (width, hidden) = comptime!((plan.width(), plan.hidden));
+        let (row, column) = (i / width, i % width);
+        out[i] = if row < comptime!(rows[1]) {
+            merged(flat, real, column, row, plan)
+        } else if row < comptime!(rows[2]) {
+            beside(flat, comptime!(parts[2]), 0usize, column, 1usize, hidden)
+        } else if row < comptime!(rows[3]) {
+            beside(flat, comptime!(parts[3]), column, row - comptime!(rows[2]), hidden, hidden)
+        } else if row < comptime!(rows[4]) {
+            beside(flat, comptime!(parts[4]), 0usize, column, 1usize, hidden)
+        } else if row < comptime!(rows[5]) {
+            beside(flat, comptime!(parts[5]), row - comptime!(rows[4]), column, 3usize, hidden)
+        } else if row < comptime!(rows[6]) {
+            beside(flat, comptime!(parts[6]), 0usize, column, 1usize, 3usize)
+        } else if row < comptime!(rows[7]) {
+            let own = row - comptime!(rows[6]);
+            merged(flat, real, own % width, own / width * width + column, plan)
+        } else {
+            beside(flat, comptime!(parts[3]), row - comptime!(rows[7]), column, hidden, hidden)
+        };
+    }
+}
+
+/// Four inputs of a sample worth a color: of a term's channels, or its direction.
+#[cube]
+fn input(
+    values: &[F4],
+    words: &[u32],
+    place: &[f32],
+    ray: &[u32],
+    direction: &[f32],
+    index: &[u32],
+    k: usize,
+    samples: usize,
+    quad: usize,
+    #[comptime] plan: Plan,
+) -> F4 {
+    let mut v = F4::new(0.0f32);
+    if k < samples {
+        let s = index[k] as usize;
+        #[unroll]
+        for i in 0..3usize {
+            let first = comptime!(plan.quads[..i].iter().sum::<usize>());
+            let own = comptime!(plan.quads[i]);
+            if comptime!(own > 0) && quad >= first && quad < comptime!(first + own) {
+                let t = term(words, place, s, i, own);
+                v = looked_up(values, &t, quad - first, own);
+            }
+        }
+        if quad == comptime!(plan.products()) {
+            let r = ray[s] as usize;
+            let rays = direction.len() / 3;
+            v.insert(0usize, direction[r]);
+            v.insert(1usize, direction[rays + r]);
+            v.insert(2usize, direction[2 * rays + r]);
+        }
+    }
+    v
+}
+
+/// Fills a tile with a piece of the inputs of the samples of `tile`.
+#[cube]
+fn inputs(
+    a: &mut [F4],
+    values: &[F4],
+    words: &[u32],
+    place: &[f32],
+    ray: &[u32],
+    direction: &[f32],
+    index: &[u32],
+    tile: usize,
+    samples: usize,
+    row: usize,
+    column: usize,
+    #[comptime] piece: usize,
+    #[comptime] plan: Plan,
+) {
+    let lanes = comptime!(plan.lanes);
+    let quad = comptime!(piece * tile::columns(lanes)) + column;
+    if quad < comptime!(plan.inputs() / 4) {
+        let k = 4 * (tile * lanes + row);
+        let own = Block::of(
+            input(values, words, place, ray, direction, index, k, samples, quad, plan),
+            input(values, words, place, ray, direction, index, k + 1, samples, quad, plan),
+            input(values, words, place, ray, direction, index, k + 2, samples, quad, plan),
+            input(values, words, place, ray, direction, index, k + 3, samples, quad, plan),
+        );
+        put(a, &turned(&own), row, column, lanes);
+    }
+}
+
+/// One channel of the bias of a thread's block.
+#[cube]
+fn spread(bias: F4, #[comptime] j: usize) -> F4 {
+    F4::new(bias.extract(j))
+}
+
+/// The first hidden layer; the tile is free afterwards.
+#[cube]
+fn first(
+    a: &mut [F4],
+    w: &[F4],
+    values: &[F4],
+    words: &[u32],
+    place: &[f32],
+    ray: &[u32],
+    direction: &[f32],
+    index: &[u32],
+    tile: usize,
+    samples: usize,
+    row: usize,
+    column: usize,
+    #[comptime] plan: Plan,
+) -> Block {
+    let lanes = comptime!(plan.lanes);
+    let rows = comptime!(plan.rows());
+    let bias = w[comptime!(rows[1] * tile::columns(lanes)) + column];
+    let mut c0 = spread(bias, 0usize);
+    let mut c1 = spread(bias, 1usize);
+    let mut c2 = spread(bias, 2usize);
+    let mut c3 = spread(bias, 3usize);
+    #[unroll]
+    for p in 0..comptime!(plan.pieces()) {
+        inputs(a, values, words, place, ray, direction, index, tile, samples, row, column, p, plan);
+        sync_cube();
+        let from = comptime!(p * plan.width());
+        let own = product(&*a, 0usize, w, from, comptime!(plan.piece(p)), row, column, lanes);
+        c0 += own.channel(0usize);
+        c1 += own.channel(1usize);
+        c2 += own.channel(2usize);
+        c3 += own.channel(3usize);
+        sync_cube();
+    }
+    tile::relu(&Block::of(c0, c1, c2, c3))
+}
+
+/// The second hidden layer of the first, a tile.
+#[cube]
+fn second(b: &[F4], w: &[F4], row: usize, column: usize, #[comptime] plan: Plan) -> Block {
+    let lanes = comptime!(plan.lanes);
+    let rows = comptime!(plan.rows());
+    let bias = w[comptime!(rows[3] * tile::columns(lanes)) + column];
+    let z = product(b, 0usize, w, comptime!(rows[2]), comptime!(plan.hidden), row, column, lanes);
+    tile::relu(&Block::of(
+        z.channel(0usize) + spread(bias, 0usize),
+        z.channel(1usize) + spread(bias, 1usize),
+        z.channel(2usize) + spread(bias, 2usize),
+        z.channel(3usize) + spread(bias, 3usize),
+    ))
+}
+
+/// Colors, planes `[3, capacity]`.
+#[cube(launch_unchecked)]
+pub(super) fn forward(
+    w: &[F4],
+    values: &[F4],
+    words: &[u32],
+    place: &[f32],
+    ray: &[u32],
+    direction: &[f32],
+    index: &[u32],
+    count: &[u32],
+    rgb: &mut [F4],
+    #[comptime] plan: Plan,
+) {
+    let (lanes, width) = comptime!((plan.lanes, plan.width()));
+    let rows = comptime!(plan.rows());
+    let columns = comptime!(tile::columns(lanes));
+    let (row, column) = (UNIT_POS as usize / columns, UNIT_POS as usize % columns);
+    let samples = count[0] as usize;
+    let mut a = Shared::<[F4]>::new_slice(comptime!(width * lanes));
+    let mut b = Shared::<[F4]>::new_slice(comptime!(width * lanes));
+    for tile in range_stepped(CUBE_POS, samples.div_ceil(comptime!(4 * lanes)), CUBE_COUNT) {
+        let h1 =
+            first(&mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan);
+        put(&mut b, &h1, row, column, lanes);
+        sync_cube();
+        let h2 = second(&b, w, row, column, plan);
+        put(&mut a, &h2, row, column, lanes);
+        sync_cube();
+        let v = narrow(&a, w, comptime!(rows[4]), row, column, 3usize, lanes);
+        if column < 3 {
+            let bias = w[comptime!(rows[5] * columns)];
+            let own = select(column == 0, bias.extract(0usize), bias.extract(1usize));
+            let own = select(column == 2, bias.extract(2usize), own);
+            rgb[column * (rgb.len() / 3) + tile * lanes + row] = tile::sigmoid(v + F4::new(own));
+        }
+        sync_cube();
+    }
+}
+
+/// What goes into the sigmoid of four samples' color `o`, as a gradient; 0 behind the last.
+#[cube]
+fn g_color(g_pre: &[F4], o: usize, here: usize, samples: usize) -> F4 {
+    let mut v = g_pre[o * (g_pre.len() / 3) + here];
+    #[unroll]
+    for i in 0..4usize {
+        if 4 * here + i >= samples {
+            v.insert(i, 0.0f32);
+        }
+    }
+    v
+}
+
+/// One channel of the gradient by the second hidden layer.
+#[cube]
+fn from_colors(g0: F4, g1: F4, g2: F4, w0: F4, w1: F4, w2: F4, #[comptime] j: usize) -> F4 {
+    g0 * spread(w0, j) + g1 * spread(w1, j) + g2 * spread(w2, j)
+}
+
+#[cube]
+fn add(gradient: &mut [f32], i: usize, v: f32, fresh: bool) {
+    gradient[i] = if fresh { v } else { gradient[i] + v };
+}
+
+/// Gradients by products of samples `from..from + limit`, `[limit, channels]`, and of the weights by group.
+#[cube(launch_unchecked)]
+pub(super) fn backward(
+    w: &[F4],
+    values: &[F4],
+    words: &[u32],
+    place: &[f32],
+    ray: &[u32],
+    direction: &[f32],
+    index: &[u32],
+    count: &[u32],
+    g_pre: &[F4],
+    g_products: &mut [F4],
+    partial: &mut [f32],
+    from: u32,
+    limit: u32,
+    #[comptime] plan: Plan,
+) {
+    let (lanes, width, hidden) = comptime!((plan.lanes, plan.width(), plan.hidden));
+    let (rows, own) = comptime!((plan.rows(), plan.gradients()));
+    let columns = comptime!(tile::columns(lanes));
+    let (row, column) = (UNIT_POS as usize / columns, UNIT_POS as usize % columns);
+    let samples = count[0] as usize;
+    let sum = CUBE_POS * comptime!(own[6] * width);
+    let mut a = Shared::<[F4]>::new_slice(comptime!(width * lanes));
+    let mut b = Shared::<[F4]>::new_slice(comptime!(width * lanes));
+    let start = from as usize / comptime!(4 * lanes);
+    let end = min(samples, from as usize + limit as usize).div_ceil(comptime!(4 * lanes));
+    for tile in range_stepped(start + CUBE_POS, end, CUBE_COUNT) {
+        let fresh = tile == CUBE_POS;
+        let here = tile * lanes + row;
+        let h1 =
+            first(&mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan);
+        put(&mut b, &h1, row, column, lanes);
+        sync_cube();
+        let h2 = second(&b, w, row, column, plan);
+        put(&mut a, &h2, row, column, lanes);
+        sync_cube();
+        // W3 and b3
+        let c = UNIT_POS as usize;
+        if c < hidden {
+            #[unroll]
+            for o in 0..3usize {
+                let mut s = 0.0f32;
+                for r in 0..lanes {
+                    s += a[at(c, r, lanes)].dot(g_color(g_pre, o, tile * lanes + r, samples));
+                }
+                add(partial, sum + comptime!((own[4] + o) * width) + c, s, fresh);
+            }
+        }
+        if c < 3 {
+            let mut s = F4::new(0.0f32);
+            for r in 0..lanes {
+                s += g_color(g_pre, c, tile * lanes + r, samples);
+            }
+            let all = s.extract(0usize) + s.extract(1usize) + (s.extract(2usize) + s.extract(3usize));
+            add(partial, sum + comptime!(own[5] * width) + c, all, fresh);
+        }
+        let g0 = g_color(g_pre, 0usize, here, samples);
+        let g1 = g_color(g_pre, 1usize, here, samples);
+        let g2 = g_color(g_pre, 2usize, here, samples);
+        let w0 = w[comptime!(rows[4] * columns) + column];
+        let w1 = w[comptime!((rows[4] + 1) * columns) + column];
+        let w2 = w[comptime!((rows[4] + 2) * columns) + column];
+        let g_h2 = Block::of(
+            from_colors(g0, g1, g2, w0, w1, w2, 0usize),
+            from_colors(g0, g1, g2, w0, w1, w2, 1usize),
+            from_colors(g0, g1, g2, w0, w1, w2, 2usize),
+            from_colors(g0, g1, g2, w0, w1, w2, 3usize),
+        );
+        let g_z2 = gate(&g_h2, &a, row, column, lanes);
+        sync_cube();
+        put(&mut a, &g_z2, row, column, lanes);
+        sync_cube();
+        let at_w2 = sum + comptime!(own[2] * width);
+        outer(&a, 0usize, &b, hidden, hidden, partial, at_w2, fresh, row, column, lanes);
+        sums(&a, 0usize, hidden, partial, sum + comptime!(own[3] * width), fresh, row, column, lanes);
+        let g_h1 = product(&a, 0usize, w, comptime!(rows[7]), hidden, row, column, lanes);
+        let g_z1 = gate(&g_h1, &b, row, column, lanes);
+        sync_cube();
+        put(&mut b, &g_z1, row, column, lanes);
+        sync_cube();
+        sums(&b, 0usize, hidden, partial, sum + comptime!(own[1] * width), fresh, row, column, lanes);
+        #[unroll]
+        for p in 0..comptime!(plan.pieces()) {
+            inputs(&mut a, values, words, place, ray, direction, index, tile, samples, row, column, p, plan);
+            sync_cube();
+            let at_m = sum + comptime!(p * width * width);
+            let n = comptime!(plan.piece(p));
+            outer(&b, 0usize, &a, hidden, n, partial, at_m, fresh, row, column, lanes);
+            if comptime!(p * columns < plan.products()) {
+                let from_m = comptime!(rows[6] + p * width);
+                let g = turned(&product(&b, 0usize, w, from_m, hidden, row, column, lanes));
+                let quad = comptime!(p * columns) + column;
+                let products = comptime!(plan.products());
+                if quad < products {
+                    let k = (4 * here - from as usize) * products + quad;
+                    #[unroll]
+                    for j in 0..4usize {
+                        g_products[k + j * products] = g.channel(j);
+                    }
+                }
+            }
+            sync_cube();
+        }
+    }
+}
+
+/// Sums of the groups' gradients, in the order of the groups.
+#[cube(launch)]
+pub(super) fn reduce(partial: &[f32], count: &[u32], summed: &mut [f32], tile: u32, groups: u32) {
+    let i = ABSOLUTE_POS;
+    let size = summed.len();
+    if i < size {
+        let tiles = count[0].div_ceil(tile);
+        let mut sum = 0.0f32;
+        for group in 0..min(tiles, groups) {
+            sum += partial[group as usize * size + i];
+        }
+        summed[i] = sum;
+    }
+}
+
+/// The gradient by `[M, W1_direction]` of hidden channel `h` and input `c`.
+#[cube]
+fn g_merged(summed: &[f32], h: usize, c: usize, #[comptime] width: usize) -> f32 {
+    summed[(c / width * width + h) * width + c % width]
+}
+
+/// Gradients of the flat weights.
+#[cube(launch)]
+pub(super) fn chain(
+    flat: &[f32],
+    real: &[u32],
+    padded: &[u32],
+    summed: &[f32],
+    g_flat: &mut [f32],
+    #[comptime] plan: Plan,
+) {
+    let i = ABSOLUTE_POS;
+    if i < g_flat.len() {
+        let (parts, own) = comptime!((plan.parts(), plan.gradients()));
+        let (width, hidden, features) = comptime!((plan.width(), plan.hidden, plan.features));
+        let (channels, products) = comptime!((plan.channels, 4 * plan.products()));
+        let inputs = comptime!(features + 3);
+        let mut g = 0.0f32;
+        if i < comptime!(parts[1]) {
+            let (f, c) = (i / channels, padded[i % channels] as usize);
+            for h in 0..hidden {
+                g += flat[comptime!(parts[1]) + h * inputs + f] * g_merged(summed, h, c, width);
+            }
+        } else if i < comptime!(parts[2]) {
+            let (h, f) = ((i - comptime!(parts[1])) / inputs, (i - comptime!(parts[1])) % inputs);
+            if f < features {
+                for c in 0..products {
+                    if real[c] != NONE {
+                        g += flat[f * channels + real[c] as usize] * g_merged(summed, h, c, width);
+                    }
+                }
+            } else {
+                g = g_merged(summed, h, products + f - features, width);
+            }
+        } else if i < comptime!(parts[3]) {
+            g = summed[comptime!(own[1] * width) + i - comptime!(parts[2])];
+        } else if i < comptime!(parts[4]) {
+            let k = i - comptime!(parts[3]);
+            g = summed[(comptime!(own[2]) + k / hidden) * width + k % hidden];
+        } else if i < comptime!(parts[5]) {
+            g = summed[comptime!(own[3] * width) + i - comptime!(parts[4])];
+        } else if i < comptime!(parts[6]) {
+            let k = i - comptime!(parts[5]);
+            g = summed[(comptime!(own[4]) + k / hidden) * width + k % hidden];
+        } else {
+            g = summed[comptime!(own[5] * width) + i - comptime!(parts[6])];
+        }
+        g_flat[i] = g;
+    }
+}

@@ -1,0 +1,508 @@
+//! Planes and lines on a device: lookups, gradients back onto them, and what is asked of them besides the photographs.
+
+use super::super::device::{Atomics, Buffer, Device, groups};
+use super::super::sum::{Exchange, Fixed, MOST, Native, Sum};
+use crate::kernel::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, Penalty, tv_factors};
+use cubecl::prelude::*;
+
+type F4 = Vector<f32, Const<4>>;
+
+const UNITS: u32 = 256;
+
+/// Groups of a launch whose threads take one item after the other.
+const GROUPS: usize = 4096;
+
+/// Groups that look for a bound.
+const BOUNDING: usize = 64;
+
+/// Words of a grid: vertices (3), where planes (3) and lines (3) begin, in vectors.
+const PLANES: usize = 3;
+const LINES: usize = 6;
+
+/// No channel of the CPU's.
+pub(super) const NONE: u32 = u32::MAX;
+
+/// Where a sample lies in a term's plane and line; vectors of four channels are counted.
+#[derive(CubeType)]
+pub(super) struct Term {
+    plane: usize,
+    pitch: usize,
+    line: usize,
+    x: f32,
+    y: f32,
+    z: f32,
+}
+
+/// A coordinate between two vertices.
+#[derive(CubeType)]
+struct Along {
+    below: usize,
+    frac: f32,
+}
+
+#[cube]
+fn along(words: &[u32], place: &[f32], plane: usize, s: usize, #[comptime] axis: usize) -> Along {
+    let v = place[axis * plane + s];
+    let below = min(u32::cast_from(v), words[axis] - 2);
+    Along { below: below as usize, frac: v - f32::cast_from(below) }
+}
+
+/// Sample `s` in term `i`.
+#[cube]
+pub(super) fn term(
+    words: &[u32],
+    place: &[f32],
+    s: usize,
+    #[comptime] i: usize,
+    #[comptime] quads: usize,
+) -> Term {
+    let plane = place.len() / 3;
+    let x = along(words, place, plane, s, comptime!(PLANE_AXES[i].0));
+    let y = along(words, place, plane, s, comptime!(PLANE_AXES[i].1));
+    let z = along(words, place, plane, s, comptime!(LINE_AXIS[i]));
+    let width = words[comptime!(PLANE_AXES[i].0)] as usize;
+    Term {
+        plane: words[comptime!(PLANES + i)] as usize + (y.below * width + x.below) * quads,
+        pitch: width * quads,
+        line: words[comptime!(LINES + i)] as usize + z.below * quads,
+        x: x.frac,
+        y: y.frac,
+        z: z.frac,
+    }
+}
+
+/// Plane times line of four channels.
+#[cube]
+pub(super) fn looked_up(values: &[F4], t: &Term, q: usize, #[comptime] quads: usize) -> F4 {
+    let p = t.plane + q;
+    let (x, y) = (t.x, t.y);
+    let (u, v) = (1.0f32 - x, 1.0f32 - y);
+    let below = values[p] * F4::new(u * v) + values[p + quads] * F4::new(x * v);
+    let above = values[p + t.pitch] * F4::new(u * y) + values[p + t.pitch + quads] * F4::new(x * y);
+    let low = values[t.line + q];
+    (below + above) * (low + (values[t.line + quads + q] - low) * F4::new(t.z))
+}
+
+/// Σ over terms and channels.
+#[cube(launch)]
+fn gather(
+    values: &[F4],
+    words: &[u32],
+    place: &[f32],
+    count: &[u32],
+    feature: &mut [f32],
+    #[comptime] quads: [usize; 3],
+) {
+    for s in range_stepped(ABSOLUTE_POS, count[0] as usize, CUBE_COUNT * UNITS as usize) {
+        let mut sum = 0.0f32;
+        #[unroll]
+        for i in 0..3usize {
+            if comptime!(quads[i] > 0) {
+                let t = term(words, place, s, i, comptime!(quads[i]));
+                for q in 0..comptime!(quads[i]) {
+                    let v = looked_up(values, &t, q, comptime!(quads[i]));
+                    sum += v.extract(0usize) + v.extract(1usize) + (v.extract(2usize) + v.extract(3usize));
+                }
+            }
+        }
+        feature[s] = sum;
+    }
+}
+
+/// How many samples from `from` on there are, at most `limit`.
+#[cube]
+fn rest(count: &[u32], from: u32, limit: u32) -> usize {
+    min(max(count[0], from) - from, limit) as usize
+}
+
+/// Adds gradients of samples to planes and lines. A thread takes a sample's channel.
+#[cube(launch)]
+fn scatter<S: Sum>(
+    gradient: &[Atomic<S::Word>],
+    values: &[f32],
+    words: &[u32],
+    place: &[f32],
+    index: &[u32],
+    count: &[u32],
+    g: &[f32],
+    units: &[f32],
+    from: u32,
+    limit: u32,
+    #[comptime] quads: [usize; 3],
+    #[comptime] by_channel: bool,
+) {
+    let channels = comptime!(4 * (quads[0] + quads[1] + quads[2]));
+    let all = rest(count, from, limit) * channels;
+    for item in range_stepped(ABSOLUTE_POS, all, CUBE_COUNT * UNITS as usize) {
+        let (n, c) = (item / channels, item % channels);
+        let s = if by_channel { index[from as usize + n] as usize } else { n };
+        let own = if by_channel { g[item] } else { g[n] };
+        // no need to spread what is exactly nothing
+        if own != 0.0f32 {
+            #[unroll]
+            for i in 0..3usize {
+                let first = comptime!(4 * quads[..i].iter().sum::<usize>());
+                let next = comptime!(4 * quads[i]);
+                if c >= first && c < comptime!(first + next) {
+                    let t = term(words, place, s, i, comptime!(quads[i]));
+                    let p = 4 * t.plane + c - first;
+                    let q = p + 4 * t.pitch;
+                    let l = 4 * t.line + c - first;
+                    let (u, v) = (1.0f32 - t.x, 1.0f32 - t.y);
+                    let (w0, w1, w2, w3) = (u * v, t.x * v, u * t.y, t.x * t.y);
+                    let plane =
+                        values[p] * w0 + values[p + next] * w1 + values[q] * w2 + values[q + next] * w3;
+                    let low = values[l];
+                    let line = (low + (values[l + next] - low) * t.z) * own;
+                    let plane = plane * own;
+                    S::add(&gradient[p], line * w0, units[0]);
+                    S::add(&gradient[p + next], line * w1, units[0]);
+                    S::add(&gradient[q], line * w2, units[0]);
+                    S::add(&gradient[q + next], line * w3, units[0]);
+                    S::add(&gradient[l], plane * (1.0f32 - t.z), units[1]);
+                    S::add(&gradient[l + next], plane * t.z, units[1]);
+                }
+            }
+        }
+    }
+}
+
+/// The largest of 256 and their sum, at unit 0.
+#[cube]
+fn reduced(shared: &mut [f32], own: f32, #[comptime] largest: bool) -> f32 {
+    sync_cube();
+    shared[UNIT_POS as usize] = own;
+    sync_cube();
+    let mut all = 0.0f32;
+    if UNIT_POS == 0 {
+        for i in 0..UNITS as usize {
+            all = if largest { max(all, shared[i]) } else { all + shared[i] };
+        }
+    }
+    all
+}
+
+/// By group: the sum of samples' largest gradients, the largest value of the planes and that of the lines.
+#[cube(launch)]
+fn bound(
+    values: &[f32],
+    words: &[u32],
+    count: &[u32],
+    g: &[f32],
+    partial: &mut [f32],
+    from: u32,
+    limit: u32,
+    #[comptime] width: usize,
+) {
+    let mut sum = 0.0f32;
+    for n in range_stepped(ABSOLUTE_POS, rest(count, from, limit), CUBE_COUNT * UNITS as usize) {
+        let mut most = 0.0f32;
+        for c in 0..width {
+            most = max(most, g[n * width + c].abs());
+        }
+        sum += most;
+    }
+    let mut plane = 0.0f32;
+    let mut line = 0.0f32;
+    let lines = 4 * words[LINES] as usize;
+    for i in range_stepped(ABSOLUTE_POS, values.len(), CUBE_COUNT * UNITS as usize) {
+        let v = values[i].abs();
+        plane = max(plane, select(i < lines, v, 0.0f32));
+        line = max(line, select(i < lines, 0.0f32, v));
+    }
+    let mut shared = Shared::<[f32]>::new_slice(UNITS as usize);
+    let sum = reduced(&mut shared, sum, false);
+    let plane = reduced(&mut shared, plane, true);
+    let line = reduced(&mut shared, line, true);
+    if UNIT_POS == 0 {
+        partial[CUBE_POS] = sum;
+        partial[BOUNDING + CUBE_POS] = plane;
+        partial[2 * BOUNDING + CUBE_POS] = line;
+    }
+}
+
+/// Steps per 1 in which sums are counted: of planes, whose gradients are times lines, and of lines.
+#[cube(launch)]
+fn units_of(partial: &[f32], units: &mut [f32]) {
+    if ABSOLUTE_POS == 0 {
+        let mut sum = 0.0f32;
+        let mut plane = 0.0f32;
+        let mut line = 0.0f32;
+        for i in 0..BOUNDING {
+            sum += partial[i];
+            plane = max(plane, partial[BOUNDING + i]);
+            line = max(line, partial[2 * BOUNDING + i]);
+        }
+        units[0] = MOST / max(sum * line, 1e-30f32);
+        units[1] = MOST / max(sum * plane, 1e-30f32);
+    }
+}
+
+/// Whole numbers become floats, added to the gradient, and zero.
+#[cube(launch)]
+fn settle(whole: &mut [i32], words: &[u32], units: &[f32], gradient: &mut [f32]) {
+    let i = ABSOLUTE_POS;
+    if i < whole.len() {
+        let unit = select(i < 4 * words[LINES] as usize, units[0], units[1]);
+        gradient[i] += f32::cast_from(whole[i]) / unit;
+        whole[i] = 0;
+    }
+}
+
+/// −1, 0 or 1.
+#[cube]
+fn sign(x: f32) -> f32 {
+    select(x > 0.0f32, 1.0f32, select(x < 0.0f32, -1.0f32, 0.0f32))
+}
+
+/// Adds the gradients of total variation and L1; factors are those of each plane's rows and columns, and of each plane's
+/// and line's L1.
+#[cube(launch)]
+fn penalize(
+    values: &[f32],
+    words: &[u32],
+    factors: &[f32],
+    gradient: &mut [f32],
+    tv: f32,
+    l1: f32,
+    #[comptime] quads: [usize; 3],
+) {
+    let at = ABSOLUTE_POS;
+    if at < values.len() {
+        let x = values[at];
+        let mut g = 0.0f32;
+        #[unroll]
+        for i in 0..3usize {
+            let n = comptime!(4 * quads[i]);
+            let width = words[comptime!(PLANE_AXES[i].0)] as usize;
+            let height = words[comptime!(PLANE_AXES[i].1)] as usize;
+            let first = 4 * words[comptime!(PLANES + i)] as usize;
+            let pitch = width * n;
+            if comptime!(n > 0) && at >= first && at < first + height * pitch {
+                let (row, column) = ((at - first) / pitch, (at - first) % pitch);
+                let mut rows = 0.0f32;
+                let mut columns = 0.0f32;
+                if row > 0 {
+                    rows += x - values[at - pitch];
+                }
+                if row + 1 < height {
+                    rows += x - values[at + pitch];
+                }
+                if column >= n {
+                    columns += x - values[at - n];
+                }
+                if column + n < pitch {
+                    columns += x - values[at + n];
+                }
+                g = (factors[i] * rows + factors[3 + i] * columns) * tv + factors[6 + i] * l1 * sign(x);
+            }
+            let first = 4 * words[comptime!(LINES + i)] as usize;
+            let vertices = words[comptime!(LINE_AXIS[i])] as usize;
+            if comptime!(n > 0) && at >= first && at < first + vertices * n {
+                g = factors[9 + i] * l1 * sign(x);
+            }
+        }
+        gradient[at] += g;
+    }
+}
+
+/// Planes and lines of a grid on a device. Channels of each term are filled up with zeros to vectors of four; they stay
+/// zero.
+pub struct DeviceGrid {
+    grid: Grid,
+    padded: Grid,
+    words: Buffer,
+    factors: Buffer,
+    units: Buffer,
+    partial: Buffer,
+    whole: Option<Buffer>,
+}
+
+impl DeviceGrid {
+    /// Of a grid.
+    pub fn new(device: &Device, grid: Grid) -> DeviceGrid {
+        let padded = Grid { rank: grid.rank.map(|r| r.next_multiple_of(4)), ..grid };
+        let vectors = |f: Factor| (f.start / 4) as u32;
+        let mut words: Vec<u32> = grid.size.map(|n| n as u32).to_vec();
+        words.extend((0..3).map(|i| vectors(padded.plane(i))));
+        words.extend((0..3).map(|i| vectors(padded.line(i))));
+        let tv = [0, 1, 2].map(|i| tv_factors(&grid.plane(i)).map(|k| (2.0 * k) as f32));
+        let one = |f: Factor| 1.0 / f.len().max(1) as f32;
+        let mut factors = [tv.map(|k| k[0]), tv.map(|k| k[1])].concat();
+        factors.extend((0..3).map(|i| one(grid.plane(i))).chain((0..3).map(|i| one(grid.line(i)))));
+        let fixed = device.atomics() == Atomics::Fixed;
+        DeviceGrid {
+            grid,
+            padded,
+            words: device.upload(&words),
+            factors: device.upload(&factors),
+            units: device.zeros(2),
+            partial: device.scratch(3 * BOUNDING),
+            whole: fixed.then(|| device.zeros(padded.len())),
+        }
+    }
+
+    /// Floats on the device.
+    pub fn len(&self) -> usize {
+        self.padded.len()
+    }
+
+    /// Has it no channel at all?
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Vectors of each term.
+    pub(super) fn quads(&self) -> [usize; 3] {
+        self.padded.rank.map(|r| r / 4)
+    }
+
+    /// Where things lie: an argument of kernels that look up.
+    pub(super) fn words(&self) -> &Buffer {
+        &self.words
+    }
+
+    /// The CPU's channel of each on the device, [`NONE`] for those that fill up.
+    pub(super) fn channels(&self) -> Vec<u32> {
+        let mut before = 0;
+        let mut out = Vec::new();
+        for (own, all) in self.grid.rank.into_iter().zip(self.padded.rank) {
+            out.extend((0..all).map(|c| if c < own { (before + c) as u32 } else { NONE }));
+            before += own;
+        }
+        out
+    }
+
+    /// Pairs of factors: the CPU's, the device's.
+    fn pairs(&self) -> impl Iterator<Item = (Factor, Factor)> {
+        let (a, b) = (self.grid, self.padded);
+        let planes = (0..3).map(move |i| (a.plane(i), b.plane(i)));
+        planes.chain((0..3).map(move |i| (a.line(i), b.line(i))))
+    }
+
+    /// Copies planes and lines as the CPU has them to the device.
+    pub fn upload(&self, device: &Device, values: &[f32]) -> Buffer {
+        assert_eq!(values.len(), self.grid.len());
+        if self.grid == self.padded {
+            return device.upload(values);
+        }
+        let mut out = vec![0f32; self.padded.len()];
+        for (a, b) in self.pairs().filter(|(a, _)| !a.is_empty()) {
+            let rows = values[a.range()].chunks(a.channels).zip(out[b.range()].chunks_mut(b.channels));
+            rows.for_each(|(from, to)| to[..a.channels].copy_from_slice(from));
+        }
+        device.upload(&out)
+    }
+
+    /// Copies them back.
+    pub fn read(&self, device: &Device, buffer: &Buffer) -> Vec<f32> {
+        let values = device.read::<f32>(buffer);
+        if self.grid == self.padded {
+            return values;
+        }
+        let mut out = Vec::with_capacity(self.grid.len());
+        for (a, b) in self.pairs().filter(|(a, _)| !a.is_empty()) {
+            values[b.range()].chunks(b.channels).for_each(|row| out.extend_from_slice(&row[..a.channels]));
+        }
+        out
+    }
+
+    /// Features of samples, `[capacity]`: the sum over terms and channels. place: planes `[3, capacity]`.
+    pub fn gather(&self, device: &Device, values: &Buffer, place: &Buffer, count: &Buffer, feature: &Buffer) {
+        assert!(values.words() == self.len() && place.words() == 3 * feature.words());
+        gather::launch(
+            device.launch(),
+            groups(feature.words().div_ceil(UNITS as usize).min(GROUPS)),
+            CubeDim::new_1d(UNITS),
+            values.arg(),
+            self.words.arg(),
+            place.arg(),
+            count.arg(),
+            feature.arg(),
+            self.quads(),
+        );
+    }
+
+    /// Adds to the gradient what samples say. Without `index`, `g` is `[capacity]`, by the features of
+    /// [`DeviceGrid::gather`]. With it, `g` is `[limit, channels]`, by the products of plane and line of samples
+    /// `index[from..from + limit]`.
+    pub fn scatter(
+        &self,
+        device: &Device,
+        gradient: &Buffer,
+        values: &Buffer,
+        place: &Buffer,
+        index: Option<(&Buffer, usize, usize)>,
+        count: &Buffer,
+        g: &Buffer,
+    ) {
+        assert!(gradient.words() == self.len() && values.words() == self.len());
+        let channels = self.padded.channels();
+        let (list, from, limit) = index.unwrap_or((count, 0, g.words()));
+        let dim = CubeDim::new_1d(UNITS);
+        if self.whole.is_some() {
+            bound::launch(
+                device.launch(),
+                groups(BOUNDING),
+                dim,
+                values.arg(),
+                self.words.arg(),
+                count.arg(),
+                g.arg(),
+                self.partial.arg(),
+                from as u32,
+                limit as u32,
+                if index.is_some() { channels } else { 1 },
+            );
+            let one = CubeCount::new_single();
+            units_of::launch(device.launch(), one, CubeDim::new_1d(1), self.partial.arg(), self.units.arg());
+        }
+        let launch = match device.atomics() {
+            Atomics::Native => scatter::launch::<Native>,
+            Atomics::Exchange => scatter::launch::<Exchange>,
+            Atomics::Fixed => scatter::launch::<Fixed>,
+        };
+        launch(
+            device.launch(),
+            groups((limit * channels).div_ceil(UNITS as usize).min(GROUPS)),
+            dim,
+            self.whole.as_ref().unwrap_or(gradient).arg(),
+            values.arg(),
+            self.words.arg(),
+            place.arg(),
+            list.arg(),
+            count.arg(),
+            g.arg(),
+            self.units.arg(),
+            from as u32,
+            limit as u32,
+            self.quads(),
+            index.is_some(),
+        );
+        if let Some(whole) = &self.whole {
+            let count = groups(self.len().div_ceil(UNITS as usize));
+            let (words, units) = (self.words.arg(), self.units.arg());
+            settle::launch(device.launch(), count, dim, whole.arg(), words, units, gradient.arg());
+        }
+    }
+
+    /// Adds the gradients of total variation and L1; lines are not asked to be orthogonal.
+    pub fn penalize(&self, device: &Device, values: &Buffer, penalty: &Penalty, gradient: &Buffer) {
+        assert_eq!(penalty.ortho, 0.0, "a device knows no orthogonality");
+        if penalty.is_zero() {
+            return;
+        }
+        penalize::launch(
+            device.launch(),
+            groups(self.len().div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            values.arg(),
+            self.words.arg(),
+            self.factors.arg(),
+            gradient.arg(),
+            penalty.tv,
+            penalty.l1,
+            self.quads(),
+        );
+    }
+}

@@ -1,0 +1,275 @@
+//! The lattice points of rays inside a box and a mask: see [`crate::kernel::vm::mask::Walk`], whose rule this is.
+
+use super::super::device::{Buffer, Device, groups};
+use super::super::draw::Batch;
+use super::super::march::{bit, prefix_sum};
+use super::super::occupancy::words;
+use crate::kernel::vm::VmField;
+use crate::kernel::vm::mask::BLOCK;
+use cubecl::prelude::*;
+
+const UNITS: u32 = 256;
+
+/// Further than anything.
+const FAR: f32 = 1e30;
+
+/// Numbers of a lattice: box (6), step, near, far; corner of the mask (3), its cells in a unit of length (3).
+const STEP: usize = 6;
+const MASK: usize = 9;
+const SCALE: usize = 12;
+
+/// Whole numbers of a lattice: samples of a ray; vertices (3); cells of the mask (3); blocks (3).
+const VERTICES: usize = 1;
+const CELLS: usize = 4;
+const BLOCKS: usize = 7;
+
+/// Where a ray enters and leaves the box.
+#[derive(CubeType)]
+struct Span {
+    enter: f32,
+    leave: f32,
+}
+
+/// Along one more axis; a direction of zero counts as 1e-6, as published.
+#[cube]
+fn crossed(span: Span, o: f32, d: f32, low: f32, high: f32) -> Span {
+    let d = select(d == 0.0f32, 1e-6f32, d);
+    let (p, q) = ((low - o) / d, (high - o) / d);
+    Span { enter: max(span.enter, min(p, q)), leave: min(span.leave, max(p, q)) }
+}
+
+/// Is `v` further outside than rounding may put it?
+#[cube]
+fn outside(v: f32, low: f32, high: f32, slack: f32) -> bool {
+    !(v >= low - slack && v <= high + slack)
+}
+
+/// The cell of a coordinate that counts cells.
+#[cube]
+fn cell(g: f32, cells: u32) -> u32 {
+    min(u32::cast_from(max(g, 0.0f32)), cells - 1)
+}
+
+/// How far it is to the border of a cell, or of its block, in `t`.
+#[cube]
+fn border(g: f32, cell: u32, cells: u32, d: f32, scale: f32, empty: bool) -> f32 {
+    let ahead = select(d > 0.0f32, 1u32, 0u32);
+    let block = cell / comptime!(BLOCK as u32);
+    let wall = select(empty, min((block + ahead) * comptime!(BLOCK as u32), cells), cell + ahead);
+    select(d == 0.0f32, FAR, (f32::cast_from(wall) - g) * (1.0f32 / (d * scale)))
+}
+
+/// Where a coordinate lies among the vertices of the grid.
+#[cube]
+fn place_of(p: f32, low: f32, high: f32, vertices: u32) -> f32 {
+    let last = f32::cast_from(vertices - 1);
+    clamp((p - low) / (high - low) * last, 0.0f32, last)
+}
+
+/// Counts a ray's samples or, once it is known where they lie, writes them.
+#[cube(launch)]
+fn pass(
+    lattice: &[f32],
+    sizes: &[u32],
+    bits: &[u32],
+    blocks: &[u32],
+    origin: &[f32],
+    direction: &[f32],
+    jitter: &[f32],
+    alive: &[u32],
+    offsets: &[u32],
+    counts: &mut [u32],
+    points: &mut [u32],
+    t: &mut [f32],
+    ray: &mut [u32],
+    place: &mut [f32],
+    #[comptime] masked: bool,
+    #[comptime] writes: bool,
+) {
+    let rays = jitter.len();
+    let plane = t.len();
+    let r = ABSOLUTE_POS;
+    if r < rays {
+        let (ox, oy, oz) = (origin[r], origin[rays + r], origin[2 * rays + r]);
+        let (dx, dy, dz) = (direction[r], direction[rays + r], direction[2 * rays + r]);
+        let (lx, ly, lz) = (lattice[0], lattice[1], lattice[2]);
+        let (hx, hy, hz) = (lattice[3], lattice[4], lattice[5]);
+        let step = lattice[STEP];
+        let span = crossed(Span { enter: -FAR, leave: FAR }, ox, dx, lx, hx);
+        let span = crossed(span, oy, dy, ly, hy);
+        let span = crossed(span, oz, dz, lz, hz);
+        let entry = clamp(span.enter, lattice[STEP + 1], lattice[STEP + 2]);
+        let start = entry + jitter[r] * step;
+        let meets = span.enter <= span.leave && alive[r] == 1;
+        let end = select(meets, sizes[0] - 1, 0u32);
+        let (sx, sy, sz) = (1e-6f32 * (hx - lx), 1e-6f32 * (hy - ly), 1e-6f32 * (hz - lz));
+        let mut first = 0usize;
+        let mut most = end;
+        if writes {
+            first = offsets[r] as usize;
+            most = offsets[r + 1] - offsets[r];
+        } else {
+            let inside = max((span.leave - entry) / step, 0.0f32);
+            points[r] = select(meets, min(u32::cast_from(min(inside, 1e9f32)) + 1, sizes[0]), 0u32);
+        }
+        let mut found = 0u32;
+        let mut k = 0u32;
+        let mut marching = k < end && found < most;
+        while marching {
+            // computed, never accumulated
+            let at = start + step * f32::cast_from(k);
+            let (px, py, pz) = (ox + at * dx, oy + at * dy, oz + at * dz);
+            // the border itself belongs to the box, and rounding may put a sample just outside
+            let beside = outside(px, lx, hx, sx) || outside(py, ly, hy, sy) || outside(pz, lz, hz, sz);
+            let mut kept = !beside;
+            let mut skip = 1u32;
+            if masked {
+                let (nx, ny, nz) = (sizes[CELLS], sizes[CELLS + 1], sizes[CELLS + 2]);
+                let (ux, uy, uz) = (lattice[SCALE], lattice[SCALE + 1], lattice[SCALE + 2]);
+                let gx = (px - lattice[MASK]) * ux;
+                let gy = (py - lattice[MASK + 1]) * uy;
+                let gz = (pz - lattice[MASK + 2]) * uz;
+                let beyond = outside(gx, 0.0f32, f32::cast_from(nx), 1e-3f32)
+                    || outside(gy, 0.0f32, f32::cast_from(ny), 1e-3f32)
+                    || outside(gz, 0.0f32, f32::cast_from(nz), 1e-3f32);
+                kept = !beside && !beyond;
+                if kept {
+                    let (cx, cy, cz) = (cell(gx, nx), cell(gy, ny), cell(gz, nz));
+                    if !bit(bits, (cx * ny + cy) * nz + cz) {
+                        kept = false;
+                        // on to the border of the empty cell, or of its block if that is empty too; by whole steps
+                        let size = comptime!(BLOCK as u32);
+                        let b = (cx / size * sizes[BLOCKS + 1] + cy / size) * sizes[BLOCKS + 2] + cz / size;
+                        let empty = !bit(blocks, b);
+                        let far = min(
+                            border(gx, cx, nx, dx, ux, empty),
+                            min(border(gy, cy, ny, dy, uy, empty), border(gz, cz, nz, dz, uz, empty)),
+                        );
+                        // a hair less, so that rounding cannot jump over a sample in the next cell
+                        let whole = (max(far, 0.0f32) / step - 1e-3f32).ceil();
+                        skip = u32::cast_from(clamp(whole, 1.0f32, 1e9f32));
+                    }
+                }
+            }
+            if at > span.leave + step {
+                marching = false;
+            } else {
+                if kept {
+                    if writes {
+                        let s = first + found as usize;
+                        t[s] = at;
+                        ray[s] = r as u32;
+                        place[s] = place_of(px, lx, hx, sizes[VERTICES]);
+                        place[plane + s] = place_of(py, ly, hy, sizes[VERTICES + 1]);
+                        place[2 * plane + s] = place_of(pz, lz, hz, sizes[VERTICES + 2]);
+                    }
+                    found += 1;
+                }
+                k += skip;
+                marching = k < end && found < most;
+            }
+        }
+        if !writes {
+            counts[r] = found;
+        }
+    }
+}
+
+/// The lattice of a field on a device.
+pub struct DeviceLattice {
+    lattice: Buffer,
+    sizes: Buffer,
+    mask: Option<[Buffer; 2]>,
+    /// The most samples that a ray can have.
+    pub most: usize,
+}
+
+impl DeviceLattice {
+    /// Of a field.
+    pub fn new(device: &Device, field: &VmField) -> DeviceLattice {
+        let l = &field.lattice;
+        assert!(l.step.is_finite() && l.step > 0.0);
+        let mut numbers = [l.min.as_slice(), &l.max, &[l.step, l.near, l.far]].concat();
+        let mut sizes = vec![l.samples.max(1) as u32];
+        sizes.extend(field.density.size.map(|n| n as u32));
+        let mask = field.mask.as_ref().map(|mask| {
+            let ((low, high), cells) = (mask.bounds(), mask.size());
+            numbers.extend(low);
+            numbers.extend((0..3).map(|a| cells[a] as f32 / (high[a] - low[a])));
+            sizes.extend(cells.map(|n| n as u32));
+            sizes.extend(cells.map(|n| n.div_ceil(BLOCK) as u32));
+            [mask.bits(), mask.blocks()].map(|bits| device.upload(&words(bits)))
+        });
+        // as many as the diagonal has, and those that rounding adds
+        let diagonal = (0..3).map(|a| (l.max[a] - l.min[a]).powi(2)).sum::<f32>().sqrt();
+        let most = l.samples.saturating_sub(1).min((diagonal / l.step) as usize + 3).max(1);
+        DeviceLattice { lattice: device.upload(&numbers), sizes: device.upload(&sizes), mask, most }
+    }
+}
+
+/// The samples of a batch of rays.
+pub struct VmSamples {
+    /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
+    pub offsets: Buffer,
+    /// `[2]`: how many there are, twice.
+    pub count: Buffer,
+    /// `[capacity]`, lattice points in `t`.
+    pub t: Buffer,
+    /// `[capacity]`, their rays.
+    pub ray: Buffer,
+    /// Planes `[3, capacity]`: where they lie among the vertices of the grid, within the outer ones.
+    pub place: Buffer,
+    /// `[rays]`: lattice points inside the box, were nothing skipped.
+    pub points: Buffer,
+    counts: Buffer,
+}
+
+impl VmSamples {
+    /// Room for so many rays and `capacity` samples.
+    pub fn new(device: &Device, rays: usize, capacity: usize) -> VmSamples {
+        VmSamples {
+            offsets: device.zeros(rays + 1),
+            count: device.zeros(2),
+            t: device.scratch(capacity),
+            ray: device.scratch(capacity),
+            place: device.scratch(3 * capacity),
+            points: device.zeros(rays),
+            counts: device.zeros(rays),
+        }
+    }
+
+    /// Finds the samples of rays.
+    pub fn march(&self, device: &Device, lattice: &DeviceLattice, rays: &Batch) {
+        assert_eq!(rays.rays(), self.counts.words());
+        let [bits, blocks] = match &lattice.mask {
+            Some(own) => own.each_ref(),
+            None => [&lattice.sizes; 2],
+        };
+        let both = |writes: bool| {
+            pass::launch(
+                device.launch(),
+                groups(rays.jitter.words().div_ceil(UNITS as usize)),
+                CubeDim::new_1d(UNITS),
+                lattice.lattice.arg(),
+                lattice.sizes.arg(),
+                bits.arg(),
+                blocks.arg(),
+                rays.origin.arg(),
+                rays.direction.arg(),
+                rays.jitter.arg(),
+                rays.alive.arg(),
+                self.offsets.arg(),
+                self.counts.arg(),
+                self.points.arg(),
+                self.t.arg(),
+                self.ray.arg(),
+                self.place.arg(),
+                lattice.mask.is_some(),
+                writes,
+            );
+        };
+        both(false);
+        prefix_sum(device, &self.counts, &self.offsets, &self.count, self.t.words());
+        both(true);
+    }
+}

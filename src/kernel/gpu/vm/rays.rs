@@ -1,0 +1,312 @@
+//! From features to weights, and compositing: see `render` of [`crate::kernel::vm`], whose module holds the formulas. A
+//! thread takes a ray.
+
+use super::super::device::{Buffer, Device, groups};
+use super::super::march::prefix_sum;
+use super::march::VmSamples;
+use crate::kernel::vm::{RAY_WIDTH, VmField};
+use cubecl::prelude::*;
+
+const UNITS: u32 = 64;
+
+#[cube]
+fn sigmoid(v: f32) -> f32 {
+    1.0f32 / (1.0f32 + (-v).exp())
+}
+
+/// Weights of samples until a ray's light is used up, and how many of them are worth a color.
+#[cube(launch)]
+fn weigh(
+    offsets: &[u32],
+    feature: &[f32],
+    alpha: &mut [f32],
+    light: &mut [f32],
+    weight: &mut [f32],
+    ends: &mut [u32],
+    counts: &mut [u32],
+    shift: f32,
+    length: f32,
+    threshold: f32,
+    stop: f32,
+    #[comptime] softplus: bool,
+) {
+    let r = ABSOLUTE_POS;
+    if r < ends.len() {
+        let mut transmittance = 1.0f32;
+        let mut worth = 0u32;
+        let mut s = offsets[r] as usize;
+        let end = offsets[r + 1] as usize;
+        let mut seen = s < end;
+        while seen {
+            let x = feature[s] + shift;
+            let density = if softplus {
+                max(x, 0.0f32) + (1.0f32 + (-x.abs()).exp()).ln()
+            } else {
+                max(feature[s], 0.0f32)
+            };
+            let own = 1.0f32 - (-density * length).exp();
+            let w = own * transmittance;
+            alpha[s] = own;
+            light[s] = transmittance;
+            weight[s] = w;
+            worth += select(w > threshold, 1u32, 0u32);
+            transmittance *= 1.0f32 - own + 1e-10f32;
+            s += 1;
+            let dark = own > 0.0f32 && transmittance <= stop;
+            seen = s < end && !dark;
+        }
+        ends[r] = s as u32;
+        counts[r] = worth;
+    }
+}
+
+/// The samples worth a color, one after the other.
+#[cube(launch)]
+fn list(offsets: &[u32], ends: &[u32], weight: &[f32], firsts: &[u32], index: &mut [u32], threshold: f32) {
+    let r = ABSOLUTE_POS;
+    if r < ends.len() {
+        let mut next = firsts[r] as usize;
+        for s in (offsets[r] as usize)..(ends[r] as usize) {
+            if weight[s] > threshold {
+                index[next] = s as u32;
+                next += 1;
+            }
+        }
+    }
+}
+
+/// Composites.
+#[cube(launch)]
+fn composite(
+    offsets: &[u32],
+    ends: &[u32],
+    firsts: &[u32],
+    t: &[f32],
+    weight: &[f32],
+    rgb: &[f32],
+    out: &mut [f32],
+    threshold: f32,
+) {
+    let r = ABSOLUTE_POS;
+    let rays = ends.len();
+    if r < rays {
+        let plane = rgb.len() / 3;
+        let mut next = firsts[r] as usize;
+        let mut red = 0.0f32;
+        let mut green = 0.0f32;
+        let mut blue = 0.0f32;
+        let mut opacity = 0.0f32;
+        let mut depth = 0.0f32;
+        for s in (offsets[r] as usize)..(ends[r] as usize) {
+            let w = weight[s];
+            if w > threshold {
+                red += w * rgb[next];
+                green += w * rgb[plane + next];
+                blue += w * rgb[2 * plane + next];
+                next += 1;
+            }
+            opacity += w;
+            depth += w * t[s];
+        }
+        out[r] = red;
+        out[rays + r] = green;
+        out[2 * rays + r] = blue;
+        out[3 * rays + r] = opacity;
+        out[4 * rays + r] = depth;
+    }
+}
+
+/// Gradients by features, and by what goes into the colors' sigmoids.
+#[cube(launch)]
+fn backward(
+    offsets: &[u32],
+    ends: &[u32],
+    firsts: &[u32],
+    t: &[f32],
+    feature: &[f32],
+    alpha: &[f32],
+    light: &[f32],
+    weight: &[f32],
+    rgb: &[f32],
+    g_out: &[f32],
+    g_feature: &mut [f32],
+    g_pre: &mut [f32],
+    shift: f32,
+    length: f32,
+    threshold: f32,
+    #[comptime] softplus: bool,
+) {
+    let r = ABSOLUTE_POS;
+    let rays = ends.len();
+    if r < rays {
+        let plane = rgb.len() / 3;
+        let (g0, g1, g2) = (g_out[r], g_out[rays + r], g_out[2 * rays + r]);
+        let (g3, g4) = (g_out[3 * rays + r], g_out[4 * rays + r]);
+        let (begin, end) = (offsets[r] as usize, ends[r] as usize);
+        for s in end..(offsets[r + 1] as usize) {
+            g_feature[s] = 0.0f32;
+        }
+        let mut next = firsts[r + 1] as usize;
+        let mut behind = 0.0f32; // Σ_{j>k} w_j dL/dw_j
+        for k in 0..end - begin {
+            let s = end - 1 - k;
+            let w = weight[s];
+            let mut g_w = g3 + g4 * t[s];
+            if w > threshold {
+                next -= 1;
+                let (c0, c1, c2) = (rgb[next], rgb[plane + next], rgb[2 * plane + next]);
+                g_w += g0 * c0 + g1 * c1 + g2 * c2;
+                g_pre[next] = w * g0 * c0 * (1.0f32 - c0);
+                g_pre[plane + next] = w * g1 * c1 * (1.0f32 - c1);
+                g_pre[2 * plane + next] = w * g2 * c2 * (1.0f32 - c2);
+            }
+            let open = 1.0f32 - alpha[s];
+            let g_alpha = light[s] * g_w - behind / (open + 1e-10f32);
+            // dα/dσ = (1 − α) δ s
+            let mut slope = select(feature[s] > 0.0f32, 1.0f32, 0.0f32);
+            if softplus {
+                slope = sigmoid(feature[s] + shift);
+            }
+            g_feature[s] = g_alpha * open * length * slope;
+            behind += w * g_w;
+        }
+    }
+}
+
+/// What lies along the rays of a batch.
+pub struct Along {
+    /// `[capacity]`, samples' features.
+    pub feature: Buffer,
+    /// `[capacity]`, gradients by them.
+    pub g_feature: Buffer,
+    /// `[2]`, samples worth a color, twice.
+    pub count: Buffer,
+    /// `[capacity]`, which they are.
+    pub index: Buffer,
+    /// Planes `[3, capacity]`, their colors.
+    pub rgb: Buffer,
+    /// Planes `[3, capacity]`, gradients by what goes into their sigmoids.
+    pub g_pre: Buffer,
+    /// Planes `[5, rays]`: see [`RAY_WIDTH`].
+    pub out: Buffer,
+    alpha: Buffer,
+    light: Buffer,
+    weight: Buffer,
+    ends: Buffer,
+    counts: Buffer,
+    firsts: Buffer,
+    shift: f32,
+    length: f32,
+    threshold: f32,
+    stop: f32,
+    softplus: bool,
+}
+
+impl Along {
+    /// Of so many rays and up to `capacity` samples of a field; with room for gradients where it learns.
+    pub fn new(device: &Device, field: &VmField, rays: usize, capacity: usize, learns: bool) -> Along {
+        let s = &field.shading;
+        let samples = |planes: usize| device.scratch(planes * capacity);
+        let gradients = |planes: usize| device.scratch(if learns { planes * capacity } else { 1 });
+        Along {
+            feature: samples(1),
+            g_feature: gradients(1),
+            count: device.zeros(2),
+            index: samples(1),
+            rgb: samples(3),
+            g_pre: gradients(3),
+            out: device.scratch(RAY_WIDTH * rays),
+            alpha: samples(1),
+            light: samples(1),
+            weight: samples(1),
+            ends: device.scratch(rays),
+            counts: device.scratch(rays),
+            firsts: device.scratch(rays + 1),
+            shift: s.shift,
+            length: field.lattice.step * s.distance_scale,
+            threshold: s.weight_threshold,
+            stop: s.stop,
+            softplus: s.softplus,
+        }
+    }
+
+    fn groups(&self) -> CubeCount {
+        groups(self.ends.words().div_ceil(UNITS as usize))
+    }
+
+    /// Weights of samples from their features, and the list of those worth a color.
+    pub fn weigh(&self, device: &Device, samples: &VmSamples) {
+        weigh::launch(
+            device.launch(),
+            self.groups(),
+            CubeDim::new_1d(UNITS),
+            samples.offsets.arg(),
+            self.feature.arg(),
+            self.alpha.arg(),
+            self.light.arg(),
+            self.weight.arg(),
+            self.ends.arg(),
+            self.counts.arg(),
+            self.shift,
+            self.length,
+            self.threshold,
+            self.stop,
+            self.softplus,
+        );
+        prefix_sum(device, &self.counts, &self.firsts, &self.count, self.index.words());
+        list::launch(
+            device.launch(),
+            self.groups(),
+            CubeDim::new_1d(UNITS),
+            samples.offsets.arg(),
+            self.ends.arg(),
+            self.weight.arg(),
+            self.firsts.arg(),
+            self.index.arg(),
+            self.threshold,
+        );
+    }
+
+    /// Composites colors.
+    pub fn composite(&self, device: &Device, samples: &VmSamples) {
+        composite::launch(
+            device.launch(),
+            self.groups(),
+            CubeDim::new_1d(UNITS),
+            samples.offsets.arg(),
+            self.ends.arg(),
+            self.firsts.arg(),
+            samples.t.arg(),
+            self.weight.arg(),
+            self.rgb.arg(),
+            self.out.arg(),
+            self.threshold,
+        );
+    }
+
+    /// Gradients of samples from those by what was composited, planes `[5, rays]`.
+    pub fn backward(&self, device: &Device, samples: &VmSamples, g_out: &Buffer) {
+        assert!(g_out.words() == self.out.words() && self.g_feature.words() == self.feature.words());
+        backward::launch(
+            device.launch(),
+            self.groups(),
+            CubeDim::new_1d(UNITS),
+            samples.offsets.arg(),
+            self.ends.arg(),
+            self.firsts.arg(),
+            samples.t.arg(),
+            self.feature.arg(),
+            self.alpha.arg(),
+            self.light.arg(),
+            self.weight.arg(),
+            self.rgb.arg(),
+            g_out.arg(),
+            self.g_feature.arg(),
+            self.g_pre.arg(),
+            self.shift,
+            self.length,
+            self.threshold,
+            self.softplus,
+        );
+    }
+}

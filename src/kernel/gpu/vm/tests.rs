@@ -1,0 +1,269 @@
+use super::super::device::tests::{agree, device, devices, planes};
+use super::super::{Atomics, Device};
+use super::*;
+use crate::kernel::march::MarchRay;
+use crate::kernel::vm::mask::{BoxMask, Lattice, Walk};
+use crate::kernel::vm::{
+    self, DecoderShape, DecoderWeights, Grid, Penalty, RAY_WIDTH, Rendered, VmField, penalize,
+};
+use crate::kernel::{reference, rng};
+
+/// A field, its values, rays, and gradients of what they see.
+struct Case {
+    field: VmField,
+    density: Vec<f32>,
+    color: Vec<f32>,
+    network: Vec<f32>,
+    rays: Vec<MarchRay>,
+    g: Vec<f32>,
+}
+
+/// What differs between cases.
+#[derive(Clone, Copy)]
+struct Shape {
+    softplus: bool,
+    hidden: usize,
+    density: [usize; 3],
+    color: [usize; 3],
+    threshold: f32,
+    stop: f32,
+    masked: bool,
+}
+
+/// Hidden layers of one tile, ranks of whole vectors.
+const NARROW: Shape = Shape {
+    softplus: false,
+    hidden: 64,
+    density: [8, 8, 8],
+    color: [24, 24, 24],
+    threshold: 1e-3,
+    stop: 1e-3,
+    masked: true,
+};
+
+/// Hidden layers of a wide tile, ranks of any kind, nothing left out.
+const WIDE: Shape = Shape {
+    softplus: true,
+    hidden: 72,
+    density: [5, 4, 1],
+    color: [9, 0, 6],
+    threshold: 0.0,
+    stop: 0.0,
+    masked: false,
+};
+
+fn case(shape: Shape, count: u64) -> Case {
+    let size = [9, 12, 7];
+    let (min, max) = ([-1.0, -1.5, -0.75], [1.0, 1.5, 0.75]);
+    let hit = |c: [usize; 3]| !(c[0] + 3 * c[1] + 5 * c[2]).is_multiple_of(4) && c[2] < 25;
+    let mask = BoxMask::new([-1.0, -1.25, -0.75], [1.0, 1.5, 1.0], [19, 20, 29], hit);
+    let field = VmField {
+        density: Grid { size, rank: shape.density },
+        color: Grid { size, rank: shape.color },
+        decoder: DecoderShape {
+            channels: shape.color.iter().sum(),
+            features: 7,
+            hidden: shape.hidden,
+            view_frequencies: 0,
+            feature_frequencies: 0,
+        },
+        lattice: Lattice { min, max, step: 0.05, samples: 90, near: 0.5, far: 9.0 },
+        shading: vm::Shading {
+            softplus: shape.softplus,
+            shift: -1.0,
+            distance_scale: 3.0,
+            weight_threshold: shape.threshold,
+            stop: shape.stop,
+        },
+        mask: shape.masked.then_some(mask),
+    };
+    let normal = |stream: u64, n: usize, scale: f32| -> Vec<f32> {
+        (0..n).map(|i| scale * rng::normal(5, stream, i as u64)).collect()
+    };
+    let density: Vec<f32> = normal(1, field.density.len(), 0.4).iter().map(|v| v + 0.2).collect();
+    let rays = (0..count).map(|i| {
+        let u = |k: u64| rng::uniform(5, 4, 8 * i + k) - 0.5;
+        let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(2), 0.8 * u(3), -1.0] };
+        MarchRay { origin: [3.0 * u(0), 3.0 * u(1), 3.0], direction, jitter: u(4) + 0.5 }
+    });
+    Case {
+        color: normal(2, field.color.len(), 0.7),
+        network: normal(3, field.decoder.len(), 0.3),
+        rays: rays.collect(),
+        g: normal(5, count as usize * RAY_WIDTH, 1.0),
+        density,
+        field,
+    }
+}
+
+/// Some places more than rays.
+fn room(case: &Case) -> usize {
+    case.rays.len() + 3
+}
+
+/// Rays and values on a device.
+struct There {
+    vm: Vm,
+    values: [Buffer; 3],
+    rays: Batch,
+    g_out: Buffer,
+}
+
+impl There {
+    fn new(device: &Device, case: &Case) -> There {
+        let n = room(case);
+        let vm = Vm::new(device, &case.field, n, true);
+        There {
+            values: [
+                vm.density.upload(device, &case.density),
+                vm.color.upload(device, &case.color),
+                device.upload(&case.network),
+            ],
+            rays: Batch::of_rays(device, &case.rays, n),
+            g_out: device.upload(&planes::<RAY_WIDTH>(case.g.as_chunks().0, n)),
+            vm,
+        }
+    }
+
+    fn values(&self) -> VmValues<'_> {
+        VmValues { density: &self.values[0], color: &self.values[1], network: &self.values[2] }
+    }
+
+    fn render(&self, device: &Device) -> Vec<f32> {
+        device.read(self.vm.render(device, self.values(), &self.rays))
+    }
+
+    /// Of density, appearance and decoder, after a render.
+    fn gradients(&self, device: &Device) -> [Vec<f32>; 3] {
+        let [d, c, n] = self.values.each_ref().map(|v| device.zeros(v.words()));
+        let gradients = VmValues { density: &d, color: &c, network: &n };
+        self.vm.backward(device, self.values(), &self.rays, &self.g_out, gradients);
+        [self.vm.density.read(device, &d), self.vm.color.read(device, &c), device.read(&n)]
+    }
+}
+
+fn on_cpu(case: &Case) -> (Rendered, DecoderWeights) {
+    let weights = DecoderWeights::new(case.field.decoder, &case.network);
+    (vm::render(&case.field, &case.density, &case.color, &weights, &case.rays), weights)
+}
+
+#[test]
+fn lattice_points_are_those_of_the_cpu_with_and_without_a_mask() {
+    let Some(device) = device() else { return };
+    for masked in [true, false] {
+        let case = case(Shape { masked, ..NARROW }, 700);
+        let there = There::new(&device, &case);
+        there.vm.samples.march(&device, &there.vm.lattice, &there.rays);
+        let (mut t, mut offsets, mut points) = (vec![], vec![0u32], vec![]);
+        for ray in &case.rays {
+            let mut walk = Walk::new(&case.field.lattice, case.field.mask.as_ref(), ray);
+            t.extend(std::iter::from_fn(|| walk.advance()));
+            offsets.push(t.len() as u32);
+            points.push(case.field.lattice.points(ray) as u32);
+        }
+        offsets.extend([t.len() as u32; 3]);
+        points.extend([0; 3]);
+        println!("{} samples, {} at most", t.len(), there.vm.samples.t.words());
+        assert_eq!(device.read::<u32>(&there.vm.samples.count), [t.len() as u32; 2]);
+        assert_eq!(device.read::<u32>(&there.vm.samples.offsets), offsets);
+        assert_eq!(device.read::<u32>(&there.vm.samples.points), points);
+        agree("lattice points", &device.read::<f32>(&there.vm.samples.t)[..t.len()], &t, 1e-5);
+    }
+}
+
+#[test]
+fn rendered_rays_are_those_of_the_cpu() {
+    let Some(device) = device() else { return };
+    for shape in [NARROW, Shape { softplus: true, stop: 0.0, ..NARROW }, WIDE, Shape { hidden: 128, ..WIDE }]
+    {
+        let case = case(shape, 300);
+        let (want, _) = on_cpu(&case);
+        let there = There::new(&device, &case);
+        let got = there.render(&device);
+        let [looked_up, colored, _] = there.vm.counts().map(|b| device.read::<u32>(b)[0] as u64);
+        assert_eq!(colored, want.color_samples);
+        assert!(looked_up >= want.density_samples && colored > 1000, "{looked_up} {colored}");
+        agree("rendered", &got, &planes::<RAY_WIDTH>(want.out.as_chunks().0, room(&case)), 1e-4);
+    }
+}
+
+#[test]
+fn gradients_are_those_of_the_cpu_however_they_are_added() {
+    for shape in [NARROW, WIDE] {
+        let case = case(shape, 200);
+        let (rendered, weights) = on_cpu(&case);
+        let (mut d, mut c) = (vec![0.0; case.density.len()], vec![0.0; case.color.len()]);
+        let n = vm::backward(&case.field, &case.density, &weights, rendered, &case.g, &mut d, &mut c);
+        for device in devices() {
+            let mut there = There::new(&device, &case);
+            there.render(&device);
+            let got = there.gradients(&device);
+            for (what, (got, want)) in
+                ["density", "color", "decoder"].iter().zip(got.iter().zip([&d, &c, &n]))
+            {
+                agree(&format!("{:?} gradient of the {what}", device.atomics()), got, want, 1e-4);
+            }
+            if device.atomics() == Atomics::Fixed {
+                assert_eq!(there.gradients(&device), got, "whole numbers add to the same in any order");
+            }
+            // in pieces, the same
+            there.vm.decoder.chunk = 16 * TILE;
+            let pieces = there.gradients(&device);
+            agree("gradient of the color in pieces", &pieces[1], &got[1], 1e-4);
+            agree("gradient of the decoder in pieces", &pieces[2], &got[2], 1e-4);
+        }
+    }
+}
+
+#[test]
+fn gradients_agree_with_f64_finite_differences() {
+    let Some(device) = device() else { return };
+    let mut errors = Vec::new();
+    for shape in [WIDE, Shape { softplus: false, hidden: 32, ..WIDE }] {
+        let case = case(shape, 24);
+        let there = There::new(&device, &case);
+        there.render(&device);
+        let got = there.gradients(&device).concat();
+        let mut x = reference::wide(&[case.density.as_slice(), &case.color, &case.network].concat());
+        let loss = |x: &[f64]| -> f64 {
+            let out = reference::vm::render(&case.field, x, &case.rays);
+            out.iter().zip(&case.g).map(|(o, &g)| o * g as f64).sum()
+        };
+        let largest = got.iter().fold(0f32, |m, g| m.max(g.abs())) as f64;
+        for k in 0..150 {
+            let i = rng::below(1, 6, k, x.len() as u64) as usize;
+            let (old, h) = (x[i], 1e-6);
+            x[i] = old + h;
+            let up = loss(&x);
+            x[i] = old - h;
+            let down = loss(&x);
+            x[i] = old;
+            let want = (up - down) / (2.0 * h);
+            errors.push((got[i] as f64 - want).abs() / want.abs().max(1e-2 * largest));
+        }
+    }
+    errors.sort_by(f64::total_cmp);
+    let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
+    println!("{} gradients: worst {worst:.2e}, median {median:.2e}", errors.len());
+    assert!(worst <= 1e-3 && median <= 1e-5, "worst {worst:.2e}, median {median:.2e}");
+}
+
+#[test]
+fn penalties_are_those_of_the_cpu() {
+    let Some(device) = device() else { return };
+    for rank in [[8, 4, 12], [3, 0, 2]] {
+        let grid = Grid { size: [5, 8, 6], rank };
+        let normal =
+            |stream: u64| -> Vec<f32> { (0..grid.len() as u64).map(|i| rng::normal(7, stream, i)).collect() };
+        let (x, before) = (normal(1), normal(2));
+        for penalty in [Penalty { tv: 0.7, l1: 0.3, ortho: 0.0 }, Penalty { l1: 0.3, ..Penalty::default() }] {
+            let mut want = before.clone();
+            penalize(&grid, &penalty, &x, &mut want);
+            let on = DeviceGrid::new(&device, grid);
+            let (values, gradient) = (on.upload(&device, &x), on.upload(&device, &before));
+            on.penalize(&device, &values, &penalty, &gradient);
+            agree("penalized", &on.read(&device, &gradient), &want, 1e-5);
+            assert_eq!(on.read(&device, &values), x);
+        }
+    }
+}
