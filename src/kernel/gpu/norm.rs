@@ -32,7 +32,7 @@ fn length(raw: &[f32], pieces: &[u32], i: usize) -> f32 {
 
 /// By its bits: compilers may take for granted that floats are finite.
 #[cube]
-fn finite(v: f32) -> bool {
+pub(super) fn finite(v: f32) -> bool {
     (u32::reinterpret(v) & 0x7f80_0000u32) != 0x7f80_0000u32
 }
 

@@ -6,11 +6,13 @@
 
 mod decoder;
 mod grid;
+mod losses;
 mod march;
 mod rays;
 
 pub use decoder::DeviceDecoder;
 pub use grid::DeviceGrid;
+pub use losses::{Behind, MaskTerm, VmFigures, VmLosses};
 
 use super::device::{Buffer, Device};
 use super::draw::Batch;
@@ -75,7 +77,8 @@ impl Vm {
     }
 
     /// Adds the gradients of planes and lines to those of `gradients`, and writes those of the decoder's weights: of the
-    /// rays of the last render, by what was composited, planes `[5, rays]`.
+    /// rays of the last render, by what was composited, planes `[5, rays]`. Where one of the latter is not finite,
+    /// `broken`, `[1]`, becomes 1.
     pub fn backward(
         &self,
         device: &Device,
@@ -83,6 +86,7 @@ impl Vm {
         rays: &Batch,
         g_out: &Buffer,
         gradients: VmValues,
+        broken: &Buffer,
     ) {
         let (samples, along) = (&self.samples, &self.along);
         along.backward(device, samples, g_out);
@@ -99,6 +103,7 @@ impl Vm {
             values.network,
             gradients.color,
             gradients.network,
+            broken,
         );
     }
 

@@ -196,7 +196,8 @@ impl DeviceDecoder {
         }
     }
 
-    /// Adds the gradient of planes and lines and writes that of the flat weights.
+    /// Adds the gradient of planes and lines and writes that of the flat weights; `broken`, `[1]`, becomes 1 where one of
+    /// these is not finite.
     pub fn backward(
         &self,
         device: &Device,
@@ -208,6 +209,7 @@ impl DeviceDecoder {
         flat: &Buffer,
         g_values: &Buffer,
         g_flat: &Buffer,
+        broken: &Buffer,
     ) {
         assert!(along.index.words() == self.capacity && values.words() == grid.len());
         let dim = cubecl::prelude::CubeDim::new_1d(tile::UNITS);
@@ -257,6 +259,7 @@ impl DeviceDecoder {
             self.padded.arg(),
             self.summed.arg(),
             g_flat.arg(),
+            broken.arg(),
             self.plan,
         );
     }

@@ -137,7 +137,9 @@ impl There {
     fn gradients(&self, device: &Device) -> [Vec<f32>; 3] {
         let [d, c, n] = self.values.each_ref().map(|v| device.zeros(v.words()));
         let gradients = VmValues { density: &d, color: &c, network: &n };
-        self.vm.backward(device, self.values(), &self.rays, &self.g_out, gradients);
+        let broken = device.zeros(1);
+        self.vm.backward(device, self.values(), &self.rays, &self.g_out, gradients, &broken);
+        assert_eq!(device.read::<u32>(&broken), [0]);
         [self.vm.density.read(device, &d), self.vm.color.read(device, &c), device.read(&n)]
     }
 }
@@ -265,5 +267,94 @@ fn penalties_are_those_of_the_cpu() {
             agree("penalized", &on.read(&device, &gradient), &want, 1e-5);
             assert_eq!(on.read(&device, &values), x);
         }
+    }
+}
+
+/// Losses of rays in f64, unweighted: squared error, mask, squared opacity of the background.
+fn losses(shown: &Shown, composed: &[f64], term: MaskTerm, behind: Behind) -> [f64; 3] {
+    let n = shown.alpha.len();
+    let alive = |r: &usize| shown.alive[*r] == 1;
+    let outside = (0..n).filter(alive).filter(|&r| shown.alpha[r] == 0.0).count() as f64;
+    let rays = (0..n).filter(alive).count() as f64;
+    let mut t = [0f64; 3];
+    for r in (0..n).filter(alive) {
+        let (o, a) = (composed[3 * n + r], shown.alpha[r] as f64);
+        for c in 0..3 {
+            let b = shown.background[c * n + r] as f64;
+            let seen = composed[c * n + r] + (1.0 - o) * (b + behind.lift as f64);
+            let over = if behind.target { (1.0 - a) * b } else { 0.0 };
+            t[0] += (seen.clamp(0.0, 1.0) - shown.color[c * n + r] as f64 - over).powi(2) / (3.0 * rays);
+        }
+        let p = o.clamp(1e-3, 1.0 - 1e-3);
+        t[2] += if a == 0.0 { o * o / outside } else { 0.0 };
+        if let MaskTerm::Ce(_) = term {
+            t[1] -= (a * p.ln() + (1.0 - a) * (1.0 - p).ln()) / rays;
+        }
+    }
+    if let MaskTerm::L2(_) = term {
+        t[1] = t[2];
+    }
+    t
+}
+
+/// What pixels show.
+struct Shown {
+    color: Vec<f32>,
+    alpha: Vec<f32>,
+    background: Vec<f32>,
+    alive: Vec<u32>,
+}
+
+#[test]
+fn losses_and_gradients_agree_with_f64_finite_differences() {
+    let Some(device) = device() else { return };
+    const N: usize = 40;
+    let drawn = |stream: u64, n: usize, low: f32, high: f32| -> Vec<f32> {
+        (0..n as u64).map(|i| low + (high - low) * rng::uniform(8, stream, i)).collect()
+    };
+    let alpha: Vec<f32> = (0..N).map(|r| [0.0, 1.0, 0.4][r % 3]).collect();
+    let alive: Vec<u32> = (0..N).map(|r| u32::from(r % 7 != 3)).collect();
+    let shown =
+        Shown { color: drawn(1, 3 * N, 0.0, 1.0), alpha, background: drawn(2, 3 * N, 0.0, 1.0), alive };
+    // some colors and opacities leave their range
+    let composed = [drawn(3, 3 * N, -0.3, 1.1), drawn(4, N, 0.0, 1.0), drawn(5, N, 0.0, 3.0)].concat();
+    let batch = Batch {
+        color: device.upload(&shown.color),
+        alpha: device.upload(&shown.alpha),
+        background: device.upload(&shown.background),
+        alive: device.upload(&shown.alive),
+        ..Batch::new(&device, N)
+    };
+    let vm = Vm::new(&device, &case(NARROW, 1).field, N, false);
+    for (term, lift, target) in
+        [(MaskTerm::L2(0.3), 0.0, true), (MaskTerm::Ce(0.2), 1.0, false), (MaskTerm::None, 0.5, true)]
+    {
+        let behind = Behind { lift, target };
+        let mut on = VmLosses::new(&device, N, term);
+        let g = on.of_rays(&device, &device.upload(&composed), &batch, behind);
+        let got = device.read::<f32>(g);
+        let wide = reference::wide(&composed);
+        let want = losses(&shown, &wide, term, behind);
+        on.add(&device, &vm, &device.upload(&[0u32]));
+        on.add(&device, &vm, &device.upload(&[1u32]));
+        let figures = on.read(&device);
+        agree("losses", &figures.terms, &want.map(|t| 2.0 * t as f32), 1e-5);
+        assert_eq!((figures.rays, figures.broken), (2 * 34, true));
+        assert_eq!(on.read(&device).terms, [0.0; 3]);
+        let total = |x: &[f64]| {
+            let t = losses(&shown, x, term, behind);
+            t[0] + match term {
+                MaskTerm::None => 0.0,
+                MaskTerm::L2(w) | MaskTerm::Ce(w) => w as f64 * t[1],
+            }
+        };
+        let slope = |i: usize| {
+            let mut x = wide.clone();
+            x[i] += 1e-7;
+            let up = total(&x);
+            x[i] -= 2e-7;
+            ((up - total(&x)) / 2e-7) as f32
+        };
+        agree("gradients", &got, &(0..5 * N).map(slope).collect::<Vec<_>>(), 1e-4);
     }
 }

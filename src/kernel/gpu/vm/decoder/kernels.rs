@@ -1,5 +1,6 @@
 //! What runs on the device: weights made ready, the layers forward and backward, gradients of the weights.
 
+use super::super::super::norm::finite;
 use super::super::super::tile::{self, Block, at, gate, narrow, outer, product, put, sums, turned};
 use super::super::grid::{NONE, looked_up, term};
 use super::Plan;
@@ -405,6 +406,7 @@ pub(super) fn chain(
     padded: &[u32],
     summed: &[f32],
     g_flat: &mut [f32],
+    broken: &mut [u32],
     #[comptime] plan: Plan,
 ) {
     let i = ABSOLUTE_POS;
@@ -444,5 +446,9 @@ pub(super) fn chain(
             g = summed[comptime!(own[5] * width) + i - comptime!(parts[6])];
         }
         g_flat[i] = g;
+        // all who write, write the same
+        if !finite(g) {
+            broken[0] = 1;
+        }
     }
 }

@@ -1,0 +1,275 @@
+//! What a training step of TensoRF's field minimizes, and its gradients.
+//!
+//! With `C` and `O` a ray's color and opacity, `h` and `a` color (over black) and alpha of its pixel, `b` what both are
+//! seen over, and means over the rays that there are:
+//!
+//! ```text
+//! ⟨(clamp(C + (1 − O) b) − h − (1 − a) b)²⟩ + mask · ⟨O²⟩ over rays with a = 0, or mask · ⟨−a ln O − (1 − a) ln(1 − O)⟩
+//! ```
+
+use super::super::device::{Buffer, Device, groups};
+use super::super::draw::Batch;
+use super::Vm;
+use crate::kernel::vm::RAY_WIDTH;
+use cubecl::prelude::*;
+
+const UNITS: u32 = 256;
+
+/// Terms of a ray: squared error, mask, squared opacity of the background.
+const TERMS: usize = 3;
+
+/// Words of what steps came to: terms, lattice points, samples looked up, samples decoded, rays, broken.
+const TOTALS: usize = TERMS + 5;
+
+/// How opacity is held to the mask.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum MaskTerm {
+    /// Not at all.
+    None,
+    /// Squared opacity of background rays, with this weight.
+    L2(f32),
+    /// Cross entropy of opacity and alpha, with this weight.
+    Ce(f32),
+}
+
+/// What rays are seen over.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Behind {
+    /// A gray added to the batch's background behind the render, not behind the pixel.
+    pub lift: f32,
+    /// Is the batch's background behind the pixel, too?
+    pub target: bool,
+}
+
+/// How many rays there are, and how many of them show background. One group of threads.
+#[cube(launch)]
+fn tally(alpha: &[f32], alive: &[u32], out: &mut [u32]) {
+    let unit = UNIT_POS as usize;
+    let mut rays = 0u32;
+    let mut outside = 0u32;
+    for r in range_stepped(unit, alpha.len(), UNITS as usize) {
+        rays += alive[r];
+        outside += select(alpha[r] == 0.0f32, alive[r], 0u32);
+    }
+    let mut all = Shared::<[u32]>::new_slice(UNITS as usize);
+    let mut empty = Shared::<[u32]>::new_slice(UNITS as usize);
+    all[unit] = rays;
+    empty[unit] = outside;
+    sync_cube();
+    if unit == 0 {
+        rays = 0;
+        outside = 0;
+        for i in 0..UNITS as usize {
+            rays += all[i];
+            outside += empty[i];
+        }
+        out[0] = rays;
+        out[1] = outside;
+    }
+}
+
+/// Terms of rays, planes `[3, rays]`, and gradients by what was composited, planes `[5, rays]`.
+#[cube(launch)]
+fn of_rays(
+    composed: &[f32],
+    color: &[f32],
+    alpha: &[f32],
+    background: &[f32],
+    alive: &[u32],
+    tally: &[u32],
+    g_out: &mut [f32],
+    terms: &mut [f32],
+    lift: f32,
+    over: f32,
+    weight: f32,
+    #[comptime] l2: bool,
+    #[comptime] ce: bool,
+) {
+    let rays = alpha.len();
+    let r = ABSOLUTE_POS;
+    if r < rays {
+        let there = f32::cast_from(alive[r]);
+        let even = there / max(f32::cast_from(tally[0]), 1.0f32);
+        let (opacity, a) = (composed[3 * rays + r], alpha[r]);
+        let mut square = 0.0f32;
+        let mut g_opacity = 0.0f32;
+        #[unroll]
+        for c in 0..3usize {
+            let b = background[c * rays + r];
+            let raw = composed[c * rays + r] + (1.0f32 - opacity) * (b + lift);
+            let seen = clamp(raw, 0.0f32, 1.0f32);
+            let e = seen - (color[c * rays + r] + over * (1.0f32 - a) * b);
+            square += e * e;
+            let g = select(raw == seen, 2.0f32 * e * even / 3.0f32, 0.0f32);
+            g_out[c * rays + r] = g;
+            g_opacity -= g * (b + lift);
+        }
+        let outside = select(a == 0.0f32, there, 0.0f32) / max(f32::cast_from(tally[1]), 1.0f32);
+        let empty = opacity * opacity * outside;
+        let mut mask = 0.0f32;
+        if l2 {
+            mask = empty;
+            g_opacity += 2.0f32 * weight * opacity * outside;
+        }
+        if ce {
+            let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
+            mask = -(a * p.ln() + (1.0f32 - a) * (1.0f32 - p).ln()) * even;
+            let by_p = ((1.0f32 - a) / (1.0f32 - p) - a / p) * even * weight;
+            g_opacity += select(p == opacity, by_p, 0.0f32);
+        }
+        g_out[3 * rays + r] = g_opacity;
+        g_out[4 * rays + r] = 0.0f32;
+        terms[r] = square * even / 3.0f32;
+        terms[rays + r] = mask;
+        terms[2 * rays + r] = empty;
+    }
+}
+
+/// Adds a step to what the steps before came to: a group of threads for each term, and one for lattice points.
+#[cube(launch)]
+fn add(
+    terms: &[f32],
+    points: &[u32],
+    looked_up: &[u32],
+    decoded: &[u32],
+    tally: &[u32],
+    broken: &[u32],
+    totals: &mut [u32],
+) {
+    let unit = UNIT_POS as usize;
+    let term = CUBE_POS_X as usize;
+    let rays = points.len();
+    let mut own = 0.0f32;
+    let mut crossed = 0u32;
+    for r in range_stepped(unit, rays, UNITS as usize) {
+        if term < TERMS {
+            own += terms[term * rays + r];
+        } else {
+            crossed += points[r];
+        }
+    }
+    let mut sums = Shared::<[f32]>::new_slice(UNITS as usize);
+    let mut counts = Shared::<[u32]>::new_slice(UNITS as usize);
+    sums[unit] = own;
+    counts[unit] = crossed;
+    sync_cube();
+    if unit == 0 {
+        own = 0.0f32;
+        crossed = 0u32;
+        for i in 0..UNITS as usize {
+            own += sums[i];
+            crossed += counts[i];
+        }
+        if term < TERMS {
+            totals[term] = u32::reinterpret(f32::reinterpret(totals[term]) + own);
+        } else {
+            totals[TERMS] += crossed;
+            totals[comptime!(TERMS + 1)] += looked_up[0];
+            totals[comptime!(TERMS + 2)] += decoded[0];
+            totals[comptime!(TERMS + 3)] += tally[0];
+            totals[comptime!(TERMS + 4)] = broken[0];
+        }
+    }
+}
+
+/// What steps came to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VmFigures {
+    /// Sums over the steps of the squared error, the mask's term and the background's squared opacity, unweighted.
+    pub terms: [f32; 3],
+    /// Lattice points inside the box, were nothing skipped.
+    pub lattice: u64,
+    /// Samples whose density was looked up.
+    pub density: u64,
+    /// Samples whose color was decoded.
+    pub color: u64,
+    /// Rays.
+    pub rays: u64,
+    /// Was a gradient of the decoder not finite?
+    pub broken: bool,
+}
+
+/// The losses of so many rays.
+pub struct VmLosses {
+    term: MaskTerm,
+    tally: Buffer,
+    g_out: Buffer,
+    terms: Buffer,
+    totals: Buffer,
+}
+
+impl VmLosses {
+    /// For so many rays.
+    pub fn new(device: &Device, rays: usize, term: MaskTerm) -> VmLosses {
+        VmLosses {
+            term,
+            tally: device.scratch(2),
+            g_out: device.scratch(RAY_WIDTH * rays),
+            terms: device.scratch(TERMS * rays),
+            totals: device.zeros(TOTALS),
+        }
+    }
+
+    /// Gradients by what [`Vm::render`] composited, planes `[5, rays]`.
+    pub fn of_rays(&self, device: &Device, composed: &Buffer, batch: &Batch, behind: Behind) -> &Buffer {
+        let dim = CubeDim::new_1d(UNITS);
+        let (weight, l2, ce) = match self.term {
+            MaskTerm::None => (0.0, false, false),
+            MaskTerm::L2(weight) => (weight, true, false),
+            MaskTerm::Ce(weight) => (weight, false, true),
+        };
+        let Batch { color, alpha, background, alive, .. } = batch;
+        let one = CubeCount::new_single();
+        tally::launch(device.launch(), one, dim, alpha.arg(), alive.arg(), self.tally.arg());
+        of_rays::launch(
+            device.launch(),
+            groups(alpha.words().div_ceil(UNITS as usize)),
+            dim,
+            composed.arg(),
+            color.arg(),
+            alpha.arg(),
+            background.arg(),
+            alive.arg(),
+            self.tally.arg(),
+            self.g_out.arg(),
+            self.terms.arg(),
+            behind.lift,
+            f32::from(behind.target),
+            weight,
+            l2,
+            ce,
+        );
+        &self.g_out
+    }
+
+    /// How many rays the last batch had and how many of them showed background, `[2]`.
+    pub fn rays(&self) -> &Buffer {
+        &self.tally
+    }
+
+    /// Adds the last step to what is read.
+    pub fn add(&self, device: &Device, vm: &Vm, broken: &Buffer) {
+        let [looked_up, decoded, points] = vm.counts();
+        add::launch(
+            device.launch(),
+            CubeCount::new_1d(TERMS as u32 + 1),
+            CubeDim::new_1d(UNITS),
+            self.terms.arg(),
+            points.arg(),
+            looked_up.arg(),
+            decoded.arg(),
+            self.tally.arg(),
+            broken.arg(),
+            self.totals.arg(),
+        );
+    }
+
+    /// Waits for the device; what the steps since the last time came to.
+    pub fn read(&mut self, device: &Device) -> VmFigures {
+        let t = device.read::<u32>(&self.totals);
+        self.totals = device.zeros(TOTALS);
+        let [lattice, density, color, rays] = [3, 4, 5, 6].map(|i| t[i] as u64);
+        let terms = [t[0], t[1], t[2]].map(f32::from_bits);
+        VmFigures { terms, lattice, density, color, rays, broken: t[7] != 0 }
+    }
+}
