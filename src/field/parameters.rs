@@ -71,14 +71,19 @@ impl Parameter {
         [self.values(), first, second]
     }
 
-    /// Gives it these, as many as it has.
-    pub fn set(&mut self, state: [Vec<f32>; 3]) {
+    /// Returns a parameter like it with other values and moments, as many as it has.
+    pub fn with(&self, state: [Vec<f32>; 3]) -> Parameter {
         let device = self.moments[0].device();
         let [value, first, second] = state.map(|v| {
             assert_eq!(v.len(), self.len());
             tensor(v, [self.len()], &device)
         });
-        (self.value, self.moments) = (leaf(value), [first, second]);
+        Parameter { name: self.name, shape: self.shape.clone(), value: leaf(value), moments: [first, second] }
+    }
+
+    /// Gives it these, as many as it has.
+    pub fn set(&mut self, state: [Vec<f32>; 3]) {
+        *self = self.with(state);
     }
 
     /// Is every value a finite number?

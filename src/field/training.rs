@@ -66,6 +66,8 @@ pub trait Learner {
     const FORMAT: &'static str;
     /// The settings that hold its learning rates.
     const RATES: [&'static str; 2];
+    /// Steps that a squared error is the mean of.
+    const EVERY: u64 = 1;
 
     /// Makes the optimizer step after `progress.step`.
     fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError>;
@@ -127,7 +129,8 @@ pub fn train<L: Learner>(
         let result = learner.step(&progress).and_then(|report| {
             progress.step += 1;
             if let Some(error) = report.square_error {
-                let keep = if progress.mean_square == 0.0 { 0.0 } else { 0.98 };
+                let kept = 0.98f64.powi(L::EVERY as i32);
+                let keep = if progress.mean_square == 0.0 { 0.0 } else { kept };
                 progress.mean_square = keep * progress.mean_square + (1.0 - keep) * error as f64;
             }
             let figures = [vec![("psnr", progress.psnr())], report.figures].concat();

@@ -12,6 +12,8 @@ mod grow;
 mod infer;
 #[cfg(feature = "cpu")]
 mod mean;
+#[cfg(feature = "wgpu")]
+mod on_device;
 #[cfg(feature = "cpu")]
 mod record;
 #[cfg(feature = "cpu")]

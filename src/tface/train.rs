@@ -1,6 +1,8 @@
 //! One training step of the stages `baseline` and `tface`; the loop around it is [`crate::field::training`]'s.
 
 use super::grow::{update_mask, upsample};
+#[cfg(feature = "wgpu")]
+use super::on_device::OnDevice;
 use super::record::FORMAT;
 use super::state::VmState;
 use crate::config::{MaskLoss, MaskUse, VmBackground, VmConfig};
@@ -71,20 +73,21 @@ impl TfaceReport {
 
 /// Samples of this process.
 #[derive(Clone, Copy, Debug, Default)]
-struct Counts {
-    rays: u64,
-    lattice: u64,
-    density: u64,
-    color: u64,
+pub(super) struct Counts {
+    pub rays: u64,
+    pub lattice: u64,
+    pub density: u64,
+    pub color: u64,
 }
 
-struct VmTraining<'a> {
-    config: &'a VmConfig,
+/// A training on the CPU, and what one on a GPU begins and ends with.
+pub(super) struct VmTraining<'a> {
+    pub config: &'a VmConfig,
     session: TrainingSession<'a>,
-    device: Device,
-    pixels: &'a Pixels<'a>,
-    state: VmState,
-    counts: Counts,
+    pub device: Device,
+    pub pixels: &'a Pixels<'a>,
+    pub state: VmState,
+    pub counts: Counts,
 }
 
 /// Trains one field in `bounds` until `config.steps`, saving checkpoints into the session's folder and continuing
@@ -96,17 +99,23 @@ pub(super) fn train_one(
     config: &VmConfig,
     session: &TrainingSession,
 ) -> Result<TfaceReport> {
-    let device = match field::place(session.device)? {
-        Place::Cpu => field::processor(),
-        // fields of this kind are learned on the processor for now
-        #[cfg(feature = "wgpu")]
-        Place::Gpu(_) => field::processor(),
-    };
     let began = Instant::now();
-    let state = VmState::new(config, session.seed, bounds, hull, &device);
-    let mut learner =
-        VmTraining { config, session: *session, device, pixels, state, counts: Counts::default() };
-    let (progress, warnings) = training::train(&mut learner, session, config.steps, config.checkpoint_s)?;
+    let mut learner = VmTraining::new(pixels, bounds, hull, config, session, field::processor());
+    let (progress, warnings) = match field::place(session.device)? {
+        Place::Cpu => training::train(&mut learner, session, config.steps, config.checkpoint_s)?,
+        #[cfg(feature = "wgpu")]
+        Place::Gpu(gpu) => {
+            let unknown = |what| {
+                let problem = format!("device `{}` knows no {what}", session.device);
+                Error::usage(problem, "train with `--device cpu`")
+            };
+            OnDevice::knows(config).map_err(unknown)?;
+            let mut there = OnDevice::new(learner, gpu.device);
+            let done = training::train(&mut there, session, config.steps, config.checkpoint_s)?;
+            learner = there.finish();
+            done
+        }
+    };
     let VmTraining { state, counts, .. } = learner;
     Ok(TfaceReport {
         fields: 1,
@@ -188,7 +197,7 @@ impl Learner for VmTraining<'_> {
     fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError> {
         let config = self.config;
         let step = progress.step;
-        let seed = self.session.seed ^ progress.salt << 32;
+        let seed = self.seed(progress);
         let mut batch = self.pixels.draw(seed, step, config.rays, true);
         let field = self.state.field(config, true);
         let rays = std::mem::take(&mut batch.rays);
@@ -210,7 +219,9 @@ impl Learner for VmTraining<'_> {
             }
         }
         self.descend(total, step)?;
-        self.grow(step)?;
+        if self.grows(step) {
+            self.grow(step)?;
+        }
         let mut figures = vec![("rgb", rgb as f64), ("mask", mask as f64), ("samples", looked_up as f64)];
         figures.extend(outside.map(|outside| ("outside", outside as f64)));
         Ok(StepReport { square_error: Some(rgb), figures })
@@ -237,21 +248,55 @@ impl Learner for VmTraining<'_> {
     }
 }
 
-impl VmTraining<'_> {
-    fn not_finite(&self, term: &'static str, value: f32, step: u64) -> StepError {
+/// Is the batch of a step seen over white, half of them are, where the target stays over black? As published.
+pub(super) fn over_white(seed: u64, step: u64) -> bool {
+    rng::uniform(seed, step << 4 | 9, 0) < 0.5
+}
+
+/// Random numbers of a step's backgrounds.
+pub(super) const BEHIND: u64 = 8;
+
+impl<'a> VmTraining<'a> {
+    /// Before the first step.
+    pub fn new(
+        pixels: &'a Pixels<'a>,
+        bounds: [[f32; 3]; 2],
+        hull: Option<&Bitmask>,
+        config: &'a VmConfig,
+        session: &TrainingSession<'a>,
+        device: Device,
+    ) -> VmTraining<'a> {
+        let state = VmState::new(config, session.seed, bounds, hull, &device);
+        VmTraining { config, session: *session, device, pixels, state, counts: Counts::default() }
+    }
+
+    /// The seed of a step: another one after a step that diverged.
+    pub fn seed(&self, progress: &TrainingProgress) -> u64 {
+        self.session.seed ^ progress.salt << 32
+    }
+
+    /// The error that something is not finite.
+    pub fn not_finite(&self, term: &'static str, value: f32, step: u64) -> StepError {
         let lr = self.config.lr_network * learning_rate(self.config, step - self.state.reset);
         StepError::NotFinite { term, value, lr }
     }
 
-    /// Both grids with their regularizers attached.
-    fn penalized(&self, field: &VmField, step: u64) -> (Tensor<1>, Tensor<1>) {
+    /// What is asked of both grids at a step besides the photographs.
+    pub fn penalties(&self, step: u64) -> [Penalty; 2] {
         let config = self.config;
         let faded = tv_fade(config, step);
         let tv = |weight: f64| (0.01 * weight * faded) as f32;
         let l1 = if self.state.masked { config.l1_rest } else { config.l1_start } as f32;
         let ortho = config.ortho as f32;
-        let of_density = Penalty { tv: tv(config.tv_density), l1, ortho };
-        let of_color = Penalty { tv: tv(config.tv_color), l1: 0.0, ortho };
+        [
+            Penalty { tv: tv(config.tv_density), l1, ortho },
+            Penalty { tv: tv(config.tv_color), l1: 0.0, ortho },
+        ]
+    }
+
+    /// Both grids with their regularizers attached.
+    fn penalized(&self, field: &VmField, step: u64) -> (Tensor<1>, Tensor<1>) {
+        let [of_density, of_color] = self.penalties(step);
         let attach = |p: Tensor<1>, grid, penalty: Penalty| {
             if penalty.is_zero() { p } else { ops::penalized(p, Arc::new(GridPenalty { grid, penalty })) }
         };
@@ -279,14 +324,14 @@ impl VmTraining<'_> {
         let open = || opacity.clone().neg() + 1.0;
         match config.background {
             VmBackground::Black => {}
-            // the published flip: the render is over white, the target stays over black
             VmBackground::Reference => {
-                if rng::uniform(seed, stream | 9, 0) < 0.5 {
+                if over_white(seed, step) {
                     color = color + open();
                 }
             }
             VmBackground::Random => {
-                let behind: Vec<f32> = (0..3 * n as u64).map(|i| rng::uniform(seed, stream | 8, i)).collect();
+                let behind: Vec<f32> =
+                    (0..3 * n as u64).map(|i| rng::uniform(seed, stream | BEHIND, i)).collect();
                 for ((t, b), i) in target.iter_mut().zip(&behind).zip(0..) {
                     let i: usize = i;
                     *t += (1.0 - batch.alpha[i / 3]) * b;
@@ -329,15 +374,9 @@ impl VmTraining<'_> {
         (total, rgb, mask, outside)
     }
 
-    /// Backward and Adam. Nothing is updated where the decoder's gradient is not finite; the grids are looked
-    /// at before every checkpoint.
-    fn descend(&mut self, loss: Tensor<1>, step: u64) -> Result<(), StepError> {
+    /// The optimizer's step of each parameter.
+    pub fn adam_steps(&self, step: u64) -> [AdamStep; 3] {
         let config = self.config;
-        let mut gradients = loss.backward();
-        drop(loss);
-        if !self.state.parameters[2].has_finite_gradient(&gradients) {
-            return Err(self.not_finite("gradient of the", f32::NAN, step));
-        }
         let factor = learning_rate(config, step - self.state.reset);
         let grid = AdamStep {
             lr: (config.lr_grid * factor) as f32,
@@ -349,19 +388,36 @@ impl VmTraining<'_> {
             skip_zero: false,
         };
         let network = AdamStep { lr: (config.lr_network * factor) as f32, ..grid };
-        for (p, step) in self.state.parameters.iter_mut().zip([grid, grid, network]) {
+        [grid, grid, network]
+    }
+
+    /// Backward and Adam. Nothing is updated where the decoder's gradient is not finite; the grids are looked
+    /// at before every checkpoint.
+    fn descend(&mut self, loss: Tensor<1>, step: u64) -> Result<(), StepError> {
+        let mut gradients = loss.backward();
+        drop(loss);
+        if !self.state.parameters[2].has_finite_gradient(&gradients) {
+            return Err(self.not_finite("gradient of the", f32::NAN, step));
+        }
+        let steps = self.adam_steps(step);
+        for (p, step) in self.state.parameters.iter_mut().zip(steps) {
             p.update(&mut gradients, step);
         }
         Ok(())
     }
 
+    /// Is a mask or a finer grid due after a step?
+    pub fn grows(&self, step: u64) -> bool {
+        self.config.mask_steps.contains(&step) || self.config.upsample_steps.contains(&step)
+    }
+
     /// Rebuilds the mask and refines the grids where that is due after step `step`.
-    fn grow(&mut self, step: u64) -> Result<(), StepError> {
+    pub fn grow(&mut self, step: u64) -> Result<(), StepError> {
         let config = self.config;
         let masking = config.mask_steps.contains(&step);
         let upsampling = config.upsample_steps.iter().position(|&s| s == step);
         // what is not finite would be spread, or taken for empty
-        if (masking || upsampling.is_some()) && !self.state.is_finite() {
+        if !self.state.is_finite() {
             return Err(self.not_finite("grid", f32::NAN, step));
         }
         if masking && !update_mask(&mut self.state, config, step + 1) {

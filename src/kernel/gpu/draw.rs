@@ -363,6 +363,7 @@ pub struct Photographs {
     pixels: Buffer,
     drawable: Buffer,
     drawing: Drawing,
+    behind: u64,
 }
 
 impl Photographs {
@@ -403,12 +404,17 @@ impl Photographs {
         }
         assert!(cumulative > 0, "no pixel is drawable");
         let [views, pixels, drawable] = [views, pixels, drawable].map(|words| device.upload(&words));
-        Ok(Photographs { views, pixels, drawable, drawing })
+        Ok(Photographs { views, pixels, drawable, drawing, behind: 3 })
     }
 
     /// Bytes of the pixels of these.
     fn bytes(seen: &[DrawnView]) -> u64 {
         seen.iter().map(|view| 4 * view.pixels.len().next_multiple_of(32) as u64).sum()
+    }
+
+    /// The same with backgrounds of a step's random numbers `k`, not 3.
+    pub fn behind(self, k: u64) -> Photographs {
+        Photographs { behind: k, ..self }
     }
 
     /// Draws the rays of a step: a function of seed and step alone.
@@ -417,7 +423,7 @@ impl Photographs {
     ///
     /// - wanted: `[1]`, how many rays; those of `into` behind them are none
     pub fn draw(&self, device: &Device, (seed, step): (u64, u64), wanted: &Buffer, into: &Batch) {
-        let [view, pixel, shift, behind] = [0, 1, 2, 3].map(|k| stream(seed, step << 4 | k));
+        let [view, pixel, shift, behind] = [0, 1, 2, self.behind].map(|k| stream(seed, step << 4 | k));
         assert!(into.rays() < 1 << 22, "the number of a try has 32 bits");
         draw_rays::launch(
             device.launch(),

@@ -23,6 +23,9 @@ use rays::Along;
 /// Samples of a tile, of which all rooms are a multiple.
 const TILE: usize = 64;
 
+/// The most samples of a batch: what lies along rays that have more is not looked at. A mask leaves far fewer.
+const MOST: usize = 1 << 23;
+
 /// A field on a device, and room for a batch of rays.
 pub struct Vm {
     /// Planes and lines of the density.
@@ -52,7 +55,7 @@ impl Vm {
     pub fn new(device: &Device, field: &VmField, rays: usize, learns: bool) -> Vm {
         assert_eq!(field.density.size, field.color.size);
         let lattice = DeviceLattice::new(device, field);
-        let capacity = (rays * lattice.most).next_multiple_of(TILE);
+        let capacity = (rays * lattice.most).min(MOST).next_multiple_of(TILE);
         let color = DeviceGrid::new(device, field.color);
         Vm {
             density: DeviceGrid::new(device, field.density),

@@ -135,7 +135,9 @@ impl DeviceDecoder {
         for (c, &own) in real.iter().enumerate().filter(|(_, own)| **own != NONE) {
             padded[own as usize] = c as u32;
         }
-        let chunk = capacity.min(CHUNK);
+        // a power of two, so that pieces are whole tiles
+        let fits = (device.limits().largest_buffer as usize / (16 * plan.products()).max(1)).max(super::TILE);
+        let chunk = capacity.min(CHUNK).min(1 << fits.ilog2());
         let learned = |words: usize| device.scratch(if learns { words } else { 1 });
         let gradients = plan.gradients()[6] * plan.width();
         DeviceDecoder {

@@ -1,0 +1,246 @@
+//! Training of `baseline` and `tface` on a GPU: the step of [`super::train`] with nobody waiting for the device.
+//!
+//! Rays are drawn, marched, decoded, compared and applied there; the host asks what some [`READ_EVERY`] steps came to.
+//! Masks and finer grids, a handful in a training, are made on the host. What a checkpoint holds is the same as on the
+//! CPU, so that either goes on from it.
+
+use super::record::FORMAT;
+use super::state::VmState;
+use super::train::{BEHIND, VmTraining, over_white};
+use crate::config::{MaskLoss, VmBackground, VmConfig};
+use crate::field::checkpoint::{Checkpoint, TrainingProgress};
+use crate::field::parameters::Parameter;
+use crate::field::pixels::Pixels;
+use crate::field::training::{Learner, StepError, StepReport};
+use crate::kernel::gpu::{
+    self, Batch, Behind, Buffer, Device, Gate, MaskTerm, Photographs, Vm, VmLosses, VmValues,
+};
+use crate::kernel::vm::VmField;
+
+/// Steps between two looks at losses: what goes wrong is known that much later.
+const READ_EVERY: u64 = 50;
+
+/// Values, moments and gradient of a parameter.
+struct Group {
+    state: [Buffer; 3],
+    gradient: Buffer,
+}
+
+impl Group {
+    fn new(device: &Device, p: &Parameter, upload: impl Fn(&[f32]) -> Buffer) -> Group {
+        let state = p.state().map(|v| upload(&v));
+        Group { gradient: device.zeros(state[0].words()), state }
+    }
+}
+
+/// What a training has on its device between two changes of its grids.
+struct There {
+    vm: Vm,
+    groups: [Group; 3],
+    broken: Buffer,
+}
+
+impl There {
+    fn new(device: &Device, field: &VmField, parameters: &[Parameter; 3], rays: usize) -> There {
+        let vm = Vm::new(device, field, rays, true);
+        let [density, color, network] = parameters;
+        let groups = [
+            Group::new(device, density, |v| vm.density.upload(device, v)),
+            Group::new(device, color, |v| vm.color.upload(device, v)),
+            Group::new(device, network, |v| device.upload(v)),
+        ];
+        There { groups, vm, broken: device.zeros(1) }
+    }
+
+    fn values(&self) -> VmValues<'_> {
+        let [density, color, network] = self.groups.each_ref().map(|g| &g.state[0]);
+        VmValues { density, color, network }
+    }
+
+    fn gradients(&self) -> VmValues<'_> {
+        let [density, color, network] = self.groups.each_ref().map(|g| &g.gradient);
+        VmValues { density, color, network }
+    }
+
+    /// Waits for the device; parameters as they are there, in place of those that lay there before.
+    fn read(&self, device: &Device, old: &[Parameter; 3]) -> [Parameter; 3] {
+        std::array::from_fn(|i| {
+            let state = self.groups[i].state.each_ref().map(|b| match i {
+                0 => self.vm.density.read(device, b),
+                1 => self.vm.color.read(device, b),
+                _ => device.read(b),
+            });
+            old[i].with(state)
+        })
+    }
+}
+
+pub(super) struct OnDevice<'a> {
+    /// What the CPU trains with; its parameters are older than those on the device.
+    host: VmTraining<'a>,
+    device: Device,
+    photographs: Photographs,
+    wanted: Buffer,
+    batch: Batch,
+    losses: VmLosses,
+    there: There,
+    /// Steps since losses were read.
+    unread: u64,
+}
+
+/// How opacity is held to the mask.
+fn mask_term(config: &VmConfig, pixels: &Pixels) -> MaskTerm {
+    let weight = config.mask_weight as f32;
+    match config.mask_loss {
+        _ if !pixels.masked => MaskTerm::None,
+        MaskLoss::None => MaskTerm::None,
+        MaskLoss::L2 => MaskTerm::L2(weight),
+        MaskLoss::Ce => MaskTerm::Ce(weight),
+    }
+}
+
+impl<'a> OnDevice<'a> {
+    /// Can a device train this? Else what it cannot.
+    pub fn knows(config: &VmConfig) -> Result<(), &'static str> {
+        if config.ortho > 0.0 {
+            return Err("lines that are orthogonal");
+        }
+        gpu::DeviceDecoder::knows(&super::record::decoder(config))
+    }
+
+    /// Moves a training that a device [`knows`](OnDevice::knows) there.
+    pub fn new(host: VmTraining<'a>, device: Device) -> OnDevice<'a> {
+        let config = host.config;
+        let random = config.background == VmBackground::Random;
+        let field = host.state.field(config, true);
+        OnDevice {
+            photographs: host.pixels.on_device(&device, true, random).behind(BEHIND),
+            wanted: device.upload(&[config.rays as u32]),
+            batch: Batch::new(&device, config.rays),
+            losses: VmLosses::new(&device, config.rays, mask_term(config, host.pixels)),
+            there: There::new(&device, &field, &host.state.parameters, config.rays),
+            host,
+            device,
+            unread: 0,
+        }
+    }
+
+    /// Ends the training on the device: what there is on the host.
+    pub fn finish(self) -> VmTraining<'a> {
+        self.host
+    }
+
+    /// Copies the host's state to the device.
+    fn push(&mut self) {
+        let (config, state) = (self.host.config, &self.host.state);
+        self.there = There::new(&self.device, &state.field(config, true), &state.parameters, config.rays);
+    }
+
+    /// Rebuilds the mask and refines the grids, on the host.
+    fn grow(&mut self, step: u64) -> Result<(), StepError> {
+        self.host.state.parameters = self.there.read(&self.device, &self.host.state.parameters);
+        self.host.grow(step)?;
+        self.push();
+        Ok(())
+    }
+
+    /// Launches a step; waits for nothing.
+    fn launch(&self, seed: u64, step: u64) {
+        let (device, config, there) = (&self.device, self.host.config, &self.there);
+        let (vm, batch, values) = (&there.vm, &self.batch, there.values());
+        self.photographs.draw(device, (seed, step), &self.wanted, batch);
+        let composed = vm.render(device, values, batch);
+        let white = config.background == VmBackground::Reference && over_white(seed, step);
+        let behind = Behind { lift: f32::from(white), target: config.background == VmBackground::Random };
+        let g_out = self.losses.of_rays(device, composed, batch, behind);
+        vm.backward(device, values, batch, g_out, there.gradients(), &there.broken);
+        let [of_density, of_color] = self.host.penalties(step);
+        vm.density.penalize(device, values.density, &of_density, there.gradients().density);
+        vm.color.penalize(device, values.color, &of_color, there.gradients().color);
+        let gate = Gate { count: self.losses.rays(), broken: &there.broken };
+        for (group, step) in there.groups.iter().zip(self.host.adam_steps(step)) {
+            gpu::adam(device, group.state.each_ref(), &group.gradient, &step, gate);
+        }
+        self.losses.add(device, vm, &there.broken);
+    }
+
+    /// Waits for the device: means over the steps since the last time.
+    fn report(&mut self, step: u64) -> Result<StepReport, StepError> {
+        let figures = self.losses.read(&self.device);
+        let steps = std::mem::take(&mut self.unread).max(1) as f64;
+        let counts = &mut self.host.counts;
+        counts.rays += figures.rays;
+        counts.lattice += figures.lattice;
+        counts.density += figures.density;
+        counts.color += figures.color;
+        let [rgb, mask, outside] = figures.terms.map(|t| t as f64 / steps);
+        for (term, value) in [("rgb", rgb), ("mask", mask)] {
+            if !value.is_finite() {
+                return Err(self.host.not_finite(term, value as f32, step));
+            }
+        }
+        if figures.broken {
+            return Err(self.host.not_finite("gradient of the", f32::NAN, step));
+        }
+        let samples = figures.density as f64 / steps;
+        let figures = vec![("rgb", rgb), ("mask", mask), ("samples", samples), ("outside", outside)];
+        Ok(StepReport { square_error: Some(rgb as f32), figures })
+    }
+}
+
+impl Learner for OnDevice<'_> {
+    const FORMAT: &'static str = FORMAT;
+    const RATES: [&'static str; 2] = VmTraining::RATES;
+    const EVERY: u64 = READ_EVERY;
+
+    fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError> {
+        let step = progress.step;
+        self.launch(self.host.seed(progress), step);
+        self.unread += 1;
+        let done = step + 1;
+        let mut report = StepReport { square_error: None, figures: Vec::new() };
+        if done.is_multiple_of(READ_EVERY) || done == self.host.config.steps {
+            report = self.report(step)?;
+        }
+        if self.host.grows(step) {
+            self.grow(step)?;
+        }
+        Ok(report)
+    }
+
+    fn save(
+        &self,
+        progress: &TrainingProgress,
+        into: &mut Checkpoint,
+        finished: bool,
+    ) -> Result<(), StepError> {
+        let state = &self.host.state;
+        let state = VmState {
+            parameters: self.there.read(&self.device, &state.parameters),
+            mask: state.mask.clone(),
+            ..*state
+        };
+        let broken = self.device.read::<u32>(&self.there.broken)[0] != 0;
+        if broken || !state.is_finite() {
+            return Err(self.host.not_finite("grid", f32::NAN, progress.step));
+        }
+        state.save(self.host.config, into, finished);
+        Ok(())
+    }
+
+    fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
+        let finished = from.as_ref().is_some_and(|(.., finished)| *finished);
+        self.host.restore(from)?;
+        self.losses.read(&self.device);
+        self.unread = 0;
+        // nobody goes on from a finished one, which has no moments
+        if !finished {
+            self.push();
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+#[path = "on_device_tests.rs"]
+mod tests;
