@@ -4,10 +4,14 @@ use super::record::{FORMAT, FieldRecord, NAMES, Placement, geometry};
 use crate::Result;
 use crate::field::checkpoint::{self, Checkpoint};
 use crate::geom::{Ray, RayResult};
+#[cfg(feature = "wgpu")]
+use crate::kernel::gpu;
 use crate::kernel::march::MarchRay;
 use crate::kernel::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
 use glam::Vec3;
 use std::path::Path;
+#[cfg(feature = "wgpu")]
+use std::sync::{Arc, Mutex};
 
 /// The trained field on the host. Positions and distances are in scene units.
 pub struct TFace {
@@ -16,6 +20,9 @@ pub struct TFace {
     pub(super) values: [Vec<f32>; 3],
     weights: DecoderWeights,
     pub(super) placement: Option<Placement>,
+    /// The field on a device, which answers instead of the processor.
+    #[cfg(feature = "wgpu")]
+    there: Mutex<Option<gpu::VmRenderer>>,
 }
 
 /// Rays rendered together: what they keep stays in the low hundreds of megabytes.
@@ -24,7 +31,14 @@ const PASS: usize = 1 << 13;
 impl TFace {
     pub(super) fn from_parts(field: VmField, values: [Vec<f32>; 3], placement: Option<Placement>) -> TFace {
         let weights = DecoderWeights::new(field.decoder, &values[2]);
-        TFace { field, values, weights, placement }
+        TFace {
+            field,
+            values,
+            weights,
+            placement,
+            #[cfg(feature = "wgpu")]
+            there: Mutex::new(None),
+        }
     }
 
     /// Loads the field from the checkpoint in a folder of `stage`.
@@ -41,37 +55,59 @@ impl TFace {
         Ok(TFace::from_parts(field, values, record.placement))
     }
 
+    /// Lets a device answer, where it can decode this field.
+    #[cfg(feature = "wgpu")]
+    pub(super) fn on(&mut self, device: Arc<gpu::Device>) {
+        if gpu::DeviceDecoder::knows(&self.field.decoder).is_ok() {
+            let renderer =
+                gpu::VmRenderer::new(device, &self.field, self.values.each_ref().map(|v| v.as_slice()));
+            self.there = Mutex::new(Some(renderer));
+        }
+    }
+
+    /// What the device answers; none where there is none, or where it failed: then the processor answers.
+    #[cfg(feature = "wgpu")]
+    fn ask(&self, rays: impl Fn() -> Vec<MarchRay>) -> Option<Vec<[f32; RAY_WIDTH]>> {
+        let mut there = self.there.lock().ok()?;
+        let answer = there.as_mut()?.render(&rays());
+        if let Err(e) = &answer {
+            tracing::warn!("{e}; the processor goes on");
+            *there = None;
+        }
+        answer.ok()
+    }
+
     /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
     /// vector `forward`.
     pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
-        rays.chunks(PASS).flat_map(|rays| self.pass(rays, forward)).collect()
-    }
-
-    fn pass(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         let p = self.placement.unwrap_or(Placement { scale: 1.0, offset: [0.0; 3], depth_directions: false });
         // length of each direction in the field's units of t
         let stretch = |r: &Ray| {
             if p.depth_directions { 1.0 / r.direction.dot(forward).max(1e-3) } else { 1.0 }
         };
-        let placed: Vec<MarchRay> = rays
-            .iter()
-            .map(|r| MarchRay {
+        let placed = |rays: &[Ray]| -> Vec<MarchRay> {
+            let place = |r: &Ray| MarchRay {
                 origin: std::array::from_fn(|a| p.scale * r.origin[a] + p.offset[a]),
                 direction: (r.direction * stretch(r)).to_array(),
                 jitter: 0.0,
-            })
-            .collect();
+            };
+            rays.iter().map(place).collect()
+        };
+        let result = |(o, r): (&[f32; RAY_WIDTH], &Ray)| RayResult {
+            color: [o[0], o[1], o[2]].map(|c| c.clamp(0.0, 1.0)),
+            opacity: o[3].clamp(0.0, 1.0),
+            depth: if o[3] > 0.0 { o[4] / o[3] * stretch(r) / p.scale } else { 0.0 },
+            normal: Vec3::ZERO,
+        };
+        #[cfg(feature = "wgpu")]
+        if let Some(seen) = self.ask(|| placed(rays)) {
+            return seen.iter().zip(rays).map(result).collect();
+        }
         let [density, color, _] = &self.values;
-        vm::render(&self.field, density, color, &self.weights, &placed)
-            .out
-            .chunks_exact(RAY_WIDTH)
-            .zip(rays)
-            .map(|(o, r)| RayResult {
-                color: [o[0], o[1], o[2]].map(|c| c.clamp(0.0, 1.0)),
-                opacity: o[3].clamp(0.0, 1.0),
-                depth: if o[3] > 0.0 { o[4] / o[3] * stretch(r) / p.scale } else { 0.0 },
-                normal: Vec3::ZERO,
-            })
-            .collect()
+        let pass = |rays: &[Ray]| -> Vec<RayResult> {
+            let seen = vm::render(&self.field, density, color, &self.weights, &placed(rays)).out;
+            seen.as_chunks().0.iter().zip(rays).map(result).collect()
+        };
+        rays.chunks(PASS).flat_map(pass).collect()
     }
 }

@@ -17,24 +17,46 @@
 use super::TFace;
 use super::train::{self, TfaceReport, train_one};
 use crate::config::{MaskUse, VmConfig, VmStart};
+#[cfg(feature = "wgpu")]
+use crate::field::Place;
 use crate::field::pixels::{Pixels, TrainView};
 use crate::field::training::{self, TrainingSession};
 use crate::geom::{Aabb, Ray, RayResult};
+#[cfg(feature = "wgpu")]
+use crate::io::Lock;
 use crate::kernel::march::Bitmask;
 use crate::{Monitor, Result, io};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
+#[cfg(feature = "wgpu")]
+use std::sync::Arc;
 
 /// The trained fields of a stage. Positions and distances are in scene units.
 pub struct FieldMean {
     fields: Vec<TFace>,
+    /// Held while a device answers.
+    #[cfg(feature = "wgpu")]
+    _lock: Option<Lock>,
 }
 
 impl FieldMean {
     /// Loads `count` fields from the checkpoints in a folder of `stage`.
     pub fn load(stage: &'static str, dir: &Path, count: usize) -> Result<FieldMean> {
         let fields = (0..count).map(|i| TFace::load(stage, &folder(dir, i))).collect::<Result<_>>()?;
-        Ok(FieldMean { fields })
+        Ok(FieldMean {
+            fields,
+            #[cfg(feature = "wgpu")]
+            _lock: None,
+        })
+    }
+
+    /// Lets the GPU of a place answer, if it is one.
+    #[cfg(feature = "wgpu")]
+    pub fn on(mut self, place: Place) -> FieldMean {
+        let Place::Gpu(gpu) = place else { return self };
+        let device = Arc::new(gpu.device);
+        self.fields.iter_mut().for_each(|field| field.on(device.clone()));
+        FieldMean { _lock: gpu.lock, ..self }
     }
 
     /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit

@@ -16,6 +16,7 @@ use crate::kernel::gpu::{
     self, Batch, Behind, Buffer, Device, Gate, MaskTerm, Photographs, Vm, VmLosses, VmValues,
 };
 use crate::kernel::vm::VmField;
+use crate::{Error, Result};
 
 /// Steps between two looks at losses: what goes wrong is known that much later.
 const READ_EVERY: u64 = 50;
@@ -63,15 +64,17 @@ impl There {
     }
 
     /// Waits for the device; parameters as they are there, in place of those that lay there before.
-    fn read(&self, device: &Device, old: &[Parameter; 3]) -> [Parameter; 3] {
-        std::array::from_fn(|i| {
-            let state = self.groups[i].state.each_ref().map(|b| match i {
-                0 => self.vm.density.read(device, b),
-                1 => self.vm.color.read(device, b),
-                _ => device.read(b),
-            });
-            old[i].with(state)
-        })
+    fn fetch(&self, device: &Device, old: &[Parameter; 3]) -> Result<[Parameter; 3]> {
+        let [density, color, network] = old;
+        let group = |old: &Parameter, i: usize, fetch: &dyn Fn(&Buffer) -> Result<Vec<f32>>| {
+            let [values, first, second] = &self.groups[i].state;
+            Ok::<_, Error>(old.with([fetch(values)?, fetch(first)?, fetch(second)?]))
+        };
+        Ok([
+            group(density, 0, &|b| self.vm.density.fetch(device, b))?,
+            group(color, 1, &|b| self.vm.color.fetch(device, b))?,
+            group(network, 2, &|b| device.fetch(b))?,
+        ])
     }
 }
 
@@ -138,7 +141,7 @@ impl<'a> OnDevice<'a> {
 
     /// Rebuilds the mask and refines the grids, on the host.
     fn grow(&mut self, step: u64) -> Result<(), StepError> {
-        self.host.state.parameters = self.there.read(&self.device, &self.host.state.parameters);
+        self.host.state.parameters = self.there.fetch(&self.device, &self.host.state.parameters)?;
         self.host.grow(step)?;
         self.push();
         Ok(())
@@ -166,7 +169,7 @@ impl<'a> OnDevice<'a> {
 
     /// Waits for the device: means over the steps since the last time.
     fn report(&mut self, step: u64) -> Result<StepReport, StepError> {
-        let figures = self.losses.read(&self.device);
+        let figures = self.losses.fetch(&self.device)?;
         let steps = std::mem::take(&mut self.unread).max(1) as f64;
         let counts = &mut self.host.counts;
         counts.rays += figures.rays;
@@ -216,11 +219,11 @@ impl Learner for OnDevice<'_> {
     ) -> Result<(), StepError> {
         let state = &self.host.state;
         let state = VmState {
-            parameters: self.there.read(&self.device, &state.parameters),
+            parameters: self.there.fetch(&self.device, &state.parameters)?,
             mask: state.mask.clone(),
             ..*state
         };
-        let broken = self.device.read::<u32>(&self.there.broken)[0] != 0;
+        let broken = self.device.fetch::<u32>(&self.there.broken)?[0] != 0;
         if broken || !state.is_finite() {
             return Err(self.host.not_finite("grid", f32::NAN, progress.step));
         }
@@ -231,7 +234,7 @@ impl Learner for OnDevice<'_> {
     fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
         let finished = from.as_ref().is_some_and(|(.., finished)| *finished);
         self.host.restore(from)?;
-        self.losses.read(&self.device);
+        self.losses.fetch(&self.device)?;
         self.unread = 0;
         // nobody goes on from a finished one, which has no moments
         if !finished {

@@ -1,12 +1,14 @@
 use super::*;
 use crate::Monitor;
+use crate::Quiet;
 use crate::config::Preset;
+use crate::field;
 use crate::field::ball::{self, StopAfter, hull, session, temporary};
 use crate::field::pixels::TrainView;
-use crate::field::training::{self, TrainingSession};
+use crate::field::training::TrainingSession;
 use crate::kernel::gpu::tests::device;
-use crate::tface::TFace;
-use crate::{Quiet, Result};
+use crate::tface::train::train_one;
+use crate::tface::{FieldMean, TFace};
 use glam::Vec2;
 use std::path::Path;
 
@@ -69,16 +71,23 @@ fn losses_follow_those_of_the_cpu_and_nobody_waits() {
     }
 }
 
-/// PSNR of two photographs.
+/// PSNR of two photographs; a device sees the same.
 fn psnr(views: &[TrainView], dir: &Path) -> f64 {
     let face = TFace::load("tface", dir).unwrap();
+    let there = FieldMean::load("tface", dir, 1).unwrap().on(field::place("wgpu:0").unwrap());
     let mut sum = 0f64;
     for view in &views[..2] {
         let rays: Vec<_> = (0..1600)
             .map(|p| view.camera.ray(Vec2::new((p % 40) as f32 + 0.5, (p / 40) as f32 + 0.5)).unwrap())
             .collect();
         let mask = &view.mask.as_ref().unwrap().values;
-        for (p, seen) in face.render(&rays, view.camera.forward()).iter().enumerate() {
+        let forward = view.camera.forward();
+        for (p, (seen, there)) in
+            face.render(&rays, forward).iter().zip(there.render(&rays, forward)).enumerate()
+        {
+            let close = |a: f32, b: f32| (a - b).abs() < 1e-4;
+            assert!((0..3).all(|c| close(seen.color[c], there.color[c])), "{seen:?} {there:?}");
+            assert!(close(seen.opacity, there.opacity) && close(seen.depth, there.depth));
             let a = mask[p] as f64 / 255.0;
             let want = view.photo.rgb[p].map(|c| a * c as f64 / 255.0);
             sum += (0..3).map(|c| (seen.color[c] as f64 - want[c]).powi(2)).sum::<f64>();
@@ -100,16 +109,9 @@ fn a_checkpoint_goes_from_the_cpu_to_a_device_and_back() {
         for &(on_device, steps) in parts {
             let stop = StopAfter::new(steps);
             let session = session("tface", dir.path(), "ball", &stop as &dyn Monitor);
-            let host = training(&pixels, &config, &session);
-            let end = if on_device {
-                let mut there = OnDevice::new(host, device().unwrap());
-                training::train(&mut there, &session, config.steps, 60.0).map(|(p, _)| p.step)
-            } else {
-                let mut host = host;
-                training::train(&mut host, &session, config.steps, 60.0).map(|(p, _)| p.step)
-            };
-            let done: Result<u64> = end;
-            assert!(done.is_ok_and(|s| s == config.steps) || steps < config.steps);
+            let session = TrainingSession { device: if on_device { "wgpu:0" } else { "cpu" }, ..session };
+            let done = train_one(&pixels, BOUNDS, Some(&hull()), &config, &session);
+            assert!(done.is_ok() || steps < config.steps);
         }
         psnr(&views, dir.path())
     };

@@ -41,7 +41,7 @@ pub use points::SurfacePoints;
 pub use schedule::{Pitch, RayBudget, Schedule};
 pub use sdf::Sdf;
 pub use self_test::{Check, self_test};
-pub use vm::{Behind, DeviceDecoder, DeviceGrid, MaskTerm, Vm, VmFigures, VmLosses, VmValues};
+pub use vm::{Behind, DeviceDecoder, DeviceGrid, MaskTerm, Vm, VmFigures, VmLosses, VmRenderer, VmValues};
 
 #[cfg(test)]
 pub(crate) use device::tests;

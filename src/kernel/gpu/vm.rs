@@ -9,10 +9,12 @@ mod grid;
 mod losses;
 mod march;
 mod rays;
+mod renderer;
 
 pub use decoder::DeviceDecoder;
 pub use grid::DeviceGrid;
 pub use losses::{Behind, MaskTerm, VmFigures, VmLosses};
+pub use renderer::VmRenderer;
 
 use super::device::{Buffer, Device};
 use super::draw::Batch;
@@ -25,6 +27,9 @@ const TILE: usize = 64;
 
 /// The most samples of a batch: what lies along rays that have more is not looked at. A mask leaves far fewer.
 const MOST: usize = 1 << 23;
+
+/// The same of a field that does not learn.
+const SEEN: usize = 1 << 22;
 
 /// A field on a device, and room for a batch of rays.
 pub struct Vm {
@@ -53,9 +58,14 @@ impl Vm {
     /// For so many rays, whatever they meet; with room for gradients where it learns. The decoder must be one that
     /// [`DeviceDecoder::knows`].
     pub fn new(device: &Device, field: &VmField, rays: usize, learns: bool) -> Vm {
+        Vm::with_room(device, field, rays, if learns { MOST } else { SEEN }, learns)
+    }
+
+    /// With room for `most` samples at most.
+    fn with_room(device: &Device, field: &VmField, rays: usize, most: usize, learns: bool) -> Vm {
         assert_eq!(field.density.size, field.color.size);
         let lattice = DeviceLattice::new(device, field);
-        let capacity = (rays * lattice.most).min(MOST).next_multiple_of(TILE);
+        let capacity = (rays * lattice.most).min(most).next_multiple_of(TILE);
         let color = DeviceGrid::new(device, field.color);
         Vm {
             density: DeviceGrid::new(device, field.density),
@@ -110,7 +120,7 @@ impl Vm {
         );
     }
 
-    /// How many samples were looked up and how many decoded, `[2]` each; and lattice points of each ray, `[rays]`.
+    /// How many samples were looked up, and would have been with more room, and how many decoded, `[2]` each; and lattice points of each ray, `[rays]`.
     pub fn counts(&self) -> [&Buffer; 3] {
         [&self.samples.count, &self.along.count, &self.samples.points]
     }

@@ -2,6 +2,7 @@
 
 use super::super::device::{Atomics, Buffer, Device, groups};
 use super::super::sum::{Exchange, Fixed, MOST, Native, Sum};
+use crate::Result;
 use crate::kernel::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, Penalty, tv_factors};
 use cubecl::prelude::*;
 
@@ -394,17 +395,17 @@ impl DeviceGrid {
         device.upload(&out)
     }
 
-    /// Copies them back.
-    pub fn read(&self, device: &Device, buffer: &Buffer) -> Vec<f32> {
-        let values = device.read::<f32>(buffer);
+    /// Waits for the device and copies them back: see [`Device::fetch`].
+    pub fn fetch(&self, device: &Device, buffer: &Buffer) -> Result<Vec<f32>> {
+        let values = device.fetch::<f32>(buffer)?;
         if self.grid == self.padded {
-            return values;
+            return Ok(values);
         }
         let mut out = Vec::with_capacity(self.grid.len());
         for (a, b) in self.pairs().filter(|(a, _)| !a.is_empty()) {
             values[b.range()].chunks(b.channels).for_each(|row| out.extend_from_slice(&row[..a.channels]));
         }
-        out
+        Ok(out)
     }
 
     /// Features of samples, `[capacity]`: the sum over terms and channels. place: planes `[3, capacity]`.

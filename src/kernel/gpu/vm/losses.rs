@@ -10,6 +10,7 @@
 use super::super::device::{Buffer, Device, groups};
 use super::super::draw::Batch;
 use super::Vm;
+use crate::Result;
 use crate::kernel::vm::RAY_WIDTH;
 use cubecl::prelude::*;
 
@@ -265,11 +266,11 @@ impl VmLosses {
     }
 
     /// Waits for the device; what the steps since the last time came to.
-    pub fn read(&mut self, device: &Device) -> VmFigures {
-        let t = device.read::<u32>(&self.totals);
+    pub fn fetch(&mut self, device: &Device) -> Result<VmFigures> {
+        let t = device.fetch::<u32>(&self.totals)?;
         self.totals = device.zeros(TOTALS);
         let [lattice, density, color, rays] = [3, 4, 5, 6].map(|i| t[i] as u64);
         let terms = [t[0], t[1], t[2]].map(f32::from_bits);
-        VmFigures { terms, lattice, density, color, rays, broken: t[7] != 0 }
+        Ok(VmFigures { terms, lattice, density, color, rays, broken: t[7] != 0 })
     }
 }

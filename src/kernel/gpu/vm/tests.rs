@@ -9,18 +9,18 @@ use crate::kernel::vm::{
 use crate::kernel::{reference, rng};
 
 /// A field, its values, rays, and gradients of what they see.
-struct Case {
-    field: VmField,
-    density: Vec<f32>,
-    color: Vec<f32>,
-    network: Vec<f32>,
-    rays: Vec<MarchRay>,
+pub(super) struct Case {
+    pub field: VmField,
+    pub density: Vec<f32>,
+    pub color: Vec<f32>,
+    pub network: Vec<f32>,
+    pub rays: Vec<MarchRay>,
     g: Vec<f32>,
 }
 
 /// What differs between cases.
 #[derive(Clone, Copy)]
-struct Shape {
+pub(super) struct Shape {
     softplus: bool,
     hidden: usize,
     density: [usize; 3],
@@ -31,7 +31,7 @@ struct Shape {
 }
 
 /// Hidden layers of one tile, ranks of whole vectors.
-const NARROW: Shape = Shape {
+pub(super) const NARROW: Shape = Shape {
     softplus: false,
     hidden: 64,
     density: [8, 8, 8],
@@ -52,7 +52,7 @@ const WIDE: Shape = Shape {
     masked: false,
 };
 
-fn case(shape: Shape, count: u64) -> Case {
+pub(super) fn case(shape: Shape, count: u64) -> Case {
     let size = [9, 12, 7];
     let (min, max) = ([-1.0, -1.5, -0.75], [1.0, 1.5, 0.75]);
     let hit = |c: [usize; 3]| !(c[0] + 3 * c[1] + 5 * c[2]).is_multiple_of(4) && c[2] < 25;
@@ -140,7 +140,11 @@ impl There {
         let broken = device.zeros(1);
         self.vm.backward(device, self.values(), &self.rays, &self.g_out, gradients, &broken);
         assert_eq!(device.read::<u32>(&broken), [0]);
-        [self.vm.density.read(device, &d), self.vm.color.read(device, &c), device.read(&n)]
+        [
+            self.vm.density.fetch(device, &d).unwrap(),
+            self.vm.color.fetch(device, &c).unwrap(),
+            device.read(&n),
+        ]
     }
 }
 
@@ -264,8 +268,8 @@ fn penalties_are_those_of_the_cpu() {
             let on = DeviceGrid::new(&device, grid);
             let (values, gradient) = (on.upload(&device, &x), on.upload(&device, &before));
             on.penalize(&device, &values, &penalty, &gradient);
-            agree("penalized", &on.read(&device, &gradient), &want, 1e-5);
-            assert_eq!(on.read(&device, &values), x);
+            agree("penalized", &on.fetch(&device, &gradient).unwrap(), &want, 1e-5);
+            assert_eq!(on.fetch(&device, &values).unwrap(), x);
         }
     }
 }
@@ -337,10 +341,10 @@ fn losses_and_gradients_agree_with_f64_finite_differences() {
         let want = losses(&shown, &wide, term, behind);
         on.add(&device, &vm, &device.upload(&[0u32]));
         on.add(&device, &vm, &device.upload(&[1u32]));
-        let figures = on.read(&device);
+        let figures = on.fetch(&device).unwrap();
         agree("losses", &figures.terms, &want.map(|t| 2.0 * t as f32), 1e-5);
         assert_eq!((figures.rays, figures.broken), (2 * 34, true));
-        assert_eq!(on.read(&device).terms, [0.0; 3]);
+        assert_eq!(on.fetch(&device).unwrap().terms, [0.0; 3]);
         let total = |x: &[f64]| {
             let t = losses(&shown, x, term, behind);
             t[0] + match term {
