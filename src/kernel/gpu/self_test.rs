@@ -166,6 +166,7 @@ pub fn self_test(device: &Device) -> Result<Vec<Check>> {
     let [p, m, v] = &mut want;
     kernel::adam::adam(p, m, v, &mut g_flat.clone(), &step);
     check("optimizer", &device.fetch(&there[0])?, &want[0], 1e-5);
+    checks.extend(super::vm::checks(device)?);
     Ok(checks)
 }
 
@@ -180,7 +181,7 @@ mod tests {
             let began = std::time::Instant::now();
             let checks = self_test(&device).unwrap();
             println!("{:?} in {:.1?}: {checks:?}", device.atomics(), began.elapsed());
-            assert!(checks.len() == 6 && checks.iter().all(|c| c.passed()), "{checks:?}");
+            assert!(checks.len() == 10 && checks.iter().all(|c| c.passed()), "{checks:?}");
         }
         let wrong = |got: f32| Check { name: "", error: worst(&[1.0, got], &[1.0, 2.0]), allowed: 1e-4 };
         assert!(wrong(2.0).passed() && !wrong(2.001).passed() && !wrong(f32::NAN).passed());

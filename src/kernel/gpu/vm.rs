@@ -10,11 +10,13 @@ mod losses;
 mod march;
 mod rays;
 mod renderer;
+mod self_test;
 
 pub use decoder::DeviceDecoder;
 pub use grid::DeviceGrid;
 pub use losses::{Behind, MaskTerm, VmFigures, VmLosses};
 pub use renderer::VmRenderer;
+pub(super) use self_test::checks;
 
 use super::device::{Buffer, Device};
 use super::draw::Batch;

@@ -57,7 +57,7 @@ impl VmRenderer {
 #[cfg(test)]
 mod tests {
     use super::super::super::device::tests::{agree, device};
-    use super::super::tests::{NARROW, case};
+    use super::super::self_test::{NARROW, case};
     use super::*;
     use crate::kernel::vm::{DecoderWeights, render};
 
