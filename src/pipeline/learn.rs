@@ -145,10 +145,7 @@ impl Fields for TrainedFields<'_> {
         let Line { run, config, .. } = self.line;
         let load = || {
             let count = config.radiance(stage).learned();
-            let field = FieldMean::load(stage.word(), &run.path(stage), count)?;
-            #[cfg(feature = "wgpu")]
-            let field = field.on(place(&config.device)?);
-            Ok(field)
+            FieldMean::load(stage.word(), &run.path(stage), count)
         };
         let cell = if stage == Stage::Baseline { &self.baseline } else { &self.tface };
         once(cell, load).map(|f| f as &dyn Radiance)

@@ -15,6 +15,7 @@ use crate::field::training::{Learner, StepError, StepReport};
 use crate::kernel::gpu::{
     self, Batch, Behind, Buffer, Device, Gate, MaskTerm, Photographs, Vm, VmLosses, VmValues,
 };
+use crate::kernel::rng;
 use crate::kernel::vm::VmField;
 use crate::{Error, Result};
 
@@ -82,7 +83,8 @@ pub(super) struct OnDevice<'a> {
     /// What the CPU trains with; its parameters are older than those on the device.
     host: VmTraining<'a>,
     device: Device,
-    photographs: Photographs,
+    /// None where rays are drawn on the host: without repetition, in an order that a device does not know.
+    photographs: Option<Photographs>,
     wanted: Buffer,
     batch: Batch,
     losses: VmLosses,
@@ -112,12 +114,20 @@ impl<'a> OnDevice<'a> {
     }
 
     /// Moves a training that a device [`knows`](OnDevice::knows) there.
-    pub fn new(host: VmTraining<'a>, device: Device) -> OnDevice<'a> {
+    ///
+    /// # Errors
+    ///
+    /// Where the photographs do not fit.
+    pub fn new(host: VmTraining<'a>, device: Device) -> Result<OnDevice<'a>> {
         let config = host.config;
         let random = config.background == VmBackground::Random;
         let field = host.state.field(config, true);
-        OnDevice {
-            photographs: host.pixels.on_device(&device, true, random).behind(BEHIND),
+        let photographs = match config.whole_frame {
+            true => None,
+            false => Some(host.pixels.on_device(&device, true, random)?.behind(BEHIND)),
+        };
+        Ok(OnDevice {
+            photographs,
             wanted: device.upload(&[config.rays as u32]),
             batch: Batch::new(&device, config.rays),
             losses: VmLosses::new(&device, config.rays, mask_term(config, host.pixels)),
@@ -125,7 +135,7 @@ impl<'a> OnDevice<'a> {
             host,
             device,
             unread: 0,
-        }
+        })
     }
 
     /// Ends the training on the device: what there is on the host.
@@ -147,11 +157,37 @@ impl<'a> OnDevice<'a> {
         Ok(())
     }
 
+    /// The rays of a step, drawn on the host.
+    fn drawn(&self, seed: u64, step: u64) -> Batch {
+        let (device, config) = (&self.device, self.host.config);
+        let own = self.host.pixels.draw(seed, step, config.rays, true);
+        let random = config.background == VmBackground::Random;
+        let (mut color, mut behind) = (vec![0f32; 3 * config.rays], vec![0f32; 3 * config.rays]);
+        let mut alpha = vec![0f32; config.rays];
+        for (r, (seen, a)) in own.color.iter().zip(&own.alpha).enumerate() {
+            alpha[r] = *a;
+            for c in 0..3 {
+                color[c * config.rays + r] = seen[c];
+                if random {
+                    let i = (3 * r + c) as u64;
+                    behind[c * config.rays + r] = rng::uniform(seed, step << 4 | BEHIND, i);
+                }
+            }
+        }
+        let [color, alpha, background] = [&color, &alpha, &behind].map(|v| device.upload(v));
+        Batch { color, alpha, background, ..Batch::of_rays(device, &own.rays, config.rays) }
+    }
+
     /// Launches a step; waits for nothing.
-    fn launch(&self, seed: u64, step: u64) {
+    fn launch(&mut self, seed: u64, step: u64) {
+        if self.photographs.is_none() {
+            self.batch = self.drawn(seed, step);
+        }
         let (device, config, there) = (&self.device, self.host.config, &self.there);
         let (vm, batch, values) = (&there.vm, &self.batch, there.values());
-        self.photographs.draw(device, (seed, step), &self.wanted, batch);
+        if let Some(photographs) = &self.photographs {
+            photographs.draw(device, (seed, step), &self.wanted, batch);
+        }
         let composed = vm.render(device, values, batch);
         let white = config.background == VmBackground::Reference && over_white(seed, step);
         let behind = Behind { lift: f32::from(white), target: config.background == VmBackground::Random };

@@ -50,7 +50,7 @@ fn losses_follow_those_of_the_cpu_and_nobody_waits() {
     let pixels = pixels(&views, &config);
     let session = session("tface", dir.path(), "ball", &Quiet);
     let mut on_cpu = training(&pixels, &config, &session);
-    let mut there = OnDevice::new(training(&pixels, &config, &session), device);
+    let mut there = OnDevice::new(training(&pixels, &config, &session), device).ok().unwrap();
     let mut want = 0f64;
     for step in 0..config.steps {
         let progress = TrainingProgress { step, ..TrainingProgress::default() };
@@ -121,4 +121,34 @@ fn a_checkpoint_goes_from_the_cpu_to_a_device_and_back() {
         println!("{parts:?}: {other:.2} dB, on the CPU {whole:.2} dB");
         assert!((other - whole).abs() < 0.2, "{parts:?}: {other} {whole}");
     }
+}
+
+#[test]
+fn rays_that_the_host_draws_in_order_give_the_losses_of_the_cpu() {
+    let Some(device) = device() else { return };
+    let (dir, views) = (temporary(), ball::views());
+    let config = VmConfig {
+        whole_frame: true,
+        mask_loss: MaskLoss::Ce,
+        background: VmBackground::Reference,
+        ..config()
+    };
+    let pixels = Pixels::permuted(&views, config.foreground, BOUNDS, true);
+    let session = session("tface", dir.path(), "ball", &Quiet);
+    let mut on_cpu = training(&pixels, &config, &session);
+    let mut there = OnDevice::new(training(&pixels, &config, &session), device).ok().unwrap();
+    for step in 0..6 {
+        let progress = TrainingProgress { step, ..TrainingProgress::default() };
+        let want = on_cpu.step(&progress).ok().unwrap().figures;
+        there.launch(there.host.seed(&progress), step);
+        there.unread += 1;
+        let got = there.report(step).ok().unwrap().figures;
+        for ((name, got), (_, want)) in got.iter().zip(&want).take(2) {
+            assert!((got - want).abs() < 1e-3 * want, "{name} at step {step}: {got} {want}");
+        }
+    }
+    // rays, their lattice points and colors are counted as on the CPU
+    let (counts, want) = (there.host.counts, on_cpu.counts);
+    assert_eq!((counts.rays, counts.lattice), (want.rays, want.lattice));
+    assert!(counts.color.abs_diff(want.color) < 10 && counts.density >= want.density);
 }

@@ -110,7 +110,7 @@ pub(super) fn train_one(
                 Error::usage(problem, "train with `--device cpu`")
             };
             OnDevice::knows(config).map_err(unknown)?;
-            let mut there = OnDevice::new(learner, gpu.device);
+            let mut there = OnDevice::new(learner, gpu.device)?;
             let done = training::train(&mut there, session, config.steps, config.checkpoint_s)?;
             learner = there.finish();
             done

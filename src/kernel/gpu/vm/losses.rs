@@ -4,8 +4,10 @@
 //! seen over, and means over the rays that there are:
 //!
 //! ```text
-//! ⟨(clamp(C + (1 − O) b) − h − (1 − a) b)²⟩ + mask · ⟨O²⟩ over rays with a = 0, or mask · ⟨−a ln O − (1 − a) ln(1 − O)⟩
+//! ⟨(clamp(C + (1 − O) b) − h − (1 − a) b)²⟩ + mask · ⟨O²⟩ over rays with a = 0, or mask · ⟨−m ln O − (1 − m) ln(1 − O)⟩
 //! ```
+//!
+//! where m is 1 for all that is a little head.
 
 use super::super::device::{Buffer, Device, groups};
 use super::super::draw::Batch;
@@ -29,7 +31,7 @@ pub enum MaskTerm {
     None,
     /// Squared opacity of background rays, with this weight.
     L2(f32),
-    /// Cross entropy of opacity and alpha, with this weight.
+    /// Cross entropy of opacity and mask, where all that is a little head is head, with this weight.
     Ce(f32),
 }
 
@@ -114,8 +116,9 @@ fn of_rays(
         }
         if ce {
             let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
-            mask = -(a * p.ln() + (1.0f32 - a) * (1.0f32 - p).ln()) * even;
-            let by_p = ((1.0f32 - a) / (1.0f32 - p) - a / p) * even * weight;
+            let m = select(a == 0.0f32, 0.0f32, 1.0f32);
+            mask = -(m * p.ln() + (1.0f32 - m) * (1.0f32 - p).ln()) * even;
+            let by_p = ((1.0f32 - m) / (1.0f32 - p) - m / p) * even * weight;
             g_opacity += select(p == opacity, by_p, 0.0f32);
         }
         g_out[3 * rays + r] = g_opacity;

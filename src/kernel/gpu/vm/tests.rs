@@ -156,7 +156,7 @@ fn losses(shown: &Shown, composed: &[f64], term: MaskTerm, behind: Behind) -> [f
         let p = o.clamp(1e-3, 1.0 - 1e-3);
         t[2] += if a == 0.0 { o * o / outside } else { 0.0 };
         if let MaskTerm::Ce(_) = term {
-            t[1] -= (a * p.ln() + (1.0 - a) * (1.0 - p).ln()) / rays;
+            t[1] -= if a > 0.0 { p.ln() } else { (1.0 - p).ln() } / rays;
         }
     }
     if let MaskTerm::L2(_) = term {
