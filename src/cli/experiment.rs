@@ -27,7 +27,7 @@ pub(super) struct ExperimentOptions {
     /// A share of the published effort, 0.001 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 1.0)]
     scale: f64,
-    /// Make this run alone, as named by --dry-run, and no tables; repeatable
+    /// Make this run alone, as named by --dry-run; the tables are of what lies there by now; repeatable
     #[arg(long, value_name = "CAPTURE/RUN")]
     only: Vec<String>,
     /// Figures of the publication: lines of table,row,measure,value
@@ -115,7 +115,10 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         io::create_folder(run.dir())?;
         screen.note("experiment", &task.name);
         match work(&line, task.run) {
-            Err(e) if e.kind().is_stop() => return Err(e),
+            Err(e) if e.kind().is_stop() => {
+                failed = Some(e);
+                break;
+            }
             // a row that fails is a result; the others are made all the same
             Err(e) => {
                 screen.note("experiment", &format!("{}: {e}", task.name));
@@ -127,27 +130,26 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     if common.dry_run {
         return Ok(());
     }
-    if options.only.is_empty() {
-        let rows: Vec<_> = ROWS.into_iter().filter(|row| words.contains(&row.table)).collect();
-        let of = |capture: &String, row: &crate::report::experiment::ExperimentRow| {
-            let beside = format!("{capture}/{}", row.run);
-            measured(&Run::open(&folder.join(&beside), stop.clone(), screen.clone()), row, &beside)
-        };
-        let measured = rows.iter().map(|row| captures.iter().map(|c| of(c, row)).collect()).collect();
-        let orderings = ORDERINGS.into_iter().filter(|o| words.contains(&o.table)).collect();
-        let experiment =
-            Experiment { scale: options.scale, tables, rows, orderings, captures, measured, published };
-        write(&folder, &experiment)?;
-        if common.json {
-            let result = json!({"event": "result", "out": folder.join("experiment.json")});
-            print(&format!("{result}\n"))?;
-        } else if !common.quiet {
-            print(&format!(
-                "{}\nexperiment {}\n",
-                experiment.markdown(),
-                folder.join("experiment.html").display()
-            ))?;
-        }
+    // of what lies there by now: whoever makes runs one by one has the tables as they fill
+    let rows: Vec<_> = ROWS.into_iter().filter(|row| words.contains(&row.table)).collect();
+    let of = |capture: &String, row: &crate::report::experiment::ExperimentRow| {
+        let beside = format!("{capture}/{}", row.run);
+        measured(&Run::open(&folder.join(&beside), stop.clone(), screen.clone()), row, &beside)
+    };
+    let measured = rows.iter().map(|row| captures.iter().map(|c| of(c, row)).collect()).collect();
+    let orderings = ORDERINGS.into_iter().filter(|o| words.contains(&o.table)).collect();
+    let experiment =
+        Experiment { scale: options.scale, tables, rows, orderings, captures, measured, published };
+    write(&folder, &experiment)?;
+    if common.json {
+        let result = json!({"event": "result", "out": folder.join("experiment.json")});
+        print(&format!("{result}\n"))?;
+    } else if !common.quiet {
+        print(&format!(
+            "{}\nexperiment {}\n",
+            experiment.markdown(),
+            folder.join("experiment.html").display()
+        ))?;
     }
     failed.map_or(Ok(()), Err)
 }

@@ -356,7 +356,7 @@ case (stability) is not within its bound.")]
   tiface experiment captures/* --scale 0.1      all tables at a tenth of the effort
   tiface experiment captures/002_00 --tables components,iface --out tables/
   tiface experiment captures/* --dry-run        the runs that tables are made of, and which are done
-  tiface experiment captures/* --only 002_00/tface-ce    one of them, for a cluster; tables come with a last call
+  tiface experiment captures/* --only 002_00/tface-ce    one of them, for a cluster; tables fill as they come
   tiface experiment captures/* --published figures.csv   a line is: tface,l2-reference,masked,30.1
 
 Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md, .csv, .json and .html.")]
