@@ -145,7 +145,10 @@ impl Fields for TrainedFields<'_> {
         let Line { run, config, .. } = self.line;
         let load = || {
             let count = config.radiance(stage).learned();
-            FieldMean::load(stage.word(), &run.path(stage), count)
+            let field = FieldMean::load(stage.word(), &run.path(stage), count)?;
+            #[cfg(feature = "wgpu")]
+            let field = field.on(place_of(&config.device)?);
+            Ok(field)
         };
         let cell = if stage == Stage::Baseline { &self.baseline } else { &self.tface };
         once(cell, load).map(|f| f as &dyn Radiance)
