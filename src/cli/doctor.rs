@@ -103,43 +103,61 @@ impl Display for Examination {
     }
 }
 
-/// What a step of I-Face as it is configured would take on GPUs by their data sheets.
+/// What steps of both fields as they are configured would take on GPUs by their data sheets.
 #[cfg(feature = "wgpu")]
 pub(super) fn model(common: &Common) -> Result<()> {
-    use crate::kernel::gpu::cost::{self, GPUS};
-    let config = common.resolve(None, None, &[])?.iface;
-    let shape = crate::iface::field_shape(&config);
-    let cost = cost::step_cost(&shape, config.samples, config.max_rays);
-    let memory = cost::memory(&shape, 4 * config.samples);
-    let predicted: Vec<Vec<f64>> =
-        GPUS.iter().map(|gpu| cost.iter().map(|kernel| cost::predict(kernel, gpu)).collect()).collect();
+    use crate::kernel::gpu::cost::{self, GPUS, GpuSheet, KernelCost};
+    /// Samples of a ray of T-Face whose density is looked up, and that get color: estimates for a head.
+    const LOOKED_UP: f64 = 100.0;
+    const COLORED: f64 = 10.0;
+    let config = common.resolve(None, None, &[])?;
+    let (iface, tface) = (&config.iface, &config.tface);
+    let shape = crate::iface::field_shape(iface);
+    let memory = cost::memory(&shape, 4 * iface.samples);
+    let side = (tface.voxels_final as f64).cbrt();
+    let channels: usize = tface.density_rank.iter().chain(&tface.color_rank).map(|&r| r as usize).sum();
+    let floats = channels as f64 * side * (side + 1.0);
+    let rays = tface.rays as f64;
+    let steps = [
+        (
+            format!("A step of I-Face, {} samples", iface.samples),
+            cost::step_cost(&shape, iface.samples, iface.max_rays),
+        ),
+        (
+            format!("A step of T-Face, {} rays, its last grid", tface.rays),
+            cost::vm_step_cost(floats, LOOKED_UP * rays, COLORED * rays),
+        ),
+    ];
+    let on = |gpu: &GpuSheet, kernels: &[KernelCost]| -> Vec<f64> {
+        kernels.iter().map(|kernel| cost::predict(kernel, gpu)).collect()
+    };
     if common.json {
-        let rows: Vec<_> = GPUS
-            .iter()
-            .zip(&predicted)
-            .map(|(gpu, seconds)| serde_json::json!({"gpu": gpu, "seconds": seconds}))
-            .collect();
-        let all = serde_json::json!({"kernels": cost, "predicted": rows, "memory": memory});
+        let rows = |(name, kernels): &(String, Vec<KernelCost>)| {
+            let seconds: Vec<_> =
+                GPUS.iter().map(|gpu| serde_json::json!({"gpu": gpu, "seconds": on(gpu, kernels)})).collect();
+            serde_json::json!({"step": name, "kernels": kernels, "predicted": seconds})
+        };
+        let all = serde_json::json!({"steps": steps.each_ref().map(rows), "iface_memory": memory});
         return print(&format!("{all}\n"));
     }
-    let mut text = format!(
-        "A prediction from data sheets, nothing here was measured.\n\nA step of I-Face, {} samples:\n{:<34} {:>8} {:>8} {:>9}\n",
-        config.samples, "", "MB", "GFLOP", "M atomics"
-    );
-    for k in &cost {
-        let [mb, gflop, atomics] = [k.bytes / 1e6, k.flops / 1e9, k.atomics / 1e6];
-        text += &format!("{:<34} {mb:>8.1} {gflop:>8.2} {atomics:>9.1}\n", k.name);
+    let mut text = "A prediction from data sheets: nothing here was measured.\n".to_string();
+    for (name, kernels) in &steps {
+        text += &format!("\n{name:<42} {:>8} {:>8} {:>9}\n", "MB", "GFLOP", "M atomics");
+        for k in kernels {
+            let [mb, gflop, atomics] = [k.bytes / 1e6, k.flops / 1e9, k.atomics / 1e6];
+            text += &format!("  {:<40} {mb:>8.1} {gflop:>8.2} {atomics:>9.1}\n", k.name);
+        }
+        text += &format!("{:<42} {:>8}  slowest\n", "", "ms");
+        for gpu in &GPUS {
+            let seconds = on(gpu, kernels);
+            let all: f64 = seconds.iter().sum();
+            let slowest = (0..kernels.len()).max_by(|&a, &b| seconds[a].total_cmp(&seconds[b])).unwrap_or(0);
+            text += &format!("  {:<40} {:>8.2}  {}\n", gpu.name, 1e3 * all, kernels[slowest].name);
+        }
     }
-    text += &format!("{:<34} {:>8} {:>8}  slowest\n", "\nGPU", "ms", "M/s");
-    for (gpu, seconds) in GPUS.iter().zip(&predicted) {
-        let all: f64 = seconds.iter().sum();
-        let slowest = (0..cost.len()).max_by(|&a, &b| seconds[a].total_cmp(&seconds[b])).unwrap_or(0);
-        let rate = config.samples as f64 / all / 1e6;
-        text += &format!("{:<33} {:>8.2} {rate:>8.1}  {}\n", gpu.name, 1e3 * all, cost[slowest].name);
-    }
+    let gib = memory / (1u64 << 30) as f64;
     text += &format!(
-        "\nIts memory: {:.2} GiB with room for four times the samples, without photographs.\n",
-        memory / (1u64 << 30) as f64
+        "\nI-Face's memory: {gib:.2} GiB, room for four times the samples; photographs come on top.\n"
     );
     print(&text)
 }

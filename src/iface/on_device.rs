@@ -328,6 +328,7 @@ impl There {
 impl Learner for OnDevice<'_> {
     const FORMAT: &'static str = FORMAT;
     const RATES: [&'static str; 2] = SdfTraining::RATES;
+    const EVERY: u64 = READ_EVERY;
 
     fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError> {
         let config = self.host.config;

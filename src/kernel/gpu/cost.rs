@@ -1,4 +1,4 @@
-//! What a training step of the signed-distance field moves and computes, counted from the kernels, and what that would
+//! What a training step of a field moves and computes, counted from the kernels, and what that would
 //! take on a GPU of which nothing is known but its data sheet. **A prediction**, not a measurement.
 
 use super::sdf::Sdf;
@@ -113,6 +113,24 @@ pub fn step_cost(shape: &FieldShape, samples: usize, rays: usize) -> Vec<KernelC
     ]
 }
 
+/// The kernels of a step of a vector-matrix field whose grids have so many floats, at so many samples whose density is
+/// looked up, and so many of those that get color; counts of a decoder of 128 units with 27 appearance features.
+pub fn vm_step_cost(floats: f64, density: f64, color: f64) -> Vec<KernelCost> {
+    let kernel = |name, bytes: f64, flops: f64, atomics: f64| KernelCost { name, bytes, flops, atomics };
+    vec![
+        kernel("march", 20.0 * density, 1_000.0 * density, 0.0),
+        kernel("density", 592.0 * density, 290.0 * density, 0.0),
+        kernel("weights and compositing", 70.0 * density + 40.0 * color, 80.0 * density, 0.0),
+        kernel("decoder", 1_750.0 * color, 53e3 * color, 0.0),
+        kernel("backward of the decoder", 10_500.0 * color, 158e3 * color, 0.0),
+        kernel("scatter color", 2_000.0 * color, 1_500.0 * color, 432.0 * color),
+        // a third of the samples carry weight
+        kernel("scatter density", 200.0 * density, 170.0 * density, 48.0 * density),
+        kernel("total variation", 12.0 * floats, 10.0 * floats, 0.0),
+        kernel("optimizer", 32.0 * floats, 12.0 * floats, 0.0),
+    ]
+}
+
 /// Seconds a kernel takes on a GPU: what is slowest of moving, computing and adding.
 pub fn predict(kernel: &KernelCost, gpu: &GpuSheet) -> f64 {
     let moved = kernel.bytes / (STREAMED * gpu.bandwidth);
@@ -151,6 +169,10 @@ mod tests {
         for gpu in &GPUS {
             assert!(cost.iter().all(|k| predict(k, gpu) > k.bytes / gpu.bandwidth));
         }
+        // three planes and lines of 331 x 368 x 220, 64 channels: 5.9 million floats, of 32 bytes each
+        let floats = 64.0 * ((331 * 368 + 331 * 220 + 368 * 220) / 3 + (331 + 368 + 220) / 3) as f64;
+        let last = *vm_step_cost(floats, 4e5, 4e4).last().unwrap();
+        assert!((last.bytes / 1e6 - 188.8).abs() < 0.1, "{}", last.bytes);
         assert!(memory(&shape, 1 << 18) > 4.0 * (1 << 18) as f64 * 300.0);
     }
 }
