@@ -29,7 +29,8 @@ pub(super) fn run(common: &Common) -> Result<()> {
     #[cfg(feature = "wgpu")]
     let (devices, auto) = {
         use crate::field::devices::{best, examine};
-        let auto = match best() {
+        let choice = crate::config::DeviceChoice::parse("auto").expect("a device's name");
+        let auto = match best(&choice) {
             Ok(gpu) => format!("{}: {}", gpu.device.name(), gpu.why),
             Err(why) => format!("the processor: {why}"),
         };

@@ -361,7 +361,7 @@ case (stability) is not within its bound.")]
 
 Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md, .csv, .json and .html.")]
     Experiment(ExperimentOptions),
-    /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates, size
+    /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates
     #[command(after_long_help = "Examples:
   tiface check head.glb
   tiface check scan.obj --require watertight --require one-piece
@@ -412,8 +412,15 @@ Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are expe
         #[arg(long, value_name = "KEY")]
         explain: Option<String>,
     },
-    /// What this machine can compute on: its GPUs, whether they compute right, which one `auto` takes
+    /// The GPUs here, whether they compute right, and which one `auto` takes
     #[cfg(feature = "cpu")]
+    #[command(after_long_help = "Examples:
+  tiface doctor                 drivers, memory, and a self-test of each device; what to paste into a bug report
+  tiface doctor --json          the same for programs
+  tiface doctor --model         what training steps would take on GPUs by their data sheets
+
+It exits with 1 if a device computes something else than the processor does. Without the feature `wgpu` it knows the
+processor alone, and no --model.")]
     Doctor {
         /// What a training step would take on GPUs by their data sheets: a prediction, not a measurement
         #[cfg(feature = "wgpu")]

@@ -33,6 +33,12 @@ pub(super) struct Common {
     /// auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one
     #[arg(long, global = true, env = "TIFACE_DEVICE", hide_env = true)]
     pub device: Option<String>,
+    /// On a GPU, sum in whole numbers: the same bytes every time, as on the processor
+    #[arg(long, global = true, hide_short_help = true)]
+    pub deterministic: bool,
+    /// Memory of a GPU that a training may take, GiB [default: all of it]
+    #[arg(long, global = true, value_name = "GIB", hide_short_help = true)]
+    pub memory: Option<f64>,
     /// Start of every random sequence
     #[arg(long, global = true, env = "TIFACE_SEED", hide_env = true)]
     pub seed: Option<u64>,
@@ -121,8 +127,15 @@ impl Common {
                 .map_err(|_| Error::usage(format!("`{name}` is not UTF-8"), "save it as UTF-8"))?;
             sources.files.push((name, text));
         }
-        if let Some(device) = &self.device {
-            sources.options.push((format!("--device {device}"), "device".into(), device.clone()));
+        if self.device.is_some() || self.deterministic || self.memory.is_some() {
+            let mut word = self.device.clone().unwrap_or_else(|| "auto".into());
+            if self.deterministic {
+                word += "+deterministic";
+            }
+            if let Some(gib) = self.memory {
+                word += &format!("+{gib}GiB");
+            }
+            sources.options.push((format!("--device {word}"), "device".into(), word));
         }
         if let Some(seed) = self.seed {
             sources.options.push((format!("--seed {seed}"), "seed".into(), seed.to_string()));

@@ -10,6 +10,7 @@
 
 mod baseline;
 mod capture;
+mod device;
 mod ensemble;
 pub mod iface;
 mod mask;
@@ -23,6 +24,7 @@ mod vm;
 
 pub use baseline::BaselineConfig;
 pub use capture::CaptureConfig;
+pub use device::DeviceChoice;
 pub use ensemble::EnsembleConfig;
 pub use iface::IfaceConfig;
 pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors};
@@ -121,7 +123,7 @@ pub struct Config {
     pub preset: Preset,
     /// Start of every random sequence.
     pub seed: u64,
-    /// `auto`, `cpu`, `wgpu`, `vulkan`, `metal` or `dx12`, with `:N` a numbered one.
+    /// A [`DeviceChoice`] as a word.
     pub device: String,
     /// What was photographed.
     pub capture: CaptureConfig,
@@ -156,7 +158,8 @@ const ROOT_KEYS: &[Key] = &[
     ),
     Key::word(
         "device",
-        "Where fields are learned: auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one.",
+        "Where fields are learned: auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one; +deterministic and +8GiB \
+         say how.",
     ),
 ];
 

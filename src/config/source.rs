@@ -1,6 +1,6 @@
 //! From files and `--set` to a [`Config`]: which value wins, and what is wrong with one.
 
-use super::{Config, Key, Preset, all_keys, lookup, show};
+use super::{Config, DeviceChoice, Key, Preset, all_keys, lookup, show};
 use crate::{Error, Result};
 use serde::Deserialize;
 use toml::de::{DeTable, DeValue};
@@ -131,7 +131,7 @@ fn assign(config: &Config, key: &str, given: RawValue) -> Result<Config> {
             let problem = format!(": `{word}`: `~` is a word of the shell; write the whole path");
             return Err(wrong(key, &problem));
         }
-        Some(word) if key == "device" && !is_device(word) => {
+        Some(word) if key == "device" && DeviceChoice::parse(word).is_none() => {
             let problem = format!(
                 ": unknown device `{word}`, expected auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one"
             );
@@ -185,13 +185,6 @@ fn check_range(key: &Key, value: &Value) -> Result<(), String> {
     // NaN is in no range; a number without a range must still be finite
     let inside = number >= key.min && number <= key.max && number.is_finite();
     if inside { Ok(()) } else { Err(show(value)) }
-}
-
-fn is_device(word: &str) -> bool {
-    match word.split_once(':') {
-        Some(("wgpu" | "vulkan" | "metal" | "dx12", n)) => n.parse::<u32>().is_ok(),
-        _ => matches!(word, "auto" | "cpu" | "wgpu" | "vulkan" | "metal" | "dx12"),
-    }
 }
 
 fn kind(value: &Value) -> &'static str {

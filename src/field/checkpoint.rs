@@ -8,7 +8,7 @@
 use crate::io::{
     Limits, ReadError, TensorValues, Tensors, is_file, read_tensors, remove, rename, write_tensors,
 };
-use crate::{Error, Result};
+use crate::{Error, ErrorKind, Result};
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -250,6 +250,8 @@ pub fn restore<T>(
                 }
                 return Ok(Some((state, warnings)));
             }
+            // nor over a device that does not
+            Err(e) if e.kind() == ErrorKind::NotNow => return Err(e),
             Err(e) => {
                 warnings.push(format!("{e}; falling back to the checkpoint before it"));
                 failure.get_or_insert((e, damaged));

@@ -4,12 +4,14 @@
 //! takes a device it compares its kernels with the processor's, once for each adapter, driver and release: what was
 //! found is kept in the user's cache.
 
+use crate::config::DeviceChoice;
 use crate::io::{self, Limits, Lock, LockError};
 use crate::kernel::gpu::{self, Adapter, Check, Device};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 /// A device that was opened for a training.
 pub struct Gpu {
@@ -18,30 +20,42 @@ pub struct Gpu {
     /// Why it was chosen.
     pub why: String,
     /// Nobody else's `auto` takes it while this is held; none where somebody else had it already.
-    pub lock: Option<Lock>,
+    pub lock: Option<Arc<Lock>>,
+    /// Did nobody name it?
+    pub by_itself: bool,
 }
 
-/// Opens the GPU of a name: an API (`wgpu` is any) and, after a colon, a number among its adapters. Without a number
-/// it is the first one that is no software.
+/// Opens the GPU that is named: an API (`wgpu` is any) and a number among its adapters. Without a number it is the
+/// first one that is no software.
 ///
 /// # Errors
 ///
 /// Where there is none.
-pub fn open(name: &str) -> Result<Gpu> {
-    let (api, number) = match name.split_once(':') {
-        Some((api, number)) => (api, number.parse::<usize>().ok()),
-        None => (name, None),
-    };
+pub fn open(choice: &DeviceChoice) -> Result<Gpu> {
+    let (api, number) = (choice.name.as_str(), choice.number);
+    let name = number.map_or(api.to_string(), |number| format!("{api}:{number}"));
     let adapters: Vec<Adapter> =
         Adapter::all().into_iter().filter(|a| api == "wgpu" || a.api == api).collect();
     let chosen = match number {
         Some(number) => adapters.get(number),
         None => adapters.iter().find(|adapter| !adapter.software),
     };
-    let adapter = chosen.ok_or_else(|| missing(name, api, &adapters))?;
-    let device = Device::open(adapter);
-    let lock = Lock::take(&lock_file(&device)).ok();
-    Ok(Gpu { device, why: format!("named `{name}`"), lock })
+    let adapter = chosen.ok_or_else(|| missing(&name, api, &adapters))?;
+    let device = opened(adapter, choice);
+    let lock = taken(lock_file(&device)).ok();
+    Ok(Gpu { device, why: format!("named `{name}`"), lock, by_itself: false })
+}
+
+/// An adapter, used as it is asked to be.
+fn opened(adapter: &Adapter, choice: &DeviceChoice) -> Device {
+    let mut device = Device::open(adapter);
+    if choice.deterministic {
+        device = device.with_atomics(gpu::Atomics::Fixed);
+    }
+    if let Some(gib) = choice.memory_gib {
+        device = device.with_memory((gib * (1u64 << 30) as f64) as u64);
+    }
+    device
 }
 
 fn missing(name: &str, api: &str, adapters: &[Adapter]) -> Error {
@@ -60,12 +74,12 @@ fn missing(name: &str, api: &str, adapters: &[Adapter]) -> Error {
 
 /// Opens the first GPU that is no software, that nobody uses and that passes the self-test; says why not where there
 /// is none.
-pub fn best() -> std::result::Result<Gpu, String> {
+pub fn best(choice: &DeviceChoice) -> std::result::Result<Gpu, String> {
     let mut passed_over = Vec::new();
     for adapter in Adapter::all().iter().filter(|a| !a.software) {
-        let device = Device::open(adapter);
+        let device = opened(adapter, choice);
         let name = device.name().to_string();
-        let lock = match Lock::take(&lock_file(&device)) {
+        let lock = match taken(lock_file(&device)) {
             Ok(lock) => Some(lock),
             Err(LockError::Held { .. }) => {
                 passed_over.push(format!("{name} is in use"));
@@ -80,7 +94,7 @@ pub fn best() -> std::result::Result<Gpu, String> {
                     "the first GPU that is free and computes what the processor does ({})",
                     adapter.api
                 );
-                return Ok(Gpu { device, why, lock });
+                return Ok(Gpu { device, why, lock, by_itself: true });
             }
             Err(why) => passed_over.push(format!("{name} {why}")),
         }
@@ -88,14 +102,16 @@ pub fn best() -> std::result::Result<Gpu, String> {
     Err(if passed_over.is_empty() { "no GPU is here".into() } else { passed_over.join(", ") })
 }
 
-/// What learns where a device is named so, and why.
-pub fn chosen(name: &str) -> String {
-    let told = |gpu: Gpu| format!("{}: {}", gpu.device.name(), gpu.why);
-    match name {
-        "cpu" => "the processor".into(),
-        "auto" => best().map_or_else(|why| format!("the processor: {why}"), told),
-        other => open(other).map_or_else(|e| e.to_string(), told),
+/// Takes the lock of a device, or shares it where this process has it already: its fields are on the same device.
+fn taken(file: PathBuf) -> std::result::Result<Arc<Lock>, LockError> {
+    static OURS: Mutex<BTreeMap<PathBuf, Weak<Lock>>> = Mutex::new(BTreeMap::new());
+    let mut ours = OURS.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(lock) = ours.get(&file).and_then(Weak::upgrade) {
+        return Ok(lock);
     }
+    let lock = Arc::new(Lock::take(&file)?);
+    ours.insert(file, Arc::downgrade(&lock));
+    Ok(lock)
 }
 
 /// The lock of a device: the same for every API that leads to the same card.
@@ -116,8 +132,10 @@ fn kept_file() -> Option<PathBuf> {
 }
 
 fn trusted(device: &Device, adapter: &Adapter) -> std::result::Result<(), String> {
-    let key =
-        format!("{} | {} | {} | {}", device.name(), device.driver(), adapter.api, env!("CARGO_PKG_VERSION"));
+    // another program may have other kernels
+    let built = std::env::current_exe().ok().and_then(|exe| io::modified(&exe));
+    let release = env!("CARGO_PKG_VERSION");
+    let key = format!("{} | {} | {} | {release} {built:?}", device.name(), device.driver(), adapter.api);
     let file = kept_file();
     // a file that cannot be read is as good as none
     let mut kept: Kept =
@@ -226,19 +244,23 @@ fn examined(adapter: &Adapter, number: usize) -> Found {
 mod tests {
     use super::*;
 
+    fn named(word: &str) -> DeviceChoice {
+        DeviceChoice::parse(word).unwrap()
+    }
+
     #[test]
     fn a_device_that_is_not_there_is_refused_with_what_is() {
         for name in ["wgpu:99", "vulkan:99", "metal:99"] {
-            let e = open(name).err().unwrap();
+            let e = open(&named(name)).err().unwrap();
             assert!(e.to_string().contains(name) && e.hint().contains("tiface doctor"), "{e}");
             assert_eq!(e.kind(), crate::ErrorKind::Usage);
         }
         let all = Adapter::all();
         if all.iter().all(|a| a.software) {
             // software is taken only where it is named, with its number
-            let e = open("wgpu").err().unwrap();
+            let e = open(&named("wgpu")).err().unwrap();
             assert!(e.to_string().contains(if all.is_empty() { "no adapter" } else { "software" }), "{e}");
-            assert_eq!(best().err().unwrap(), "no GPU is here");
+            assert_eq!(best(&named("auto")).err().unwrap(), "no GPU is here");
         }
     }
 
@@ -248,11 +270,14 @@ mod tests {
             println!("skipped: locks of devices, for no adapter is here");
             return;
         }
-        let held = open("wgpu:0").unwrap();
-        let again = open("wgpu:0").unwrap();
-        // named, it is shared; but only one of them keeps it from others
-        assert!(held.lock.is_some() && again.lock.is_none());
-        drop(held);
-        assert!(open("wgpu:0").unwrap().lock.is_some());
+        let held = open(&named("wgpu:0")).unwrap();
+        let again = open(&named("wgpu:0")).unwrap();
+        // one process has one lock, however many fields it has there; another process has none
+        let file = lock_file(&held.device);
+        assert!(held.lock.is_some() && again.lock.is_some());
+        assert!(matches!(Lock::take(&file), Err(LockError::Held { .. })));
+        // used as it is asked to be
+        let asked = open(&named("wgpu:0+deterministic+0.5GiB")).unwrap().device;
+        assert_eq!((asked.atomics(), asked.limits().memory), (gpu::Atomics::Fixed, Some(1 << 29)));
     }
 }

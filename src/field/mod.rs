@@ -15,18 +15,39 @@ pub mod parameters;
 pub mod pixels;
 pub mod training;
 
-#[cfg(not(feature = "wgpu"))]
-use crate::Error;
-use crate::Result;
+use crate::config::DeviceChoice;
+use crate::{Error, Result};
 use burn::tensor::{Device, Tensor, TensorData};
 
 /// Where a field is learned.
 pub enum Place {
-    /// The processor: see [`processor`].
-    Cpu,
+    /// The processor, see [`processor`]; with the reason where `auto` found nothing else.
+    Cpu(String),
     /// A GPU.
     #[cfg(feature = "wgpu")]
     Gpu(devices::Gpu),
+}
+
+impl Place {
+    /// Returns what it is and why it was chosen, for reports.
+    pub fn told(&self) -> String {
+        match self {
+            Place::Cpu(why) if why.is_empty() => "the processor".into(),
+            Place::Cpu(why) => format!("the processor: {why}"),
+            #[cfg(feature = "wgpu")]
+            Place::Gpu(gpu) => format!("{}: {}", gpu.device.name(), gpu.why),
+        }
+    }
+
+    /// Takes the processor where a GPU that nobody named cannot do what is asked; where it was named, that is an error.
+    pub fn or_processor(self, asked: impl FnOnce(&Place) -> Result<()>) -> Result<Place> {
+        match asked(&self) {
+            Ok(()) => Ok(self),
+            #[cfg(feature = "wgpu")]
+            Err(why) if matches!(&self, Place::Gpu(gpu) if gpu.by_itself) => Ok(Place::Cpu(why.to_string())),
+            Err(why) => Err(why),
+        }
+    }
 }
 
 /// Returns the processor as burn's device.
@@ -34,21 +55,23 @@ pub fn processor() -> Device {
     Device::flex()
 }
 
-/// Returns the place of a device's name: `auto`, `cpu`, `wgpu`, `vulkan`, `metal` or `dx12`, the GPUs with a number
-/// after a colon where there are several.
+/// Returns the place that a word names: see [`DeviceChoice`].
 ///
 /// # Errors
 ///
 /// Where this build or this machine does not have it.
 pub fn place(name: &str) -> Result<Place> {
-    match name {
-        "cpu" => Ok(Place::Cpu),
+    let choice = DeviceChoice::parse(name).ok_or_else(|| {
+        Error::usage(format!("there is no device `{name}`"), "`tiface config --explain device` says which")
+    })?;
+    match choice.name.as_str() {
+        "cpu" => Ok(Place::Cpu(String::new())),
         #[cfg(feature = "wgpu")]
-        "auto" => Ok(devices::best().map_or(Place::Cpu, Place::Gpu)),
+        "auto" => Ok(devices::best(&choice).map_or_else(Place::Cpu, Place::Gpu)),
         #[cfg(not(feature = "wgpu"))]
-        "auto" => Ok(Place::Cpu),
+        "auto" => Ok(Place::Cpu(String::new())),
         #[cfg(feature = "wgpu")]
-        other => Ok(Place::Gpu(devices::open(other)?)),
+        _ => Ok(Place::Gpu(devices::open(&choice)?)),
         #[cfg(not(feature = "wgpu"))]
         other => {
             let problem = format!("device `{other}`: this build learns on the processor alone");

@@ -191,6 +191,16 @@ impl<'a> Pixels<'a> {
         gpu::Photographs::new(device, &views, self.radius, drawing)
     }
 
+    /// Bytes that the photographs take on a device.
+    #[cfg(feature = "wgpu")]
+    pub fn bytes_on_device(&self) -> u64 {
+        let area = |(x0, y0, x1, y1, _): &(u32, u32, u32, u32, Vec<u64>)| match x0 > x1 {
+            true => 0,
+            false => (x1 - x0 + 1) as u64 * (y1 - y0 + 1) as u64,
+        };
+        self.drawable.iter().map(|view| 4 * area(view).next_multiple_of(32)).sum()
+    }
+
     /// The drawable part of a view, packed.
     #[cfg(feature = "wgpu")]
     fn drawn(&self, v: usize) -> gpu::DrawnView {

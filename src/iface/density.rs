@@ -7,6 +7,7 @@
 use super::occupancy::Occupancy;
 use super::schedule::{self, march_step};
 use super::train::IfaceReport;
+use crate::config::DeviceChoice;
 use crate::config::iface::{Foreground, IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
 use crate::field::pixels::{Batch, Pixels, TrainView};
@@ -167,6 +168,7 @@ pub fn train_density(
         inv_s: 0.0,
         train_psnr: progress.psnr(),
         occupied: learner.state.occupancy.share(),
+        device: crate::field::Place::Cpu(String::new()).told(),
         warnings,
     };
     Ok((DensityField::new(config, learner.state), report))
@@ -174,7 +176,7 @@ pub fn train_density(
 
 /// What ranges of single keys cannot say.
 fn check(config: &IfaceConfig, device: &str) -> Result<()> {
-    if !["cpu", "auto"].contains(&device) {
+    if DeviceChoice::parse(device).is_none_or(|choice| !["cpu", "auto"].contains(&choice.name.as_str())) {
         let problem = format!("device `{device}` has no kernels for `iface.field = \"density\"`");
         return Err(Error::usage(
             problem,

@@ -23,7 +23,7 @@ use glam::Vec3;
 use std::path::Path;
 #[cfg(feature = "wgpu")]
 use std::sync::{
-    Mutex,
+    Arc, Mutex,
     atomic::{AtomicBool, Ordering},
 };
 
@@ -50,7 +50,7 @@ pub struct IFace {
 struct OnGpu {
     evaluator: Mutex<Evaluator>,
     /// Held while the field is.
-    _lock: Option<Lock>,
+    _lock: Option<Arc<Lock>>,
     failed: AtomicBool,
 }
 
@@ -95,6 +95,9 @@ impl IFace {
     #[cfg(feature = "wgpu")]
     pub fn on(mut self, place: Place) -> IFace {
         let Place::Gpu(Gpu { device, lock, .. }) = place else { return self };
+        if !Evaluator::knows(&self.shape) {
+            return self;
+        }
         let band = self.config.occupancy == OccupancyRule::Band;
         let masks = [Some(&self.occupancy.occupied), band.then_some(&self.occupancy.solid)];
         let evaluator = Evaluator::new(device, &self.shape, &self.table, &self.flat, self.inv_s, masks);

@@ -95,7 +95,17 @@ pub(super) struct OnDevice<'a> {
 }
 
 impl<'a> OnDevice<'a> {
-    /// Moves a training to a device.
+    /// Refuses a training that a device cannot take: it knows no such field, or has too little memory.
+    pub fn fits(host: &SdfTraining, device: &Device) -> Result<()> {
+        if !Sdf::knows(&host.shape) {
+            let problem = format!("a device has no room for {} levels in a tile", host.config.levels);
+            return Err(Error::usage(problem, "lower iface.levels, or train with `--device cpu`"));
+        }
+        gpu::Photographs::fit(device, host.pixels.bytes_on_device())?;
+        room(host, device, points(host.config)).map(|_| ())
+    }
+
+    /// Moves a training that [`fits`](OnDevice::fits) to a device.
     ///
     /// # Errors
     ///
@@ -103,7 +113,7 @@ impl<'a> OnDevice<'a> {
     pub fn new(host: SdfTraining<'a>, device: Device) -> Result<OnDevice<'a>> {
         let config = host.config;
         let rays = config.rays.max(config.max_rays);
-        let points = if config.stereo > 0.0 { STEREO_POINTS as usize } else { 1 };
+        let points = points(config);
         let capacity = room(&host, &device, points)?;
         let weights = LossWeights {
             rgb_mse: config.rgb_mse as f32,
@@ -259,6 +269,11 @@ impl<'a> OnDevice<'a> {
     }
 }
 
+/// Stereo points that a step has room for.
+fn points(config: &IfaceConfig) -> usize {
+    if config.stereo > 0.0 { STEREO_POINTS as usize } else { 1 }
+}
+
 /// Samples that a step has room for: as many as on the CPU where the device's memory and buffers are large enough.
 fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<usize> {
     /// Samples with their rays, compositing and losses.
@@ -269,7 +284,8 @@ fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<usize> {
     let [words, widest] = Sdf::words_per_sample(&host.shape);
     // values, moments and gradient; cells with distance, reach and bits
     let cells = host.config.occupancy_resolution.pow(3) as u64;
-    let fixed = KEPT + 32 * hash::entries(&host.shape.levels) as u64 + 13 * cells;
+    let photographs = host.pixels.bytes_on_device() * 33 / 32;
+    let fixed = KEPT + photographs + 32 * hash::entries(&host.shape.levels) as u64 + 13 * cells;
     let by_buffer = limits.largest_buffer / (4 * widest as u64);
     let by_memory =
         limits.memory.map_or(u64::MAX, |memory| memory.saturating_sub(fixed) / (4 * (words + BESIDE) as u64));

@@ -38,6 +38,8 @@ pub struct IfaceReport {
     pub train_psnr: f64,
     /// Share of the occupancy grid that was marched at the end.
     pub occupied: f64,
+    /// What learned it, and why that.
+    pub device: String,
     /// Oddities on the way: a damaged checkpoint, a restored step.
     pub warnings: Vec<String>,
 }
@@ -122,11 +124,16 @@ pub fn train(
     config: &IfaceConfig,
     session: &TrainingSession,
 ) -> Result<(IFace, IfaceReport)> {
-    let place = field::place(session.device)?;
     let began = Instant::now();
     let mut learner = SdfTraining::new(views, hull, config, session)?;
+    let place = field::place(session.device)?.or_processor(|place| match place {
+        Place::Cpu(_) => Ok(()),
+        #[cfg(feature = "wgpu")]
+        Place::Gpu(gpu) => OnDevice::fits(&learner, &gpu.device),
+    })?;
+    let device = place.told();
     let (progress, warnings) = match place {
-        Place::Cpu => training::train(&mut learner, session, config.steps, config.checkpoint_s)?,
+        Place::Cpu(_) => training::train(&mut learner, session, config.steps, config.checkpoint_s)?,
         #[cfg(feature = "wgpu")]
         Place::Gpu(gpu) => {
             let mut there = OnDevice::new(learner, gpu.device)?;
@@ -141,6 +148,7 @@ pub fn train(
         inv_s: learner.state.model.sharpness(),
         train_psnr: progress.psnr(),
         occupied: learner.state.occupancy.share(),
+        device,
         warnings,
     };
     Ok((IFace::new(config, learner.state), report))

@@ -234,6 +234,11 @@ impl Lock {
             .create(true)
             .truncate(false)
             .open(path)
+            // another user's: it can be locked all the same
+            .or_else(|e| match e.kind() {
+                std::io::ErrorKind::PermissionDenied => File::open(path),
+                _ => Err(e),
+            })
             .map_err(fail)?;
         match file.try_lock() {
             Ok(()) => Ok(Lock { _file: file }),

@@ -39,19 +39,14 @@ pub(super) fn learn(
         identity: dir.identity(),
         monitor: dir.monitor(),
     };
-    #[cfg(feature = "wgpu")]
-    let place = crate::field::devices::chosen(&config.device);
-    #[cfg(not(feature = "wgpu"))]
-    let place = "the processor";
-    let (mut report, warnings) = train(stage, capture, scene, config, &session)?;
-    report["device"] = json!(place);
+    let (report, warnings) = train(stage, capture, scene, config, &session)?;
     warnings.iter().for_each(|w| dir.warn(w));
     Ok(report)
 }
 
 /// The start of a stage's random numbers. The published radiance fields have another than I-Face's 42; a seed that is
 /// set changes both.
-fn seed(stage: Stage, config: &Config) -> u64 {
+pub(super) fn seed(stage: Stage, config: &Config) -> u64 {
     match config.preset {
         Preset::Paper if stage != Stage::Iface => config.seed ^ 42 ^ 20_211_202,
         _ => config.seed,

@@ -187,6 +187,18 @@ impl Line<'_> {
                     settings.insert(if settings.contains_key(&own) { own } else { key }, value);
                 }
                 settings.remove("tface.checkpoint_s");
+                // follows from the box
+                settings.remove("tface.alpha_unit");
+                // as in runs from before there was anything else
+                let own = &learned.tface;
+                let published = own.near > 0.0 || own.far < 1e6;
+                for (key, told) in
+                    [("depth_directions", own.depth_directions), ("near", published), ("far", published)]
+                {
+                    if !told {
+                        settings.remove(&format!("tface.{key}"));
+                    }
+                }
                 if stage == Stage::Baseline {
                     settings.remove("tface.mask_weight"); // of a loss that it has not
                 }
@@ -198,6 +210,9 @@ impl Line<'_> {
             }
             Stage::Mesh => {
                 settings.insert("capture.unit_m".into(), config.capture.unit_m.to_string());
+                if !config.mesh.dense {
+                    settings.remove("mesh.dense"); // as in runs from before there was another
+                }
                 settings.insert("format of mesh/parts".into(), crate::mesh::files::FORMAT.into());
                 // a few triangles per cell of a closed surface, three formats and the parts
                 let c = &config.mesh;

@@ -36,7 +36,7 @@ pub struct FieldMean {
     fields: Vec<TFace>,
     /// Held while a device answers.
     #[cfg(feature = "wgpu")]
-    _lock: Option<Lock>,
+    _lock: Option<Arc<Lock>>,
 }
 
 impl FieldMean {

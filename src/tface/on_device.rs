@@ -151,6 +151,9 @@ impl<'a> OnDevice<'a> {
 
     /// Rebuilds the mask and refines the grids, on the host.
     fn grow(&mut self, step: u64) -> Result<(), StepError> {
+        if self.device.fetch::<u32>(&self.there.broken)?[0] != 0 {
+            return Err(self.host.not_finite("gradient of the", f32::NAN, step));
+        }
         self.host.state.parameters = self.there.fetch(&self.device, &self.host.state.parameters)?;
         self.host.grow(step)?;
         self.push();
@@ -270,7 +273,7 @@ impl Learner for OnDevice<'_> {
     fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
         let finished = from.as_ref().is_some_and(|(.., finished)| *finished);
         self.host.restore(from)?;
-        self.losses.fetch(&self.device)?;
+        self.losses.forget(&self.device);
         self.unread = 0;
         // nobody goes on from a finished one, which has no moments
         if !finished {

@@ -46,6 +46,8 @@ pub struct TfaceReport {
     pub density_samples: u64,
     /// Those whose color was decoded.
     pub color_samples: u64,
+    /// What learned the first of them, and why that.
+    pub device: String,
     /// Oddities on the way.
     pub warnings: Vec<String>,
 }
@@ -66,6 +68,7 @@ impl TfaceReport {
             lattice_samples: self.lattice_samples + other.lattice_samples,
             density_samples: self.density_samples + other.density_samples,
             color_samples: self.color_samples + other.color_samples,
+            device: self.device,
             warnings: [self.warnings, other.warnings].concat(),
         }
     }
@@ -101,15 +104,19 @@ pub(super) fn train_one(
 ) -> Result<TfaceReport> {
     let began = Instant::now();
     let mut learner = VmTraining::new(pixels, bounds, hull, config, session, field::processor());
-    let (progress, warnings) = match field::place(session.device)? {
-        Place::Cpu => training::train(&mut learner, session, config.steps, config.checkpoint_s)?,
+    let place = field::place(session.device)?.or_processor(|place| match place {
+        Place::Cpu(_) => Ok(()),
+        #[cfg(feature = "wgpu")]
+        Place::Gpu(_) => OnDevice::knows(config).map_err(|what| {
+            let problem = format!("device `{}` knows no {what}", session.device);
+            Error::usage(problem, "train with `--device cpu`")
+        }),
+    })?;
+    let device = place.told();
+    let (progress, warnings) = match place {
+        Place::Cpu(_) => training::train(&mut learner, session, config.steps, config.checkpoint_s)?,
         #[cfg(feature = "wgpu")]
         Place::Gpu(gpu) => {
-            let unknown = |what| {
-                let problem = format!("device `{}` knows no {what}", session.device);
-                Error::usage(problem, "train with `--device cpu`")
-            };
-            OnDevice::knows(config).map_err(unknown)?;
             let mut there = OnDevice::new(learner, gpu.device)?;
             let done = training::train(&mut there, session, config.steps, config.checkpoint_s)?;
             learner = there.finish();
@@ -128,6 +135,7 @@ pub(super) fn train_one(
         lattice_samples: counts.lattice,
         density_samples: counts.density,
         color_samples: counts.color,
+        device,
         warnings,
     })
 }

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 pub enum Atomics {
     /// The device adds floats itself.
     Native,
-    /// Compare and exchange until nobody came between: for adapters that cannot.
+    /// Words are exchanged until nobody came between: for adapters that cannot.
     Exchange,
     /// Integers of a fixed unit, chosen from a bound on the sum: the same bytes in any order.
     Fixed,
@@ -25,6 +25,7 @@ pub enum Atomics {
 pub struct Device {
     client: Client,
     atomics: Atomics,
+    memory: Option<u64>,
     launches: AtomicUsize,
     readbacks: AtomicUsize,
 }
@@ -102,7 +103,8 @@ impl Device {
         let float = Type::atomic(ElemType::Float(FloatKind::F32));
         let native = client.properties().atomic_type_usage(float).contains(AtomicUsage::Add);
         let atomics = if native { Atomics::Native } else { Atomics::Exchange };
-        Device { client, atomics, launches: AtomicUsize::new(0), readbacks: AtomicUsize::new(0) }
+        let memory = client.properties().memory.max_memory();
+        Device { client, atomics, memory, launches: AtomicUsize::new(0), readbacks: AtomicUsize::new(0) }
     }
 
     /// As the adapter names itself.
@@ -125,7 +127,7 @@ impl Device {
     pub fn limits(&self) -> DeviceLimits {
         let properties = self.client.properties();
         DeviceLimits {
-            memory: properties.memory.max_memory(),
+            memory: self.memory,
             largest_buffer: properties.memory.max_page_size,
             shared: properties.hardware.max_shared_memory_size,
         }
@@ -143,6 +145,11 @@ impl Device {
             "the adapter cannot add floats"
         );
         Device { atomics, ..self }
+    }
+
+    /// The same device of which no more than so many bytes are to be taken.
+    pub fn with_memory(self, bytes: u64) -> Device {
+        Device { memory: Some(self.memory.map_or(bytes, |all| all.min(bytes))), ..self }
     }
 
     /// Copies values to the device.

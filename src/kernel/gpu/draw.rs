@@ -377,17 +377,8 @@ impl Photographs {
     ///
     /// Where no pixel is drawable, or 2³² pixels are.
     pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: Drawing) -> Result<Photographs> {
-        let (needed, room) = (Photographs::bytes(seen), device.limits().largest_buffer);
-        if needed > room {
-            let mib = |bytes: u64| bytes.div_ceil(1 << 20);
-            let problem = format!(
-                "the photographs take {} MiB of the device `{}`, whose buffers hold {} MiB",
-                mib(needed),
-                device.name(),
-                mib(room)
-            );
-            return Err(Error::cannot(problem, "use `--set capture.downscale=2`, or `--device cpu`"));
-        }
+        let bytes = seen.iter().map(|view| 4 * view.pixels.len().next_multiple_of(32) as u64).sum();
+        Photographs::fit(device, bytes)?;
         let (mut views, mut pixels, mut drawable) = (Vec::new(), Vec::new(), Vec::new());
         let mut cumulative = 0u32;
         for view in seen {
@@ -407,9 +398,20 @@ impl Photographs {
         Ok(Photographs { views, pixels, drawable, drawing, behind: 3 })
     }
 
-    /// Bytes of the pixels of these.
-    fn bytes(seen: &[DrawnView]) -> u64 {
-        seen.iter().map(|view| 4 * view.pixels.len().next_multiple_of(32) as u64).sum()
+    /// Refuses photographs of so many bytes where a buffer of the device does not hold them.
+    pub fn fit(device: &Device, bytes: u64) -> Result<()> {
+        let room = device.limits().largest_buffer;
+        if bytes <= room {
+            return Ok(());
+        }
+        let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+        let problem = format!(
+            "the photographs take {} MiB of the device `{}`, whose buffers hold {} MiB",
+            mib(bytes),
+            device.name(),
+            mib(room)
+        );
+        Err(Error::cannot(problem, "use `--set capture.downscale=2`, or `--device cpu`"))
     }
 
     /// The same with backgrounds of a step's random numbers `k`, not 3.

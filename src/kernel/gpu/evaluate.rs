@@ -32,6 +32,11 @@ pub struct Evaluator {
 }
 
 impl Evaluator {
+    /// Can a device evaluate a field of this shape?
+    pub fn knows(shape: &FieldShape) -> bool {
+        Sdf::knows(shape)
+    }
+
     /// Of a field: its table, `[entries, 2]`, network weights, sharpness, and the cells to march through with those that
     /// are solid.
     pub fn new(

@@ -114,6 +114,7 @@ impl SurfacePoints {
     /// These from now on: positions in field coordinates, length of a pixel there, weight.
     pub fn put(&mut self, device: &Device, rows: &[[f32; ROW]]) {
         self.count = rows.len();
+        self.terms = device.zeros(self.most());
         if self.count > 0 {
             self.rows = device.upload(rows);
         }

@@ -37,12 +37,14 @@ struct Plan {
 }
 
 impl Plan {
+    /// Is there room for the inputs of both networks in a tile?
+    fn fits(layout: Layout) -> bool {
+        layout.padded() + OUTPUTS <= CHANNELS && layout.color_padded() <= CHANNELS
+    }
+
     fn new(layout: Layout) -> Plan {
         let (padded, color) = (layout.padded(), layout.color_padded());
-        assert!(
-            padded + OUTPUTS <= CHANNELS && color <= CHANNELS,
-            "the field has more levels than a tile has room"
-        );
+        assert!(Plan::fits(layout), "the field has more levels than a tile has room");
         Plan { features: layout.inputs - 3, padded, color, skip: layout.color_skip }
     }
 
@@ -122,7 +124,12 @@ pub struct Sdf {
 }
 
 impl Sdf {
-    /// For up to `capacity` samples, a multiple of [`TILE`].
+    /// Can a device compute a field of this shape? Not one of some twenty levels.
+    pub fn knows(shape: &FieldShape) -> bool {
+        Plan::fits(shape.layout())
+    }
+
+    /// For up to `capacity` samples, a multiple of [`TILE`], of a field that it [`knows`](Sdf::knows).
     pub fn new(device: &Device, shape: &FieldShape, capacity: usize) -> Sdf {
         assert!(capacity.is_multiple_of(TILE) && capacity > 0);
         let layout = shape.layout();

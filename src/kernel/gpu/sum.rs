@@ -36,12 +36,12 @@ impl Sum for Exchange {
     type Word = u32;
 
     fn add(word: &Atomic<u32>, v: f32, _unit: f32) {
-        let mut seen = word.load();
-        let mut waiting = true;
-        while waiting {
-            let found = word.compare_exchange_weak(seen, u32::reinterpret(f32::reinterpret(seen) + v));
-            waiting = found != seen;
-            seen = found;
+        // takes what lies there, puts it back with its own, and goes on with what came between: a weak comparison may
+        // fail without telling so
+        let mut own = v;
+        while own != 0.0f32 {
+            let found = f32::reinterpret(word.exchange(0u32));
+            own = f32::reinterpret(word.exchange(u32::reinterpret(found + own)));
         }
     }
 }

@@ -71,7 +71,7 @@ fn train_until(line: &Line, stage: Stage, step: u64) -> Result<()> {
     io::create_folder(&folder)?;
     let session = TrainingSession {
         stage: stage.word(),
-        seed: line.config.seed,
+        seed: learn::seed(stage, line.config),
         device: &line.config.device,
         dir: &folder,
         identity: "bench",

@@ -268,6 +268,11 @@ impl VmLosses {
         );
     }
 
+    /// Forgets what steps came to since the last time.
+    pub fn forget(&mut self, device: &Device) {
+        self.totals = device.zeros(TOTALS);
+    }
+
     /// Waits for the device; what the steps since the last time came to.
     pub fn fetch(&mut self, device: &Device) -> Result<VmFigures> {
         let t = device.fetch::<u32>(&self.totals)?;

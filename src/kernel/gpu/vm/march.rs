@@ -76,7 +76,7 @@ fn pass(
     origin: &[f32],
     direction: &[f32],
     jitter: &[f32],
-    alive: &[u32],
+    alive: &mut [u32],
     offsets: &[u32],
     counts: &mut [u32],
     points: &mut [u32],
@@ -108,6 +108,10 @@ fn pass(
         if writes {
             first = offsets[r] as usize;
             most = offsets[r + 1] - offsets[r];
+            // no room: no ray
+            if most < counts[r] {
+                alive[r] = 0;
+            }
         } else {
             let inside = max((span.leave - entry) / step, 0.0f32);
             points[r] = select(meets, min(u32::cast_from(min(inside, 1e9f32)) + 1, sizes[0]), 0u32);
