@@ -116,7 +116,7 @@ pub(super) fn model(common: &Common) -> Result<()> {
     let shape = crate::iface::field_shape(iface);
     let memory = cost::memory(&shape, 4 * iface.samples);
     let side = (tface.voxels_final as f64).cbrt();
-    let channels: usize = tface.density_rank.iter().chain(&tface.color_rank).map(|&r| r as usize).sum();
+    let channels: usize = tface.density_rank.iter().chain(&tface.color_rank).sum();
     let floats = channels as f64 * side * (side + 1.0);
     let rays = tface.rays as f64;
     let steps = [

@@ -21,7 +21,7 @@ pub struct TrainingSession<'a> {
     pub stage: &'static str,
     /// Seed of every random number.
     pub seed: u64,
-    /// Name of the device: see [`super::device`].
+    /// Name of the device: see [`super::place`].
     pub device: &'a str,
     /// The folder of the checkpoints; training continues from those that lie there.
     pub dir: &'a Path,

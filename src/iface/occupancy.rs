@@ -60,6 +60,7 @@ impl Occupancy {
     }
 
     /// The cells that may ever be marched through.
+    #[cfg(feature = "wgpu")]
     pub fn allowed(&self) -> &Bitmask {
         &self.allowed
     }
