@@ -7,7 +7,7 @@ use crate::config::Config;
 use crate::io::{self, Limits};
 use crate::pipeline::Line;
 use crate::pipeline::experiment::{ORDERINGS, ROWS, TABLES, config, is_done, measured, runs, work};
-use crate::report::experiment::{Experiment, read_published};
+use crate::report::experiment::{Experiment, ExperimentRow, Measured, read_published};
 use crate::run::Run;
 use crate::{Error, Result};
 use clap::Args;
@@ -68,7 +68,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         None => Vec::new(),
     };
     let mut set = common.set.clone();
-    set.extend(common.device.iter().map(|d| format!("device={d}")));
+    set.extend(common.device_word().iter().map(|d| format!("device={d}")));
     set.extend(common.seed.iter().map(|s| format!("seed={s}")));
     let mut captures: Vec<String> = Vec::new();
     let mut tasks = Vec::new();
@@ -103,18 +103,20 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     }
     let chosen = |task: &&Task| options.only.is_empty() || options.only.contains(&task.name);
     let open = |task: &Task| Run::open(&folder.join(&task.name), stop.clone(), screen.clone());
+    let opened: Vec<Run> = tasks.iter().map(open).collect();
+    let mut lines: Vec<Option<Line>> = tasks.iter().map(|_| None).collect();
     let mut failed = None;
-    for task in tasks.iter().filter(chosen) {
-        let run = open(task);
-        let line = Line::open(&task.config, &run).map_err(|e| e.within(&task.name))?;
+    for ((task, run), line) in tasks.iter().zip(&opened).zip(&mut lines).filter(|((task, _), _)| chosen(task))
+    {
+        let line = &*line.insert(Line::open(&task.config, run).map_err(|e| e.within(&task.name))?);
         if common.dry_run {
-            let state = if is_done(&line, task.run) { "done" } else { "to do" };
+            let state = if is_done(line, task.run) { "done" } else { "to do" };
             print(&format!("{:<32} {state}\n", task.name))?;
             continue;
         }
         io::create_folder(run.dir())?;
         screen.note("experiment", &task.name);
-        match work(&line, task.run) {
+        match work(line, task.run) {
             Err(e) if e.kind().is_stop() => {
                 failed = Some(e);
                 break;
@@ -132,11 +134,13 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     }
     // of what lies there by now: whoever makes runs one by one has the tables as they fill
     let rows: Vec<_> = ROWS.into_iter().filter(|row| words.contains(&row.table)).collect();
-    let of = |capture: &String, row: &crate::report::experiment::ExperimentRow| {
-        let beside = format!("{capture}/{}", row.run);
-        measured(&Run::open(&folder.join(&beside), stop.clone(), screen.clone()), row, &beside)
-    };
-    let measured = rows.iter().map(|row| captures.iter().map(|c| of(c, row)).collect()).collect();
+    let mut measured: Vec<Vec<Measured>> = vec![Vec::new(); rows.len()];
+    // every capture has every run, in the same order: so each row gets one of each capture, in theirs
+    for (task, line) in tasks.iter().zip(&lines) {
+        let (own, places): (Vec<&ExperimentRow>, Vec<&mut Vec<Measured>>) =
+            rows.iter().zip(&mut measured).filter(|(row, _)| row.run == task.run).unzip();
+        places.into_iter().zip(found(&folder, task, line.as_ref(), &own)).for_each(|(to, m)| to.push(m));
+    }
     let orderings = ORDERINGS.into_iter().filter(|o| words.contains(&o.table)).collect();
     let experiment =
         Experiment { scale: options.scale, tables, rows, orderings, captures, measured, published };
@@ -152,6 +156,26 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         ))?;
     }
     failed.map_or(Ok(()), Err)
+}
+
+/// What some rows came to in their run; one that was not worked on is opened here, and only looked at.
+fn found(folder: &Path, task: &Task, line: Option<&Line>, rows: &[&ExperimentRow]) -> Vec<Measured> {
+    let of = |line: &Line| rows.iter().map(|row| measured(line, row, &task.name)).collect();
+    if let Some(line) = line {
+        return of(line);
+    }
+    let run = Run::quiet(&folder.join(&task.name));
+    let problem = if io::is_folder(run.dir()) {
+        // made elsewhere, maybe: that its device is not here does not matter for figures
+        let config = Config { device: "cpu".into(), ..task.config.clone() };
+        match Line::open(&config, &run) {
+            Ok(line) => return of(&line),
+            Err(e) => e.to_string(),
+        }
+    } else {
+        "not made yet".to_owned() // and the capture need not be read to say so
+    };
+    vec![Measured { problem: Some(problem), ..Measured::default() }; rows.len()]
 }
 
 /// The tables in all forms; the JSON last, for whoever waits for it.

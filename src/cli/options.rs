@@ -127,14 +127,7 @@ impl Common {
                 .map_err(|_| Error::usage(format!("`{name}` is not UTF-8"), "save it as UTF-8"))?;
             sources.files.push((name, text));
         }
-        if self.device.is_some() || self.deterministic || self.memory.is_some() {
-            let mut word = self.device.clone().unwrap_or_else(|| "auto".into());
-            if self.deterministic {
-                word += "+deterministic";
-            }
-            if let Some(gib) = self.memory {
-                word += &format!("+{gib}GiB");
-            }
+        if let Some(word) = self.device_word() {
             sources.options.push((format!("--device {word}"), "device".into(), word));
         }
         if let Some(seed) = self.seed {
@@ -142,6 +135,21 @@ impl Common {
         }
         sources.options.extend_from_slice(options);
         Config::resolve(&sources)
+    }
+
+    /// The device that was chosen and how it is to be used; none where nothing was said.
+    pub(super) fn device_word(&self) -> Option<String> {
+        if self.device.is_none() && !self.deterministic && self.memory.is_none() {
+            return None;
+        }
+        let mut word = self.device.clone().unwrap_or_else(|| "auto".into());
+        if self.deterministic {
+            word += "+deterministic";
+        }
+        if let Some(gib) = self.memory {
+            word += &format!("+{gib}GiB");
+        }
+        Some(word)
     }
 }
 

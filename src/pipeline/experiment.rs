@@ -9,8 +9,8 @@ use crate::config::{
 };
 use crate::io::{self, Limits};
 use crate::report::experiment::{ExperimentRow, Measured, Ordering};
-use crate::run::{Run, read_record, read_status};
-use crate::{Error, Result};
+use crate::run::{read_record, read_status};
+use crate::{Error, ErrorKind, Result};
 use serde_json::Value;
 
 /// The tables, by their word and heading.
@@ -96,6 +96,7 @@ fn has_surface(run: &str) -> bool {
 ///
 /// A scale of 1 is the publication. Below, rays, voxels, samples and steps of I-Face are that share, steps of T-Face and
 /// the baseline its square (each costs more rays and samples, too), and warm-up and annealing follow the steps.
+/// Instant-NeRF learns on the processor, whatever device is set.
 ///
 /// # Errors
 ///
@@ -161,7 +162,12 @@ pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
         ..Sources::default()
     };
     let mut resolved = Config::resolve(&sources)?;
+    if run == "iface-nerf" {
+        // there are no kernels of that field for another, and a device that is set is meant for the other runs
+        resolved.device = "cpu".into();
+    }
     if scale < 1.0 && preset == Preset::Paper {
+        // constants of a preset and no keys: no setting names them, and none is lost; they follow the steps as set
         resolved.iface.warmup = (resolved.iface.steps / 40).max(1);
         resolved.iface.anneal_end = resolved.iface.steps;
     }
@@ -214,23 +220,63 @@ pub fn work(line: &Line, run: &str) -> Result<()> {
     if has_surface(run) {
         let fields = learn::trained_fields(line);
         match complete(line, Stage::Mesh, &fields) {
-            Err(e) if e.kind() != crate::ErrorKind::Cannot => return Err(e),
+            Err(e) if !is_no_surface(&e) => return Err(e),
             _ => {}
         }
     }
     Ok(())
 }
 
-/// What a row came to in a run; `beside` is the path of the run's folder from the page.
-pub fn measured(run: &Run, row: &ExperimentRow, beside: &str) -> Measured {
-    let mut out = Measured::default();
-    let stages = Stage::ALL.into_iter().filter_map(|s| Some((s, read_status(&run.path(s)).ok()??)));
-    let failed = stages.filter_map(|(s, status)| Some(format!("stage `{s}`: {}", status.error?))).next();
-    let file = run.path("metrics/metrics.json");
-    let Ok(value) = io::read_json(&file, &Limits::default()) else {
-        out.problem = Some(failed.unwrap_or_else(|| "not made yet".into()));
-        return out;
+/// Does an error of the stage `mesh` say that there is no surface? It has no kind of its own: that an extraction met none
+/// is said by how its message begins, and other settings or a full disk are of the same kind.
+fn is_no_surface(e: &Error) -> bool {
+    e.kind() == ErrorKind::Cannot && e.to_string().starts_with("stage `mesh`: no surface")
+}
+
+/// The stages that a run is made of.
+fn stages(line: &Line, run: &str) -> Vec<Stage> {
+    let mut order = line.order(Stage::Metrics);
+    order.extend(has_surface(run).then_some(Stage::Mesh));
+    order
+}
+
+/// What stages of a run failed with, and the first one that is not done as the line has it.
+fn problems(line: &Line, run: &str) -> Vec<String> {
+    let failed = |stage: Stage| {
+        let status = read_status(&line.run.path(stage)).ok().flatten()?;
+        Some(format!("stage `{stage}`: {}", status.error?))
     };
+    let mut out: Vec<String> = Stage::ALL.into_iter().filter_map(failed).collect();
+    let plans: Vec<_> = stages(line, run).into_iter().map(|stage| line.plan(stage)).collect();
+    if let Some(e) = plans.iter().find_map(|plan| line.run.agrees(plan).err()) {
+        out.push(e.to_string());
+    } else if let Some(plan) = plans.iter().find(|plan| !line.run.is_done(plan))
+        && out.is_empty()
+    {
+        out.push(format!("stage `{}` is not done yet", plan.name));
+    }
+    // differences of settings stand on a line each, a problem on one
+    out.iter().map(|text| text.replace(":\n  ", ": ").replace("\n  ", ", ")).collect()
+}
+
+/// What a row came to in its run; `beside` is the path of the run's folder from the page. Figures count where the run's
+/// stages are done with the line's configuration: what others left in the same folder has none.
+pub fn measured(line: &Line, row: &ExperimentRow, beside: &str) -> Measured {
+    let mut out = Measured::default();
+    let mut problems = problems(line, row.run);
+    if line.order(Stage::Metrics).into_iter().all(|stage| line.run.is_done(&line.plan(stage))) {
+        match io::read_json(&line.run.path("metrics/metrics.json"), &Limits::default()) {
+            Ok(value) => out = figures(line, row, &value, beside),
+            Err(e) => problems.push(e.to_string()),
+        }
+    }
+    out.problem = (!problems.is_empty()).then(|| problems.join("; "));
+    out
+}
+
+/// Figures of a row whose stages are done; `value` is what `metrics.json` holds.
+fn figures(line: &Line, row: &ExperimentRow, value: &Value, beside: &str) -> Measured {
+    let mut out = Measured::default();
     let set = &value[row.pictures];
     let list = |part: &str| set[part]["views"].as_array().cloned().unwrap_or_default();
     let (heads, regions) = (list("head"), list("region"));
@@ -242,16 +288,23 @@ pub fn measured(run: &Run, row: &ExperimentRow, beside: &str) -> Measured {
         out.figures.push([of("psnr_masked"), of("psnr"), region, of("ssim_masked"), of("ssim")]);
         out.views.push(name.into());
     }
+    out.masks = value["truth"]["masks"].as_str().map(String::from);
     out.outside = set["mean_square_opacity_outside"].as_f64();
     let summary =
-        |stage: Stage| read_record(&run.path(stage)).ok().flatten().map_or(Value::Null, |r| r.summary);
+        |stage: Stage| read_record(&line.run.path(stage)).ok().flatten().map_or(Value::Null, |r| r.summary);
+    let shown = summary(Stage::Render);
+    // 0 stands where an interrupted process had made all views, and nobody knows how long that took
+    let seconds = |method: &str| shown["seconds_per_view"][method].as_f64().filter(|s| *s > 0.0);
     out.seconds = match row.pictures {
-        "ensemble" => summary(Stage::Ensemble)["seconds_per_view"].as_f64(),
-        method => summary(Stage::Render)["seconds_per_view"][method].as_f64(),
+        "ensemble" => {
+            let blend = summary(Stage::Ensemble)["seconds_per_view"].as_f64();
+            let members = line.config.ensemble.members.iter().map(|member| seconds(member.folder()));
+            members.chain([blend]).sum()
+        }
+        method => seconds(method),
     };
-    if row.table == "iface" && has_surface(row.run) {
+    if row.table == "iface" && has_surface(row.run) && line.run.is_done(&line.plan(Stage::Mesh)) {
         out.pieces = summary(Stage::Mesh)["report"]["topology"]["pieces"].as_u64();
-        out.problem = failed.filter(|_| out.pieces.is_none());
     }
     if let Some(first) = out.views.first() {
         let folder =
@@ -263,15 +316,33 @@ pub fn measured(run: &Run, row: &ExperimentRow, beside: &str) -> Measured {
 
 /// Is everything of a run made?
 pub fn is_done(line: &Line, run: &str) -> bool {
-    let mut order = line.order(Stage::Metrics);
-    order.extend(has_surface(run).then_some(Stage::Mesh));
-    order.into_iter().all(|stage| line.run.is_done(&line.plan(stage)))
+    stages(line, run).into_iter().all(|stage| line.run.is_done(&line.plan(stage)))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Quiet;
     use crate::capture::synthetic::{SyntheticOptions, write_capture};
+    use crate::geom::Aabb;
+    use crate::mesh::extract_dense;
+    use crate::run::Run;
+    use glam::Vec3;
+    use serde_json::json;
+    use std::path::Path;
+
+    /// A tiny capture in a folder; its path.
+    fn head(dir: &Path) -> String {
+        let root = dir.join("head");
+        std::fs::create_dir_all(&root).unwrap();
+        write_capture(&root, &SyntheticOptions { width: 48, height: 64, train: 6, test: 2, seed: 1 })
+            .unwrap();
+        root.to_str().unwrap().into()
+    }
+
+    fn row_of(table: &str, row: &str) -> ExperimentRow {
+        ROWS.into_iter().find(|r| r.table == table && r.row == row).unwrap()
+    }
 
     #[test]
     fn every_row_has_a_run_whose_pictures_it_names() {
@@ -323,16 +394,105 @@ mod tests {
         assert_eq!(c.tface.upsample_steps, [20, 30, 40, 55, 70]);
         assert_eq!(config("paper", 1.0, &[]).unwrap().iface.warmup, 500);
         assert!(config("paper", 0.1, &["tface.stepz=1".into()]).is_err());
+        // a fortieth of the steps as they are set; no setting names these themselves, so that none is overwritten
+        let c = config("paper", 0.1, &["iface.steps=400".into()]).unwrap();
+        assert_eq!((c.iface.steps, c.iface.warmup, c.iface.anneal_end), (400, 10, 400));
+        for constant in ["iface.warmup", "iface.anneal_end"] {
+            let e = config("paper", 0.1, &[format!("{constant}=7")]).unwrap_err().to_string();
+            assert!(e.ends_with(&format!("there is no key `{constant}`")), "{e}");
+        }
+    }
+
+    #[test]
+    fn instant_nerf_learns_on_the_processor_whatever_device_is_set() {
+        let device = |run: &str| config(run, 1.0, &["device=wgpu:1".into()]).unwrap().device;
+        assert_eq!(["iface-nerf", "iface-bare", "paper"].map(device), ["cpu", "wgpu:1", "wgpu:1"]);
+        // a word that names none is refused all the same
+        assert!(config("iface-nerf", 1.0, &["device=gpu".into()]).is_err());
+    }
+
+    /// Stages that are done without any work, in a folder that is then asked about with other settings.
+    #[test]
+    fn figures_count_only_where_the_stages_are_done_as_asked_for() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = head(dir.path());
+        let of = |scale: f64| {
+            let mut c = config("paper", scale, &["device=cpu".into()]).unwrap();
+            c.capture.path.clone_from(&path);
+            c
+        };
+        let (c, other) = (of(0.01), of(0.02));
+        let run = Run::quiet(&dir.path().join("run"));
+        let line = Line::open(&c, &run).unwrap();
+        let view = json!([{"name": "v", "psnr_masked": 30.0, "psnr": 20.0}]);
+        let set = json!({"head": {"views": view}});
+        let metrics =
+            json!({"volume": set, "ensemble": set, "truth": {"photographs": "photo", "masks": "run"}});
+        for stage in line.order(Stage::Metrics) {
+            let made = run.stage(line.plan(stage), |dir| match stage {
+                Stage::Render => {
+                    Ok(json!({"seconds_per_view": {"baseline": 1.5, "tface": 2.0, "volume": 4.0}}))
+                }
+                Stage::Ensemble => Ok(json!({"seconds_per_view": 0.5})),
+                Stage::Metrics => {
+                    io::write_atomic(&dir.folder().join("metrics.json"), metrics.to_string().as_bytes())?;
+                    Ok(Value::Null)
+                }
+                _ => Ok(Value::Null),
+            });
+            made.unwrap();
+        }
+        let (surface, blend) = (row_of("iface", "sparsity"), row_of("components", "ensemble"));
+        let told = |m: &Measured| m.problem.clone().unwrap_or_default();
+
+        // a surface is asked for, too; that there is none is a result, and said
+        let found = measured(&line, &surface, "x");
+        assert_eq!((found.figures.len(), told(&found).as_str()), (1, "stage `mesh` is not done yet"));
+        let positive = |points: &[Vec3]| vec![1.0; points.len()];
+        let slopes = |points: &[Vec3]| (vec![1.0; points.len()], vec![Vec3::X; points.len()]);
+        let colors = |points: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; points.len()];
+        let none = run.stage(line.plan(Stage::Mesh), |_| {
+            extract_dense(positive, slopes, colors, Aabb::SCENE, (9, 100), &Quiet)?;
+            Ok(Value::Null)
+        });
+        assert!(is_no_surface(&none.unwrap_err()));
+        let found = measured(&line, &surface, "x");
+        assert!(found.figures.len() == 1 && found.pieces.is_none(), "{found:?}");
+        assert!(told(&found).starts_with("stage `mesh`: no surface"), "{found:?}");
+        // of every row of the run
+        assert_eq!(told(&measured(&line, &blend, "x")), told(&found));
+        run.stage(line.plan(Stage::Mesh), |_| Ok(json!({"report": {"topology": {"pieces": 3}}}))).unwrap();
+        let found = measured(&line, &surface, "x");
+        assert_eq!((found.pieces, found.seconds, found.problem), (Some(3), Some(4.0), None));
+        assert_eq!(found.masks.as_deref(), Some("run"));
+        // its members' 1.5, 2 and 4, and 0.5 of the blend
+        assert_eq!(measured(&line, &blend, "x").seconds, Some(8.0));
+
+        // another mesh: figures of the views are those, the pieces are not
+        let mut finer = c.clone();
+        finer.mesh.resolution += 1;
+        let found = measured(&Line::open(&finer, &run).unwrap(), &surface, "x");
+        assert!(found.figures.len() == 1 && found.pieces.is_none(), "{found:?}");
+        assert!(told(&found).contains("stage `mesh` was done with other settings: mesh.resolution: was"));
+
+        // another scale: nothing is
+        let line = Line::open(&other, &run).unwrap();
+        let refused = work(&line, "paper").unwrap_err();
+        assert!(refused.to_string().contains("was done with other settings") && !is_no_surface(&refused));
+        for row in [surface, blend] {
+            let found = measured(&line, &row, "x");
+            assert!(found.views.is_empty() && found.figures.is_empty() && found.picture.is_none());
+            assert_eq!((found.seconds, found.pieces, found.masks.clone()), (None, None, None));
+            let told = told(&found);
+            assert!(told.contains("was done with other settings: ") && !told.contains('\n'), "{told}");
+            assert!(told.contains("voxels_final: was "), "{told}");
+        }
     }
 
     /// Two rows of a tiny capture, made, read, and not made again.
     #[test]
     fn a_row_is_made_measured_and_not_made_again() {
         let dir = tempfile::tempdir().unwrap();
-        let root = dir.path().join("head");
-        std::fs::create_dir_all(&root).unwrap();
-        write_capture(&root, &SyntheticOptions { width: 48, height: 64, train: 6, test: 2, seed: 1 })
-            .unwrap();
         let less = ["tface.steps=12", "tface.rays=128", "tface.voxels_start=1000", "tface.voxels_final=2000"];
         let less: Vec<String> = less
             .iter()
@@ -340,15 +500,16 @@ mod tests {
             .map(|s| s.to_string())
             .collect();
         let mut c = config("tface-ce-one", 0.01, &less).unwrap();
-        c.capture.path = root.to_str().unwrap().into();
+        c.capture.path = head(dir.path());
         let run = Run::quiet(&dir.path().join("run"));
-        let row = ROWS.iter().find(|r| r.row == "ce-one").unwrap();
-        assert_eq!(measured(&run, row, "x").problem.as_deref(), Some("not made yet"));
+        let row = row_of("tface", "ce-one");
         let line = Line::open(&c, &run).unwrap();
+        assert_eq!(measured(&line, &row, "x").problem.as_deref(), Some("stage `mask` is not done yet"));
         work(&line, row.run).unwrap();
         assert!(is_done(&line, row.run));
-        let found = measured(&run, row, "head/run");
+        let found = measured(&line, &row, "head/run");
         assert_eq!((found.views.len(), found.problem.clone()), (2, None));
+        assert_eq!(found.masks.as_deref(), Some("capture"));
         assert!(found.figures.iter().all(|f| f[0].is_some() && f[1].is_some()) && found.seconds.is_some());
         let picture = found.picture.unwrap();
         assert!(run.dir().join(picture.strip_prefix("head/run/").unwrap()).is_file(), "{picture}");

@@ -16,6 +16,9 @@ pub const MEASURES: [(&str, &str, usize, bool); 6] = [
     ("seconds", "seconds a view", 2, false),
 ];
 
+/// Behind the title of a row that was judged by masks which its own run made.
+const OWN_MASKS: &str = " †";
+
 /// Resamplings of an interval.
 const DRAWS: u64 = 1000;
 
@@ -65,6 +68,9 @@ pub struct Measured {
     pub outside: Option<f64>,
     /// Pieces of the surface, where one was made.
     pub pieces: Option<u64>,
+    /// Whose masks the figures count inside: `capture`, `run` (made by the run itself, for a photograph at least) or
+    /// `none`.
+    pub masks: Option<String>,
     /// Why there are no figures, or no surface.
     pub problem: Option<String>,
     /// A picture, by its path from the page.
@@ -220,7 +226,7 @@ impl Experiment {
         self.measured[row].iter().zip(&self.measured[from]).map(pair).collect()
     }
 
-    /// Whether an ordering holds: for each capture, and on average.
+    /// Whether an ordering holds: for each capture, and on average over those that have both rows.
     pub fn holds(&self, ordering: &Ordering) -> (Vec<Holds>, Holds) {
         let measure = MEASURES.iter().position(|m| m.0 == ordering.by).unwrap_or(0);
         let rows = (self.index(ordering.table, ordering.better), self.index(ordering.table, ordering.worse));
@@ -233,9 +239,15 @@ impl Experiment {
             (Some(_), Some(_)) => Holds::No,
             _ => Holds::Unknown,
         };
-        let each = self.measured[better].iter().zip(&self.measured[worse]);
-        let each = each.map(|(a, b)| judge(a.mean(measure), b.mean(measure))).collect();
-        (each, judge(self.mean(better, measure), self.mean(worse, measure)))
+        let pairs = self.measured[better].iter().zip(&self.measured[worse]);
+        let pairs: Vec<_> = pairs.map(|(a, b)| (a.mean(measure), b.mean(measure))).collect();
+        let each = pairs.iter().map(|&(a, b)| judge(a, b)).collect();
+        // a capture with one of the rows alone says which heads are hard, and nothing of the rows
+        let both: Vec<(f64, f64)> = pairs.into_iter().filter_map(|(a, b)| a.zip(b)).collect();
+        let mean = |of: fn(&(f64, f64)) -> f64| {
+            (!both.is_empty()).then(|| both.iter().map(of).sum::<f64>() / both.len() as f64)
+        };
+        (each, judge(mean(|pair| pair.0), mean(|pair| pair.1)))
     }
 
     fn published(&self, row: &ExperimentRow, measure: &str) -> Option<f64> {
@@ -244,8 +256,15 @@ impl Experiment {
         found.map(|p| p.value)
     }
 
-    fn title(&self, table: &str, row: &str) -> &'static str {
-        self.index(table, row).map_or("", |i| self.rows[i].title)
+    /// Was a row judged by masks that its own run made, for a capture at least?
+    fn judged_itself(&self, row: usize) -> bool {
+        self.measured[row].iter().any(|m| m.masks.as_deref() == Some("run"))
+    }
+
+    /// What a person reads of a row, marked where it was judged by its run's own masks.
+    fn title(&self, row: usize) -> String {
+        let mark = if self.judged_itself(row) { OWN_MASKS } else { "" };
+        format!("{}{mark}", self.rows[row].title)
     }
 
     /// Cells of a table: the heading, then a line for each row.
@@ -264,7 +283,7 @@ impl Experiment {
         let dash = || "–".to_owned();
         let first = self.rows.iter().position(|r| r.table == table);
         for (i, row) in self.rows.iter().enumerate().filter(|(_, r)| r.table == table) {
-            let mut line = vec![row.title.to_owned()];
+            let mut line = vec![self.title(i)];
             for (k, (word, _, digits, _)) in MEASURES.into_iter().enumerate() {
                 line.push(self.mean(i, k).map_or_else(dash, |v| format!("{v:.digits$}")));
                 if self.published.iter().any(|p| p.table == table && p.measure == word) {
@@ -311,7 +330,8 @@ impl Experiment {
         for o in &self.orderings {
             let sign = if o.or_equal { "≥" } else { ">" };
             let (each, mean) = self.holds(o);
-            let claim = format!("{} {sign} {}", self.title(o.table, o.better), self.title(o.table, o.worse));
+            let title = |row: &str| self.index(o.table, row).map_or(String::new(), |i| self.title(i));
+            let claim = format!("{} {sign} {}", title(o.better), title(o.worse));
             let mut line = vec![o.by.to_owned(), claim];
             line.extend(each.iter().map(word));
             line.push(word(&mean));
@@ -322,10 +342,17 @@ impl Experiment {
 
     fn about(&self) -> String {
         let many = self.captures.len();
+        let own = match (0..self.rows.len()).any(|i| self.judged_itself(i)) {
+            true => {
+                ", but in rows with †: for a capture at least, these are judged by masks that their own run made"
+            }
+            false => "",
+        };
         format!(
             "{many} captures ({}), scale {} of the published effort. PSNR and SSIM are means over held-out photographs as \
-             they were taken, then over captures; masks are the captures' own. Intervals: {DRAWS} resamplings of the \
-             photographs.{}",
+             they were taken, then over captures; masks are the captures' own{own}. Seconds a view of an ensemble are \
+             those of its members and of the blend. Orderings on average are over the captures that have both rows. \
+             Intervals: {DRAWS} resamplings of the photographs.{}",
             self.captures.join(", "),
             self.scale,
             if self.published.is_empty() {
@@ -367,8 +394,9 @@ impl Experiment {
             let plain = !text.contains([',', '"', '\n']);
             if plain { text.to_owned() } else { format!("\"{}\"", text.replace('"', "\"\"")) }
         };
-        let mut out =
-            String::from("table,row,capture,photograph,masked,full,region,masked_ssim,full_ssim,seconds\n");
+        let mut out = String::from(
+            "table,row,capture,photograph,masked,full,region,masked_ssim,full_ssim,seconds,masks\n",
+        );
         for (row, measured) in self.rows.iter().zip(&self.measured) {
             for (capture, m) in self.captures.iter().zip(measured) {
                 for (view, figures) in m.views.iter().zip(&m.figures) {
@@ -376,7 +404,8 @@ impl Experiment {
                     let numbers: Vec<String> =
                         numbers.map(|v| v.map_or(String::new(), |v| v.to_string())).collect();
                     let (capture, view) = (quoted(capture), quoted(view));
-                    let _ = writeln!(out, "{},{},{capture},{view},{}", row.table, row.row, numbers.join(","));
+                    let (numbers, masks) = (numbers.join(","), m.masks.as_deref().unwrap_or_default());
+                    let _ = writeln!(out, "{},{},{capture},{view},{numbers},{masks}", row.table, row.row);
                 }
             }
         }
@@ -502,7 +531,32 @@ mod tests {
         let mut missing = e.clone();
         missing.measured[1][0].figures.clear();
         missing.measured[1][0].views.clear();
-        assert_eq!(missing.holds(&e.orderings[0]).0, [Holds::Unknown, Holds::No]);
+        // on average over the second alone, where the first row is better: 29.99 < 30, though 29.99 > 25.5
+        assert_eq!(missing.holds(&e.orderings[0]), (vec![Holds::Unknown, Holds::No], Holds::No));
+        missing.measured[0][1].figures.clear();
+        assert_eq!(missing.holds(&e.orderings[0]), (vec![Holds::Unknown; 2], Holds::Unknown));
+    }
+
+    #[test]
+    fn rows_judged_by_masks_of_their_own_run_are_marked() {
+        let mut e = experiment();
+        e.measured[0][0].masks = Some("capture".into());
+        e.measured[0][1].masks = Some("none".into());
+        assert!(!e.markdown().contains('†'));
+        e.measured[1][1].masks = Some("run".into());
+        let text = e.markdown();
+        assert!(text.contains("| second † | 26.12 |") && text.contains("| first <b> | 25.50 |"), "{text}");
+        assert!(text.contains("| second † > first <b> |") && text.contains("but in rows with †"), "{text}");
+        let page = e.html();
+        assert!(page.contains("<td>second †</td>") && page.contains("but in rows with †"), "{page}");
+        let csv = e.csv();
+        assert!(csv.contains(",seconds,masks\n") && csv.contains("t,a,lps,v0,20,,,,,1.5,capture\n"), "{csv}");
+        assert!(csv.contains("t,b,\"x,y\",v0,29.99,,,,,1.5,run\n"), "{csv}");
+        let value: serde_json::Value = serde_json::from_str(&e.json()).unwrap();
+        assert_eq!(
+            (&value["measured"][1][1]["masks"], value["measured"][1][0]["masks"].is_null()),
+            (&"run".into(), true)
+        );
     }
 
     #[test]
@@ -529,7 +583,7 @@ mod tests {
         );
         assert!(text.contains("+0.62 ("), "{text}");
         assert!(text.contains("| masked | second > first <b> | holds | does not hold | holds |"), "{text}");
-        assert!(e.csv().contains("t,a,\"x,y\",v0,30,,,,,1.5\n"), "{}", e.csv());
+        assert!(e.csv().contains("t,a,\"x,y\",v0,30,,,,,1.5,\n"), "{}", e.csv());
         let page = e.html();
         assert!(page.contains("first &lt;b&gt;") && !page.contains("first <b>"));
         let value: serde_json::Value = serde_json::from_str(&e.json()).unwrap();
