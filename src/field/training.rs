@@ -133,7 +133,9 @@ pub fn train<L: Learner>(
                 let keep = if progress.mean_square == 0.0 { 0.0 } else { kept };
                 progress.mean_square = keep * progress.mean_square + (1.0 - keep) * error as f64;
             }
-            let figures = [vec![("psnr", progress.psnr())], report.figures].concat();
+            // none before the first error is known, which a device tells once in many steps
+            let psnr = (progress.mean_square > 0.0).then(|| ("psnr", progress.psnr()));
+            let figures: Vec<_> = psnr.into_iter().chain(report.figures).collect();
             monitor.step(progress.step, steps, &figures);
             let (last, stop) = (progress.step == steps, monitor.stop());
             if last || stop || saved.elapsed() > every {
