@@ -193,6 +193,7 @@ impl Device {
     /// # Panics
     ///
     /// Where that fails.
+    #[cfg(test)]
     pub fn read<T: Pod>(&self, buffer: &Buffer) -> Vec<T> {
         self.fetch(buffer).expect("the device answers")
     }

@@ -1,0 +1,221 @@
+//! The tables of an experiment as people and programs read them: Markdown, CSV, JSON and a page.
+
+use super::{DRAWS, Experiment, Holds, MEASURES, bootstrap};
+use crate::report::{STYLE, escape, link};
+use std::fmt::Write;
+
+impl Experiment {
+    /// Cells of a table: the heading, then a line for each row.
+    fn cells(&self, table: &str) -> Vec<Vec<String>> {
+        let mut heading = vec!["row".to_owned()];
+        for (word, title, ..) in MEASURES {
+            heading.push(title.into());
+            if self.published.iter().any(|p| p.table == table && p.measure == word) {
+                heading.push(format!("{title}, published"));
+            }
+        }
+        heading.push("more than the first row, dB (95 %)".into());
+        heading.push("seen where nothing is".into());
+        heading.push("pieces".into());
+        let mut out = vec![heading];
+        let dash = || "–".to_owned();
+        let first = self.rows.iter().position(|r| r.table == table);
+        for (i, row) in self.rows.iter().enumerate().filter(|(_, r)| r.table == table) {
+            let mut line = vec![self.title(i)];
+            for (k, (word, _, digits, _)) in MEASURES.into_iter().enumerate() {
+                line.push(self.mean(i, k).map_or_else(dash, |v| format!("{v:.digits$}")));
+                if self.published.iter().any(|p| p.table == table && p.measure == word) {
+                    line.push(self.published(row, word).map_or_else(dash, |v| format!("{v:.digits$}")));
+                }
+            }
+            let more = first.filter(|f| *f != i).and_then(|f| bootstrap(&self.differences(i, f, 0)));
+            line.push(
+                more.map_or_else(dash, |m| format!("{:+.2} ({:+.2} to {:+.2})", m.mean, m.low, m.high)),
+            );
+            let outside: Vec<f64> = self.measured[i].iter().filter_map(|m| m.outside).collect();
+            let mean = outside.iter().sum::<f64>() / outside.len().max(1) as f64;
+            line.push(if outside.is_empty() { dash() } else { format!("{mean:.4}") });
+            let pieces: Vec<String> =
+                self.measured[i].iter().filter_map(|m| Some(m.pieces?.to_string())).collect();
+            line.push(if pieces.is_empty() { dash() } else { pieces.join(", ") });
+            out.push(line);
+        }
+        out
+    }
+
+    /// What is wrong with single rows, a sentence each.
+    fn problems(&self) -> Vec<String> {
+        let mut out = Vec::new();
+        for (row, measured) in self.rows.iter().zip(&self.measured) {
+            for (capture, m) in self.captures.iter().zip(measured) {
+                if let Some(problem) = &m.problem {
+                    let line = format!("{capture}, run `{}`: {problem}", row.run);
+                    if !out.contains(&line) {
+                        out.push(line);
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    /// The orderings as cells: the heading, then one line each.
+    fn verdicts(&self) -> Vec<Vec<String>> {
+        let mut out = vec![["by", "as published"].map(String::from).to_vec()];
+        out[0].extend(self.captures.iter().cloned());
+        out[0].push("on average".into());
+        let word = |h: &Holds| ["holds", "does not hold", "–"][*h as usize].to_owned();
+        for o in &self.orderings {
+            let sign = if o.or_equal { "≥" } else { ">" };
+            let (each, mean) = self.holds(o);
+            let title = |row: &str| self.index(o.table, row).map_or(String::new(), |i| self.title(i));
+            let claim = format!("{} {sign} {}", title(o.better), title(o.worse));
+            let mut line = vec![o.by.to_owned(), claim];
+            line.extend(each.iter().map(word));
+            line.push(word(&mean));
+            out.push(line);
+        }
+        out
+    }
+
+    fn about(&self) -> String {
+        let many = self.captures.len();
+        let own = match (0..self.rows.len()).any(|i| self.judged_itself(i)) {
+            true => {
+                ", but in rows with †: for a capture at least, these are judged by masks that their own run made"
+            }
+            false => "",
+        };
+        format!(
+            "{many} captures ({}), scale {} of the published effort. PSNR and SSIM are means over held-out photographs as \
+             they were taken, then over captures; masks are the captures' own{own}. Seconds a view of an ensemble are \
+             those of its members and of the blend. Orderings on average are over the captures that have both rows. \
+             Intervals: {DRAWS} resamplings of the photographs.{}",
+            self.captures.join(", "),
+            self.scale,
+            if self.published.is_empty() {
+                " No published figures were given (`--published FILE`)."
+            } else {
+                ""
+            }
+        )
+    }
+
+    /// As Markdown.
+    pub fn markdown(&self) -> String {
+        let table = |cells: &[Vec<String>]| {
+            let mut out = String::new();
+            for (i, line) in cells.iter().enumerate() {
+                let _ = writeln!(out, "| {} |", line.join(" | "));
+                if i == 0 {
+                    let _ = writeln!(out, "|{}", " --- |".repeat(line.len()));
+                }
+            }
+            out
+        };
+        let mut out = format!("# The paper's experiment\n\n{}\n", self.about());
+        for (word, title) in &self.tables {
+            let _ = write!(out, "\n## {title}\n\n{}", table(&self.cells(word)));
+        }
+        let _ = write!(out, "\n## Orderings\n\n{}", table(&self.verdicts()));
+        let problems = self.problems();
+        if !problems.is_empty() {
+            let _ = write!(out, "\n## What is missing\n\n");
+            problems.iter().for_each(|p| out += &format!("- {p}\n"));
+        }
+        out
+    }
+
+    /// Every figure of every photograph, as comma-separated values.
+    pub fn csv(&self) -> String {
+        let quoted = |text: &str| {
+            let plain = !text.contains([',', '"', '\n']);
+            if plain { text.to_owned() } else { format!("\"{}\"", text.replace('"', "\"\"")) }
+        };
+        let mut out = String::from(
+            "table,row,capture,photograph,masked,full,region,masked_ssim,full_ssim,seconds,masks\n",
+        );
+        for (row, measured) in self.rows.iter().zip(&self.measured) {
+            for (capture, m) in self.captures.iter().zip(measured) {
+                for (view, figures) in m.views.iter().zip(&m.figures) {
+                    let numbers = figures.iter().chain([&m.seconds]);
+                    let numbers: Vec<String> =
+                        numbers.map(|v| v.map_or(String::new(), |v| v.to_string())).collect();
+                    let (capture, view) = (quoted(capture), quoted(view));
+                    let (numbers, masks) = (numbers.join(","), m.masks.as_deref().unwrap_or_default());
+                    let _ = writeln!(out, "{},{},{capture},{view},{numbers},{masks}", row.table, row.row);
+                }
+            }
+        }
+        out
+    }
+
+    /// All of it, as JSON, with intervals and verdicts.
+    pub fn json(&self) -> String {
+        let mut value = serde_json::json!(self);
+        let rows: Vec<_> = (0..self.rows.len())
+            .map(|i| {
+                let means: serde_json::Map<String, serde_json::Value> = (MEASURES.iter().enumerate())
+                    .map(|(k, m)| (m.0.to_owned(), serde_json::json!(self.mean(i, k))))
+                    .collect();
+                let first = self.rows.iter().position(|r| r.table == self.rows[i].table).unwrap_or(i);
+                let more = bootstrap(&self.differences(i, first, 0));
+                serde_json::json!({"table": self.rows[i].table, "row": self.rows[i].row, "mean": means,
+                                   "masked_over_first": more})
+            })
+            .collect();
+        let verdicts: Vec<_> = (self.orderings.iter())
+            .map(|o| {
+                let (captures, mean) = self.holds(o);
+                serde_json::json!({"ordering": o, "captures": captures, "average": mean})
+            })
+            .collect();
+        value["means"] = rows.into();
+        value["verdicts"] = verdicts.into();
+        format!("{value:#}\n")
+    }
+
+    /// As a page, with a picture of every row and capture; pictures are named by their paths from the page.
+    pub fn html(&self) -> String {
+        let table = |cells: &[Vec<String>]| {
+            let mut out = String::from("<table>");
+            for (i, line) in cells.iter().enumerate() {
+                let tag = if i == 0 { "th" } else { "td" };
+                let cells: String = line.iter().map(|c| format!("<{tag}>{}</{tag}>", escape(c))).collect();
+                let _ = write!(out, "<tr>{cells}</tr>");
+            }
+            out + "</table>"
+        };
+        let mut out = format!(
+            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><link rel=\"icon\" href=\"data:,\">\
+             <title>experiment · tiface</title><style>\n{}\n.row img {{ max-height: 16rem; margin: 0 .5rem .5rem 0 }}\n\
+             </style></head><body>\n<h1>The paper's experiment</h1><p>{}</p>\n",
+            STYLE,
+            escape(&self.about())
+        );
+        for (word, title) in &self.tables {
+            let _ = writeln!(out, "<h2>{}</h2>{}", escape(title), table(&self.cells(word)));
+            for (row, measured) in self.rows.iter().zip(&self.measured).filter(|(r, _)| r.table == *word) {
+                let pictures: String = (self.captures.iter().zip(measured))
+                    .filter_map(|(capture, m)| {
+                        let address = escape(&link(m.picture.as_ref()?));
+                        Some(format!(
+                            "<img src=\"{address}\" alt=\"{} {}\">",
+                            escape(capture),
+                            escape(row.title)
+                        ))
+                    })
+                    .collect();
+                if !pictures.is_empty() {
+                    let _ =
+                        writeln!(out, "<h3>{}</h3><div class=\"row\">{pictures}</div>", escape(row.title));
+                }
+            }
+        }
+        let _ = writeln!(out, "<h2>Orderings</h2>{}", table(&self.verdicts()));
+        for problem in self.problems() {
+            let _ = writeln!(out, "<p>{}</p>", escape(&problem));
+        }
+        out + "</body></html>\n"
+    }
+}
