@@ -22,6 +22,7 @@
 #[cfg(feature = "cpu")]
 mod bench;
 mod clicks;
+mod cost;
 mod ensemble;
 #[cfg(feature = "cpu")]
 pub mod experiment;

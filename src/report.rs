@@ -13,7 +13,7 @@ mod serve;
 
 pub use chart::{Chart, Curve, charts};
 pub use live::{FieldView, serve_run};
-pub use runs::{RunRow, runs_html};
+pub use runs::{RunRow, runs_csv, runs_html};
 pub use serve::{Answer, Server};
 
 use crate::config::Stage;

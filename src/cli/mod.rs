@@ -46,6 +46,7 @@ use out::Out;
 use preview::PreviewOptions;
 use run::LineCommand;
 use screen::Screen;
+use status::StatusOptions;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use target::RunTarget;
@@ -385,7 +386,7 @@ Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are expe
     /// The page of a run made anew, or one page of many runs
     #[command(after_long_help = "Examples:
   tiface report runs/002_00                     its report.html, from what lies there
-  tiface report runs/* --out fleet.html         all of them in a table, with links to each
+  tiface report runs/* --out fleet.html         all of them in a table, with links to each; fleet.csv beside it
   tiface report runs/* --json                   the same figures, an object for each run")]
     Report {
         /// Run folders; without any, all under runs/
@@ -394,12 +395,14 @@ Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are expe
     /// Stages, progress, time left and last error of one or many runs
     #[command(after_long_help = "Examples:
   tiface status
-  tiface status runs/002_00
-  tiface status runs/* --json")]
-    Status {
-        /// Run folders; without any, all under runs/
-        runs: Vec<PathBuf>,
-    },
+  tiface status runs/002_00                     a row for each stage
+  tiface status runs/*                          a line for each run, and one for all
+  tiface status runs/* --failed                 those to look after; exit code 3 if any run failed
+  tiface status runs/* --json                   an object for each run
+
+A sign for each stage: # done, > running, x failed, ! killed, = stopped, ? not readable, . to do. Of more than 40 runs,
+those that are done or not begun share lines; -v gives each its own.")]
+    Status(StatusOptions),
     /// Print the effective configuration, or explain a key
     #[command(after_long_help = "Examples:
   tiface config --preset paper
@@ -463,7 +466,7 @@ pub fn main() -> ExitCode {
         Command::Bench(options) => bench::run(&invocation, options),
         #[cfg(feature = "cpu")]
         Command::Experiment(options) => experiment::run(&invocation, options),
-        Command::Status { runs } => makes_nothing("status").and_then(|()| status::run(&common, runs)),
+        Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
         Command::Report { runs } => report::run(&invocation, runs),
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),

@@ -7,7 +7,7 @@ use super::stdout::print;
 use super::target::RunTarget;
 use crate::io;
 use crate::pipeline::{Line, renew_report};
-use crate::report::{RunRow, runs_html};
+use crate::report::{RunRow, runs_csv, runs_html};
 use crate::run::Run;
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -59,7 +59,7 @@ fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()
     told(invocation, &page)
 }
 
-/// Writes the page of many runs.
+/// Writes the page of many runs, and their figures beside it as CSV.
 fn many(invocation: &Invocation, runs: &[PathBuf], asked: Option<&Out>) -> Result<()> {
     let page = asked.map_or_else(|| PathBuf::from("runs.html"), |out| out.file("runs.html"));
     if let Some(wrong) = runs.iter().find(|run| !io::is_folder(run)) {
@@ -72,6 +72,7 @@ fn many(invocation: &Invocation, runs: &[PathBuf], asked: Option<&Out>) -> Resul
     let folder = page.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
     io::create_folder(folder)?;
     let rows: Vec<RunRow> = runs.par_iter().map(|run| RunRow::read(run, folder)).collect();
+    io::write_atomic(&page.with_extension("csv"), runs_csv(&rows).as_bytes())?;
     io::write_atomic(&page, runs_html(&rows)?.as_bytes())?;
     if invocation.common.json {
         let line = |row: RunRow| format!("{}\n", json!(RunRow { picture: String::new(), ..row }));

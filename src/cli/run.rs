@@ -10,8 +10,9 @@ use super::target::{DEMO_CAPTURE, RunTarget};
 use crate::config::{Config, Preset, RenderConfig};
 use crate::io;
 use crate::pipeline::{Line, Stage, reconstruct};
-use crate::run::Run;
-use crate::{Error, Result};
+use crate::report::duration;
+use crate::run::{Cost, Run};
+use crate::{Error, ErrorKind, Result};
 use serde_json::{Map, Value, json};
 use std::path::Path;
 
@@ -47,24 +48,20 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
     }
     let bars = require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>>>()?;
     let run = Run::open(&target.run, stop.clone(), screen.clone());
-    let mut line = Line::open(&config, &run)?;
-    if is_demo(&config, &run) {
-        line = line.of_demo();
-    }
-    if let Some(path) = path {
-        line = line.along(path)?;
-    }
-    if let Some(out) = &out {
-        out.check(run.dir(), &line.order(*until))?;
-    }
+    let line = ready(common, command, &config, &run, path, out.as_ref()).inspect_err(|e| {
+        // who runs many heads looks for what went wrong in their folders, not in logs
+        let is_named = common.run.is_some() || io::is_folder(run.dir());
+        let is_begun = io::is_file(&run.path("config.toml"));
+        let tells = e.kind() == ErrorKind::Cannot || (e.kind() == ErrorKind::Usage && !is_begun);
+        if is_named && tells && !common.dry_run {
+            run.failed(e);
+        }
+    })?;
     if common.dry_run {
         return print(&outlook(&line, *until, common)?);
     }
-    if let Some(fresh) = common.fresh {
-        line.fresh(fresh, *until)?;
-    }
-    line.remember(*until)?;
-    screen.expect(line.ahead(*until));
+    run.not_failed();
+    screen.expect(line.ahead(*until).into_iter().map(|(stage, cost)| (stage, cost.seconds())).collect());
     let done = reconstruct(&line, *until)?;
     let written = out.map(|out| out.write(product, &line, &run)).transpose()?.unwrap_or_default();
     if common.json {
@@ -78,11 +75,40 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
     bars.iter().try_for_each(|bar| bar.check(&done))
 }
 
-/// What would be done for `until`, a row for each stage.
+/// The line, opened; all that can be refused before the first stage is refused here.
+fn ready<'a>(
+    common: &Common,
+    command: &LineCommand,
+    config: &'a Config,
+    run: &'a Run,
+    path: Option<RenderConfig>,
+    out: Option<&Out>,
+) -> Result<Line<'a>> {
+    let mut line = Line::open(config, run)?;
+    if is_demo(config, run) {
+        line = line.of_demo();
+    }
+    if let Some(path) = path {
+        line = line.along(path)?;
+    }
+    if let Some(out) = out {
+        out.check(run.dir(), &line.order(command.until))?;
+    }
+    if !common.dry_run {
+        if let Some(fresh) = common.fresh {
+            line.fresh(fresh, command.until)?;
+        }
+        line.remember(command.until)?;
+    }
+    Ok(line)
+}
+
+/// What would be done for `until`, a row for each stage, with what each may cost, and all together.
 fn outlook(line: &Line, until: Stage, common: &Common) -> Result<String> {
     let fresh = common.fresh.map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
     let mut text = String::new();
-    for (stage, found) in line.outlook(until)? {
+    let mut sum = Cost::default();
+    for (of, (stage, found)) in line.order(until).into_iter().zip(line.outlook(until)?) {
         let anew = fresh.contains(&stage);
         let (outlook, differences) = match found {
             _ if anew => ("to do, afresh", Vec::new()),
@@ -90,12 +116,27 @@ fn outlook(line: &Line, until: Stage, common: &Common) -> Result<String> {
             Some(d) if d.is_empty() => ("done", d),
             Some(d) => ("would stop: done with other settings", d),
         };
+        let cost = outlook.starts_with("to do").then(|| line.cost(of));
+        sum = sum + cost.unwrap_or_default();
         if common.json {
-            text += &format!("{}\n", json!({"stage": stage, "outlook": outlook, "differences": differences}));
+            let found =
+                json!({"stage": stage, "outlook": outlook, "differences": differences, "estimate": cost});
+            text += &format!("{found}\n");
         } else {
-            text += &format!("{stage:<8} {outlook}\n");
+            let about = cost.map_or(String::new(), |cost| format!("  about {}", duration(cost.seconds())));
+            text += &format!("{stage:<8} {outlook}{about}\n");
             text.extend(differences.iter().map(|d| format!("           {d}\n")));
         }
+    }
+    if !common.json && sum.cpu_s > 0.0 {
+        let gib = |bytes: u64| bytes as f64 / (1u64 << 30) as f64;
+        text += &format!(
+            "{:<8} about {} on the processor, {:.1} GiB of memory, {:.1} GiB of disk\n",
+            "all",
+            duration(sum.seconds()),
+            gib(sum.memory_bytes),
+            gib(sum.disk_bytes)
+        );
     }
     Ok(text)
 }

@@ -1,87 +1,279 @@
-//! `tiface status`: where runs stand; reads only `status.json` and `done.json`.
+//! `tiface status`: where runs stand; reads only what stages say of themselves.
 
-use super::options::Common;
+use super::invocation::Invocation;
 use super::plain::one_line;
 use super::screen::figure;
 use super::stdout::print;
 use crate::io;
-use crate::pipeline::Stage;
 use crate::report::duration;
-use crate::run::{Record, State, Status, read_record, read_status};
+use crate::run::{Phase, Record, Standing, State, Status, read_record, read_status};
 use crate::{Error, Result};
-use serde_json::json;
+use clap::Args;
+use rayon::prelude::*;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
-pub(super) fn run(common: &Common, runs: &[PathBuf]) -> Result<()> {
-    let all = match (runs.is_empty(), &common.run) {
-        (false, _) => runs.to_vec(),
-        (true, Some(run)) => vec![run.clone()],
-        (true, None) => io::list_folders(Path::new("runs"))?,
-    };
-    if all.is_empty() {
-        return Err(Error::cannot("there are no runs under `runs/`", "name a run folder"));
-    }
-    let mut text = String::new();
-    let mut damaged = 0;
-    for run in &all {
-        let mut stages = vec!["–".to_string()];
-        if io::is_folder(run) {
-            stages = Stage::ALL.map(|stage| stage.to_string()).to_vec();
-            let paths = io::list_folders(&run.join("render/paths")).unwrap_or_default();
-            let names = paths.iter().map(|path| path.file_name().unwrap_or_default().to_string_lossy());
-            stages.extend(names.map(|name| format!("render/paths/{name}")));
-        }
-        for stage in stages {
-            let found = read(run, &stage);
-            damaged += usize::from(found.is_err());
-            text += &match found {
-                Ok((status, record)) if common.json => format!(
-                    "{}\n",
-                    json!({"run": run, "stage": stage, "done": record.is_some(), "status": status,
-                        "summary": record.map(|r| r.summary)})
-                ),
-                Err(e) if common.json => {
-                    format!("{}\n", json!({"run": run, "stage": stage, "error": e.to_string()}))
-                }
-                Ok((status, record)) => row(run, &stage, &words(status.as_ref(), record.as_ref())),
-                Err(e) => row(run, &stage, &format!("UNREADABLE: {e}")),
-            };
-        }
-    }
-    print(&text)?;
-    if damaged > 0 {
-        return Err(Error::cannot(
-            format!("{damaged} of these lines could not be read"),
-            "name run folders; `tiface run RUN --fresh STAGE` makes a stage anew",
-        ));
-    }
-    Ok(())
+/// Which runs, and how long.
+#[derive(Args, Debug)]
+pub(super) struct StatusOptions {
+    /// Run folders; without any, all under runs/
+    runs: Vec<PathBuf>,
+    /// Only runs that failed, were killed or cannot be read
+    #[arg(long)]
+    failed: bool,
+    /// Again every two seconds, until all are done or Ctrl-C is pressed
+    #[arg(long, conflicts_with = "json")]
+    watch: bool,
 }
 
-fn row(run: &Path, stage: &str, words: &str) -> String {
-    format!("{:<24} {stage:<8} {}\n", one_line(&run.display().to_string()), one_line(words))
+const EVERY: Duration = Duration::from_secs(2);
+/// More runs than this: those with nothing to tell but that they are done, or not begun, share lines.
+const LINES: usize = 40;
+/// Columns of a shared line.
+const WIDTH: usize = 100;
+
+pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()> {
+    let common = invocation.common;
+    loop {
+        // anew each time: runs may come while one looks
+        let all = match (options.runs.is_empty(), &common.run) {
+            (false, _) => options.runs.clone(),
+            (true, Some(run)) => vec![run.clone()],
+            (true, None) => io::list_folders(Path::new("runs"))?,
+        };
+        let found: Vec<(&Path, Result<Standing>)> =
+            all.par_iter().map(|run| (run.as_path(), look(run))).collect();
+        let text = match &found[..] {
+            [] => return Err(Error::cannot("there are no runs under `runs/`", "name a run folder")),
+            found if common.json => objects(found, options.failed),
+            [(run, Ok(standing))] if !options.failed => stages(run, standing),
+            found => heads(found, options.failed, common.verbose > 0),
+        };
+        let clear = if options.watch && std::io::stdout().is_terminal() { "\x1b[H\x1b[2J" } else { "" };
+        print(&format!("{clear}{text}"))?;
+        let is = |phases: &[Phase]| {
+            let phase = |run: &Result<Standing>| run.as_ref().map_or(Phase::Unreadable, |s| s.phase);
+            found.iter().filter(|(_, run)| phases.contains(&phase(run))).count()
+        };
+        if options.watch && is(&[Phase::Done]) < found.len() && invocation.stop.requested().is_none() {
+            std::thread::park_timeout(EVERY);
+            if invocation.stop.requested().is_none() {
+                continue;
+            }
+        }
+        let (unreadable, failed) = (is(&[Phase::Unreadable]), is(&[Phase::Failed]));
+        return match (unreadable, failed) {
+            (0, 0) => Ok(()),
+            (0, n) => Err(Error::below(
+                format!("{n} of {} runs failed", found.len()),
+                "`tiface status --failed` says why; mend the cause, then repeat the command on them",
+            )),
+            (n, _) => Err(Error::cannot(
+                format!("{n} of {} runs could not be read", found.len()),
+                "name run folders; `tiface run RUN --fresh STAGE` makes a stage anew",
+            )),
+        };
+    }
 }
 
-/// What a stage left in a run.
-fn read(run: &Path, stage: &str) -> Result<(Option<Status>, Option<Record>)> {
+/// Where a run stands, if it is a folder at all.
+fn look(run: &Path) -> Result<Standing> {
     if !io::is_folder(run) {
         return Err(Error::cannot(format!("`{}` is not a folder", run.display()), ""));
     }
-    let folder = run.join(stage);
-    Ok((read_status(&folder)?, read_record(&folder)?))
+    Ok(Standing::read(run))
 }
 
-/// Where a stage stands. The record is the truth: it is written after the status that says "done".
-fn words(status: Option<&Status>, record: Option<&Record>) -> String {
-    let s = match (record, status) {
-        (Some(record), _) => return format!("done in {}", duration(record.elapsed_s)),
-        (None, None) => return "–".into(),
-        (None, Some(status)) => status,
+/// Is this one that somebody has to look after?
+fn has_failed(run: &Result<Standing>) -> bool {
+    let wrong = [Phase::Failed, Phase::Killed, Phase::Unreadable];
+    run.as_ref().map_or(true, |s| wrong.contains(&s.phase))
+}
+
+fn name(run: &Path) -> String {
+    one_line(&run.file_name().unwrap_or(run.as_os_str()).to_string_lossy()).into_owned()
+}
+
+/// A line for each run, and one for all.
+fn heads(runs: &[(&Path, Result<Standing>)], failed: bool, each: bool) -> String {
+    let mut text = String::new();
+    let shown: Vec<_> = runs.iter().filter(|(_, run)| !failed || has_failed(run)).collect();
+    let width = shown.iter().map(|(run, _)| name(run).chars().count()).max().unwrap_or(0).clamp(8, 32);
+    let mut shared: BTreeMap<&str, Vec<String>> = BTreeMap::new();
+    let mut left_s = 0.0;
+    let mut counts: BTreeMap<usize, (&str, usize)> = BTreeMap::new();
+    for (_, run) in runs {
+        let phase = run.as_ref().map_or(Phase::Unreadable, |s| s.phase);
+        counts.entry(phase as usize).or_insert((word(phase), 0)).1 += 1;
+        left_s += run.as_ref().ok().and_then(|s| s.left_s).unwrap_or(0.0);
+    }
+    for (run, standing) in shown {
+        let standing = match standing {
+            Ok(standing) => standing,
+            Err(e) => {
+                let _ = writeln!(text, "{:<width$}  UNREADABLE: {}", name(run), one_line(&e.to_string()));
+                continue;
+            }
+        };
+        let settled = [Phase::Done, Phase::Waiting].contains(&standing.phase);
+        if settled && !each && runs.len() > LINES {
+            shared.entry(word(standing.phase)).or_default().push(name(run));
+            continue;
+        }
+        let bar: String = standing.stages.iter().map(|s| sign(s.phase)).collect();
+        let _ = writeln!(text, "{:<width$}  {bar}  {}", name(run), one_line(&told(standing)));
+    }
+    for (word, names) in shared {
+        let mut line = format!("{word}:");
+        for name in names {
+            if line.len() + 1 + name.len() > WIDTH {
+                text += &format!("{line}\n");
+                line = "  ".into();
+            }
+            line += &format!(" {name}");
+        }
+        text += &format!("{line}\n");
+    }
+    let counts: Vec<String> = counts.values().map(|(word, n)| format!("{n} {word}")).collect();
+    let left = if left_s > 0.0 {
+        format!("; about {} left, one after the other", duration(left_s))
+    } else {
+        String::new()
     };
-    let state = match s.state {
-        State::Running | State::Done => "running, or killed".to_string(),
-        State::Stopped => "stopped".into(),
-        State::Failed => format!("failed: {}", s.error.as_deref().unwrap_or("no reason given")),
+    text + &format!("{} runs: {}{left}\n", runs.len(), counts.join(", "))
+}
+
+fn word(phase: Phase) -> &'static str {
+    match phase {
+        Phase::Waiting => "not begun",
+        Phase::Running => "running",
+        Phase::Killed => "killed",
+        Phase::Stopped => "stopped",
+        Phase::Failed => "failed",
+        Phase::Unreadable => "UNREADABLE",
+        Phase::Begun => "begun",
+        Phase::Done => "done",
+    }
+}
+
+fn sign(phase: Phase) -> char {
+    match phase {
+        Phase::Waiting | Phase::Begun => '.',
+        Phase::Running => '>',
+        Phase::Killed => '!',
+        Phase::Stopped => '=',
+        Phase::Failed => 'x',
+        Phase::Unreadable => '?',
+        Phase::Done => '#',
+    }
+}
+
+/// Where a run stands, after its bar.
+fn told(run: &Standing) -> String {
+    let at = run.stages.iter().find(|s| Some(s.stage) == run.at);
+    let step = at.and_then(|s| s.status.as_ref()).filter(|s| s.steps > 0);
+    let share = step.map_or(String::new(), |s| format!(" {} %", 100 * s.step.min(s.steps) / s.steps));
+    let place = at.map_or(String::new(), |s| format!("{}{share} ", s.stage));
+    let left = run.left_s.filter(|s| *s > 0.0 && run.phase != Phase::Failed);
+    let left = left.map_or(String::new(), |s| format!(", about {} left", duration(s)));
+    match (&run.error, run.phase) {
+        (Some(error), Phase::Failed) => format!("{place}failed: {error}"),
+        (Some(error), _) => format!("{place}{}: {error}", word(run.phase)),
+        (None, Phase::Done) => format!("done in {}", duration(run.elapsed_s)),
+        (None, phase) => format!("{place}{}{left}", word(phase)),
+    }
+}
+
+/// A JSON object for each run, without settings.
+fn objects(runs: &[(&Path, Result<Standing>)], failed: bool) -> String {
+    let object = |(run, standing): &&(&Path, Result<Standing>)| {
+        let value = match standing {
+            Err(e) => json!({"run": run, "state": Phase::Unreadable, "error": e.to_string()}),
+            Ok(s) => {
+                let stages: Vec<Value> = s.stages.iter().map(stage_object).collect();
+                json!({"run": run, "state": s.phase, "stage": s.at.map(|s| s.word()), "error": s.error,
+                    "elapsed_s": s.elapsed_s, "left_s": s.left_s, "stages": stages})
+            }
+        };
+        format!("{value}\n")
+    };
+    runs.iter().filter(|(_, run)| !failed || has_failed(run)).collect::<Vec<_>>().iter().map(object).collect()
+}
+
+fn stage_object(s: &crate::run::StageStanding) -> Value {
+    let mut value = json!({"stage": s.stage.word(), "state": s.phase, "left_s": s.left_s, "error": s.error});
+    if let Some(status) = &s.status {
+        value["step"] = json!(status.step);
+        value["steps"] = json!(status.steps);
+        value["rate"] = json!(status.rate);
+        value["pid"] = json!(status.pid);
+        value["host"] = json!(status.host);
+        value["device"] = json!(status.device);
+        value["updated"] = json!(status.updated);
+        value["elapsed_s"] = json!(status.elapsed_s);
+    }
+    if let Some(record) = &s.record {
+        value["elapsed_s"] = json!(record.elapsed_s);
+        value["cpu_s"] = json!(record.cpu_s);
+        value["peak_bytes"] = json!(record.peak_bytes);
+        value["warnings"] = json!(record.warnings);
+        value["summary"] = record.summary.clone();
+    }
+    value
+}
+
+/// A row for each stage of one run, views of paths included, and what is left of all.
+fn stages(run: &Path, standing: &Standing) -> String {
+    let mut text = String::new();
+    let mut row = |stage: &str, words: &str| {
+        let _ = writeln!(text, "{:<24} {stage:<8} {}", one_line(&run.display().to_string()), one_line(words));
+    };
+    for s in &standing.stages {
+        let words = match &s.error {
+            Some(error) if s.phase == Phase::Unreadable => format!("UNREADABLE: {error}"),
+            _ => words(s.phase, s.status.as_ref(), s.record.as_ref()),
+        };
+        row(s.stage.word(), &words);
+    }
+    for path in io::list_folders(&run.join("render/paths")).unwrap_or_default() {
+        let name = format!("render/paths/{}", path.file_name().unwrap_or_default().to_string_lossy());
+        let found = read_status(&path).and_then(|status| Ok((status, read_record(&path)?)));
+        let words = match &found {
+            Err(e) => format!("UNREADABLE: {e}"),
+            Ok((status, record)) => {
+                let phase = match (record, status.as_ref().map(|s| s.state)) {
+                    (Some(_), _) => Phase::Done,
+                    (None, None) => Phase::Waiting,
+                    (None, Some(State::Failed)) => Phase::Failed,
+                    (None, Some(State::Stopped)) => Phase::Stopped,
+                    (None, Some(_)) => Phase::Running,
+                };
+                words(phase, status.as_ref(), record.as_ref())
+            }
+        };
+        row(&name, &words);
+    }
+    if standing.at.is_none() && standing.phase == Phase::Failed {
+        row("–", &told(standing));
+    }
+    if let Some(left) = standing.left_s.filter(|s| *s > 0.0) {
+        row("all", &format!("about {} left", duration(left)));
+    }
+    text
+}
+
+/// Where a stage stands, in words.
+fn words(phase: Phase, status: Option<&Status>, record: Option<&Record>) -> String {
+    let Some(s) = status.filter(|_| phase != Phase::Done) else {
+        return record.map_or("–".into(), |r| format!("done in {}", duration(r.elapsed_s)));
+    };
+    let state = match phase {
+        Phase::Failed => format!("failed: {}", s.error.as_deref().unwrap_or("no reason given")),
+        phase => word(phase).into(),
     };
     let step = if s.steps > 0 { format!(", step {} of {}", s.step, s.steps) } else { String::new() };
     let rate = s.rate.map(|rate| format!(", {}/s", figure(rate))).unwrap_or_default();

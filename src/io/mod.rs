@@ -35,7 +35,7 @@ pub use pictures::{
     PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, png_bytes, read_gray, read_photo,
     write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
 };
-pub use process::{cpu_seconds, forget_peak_memory, peak_memory, processor};
+pub use process::{cpu_seconds, forget_peak_memory, has_open, peak_memory, processor};
 pub use read::read_bytes;
 pub use tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
 pub use torch::{TorchNumbers, TorchTensor, TorchValue, parse_torch, read_torch};

@@ -1,4 +1,6 @@
-//! What this process has cost so far, and what it runs on, as far as the system says.
+//! What this process has cost so far, what it runs on, and whether others are there, as far as the system says.
+
+use std::path::Path;
 
 /// Returns the seconds of all threads of this process, user and system; those by the clock where the system does not
 /// say.
@@ -28,6 +30,31 @@ pub fn peak_memory() -> Option<u64> {
 pub fn forget_peak_memory() {
     // 5: the peak becomes what is held now (proc_pid_clear_refs(5))
     let _ = std::fs::write("/proc/self/clear_refs", "5");
+}
+
+/// Returns whether a process of this machine is there and has a file open. Where the system shows no open files (another
+/// user's process, too), that it is there must do.
+pub fn has_open(pid: u32, file: &Path) -> bool {
+    let files = std::fs::read_dir(format!("/proc/{pid}/fd")).ok();
+    match (files, file.canonicalize()) {
+        (Some(files), Ok(file)) => {
+            files.flatten().any(|f| std::fs::read_link(f.path()).is_ok_and(|to| to == file))
+        }
+        _ => is_there(pid),
+    }
+}
+
+#[cfg(unix)]
+fn is_there(pid: u32) -> bool {
+    use rustix::process::{Pid, test_kill_process};
+    let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
+    // one that may not be asked is there
+    pid.is_some_and(|pid| test_kill_process(pid).err().is_none_or(|e| e == rustix::io::Errno::PERM))
+}
+
+#[cfg(not(unix))]
+fn is_there(_: u32) -> bool {
+    true
 }
 
 /// Returns what the system calls its processor; empty where it does not say.

@@ -3,7 +3,7 @@
 use super::ensemble::can_blend;
 use super::line::Line;
 use super::path::{CameraPath, PATHS};
-use crate::capture::{Split, View};
+use crate::capture::View;
 use crate::config::iface::FieldKind;
 use crate::config::{Config, Stage, VmConfig};
 use crate::io;
@@ -73,6 +73,7 @@ impl Line<'_> {
         let order = self.order(until).into_iter();
         let left: Vec<Stage> = order.filter(|stage| !self.run.is_done(&self.plan(*stage))).collect();
         self.require_inputs(&left)?;
+        self.write_estimate(left.is_empty())?;
         self.write("config.toml", self.config.to_toml().as_bytes(), left.is_empty())
     }
 
@@ -266,41 +267,8 @@ impl Line<'_> {
         Plan { name: folder, fingerprint, device: &self.config.device, needs_bytes, saves: false }
     }
 
-    /// The folders of the stages that `until` needs and that are not done, with the seconds that each may take on two
-    /// cores: from counts of rays, samples, cells and pixels, and what one of each took where it was measured. No more
-    /// than an estimate; whoever shows it corrects it by the pace of the stage at work.
-    pub fn ahead(&self, until: Stage) -> Vec<(String, f64)> {
-        let Config { iface, mesh, .. } = self.config;
-        let all = self.pixels() as f64;
-        let each = all / self.capture.views.len().max(1) as f64;
-        let test = each * self.capture.split(Split::Test).count().max(1) as f64;
-        let rendered = match &self.path {
-            Some(CameraPath { cameras: Some(cameras), .. }) => each * cameras.len() as f64,
-            Some(CameraPath { render, .. }) => each * f64::from(render.orbit_views),
-            None => test,
-        };
-        let seconds = |stage: Stage| match stage {
-            Stage::Mask => 2.0 + 2e-6 * all,
-            Stage::Baseline | Stage::Tface => {
-                let c = self.config.radiance(stage);
-                // whole frames are mostly outside the hull, and nothing of them is skipped
-                let ray = if stage == Stage::Baseline { 60e-6 } else { 23e-6 };
-                if c.import.is_empty() { ray * (c.steps as usize * c.rays * c.learned()) as f64 } else { 1.0 }
-            }
-            Stage::Iface => 3e-6 * (iface.steps as usize * iface.samples) as f64,
-            Stage::Mesh => {
-                3e-4 * f64::from(mesh.resolution).powi(2) + 5e-6 * (mesh.texels() * mesh.pictures()) as f64
-            }
-            Stage::Render => 8e-6 * rendered * self.render_config().method.len() as f64,
-            Stage::Ensemble => 1e-6 * all,
-            Stage::Metrics => 2.0 + 1e-6 * test,
-        };
-        let order = self.order(until).into_iter().map(|stage| (stage, self.plan(stage)));
-        order.filter(|(_, p)| !self.run.is_done(p)).map(|(s, p)| (p.name.into(), seconds(s))).collect()
-    }
-
     /// Of all photographs.
-    fn pixels(&self) -> u64 {
+    pub(super) fn pixels(&self) -> u64 {
         let pixels = |v: &View| v.camera.width as u64 * v.camera.height as u64;
         self.capture.views.iter().map(pixels).sum()
     }

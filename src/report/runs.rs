@@ -1,11 +1,12 @@
 //! One page of many runs: a row each, sorted by whatever one likes.
 
-use super::{STYLE, duration, fill, link, picture_url};
+use super::{STYLE, fill, link, picture_url};
 use crate::Result;
+use crate::capture::synthetic::SyntheticHead;
 use crate::config::{Config, NAMES, Sources, Stage, called};
 use crate::image::{over_black, reduce_photo, working_size};
 use crate::io::{self, Limits};
-use crate::run::{Record, State, read_record, read_status};
+use crate::run::{Phase, Record, Standing};
 use minijinja::context;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -43,8 +44,16 @@ pub struct RunRow {
     pub triangles: Option<u64>,
     /// Of `head.glb`.
     pub megabytes: Option<f64>,
-    /// Work of all stages.
+    /// Mean distance of the mesh from the true surface, millimeters; where that is known, of the demo head.
+    pub mm: Option<f64>,
+    /// Work of all stages by the clock.
     pub seconds: f64,
+    /// The same of all processor cores.
+    pub cpu_s: Option<f64>,
+    /// The most memory of any stage, bytes.
+    pub peak_bytes: Option<u64>,
+    /// What stages warned of.
+    pub warnings: Vec<String>,
     /// When its last stage ended, in seconds since 1970.
     pub finished: u64,
 }
@@ -53,20 +62,24 @@ impl RunRow {
     /// Reads what the run in a folder says of itself; its page is linked from one in `beside`. A file that is missing or
     /// damaged leaves its figures out: one run must not hide the others.
     pub fn read(run: &Path, beside: &Path) -> RunRow {
-        let records: Vec<(Stage, Record)> = Stage::ALL
-            .into_iter()
-            .filter_map(|stage| Some((stage, read_record(&run.join(stage)).ok()??)))
-            .collect();
+        let standing = Standing::read(run);
+        let records: Vec<(Stage, &Record)> =
+            standing.stages.iter().filter_map(|s| Some((s.stage, s.record.as_ref()?))).collect();
         let of = |stage| records.iter().find(|(s, _)| *s == stage).map(|(_, r)| &r.summary);
         let name = io::real_path(run).unwrap_or(run.into());
-        let (state, done) = standing(run, of(Stage::Metrics).is_some(), records.last().map(|(s, _)| *s));
         let mut row = RunRow {
             name: name.file_name().unwrap_or(run.as_os_str()).to_string_lossy().into_owned(),
-            state,
-            done,
+            state: state(&standing),
+            done: standing.phase == Phase::Done,
             picture: picture(run).unwrap_or_default(),
             preset: preset(run).unwrap_or_default(),
-            seconds: records.iter().map(|(_, r)| r.elapsed_s).sum(),
+            seconds: standing.elapsed_s,
+            cpu_s: records.iter().map(|(_, r)| r.cpu_s).sum::<Option<f64>>().filter(|s| *s > 0.0),
+            peak_bytes: records.iter().filter_map(|(_, r)| r.peak_bytes).max(),
+            warnings: records
+                .iter()
+                .flat_map(|(s, r)| r.warnings.iter().map(move |w| format!("{s}: {w}")))
+                .collect(),
             finished: records.iter().map(|(_, r)| r.finished).max().unwrap_or(0),
             megabytes: io::file_size(&run.join("mesh/head.glb")).map(|bytes| bytes as f64 / 1e6),
             ..RunRow::default()
@@ -85,30 +98,34 @@ impl RunRow {
                 (row.psnr, row.ssim, row.method) = (Some(psnr), mean(word, "ssim_masked"), called(word));
             }
             let meshes = ["raycast", "textured", "raster"].into_iter();
+            // per cent of the height of the one head whose surface is known
+            let percent = metrics["truth_percent_of_head"]["accuracy_mean"].as_f64();
+            row.mm = percent.map(|p| 10.0 * p * f64::from(SyntheticHead::HEAD_HEIGHT));
             row.mesh_psnr = meshes.filter_map(|word| mean(word, "psnr_masked")).max_by(f64::total_cmp);
         }
         row
     }
 }
 
-/// Where a run stands, in words, and whether it is done.
-fn standing(run: &Path, is_judged: bool, last: Option<Stage>) -> (String, bool) {
-    if is_judged {
-        return ("done".into(), true);
-    }
-    let open =
-        Stage::ALL.into_iter().rev().filter(|stage| read_record(&run.join(stage)).ok().flatten().is_none());
-    let mut begun = open.filter_map(|stage| Some((stage, read_status(&run.join(stage)).ok()??)));
-    let words = match begun.next() {
-        Some((stage, s)) if s.state == State::Failed => {
-            format!("{stage} failed: {}", s.error.unwrap_or_default())
+/// Where a run stands, in words.
+fn state(run: &Standing) -> String {
+    let stage = run.stages.iter().find(|s| Some(s.stage) == run.at);
+    let place = stage.map_or(String::new(), |s| format!("{} ", s.stage));
+    let share = stage.and_then(|s| s.status.as_ref()).filter(|s| s.steps > 0);
+    let share = share.map_or(String::new(), |s| format!(", {} %", 100 * s.step.min(s.steps) / s.steps));
+    match run.phase {
+        Phase::Done => "done".into(),
+        Phase::Failed => format!("{place}failed: {}", run.error.as_deref().unwrap_or_default()),
+        Phase::Unreadable => format!("{place}cannot be read: {}", run.error.as_deref().unwrap_or_default()),
+        Phase::Running => format!("{place}at work{share}"),
+        Phase::Killed => format!("{place}killed{share}"),
+        Phase::Stopped => format!("{place}stopped{share}"),
+        Phase::Begun => {
+            let last = run.stages.iter().rev().find(|s| s.phase == Phase::Done);
+            last.map_or("begun".into(), |s| format!("{} done", s.stage))
         }
-        Some((stage, s)) if s.state == State::Stopped => format!("{stage} stopped"),
-        Some((stage, s)) if s.steps > 0 => format!("{stage}, {} %", 100 * s.step / s.steps.max(1)),
-        Some((stage, _)) => stage.to_string(),
-        None => last.map_or("empty".into(), |stage| format!("{stage} done")),
-    };
-    (words, false)
+        Phase::Waiting => "empty".into(),
+    }
 }
 
 fn preset(run: &Path) -> Option<String> {
@@ -145,27 +162,85 @@ fn relative(file: &Path, folder: &Path) -> PathBuf {
     up.collect::<PathBuf>().join(file.components().skip(shared).collect::<PathBuf>())
 }
 
+/// What is compared over runs: its heading, also in the CSV, and its value.
+const FIGURES: [(&str, fn(&RunRow) -> Option<f64>); 10] = [
+    ("PSNR", |r| r.psnr),
+    ("SSIM", |r| r.ssim),
+    ("mesh PSNR", |r| r.mesh_psnr),
+    ("mm", |r| r.mm),
+    ("triangles", |r| r.triangles.map(|n| n as f64)),
+    ("MB", |r| r.megabytes),
+    ("minutes", |r| Some(r.seconds / 60.0)),
+    ("CPU minutes", |r| r.cpu_s.map(|s| s / 60.0)),
+    ("GiB", |r| r.peak_bytes.map(|b| b as f64 / (1u64 << 30) as f64)),
+    ("warnings", |r| Some(r.warnings.len() as f64)),
+];
+const DIGITS: [usize; FIGURES.len()] = [2, 4, 2, 2, 0, 1, 1, 1, 2, 0];
+
+/// Farther from the median than this many robust standard deviations is worth a look (Iglewicz and Hoaglin 1993).
+const OUTLIER: f64 = 3.5;
+
+/// Which of some values are far from the others, by the modified z-score: the distance from the median over 1.4826 times
+/// the median of all distances. Of fewer than five nothing is said.
+fn outliers(values: &[Option<f64>]) -> Vec<bool> {
+    let median = |mut v: Vec<f64>| {
+        v.sort_by(f64::total_cmp);
+        (v[(v.len() - 1) / 2] + v[v.len() / 2]) / 2.0
+    };
+    let known: Vec<f64> = values.iter().flatten().copied().collect();
+    if known.len() < 5 {
+        return vec![false; values.len()];
+    }
+    let middle = median(known.clone());
+    let spread = 1.4826 * median(known.iter().map(|v| (v - middle).abs()).collect());
+    // most may be alike to the last digit: then whatever differs by more than a thousandth stands out
+    let spread = spread.max(1e-3 * middle.abs() / OUTLIER);
+    values.iter().map(|v| v.is_some_and(|v| (v - middle).abs() > OUTLIER * spread)).collect()
+}
+
 /// Returns the page of many runs.
 pub fn runs_html(rows: &[RunRow]) -> Result<String> {
-    let figure = |value: Option<f64>, digits| value.map_or("–".into(), |v| format!("{v:.digits$}"));
-    let cells = |row: &RunRow| -> [String; 7] {
-        [
-            figure(row.psnr, 2),
-            figure(row.ssim, 4),
-            figure(row.mesh_psnr, 2),
-            row.watertight.map_or("–", |closed| if closed { "yes" } else { "NO" }).into(),
-            row.triangles.map_or("–".into(), |n| n.to_string()),
-            figure(row.megabytes, 1),
-            duration(row.seconds),
-        ]
+    // what is not done yet has figures of less than the others
+    let value = |row: &RunRow, of: fn(&RunRow) -> Option<f64>| of(row).filter(|_| row.done);
+    let far: Vec<Vec<bool>> = FIGURES
+        .iter()
+        .map(|(_, of)| outliers(&rows.iter().map(|r| value(r, *of)).collect::<Vec<_>>()))
+        .collect();
+    let cells = |(i, row): (usize, &RunRow)| -> Vec<(String, bool)> {
+        let figure = |k: usize| {
+            let (_, of) = FIGURES[k];
+            (of(row).map_or("–".into(), |v| format!("{v:.*}", DIGITS[k])), far[k][i])
+        };
+        (0..FIGURES.len()).map(figure).collect()
     };
-    let cells: Vec<_> = rows.iter().map(cells).collect();
+    let cells: Vec<_> = rows.iter().enumerate().map(cells).collect();
     let done = rows.iter().filter(|row| row.done).count();
+    let failed = rows.iter().filter(|row| row.state.contains("failed")).count();
+    let headings: Vec<&str> = FIGURES.iter().map(|(heading, _)| *heading).collect();
     let script = include_str!("runs.js");
     fill(
         include_str!("runs.html"),
-        context! { style => STYLE, script, title => format!("{} runs", rows.len()), rows, cells, done },
+        context! { style => STYLE, script, title => format!("{} runs", rows.len()), rows, cells, headings, done, failed },
     )
+}
+
+/// Returns the figures of many runs as comma-separated values (RFC 4180), a heading first.
+pub fn runs_csv(rows: &[RunRow]) -> String {
+    let quoted = |text: &str| {
+        // what begins like a formula is one to spreadsheets
+        let text = if text.starts_with(['=', '+', '-', '@']) { format!("'{text}") } else { text.to_owned() };
+        format!("\"{}\"", text.replace('"', "\"\""))
+    };
+    let mut csv = "run,state,best,watertight,preset".to_owned();
+    FIGURES.iter().for_each(|(heading, _)| csv += &format!(",{heading}"));
+    for row in rows {
+        let closed = row.watertight.map_or("", |closed| if closed { "yes" } else { "no" });
+        csv += "\n";
+        csv += &[&row.name, &row.state, &row.method].map(|text| quoted(text)).join(",");
+        csv += &format!(",{closed},{}", row.preset);
+        FIGURES.iter().for_each(|(_, of)| csv += &of(row).map_or(",".into(), |v| format!(",{v}")));
+    }
+    csv + "\n"
 }
 
 #[cfg(test)]
@@ -189,6 +264,38 @@ mod tests {
         let page = runs_html(&[row.clone(), RunRow { psnr: Some(31.25), ..row }]).unwrap();
         assert!(!page.contains("<img src=x") && page.contains("&lt;img src=x") && page.contains("31.25"));
         assert_eq!(page.matches("<tr>").count(), 3);
+    }
+
+    #[test]
+    fn what_stands_out_is_marked_and_what_all_share_is_not() {
+        // median 31, distances 1, 0, 1, 0, 9: their median is 1
+        let psnr = [30.0, 31.0, 32.0, 31.0, 22.0];
+        assert_eq!(outliers(&psnr.map(Some)), [false, false, false, false, true]);
+        assert_eq!(outliers(&[Some(1.0), None, Some(900.0)]), [false; 3]);
+        assert_eq!(outliers(&[Some(7.0), Some(7.0), Some(7.0), Some(7.0), None, Some(7.1)])[5], true);
+        let row = |psnr| RunRow { psnr: Some(psnr), done: true, seconds: 60.0, ..RunRow::default() };
+        let page = runs_html(&psnr.map(row)).unwrap();
+        assert_eq!(page.matches("class=\"far\"").count(), 1, "{page}");
+        assert!(page.contains("<td class=\"far\">22.00</td>"));
+    }
+
+    #[test]
+    fn a_table_for_spreadsheets_quotes_names_and_keeps_all_digits() {
+        let row = RunRow {
+            name: "=cmd|\"x\"".into(),
+            state: "a, b".into(),
+            watertight: Some(false),
+            psnr: Some(31.25),
+            warnings: vec!["w".into()],
+            ..RunRow::default()
+        };
+        let csv = runs_csv(&[row]);
+        let lines: Vec<&str> = csv.lines().collect();
+        assert_eq!(
+            lines[0],
+            "run,state,best,watertight,preset,PSNR,SSIM,mesh PSNR,mm,triangles,MB,minutes,CPU minutes,GiB,warnings"
+        );
+        assert_eq!(lines[1], "\"'=cmd|\"\"x\"\"\",\"a, b\",\"\",no,,31.25,,,,,,0,,,1");
     }
 
     #[test]

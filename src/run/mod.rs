@@ -6,6 +6,8 @@
 //!                   log.jsonl    one object per logged step
 //!                   …            the stage's own files
 //!                   done.json    last: what shaped the result, and its figures
+//! runs/002_00/estimate.json      what stages may cost, told before they are worked on
+//!             failed.json        what a command ended with before any stage could say so
 //! ```
 //!
 //! A stage whose `done.json` has the same fingerprint is skipped without touching a file; one with
@@ -17,15 +19,19 @@
 //! things happened, and so differ from run to run.
 
 use crate::{Error, ErrorKind, Quiet, Result};
+mod estimate;
 mod fingerprint;
 mod progress;
 mod stage;
+mod standing;
 mod status;
 mod stop;
 
+pub use estimate::{Cost, ESTIMATE, Estimate, read_estimate};
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer};
 pub use stage::{Done, Plan, StageDir};
+pub use standing::{FAILED, Failure, Phase, StageStanding, Standing, read_failure};
 pub use status::{Record, State, Status, read_record, read_status};
 pub use stop::Stop;
 
@@ -151,6 +157,18 @@ impl Run {
     /// The stop request this run listens to.
     pub fn stop(&self) -> &Stop {
         &self.stop
+    }
+
+    /// Leaves word of what a command ended with before any stage could say so; whether that succeeds is no matter.
+    pub fn failed(&self, error: &Error) {
+        let failure =
+            Failure { error: error.to_string(), hint: error.hint().into(), exit: error.kind().code() };
+        let _ = self.write(FAILED, format!("{}\n", serde_json::json!(failure)).as_bytes());
+    }
+
+    /// Takes back what [`Run::failed`] said.
+    pub fn not_failed(&self) {
+        let _ = io::remove(&self.path(FAILED));
     }
 
     fn lock(&self, stage: &str) -> Result<Lock> {

@@ -98,10 +98,22 @@ struct Pace {
     saved: Option<Instant>,
     /// A status that cannot be written is reported once, not once a second.
     complained: bool,
+    /// What was warned of.
+    warnings: Vec<String>,
     /// Has this process done a step?
     stepped: bool,
 }
 
+impl Pace {
+    fn remember(&mut self, warning: &str) {
+        // once each, and as many as anybody reads
+        if self.warnings.len() < MOST_WARNINGS && !self.warnings.iter().any(|w| w == warning) {
+            self.warnings.push(warning.to_owned());
+        }
+    }
+}
+
+const MOST_WARNINGS: usize = 50;
 const SHOW: Duration = Duration::from_millis(100);
 const LOG: Duration = Duration::from_secs(1);
 const SAVE: Duration = Duration::from_secs(2);
@@ -157,11 +169,17 @@ impl Progress {
         self.state().1.stepped
     }
 
+    /// What was warned of, each once.
+    pub fn warnings(&self) -> Vec<String> {
+        self.state().1.warnings.clone()
+    }
+
     pub fn note(&self, text: &str) {
         self.observer.event(&Event::Note { stage: &self.stage, text });
     }
 
     pub fn warn(&self, text: &str) {
+        self.state().1.remember(text);
         self.observer.event(&Event::Warning { stage: &self.stage, text });
     }
 
@@ -217,7 +235,9 @@ impl Monitor for Progress {
             && !pace.complained
         {
             pace.complained = true;
-            self.warn(&e.to_string());
+            let text = e.to_string();
+            pace.remember(&text);
+            self.observer.event(&Event::Warning { stage: &self.stage, text: &text });
         }
         if last || due(pace.shown, SHOW) {
             pace.shown = Some(now);

@@ -157,12 +157,14 @@ impl Run {
         };
         let (stop, observer) = (self.stop.clone(), self.observer.clone());
         let progress = Arc::new(Progress::new(name, folder.clone(), stop, observer, status));
+        let cpu_before_s = io::cpu_seconds();
+        io::forget_peak_memory();
         let _at_work = self.stop.at_work(&progress, plan.saves);
         progress.save(|_| {})?;
         self.observer.event(&Event::Started { stage: name });
         let stage = StageDir { folder, identity: plan.fingerprint.digest(), progress };
         match work(&stage) {
-            Ok(summary) => self.record(&plan, &stage, summary),
+            Ok(summary) => self.record(&plan, &stage, summary, io::cpu_seconds() - cpu_before_s),
             Err(failure) => {
                 let signal = self.stop.requested().filter(|_| failure.kind().is_stop());
                 let failure = signal.map_or(failure.clone(), |kind| failure.with_kind(kind));
@@ -221,7 +223,7 @@ impl Run {
         Ok(status.elapsed_s)
     }
 
-    fn record(&self, plan: &Plan, stage: &StageDir, summary: Value) -> Result<Done> {
+    fn record(&self, plan: &Plan, stage: &StageDir, summary: Value, cpu_s: f64) -> Result<Done> {
         let elapsed_s = stage.progress.elapsed_s();
         stage.progress.save(|s| {
             s.state = State::Done;
@@ -234,6 +236,9 @@ impl Run {
             digest: digest.clone(),
             summary: summary.clone(),
             elapsed_s,
+            cpu_s: Some((cpu_s.max(0.0) * 1e3).round() / 1e3),
+            peak_bytes: io::peak_memory(),
+            warnings: stage.progress.warnings(),
             finished: now(),
             version: env!("CARGO_PKG_VERSION").into(),
         };

@@ -64,6 +64,15 @@ pub struct Record {
     pub summary: Value,
     /// Seconds of work.
     pub elapsed_s: f64,
+    /// Seconds of all processor cores, of the process that finished it; `None` in older records.
+    #[serde(default)]
+    pub cpu_s: Option<f64>,
+    /// The most memory of the process meanwhile, bytes; `None` where the system does not say.
+    #[serde(default)]
+    pub peak_bytes: Option<u64>,
+    /// What went differently than hoped.
+    #[serde(default)]
+    pub warnings: Vec<String>,
     /// Seconds since 1970.
     pub finished: u64,
     /// The version of `tiface`.
@@ -87,6 +96,7 @@ pub fn read_record(folder: &Path) -> Result<Option<Record>, ReadError> {
     let record: Option<Record> = read(&path)?;
     if let Some(r) = &record {
         not_negative(&path, "elapsed_s", Some(r.elapsed_s))?;
+        not_negative(&path, "cpu_s", r.cpu_s)?;
         let digest = r.fingerprint.digest();
         if r.digest != digest {
             return Err(ReadError::value(&path, "digest", &r.digest, format!("{digest}, its fingerprint's")));

@@ -1,0 +1,267 @@
+//! Where a run stands as a whole: its stages by what they left, what is still to do, and what went wrong.
+
+use super::{LOCK, Record, State, Status, read_estimate, read_record, read_status};
+use crate::config::Stage;
+use crate::io::{self, Limits};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Where a stage, or a run, stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Phase {
+    /// Nothing was begun.
+    Waiting,
+    /// A process works on it; on another machine: it was not heard to end.
+    Running,
+    /// Its process is gone without having said why.
+    Killed,
+    /// Stopped on request after saving.
+    Stopped,
+    /// Ended by an error.
+    Failed,
+    /// What it left cannot be read.
+    Unreadable,
+    /// Of a run: some stages are done, none is at work.
+    Begun,
+    /// Complete.
+    Done,
+}
+
+/// A stage of a run.
+#[derive(Clone, Debug)]
+pub struct StageStanding {
+    /// Which.
+    pub stage: Stage,
+    /// Where it stands.
+    pub phase: Phase,
+    /// Its `status.json`.
+    pub status: Option<Status>,
+    /// Its `done.json`.
+    pub record: Option<Record>,
+    /// What it failed with, or why it cannot be read.
+    pub error: Option<String>,
+    /// Seconds by the clock that are left of it.
+    pub left_s: f64,
+}
+
+/// A run.
+#[derive(Clone, Debug)]
+pub struct Standing {
+    /// The stages that it is to have, in order; where it does not say, all of them.
+    pub stages: Vec<StageStanding>,
+    /// Where it stands.
+    pub phase: Phase,
+    /// The stage at work, else the one that ended last without being done.
+    pub at: Option<Stage>,
+    /// What a command on it, or one of its stages, ended with.
+    pub error: Option<String>,
+    /// Seconds by the clock that are left of all stages, at the pace of those that are done; `None` where the run has
+    /// no estimate.
+    pub left_s: Option<f64>,
+    /// Seconds of work so far.
+    pub elapsed_s: f64,
+}
+
+/// `failed.json`: what a command ended with before any stage could say so.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Failure {
+    /// What was wrong.
+    pub error: String,
+    /// What to do about it.
+    pub hint: String,
+    /// The exit code.
+    pub exit: u8,
+}
+
+/// Its name in a run.
+pub const FAILED: &str = "failed.json";
+
+impl Standing {
+    /// Reads where the run in a folder stands; what is missing or damaged is part of the answer.
+    pub fn read(run: &Path) -> Standing {
+        let estimate = read_estimate(run).unwrap_or_default();
+        let is_part = |stage: &Stage| estimate.as_ref().is_none_or(|e| e.contains_key(stage.word()));
+        let mut stages: Vec<StageStanding> =
+            Stage::ALL.into_iter().filter(is_part).map(|stage| StageStanding::read(run, stage)).collect();
+        let cost = |s: &StageStanding| estimate.as_ref()?.get(s.stage.word()).map(|c| c.seconds());
+        // the machine that works on it may be faster or slower, and do other things besides
+        let done = stages.iter().filter_map(|s| Some((s.record.as_ref()?.elapsed_s, cost(s)?)));
+        let (took, estimated) = done.fold((0.0, 0.0), |(a, b), (took, cost)| (a + took, b + cost));
+        let pace = if estimated > 1.0 { (took / estimated).clamp(0.02, 50.0) } else { 1.0 };
+        for s in &mut stages {
+            s.left_s = match (s.phase, &s.status) {
+                (Phase::Done, _) => 0.0,
+                (Phase::Running, Some(Status { eta_s: Some(eta), .. })) => *eta,
+                (phase, status) => {
+                    let all = cost(s).unwrap_or(0.0) * pace;
+                    let kept = phase != Phase::Waiting && s.stage.learns();
+                    let share = status.as_ref().filter(|s| kept && s.steps > 0);
+                    all * (1.0 - share.map_or(0.0, |s| (s.step as f64 / s.steps as f64).min(1.0)))
+                }
+            };
+        }
+        let failure = read_failure(run);
+        let has = |phase: Phase| stages.iter().rev().find(|s| s.phase == phase);
+        let is_done = match &estimate {
+            Some(_) => stages.iter().all(|s| s.phase == Phase::Done),
+            None => stages.iter().any(|s| s.stage == Stage::Metrics && s.phase == Phase::Done),
+        };
+        let worst = [Phase::Running, Phase::Unreadable, Phase::Failed, Phase::Killed, Phase::Stopped];
+        let found = worst.into_iter().find_map(has).map(|s| (s.phase, Some(s.stage)));
+        let (phase, at) = match found {
+            _ if is_done => (Phase::Done, None),
+            Some((Phase::Running, at)) => (Phase::Running, at),
+            _ if failure.is_some() => (Phase::Failed, None),
+            Some(found) => found,
+            None if has(Phase::Done).is_some() => (Phase::Begun, None),
+            None => (Phase::Waiting, None),
+        };
+        let of_stage = at.and_then(|at| stages.iter().find(|s| s.stage == at)?.error.clone());
+        let error = of_stage.or(failure.filter(|_| phase == Phase::Failed).map(|f| f.error));
+        let elapsed = |s: &StageStanding| {
+            let kept = s.status.as_ref().map_or(0.0, |s| s.elapsed_s);
+            s.record.as_ref().map_or(kept, |r| r.elapsed_s)
+        };
+        Standing {
+            elapsed_s: stages.iter().map(elapsed).sum(),
+            left_s: estimate.is_some().then(|| stages.iter().map(|s| s.left_s).sum()),
+            stages,
+            phase,
+            at,
+            error,
+        }
+    }
+}
+
+impl StageStanding {
+    fn read(run: &Path, stage: Stage) -> StageStanding {
+        let folder = run.join(stage);
+        let (record, status) = (read_record(&folder), read_status(&folder));
+        let unreadable = record.as_ref().err().or(status.as_ref().err()).map(|e| e.to_string());
+        let (record, status) = (record.unwrap_or_default(), status.unwrap_or_default());
+        // the record is the truth: it is written after the status that says "done"
+        let phase = match (&record, &unreadable, &status) {
+            (Some(_), _, _) => Phase::Done,
+            (None, Some(_), _) => Phase::Unreadable,
+            (None, None, None) => Phase::Waiting,
+            (None, None, Some(s)) => match s.state {
+                State::Running | State::Done if is_alive(s, &folder) => Phase::Running,
+                State::Running | State::Done => Phase::Killed,
+                State::Stopped => Phase::Stopped,
+                State::Failed => Phase::Failed,
+            },
+        };
+        let error = match phase {
+            Phase::Unreadable => unreadable,
+            Phase::Failed => Some(status.as_ref().and_then(|s| s.error.clone()).unwrap_or_default()),
+            _ => None,
+        };
+        StageStanding { stage, phase, status, record, error, left_s: 0.0 }
+    }
+}
+
+/// Does the process of a status still work on a stage? Of one on another machine nobody here can tell.
+fn is_alive(status: &Status, folder: &Path) -> bool {
+    status.host != super::status::host() || io::has_open(status.pid, &folder.join(LOCK))
+}
+
+/// The `failed.json` of a run; nothing if it cannot be read, for it only tells of others.
+pub fn read_failure(run: &Path) -> Option<Failure> {
+    let path = run.join(FAILED);
+    io::is_file(&path).then(|| io::read_typed(&path, &Limits::default()).ok()).flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run::{ESTIMATE, Plan, Run};
+    use crate::run::{Fingerprint, StageDir};
+    use crate::{Error, Result};
+    use serde_json::{Value, json};
+
+    fn plan(stage: &str) -> Plan<'_> {
+        Plan {
+            name: stage,
+            fingerprint: Fingerprint::default(),
+            device: "cpu",
+            needs_bytes: 0,
+            saves: stage == "iface",
+        }
+    }
+
+    fn expect(run: &Path) {
+        let cost = |s: f64| json!({"cpu_s": s * rayon::current_num_threads() as f64, "memory_bytes": 0, "disk_bytes": 0});
+        let text = json!({"mask": cost(10.0), "iface": cost(100.0), "metrics": cost(20.0)}).to_string();
+        std::fs::write(run.join(ESTIMATE), text).unwrap();
+    }
+
+    #[test]
+    fn a_run_stands_where_its_stages_do_and_the_rest_takes_as_much_longer_as_what_is_done() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = Run::quiet(dir.path());
+        let read = || Standing::read(dir.path());
+        assert_eq!((read().phase, read().left_s, read().stages.len()), (Phase::Waiting, None, 8));
+        expect(dir.path());
+        assert_eq!((read().left_s, read().stages.len()), (Some(130.0), 3));
+
+        run.stage(plan("mask"), |_| Ok(Value::Null)).unwrap();
+        // as if it had taken twice what was estimated
+        let record = dir.path().join("mask/done.json");
+        let mut value: Value = serde_json::from_slice(&std::fs::read(&record).unwrap()).unwrap();
+        assert!(value["cpu_s"].as_f64().is_some());
+        value["elapsed_s"] = json!(20.0);
+        std::fs::write(&record, value.to_string()).unwrap();
+        assert_eq!((read().phase, read().left_s, read().elapsed_s), (Phase::Begun, Some(240.0), 20.0));
+
+        // at work, this very process holds the lock; a quarter is done
+        let work = |stage: &StageDir| -> Result<Value> {
+            stage.monitor().step(1, 4, &[]);
+            let now = read();
+            assert_eq!((now.phase, now.at), (Phase::Running, Some(Stage::Iface)));
+            Err(Error::cannot("no light", "lamp"))
+        };
+        run.stage(plan("iface"), work).unwrap_err();
+        let now = read();
+        assert_eq!(
+            (now.phase, now.at, now.error.as_deref()),
+            (Phase::Failed, Some(Stage::Iface), Some("no light"))
+        );
+        assert_eq!(now.left_s, Some(0.75 * 200.0 + 40.0));
+    }
+
+    #[test]
+    fn a_process_that_is_gone_was_killed_and_one_elsewhere_may_be_at_work() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("iface");
+        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::write(folder.join(LOCK), "").unwrap();
+        let phase = |pid: u32, host: &str| {
+            let status = json!({"state": "running", "step": 0, "steps": 0, "rate": null, "eta_s": null,
+                "elapsed_s": 1.0, "device": "cpu", "pid": pid, "host": host, "error": null, "updated": 0,
+                "fingerprint": Fingerprint::default()});
+            std::fs::write(folder.join("status.json"), status.to_string()).unwrap();
+            Standing::read(dir.path()).phase
+        };
+        let here = crate::run::status::host();
+        // no process has this number, and ours, another one's before, has not opened the lock
+        assert_eq!(phase(u32::MAX, &here), Phase::Killed);
+        #[cfg(target_os = "linux")]
+        assert_eq!(phase(std::process::id(), &here), Phase::Killed);
+        let _held = std::fs::File::open(folder.join(LOCK)).unwrap();
+        assert_eq!(phase(std::process::id(), &here), Phase::Running);
+        assert_eq!(phase(u32::MAX, "another machine"), Phase::Running);
+    }
+
+    #[test]
+    fn what_a_command_ended_with_before_any_stage_is_told_until_the_run_is_done() {
+        let dir = tempfile::tempdir().unwrap();
+        let failure = Failure { error: "no cameras".into(), hint: "add them".into(), exit: 1 };
+        std::fs::write(dir.path().join(FAILED), serde_json::to_string(&failure).unwrap()).unwrap();
+        let now = Standing::read(dir.path());
+        assert_eq!((now.phase, now.error.as_deref()), (Phase::Failed, Some("no cameras")));
+        Run::quiet(dir.path()).stage(plan("metrics"), |_| Ok(Value::Null)).unwrap();
+        let now = Standing::read(dir.path());
+        assert_eq!((now.phase, now.error), (Phase::Done, None));
+    }
+}
