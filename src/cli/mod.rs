@@ -38,6 +38,7 @@ use crate::{Error, Result};
 #[cfg(feature = "cpu")]
 use bench::BenchOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
+use completions::Form;
 #[cfg(feature = "cpu")]
 use experiment::ExperimentOptions;
 use invocation::Invocation;
@@ -269,6 +270,9 @@ from different sides. The other views follow from the cameras.")]
         /// Around soft outlines: shells (translucent layers, where they help) or none
         #[arg(long, value_name = "KIND")]
         hair: Option<String>,
+        /// In other programs: unlit (colors as photographed, light included) or lit (lamps shade them once more)
+        #[arg(long, value_name = "KIND")]
+        material: Option<String>,
         /// Put the detail that simplification takes into a normal map; the GLB's material is lit then
         #[arg(long)]
         normal_map: bool,
@@ -430,10 +434,14 @@ processor alone, and no --model.")]
         #[arg(long)]
         model: bool,
     },
-    /// Completions for a shell, on stdout
+    /// Completions for a shell, on stdout, or manual pages
+    #[command(after_long_help = "Examples:
+  tiface completions bash > /etc/bash_completion.d/tiface
+  tiface completions man | man -l -             the manual page
+  tiface completions man --out man1/            a page for each command, tiface.1, tiface-run.1 and so on")]
     Completions {
-        /// bash, zsh, fish, powershell or elvish
-        shell: clap_complete::Shell,
+        /// What for
+        form: Form,
     },
 }
 
@@ -481,9 +489,8 @@ pub fn main() -> ExitCode {
             }
             doctor::run(&common)
         }),
-        Command::Completions { shell } => {
-            makes_nothing("completions").and_then(|()| completions::run(*shell, &mut Cli::command()))
-        }
+        Command::Completions { form } => Out::find(common.out.as_deref(), "completions")
+            .and_then(|out| completions::run(*form, Cli::command(), out.as_ref())),
         stages => run::run(&invocation, &stages.on_line(&common)?),
     });
     ExitCode::from(match ended {
@@ -505,7 +512,18 @@ impl Command {
             Command::Baseline(place) => (place, Stage::Baseline, Vec::new()),
             Command::Tface(place) => (place, Stage::Tface, Vec::new()),
             Command::Iface(place) => (place, Stage::Iface, Vec::new()),
-            Command::Mesh { place, format, frame, triangles, texture, lobes, hair, normal_map, no_cap } => {
+            Command::Mesh {
+                place,
+                format,
+                frame,
+                triangles,
+                texture,
+                lobes,
+                hair,
+                material,
+                normal_map,
+                no_cap,
+            } => {
                 let keys = key_options([
                     ("--format", "mesh.format", format.as_deref()),
                     ("--frame", "mesh.frame", frame.as_deref()),
@@ -513,6 +531,7 @@ impl Command {
                     ("--texture", "mesh.texture_px", texture.as_deref()),
                     ("--lobes", "mesh.lobes", lobes.as_deref()),
                     ("--hair", "mesh.hair", hair.as_deref()),
+                    ("--material", "mesh.material", material.as_deref()),
                     ("--normal-map", "mesh.normal_map", on(*normal_map, "true")),
                     ("--no-cap", "mesh.cap", on(*no_cap, "false")),
                 ]);
@@ -599,7 +618,7 @@ mod tests {
     fn every_command_with_something_to_choose_shows_worked_examples() {
         for command in Cli::command().get_subcommands() {
             let shown = command.get_after_long_help().map(|h| h.to_string()).unwrap_or_default();
-            let plain = ["metrics", "completions"].contains(&command.get_name());
+            let plain = ["metrics"].contains(&command.get_name());
             assert!(plain || shown.matches("tiface ").count() >= 3, "{}", command.get_name());
         }
     }

@@ -55,6 +55,16 @@ pub enum Hair {
     None,
 }
 
+/// What light does to the mesh in other programs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Material {
+    /// Nothing: the photographs' light is in its colors already.
+    Unlit,
+    /// It shades a rough surface that is no metal.
+    Lit,
+}
+
 /// How a texture is stored inside or beside a mesh.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -93,6 +103,9 @@ table! {
         hair: Hair => Hair::Shells, Hair::Shells, Hair::None;
         /// A tangent-space map of the field's normals in the GLB: true or false.
         normal_map: bool => false;
+        /// Material of the GLB: unlit (colors as in the photographs, whose light is in them), or lit (lamps shade it once
+        /// more, as they do with a normal map in any case).
+        material: Material => Material::Unlit;
         /// How pictures are stored with the mesh: png or jpeg.
         texture_format: TextureFormat => TextureFormat::Png;
         /// Also keep the baked color as head.exr, scene-linear: true or false.

@@ -28,7 +28,7 @@ pub use device::DeviceChoice;
 pub use ensemble::EnsembleConfig;
 pub use iface::IfaceConfig;
 pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors};
-pub use mesh::{ColorSource, Genus, Hair, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
+pub use mesh::{ColorSource, Genus, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 pub use metrics::{MetricsConfig, TruthPhoto};
 pub use render::{Method, NAMES, PictureFormat, RenderConfig, ViewBackground, called};
 pub use source::Sources;

@@ -2,7 +2,7 @@
 
 use crate::Result;
 use crate::capture::Capture;
-use crate::config::{Config, MeshFormat, MeshFrame, TextureFormat};
+use crate::config::{Config, Material, MeshFormat, MeshFrame, TextureFormat};
 use crate::geom::{Mesh, Similarity};
 use crate::mesh::files::{ExportOptions, ExportedFiles, HeadMesh, to_glb, to_obj, to_ply, turn_to_y_up};
 use glam::{DMat3, DVec3, Mat3, Vec3};
@@ -23,6 +23,8 @@ pub struct Export {
     pub frame: MeshFrame,
     /// How pictures are stored with the mesh.
     pub texture_format: TextureFormat,
+    /// What light does to the GLB.
+    pub material: Material,
     /// Where the cameras stood, world: faces look at cameras.
     pub cameras: Vec<DVec3>,
 }
@@ -35,6 +37,7 @@ impl Export {
             up: capture.up,
             unit_m: config.capture.unit_m,
             frame: config.mesh.frame,
+            material: config.mesh.material,
             texture_format: config.mesh.texture_format,
             cameras: capture.views.iter().map(|v| v.camera.position).collect(),
         }
@@ -53,7 +56,7 @@ impl Export {
             up,
             unit_m: self.unit_m,
             // an unlit material shows no normal map: who asks for one wants light
-            unlit: texture.as_ref().is_none_or(|t| t.normal.is_none()),
+            unlit: self.material == Material::Unlit && texture.as_ref().is_none_or(|t| t.normal.is_none()),
             world_from_mesh,
             jpeg_quality: (self.texture_format == TextureFormat::Jpeg).then_some(JPEG_QUALITY),
         };
@@ -148,6 +151,7 @@ mod tests {
             up: Vec3::Z,
             unit_m: 1.0,
             frame: MeshFrame::Head,
+            material: Material::Unlit,
             texture_format: TextureFormat::Png,
             cameras: vec![DVec3::new(0.5, -9.0, 4.0)],
         };
@@ -225,6 +229,7 @@ mod tests {
             up: Vec3::Z,
             unit_m: 1.0,
             frame: MeshFrame::Dataset,
+            material: Material::Unlit,
             texture_format: TextureFormat::Png,
             cameras: vec![place.translation + DVec3::new(0.3, -0.6, 0.1)],
         };
@@ -319,6 +324,7 @@ mod tests {
             up: Vec3::Z,
             unit_m: 1.0,
             frame: MeshFrame::Dataset,
+            material: Material::Unlit,
             texture_format: TextureFormat::Png,
             cameras: vec![DVec3::new(0.0, -3.0, 0.0)],
         };

@@ -5,7 +5,7 @@ use super::line::Line;
 use super::path::{CameraPath, PATHS};
 use crate::capture::View;
 use crate::config::iface::FieldKind;
-use crate::config::{Config, Stage, VmConfig};
+use crate::config::{Config, Material, Stage, VmConfig};
 use crate::io;
 use crate::run::{Fingerprint, Plan, read_record, read_status};
 use crate::{Error, Result};
@@ -211,6 +211,9 @@ impl Line<'_> {
             }
             Stage::Mesh => {
                 settings.insert("capture.unit_m".into(), config.capture.unit_m.to_string());
+                if config.mesh.material == Material::Unlit {
+                    settings.remove("mesh.material"); // as in runs from before there was another
+                }
                 if !config.mesh.dense {
                     settings.remove("mesh.dense"); // as in runs from before there was another
                 }

@@ -1,0 +1,249 @@
+"""Six tiny heads go through the fleet while its tasks, its engine and all of it at once are killed.
+
+    python tools/fleet/check_fleet.py target/release/tiface [--kills 20] [--engine-kills 3]
+
+One head is broken on purpose, one has a stage that somebody else holds for a while. The others must come out with the
+bytes of runs that nobody disturbed, the broken one must be named with its cause, nothing that was done may be done again.
+"""
+
+import argparse
+import fcntl
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+HEADS = [f"head_{i}" for i in range(1, 7)]
+BROKEN, HELD = HEADS[2], HEADS[4]
+# Seconds for each head, with a checkpoint often enough that kills leave something to go on from.
+SETTINGS = """
+device = "cpu"
+[iface]
+steps = 120
+rays = 256
+max_rays = 512
+samples = 4096
+levels = 6
+log2_table = 12
+occupancy_resolution = 32
+checkpoint_s = 0.1
+[tface]
+steps = 60
+fields = 1
+rays = 512
+voxels_start = 4096
+voxels_final = 13824
+upsample_steps = [20, 40]
+mask_steps = [20, 40]
+checkpoint_s = 0.1
+[mesh]
+resolution = 48
+texture_px = 256
+[render]
+samples = 1
+method = ["tface", "volume", "raycast"]
+"""
+# What tells when and how fast things happened.
+CLOCKS = {"status.json", "log.jsonl", "done.json", ".lock", "failed.json", "estimate.json", "config.toml", "report.html"}
+
+
+def products(run):
+    """Digests of what stages made."""
+    files = [path for path in sorted(run.rglob("*")) if path.is_file() and path.name not in CLOCKS]
+    out = {}
+    for path in files:
+        data = path.read_bytes()
+        if path.name in ("metrics.json", "weights.json"):
+            data = json.dumps(without_seconds(json.loads(data)), sort_keys=True).encode()
+        out[str(path.relative_to(run))] = hashlib.sha256(data).hexdigest()
+    return out
+
+
+def without_seconds(value):
+    if isinstance(value, dict):
+        return {key: without_seconds(v) for key, v in value.items() if "second" not in key}
+    return value
+
+
+def processes(words):
+    """Numbers of processes whose command line has all of these words."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            except OSError:
+                continue
+            if all(word in line for word in words):
+                found.append(int(entry.name))
+    return found
+
+
+def kill(pids):
+    killed = 0
+    for pid in pids:
+        try:
+            os.kill(pid, signal.SIGKILL)
+            killed += 1
+        except ProcessLookupError:
+            pass
+    return killed
+
+
+def photograph(tiface, run, size):
+    """Photographs of the demo head; its cameras are written last, and then it need not be learned."""
+    words = [tiface, "demo", "--run", run, "--size", size, "--views", "10", "--quiet"]
+    demo = subprocess.Popen([str(word) for word in words])
+    while not (run / "capture/transforms.json").is_file():
+        assert demo.poll() is None, "the demo head was not photographed"
+        time.sleep(0.02)
+    demo.kill()
+    demo.wait()
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("tiface", type=Path)
+    options.add_argument("--kills", type=int, default=20, help="of tasks")
+    options.add_argument("--engine-kills", type=int, default=3)
+    options.add_argument("--seed", type=int, default=1)
+    options.add_argument("--keep", type=Path, help="work here and leave it")
+    options = options.parse_args()
+    tiface = options.tiface.resolve()
+    folder = options.keep or Path(tempfile.mkdtemp(prefix="fleet-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    chance = random.Random(options.seed)
+    os.environ["XDG_CONFIG_HOME"] = str(folder)  # nobody's own settings
+    config = folder / "heads.toml"
+    config.write_text(SETTINGS)
+    words = ["--preset", "draft", "--config", str(config)]
+
+    def run(*command, check=True):
+        done = subprocess.run([tiface, *map(str, command)], capture_output=True, text=True)
+        assert done.returncode == 0 or not check, f"{command}: {done.stderr}"
+        return done
+
+    captures, alone, runs = folder / "captures", folder / "alone", folder / "runs"
+    captures.mkdir(exist_ok=True)
+    for i, head in enumerate(HEADS):
+        if not (captures / head).is_dir():
+            photograph(tiface, folder / "photographed" / head, f"{60 + 2 * i}x72")
+            shutil.move(folder / "photographed" / head / "capture", captures / head)
+    frames = captures / BROKEN / "transforms_train.json"
+    broken = json.loads(frames.read_text())
+    broken["frames"][4]["transform_matrix"][0][3] = "north"
+    frames.write_text(json.dumps(broken))
+    good = [head for head in HEADS if head != BROKEN]
+    begun = time.monotonic()
+    for head in good:
+        run("run", captures / head, "--run", alone / head, *words, "--quiet")
+    undisturbed = time.monotonic() - begun
+
+    # somebody holds a stage of one head: not now, but soon
+    stage = runs / HELD / "tface"
+    stage.mkdir(parents=True, exist_ok=True)
+    lock = open(stage / ".lock", "a")
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    held_until = time.monotonic() + 20
+
+    engine_words = [sys.executable, "-m", "snakemake", "--snakefile", HERE / "Snakefile"]
+    engine_words += ["--profile", HERE / "profiles/local", "--cores", "2", "--retries", "30", "--config"]
+    engine_words += [f"captures={captures}", f"runs={runs}", f"tiface={tiface}", "threads=1"]
+    engine_words += [f"options={' '.join(words)}"]
+    engine_words = [str(word) for word in engine_words]
+    log = open(folder / "engine.txt", "a")
+
+    def start():
+        subprocess.run([*engine_words, "--unlock"], stdout=log, stderr=log, cwd=folder, check=True)
+        return subprocess.Popen(engine_words, stdout=log, stderr=log, cwd=folder, start_new_session=True)
+
+    kills = engine_kills = 0
+    finished = {}  # when each stage was recorded as done, the first time it was seen
+
+    def look():
+        for record in runs.glob("*/*/done.json"):
+            try:
+                when = json.loads(record.read_text())["finished"], record.stat().st_ino
+            except (OSError, ValueError):
+                continue
+            finished.setdefault(record, when)
+
+    engine = start()
+    next_kill = time.monotonic() + 2
+    deadline = time.monotonic() + 30 * 60
+    while engine.poll() is None or kills < options.kills or engine_kills < options.engine_kills:
+        assert time.monotonic() < deadline, "the fleet does not come to its end"
+        if engine.poll() is not None:
+            assert finished, f"nothing works: {folder / 'engine.txt'}"
+            # all is done before enough was killed: begin one head anew
+            head = chance.choice(good)
+            for record in [r for r in finished if f"/{head}/" in str(r)]:
+                del finished[record]
+            shutil.rmtree(runs / head, ignore_errors=True)
+            engine = start()
+        time.sleep(0.05)
+        look()
+        if lock and time.monotonic() > held_until:
+            lock.close()
+            lock = None
+        if time.monotonic() < next_kill:
+            continue
+        tasks = processes([str(tiface), "--run", str(runs)])
+        tasks = [pid for pid in tasks if Path(f"/proc/{pid}/exe").resolve() == tiface]
+        if kills < options.kills and tasks:
+            kills += kill([chance.choice(tasks)])
+            next_kill = time.monotonic() + chance.uniform(0.2, 1.5)
+        due = options.engine_kills and kills >= (engine_kills + 1) * options.kills // (options.engine_kills + 1)
+        if engine_kills < options.engine_kills and due:
+            engine_kills += 1
+            everything = processes([str(HERE / "Snakefile"), str(runs)]) if engine_kills % 2 == 0 else []
+            if everything:
+                # the machine goes down: tasks, their shells, the engine
+                kill(processes([str(runs)]))
+            kill([engine.pid])
+            engine.wait()
+            engine = start()
+            next_kill = time.monotonic() + 2
+    code = engine.wait()
+    while code != 1 or any(not (runs / head / "metrics/done.json").is_file() for head in good):
+        # retries of one stage may be used up; an engine is started again then
+        assert time.monotonic() < deadline
+        look()
+        engine = start()
+        code = engine.wait()
+    print(f"{kills} tasks and {engine_kills} engines killed; the engine ended with {code}")
+
+    told = run("status", *[runs / head for head in HEADS], "--json", check=False)
+    states = {Path(o["run"]).name: o for o in map(json.loads, told.stdout.splitlines())}
+    assert told.returncode == 3, told.stderr
+    for head in good:
+        assert states[head]["state"] == "done", states[head]
+        ours, theirs = products(runs / head), products(alone / head)
+        assert len(theirs) > 20 and ours.keys() == theirs.keys(), ours.keys() ^ theirs.keys()
+        different = [name for name in theirs if ours[name] != theirs[name]]
+        assert not different, f"{head}: {different}"
+    cause = states[BROKEN]
+    assert cause["state"] == "failed" and "transform_matrix" in cause["error"], cause
+    for record, when in finished.items():
+        now = json.loads(record.read_text())["finished"], record.stat().st_ino
+        assert now == when, f"{record} was made again"
+    attempts = (runs / ".fleet/log" / f"{BROKEN}.mask.txt").read_text().count("transform_matrix")
+    assert attempts <= options.engine_kills + 3, f"what cannot work was tried {attempts} times"
+    page, table = runs / "fleet.html", runs / "fleet.csv"
+    assert page.is_file() and len(table.read_text().splitlines()) == len(HEADS) + 1
+    assert BROKEN in page.read_text() and "transform_matrix" in table.read_text()
+    print(f"{len(good)} heads as if undisturbed ({undisturbed:.0f} s alone), {len(finished)} stages made once each")
+    print(f"{BROKEN}: {cause['error']}")
+    if not options.keep:
+        shutil.rmtree(folder)
+
+
+main()

@@ -1,0 +1,166 @@
+"""Runs every command of the guides as it stands there, on tiny heads.
+
+    python tools/guides/check_guides.py target/release/tiface [GUIDE.md ...]
+
+Blocks of `sh` run line by line in one folder per guide, where captures lie as the guide has them; a user's own
+configuration makes them small. Blocks of `python` run with this interpreter. `sh colmap` needs COLMAP and photographs of
+something real; it is left out aloud where they are not. `sh cluster` needs a cluster: only what can be asked of it
+without one is.
+"""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+GUIDES = [ROOT / "docs" / name for name in ("artist.md", "researcher.md", "many-heads.md")]
+# Seconds for each head. What a guide's own options say wins.
+SMALL = """
+device = "cpu"
+[iface]
+steps = 60
+rays = 256
+max_rays = 512
+samples = 4096
+levels = 6
+log2_table = 12
+occupancy_resolution = 32
+[tface]
+steps = 60
+fields = 1
+rays = 512
+voxels_start = 4096
+voxels_final = 13824
+upsample_steps = [20, 40]
+mask_steps = [20, 40]
+[baseline]
+steps = 20
+rays = 256
+[mesh]
+resolution = 48
+texture_px = 256
+[render]
+samples = 1
+"""
+
+
+def blocks(text):
+    """Kind and lines of each fenced block; a line that ends in a backslash goes on."""
+    for kind, body in re.findall(r"^```(\S[^\n]*)\n(.*?)^```", text, re.M | re.S):
+        yield kind.strip(), body
+
+
+def photograph(tiface, folder, size):
+    """Photographs of the demo head with cameras and masks; its cameras are written last."""
+    demo = subprocess.Popen([tiface, "demo", "--run", folder / "demo", "--size", size, "--views", "10", "--quiet"])
+    while not (folder / "demo/capture/transforms.json").is_file():
+        assert demo.poll() is None
+    demo.kill()
+    demo.wait()
+    return folder / "demo/capture"
+
+
+def clicks(capture):
+    """Clicks as a person would make them on three photographs: the middle of the head, and two corners."""
+    names = [f["file_path"] for f in json.loads((capture / "transforms_train.json").read_text())["frames"]]
+    width, height = 64, 80
+    views = {}
+    for name in (names[0], names[3], names[6]):
+        views[Path(name).name] = {
+            "points": [[width // 2, height // 2], [width // 2, height // 3], [1, 1], [width - 2, 1]],
+            "labels": [1, 1, 0, 0],
+        }
+    return views
+
+
+def prepare(tiface, folder):
+    """Captures as the guides name them: captures/002_00 and 003_00 with masks, head with COLMAP's cameras and none."""
+    for name, size in (("002_00", "64x80"), ("003_00", "66x80")):
+        made = photograph(tiface, folder / "photographed" / name, size)
+        (folder / "captures").mkdir(exist_ok=True)
+        shutil.move(made, folder / "captures" / name)
+    subprocess.run([tiface, "convert", "captures/002_00", "--to", "colmap", "--out", "head", "--quiet"], cwd=folder, check=True)
+    for masks in (folder / "head").glob("*mask*"):
+        shutil.rmtree(masks)
+
+
+def run(guide, tiface, seen):
+    folder = Path(tempfile.mkdtemp(prefix=f"{guide.stem}-"))
+    shown = folder / "program"
+    shown.mkdir()
+    (shown / "tiface").symlink_to(tiface)
+    settings = folder / "settings/tiface"
+    settings.mkdir(parents=True)
+    environment = {
+        **os.environ,
+        "PATH": f"{shown}:{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "XDG_CONFIG_HOME": str(folder / "settings"),
+        "NO_COLOR": "1",
+    }
+    prepare(tiface, folder)
+    (settings / "config.toml").write_text(SMALL)
+    (folder / "tools").symlink_to(ROOT / "tools")
+    count = 0
+    for kind, body in blocks(guide.read_text()):
+        if kind == "sh colmap":
+            why = colmap(body, environment)
+            print(f"skipped: {guide.name}: COLMAP: {why}" if why else f"{guide.name}: COLMAP placed the cameras")
+        elif kind == "python":
+            subprocess.run([sys.executable, "-c", body], cwd=folder, env=environment, check=True)
+            count += 1
+        elif kind == "sh":
+            for line in body.replace("\\\n", " ").splitlines():
+                if line.strip() and not line.startswith("#"):
+                    if "--prompts prompts.json" in line and not (folder / "prompts.json").is_file():
+                        # what a person does in the browser in between
+                        views = clicks(folder / "captures/002_00")
+                        (folder / "prompts.json").write_text(json.dumps(prompts(views)))
+                    done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True)
+                    assert done.returncode == 0, f"{guide.name}: `{line}` ended with {done.returncode}\n{done.stdout}{done.stderr}"
+                    count += 1
+        else:
+            assert kind in ("text", "yaml", "sh cluster"), f"{guide.name}: a block of `{kind}` is not tested"
+        seen.append(kind)
+    print(f"{guide.name}: {count} commands")
+    assert count
+    shutil.rmtree(folder)
+
+
+def prompts(views):
+    """As the page saves them."""
+    return views
+
+
+def colmap(body, environment):
+    """Runs COLMAP on photographs of something real; the reason where that cannot be done."""
+    photographs = ROOT.parent / "shared/data/captures/fox/images"
+    if not shutil.which("colmap"):
+        return "it is not installed"
+    if not photographs.is_dir():
+        return "there are no photographs of something real"
+    with tempfile.TemporaryDirectory() as folder:
+        images = Path(folder) / "head/images"
+        images.mkdir(parents=True)
+        for i, photograph in enumerate(sorted(photographs.iterdir())):
+            if i < 12:
+                shutil.copy(photograph, images)
+        environment = {**environment, "QT_QPA_PLATFORM": "offscreen"}
+        subprocess.run(["bash", "-e", "-c", body], cwd=folder, env=environment, check=True, capture_output=True)
+        found = subprocess.run(["tiface", "inspect", "head"], cwd=folder, env=environment, capture_output=True, text=True)
+        assert "COLMAP" in found.stdout, found.stdout + found.stderr
+    return ""
+
+
+def main():
+    tiface = str(Path(sys.argv[1]).resolve())
+    seen = []
+    for guide in [Path(p).resolve() for p in sys.argv[2:]] or GUIDES:
+        run(guide, tiface, seen)
+
+
+main()
