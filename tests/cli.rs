@@ -392,3 +392,69 @@ fn a_capture_is_converted_into_a_new_folder_only() {
         assert!(code(&o) == expected && err(&o).contains(text), "{words:?}: {} {}", code(&o), err(&o));
     }
 }
+
+#[test]
+fn what_stopped_a_run_before_its_first_stage_is_told_by_its_folder_until_it_is_mended() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    let frames = dir.path().join("head/transforms_train.json");
+    let sound = std::fs::read_to_string(&frames).unwrap();
+    std::fs::write(&frames, &sound[..sound.len() / 2]).unwrap();
+    // a dry run leaves nothing, and neither does a name that was mistyped
+    for words in [&["mask", "head", "--run", "runs/a", "--dry-run"][..], &["mask", "head"]] {
+        assert_eq!(code(&tiface(dir.path(), words)), 1);
+        assert!(!dir.path().join("runs").exists());
+    }
+    assert_eq!(code(&tiface(dir.path(), &["mask", "head", "--run", "runs/a"])), 1);
+    let o = tiface(dir.path(), &["status", "runs/a"]);
+    assert!(code(&o) == 3 && out(&o).contains("failed: ") && out(&o).contains("transforms_train.json"), "{}", out(&o));
+    let o = tiface(dir.path(), &["status", "--failed"]);
+    assert!(code(&o) == 3 && out(&o).starts_with("a         ........  failed: "), "{}", out(&o));
+    std::fs::write(&frames, sound).unwrap();
+    assert_eq!(code(&tiface(dir.path(), &["mask", "head", "--run", "runs/a"])), 0);
+    let o = tiface(dir.path(), &["status", "--json"]);
+    let run: serde_json::Value = serde_json::from_str(&out(&o)).unwrap();
+    assert_eq!((code(&o), &run["state"], &run["error"]), (0, &"begun".into(), &serde_json::Value::Null));
+    assert!(run["left_s"].as_f64().unwrap() > 1.0 && run["stages"][0]["cpu_s"].as_f64().is_some(), "{run}");
+    assert!(!out(&o).contains("settings"));
+}
+
+#[test]
+fn a_dry_run_says_about_how_long_and_how_much() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    let total = |more: &[&str]| {
+        let o = tiface(dir.path(), &[&["run", "head", "--dry-run", "--json"], more].concat());
+        assert_eq!(code(&o), 0, "{}", err(&o));
+        let stages: Vec<serde_json::Value> = out(&o).lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+        let sum = |key: &str| stages.iter().map(|s| s["estimate"][key].as_f64().unwrap()).sum::<f64>();
+        (sum("cpu_s"), sum("memory_bytes"), sum("disk_bytes"))
+    };
+    let (draft, twice) = (total(&["--preset", "draft"]), total(&["--preset", "draft", "--set", "iface.steps=6000"]));
+    assert!(twice.0 > 1.3 * draft.0 && twice.1 == draft.1 && draft.2 > 1e7, "{draft:?}, {twice:?}");
+    let text = out(&tiface(dir.path(), &["run", "head", "--dry-run"]));
+    let last = text.lines().last().unwrap();
+    assert!(last.starts_with("all      about ") && last.contains("GiB of memory, "), "{text}");
+}
+
+#[test]
+fn a_hundred_heads_stand_on_one_screen() {
+    let dir = tempfile::tempdir().unwrap();
+    let cost = r#"{"cpu_s": 100, "memory_bytes": 1, "disk_bytes": 1}"#;
+    for i in 0..100 {
+        let run = dir.path().join(format!("runs/head_{i:03}"));
+        std::fs::create_dir_all(&run).unwrap();
+        std::fs::write(run.join("estimate.json"), format!("{{\"mask\": {cost}, \"metrics\": {cost}}}")).unwrap();
+        if i == 42 {
+            std::fs::write(run.join("failed.json"), r#"{"error": "no light", "hint": "", "exit": 1}"#).unwrap();
+        }
+    }
+    let o = tiface(dir.path(), &["status"]);
+    let text = out(&o);
+    assert!(code(&o) == 3 && text.lines().count() <= 24, "{text}");
+    assert!(text.contains("head_042  ..  failed: no light") && text.contains(" head_099"), "{text}");
+    assert!(text.contains("100 runs: 99 not begun, 1 failed; about "), "{text}");
+    assert_eq!(out(&tiface(dir.path(), &["status", "-v"])).lines().count(), 101);
+}

@@ -184,6 +184,10 @@ step "three.js agrees on the soft globe" node tools/readers/check_three.mjs "$sc
 if [ $blender = yes ]; then
   step "Blender agrees on the soft globe" .venv-blender/bin/python tools/readers/check_blender.py "$scratch/globe/globe_soft.glb" --up 0 0 1
 fi
+step "the engine of many heads is here" .venv/bin/python -m pip install --quiet --disable-pip-version-check \
+  -r tools/fleet/requirements.txt
+step "many heads outlive kills" .venv/bin/python tools/fleet/check_fleet.py "$target/release/tiface"
+step "the commands of the guides work" .venv/bin/python tools/guides/check_guides.py "$target/release/tiface"
 if [ $demo = yes ]; then
   step "the demo head is reconstructed" train_demo
   readers_agree "the demo head" "$scratch/demo/mesh/head.glb" --up 0 0 1

@@ -68,14 +68,8 @@ def photograph(tiface, folder, size):
 def clicks(capture):
     """Clicks as a person would make them on three photographs: the middle of the head, and two corners."""
     names = [f["file_path"] for f in json.loads((capture / "transforms_train.json").read_text())["frames"]]
-    width, height = 64, 80
-    views = {}
-    for name in (names[0], names[3], names[6]):
-        views[Path(name).name] = {
-            "points": [[width // 2, height // 2], [width // 2, height // 3], [1, 1], [width - 2, 1]],
-            "labels": [1, 1, 0, 0],
-        }
-    return views
+    points = [{"x": x, "y": y, "label": label} for x, y, label in ((32, 40, 1), (32, 28, 1), (2, 2, 0), (61, 2, 0))]
+    return {"frames": [{"file_path": name, "points": points} for name in (names[0], names[3], names[6])]}
 
 
 def prepare(tiface, folder):
@@ -118,8 +112,7 @@ def run(guide, tiface, seen):
                 if line.strip() and not line.startswith("#"):
                     if "--prompts prompts.json" in line and not (folder / "prompts.json").is_file():
                         # what a person does in the browser in between
-                        views = clicks(folder / "captures/002_00")
-                        (folder / "prompts.json").write_text(json.dumps(prompts(views)))
+                        (folder / "prompts.json").write_text(json.dumps(clicks(folder / "captures/002_00")))
                     done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True)
                     assert done.returncode == 0, f"{guide.name}: `{line}` ended with {done.returncode}\n{done.stdout}{done.stderr}"
                     count += 1
@@ -129,11 +122,6 @@ def run(guide, tiface, seen):
     print(f"{guide.name}: {count} commands")
     assert count
     shutil.rmtree(folder)
-
-
-def prompts(views):
-    """As the page saves them."""
-    return views
 
 
 def colmap(body, environment):
