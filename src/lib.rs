@@ -54,6 +54,8 @@ pub mod run;
 pub mod capture;
 #[cfg(feature = "cpu")]
 pub mod field;
+#[cfg(feature = "matting")]
+mod onnx;
 pub mod report;
 
 pub mod mask;

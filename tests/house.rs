@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 /// Layers from the ground up; a module may know those below its own layer.
 const LAYERS: &[(&str, &[&str])] = &[
     ("ground", &["error", "monitor", "geom", "image", "io", "config", "kernel"]),
-    ("shared", &["capture", "field", "run", "report"]),
+    ("shared", &["capture", "field", "onnx", "run", "report"]),
     ("stages", &["mask", "tface", "iface", "mesh", "render", "ensemble", "metrics"]),
     ("pipeline", &["pipeline"]),
     ("cli", &["cli"]),

@@ -1,13 +1,17 @@
-//! From photographs without masks to closed meshes at several resolutions: clicks, a short training, extraction.
+//! Short trainings from one end of the line to the other: from photographs without masks to closed meshes at several
+//! resolutions, of one capture in two formats, and of photographs at full size.
 #![cfg(feature = "cpu")]
 
 mod command;
 
 use command::tiface;
-use std::path::Path;
+use serde_json::Value;
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::process::Output;
-use tiface::capture::synthetic::{SyntheticOptions, write_capture};
-use tiface::io::{Limits, read_gray};
+use tiface::capture::synthetic::{SyntheticOptions, write_borders, write_capture};
+use tiface::image::Gray;
+use tiface::io::{Limits, read_gray, read_photo, write_png_gray, write_png_rgb};
 use tiface::mask::Click;
 use tiface::mask::distance::squared_distance;
 use tiface::mask::prompts::{PhotoPrompts, Prompts};
@@ -95,4 +99,123 @@ fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
     // sheets of a barely trained field lie closer than a cell and then may cross: a few triangles of ten thousand
     assert!(found.iter().all(|(_, _, triangles, crossing)| crossing * 200 < *triangles), "{found:?}");
     eprintln!("resolution, mesh, triangles, crossing: {found:?}");
+}
+
+const FEW: [&str; 13] = [
+    "device=cpu",
+    "iface.steps=12",
+    "iface.rays=128",
+    "iface.max_rays=256",
+    "iface.samples=4096",
+    "iface.levels=6",
+    "iface.log2_table=12",
+    "iface.occupancy_resolution=32",
+    "tface.steps=8",
+    "tface.rays=128",
+    "tface.voxels_start=1000",
+    "tface.voxels_final=2000",
+    "tface.upsample_steps=4",
+];
+
+/// A stage or the line with a few steps of everything.
+fn few(folder: &Path, words: &[&str], set: &[&str]) {
+    let sets = FEW.iter().chain(&["tface.mask_steps=4"]).chain(set).flat_map(|s| ["--set", *s]);
+    let words: Vec<&str> = words.iter().copied().chain(["--preset", "draft"]).chain(sets).collect();
+    worked(&tiface(folder, &words));
+}
+
+/// The head of a safetensors file and the bytes behind it.
+fn checkpoint(path: &Path) -> (Value, Vec<u8>) {
+    let bytes = fs::read(path).unwrap();
+    let head = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    (serde_json::from_slice(&bytes[8..8 + head]).unwrap(), bytes[8 + head..].to_vec())
+}
+
+#[test]
+fn fox_written_as_colmap_and_read_again_trains_to_the_same_bytes() {
+    let shared = std::env::var("TIFACE_SHARED")
+        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
+    let fox = PathBuf::from(shared).join("data/captures/fox");
+    if !fox.is_dir() {
+        eprintln!("skipped: the capture `fox` is not at {}", fox.display());
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    worked(&tiface(dir.path(), &["convert", fox.to_str().unwrap(), "--to", "colmap", "--out", "written"]));
+    let set = ["mask.source=none", "capture.downscale=8"];
+    for (run, from) in [("own", fox.to_str().unwrap()), ("read", "written")] {
+        few(dir.path(), &["iface", from, "-r", run], &set);
+        few(dir.path(), &["tface", run], &[]);
+    }
+    for stage in ["iface", "tface"] {
+        let of = |run: &str| checkpoint(&dir.path().join(run).join(stage).join("checkpoint.safetensors"));
+        let ((mut own, own_bytes), (mut read, read_bytes)) = (of("own"), of("read"));
+        // which photographs and cameras it was learned from: files of other names, poses that differ in the last digit
+        for head in [&mut own, &mut read] {
+            let identity = head["__metadata__"].as_object_mut().unwrap().remove("identity").unwrap();
+            assert_eq!(identity.as_str().map(str::len), Some(64));
+        }
+        assert_eq!(own, read, "{stage}");
+        assert!(own_bytes == read_bytes, "{stage}: tensors differ");
+    }
+}
+
+/// Photographs of 3000 × 4096 with masks of borders, from small ones: every pixel becomes 8 × 8.
+fn full_size(root: &Path, border: u32) {
+    let small = root.with_extension("small");
+    let options = SyntheticOptions { width: 375, height: 512, train: 4, test: 1, seed: 3 };
+    write_capture(&small, &options).unwrap();
+    let limits = Limits::default();
+    let larger = |i: u32| (i / 3000 / 8 * 375 + i % 3000 / 8) as usize;
+    for i in 0..5 {
+        let name = format!("{i:03}.png");
+        let photo = read_photo(&small.join("images").join(&name), None, &limits).unwrap();
+        let rgb: Vec<[u8; 3]> = (0..3000 * 4096).map(|i| photo.rgb[larger(i)]).collect();
+        fs::create_dir_all(root.join("images")).unwrap();
+        write_png_rgb(&root.join("images").join(&name), 3000, 4096, &rgb).unwrap();
+        for folder in ["masks", "face_masks"] {
+            let mask = read_gray(&small.join(folder).join(&name), None, &limits).unwrap();
+            let values = (0..3000 * 4096).map(|i| mask.values[larger(i)]).collect();
+            fs::create_dir_all(root.join(folder)).unwrap();
+            write_png_gray(&root.join(folder).join(&name), &Gray { width: 3000, height: 4096, values })
+                .unwrap();
+        }
+    }
+    write_borders(root, &SyntheticOptions { width: 3000, height: 4096, ..options }, border).unwrap();
+    for name in ["transforms.json", "transforms_train.json", "transforms_test.json"] {
+        let mut cameras: Value = serde_json::from_slice(&fs::read(small.join(name)).unwrap()).unwrap();
+        for key in ["fl_x", "fl_y", "cx", "cy", "w", "h"] {
+            if let Some(v) = cameras.get(key).and_then(Value::as_f64) {
+                cameras[key] = if key.len() == 1 { (8 * v as u64).into() } else { (8.0 * v).into() };
+            }
+        }
+        fs::write(root.join(name), cameras.to_string()).unwrap();
+    }
+}
+
+/// A few steps of both fields and a coarse mesh; the photographs are what is large.
+#[test]
+fn photographs_of_full_size_with_borders_go_through_the_line() {
+    let dir = tempfile::tempdir().unwrap();
+    full_size(&dir.path().join("head"), 60);
+    let inspected = tiface(dir.path(), &["inspect", "head", "--json"]);
+    worked(&inspected);
+    let found = String::from_utf8_lossy(&inspected.stdout).into_owned();
+    assert!(found.contains("3000") && found.contains("4096"), "{found}");
+    let set = [
+        "mesh.resolution=24",
+        "mesh.triangles=500",
+        "mesh.texture_px=64",
+        "mesh.format=ply",
+        "render.method=raster",
+        "ensemble.members=",
+    ];
+    few(dir.path(), &["run", "head"], &set);
+    let text = fs::read_to_string(dir.path().join("runs/head/metrics/metrics.json")).unwrap();
+    let metrics: Value = serde_json::from_str(&text).unwrap();
+    let psnr = metrics["raster"]["head"]["mean"]["psnr_masked"].as_f64().unwrap();
+    assert!(psnr > 5.0, "{text}");
+    let view = dir.path().join("runs/head/render/raster/004.png");
+    let photo = read_photo(&view, Some((3000, 4096)), &Limits::default()).unwrap();
+    assert_eq!((photo.width, photo.height), (3000, 4096));
 }

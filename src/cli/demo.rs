@@ -75,7 +75,8 @@ fn photographs(size: Option<&str>, views: Option<usize>) -> Result<SyntheticOpti
     Ok(options)
 }
 
-fn photograph(
+/// Photographs the demo head into a folder.
+pub(super) fn photograph(
     capture: &Path,
     options: &SyntheticOptions,
     border: Option<u32>,

@@ -1,12 +1,16 @@
 //! `tiface experiment`: the paper's tables over captures, beside what was published.
 
+use super::demo::photograph;
 use super::invocation::Invocation;
 use super::out::Out;
 use super::stdout::print;
+use crate::capture::synthetic::SyntheticOptions;
 use crate::config::Config;
 use crate::io::{self, Limits};
 use crate::pipeline::Line;
-use crate::pipeline::experiment::{ORDERINGS, ROWS, TABLES, config, is_done, measured, runs, work};
+use crate::pipeline::experiment::{
+    ORDERINGS, ROWS, TABLES, config, is_done, measured, runs, without_masks, work,
+};
 use crate::report::experiment::{Experiment, ExperimentRow, Measured, read_published};
 use crate::run::Run;
 use crate::{Error, Result};
@@ -18,7 +22,7 @@ use std::path::{Path, PathBuf};
 /// What is reproduced.
 #[derive(Args, Debug)]
 pub(super) struct ExperimentOptions {
-    /// Captures
+    /// Captures; `demo` is the synthetic head
     #[arg(value_name = "CAPTURE", required = true)]
     captures: Vec<PathBuf>,
     /// Of these tables, with commas [default: all]
@@ -73,7 +77,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     let mut captures: Vec<String> = Vec::new();
     let mut tasks = Vec::new();
     for path in &options.captures {
-        let real = io::real_path(path)?;
+        let real = io::real_path(&demo(path, &folder, invocation)?)?;
         let name = real.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned());
         if captures.contains(&name) {
             return Err(Error::usage(
@@ -90,6 +94,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         for run in runs(&words) {
             let mut config = config(run, options.scale, &set)?;
             config.capture.path = text.into();
+            without_masks(run, &mut config);
             tasks.push(Task { name: format!("{name}/{run}"), run, config });
         }
         captures.push(name);
@@ -108,7 +113,16 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     let mut failed = None;
     for ((task, run), line) in tasks.iter().zip(&opened).zip(&mut lines).filter(|((task, _), _)| chosen(task))
     {
-        let line = &*line.insert(Line::open(&task.config, run).map_err(|e| e.within(&task.name))?);
+        let opened = match Line::open(&task.config, run) {
+            Ok(opened) => opened,
+            // what a capture lacks for one row, as masks, it does not lack for each
+            Err(e) => {
+                screen.note("experiment", &format!("{}: {e}", task.name));
+                failed.get_or_insert(e.within(&task.name));
+                continue;
+            }
+        };
+        let line = &*line.insert(opened);
         if common.dry_run {
             let state = if is_done(line, task.run) { "done" } else { "to do" };
             print(&format!("{:<32} {state}\n", task.name))?;
@@ -156,6 +170,18 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         ))?;
     }
     failed.map_or(Ok(()), Err)
+}
+
+/// A capture as it was named; `demo`, where no folder is called so, is the demo head, photographed into the experiment.
+fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> {
+    if path != Path::new("demo") || io::is_folder(path) {
+        return Ok(path.into());
+    }
+    let capture = folder.join("captures/demo");
+    if !io::is_file(&capture.join("transforms.json")) {
+        photograph(&capture, &SyntheticOptions::default(), None, invocation)?;
+    }
+    Ok(capture)
 }
 
 /// What some rows came to in their run; one that was not worked on is opened here, and only looked at.

@@ -108,6 +108,9 @@ struct ClickOptions {
     /// ViTMatte, ONNX
     #[arg(long, value_name = "FILE")]
     vitmatte: Option<PathBuf>,
+    /// Make masks without any click: a network from a picture to its alpha (U²-Net, ISNet, MODNet, BiRefNet), ONNX
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["prompts", "point"])]
+    alpha_net: Option<PathBuf>,
     /// An ONNX Runtime library to run them with, instead of the built-in engine
     #[arg(long, value_name = "FILE")]
     onnxruntime: Option<PathBuf>,
@@ -129,6 +132,7 @@ impl ClickOptions {
             file("--sam", "mask.sam", &self.sam)?,
             file("--sam-decoder", "mask.sam_decoder", &self.sam_decoder)?,
             file("--vitmatte", "mask.vitmatte", &self.vitmatte)?,
+            file("--alpha-net", "mask.alpha_net", &self.alpha_net)?,
             file("--onnxruntime", "mask.onnxruntime", &self.onnxruntime)?,
         ];
         let mut keys: Vec<KeyOption> = files.into_iter().flatten().collect();
@@ -211,6 +215,7 @@ takes no space: whoever changes one then changes both. The new folder must not b
   tiface mask captures/002_00 --view 010 --point 181,288,1 --point 32,51,0
   tiface mask captures/002_00 --prompts prompts.json --sam encoder.onnx --sam-decoder decoder.onnx \\
       --vitmatte vitmatte.onnx
+  tiface mask captures/002_00 --alpha-net isnet.onnx    no click at all
 
 Click the face, the hair and every garment of another color, and the background twice; on three photographs
 from different sides. The other views follow from the cameras.")]
@@ -220,7 +225,7 @@ from different sides. The other views follow from the cameras.")]
         #[command(flatten)]
         clicks: ClickOptions,
         /// Write an annotation page to click on instead, to --out or <capture>_clicks.html
-        #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "onnxruntime"])]
+        #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "alpha_net", "onnxruntime"])]
         page: bool,
     },
     /// Stage: learn T-Face, a radiance field, from the masked photographs

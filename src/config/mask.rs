@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MaskSource {
-    /// Clicks, if some are given; else whatever the capture has: named in its frames, beside the
+    /// Clicks or an alpha network, if given; else whatever the capture has: named in its frames, beside the
     /// photographs, or their alpha.
     Auto,
     /// The photographs' own alpha.
@@ -16,6 +16,8 @@ pub enum MaskSource {
     Folder,
     /// Made from clicks: `mask.prompts` or `mask.point`.
     Clicks,
+    /// Made without any: by the network `mask.alpha_net`.
+    Network,
     /// None, as is only done when asked for: everything in the picture is reconstructed.
     None,
 }
@@ -70,8 +72,8 @@ table! {
     /// Where masks come from, what they mean, and how they are made from clicks.
     pub struct MaskConfig;
     keys {
-        /// Where masks come from: auto (clicks if given, else what the capture has), alpha, folder
-        /// (capture.mask_dir), clicks or none (go on without: whatever the cameras see is learned).
+        /// Where masks come from: auto (clicks or an alpha network if given, else what the capture has), alpha, folder
+        /// (capture.mask_dir), clicks, network or none (go on without: whatever the cameras see is learned).
         source: MaskSource => MaskSource::Auto;
         /// What lies outside a mask: empty (nothing of the head) or ignore (not looked at).
         meaning: MaskMeaning => MaskMeaning::Empty;
@@ -92,6 +94,12 @@ table! {
         sam_decoder: String => String::new();
         /// ViTMatte as an ONNX file (needs a build with the feature `matting`).
         vitmatte: String => String::new();
+        /// A network from a picture to its alpha as an ONNX file (U²-Net, ISNet, MODNet, BiRefNet): masks without any
+        /// click (needs a build with the feature `matting`).
+        alpha_net: String => String::new();
+        /// What it is shown: auto (as the file beside it says, else by its name), or SIDE,MEAN,SCALE as 1024,0.5,1, or
+        /// SIDE,imagenet.
+        alpha_input: String => "auto".into();
         /// The ONNX Runtime library to run networks with; empty for the built-in engine.
         onnxruntime: String => String::new();
         /// What ViTMatte is shown: auto (as the file beside it says, else imagenet), imagenet or half.
@@ -110,6 +118,25 @@ table! {
 }
 
 impl MaskConfig {
+    /// Are the masks made, from clicks or by a network?
+    pub fn made(&self) -> bool {
+        self.clicked() || self.with_alpha_net()
+    }
+
+    /// Are the masks made by the alpha network alone?
+    pub fn with_alpha_net(&self) -> bool {
+        match self.source {
+            MaskSource::Network => true,
+            MaskSource::Auto => !self.alpha_net.is_empty(),
+            _ => false,
+        }
+    }
+
+    /// Is any network to run?
+    pub fn with_networks(&self) -> bool {
+        self.with_sam() || self.with_vitmatte() || self.with_alpha_net()
+    }
+
     /// Are the masks made from clicks?
     pub fn clicked(&self) -> bool {
         match self.source {
@@ -150,24 +177,32 @@ impl MaskConfig {
                     "name a file: `--prompts prompts.json`",
                 );
             }
+            MaskSource::Network if self.alpha_net.is_empty() => {
+                let hint = "name its file: `--alpha-net FILE.onnx`";
+                return problem("mask.source", "is network, but there is none", hint);
+            }
             MaskSource::Alpha | MaskSource::Folder | MaskSource::None if given => {
                 let hint = "leave out the clicks, or set `mask.source` to clicks";
                 return problem("mask.source", "does not make masks, but clicks are given", hint);
             }
             _ => {}
         }
-        let networks = [&self.sam, &self.sam_decoder, &self.vitmatte];
-        if !self.clicked() && networks.iter().any(|file| !file.is_empty()) {
-            let hint = "give clicks: `--prompts prompts.json`";
+        if given && !self.alpha_net.is_empty() {
+            let hint = "leave one of them out: an alpha network needs no clicks";
+            return problem("mask.alpha_net", "is named beside clicks", hint);
+        }
+        let networks = [&self.sam, &self.sam_decoder, &self.vitmatte, &self.alpha_net];
+        if !self.made() && networks.iter().any(|file| !file.is_empty()) {
+            let hint = "give clicks: `--prompts prompts.json`, or `--alpha-net FILE.onnx`";
             return problem(
                 "mask.sam",
                 "or `mask.vitmatte` names a network, but there are no clicks to start from",
                 hint,
             );
         }
-        if self.clicked() && self.meaning == MaskMeaning::Ignore {
-            let hint = "set `mask.meaning` to empty: clicks say what is head";
-            return problem("mask.meaning", "is ignore, but masks are made from clicks", hint);
+        if self.made() && self.meaning == MaskMeaning::Ignore {
+            let hint = "set `mask.meaning` to empty: masks that are made say what is head";
+            return problem("mask.meaning", "is ignore, but masks are made", hint);
         }
         if self.with_sam() && (self.sam.is_empty() || self.sam_decoder.is_empty()) {
             let hint = "name both files: `--sam encoder.onnx --sam-decoder decoder.onnx`";
@@ -202,6 +237,10 @@ mod tests {
         let key = |c: MaskConfig| c.problem().unwrap().0;
         assert_eq!(key(MaskConfig { source: MaskSource::Clicks, ..start() }), "mask.source");
         assert_eq!(key(MaskConfig { source: MaskSource::Folder, ..clicked.clone() }), "mask.source");
+        let named = MaskConfig { alpha_net: "a.onnx".into(), ..start() };
+        assert!(named.made() && !named.clicked() && named.problem().is_none());
+        assert_eq!(key(MaskConfig { prompts: "p.json".into(), ..named }), "mask.alpha_net");
+        assert_eq!(key(MaskConfig { source: MaskSource::Network, ..start() }), "mask.source");
         assert_eq!(key(MaskConfig { point: vec!["1,2,1".into()], ..clicked.clone() }), "mask.point");
         assert_eq!(key(MaskConfig { meaning: MaskMeaning::Ignore, ..clicked.clone() }), "mask.meaning");
         assert_eq!(key(MaskConfig { vitmatte: "a.onnx".into(), ..start() }), "mask.sam");

@@ -15,7 +15,7 @@ use crate::Result;
 use crate::capture::carve::Cube;
 use crate::geom::Camera;
 use crate::image::Gray;
-use glam::Vec2;
+use glam::{DVec3, Vec2};
 use rayon::prelude::*;
 
 /// Rows that masks are reduced to.
@@ -82,12 +82,7 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
     if used.len() < 2 {
         return Ok(Consistency { masks: used.len(), ..Consistency::default() });
     }
-    let cameras: Vec<Camera> = used.iter().map(|&i| views[i].camera.clone()).collect();
-    let cube = hull::cube(&cameras, cells, CUBE)?;
-    let claims: Vec<Claims> = used
-        .par_iter()
-        .filter_map(|&i| Some(Claims::new(views[i].camera, views[i].mask?, &cube, rows)))
-        .collect();
+    let (cube, claims) = claims_of(views, &used, cells, rows)?;
     let votes = Votes::count(cube, &claims);
     let mut active = vec![true; claims.len()];
     let mut conflicts = Vec::new();
@@ -115,6 +110,22 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
     }
 }
 
+/// The cube that some views look at, and what the mask of each claims.
+pub(super) fn claims_of(
+    views: &[ConsistencyView],
+    used: &[usize],
+    cells: usize,
+    rows: u32,
+) -> Result<(Cube, Vec<Claims>)> {
+    let cameras: Vec<Camera> = used.iter().map(|&i| views[i].camera.clone()).collect();
+    let cube = hull::cube(&cameras, cells, CUBE)?;
+    let claims = used
+        .par_iter()
+        .filter_map(|&i| Some(Claims::new(views[i].camera, views[i].mask?, &cube, rows)))
+        .collect();
+    Ok((cube, claims))
+}
+
 fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String {
     let percent =
         |v: f64| if v < 0.02 { format!("{:.1} %", 100.0 * v) } else { format!("{:.0} %", 100.0 * v) };
@@ -134,14 +145,14 @@ fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String
 }
 
 /// What a reduced mask claims: where the head is, and where it cannot be.
-struct Claims {
+pub(super) struct Claims {
     camera: Camera,
     frame: ViewFrame,
     /// Pixels so far beside the mask that a cell there is ruled out.
     beside: Vec<bool>,
     on: Vec<bool>,
     /// Pixels well inside the mask, whose rays must meet something.
-    inner: Vec<usize>,
+    pub(super) inner: Vec<usize>,
 }
 
 impl Claims {
@@ -164,14 +175,14 @@ impl Claims {
 }
 
 /// Which views vote against and for every cell: bits of views, `words` of them against and as many for.
-struct Votes {
-    cube: Cube,
+pub(super) struct Votes {
+    pub(super) cube: Cube,
     words: usize,
     bits: Vec<u64>,
 }
 
 impl Votes {
-    fn count(cube: Cube, claims: &[Claims]) -> Votes {
+    pub(super) fn count(cube: Cube, claims: &[Claims]) -> Votes {
         let words = claims.len().div_ceil(64);
         let frames: Vec<&ViewFrame> = claims.iter().map(|c| &c.frame).collect();
         let bits = hull::vote(&cube, &frames, 2 * words, |cell: &mut [u64], k, pixel| {
@@ -179,6 +190,22 @@ impl Votes {
             cell[words + k / 64] |= (claims[k].on[pixel] as u64) << (k % 64);
         });
         Votes { cube, words, bits }
+    }
+
+    /// Cells as what they cost: how many active views rule them out, and how many have them on the head.
+    pub(super) fn costs(&self, active: &[bool]) -> Vec<(u16, u16)> {
+        let mut mask = vec![0u64; self.words];
+        for i in (0..active.len()).filter(|&i| active[i]) {
+            mask[i / 64] |= 1 << (i % 64);
+        }
+        let ones = |set: &[u64]| set.iter().zip(&mask).map(|(s, m)| (s & m).count_ones() as u16).sum::<u16>();
+        let cells = self.bits.par_chunks_exact(2 * self.words);
+        cells.map(|cell| (ones(&cell[..self.words]), ones(&cell[self.words..]))).collect()
+    }
+
+    /// Does a view rule a cell out?
+    pub(super) fn rules_out(&self, view: usize, cell: usize) -> bool {
+        self.bits[2 * cell * self.words + view / 64] & (1 << (view % 64)) != 0
     }
 }
 
@@ -196,18 +223,10 @@ struct Conflicts {
 impl Conflicts {
     fn of(votes: &Votes, claims: &[Claims], active: &[bool]) -> Conflicts {
         let count = claims.len();
-        let mut mask = vec![0u64; votes.words];
-        for i in (0..count).filter(|&i| active[i]) {
-            mask[i / 64] |= 1 << (i % 64);
-        }
-        // cells as what they cost: how many active views rule them out, and how many have them on the head
-        let ones = |set: &[u64]| set.iter().zip(&mask).map(|(s, m)| (s & m).count_ones() as u16).sum::<u16>();
-        let cells = votes.bits.par_chunks_exact(2 * votes.words);
-        let costs: Vec<(u16, u16)> =
-            cells.map(|cell| (ones(&cell[..votes.words]), ones(&cell[votes.words..]))).collect();
+        let costs = votes.costs(active);
         let found: Vec<Option<(f64, Vec<f64>)>> = (0..count)
             .into_par_iter()
-            .map(|j| active[j].then(|| open_claims(votes, &claims[j], &costs, &mask, count)))
+            .map(|j| active[j].then(|| open_claims(votes, &claims[j], &costs, active)))
             .collect();
         let others = (active.iter().filter(|a| **a).count().max(2) - 1) as f64;
         let zero = || vec![0.0; count];
@@ -241,28 +260,18 @@ impl Conflicts {
 
 /// The share of a view's claims that nothing explains, and the views that rule out the best point of each such
 /// ray: `k` of them share a claim in equal parts.
-fn open_claims(
-    votes: &Votes,
-    claims: &Claims,
-    costs: &[(u16, u16)],
-    mask: &[u64],
-    count: usize,
-) -> (f64, Vec<f64>) {
-    let mut takers = vec![0.0; count];
+fn open_claims(votes: &Votes, claims: &Claims, costs: &[(u16, u16)], active: &[bool]) -> (f64, Vec<f64>) {
+    let mut takers = vec![0.0; active.len()];
     let (mut open, mut asked) = (0usize, 0usize);
     for &pixel in &claims.inner {
-        let (x, y) = (pixel % claims.frame.width, pixel / claims.frame.width);
-        let Some((cost, cell)) = best_on_ray(&votes.cube, &claims.camera, x, y, costs) else { continue };
+        let Some((cost, cell)) = best_on_ray(&votes.cube, claims, pixel, costs) else { continue };
         asked += 1;
         if cost == 0 {
             continue;
         }
         open += 1;
-        for i in 0..count {
-            let bit = votes.bits[2 * cell * votes.words + i / 64] & mask[i / 64] & (1 << (i % 64));
-            if bit != 0 {
-                takers[i] += 1.0 / cost as f64;
-            }
+        for i in (0..active.len()).filter(|&i| active[i] && votes.rules_out(i, cell)) {
+            takers[i] += 1.0 / cost as f64;
         }
     }
     let asked = asked.max(1) as f64;
@@ -270,26 +279,29 @@ fn open_claims(
     (open as f64 / asked, takers)
 }
 
-/// The cell on a pixel's ray that fewest views rule out, of those that another view has on the head if there are
-/// any; of equals the one that most have there. Nothing when no other view looks at the ray within the cube.
-fn best_on_ray(
-    cube: &Cube,
-    camera: &Camera,
-    x: usize,
-    y: usize,
-    costs: &[(u16, u16)],
-) -> Option<(u16, usize)> {
-    let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
+/// The cells on a pixel's ray, from the camera on, each half a cell from the last.
+pub(super) fn cells_on_ray<'a>(
+    cube: &'a Cube,
+    claims: &Claims,
+    pixel: usize,
+) -> impl Iterator<Item = usize> + use<'a> {
     let (n, cell) = (cube.n, cube.cell());
-    // in cells from the cube's corner
-    let origin = (camera.position - cube.center + cube.half) / cell;
-    let direction = ray.direction.as_dvec3();
+    let (x, y) = (pixel % claims.frame.width, pixel / claims.frame.width);
     let (mut begin, mut end) = (0.0f64, f64::INFINITY);
+    let (mut origin, mut direction) = (DVec3::ZERO, DVec3::ZERO);
+    match claims.camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)) {
+        None => end = 0.0,
+        Some(ray) => {
+            // in cells from the cube's corner
+            origin = (claims.camera.position - cube.center + cube.half) / cell;
+            direction = ray.direction.as_dvec3();
+        }
+    }
     for a in 0..3 {
         let (o, d) = (origin[a], direction[a]);
         if d.abs() < 1e-12 {
             if o < 0.0 || o >= n as f64 {
-                return None;
+                end = 0.0;
             }
             continue;
         }
@@ -297,17 +309,26 @@ fn best_on_ray(
         begin = begin.max(p.min(q));
         end = end.min(p.max(q));
     }
+    let mut t = begin + 0.25;
+    std::iter::from_fn(move || {
+        while t < end {
+            let p = origin + direction * t;
+            t += 0.5;
+            let at = [p.x, p.y, p.z].map(|v| v as usize);
+            if at.iter().all(|&v| v < n) {
+                return Some((at[0] * n + at[1]) * n + at[2]);
+            }
+        }
+        None
+    })
+}
+
+/// The cell on a pixel's ray that fewest views rule out, of those that another view has on the head if there are
+/// any; of equals the one that most have there. Nothing when no other view looks at the ray within the cube.
+fn best_on_ray(cube: &Cube, claims: &Claims, pixel: usize, costs: &[(u16, u16)]) -> Option<(u16, usize)> {
     // whom the ray's own view has on its side comes first, then who is against
     let mut best: Option<(bool, u16, u16, usize)> = None;
-    let mut t = begin + 0.25;
-    while t < end {
-        let p = origin + direction * t;
-        t += 0.5;
-        let at = [p.x, p.y, p.z].map(|v| v as usize);
-        if at.iter().any(|&v| v >= n) {
-            continue;
-        }
-        let i = (at[0] * n + at[1]) * n + at[2];
+    for i in cells_on_ray(cube, claims, pixel) {
         let (no, yes) = costs[i];
         if no == 0 && yes < 2 {
             continue; // no other view looks there, which explains nothing
@@ -327,7 +348,7 @@ fn best_on_ray(
 mod tests {
     use super::*;
     use crate::geom::Distortion;
-    use glam::{DMat3, DVec3};
+    use glam::DMat3;
 
     /// Eight cameras on a ring, rising a little from one to the next.
     fn ring(count: usize) -> Vec<Camera> {

@@ -23,6 +23,7 @@ pub mod grabcut;
 
 pub mod propagate;
 
+pub mod agreement;
 pub mod consistency;
 
 pub mod matting;

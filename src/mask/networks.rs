@@ -1,26 +1,28 @@
-//! SAM and ViTMatte from files that a user brings (feature `matting`).
+//! SAM, ViTMatte and alpha networks from files that a user brings (feature `matting`).
 //!
 //! ```text
 //! photograph + clicks ── segment ── hard mask        photograph + trimap ── alpha ── soft alpha
+//! photograph ─────────── propose ── alpha of whatever the network takes for what is meant
 //! ```
 //!
 //! Files are recognized by their inputs and outputs, looked through before an engine sees them, and recorded
 //! with size and SHA-256. Nothing is downloaded, and nothing is read but the files named, the processor
 //! file beside a network, and the ONNX Runtime library when one is named.
 
-mod onnx;
+mod alpha;
 mod processor;
 mod sam;
 mod vitmatte;
 
-pub use self::onnx::NetworkFile;
+pub use crate::onnx::NetworkFile;
 
-use self::onnx::{Contract, Engines, Runtime};
+use self::alpha::AlphaNet;
 use self::sam::Sam;
 use self::vitmatte::VitMatte;
 use super::click::Click;
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
+use crate::onnx::{Contract, Engines, Runtime};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -28,6 +30,7 @@ use std::path::Path;
 pub struct Networks {
     sam: Option<Sam>,
     vitmatte: Option<VitMatte>,
+    alpha_net: Option<AlphaNet>,
     files: Vec<NetworkFile>,
     memory_bytes: u64,
 }
@@ -39,7 +42,7 @@ impl Networks {
     /// When a file cannot be read, is no sound ONNX file, is refused for what it holds, is of no known form or
     /// of the other network, when encoder and decoder do not fit, or when the engine cannot load it.
     pub fn open(config: &MaskConfig) -> Result<Option<Networks>> {
-        if !config.with_sam() && !config.with_vitmatte() {
+        if !config.with_networks() {
             return Ok(None);
         }
         let memory_bytes = (config.memory_gib * (1u64 << 30) as f64) as u64;
@@ -58,13 +61,16 @@ impl Networks {
         let sam = config.with_sam().then(sam).transpose()?;
         let vitmatte = || VitMatte::open(config.vitmatte.as_ref(), &engines, config.vitmatte_colors);
         let vitmatte = config.with_vitmatte().then(vitmatte).transpose()?;
+        let alpha_net = || AlphaNet::open(config.alpha_net.as_ref(), &engines, &config.alpha_input);
+        let alpha_net = config.with_alpha_net().then(alpha_net).transpose()?;
         let networks = sam.iter().flat_map(|sam| [&sam.encoder, &sam.decoder]);
-        let networks = networks.chain(vitmatte.iter().map(|v| &v.session)).map(|session| &session.file);
+        let networks = networks.chain(vitmatte.iter().map(|v| &v.session));
+        let networks = networks.chain(alpha_net.iter().map(|a| &a.session)).map(|session| &session.file);
         let files = networks.chain(engines.runtime.iter().map(|r| &r.file)).cloned().collect();
-        Ok(Some(Networks { sam, vitmatte, files, memory_bytes }))
+        Ok(Some(Networks { sam, vitmatte, alpha_net, files, memory_bytes }))
     }
 
-    /// What was loaded: SAM's encoder and decoder, ViTMatte, the library.
+    /// What was loaded: SAM's encoder and decoder, ViTMatte, the alpha network, the library.
     pub fn files(&self) -> &[NetworkFile] {
         &self.files
     }
@@ -77,7 +83,18 @@ impl Networks {
         let photo = Photo { width, height, rgb: vec![[128; 3]; pixels], alpha: None };
         self.segment(&photo, &[Click { x: 0.0, y: 0.0, head: true }])?;
         self.alpha(&photo, &Gray { width, height, values: vec![128; pixels] })?;
+        self.propose(&photo, (width, height))?;
         Ok(())
+    }
+
+    /// The alpha, at `size`, that the alpha network gives a photograph by itself; `None` without one.
+    ///
+    /// # Errors
+    /// For a photograph whose size is not that of its colors; when the network fails or gives what is no picture.
+    pub fn propose(&self, photo: &Photo, size: (u32, u32)) -> Result<Option<Gray>> {
+        let Some(alpha_net) = &self.alpha_net else { return Ok(None) };
+        check_size(photo)?;
+        alpha_net.alpha(photo, size).map(Some)
     }
 
     /// SAM's hard mask (0 or 255) of what was clicked, and how good SAM thinks it is (estimated IoU); `None` without SAM.
@@ -129,13 +146,18 @@ impl Networks {
             let attention = (pixels / 256).saturating_pow(2).saturating_mul(48);
             (3 * vitmatte.session.file.bytes).saturating_add(500 * pixels).saturating_add(attention)
         });
-        sam.max(vitmatte)
+        let alpha = self.alpha_net.as_ref().map_or(0, |net| {
+            let pixels = net.size.0 as u64 * net.size.1 as u64;
+            3 * net.session.file.bytes + 1500 * pixels
+        });
+        sam.max(vitmatte).max(alpha)
     }
 
     /// How many photographs of this size may be run side by side within the memory and `threads`: at least one. ONNX
     /// Runtime takes one at a time and spreads it over the threads itself.
     pub fn photos_at_once(&self, width: u32, height: u32, threads: usize) -> usize {
         let sessions = self.sam.iter().map(|s| &s.encoder).chain(self.vitmatte.iter().map(|v| &v.session));
+        let sessions = sessions.chain(self.alpha_net.iter().map(|a| &a.session));
         if sessions.into_iter().any(|session| session.runs_alone()) {
             return 1;
         }

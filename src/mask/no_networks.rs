@@ -1,4 +1,4 @@
-//! What stands for SAM and ViTMatte in a build without the feature `matting`: none can be opened.
+//! What stands for networks in a build without the feature `matting`: none can be opened.
 
 use super::click::Click;
 use crate::config::MaskConfig;
@@ -17,11 +17,11 @@ impl NoNetworks {
     /// # Errors
     /// When it uses one.
     pub fn open(config: &MaskConfig) -> Result<Option<NoNetworks>> {
-        if !config.with_sam() && !config.with_vitmatte() {
+        if !config.with_networks() {
             return Ok(None);
         }
         Err(Error::cannot(
-            "this build cannot run networks, but SAM or ViTMatte is named",
+            "this build cannot run networks, but one is named",
             "build with `--features matting`, or leave the files out: clicks work without them",
         ))
     }
@@ -43,6 +43,11 @@ impl NoNetworks {
 
     /// SAM's mask.
     pub fn segment(&self, _photo: &Photo, _clicks: &[Click]) -> Result<Option<(Gray, f32)>> {
+        match *self {}
+    }
+
+    /// The alpha network's alpha.
+    pub fn propose(&self, _photo: &Photo, _size: (u32, u32)) -> Result<Option<Gray>> {
         match *self {}
     }
 

@@ -1,4 +1,4 @@
-//! A few clicked views → a mask for every view, through the seeds cameras.
+//! A few clicked views → a mask for every view, through the known cameras.
 //!
 //! 1. The clicked views are cut by themselves; from all of them together the colors of head and background are learned
 //!    once, and frozen.
@@ -8,6 +8,12 @@
 //! 4. All masks carve again, each cell forgiven a few votes against it, and 3 is repeated.
 //!
 //! The hull is an outer bound: it excludes and never includes, but for its core.
+//!
+//! Where a network has proposed a mask for every view, those that agree stand for the clicked ones ([`propagate_proposals`]).
+
+mod proposed;
+
+pub use self::proposed::{propagate_proposals, rows_size};
 
 use super::click::{self, Click};
 use super::components::gray;
@@ -67,6 +73,8 @@ pub struct HardMasks {
     pub masks: Vec<Gray>,
     /// What a person should look at.
     pub warnings: Vec<String>,
+    /// What a person may want to know.
+    pub notes: Vec<String>,
 }
 
 /// Masks every view from the clicks on some. `load` gives the photograph of a view by its index.
@@ -106,17 +114,7 @@ where
         let v = &views[i];
         click::check(&format!("view `{}`", v.name), v.clicks, v.camera.width, v.camera.height)?;
     }
-    let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
-    let cube = hull::cube(&cameras, cells, CUBE)?;
-    let mut photos = Vec::with_capacity(views.len());
-    for start in (0..views.len()).step_by(at_once) {
-        let some = start..(start + at_once).min(views.len());
-        let loaded: Vec<Result<Photo>> = some.into_par_iter().map(|i| reduced(&views[i], load(i)?)).collect();
-        for photo in loaded {
-            photos.push(photo?);
-        }
-    }
-    let mut propagation = Propagation { views, photos, cube, warnings: Vec::new() };
+    let mut propagation = Propagation::new(cells, at_once, views, load)?;
     let start = propagation.clicked(&clicked)?;
     Ok(propagation.run(start))
 }
@@ -136,11 +134,11 @@ fn reduced(view: &PropagateView, photo: Photo) -> Result<Photo> {
     Ok(reduce_to_rows(&photo, grabcut::ROWS))
 }
 
-/// What the clicked views gave.
-struct ClickedViews {
-    /// Colors of all clicked views together.
+/// What the clicked views gave, or those that agree.
+struct StartViews {
+    /// Colors of all of them together.
     models: Models,
-    /// Per view: its labels and own colors, where it was clicked.
+    /// Per view: its labels and the colors it is cut by, where it is one of them.
     own: Vec<Option<(Vec<bool>, Models)>>,
 }
 
@@ -149,10 +147,45 @@ struct Propagation<'a> {
     /// At the working size.
     photos: Vec<Photo>,
     cube: Cube,
+    /// Per view: what lies well inside its proposed mask; empty where that is not believed.
+    inside: Vec<Vec<bool>>,
     warnings: Vec<String>,
+    notes: Vec<String>,
 }
 
-impl Propagation<'_> {
+impl<'a> Propagation<'a> {
+    fn new<F>(cells: usize, at_once: usize, views: &'a [PropagateView<'a>], load: F) -> Result<Self>
+    where
+        F: Fn(usize) -> Result<Photo> + Sync,
+    {
+        let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
+        let cube = hull::cube(&cameras, cells, CUBE)?;
+        let mut photos = Vec::with_capacity(views.len());
+        for start in (0..views.len()).step_by(at_once) {
+            let some = start..(start + at_once).min(views.len());
+            let loaded: Vec<Result<Photo>> =
+                some.into_par_iter().map(|i| reduced(&views[i], load(i)?)).collect();
+            for photo in loaded {
+                photos.push(photo?);
+            }
+        }
+        let inside = vec![Vec::new(); views.len()];
+        Ok(Propagation { views, photos, cube, inside, warnings: Vec::new(), notes: Vec::new() })
+    }
+
+    /// The colors of both sides.
+    fn common(&self, mut inside: Vec<Rgb>, mut outside: Vec<Rgb>) -> Option<Models> {
+        for side in [&mut inside, &mut outside] {
+            let every = side.len().div_ceil(MOST_COLORS).max(1);
+            *side = side.iter().step_by(every).copied().collect();
+        }
+        let mut models = Models::fit(&inside, &outside)?;
+        for _ in 0..grabcut::ROUNDS {
+            models = models.refit(&inside, &outside);
+        }
+        Some(models)
+    }
+
     /// The clicks of a view brought to its working size. The border margins are a guess: once a hull says where the head
     /// is, it may touch any border.
     fn grabcut(&self, i: usize, margins: bool) -> (Grabcut, Vec<String>) {
@@ -162,7 +195,7 @@ impl Propagation<'_> {
     }
 
     /// Cuts the clicked views by themselves and learns the common colors.
-    fn clicked(&mut self, clicked: &[usize]) -> Result<ClickedViews> {
+    fn clicked(&mut self, clicked: &[usize]) -> Result<StartViews> {
         let found: Vec<_> = clicked
             .par_iter()
             .map(|&i| {
@@ -188,20 +221,13 @@ impl Propagation<'_> {
             }
             own[i] = Some((head, models));
         }
-        for side in [&mut inside, &mut outside] {
-            let every = side.len().div_ceil(MOST_COLORS).max(1);
-            *side = side.iter().step_by(every).copied().collect();
-        }
         let empty = || grabcut::empty(self.views[clicked[0]].name);
-        let mut models = Models::fit(&inside, &outside).ok_or_else(empty)?;
-        for _ in 0..grabcut::ROUNDS {
-            models = models.refit(&inside, &outside);
-        }
-        Ok(ClickedViews { models, own })
+        let models = self.common(inside, outside).ok_or_else(empty)?;
+        Ok(StartViews { models, own })
     }
 
     /// Carves and cuts in turn.
-    fn run(mut self, start: ClickedViews) -> HardMasks {
+    fn run(mut self, start: StartViews) -> HardMasks {
         let mut masks: Vec<Option<Gray>> = (start.own.iter().zip(&self.photos))
             .map(|(own, photo)| {
                 own.as_ref().map(|(head, _)| gray(head, photo.width as usize, photo.height as usize))
@@ -230,7 +256,12 @@ impl Propagation<'_> {
                     .into(),
             );
         }
-        HardMasks { masks, warnings: self.warnings }
+        HardMasks { masks, warnings: self.warnings, notes: self.notes }
+    }
+
+    /// Does what was proposed stand for the clicks?
+    fn is_proposed(&self) -> bool {
+        self.inside.iter().any(|inside| !inside.is_empty())
     }
 
     /// The cells where the head may be, and the core where it must be.
@@ -245,6 +276,8 @@ impl Propagation<'_> {
         // while only the clicked views have masks they decide alone; an empty mask is one, too
         let unmasked = self.views.iter().zip(masks).any(|(v, m)| v.votes && m.is_none());
         let (against, least) = match unmasked {
+            // a person has looked at clicked ones
+            true if self.is_proposed() => (MOST_NEGATIVE.min(total / 6), 0),
             true => (0, 0),
             false => (MOST_NEGATIVE.min(total / 6), (LEAST_POSITIVE * total as f64).ceil() as usize),
         };
@@ -258,7 +291,7 @@ impl Propagation<'_> {
 
     /// Cuts one view under what the hull allows.
     fn cut_one(&self, i: usize, models: &Models, hull: &[bool], core: &[bool], round: usize) -> (Gray, f64) {
-        let (mut grabcut, _) = self.grabcut(i, round == 0);
+        let (mut grabcut, _) = self.grabcut(i, round == 0 && !self.is_proposed());
         let (w, h) = (grabcut.width, grabcut.height);
         let camera = self.views[i].camera.resized(w as u32, h as u32);
         let allowed = hull::silhouette(&self.cube, hull, &camera);
@@ -270,7 +303,7 @@ impl Propagation<'_> {
             if *seeds == Seed::Unknown {
                 if !allowed[p] {
                     *seeds = Seed::Background;
-                } else if within[p] {
+                } else if within[p] || self.inside[i].get(p) == Some(&true) {
                     *seeds = Seed::Head;
                 }
             }
@@ -312,7 +345,7 @@ mod tests {
     use crate::kernel::rng;
     use glam::{DMat3, DVec3, Vec2};
 
-    fn ring() -> Vec<Camera> {
+    pub(super) fn ring() -> Vec<Camera> {
         (0..6)
             .map(|i| {
                 let rotation = DMat3::from_rotation_y(0.5 * i as f64);
@@ -332,7 +365,7 @@ mod tests {
     }
 
     /// A ball of two colors before a dark background with lamps, and which pixels are the ball.
-    fn photo(camera: &Camera, stream: u64) -> (Photo, Vec<bool>) {
+    pub(super) fn photo(camera: &Camera, stream: u64) -> (Photo, Vec<bool>) {
         let mut truth = Vec::new();
         let rgb = (0..72 * 96u32)
             .map(|i| {

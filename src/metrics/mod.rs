@@ -19,10 +19,14 @@
 //! ```
 
 pub mod distance;
+#[cfg(feature = "matting")]
+mod lpips;
 mod parts;
 mod psnr;
 mod ssim;
 
+#[cfg(feature = "matting")]
+pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr::psnr;
 pub use ssim::{ssim_reflect_map, ssim_valid};
@@ -47,6 +51,9 @@ pub struct ViewMetrics {
     pub psnr_masked: Option<f64>,
     /// Mean of [`ssim_reflect_map`] over the pixels that are in the mask and valid.
     pub ssim_masked: Option<f64>,
+    /// LPIPS of the whole frame, where a network was given for it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
 }
 
 /// Means over all views that have a value.
@@ -60,6 +67,9 @@ pub struct Means {
     pub psnr_masked: Option<f64>,
     /// Of `ssim_masked`.
     pub ssim_masked: Option<f64>,
+    /// Of `lpips`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
 }
 
 /// What `metrics.json` holds.
@@ -83,6 +93,7 @@ impl Metrics {
             ssim: mean(|v| v.ssim),
             psnr_masked: mean(|v| v.psnr_masked),
             ssim_masked: mean(|v| v.ssim_masked),
+            lpips: mean(|v| v.lpips),
         };
         Metrics { mean, views }
     }
@@ -133,6 +144,7 @@ pub fn compare(
         ssim: ssim_valid(&ours, &theirs),
         psnr_masked: inside.as_ref().and_then(|m| psnr(&ours, &theirs, Some(m))),
         ssim_masked,
+        lpips: None,
     })
 }
 

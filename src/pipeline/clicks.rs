@@ -1,7 +1,9 @@
-//! Masks from clicks: cut where somebody clicked, propagated to every other view, made soft.
+//! Masks from clicks: cut where somebody clicked, propagated to every other view, made soft. Or without any: what a network
+//! proposes for each view, as far as the views agree, stands for the clicks.
 //!
 //! ```text
-//! clicks → cut (GrabCut, or SAM) → propagated through the cameras → band → matting (closed form, ViTMatte) → alpha
+//! clicks → cut (GrabCut, or SAM) ─┬─ propagated through the cameras → band → matting (closed form, ViTMatte) → alpha
+//! proposals → those that agree ───┘
 //! ```
 
 use crate::capture::{Capture, Split};
@@ -13,7 +15,7 @@ use crate::mask::matting::trimap::UnknownBand;
 use crate::mask::matting::{SoftMask, SoftenOptions, soften_with};
 use crate::mask::networks::Networks;
 use crate::mask::prompts::{self, PhotoPrompts, Prompts};
-use crate::mask::propagate::{PropagateView, propagate};
+use crate::mask::propagate::{PropagateView, propagate, propagate_proposals, rows_size};
 use crate::mask::{Click, distance};
 use crate::run::{Fingerprint, StageDir};
 use crate::{Error, Result};
@@ -25,7 +27,7 @@ use std::path::Path;
 /// Memory that photographs worked on side by side may take without networks, bytes.
 const MOST_BYTES: u64 = 3 << 29;
 
-/// The clicks that masks are made from.
+/// What masks are made from: clicks, or none where a network proposes them.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct MaskPrompts {
     /// Of each view, in pixels of its camera.
@@ -37,18 +39,20 @@ pub(super) struct MaskPrompts {
 }
 
 /// What of the clicks comes from files, as `inputs` names them.
-const INPUTS: [&str; 4] = ["clicks", "sam", "sam_decoder", "vitmatte"];
+const INPUTS: [&str; 5] = ["clicks", "sam", "sam_decoder", "vitmatte", "alpha_net"];
 
 impl MaskPrompts {
-    /// The clicks that a configuration means, checked against the capture; `None` if masks are not made from clicks.
+    /// What a configuration means, checked against the capture; `None` if masks are not made.
     ///
     /// `kept` is the copy of the clicks that the run keeps, for when the file is gone.
     pub fn open(config: &MaskConfig, capture: &Capture, kept: &Path) -> Result<Option<MaskPrompts>> {
-        if !config.clicked() {
+        if !config.made() {
             return Ok(None);
         }
         let mut file = Vec::new();
-        let clicks = if config.prompts.is_empty() {
+        let clicks = if config.with_alpha_net() {
+            vec![Vec::new(); capture.views.len()]
+        } else if config.prompts.is_empty() {
             let points = config.point.iter().map(|p| prompts::parse_point(p)).collect::<Result<_>>()?;
             let view = match config.view.as_str() {
                 "" => capture.views.iter().find(|v| v.split == Split::Train).or(capture.views.first()),
@@ -69,13 +73,16 @@ impl MaskPrompts {
             let prompts = prompts::parse_prompts(path, &file, &Limits::default())?;
             prompts.clicks(&path.to_string_lossy(), capture)?
         };
-        if clicks.iter().all(Vec::is_empty) {
+        if config.clicked() && clicks.iter().all(Vec::is_empty) {
             return Err(Error::cannot(
                 format!("`{}` holds no click on a photograph of this capture", config.prompts),
                 "click on a few photographs: `tiface mask CAPTURE --page`",
             ));
         }
-        let mut inputs = vec![("clicks", Fingerprint::of_bytes(format!("{clicks:?}").as_bytes()))];
+        let mut inputs = Vec::new();
+        if config.clicked() {
+            inputs.push(("clicks", Fingerprint::of_bytes(format!("{clicks:?}").as_bytes())));
+        }
         for (name, path) in network_files(config) {
             let mut digest = digest(path)?;
             // what says how a picture is prepared for the network lies beside it
@@ -103,6 +110,7 @@ fn network_files(config: &MaskConfig) -> impl Iterator<Item = (&'static str, &Pa
     let sam = [("sam", &config.sam), ("sam_decoder", &config.sam_decoder)];
     let files = sam.map(|file| config.with_sam().then_some(file)).into_iter();
     let files = files.chain([config.with_vitmatte().then_some(("vitmatte", &config.vitmatte))]);
+    let files = files.chain([config.with_alpha_net().then_some(("alpha_net", &config.alpha_net))]);
     files.flatten().map(|(name, path)| (name, Path::new(path)))
 }
 
@@ -159,10 +167,14 @@ pub(super) fn make_masks(
         networks.prepare(w, h)?;
         networks.files().iter().for_each(|file| dir.note(&file.to_string()));
     }
-    let hard = hard_masks(capture, &prompts.clicks, dir)?;
     let soft = soften_options(config);
-    let total = hard.len();
     let at_once = photos_at_once(networks, largest, &soft, config);
+    let proposals = match networks.filter(|_| config.with_alpha_net()) {
+        Some(networks) => proposals(networks, capture, at_once, dir)?,
+        None => Vec::new(),
+    };
+    let hard = hard_masks(capture, &prompts.clicks, &proposals, dir)?;
+    let total = hard.len();
     for start in (0..total).step_by(at_once) {
         let some = start..(start + at_once).min(total);
         let masks: Vec<Result<(Photo, SoftMask)>> = some
@@ -185,10 +197,38 @@ pub(super) fn make_masks(
     Ok(networks.map_or(json!([]), |n| json!(n.files())))
 }
 
-/// Hard masks of all views.
-fn hard_masks(capture: &Capture, clicks: &[Vec<Click>], dir: &StageDir) -> Result<Vec<Gray>> {
+/// What the alpha network proposes for each view, at the size that masks are cut at.
+fn proposals(networks: &Networks, capture: &Capture, at_once: usize, dir: &StageDir) -> Result<Vec<Gray>> {
+    let mut out = Vec::new();
+    while out.len() < capture.views.len() {
+        let some = out.len()..(out.len() + at_once).min(capture.views.len());
+        let found: Vec<Result<Option<Gray>>> = some
+            .into_par_iter()
+            .map(|i| {
+                let photo = photo(capture, i, dir)?;
+                let found = networks.propose(&photo, rows_size(&photo));
+                found.map_err(|e| e.within(format!("view `{}`", capture.views[i].name)))
+            })
+            .collect();
+        for found in found {
+            out.extend(found?);
+        }
+        dir.step(out.len() / 2, capture.views.len())?;
+    }
+    Ok(out)
+}
+
+/// Hard masks of all views, from clicks, or from what was proposed for each.
+fn hard_masks(
+    capture: &Capture,
+    clicks: &[Vec<Click>],
+    proposals: &[Gray],
+    dir: &StageDir,
+) -> Result<Vec<Gray>> {
     let views = &capture.views;
-    let (masks, warnings) = if let [view] = &views[..] {
+    let (masks, warnings) = if let ([_], [mask]) = (&views[..], proposals) {
+        (vec![mask.clone()], vec!["there is one view: nothing says whether the network is right".into()])
+    } else if let [view] = &views[..] {
         let found = grabcut(&view.name, &photo(capture, 0, dir)?, &clicks[0])?;
         (vec![found.mask], found.warnings)
     } else {
@@ -199,7 +239,12 @@ fn hard_masks(capture: &Capture, clicks: &[Vec<Click>], dir: &StageDir) -> Resul
         };
         let views: Vec<PropagateView> =
             views.iter().zip(clicks.iter().map(Vec::as_slice)).map(view).collect();
-        let found = propagate(&views, |i| photo(capture, i, dir))?;
+        let load = |i| photo(capture, i, dir);
+        let found = match proposals {
+            [] => propagate(&views, load)?,
+            some => propagate_proposals(&views, some, load)?,
+        };
+        found.notes.iter().for_each(|note| dir.note(note));
         (found.masks, found.warnings)
     };
     warnings.iter().for_each(|w| dir.warn(w));

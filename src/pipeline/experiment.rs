@@ -1,8 +1,9 @@
 //! The paper's tables: which runs they are made of, and what those came to. A row is a preset of settings; a run is made by
 //! the line like any other, and one that is done is not made again.
 
-use super::line::Line;
+use super::line::{Line, capture_options};
 use super::{Stage, complete, learn, reconstruct};
+use crate::capture;
 use crate::config::iface::FieldKind;
 use crate::config::{
     Config, MaskLoss, MaskSource, MaskUse, Method, Preset, Sources, TruthPhoto, VmBackground, VmConfig,
@@ -12,6 +13,7 @@ use crate::report::experiment::{ExperimentRow, Measured, Ordering};
 use crate::run::{read_record, read_status};
 use crate::{Error, ErrorKind, Result};
 use serde_json::Value;
+use std::path::Path;
 
 /// The tables, by their word and heading.
 pub const TABLES: [(&str, &str); 4] = [
@@ -166,12 +168,19 @@ pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
         // there are no kernels of that field for another, and a device that is set is meant for the other runs
         resolved.device = "cpu".into();
     }
-    if scale < 1.0 && preset == Preset::Paper {
-        // constants of a preset and no keys: no setting names them, and none is lost; they follow the steps as set
-        resolved.iface.warmup = (resolved.iface.steps / 40).max(1);
-        resolved.iface.anneal_end = resolved.iface.steps;
-    }
     Ok(resolved)
+}
+
+/// The settings of a run for a capture that has no masks, where the run needs none; as they are for every other.
+pub fn without_masks(run: &str, config: &mut Config) {
+    let options = capture_options(config);
+    let bare = || {
+        let capture = capture::open(Path::new(&config.capture.path), &options)?;
+        capture::require_masks(&capture, &options)
+    };
+    if run == "baseline-one" && bare().is_err() {
+        config.mask.source = MaskSource::None;
+    }
 }
 
 fn unknown(run: &str) -> Error {
@@ -285,7 +294,7 @@ fn figures(line: &Line, row: &ExperimentRow, value: &Value, beside: &str) -> Mea
         let region = regions.iter().find(|r| r["name"] == head["name"]);
         let of = |key: &str| head[key].as_f64();
         let region = region.and_then(|r| r["psnr_masked"].as_f64());
-        out.figures.push([of("psnr_masked"), of("psnr"), region, of("ssim_masked"), of("ssim")]);
+        out.figures.push([of("psnr_masked"), of("psnr"), region, of("ssim_masked"), of("ssim"), of("lpips")]);
         out.views.push(name.into());
     }
     out.masks = value["truth"]["masks"].as_str().map(String::from);
@@ -329,7 +338,6 @@ mod tests {
     use crate::run::Run;
     use glam::Vec3;
     use serde_json::json;
-    use std::path::Path;
 
     /// A tiny capture in a folder; its path.
     fn head(dir: &Path) -> String {
@@ -400,6 +408,32 @@ mod tests {
         for constant in ["iface.warmup", "iface.anneal_end"] {
             let e = config("paper", 0.1, &[format!("{constant}=7")]).unwrap_err().to_string();
             assert!(e.ends_with(&format!("there is no key `{constant}`")), "{e}");
+        }
+    }
+
+    #[test]
+    fn a_capture_without_masks_has_the_rows_that_learn_from_none() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = head(dir.path());
+        let opens = |run: &str| {
+            let mut c = config(run, 0.01, &["device=cpu".into()]).unwrap();
+            c.capture.path.clone_from(&path);
+            without_masks(run, &mut c);
+            let run = Run::quiet(&dir.path().join("run"));
+            Line::open(&c, &run).map(|_| c.mask.source)
+        };
+        assert!(opens("baseline-one").is_ok_and(|source| source == MaskSource::Auto));
+        std::fs::remove_dir_all(Path::new(&path).join("masks")).unwrap();
+        for file in ["transforms.json", "transforms_train.json", "transforms_test.json"] {
+            let file = Path::new(&path).join(file);
+            let text = std::fs::read_to_string(&file).unwrap();
+            std::fs::write(&file, text.replace("mask_path", "no_path")).unwrap();
+        }
+        let bare = ["baseline-one", "iface-bare"].map(|run| opens(run).unwrap());
+        assert_eq!(bare, [MaskSource::None; 2]);
+        for run in ["paper", "tface-l2-one", "standard"] {
+            let e = opens(run).unwrap_err().to_string();
+            assert!(e.contains("mask"), "{run}: {e}");
         }
     }
 

@@ -35,6 +35,8 @@ pub struct Line<'a> {
     /// Where masks are made: those that the capture has all the same. Views are judged by them, for no run may shape what
     /// it is judged by.
     pub(super) own_masks: Option<OwnMasks>,
+    /// Digest of the network for LPIPS.
+    pub(super) lpips: Option<String>,
 }
 
 /// Masks that the capture has beside those that are made.
@@ -77,6 +79,7 @@ impl<'a> Line<'a> {
         let others = clicks.is_some() || config.mask.source == MaskSource::None;
         let own_masks = others.then(|| own_masks(&capture, &options)).transpose()?;
         let imports = imports(config, run)?;
+        let lpips = lpips(config, run)?;
         capture.warnings.iter().for_each(|warning| run.warn("capture", warning));
         if clicks.is_some() {
             // what later stages read is what the stage `mask` makes
@@ -95,6 +98,7 @@ impl<'a> Line<'a> {
             synthetic: false,
             clicks,
             own_masks,
+            lpips,
         })
     }
 
@@ -197,7 +201,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
     let c = &config.capture;
     CaptureOptions {
         downscale: c.downscale,
-        masks: if config.mask.clicked() { MaskSource::Clicks } else { config.mask.source },
+        masks: if config.mask.made() { MaskSource::Clicks } else { config.mask.source },
         mask_dir: c.mask_dir.clone(),
         mask_meaning: config.mask.meaning,
         unit_m: c.unit_m,
@@ -271,6 +275,23 @@ fn imports(config: &Config, run: &Run) -> Result<Vec<Import>> {
     named.into_iter().filter(|(_, file)| !file.is_empty()).map(open).collect()
 }
 
+/// Digest of the network for LPIPS, if one is named; figures that are there need it no more.
+fn lpips(config: &Config, run: &Run) -> Result<Option<String>> {
+    let file = &config.metrics.lpips;
+    if file.is_empty() {
+        return Ok(None);
+    }
+    let bytes = io::read_bytes(Path::new(file), &Limits { file_bytes: 2 << 30, ..Limits::default() });
+    match bytes {
+        Ok(bytes) => Ok(Some(Fingerprint::of_bytes(&bytes))),
+        Err(e) => {
+            let record = read_record(&run.path(Stage::Metrics)).ok().flatten();
+            let digest = record.and_then(|r| r.fingerprint.inputs.get("lpips").cloned());
+            digest.map(Some).ok_or_else(|| e.into())
+        }
+    }
+}
+
 /// The checkpoint that a stage took when the run was last worked on, if the run says so.
 fn saved_import(run: &Run, stage: Stage) -> Option<String> {
     let bytes = io::read_bytes(&run.path("config.toml"), &Limits::default()).ok()?;
@@ -300,7 +321,7 @@ fn remembered(
     let capture = scene_file::read_capture(&run.path("cameras.json"), root).map_err(|_| gone(&problem))?;
     let mut inputs = record.fingerprint.inputs;
     let digest = inputs.remove("capture").unwrap_or_default();
-    let clicks = config.mask.clicked().then(|| MaskPrompts::remembered(&inputs));
+    let clicks = config.mask.made().then(|| MaskPrompts::remembered(&inputs));
     Ok((capture, digest, clicks, Some(problem)))
 }
 

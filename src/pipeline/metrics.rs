@@ -5,9 +5,11 @@ use super::mesh::surface_in_world;
 use super::pictures;
 use super::truth::against_truth;
 use crate::capture::{LoadedView, View};
-use crate::config::{Stage, TruthPhoto, ViewBackground};
+use crate::config::{Config, Stage, TruthPhoto, ViewBackground};
 use crate::image::Gray;
 use crate::io::{self, Limits};
+#[cfg(feature = "matting")]
+use crate::metrics::Lpips;
 use crate::metrics::{Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, parts};
 use crate::run::StageDir;
 use crate::{Error, Result};
@@ -76,9 +78,10 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     let mut views: Vec<View> = judged.iter().flatten().map(|c| line.judged(c.view)).collect();
     views.sort_by(|a, b| a.name.cmp(&b.name));
     views.dedup_by(|a, b| a.name == b.name);
+    let lpips = measure(line.config, dir)?;
     let tones = Tones::of(&views.iter().collect::<Vec<_>>())?;
     for (i, (set, pictures)) in sets.iter().zip(&judged).enumerate() {
-        let figures = pictures.par_iter().map(|p| figures(line, p, tones.as_ref()));
+        let figures = pictures.par_iter().map(|p| figures(line, p, tones.as_ref(), lpips.as_ref()));
         let figures = figures.collect::<Result<Vec<_>>>()?;
         if !figures.is_empty() {
             out.insert(set.name.clone(), entry(figures));
@@ -102,7 +105,46 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     Ok(means(&value))
 }
 
-fn figures(line: &Line, picture: &Comparable, tones: Option<&Tones>) -> Result<ViewFigures> {
+/// The network for LPIPS, if one is named.
+#[cfg(feature = "matting")]
+fn measure(config: &Config, dir: &StageDir) -> Result<Option<Lpips>> {
+    let file = &config.metrics.lpips;
+    if file.is_empty() {
+        return Ok(None);
+    }
+    let lpips = Lpips::open(file.as_ref(), &config.mask.onnxruntime, config.mask.memory_gib)?;
+    dir.note(&lpips.file().to_string());
+    Ok(Some(lpips))
+}
+
+/// What stands for LPIPS in a build that runs no networks.
+#[cfg(not(feature = "matting"))]
+enum Lpips {}
+
+#[cfg(not(feature = "matting"))]
+impl Lpips {
+    fn distance(&self, _: &crate::image::Image, _: &crate::image::Photo) -> Result<f64> {
+        match *self {}
+    }
+}
+
+#[cfg(not(feature = "matting"))]
+fn measure(config: &Config, _: &StageDir) -> Result<Option<Lpips>> {
+    match config.metrics.lpips.is_empty() {
+        true => Ok(None),
+        false => Err(Error::cannot(
+            "this build cannot run networks, but `metrics.lpips` names one",
+            "build with `--features matting`, or leave the file out",
+        )),
+    }
+}
+
+fn figures(
+    line: &Line,
+    picture: &Comparable,
+    tones: Option<&Tones>,
+    lpips: Option<&Lpips>,
+) -> Result<ViewFigures> {
     let config = &line.config.render;
     let background = config.background;
     let loaded = line.judged(picture.view).load(&Limits::default())?;
@@ -114,7 +156,8 @@ fn figures(line: &Line, picture: &Comparable, tones: Option<&Tones>) -> Result<V
     let against =
         |mask: Option<&Gray>| compare(&picture.view.name, &render, &photo, mask, loaded.valid.as_ref());
     let region = loaded.region.as_ref().map(|r| against(Some(r))).transpose()?;
-    let head = against(loaded.mask.as_ref())?;
+    let mut head = against(loaded.mask.as_ref())?;
+    head.lpips = lpips.map(|network| network.distance(&render, &photo)).transpose()?;
     // a picture over a background is opaque; what it was before is in the float view
     let before = match io::is_file(&picture.float) {
         true => Some(pictures::read_float(&picture.float)?),

@@ -15,13 +15,14 @@ use std::path::Path;
 const FORMAT: u32 = 2;
 
 /// Keys of `[mask]` that say where something lies; what it holds is an input of the stage.
-const PLACES: [&str; 8] = [
+const PLACES: [&str; 9] = [
     "mask.prompts",
     "mask.point",
     "mask.view",
     "mask.sam",
     "mask.sam_decoder",
     "mask.vitmatte",
+    "mask.alpha_net",
     "mask.onnxruntime",
     "mask.memory_gib",
 ];
@@ -164,6 +165,9 @@ impl Line<'_> {
                     // where clicks and networks lie does not matter either, nor how much memory they get
                     Some(clicks) => {
                         settings.retain(|key, _| !PLACES.contains(&key.as_str()));
+                        if !config.mask.with_alpha_net() {
+                            settings.remove("mask.alpha_input"); // as in runs from before there was any
+                        }
                         inputs.extend(clicks.inputs.iter().cloned());
                     }
                     // how masks would be made does not shape those that were found
@@ -234,6 +238,8 @@ impl Line<'_> {
             Stage::Ensemble => needs_bytes += self.pixels() * 4,
             Stage::Metrics => {
                 inputs.extend(self.own_masks.as_ref().map(|own| ("own masks", own.digest.clone())));
+                settings.remove("metrics.lpips"); // what the file holds matters, not where it lies
+                inputs.extend(self.lpips.clone().map(|digest| ("lpips", digest)));
             }
         }
         let mut fingerprint = Fingerprint::new(FORMAT, settings);

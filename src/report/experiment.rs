@@ -7,12 +7,13 @@ use crate::{Error, Result};
 use serde::Serialize;
 
 /// What is measured of a row, in the order of the columns: its word, its heading, digits, and whether more is better.
-pub const MEASURES: [(&str, &str, usize, bool); 6] = [
+pub const MEASURES: [(&str, &str, usize, bool); 7] = [
     ("masked", "PSNR inside the mask, dB", 2, true),
     ("full", "PSNR of the whole photograph, dB", 2, true),
     ("region", "PSNR of face and hair, dB", 2, true),
     ("masked_ssim", "SSIM inside the mask", 3, true),
     ("full_ssim", "SSIM of the whole photograph", 3, true),
+    ("lpips", "LPIPS of the whole photograph", 3, false),
     ("seconds", "seconds a view", 2, false),
 ];
 
@@ -53,7 +54,7 @@ pub struct Ordering {
 }
 
 /// One photograph's figures, in the order of [`MEASURES`]; the last is of the whole row.
-pub type ViewRow = [Option<f64>; 5];
+pub type ViewRow = [Option<f64>; MEASURES.len() - 1];
 
 /// A row as a capture has it.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -79,7 +80,7 @@ pub struct Measured {
 
 impl Measured {
     fn mean(&self, measure: usize) -> Option<f64> {
-        if measure == 5 {
+        if measure == MEASURES.len() - 1 {
             return self.seconds;
         }
         let values: Vec<f64> = self.figures.iter().filter_map(|f| f[measure]).collect();
@@ -204,6 +205,9 @@ pub enum Holds {
     Unknown,
 }
 
+/// Whether an ordering holds, and the better row's figure less the worse one's.
+pub type Verdict = (Holds, Option<f64>);
+
 impl Experiment {
     fn index(&self, table: &str, row: &str) -> Option<usize> {
         self.rows.iter().position(|r| r.table == table && r.row == row)
@@ -226,18 +230,18 @@ impl Experiment {
         self.measured[row].iter().zip(&self.measured[from]).map(pair).collect()
     }
 
-    /// Whether an ordering holds: for each capture, and on average over those that have both rows.
-    pub fn holds(&self, ordering: &Ordering) -> (Vec<Holds>, Holds) {
+    /// Whether an ordering holds, and by how much the better row is better: for each capture, and on average over those
+    /// that have both rows.
+    pub fn holds(&self, ordering: &Ordering) -> (Vec<Verdict>, Verdict) {
         let measure = MEASURES.iter().position(|m| m.0 == ordering.by).unwrap_or(0);
         let rows = (self.index(ordering.table, ordering.better), self.index(ordering.table, ordering.worse));
         let (Some(better), Some(worse)) = rows else {
-            return (vec![Holds::Unknown; self.captures.len()], Holds::Unknown);
+            return (vec![(Holds::Unknown, None); self.captures.len()], (Holds::Unknown, None));
         };
         let slack = if ordering.or_equal { 0.05 } else { 0.0 };
         let judge = |a: Option<f64>, b: Option<f64>| match (a, b) {
-            (Some(a), Some(b)) if a + slack > b => Holds::Yes,
-            (Some(_), Some(_)) => Holds::No,
-            _ => Holds::Unknown,
+            (Some(a), Some(b)) => (if a + slack > b { Holds::Yes } else { Holds::No }, Some(a - b)),
+            _ => (Holds::Unknown, None),
         };
         let pairs = self.measured[better].iter().zip(&self.measured[worse]);
         let pairs: Vec<_> = pairs.map(|(a, b)| (a.mean(measure), b.mean(measure))).collect();
@@ -280,7 +284,7 @@ mod tests {
     fn measured(values: &[f64]) -> Measured {
         Measured {
             views: (0..values.len()).map(|i| format!("v{i}")).collect(),
-            figures: values.iter().map(|v| [Some(*v), None, None, None, None]).collect(),
+            figures: values.iter().map(|v| [Some(*v), None, None, None, None, None]).collect(),
             seconds: Some(1.5),
             ..Measured::default()
         }
@@ -310,17 +314,22 @@ mod tests {
     #[test]
     fn orderings_are_judged_by_capture_and_on_average() {
         let e = experiment();
+        let words = |e: &Experiment, i: usize| {
+            let (each, mean) = e.holds(&e.orderings[i]);
+            (each.into_iter().map(|v| v.0).collect::<Vec<_>>(), mean.0)
+        };
         // 22.25 > 21, 29.99 < 30; 26.12 > 25.5
-        assert_eq!(e.holds(&e.orderings[0]), (vec![Holds::Yes, Holds::No], Holds::Yes));
+        assert_eq!(words(&e, 0), (vec![Holds::Yes, Holds::No], Holds::Yes));
+        assert!((e.holds(&e.orderings[0]).0[0].1.unwrap() - 1.25).abs() < 1e-9);
         // a twentieth is as good
-        assert_eq!(e.holds(&e.orderings[1]), (vec![Holds::No, Holds::Yes], Holds::No));
+        assert_eq!(words(&e, 1), (vec![Holds::No, Holds::Yes], Holds::No));
         let mut missing = e.clone();
         missing.measured[1][0].figures.clear();
         missing.measured[1][0].views.clear();
         // on average over the second alone, where the first row is better: 29.99 < 30, though 29.99 > 25.5
-        assert_eq!(missing.holds(&e.orderings[0]), (vec![Holds::Unknown, Holds::No], Holds::No));
+        assert_eq!(words(&missing, 0), (vec![Holds::Unknown, Holds::No], Holds::No));
         missing.measured[0][1].figures.clear();
-        assert_eq!(missing.holds(&e.orderings[0]), (vec![Holds::Unknown; 2], Holds::Unknown));
+        assert_eq!(words(&missing, 0), (vec![Holds::Unknown; 2], Holds::Unknown));
     }
 
     #[test]
@@ -334,10 +343,13 @@ mod tests {
         assert!(text.contains("| second † | 26.12 |") && text.contains("| first <b> | 25.50 |"), "{text}");
         assert!(text.contains("| second † > first <b> |") && text.contains("but in rows with †"), "{text}");
         let page = e.html();
-        assert!(page.contains("<td>second †</td>") && page.contains("but in rows with †"), "{page}");
+        assert!(page.contains("<th>second †</th>") && page.contains("but in rows with †"), "{page}");
         let csv = e.csv();
-        assert!(csv.contains(",seconds,masks\n") && csv.contains("t,a,lps,v0,20,,,,,1.5,capture\n"), "{csv}");
-        assert!(csv.contains("t,b,\"x,y\",v0,29.99,,,,,1.5,run\n"), "{csv}");
+        assert!(
+            csv.contains(",lpips,seconds,masks\n") && csv.contains("t,a,lps,v0,20,,,,,,1.5,capture\n"),
+            "{csv}"
+        );
+        assert!(csv.contains("t,b,\"x,y\",v0,29.99,,,,,,1.5,run\n"), "{csv}");
         let value: serde_json::Value = serde_json::from_str(&e.json()).unwrap();
         assert_eq!(
             (&value["measured"][1][1]["masks"], value["measured"][1][0]["masks"].is_null()),
@@ -368,8 +380,11 @@ mod tests {
             "{text}"
         );
         assert!(text.contains("+0.62 ("), "{text}");
-        assert!(text.contains("| masked | second > first <b> | holds | does not hold | holds |"), "{text}");
-        assert!(e.csv().contains("t,a,\"x,y\",v0,30,,,,,1.5,\n"), "{}", e.csv());
+        let verdict = "| second > first <b> | holds, +1.25 | does not hold, -0.01 | holds, +0.62 |";
+        assert!(text.contains(verdict), "{text}");
+        // nobody measured it
+        assert!(!text.contains("LPIPS"), "{text}");
+        assert!(e.csv().contains("t,a,\"x,y\",v0,30,,,,,,1.5,\n"), "{}", e.csv());
         let page = e.html();
         assert!(page.contains("first &lt;b&gt;") && !page.contains("first <b>"));
         let value: serde_json::Value = serde_json::from_str(&e.json()).unwrap();

@@ -3,9 +3,9 @@
 //! Looked for in the folder of the network's file, and in the folder above when that is called `onnx`, which is
 //! how public collections lie. A file of the other network's processor is not obeyed.
 
-use super::onnx::file_error;
 use crate::Result;
 use crate::io::{self, Limits};
+use crate::onnx::file_error;
 use serde::Deserialize;
 use serde_json::Value;
 use std::path::Path;
@@ -49,7 +49,7 @@ impl Normal {
 pub(super) struct Processor {
     /// How it normalizes.
     pub normal: Normal,
-    /// Side of the padded square (`pad_size`, else `size.longest_edge`), where it is said.
+    /// Side of the square (`pad_size`, else `size.longest_edge`, `size.height` or `size.shortest_edge`), where it is said.
     pub side: Option<usize>,
 }
 
@@ -64,7 +64,7 @@ struct ProcessorFile {
 }
 
 /// The processor file of the network at `network`, unless there is none or it is of another network than
-/// `kind` ("sam", "vitmatte").
+/// `kind` ("sam", "vitmatte", or empty for any).
 pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>> {
     const NAME: &str = "preprocessor_config.json";
     let folder = network.parent().unwrap_or(Path::new(""));
@@ -94,8 +94,11 @@ pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>> {
     };
     let mean = three("image_mean", file.image_mean, IMAGENET.mean, 0.0)?;
     let std = three("image_std", file.image_std, IMAGENET.std, 1e-3)?;
-    let side = file.pad_size["height"].as_u64().or(file.size["longest_edge"].as_u64());
-    if let Some(side) = side.filter(|side| kind == "sam" && (side % 16 != 0 || !(64..=4096).contains(side))) {
+    let said = |key: &str| file.size[key].as_u64();
+    let side = file.pad_size["height"].as_u64().or(said("longest_edge"));
+    let side = side.or(said("height").or(said("shortest_edge")).filter(|_| kind.is_empty()));
+    let used = kind != "vitmatte";
+    if let Some(side) = side.filter(|side| used && (side % 16 != 0 || !(64..=4096).contains(side))) {
         return Err(wrong(format!("the side is {side}, expected a multiple of 16 from 64 to 4096")));
     }
     let side = side.and_then(|side| usize::try_from(side).ok());

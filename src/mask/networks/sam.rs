@@ -9,11 +9,11 @@
 //! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label −1 at the
 //! end when no box is given. S and the embedding's width are read from the files.
 
-use super::onnx::{Contract, Engines, NetworkArray, NetworkSession, Role, file_error};
 use super::processor::{self, IMAGENET, Normal};
 use crate::image::{Gray, Photo};
 use crate::mask::click::{self, Click};
 use crate::mask::scale::bilinear;
+use crate::onnx::{Contract, Engines, NetworkArray, NetworkSession, Role, file_error};
 use crate::{Error, Result};
 use image::RgbImage;
 use image::imageops::{self, FilterType};

@@ -4,8 +4,6 @@
 //! and alphas, 1e-6 for normalized pixels, 2 of 255 and a mean of 0.3 for resized pictures, 1 % of mask pixels.
 
 use super::Networks;
-use super::onnx::tests::{config, engines, made, shared};
-use super::onnx::{Engines, NetworkArray, NetworkSession, Role, Runtime};
 use super::processor::IMAGENET;
 use super::sam::{Sam, enlarged, normalized, resized};
 use super::vitmatte::VitMatte;
@@ -14,6 +12,8 @@ use crate::config::{MaskConfig, VitmatteColors};
 use crate::image::{Gray, Photo};
 use crate::io::{Limits, NpyValues, read_gray, read_json, read_npy, read_photo};
 use crate::mask::Click;
+use crate::onnx::tests::{config, engines, made, shared};
+use crate::onnx::{Engines, NetworkArray, NetworkSession, Role, Runtime};
 use std::fs;
 use std::path::{Path, PathBuf};
 

@@ -9,10 +9,10 @@
 //!
 //! The file `preprocessor_config.json` beside the network means the second; without it, the first.
 
-use super::onnx::{Engines, NetworkArray, NetworkSession, Role};
 use super::processor::{self, IMAGENET, Normal};
 use crate::config::VitmatteColors;
 use crate::image::{Gray, Photo};
+use crate::onnx::{Engines, NetworkArray, NetworkSession, Role};
 use crate::{Error, Result};
 use std::path::Path;
 

@@ -1,28 +1,35 @@
 //! The tables of an experiment as people and programs read them: Markdown, CSV, JSON and a page.
 
-use super::{DRAWS, Experiment, Holds, MEASURES, bootstrap};
+use super::{DRAWS, Experiment, MEASURES, Ordering, Verdict, bootstrap};
 use crate::report::{STYLE, escape, link};
 use std::fmt::Write;
 
 impl Experiment {
+    /// The measures that anything has, by their places in [`MEASURES`].
+    fn measures(&self) -> Vec<usize> {
+        (0..MEASURES.len())
+            .filter(|&k| k == 0 || (0..self.rows.len()).any(|i| self.mean(i, k).is_some()))
+            .collect()
+    }
+
     /// Cells of a table: the heading, then a line for each row.
     fn cells(&self, table: &str) -> Vec<Vec<String>> {
         let mut heading = vec!["row".to_owned()];
-        for (word, title, ..) in MEASURES {
+        for (word, title, ..) in self.measures().into_iter().map(|k| MEASURES[k]) {
             heading.push(title.into());
             if self.published.iter().any(|p| p.table == table && p.measure == word) {
                 heading.push(format!("{title}, published"));
             }
         }
-        heading.push("more than the first row, dB (95 %)".into());
-        heading.push("seen where nothing is".into());
-        heading.push("pieces".into());
+        heading.push("PSNR inside the mask more than the first row's, dB (95 %)".into());
+        heading.push("mean opacity² where no head is".into());
+        heading.push("pieces of the surface".into());
         let mut out = vec![heading];
         let dash = || "–".to_owned();
         let first = self.rows.iter().position(|r| r.table == table);
         for (i, row) in self.rows.iter().enumerate().filter(|(_, r)| r.table == table) {
             let mut line = vec![self.title(i)];
-            for (k, (word, _, digits, _)) in MEASURES.into_iter().enumerate() {
+            for (k, (word, _, digits, _)) in self.measures().into_iter().map(|k| (k, MEASURES[k])) {
                 line.push(self.mean(i, k).map_or_else(dash, |v| format!("{v:.digits$}")));
                 if self.published.iter().any(|p| p.table == table && p.measure == word) {
                     line.push(self.published(row, word).map_or_else(dash, |v| format!("{v:.digits$}")));
@@ -43,34 +50,43 @@ impl Experiment {
         out
     }
 
-    /// What is wrong with single rows, a sentence each.
+    /// What is wrong with single runs, a sentence for each capture and problem.
     fn problems(&self) -> Vec<String> {
-        let mut out = Vec::new();
-        for (row, measured) in self.rows.iter().zip(&self.measured) {
-            for (capture, m) in self.captures.iter().zip(measured) {
-                if let Some(problem) = &m.problem {
-                    let line = format!("{capture}, run `{}`: {problem}", row.run);
-                    if !out.contains(&line) {
-                        out.push(line);
-                    }
+        let mut out: Vec<((&str, &str), Vec<&str>)> = Vec::new();
+        for (k, capture) in self.captures.iter().enumerate() {
+            for (row, measured) in self.rows.iter().zip(&self.measured) {
+                let Some(problem) = measured.get(k).and_then(|m| m.problem.as_deref()) else { continue };
+                let what = (capture.as_str(), problem);
+                let at = out.iter().position(|(w, _)| *w == what).unwrap_or(out.len());
+                if at == out.len() {
+                    out.push((what, Vec::new()));
+                }
+                if !out[at].1.contains(&row.run) {
+                    out[at].1.push(row.run);
                 }
             }
         }
-        out
+        out.iter()
+            .map(|((capture, problem), runs)| format!("{capture}, {}: {problem}", runs.join(", ")))
+            .collect()
     }
 
     /// The orderings as cells: the heading, then one line each.
     fn verdicts(&self) -> Vec<Vec<String>> {
-        let mut out = vec![["by", "as published"].map(String::from).to_vec()];
+        let mut out = vec![vec!["as published, by PSNR inside the mask".to_owned()]];
         out[0].extend(self.captures.iter().cloned());
         out[0].push("on average".into());
-        let word = |h: &Holds| ["holds", "does not hold", "–"][*h as usize].to_owned();
+        let word = |(holds, by): &Verdict| {
+            let word = ["holds", "does not hold", "–"][*holds as usize];
+            by.map_or(word.to_owned(), |by| format!("{word}, {by:+.2}"))
+        };
+        let measure = |o: &Ordering| MEASURES.iter().find(|m| m.0 == o.by).filter(|m| m.0 != "masked");
         for o in &self.orderings {
             let sign = if o.or_equal { "≥" } else { ">" };
             let (each, mean) = self.holds(o);
             let title = |row: &str| self.index(o.table, row).map_or(String::new(), |i| self.title(i));
             let claim = format!("{} {sign} {}", title(o.better), title(o.worse));
-            let mut line = vec![o.by.to_owned(), claim];
+            let mut line = vec![measure(o).map_or(claim.clone(), |m| format!("{claim}, by {}", m.1))];
             line.extend(each.iter().map(word));
             line.push(word(&mean));
             out.push(line);
@@ -89,8 +105,8 @@ impl Experiment {
         format!(
             "{many} captures ({}), scale {} of the published effort. PSNR and SSIM are means over held-out photographs as \
              they were taken, then over captures; masks are the captures' own{own}. Seconds a view of an ensemble are \
-             those of its members and of the blend. Orderings on average are over the captures that have both rows. \
-             Intervals: {DRAWS} resamplings of the photographs.{}",
+             those of its members and of the blend. A row that some captures lack is the mean of the others; \
+             orderings on average are over the captures that have both rows. Intervals: {DRAWS} resamplings of the photographs.{}",
             self.captures.join(", "),
             self.scale,
             if self.published.is_empty() {
@@ -133,7 +149,7 @@ impl Experiment {
             if plain { text.to_owned() } else { format!("\"{}\"", text.replace('"', "\"\"")) }
         };
         let mut out = String::from(
-            "table,row,capture,photograph,masked,full,region,masked_ssim,full_ssim,seconds,masks\n",
+            "table,row,capture,photograph,masked,full,region,masked_ssim,full_ssim,lpips,seconds,masks\n",
         );
         for (row, measured) in self.rows.iter().zip(&self.measured) {
             for (capture, m) in self.captures.iter().zip(measured) {
@@ -167,7 +183,9 @@ impl Experiment {
         let verdicts: Vec<_> = (self.orderings.iter())
             .map(|o| {
                 let (captures, mean) = self.holds(o);
-                serde_json::json!({"ordering": o, "captures": captures, "average": mean})
+                let (words, more): (Vec<_>, Vec<_>) = captures.into_iter().unzip();
+                serde_json::json!({"ordering": o, "captures": words, "average": mean.0,
+                                   "more": more, "more_average": mean.1})
             })
             .collect();
         value["means"] = rows.into();
@@ -178,42 +196,52 @@ impl Experiment {
     /// As a page, with a picture of every row and capture; pictures are named by their paths from the page.
     pub fn html(&self) -> String {
         let table = |cells: &[Vec<String>]| {
-            let mut out = String::from("<table>");
+            let mut out = String::from("<div class=\"wide\"><table>");
             for (i, line) in cells.iter().enumerate() {
-                let tag = if i == 0 { "th" } else { "td" };
-                let cells: String = line.iter().map(|c| format!("<{tag}>{}</{tag}>", escape(c))).collect();
+                let cell = |(k, c): (usize, &String)| {
+                    let tag = if i == 0 || k == 0 { "th" } else { "td" };
+                    format!("<{tag}>{}</{tag}>", escape(c))
+                };
+                let cells: String = line.iter().enumerate().map(cell).collect();
                 let _ = write!(out, "<tr>{cells}</tr>");
             }
-            out + "</table>"
+            out + "</table></div>"
         };
         let mut out = format!(
             "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><link rel=\"icon\" href=\"data:,\">\
-             <title>experiment · tiface</title><style>\n{}\n.row img {{ max-height: 16rem; margin: 0 .5rem .5rem 0 }}\n\
-             </style></head><body>\n<h1>The paper's experiment</h1><p>{}</p>\n",
+             <title>experiment · tiface</title><style>\n{}\n.wide {{ overflow-x: auto }}\n.wide th {{ white-space: normal; \
+             vertical-align: bottom; font-weight: 500 }}\n.wide th:first-child {{ min-width: 12rem }}\n\
+             .rows {{ display: flex; flex-wrap: wrap; gap: 1rem; margin-top: 1rem }}\n.rows figure {{ margin: 0; \
+             max-width: 12rem }}\n.rows img {{ max-width: 100%; max-height: 14rem }}\n</style></head><body>\n<h1>The paper's experiment</h1><p>{}</p>\n",
             STYLE,
             escape(&self.about())
         );
         for (word, title) in &self.tables {
             let _ = writeln!(out, "<h2>{}</h2>{}", escape(title), table(&self.cells(word)));
-            for (row, measured) in self.rows.iter().zip(&self.measured).filter(|(r, _)| r.table == *word) {
-                let pictures: String = (self.captures.iter().zip(measured))
-                    .filter_map(|(capture, m)| {
-                        let address = escape(&link(m.picture.as_ref()?));
+            // a line of pictures for each capture: rows are compared on one photograph
+            for (k, capture) in self.captures.iter().enumerate() {
+                let rows = self.rows.iter().zip(&self.measured).filter(|(row, _)| row.table == *word);
+                let pictures: String = rows
+                    .filter_map(|(row, measured)| {
+                        let address = escape(&link(measured.get(k)?.picture.as_ref()?));
+                        let (capture, title) = (escape(capture), escape(row.title));
                         Some(format!(
-                            "<img src=\"{address}\" alt=\"{} {}\">",
-                            escape(capture),
-                            escape(row.title)
+                            "<figure><img src=\"{address}\" alt=\"{capture} {title}\"><figcaption>{capture}: \
+                             {title}</figcaption></figure>"
                         ))
                     })
                     .collect();
                 if !pictures.is_empty() {
-                    let _ =
-                        writeln!(out, "<h3>{}</h3><div class=\"row\">{pictures}</div>", escape(row.title));
+                    let _ = writeln!(out, "<div class=\"rows\">{pictures}</div>");
                 }
             }
         }
         let _ = writeln!(out, "<h2>Orderings</h2>{}", table(&self.verdicts()));
-        for problem in self.problems() {
+        let problems = self.problems();
+        if !problems.is_empty() {
+            out += "<h2>What is missing</h2>\n";
+        }
+        for problem in problems {
             let _ = writeln!(out, "<p>{}</p>", escape(&problem));
         }
         out + "</body></html>\n"

@@ -10,12 +10,14 @@ pub(super) const I64: i32 = 7;
 
 /// What a file is named for: the setting that names it, and the words for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::mask::networks) struct Role(pub(super) &'static str, pub(super) &'static str);
+pub(crate) struct Role(pub(super) &'static str, pub(super) &'static str);
 
 impl Role {
     pub const SAM: Role = Role("sam", "the SAM encoder");
     pub const SAM_DECODER: Role = Role("sam_decoder", "the SAM decoder");
     pub const VITMATTE: Role = Role("vitmatte", "the ViTMatte network");
+    pub const ALPHA: Role = Role("alpha_net", "the network for alphas");
+    pub const LPIPS: Role = Role("lpips", "the network for LPIPS");
 }
 
 /// The form of a network: how it is fed and what it answers.
@@ -37,6 +39,10 @@ pub enum Contract {
     OriginalDecoder,
     /// ViTMatte.
     VitMatte,
+    /// Any network from a picture to its alpha.
+    Alpha,
+    /// A network that says how far two pictures are apart.
+    Lpips,
 }
 
 struct Form {
@@ -45,6 +51,7 @@ struct Form {
     name: &'static str,
     /// Name ("" for any), numbers and extents (0 for any) of each input.
     inputs: &'static [(&'static str, i32, &'static [usize])],
+    /// None by name: the first output is asked for, whatever it is called.
     outputs: &'static [&'static str],
 }
 
@@ -75,6 +82,10 @@ const FORMS: &[Form] = &[
     Form { contract: Contract::OriginalEncoder { picture: false }, role: Role::SAM,
         name: "SAM encoder (original form, takes normalized numbers)",
         inputs: &[("", F32, &[1, 3, 0, 0])], outputs: &["image_embeddings"] },
+    Form { contract: Contract::Alpha, role: Role::ALPHA, name: "network for alphas",
+        inputs: &[("", F32, &[0, 3, 0, 0])], outputs: &[] },
+    Form { contract: Contract::Lpips, role: Role::LPIPS, name: "network for LPIPS",
+        inputs: &[("", F32, &[0, 3, 0, 0]), ("", F32, &[0, 3, 0, 0])], outputs: &[] },
 ];
 
 impl Contract {
@@ -87,9 +98,12 @@ impl Contract {
         self.form().role
     }
 
-    /// The outputs that are asked for, in order.
-    pub(in crate::mask::networks) fn outputs(self) -> &'static [&'static str] {
-        self.form().outputs
+    /// The outputs that are asked for of a file that has these, in order.
+    pub(super) fn outputs(self, given: &[Port]) -> Vec<String> {
+        match self.form().outputs {
+            [] => given.iter().take(1).map(|port| port.name.clone()).collect(),
+            named => named.iter().map(|name| name.to_string()).collect(),
+        }
     }
 }
 
@@ -145,7 +159,15 @@ pub(super) fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
 pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, String> {
     let mut near = None;
     let gives = |name: &&str| outputs.iter().any(|p| p.name == **name);
-    for form in FORMS.iter().filter(|f| f.outputs.iter().all(gives)) {
+    // one that is called anything is told by its extents
+    let fits = |form: &&Form| match (form.contract, outputs.first().map(|port| &port.dims)) {
+        (_, None) => false,
+        (Contract::Alpha, Some(Some(dims))) => {
+            dims.len() > 2 && dims[..dims.len() - 2].iter().all(|d| d.is_none_or(|d| d == 1))
+        }
+        _ => form.outputs.iter().all(gives),
+    };
+    for form in FORMS.iter().filter(fits) {
         match misfit(inputs, form.inputs) {
             None => return Ok(form.contract),
             Some(why) => near = near.or(Some(why)),
@@ -160,8 +182,9 @@ pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, S
 
 /// What keeps these from being exactly the inputs wanted.
 fn misfit(inputs: &[Port], wanted: &[(&str, i32, &[usize])]) -> Option<String> {
-    for (name, kind, extents) in wanted {
-        let Some(port) = inputs.iter().find(|p| p.name == *name || name.is_empty()) else {
+    for (i, (name, kind, extents)) in wanted.iter().enumerate() {
+        let any = inputs.get(i).filter(|_| name.is_empty());
+        let Some(port) = any.or_else(|| inputs.iter().find(|p| p.name == *name)) else {
             return Some(format!("it lacks the input `{name}`"));
         };
         let (name, kinds) = (&port.name, pb::tensor_proto::DataType::try_from(port.kind));
@@ -212,6 +235,19 @@ mod tests {
         assert!(recognized(half, &["alphas"]).unwrap_err().contains("float16"));
         let more = vec![port("pixel_values", F32, &[0, 4, 0, 0]), port("style", F32, &[1])];
         assert!(recognized(more, &["alphas"]).unwrap_err().contains("`style`"));
+    }
+
+    #[test]
+    fn what_gives_one_picture_for_one_is_an_alpha_network_and_for_two_a_measure() {
+        let picture = || port("any name", F32, &[0, 3, 0, 0]);
+        let of = |inputs: Vec<Port>, output: &[usize]| recognize(&inputs, &[port("y", F32, output)]);
+        assert_eq!(of(vec![picture()], &[1, 1, 64, 64]), Ok(Contract::Alpha));
+        assert_eq!(of(vec![picture()], &[0, 0, 0]), Ok(Contract::Alpha));
+        assert!(of(vec![picture()], &[1, 2, 64, 64]).is_err() && of(vec![picture()], &[1, 1000]).is_err());
+        assert_eq!(of(vec![picture(), picture()], &[1, 1, 1, 1]), Ok(Contract::Lpips));
+        assert!(of(vec![picture(), port("z", F32, &[0, 4, 0, 0])], &[1]).unwrap_err().contains("`z`"));
+        let more = [port("first", F32, &[1, 1, 8, 8]), port("side", F32, &[1, 1, 8, 8])];
+        assert_eq!(Contract::Alpha.outputs(&more), ["first"]);
     }
 
     #[test]

@@ -31,7 +31,7 @@ impl TractModel {
     /// ones. `outputs`: those that will be asked for. `array_bytes`: bytes of the largest array that may be planned.
     pub(super) fn load(
         proto: &pb::ModelProto,
-        outputs: &[&str],
+        outputs: &[String],
         array_bytes: u64,
     ) -> Result<TractModel, String> {
         let read = || -> TractResult<InferenceModel> {
@@ -39,7 +39,8 @@ impl TractModel {
             let mut parsed = onnx.model_for_proto_model(proto)?;
             let named = proto.graph.iter().flat_map(|g| &g.output).zip(&parsed.outputs);
             let named: HashMap<&str, OutletId> = named.map(|(port, at)| (port.name.as_str(), *at)).collect();
-            let wanted: Vec<OutletId> = outputs.iter().filter_map(|name| named.get(name).copied()).collect();
+            let wanted: Vec<OutletId> =
+                outputs.iter().filter_map(|name| named.get(name.as_str()).copied()).collect();
             parsed.select_output_outlets(&wanted)?;
             Ok(parsed)
         };

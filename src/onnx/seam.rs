@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 /// A file that was loaded, for the record of a run.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
 pub struct NetworkFile {
-    /// "sam", "sam_decoder", "vitmatte" or "onnxruntime": the name of the setting that named it.
+    /// "sam", "sam_decoder", "vitmatte", "alpha_net", "lpips" or "onnxruntime": the name of the setting that named it.
     pub role: &'static str,
     /// The file as named.
     pub path: PathBuf,
@@ -53,7 +53,7 @@ impl Display for NetworkFile {
 
 /// An array a network takes or gives, row-major.
 #[derive(Clone, Debug, PartialEq)]
-pub(in crate::mask::networks) struct NetworkArray {
+pub(crate) struct NetworkArray {
     /// Extents.
     pub shape: Vec<usize>,
     /// As many values as the extents' product; whole numbers where the network takes integers.
@@ -61,7 +61,7 @@ pub(in crate::mask::networks) struct NetworkArray {
 }
 
 impl NetworkArray {
-    pub(in crate::mask::networks) fn new(shape: &[usize], values: Vec<f32>) -> NetworkArray {
+    pub(crate) fn new(shape: &[usize], values: Vec<f32>) -> NetworkArray {
         debug_assert_eq!(shape.iter().product::<usize>(), values.len());
         NetworkArray { shape: shape.to_vec(), values }
     }
@@ -97,6 +97,6 @@ pub(super) fn one_line(said: &str) -> String {
 }
 
 /// The error for a file that is not what it was named for.
-pub(in crate::mask::networks) fn file_error(path: &Path, problem: &str, hint: impl Into<String>) -> Error {
+pub(crate) fn file_error(path: &Path, problem: &str, hint: impl Into<String>) -> Error {
     Error::cannot(format!("`{}` {problem}", path.display()), hint)
 }

@@ -17,10 +17,10 @@ mod ort;
 mod seam;
 mod tract;
 
-pub(super) use self::contract::{Contract, Role};
-pub(super) use self::ort::Runtime;
+pub(crate) use self::contract::{Contract, Role};
+pub(crate) use self::ort::Runtime;
 pub use self::seam::NetworkFile;
-pub(super) use self::seam::{NetworkArray, file_error};
+pub(crate) use self::seam::{NetworkArray, file_error};
 
 use self::contract::{Port, in_words};
 use self::seam::{guarded, one_line};
@@ -33,7 +33,7 @@ use tract_onnx::prelude::Framework;
 const MOST_FILE_BYTES: u64 = 2 << 30;
 
 /// What runs networks, and within which bounds.
-pub(super) struct Engines {
+pub(crate) struct Engines {
     /// ONNX Runtime; without it tract runs the files.
     pub runtime: Option<Runtime>,
     /// Bytes of the largest single array that tract may plan.
@@ -48,19 +48,21 @@ enum Engine {
 }
 
 /// A network ready to run.
-pub(super) struct NetworkSession {
+pub(crate) struct NetworkSession {
     /// Its file.
     pub file: NetworkFile,
     /// What it takes, in the file's order.
     pub inputs: Vec<Port>,
     /// Which network it is.
     pub contract: Contract,
+    /// The outputs that are asked for.
+    outputs: Vec<String>,
     engine: Engine,
 }
 
 impl NetworkSession {
     /// Reads, recognizes and loads a file, which must be of a form of this role.
-    pub(super) fn open(role: Role, path: &Path, engines: &Engines) -> Result<NetworkSession> {
+    pub(crate) fn open(role: Role, path: &Path, engines: &Engines) -> Result<NetworkSession> {
         let bytes = io::read_bytes(path, &Limits { file_bytes: MOST_FILE_BYTES, ..Limits::default() })?;
         if names_another_file(&bytes) {
             return Err(file_error(
@@ -84,9 +86,9 @@ impl NetworkSession {
         let contract = contract::recognize(&inputs, &outputs).map_err(|why| {
             file_error(
                 path,
-                &format!("is no SAM or ViTMatte network: {}", one_line(&why)),
-                "give a SAM encoder and its decoder, or a ViTMatte network, exported with transformers or by SAM's \
-                 own script",
+                &format!("is no network that is known: {}", one_line(&why)),
+                "give a SAM encoder and its decoder, a ViTMatte network, or one that takes a picture and gives its \
+                 alpha, exported with transformers or by its publisher's own script",
             )
         })?;
         let Role(key, named) = role;
@@ -94,27 +96,27 @@ impl NetworkSession {
             let hint = format!("give the file where a {contract} is asked for");
             return Err(file_error(path, &format!("is a {contract}, but was given as {named}"), hint));
         }
-        let outputs = contract.outputs();
+        let outputs = contract.outputs(&outputs);
         let engine = match &engines.runtime {
-            None => guarded(|| tract::TractModel::load(&proto, outputs, engines.array_bytes))
+            None => guarded(|| tract::TractModel::load(&proto, &outputs, engines.array_bytes))
                 .map(|model| Engine::Tract(Box::new(model))),
             Some(runtime) => {
-                guarded(|| ort::OrtModel::load(runtime, &bytes, outputs, engines.threads)).map(Engine::Ort)
+                guarded(|| ort::OrtModel::load(runtime, &bytes, &outputs, engines.threads)).map(Engine::Ort)
             }
         };
         let engine = engine.map_err(|e| engine_error(path, engines.runtime.is_some(), "load", &e))?;
         let name = if engines.runtime.is_some() { ort::NAME } else { tract::NAME };
         let file = NetworkFile::new(key, path, &bytes, contract, name);
-        Ok(NetworkSession { file, inputs, contract, engine })
+        Ok(NetworkSession { file, inputs, contract, outputs, engine })
     }
 
     /// Does one run at a time use all threads? tract runs several side by side, each on one thread.
-    pub(super) fn runs_alone(&self) -> bool {
+    pub(crate) fn runs_alone(&self) -> bool {
         matches!(self.engine, Engine::Ort(_))
     }
 
     /// Feeds the inputs by name; gives the outputs of its form, every number of them finite.
-    pub(super) fn run(&self, inputs: &[(&str, NetworkArray)]) -> Result<Vec<NetworkArray>> {
+    pub(crate) fn run(&self, inputs: &[(&str, NetworkArray)]) -> Result<Vec<NetworkArray>> {
         let run = || {
             let mut fed = Vec::new();
             for port in &self.inputs {
@@ -127,11 +129,10 @@ impl NetworkSession {
             }
         };
         let given = guarded(run).map_err(|e| engine_error(&self.file.path, self.runs_alone(), "run", &e))?;
-        let names = self.contract.outputs();
-        if given.len() != names.len() {
-            return Err(self.unusable(names[0], "the engine left outputs out"));
+        if given.len() != self.outputs.len() {
+            return Err(self.unusable(&self.outputs[0], "the engine left outputs out"));
         }
-        for (name, output) in names.iter().zip(&given) {
+        for (name, output) in self.outputs.iter().zip(&given) {
             if output.shape.iter().product::<usize>() != output.values.len() {
                 return Err(self.unusable(name, "its numbers do not fill its extents"));
             }
@@ -144,24 +145,35 @@ impl NetworkSession {
     }
 
     /// Checks the extents of an output, `None` where any will do.
-    pub(super) fn expect(&self, output: usize, found: &NetworkArray, dims: &[Option<usize>]) -> Result<()> {
+    pub(crate) fn expect(&self, output: usize, found: &NetworkArray, dims: &[Option<usize>]) -> Result<()> {
         let fits =
             |(found, expected): (&usize, &Option<usize>)| *found > 0 && expected.is_none_or(|e| e == *found);
         if found.shape.len() == dims.len() && found.shape.iter().zip(dims).all(fits) {
             return Ok(());
         }
         let problem = format!("it is {:?}, expected {}", found.shape, in_words(dims.iter().copied()));
-        Err(self.unusable(self.contract.outputs()[output], problem))
+        Err(self.unusable(&self.outputs[output], problem))
     }
 
     /// The output is not as its form promises.
-    pub(super) fn unusable(&self, output: &str, problem: impl std::fmt::Display) -> Error {
+    pub(crate) fn unusable(&self, output: &str, problem: impl std::fmt::Display) -> Error {
         let hint = "take the network's file from its publisher again; its weights or its graph are damaged";
         file_error(&self.file.path, &format!("gave an unusable `{output}`: {problem}"), hint)
     }
 
+    /// Checks that the first output is one picture, and returns its width and height.
+    pub(crate) fn one_picture(&self, found: &NetworkArray) -> Result<(usize, usize)> {
+        match found.shape[..] {
+            [.., height, width] if width > 0 && width * height == found.values.len() => Ok((width, height)),
+            _ => {
+                let problem = format!("it is {:?}, expected [1, 1, height, width]", found.shape);
+                Err(self.unusable(&self.outputs[0], problem))
+            }
+        }
+    }
+
     /// Extent of one axis of an input, where the file fixes it.
-    pub(super) fn input_extent(&self, name: &str, axis: usize) -> Option<usize> {
+    pub(crate) fn input_extent(&self, name: &str, axis: usize) -> Option<usize> {
         self.inputs.iter().find(|p| p.name == name)?.extent(axis)
     }
 }
@@ -188,4 +200,4 @@ fn engine_error(path: &Path, runtime: bool, doing: &str, problem: &str) -> Error
 }
 
 #[cfg(test)]
-pub(super) mod tests;
+pub(crate) mod tests;

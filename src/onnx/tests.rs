@@ -8,10 +8,10 @@ use crate::mask::networks::Networks;
 use std::fs;
 use std::path::PathBuf;
 
-pub(in crate::mask::networks) mod made;
+pub(crate) mod made;
 
 /// The shared data, where it is.
-pub(in crate::mask) fn shared(folder: &str) -> Option<PathBuf> {
+pub(crate) fn shared(folder: &str) -> Option<PathBuf> {
     let root = std::env::var_os("TIFACE_SHARED")
         .map(PathBuf::from)
         .unwrap_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared")));
@@ -24,7 +24,7 @@ pub(in crate::mask) fn shared(folder: &str) -> Option<PathBuf> {
 }
 
 /// The ONNX Runtime library the environment names.
-pub(in crate::mask) fn onnxruntime() -> Option<PathBuf> {
+pub(crate) fn onnxruntime() -> Option<PathBuf> {
     let named = std::env::var_os("TIFACE_ONNXRUNTIME").map(PathBuf::from);
     if named.is_none() {
         eprintln!("skipped: ONNX Runtime, TIFACE_ONNXRUNTIME names no library");
@@ -33,12 +33,12 @@ pub(in crate::mask) fn onnxruntime() -> Option<PathBuf> {
 }
 
 /// Both engines, or the one there is.
-pub(in crate::mask) fn engines() -> Vec<Option<PathBuf>> {
+pub(crate) fn engines() -> Vec<Option<PathBuf>> {
     std::iter::once(None).chain(onnxruntime().map(Some)).collect()
 }
 
 /// A configuration that names nothing, or the library.
-pub(in crate::mask::networks) fn config(onnxruntime: &Option<PathBuf>) -> MaskConfig {
+pub(crate) fn config(onnxruntime: &Option<PathBuf>) -> MaskConfig {
     let named = |path: &PathBuf| path.to_str().unwrap().to_owned();
     let onnxruntime = onnxruntime.as_ref().map_or(String::new(), named);
     MaskConfig { onnxruntime, ..MaskConfig::preset(Preset::Standard) }
@@ -87,7 +87,7 @@ fn reason(error: &Error) -> Option<&'static str> {
     let reasons = [
         "is not a sound ONNX file",
         "is refused: its weights lie in another file",
-        "is no SAM or ViTMatte network",
+        "is no network that is known",
         ", but was given as the ViTMatte network",
         " cannot load `",
         " cannot run `",
@@ -389,7 +389,5 @@ fn a_file_that_is_no_library_is_refused_with_a_fix() {
 #[test]
 fn the_engine_recorded_is_the_one_the_manifest_pins() {
     let version = tract::NAME.strip_prefix("tract ").unwrap();
-    assert!(
-        include_str!("../../../../Cargo.toml").contains(&format!("tract-onnx = {{ version = \"={version}\""))
-    );
+    assert!(include_str!("../../Cargo.toml").contains(&format!("tract-onnx = {{ version = \"={version}\"")));
 }

@@ -74,7 +74,7 @@ impl Runtime {
 pub(super) struct OrtModel {
     // its bindings allow one run at a time; the run itself spreads over the threads
     session: Mutex<ort::session::Session>,
-    outputs: &'static [&'static str],
+    outputs: Vec<String>,
 }
 
 impl OrtModel {
@@ -82,7 +82,7 @@ impl OrtModel {
     pub(super) fn load(
         runtime: &Runtime,
         bytes: &[u8],
-        outputs: &'static [&'static str],
+        outputs: &[String],
         threads: usize,
     ) -> Result<OrtModel, String> {
         let session = || -> Result<ort::session::Session, ort::Error> {
@@ -93,7 +93,7 @@ impl OrtModel {
             builder.commit_from_memory(bytes)
         };
         let session = Mutex::new(session().map_err(|e| e.to_string())?);
-        Ok(OrtModel { session, outputs })
+        Ok(OrtModel { session, outputs: outputs.to_vec() })
     }
 
     /// One run.
@@ -108,11 +108,11 @@ impl OrtModel {
                 };
                 inputs.push((&port.name, value));
             }
-            let wanted = self.outputs.iter().fold(OutputSelector::no_default(), |o, name| o.with(*name));
+            let wanted = self.outputs.iter().fold(OutputSelector::no_default(), |o, name| o.with(name));
             let options = RunOptions::new()?.with_outputs(wanted);
             let given = session.run_with_options(inputs, &options)?;
             let mut found = Vec::new();
-            for value in self.outputs.iter().filter_map(|name| given.get(name)) {
+            for value in self.outputs.iter().filter_map(|name| given.get(name.as_str())) {
                 let (shape, values) = value.try_extract_tensor::<f32>()?;
                 let shape = shape.iter().map(|&d| usize::try_from(d).unwrap_or(0)).collect();
                 found.push(NetworkArray { shape, values: values.to_vec() });

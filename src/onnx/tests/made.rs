@@ -73,7 +73,7 @@ pub(crate) fn integers(name: &str, values: &[i64]) -> Message {
 pub(crate) fn node(op: &str, inputs: &[&str], outputs: &[&str], attributes: &[Message]) -> Message {
     let m = inputs.iter().fold(Message::new(), |m, name| m.text(1, name));
     let m = outputs.iter().fold(m, |m, name| m.text(2, name));
-    m.text(3, &format!("the_{}", op.to_lowercase())).text(4, op).messages(5, attributes)
+    m.text(3, &format!("{}_{}", op.to_lowercase(), outputs.join("_"))).text(4, op).messages(5, attributes)
 }
 
 /// One integer without axes.
