@@ -91,7 +91,8 @@ pub(super) fn finish(
 
     let front = export.front(center(surface, &world_from_scene));
     let front = front.map(|d| scene.scene_from_world.direction(d));
-    let config = AtlasConfig { size_px: c.texture_px, gutter_px: c.gutter_px, front };
+    let up = front.map(|_| scene.scene_from_world.direction(export.up.normalize_or(Vec3::Y)));
+    let config = AtlasConfig { size_px: c.texture_px, gutter_px: c.gutter_px, front, up };
     let (layout, done) = atlas(&mesh, &config, monitor)?;
     warnings.extend(done.warnings());
     report.insert("atlas".into(), json!(done));

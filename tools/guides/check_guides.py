@@ -114,7 +114,8 @@ def run(guide, tiface, seen):
                         # what a person does in the browser in between
                         (folder / "prompts.json").write_text(json.dumps(clicks(folder / "captures/002_00")))
                     done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True)
-                    assert done.returncode == 0, f"{guide.name}: `{line}` ended with {done.returncode}\n{done.stdout}{done.stderr}"
+                    expected = re.search(r"# exit code (\d+)", line)
+                    assert done.returncode == int(expected[1] if expected else 0), f"{guide.name}: `{line}` ended with {done.returncode}\n{done.stdout}{done.stderr}"
                     count += 1
         else:
             assert kind in ("text", "yaml", "sh cluster"), f"{guide.name}: a block of `{kind}` is not tested"

@@ -11,6 +11,7 @@ use super::library::ChartSet;
 use super::pack::{ChartPose, pack};
 use super::patch::{neighbours, part};
 use super::planar::planar;
+use super::upright::upright;
 use crate::geom::{Atlas, Mesh, THOROUGH, overlaps, turn};
 use crate::{Error, Monitor, Result};
 use glam::{DVec2, Vec2};
@@ -73,7 +74,11 @@ pub(super) fn lay(
         let leg = |t: u32| (2.0 * mesh.area(t)).sqrt().max(2.0 / scale);
         let halves = loose.iter().map(|&t| Flat::half_square(mesh, t, leg(t)));
         let all: Vec<Flat> = charts.iter().cloned().chain(halves).collect();
-        let places = pack(&all, size, f64::from(config.gutter_px), monitor)?;
+        let stands = match config.front.zip(config.up) {
+            Some((front, up)) => upright(mesh, &all, front, up),
+            None => vec![None; all.len()],
+        };
+        let places = pack(&all, &stands, size, f64::from(config.gutter_px), monitor)?;
         let atlas = placed(mesh, &all, &places, config);
         bad = faults(&atlas);
         if !bad.contains(&true) {

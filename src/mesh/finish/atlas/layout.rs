@@ -19,11 +19,13 @@ pub struct AtlasConfig {
     /// Where the face looks, in the mesh's coordinates: what lies there becomes one chart, with seams around it
     /// and none across. That costs stretch: the nose is laid flat with the cheeks.
     pub front: Option<Vec3>,
+    /// Where up is there: what lies in front stands upright in the texture. With `front` alone.
+    pub up: Option<Vec3>,
 }
 
 impl Default for AtlasConfig {
     fn default() -> AtlasConfig {
-        AtlasConfig { size_px: 2048, gutter_px: 8, front: None }
+        AtlasConfig { size_px: 2048, gutter_px: 8, front: None, up: None }
     }
 }
 
@@ -38,7 +40,9 @@ impl AtlasConfig {
             self.gutter_px,
         )?;
         let front = self.front.unwrap_or(Vec3::Z);
-        setting(front.is_finite() && front != Vec3::ZERO, "AtlasConfig::front", "a direction", front)
+        setting(front.is_finite() && front != Vec3::ZERO, "AtlasConfig::front", "a direction", front)?;
+        let up = self.up.unwrap_or(Vec3::Z);
+        setting(up.is_finite() && up != Vec3::ZERO, "AtlasConfig::up", "a direction", up)
     }
 }
 

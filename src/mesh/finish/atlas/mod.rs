@@ -21,6 +21,7 @@ mod raster;
 mod relax;
 mod smooth;
 mod squares;
+mod upright;
 
 pub use layout::AtlasConfig;
 
@@ -86,7 +87,7 @@ impl AtlasReport {
 ///     ],
 ///     ..Mesh::default()
 /// };
-/// let config = AtlasConfig { size_px: 128, gutter_px: 2, front: None };
+/// let config = AtlasConfig { size_px: 128, gutter_px: 2, ..AtlasConfig::default() };
 /// let (atlas, report) = atlas(&mesh, &config, &tiface::Quiet)?;
 /// assert_eq!(atlas.triangles.len(), 8);
 /// assert!(report.uv.is_sound() && report.uv.overlapping == 0);

@@ -50,9 +50,11 @@ struct TurnedMask {
 /// Which chart goes where: turn, column and row of each.
 type CellPlaces = Vec<(usize, usize, usize)>;
 
-/// Places charts in a square texture: twice the gutter between any two of them and to the border.
+/// Places charts in a square texture: twice the gutter between any two of them and to the border. Where `stands` says
+/// where up is in a chart, it is turned to the texture's up and no other way.
 pub(super) fn pack(
     charts: &[Flat],
+    stands: &[Option<DVec2>],
     size_px: f64,
     gutter_px: f64,
     monitor: &dyn Monitor,
@@ -86,7 +88,7 @@ pub(super) fn pack(
         // The first time with the gutter that the widest needs, then with that of the size found.
         for _ in 0..2 {
             let reach = gutter_px * most as f64 / room;
-            let drawn = draw(&outlines, scale, reach, turns);
+            let drawn = draw(&outlines, stands, scale, reach, turns);
             match smallest(&drawn, &mut order, start, most, monitor)? {
                 Some((side, layout)) => {
                     (most, start) = (side, side);
@@ -116,14 +118,25 @@ fn bounds(outline: &[[DVec2; 2]], turn: DVec2) -> (DVec2, DVec2) {
 }
 
 /// Each chart in each direction, `scale` cells a unit.
-fn draw(outlines: &[Vec<[DVec2; 2]>], scale: f64, reach: f64, turns: usize) -> Vec<Vec<TurnedMask>> {
-    let drawn = |outline: &[[DVec2; 2]], k: usize| {
-        let turn = DVec2::from_angle(std::f64::consts::TAU * k as f64 / turns as f64);
+fn draw(
+    outlines: &[Vec<[DVec2; 2]>],
+    stands: &[Option<DVec2>],
+    scale: f64,
+    reach: f64,
+    turns: usize,
+) -> Vec<Vec<TurnedMask>> {
+    let drawn = |outline: &[[DVec2; 2]], turn: DVec2| {
         let (low, high) = bounds(outline, turn);
         let sides: Vec<_> = outline.iter().map(|s| s.map(|p| (turn.rotate(p) - low) * scale)).collect();
         TurnedMask { mask: Mask::of(&sides, (high - low) * scale, reach), turn, low }
     };
-    outlines.par_iter().map(|outline| (0..turns).map(|k| drawn(outline, k)).collect()).collect()
+    let every = |k: usize| DVec2::from_angle(std::f64::consts::TAU * k as f64 / turns as f64);
+    let one = |(outline, stands): (&Vec<[DVec2; 2]>, &Option<DVec2>)| match stands {
+        // as complex numbers, the turn that brings `up` to i
+        Some(up) => vec![drawn(outline, DVec2::new(up.y, up.x))],
+        None => (0..turns).map(|k| drawn(outline, every(k))).collect(),
+    };
+    outlines.par_iter().zip(stands).map(one).collect()
 }
 
 /// The smallest side found at which everything fits, from `start` on, at most `most`; `order` becomes the one that
@@ -216,7 +229,7 @@ mod tests {
     #[test]
     fn a_square_fills_the_texture_but_for_two_gutters() {
         let chart = rectangle(3.0, 3.0);
-        let places = pack(std::slice::from_ref(&chart), 256.0, 8.0, &Quiet).unwrap();
+        let places = pack(std::slice::from_ref(&chart), &[None], 256.0, 8.0, &Quiet).unwrap();
         let p = corners(&chart, &places[0]);
         let low = p.iter().fold(DVec2::INFINITY, |m, p| m.min(*p));
         let high = p.iter().fold(DVec2::NEG_INFINITY, |m, p| m.max(*p));
@@ -229,12 +242,12 @@ mod tests {
     fn four_strips_lie_side_by_side_at_one_scale() {
         // 4 × 1 each: together a square
         let charts = vec![rectangle(4.0, 1.0); 4];
-        let places = pack(&charts, 512.0, 4.0, &Quiet).unwrap();
+        let places = pack(&charts, &[None; 4], 512.0, 4.0, &Quiet).unwrap();
         let scale = places[0].scale;
         assert!(places.iter().all(|p| p.scale == scale));
         // (512 − 16) / 4 = 124 if side by side along their length; across (512 − 16 − 3 · 8) / 4 = 118
         assert!((112.0..118.1).contains(&scale), "{scale}");
-        assert!(pack(&charts, 512.0, 4.0, &Stopping).unwrap_err().kind().is_stop());
-        assert!(pack(&charts, 16.0, 8.0, &Quiet).unwrap_err().to_string().contains("do not fit"));
+        assert!(pack(&charts, &[None; 4], 512.0, 4.0, &Stopping).unwrap_err().kind().is_stop());
+        assert!(pack(&charts, &[None; 4], 16.0, 8.0, &Quiet).unwrap_err().to_string().contains("do not fit"));
     }
 }

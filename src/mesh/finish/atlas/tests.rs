@@ -8,7 +8,7 @@ use std::f32::consts::{PI, TAU};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 fn config(size_px: u32) -> AtlasConfig {
-    AtlasConfig { size_px, gutter_px: 4, front: None }
+    AtlasConfig { size_px, gutter_px: 4, ..AtlasConfig::default() }
 }
 
 /// A sphere of rings and a pole at each end.
@@ -173,7 +173,7 @@ fn a_mesh_that_cannot_be_textured_is_a_named_error_with_a_hint() {
         ),
         (error(&index, &config(512)), "triangle 7 names vertex 999"),
         (
-            error(&sphere(60, 60), &AtlasConfig { size_px: 32, gutter_px: 4, front: None }),
+            error(&sphere(60, 60), &AtlasConfig { size_px: 32, gutter_px: 4, ..AtlasConfig::default() }),
             "texture of 32 × 32",
         ),
     ];
@@ -251,6 +251,24 @@ fn one_thread_and_two_make_the_same_bytes() {
         pool.install(|| laid(&mesh, &AtlasConfig { front: Some(Vec3::Z), ..config(512) }).0)
     };
     assert_eq!(with(1), with(2));
+}
+
+#[test]
+fn the_face_stands_upright_in_the_texture() {
+    let mesh = sphere(60, 90);
+    for up in [Vec3::Y, Vec3::X, Vec3::new(1.0, -2.0, 0.0).normalize()] {
+        let front = AtlasConfig { front: Some(Vec3::Z), up: Some(up), ..config(512) };
+        let (atlas, report) = laid(&mesh, &front);
+        assert!(report.fallback.is_none());
+        // two points of the face, one above the other: v runs down
+        let at = |p: Vec3| {
+            let near = |t: &usize| mesh.corners(*t as u32).iter().map(|q| q.distance(p)).sum::<f32>();
+            let t = (0..mesh.triangles.len()).min_by(|a, b| near(a).total_cmp(&near(b))).unwrap();
+            atlas.triangles[t].map(|i| atlas.uvs[i as usize]).iter().sum::<glam::Vec2>() / 3.0
+        };
+        let step = at((Vec3::Z + 0.2 * up).normalize()) - at((Vec3::Z - 0.2 * up).normalize());
+        assert!(step.y < 0.0 && step.x.abs() < 0.15 * -step.y, "{up}: {step}");
+    }
 }
 
 /// A bumpy ball of 200,000 triangles.

@@ -101,7 +101,7 @@ const BATCH: usize = 1 << 17;
 ///     ],
 ///     ..Mesh::default()
 /// };
-/// let (atlas, _) = atlas(&mesh, &AtlasConfig { size_px: 64, gutter_px: 2, front: None }, &tiface::Quiet)?;
+/// let (atlas, _) = atlas(&mesh, &AtlasConfig { size_px: 64, gutter_px: 2, ..AtlasConfig::default() }, &tiface::Quiet)?;
 /// // a ball that shows sRGB-coded 0.5 from everywhere
 /// let gradient = |points: &[Vec3]| points.iter().map(|p| (p.length() - 1.0, p.normalize_or_zero())).unzip();
 /// let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]| vec![[0.5; 3]; directions.len()];
