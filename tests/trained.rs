@@ -101,7 +101,8 @@ fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
     eprintln!("resolution, mesh, triangles, crossing: {found:?}");
 }
 
-const FEW: [&str; 13] = [
+/// A few steps of everything.
+const FEW: [&str; 14] = [
     "device=cpu",
     "iface.steps=12",
     "iface.rays=128",
@@ -115,11 +116,12 @@ const FEW: [&str; 13] = [
     "tface.voxels_start=1000",
     "tface.voxels_final=2000",
     "tface.upsample_steps=4",
+    "tface.mask_steps=4",
 ];
 
-/// A stage or the line with a few steps of everything.
+/// Works on a stage or the line with these settings and `set`.
 fn few(folder: &Path, words: &[&str], set: &[&str]) {
-    let sets = FEW.iter().chain(&["tface.mask_steps=4"]).chain(set).flat_map(|s| ["--set", *s]);
+    let sets = FEW.iter().chain(set).flat_map(|s| ["--set", *s]);
     let words: Vec<&str> = words.iter().copied().chain(["--preset", "draft"]).chain(sets).collect();
     worked(&tiface(folder, &words));
 }
@@ -145,7 +147,7 @@ fn fox_written_as_colmap_and_read_again_trains_to_the_same_bytes() {
     let set = ["mask.source=none", "capture.downscale=8"];
     for (run, from) in [("own", fox.to_str().unwrap()), ("read", "written")] {
         few(dir.path(), &["iface", from, "-r", run], &set);
-        few(dir.path(), &["tface", run], &[]);
+        few(dir.path(), &["tface", from, "-r", run], &set);
     }
     for stage in ["iface", "tface"] {
         let of = |run: &str| checkpoint(&dir.path().join(run).join(stage).join("checkpoint.safetensors"));

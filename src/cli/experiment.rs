@@ -116,6 +116,10 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         let opened = match Line::open(&task.config, run) {
             Ok(opened) => opened,
             // what a capture lacks for one row, as masks, it does not lack for each
+            Err(e) if common.dry_run => {
+                print(&format!("{:<32} cannot be made: {e}\n", task.name))?;
+                continue;
+            }
             Err(e) => {
                 screen.note("experiment", &format!("{}: {e}", task.name));
                 failed.get_or_insert(e.within(&task.name));
@@ -179,6 +183,12 @@ fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> 
     }
     let capture = folder.join("captures/demo");
     if !io::is_file(&capture.join("transforms.json")) {
+        if invocation.common.dry_run {
+            return Err(Error::usage(
+                "the demo head is not photographed yet, so nothing can be said of its runs",
+                "repeat without --dry-run, or photograph it: `tiface demo --run FOLDER`",
+            ));
+        }
         photograph(&capture, &SyntheticOptions::default(), None, invocation)?;
     }
     Ok(capture)

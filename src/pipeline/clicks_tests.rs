@@ -194,6 +194,40 @@ fn networks_cut_and_soften_and_are_recorded() {
     assert_eq!(inputs, ["clicks", "sam", "sam_decoder", "vitmatte"]);
 }
 
+/// Every photograph painted bright where the head is, and a network that takes what is bright for it.
+#[cfg(feature = "matting")]
+#[test]
+fn a_network_masks_all_views_without_a_click() {
+    let dir = tempfile::tempdir().unwrap();
+    let (mut config, truth) = clicked(dir.path());
+    let capture = capture::open(Path::new(&config.capture.path), &CaptureOptions::default()).unwrap();
+    for (view, mask) in capture.views.iter().zip(&truth) {
+        let color = |(i, &m): (usize, &u8)| [if m >= 128 { 180 } else { 20 } + (i * 7919 % 13) as u8; 3];
+        let rgb: Vec<[u8; 3]> = mask.values.iter().enumerate().map(color).collect();
+        io::write_png_rgb(&view.photo, mask.width, mask.height, &rgb).unwrap();
+    }
+    // 0.73 and 0.1 of white: logits of 6.6 and -6
+    let file = dir.path().join("net.onnx");
+    std::fs::write(&file, crate::onnx::tests::made::brightness(96, 20.0, -8.0)).unwrap();
+    config.mask.prompts.clear();
+    (config.mask.alpha_net, config.mask.alpha_input) = (file.to_str().unwrap().into(), "96,0,1".into());
+    let run = run(dir.path(), "run");
+    let line = Line::open(&config, &run).unwrap();
+    let done = complete(&line, Stage::Mask, &NoFields).unwrap();
+    assert_eq!((&done.summary["masks"], &done.summary["made"]["clicked_views"]), (&10.into(), &0.into()));
+    assert_eq!(done.summary["made"]["networks"][0]["role"], "alpha_net");
+    assert_eq!(line.clicks.as_ref().unwrap().inputs.iter().map(|i| i.0).collect::<Vec<_>>(), ["alpha_net"]);
+    for (view, truth) in line.capture().views.iter().zip(&truth) {
+        let made = view.load_mask(&Limits::default()).unwrap().unwrap();
+        assert!(iou(&made, truth) > 0.95, "{}: {}", view.name, iou(&made, truth));
+    }
+    assert!(complete(&line, Stage::Mask, &NoFields).unwrap().skipped);
+    // a head's masks follow from what the network is shown, not from where it lies
+    config.mask.alpha_input = "96,0.1,1".into();
+    let other = complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
+    assert!(other.to_string().contains("mask.alpha_input"), "{other}");
+}
+
 /// What the clicks that come with a capture are worth, against its true masks.
 #[test]
 fn three_clicked_photographs_of_a_light_stage_mask_them_all() {

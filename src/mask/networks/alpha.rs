@@ -111,18 +111,6 @@ mod tests {
     use crate::onnx::tests::{config, engines, made};
     use std::fs;
 
-    /// A network that gives `weight · mean of the channels + bias`, and something of its training beside it.
-    fn brightness(side: i64, weight: f32, bias: f32) -> Vec<u8> {
-        use made::{floats, graph, model, node, port};
-        let weights = [floats("w", &[1, 3, 1, 1], &[weight / 3.0; 3]), floats("b", &[1], &[bias])];
-        let nodes = [
-            node("Conv", &["picture", "w", "b"], &["alpha"], &[]),
-            node("Identity", &["picture"], &["features"], &[]),
-        ];
-        let outputs = [port("alpha", 1, &[1, 1, side, side]), port("features", 1, &[1, 3, side, side])];
-        model(&graph(&nodes, &weights, &[port("picture", 1, &[1, 3, side, side])], &outputs))
-    }
-
     #[test]
     fn an_alpha_network_sees_a_square_and_its_logits_become_an_alpha() {
         let dir = tempfile::tempdir().unwrap();
@@ -136,7 +124,7 @@ mod tests {
             (10.0, 0.0, 254, 1),
         ] {
             let path = dir.path().join("net.onnx");
-            fs::write(&path, brightness(32, weight, bias)).unwrap();
+            fs::write(&path, made::brightness(32, weight, bias)).unwrap();
             for engine in engines() {
                 let config = MaskConfig {
                     alpha_net: path.to_str().unwrap().into(),
@@ -163,7 +151,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let open = |name: &str, input: &str| {
             let path = dir.path().join(name);
-            fs::write(&path, brightness(0, 1.0, 0.0)).unwrap();
+            fs::write(&path, made::brightness(0, 1.0, 0.0)).unwrap();
             let named = MaskConfig {
                 alpha_net: path.to_str().unwrap().into(),
                 alpha_input: input.into(),

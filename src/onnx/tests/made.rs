@@ -152,3 +152,14 @@ pub(crate) fn original_encoder(picture: bool, side: i64, depth: i64) -> Vec<u8> 
     let output = port("image_embeddings", 1, &[1, depth, side / 16, side / 16]);
     model(&graph(&nodes, &weights, &[port("input_image", 1, dims)], &[output]))
 }
+
+/// A network that gives `weight · mean of the channels + bias`, and something of its training beside it.
+pub(crate) fn brightness(side: i64, weight: f32, bias: f32) -> Vec<u8> {
+    let weights = [floats("w", &[1, 3, 1, 1], &[weight / 3.0; 3]), floats("b", &[1], &[bias])];
+    let nodes = [
+        node("Conv", &["picture", "w", "b"], &["alpha"], &[]),
+        node("Identity", &["picture"], &["features"], &[]),
+    ];
+    let outputs = [port("alpha", 1, &[1, 1, side, side]), port("features", 1, &[1, 3, side, side])];
+    model(&graph(&nodes, &weights, &[port("picture", 1, &[1, 3, side, side])], &outputs))
+}
