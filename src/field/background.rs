@@ -10,19 +10,37 @@ use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 /// Half edge of the window that collects background pixels, as a share of the picture's height.
 const WINDOW: f32 = 0.02;
 
-/// Colors over black for every pixel: the photograph where the mask is full, black where it is empty.
+/// The soft pixels of a photograph as they would be over black. All others show the photograph, or nothing.
+pub struct SoftPixels {
+    /// Which they are, rising.
+    at: Vec<u32>,
+    color: Vec<[u8; 3]>,
+}
+
+impl SoftPixels {
+    /// Returns what pixel `p` of the photograph shows over black: the photograph where the mask is full, black where it
+    /// is empty.
+    pub fn over_black(&self, photo: &Photo, mask: &Gray, p: usize) -> [u8; 3] {
+        match mask.values[p] {
+            0 => [0; 3],
+            255 => photo.rgb[p],
+            _ => self.at.binary_search(&(p as u32)).map_or([0; 3], |i| self.color[i]),
+        }
+    }
+}
+
+/// Takes the background's light out of the soft pixels.
 ///
 /// No channel exceeds the mask's alpha, so that color never asks for more than the mask's opacity.
-pub fn over_black(photo: &Photo, mask: &Gray) -> Vec<[u8; 3]> {
+pub fn soft_pixels(photo: &Photo, mask: &Gray) -> SoftPixels {
     let (w, h) = (photo.width as usize, photo.height as usize);
     let linear: [f32; 256] = std::array::from_fn(|i| linear_from_srgb(i as f32 / 255.0));
-    let soft: Vec<usize> = (0..w * h).filter(|&p| !matches!(mask.values[p], 0 | 255)).collect();
-    let mut out: Vec<[u8; 3]> =
-        photo.rgb.iter().zip(&mask.values).map(|(rgb, &a)| if a == 255 { *rgb } else { [0; 3] }).collect();
+    let at: Vec<u32> = (0..(w * h) as u32).filter(|&p| !matches!(mask.values[p as usize], 0 | 255)).collect();
     let reach = ((WINDOW * h as f32).ceil() as usize).max(2);
     // large photographs are looked at every few pixels: the background is smooth
     let stride = (reach / 16).max(1);
-    for p in soft {
+    let over_black = |&p: &u32| {
+        let p = p as usize;
         let (x, y) = (p % w, p / w);
         // nearer background pixels count more; a window without any leaves it black
         let (mut sum, mut weight) = ([0f32; 3], 0f32);
@@ -38,13 +56,14 @@ pub fn over_black(photo: &Photo, mask: &Gray) -> Vec<[u8; 3]> {
             }
         }
         let alpha = mask.values[p] as f32 / 255.0;
-        out[p] = std::array::from_fn(|c| {
+        std::array::from_fn(|c| {
             let background = if weight > 0.0 { sum[c] / weight } else { 0.0 };
             let head = linear[photo.rgb[p][c] as usize] - (1.0 - alpha) * background;
             quantize(srgb_from_linear(head.max(0.0)).min(alpha))
-        });
-    }
-    out
+        })
+    };
+    let color = at.iter().map(over_black).collect();
+    SoftPixels { at, color }
 }
 
 #[cfg(test)]
@@ -58,7 +77,9 @@ mod tests {
         let rgb = [0.5, 0.5, 0.35, 0.2, 0.2].map(|l| [coded(l); 3]).to_vec();
         let photo = Photo { width: 5, height: 1, rgb, alpha: None };
         let mask = Gray { width: 5, height: 1, values: vec![0, 0, 128, 255, 255] };
-        let out = over_black(&photo, &mask);
+        let soft = soft_pixels(&photo, &mask);
+        let out: Vec<[u8; 3]> = (0..5).map(|p| soft.over_black(&photo, &mask, p)).collect();
+        assert_eq!(soft.at, [2]);
         assert_eq!(out[0], [0; 3]);
         assert_eq!(out[3], photo.rgb[3]);
         // α F = 0.5 · 0.2 = 0.1 linear, coded 0.349
@@ -69,7 +90,6 @@ mod tests {
     fn a_lamp_behind_thin_hair_leaves_no_light() {
         let photo = Photo { width: 2, height: 1, rgb: vec![[255; 3], [240; 3]], alpha: None };
         let mask = Gray { width: 2, height: 1, values: vec![0, 40] };
-        let out = over_black(&photo, &mask);
-        assert!(out[1][0] <= 40);
+        assert!(soft_pixels(&photo, &mask).over_black(&photo, &mask, 1)[0] <= 40);
     }
 }

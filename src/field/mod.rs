@@ -10,6 +10,8 @@ mod background;
 pub mod checkpoint;
 #[cfg(feature = "wgpu")]
 pub mod devices;
+#[cfg(feature = "wgpu")]
+pub mod drawing;
 pub mod ops;
 pub mod parameters;
 pub mod pixels;

@@ -2,8 +2,12 @@
 //!
 //! A pixel farther from the mask than the visual hull's cells reach meets no sample and teaches
 //! nothing, so only the mask and a margin around it are drawn. Photographs stay 8 bit.
+//!
+//! Where pixels are finer than what the field resolves in the end, photographs are large: while the field is coarser
+//! still, a ray stands for a square of pixels, with their mean color through their middle, as if it were drawn from a
+//! level of the photograph's pyramid. Single pixels would show it noise.
 
-use super::background;
+use super::background::{SoftPixels, soft_pixels};
 use crate::config::iface::Foreground;
 use crate::geom::{Camera, Ray};
 use crate::image::{Gray, Photo};
@@ -36,11 +40,16 @@ pub struct Batch {
     pub alpha: Vec<f32>,
 }
 
+/// A ray, the color over black that its pixel shows, and the pixel's alpha.
+pub type Drawn = (MarchRay, [f32; 3], f32);
+
 /// The drawable pixels of all views.
 pub struct Pixels<'a> {
     views: &'a [TrainView],
-    /// Per view: what a render over black should show; empty for views without a mask.
-    over_black: Vec<Vec<[u8; 3]>>,
+    /// Per view: what a render over black should show; none where that is alpha times the photograph.
+    soft: Vec<Option<SoftPixels>>,
+    /// Per view: the width of a pixel at the scene's middle, scene units; infinite where photographs are not large.
+    pixel: Vec<f32>,
     /// Per view: inclusive box of drawable pixels and one bit per pixel.
     drawable: Vec<(u32, u32, u32, u32, Vec<u64>)>,
     /// Running count of drawable pixels.
@@ -78,13 +87,14 @@ impl<'a> Pixels<'a> {
         let usable = |v: &TrainView| v.mask.as_ref().is_some_and(|m| m.values.iter().any(|&a| a < 255));
         let masked = views.iter().any(usable);
         let reach = if published { f32::INFINITY } else { reach };
-        let over_black = views
+        let soft = views
             .par_iter()
             .map(|v| match (&v.mask, foreground) {
-                (Some(mask), Foreground::Estimated) => background::over_black(&v.photo, mask),
-                _ => Vec::new(),
+                (Some(mask), Foreground::Estimated) => Some(soft_pixels(&v.photo, mask)),
+                _ => None,
             })
             .collect();
+        let pixel = vec![f32::INFINITY; views.len()];
         let drawable: Vec<_> = views
             .par_iter()
             .map(|v| drawable(v, if masked && !usable(v) { Reach::Nothing } else { Reach::Within(reach) }))
@@ -97,7 +107,7 @@ impl<'a> Pixels<'a> {
                 sum
             })
             .collect();
-        Pixels { views, over_black, drawable, cumulative, radius, masked, published, order: None }
+        Pixels { views, soft, pixel, drawable, cumulative, radius, masked, published, order: None }
     }
 
     /// Pixels as TensoRF's code draws them: all valid ones whose ray meets the box `bounds` at any distance, in a random
@@ -144,6 +154,17 @@ impl<'a> Pixels<'a> {
         pixels
     }
 
+    /// The same where photographs count as large whose pixels, at the scene's middle, are finer than `finest`: what the
+    /// field resolves in the end, scene units.
+    pub fn with_large(mut self, finest: f32) -> Self {
+        for (own, view) in self.pixel.iter_mut().zip(self.views) {
+            let camera = &view.camera;
+            let pixel = (camera.position.length() / camera.fx.max(camera.fy)) as f32;
+            *own = if pixel < finest { pixel } else { f32::INFINITY };
+        }
+        self
+    }
+
     /// The photographs.
     pub fn views(&self) -> &'a [TrainView] {
         self.views
@@ -154,15 +175,13 @@ impl<'a> Pixels<'a> {
         self.cumulative.last().copied().unwrap_or(0)
     }
 
-    /// `count` random rays of a step: a function of seed and step alone.
-    pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool) -> Batch {
-        let drawn: Vec<(MarchRay, [f32; 3], f32)> = (0..count)
+    /// `count` random rays of a step: a function of seed and step alone. Of large photographs each stands for a square of
+    /// pixels, the widest of [`SIDES`] that is no wider than `detail`, in scene units.
+    pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool, detail: f32) -> Batch {
+        let drawn: Vec<Drawn> = (0..count)
             .into_par_iter()
             .with_min_len(256)
-            .filter_map(|i| match &self.order {
-                Some(order) => self.draw_next(order, (seed, step), (i as u64, count as u64), jitter),
-                None => self.draw_one(seed, step, i as u64, jitter),
-            })
+            .filter_map(|i| self.drawn((seed, step), (i as u64, count as u64), jitter, detail))
             .collect();
         let mut batch = Batch {
             rays: Vec::with_capacity(drawn.len()),
@@ -177,17 +196,45 @@ impl<'a> Pixels<'a> {
         batch
     }
 
+    /// The same, each in its place: none where a pixel has no ray.
+    #[cfg(feature = "wgpu")]
+    pub fn draw_each(
+        &self,
+        seed: u64,
+        step: u64,
+        count: usize,
+        jitter: bool,
+        detail: f32,
+    ) -> Vec<Option<Drawn>> {
+        let one = |i| self.drawn((seed, step), (i as u64, count as u64), jitter, detail);
+        (0..count).into_par_iter().with_min_len(256).map(one).collect()
+    }
+
+    /// Ray `i` of a batch of `count`.
+    fn drawn(&self, at: (u64, u64), (i, count): (u64, u64), jitter: bool, detail: f32) -> Option<Drawn> {
+        match &self.order {
+            Some(order) => self.draw_next(order, at, (i, count), jitter),
+            None => self.draw_one(at, i, jitter, detail),
+        }
+    }
+
+    /// Are pixels gone through in an order?
+    #[cfg(feature = "wgpu")]
+    pub fn is_ordered(&self) -> bool {
+        self.order.is_some()
+    }
+
+    /// Does every view come as often, with any pixel of its frame?
+    #[cfg(feature = "wgpu")]
+    pub fn is_published(&self) -> bool {
+        self.published
+    }
+
     /// Copies the photographs to a device, where the same rays are drawn from them.
     #[cfg(feature = "wgpu")]
-    pub fn on_device(
-        &self,
-        device: &gpu::Device,
-        jitter: bool,
-        background: bool,
-    ) -> crate::Result<gpu::Photographs> {
-        let drawing = gpu::Drawing { every: self.published, jitter, background };
+    pub fn on_device(&self, device: &gpu::Device, drawing: gpu::Drawing) -> gpu::Photographs {
         let views: Vec<gpu::DrawnView> =
-            (0..self.views.len()).into_par_iter().map(|v| self.drawn(v)).collect();
+            (0..self.views.len()).into_par_iter().map(|v| self.drawn_view(v)).collect();
         gpu::Photographs::new(device, &views, self.radius, drawing)
     }
 
@@ -203,9 +250,8 @@ impl<'a> Pixels<'a> {
 
     /// The drawable part of a view, packed.
     #[cfg(feature = "wgpu")]
-    fn drawn(&self, v: usize) -> gpu::DrawnView {
+    fn drawn_view(&self, v: usize) -> gpu::DrawnView {
         let view = &self.views[v];
-        let over_black = &self.over_black[v];
         let (x0, y0, x1, y1, bits) = &self.drawable[v];
         let [x, y, width, height] = if x0 > x1 { [0; 4] } else { [*x0, *y0, x1 - x0 + 1, y1 - y0 + 1] };
         let mut pixels = Vec::with_capacity((width * height) as usize);
@@ -213,8 +259,7 @@ impl<'a> Pixels<'a> {
         for row in y..y + height {
             let first = row as usize * view.photo.width as usize;
             for p in first + x as usize..first + (x + width) as usize {
-                let [r, g, b] = over_black.get(p).copied().unwrap_or(view.photo.rgb[p]);
-                let alpha = view.mask.as_ref().map_or(255, |m| m.values[p]);
+                let ([r, g, b], alpha) = self.pixel(v, p);
                 drawable[pixels.len() / 32] |= ((bits[p >> 6] >> (p & 63) & 1) as u32) << (pixels.len() % 32);
                 pixels.push(u32::from_le_bytes([r, g, b, alpha]));
             }
@@ -223,7 +268,8 @@ impl<'a> Pixels<'a> {
             camera: view.camera.clone(),
             part: [x, y, width, height],
             pixels,
-            over_black: !over_black.is_empty(),
+            over_black: self.soft[v].is_some(),
+            pixel: self.pixel[v],
             drawable,
         }
     }
@@ -235,7 +281,7 @@ impl<'a> Pixels<'a> {
         (seed, step): (u64, u64),
         (i, count): (u64, u64),
         jitter: bool,
-    ) -> Option<(MarchRay, [f32; 3], f32)> {
+    ) -> Option<Drawn> {
         let all = self.count();
         let batches = (all / count).max(1);
         let place = step % batches * count + i;
@@ -259,18 +305,48 @@ impl<'a> Pixels<'a> {
         Some((MarchRay { origin, direction, jitter }, color, alpha))
     }
 
-    /// What pixel `p` of view `v` should show over black, and its alpha.
-    fn seen(&self, v: usize, p: usize) -> ([f32; 3], f32) {
+    /// Pixel `p` of view `v`, and its alpha: over black already where the view has soft pixels.
+    fn pixel(&self, v: usize, p: usize) -> ([u8; 3], u8) {
         let view = &self.views[v];
-        let alpha = view.mask.as_ref().map_or(1.0, |m| m.values[p] as f32 / 255.0);
-        let color = match self.over_black[v].get(p) {
-            Some(head) => head.map(|c| c as f32 / 255.0),
-            None => view.photo.rgb[p].map(|c| alpha * c as f32 / 255.0),
-        };
-        (color, alpha)
+        let alpha = view.mask.as_ref().map_or(255, |m| m.values[p]);
+        match (&self.soft[v], &view.mask) {
+            (Some(soft), Some(mask)) => (soft.over_black(&view.photo, mask, p), alpha),
+            _ => (view.photo.rgb[p], alpha),
+        }
     }
 
-    fn draw_one(&self, seed: u64, step: u64, i: u64, jitter: bool) -> Option<(MarchRay, [f32; 3], f32)> {
+    /// What pixel `p` of view `v` should show over black, and its alpha.
+    fn seen(&self, v: usize, p: usize) -> ([f32; 3], f32) {
+        let (color, alpha) = self.pixel(v, p);
+        let alpha = alpha as f32 / 255.0;
+        let share = if self.soft[v].is_some() { 1.0 } else { alpha };
+        (color.map(|c| share * c as f32 / 255.0), alpha)
+    }
+
+    /// What the drawable pixels of a square show on average, its corner at `at`, and their middle.
+    fn square(&self, v: usize, at: [u32; 2], side: u32) -> (Vec2, [f32; 3], f32) {
+        let (.., bits) = &self.drawable[v];
+        let photo = &self.views[v].photo;
+        let (mut middle, mut color, mut alpha, mut count) = ([0u32; 2], [0u32; 3], 0u32, 0u32);
+        for y in at[1]..(at[1] + side).min(photo.height) {
+            for x in at[0]..(at[0] + side).min(photo.width) {
+                let p = y as usize * photo.width as usize + x as usize;
+                if bits[p >> 6] >> (p & 63) & 1 == 1 {
+                    let (own, a) = self.pixel(v, p);
+                    let share = if self.soft[v].is_some() { 255 } else { a as u32 };
+                    (0..3).for_each(|c| color[c] += share * own[c] as u32);
+                    middle = [middle[0] + x - at[0], middle[1] + y - at[1]];
+                    alpha += a as u32;
+                    count += 1;
+                }
+            }
+        }
+        let mean = |sum: u32, whole: u32| sum as f32 / (whole * count) as f32;
+        let middle = [0, 1].map(|a| at[a] as f32 + mean(middle[a], 1) + 0.5);
+        (Vec2::from(middle), color.map(|sum| mean(sum, 255 * 255)), mean(alpha, 255))
+    }
+
+    fn draw_one(&self, (seed, step): (u64, u64), i: u64, jitter: bool, detail: f32) -> Option<Drawn> {
         let stream = step << 4;
         let v = if self.published {
             rng::below(seed, stream, i, self.views.len() as u64) as usize
@@ -294,18 +370,32 @@ impl<'a> Pixels<'a> {
             if bits[p >> 6] >> (p & 63) & 1 == 0 {
                 continue;
             }
-            let Some(ray) = view.camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)) else { continue };
+            let side = side(self.pixel[v], detail);
+            let (at, color, alpha) = if side == 1 {
+                let (color, alpha) = self.seen(v, p);
+                (Vec2::new(x as f32 + 0.5, y as f32 + 0.5), color, alpha)
+            } else {
+                self.square(v, [x, y].map(|at| at / side * side), side)
+            };
+            let Some(ray) = view.camera.ray(at) else { continue };
             let shift = if jitter { rng::uniform(seed, stream + 2, i) } else { 0.0 };
             let march = MarchRay {
                 origin: (ray.origin * self.radius).to_array(),
                 direction: ray.direction.to_array(),
                 jitter: shift,
             };
-            let (color, alpha) = self.seen(v, p);
             return Some((march, color, alpha));
         }
         None
     }
+}
+
+/// How many pixels wide squares are.
+pub const SIDES: [u32; 4] = [1, 2, 4, 8];
+
+/// The widest square of pixels of this width that is no wider than `detail`; a pixel where none is.
+fn side(pixel: f32, detail: f32) -> u32 {
+    SIDES.into_iter().rfind(|&side| side as f32 * pixel <= detail).unwrap_or(1)
 }
 
 /// Does the line of a ray meet a box? Zero components of its direction count as 1e-6, as published.
@@ -390,179 +480,5 @@ fn dilated(values: &[u8], w: usize, h: usize, margin: usize) -> Vec<bool> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn view() -> TrainView {
-        let camera = Camera::above(20, 10, 20.0, 4.0);
-        let rgb = (0..200).map(|i| [i as u8, 0, 255]).collect();
-        let mut values = vec![0; 200];
-        values[5 * 20 + 8] = 255;
-        TrainView {
-            camera,
-            photo: Photo { width: 20, height: 10, rgb, alpha: None },
-            mask: Some(Gray { width: 20, height: 10, values }),
-            valid: None,
-        }
-    }
-
-    #[test]
-    fn only_pixels_near_the_mask_are_drawn_and_carry_their_own_color() {
-        // margin = ceil(0.1 · 20 / 3) + 1 = 2: a square of 5 × 5 around (8, 5)
-        let views = [view()];
-        let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false);
-        assert_eq!(pixels.count(), 25);
-        let batch = pixels.draw(1, 2, 400, true);
-        assert_eq!(batch.rays.len(), 400);
-        let mut head = 0;
-        for (ray, (color, alpha)) in batch.rays.iter().zip(batch.color.iter().zip(&batch.alpha)) {
-            let d = ray.direction;
-            let (x, y) = (d[0] / -d[2] * 20.0 + 10.0, d[1] / d[2] * 20.0 + 5.0);
-            assert!((x - 8.5).abs() < 2.01 && (y - 5.5).abs() < 2.01, "{x} {y}");
-            if *alpha > 0.0 {
-                // pixel (8, 5) is number 108 and has red 108
-                assert!((x - 8.5).abs() < 1e-3 && (y - 5.5).abs() < 1e-3);
-                assert!((color[0] * 255.0 - 108.0).abs() < 1e-3);
-                head += 1;
-            } else {
-                assert_eq!(*color, [0.0; 3]);
-            }
-        }
-        assert!(head > 4 && head < 40, "{head} of 400 should be about 16");
-    }
-
-    #[test]
-    fn a_view_without_a_mask_teaches_nothing_beside_views_with_one() {
-        let mut white = view();
-        white.mask.as_mut().unwrap().values.fill(255);
-        let views = [view(), TrainView { mask: None, ..view() }, white];
-        let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false);
-        assert_eq!(pixels.count(), 25);
-        // alone it is drawn from everywhere
-        let alone = [TrainView { mask: None, ..view() }];
-        assert_eq!(Pixels::new(&alone, 0.1, 1.0, Foreground::Photo, false).count(), 200);
-    }
-
-    #[test]
-    fn a_permutation_has_every_number_once_and_another_order_for_every_key() {
-        for n in [1, 2, 3, 64, 65, 1000] {
-            let all = |key: u64| (0..n).map(|i| permuted(key, i, n)).collect::<Vec<u64>>();
-            let mut sorted = all(7);
-            sorted.sort_unstable();
-            assert_eq!(sorted, (0..n).collect::<Vec<u64>>());
-            assert!(n < 64 || all(7) != all(8));
-        }
-        // no order to be seen: neighbors are a third of 1000 apart on average
-        let all: Vec<u64> = (0..1000).map(|i| permuted(3, i, 1000)).collect();
-        let apart = all.windows(2).map(|w| w[0].abs_diff(w[1])).sum::<u64>() as f64 / 999.0;
-        assert!((apart - 333.0).abs() < 30.0, "{apart}");
-    }
-
-    #[test]
-    fn an_epoch_has_every_valid_pixel_that_meets_the_box_once_with_directions_of_depth_one() {
-        let mut one = view();
-        let mut valid = vec![255; 200];
-        valid[7 * 20 + 9] = 0;
-        one.valid = Some(Gray { width: 20, height: 10, values: valid });
-        let views = [one, view()];
-        // pixels are 1/20 apart at depth 1. The near face at z = 1 is 3 away: |x − 10| < 1.5 · 20 / 3 = 10 has all
-        // columns, |y − 5| < 0.4 · 20 / 3 = 2.67 the six rows with centers 0.5, 1.5 and 2.5 off the middle
-        let bounds = [[-1.5, -0.4, -1.0], [1.5, 0.4, 1.0]];
-        let pixels = Pixels::permuted(&views, Foreground::Photo, bounds, true);
-        assert_eq!(pixels.count(), 2 * 20 * 6 - 1);
-        // 239 pixels in batches of 50: four a round, and a tail that is left out
-        let mut seen = Vec::new();
-        for step in 0..4 {
-            let batch = pixels.draw(1, step, 50, false);
-            assert_eq!(batch.rays.len(), 50);
-            for (ray, color) in batch.rays.iter().zip(&batch.color) {
-                assert!((ray.direction[2] + 1.0).abs() < 1e-6, "{ray:?}");
-                let (x, y) = (ray.direction[0] * 20.0 + 9.5, 4.5 - ray.direction[1] * 20.0);
-                assert!((x - x.round()).abs() < 1e-4 && (2.0..=7.0).contains(&y.round()), "{x} {y}");
-                seen.push((y.round() as u64 * 20 + x.round() as u64, *color));
-            }
-        }
-        let count = |p: u64| seen.iter().filter(|(q, _)| *q == p).count();
-        assert!((0..200).all(|p| count(p) <= 2) && count(7 * 20 + 9) <= 1 && seen.len() == 200);
-        // pixel (8, 5), number 108, is head
-        let head = seen.iter().filter(|(p, _)| *p == 108);
-        assert!(head.clone().count() > 0 && head.clone().all(|(_, c)| (c[0] * 255.0 - 108.0).abs() < 1e-3));
-        let first = pixels.draw(1, 0, 50, false).rays;
-        assert!(first == pixels.draw(1, 0, 50, false).rays && first != pixels.draw(1, 4, 50, false).rays);
-        // more than there are: all of them, once
-        assert_eq!(pixels.draw(1, 9, 1000, false).rays.len(), 239);
-    }
-
-    #[test]
-    fn published_sampling_draws_the_whole_frame_of_every_view_as_often() {
-        let views = [view(), view()];
-        let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, true);
-        let batch = pixels.draw(1, 2, 2000, false);
-        assert_eq!(batch.rays.len(), 2000);
-        let left = batch.rays.iter().filter(|r| r.direction[0] < 0.0).count();
-        assert!((900..1100).contains(&left), "{left}");
-        // one pixel of 200 is head
-        let head = batch.alpha.iter().filter(|&&a| a > 0.0).count();
-        assert!((2..25).contains(&head), "{head}");
-    }
-
-    #[cfg(feature = "wgpu")]
-    #[test]
-    fn a_device_draws_the_same_rays() {
-        use crate::geom::{Distortion, Projection};
-        use crate::kernel::gpu::tests::{agree, device, planes};
-        let Some(device) = device() else { return };
-        let bent = |distortion: Distortion| {
-            let mut view = view();
-            view.camera.distortion = distortion;
-            view.camera.rotation = glam::DMat3::from_rotation_y(0.4) * glam::DMat3::from_rotation_x(-0.2);
-            view.mask.as_mut().unwrap().values.iter_mut().enumerate().for_each(|(i, v)| *v = 40 + i as u8);
-            view.valid =
-                Some(Gray { width: 20, height: 10, values: (0..200).map(|i| (i % 7 > 1) as u8).collect() });
-            view
-        };
-        let perspective = Distortion {
-            k1: -0.2,
-            k2: 0.05,
-            k4: 0.1,
-            p1: 0.01,
-            p2: -0.02,
-            sx1: 0.003,
-            ..Distortion::default()
-        };
-        let fisheye = Distortion { k1: 0.02, k4: -0.01, projection: Projection::Fisheye, ..perspective };
-        let fov = Distortion { omega: 0.9, projection: Projection::Fov, ..Distortion::default() };
-        let empty = TrainView { mask: None, ..view() };
-        let views = [view(), bent(perspective), empty, bent(fisheye), bent(fov)];
-        for (foreground, published) in [(Foreground::Estimated, false), (Foreground::Photo, true)] {
-            let pixels = Pixels::new(&views, 0.1, 0.3, foreground, published);
-            let there = pixels.on_device(&device, !published, true).unwrap();
-            let batch = gpu::Batch::new(&device, 2050);
-            let (seed, step) = (77, 1 << 33);
-            there.draw(&device, (seed, step), &device.upload(&[2000u32]), &batch);
-            let want = pixels.draw(seed, step, 2000, !published);
-            let alive = device.read::<u32>(&batch.alive);
-            assert!(alive[2000..].iter().all(|&a| a == 0));
-            let kept: Vec<usize> = (0..2050).filter(|&r| alive[r] == 1).collect();
-            // published: pixels that are not valid leave a gap
-            assert_eq!((kept.len(), kept.len() < 2000), (want.rays.len(), published));
-            let take = |buffer: &gpu::Buffer, planes: usize| -> Vec<f32> {
-                let all = device.read::<f32>(buffer);
-                (0..planes)
-                    .flat_map(|k| kept.iter().map(move |r| (k, *r)))
-                    .map(|(k, r)| all[k * 2050 + r])
-                    .collect()
-            };
-            let n = want.rays.len();
-            let turned =
-                |f: fn(&MarchRay) -> [f32; 3]| planes(&want.rays.iter().map(f).collect::<Vec<_>>(), n);
-            agree("drawn origins", &take(&batch.origin, 3), &turned(|r| r.origin), 1e-6);
-            agree("drawn directions", &take(&batch.direction, 3), &turned(|r| r.direction), 1e-5);
-            agree("drawn colors", &take(&batch.color, 3), &planes(&want.color, n), 1e-6);
-            assert_eq!(take(&batch.alpha, 1), want.alpha);
-            assert_eq!(take(&batch.jitter, 1), want.rays.iter().map(|r| r.jitter).collect::<Vec<_>>());
-            let behind = device.read::<f32>(&batch.background);
-            assert_eq!(behind[2050 + 9], rng::uniform(seed, step << 4 | 3, 3 * 9 + 1));
-        }
-    }
-}
+#[path = "pixels_tests.rs"]
+mod tests;

@@ -260,7 +260,7 @@ impl Learner for DensityTraining<'_> {
             };
             self.state.occupancy.look((seed, step), config.radius, OCCUPIED, opacity);
         }
-        let batch = self.pixels.draw(seed, step, self.state.rays, config.jitter);
+        let batch = self.pixels.draw(seed, step, self.state.rays, config.jitter, 0.0);
         let samples = self.state.march(config, &self.shape, &weights, &batch.rays);
         let n = samples.t.len();
         self.state.rays = schedule::next_rays(self.state.rays, n, config.samples, 1, config.max_rays);

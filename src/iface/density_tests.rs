@@ -43,7 +43,7 @@ fn a_step_is_the_one_of_its_formulas() {
     }
     let before = learner.state.parameters.clone();
     let weights = learner.state.weights(&learner.shape);
-    let batch = learner.pixels.draw(3, 2, learner.state.rays, false);
+    let batch = learner.pixels.draw(3, 2, learner.state.rays, false, 0.0);
     let samples = learner.state.march(&config, &learner.shape, &weights, &batch.rays);
     let n = samples.t.len();
     assert!(n > 100, "{n} samples");

@@ -10,10 +10,11 @@ use super::state::{FORMAT, SdfState};
 use super::train::{LOST_AFTER, MOST_BUDGETS, STEREO_POINTS, SdfTraining, TERMS, VARIANCE, adam_steps, lost};
 use crate::config::iface::{Background, IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
+use crate::field::drawing::{self, DeviceRays};
 use crate::field::parameters::Parameter;
 use crate::field::training::{Learner, StepError, StepReport};
 use crate::kernel::gpu::{
-    self, Band, Batch, Buffer, Device, Gate, LossWeights, Losses, Neus, Norm, Occupancy, Photographs, Pitch,
+    self, Band, Batch, Buffer, Device, Drawing, Gate, LossWeights, Losses, Neus, Norm, Occupancy, Pitch,
     RayBudget, Rays, Samples, Schedule, Sdf, SurfacePoints,
 };
 use crate::kernel::hash;
@@ -82,7 +83,7 @@ pub(super) struct OnDevice<'a> {
     /// What the CPU trains with; its state is older than that on the device.
     host: SdfTraining<'a>,
     device: Device,
-    photographs: Photographs,
+    rays: DeviceRays,
     batch: Batch,
     samples: Samples,
     points: SurfacePoints,
@@ -101,7 +102,6 @@ impl<'a> OnDevice<'a> {
             let problem = format!("a device has no room for {} levels in a tile", host.config.levels);
             return Err(Error::usage(problem, "lower iface.levels, or train with `--device cpu`"));
         }
-        gpu::Photographs::fit(device, host.pixels.bytes_on_device())?;
         room(host, device, points(host.config)).map(|_| ())
     }
 
@@ -114,7 +114,7 @@ impl<'a> OnDevice<'a> {
         let config = host.config;
         let rays = config.rays.max(config.max_rays);
         let points = points(config);
-        let capacity = room(&host, &device, points)?;
+        let (capacity, resident) = room(&host, &device, points)?;
         let weights = LossWeights {
             rgb_mse: config.rgb_mse as f32,
             rgb_l1: config.rgb_l1 as f32,
@@ -124,12 +124,17 @@ impl<'a> OnDevice<'a> {
             sparsity: config.sparsity as f32,
             sparsity_scale: config.sparsity_scale as f32,
         };
-        let random = config.background == Background::Random;
+        let drawing = Drawing {
+            every: host.pixels.is_published(),
+            jitter: config.jitter,
+            background: config.background == Background::Random,
+            behind: 3,
+        };
         let allowed = host.state.occupancy.allowed();
         let band = (config.occupancy == OccupancyRule::Band)
             .then(|| Band::new(&device, allowed, config.band, config.soften as f32));
         Ok(OnDevice {
-            photographs: host.pixels.on_device(&device, config.jitter, random)?,
+            rays: DeviceRays::new(&host.pixels, &device, drawing, resident),
             batch: Batch::new(&device, rays),
             samples: Samples::new(&device, rays, capacity),
             points: SurfacePoints::new(&device, points, config.stereo as f32, KNEE as f32),
@@ -235,14 +240,15 @@ impl<'a> OnDevice<'a> {
     }
 
     /// Launches the step; waits for nothing.
-    fn launch(&self, seed: (u64, u64), factor: f64) {
+    fn launch(&mut self, seed: (u64, u64), factor: f64) {
         let device = &self.device;
         let (there, config) = (&self.there, self.host.config);
         let samples = &self.samples;
-        let (rays, offsets, count) = (&self.batch, &samples.offsets, &samples.count);
         let step = seed.1;
-        there.schedule.advance(device, &there.inv_s, count, !there.stepped);
-        self.photographs.draw(device, seed, &there.schedule.rays, rays);
+        there.schedule.advance(device, &there.inv_s, &samples.count, !there.stepped);
+        let detail = schedule::detail(config, step);
+        self.rays.draw(device, &self.host.pixels, seed, &there.schedule.rays, &mut self.batch, detail);
+        let (rays, offsets, count) = (&self.batch, &samples.offsets, &samples.count);
         samples.march(device, &there.occupancy, rays, &there.schedule.pitch, usize::MAX, self.points.most());
         let both = self.points.append(device, seed, samples);
         let (x, toward) = (&samples.x, &samples.direction);
@@ -274,33 +280,41 @@ fn points(config: &IfaceConfig) -> usize {
     if config.stereo > 0.0 { STEREO_POINTS as usize } else { 1 }
 }
 
-/// Samples that a step has room for: as many as on the CPU where the device's memory and buffers are large enough.
-fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<usize> {
+/// Samples that a step has room for, as many as on the CPU where the device's memory and buffers are large enough; and do
+/// photographs lie there, too?
+fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<(usize, bool)> {
     /// Samples with their rays, compositing and losses.
     const BESIDE: usize = 3 + 3 + 2 + 9 + 2;
-    /// What the driver and others keep for themselves.
-    const KEPT: u64 = 512 << 20;
-    let limits = device.limits();
+    let config = host.config;
     let [words, widest] = Sdf::words_per_sample(&host.shape);
+    let sample = 4 * (words + BESIDE) as u64;
     // values, moments and gradient; cells with distance, reach and bits
-    let cells = host.config.occupancy_resolution.pow(3) as u64;
-    let photographs = host.pixels.bytes_on_device() * 33 / 32;
-    let fixed = KEPT + photographs + 32 * hash::entries(&host.shape.levels) as u64 + 13 * cells;
-    let by_buffer = limits.largest_buffer / (4 * widest as u64);
-    let by_memory =
-        limits.memory.map_or(u64::MAX, |memory| memory.saturating_sub(fixed) / (4 * (words + BESIDE) as u64));
-    let wanted = (MOST_BUDGETS * host.config.samples + points) as u64;
-    let capacity = wanted.min(by_buffer).min(by_memory) as usize;
-    let least = host.config.samples + points;
+    let cells = config.occupancy_resolution.pow(3) as u64;
+    let fixed = 32 * hash::entries(&host.shape.levels) as u64 + 13 * cells;
+    let spare = device.spare().saturating_sub(fixed);
+    let wanted = (MOST_BUDGETS * config.samples + points) as u64;
+    let resident = drawing::resident(&host.pixels, device, spare.saturating_sub(wanted * sample));
+    let by_buffer = device.limits().largest_buffer / (4 * widest as u64);
+    let capacity = wanted.min(by_buffer).min((spare - resident.unwrap_or(0)) / sample) as usize;
+    let least = config.samples + points;
     if capacity < least {
+        let mib = |bytes: u64| bytes.div_ceil(1 << 20);
         let problem = format!(
-            "the device `{}` has room for {capacity} samples of a step, {least} are needed",
-            device.name()
+            "the device `{}` has room for {capacity} samples of a step beside {} MiB of hash tables and cells, {least} are \
+             needed",
+            device.name(),
+            mib(fixed),
         );
-        return Err(Error::cannot(problem, format!("lower iface.samples ({})", host.config.samples)));
+        let remedy = match capacity.saturating_sub(points) {
+            0..64 => format!("iface.log2_table ({})", config.log2_table),
+            fits => format!("iface.samples to {fits}"),
+        };
+        return Err(Error::cannot(problem, format!("lower {remedy}, or give more with `--memory`")));
     }
     // the last tile is a whole one
-    Ok(if capacity as u64 == wanted { capacity.next_multiple_of(TILE) } else { capacity / TILE * TILE })
+    let whole =
+        if capacity as u64 == wanted { capacity.next_multiple_of(TILE) } else { capacity / TILE * TILE };
+    Ok((whole, resident.is_some()))
 }
 
 fn there_occupancy(device: &Device, host: &SdfTraining) -> Occupancy {

@@ -1,6 +1,6 @@
 //! Training on a device against training on the CPU: an analytic ball.
 
-use super::{OnDevice, READ_EVERY};
+use super::{MOST_BUDGETS, OnDevice, READ_EVERY, room};
 use crate::config::Preset;
 use crate::config::iface::{IfaceConfig, Start};
 use crate::field::ball::{StopAfter, hull, temporary, textured_views};
@@ -10,7 +10,7 @@ use crate::field::training::{Learner, TrainingSession};
 use crate::geom::Ray;
 use crate::iface::train::SdfTraining;
 use crate::iface::{IFace, IfaceReport, train};
-use crate::kernel::gpu::tests::device;
+use crate::kernel::gpu::tests::{device, lose_after};
 use crate::{Monitor, Quiet, Result};
 use glam::Vec2;
 use std::path::Path;
@@ -135,6 +135,37 @@ fn a_training_goes_on_there_and_back() {
 }
 
 #[test]
+fn a_device_that_is_lost_leaves_the_last_checkpoint_and_the_training_goes_on() {
+    if device().is_none() {
+        return;
+    }
+    let views = textured_views();
+    let config = IfaceConfig { steps: 90, start: Start::Sphere, ..config() };
+    let run = |dir: &Path, device: &str, monitor: &dyn Monitor| {
+        let result = learned(&views, &config, &on(device, dir, monitor));
+        lose_after(usize::MAX);
+        result
+    };
+    let (alone, lost) = (temporary(), temporary());
+    let (want, _) = run(alone.path(), "cpu", &Quiet).unwrap();
+    run(lost.path(), "wgpu:0", &StopAfter::new(40)).err().unwrap();
+    let file = lost.path().join("checkpoint.safetensors");
+    let before = std::fs::read(&file).unwrap();
+    // at the losses of step 50, where points are looked for at step 54, and while the end is saved
+    for answers in [0, 3, 14] {
+        lose_after(answers);
+        let e = run(lost.path(), "wgpu:0", &Quiet).err().unwrap();
+        assert!(e.to_string().contains("failed: device lost") && e.hint().contains("repeat"), "{e}");
+        assert_eq!(e.kind() as i32, 75);
+        assert!(std::fs::read(&file).unwrap() == before, "the last checkpoint is touched after {answers}");
+    }
+    let (got, _) = run(lost.path(), "wgpu:0", &Quiet).unwrap();
+    let (want, got) = (psnr(&want, &views[4]), psnr(&got, &views[4]));
+    println!("{want:.2} dB alone, {got:.2} dB after a device was lost");
+    assert!((want - got).abs() < 0.2, "{want} {got}");
+}
+
+#[test]
 fn a_step_waits_for_nothing() {
     if device().is_none() {
         return;
@@ -208,5 +239,59 @@ fn a_device_with_too_little_room_is_refused_before_the_first_step() {
     let session = on("wgpu:0", dir.path(), &Quiet);
     let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
     let e = OnDevice::new(host, device).err().unwrap();
-    assert!(e.to_string().contains("has room for") && e.hint().contains("iface.samples"), "{e}");
+    assert!(e.to_string().contains("has room for") && e.hint().contains("iface.samples to"), "{e}");
+    // what fits beside 512 MiB that are not to be had: nothing at all, or samples, or samples and photographs
+    let config = IfaceConfig { samples: 4096, ..self::config() };
+    let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
+    let of = |mib: u64| self::device().unwrap().with_memory(mib << 20);
+    let e = room(&host, &of(512), 1).err().unwrap();
+    assert!(e.hint().contains("iface.log2_table (12)"), "{e:?}");
+    let [whole, few] = [900, 522].map(|mib| room(&host, &of(mib), 1).unwrap());
+    println!("samples, and do photographs lie there: {whole:?} {few:?}");
+    assert!(whole.1 && whole.0 > MOST_BUDGETS * 4096 && !few.1 && few.0 < whole.0 && few.0 > 4096);
+}
+
+/// `cargo test --release --features wgpu --lib exchange_costs -- --ignored --nocapture`
+#[test]
+#[ignore = "measures times"]
+fn exchange_costs_at_most_half_more_than_native_sums() {
+    use crate::kernel::gpu::Atomics;
+    let Some(native) = device().filter(|d| d.atomics() == Atomics::Native) else {
+        println!("skipped: no adapter here adds floats by itself");
+        return;
+    };
+    const STEPS: u64 = 5;
+    let views = textured_views();
+    let config = IfaceConfig { start: Start::Sphere, stereo: 0.0, ..IfaceConfig::preset(Preset::Draft) };
+    let (hull, dir) = (hull(), temporary());
+    let session = on("wgpu:0", dir.path(), &Quiet);
+    let ways = [native, device().unwrap().with_atomics(Atomics::Exchange)];
+    let mut both = ways.map(|device| {
+        let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
+        let mut there = OnDevice::new(host, device).unwrap();
+        there.restore(None).ok().unwrap();
+        there
+    });
+    let mut best = [f64::INFINITY; 2];
+    let mut step = 1;
+    // in turn, so that what else the machine does is the same to both; the first round compiles
+    for round in 0..12 {
+        for (there, best) in both.iter_mut().zip(&mut best) {
+            let began = std::time::Instant::now();
+            for step in step..step + STEPS {
+                there.step(&TrainingProgress { step, ..TrainingProgress::default() }).ok().unwrap();
+            }
+            there.device.fetch::<u32>(&there.samples.count).unwrap();
+            let ms = 1e3 * began.elapsed().as_secs_f64() / STEPS as f64;
+            *best = if round > 2 { best.min(ms) } else { *best };
+        }
+        step += STEPS;
+    }
+    let count = both.each_ref().map(|there| there.device.read::<u32>(&there.samples.count)[0]);
+    let [native, exchange] = best;
+    println!(
+        "{native:.1} ms a step with native sums, {exchange:.1} ms with exchanged words: {:.2} x ({count:?} samples)",
+        exchange / native
+    );
+    assert!(exchange <= 1.5 * native);
 }

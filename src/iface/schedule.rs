@@ -32,6 +32,17 @@ pub fn active_levels(config: &IfaceConfig, step: u64) -> usize {
     (config.start_levels + (step / config.level_every) as usize).min(config.levels)
 }
 
+/// Width of the cells of the finest of so many levels, scene units.
+pub fn cell(config: &IfaceConfig, levels: usize) -> f32 {
+    (2.0 / (config.base_resolution as f64 * config.growth.powi(levels as i32 - 1))) as f32
+}
+
+/// What a ray of a large photograph stands for at a step, scene units: as much as a cell of the finest level that takes
+/// part; a pixel in the second half.
+pub fn detail(config: &IfaceConfig, step: u64) -> f32 {
+    if 2 * step < config.steps { cell(config, active_levels(config, step)) } else { 0.0 }
+}
+
 /// Share of the hard cosine in the alpha at a step: 0 → 1 over `anneal_end`.
 pub fn anneal(config: &IfaceConfig, step: u64) -> f32 {
     if config.anneal_end == 0 { 1.0 } else { (step as f32 / config.anneal_end as f32).min(1.0) }
@@ -85,6 +96,18 @@ mod tests {
         }
         assert_eq!(&seen[..6], [492, 704, 895, 1067, 1222, 1361]);
         assert_eq!(seen[199], 2612);
+    }
+
+    #[test]
+    fn rays_stand_for_less_as_levels_come_and_for_a_pixel_in_the_second_half() {
+        let config = IfaceConfig::preset(Preset::Draft);
+        // cells of the level with 16 · 1.4⁵ = 86.05 of them on a side of 2, then 120.5; the finest has 1269.7
+        for (step, want) in
+            [(0, 0.023_242), (99, 0.023_242), (100, 0.016_602), (1499, 0.001_575_2), (1500, 0.0)]
+        {
+            assert!((detail(&config, step) - want).abs() < 1e-6, "{step}: {}", detail(&config, step));
+        }
+        assert!((cell(&config, config.levels) - 0.001_575_2).abs() < 1e-6);
     }
 
     #[test]

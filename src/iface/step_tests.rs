@@ -122,7 +122,7 @@ fn formulas(learner: &SdfTraining, x: &[Var], step: u64, lengths: &[usize]) -> V
     let inv_s = (variance[0] * of(10.0)).exp();
 
     let seed = learner.session.seed;
-    let batch = learner.pixels.draw(seed, step, learner.state.rays, config.jitter);
+    let batch = learner.pixels.draw(seed, step, learner.state.rays, config.jitter, 0.0);
     // the f32 of 1.732 · 2 r / n
     let dt = f64::from(1.732 * 2.0 * config.radius / config.samples_per_ray as f32);
     let (mut offsets, mut t) = (vec![0i32], Vec::new());

@@ -169,7 +169,10 @@ impl<'a> SdfTraining<'a> {
             None => f32::INFINITY,
         };
         let published = config.occupancy == OccupancyRule::Nerfacc;
-        let pixels = Pixels::new(views, reach, config.radius, config.foreground, published);
+        let mut pixels = Pixels::new(views, reach, config.radius, config.foreground, published);
+        if !published {
+            pixels = pixels.with_large(schedule::cell(config, config.levels));
+        }
         if pixels.count() == 0 {
             return Err(training::no_pixels());
         }
@@ -196,7 +199,8 @@ impl Learner for SdfTraining<'_> {
         if schedule::stereo_step(config) == Some(step) {
             self.find_stereo(&shape);
         }
-        let mut batch = self.pixels.draw(seed, step, self.state.rays, config.jitter);
+        let detail = schedule::detail(config, step);
+        let mut batch = self.pixels.draw(seed, step, self.state.rays, config.jitter, detail);
         let mut samples = self.state.occupancy.march(config, dt, &batch.rays);
         let n = samples.t.len();
         self.state.rays = self.next_rays(self.state.rays, n);

@@ -80,7 +80,7 @@ pub(super) fn train(
     // without masks nothing may know the head's outline nor what that carves; only the box stays
     let masked = c.masks != MaskUse::None;
     let views = train_views(capture, scene, config, masked)?;
-    let report = tface::train(&views, scene.aabb, hull.as_ref().filter(|_| masked), &c, session)?;
+    let report = tface::train(views, scene.aabb, hull.as_ref().filter(|_| masked), &c, session)?;
     Ok((json!(report), report.warnings))
 }
 

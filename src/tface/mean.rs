@@ -96,7 +96,7 @@ fn folder(dir: &Path, i: usize) -> PathBuf {
 /// `views` have their cameras in scene coordinates; `bounds` is the scene's tight box; `hull` the masks' visual hull
 /// over [-1, 1]³.
 pub fn train(
-    views: &[TrainView],
+    views: Vec<TrainView>,
     bounds: Aabb,
     hull: Option<&Bitmask>,
     config: &VmConfig,
@@ -111,7 +111,11 @@ pub fn train(
     let config = &config.placed(bounds);
     let pixels = match config.whole_frame {
         true => Pixels::permuted(&views, config.foreground, bounds, config.depth_directions),
-        false => Pixels::new(&views, reach, 1.0, config.foreground, false),
+        false => {
+            let volume: f32 = (0..3).map(|a| bounds[1][a] - bounds[0][a]).product();
+            let cell = (volume as f64 / config.voxels_final as f64).cbrt() as f32;
+            Pixels::new(&views, reach, 1.0, config.foreground, false).with_large(train::DETAIL * cell)
+        }
     };
     if pixels.count() == 0 {
         return Err(training::no_pixels());
@@ -215,9 +219,9 @@ mod tests {
     #[test]
     fn two_fields_are_seen_as_their_mean_and_counted_as_one_training() {
         let dir = temporary();
-        let (views, hull, heard) = (views(), hull(), Heard::default());
+        let (hull, heard) = (hull(), Heard::default());
         let learn = |dir: &Path, monitor: &dyn Monitor| {
-            train(&views, BOX, Some(&hull), &config(), &session("tface", dir, "ball", monitor))
+            train(views(), BOX, Some(&hull), &config(), &session("tface", dir, "ball", monitor))
         };
         let report = learn(dir.path(), &heard).unwrap();
         let heard = heard.0.into_inner().unwrap();
@@ -269,9 +273,9 @@ mod tests {
     #[test]
     fn a_field_in_another_ones_place_is_refused() {
         let dir = temporary();
-        let (views, hull) = (views(), hull());
+        let hull = hull();
         let learn =
-            || train(&views, BOX, Some(&hull), &config(), &session("tface", dir.path(), "ball", &Quiet));
+            || train(views(), BOX, Some(&hull), &config(), &session("tface", dir.path(), "ball", &Quiet));
         learn().unwrap();
         let name = "checkpoint.safetensors";
         std::fs::copy(dir.path().join(name), dir.path().join("field_2").join(name)).unwrap();

@@ -9,13 +9,13 @@ use super::state::VmState;
 use super::train::{BEHIND, VmTraining, over_white};
 use crate::config::{MaskLoss, VmBackground, VmConfig};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
+use crate::field::drawing::{self, DeviceRays};
 use crate::field::parameters::Parameter;
 use crate::field::pixels::Pixels;
 use crate::field::training::{Learner, StepError, StepReport};
 use crate::kernel::gpu::{
-    self, Batch, Behind, Buffer, Device, Gate, MaskTerm, Photographs, Vm, VmLosses, VmValues,
+    self, Batch, Behind, Buffer, Device, Drawing, Gate, MaskTerm, Vm, VmLosses, VmValues,
 };
-use crate::kernel::rng;
 use crate::kernel::vm::VmField;
 use crate::{Error, Result};
 
@@ -83,12 +83,12 @@ pub(super) struct OnDevice<'a> {
     /// What the CPU trains with; its parameters are older than those on the device.
     host: VmTraining<'a>,
     device: Device,
-    /// None where rays are drawn on the host: without repetition, in an order that a device does not know.
-    photographs: Option<Photographs>,
+    rays: DeviceRays,
     wanted: Buffer,
     batch: Batch,
     losses: VmLosses,
-    there: There,
+    /// None only while it is made anew.
+    there: Option<There>,
     /// Steps since losses were read.
     unread: u64,
 }
@@ -105,33 +105,70 @@ fn mask_term(config: &VmConfig, pixels: &Pixels) -> MaskTerm {
 }
 
 impl<'a> OnDevice<'a> {
-    /// Can a device train this? Else what it cannot.
-    pub fn knows(config: &VmConfig) -> Result<(), &'static str> {
-        if config.ortho > 0.0 {
-            return Err("lines that are orthogonal");
+    /// Refuses a training that a device cannot take: it knows no such field, or has too little memory for the last grids.
+    /// Do photographs lie there, too?
+    pub fn fits(host: &VmTraining, device: &Device) -> Result<bool> {
+        let config = host.config;
+        let known = match config.ortho > 0.0 {
+            true => Err("lines that are orthogonal"),
+            false => gpu::DeviceDecoder::knows(&super::record::decoder(config)),
+        };
+        known.map_err(|what| {
+            let problem = format!("the device `{}` knows no {what}", device.name());
+            Error::usage(problem, "train with `--device cpu`")
+        })?;
+        let sizes = [host.state.size, host.state.last_size(config)];
+        let fields = sizes.map(|size| host.state.field_of(config, size, true));
+        let [fixed, ray] = fields
+            .each_ref()
+            .map(|f| Vm::bytes(device, f))
+            .into_iter()
+            .fold([0; 2], |a, b| [a[0].max(b[0]), a[1].max(b[1])]);
+        let widest = fields.iter().map(Vm::widest).max().unwrap_or(1);
+        let spare = device.spare().saturating_sub(fixed);
+        // lattice points of all steps between two looks are counted in 32 bits
+        let most = (spare / ray).min(device.limits().largest_buffer / widest);
+        let most = most.min(u32::MAX as u64 / READ_EVERY / (widest / 12 + 2));
+        let rays = config.rays as u64;
+        if rays > most {
+            let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+            let problem = format!(
+                "the device `{}` has room for {most} rays of a step beside {} MiB of grids and gradients, {rays} are asked \
+                 for",
+                device.name(),
+                mib(fixed)
+            );
+            let stage = host.stage();
+            let remedy = match most {
+                0..64 => format!("{stage}.voxels_final ({})", config.voxels_final),
+                _ => format!("{stage}.rays to {most}"),
+            };
+            return Err(Error::cannot(problem, format!("lower {remedy}, or give more with `--memory`")));
         }
-        gpu::DeviceDecoder::knows(&super::record::decoder(config))
+        Ok(drawing::resident(host.pixels, device, spare - rays * ray).is_some())
     }
 
-    /// Moves a training that a device [`knows`](OnDevice::knows) there.
+    /// Moves a training there.
     ///
     /// # Errors
     ///
-    /// Where the photographs do not fit.
+    /// Where it does not [fit](OnDevice::fits).
     pub fn new(host: VmTraining<'a>, device: Device) -> Result<OnDevice<'a>> {
+        let resident = OnDevice::fits(&host, &device)?;
         let config = host.config;
-        let random = config.background == VmBackground::Random;
         let field = host.state.field(config, true);
-        let photographs = match config.whole_frame {
-            true => None,
-            false => Some(host.pixels.on_device(&device, true, random)?.behind(BEHIND)),
+        let drawing = Drawing {
+            every: false,
+            jitter: true,
+            background: config.background == VmBackground::Random,
+            behind: BEHIND,
         };
         Ok(OnDevice {
-            photographs,
+            rays: DeviceRays::new(host.pixels, &device, drawing, resident),
             wanted: device.upload(&[config.rays as u32]),
             batch: Batch::new(&device, config.rays),
             losses: VmLosses::new(&device, config.rays, mask_term(config, host.pixels)),
-            there: There::new(&device, &field, &host.state.parameters, config.rays),
+            there: Some(There::new(&device, &field, &host.state.parameters, config.rays)),
             host,
             device,
             unread: 0,
@@ -143,54 +180,38 @@ impl<'a> OnDevice<'a> {
         self.host
     }
 
+    fn there(&self) -> &There {
+        self.there.as_ref().expect("made anew where it was dropped")
+    }
+
     /// Copies the host's state to the device.
     fn push(&mut self) {
         let (config, state) = (self.host.config, &self.host.state);
-        self.there = There::new(&self.device, &state.field(config, true), &state.parameters, config.rays);
+        // what lies there goes first, or there would have to be room for both
+        self.there = None;
+        self.device.tidy();
+        let there = There::new(&self.device, &state.field(config, true), &state.parameters, config.rays);
+        self.there = Some(there);
     }
 
     /// Rebuilds the mask and refines the grids, on the host.
     fn grow(&mut self, step: u64) -> Result<(), StepError> {
-        if self.device.fetch::<u32>(&self.there.broken)?[0] != 0 {
+        if self.device.fetch::<u32>(&self.there().broken)?[0] != 0 {
             return Err(self.host.not_finite("gradient of the", f32::NAN, step));
         }
-        self.host.state.parameters = self.there.fetch(&self.device, &self.host.state.parameters)?;
+        self.host.state.parameters = self.there().fetch(&self.device, &self.host.state.parameters)?;
         self.host.grow(step)?;
         self.push();
         Ok(())
     }
 
-    /// The rays of a step, drawn on the host.
-    fn drawn(&self, seed: u64, step: u64) -> Batch {
-        let (device, config) = (&self.device, self.host.config);
-        let own = self.host.pixels.draw(seed, step, config.rays, true);
-        let random = config.background == VmBackground::Random;
-        let (mut color, mut behind) = (vec![0f32; 3 * config.rays], vec![0f32; 3 * config.rays]);
-        let mut alpha = vec![0f32; config.rays];
-        for (r, (seen, a)) in own.color.iter().zip(&own.alpha).enumerate() {
-            alpha[r] = *a;
-            for c in 0..3 {
-                color[c * config.rays + r] = seen[c];
-                if random {
-                    let i = (3 * r + c) as u64;
-                    behind[c * config.rays + r] = rng::uniform(seed, step << 4 | BEHIND, i);
-                }
-            }
-        }
-        let [color, alpha, background] = [&color, &alpha, &behind].map(|v| device.upload(v));
-        Batch { color, alpha, background, ..Batch::of_rays(device, &own.rays, config.rays) }
-    }
-
     /// Launches a step; waits for nothing.
     fn launch(&mut self, seed: u64, step: u64) {
-        if self.photographs.is_none() {
-            self.batch = self.drawn(seed, step);
-        }
-        let (device, config, there) = (&self.device, self.host.config, &self.there);
+        let (device, config, there) = (&self.device, self.host.config, self.there.as_ref());
+        let there = there.expect("made anew where it was dropped");
+        let detail = self.host.detail(step);
+        self.rays.draw(device, self.host.pixels, (seed, step), &self.wanted, &mut self.batch, detail);
         let (vm, batch, values) = (&there.vm, &self.batch, there.values());
-        if let Some(photographs) = &self.photographs {
-            photographs.draw(device, (seed, step), &self.wanted, batch);
-        }
         let composed = vm.render(device, values, batch);
         let white = config.background == VmBackground::Reference && over_white(seed, step);
         let behind = Behind { lift: f32::from(white), target: config.background == VmBackground::Random };
@@ -258,11 +279,11 @@ impl Learner for OnDevice<'_> {
     ) -> Result<(), StepError> {
         let state = &self.host.state;
         let state = VmState {
-            parameters: self.there.fetch(&self.device, &state.parameters)?,
+            parameters: self.there().fetch(&self.device, &state.parameters)?,
             mask: state.mask.clone(),
             ..*state
         };
-        let broken = self.device.fetch::<u32>(&self.there.broken)?[0] != 0;
+        let broken = self.device.fetch::<u32>(&self.there().broken)?[0] != 0;
         if broken || !state.is_finite() {
             return Err(self.host.not_finite("grid", f32::NAN, progress.step));
         }

@@ -6,7 +6,7 @@ use crate::field;
 use crate::field::ball::{self, StopAfter, hull, session, temporary};
 use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
-use crate::kernel::gpu::tests::device;
+use crate::kernel::gpu::tests::{device, lose_after};
 use crate::tface::train::train_one;
 use crate::tface::{FieldMean, TFace};
 use glam::Vec2;
@@ -140,7 +140,11 @@ fn rays_that_the_host_draws_in_order_give_the_losses_of_the_cpu() {
     for step in 0..6 {
         let progress = TrainingProgress { step, ..TrainingProgress::default() };
         let want = on_cpu.step(&progress).ok().unwrap().figures;
+        let before = there.device.counts();
         there.launch(there.host.seed(&progress), step);
+        let after = there.device.counts();
+        // what the host draws is sent there, and nothing is waited for
+        assert!(after.0 - before.0 <= 40 && after.1 == before.1);
         there.unread += 1;
         let got = there.report(step).ok().unwrap().figures;
         for ((name, got), (_, want)) in got.iter().zip(&want).take(2) {
@@ -151,4 +155,66 @@ fn rays_that_the_host_draws_in_order_give_the_losses_of_the_cpu() {
     let (counts, want) = (there.host.counts, on_cpu.counts);
     assert_eq!((counts.rays, counts.lattice), (want.rays, want.lattice));
     assert!(counts.color.abs_diff(want.color) < 10 && counts.density >= want.density);
+}
+
+#[test]
+fn a_device_that_is_lost_leaves_the_last_checkpoint_and_the_training_goes_on() {
+    if device().is_none() {
+        return;
+    }
+    let (views, config, dir) = (ball::views(), config(), temporary());
+    let pixels = pixels(&views, &config);
+    let train = |answers: usize, steps: u64| {
+        let stop = StopAfter::new(steps);
+        let session = session("tface", dir.path(), "ball", &stop as &dyn Monitor);
+        let session = TrainingSession { device: "wgpu:0", ..session };
+        lose_after(answers);
+        let done = train_one(&pixels, BOUNDS, Some(&hull()), &config, &session);
+        lose_after(usize::MAX);
+        done
+    };
+    assert!(train(usize::MAX, 25).err().unwrap().kind().is_stop());
+    let file = dir.path().join("checkpoint.safetensors");
+    let before = std::fs::read(&file).unwrap();
+    // where the grids grow at step 30, at the losses of step 50, and while the end is saved
+    for answers in [2, 10, 33] {
+        let e = train(answers, 1000).err().unwrap();
+        assert!(e.to_string().contains("failed: device lost") && e.kind() as i32 == 75, "{e}");
+        assert!(std::fs::read(&file).unwrap() == before, "the last checkpoint is touched after {answers}");
+    }
+    assert!(train(usize::MAX, 1000).is_ok());
+    // alone it comes to 19.27 dB
+    let got = psnr(&views, dir.path());
+    println!("{got:.2} dB after a device was lost");
+    assert!((got - 19.27).abs() < 0.2, "{got}");
+}
+
+#[test]
+fn a_device_with_too_little_memory_is_refused_before_the_first_step_and_told_what_fits() {
+    let Some(device) = device() else { return };
+    let (views, dir) = (ball::views(), temporary());
+    let refused = |config: &VmConfig, mib: u64| {
+        let pixels = pixels(&views, config);
+        let session = session("tface", dir.path(), "ball", &Quiet);
+        let device = self::device().unwrap().with_memory(mib << 20);
+        OnDevice::fits(&training(&pixels, config, &session), &device)
+    };
+    assert!(refused(&config(), 1024).unwrap(), "photographs lie there");
+    let e = refused(&config(), 512).err().unwrap();
+    assert!(e.to_string().contains("has room for 0 rays") && e.hint().contains("voxels_final"), "{e:?}");
+    // what is told fits, and one ray more does not
+    let many = VmConfig { rays: 1_000_000, ..config() };
+    let e = refused(&many, 2048).err().unwrap();
+    let most = e.hint().split(' ').find_map(|w| w.trim_end_matches(',').parse::<usize>().ok()).unwrap();
+    assert!(e.hint().starts_with("lower tface.rays to") && most > 1000, "{e:?}");
+    assert!(refused(&VmConfig { rays: most, ..config() }, 2048).is_ok());
+    assert!(refused(&VmConfig { rays: most + 1, ..config() }, 2048).is_err());
+    // what is counted is what is made, but for what is a matter of kilobytes
+    let field = training(&pixels(&views, &config()), &config(), &session("tface", dir.path(), "b", &Quiet))
+        .state
+        .field(&config(), true);
+    let [fixed, ray] = Vm::bytes(&device, &field);
+    println!("{} KiB of grids and gradients, {ray} bytes a ray", fixed >> 10);
+    // ‖(16, 16, 16)‖ = 27.7: 27 samples, of which the last is none, of 17 words each, and 34 words of the ray
+    assert_eq!((ray, Vm::widest(&field)), (4 * (26 * 17 + 34), 12 * 26));
 }

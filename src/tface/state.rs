@@ -83,12 +83,27 @@ impl VmState {
     /// Returns the field as the kernels see it. In training a ray has `‖size‖ / ratio` samples, else as many as the
     /// box's diagonal needs; both as published.
     pub fn field(&self, config: &VmConfig, training: bool) -> Arc<VmField> {
-        let mut field = FieldRecord::of(config).field(self.bounds, self.size, self.mask.clone());
+        Arc::new(self.field_of(config, self.size, training))
+    }
+
+    /// The same with grids of `size`.
+    pub fn field_of(&self, config: &VmConfig, size: [usize; 3], training: bool) -> VmField {
+        let mut field = FieldRecord::of(config).field(self.bounds, size, self.mask.clone());
         if training {
-            let vertices = self.size.iter().map(|&n| (n * n) as f32).sum::<f32>().sqrt();
+            let vertices = size.iter().map(|&n| (n * n) as f32).sum::<f32>().sqrt();
             field.lattice.samples = ((vertices / config.step_ratio as f32) as usize).min(1_000_000);
         }
-        Arc::new(field)
+        field
+    }
+
+    /// Vertices of the last grid, where the box stays as it is.
+    #[cfg(feature = "wgpu")]
+    pub fn last_size(&self, config: &VmConfig) -> [usize; 3] {
+        let extent = std::array::from_fn(|a| self.bounds[1][a] - self.bounds[0][a]);
+        size_for(
+            extent,
+            if config.upsample_steps.is_empty() { config.voxels_start } else { config.voxels_final },
+        )
     }
 
     /// Puts the state into a checkpoint. The optimizer's moments are left out of a finished one: nobody goes on

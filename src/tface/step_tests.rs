@@ -94,7 +94,7 @@ fn formulas(learner: &VmTraining, x: &[Var], step: u64) -> [Var; 3] {
     let of = Var::of;
     let (config, seed) = (learner.config, learner.session.seed);
     let field = learner.state.field(config, true);
-    let batch = learner.pixels.draw(seed, step, config.rays, true);
+    let batch = learner.pixels.draw(seed, step, config.rays, true, 0.0);
     let out = vm::render(&field, x, &batch.rays);
     let n = batch.rays.len();
     let white = config.background == VmBackground::Reference && rng::uniform(seed, step << 4 | 9, 0) < 0.5;
@@ -140,7 +140,7 @@ fn formulas(learner: &VmTraining, x: &[Var], step: u64) -> [Var; 3] {
 /// The third step, as it is by the formulas?
 fn agrees(config: &VmConfig) {
     let dir = temporary();
-    let views = masked_as_configured(&views(), config.masks);
+    let views = masked_as_configured(views(), config.masks);
     let pixels = Pixels::permuted(&views, config.foreground, BOX, config.depth_directions);
     let mut learner = learner(config, &pixels, dir.path());
     let progress = |step: u64| TrainingProgress { step, ..TrainingProgress::default() };

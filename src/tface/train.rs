@@ -11,7 +11,6 @@ use crate::field::ops::{self, GridPenalty, VmBatch};
 use crate::field::pixels::{Batch, Pixels, TrainView};
 use crate::field::training::{self, Learner, StepError, StepReport, TrainingSession};
 use crate::field::{self, Place};
-use crate::image::Gray;
 use crate::kernel::adam::AdamStep;
 use crate::kernel::march::Bitmask;
 use crate::kernel::rng;
@@ -107,10 +106,7 @@ pub(super) fn train_one(
     let place = field::place(session.device)?.or_processor(|place| match place {
         Place::Cpu(_) => Ok(()),
         #[cfg(feature = "wgpu")]
-        Place::Gpu(_) => OnDevice::knows(config).map_err(|what| {
-            let problem = format!("device `{}` knows no {what}", session.device);
-            Error::usage(problem, "train with `--device cpu`")
-        }),
+        Place::Gpu(gpu) => OnDevice::fits(&learner, &gpu.device).map(|_| ()),
     })?;
     let device = place.told();
     let (progress, warnings) = match place {
@@ -176,26 +172,24 @@ fn tv_fade(config: &VmConfig, step: u64) -> f64 {
     0.1f64.powf((step + 1) as f64 / config.steps as f64)
 }
 
+/// The share of a cell that is told apart: densities and colors change across a cell as its corners say, and outlines lie
+/// anywhere in it.
+pub(super) const DETAIL: f32 = 0.25;
+
 /// The views with their masks as the setting wants them.
-pub(super) fn masked_as_configured(views: &[TrainView], masks: MaskUse) -> Vec<TrainView> {
-    let change = |mask: &Gray| match masks {
-        MaskUse::None => None,
-        MaskUse::Soft => Some(mask.clone()),
-        MaskUse::Binary | MaskUse::Hard => {
-            let least = if masks == MaskUse::Hard { 128 } else { 1 };
-            let values = mask.values.iter().map(|&a| if a >= least { 255 } else { 0 }).collect();
-            Some(Gray { values, ..mask.clone() })
-        }
+pub(super) fn masked_as_configured(mut views: Vec<TrainView>, masks: MaskUse) -> Vec<TrainView> {
+    let least = match masks {
+        MaskUse::None | MaskUse::Soft => None,
+        MaskUse::Binary => Some(1),
+        MaskUse::Hard => Some(128),
     };
+    for view in &mut views {
+        view.mask = view.mask.take().filter(|_| masks != MaskUse::None);
+        if let (Some(mask), Some(least)) = (&mut view.mask, least) {
+            mask.values.iter_mut().for_each(|a| *a = if *a >= least { 255 } else { 0 });
+        }
+    }
     views
-        .iter()
-        .map(|v| TrainView {
-            camera: v.camera.clone(),
-            photo: v.photo.clone(),
-            mask: v.mask.as_ref().and_then(change),
-            valid: v.valid.clone(),
-        })
-        .collect()
 }
 
 impl Learner for VmTraining<'_> {
@@ -206,7 +200,7 @@ impl Learner for VmTraining<'_> {
         let config = self.config;
         let step = progress.step;
         let seed = self.seed(progress);
-        let mut batch = self.pixels.draw(seed, step, config.rays, true);
+        let mut batch = self.pixels.draw(seed, step, config.rays, true, self.detail(step));
         let field = self.state.field(config, true);
         let rays = std::mem::take(&mut batch.rays);
         self.counts.rays += rays.len() as u64;
@@ -278,9 +272,23 @@ impl<'a> VmTraining<'a> {
         VmTraining { config, session: *session, device, pixels, state, counts: Counts::default() }
     }
 
+    /// The stage, which is the table of its settings.
+    #[cfg(feature = "wgpu")]
+    pub fn stage(&self) -> &'static str {
+        self.session.stage
+    }
+
     /// The seed of a step: another one after a step that diverged.
     pub fn seed(&self, progress: &TrainingProgress) -> u64 {
         self.session.seed ^ progress.salt << 32
+    }
+
+    /// What a ray of a large photograph stands for at a step, scene units; a pixel in the second half.
+    pub fn detail(&self, step: u64) -> f32 {
+        let [low, high] = self.state.bounds;
+        let cell =
+            (0..3).map(|a| (high[a] - low[a]) / self.state.size[a] as f32).fold(f32::INFINITY, f32::min);
+        if 2 * step < self.config.steps { DETAIL * cell } else { 0.0 }
     }
 
     /// The error that something is not finite.

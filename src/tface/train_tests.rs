@@ -31,7 +31,7 @@ fn config() -> VmConfig {
 }
 
 fn run(config: &VmConfig, dir: &Path, monitor: &dyn Monitor) -> Result<TfaceReport> {
-    train(&views(), BOX, Some(&hull()), config, &session("baseline", dir, "ball", monitor))
+    train(views(), BOX, Some(&hull()), config, &session("baseline", dir, "ball", monitor))
 }
 
 #[test]
@@ -168,11 +168,11 @@ fn impossible_settings_and_empty_masks_are_named() {
     }
     let mut empty = views();
     empty.iter_mut().for_each(|v| v.mask.as_mut().unwrap().values.fill(0));
-    let end = train(&empty, BOX, Some(&hull()), &config(), &session("tface", dir.path(), "e", &Quiet));
+    let end = train(empty, BOX, Some(&hull()), &config(), &session("tface", dir.path(), "e", &Quiet));
     assert!(end.unwrap_err().to_string().starts_with("no training view has a pixel"));
     // a hull without a cell: the first alpha mask has nothing to keep
     let nothing = Bitmask::filled(32, false);
-    let end = train(&views(), BOX, Some(&nothing), &config(), &session("tface", dir.path(), "n", &Quiet));
+    let end = train(views(), BOX, Some(&nothing), &config(), &session("tface", dir.path(), "n", &Quiet));
     let e = end.unwrap_err();
     assert!(e.to_string().starts_with("the field is empty at step 40"), "{e}");
     assert!(e.hint().contains("tface.mask_threshold"), "{e:?}");
@@ -183,8 +183,7 @@ fn a_checkpoint_of_other_settings_is_refused() {
     let dir = temporary();
     let config = VmConfig { steps: 2, ..config() };
     run(&config, dir.path(), &Quiet).unwrap();
-    let views = views();
-    let again = train(&views, BOX, Some(&hull()), &config, &session("tface", dir.path(), "other", &Quiet));
+    let again = train(views(), BOX, Some(&hull()), &config, &session("tface", dir.path(), "other", &Quiet));
     let message = again.err().unwrap().to_string();
     assert!(message.contains("checkpoint.safetensors") && message.contains("other settings"), "{message}");
 }

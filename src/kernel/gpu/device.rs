@@ -6,7 +6,8 @@ use cubecl::device::{WgpuBackend, WgpuDevice, WgpuDeviceKind};
 use cubecl::features::AtomicUsage;
 use cubecl::ir::{ElemType, FloatKind, Type};
 use cubecl::prelude::{BufferArg, Client, CubeCount};
-use cubecl::server::{Handle, ServerError};
+use cubecl::server::Handle;
+use std::fmt::Display;
 use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -133,6 +134,13 @@ impl Device {
         }
     }
 
+    /// Bytes that a training may take: what there is but for what the driver and others keep. All that can be counted
+    /// where the driver does not say.
+    pub fn spare(&self) -> u64 {
+        const KEPT: u64 = 512 << 20;
+        self.memory.map_or(u64::MAX, |memory| memory.saturating_sub(KEPT))
+    }
+
     /// How this device adds.
     pub fn atomics(&self) -> Atomics {
         self.atomics
@@ -150,6 +158,12 @@ impl Device {
     /// The same device of which no more than so many bytes are to be taken.
     pub fn with_memory(self, bytes: u64) -> Device {
         Device { memory: Some(self.memory.map_or(bytes, |all| all.min(bytes))), ..self }
+    }
+
+    /// Gives memory back that nobody uses any more.
+    pub fn tidy(&self) {
+        // what cannot be given back now is so later
+        let _ = self.client.memory_cleanup();
     }
 
     /// Copies values to the device.
@@ -176,8 +190,10 @@ impl Device {
     /// no memory left. Of kind [`NotNow`](crate::ErrorKind::NotNow): nothing on the host is harmed.
     pub fn fetch<T: Pod>(&self, buffer: &Buffer) -> Result<Vec<T>> {
         self.readbacks.fetch_add(1, Ordering::Relaxed);
+        #[cfg(test)]
+        tests::answer().map_err(|e| self.failed(e))?;
         let read = self.client.read_one(buffer.handle.clone());
-        let bytes = read.map_err(|e| self.failed(&e))?;
+        let bytes = read.map_err(|e| self.failed(e))?;
         Ok(bytemuck::pod_collect_to_vec(&bytes[..buffer.words * 4]))
     }
 
@@ -198,7 +214,7 @@ impl Device {
         self.fetch(buffer).expect("the device answers")
     }
 
-    fn failed(&self, why: &ServerError) -> Error {
+    fn failed(&self, why: impl Display) -> Error {
         let why = why.to_string();
         let first = why.lines().next().unwrap_or_default();
         let hint =
@@ -230,6 +246,7 @@ pub(super) fn groups(count: usize) -> CubeCount {
 pub(crate) mod tests {
     use super::super::self_test::worst;
     use super::*;
+    use std::cell::Cell;
 
     pub(crate) use super::super::self_test::planes;
 
@@ -240,6 +257,23 @@ pub(crate) mod tests {
             println!("skipped: kernels on a GPU, for no adapter is here (Mesa's lavapipe would do)");
         }
         found
+    }
+
+    thread_local! {
+        /// Readbacks that this thread's devices still answer.
+        static ANSWERS: Cell<usize> = const { Cell::new(usize::MAX) };
+    }
+
+    /// Lets the devices of this thread answer so many readbacks and fail after that.
+    pub fn lose_after(readbacks: usize) {
+        ANSWERS.set(readbacks);
+    }
+
+    /// Does a device answer once more?
+    pub(super) fn answer() -> std::result::Result<(), &'static str> {
+        let left = ANSWERS.get();
+        ANSWERS.set(if left == usize::MAX { left } else { left.saturating_sub(1) });
+        if left > 0 { Ok(()) } else { Err("device lost (of a test)") }
     }
 
     /// Every way of adding that the device has.

@@ -6,19 +6,19 @@ use super::device::{Buffer, Device, groups};
 use super::rng::{below, stream, uniform};
 use crate::geom::{Camera, Projection};
 use crate::kernel::march::MarchRay;
-use crate::{Error, Result};
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
 
 /// Words that describe a photograph: pixels drawable up to and with it, box, its first pixel, whether color is over
-/// black already, focal lengths, principal point, lens, rotation by columns, position.
-const VIEW: usize = 36;
+/// black already, focal lengths, principal point, lens, rotation by columns, position, width of a pixel.
+const VIEW: usize = 37;
 /// Where its camera's begin.
 const CAMERA: usize = 7;
 const LENS: usize = CAMERA + 4;
 const ROTATION: usize = LENS + 13;
 const POSITION: usize = ROTATION + 9;
+const PIXEL: usize = POSITION + 3;
 
 /// Tries to meet a pixel worth drawing in its box.
 const TRIES: u32 = 256;
@@ -35,6 +35,8 @@ pub struct DrawnView {
     pub over_black: bool,
     /// A bit a pixel of the box, from the lowest of 32 on: is it drawn?
     pub drawable: Vec<u32>,
+    /// The width of a pixel at the scene's middle, scene units, where rays may stand for squares of pixels; else infinite.
+    pub pixel: f32,
 }
 
 impl DrawnView {
@@ -55,6 +57,7 @@ impl DrawnView {
         words.extend(bends.map(|v| (v as f32).to_bits()));
         words.extend(c.rotation.to_cols_array().map(|v| (v as f32).to_bits()));
         words.extend((c.position.as_vec3() * radius).to_array().map(f32::to_bits));
+        words.push(self.pixel.to_bits());
         words.try_into().expect("as many words as a view has")
     }
 }
@@ -157,10 +160,56 @@ fn undo(views: &[u32], lens: usize, xd: f32, yd: f32) -> Point {
     Point { x, y, found }
 }
 
-/// A channel of a pixel, 0 to 1.
+/// Sums over the drawable pixels of a square.
+#[derive(CubeType, Clone, Copy)]
+struct Square {
+    x: u32,
+    y: u32,
+    red: u32,
+    green: u32,
+    blue: u32,
+    alpha: u32,
+    count: u32,
+}
+
+/// The square around a pixel of a view's box, as wide as `detail` says; columns and rows count within the box.
 #[cube]
-fn channel(pixel: u32, #[comptime] shift: u32) -> f32 {
-    f32::cast_from((pixel >> shift) & 255) / 255.0f32
+fn square(
+    views: &[u32],
+    pixels: &[u32],
+    drawable: &[u32],
+    view: usize,
+    column: u32,
+    row: u32,
+    detail: f32,
+) -> Square {
+    let (x0, y0, width, height) = (views[view + 1], views[view + 2], views[view + 3], views[view + 4]);
+    let mut side = 1u32;
+    for _ in 0..3u32 {
+        let wider = f32::cast_from(2 * side) * number(views, view, PIXEL) <= detail;
+        side = select(wider, 2 * side, side);
+    }
+    // squares begin at multiples of their width in the whole photograph
+    let (left, top) = ((x0 + column) / side * side, (y0 + row) / side * side);
+    let mut sums = Square { x: 0u32, y: 0u32, red: 0u32, green: 0u32, blue: 0u32, alpha: 0u32, count: 0u32 };
+    for y in max(top, y0)..min(top + side, y0 + height) {
+        for x in max(left, x0)..min(left + side, x0 + width) {
+            let at = (views[view + 5] + (y - y0) * width + x - x0) as usize;
+            if (drawable[at >> 5] >> u32::cast_from(at & 31)) & 1 == 1 {
+                let pixel = pixels[at];
+                let alpha = pixel >> 24;
+                let share = select(views[view + 6] == 1, 255u32, alpha);
+                sums.x += x;
+                sums.y += y;
+                sums.red += share * (pixel & 255);
+                sums.green += share * ((pixel >> 8) & 255);
+                sums.blue += share * ((pixel >> 16) & 255);
+                sums.alpha += alpha;
+                sums.count += 1;
+            }
+        }
+    }
+    sums
 }
 
 /// The view of a drawable pixel: the first whose running count is beyond it.
@@ -200,6 +249,7 @@ fn draw_rays(
     shift_low: u32,
     behind_high: u32,
     behind_low: u32,
+    detail: f32,
     #[comptime] every: bool,
     #[comptime] shifted: bool,
     #[comptime] random: bool,
@@ -208,14 +258,14 @@ fn draw_rays(
     let r = ABSOLUTE_POS;
     if r < rays {
         let i = u32::cast_from(r);
-        let count = views.len() / VIEW;
+        let all = views.len() / VIEW;
         let view = if every {
-            below(view_high, view_low, i, u32::cast_from(count)) as usize
+            below(view_high, view_low, i, u32::cast_from(all)) as usize
         } else {
-            view_of(views, below(view_high, view_low, i, views[(count - 1) * VIEW]))
+            view_of(views, below(view_high, view_low, i, views[(all - 1) * VIEW]))
         };
         let view = view * VIEW;
-        let (x0, y0, width, height) = (views[view + 1], views[view + 2], views[view + 3], views[view + 4]);
+        let (width, height) = (views[view + 3], views[view + 4]);
         let mut found = false;
         // rejection inside the box: a head fills most of it
         let mut attempt = 0u32;
@@ -229,18 +279,28 @@ fn draw_rays(
         }
         let mut x = 0.0f32;
         let mut y = 0.0f32;
-        let mut at = 0usize;
+        let mut red = 0u32;
+        let mut green = 0u32;
+        let mut blue = 0u32;
+        let mut opaque = 0u32;
+        let mut count = 1u32;
         while attempt < last {
             let k = (i << 9) | (attempt << 1);
             let column = below(pixel_high, pixel_low, k, width);
             let row = below(pixel_high, pixel_low, k | 1, height);
             attempt += 1;
-            at = (views[view + 5] + row * width + column) as usize;
+            let at = (views[view + 5] + row * width + column) as usize;
             if (drawable[at >> 5] >> u32::cast_from(at & 31)) & 1 == 1 {
-                let xd = (f32::cast_from(x0 + column) + 0.5f32 - number(views, view, CAMERA + 2))
-                    / number(views, view, CAMERA);
-                let yd = (f32::cast_from(y0 + row) + 0.5f32 - number(views, view, CAMERA + 3))
-                    / number(views, view, CAMERA + 1);
+                let seen = square(views, pixels, drawable, view, column, row, detail);
+                red = seen.red;
+                green = seen.green;
+                blue = seen.blue;
+                opaque = seen.alpha;
+                count = seen.count;
+                let whole = f32::cast_from(count);
+                let (u, v) = (f32::cast_from(seen.x) / whole, f32::cast_from(seen.y) / whole);
+                let xd = (u + 0.5f32 - number(views, view, CAMERA + 2)) / number(views, view, CAMERA);
+                let yd = (v + 0.5f32 - number(views, view, CAMERA + 3)) / number(views, view, CAMERA + 1);
                 // pictures have y down
                 let d = undo(views, view + LENS, xd, yd);
                 x = d.x;
@@ -249,18 +309,13 @@ fn draw_rays(
                 last = select(found, 0u32, last);
             }
         }
-        let pixel = pixels[at];
-        let mut a = 0.0f32;
-        let mut share = 0.0f32;
-        if found {
-            a = channel(pixel, comptime!(24u32));
-            share = select(views[view + 6] == 1, 1.0f32, a);
-        }
-        alive[r] = select(found, 1u32, 0u32);
-        alpha[r] = a;
-        color[r] = share * channel(pixel, comptime!(0u32));
-        color[rays + r] = share * channel(pixel, comptime!(8u32));
-        color[2 * rays + r] = share * channel(pixel, comptime!(16u32));
+        let there = select(found, 1u32, 0u32);
+        let most = f32::cast_from(255 * count);
+        alive[r] = there;
+        alpha[r] = f32::cast_from(there * opaque) / most;
+        color[r] = f32::cast_from(there * red) / (255.0f32 * most);
+        color[rays + r] = f32::cast_from(there * green) / (255.0f32 * most);
+        color[2 * rays + r] = f32::cast_from(there * blue) / (255.0f32 * most);
         // cameras look along −Z
         let over = 1.0f32 / (x * x + y * y + 1.0f32).sqrt();
         #[unroll]
@@ -284,6 +339,14 @@ fn draw_rays(
             }
             background[c as usize * rays + r] = behind;
         }
+    }
+}
+
+#[cube(launch)]
+fn keep(wanted: &[u32], alive: &mut [u32]) {
+    let r = ABSOLUTE_POS;
+    if r < alive.len() && r >= wanted[0] as usize {
+        alive[r] = 0;
     }
 }
 
@@ -344,6 +407,12 @@ impl Batch {
     pub fn rays(&self) -> usize {
         self.jitter.words()
     }
+
+    /// Keeps so many of them, `[1]`: those behind are none.
+    pub fn keep(&self, device: &Device, wanted: &Buffer) {
+        let count = groups(self.rays().div_ceil(UNITS as usize));
+        keep::launch(device.launch(), count, CubeDim::new_1d(UNITS), wanted.arg(), self.alive.arg());
+    }
 }
 
 /// How rays are drawn.
@@ -355,6 +424,8 @@ pub struct Drawing {
     pub jitter: bool,
     /// A random color behind each ray, else black.
     pub background: bool,
+    /// Which random numbers of a step these are.
+    pub behind: u64,
 }
 
 /// Photographs on a device.
@@ -363,22 +434,15 @@ pub struct Photographs {
     pixels: Buffer,
     drawable: Buffer,
     drawing: Drawing,
-    behind: u64,
 }
 
 impl Photographs {
     /// Copies photographs there; the field's coordinates are the scene's times `radius`.
     ///
-    /// # Errors
-    ///
-    /// Where they do not fit into one buffer of the device.
-    ///
     /// # Panics
     ///
     /// Where no pixel is drawable, or 2³² pixels are.
-    pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: Drawing) -> Result<Photographs> {
-        let bytes = seen.iter().map(|view| 4 * view.pixels.len().next_multiple_of(32) as u64).sum();
-        Photographs::fit(device, bytes)?;
+    pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: Drawing) -> Photographs {
         let (mut views, mut pixels, mut drawable) = (Vec::new(), Vec::new(), Vec::new());
         let mut cumulative = 0u32;
         for view in seen {
@@ -395,37 +459,25 @@ impl Photographs {
         }
         assert!(cumulative > 0, "no pixel is drawable");
         let [views, pixels, drawable] = [views, pixels, drawable].map(|words| device.upload(&words));
-        Ok(Photographs { views, pixels, drawable, drawing, behind: 3 })
+        Photographs { views, pixels, drawable, drawing }
     }
 
-    /// Refuses photographs of so many bytes where a buffer of the device does not hold them.
-    pub fn fit(device: &Device, bytes: u64) -> Result<()> {
-        let room = device.limits().largest_buffer;
-        if bytes <= room {
-            return Ok(());
-        }
-        let mib = |bytes: u64| bytes.div_ceil(1 << 20);
-        let problem = format!(
-            "the photographs take {} MiB of the device `{}`, whose buffers hold {} MiB",
-            mib(bytes),
-            device.name(),
-            mib(room)
-        );
-        Err(Error::cannot(problem, "use `--set capture.downscale=2`, or `--device cpu`"))
-    }
-
-    /// The same with backgrounds of a step's random numbers `k`, not 3.
-    pub fn behind(self, k: u64) -> Photographs {
-        Photographs { behind: k, ..self }
-    }
-
-    /// Draws the rays of a step: a function of seed and step alone.
+    /// Draws the rays of a step: a function of seed and step alone. Of large photographs each stands for a square of
+    /// pixels no wider than `detail`.
     ///
     /// # Shapes
     ///
     /// - wanted: `[1]`, how many rays; those of `into` behind them are none
-    pub fn draw(&self, device: &Device, (seed, step): (u64, u64), wanted: &Buffer, into: &Batch) {
-        let [view, pixel, shift, behind] = [0, 1, 2, self.behind].map(|k| stream(seed, step << 4 | k));
+    pub fn draw(
+        &self,
+        device: &Device,
+        (seed, step): (u64, u64),
+        wanted: &Buffer,
+        into: &Batch,
+        detail: f32,
+    ) {
+        let [view, pixel, shift, behind] =
+            [0, 1, 2, self.drawing.behind].map(|k| stream(seed, step << 4 | k));
         assert!(into.rays() < 1 << 22, "the number of a try has 32 bits");
         draw_rays::launch(
             device.launch(),
@@ -450,6 +502,7 @@ impl Photographs {
             shift[1],
             behind[0],
             behind[1],
+            detail,
             self.drawing.every,
             self.drawing.jitter,
             self.drawing.background,

@@ -16,13 +16,18 @@ use std::ops::Range;
 /// Samples evaluated together: some two hundred megabytes of memory.
 const CAPACITY: usize = 1 << 17;
 
+/// The same where fewer points are asked for: planes are copied whole.
+const FEWER: [usize; 2] = [1 << 10, 1 << 14];
+
 /// Rays marched together.
 const RAYS: usize = 1 << 14;
 
 /// A field and what its evaluation needs.
 pub struct Evaluator {
     device: Device,
+    /// For [`CAPACITY`] samples, and for [`FEWER`].
     sdf: Sdf,
+    fewer: [Sdf; 2],
     table: Buffer,
     flat: Buffer,
     inv_s: Buffer,
@@ -47,8 +52,12 @@ impl Evaluator {
         inv_s: f32,
         [occupied, solid]: [Option<&Bitmask>; 2],
     ) -> Evaluator {
-        let mut sdf = Sdf::new(&device, shape, CAPACITY);
-        sdf.activate(shape.active);
+        let of = |capacity: usize| {
+            let mut sdf = Sdf::new(&device, shape, capacity);
+            sdf.activate(shape.active);
+            sdf
+        };
+        let (sdf, fewer) = (of(CAPACITY), FEWER.map(of));
         let everywhere = Bitmask::filled(2, true);
         Evaluator {
             table: device.upload(table),
@@ -56,6 +65,7 @@ impl Evaluator {
             inv_s: device.upload(&[inv_s]),
             occupancy: Occupancy::new(&device, occupied.unwrap_or(&everywhere), solid, shape.radius),
             sdf,
+            fewer,
             rays: None,
             device,
         }
@@ -79,12 +89,14 @@ impl Evaluator {
         let mut out = vec![Vec::with_capacity(x.len()); asked.len()];
         for first in (0..x.len()).step_by(CAPACITY) {
             let span = first..(first + CAPACITY).min(x.len());
-            let there = |rows: &[[f32; 3]]| device.upload(&planes(&rows[span.clone()], CAPACITY));
+            let mut sizes = FEWER.into_iter().zip(&self.fewer).chain([(CAPACITY, &self.sdf)]);
+            let (capacity, sdf) = sizes.find(|(c, _)| *c >= span.len()).expect("no span is longer");
+            let there = |rows: &[[f32; 3]]| device.upload(&planes(&rows[span.clone()], capacity));
             let at = there(x);
             let toward = direction.map(there);
             let normal = normal.map(there);
             let count = device.upload(&[span.len() as u32]);
-            let seen = self.sdf.shade(
+            let seen = sdf.shade(
                 device,
                 [&self.table, &self.flat],
                 &at,
@@ -92,8 +104,8 @@ impl Evaluator {
                 normal.as_ref(),
                 &count,
             );
-            let all = device.fetch_part(seen, asked.start * CAPACITY..asked.end * CAPACITY)?;
-            for (own, plane) in out.iter_mut().zip(all.chunks_exact(CAPACITY)) {
+            let all = device.fetch_part(seen, asked.start * capacity..asked.end * capacity)?;
+            for (own, plane) in out.iter_mut().zip(all.chunks_exact(capacity)) {
                 own.extend_from_slice(&plane[..span.len()]);
             }
         }
@@ -150,6 +162,14 @@ mod tests {
         let mut there =
             Evaluator::new(device, &shape, table.as_flattened(), &flat, 20.0, [Some(&mask), None]);
 
+        // one point, some, and more than a small batch holds
+        for n in [1, 700, 1100] {
+            let some: Vec<[f32; 3]> = x.iter().copied().cycle().take(n).collect();
+            let got = there.outputs(&some, None, None, 0..1).unwrap();
+            let want: Vec<f32> =
+                sdf::gradients(&shape, &table, &weights, &some).iter().map(|w| w.0).collect();
+            agree("distances of a few", &got[0], &want, 1e-4);
+        }
         let got = there.outputs(&x, None, None, 0..4).unwrap();
         let want = sdf::gradients(&shape, &table, &weights, &x);
         agree("distances", &got[0], &want.iter().map(|w| w.0).collect::<Vec<_>>(), 1e-4);

@@ -18,19 +18,17 @@ pub use losses::{Behind, MaskTerm, VmFigures, VmLosses};
 pub use renderer::VmRenderer;
 pub(super) use self_test::checks;
 
+use super::device::Atomics;
 use super::device::{Buffer, Device};
 use super::draw::Batch;
-use crate::kernel::vm::VmField;
+use crate::kernel::vm::{Grid, VmField};
 use march::{DeviceLattice, VmSamples};
 use rays::Along;
 
 /// Samples of a tile, of which all rooms are a multiple.
 const TILE: usize = 64;
 
-/// The most samples of a batch: what lies along rays that have more is not looked at. A mask leaves far fewer.
-const MOST: usize = 1 << 23;
-
-/// The same of a field that does not learn.
+/// The most samples of a pass through a field that does not learn: of rays that have more, fewer are taken.
 const SEEN: usize = 1 << 22;
 
 /// A field on a device, and room for a batch of rays.
@@ -60,14 +58,30 @@ impl Vm {
     /// For so many rays, whatever they meet; with room for gradients where it learns. The decoder must be one that
     /// [`DeviceDecoder::knows`].
     pub fn new(device: &Device, field: &VmField, rays: usize, learns: bool) -> Vm {
-        Vm::with_room(device, field, rays, if learns { MOST } else { SEEN }, learns)
+        Vm::with_room(device, field, rays, if learns { usize::MAX } else { SEEN }, learns)
+    }
+
+    /// Bytes that a field takes that learns: with values, moments and gradients, and for each ray of a batch. Rays have
+    /// room for all samples that they can have.
+    pub fn bytes(device: &Device, field: &VmField) -> [u64; 2] {
+        let floats = |grid: Grid| DeviceGrid::padded(grid).len() as u64;
+        let copies = if device.atomics() == Atomics::Fixed { 5 } else { 4 };
+        let grids = copies * (floats(field.density) + floats(field.color));
+        let products = DeviceGrid::padded(field.color).channels() * DeviceDecoder::CHUNK;
+        let samples = DeviceLattice::most(field) * (VmSamples::WORDS + Along::WORDS);
+        [4 * (grids + products as u64), 4 * (samples + Along::OF_RAY) as u64]
+    }
+
+    /// Bytes of the largest buffer for each ray of a batch.
+    pub fn widest(field: &VmField) -> u64 {
+        12 * DeviceLattice::most(field) as u64
     }
 
     /// With room for `most` samples at most.
     fn with_room(device: &Device, field: &VmField, rays: usize, most: usize, learns: bool) -> Vm {
         assert_eq!(field.density.size, field.color.size);
         let lattice = DeviceLattice::new(device, field);
-        let capacity = (rays * lattice.most).min(most).next_multiple_of(TILE);
+        let capacity = rays.saturating_mul(lattice.most).min(most).next_multiple_of(TILE);
         let color = DeviceGrid::new(device, field.color);
         Vm {
             density: DeviceGrid::new(device, field.density),

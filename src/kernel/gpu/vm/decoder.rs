@@ -24,9 +24,6 @@ use kernels::{backward, chain, forward, prepare, reduce};
 /// Groups that take tiles, one after the other, and sum gradients of weights, each over its own.
 const GROUPS: usize = 256;
 
-/// Samples whose gradients by products are there at once.
-const CHUNK: usize = 1 << 20;
-
 /// Where the matrices of a decoder stand, in rows of as many floats as a tile has channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct Plan {
@@ -110,6 +107,9 @@ pub struct DeviceDecoder {
 }
 
 impl DeviceDecoder {
+    /// Samples whose gradients by products are there at once.
+    pub const CHUNK: usize = 1 << 20;
+
     /// Can a device decode this? Else what it cannot.
     pub fn knows(shape: &DecoderShape) -> Result<(), &'static str> {
         if shape.view_frequencies > 0 || shape.feature_frequencies > 0 {
@@ -137,7 +137,7 @@ impl DeviceDecoder {
         }
         // a power of two, so that pieces are whole tiles
         let fits = (device.limits().largest_buffer as usize / (16 * plan.products()).max(1)).max(super::TILE);
-        let chunk = capacity.min(CHUNK).min(1 << fits.ilog2());
+        let chunk = capacity.min(Self::CHUNK).min(1 << fits.ilog2());
         let learned = |words: usize| device.scratch(if learns { words } else { 1 });
         let gradients = plan.gradients()[6] * plan.width();
         DeviceDecoder {

@@ -322,7 +322,7 @@ pub struct DeviceGrid {
 impl DeviceGrid {
     /// Of a grid.
     pub fn new(device: &Device, grid: Grid) -> DeviceGrid {
-        let padded = Grid { rank: grid.rank.map(|r| r.next_multiple_of(4)), ..grid };
+        let padded = DeviceGrid::padded(grid);
         let vectors = |f: Factor| (f.start / 4) as u32;
         let mut words: Vec<u32> = grid.size.map(|n| n as u32).to_vec();
         words.extend((0..3).map(|i| vectors(padded.plane(i))));
@@ -341,6 +341,11 @@ impl DeviceGrid {
             partial: device.scratch(3 * BOUNDING),
             whole: fixed.then(|| device.zeros(padded.len())),
         }
+    }
+
+    /// The grid with every term filled up.
+    pub fn padded(grid: Grid) -> Grid {
+        Grid { rank: grid.rank.map(|r| r.next_multiple_of(4)), ..grid }
     }
 
     /// Floats on the device.

@@ -204,10 +204,15 @@ impl DeviceLattice {
             sizes.extend(cells.map(|n| n.div_ceil(BLOCK) as u32));
             [mask.bits(), mask.blocks()].map(|bits| device.upload(&words(bits)))
         });
-        // as many as the diagonal has, and those that rounding adds
-        let diagonal = (0..3).map(|a| (l.max[a] - l.min[a]).powi(2)).sum::<f32>().sqrt();
-        let most = l.samples.saturating_sub(1).min((diagonal / l.step) as usize + 3).max(1);
+        let most = DeviceLattice::most(field);
         DeviceLattice { lattice: device.upload(&numbers), sizes: device.upload(&sizes), mask, most }
+    }
+
+    /// The most samples that a ray of a field can have: as many as the diagonal has, and those that rounding adds.
+    pub fn most(field: &VmField) -> usize {
+        let l = &field.lattice;
+        let diagonal = (0..3).map(|a| (l.max[a] - l.min[a]).powi(2)).sum::<f32>().sqrt();
+        l.samples.saturating_sub(1).min((diagonal / l.step) as usize + 3).max(1)
     }
 }
 
@@ -229,6 +234,9 @@ pub struct VmSamples {
 }
 
 impl VmSamples {
+    /// Words of a sample.
+    pub const WORDS: usize = 5;
+
     /// Room for so many rays and `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> VmSamples {
         VmSamples {

@@ -203,6 +203,11 @@ pub struct Along {
 }
 
 impl Along {
+    /// Words of a sample of a field that learns.
+    pub const WORDS: usize = 12;
+    /// Words of a ray: what is composited with gradients and terms, offsets, counts, and the ray itself.
+    pub const OF_RAY: usize = 2 * RAY_WIDTH + 24;
+
     /// Of so many rays and up to `capacity` samples of a field; with room for gradients where it learns.
     pub fn new(device: &Device, field: &VmField, rays: usize, capacity: usize, learns: bool) -> Along {
         let s = &field.shading;

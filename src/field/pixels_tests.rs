@@ -1,0 +1,210 @@
+//! Pixels that are drawn, on the processor and on a device.
+
+use super::*;
+
+fn view() -> TrainView {
+    let camera = Camera::above(20, 10, 20.0, 4.0);
+    let rgb = (0..200).map(|i| [i as u8, 0, 255]).collect();
+    let mut values = vec![0; 200];
+    values[5 * 20 + 8] = 255;
+    TrainView {
+        camera,
+        photo: Photo { width: 20, height: 10, rgb, alpha: None },
+        mask: Some(Gray { width: 20, height: 10, values }),
+        valid: None,
+    }
+}
+
+#[test]
+fn only_pixels_near_the_mask_are_drawn_and_carry_their_own_color() {
+    // margin = ceil(0.1 · 20 / 3) + 1 = 2: a square of 5 × 5 around (8, 5)
+    let views = [view()];
+    let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false);
+    assert_eq!(pixels.count(), 25);
+    let batch = pixels.draw(1, 2, 400, true, 0.0);
+    assert_eq!(batch.rays.len(), 400);
+    let mut head = 0;
+    for (ray, (color, alpha)) in batch.rays.iter().zip(batch.color.iter().zip(&batch.alpha)) {
+        let d = ray.direction;
+        let (x, y) = (d[0] / -d[2] * 20.0 + 10.0, d[1] / d[2] * 20.0 + 5.0);
+        assert!((x - 8.5).abs() < 2.01 && (y - 5.5).abs() < 2.01, "{x} {y}");
+        if *alpha > 0.0 {
+            // pixel (8, 5) is number 108 and has red 108
+            assert!((x - 8.5).abs() < 1e-3 && (y - 5.5).abs() < 1e-3);
+            assert!((color[0] * 255.0 - 108.0).abs() < 1e-3);
+            head += 1;
+        } else {
+            assert_eq!(*color, [0.0; 3]);
+        }
+    }
+    assert!(head > 4 && head < 40, "{head} of 400 should be about 16");
+}
+
+#[test]
+fn a_ray_of_a_large_photograph_stands_for_a_square_of_pixels_while_the_field_is_coarse() {
+    // a pixel is 4 / 20 = 0.2 wide at the middle: less than 0.3, so two of them for a detail of 0.5, not four
+    let views = [view()];
+    let large = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false).with_large(0.3);
+    let batch = large.draw(1, 2, 400, true, 0.5);
+    assert_eq!(batch.rays.len(), 400);
+    let mut head = 0;
+    for (ray, (color, alpha)) in batch.rays.iter().zip(batch.color.iter().zip(&batch.alpha)) {
+        let d = ray.direction;
+        let (x, y) = (d[0] / -d[2] * 20.0 + 10.0, d[1] / d[2] * 20.0 + 5.0);
+        // columns 6 to 10, rows 3 to 7: squares begin at even ones, and have their middle where they are drawable
+        let near = |v: f32, middles: &[f32]| middles.iter().any(|m| (v - m).abs() < 1e-3);
+        assert!(near(x, &[7.0, 9.0, 10.5]) && near(y, &[3.5, 5.0, 7.0]), "{x} {y}");
+        if *alpha > 0.0 {
+            // pixel (8, 5), red 108, is one of four
+            assert!(near(x, &[9.0]) && near(y, &[5.0]));
+            assert!(
+                (alpha - 0.25).abs() < 1e-6 && (color[0] * 255.0 - 27.0).abs() < 1e-3,
+                "{alpha} {color:?}"
+            );
+            head += 1;
+        }
+    }
+    // four of 25 pixels lie in that square
+    assert!((40..90).contains(&head), "{head} of 400 should be about 64");
+    // in the end, and where pixels are not that fine, every ray is a pixel
+    let small = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false).with_large(0.1);
+    for (pixels, detail) in [(&large, 0.0), (&small, 0.5)] {
+        assert_eq!(pixels.draw(1, 2, 400, true, detail).rays, large.draw(1, 2, 400, true, 0.3).rays);
+    }
+    assert_eq!([0.1f32, 0.2, 0.4, 0.9, 9.0].map(|detail| side(0.1, detail)), [1, 2, 4, 8, 8]);
+}
+
+#[test]
+fn a_view_without_a_mask_teaches_nothing_beside_views_with_one() {
+    let mut white = view();
+    white.mask.as_mut().unwrap().values.fill(255);
+    let views = [view(), TrainView { mask: None, ..view() }, white];
+    let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false);
+    assert_eq!(pixels.count(), 25);
+    // alone it is drawn from everywhere
+    let alone = [TrainView { mask: None, ..view() }];
+    assert_eq!(Pixels::new(&alone, 0.1, 1.0, Foreground::Photo, false).count(), 200);
+}
+
+#[test]
+fn a_permutation_has_every_number_once_and_another_order_for_every_key() {
+    for n in [1, 2, 3, 64, 65, 1000] {
+        let all = |key: u64| (0..n).map(|i| permuted(key, i, n)).collect::<Vec<u64>>();
+        let mut sorted = all(7);
+        sorted.sort_unstable();
+        assert_eq!(sorted, (0..n).collect::<Vec<u64>>());
+        assert!(n < 64 || all(7) != all(8));
+    }
+    // no order to be seen: neighbors are a third of 1000 apart on average
+    let all: Vec<u64> = (0..1000).map(|i| permuted(3, i, 1000)).collect();
+    let apart = all.windows(2).map(|w| w[0].abs_diff(w[1])).sum::<u64>() as f64 / 999.0;
+    assert!((apart - 333.0).abs() < 30.0, "{apart}");
+}
+
+#[test]
+fn an_epoch_has_every_valid_pixel_that_meets_the_box_once_with_directions_of_depth_one() {
+    let mut one = view();
+    let mut valid = vec![255; 200];
+    valid[7 * 20 + 9] = 0;
+    one.valid = Some(Gray { width: 20, height: 10, values: valid });
+    let views = [one, view()];
+    // pixels are 1/20 apart at depth 1. The near face at z = 1 is 3 away: |x − 10| < 1.5 · 20 / 3 = 10 has all
+    // columns, |y − 5| < 0.4 · 20 / 3 = 2.67 the six rows with centers 0.5, 1.5 and 2.5 off the middle
+    let bounds = [[-1.5, -0.4, -1.0], [1.5, 0.4, 1.0]];
+    let pixels = Pixels::permuted(&views, Foreground::Photo, bounds, true);
+    assert_eq!(pixels.count(), 2 * 20 * 6 - 1);
+    // 239 pixels in batches of 50: four a round, and a tail that is left out
+    let mut seen = Vec::new();
+    for step in 0..4 {
+        let batch = pixels.draw(1, step, 50, false, 0.0);
+        assert_eq!(batch.rays.len(), 50);
+        for (ray, color) in batch.rays.iter().zip(&batch.color) {
+            assert!((ray.direction[2] + 1.0).abs() < 1e-6, "{ray:?}");
+            let (x, y) = (ray.direction[0] * 20.0 + 9.5, 4.5 - ray.direction[1] * 20.0);
+            assert!((x - x.round()).abs() < 1e-4 && (2.0..=7.0).contains(&y.round()), "{x} {y}");
+            seen.push((y.round() as u64 * 20 + x.round() as u64, *color));
+        }
+    }
+    let count = |p: u64| seen.iter().filter(|(q, _)| *q == p).count();
+    assert!((0..200).all(|p| count(p) <= 2) && count(7 * 20 + 9) <= 1 && seen.len() == 200);
+    // pixel (8, 5), number 108, is head
+    let head = seen.iter().filter(|(p, _)| *p == 108);
+    assert!(head.clone().count() > 0 && head.clone().all(|(_, c)| (c[0] * 255.0 - 108.0).abs() < 1e-3));
+    let first = pixels.draw(1, 0, 50, false, 0.0).rays;
+    assert!(
+        first == pixels.draw(1, 0, 50, false, 0.0).rays && first != pixels.draw(1, 4, 50, false, 0.0).rays
+    );
+    // more than there are: all of them, once
+    assert_eq!(pixels.draw(1, 9, 1000, false, 0.0).rays.len(), 239);
+}
+
+#[test]
+fn published_sampling_draws_the_whole_frame_of_every_view_as_often() {
+    let views = [view(), view()];
+    let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, true);
+    let batch = pixels.draw(1, 2, 2000, false, 0.0);
+    assert_eq!(batch.rays.len(), 2000);
+    let left = batch.rays.iter().filter(|r| r.direction[0] < 0.0).count();
+    assert!((900..1100).contains(&left), "{left}");
+    // one pixel of 200 is head
+    let head = batch.alpha.iter().filter(|&&a| a > 0.0).count();
+    assert!((2..25).contains(&head), "{head}");
+}
+
+#[cfg(feature = "wgpu")]
+#[test]
+fn a_device_draws_the_same_rays() {
+    use crate::geom::{Distortion, Projection};
+    use crate::kernel::gpu::tests::{agree, device, planes};
+    let Some(device) = device() else { return };
+    let bent = |distortion: Distortion| {
+        let mut view = view();
+        view.camera.distortion = distortion;
+        view.camera.rotation = glam::DMat3::from_rotation_y(0.4) * glam::DMat3::from_rotation_x(-0.2);
+        view.mask.as_mut().unwrap().values.iter_mut().enumerate().for_each(|(i, v)| *v = 40 + i as u8);
+        view.valid =
+            Some(Gray { width: 20, height: 10, values: (0..200).map(|i| (i % 7 > 1) as u8).collect() });
+        view
+    };
+    let perspective =
+        Distortion { k1: -0.2, k2: 0.05, k4: 0.1, p1: 0.01, p2: -0.02, sx1: 0.003, ..Distortion::default() };
+    let fisheye = Distortion { k1: 0.02, k4: -0.01, projection: Projection::Fisheye, ..perspective };
+    let fov = Distortion { omega: 0.9, projection: Projection::Fov, ..Distortion::default() };
+    let empty = TrainView { mask: None, ..view() };
+    let views = [view(), bent(perspective), empty, bent(fisheye), bent(fov)];
+    // the last with squares of two pixels for a ray, a twentieth of the distance 4 wide each
+    for (foreground, published, detail) in [
+        (Foreground::Estimated, false, 0.0),
+        (Foreground::Photo, true, 0.0),
+        (Foreground::Estimated, false, 0.5),
+    ] {
+        let pixels = Pixels::new(&views, 0.1, 0.3, foreground, published).with_large(0.3);
+        let drawing = gpu::Drawing { every: published, jitter: !published, background: true, behind: 3 };
+        let there = pixels.on_device(&device, drawing);
+        let batch = gpu::Batch::new(&device, 2050);
+        let (seed, step) = (77, 1 << 33);
+        there.draw(&device, (seed, step), &device.upload(&[2000u32]), &batch, detail);
+        let want = pixels.draw(seed, step, 2000, !published, detail);
+        let alive = device.read::<u32>(&batch.alive);
+        assert!(alive[2000..].iter().all(|&a| a == 0));
+        let kept: Vec<usize> = (0..2050).filter(|&r| alive[r] == 1).collect();
+        // published: pixels that are not valid leave a gap
+        assert_eq!((kept.len(), kept.len() < 2000), (want.rays.len(), published));
+        let take = |buffer: &gpu::Buffer, planes: usize| -> Vec<f32> {
+            let all = device.read::<f32>(buffer);
+            (0..planes)
+                .flat_map(|k| kept.iter().map(move |r| (k, *r)))
+                .map(|(k, r)| all[k * 2050 + r])
+                .collect()
+        };
+        let n = want.rays.len();
+        let turned = |f: fn(&MarchRay) -> [f32; 3]| planes(&want.rays.iter().map(f).collect::<Vec<_>>(), n);
+        agree("drawn origins", &take(&batch.origin, 3), &turned(|r| r.origin), 1e-6);
+        agree("drawn directions", &take(&batch.direction, 3), &turned(|r| r.direction), 1e-5);
+        agree("drawn colors", &take(&batch.color, 3), &planes(&want.color, n), 1e-6);
+        assert_eq!(take(&batch.alpha, 1), want.alpha);
+        assert_eq!(take(&batch.jitter, 1), want.rays.iter().map(|r| r.jitter).collect::<Vec<_>>());
+        let behind = device.read::<f32>(&batch.background);
+        assert_eq!(behind[2050 + 9], rng::uniform(seed, step << 4 | 3, 3 * 9 + 1));
+    }
+}
