@@ -210,7 +210,9 @@ impl Experiment {
         let mut out = format!(
             "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><link rel=\"icon\" href=\"data:,\">\
              <title>experiment · tiface</title><style>\n{}\n.wide {{ overflow-x: auto }}\n.wide th {{ white-space: normal; \
-             vertical-align: bottom; font-weight: 500 }}\n.wide th:first-child {{ min-width: 12rem }}\n\
+             overflow-wrap: normal; vertical-align: bottom; font-weight: 500 }}\n.wide th:first-child {{ white-space: nowrap \
+             }}\n.wide tr:first-child th {{ min-width: 4.5rem }}\n.wide th, .wide td {{ \
+             padding-inline: .5rem }}\n\
              .rows {{ display: flex; flex-wrap: wrap; gap: 1rem; margin-top: 1rem }}\n.rows figure {{ margin: 0; \
              max-width: 12rem }}\n.rows img {{ max-width: 100%; max-height: 14rem }}\n</style></head><body>\n<h1>The paper's experiment</h1><p>{}</p>\n",
             STYLE,
