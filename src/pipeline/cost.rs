@@ -57,7 +57,7 @@ impl Line<'_> {
             }
             Stage::Iface => {
                 let samples = (iface.steps as usize * iface.samples) as f64;
-                let table = (iface.levels as u64 * 2 << iface.log2_table.min(32)) as f64;
+                let table = ((iface.levels as u64 * 2) << iface.log2_table.min(32)) as f64;
                 let cpu_s = 2.0 + 5e-6 * samples + 2e-9 * table * iface.steps as f64 + 4e-6 * all;
                 (cpu_s, 80.0 + 4e-6 * all + 20e-6 * table + 2e-3 * iface.samples as f64)
             }
