@@ -1,8 +1,45 @@
 //! The `tiface` binary: parse, run, exit code; nothing else.
 
-/// Training allocates and frees the same large blocks every step; this returns them to the system late.
+use mimalloc::MiMalloc;
+use std::alloc::{GlobalAlloc, Layout};
+
+/// Training allocates and frees the same large blocks every step; mimalloc returns them to the system late. Where there
+/// is no memory, the process ends with a sentence instead of an abort.
+struct Allocator;
+
 #[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+static ALLOCATOR: Allocator = Allocator;
+
+// SAFETY: every call is mimalloc's own, and what it returns is handed on as it is.
+unsafe impl GlobalAlloc for Allocator {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        // SAFETY: as the caller promises.
+        there(unsafe { MiMalloc.alloc(layout) }, layout.size())
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        // SAFETY: as the caller promises.
+        there(unsafe { MiMalloc.alloc_zeroed(layout) }, layout.size())
+    }
+
+    unsafe fn realloc(&self, place: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        // SAFETY: as the caller promises.
+        there(unsafe { MiMalloc.realloc(place, layout, size) }, size)
+    }
+
+    unsafe fn dealloc(&self, place: *mut u8, layout: Layout) {
+        // SAFETY: as the caller promises.
+        unsafe { MiMalloc.dealloc(place, layout) }
+    }
+}
+
+#[inline]
+fn there(place: *mut u8, bytes: usize) -> *mut u8 {
+    if place.is_null() {
+        tiface::cli::out_of_memory(bytes);
+    }
+    place
+}
 
 fn main() -> std::process::ExitCode {
     // a library below the graphics drivers complains on stderr, once an adapter, where there is no desktop

@@ -48,6 +48,7 @@ use preview::PreviewOptions;
 use run::LineCommand;
 use screen::Screen;
 use status::StatusOptions;
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use target::RunTarget;
@@ -448,6 +449,19 @@ processor alone, and no --model.")]
         /// What for
         form: Form,
     },
+}
+
+/// Ends the process where memory for so many bytes cannot be had. Nothing is allocated on the way, and nothing is lost
+/// that a kill would have kept.
+#[cold]
+pub fn out_of_memory(bytes: usize) -> ! {
+    let _ = writeln!(
+        std::io::stderr(),
+        "error: out of memory: {bytes} bytes more cannot be had\n\n\
+         hint: free memory, or lower `capture.downscale`, `mesh.resolution` or the `rays` of a field; what is complete \
+         is kept: repeat the command to continue"
+    );
+    signal_hook::low_level::exit(crate::ErrorKind::NotNow.code().into())
 }
 
 /// Parses the command line, does what it says, and gives the exit code.

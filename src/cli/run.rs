@@ -158,7 +158,12 @@ fn configure(common: &Common, command: &LineCommand) -> Result<Config> {
         // a new preset starts over, but on the same photographs
         remember(&Common::default().resolve(Some(saved), None, &[])?.capture.path);
     }
-    let config = common.resolve(target.saved.as_deref(), *fallback, &keys)?;
+    let mut config = common.resolve(target.saved.as_deref(), *fallback, &keys)?;
+    // the run remembers it from anywhere
+    if let Some(path) = io::real_path(Path::new(&config.capture.path)).ok().as_deref().and_then(Path::to_str)
+    {
+        config.capture.path = path.into();
+    }
     if config.capture.path.is_empty() {
         return Err(Error::usage("no capture is named", "name one: `tiface run CAPTURE`"));
     }

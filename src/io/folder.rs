@@ -224,28 +224,34 @@ impl Lock {
     /// Takes the lock `path` without waiting. The file stays when the lock is freed: removing it
     /// would let two processes lock two files of the same name. A link is an error.
     pub fn take(path: &Path) -> Result<Lock, LockError> {
-        let fail = |source| LockError::Io { path: path.into(), source };
-        if is_link(path) {
-            return Err(fail(linked()));
-        }
-        let file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .open(path)
-            // another user's: it can be locked all the same
-            .or_else(|e| match e.kind() {
-                std::io::ErrorKind::PermissionDenied => File::open(path),
-                _ => Err(e),
-            })
-            .map_err(fail)?;
+        let file = lock_file(path)?;
         match file.try_lock() {
             Ok(()) => Ok(Lock { _file: file }),
             Err(TryLockError::WouldBlock) => Err(LockError::Held { path: path.into() }),
-            Err(TryLockError::Error(e)) => Err(fail(e)),
+            Err(TryLockError::Error(source)) => Err(LockError::Io { path: path.into(), source }),
         }
     }
+
+    /// [`Lock::take`] that waits for whoever holds it: for locks that are held for moments.
+    pub fn wait(path: &Path) -> Result<Lock, LockError> {
+        let file = lock_file(path)?;
+        file.lock().map_err(|source| LockError::Io { path: path.into(), source })?;
+        Ok(Lock { _file: file })
+    }
+}
+
+fn lock_file(path: &Path) -> Result<File, LockError> {
+    let fail = |source| LockError::Io { path: path.into(), source };
+    if is_link(path) {
+        return Err(fail(linked()));
+    }
+    let open = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path);
+    // another user's: it can be locked all the same
+    let readable = open.or_else(|e| match e.kind() {
+        std::io::ErrorKind::PermissionDenied => File::open(path),
+        _ => Err(e),
+    });
+    readable.map_err(fail)
 }
 
 #[cfg(test)]

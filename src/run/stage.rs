@@ -255,6 +255,14 @@ fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<()> {
         return Ok(());
     }
     let (stage, state) = (plan.name, if done { "done" } else { "begun" });
+    if differences == ["capture: has changed since"] {
+        let what = format!("stage `{stage}` was {state} with other photographs, masks or cameras");
+        let hint = format!(
+            "say where those lie with `--set capture.path=FOLDER`, choose another folder with `--run DIR`, or recompute \
+             this stage and what follows with `--fresh {stage}`"
+        );
+        return Err(Error::cannot(what, hint));
+    }
     let problem = format!("stage `{stage}` was {state} with other settings:\n  {}", differences.join("\n  "));
     Err(Error::cannot(
         problem,

@@ -1,0 +1,163 @@
+//! What happens around a run: two processes at once, a clock that jumps, a run that may not be written, a capture that
+//! changes, moves or comes along to another machine, few open files, little memory.
+#![cfg(all(feature = "cpu", target_os = "linux"))]
+
+mod tiny;
+
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use tiny::{capture, copy, files, said, same, shim, tiface};
+
+fn done(output: &Output) {
+    assert!(output.status.success(), "{:?}: {}", output.status, said(output));
+}
+
+/// The program under a shell's limit, such as `ulimit -n 32`.
+fn limited(limit: &str, command: &Command) -> Output {
+    let script = format!("{limit} && exec \"$0\" \"$@\"");
+    let mut shell = Command::new("sh");
+    shell.args(["-c", &script]).arg(command.get_program()).args(command.get_args());
+    shell.current_dir(command.get_current_dir().unwrap());
+    shell.envs(command.get_envs().filter_map(|(k, v)| Some((k, v?)))).output().unwrap()
+}
+
+#[test]
+fn two_processes_at_once_make_every_stage_once() {
+    let dir = tempfile::tempdir().unwrap();
+    capture(dir.path());
+    for stage in tiface::pipeline::Stage::ALL {
+        let stage = stage.word();
+        done(&tiface(dir.path(), &[stage, "head", "--run", "calm"]).output().unwrap());
+        let start = || {
+            let mut command = tiface(dir.path(), &[stage, "head", "--run", "raced"]);
+            command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
+        };
+        let both = [start(), start()].map(|child| child.wait_with_output().unwrap());
+        // one works; the other is told so, or comes when all is done
+        assert!(
+            both.iter().any(|o| o.status.success()),
+            "{stage}: {}",
+            both.iter().map(said).collect::<String>()
+        );
+        for output in &both {
+            assert!([Some(0), Some(75)].contains(&output.status.code()), "{stage}: {}", said(output));
+        }
+        same(&files(&dir.path().join("calm")), &files(&dir.path().join("raced")), stage);
+    }
+}
+
+#[test]
+fn a_clock_that_jumps_changes_no_product() {
+    let dir = tempfile::tempdir().unwrap();
+    let Some(shim) = shim(dir.path()) else { return };
+    capture(dir.path());
+    done(&tiface(dir.path(), &["run", "head", "--run", "calm"]).output().unwrap());
+    let mut command = tiface(dir.path(), &["run", "head", "--run", "jumped"]);
+    done(&command.env("LD_PRELOAD", shim).env("FAULT_CLOCK", "1").output().unwrap());
+    same(&files(&dir.path().join("calm")), &files(&dir.path().join("jumped")), "a jumping clock");
+    let status = std::fs::read_to_string(dir.path().join("jumped/mask/status.json")).unwrap();
+    let status: serde_json::Value = serde_json::from_str(&status).unwrap();
+    let now = std::time::UNIX_EPOCH.elapsed().unwrap().as_secs();
+    assert!(
+        now.abs_diff(status["updated"].as_u64().unwrap()) > 100_000_000,
+        "the clock was not asked: {status}"
+    );
+}
+
+#[test]
+fn a_run_that_may_not_be_written_is_read_and_nothing_else() {
+    let dir = tempfile::tempdir().unwrap();
+    let head = capture(dir.path());
+    let nobody = |words: &[&str]| {
+        let command = tiface(dir.path(), words);
+        let mut user = Command::new("setpriv");
+        user.args(["--reuid=65534", "--regid=65534", "--clear-groups"]);
+        user.arg(command.get_program()).args(command.get_args()).current_dir(dir.path());
+        user.envs(command.get_envs().filter_map(|(k, v)| Some((k, v?)))).output()
+    };
+    let open = Command::new("chmod").args(["-R", "a+rX,go-w"]).arg(dir.path()).status();
+    assert!(open.unwrap().success());
+    if !nobody(&["inspect", "head"]).is_ok_and(|o| o.status.success()) {
+        eprintln!("skipped: the program cannot be run as another user here");
+        return;
+    }
+    done(&tiface(dir.path(), &["run", "head", "--run", "run"]).output().unwrap());
+    let before = files(&dir.path().join("run"));
+    for words in [&["run", "run"][..], &["status", "run"], &["preview", "run", "--size", "32"]] {
+        let output = nobody(words).unwrap();
+        assert!(output.status.success() || words[0] == "preview", "{words:?}: {}", said(&output));
+        assert!([Some(0), Some(1)].contains(&output.status.code()), "{words:?}: {}", said(&output));
+    }
+    for words in [&["run", "run", "--fresh", "mesh"][..], &["mask", "head", "--run", "new"]] {
+        let output = nobody(words).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{words:?}: {}", said(&output));
+        assert!(said(&output).contains("ermission denied"), "{}", said(&output));
+    }
+    assert!(before == files(&dir.path().join("run")) && head.is_dir());
+}
+
+#[test]
+fn a_capture_that_changed_or_moved_under_a_run_is_named_with_its_key() {
+    let dir = tempfile::tempdir().unwrap();
+    let head = capture(dir.path());
+    done(&tiface(dir.path(), &["iface", "head", "--run", "run"]).output().unwrap());
+    let mesh = |folder: &Path, more: &[&str]| {
+        let mut words = vec!["mesh", "run"];
+        words.extend(more);
+        Command::new(env!("CARGO_BIN_EXE_tiface"))
+            .args(words)
+            .current_dir(folder)
+            .env("XDG_CONFIG_HOME", folder)
+            .output()
+            .unwrap()
+    };
+    let refused = |output: Output, what: &str| {
+        let text = said(&output);
+        assert_eq!(output.status.code(), Some(1), "{text}");
+        assert!(text.contains(what) && text.contains("--set capture.path=FOLDER"), "{text}");
+    };
+    let old = copy(&head, &dir.path().join("old"));
+    std::fs::copy(head.join("images/001.png"), head.join("images/000.png")).unwrap();
+    refused(mesh(dir.path(), &[]), "other photographs, masks or cameras");
+    std::fs::remove_dir_all(&head).unwrap();
+    refused(mesh(dir.path(), &[]), "cannot be opened");
+
+    // both on another machine: one key, once, and the run remembers it from anywhere
+    let other = dir.path().join("other");
+    std::fs::create_dir(&other).unwrap();
+    std::fs::rename(old, other.join("photographs")).unwrap();
+    std::fs::rename(dir.path().join("run"), other.join("run")).unwrap();
+    refused(mesh(&other, &[]), "cannot be opened");
+    done(&mesh(&other, &["--set", "capture.path=photographs"]));
+    let output = Command::new(env!("CARGO_BIN_EXE_tiface"))
+        .args(["ensemble", "other/run", "--members", "baseline,tface", "--weights", "0.5,0.5"])
+        .args(["--set", "render.method=baseline,tface"])
+        .current_dir(dir.path())
+        .env("XDG_CONFIG_HOME", dir.path())
+        .output()
+        .unwrap();
+    done(&output);
+}
+
+#[test]
+fn few_open_files_and_little_memory_end_in_a_product_or_a_sentence() {
+    let dir = tempfile::tempdir().unwrap();
+    capture(dir.path());
+    let run = |name: &str| {
+        let mut command = tiface(dir.path(), &["run", "head", "--run", name]);
+        command.env("RAYON_NUM_THREADS", "2");
+        command
+    };
+    done(&limited("ulimit -n 32", &run("calm")));
+    let gib = |n: u32| format!("ulimit -v {}", n << 20);
+    let output = limited(&gib(2), &run("two"));
+    done(&output);
+    same(&files(&dir.path().join("calm")), &files(&dir.path().join("two")), "in 2 GiB");
+    // so much more than there is: the sentence, and then all the same a run
+    let large =
+        limited(&gib(2), run("large").args(["--set", "iface.levels=16", "--set", "iface.log2_table=24"]));
+    let text = said(&large);
+    assert_eq!(large.status.code(), Some(75), "{text}");
+    assert!(text.contains("error: out of memory: ") && text.contains("hint: "), "{text}");
+    done(&limited(&gib(2), run("large").args(["--fresh", "iface"])));
+}

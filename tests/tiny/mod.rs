@@ -1,0 +1,103 @@
+//! The smallest run, its files, and the library that gets in the way of its writes.
+#![allow(dead_code)]
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+
+const SETTINGS: &str = "device=cpu mask.source=none iface.steps=4 iface.rays=64 iface.max_rays=128 \
+    iface.samples=1024 iface.levels=4 iface.log2_table=10 iface.occupancy_resolution=16 iface.stereo=0 \
+    tface.steps=4 tface.fields=2 tface.rays=64 tface.voxels_start=512 tface.voxels_final=1728 \
+    tface.upsample_steps=1,2 tface.mask_steps=1,2 baseline.steps=2 baseline.rays=64 mesh.resolution=32 \
+    mesh.triangles=300 mesh.texture_px=64 mesh.format=glb,obj mesh.hair=none render.samples=1 \
+    render.method=baseline,tface,volume,textured ensemble.members=tface,volume ensemble.weights=0.8,0.2";
+
+pub type Files = BTreeMap<PathBuf, Vec<u8>>;
+
+/// Six photographs in `folder/head`.
+pub fn capture(folder: &Path) -> PathBuf {
+    let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
+    write_capture(&folder.join("head"), &options).unwrap();
+    folder.join("head")
+}
+
+/// The program with these words in a folder, and the settings of the smallest run.
+pub fn tiface(folder: &Path, words: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tiface"));
+    command.args(words).current_dir(folder).env("XDG_CONFIG_HOME", folder).env_remove("RUST_LOG");
+    if !["report", "convert", "preview"].contains(&words[0]) {
+        command.args(["--preset", "draft"]);
+        for setting in SETTINGS.split_whitespace() {
+            command.args(["--set", setting]);
+        }
+    }
+    command
+}
+
+/// Compiles `fault/fault.c`; `None`, said aloud, without a compiler.
+pub fn shim(folder: &Path) -> Option<PathBuf> {
+    let shim = folder.join("fault.so");
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fault/fault.c");
+    match Command::new("cc").args(["-shared", "-fPIC", "-o"]).args([&shim, &source]).arg("-ldl").status() {
+        Ok(status) => {
+            assert!(status.success(), "the library does not compile");
+            Some(shim)
+        }
+        Err(_) => {
+            eprintln!("skipped: no `cc` to compile a library that lets writes fail");
+            None
+        }
+    }
+}
+
+pub fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// All files with their bytes; what tells when things happened without it.
+pub fn files(folder: &Path) -> Files {
+    fn walk(folder: &Path, root: &Path, found: &mut Files) {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                walk(&path, root, found);
+            } else if path.file_name().is_some_and(|n| n != ".lock") {
+                found.insert(path.strip_prefix(root).unwrap().into(), std::fs::read(&path).unwrap());
+            }
+        }
+    }
+    let mut found = Files::new();
+    walk(folder, folder, &mut found);
+    found
+}
+
+pub fn name(file: &Path) -> &str {
+    file.file_name().unwrap().to_str().unwrap()
+}
+
+/// Do the bytes tell times, which are others in every run?
+pub fn is_timed(file: &Path) -> bool {
+    ["done.json", "status.json", "log.jsonl", "report.html", "page.html"].contains(&name(file))
+}
+
+/// Files of two folders with the same names and, but for times, the same bytes.
+pub fn same(new: &Files, found: &Files, what: &str) {
+    // beside a run, nobody may know whose it is
+    let counts = |f: &&PathBuf| f.starts_with("run") || !name(f).ends_with(".tmp");
+    let names = |files: &Files| files.keys().filter(counts).cloned().collect::<Vec<_>>();
+    assert_eq!(names(new), names(found), "{what}, repeated");
+    for (file, bytes) in new.iter().filter(|(file, _)| !is_timed(file)) {
+        assert!(found[file] == *bytes, "{what}, repeated: {} differs", file.display());
+    }
+}
+
+/// A copy of a folder in the place of whatever is there.
+pub fn copy(from: &Path, to: &Path) -> PathBuf {
+    if to.exists() {
+        std::fs::remove_dir_all(to).unwrap();
+    }
+    let status = Command::new("cp").arg("-r").arg(from).arg(to).status().unwrap();
+    assert!(status.success());
+    to.into()
+}
