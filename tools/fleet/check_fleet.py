@@ -87,6 +87,14 @@ def processes(words):
     return found
 
 
+def runs_program(pid, program):
+    """Is a process, if it is still there, the program itself and no shell around it?"""
+    try:
+        return Path(os.readlink(f"/proc/{pid}/exe")) == program
+    except OSError:
+        return False
+
+
 def kill(pids):
     killed = 0
     for pid in pids:
@@ -197,7 +205,7 @@ def main():
         if time.monotonic() < next_kill:
             continue
         tasks = processes([str(tiface), "--run", str(runs)])
-        tasks = [pid for pid in tasks if Path(f"/proc/{pid}/exe").resolve() == tiface]
+        tasks = [pid for pid in tasks if runs_program(pid, tiface)]
         if kills < options.kills and tasks:
             kills += kill([chance.choice(tasks)])
             next_kill = time.monotonic() + chance.uniform(0.2, 1.5)
