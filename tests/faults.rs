@@ -155,5 +155,6 @@ fn a_fault_in_any_write_of_any_stage_loses_nothing_and_the_repeated_command_comp
         tried += bench.try_faults(&place, words).1;
     }
     eprintln!("{tried} faults, nothing lost");
-    assert!(tried > 100);
+    // a handful of each of four kinds at each of 18 commands, fewer where there is little to write
+    assert!(tried >= 50, "{tried}");
 }

@@ -83,6 +83,13 @@ vulkan_is_here() {
   echo "$VK_DRIVER_FILES"
 }
 
+guides() {
+  .venv/bin/python tools/guides/check_guides.py "$target/release/tiface" | tee "$scratch/guides.log"
+  local ended=${PIPESTATUS[0]}
+  grep -h '^skipped:' "$scratch/guides.log" >> "$scratch/skipped"
+  return "$ended"
+}
+
 example() { "$target/release/examples/$1" "$2"; }
 
 # Blender as a module has its own environment: it brings its own numpy. Only when pip cannot get it
@@ -187,7 +194,7 @@ fi
 step "the engine of many heads is here" .venv/bin/python -m pip install --quiet --disable-pip-version-check \
   -r tools/fleet/requirements.txt
 step "many heads outlive kills" .venv/bin/python tools/fleet/check_fleet.py "$target/release/tiface"
-step "the commands of the guides work" .venv/bin/python tools/guides/check_guides.py "$target/release/tiface"
+step "the commands of the guides work" guides
 if [ $demo = yes ]; then
   step "the demo head is reconstructed" train_demo
   readers_agree "the demo head" "$scratch/demo/mesh/head.glb" --up 0 0 1

@@ -25,7 +25,7 @@ pub(super) struct StatusOptions {
     /// Only runs that failed, were killed or cannot be read
     #[arg(long)]
     failed: bool,
-    /// Again every two seconds, until all are done or Ctrl-C is pressed
+    /// Again every two seconds, until all are done or failed, or Ctrl-C is pressed
     #[arg(long, conflicts_with = "json")]
     watch: bool,
 }
@@ -59,7 +59,8 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
             let phase = |run: &Result<Standing>| run.as_ref().map_or(Phase::Unreadable, |s| s.phase);
             found.iter().filter(|(_, run)| phases.contains(&phase(run))).count()
         };
-        if options.watch && is(&[Phase::Done]) < found.len() && invocation.stop.requested().is_none() {
+        let may_change = [Phase::Waiting, Phase::Running, Phase::Begun, Phase::Killed, Phase::Stopped];
+        if options.watch && is(&may_change) > 0 && invocation.stop.requested().is_none() {
             std::thread::park_timeout(EVERY);
             if invocation.stop.requested().is_none() {
                 continue;
@@ -175,8 +176,8 @@ fn sign(phase: Phase) -> char {
 /// Where a run stands, after its bar.
 fn told(run: &Standing) -> String {
     let at = run.stages.iter().find(|s| Some(s.stage) == run.at);
-    let step = at.and_then(|s| s.status.as_ref()).filter(|s| s.steps > 0);
-    let share = step.map_or(String::new(), |s| format!(" {} %", 100 * s.step.min(s.steps) / s.steps));
+    let percent = at.and_then(|s| s.status.as_ref()?.percent());
+    let share = percent.map_or(String::new(), |p| format!(" {p} %"));
     let place = at.map_or(String::new(), |s| format!("{}{share} ", s.stage));
     let left = run.left_s.filter(|s| *s > 0.0 && run.phase != Phase::Failed);
     let left = left.map_or(String::new(), |s| format!(", about {} left", duration(s)));

@@ -36,14 +36,28 @@ pub fn open(choice: &DeviceChoice) -> Result<Gpu> {
     let name = number.map_or(api.to_string(), |number| format!("{api}:{number}"));
     let adapters: Vec<Adapter> =
         Adapter::all().into_iter().filter(|a| api == "wgpu" || a.api == api).collect();
-    let chosen = match number {
-        Some(number) => adapters.get(number),
-        None => adapters.iter().find(|adapter| !adapter.software),
+    let chosen: Vec<&Adapter> = match number {
+        Some(number) => adapters.get(number).into_iter().collect(),
+        None => adapters.iter().filter(|adapter| !adapter.software).collect(),
     };
-    let adapter = chosen.ok_or_else(|| missing(&name, api, &adapters))?;
-    let device = opened(adapter, choice);
-    let lock = taken(lock_file(&device)).ok();
-    Ok(Gpu { device, why: format!("named `{name}`"), lock, by_itself: false })
+    let mut in_use = Vec::new();
+    for adapter in chosen {
+        let device = opened(adapter, choice);
+        let lock = taken(lock_file(&device));
+        // whoever names one by its number shares it
+        if number.is_none() && matches!(lock, Err(LockError::Held { .. })) {
+            in_use.push(device.name().to_string());
+            continue;
+        }
+        return Ok(Gpu { device, why: format!("named `{name}`"), lock: lock.ok(), by_itself: false });
+    }
+    if in_use.is_empty() {
+        return Err(missing(&name, api, &adapters));
+    }
+    Err(Error::not_now(
+        format!("device `{name}`: {} in use by other processes", in_use.join(", ")),
+        "wait for them, then repeat the command; a number, as in `wgpu:0`, shares one with them",
+    ))
 }
 
 /// An adapter, used as it is asked to be.

@@ -390,6 +390,10 @@ impl<'a> Pixels<'a> {
     }
 }
 
+/// The widest pixel of a photograph that counts as large, scene units: a thousand of them lie across the scene. Coarser
+/// photographs are learned pixel by pixel from the first step, however coarse the field is.
+pub const LARGE: f32 = 2.0 / 1000.0;
+
 /// How many pixels wide squares are.
 pub const SIDES: [u32; 4] = [1, 2, 4, 8];
 

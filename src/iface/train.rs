@@ -11,7 +11,7 @@ use super::state::{FORMAT, SdfState};
 use super::stereo::{self, HostField, SurfacePoint};
 use crate::config::iface::{IfaceConfig, OccupancyRule, Start};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
-use crate::field::pixels::{Batch, Pixels, TrainView};
+use crate::field::pixels::{Batch, LARGE, Pixels, TrainView};
 use crate::field::training::{self, Learner, StepError, StepReport, TrainingSession};
 use crate::field::{self, Place};
 use crate::kernel::adam::AdamStep;
@@ -171,7 +171,7 @@ impl<'a> SdfTraining<'a> {
         let published = config.occupancy == OccupancyRule::Nerfacc;
         let mut pixels = Pixels::new(views, reach, config.radius, config.foreground, published);
         if !published {
-            pixels = pixels.with_large(schedule::cell(config, config.levels));
+            pixels = pixels.with_large(LARGE.min(schedule::cell(config, config.levels)));
         }
         if pixels.count() == 0 {
             return Err(training::no_pixels());

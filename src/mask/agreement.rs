@@ -78,7 +78,12 @@ pub fn beliefs(views: &[ConsistencyView]) -> Result<Vec<Belief>> {
             .filter(|&i| active[i] && (blame[i].open > MOST_OPEN || mean(&blame[i]) > MOST_RULED_OUT))
             .rev()
             .max_by(|&a, &b| weight(&blame[a]).total_cmp(&weight(&blame[b])));
-        let Some(worst) = worst.filter(|_| left > 2) else { break };
+        let Some(worst) = worst else { break };
+        if left <= 2 {
+            // two that contradict each other say nothing of who is right
+            active.iter().zip(&used).filter(|(a, _)| **a).for_each(|(_, &i)| out[i] = Belief::Unlike);
+            break;
+        }
         active[worst] = false;
         let much = OWN * blame[worst].open > blame[worst].taken;
         out[used[worst]] = if much { Belief::Unlike } else { Belief::LeavesOut };
@@ -185,6 +190,23 @@ mod tests {
 
     fn masks(without: &[usize]) -> Vec<Gray> {
         ring().iter().enumerate().map(|(i, c)| mask(c, !without.contains(&i))).collect()
+    }
+
+    #[test]
+    fn masks_that_all_contradict_each_other_are_believed_by_nobody() {
+        // a ball each, far from everybody else's
+        let cameras = ring();
+        let alone = |i: usize| {
+            let c = DVec3::new(0.0, if i % 2 == 0 { 1.6 } else { -1.6 }, 0.0)
+                + 0.8 * DVec3::new((2.4 * i as f64).cos(), 0.0, (2.4 * i as f64).sin());
+            let hit = |p: u32| {
+                let ray = cameras[i].ray(Vec2::new((p % 96) as f32 + 0.5, (p / 96) as f32 + 0.5)).unwrap();
+                (c - cameras[i].position).cross(ray.direction.as_dvec3()).length() < 0.35
+            };
+            Gray { width: 96, height: 128, values: (0..96 * 128).map(|p| 255 * hit(p) as u8).collect() }
+        };
+        let found = judged(&(0..12).map(alone).collect::<Vec<_>>());
+        assert!(!found.contains(&Belief::Agrees), "{found:?}");
     }
 
     #[test]

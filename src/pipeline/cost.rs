@@ -30,8 +30,8 @@ impl Line<'_> {
 
     /// What a stage may cost on the processor.
     ///
-    /// The constants are a least-squares fit of relative errors to measured runs of the demo head and of real captures, at
-    /// 64 x 80 to 384 x 512 pixels, tiny to full settings; `docs/many-heads.md` says how far off they are.
+    /// The constants are those of runs of the demo head and of a bust, at 64 x 80 to 384 x 512 pixels and tiny to full
+    /// settings; `docs/many-heads.md` says how far off others were.
     pub fn cost(&self, stage: Stage) -> Cost {
         let Config { iface, mesh, .. } = self.config;
         let all = self.pixels() as f64;
@@ -43,28 +43,30 @@ impl Line<'_> {
             None => held_out,
         };
         let methods = &self.render_config().method;
+        // carried to all views, and made soft
+        let clicked = if self.clicks.is_some() { 2.5e-6 * all } else { 0.0 };
         let (cpu_s, mib) = match stage {
-            Stage::Mask => (0.3 + 3.5e-6 * all, 40.0 + 1.2e-5 * all),
+            Stage::Mask => (0.7 + 3e-7 * all + clicked, 115.0 + 5e-6 * all),
             Stage::Baseline | Stage::Tface => {
                 let c = self.config.radiance(stage);
                 let rays = (c.steps as usize * c.rays * c.learned()) as f64;
                 let parameters = vm_parameters(&c);
                 // whole frames are mostly outside the hull, and nothing of them is skipped
                 let ray = if stage == Stage::Baseline { 120e-6 } else { 35e-6 };
-                let cpu_s = 1.0 + ray * rays + 4e-9 * parameters * (c.steps as usize * c.learned()) as f64;
-                let mib = 80.0 + 4e-6 * all + 24e-6 * parameters + 0.02 * c.rays as f64;
+                let cpu_s = 0.1 + ray * rays + 4e-9 * parameters * (c.steps as usize * c.learned()) as f64;
+                let mib = 45.0 + 25e-6 * all + 24e-6 * parameters + 0.07 * c.rays as f64;
                 if c.import.is_empty() { (cpu_s, mib) } else { (1.0, mib) }
             }
             Stage::Iface => {
                 let samples = (iface.steps as usize * iface.samples) as f64;
                 let table = ((iface.levels as u64 * 2) << iface.log2_table.min(32)) as f64;
-                let cpu_s = 2.0 + 5e-6 * samples + 2e-9 * table * iface.steps as f64 + 4e-6 * all;
-                (cpu_s, 80.0 + 4e-6 * all + 20e-6 * table + 2e-3 * iface.samples as f64)
+                let cpu_s = 3.8 + 4.7e-6 * samples + 2e-9 * table * iface.steps as f64 + 1.8e-6 * all;
+                (cpu_s, 100.0 + 25e-6 * all + 20e-6 * table + 0.02 * iface.samples as f64)
             }
             Stage::Mesh => {
                 let cells = f64::from(mesh.resolution).powi(2);
                 let texels = (mesh.texels() * mesh.pictures()) as f64;
-                (1.0 + 5e-4 * cells + 6e-6 * texels, 80.0 + 2e-3 * cells + 1e-4 * texels)
+                (0.5 + 1.6e-4 * cells + 5e-6 * texels, 110.0 + 6e-3 * cells + 5e-4 * texels)
             }
             Stage::Render => {
                 let pixel = |method: &Method| match method {
@@ -72,11 +74,11 @@ impl Line<'_> {
                     Method::Volume => 20e-6,
                     _ => 2.5e-6,
                 };
-                let cpu_s = 0.5 + shown * methods.iter().map(pixel).sum::<f64>();
-                (cpu_s, 100.0 + 1e-4 * each + 1e-4 * mesh.texels() as f64)
+                let cpu_s = 0.1 + shown * methods.iter().map(pixel).sum::<f64>();
+                (cpu_s, 220.0 + 1e-4 * each + 1e-4 * mesh.texels() as f64)
             }
-            Stage::Ensemble => (0.5 + 8e-6 * held_out, 100.0 + 1e-4 * each),
-            Stage::Metrics => (0.3 + 2e-6 * held_out * methods.len() as f64, 60.0 + 1e-4 * each),
+            Stage::Ensemble => (0.2 + 3e-6 * held_out, 220.0 + 1e-4 * each),
+            Stage::Metrics => (0.2 + 1.2e-6 * held_out * methods.len() as f64, 220.0 + 1e-4 * each),
         };
         let disk_bytes = self.plan(stage).needs_bytes;
         Cost { cpu_s, memory_bytes: (mib * MIB) as u64, disk_bytes }

@@ -28,6 +28,8 @@ pub struct RunRow {
     pub state: String,
     /// Is there nothing left to do?
     pub done: bool,
+    /// Did it end by an error?
+    pub failed: bool,
     /// The preset, if it can be read.
     pub preset: String,
     /// Masked PSNR in dB of the best method.
@@ -71,6 +73,7 @@ impl RunRow {
             name: name.file_name().unwrap_or(run.as_os_str()).to_string_lossy().into_owned(),
             state: state(&standing),
             done: standing.phase == Phase::Done,
+            failed: standing.phase == Phase::Failed,
             picture: picture(run).unwrap_or_default(),
             preset: preset(run).unwrap_or_default(),
             seconds: standing.elapsed_s,
@@ -111,8 +114,8 @@ impl RunRow {
 fn state(run: &Standing) -> String {
     let stage = run.stages.iter().find(|s| Some(s.stage) == run.at);
     let place = stage.map_or(String::new(), |s| format!("{} ", s.stage));
-    let share = stage.and_then(|s| s.status.as_ref()).filter(|s| s.steps > 0);
-    let share = share.map_or(String::new(), |s| format!(", {} %", 100 * s.step.min(s.steps) / s.steps));
+    let percent = stage.and_then(|s| s.status.as_ref()?.percent());
+    let share = percent.map_or(String::new(), |p| format!(", {p} %"));
     match run.phase {
         Phase::Done => "done".into(),
         Phase::Failed => format!("{place}failed: {}", run.error.as_deref().unwrap_or_default()),
@@ -215,7 +218,7 @@ pub fn runs_html(rows: &[RunRow]) -> Result<String> {
     };
     let cells: Vec<_> = rows.iter().enumerate().map(cells).collect();
     let done = rows.iter().filter(|row| row.done).count();
-    let failed = rows.iter().filter(|row| row.state.contains("failed")).count();
+    let failed = rows.iter().filter(|row| row.failed).count();
     let headings: Vec<&str> = FIGURES.iter().map(|(heading, _)| *heading).collect();
     let script = include_str!("runs.js");
     fill(

@@ -91,10 +91,10 @@ impl Run {
             return Ok(());
         }
         io::create_folder(&self.dir)?;
-        // one process at a time: what else looks half-written here was left by one that is gone
+        // one process at a time: what else of this file looks half-written was left by one that is gone
         let lock = Lock::wait(&self.path(LOCK));
         if lock.is_ok() {
-            let _ = io::remove_leftovers(&self.dir); // the next one tries again
+            let _ = io::remove_leftovers(&self.dir, Some(name)); // the next one tries again
         }
         Ok(io::write_atomic(&path, bytes)?)
     }

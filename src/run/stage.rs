@@ -284,7 +284,7 @@ fn sweep(folder: &Path) -> Result<usize> {
     if io::is_link(folder) {
         return Ok(0);
     }
-    let mut removed = io::remove_leftovers(folder)?;
+    let mut removed = io::remove_leftovers(folder, None)?;
     for inner in io::list_folders(folder)?.iter().filter(|f| !has_record(f)) {
         removed += sweep(inner)?;
     }

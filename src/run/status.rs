@@ -51,6 +51,14 @@ pub struct Status {
     pub fingerprint: Fingerprint,
 }
 
+impl Status {
+    /// Returns the steps done, in whole per cent; `None` while nobody knows how many there are.
+    pub fn percent(&self) -> Option<u64> {
+        let share = self.step as f64 / self.steps as f64;
+        (self.steps > 0).then_some((100.0 * share.min(1.0)) as u64)
+    }
+}
+
 /// `done.json`: the stage is complete.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Record {

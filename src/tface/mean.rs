@@ -19,7 +19,7 @@ use super::train::{self, TfaceReport, train_one};
 use crate::config::{MaskUse, VmConfig, VmStart};
 #[cfg(feature = "wgpu")]
 use crate::field::Place;
-use crate::field::pixels::{Pixels, TrainView};
+use crate::field::pixels::{LARGE, Pixels, TrainView};
 use crate::field::training::{self, TrainingSession};
 use crate::geom::{Aabb, Ray, RayResult};
 #[cfg(feature = "wgpu")]
@@ -114,7 +114,8 @@ pub fn train(
         false => {
             let volume: f32 = (0..3).map(|a| bounds[1][a] - bounds[0][a]).product();
             let cell = (volume as f64 / config.voxels_final as f64).cbrt() as f32;
-            Pixels::new(&views, reach, 1.0, config.foreground, false).with_large(train::DETAIL * cell)
+            Pixels::new(&views, reach, 1.0, config.foreground, false)
+                .with_large(LARGE.min(train::DETAIL * cell))
         }
     };
     if pixels.count() == 0 {

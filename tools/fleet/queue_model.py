@@ -29,7 +29,8 @@ LEARNS = ("baseline", "tface", "iface")
 
 
 def simulate(heads, slots, preempt_per_hour, checkpoint_s, overhead_s, seed):
-    """Returns seconds to the end, seconds of slots that were worked, of those lost, and each head's end."""
+    """Returns seconds to the end, seconds of slots that were worked, of those lost, and each head's end; None if it would
+    not come to one."""
     chance = random.Random(seed)
     left = {(h, stage): seconds for h, head in enumerate(heads) for stage, seconds in head.items()}
     waiting = [(h, list(NEEDS).index(s), s) for (h, s) in left if not [n for n in NEEDS[s] if n in heads[h]]]
@@ -47,6 +48,8 @@ def simulate(heads, slots, preempt_per_hour, checkpoint_s, overhead_s, seed):
             did = max(0.0, until - overhead_s)
             every = checkpoint_s if checkpoint_s and stage in LEARNS else 0
             kept = did - did % every if every else 0.0
+            if not kept and need > 4 * 3600 / preempt_per_hour:
+                return None  # so long without a checkpoint comes through once in fifty times: never, for a thousand
             left[h, stage] -= kept
             worked += until
             lost += until - kept
@@ -75,8 +78,8 @@ def main():
     measured = []
     for line in sys.stdin:
         run = json.loads(line)
-        if run["state"] == "done":
-            measured.append({s["stage"]: s["elapsed_s"] for s in run["stages"]})
+        if run.get("state") == "done":
+            measured.append({s["stage"]: s["elapsed_s"] for s in run["stages"] if s["state"] == "done"})
     assert measured, "no run of these is done"
     chance = random.Random(options.seed)
     heads = []
@@ -90,7 +93,11 @@ def main():
         cases += [("preempted, checkpoints", options.preempt, options.checkpoint), ("preempted, none", options.preempt, 0)]
     print("| case | hours | slots busy | of it lost | half of the heads after | the last tenth took |\n|---|---|---|---|---|---|")
     for name, preempt, checkpoint in cases:
-        end, worked, lost, ends = simulate(heads, options.slots, preempt, checkpoint, options.overhead, options.seed)
+        found = simulate(heads, options.slots, preempt, checkpoint, options.overhead, options.seed)
+        if found is None:
+            print(f"| {name} | never: the longest stages last longer than slots do | | | | |")
+            continue
+        end, worked, lost, ends = found
         times = sorted(ends.values())
         busy, wasted = worked / (end * options.slots), lost / worked
         last = end - times[int(0.9 * len(times))]

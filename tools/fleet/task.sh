@@ -19,8 +19,10 @@ fi
 rm -f "$mark"
 
 if [ -n "$capture" ] && [ -n "${SCRATCH:-}" ]; then
-  local=$SCRATCH/$(basename "$capture")
-  mkdir -p "$SCRATCH" || exit 1
+  # by what it is and holds: one that was mended, or another of the same name, is copied again
+  key=$( (realpath "$capture"; find -L "$capture" -type f -printf '%P %s %T@\n' | sort) | sha256sum | cut -c1-16)
+  local=$SCRATCH/$key/$(basename "$capture")
+  mkdir -p "$SCRATCH/$key" || exit 1
   exec 9> "$local.lock" # several stages of a head may begin at once
   flock 9
   if [ ! -d "$local" ]; then
@@ -37,10 +39,12 @@ for word in "$@"; do
 done
 
 # Signals of the engine are for the program, which saves and ends; bash alone would wait for it and say nothing.
-trap 'kill -TERM "$child" 2> /dev/null' TERM INT
+stop= child=
+trap 'stop=1; [ -z "$child" ] || kill -TERM "$child" 2> /dev/null' TERM INT
 # 75 is often another process on the same stage, which an engine that was killed left behind: it ends by itself.
 patience=${TIFACE_PATIENCE:-600} pause=1 begun=$SECONDS
 while :; do
+  [ -z "$stop" ] || exit 143
   "${words[@]}" >> "$log" 2>&1 &
   child=$!
   wait "$child"
@@ -51,6 +55,8 @@ while :; do
     code=$?
   done
   [ "$code" -eq 75 ] && [ $((SECONDS - begun)) -lt "$patience" ] || break
+  # who has too little memory waits for the engine's next attempt, which asks for more
+  tail -n 5 "$log" | grep -q 'out of memory' && break
   sleep "$pause"
   pause=$((pause < 30 ? pause * 2 : 30))
 done

@@ -4,8 +4,7 @@
 
 Blocks of `sh` run line by line in one folder per guide, where captures lie as the guide has them; a user's own
 configuration makes them small. Blocks of `python` run with this interpreter. `sh colmap` needs COLMAP and photographs of
-something real; it is left out aloud where they are not. `sh cluster` needs a cluster: only what can be asked of it
-without one is.
+something real; it is left out aloud where they are not. `sh cluster` needs a cluster, and is not run.
 """
 
 import json
@@ -55,9 +54,9 @@ def blocks(text):
         yield kind.strip(), body
 
 
-def photograph(tiface, folder, size):
+def photograph(tiface, folder, size, environment):
     """Photographs of the demo head with cameras and masks; its cameras are written last."""
-    demo = subprocess.Popen([tiface, "demo", "--run", folder / "demo", "--size", size, "--views", "10", "--quiet"])
+    demo = subprocess.Popen([tiface, "demo", "--run", folder / "demo", "--size", size, "--views", "10", "--quiet"], env=environment)
     while not (folder / "demo/capture/transforms.json").is_file():
         assert demo.poll() is None
     demo.kill()
@@ -72,13 +71,13 @@ def clicks(capture):
     return {"frames": [{"file_path": name, "points": points} for name in (names[0], names[3], names[6])]}
 
 
-def prepare(tiface, folder):
+def prepare(tiface, folder, environment):
     """Captures as the guides name them: captures/002_00 and 003_00 with masks, head with COLMAP's cameras and none."""
     for name, size in (("002_00", "64x80"), ("003_00", "66x80")):
-        made = photograph(tiface, folder / "photographed" / name, size)
+        made = photograph(tiface, folder / "photographed" / name, size, environment)
         (folder / "captures").mkdir(exist_ok=True)
         shutil.move(made, folder / "captures" / name)
-    subprocess.run([tiface, "convert", "captures/002_00", "--to", "colmap", "--out", "head", "--quiet"], cwd=folder, check=True)
+    subprocess.run([tiface, "convert", "captures/002_00", "--to", "colmap", "--out", "head", "--quiet"], cwd=folder, env=environment, check=True)
     for masks in (folder / "head").glob("*mask*"):
         shutil.rmtree(masks)
 
@@ -96,7 +95,7 @@ def run(guide, tiface, seen):
         "XDG_CONFIG_HOME": str(folder / "settings"),
         "NO_COLOR": "1",
     }
-    prepare(tiface, folder)
+    prepare(tiface, folder, environment)
     (settings / "config.toml").write_text(SMALL)
     (folder / "tools").symlink_to(ROOT / "tools")
     count = 0
@@ -139,7 +138,8 @@ def colmap(body, environment):
             if i < 12:
                 shutil.copy(photograph, images)
         environment = {**environment, "QT_QPA_PLATFORM": "offscreen"}
-        subprocess.run(["bash", "-e", "-c", body], cwd=folder, env=environment, check=True, capture_output=True)
+        done = subprocess.run(["bash", "-e", "-c", body], cwd=folder, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
         found = subprocess.run(["tiface", "inspect", "head"], cwd=folder, env=environment, capture_output=True, text=True)
         assert "COLMAP" in found.stdout, found.stdout + found.stderr
     return ""

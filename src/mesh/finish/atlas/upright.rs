@@ -7,6 +7,9 @@ use glam::{DVec2, Vec3};
 /// Of the surface, a chart that is no more than a sliver of the face need not stand.
 const LEAST: f64 = 0.01;
 
+/// Less than this share of the steepest rise says nothing of where up is.
+const LEAST_RISE: f64 = 0.1;
+
 /// For each chart where up is in it, of length 1, if it has to stand upright: the one that the foremost triangle, seen
 /// along `front`, is part of.
 pub(super) fn upright(mesh: &Mesh, charts: &[Flat], front: Vec3, up: Vec3) -> Vec<Option<DVec2>> {
@@ -32,7 +35,8 @@ fn rising(mesh: &Mesh, chart: &Flat, up: Vec3) -> Option<DVec2> {
         sum += DVec2::new(along * v.y - across * u.y, across * u.x - along * v.x)
             * twice_area([a, b, c]).signum();
     }
-    sum.try_normalize()
+    // seen from below or above, up is nowhere in it; the gradient of what stands straight is 1 everywhere
+    (sum.length() > LEAST_RISE * 2.0 * chart.area()).then(|| sum.normalize())
 }
 
 #[cfg(test)]
@@ -57,6 +61,9 @@ mod tests {
         let found = upright(&mesh, std::slice::from_ref(&chart), -Vec3::Y, Vec3::Z)[0].unwrap();
         assert!((found - DVec2::NEG_X).length() < 1e-12, "{found}");
         // level ground rises nowhere
-        assert_eq!(upright(&mesh, &[chart], -Vec3::Y, Vec3::Y), [None]);
+        let nearly_level = (Vec3::Y + 0.05 * Vec3::Z).normalize();
+        for up in [Vec3::Y, nearly_level] {
+            assert_eq!(upright(&mesh, std::slice::from_ref(&chart), -Vec3::Y, up), [None]);
+        }
     }
 }
