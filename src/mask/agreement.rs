@@ -197,7 +197,7 @@ mod tests {
         // a ball each, far from everybody else's
         let cameras = ring();
         let alone = |i: usize| {
-            let c = DVec3::new(0.0, if i % 2 == 0 { 1.6 } else { -1.6 }, 0.0)
+            let c = DVec3::new(0.0, if i.is_multiple_of(2) { 1.6 } else { -1.6 }, 0.0)
                 + 0.8 * DVec3::new((2.4 * i as f64).cos(), 0.0, (2.4 * i as f64).sin());
             let hit = |p: u32| {
                 let ray = cameras[i].ray(Vec2::new((p % 96) as f32 + 0.5, (p / 96) as f32 + 0.5)).unwrap();

@@ -52,7 +52,9 @@ impl Line<'_> {
                 let rays = (c.steps as usize * c.rays * c.learned()) as f64;
                 let parameters = vm_parameters(&c);
                 // whole frames are mostly outside the hull, and nothing of them is skipped
-                let ray = if stage == Stage::Baseline { 120e-6 } else { 35e-6 };
+                let outside = if stage == Stage::Baseline { 4.0 } else { 1.0 };
+                // samples along a ray are as dense as the grid
+                let ray = outside * (5e-6 + 0.16e-6 * (c.voxels_final as f64).cbrt());
                 let cpu_s = 0.1 + ray * rays + 4e-9 * parameters * (c.steps as usize * c.learned()) as f64;
                 let mib = 45.0 + 25e-6 * all + 24e-6 * parameters + 0.07 * c.rays as f64;
                 if c.import.is_empty() { (cpu_s, mib) } else { (1.0, mib) }
@@ -61,12 +63,15 @@ impl Line<'_> {
                 let samples = (iface.steps as usize * iface.samples) as f64;
                 let table = ((iface.levels as u64 * 2) << iface.log2_table.min(32)) as f64;
                 let cpu_s = 3.8 + 4.7e-6 * samples + 2e-9 * table * iface.steps as f64 + 1.8e-6 * all;
-                (cpu_s, 100.0 + 25e-6 * all + 20e-6 * table + 0.02 * iface.samples as f64)
+                (cpu_s, 100.0 + 25e-6 * all + 20e-6 * table + 0.012 * iface.samples as f64)
             }
             Stage::Mesh => {
                 let cells = f64::from(mesh.resolution).powi(2);
                 let texels = (mesh.texels() * mesh.pictures()) as f64;
-                (0.5 + 1.6e-4 * cells + 5e-6 * texels, 110.0 + 6e-3 * cells + 5e-4 * texels)
+                (
+                    0.5 + 1.3e-4 * cells + 5e-6 * texels + 1e-6 * all,
+                    110.0 + 25e-6 * all + 6e-3 * cells + 5e-4 * texels,
+                )
             }
             Stage::Render => {
                 let pixel = |method: &Method| match method {
@@ -75,7 +80,7 @@ impl Line<'_> {
                     _ => 2.5e-6,
                 };
                 let cpu_s = 0.1 + shown * methods.iter().map(pixel).sum::<f64>();
-                (cpu_s, 220.0 + 1e-4 * each + 1e-4 * mesh.texels() as f64)
+                (cpu_s, 220.0 + 25e-6 * all + 1e-4 * (shown * methods.len() as f64 + mesh.texels() as f64))
             }
             Stage::Ensemble => (0.2 + 3e-6 * held_out, 220.0 + 1e-4 * each),
             Stage::Metrics => (0.2 + 1.2e-6 * held_out * methods.len() as f64, 220.0 + 1e-4 * each),
