@@ -49,11 +49,11 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
     let bars = require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>>>()?;
     let run = Run::open(&target.run, stop.clone(), screen.clone());
     let line = ready(common, command, &config, &run, path, out.as_ref()).inspect_err(|e| {
-        // who runs many heads looks for what went wrong in their folders, not in logs
+        // who runs many heads looks for what went wrong in their folders, not in logs; a run that has begun stays as it is
         let is_named = common.run.is_some() || io::is_folder(run.dir());
         let is_begun = io::is_file(&run.path("config.toml"));
-        let tells = e.kind() == ErrorKind::Cannot || (e.kind() == ErrorKind::Usage && !is_begun);
-        if is_named && tells && !common.dry_run {
+        let tells = matches!(e.kind(), ErrorKind::Cannot | ErrorKind::Usage);
+        if is_named && tells && !is_begun && !common.dry_run {
             run.failed(e);
         }
     })?;

@@ -193,20 +193,23 @@ mod tests {
     }
 
     #[test]
-    fn masks_that_all_contradict_each_other_are_believed_by_nobody() {
-        // a ball each, far from everybody else's
+    fn two_masks_that_contradict_each_other_are_both_not_believed() {
+        // what one shows lies above everything that the other does
         let cameras = ring();
-        let alone = |i: usize| {
-            let c = DVec3::new(0.0, if i.is_multiple_of(2) { 1.6 } else { -1.6 }, 0.0)
-                + 0.8 * DVec3::new((2.4 * i as f64).cos(), 0.0, (2.4 * i as f64).sin());
+        let at = |y: f64, i: usize| {
+            let c = DVec3::new(0.0, y, 0.0);
             let hit = |p: u32| {
                 let ray = cameras[i].ray(Vec2::new((p % 96) as f32 + 0.5, (p / 96) as f32 + 0.5)).unwrap();
-                (c - cameras[i].position).cross(ray.direction.as_dvec3()).length() < 0.35
+                (c - cameras[i].position).cross(ray.direction.as_dvec3()).length() < 0.5
             };
             Gray { width: 96, height: 128, values: (0..96 * 128).map(|p| 255 * hit(p) as u8).collect() }
         };
-        let found = judged(&(0..12).map(alone).collect::<Vec<_>>());
+        let (high, low) = (at(1.0, 0), at(-1.0, 3));
+        let view = |i: usize, mask| ConsistencyView { name: "v", camera: &cameras[i], mask: Some(mask) };
+        let found = beliefs(&[view(0, &high), view(3, &low)]).unwrap();
         assert!(!found.contains(&Belief::Agrees), "{found:?}");
+        let same = at(1.0, 3);
+        assert_eq!(beliefs(&[view(0, &high), view(3, &same)]).unwrap(), [Belief::Agrees; 2]);
     }
 
     #[test]

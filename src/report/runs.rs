@@ -261,7 +261,8 @@ mod tests {
         std::fs::write(run.join("iface/done.json"), "{").unwrap();
         io::write_png_rgba(&run.join("ensemble/a.png"), 1, 1, &[[200, 100, 50, 51]]).unwrap();
         let row = RunRow::read(&run, dir.path());
-        assert_eq!((row.name.as_str(), row.state.as_str(), row.done), (name, "empty", false));
+        assert_eq!((row.name.as_str(), row.done, row.failed), (name, false, false));
+        assert!(row.state.starts_with("iface cannot be read: "), "{}", row.state);
         assert_eq!(row.link, "%3Cimg%20src%3Dx%20onerror%3Dalert%281%29%3E/report.html");
         assert!(row.picture.starts_with("data:image/jpeg;base64,") && row.psnr.is_none());
         let page = runs_html(&[row.clone(), RunRow { psnr: Some(31.25), ..row }]).unwrap();
@@ -278,7 +279,7 @@ mod tests {
         assert!(outliers(&[Some(7.0), Some(7.0), Some(7.0), Some(7.0), None, Some(7.1)])[5]);
         let row = |psnr| RunRow { psnr: Some(psnr), done: true, seconds: 60.0, ..RunRow::default() };
         let page = runs_html(&psnr.map(row)).unwrap();
-        assert_eq!(page.matches("class=\"far\"").count(), 1, "{page}");
+        assert_eq!(page.matches("<td class=\"far\"").count(), 1, "{page}");
         assert!(page.contains("<td class=\"far\">22.00</td>"));
     }
 

@@ -78,7 +78,8 @@ pub fn name(file: &Path) -> &str {
 
 /// Do the bytes tell times, which are others in every run?
 pub fn is_timed(file: &Path) -> bool {
-    ["done.json", "status.json", "log.jsonl", "report.html", "page.html"].contains(&name(file))
+    let names = ["done.json", "status.json", "log.jsonl", "failed.json", "report.html", "page.html"];
+    names.contains(&name(file))
 }
 
 /// Files of two folders with the same names and, but for times, the same bytes.
