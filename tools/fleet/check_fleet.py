@@ -21,36 +21,11 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+from tiny_heads import SETTINGS, photograph  # noqa: E402
+
 HEADS = [f"head_{i}" for i in range(1, 7)]
 BROKEN, HELD = HEADS[2], HEADS[4]
-# Seconds for each head, with a checkpoint often enough that kills leave something to go on from.
-SETTINGS = """
-device = "cpu"
-[iface]
-steps = 120
-rays = 256
-max_rays = 512
-samples = 4096
-levels = 6
-log2_table = 12
-occupancy_resolution = 32
-checkpoint_s = 0.1
-[tface]
-steps = 60
-fields = 1
-rays = 512
-voxels_start = 4096
-voxels_final = 13824
-upsample_steps = [20, 40]
-mask_steps = [20, 40]
-checkpoint_s = 0.1
-[mesh]
-resolution = 48
-texture_px = 256
-[render]
-samples = 1
-method = ["tface", "volume", "raycast"]
-"""
 # What tells when and how fast things happened.
 CLOCKS = {"status.json", "log.jsonl", "done.json", ".lock", "failed.json", "estimate.json", "config.toml", "report.html"}
 
@@ -106,17 +81,6 @@ def kill(pids):
     return killed
 
 
-def photograph(tiface, run, size):
-    """Photographs of the demo head; its cameras are written last, and then it need not be learned."""
-    words = [tiface, "demo", "--run", run, "--size", size, "--views", "10", "--quiet"]
-    demo = subprocess.Popen([str(word) for word in words])
-    while not (run / "capture/transforms.json").is_file():
-        assert demo.poll() is None, "the demo head was not photographed"
-        time.sleep(0.02)
-    demo.kill()
-    demo.wait()
-
-
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("tiface", type=Path)
@@ -132,7 +96,7 @@ def main():
     os.environ["XDG_CONFIG_HOME"] = str(folder)  # nobody's own settings
     config = folder / "heads.toml"
     config.write_text(SETTINGS)
-    words = ["--preset", "draft", "--config", str(config)]
+    words = ["--preset", "draft", "--config", str(config), "--set", "render.method=tface,volume,raycast"]
 
     def run(*command, check=True):
         done = subprocess.run([tiface, *map(str, command)], capture_output=True, text=True)
@@ -143,8 +107,7 @@ def main():
     captures.mkdir(exist_ok=True)
     for i, head in enumerate(HEADS):
         if not (captures / head).is_dir():
-            photograph(tiface, folder / "photographed" / head, f"{60 + 2 * i}x72")
-            shutil.move(folder / "photographed" / head / "capture", captures / head)
+            shutil.move(photograph(tiface, folder / "photographed" / head, f"{60 + 2 * i}x72"), captures / head)
     frames = captures / BROKEN / "transforms_train.json"
     broken = json.loads(frames.read_text())
     broken["frames"][4]["transform_matrix"][0][3] = "north"
@@ -178,15 +141,14 @@ def main():
         return subprocess.Popen(engine_words, stdout=log, stderr=log, cwd=folder, start_new_session=True)
 
     kills = engine_kills = 0
-    finished = {}  # when each stage was recorded as done, the first time it was seen
+    finished = {}  # checkpoints of fields that are done, as they were first seen
 
     def look():
+        # a task killed between its record and its end is done again by the engine; what was learned must not be
         for record in runs.glob("*/*/done.json"):
-            try:
-                when = json.loads(record.read_text())["finished"], record.stat().st_ino
-            except (OSError, ValueError):
-                continue
-            finished.setdefault(record, when)
+            learned = record.with_name("checkpoint.safetensors")
+            if learned.is_file():
+                finished.setdefault(learned, (learned.stat().st_ino, learned.stat().st_mtime_ns))
 
     engine = start()
     next_kill = time.monotonic() + 2
@@ -231,6 +193,7 @@ def main():
         look()
         engine = start()
         code = engine.wait()
+    look()
     print(f"{kills} tasks and {engine_kills} engines killed; the engine ended with {code}")
 
     told = run("status", *[runs / head for head in HEADS], "--json", check=False)
@@ -245,15 +208,15 @@ def main():
         assert not different, f"{head}: {different}"
     cause = states[BROKEN]
     assert cause["state"] == "failed" and "transform_matrix" in cause["error"], cause
-    for record, when in finished.items():
-        now = json.loads(record.read_text())["finished"], record.stat().st_ino
-        assert now == when, f"{record} was made again"
+    assert len(finished) == 2 * len(good), finished
+    for learned, when in finished.items():
+        assert (learned.stat().st_ino, learned.stat().st_mtime_ns) == when, f"{learned} was learned again"
     attempts = (runs / ".fleet/log" / f"{BROKEN}.mask.txt").read_text().count("transform_matrix")
     assert 1 <= attempts <= starts, f"what cannot work was tried {attempts} times by {starts} engines"
     page, table = folder / "fleet.html", folder / "fleet.csv"
     assert page.is_file() and len(table.read_text().splitlines()) == len(HEADS) + 1
     assert BROKEN in page.read_text() and "transform_matrix" in table.read_text()
-    print(f"{len(good)} heads as if undisturbed ({undisturbed:.0f} s alone), {len(finished)} stages made once each")
+    print(f"{len(good)} heads as if undisturbed ({undisturbed:.0f} s alone), {len(finished)} fields learned once each")
     print(f"{BROKEN}: {cause['error']}")
     if not options.keep:
         shutil.rmtree(folder)

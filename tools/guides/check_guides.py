@@ -17,51 +17,16 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tools"))
+from tiny_heads import SETTINGS, photograph  # noqa: E402
+
 GUIDES = [ROOT / "docs" / name for name in ("artist.md", "researcher.md", "many-heads.md")]
-# Seconds for each head. What a guide's own options say wins.
-SMALL = """
-device = "cpu"
-[iface]
-steps = 60
-rays = 256
-max_rays = 512
-samples = 4096
-levels = 6
-log2_table = 12
-occupancy_resolution = 32
-[tface]
-steps = 60
-fields = 1
-rays = 512
-voxels_start = 4096
-voxels_final = 13824
-upsample_steps = [20, 40]
-mask_steps = [20, 40]
-[baseline]
-steps = 20
-rays = 256
-[mesh]
-resolution = 48
-texture_px = 256
-[render]
-samples = 1
-"""
 
 
 def blocks(text):
     """Kind and lines of each fenced block; a line that ends in a backslash goes on."""
     for kind, body in re.findall(r"^```(\S[^\n]*)\n(.*?)^```", text, re.M | re.S):
         yield kind.strip(), body
-
-
-def photograph(tiface, folder, size, environment):
-    """Photographs of the demo head with cameras and masks; its cameras are written last."""
-    demo = subprocess.Popen([tiface, "demo", "--run", folder / "demo", "--size", size, "--views", "10", "--quiet"], env=environment)
-    while not (folder / "demo/capture/transforms.json").is_file():
-        assert demo.poll() is None
-    demo.kill()
-    demo.wait()
-    return folder / "demo/capture"
 
 
 def clicks(capture):
@@ -96,7 +61,7 @@ def run(guide, tiface, seen):
         "NO_COLOR": "1",
     }
     prepare(tiface, folder, environment)
-    (settings / "config.toml").write_text(SMALL)
+    (settings / "config.toml").write_text(SETTINGS)
     (folder / "tools").symlink_to(ROOT / "tools")
     count = 0
     for kind, body in blocks(guide.read_text()):
