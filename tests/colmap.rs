@@ -551,15 +551,29 @@ fn every_format_is_written_and_read_again() {
         [CameraFormat::Colmap, CameraFormat::Transforms, CameraFormat::Llff].into_iter().enumerate()
     {
         let folder = at(&format!("step {step}"));
-        let done = convert(&last, format, &folder, step == 0).unwrap();
+        let from = last;
+        let done = convert(&from, format, &folder, step == 0).unwrap();
         assert_eq!((done.views, done.masks, &done.folder), (9, 9, &folder));
         last = capture::open(&folder, &options).unwrap();
         let warned = done.warnings.iter().any(|w| w.contains("does not say where up is"));
         let up = if warned { head.up } else { last.up };
         same(&head, &Capture { up, ..last.clone() }, true);
-        // what is there is never touched
-        let e = convert(&last, format, &folder, false).unwrap_err();
-        assert!(e.to_string().contains("is not an empty folder"), "{e}");
+        // an interrupted conversion goes on, and anything else that is there is never touched
+        let photo = std::fs::read_dir(folder.join("images")).unwrap().next().unwrap().unwrap().path();
+        std::fs::remove_file(&photo).unwrap();
+        assert_eq!(convert(&from, format, &folder, false).unwrap(), done);
+        assert!(photo.is_file());
+        let stranger = folder.join("images/notes.txt");
+        std::fs::write(&stranger, "kept").unwrap();
+        let e = convert(&from, format, &folder, false).unwrap_err();
+        assert!(e.to_string().contains("`images/notes.txt` is there and another file"), "{e}");
+        std::fs::remove_file(stranger).unwrap();
+        std::fs::write(&photo, "another").unwrap();
+        let e = convert(&from, format, &folder, false).unwrap_err();
+        assert!(e.to_string().contains("is there and another file"), "{e}");
+        assert_eq!(std::fs::read(&photo).unwrap(), b"another");
+        std::fs::remove_file(photo).unwrap();
+        convert(&from, format, &folder, false).unwrap();
     }
     assert!(last.format.starts_with("LLFF"));
 }

@@ -17,9 +17,10 @@ done
 
 target=${CARGO_TARGET_DIR:-target}
 scratch=$(mktemp -d)
-trap 'rm -rf "$scratch"' EXIT
+trap 'kill "${fuzzers[@]}" 2> /dev/null; rm -rf "$scratch"' EXIT
 results=()
 failed=0
+fuzzers=()
 
 # step NAME COMMAND...: runs it, shows it, remembers how it ended
 step() {
@@ -81,6 +82,24 @@ vulkan_is_here() {
   VK_DRIVER_FILES=$(driver)
   export VK_DRIVER_FILES
   echo "$VK_DRIVER_FILES"
+}
+
+# A minute for every reader of foreign bytes, half of it from each of two beginnings, beside whatever else is done: it
+# takes what the other steps leave of the processors.
+fuzz_begins() {
+  local seed
+  for seed in 1 2; do
+    TIFACE_FUZZ_S=30 TIFACE_FUZZ_SEED=$seed nice -n 19 \
+      cargo test --release --features matting,wgpu --test fuzz -- --nocapture > "$scratch/fuzz.$seed" 2>&1 &
+    fuzzers+=($!)
+  done
+}
+
+fuzz_ends() {
+  local ended=0 fuzzer
+  for fuzzer in "${fuzzers[@]}"; do wait "$fuzzer" || ended=1; done
+  cat "$scratch"/fuzz.*
+  return $ended
 }
 
 guides() {
@@ -158,6 +177,7 @@ if ! vulkan_is_here; then
   results+=("SKIPPED a Vulkan in software for the kernels of GPUs: apt cannot install mesa-vulkan-drivers")
 fi
 step "tests" tests
+fuzz_begins
 blender=yes
 printf '\n== Blender is here\n'
 if ! blender_is_here; then
@@ -209,6 +229,7 @@ if [ $demo = yes ]; then
 else
   results+=("SKIPPED the demo head, as asked by --no-demo")
 fi
+step "no input makes a reader panic, hang or fill the memory" fuzz_ends
 
 # how long which step took, and what could not run
 printf '\n== summary\n'

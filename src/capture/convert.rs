@@ -1,8 +1,9 @@
 //! A capture written again with cameras of another format: nothing is resampled, nothing that is there is touched.
 //!
 //! Photographs go to `images/`, head masks to `masks/`, valid pixels to `valid/` and regions to `face_masks/`, as
-//! they are; the camera files come last, so that a folder that has them is complete. What a format cannot say is an
-//! error where pictures would no longer fit their cameras, and a warning otherwise.
+//! they are; the camera files come last, so that a folder that has them is complete. A conversion that was interrupted
+//! goes on where it stopped: what it wrote is there already. What a format cannot say is an error where pictures would
+//! no longer fit their cameras, and a warning otherwise.
 
 use super::colmap;
 use super::gather::{every_eighth, up};
@@ -15,6 +16,7 @@ use crate::io::{self, Limits};
 use crate::{Error, Result};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 /// A format that cameras can be written in.
@@ -65,12 +67,55 @@ struct Place<'v> {
     region: Option<String>,
 }
 
-/// Writes `capture` into `folder`, which must be new or empty. Photographs and masks are copied, or hard-linked with
+/// What a file of the new capture holds.
+enum Content<'v> {
+    /// The bytes of another file.
+    File(&'v Path),
+    /// A mask that is no PNG yet, and the size of its photograph.
+    Mask(&'v Path, (u32, u32)),
+    Bytes(Vec<u8>),
+}
+
+impl Content<'_> {
+    fn bytes(&self, target: &Path) -> Result<Vec<u8>> {
+        let limits = Limits::default();
+        Ok(match self {
+            Content::File(from) => io::read_bytes(from, &limits)?,
+            Content::Mask(from, size) => {
+                io::png_gray_bytes(&io::read_gray(from, Some(*size), &limits)?, target)?
+            }
+            Content::Bytes(bytes) => bytes.clone(),
+        })
+    }
+
+    fn write(&self, target: &Path, link: bool) -> Result<()> {
+        if let Some(folder) = target.parent() {
+            io::create_folder(folder)?;
+        }
+        match self {
+            Content::File(from) if link => io::hard_link(from, target)?,
+            Content::File(from) => io::copy(from, target)?,
+            _ => io::write_atomic(target, &self.bytes(target)?)?,
+        }
+        Ok(())
+    }
+
+    /// Does the file hold just that?
+    fn is_in(&self, target: &Path) -> Result<bool> {
+        let sizes = match self {
+            Content::File(from) => io::file_size(from) == io::file_size(target),
+            _ => true,
+        };
+        Ok(sizes && io::read_bytes(target, &Limits::default()).unwrap_or_default() == self.bytes(target)?)
+    }
+}
+
+/// Writes `capture` into `folder`, which must be new, empty, or hold what the same conversion wrote. Photographs and masks are copied, or hard-linked with
 /// `link`: then they cost no space, and who changes one changes the other.
 ///
 /// # Errors
 ///
-/// If the capture was opened reduced in size, the folder is not empty, or the format has no such lens.
+/// If the capture was opened reduced in size, the folder holds anything else, or the format has no such lens.
 pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -> Result<Conversion> {
     if let Some(view) = capture.views.iter().find(|v| v.photo_size != (v.camera.width, v.camera.height)) {
         let message = format!("the photograph of `{}` would be converted reduced in size", view.name);
@@ -79,11 +124,8 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -
             "convert with `--set capture.downscale=1`: photographs are kept as they are",
         ));
     }
-    let occupied =
-        io::exists(folder) && (!io::is_folder(folder) || io::any_file(folder, &|_| false)?.is_some());
-    if occupied {
-        let message = format!("`{}` is not an empty folder", folder.display());
-        return Err(Error::cannot(message, "name a new one: nothing that is there is overwritten"));
+    if io::exists(folder) && !io::is_folder(folder) {
+        return Err(occupied(folder, "it is no folder"));
     }
     let mut out = Conversion { folder: folder.into(), views: capture.views.len(), ..Conversion::default() };
     let places: Vec<Place> = capture.views.iter().map(|v| place(v, to)).collect();
@@ -102,41 +144,53 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -
         CameraFormat::Colmap => sparse(capture, &places, named_splits, &mut out.warnings)?,
         CameraFormat::Llff => poses(capture, &places, named_splits, &mut out.warnings)?,
     };
-    let put = |from: &Path, name: &str| -> Result<()> {
-        let target = folder.join(name);
-        io::create_folder(target.parent().unwrap_or(folder))?;
-        if link {
-            io::hard_link(from, &target)?;
-        } else {
-            io::copy(from, &target)?;
-        }
-        Ok(())
-    };
+    let mut contents: Vec<(PathBuf, Content)> = Vec::new();
     for place in &places {
-        put(&place.view.photo, &place.photo)?;
+        let mut put = |name: &str, content| contents.push((folder.join(name), content));
+        put(&place.photo, Content::File(&place.view.photo));
         if let (ViewMask::File(from), Some(name)) = (&place.view.mask, &place.mask) {
+            let is_png = from.extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
+            put(name, if is_png { Content::File(from) } else { Content::Mask(from, place.view.photo_size) });
             out.masks += 1;
-            if from.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
-                put(from, name)?;
-            } else {
-                let target = folder.join(name);
-                io::create_folder(target.parent().unwrap_or(folder))?;
-                let gray = io::read_gray(from, Some(place.view.photo_size), &Limits::default())?;
-                io::write_png_gray(&target, &gray)?;
-            }
         }
         for (from, name) in [(&place.view.valid, &place.valid), (&place.view.region, &place.region)] {
             if let (Some(from), Some(name)) = (from, name) {
-                put(from, name)?;
+                put(name, Content::File(from));
             }
         }
     }
-    for (name, bytes) in files {
-        let path = folder.join(name);
-        io::create_folder(path.parent().unwrap_or(folder))?;
-        io::write_atomic(&path, &bytes)?;
+    contents.extend(files.into_iter().map(|(name, bytes)| (folder.join(name), Content::Bytes(bytes))));
+    let there = written(folder, &contents)?;
+    for (target, content) in contents.iter().filter(|(target, _)| !there.contains(target)) {
+        content.write(target, link)?;
     }
     Ok(out)
+}
+
+fn occupied(folder: &Path, why: &str) -> Error {
+    let message = format!("`{}` cannot be written into: {why}", folder.display());
+    Error::cannot(message, "name a new folder: nothing that is there is overwritten")
+}
+
+/// What of `contents` is in the folder already; anything else in it is an error.
+fn written(folder: &Path, contents: &[(PathBuf, Content)]) -> Result<HashSet<PathBuf>> {
+    let contents: HashMap<&PathBuf, &Content> =
+        contents.iter().map(|(target, content)| (target, content)).collect();
+    let mut there = HashSet::new();
+    let mut folders = if io::exists(folder) { vec![folder.to_path_buf()] } else { Vec::new() };
+    while let Some(inner) = folders.pop() {
+        folders.extend(io::list_folders(&inner)?);
+        for target in io::list_files(&inner)?.iter().map(|name| inner.join(name)) {
+            match contents.get(&target) {
+                Some(content) if content.is_in(&target)? => there.insert(target),
+                _ => {
+                    let name = target.strip_prefix(folder).unwrap_or(&target);
+                    return Err(occupied(folder, &format!("`{}` is there and another file", name.display())));
+                }
+            };
+        }
+    }
+    Ok(there)
 }
 
 fn place(view: &View, to: CameraFormat) -> Place<'_> {

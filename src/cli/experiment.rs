@@ -3,16 +3,18 @@
 use super::demo::photograph;
 use super::invocation::Invocation;
 use super::out::Out;
+use super::run::in_words;
 use super::stdout::print;
 use crate::capture::synthetic::SyntheticOptions;
 use crate::config::Config;
 use crate::io::{self, Limits};
 use crate::pipeline::Line;
 use crate::pipeline::experiment::{
-    ORDERINGS, ROWS, TABLES, config, is_done, measured, runs, without_masks, work,
+    ORDERINGS, ROWS, TABLES, ahead, config, measured, runs, without_masks, work,
 };
+use crate::report::duration;
 use crate::report::experiment::{Experiment, ExperimentRow, Measured, read_published};
-use crate::run::Run;
+use crate::run::{Cost, Run};
 use crate::{Error, Result};
 use clap::Args;
 use clap::builder::PossibleValuesParser;
@@ -110,7 +112,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     let open = |task: &Task| Run::open(&folder.join(&task.name), stop.clone(), screen.clone());
     let opened: Vec<Run> = tasks.iter().map(open).collect();
     let mut lines: Vec<Option<Line>> = tasks.iter().map(|_| None).collect();
-    let mut failed = None;
+    let (mut failed, mut sum) = (None, Cost::default());
     for ((task, run), line) in tasks.iter().zip(&opened).zip(&mut lines).filter(|((task, _), _)| chosen(task))
     {
         let opened = match Line::open(&task.config, run) {
@@ -128,7 +130,9 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         };
         let line = &*line.insert(opened);
         if common.dry_run {
-            let state = if is_done(line, task.run) { "done" } else { "to do" };
+            let cost = ahead(line, task.run);
+            sum = sum + cost.unwrap_or_default();
+            let state = cost.map_or("done".into(), |c| format!("to do  about {}", duration(c.seconds())));
             print(&format!("{:<32} {state}\n", task.name))?;
             continue;
         }
@@ -148,6 +152,9 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         }
     }
     if common.dry_run {
+        if sum.cpu_s > 0.0 {
+            print(&format!("{:<32} {}\n", "all", in_words(sum)))?;
+        }
         return Ok(());
     }
     // of what lies there by now: whoever makes runs one by one has the tables as they fill

@@ -129,16 +129,17 @@ fn outlook(line: &Line, until: Stage, common: &Common) -> Result<String> {
         }
     }
     if !common.json && sum.cpu_s > 0.0 {
-        let gib = |bytes: u64| bytes as f64 / (1u64 << 30) as f64;
-        text += &format!(
-            "{:<8} about {} on the processor, {:.1} GiB of memory, {:.1} GiB of disk\n",
-            "all",
-            duration(sum.seconds()),
-            gib(sum.memory_bytes),
-            gib(sum.disk_bytes)
-        );
+        text += &format!("{:<8} {}\n", "all", in_words(sum));
     }
     Ok(text)
+}
+
+/// What all of it may cost.
+pub(super) fn in_words(cost: Cost) -> String {
+    let gib = |bytes: u64| bytes as f64 / (1u64 << 30) as f64;
+    let (memory, disk) = (gib(cost.memory_bytes), gib(cost.disk_bytes));
+    let time = duration(cost.seconds());
+    format!("about {time} on the processor, {memory:.1} GiB of memory, {disk:.1} GiB of disk")
 }
 
 /// The configuration that a target and the options amount to; it remembers its capture.

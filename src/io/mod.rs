@@ -32,8 +32,8 @@ pub use limits::Limits;
 pub use npy::{Npy, NpyValues, npy_bytes, parse_npy, read_npy};
 pub use npz::read_npz;
 pub use pictures::{
-    PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, png_bytes, read_gray, read_photo,
-    write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
+    PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, png_bytes, png_gray_bytes,
+    read_gray, read_photo, write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
 };
 pub use process::{cpu_seconds, forget_peak_memory, has_open, peak_memory, processor};
 pub use read::read_bytes;

@@ -336,9 +336,14 @@ pub fn write_png_rgba(path: &Path, width: u32, height: u32, rgba: &[[u8; 4]]) ->
     write_png(path, width, height, rgba.as_flattened(), ExtendedColorType::Rgba8)
 }
 
+/// A gray picture as the bytes of an 8-bit PNG file. `path` is for messages only.
+pub fn png_gray_bytes(gray: &Gray, path: &Path) -> Result<Vec<u8>, WriteError> {
+    png(path, gray.width, gray.height, &gray.values, ExtendedColorType::L8)
+}
+
 /// Writes an 8-bit gray PNG.
 pub fn write_png_gray(path: &Path, gray: &Gray) -> Result<(), WriteError> {
-    write_png(path, gray.width, gray.height, &gray.values, ExtendedColorType::L8)
+    write_atomic(path, &png_gray_bytes(gray, path)?)
 }
 
 /// Writes a 16-bit gray PNG (depth in millimetres).

@@ -10,7 +10,7 @@ use crate::config::{
 };
 use crate::io::{self, Limits};
 use crate::report::experiment::{ExperimentRow, Measured, Ordering};
-use crate::run::{read_record, read_status};
+use crate::run::{Cost, read_record, read_status};
 use crate::{Error, ErrorKind, Result};
 use serde_json::Value;
 use std::path::Path;
@@ -323,9 +323,10 @@ fn figures(line: &Line, row: &ExperimentRow, value: &Value, beside: &str) -> Mea
     out
 }
 
-/// Is everything of a run made?
-pub fn is_done(line: &Line, run: &str) -> bool {
-    stages(line, run).into_iter().all(|stage| line.run.is_done(&line.plan(stage)))
+/// What the stages of a run that are not made yet may cost, one after the other; `None` if all are made.
+pub fn ahead(line: &Line, run: &str) -> Option<Cost> {
+    let stages = stages(line, run).into_iter().filter(|stage| !line.run.is_done(&line.plan(*stage)));
+    stages.map(|stage| line.cost(stage)).reduce(|sum, cost| sum + cost)
 }
 
 #[cfg(test)]
@@ -540,7 +541,7 @@ mod tests {
         let line = Line::open(&c, &run).unwrap();
         assert_eq!(measured(&line, &row, "x").problem.as_deref(), Some("stage `mask` is not done yet"));
         work(&line, row.run).unwrap();
-        assert!(is_done(&line, row.run));
+        assert!(ahead(&line, row.run).is_none());
         let found = measured(&line, &row, "head/run");
         assert_eq!((found.views.len(), found.problem.clone()), (2, None));
         assert_eq!(found.masks.as_deref(), Some("capture"));

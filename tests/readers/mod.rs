@@ -4,24 +4,29 @@
 
 use glam::{DMat3, DVec3};
 use std::fs;
+use std::io::{Read, Write};
+use std::net::{Shutdown, TcpStream};
 use std::path::Path;
+use std::sync::LazyLock;
 use tiface::capture::{self, CaptureOptions};
 use tiface::config::{Config, Preset, Sources};
 use tiface::geom::{Camera, Distortion};
+use tiface::iface::IFace;
 use tiface::io::{self, Limits};
 use tiface::mesh::files::{ExtractedSurface, HeadMesh, ReadOptions, check_around, open_mesh, read_with};
 use tiface::pipeline::Line;
-use tiface::report::RunRow;
 use tiface::report::bench::BenchResult;
 use tiface::report::experiment::{ExperimentRow, read_published};
+use tiface::report::{Answer, RunRow, Server};
 use tiface::run::{Run, read_record, read_status};
+use tiface::tface::TFace;
 
 /// A reader gets a folder of its own, prepared by [`prepare`], and the bytes. It must come back, with whatever it
 /// makes of them, in words.
 pub type Reader = fn(&Path, &[u8]) -> String;
 
 /// By the name of their seeds.
-pub const READERS: [(&str, Reader); 22] = [
+pub const READERS: [(&str, Reader); 25] = [
     ("bench", |_, bytes| told(BenchResult::parse(&text(bytes), "bench.json"))),
     ("camera_path", camera_path),
     ("cameras", cameras),
@@ -29,6 +34,8 @@ pub const READERS: [(&str, Reader); 22] = [
     ("colmap_text", |dir, bytes| model(dir, bytes, "txt")),
     ("config", config),
     ("exr", exr),
+    ("http", http),
+    ("iface", iface),
     ("llff", |dir, bytes| open(dir, "poses_bounds.npy", bytes)),
     ("mask", mask),
     ("mesh", mesh),
@@ -42,6 +49,7 @@ pub const READERS: [(&str, Reader); 22] = [
     ("realitycapture", realitycapture),
     ("run", run),
     ("surface", surface),
+    ("tface", tface),
     ("torch", torch),
     ("transforms", |dir, bytes| open(dir, "transforms.json", bytes)),
 ];
@@ -170,6 +178,60 @@ fn surface(dir: &Path, bytes: &[u8]) -> String {
     put(dir, "head/surface.safetensors", bytes);
     let tensors = told(io::parse_tensors(dir, bytes, &limits()));
     tensors + &told(ExtractedSurface::load(&dir.join("head"))) + &told(HeadMesh::load(&dir.join("head")))
+}
+
+/// A checkpoint of T-Face.
+fn tface(dir: &Path, bytes: &[u8]) -> String {
+    put(dir, "head/checkpoint.safetensors", bytes);
+    told(TFace::load("tface", &dir.join("head")))
+}
+
+/// A checkpoint of I-Face with the settings of its seeds.
+fn iface(dir: &Path, bytes: &[u8]) -> String {
+    put(dir, "head/checkpoint.safetensors", bytes);
+    let mut config = Config::preset(Preset::Draft).iface;
+    (config.levels, config.log2_table, config.occupancy_resolution) = (1, 4, 16);
+    told(IFace::load(&dir.join("head"), &config, None))
+}
+
+/// A request to the page of a run, whose port and token are not known before: `PORT` and `TOKEN` stand for them.
+fn http(_: &Path, bytes: &[u8]) -> String {
+    static SERVER: LazyLock<&Server> = LazyLock::new(|| {
+        let server: &Server = Box::leak(Box::new(Server::open().unwrap()));
+        let answer =
+            |path: &str| (path == "page").then(|| Answer { kind: "text/plain", body: b"page".into() });
+        std::thread::spawn(move || server.run(&|| false, &answer));
+        server
+    });
+    let url = SERVER.url();
+    let (port, token) =
+        url.trim_start_matches("http://127.0.0.1:").trim_end_matches('/').split_once('/').unwrap();
+    let request = replaced(&replaced(bytes, b"PORT", port.as_bytes()), b"TOKEN", token.as_bytes());
+    // a system that has no port left tells nothing about the server
+    let Ok(mut stream) = TcpStream::connect(("127.0.0.1", port.parse().unwrap())) else {
+        return String::new();
+    };
+    // a server that has heard enough may close before all is said
+    let _ = stream.write_all(&request).and_then(|()| stream.shutdown(Shutdown::Write));
+    let mut heard = Vec::new();
+    match stream.read_to_end(&mut heard) {
+        Ok(_) => {
+            let text = text(&heard);
+            assert!(text.starts_with("HTTP/1.1 "), "no answer: {text}");
+            let known = text.ends_with("\r\n\r\npage") == text.starts_with("HTTP/1.1 200 ");
+            assert!(known, "what nobody offered: {text}");
+            text.lines().next().unwrap_or_default().replace(|c: char| c.is_ascii_digit(), "")
+        }
+        Err(e) => e.kind().to_string(),
+    }
+}
+
+/// The first place of a word taken by another.
+fn replaced(bytes: &[u8], word: &[u8], by: &[u8]) -> Vec<u8> {
+    match bytes.windows(word.len()).position(|w| w == word) {
+        Some(at) => [&bytes[..at], by, &bytes[at + word.len()..]].concat(),
+        None => bytes.to_vec(),
+    }
 }
 
 fn torch(dir: &Path, bytes: &[u8]) -> String {

@@ -17,7 +17,7 @@ import { fileURLToPath } from "node:url";
 import { parseArgs } from "node:util";
 import { chromium } from "playwright-core";
 import { PNG } from "pngjs";
-import { Matrix4, Quaternion, Vector3 } from "three";
+import { inFile, psnr } from "./pictures.mjs";
 
 const { values, positionals: [run] } = parseArgs({
   allowPositionals: true,
@@ -62,16 +62,6 @@ const server = createServer(async (request, response) => {
 await new Promise((ready) => server.listen(0, "127.0.0.1", ready));
 const origin = `http://127.0.0.1:${server.address().port}`;
 
-/** A camera of the run in the file's axes and metres: +Y up. */
-function inFile(camera, { up, unit_m: unit }) {
-  const turn = new Matrix4().makeRotationFromQuaternion(
-    new Quaternion().setFromUnitVectors(new Vector3(...up).normalize(), new Vector3(0, 1, 0)));
-  const r = camera.rotation; // columns
-  const pose = new Matrix4().set(r[0], r[3], r[6], 0, r[1], r[4], r[7], 0, r[2], r[5], r[8], 0, 0, 0, 0, 1)
-    .setPosition(new Vector3(...camera.position).multiplyScalar(unit));
-  return { ...camera, pose: turn.multiply(pose).elements };
-}
-
 /** In the page: pictures of the head, with lobes and without, as data URLs. */
 async function pictures(cameras) {
   const { Matrix4, PerspectiveCamera, Scene, Vector3, WebGLRenderer } = await import("three");
@@ -101,17 +91,6 @@ async function pictures(cameras) {
     };
     return { three: shot(1), base: shot(0) };
   });
-}
-
-/** PSNR in dB of the pixels that both pictures cover. */
-function psnr(a, b) {
-  let [sum, n] = [0, 0];
-  for (let i = 0; i < a.data.length; i += 4) {
-    if (a.data[i + 3] < 255 || b.data[i + 3] < 255) continue;
-    for (let k = 0; k < 3; k++) sum += (a.data[i + k] - b.data[i + k]) ** 2;
-    n += 3;
-  }
-  return { db: 10 * Math.log10(255 ** 2 / (sum / n)), share: n / 3 / (a.data.length / 4) };
 }
 
 /** The same of the pixels that the head covers in part: its outline, and what is soft around it. Over black. */
