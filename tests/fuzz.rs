@@ -21,7 +21,7 @@ const MOST_BYTES: usize = 160 << 20;
 /// Work for one input, seconds.
 const MOST_SECONDS: f64 = 1.0;
 /// Longer inputs find nothing that shorter ones do not.
-const LONGEST: usize = 1 << 15;
+const LONGEST: usize = 1 << 17;
 
 static HELD: AtomicUsize = AtomicUsize::new(0);
 static PEAK: AtomicUsize = AtomicUsize::new(0);
@@ -197,7 +197,8 @@ fn no_input_makes_a_reader_panic_hang_or_fill_the_memory() {
             }
             pool.push(input);
         }
-        assert!(!pool.is_empty(), "no seeds of `{name}`");
+        // what is never read whole is only known at its door
+        assert!(answers.contains(""), "no seed of `{name}` is read: {answers:?}");
         let mut random = Random(setting("TIFACE_FUZZ_SEED", 1));
         let (begin, mut count, mut wrong) = (Instant::now(), 0u64, 0);
         while begin.elapsed() < seconds && wrong < 3 {
