@@ -54,7 +54,7 @@ pub use crate::geom::RayResult;
 pub use bench::{Bench, SWEEPS};
 pub use export::Export;
 pub use field_view::field_view;
-pub use line::{Line, capture_options, feasible};
+pub use line::{Line, capture_options, feasible, require_device};
 pub use mask::{click_page, disagreements};
 pub use mesh::export_head;
 pub use page::{head_page, renew_report, viewer_of_file};

@@ -351,6 +351,44 @@ fn an_out_or_a_device_that_cannot_be_is_refused_before_anything_begins() {
     assert_eq!(code(&o), 0, "{}", err(&o));
     let left: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
     assert_eq!(left, ["head"]);
+    // what computes nothing on a device needs none, and nor does what is done
+    for _ in 0..2 {
+        let o = tiface(dir.path(), &["mask", "head", "--device", "wgpu:99"]);
+        assert_eq!(code(&o), 0, "{}", err(&o));
+    }
+    let o = tiface(dir.path(), &["report", "runs/head"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+}
+
+#[test]
+fn the_tables_say_what_they_need_and_are_collected_without_making_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&dir.path().join("head"), &options).unwrap();
+    let experiment = |more: &[&str]| {
+        let words = ["experiment", "head", "--tables", "components", "--scale", "0.01", "--out", "tables/"];
+        tiface(dir.path(), &[&words[..], more].concat())
+    };
+    let o = experiment(&["--dry-run"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    let said = out(&o);
+    let lines: Vec<&str> = said.lines().collect();
+    assert!(lines[0].starts_with("head/paper ") && lines[0].contains("to do  about "), "{said}");
+    assert!(lines[1].starts_with("all ") && lines.len() == 2, "{said}");
+    let o = experiment(&["--dry-run", "--json"]);
+    let run: serde_json::Value = serde_json::from_str(out(&o).trim()).unwrap();
+    assert_eq!((&run["run"], &run["done"]), (&"head/paper".into(), &false.into()));
+    assert!(run["estimate"]["cpu_s"].as_f64().unwrap() > 0.0);
+    for wrong in [["--preset", "draft"], ["--run", "runs/other"], ["--fresh", "iface"]] {
+        let o = experiment(&wrong);
+        assert_eq!(code(&o), 2, "{}", err(&o));
+        assert!(err(&o).contains("does not go with `experiment`"), "{}", err(&o));
+    }
+    assert!(!dir.path().join("tables").exists());
+    let o = experiment(&["--collect"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    let table = std::fs::read_to_string(dir.path().join("tables/experiment.md")).unwrap();
+    assert!(table.contains("not made yet") && !dir.path().join("tables/head").exists(), "{table}");
 }
 
 #[test]

@@ -12,7 +12,8 @@ use readers::{READERS, Reader, prepare};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::collections::HashSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
@@ -20,6 +21,8 @@ use std::time::{Duration, Instant};
 const MOST_BYTES: usize = 160 << 20;
 /// Work for one input, seconds.
 const MOST_SECONDS: f64 = 1.0;
+/// A reader that has not come back by then never will, on however busy a machine, seconds.
+const NEVER: f64 = 60.0;
 /// Longer inputs find nothing that shorter ones do not.
 const LONGEST: usize = 1 << 17;
 
@@ -51,6 +54,26 @@ unsafe impl GlobalAlloc for Counted {
 
 #[global_allocator]
 static ALLOCATOR: Counted = Counted;
+
+/// What a reader works on, since when, and where it is kept if nothing ever comes of it.
+static NOW: Mutex<Option<(Instant, PathBuf, Vec<u8>)>> = Mutex::new(None);
+
+/// Ends the process if a reader does not come back: nothing else ends an endless loop.
+fn watch() {
+    std::thread::spawn(|| {
+        loop {
+            std::thread::sleep(Duration::from_secs(1));
+            let now = NOW.lock().unwrap();
+            if let Some((_, folder, input)) = now.as_ref().filter(|now| now.0.elapsed().as_secs_f64() > NEVER)
+            {
+                let file = folder.join("found-hang");
+                std::fs::write(&file, input).unwrap();
+                eprintln!("a reader does not come back: {}", file.display());
+                std::process::abort();
+            }
+        }
+    });
+}
 
 /// SplitMix64.
 struct Random(u64);
@@ -148,7 +171,14 @@ fn change(input: &mut Vec<u8>, other: &[u8], random: &mut Random) {
 }
 
 /// Feeds a reader; its answer without numbers and quotations, or what is wrong.
-fn feed(read: Reader, dir: &Path, input: &[u8]) -> Result<String, String> {
+fn feed(read: Reader, seeds: &Path, dir: &Path, input: &[u8]) -> Result<String, String> {
+    *NOW.lock().unwrap() = Some((Instant::now(), seeds.into(), input.into()));
+    let answer = measured(read, dir, input);
+    *NOW.lock().unwrap() = None;
+    answer
+}
+
+fn measured(read: Reader, dir: &Path, input: &[u8]) -> Result<String, String> {
     let before = HELD.load(Relaxed);
     PEAK.store(before, Relaxed);
     let (work, begin) = (tiface::io::cpu_seconds(), Instant::now());
@@ -177,6 +207,7 @@ fn no_input_makes_a_reader_panic_hang_or_fill_the_memory() {
     // files are written a million times: into memory, where there is such a place
     let scratch = Path::new("/dev/shm");
     let scratch = if scratch.is_dir() { scratch.to_path_buf() } else { std::env::temp_dir() };
+    watch();
     let (mut total, mut findings) = (0u64, Vec::new());
     for (name, read) in READERS.into_iter().filter(|(name, _)| only.as_ref().is_none_or(|o| o == name)) {
         let dir = tempfile::tempdir_in(&scratch).unwrap();
@@ -187,11 +218,12 @@ fn no_input_makes_a_reader_panic_hang_or_fill_the_memory() {
             std::fs::write(&file, input).unwrap();
             findings.push(format!("{name}: {what}: {}", file.display()));
         };
+        let seeds = root.join(name);
         let mut answers = HashSet::new();
         let mut pool: Vec<Vec<u8>> = Vec::new();
         for entry in std::fs::read_dir(root.join(name)).unwrap() {
             let input = std::fs::read(entry.unwrap().path()).unwrap();
-            match feed(read, dir.path(), &input) {
+            match feed(read, &seeds, dir.path(), &input) {
                 Ok(answer) => drop(answers.insert(answer)),
                 Err(what) => found(what, &input),
             }
@@ -212,7 +244,7 @@ fn no_input_makes_a_reader_panic_hang_or_fill_the_memory() {
             }
             input.truncate(LONGEST);
             count += 1;
-            match feed(read, dir.path(), &input) {
+            match feed(read, &seeds, dir.path(), &input) {
                 Ok(answer) => {
                     if answers.insert(answer) {
                         pool.push(input);

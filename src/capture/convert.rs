@@ -161,6 +161,11 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -
     }
     contents.extend(files.into_iter().map(|(name, bytes)| (folder.join(name), Content::Bytes(bytes))));
     let there = written(folder, &contents)?;
+    // all that is there is ours, and so is what was half written
+    let inside: HashSet<&Path> = contents.iter().filter_map(|(target, _)| target.parent()).collect();
+    for inner in inside.into_iter().filter(|inner| io::is_folder(inner)) {
+        io::remove_leftovers(inner, None)?;
+    }
     for (target, content) in contents.iter().filter(|(target, _)| !there.contains(target)) {
         content.write(target, link)?;
     }

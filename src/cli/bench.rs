@@ -11,7 +11,7 @@ use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::config::{Config, Preset};
 use crate::io::{self, Limits};
 use crate::mesh::files::read;
-use crate::pipeline::{Bench, Line, SWEEPS, feasible};
+use crate::pipeline::{Bench, Line, SWEEPS, feasible, require_device};
 use crate::report::bench::BenchResult;
 use crate::report::duration;
 use crate::run::{Event, Observer, Run};
@@ -62,6 +62,7 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
     let target = options.path.as_deref().map(|path| RunTarget::find(common, Some(path))).transpose()?;
     let mut config = configure(common, target.as_ref())?;
     feasible(&config)?;
+    require_device(&config)?;
     let truth = options.truth.as_deref().map(|path| read(&io::read_bytes(path, &Limits::default())?, path));
     let truth = truth.transpose()?;
     let name = match &target {

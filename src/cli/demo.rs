@@ -7,7 +7,7 @@ use super::target::{DEMO_CAPTURE, RunTarget};
 use crate::capture::synthetic::{SyntheticOptions, check, write_borders, write_capture};
 use crate::config::Preset;
 use crate::io;
-use crate::pipeline::{Stage, feasible};
+use crate::pipeline::{Stage, feasible, require_device};
 use crate::report::duration;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -36,7 +36,8 @@ pub(super) fn run(
     let fallback = Some((Preset::Draft, SHORTER));
     // what is wrong with the command line is reported before the head is photographed
     Out::find(common.out.as_deref(), "run")?;
-    feasible(&common.resolve(saved.as_deref(), fallback, &[])?)?;
+    let config = common.resolve(saved.as_deref(), fallback, &[])?;
+    feasible(&config)?;
     // the cameras are written last: where they are, everything is
     if io::is_file(&capture.join("transforms.json")) {
         if size.is_some() || views.is_some() || border.is_some() {
@@ -47,6 +48,7 @@ pub(super) fn run(
             ));
         }
     } else {
+        require_device(&config)?;
         if common.dry_run {
             let text = format!("would photograph a synthetic head into `{}`", capture.display());
             invocation.screen.note("capture", &text);

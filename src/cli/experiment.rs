@@ -33,9 +33,12 @@ pub(super) struct ExperimentOptions {
     /// A share of the published effort, 0.001 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 1.0)]
     scale: f64,
-    /// Make this run alone, as named by --dry-run; the tables are of what lies there by now; repeatable
+    /// Make this run alone, as named by --dry-run, and no tables; repeatable
     #[arg(long, value_name = "CAPTURE/RUN")]
     only: Vec<String>,
+    /// Make no run, only the tables of those that are there
+    #[arg(long, conflicts_with = "only")]
+    collect: bool,
     /// Figures of the publication: lines of table,row,measure,value
     #[arg(long, value_name = "FILE")]
     published: Option<PathBuf>,
@@ -56,6 +59,19 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         return Err(Error::usage(
             found,
             "0.1 makes all tables of two captures in some two hours on two cores",
+        ));
+    }
+    let ignored = [
+        ("--preset", common.preset.is_some()),
+        ("--config", !common.config.is_empty()),
+        ("--fresh", common.fresh.is_some()),
+        ("--run", common.run.is_some()),
+    ];
+    if let Some((word, _)) = ignored.iter().find(|(_, given)| *given) {
+        let problem = format!("`{word}` does not go with `experiment`, whose rows are settings of their own");
+        return Err(Error::usage(
+            problem,
+            "change all of them with `--set KEY=VALUE`; `--out FOLDER` names the folder",
         ));
     }
     let folder = match Out::find(common.out.as_deref(), "experiment")? {
@@ -108,7 +124,8 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
             format!("runs are {}", known.join(", ")),
         ));
     }
-    let chosen = |task: &&Task| options.only.is_empty() || options.only.contains(&task.name);
+    let all = options.only.is_empty();
+    let chosen = |task: &&Task| !options.collect && (all || options.only.contains(&task.name));
     let open = |task: &Task| Run::open(&folder.join(&task.name), stop.clone(), screen.clone());
     let opened: Vec<Run> = tasks.iter().map(open).collect();
     let mut lines: Vec<Option<Line>> = tasks.iter().map(|_| None).collect();
@@ -119,7 +136,10 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
             Ok(opened) => opened,
             // what a capture lacks for one row, as masks, it does not lack for each
             Err(e) if common.dry_run => {
-                print(&format!("{:<32} cannot be made: {e}\n", task.name))?;
+                match common.json {
+                    true => print(&format!("{}\n", json!({"run": task.name, "error": e.to_string()})))?,
+                    false => print(&format!("{:<32} cannot be made: {e}\n", task.name))?,
+                }
                 continue;
             }
             Err(e) => {
@@ -132,6 +152,11 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         if common.dry_run {
             let cost = ahead(line, task.run);
             sum = sum + cost.unwrap_or_default();
+            if common.json {
+                let done = cost.is_none();
+                print(&format!("{}\n", json!({"run": task.name, "done": done, "estimate": cost})))?;
+                continue;
+            }
             let state = cost.map_or("done".into(), |c| format!("to do  about {}", duration(c.seconds())));
             print(&format!("{:<32} {state}\n", task.name))?;
             continue;
@@ -152,12 +177,15 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         }
     }
     if common.dry_run {
-        if sum.cpu_s > 0.0 {
+        if sum.cpu_s > 0.0 && !common.json {
             print(&format!("{:<32} {}\n", "all", in_words(sum)))?;
         }
         return Ok(());
     }
-    // of what lies there by now: whoever makes runs one by one has the tables as they fill
+    // a run alone is one task of many: each would read all captures to say what the others came to
+    if !all {
+        return failed.map_or(Ok(()), Err);
+    }
     let rows: Vec<_> = ROWS.into_iter().filter(|row| words.contains(&row.table)).collect();
     let mut measured: Vec<Vec<Measured>> = vec![Vec::new(); rows.len()];
     // every capture has every run, in the same order: so each row gets one of each capture, in theirs

@@ -11,7 +11,7 @@ use crate::config::{Config, Preset, RenderConfig};
 use crate::io;
 use crate::pipeline::{Line, Stage, reconstruct};
 use crate::report::duration;
-use crate::run::{Cost, Run};
+use crate::run::{Cost, Phase, Run, Standing};
 use crate::{Error, ErrorKind, Result};
 use serde_json::{Map, Value, json};
 use std::path::Path;
@@ -49,11 +49,16 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
     let bars = require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>>>()?;
     let run = Run::open(&target.run, stop.clone(), screen.clone());
     let line = ready(common, command, &config, &run, path, out.as_ref()).inspect_err(|e| {
-        // who runs many heads looks for what went wrong in their folders, not in logs; a run that has begun stays as it is
+        // who runs many heads looks for what went wrong in their folders, not in logs; a run that is done stays as it is,
+        // and a slip on the command line is no fault of one that has begun
         let is_named = common.run.is_some() || io::is_folder(run.dir());
         let is_begun = io::is_file(&run.path("config.toml"));
-        let tells = matches!(e.kind(), ErrorKind::Cannot | ErrorKind::Usage);
-        if is_named && tells && !is_begun && !common.dry_run {
+        let tells = match e.kind() {
+            ErrorKind::Cannot => !is_begun || Standing::read(run.dir()).phase != Phase::Done,
+            ErrorKind::Usage => !is_begun,
+            _ => false,
+        };
+        if is_named && tells && !common.dry_run {
             run.failed(e);
         }
     })?;

@@ -4,9 +4,10 @@ use super::invocation::Invocation;
 use super::plain::one_line;
 use super::screen::figure;
 use super::stdout::print;
+use crate::config::Stage;
 use crate::io;
 use crate::report::duration;
-use crate::run::{Phase, Record, Standing, State, Status, read_record, read_status};
+use crate::run::{Phase, Record, StageStanding, Standing, Status};
 use crate::{Error, Result};
 use clap::Args;
 use rayon::prelude::*;
@@ -234,29 +235,11 @@ fn stages(run: &Path, standing: &Standing) -> String {
         let _ = writeln!(text, "{:<24} {stage:<8} {}", one_line(&run.display().to_string()), one_line(words));
     };
     for s in &standing.stages {
-        let words = match &s.error {
-            Some(error) if s.phase == Phase::Unreadable => format!("UNREADABLE: {error}"),
-            _ => words(s.phase, s.status.as_ref(), s.record.as_ref()),
-        };
-        row(s.stage.word(), &words);
+        row(s.stage.word(), &of_stage(s));
     }
     for path in io::list_folders(&run.join("render/paths")).unwrap_or_default() {
         let name = format!("render/paths/{}", path.file_name().unwrap_or_default().to_string_lossy());
-        let found = read_status(&path).and_then(|status| Ok((status, read_record(&path)?)));
-        let words = match &found {
-            Err(e) => format!("UNREADABLE: {e}"),
-            Ok((status, record)) => {
-                let phase = match (record, status.as_ref().map(|s| s.state)) {
-                    (Some(_), _) => Phase::Done,
-                    (None, None) => Phase::Waiting,
-                    (None, Some(State::Failed)) => Phase::Failed,
-                    (None, Some(State::Stopped)) => Phase::Stopped,
-                    (None, Some(_)) => Phase::Running,
-                };
-                words(phase, status.as_ref(), record.as_ref())
-            }
-        };
-        row(&name, &words);
+        row(&name, &of_stage(&StageStanding::read(&path, Stage::Render)));
     }
     if standing.at.is_none() && standing.phase == Phase::Failed {
         row("–", &told(standing));
@@ -268,6 +251,13 @@ fn stages(run: &Path, standing: &Standing) -> String {
 }
 
 /// Where a stage stands, in words.
+fn of_stage(s: &StageStanding) -> String {
+    match &s.error {
+        Some(error) if s.phase == Phase::Unreadable => format!("UNREADABLE: {error}"),
+        _ => words(s.phase, s.status.as_ref(), s.record.as_ref()),
+    }
+}
+
 fn words(phase: Phase, status: Option<&Status>, record: Option<&Record>) -> String {
     let Some(s) = status.filter(|_| phase != Phase::Done) else {
         return record.map_or("–".into(), |r| format!("done in {}", duration(r.elapsed_s)));

@@ -43,6 +43,11 @@ impl Stage {
         matches!(self, Baseline | Tface | Iface)
     }
 
+    /// Does it compute on the device, where that is a GPU?
+    pub fn uses_device(self) -> bool {
+        self.learns() || matches!(self, Mesh | Render)
+    }
+
     /// The stages that it reads from. What views are made of decides what `render` needs.
     pub fn needs(self, config: &Config) -> Vec<Stage> {
         match self {

@@ -5,7 +5,7 @@ use super::line::Line;
 use super::path::CameraPath;
 use crate::Result;
 use crate::capture::Split;
-use crate::config::{Config, Method, Stage, VmConfig};
+use crate::config::{Config, Method, Preset, Stage, VmBackground, VmConfig};
 use crate::run::{Cost, ESTIMATE, Estimate};
 
 const MIB: f64 = (1u64 << 20) as f64;
@@ -34,6 +34,8 @@ impl Line<'_> {
     /// settings; `docs/many-heads.md` says how far off others were.
     pub fn cost(&self, stage: Stage) -> Cost {
         let Config { iface, mesh, .. } = self.config;
+        let published = self.config.preset == Preset::Paper;
+        let shell = |c: &VmConfig| c.background == VmBackground::Reference;
         let all = self.pixels() as f64;
         let each = all / self.capture.views.len().max(1) as f64;
         let held_out = each * self.capture.split(Split::Test).count().max(1) as f64;
@@ -45,14 +47,23 @@ impl Line<'_> {
         let methods = &self.render_config().method;
         // carried to all views, and made soft
         let clicked = if self.clicks.is_some() { 2.5e-6 * all } else { 0.0 };
+        // ISNet takes 4.5 s of a core a photograph with ONNX Runtime; others more or less
+        let m = &self.config.mask;
+        let files = [&m.sam, &m.vitmatte, &m.alpha_net].into_iter().filter(|file| !file.is_empty()).count();
+        let networks = 5.0 * (files * self.capture.views.len()) as f64;
         let (cpu_s, mib) = match stage {
-            Stage::Mask => (0.7 + 3e-7 * all + clicked, 115.0 + 5e-6 * all),
+            Stage::Mask => (0.7 + 3e-7 * all + clicked + networks, 115.0 + 5e-6 * all),
             Stage::Baseline | Stage::Tface => {
                 let c = self.config.radiance(stage);
                 let rays = (c.steps as usize * c.rays * c.learned()) as f64;
                 let parameters = vm_parameters(&c);
-                // whole frames are mostly outside the hull, and nothing of them is skipped
-                let outside = if stage == Stage::Baseline { 4.0 } else { 1.0 };
+                // whole frames are mostly outside the hull, and nothing of them is skipped; nor is the shell that two
+                // backgrounds leave
+                let outside = match stage {
+                    Stage::Baseline => 4.0,
+                    _ if shell(&c) => 2.3,
+                    _ => 1.0,
+                };
                 // samples along a ray are as dense as the grid
                 let ray = outside * (5e-6 + 0.16e-6 * (c.voxels_final as f64).cbrt());
                 let cpu_s = 0.1 + ray * rays + 4e-9 * parameters * (c.steps as usize * c.learned()) as f64;
@@ -74,7 +85,15 @@ impl Line<'_> {
                 )
             }
             Stage::Render => {
+                // through all of the box, in all of the picture
+                let whole = |method: &Method| {
+                    let c = self.config.radiance(method.stage());
+                    let empty = if *method == Method::Baseline || shell(&c) { 0.25e-6 } else { 0.1e-6 };
+                    empty * (c.voxels_final as f64).cbrt()
+                };
                 let pixel = |method: &Method| match method {
+                    Method::Baseline | Method::Tface if published => whole(method),
+                    Method::Volume if published => 90e-6,
                     Method::Baseline | Method::Tface => 8e-6,
                     Method::Volume => 20e-6,
                     _ => 2.5e-6,

@@ -1,6 +1,7 @@
 //! A capture, its configuration and its run: what every stage works on.
 
 use super::clicks::MaskPrompts;
+use super::metrics::measure;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::Scene;
@@ -162,14 +163,22 @@ impl<'a> Line<'a> {
         self.path.as_ref().map_or(&self.config.render, |path| &path.render)
     }
 
-    /// An error if something that one of these stages works on is no longer there.
+    /// An error if something that one of these stages works on is not there: photographs, checkpoints, networks, the
+    /// device.
     pub(super) fn require_inputs(&self, stages: &[Stage]) -> Result<()> {
         if let Some(problem) = self.gone.as_ref().filter(|_| !stages.is_empty()) {
             return Err(gone(problem));
         }
         let mut lost =
             self.imports.iter().filter(|i| stages.contains(&i.stage)).filter_map(|i| i.gone.clone());
-        lost.next().map_or(Ok(()), Err)
+        lost.next().map_or(Ok(()), Err)?;
+        if stages.contains(&Stage::Metrics) {
+            measure(self.config)?;
+        }
+        match stages.iter().any(|stage| stage.uses_device()) {
+            true => require_device(self.config),
+            false => Ok(()),
+        }
     }
 
     /// Writes a file of the run itself. That it cannot be written is no failure where nothing is left to do: a run
@@ -185,14 +194,25 @@ impl<'a> Line<'a> {
     }
 }
 
-/// Refuses settings that contradict each other, and a device that this build cannot learn on.
+/// Refuses settings that contradict each other, and a box that is none.
 pub fn feasible(config: &Config) -> Result<()> {
     if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
         return Err(Error::usage(format!("`{key}` {problem}"), hint));
     }
     SceneBox::parse(&config.capture.r#box)?;
-    #[cfg(feature = "cpu")]
-    crate::field::place(&config.device)?;
+    Ok(())
+}
+
+/// Refuses a device that this build or this machine does not have, or that somebody else uses. What is done needs none:
+/// so this is asked where a stage is to do that computes on it.
+#[cfg(feature = "cpu")]
+pub fn require_device(config: &Config) -> Result<()> {
+    crate::field::place(&config.device).map(drop)
+}
+
+/// No fields, no device.
+#[cfg(not(feature = "cpu"))]
+pub fn require_device(_: &Config) -> Result<()> {
     Ok(())
 }
 
@@ -264,9 +284,8 @@ fn imports(config: &Config, run: &Run) -> Result<Vec<Import>> {
     let open = |(stage, file): (Stage, &String)| match file_digest(Path::new(file)) {
         Ok(digest) => Ok(Import { stage, digest, gone: None }),
         Err(e) => {
-            let missing = matches!(&e, io::ReadError::Io { source, .. } if source.kind() == NotFound);
             let record = read_record(&run.path(stage)).ok().flatten();
-            let record = record.filter(|_| missing && saved_import(run, stage).as_ref() == Some(file));
+            let record = record.filter(|_| is_missing(&e) && saved_import(run, stage).as_ref() == Some(file));
             let digest = record.and_then(|r| r.fingerprint.inputs.get("import").cloned());
             let e = Error::from(e);
             digest.map(|digest| Import { stage, digest, gone: Some(e.clone()) }).ok_or(e)
@@ -286,6 +305,8 @@ fn lpips(config: &Config, run: &Run) -> Result<Option<String>> {
         Ok(bytes) => Ok(Some(Fingerprint::of_bytes(&bytes))),
         Err(e) => {
             let record = read_record(&run.path(Stage::Metrics)).ok().flatten();
+            let same = || saved(run).is_some_and(|saved| saved.metrics.lpips == *file);
+            let record = record.filter(|_| is_missing(&e) && same());
             let digest = record.and_then(|r| r.fingerprint.inputs.get("lpips").cloned());
             digest.map(Some).ok_or_else(|| e.into())
         }
@@ -294,10 +315,19 @@ fn lpips(config: &Config, run: &Run) -> Result<Option<String>> {
 
 /// The checkpoint that a stage took when the run was last worked on, if the run says so.
 fn saved_import(run: &Run, stage: Stage) -> Option<String> {
+    let saved = saved(run)?;
+    Some(if stage == Stage::Baseline { saved.baseline.import } else { saved.tface.import })
+}
+
+/// The configuration that the run was last worked on with.
+fn saved(run: &Run) -> Option<Config> {
     let bytes = io::read_bytes(&run.path("config.toml"), &Limits::default()).ok()?;
     let file = ("config.toml".to_owned(), String::from_utf8(bytes).ok()?);
-    let saved = Config::resolve(&Sources { files: vec![file], ..Sources::default() }).ok()?;
-    Some(if stage == Stage::Baseline { saved.baseline.import } else { saved.tface.import })
+    Config::resolve(&Sources { files: vec![file], ..Sources::default() }).ok()
+}
+
+fn is_missing(e: &io::ReadError) -> bool {
+    matches!(e, io::ReadError::Io { source, .. } if source.kind() == NotFound)
 }
 
 /// What a run remembers of a capture that is no longer there: its cameras, its digest, the clicks' digests, and why it

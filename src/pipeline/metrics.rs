@@ -78,7 +78,8 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     let mut views: Vec<View> = judged.iter().flatten().map(|c| line.judged(c.view)).collect();
     views.sort_by(|a, b| a.name.cmp(&b.name));
     views.dedup_by(|a, b| a.name == b.name);
-    let lpips = measure(line.config, dir)?;
+    let lpips = measure(line.config)?;
+    lpips.iter().for_each(|network| dir.note(&network.file().to_string()));
     let tones = Tones::of(&views.iter().collect::<Vec<_>>())?;
     for (i, (set, pictures)) in sets.iter().zip(&judged).enumerate() {
         let figures = pictures.par_iter().map(|p| figures(line, p, tones.as_ref(), lpips.as_ref()));
@@ -107,29 +108,31 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
 
 /// The network for LPIPS, if one is named.
 #[cfg(feature = "matting")]
-fn measure(config: &Config, dir: &StageDir) -> Result<Option<Lpips>> {
+pub(super) fn measure(config: &Config) -> Result<Option<Lpips>> {
     let file = &config.metrics.lpips;
     if file.is_empty() {
         return Ok(None);
     }
-    let lpips = Lpips::open(file.as_ref(), &config.mask.onnxruntime, config.mask.memory_gib)?;
-    dir.note(&lpips.file().to_string());
-    Ok(Some(lpips))
+    Lpips::open(file.as_ref(), &config.mask.onnxruntime, config.mask.memory_gib).map(Some)
 }
 
 /// What stands for LPIPS in a build that runs no networks.
 #[cfg(not(feature = "matting"))]
-enum Lpips {}
+pub(super) enum Lpips {}
 
 #[cfg(not(feature = "matting"))]
 impl Lpips {
+    fn file(&self) -> &str {
+        match *self {}
+    }
+
     fn distance(&self, _: &crate::image::Image, _: &crate::image::Photo) -> Result<f64> {
         match *self {}
     }
 }
 
 #[cfg(not(feature = "matting"))]
-fn measure(config: &Config, _: &StageDir) -> Result<Option<Lpips>> {
+pub(super) fn measure(config: &Config) -> Result<Option<Lpips>> {
     match config.metrics.lpips.is_empty() {
         true => Ok(None),
         false => Err(Error::cannot(

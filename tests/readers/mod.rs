@@ -18,7 +18,7 @@ use tiface::pipeline::Line;
 use tiface::report::bench::BenchResult;
 use tiface::report::experiment::{ExperimentRow, read_published};
 use tiface::report::{Answer, RunRow, Server};
-use tiface::run::{Run, read_record, read_status};
+use tiface::run::{Run, Standing, read_estimate, read_record, read_status};
 use tiface::tface::TFace;
 
 /// A reader gets a folder of its own, prepared by [`prepare`], and the bytes. It must come back, with whatever it
@@ -261,14 +261,17 @@ fn published(_: &Path, bytes: &[u8]) -> String {
     told(read_published(&text(bytes), &[row], "published.csv"))
 }
 
-/// Records and statuses of a run, and the row of a page they make.
+/// Records and statuses of a run, what it may cost, what it ended with, and what a page and a list say of it.
 fn run(dir: &Path, bytes: &[u8]) -> String {
     let mask = dir.join("run/mask");
     let mut parts = parts(bytes);
     put(&mask, "done.json", parts.next().unwrap_or_default());
     put(&mask, "status.json", parts.next().unwrap_or_default());
+    put(&dir.join("run"), "estimate.json", parts.next().unwrap_or(b"{}"));
+    put(&dir.join("run"), "failed.json", parts.next().unwrap_or_default());
     RunRow::read(&dir.join("run"), dir);
-    told(read_record(&mask)) + &told(read_status(&mask))
+    Standing::read(&dir.join("run"));
+    told(read_record(&mask)) + &told(read_status(&mask)) + &told(read_estimate(&dir.join("run")))
 }
 
 /// What a run remembers of its photographs, once they are gone.

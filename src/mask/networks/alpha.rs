@@ -88,14 +88,17 @@ impl AlphaNet {
 fn parse(input: &str) -> Result<(usize, Normal)> {
     let parts: Vec<&str> = input.split(',').map(str::trim).collect();
     let read = match parts[..] {
-        [side, mean, scale] => side.parse().ok().zip(mean.parse().ok()).zip(scale.parse().ok()),
-        [side, "imagenet"] => return parse(&format!("{side},0,1")).map(|(side, _)| (side, IMAGENET)),
+        [side, mean, scale] => (|| {
+            let (side, mean, scale) = (side.parse().ok()?, mean.parse().ok()?, scale.parse().ok()?);
+            Some((side, Normal { mean: [mean; 3], std: [scale; 3] }))
+        })(),
+        [side, "imagenet"] => side.parse().ok().map(|side| (side, IMAGENET)),
         _ => None,
     };
-    read.filter(|&((side, mean), scale): &((usize, f64), f64)| {
-        (32..=4096).contains(&side) && (0.0..=1.0).contains(&mean) && (1e-3..=2.0).contains(&scale)
+    read.filter(|(side, normal): &(usize, Normal)| {
+        let [mean, scale] = [normal.mean[0], normal.std[0]];
+        (32..=4096).contains(side) && (0.0..=1.0).contains(&mean) && (1e-3..=2.0).contains(&scale)
     })
-    .map(|((side, mean), scale)| (side, Normal { mean: [mean; 3], std: [scale; 3] }))
     .ok_or_else(|| {
         Error::usage(
             format!("`mask.alpha_input` is `{input}`"),

@@ -73,7 +73,7 @@ impl Experiment {
 
     /// The orderings as cells: the heading, then one line each.
     fn verdicts(&self) -> Vec<Vec<String>> {
-        let mut out = vec![vec!["as published, by PSNR inside the mask".to_owned()]];
+        let mut out = vec![vec!["as expected, by PSNR inside the mask".to_owned()]];
         out[0].extend(self.captures.iter().cloned());
         out[0].push("on average".into());
         let word = |(holds, by): &Verdict| {
