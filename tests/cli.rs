@@ -421,7 +421,11 @@ fn a_capture_is_converted_into_a_new_folder_only() {
     let o = tiface(dir.path(), &["convert", "back", "--to", "llff", "--dry-run"]);
     assert!(code(&o) == 0 && !dir.path().join("back_llff").exists(), "{}", err(&o));
     for (words, expected, text) in [
-        (&["convert", "head", "--to", "colmap"][..], 1, "is not an empty folder"),
+        (
+            &["convert", "head", "--to", "transforms", "--out", "head_colmap"][..],
+            1,
+            "is there and another file",
+        ),
         (&["convert", "head", "--to", "nerf"], 2, "`--to nerf` is no format of cameras"),
         (&["convert", "absent", "--to", "llff"], 1, "absent"),
         (&["demo", "--size", "large"], 2, "`--size large` is no size in pixels"),
@@ -454,8 +458,20 @@ fn what_stopped_a_run_before_its_first_stage_is_told_by_its_folder_until_it_is_m
     );
     let o = tiface(dir.path(), &["status", "--failed"]);
     assert!(code(&o) == 3 && out(&o).starts_with("a         ........  failed: "), "{}", out(&o));
-    std::fs::write(&frames, sound).unwrap();
+    std::fs::write(&frames, &sound).unwrap();
     assert_eq!(code(&tiface(dir.path(), &["mask", "head", "--run", "runs/a"])), 0);
+    // one that broke after it began is told, too, but not what was asked for by mistake
+    let mask = ["mask", "head", "--run", "runs/a"];
+    for (broken, more, failed) in
+        [(false, &["--set", "mask.mask_dir=x"][..], 0), (true, &[], 3), (false, &[], 0)]
+    {
+        std::fs::write(&frames, if broken { "{" } else { &sound }).unwrap();
+        let o = tiface(dir.path(), &[&mask[..], more].concat());
+        assert_eq!(code(&o) == 0, !broken && more.is_empty(), "{}", err(&o));
+        let o = tiface(dir.path(), &["status", "--failed"]);
+        assert_eq!(code(&o), failed, "{}", out(&o));
+        assert_eq!(out(&o).contains("transforms_train.json"), broken, "{}", out(&o));
+    }
     let o = tiface(dir.path(), &["status", "--json"]);
     let run: serde_json::Value = serde_json::from_str(&out(&o)).unwrap();
     assert_eq!((code(&o), &run["state"], &run["error"]), (0, &"begun".into(), &serde_json::Value::Null));

@@ -102,10 +102,11 @@ fuzz_ends() {
   return $ended
 }
 
-guides() {
-  .venv/bin/python tools/guides/check_guides.py "$target/release/tiface" | tee "$scratch/guides.log"
+# A check in Python that says aloud what it had to skip.
+check() {
+  .venv/bin/python "$1" "$target/release/tiface" | tee "$scratch/check.log"
   local ended=${PIPESTATUS[0]}
-  grep -h '^skipped:' "$scratch/guides.log" >> "$scratch/skipped"
+  grep -h '^skipped:' "$scratch/check.log" >> "$scratch/skipped"
   return "$ended"
 }
 
@@ -213,8 +214,8 @@ if [ $blender = yes ]; then
 fi
 step "the engine of many heads is here" .venv/bin/python -m pip install --quiet --disable-pip-version-check \
   -r tools/fleet/requirements.txt
-step "many heads outlive kills" .venv/bin/python tools/fleet/check_fleet.py "$target/release/tiface"
-step "the commands of the guides work" guides
+step "many heads outlive kills" check tools/fleet/check_fleet.py
+step "the commands of the guides work" check tools/guides/check_guides.py
 if [ $demo = yes ]; then
   step "the demo head is reconstructed" train_demo
   readers_agree "the demo head" "$scratch/demo/mesh/head.glb" --up 0 0 1

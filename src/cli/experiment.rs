@@ -251,6 +251,7 @@ fn found(folder: &Path, task: &Task, line: Option<&Line>, rows: &[&ExperimentRow
 
 /// The tables in all forms; the JSON last, for whoever waits for it.
 fn write(folder: &Path, experiment: &Experiment) -> Result<()> {
+    io::create_folder(folder)?;
     for (name, text) in [
         ("experiment.md", experiment.markdown()),
         ("experiment.csv", experiment.csv()),

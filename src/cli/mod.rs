@@ -401,6 +401,9 @@ Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are expe
     Report {
         /// Run folders; without any, all under runs/
         runs: Vec<PathBuf>,
+        /// In a table, also where there is only one run
+        #[arg(long)]
+        table: bool,
     },
     /// Stages, progress, time left and last error of one or many runs
     #[command(after_long_help = "Examples:
@@ -494,7 +497,7 @@ pub fn main() -> ExitCode {
         #[cfg(feature = "cpu")]
         Command::Experiment(options) => experiment::run(&invocation, options),
         Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
-        Command::Report { runs } => report::run(&invocation, runs),
+        Command::Report { runs, table } => report::run(&invocation, runs, *table),
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),
         #[cfg(feature = "cpu")]

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-pub(super) fn run(invocation: &Invocation, runs: &[PathBuf]) -> Result<()> {
+pub(super) fn run(invocation: &Invocation, runs: &[PathBuf], table: bool) -> Result<()> {
     let common = invocation.common;
     let asked = Out::find(common.out.as_deref(), "report")?;
     let all = match (runs, &common.run) {
@@ -24,7 +24,7 @@ pub(super) fn run(invocation: &Invocation, runs: &[PathBuf]) -> Result<()> {
     };
     match &all[..] {
         [] => Err(Error::cannot("there are no runs under `runs/`", "name a run folder")),
-        [one] => renew(invocation, one, asked.as_ref()),
+        [one] if !table => renew(invocation, one, asked.as_ref()),
         all => many(invocation, all, asked.as_ref()),
     }
 }

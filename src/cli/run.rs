@@ -50,12 +50,15 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
     let run = Run::open(&target.run, stop.clone(), screen.clone());
     let line = ready(common, command, &config, &run, path, out.as_ref()).inspect_err(|e| {
         // who runs many heads looks for what went wrong in their folders, not in logs; a run that is done stays as it is,
-        // and a slip on the command line is no fault of one that has begun
+        // and what was asked for otherwise than before is no fault of one that has begun
         let is_named = common.run.is_some() || io::is_folder(run.dir());
-        let is_begun = io::is_file(&run.path("config.toml"));
-        let tells = match e.kind() {
-            ErrorKind::Cannot => !is_begun || Standing::read(run.dir()).phase != Phase::Done,
-            ErrorKind::Usage => !is_begun,
+        let tells = match (e.kind(), begun_with(&run)) {
+            (ErrorKind::Cannot | ErrorKind::Usage, None) => true,
+            (ErrorKind::Cannot, Some(before)) => {
+                common.fresh.is_none()
+                    && before == but_for_device(&config.to_toml())
+                    && Standing::read(run.dir()).phase != Phase::Done
+            }
             _ => false,
         };
         if is_named && tells && !common.dry_run {
@@ -78,6 +81,17 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
         print(&summary(&run, line.views(), &done, &written))?;
     }
     bars.iter().try_for_each(|bar| bar.check(&done))
+}
+
+/// The settings that a run was last worked on with, as text; none if it has not begun.
+fn begun_with(run: &Run) -> Option<String> {
+    let bytes = io::read_bytes(&run.path("config.toml"), &io::Limits::default()).ok()?;
+    Some(but_for_device(&String::from_utf8_lossy(&bytes)))
+}
+
+/// Stages of one run may be made on several devices.
+fn but_for_device(settings: &str) -> String {
+    settings.lines().filter(|line| !line.starts_with("device = ")).map(|line| format!("{line}\n")).collect()
 }
 
 /// The line, opened; all that can be refused before the first stage is refused here.

@@ -3,7 +3,10 @@
     python tools/fleet/check_fleet.py target/release/tiface [--kills 20] [--engine-kills 3]
 
 One head is broken on purpose, one has a stage that somebody else holds for a while. The others must come out with the
-bytes of runs that nobody disturbed, the broken one must be named with its cause, nothing that was done may be done again.
+bytes of runs that nobody disturbed, the broken one must be named with its cause, nothing that was done may be done
+again.
+Before that the paper's tables are planned on a GPU, a head is mended between two plans, and a task waits for a GPU that
+somebody else holds.
 """
 
 import argparse
@@ -12,6 +15,7 @@ import hashlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -27,7 +31,16 @@ from tiny_heads import SETTINGS, photograph  # noqa: E402
 HEADS = [f"head_{i}" for i in range(1, 7)]
 BROKEN, HELD = HEADS[2], HEADS[4]
 # What tells when and how fast things happened.
-CLOCKS = {"status.json", "log.jsonl", "done.json", ".lock", "failed.json", "estimate.json", "config.toml", "report.html"}
+CLOCKS = {
+    "status.json",
+    "log.jsonl",
+    "done.json",
+    ".lock",
+    "failed.json",
+    "estimate.json",
+    "config.toml",
+    "report.html",
+}
 
 
 def products(run):
@@ -81,6 +94,87 @@ def kill(pids):
     return killed
 
 
+def planned(engine, captures, runs, tiface, config):
+    """Rows of the paper's tables that are planned, and the device that each stage is planned on beside a GPU."""
+    words = [*engine, "--resources", "gpu=1", "--dry-run", "--printshellcmds", "--config", f"captures={captures}"]
+    words += [f"runs={runs}", f"tiface={tiface}", "gpus=1", "experiment=components", "scale=0.01"]
+    words += [f"options=--preset draft --config {config}"]
+    told = subprocess.run(words, capture_output=True, text=True, cwd=captures.parent)
+    assert told.returncode == 0, told.stdout + told.stderr
+    rows = re.findall(r"^ *wildcards: row=(\S+)$", told.stdout + told.stderr, re.M)
+    devices = re.findall(r" (\w+) CAPTURE .*--device (\w+)", told.stdout + told.stderr)
+    return sorted(rows), dict(devices)
+
+
+def virtual_gpu(folder):
+    """Variables under which a software driver passes for a GPU; none where that cannot be had.
+
+    Software is used where it is named with a number, and is shared then: only what passes for a GPU is waited for."""
+    compiler = shutil.which("cc")
+    if not compiler or sys.platform != "linux":
+        return {}
+    folder.mkdir(parents=True)
+    library = folder / "libvirtual_gpu.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, HERE / "virtual_gpu.c"], check=True)
+    layer = {"name": "VK_LAYER_virtual_gpu", "type": "GLOBAL", "library_path": str(library), "api_version": "1.3.0"}
+    layer |= {"implementation_version": "1", "description": "every adapter is a virtual GPU"}
+    (folder / "layer.json").write_text(json.dumps({"file_format_version": "1.0.0", "layer": layer}))
+    return {"VK_LAYER_PATH": str(folder), "VK_INSTANCE_LAYERS": layer["name"]}
+
+
+def wait_for_a_gpu(tiface, folder, capture, words):
+    """A task whose GPUs are all held ends with exit code 75, or waits, and learns once one is free."""
+    shutil.rmtree(folder, ignore_errors=True)
+    locks = folder / "locks"
+    locks.mkdir(parents=True)
+    environment = {**os.environ, "TMPDIR": str(locks)}  # where devices have their locks
+    words = ["iface", capture, *words, "--set", "iface.steps=10", "--device", "wgpu", "--quiet"]
+    words = [str(word) for word in words]
+    held = []
+
+    def hold():
+        """Takes the lock of every GPU that is free, as a run finds them; the exit code of the one that finds none."""
+        while True:
+            known = set(locks.glob("tiface-*.lock"))
+            trial = [tiface, *words, "--run", folder / "trial"]
+            trial = subprocess.Popen(trial, env=environment, stderr=subprocess.PIPE)
+            while trial.poll() is None and set(locks.glob("tiface-*.lock")) == known:
+                time.sleep(0.02)
+            trial.kill()
+            trial.communicate()
+            found = set(locks.glob("tiface-*.lock")) - known
+            if not found:
+                return trial.returncode
+            for lock in found:
+                held.append(open(lock, "a"))
+                fcntl.flock(held[-1], fcntl.LOCK_EX)
+
+    code = hold()
+    if not held and (variables := virtual_gpu(folder / "layer")):
+        environment |= variables
+        code = hold()
+    if not held:
+        print(f"skipped: a task waits for a GPU: neither one is here nor software that passes for one ({code})")
+        return
+    assert code == 75, f"all GPUs are held, and a run ended with {code}"
+    run, mark, log = folder / "run", folder / "exit", folder / "log.txt"
+    words[1] = "CAPTURE"
+    task = ["bash", HERE / "task.sh", "1", mark, log, capture, tiface, *words, "--run", run]
+    code = subprocess.run(task, env={**environment, "TIFACE_PATIENCE": "0"}).returncode
+    assert code == 75 and not mark.exists(), f"ended with {code}: {log.read_text()}"
+    waiting = subprocess.Popen(task, env=environment)
+    deadline = time.monotonic() + 300
+    while log.read_text().count("in use by other processes") < 3:
+        assert waiting.poll() is None and time.monotonic() < deadline, log.read_text()
+        time.sleep(0.05)
+    assert not (run / "iface/done.json").exists()
+    for lock in held:
+        lock.close()
+    assert waiting.wait(300) == 0, log.read_text()
+    assert (run / "iface/done.json").is_file()
+    print(f"a task waited for a GPU, and learned when it was let go ({len(held)} held)")
+
+
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("tiface", type=Path)
@@ -108,11 +202,29 @@ def main():
     for i, head in enumerate(HEADS):
         if not (captures / head).is_dir():
             shutil.move(photograph(tiface, folder / "photographed" / head, f"{60 + 2 * i}x72"), captures / head)
+    good = [head for head in HEADS if head != BROKEN]
     frames = captures / BROKEN / "transforms_train.json"
-    broken = json.loads(frames.read_text())
+    sound = frames.read_text()
+    broken = json.loads(sound)
     broken["frames"][4]["transform_matrix"][0][3] = "north"
     frames.write_text(json.dumps(broken))
-    good = [head for head in HEADS if head != BROKEN]
+
+    # the tables are made of what can be made; a capture that is mended within its files gets its rows at the next start
+    engine_words = [sys.executable, "-m", "snakemake", "--snakefile", HERE / "Snakefile"]
+    engine_words = [str(word) for word in [*engine_words, "--profile", HERE / "profiles/local", "--cores", "2"]]
+    plan = engine_words, captures, folder / "planned/runs", tiface, config
+    rows, _ = planned(*plan)
+    assert rows == [f"{head}/paper" for head in good], rows
+    frames.write_text(sound)
+    rows, devices = planned(*plan)
+    assert rows == [f"{head}/paper" for head in HEADS], rows
+    frames.write_text(json.dumps(broken))
+    # beside a GPU, what computes nothing on it does not ask for it
+    assert devices.pop("iface") == devices.pop("mesh") == devices.pop("render") == "wgpu", devices
+    assert devices.pop("mask") == devices.pop("metrics") == "cpu", devices
+    print("the tables are planned: what cannot be made is left out until it is mended")
+    wait_for_a_gpu(tiface, folder / "gpu", captures / good[0], words)
+
     begun = time.monotonic()
     for head in good:
         run("run", captures / head, "--run", alone / head, *words, "--quiet")
@@ -125,11 +237,8 @@ def main():
     fcntl.flock(lock, fcntl.LOCK_EX)
     held_until = time.monotonic() + 20
 
-    engine_words = [sys.executable, "-m", "snakemake", "--snakefile", HERE / "Snakefile"]
-    engine_words += ["--profile", HERE / "profiles/local", "--cores", "2", "--config"]
-    engine_words += [f"captures={captures}", f"runs={runs}", f"tiface={tiface}", "threads=1"]
+    engine_words += ["--config", f"captures={captures}", f"runs={runs}", f"tiface={tiface}", "threads=1"]
     engine_words += [f"options={' '.join(words)}"]
-    engine_words = [str(word) for word in engine_words]
     log = open(folder / "engine.txt", "a")
 
     starts = 0

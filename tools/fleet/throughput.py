@@ -9,6 +9,7 @@ are cores for it, at least one.
 import argparse
 import os
 import subprocess
+import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -22,13 +23,15 @@ def reconstruct(tiface, capture, run, threads, options):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0], epilog="Options of `tiface run` follow `--`.")
     parser.add_argument("tiface", type=Path)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--heads", type=int, default=4)
     parser.add_argument("--jobs", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("options", nargs="*")
-    arguments = parser.parse_args()
+    # all after `--` is for the program: argparse would give what stands there to its own options, or to nobody
+    words = sys.argv[1:]
+    end = words.index("--") if "--" in words else len(words)
+    arguments, options = parser.parse_args(words[:end]), words[end + 1 :]
     cores = len(os.sched_getaffinity(0))
     print("| at once | threads each | heads an hour | of the first |\n|---|---|---|---|")
     first = None
@@ -38,7 +41,7 @@ def main():
             begin = time.monotonic()
             made = [
                 pool.submit(
-                    reconstruct, arguments.tiface, arguments.capture, Path(scratch) / str(head), threads, arguments.options
+                    reconstruct, arguments.tiface, arguments.capture, Path(scratch) / str(head), threads, options
                 )
                 for head in range(arguments.heads)
             ]

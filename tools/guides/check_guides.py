@@ -4,7 +4,8 @@
 
 Blocks of `sh` run line by line in one folder per guide, where captures lie as the guide has them; a user's own
 configuration makes them small. Blocks of `python` run with this interpreter. `sh colmap` needs COLMAP and photographs of
-something real; it is left out aloud where they are not. `sh cluster` needs a cluster, and is not run.
+something real; it is left out aloud where they are not. `sh cluster` needs GPUs or a cluster: what the engine would do
+there is planned alone, and files for Kubernetes are read.
 """
 
 import json
@@ -81,8 +82,10 @@ def run(guide, tiface, seen):
                     expected = re.search(r"# exit code (\d+)", line)
                     assert done.returncode == int(expected[1] if expected else 0), f"{guide.name}: `{line}` ended with {done.returncode}\n{done.stdout}{done.stderr}"
                     count += 1
+        elif kind == "sh cluster":
+            count += cluster(guide, body, folder, environment)
         else:
-            assert kind in ("text", "yaml", "sh cluster"), f"{guide.name}: a block of `{kind}` is not tested"
+            assert kind in ("text", "yaml"), f"{guide.name}: a block of `{kind}` is not tested"
         seen.append(kind)
     print(f"{guide.name}: {count} commands")
     assert count
@@ -108,6 +111,37 @@ def colmap(body, environment):
         found = subprocess.run(["tiface", "inspect", "head"], cwd=folder, env=environment, capture_output=True, text=True)
         assert "COLMAP" in found.stdout, found.stdout + found.stderr
     return ""
+
+
+def cluster(guide, body, folder, environment):
+    """Plans what the engine would do on GPUs and clusters, reads what Kubernetes would; the number of these commands."""
+    count = 0
+    for line in body.replace("\\\n", " ").splitlines():
+        words = line.split()
+        if words[:2] == ["pip", "install"]:
+            done = subprocess.run([sys.executable, "-m", *words, "--quiet"], cwd=folder, env=environment, capture_output=True, text=True)
+            if done.returncode:
+                print(f"skipped: {guide.name}: a plan for a cluster: `{line}` failed: {done.stderr.strip()[-200:]}")
+                return count
+        elif words[:1] == ["snakemake"]:
+            # captures lie here and not where all nodes would look for them; what is done already is planned as well, so
+            # that the recipe is asked for each task's threads, memory, time and words
+            line = line.replace("=/data/", "=") + " --dry-run --forceall --printshellcmds"
+            done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True)
+            told = done.stdout + done.stderr
+            assert done.returncode == 0, f"{guide.name}: `{line}` ended with {done.returncode}\n{told}"
+            assert " iface CAPTURE " in told and "--device wgpu" in told and "gpu=1" in told, told
+        elif words[:3] == ["kubectl", "apply", "-f"]:
+            import yaml  # comes with the engine, which a guide installs first
+
+            job = yaml.safe_load((folder / words[3]).read_text())
+            pod = job["spec"]["template"]["spec"]["containers"][0]
+            threads = {e["name"]: e["value"] for e in pod["env"]}["RAYON_NUM_THREADS"]
+            assert job["kind"] == "Job" and threads == pod["resources"]["requests"]["cpu"], job
+        else:
+            continue  # containers are built elsewhere
+        count += 1
+    return count
 
 
 def main():
