@@ -122,7 +122,7 @@ pub(super) enum Lpips {}
 
 #[cfg(not(feature = "matting"))]
 impl Lpips {
-    fn file(&self) -> &str {
+    fn file(&self) -> std::convert::Infallible {
         match *self {}
     }
 
