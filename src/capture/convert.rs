@@ -110,8 +110,8 @@ impl Content<'_> {
     }
 }
 
-/// Writes `capture` into `folder`, which must be new, empty, or hold what the same conversion wrote. Photographs and masks are copied, or hard-linked with
-/// `link`: then they cost no space, and who changes one changes the other.
+/// Writes `capture` into `folder`, which must be new, empty, or hold what the same conversion wrote. Photographs and
+/// masks are copied, or hard-linked with `link`: then they cost no space, and who changes one changes the other.
 ///
 /// # Errors
 ///

@@ -237,9 +237,7 @@ fn found(folder: &Path, task: &Task, line: Option<&Line>, rows: &[&ExperimentRow
     }
     let run = Run::quiet(&folder.join(&task.name));
     let problem = if io::is_folder(run.dir()) {
-        // made elsewhere, maybe: that its device is not here does not matter for figures
-        let config = Config { device: "cpu".into(), ..task.config.clone() };
-        match Line::open(&config, &run) {
+        match Line::open(&task.config, &run) {
             Ok(line) => return of(&line),
             Err(e) => e.to_string(),
         }

@@ -197,7 +197,8 @@ enum Command {
   tiface convert captures/002_00 --to llff --link
 
 Photographs and masks are copied as they are; --link gives them a second name on the same disk instead, which
-takes no space: whoever changes one then changes both. The new folder must not be there, or be empty, or hold what the same command wrote before it was stopped.")]
+takes no space: whoever changes one then changes both. The new folder must not be there, or be empty, or hold what the
+same command wrote before it was stopped.")]
     Convert {
         /// A folder of photographs with cameras
         capture: PathBuf,

@@ -5,7 +5,7 @@ use super::line::Line;
 use super::path::CameraPath;
 use crate::Result;
 use crate::capture::Split;
-use crate::config::{Config, Method, Preset, Stage, VmBackground, VmConfig};
+use crate::config::{Config, MaskSource, Method, Preset, Stage, VmBackground, VmConfig};
 use crate::run::{Cost, ESTIMATE, Estimate};
 
 const MIB: f64 = (1u64 << 20) as f64;
@@ -93,6 +93,8 @@ impl Line<'_> {
                 };
                 let pixel = |method: &Method| match method {
                     Method::Baseline | Method::Tface if published => whole(method),
+                    // nothing says where there is nothing, so all of a ray is looked at
+                    Method::Volume if published && self.config.mask.source == MaskSource::None => 700e-6,
                     Method::Volume if published => 90e-6,
                     Method::Baseline | Method::Tface => 8e-6,
                     Method::Volume => 20e-6,
