@@ -171,7 +171,7 @@ step "lints, all features" cargo clippy --release --all-targets --all-features -
 step "lints, default features" cargo clippy --release -- -D warnings
 step "lints, without the learned fields" cargo clippy --release --no-default-features --lib -- -D warnings
 step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --all-features --no-deps
-step "build" cargo build --release --features matting,wgpu --bins --examples --benches
+step "build" cargo build --release --features matting,wgpu --bins --examples
 step "ONNX Runtime is here" onnx_runtime
 printf '\n== Vulkan is here\n'
 if ! vulkan_is_here; then
