@@ -84,12 +84,12 @@ vulkan_is_here() {
   echo "$VK_DRIVER_FILES"
 }
 
-# A minute for every reader of foreign bytes, half of it from each of two beginnings, beside whatever else is done: it
-# takes what the other steps leave of the processors.
+# A minute for every reader of foreign bytes, a quarter of it from each of four beginnings, beside whatever else is done:
+# it takes what the other steps leave of the processors.
 fuzz_begins() {
   local seed
-  for seed in 1 2; do
-    TIFACE_FUZZ_S=30 TIFACE_FUZZ_SEED=$seed nice -n 19 \
+  for seed in 1 2 3 4; do
+    TIFACE_FUZZ_S=15 TIFACE_FUZZ_SEED=$seed nice -n 19 \
       cargo test --release --features matting,wgpu --test fuzz -- --nocapture > "$scratch/fuzz.$seed" 2>&1 &
     fuzzers+=($!)
   done
