@@ -15,9 +15,8 @@ import { mkdir, readFile, readdir, writeFile } from "node:fs/promises";
 import path from "node:path";
 import { fileURLToPath } from "node:url";
 import { parseArgs } from "node:util";
-import { chromium } from "playwright-core";
 import { PNG } from "pngjs";
-import { inFile, psnr } from "./pictures.mjs";
+import { inFile, launch, psnr } from "./pictures.mjs";
 
 const { values, positionals: [run] } = parseArgs({
   allowPositionals: true,
@@ -113,11 +112,7 @@ const views = described.views
   .slice(0, Number(values.views));
 check(folder, views.length > 0, "no picture of an undistorted camera");
 
-const browser = await chromium.launch({
-  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium", headless: true,
-  args: ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync"],
-});
+const browser = await launch();
 try {
   const page = await browser.newPage({ viewport: { width: 400, height: 400 } });
   const asked = [], said = [];

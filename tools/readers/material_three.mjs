@@ -15,9 +15,8 @@ import { mkdir, readFile, readdir, writeFile } from "node:fs/promises";
 import path from "node:path";
 import { fileURLToPath } from "node:url";
 import { parseArgs } from "node:util";
-import { chromium } from "playwright-core";
 import { PNG } from "pngjs";
-import { inFile, psnr } from "./pictures.mjs";
+import { inFile, launch, psnr } from "./pictures.mjs";
 
 const { values, positionals: [run, unlit, lit] } = parseArgs({
   allowPositionals: true,
@@ -77,11 +76,7 @@ const folder = path.join(run, "render/textured");
 const rendered = new Set(await readdir(folder));
 const view = described.views.find(({ name }) => rendered.has(`${name}.png`));
 const truth = PNG.sync.read(await readFile(path.join(folder, `${view.name}.png`)));
-const browser = await chromium.launch({
-  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium", headless: true,
-  args: ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync"],
-});
+const browser = await launch();
 try {
   const tab = await browser.newPage({ viewport: { width: 400, height: 400 } });
   await tab.goto(`http://127.0.0.1:${server.address().port}/`);

@@ -1,6 +1,15 @@
-// What checks of pictures in three.js share: cameras of a run in the axes of its file, and how far pictures differ.
+// What checks of pictures in three.js share: a browser, cameras of a run in the axes of its file, and how far pictures
+// differ.
 
+import { chromium } from "playwright-core";
 import { Matrix4, Quaternion, Vector3 } from "three";
+
+/** Chromium without a window, WebGL in software; /usr/bin/chromium, or what CHROMIUM names. */
+export const launch = () => chromium.launch({
+  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium", headless: true,
+  args: ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync"],
+});
 
 /** A camera of the run in the file's axes and metres: +Y up. */
 export function inFile(camera, { up, unit_m: unit }) {
