@@ -35,10 +35,12 @@ pub use source::Sources;
 pub use stage::Stage;
 pub use vm::{DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
+use crate::io::{self, Limits};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
+use std::path::Path;
 use std::str::FromStr;
 use toml::{Table, Value};
 
@@ -158,7 +160,7 @@ const ROOT_KEYS: &[Key] = &[
     ),
     Key::word(
         "device",
-        "Where fields are learned: auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one; +deterministic and +8GiB \
+        "Where fields are learned: auto, cpu, wgpu, vulkan, metal, dx12 or cuda, with :N a numbered one; +deterministic and +8GiB \
          say how.",
     ),
 ];
@@ -203,6 +205,14 @@ impl Config {
             ensemble: EnsembleConfig::preset(preset),
             metrics: MetricsConfig::preset(preset),
         }
+    }
+
+    /// Returns the configuration that the run in `folder` was last worked on with; none where it has no `config.toml`, or
+    /// one that is not understood any more.
+    pub fn of_run(folder: &Path) -> Option<Config> {
+        let bytes = io::read_bytes(&folder.join("config.toml"), &Limits::default()).ok()?;
+        let file = ("config.toml".to_owned(), String::from_utf8(bytes).ok()?);
+        Config::resolve(&Sources { files: vec![file], ..Sources::default() }).ok()
     }
 
     /// Settings of the radiance field that the stage `baseline` or `tface` learns.

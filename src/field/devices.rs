@@ -25,7 +25,7 @@ pub struct Gpu {
     pub by_itself: bool,
 }
 
-/// Opens the GPU that is named: an API (`wgpu` is any) and a number among its adapters. Without a number it is the
+/// Opens the GPU that is named: an API (`wgpu` is any but CUDA) and a number among its adapters. Without a number it is the
 /// first one that is no software.
 ///
 /// # Errors
@@ -35,7 +35,7 @@ pub fn open(choice: &DeviceChoice) -> Result<Gpu> {
     let (api, number) = (choice.name.as_str(), choice.number);
     let name = number.map_or(api.to_string(), |number| format!("{api}:{number}"));
     let adapters: Vec<Adapter> =
-        Adapter::all().into_iter().filter(|a| api == "wgpu" || a.api == api).collect();
+        Adapter::all().into_iter().filter(|a| a.api == api || (api == "wgpu" && a.api != "cuda")).collect();
     let chosen: Vec<&Adapter> = match number {
         Some(number) => adapters.get(number).into_iter().collect(),
         None => adapters.iter().filter(|adapter| !adapter.software).collect(),
@@ -74,6 +74,10 @@ fn opened(adapter: &Adapter, choice: &DeviceChoice) -> Device {
 
 fn missing(name: &str, api: &str, adapters: &[Adapter]) -> Error {
     let problem = match adapters {
+        [] if api == "cuda" && !cfg!(feature = "cuda") => {
+            let problem = format!("device `{name}`: this build knows no CUDA");
+            return Error::usage(problem, "build with `--features cuda`, or choose `--device vulkan`");
+        }
         [] => format!("device `{name}`: no adapter is here for `{api}`"),
         [only] if only.software => {
             format!("device `{name}`: the only adapter is software, `{api}:0`, slower than `cpu`")
@@ -268,6 +272,10 @@ mod tests {
             let e = open(&named(name)).err().unwrap();
             assert!(e.to_string().contains(name) && e.hint().contains("tiface doctor"), "{e}");
             assert_eq!(e.kind(), crate::ErrorKind::Usage);
+        }
+        if !cfg!(feature = "cuda") {
+            let e = open(&named("cuda")).err().unwrap();
+            assert!(e.to_string().contains("knows no CUDA") && e.hint().contains("--features cuda"), "{e}");
         }
         let all = Adapter::all();
         if all.iter().all(|a| a.software) {

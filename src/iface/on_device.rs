@@ -14,8 +14,8 @@ use crate::field::drawing::{self, DeviceRays};
 use crate::field::parameters::Parameter;
 use crate::field::training::{Learner, StepError, StepReport};
 use crate::kernel::gpu::{
-    self, Band, Batch, Buffer, Device, Drawing, Gate, LossWeights, Losses, Neus, Norm, Occupancy, Pitch,
-    RayBudget, Rays, Samples, Schedule, Sdf, SurfacePoints,
+    self, Band, Batch, Buffer, Device, Drawing, Gate, LossWeights, Losses, Nerfacc, Neus, Norm, Occupancy,
+    Pitch, RayBudget, Rays, Samples, Schedule, Sdf, SurfacePoints,
 };
 use crate::kernel::hash;
 use crate::kernel::mlp::TILE;
@@ -63,6 +63,27 @@ impl Group {
     }
 }
 
+/// How the cells to march through are looked at again.
+enum CellRule {
+    Band(Band),
+    Nerfacc(Nerfacc),
+}
+
+impl CellRule {
+    fn new(device: &Device, host: &SdfTraining, capacity: usize) -> CellRule {
+        let (config, occupancy) = (host.config, &host.state.occupancy);
+        match config.occupancy {
+            OccupancyRule::Band => {
+                CellRule::Band(Band::new(device, occupancy.allowed(), config.band, config.soften as f32))
+            }
+            OccupancyRule::Nerfacc => {
+                let step = schedule::march_step(config, 1.0);
+                CellRule::Nerfacc(Nerfacc::new(device, &occupancy.history, step, capacity))
+            }
+        }
+    }
+}
+
 /// What a training has on its device.
 struct There {
     table: Group,
@@ -75,6 +96,7 @@ struct There {
     broken: Buffer,
     schedule: Schedule,
     occupancy: Occupancy,
+    cells: CellRule,
     /// Has a step been made since?
     stepped: bool,
 }
@@ -91,7 +113,6 @@ pub(super) struct OnDevice<'a> {
     sdf: Sdf,
     neus: Neus,
     losses: Losses,
-    band: Option<Band>,
     there: There,
 }
 
@@ -130,9 +151,6 @@ impl<'a> OnDevice<'a> {
             background: config.background == Background::Random,
             behind: 3,
         };
-        let allowed = host.state.occupancy.allowed();
-        let band = (config.occupancy == OccupancyRule::Band)
-            .then(|| Band::new(&device, allowed, config.band, config.soften as f32));
         Ok(OnDevice {
             rays: DeviceRays::new(&host.pixels, &device, drawing, resident),
             batch: Batch::new(&device, rays),
@@ -142,8 +160,7 @@ impl<'a> OnDevice<'a> {
             sdf: Sdf::new(&device, &host.shape, capacity),
             neus: Neus::new(&device, rays, capacity),
             losses: Losses::new(&device, weights, rays, capacity),
-            band,
-            there: There::new(&device, &host),
+            there: There::new(&device, &host, capacity),
             host,
             device,
         })
@@ -166,6 +183,9 @@ impl<'a> OnDevice<'a> {
         variance.keep_within(VARIANCE);
         let mut occupancy = host.state.occupancy.clone();
         [occupancy.occupied, occupancy.solid] = there.occupancy.read(&self.device)?;
+        if let CellRule::Nerfacc(rule) = &there.cells {
+            occupancy.history = rule.read(&self.device)?;
+        }
         let mut rays = self.device.fetch::<u32>(&there.schedule.rays)?[0] as usize;
         if there.stepped {
             let wanted = self.device.fetch::<u32>(&self.samples.count)?[1] as usize;
@@ -176,7 +196,7 @@ impl<'a> OnDevice<'a> {
 
     /// Copies the host's state to the device.
     fn push(&mut self) {
-        self.there = There::new(&self.device, &self.host);
+        self.there = There::new(&self.device, &self.host, self.samples.t.words());
         self.push_points();
     }
 
@@ -185,22 +205,14 @@ impl<'a> OnDevice<'a> {
         self.points.put(&self.device, &rows);
     }
 
-    fn update_occupancy(&mut self, (seed, step): (u64, u64)) -> Result<()> {
-        let there = &self.there;
-        if let Some(band) = &self.band {
-            let field = [there.table.value(), &there.flat, &there.inv_s];
-            let over = [&self.samples.x, &self.samples.direction];
-            band.update(&self.device, &there.occupancy, &self.sdf, field, over);
-            return Ok(());
+    fn update_occupancy(&self, at: (u64, u64)) {
+        let (there, device) = (&self.there, &self.device);
+        let field = [there.table.value(), &there.flat, &there.inv_s];
+        let over = [&self.samples.x, &self.samples.direction];
+        match &there.cells {
+            CellRule::Band(rule) => rule.update(device, &there.occupancy, &self.sdf, field, over),
+            CellRule::Nerfacc(rule) => rule.update(device, at, &there.occupancy, &self.sdf, field, over),
         }
-        // the published rule draws its cells by what is occupied: it looks at the field on the host
-        self.host.state = self.pulled()?;
-        let inv_s = self.host.state.model.sharpness();
-        let shape = self.host.shape_at(step);
-        let dt = schedule::march_step(self.host.config, inv_s);
-        self.host.update_occupancy(&shape, (seed, step), inv_s, dt);
-        self.there.occupancy = there_occupancy(&self.device, &self.host);
-        Ok(())
     }
 
     /// What the last step came to.
@@ -334,7 +346,8 @@ fn pitch(config: &IfaceConfig) -> Pitch {
 }
 
 impl There {
-    fn new(device: &Device, host: &SdfTraining) -> There {
+    /// `capacity`: samples that a step has room for.
+    fn new(device: &Device, host: &SdfTraining, capacity: usize) -> There {
         let [table, network @ .., variance] = &host.state.model.0;
         let flat = host.shape.layout().len();
         let config = host.config;
@@ -350,6 +363,7 @@ impl There {
             broken: device.zeros(1),
             schedule: Schedule::new(device, pitch(config), budget, host.state.rays),
             occupancy: there_occupancy(device, host),
+            cells: CellRule::new(device, host, capacity),
             stepped: false,
         }
     }
@@ -377,7 +391,7 @@ impl Learner for OnDevice<'_> {
             &there.inv_s,
         );
         if self.host.looks_again(step) {
-            self.update_occupancy(seed)?;
+            self.update_occupancy(seed);
         }
         if schedule::stereo_step(config) == Some(step) {
             self.host.state = self.pulled()?;

@@ -1,8 +1,8 @@
 //! Training on a device against training on the CPU: an analytic ball.
 
-use super::{MOST_BUDGETS, OnDevice, READ_EVERY, room};
+use super::{MOST_BUDGETS, OnDevice, READ_EVERY, VARIANCE, room, schedule};
 use crate::config::Preset;
-use crate::config::iface::{IfaceConfig, Start};
+use crate::config::iface::{IfaceConfig, OccupancyRule, Start};
 use crate::field::ball::{StopAfter, hull, temporary, textured_views};
 use crate::field::checkpoint::TrainingProgress;
 use crate::field::pixels::TrainView;
@@ -219,7 +219,7 @@ fn cells_are_those_that_the_cpu_keeps() {
         &own.flat,
         &own.inv_s,
     );
-    there.update_occupancy((3, 7)).unwrap();
+    there.update_occupancy((3, 7));
     let [occupied, solid] = there.there.occupancy.read(&there.device).unwrap();
     let differ = |a: &crate::kernel::march::Bitmask, b: &crate::kernel::march::Bitmask| {
         (0..64_000).filter(|&i| a.get(i) != b.get(i)).count()
@@ -228,6 +228,101 @@ fn cells_are_those_that_the_cpu_keeps() {
     assert!(want.occupied.count() > 1000 && want.solid.count() > 100);
     // those whose distance is the band's but for rounding
     assert!(differ(&occupied, &want.occupied) <= 3 && differ(&solid, &want.solid) <= 3);
+}
+
+#[test]
+fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
+    let Some(device) = device() else { return };
+    let views = textured_views();
+    // a sample has room for fewer cells than there are: they are looked at piece by piece
+    let config = IfaceConfig {
+        occupancy: OccupancyRule::Nerfacc,
+        occupancy_resolution: 36,
+        samples_per_ray: 64,
+        samples: 1024,
+        ..config()
+    };
+    let dir = temporary();
+    let session = on("wgpu:0", dir.path(), &Quiet);
+    let host = || {
+        let mut host = SdfTraining::new(&views, None, &config, &session).unwrap();
+        host.restore(None).ok().unwrap();
+        host
+    };
+    let (mut want, mut there) = (host(), OnDevice::new(host(), device).unwrap());
+    assert!(there.samples.t.words() < 36 * 36 * 36);
+    let total = 36usize.pow(3);
+    // all cells; then a quarter anywhere and some of many that are kept, and of few
+    for (step, kept) in [(16, None), (272, None), (288, Some(total / 2)), (304, Some(500))] {
+        if let Some(kept) = kept {
+            (0..total).for_each(|i| want.state.occupancy.occupied.set(i, i % (total / kept) == 0));
+            there.host.state.occupancy = want.state.occupancy.clone();
+            there.push();
+        }
+        let shape = want.shape_at(step);
+        let (inv_s, dt) = (want.state.model.sharpness(), schedule::march_step(&config, 1.0));
+        want.update_occupancy(&shape, (3, step), inv_s, dt);
+        there.sdf.activate(shape.active);
+        let own = &there.there;
+        let range = [*VARIANCE.start(), *VARIANCE.end()];
+        let weights = [own.network.value(), own.variance.value()];
+        there.norm.forward(&there.device, weights[0], weights[1], range, &own.flat, &own.inv_s);
+        let before = there.device.counts().1;
+        there.update_occupancy((3, step));
+        assert_eq!(there.device.counts().1, before, "something was read back");
+        let got = there.pulled().unwrap().occupancy;
+        let want = &want.state.occupancy;
+        let mut history = (0f32, 0);
+        for (a, b) in got.history.iter().zip(&want.history) {
+            history.0 = history.0.max((a - b).abs() / b.max(1e-6));
+            history.1 += usize::from(*b > 0.0);
+        }
+        let differ = (0..total).filter(|&i| got.occupied.get(i) != want.occupied.get(i)).count();
+        println!(
+            "step {step}: {} cells kept, {} seen, {:.0e} apart, {differ} otherwise",
+            want.occupied.count(),
+            history.1,
+            history.0
+        );
+        assert!(history.0 < 1e-4 && history.1 > total / 5, "{history:?}");
+        assert!(want.occupied.count() > 300 && want.occupied.count() < total && differ <= 3, "{differ}");
+    }
+}
+
+#[test]
+fn the_paper_waits_for_nothing_either_and_learns_what_the_cpu_does() {
+    if device().is_none() {
+        return;
+    }
+    let views = textured_views();
+    let config = IfaceConfig {
+        steps: 150,
+        rays: 128,
+        samples: 4096,
+        levels: 6,
+        log2_table: 12,
+        occupancy_resolution: 24,
+        samples_per_ray: 128,
+        ..IfaceConfig::preset(Preset::Paper)
+    };
+    let both = ["cpu", "wgpu:0"].map(|device| {
+        let dir = temporary();
+        let (face, report) = train(&views, None, &config, &on(device, dir.path(), &Quiet)).unwrap();
+        (psnr(&face, &views[4]), report.occupied)
+    });
+    println!("dB and share of the cells, on the CPU and on the device: {both:.3?}");
+    let [cpu, there] = both;
+    assert!((cpu.0 - there.0).abs() < 0.2 && (cpu.1 - there.1).abs() < 0.02);
+    // 50 steps with four looks at the cells: one readback
+    let dir = temporary();
+    let host = SdfTraining::new(&views, None, &config, &on("wgpu:0", dir.path(), &Quiet)).unwrap();
+    let mut there = OnDevice::new(host, device().unwrap()).unwrap();
+    there.restore(None).ok().unwrap();
+    let before = there.device.counts().1;
+    for step in 0..READ_EVERY {
+        there.step(&TrainingProgress { step, ..TrainingProgress::default() }).ok().unwrap();
+    }
+    assert_eq!(there.device.counts().1 - before, 1);
 }
 
 #[test]

@@ -7,7 +7,7 @@ use super::{mask, scene_file};
 use crate::capture::scene::Scene;
 use crate::capture::scene_box::SceneBox;
 use crate::capture::{self, Capture, CaptureOptions, Split, View, ViewMask};
-use crate::config::{Config, MaskSource, RenderConfig, Sources, Stage};
+use crate::config::{Config, MaskSource, RenderConfig, Stage};
 use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
 use crate::{Error, Result};
@@ -305,7 +305,7 @@ fn lpips(config: &Config, run: &Run) -> Result<Option<String>> {
         Ok(bytes) => Ok(Some(Fingerprint::of_bytes(&bytes))),
         Err(e) => {
             let record = read_record(&run.path(Stage::Metrics)).ok().flatten();
-            let same = || saved(run).is_some_and(|saved| saved.metrics.lpips == *file);
+            let same = || Config::of_run(run.dir()).is_some_and(|saved| saved.metrics.lpips == *file);
             let record = record.filter(|_| is_missing(&e) && same());
             let digest = record.and_then(|r| r.fingerprint.inputs.get("lpips").cloned());
             digest.map(Some).ok_or_else(|| e.into())
@@ -315,15 +315,8 @@ fn lpips(config: &Config, run: &Run) -> Result<Option<String>> {
 
 /// The checkpoint that a stage took when the run was last worked on, if the run says so.
 fn saved_import(run: &Run, stage: Stage) -> Option<String> {
-    let saved = saved(run)?;
+    let saved = Config::of_run(run.dir())?;
     Some(if stage == Stage::Baseline { saved.baseline.import } else { saved.tface.import })
-}
-
-/// The configuration that the run was last worked on with.
-fn saved(run: &Run) -> Option<Config> {
-    let bytes = io::read_bytes(&run.path("config.toml"), &Limits::default()).ok()?;
-    let file = ("config.toml".to_owned(), String::from_utf8(bytes).ok()?);
-    Config::resolve(&Sources { files: vec![file], ..Sources::default() }).ok()
 }
 
 fn is_missing(e: &io::ReadError) -> bool {

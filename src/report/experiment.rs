@@ -6,15 +6,15 @@ use crate::kernel::rng;
 use crate::{Error, Result};
 use serde::Serialize;
 
-/// What is measured of a row, in the order of the columns: its word, its heading, digits, and whether more is better.
-pub const MEASURES: [(&str, &str, usize, bool); 7] = [
-    ("masked", "PSNR inside the mask, dB", 2, true),
-    ("full", "PSNR of the whole photograph, dB", 2, true),
-    ("region", "PSNR of face and hair, dB", 2, true),
-    ("masked_ssim", "SSIM inside the mask", 3, true),
-    ("full_ssim", "SSIM of the whole photograph", 3, true),
-    ("lpips", "LPIPS of the whole photograph", 3, false),
-    ("seconds", "seconds a view", 2, false),
+/// What is measured of a row, in the order of the columns: its word, its heading, and digits.
+pub const MEASURES: [(&str, &str, usize); 7] = [
+    ("masked", "PSNR inside the mask, dB", 2),
+    ("full", "PSNR of the whole photograph, dB", 2),
+    ("region", "PSNR of face and hair, dB", 2),
+    ("masked_ssim", "SSIM inside the mask", 3),
+    ("full_ssim", "SSIM of the whole photograph", 3),
+    ("lpips", "LPIPS of the whole photograph", 3),
+    ("seconds", "seconds a view", 2),
 ];
 
 /// Behind the title of a row that was judged by masks which its own run made.

@@ -3,7 +3,7 @@
 use super::{STYLE, fill, link, picture_url};
 use crate::Result;
 use crate::capture::synthetic::SyntheticHead;
-use crate::config::{Config, NAMES, Sources, Stage, called};
+use crate::config::{Config, NAMES, Stage, called};
 use crate::image::{over_black, reduce_photo, working_size};
 use crate::io::{self, Limits};
 use crate::run::{Phase, Record, Standing};
@@ -75,7 +75,7 @@ impl RunRow {
             done: standing.phase == Phase::Done,
             failed: standing.phase == Phase::Failed,
             picture: picture(run).unwrap_or_default(),
-            preset: preset(run).unwrap_or_default(),
+            preset: Config::of_run(run).map_or(String::new(), |config| config.preset.name().into()),
             seconds: standing.elapsed_s,
             cpu_s: records.iter().map(|(_, r)| r.cpu_s).sum::<Option<f64>>().filter(|s| *s > 0.0),
             peak_bytes: records.iter().filter_map(|(_, r)| r.peak_bytes).max(),
@@ -129,13 +129,6 @@ fn state(run: &Standing) -> String {
         }
         Phase::Waiting => "empty".into(),
     }
-}
-
-fn preset(run: &Path) -> Option<String> {
-    let bytes = io::read_bytes(&run.join("config.toml"), &Limits::default()).ok()?;
-    let file = ("config.toml".to_owned(), String::from_utf8(bytes).ok()?);
-    let config = Config::resolve(&Sources { files: vec![file], ..Sources::default() }).ok()?;
-    Some(config.preset.name().into())
 }
 
 /// The first view of the best that a run shows, over black.

@@ -2,7 +2,7 @@
 
 use crate::{Error, Result};
 use bytemuck::Pod;
-use cubecl::device::{WgpuBackend, WgpuDevice, WgpuDeviceKind};
+use cubecl::device::{CudaDevice, WgpuBackend, WgpuDevice, WgpuDeviceKind};
 use cubecl::features::AtomicUsage;
 use cubecl::ir::{ElemType, FloatKind, Type};
 use cubecl::prelude::{BufferArg, Client, CubeCount};
@@ -65,7 +65,7 @@ pub struct DeviceLimits {
 /// A way to a GPU: an adapter as one API offers it.
 pub struct Adapter {
     device: cubecl::Device,
-    /// `vulkan`, `metal` or `dx12`.
+    /// `vulkan`, `metal`, `dx12` or `cuda`.
     pub api: &'static str,
     /// `discrete`, `integrated`, `virtual` or `software`.
     pub kind: &'static str,
@@ -74,7 +74,7 @@ pub struct Adapter {
 }
 
 impl Adapter {
-    /// All of this machine, the fastest kind first.
+    /// All of this machine, the fastest kind first. A card that has several APIs is there once for each.
     pub fn all() -> Vec<Adapter> {
         use WgpuDeviceKind::{Cpu, DiscreteGpu, IntegratedGpu, VirtualGpu};
         let kinds = [
@@ -85,7 +85,7 @@ impl Adapter {
         ];
         let apis =
             [(WgpuBackend::Vulkan, "vulkan"), (WgpuBackend::Metal, "metal"), (WgpuBackend::Dx12, "dx12")];
-        let mut all = Vec::new();
+        let mut all = Adapter::of_cuda();
         for (like, kind) in kinds {
             for (backend, api) in apis {
                 let id = cubecl::Device::from(WgpuDevice::new(like.clone()).on(backend)).to_id();
@@ -94,6 +94,16 @@ impl Adapter {
             }
         }
         all
+    }
+
+    /// Those that CUDA reaches, where it is built in: none without NVIDIA's driver.
+    fn of_cuda() -> Vec<Adapter> {
+        if !cfg!(feature = "cuda") {
+            return Vec::new();
+        }
+        let id = cubecl::Device::Cuda(CudaDevice::default()).to_id();
+        let found = cubecl::Device::enumerate(id).into_iter().map(cubecl::Device::from_id);
+        found.map(|device| Adapter { device, api: "cuda", kind: "discrete", software: false }).collect()
     }
 }
 

@@ -1,4 +1,4 @@
-//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal and DX12. Each is the twin of a kernel of [`super`].
+//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal, DX12 and CUDA. Each is the twin of a kernel of [`super`].
 //!
 //! Values of samples lie plane by plane, `[channels, capacity]`: neighboring threads read neighboring words, and a
 //! plane is read four samples at a time. `capacity` is a multiple of [`mlp::TILE`](super::mlp::TILE); how many samples
@@ -36,7 +36,7 @@ pub use losses::{LossWeights, Losses};
 pub use march::Samples;
 pub use neus::{Neus, Rays};
 pub use norm::Norm;
-pub use occupancy::{Band, Occupancy};
+pub use occupancy::{Band, Nerfacc, Occupancy};
 pub use points::SurfacePoints;
 pub use schedule::{Pitch, RayBudget, Schedule};
 pub use sdf::Sdf;

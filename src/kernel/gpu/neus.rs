@@ -37,6 +37,16 @@ fn sigmoid(v: f32) -> f32 {
     1.0f32 / (1.0f32 + (-v).exp())
 }
 
+/// How opaque a cell of half size `half` may be: see [`neus::occupancy`].
+#[cube]
+pub(super) fn opacity(sdf: f32, half: f32, inv_s: f32) -> f32 {
+    let sharp = clamp(inv_s, 1e-6f32, 1e6f32);
+    // seen head on, where the signed distance falls
+    let previous = sigmoid((sdf + half) * sharp);
+    let next = sigmoid((sdf - half) * sharp);
+    clamp((previous - next + EPSILON) / (previous + EPSILON), 0.0f32, 1.0f32)
+}
+
 /// Sample `s` of a ray along `d`.
 #[cube]
 fn sample(

@@ -1,12 +1,21 @@
-//! Which cells may hold surface, looked at again on the device: the rule of a band around the zero set.
+//! Which cells may hold surface, looked at again on the device: the rule of a band around the zero set, and nerfacc's.
 
 use super::device::{Buffer, Device, groups};
+use super::march::prefix_sum;
+use super::neus::opacity;
+use super::rng;
 use super::sdf::Sdf;
 use crate::Result;
 use crate::kernel::march::Bitmask;
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
+
+/// Every cell is looked at before this step, a quarter of them and of those marched through after it.
+const ALL_BELOW: u64 = 256;
+
+/// Opacity of a cell that is marched through, unless the mean is less.
+const THRESHOLD: f32 = 1e-3;
 
 #[cube]
 fn center(index: u32, cell: f32, radius: f32) -> f32 {
@@ -122,6 +131,194 @@ fn decide(
         }
         mask[word] = kept;
         solid[word] = deep;
+    }
+}
+
+/// Counts the cells of each word of a mask.
+#[cube(launch)]
+fn tally(mask: &[u32], counts: &mut [u32]) {
+    let word = ABSOLUTE_POS;
+    if word < mask.len() {
+        counts[word] = mask[word].count_ones();
+    }
+}
+
+/// The occupied cell of a rank, where `before` says how many lie before each word of the mask.
+#[cube]
+fn of_rank(mask: &[u32], before: &[u32], rank: u32) -> u32 {
+    // the last word with no more than `rank` before it
+    let mut low = 0u32;
+    let mut high = u32::cast_from(mask.len());
+    while high - low > 1 {
+        let middle = (low + high) / 2;
+        if before[middle as usize] <= rank {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    let mut left = mask[low as usize];
+    for _ in before[low as usize]..rank {
+        // without its lowest bit
+        left &= left - 1;
+    }
+    low * 32 + left.trailing_zeros()
+}
+
+/// The cell of a draw; one that there is not where nothing is drawn: see `look` of the CPU's.
+#[cube]
+fn drawn_cell(
+    mask: &[u32],
+    before: &[u32],
+    k: u32,
+    cells: u32,
+    any: &Draws,
+    some: &Draws,
+    #[comptime] all: bool,
+) -> u32 {
+    let mut cell = k;
+    if !all {
+        let quarter = cells / 4;
+        let kept = before[mask.len()];
+        if k < quarter {
+            cell = rng::below(any.high, any.low, k, cells);
+        } else if kept > quarter {
+            cell = of_rank(mask, before, rng::below(some.high, some.low, k - quarter, kept));
+        } else if k - quarter < kept {
+            cell = of_rank(mask, before, k - quarter);
+        } else {
+            cell = u32::MAX;
+        }
+    }
+    cell
+}
+
+/// A stream of random numbers.
+#[derive(CubeType, CubeLaunch, Clone, Copy)]
+struct Draws {
+    high: u32,
+    low: u32,
+}
+
+/// Says of every cell which draw of it is the last one, counted from 1.
+#[cube(launch)]
+fn claim(mask: &[u32], before: &[u32], last: &[Atomic<u32>], cells: u32, any: Draws, some: Draws) {
+    let k = u32::cast_from(ABSOLUTE_POS);
+    if k < cells / 4 * 2 {
+        let cell = drawn_cell(mask, before, k, cells, &any, &some, false);
+        if cell < cells {
+            last[cell as usize].fetch_max(k + 1);
+        }
+    }
+}
+
+/// A random point in the cell of each draw from `first` on.
+#[cube(launch)]
+fn scatter(
+    mask: &[u32],
+    before: &[u32],
+    x: &mut [f32],
+    drawn: &mut [u32],
+    count: &mut [u32],
+    first: u32,
+    here: u32,
+    resolution: u32,
+    radius: f32,
+    any: Draws,
+    some: Draws,
+    jitter: Draws,
+    #[comptime] all: bool,
+) {
+    let s = ABSOLUTE_POS;
+    let plane = x.len() / 3;
+    if s < here as usize {
+        let k = first + u32::cast_from(s);
+        let cells = resolution * resolution * resolution;
+        let cell = drawn_cell(mask, before, k, cells, &any, &some, all);
+        drawn[s] = cell;
+        // where nothing is drawn any point will do
+        let i = select(cell < cells, cell, 0u32);
+        let width = 2.0f32 * radius / f32::cast_from(resolution);
+        let (a, b, c) = (i / (resolution * resolution), i / resolution % resolution, i % resolution);
+        let u = rng::uniform(jitter.high, jitter.low, 3 * k);
+        let v = rng::uniform(jitter.high, jitter.low, 3 * k + 1);
+        let w = rng::uniform(jitter.high, jitter.low, 3 * k + 2);
+        x[s] = (f32::cast_from(a) + u) * width - radius;
+        x[plane + s] = (f32::cast_from(b) + v) * width - radius;
+        x[2 * plane + s] = (f32::cast_from(c) + w) * width - radius;
+    }
+    if s == 0 {
+        count[0] = here;
+    }
+}
+
+/// What a cell was lessens; what is seen of it now may be more.
+#[cube(launch)]
+fn remember(
+    field: &[f32],
+    inv_s: &[f32],
+    drawn: &[u32],
+    last: &[u32],
+    history: &mut [f32],
+    first: u32,
+    here: u32,
+    step: f32,
+    #[comptime] all: bool,
+) {
+    let s = ABSOLUTE_POS;
+    if s < here as usize {
+        let plane = field.len() / 8;
+        let cell = drawn[s] as usize;
+        if cell < history.len() && (all || last[cell] == first + u32::cast_from(s) + 1) {
+            let sharp = inv_s[0] * field[7 * plane + s].exp();
+            history[cell] = max(0.95f32 * history[cell], opacity(field[s], 0.5f32 * step, sharp));
+        }
+    }
+}
+
+/// Sums 32 values a thread, and those of a group.
+#[cube(launch)]
+fn partial_sums(history: &[f32], sums: &mut [f32]) {
+    let mut own = 0.0f32;
+    for k in 0..32usize {
+        let i = 32 * ABSOLUTE_POS + k;
+        if i < history.len() {
+            own += history[i];
+        }
+    }
+    let mut all = Shared::<[f32]>::new_slice(UNITS as usize);
+    all[UNIT_POS as usize] = own;
+    sync_cube();
+    if UNIT_POS == 0 && CUBE_POS < sums.len() {
+        let mut sum = 0.0f32;
+        for k in 0..UNITS as usize {
+            sum += all[k];
+        }
+        sums[CUBE_POS] = sum;
+    }
+}
+
+/// Decides about 32 cells a thread by what is remembered: more than a thousandth, or than the mean where that is less.
+#[cube(launch)]
+fn decide_by_history(history: &[f32], sums: &[f32], last: &mut [u32], mask: &mut [u32], threshold: f32) {
+    let word = ABSOLUTE_POS;
+    if word < mask.len() {
+        let mut sum = 0.0f32;
+        for k in 0..sums.len() {
+            sum += sums[k];
+        }
+        let least = min(sum / f32::cast_from(history.len()), threshold);
+        let mut kept = 0u32;
+        for bit in 0..32usize {
+            let i = 32 * word + bit;
+            if i < history.len() {
+                last[i] = 0;
+                if history[i] > least {
+                    kept |= 1u32 << u32::cast_from(bit);
+                }
+            }
+        }
+        mask[word] = kept;
     }
 }
 
@@ -246,6 +443,135 @@ impl Band {
             resolution,
             self.units,
             half,
+        );
+    }
+}
+
+/// nerfacc's rule for a signed distance: see the `look` of `iface`'s occupancy on the CPU.
+pub struct Nerfacc {
+    history: Buffer,
+    /// Cells of each word of the mask, and how many lie before it.
+    counts: Buffer,
+    before: Buffer,
+    kept: Buffer,
+    /// The last draw of each cell, counted from 1; 0 between updates.
+    last: Buffer,
+    /// Cells of the draws that are evaluated together.
+    drawn: Buffer,
+    sums: Buffer,
+    count: Buffer,
+    step: f32,
+}
+
+impl Nerfacc {
+    /// With what was remembered of the cells, `[cells]`; `step` is the march step, `capacity` how many cells are
+    /// evaluated together.
+    pub fn new(device: &Device, history: &[f32], step: f32, capacity: usize) -> Nerfacc {
+        let cells = history.len();
+        // words of 64 bits on the host
+        let words = 2 * cells.div_ceil(64);
+        Nerfacc {
+            history: device.upload(history),
+            counts: device.zeros(words),
+            before: device.zeros(words + 1),
+            kept: device.zeros(2),
+            last: device.zeros(cells),
+            drawn: device.zeros(capacity),
+            sums: device.zeros(cells.div_ceil(32 * UNITS as usize)),
+            count: device.zeros(2),
+            step,
+        }
+    }
+
+    /// Waits for the device; what is remembered of the cells.
+    pub fn read(&self, device: &Device) -> Result<Vec<f32>> {
+        device.fetch(&self.history)
+    }
+
+    /// Looks at the field again before step `n`. `x` and `direction`, planes `[3, capacity]`, are written over; `inv_s`
+    /// is `[1]`.
+    pub fn update(
+        &self,
+        device: &Device,
+        (seed, n): (u64, u64),
+        occupancy: &Occupancy,
+        field: &Sdf,
+        [table, flat, inv_s]: [&Buffer; 3],
+        [x, direction]: [&Buffer; 2],
+    ) {
+        let cells = self.history.words();
+        let all = n < ALL_BELOW;
+        let dim = CubeDim::new_1d(UNITS);
+        let over = |count: usize| groups(count.div_ceil(UNITS as usize));
+        let draws = |purpose: u64| {
+            let [high, low] = rng::stream(seed, n << 4 | purpose);
+            DrawsLaunch::new(high, low)
+        };
+        let draw_count = if all { cells } else { cells / 4 * 2 };
+        if !all {
+            let mask = &occupancy.mask;
+            tally::launch(device.launch(), over(mask.words()), dim, mask.arg(), self.counts.arg());
+            prefix_sum(device, &self.counts, &self.before, &self.kept, cells);
+            claim::launch(
+                device.launch(),
+                over(draw_count),
+                dim,
+                mask.arg(),
+                self.before.arg(),
+                self.last.arg(),
+                cells as u32,
+                draws(5),
+                draws(6),
+            );
+        }
+        let capacity = self.drawn.words();
+        for first in (0..draw_count).step_by(capacity) {
+            let here = capacity.min(draw_count - first);
+            scatter::launch(
+                device.launch(),
+                over(here),
+                dim,
+                occupancy.mask.arg(),
+                self.before.arg(),
+                x.arg(),
+                self.drawn.arg(),
+                self.count.arg(),
+                first as u32,
+                here as u32,
+                occupancy.resolution as u32,
+                occupancy.radius,
+                draws(5),
+                draws(6),
+                draws(7),
+                all,
+            );
+            let out = field.forward(device, table, flat, x, direction, &self.count);
+            remember::launch(
+                device.launch(),
+                over(here),
+                dim,
+                out.arg(),
+                inv_s.arg(),
+                self.drawn.arg(),
+                self.last.arg(),
+                self.history.arg(),
+                first as u32,
+                here as u32,
+                self.step,
+                all,
+            );
+        }
+        let groups_of_32 = groups(self.sums.words());
+        partial_sums::launch(device.launch(), groups_of_32, dim, self.history.arg(), self.sums.arg());
+        decide_by_history::launch(
+            device.launch(),
+            over(occupancy.mask.words()),
+            dim,
+            self.history.arg(),
+            self.sums.arg(),
+            self.last.arg(),
+            occupancy.mask.arg(),
+            THRESHOLD,
         );
     }
 }

@@ -15,7 +15,7 @@ impl Experiment {
     /// Cells of a table: the heading, then a line for each row.
     fn cells(&self, table: &str) -> Vec<Vec<String>> {
         let mut heading = vec!["row".to_owned()];
-        for (word, title, ..) in self.measures().into_iter().map(|k| MEASURES[k]) {
+        for (word, title, _) in self.measures().into_iter().map(|k| MEASURES[k]) {
             heading.push(title.into());
             if self.published.iter().any(|p| p.table == table && p.measure == word) {
                 heading.push(format!("{title}, published"));
@@ -29,7 +29,7 @@ impl Experiment {
         let first = self.rows.iter().position(|r| r.table == table);
         for (i, row) in self.rows.iter().enumerate().filter(|(_, r)| r.table == table) {
             let mut line = vec![self.title(i)];
-            for (k, (word, _, digits, _)) in self.measures().into_iter().map(|k| (k, MEASURES[k])) {
+            for (k, (word, _, digits)) in self.measures().into_iter().map(|k| (k, MEASURES[k])) {
                 line.push(self.mean(i, k).map_or_else(dash, |v| format!("{v:.digits$}")));
                 if self.published.iter().any(|p| p.table == table && p.measure == word) {
                     line.push(self.published(row, word).map_or_else(dash, |v| format!("{v:.digits$}")));
@@ -102,8 +102,9 @@ impl Experiment {
             }
             false => "",
         };
+        let captures = if many == 1 { "capture" } else { "captures" };
         format!(
-            "{many} captures ({}), scale {} of the published effort. PSNR and SSIM are means over held-out photographs as \
+            "{many} {captures} ({}), scale {} of the published effort. PSNR and SSIM are means over held-out photographs as \
              they were taken, then over captures; masks are the captures' own{own}. Seconds a view of an ensemble are \
              those of its members and of the blend. A row that some captures lack is the mean of the others; \
              orderings on average are over the captures that have both rows. Intervals: {DRAWS} resamplings of the photographs.{}",
