@@ -4,7 +4,7 @@
 //! [`READ_EVERY`]. What a checkpoint holds is the same as on the CPU, so that either goes on from it.
 
 use super::losses::KNEE;
-use super::model::SdfModel;
+use super::model::{SdfModel, shape};
 use super::schedule;
 use super::state::{FORMAT, SdfState};
 use super::train::{LOST_AFTER, MOST_BUDGETS, STEREO_POINTS, SdfTraining, TERMS, VARIANCE, adam_steps, lost};
@@ -19,6 +19,7 @@ use crate::kernel::gpu::{
 };
 use crate::kernel::hash;
 use crate::kernel::mlp::TILE;
+use crate::kernel::sdf::FieldShape;
 use crate::{Error, Result};
 
 /// Steps between two looks at losses and flags: what goes wrong is known that much later.
@@ -302,7 +303,8 @@ fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<(usize, bo
     let sample = 4 * (words + BESIDE) as u64;
     // values, moments and gradient; cells with distance, reach and bits
     let cells = config.occupancy_resolution.pow(3) as u64;
-    let fixed = 32 * hash::entries(&host.shape.levels) as u64 + 13 * cells;
+    let beside = |shape: &FieldShape| 32 * hash::entries(&shape.levels) as u64 + 13 * cells;
+    let fixed = beside(&host.shape);
     let spare = device.spare().saturating_sub(fixed);
     let wanted = (MOST_BUDGETS * config.samples + points) as u64;
     let resident = drawing::resident(&host.pixels, device, spare.saturating_sub(wanted * sample));
@@ -318,7 +320,12 @@ fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<(usize, bo
             mib(fixed),
         );
         let remedy = match capacity.saturating_sub(points) {
-            0..64 => format!("iface.log2_table ({})", config.log2_table),
+            0..64 => {
+                let table = |log2: u32| beside(&shape(&IfaceConfig { log2_table: log2, ..config.clone() }));
+                let room = device.spare().saturating_sub(least as u64 * sample);
+                let fits = (4..config.log2_table).rev().find(|&log2| table(log2) <= room);
+                fits.map_or("iface.samples".into(), |log2| format!("iface.log2_table to {log2}"))
+            }
             fits => format!("iface.samples to {fits}"),
         };
         return Err(Error::cannot(problem, format!("lower {remedy}, or give more with `--memory`")));

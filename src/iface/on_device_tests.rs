@@ -340,7 +340,20 @@ fn a_device_with_too_little_room_is_refused_before_the_first_step() {
     let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
     let of = |mib: u64| self::device().unwrap().with_memory(mib << 20);
     let e = room(&host, &of(512), 1).err().unwrap();
-    assert!(e.hint().contains("iface.log2_table (12)"), "{e:?}");
+    assert!(e.hint().contains("lower iface.samples, or give more"), "{e:?}");
+    // where the tables alone are too large, the largest that fit are named, and they do fit
+    let config = IfaceConfig { samples: 512, levels: 16, log2_table: 20, ..self::config() };
+    let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
+    let e = room(&host, &of(640), 1).err().unwrap();
+    let log2 = e.hint().strip_prefix("lower iface.log2_table to ").and_then(|h| h.split(',').next());
+    let log2: u32 = log2.unwrap_or_else(|| panic!("{}", e.hint())).parse().unwrap();
+    for (log2_table, fits) in [(log2, true), (log2 + 1, false)] {
+        let config = IfaceConfig { log2_table, ..config.clone() };
+        let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
+        assert_eq!(room(&host, &of(640), 1).is_ok(), fits, "{log2_table}");
+    }
+    let config = IfaceConfig { samples: 4096, ..self::config() };
+    let host = SdfTraining::new(&views, Some(&hull), &config, &session).unwrap();
     let [whole, few] = [900, 522].map(|mib| room(&host, &of(mib), 1).unwrap());
     println!("samples, and do photographs lie there: {whole:?} {few:?}");
     assert!(whole.1 && whole.0 > MOST_BUDGETS * 4096 && !few.1 && few.0 < whole.0 && few.0 > 4096);
