@@ -8,10 +8,19 @@ fn read(name: &str) -> String {
     std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).unwrap()
 }
 
-/// Name, what stands behind the version, and license of every crate in the program.
+/// Name, what stands behind the version, and license of every crate in the program, without the feature `cuda`.
 fn crates() -> Vec<(String, String, String)> {
     let output = Command::new(env!("CARGO"))
-        .args(["tree", "--locked", "--all-features", "--edges", "normal,build", "--prefix", "none"])
+        .args([
+            "tree",
+            "--locked",
+            "--features",
+            "matting,wgpu",
+            "--edges",
+            "normal,build",
+            "--prefix",
+            "none",
+        ])
         .args(["--format", "{p}|{l}"])
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .output()

@@ -12,7 +12,7 @@ cd "$(dirname "$0")/.."
 bin=$(rustc --print sysroot)/lib/rustlib/$(rustc -vV | sed -n 's/^host: //p')/bin
 [ -x "$bin/llvm-cov" ] || { echo "llvm-cov is missing: rustup component add llvm-tools" >&2; exit 2; }
 scratch=$(mktemp -d)
-trap 'rm -rf "$scratch" target/release/tiface' EXIT
+trap 'rm -rf "$scratch" "${CARGO_TARGET_DIR:-target}/release/tiface"' EXIT
 printf '#!/bin/sh\nexec "$@" -Cinstrument-coverage\n' > "$scratch/rustc"
 chmod +x "$scratch/rustc"
 export RUSTC_WORKSPACE_WRAPPER=$scratch/rustc CARGO_INCREMENTAL=0

@@ -13,6 +13,17 @@ fn from(file: &str, set: &[&str]) -> Result<Config> {
 }
 
 #[test]
+fn the_settings_of_a_run_are_read_again_unless_they_are_not_understood() {
+    let dir = tempfile::tempdir().unwrap();
+    assert!(Config::of_run(dir.path()).is_none());
+    let config = from("preset = \"draft\"", &["mesh.resolution=301"]).unwrap();
+    std::fs::write(dir.path().join("config.toml"), config.to_toml()).unwrap();
+    assert_eq!(Config::of_run(dir.path()), Some(config));
+    std::fs::write(dir.path().join("config.toml"), "mesh.resolution = 'fine'").unwrap();
+    assert!(Config::of_run(dir.path()).is_none());
+}
+
+#[test]
 fn later_wins_default_preset_file_set() {
     let c = from("preset = \"draft\"\n[mesh]\nresolution = 300\n", &["mesh.resolution=301"]).unwrap();
     assert_eq!((c.preset, c.mesh.resolution), (Preset::Draft, 301));

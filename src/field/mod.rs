@@ -77,7 +77,8 @@ pub fn place(name: &str) -> Result<Place> {
         #[cfg(not(feature = "wgpu"))]
         other => {
             let problem = format!("device `{other}`: this build learns on the processor alone");
-            Err(Error::usage(problem, "build with `--features wgpu`, or leave `--device` out"))
+            let feature = if other == "cuda" { "cuda" } else { "wgpu" };
+            Err(Error::usage(problem, format!("build with `--features {feature}`, or leave `--device` out")))
         }
     }
 }

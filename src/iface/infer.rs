@@ -30,9 +30,6 @@ use std::sync::{
 /// Samples evaluated together in a volume render.
 const SAMPLES: usize = 1 << 16;
 
-/// Samples of a ray that are evaluated before it is asked whether light still passes.
-const AT_ONCE: usize = 64;
-
 /// The trained field on the host. All positions and distances are in scene units, the box is [-1, 1]³.
 pub struct IFace {
     config: IfaceConfig,
@@ -227,56 +224,35 @@ impl IFace {
             return seen.iter().map(|o| self.result(o)).collect();
         }
         let samples = self.occupancy.march(config, dt, &marched);
-        // as many rays as have a bounded number of samples at once: a sample costs some two kilobytes
+        // pieces of whole rays with a bounded number of samples: a sample costs some two kilobytes
         let mut out = Vec::with_capacity(rays.len());
-        while out.len() < marched.len() {
-            let first = out.len();
-            let mut room = SAMPLES;
-            let fit = samples.offsets[first..].windows(2).take_while(|o| {
-                let count = ((o[1] - o[0]) as usize).min(AT_ONCE);
-                room = room.saturating_sub(count);
-                room > 0
-            });
-            let last = first + fit.count().max(1);
+        let mut first = 0;
+        while first < marched.len() {
+            let most = samples.offsets[first] as usize + SAMPLES;
+            let fits = samples.offsets.partition_point(|&o| o as usize <= most) - 1;
+            let last = fits.clamp(first + 1, marched.len());
             out.extend(self.composite(&marched[first..last], &samples, first, dt));
+            first = last;
         }
         out
     }
 
-    /// Composites rays `first..first + rays.len()` of a march, from front to back: nothing is evaluated behind what lets
-    /// no light pass at all.
+    /// Composites rays `first..first + rays.len()` of a march.
     fn composite(&self, rays: &[MarchRay], samples: &Samples, first: usize, dt: f32) -> Vec<RayResult> {
-        let mut out = vec![0f32; rays.len() * neus::RAY_WIDTH];
-        let mut transmittance = vec![1f32; rays.len()];
-        let own = |r: usize| samples.offsets[first + r] as usize..samples.offsets[first + r + 1] as usize;
-        let mut going: Vec<usize> = (0..rays.len()).collect();
-        for done in (0..).step_by(AT_ONCE) {
-            going.retain(|&r| own(r).len() > done && transmittance[r] > 0.0);
-            if going.is_empty() {
-                break;
-            }
-            let mut piece = Samples { offsets: vec![0], t: Vec::new() };
-            for &r in &going {
-                let t = &samples.t[own(r)][done..];
-                piece.t.extend(&t[..t.len().min(AT_ONCE)]);
-                piece.offsets.push(piece.t.len() as i32);
-            }
-            let there: Vec<MarchRay> = going.iter().map(|&r| rays[r]).collect();
-            let (x, d) = piece.points(&there, 0);
-            let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
-            let direction: Vec<[f32; 3]> = there.iter().map(|r| r.direction).collect();
-            let steps = vec![dt; x.len()];
-            let bundle = Rays { offsets: &piece.offsets, direction: &direction, t: &piece.t, dt: &steps };
-            let mut passed: Vec<f32> = going.iter().map(|&r| transmittance[r]).collect();
-            let rows = |r: usize| r * neus::RAY_WIDTH..(r + 1) * neus::RAY_WIDTH;
-            let mut seen: Vec<f32> = going.iter().flat_map(|&r| out[rows(r)].to_vec()).collect();
-            neus::extend(bundle, field.output(), self.inv_s, 1.0, &mut passed, &mut seen);
-            for (k, &r) in going.iter().enumerate() {
-                transmittance[r] = passed[k];
-                out[rows(r)].copy_from_slice(&seen[rows(k)]);
-            }
-        }
-        out.chunks_exact(neus::RAY_WIDTH).map(|o| self.result(o)).collect()
+        let offsets = &samples.offsets[first..=first + rays.len()];
+        let start = offsets[0] as usize;
+        let t = &samples.t[start..offsets[rays.len()] as usize];
+        let offsets: Vec<i32> = offsets.iter().map(|&o| o - start as i32).collect();
+        let n = t.len();
+        let (x, d) = samples.points(rays, first);
+        let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
+        let direction: Vec<[f32; 3]> = rays.iter().map(|r| r.direction).collect();
+        let steps = vec![dt; n];
+        let bundle = Rays { offsets: &offsets, direction: &direction, t, dt: &steps };
+        neus::forward(bundle, field.output(), self.inv_s, 1.0)
+            .chunks_exact(neus::RAY_WIDTH)
+            .map(|o| self.result(o))
+            .collect()
     }
 
     /// What a ray composited, in scene units.

@@ -1,7 +1,7 @@
 //! Which cells of the box may hold surface.
 
 use crate::config::iface::{IfaceConfig, OccupancyRule};
-use crate::kernel::march::{self, Bitmask, MarchRay, Samples};
+use crate::kernel::march::{self, Bitmask, MarchRay, Samples, nerfacc};
 use crate::kernel::{neus, rng};
 use rayon::prelude::*;
 
@@ -158,7 +158,7 @@ impl Occupancy {
             let each = sdf(points).into_par_iter().zip(local);
             each.map(|(f, soft)| neus::occupancy(f, 0.5 * step, inv_s * soft.exp())).collect()
         };
-        self.look((seed, n), config.radius, 1e-3, opacity);
+        self.look((seed, n), config.radius, nerfacc::OPAQUE, opacity);
     }
 
     /// nerfacc's rule for any opacity of a cell: what is above `threshold`, or above the mean where that is less, is
@@ -172,19 +172,20 @@ impl Occupancy {
     ) {
         let r = self.occupied.resolution;
         let total = r * r * r;
-        let cells: Vec<usize> = if n < 256 {
+        let [any, some, jitter] = nerfacc::DRAWS;
+        let cells: Vec<usize> = if n < nerfacc::ALL_BELOW {
             (0..total).collect()
         } else {
             let quarter = total as u64 / 4;
-            let random = (0..quarter).map(|k| rng::below(seed, n << 4 | 5, k, total as u64) as usize);
+            let random = (0..quarter).map(|k| rng::below(seed, n << 4 | any, k, total as u64) as usize);
             let occupied: Vec<usize> = (0..total).filter(|&i| self.occupied.get(i)).collect();
             let kept = occupied.len() as u64;
-            let some: Vec<usize> = if kept > quarter {
-                (0..quarter).map(|k| occupied[rng::below(seed, n << 4 | 6, k, kept) as usize]).collect()
+            let again: Vec<usize> = if kept > quarter {
+                (0..quarter).map(|k| occupied[rng::below(seed, n << 4 | some, k, kept) as usize]).collect()
             } else {
                 occupied
             };
-            random.chain(some).collect()
+            random.chain(again).collect()
         };
         let cell = 2.0 * radius / r as f32;
         let points: Vec<[f32; 3]> = cells
@@ -193,14 +194,17 @@ impl Occupancy {
             .map(|(k, &i)| {
                 let corner = [i / (r * r), i / r % r, i % r];
                 std::array::from_fn(|a| {
-                    let jitter = rng::uniform(seed, n << 4 | 7, (3 * k + a) as u64);
-                    (corner[a] as f32 + jitter) * cell - radius
+                    let within = rng::uniform(seed, n << 4 | jitter, (3 * k + a) as u64);
+                    (corner[a] as f32 + within) * cell - radius
                 })
             })
             .collect();
         let opacity = opacity(&points);
-        let decayed: Vec<(usize, f32)> =
-            cells.iter().zip(&opacity).map(|(&i, &o)| (i, (0.95 * self.history[i]).max(o))).collect();
+        let decayed: Vec<(usize, f32)> = cells
+            .iter()
+            .zip(&opacity)
+            .map(|(&i, &o)| (i, (nerfacc::DECAY * self.history[i]).max(o)))
+            .collect();
         for (i, o) in decayed {
             self.history[i] = o;
         }

@@ -71,7 +71,7 @@ enum CellRule {
 }
 
 impl CellRule {
-    fn new(device: &Device, host: &SdfTraining, capacity: usize) -> CellRule {
+    fn new(device: &Device, host: &SdfTraining, there: &Occupancy, capacity: usize) -> CellRule {
         let (config, occupancy) = (host.config, &host.state.occupancy);
         match config.occupancy {
             OccupancyRule::Band => {
@@ -79,7 +79,7 @@ impl CellRule {
             }
             OccupancyRule::Nerfacc => {
                 let step = schedule::march_step(config, 1.0);
-                CellRule::Nerfacc(Nerfacc::new(device, &occupancy.history, step, capacity))
+                CellRule::Nerfacc(Nerfacc::new(device, there, &occupancy.history, step, capacity))
             }
         }
     }
@@ -296,15 +296,15 @@ fn points(config: &IfaceConfig) -> usize {
 /// Samples that a step has room for, as many as on the CPU where the device's memory and buffers are large enough; and do
 /// photographs lie there, too?
 fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<(usize, bool)> {
-    /// Samples with their rays, compositing and losses.
-    const BESIDE: usize = 3 + 3 + 2 + 9 + 2;
+    /// Samples with their rays, compositing and losses, and the cells that are looked at in their place.
+    const BESIDE: usize = 3 + 3 + 2 + 9 + 2 + 1;
     let config = host.config;
     let [words, widest] = Sdf::words_per_sample(&host.shape);
     let sample = 4 * (words + BESIDE) as u64;
-    // values, moments and gradient; cells with distance, reach and bits
+    // values, moments and gradient; cells with their number, distance and reach or history and last draw, and bits
     let cells = config.occupancy_resolution.pow(3) as u64;
-    let beside = |shape: &FieldShape| 32 * hash::entries(&shape.levels) as u64 + 13 * cells;
-    let fixed = beside(&host.shape);
+    let fixed_with = |shape: &FieldShape| 32 * hash::entries(&shape.levels) as u64 + 13 * cells;
+    let fixed = fixed_with(&host.shape);
     let spare = device.spare().saturating_sub(fixed);
     let wanted = (MOST_BUDGETS * config.samples + points) as u64;
     let resident = drawing::resident(&host.pixels, device, spare.saturating_sub(wanted * sample));
@@ -321,10 +321,13 @@ fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<(usize, bo
         );
         let remedy = match capacity.saturating_sub(points) {
             0..64 => {
-                let table = |log2: u32| beside(&shape(&IfaceConfig { log2_table: log2, ..config.clone() }));
+                let table =
+                    |log2: u32| fixed_with(&shape(&IfaceConfig { log2_table: log2, ..config.clone() }));
                 let room = device.spare().saturating_sub(least as u64 * sample);
                 let fits = (4..config.log2_table).rev().find(|&log2| table(log2) <= room);
-                fits.map_or("iface.samples".into(), |log2| format!("iface.log2_table to {log2}"))
+                fits.map_or("iface.levels or iface.occupancy_resolution".into(), |log2| {
+                    format!("iface.log2_table to {log2}")
+                })
             }
             fits => format!("iface.samples to {fits}"),
         };
@@ -359,6 +362,7 @@ impl There {
         let flat = host.shape.layout().len();
         let config = host.config;
         let budget = RayBudget { samples: config.samples, min: host.fewest_rays(), max: config.max_rays };
+        let occupancy = there_occupancy(device, host);
         There {
             table: Group::new(device, std::slice::from_ref(table)),
             network: Group::new(device, network),
@@ -369,8 +373,8 @@ impl There {
             g_inv_s: device.zeros(1),
             broken: device.zeros(1),
             schedule: Schedule::new(device, pitch(config), budget, host.state.rays),
-            occupancy: there_occupancy(device, host),
-            cells: CellRule::new(device, host, capacity),
+            cells: CellRule::new(device, host, &occupancy, capacity),
+            occupancy,
             stepped: false,
         }
     }

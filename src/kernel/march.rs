@@ -5,6 +5,19 @@
 
 use rayon::prelude::*;
 
+/// nerfacc 0.3.3's look at the cells again: constants that the processor and GPUs share.
+pub(crate) mod nerfacc {
+    /// Every cell is looked at before this step; from it on a quarter of them anywhere, and as many of those marched
+    /// through.
+    pub const ALL_BELOW: u64 = 256;
+    /// What is left of a cell's opacity at the next look.
+    pub const DECAY: f32 = 0.95;
+    /// Purposes of random numbers: cells anywhere, cells marched through, points in cells.
+    pub const DRAWS: [u64; 3] = [5, 6, 7];
+    /// Opacity of a cell of a signed distance that is marched through, unless the mean is less.
+    pub const OPAQUE: f32 = 1e-3;
+}
+
 /// Which cells of a cubic grid over `[-radius, radius]³` may hold surface; `(ix · R + iy) · R + iz`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bitmask {
@@ -17,8 +30,13 @@ pub struct Bitmask {
 impl Bitmask {
     /// All cells alike.
     pub fn filled(resolution: usize, occupied: bool) -> Bitmask {
-        let words = resolution.pow(3).div_ceil(64);
-        Bitmask { resolution, bits: vec![if occupied { u64::MAX } else { 0 }; words] }
+        let cells = resolution.pow(3);
+        let mut bits = vec![if occupied { u64::MAX } else { 0 }; cells.div_ceil(64)];
+        // what is behind the last cell is none
+        if let (Some(last), 1..) = (bits.last_mut(), cells % 64) {
+            *last &= (1 << (cells % 64)) - 1;
+        }
+        Bitmask { resolution, bits }
     }
 
     /// Is cell `i` occupied?
@@ -56,8 +74,7 @@ impl Bitmask {
 
     /// How many cells are occupied.
     pub fn count(&self) -> usize {
-        let cells = self.resolution.pow(3);
-        (0..cells).filter(|&i| self.get(i)).count()
+        self.bits.iter().map(|word| word.count_ones() as usize).sum()
     }
 }
 

@@ -97,39 +97,26 @@ fn local(inv_s: f32, field: &[f32]) -> f32 {
 /// - field: `[samples, 8]` as the field gives it
 /// - output: `[rays, 8]` = rgb, opacity, Σ w t, Σ w n̂
 pub fn forward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
+    let inv_s = inv_s.clamp(1e-6, 1e6);
     let count = rays.offsets.len() - 1;
     let mut out = vec![0f32; count * RAY_WIDTH];
-    extend(rays, field, inv_s, anneal, &mut vec![1f32; count], &mut out);
-    out
-}
-
-/// Goes on compositing behind what `out`, `[rays, 8]`, has already and of which `transmittance`, `[rays]`, passes:
-/// piece by piece the same bytes as [`forward`] at once.
-pub fn extend(
-    rays: Rays,
-    field: &[f32],
-    inv_s: f32,
-    anneal: f32,
-    transmittance: &mut [f32],
-    out: &mut [f32],
-) {
-    let inv_s = inv_s.clamp(1e-6, 1e6);
-    let each = out.par_chunks_mut(RAY_WIDTH).zip(transmittance);
-    each.with_min_len(64).enumerate().for_each(|(r, (out, transmittance))| {
+    out.par_chunks_mut(RAY_WIDTH).with_min_len(64).enumerate().for_each(|(r, out)| {
+        let mut transmittance = 1f32;
         for s in rays.offsets[r] as usize..rays.offsets[r + 1] as usize {
             let f = &field[s * WIDTH..][..WIDTH];
             let (n, _) = normal_of(f);
             let a = alpha_of(f[0], dot(rays.direction[r], n), rays.dt[s], local(inv_s, f), anneal).alpha;
-            let w = *transmittance * a;
+            let w = transmittance * a;
             for c in 0..3 {
                 out[c] += w * f[4 + c];
                 out[5 + c] += w * n[c];
             }
             out[3] += w;
             out[4] += w * rays.t[s];
-            *transmittance *= 1.0 - a;
+            transmittance *= 1.0 - a;
         }
     });
+    out
 }
 
 /// Gradients by the field's output `[samples, 8]` and by `inv_s`.

@@ -37,14 +37,20 @@ fn sigmoid(v: f32) -> f32 {
     1.0f32 / (1.0f32 + (-v).exp())
 }
 
+/// Opacity between two sigmoids, not clipped yet.
+#[cube]
+fn between(previous: f32, next: f32) -> f32 {
+    (previous - next + EPSILON) / (previous + EPSILON)
+}
+
 /// How opaque a cell of half size `half` may be: see [`neus::occupancy`].
 #[cube]
-pub(super) fn opacity(sdf: f32, half: f32, inv_s: f32) -> f32 {
+pub(super) fn occupancy(sdf: f32, half: f32, inv_s: f32) -> f32 {
     let sharp = clamp(inv_s, 1e-6f32, 1e6f32);
     // seen head on, where the signed distance falls
     let previous = sigmoid((sdf + half) * sharp);
     let next = sigmoid((sdf - half) * sharp);
-    clamp((previous - next + EPSILON) / (previous + EPSILON), 0.0f32, 1.0f32)
+    clamp(between(previous, next), 0.0f32, 1.0f32)
 }
 
 /// Sample `s` of a ray along `d`.
@@ -72,7 +78,7 @@ fn sample(
     let half = 0.5f32 * ic * dt;
     let previous = sigmoid((field[s] - half) * sharp);
     let next = sigmoid((field[s] + half) * sharp);
-    let raw = (previous - next + EPSILON) / (previous + EPSILON);
+    let raw = between(previous, next);
     let alpha = clamp(raw, 0.0f32, 1.0f32);
     Sample {
         alpha,

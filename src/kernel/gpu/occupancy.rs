@@ -2,20 +2,16 @@
 
 use super::device::{Buffer, Device, groups};
 use super::march::prefix_sum;
-use super::neus::opacity;
+use super::neus;
 use super::rng;
 use super::sdf::Sdf;
 use crate::Result;
-use crate::kernel::march::Bitmask;
+use crate::kernel::march::{Bitmask, nerfacc};
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
 
-/// Every cell is looked at before this step, a quarter of them and of those marched through after it.
-const ALL_BELOW: u64 = 256;
-
-/// Opacity of a cell that is marched through, unless the mean is less.
-const THRESHOLD: f32 = 1e-3;
+const DECAY: f32 = nerfacc::DECAY;
 
 #[cube]
 fn center(index: u32, cell: f32, radius: f32) -> f32 {
@@ -165,7 +161,7 @@ fn of_rank(mask: &[u32], before: &[u32], rank: u32) -> u32 {
     low * 32 + left.trailing_zeros()
 }
 
-/// The cell of a draw; one that there is not where nothing is drawn: see `look` of the CPU's.
+/// The cell of a draw, none of the grid's where nothing is drawn: see `look` on the CPU.
 #[cube]
 fn drawn_cell(
     mask: &[u32],
@@ -248,7 +244,13 @@ fn scatter(
         x[2 * plane + s] = (f32::cast_from(c) + w) * width - radius;
     }
     if s == 0 {
-        count[0] = here;
+        let mut draws = here;
+        if !all {
+            let quarter = resolution * resolution * resolution / 4;
+            let there = quarter + min(before[mask.len()], quarter);
+            draws = min(max(there, first) - first, here);
+        }
+        count[0] = draws;
     }
 }
 
@@ -271,7 +273,7 @@ fn remember(
         let cell = drawn[s] as usize;
         if cell < history.len() && (all || last[cell] == first + u32::cast_from(s) + 1) {
             let sharp = inv_s[0] * field[7 * plane + s].exp();
-            history[cell] = max(0.95f32 * history[cell], opacity(field[s], 0.5f32 * step, sharp));
+            history[cell] = max(DECAY * history[cell], neus::occupancy(field[s], 0.5f32 * step, sharp));
         }
     }
 }
@@ -298,16 +300,24 @@ fn partial_sums(history: &[f32], sums: &mut [f32]) {
     }
 }
 
-/// Decides about 32 cells a thread by what is remembered: more than a thousandth, or than the mean where that is less.
+/// The mean of what is remembered, or `most` where that is less.
 #[cube(launch)]
-fn decide_by_history(history: &[f32], sums: &[f32], last: &mut [u32], mask: &mut [u32], threshold: f32) {
-    let word = ABSOLUTE_POS;
-    if word < mask.len() {
+fn mean(sums: &[f32], least: &mut [f32], cells: u32, most: f32) {
+    if ABSOLUTE_POS == 0 {
         let mut sum = 0.0f32;
         for k in 0..sums.len() {
             sum += sums[k];
         }
-        let least = min(sum / f32::cast_from(history.len()), threshold);
+        least[0] = min(sum / f32::cast_from(cells), most);
+    }
+}
+
+/// Decides about 32 cells a thread: those of which more is remembered than `least`, `[1]`.
+#[cube(launch)]
+fn decide_by_history(history: &[f32], least: &[f32], last: &mut [u32], mask: &mut [u32]) {
+    let word = ABSOLUTE_POS;
+    if word < mask.len() {
+        let least = least[0];
         let mut kept = 0u32;
         for bit in 0..32usize {
             let i = 32 * word + bit;
@@ -453,12 +463,14 @@ pub struct Nerfacc {
     /// Cells of each word of the mask, and how many lie before it.
     counts: Buffer,
     before: Buffer,
+    /// How many are marched through, which only the prefix sum needs.
     kept: Buffer,
     /// The last draw of each cell, counted from 1; 0 between updates.
     last: Buffer,
     /// Cells of the draws that are evaluated together.
     drawn: Buffer,
     sums: Buffer,
+    least: Buffer,
     count: Buffer,
     step: f32,
 }
@@ -466,10 +478,15 @@ pub struct Nerfacc {
 impl Nerfacc {
     /// With what was remembered of the cells, `[cells]`; `step` is the march step, `capacity` how many cells are
     /// evaluated together.
-    pub fn new(device: &Device, history: &[f32], step: f32, capacity: usize) -> Nerfacc {
-        let cells = history.len();
-        // words of 64 bits on the host
-        let words = 2 * cells.div_ceil(64);
+    pub fn new(
+        device: &Device,
+        occupancy: &Occupancy,
+        history: &[f32],
+        step: f32,
+        capacity: usize,
+    ) -> Nerfacc {
+        let (cells, words) = (history.len(), occupancy.mask.words());
+        assert_eq!(cells, occupancy.resolution.pow(3));
         Nerfacc {
             history: device.upload(history),
             counts: device.zeros(words),
@@ -478,6 +495,7 @@ impl Nerfacc {
             last: device.zeros(cells),
             drawn: device.zeros(capacity),
             sums: device.zeros(cells.div_ceil(32 * UNITS as usize)),
+            least: device.zeros(1),
             count: device.zeros(2),
             step,
         }
@@ -500,7 +518,8 @@ impl Nerfacc {
         [x, direction]: [&Buffer; 2],
     ) {
         let cells = self.history.words();
-        let all = n < ALL_BELOW;
+        let all = n < nerfacc::ALL_BELOW;
+        let [any, some, jitter] = nerfacc::DRAWS;
         let dim = CubeDim::new_1d(UNITS);
         let over = |count: usize| groups(count.div_ceil(UNITS as usize));
         let draws = |purpose: u64| {
@@ -520,11 +539,12 @@ impl Nerfacc {
                 self.before.arg(),
                 self.last.arg(),
                 cells as u32,
-                draws(5),
-                draws(6),
+                draws(any),
+                draws(some),
             );
         }
         let capacity = self.drawn.words();
+        assert!(capacity <= x.words() / 3);
         for first in (0..draw_count).step_by(capacity) {
             let here = capacity.min(draw_count - first);
             scatter::launch(
@@ -540,9 +560,9 @@ impl Nerfacc {
                 here as u32,
                 occupancy.resolution as u32,
                 occupancy.radius,
-                draws(5),
-                draws(6),
-                draws(7),
+                draws(any),
+                draws(some),
+                draws(jitter),
                 all,
             );
             let out = field.forward(device, table, flat, x, direction, &self.count);
@@ -561,17 +581,25 @@ impl Nerfacc {
                 all,
             );
         }
-        let groups_of_32 = groups(self.sums.words());
-        partial_sums::launch(device.launch(), groups_of_32, dim, self.history.arg(), self.sums.arg());
+        let sums = &self.sums;
+        partial_sums::launch(device.launch(), groups(sums.words()), dim, self.history.arg(), sums.arg());
+        mean::launch(
+            device.launch(),
+            CubeCount::new_single(),
+            CubeDim::new_1d(1),
+            sums.arg(),
+            self.least.arg(),
+            cells as u32,
+            nerfacc::OPAQUE,
+        );
         decide_by_history::launch(
             device.launch(),
             over(occupancy.mask.words()),
             dim,
             self.history.arg(),
-            self.sums.arg(),
+            self.least.arg(),
             self.last.arg(),
             occupancy.mask.arg(),
-            THRESHOLD,
         );
     }
 }
