@@ -259,6 +259,8 @@ fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
     for (step, kept) in [(16, None), (272, Some(total)), (288, Some(total / 2)), (304, Some(500))] {
         if let Some(kept) = kept {
             (0..total).for_each(|i| want.state.occupancy.occupied.set(i, i % (total / kept) == 0));
+            // whatever is drawn changes
+            want.state.occupancy.history.fill(1e-4);
             there.host.state.occupancy = want.state.occupancy.clone();
             there.push();
         }
@@ -273,7 +275,7 @@ fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
         let changed =
             |history: &[f32]| -> Vec<usize> { (0..total).filter(|&i| history[i] != before[i]).collect() };
         let [here, drawn] = [&got.history, &want.history].map(|h| changed(h));
-        assert_eq!(here, drawn, "step {step}");
+        assert!(here == drawn, "step {step}: {} and {} cells are drawn", here.len(), drawn.len());
         // an opacity is a difference of two numbers up to one: small ones have few digits
         let apart = |(a, b): (&f32, &f32)| (a - b).abs() / (1e-4 * b + 1e-6);
         let worst = got.history.iter().zip(&want.history).map(apart).fold(0f32, f32::max);
@@ -324,7 +326,7 @@ fn the_paper_waits_for_nothing_either_and_learns_what_the_cpu_does() {
     let (face, report) = run(moved.path(), "cpu", &Quiet).unwrap();
     all.push((psnr(&face, &views[4]), report.occupied));
     println!("dB and share of the cells, on the CPU, on the device, on both in turn: {all:.3?}");
-    assert!(all[0].0 > 20.0 && all[0].1 < 0.9, "{all:?}");
+    assert!(all[0].0 > 17.0 && all[0].1 < 0.9, "{all:?}");
     assert!(all.iter().all(|there| (all[0].0 - there.0).abs() < 0.2 && (all[0].1 - there.1).abs() < 0.02));
     // 50 steps with four looks at cells that are drawn: one readback
     let dir = temporary();
