@@ -66,8 +66,8 @@ impl Group {
 
 /// How the cells to march through are looked at again.
 enum CellRule {
-    Band(Band),
-    Nerfacc(Nerfacc),
+    Band(Box<Band>),
+    Nerfacc(Box<Nerfacc>),
 }
 
 impl CellRule {
@@ -75,11 +75,12 @@ impl CellRule {
         let (config, occupancy) = (host.config, &host.state.occupancy);
         match config.occupancy {
             OccupancyRule::Band => {
-                CellRule::Band(Band::new(device, occupancy.allowed(), config.band, config.soften as f32))
+                let rule = Band::new(device, occupancy.allowed(), config.band, config.soften as f32);
+                CellRule::Band(Box::new(rule))
             }
             OccupancyRule::Nerfacc => {
                 let step = schedule::march_step(config, 1.0);
-                CellRule::Nerfacc(Nerfacc::new(device, there, &occupancy.history, step, capacity))
+                CellRule::Nerfacc(Box::new(Nerfacc::new(device, there, &occupancy.history, step, capacity)))
             }
         }
     }

@@ -6,7 +6,7 @@
 use rayon::prelude::*;
 
 /// nerfacc 0.3.3's look at the cells again: constants that the processor and GPUs share.
-pub(crate) mod nerfacc {
+pub mod nerfacc {
     /// Every cell is looked at before this step; from it on a quarter of them anywhere, and as many of those marched
     /// through.
     pub const ALL_BELOW: u64 = 256;
