@@ -58,7 +58,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         let found = format!("`--scale {}` is not within 0.001 and 1", options.scale);
         return Err(Error::usage(
             found,
-            "0.1 makes all tables of two captures in some two hours on two cores",
+            "0.1 makes all tables of two captures in some 70 minutes on two cores",
         ));
     }
     let ignored = [

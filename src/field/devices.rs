@@ -1,7 +1,7 @@
 //! The GPUs of this machine: which are there, which is chosen, and whether it can be trusted.
 //!
 //! A device is used by one training at a time: it has a lock, a file in the folder for temporary files. Before `auto`
-//! takes a device it compares its kernels with the processor's, once for each adapter, driver and release: what was
+//! takes a device it compares its kernels with the processor's, once for each adapter and program: what was
 //! found is kept in the user's cache.
 
 use crate::config::DeviceChoice;
@@ -139,7 +139,7 @@ fn lock_file(device: &Device) -> PathBuf {
     std::env::temp_dir().join(format!("tiface-{plain}.lock"))
 }
 
-/// What self-tests found, by adapter, driver and release.
+/// What self-tests found, by adapter and program.
 #[derive(Default, Serialize, Deserialize)]
 struct Kept(BTreeMap<String, bool>);
 

@@ -15,7 +15,7 @@ use crate::field::training::{self, Learner, StepError, StepReport, TrainingSessi
 use crate::geom::{Ray, RayResult};
 use crate::kernel::adam::{AdamStep, adam};
 use crate::kernel::density::{self, DensityShape, DensityWeights};
-use crate::kernel::march::{MarchRay, Samples};
+use crate::kernel::march::{Bitmask, MarchRay, Samples};
 use crate::kernel::{hash, rng};
 use crate::{Error, Result};
 use glam::Vec3;
@@ -101,10 +101,8 @@ impl DensityState {
         let o = &mut state.occupancy;
         o.history = from.floats("occupancy.history", &[o.history.len()])?;
         let bits = from.words("occupancy.occupied")?;
-        if bits.len() != o.occupied.bits.len() {
-            return Err(from.wrong("tensor `occupancy.occupied` has another size".into()));
-        }
-        o.occupied.bits = bits;
+        o.occupied = Bitmask::of(o.occupied.resolution, bits)
+            .ok_or_else(|| from.wrong("tensor `occupancy.occupied` has another size".into()))?;
         let most = config.rays.max(config.max_rays) as u64;
         state.rays = from.number("rays", 1..=most)? as usize;
         Ok(state)

@@ -320,17 +320,13 @@ fn room(host: &SdfTraining, device: &Device, points: usize) -> Result<(usize, bo
             device.name(),
             mib(fixed),
         );
-        let remedy = match capacity.saturating_sub(points) {
-            0..64 => {
-                let table =
-                    |log2: u32| fixed_with(&shape(&IfaceConfig { log2_table: log2, ..config.clone() }));
-                let room = device.spare().saturating_sub(least as u64 * sample);
-                let fits = (4..config.log2_table).rev().find(|&log2| table(log2) <= room);
-                fits.map_or("iface.levels or iface.occupancy_resolution".into(), |log2| {
-                    format!("iface.log2_table to {log2}")
-                })
-            }
-            fits => format!("iface.samples to {fits}"),
+        let table = |log2: u32| fixed_with(&shape(&IfaceConfig { log2_table: log2, ..config.clone() }));
+        let beside = device.spare().checked_sub(least as u64 * sample).filter(|_| by_buffer >= least as u64);
+        let smaller = beside.and_then(|room| (4..config.log2_table).rev().find(|&log2| table(log2) <= room));
+        let remedy = match (capacity.saturating_sub(points), smaller) {
+            (fits @ 64.., _) => format!("iface.samples to {fits}"),
+            (_, Some(log2)) => format!("iface.log2_table to {log2}"),
+            _ => "iface.samples, then iface.log2_table".into(),
         };
         return Err(Error::cannot(problem, format!("lower {remedy}, or give more with `--memory`")));
     }

@@ -68,10 +68,8 @@ impl SdfState {
             [("occupancy.occupied", &mut occupancy.occupied), ("occupancy.solid", &mut occupancy.solid)]
         {
             let bits = from.words(name)?;
-            if bits.len() != mask.bits.len() {
-                return Err(from.wrong(format!("tensor `{name}` has another size")));
-            }
-            mask.bits = bits;
+            *mask = Bitmask::of(mask.resolution, bits)
+                .ok_or_else(|| from.wrong(format!("tensor `{name}` has another size")))?;
         }
         let most = config.rays.max(config.max_rays) as u64;
         let mut stereo = Vec::new();

@@ -5,14 +5,15 @@
 
 use rayon::prelude::*;
 
-/// nerfacc 0.3.3's look at the cells again: constants that the processor and GPUs share.
+/// What the processor and GPUs share of nerfacc's look at the cells again (`OccupancyGrid` of its release 0.3.3, with
+/// instant-nsr-pl's numbers).
 pub mod nerfacc {
-    /// Every cell is looked at before this step; from it on a quarter of them anywhere, and as many of those marched
-    /// through.
+    /// Every cell is looked at before this step; from it on a quarter of them anywhere, and at most as many of those
+    /// marched through.
     pub const ALL_BELOW: u64 = 256;
     /// What is left of a cell's opacity at the next look.
     pub const DECAY: f32 = 0.95;
-    /// Purposes of random numbers: cells anywhere, cells marched through, points in cells.
+    /// Our streams of random numbers: cells anywhere, cells marched through, points in cells.
     pub const DRAWS: [u64; 3] = [5, 6, 7];
     /// Opacity of a cell of a signed distance that is marched through, unless the mean is less.
     pub const OPAQUE: f32 = 1e-3;
@@ -30,13 +31,23 @@ pub struct Bitmask {
 impl Bitmask {
     /// All cells alike.
     pub fn filled(resolution: usize, occupied: bool) -> Bitmask {
-        let cells = resolution.pow(3);
-        let mut bits = vec![if occupied { u64::MAX } else { 0 }; cells.div_ceil(64)];
-        // what is behind the last cell is none
-        if let (Some(last), 1..) = (bits.last_mut(), cells % 64) {
-            *last &= (1 << (cells % 64)) - 1;
+        let words = resolution.pow(3).div_ceil(64);
+        Bitmask { resolution, bits: vec![if occupied { u64::MAX } else { 0 }; words] }.whole()
+    }
+
+    /// Of these words, one bit a cell; none where there are too few or too many.
+    pub fn of(resolution: usize, bits: Vec<u64>) -> Option<Bitmask> {
+        let fits = bits.len() == resolution.pow(3).div_ceil(64);
+        fits.then(|| Bitmask { resolution, bits }.whole())
+    }
+
+    /// Clears what is behind the last cell.
+    fn whole(mut self) -> Bitmask {
+        let over = self.resolution.pow(3) % 64;
+        if let (Some(last), 1..) = (self.bits.last_mut(), over) {
+            *last &= (1 << over) - 1;
         }
-        Bitmask { resolution, bits }
+        self
     }
 
     /// Is cell `i` occupied?
@@ -217,6 +228,16 @@ pub fn march(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn masks_have_no_cells_behind_the_last() {
+        // 27 cells in a word of 64
+        let full = Bitmask::filled(3, true);
+        assert_eq!((full.count(), full.bits[0]), (27, (1 << 27) - 1));
+        assert_eq!(Bitmask::of(3, vec![u64::MAX]), Some(full));
+        assert_eq!(Bitmask::of(4, vec![u64::MAX]).unwrap().count(), 64);
+        assert!(Bitmask::of(3, vec![0; 2]).is_none() && Bitmask::of(5, vec![0]).is_none());
+    }
 
     const RAY: MarchRay = MarchRay { origin: [0.03, 0.01, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
 

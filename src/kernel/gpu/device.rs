@@ -74,7 +74,7 @@ pub struct Adapter {
 }
 
 impl Adapter {
-    /// All of this machine, the fastest kind first. A card that has several APIs is there once for each.
+    /// All of this machine, the fastest kind first, CUDA's behind all others. A card that has several APIs is there once for each.
     pub fn all() -> Vec<Adapter> {
         use WgpuDeviceKind::{Cpu, DiscreteGpu, IntegratedGpu, VirtualGpu};
         let kinds = [

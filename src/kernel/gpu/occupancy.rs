@@ -394,7 +394,7 @@ impl Band {
         }
     }
 
-    /// Looks at the field again. `x` and `direction`, planes `[3, capacity]`, are written over; `inv_s` is `[1]`.
+    /// Looks at the field again. Of `x` and `direction`, planes `[3, capacity]`, the first is written over; `inv_s` is `[1]`.
     pub fn update(
         &self,
         device: &Device,
@@ -506,7 +506,7 @@ impl Nerfacc {
         device.fetch(&self.history)
     }
 
-    /// Looks at the field again before step `n`. `x` and `direction`, planes `[3, capacity]`, are written over; `inv_s`
+    /// Looks at the field again before step `n`. Of `x` and `direction`, planes `[3, capacity]`, the first is written over; `inv_s`
     /// is `[1]`.
     pub fn update(
         &self,
