@@ -1,0 +1,361 @@
+//! nerfacc's rule: a decaying maximum of the opacity of each cell, looked at again at random.
+
+use super::super::device::{Buffer, Device, groups};
+use super::super::march::prefix_sum;
+use super::super::sdf::Sdf;
+use super::super::{neus, rng};
+use super::{Occupancy, UNITS};
+use crate::Result;
+use crate::kernel::march::nerfacc;
+use cubecl::prelude::*;
+
+const DECAY: f32 = nerfacc::DECAY;
+
+/// Counts the cells of each word of a mask.
+#[cube(launch)]
+fn tally(mask: &[u32], counts: &mut [u32]) {
+    let word = ABSOLUTE_POS;
+    if word < mask.len() {
+        counts[word] = mask[word].count_ones();
+    }
+}
+
+/// The occupied cell of a rank, where `before` says how many lie before each word of the mask.
+#[cube]
+fn of_rank(mask: &[u32], before: &[u32], rank: u32) -> u32 {
+    // the last word with no more than `rank` before it
+    let mut low = 0u32;
+    let mut high = u32::cast_from(mask.len());
+    while high - low > 1 {
+        let middle = (low + high) / 2;
+        if before[middle as usize] <= rank {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    let mut left = mask[low as usize];
+    for _ in before[low as usize]..rank {
+        // without its lowest bit
+        left &= left - 1;
+    }
+    low * 32 + left.trailing_zeros()
+}
+
+/// The cell of a draw, none of the grid's where nothing is drawn: see `look` on the CPU.
+#[cube]
+fn drawn_cell(
+    mask: &[u32],
+    before: &[u32],
+    k: u32,
+    cells: u32,
+    any: &Draws,
+    some: &Draws,
+    #[comptime] all: bool,
+) -> u32 {
+    let mut cell = k;
+    if !all {
+        let quarter = cells / 4;
+        let kept = before[mask.len()];
+        if k < quarter {
+            cell = rng::below(any.high, any.low, k, cells);
+        } else if kept > quarter {
+            cell = of_rank(mask, before, rng::below(some.high, some.low, k - quarter, kept));
+        } else if k - quarter < kept {
+            cell = of_rank(mask, before, k - quarter);
+        } else {
+            cell = u32::MAX;
+        }
+    }
+    cell
+}
+
+/// A stream of random numbers.
+#[derive(CubeType, CubeLaunch, Clone, Copy)]
+struct Draws {
+    high: u32,
+    low: u32,
+}
+
+/// Says of every cell which draw of it is the last one, counted from 1.
+#[cube(launch)]
+fn claim(mask: &[u32], before: &[u32], last: &[Atomic<u32>], cells: u32, any: Draws, some: Draws) {
+    let k = u32::cast_from(ABSOLUTE_POS);
+    if k < cells / 4 * 2 {
+        let cell = drawn_cell(mask, before, k, cells, &any, &some, false);
+        if cell < cells {
+            last[cell as usize].fetch_max(k + 1);
+        }
+    }
+}
+
+/// A random point in the cell of each draw from `first` on.
+#[cube(launch)]
+fn scatter(
+    mask: &[u32],
+    before: &[u32],
+    x: &mut [f32],
+    drawn: &mut [u32],
+    count: &mut [u32],
+    first: u32,
+    here: u32,
+    resolution: u32,
+    radius: f32,
+    any: Draws,
+    some: Draws,
+    jitter: Draws,
+    #[comptime] all: bool,
+) {
+    let s = ABSOLUTE_POS;
+    let plane = x.len() / 3;
+    if s < here as usize {
+        let k = first + u32::cast_from(s);
+        let cells = resolution * resolution * resolution;
+        let cell = drawn_cell(mask, before, k, cells, &any, &some, all);
+        drawn[s] = cell;
+        // where nothing is drawn any point will do
+        let i = select(cell < cells, cell, 0u32);
+        let width = 2.0f32 * radius / f32::cast_from(resolution);
+        let (a, b, c) = (i / (resolution * resolution), i / resolution % resolution, i % resolution);
+        let u = rng::uniform(jitter.high, jitter.low, 3 * k);
+        let v = rng::uniform(jitter.high, jitter.low, 3 * k + 1);
+        let w = rng::uniform(jitter.high, jitter.low, 3 * k + 2);
+        x[s] = (f32::cast_from(a) + u) * width - radius;
+        x[plane + s] = (f32::cast_from(b) + v) * width - radius;
+        x[2 * plane + s] = (f32::cast_from(c) + w) * width - radius;
+    }
+    if s == 0 {
+        let mut draws = here;
+        if !all {
+            let quarter = resolution * resolution * resolution / 4;
+            let there = quarter + min(before[mask.len()], quarter);
+            draws = min(max(there, first) - first, here);
+        }
+        count[0] = draws;
+    }
+}
+
+/// What a cell was lessens; what is seen of it now may be more.
+#[cube(launch)]
+fn remember(
+    field: &[f32],
+    inv_s: &[f32],
+    drawn: &[u32],
+    last: &[u32],
+    history: &mut [f32],
+    first: u32,
+    here: u32,
+    step: f32,
+    #[comptime] all: bool,
+) {
+    let s = ABSOLUTE_POS;
+    if s < here as usize {
+        let plane = field.len() / 8;
+        let cell = drawn[s] as usize;
+        if cell < history.len() && (all || last[cell] == first + u32::cast_from(s) + 1) {
+            let sharp = inv_s[0] * field[7 * plane + s].exp();
+            history[cell] = max(DECAY * history[cell], neus::occupancy(field[s], 0.5f32 * step, sharp));
+        }
+    }
+}
+
+/// Sums 32 values a thread, and those of a group.
+#[cube(launch)]
+fn partial_sums(history: &[f32], sums: &mut [f32]) {
+    let mut own = 0.0f32;
+    for k in 0..32usize {
+        let i = 32 * ABSOLUTE_POS + k;
+        if i < history.len() {
+            own += history[i];
+        }
+    }
+    let mut all = Shared::<[f32]>::new_slice(UNITS as usize);
+    all[UNIT_POS as usize] = own;
+    sync_cube();
+    if UNIT_POS == 0 && CUBE_POS < sums.len() {
+        let mut sum = 0.0f32;
+        for k in 0..UNITS as usize {
+            sum += all[k];
+        }
+        sums[CUBE_POS] = sum;
+    }
+}
+
+/// The mean of what is remembered, or `most` where that is less.
+#[cube(launch)]
+fn mean(sums: &[f32], least: &mut [f32], cells: u32, most: f32) {
+    if ABSOLUTE_POS == 0 {
+        let mut sum = 0.0f32;
+        for k in 0..sums.len() {
+            sum += sums[k];
+        }
+        least[0] = min(sum / f32::cast_from(cells), most);
+    }
+}
+
+/// Decides about 32 cells a thread: those of which more is remembered than `least`, `[1]`.
+#[cube(launch)]
+fn decide_by_history(history: &[f32], least: &[f32], last: &mut [u32], mask: &mut [u32]) {
+    let word = ABSOLUTE_POS;
+    if word < mask.len() {
+        let least = least[0];
+        let mut kept = 0u32;
+        for bit in 0..32usize {
+            let i = 32 * word + bit;
+            if i < history.len() {
+                last[i] = 0;
+                if history[i] > least {
+                    kept |= 1u32 << u32::cast_from(bit);
+                }
+            }
+        }
+        mask[word] = kept;
+    }
+}
+
+/// nerfacc's rule for a signed distance: see the `look` of `iface`'s occupancy on the CPU.
+pub struct Nerfacc {
+    history: Buffer,
+    /// Cells of each word of the mask, and how many lie before it.
+    counts: Buffer,
+    before: Buffer,
+    /// How many are marched through, which only the prefix sum needs.
+    kept: Buffer,
+    /// The last draw of each cell, counted from 1; 0 between updates.
+    last: Buffer,
+    /// Cells of the draws that are evaluated together.
+    drawn: Buffer,
+    sums: Buffer,
+    least: Buffer,
+    count: Buffer,
+    step: f32,
+}
+
+impl Nerfacc {
+    /// With what was remembered of the cells, `[cells]`; `step` is the march step, `capacity` how many cells are
+    /// evaluated together.
+    pub fn new(
+        device: &Device,
+        occupancy: &Occupancy,
+        history: &[f32],
+        step: f32,
+        capacity: usize,
+    ) -> Nerfacc {
+        let (cells, words) = (history.len(), occupancy.mask.words());
+        assert_eq!(cells, occupancy.resolution.pow(3));
+        Nerfacc {
+            history: device.upload(history),
+            counts: device.zeros(words),
+            before: device.zeros(words + 1),
+            kept: device.zeros(2),
+            last: device.zeros(cells),
+            drawn: device.zeros(capacity),
+            sums: device.zeros(cells.div_ceil(32 * UNITS as usize)),
+            least: device.zeros(1),
+            count: device.zeros(2),
+            step,
+        }
+    }
+
+    /// Waits for the device; what is remembered of the cells.
+    pub fn read(&self, device: &Device) -> Result<Vec<f32>> {
+        device.fetch(&self.history)
+    }
+
+    /// Looks at the field again before step `n`. Of `x` and `direction`, planes `[3, capacity]`, the first is written over; `inv_s`
+    /// is `[1]`.
+    pub fn update(
+        &self,
+        device: &Device,
+        (seed, n): (u64, u64),
+        occupancy: &Occupancy,
+        field: &Sdf,
+        [table, flat, inv_s]: [&Buffer; 3],
+        [x, direction]: [&Buffer; 2],
+    ) {
+        let cells = self.history.words();
+        let all = n < nerfacc::ALL_BELOW;
+        let [any, some, jitter] = nerfacc::DRAWS;
+        let dim = CubeDim::new_1d(UNITS);
+        let over = |count: usize| groups(count.div_ceil(UNITS as usize));
+        let draws = |purpose: u64| {
+            let [high, low] = rng::stream(seed, n << 4 | purpose);
+            DrawsLaunch::new(high, low)
+        };
+        let draw_count = if all { cells } else { cells / 4 * 2 };
+        if !all {
+            let mask = &occupancy.mask;
+            tally::launch(device.launch(), over(mask.words()), dim, mask.arg(), self.counts.arg());
+            prefix_sum(device, &self.counts, &self.before, &self.kept, cells);
+            claim::launch(
+                device.launch(),
+                over(draw_count),
+                dim,
+                mask.arg(),
+                self.before.arg(),
+                self.last.arg(),
+                cells as u32,
+                draws(any),
+                draws(some),
+            );
+        }
+        let capacity = self.drawn.words();
+        assert!(capacity <= x.words() / 3);
+        for first in (0..draw_count).step_by(capacity) {
+            let here = capacity.min(draw_count - first);
+            scatter::launch(
+                device.launch(),
+                over(here),
+                dim,
+                occupancy.mask.arg(),
+                self.before.arg(),
+                x.arg(),
+                self.drawn.arg(),
+                self.count.arg(),
+                first as u32,
+                here as u32,
+                occupancy.resolution as u32,
+                occupancy.radius,
+                draws(any),
+                draws(some),
+                draws(jitter),
+                all,
+            );
+            let out = field.forward(device, table, flat, x, direction, &self.count);
+            remember::launch(
+                device.launch(),
+                over(here),
+                dim,
+                out.arg(),
+                inv_s.arg(),
+                self.drawn.arg(),
+                self.last.arg(),
+                self.history.arg(),
+                first as u32,
+                here as u32,
+                self.step,
+                all,
+            );
+        }
+        let sums = &self.sums;
+        partial_sums::launch(device.launch(), groups(sums.words()), dim, self.history.arg(), sums.arg());
+        mean::launch(
+            device.launch(),
+            CubeCount::new_single(),
+            CubeDim::new_1d(1),
+            sums.arg(),
+            self.least.arg(),
+            cells as u32,
+            nerfacc::OPAQUE,
+        );
+        decide_by_history::launch(
+            device.launch(),
+            over(occupancy.mask.words()),
+            dim,
+            self.history.arg(),
+            self.least.arg(),
+            self.last.arg(),
+            occupancy.mask.arg(),
+        );
+    }
+}
