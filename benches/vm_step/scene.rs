@@ -1,9 +1,9 @@
 //! A field with the content of a head, and rays of cameras around it; everything from fixed seeds.
 
-use tiface::kernel::march::MarchRay;
-use tiface::kernel::rng;
-use tiface::kernel::vm::mask::{BoxMask, Lattice};
-use tiface::kernel::vm::{self, DecoderShape, Grid, PLANE_AXES, Shading, VmField};
+use tiface::kernel::cpu::march::MarchRay;
+use tiface::kernel::cpu::rng;
+use tiface::kernel::cpu::vm::mask::{BoxMask, Lattice};
+use tiface::kernel::cpu::vm::{self, DecoderShape, Grid, PLANE_AXES, Shading, VmField};
 
 /// Extent of the published box, world units.
 const EXTENT: [f32; 3] = [3.0, 3.34, 2.0];
@@ -16,8 +16,6 @@ const MASK_SIZE: [usize; 3] = [141, 157, 94];
 #[derive(Clone)]
 pub struct Scene {
     pub field: VmField,
-    /// Largest density feature.
-    pub peak: f32,
     pub density: Vec<f32>,
     pub color: Vec<f32>,
     pub network: Vec<f32>,
@@ -79,22 +77,9 @@ pub fn scene(size: [usize; 3], peak: f32, rays: usize) -> Scene {
         .collect();
     let (rays, target, background) = batch(rays);
     let color = noise(2, color.len(), 0.3);
-    let mut s = Scene { field, peak, density: values, color, network, rays, target, background };
+    let mut s = Scene { field, density: values, color, network, rays, target, background };
     s.field.mask = Some(alpha_mask(&s));
     s
-}
-
-impl Scene {
-    /// The same field without the rays that are marked.
-    pub fn without(&self, marked: impl Fn(usize) -> bool) -> Scene {
-        let kept: Vec<usize> = (0..self.rays.len()).filter(|&i| !marked(i)).collect();
-        Scene {
-            rays: kept.iter().map(|&i| self.rays[i]).collect(),
-            background: kept.iter().map(|&i| self.background[i]).collect(),
-            target: kept.iter().flat_map(|&i| [0, 1, 2].map(|k| self.target[3 * i + k])).collect(),
-            ..self.clone()
-        }
-    }
 }
 
 /// The published mask: vertices of alpha ≥ 1e-4 (without the distance scale), those beside them, and the

@@ -32,7 +32,7 @@ impl Projector {
         let reach = border
             .filter_map(|(x, y)| {
                 let (x, y) = ((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy);
-                camera.distortion.undo(x, y).map(|(x, y)| x * x + y * y)
+                camera.distortion.undistort(x, y).map(|(x, y)| x * x + y * y)
             })
             .fold(0.0, f64::max);
         Projector {

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::image::{Gray, Image, Photo, quantize};
-use crate::kernel::rng::{normal, uniform};
+use crate::kernel::cpu::rng::{normal, uniform};
 
 const SIZE: u32 = 64;
 const PIXELS: usize = (SIZE * SIZE) as usize;

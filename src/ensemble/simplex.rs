@@ -98,7 +98,7 @@ fn on_face(h: &[f64], g: &[f64], on: &[usize]) -> Option<[f64; MAX_MEMBERS]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernel::rng::uniform;
+    use crate::kernel::cpu::rng::uniform;
 
     #[test]
     fn cholesky_solves_a_system_worked_by_hand() {

@@ -3,7 +3,7 @@
 //! Whole views would be missed by the fields; a few squares of each are not, since other views show the
 //! same skin. They are large enough that what is in them cannot be guessed from the pixels around.
 
-use crate::kernel::rng;
+use crate::kernel::cpu::rng;
 
 /// The side of a tile is this part of the shorter side of its photograph: a third of an eye.
 const PARTS: u32 = 16;

@@ -60,10 +60,10 @@ impl Checkpoint {
     /// Reads one file of this format.
     pub fn read(path: &Path, stage: &'static str, format: &str) -> Result<Checkpoint> {
         let content = read_tensors(path, &Limits::default()).map_err(|e| unreadable(e, stage))?;
-        Checkpoint::understand(path, stage, format, content)
+        Checkpoint::parse(path, stage, format, content)
     }
 
-    fn understand(
+    fn parse(
         path: &Path,
         stage: &'static str,
         format: &str,
@@ -234,7 +234,7 @@ pub fn restore<T>(
         };
         let whole = content.is_ok();
         let opened = content.and_then(|content| {
-            let file = Checkpoint::understand(&path, stage, format, content)?;
+            let file = Checkpoint::parse(&path, stage, format, content)?;
             match file.text("identity")? {
                 found if found == identity => Ok(file),
                 _ => Err(file.wrong("it was trained with other settings or inputs".into())),

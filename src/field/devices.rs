@@ -22,7 +22,7 @@ pub struct Gpu {
     /// Nobody else's `auto` takes it while this is held; none where somebody else had it already.
     pub lock: Option<Arc<Lock>>,
     /// Did nobody name it?
-    pub by_itself: bool,
+    pub auto_selected: bool,
 }
 
 /// Opens the GPU that is named: an API (`wgpu` is any but CUDA) and a number among its adapters. Without a number it is the
@@ -49,7 +49,7 @@ pub fn open(choice: &DeviceChoice) -> Result<Gpu> {
             in_use.push(device.name().to_string());
             continue;
         }
-        return Ok(Gpu { device, why: format!("named `{name}`"), lock: lock.ok(), by_itself: false });
+        return Ok(Gpu { device, why: format!("named `{name}`"), lock: lock.ok(), auto_selected: false });
     }
     if in_use.is_empty() {
         return Err(missing(&name, api, &adapters));
@@ -112,7 +112,7 @@ pub fn best(choice: &DeviceChoice) -> std::result::Result<Gpu, String> {
                     "the first GPU that is free and computes what the processor does ({})",
                     adapter.api
                 );
-                return Ok(Gpu { device, why, lock, by_itself: true });
+                return Ok(Gpu { device, why, lock, auto_selected: true });
             }
             Err(why) => passed_over.push(format!("{name} {why}")),
         }

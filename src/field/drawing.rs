@@ -5,14 +5,14 @@
 //! a megabyte a step.
 
 use super::pixels::Pixels;
-use crate::kernel::gpu::{Batch, Buffer, Device, Drawing, Photographs};
-use crate::kernel::rng;
+use crate::kernel::cpu::rng;
+use crate::kernel::gpu::{Batch, Buffer, Device, Photographs, SamplingOptions};
 
 /// Where rays of a training on a device come from.
 pub struct DeviceRays {
     /// None where the processor draws.
-    there: Option<Photographs>,
-    drawing: Drawing,
+    resident: Option<Photographs>,
+    drawing: SamplingOptions,
 }
 
 /// Bytes of photographs that fit in `room` bytes of a device; none where they do not, or where the device knows no such
@@ -25,8 +25,8 @@ pub fn resident(pixels: &Pixels, device: &Device, room: u64) -> Option<u64> {
 
 impl DeviceRays {
     /// From photographs that lie on the device where that is said.
-    pub fn new(pixels: &Pixels, device: &Device, drawing: Drawing, resident: bool) -> DeviceRays {
-        DeviceRays { there: resident.then(|| pixels.on_device(device, drawing)), drawing }
+    pub fn new(pixels: &Pixels, device: &Device, drawing: SamplingOptions, resident: bool) -> DeviceRays {
+        DeviceRays { resident: resident.then(|| pixels.on_device(device, drawing)), drawing }
     }
 
     /// Draws the rays of a step into `batch`: a function of seed and step alone. See [`Pixels::draw`].
@@ -43,7 +43,7 @@ impl DeviceRays {
         batch: &mut Batch,
         detail: f32,
     ) {
-        if let Some(photographs) = &self.there {
+        if let Some(photographs) = &self.resident {
             return photographs.draw(device, (seed, step), wanted, batch, detail);
         }
         let rays = batch.rays();
@@ -86,7 +86,7 @@ mod tests {
         let Some(device) = device() else { return };
         let views = ball::textured_views();
         let pixels = Pixels::new(&views, 0.25, 1.0, Foreground::Estimated, false).with_large(1.0);
-        let drawing = Drawing { every: false, jitter: true, background: true, behind: 8 };
+        let drawing = SamplingOptions { every: false, jitter: true, background: true, behind: 8 };
         assert!(resident(&pixels, &device, 0).is_none() && resident(&pixels, &device, 1 << 30).is_some());
         let wanted = device.upload(&[900u32]);
         for detail in [0.0, 0.2] {

@@ -1,89 +1,58 @@
-//! Trainable arrays with their AdamW moments.
+//! Trained arrays with their AdamW moments: on the host, as checkpoints hold them, and on the device that trains.
 //!
-//! Not burn's `ModuleOptimizer`: every group has its own learning rate and decay, the hash table
-//! updates touched rows only, and the moments go into the same safetensors checkpoint as the weights,
-//! by name, so that a resumed run gives the same bytes.
+//! A group is what the optimizer steps at one rate, one flat array; in checkpoints each of its parts has its own name.
+//! Groups have their own learning rate and decay, the hash table updates touched rows only,
+//! and the moments lie in the same safetensors checkpoint as the weights, so that a resumed run gives the same bytes.
 
 use super::checkpoint::Checkpoint;
-use super::{ops, tensor, values};
+use super::ops::ArrayDevice;
 use crate::Result;
-use crate::kernel::adam::AdamStep;
-use burn::tensor::{Device, Gradients, Tensor};
-use std::ops::RangeInclusive;
+use crate::kernel::cpu::adam::AdamStep;
 
-/// A trainable array, flat on its device, and the optimizer's moments of it.
-pub struct Parameter {
+/// A named array of a group.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Part {
     /// Its name in checkpoints.
     pub name: &'static str,
-    shape: Vec<usize>,
-    value: Tensor<1>,
-    /// Running means of the gradient and of its square.
-    moments: [Tensor<1>; 2],
+    /// Its shape there.
+    pub shape: Vec<usize>,
 }
 
-fn leaf(value: Tensor<1>) -> Tensor<1> {
-    value.autodiff().require_grad()
-}
-
-impl Parameter {
-    /// Returns a parameter of these values, as many as `shape` says, with zero moments.
-    pub fn new(name: &'static str, shape: &[usize], values: Vec<f32>, device: &Device) -> Parameter {
-        let n = values.len();
-        let moments = [(); 2].map(|_| Tensor::zeros([n], device));
-        Parameter { name, shape: shape.to_vec(), value: leaf(tensor(values, [n], device)), moments }
-    }
-
-    /// Returns the values as part of a graph.
-    pub fn flat(&self) -> Tensor<1> {
-        self.value.clone()
-    }
-
-    /// Returns the values as part of a graph, in the parameter's shape.
-    pub fn shaped<const D: usize>(&self) -> Tensor<D> {
-        self.value
-            .clone()
-            .reshape::<D, [usize; D]>(self.shape.clone().try_into().expect("a shape of D extents"))
-    }
-
-    /// Returns its shape.
-    pub fn shape(&self) -> &[usize] {
-        &self.shape
-    }
-
-    /// How many values there are.
-    pub fn len(&self) -> usize {
+impl Part {
+    /// How many values it has.
+    pub fn count(&self) -> usize {
         self.shape.iter().product()
     }
+}
 
-    /// Is there none?
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
+/// A group on the host.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct HostGroup {
+    /// Its parts, one after the other.
+    pub parts: Vec<Part>,
+    /// Values, running mean of the gradient and that of its square.
+    pub state: [Vec<f32>; 3],
+}
+
+/// Names of a group's arrays in checkpoints.
+const KINDS: [&str; 3] = ["model", "first", "second"];
+
+impl HostGroup {
+    /// Returns a group of these parts and values, with zero moments.
+    pub fn new(parts: Vec<Part>, values: Vec<f32>) -> HostGroup {
+        assert_eq!(values.len(), parts.iter().map(Part::count).sum::<usize>());
+        let zeros = vec![0.0; values.len()];
+        HostGroup { parts, state: [values, zeros.clone(), zeros] }
     }
 
-    /// Returns the values on the host.
-    pub fn values(&self) -> Vec<f32> {
-        values(self.value.clone().inner())
+    /// Returns a group of one flat array.
+    pub fn flat(name: &'static str, values: Vec<f32>) -> HostGroup {
+        HostGroup::new(vec![Part { name, shape: vec![values.len()] }], values)
     }
 
-    /// Returns values, running mean of the gradient and that of its square, on the host.
-    pub fn state(&self) -> [Vec<f32>; 3] {
-        let [first, second] = self.moments.each_ref().map(|m| values(m.clone()));
-        [self.values(), first, second]
-    }
-
-    /// Returns a parameter like it with other values and moments, as many as it has.
-    pub fn with(&self, state: [Vec<f32>; 3]) -> Parameter {
-        let device = self.moments[0].device();
-        let [value, first, second] = state.map(|v| {
-            assert_eq!(v.len(), self.len());
-            tensor(v, [self.len()], &device)
-        });
-        Parameter { name: self.name, shape: self.shape.clone(), value: leaf(value), moments: [first, second] }
-    }
-
-    /// Gives it these, as many as it has.
-    pub fn set(&mut self, state: [Vec<f32>; 3]) {
-        *self = self.with(state);
+    /// Returns the values.
+    pub fn values(&self) -> &[f32] {
+        &self.state[0]
     }
 
     /// Is every value a finite number?
@@ -91,68 +60,82 @@ impl Parameter {
         self.values().iter().all(|v| v.is_finite())
     }
 
-    /// Is every number of its gradient finite? So it is where it took no part in the loss.
-    pub fn has_finite_gradient(&self, gradients: &Gradients) -> bool {
-        self.value.grad(gradients).is_none_or(|g| values(g).iter().all(|g| g.is_finite()))
-    }
-
-    /// Takes the gradient out of `gradients` and makes one step. A parameter that took no part in the loss
-    /// (no gradient) stays as it is.
-    pub fn update(&mut self, gradients: &mut Gradients, step: AdamStep) {
-        let Some(g) = self.value.grad_remove(gradients) else { return };
-        // give up every other reference, so that the update happens in place
-        let device = g.device();
-        let taken = || Tensor::zeros([1], &device);
-        let p = std::mem::replace(&mut self.value, taken()).inner();
-        let [m, v] = std::mem::replace(&mut self.moments, [taken(), taken()]);
-        let (p, m, v) = ops::adam_step(p, m, v, g, step);
-        self.moments = [m, v];
-        self.value = leaf(p);
-    }
-
-    /// Moves values that left a range to its ends.
-    pub fn keep_within(&mut self, range: RangeInclusive<f32>) {
-        let device = self.value.device();
-        let value = std::mem::replace(&mut self.value, Tensor::zeros([1], &device)).inner();
-        self.value = leaf(value.clamp(*range.start(), *range.end()));
-    }
-
     /// Makes the moments zero, as before the first step.
     pub fn forget_moments(&mut self) {
-        self.moments = [(); 2].map(|_| Tensor::zeros([self.len()], &self.moments[0].device()));
+        self.state[1..].iter_mut().for_each(|moment| moment.fill(0.0));
     }
 
-    /// Gives it other values, a flat array of any length, and zero moments.
-    pub fn replace(&mut self, values: Vec<f32>) {
-        *self = Parameter::new(self.name, &[values.len()], values, &self.moments[0].device());
-    }
-
-    /// Puts the values into a checkpoint, and the moments with them unless nobody goes on from it.
+    /// Puts it into a checkpoint; without the moments where no training goes on from it.
     pub fn save(&self, into: &mut Checkpoint, with_moments: bool) {
-        let mut put = |kind: &str, v| into.put_floats(&format!("{kind}.{}", self.name), &self.shape, v);
-        put("model", self.values());
-        if with_moments {
-            let [first, second] = self.moments.each_ref().map(|m| values(m.clone()));
-            put("first", first);
-            put("second", second);
+        let kinds = KINDS.into_iter().zip(&self.state).take(if with_moments { 3 } else { 1 });
+        for (kind, values) in kinds {
+            let mut rest = &values[..];
+            for part in &self.parts {
+                let (own, tail) = rest.split_at(part.count());
+                into.put_floats(&format!("{kind}.{}", part.name), &part.shape, own.to_vec());
+                rest = tail;
+            }
         }
     }
 
-    /// Takes the values out of a checkpoint, and the moments with them unless nobody goes on from it. `shape` is
-    /// what they must have there; nothing is reserved by it.
-    pub fn restore(&mut self, shape: &[usize], from: &mut Checkpoint, with_moments: bool) -> Result<()> {
-        let device = self.moments[0].device();
-        let values = from.floats(&format!("model.{}", self.name), shape)?;
-        let n = values.len();
-        self.moments = if with_moments {
-            let first = from.floats(&format!("first.{}", self.name), shape)?;
-            let second = from.squares(&format!("second.{}", self.name), shape)?;
-            [first, second].map(|m| tensor(m, [n], &device))
-        } else {
-            [(); 2].map(|_| Tensor::zeros([1], &device))
-        };
-        self.value = leaf(tensor(values, [n], &device));
-        self.shape = shape.to_vec();
-        Ok(())
+    /// Takes parts of exactly these shapes out of a checkpoint, with zero moments where no training goes on from it;
+    /// nothing is reserved by what the shapes say.
+    pub fn restore(parts: Vec<Part>, from: &mut Checkpoint, with_moments: bool) -> Result<HostGroup> {
+        let mut state = [Vec::new(), Vec::new(), Vec::new()];
+        for part in &parts {
+            let name = |kind: &str| format!("{kind}.{}", part.name);
+            let value = from.floats(&name(KINDS[0]), &part.shape)?;
+            let (first, second) = match with_moments {
+                true => {
+                    (from.floats(&name(KINDS[1]), &part.shape)?, from.squares(&name(KINDS[2]), &part.shape)?)
+                }
+                false => (vec![0.0; value.len()], vec![0.0; value.len()]),
+            };
+            state.iter_mut().zip([value, first, second]).for_each(|(all, own)| all.extend(own));
+        }
+        Ok(HostGroup { parts, state })
+    }
+}
+
+/// A group on the device that trains it.
+pub struct ParameterGroup<D: ArrayDevice> {
+    parts: Vec<Part>,
+    /// Values, running mean of the gradient and that of its square.
+    state: [D::Array; 3],
+    /// Zero before the backward of a step, which adds to it or writes it.
+    pub gradient: D::Array,
+}
+
+impl<D: ArrayDevice> ParameterGroup<D> {
+    /// Copies a group to the device.
+    pub fn upload(device: &D, group: HostGroup) -> ParameterGroup<D> {
+        let gradient = device.upload(vec![0.0; group.values().len()]);
+        ParameterGroup { parts: group.parts, state: group.state.map(|v| device.upload(v)), gradient }
+    }
+
+    /// Waits for the device and copies the group to the host.
+    pub fn download(&self, device: &D) -> Result<HostGroup> {
+        let [values, first, second] = self.state.each_ref().map(|array| device.download(array));
+        Ok(HostGroup { parts: self.parts.clone(), state: [values?, first?, second?] })
+    }
+
+    /// The values.
+    pub fn value(&self) -> &D::Array {
+        &self.state[0]
+    }
+
+    /// The values, to change them in place.
+    pub fn value_mut(&mut self) -> &mut D::Array {
+        &mut self.state[0]
+    }
+
+    /// Values, beside the gradient to be written.
+    pub fn value_and_gradient(&mut self) -> (&D::Array, &mut D::Array) {
+        (&self.state[0], &mut self.gradient)
+    }
+
+    /// Makes an optimizer step, and the gradient zero, where the gate is open.
+    pub fn step(&mut self, device: &D, step: &AdamStep, gate: D::Gate<'_>) {
+        device.adam(self.state.each_mut(), &mut self.gradient, step, gate);
     }
 }

@@ -11,10 +11,10 @@ use super::background::{SoftPixels, soft_pixels};
 use crate::config::iface::Foreground;
 use crate::geom::{Camera, Ray};
 use crate::image::{Gray, Photo};
+use crate::kernel::cpu::march::MarchRay;
+use crate::kernel::cpu::rng;
 #[cfg(feature = "wgpu")]
 use crate::kernel::gpu;
-use crate::kernel::march::MarchRay;
-use crate::kernel::rng;
 use glam::Vec2;
 use rayon::prelude::*;
 
@@ -31,6 +31,7 @@ pub struct TrainView {
 }
 
 /// Pixels drawn for one step.
+#[derive(Default)]
 pub struct Batch {
     /// Rays in field coordinates.
     pub rays: Vec<MarchRay>,
@@ -41,7 +42,7 @@ pub struct Batch {
 }
 
 /// A ray, the color over black that its pixel shows, and the pixel's alpha.
-pub type Drawn = (MarchRay, [f32; 3], f32);
+pub type SampledRay = (MarchRay, [f32; 3], f32);
 
 /// The drawable pixels of all views.
 pub struct Pixels<'a> {
@@ -56,8 +57,8 @@ pub struct Pixels<'a> {
     cumulative: Vec<u64>,
     radius: f32,
     /// Has any view a mask that says something?
-    pub masked: bool,
-    published: bool,
+    pub has_masks: bool,
+    reference_sampling: bool,
     /// How pixels follow each other that are drawn without repetition.
     order: Option<Order>,
 }
@@ -82,11 +83,11 @@ impl<'a> Pixels<'a> {
         reach: f32,
         radius: f32,
         foreground: Foreground,
-        published: bool,
+        reference_sampling: bool,
     ) -> Pixels<'a> {
         let usable = |v: &TrainView| v.mask.as_ref().is_some_and(|m| m.values.iter().any(|&a| a < 255));
-        let masked = views.iter().any(usable);
-        let reach = if published { f32::INFINITY } else { reach };
+        let has_masks = views.iter().any(usable);
+        let reach = if reference_sampling { f32::INFINITY } else { reach };
         let soft = views
             .par_iter()
             .map(|v| match (&v.mask, foreground) {
@@ -97,7 +98,7 @@ impl<'a> Pixels<'a> {
         let pixel = vec![f32::INFINITY; views.len()];
         let drawable: Vec<_> = views
             .par_iter()
-            .map(|v| drawable(v, if masked && !usable(v) { Reach::Nothing } else { Reach::Within(reach) }))
+            .map(|v| drawable(v, if has_masks && !usable(v) { Reach::Nothing } else { Reach::Within(reach) }))
             .collect();
         let mut sum = 0;
         let cumulative = drawable
@@ -107,7 +108,17 @@ impl<'a> Pixels<'a> {
                 sum
             })
             .collect();
-        Pixels { views, soft, pixel, drawable, cumulative, radius, masked, published, order: None }
+        Pixels {
+            views,
+            soft,
+            pixel,
+            drawable,
+            cumulative,
+            radius,
+            has_masks,
+            reference_sampling,
+            order: None,
+        }
     }
 
     /// Pixels as TensoRF's code draws them: all valid ones whose ray meets the box `bounds` at any distance, in a random
@@ -178,7 +189,7 @@ impl<'a> Pixels<'a> {
     /// `count` random rays of a step: a function of seed and step alone. Of large photographs each stands for a square of
     /// pixels, the widest of [`SIDES`] that is no wider than `detail`, in scene units.
     pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool, detail: f32) -> Batch {
-        let drawn: Vec<Drawn> = (0..count)
+        let drawn: Vec<SampledRay> = (0..count)
             .into_par_iter()
             .with_min_len(256)
             .filter_map(|i| self.drawn((seed, step), (i as u64, count as u64), jitter, detail))
@@ -205,13 +216,13 @@ impl<'a> Pixels<'a> {
         count: usize,
         jitter: bool,
         detail: f32,
-    ) -> Vec<Option<Drawn>> {
+    ) -> Vec<Option<SampledRay>> {
         let one = |i| self.drawn((seed, step), (i as u64, count as u64), jitter, detail);
         (0..count).into_par_iter().with_min_len(256).map(one).collect()
     }
 
     /// Ray `i` of a batch of `count`.
-    fn drawn(&self, at: (u64, u64), (i, count): (u64, u64), jitter: bool, detail: f32) -> Option<Drawn> {
+    fn drawn(&self, at: (u64, u64), (i, count): (u64, u64), jitter: bool, detail: f32) -> Option<SampledRay> {
         match &self.order {
             Some(order) => self.draw_next(order, at, (i, count), jitter),
             None => self.draw_one(at, i, jitter, detail),
@@ -226,13 +237,13 @@ impl<'a> Pixels<'a> {
 
     /// Does every view come as often, with any pixel of its frame?
     #[cfg(feature = "wgpu")]
-    pub fn is_published(&self) -> bool {
-        self.published
+    pub fn uses_reference_sampling(&self) -> bool {
+        self.reference_sampling
     }
 
     /// Copies the photographs to a device, where the same rays are drawn from them.
     #[cfg(feature = "wgpu")]
-    pub fn on_device(&self, device: &gpu::Device, drawing: gpu::Drawing) -> gpu::Photographs {
+    pub fn on_device(&self, device: &gpu::Device, drawing: gpu::SamplingOptions) -> gpu::Photographs {
         let views: Vec<gpu::DrawnView> =
             (0..self.views.len()).into_par_iter().map(|v| self.drawn_view(v)).collect();
         gpu::Photographs::new(device, &views, self.radius, drawing)
@@ -281,7 +292,7 @@ impl<'a> Pixels<'a> {
         (seed, step): (u64, u64),
         (i, count): (u64, u64),
         jitter: bool,
-    ) -> Option<Drawn> {
+    ) -> Option<SampledRay> {
         let all = self.count();
         let batches = (all / count).max(1);
         let place = step % batches * count + i;
@@ -301,7 +312,7 @@ impl<'a> Pixels<'a> {
         let jitter = if jitter { rng::uniform(seed, (step << 4) + 2, i) } else { 0.0 };
         let depth = if order.depth_directions { ray.direction.dot(view.camera.forward()) } else { 1.0 };
         let (origin, direction) = (ray.origin.to_array(), (ray.direction / depth).to_array());
-        let (color, alpha) = self.seen(v, p);
+        let (color, alpha) = self.premultiplied_color(v, p);
         Some((MarchRay { origin, direction, jitter }, color, alpha))
     }
 
@@ -316,7 +327,7 @@ impl<'a> Pixels<'a> {
     }
 
     /// What pixel `p` of view `v` should show over black, and its alpha.
-    fn seen(&self, v: usize, p: usize) -> ([f32; 3], f32) {
+    fn premultiplied_color(&self, v: usize, p: usize) -> ([f32; 3], f32) {
         let (color, alpha) = self.pixel(v, p);
         let alpha = alpha as f32 / 255.0;
         let share = if self.soft[v].is_some() { 1.0 } else { alpha };
@@ -346,9 +357,9 @@ impl<'a> Pixels<'a> {
         (Vec2::from(middle), color.map(|sum| mean(sum, 255 * 255)), mean(alpha, 255))
     }
 
-    fn draw_one(&self, (seed, step): (u64, u64), i: u64, jitter: bool, detail: f32) -> Option<Drawn> {
+    fn draw_one(&self, (seed, step): (u64, u64), i: u64, jitter: bool, detail: f32) -> Option<SampledRay> {
         let stream = step << 4;
-        let v = if self.published {
+        let v = if self.reference_sampling {
             rng::below(seed, stream, i, self.views.len() as u64) as usize
         } else {
             let which = rng::below(seed, stream, i, self.count());
@@ -362,7 +373,7 @@ impl<'a> Pixels<'a> {
         let width = view.photo.width;
         // rejection inside the box of drawable pixels: a head fills most of its box
         // (published: a pixel that is not valid is dropped, and the batch shrinks)
-        for attempt in 0..if self.published { 1 } else { 256 } {
+        for attempt in 0..if self.reference_sampling { 1 } else { 256 } {
             let k = i << 9 | attempt << 1;
             let x = x0 + rng::below(seed, stream + 1, k, (x1 - x0 + 1) as u64) as u32;
             let y = y0 + rng::below(seed, stream + 1, k | 1, (y1 - y0 + 1) as u64) as u32;
@@ -372,7 +383,7 @@ impl<'a> Pixels<'a> {
             }
             let side = side(self.pixel[v], detail);
             let (at, color, alpha) = if side == 1 {
-                let (color, alpha) = self.seen(v, p);
+                let (color, alpha) = self.premultiplied_color(v, p);
                 (Vec2::new(x as f32 + 0.5, y as f32 + 0.5), color, alpha)
             } else {
                 self.square(v, [x, y].map(|at| at / side * side), side)

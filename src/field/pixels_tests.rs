@@ -179,7 +179,8 @@ fn a_device_draws_the_same_rays() {
         (Foreground::Estimated, false, 0.5),
     ] {
         let pixels = Pixels::new(&views, 0.1, 0.3, foreground, published).with_large(0.3);
-        let drawing = gpu::Drawing { every: published, jitter: !published, background: true, behind: 3 };
+        let drawing =
+            gpu::SamplingOptions { every: published, jitter: !published, background: true, behind: 3 };
         let there = pixels.on_device(&device, drawing);
         let batch = gpu::Batch::new(&device, 2050);
         let (seed, step) = (77, 1 << 33);

@@ -1,13 +1,14 @@
-//! The training loop of every field.
+//! The trainer of every field.
 //!
 //! ```text
-//! restore, or start and save → step → not finite? back to the last checkpoint, once
-//!                                   → stop asked for, or time? save
-//!                                   → finish
+//! restore, or start and save → prepare → rays, losses, gradients → Adam → read losses → after the step
+//!                                → not finite? back to the last checkpoint, once
+//!                                → stop asked for, or time? save
+//!                                → finish
 //! ```
 //!
-//! A field says what a step is and where it keeps what it needs between steps (rays, samples, parameters, moments):
-//! the loop sees named figures after a step, and the whole state when a checkpoint is due, and nothing else.
+//! A model says what differs between fields and leaves what it needs between steps (rays, samples, parameters, moments)
+//! where it is: the trainer sees named figures after a step, and the whole state when a checkpoint is due.
 
 use super::checkpoint::{self, Checkpoint, TrainingProgress};
 use crate::{Error, Monitor, Result};
@@ -21,7 +22,7 @@ pub struct TrainingSession<'a> {
     pub stage: &'static str,
     /// Seed of every random number.
     pub seed: u64,
-    /// Name of the device: see [`super::place`].
+    /// Name of the device: see [`super::compute_device`].
     pub device: &'a str,
     /// The folder of the checkpoints; training continues from those that lie there.
     pub dir: &'a Path,
@@ -29,6 +30,15 @@ pub struct TrainingSession<'a> {
     pub identity: &'a str,
     /// Hears of every step and asks to stop.
     pub monitor: &'a dyn Monitor,
+}
+
+/// A step of a training.
+#[derive(Clone, Copy, Debug)]
+pub struct StepAt {
+    /// Seed of its random numbers: another one after a step that diverged.
+    pub seed: u64,
+    /// Optimizer steps before it.
+    pub step: u64,
 }
 
 /// What a step came to, on the host.
@@ -47,11 +57,24 @@ pub enum StepError {
         term: &'static str,
         /// Its value.
         value: f32,
-        /// Learning rate of the networks there.
-        lr: f64,
     },
     /// Going back would not help.
     Failed(Error),
+}
+
+impl StepError {
+    /// The error that a gradient is not finite: a finite loss does not promise one.
+    pub fn gradient() -> StepError {
+        StepError::NotFinite { term: "gradient of the", value: f32::NAN }
+    }
+
+    /// The first of these named terms that is not finite.
+    pub fn check(terms: impl IntoIterator<Item = (&'static str, f32)>) -> Result<(), StepError> {
+        match terms.into_iter().find(|(_, value)| !value.is_finite()) {
+            Some((term, value)) => Err(StepError::NotFinite { term, value }),
+            None => Ok(()),
+        }
+    }
 }
 
 impl From<Error> for StepError {
@@ -61,61 +84,91 @@ impl From<Error> for StepError {
 }
 
 /// A field in training.
-pub trait Learner {
+pub trait Model {
     /// Name of its checkpoints' format.
     const FORMAT: &'static str;
     /// The settings that hold its learning rates.
     const RATES: [&'static str; 2];
-    /// Steps that a squared error is the mean of.
-    const EVERY: u64 = 1;
+    /// Steps between two reports.
+    const READ_EVERY: u64;
 
-    /// Makes the optimizer step after `progress.step`.
-    fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError>;
+    /// Learning rate of the networks at a step.
+    fn learning_rate(&self, step: u64) -> f64;
+
+    /// Does what is due before a step: occupancy, stereo points.
+    fn prepare(&mut self, _: StepAt) -> Result<(), StepError> {
+        Ok(())
+    }
+
+    /// Draws rays and leaves the gradients of their losses in the parameter groups.
+    fn backward(&mut self, at: StepAt);
+
+    /// Makes the optimizer's step of every parameter group.
+    fn optimize(&mut self, step: u64);
+
+    /// Waits for the device and returns what `step`, the last one, or the mean of those since the last report came to.
+    fn report(&mut self, step: u64) -> Result<StepReport, StepError>;
+
+    /// Does what is due after a step: finer grids.
+    fn finish_step(&mut self, _: u64) -> Result<(), StepError> {
+        Ok(())
+    }
 
     /// Puts everything needed to go on into a checkpoint; of a finished one only the result is read.
-    fn save(
-        &self,
-        progress: &TrainingProgress,
-        into: &mut Checkpoint,
-        finished: bool,
-    ) -> Result<(), StepError>;
+    fn save(&self, into: &mut Checkpoint, finished: bool) -> Result<(), StepError>;
 
-    /// Takes up a checkpoint's state, or the one before the first step.
+    /// Takes up a checkpoint's state, with its progress and whether it is finished, or the one before the first step.
     fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError>;
+}
+
+/// Makes a step, and returns what it came to where that is read.
+pub fn step<M: Model>(
+    model: &mut M,
+    seed: u64,
+    progress: &TrainingProgress,
+    read: bool,
+) -> Result<Option<StepReport>, StepError> {
+    let at = StepAt { seed: seed ^ progress.salt << 32, step: progress.step };
+    model.prepare(at)?;
+    model.backward(at);
+    model.optimize(at.step);
+    let report = read.then(|| model.report(at.step)).transpose()?;
+    model.finish_step(at.step)?;
+    Ok(report)
 }
 
 /// Trains until `steps`, saving a checkpoint every `checkpoint_s` seconds. A finished training is left as it is.
 /// Returns how far it came and oddities on the way.
-pub fn train<L: Learner>(
-    learner: &mut L,
+pub fn train<M: Model>(
+    model: &mut M,
     session: &TrainingSession,
     steps: u64,
     checkpoint_s: f64,
 ) -> Result<(TrainingProgress, Vec<String>)> {
     let every = Duration::from_secs_f64(checkpoint_s);
     let &TrainingSession { stage, identity, dir, monitor, .. } = session;
-    let save = |learner: &L, progress: &TrainingProgress, finished: bool| -> Result<(), StepError> {
-        let mut into = Checkpoint::new(stage, L::FORMAT, identity);
+    let save = |model: &M, progress: &TrainingProgress, finished: bool| -> Result<(), StepError> {
+        let mut into = Checkpoint::new(stage, M::FORMAT, identity);
         progress.save(&mut into, finished);
         // a poisoned field must not take the place of a good checkpoint
-        learner.save(progress, &mut into, finished)?;
+        model.save(&mut into, finished)?;
         Ok(into.save(dir)?)
     };
-    let restore = |learner: &mut L| {
-        checkpoint::restore(dir, stage, L::FORMAT, identity, |file| {
+    let restore = |model: &mut M| {
+        checkpoint::restore(dir, stage, M::FORMAT, identity, |file| {
             let (progress, finished) = TrainingProgress::restore(file, steps)?;
-            let taken = learner.restore(Some((file, &progress, finished)));
-            taken.map_err(|e| failure::<L>(e, stage, progress.step, false))?;
+            let taken = model.restore(Some((file, &progress, finished)));
+            taken.map_err(|e| failure(model, e, stage, progress.step, false))?;
             Ok(progress)
         })
     };
-    let (mut progress, mut warnings) = match restore(learner)? {
+    let (mut progress, mut warnings) = match restore(model)? {
         Some(restored) => restored,
         None => {
             let progress = TrainingProgress::default();
             // a training that breaks early goes back to here
-            let started = learner.restore(None).and_then(|()| save(learner, &progress, false));
-            started.map_err(|e| failure::<L>(e, stage, 0, false))?;
+            let started = model.restore(None).and_then(|()| save(model, &progress, false));
+            started.map_err(|e| failure(model, e, stage, 0, false))?;
             (progress, Vec::new())
         }
     };
@@ -125,21 +178,23 @@ pub fn train<L: Learner>(
     let mut went_back = progress.salt > 0;
     let mut saved = Instant::now();
     while progress.step < steps {
-        let step = progress.step;
-        let result = learner.step(&progress).and_then(|report| {
-            progress.step += 1;
+        let done = progress.step + 1;
+        let read = done.is_multiple_of(M::READ_EVERY) || done == steps;
+        let result = step(model, session.seed, &progress, read).and_then(|report| {
+            progress.step = done;
+            let report = report.unwrap_or(StepReport { square_error: None, figures: Vec::new() });
             if let Some(error) = report.square_error {
-                let kept = 0.98f64.powi(L::EVERY as i32);
+                let kept = 0.98f64.powi(M::READ_EVERY as i32);
                 let keep = if progress.mean_square == 0.0 { 0.0 } else { kept };
                 progress.mean_square = keep * progress.mean_square + (1.0 - keep) * error as f64;
             }
             // none before the first error is known, which a device tells once in many steps
             let psnr = (progress.mean_square > 0.0).then(|| ("psnr", progress.psnr()));
             let figures: Vec<_> = psnr.into_iter().chain(report.figures).collect();
-            monitor.step(progress.step, steps, &figures);
-            let (last, stop) = (progress.step == steps, monitor.stop());
+            monitor.step(done, steps, &figures);
+            let (last, stop) = (done == steps, monitor.stop());
             if last || stop || saved.elapsed() > every {
-                save(learner, &progress, last)?;
+                save(model, &progress, last)?;
                 saved = Instant::now();
             }
             Ok(stop && !last)
@@ -147,19 +202,20 @@ pub fn train<L: Learner>(
         match result {
             Ok(false) => {}
             Ok(true) => return Err(stopped(progress.step, steps)),
-            Err(StepError::NotFinite { term, value, .. }) if !went_back => {
+            Err(StepError::NotFinite { term, value }) if !went_back => {
                 went_back = true;
                 warnings.push(format!(
-                    "the {term} loss became {value} at step {step}; went back to the last checkpoint once"
+                    "the {term} loss became {value} at step {}; went back to the last checkpoint once",
+                    done - 1
                 ));
-                let Some((restored, notes)) = restore(learner)? else {
+                let Some((restored, notes)) = restore(model)? else {
                     return Err(Error::cannot("the checkpoint of the start is gone", "start again"));
                 };
                 warnings.extend(notes);
                 // other rays, or the same step would break in the same way
                 progress = TrainingProgress { salt: 1, ..restored };
             }
-            Err(e) => return Err(failure::<L>(e, stage, step, went_back)),
+            Err(e) => return Err(failure(model, e, stage, done - 1, went_back)),
         }
     }
     checkpoint::finish(dir)?;
@@ -179,11 +235,12 @@ pub fn no_pixels() -> Error {
     )
 }
 
-fn failure<L: Learner>(e: StepError, stage: &str, step: u64, went_back: bool) -> Error {
+fn failure<M: Model>(model: &M, e: StepError, stage: &str, step: u64, went_back: bool) -> Error {
     match e {
         StepError::Failed(e) => e,
-        StepError::NotFinite { term, value, lr } => {
-            let [a, b] = L::RATES;
+        StepError::NotFinite { term, value } => {
+            let [a, b] = M::RATES;
+            let lr = model.learning_rate(step);
             let again = if went_back { ", and was again after restoring the last checkpoint" } else { "" };
             Error::cannot(
                 format!("the {term} loss is {value} at step {step} (learning rate {lr:.2e}){again}"),

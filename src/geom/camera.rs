@@ -172,7 +172,7 @@ impl Distortion {
     /// Distorted normalized coordinates back to ideal ones: Newton on the coefficients with their exact Jacobian,
     /// whose result is checked, then the projection's inverse. `None` where the model folds over (no ideal point
     /// maps there) and from 90° on.
-    pub fn undo(&self, xd: f64, yd: f64) -> Option<(f64, f64)> {
+    pub fn undistort(&self, xd: f64, yd: f64) -> Option<(f64, f64)> {
         if self.is_none() {
             return Some((xd, yd));
         }
@@ -207,7 +207,7 @@ impl Distortion {
     }
 }
 
-/// How near [`Distortion::undo`] must come; at a focal length of 10 000 pixels, 1e-6 of a pixel.
+/// How near [`Distortion::undistort`] must come; at a focal length of 10 000 pixels, 1e-6 of a pixel.
 const RESIDUAL: f64 = 1e-10;
 
 /// One camera: intrinsics in pixels of its own picture, pose in the dataset's world.
@@ -239,7 +239,7 @@ impl Camera {
     pub fn ray(&self, pixel: Vec2) -> Option<Ray> {
         let xd = (pixel.x as f64 - self.cx) / self.fx;
         let yd = (pixel.y as f64 - self.cy) / self.fy;
-        let (x, y) = self.distortion.undo(xd, yd)?;
+        let (x, y) = self.distortion.undistort(xd, yd)?;
         let direction = (self.rotation * DVec3::new(x, -y, -1.0)).normalize();
         Some(Ray {
             origin: self.position.as_vec3(),
@@ -416,7 +416,7 @@ mod tests {
             for i in 0..400 {
                 let (x, y) = ((i % 20) as f64 / 19.0 * 1.6 - 0.8, (i / 20) as f64 / 19.0 * 1.6 - 0.8);
                 let (xd, yd) = lens.apply(x, y);
-                let (u, v) = lens.undo(xd, yd).unwrap();
+                let (u, v) = lens.undistort(xd, yd).unwrap();
                 assert!((u - x).abs() + (v - y).abs() < 1e-11, "{lens:?} at {x}, {y}: {u}, {v}");
             }
         }
@@ -454,10 +454,10 @@ mod tests {
         let none = Distortion::default();
         // r (1 − 0.3 r²) is at most 2/3 · √(1/0.9) = 0.7027
         let barrel = Distortion { k1: -0.3, ..none };
-        assert!(barrel.undo(0.70, 0.0).is_some() && barrel.undo(0.71, 0.0).is_none());
+        assert!(barrel.undistort(0.70, 0.0).is_some() && barrel.undistort(0.71, 0.0).is_none());
         let fisheye = Distortion { projection: Projection::Fisheye, ..none };
-        assert!(fisheye.undo(1.56, 0.0).is_some() && fisheye.undo(1.58, 0.0).is_none());
-        assert!(barrel.undo(f64::NAN, 0.0).is_none() && fisheye.undo(f64::INFINITY, 0.0).is_none());
+        assert!(fisheye.undistort(1.56, 0.0).is_some() && fisheye.undistort(1.58, 0.0).is_none());
+        assert!(barrel.undistort(f64::NAN, 0.0).is_none() && fisheye.undistort(f64::INFINITY, 0.0).is_none());
     }
 
     #[test]

@@ -5,18 +5,21 @@
 //! milestones take to a third each. Meshed where the density is 5. On the CPU alone.
 
 use super::occupancy::Occupancy;
-use super::schedule::{self, march_step};
+use super::schedule::step_length;
 use super::train::IfaceReport;
 use crate::config::DeviceChoice;
 use crate::config::iface::{Foreground, IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
+use crate::field::ops::{ArrayDevice, Cpu, Ops, slice, slice_mut};
+use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::{Batch, Pixels, TrainView};
-use crate::field::training::{self, Learner, StepError, StepReport, TrainingSession};
+use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::geom::{Ray, RayResult};
-use crate::kernel::adam::{AdamStep, adam};
-use crate::kernel::density::{self, DensityShape, DensityWeights};
-use crate::kernel::march::{Bitmask, MarchRay, Samples};
-use crate::kernel::{hash, rng};
+use crate::kernel::cpu::adam::AdamStep;
+use crate::kernel::cpu::density::{self, DensitySamples, DensityShape, DensityWeights};
+use crate::kernel::cpu::march::{Bitmask, MarchRay, Samples};
+use crate::kernel::cpu::schedule::RayBudget;
+use crate::kernel::cpu::{hash, rng};
 use crate::{Error, Result};
 use glam::Vec3;
 use std::path::Path;
@@ -40,11 +43,12 @@ const OCCUPIED: f32 = 0.01;
 /// A ray ends where less of its light is left.
 const DARK: f32 = 1e-4;
 
-/// What is learned, and the cells to march through.
+/// Training between two steps.
 struct DensityState {
-    /// Hash table and networks: values, first and second moments.
-    parameters: [[Vec<f32>; 3]; 2],
+    /// Hash table and networks.
+    groups: [HostGroup; 2],
     occupancy: Occupancy,
+    /// Rays of the next step.
     rays: usize,
 }
 
@@ -53,6 +57,11 @@ const NAMES: [&str; 2] = ["table", "network"];
 fn shape(config: &IfaceConfig) -> DensityShape {
     let levels = hash::levels(config.levels, config.base_resolution, config.growth, config.log2_table);
     DensityShape { levels, radius: config.radius }
+}
+
+/// How the rays of a step follow the samples of the one before it.
+fn ray_budget(config: &IfaceConfig) -> RayBudget {
+    RayBudget { samples: config.samples, min: 1, max: config.max_rays }
 }
 
 impl DensityState {
@@ -67,24 +76,12 @@ impl DensityState {
             let uniform = |i| bound * (2.0 * rng::uniform(seed, 122 + k as u64, i) - 1.0);
             network.extend((0..(rows * columns) as u64).map(uniform));
         }
-        let parameters = [table, network].map(|v| [v.clone(), vec![0.0; v.len()], vec![0.0; v.len()]]);
-        DensityState { parameters, occupancy: Occupancy::new(config, None), rays: config.rays }
-    }
-
-    fn table(&self) -> &[[f32; 2]] {
-        bytemuck::cast_slice(&self.parameters[0][0])
-    }
-
-    fn weights(&self, shape: &DensityShape) -> DensityWeights {
-        DensityWeights::new(shape, &self.parameters[1][0])
+        let groups = [HostGroup::flat(NAMES[0], table), HostGroup::flat(NAMES[1], network)];
+        DensityState { groups, occupancy: Occupancy::new(config, None), rays: config.rays }
     }
 
     fn save(&self, into: &mut Checkpoint) {
-        for (name, values) in NAMES.iter().zip(&self.parameters) {
-            for (kind, values) in ["model", "first", "second"].iter().zip(values) {
-                into.put_floats(&format!("{kind}.{name}"), &[values.len()], values.clone());
-            }
-        }
+        self.groups.iter().for_each(|group| group.save(into, true));
         into.put_words("occupancy.occupied", self.occupancy.occupied.bits.clone());
         into.put_floats("occupancy.history", &[self.occupancy.history.len()], self.occupancy.history.clone());
         into.set("rays", self.rays);
@@ -92,11 +89,8 @@ impl DensityState {
 
     fn restore(config: &IfaceConfig, from: &mut Checkpoint) -> Result<DensityState> {
         let mut state = DensityState::new(config, 0);
-        for (name, [value, first, second]) in NAMES.iter().zip(&mut state.parameters) {
-            let n = [value.len()];
-            *value = from.floats(&format!("model.{name}"), &n)?;
-            *first = from.floats(&format!("first.{name}"), &n)?;
-            *second = from.squares(&format!("second.{name}"), &n)?;
+        for group in &mut state.groups {
+            *group = HostGroup::restore(group.parts.clone(), from, true)?;
         }
         let o = &mut state.occupancy;
         o.history = from.floats("occupancy.history", &[o.history.len()])?;
@@ -107,41 +101,208 @@ impl DensityState {
         state.rays = from.number("rays", 1..=most)? as usize;
         Ok(state)
     }
+}
 
-    /// Samples along rays in marked cells, up to where the light is gone.
-    fn march(
-        &self,
-        config: &IfaceConfig,
-        shape: &DensityShape,
-        weights: &DensityWeights,
-        rays: &[MarchRay],
-    ) -> Samples {
-        let dt = march_step(config, 0.0);
-        let all = self.occupancy.march(config, dt, rays);
-        let (x, _) = all.points(rays, 0);
-        let found = density::evaluate(shape, self.table(), weights, &x, None).density;
-        let mut kept = Samples { offsets: vec![0], t: Vec::new() };
-        for own in all.offsets.windows(2) {
-            let mut thickness = 0f32;
-            for s in own[0] as usize..own[1] as usize {
-                if (-thickness).exp() < DARK {
-                    break;
-                }
-                kept.t.push(all.t[s]);
-                thickness += found[s] * dt;
+/// Samples along rays in marked cells, up to where the light is gone.
+fn march(
+    config: &IfaceConfig,
+    occupancy: &Occupancy,
+    (shape, table, weights): (&DensityShape, &[[f32; 2]], &DensityWeights),
+    rays: &[MarchRay],
+) -> Samples {
+    let dt = step_length(config).at(0.0);
+    let all = occupancy.march(config, dt, rays);
+    let (x, _) = all.points(rays, 0);
+    let found = density::evaluate(shape, table, weights, &x, None).density;
+    let mut kept = Samples { offsets: vec![0], t: Vec::new() };
+    for own in all.offsets.windows(2) {
+        let mut thickness = 0f32;
+        for s in own[0] as usize..own[1] as usize {
+            if (-thickness).exp() < DARK {
+                break;
             }
-            kept.offsets.push(kept.t.len() as i32);
+            kept.t.push(all.t[s]);
+            thickness += found[s] * dt;
         }
-        kept
+        kept.offsets.push(kept.t.len() as i32);
+    }
+    kept
+}
+
+/// Hash table and networks.
+type DensityGroups<O> = [ParameterGroup<<O as Ops>::Device>; 2];
+
+/// The operations of a training step on one device, in the order of the step.
+trait DensityOps: Ops {
+    /// Begins a training, or goes on with one: the cells to march through, and the rays of the next step.
+    fn load(&mut self, occupancy: &Occupancy, rays: usize);
+
+    /// Waits for the device; the cells to march through, and the rays of the next step.
+    fn read(&self, occupancy: &mut Occupancy) -> Result<usize>;
+
+    /// Waits for the device: was a gradient not finite since the state was loaded?
+    fn is_broken(&self) -> Result<bool>;
+
+    /// Evaluates the field again to find the cells that may hold something.
+    fn update_occupancy(&mut self, groups: &DensityGroups<Self>, at: StepAt);
+
+    /// Draws as many rays as the samples of the last step leave for this one.
+    fn draw(&mut self, at: StepAt);
+
+    /// Marches them up to where the light is gone.
+    fn march(&mut self, groups: &DensityGroups<Self>);
+
+    /// Evaluates the field at the samples, composites them, and leaves the gradients of the losses by its output.
+    fn losses(&mut self, groups: &DensityGroups<Self>);
+
+    /// Gradients of the parameters; closes the [gate](Ops::gate) where one is not finite.
+    fn backward(&mut self, groups: &mut DensityGroups<Self>);
+
+    /// Waits for the device and returns what the last step came to.
+    fn figures(&mut self) -> Result<DensityFigures>;
+}
+
+/// What a step came to.
+struct DensityFigures {
+    /// Squared and smooth-L1 error of the colors, distortion.
+    terms: [f32; 3],
+    samples: usize,
+    /// Rays of the next step.
+    rays: usize,
+    /// Was a gradient not finite?
+    broken: bool,
+}
+
+/// The operations on the processor.
+struct CpuDensity<'a> {
+    config: &'a IfaceConfig,
+    pixels: &'a Pixels<'a>,
+    shape: DensityShape,
+    occupancy: Occupancy,
+    rays: usize,
+    /// Samples of the last step; none before the first one.
+    last_samples: Option<usize>,
+    batch: Batch,
+    samples: Samples,
+    found: Option<(DensityWeights, DensitySamples)>,
+    terms: [f32; 3],
+    /// By densities and colors of the samples.
+    gradients: (Vec<f32>, Vec<[f32; 3]>),
+    broken: bool,
+}
+
+impl<'a> CpuDensity<'a> {
+    fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>) -> CpuDensity<'a> {
+        CpuDensity {
+            config,
+            pixels,
+            shape: shape(config),
+            occupancy: Occupancy::new(config, None),
+            rays: config.rays,
+            last_samples: None,
+            batch: Batch::default(),
+            samples: Samples::default(),
+            found: None,
+            terms: [0.0; 3],
+            gradients: Default::default(),
+            broken: false,
+        }
+    }
+
+    fn next_rays(&self) -> usize {
+        self.last_samples.map_or(self.rays, |n| ray_budget(self.config).next(self.rays, n))
+    }
+
+    fn field<'g>(&self, [table, network]: &'g DensityGroups<Self>) -> (&'g [[f32; 2]], DensityWeights) {
+        let table = bytemuck::cast_slice(slice(table.value()));
+        (table, DensityWeights::new(&self.shape, slice(network.value())))
     }
 }
 
-struct DensityTraining<'a> {
+impl Ops for CpuDensity<'_> {
+    type Device = Cpu;
+
+    fn device(&self) -> &Cpu {
+        &Cpu
+    }
+
+    fn gate(&self) -> bool {
+        !self.samples.t.is_empty() && !self.broken
+    }
+}
+
+impl DensityOps for CpuDensity<'_> {
+    fn load(&mut self, occupancy: &Occupancy, rays: usize) {
+        self.occupancy = occupancy.clone();
+        (self.rays, self.last_samples, self.broken) = (rays, None, false);
+    }
+
+    fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {
+        *occupancy = self.occupancy.clone();
+        Ok(self.next_rays())
+    }
+
+    fn is_broken(&self) -> Result<bool> {
+        Ok(self.broken)
+    }
+
+    fn update_occupancy(&mut self, groups: &DensityGroups<Self>, at: StepAt) {
+        let (table, weights) = self.field(groups);
+        let (shape, dt) = (&self.shape, step_length(self.config).at(0.0));
+        let opacity = |x: &[[f32; 3]]| {
+            let found = density::evaluate(shape, table, &weights, x, None);
+            found.density.into_iter().map(|s| s * dt).collect()
+        };
+        self.occupancy.look((at.seed, at.step), self.config.radius, OCCUPIED, opacity);
+    }
+
+    fn draw(&mut self, at: StepAt) {
+        self.rays = self.next_rays();
+        self.batch = self.pixels.draw(at.seed, at.step, self.rays, self.config.jitter, 0.0);
+    }
+
+    fn march(&mut self, groups: &DensityGroups<Self>) {
+        let (table, weights) = self.field(groups);
+        let field = (&self.shape, table, &weights);
+        self.samples = march(self.config, &self.occupancy, field, &self.batch.rays);
+        self.last_samples = Some(self.samples.t.len());
+        self.found = None;
+        if !self.samples.t.is_empty() {
+            let (x, d) = self.samples.points(&self.batch.rays, 0);
+            let found = density::evaluate(&self.shape, table, &weights, &x, Some(&d));
+            self.found = Some((weights, found));
+        }
+    }
+
+    fn losses(&mut self, _: &DensityGroups<Self>) {
+        let Some((_, found)) = &self.found else { return };
+        let dt = step_length(self.config).at(0.0);
+        let (terms, g_density, g_color) = losses(&self.batch, &self.samples, found, dt);
+        (self.terms, self.gradients) = (terms, (g_density, g_color));
+    }
+
+    fn backward(&mut self, [table, network]: &mut DensityGroups<Self>) {
+        let Some((weights, found)) = self.found.take() else { return };
+        let g_table = bytemuck::cast_slice_mut(slice_mut(&mut table.gradient));
+        let by = (&self.gradients.0[..], &self.gradients.1[..]);
+        let g_network = density::backward(&self.shape, &weights, &found, by, g_table);
+        self.broken |= !g_network.iter().chain(&self.terms).all(|g| g.is_finite());
+        slice_mut(&mut network.gradient).copy_from_slice(&g_network);
+    }
+
+    fn figures(&mut self) -> Result<DensityFigures> {
+        let (samples, rays) = (self.samples.t.len(), self.next_rays());
+        Ok(DensityFigures { terms: self.terms, samples, rays, broken: self.broken })
+    }
+}
+
+/// A density in training on a device.
+struct DensityModel<'a, O: DensityOps> {
     config: &'a IfaceConfig,
     session: TrainingSession<'a>,
-    shape: DensityShape,
-    pixels: Pixels<'a>,
-    state: DensityState,
+    ops: O,
+    groups: DensityGroups<O>,
+    occupancy: Occupancy,
 }
 
 /// Trains until `config.steps`, saving checkpoints and continuing from the one that lies in the session's folder.
@@ -157,19 +318,19 @@ pub fn train_density(
     if pixels.count() == 0 {
         return Err(training::no_pixels());
     }
-    let state = DensityState::new(config, session.seed);
-    let mut learner = DensityTraining { config, session: *session, shape: shape(config), pixels, state };
-    let (progress, warnings) = training::train(&mut learner, session, config.steps, config.checkpoint_s)?;
+    let mut model = DensityModel::new(CpuDensity::new(config, &pixels), config, session);
+    let (progress, warnings) = training::train(&mut model, session, config.steps, config.checkpoint_s)?;
+    let state = model.state()?;
     let report = IfaceReport {
         steps: config.steps,
         seconds: began.elapsed().as_secs_f64(),
         inv_s: 0.0,
         train_psnr: progress.psnr(),
-        occupied: learner.state.occupancy.share(),
-        device: crate::field::Place::Cpu(String::new()).told(),
+        occupied: state.occupancy.share(),
+        device: crate::field::ComputeDevice::Cpu(String::new()).description(),
         warnings,
     };
-    Ok((DensityField::new(config, learner.state), report))
+    Ok((DensityField::new(config, state), report))
 }
 
 /// What ranges of single keys cannot say.
@@ -241,78 +402,89 @@ fn losses(
     ([(square / n) as f32, (smooth / n) as f32, spread as f32], g_density, g_color)
 }
 
-impl Learner for DensityTraining<'_> {
-    const FORMAT: &'static str = FORMAT;
-    const RATES: [&'static str; 2] = ["lr_network", "lr_table"];
-
-    fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError> {
-        let (config, step) = (self.config, progress.step);
-        let seed = self.session.seed ^ progress.salt << 32;
-        let dt = march_step(config, 0.0);
-        let weights = self.state.weights(&self.shape);
-        if step.is_multiple_of(config.occupancy_every) {
-            let (table, shape) = (self.state.parameters[0][0].clone(), &self.shape);
-            let opacity = |x: &[[f32; 3]]| {
-                let found = density::evaluate(shape, bytemuck::cast_slice(&table), &weights, x, None);
-                found.density.into_iter().map(|s| s * dt).collect()
-            };
-            self.state.occupancy.look((seed, step), config.radius, OCCUPIED, opacity);
-        }
-        let batch = self.pixels.draw(seed, step, self.state.rays, config.jitter, 0.0);
-        let samples = self.state.march(config, &self.shape, &weights, &batch.rays);
-        let n = samples.t.len();
-        self.state.rays = schedule::next_rays(self.state.rays, n, config.samples, 1, config.max_rays);
-        let mut terms = [0f32; 3];
-        if n > 0 {
-            let (x, d) = samples.points(&batch.rays, 0);
-            let found = density::evaluate(&self.shape, self.state.table(), &weights, &x, Some(&d));
-            let (values, g_density, g_color) = losses(&batch, &samples, &found, dt);
-            terms = values;
-            let lr = config.lr_network * learning_rate(config, step);
-            for (term, value) in ["rgb", "smooth", "distortion"].into_iter().zip(terms) {
-                if !value.is_finite() {
-                    return Err(StepError::NotFinite { term, value, lr });
-                }
-            }
-            let mut g_table = vec![[0f32; 2]; self.state.table().len()];
-            let by = (&g_density[..], &g_color[..]);
-            let g_network = density::backward(&self.shape, &weights, &found, by, &mut g_table);
-            if !g_network.iter().all(|g| g.is_finite()) {
-                return Err(StepError::NotFinite { term: "gradient of the", value: f32::NAN, lr });
-            }
-            let adam_step = AdamStep {
-                lr: lr as f32,
-                beta1: 0.9,
-                beta2: 0.99,
-                epsilon: 1e-15,
-                weight_decay: config.weight_decay as f32,
-                step: step + 1,
-                skip_zero: false,
-            };
-            let gradients = [g_table.into_flattened(), g_network];
-            for ([value, first, second], mut g) in self.state.parameters.iter_mut().zip(gradients) {
-                adam(value, first, second, &mut g, &adam_step);
-            }
-        }
-        let figures = vec![
-            ("rgb", f64::from(terms[0])),
-            ("smooth", f64::from(terms[1])),
-            ("distortion", f64::from(terms[2])),
-            ("rays", self.state.rays as f64),
-            ("samples", n as f64),
-        ];
-        Ok(StepReport { square_error: (n > 0).then_some(terms[0]), figures })
+impl<'a, O: DensityOps> DensityModel<'a, O> {
+    /// Before the first step; a checkpoint is not looked for yet.
+    fn new(ops: O, config: &'a IfaceConfig, session: &TrainingSession<'a>) -> DensityModel<'a, O> {
+        let DensityState { groups, occupancy, .. } = DensityState::new(config, session.seed);
+        let groups = groups.map(|group| ParameterGroup::upload(ops.device(), group));
+        DensityModel { config, session: *session, ops, groups, occupancy }
     }
 
-    fn save(&self, _: &TrainingProgress, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {
-        self.state.save(into);
+    /// Waits for the device; the state as it is there.
+    fn state(&self) -> Result<DensityState> {
+        let [table, network] = self.groups.each_ref().map(|group| group.download(self.ops.device()));
+        let mut occupancy = self.occupancy.clone();
+        let rays = self.ops.read(&mut occupancy)?;
+        Ok(DensityState { groups: [table?, network?], occupancy, rays })
+    }
+}
+
+impl<O: DensityOps> Model for DensityModel<'_, O> {
+    const FORMAT: &'static str = FORMAT;
+    const RATES: [&'static str; 2] = ["lr_network", "lr_table"];
+    const READ_EVERY: u64 = <O::Device as ArrayDevice>::READ_EVERY;
+
+    fn learning_rate(&self, step: u64) -> f64 {
+        self.config.lr_network * learning_rate(self.config, step)
+    }
+
+    fn prepare(&mut self, at: StepAt) -> Result<(), StepError> {
+        if at.step.is_multiple_of(self.config.occupancy_every) {
+            self.ops.update_occupancy(&self.groups, at);
+        }
+        Ok(())
+    }
+
+    fn backward(&mut self, at: StepAt) {
+        self.ops.draw(at);
+        self.ops.march(&self.groups);
+        self.ops.losses(&self.groups);
+        self.ops.backward(&mut self.groups);
+    }
+
+    fn optimize(&mut self, step: u64) {
+        let adam_step = AdamStep {
+            lr: self.learning_rate(step) as f32,
+            beta1: 0.9,
+            beta2: 0.99,
+            epsilon: 1e-15,
+            weight_decay: self.config.weight_decay as f32,
+            step: step + 1,
+            skip_zero: false,
+        };
+        self.groups.iter_mut().for_each(|group| group.step(self.ops.device(), &adam_step, self.ops.gate()));
+    }
+
+    fn report(&mut self, _: u64) -> Result<StepReport, StepError> {
+        let DensityFigures { terms, samples, rays, broken } = self.ops.figures()?;
+        let terms = if samples > 0 { terms } else { [0.0; 3] };
+        let terms = ["rgb", "smooth", "distortion"].into_iter().zip(terms);
+        StepError::check(terms.clone())?;
+        if broken {
+            return Err(StepError::gradient());
+        }
+        let mut figures: Vec<_> = terms.map(|(name, value)| (name, f64::from(value))).collect();
+        figures.extend([("rays", rays as f64), ("samples", samples as f64)]);
+        let square_error = (samples > 0).then_some(figures[0].1 as f32);
+        Ok(StepReport { square_error, figures })
+    }
+
+    fn save(&self, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {
+        if self.ops.is_broken()? {
+            return Err(StepError::gradient());
+        }
+        self.state()?.save(into);
         Ok(())
     }
 
     fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
-        if let Some((from, ..)) = from {
-            self.state = DensityState::restore(self.config, from)?;
-        }
+        let state = match from {
+            Some((from, ..)) => DensityState::restore(self.config, from)?,
+            None => DensityState::new(self.config, self.session.seed),
+        };
+        self.ops.load(&state.occupancy, state.rays);
+        self.groups = state.groups.map(|group| ParameterGroup::upload(self.ops.device(), group));
+        self.occupancy = state.occupancy;
         Ok(())
     }
 }
@@ -321,14 +493,18 @@ impl Learner for DensityTraining<'_> {
 pub struct DensityField {
     config: IfaceConfig,
     shape: DensityShape,
+    table: Vec<f32>,
     weights: DensityWeights,
-    state: DensityState,
+    occupancy: Occupancy,
 }
 
 impl DensityField {
     fn new(config: &IfaceConfig, state: DensityState) -> DensityField {
         let shape = shape(config);
-        DensityField { config: config.clone(), weights: state.weights(&shape), shape, state }
+        let DensityState { groups: [table, network], occupancy, .. } = state;
+        let [table, ..] = table.state;
+        let weights = DensityWeights::new(&shape, network.values());
+        DensityField { config: config.clone(), shape, table, weights, occupancy }
     }
 
     /// Loads the field from the checkpoint in a stage folder. `config` is what it was trained with.
@@ -338,14 +514,17 @@ impl DensityField {
         Ok(DensityField::new(config, DensityState::restore(config, &mut file)?))
     }
 
+    fn table(&self) -> &[[f32; 2]] {
+        bytemuck::cast_slice(&self.table)
+    }
+
     fn scaled(&self, points: &[Vec3]) -> Vec<[f32; 3]> {
         points.iter().map(|p| (*p * self.config.radius).to_array()).collect()
     }
 
     fn density(&self, points: &[Vec3]) -> Vec<f32> {
         let look = |points: &[Vec3]| {
-            density::evaluate(&self.shape, self.state.table(), &self.weights, &self.scaled(points), None)
-                .density
+            density::evaluate(&self.shape, self.table(), &self.weights, &self.scaled(points), None).density
         };
         points.chunks(1 << 16).flat_map(look).collect()
     }
@@ -374,7 +553,7 @@ impl DensityField {
         let x: Vec<[f32; 3]> = places.flat_map(|(p, n)| std::iter::repeat_n(p, *n as usize)).collect();
         let d: Vec<[f32; 3]> = directions.iter().map(|d| d.to_array()).collect();
         let look = |(x, d): (&[[f32; 3]], &[[f32; 3]])| {
-            density::evaluate(&self.shape, self.state.table(), &self.weights, x, Some(d)).color
+            density::evaluate(&self.shape, self.table(), &self.weights, x, Some(d)).color
         };
         x.chunks(1 << 16).zip(d.chunks(1 << 16)).flat_map(look).collect()
     }
@@ -387,16 +566,17 @@ impl DensityField {
 
     fn pass(&self, rays: &[Ray]) -> Vec<RayResult> {
         let radius = self.config.radius;
-        let march = |r: &Ray| MarchRay {
+        let marched = |r: &Ray| MarchRay {
             origin: (r.origin * radius).to_array(),
             direction: r.direction.to_array(),
             jitter: 0.0,
         };
-        let rays: Vec<MarchRay> = rays.iter().map(march).collect();
-        let samples = self.state.march(&self.config, &self.shape, &self.weights, &rays);
+        let rays: Vec<MarchRay> = rays.iter().map(marched).collect();
+        let field = (&self.shape, self.table(), &self.weights);
+        let samples = march(&self.config, &self.occupancy, field, &rays);
         let (x, d) = samples.points(&rays, 0);
-        let found = density::evaluate(&self.shape, self.state.table(), &self.weights, &x, Some(&d));
-        let dt = march_step(&self.config, 0.0);
+        let found = density::evaluate(&self.shape, self.table(), &self.weights, &x, Some(&d));
+        let dt = step_length(&self.config).at(0.0);
         let seen = |own: &[i32]| {
             let own = own[0] as usize..own[1] as usize;
             let weight = density::weights(&found.density[own.clone()], dt);

@@ -3,8 +3,8 @@
 use super::*;
 use crate::config::Preset;
 use crate::field::ball::{BALL, resumes, session, temporary, views};
-use crate::kernel::reference::tape::{AdamW, Stepped, Var, gradient};
-use crate::kernel::reference::{Real, density as plain, wide};
+use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};
+use crate::kernel::cpu::reference::{Real, density as plain, wide};
 use crate::{Monitor, Quiet};
 use glam::Vec2;
 
@@ -33,21 +33,26 @@ fn a_step_is_the_one_of_its_formulas() {
     let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
     let mut state = DensityState::new(&config, session.seed);
     // as if it had learned for a while: something to be seen, and not the same everywhere
-    let [table, network] = &mut state.parameters;
-    table[0].iter_mut().enumerate().for_each(|(i, v)| *v = rng::normal(5, 1, i as u64));
-    network[0].iter_mut().for_each(|v| *v *= 1.5);
-    let mut learner = DensityTraining { config: &config, session, shape: shape(&config), pixels, state };
+    let [table, network] = &mut state.groups;
+    table.state[0].iter_mut().enumerate().for_each(|(i, v)| *v = rng::normal(5, 1, i as u64));
+    network.state[0].iter_mut().for_each(|v| *v *= 1.5);
+    let mut model = DensityModel::new(CpuDensity::new(&config, &pixels), &config, &session);
+    model.ops.load(&state.occupancy, state.rays);
+    model.groups = state.groups.map(|group| ParameterGroup::upload(model.ops.device(), group));
     let progress = |step: u64| TrainingProgress { step, ..TrainingProgress::default() };
     for step in 0..2 {
-        assert!(learner.step(&progress(step)).is_ok());
+        assert!(training::step(&mut model, session.seed, &progress(step), true).is_ok());
     }
-    let before = learner.state.parameters.clone();
-    let weights = learner.state.weights(&learner.shape);
-    let batch = learner.pixels.draw(3, 2, learner.state.rays, false, 0.0);
-    let samples = learner.state.march(&config, &learner.shape, &weights, &batch.rays);
+    let state = model.state().unwrap();
+    let before = state.groups.clone().map(|group| group.state);
+    let shape = shape(&config);
+    let weights = DensityWeights::new(&shape, &before[1][0]);
+    let batch = pixels.draw(3, 2, state.rays, false, 0.0);
+    let table = bytemuck::cast_slice(&before[0][0]);
+    let samples = march(&config, &state.occupancy, (&shape, table, &weights), &batch.rays);
     let n = samples.t.len();
     assert!(n > 100, "{n} samples");
-    let dt = f64::from(march_step(&config, 0.0));
+    let dt = f64::from(step_length(&config).at(0.0));
     let of = Var::of;
     let x: Vec<f64> = before.iter().flat_map(|p| wide(&p[0])).collect();
     let mut terms = [0.0; 2];
@@ -64,7 +69,7 @@ fn a_step_is_the_one_of_its_formulas() {
             let (mut thickness, mut seen, mut w) = (of(0.0), [of(0.0); 3], Vec::new());
             for &t in &samples.t[own.clone()] {
                 let p = std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]);
-                let (sigma, color) = plain::field(&learner.shape, &table, network, p, ray.direction);
+                let (sigma, color) = plain::field(&shape, &table, network, p, ray.direction);
                 let weight = (-thickness).exp() * (of(1.0) - (-sigma * of(dt)).exp());
                 thickness += sigma * of(dt);
                 (0..3).for_each(|k| seen[k] += weight * color[k]);
@@ -86,13 +91,15 @@ fn a_step_is_the_one_of_its_formulas() {
         terms = [smooth.value(), spread.value()];
         smooth + spread * of(0.001)
     });
-    let Ok(report) = learner.step(&progress(2)) else { panic!("a finite step") };
+    let step = training::step(&mut model, session.seed, &progress(2), true);
+    let Ok(Some(report)) = step else { panic!("a finite step") };
     for (name, want) in ["smooth", "distortion"].into_iter().zip(terms) {
         let got = report.figures.iter().find(|(n, _)| *n == name).unwrap().1;
         assert!((got - want).abs() < 1e-5 * want, "{name}: {got} {want}");
     }
     let mut start = 0;
-    for ((name, before), after) in NAMES.iter().zip(&before).zip(&learner.state.parameters) {
+    for ((name, before), after) in NAMES.iter().zip(&before).zip(model.state().unwrap().groups) {
+        let after = after.state;
         let own = &slopes[start..start + before[0].len()];
         start += own.len();
         let [value, first, second] = before.each_ref().map(|v| wide(v));

@@ -4,7 +4,18 @@
 //! to its distance for a few hundred cheap steps replaces the thousands that carve a sphere, and gives
 //! the occupancy grid a band from the first training step.
 
-use crate::kernel::march::Bitmask;
+use super::model::shape;
+use super::schedule;
+use super::state::SdfState;
+use crate::Error;
+use crate::config::iface::IfaceConfig;
+use crate::field::parameters::Part;
+use crate::field::training::{StepError, TrainingSession};
+use crate::kernel::cpu::adam::adam;
+use crate::kernel::cpu::losses::{self, LossWeights};
+use crate::kernel::cpu::march::Bitmask;
+use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
+use crate::kernel::cpu::{rng, weight_norm};
 use rayon::prelude::*;
 
 /// Signed distance to a hull's boundary at cell centres, in units of the box's half edge; negative inside.
@@ -119,6 +130,84 @@ impl HullDistance {
         }
         sum
     }
+}
+
+/// Fits the geometry of the field to the hull's distance, on the processor: half of the points in a band around its
+/// boundary.
+pub fn fit_hull(
+    state: &mut SdfState,
+    hull: &Bitmask,
+    config: &IfaceConfig,
+    session: &TrainingSession,
+) -> Result<(), StepError> {
+    /// Enough for errors well below a cell of the hull with the coarse levels.
+    const STEPS: u64 = 250;
+    const POINTS: usize = 8192;
+    /// Weights of distance and eikonal.
+    const DISTANCE: f32 = 10.0;
+    let eikonal = LossWeights { eikonal: 0.1, ..LossWeights::default() };
+    let distance = HullDistance::new(hull);
+    let shape = FieldShape { active: schedule::active_levels(config, 0), ..shape(config) };
+    let layout = shape.layout();
+    // the colors, behind the geometry, stay as they are
+    let colors = |part: &&Part| part.name.starts_with('c');
+    let [table, network, _] = &state.groups;
+    let colored: usize = network.parts.iter().filter(colors).map(|part| part.count()).sum();
+    let geometry = network.values().len() - colored;
+    let mut g_table = vec![0f32; table.values().len()];
+    let mut g_network = vec![0f32; network.values().len()];
+    for step in 0..STEPS {
+        let mut x = Vec::with_capacity(POINTS);
+        let mut target = Vec::with_capacity(POINTS);
+        let mut k = 0;
+        while target.len() < POINTS {
+            let u = |a: u64| 2.0 * rng::uniform(session.seed, 201 + (step << 10), 4 * k + a) - 1.0;
+            let p = [u(0), u(1), u(2)];
+            k += 1;
+            let f = distance.at(p);
+            // every second point anywhere, the others near the boundary
+            if k % 2 == 0 && f.abs() > 0.1 {
+                continue;
+            }
+            x.push(p.map(|c| c * config.radius));
+            target.push(f * config.radius);
+        }
+        let (_, weights) = state.weights(&shape);
+        let field = sdf::forward(&shape, state.table(), &weights, &x, &[[0.0, 0.0, 1.0]; POINTS]);
+        let mut g_field = vec![0f32; field.output().len()];
+        losses::of_samples(field.output(), &eikonal, &mut g_field);
+        let rows = field.output().chunks_exact(WIDTH).zip(g_field.chunks_exact_mut(WIDTH));
+        for ((out, g), target) in rows.zip(target) {
+            let error = out[0] - target;
+            g[0] += DISTANCE / POINTS as f32 * if error == 0.0 { 0.0 } else { error.signum() };
+        }
+        let g_flat = sdf::backward(&field, &weights, &g_field, bytemuck::cast_slice_mut(&mut g_table));
+        weight_norm::backward(layout, state.groups[1].values(), &g_flat, &mut g_network);
+        let factor = 0.1f64.powf(step as f64 / STEPS as f64) * ((step + 1) as f64 / 20.0).min(1.0);
+        if !g_network.iter().all(|g| g.is_finite()) {
+            let lr = config.lr_network * factor;
+            let problem = format!(
+                "a gradient of the fit to the visual hull is NaN or infinite at step {step} (learning rate {lr:.2e})"
+            );
+            let hint = "lower iface.lr_network and iface.lr_table, or start again with another --seed";
+            return Err(StepError::Failed(Error::cannot(problem, hint)));
+        }
+        let steps = schedule::adam_steps(config, factor, step + 1);
+        let counts = [g_table.len(), geometry];
+        for (((group, g), count), step) in
+            state.groups.iter_mut().zip([&mut g_table, &mut g_network]).zip(counts).zip(&steps)
+        {
+            let [p, m, v] = group.state.each_mut().map(|values| &mut values[..count]);
+            adam(p, m, v, &mut g[..count], step);
+        }
+        if session.monitor.stop() {
+            let kept = "before the first step: the fit to the hull starts again";
+            return Err(StepError::Failed(Error::stopped(kept)));
+        }
+    }
+    // training starts with its own moments
+    state.groups.iter_mut().for_each(|group| group.forget_moments());
+    Ok(())
 }
 
 #[cfg(test)]

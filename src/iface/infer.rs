@@ -2,23 +2,22 @@
 
 use super::model::shape;
 use super::occupancy::Occupancy;
-use super::schedule::march_step;
+use super::schedule::step_length;
 use super::state::{FORMAT, SdfState};
 use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
-use crate::field;
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
 #[cfg(feature = "wgpu")]
-use crate::field::{Place, devices::Gpu};
+use crate::field::{ComputeDevice, devices::Gpu};
 use crate::geom::{Ray, RayResult};
 #[cfg(feature = "wgpu")]
 use crate::io::Lock;
+use crate::kernel::cpu::march::{Bitmask, MarchRay, Samples};
+use crate::kernel::cpu::mlp::Weights;
+use crate::kernel::cpu::neus::{self, Rays};
+use crate::kernel::cpu::sdf::{self, FieldShape};
 #[cfg(feature = "wgpu")]
 use crate::kernel::gpu::Evaluator;
-use crate::kernel::march::{Bitmask, MarchRay, Samples};
-use crate::kernel::mlp::Weights;
-use crate::kernel::neus::{self, Rays};
-use crate::kernel::sdf::{self, FieldShape};
 use glam::Vec3;
 use std::path::Path;
 #[cfg(feature = "wgpu")]
@@ -42,7 +41,7 @@ pub struct IFace {
     #[cfg(feature = "wgpu")]
     flat: Vec<f32>,
     #[cfg(feature = "wgpu")]
-    there: Option<OnGpu>,
+    on_gpu: Option<OnGpu>,
 }
 
 /// The field on a device, which answers instead of the processor until it fails.
@@ -57,10 +56,10 @@ struct OnGpu {
 impl IFace {
     pub(super) fn new(config: &IfaceConfig, state: SdfState) -> IFace {
         let shape = shape(config);
-        let (table, weights) = state.model.on_host(&shape);
-        #[cfg(feature = "wgpu")]
-        let flat = field::values(state.model.weights().inner());
-        let (inv_s, occupancy) = (state.model.sharpness(), state.occupancy);
+        let (_flat, weights) = state.weights(&shape);
+        let inv_s = state.inv_s();
+        let SdfState { groups: [table, ..], occupancy, .. } = state;
+        let [table, ..] = table.state;
         let mut face = IFace {
             config: config.clone(),
             shape,
@@ -69,9 +68,9 @@ impl IFace {
             inv_s,
             occupancy,
             #[cfg(feature = "wgpu")]
-            flat,
+            flat: _flat,
             #[cfg(feature = "wgpu")]
-            there: None,
+            on_gpu: None,
         };
         if config.occupancy == OccupancyRule::Band {
             // the surface moved since the last update
@@ -87,33 +86,33 @@ impl IFace {
     pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&Bitmask>) -> Result<IFace> {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
         TrainingProgress::restore(&file, config.steps)?;
-        let state = SdfState::restore(config, hull, &mut file, &field::processor())?;
+        let state = SdfState::restore(config, hull, &mut file)?;
         Ok(IFace::new(config, state))
     }
 
     /// Lets the GPU of a place answer, if it is one.
     #[cfg(feature = "wgpu")]
-    pub fn on(mut self, place: Place) -> IFace {
-        let Place::Gpu(Gpu { device, lock, .. }) = place else { return self };
-        if !Evaluator::knows(&self.shape) {
+    pub fn on(mut self, place: ComputeDevice) -> IFace {
+        let ComputeDevice::Gpu(Gpu { device, lock, .. }) = place else { return self };
+        if !Evaluator::supports(&self.shape) {
             return self;
         }
         let band = self.config.occupancy == OccupancyRule::Band;
         let masks = [Some(&self.occupancy.occupied), band.then_some(&self.occupancy.solid)];
         let evaluator = Evaluator::new(device, &self.shape, &self.table, &self.flat, self.inv_s, masks);
         let failed = AtomicBool::new(false);
-        self.there = Some(OnGpu { evaluator: Mutex::new(evaluator), _lock: lock, failed });
+        self.on_gpu = Some(OnGpu { evaluator: Mutex::new(evaluator), _lock: lock, failed });
         self
     }
 
     /// What the device answers; none where there is none, or where it failed: then the processor answers.
     #[cfg(feature = "wgpu")]
     fn ask<T>(&self, question: impl FnOnce(&mut Evaluator) -> Result<T>) -> Option<T> {
-        let there = self.there.as_ref().filter(|there| !there.failed.load(Ordering::Relaxed))?;
-        let mut evaluator = there.evaluator.lock().ok()?;
+        let gpu = self.on_gpu.as_ref().filter(|gpu| !gpu.failed.load(Ordering::Relaxed))?;
+        let mut evaluator = gpu.evaluator.lock().ok()?;
         let answer = question(&mut evaluator);
         if let Err(e) = &answer {
-            there.failed.store(true, Ordering::Relaxed);
+            gpu.failed.store(true, Ordering::Relaxed);
             tracing::warn!("{e}; the processor goes on");
         }
         answer.ok()
@@ -130,7 +129,7 @@ impl IFace {
 
     fn raw_sdf(&self, x: &[[f32; 3]]) -> Vec<f32> {
         #[cfg(feature = "wgpu")]
-        if let Some(mut planes) = self.ask(|there| there.outputs(x, None, None, 0..1)) {
+        if let Some(mut planes) = self.ask(|field| field.evaluate(x, None, None, 0..1)) {
             return planes.swap_remove(0);
         }
         sdf::values(&self.shape, self.table(), &self.weights, x)
@@ -154,7 +153,7 @@ impl IFace {
     pub fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
         let x = self.scaled(points);
         #[cfg(feature = "wgpu")]
-        if let Some(planes) = self.ask(|there| there.outputs(&x, None, None, 7..8)) {
+        if let Some(planes) = self.ask(|field| field.evaluate(&x, None, None, 7..8)) {
             return planes[0].iter().map(|soft| self.inv_s() * soft.exp()).collect();
         }
         let soft = sdf::softness(&self.shape, self.table(), &self.weights, &x);
@@ -165,7 +164,7 @@ impl IFace {
     pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let x = self.scaled(points);
         #[cfg(feature = "wgpu")]
-        if let Some(planes) = self.ask(|there| there.outputs(&x, None, None, 0..4)) {
+        if let Some(planes) = self.ask(|field| field.evaluate(&x, None, None, 0..4)) {
             let [f, nx, ny, nz] = [0, 1, 2, 3].map(|k| &planes[k]);
             let normal = |i: usize| Vec3::new(nx[i], ny[i], nz[i]);
             return (f.iter().map(|f| f / self.config.radius).collect(), (0..x.len()).map(normal).collect());
@@ -186,14 +185,14 @@ impl IFace {
         let arrays = |v: &[Vec3]| -> Vec<[f32; 3]> { v.iter().map(|v| v.to_array()).collect() };
         let (x, normals, directions) = (self.scaled(points), arrays(normals), arrays(directions));
         #[cfg(feature = "wgpu")]
-        if self.there.is_some() {
+        if self.on_gpu.is_some() {
             // a point with several directions is evaluated for each
             let each: Vec<usize> =
                 (0..x.len()).flat_map(|i| std::iter::repeat_n(i, counts[i] as usize)).collect();
             let [x, normals]: [Vec<[f32; 3]>; 2] =
                 [&x, &normals].map(|rows| each.iter().map(|&i| rows[i]).collect());
-            let asked = self.ask(|there| there.outputs(&x, Some(&directions), Some(&normals), 4..7));
-            if let Some(rgb) = asked {
+            let colors = self.ask(|field| field.evaluate(&x, Some(&directions), Some(&normals), 4..7));
+            if let Some(rgb) = colors {
                 return (0..each.len()).map(|i| [rgb[0][i], rgb[1][i], rgb[2][i]]).collect();
             }
         }
@@ -210,7 +209,7 @@ impl IFace {
     fn render_pass(&self, rays: &[Ray]) -> Vec<RayResult> {
         let config = &self.config;
         let radius = config.radius;
-        let dt = march_step(config, self.inv_s);
+        let dt = step_length(config).at(self.inv_s);
         let marched: Vec<MarchRay> = rays
             .iter()
             .map(|r| MarchRay {
@@ -220,7 +219,7 @@ impl IFace {
             })
             .collect();
         #[cfg(feature = "wgpu")]
-        if let Some(seen) = self.ask(|there| there.render(&marched, dt)) {
+        if let Some(seen) = self.ask(|field| field.render(&marched, dt)) {
             return seen.iter().map(|o| self.result(o)).collect();
         }
         let samples = self.occupancy.march(config, dt, &marched);

@@ -8,14 +8,15 @@
 //! network the hash features themselves, and hold the surface to points that stereo finds on it half-way (Fu et al.
 //! 2022, "Geo-NeuS", use points of a reconstruction as zero set).
 
+mod cpu;
 mod density;
+#[cfg(feature = "wgpu")]
+mod gpu;
 mod hull_start;
 mod infer;
-mod losses;
 mod model;
 mod occupancy;
-#[cfg(feature = "wgpu")]
-mod on_device;
+mod ops;
 mod schedule;
 mod state;
 mod stereo;

@@ -1,8 +1,8 @@
 //! Which cells of the box may hold surface.
 
 use crate::config::iface::{IfaceConfig, OccupancyRule};
-use crate::kernel::march::{self, Bitmask, MarchRay, Samples, nerfacc};
-use crate::kernel::{neus, rng};
+use crate::kernel::cpu::march::{self, Bitmask, MarchRay, Samples, nerfacc};
+use crate::kernel::cpu::{neus, rng};
 use rayon::prelude::*;
 
 /// Cells to march through, cells known to be deep inside, and the history the nerfacc rule keeps.

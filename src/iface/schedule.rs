@@ -1,6 +1,8 @@
 //! What changes with the step: learning rate, rays per step, active levels, march step.
 
 use crate::config::iface::{IfaceConfig, OccupancyRule};
+use crate::kernel::cpu::adam::AdamStep;
+use crate::kernel::cpu::schedule::{RayBudget, StepLength};
 
 /// Learning-rate factor at optimizer step `n`: linear from 1 % over `warmup`, then exponential down to
 /// `lr_final` at `steps`.
@@ -13,15 +15,31 @@ pub fn learning_rate(config: &IfaceConfig, n: u64) -> f64 {
     }
 }
 
-/// Rays of the next step: nine tenths of this step's count plus a tenth of the count that would have met
-/// the sample budget, at most `max`. The published code has no floor and divides by zero when no ray
-/// met a sample; here a step without samples keeps its count, and at least `min` are drawn.
-pub fn next_rays(rays: usize, samples: usize, budget: usize, min: usize, max: usize) -> usize {
-    if samples == 0 {
-        return rays;
-    }
-    let fitting = (rays as f64 * (budget as f64 / samples as f64)) as usize;
-    ((rays as f64 * 0.9 + fitting as f64 * 0.1) as usize).clamp(min.min(max), max)
+/// AdamW of the three groups at step number `step`, from 1, where learning rates are `factor` of their peak.
+pub fn adam_steps(config: &IfaceConfig, factor: f64, step: u64) -> [AdamStep; 3] {
+    let network = AdamStep {
+        lr: (config.lr_network * factor) as f32,
+        beta1: 0.9,
+        beta2: 0.99,
+        epsilon: 1e-15,
+        weight_decay: config.weight_decay as f32,
+        step,
+        skip_zero: false,
+    };
+    let table = AdamStep {
+        lr: (config.lr_table * factor) as f32,
+        weight_decay: config.table_decay as f32,
+        skip_zero: config.touched_rows,
+        ..network
+    };
+    let variance = AdamStep { lr: (config.lr_variance * factor) as f32, ..network };
+    [table, network, variance]
+}
+
+/// How the rays of a step follow the samples of the one before it.
+pub fn ray_budget(config: &IfaceConfig) -> RayBudget {
+    let min = if config.occupancy == OccupancyRule::Band { 64 } else { 1 };
+    RayBudget { samples: config.samples, min, max: config.max_rays }
 }
 
 /// Hash levels that take part at a step.
@@ -53,13 +71,23 @@ pub fn stereo_step(config: &IfaceConfig) -> Option<u64> {
     (config.stereo > 0.0).then_some((config.steps as f64 * config.stereo_at) as u64)
 }
 
-/// Returns the march step at a sharpness.
-pub fn march_step(config: &IfaceConfig, inv_s: f32) -> f32 {
+/// How long march steps are.
+pub fn step_length(config: &IfaceConfig) -> StepLength {
     match config.occupancy {
         // nerfacc's constant 1.732 where √3 is meant, kept for the published step length
-        OccupancyRule::Nerfacc => 1.732 * 2.0 * config.radius / config.samples_per_ray as f32,
-        OccupancyRule::Band => (config.march / inv_s).min(config.max_step).max(config.min_step),
+        OccupancyRule::Nerfacc => {
+            StepLength::Constant(1.732 * 2.0 * config.radius / config.samples_per_ray as f32)
+        }
+        OccupancyRule::Band => {
+            StepLength::OfSharpness { units: config.march, min: config.min_step, max: config.max_step }
+        }
     }
+}
+
+/// Is the occupancy updated before this step? A new level, and the end of the hull's fit, move the surface: at once then.
+pub fn updates_occupancy(config: &IfaceConfig, step: u64) -> bool {
+    let level_came = config.level_every > 0 && step.is_multiple_of(config.level_every);
+    step.is_multiple_of(config.occupancy_every) || (config.occupancy == OccupancyRule::Band && level_came)
 }
 
 #[cfg(test)]
@@ -86,19 +114,6 @@ mod tests {
     }
 
     #[test]
-    fn the_ray_count_follows_the_published_sequence_and_stalls_where_it_does() {
-        // 100 samples per ray from 256 rays, budget 262,144
-        let mut rays = 256;
-        let mut seen = Vec::new();
-        for _ in 0..200 {
-            rays = next_rays(rays, rays * 100, 262_144, 1, 8192);
-            seen.push(rays);
-        }
-        assert_eq!(&seen[..6], [492, 704, 895, 1067, 1222, 1361]);
-        assert_eq!(seen[199], 2612);
-    }
-
-    #[test]
     fn rays_stand_for_less_as_levels_come_and_for_a_pixel_in_the_second_half() {
         let config = IfaceConfig::preset(Preset::Draft);
         // cells of the level with 16 · 1.4⁵ = 86.05 of them on a side of 2, then 120.5; the finest has 1269.7
@@ -108,11 +123,5 @@ mod tests {
             assert!((detail(&config, step) - want).abs() < 1e-6, "{step}: {}", detail(&config, step));
         }
         assert!((cell(&config, config.levels) - 0.001_575_2).abs() < 1e-6);
-    }
-
-    #[test]
-    fn a_step_without_samples_changes_nothing() {
-        assert_eq!(next_rays(300, 0, 1000, 64, 8192), 300);
-        assert_eq!(next_rays(64, 1_000_000, 1000, 64, 8192), 64);
     }
 }

@@ -1,21 +1,24 @@
 //! What a training of I-Face keeps between steps, and how it lies in a checkpoint.
 
-use super::model::SdfModel;
+use super::model::{initial, parts};
 use super::occupancy::Occupancy;
 use super::stereo::SurfacePoint;
 use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::checkpoint::Checkpoint;
-use crate::kernel::march::Bitmask;
-use burn::tensor::Device;
+use crate::field::parameters::HostGroup;
+use crate::kernel::cpu::march::Bitmask;
+use crate::kernel::cpu::mlp::Weights;
+use crate::kernel::cpu::sdf::FieldShape;
+use crate::kernel::cpu::weight_norm;
 
 /// Version of the checkpoints' layout.
 pub const FORMAT: &str = "tiface-iface-1";
 
 /// Training between two steps.
 pub struct SdfState {
-    /// Parameters with the optimizer's moments.
-    pub model: SdfModel,
+    /// Hash table, networks and variance.
+    pub groups: [HostGroup; 3],
     /// Cells to march through.
     pub occupancy: Occupancy,
     /// Rays of the next step.
@@ -26,9 +29,9 @@ pub struct SdfState {
 
 impl SdfState {
     /// Returns the state before the first step.
-    pub fn new(config: &IfaceConfig, seed: u64, hull: Option<&Bitmask>, device: &Device) -> SdfState {
+    pub fn new(config: &IfaceConfig, seed: u64, hull: Option<&Bitmask>) -> SdfState {
         SdfState {
-            model: SdfModel::new(config, seed, device),
+            groups: initial(config, seed),
             occupancy: Occupancy::new(config, hull),
             rays: config.rays,
             stereo: Vec::new(),
@@ -37,7 +40,7 @@ impl SdfState {
 
     /// Puts the state into a checkpoint.
     pub fn save(&self, into: &mut Checkpoint) {
-        self.model.0.iter().for_each(|p| p.save(into, true));
+        self.groups.iter().for_each(|group| group.save(into, true));
         let o = &self.occupancy;
         into.put_words("occupancy.occupied", o.occupied.bits.clone());
         into.put_words("occupancy.solid", o.solid.bits.clone());
@@ -53,13 +56,9 @@ impl SdfState {
     }
 
     /// Takes the state out of a checkpoint; names, shapes and types must be exactly the configured model's.
-    pub fn restore(
-        config: &IfaceConfig,
-        hull: Option<&Bitmask>,
-        from: &mut Checkpoint,
-        device: &Device,
-    ) -> Result<SdfState> {
-        let model = SdfModel::restore(config, from, device)?;
+    pub fn restore(config: &IfaceConfig, hull: Option<&Bitmask>, from: &mut Checkpoint) -> Result<SdfState> {
+        let [table, network, variance] = parts(config).map(|parts| HostGroup::restore(parts, from, true));
+        let groups = [table?, network?, variance?];
         let mut occupancy = Occupancy::new(config, hull);
         if !occupancy.history.is_empty() {
             occupancy.history = from.floats("occupancy.history", &[occupancy.history.len()])?;
@@ -78,6 +77,23 @@ impl SdfState {
             let rows = from.floats("stereo", &[count, SurfacePoint::WIDTH])?;
             stereo.extend(rows.chunks_exact(SurfacePoint::WIDTH).map(SurfacePoint::of_row));
         }
-        Ok(SdfState { model, occupancy, rays: from.number("rays", 1..=most)? as usize, stereo })
+        Ok(SdfState { groups, occupancy, rays: from.number("rays", 1..=most)? as usize, stereo })
+    }
+
+    /// Returns the hash table, `[entries, 2]`.
+    pub fn table(&self) -> &[[f32; 2]] {
+        bytemuck::cast_slice(self.groups[0].values())
+    }
+
+    /// Returns the flat network weights of the field, weight norm applied, and the same prepared for its kernels.
+    pub fn weights(&self, shape: &FieldShape) -> (Vec<f32>, Weights) {
+        let flat = weight_norm::forward(shape.layout(), self.groups[1].values());
+        let weights = Weights::new(shape.layout(), &flat);
+        (flat, weights)
+    }
+
+    /// Returns the NeuS sharpness.
+    pub fn inv_s(&self) -> f32 {
+        (10.0 * self.groups[2].values()[0]).exp().clamp(1e-6, 1e6)
     }
 }

@@ -1,7 +1,7 @@
 //! Points of the surface that several photographs agree on, found from the field as it is.
 //!
 //! Rays meet the field's zero set; points spread over it are moved along their normals until all photographs that see
-//! them show the same there ([`crate::kernel::stereo`]). Hair is left out: stereo finds its strands some millimeters
+//! them show the same there ([`crate::kernel::cpu::stereo`]). Hair is left out: stereo finds its strands some millimeters
 //! inside of where its outline is.
 
 use super::occupancy::Occupancy;
@@ -9,10 +9,10 @@ use crate::config::iface::IfaceConfig;
 use crate::field::pixels::TrainView;
 use crate::geom::Camera;
 use crate::image::eroded;
-use crate::kernel::march::MarchRay;
-use crate::kernel::mlp::Weights;
-use crate::kernel::sdf::{self, FieldShape};
-use crate::kernel::stereo::{self, StereoPoint, StereoView, Surfel};
+use crate::kernel::cpu::march::MarchRay;
+use crate::kernel::cpu::mlp::Weights;
+use crate::kernel::cpu::sdf::{self, FieldShape};
+use crate::kernel::cpu::stereo::{self, StereoPoint, StereoView, Surfel};
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 

@@ -1,23 +1,7 @@
-//! The arithmetic: slices in, slices out; rayon and autovectorised SIMD; knows no tensors.
+//! The arithmetic of the learned fields: slices or buffers in, slices or buffers out.
 //!
-//! Every kernel gives the same bytes for any number of threads: work is cut into pieces of fixed
-//! size, each piece owns what it writes, and sums over pieces are taken in a fixed order.
+//! A kernel of a GPU has the name of its twin on the processor.
 
-pub mod adam;
-pub mod cg;
-pub mod density;
+pub mod cpu;
 #[cfg(feature = "wgpu")]
 pub mod gpu;
-pub mod hash;
-pub mod march;
-pub mod matrix;
-pub mod mlp;
-pub mod neus;
-pub mod pool;
-pub(crate) mod reference;
-pub mod rng;
-pub mod sdf;
-pub mod simd;
-pub mod sphharm;
-pub mod stereo;
-pub mod vm;

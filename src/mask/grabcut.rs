@@ -311,7 +311,7 @@ fn edges(photo: &Photo) -> Vec<[i32; 4]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernel::rng;
+    use crate::kernel::cpu::rng;
 
     /// A noisy disc of two skin-like colors on a dark background with bright lamps; `scale` enlarges everything.
     fn head(scale: f32) -> (Photo, Vec<bool>) {

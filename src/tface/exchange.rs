@@ -10,8 +10,8 @@ use crate::field::checkpoint::{self, Checkpoint};
 use crate::field::training::TrainingSession;
 use crate::geom::Similarity;
 use crate::io::Limits;
-use crate::kernel::vm::mask::BoxMask;
-use crate::kernel::vm::{DecoderShape, Factor, Grid, Shading};
+use crate::kernel::cpu::vm::mask::BoxMask;
+use crate::kernel::cpu::vm::{DecoderShape, Factor, Grid, Shading};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -92,7 +92,7 @@ pub fn import_th(
         return Err(unsound("its grid has more than 65536 nodes along an axis"));
     }
     let record = record_of(&c, Some(placement));
-    record.sound().map_err(unsound)?;
+    record.validate().map_err(unsound)?;
     let face = field_of(&c, &record);
     let mut file = Checkpoint::new(session.stage, FORMAT, session.identity);
     file.set("finished", 1);

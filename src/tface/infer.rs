@@ -4,10 +4,10 @@ use super::record::{FORMAT, FieldRecord, NAMES, Placement, geometry};
 use crate::Result;
 use crate::field::checkpoint::{self, Checkpoint};
 use crate::geom::{Ray, RayResult};
+use crate::kernel::cpu::march::MarchRay;
+use crate::kernel::cpu::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
 #[cfg(feature = "wgpu")]
 use crate::kernel::gpu;
-use crate::kernel::march::MarchRay;
-use crate::kernel::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
 use glam::Vec3;
 use std::path::Path;
 #[cfg(feature = "wgpu")]
@@ -22,7 +22,7 @@ pub struct TFace {
     pub(super) placement: Option<Placement>,
     /// The field on a device, which answers instead of the processor.
     #[cfg(feature = "wgpu")]
-    there: Mutex<Option<gpu::VmRenderer>>,
+    on_gpu: Mutex<Option<gpu::VmRenderer>>,
 }
 
 /// Rays rendered together: what they keep stays in the low hundreds of megabytes.
@@ -37,7 +37,7 @@ impl TFace {
             weights,
             placement,
             #[cfg(feature = "wgpu")]
-            there: Mutex::new(None),
+            on_gpu: Mutex::new(None),
         }
     }
 
@@ -58,21 +58,21 @@ impl TFace {
     /// Lets a device answer, where it can decode this field.
     #[cfg(feature = "wgpu")]
     pub(super) fn on(&mut self, device: Arc<gpu::Device>) {
-        if gpu::DeviceDecoder::knows(&self.field.decoder).is_ok() {
+        if gpu::DeviceDecoder::supports(&self.field.decoder).is_ok() {
             let renderer =
                 gpu::VmRenderer::new(device, &self.field, self.values.each_ref().map(|v| v.as_slice()));
-            self.there = Mutex::new(Some(renderer));
+            self.on_gpu = Mutex::new(Some(renderer));
         }
     }
 
     /// What the device answers; none where there is none, or where it failed: then the processor answers.
     #[cfg(feature = "wgpu")]
     fn ask(&self, rays: impl Fn() -> Vec<MarchRay>) -> Option<Vec<[f32; RAY_WIDTH]>> {
-        let mut there = self.there.lock().ok()?;
-        let answer = there.as_mut()?.render(&rays());
+        let mut renderer = self.on_gpu.lock().ok()?;
+        let answer = renderer.as_mut()?.render(&rays());
         if let Err(e) = &answer {
             tracing::warn!("{e}; the processor goes on");
-            *there = None;
+            *renderer = None;
         }
         answer.ok()
     }

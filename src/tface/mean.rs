@@ -18,13 +18,13 @@ use super::TFace;
 use super::train::{self, TfaceReport, train_one};
 use crate::config::{MaskUse, VmConfig, VmStart};
 #[cfg(feature = "wgpu")]
-use crate::field::Place;
+use crate::field::ComputeDevice;
 use crate::field::pixels::{LARGE, Pixels, TrainView};
 use crate::field::training::{self, TrainingSession};
 use crate::geom::{Aabb, Ray, RayResult};
 #[cfg(feature = "wgpu")]
 use crate::io::Lock;
-use crate::kernel::march::Bitmask;
+use crate::kernel::cpu::march::Bitmask;
 use crate::{Monitor, Result, io};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
@@ -52,8 +52,8 @@ impl FieldMean {
 
     /// Lets the GPU of a place answer, if it is one.
     #[cfg(feature = "wgpu")]
-    pub fn on(mut self, place: Place) -> FieldMean {
-        let Place::Gpu(gpu) = place else { return self };
+    pub fn on(mut self, place: ComputeDevice) -> FieldMean {
+        let ComputeDevice::Gpu(gpu) = place else { return self };
         let device = Arc::new(gpu.device);
         self.fields.iter_mut().for_each(|field| field.on(device.clone()));
         FieldMean { _lock: gpu.lock, ..self }

@@ -5,17 +5,21 @@
 //! on photographs as they are; only its box still comes from the masks.
 
 #[cfg(feature = "cpu")]
-mod exchange;
+mod cpu;
 #[cfg(feature = "cpu")]
-mod grow;
+mod exchange;
+#[cfg(feature = "wgpu")]
+mod gpu;
 #[cfg(feature = "cpu")]
 mod infer;
 #[cfg(feature = "cpu")]
 mod mean;
-#[cfg(feature = "wgpu")]
-mod on_device;
+#[cfg(feature = "cpu")]
+mod ops;
 #[cfg(feature = "cpu")]
 mod record;
+#[cfg(feature = "cpu")]
+mod refine;
 #[cfg(feature = "cpu")]
 mod state;
 pub mod th;

@@ -3,8 +3,8 @@
 use crate::Result;
 use crate::config::{DensityActivation, VmConfig};
 use crate::field::checkpoint::Checkpoint;
-use crate::kernel::vm::mask::{BoxMask, Lattice};
-use crate::kernel::vm::{DecoderShape, Grid, Shading, VmField, samples_across, step_size};
+use crate::kernel::cpu::vm::mask::{BoxMask, Lattice};
+use crate::kernel::cpu::vm::{DecoderShape, Grid, Shading, VmField, samples_across, step_size};
 use serde::{Deserialize, Serialize};
 
 /// Version of the checkpoints' layout.
@@ -103,7 +103,7 @@ impl FieldRecord {
     }
 
     /// Can this be rendered at all? What is impossible, else.
-    pub fn sound(&self) -> Result<(), &'static str> {
+    pub fn validate(&self) -> Result<(), &'static str> {
         let (d, s) = (&self.decoder, &self.shading);
         let numbers = [s.shift, s.distance_scale, s.weight_threshold, s.stop, self.mask_threshold];
         let ranks = [self.density_rank, self.color_rank];
@@ -176,7 +176,7 @@ impl FieldRecord {
     pub fn restore(from: &Checkpoint) -> Result<FieldRecord> {
         let record: FieldRecord = serde_json::from_str(from.text("field")?)
             .map_err(|e| from.wrong(format!("its `field` cannot be understood: {e}")))?;
-        record.sound().map_err(|why| from.wrong(why.into()))?;
+        record.validate().map_err(|why| from.wrong(why.into()))?;
         Ok(record)
     }
 }

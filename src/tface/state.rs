@@ -4,22 +4,22 @@ use super::record::{FieldRecord, NAMES, decoder, geometry, grids};
 use crate::Result;
 use crate::config::VmConfig;
 use crate::field::checkpoint::Checkpoint;
-use crate::field::parameters::Parameter;
-use crate::kernel::march::Bitmask;
-use crate::kernel::rng;
-use crate::kernel::vm::mask::BoxMask;
-use crate::kernel::vm::{VmField, size_for, voxel_schedule};
-use burn::tensor::Device;
+use crate::field::parameters::{HostGroup, Part};
+use crate::kernel::cpu::march::Bitmask;
+use crate::kernel::cpu::rng;
+use crate::kernel::cpu::vm::mask::BoxMask;
+use crate::kernel::cpu::vm::{VmField, size_for, voxel_schedule};
 use std::sync::Arc;
 
 /// Training between two steps.
+#[derive(Clone)]
 pub struct VmState {
     /// Lower and upper corner of the grid, scene units.
     pub bounds: [[f32; 3]; 2],
     /// Vertices along each axis.
     pub size: [usize; 3],
     /// Flat planes and lines of the density, those of the appearance, flat decoder weights.
-    pub parameters: [Parameter; 3],
+    pub groups: [HostGroup; 3],
     /// Cells that may hold anything; all without.
     pub mask: Option<BoxMask>,
     /// Step at which the learning rates last started.
@@ -58,26 +58,20 @@ fn hull_mask(hull: &Bitmask) -> Option<BoxMask> {
 
 impl VmState {
     /// Returns the start, before any step.
-    pub fn new(
-        config: &VmConfig,
-        seed: u64,
-        bounds: [[f32; 3]; 2],
-        hull: Option<&Bitmask>,
-        device: &Device,
-    ) -> VmState {
+    pub fn new(config: &VmConfig, seed: u64, bounds: [[f32; 3]; 2], hull: Option<&Bitmask>) -> VmState {
         let extent = std::array::from_fn(|a| bounds[1][a] - bounds[0][a]);
         let size = size_for(extent, config.voxels_start);
         let mut names = NAMES.into_iter();
-        let parameters = start_values(config, size, seed)
-            .map(|values| Parameter::new(names.next().unwrap_or_default(), &[values.len()], values, device));
+        let groups = start_values(config, size, seed)
+            .map(|values| HostGroup::flat(names.next().unwrap_or_default(), values));
         let mask = hull.and_then(hull_mask);
-        VmState { bounds, size, parameters, mask, reset: 0, moments_from: 0, masked: false }
+        VmState { bounds, size, groups, mask, reset: 0, moments_from: 0, masked: false }
     }
 
     /// Is every weight a finite number? A NaN in a relu density has neither weight nor gradient: no loss
     /// would tell, and total variation would spread it.
     pub fn is_finite(&self) -> bool {
-        self.parameters.iter().all(|p| p.is_finite())
+        self.groups.iter().all(|group| group.is_finite())
     }
 
     /// Returns the field as the kernels see it. In training a ray has `‖size‖ / ratio` samples, else as many as the
@@ -110,7 +104,7 @@ impl VmState {
     /// from it.
     pub fn save(&self, config: &VmConfig, into: &mut Checkpoint, finished: bool) {
         FieldRecord::of(config).save(self.bounds, self.size, self.mask.as_ref(), into);
-        self.parameters.iter().for_each(|p| p.save(into, !finished));
+        self.groups.iter().for_each(|group| group.save(into, !finished));
         into.set("reset", self.reset);
         into.set("moments_from", self.moments_from);
         into.set("masked", u64::from(self.masked));
@@ -130,8 +124,8 @@ impl VmState {
         (self.bounds, self.size, self.mask) = geometry(from)?;
         let (density, color) = grids(config, self.size);
         let lengths = [density.len(), color.len(), decoder(config).len()];
-        for (p, len) in self.parameters.iter_mut().zip(lengths) {
-            p.restore(&[len], from, !finished)?;
+        for ((group, name), len) in self.groups.iter_mut().zip(NAMES).zip(lengths) {
+            *group = HostGroup::restore(vec![Part { name, shape: vec![len] }], from, !finished)?;
         }
         Ok(())
     }

@@ -1,14 +1,17 @@
 //! A whole optimizer step against the same arithmetic in f64: sampling, field, compositing, every loss term and the groups
 //! of Adam, parameter by parameter, for every row of the paper's table; and the terms on numbers worked by hand.
 
+use super::super::ops::mask_term;
 use super::*;
 use crate::Quiet;
-use crate::config::{DensityActivation, Preset};
+use crate::config::{DensityActivation, MaskLoss, Preset, VmBackground};
 use crate::field::ball::{session, temporary, views};
-use crate::kernel::march::MarchRay;
-use crate::kernel::reference::tape::{AdamW, Stepped, Var, gradient};
-use crate::kernel::reference::{Real, vm, wide};
-use crate::kernel::vm::Grid;
+use crate::field::parameters::HostGroup;
+use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};
+use crate::kernel::cpu::reference::{Real, vm, wide};
+use crate::kernel::cpu::rng;
+use crate::kernel::cpu::vm::Grid;
+use crate::kernel::cpu::vm::losses::{Targets, of_rays};
 use std::path::Path;
 
 const BOX: [[f32; 3]; 2] = [[-0.8, -0.7, -0.75], [0.8, 0.7, 0.75]];
@@ -32,19 +35,12 @@ fn paper() -> VmConfig {
     .placed(BOX)
 }
 
-fn learner<'a>(config: &'a VmConfig, pixels: &'a Pixels<'a>, dir: &'a Path) -> VmTraining<'a> {
-    let device = field::processor();
+fn model<'a>(config: &'a VmConfig, pixels: &'a Pixels<'a>, dir: &'a Path) -> VmModel<'a, CpuVm<'a>> {
     let session = session("tface", dir, "step", &Quiet);
-    let state = VmState::new(config, session.seed, BOX, None, &device);
-    VmTraining { config, session, device, pixels, state, counts: Counts::default() }
-}
-
-fn kept(learner: &VmTraining) -> Vec<[Vec<f32>; 3]> {
-    let mut file = Checkpoint::new("tface", FORMAT, "kept");
-    learner.state.save(learner.config, &mut file, false);
-    let mut read = |kind: &str, name: &str, n: usize| file.floats(&format!("{kind}.{name}"), &[n]).unwrap();
-    let each = learner.state.parameters.iter();
-    each.map(|p| ["model", "first", "second"].map(|kind| read(kind, p.name, p.len()))).collect()
+    let state = VmState::new(config, session.seed, BOX, None);
+    let mut model = VmModel::new(CpuVm::new(config, pixels), state, config, &session);
+    model.load();
+    model
 }
 
 /// 2 (Σ (∂_h x)² / (C (H − 1) W) + Σ (∂_w x)² / (C H (W − 1))) of all planes.
@@ -90,11 +86,11 @@ fn orthogonality(grid: &Grid, x: &[Var]) -> Var {
 }
 
 /// Color loss, mask loss and all together, by the formulas.
-fn formulas(learner: &VmTraining, x: &[Var], step: u64) -> [Var; 3] {
+fn formulas((config, pixels, state): (&VmConfig, &Pixels, &VmState), x: &[Var], step: u64) -> [Var; 3] {
     let of = Var::of;
-    let (config, seed) = (learner.config, learner.session.seed);
-    let field = learner.state.field(config, true);
-    let batch = learner.pixels.draw(seed, step, config.rays, true, 0.0);
+    let seed = 3; // of the session
+    let field = state.field(config, true);
+    let batch = pixels.draw(seed, step, config.rays, true, 0.0);
     let out = vm::render(&field, x, &batch.rays);
     let n = batch.rays.len();
     let white = config.background == VmBackground::Reference && rng::uniform(seed, step << 4 | 9, 0) < 0.5;
@@ -120,7 +116,7 @@ fn formulas(learner: &VmTraining, x: &[Var], step: u64) -> [Var; 3] {
     }
     let rgb = squares / of(3.0 * n as f64);
     let mask = match config.mask_loss {
-        _ if !learner.pixels.masked => of(0.0),
+        _ if !pixels.has_masks => of(0.0),
         MaskLoss::None => of(0.0),
         MaskLoss::L2 => outside / of(count),
         MaskLoss::Ce => cross / of(n as f64),
@@ -142,24 +138,28 @@ fn agrees(config: &VmConfig) {
     let dir = temporary();
     let views = masked_as_configured(views(), config.masks);
     let pixels = Pixels::permuted(&views, config.foreground, BOX, config.depth_directions);
-    let mut learner = learner(config, &pixels, dir.path());
+    let mut model = model(config, &pixels, dir.path());
+    let seed = model.session.seed;
     let progress = |step: u64| TrainingProgress { step, ..TrainingProgress::default() };
     for step in 0..2 {
-        assert!(learner.step(&progress(step)).is_ok());
+        assert!(training::step(&mut model, seed, &progress(step), true).is_ok());
     }
-    let before = kept(&learner);
+    let kept = |model: &VmModel<CpuVm>| model.state().ok().unwrap().groups.map(|group| group.state);
+    let before = kept(&model);
     let x: Vec<f64> = before.iter().flat_map(|[v, ..]| wide(v)).collect();
     let mut terms = [0.0; 2];
     let (_, slopes) = gradient(&x, |x| {
-        let [rgb, mask, total] = formulas(&learner, x, 2);
+        let [rgb, mask, total] = formulas((config, &pixels, &model.state), x, 2);
         terms = [rgb.value(), mask.value()];
         total
     });
-    let Ok(report) = learner.step(&progress(2)) else { panic!("a finite step") };
+    let Ok(Some(report)) = training::step(&mut model, seed, &progress(2), true) else {
+        panic!("a finite step")
+    };
     for ((name, got), want) in report.figures.iter().zip(terms) {
         assert!((got - want).abs() <= 1e-5 * want.abs(), "{name}: {got} {want}");
     }
-    let after = kept(&learner);
+    let after = kept(&model);
     let factor = 0.1f64.powf(2.0 / config.steps as f64);
     let mut start = 0;
     for (i, (before, after)) in before.iter().zip(&after).enumerate() {
@@ -207,34 +207,25 @@ fn a_step_with_softplus_and_encodings_is_the_one_of_its_formulas() {
     });
 }
 
-/// Three rays: half seen on head, background of which 0.6 and 0.2 are collected.
-fn three() -> (Tensor<2>, Batch) {
-    let device = field::processor();
-    let out = vec![
+/// Color and mask losses of three rays, half seen on head, background of which 0.6 and 0.2 are collected.
+fn losses_of(config: &VmConfig, step: u64) -> (f32, f32) {
+    let composed = [
         0.3, 0.2, 0.1, 0.5, 0.0, //
         0.1, 0.1, 0.1, 0.6, 0.0, //
         0.0, 0.0, 0.0, 0.2, 0.0,
     ];
-    let ray = MarchRay { origin: [0.0; 3], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
-    let batch = Batch {
-        rays: vec![ray; 3],
-        color: vec![[0.4, 0.2, 0.3], [0.0; 3], [0.0; 3]],
-        alpha: vec![1.0, 0.0, 0.0],
-    };
-    (field::tensor(out, [3, 5], &device).autodiff(), batch)
-}
-
-/// Color and mask losses of [`three`].
-fn losses_of(config: VmConfig, step: u64) -> (f32, Option<f32>) {
-    let (dir, views) = (temporary(), views());
+    let views = views();
     let pixels = Pixels::permuted(&views, config.foreground, BOX, false);
-    let learner = learner(&config, &pixels, dir.path());
-    let (out, batch) = three();
-    let (_, rgb, mask, outside) = learner.losses(out, &batch, step, 3);
+    let random = config.background == VmBackground::Random;
+    let behind = |r: u64| std::array::from_fn(|c| rng::uniform(3, step << 4 | 8, 3 * r + c as u64));
+    let background = [0, 1, 2].map(|r| if random { behind(r) } else { [0.0; 3] });
+    let color = [[0.4, 0.2, 0.3], [0.0; 3], [0.0; 3]];
+    let targets = Targets { color: &color, alpha: &[1.0, 0.0, 0.0], background: &background };
+    let mode = background_mode(config, StepAt { seed: 3, step });
+    let ([rgb, mask, outside], _) = of_rays(&composed, targets, mode, mask_term(config, &pixels));
     // (0.36 + 0.04) / 2, whatever the loss
-    assert!((outside.unwrap() - 0.2).abs() < 1e-6);
-    let value = |t: Tensor<1>| field::values(t.inner())[0];
-    (value(rgb), mask.map(value))
+    assert!((outside - 0.2).abs() < 1e-6);
+    (rgb, mask)
 }
 
 #[test]
@@ -242,20 +233,20 @@ fn the_terms_are_those_worked_by_hand() {
     let is = |found: f32, want: f64| assert!((f64::from(found) - want).abs() < 1e-6, "{found} {want}");
     let with = |mask_loss, background| VmConfig { mask_loss, background, ..paper() };
     // over black: 0.1² + 0 + 0.2² on the head, 3 · 0.1² and nothing beside it, of nine
-    let (rgb, mask) = losses_of(with(MaskLoss::L2, VmBackground::Black), 0);
+    let (rgb, mask) = losses_of(&with(MaskLoss::L2, VmBackground::Black), 0);
     is(rgb, (0.01 + 0.04 + 0.03) / 9.0);
     // (0.6² + 0.2²) / 2
-    is(mask.unwrap(), 0.2);
+    is(mask, 0.2);
     // −(ln 0.5 + ln 0.4 + ln 0.8) / 3
-    let (_, mask) = losses_of(with(MaskLoss::Ce, VmBackground::Black), 0);
-    is(mask.unwrap(), -(0.5f64 * 0.4 * 0.8).ln() / 3.0);
-    assert_eq!(losses_of(with(MaskLoss::None, VmBackground::Black), 0).1, None);
+    let (_, mask) = losses_of(&with(MaskLoss::Ce, VmBackground::Black), 0);
+    is(mask, -(0.5f64 * 0.4 * 0.8).ln() / 3.0);
+    assert_eq!(losses_of(&with(MaskLoss::None, VmBackground::Black), 0).1, 0.0);
     // over white against a black target: 0.8, 0.7, 0.6 for 0.4, 0.2, 0.3; 0.5 and 0.8 thrice for nothing
     let white = (0.16 + 0.25 + 0.09 + 3.0 * 0.25 + 3.0 * 0.64) / 9.0;
     let step_of =
         |is_white: bool| (0..).find(|s| (rng::uniform(3, s << 4 | 9, 0) < 0.5) == is_white).unwrap();
-    is(losses_of(with(MaskLoss::None, VmBackground::Reference), step_of(true)).0, white);
-    is(losses_of(with(MaskLoss::None, VmBackground::Reference), step_of(false)).0, 0.08 / 9.0);
+    is(losses_of(&with(MaskLoss::None, VmBackground::Reference), step_of(true)).0, white);
+    is(losses_of(&with(MaskLoss::None, VmBackground::Reference), step_of(false)).0, 0.08 / 9.0);
     // one random color behind both: what is collected beside the head hides it, what is missing lets it through
     let step = 5;
     let behind = |i: u64| f64::from(rng::uniform(3, step << 4 | 8, i));
@@ -266,7 +257,7 @@ fn the_terms_are_those_worked_by_hand() {
         ((own + open[r] * b).clamp(0.0, 1.0) - wanted).powi(2)
     };
     let wanted = (0..9).map(error).sum::<f64>() / 9.0;
-    is(losses_of(with(MaskLoss::None, VmBackground::Random), step).0, wanted);
+    is(losses_of(&with(MaskLoss::None, VmBackground::Random), step).0, wanted);
 }
 
 #[test]
@@ -277,7 +268,7 @@ fn the_published_background_is_white_in_half_of_the_batches() {
     let config = VmConfig { mask_loss: MaskLoss::None, ..paper() };
     assert_eq!(config.background, VmBackground::Reference);
     for step in 0..6 {
-        let rgb = losses_of(config.clone(), step).0;
+        let rgb = losses_of(&config, step).0;
         assert_eq!(rgb > 0.1, rng::uniform(3, step << 4 | 9, 0) < 0.5, "step {step}: {rgb}");
     }
 }
@@ -290,15 +281,15 @@ fn the_alpha_mask_looks_at_steps_of_the_published_world() {
     let pixels = Pixels::permuted(&views, config.foreground, BOX, true);
     let unit = 0.8 / 1.67;
     assert!((config.alpha_unit - unit).abs() < 1e-6 && (config.distance_scale - 25.0 / unit).abs() < 1e-4);
-    let mut learner = learner(&config, &pixels, dir.path());
-    let field = learner.state.field(&config, false);
+    let mut state = model(&config, &pixels, dir.path()).state;
+    let field = state.field(&config, false);
     let step = f64::from(field.lattice.step) / unit;
     // Σ of plane · line over 6 channels at the threshold
     let sigma = -(1.0f64 - 1e-4).ln() / step;
     for (share, kept) in [(1.001, true), (0.999, false)] {
         let value = (share * sigma / 6.0).sqrt() as f32;
-        learner.state = VmState::new(&config, 3, BOX, None, &learner.device);
-        learner.state.parameters[0].replace(vec![value; field.density.len()]);
-        assert_eq!(update_mask(&mut learner.state, &config, 1), kept, "{share}");
+        state = VmState::new(&config, 3, BOX, None);
+        state.groups[0] = HostGroup::flat("density", vec![value; field.density.len()]);
+        assert_eq!(update_mask(&mut state, &config, 1), kept, "{share}");
     }
 }

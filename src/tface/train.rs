@@ -1,25 +1,24 @@
-//! One training step of the stages `baseline` and `tface`; the loop around it is [`crate::field::training`]'s.
+//! Training of the stages `baseline` and `tface`, on any device.
 
-use super::grow::{update_mask, upsample};
+use super::cpu::CpuVm;
 #[cfg(feature = "wgpu")]
-use super::on_device::OnDevice;
+use super::gpu::GpuVm;
+use super::ops::{VmGroups, VmOps, background_mode};
 use super::record::FORMAT;
+use super::refine::{update_mask, upsample};
 use super::state::VmState;
-use crate::config::{MaskLoss, MaskUse, VmBackground, VmConfig};
+use crate::config::{MaskUse, VmConfig};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
-use crate::field::ops::{self, GridPenalty, VmBatch};
-use crate::field::pixels::{Batch, Pixels, TrainView};
-use crate::field::training::{self, Learner, StepError, StepReport, TrainingSession};
-use crate::field::{self, Place};
-use crate::kernel::adam::AdamStep;
-use crate::kernel::march::Bitmask;
-use crate::kernel::rng;
-use crate::kernel::vm::{Penalty, RAY_WIDTH, VmField};
+use crate::field::ops::ArrayDevice;
+use crate::field::pixels::{Pixels, TrainView};
+use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
+use crate::field::{self, ComputeDevice};
+use crate::kernel::cpu::adam::AdamStep;
+use crate::kernel::cpu::march::Bitmask;
+use crate::kernel::cpu::vm::Penalty;
+use crate::kernel::cpu::vm::losses::VmFigures;
 use crate::{Error, Result};
-use burn::tensor::{Device, Tensor};
 use serde::Serialize;
-use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 /// What training did.
@@ -73,23 +72,19 @@ impl TfaceReport {
     }
 }
 
-/// Samples of this process.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Counts {
-    pub rays: u64,
-    pub lattice: u64,
-    pub density: u64,
-    pub color: u64,
-}
-
-/// A training on the CPU, and what one on a GPU begins and ends with.
-pub(super) struct VmTraining<'a> {
+/// A vector-matrix field in training on a device.
+pub(super) struct VmModel<'a, O: VmOps> {
     pub config: &'a VmConfig,
     session: TrainingSession<'a>,
-    pub device: Device,
-    pub pixels: &'a Pixels<'a>,
+    pub ops: O,
+    /// Parameters on the device, once they are loaded.
+    groups: Option<VmGroups<O>>,
+    /// The host's part of the state; its groups lie on the device.
     pub state: VmState,
-    pub counts: Counts,
+    /// Steps since losses were read.
+    unread: u64,
+    /// Samples of this process.
+    pub counts: VmFigures,
 }
 
 /// Trains one field in `bounds` until `config.steps`, saving checkpoints into the session's folder and continuing
@@ -102,28 +97,38 @@ pub(super) fn train_one(
     session: &TrainingSession,
 ) -> Result<TfaceReport> {
     let began = Instant::now();
-    let mut learner = VmTraining::new(pixels, bounds, hull, config, session, field::processor());
-    let place = field::place(session.device)?.or_processor(|place| match place {
-        Place::Cpu(_) => Ok(()),
+    let state = VmState::new(config, session.seed, bounds, hull);
+    let place = field::compute_device(session.device)?.fallback_to_cpu(|place| match place {
+        ComputeDevice::Cpu(_) => Ok(()),
         #[cfg(feature = "wgpu")]
-        Place::Gpu(gpu) => OnDevice::fits(&learner, &gpu.device).map(|_| ()),
+        ComputeDevice::Gpu(gpu) => GpuVm::fits(session.stage, config, pixels, &state, &gpu.device).map(drop),
     })?;
-    let device = place.told();
-    let (progress, warnings) = match place {
-        Place::Cpu(_) => training::train(&mut learner, session, config.steps, config.checkpoint_s)?,
+    let device = place.description();
+    let report = match place {
+        ComputeDevice::Cpu(_) => train_on(CpuVm::new(config, pixels), state, config, session)?,
         #[cfg(feature = "wgpu")]
-        Place::Gpu(gpu) => {
-            let mut there = OnDevice::new(learner, gpu.device)?;
-            let done = training::train(&mut there, session, config.steps, config.checkpoint_s)?;
-            learner = there.finish();
-            done
+        ComputeDevice::Gpu(gpu) => {
+            let resident = GpuVm::fits(session.stage, config, pixels, &state, &gpu.device)?;
+            let ops = GpuVm::new(config, pixels, gpu.device, resident);
+            train_on(ops, state, config, session)?
         }
     };
-    let VmTraining { state, counts, .. } = learner;
+    Ok(TfaceReport { seconds: began.elapsed().as_secs_f64(), device, ..report })
+}
+
+fn train_on<O: VmOps>(
+    ops: O,
+    state: VmState,
+    config: &VmConfig,
+    session: &TrainingSession,
+) -> Result<TfaceReport> {
+    let mut model = VmModel::new(ops, state, config, session);
+    let (progress, warnings) = training::train(&mut model, session, config.steps, config.checkpoint_s)?;
+    let VmModel { state, counts, .. } = model;
     Ok(TfaceReport {
         fields: 1,
         steps: config.steps,
-        seconds: began.elapsed().as_secs_f64(),
+        seconds: 0.0,
         train_psnr: progress.psnr(),
         occupied: state.mask.as_ref().map_or(1.0, |m| m.share()),
         size: state.size,
@@ -131,7 +136,7 @@ pub(super) fn train_one(
         lattice_samples: counts.lattice,
         density_samples: counts.density,
         color_samples: counts.color,
-        device,
+        device: String::new(),
         warnings,
     })
 }
@@ -192,113 +197,53 @@ pub(super) fn masked_as_configured(mut views: Vec<TrainView>, masks: MaskUse) ->
     views
 }
 
-impl Learner for VmTraining<'_> {
-    const FORMAT: &'static str = FORMAT;
-    const RATES: [&'static str; 2] = ["lr_grid", "lr_network"];
-
-    fn step(&mut self, progress: &TrainingProgress) -> Result<StepReport, StepError> {
-        let config = self.config;
-        let step = progress.step;
-        let seed = self.seed(progress);
-        let mut batch = self.pixels.draw(seed, step, config.rays, true, self.detail(step));
-        let field = self.state.field(config, true);
-        let rays = std::mem::take(&mut batch.rays);
-        self.counts.rays += rays.len() as u64;
-        self.counts.lattice += rays.iter().map(|r| field.lattice.points(r)).sum::<u64>();
-        let vm = Arc::new(VmBatch::new(field.clone(), rays));
-        let (density, color) = self.penalized(&field, step);
-        let out = ops::vm_render(density, color, self.state.parameters[2].flat(), vm.clone());
-        let looked_up = vm.density_samples.load(Ordering::Relaxed);
-        self.counts.density += looked_up;
-        self.counts.color += vm.color_samples.load(Ordering::Relaxed);
-
-        let (total, rgb, mask, outside) = self.losses(out, &batch, step, seed);
-        let value = |t: Tensor<1>| field::values(t.inner())[0];
-        let (rgb, mask) = (value(rgb), mask.map_or(0.0, value));
-        for (term, value) in [("rgb", rgb), ("mask", mask)] {
-            if !value.is_finite() {
-                return Err(self.not_finite(term, value, step));
-            }
-        }
-        self.descend(total, step)?;
-        if self.grows(step) {
-            self.grow(step)?;
-        }
-        let mut figures = vec![("rgb", rgb as f64), ("mask", mask as f64), ("samples", looked_up as f64)];
-        figures.extend(outside.map(|outside| ("outside", outside as f64)));
-        Ok(StepReport { square_error: Some(rgb), figures })
-    }
-
-    fn save(
-        &self,
-        progress: &TrainingProgress,
-        into: &mut Checkpoint,
-        finished: bool,
-    ) -> Result<(), StepError> {
-        if !self.state.is_finite() {
-            return Err(self.not_finite("grid", f32::NAN, progress.step));
-        }
-        self.state.save(self.config, into, finished);
-        Ok(())
-    }
-
-    fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
-        if let Some((from, progress, finished)) = from {
-            self.state.restore(self.config, from, progress.step, finished)?;
-        }
-        Ok(())
-    }
-}
-
-/// Is the batch of a step seen over white, half of them are, where the target stays over black? As published.
-pub(super) fn over_white(seed: u64, step: u64) -> bool {
-    rng::uniform(seed, step << 4 | 9, 0) < 0.5
-}
-
-/// Random numbers of a step's backgrounds.
-pub(super) const BEHIND: u64 = 8;
-
-impl<'a> VmTraining<'a> {
-    /// Before the first step.
+impl<'a, O: VmOps> VmModel<'a, O> {
+    /// Before the first step; a checkpoint is not looked for yet.
     pub fn new(
-        pixels: &'a Pixels<'a>,
-        bounds: [[f32; 3]; 2],
-        hull: Option<&Bitmask>,
+        ops: O,
+        state: VmState,
         config: &'a VmConfig,
         session: &TrainingSession<'a>,
-        device: Device,
-    ) -> VmTraining<'a> {
-        let state = VmState::new(config, session.seed, bounds, hull, &device);
-        VmTraining { config, session: *session, device, pixels, state, counts: Counts::default() }
+    ) -> VmModel<'a, O> {
+        let counts = VmFigures::default();
+        VmModel { config, session: *session, ops, groups: None, state, unread: 0, counts }
     }
 
-    /// The stage, which is the table of its settings.
-    #[cfg(feature = "wgpu")]
-    pub fn stage(&self) -> &'static str {
-        self.session.stage
+    fn groups(&self) -> &VmGroups<O> {
+        self.groups.as_ref().expect("parameters are loaded before the first step")
     }
 
-    /// The seed of a step: another one after a step that diverged.
-    pub fn seed(&self, progress: &TrainingProgress) -> u64 {
-        self.session.seed ^ progress.salt << 32
+    /// Copies the state to the device.
+    fn load(&mut self) {
+        // what lies there goes first, or there would have to be room for both
+        self.ops.unload(self.groups.take());
+        let groups = std::mem::take(&mut self.state.groups);
+        self.groups = Some(self.ops.load(&self.state.field(self.config, true), groups));
+    }
+
+    /// Waits for the device; the state as it is there.
+    fn state(&self) -> Result<VmState, StepError> {
+        if self.ops.is_broken()? {
+            return Err(StepError::gradient());
+        }
+        let groups = self.ops.read(self.groups())?;
+        let state = VmState { groups, mask: self.state.mask.clone(), ..self.state };
+        if !state.is_finite() {
+            return Err(StepError::NotFinite { term: "grid", value: f32::NAN });
+        }
+        Ok(state)
     }
 
     /// What a ray of a large photograph stands for at a step, scene units; a pixel in the second half.
-    pub fn detail(&self, step: u64) -> f32 {
+    fn detail(&self, step: u64) -> f32 {
         let [low, high] = self.state.bounds;
         let cell =
             (0..3).map(|a| (high[a] - low[a]) / self.state.size[a] as f32).fold(f32::INFINITY, f32::min);
         if 2 * step < self.config.steps { DETAIL * cell } else { 0.0 }
     }
 
-    /// The error that something is not finite.
-    pub fn not_finite(&self, term: &'static str, value: f32, step: u64) -> StepError {
-        let lr = self.config.lr_network * learning_rate(self.config, step - self.state.reset);
-        StepError::NotFinite { term, value, lr }
-    }
-
     /// What is asked of both grids at a step besides the photographs.
-    pub fn penalties(&self, step: u64) -> [Penalty; 2] {
+    fn penalties(&self, step: u64) -> [Penalty; 2] {
         let config = self.config;
         let faded = tv_fade(config, step);
         let tv = |weight: f64| (0.01 * weight * faded) as f32;
@@ -309,89 +254,30 @@ impl<'a> VmTraining<'a> {
             Penalty { tv: tv(config.tv_color), l1: 0.0, ortho },
         ]
     }
+}
 
-    /// Both grids with their regularizers attached.
-    fn penalized(&self, field: &VmField, step: u64) -> (Tensor<1>, Tensor<1>) {
-        let [of_density, of_color] = self.penalties(step);
-        let attach = |p: Tensor<1>, grid, penalty: Penalty| {
-            if penalty.is_zero() { p } else { ops::penalized(p, Arc::new(GridPenalty { grid, penalty })) }
-        };
-        (
-            attach(self.state.parameters[0].flat(), field.density, of_density),
-            attach(self.state.parameters[1].flat(), field.color, of_color),
-        )
+impl<O: VmOps> Model for VmModel<'_, O> {
+    const FORMAT: &'static str = FORMAT;
+    const RATES: [&'static str; 2] = ["lr_grid", "lr_network"];
+    const READ_EVERY: u64 = <O::Device as ArrayDevice>::READ_EVERY;
+
+    fn learning_rate(&self, step: u64) -> f64 {
+        self.config.lr_network * learning_rate(self.config, step.saturating_sub(self.state.reset))
     }
 
-    /// Total, color and mask losses; mean opacity² of the batch's background rays.
-    fn losses(
-        &self,
-        out: Tensor<2>,
-        batch: &Batch,
-        step: u64,
-        seed: u64,
-    ) -> (Tensor<1>, Tensor<1>, Option<Tensor<1>>, Option<f32>) {
-        let config = self.config;
-        let device = &self.device;
-        let n = batch.alpha.len();
-        let stream = step << 4;
-        let opacity = out.clone().narrow(1, 3, 1); // [n, 1]
-        let mut color = out.clone().narrow(1, 0, 3); // [n, 3]
-        let mut target: Vec<f32> = batch.color.iter().flatten().copied().collect();
-        let open = || opacity.clone().neg() + 1.0;
-        match config.background {
-            VmBackground::Black => {}
-            VmBackground::Reference => {
-                if over_white(seed, step) {
-                    color = color + open();
-                }
-            }
-            VmBackground::Random => {
-                let behind: Vec<f32> =
-                    (0..3 * n as u64).map(|i| rng::uniform(seed, stream | BEHIND, i)).collect();
-                for ((t, b), i) in target.iter_mut().zip(&behind).zip(0..) {
-                    let i: usize = i;
-                    *t += (1.0 - batch.alpha[i / 3]) * b;
-                }
-                color = color + open() * field::tensor(behind, [n, 3], device).autodiff();
-            }
-        }
-        let target: Tensor<2> = field::tensor(target, [n, 3], device).autodiff();
-        let rgb = (color.clamp(0.0, 1.0) - target).square().mean();
-        let mut total = rgb.clone();
-
-        let is_background = |a: &f32| f32::from(*a == 0.0);
-        let background: Vec<f32> = batch.alpha.iter().map(is_background).collect();
-        let count: f32 = background.iter().sum();
-        let collected = field::values(opacity.clone().inner());
-        let outside = (count > 0.0).then(|| {
-            let sum: f32 = collected.iter().zip(&background).map(|(o, b)| o * o * b).sum();
-            sum / count
-        });
-        let mask = match config.mask_loss {
-            _ if !self.pixels.masked => None,
-            MaskLoss::None => None,
-            // a batch without a background ray has no such loss (the published mean is NaN then)
-            MaskLoss::L2 => (count > 0.0).then(|| {
-                let background = field::tensor(background, [n, 1], device).autodiff();
-                (opacity.clone().square() * background).sum() / count as f64
-            }),
-            MaskLoss::Ce => Some({
-                let head: Vec<f32> = background.iter().map(|b| 1.0 - b).collect();
-                let alpha: Tensor<2> = field::tensor(head, [n, 1], device).autodiff();
-                let p = opacity.clone().clamp(1e-3, 1.0 - 1e-3);
-                let cross = alpha.clone() * p.clone().log() + (alpha.neg() + 1.0) * (p.neg() + 1.0).log();
-                cross.mean().neg()
-            }),
-        };
-        if let Some(mask) = &mask {
-            total = total + mask.clone() * config.mask_weight;
-        }
-        debug_assert_eq!(out.dims()[1], RAY_WIDTH);
-        (total, rgb, mask, outside)
+    fn backward(&mut self, at: StepAt) {
+        let (detail, penalties) = (self.detail(at.step), self.penalties(at.step));
+        let groups = self.groups.as_mut().expect("parameters are loaded before the first step");
+        let ops = &mut self.ops;
+        ops.draw(at, detail);
+        ops.vm_render(groups);
+        ops.losses(background_mode(self.config, at));
+        ops.backward(groups);
+        ops.penalize(groups, &penalties);
+        self.unread += 1;
     }
 
-    /// The optimizer's step of each parameter.
-    pub fn adam_steps(&self, step: u64) -> [AdamStep; 3] {
+    fn optimize(&mut self, step: u64) {
         let config = self.config;
         let factor = learning_rate(config, step - self.state.reset);
         let grid = AdamStep {
@@ -404,38 +290,39 @@ impl<'a> VmTraining<'a> {
             skip_zero: false,
         };
         let network = AdamStep { lr: (config.lr_network * factor) as f32, ..grid };
-        [grid, grid, network]
-    }
-
-    /// Backward and Adam. Nothing is updated where the decoder's gradient is not finite; the grids are looked
-    /// at before every checkpoint.
-    fn descend(&mut self, loss: Tensor<1>, step: u64) -> Result<(), StepError> {
-        let mut gradients = loss.backward();
-        drop(loss);
-        if !self.state.parameters[2].has_finite_gradient(&gradients) {
-            return Err(self.not_finite("gradient of the", f32::NAN, step));
+        let groups = self.groups.as_mut().expect("parameters are loaded before the first step");
+        for (group, step) in groups.iter_mut().zip([grid, grid, network]) {
+            group.step(self.ops.device(), &step, self.ops.gate());
         }
-        let steps = self.adam_steps(step);
-        for (p, step) in self.state.parameters.iter_mut().zip(steps) {
-            p.update(&mut gradients, step);
+    }
+
+    fn report(&mut self, _: u64) -> Result<StepReport, StepError> {
+        let found = self.ops.figures()?;
+        let steps = std::mem::take(&mut self.unread).max(1) as f64;
+        self.counts.rays += found.rays;
+        self.counts.lattice += found.lattice;
+        self.counts.density += found.density;
+        self.counts.color += found.color;
+        let [rgb, mask, outside] = found.terms.map(|t| f64::from(t) / steps);
+        StepError::check([("rgb", rgb as f32), ("mask", mask as f32)])?;
+        if found.broken {
+            return Err(StepError::gradient());
         }
-        Ok(())
+        let samples = found.density as f64 / steps;
+        let figures = vec![("rgb", rgb), ("mask", mask), ("samples", samples), ("outside", outside)];
+        Ok(StepReport { square_error: (found.rays > 0).then_some(rgb as f32), figures })
     }
 
-    /// Is a mask or a finer grid due after a step?
-    pub fn grows(&self, step: u64) -> bool {
-        self.config.mask_steps.contains(&step) || self.config.upsample_steps.contains(&step)
-    }
-
-    /// Rebuilds the mask and refines the grids where that is due after step `step`.
-    pub fn grow(&mut self, step: u64) -> Result<(), StepError> {
+    /// Rebuilds the mask and refines the grids where that is due, on the host.
+    fn finish_step(&mut self, step: u64) -> Result<(), StepError> {
         let config = self.config;
         let masking = config.mask_steps.contains(&step);
         let upsampling = config.upsample_steps.iter().position(|&s| s == step);
-        // what is not finite would be spread, or taken for empty
-        if !self.state.is_finite() {
-            return Err(self.not_finite("grid", f32::NAN, step));
+        if !masking && upsampling.is_none() {
+            return Ok(());
         }
+        // what is not finite would be spread, or taken for empty
+        self.state = self.state()?;
         if masking && !update_mask(&mut self.state, config, step + 1) {
             let (stage, threshold) = (self.session.stage, config.mask_threshold);
             return Err(StepError::Failed(Error::cannot(
@@ -450,6 +337,27 @@ impl<'a> VmTraining<'a> {
         }
         if let Some(which) = upsampling {
             upsample(&mut self.state, config, which, step + 1);
+        }
+        self.load();
+        Ok(())
+    }
+
+    fn save(&self, into: &mut Checkpoint, finished: bool) -> Result<(), StepError> {
+        self.state()?.save(self.config, into, finished);
+        Ok(())
+    }
+
+    fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
+        let mut finished = false;
+        if let Some((from, progress, done)) = from {
+            self.state.restore(self.config, from, progress.step, done)?;
+            finished = done;
+        }
+        self.ops.forget();
+        self.unread = 0;
+        // no training goes on from a finished one, which has no moments
+        if !finished {
+            self.load();
         }
         Ok(())
     }

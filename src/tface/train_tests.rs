@@ -7,7 +7,7 @@ use crate::field::ball::{
 };
 use crate::field::checkpoint;
 use crate::geom::Aabb;
-use crate::kernel::vm::size_for;
+use crate::kernel::cpu::vm::size_for;
 use crate::tface::{TFace, train};
 use crate::{Monitor, Quiet};
 use glam::{Vec2, Vec3};
@@ -133,9 +133,8 @@ fn published_rates_are_reproduced() {
 
 #[test]
 fn upsampling_starts_the_rates_again_from_the_next_step() {
-    let device = crate::field::processor();
     let config = config();
-    let mut state = VmState::new(&config, 1, [[-1.0; 3], [1.0; 3]], None, &device);
+    let mut state = VmState::new(&config, 1, [[-1.0; 3], [1.0; 3]], None);
     assert_eq!(state.size, [16; 3]);
     upsample(&mut state, &config, 1, 2001);
     assert_eq!((state.size, state.reset), (size_for([2.0; 3], 28 * 28 * 28), 2001));

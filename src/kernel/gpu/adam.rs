@@ -1,7 +1,7 @@
-//! The optimizer of [`crate::kernel::adam`].
+//! The optimizer of [`crate::kernel::cpu::adam`].
 
 use super::device::{Buffer, Device, groups};
-use crate::kernel::adam::AdamStep;
+use crate::kernel::cpu::adam::AdamStep;
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
@@ -75,7 +75,7 @@ pub fn adam(device: &Device, [p, m, v]: [&Buffer; 3], g: &Buffer, step: &AdamSte
 mod tests {
     use super::super::device::tests::{agree, device};
     use super::*;
-    use crate::kernel::{adam, rng};
+    use crate::kernel::cpu::{adam, rng};
 
     #[test]
     fn steps_are_those_of_the_cpu_with_and_without_idle_weights() {

@@ -2,9 +2,9 @@
 //! take on a GPU of which nothing is known but its data sheet. **A prediction**, not a measurement.
 
 use super::sdf::Sdf;
-use crate::kernel::hash;
-use crate::kernel::mlp::{HIDDEN, OUTPUTS};
-use crate::kernel::sdf::{FieldShape, WIDTH};
+use crate::kernel::cpu::hash;
+use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS};
+use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
 use serde::Serialize;
 
 /// A kernel, or some that belong together.

@@ -147,7 +147,7 @@ impl Device {
 
     /// Bytes that a training may take: what there is but for what the driver and others keep. All that can be counted
     /// where the driver does not say.
-    pub fn spare(&self) -> u64 {
+    pub fn available_memory(&self) -> u64 {
         const KEPT: u64 = 512 << 20;
         self.memory.map_or(u64::MAX, |memory| memory.saturating_sub(KEPT))
     }
@@ -172,7 +172,7 @@ impl Device {
     }
 
     /// Gives memory back that nobody uses any more.
-    pub fn tidy(&self) {
+    pub fn release_unused(&self) {
         // what cannot be given back now is so later
         let _ = self.client.memory_cleanup();
     }

@@ -5,7 +5,7 @@
 use super::device::{Buffer, Device, groups};
 use super::rng::{below, stream, uniform};
 use crate::geom::{Camera, Projection};
-use crate::kernel::march::MarchRay;
+use crate::kernel::cpu::march::MarchRay;
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
@@ -78,7 +78,7 @@ struct Point {
 
 /// What the coefficients of a lens do to a projected point, and how that changes with it.
 #[derive(CubeType, Clone, Copy)]
-struct Bent {
+struct DistortJacobian {
     x: f32,
     y: f32,
     xx: f32,
@@ -88,7 +88,7 @@ struct Bent {
 }
 
 #[cube]
-fn bend(views: &[u32], lens: usize, x: f32, y: f32) -> Bent {
+fn distort(views: &[u32], lens: usize, x: f32, y: f32) -> DistortJacobian {
     let (k1, k2, k3) = (number(views, lens, 2), number(views, lens, 3), number(views, lens, 4));
     let (k4, k5, k6) = (number(views, lens, 5), number(views, lens, 6), number(views, lens, 7));
     let (p1, p2) = (number(views, lens, 8), number(views, lens, 9));
@@ -106,7 +106,7 @@ fn bend(views: &[u32], lens: usize, x: f32, y: f32) -> Bent {
     }
     slope *= 2.0f32;
     let cross = x * y * slope + 2.0f32 * p1 * x + 2.0f32 * p2 * y;
-    Bent {
+    DistortJacobian {
         x: x * radial + 2.0f32 * p1 * x * y + p2 * (r2 + 2.0f32 * x * x) + sx * r2,
         y: y * radial + p1 * (r2 + 2.0f32 * y * y) + 2.0f32 * p2 * x * y + sy * r2,
         xx: radial + x * x * slope + 2.0f32 * p1 * y + 6.0f32 * p2 * x + 2.0f32 * sx * x,
@@ -116,15 +116,15 @@ fn bend(views: &[u32], lens: usize, x: f32, y: f32) -> Bent {
     }
 }
 
-/// The way back through a lens: see [`crate::geom::Distortion::undo`].
+/// The way back through a lens: see [`crate::geom::Distortion::undistort`].
 #[cube]
-fn undo(views: &[u32], lens: usize, xd: f32, yd: f32) -> Point {
+fn undistort(views: &[u32], lens: usize, xd: f32, yd: f32) -> Point {
     let mut x = xd;
     let mut y = yd;
     let mut found = true;
     if views[lens + 1] == 0 {
         for _ in 0..10u32 {
-            let at = bend(views, lens, x, y);
+            let at = distort(views, lens, x, y);
             let (ex, ey) = (at.x - xd, at.y - yd);
             let det = at.xx * at.yy - at.xy * at.yx;
             found = found && det > 1e-6f32;
@@ -132,7 +132,7 @@ fn undo(views: &[u32], lens: usize, xd: f32, yd: f32) -> Point {
             x -= (at.yy * ex - at.xy * ey) * over;
             y -= (at.xx * ey - at.yx * ex) * over;
         }
-        let at = bend(views, lens, x, y);
+        let at = distort(views, lens, x, y);
         found = found && (at.x - xd).abs() + (at.y - yd).abs() < 1e-5f32;
         // tan θ / r of the projection
         let r = (x * x + y * y).sqrt();
@@ -302,7 +302,7 @@ fn draw_rays(
                 let xd = (u + 0.5f32 - number(views, view, CAMERA + 2)) / number(views, view, CAMERA);
                 let yd = (v + 0.5f32 - number(views, view, CAMERA + 3)) / number(views, view, CAMERA + 1);
                 // pictures have y down
-                let d = undo(views, view + LENS, xd, yd);
+                let d = undistort(views, view + LENS, xd, yd);
                 x = d.x;
                 y = -d.y;
                 found = d.found;
@@ -417,7 +417,7 @@ impl Batch {
 
 /// How rays are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Drawing {
+pub struct SamplingOptions {
     /// Every photograph as often, any pixel of its box once: without a ray where that is not worth drawing.
     pub every: bool,
     /// Is each ray's first sample shifted by a random part of a step?
@@ -433,7 +433,7 @@ pub struct Photographs {
     views: Buffer,
     pixels: Buffer,
     drawable: Buffer,
-    drawing: Drawing,
+    drawing: SamplingOptions,
 }
 
 impl Photographs {
@@ -442,7 +442,7 @@ impl Photographs {
     /// # Panics
     ///
     /// Where no pixel is drawable, or 2³² pixels are.
-    pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: Drawing) -> Photographs {
+    pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: SamplingOptions) -> Photographs {
         let (mut views, mut pixels, mut drawable) = (Vec::new(), Vec::new(), Vec::new());
         let mut cumulative = 0u32;
         for view in seen {

@@ -1,22 +1,22 @@
-//! A trained signed-distance field on a device: what is asked of it after training, in batches that fill the device.
+//! A trained signed-distance field on a device: what it is evaluated for after training, in batches that fill the device.
 
 use super::device::{Buffer, Device};
 use super::draw::Batch;
 use super::march::Samples;
-use super::neus::{self, Neus, Rays};
+use super::neus::{Neus, Rays};
 use super::occupancy::Occupancy;
 use super::sdf::Sdf;
 use super::self_test::planes;
 use crate::Result;
-use crate::kernel::march::{Bitmask, MarchRay};
-use crate::kernel::neus::RAY_WIDTH;
-use crate::kernel::sdf::{FieldShape, WIDTH};
+use crate::kernel::cpu::march::{Bitmask, MarchRay};
+use crate::kernel::cpu::neus::RAY_WIDTH;
+use crate::kernel::cpu::sdf::FieldShape;
 use std::ops::Range;
 
 /// Samples evaluated together: some two hundred megabytes of memory.
 const CAPACITY: usize = 1 << 17;
 
-/// The same where fewer points are asked for: planes are copied whole.
+/// The same where fewer points are evaluated: planes are copied whole.
 const FEWER: [usize; 2] = [1 << 10, 1 << 14];
 
 /// Rays marched together.
@@ -38,8 +38,8 @@ pub struct Evaluator {
 
 impl Evaluator {
     /// Can a device evaluate a field of this shape?
-    pub fn knows(shape: &FieldShape) -> bool {
-        Sdf::knows(shape)
+    pub fn supports(shape: &FieldShape) -> bool {
+        Sdf::supports(shape)
     }
 
     /// Of a field: its table, `[entries, 2]`, network weights, sharpness, and the cells to march through with those that
@@ -71,22 +71,22 @@ impl Evaluator {
         }
     }
 
-    /// Sdf, gradient (3), color (3) and logarithm of the local sharpness of points: the asked ones of these, a plane
+    /// Sdf, gradient (3), color (3) and logarithm of the local sharpness of points: these channels of the eight, a plane
     /// `[n]` each.
     ///
     /// # Shapes
     ///
     /// - x, direction: `[n, 3]`; without directions color means nothing
     /// - normal: `[n, 3]`, what color sees as normal; without it, that of the field
-    pub fn outputs(
+    pub fn evaluate(
         &self,
         x: &[[f32; 3]],
         direction: Option<&[[f32; 3]]>,
         normal: Option<&[[f32; 3]]>,
-        asked: Range<usize>,
+        channels: Range<usize>,
     ) -> Result<Vec<Vec<f32>>> {
         let device = &self.device;
-        let mut out = vec![Vec::with_capacity(x.len()); asked.len()];
+        let mut out = vec![Vec::with_capacity(x.len()); channels.len()];
         for first in (0..x.len()).step_by(CAPACITY) {
             let span = first..(first + CAPACITY).min(x.len());
             let mut sizes = FEWER.into_iter().zip(&self.fewer).chain([(CAPACITY, &self.sdf)]);
@@ -104,7 +104,7 @@ impl Evaluator {
                 normal.as_ref(),
                 &count,
             );
-            let all = device.fetch_part(seen, asked.start * capacity..asked.end * capacity)?;
+            let all = device.fetch_part(seen, channels.start * capacity..channels.end * capacity)?;
             for (own, plane) in out.iter_mut().zip(all.chunks_exact(capacity)) {
                 own.extend_from_slice(&plane[..span.len()]);
             }
@@ -112,7 +112,7 @@ impl Evaluator {
         Ok(out)
     }
 
-    /// Volume render with steps of `pitch`: see [`crate::kernel::neus::forward`]. `[rays, 8]`.
+    /// Volume render with steps of `pitch`: see [`crate::kernel::cpu::neus::forward`]. `[rays, 9]`.
     pub fn render(&mut self, rays: &[MarchRay], pitch: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
         let device = &self.device;
         let pitch = device.upload(&[pitch]);
@@ -138,7 +138,6 @@ impl Evaluator {
             assert!(done > 0, "one ray has more samples than there is room for");
             out.extend((0..done).map(|r| std::array::from_fn(|k| seen[k * RAYS + r])));
         }
-        const { assert!(neus::RAY_WIDTH >= RAY_WIDTH && WIDTH == 8) };
         Ok(out)
     }
 }
@@ -148,8 +147,8 @@ mod tests {
     use super::super::device::tests::{agree, device};
     use super::super::self_test::Case;
     use super::*;
-    use crate::kernel::mlp::Weights;
-    use crate::kernel::{march, rng, sdf};
+    use crate::kernel::cpu::mlp::Weights;
+    use crate::kernel::cpu::{march, rng, sdf};
 
     #[test]
     fn what_is_asked_is_what_the_cpu_answers() {
@@ -165,22 +164,22 @@ mod tests {
         // one point, some, and more than a small batch holds
         for n in [1, 700, 1100] {
             let some: Vec<[f32; 3]> = x.iter().copied().cycle().take(n).collect();
-            let got = there.outputs(&some, None, None, 0..1).unwrap();
+            let got = there.evaluate(&some, None, None, 0..1).unwrap();
             let want: Vec<f32> =
                 sdf::gradients(&shape, &table, &weights, &some).iter().map(|w| w.0).collect();
             agree("distances of a few", &got[0], &want, 1e-4);
         }
-        let got = there.outputs(&x, None, None, 0..4).unwrap();
+        let got = there.evaluate(&x, None, None, 0..4).unwrap();
         let want = sdf::gradients(&shape, &table, &weights, &x);
         agree("distances", &got[0], &want.iter().map(|w| w.0).collect::<Vec<_>>(), 1e-4);
         for axis in 0..3 {
             agree("slopes", &got[1 + axis], &want.iter().map(|w| w.1[axis]).collect::<Vec<_>>(), 1e-4);
         }
-        let soft = there.outputs(&x, None, None, 7..8).unwrap();
+        let soft = there.evaluate(&x, None, None, 7..8).unwrap();
         agree("softness", &soft[0], &sdf::softness(&shape, &table, &weights, &x), 1e-4);
         // any unit vectors as normals
         let normal: Vec<[f32; 3]> = direction.iter().rev().copied().collect();
-        let got = there.outputs(&x, Some(&direction), Some(&normal), 4..7).unwrap();
+        let got = there.evaluate(&x, Some(&direction), Some(&normal), 4..7).unwrap();
         let want = sdf::colors(&shape, &table, &weights, &x, &normal, None, &direction);
         agree("colors", &got.concat(), &planes(&want, x.len()), 1e-4);
 
@@ -201,13 +200,13 @@ mod tests {
         let field = sdf::forward(&shape, &table, &weights, &x, &d);
         let along: Vec<[f32; 3]> = few.iter().map(|r| r.direction).collect();
         let dt = vec![0.04; x.len()];
-        let bundle = crate::kernel::neus::Rays {
+        let bundle = crate::kernel::cpu::neus::Rays {
             offsets: &samples.offsets,
             direction: &along,
             t: &samples.t,
             dt: &dt,
         };
-        let want = crate::kernel::neus::forward(bundle, field.output(), 20.0, 1.0);
+        let want = crate::kernel::cpu::neus::forward(bundle, field.output(), 20.0, 1.0);
         let got: Vec<[f32; RAY_WIDTH]> = some.iter().map(|&r| got[r]).collect();
         agree("renders", got.as_flattened(), &want, 1e-4);
         assert!(flatten(x).len() > 20_000);

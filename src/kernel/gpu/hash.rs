@@ -1,9 +1,9 @@
-//! The hash encoding of [`crate::kernel::hash`]: features with Jacobian, and their scatter.
+//! The hash encoding of [`crate::kernel::cpu::hash`]: features with Jacobian, and their scatter.
 
 use super::device::{Atomics, Buffer, Device};
 use super::sum::{Exchange, Fixed, MOST, Native, Sum};
-use crate::kernel::hash::Level;
-use crate::kernel::sdf::FieldShape;
+use crate::kernel::cpu::hash::Level;
+use crate::kernel::cpu::sdf::FieldShape;
 use cubecl::prelude::*;
 
 /// Samples a group of threads handles.
@@ -119,7 +119,7 @@ fn gather(
     }
 }
 
-/// Adds to the table what [`crate::kernel::hash::scatter`] adds.
+/// Adds to the table what [`crate::kernel::cpu::hash::scatter`] adds.
 #[cube(launch)]
 fn scatter<S: Sum>(
     gradient: &[Atomic<S::Word>],
@@ -275,7 +275,7 @@ impl Grid {
         );
     }
 
-    /// Adds the gradient of the table, zero before: see [`crate::kernel::hash::scatter`]. With [`Atomics::Fixed`] once
+    /// Adds the gradient of the table, zero before: see [`crate::kernel::cpu::hash::scatter`]. With [`Atomics::Fixed`] once
     /// a step.
     ///
     /// # Shapes
@@ -340,8 +340,8 @@ impl Grid {
 mod tests {
     use super::super::device::tests::{agree, device, devices, planes};
     use super::*;
-    use crate::kernel::hash;
-    use crate::kernel::rng;
+    use crate::kernel::cpu::hash;
+    use crate::kernel::cpu::rng;
 
     const SAMPLES: usize = 1000;
     const CAPACITY: usize = 1024;

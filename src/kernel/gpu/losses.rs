@@ -1,46 +1,12 @@
-//! What a training step of the signed-distance field minimizes, and its gradients.
-//!
-//! With `C` and `O` a ray's color and opacity, `h` and `a` color (over black) and alpha of its pixel, `b` a background,
-//! `e = C + (1 − O) b − h − (1 − a) b`, and means over the rays that met a sample (rgb), over those that are all head
-//! (each sample's own color), over all rays (mask) and over the samples (the others):
-//!
-//! ```text
-//! rgb_mse · ⟨e²⟩ + rgb_l1 · ⟨|e|⟩ + rgb_sample · ⟨Σ w (c − h)²⟩ + mask · ⟨−a ln O − (1 − a) ln(1 − O)⟩
-//!   + eikonal · ⟨(‖∇f‖ − 1)²⟩ + sparsity · ⟨exp(−β |f|)⟩
-//! ```
+//! What a training step of the signed-distance field minimizes, and its gradients: see [`crate::kernel::cpu::losses`].
 
 use super::device::{Buffer, Device, groups};
 use super::draw::Batch;
-use super::neus::RAY_WIDTH;
+use crate::kernel::cpu::losses::{LossWeights, RAY_TERMS, SAMPLE_TERMS, TERMS};
+use crate::kernel::cpu::neus::RAY_WIDTH;
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
-
-/// Terms of a ray: squared and absolute error, each sample's own color, mask.
-const RAY_TERMS: usize = 4;
-/// Terms of a sample: eikonal, sparsity.
-const SAMPLE_TERMS: usize = 2;
-/// All of them, and that of points.
-pub(super) const TERMS: usize = RAY_TERMS + SAMPLE_TERMS + 1;
-
-/// Weights of the terms; β of the last.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct LossWeights {
-    /// Of the squared error of the color.
-    pub rgb_mse: f32,
-    /// Of its absolute error.
-    pub rgb_l1: f32,
-    /// Of the squared error of each sample's own color.
-    pub rgb_sample: f32,
-    /// Of the cross entropy of opacity and alpha.
-    pub mask: f32,
-    /// Of the length of the sdf's gradient.
-    pub eikonal: f32,
-    /// Of closeness to the surface.
-    pub sparsity: f32,
-    /// β.
-    pub sparsity_scale: f32,
-}
 
 /// How many rays met a sample, how many are all head, and how many there are. One group of threads.
 #[cube(launch)]
@@ -286,7 +252,7 @@ mod tests {
     use super::super::device::tests::{agree, device, planes};
     use super::super::neus::{Neus, Rays};
     use super::*;
-    use crate::kernel::rng;
+    use crate::kernel::cpu::rng;
 
     const WEIGHTS: LossWeights = LossWeights {
         rgb_mse: 10.0,
@@ -296,6 +262,8 @@ mod tests {
         eikonal: 0.2,
         sparsity: 0.3,
         sparsity_scale: 4.0,
+        stereo: 0.0,
+        knee: 0.0,
     };
     const ANNEAL: f64 = 0.4;
     const STEP: f64 = 0.05;

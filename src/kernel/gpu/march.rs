@@ -1,4 +1,4 @@
-//! Marching through the occupancy bitmask of [`crate::kernel::march`], without the host knowing how many samples there
+//! Marching through the occupancy bitmask of [`crate::kernel::cpu::march`], without the host knowing how many samples there
 //! are: a pass counts them, a prefix sum says where each ray's lie, a second pass writes them.
 
 use super::device::{Buffer, Device, groups};
@@ -239,7 +239,7 @@ impl Samples {
         }
     }
 
-    /// Marches rays with steps of `pitch`, `[1]`: see [`crate::kernel::march::march`]. Rays beyond the room there is are
+    /// Marches rays with steps of `pitch`, `[1]`: see [`crate::kernel::cpu::march::march`]. Rays beyond the room there is are
     /// none from then on. The last `apart` places are left free.
     pub fn march(
         &self,
@@ -286,8 +286,8 @@ impl Samples {
 mod tests {
     use super::super::device::tests::{agree, device, planes};
     use super::*;
-    use crate::kernel::march::{Bitmask, MarchRay, march};
-    use crate::kernel::rng;
+    use crate::kernel::cpu::march::{Bitmask, MarchRay, march};
+    use crate::kernel::cpu::rng;
 
     const RADIUS: f32 = 1.1;
     const STEP: f32 = 0.02;

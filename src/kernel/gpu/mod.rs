@@ -1,7 +1,7 @@
-//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal, DX12 and CUDA. Each is the twin of a kernel of [`super`].
+//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal, DX12 and CUDA. Each is the twin of a kernel of [`super::cpu`].
 //!
 //! Values of samples lie plane by plane, `[channels, capacity]`: neighboring threads read neighboring words, and a
-//! plane is read four samples at a time. `capacity` is a multiple of [`mlp::TILE`](super::mlp::TILE); how many samples
+//! plane is read four samples at a time. `capacity` is a multiple of [`mlp::TILE`](super::cpu::mlp::TILE); how many samples
 //! there really are is a count in a buffer that a kernel before wrote, so that nobody waits to read it back. Weights
 //! and tables lie as on the CPU.
 //!
@@ -16,7 +16,6 @@ mod hash;
 mod losses;
 mod march;
 mod neus;
-mod norm;
 mod occupancy;
 mod points;
 mod rng;
@@ -26,25 +25,23 @@ mod self_test;
 mod sum;
 mod tile;
 mod vm;
+mod weight_norm;
 
 pub use adam::{Gate, adam};
 pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits};
-pub use draw::{Batch, Drawing, DrawnView, Photographs};
+pub use draw::{Batch, DrawnView, Photographs, SamplingOptions};
 pub use evaluate::Evaluator;
 pub use hash::Grid;
-pub use losses::{LossWeights, Losses};
+pub use losses::Losses;
 pub use march::Samples;
 pub use neus::{Neus, Rays};
-pub use norm::Norm;
 pub use occupancy::{Band, Nerfacc, Occupancy};
 pub use points::SurfacePoints;
-pub use schedule::{Pitch, RayBudget, Schedule};
+pub use schedule::Schedule;
 pub use sdf::Sdf;
 pub use self_test::{Check, self_test};
-pub use vm::{Behind, DeviceDecoder, DeviceGrid, MaskTerm, Vm, VmFigures, VmLosses, VmRenderer, VmValues};
+pub use vm::{DeviceDecoder, DeviceGrid, Vm, VmLosses, VmRenderer, VmValues};
+pub use weight_norm::WeightNorm;
 
 #[cfg(test)]
 pub(crate) use device::tests;
-
-#[cfg(test)]
-mod step_tests;

@@ -1,17 +1,13 @@
-//! NeuS compositing of ragged rays: see [`crate::kernel::neus`]. A thread takes a ray.
-//!
-//! Beside what the CPU composites stands `Σ w ‖c‖²`, of which, with color and opacity, a loss of each sample's own color
-//! is made: `Σ w ‖c − h‖² = Σ w ‖c‖² − 2 h · Σ w c + ‖h‖² Σ w`.
+//! NeuS compositing of ragged rays: see [`crate::kernel::cpu::neus`]. A thread takes a ray.
 
 use super::device::{Buffer, Device, groups};
-use crate::kernel::neus::{self, SHORTEST};
-use crate::kernel::sdf::WIDTH;
+use crate::kernel::cpu::neus::SHORTEST;
+use crate::kernel::cpu::sdf::WIDTH;
 use cubecl::prelude::*;
 
 const UNITS: u32 = 64;
 
-/// Values per ray: rgb (3), opacity, Σ w t, Σ w n̂ (3), Σ w ‖c‖².
-pub const RAY_WIDTH: usize = neus::RAY_WIDTH + 1;
+pub use crate::kernel::cpu::neus::RAY_WIDTH;
 
 /// ε of the opacity.
 const EPSILON: f32 = 1e-5;
@@ -279,6 +275,16 @@ impl Neus {
         }
     }
 
+    /// What the last forward composited, planes `[9, rays]`.
+    pub fn output(&self) -> &Buffer {
+        &self.out
+    }
+
+    /// What the last backward wrote, planes `[8, capacity]`.
+    pub fn gradient(&self) -> &Buffer {
+        &self.g_field
+    }
+
     /// Composites: planes `[9, rays]` of the field's planes `[8, capacity]`; inv_s: `[1]`.
     pub fn forward(
         &self,
@@ -344,7 +350,7 @@ impl Neus {
 mod tests {
     use super::super::device::tests::{agree, device, planes};
     use super::*;
-    use crate::kernel::rng;
+    use crate::kernel::cpu::{neus, rng};
 
     /// Runs both and returns (device, CPU): rays' values, gradients by field, by inv_s.
     type Found = (Vec<f32>, Vec<f32>, f32);
@@ -368,26 +374,11 @@ mod tests {
         let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros(1));
         let g_field = device.read(on.backward(device, there, &on_field, &on_s, anneal, &g_out, &g_s));
         let flat = field.as_flattened();
-        // squared colors are composited as the CPU does it: as colors of a second field
-        let squared: Vec<[f32; WIDTH]> = field
-            .iter()
-            .map(|f| [f[0], f[1], f[2], f[3], f[4] * f[4], f[5] * f[5], f[6] * f[6], f[7]])
-            .collect();
-        let squared = squared.as_flattened();
-        let two = [flat, squared].map(|f| neus::forward(rays, f, inv_s, anneal));
-        let want: Vec<[f32; RAY_WIDTH]> = two[0]
-            .chunks(8)
-            .zip(two[1].chunks(8))
-            .map(|(a, b)| std::array::from_fn(|k| if k < 8 { a[k] } else { b[0] + b[1] + b[2] }))
-            .collect();
-        let g_first: Vec<f32> = g.iter().flat_map(|g| g[..8].to_vec()).collect();
-        let g_second: Vec<f32> = g.iter().flat_map(|g| [g[8], g[8], g[8], 0.0, 0.0, 0.0, 0.0, 0.0]).collect();
-        let (first, s1) = neus::backward(rays, flat, inv_s, anneal, &g_first);
-        let (second, s2) = neus::backward(rays, squared, inv_s, anneal, &g_second);
-        let chained = |i: usize| if (4..7).contains(&(i % 8)) { 2.0 * flat[i] } else { 1.0 };
-        let want_field: Vec<f32> = (0..flat.len()).map(|i| first[i] + chained(i) * second[i]).collect();
-        let want_field = planes::<WIDTH>(want_field.as_chunks().0, n);
-        [(out, g_field, device.read::<f32>(&g_s)[0]), (planes(&want, count), want_field, s1 + s2)]
+        let want = neus::forward(rays, flat, inv_s, anneal);
+        let (want_field, want_s) = neus::backward(rays, flat, inv_s, anneal, g.as_flattened());
+        let [want, want_field] =
+            [planes::<RAY_WIDTH>(want.as_chunks().0, count), planes::<WIDTH>(want_field.as_chunks().0, n)];
+        [(out, g_field, device.read::<f32>(&g_s)[0]), (want, want_field, want_s)]
     }
 
     #[test]

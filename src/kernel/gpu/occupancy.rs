@@ -3,7 +3,7 @@
 use super::device::{Buffer, Device, groups};
 use super::sdf::Sdf;
 use crate::Result;
-use crate::kernel::march::Bitmask;
+use crate::kernel::cpu::march::Bitmask;
 use cubecl::prelude::*;
 
 mod nerfacc;

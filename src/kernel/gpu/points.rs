@@ -7,7 +7,8 @@
 use super::device::{Buffer, Device, groups};
 use super::march::Samples;
 use super::rng::{below, stream};
-use crate::kernel::sdf::WIDTH;
+use crate::kernel::cpu::losses::LossWeights;
+use crate::kernel::cpu::sdf::WIDTH;
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
@@ -90,21 +91,19 @@ fn of_points(
 pub struct SurfacePoints {
     rows: Buffer,
     count: usize,
-    weight: f32,
-    knee: f32,
+    weights: LossWeights,
     drawn: Buffer,
     terms: Buffer,
     both: Buffer,
 }
 
 impl SurfacePoints {
-    /// No points yet; up to `most` a step, of this weight, and a loss that is linear beyond `knee` pixels.
-    pub fn new(device: &Device, most: usize, weight: f32, knee: f32) -> SurfacePoints {
+    /// No points yet; up to `most` a step.
+    pub fn new(device: &Device, most: usize, weights: &LossWeights) -> SurfacePoints {
         SurfacePoints {
             rows: device.zeros(ROW),
             count: 0,
-            weight,
-            knee,
+            weights: *weights,
             drawn: device.zeros(most),
             terms: device.zeros(most),
             both: device.zeros(1),
@@ -163,8 +162,8 @@ impl SurfacePoints {
             field.arg(),
             g_field.arg(),
             self.terms.arg(),
-            self.weight,
-            self.knee,
+            self.weights.stereo,
+            self.weights.knee,
         );
     }
 
@@ -178,7 +177,7 @@ impl SurfacePoints {
 mod tests {
     use super::super::device::tests::{agree, device};
     use super::*;
-    use crate::kernel::rng;
+    use crate::kernel::cpu::rng;
 
     #[test]
     fn points_stand_behind_the_samples_and_pull_the_surface() {
@@ -186,7 +185,11 @@ mod tests {
         const PLANE: usize = 64;
         let rows: Vec<[f32; 5]> =
             (0..7).map(|i| [i as f32, 10.0 + i as f32, -1.0, 0.02 + 0.001 * i as f32, 0.5]).collect();
-        let mut points = SurfacePoints::new(&device, 20, 3.0, 0.15);
+        let mut points = SurfacePoints::new(
+            &device,
+            20,
+            &LossWeights { stereo: 3.0, knee: 0.15, ..LossWeights::default() },
+        );
         let mut samples = Samples::new(&device, 4, PLANE);
         samples.count = device.upload(&[40u32, 40]);
         // none are there yet

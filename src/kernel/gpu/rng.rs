@@ -1,7 +1,7 @@
-//! The random numbers of [`crate::kernel::rng`], bit by bit: 64-bit words as two of 32 bits, which is what every adapter
+//! The random numbers of [`crate::kernel::cpu::rng`], bit by bit: 64-bit words as two of 32 bits, which is what every adapter
 //! has.
 
-use crate::kernel::rng;
+use crate::kernel::cpu::rng;
 use cubecl::prelude::*;
 
 /// A word of 64 bits.

@@ -1,43 +1,17 @@
 //! What a step takes from the one before it, without asking the host: how many rays, and how long a march step is.
 
 use super::device::{Buffer, Device};
-use super::losses::TERMS;
 use crate::Result;
+use crate::kernel::cpu::losses::TERMS;
+use crate::kernel::cpu::schedule::{Figures, RayBudget, StepLength};
 use cubecl::prelude::*;
-
-/// How long a march step is.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Pitch {
-    /// Always this.
-    Constant(f32),
-    /// So many units of the surface's width, `1 / inv_s`, but within these.
-    OfSharpness {
-        /// Units.
-        units: f32,
-        /// Shortest step.
-        min: f32,
-        /// Longest step.
-        max: f32,
-    },
-}
-
-/// How many rays a step draws: nine tenths of the last one's and a tenth of what would have met the budget.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct RayBudget {
-    /// Samples of a step.
-    pub samples: usize,
-    /// Fewest rays.
-    pub min: usize,
-    /// Most rays.
-    pub max: usize,
-}
 
 #[cube(launch)]
 fn advance(
     inv_s: &[f32],
     count: &[u32],
     rays: &mut [u32],
-    pitch: &mut [f32],
+    step_length: &mut [f32],
     blind: &mut [u32],
     units: f32,
     shortest: f32,
@@ -49,7 +23,7 @@ fn advance(
 ) {
     if ABSOLUTE_POS == 0 {
         let s = clamp(inv_s[0], 1e-6f32, 1e6f32);
-        pitch[0] = max(min(units / s, longest), shortest);
+        step_length[0] = max(min(units / s, longest), shortest);
         let wanted = count[1];
         if first == 0 {
             if wanted == 0 {
@@ -88,31 +62,14 @@ fn collect(
     }
 }
 
-/// What a step came to.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Figures {
-    /// Its losses, in the order of [`Losses::sums`](super::Losses::sums).
-    pub losses: [f32; TERMS],
-    /// NeuS' variance v behind it: the sharpness is exp(10 v).
-    pub variance: f32,
-    /// Samples, as many as there would have been with room for all.
-    pub samples: u32,
-    /// Rays.
-    pub rays: u32,
-    /// Steps in a row before it that met no sample.
-    pub blind: u32,
-    /// Was a gradient not finite, in this step or before?
-    pub broken: bool,
-}
-
 /// What a step takes from the one before it.
 pub struct Schedule {
-    pitch_rule: Pitch,
+    rule: StepLength,
     budget: RayBudget,
     /// `[1]`: rays of this step.
     pub rays: Buffer,
     /// `[1]`: length of its march step.
-    pub pitch: Buffer,
+    pub step_length: Buffer,
     /// `[1]`: steps in a row before it that met no sample.
     blind: Buffer,
     figures: Buffer,
@@ -120,12 +77,12 @@ pub struct Schedule {
 
 impl Schedule {
     /// Starts with so many rays.
-    pub fn new(device: &Device, pitch: Pitch, budget: RayBudget, rays: usize) -> Schedule {
+    pub fn new(device: &Device, rule: StepLength, budget: RayBudget, rays: usize) -> Schedule {
         Schedule {
-            pitch_rule: pitch,
+            rule,
             budget,
             rays: device.upload(&[rays as u32]),
-            pitch: device.zeros(1),
+            step_length: device.zeros(1),
             blind: device.zeros(1),
             figures: device.zeros(TERMS + 5),
         }
@@ -135,9 +92,9 @@ impl Schedule {
     /// how many there would have been with more room, `[2]`.
     pub fn advance(&self, device: &Device, inv_s: &Buffer, count: &Buffer, first: bool) {
         let RayBudget { samples, min, max } = self.budget;
-        let [units, shortest, longest] = match self.pitch_rule {
-            Pitch::Constant(step) => [0.0, step, step],
-            Pitch::OfSharpness { units, min, max } => [units, min, max],
+        let [units, shortest, longest] = match self.rule {
+            StepLength::Constant(step) => [0.0, step, step],
+            StepLength::OfSharpness { units, min, max } => [units, min, max],
         };
         advance::launch(
             device.launch(),
@@ -146,7 +103,7 @@ impl Schedule {
             inv_s.arg(),
             count.arg(),
             self.rays.arg(),
-            self.pitch.arg(),
+            self.step_length.arg(),
             self.blind.arg(),
             units,
             shortest,
@@ -181,12 +138,14 @@ impl Schedule {
             self.figures.arg(),
         );
         let words = device.fetch::<u32>(&self.figures)?;
+        let (samples, rays) = (words[TERMS + 1] as usize, words[TERMS + 2] as usize);
         Ok(Figures {
             losses: std::array::from_fn(|i| f32::from_bits(words[i])),
             variance: f32::from_bits(words[TERMS]),
-            samples: words[TERMS + 1],
-            rays: words[TERMS + 2],
-            blind: words[TERMS + 3],
+            samples,
+            rays: self.budget.next(rays, samples),
+            // counted on the device when the next step begins
+            blind: if samples == 0 { u64::from(words[TERMS + 3]) + 1 } else { 0 },
             broken: words[TERMS + 4] != 0,
         })
     }
@@ -201,10 +160,10 @@ mod tests {
     fn rays_follow_the_budget_and_steps_the_sharpness() {
         let Some(device) = device() else { return };
         let budget = RayBudget { samples: 262_144, min: 64, max: 8192 };
-        let rule = Pitch::OfSharpness { units: 1.0, min: 0.004, max: 0.05 };
+        let rule = StepLength::OfSharpness { units: 1.0, min: 0.004, max: 0.05 };
         let schedule = Schedule::new(&device, rule, budget, 256);
         let inv_s = device.upload(&[100f32]);
-        // 100 samples a ray, worked out by hand in `iface::schedule`
+        // 100 samples a ray, worked out by hand in `kernel::cpu::schedule`
         let mut rays = 256;
         for (k, want) in [256, 492, 704, 895, 1067, 1222, 1361].into_iter().enumerate() {
             let count = device.upload(&[0, 100 * rays]);
@@ -212,7 +171,7 @@ mod tests {
             rays = device.read::<u32>(&schedule.rays)[0];
             assert!(rays.abs_diff(want) <= 1, "{rays} {want}");
         }
-        assert_eq!(device.read::<f32>(&schedule.pitch), [0.01]);
+        assert_eq!(device.read::<f32>(&schedule.step_length), [0.01]);
         // without samples nothing changes, but is counted
         let none = device.upload(&[0u32, 0]);
         (0..3).for_each(|_| schedule.advance(&device, &device.upload(&[1e-3f32]), &none, false));
@@ -221,15 +180,15 @@ mod tests {
         let figures = |count: &Buffer, broken: u32| {
             schedule.figures(&device, &there, &inv_s, count, &device.upload(&[broken])).unwrap()
         };
-        let (samples, blind) = (0, 3);
+        let (samples, rays, blind) = (0, rays as usize, 4);
         let want = Figures { losses, variance: 100.0, samples, rays, blind, broken: true };
         assert_eq!(figures(&none, 1), want);
-        assert_eq!(device.read::<f32>(&schedule.pitch), [0.05]);
+        assert_eq!(device.read::<f32>(&schedule.step_length), [0.05]);
         // few and many samples stay within the bounds
         for (wanted, want) in [(1u32, 8192), (u32::MAX, 7372)] {
             schedule.advance(&device, &inv_s, &device.upload(&[0, wanted]), false);
             assert_eq!(device.read::<u32>(&schedule.rays), [want]);
         }
-        assert_eq!(figures(&none, 0).blind, 0);
+        assert_eq!(figures(&none, 0).blind, 1);
     }
 }

@@ -1,4 +1,4 @@
-//! The signed-distance field of [`crate::kernel::sdf`], whose module holds the formulas: forward with normals, and the
+//! The signed-distance field of [`crate::kernel::cpu::sdf`], whose module holds the formulas: forward with normals, and the
 //! backward with its second-order path.
 //!
 //! A group of 256 threads takes 64 samples through all layers. Activations stand in workgroup memory, channel by
@@ -12,8 +12,8 @@ mod kernels;
 use super::device::{Buffer, Device, groups};
 use super::hash::Grid;
 use super::tile::{CHANNELS, UNITS};
-use crate::kernel::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
-use crate::kernel::sdf::{FieldShape, WIDTH};
+use crate::kernel::cpu::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
+use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
 use cubecl::prelude::*;
 use kernels::{color_backward, forward, geometry_backward, prepare, reduce};
 
@@ -125,11 +125,11 @@ pub struct Sdf {
 
 impl Sdf {
     /// Can a device compute a field of this shape? Not one of some twenty levels.
-    pub fn knows(shape: &FieldShape) -> bool {
+    pub fn supports(shape: &FieldShape) -> bool {
         Plan::fits(shape.layout())
     }
 
-    /// For up to `capacity` samples, a multiple of [`TILE`], of a field that it [`knows`](Sdf::knows).
+    /// For up to `capacity` samples, a multiple of [`TILE`], of a field that it [`supports`](Sdf::supports).
     pub fn new(device: &Device, shape: &FieldShape, capacity: usize) -> Sdf {
         assert!(capacity.is_multiple_of(TILE) && capacity > 0);
         let layout = shape.layout();
@@ -163,7 +163,12 @@ impl Sdf {
     /// Words of memory that a sample takes: all of them, and of the largest buffer.
     pub fn words_per_sample(shape: &FieldShape) -> [usize; 2] {
         let features = 2 * shape.levels.len();
-        [6 * features + 3 * HIDDEN + 2 * OUTPUTS + WIDTH + 3, 3 * features]
+        [6 * features + 3 * HIDDEN + 2 * OUTPUTS + WIDTH + 3, HIDDEN.max(3 * features)]
+    }
+
+    /// What the last forward computed, planes `[8, capacity]`.
+    pub fn output(&self) -> &Buffer {
+        &self.out
     }
 
     /// How many of the levels take part from now on.
@@ -171,7 +176,7 @@ impl Sdf {
         self.grid.activate(levels);
     }
 
-    /// Sdf, gradient and color of samples, and what the backward needs: see [`crate::kernel::sdf::forward`].
+    /// Sdf, gradient and color of samples, and what the backward needs: see [`crate::kernel::cpu::sdf::forward`].
     ///
     /// # Shapes
     ///
@@ -242,7 +247,7 @@ impl Sdf {
     }
 
     /// Adds the gradient of the table, zero before, and writes that of the weights: see
-    /// [`crate::kernel::sdf::backward`]. Of the samples of the last forward.
+    /// [`crate::kernel::cpu::sdf::backward`]. Of the samples of the last forward.
     ///
     /// # Shapes
     ///

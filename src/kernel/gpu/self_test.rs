@@ -9,11 +9,11 @@ use super::neus::{Neus, RAY_WIDTH, Rays};
 use super::occupancy::Occupancy;
 use super::sdf::Sdf;
 use crate::Result;
-use crate::kernel::adam::AdamStep;
-use crate::kernel::march::{Bitmask, MarchRay};
-use crate::kernel::mlp::Weights;
-use crate::kernel::sdf::{FieldShape, WIDTH};
-use crate::kernel::{self, hash, rng};
+use crate::kernel::cpu::adam::AdamStep;
+use crate::kernel::cpu::march::{Bitmask, MarchRay};
+use crate::kernel::cpu::mlp::Weights;
+use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
+use crate::kernel::cpu::{self, hash, rng};
 
 /// A kernel, or some that work together, and how far it was from the CPU.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -98,9 +98,9 @@ pub fn self_test(device: &Device) -> Result<Vec<Check>> {
     let Case { shape, table, flat, x, direction, g_out } = Case::new(SAMPLES, 6, true, 5);
 
     let weights = Weights::new(shape.layout(), &flat);
-    let a = kernel::sdf::forward(&shape, &table, &weights, &x, &direction);
+    let a = cpu::sdf::forward(&shape, &table, &weights, &x, &direction);
     let mut g_table = vec![[0f32; 2]; table.len()];
-    let g_flat = kernel::sdf::backward(&a, &weights, g_out.as_flattened(), &mut g_table);
+    let g_flat = cpu::sdf::backward(&a, &weights, g_out.as_flattened(), &mut g_table);
     let mut field = Sdf::new(device, &shape, SAMPLES);
     field.activate(shape.active);
     let [at, toward] = [&x, &direction].map(|v| device.upload(&planes(v, SAMPLES)));
@@ -123,7 +123,7 @@ pub fn self_test(device: &Device) -> Result<Vec<Check>> {
         .collect();
     let mut mask = Bitmask::filled(8, true);
     (0..512).step_by(3).for_each(|i| mask.set(i, false));
-    let marched = kernel::march::march(&mask, None, 2.0, 0.25, &rays, 100);
+    let marched = cpu::march::march(&mask, None, 2.0, 0.25, &rays, 100);
     let batch = Batch::of_rays(device, &rays, rays.len());
     let samples = Samples::new(device, rays.len(), 1024);
     let occupancy = Occupancy::new(device, &mask, None, 2.0);
@@ -135,19 +135,19 @@ pub fn self_test(device: &Device) -> Result<Vec<Check>> {
 
     let along: Vec<[f32; 3]> = rays.iter().map(|r| r.direction).collect();
     let dt = vec![0.25f32; n];
-    let bundle = kernel::neus::Rays { offsets: &marched.offsets, direction: &along, t: &marched.t, dt: &dt };
+    let bundle = cpu::neus::Rays { offsets: &marched.offsets, direction: &along, t: &marched.t, dt: &dt };
     let values: Vec<[f32; WIDTH]> = (0..n).map(|i| rows[i % SAMPLES]).collect();
-    let seen = kernel::neus::forward(bundle, values.as_flattened(), 20.0, 0.5);
+    let seen = cpu::neus::forward(bundle, values.as_flattened(), 20.0, 0.5);
     let neus = Neus::new(device, rays.len(), n);
     let [t, dt] = [&marched.t, &dt].map(|v| device.upload(v));
     let offsets = device.upload(&marched.offsets);
     let there = Rays { offsets: &offsets, direction: &batch.direction, t: &t, dt: &dt };
     let out = neus.forward(device, there, &device.upload(&planes(&values, n)), &device.upload(&[20f32]), 0.5);
     // the device composites squared colors, too
-    let got = device.fetch::<f32>(out)?[..kernel::neus::RAY_WIDTH * rays.len()].to_vec();
-    let seen: &[[f32; kernel::neus::RAY_WIDTH]] = seen.as_chunks().0;
+    let got = device.fetch::<f32>(out)?[..cpu::neus::RAY_WIDTH * rays.len()].to_vec();
+    let seen: &[[f32; cpu::neus::RAY_WIDTH]] = seen.as_chunks().0;
     check("compositing", &got, &planes(seen, rays.len()), 1e-4);
-    const { assert!(RAY_WIDTH > kernel::neus::RAY_WIDTH) };
+    const { assert!(RAY_WIDTH == cpu::neus::RAY_WIDTH) };
 
     let step = AdamStep {
         lr: 0.01,
@@ -164,7 +164,7 @@ pub fn self_test(device: &Device) -> Result<Vec<Check>> {
     let gradient = device.upload(&g_flat);
     adam(device, there.each_ref(), &gradient, &step, gate);
     let [p, m, v] = &mut want;
-    kernel::adam::adam(p, m, v, &mut g_flat.clone(), &step);
+    cpu::adam::adam(p, m, v, &mut g_flat.clone(), &step);
     check("optimizer", &device.fetch(&there[0])?, &want[0], 1e-5);
     checks.extend(super::vm::checks(device)?);
     Ok(checks)

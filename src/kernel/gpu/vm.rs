@@ -1,4 +1,4 @@
-//! TensoRF's field of [`crate::kernel::vm`], whose modules hold the formulas: rays through it, and their gradients.
+//! TensoRF's field of [`crate::kernel::cpu::vm`], whose modules hold the formulas: rays through it, and their gradients.
 //!
 //! Samples are marched first, all that the mask leaves; then their densities are looked up, weights are composited, and
 //! those worth a color are listed and decoded. The rays that the CPU ends early are marched on here, but what lies
@@ -14,14 +14,14 @@ mod self_test;
 
 pub use decoder::DeviceDecoder;
 pub use grid::DeviceGrid;
-pub use losses::{Behind, MaskTerm, VmFigures, VmLosses};
+pub use losses::VmLosses;
 pub use renderer::VmRenderer;
 pub(super) use self_test::checks;
 
 use super::device::Atomics;
 use super::device::{Buffer, Device};
 use super::draw::Batch;
-use crate::kernel::vm::{Grid, VmField};
+use crate::kernel::cpu::vm::{Grid, VmField};
 use march::{DeviceLattice, VmSamples};
 use rays::Along;
 
@@ -56,7 +56,7 @@ pub struct VmValues<'a> {
 
 impl Vm {
     /// For so many rays, whatever they meet; with room for gradients where it learns. The decoder must be one that
-    /// [`DeviceDecoder::knows`].
+    /// [`DeviceDecoder::supports`].
     pub fn new(device: &Device, field: &VmField, rays: usize, learns: bool) -> Vm {
         Vm::with_room(device, field, rays, if learns { usize::MAX } else { SEEN }, learns)
     }
@@ -93,7 +93,7 @@ impl Vm {
         }
     }
 
-    /// Renders rays, all that there is room for: planes `[5, rays]`, see [`crate::kernel::vm::RAY_WIDTH`].
+    /// Renders rays, all that there is room for: planes `[5, rays]`, see [`crate::kernel::cpu::vm::RAY_WIDTH`].
     pub fn render(&self, device: &Device, values: VmValues, rays: &Batch) -> &Buffer {
         let (samples, along) = (&self.samples, &self.along);
         self.decoder.prepare(device, values.network);
@@ -103,6 +103,11 @@ impl Vm {
         self.decoder.forward(device, &self.color, values.color, rays, samples, along);
         along.composite(device, samples);
         &along.out
+    }
+
+    /// What the last render composited, planes `[5, rays]`.
+    pub fn output(&self) -> &Buffer {
+        &self.along.out
     }
 
     /// Adds the gradients of planes and lines to those of `gradients`, and writes those of the decoder's weights: of the

@@ -323,7 +323,7 @@ impl PixelGraph {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernel::rng;
+    use crate::kernel::cpu::rng;
 
     struct Random(u64, u64);
 

@@ -26,7 +26,7 @@
 use super::trimap::{HEAD, UNKNOWN};
 use crate::geom::cofactors;
 use crate::image::{Gray, Photo};
-use crate::kernel::cg::{self, dot};
+use crate::kernel::cpu::cg::{self, dot};
 use crate::{Error, Result};
 
 /// How the opacity of the band is solved for.

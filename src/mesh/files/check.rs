@@ -68,8 +68,8 @@ pub struct CheckReport {
     pub max: [f64; 3],
     /// Size of the box in metres.
     pub size_m: [f64; 3],
-    /// Enclosed volume in litres; negative when wound inward, meaningless when open.
-    pub volume_l: f64,
+    /// Enclosed volume in litres, negative when wound inward; an open mesh encloses none.
+    pub volume_l: Option<f64>,
     /// Does every vertex have a color?
     pub has_colors: bool,
     /// Does a picture give it its colors? For those who have read it: [`check`] knows only the mesh.
@@ -88,6 +88,15 @@ pub struct CheckReport {
 pub const BARS: [&str; 5] = ["watertight", "manifold", "one-piece", "no-self-intersections", "sound-uv"];
 
 impl CheckReport {
+    /// Closed, and wound outward?
+    fn is_watertight(&self) -> bool {
+        self.closed && self.orientation().is_empty()
+    }
+
+    fn orientation(&self) -> &'static str {
+        if self.volume_l.is_some_and(|volume| volume < 0.0) { ", inside out" } else { "" }
+    }
+
     /// Checks the named bars; see [`BARS`].
     ///
     /// # Errors
@@ -98,10 +107,14 @@ impl CheckReport {
         for &bar in bars {
             let (reached, found) = match bar {
                 "watertight" => (
-                    self.closed,
+                    self.is_watertight(),
                     format!(
-                        "{} open edges, {} wound alike, {} in more than two triangles, {} invalid triangles",
-                        self.boundary_edges, self.flipped_edges, self.nonmanifold_edges, self.invalid
+                        "{} open edges, {} wound alike, {} in more than two triangles, {} invalid triangles{}",
+                        self.boundary_edges,
+                        self.flipped_edges,
+                        self.nonmanifold_edges,
+                        self.invalid,
+                        self.orientation()
                     ),
                 ),
                 "manifold" => (
@@ -145,7 +158,10 @@ impl fmt::Display for CheckReport {
         } = self;
         let CheckReport { self_intersections, volume_l, bad_normals, size_m: [x, y, z], .. } = self;
         let yes = |b: bool| if b { "yes" } else { "NO" };
-        let [watertight, manifold, normals] = [self.closed, self.manifold, self.has_normals].map(yes);
+        let [watertight, manifold, normals] =
+            [self.is_watertight(), self.manifold, self.has_normals].map(yes);
+        let orientation = self.orientation();
+        let volume = volume_l.map_or("undefined: the mesh is open".into(), |v| format!("{v:.4} litres"));
         let genus = self.genus.map_or("undefined".into(), |g| g.to_string());
         let (least, left) = bound("at least ", self.self_intersections_left, "triangles");
         let (low, high) = (DVec3::from(self.min), DVec3::from(self.max));
@@ -163,14 +179,14 @@ impl fmt::Display for CheckReport {
             "\
 vertices             {vertices} ({welded_vertices} after welding)
 triangles            {triangles}
-watertight           {watertight} ({boundary_edges} open edges, {flipped_edges} wound alike)
+watertight           {watertight} ({boundary_edges} open edges, {flipped_edges} wound alike{orientation})
 manifold             {manifold} ({nonmanifold_edges} edges, {nonmanifold_vertices} vertices)
 pieces               {pieces} (Euler {euler}, genus {genus})
 self-intersecting    {least}{self_intersections} triangles{left}
 slivers              {slivers} triangles, {degenerate} without area, {invalid} invalid
 size                 {x:.4} × {y:.4} × {z:.4} m
 box                  {low:.digits$} to {high:.digits$}
-volume               {volume_l:.4} litres
+volume               {volume}
 colors               {colors}
 normals              {normals} ({bad_normals} not of unit length)
 "
@@ -264,7 +280,7 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
         min: low.to_array(),
         max: high.to_array(),
         size_m: ((high - low) * unit_m).to_array(),
-        volume_l: volume * unit_m.powi(3) * 1000.0,
+        volume_l: closed.then_some(volume * unit_m.powi(3) * 1000.0),
         has_colors: count > 0 && mesh.colors.len() == count,
         has_texture: None,
         has_normals: count > 0 && mesh.normals.len() == count,
@@ -350,7 +366,7 @@ mod tests {
         let r = check(&cuboid(Vec3::ZERO, Vec3::new(2.0, 3.0, 4.0)), 0.1);
         assert!(r.closed && r.manifold);
         assert_eq!((r.pieces, r.euler, r.genus), (1, 2, Some(0)));
-        assert!((r.volume_l - 24.0).abs() < 1e-9);
+        assert!((r.volume_l.unwrap() - 24.0).abs() < 1e-9);
         assert!((r.size_m[2] - 0.4).abs() < 1e-12);
         assert_eq!((r.self_intersections, r.slivers, r.degenerate), (0, 0, 0));
         assert_eq!(r.require(&BARS[..4]), Ok(()));
@@ -390,6 +406,34 @@ mod tests {
         m.triangles.push([0, 1, 8]);
         let r = check(&m, 1.0);
         assert_eq!((r.nonmanifold_edges, r.boundary_edges, r.manifold), (1, 2, false));
+    }
+
+    #[test]
+    fn an_inside_out_mesh_is_not_watertight() {
+        let mut m = cuboid(Vec3::ZERO, Vec3::ONE);
+        m.triangles.iter_mut().for_each(|t| t.swap(0, 1));
+        let r = check(&m, 1.0);
+        assert!(r.closed && r.volume_l.unwrap() < 0.0);
+        let missed = r.require(&["watertight"]).unwrap_err();
+        assert!(
+            missed.kind() == ErrorKind::BelowBar && missed.to_string().ends_with("inside out"),
+            "{missed}"
+        );
+        assert!(r.to_string().contains("watertight           NO (0 open edges, 0 wound alike, inside out)"));
+        // a hollow in a box is wound towards the box's outside, and as it should be
+        let hollow = both(cuboid(Vec3::splat(-1.0), Vec3::splat(2.0)), m);
+        assert_eq!(check(&hollow, 1.0).require(&["watertight"]), Ok(()));
+    }
+
+    #[test]
+    fn an_open_mesh_has_no_volume_wherever_it_lies() {
+        for away in [0.0, 10.0] {
+            let mut m = cuboid(Vec3::splat(away), Vec3::splat(away + 1.0));
+            m.triangles.pop();
+            let r = check(&m, 1.0);
+            assert_eq!(r.volume_l, None);
+            assert!(r.to_string().contains("volume               undefined: the mesh is open"), "{r}");
+        }
     }
 
     #[test]

@@ -11,6 +11,7 @@ use gltf::json::mesh::{Mode, Semantic};
 use gltf::json::validation::Checked;
 use serde::Deserialize;
 use serde::de::IgnoredAny;
+use serde_json::Value;
 use std::collections::BTreeMap;
 
 /// Most objects and arrays. One takes two bytes of JSON and up to 144 in memory, and twice that while a list grows.
@@ -84,6 +85,9 @@ pub(super) struct GlbBuffer {
 #[derive(Deserialize)]
 pub(super) struct GlbMesh {
     pub primitives: Vec<GlbPrimitive>,
+    /// Of morph targets, where a node has none of its own.
+    #[serde(default)]
+    pub weights: Value,
 }
 
 #[derive(Deserialize)]
@@ -93,6 +97,8 @@ pub(super) struct GlbPrimitive {
     #[serde(default)]
     pub mode: Checked<Mode>,
     pub material: Option<u32>,
+    /// Morph targets.
+    pub targets: Option<IgnoredAny>,
 }
 
 #[derive(Deserialize, Default)]
@@ -102,17 +108,40 @@ pub(super) struct GlbNode {
     pub children: Vec<u32>,
     matrix: Option<Box<[f64; 16]>>,
     translation: Option<[f64; 3]>,
-    rotation: Option<[f64; 4]>,
+    rotation: Option<Box<[f64; 4]>>,
     scale: Option<[f64; 3]>,
+    skin: Option<IgnoredAny>,
+    weights: Option<Box<Value>>,
+    extensions: GlbNodeExtensions,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+struct GlbNodeExtensions {
+    #[serde(rename = "EXT_mesh_gpu_instancing")]
+    instancing: Option<IgnoredAny>,
 }
 
 impl GlbNode {
+    /// What puts the triangles of its mesh elsewhere than their accessors and the nodes' transforms say.
+    pub fn deformation(&self, mesh: &GlbMesh) -> Option<&'static str> {
+        let weights = self.weights.as_deref().unwrap_or(&mesh.weights);
+        let is_morphed = mesh.primitives.iter().any(|p| p.targets.is_some())
+            && weights.as_array().into_iter().flatten().any(|w| w.as_f64().is_some_and(|w| w != 0.0));
+        let found = [
+            (self.skin.is_some(), "a skin"),
+            (is_morphed, "a morph target whose weight is not 0"),
+            (self.extensions.instancing.is_some(), "`EXT_mesh_gpu_instancing`"),
+        ];
+        found.into_iter().find_map(|(is_there, name)| is_there.then_some(name))
+    }
+
     /// From the node's coordinates to its parent's.
     pub fn parent_from_node(&self) -> DMat4 {
         if let Some(matrix) = &self.matrix {
             return DMat4::from_cols_array(matrix);
         }
-        let q = DQuat::from_array(self.rotation.unwrap_or([0.0, 0.0, 0.0, 1.0]));
+        let q = self.rotation.as_deref().map_or(DQuat::IDENTITY, |q| DQuat::from_array(*q));
         let q = if q.length() > 0.0 { q / q.length() } else { DQuat::IDENTITY };
         DMat4::from_scale_rotation_translation(
             self.scale.map_or(DVec3::ONE, DVec3::from),
@@ -132,7 +161,7 @@ pub(super) struct GlbScene {
 #[serde(rename_all = "camelCase", default)]
 pub(super) struct GlbMaterial {
     pub pbr_metallic_roughness: GlbPbr,
-    pub extras: serde_json::Value,
+    pub extras: Value,
 }
 
 impl GlbMaterial {
@@ -147,7 +176,7 @@ impl GlbMaterial {
 pub(super) struct GlbPbr {
     pub base_color_texture: Option<GlbTextureUse>,
     /// What colors and texture are multiplied with, whatever stands there.
-    pub base_color_factor: serde_json::Value,
+    pub base_color_factor: Value,
 }
 
 impl GlbPbr {
@@ -200,7 +229,7 @@ mod tests {
         let half = std::f64::consts::FRAC_1_SQRT_2;
         let node = GlbNode {
             translation: Some([10.0, 0.0, 0.0]),
-            rotation: Some([0.0, 0.0, half, half]), // a quarter turn about z: x → y
+            rotation: Some(Box::new([0.0, 0.0, half, half])), // a quarter turn about z: x → y
             scale: Some([2.0, 1.0, 1.0]),
             ..GlbNode::default()
         };

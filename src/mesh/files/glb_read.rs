@@ -199,7 +199,7 @@ impl<'a> GlbReader<'a> {
         let root = self.root;
         if root.nodes.is_empty() {
             for mesh in 0..root.meshes.len() as u32 {
-                self.parts_of(mesh, DMat4::IDENTITY, &mut visit)?;
+                self.parts_of(mesh, &GlbNode::default(), DMat4::IDENTITY, &mut visit)?;
             }
         }
         let mut tree = NodeStack { reached: vec![false; root.nodes.len()], nodes: Vec::new() };
@@ -210,7 +210,7 @@ impl<'a> GlbReader<'a> {
                 return Err(self.source.broken(format!("node {index}"), "its transform is not finite"));
             }
             if let Some(mesh) = node.mesh {
-                self.parts_of(mesh, matrix, &mut visit)?;
+                self.parts_of(mesh, node, matrix, &mut visit)?;
             }
             self.push(&node.children, matrix, &mut tree)?;
         }
@@ -220,10 +220,14 @@ impl<'a> GlbReader<'a> {
     fn parts_of(
         &self,
         index: u32,
+        node: &GlbNode,
         matrix: DMat4,
         visit: &mut impl FnMut(&GlbPart<'a>) -> Result<()>,
     ) -> Result<()> {
         let mesh = self.get("mesh", &self.root.meshes, index)?;
+        if let Some(feature) = node.deformation(mesh) {
+            return Err(self.source.unsupported(format!("mesh {index}"), feature));
+        }
         for (k, primitive) in mesh.primitives.iter().enumerate() {
             let at = format!("mesh {index}, primitive {k}");
             match primitive.mode {

@@ -32,7 +32,7 @@ pub fn picture_beside(picture: Option<&PictureSource>, path: &Path) -> Result<Op
         Some(PictureSource::Beside(name)) => Some(name.clone()),
         Some(PictureSource::Material(mtl)) => {
             let mtl = path.with_file_name(mtl);
-            picture_of_mtl(&io::read_bytes(&mtl, &Limits::default())?, &mtl)?
+            picture_of_mtl(&io::read_maybe_empty(&mtl, &Limits::default())?, &mtl)?
         }
         Some(PictureSource::Inside(_)) | None => None,
     };

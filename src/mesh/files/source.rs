@@ -82,7 +82,9 @@ impl Source<'_> {
     /// A file that is right, but beyond this reader.
     pub fn unsupported(&self, at: impl Display, feature: impl Display) -> Error {
         let hint = match self.format {
-            "GLB" => "export it as a plain .glb without compression, with one picture inside",
+            "GLB" => {
+                "export it as a plain .glb: shape keys, poses and instances applied, no compression, one picture inside"
+            }
             _ => {
                 "export it with one texture that lies in the same folder, or as a .glb with the picture inside"
             }

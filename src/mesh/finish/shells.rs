@@ -15,7 +15,7 @@
 
 use super::appearance::{Nodes, Photograph};
 use crate::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, ShellLayer, Shells};
-use crate::kernel::cg::{conjugate_gradients, dot};
+use crate::kernel::cpu::cg::{conjugate_gradients, dot};
 use crate::{Monitor, Result};
 use glam::Vec2;
 use rayon::prelude::*;

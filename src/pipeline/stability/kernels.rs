@@ -3,16 +3,16 @@
 use super::case::{Cases, StabilityCase, relative, worst};
 use crate::geom::{Camera, Distortion};
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
-use crate::kernel::adam::{AdamStep, adam};
-use crate::kernel::hash::{self, Level};
-use crate::kernel::march::MarchRay;
-use crate::kernel::mlp::Weights;
-use crate::kernel::reference::{self, wide};
-use crate::kernel::sdf::{self, FieldShape};
-use crate::kernel::sphharm::sh16;
-use crate::kernel::vm::mask::Lattice;
-use crate::kernel::vm::{self, DecoderShape, DecoderWeights, Grid, Shading, VmField};
-use crate::kernel::{rng, simd};
+use crate::kernel::cpu::adam::{AdamStep, adam};
+use crate::kernel::cpu::hash::{self, Level};
+use crate::kernel::cpu::march::MarchRay;
+use crate::kernel::cpu::mlp::Weights;
+use crate::kernel::cpu::reference::{self, wide};
+use crate::kernel::cpu::sdf::{self, FieldShape};
+use crate::kernel::cpu::sphharm::sh16;
+use crate::kernel::cpu::vm::mask::Lattice;
+use crate::kernel::cpu::vm::{self, DecoderShape, DecoderWeights, Grid, Shading, VmField};
+use crate::kernel::cpu::{rng, simd};
 use crate::metrics::{ssim_reflect_map, ssim_valid};
 use glam::{DMat3, DVec3, Vec2};
 use std::array::from_fn;
@@ -325,7 +325,7 @@ fn cameras(cases: &mut Cases) {
             let u = |k: u64| 1.4 * rng::uniform(58, k, i) as f64 - 0.7;
             let (x, y) = (u(0), u(1));
             let (xd, yd) = distortion.apply(x, y);
-            distortion.undo(xd, yd).map_or(f64::NAN, |(a, b)| (a - x).abs() + (b - y).abs())
+            distortion.undistort(xd, yd).map_or(f64::NAN, |(a, b)| (a - x).abs() + (b - y).abs())
         });
         cases.add(format!("lens, {name}: undone"), worst(undone), 1e-7, "focal lengths");
     }

@@ -3,10 +3,10 @@
 
 use super::case::{Cases, StabilityCase, worst};
 use crate::geom::{Bvh, Camera, Distortion, Mesh, Ray};
-use crate::kernel::march::{Bitmask, MarchRay, march};
-use crate::kernel::neus::{self, Rays};
-use crate::kernel::vm::mask::{Lattice, Walk};
-use crate::kernel::{hash, rng};
+use crate::kernel::cpu::march::{Bitmask, MarchRay, march};
+use crate::kernel::cpu::neus::{self, Rays};
+use crate::kernel::cpu::vm::mask::{Lattice, Walk};
+use crate::kernel::cpu::{hash, rng};
 use crate::mesh::{Volume, marching};
 use crate::render::{RasterOptions, RasterView, raster};
 use glam::{DMat3, DVec3, Vec2, Vec3};

@@ -1,10 +1,10 @@
 //! NeuS from the softest to the sharpest surface, forward and backward, against f64; and fields without a direction.
 
 use super::case::{Cases, StabilityCase, relative, worst};
-use crate::kernel::neus::{self, Rays};
-use crate::kernel::reference::{neus::composite, wide};
-use crate::kernel::rng;
-use crate::kernel::sdf::WIDTH;
+use crate::kernel::cpu::neus::{self, Rays};
+use crate::kernel::cpu::reference::{neus::composite, wide};
+use crate::kernel::cpu::rng;
+use crate::kernel::cpu::sdf::WIDTH;
 use std::array::from_fn;
 
 pub(super) fn cases() -> Vec<StabilityCase> {

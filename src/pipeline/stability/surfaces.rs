@@ -3,7 +3,7 @@
 use super::case::{Cases, StabilityCase, worst};
 use crate::Quiet;
 use crate::geom::{Aabb, Mesh, topology};
-use crate::kernel::rng;
+use crate::kernel::cpu::rng;
 use crate::mesh::{ExtractOptions, SimplifyConfig, Volume, extract, marching, simplify};
 use glam::{DVec3, Vec3};
 use std::collections::BTreeMap;

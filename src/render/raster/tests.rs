@@ -2,7 +2,7 @@ use super::project::{Corner, Face, area};
 use super::tile::UNIT;
 use super::*;
 use crate::geom::{Bvh, Distortion, ShellCaster};
-use crate::kernel::rng;
+use crate::kernel::cpu::rng;
 use crate::render::{RaycastOptions, raycast};
 use glam::{DMat3, DVec3, Vec2};
 

@@ -6,7 +6,7 @@ use super::super::sdf::Sdf;
 use super::super::{neus, rng};
 use super::{Occupancy, UNITS};
 use crate::Result;
-use crate::kernel::march::nerfacc;
+use crate::kernel::cpu::march::nerfacc;
 use cubecl::prelude::*;
 
 const DECAY: f32 = nerfacc::DECAY;

@@ -4,8 +4,8 @@ use super::super::tile::{
     self, CHANNELS, LANES, at, gate, load, narrow, outer, product, put, save, sigmoid, sums,
 };
 use super::{NORMAL, Plan};
-use crate::kernel::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, SOFTNESS, TILE};
-use crate::kernel::neus::SHORTEST;
+use crate::kernel::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, SOFTNESS, TILE};
+use crate::kernel::cpu::neus::SHORTEST;
 use cubecl::prelude::*;
 
 type F4 = Vector<f32, Const<4>>;
@@ -122,7 +122,7 @@ fn color_inputs(
     }
 }
 
-/// [`crate::kernel::sphharm::sh16`].
+/// [`crate::kernel::cpu::sphharm::sh16`].
 #[cube]
 fn harmonics(a: &mut [F4], x: F4, y: F4, z: F4, row: usize) {
     let (xy, yz, xz) = (x * y, y * z, x * z);

@@ -1,8 +1,8 @@
 use super::super::device::tests::{agree, device, devices, planes};
 use super::super::self_test::Case;
 use super::*;
-use crate::kernel::mlp::Weights;
-use crate::kernel::sdf;
+use crate::kernel::cpu::mlp::Weights;
+use crate::kernel::cpu::sdf;
 
 const SAMPLES: usize = 1000;
 const CAPACITY: usize = 1088; // one tile more than there are samples for

@@ -1,4 +1,4 @@
-//! The color decoder of [`crate::kernel::vm`] without encodings, which is what is published.
+//! The color decoder of [`crate::kernel::cpu::vm`] without encodings, which is what is published.
 //!
 //! Between products and first layer lies nothing but two matrices; here they are one:
 //!
@@ -18,7 +18,7 @@ use super::super::tile;
 use super::grid::{DeviceGrid, NONE};
 use super::march::VmSamples;
 use super::rays::Along;
-use crate::kernel::vm::DecoderShape;
+use crate::kernel::cpu::vm::DecoderShape;
 use kernels::{backward, chain, forward, prepare, reduce};
 
 /// Groups that take tiles, one after the other, and sum gradients of weights, each over its own.
@@ -111,7 +111,7 @@ impl DeviceDecoder {
     pub const CHUNK: usize = 1 << 20;
 
     /// Can a device decode this? Else what it cannot.
-    pub fn knows(shape: &DecoderShape) -> Result<(), &'static str> {
+    pub fn supports(shape: &DecoderShape) -> Result<(), &'static str> {
         if shape.view_frequencies > 0 || shape.feature_frequencies > 0 {
             return Err("encodings of directions or features");
         }
@@ -126,7 +126,7 @@ impl DeviceDecoder {
         capacity: usize,
         learns: bool,
     ) -> DeviceDecoder {
-        assert_eq!(DeviceDecoder::knows(shape), Ok(()));
+        assert_eq!(DeviceDecoder::supports(shape), Ok(()));
         let lanes = if shape.hidden > tile::channels(16) { 8 } else { 16 };
         let (features, hidden, quads) = (shape.features, shape.hidden, grid.quads());
         let plan = Plan { quads, channels: shape.channels, features, hidden, lanes };

@@ -2,8 +2,7 @@
 
 use super::super::device::{Atomics, Buffer, Device, groups};
 use super::super::sum::{Exchange, Fixed, MOST, Native, Sum};
-use crate::Result;
-use crate::kernel::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, Penalty, tv_factors};
+use crate::kernel::cpu::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, Penalty, tv_factors};
 use cubecl::prelude::*;
 
 type F4 = Vector<f32, Const<4>>;
@@ -386,31 +385,35 @@ impl DeviceGrid {
         planes.chain((0..3).map(move |i| (a.line(i), b.line(i))))
     }
 
-    /// Copies planes and lines as the CPU has them to the device.
-    pub fn upload(&self, device: &Device, values: &[f32]) -> Buffer {
+    /// Returns planes and lines, as the processor has them, as they lie on the device: with zeros in channels that fill up.
+    pub fn pad(&self, values: Vec<f32>) -> Vec<f32> {
         assert_eq!(values.len(), self.grid.len());
         if self.grid == self.padded {
-            return device.upload(values);
+            return values;
         }
         let mut out = vec![0f32; self.padded.len()];
         for (a, b) in self.pairs().filter(|(a, _)| !a.is_empty()) {
             let rows = values[a.range()].chunks(a.channels).zip(out[b.range()].chunks_mut(b.channels));
             rows.for_each(|(from, to)| to[..a.channels].copy_from_slice(from));
         }
-        device.upload(&out)
+        out
     }
 
-    /// Waits for the device and copies them back: see [`Device::fetch`].
-    pub fn fetch(&self, device: &Device, buffer: &Buffer) -> Result<Vec<f32>> {
-        let values = device.fetch::<f32>(buffer)?;
+    /// Returns planes and lines without what [`pad`](DeviceGrid::pad) added.
+    pub fn cut(&self, values: Vec<f32>) -> Vec<f32> {
         if self.grid == self.padded {
-            return Ok(values);
+            return values;
         }
         let mut out = Vec::with_capacity(self.grid.len());
         for (a, b) in self.pairs().filter(|(a, _)| !a.is_empty()) {
             values[b.range()].chunks(b.channels).for_each(|row| out.extend_from_slice(&row[..a.channels]));
         }
-        Ok(out)
+        out
+    }
+
+    /// Copies planes and lines as the processor has them to the device.
+    pub fn upload(&self, device: &Device, values: &[f32]) -> Buffer {
+        device.upload(&self.pad(values.to_vec()))
     }
 
     /// Features of samples, `[capacity]`: the sum over terms and channels. place: planes `[3, capacity]`.

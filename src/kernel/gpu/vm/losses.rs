@@ -1,48 +1,17 @@
-//! What a training step of TensoRF's field minimizes, and its gradients.
-//!
-//! With `C` and `O` a ray's color and opacity, `h` and `a` color (over black) and alpha of its pixel, `b` what both are
-//! seen over, and means over the rays that there are:
-//!
-//! ```text
-//! ⟨(clamp(C + (1 − O) b) − h − (1 − a) b)²⟩ + mask · ⟨O²⟩ over rays with a = 0, or mask · ⟨−m ln O − (1 − m) ln(1 − O)⟩
-//! ```
-//!
-//! where m is 1 for all that is a little head.
+//! What a training step of TensoRF's field minimizes, and its gradients: see [`crate::kernel::cpu::vm::losses`].
 
 use super::super::device::{Buffer, Device, groups};
 use super::super::draw::Batch;
 use super::Vm;
 use crate::Result;
-use crate::kernel::vm::RAY_WIDTH;
+use crate::kernel::cpu::vm::RAY_WIDTH;
+use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm, TERMS, VmFigures};
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;
 
-/// Terms of a ray: squared error, mask, squared opacity of the background.
-const TERMS: usize = 3;
-
 /// Words of what steps came to: terms, lattice points, samples looked up, samples decoded, rays, broken.
 const TOTALS: usize = TERMS + 5;
-
-/// How opacity is held to the mask.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum MaskTerm {
-    /// Not at all.
-    None,
-    /// Squared opacity of background rays, with this weight.
-    L2(f32),
-    /// Cross entropy of opacity and mask, where all that is a little head is head, with this weight.
-    Ce(f32),
-}
-
-/// What rays are seen over.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Behind {
-    /// A gray added to the batch's background behind the render, not behind the pixel.
-    pub lift: f32,
-    /// Is the batch's background behind the pixel, too?
-    pub target: bool,
-}
 
 /// How many rays there are, and how many of them show background. One group of threads.
 #[cube(launch)]
@@ -176,23 +145,6 @@ fn add(
     }
 }
 
-/// What steps came to.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct VmFigures {
-    /// Sums over the steps of the squared error, the mask's term and the background's squared opacity, unweighted.
-    pub terms: [f32; 3],
-    /// Lattice points inside the box, were nothing skipped.
-    pub lattice: u64,
-    /// Samples whose density was looked up.
-    pub density: u64,
-    /// Samples whose color was decoded.
-    pub color: u64,
-    /// Rays.
-    pub rays: u64,
-    /// Was a gradient of the decoder not finite?
-    pub broken: bool,
-}
-
 /// The losses of so many rays.
 pub struct VmLosses {
     term: MaskTerm,
@@ -215,7 +167,13 @@ impl VmLosses {
     }
 
     /// Gradients by what [`Vm::render`] composited, planes `[5, rays]`.
-    pub fn of_rays(&self, device: &Device, composed: &Buffer, batch: &Batch, behind: Behind) -> &Buffer {
+    pub fn of_rays(
+        &self,
+        device: &Device,
+        composed: &Buffer,
+        batch: &Batch,
+        mode: BackgroundMode,
+    ) -> &Buffer {
         let dim = CubeDim::new_1d(UNITS);
         let (weight, l2, ce) = match self.term {
             MaskTerm::None => (0.0, false, false),
@@ -237,12 +195,17 @@ impl VmLosses {
             self.tally.arg(),
             self.g_out.arg(),
             self.terms.arg(),
-            behind.lift,
-            f32::from(behind.target),
+            mode.lift,
+            f32::from(mode.target),
             weight,
             l2,
             ce,
         );
+        &self.g_out
+    }
+
+    /// What the last [`of_rays`](VmLosses::of_rays) wrote, planes `[5, rays]`.
+    pub fn gradient(&self) -> &Buffer {
         &self.g_out
     }
 

@@ -1,11 +1,11 @@
-//! The lattice points of rays inside a box and a mask: see [`crate::kernel::vm::mask::Walk`], whose rule this is.
+//! The lattice points of rays inside a box and a mask: see [`crate::kernel::cpu::vm::mask::Walk`], whose rule this is.
 
 use super::super::device::{Buffer, Device, groups};
 use super::super::draw::Batch;
 use super::super::march::{bit, prefix_sum};
 use super::super::occupancy::words;
-use crate::kernel::vm::VmField;
-use crate::kernel::vm::mask::BLOCK;
+use crate::kernel::cpu::vm::VmField;
+use crate::kernel::cpu::vm::mask::BLOCK;
 use cubecl::prelude::*;
 
 const UNITS: u32 = 256;

@@ -1,10 +1,10 @@
-//! From features to weights, and compositing: see `render` of [`crate::kernel::vm`], whose module holds the formulas. A
+//! From features to weights, and compositing: see `render` of [`crate::kernel::cpu::vm`], whose module holds the formulas. A
 //! thread takes a ray.
 
 use super::super::device::{Buffer, Device, groups};
 use super::super::march::prefix_sum;
 use super::march::VmSamples;
-use crate::kernel::vm::{RAY_WIDTH, VmField};
+use crate::kernel::cpu::vm::{RAY_WIDTH, VmField};
 use cubecl::prelude::*;
 
 const UNITS: u32 = 64;

@@ -4,8 +4,8 @@ use super::super::device::{Buffer, Device};
 use super::super::draw::Batch;
 use super::{Vm, VmValues};
 use crate::Result;
-use crate::kernel::march::MarchRay;
-use crate::kernel::vm::{RAY_WIDTH, VmField};
+use crate::kernel::cpu::march::MarchRay;
+use crate::kernel::cpu::vm::{RAY_WIDTH, VmField};
 use std::sync::Arc;
 
 /// Rays of a pass.
@@ -22,7 +22,7 @@ pub struct VmRenderer {
 
 impl VmRenderer {
     /// Of flat planes and lines of density and appearance, and flat decoder weights. The decoder must be one that
-    /// [`DeviceDecoder::knows`](super::DeviceDecoder::knows).
+    /// [`DeviceDecoder::supports`](super::DeviceDecoder::supports).
     pub fn new(device: Arc<Device>, field: &VmField, [density, color, network]: [&[f32]; 3]) -> VmRenderer {
         let vm = Vm::new(&device, field, PASS, false);
         let values =
@@ -59,7 +59,7 @@ mod tests {
     use super::super::super::device::tests::{agree, device};
     use super::super::self_test::{NARROW, case};
     use super::*;
-    use crate::kernel::vm::{DecoderWeights, render};
+    use crate::kernel::cpu::vm::{DecoderWeights, render};
 
     #[test]
     fn rays_are_those_of_the_cpu_in_as_many_passes_as_there_is_room() {

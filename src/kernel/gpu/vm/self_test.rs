@@ -5,10 +5,10 @@ use super::super::draw::Batch;
 use super::super::self_test::{Check, planes, worst};
 use super::{Vm, VmValues};
 use crate::Result;
-use crate::kernel::march::MarchRay;
-use crate::kernel::rng;
-use crate::kernel::vm::mask::{BoxMask, Lattice};
-use crate::kernel::vm::{self, DecoderShape, DecoderWeights, Grid, RAY_WIDTH, Rendered, VmField};
+use crate::kernel::cpu::march::MarchRay;
+use crate::kernel::cpu::rng;
+use crate::kernel::cpu::vm::mask::{BoxMask, Lattice};
+use crate::kernel::cpu::vm::{self, DecoderShape, DecoderWeights, Grid, RAY_WIDTH, Rendered, VmField};
 
 /// A field, its values, rays, and gradients of what they see.
 pub(super) struct Case {
@@ -133,7 +133,7 @@ impl There {
         self.vm.backward(device, self.values(), &self.rays, &self.g_out, gradients, &broken);
         assert_eq!(device.fetch::<u32>(&broken)?, [0]);
         let (density, color) = (&self.vm.density, &self.vm.color);
-        Ok([density.fetch(device, &d)?, color.fetch(device, &c)?, device.fetch(&n)?])
+        Ok([density.cut(device.fetch(&d)?), color.cut(device.fetch(&c)?), device.fetch(&n)?])
     }
 }
 

@@ -2,9 +2,10 @@ use super::super::Atomics;
 use super::super::device::tests::{agree, device, devices, planes};
 use super::self_test::{NARROW, Shape, There, case, on_cpu, room};
 use super::*;
-use crate::kernel::vm::mask::Walk;
-use crate::kernel::vm::{Grid, Penalty, RAY_WIDTH, penalize};
-use crate::kernel::{reference, rng};
+use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm};
+use crate::kernel::cpu::vm::mask::Walk;
+use crate::kernel::cpu::vm::{Grid, Penalty, RAY_WIDTH, penalize};
+use crate::kernel::cpu::{reference, rng};
 
 /// Hidden layers of a wide tile, ranks of any kind, nothing left out.
 const WIDE: Shape = Shape {
@@ -132,14 +133,14 @@ fn penalties_are_those_of_the_cpu() {
             let on = DeviceGrid::new(&device, grid);
             let (values, gradient) = (on.upload(&device, &x), on.upload(&device, &before));
             on.penalize(&device, &values, &penalty, &gradient);
-            agree("penalized", &on.fetch(&device, &gradient).unwrap(), &want, 1e-5);
-            assert_eq!(on.fetch(&device, &values).unwrap(), x);
+            agree("penalized", &on.cut(device.read(&gradient)), &want, 1e-5);
+            assert_eq!(on.cut(device.read(&values)), x);
         }
     }
 }
 
 /// Losses of rays in f64, unweighted: squared error, mask, squared opacity of the background.
-fn losses(shown: &Shown, composed: &[f64], term: MaskTerm, behind: Behind) -> [f64; 3] {
+fn losses(shown: &Shown, composed: &[f64], term: MaskTerm, mode: BackgroundMode) -> [f64; 3] {
     let n = shown.alpha.len();
     let alive = |r: &usize| shown.alive[*r] == 1;
     let outside = (0..n).filter(alive).filter(|&r| shown.alpha[r] == 0.0).count() as f64;
@@ -149,8 +150,8 @@ fn losses(shown: &Shown, composed: &[f64], term: MaskTerm, behind: Behind) -> [f
         let (o, a) = (composed[3 * n + r], shown.alpha[r] as f64);
         for c in 0..3 {
             let b = shown.background[c * n + r] as f64;
-            let seen = composed[c * n + r] + (1.0 - o) * (b + behind.lift as f64);
-            let over = if behind.target { (1.0 - a) * b } else { 0.0 };
+            let seen = composed[c * n + r] + (1.0 - o) * (b + mode.lift as f64);
+            let over = if mode.target { (1.0 - a) * b } else { 0.0 };
             t[0] += (seen.clamp(0.0, 1.0) - shown.color[c * n + r] as f64 - over).powi(2) / (3.0 * rays);
         }
         let p = o.clamp(1e-3, 1.0 - 1e-3);
@@ -197,12 +198,12 @@ fn losses_and_gradients_agree_with_f64_finite_differences() {
     for (term, lift, target) in
         [(MaskTerm::L2(0.3), 0.0, true), (MaskTerm::Ce(0.2), 1.0, false), (MaskTerm::None, 0.5, true)]
     {
-        let behind = Behind { lift, target };
+        let mode = BackgroundMode { lift, target };
         let mut on = VmLosses::new(&device, N, term);
-        let g = on.of_rays(&device, &device.upload(&composed), &batch, behind);
+        let g = on.of_rays(&device, &device.upload(&composed), &batch, mode);
         let got = device.read::<f32>(g);
         let wide = reference::wide(&composed);
-        let want = losses(&shown, &wide, term, behind);
+        let want = losses(&shown, &wide, term, mode);
         on.add(&device, &vm, &device.upload(&[0u32]));
         on.add(&device, &vm, &device.upload(&[1u32]));
         let figures = on.fetch(&device).unwrap();
@@ -210,7 +211,7 @@ fn losses_and_gradients_agree_with_f64_finite_differences() {
         assert_eq!((figures.rays, figures.broken), (2 * 34, true));
         assert_eq!(on.fetch(&device).unwrap().terms, [0.0; 3]);
         let total = |x: &[f64]| {
-            let t = losses(&shown, x, term, behind);
+            let t = losses(&shown, x, term, mode);
             t[0] + match term {
                 MaskTerm::None => 0.0,
                 MaskTerm::L2(w) | MaskTerm::Ce(w) => w as f64 * t[1],

@@ -26,7 +26,7 @@ pub use rows::Photograph;
 
 use crate::geom::{Atlas, Bvh, Harmonics, Mesh};
 use crate::image::Image;
-use crate::kernel::sphharm::{Y0, functions};
+use crate::kernel::cpu::sphharm::{Y0, functions};
 use crate::{Monitor, Result};
 use glam::Mat3;
 use rayon::prelude::*;

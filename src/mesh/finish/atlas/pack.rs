@@ -7,7 +7,7 @@
 
 use super::flat::Flat;
 use super::raster::{Mask, Page};
-use crate::kernel::rng::mix;
+use crate::kernel::cpu::rng::mix;
 use crate::{Error, Monitor, Result};
 use glam::DVec2;
 use rayon::prelude::*;

@@ -33,7 +33,7 @@ fn grow(image: &mut Image, covered: &[bool], gutter: u32) -> Vec<bool> {
         let (x, y) = ((i % w) as isize, (i / w) as isize);
         (0..9).filter(|&k| k != 4).filter_map(move |k| {
             let (x, y) = (x + k % 3 - 1, y + k / 3 - 1);
-            (x >= 0 && y >= 0 && x < w as isize && y < h as isize).then_some(y as usize * w + x as usize)
+            (x >= 0 && y >= 0 && x < w as isize && y < h as isize).then(|| y as usize * w + x as usize)
         })
     };
     for i in (0..w * h).filter(|&i| covered[i]) {

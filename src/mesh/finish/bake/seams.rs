@@ -7,7 +7,7 @@
 
 use crate::geom::{Atlas, Mesh};
 use crate::image::{Image, Photo};
-use crate::kernel::cg::{conjugate_gradients, dot};
+use crate::kernel::cpu::cg::{conjugate_gradients, dot};
 use glam::Vec2;
 use std::collections::HashMap;
 

@@ -10,7 +10,7 @@
 
 use super::collapse::{POOR, TURN};
 use crate::geom::{area_vector, shape};
-use crate::kernel::cg::conjugate_gradients;
+use crate::kernel::cpu::cg::conjugate_gradients;
 use crate::mesh::moves::move_vertices;
 use glam::Vec3;
 use rayon::prelude::*;

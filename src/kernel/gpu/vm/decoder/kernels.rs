@@ -1,7 +1,7 @@
 //! What runs on the device: weights made ready, the layers forward and backward, gradients of the weights.
 
-use super::super::super::norm::finite;
 use super::super::super::tile::{self, Block, at, gate, narrow, outer, product, put, sums, turned};
+use super::super::super::weight_norm::finite;
 use super::super::grid::{NONE, looked_up, term};
 use super::Plan;
 use cubecl::prelude::*;

@@ -1,0 +1,266 @@
+//! A training step of the signed-distance field on the processor.
+
+use super::model::shape;
+use super::occupancy::Occupancy;
+use super::ops::{
+    BACKGROUND_STREAM, MOST_BUDGETS, STEREO_POINTS, STEREO_STREAM, SdfGroups, SdfOps, VARIANCE, loss_weights,
+    random_background,
+};
+use super::schedule;
+use super::stereo::SurfacePoint;
+use crate::Result;
+use crate::config::iface::IfaceConfig;
+use crate::field::ops::{Cpu, Ops, slice, slice_mut};
+use crate::field::pixels::{Batch, Pixels};
+use crate::field::training::StepAt;
+use crate::kernel::cpu::losses::{self, RAY_TERMS, TERMS, Targets};
+use crate::kernel::cpu::march::Samples;
+use crate::kernel::cpu::mlp::Weights;
+use crate::kernel::cpu::neus::{self, Rays};
+use crate::kernel::cpu::schedule::Figures;
+use crate::kernel::cpu::sdf::{self, Activations, FieldShape, WIDTH};
+use crate::kernel::cpu::{rng, weight_norm};
+
+/// The operations of [`SdfOps`] on the processor.
+pub struct CpuSdf<'a> {
+    config: &'a IfaceConfig,
+    pixels: &'a Pixels<'a>,
+    shape: FieldShape,
+    occupancy: Occupancy,
+    all_points: Vec<SurfacePoint>,
+    rays: usize,
+    /// Steps in a row that met no sample.
+    blind: u64,
+    /// Samples of the last step, as many as there would have been with room for all; none before the first one.
+    samples_wanted: Option<usize>,
+    weights: Option<Weights>,
+    inv_s: f32,
+    step: CpuStep,
+}
+
+/// What the operations of a step leave for the next ones.
+#[derive(Default)]
+struct CpuStep {
+    dt: f32,
+    batch: Batch,
+    background: Vec<[f32; 3]>,
+    samples: Samples,
+    direction: Vec<[f32; 3]>,
+    dts: Vec<f32>,
+    points: Vec<SurfacePoint>,
+    activations: Option<Activations>,
+    composed: Vec<f32>,
+    terms: [f32; TERMS],
+    /// `[samples + points, 8]`.
+    g_field: Vec<f32>,
+    g_inv_s: f32,
+    broken: bool,
+}
+
+impl CpuStep {
+    fn rays(&self) -> Rays<'_> {
+        let Samples { offsets, t } = &self.samples;
+        Rays { offsets, direction: &self.direction, t, dt: &self.dts }
+    }
+
+    fn is_empty(&self) -> bool {
+        self.samples.t.is_empty()
+    }
+}
+
+/// Drops the last rays of a batch until at most `most` samples are left (one ray always stays).
+fn truncate(batch: &mut Batch, samples: &mut Samples, most: usize) {
+    if samples.t.len() <= most {
+        return;
+    }
+    let kept = samples.offsets.iter().rposition(|&o| o as usize <= most).unwrap_or(0).max(1);
+    samples.offsets.truncate(kept + 1);
+    samples.t.truncate(samples.offsets[kept] as usize);
+    batch.rays.truncate(kept);
+    batch.color.truncate(kept);
+    batch.alpha.truncate(kept);
+}
+
+impl<'a> CpuSdf<'a> {
+    /// The operations of a training with these settings and photographs.
+    pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>) -> CpuSdf<'a> {
+        CpuSdf {
+            config,
+            pixels,
+            shape: shape(config),
+            occupancy: Occupancy::new(config, None),
+            all_points: Vec::new(),
+            rays: config.rays,
+            blind: 0,
+            samples_wanted: None,
+            weights: None,
+            inv_s: 0.0,
+            step: CpuStep::default(),
+        }
+    }
+
+    fn prepared(&self) -> &Weights {
+        self.weights.as_ref().expect("weights are computed before the field is evaluated")
+    }
+
+    fn next_rays(&self) -> usize {
+        self.samples_wanted.map_or(self.rays, |n| schedule::ray_budget(self.config).next(self.rays, n))
+    }
+}
+
+impl Ops for CpuSdf<'_> {
+    type Device = Cpu;
+
+    fn device(&self) -> &Cpu {
+        &Cpu
+    }
+
+    fn gate(&self) -> bool {
+        !self.step.is_empty() && !self.step.broken
+    }
+}
+
+impl SdfOps for CpuSdf<'_> {
+    fn load(&mut self, occupancy: &Occupancy, rays: usize, points: &[SurfacePoint]) {
+        self.occupancy = occupancy.clone();
+        (self.rays, self.samples_wanted, self.blind) = (rays, None, 0);
+        self.step = CpuStep::default();
+        self.set_points(points);
+    }
+
+    fn set_points(&mut self, points: &[SurfacePoint]) {
+        self.all_points = points.to_vec();
+    }
+
+    fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {
+        *occupancy = self.occupancy.clone();
+        Ok(self.next_rays())
+    }
+
+    fn is_broken(&self) -> Result<bool> {
+        Ok(self.step.broken)
+    }
+
+    fn weights(&mut self, groups: &mut SdfGroups<Self>) {
+        let [_, network, variance] = groups;
+        let layout = self.shape.layout();
+        self.weights = Some(Weights::new(layout, &weight_norm::forward(layout, slice(network.value()))));
+        let v = &mut slice_mut(variance.value_mut())[0];
+        *v = v.clamp(VARIANCE[0], VARIANCE[1]);
+        self.inv_s = (10.0 * *v).exp();
+    }
+
+    fn update_occupancy(&mut self, [table, ..]: &SdfGroups<Self>, levels: usize, at: StepAt) {
+        self.shape.active = levels;
+        let (shape, table) = (&self.shape, bytemuck::cast_slice(slice(table.value())));
+        let weights = self.weights.as_ref().expect("weights are computed before the field is evaluated");
+        let distances = |x: &[[f32; 3]]| sdf::values(shape, table, weights, x);
+        let soft = |x: &[[f32; 3]]| sdf::softness(shape, table, weights, x);
+        let dt = schedule::step_length(self.config).at(self.inv_s);
+        self.occupancy.update(self.config, (at.seed, at.step), self.inv_s, dt, distances, soft);
+    }
+
+    fn advance(&mut self) {
+        self.rays = self.next_rays();
+        self.step.dt = schedule::step_length(self.config).at(self.inv_s);
+    }
+
+    fn draw(&mut self, at: StepAt, detail: f32) {
+        self.step.batch = self.pixels.draw(at.seed, at.step, self.rays, self.config.jitter, detail);
+        let random = random_background(self.config);
+        let color = |r: u64| match random {
+            true => std::array::from_fn(|c| {
+                rng::uniform(at.seed, at.step << 4 | BACKGROUND_STREAM, 3 * r + c as u64)
+            }),
+            false => [0.0; 3],
+        };
+        self.step.background = (0..self.step.batch.rays.len() as u64).map(color).collect();
+    }
+
+    fn march(&mut self) {
+        let (config, step) = (self.config, &mut self.step);
+        step.samples = self.occupancy.march(config, step.dt, &step.batch.rays);
+        let wanted = step.samples.t.len();
+        truncate(&mut step.batch, &mut step.samples, MOST_BUDGETS * config.samples);
+        step.background.truncate(step.batch.rays.len());
+        step.direction = step.batch.rays.iter().map(|r| r.direction).collect();
+        step.dts = vec![step.dt; step.samples.t.len()];
+        self.samples_wanted = Some(wanted);
+        self.blind = if wanted == 0 { self.blind + 1 } else { 0 };
+    }
+
+    fn append_points(&mut self, at: StepAt) {
+        let all = &self.all_points;
+        let count = if all.is_empty() || self.step.is_empty() { 0 } else { STEREO_POINTS };
+        let drawn = |i| rng::below(at.seed, at.step << 4 | STEREO_STREAM, i, all.len() as u64) as usize;
+        self.step.points = (0..count).map(|i| all[drawn(i)]).collect();
+    }
+
+    fn sdf_field(&mut self, [table, ..]: &SdfGroups<Self>, levels: usize) {
+        self.shape.active = levels;
+        if self.step.is_empty() {
+            return;
+        }
+        let step = &self.step;
+        let (mut x, mut d) = step.samples.points(&step.batch.rays, 0);
+        x.extend(step.points.iter().map(|p| p.position));
+        d.resize(x.len(), [0.0, 0.0, 1.0]); // the color of points has no loss
+        let table = bytemuck::cast_slice(slice(table.value()));
+        let activations = sdf::forward(&self.shape, table, self.prepared(), &x, &d);
+        self.step.activations = Some(activations);
+    }
+
+    fn neus(&mut self, anneal: f32) {
+        let step = &mut self.step;
+        let field = step.activations.as_ref().map_or(&[][..], |a| a.output());
+        step.composed = neus::forward(step.rays(), field, self.inv_s, anneal);
+    }
+
+    fn losses(&mut self, anneal: f32) {
+        let step = &mut self.step;
+        let w = loss_weights(self.config, self.pixels.has_masks);
+        let Batch { color, alpha, .. } = &step.batch;
+        let targets = Targets { offsets: &step.samples.offsets, color, alpha, background: &step.background };
+        let (of_rays, g_composed) = losses::of_rays(&step.composed, targets, &w);
+        let field = step.activations.as_ref().map_or(&[][..], |a| a.output());
+        let n = step.samples.t.len();
+        let (mut g_field, g_inv_s) =
+            neus::backward(step.rays(), &field[..n * WIDTH], self.inv_s, anneal, &g_composed);
+        let of_samples = losses::of_samples(&field[..n * WIDTH], &w, &mut g_field);
+        g_field.resize(field.len(), 0.0);
+        let points: Vec<[f32; 2]> = step.points.iter().map(|p| [p.footprint, p.weight]).collect();
+        let of_points = losses::of_points(&field[n * WIDTH..], &points, &w, &mut g_field[n * WIDTH..]);
+        step.terms[..RAY_TERMS].copy_from_slice(&of_rays);
+        step.terms[RAY_TERMS..TERMS - 1].copy_from_slice(&of_samples);
+        step.terms[TERMS - 1] = of_points;
+        (step.g_field, step.g_inv_s) = (g_field, g_inv_s);
+    }
+
+    fn backward(&mut self, [table, network, variance]: &mut SdfGroups<Self>) {
+        let Some(activations) = self.step.activations.take().filter(|_| !self.step.is_empty()) else {
+            return;
+        };
+        let weights = self.weights.as_ref().expect("the field was evaluated with them");
+        let g_table = bytemuck::cast_slice_mut(slice_mut(&mut table.gradient));
+        let g_flat = sdf::backward(&activations, weights, &self.step.g_field, g_table);
+        let (parameters, gradient) = network.value_and_gradient();
+        let g_network = slice_mut(gradient);
+        weight_norm::backward(self.shape.layout(), slice(parameters), &g_flat, g_network);
+        let g_variance = 10.0 * self.inv_s * self.step.g_inv_s;
+        slice_mut(&mut variance.gradient)[0] = g_variance;
+        // what breaks the table's gradient passes through the layers above it; nothing is applied to a loss that is none
+        let all = g_network.iter().chain(&self.step.terms).chain([&g_variance]);
+        self.step.broken |= !all.into_iter().all(|g| g.is_finite());
+    }
+
+    fn figures(&mut self, [.., variance]: &SdfGroups<Self>) -> Result<Figures> {
+        Ok(Figures {
+            losses: self.step.terms,
+            variance: slice(variance.value())[0],
+            samples: self.samples_wanted.unwrap_or(0),
+            rays: self.next_rays(),
+            blind: self.blind,
+            broken: self.step.broken,
+        })
+    }
+}

@@ -1,0 +1,317 @@
+//! A training step of the signed-distance field on a GPU, with the host waiting for nothing: rays are drawn, marched,
+//! shaded, compared and applied there.
+
+use super::model::shape;
+use super::occupancy::Occupancy;
+use super::ops::{
+    BACKGROUND_STREAM, MOST_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, loss_weights,
+    random_background,
+};
+use super::schedule;
+use super::stereo::SurfacePoint;
+use crate::config::iface::{IfaceConfig, OccupancyRule};
+use crate::field::drawing::DeviceRays;
+use crate::field::memory::MemoryNeed;
+use crate::field::ops::Ops;
+use crate::field::pixels::Pixels;
+use crate::field::training::StepAt;
+use crate::kernel::cpu::hash;
+use crate::kernel::cpu::mlp::TILE;
+use crate::kernel::cpu::schedule::Figures;
+use crate::kernel::cpu::sdf::FieldShape;
+use crate::kernel::gpu::{
+    self, Band, Batch, Buffer, Device, Gate, Losses, Nerfacc, Neus, Rays, Samples, SamplingOptions, Schedule,
+    Sdf, SurfacePoints, WeightNorm,
+};
+use crate::{Error, Result};
+
+/// How the cells to march through are updated.
+enum CellRule {
+    Band(Box<Band>),
+    Nerfacc(Box<Nerfacc>),
+}
+
+/// The operations of [`SdfOps`] on a GPU, and its memory for them.
+pub struct GpuSdf<'a> {
+    config: &'a IfaceConfig,
+    pixels: &'a Pixels<'a>,
+    pub(super) device: Device,
+    photographs: DeviceRays,
+    batch: Batch,
+    samples: Samples,
+    points: SurfacePoints,
+    /// `[1]`: samples and points of the step.
+    total_count: Buffer,
+    norm: WeightNorm,
+    sdf: Sdf,
+    neus: Neus,
+    losses: Losses,
+    flat: Buffer,
+    g_flat: Buffer,
+    inv_s: Buffer,
+    g_inv_s: Buffer,
+    /// `[1]`: not 0 once a gradient was not finite.
+    broken: Buffer,
+    schedule: Schedule,
+    occupancy: gpu::Occupancy,
+    cells: CellRule,
+    /// Has a step been made since the state was loaded?
+    stepped: bool,
+}
+
+impl<'a> GpuSdf<'a> {
+    /// Refuses a training that a device cannot take: it knows no such field, or has too little memory.
+    pub fn fits(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<()> {
+        let shape = shape(config);
+        if !Sdf::supports(&shape) {
+            let problem = format!("a device has no room for {} levels in a tile", config.levels);
+            return Err(Error::usage(problem, "lower iface.levels, or train with `--device cpu`"));
+        }
+        max_samples(config, &shape, pixels, device).map(drop)
+    }
+
+    /// The operations of a training that [`fits`](GpuSdf::fits) a device.
+    ///
+    /// # Errors
+    ///
+    /// Where the device has too little memory.
+    pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>, device: Device) -> Result<GpuSdf<'a>> {
+        let shape = shape(config);
+        let rays = config.rays.max(config.max_rays);
+        let (capacity, resident) = max_samples(config, &shape, pixels, &device)?;
+        let weights = loss_weights(config, pixels.has_masks);
+        let drawing = SamplingOptions {
+            every: pixels.uses_reference_sampling(),
+            jitter: config.jitter,
+            background: random_background(config),
+            behind: BACKGROUND_STREAM,
+        };
+        let flat = shape.layout().len();
+        let start = Occupancy::new(config, None);
+        let (occupancy, cells) = cells(&device, config, &start, capacity);
+        Ok(GpuSdf {
+            config,
+            pixels,
+            photographs: DeviceRays::new(pixels, &device, drawing, resident),
+            batch: Batch::new(&device, rays),
+            samples: Samples::new(&device, rays, capacity),
+            points: SurfacePoints::new(&device, stereo_points(config), &weights),
+            total_count: device.zeros(1),
+            norm: WeightNorm::new(&device, shape.layout()),
+            sdf: Sdf::new(&device, &shape, capacity),
+            neus: Neus::new(&device, rays, capacity),
+            losses: Losses::new(&device, weights, rays, capacity),
+            flat: device.zeros(flat),
+            g_flat: device.zeros(flat),
+            inv_s: device.zeros(1),
+            g_inv_s: device.zeros(1),
+            broken: device.zeros(1),
+            schedule: Schedule::new(
+                &device,
+                schedule::step_length(config),
+                schedule::ray_budget(config),
+                config.rays,
+            ),
+            occupancy,
+            cells,
+            stepped: false,
+            device,
+        })
+    }
+
+    fn rays(&self) -> Rays<'_> {
+        let Samples { offsets, t, dt, .. } = &self.samples;
+        Rays { offsets, direction: &self.batch.direction, t, dt }
+    }
+}
+
+/// Stereo points that a step has room for.
+fn stereo_points(config: &IfaceConfig) -> usize {
+    if config.stereo > 0.0 { STEREO_POINTS as usize } else { 1 }
+}
+
+/// Samples that a step has room for, as many as on the processor where the device's memory and buffers are large enough;
+/// and do photographs lie there, too?
+pub(super) fn max_samples(
+    config: &IfaceConfig,
+    shape_: &FieldShape,
+    pixels: &Pixels,
+    device: &Device,
+) -> Result<(usize, bool)> {
+    /// Samples with their rays, compositing and losses, and the cells that are looked at in their place.
+    const BESIDE: usize = 3 + 3 + 2 + 9 + 2 + 1;
+    let points = stereo_points(config);
+    let [words, widest] = Sdf::words_per_sample(shape_);
+    let bytes = 4 * (words + BESIDE) as u64;
+    // values, moments and gradient; cells with their number, distance and reach or history and last draw, and bits
+    let cells = config.occupancy_resolution.pow(3) as u64;
+    let fixed = |shape: &FieldShape| 32 * hash::entries(&shape.levels) as u64 + 13 * cells;
+    let least = (config.samples + points) as u64;
+    let wanted = (MOST_BUDGETS * config.samples + points) as u64;
+    let need = MemoryNeed {
+        fixed: (fixed(shape_), "hash tables and cells"),
+        unit: "samples",
+        each: [bytes, 4 * widest as u64],
+        wanted,
+        least,
+    };
+    let (capacity, resident) = need.plan(pixels, device, |fits| {
+        let table = |log2: u32| fixed(&shape(&IfaceConfig { log2_table: log2, ..config.clone() }));
+        let by_buffer = device.limits().largest_buffer / (4 * widest as u64);
+        let left = device.available_memory().checked_sub(least * bytes).filter(|_| by_buffer >= least);
+        let smaller = left.and_then(|left| (4..config.log2_table).rev().find(|&log2| table(log2) <= left));
+        match (fits.saturating_sub(points as u64), smaller) {
+            (fits @ 64.., _) => format!("iface.samples to {fits}"),
+            (_, Some(log2)) => format!("iface.log2_table to {log2}"),
+            _ => "iface.samples, then iface.log2_table".into(),
+        }
+    })?;
+    // the last tile is a whole one
+    let whole =
+        if capacity as u64 == wanted { capacity.next_multiple_of(TILE) } else { capacity / TILE * TILE };
+    Ok((whole, resident))
+}
+
+/// The cells to march through, and how they are updated.
+fn cells(
+    device: &Device,
+    config: &IfaceConfig,
+    start: &Occupancy,
+    capacity: usize,
+) -> (gpu::Occupancy, CellRule) {
+    let solid = (config.occupancy == OccupancyRule::Band).then_some(&start.solid);
+    let cells = gpu::Occupancy::new(device, &start.occupied, solid, config.radius);
+    let rule = match config.occupancy {
+        OccupancyRule::Band => {
+            CellRule::Band(Box::new(Band::new(device, start.allowed(), config.band, config.soften as f32)))
+        }
+        OccupancyRule::Nerfacc => {
+            let step = schedule::step_length(config).at(1.0);
+            CellRule::Nerfacc(Box::new(Nerfacc::new(device, &cells, &start.history, step, capacity)))
+        }
+    };
+    (cells, rule)
+}
+
+impl Ops for GpuSdf<'_> {
+    type Device = Device;
+
+    fn device(&self) -> &Device {
+        &self.device
+    }
+
+    fn gate(&self) -> Gate<'_> {
+        Gate { count: &self.samples.count, broken: &self.broken }
+    }
+}
+
+impl SdfOps for GpuSdf<'_> {
+    fn load(&mut self, occupancy: &Occupancy, rays: usize, points: &[SurfacePoint]) {
+        let (device, config) = (&self.device, self.config);
+        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.words());
+        let budget = schedule::ray_budget(config);
+        self.schedule = Schedule::new(device, schedule::step_length(config), budget, rays);
+        self.broken = device.zeros(1);
+        self.stepped = false;
+        self.set_points(points);
+    }
+
+    fn set_points(&mut self, points: &[SurfacePoint]) {
+        let rows: Vec<[f32; 5]> = points.iter().map(|p| p.row()).collect();
+        self.points.put(&self.device, &rows);
+    }
+
+    fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {
+        [occupancy.occupied, occupancy.solid] = self.occupancy.read(&self.device)?;
+        if let CellRule::Nerfacc(rule) = &self.cells {
+            occupancy.history = rule.read(&self.device)?;
+        }
+        let rays = self.device.fetch::<u32>(&self.schedule.rays)?[0] as usize;
+        if !self.stepped {
+            return Ok(rays);
+        }
+        let wanted = self.device.fetch::<u32>(&self.samples.count)?[1] as usize;
+        Ok(schedule::ray_budget(self.config).next(rays, wanted))
+    }
+
+    fn is_broken(&self) -> Result<bool> {
+        Ok(self.device.fetch::<u32>(&self.broken)?[0] != 0)
+    }
+
+    fn weights(&mut self, [_, network, variance]: &mut SdfGroups<Self>) {
+        let (flat, inv_s) = (&self.flat, &self.inv_s);
+        self.norm.forward(&self.device, network.value(), variance.value(), VARIANCE, flat, inv_s);
+    }
+
+    fn update_occupancy(&mut self, [table, ..]: &SdfGroups<Self>, levels: usize, at: StepAt) {
+        self.sdf.activate(levels);
+        let device = &self.device;
+        let field = [table.value(), &self.flat, &self.inv_s];
+        let over = [&self.samples.x, &self.samples.direction];
+        match &self.cells {
+            CellRule::Band(rule) => rule.update(device, &self.occupancy, &self.sdf, field, over),
+            CellRule::Nerfacc(rule) => {
+                rule.update(device, (at.seed, at.step), &self.occupancy, &self.sdf, field, over);
+            }
+        }
+    }
+
+    fn advance(&mut self) {
+        self.schedule.advance(&self.device, &self.inv_s, &self.samples.count, !self.stepped);
+        self.stepped = true;
+    }
+
+    fn draw(&mut self, at: StepAt, detail: f32) {
+        let (device, at) = (&self.device, (at.seed, at.step));
+        self.photographs.draw(device, self.pixels, at, &self.schedule.rays, &mut self.batch, detail);
+    }
+
+    fn march(&mut self) {
+        let apart = self.points.most();
+        let (device, step) = (&self.device, &self.schedule.step_length);
+        self.samples.march(device, &self.occupancy, &self.batch, step, usize::MAX, apart);
+    }
+
+    fn append_points(&mut self, at: StepAt) {
+        self.total_count = self.points.append(&self.device, (at.seed, at.step), &self.samples).clone();
+    }
+
+    fn sdf_field(&mut self, [table, ..]: &SdfGroups<Self>, levels: usize) {
+        self.sdf.activate(levels);
+        let Samples { x, direction, .. } = &self.samples;
+        self.sdf.forward(&self.device, table.value(), &self.flat, x, direction, &self.total_count);
+    }
+
+    fn neus(&mut self, anneal: f32) {
+        self.neus.forward(&self.device, self.rays(), self.sdf.output(), &self.inv_s, anneal);
+    }
+
+    fn losses(&mut self, anneal: f32) {
+        let (device, field, count) = (&self.device, self.sdf.output(), &self.samples.count);
+        let g_out = self.losses.of_rays(device, self.neus.output(), &self.batch, &self.samples.offsets);
+        let (inv_s, g_inv_s) = (&self.inv_s, &self.g_inv_s);
+        let g_field = self.neus.backward(device, self.rays(), field, inv_s, anneal, g_out, g_inv_s);
+        self.losses.of_samples(device, field, count, g_field);
+        self.points.losses(device, field, count, g_field);
+    }
+
+    fn backward(&mut self, [table, network, variance]: &mut SdfGroups<Self>) {
+        let device = &self.device;
+        let Samples { x, direction, .. } = &self.samples;
+        let (count, g_field) = (&self.total_count, self.neus.gradient());
+        self.sdf.backward(device, x, direction, count, g_field, &table.gradient, &self.g_flat);
+        let from = [&self.g_flat, &self.g_inv_s];
+        let into = [&network.gradient, &variance.gradient];
+        self.norm.backward(device, network.value(), &self.inv_s, from, into, &self.broken);
+    }
+
+    fn figures(&mut self, [.., variance]: &SdfGroups<Self>) -> Result<Figures> {
+        let (device, count) = (&self.device, &self.samples.count);
+        let sums = self.losses.sums(device, count, self.points.terms());
+        self.schedule.figures(device, sums, variance.value(), count, &self.broken)
+    }
+}
+
+#[cfg(test)]
+#[path = "gpu_tests.rs"]
+mod tests;

@@ -1,0 +1,420 @@
+//! Instant-NeRF: a density on a hash grid, and volume rendering with the distortion loss.
+//!
+//! Müller et al. 2022 ("Instant Neural Graphics Primitives"), as in instant-nsr-pl's `nerf` model:
+//!
+//! ```text
+//! u = hash features          h = relu(W1 u)       o = W2 h  [16]      σ = exp(o₀ − 1)
+//! c = [o, SH16(d)]           rgb = sigmoid(C3 relu(C2 relu(C1 c)))    no biases
+//! T_k = exp(−Σ_{j<k} σ_j δ)  w_k = T_k (1 − exp(−σ_k δ))              rgb and opacity: Σ w (c, 1)
+//! distortion = Σ_k ⅓ δ w_k² + 2 w_k (m_k Σ_{j<k} w_j − Σ_{j<k} w_j m_j)     m: midpoints
+//! ```
+//!
+//! Distortion: Barron et al. 2022 ("Mip-NeRF 360", eq. 15). The gradient of the exponential is held below exp(15), as
+//! there.
+
+use super::hash::{self, Level};
+use super::matrix::{Matrix, add_to, split};
+use super::simd::{exp, gemm, sigmoid};
+use super::sphharm::sh16;
+use crate::dispatch;
+use rayon::prelude::*;
+
+/// Width of all hidden layers.
+const HIDDEN: usize = 64;
+/// Outputs of the geometry network, the density's logarithm first; all go to the color network.
+const FEATURES: usize = 16;
+/// Inputs of the color network: features and harmonics.
+const COLOR_INPUTS: usize = FEATURES + 16;
+/// Color channels as stored.
+const RGB: usize = 8;
+/// Samples a task handles: fixed, so that sums do not depend on the number of threads.
+const CHUNK: usize = 64;
+
+/// Grid and box of the field.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DensityShape {
+    /// Levels of the hash grid; a multiple of 4.
+    pub levels: Vec<Level>,
+    /// The field lives in `[-radius, radius]³`.
+    pub radius: f32,
+}
+
+impl DensityShape {
+    /// Shapes `[out, in]` of W1, W2, C1, C2, C3 in storage order, row-major.
+    pub fn shapes(&self) -> [(usize, usize); 5] {
+        let u = 2 * self.levels.len();
+        [(HIDDEN, u), (FEATURES, HIDDEN), (HIDDEN, COLOR_INPUTS), (HIDDEN, HIDDEN), (3, HIDDEN)]
+    }
+
+    /// Floats of all matrices.
+    pub fn len(&self) -> usize {
+        self.shapes().iter().map(|(o, i)| o * i).sum()
+    }
+
+    /// Never: a network has weights. (Beside `len` by convention.)
+    pub fn is_empty(&self) -> bool {
+        false
+    }
+
+    fn x01(&self, x: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        x.iter().map(|p| p.map(|c| c * (0.5 / self.radius) + 0.5)).collect()
+    }
+}
+
+/// The networks' matrices in both orders.
+#[derive(Debug)]
+pub struct DensityWeights {
+    m: [Matrix; 5],
+}
+
+impl DensityWeights {
+    /// From the flat vector that [`DensityShape::shapes`] describes.
+    pub fn new(shape: &DensityShape, flat: &[f32]) -> DensityWeights {
+        let shapes = shape.shapes();
+        let mut parts = split(flat, shapes).into_iter().zip(shapes);
+        let m = std::array::from_fn(|_| {
+            let (values, (rows, columns)) = parts.next().expect("five matrices");
+            Matrix::new(values, (rows, columns), (rows.next_multiple_of(8), columns))
+        });
+        DensityWeights { m }
+    }
+}
+
+/// What evaluating samples leaves behind, rows of a sample together.
+#[derive(Clone, Debug, Default)]
+struct Tile {
+    u: Vec<f32>,
+    h: Vec<f32>,
+    o: Vec<f32>,
+    c0: Vec<f32>,
+    c1: Vec<f32>,
+    c2: Vec<f32>,
+    rgb: Vec<f32>,
+}
+
+/// Samples evaluated, with what the backward needs.
+#[derive(Clone, Debug)]
+pub struct DensitySamples {
+    /// `[n]` densities.
+    pub density: Vec<f32>,
+    /// `[n, 3]` colors; empty where they were not asked for.
+    pub color: Vec<[f32; 3]>,
+    tiles: Vec<Tile>,
+    x01: Vec<[f32; 3]>,
+}
+
+fn relu(v: &mut [f32]) {
+    v.iter_mut().for_each(|v| *v = v.max(0.0));
+}
+
+struct ForwardTask<'a> {
+    /// First sample, and how many there are in all.
+    first: usize,
+    all: usize,
+    /// `[levels, all]`
+    features: &'a [[f32; 2]],
+    levels: usize,
+    direction: Option<&'a [[f32; 3]]>,
+    density: &'a mut [f32],
+    color: &'a mut [[f32; 3]],
+    tile: &'a mut Tile,
+}
+
+#[inline(always)]
+fn forward_body<const F: bool>(task: &mut ForwardTask, w: &DensityWeights) {
+    let (n, inputs) = (task.density.len(), 2 * task.levels);
+    let t = &mut *task.tile;
+    t.u = vec![0.0; CHUNK * inputs];
+    for l in 0..task.levels {
+        for s in 0..n {
+            let f = task.features[l * task.all + task.first + s];
+            t.u[s * inputs + 2 * l..][..2].copy_from_slice(&f);
+        }
+    }
+    t.h = vec![0.0; CHUNK * HIDDEN];
+    gemm::<F>((CHUNK, HIDDEN, inputs), &t.u, (inputs, 1), &w.m[0].t, HIDDEN, &mut t.h, HIDDEN, false);
+    relu(&mut t.h);
+    t.o = vec![0.0; CHUNK * FEATURES];
+    gemm::<F>((CHUNK, FEATURES, HIDDEN), &t.h, (HIDDEN, 1), &w.m[1].t, FEATURES, &mut t.o, FEATURES, false);
+    for (s, density) in task.density.iter_mut().enumerate() {
+        *density = exp::<F>(t.o[s * FEATURES] - 1.0);
+    }
+    let Some(direction) = task.direction else { return };
+    t.c0 = vec![0.0; CHUNK * COLOR_INPUTS];
+    for (s, d) in direction.iter().enumerate() {
+        let row = &mut t.c0[s * COLOR_INPUTS..][..COLOR_INPUTS];
+        row[..FEATURES].copy_from_slice(&t.o[s * FEATURES..][..FEATURES]);
+        row[FEATURES..].copy_from_slice(&sh16(*d));
+    }
+    t.c1 = vec![0.0; CHUNK * HIDDEN];
+    let size = (CHUNK, HIDDEN, COLOR_INPUTS);
+    gemm::<F>(size, &t.c0, (COLOR_INPUTS, 1), &w.m[2].t, HIDDEN, &mut t.c1, HIDDEN, false);
+    relu(&mut t.c1);
+    t.c2 = vec![0.0; CHUNK * HIDDEN];
+    gemm::<F>((CHUNK, HIDDEN, HIDDEN), &t.c1, (HIDDEN, 1), &w.m[3].t, HIDDEN, &mut t.c2, HIDDEN, false);
+    relu(&mut t.c2);
+    t.rgb = vec![0.0; CHUNK * RGB];
+    gemm::<F>((CHUNK, RGB, HIDDEN), &t.c2, (HIDDEN, 1), &w.m[4].t, RGB, &mut t.rgb, RGB, false);
+    for (s, color) in task.color.iter_mut().enumerate() {
+        *color = std::array::from_fn(|c| sigmoid::<F>(t.rgb[s * RGB + c]));
+    }
+}
+
+dispatch! { fn forward_task / forward_body(task: &mut ForwardTask, w: &DensityWeights) }
+
+/// Evaluates samples; colors only where there are directions.
+///
+/// # Shapes
+///
+/// - table: `[entries, 2]`; x: `[n, 3]` in the field's box; direction: `[n, 3]` unit
+pub fn evaluate(
+    shape: &DensityShape,
+    table: &[[f32; 2]],
+    weights: &DensityWeights,
+    x: &[[f32; 3]],
+    direction: Option<&[[f32; 3]]>,
+) -> DensitySamples {
+    let (n, levels) = (x.len(), shape.levels.len());
+    let x01 = shape.x01(x);
+    let mut features = vec![[0f32; 2]; levels * n];
+    hash::gather(&shape.levels, table, &x01, 1.0, &mut features, None);
+    let mut density = vec![0f32; n];
+    let mut color = vec![[0f32; 3]; if direction.is_some() { n } else { 0 }];
+    let mut tiles = vec![Tile::default(); n.div_ceil(CHUNK)];
+    let mut colors = color.chunks_mut(CHUNK);
+    let tasks: Vec<ForwardTask> = density
+        .chunks_mut(CHUNK)
+        .zip(&mut tiles)
+        .enumerate()
+        .map(|(i, (density, tile))| ForwardTask {
+            first: i * CHUNK,
+            all: n,
+            features: &features,
+            levels,
+            direction: direction.map(|d| &d[i * CHUNK..][..density.len()]),
+            density,
+            color: colors.next().unwrap_or_default(),
+            tile,
+        })
+        .collect();
+    tasks.into_par_iter().for_each(|mut task| {
+        forward_task(&mut task, weights);
+        if task.direction.is_none() {
+            *task.tile = Tile::default(); // nobody asks for gradients of a look
+        }
+    });
+    DensitySamples { density, color, tiles, x01 }
+}
+
+struct BackwardTask<'a> {
+    tile: &'a Tile,
+    g_density: &'a [f32],
+    g_color: &'a [[f32; 3]],
+    density: &'a [f32],
+    color: &'a [[f32; 3]],
+    /// Gradients of the five matrices, and of the features.
+    g: [Vec<f32>; 5],
+    g_u: Vec<f32>,
+}
+
+/// `G[out, in] = gᵀ v` over the samples of a tile.
+#[inline(always)]
+fn outer<const F: bool>(g: &[f32], out: usize, v: &[f32], inputs: usize) -> Vec<f32> {
+    let mut sum = vec![0f32; out * inputs];
+    gemm::<F>((out, inputs, CHUNK), g, (1, out), v, inputs, &mut sum, inputs, false);
+    sum
+}
+
+/// `g W`, zero where the layer before gave nothing.
+#[inline(always)]
+fn back<const F: bool>(g: &[f32], out: usize, w: &Matrix, inputs: usize, layer: Option<&[f32]>) -> Vec<f32> {
+    let mut before = vec![0f32; CHUNK * inputs];
+    gemm::<F>((CHUNK, inputs, out), g, (out, 1), &w.m, inputs, &mut before, inputs, false);
+    if let Some(layer) = layer {
+        before.iter_mut().zip(layer).for_each(|(g, v)| *g = if *v > 0.0 { *g } else { 0.0 });
+    }
+    before
+}
+
+#[inline(always)]
+fn backward_body<const F: bool>(task: &mut BackwardTask, w: &DensityWeights) {
+    let t = task.tile;
+    let inputs = t.u.len() / CHUNK;
+    let mut g_rgb = vec![0f32; CHUNK * RGB];
+    for (s, (g, c)) in task.g_color.iter().zip(task.color).enumerate() {
+        (0..3).for_each(|k| g_rgb[s * RGB + k] = g[k] * c[k] * (1.0 - c[k]));
+    }
+    task.g[4] = outer::<F>(&g_rgb, RGB, &t.c2, HIDDEN);
+    let g_c2 = back::<F>(&g_rgb, RGB, &w.m[4], HIDDEN, Some(&t.c2));
+    task.g[3] = outer::<F>(&g_c2, HIDDEN, &t.c1, HIDDEN);
+    let g_c1 = back::<F>(&g_c2, HIDDEN, &w.m[3], HIDDEN, Some(&t.c1));
+    task.g[2] = outer::<F>(&g_c1, HIDDEN, &t.c0, COLOR_INPUTS);
+    let g_c0 = back::<F>(&g_c1, HIDDEN, &w.m[2], COLOR_INPUTS, None);
+    let mut g_o = vec![0f32; CHUNK * FEATURES];
+    for (s, (g, density)) in task.g_density.iter().zip(task.density).enumerate() {
+        let row = &mut g_o[s * FEATURES..][..FEATURES];
+        row.copy_from_slice(&g_c0[s * COLOR_INPUTS..][..FEATURES]);
+        row[0] += g * density.min(15f32.exp());
+    }
+    task.g[1] = outer::<F>(&g_o, FEATURES, &t.h, HIDDEN);
+    let g_h = back::<F>(&g_o, FEATURES, &w.m[1], HIDDEN, Some(&t.h));
+    task.g[0] = outer::<F>(&g_h, HIDDEN, &t.u, inputs);
+    task.g_u = back::<F>(&g_h, HIDDEN, &w.m[0], inputs, None);
+}
+
+dispatch! { fn backward_task / backward_body(task: &mut BackwardTask, w: &DensityWeights) }
+
+/// Gradients by the flat weights, returned, and by the table, added to `g_table`.
+///
+/// # Shapes
+///
+/// - g_density: `[n]`; g_color: `[n, 3]`, by what [`evaluate`] gave with directions
+pub fn backward(
+    shape: &DensityShape,
+    weights: &DensityWeights,
+    samples: &DensitySamples,
+    (g_density, g_color): (&[f32], &[[f32; 3]]),
+    g_table: &mut [[f32; 2]],
+) -> Vec<f32> {
+    let (n, levels) = (g_density.len(), shape.levels.len());
+    let mut flat = vec![0f32; shape.len()];
+    let mut g_value = vec![[0f32; 2]; levels * n];
+    let shapes = shape.shapes();
+    // some tiles at a time: each holds a gradient of all matrices
+    const PASS: usize = 64;
+    for (pass, tiles) in samples.tiles.chunks(PASS).enumerate() {
+        let done: Vec<BackwardTask> = tiles
+            .par_iter()
+            .enumerate()
+            .map(|(i, tile)| {
+                let first = (pass * PASS + i) * CHUNK;
+                let own = first..(first + CHUNK).min(n);
+                let mut task = BackwardTask {
+                    tile,
+                    g_density: &g_density[own.clone()],
+                    g_color: &g_color[own.clone()],
+                    density: &samples.density[own.clone()],
+                    color: &samples.color[own],
+                    g: Default::default(),
+                    g_u: Vec::new(),
+                };
+                backward_task(&mut task, weights);
+                task
+            })
+            .collect();
+        for (i, task) in done.iter().enumerate() {
+            let strides = shapes.map(|(_, inputs)| inputs);
+            let parts: Vec<(&[f32], usize)> = task.g.iter().zip(strides).map(|(g, s)| (&g[..], s)).collect();
+            add_to(&mut flat, &shapes, &parts);
+            let first = (pass * PASS + i) * CHUNK;
+            for s in 0..task.density.len() {
+                for l in 0..levels {
+                    let g = &task.g_u[s * 2 * levels + 2 * l..][..2];
+                    g_value[l * n + first + s] = [g[0], g[1]];
+                }
+            }
+        }
+    }
+    let nothing = vec![[0f32; 2]; levels * n];
+    let no_normals = vec![[0f32; 3]; n];
+    hash::scatter(&shape.levels, g_table, &samples.x01, 1.0, &g_value, &nothing, &no_normals);
+    flat
+}
+
+/// A ray's weights: `[samples]`, of intervals of length `dt`.
+pub fn weights(density: &[f32], dt: f32) -> Vec<f32> {
+    let mut thickness = 0f32;
+    let weight = |sigma: &f32| {
+        let before = (-thickness).exp();
+        thickness += sigma * dt;
+        before * -(-sigma * dt).exp_m1()
+    };
+    density.iter().map(weight).collect()
+}
+
+/// The distortion of a ray's weights at midpoints `t`, and its gradient by each weight.
+pub fn distortion(weight: &[f32], t: &[f32], dt: f32) -> (f32, Vec<f32>) {
+    let (mut sum, mut moment) = (0f32, 0f32);
+    let mut value = 0f32;
+    let mut g = Vec::with_capacity(weight.len());
+    for (&w, &m) in weight.iter().zip(t) {
+        let before = m * sum - moment;
+        value += dt * w * w / 3.0 + 2.0 * w * before;
+        g.push(2.0 / 3.0 * dt * w + 2.0 * before);
+        sum += w;
+        moment += w * m;
+    }
+    let (mut behind, mut behind_moment) = (0f32, 0f32);
+    for ((g, &w), &m) in g.iter_mut().zip(weight).zip(t).rev() {
+        *g += 2.0 * (behind_moment - m * behind);
+        behind += w;
+        behind_moment += w * m;
+    }
+    (value, g)
+}
+
+/// Gradient by a ray's densities of a loss whose gradient by its weights is `g`.
+pub fn weights_backward(density: &[f32], weight: &[f32], g: &[f32], dt: f32) -> Vec<f32> {
+    let mut thickness: f32 = density.iter().map(|s| s * dt).sum();
+    let mut behind = 0f32; // Σ w_j g_j of the samples behind
+    let mut out = vec![0f32; density.len()];
+    for k in (0..density.len()).rev() {
+        // d w_k / d σ_k = δ T_k exp(−σ_k δ), and all light behind loses δ of itself
+        out[k] = dt * ((-thickness).exp() * g[k] - behind);
+        thickness -= density[k] * dt;
+        behind += weight[k] * g[k];
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::cpu::reference::tape::{Var, gradient};
+    use crate::kernel::cpu::reference::{Real, wide};
+
+    #[test]
+    fn weights_and_distortion_have_the_published_values() {
+        // σ = (0, 2, 5) over δ = 0.01 · 25, the last without length
+        let w = weights(&[0.0, 2.0], 0.25);
+        assert!(w[0] == 0.0 && (w[1] - 0.393_469_34).abs() < 1e-7, "{w:?}");
+        let (value, _) = distortion(&[0.1, 0.3, 0.4], &[1.0, 1.2, 1.5], 0.1);
+        assert!((value - 0.132_666_67).abs() < 1e-7, "{value}");
+    }
+
+    #[test]
+    fn gradients_of_weights_and_distortion_are_those_of_their_formulas() {
+        let density = [0.3f32, 4.0, 0.0, 9.0, 2.0];
+        let t = [1.0f32, 1.1, 1.3, 1.4, 1.5];
+        let (dt, of) = (0.1f32, Var::of);
+        let w = weights(&density, dt);
+        let (value, mut g) = distortion(&w, &t, dt);
+        g.iter_mut().enumerate().for_each(|(k, g)| *g += k as f32 - 1.5); // and Σ (k − 1.5) w
+        let g = weights_backward(&density, &w, &g, dt);
+        let mut distortion_alone = 0.0;
+        let (_, want) = gradient(&wide(&density), |x| {
+            let mut thickness = of(0.0);
+            let w: Vec<Var> = x
+                .iter()
+                .map(|s| {
+                    let before = (-thickness).exp();
+                    thickness += *s * of(dt.into());
+                    before * (of(1.0) - (-*s * of(dt.into())).exp())
+                })
+                .collect();
+            let mut sum = of(0.0);
+            for (i, a) in w.iter().enumerate() {
+                sum += *a * *a * of(f64::from(dt) / 3.0);
+                for (j, b) in w.iter().enumerate() {
+                    sum += *a * *b * of(f64::from((t[i] - t[j]).abs()));
+                }
+            }
+            distortion_alone = sum.value();
+            sum + w.iter().enumerate().map(|(k, w)| *w * of(k as f64 - 1.5)).sum()
+        });
+        assert!((f64::from(value) - distortion_alone).abs() < 1e-6);
+        for (g, want) in g.iter().zip(want) {
+            assert!((f64::from(*g) - want).abs() < 1e-5 * want.abs().max(0.1), "{g} {want}");
+        }
+    }
+}

@@ -1,0 +1,317 @@
+//! NeuS compositing of ragged rays, forward and backward.
+//!
+//! Wang et al. 2021, "NeuS", eq. 10-13, with the cosine annealing of its code: along a ray of unit
+//! direction `d`, a sample of length `δ` with distance `f` and unit normal `n̂` has
+//!
+//! ```text
+//! cos = d·n̂     ic = −[relu(½ − ½cos)(1 − a) + relu(−cos) a]     (a: anneal, 0 → 1)
+//! P = σ(s (f − ½ ic δ))     N = σ(s (f + ½ ic δ))     α = clip((P − N + ε)/(P + ε), 0, 1),  ε = 1e-5
+//! T_i = Π_{j<i} (1 − α_j)     w = T α     out = Σ w · (rgb, 1, t, n̂, ‖rgb‖²)
+//! ```
+//!
+//! The last column of the field's output is `ln(s / inv_s)` of its sample: 0 everywhere in NeuS.
+
+use super::sdf::WIDTH;
+use rayon::prelude::*;
+
+/// Values per ray: rgb (3), opacity, depth (Σ w t), normal (3, Σ w n̂), squared color (Σ w ‖rgb‖²).
+pub const RAY_WIDTH: usize = 9;
+
+/// The ragged samples of a batch of rays, sorted by ray and then by `t`.
+#[derive(Clone, Copy)]
+pub struct Rays<'a> {
+    /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
+    pub offsets: &'a [i32],
+    /// `[rays, 3]` unit directions.
+    pub direction: &'a [[f32; 3]],
+    /// `[samples]` midpoints.
+    pub t: &'a [f32],
+    /// `[samples]` lengths.
+    pub dt: &'a [f32],
+}
+
+const EPSILON: f32 = 1e-5;
+
+fn sigmoid(x: f32) -> f32 {
+    if x >= 0.0 {
+        1.0 / (1.0 + (-x).exp())
+    } else {
+        let e = x.exp();
+        e / (1.0 + e)
+    }
+}
+
+/// Opacity of one sample, and what its derivative needs.
+struct Alpha {
+    alpha: f32,
+    clipped: bool,
+    previous: f32,
+    next: f32,
+    ic: f32,
+    ic_by_cos: f32,
+}
+
+fn alpha_of(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32) -> Alpha {
+    let (soft, hard) = (0.5 - 0.5 * cos, -cos);
+    let ic = -(soft.max(0.0) * (1.0 - anneal) + hard.max(0.0) * anneal);
+    let ic_by_cos = 0.5 * (1.0 - anneal) * f32::from(soft > 0.0) + anneal * f32::from(hard > 0.0);
+    let half = 0.5 * ic * dt;
+    let (previous, next) = (sigmoid((sdf - half) * inv_s), sigmoid((sdf + half) * inv_s));
+    let raw = (previous - next + EPSILON) / (previous + EPSILON);
+    Alpha { alpha: raw.clamp(0.0, 1.0), clipped: !(0.0..=1.0).contains(&raw), previous, next, ic, ic_by_cos }
+}
+
+/// Opacity of one interval: see the module. `inv_s` is clamped to [1e-6, 1e6].
+pub fn alpha(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32) -> f32 {
+    alpha_of(sdf, cos, dt, inv_s.clamp(1e-6, 1e6), anneal).alpha
+}
+
+/// How opaque a cell of half size `half` may be: [`alpha`] seen head on, for the occupancy grid.
+pub fn occupancy(sdf: f32, half: f32, inv_s: f32) -> f32 {
+    alpha_of(sdf, -1.0, 2.0 * half, inv_s.clamp(1e-6, 1e6), 1.0).alpha
+}
+
+/// Gradients of the field up to this length have no direction that could be learned: what comes back through their unit
+/// normal would be of no size that means anything, up to 1e12.
+pub const SHORTEST: f32 = 1e-6;
+
+fn normal_of(field: &[f32]) -> ([f32; 3], f32) {
+    let n = [field[1], field[2], field[3]];
+    let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt().max(1e-12);
+    (n.map(|c| c / length), length)
+}
+
+fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// Squared color of a sample.
+fn square_of(field: &[f32]) -> f32 {
+    field[4] * field[4] + field[5] * field[5] + field[6] * field[6]
+}
+
+/// Sharpness at a sample.
+fn local(inv_s: f32, field: &[f32]) -> f32 {
+    (inv_s * field[7].exp()).clamp(1e-6, 1e6)
+}
+
+/// Composites. A ray without samples gives zeros.
+///
+/// # Shapes
+///
+/// - field: `[samples, 8]` as the field gives it
+/// - output: `[rays, 9]` = rgb, opacity, Σ w t, Σ w n̂, Σ w ‖rgb‖²
+pub fn forward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
+    let inv_s = inv_s.clamp(1e-6, 1e6);
+    let count = rays.offsets.len() - 1;
+    let mut out = vec![0f32; count * RAY_WIDTH];
+    out.par_chunks_mut(RAY_WIDTH).with_min_len(64).enumerate().for_each(|(r, out)| {
+        let mut transmittance = 1f32;
+        for s in rays.offsets[r] as usize..rays.offsets[r + 1] as usize {
+            let f = &field[s * WIDTH..][..WIDTH];
+            let (n, _) = normal_of(f);
+            let a = alpha_of(f[0], dot(rays.direction[r], n), rays.dt[s], local(inv_s, f), anneal).alpha;
+            let w = transmittance * a;
+            for c in 0..3 {
+                out[c] += w * f[4 + c];
+                out[5 + c] += w * n[c];
+            }
+            out[3] += w;
+            out[4] += w * rays.t[s];
+            out[8] += w * square_of(f);
+            transmittance *= 1.0 - a;
+        }
+    });
+    out
+}
+
+/// Gradients by the field's output `[samples, 8]` and by `inv_s`.
+///
+/// # Shapes
+///
+/// - g_out: `[rays, 9]`
+pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32]) -> (Vec<f32>, f32) {
+    let clamped = inv_s.clamp(1e-6, 1e6);
+    let count = rays.offsets.len() - 1;
+    let mut g_field = vec![0f32; field.len()];
+    // each ray owns a contiguous piece of the samples
+    let mut rest = &mut g_field[..];
+    let mut tasks = Vec::with_capacity(count);
+    for r in 0..count {
+        let n = (rays.offsets[r + 1] - rays.offsets[r]) as usize;
+        let (own, tail) = rest.split_at_mut(n * WIDTH);
+        rest = tail;
+        tasks.push((r, own));
+    }
+    let g_inv_s: Vec<f64> = tasks
+        .into_par_iter()
+        .with_min_len(64)
+        .map(|(r, own)| {
+            let first = rays.offsets[r] as usize;
+            let n = own.len() / WIDTH;
+            let g = &g_out[r * RAY_WIDTH..][..RAY_WIDTH];
+            // forward again: alphas, transmittances and what each weight is worth
+            let mut samples = Vec::with_capacity(n);
+            let mut transmittance = 1f32;
+            for s in first..first + n {
+                let f = &field[s * WIDTH..][..WIDTH];
+                let (normal, length) = normal_of(f);
+                let cos = dot(rays.direction[r], normal);
+                let sharp = local(clamped, f);
+                let a = alpha_of(f[0], cos, rays.dt[s], sharp, anneal);
+                let worth = g[0] * f[4]
+                    + g[1] * f[5]
+                    + g[2] * f[6]
+                    + g[3]
+                    + g[4] * rays.t[s]
+                    + g[5] * normal[0]
+                    + g[6] * normal[1]
+                    + g[7] * normal[2]
+                    + g[8] * square_of(f);
+                let next = transmittance * (1.0 - a.alpha);
+                samples.push((a, normal, length, transmittance, worth, sharp));
+                transmittance = next;
+            }
+            let mut behind = 0f32; // Σ_{j>k} w_j worth_j
+            let mut g_s = 0f64;
+            for k in (0..n).rev() {
+                let (a, normal, length, transmittance, worth, sharp) = &samples[k];
+                let s = first + k;
+                let w = transmittance * a.alpha;
+                let out = &mut own[k * WIDTH..][..WIDTH];
+                for c in 0..3 {
+                    out[4 + c] = w * (g[c] + 2.0 * g[8] * field[s * WIDTH + 4 + c]);
+                }
+                let g_alpha = transmittance * worth - behind / (1.0 - a.alpha).max(1e-10);
+                behind += w * worth;
+                // by the unit normal: as composited, and through the cosine
+                let mut g_normal = [w * g[5], w * g[6], w * g[7]];
+                if !a.clipped {
+                    let (p, q) = (a.previous, a.next);
+                    let d = p + EPSILON;
+                    // α = (P − N + ε)/(P + ε): ∂P = N/(P+ε)², ∂N = −1/(P+ε)
+                    let g_p = g_alpha * q / (d * d) * p * (1.0 - p);
+                    let g_q = -g_alpha / d * q * (1.0 - q);
+                    out[0] = (g_p + g_q) * sharp;
+                    let half = 0.5 * a.ic * rays.dt[s];
+                    let sdf = field[s * WIDTH];
+                    // by ln s: the same for the sample's own offset and, divided by inv_s, for inv_s
+                    let g_ln = (g_p * (sdf - half) + g_q * (sdf + half)) * sharp;
+                    out[7] = g_ln;
+                    g_s += g_ln as f64;
+                    let g_ic = (g_q - g_p) * sharp * 0.5 * rays.dt[s];
+                    let g_cos = g_ic * a.ic_by_cos;
+                    for c in 0..3 {
+                        g_normal[c] += g_cos * rays.direction[r][c];
+                    }
+                }
+                let along = dot(*normal, g_normal);
+                if *length > SHORTEST {
+                    for c in 0..3 {
+                        out[1 + c] = (g_normal[c] - normal[c] * along) / length;
+                    }
+                }
+            }
+            g_s
+        })
+        .collect();
+    let inside = (1e-6..=1e6).contains(&inv_s);
+    (g_field, if inside { (g_inv_s.iter().sum::<f64>() / inv_s as f64) as f32 } else { 0.0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::cpu::reference;
+
+    #[test]
+    fn alphas_match_the_published_values() {
+        let dt = 0.00101484375;
+        let e3 = 3f32.exp();
+        for (sdf, cos, s, a, want) in [
+            (0.01, -0.8, 64.0, 0.25, 0.0194449),
+            (0.0, -1.0, e3, 0.0, 0.0101598),
+            (-0.05, -1.0, 1000.0, 1.0, 1.0),
+            (0.02, 0.5, 200.0, 0.5, 4.66413e-4),
+        ] {
+            let got = alpha(sdf, cos, dt, s, a);
+            assert!((got - want).abs() < 2e-6 * want.max(0.05), "{got} {want}");
+        }
+        for (sdf, s, want) in
+            [(0.05, e3, 0.00546357), (0.2, e3, 3.70632e-4), (-0.1, e3, 0.0178938), (0.01, 1000.0, 5.80727e-5)]
+        {
+            let got = occupancy(sdf, 0.5 * dt, s);
+            assert!((got - want).abs() < 5e-7, "{got} {want}");
+        }
+    }
+
+    #[test]
+    fn extreme_fields_have_finite_opacities_and_bounded_gradients() {
+        let offsets = [0, 4];
+        let (direction, t, dt) = ([[0.6, 0.0, -0.8]], [1.0, 1.1, 1.2, 1.3], [1e-9, 0.05, 3.0, 1e3]);
+        let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let g = [1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0];
+        for inv_s in [0.0, 1e-9, 1e-6, 1.0, 1e6, 1e9, f32::INFINITY] {
+            for sdf in [0.0, 1e-30, -1e-6, 1.0, -1e3, 1e20] {
+                for slope in [0.0, 1e-30, 1e-12, 2e-6, 1.0, 1e6] {
+                    let sample = |k: usize| [sdf, slope, -0.5 * slope, 0.0, 0.5, 0.5, 0.5, -(k as f32)];
+                    let field: Vec<f32> = (0..4).flat_map(sample).collect();
+                    let seen = forward(rays, &field, inv_s, 1.0);
+                    assert!(
+                        seen.iter().all(|v| v.is_finite() && v.abs() < 2.0),
+                        "{inv_s} {sdf} {slope} {seen:?}"
+                    );
+                    let (g_field, g_s) = backward(rays, &field, inv_s, 1.0, &g);
+                    let all = || g_field.iter().chain([&g_s]);
+                    assert!(all().all(|v| v.is_finite()), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
+                    // 3 · 1e6, the unit normal's 1 / SHORTEST, and 1e3 · 1e6 by the length of an interval
+                    assert!(all().all(|v| v.abs() < 1e10), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
+                    if slope < SHORTEST {
+                        assert!(g_field.as_chunks::<8>().0.iter().all(|g| g[1..4] == [0.0; 3]));
+                    }
+                }
+            }
+        }
+    }
+
+    /// Σ g · out of the formulas in f64.
+    fn loss(rays: Rays, field: &[f64], inv_s: f64, anneal: f64, g: &[f32]) -> f64 {
+        let out = reference::neus::composite(rays, field, inv_s, anneal);
+        out.iter().zip(g).map(|(o, g)| o * *g as f64).sum()
+    }
+
+    #[test]
+    fn the_backward_agrees_with_f64_finite_differences() {
+        let offsets = [0, 5, 5, 12];
+        let direction = [[0.6, 0.0, -0.8], [0.0, 0.0, 1.0], [0.36, -0.48, 0.8]];
+        let t: Vec<f32> = (0..12).map(|i| 1.0 + 0.05 * i as f32).collect();
+        let dt = vec![0.05f32; 12];
+        let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let field: Vec<f32> = (0..96)
+            .map(|i| match i % 8 {
+                0 => 0.12 - 0.03 * (i / 8 % 6) as f32,
+                7 => -0.1 * (i % 5) as f32,
+                1..=3 => (i as f32 * 0.7).sin() * 0.8 + if i % 8 == 3 { 0.5 } else { 0.0 },
+                _ => 0.5 + 0.4 * (i as f32 * 1.3).cos(),
+            })
+            .collect();
+        let g: Vec<f32> = (0..27).map(|i| (i as f32 * 0.9).sin()).collect();
+        let (inv_s, anneal) = (30f32, 0.4f32);
+        let (g_field, g_s) = backward(rays, &field, inv_s, anneal, &g);
+        let wide = reference::wide(&field);
+        let at = |f: &[f64], s: f64| loss(rays, f, s, anneal as f64, &g);
+        let scale = g_field.iter().fold(0f32, |a, &b| a.max(b.abs())) as f64;
+        for i in 0..96 {
+            let mut f = wide.clone();
+            f[i] += 1e-6;
+            let up = at(&f, inv_s as f64);
+            f[i] -= 2e-6;
+            let slope = (up - at(&f, inv_s as f64)) / 2e-6;
+            let error = (slope - g_field[i] as f64).abs() / slope.abs().max(1e-3 * scale);
+            assert!(error < 1e-3, "field {i}: {slope} {}", g_field[i]);
+        }
+        let slope = (at(&wide, inv_s as f64 + 1e-4) - at(&wide, inv_s as f64 - 1e-4)) / 2e-4;
+        assert!((slope - g_s as f64).abs() < 1e-3 * slope.abs(), "inv_s {slope} {g_s}");
+        assert_eq!(&forward(rays, &field, inv_s, anneal)[9..18], &[0.0; 9]);
+    }
+}

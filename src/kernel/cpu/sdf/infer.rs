@@ -1,0 +1,233 @@
+//! The signed-distance field evaluated, not trained: nothing is kept for a backward.
+
+use super::{CHUNK, FieldShape, Inputs, WIDTH, color_layers, run, skip, softened};
+use crate::dispatch;
+use crate::kernel::cpu::hash;
+use crate::kernel::cpu::mlp::{
+    COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
+};
+use crate::kernel::cpu::pool::Buffer;
+use crate::kernel::cpu::simd::{exp, gemm, ln_1p, sigmoid};
+use crate::kernel::cpu::sphharm::sh16;
+use rayon::prelude::*;
+
+/// softplus₁₀₀.
+#[inline(always)]
+fn softplus<const F: bool>(v: f32) -> f32 {
+    v.max(0.0) + 0.01 * ln_1p::<F>(exp::<F>(-(100.0 * v).abs()))
+}
+
+/// One of the geometry network's outputs.
+#[inline(always)]
+fn value_body<const F: bool>(inputs: &Inputs, output: usize, values: &mut [f32], w: &Weights) {
+    let kp = w.layout.padded();
+    let samples = inputs.x.len();
+    let mut u = vec![0f32; TILE * kp];
+    let mut h = [0f32; TILE * HIDDEN];
+    let w2 = &w.w2.m[output * HIDDEN..][..HIDDEN];
+    for tile in 0..samples.div_ceil(TILE) {
+        let base = tile * TILE;
+        let rows = TILE.min(samples - base);
+        inputs.fill(&mut u, kp, base, rows);
+        gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
+        for r in 0..rows {
+            let row = &h[r * HIDDEN..][..HIDDEN];
+            let mut sum = [0f32; 8];
+            for j in 0..HIDDEN {
+                sum[j % 8] += softplus::<F>(row[j] + w.b1[j]) * w2[j];
+            }
+            values[base + r] = sum.iter().sum::<f32>() + w.b2[output];
+        }
+    }
+}
+
+dispatch! {
+    fn value_task / value_body(inputs: &Inputs, output: usize, values: &mut [f32], w: &Weights)
+}
+
+/// Signed distance alone: a quarter of the work of [`super::forward`]. `[n, 3]` → `[n]`.
+pub fn values(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
+    output(shape, table, weights, x, 0)
+}
+
+/// ln of the local sharpness as a share of the sharpest, `-soften..=0`. `[n, 3]` → `[n]`.
+pub fn softness(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
+    if shape.soften == 0.0 {
+        return vec![0.0; x.len()];
+    }
+    let mut soft = output(shape, table, weights, x, SOFTNESS);
+    // fused products outside of a dispatched function would be calls of the C library
+    soft.iter_mut().for_each(|v| *v = softened::<false>(shape.soften, *v));
+    soft
+}
+
+/// One of the geometry network's outputs.
+fn output(
+    shape: &FieldShape,
+    table: &[[f32; 2]],
+    weights: &Weights,
+    x: &[[f32; 3]],
+    output: usize,
+) -> Vec<f32> {
+    /// Points per pass: bounds the scratch memory whatever the caller asks for.
+    const PASS: usize = 1 << 16;
+    let mut values = vec![0.0; x.len()];
+    let active = &shape.levels[..shape.active];
+    for (x, values) in x.chunks(PASS).zip(values.chunks_mut(PASS)) {
+        let n = x.len();
+        let mut value = Buffer::scratch(active.len() * n * 2);
+        hash::gather(active, table, &shape.x01(x), 1.0, bytemuck::cast_slice_mut(&mut value), None);
+        let value = &value[..];
+        values.par_chunks_mut(CHUNK).enumerate().for_each(|(i, values)| {
+            let own = i * CHUNK..i * CHUNK + values.len();
+            value_task(&Inputs::new(shape, x, value, own), output, values, weights);
+        });
+    }
+    values
+}
+
+struct ColorTask<'a> {
+    inputs: Inputs<'a>,
+    normal: &'a [[f32; 3]],
+    /// Directions of each point; one each where there is no list.
+    counts: Option<&'a [u32]>,
+    direction: &'a [[f32; 3]],
+    rgb: &'a mut [[f32; 3]],
+}
+
+/// The color network on a tile whose inputs are filled; colors in the first `rows` of `out`.
+struct Shader {
+    c0: Vec<f32>, // [TILE, cp]
+    c1: [f32; TILE * HIDDEN],
+    c2: [f32; TILE * HIDDEN],
+    rgb: [f32; TILE * RGB_PADDED],
+}
+
+impl Shader {
+    #[inline(always)]
+    fn run<const F: bool>(&mut self, w: &Weights, out: &mut [[f32; 3]]) {
+        let Shader { c0, c1, c2, rgb } = self;
+        color_layers::<F>(w, c0, c1, c2, rgb);
+        for (r, out) in out.iter_mut().enumerate() {
+            *out = std::array::from_fn(|c| sigmoid::<F>(rgb[r * RGB_PADDED + c]));
+        }
+    }
+}
+
+#[inline(always)]
+fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
+    let (kp, ci) = (w.layout.padded(), w.layout.color_padded());
+    let samples = task.inputs.x.len();
+    let mut u = vec![0f32; TILE * kp];
+    let mut h = [0f32; TILE * HIDDEN];
+    let mut o = [0f32; TILE * OUTPUTS_PADDED];
+    let mut shader = Shader {
+        c0: vec![0.0; TILE * ci],
+        c1: [0.0; TILE * HIDDEN],
+        c2: [0.0; TILE * HIDDEN],
+        rgb: [0.0; TILE * RGB_PADDED],
+    };
+    // directions that wait in the shader's tile, and those that are done
+    let (mut waiting, mut done) = (0, 0);
+    for tile in 0..samples.div_ceil(TILE) {
+        let base = tile * TILE;
+        let rows = TILE.min(samples - base);
+        task.inputs.fill(&mut u, kp, base, rows);
+        gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
+        for row in h.chunks_exact_mut(HIDDEN) {
+            for j in 0..HIDDEN {
+                row[j] = softplus::<F>(row[j] + w.b1[j]);
+            }
+        }
+        let op = OUTPUTS_PADDED;
+        gemm::<F>((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2.t, op, &mut o, op, false);
+        for r in 0..rows {
+            for _ in 0..task.counts.map_or(1, |c| c[base + r]) {
+                let row = &mut shader.c0[waiting * ci..][..ci];
+                (0..OUTPUTS).for_each(|j| row[j] = o[r * op + j] + w.b2[j]);
+                row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(task.direction[done + waiting]));
+                row[OUTPUTS + 16..COLOR_INPUTS].copy_from_slice(&task.normal[base + r]);
+                skip(w.layout, &u[r * kp..], row);
+                waiting += 1;
+                if waiting == TILE {
+                    shader.run::<F>(w, &mut task.rgb[done..done + TILE]);
+                    (waiting, done) = (0, done + TILE);
+                }
+            }
+        }
+    }
+    if waiting > 0 {
+        shader.run::<F>(w, &mut task.rgb[done..done + waiting]);
+    }
+}
+
+dispatch! { fn color_task / color_body(task: &mut ColorTask, w: &Weights) }
+
+/// Color of points whose unit normals are known (of a mesh's surface), point `i` seen along `counts[i]` unit
+/// directions (one each without a list): no gradient is computed, a third of the work of [`super::forward`], and
+/// the geometry network is evaluated once a point.
+///
+/// # Shapes
+///
+/// - x, normal: `[n, 3]`; direction: `[sum of counts, 3]`, away from the camera, point by point
+/// - output: `[sum of counts, 3]`
+pub fn colors(
+    shape: &FieldShape,
+    table: &[[f32; 2]],
+    weights: &Weights,
+    x: &[[f32; 3]],
+    normal: &[[f32; 3]],
+    counts: Option<&[u32]>,
+    direction: &[[f32; 3]],
+) -> Vec<[f32; 3]> {
+    const PASS: usize = 1 << 15;
+    let all = |counts: Option<&[u32]>, n: usize| counts.map_or(n, |c| c.iter().map(|&c| c as usize).sum());
+    assert!(normal.len() == x.len() && counts.is_none_or(|c| c.len() == x.len()));
+    assert_eq!(direction.len(), all(counts, x.len()));
+    let mut rgb = vec![[0f32; 3]; direction.len()];
+    let active = &shape.levels[..shape.active];
+    let (mut rest, mut ahead) = (&mut rgb[..], direction);
+    for first in (0..x.len()).step_by(PASS) {
+        let span = first..(first + PASS).min(x.len());
+        let (x, normal, counts) = (&x[span.clone()], &normal[span.clone()], counts.map(|c| &c[span]));
+        let n = x.len();
+        let mut value = Buffer::scratch(active.len() * n * 2);
+        hash::gather(active, table, &shape.x01(x), 1.0, bytemuck::cast_slice_mut(&mut value), None);
+        let value = &value[..];
+        let mut tasks = Vec::with_capacity(n.div_ceil(CHUNK));
+        for start in (0..n).step_by(CHUNK) {
+            let own = start..(start + CHUNK).min(n);
+            let counts = counts.map(|c| &c[own.clone()]);
+            let colors = all(counts, own.len());
+            let (rgb, after) = rest.split_at_mut(colors);
+            let (direction, later) = ahead.split_at(colors);
+            (rest, ahead) = (after, later);
+            let normal = &normal[own.clone()];
+            tasks.push(ColorTask {
+                inputs: Inputs::new(shape, x, value, own),
+                normal,
+                counts,
+                direction,
+                rgb,
+            });
+        }
+        tasks.par_iter_mut().for_each(|task| color_task(task, weights));
+    }
+    rgb
+}
+
+/// Signed distance and gradient, no color: `[n, 3]` → `[n]` pairs.
+pub fn gradients(
+    shape: &FieldShape,
+    table: &[[f32; 2]],
+    weights: &Weights,
+    x: &[[f32; 3]],
+) -> Vec<(f32, [f32; 3])> {
+    const PASS: usize = 1 << 15;
+    x.chunks(PASS)
+        .flat_map(|x| {
+            let a = run(shape, table, weights, x, None);
+            a.out.chunks_exact(WIDTH).map(|o| (o[0], [o[1], o[2], o[3]])).collect::<Vec<_>>()
+        })
+        .collect()
+}

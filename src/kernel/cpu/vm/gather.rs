@@ -1,0 +1,295 @@
+//! Looking up planes and lines, and spreading gradients back onto them.
+
+use super::{Grid, LINE_AXIS, PLANE_AXES};
+use crate::dispatch;
+use crate::kernel::cpu::simd::fma;
+use rayon::prelude::*;
+
+/// Where a point lies between the vertices of a grid.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Cell {
+    /// Vertex below, per axis; the one above exists.
+    pub index: [u32; 3],
+    /// 0..=1 on the way to the one above.
+    pub frac: [f32; 3],
+}
+
+impl Cell {
+    /// The cell of a point given as 0..=1 along each axis of the box (the border's vertices are at 0 and 1).
+    #[inline(always)]
+    pub fn new(size: [usize; 3], unit: [f32; 3]) -> Cell {
+        let mut cell = Cell::default();
+        for a in 0..3 {
+            let x = (unit[a] * (size[a] - 1) as f32).clamp(0.0, (size[a] - 1) as f32);
+            let i = (x as u32).min(size[a] as u32 - 2);
+            cell.index[a] = i;
+            cell.frac[a] = x - i as f32;
+        }
+        cell
+    }
+}
+
+/// The four corners of a cell in plane `i`: offsets of the two rows, and their weights.
+#[derive(Clone, Copy)]
+struct Corners {
+    rows: [usize; 2],
+    weight: [f32; 4],
+}
+
+/// Plane and line of a term as slices.
+struct Term<'a> {
+    plane: &'a [f32],
+    line: &'a [f32],
+    width: usize,
+    channels: usize,
+}
+
+fn terms<'a>(grid: &Grid, values: &'a [f32]) -> [Term<'a>; 3] {
+    std::array::from_fn(|i| {
+        let plane = grid.plane(i);
+        Term {
+            plane: &values[plane.range()],
+            line: &values[grid.line(i).range()],
+            width: plane.width,
+            channels: plane.channels,
+        }
+    })
+}
+
+#[inline(always)]
+fn corners(i: usize, cell: &Cell, width: usize, channels: usize) -> Corners {
+    let (a, b) = PLANE_AXES[i];
+    let row = cell.index[b] as usize * width + cell.index[a] as usize;
+    let (x, y) = (cell.frac[a], cell.frac[b]);
+    Corners {
+        rows: [row * channels, (row + width) * channels],
+        weight: [(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y],
+    }
+}
+
+#[inline(always)]
+fn lanes<const W: usize>(values: &[f32], start: usize) -> &[f32; W] {
+    values[start..start + W].try_into().expect("a slice of W floats")
+}
+
+/// Plane and line values of `W` channels from `c` on.
+#[inline(always)]
+fn look_up<const F: bool, const W: usize>(
+    term: &Term,
+    at: &Corners,
+    line: usize,
+    z: f32,
+    c: usize,
+) -> ([f32; W], [f32; W]) {
+    let n = term.channels;
+    let (p, q) = (at.rows[0] + c, at.rows[1] + c);
+    let (a, b) = (lanes::<W>(term.plane, p), lanes::<W>(term.plane, p + n));
+    let (d, e) = (lanes::<W>(term.plane, q), lanes::<W>(term.plane, q + n));
+    let (l, m) = (lanes::<W>(term.line, line + c), lanes::<W>(term.line, line + n + c));
+    let w = at.weight;
+    let mut plane = [0f32; W];
+    let mut value = [0f32; W];
+    for k in 0..W {
+        plane[k] = fma::<F>(w[3], e[k], fma::<F>(w[2], d[k], fma::<F>(w[1], b[k], w[0] * a[k])));
+        value[k] = fma::<F>(z, m[k] - l[k], l[k]);
+    }
+    (plane, value)
+}
+
+/// Runs `body` over the channels of a term in the widest pieces that fit.
+macro_rules! in_pieces {
+    ($channels:expr, $c:ident, $width:ident, $body:block) => {{
+        let mut $c = 0;
+        while $c + 16 <= $channels {
+            const $width: usize = 16;
+            $body
+            $c += 16;
+        }
+        while $c + 8 <= $channels {
+            const $width: usize = 8;
+            $body
+            $c += 8;
+        }
+        while $c + 4 <= $channels {
+            const $width: usize = 4;
+            $body
+            $c += 4;
+        }
+        while $c < $channels {
+            const $width: usize = 1;
+            $body
+            $c += 1;
+        }
+    }};
+}
+
+/// A set of planes and lines, prepared for lookups.
+pub(super) struct Lookup<'a> {
+    terms: [Term<'a>; 3],
+    size: [usize; 3],
+}
+
+impl<'a> Lookup<'a> {
+    pub fn new(grid: &Grid, values: &'a [f32]) -> Lookup<'a> {
+        assert_eq!(values.len(), grid.len(), "planes and lines do not fit their grid");
+        Lookup { terms: terms(grid, values), size: grid.size }
+    }
+
+    pub fn size(&self) -> [usize; 3] {
+        self.size
+    }
+
+    /// Σ over terms and channels of plane times line.
+    #[inline(always)]
+    pub fn sum<const F: bool>(&self, cell: &Cell) -> f32 {
+        let mut total = 0f32;
+        for i in 0..3 {
+            let term = &self.terms[i];
+            let at = corners(i, cell, term.width, term.channels);
+            let axis = LINE_AXIS[i];
+            let line = cell.index[axis] as usize * term.channels;
+            in_pieces!(term.channels, c, W, {
+                let (p, v) = look_up::<F, W>(term, &at, line, cell.frac[axis], c);
+                let mut s = [0f32; W];
+                for k in 0..W {
+                    s[k] = p[k] * v[k];
+                }
+                total += s.iter().sum::<f32>();
+            });
+        }
+        total
+    }
+
+    /// Plane and line values of all channels, terms one after the other. Both `[channels]` or longer.
+    #[inline(always)]
+    pub fn factors<const F: bool>(&self, cell: &Cell, planes: &mut [f32], lines: &mut [f32]) {
+        let mut first = 0;
+        for i in 0..3 {
+            let term = &self.terms[i];
+            let at = corners(i, cell, term.width, term.channels);
+            let axis = LINE_AXIS[i];
+            let line = cell.index[axis] as usize * term.channels;
+            in_pieces!(term.channels, c, W, {
+                let (p, v) = look_up::<F, W>(term, &at, line, cell.frac[axis], c);
+                planes[first + c..first + c + W].copy_from_slice(&p);
+                lines[first + c..first + c + W].copy_from_slice(&v);
+            });
+            first += term.channels;
+        }
+    }
+}
+
+/// Gradients of many lookups: what each sample says about its plane and line values.
+pub(super) struct Spread<'a> {
+    pub cells: &'a [Cell],
+    /// `[samples, stride]`, the first `channels` of a row are used.
+    pub planes: &'a [f32],
+    /// As `planes`.
+    pub lines: &'a [f32],
+    pub stride: usize,
+}
+
+/// Part of a plane or a line that one task owns.
+struct Band<'a> {
+    term: usize,
+    line: bool,
+    /// First row of the plane; 0 for a line.
+    row: usize,
+    channels: usize,
+    /// First channel of this term in a sample's row.
+    first: usize,
+    width: usize,
+    values: &'a mut [f32],
+}
+
+/// `into += weight · g`, n channels.
+#[inline(always)]
+fn add<const F: bool>(into: &mut [f32], g: &[f32], weight: f32, n: usize) {
+    let (into, g) = (&mut into[..n], &g[..n]);
+    in_pieces!(n, c, W, {
+        // a copy, so that nothing is written while there is something to read: this is what vectorises
+        let mut sum: [f32; W] = *lanes::<W>(into, c);
+        let g: &[f32; W] = lanes::<W>(g, c);
+        for k in 0..W {
+            sum[k] = fma::<F>(weight, g[k], sum[k]);
+        }
+        into[c..c + W].copy_from_slice(&sum);
+    });
+}
+
+/// Two neighbours along a row at once: they lie one after the other.
+#[inline(always)]
+fn add_pair<const F: bool>(into: &mut [f32], g: &[f32], a: f32, b: f32, n: usize) {
+    add::<F>(into, g, a, n);
+    add::<F>(&mut into[n..], g, b, n);
+}
+
+#[inline(always)]
+fn band_body<const F: bool>(band: &mut Band, spread: &Spread) {
+    let n = band.channels;
+    if band.line {
+        let axis = LINE_AXIS[band.term];
+        for (s, cell) in spread.cells.iter().enumerate() {
+            let g = &spread.lines[s * spread.stride + band.first..][..n];
+            let z = cell.frac[axis];
+            let at = cell.index[axis] as usize * n;
+            add_pair::<F>(&mut band.values[at..at + 2 * n], g, 1.0 - z, z, n);
+        }
+        return;
+    }
+    let (a, b) = PLANE_AXES[band.term];
+    let pitch = band.width * n;
+    let rows = band.values.len() / pitch;
+    for (s, cell) in spread.cells.iter().enumerate() {
+        // this row and the next; those of other bands are somebody else's
+        let row = (cell.index[b] as usize).wrapping_sub(band.row);
+        if row >= rows && row.wrapping_add(1) >= rows {
+            continue;
+        }
+        let g = &spread.planes[s * spread.stride + band.first..][..n];
+        let (x, y) = (cell.frac[a], cell.frac[b]);
+        let at = cell.index[a] as usize * n;
+        if row < rows {
+            let w = 1.0 - y;
+            add_pair::<F>(&mut band.values[row * pitch + at..][..2 * n], g, (1.0 - x) * w, x * w, n);
+        }
+        let next = row.wrapping_add(1);
+        if next < rows {
+            add_pair::<F>(&mut band.values[next * pitch + at..][..2 * n], g, (1.0 - x) * y, x * y, n);
+        }
+    }
+}
+
+dispatch! { fn spread_band / band_body(band: &mut Band, spread: &Spread) }
+
+/// Bands a plane is cut into: fixed, so that the order of sums does not depend on the number of threads.
+const BANDS: usize = 6;
+
+/// Adds the gradients of all samples to `gradient` (laid out as `grid`). Every vertex is summed in the order
+/// of the samples, whatever the number of threads.
+pub(super) fn scatter(grid: &Grid, spread: &Spread, gradient: &mut [f32]) {
+    assert_eq!(gradient.len(), grid.len());
+    let mut bands = Vec::new();
+    let mut rest = gradient;
+    for line in [false, true] {
+        let mut first = 0;
+        for term in 0..3 {
+            let factor = if line { grid.line(term) } else { grid.plane(term) };
+            let (mut own, tail) = std::mem::take(&mut rest).split_at_mut(factor.len());
+            rest = tail;
+            let pitch = factor.width * factor.channels;
+            let rows = if line { 1 } else { factor.height.div_ceil(BANDS) };
+            let mut row = 0;
+            while factor.channels > 0 && row < factor.height {
+                let take = rows.min(factor.height - row);
+                let (values, more) = own.split_at_mut(take * pitch);
+                own = more;
+                let (channels, width) = (factor.channels, factor.width);
+                bands.push(Band { term, line, row, channels, first, width, values });
+                row += take;
+            }
+            first += grid.rank[term];
+        }
+    }
+    bands.par_iter_mut().with_max_len(1).for_each(|band| spread_band(band, spread));
+}

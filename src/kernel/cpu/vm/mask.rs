@@ -1,0 +1,288 @@
+//! Which cells of a box may hold anything, and marching through them on a fixed lattice of steps.
+//!
+//! TensoRF's alpha mask (Chen et al. 2022, §4.3; `alphaMask` of the published code) marks vertices and is
+//! looked up trilinearly: a point is kept if any vertex around it is. That is the same as cells whose
+//! corners are evaluated once, so here cells are stored, and a ray steps over empty ones *before* the field is
+//! touched. Sample positions `t = entry + step · (k + jitter)` do not depend on the mask.
+
+use crate::kernel::cpu::march::MarchRay;
+
+/// Cells of a box, one bit each, cell `(x · ny + y) · nz + z`; and blocks of cells that are all empty.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BoxMask {
+    min: [f32; 3],
+    max: [f32; 3],
+    size: [usize; 3],
+    bits: Vec<u64>,
+    /// Bits of blocks of `BLOCK`³ cells that hold an occupied cell.
+    blocks: Vec<u64>,
+}
+
+/// Cells along the edge of a block.
+pub(in crate::kernel) const BLOCK: usize = 8;
+
+fn bit(bits: &[u64], i: usize) -> bool {
+    bits[i >> 6] >> (i & 63) & 1 == 1
+}
+
+impl BoxMask {
+    /// From cells evaluated one by one.
+    pub fn new(
+        min: [f32; 3],
+        max: [f32; 3],
+        size: [usize; 3],
+        occupied: impl Fn([usize; 3]) -> bool,
+    ) -> BoxMask {
+        let cells: usize = size.iter().product();
+        let mut mask = BoxMask { min, max, size, bits: vec![0; cells.div_ceil(64)], blocks: Vec::new() };
+        for x in 0..size[0] {
+            for y in 0..size[1] {
+                for z in 0..size[2] {
+                    if occupied([x, y, z]) {
+                        let i = mask.cell([x, y, z]);
+                        mask.bits[i >> 6] |= 1 << (i & 63);
+                    }
+                }
+            }
+        }
+        mask.group();
+        mask
+    }
+
+    /// From its bits, as [`BoxMask::bits`] gives them; `None` if they are not as many as the cells need.
+    pub fn from_bits(min: [f32; 3], max: [f32; 3], size: [usize; 3], bits: Vec<u64>) -> Option<BoxMask> {
+        let cells = size.iter().try_fold(1usize, |n, &s| n.checked_mul(s))?;
+        if bits.len() != cells.div_ceil(64) {
+            return None;
+        }
+        let mut mask = BoxMask { min, max, size, bits, blocks: Vec::new() };
+        mask.group();
+        Some(mask)
+    }
+
+    /// Cells around vertices: a cell is occupied if one of its eight corners is. `vertices` are
+    /// `(x · ny + y) · nz + z`, at least 2 along each axis, the outer ones on the border of `min..max`.
+    ///
+    /// The cells go one further than the vertices on every side, as the published lookup does: it pads with
+    /// zeros, and a point less than a cell outside still has some of the vertex on the border.
+    pub fn from_vertices(min: [f32; 3], max: [f32; 3], size: [usize; 3], vertices: &[bool]) -> BoxMask {
+        assert_eq!(vertices.len(), size.iter().product::<usize>());
+        let unit: [f32; 3] = std::array::from_fn(|a| (max[a] - min[a]) / (size[a] - 1) as f32);
+        let grown = |corner: [f32; 3], sign: f32| std::array::from_fn(|a| corner[a] + sign * unit[a]);
+        BoxMask::new(grown(min, -1.0), grown(max, 1.0), size.map(|n| n + 1), |[x, y, z]| {
+            (0..8).any(|k| {
+                // cell 0 lies before vertex 0: its upper corner
+                let v = [x + (k & 1), y + (k >> 1 & 1), z + (k >> 2)];
+                (0..3).all(|a| v[a] > 0 && v[a] <= size[a])
+                    && vertices[((v[0] - 1) * size[1] + v[1] - 1) * size[2] + v[2] - 1]
+            })
+        })
+    }
+
+    fn group(&mut self) {
+        let b = self.size.map(|n| n.div_ceil(BLOCK));
+        self.blocks = vec![0; (b[0] * b[1] * b[2]).div_ceil(64)];
+        for x in 0..self.size[0] {
+            for y in 0..self.size[1] {
+                for z in 0..self.size[2] {
+                    if bit(&self.bits, self.cell([x, y, z])) {
+                        let i = ((x / BLOCK) * b[1] + y / BLOCK) * b[2] + z / BLOCK;
+                        self.blocks[i >> 6] |= 1 << (i & 63);
+                    }
+                }
+            }
+        }
+    }
+
+    fn cell(&self, c: [usize; 3]) -> usize {
+        (c[0] * self.size[1] + c[1]) * self.size[2] + c[2]
+    }
+
+    /// Lower and upper corner.
+    pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
+        (self.min, self.max)
+    }
+
+    /// Cells along each axis.
+    pub fn size(&self) -> [usize; 3] {
+        self.size
+    }
+
+    /// The cells' bits.
+    pub fn bits(&self) -> &[u64] {
+        &self.bits
+    }
+
+    /// Bits of blocks of 8³ cells that hold an occupied cell, in the order of cells.
+    #[cfg(feature = "wgpu")]
+    pub(in crate::kernel) fn blocks(&self) -> &[u64] {
+        &self.blocks
+    }
+
+    /// Share of cells that are occupied, 0..=1.
+    pub fn share(&self) -> f64 {
+        let cells: usize = self.size.iter().product();
+        let set: u64 = self.bits.iter().map(|b| b.count_ones() as u64).sum();
+        set as f64 / cells.max(1) as f64
+    }
+
+    /// Is a point in an occupied cell? Outside the box nothing is.
+    pub fn contains(&self, p: [f32; 3]) -> bool {
+        let mut c = [0; 3];
+        for a in 0..3 {
+            // also refuses NaN
+            if !(p[a] >= self.min[a] && p[a] <= self.max[a]) {
+                return false;
+            }
+            let g = (p[a] - self.min[a]) / (self.max[a] - self.min[a]) * self.size[a] as f32;
+            c[a] = (g as usize).min(self.size[a] - 1);
+        }
+        bit(&self.bits, self.cell(c))
+    }
+}
+
+/// The lattice of a box: entry, step and how many samples a ray has.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lattice {
+    /// Lower corner of the field's box.
+    pub min: [f32; 3],
+    /// Upper corner.
+    pub max: [f32; 3],
+    /// Distance of samples, in units of `t`.
+    pub step: f32,
+    /// Samples of a ray; the last has no length and so no weight.
+    pub samples: usize,
+    /// The entry is kept within these.
+    pub near: f32,
+    /// See `near`.
+    pub far: f32,
+}
+
+impl Lattice {
+    /// Lattice points of a ray inside the box: what a renderer that skips nothing evaluates.
+    pub fn points(&self, ray: &MarchRay) -> u64 {
+        match self.crossing(ray) {
+            Some((enter, leave)) => {
+                let inside = (leave - enter.clamp(self.near, self.far)) / self.step;
+                (inside.max(0.0) as u64 + 1).min(self.samples as u64)
+            }
+            None => 0,
+        }
+    }
+
+    /// Where a ray enters and leaves the box; zero components of its direction count as 1e-6, as published.
+    #[inline(always)]
+    fn crossing(&self, ray: &MarchRay) -> Option<(f32, f32)> {
+        let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
+        for a in 0..3 {
+            let d = if ray.direction[a] == 0.0 { 1e-6 } else { ray.direction[a] };
+            let (p, q) = ((self.min[a] - ray.origin[a]) / d, (self.max[a] - ray.origin[a]) / d);
+            enter = enter.max(p.min(q));
+            leave = leave.min(p.max(q));
+        }
+        // also refuses NaN
+        (enter <= leave).then_some((enter, leave))
+    }
+}
+
+/// The lattice points of a ray inside the box and inside a mask, one after the other.
+///
+/// A state and not a closure: a closure handed down would be compiled without the vector instructions of the
+/// kernel that calls it.
+pub struct Walk<'a> {
+    lattice: &'a Lattice,
+    mask: Option<&'a BoxMask>,
+    ray: MarchRay,
+    start: f32,
+    leave: f32,
+    /// Next point.
+    k: i64,
+    end: i64,
+    /// Mask cells in a unit of length, and the inverse of how many a ray crosses in a unit of t.
+    scale: [f32; 3],
+    inverse: [f32; 3],
+    blocks: [usize; 3],
+}
+
+impl<'a> Walk<'a> {
+    /// Before the first point; without any for a ray that misses.
+    #[inline(always)]
+    pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &MarchRay) -> Walk<'a> {
+        let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
+        let (enter, leave) = crossing.unwrap_or((0.0, 0.0));
+        let start = enter.clamp(lattice.near, lattice.far) + ray.jitter * lattice.step;
+        let any = crossing.is_some() && start.is_finite();
+        let mut scale = [0f32; 3];
+        let mut inverse = [0f32; 3];
+        let mut blocks = [0; 3];
+        if let Some(m) = mask {
+            for a in 0..3 {
+                scale[a] = m.size[a] as f32 / (m.max[a] - m.min[a]);
+                inverse[a] = 1.0 / (ray.direction[a] * scale[a]);
+                blocks[a] = m.size[a].div_ceil(BLOCK);
+            }
+        }
+        let end = if any { lattice.samples.saturating_sub(1) as i64 } else { 0 };
+        Walk { lattice, mask, ray: *ray, start, leave, k: 0, end, scale, inverse, blocks }
+    }
+
+    /// The next `t`.
+    #[inline(always)]
+    pub fn advance(&mut self) -> Option<f32> {
+        let l = self.lattice;
+        while self.k < self.end {
+            let t = self.start + l.step * self.k as f32;
+            // the border itself belongs to the box, and rounding may put a sample just outside
+            if t > self.leave + l.step {
+                return None;
+            }
+            let mut p = [0f32; 3];
+            let mut outside = false;
+            for a in 0..3 {
+                p[a] = self.ray.origin[a] + t * self.ray.direction[a];
+                let slack = 1e-6 * (l.max[a] - l.min[a]);
+                // written so that NaN is outside, too
+                outside |= !(p[a] >= l.min[a] - slack && p[a] <= l.max[a] + slack);
+            }
+            let Some(mask) = self.mask else {
+                self.k += 1;
+                if outside {
+                    continue;
+                }
+                return Some(t);
+            };
+            let mut g = [0f32; 3];
+            let mut c = [0usize; 3];
+            for a in 0..3 {
+                g[a] = (p[a] - mask.min[a]) * self.scale[a];
+                let top = mask.size[a] as f32;
+                outside |= !(g[a] >= -1e-3 && g[a] <= top + 1e-3);
+                c[a] = (g[a].max(0.0) as usize).min(mask.size[a] - 1);
+            }
+            if outside {
+                self.k += 1;
+                continue;
+            }
+            if bit(&mask.bits, (c[0] * mask.size[1] + c[1]) * mask.size[2] + c[2]) {
+                self.k += 1;
+                return Some(t);
+            }
+            // on to the border of the empty cell, or of its block if that is empty too; by whole steps
+            let block = [c[0] / BLOCK, c[1] / BLOCK, c[2] / BLOCK];
+            let at = (block[0] * self.blocks[1] + block[1]) * self.blocks[2] + block[2];
+            let empty = !bit(&mask.blocks, at);
+            let mut border = f32::INFINITY;
+            for a in 0..3 {
+                let ahead = usize::from(self.ray.direction[a] > 0.0);
+                if self.ray.direction[a] != 0.0 {
+                    let wall =
+                        if empty { ((block[a] + ahead) * BLOCK).min(mask.size[a]) } else { c[a] + ahead };
+                    border = border.min((wall as f32 - g[a]) * self.inverse[a]);
+                }
+            }
+            // a hair less, so that rounding cannot jump over a sample in the next cell
+            self.k += ((border.max(0.0) / l.step - 1e-3).ceil() as i64).max(1);
+        }
+        None
+    }
+}

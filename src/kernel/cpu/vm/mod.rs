@@ -1,0 +1,145 @@
+//! TensoRF's vector-matrix decomposition (Chen et al. 2022, Eq. 7): planes times lines.
+//!
+//! A grid of `nx × ny × nz` vertices is three terms; term `i` is a plane over two axes times a line along
+//! the third, summed over its channels:
+//!
+//! ```text
+//! term 0: plane (x, y) · line z      term 1: plane (x, z) · line y      term 2: plane (y, z) · line x
+//! feature(p) = Σ_i Σ_c plane_i,c(p) · line_i,c(p)       bilinear and linear, vertices on the box's border
+//! ```
+//!
+//! Values of one vertex lie together (channel last): a corner is then one or a few cache lines, which
+//! makes lookups seven times faster than the channel-first storage of the published code.
+
+mod decoder;
+mod gather;
+pub mod losses;
+pub mod mask;
+mod penalty;
+mod render;
+mod resize;
+
+pub use decoder::{DecoderShape, DecoderWeights};
+pub use gather::Cell;
+#[cfg(feature = "wgpu")]
+pub(in crate::kernel) use penalty::tv_factors;
+pub use penalty::{Penalty, penalize};
+pub use render::{RAY_WIDTH, Rendered, Shading, VmField, backward, density_at, render};
+pub use resize::{cropped, resized};
+
+/// Axes (width, height) of each term's plane; x, y, z are 0, 1, 2.
+pub const PLANE_AXES: [(usize, usize); 3] = [(0, 1), (0, 2), (1, 2)];
+/// Axis of each term's line.
+pub const LINE_AXIS: [usize; 3] = [2, 1, 0];
+
+/// Where the planes and lines of one set lie in their flat array: plane 0, 1, 2, line 0, 1, 2, each
+/// `[height, width, channels]` or `[n, channels]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Grid {
+    /// Vertices along x, y, z; at least 2 each.
+    pub size: [usize; 3],
+    /// Channels of each term.
+    pub rank: [usize; 3],
+}
+
+/// One plane or line inside the flat array.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Factor {
+    /// First float.
+    pub start: usize,
+    /// Vertices along the plane's second axis; 1 for a line.
+    pub height: usize,
+    /// Vertices along the plane's first axis, or of the line.
+    pub width: usize,
+    /// Floats of a vertex.
+    pub channels: usize,
+}
+
+impl Factor {
+    /// How many floats it has.
+    pub fn len(&self) -> usize {
+        self.height * self.width * self.channels
+    }
+
+    /// Does it have no channel?
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Its part of the flat array.
+    pub fn range(&self) -> std::ops::Range<usize> {
+        self.start..self.start + self.len()
+    }
+}
+
+impl Grid {
+    /// The plane of term `i`.
+    pub fn plane(&self, i: usize) -> Factor {
+        let before: usize = (0..i).map(|j| self.plane_len(j)).sum();
+        let (w, h) = PLANE_AXES[i];
+        Factor { start: before, height: self.size[h], width: self.size[w], channels: self.rank[i] }
+    }
+
+    /// The line of term `i`.
+    pub fn line(&self, i: usize) -> Factor {
+        let planes: usize = (0..3).map(|j| self.plane_len(j)).sum();
+        let before: usize = (0..i).map(|j| self.size[LINE_AXIS[j]] * self.rank[j]).sum();
+        Factor { start: planes + before, height: 1, width: self.size[LINE_AXIS[i]], channels: self.rank[i] }
+    }
+
+    fn plane_len(&self, i: usize) -> usize {
+        let (w, h) = PLANE_AXES[i];
+        self.size[w] * self.size[h] * self.rank[i]
+    }
+
+    /// Floats of all planes and lines.
+    pub fn len(&self) -> usize {
+        let last = self.line(2);
+        last.start + last.len()
+    }
+
+    /// Has it no channel at all?
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Channels of all terms together.
+    pub fn channels(&self) -> usize {
+        self.rank.iter().sum()
+    }
+}
+
+/// Vertices along each axis for about so many voxels in a box: `floor(extent / (Π extent / V)^(1/3))`, two at
+/// least.
+pub fn size_for(extent: [f32; 3], voxels: u64) -> [usize; 3] {
+    let product: f32 = extent.iter().product();
+    let edge = (product / voxels as f32).cbrt();
+    extent.map(|e| ((e / edge) as usize).max(2))
+}
+
+/// Length of a march step: `ratio` times the mean distance of vertices over the three axes.
+pub fn step_size(extent: [f32; 3], size: [usize; 3], ratio: f32) -> f32 {
+    (0..3).map(|a| extent[a] / (size[a] - 1) as f32).sum::<f32>() / 3.0 * ratio
+}
+
+/// Samples of a ray outside training: as many as the box's diagonal needs, a million at most.
+pub fn samples_across(extent: [f32; 3], step: f32) -> usize {
+    let diagonal = extent.iter().map(|e| e * e).sum::<f32>().sqrt();
+    ((diagonal / step) as usize).saturating_add(1).min(1_000_000)
+}
+
+/// The voxel counts of `steps` upsamplings: equal ratios from `first` to `last`, computed in f32 as published.
+pub fn voxel_schedule(first: u64, last: u64, steps: usize) -> Vec<u64> {
+    let (a, b) = ((first as f64).ln() as f32, (last as f64).ln() as f32);
+    let at = |k: usize| {
+        let x = a as f64 + (b as f64 - a as f64) * k as f64 / steps as f64;
+        (x as f32).exp().round() as u64
+    };
+    (1..=steps).map(at).collect()
+}
+
+#[cfg(test)]
+#[path = "fixture_tests.rs"]
+pub(crate) mod fixture;
+#[cfg(test)]
+mod tests;

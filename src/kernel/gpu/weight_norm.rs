@@ -1,0 +1,283 @@
+//! From trained parameters to what the field computes with, and back: weight norm of the geometry network (Salimans,
+//! Kingma 2016) and the sharpness of NeuS.
+//!
+//! ```text
+//! W = g v / ‖v‖ by rows     g_g = ĝ · v / ‖v‖     g_v = g / ‖v‖ (ĝ − (ĝ · v̂) v̂),  ĝ the gradient by W
+//! inv_s = exp(10 s)         g_s = 10 inv_s g_inv_s
+//! ```
+
+use super::device::{Buffer, Device, groups};
+use crate::kernel::cpu::mlp::Layout;
+use crate::kernel::cpu::weight_norm::{self, Row};
+use cubecl::prelude::*;
+
+const UNITS: u32 = 64;
+
+/// Words that describe a piece: where its parameters, its length parameter and its weights begin, and how many they
+/// are. A piece without a length parameter is copied.
+const PIECE: usize = 4;
+
+/// No length parameter.
+const NONE: u32 = u32::MAX;
+
+/// ‖v‖ of a piece, 1 where it has no length parameter.
+#[cube]
+fn length(raw: &[f32], pieces: &[u32], i: usize) -> f32 {
+    let from = pieces[i * PIECE] as usize;
+    let mut sum = 0.0f32;
+    for k in 0..pieces[i * PIECE + 3] as usize {
+        sum += raw[from + k] * raw[from + k];
+    }
+    select(pieces[i * PIECE + 1] == NONE, 1.0f32, max(sum.sqrt(), 1e-12f32))
+}
+
+/// By its bits: compilers may take for granted that floats are finite.
+#[cube]
+pub(super) fn finite(v: f32) -> bool {
+    (u32::reinterpret(v) & 0x7f80_0000u32) != 0x7f80_0000u32
+}
+
+/// g of a piece, 1 where it has none.
+#[cube]
+fn scale(raw: &[f32], pieces: &[u32], i: usize) -> f32 {
+    let at = pieces[i * PIECE + 1];
+    let mut g = 1.0f32;
+    if at != NONE {
+        g = raw[at as usize];
+    }
+    g
+}
+
+#[cube(launch)]
+fn forward(
+    raw: &[f32],
+    pieces: &[u32],
+    variance: &mut [f32],
+    flat: &mut [f32],
+    inv_s: &mut [f32],
+    least: f32,
+    most: f32,
+) {
+    let i = ABSOLUTE_POS;
+    if i < pieces.len() / PIECE {
+        let (from, to) = (pieces[i * PIECE] as usize, pieces[i * PIECE + 2] as usize);
+        let share = scale(raw, pieces, i) / length(raw, pieces, i);
+        for k in 0..pieces[i * PIECE + 3] as usize {
+            flat[to + k] = raw[from + k] * share;
+        }
+    }
+    if i == 0 {
+        let v = clamp(variance[0], least, most);
+        variance[0] = v;
+        inv_s[0] = (10.0f32 * v).exp();
+    }
+}
+
+#[cube(launch)]
+fn backward(
+    raw: &[f32],
+    pieces: &[u32],
+    inv_s: &[f32],
+    g_flat: &[f32],
+    g_inv_s: &[f32],
+    g_raw: &mut [f32],
+    g_variance: &mut [f32],
+    broken: &mut [u32],
+) {
+    let i = ABSOLUTE_POS;
+    if i < pieces.len() / PIECE {
+        let (from, to) = (pieces[i * PIECE] as usize, pieces[i * PIECE + 2] as usize);
+        let count = pieces[i * PIECE + 3] as usize;
+        let at = pieces[i * PIECE + 1];
+        let length = length(raw, pieces, i);
+        let share = scale(raw, pieces, i) / length;
+        let mut along = 0.0f32;
+        if at != NONE {
+            for k in 0..count {
+                along += g_flat[to + k] * raw[from + k];
+            }
+            along /= length;
+            g_raw[at as usize] = along;
+            if !finite(along) {
+                broken[0] = 1;
+            }
+        }
+        for k in 0..count {
+            let own = share * (g_flat[to + k] - along * raw[from + k] / length);
+            g_raw[from + k] = own;
+            // all who write, write the same
+            if !finite(own) {
+                broken[0] = 1;
+            }
+        }
+    }
+    if i == 0 {
+        let own = 10.0f32 * inv_s[0] * g_inv_s[0];
+        g_variance[0] = own;
+        if !finite(own) {
+            broken[0] = 1;
+        }
+    }
+}
+
+/// Where the trained parameters of a network stand among its weights.
+///
+/// Parameters are one vector: v1, g1, b1, v2, g2, b2, c1, c2, c3; weights are as [`Layout`] describes them.
+pub struct WeightNorm {
+    pieces: Buffer,
+    count: usize,
+    parameters: usize,
+}
+
+impl WeightNorm {
+    /// Of a network.
+    pub fn new(device: &Device, layout: Layout) -> WeightNorm {
+        let (rows, parameters) = weight_norm::rows(layout);
+        let piece = |row: &Row| {
+            let length = row.length.map_or(NONE, |g| g as u32);
+            [row.from as u32, length, row.to as u32, row.count as u32]
+        };
+        let pieces: Vec<u32> = rows.iter().flat_map(piece).collect();
+        let count = pieces.len() / PIECE;
+        WeightNorm { pieces: device.upload(&pieces), count, parameters }
+    }
+
+    /// How many parameters there are.
+    pub fn parameters(&self) -> usize {
+        self.parameters
+    }
+
+    /// Weights and sharpness, `[1]`, of parameters and variance, `[1]`, which is first kept in a range.
+    pub fn forward(
+        &self,
+        device: &Device,
+        raw: &Buffer,
+        variance: &Buffer,
+        range: [f32; 2],
+        flat: &Buffer,
+        inv_s: &Buffer,
+    ) {
+        assert_eq!(raw.words(), self.parameters);
+        forward::launch(
+            device.launch(),
+            groups(self.count.div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            raw.arg(),
+            self.pieces.arg(),
+            variance.arg(),
+            flat.arg(),
+            inv_s.arg(),
+            range[0],
+            range[1],
+        );
+    }
+
+    /// Gradients by parameters and variance of those by weights and sharpness; makes `broken`, `[1]`, 1 where one is not
+    /// finite. What breaks the gradient of the table passes through the layers above it.
+    pub fn backward(
+        &self,
+        device: &Device,
+        raw: &Buffer,
+        inv_s: &Buffer,
+        [g_flat, g_inv_s]: [&Buffer; 2],
+        [g_raw, g_variance]: [&Buffer; 2],
+        broken: &Buffer,
+    ) {
+        backward::launch(
+            device.launch(),
+            groups(self.count.div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            raw.arg(),
+            self.pieces.arg(),
+            inv_s.arg(),
+            g_flat.arg(),
+            g_inv_s.arg(),
+            g_raw.arg(),
+            g_variance.arg(),
+            broken.arg(),
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::tests::{agree, device};
+    use super::*;
+    use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS};
+    use crate::kernel::cpu::rng;
+
+    /// Weights of parameters in f64, by the shapes alone.
+    fn weights(layout: Layout, raw: &[f64]) -> Vec<f64> {
+        let mut rest = raw;
+        let mut flat = Vec::new();
+        let take = |rest: &mut &[f64], n: usize| -> Vec<f64> {
+            let (own, tail) = rest.split_at(n);
+            *rest = tail;
+            own.to_vec()
+        };
+        for (part, (outputs, inputs)) in layout.shapes().into_iter().enumerate() {
+            let v = take(&mut rest, outputs * inputs);
+            if part == 0 || part == 2 {
+                let g = take(&mut rest, outputs);
+                for (row, g) in v.chunks(inputs).zip(g) {
+                    let length = row.iter().map(|x| x * x).sum::<f64>().sqrt();
+                    flat.extend(row.iter().map(|x| g * x / length));
+                }
+            } else {
+                flat.extend(v);
+            }
+        }
+        flat
+    }
+
+    #[test]
+    fn weights_and_gradients_agree_with_f64() {
+        let Some(device) = device() else { return };
+        let layout = Layout::new(5, true);
+        let norm = WeightNorm::new(&device, layout);
+        assert_eq!(norm.parameters(), layout.len() + HIDDEN + OUTPUTS);
+        let normal = |stream: u64, n: usize| -> Vec<f32> {
+            (0..n as u64).map(|i| rng::normal(3, stream, i)).collect()
+        };
+        let (raw, g) = (normal(1, norm.parameters()), normal(2, layout.len()));
+        let [there, g_flat] = [&raw, &g].map(|v| device.upload(v));
+        let (variance, g_inv_s) = (device.upload(&[0.3f32]), device.upload(&[0.7f32]));
+        let (flat, inv_s) = (device.scratch(layout.len()), device.scratch(1));
+        norm.forward(&device, &there, &variance, [-1.0, 0.25], &flat, &inv_s);
+        let wide: Vec<f64> = raw.iter().map(|&v| v as f64).collect();
+        let want: Vec<f32> = weights(layout, &wide).iter().map(|&v| v as f32).collect();
+        agree("weights", &device.read::<f32>(&flat), &want, 1e-5);
+        // 0.3 is kept to 0.25: inv_s = exp(2.5), and its gradient 0.7 becomes 7 exp(2.5)
+        assert_eq!(device.read::<f32>(&variance), [0.25]);
+        agree("sharpness", &device.read::<f32>(&inv_s), &[2.5f32.exp()], 1e-5);
+        let (g_raw, g_variance) = (device.scratch(raw.len()), device.scratch(1));
+        let broken = device.zeros(1);
+        let into = [&g_raw, &g_variance];
+        norm.backward(&device, &there, &inv_s, [&g_flat, &g_inv_s], into, &broken);
+        assert_eq!(device.read::<u32>(&broken), [0]);
+        agree("gradient by the variance", &device.read::<f32>(&g_variance), &[7.0 * 2.5f32.exp()], 1e-5);
+        let loss =
+            |raw: &[f64]| -> f64 { weights(layout, raw).iter().zip(&g).map(|(w, &g)| w * g as f64).sum() };
+        let got = device.read::<f32>(&g_raw);
+        let some: Vec<usize> = (0..raw.len()).step_by(7).collect();
+        let slopes: Vec<f32> = some
+            .iter()
+            .map(|&i| {
+                let at = |h: f64| {
+                    let mut p = wide.clone();
+                    p[i] += h;
+                    loss(&p)
+                };
+                ((at(1e-5) - at(-1e-5)) / 2e-5) as f32
+            })
+            .collect();
+        agree("gradient by the parameters", &some.iter().map(|&i| got[i]).collect::<Vec<_>>(), &slopes, 1e-5);
+        for (value, at) in [(f32::NAN, 0), (f32::INFINITY, layout.len() - 1)] {
+            let mut g = g.clone();
+            g[at] = value;
+            let broken = device.zeros(1);
+            norm.backward(&device, &there, &inv_s, [&device.upload(&g), &g_inv_s], into, &broken);
+            assert_eq!(device.read::<u32>(&broken), [1]);
+        }
+    }
+}

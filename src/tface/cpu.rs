@@ -1,0 +1,152 @@
+//! A training step of the vector-matrix field on the processor.
+
+use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_background};
+use crate::Result;
+use crate::config::VmConfig;
+use crate::field::ops::{Cpu, Ops, slice, slice_mut};
+use crate::field::parameters::{HostGroup, ParameterGroup};
+use crate::field::pixels::{Batch, Pixels};
+use crate::field::training::StepAt;
+use crate::kernel::cpu::rng;
+use crate::kernel::cpu::vm::losses::{self, BackgroundMode, Targets, VmFigures};
+use crate::kernel::cpu::vm::{self, DecoderWeights, Penalty, Rendered, VmField};
+use std::sync::Arc;
+
+/// The operations of [`VmOps`] on the processor.
+pub struct CpuVm<'a> {
+    config: &'a VmConfig,
+    pixels: &'a Pixels<'a>,
+    field: Option<Arc<VmField>>,
+    batch: Batch,
+    background: Vec<[f32; 3]>,
+    rendered: Option<(DecoderWeights, Rendered)>,
+    g_composed: Vec<f32>,
+    figures: VmFigures,
+}
+
+impl<'a> CpuVm<'a> {
+    /// The operations of a training with these settings and photographs.
+    pub fn new(config: &'a VmConfig, pixels: &'a Pixels<'a>) -> CpuVm<'a> {
+        CpuVm {
+            config,
+            pixels,
+            field: None,
+            batch: Batch::default(),
+            background: Vec::new(),
+            rendered: None,
+            g_composed: Vec::new(),
+            figures: VmFigures::default(),
+        }
+    }
+
+    fn field(&self) -> &VmField {
+        self.field.as_ref().expect("a field is loaded before the first step")
+    }
+}
+
+impl Ops for CpuVm<'_> {
+    type Device = Cpu;
+
+    fn device(&self) -> &Cpu {
+        &Cpu
+    }
+
+    fn gate(&self) -> bool {
+        !self.batch.rays.is_empty() && !self.figures.broken
+    }
+}
+
+impl VmOps for CpuVm<'_> {
+    fn load(&mut self, field: &Arc<VmField>, groups: [HostGroup; 3]) -> VmGroups<Self> {
+        self.field = Some(field.clone());
+        self.figures.broken = false;
+        groups.map(|group| ParameterGroup::upload(&Cpu, group))
+    }
+
+    fn unload(&mut self, _: Option<VmGroups<Self>>) {
+        self.field = None;
+    }
+
+    fn read(&self, groups: &VmGroups<Self>) -> Result<[HostGroup; 3]> {
+        let [density, color, network] = groups.each_ref().map(|group| group.download(&Cpu));
+        Ok([density?, color?, network?])
+    }
+
+    fn is_broken(&self) -> Result<bool> {
+        Ok(self.figures.broken)
+    }
+
+    fn draw(&mut self, at: StepAt, detail: f32) {
+        self.batch = self.pixels.draw(at.seed, at.step, self.config.rays, true, detail);
+        let random = random_background(self.config);
+        let color = |r: u64| match random {
+            true => std::array::from_fn(|c| {
+                rng::uniform(at.seed, at.step << 4 | BACKGROUND_STREAM, 3 * r + c as u64)
+            }),
+            false => [0.0; 3],
+        };
+        self.background = (0..self.batch.rays.len() as u64).map(color).collect();
+        let lattice = &self.field().lattice;
+        let points = self.batch.rays.iter().map(|ray| lattice.points(ray)).sum::<u64>();
+        self.figures.lattice += points;
+        self.figures.rays += self.batch.rays.len() as u64;
+    }
+
+    fn vm_render(&mut self, [density, color, network]: &VmGroups<Self>) {
+        let field = self.field();
+        let weights = DecoderWeights::new(field.decoder, slice(network.value()));
+        let [density, color] = [density, color].map(|group| slice(group.value()));
+        let rendered = vm::render(field, density, color, &weights, &self.batch.rays);
+        self.figures.density += rendered.density_samples;
+        self.figures.color += rendered.color_samples;
+        self.rendered = Some((weights, rendered));
+    }
+
+    fn losses(&mut self, mode: BackgroundMode) {
+        let composed = self.rendered.as_ref().map_or(&[][..], |(_, rendered)| &rendered.out);
+        let Batch { color, alpha, .. } = &self.batch;
+        let targets = Targets { color, alpha, background: &self.background };
+        let (terms, gradient) = losses::of_rays(composed, targets, mode, mask_term(self.config, self.pixels));
+        self.g_composed = gradient;
+        self.figures.terms.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
+    }
+
+    fn backward(&mut self, [density, color, network]: &mut VmGroups<Self>) {
+        let Some((weights, rendered)) = self.rendered.take() else { return };
+        let (values, g_density) = density.value_and_gradient();
+        let flat = vm::backward(
+            self.field(),
+            slice(values),
+            &weights,
+            rendered,
+            &self.g_composed,
+            slice_mut(g_density),
+            slice_mut(&mut color.gradient),
+        );
+        self.figures.broken |= !flat.iter().chain(&self.figures.terms).all(|g| g.is_finite());
+        slice_mut(&mut network.gradient).copy_from_slice(&flat);
+    }
+
+    fn penalize(&mut self, groups: &mut VmGroups<Self>, penalties: &[Penalty; 2]) {
+        if !self.gate() {
+            return;
+        }
+        let field = self.field();
+        for ((grid, penalty), group) in [field.density, field.color].iter().zip(penalties).zip(groups) {
+            if !penalty.is_zero() {
+                let (values, gradient) = group.value_and_gradient();
+                vm::penalize(grid, penalty, slice(values), slice_mut(gradient));
+            }
+        }
+    }
+
+    fn forget(&mut self) {
+        self.figures = VmFigures { broken: self.figures.broken, ..VmFigures::default() };
+    }
+
+    fn figures(&mut self) -> Result<VmFigures> {
+        let figures = self.figures;
+        self.forget();
+        Ok(figures)
+    }
+}

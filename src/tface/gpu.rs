@@ -1,0 +1,199 @@
+//! A training step of the vector-matrix field on a GPU, with the host waiting for nothing: rays are drawn, marched, decoded,
+//! compared and applied there. Masks and finer grids, a handful in a training, are made on the host.
+
+use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_background};
+use super::record::decoder;
+use super::state::VmState;
+use crate::config::VmConfig;
+use crate::field::drawing::DeviceRays;
+use crate::field::memory::MemoryNeed;
+use crate::field::ops::{ArrayDevice, Ops};
+use crate::field::parameters::{HostGroup, ParameterGroup};
+use crate::field::pixels::Pixels;
+use crate::field::training::StepAt;
+use crate::kernel::cpu::vm::losses::{BackgroundMode, VmFigures};
+use crate::kernel::cpu::vm::{Penalty, VmField};
+use crate::kernel::gpu::{
+    self, Batch, Buffer, Device, DeviceDecoder, Gate, SamplingOptions, Vm, VmLosses, VmValues,
+};
+use crate::{Error, Result};
+use std::sync::Arc;
+
+/// The operations of [`VmOps`] on a GPU, and its memory for them.
+pub struct GpuVm<'a> {
+    pixels: &'a Pixels<'a>,
+    pub(super) device: Device,
+    photographs: DeviceRays,
+    /// `[1]`: rays of a step.
+    ray_count: Buffer,
+    batch: Batch,
+    losses: VmLosses,
+    /// None while no field is loaded.
+    vm: Option<Vm>,
+    /// `[1]`: not 0 once a gradient was not finite.
+    broken: Buffer,
+}
+
+impl<'a> GpuVm<'a> {
+    /// Refuses a training that a device cannot take: it knows no such field, or has too little memory for the last grids.
+    /// Do photographs lie there, too?
+    pub fn fits(
+        stage: &str,
+        config: &VmConfig,
+        pixels: &Pixels,
+        start: &VmState,
+        device: &Device,
+    ) -> Result<bool> {
+        let known = match config.ortho > 0.0 {
+            true => Err("lines that are orthogonal"),
+            false => DeviceDecoder::supports(&decoder(config)),
+        };
+        known.map_err(|what| {
+            let problem = format!("the device `{}` knows no {what}", device.name());
+            Error::usage(problem, "train with `--device cpu`")
+        })?;
+        let fields = [start.size, start.last_size(config)].map(|size| start.field_of(config, size, true));
+        let [fixed, ray] = fields
+            .each_ref()
+            .map(|f| Vm::bytes(device, f))
+            .into_iter()
+            .fold([0; 2], |a, b| [a[0].max(b[0]), a[1].max(b[1])]);
+        let widest = fields.iter().map(Vm::widest).max().unwrap_or(1);
+        let rays = config.rays as u64;
+        // lattice points of all steps between two reads are counted in 32 bits
+        let countable = u32::MAX as u64 / Device::READ_EVERY / (widest / 12 + 2);
+        let need = MemoryNeed {
+            fixed: (fixed, "grids and gradients"),
+            unit: "rays",
+            each: [ray, widest.max(device.limits().largest_buffer.div_ceil(countable))],
+            wanted: rays,
+            least: rays,
+        };
+        let plan = need.plan(pixels, device, |fits| match fits {
+            0..64 => format!("{stage}.voxels_final ({})", config.voxels_final),
+            _ => format!("{stage}.rays to {fits}"),
+        });
+        plan.map(|(_, resident)| resident)
+    }
+
+    /// The operations of a training that [`fits`](GpuVm::fits) a device, whose memory has room for the photographs where
+    /// they are `resident`.
+    pub fn new(config: &'a VmConfig, pixels: &'a Pixels<'a>, device: Device, resident: bool) -> GpuVm<'a> {
+        let drawing = SamplingOptions {
+            every: false,
+            jitter: true,
+            background: random_background(config),
+            behind: BACKGROUND_STREAM,
+        };
+        GpuVm {
+            pixels,
+            photographs: DeviceRays::new(pixels, &device, drawing, resident),
+            ray_count: device.upload(&[config.rays as u32]),
+            batch: Batch::new(&device, config.rays),
+            losses: VmLosses::new(&device, config.rays, mask_term(config, pixels)),
+            vm: None,
+            broken: device.zeros(1),
+            device,
+        }
+    }
+
+    fn vm(&self) -> &Vm {
+        self.vm.as_ref().expect("a field is loaded before the first step")
+    }
+}
+
+/// The arrays of all groups.
+fn arrays<'g>(
+    groups: &'g VmGroups<GpuVm>,
+    which: impl Fn(&'g ParameterGroup<Device>) -> &'g Buffer,
+) -> VmValues<'g> {
+    let [density, color, network] = groups;
+    VmValues { density: which(density), color: which(color), network: which(network) }
+}
+
+impl Ops for GpuVm<'_> {
+    type Device = Device;
+
+    fn device(&self) -> &Device {
+        &self.device
+    }
+
+    fn gate(&self) -> Gate<'_> {
+        Gate { count: self.losses.rays(), broken: &self.broken }
+    }
+}
+
+impl VmOps for GpuVm<'_> {
+    fn load(&mut self, field: &Arc<VmField>, groups: [HostGroup; 3]) -> VmGroups<Self> {
+        self.vm = Some(Vm::new(&self.device, field, self.batch.rays(), true));
+        self.broken = self.device.zeros(1);
+        let [density, color, network] = groups;
+        let pad = |mut group: HostGroup, grid: &gpu::DeviceGrid| {
+            group.state = group.state.map(|values| grid.pad(values));
+            group
+        };
+        let vm = self.vm();
+        [pad(density, &vm.density), pad(color, &vm.color), network]
+            .map(|group| ParameterGroup::upload(&self.device, group))
+    }
+
+    fn unload(&mut self, groups: Option<VmGroups<Self>>) {
+        drop(groups);
+        self.vm = None;
+        self.device.release_unused();
+    }
+
+    fn read(&self, groups: &VmGroups<Self>) -> Result<[HostGroup; 3]> {
+        let vm = self.vm();
+        let [density, color, network] = groups.each_ref().map(|group| group.download(&self.device));
+        let cut = |mut group: HostGroup, grid: &gpu::DeviceGrid| {
+            group.state = group.state.map(|values| grid.cut(values));
+            group
+        };
+        Ok([cut(density?, &vm.density), cut(color?, &vm.color), network?])
+    }
+
+    fn is_broken(&self) -> Result<bool> {
+        Ok(self.device.fetch::<u32>(&self.broken)?[0] != 0)
+    }
+
+    fn draw(&mut self, at: StepAt, detail: f32) {
+        let (device, at) = (&self.device, (at.seed, at.step));
+        self.photographs.draw(device, self.pixels, at, &self.ray_count, &mut self.batch, detail);
+    }
+
+    fn vm_render(&mut self, groups: &VmGroups<Self>) {
+        self.vm().render(&self.device, arrays(groups, |group| group.value()), &self.batch);
+    }
+
+    fn losses(&mut self, mode: BackgroundMode) {
+        self.losses.of_rays(&self.device, self.vm().output(), &self.batch, mode);
+    }
+
+    fn backward(&mut self, groups: &mut VmGroups<Self>) {
+        let (device, vm) = (&self.device, self.vm());
+        let values = arrays(groups, |group| group.value());
+        let gradients = arrays(groups, |group| &group.gradient);
+        vm.backward(device, values, &self.batch, self.losses.gradient(), gradients, &self.broken);
+        self.losses.add(device, vm, &self.broken);
+    }
+
+    fn penalize(&mut self, groups: &mut VmGroups<Self>, penalties: &[Penalty; 2]) {
+        let (device, vm) = (&self.device, self.vm());
+        for ((grid, penalty), group) in [&vm.density, &vm.color].into_iter().zip(penalties).zip(groups) {
+            grid.penalize(device, group.value(), penalty, &group.gradient);
+        }
+    }
+
+    fn forget(&mut self) {
+        self.losses.forget(&self.device);
+    }
+
+    fn figures(&mut self) -> Result<VmFigures> {
+        self.losses.fetch(&self.device)
+    }
+}
+
+#[cfg(test)]
+#[path = "gpu_tests.rs"]
+mod tests;

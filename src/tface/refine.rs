@@ -1,0 +1,150 @@
+//! Between steps: the alpha mask is rebuilt, the box shrinks, the grids become finer.
+
+use super::record::{NAMES, grids};
+use super::state::{VmState, upsampled_voxels};
+use crate::config::VmConfig;
+use crate::field::parameters::HostGroup;
+use crate::kernel::cpu::vm::mask::BoxMask;
+use crate::kernel::cpu::vm::{cropped, density_at, resized, size_for};
+use rayon::prelude::*;
+
+/// Most vertices of an alpha mask; a finer grid keeps the mask's size (published).
+const MASK_VERTICES: usize = 256 * 256 * 256;
+
+/// Rebuilds the alpha mask after `step` steps and, the first time, shrinks the box to it. False if nothing is left.
+///
+/// The published mask leaves the distance scale out of its alpha (`1 − exp(−σ · step)`), which makes it
+/// that much stricter than rendering; kept, and `mask_threshold` is in these terms.
+pub fn update_mask(state: &mut VmState, config: &VmConfig, step: u64) -> bool {
+    let size = match &state.mask {
+        Some(mask) if state.masked && state.size.iter().product::<usize>() >= MASK_VERTICES => {
+            mask.size().map(|n| n - 1)
+        }
+        _ => state.size,
+    };
+    let [low, high] = state.bounds;
+    let kept = occupied_vertices(state, config, size);
+    let Some((first, last)) = extent(&kept, size) else { return false };
+    state.mask = Some(BoxMask::from_vertices(low, high, size, &kept));
+    if !state.masked {
+        state.masked = true;
+        shrink(state, config, size, [first, last], step);
+    }
+    true
+}
+
+/// Vertices with enough alpha, and those beside them. `(x · ny + y) · nz + z`.
+fn occupied_vertices(state: &VmState, config: &VmConfig, size: [usize; 3]) -> Vec<bool> {
+    let field = state.field(config, false);
+    let density = state.groups[0].values();
+    let [low, high] = state.bounds;
+    let least = -(1.0 - config.mask_threshold as f32).ln() / (field.lattice.step / config.alpha_unit as f32);
+    let slab = size[1] * size[2];
+    let mut alive = vec![false; size[0] * slab];
+    alive.par_chunks_mut(slab).enumerate().for_each(|(x, out)| {
+        let at = |a: usize, i: usize| low[a] + (high[a] - low[a]) * i as f32 / (size[a] - 1) as f32;
+        let mut points = Vec::with_capacity(slab);
+        let mut index = Vec::with_capacity(slab);
+        for i in 0..slab {
+            let p = [at(0, x), at(1, i / size[2]), at(2, i % size[2])];
+            // what the mask before has emptied stays empty: only the rest is evaluated
+            if state.mask.as_ref().is_none_or(|m| m.contains(p)) {
+                points.push(p);
+                index.push(i);
+            }
+        }
+        for (sigma, i) in density_at(&field, density, &points).into_iter().zip(index) {
+            out[i] = sigma >= least;
+        }
+    });
+    dilated(&alive, size)
+}
+
+/// Each vertex or one of its 26 neighbours, one axis after the other.
+fn dilated(alive: &[bool], size: [usize; 3]) -> Vec<bool> {
+    let strides = [size[1] * size[2], size[2], 1];
+    let mut now = alive.to_vec();
+    for a in 0..3 {
+        let before = now.clone();
+        now.par_chunks_mut(strides[0]).enumerate().for_each(|(x, out)| {
+            for (i, v) in out.iter_mut().enumerate() {
+                let at = x * strides[0] + i;
+                let k = [x, i / size[2], i % size[2]][a];
+                *v = before[at]
+                    || k > 0 && before[at - strides[a]]
+                    || k + 1 < size[a] && before[at + strides[a]];
+            }
+        });
+    }
+    now
+}
+
+fn extent(kept: &[bool], size: [usize; 3]) -> Option<([usize; 3], [usize; 3])> {
+    let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
+    for (i, _) in kept.iter().enumerate().filter(|(_, k)| **k) {
+        let c = [i / (size[1] * size[2]), i / size[2] % size[1], i % size[2]];
+        for a in 0..3 {
+            low[a] = low[a].min(c[a]);
+            high[a] = high[a].max(c[a]);
+        }
+    }
+    (low[0] != usize::MAX).then_some((low, high))
+}
+
+/// Crops the grids to the vertices `first..=last` of a mask of `size` vertices. The optimizer starts again: its
+/// moments belong to planes of another size.
+fn shrink(
+    state: &mut VmState,
+    config: &VmConfig,
+    size: [usize; 3],
+    [first, last]: [[usize; 3]; 2],
+    step: u64,
+) {
+    let [low, high] = state.bounds;
+    let (mut from, mut to) = ([0; 3], [0; 3]);
+    for a in 0..3 {
+        // a vertex of the mask in vertices of the grid, half to even as published
+        let scaled = |i: usize| {
+            (i as f64 * (state.size[a] - 1) as f64 / (size[a] - 1) as f64).round_ties_even() as usize
+        };
+        from[a] = scaled(first[a]).min(state.size[a] - 2);
+        to[a] = (scaled(last[a]) + 1).clamp(from[a] + 2, state.size[a]);
+    }
+    if from == [0; 3] && to == state.size {
+        return;
+    }
+    let unit: [f32; 3] = std::array::from_fn(|a| (high[a] - low[a]) / (state.size[a] - 1) as f32);
+    let (density, color) = grids(config, state.size);
+    let (kept, density) = cropped(&density, state.groups[0].values(), from, to);
+    let (_, color) = cropped(&color, state.groups[1].values(), from, to);
+    state.bounds = [
+        std::array::from_fn(|a| low[a] + unit[a] * from[a] as f32),
+        std::array::from_fn(|a| low[a] + unit[a] * (to[a] - 1) as f32),
+    ];
+    state.size = kept.size;
+    replace(state, density, color, step);
+}
+
+/// Makes the grids finer where, after `step` steps, upsampling `which` (from 0) is due.
+pub fn upsample(state: &mut VmState, config: &VmConfig, which: usize, step: u64) {
+    let voxels = upsampled_voxels(config)[which];
+    let extent = std::array::from_fn(|a| state.bounds[1][a] - state.bounds[0][a]);
+    let size = size_for(extent, voxels);
+    let (old_density, old_color) = grids(config, state.size);
+    let (new_density, new_color) = grids(config, size);
+    let density = resized(&old_density, state.groups[0].values(), &new_density);
+    let color = resized(&old_color, state.groups[1].values(), &new_color);
+    state.size = size;
+    replace(state, density, color, step);
+    if config.lr_reset {
+        state.reset = step;
+    }
+}
+
+fn replace(state: &mut VmState, density: Vec<f32>, color: Vec<f32>, step: u64) {
+    let [of_density, of_color, network] = &mut state.groups;
+    *of_density = HostGroup::flat(NAMES[0], density);
+    *of_color = HostGroup::flat(NAMES[1], color);
+    network.forget_moments();
+    state.moments_from = step;
+}
