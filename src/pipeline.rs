@@ -55,7 +55,7 @@ pub use bench::{Bench, SWEEPS};
 pub use export::Export;
 pub use field_view::field_view;
 pub use line::{Line, capture_options, feasible, require_device};
-pub use mask::{click_page, disagreements};
+pub use mask::{click_page, inspect_capture};
 pub use mesh::export_head;
 pub use page::{head_page, renew_report, viewer_of_file};
 pub use preview::{Preview, PreviewPicture, PreviewRenderer};
@@ -92,7 +92,10 @@ pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> 
         ensemble::can_blend(config)?;
     }
     let done = run.stage(line.plan(stage), |dir| match stage {
-        Stage::Mask => mask::mask(capture, line.clicks.as_ref(), config, dir),
+        Stage::Mask => {
+            line.write_inputs(dir.folder())?;
+            mask::mask(capture, line.clicks.as_ref(), config, dir)
+        }
         Stage::Baseline | Stage::Tface | Stage::Iface => {
             learn::learn(stage, capture, &line.scene()?, config, dir)
         }

@@ -16,7 +16,7 @@ pub use live::{FieldView, serve_run};
 pub use runs::{RunRow, runs_csv, runs_html};
 pub use serve::{Answer, Server};
 
-use crate::config::Stage;
+use crate::config::{Stage, called};
 use crate::{Error, ErrorKind, Result};
 use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::{Environment, context};
@@ -289,6 +289,16 @@ pub fn judged_by(truth: &Value) -> Option<String> {
         _ => "without masks",
     };
     Some(format!("judged {photographs}, {masks}"))
+}
+
+/// That a blend is no better than the best of its members, from the `blend` of `metrics.json`; nothing where it is.
+pub fn blend_verdict(blend: &Value) -> Option<String> {
+    let gain = blend["gain_db"].as_f64().filter(|gain| *gain <= 0.0)?;
+    let member = called(blend["best_member"].as_str()?);
+    Some(format!(
+        "the blend is not better than its best member on the views that are judged: {:.2} dB below {member}",
+        -gain
+    ))
 }
 
 /// `8.2 s`, `2 min 25 s`, `3 h 07 min`.

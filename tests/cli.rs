@@ -4,8 +4,10 @@
 mod command;
 
 use command::tiface;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::io::{Limits, read_gray, write_png_gray};
 
 fn code(output: &Output) -> i32 {
     output.status.code().unwrap()
@@ -98,6 +100,144 @@ fn a_dry_run_names_only_the_stages_a_command_needs() {
     assert!(!dir.path().join("runs").exists());
 }
 
+/// A capture of 24 + 1 photographs of the synthetic head.
+fn head(folder: &Path) -> PathBuf {
+    let options = SyntheticOptions { width: 48, height: 60, train: 24, test: 1, seed: 1 };
+    write_capture(&folder.join("head"), &options).unwrap();
+    folder.join("head")
+}
+
+/// Rewrites the mask of a view, value by value.
+fn remask(head: &Path, view: usize, value: impl Fn(u8) -> u8) {
+    let file = head.join(format!("masks/{view:03}.png"));
+    let mut mask = read_gray(&file, None, &Limits::default()).unwrap();
+    mask.values.iter_mut().for_each(|v| *v = value(*v));
+    write_png_gray(&file, &mask).unwrap();
+}
+
+/// What `inspect` prints of the capture `head`, and whether a training would be planned; both say the same.
+fn inspected(folder: &Path, set: &[&str]) -> (String, bool) {
+    let set: Vec<&str> = set.iter().flat_map(|set| ["--set", set]).collect();
+    let found = tiface(folder, &[&["inspect", "head"][..], &set].concat());
+    let planned = tiface(folder, &[&["run", "head", "--dry-run"][..], &set].concat());
+    assert_eq!(code(&found), code(&planned), "{}\n{}", out(&found), err(&planned));
+    assert_eq!(out(&found).contains("nothing stands in the way"), code(&found) == 0);
+    (out(&found), code(&found) == 0)
+}
+
+#[test]
+fn inverted_masks_are_a_problem_and_nothing_is_trained_on_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let head = head(dir.path());
+    let (text, sound) = inspected(dir.path(), &[]);
+    assert!(sound && !text.contains("warning"), "{text}");
+    (0..25).for_each(|view| remask(&head, view, |v| 255 - v));
+    let (text, sound) = inspected(dir.path(), &[]);
+    assert!(!sound, "{text}");
+    assert!(text.contains("problem   25 times, the first: the mask of view `000` looks inverted"), "{text}");
+    assert!(text.contains("mask.trust=true"), "{text}");
+    let o = tiface(dir.path(), &["iface", "head"]);
+    assert!(code(&o) == 1 && err(&o).contains("looks inverted"), "{}", err(&o));
+    assert!(!dir.path().join("runs/head/iface").exists());
+    let (text, sound) = inspected(dir.path(), &["mask.trust=true"]);
+    assert!(sound && text.contains("warning   25 times, the first: the mask of view"), "{text}");
+}
+
+#[test]
+fn a_mask_that_shows_nothing_or_everything_among_good_ones_is_a_problem() {
+    for (value, words) in [(0, "shows too little"), (255, "the mask of view `007`")] {
+        let dir = tempfile::tempdir().unwrap();
+        let head = head(dir.path());
+        remask(&head, 7, |_| value);
+        let (text, sound) = inspected(dir.path(), &[]);
+        let problems: Vec<&str> = text.lines().filter(|line| line.contains("problem ")).collect();
+        assert!(!sound && problems.len() == 1, "{value}: {text}");
+        assert!(problems[0].contains("`007`") && problems[0].contains(words), "{text}");
+        let (text, sound) = inspected(dir.path(), &["mask.trust=true"]);
+        assert!(sound && text.contains(words), "{text}");
+    }
+}
+
+#[test]
+fn masks_of_other_photographs_are_a_problem() {
+    let dir = tempfile::tempdir().unwrap();
+    let masks = head(dir.path()).join("masks");
+    std::fs::rename(&masks, masks.with_file_name("old")).unwrap();
+    std::fs::create_dir(&masks).unwrap();
+    for view in 0..25 {
+        let from = masks.with_file_name("old").join(format!("{view:03}.png"));
+        std::fs::rename(from, masks.join(format!("{:03}.png", (view + 11) % 25))).unwrap();
+    }
+    let (text, sound) = inspected(dir.path(), &[]);
+    assert!(!sound && text.contains("problem "), "{text}");
+}
+
+#[test]
+fn a_camera_turned_away_from_the_head_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let head = head(dir.path());
+    let file = head.join("transforms_train.json");
+    let mut json: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    for row in 0..3 {
+        for column in [0, 2] {
+            let v = &mut json["frames"][5]["transform_matrix"][row][column];
+            *v = (-v.as_f64().unwrap()).into();
+        }
+    }
+    std::fs::write(&file, json.to_string()).unwrap();
+    let (text, sound) = inspected(dir.path(), &[]);
+    assert!(!sound && text.contains("problem   the mask of view `005` contradicts its camera"), "{text}");
+}
+
+#[test]
+fn a_black_photograph_under_a_mask_that_shows_the_head_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let head = head(dir.path());
+    write_png_gray(
+        &head.join("images/003.png"),
+        &tiface::image::Gray { width: 48, height: 60, values: vec![3; 48 * 60] },
+    )
+    .unwrap();
+    let (text, sound) = inspected(dir.path(), &[]);
+    assert!(!sound && text.contains("problem   the photograph of view `003` is black"), "{text}");
+}
+
+#[test]
+fn a_head_of_six_metres_is_doubted() {
+    let dir = tempfile::tempdir().unwrap();
+    head(dir.path());
+    let (text, _) = inspected(dir.path(), &[]);
+    assert!(text.contains(" m high\n") && !text.contains("unit_m"), "{text}");
+    let (text, sound) = inspected(dir.path(), &["capture.unit_m=20"]);
+    assert!(
+        sound && text.contains("warning   the head is 7.") && text.contains("capture.unit_m=METRES"),
+        "{text}"
+    );
+}
+
+#[test]
+fn inspect_says_of_what_is_no_capture_what_it_is() {
+    let dir = tempfile::tempdir().unwrap();
+    let head = head(dir.path());
+    let says = |path: &str, words: &[&str]| {
+        let o = tiface(dir.path(), &["inspect", path]);
+        assert_eq!(code(&o), 1);
+        for word in words {
+            assert!(out(&o).contains(word), "{path}: {word} is missing in {}", out(&o));
+        }
+        assert!(!out(&o).contains("not recognized"), "{}", out(&o));
+    };
+    says("absent", &["`absent` does not exist", "hint: "]);
+    let o = tiface(dir.path(), &["run", "head", "--run", "a run", "--dry-run"]);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    std::fs::create_dir(dir.path().join("a run")).unwrap();
+    let settings = format!("[capture]\npath = \"{}\"\n", head.display());
+    std::fs::write(dir.path().join("a run/config.toml"), settings).unwrap();
+    says("a run", &["it is the folder of a run", &format!("inspect its capture, `{}`", head.display())]);
+    std::fs::write(head.join("transforms_train.json"), "{\n\"frames\": [,\n").unwrap();
+    says("head", &["format    transforms.json", "transforms_train.json`, line 2"]);
+}
+
 #[test]
 fn a_blend_that_cannot_be_made_is_refused_before_anything_is_learned() {
     let dir = tempfile::tempdir().unwrap();
@@ -161,6 +301,19 @@ fn a_head_far_from_the_origin_is_checked_and_measured_like_one_near_it() {
         assert!(out(&o).contains(expected), "{center:?} {}", out(&o));
         assert!(out(&o).contains("8.0000 litres") && out(&o).contains("0.2000 × 0.2000 × 0.2000 m"));
     }
+}
+
+#[test]
+fn empty_settings_and_an_empty_material_are_no_damage() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("empty.toml"), "").unwrap();
+    let o = tiface(dir.path(), &["config", "-c", "empty.toml"]);
+    assert_eq!(out(&o), out(&tiface(dir.path(), &["config"])), "{}", err(&o));
+    let obj = "mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+    std::fs::write(dir.path().join("t.obj"), obj).unwrap();
+    std::fs::write(dir.path().join("t.mtl"), "").unwrap();
+    let o = tiface(dir.path(), &["preview", "t.obj", "--size", "16"]);
+    assert!(code(&o) == 0 && err(&o).is_empty(), "{}", err(&o));
 }
 
 #[test]
@@ -520,4 +673,190 @@ fn a_hundred_heads_stand_on_one_screen() {
     assert!(text.contains("head_042  ..  failed: no light") && text.contains(" head_099"), "{text}");
     assert!(text.contains("100 runs: 99 not begun, 1 failed; about "), "{text}");
     assert_eq!(out(&tiface(dir.path(), &["status", "-v"])).lines().count(), 101);
+}
+
+/// A capture of eight photographs and a held-out one in `folder/head`.
+#[test]
+fn masks_that_are_refused_clear_nothing_that_was_made_with_others() {
+    let dir = tempfile::tempdir().unwrap();
+    let head = head(dir.path());
+    assert_eq!(code(&tiface(dir.path(), &["mask", "head"])), 0);
+    (0..24).for_each(|view| remask(&head, view, |v| 255 - v));
+    let words = ["mask", "head", "--fresh", "mask"];
+    for words in [&words[..], &["mask", "head", "--fresh", "mask", "--dry-run"]] {
+        let o = tiface(dir.path(), words);
+        assert_eq!(code(&o), 1, "{words:?}: {}{}", out(&o), err(&o));
+        assert!(err(&o).contains("inverted") && err(&o).contains("mask.trust"), "{}", err(&o));
+        assert!(dir.path().join("runs/head/mask/done.json").is_file());
+    }
+}
+
+fn small_head(folder: &Path) {
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&folder.join("head"), &options).unwrap();
+}
+
+#[test]
+fn a_dry_run_ends_as_the_command_itself_would() {
+    let dir = tempfile::tempdir().unwrap();
+    small_head(dir.path());
+    assert_eq!(code(&tiface(dir.path(), &["mask", "head"])), 0);
+    let other = ["mask", "head", "--set", "capture.downscale=2"];
+    for words in [&other[..], &["mask", "head", "--set", "capture.downscale=2", "--dry-run"]] {
+        let o = tiface(dir.path(), words);
+        assert_eq!(code(&o), 1, "{words:?}: {}{}", out(&o), err(&o));
+        assert!(err(&o).contains("capture.downscale: was 1, is 2"), "{}", err(&o));
+        assert_eq!(out(&o).contains("would stop"), words.contains(&"--dry-run"), "{}", out(&o));
+    }
+    let afresh = [&other[..], &["--fresh", "mask", "--dry-run"]].concat();
+    let o = tiface(dir.path(), &afresh);
+    assert!(code(&o) == 0 && out(&o).contains("to do, afresh"), "{}{}", out(&o), err(&o));
+}
+
+#[test]
+fn what_a_stage_made_anew_puts_out_of_date_is_named_before_it_goes() {
+    let dir = tempfile::tempdir().unwrap();
+    small_head(dir.path());
+    assert_eq!(code(&tiface(dir.path(), &["mask", "head"])), 0);
+    // as if it had been begun
+    let mesh = dir.path().join("runs/head/mesh");
+    std::fs::create_dir(&mesh).unwrap();
+    for file in [".lock", "surface.ply"] {
+        std::fs::write(mesh.join(file), "x").unwrap();
+    }
+    let words = ["mask", "head", "--fresh", "mask"];
+    let o = tiface(dir.path(), &[&words[..], &["--dry-run"]].concat());
+    assert!(code(&o) == 0 && out(&o).contains("mesh     would be removed"), "{}{}", out(&o), err(&o));
+    assert!(mesh.join("surface.ply").is_file());
+    let o = tiface(dir.path(), &words);
+    assert!(code(&o) == 0 && err(&o).contains("out of date: `mask`, `mesh`"), "{}", err(&o));
+    assert!(!mesh.join("surface.ply").exists());
+}
+
+#[test]
+#[cfg(not(feature = "wgpu"))]
+fn what_only_gpus_have_is_refused_with_the_feature_that_it_needs() {
+    let dir = tempfile::tempdir().unwrap();
+    small_head(dir.path());
+    for words in [
+        &["iface", "head", "--memory", "2"][..],
+        &["iface", "head", "--memory", "2", "--dry-run"],
+        &["iface", "head", "--set", "device=cpu+2GiB"],
+        &["demo", "--memory", "2"],
+        &["doctor", "--model"],
+    ] {
+        let o = tiface(dir.path(), words);
+        assert_eq!(code(&o), 2, "{words:?}: {}{}", out(&o), err(&o));
+        assert!(err(&o).contains("--features wgpu"), "{words:?}: {}", err(&o));
+    }
+    assert!(!dir.path().join("runs").exists());
+}
+
+#[test]
+fn a_file_of_the_capture_that_changed_under_a_run_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    small_head(dir.path());
+    assert_eq!(code(&tiface(dir.path(), &["mask", "head"])), 0);
+    let image = |name: &str| dir.path().join("head/images").join(name);
+    let sound = std::fs::read(image("003.png")).unwrap();
+    std::fs::copy(image("001.png"), image("003.png")).unwrap();
+    for words in [&["mask", "runs/head"][..], &["mask", "runs/head", "--dry-run"]] {
+        let o = tiface(dir.path(), words);
+        assert!(code(&o) == 1 && err(&o).contains("`images/003.png` has changed"), "{}", err(&o));
+        assert!(!err(&o).contains("more differ"), "{}", err(&o));
+    }
+    std::fs::write(image("003.png"), &sound).unwrap();
+    let frames = dir.path().join("head/transforms.json");
+    for file in [frames, dir.path().join("head/transforms_train.json")] {
+        let text = std::fs::read_to_string(&file).unwrap();
+        std::fs::write(&file, text.replace("\"cx\": 16.0", "\"cx\": 16.5")).unwrap();
+    }
+    let o = tiface(dir.path(), &["mask", "runs/head"]);
+    assert!(code(&o) == 1 && err(&o).contains("the camera of view `"), "{}", err(&o));
+    assert!(err(&o).contains("more differ"), "{}", err(&o));
+    // as runs from before it was kept
+    std::fs::remove_file(dir.path().join("runs/head/mask/inputs.json")).unwrap();
+    let o = tiface(dir.path(), &["mask", "runs/head"]);
+    assert!(code(&o) == 1 && err(&o).contains("other photographs, masks or cameras\n"), "{}", err(&o));
+}
+
+#[test]
+fn settings_of_a_run_that_nothing_can_be_made_of_are_named_by_its_status() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir_all(dir.path().join("runs/a/mask")).unwrap();
+    std::fs::write(dir.path().join("runs/a/config.toml"), "seed = 7\n[iface]\nsteps = \n").unwrap();
+    for words in [&["status"][..], &["status", "runs/a"], &["status", "--json"], &["status", "--failed"]] {
+        let o = tiface(dir.path(), words);
+        assert_eq!(code(&o), 1, "{words:?}: {}{}", out(&o), err(&o));
+        assert!(out(&o).contains("a/config.toml`, line 3"), "{words:?}: {}", out(&o));
+    }
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn a_mesh_in_the_making_is_no_reason_to_make_one() {
+    let dir = tempfile::tempdir().unwrap();
+    let mesh = dir.path().join("run/mesh");
+    std::fs::create_dir_all(&mesh).unwrap();
+    std::fs::write(dir.path().join("run/config.toml"), "").unwrap();
+    let preview = || tiface(dir.path(), &["preview", "run"]);
+    assert!(code(&preview()) == 1 && err(&preview()).contains("make one: `tiface mesh run`"));
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap();
+    let (host, pid) = (host.trim(), std::process::id());
+    let status = format!(
+        r#"{{"state": "running", "step": 1, "steps": 2, "rate": null, "eta_s": null, "elapsed_s": 1, "device": "cpu",
+        "pid": {pid}, "host": "{host}", "error": null, "updated": 0,
+        "fingerprint": {{"format": 1, "settings": {{}}, "inputs": {{}}}}}}"#
+    );
+    std::fs::write(mesh.join("status.json"), status).unwrap();
+    let _held = std::fs::File::create(mesh.join(".lock")).unwrap();
+    let o = preview();
+    assert_eq!(code(&o), 75, "{}", err(&o));
+    assert!(err(&o).contains(&format!("right now, by process {pid} on {host}")), "{}", err(&o));
+    assert!(err(&o).contains("hint: wait for it"), "{}", err(&o));
+}
+
+#[test]
+fn a_demo_that_cannot_be_is_refused_before_a_photograph_is_taken() {
+    let dir = tempfile::tempdir().unwrap();
+    for (words, expected, said) in [
+        (["--size", "9x9"], 1, "9 × 9 pixels"),
+        (["--views", "2000"], 1, "1..=999 views"),
+        (["--views", "2"], 2, "`--views 2` leaves 1 to learn from"),
+        (["--border", "128"], 2, "`--border 128` leaves nothing"),
+    ] {
+        for dry in [&["--dry-run"][..], &[]] {
+            let o = tiface(dir.path(), &[&["demo"], &words[..], dry].concat());
+            assert!(code(&o) == expected && err(&o).contains(said), "{words:?}: {} {}", code(&o), err(&o));
+            assert!(!err(&o).contains("photograph"), "{}", err(&o));
+        }
+    }
+    assert!(!dir.path().join("runs").exists());
+}
+
+#[test]
+#[cfg(not(feature = "matting"))]
+fn a_network_that_this_build_cannot_run_is_refused_before_a_run_is_begun() {
+    let dir = tempfile::tempdir().unwrap();
+    small_head(dir.path());
+    std::fs::write(dir.path().join("net.onnx"), "weights").unwrap();
+    for more in [&[][..], &["--run", "named"], &["--dry-run"]] {
+        let o = tiface(dir.path(), &[&["mask", "head", "--alpha-net", "net.onnx"], more].concat());
+        assert!(code(&o) == 2 && err(&o).contains("--features matting"), "{}", err(&o));
+    }
+    assert!(!dir.path().join("runs").exists() && !dir.path().join("named").exists());
+}
+
+#[test]
+fn a_refused_command_leaves_nothing_in_somebodys_own_folder() {
+    let dir = tempfile::tempdir().unwrap();
+    small_head(dir.path());
+    std::fs::create_dir_all(dir.path().join("thesis/mask")).unwrap();
+    std::fs::write(dir.path().join("thesis/mask/costume.png"), "mine").unwrap();
+    for more in [&["--fresh", "mask"][..], &[]] {
+        let o = tiface(dir.path(), &[&["mask", "head", "--run", "thesis"], more].concat());
+        assert!(code(&o) == 1 && err(&o).contains("mask/costume.png"), "{}", err(&o));
+        let left: Vec<_> = std::fs::read_dir(dir.path().join("thesis")).unwrap().collect();
+        assert_eq!(left.len(), 1, "{left:?}");
+    }
 }

@@ -332,6 +332,16 @@ fn between(k: usize) -> ([f64; 4], DVec3) {
 }
 
 #[test]
+#[cfg(unix)]
+fn a_model_that_is_a_link_into_a_store_is_read() {
+    let (store, dir) = (capture_of(&rows()), tempfile::tempdir().unwrap());
+    for folder in ["sparse", "images"] {
+        std::os::unix::fs::symlink(store.path().join(folder), dir.path().join(folder)).unwrap();
+    }
+    assert_eq!(open(&dir).unwrap().views.len(), open(&store).unwrap().views.len());
+}
+
+#[test]
 fn rigs_and_frames_must_say_what_the_images_say() {
     let dir = capture_of(&rows());
     let (binary, frames, text, frames_text) = rigs(between);
@@ -576,6 +586,117 @@ fn every_format_is_written_and_read_again() {
         convert(&from, format, &folder, false).unwrap();
     }
     assert!(last.format.starts_with("LLFF"));
+}
+
+/// The head with one photograph under another name.
+fn renamed(head: &Capture, index: usize, name: &str, dir: &Path) -> Capture {
+    let photo = dir.join(name);
+    fs::create_dir_all(photo.parent().unwrap()).unwrap();
+    fs::copy(&head.views[index].photo, &photo).unwrap();
+    let mut capture = head.clone();
+    capture.views[index].name = Path::new(name).with_extension("").to_string_lossy().into_owned();
+    capture.views[index].photo = photo;
+    capture
+}
+
+#[test]
+fn a_held_out_name_that_a_format_cannot_carry_is_refused_not_learned() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let options = CaptureOptions::default();
+    let small = SyntheticOptions { width: 24, height: 30, train: 6, test: 2, seed: 1 };
+    write_capture(&at("head"), &small).unwrap();
+    let head = capture::open(&at("head"), &options).unwrap();
+    let held_out = head.views.iter().rposition(|v| v.split == Split::Test).unwrap();
+    let names = ["#a.png", "#d/a.png", " a.png", "a.png ", "a\nb.png", "a\rb.png", "c:a.png"];
+    for (i, name) in names.into_iter().enumerate() {
+        let from = renamed(&head, held_out, name, &at("names"));
+        let e = convert(&from, CameraFormat::Colmap, &at("c"), false).unwrap_err();
+        assert!(e.to_string().contains(name) && !at("c").exists(), "{e}");
+        let folder = at(&format!("t{i}"));
+        convert(&from, CameraFormat::Transforms, &folder, false).unwrap();
+        let again = capture::open(&folder, &options).unwrap();
+        let splits = |c: &Capture| c.views.iter().map(|v| v.split).collect::<Vec<_>>();
+        assert_eq!(splits(&again), splits(&from), "{name:?}");
+    }
+    // one that is learned from stands in the binary file alone
+    for name in ["#a.png", "a.png "] {
+        let from = renamed(&head, 0, name, &at("names"));
+        let folder = at(&format!("learned{name}"));
+        convert(&from, CameraFormat::Colmap, &folder, false).unwrap();
+        assert_eq!(capture::open(&folder, &options).unwrap().split(Split::Test).count(), 2, "{name:?}");
+    }
+    // LLFF lists its photographs by their endings
+    for name in ["z.png ", ".z.png"] {
+        let from = renamed(&head, 0, name, &at("names"));
+        let e = convert(&from, CameraFormat::Llff, &at("l"), false).unwrap_err();
+        assert!(e.to_string().contains(name) && !at("l").exists(), "{e}");
+    }
+}
+
+#[test]
+fn splits_that_only_look_like_every_eighth_survive_every_format() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let options = CaptureOptions::default();
+    let opened = |train, test| {
+        let folder = at(&format!("head {train} {test}"));
+        write_capture(&folder, &SyntheticOptions { width: 24, height: 30, train, test, seed: 1 }).unwrap();
+        capture::open(&folder, &options).unwrap()
+    };
+    // `a-1.png` comes before `a.png`, but `a` before `a-1`: readers differ on which of them is the first
+    let head = opened(4, 1);
+    let first = renamed(&head, 0, "a.png", &at("names"));
+    let mut twins = renamed(&first, 1, "a-1.png", &at("names"));
+    for split in 0..2 {
+        twins.views.iter_mut().for_each(|v| v.split = Split::Train);
+        twins.views[split].split = Split::Test;
+        twins.views.iter_mut().skip(2).for_each(|v| v.name = format!("b{}", v.name));
+        check(&twins, &at(&format!("twins {split}")));
+    }
+    // the first of three is held out, though nobody holds out any of three
+    let mut three = opened(2, 1);
+    three
+        .views
+        .iter_mut()
+        .enumerate()
+        .for_each(|(i, v)| v.split = if i == 0 { Split::Test } else { Split::Train });
+    check(&three, &at("three"));
+
+    fn check(from: &Capture, folder: &Path) {
+        for (name, format) in [("t", CameraFormat::Transforms), ("c", CameraFormat::Colmap)] {
+            let folder = folder.join(name);
+            convert(from, format, &folder, false).unwrap();
+            let again = capture::open(&folder, &CaptureOptions::default()).unwrap();
+            let held_out = |c: &Capture| c.split(Split::Test).map(|v| v.name.clone()).collect::<Vec<_>>();
+            assert_eq!(held_out(&again), held_out(from));
+        }
+    }
+}
+
+#[test]
+fn text_files_of_a_model_may_be_empty_and_binary_ones_not() {
+    let dir = capture_of(&rows());
+    let (cameras, images) = as_text("\n");
+    for name in ["cameras", "images"] {
+        fs::remove_file(dir.path().join(format!("sparse/0/{name}.bin"))).unwrap();
+    }
+    put(&dir, "sparse/0/cameras.txt", &cameras);
+    put(&dir, "sparse/0/images.txt", &images);
+    for name in ["points3D", "rigs", "frames", "test"] {
+        put(&dir, &format!("sparse/0/{name}.txt"), "");
+    }
+    // COLMAP's manual makes `points3D.txt` empty for known poses; `test.txt` then holds nothing out
+    let c = open(&dir).unwrap();
+    assert_eq!((c.split(Split::Train).count(), c.split(Split::Test).count()), (MODELS.len(), 0));
+    put(&dir, "sparse/0/images.txt", "");
+    refused(&dir, &["images.txt", "it has no images"]);
+    put(&dir, "sparse/0/images.txt", &images);
+    put(&dir, "sparse/0/cameras.txt", "");
+    refused(&dir, &["its camera 10 is not in the cameras file"]);
+    let dir = capture_of(&rows());
+    put(&dir, "sparse/0/points3D.bin", "");
+    refused(&dir, &["points3D.bin", "empty"]);
 }
 
 #[test]

@@ -138,3 +138,25 @@ fn a_finished_run_needs_its_imported_checkpoint_no_more() {
     assert!(anew.status.code() == Some(1) && text(&anew).contains("official.th"), "{}", text(&anew));
     assert!(before == files(&run), "something was removed");
 }
+
+#[test]
+fn a_product_that_was_cut_is_not_passed_over_as_done() {
+    let dir = tempfile::tempdir().unwrap();
+    finished(dir.path());
+    let run = dir.path().join("runs/head");
+    let picture = std::fs::read_dir(run.join("ensemble")).unwrap().map(|entry| entry.unwrap().path());
+    let picture = picture.filter(|path| path.extension().is_some_and(|e| e == "png")).min().unwrap();
+    let whole = std::fs::read(&picture).unwrap();
+    std::fs::write(&picture, &whole[..whole.len() / 2]).unwrap();
+    let before = files(&run);
+    let name = picture.strip_prefix(dir.path()).unwrap().display().to_string();
+    for words in [&["run", "runs/head"][..], &["run", "runs/head", "--dry-run"]] {
+        let o = tiface(dir.path(), words);
+        assert_eq!(o.status.code(), Some(1), "{}", text(&o));
+        assert!(text(&o).contains(&format!("`{name}` has {} bytes", whole.len() / 2)), "{}", text(&o));
+        assert!(text(&o).contains("`--fresh ensemble`"), "{}", text(&o));
+    }
+    assert!(before == files(&run), "a refused command has changed the run");
+    worked(&tiface(dir.path(), &["run", "runs/head", "--fresh", "ensemble"]));
+    assert!(std::fs::read(&picture).unwrap() == whole);
+}

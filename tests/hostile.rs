@@ -695,6 +695,57 @@ fn names_that_lead_out_of_the_capture_are_refused() {
 }
 
 #[test]
+#[cfg(unix)]
+fn a_capture_whose_files_are_links_into_a_store_is_read() {
+    use std::os::unix::fs::symlink;
+    let store = capture_with(sound, 5);
+    let options = CaptureOptions::default();
+    // every file a link, as git-annex, DVC and caches of data sets keep them
+    let files = tempfile::tempdir().unwrap();
+    fs::create_dir(files.path().join("images")).unwrap();
+    let names = (0..5).map(|i| format!("images/{i}.png")).chain(["transforms.json".into()]);
+    names.for_each(|name| symlink(store.path().join(&name), files.path().join(&name)).unwrap());
+    // or the folder of photographs alone
+    let folder = tempfile::tempdir().unwrap();
+    fs::copy(store.path().join("transforms.json"), folder.path().join("transforms.json")).unwrap();
+    symlink(store.path().join("images"), folder.path().join("images")).unwrap();
+    for dir in [&files, &folder] {
+        let c = open(dir).unwrap();
+        assert!(c.views.len() == 5 && c.views.iter().all(|v| v.load(&limits()).is_ok()));
+    }
+    // what a camera file names outside stays outside
+    for name in ["../secret.png", "images/../../secret.png", "/etc/passwd"] {
+        let json = sound(&[frame(0, name), frame(1, "images/1.png")]);
+        fs::write(folder.path().join("transforms.json"), json).unwrap();
+        let e = capture::open(folder.path(), &options).unwrap_err();
+        assert!(e.to_string().contains("outside the capture"), "{name}: {e}");
+    }
+}
+
+#[test]
+fn photographs_that_are_tiff_or_webp_are_named_with_the_way_out() {
+    let names =
+        [("0.tif", &b"II*\0 and more"[..], "a TIFF"), ("0.webp", b"RIFF\0\0\0\0WEBPVP8 ", "a WebP picture")];
+    for (name, bytes, what) in names {
+        // named with its ending or without, or listed in a folder
+        for named in [format!("images/{name}"), "images/0".into(), String::new()] {
+            let dir = tempfile::tempdir().unwrap();
+            fs::create_dir(dir.path().join("images")).unwrap();
+            fs::write(dir.path().join("images").join(name), bytes).unwrap();
+            if named.is_empty() {
+                fs::write(dir.path().join("poses_bounds.npy"), poses(1, 6.0, 8.0)).unwrap();
+            } else {
+                fs::write(dir.path().join("transforms.json"), sound(&[frame(0, &named)])).unwrap();
+            }
+            let found = inspect(dir.path(), &CaptureOptions::default());
+            let problem = &found.problems[0];
+            assert!(problem.what.contains(what) && problem.what.contains(name), "{named}: {found}");
+            assert!(problem.hint.contains("convert it to PNG or JPEG") && found.format.is_some(), "{found}");
+        }
+    }
+}
+
+#[test]
 fn strange_names_inside_the_capture_are_read() {
     let dir = capture_with(sound, 3);
     let long = "n".repeat(251);
@@ -794,7 +845,38 @@ fn unread(names: &[(&str, &[u8])]) -> (String, String) {
 fn formats_that_are_not_read_are_named_with_the_way_from_there() {
     let photo = png(4, 4);
     let picture = |name: &'static str| (name, &photo[..]);
-    let rows: [(&[(&str, &[u8])], &str, &str); 11] = [
+    let rows: [(&[(&str, &[u8])], &str, &str); 18] = [
+        (
+            &[picture("images/0.png"), ("MeshroomCache/", b""), ("head.mg", b"{}")],
+            "a Meshroom project (`MeshroomCache`)",
+            "`ExportColmap`",
+        ),
+        (
+            &[picture("0.png"), ("cameras.sfm", b"{}")],
+            "Meshroom project (`cameras.sfm`)",
+            "aliceVision_exportColmap",
+        ),
+        (
+            &[picture("images/0.png"), ("reconstruction.json", b"[]")],
+            "an OpenSfM project (`reconstruction.json`)",
+            "`opensfm export_colmap ROOT`",
+        ),
+        (
+            &[picture("0.png"), ("sfm_data.json", b"{}")],
+            "an OpenMVG scene",
+            "openMVG_main_openMVG2Colmap -i ROOT/sfm",
+        ),
+        (
+            &[picture("0.jpg"), ("bundle/bundle.out", b"# Bundle file v0.3")],
+            "a Bundler scene (`bundle/bundle.out`)",
+            "InterfaceVisualSFM -i ROOT/bundle/bundle.out",
+        ),
+        (&[picture("0.jpg"), ("a.nvm", b"NVM_V3")], "a VisualSFM scene (`a.nvm`)", "`sparse/0`"),
+        (
+            &[picture("images/00000000.jpg"), ("cams/00000000_cam.txt", b"extrinsic")],
+            "an MVSNet scene (`cams/00000000_cam.txt`)",
+            "InterfaceMVSNet -i ROOT",
+        ),
         (&[picture("images/0.png"), ("a.psx", b"<")], "Metashape project (`a.psx`)", "Export Cameras"),
         (&[picture("0.png"), ("a.rcproj", b"x")], "RealityCapture project (`a.rcproj`)", "as CSV"),
         (&[("calibration/camera_params.json", b"{}")], "NeRSemble", "`world_2_cam`"),
@@ -838,7 +920,9 @@ fn formats_that_are_not_read_are_named_with_the_way_from_there() {
         message.ends_with("nearest is `a.xml`, which has no `<chunk` as Metashape's cameras have"),
         "{message}"
     );
-    for format in ["Polycam", "NeRSemble", "Multiface", "FaceScape"] {
+    for format in
+        ["Meshroom", "OpenSfM", "Bundler", "NVM", "MVSNet", "Polycam", "NeRSemble", "Multiface", "FaceScape"]
+    {
         assert!(hint.contains(format), "{hint}");
     }
     for (name, words) in [

@@ -196,13 +196,42 @@ fn what_is_not_read_of_a_glb_cannot_refuse_it() {
     // an empty scene beside the one that counts; targets, weights and names of strange types
     d["scenes"] = json!([{"nodes": [0], "name": 3}, {}]);
     d["accessors"][0]["min"] = odd.clone();
-    d["meshes"][0]["weights"] = odd.clone();
+    d["meshes"][0]["weights"] = json!([odd, 0]);
     d["meshes"][0]["primitives"][0]["targets"] = odd.clone();
     d["meshes"][0]["primitives"][0]["extensions"] = odd.clone();
     d["bufferViews"][0]["target"] = odd.clone();
     d["materials"] = json!([{"alphaMode": odd, "pbrMetallicRoughness": {"baseColorFactor": odd}}]);
     assert_eq!(message(&glb(&d, &bin())), "read 4 triangles");
     assert!(message(&with("/scenes/0", json!({}))).contains("holds no triangles"));
+}
+
+#[test]
+fn a_mesh_that_skins_morphs_or_instances_move_is_refused_not_measured_elsewhere() {
+    let refusal = |node: Value, mesh: Value, targets: Value| {
+        let mut d = document();
+        d["nodes"][0].as_object_mut().unwrap().extend(node.as_object().unwrap().clone());
+        d["meshes"][0]["weights"] = mesh;
+        d["meshes"][0]["primitives"][0]["targets"] = targets;
+        message(&glb(&d, &bin()))
+    };
+    let targets = || json!([{"POSITION": 0}]);
+    for (node, mesh, targets, expected) in [
+        (json!({"skin": 0}), json!(null), json!(null), "`bad`, mesh 0: a skin is not supported"),
+        (json!({}), json!([0.5]), targets(), "mesh 0: a morph target whose weight is not 0 is not supported"),
+        (json!({"weights": [0, 1]}), json!([0, 0]), targets(), "a morph target whose weight is not 0"),
+        // a node's weights come before its mesh's
+        (json!({"weights": [0]}), json!([1]), targets(), "read 4 triangles"),
+        (json!({"weights": [1]}), json!([1]), json!(null), "read 4 triangles"),
+        (
+            json!({"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}}),
+            json!(null),
+            json!(null),
+            "mesh 0: `EXT_mesh_gpu_instancing` is not supported",
+        ),
+    ] {
+        let found = refusal(node, mesh, targets);
+        assert!(found.contains(expected), "{found}");
+    }
 }
 
 #[test]
@@ -934,7 +963,8 @@ fn a_head_far_from_the_origin_is_watertight_in_every_format() {
                 let same = |r: &CheckReport| (r.closed, r.manifold, r.welded_vertices, r.euler, r.degenerate);
                 assert_eq!(same(&r), same(&near), "{away} file {k}");
                 assert_eq!(r.self_intersections, 0, "{away} file {k}");
-                assert!((r.volume_l / near.volume_l - 1.0).abs() < 1e-3, "{away} file {k}: {}", r.volume_l);
+                let [found, expected] = [r.volume_l, near.volume_l].map(Option::unwrap);
+                assert!((found / expected - 1.0).abs() < 1e-3, "{away} file {k}: {found}");
                 for axis in 0..3 {
                     let expected = away[axis] + near.min[axis];
                     assert!((r.min[axis] - expected).abs() < 1e-5, "{away} file {k}: {:?}", r.min);

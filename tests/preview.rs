@@ -150,6 +150,32 @@ fn a_turntable_turns_and_a_sheet_has_eight_pictures() {
 }
 
 #[test]
+fn what_a_killed_turntable_left_half_written_is_removed_by_the_next() {
+    let dir = folder();
+    let frames = dir.path().join("t");
+    std::fs::create_dir(&frames).unwrap();
+    // the numbers of a process that has ended and of one that has not
+    let mut ended =
+        std::process::Command::new(env!("CARGO_BIN_EXE_tiface")).arg("--version").spawn().unwrap();
+    ended.wait().unwrap();
+    let [left, written] = [ended.id(), std::process::id()].map(|pid| format!(".0002.png.{pid}.tmp"));
+    let beside = format!(".turn.png.{}.tmp", ended.id());
+    for file in
+        [&frames.join(&left), &frames.join(&written), &dir.path().join(&beside), &dir.path().join(&left)]
+    {
+        std::fs::write(file, "half").unwrap();
+    }
+    for out in ["t/", "turn.png"] {
+        let words = ["preview", "b.ply", "--turntable", "--frames", "2", "--size", "16", "--out", out];
+        let o = tiface(dir.path(), &words);
+        assert_eq!(code(&o), 0, "{}", err(&o));
+    }
+    assert!(!frames.join(&left).exists() && !dir.path().join(beside).exists());
+    // what another process writes is its own, and what another command left beside is not this one's
+    assert!(frames.join(written).exists() && dir.path().join(left).exists());
+}
+
+#[test]
 fn what_cannot_be_shown_is_said() {
     let dir = folder();
     std::fs::create_dir(dir.path().join("empty")).unwrap();

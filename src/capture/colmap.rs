@@ -15,8 +15,8 @@ use super::frame::{CameraFrame, Listing};
 use super::masks::few;
 use super::names::{CaptureFolder, FLIP, join};
 use super::view::Split;
-use crate::Result;
 use crate::io::{self, ReadError};
+use crate::{Error, Result};
 use glam::{DMat3, DQuat, DVec3};
 use model::{CAMERA, Image, Model, Rigid};
 use std::collections::{HashMap, HashSet};
@@ -55,8 +55,12 @@ impl ModelFiles {
         let limits = &folder.options.limits;
         let bytes = |kind: &str| -> Result<Option<(PathBuf, Vec<u8>)>> {
             let name = self.name(kind);
-            match folder.file(&name, Path::new(&name))? {
-                Some(path) => Ok(Some((path.clone(), io::read_bytes(&path, limits)?))),
+            match folder.file(Path::new(&name)) {
+                Some(path) => {
+                    // a list of nothing is a count in binary, and nothing in text
+                    let read = if self.ending == "bin" { io::read_bytes } else { io::read_maybe_empty };
+                    read(&path, limits).map(|bytes| Some((path, bytes))).map_err(Error::from)
+                }
                 None => Ok(None),
             }
         };
@@ -156,11 +160,19 @@ fn other_models(root: &Path, files: &ModelFiles) -> Vec<String> {
 /// Names in `test.txt` beside the model, as 3D Gaussian splatting has them.
 fn held_out(folder: &CaptureFolder, files: &ModelFiles) -> Result<Option<HashSet<String>>> {
     let name = ModelFiles { ending: "txt", ..files.clone() }.name("test");
-    let Some(path) = folder.file(&name, Path::new(&name))? else { return Ok(None) };
-    let bytes = io::read_bytes(&path, &folder.options.limits)?;
-    let text = String::from_utf8_lossy(&bytes);
-    let names = text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#'));
-    Ok(Some(names.map(str::to_owned).collect()))
+    let Some(path) = folder.file(Path::new(&name)) else { return Ok(None) };
+    let bytes = io::read_maybe_empty(&path, &folder.options.limits)?;
+    Ok(Some(names_in(&String::from_utf8_lossy(&bytes)).map(str::to_owned).collect()))
+}
+
+fn names_in(text: &str) -> impl Iterator<Item = &str> {
+    text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#'))
+}
+
+/// Does a photograph's name come back from a model, and from `test.txt` if it is held out?
+pub(super) fn can_name(name: &str, in_test: bool) -> bool {
+    let is_relative = join("images", name).len() > name.len();
+    is_relative && (!in_test || !name.contains(char::is_control) && names_in(name).eq([name]))
 }
 
 fn frame(

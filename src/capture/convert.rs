@@ -14,6 +14,7 @@ use super::view::{Capture, Split, View, ViewMask};
 use crate::geom::Camera;
 use crate::io::{self, Limits};
 use crate::{Error, Result};
+use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::collections::{HashMap, HashSet};
@@ -59,7 +60,9 @@ pub struct Conversion {
 struct Place<'v> {
     view: &'v View,
     camera: Camera,
-    /// With its ending, `/` between, below the folder of photographs.
+    /// Without its ending, `/` between, below the folder of photographs.
+    stem: String,
+    /// With its ending.
     name: String,
     photo: String,
     mask: Option<String>,
@@ -135,9 +138,19 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -
         let message = format!("two photographs would both be called `{}`", twice[0]);
         return Err(Error::cannot(message, "rename one of them, or convert to another format"));
     }
-    // readers hold out every 8th in the order of the new names
-    let renamed: Vec<View> = places.iter().map(|p| View { name: p.name.clone(), ..p.view.clone() }).collect();
-    let named_splits = every_eighth(&renamed) != capture.views.iter().map(|v| v.split).collect::<Vec<_>>();
+    // readers hold out every 8th in the order of the new names, with their endings or without
+    let splits: Vec<Split> = capture.views.iter().map(|v| v.split).collect();
+    let named_splits = every_eighth(places.iter().map(|p| p.name.as_str())) != splits
+        || every_eighth(places.iter().map(|p| p.stem.as_str())) != splits;
+    let can_name = |p: &Place| match to {
+        CameraFormat::Transforms => true,
+        CameraFormat::Colmap => colmap::can_name(&p.name, named_splits && p.view.split != Split::Train),
+        CameraFormat::Llff => llff::is_photograph(&p.name),
+    };
+    if let Some(place) = places.iter().find(|p| !can_name(p)) {
+        let message = format!("the photograph `{}` has a name that this format cannot carry", place.name);
+        return Err(Error::cannot(message, "rename it, or choose `--to transforms`"));
+    }
     // what cannot be said is found before anything is written
     let files = match to {
         CameraFormat::Transforms => transforms(capture, &places, named_splits)?,
@@ -145,6 +158,17 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -
         CameraFormat::Llff => poses(capture, &places, named_splits, &mut out.warnings)?,
     };
     let mut contents: Vec<(PathBuf, Content)> = Vec::new();
+    // a link may name anything: only what is a picture is copied
+    capture.views.par_iter().try_for_each(|view| {
+        if view.valid.is_some() || matches!(view.mask, ViewMask::File(_)) {
+            view.load(&Limits::default())?;
+        }
+        match &view.region {
+            Some(region) => io::read_gray(region, Some(view.photo_size), &Limits::default()).map(drop),
+            None => Ok(()),
+        }
+        .map_err(Error::from)
+    })?;
     for place in &places {
         let mut put = |name: &str, content| contents.push((folder.join(name), content));
         put(&place.photo, Content::File(&place.view.photo));
@@ -164,7 +188,7 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path, link: bool) -
     // all that is there is ours, and so is what was half written
     let inside: HashSet<&Path> = contents.iter().filter_map(|(target, _)| target.parent()).collect();
     for inner in inside.into_iter().filter(|inner| io::is_folder(inner)) {
-        io::remove_leftovers(inner, None)?;
+        io::remove_leftovers(inner, |_, _| true)?;
     }
     for (target, content) in contents.iter().filter(|(target, _)| !there.contains(target)) {
         content.write(target, link)?;
@@ -217,10 +241,11 @@ fn place(view: &View, to: CameraFormat) -> Place<'_> {
         // of the photograph as it lies there: the check above has seen to that
         camera: view.camera.clone(),
         photo: format!("images/{name}"),
-        name,
         mask,
         valid: beside("valid", &view.valid),
         region: beside("face_masks", &view.region),
+        stem,
+        name,
     }
 }
 
@@ -303,10 +328,7 @@ fn sparse(
         if capture.split(Split::Val).next().is_some() {
             warnings.push("COLMAP has no validation views: they are held out with those for testing".into());
         }
-        files.push((
-            "sparse/0/test.txt".into(),
-            if names.is_empty() { b"# none\n".to_vec() } else { names.into() },
-        ));
+        files.push(("sparse/0/test.txt".into(), names.into()));
     }
     files.extend(model.into_iter().map(|(name, bytes)| (format!("sparse/0/{name}"), bytes)));
     Ok(files)

@@ -1,10 +1,13 @@
 //! What lies directly in a folder.
 
-use crate::io::{self, Limits};
+use crate::io::{self, Limits, ReadError};
 use std::path::{Path, PathBuf};
 
 /// Endings of photographs, those that are not read among them.
-pub(super) const PHOTOGRAPHS: [&str; 8] = ["jpg", "jpeg", "png", "tif", "tiff", "heic", "webp", "bmp"];
+pub(super) const PHOTOGRAPHS: [&str; 8] = ["png", "jpg", "jpeg", "tif", "tiff", "heic", "webp", "bmp"];
+
+/// How many of them, from the first, are those of files that are read.
+const READ: usize = 3;
 
 /// Where photographs lie, if not beside the cameras.
 pub(super) const IMAGE_FOLDERS: [&str; 5] = ["images", "image", "input", "rgb", "photos"];
@@ -28,9 +31,9 @@ impl FolderEntries {
         }
     }
 
-    /// The first of these files or folders that is there.
+    /// The first of these files or folders that exists, `/` between a folder and what it holds.
     pub fn any<'a>(&self, names: &[&'a str]) -> Option<&'a str> {
-        names.iter().copied().find(|n| self.files.iter().chain(&self.folders).any(|f| f == n))
+        names.iter().copied().find(|n| io::exists(&self.root.join(n)))
     }
 
     /// The first file with one of these endings.
@@ -61,6 +64,16 @@ impl FolderEntries {
             .chain(folders)
             .find(|f| FolderEntries::of(f).ending(&PHOTOGRAPHS).is_some())
     }
+}
+
+/// The photographs in a folder, in name order; only where none can be read those of other formats, to be refused by
+/// name.
+pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
+    let mut files = io::list_files(folder)?;
+    let can_be_read = files.iter().any(|f| has_ending(f, &PHOTOGRAPHS[..READ]));
+    let endings = if can_be_read { &PHOTOGRAPHS[..READ] } else { &PHOTOGRAPHS };
+    files.retain(|f| has_ending(f, endings));
+    Ok(files)
 }
 
 /// Does a name end so, in any case?

@@ -4,7 +4,7 @@ use super::entries::{FolderEntries, PHOTOGRAPHS, has_ending};
 use super::format::CameraFiles;
 use super::realitycapture;
 use crate::Error;
-use crate::io;
+use crate::config::Config;
 use std::fmt::Display;
 use std::path::Path;
 
@@ -26,6 +26,14 @@ fn nerfstudio(kind: &str, data: impl Display, more: &str) -> String {
     )
 }
 
+/// What else becomes of cameras that another program brought into COLMAP's form.
+fn through_colmap(command: &str) -> String {
+    format!(
+        "{command} writes its cameras as COLMAP's: put `cameras`, `images` and `points3D` (`.bin` or `.txt`) into \
+         `sparse/0`, the photographs beside it into `images/`"
+    )
+}
+
 fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> Error {
     Error::cannot(format_args!("`{}` is not a capture: {found}", root.display()), hint)
 }
@@ -33,6 +41,11 @@ fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> E
 /// Why a folder is no capture: what it looks like instead, and the way from there.
 pub(super) fn explain(root: &Path) -> Error {
     let found = FolderEntries::of(root);
+    if let Some(run) = Config::of_run(root).filter(|run| !run.capture.path.is_empty()) {
+        let hint =
+            format!("inspect its capture, `{}`; `tiface status` says how far the run is", run.capture.path);
+        return not_a_capture(root, "it is the folder of a run", hint);
+    }
     if let Some((inner, file)) = nested(&found) {
         let what = format!("`{file}` lies in its folder `{inner}`");
         return not_a_capture(root, what, format!("give that folder: `{}`", found.at(inner)));
@@ -43,7 +56,8 @@ pub(super) fn explain(root: &Path) -> Error {
         }
         None => {
             let nearest = nearest(&found).map_or(String::new(), |n| format!("; nearest is {n}"));
-            let others = "Polycam, NeRSemble, Multiface, FaceScape, photographs alone or a video are named with the way from there";
+            let others = "Meshroom, OpenSfM, OpenMVG, Bundler, NVM, MVSNet, Polycam, NeRSemble, Multiface, FaceScape, \
+                          photographs alone or a video are named with the way from there";
             not_a_capture(
                 root,
                 format!("it holds none of the camera files that are read: {LOOKED_FOR}{nearest}"),
@@ -113,8 +127,7 @@ fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
             "it holds K, distortion and [R|t] of each camera; take one frame of one expression of `images/`";
         return by_hand("a Multiface recording", t, moment);
     }
-    let calibration = ["calibration/camera_params.json", "camera_params.json"];
-    if let Some(t) = calibration.into_iter().find(|t| io::is_file(&found.root.join(t))) {
+    if let Some(t) = found.any(&["calibration/camera_params.json", "camera_params.json"]) {
         let moment = "it holds `world_2_cam` of each camera and one `intrinsics`; take one moment of one sequence, \
                       its `alpha_maps` are masks";
         return by_hand("a NeRSemble participant", t, moment);
@@ -135,6 +148,34 @@ fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
         let way = "export its registration as CSV (`Internal/External camera parameters`) into this folder, or its \
                    metadata as XMP beside the photographs";
         return one("a RealityCapture project", t, way.into());
+    }
+    let meshroom = found.any(&["MeshroomCache"]).or_else(|| found.ending(&["mg", "sfm"]).map(String::as_str));
+    if let Some(t) = meshroom {
+        let way = "its node `ExportColmap` (or `aliceVision_exportColmap --input cameras.sfm --output NEW`)";
+        return one("a Meshroom project", t, through_colmap(way));
+    }
+    if let Some(t) = found.any(&["reconstruction.json"]) {
+        let way = format!("`opensfm export_colmap {}`", found.root.display());
+        return one("an OpenSfM project", t, through_colmap(&way));
+    }
+    if let Some(t) = found.any(&["sfm_data.json", "sfm_data.bin"]) {
+        let way = format!("`openMVG_main_openMVG2Colmap -i {} -o NEW`", found.at(t));
+        return one("an OpenMVG scene", t, through_colmap(&way));
+    }
+    let openmvs = |import: &str, from: String| {
+        let way = format!(
+            "OpenMVS (`{import} -i {from} -o scene.mvs`, then `InterfaceCOLMAP -i scene.mvs -o NEW`)"
+        );
+        through_colmap(&way)
+    };
+    let nvm = found.ending(&["nvm"]).map(|t| ("a VisualSFM scene", t.as_str()));
+    let bundler = || found.any(&["bundle.out", "bundle/bundle.out"]).map(|t| ("a Bundler scene", t));
+    if let Some((what, t)) = nvm.or_else(bundler) {
+        return one(what, t, openmvs("InterfaceVisualSFM", found.at(t)));
+    }
+    let mvsnet = ["cams/00000000_cam.txt", "Cameras/00000000_cam.txt", "pair.txt"];
+    if let Some(t) = found.any(&mvsnet) {
+        return one("an MVSNet scene", t, openmvs("InterfaceMVSNet", found.root.display().to_string()));
     }
     let colmap =
         ["sparse", "colmap", "cameras.bin", "cameras.txt", "images.bin", "images.txt", "database.db"];

@@ -10,6 +10,8 @@ use std::path::PathBuf;
 /// Everything a format's reader found.
 #[derive(Debug)]
 pub(super) struct Listing {
+    /// The format, in words, once one was recognized.
+    pub format: Option<&'static str>,
     pub frames: Vec<CameraFrame>,
     /// What the format was recognized by, and what else was found.
     pub reasons: Vec<String>,
@@ -30,6 +32,7 @@ pub(super) struct Listing {
 impl Default for Listing {
     fn default() -> Listing {
         Listing {
+            format: None,
             frames: Vec::new(),
             reasons: Vec::new(),
             warnings: Vec::new(),

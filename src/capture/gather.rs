@@ -34,6 +34,7 @@ pub(super) fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>,
     let mut listing = Listing::default();
     let capture = open_folder(root, options).map(|(folder, files)| {
         let (format, reason) = files.describe();
+        listing.format = Some(format);
         listing.reasons.push(reason);
         files.list(&folder, &mut listing);
         build(&folder, format, &mut listing)
@@ -55,8 +56,11 @@ fn open_folder<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<(Captu
     }
     if io::is_file(root) {
         return Err(foreign::explain_file(root));
+    } else if !io::exists(root) {
+        let hint = "check the path: a capture is a folder of photographs and cameras";
+        return Err(Error::cannot(format_args!("`{}` does not exist", root.display()), hint));
     } else if !io::is_folder(root) {
-        io::read_bytes(root, &options.limits)?; // names what it is instead, or that it is not there
+        io::read_bytes(root, &options.limits)?; // names what it is instead
     }
     let files = CameraFiles::find(root).ok_or_else(|| foreign::explain(root))?;
     Ok((CaptureFolder::new(root, options)?, files))
@@ -195,17 +199,20 @@ fn name_splits(views: &mut [View], kept: &[(CameraFrame, PictureInfo)], listing:
         listing.warnings.push(format!("all {} views are trained on, none is held out", views.len()));
         return;
     }
-    let splits = every_eighth(views);
+    let splits = every_eighth(views.iter().map(|v| v.name.as_str()));
     views.iter_mut().zip(splits).for_each(|(view, split)| view.split = split);
     listing.reasons.push("no splits are named: every 8th view in name order is held out for testing".into());
 }
 
-/// The splits of a capture that names none: every 8th view in name order, starting with the first, is held out.
-pub(super) fn every_eighth(views: &[View]) -> Vec<Split> {
-    let mut order: Vec<usize> = (0..views.len()).collect();
-    order.sort_by(|&a, &b| views[a].name.cmp(&views[b].name));
-    let mut splits = vec![Split::Train; views.len()];
-    order.into_iter().step_by(8).for_each(|i| splits[i] = Split::Test);
+/// The splits of a capture that names none: every 8th view in name order, starting with the first, is held out, but none
+/// of fewer than four.
+pub(super) fn every_eighth<'n>(names: impl Iterator<Item = &'n str>) -> Vec<Split> {
+    let mut order: Vec<(&str, usize)> = names.zip(0..).collect();
+    order.sort_unstable();
+    let mut splits = vec![Split::Train; order.len()];
+    if order.len() >= 4 {
+        order.into_iter().step_by(8).for_each(|(_, i)| splits[i] = Split::Test);
+    }
     splits
 }
 

@@ -26,8 +26,23 @@ pub struct Problem {
     pub count: usize,
 }
 
+impl fmt::Display for Problem {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        if self.count > 1 {
+            write!(f, "{} times, the first: ", self.count)?;
+        }
+        f.write_str(&self.what)
+    }
+}
+
+impl From<&Problem> for Error {
+    fn from(problem: &Problem) -> Error {
+        Error::cannot(problem, &problem.hint)
+    }
+}
+
 /// One entry for all that have the same problem but for the frame or picture, and the numbers in it.
-fn grouped(all: &[Error]) -> Vec<Problem> {
+pub fn grouped(all: &[Error]) -> Vec<Problem> {
     let mut problems: Vec<Problem> = Vec::new();
     let mut first: HashMap<(String, String), usize> = HashMap::new();
     for error in all {
@@ -41,13 +56,13 @@ fn grouped(all: &[Error]) -> Vec<Problem> {
     problems
 }
 
-/// A message without its digits and what it quotes as the name of a frame or of a file that is no camera file.
+/// A message without its digits and what it quotes as the name of a frame, a view or a file that is no camera file.
 fn without_names(message: &str) -> String {
     let mut before = "";
     let mut rest = String::new();
     for (i, part) in message.split('`').enumerate() {
         let is_file = part.contains(['.', '/', '\\']) && !part.ends_with(".json") && !part.ends_with(".npy");
-        let is_name = i % 2 == 1 && (before.ends_with("frame ") || is_file);
+        let is_name = i % 2 == 1 && (before.ends_with("frame ") || before.ends_with("view ") || is_file);
         if !is_name {
             rest.extend(part.chars().filter(|c| !c.is_ascii_digit()));
         }
@@ -80,7 +95,7 @@ impl Range {
 pub struct Inspection {
     /// The folder.
     pub root: PathBuf,
-    /// The format, if one was recognized and something can be used.
+    /// The format, if one was recognized.
     pub format: Option<String>,
     /// Why, and what else lies there.
     pub reasons: Vec<String>,
@@ -112,6 +127,8 @@ pub struct Inspection {
     pub regions: usize,
     /// How well two pose files agree.
     pub poses: Vec<Agreement>,
+    /// How high the head is, metres, where masks say it.
+    pub height_m: Option<f64>,
     /// The head's box in the world.
     pub scene: Option<Aabb>,
     /// The same in words.
@@ -127,6 +144,16 @@ impl Inspection {
     pub fn is_sound(&self) -> bool {
         self.problems.is_empty() && self.format.is_some()
     }
+
+    /// Adds masks that cannot be right: problems, or warnings where masks are trusted all the same.
+    pub fn add_refused_masks(&mut self, refused: &[Error], options: &CaptureOptions) {
+        let found = grouped(refused);
+        if options.trust_masks {
+            self.warnings.extend(found.iter().map(Problem::to_string));
+        } else {
+            self.problems.extend(found);
+        }
+    }
 }
 
 /// Reads everything in a capture, every photograph to its last pixel, and reports; never fails itself.
@@ -134,12 +161,13 @@ pub fn inspect(root: &Path, options: &CaptureOptions) -> Inspection {
     let (capture, listing) = gather(root, options);
     let mut out = Inspection {
         root: root.into(),
+        format: listing.format.map(str::to_owned),
+        reasons: listing.reasons,
         poses: listing.agreements,
         problems: grouped(&listing.problems),
         ..Inspection::default()
     };
     let Some(capture) = capture else { return out };
-    out.format = Some(capture.format.clone());
     out.reasons = capture.reasons.clone();
     out.warnings = capture.warnings.clone();
     out.up = Some(capture.up);
@@ -187,23 +215,27 @@ fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> 
         .par_iter()
         .map(|view| {
             let loaded = view.load(&options.limits)?;
+            let refused =
+                loaded.mask.as_ref().and_then(|m| masks::refuse(&view.name, &loaded.photo, m).err());
             let mask = match (loaded.mask, &view.mask) {
                 (None, ViewMask::None) => None,
                 (None, _) => view.load_mask(&options.limits)?, // "not looked at": judged all the same
                 (mask, _) => mask,
             };
-            let judged = mask.as_ref().map(|m| (masks::findings(m), masks::coverage(m)));
+            let judged = mask.as_ref().map(|m| (refused, masks::findings(m), masks::coverage(m)));
             Ok((mask, judged, loaded.valid.as_ref().map(masks::coverage)))
         })
         .collect();
     let mut kinds: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
-    let mut unreadable = Vec::new();
+    let (mut unreadable, mut all_refused) = (Vec::new(), Vec::new());
     let (mut all, mut covered, mut usable) = (Vec::new(), Vec::new(), Vec::new());
     for (view, loaded) in capture.views.iter().zip(loaded) {
         match loaded {
             Ok((mask, judged, valid)) => {
-                if let Some((findings, coverage)) = judged {
-                    findings.into_iter().for_each(|f| kinds.entry(f).or_default().push(&view.name));
+                if let Some((refused, findings, coverage)) = judged {
+                    let findings = findings.into_iter().filter(|_| refused.is_none());
+                    findings.for_each(|f| kinds.entry(f).or_default().push(&view.name));
+                    all_refused.extend(refused);
                     covered.push(coverage);
                 }
                 usable.extend(valid);
@@ -216,6 +248,7 @@ fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> 
         }
     }
     out.problems.extend(grouped(&unreadable));
+    out.add_refused_masks(&all_refused, options);
     for (finding, views) in kinds {
         let (n, list) = (views.len(), few(views));
         out.warnings.push(format!("the mask {finding} in {n} views: {list}"));
@@ -241,6 +274,10 @@ fn place(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
             let middle = b.center().as_dvec3();
             let distance = |c: DVec3| c.distance(middle);
             out.distance = Range::of(capture.views.iter().map(|v| distance(v.camera.position)));
+            if let Some(height) = scene::height(&scene, capture.up) {
+                out.height_m = Some(height * capture.unit_m);
+                out.warnings.extend(scene::doubtful_height(height, capture.unit_m));
+            }
             out.scene_text = Some(scene::describe(&scene));
             out.scene = Some(b);
             out.warnings.extend(warnings);
@@ -252,11 +289,13 @@ fn place(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
 impl fmt::Display for Inspection {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         writeln!(f, "{}", self.root.display())?;
-        writeln!(f, "  format    {}", self.format.as_deref().unwrap_or("not recognized"))?;
+        if let Some(format) = &self.format {
+            writeln!(f, "  format    {format}")?;
+        }
         for reason in &self.reasons {
             writeln!(f, "            {reason}")?;
         }
-        if self.format.is_some() {
+        if !self.sizes.is_empty() {
             writeln!(f, "  views     {} train, {} val, {} test", self.train, self.val, self.test)?;
             for ((w, h), n) in &self.sizes {
                 writeln!(f, "            {n} of {w} × {h} pixels")?;
@@ -277,7 +316,7 @@ impl fmt::Display for Inspection {
             let n = self.masks;
             write!(f, "  masks     {n} views; they cover {min:.1} % to {max:.1} % of the picture, ")?;
             writeln!(f, "in the middle {median:.1} %")?;
-        } else if self.format.is_some() {
+        } else if !self.sizes.is_empty() {
             writeln!(f, "  masks     none")?;
         }
         if let Some([min, max, _]) = self.valid_share.map(percent) {
@@ -287,12 +326,14 @@ impl fmt::Display for Inspection {
         if let Some(text) = &self.scene_text {
             writeln!(f, "  head      {text}")?;
         }
+        if let Some(height) = self.height_m {
+            writeln!(f, "            {height:.3} m high")?;
+        }
         for warning in &self.warnings {
             writeln!(f, "  warning   {warning}")?;
         }
-        for Problem { what, hint, count } in &self.problems {
-            let times = if *count > 1 { format!("{count} times, the first: ") } else { String::new() };
-            writeln!(f, "  problem   {times}{what}\n            hint: {hint}")?;
+        for problem in &self.problems {
+            writeln!(f, "  problem   {problem}\n            hint: {}", problem.hint)?;
         }
         if self.is_sound() {
             writeln!(f, "  sound     nothing stands in the way")?;

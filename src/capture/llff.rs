@@ -5,6 +5,7 @@
 //! (column 1, −column 0, column 2). The published loader divides positions by 0.3; here the world stays
 //! as the dataset has it.
 
+use super::entries::{self, has_ending};
 use super::error::{in_file, in_frame};
 use super::frame::{Agreement, CameraFrame, Intrinsics, Listing};
 use super::names::CaptureFolder;
@@ -33,7 +34,7 @@ struct PoseRow {
 fn read(folder: &CaptureFolder, file: &str) -> Result<Vec<PoseRow>> {
     let limits = &folder.options.limits;
     let problem = |text: String| in_file(file, text, "an LLFF file has one row of 17 numbers per photograph");
-    let npy = io::read_npy(&folder.camera_file(file)?, limits)?;
+    let npy = io::read_npy(&folder.root.join(file), limits)?;
     let (NpyValues::Number(values), [rows, 17]) = (&npy.values, &npy.shape[..]) else {
         return Err(problem(format!("its shape is {:?}, not (photographs, 17)", npy.shape)));
     };
@@ -237,12 +238,14 @@ fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String
     let Some(name) = names.into_iter().find(|n| io::is_folder(&folder.root.join(n))) else {
         return Ok(None);
     };
-    let mut files = io::list_files(&folder.root.join(&name))?;
-    files.retain(|n| {
-        let ending = n.rsplit_once('.').map_or("", |(_, e)| e).to_ascii_lowercase();
-        matches!(ending.as_str(), "png" | "jpg" | "jpeg")
-    });
-    Ok(Some(files.into_iter().map(|n| format!("{name}/{n}")).collect()))
+    Ok(Some(
+        entries::photographs(&folder.root.join(&name))?.into_iter().map(|n| format!("{name}/{n}")).collect(),
+    ))
+}
+
+/// Is a file of this name, in the folder of photographs, one of those that rows are paired with?
+pub(super) fn is_photograph(name: &str) -> bool {
+    !name.starts_with('.') && has_ending(name, &["png", "jpg", "jpeg"])
 }
 
 /// An LLFF file of cameras with one focal length each, and near and far.

@@ -4,10 +4,13 @@ use super::frame::{CameraFrame, Listing};
 use super::names::CaptureFolder;
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{MaskMeaning, MaskSource};
-use crate::image::Gray;
+use crate::image::{Gray, Photo};
 use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
+
+/// The brightest value of a pixel that counts as black.
+const BLACK: u8 = 16;
 
 /// Names for a message: at most six, then how many more.
 pub(super) fn few(names: impl IntoIterator<Item = impl AsRef<str>>) -> String {
@@ -28,8 +31,8 @@ pub(super) fn choose(
 ) -> Result<()> {
     let root = Path::new("");
     let beside = [common.parent().unwrap_or(root), root];
-    let files = |bases: &[&Path], names: &dyn Fn(&View) -> Vec<String>| -> Result<Vec<ViewMask>> {
-        views.iter().map(|v| Ok(first_of(folder, bases, &names(v))?.into())).collect()
+    let files = |bases: &[&Path], names: &dyn Fn(&View) -> Vec<String>| -> Vec<ViewMask> {
+        views.iter().map(|v| first_of(folder, bases, &names(v)).into()).collect()
     };
     let alpha = |listing: &mut Listing| -> Result<(String, Vec<ViewMask>)> {
         let is_mask = kept.iter().any(|(_, info)| info.alpha)
@@ -50,19 +53,19 @@ pub(super) fn choose(
                 [format!("{stem}.png"), full_name(v) + ".png", format!("{stem}.jpg"), format!("{stem}.jpeg")]
                     .into()
             };
-            vec![(format!("`{mask_dir}/`"), files(&[&inside], &names)?)]
+            vec![(format!("`{mask_dir}/`"), files(&[&inside], &names))]
         }
         _ => {
             let named = kept.iter().map(|(f, _)| f.mask.clone().into()).collect();
-            let in_folder = |text: &str, name: &dyn Fn(&View) -> String| -> Result<_> {
-                Ok((format!("`{text}`"), files(&beside, &|v| vec![name(v)])?))
+            let in_folder = |text: &str, name: &dyn Fn(&View) -> String| {
+                (format!("`{text}`"), files(&beside, &|v| vec![name(v)]))
             };
             vec![
                 alpha(listing)?,
                 (listing.masks_named.into(), named),
-                in_folder("vit_mask/NAME.png", &|v| format!("vit_mask/{}.png", v.name))?,
-                in_folder("masks/NAME.png", &|v| format!("masks/{}.png", v.name))?,
-                in_folder("masks/NAME.jpg.png", &|v| format!("masks/{}.png", full_name(v)))?,
+                in_folder("vit_mask/NAME.png", &|v| format!("vit_mask/{}.png", v.name)),
+                in_folder("masks/NAME.png", &|v| format!("masks/{}.png", v.name)),
+                in_folder("masks/NAME.jpg.png", &|v| format!("masks/{}.png", full_name(v))),
             ]
         }
     };
@@ -98,10 +101,10 @@ pub(super) fn choose(
     let (mut valid, mut region) = (0, 0);
     for (view, (frame, _)) in views.iter_mut().zip(kept) {
         let name = &view.name;
-        view.valid = first_of(folder, &beside, &[format!("masks/{name}.npy"), format!("valid/{name}.npy")])?;
+        view.valid = first_of(folder, &beside, &[format!("masks/{name}.npy"), format!("valid/{name}.npy")]);
         view.region = match &frame.region {
             Some(path) => Some(path.clone()),
-            None => first_of(folder, &beside, &[format!("face_masks/{name}.png")])?,
+            None => first_of(folder, &beside, &[format!("face_masks/{name}.png")]),
         };
         valid += view.valid.is_some() as usize;
         region += view.region.is_some() as usize;
@@ -155,13 +158,8 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> 
 }
 
 /// The first of these files that is there, below the first base with any.
-fn first_of(folder: &CaptureFolder, bases: &[&Path], names: &[String]) -> Result<Option<PathBuf>> {
-    for path in bases.iter().flat_map(|base| names.iter().map(move |name| base.join(name))) {
-        if let Some(file) = folder.file("masks", &path)? {
-            return Ok(Some(file));
-        }
-    }
-    Ok(None)
+fn first_of(folder: &CaptureFolder, bases: &[&Path], names: &[String]) -> Option<PathBuf> {
+    bases.iter().flat_map(|base| names.iter().map(move |name| base.join(name))).find_map(|p| folder.file(&p))
 }
 
 /// A view's name with its photograph's ending.
@@ -194,8 +192,30 @@ pub fn coverage(mask: &Gray) -> f64 {
     sum as f64 / (255.0 * mask.values.len().max(1) as f64)
 }
 
+/// What to do about a mask that cannot be right.
+pub const MASK_HINT: &str = "correct masks, photograph or camera, or remove the frame; a run that had begun then goes on with \
+                             `--fresh mask`. `--set mask.trust=true` goes on with the masks as they are";
+
+/// The finding of a mask that keeps what it should leave out.
+const INVERTED: &str = "looks inverted: white must keep the head";
+
+/// Refuses a view whose mask cannot be right, whatever the other views show: it is inverted, or the photograph is black
+/// where it shows the head.
+pub fn refuse(view: &str, photo: &Photo, mask: &Gray) -> Result<()> {
+    let head = || photo.rgb.iter().zip(&mask.values).filter(|(_, m)| **m > 127).map(|(rgb, _)| rgb);
+    let (all, lit) = (head().count(), head().filter(|rgb| rgb.iter().any(|&v| v > BLACK)).count());
+    let problem = if findings(mask).contains(&INVERTED) {
+        format!("the mask of view `{view}` {INVERTED}")
+    } else if 100 * lit < all {
+        format!("the photograph of view `{view}` is black where its mask shows the head")
+    } else {
+        return Ok(());
+    };
+    Err(Error::cannot(problem, MASK_HINT))
+}
+
 /// What makes a mask suspicious as the mask of a head: empty, all white, probably inverted, touching
-/// three borders or more. A person should look; nothing is refused.
+/// three borders or more. A person should look; [`refuse`] says what is refused.
 pub fn findings(mask: &Gray) -> Vec<&'static str> {
     let (w, h) = (mask.width as usize, mask.height as usize);
     let brightest = mask.values.iter().copied().max().unwrap_or(0);
@@ -218,15 +238,15 @@ pub fn findings(mask: &Gray) -> Vec<&'static str> {
         let sum: u64 = rows.flat_map(|row| &row[x0..x1]).map(|&v| v as u64).sum();
         sum as f64 / (255 * ((x1 - x0) * (y1 - y0)).max(1)) as f64
     };
-    let (top, bottom, left, right) =
-        (mean(0, w, 0, 1), mean(0, w, h - 1, h), mean(0, 1, 0, h), mean(w - 1, w, 0, h));
+    let (top, bottom) = (mean(0, w, 0, 1), mean(0, w, h - 1, h));
     // shoulders may leave through the lower part of the sides
     let upper = 3 * h / 5;
     let (high_left, high_right) = (mean(0, 1, 0, upper), mean(w - 1, w, 0, upper));
     let middle = mean(w / 3, w - w / 3, h / 3, h - h / 3);
     let mut found = Vec::new();
-    if (top + bottom + left + right) / 4.0 > 0.75 && middle < 0.5 {
-        found.push("looks inverted: white must keep the head");
+    // shoulders may fill the bottom in either case
+    if (top + high_left + high_right) / 3.0 > 0.75 && middle < 0.5 {
+        found.push(INVERTED);
     } else if [top, bottom, high_left, high_right].iter().filter(|&&b| b > 0.02).count() >= 3 {
         found.push("touches three borders or more");
     }
@@ -254,6 +274,29 @@ mod tests {
         assert!(findings(&disc(0, 255, (20.0, 15.0)))[0].contains("inverted"));
         // area π·10² of 1200 pixels
         assert!((coverage(&disc(255, 0, (20.0, 15.0))) - 0.2618).abs() < 0.01);
+    }
+
+    #[test]
+    fn inverted_masks_of_busts_and_black_photographs_are_refused() {
+        // a head on shoulders that fill the lower third from side to side
+        let bust = |inside: u8, outside: u8| {
+            let head = disc(inside, outside, (20.0, 12.0));
+            let values = head.values.iter().enumerate().map(|(i, &v)| if i / 40 >= 20 { inside } else { v });
+            Gray { values: values.collect(), ..head }
+        };
+        let photo = |v: u8| Photo { width: 40, height: 30, rgb: vec![[v; 3]; 1200], alpha: None };
+        assert!(refuse("a", &photo(99), &bust(255, 0)).is_ok());
+        let message = |photo: &Photo, mask: &Gray| refuse("a", photo, mask).unwrap_err().to_string();
+        assert!(message(&photo(99), &bust(0, 255)).contains("`a` looks inverted"));
+        assert_eq!(
+            message(&photo(9), &bust(255, 0)),
+            "the photograph of view `a` is black where its mask shows the head"
+        );
+        // a black background is none of it, nor is a mask without a head
+        let mut lit = photo(0);
+        lit.rgb[12 * 40 + 20..][..8].fill([60; 3]);
+        assert!(refuse("a", &lit, &disc(255, 0, (20.0, 15.0))).is_ok());
+        assert!(refuse("a", &photo(0), &disc(0, 0, (20.0, 15.0))).is_ok());
     }
 
     #[test]

@@ -26,7 +26,7 @@ const SKEW_PX: f64 = 0.1;
 
 /// Lists the cameras that were aligned.
 pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
-    let path = folder.camera_file(file)?;
+    let path = folder.root.join(file);
     let bytes = io::read_bytes(&path, &folder.options.limits)?;
     let text = String::from_utf8(bytes).map_err(|e| {
         ReadError::damaged(&path, "XML", e.utf8_error().valid_up_to() as u64, "it is not UTF-8")

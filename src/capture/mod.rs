@@ -49,6 +49,6 @@ mod well_seen;
 pub use crate::config::{MaskMeaning, MaskSource};
 pub use gather::{has_cameras, open};
 pub use load::LoadedView;
-pub use masks::{coverage, findings, require_masks};
+pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
 pub use view::{Capture, CaptureOptions, Split, View, ViewMask};
 pub use well_seen::well_seen;

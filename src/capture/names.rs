@@ -8,8 +8,12 @@ use crate::{Result, io};
 use glam::DMat3;
 use std::path::{Component, Path, PathBuf};
 
-/// What may be missing at the end of a photograph's name.
-const ENDINGS: [&str; 7] = ["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"];
+/// What may be missing at the end of a photograph's name: endings of files that are read, and of those that are found to
+/// be refused by name.
+const ENDINGS: [&[&str]; 2] = [
+    &["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"],
+    &[".tif", ".tiff", ".webp", ".heic", ".TIF", ".TIFF"],
+];
 
 /// OpenCV's camera axes to ours: right, down, ahead to right, up, back.
 pub(super) const FLIP: DMat3 = DMat3::from_cols_array(&[1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0]);
@@ -68,21 +72,10 @@ impl CaptureFolder<'_> {
         Ok(relative)
     }
 
-    /// The regular file at a relative path, if there is one; a link that leads out is an error.
-    pub fn file(&self, file: &str, relative: &Path) -> Result<Option<PathBuf>> {
-        let path = self.root.join(relative);
-        if !io::is_file(&path) {
-            return Ok(None);
-        }
-        if !io::real_path(&path)?.starts_with(&self.real) {
-            return Err(outside(file, &relative.to_string_lossy()));
-        }
-        Ok(Some(path))
-    }
-
-    /// A camera file directly in the capture.
-    pub fn camera_file(&self, file: &str) -> Result<PathBuf> {
-        self.file(file, Path::new(file))?.ok_or_else(|| outside(file, file))
+    /// The regular file at a relative path, if it exists. Links are followed: data sets are kept as links into a store,
+    /// and the paths that [`CaptureFolder::relative`] returns cannot climb out of the capture.
+    pub fn file(&self, relative: &Path) -> Option<PathBuf> {
+        Some(self.root.join(relative)).filter(|path| io::is_file(path))
     }
 
     /// The folder that photographs' names start from, where the format does not say: the one that has most of the
@@ -102,8 +95,7 @@ impl CaptureFolder<'_> {
         let stem =
             if has_ending(name, &PHOTOGRAPHS) { Path::new(name).with_extension("") } else { name.into() };
         for name in [format!("masks/{name}.png"), format!("masks/{}.png", stem.to_string_lossy())] {
-            let relative = self.relative(file, &name)?;
-            if let Some(path) = self.file(file, &relative)? {
+            if let Some(path) = self.file(&self.relative(file, &name)?) {
                 return Ok(Some(path));
             }
         }
@@ -125,13 +117,12 @@ impl CaptureFolder<'_> {
             let reduced = [format!("{first}_{downscale}"), format!("{first}_{downscale}x")];
             candidates.extend(reduced.map(|folder| Path::new(&folder).join(parts.as_path())));
         }
-        for candidate in candidates {
-            for ending in ENDINGS {
-                let mut with = candidate.clone().into_os_string();
-                with.push(ending);
-                if let Some(path) = self.file(file, Path::new(&with))? {
-                    return Ok((with.into(), Some(path)));
-                }
+        let all = ENDINGS.iter().flat_map(|endings| candidates.iter().map(move |c| (c, endings)));
+        for (candidate, ending) in all.flat_map(|(c, endings)| endings.iter().map(move |e| (c, e))) {
+            let mut with = candidate.clone().into_os_string();
+            with.push(ending);
+            if let Some(path) = self.file(Path::new(&with)) {
+                return Ok((with.into(), Some(path)));
             }
         }
         Ok((wanted, None))
@@ -190,12 +181,21 @@ mod tests {
 
     #[test]
     #[cfg(unix)]
-    fn a_link_that_leads_out_is_not_followed() {
+    fn a_link_is_followed_and_a_name_that_climbs_out_beside_it_is_not() {
         let (dir, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        std::fs::write(other.path().join("a.png"), b"x").unwrap();
-        std::os::unix::fs::symlink(other.path().join("a.png"), dir.path().join("a.png")).unwrap();
+        std::fs::create_dir(other.path().join("store")).unwrap();
+        for name in ["store/a.png", "b.png"] {
+            std::fs::write(other.path().join(name), b"x").unwrap();
+        }
+        std::os::unix::fs::symlink(other.path().join("store"), dir.path().join("images")).unwrap();
         let options = CaptureOptions::default();
         let folder = CaptureFolder::new(dir.path(), &options).unwrap();
-        assert!(folder.photo("t.json", "a.png").unwrap_err().to_string().contains("outside the capture"));
+        let (relative, photo) = folder.photo("t.json", "images/a.png").unwrap();
+        assert_eq!(
+            (relative.as_path(), photo),
+            (Path::new("images/a.png"), Some(dir.path().join("images/a.png")))
+        );
+        // `images/..` is the capture, wherever the link leads
+        assert_eq!(folder.photo("t.json", "images/../b.png").unwrap().1, None);
     }
 }

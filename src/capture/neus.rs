@@ -5,6 +5,7 @@
 //! dataset's own do. NeuS sends its rays through whole numbers as the centers of pixels, so principal points move
 //! by half a pixel (NeuS, `models/dataset.py`, `gen_rays_at`).
 
+use super::entries;
 use super::error::{in_file, in_frame};
 use super::frame::{CameraFrame, Intrinsics, Listing};
 use super::names::{CaptureFolder, FLIP};
@@ -13,6 +14,7 @@ use crate::geom::Aabb;
 use crate::io::{self, Npy, NpyValues};
 use glam::{DMat3, DVec3};
 use std::collections::BTreeMap;
+use std::path::Path;
 
 /// Files of this format, in this order.
 pub(super) const FILES: [&str; 2] = ["cameras_sphere.npz", "cameras.npz"];
@@ -22,7 +24,7 @@ const SKEW: f64 = 1e-3;
 
 /// Lists one frame for each photograph.
 pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
-    let arrays = io::read_npz(&folder.camera_file(file)?, &folder.options.limits)?;
+    let arrays = io::read_npz(&folder.root.join(file), &folder.options.limits)?;
     let photos = pictures(folder, &["image", "images", "rgb"])?;
     let masks = pictures(folder, &["mask", "masks"])?;
     let known = (0..).take_while(|i| arrays.contains_key(&format!("world_mat_{i}"))).count();
@@ -40,7 +42,7 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
         let (intrinsics, rotation, position) = camera;
         let (relative, photo) = folder.photo(file, name)?;
         // masks have names of their own: they are paired in order, as NeuS does
-        let mask = (masks.len() == photos.len()).then(|| folder.file(file, masks[i].as_ref())).transpose()?;
+        let mask = masks.get(i).filter(|_| masks.len() == photos.len());
         listing.frames.push(CameraFrame {
             file: file.into(),
             name: name.clone(),
@@ -50,7 +52,7 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
             intrinsics,
             rotation,
             position,
-            mask: mask.flatten(),
+            mask: mask.and_then(|mask| folder.file(Path::new(mask))),
             region: None,
         });
     }
@@ -77,9 +79,7 @@ fn pictures(folder: &CaptureFolder, names: &[&str]) -> Result<Vec<String>> {
     let Some(name) = names.iter().find(|n| io::is_folder(&folder.root.join(n))) else {
         return Ok(Vec::new());
     };
-    let mut files = io::list_files(&folder.root.join(name))?;
-    files.retain(|f| super::entries::has_ending(f, &["png", "jpg", "jpeg"]));
-    Ok(files.into_iter().map(|f| format!("{name}/{f}")).collect())
+    Ok(entries::photographs(&folder.root.join(name))?.into_iter().map(|f| format!("{name}/{f}")).collect())
 }
 
 /// The upper three rows of a 4×4 or 3×4 array, finite.

@@ -41,7 +41,7 @@ struct Entry {
 
 /// Lists the cameras of a CSV file.
 pub(super) fn list_csv(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
-    let bytes = io::read_bytes(&folder.camera_file(file)?, &folder.options.limits)?;
+    let bytes = io::read_bytes(&folder.root.join(file), &folder.options.limits)?;
     let hint = "export the registration again, `Internal/External camera parameters`";
     let wrong = |line: usize, text: String| in_file(file, format_args!("line {line}: {text}"), hint);
     let text = String::from_utf8_lossy(&bytes);
@@ -150,7 +150,7 @@ pub(super) fn list_xmp(folder: &CaptureFolder, inside: &Path, listing: &mut List
 
 /// The camera in an XMP file; `None` where it has no pose.
 fn read_xmp(folder: &CaptureFolder, file: &str, name: &str) -> Result<Option<Entry>> {
-    let Some(path) = folder.file(file, Path::new(file))? else { return Ok(None) };
+    let Some(path) = folder.file(Path::new(file)) else { return Ok(None) };
     let bytes = io::read_bytes(&path, &folder.options.limits)?;
     let text = String::from_utf8_lossy(&bytes);
     let options = ParsingOptions { allow_dtd: false, nodes_limit: 10_000, ..ParsingOptions::default() };

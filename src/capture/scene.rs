@@ -380,6 +380,35 @@ fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Scene> {
     })
 }
 
+/// Heights of what is taken for a head, metres: with or without neck and shoulders, of a child or an adult.
+const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.15..=0.6;
+
+/// Returns how high the hull is along `up`, in dataset units; `None` without a hull, since nothing then says where the
+/// head ends.
+pub fn height(scene: &Scene, up: Vec3) -> Option<f64> {
+    let hull = scene.hull.as_ref()?;
+    let r = hull.resolution;
+    let cells = (0..r.pow(3)).filter(|&i| hull.get(i));
+    let along = cells.map(|i| Vec3::new((i / (r * r)) as f32, (i / r % r) as f32, (i % r) as f32).dot(up));
+    let (low, high) = along.fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
+    let cell = 2.0 / (r as f64 * scene.scene_from_world.scale);
+    (low <= high).then(|| f64::from(high - low + 1.0) * cell)
+}
+
+/// Returns a sentence if no head is so high, because a unit of the dataset is not what `capture.unit_m` says.
+pub fn doubtful_height(height: f64, unit_m: f64) -> Option<String> {
+    let height_m = height * unit_m;
+    (!HEIGHTS_M.contains(&height_m)).then(|| {
+        format!(
+            "the head is {height_m:.3} m high if a unit of the dataset is {unit_m} m, and a head is {} to {} m high: give \
+             the unit's length in metres, `--set capture.unit_m=METRES` (with {:.3} this head is 0.3 m high)",
+            HEIGHTS_M.start(),
+            HEIGHTS_M.end(),
+            0.3 / height
+        )
+    })
+}
+
 /// The box in world coordinates.
 pub fn world_box(scene: &Scene) -> Aabb {
     let world_from_scene = scene.scene_from_world.inverse();
@@ -510,6 +539,23 @@ mod tests {
         assert!(size.max_element() < 1.05 && size.min_element() > 0.8, "{size}");
         let longest = scene.aabb.size().max_element();
         assert!(longest > 1.8 && longest <= 2.0, "{longest}");
+    }
+
+    #[test]
+    fn a_ball_is_as_high_as_it_is_wide_and_one_of_six_metres_is_doubted() {
+        let cameras = ring(12);
+        let masks: Vec<_> = cameras.iter().map(ball).collect();
+        let (scene, _) = fit(&cameras, &masks, &small()).unwrap();
+        for up in [Vec3::Z, Vec3::X, Vec3::new(0.6, 0.0, 0.8)] {
+            let height = height(&scene, up).unwrap();
+            assert!(height > 2.0 * RADIUS && height < 2.4 * RADIUS, "{up}: {height}");
+        }
+        assert_eq!((doubtful_height(0.8, 0.4), doubtful_height(0.8, 0.5)), (None, None));
+        let text = doubtful_height(6.0, 1.0).unwrap();
+        assert!(text.contains("6.000 m high") && text.contains("with 0.050 this head is 0.3 m"), "{text}");
+        assert!(doubtful_height(0.3, 0.001).is_some());
+        let (bare, _) = fit(&cameras, &[const { None }; 12], &small()).unwrap();
+        assert_eq!(super::height(&bare, Vec3::Z), None);
     }
 
     #[test]

@@ -98,7 +98,7 @@ pub fn in_box(
 mod tests {
     use super::*;
     use crate::config::{Preset, VmConfig};
-    use crate::kernel::vm::{samples_across, size_for, step_size};
+    use crate::kernel::cpu::vm::{samples_across, size_for, step_size};
 
     fn found(center: f32, half: f32) -> impl FnOnce() -> Result<(Scene, Vec<String>)> {
         let scale = 1.0 / f64::from(half);

@@ -128,7 +128,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
 
 fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
     let limits = &folder.options.limits;
-    let path = folder.camera_file(file)?;
+    let path = folder.root.join(file);
     let value = io::read_json(&path, limits)?;
     let Some(top) = value.as_object() else {
         return Err(in_file(file, "it is not a JSON object", "it must begin with `{`"));
@@ -176,9 +176,9 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
             let split = named_split(keys.split.as_deref(), split).map_err(problem)?;
             let intrinsics = intrinsics(&keys, &mut ignored).map_err(problem)?;
             let (relative, photo) = folder.photo(file, &keys.file_path)?;
-            let beside = |name: &Option<String>| match name {
-                Some(name) => folder.file(file, &folder.relative(file, name)?),
-                None => Ok(None),
+            let beside = |name: &Option<String>| -> Result<_> {
+                let named = name.as_ref().map(|name| folder.relative(file, name)).transpose()?;
+                Ok(named.and_then(|name| folder.file(&name)))
             };
             let (mask, region) = (beside(&keys.mask_path)?, beside(&keys.face_mask_path)?);
             if keys.mask_path.is_some() && mask.is_none() && photo.is_some() {

@@ -48,6 +48,8 @@ pub struct CaptureOptions {
     pub mask_dir: String,
     /// What they mean.
     pub mask_meaning: MaskMeaning,
+    /// Are masks that cannot be right a matter of warnings only?
+    pub trust_masks: bool,
     /// Metres per dataset unit.
     pub unit_m: f64,
     /// What is refused for its size.
@@ -61,6 +63,7 @@ impl Default for CaptureOptions {
             masks: MaskSource::Auto,
             mask_dir: String::new(),
             mask_meaning: MaskMeaning::Empty,
+            trust_masks: false,
             unit_m: 1.0,
             limits: Limits::default(),
         }

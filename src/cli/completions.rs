@@ -61,7 +61,7 @@ pub(super) fn run(form: Form, mut command: Command, out: Option<&Out>) -> Result
         }
     };
     let Some(out) = out else { return print(&String::from_utf8_lossy(&pages[0].1)) };
-    io::create_folder(&out.file(""))?;
+    out.prepare()?;
     pages.iter().try_for_each(|(name, text)| Ok(io::write_atomic(&out.file(name), text)?))
 }
 

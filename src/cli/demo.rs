@@ -29,6 +29,8 @@ pub(super) fn run(
 ) -> Result<()> {
     let common = invocation.common;
     let options = photographs(size, views)?;
+    check(&options)?;
+    check_border(&options, border)?;
     let run = common.run.clone().unwrap_or_else(|| PathBuf::from("runs/demo"));
     let capture = run.join(DEMO_CAPTURE);
     // repeated without options, the demo goes on as it was begun
@@ -73,8 +75,25 @@ fn photographs(size: Option<&str>, views: Option<usize>) -> Result<SyntheticOpti
     if let Some(views) = views {
         options.test = (views / 4).max(1);
         options.train = views.saturating_sub(options.test);
+        if options.train < 2 {
+            return Err(Error::usage(
+                format!("`--views {views}` leaves {} to learn from, and one is held out", options.train),
+                "name three at least: two cameras place a head",
+            ));
+        }
     }
     Ok(options)
+}
+
+fn check_border(options: &SyntheticOptions, border: Option<u32>) -> Result<()> {
+    let narrow = options.width.min(options.height);
+    match border.filter(|b| b.saturating_mul(2) >= narrow) {
+        Some(border) => Err(Error::usage(
+            format!("`--border {border}` leaves nothing of a side of {narrow} pixels"),
+            "name less than half of it",
+        )),
+        None => Ok(()),
+    }
 }
 
 /// Photographs the demo head into a folder.
@@ -87,14 +106,6 @@ pub(super) fn photograph(
     let views = options.train + options.test;
     invocation.screen.note("capture", &format!("photographing a synthetic head from {views} sides"));
     let start = Instant::now();
-    check(options)?;
-    let narrow = options.width.min(options.height);
-    if let Some(border) = border.filter(|b| b.saturating_mul(2) >= narrow) {
-        return Err(Error::usage(
-            format!("`--border {border}` leaves nothing of a side of {narrow} pixels"),
-            "name less than half of it",
-        ));
-    }
     io::create_folder(capture)?;
     if let Some(border) = border {
         write_borders(capture, options, border)?;

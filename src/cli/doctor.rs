@@ -105,6 +105,12 @@ impl Display for Examination {
     }
 }
 
+/// Refuses a prediction that this build cannot make.
+#[cfg(not(feature = "wgpu"))]
+pub(super) fn model(_: &Common) -> Result<()> {
+    Err(Error::usage("`--model`: this build knows no GPU", "build with `--features wgpu`"))
+}
+
 /// What steps of both fields as they are configured would take on GPUs by their data sheets.
 #[cfg(feature = "wgpu")]
 pub(super) fn model(common: &Common) -> Result<()> {

@@ -84,7 +84,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     let words: Vec<&str> = tables.iter().map(|t| t.0).collect();
     let published = match &options.published {
         Some(file) => {
-            let bytes = io::read_bytes(file, &Limits { file_bytes: 1 << 20, ..Limits::default() })?;
+            let bytes = io::read_maybe_empty(file, &Limits { file_bytes: 1 << 20, ..Limits::default() })?;
             read_published(&String::from_utf8_lossy(&bytes), &ROWS, &file.display().to_string())?
         }
         None => Vec::new(),

@@ -2,16 +2,14 @@
 
 use super::options::Common;
 use super::stdout::print;
-use crate::capture::inspect::inspect;
-use crate::pipeline::{capture_options, disagreements};
+use crate::pipeline::{capture_options, inspect_capture};
 use crate::{Error, ErrorKind, Result};
 use std::path::Path;
 
 pub(super) fn run(common: &Common, capture: &Path) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
     let options = capture_options(&config);
-    let mut found = inspect(capture, &options);
-    found.warnings.extend(disagreements(capture, &options));
+    let found = inspect_capture(capture, &options);
     let text = if common.json {
         format!("{}\n", serde_json::to_string(&found).unwrap_or_default())
     } else {

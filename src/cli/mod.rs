@@ -436,11 +436,10 @@ those that are done or not begun share lines; -v gives each its own.")]
   tiface doctor --json          the same for programs
   tiface doctor --model         what training steps would take on GPUs by their data sheets
 
-It exits with 1 if a device computes something else than the processor does. Without the feature `wgpu` it knows the
-processor alone, and no --model.")]
+It exits with 1 if a device computes something else than the processor does. A build without the feature `wgpu` knows
+the processor alone, and refuses --model.")]
     Doctor {
         /// What a training step would take on GPUs by their data sheets: a prediction, not a measurement
-        #[cfg(feature = "wgpu")]
         #[arg(long)]
         model: bool,
     },
@@ -502,16 +501,8 @@ pub fn main() -> ExitCode {
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),
         #[cfg(feature = "cpu")]
-        Command::Doctor {
-            #[cfg(feature = "wgpu")]
-            model,
-        } => makes_nothing("doctor").and_then(|()| {
-            #[cfg(feature = "wgpu")]
-            if *model {
-                return doctor::model(&common);
-            }
-            doctor::run(&common)
-        }),
+        Command::Doctor { model } => makes_nothing("doctor")
+            .and_then(|()| if *model { doctor::model(&common) } else { doctor::run(&common) }),
         Command::Completions { form } => Out::find(common.out.as_deref(), "completions")
             .and_then(|out| completions::run(*form, Cli::command(), out.as_ref())),
         stages => run::run(&invocation, &stages.on_line(&common)?),

@@ -121,7 +121,7 @@ impl Common {
         }
         for file in files {
             let limits = Limits { file_bytes: 1 << 20, ..Limits::default() };
-            let bytes = io::read_bytes(&file, &limits).map_err(|e| Error::usage(&e, e.hint()))?;
+            let bytes = io::read_maybe_empty(&file, &limits).map_err(|e| Error::usage(&e, e.hint()))?;
             let name = file.display().to_string();
             let text = String::from_utf8(bytes)
                 .map_err(|_| Error::usage(format!("`{name}` is not UTF-8"), "save it as UTF-8"))?;

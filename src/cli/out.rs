@@ -97,8 +97,21 @@ impl Out {
         }
     }
 
+    /// Makes the folder that is written into, and removes what killed commands left half-written in it: all of that in a
+    /// folder that was named, else what begins as the file does.
+    pub fn prepare(&self) -> Result<()> {
+        match self {
+            Out::File(file, _) => {
+                let folder = file.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
+                prepare(folder, &file.file_stem().unwrap_or_default().to_string_lossy())
+            }
+            Out::Folder(folder) => prepare(folder, ""),
+        }
+    }
+
     /// Puts the command's product where `--out` says, and returns what was written.
     pub fn write(&self, product: &str, line: &Line, run: &Run) -> Result<Vec<PathBuf>> {
+        self.prepare()?;
         match self {
             Out::File(file, ending) if let Some(format) = mesh_format(ending) => {
                 let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
@@ -121,7 +134,6 @@ impl Out {
             // no stage makes another file: `Out::find` has refused it
             Out::File(file, _) => Ok(vec![file.clone()]),
             Out::Folder(folder) => {
-                io::create_folder(folder)?;
                 // fields, and pictures that only another stage can read, stay where they are
                 match product {
                     "run" => copy_folder(run.dir(), folder, &["baseline", "tface", "iface", DEMO_CAPTURE])?,
@@ -155,14 +167,23 @@ fn mesh_format(ending: &str) -> Option<MeshFormat> {
     }
 }
 
+fn prepare(folder: &Path, start: &str) -> Result<()> {
+    io::create_folder(folder)?;
+    let belongs = |name: &str| {
+        name.strip_prefix(start).is_some_and(|rest| start.is_empty() || rest.starts_with(['.', '_']))
+    };
+    io::remove_leftovers(folder, |name, pid| belongs(name) && io::has_ended(pid))?;
+    Ok(())
+}
+
 fn copy_file(from: &Path, to: &Path) -> Result<()> {
-    Ok(io::write_atomic(to, &io::read_bytes(from, &io::Limits::default())?)?)
+    Ok(io::write_atomic(to, &io::read_maybe_empty(from, &io::Limits::default())?)?)
 }
 
 /// All files but those that tell of the work, and all folders but those named; deeper down none but
 /// the views kept in float is left out.
 fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<()> {
-    io::create_folder(to)?;
+    prepare(to, "")?;
     for name in io::list_files(from)? {
         if !["done.json", "status.json", "log.jsonl"].contains(&name.as_str()) {
             copy_file(&from.join(&name), &to.join(&name))?;

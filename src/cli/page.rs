@@ -3,6 +3,7 @@
 use super::invocation::Invocation;
 use super::out::Out;
 use super::stdout::print;
+use super::target::is_run;
 use crate::capture;
 use crate::io;
 use crate::pipeline::{capture_options, click_page};
@@ -19,7 +20,7 @@ pub(super) fn run(invocation: &Invocation, path: Option<&Path>, prompts: Option<
         return Err(Error::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
     };
     // a run knows its capture, and how large its photographs are taken
-    let saved = Some(path.join("config.toml")).filter(|file| io::is_file(file));
+    let saved = is_run(path).then(|| path.join("config.toml"));
     let config = common.resolve(saved.as_deref(), None, &[])?;
     let root = match config.capture.path.as_str() {
         "" => path,
@@ -46,9 +47,7 @@ pub(super) fn run(invocation: &Invocation, path: Option<&Path>, prompts: Option<
         screen.note("page", &format!("would write an annotation page to `{}`", out.display()));
         return Ok(());
     }
-    if let Some(Out::Folder(folder)) = &asked {
-        io::create_folder(folder)?;
-    }
+    asked.iter().try_for_each(Out::prepare)?;
     io::write_atomic(&out, html.as_bytes())?;
     if common.json {
         print(&format!("{}\n", json!({"event": "result", "page": out})))?;

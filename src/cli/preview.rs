@@ -191,9 +191,7 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
         screen.note("preview", &format!("would make pictures, {count} in all, for `{}`", shown.display()));
         return Ok(());
     }
-    if let Some(folder) = shown.parent().filter(|f| !f.as_os_str().is_empty()) {
-        io::create_folder(folder)?;
-    }
+    place.prepare()?;
     let mut first = None;
     let files = make(&preview, &place, kind, &names, &shots, options.background, invocation, &mut first)?;
     if common.json {

@@ -50,9 +50,7 @@ fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()
     renew_report(&line)?;
     if let Some(out) = asked {
         let copy = out.file("report.html");
-        if let Some(folder) = copy.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-            io::create_folder(folder)?;
-        }
+        out.prepare()?;
         io::write_atomic(&copy, &io::read_bytes(&page, &io::Limits::default())?)?;
         page = copy;
     }

@@ -50,8 +50,8 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
     let run = Run::open(&target.run, stop.clone(), screen.clone());
     let line = ready(common, command, &config, &run, path, out.as_ref()).inspect_err(|e| {
         // who runs many heads looks for what went wrong in their folders, not in logs; a run that is done stays as it is,
-        // and what was asked for otherwise than before is no fault of one that has begun
-        let is_named = common.run.is_some() || io::is_folder(run.dir());
+        // what was asked for otherwise than before is no fault of one that has begun, and a wrong command makes no folder
+        let is_named = io::is_folder(run.dir()) || common.run.is_some() && e.kind() == ErrorKind::Cannot;
         let tells = match (e.kind(), begun_with(&run)) {
             (ErrorKind::Cannot | ErrorKind::Usage, None) => true,
             (ErrorKind::Cannot, Some(before)) => {
@@ -66,7 +66,8 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
         }
     })?;
     if common.dry_run {
-        return print(&outlook(&line, *until, common)?);
+        print(&outlook(&line, *until, common)?)?;
+        return line.require(*until, common.fresh).map(|_| ());
     }
     run.not_failed();
     screen.expect(line.ahead(*until).into_iter().map(|(stage, cost)| (stage, cost.seconds())).collect());
@@ -124,16 +125,17 @@ fn ready<'a>(
 
 /// What would be done for `until`, a row for each stage, with what each may cost, and all together.
 fn outlook(line: &Line, until: Stage, common: &Common) -> Result<String> {
-    let fresh = common.fresh.map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
+    let mut removed = common.fresh.map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
     let mut text = String::new();
     let mut sum = Cost::default();
     for (of, (stage, found)) in line.order(until).into_iter().zip(line.outlook(until)?) {
-        let anew = fresh.contains(&stage);
+        let anew = removed.contains(&stage);
+        removed.retain(|name| *name != stage);
         let (outlook, differences) = match found {
             _ if anew => ("to do, afresh", Vec::new()),
             None => ("to do", Vec::new()),
             Some(d) if d.is_empty() => ("done", d),
-            Some(d) => ("would stop: done with other settings", d),
+            Some(d) => ("would stop: it differs", d),
         };
         let cost = outlook.starts_with("to do").then(|| line.cost(of));
         sum = sum + cost.unwrap_or_default();
@@ -146,6 +148,13 @@ fn outlook(line: &Line, until: Stage, common: &Common) -> Result<String> {
             text += &format!("{stage:<8} {outlook}{about}\n");
             text.extend(differences.iter().map(|d| format!("           {d}\n")));
         }
+    }
+    for stage in removed {
+        let outlook = "would be removed: out of date";
+        text += &match common.json {
+            true => format!("{}\n", json!({"stage": stage, "outlook": outlook})),
+            false => format!("{stage:<8} {outlook}\n"),
+        };
     }
     if !common.json && sum.cpu_s > 0.0 {
         text += &format!("{:<8} {}\n", "all", in_words(sum));

@@ -76,7 +76,7 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
             )),
             (n, _) => Err(Error::cannot(
                 format!("{n} of {} runs could not be read", found.len()),
-                "name run folders; `tiface run RUN --fresh STAGE` makes a stage anew",
+                "name run folders, and mend their config.toml; `tiface run RUN --fresh STAGE` makes a stage anew",
             )),
         };
     }
@@ -241,7 +241,7 @@ fn stages(run: &Path, standing: &Standing) -> String {
         let name = format!("render/paths/{}", path.file_name().unwrap_or_default().to_string_lossy());
         row(&name, &of_stage(&StageStanding::read(&path, Stage::Render)));
     }
-    if standing.at.is_none() && standing.phase == Phase::Failed {
+    if standing.at.is_none() && standing.error.is_some() {
         row("–", &told(standing));
     }
     if let Some(left) = standing.left_s.filter(|s| *s > 0.0) {

@@ -4,7 +4,7 @@ use super::screen::figure;
 use crate::config::{NAMES, called};
 use crate::io;
 use crate::pipeline::Stage;
-use crate::report::judged_by;
+use crate::report::{blend_verdict, judged_by};
 use crate::run::{Done, Run};
 use serde_json::Value;
 use std::path::PathBuf;
@@ -15,6 +15,9 @@ pub(super) fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &
     let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
     let mut text = String::new();
     let mut row = |name: &str, value: &dyn std::fmt::Display| text += &format!("{name:<9} {value}\n");
+    if let Some(height) = of(Stage::Mask).and_then(|mask| mask["height_m"].as_f64()) {
+        row("head", &format!("{height:.3} m high"));
+    }
     if let Some(mesh) = of(Stage::Mesh) {
         let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
         let files = ["glb", "obj", "ply"].map(|e| run.path(format!("mesh/head.{e}")));
@@ -67,6 +70,7 @@ fn judgement(metrics: &Value) -> Vec<String> {
             lines.extend(in_parts(&metrics[set]["parts"]["mean"]));
         }
     }
+    lines.extend(blend_verdict(&metrics["blend"]));
     lines.extend(judged_by(&metrics["truth"]));
     let truth = &metrics["truth_percent_of_head"];
     if let (Some(mean), Some(p90)) = (truth["accuracy_mean"].as_f64(), truth["accuracy_p90"].as_f64()) {
@@ -105,18 +109,20 @@ mod tests {
                 "parts": {"mean": {"psnr_edge": 21.016, "missing": 1416.4, "extra": 257.0, "psnr_cap": 32.1}},
             },
             "ensemble": {"head": {"mean": {"psnr_masked": 30.0}}},
+            "blend": {"best_member": "raycast", "gain_db": -1.877},
             "truth_percent_of_head": {"accuracy_mean": 0.312, "accuracy_p90": 0.7},
             "truth": {"photographs": "photo", "masks": "run"},
         }));
-        assert_eq!(lines.len(), 5);
+        assert_eq!(lines.len(), 6);
         assert!(lines[0].starts_with("I-Face's mesh (raycast) against"), "{}", lines[0]);
         assert!(lines[0].contains("PSNR 28.12 dB, SSIM 0.9100"), "{}", lines[0]);
         assert_eq!(lines[1], "  edge 21.02, 1416 pixels missing and 257 too many a view (at most 32.1 dB)");
         assert!(lines[2].starts_with("blend (ensemble)") && lines[2].contains("30.00 dB"), "{}", lines[2]);
+        assert!(lines[3].ends_with("1.88 dB below I-Face's mesh (raycast)"), "{}", lines[3]);
         assert_eq!(
-            lines[3],
+            lines[4],
             "judged against photographs as they were taken, inside masks that this run made: others may judge otherwise"
         );
-        assert!(lines[4].contains("0.312 % of head height"), "{}", lines[4]);
+        assert!(lines[5].contains("0.312 % of head height"), "{}", lines[5]);
     }
 }

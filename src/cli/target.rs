@@ -1,6 +1,7 @@
 //! Which capture and which run a command means.
 
 use super::options::Common;
+use crate::capture;
 use crate::io;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -20,9 +21,6 @@ pub(super) struct RunTarget {
 
 /// Where in its run the demo keeps its photographs.
 pub(super) const DEMO_CAPTURE: &str = "capture";
-
-const CAPTURE_FILES: [&str; 4] =
-    ["transforms.json", "transforms_train.json", "poses_bounds.npy", "poses_bounds_train.npy"];
 
 impl RunTarget {
     /// From the path on the command line and `--run`.
@@ -58,9 +56,10 @@ impl RunTarget {
     }
 }
 
-/// A run has its configuration; a capture has cameras. A folder with both is a capture.
-fn is_run(path: &Path) -> bool {
-    io::is_file(&path.join("config.toml")) && !CAPTURE_FILES.iter().any(|f| io::is_file(&path.join(f)))
+/// A run has its configuration; a capture has cameras. A folder with both is a run only if a stage was done in it.
+pub(super) fn is_run(path: &Path) -> bool {
+    let is_done = || io::is_file(&path.join("mask/done.json"));
+    io::is_file(&path.join("config.toml")) && (!capture::has_cameras(path) || is_done())
 }
 
 /// The run in `here`, else the one under `here/runs` that was configured last.
@@ -97,9 +96,25 @@ mod tests {
         let t = RunTarget::find(&Common::default(), Some(&capture)).unwrap();
         assert_eq!((t.run.clone(), t.capture), (capture.clone(), None));
         assert!(t.saved.is_some());
-        // a capture in which someone keeps a config.toml stays a capture
-        fs::write(capture.join("transforms.json"), "{}").unwrap();
-        assert!(RunTarget::find(&Common::default(), Some(&capture)).unwrap().capture.is_some());
+    }
+
+    #[test]
+    fn a_capture_of_any_format_that_holds_a_config_toml_is_not_taken_for_a_run() {
+        let formats: [&[&str]; 4] = [
+            &["transforms.json"],
+            &["cameras_sphere.npz"],
+            &["cameras.npz"],
+            &["sparse/0/cameras.bin", "sparse/0/images.bin"],
+        ];
+        for files in formats {
+            let dir = tempfile::tempdir().unwrap();
+            fs::write(dir.path().join("config.toml"), "").unwrap();
+            assert!(is_run(dir.path()));
+            fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
+            files.iter().for_each(|file| fs::write(dir.path().join(file), "x").unwrap());
+            let target = RunTarget::find(&Common::default(), Some(dir.path())).unwrap();
+            assert_eq!((target.capture.is_some(), target.saved), (true, None), "{files:?}");
+        }
     }
 
     #[test]

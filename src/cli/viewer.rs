@@ -55,9 +55,7 @@ pub(super) fn page(
         return Ok(());
     }
     let html = html()?;
-    if let Some(Out::Folder(folder)) = asked {
-        io::create_folder(folder)?;
-    }
+    asked.into_iter().try_for_each(Out::prepare)?;
     io::write_atomic(&file, html.as_bytes())?;
     if common.json {
         print(&format!("{}\n", json!({"event": "result", "preview": [file]})))?;

@@ -173,8 +173,8 @@ table! {
 mod tests {
     use super::*;
     use crate::config::Preset;
-    use crate::kernel::hash;
-    use crate::kernel::sdf::FieldShape;
+    use crate::kernel::cpu::hash;
+    use crate::kernel::cpu::sdf::FieldShape;
 
     /// What follows from the published settings, as the published code's own printout and arithmetic have it.
     #[test]

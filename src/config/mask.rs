@@ -75,6 +75,8 @@ table! {
         /// Where masks come from: auto (clicks or an alpha network if given, else what the capture has), alpha, folder
         /// (capture.mask_dir), clicks, network or none (go on without: whatever the cameras see is learned).
         source: MaskSource => MaskSource::Auto;
+        /// Go on with masks that were found and cannot be right: inverted ones, and those that contradict the others.
+        trust: bool => false;
         /// What lies outside a mask: empty (nothing of the head) or ignore (not looked at).
         meaning: MaskMeaning => MaskMeaning::Empty;
         /// Clicks to make masks from: a prompts.json, as `tiface mask --page` saves it.

@@ -210,9 +210,17 @@ impl Config {
     /// Returns the configuration that the run in `folder` was last worked on with; none where it has no `config.toml`, or
     /// one that is not understood any more.
     pub fn of_run(folder: &Path) -> Option<Config> {
-        let bytes = io::read_bytes(&folder.join("config.toml"), &Limits::default()).ok()?;
-        let file = ("config.toml".to_owned(), String::from_utf8(bytes).ok()?);
-        Config::resolve(&Sources { files: vec![file], ..Sources::default() }).ok()
+        Config::read(&folder.join("config.toml")).ok()
+    }
+
+    /// Reads a configuration that stands alone in a file.
+    ///
+    /// # Errors
+    ///
+    /// The first thing wrong with it, with its line.
+    pub fn read(file: &Path) -> Result<Config> {
+        let text = String::from_utf8_lossy(&io::read_bytes(file, &Limits::default())?).into_owned();
+        Config::resolve(&Sources { files: vec![(file.display().to_string(), text)], ..Sources::default() })
     }
 
     /// Settings of the radiance field that the stage `baseline` or `tface` learns.

@@ -211,7 +211,7 @@ impl VmConfig {
 mod tests {
     use super::*;
     use crate::config::{Config, Preset};
-    use crate::kernel::vm::{DecoderShape, Grid, size_for, voxel_schedule};
+    use crate::kernel::cpu::vm::{DecoderShape, Grid, size_for, voxel_schedule};
 
     /// What follows from the published settings in the published box.
     #[test]

@@ -2,6 +2,7 @@
 
 use super::error::ReadError;
 use super::write::WriteError;
+use std::collections::BTreeMap;
 use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -65,6 +66,22 @@ pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<Pat
         }
     }
     Ok(None)
+}
+
+/// Returns how many bytes the files in a folder and below have, by their path in it; hidden ones and folders that are
+/// `apart` left out. No folder has no files.
+pub fn file_sizes(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<BTreeMap<String, u64>, ReadError> {
+    let mut sizes = BTreeMap::new();
+    for entry in entries(path).map_err(|e| ReadError::io(path, e))? {
+        let (inside, name) = (entry.path(), entry.file_name().to_string_lossy().into_owned());
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            let below = if apart(&inside) { BTreeMap::new() } else { file_sizes(&inside, apart)? };
+            sizes.extend(below.into_iter().map(|(file, bytes)| (format!("{name}/{file}"), bytes)));
+        } else if !name.starts_with('.') {
+            sizes.extend(file_size(&inside).map(|bytes| (name, bytes)));
+        }
+    }
+    Ok(sizes)
 }
 
 /// Is there a regular file (through links)?

@@ -2,7 +2,8 @@
 //!
 //! Format: magic, version, header length (u16 in version 1, u32 in 2 and 3), a Python dictionary with
 //! `descr`, `fortran_order` and `shape`, then exactly shape × size bytes (NumPy NEP 1). `npyz` reserves what
-//! the length says and multiplies the extents unchecked, so both are bounded here first.
+//! the length says, multiplies the extents unchecked, and takes twice to three times as long for each bracket inside
+//! another, so all three are bounded here first.
 
 use super::error::ReadError;
 use super::limits::Limits;
@@ -15,6 +16,8 @@ const MAGIC: &[u8] = b"\x93NUMPY";
 const MAX_HEADER: usize = 64 << 10;
 /// As in NumPy 1.
 const MAX_RANK: usize = 32;
+/// The dictionary's own bracket and the shape's; only records have more.
+const MAX_BRACKETS: usize = 2;
 
 /// An array in row-major (C) order, whatever order the file had.
 #[derive(Clone, Debug, PartialEq)]
@@ -83,6 +86,9 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
     }
     let text = bytes.get(start..start + length).ok_or_else(cut)?;
     let data = &bytes[start + length..];
+    if text.iter().filter(|b| b"[({".contains(b)).count() > MAX_BRACKETS {
+        return Err(unsupported(path, &DType::Record(Vec::new())));
+    }
     if !countable(text) {
         return Err(bad(start, "its shape is not of whole numbers with a product that can be held".into()));
     }
@@ -308,16 +314,27 @@ mod tests {
             let h = format!("{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}, }}");
             assert!(matches!(parse(&npy(&h, &[])), Err(ReadError::Damaged { .. })), "{shape}");
         }
-        let nested = "{'descr': ".to_string() + &"(".repeat(60_000);
-        let error = parse(&npy(&nested, &[])).unwrap_err().to_string();
+        let unclosed = "{'descr': (".to_string() + &"1,".repeat(30_000);
+        let error = parse(&npy(&unclosed, &[])).unwrap_err().to_string();
         assert!(error.contains("header: ") && error.len() < 300, "{error}");
+    }
+
+    #[test]
+    fn brackets_inside_brackets_are_an_error_not_a_hang() {
+        for header in
+            ["[".repeat(54), "{'descr': ".to_string() + &"(".repeat(60_000), "{'a': [']', [']', [".into()]
+        {
+            let error = parse(&npy(&header, &[])).unwrap_err();
+            assert!(matches!(error, ReadError::Unsupported { .. }), "{error}");
+            assert!(error.to_string().contains("records") && error.to_string().len() < 300, "{error}");
+        }
     }
 
     #[test]
     fn objects_and_records_are_refused_by_name() {
         for (descr, word) in [
             ("'|O'", "Python objects"),
-            ("[('a', '|O')]", "Python objects"),
+            ("[('a', '|O')]", "record"),
             ("'<c16'", "<c16"),
             ("[('a', '<f4')]", "record"),
         ] {

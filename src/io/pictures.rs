@@ -70,6 +70,10 @@ pub fn parse_picture_info(bytes: &[u8], path: &Path, limits: &Limits) -> Result<
     if file.is_png()? { Ok(file.png_decoder()?.1) } else { Ok(file.jpeg_decoder()?.1) }
 }
 
+/// What to do with pictures of other formats.
+const NOT_READ: &str = "convert it to PNG or JPEG (ImageMagick: `magick mogrify -format png FILES`); where another file \
+                        names it with its ending, correct the name as well";
+
 /// The bytes of a picture that is being read.
 #[derive(Clone, Copy)]
 struct PictureFile<'a> {
@@ -105,7 +109,7 @@ impl<'a> PictureFile<'a> {
                 return Err(ReadError::damaged(self.path, "PNG or JPEG", Some(0), problem));
             }
         };
-        Err(ReadError::unsupported(self.path, other, "convert it to PNG or JPEG"))
+        Err(ReadError::unsupported(self.path, other, NOT_READ))
     }
 
     fn check_size(self, width: u32, height: u32, bytes_px: u64) -> Result<(), ReadError> {

@@ -44,6 +44,11 @@ pub fn has_open(pid: u32, file: &Path) -> bool {
     }
 }
 
+/// Returns whether a process of this machine has ended: another one, or an earlier one of this one's number.
+pub fn has_ended(pid: u32) -> bool {
+    pid == std::process::id() || !is_there(pid)
+}
+
 #[cfg(unix)]
 fn is_there(pid: u32) -> bool {
     use rustix::process::{Pid, test_kill_process};

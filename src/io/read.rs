@@ -48,6 +48,14 @@ pub fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>, ReadError> {
     read_capped(path, limits.file_bytes, "the file's size in bytes")
 }
 
+/// [`read_bytes`] of a format that may say nothing: no bytes are no damage.
+pub fn read_maybe_empty(path: &Path, limits: &Limits) -> Result<Vec<u8>, ReadError> {
+    match read_bytes(path, limits) {
+        Err(ReadError::Empty { .. }) => Ok(Vec::new()),
+        read => read,
+    }
+}
+
 pub(super) fn read_capped(path: &Path, limit: u64, what: &'static str) -> Result<Vec<u8>, ReadError> {
     let (file, length) = open(path)?;
     let too_large = |found| ReadError::too_large(path, what, found, limit);

@@ -192,16 +192,18 @@ fn sync_folder(_: &Path) -> std::io::Result<()> {
     Ok(()) // a folder cannot be opened as a file here
 }
 
-/// Removes what interrupted writes left directly in `folder`, of the file `of` alone if one is named, and says how many
-/// files that were. Only for the holder of the lock for those: another process's file in progress looks the same.
-pub fn remove_leftovers(folder: &Path, of: Option<&str>) -> Result<usize, WriteError> {
+/// Removes what interrupted writes left directly in `folder`, as far as `is_over` says so of the file's name and the
+/// process, and says how many files that were. A holder of the lock for a file knows; for others see [`has_ended`](super::has_ended).
+pub fn remove_leftovers(folder: &Path, is_over: impl Fn(&str, u32) -> bool) -> Result<usize, WriteError> {
     let fail = |source| WriteError::Io { path: folder.into(), source };
     let mut removed = 0;
     for entry in fs::read_dir(folder).map_err(fail)? {
         let entry = entry.map_err(fail)?;
         let name = entry.file_name();
-        let written = name.to_str().and_then(leftover_of).filter(|n| of.is_none_or(|of| of == *n));
-        if written.is_some() && entry.file_type().is_ok_and(|t| t.is_file()) {
+        let written = name.to_str().and_then(leftover_of);
+        if written.is_some_and(|(name, pid)| is_over(name, pid))
+            && entry.file_type().is_ok_and(|t| t.is_file())
+        {
             fs::remove_file(entry.path()).map_err(fail)?;
             removed += 1;
         }
@@ -209,10 +211,10 @@ pub fn remove_leftovers(folder: &Path, of: Option<&str>) -> Result<usize, WriteE
     Ok(removed)
 }
 
-/// The file that was being written, if a name is that of a file in progress.
-fn leftover_of(name: &str) -> Option<&str> {
+/// The file that was being written and by which process, if a name is that of a file in progress.
+fn leftover_of(name: &str) -> Option<(&str, u32)> {
     let (rest, pid) = name.strip_prefix('.')?.strip_suffix(".tmp")?.rsplit_once('.')?;
-    (!rest.is_empty() && !pid.is_empty() && pid.bytes().all(|b| b.is_ascii_digit())).then_some(rest)
+    Some((rest, pid.parse().ok()?)).filter(|_| !rest.is_empty())
 }
 
 #[cfg(test)]
@@ -288,9 +290,9 @@ mod tests {
         for name in [".a.png.123.tmp", ".b.tmp", "c.123.tmp", ".gitignore"] {
             fs::write(dir.path().join(name), b"x").unwrap();
         }
-        assert_eq!(remove_leftovers(dir.path(), Some("b.png")).unwrap(), 0);
-        assert_eq!(remove_leftovers(dir.path(), Some("a.png")).unwrap(), 1);
-        assert_eq!(remove_leftovers(dir.path(), None).unwrap(), 0);
+        assert_eq!(remove_leftovers(dir.path(), |name, _| name == "b.png").unwrap(), 0);
+        assert_eq!(remove_leftovers(dir.path(), |name, pid| (name, pid) == ("a.png", 123)).unwrap(), 1);
+        assert_eq!(remove_leftovers(dir.path(), |_, _| true).unwrap(), 0);
         assert_eq!(names(dir.path()), [".b.tmp", ".gitignore", "c.123.tmp"]);
     }
 

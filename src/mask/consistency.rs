@@ -129,7 +129,9 @@ pub(super) fn claims_of(
 fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String {
     let percent =
         |v: f64| if v < 0.02 { format!("{:.1} %", 100.0 * v) } else { format!("{:.0} %", 100.0 * v) };
-    let parts = if much > 3.0 * taken {
+    let parts = if much > 0.9 {
+        "contradicts its camera: no other view has anything where the mask shows the head".into()
+    } else if much > 3.0 * taken {
         format!("shows too much: no other view has anything for {} of it", percent(much))
     } else if much < 0.01 && taken > 3.0 * much {
         format!("shows too little: it takes away {} of what the other masks show", percent(little))
@@ -273,6 +275,10 @@ fn open_claims(votes: &Votes, claims: &Claims, costs: &[(u16, u16)], active: &[b
         for i in (0..active.len()).filter(|&i| active[i] && votes.rules_out(i, cell)) {
             takers[i] += 1.0 / cost as f64;
         }
+    }
+    if 10 * asked < claims.inner.len() {
+        // hardly a ray comes where another view looks: the camera is turned away from what its mask shows
+        return (1.0, vec![0.0; active.len()]);
     }
     let asked = asked.max(1) as f64;
     takers.iter_mut().for_each(|t| *t /= asked);
@@ -431,6 +437,19 @@ mod tests {
             masks[3] = wrong;
             let found = check(&cameras, &masks);
             assert_eq!(found.conflicts.iter().map(|d| d.view).collect::<Vec<_>>(), [3], "{said}: {found:?}");
+            assert!(found.conflicts[0].text.contains(said), "{}", found.conflicts[0].text);
+        }
+    }
+
+    #[test]
+    fn a_camera_turned_away_from_what_its_mask_shows_is_named() {
+        let mut cameras = ring(8);
+        let masks: Vec<Gray> = cameras.iter().map(mask).collect();
+        // half a radian leaves some of its rays on what others show, half a turn none
+        for (turn, said) in [(0.5, "shows too much"), (std::f64::consts::PI, "contradicts its camera")] {
+            cameras[3].rotation = ring(8)[3].rotation * DMat3::from_rotation_y(turn);
+            let found = check(&cameras, &masks);
+            assert_eq!(found.conflicts.iter().map(|d| d.view).collect::<Vec<_>>(), [3], "{turn}: {found:?}");
             assert!(found.conflicts[0].text.contains(said), "{}", found.conflicts[0].text);
         }
     }

@@ -20,7 +20,7 @@ impl NoNetworks {
         if !config.with_networks() {
             return Ok(None);
         }
-        Err(Error::cannot(
+        Err(Error::usage(
             "this build cannot run networks, but one is named",
             "build with `--features matting`, or leave the files out: clicks work without them",
         ))

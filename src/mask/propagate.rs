@@ -342,7 +342,7 @@ impl<'a> Propagation<'a> {
 mod tests {
     use super::*;
     use crate::geom::Distortion;
-    use crate::kernel::rng;
+    use crate::kernel::cpu::rng;
     use glam::{DMat3, DVec3, Vec2};
 
     pub(super) fn ring() -> Vec<Camera> {

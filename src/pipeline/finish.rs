@@ -3,7 +3,7 @@
 use super::export::{Export, center};
 use super::surface::ClosedSurface;
 use crate::capture::scene::Scene;
-use crate::config::{ColorSource, Hair, MeshConfig};
+use crate::config::{ColorSource, Hair, MeshConfig, MeshFrame};
 use crate::geom::{Camera, Mesh};
 use crate::image::{Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::mesh::bake::{BakeConfig, Learned, Seams, bake, bake_harmonics, complete, tangent_space};
@@ -60,8 +60,9 @@ pub(super) fn finish(
         report.insert("simplify".into(), json!(done));
     }
     let world_from_scene = scene.scene_from_world.inverse();
-    // as `Export::files` turns it
-    let asset_from_world = export.asset_from_world(&mesh, &world_from_scene);
+    // lobes are turned as `Export::files` turns the file; what is in no file is the same in all of them
+    let frame = if c.lobes > 0 { export.frame } else { MeshFrame::Dataset };
+    let asset_from_world = Export { frame, ..export.clone() }.asset_from_world(&mesh, &world_from_scene);
     let turned = asset_from_world * world_from_scene.rotation_f32();
     let most = if c.lobes > 0 { c.lobes } else { 2 };
     let fits = c.color == ColorSource::Photographs;

@@ -8,13 +8,13 @@ use crate::capture::scene::Scene;
 use crate::capture::{Capture, LoadedView};
 use crate::config::iface::FieldKind;
 use crate::config::{Config, MaskUse, Preset, Stage};
-use crate::field::pixels::TrainView;
 #[cfg(feature = "wgpu")]
-use crate::field::place as place_of;
+use crate::field::compute_device;
+use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
 use crate::geom::Camera;
 use crate::iface::{self, DensityField, IFace};
-use crate::kernel::march::Bitmask;
+use crate::kernel::cpu::march::Bitmask;
 use crate::render::RenderedView;
 use crate::run::StageDir;
 use crate::tface::{self, FieldMean};
@@ -130,7 +130,7 @@ impl Fields for TrainedFields<'_> {
             let hull = bitmask(&self.line.scene()?);
             let field = IFace::load(&folder, &config.iface, hull.as_ref())?;
             #[cfg(feature = "wgpu")]
-            let field = field.on(place_of(&config.device)?);
+            let field = field.on(compute_device(&config.device)?);
             Ok(Box::new(field))
         };
         once(&self.iface, load).map(|f| &**f)
@@ -142,7 +142,7 @@ impl Fields for TrainedFields<'_> {
             let count = config.radiance(stage).learned();
             let field = FieldMean::load(stage.word(), &run.path(stage), count)?;
             #[cfg(feature = "wgpu")]
-            let field = field.on(place_of(&config.device)?);
+            let field = field.on(compute_device(&config.device)?);
             Ok(field)
         };
         let cell = if stage == Stage::Baseline { &self.baseline } else { &self.tface };

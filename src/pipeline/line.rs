@@ -9,9 +9,12 @@ use crate::capture::scene_box::SceneBox;
 use crate::capture::{self, Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{Config, MaskSource, RenderConfig, Stage};
 use crate::io::{self, Limits};
+#[cfg(not(feature = "matting"))]
+use crate::mask::networks::Networks;
 use crate::run::{Fingerprint, Run, read_record};
 use crate::{Error, Result};
 use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Display;
 use std::io::ErrorKind::NotFound;
 use std::path::Path;
@@ -23,6 +26,8 @@ pub struct Line<'a> {
     pub(super) run: &'a Run,
     /// Digest of everything read from the capture.
     pub(super) digest: String,
+    /// Digest of each file and camera of the capture, by what people call it; nothing where it is only remembered.
+    inputs: BTreeMap<String, String>,
     /// What `render` shows instead of the held-out views.
     pub(super) path: Option<CameraPath>,
     /// Checkpoints that stages take instead of learning.
@@ -58,6 +63,9 @@ pub(super) struct Import {
     gone: Option<Error>,
 }
 
+/// Digests of the files and cameras of the capture, in the folder of the stage `mask`.
+const INPUTS: &str = "inputs.json";
+
 impl<'a> Line<'a> {
     /// Opens the capture and reads every byte of it once, for its digest. Nothing is written.
     ///
@@ -66,7 +74,7 @@ impl<'a> Line<'a> {
     pub fn open(config: &'a Config, run: &'a Run) -> Result<Line<'a>> {
         feasible(config)?;
         let options = capture_options(config);
-        let (mut capture, digest, clicks, gone) =
+        let (mut capture, (digest, inputs), clicks, gone) =
             match capture::open(Path::new(&config.capture.path), &options) {
                 Err(e) => remembered(config, run, e)?,
                 Ok(capture) => {
@@ -93,6 +101,7 @@ impl<'a> Line<'a> {
             config,
             run,
             digest,
+            inputs,
             path: None,
             imports,
             gone,
@@ -158,6 +167,32 @@ impl<'a> Line<'a> {
         self.write("cameras.json", &cameras, idle)
     }
 
+    /// Writes what of the capture the stage `mask` is made from, so that a later change of it can be named.
+    pub(super) fn write_inputs(&self, folder: &Path) -> Result<()> {
+        let text = serde_json::to_string_pretty(&self.inputs).unwrap_or_default();
+        Ok(io::write_atomic(&folder.join(INPUTS), format!("{text}\n").as_bytes())?)
+    }
+
+    /// The first file or camera of the capture that is not what the stage `mask` was made from, and how many more are not;
+    /// nothing where the run does not say.
+    pub(super) fn changed_input(&self) -> Option<String> {
+        let path = self.run.path(Stage::Mask).join(INPUTS);
+        let old: BTreeMap<String, String> = io::read_typed(&path, &Limits::default()).ok()?;
+        let names: BTreeSet<&String> = old.keys().chain(self.inputs.keys()).collect();
+        let mut changed = names.into_iter().filter(|name| old.get(*name) != self.inputs.get(*name));
+        let first = changed.next()?;
+        let state = match (old.contains_key(first), self.inputs.contains_key(first)) {
+            (true, true) => "has changed",
+            (true, false) => "is no longer part of the capture",
+            _ => "is new",
+        };
+        let more = match changed.count() {
+            0 => String::new(),
+            more => format!(", and {more} more differ"),
+        };
+        Some(format!("{first} {state}{more}"))
+    }
+
     /// How the views of the stage `render` are made: those of the path, if there is one.
     pub(super) fn render_config(&self) -> &RenderConfig {
         self.path.as_ref().map_or(&self.config.render, |path| &path.render)
@@ -174,6 +209,10 @@ impl<'a> Line<'a> {
         lost.next().map_or(Ok(()), Err)?;
         if stages.contains(&Stage::Metrics) {
             measure(self.config)?;
+        }
+        #[cfg(not(feature = "matting"))]
+        if self.clicks.is_some() && stages.contains(&Stage::Mask) {
+            Networks::open(&self.config.mask)?;
         }
         match stages.iter().any(|stage| stage.uses_device()) {
             true => require_device(self.config),
@@ -207,7 +246,7 @@ pub fn feasible(config: &Config) -> Result<()> {
 /// so this is asked where a stage is to do that computes on it.
 #[cfg(feature = "cpu")]
 pub fn require_device(config: &Config) -> Result<()> {
-    crate::field::place(&config.device).map(drop)
+    crate::field::compute_device(&config.device).map(drop)
 }
 
 /// No fields, no device.
@@ -224,6 +263,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
         masks: if config.mask.made() { MaskSource::Clicks } else { config.mask.source },
         mask_dir: c.mask_dir.clone(),
         mask_meaning: config.mask.meaning,
+        trust_masks: config.mask.trust,
         unit_m: c.unit_m,
         ..CaptureOptions::default()
     }
@@ -246,13 +286,15 @@ fn own_masks(capture: &Capture, options: &CaptureOptions) -> Result<OwnMasks> {
     Ok(OwnMasks { masks, digest: Fingerprint::of_bytes(digests.join(" ").as_bytes()) })
 }
 
-/// Digest of all that a capture means: cameras, splits and the bytes of every picture.
-fn capture_digest(capture: &Capture) -> Result<String> {
+/// Digest of all that a capture means: cameras, splits and the bytes of every picture; and of each of them.
+fn capture_digest(capture: &Capture) -> Result<(String, BTreeMap<String, String>)> {
     let views = capture
         .views
         .par_iter()
         .map(|view| {
             let mut text = format!("{} {:?} {:?} {}", view.name, view.split, view.camera, view.downscale);
+            let camera = Fingerprint::of_bytes(text.as_bytes());
+            let mut inputs = vec![(format!("the camera of view `{}`", view.name), camera)];
             let mask = match &view.mask {
                 ViewMask::File(path) => Some(path),
                 _ => None,
@@ -260,17 +302,21 @@ fn capture_digest(capture: &Capture) -> Result<String> {
             for path in [Some(&view.photo), mask, view.valid.as_ref(), view.region.as_ref()] {
                 text += " ";
                 if let Some(path) = path {
-                    text += &file_digest(path)?;
+                    let (digest, file) =
+                        (file_digest(path)?, path.strip_prefix(&capture.root).unwrap_or(path));
+                    text += &digest;
+                    inputs.push((format!("`{}`", file.display()), digest));
                 }
             }
-            Ok(text)
+            Ok((text, inputs))
         })
         .collect::<Result<Vec<_>>>()?;
+    let (views, inputs): (Vec<String>, Vec<_>) = views.into_iter().unzip();
     let mut text = format!("{} {}", capture.up, views.join("\n"));
     if let Some(focus) = capture.focus {
         text += &format!("\n{focus:?}");
     }
-    Ok(Fingerprint::of_bytes(text.as_bytes()))
+    Ok((Fingerprint::of_bytes(text.as_bytes()), inputs.into_iter().flatten().collect()))
 }
 
 fn file_digest(path: &Path) -> Result<String, io::ReadError> {
@@ -334,7 +380,7 @@ fn remembered(
     config: &Config,
     run: &Run,
     error: Error,
-) -> Result<(Capture, String, Option<MaskPrompts>, Option<String>)> {
+) -> Result<(Capture, (String, BTreeMap<String, String>), Option<MaskPrompts>, Option<String>)> {
     let root = Path::new(&config.capture.path);
     if capture::has_cameras(root) || !io::is_file(&run.path("config.toml")) {
         return Err(error);
@@ -345,7 +391,7 @@ fn remembered(
     let mut inputs = record.fingerprint.inputs;
     let digest = inputs.remove("capture").unwrap_or_default();
     let clicks = config.mask.made().then(|| MaskPrompts::remembered(&inputs));
-    Ok((capture, digest, clicks, Some(problem)))
+    Ok((capture, (digest, BTreeMap::new()), clicks, Some(problem)))
 }
 
 /// The capture of a run that has work left is no longer where it was.

@@ -5,7 +5,8 @@ use super::*;
 use crate::capture::Split;
 use crate::capture::synthetic::{SyntheticHead, SyntheticOptions, write_capture};
 use crate::config::{
-    ColorSource, Config, Genus, MaskSource, MeshFormat, MeshFrame, Method, Preset, ViewBackground,
+    ColorSource, Config, Genus, MaskSource, Material, MeshConfig, MeshFormat, MeshFrame, Method, Preset,
+    TextureFormat, ViewBackground,
 };
 use crate::geom::{Camera, Similarity};
 use crate::io::{self, Limits};
@@ -138,6 +139,14 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     assert!(page.contains("class=\"viewer-glb\">Z2xURg") && page.contains("\"name\":\"012\""));
     assert!(page.len() < 8_000_000, "{}", page.len());
     assert!(bytes("mesh/head.glb").starts_with(b"glTF"));
+
+    // one that was cut is named wherever the head is shown
+    assert!(Preview::of_run(run.dir()).unwrap().warnings.is_empty());
+    std::fs::write(run.path("mesh/head.glb"), b"glTF").unwrap();
+    let warnings = Preview::of_run(run.dir()).unwrap().warnings;
+    let error = head_page(&line).unwrap_err();
+    assert!(error.to_string().contains("mesh/head.glb` has 4 bytes") && warnings.len() == 1, "{error}");
+    assert!(warnings[0].contains("head.glb` has 4 bytes") && warnings[0].contains("`--fresh mesh`"));
 }
 
 /// The product looks like the whole surface, from cameras it was not baked for, in whatever frame it is exported;
@@ -417,8 +426,11 @@ fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
     value["hull"] = json!({"resolution": 0, "bits": []});
     std::fs::write(&path, value.to_string()).unwrap();
     let fog = Fog(0.into(), None);
+    // a stage that was done has lost what it made
+    let e = complete(&line, Stage::Mask, &NoFields).unwrap_err();
+    assert!(e.to_string().contains("mask/scene.json` has "), "{e}");
+    assert!(e.hint().contains("`--fresh mask`") && e.kind() == ErrorKind::Cannot, "{}", e.hint());
     for e in [
-        complete(&line, Stage::Mask, &NoFields).unwrap_err(),
         complete(&line, Stage::Mesh, &NoFields).unwrap_err(),
         complete(&line, Stage::Render, &fog).unwrap_err(),
     ] {
@@ -520,4 +532,147 @@ fn what_is_not_rendered_does_not_shape_the_views() {
     assert_eq!(render(&|c| c.mesh.resolution = 100), base);
     assert_eq!(render(&|c| c.baseline.steps = 9), base);
     assert_ne!(render(&|c| c.tface.steps = 9), base);
+}
+
+/// Records every stage as done without any work.
+fn finish(line: &Line) {
+    for stage in line.order(Stage::Metrics) {
+        line.run.stage(line.plan(stage), |_| Ok(json!(null))).unwrap();
+    }
+}
+
+/// The stages of a run that are done as planned.
+fn done(line: &Line) -> String {
+    words(&Stage::ALL.into_iter().filter(|s| line.run.is_done(&line.plan(*s))).collect::<Vec<_>>())
+}
+
+#[test]
+fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root, 8, 1);
+    let mut config = draft(&root);
+    let run = quiet(dir.path());
+    finish(&Line::open(&config, &run).unwrap());
+    let all = "mask tface iface mesh render ensemble metrics";
+    for change in [
+        |c: &mut Config| c.mesh.material = Material::Lit,
+        |c: &mut Config| c.mesh.format = vec![MeshFormat::Glb, MeshFormat::Obj],
+        |c: &mut Config| (c.mesh.frame, c.mesh.texture_format) = (MeshFrame::Head, TextureFormat::Jpeg),
+    ] {
+        change(&mut config);
+        let line = Line::open(&config, &run).unwrap();
+        assert_eq!(line.require(Stage::Mesh, Some(Stage::Mesh)).unwrap(), ["mesh"]);
+        line.fresh(Stage::Mesh, Stage::Mesh).unwrap();
+        assert_eq!(done(&line), all.replace("mesh ", ""));
+        // also where the command is repeated after it was killed
+        assert!(line.require(Stage::Mesh, Some(Stage::Mesh)).unwrap().is_empty());
+        line.run.stage(line.plan(Stage::Mesh), |_| Ok(json!(null))).unwrap();
+        assert_eq!(done(&line), all);
+    }
+    // views of a path stay as well, unless the mesh has fewer triangles
+    let orbit = crate::config::RenderConfig {
+        cameras: "orbit".into(),
+        method: vec![Method::Raycast],
+        ..config.render.clone()
+    };
+    let line = Line::open(&config, &run).unwrap().along(orbit).unwrap();
+    line.run.stage(line.plan(Stage::Render), |_| Ok(json!(null))).unwrap();
+    for (material, triangles, expected) in [
+        (Material::Unlit, config.mesh.triangles, &["mesh"][..]),
+        (Material::Lit, 100, &["mesh", "render", "ensemble", "metrics", "render/paths/orbit"]),
+    ] {
+        let mesh = MeshConfig { material, triangles, ..config.mesh.clone() };
+        let other = Config { mesh, ..config.clone() };
+        let line = Line::open(&other, &run).unwrap();
+        assert_eq!(line.out_of_date(Stage::Mesh).unwrap(), expected);
+    }
+    // fewer triangles are seen, but where rays meet the surface that they are made from
+    let follow = ["mesh", "render", "ensemble", "metrics"];
+    for (color, method, expected) in [
+        (ColorSource::Photographs, Method::Raycast, &follow[..]),
+        (ColorSource::Network, Method::Textured, &follow),
+        (ColorSource::Network, Method::Raycast, &follow[..1]),
+    ] {
+        config.mesh.color = color;
+        config.render.method = vec![method];
+        (config.ensemble.members, config.ensemble.weights) = (vec![method], vec![1.0]);
+        let run = Run::quiet(&dir.path().join(format!("{color:?} {method:?}")));
+        finish(&Line::open(&config, &run).unwrap());
+        let fewer = Config { mesh: MeshConfig { triangles: 100, ..config.mesh.clone() }, ..config.clone() };
+        let line = Line::open(&fewer, &run).unwrap();
+        assert_eq!(line.out_of_date(Stage::Mesh).unwrap(), expected, "{color:?} {method:?}");
+        // what is made anew as it was is made anew with all that follows
+        let line = Line::open(&config, &run).unwrap();
+        assert_eq!(line.out_of_date(Stage::Mesh).unwrap(), follow);
+    }
+}
+
+#[test]
+fn views_from_before_files_of_the_mesh_were_told_apart_are_still_done() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root, 8, 1);
+    let mut config = draft(&root);
+    (config.mesh.material, config.mesh.format) = (Material::Lit, vec![MeshFormat::Ply]);
+    let run = quiet(dir.path());
+    let line = Line::open(&config, &run).unwrap();
+    for stage in line.order(Stage::Metrics) {
+        let mut plan = line.plan(stage);
+        if stage == Stage::Render {
+            let whole = line.plan(Stage::Mesh).fingerprint.digest();
+            assert_ne!(plan.fingerprint.inputs.insert("mesh".into(), whole.clone()), Some(whole));
+        }
+        line.run.stage(plan, |_| Ok(json!(null))).unwrap();
+    }
+    assert_eq!(done(&line), "mask tface iface mesh render ensemble metrics");
+    line.remember(Stage::Metrics).unwrap();
+}
+
+#[test]
+fn the_frame_of_a_file_shapes_nothing_that_views_show() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 48, height: 60, train: 8, test: 1, seed: 1 };
+    let root = dir.path().join("head");
+    write_capture(&root, &options).unwrap();
+    let parts = [MeshFrame::Dataset, MeshFrame::Head].map(|frame| {
+        let mut config = draft(&root);
+        config.mesh.resolution = 48;
+        config.mesh.triangles = 1000;
+        config.mesh.texture_px = 128;
+        config.mesh.frame = frame;
+        let run = Run::quiet(&dir.path().join(format!("{frame:?}")));
+        let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
+        complete(&line, Stage::Mask, &NoFields).unwrap();
+        let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
+        complete(&line, Stage::Mesh, &exact).unwrap();
+        let parts = run.path("mesh/parts");
+        let names = io::list_files(&parts).unwrap();
+        names.into_iter().map(|n| (std::fs::read(parts.join(&n)).unwrap(), n)).collect::<Vec<_>>()
+    });
+    assert!(parts[0].len() > 1 && parts[0] == parts[1]);
+}
+
+#[test]
+fn a_stage_that_the_disk_has_no_room_for_is_refused_before_the_old_one_is_cleared() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root, 8, 1);
+    let mut config = draft(&root);
+    let run = quiet(dir.path());
+    finish(&Line::open(&config, &run).unwrap());
+    if io::free_bytes(dir.path()).is_none() {
+        eprintln!("skipped: this system does not tell how much room is left");
+        return;
+    }
+    config.iface.log2_table = 40;
+    let line = Line::open(&config, &run).unwrap();
+    let error = line.fresh(Stage::Iface, Stage::Metrics).unwrap_err();
+    assert!(
+        error.to_string().contains("`iface` needs about") && error.kind() == ErrorKind::Cannot,
+        "{error}"
+    );
+    for stage in line.order(Stage::Metrics) {
+        assert!(run.path(stage).join("done.json").is_file(), "{stage} was cleared");
+    }
 }

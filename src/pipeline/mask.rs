@@ -2,10 +2,10 @@
 
 use super::clicks::{MaskPrompts, make_masks};
 use super::scene_file;
-use crate::Result;
+use crate::capture::inspect::{Inspection, Problem, grouped, inspect};
 use crate::capture::scene::{self, Scene, SceneOptions};
 use crate::capture::scene_box::{SceneBox, in_box};
-use crate::capture::{self, Capture, Split};
+use crate::capture::{self, Capture, CaptureOptions, MASK_HINT, Split, View};
 use crate::config::{Config, MaskConfig, MaskMeaning, Preset};
 use crate::image::{Gray, Photo, working_size};
 use crate::io::{self, Limits};
@@ -16,6 +16,7 @@ use crate::mask::prompts::read_prompts;
 use crate::mask::scale::resize_gray;
 use crate::mask::sheet::{SheetView, sheet};
 use crate::run::StageDir;
+use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -29,6 +30,10 @@ pub(super) const CLICKS: &str = "prompts.json";
 /// Longest side of the masks that the head is placed by; a hull is coarser still.
 const PLACED_PX: u32 = 1024;
 
+/// Share of a mask that contradicts the others from which it cannot be right. Outlines that are six pixels of 512 off
+/// contradict nothing; half a mask, that of another view or an empty one 0.1 to 1.
+const WRONG_SHARE: f64 = 0.1;
+
 /// Masks compared with each other, at most.
 const MOST_COMPARED: usize = 256;
 
@@ -41,6 +46,8 @@ struct CaptureMasks {
     sheet: Vec<(usize, SheetView)>,
     /// How they were made, for the stage's record.
     record: Value,
+    /// Why those that were found cannot be right.
+    refused: Vec<Error>,
 }
 
 /// Finds the masks beside the photographs, or makes them from clicks: the masks as pictures, a sheet of them, and the
@@ -60,7 +67,7 @@ pub(super) fn mask(
              `mask.vitmatte` they are cut and softened by built-in methods",
         );
     }
-    let CaptureMasks { masks, sheet: mut views, record } = match prompts {
+    let CaptureMasks { masks, sheet: mut views, record, refused } = match prompts {
         Some(prompts) => masks_from_clicks(capture, prompts, config, dir)?,
         None => masks_of_capture(capture, dir)?,
     };
@@ -72,20 +79,30 @@ pub(super) fn mask(
         );
     }
     let silhouettes = config.meaning == MaskMeaning::Empty;
-    let conflicts = if silhouettes { conflicts(capture, &masks) } else { Vec::new() };
-    as_warnings(&conflicts, coverage.len()).iter().for_each(|text| dir.warn(text));
-    for (_, view) in views.iter_mut().filter(|(i, _)| conflicts.iter().any(|(view, _)| view == i)) {
+    let (conflicts, mut wrong) =
+        if silhouettes { (conflicts(capture, &masks), refused) } else { (Vec::new(), Vec::new()) };
+    let (contradicting, warnings) = judged(&conflicts, coverage.len());
+    wrong.extend(contradicting);
+    for (_, view) in views.iter_mut().filter(|(i, _)| conflicts.iter().any(|(view, ..)| view == i)) {
         view.suspicions.push("disagrees with the others".into());
     }
     let views: Vec<SheetView> = views.into_iter().map(|(_, view)| view).collect();
     if !views.is_empty() {
         io::write_atomic(&dir.folder().join(SHEET), sheet(&views)?.as_bytes())?;
     }
+    let wrong = grouped(&wrong);
+    // masks that the stage made are not refused: they are looked at before anything is learned from them
+    if let Some(problem) = wrong.first().filter(|_| prompts.is_none() && !config.trust) {
+        return Err(problem.into());
+    }
+    wrong.iter().map(Problem::to_string).chain(warnings).for_each(|text| dir.warn(&text));
     let suspicious = views.iter().filter(|v| !v.suspicions.is_empty()).map(|v| &v.name);
     let suspicious: Vec<&String> = suspicious.collect();
     // what a mask calls "not looked at" may still hold head
     let scene = place(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), wanted, dir)?;
     scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
+    let height = scene::height(&scene, capture.up);
+    height.and_then(|h| scene::doubtful_height(h, capture.unit_m)).iter().for_each(|text| dir.warn(text));
     let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;
     Ok(json!({
         "views": capture.views.len(),
@@ -94,6 +111,7 @@ pub(super) fn mask(
         "suspicious": suspicious,
         "made": record,
         "box": scene::world_box(&scene),
+        "height_m": height.map(|h| h * capture.unit_m),
     }))
 }
 
@@ -121,15 +139,17 @@ fn masks_of_capture(capture: &Capture, dir: &StageDir) -> Result<CaptureMasks> {
             .par_iter()
             .map(|v| {
                 let Some(mask) = v.load_mask(&limits)? else { return Ok(None) };
-                let view = SheetView::new(&v.name, &v.load_photo(&limits)?, &mask, None)?;
-                Ok(Some((mask, view)))
+                let photo = v.load_photo(&limits)?;
+                let refused = capture::refuse(&v.name, &photo, &mask).err();
+                Ok(Some((SheetView::new(&v.name, &photo, &mask, None)?, mask, refused)))
             })
             .collect();
         for (k, found) in loaded.into_iter().enumerate() {
-            let Some((mask, view)) = found? else {
+            let Some((view, mask, refused)) = found? else {
                 out.masks.push(None);
                 continue;
             };
+            out.refused.extend(refused);
             write_mask(dir.folder(), &view.name, &mask)?;
             out.sheet.push((8 * i + k, view));
             out.masks.push(Some(for_placing(&mask)));
@@ -190,8 +210,11 @@ fn place(
     Ok(scene)
 }
 
-/// The views whose masks do not fit the others, with a sentence each; none where the cameras cannot tell.
-fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> {
+/// A view whose mask does not fit the others: its number, how large a share of the masks that concerns, and a sentence.
+type MaskConflict = (usize, f64, String);
+
+/// The views whose masks do not fit the others; none where the cameras cannot tell.
+fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<MaskConflict> {
     // evenly spread ones, where there are very many: the check keeps bits of every cell for each
     let every = capture.views.len().div_ceil(MOST_COMPARED);
     let views: Vec<ConsistencyView> = (capture.views.iter().zip(masks).enumerate())
@@ -201,26 +224,29 @@ fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<(usize, String)> 
             mask: mask.as_ref().filter(|_| i.is_multiple_of(every)),
         })
         .collect();
-    match check_consistency(&views) {
-        // less than that is a matter of pixels
-        Ok(found) => (found.conflicts.into_iter())
-            .filter(|d| d.too_much.max(d.too_little) >= 0.005)
-            .map(|d| (d.view, d.text))
-            .collect(),
-        Err(_) => Vec::new(),
-    }
+    let found = check_consistency(&views).map_or(Vec::new(), |found| found.conflicts);
+    let conflicts = found.into_iter().map(|d| (d.view, d.too_much.max(d.too_little), d.text));
+    // less than that is a matter of pixels
+    conflicts.filter(|(_, share, _)| *share >= 0.005).collect()
 }
 
-/// The conflicts as sentences; when most masks are doubted it is not single masks that are wrong.
-fn as_warnings(conflicts: &[(usize, String)], masks: usize) -> Vec<String> {
-    if conflicts.len() > 3 && 2 * conflicts.len() > masks {
-        let (n, first) = (conflicts.len(), &conflicts[0].1);
-        return vec![format!(
-            "{n} of {masks} masks contradict each other: they, or the cameras, belong to other photographs ({first}, \
-             and so on)"
-        )];
+/// The conflicts as sentences: masks that cannot be right, and those that a person should look at. When most masks are
+/// doubted it is not single masks that are wrong.
+fn judged(conflicts: &[MaskConflict], masks: usize) -> (Vec<Error>, Vec<String>) {
+    let mut found: Vec<(bool, String)> =
+        conflicts.iter().map(|(_, share, text)| (*share >= WRONG_SHARE, text.clone())).collect();
+    let n = found.len();
+    if n > 3 && 2 * n > masks {
+        let text = format!(
+            "{n} of {masks} masks contradict each other: they, or the cameras, belong to other photographs ({}, and so \
+             on)",
+            found[0].1
+        );
+        found = vec![(found.iter().any(|(is_wrong, _)| *is_wrong), text)];
     }
-    conflicts.iter().map(|(_, text)| text.clone()).collect()
+    let (wrong, doubted): (Vec<_>, Vec<_>) = found.into_iter().partition(|(is_wrong, _)| *is_wrong);
+    let refused = wrong.into_iter().map(|(_, text)| Error::cannot(text, MASK_HINT));
+    (refused.collect(), doubted.into_iter().map(|(_, text)| text).collect())
 }
 
 /// A mask at a size that is enough to place the head and to compare masks.
@@ -228,23 +254,20 @@ fn for_placing(mask: &Gray) -> Gray {
     resize_gray(mask, working_size(mask.width, mask.height, PLACED_PX))
 }
 
-/// What the masks of a capture say against each other, a sentence for each that a person should look at. What cannot
-/// be read is passed over: `inspect` itself tells that.
-pub fn disagreements(root: &Path, options: &capture::CaptureOptions) -> Vec<String> {
-    if options.mask_meaning == capture::MaskMeaning::Ignore {
-        return Vec::new(); // no silhouettes
+/// Returns everything that [`inspect`] finds in a capture, and which of its masks contradict each other.
+pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
+    let mut found = inspect(root, options);
+    if options.mask_meaning == MaskMeaning::Ignore {
+        return found; // no silhouettes
     }
-    let Ok(capture) = capture::open(root, options) else { return Vec::new() };
-    let masks: Vec<Option<Gray>> = capture
-        .views
-        .par_iter()
-        .map(|v| {
-            let mask = v.load_mask(&options.limits).ok().flatten()?;
-            Some(for_placing(&mask))
-        })
-        .collect();
-    let count = masks.iter().flatten().count();
-    as_warnings(&conflicts(&capture, &masks), count)
+    // what cannot be opened or read is among the problems
+    let Ok(capture) = capture::open(root, options) else { return found };
+    let load = |v: &View| Some(for_placing(&v.load_mask(&options.limits).ok().flatten()?));
+    let masks: Vec<Option<Gray>> = capture.views.par_iter().map(load).collect();
+    let (wrong, warnings) = judged(&conflicts(&capture, &masks), masks.iter().flatten().count());
+    found.add_refused_masks(&wrong, options);
+    found.warnings.extend(warnings);
+    found
 }
 
 /// An annotation page; `prompts` are clicks that are there already.

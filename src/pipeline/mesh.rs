@@ -13,15 +13,15 @@ use super::surface::{ClosedSurface, Surface};
 use super::tiles;
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, LoadedView, Split};
-use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, MeshFormat};
+use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, MeshFormat, Stage};
 use crate::geom::{Aabb, Camera, Mesh, Similarity};
 use crate::image::Image;
 use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshReport, Patches, Photograph};
-use crate::run::StageDir;
-use crate::{Monitor, Result};
+use crate::run::{Phase, Record, StageDir, StageStanding, Status};
+use crate::{Error, Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -188,6 +188,27 @@ fn write_exr(linear: &Image, path: &Path) -> Result<()> {
 /// The stage `mesh` has left none, or it is damaged.
 pub fn export_head(line: &Line, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
     Export::new(&line.capture, line.config).files(&head_mesh(line)?, format, stem)
+}
+
+/// The record of the stage in a run.
+///
+/// # Errors
+///
+/// It is not done; the error says whether a process works on it.
+pub(super) fn finished_mesh(run: &Path) -> Result<Record> {
+    let StageStanding { phase, status, record, .. } =
+        StageStanding::read(&run.join(Stage::Mesh), Stage::Mesh);
+    let shown = run.display();
+    record.ok_or_else(|| match status.filter(|_| phase == Phase::Running) {
+        Some(Status { pid, host, .. }) => Error::not_now(
+            format!("the mesh of the run `{shown}` is being made right now, by process {pid} on {host}"),
+            format!("wait for it: `tiface status {shown}` says how far it is; then repeat the command"),
+        ),
+        None => Error::cannot(
+            format!("the run `{shown}` has no mesh yet"),
+            format!("make one: `tiface mesh {shown}`"),
+        ),
+    })
 }
 
 /// The head mesh that the stage left.

@@ -5,7 +5,7 @@ use super::mesh::surface_in_world;
 use super::pictures;
 use super::truth::against_truth;
 use crate::capture::{LoadedView, View};
-use crate::config::{Config, Stage, TruthPhoto, ViewBackground};
+use crate::config::{Config, Method, Stage, TruthPhoto, ViewBackground};
 use crate::image::Gray;
 use crate::io::{self, Limits};
 #[cfg(feature = "matting")]
@@ -100,10 +100,22 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
         let truth = against_truth(&surface_in_world(line)?, points);
         out.insert("truth_percent_of_head".into(), json!(truth));
     }
+    out.extend(blend_gain(&out, &line.config.ensemble.members).map(|gain| ("blend".into(), gain)));
     out.insert("truth".into(), json!({"photographs": line.config.metrics.truth, "masks": line.judges()}));
     let value = Value::Object(out);
     io::write_atomic(&dir.folder().join("metrics.json"), format!("{value:#}\n").as_bytes())?;
     Ok(means(&value))
+}
+
+/// How much better a blend of several members is than the best of them, dB.
+fn blend_gain(sets: &Map<String, Value>, members: &[Method]) -> Option<Value> {
+    let psnr = |set: &str| {
+        let mean = sets.get(set)?.pointer("/head/mean")?;
+        mean["psnr_masked"].as_f64().or(mean["psnr"].as_f64())
+    };
+    let each = members.iter().filter_map(|member| Some((member.folder(), psnr(member.folder())?)));
+    let (best, alone) = each.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|_| members.len() > 1)?;
+    Some(json!({"best_member": best, "gain_db": psnr("ensemble")? - alone}))
 }
 
 /// The network for LPIPS, if one is named.
@@ -225,6 +237,22 @@ fn means(metrics: &Value) -> Value {
 mod tests {
     use super::*;
     use crate::image::Photo;
+
+    #[test]
+    fn a_blend_that_is_below_its_best_member_is_told_by_how_much() {
+        let set = |psnr: f64| json!({"head": {"mean": {"psnr_masked": psnr, "psnr": 40.0}}});
+        let sets =
+            json!({"tface": set(30.5), "volume": set(28.0), "textured": set(33.0), "ensemble": set(30.25)});
+        let gain = |members: &[Method]| blend_gain(sets.as_object().unwrap(), members);
+        let below = gain(&[Method::Tface, Method::Volume]).unwrap();
+        assert_eq!(below, json!({"best_member": "tface", "gain_db": -0.25}));
+        let said = crate::report::blend_verdict(&below).unwrap();
+        assert!(said.contains("not better") && said.contains("0.25 dB below T-Face"), "{said}");
+        let above = gain(&[Method::Volume, Method::Baseline]).unwrap();
+        assert_eq!((&above["gain_db"], crate::report::blend_verdict(&above)), (&json!(2.25), None));
+        // one member alone is no blend
+        assert_eq!(gain(&[Method::Tface]), None);
+    }
 
     #[test]
     fn opacity_before_the_background_counts_squared_and_only_where_no_head_is() {

@@ -96,7 +96,7 @@ fn text(file: &Path) -> Result<String> {
     if !io::is_file(file) {
         return Ok(String::new());
     }
-    Ok(String::from_utf8_lossy(&io::read_bytes(file, &Limits::default())?).into_owned())
+    Ok(String::from_utf8_lossy(&io::read_maybe_empty(file, &Limits::default())?).into_owned())
 }
 
 fn facts(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
@@ -107,8 +107,12 @@ fn facts(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
         format!("preset {}", line.config.preset.name()),
         format!("seed {}", line.config.seed),
     ];
-    if let Some((_, done)) = records.iter().find(|(stage, _)| *stage == Stage::Metrics) {
-        facts.extend(crate::report::judged_by(&done.summary["truth"]));
+    let of = |stage: Stage| records.iter().find(|(s, _)| *s == stage).map(|(_, record)| &record.summary);
+    if let Some(height) = of(Stage::Mask).and_then(|mask| mask["height_m"].as_f64()) {
+        facts.push(format!("head {height:.3} m high"));
+    }
+    if let Some(summary) = of(Stage::Metrics) {
+        facts.extend(report::judged_by(&summary["truth"]));
     }
     if let Some((_, last)) = records.last() {
         facts.push(duration(records.iter().map(|(_, r)| r.elapsed_s).sum()));
@@ -123,6 +127,7 @@ fn warnings(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
     for (stage, record) in records {
         let said = record.summary["warnings"].as_array().into_iter().flatten().filter_map(Value::as_str);
         all.extend(said.map(|w| format!("{stage}: {w}")));
+        all.extend(report::blend_verdict(&record.summary["blend"]));
         if record.summary["closed"] == false {
             all.push(format!("{stage}: the surface is not watertight"));
         }

@@ -1,11 +1,13 @@
 //! What each stage builds on, and so what shapes it: known before anything runs.
 
 use super::ensemble::can_blend;
-use super::line::Line;
+use super::line::{Line, capture_options};
+use super::mask::inspect_capture;
 use super::path::{CameraPath, PATHS};
+use super::render::shows_head;
 use crate::capture::View;
 use crate::config::iface::FieldKind;
-use crate::config::{Config, Material, Stage, VmConfig};
+use crate::config::{Config, Material, Method, Stage, VmConfig};
 use crate::io;
 use crate::run::{Fingerprint, Plan, read_record, read_status};
 use crate::{Error, Result};
@@ -14,8 +16,10 @@ use std::path::Path;
 /// Raised when the meaning of a stage's files changes.
 const FORMAT: u32 = 2;
 
-/// Keys of `[mask]` that say where something lies; what it holds is an input of the stage.
-const PLACES: [&str; 9] = [
+/// Keys of `[mask]` that shape no mask which is made: where something lies, what it holds being an input of the stage, and
+/// what is asked of others.
+const PLACES: [&str; 10] = [
+    "mask.trust",
     "mask.prompts",
     "mask.point",
     "mask.view",
@@ -29,6 +33,21 @@ const PLACES: [&str; 9] = [
 
 /// Keys of `[mask]` that shape masks which were found.
 const FOUND: [&str; 2] = ["mask.source", "mask.meaning"];
+
+/// Keys of `[mesh]` that shape files for other programs, and nothing that views show.
+const FILE_KEYS: [&str; 5] =
+    ["mesh.format", "mesh.material", "mesh.texture_format", "mesh.exr", "mesh.verify"];
+
+/// Keys of `[mesh]` that shape the head mesh, and not the surface it is made from.
+const HEAD_KEYS: [&str; 7] = [
+    "mesh.frame",
+    "mesh.triangles",
+    "mesh.max_error",
+    "mesh.texture_px",
+    "mesh.lobes",
+    "mesh.hair",
+    "mesh.normal_map",
+];
 
 impl Line<'_> {
     /// The stages up to `until` that it needs, itself the last, in the order of the line. Views of a path need what
@@ -56,14 +75,28 @@ impl Line<'_> {
         self.can_make(until)?;
         let (mut found, mut missing) = (Vec::new(), Vec::new());
         for stage in self.order(until) {
-            let Plan { name, fingerprint, .. } = self.plan(stage);
+            let Plan { name, fingerprint, .. } = self.compared_plan(stage);
             // a record that cannot be read is none: the stage counts as not done
             let record = read_record(&self.run.path(name)).ok().flatten();
             missing.extend(record.is_none().then_some(stage));
-            found.push((name.to_string(), record.map(|r| fingerprint.differences(&r.fingerprint))));
+            let differences = record.map(|r| {
+                let problem = r.require_products(&self.run.path(name)).err().map(|e| e.to_string());
+                fingerprint.differences(&r.fingerprint).into_iter().chain(problem).collect()
+            });
+            found.push((name.to_string(), differences));
         }
         self.require_inputs(&missing)?;
+        self.require_masks(&missing)?;
         Ok(found)
+    }
+
+    /// Refuses what the stage `mask` would refuse, if it is one of those that are made.
+    fn require_masks(&self, made: &[Stage]) -> Result<()> {
+        if !made.contains(&Stage::Mask) {
+            return Ok(());
+        }
+        let inspection = inspect_capture(&self.capture.root, &capture_options(self.config));
+        inspection.problems.first().map_or(Ok(()), |problem| Err(Error::from(problem)))
     }
 
     /// Writes the complete configuration into the run: what repeats it. Refused, before anything is
@@ -78,27 +111,71 @@ impl Line<'_> {
         self.write("config.toml", self.config.to_toml().as_bytes(), left.is_empty())
     }
 
-    /// Folders below the run that are out of date when a stage is made anew, in the order of the line: its own, those
-    /// of what builds on it, and views of paths that show it. Where views of a path are made anew, they alone.
+    /// Folders below the run that hold something and are out of date when a stage is made anew, in the order of the line:
+    /// its own, those of what builds on it, and views of paths that show it. Where views of a path are made anew, they
+    /// alone.
+    ///
+    /// What builds on it, is done, and reads nothing that its changed settings shape stays. Where nothing has changed, a
+    /// stage is made anew with all that follows.
     pub fn out_of_date(&self, stage: Stage) -> Result<Vec<String>> {
-        if stage == Stage::Render && self.path.is_some() {
-            return Ok(vec![self.views().into()]);
-        }
-        let mut names: Vec<String> = stage.followers(self.config).iter().map(Stage::to_string).collect();
-        for folder in io::list_folders(&self.run.path(PATHS))? {
-            if may_show(&folder, &names) {
-                let name = folder.file_name().unwrap_or_default().to_string_lossy();
-                names.push(format!("{PATHS}/{name}"));
+        let mut names = vec![self.views().to_string()];
+        if stage != Stage::Render || self.path.is_none() {
+            let is_done = |stage: Stage| {
+                let plan = self.stage_plan(stage);
+                self.run.is_done(&plan) && self.run.agrees(&plan).is_ok()
+            };
+            let repeated = stage.learns() || is_done(stage);
+            let stays = |s: &Stage| !repeated && *s != stage && is_done(*s);
+            let followers = stage.followers(self.config).into_iter();
+            names = followers.filter(|s| !stays(s)).map(|s| s.to_string()).collect();
+            // views of a path show the head mesh or the extracted surface alone
+            let kept = [true, false].map(|head| self.mesh_input(head));
+            let removed = names.clone();
+            let is_old = |input: &String, digest: &String| {
+                removed.contains(input) && (repeated || !kept.contains(digest))
+            };
+            for folder in io::list_folders(&self.run.path(PATHS))? {
+                if may_show(&folder, &is_old) {
+                    let name = folder.file_name().unwrap_or_default().to_string_lossy();
+                    names.push(format!("{PATHS}/{name}"));
+                }
             }
         }
-        Ok(names)
+        let mut holds = Vec::new();
+        for name in names {
+            if !self.run.files(&name)?.is_empty() {
+                holds.push(name);
+            }
+        }
+        Ok(holds)
     }
 
-    /// Removes what is out of date when a stage is made anew on the way to `until`; nothing, if what `until` asks for
-    /// would be refused then.
+    /// Removes what is out of date when a stage is made anew on the way to `until`, and says so before; nothing, if what
+    /// `until` asks for would be refused then.
     pub fn fresh(&self, stage: Stage, until: Stage) -> Result<()> {
+        let names = self.require(until, Some(stage))?;
+        if !names.is_empty() {
+            self.run
+                .warn("run", &format!("removes what is made anew or out of date: `{}`", names.join("`, `")));
+        }
+        self.run.fresh(&names)
+    }
+
+    /// Returns what is out of date for `until`, if a stage is to be made anew on the way. Nothing is written.
+    ///
+    /// # Errors
+    ///
+    /// The command would be refused before any work.
+    pub fn require(&self, until: Stage, fresh: Option<Stage>) -> Result<Vec<String>> {
+        let Some(stage) = fresh else { return self.agrees(until, &[]).map(|()| Vec::new()) };
         let names = self.out_of_date(stage)?;
-        self.require_inputs(&stage.followers(self.config))?;
+        let made: Vec<Stage> = stage
+            .followers(self.config)
+            .into_iter()
+            .filter(|s| *s == stage || names.iter().any(|name| name == s.word()))
+            .collect();
+        self.require_inputs(&made)?;
+        self.require_masks(&made)?;
         // a finished blend is not cleared for views that it could not be made of again
         let blended = names.iter().any(|n| n == Stage::Ensemble.word())
             && !self.config.ensemble.members.is_empty()
@@ -107,13 +184,19 @@ impl Line<'_> {
             can_blend(self.config)?;
         }
         self.agrees(until, &names)?;
-        self.run.fresh(&names)
+        let mut removed = 0;
+        for name in &names {
+            removed += self.run.files(name)?.values().sum::<u64>();
+        }
+        let order = self.order(until).into_iter().filter(|stage| made.contains(stage));
+        order.map(|stage| self.plan(stage)).try_for_each(|plan| self.run.require_room(&plan, removed))?;
+        Ok(names)
     }
 
     /// Does what lies in the run agree with what `until` asks for, but for the folders in `cleared`?
     fn agrees(&self, until: Stage, cleared: &[String]) -> Result<()> {
         self.can_make(until)?;
-        let plans = self.order(until).into_iter().map(|stage| self.plan(stage));
+        let plans = self.order(until).into_iter().map(|stage| self.compared_plan(stage));
         let mut kept = plans.filter(|plan| !cleared.iter().any(|name| name == plan.name));
         kept.try_for_each(|plan| self.run.agrees(&plan))
     }
@@ -138,15 +221,30 @@ impl Line<'_> {
 
     /// What a stage is about to do; its fingerprint holds those of the stages it needs.
     pub fn plan(&self, stage: Stage) -> Plan<'_> {
-        if let (Stage::Render, Some(path)) = (stage, &self.path) {
-            return self.path_plan(path);
+        match &self.path {
+            Some(path) if stage == Stage::Render => self.path_plan(path),
+            _ => self.stage_plan(stage),
         }
+    }
+
+    /// The plan of a stage with what an earlier process saw differently in the capture.
+    fn compared_plan(&self, stage: Stage) -> Plan<'_> {
+        let mut plan = self.plan(stage);
+        if stage == Stage::Mask {
+            plan.fingerprint.changed = self.changed_input();
+        }
+        plan
+    }
+
+    /// The plan of a stage whose views, if it makes any, are those of the evaluation.
+    fn stage_plan(&self, stage: Stage) -> Plan<'_> {
         let config = self.config;
         let name = stage.word();
         let mut settings = config.values(name);
         let mut needs_bytes = 16 << 20;
         let needs = stage.needs(config).into_iter();
-        let mut inputs: Vec<_> = needs.map(|s| (s.word(), self.plan(s).fingerprint.digest())).collect();
+        let methods = &config.render.method;
+        let mut inputs: Vec<_> = needs.map(|s| (s.word(), self.input(s, name, methods))).collect();
         if stage.learns() {
             settings.insert("capture.tiles".into(), config.capture.tiles.to_string());
             settings.insert("seed".into(), config.seed.to_string());
@@ -249,6 +347,36 @@ impl Line<'_> {
         Plan { name, fingerprint, device: &config.device, needs_bytes, saves: stage.learns() }
     }
 
+    /// Digest of a stage as that in the folder `reader` takes it; of the mesh it is what views by these methods show.
+    fn input(&self, stage: Stage, reader: &str, methods: &[Method]) -> String {
+        let whole = self.stage_plan(stage).fingerprint.digest();
+        // in runs from before there was a difference it was all of the mesh
+        let old = || {
+            let folder = self.run.path(reader);
+            let record = read_record(&folder).ok().flatten().map(|r| r.fingerprint);
+            let begun = || read_status(&folder).ok().flatten().map(|s| s.fingerprint);
+            record.or_else(begun)?.inputs.remove(stage.word())
+        };
+        match stage {
+            Stage::Mesh if old().as_ref() != Some(&whole) => {
+                self.mesh_input(shows_head(self.config, methods))
+            }
+            _ => whole,
+        }
+    }
+
+    /// Digest of the head mesh, or of the extracted surface alone, without the settings that shape nothing of it.
+    fn mesh_input(&self, head: bool) -> String {
+        let mut fingerprint = self.stage_plan(Stage::Mesh).fingerprint;
+        // lobes are in the coordinates of the file
+        let frame = self.config.mesh.lobes == 0;
+        fingerprint.settings.retain(|key, _| {
+            let shapes = !FILE_KEYS.contains(&key.as_str()) && (head || !HEAD_KEYS.contains(&key.as_str()));
+            shapes && !(frame && key == "mesh.frame")
+        });
+        fingerprint.digest()
+    }
+
     /// What the views of a path are made of.
     fn path_plan<'p>(&'p self, path: &'p CameraPath) -> Plan<'p> {
         let CameraPath { folder, render, cameras, digest } = path;
@@ -265,7 +393,7 @@ impl Line<'_> {
             fingerprint = fingerprint.input("cameras", digest);
         }
         for stage in render.shows() {
-            fingerprint = fingerprint.input(stage.word(), self.plan(stage).fingerprint.digest());
+            fingerprint = fingerprint.input(stage.word(), self.input(stage, folder, &render.method));
         }
         let pixels = |c: &crate::geom::Camera| c.width as u64 * c.height as u64;
         let all = match cameras {
@@ -283,12 +411,13 @@ impl Line<'_> {
     }
 }
 
-/// Do the views in a path's folder show one of these stages? Views whose records cannot be read may.
-fn may_show(folder: &Path, stages: &[String]) -> bool {
+/// Do the views in a path's folder show a stage, of this digest, that is old? Views whose records cannot be read may.
+fn may_show(folder: &Path, is_old: &dyn Fn(&String, &String) -> bool) -> bool {
+    let any = |f: &Fingerprint| f.inputs.iter().any(|(stage, digest)| is_old(stage, digest));
     match (read_status(folder), read_record(folder)) {
         (Ok(None), Ok(None)) => false,
-        (Ok(Some(status)), _) => status.fingerprint.inputs.keys().any(|input| stages.contains(input)),
-        (_, Ok(Some(record))) => record.fingerprint.inputs.keys().any(|input| stages.contains(input)),
+        (Ok(Some(status)), _) => any(&status.fingerprint),
+        (_, Ok(Some(record))) => any(&record.fingerprint),
         _ => true,
     }
 }

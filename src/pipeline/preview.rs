@@ -1,12 +1,13 @@
 //! Pictures of a mesh to look at: of a run's head, or of a file that anybody wrote.
 
 use super::export::{center as center_of, front as front_of};
+use super::mesh::finished_mesh;
 use super::page::views::{error, heat};
 use super::path::cameras_of_file;
 use super::pictures::{behind, expected, over, straight};
 use super::scene_file::read_capture;
 use crate::capture::{Split, View};
-use crate::config::ViewBackground;
+use crate::config::{Stage, ViewBackground};
 use crate::geom::{Atlas, Camera, Distortion, Similarity};
 use crate::image::{Image, quantize, reduce_photo, working_size};
 use crate::io::{self, Limits};
@@ -48,10 +49,9 @@ impl Preview {
     ///
     /// The run has no mesh yet, or it is damaged.
     pub fn of_run(run: &Path) -> Result<Preview> {
-        if !io::is_file(&run.join("mesh/done.json")) {
-            let what = format!("the run `{}` has no mesh yet", run.display());
-            return Err(Error::cannot(what, format!("make one: `tiface mesh {}`", run.display())));
-        }
+        // pictures are of `mesh/parts`: what is wrong with other files of the stage is no reason for none
+        let problem = finished_mesh(run)?.require_products(&run.join(Stage::Mesh)).err();
+        let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
         let head = HeadMesh::load(&run.join("mesh/parts"))?;
         let capture = read_capture(&run.join("cameras.json"), Path::new(""))?;
         let to_scene = head.world_from_scene.rotation_f32().transpose();
@@ -60,7 +60,7 @@ impl Preview {
         let front = front_of(capture.up, &eyes, center);
         let up = to_scene * capture.up.normalize_or(Vec3::Y);
         let front = front.map_or_else(|| up.any_orthonormal_vector(), |f| to_scene * f);
-        Ok(Preview { head, bare_atlas: None, up, front, views: capture.views, warnings: Vec::new() })
+        Ok(Preview { head, bare_atlas: None, up, front, views: capture.views, warnings })
     }
 
     /// Returns the mesh in a `.glb`, `.obj` or `.ply` file. `up` is where its up is, +Y for most; its front is then +Z, or

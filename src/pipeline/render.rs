@@ -16,7 +16,7 @@ use super::pictures;
 use super::surface::Fields;
 use crate::capture::Split;
 use crate::capture::scene::{self, Scene};
-use crate::config::{ColorSource, Method};
+use crate::config::{ColorSource, Config, Method};
 use crate::geom::{Bvh, Camera, Ray, ShellCaster, Similarity};
 use crate::io;
 use crate::mesh::files::{ExtractedSurface, HeadMesh};
@@ -92,6 +92,14 @@ pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
     }
 }
 
+/// Do some methods show the head mesh? Fitted colors lie on it, the network's wherever rays meet the extracted surface.
+pub(super) fn shows_head(config: &Config, methods: &[Method]) -> bool {
+    let fitted = config.mesh.color == ColorSource::Photographs;
+    let shows =
+        |m: &Method| matches!(m, Method::Textured | Method::Raster) || *m == Method::Raycast && fitted;
+    methods.iter().any(shows)
+}
+
 /// The meshes that some methods show.
 pub(super) struct Meshes {
     extracted: Option<ExtractedSurface>,
@@ -105,10 +113,9 @@ impl Meshes {
     pub fn load(line: &Line, methods: &[Method]) -> Result<Meshes> {
         let (raycast, textured) = (methods.contains(&Method::Raycast), methods.contains(&Method::Textured));
         let raster = methods.contains(&Method::Raster);
-        // fitted colors lie on the head mesh, the network's wherever rays meet a surface
         let fitted = line.config.mesh.color == ColorSource::Photographs;
         let extracted = (raycast && !fitted).then(|| extracted_surface(line)).transpose()?;
-        let head = (textured || raster || raycast && fitted).then(|| head_mesh(line)).transpose()?;
+        let head = shows_head(line.config, methods).then(|| head_mesh(line)).transpose()?;
         if textured && head.as_ref().is_some_and(|head| head.texture.is_none()) {
             return Err(Error::cannot(
                 "the mesh has no texture to be shown",

@@ -2,7 +2,7 @@
 
 mod tables;
 
-use crate::kernel::rng;
+use crate::kernel::cpu::rng;
 use crate::{Error, Result};
 use serde::Serialize;
 

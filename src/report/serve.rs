@@ -2,22 +2,28 @@
 //!
 //! It listens on 127.0.0.1 alone and answers GET alone. Addresses begin with a random token, so that no other user and no
 //! other page can guess one; the `Host` must be this machine, so that no foreign name can point here. A request has
-//! [`PATIENCE`] and [`HEADER_BYTES`]; [`MOST_AT_ONCE`] are answered at a time, and more are turned away. What may be
-//! read is decided by whoever answers, by comparing whole addresses: no path is ever made from one.
+//! [`REQUEST_TIME`] and [`HEADER_BYTES`], and [`MOST_WAITING`] are listened to side by side: the oldest makes room for the
+//! next. Only those with the token take one of the [`MOST_AT_ONCE`] threads that answer; more are turned away. What may
+//! be read is decided by whoever answers, by comparing whole addresses: no path is ever made from one.
 
 use crate::{Error, ErrorKind, Result};
+use std::collections::VecDeque;
 use std::io::{ErrorKind as Io, Read, Write};
 use std::net::{Ipv4Addr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// A request may take so long, and an answer so long without any of it going.
+/// A request may take so long.
+const REQUEST_TIME: Duration = Duration::from_secs(2);
+/// An answer may take so long without any of it going.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// An answer may take so long.
 const LONGEST: Duration = Duration::from_secs(60);
 /// A request may be so long.
 const HEADER_BYTES: usize = 8192;
-/// So many connections at a time; a browser opens six.
+/// So many connections may have sent no whole request yet.
+const MOST_WAITING: usize = 64;
+/// So many answers at a time; a browser opens six connections.
 const MOST_AT_ONCE: usize = 16;
 /// How often a stop is looked for.
 const LOOK: Duration = Duration::from_millis(100);
@@ -62,60 +68,41 @@ impl Server {
 
     /// Answers until `stop`: `answer` gets what follows the token and its slash, as it was sent, without a query.
     pub fn run(&self, stop: &(dyn Fn() -> bool + Sync), answer: &(dyn Fn(&str) -> Option<Answer> + Sync)) {
-        let busy = AtomicUsize::new(0);
+        let (busy, mut waiting) = (AtomicUsize::new(0), VecDeque::new());
         std::thread::scope(|threads| {
             while !stop() {
-                let Ok((stream, _)) = self.listener.accept() else {
-                    std::thread::sleep(LOOK / 5);
-                    continue;
-                };
-                if busy.load(Ordering::SeqCst) >= MOST_AT_ONCE {
-                    continue; // dropped, and so closed
+                match self.listener.accept() {
+                    Ok((stream, _)) => {
+                        waiting.push_back(Request { stream, begin: Instant::now(), head: Vec::new() });
+                        if waiting.len() > MOST_WAITING {
+                            waiting.pop_front(); // dropped, and so closed
+                        }
+                    }
+                    Err(_) => std::thread::sleep(LOOK / 5),
                 }
-                busy.fetch_add(1, Ordering::SeqCst);
-                let busy = &busy;
-                threads.spawn(move || {
-                    // a client that goes away needs no answer
-                    let _ = self.answer(stream, stop, answer);
-                    busy.fetch_sub(1, Ordering::SeqCst);
-                });
+                for mut request in std::mem::take(&mut waiting) {
+                    let Some(head) = request.read() else {
+                        waiting.push_back(request);
+                        continue;
+                    };
+                    let (mut stream, busy) = (request.stream, &busy);
+                    match self.target(&head).map(str::to_owned) {
+                        // it fits into the system's buffer, and a client that goes away needs no answer
+                        Err(status) => drop(stream.write(&reply(status, None))),
+                        Ok(_) if busy.load(Ordering::SeqCst) >= MOST_AT_ONCE => {}
+                        Ok(rest) => {
+                            busy.fetch_add(1, Ordering::SeqCst);
+                            threads.spawn(move || {
+                                let found = answer(&rest);
+                                let status = if found.is_some() { "200 OK" } else { "404 Not Found" };
+                                let _ = send(&mut stream, &reply(status, found), stop);
+                                busy.fetch_sub(1, Ordering::SeqCst);
+                            });
+                        }
+                    }
+                }
             }
         });
-    }
-
-    fn answer(
-        &self,
-        mut stream: TcpStream,
-        stop: &dyn Fn() -> bool,
-        answer: &dyn Fn(&str) -> Option<Answer>,
-    ) -> std::io::Result<()> {
-        stream.set_nonblocking(false)?;
-        stream.set_read_timeout(Some(LOOK))?;
-        stream.set_write_timeout(Some(LOOK))?;
-        let (status, found) = match read_request(&mut stream, stop)? {
-            None => ("400 Bad Request", None),
-            Some(request) => match self.target(&request) {
-                Err(status) => (status, None),
-                Ok(rest) => match answer(rest) {
-                    None => ("404 Not Found", None),
-                    found => ("200 OK", found),
-                },
-            },
-        };
-        let Answer { kind, body } = found.unwrap_or_else(|| Answer {
-            kind: "text/plain; charset=utf-8",
-            body: format!("{status}\n").into_bytes(),
-        });
-        let head = format!(
-            "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {}\r\nConnection: close\r\n\
-             Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
-             Cross-Origin-Resource-Policy: same-origin\r\nContent-Security-Policy: default-src 'none'; img-src 'self' \
-             data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'; base-uri 'none'; \
-             form-action 'none'; frame-ancestors 'none'\r\n\r\n",
-            body.len()
-        );
-        send(&mut stream, head.as_bytes(), stop)?;
-        send(&mut stream, &body, stop)
     }
 
     /// What a request asks for after the token, or the status that refuses it.
@@ -142,26 +129,54 @@ impl Server {
     }
 }
 
-/// The head of a request; `None` if it is too long, too slow, or no text.
-fn read_request(stream: &mut TcpStream, stop: &dyn Fn() -> bool) -> std::io::Result<Option<String>> {
-    let begin = Instant::now();
-    let (mut head, mut part) = (Vec::new(), [0; 1024]);
-    while begin.elapsed() < PATIENCE && !stop() {
-        match stream.read(&mut part) {
-            Ok(0) => return Ok(None),
-            Ok(n) => head.extend_from_slice(&part[..n]),
-            Err(e) if is_slow(&e) => continue,
-            Err(e) => return Err(e),
+/// A connection whose request is not whole yet.
+struct Request {
+    stream: TcpStream,
+    begin: Instant,
+    head: Vec<u8>,
+}
+
+impl Request {
+    /// Reads what has come, without waiting. Returns the head once it is whole; an empty one if it is too long, too slow, or
+    /// no text.
+    fn read(&mut self) -> Option<String> {
+        let mut part = [0; 1024];
+        let is_open = self.stream.set_nonblocking(true).is_ok();
+        while is_open && self.begin.elapsed() < REQUEST_TIME {
+            match self.stream.read(&mut part) {
+                Ok(0) => break,
+                Ok(n) => self.head.extend_from_slice(&part[..n]),
+                Err(e) if is_slow(&e) => return None,
+                Err(_) => break,
+            }
+            let end = self.head.windows(4).position(|w| w == b"\r\n\r\n");
+            if end.unwrap_or(self.head.len()) > HEADER_BYTES {
+                break;
+            }
+            if let Some(end) = end {
+                self.head.truncate(end);
+                return Some(String::from_utf8(std::mem::take(&mut self.head)).unwrap_or_default());
+            }
         }
-        if let Some(end) = head.windows(4).position(|w| w == b"\r\n\r\n") {
-            head.truncate(end);
-            return Ok((end <= HEADER_BYTES).then(|| String::from_utf8(head).ok()).flatten());
-        }
-        if head.len() > HEADER_BYTES {
-            return Ok(None);
-        }
+        Some(String::new())
     }
-    Ok(None)
+}
+
+/// A whole answer, or the words of its status.
+fn reply(status: &str, found: Option<Answer>) -> Vec<u8> {
+    let Answer { kind, body } = found.unwrap_or_else(|| Answer {
+        kind: "text/plain; charset=utf-8",
+        body: format!("{status}\n").into_bytes(),
+    });
+    let head = format!(
+        "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {}\r\nConnection: close\r\n\
+         Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
+         Cross-Origin-Resource-Policy: same-origin\r\nContent-Security-Policy: default-src 'none'; img-src 'self' \
+         data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'; base-uri 'none'; \
+         form-action 'none'; frame-ancestors 'none'\r\n\r\n",
+        body.len()
+    );
+    [head.into_bytes(), body].concat()
 }
 
 fn is_slow(e: &std::io::Error) -> bool {
@@ -170,6 +185,8 @@ fn is_slow(e: &std::io::Error) -> bool {
 
 /// Sends all of it, unless nothing of it goes for some time, all of it takes too long, or a stop is asked for.
 fn send(stream: &mut TcpStream, mut bytes: &[u8], stop: &dyn Fn() -> bool) -> std::io::Result<()> {
+    stream.set_nonblocking(false)?;
+    stream.set_write_timeout(Some(LOOK))?;
     let begin = Instant::now();
     let mut moved = begin;
     while !bytes.is_empty() {
@@ -269,16 +286,49 @@ mod tests {
 
     #[test]
     fn silent_clients_neither_block_others_nor_the_end() {
-        let begin = Instant::now();
+        let mut silent = Vec::new();
         with_server(|server, ask| {
-            let silent: Vec<TcpStream> = (0..MOST_AT_ONCE - 2)
-                .map(|_| TcpStream::connect(("127.0.0.1", server.port)).unwrap())
-                .collect();
+            let connect = || TcpStream::connect(("127.0.0.1", server.port)).unwrap();
             let request =
                 format!("GET /{}/ HTTP/1.1\r\nHost: 127.0.0.1:{}\r\n\r\n", server.token, server.port);
-            assert!(ask(request.as_bytes()).starts_with("HTTP/1.1 200 "));
-            drop(silent);
+            let is_answered = || ask(request.as_bytes()).starts_with("HTTP/1.1 200 ");
+            silent.extend((0..2 * MOST_WAITING).map(|_| connect()));
+            assert!(is_answered());
+            let over = AtomicBool::new(false);
+            std::thread::scope(|threads| {
+                // a stranger who opens others as soon as they are closed
+                threads.spawn(|| {
+                    while !over.load(Ordering::SeqCst) {
+                        drop((0..MOST_AT_ONCE).map(|_| connect()).collect::<Vec<_>>());
+                    }
+                });
+                let answered = (0..40).filter(|_| is_answered()).count();
+                over.store(true, Ordering::SeqCst);
+                assert_eq!(answered, 40);
+            });
+            silent.extend((0..MOST_WAITING).map(|_| connect()));
         });
-        assert!(begin.elapsed() < PATIENCE, "{:?}", begin.elapsed());
+        // the server has ended, and closed what it was still listening to
+        for mut stream in silent {
+            stream.set_nonblocking(true).unwrap();
+            assert!(!stream.read(&mut [0]).is_err_and(|e| is_slow(&e)));
+        }
+    }
+
+    #[test]
+    fn a_request_in_pieces_is_answered_once_it_is_whole() {
+        with_server(|server, ask| {
+            let request =
+                format!("GET /{}/ HTTP/1.1\r\nHost: localhost:{}\r\n\r\n", server.token, server.port);
+            let (first, second) = request.split_at(20);
+            let mut stream = TcpStream::connect(("127.0.0.1", server.port)).unwrap();
+            stream.write_all(first.as_bytes()).unwrap();
+            // the server has looked at the first piece by the time it answers another
+            assert!(ask(request.as_bytes()).starts_with("HTTP/1.1 200 "));
+            stream.write_all(second.as_bytes()).unwrap();
+            let mut text = String::new();
+            stream.read_to_string(&mut text).unwrap();
+            assert!(text.ends_with("\r\n\r\nfound "), "{text}");
+        });
     }
 }

@@ -14,12 +14,15 @@ pub struct Fingerprint {
     pub settings: BTreeMap<String, String>,
     /// Name of an input to its own digest.
     pub inputs: BTreeMap<String, String>,
+    /// What of the input `capture` is not as it was, where that is known: for people, and no part of the digest.
+    #[serde(skip)]
+    pub changed: Option<String>,
 }
 
 impl Fingerprint {
     /// Settings alone.
     pub fn new(format: u32, settings: BTreeMap<String, String>) -> Fingerprint {
-        Fingerprint { format, settings, inputs: BTreeMap::new() }
+        Fingerprint { format, settings, ..Fingerprint::default() }
     }
 
     /// With one more setting.
@@ -78,7 +81,10 @@ impl Fingerprint {
             lines.push(match (older.inputs.contains_key(name), self.inputs.contains_key(name)) {
                 (true, false) => format!("{name}: was part of it, is not asked for now"),
                 (false, true) => format!("{name}: is asked for now, was no part of it"),
-                _ => format!("{name}: has changed since"),
+                _ => match &self.changed {
+                    Some(changed) if name == "capture" => format!("{name}: {changed}"),
+                    _ => format!("{name}: has changed since"),
+                },
             });
         }
         lines

@@ -94,7 +94,7 @@ impl Run {
         // one process at a time: what else of this file looks half-written was left by one that is gone
         let lock = Lock::wait(&self.path(LOCK));
         if lock.is_ok() {
-            let _ = io::remove_leftovers(&self.dir, Some(name)); // the next one tries again
+            let _ = io::remove_leftovers(&self.dir, |of, _| of == name); // the next one tries again
         }
         Ok(io::write_atomic(&path, bytes)?)
     }
@@ -135,6 +135,8 @@ impl Run {
             return Ok(());
         }
         match io::any_file(&folder, &has_record)? {
+            // another process began the stage between the two looks
+            Some(_) if has_record(&folder) => Ok(()),
             Some(file) => Err(Error::cannot(
                 format!(
                     "`{}` is in the way: it is no folder of a run, and holds `{}`",
@@ -164,8 +166,13 @@ impl Run {
         &self.stop
     }
 
-    /// Leaves word of what a command ended with before any stage could say so; whether that succeeds is no matter.
+    /// Leaves word of what a command ended with before any stage could say so; whether that succeeds is no matter. In a
+    /// folder that holds other things than a run, nothing is left.
     pub fn failed(&self, error: &Error) {
+        let is_run = ["config.toml", FAILED].iter().any(|name| io::is_file(&self.path(name)));
+        if !is_run && !matches!(io::any_file(&self.dir, &|_| false), Ok(None)) {
+            return;
+        }
         let failure =
             Failure { error: error.to_string(), hint: error.hint().into(), exit: error.kind().code() };
         let _ = self.write(FAILED, format!("{}\n", serde_json::json!(failure)).as_bytes());

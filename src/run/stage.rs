@@ -1,12 +1,13 @@
 //! One stage of a run: skipped, refused, or worked on under its lock.
 
 use super::progress::Progress;
-use super::status::{host, now};
+use super::status::{TIMED, host, now};
 use super::{Event, Fingerprint, Record, Run, State, Status};
 use super::{has_record, read_record, read_status};
 use crate::io;
 use crate::{Error, Monitor, Result};
 use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -131,15 +132,7 @@ impl Run {
         if removed > 0 {
             self.warn(name, &format!("removed {removed} half-written files of an interrupted process"));
         }
-        if let Some(free) = io::free_bytes(&folder).filter(|free| *free < plan.needs_bytes) {
-            let (needed, run) = (plan.needs_bytes, self.dir.display());
-            return Err(Error::cannot(
-                format!(
-                    "stage `{name}` needs about {needed} bytes, but only {free} are free on the disk of `{run}`"
-                ),
-                "free space, or place the run on another disk with `--run DIR`",
-            ));
-        }
+        self.require_room(&plan, 0)?;
 
         let status = Status {
             state: State::Running,
@@ -189,10 +182,31 @@ impl Run {
     pub fn agrees(&self, plan: &Plan) -> Result<()> {
         // a record that cannot be read counts as none, and is reported when the stage is worked on
         if let Ok(Some(record)) = read_record(&self.path(plan.name)) {
-            return same(plan, &record.fingerprint, true);
+            same(plan, &record.fingerprint, true)?;
+            return record.require_products(&self.path(plan.name)).map(|_| ());
         }
         self.is_ours(plan.name)?;
         self.begun(plan).map(|_| ())
+    }
+
+    /// An error if a stage needs more room than its disk has with so many bytes `removed`.
+    pub fn require_room(&self, plan: &Plan, removed: u64) -> Result<()> {
+        // a stage's folder may be a link to another disk
+        let free = io::free_bytes(&self.path(plan.name)).or_else(|| io::free_bytes(&self.dir));
+        let free = free.map(|free| free.saturating_add(removed)).filter(|free| *free < plan.needs_bytes);
+        let Some(free) = free else { return Ok(()) };
+        let (stage, needed, run) = (plan.name, plan.needs_bytes, self.dir.display());
+        Err(Error::cannot(
+            format!(
+                "stage `{stage}` needs about {needed} bytes, but only {free} are free on the disk of `{run}`"
+            ),
+            "free space, or place the run on another disk with `--run DIR`",
+        ))
+    }
+
+    /// Bytes of the files of a stage, by their path in its folder; of what has a record of its own below it none.
+    pub fn files(&self, stage: &str) -> Result<BTreeMap<String, u64>> {
+        Ok(io::file_sizes(&self.path(stage), &has_record)?)
     }
 
     /// Is the stage complete, as planned?
@@ -210,8 +224,17 @@ impl Run {
                 None
             }
         };
-        let Some(Record { fingerprint, digest, summary, .. }) = record else { return Ok(None) };
-        same(plan, &fingerprint, true)?;
+        let Some(record) = record else { return Ok(None) };
+        same(plan, &record.fingerprint, true)?;
+        for name in record.require_products(&self.path(plan.name))? {
+            let (file, run) = (self.path(plan.name).join(name), self.dir.display());
+            let again = match name.starts_with("head.") {
+                true => format!("`tiface mesh {run} --out FILE` writes the mesh again"),
+                false => "no stage reads it".into(),
+            };
+            self.warn(plan.name, &format!("`{}` is no longer in its folder; {again}", file.display()));
+        }
+        let Record { digest, summary, .. } = record;
         self.observer.event(&Event::Skipped { stage: plan.name });
         Ok(Some(Done { digest, summary, skipped: true }))
     }
@@ -230,6 +253,8 @@ impl Run {
             s.eta_s = None;
         })?;
         let digest = plan.fingerprint.digest();
+        let mut products = self.files(plan.name)?;
+        products.retain(|file, _| !TIMED.contains(&file.as_str()));
         let record = Record {
             stage: plan.name.into(),
             fingerprint: plan.fingerprint.clone(),
@@ -239,6 +264,7 @@ impl Run {
             cpu_s: Some((cpu_s.max(0.0) * 1e3).round() / 1e3),
             peak_bytes: io::peak_memory(),
             warnings: stage.progress.warnings(),
+            products,
             finished: now(),
             version: env!("CARGO_PKG_VERSION").into(),
         };
@@ -255,8 +281,12 @@ fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<()> {
         return Ok(());
     }
     let (stage, state) = (plan.name, if done { "done" } else { "begun" });
-    if differences == ["capture: has changed since"] {
-        let what = format!("stage `{stage}` was {state} with other photographs, masks or cameras");
+    if let [difference] = &differences[..]
+        && difference.starts_with("capture: ")
+    {
+        let changed = plan.fingerprint.changed.iter().map(|changed| format!(": {changed}"));
+        let changed = changed.collect::<String>();
+        let what = format!("stage `{stage}` was {state} with other photographs, masks or cameras{changed}");
         let hint = format!(
             "say where those lie with `--set capture.path=FOLDER`, choose another folder with `--run DIR`, or recompute \
              this stage and what follows with `--fresh {stage}`"
@@ -284,7 +314,7 @@ fn sweep(folder: &Path) -> Result<usize> {
     if io::is_link(folder) {
         return Ok(0);
     }
-    let mut removed = io::remove_leftovers(folder, None)?;
+    let mut removed = io::remove_leftovers(folder, |_, _| true)?;
     for inner in io::list_folders(folder)?.iter().filter(|f| !has_record(f)) {
         removed += sweep(inner)?;
     }
@@ -347,6 +377,58 @@ mod tests {
         let log = fs::read_to_string(dir.path().join("iface/log.jsonl")).unwrap();
         let line: Value = serde_json::from_str(log.trim()).unwrap();
         assert_eq!((&line["step"], &line["bad"]), (&json!(5), &Value::Null));
+    }
+
+    #[test]
+    fn a_product_that_was_cut_or_lost_is_no_finished_stage() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        let mesh = Plan { name: "mesh", ..plan(5) };
+        run.stage(mesh.clone(), |stage| {
+            fs::create_dir(stage.folder().join("parts")).unwrap();
+            for name in ["head.glb", "parts/head"] {
+                io::write_atomic(&stage.folder().join(name), b"triangles")?;
+            }
+            Ok(Value::Null)
+        })
+        .unwrap();
+        let record = read_record(&dir.path().join("mesh")).unwrap().unwrap();
+        let products: Vec<_> = record.products.iter().map(|(name, bytes)| (name.as_str(), *bytes)).collect();
+        assert_eq!(products, [("head.glb", 9), ("parts/head", 9)]);
+        let head = dir.path().join("mesh/head.glb");
+        let refused = |what: &str| {
+            for error in [run.agrees(&mesh).unwrap_err(), run.stage(mesh.clone(), never).unwrap_err()] {
+                assert!(error.to_string().contains(what), "{error}");
+                assert!(error.hint().contains("`--fresh mesh`"), "{}", error.hint());
+            }
+        };
+        fs::write(&head, b"tri").unwrap();
+        refused("mesh/head.glb` has 3 bytes, but the stage `mesh` left 9");
+        // what is made from the parts may be moved away
+        fs::remove_file(&head).unwrap();
+        assert!(run.stage(mesh.clone(), never).unwrap().skipped);
+        fs::remove_file(dir.path().join("mesh/parts/head")).unwrap();
+        refused("mesh/parts/head` is missing");
+        // records from before there were sizes in them
+        let mut record = serde_json::to_value(record).unwrap();
+        record.as_object_mut().unwrap().remove("products");
+        fs::write(dir.path().join("mesh/done.json"), record.to_string()).unwrap();
+        assert!(run.stage(mesh.clone(), never).unwrap().skipped);
+    }
+
+    #[test]
+    fn somebodys_own_folder_gets_no_word_of_what_was_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        fs::write(dir.path().join("thesis.tex"), b"mine").unwrap();
+        run.failed(&Error::cannot("no cameras", "add them"));
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+        // a run's own folder, and one that the command would have made, get it
+        fs::write(dir.path().join("config.toml"), b"").unwrap();
+        for dir in [dir.path().to_path_buf(), dir.path().join("new")] {
+            open(&dir).failed(&Error::cannot("no cameras", "add them"));
+            assert!(dir.join("failed.json").is_file());
+        }
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Where a run stands as a whole: its stages by what they left, what is still to do, and what went wrong.
 
 use super::{LOCK, Record, State, Status, read_estimate, read_record, read_status};
-use crate::config::Stage;
+use crate::config::{Config, Stage};
 use crate::io::{self, Limits};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -104,6 +104,8 @@ impl Standing {
             };
         }
         let failure = read_failure(run);
+        let settings = Some(run.join("config.toml")).filter(|file| io::is_file(file));
+        let settings = settings.and_then(|file| Config::read(&file).err());
         let has = |phase: Phase| stages.iter().rev().find(|s| s.phase == phase);
         let is_done = match &estimate {
             Some(_) => stages.iter().all(|s| s.phase == Phase::Done),
@@ -112,15 +114,21 @@ impl Standing {
         let worst = [Phase::Running, Phase::Unreadable, Phase::Failed, Phase::Killed, Phase::Stopped];
         let found = worst.into_iter().find_map(has).map(|s| (s.phase, Some(s.stage)));
         let (phase, at) = match found {
-            _ if is_done => (Phase::Done, None),
+            _ if is_done && settings.is_none() => (Phase::Done, None),
             Some((Phase::Running, at)) => (Phase::Running, at),
+            _ if settings.is_some() => (Phase::Unreadable, None),
             _ if failure.is_some() => (Phase::Failed, None),
             Some(found) => found,
             None if has(Phase::Done).is_some() => (Phase::Begun, None),
             None => (Phase::Waiting, None),
         };
         let of_stage = at.and_then(|at| stages.iter().find(|s| s.stage == at)?.error.clone());
-        let error = of_stage.or(failure.filter(|_| phase == Phase::Failed).map(|f| f.error));
+        let of_run = match phase {
+            Phase::Failed => failure.map(|f| f.error),
+            Phase::Unreadable => settings.map(|e| e.to_string()),
+            _ => None,
+        };
+        let error = of_stage.or(of_run);
         let elapsed = |s: &StageStanding| {
             let kept = s.status.as_ref().map_or(0.0, |s| s.elapsed_s);
             s.record.as_ref().map_or(kept, |r| r.elapsed_s)

@@ -1,10 +1,11 @@
 //! `status.json` and `done.json`: what a stage says of itself.
 
 use super::Fingerprint;
-use crate::Result;
 use crate::io::{self, Limits, ReadError};
+use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -81,10 +82,71 @@ pub struct Record {
     /// What went differently than hoped.
     #[serde(default)]
     pub warnings: Vec<String>,
+    /// Bytes of each file that the stage left, by its path in the stage's folder; empty in older records.
+    #[serde(default)]
+    pub products: BTreeMap<String, u64>,
     /// Seconds since 1970.
     pub finished: u64,
     /// The version of `tiface`.
     pub version: String,
+}
+
+/// Files that tell when things happened, and are no products of a stage.
+pub(super) const TIMED: [&str; 3] = ["done.json", "status.json", "log.jsonl"];
+
+/// Files that no stage reads, for people and other programs: a run is whole without them. `tiface mesh --out` writes the
+/// head again from what the stage `mesh` keeps in `parts`.
+const EXPORTS: [&str; 10] = [
+    "head.glb",
+    "head.obj",
+    "head.mtl",
+    "head.ply",
+    "head.png",
+    "head.jpg",
+    "head.exr",
+    "surface.ply",
+    "sheet.html",
+    "inputs.json",
+];
+
+impl Record {
+    /// Compares the files in the stage's folder with those that the stage left. Returns the exported files that were moved
+    /// away.
+    ///
+    /// # Errors
+    ///
+    /// Another file is no longer in the folder, or one has another size.
+    pub fn require_products(&self, folder: &Path) -> Result<Vec<&str>> {
+        let mut moved = Vec::new();
+        for (name, &bytes) in &self.products {
+            let file = folder.join(name);
+            let is_export = EXPORTS.contains(&name.as_str());
+            let problem = match io::file_size(&file) {
+                Some(found) if found == bytes => continue,
+                Some(found) => format!("has {found} bytes, but the stage `{}` left {bytes}", self.stage),
+                None if is_export => {
+                    moved.push(name.as_str());
+                    continue;
+                }
+                None => format!("is missing, though the stage `{}` is done", self.stage),
+            };
+            let stage = self.stage.split('/').next().unwrap_or_default();
+            return Err(Error::cannot(
+                format!("`{}` {problem}", file.display()),
+                match is_export {
+                    true => format!(
+                        "put the file back, remove it, for no stage reads it, or recompute the stage with `--fresh {stage}`"
+                    ),
+                    false => {
+                        format!(
+                            "put the file back, or recompute the stage and what follows with `--fresh {stage}`"
+                        )
+                    }
+                },
+            ));
+        }
+        Ok(moved)
+    }
 }
 
 /// The `status.json` of a stage folder; `None` if there is none.

@@ -10,9 +10,9 @@ use crate::mesh::files::{ExportOptions, HeadMesh, HeadTexture, compact_glb, open
 use crate::mesh::{SimplifyConfig, simplify};
 use crate::pipeline::export::{Export, center};
 use crate::pipeline::line::Line;
-use crate::pipeline::mesh::head_mesh;
+use crate::pipeline::mesh::{finished_mesh, head_mesh};
 use crate::report::{ViewRow, Viewer, ViewerCamera, viewer_html};
-use crate::run::read_record;
+use crate::run::{Record, read_record};
 use crate::{Error, Quiet};
 use glam::Vec3;
 use std::cell::RefCell;
@@ -25,9 +25,15 @@ const FEWER: usize = 100_000;
 
 /// The head of a run, without cameras, and from the dataset's world to its coordinates; `None` before the stage `mesh`.
 pub(super) fn viewer(line: &Line) -> Result<Option<(Viewer, Similarity)>> {
-    if read_record(&line.run.path(Stage::Mesh)).ok().flatten().is_none() {
-        return Ok(None);
+    match read_record(&line.run.path(Stage::Mesh)) {
+        Ok(Some(record)) => shown(line, &record).map(Some),
+        _ => Ok(None),
     }
+}
+
+/// The head of a run whose mesh is done.
+fn shown(line: &Line, mesh: &Record) -> Result<(Viewer, Similarity)> {
+    mesh.require_products(&line.run.path(Stage::Mesh))?;
     let (file, export) = (line.run.path("mesh/head.glb"), Export::new(&line.capture, line.config));
     let head = head_mesh(line)?;
     let as_glb = |head: &HeadMesh| Ok(export.files(head, MeshFormat::Glb, "head")?.files.swap_remove(0).1);
@@ -43,7 +49,7 @@ pub(super) fn viewer(line: &Line) -> Result<Option<(Viewer, Similarity)>> {
     let (glb, note) = small(&bytes, &file, || Ok(head), as_glb)?;
     let name = line.capture.name.clone();
     let viewer = Viewer { name, note, front: front.to_array(), glb, cameras: Vec::new() };
-    Ok(Some((viewer, file_from_world)))
+    Ok((viewer, file_from_world))
 }
 
 /// Where the photographs of these rows were taken from.
@@ -73,9 +79,7 @@ pub(super) fn cameras(line: &Line, rows: &[ViewRow], file_from_world: &Similarit
 ///
 /// The run has no mesh yet, or it is damaged.
 pub fn head_page(line: &Line) -> Result<String> {
-    let Some((mut viewer, file_from_world)) = viewer(line)? else {
-        return Err(Error::cannot("this run has no mesh yet", "make it: `tiface mesh RUN`"));
-    };
+    let (mut viewer, file_from_world) = shown(line, &finished_mesh(line.run.dir())?)?;
     let most = super::MOST_BYTES.saturating_sub(viewer.glb.len().div_ceil(3) * 4);
     // without photographs there is still the head
     let (mut rows, _) = if line.gone.is_none() { views::rows(line, most)? } else { Default::default() };
