@@ -62,7 +62,7 @@ table! {
     /// Settings of the stage `iface`. Lengths are in field units: the scene's box is `[-radius, radius]³`.
     pub struct IfaceConfig;
     keys {
-        /// What is learned: sdf (a signed distance, as NeuS) or density (Instant-NeRF, in preset paper and on the CPU).
+        /// What is learned: sdf (a signed distance, as NeuS) or density (Instant-NeRF, in preset paper).
         field: FieldKind => FieldKind::Sdf;
         /// Optimizer steps.
         steps: u64, 1.0..=1e7 => 3000, 8000, 20_000;

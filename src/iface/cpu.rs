@@ -3,7 +3,7 @@
 use super::model::shape;
 use super::occupancy::Occupancy;
 use super::ops::{
-    BACKGROUND_STREAM, MOST_BUDGETS, STEREO_POINTS, STEREO_STREAM, SdfGroups, SdfOps, VARIANCE, loss_weights,
+    BACKGROUND_STREAM, MOST_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, loss_weights,
     random_background,
 };
 use super::schedule;
@@ -13,7 +13,7 @@ use crate::config::iface::IfaceConfig;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
 use crate::field::pixels::{Batch, Pixels};
 use crate::field::training::StepAt;
-use crate::kernel::cpu::losses::{self, RAY_TERMS, TERMS, Targets};
+use crate::kernel::cpu::losses::{self, RAY_TERMS, STEREO_STREAM, TERMS, Targets};
 use crate::kernel::cpu::march::Samples;
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::neus::{self, Rays};

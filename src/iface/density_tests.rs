@@ -1,12 +1,16 @@
 //! Does Instant-NeRF step by its formulas, learn a ball, and go on where it stopped?
 
+use super::cpu::march;
 use super::*;
 use crate::config::Preset;
 use crate::field::ball::{BALL, resumes, session, temporary, views};
+use crate::iface::schedule::step_length;
+use crate::kernel::cpu::density::DensityWeights;
 use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};
 use crate::kernel::cpu::reference::{Real, density as plain, wide};
 use crate::{Monitor, Quiet};
-use glam::Vec2;
+use glam::{Vec2, Vec3};
+use std::path::Path;
 
 fn config() -> IfaceConfig {
     IfaceConfig {
@@ -24,19 +28,30 @@ fn config() -> IfaceConfig {
     }
 }
 
-/// The third step against the formulas in f64, parameter by parameter.
+/// A step on every device that is here.
 #[test]
 fn a_step_is_the_one_of_its_formulas() {
     let config = IfaceConfig { rays: 16, max_rays: 16, log2_table: 6, samples_per_ray: 30, ..config() };
-    let (dir, views) = (temporary(), views());
-    let session = session("iface", dir.path(), "step", &Quiet);
+    let views = views();
     let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
-    let mut state = DensityState::new(&config, session.seed);
+    agrees_on(CpuDensity::new(&config, &pixels), &config, &pixels, [1e-5, 1e-3]);
+    #[cfg(feature = "wgpu")]
+    for device in crate::kernel::gpu::tests::devices() {
+        agrees_on(GpuDensity::new(&config, &pixels, device).unwrap(), &config, &pixels, [1e-4, 1e-2]);
+    }
+}
+
+/// The third step against the formulas in f64, parameter by parameter: terms and the median of the updates within the
+/// first tolerance, every update within the second.
+fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, pixels: &Pixels, [close, near]: [f64; 2]) {
+    let dir = temporary();
+    let session = session("iface", dir.path(), "step", &Quiet);
+    let mut state = DensityState::new(config, session.seed);
     // as if it had learned for a while: something to be seen, and not the same everywhere
     let [table, network] = &mut state.groups;
     table.state[0].iter_mut().enumerate().for_each(|(i, v)| *v = rng::normal(5, 1, i as u64));
     network.state[0].iter_mut().for_each(|v| *v *= 1.5);
-    let mut model = DensityModel::new(CpuDensity::new(&config, &pixels), &config, &session);
+    let mut model = DensityModel::new(ops, config, &session);
     model.ops.load(&state.occupancy, state.rays);
     model.groups = state.groups.map(|group| ParameterGroup::upload(model.ops.device(), group));
     let progress = |step: u64| TrainingProgress { step, ..TrainingProgress::default() };
@@ -45,14 +60,14 @@ fn a_step_is_the_one_of_its_formulas() {
     }
     let state = model.state().unwrap();
     let before = state.groups.clone().map(|group| group.state);
-    let shape = shape(&config);
+    let shape = shape(config);
     let weights = DensityWeights::new(&shape, &before[1][0]);
     let batch = pixels.draw(3, 2, state.rays, false, 0.0);
     let table = bytemuck::cast_slice(&before[0][0]);
-    let samples = march(&config, &state.occupancy, (&shape, table, &weights), &batch.rays);
+    let samples = march(config, &state.occupancy, (&shape, table, &weights), &batch.rays);
     let n = samples.t.len();
     assert!(n > 100, "{n} samples");
-    let dt = f64::from(step_length(&config).at(0.0));
+    let dt = f64::from(step_length(config).at(0.0));
     let of = Var::of;
     let x: Vec<f64> = before.iter().flat_map(|p| wide(&p[0])).collect();
     let mut terms = [0.0; 2];
@@ -95,7 +110,7 @@ fn a_step_is_the_one_of_its_formulas() {
     let Ok(Some(report)) = step else { panic!("a finite step") };
     for (name, want) in ["smooth", "distortion"].into_iter().zip(terms) {
         let got = report.figures.iter().find(|(n, _)| *n == name).unwrap().1;
-        assert!((got - want).abs() < 1e-5 * want, "{name}: {got} {want}");
+        assert!((got - want).abs() < close * want, "{name}: {got} {want}");
     }
     let mut start = 0;
     for ((name, before), after) in NAMES.iter().zip(&before).zip(model.state().unwrap().groups) {
@@ -110,7 +125,7 @@ fn a_step_is_the_one_of_its_formulas() {
         errors.sort_by(f64::total_cmp);
         let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
         println!("{} of {name}: median {median:.1e}, worst {worst:.1e}", errors.len());
-        assert!(worst <= 1e-3 && median <= 1e-5, "{name}: median {median:.1e}, worst {worst:.1e}");
+        assert!(worst <= near && median <= close, "{name}: median {median:.1e}, worst {worst:.1e}");
     }
 }
 
@@ -145,12 +160,6 @@ fn a_ball_is_learned_and_comes_back_from_its_checkpoint() {
         value == field.sdf(&[p])
             && (slope[0].z - (moved[0] - moved[1]) / 4e-3).abs() < 1e-3 * slope[0].length()
     );
-    let there = train_density(
-        &views,
-        &config,
-        &TrainingSession { device: "wgpu:0", ..session("iface", dir.path(), "b", &Quiet) },
-    );
-    assert!(there.err().unwrap().to_string().contains("no kernels"));
 }
 
 #[test]
@@ -160,4 +169,109 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
         train_density(&views, &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
     };
     resumes(&run, 3);
+}
+
+#[cfg(feature = "wgpu")]
+mod on_gpus {
+    use super::*;
+    use crate::field::ball::{StopAfter, textured_views};
+    use crate::field::ops::Ops;
+    use crate::kernel::gpu::tests::{device, devices};
+    use crate::kernel::gpu::{Atomics, Device};
+
+    fn config() -> IfaceConfig {
+        IfaceConfig { steps: 300, ..super::config() }
+    }
+
+    fn learned(
+        config: &IfaceConfig,
+        device: &str,
+        dir: &Path,
+        monitor: &dyn Monitor,
+    ) -> Result<(DensityField, IfaceReport)> {
+        let session = TrainingSession { device, ..session("iface", dir, "ball", monitor) };
+        train_density(&textured_views(), config, &session)
+    }
+
+    /// PSNR of a view, dB.
+    fn psnr(field: &DensityField) -> f64 {
+        let views = textured_views();
+        let view = &views[4];
+        let (w, h) = (view.camera.width, view.camera.height);
+        let pixel = |i: u32| Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
+        let rays: Vec<_> = (0..w * h).map(|i| view.camera.ray(pixel(i)).unwrap()).collect();
+        let alpha = &view.mask.as_ref().unwrap().values;
+        let error = |(i, ray): (usize, &crate::geom::RayResult)| -> f64 {
+            let a = alpha[i] as f64 / 255.0;
+            (0..3).map(|c| (ray.color[c] as f64 - a * view.photo.rgb[i][c] as f64 / 255.0).powi(2)).sum()
+        };
+        let all: f64 = field.render(&rays).iter().enumerate().map(error).sum();
+        -10.0 * (all / (3 * w * h) as f64).log10()
+    }
+
+    #[test]
+    fn a_gpu_learns_what_the_cpu_does_and_both_go_on_where_the_other_stopped() {
+        if device().is_none() {
+            return;
+        }
+        let config = config();
+        let mut all = Vec::new();
+        for device in ["cpu", "wgpu:0"] {
+            let (field, report) = learned(&config, device, temporary().path(), &Quiet).unwrap();
+            all.push((psnr(&field), report.occupied));
+        }
+        // past the step from which cells are drawn
+        let moved = temporary();
+        for (device, steps) in [("cpu", 130), ("wgpu:0", 140)] {
+            let stopped = learned(&config, device, moved.path(), &StopAfter::new(steps)).err().unwrap();
+            assert!(stopped.to_string().contains("saved at step"), "{stopped}");
+        }
+        let (field, report) = learned(&config, "cpu", moved.path(), &Quiet).unwrap();
+        all.push((psnr(&field), report.occupied));
+        println!("dB and share of the cells, on the CPU, on the device, on both in turn: {all:.3?}");
+        assert!(all[0].0 > 15.0 && all[0].1 < 0.9, "{all:?}");
+        assert!(all.iter().all(|(db, share)| (all[0].0 - db).abs() < 0.3 && (all[0].1 - share).abs() < 0.03));
+    }
+
+    #[test]
+    fn a_step_waits_for_nothing_and_whole_numbers_give_the_same_bytes() {
+        let views = textured_views();
+        let config = config();
+        let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+        let dir = temporary();
+        let session = session("iface", dir.path(), "ball", &Quiet);
+        let trained = |device: Device| {
+            let ops = GpuDensity::new(&config, &pixels, device).unwrap();
+            let mut model = DensityModel::new(ops, &config, &session);
+            model.restore(None).ok().unwrap();
+            let before = model.ops.device().counts();
+            for step in 250..250 + Device::READ_EVERY {
+                let progress = TrainingProgress { step, ..TrainingProgress::default() };
+                let read = (step + 1).is_multiple_of(Device::READ_EVERY);
+                training::step(&mut model, session.seed, &progress, read).ok().unwrap();
+            }
+            let after = model.ops.device().counts();
+            println!("{} launches, {} readbacks", after.0 - before.0, after.1 - before.1);
+            assert!(after.0 - before.0 <= 40 * 50 && after.1 - before.1 <= 1);
+            model.state().unwrap().groups[0].values().to_vec()
+        };
+        for device in devices() {
+            let (way, before) = (device.atomics(), trained(device));
+            assert!(before.iter().all(|v| v.is_finite()));
+            if way == Atomics::Fixed {
+                let again = devices().pop().unwrap();
+                assert!(trained(again) == before, "the same steps give the same bytes");
+            }
+        }
+    }
+
+    #[test]
+    fn a_device_with_too_little_memory_is_refused_with_what_to_lower() {
+        let Some(device) = device() else { return };
+        let views = textured_views();
+        let config = IfaceConfig { samples: 1 << 18, ..config() };
+        let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+        let e = GpuDensity::fits(&config, &pixels, &device.with_memory(600 << 20)).err().unwrap();
+        assert!(e.to_string().contains("has room for") && e.hint().contains("iface.samples to"), "{e:?}");
+    }
 }

@@ -16,6 +16,7 @@ use crate::field::ops::Ops;
 use crate::field::pixels::Pixels;
 use crate::field::training::StepAt;
 use crate::kernel::cpu::hash;
+use crate::kernel::cpu::march::nerfacc;
 use crate::kernel::cpu::mlp::TILE;
 use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::cpu::sdf::FieldShape;
@@ -134,32 +135,45 @@ fn stereo_points(config: &IfaceConfig) -> usize {
 /// and do photographs lie there, too?
 pub(super) fn max_samples(
     config: &IfaceConfig,
-    shape_: &FieldShape,
+    shape: &FieldShape,
     pixels: &Pixels,
     device: &Device,
 ) -> Result<(usize, bool)> {
     /// Samples with their rays, compositing and losses, and the cells that are looked at in their place.
     const BESIDE: usize = 3 + 3 + 2 + 9 + 2 + 1;
-    let points = stereo_points(config);
-    let [words, widest] = Sdf::words_per_sample(shape_);
-    let bytes = 4 * (words + BESIDE) as u64;
+    let [words, widest] = Sdf::words_per_sample(shape);
+    samples_that_fit(config, [words + BESIDE, widest], stereo_points(config), pixels, device)
+}
+
+/// As [`max_samples`], of a field on a hash grid that takes so many words a sample, and of the largest buffer, and
+/// evaluates so many points beside the samples of a step.
+pub(super) fn samples_that_fit(
+    config: &IfaceConfig,
+    [words, widest]: [usize; 2],
+    points: usize,
+    pixels: &Pixels,
+    device: &Device,
+) -> Result<(usize, bool)> {
+    let bytes = 4 * words as u64;
     // values, moments and gradient; cells with their number, distance and reach or history and last draw, and bits
     let cells = config.occupancy_resolution.pow(3) as u64;
-    let fixed = |shape: &FieldShape| 32 * hash::entries(&shape.levels) as u64 + 13 * cells;
+    let fixed = |log2_table: u32| {
+        let levels = hash::levels(config.levels, config.base_resolution, config.growth, log2_table);
+        32 * hash::entries(&levels) as u64 + 13 * cells
+    };
     let least = (config.samples + points) as u64;
     let wanted = (MOST_BUDGETS * config.samples + points) as u64;
     let need = MemoryNeed {
-        fixed: (fixed(shape_), "hash tables and cells"),
+        fixed: (fixed(config.log2_table), "hash tables and cells"),
         unit: "samples",
         each: [bytes, 4 * widest as u64],
         wanted,
         least,
     };
     let (capacity, resident) = need.plan(pixels, device, |fits| {
-        let table = |log2: u32| fixed(&shape(&IfaceConfig { log2_table: log2, ..config.clone() }));
         let by_buffer = device.limits().largest_buffer / (4 * widest as u64);
         let left = device.available_memory().checked_sub(least * bytes).filter(|_| by_buffer >= least);
-        let smaller = left.and_then(|left| (4..config.log2_table).rev().find(|&log2| table(log2) <= left));
+        let smaller = left.and_then(|left| (4..config.log2_table).rev().find(|&log2| fixed(log2) <= left));
         match (fits.saturating_sub(points as u64), smaller) {
             (fits @ 64.., _) => format!("iface.samples to {fits}"),
             (_, Some(log2)) => format!("iface.log2_table to {log2}"),
@@ -186,8 +200,8 @@ fn cells(
             CellRule::Band(Box::new(Band::new(device, start.allowed(), config.band, config.soften as f32)))
         }
         OccupancyRule::Nerfacc => {
-            let step = schedule::step_length(config).at(1.0);
-            CellRule::Nerfacc(Box::new(Nerfacc::new(device, &cells, &start.history, step, capacity)))
+            let rule = Nerfacc::new(device, &cells, &start.history, nerfacc::OPAQUE, capacity);
+            CellRule::Nerfacc(Box::new(rule))
         }
     };
     (cells, rule)
@@ -226,12 +240,7 @@ impl SdfOps for GpuSdf<'_> {
         if let CellRule::Nerfacc(rule) = &self.cells {
             occupancy.history = rule.read(&self.device)?;
         }
-        let rays = self.device.fetch::<u32>(&self.schedule.rays)?[0] as usize;
-        if !self.stepped {
-            return Ok(rays);
-        }
-        let wanted = self.device.fetch::<u32>(&self.samples.count)?[1] as usize;
-        Ok(schedule::ray_budget(self.config).next(rays, wanted))
+        self.schedule.next_rays(&self.device, self.stepped.then_some(&self.samples.count))
     }
 
     fn is_broken(&self) -> Result<bool> {
@@ -246,12 +255,18 @@ impl SdfOps for GpuSdf<'_> {
     fn update_occupancy(&mut self, [table, ..]: &SdfGroups<Self>, levels: usize, at: StepAt) {
         self.sdf.activate(levels);
         let device = &self.device;
-        let field = [table.value(), &self.flat, &self.inv_s];
-        let over = [&self.samples.x, &self.samples.direction];
+        let Samples { x, direction, .. } = &self.samples;
         match &self.cells {
-            CellRule::Band(rule) => rule.update(device, &self.occupancy, &self.sdf, field, over),
+            CellRule::Band(rule) => {
+                let field = [table.value(), &self.flat, &self.inv_s];
+                rule.update(device, &self.occupancy, &self.sdf, field, [x, direction]);
+            }
             CellRule::Nerfacc(rule) => {
-                rule.update(device, (at.seed, at.step), &self.occupancy, &self.sdf, field, over);
+                let step = schedule::step_length(self.config).at(1.0);
+                rule.update(device, (at.seed, at.step), &self.occupancy, x, |count| {
+                    let out = self.sdf.forward(device, table.value(), &self.flat, x, direction, count);
+                    (self.neus.opacities(device, out, &self.inv_s, count, step), 1.0)
+                });
             }
         }
     }

@@ -1,6 +1,8 @@
 //! Which cells of the box may hold surface.
 
+use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
+use crate::field::checkpoint::Checkpoint;
 use crate::kernel::cpu::march::{self, Bitmask, MarchRay, Samples, nerfacc};
 use crate::kernel::cpu::{neus, rng};
 use rayon::prelude::*;
@@ -57,6 +59,33 @@ impl Occupancy {
             OccupancyRule::Nerfacc => vec![0.0; r * r * r],
         };
         Occupancy { occupied: allowed.clone(), solid: Bitmask::filled(r, false), allowed, history }
+    }
+
+    /// Puts cells and their history into a checkpoint.
+    pub fn save(&self, into: &mut Checkpoint) {
+        into.put_words("occupancy.occupied", self.occupied.bits.clone());
+        into.put_words("occupancy.solid", self.solid.bits.clone());
+        if !self.history.is_empty() {
+            into.put_floats("occupancy.history", &[self.history.len()], self.history.clone());
+        }
+    }
+
+    /// Takes cells and history out of a checkpoint, of the same resolution and rule.
+    pub fn restore(&mut self, from: &mut Checkpoint) -> Result<()> {
+        if !self.history.is_empty() {
+            self.history = from.floats("occupancy.history", &[self.history.len()])?;
+        }
+        for (name, mask) in [("occupancy.occupied", &mut self.occupied), ("occupancy.solid", &mut self.solid)]
+        {
+            // checkpoints of a density were written without solid cells, of which this rule has none
+            if name == "occupancy.solid" && !self.history.is_empty() && !from.has(name) {
+                continue;
+            }
+            let bits = from.words(name)?;
+            *mask = Bitmask::of(mask.resolution, bits)
+                .ok_or_else(|| from.wrong(format!("tensor `{name}` has another size")))?;
+        }
+        Ok(())
     }
 
     /// The cells that may ever be marched through.

@@ -23,9 +23,6 @@ pub const MOST_BUDGETS: usize = 4;
 /// Random numbers of a step's backgrounds.
 pub const BACKGROUND_STREAM: u64 = 3;
 
-/// Random numbers of a step's stereo points.
-pub const STEREO_STREAM: u64 = 12;
-
 /// Where the variance stays: `inv_s = exp(10 v)` within what the kernels compute with, 1e-6..=1e6. Beyond, its gradient
 /// would be zero, or infinite, and the surface would stay as sharp for ever.
 pub const VARIANCE: [f32; 2] = [-1.38, 1.38];

@@ -41,12 +41,7 @@ impl SdfState {
     /// Puts the state into a checkpoint.
     pub fn save(&self, into: &mut Checkpoint) {
         self.groups.iter().for_each(|group| group.save(into, true));
-        let o = &self.occupancy;
-        into.put_words("occupancy.occupied", o.occupied.bits.clone());
-        into.put_words("occupancy.solid", o.solid.bits.clone());
-        if !o.history.is_empty() {
-            into.put_floats("occupancy.history", &[o.history.len()], o.history.clone());
-        }
+        self.occupancy.save(into);
         if !self.stereo.is_empty() {
             let rows = self.stereo.iter().flat_map(|p| p.row()).collect();
             into.put_floats("stereo", &[self.stereo.len(), SurfacePoint::WIDTH], rows);
@@ -60,16 +55,7 @@ impl SdfState {
         let [table, network, variance] = parts(config).map(|parts| HostGroup::restore(parts, from, true));
         let groups = [table?, network?, variance?];
         let mut occupancy = Occupancy::new(config, hull);
-        if !occupancy.history.is_empty() {
-            occupancy.history = from.floats("occupancy.history", &[occupancy.history.len()])?;
-        }
-        for (name, mask) in
-            [("occupancy.occupied", &mut occupancy.occupied), ("occupancy.solid", &mut occupancy.solid)]
-        {
-            let bits = from.words(name)?;
-            *mask = Bitmask::of(mask.resolution, bits)
-                .ok_or_else(|| from.wrong(format!("tensor `{name}` has another size")))?;
-        }
+        occupancy.restore(from)?;
         let most = config.rays.max(config.max_rays) as u64;
         let mut stereo = Vec::new();
         if from.has("stereo") {

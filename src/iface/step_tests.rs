@@ -1,13 +1,14 @@
 //! A whole optimizer step against the same arithmetic in f64: sampling, field, compositing, every loss term, weight norm
 //! and the groups of AdamW, parameter by parameter.
 
-use super::super::ops::{STEREO_POINTS, STEREO_STREAM};
+use super::super::ops::STEREO_POINTS;
 use super::super::stereo::SurfacePoint;
 use super::*;
 use crate::Quiet;
 use crate::config::Preset;
 use crate::config::iface::Background;
 use crate::field::ball::{session, temporary, views};
+use crate::kernel::cpu::losses::STEREO_STREAM;
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::neus::Rays;
 use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};

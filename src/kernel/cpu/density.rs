@@ -13,6 +13,7 @@
 //! there.
 
 use super::hash::{self, Level};
+use super::march::Samples;
 use super::matrix::{Matrix, add_to, split};
 use super::simd::{exp, gemm, sigmoid};
 use super::sphharm::sh16;
@@ -20,11 +21,17 @@ use crate::dispatch;
 use rayon::prelude::*;
 
 /// Width of all hidden layers.
-const HIDDEN: usize = 64;
+pub const HIDDEN: usize = 64;
 /// Outputs of the geometry network, the density's logarithm first; all go to the color network.
-const FEATURES: usize = 16;
+pub const FEATURES: usize = 16;
 /// Inputs of the color network: features and harmonics.
-const COLOR_INPUTS: usize = FEATURES + 16;
+pub const COLOR_INPUTS: usize = FEATURES + 16;
+/// A ray ends where less of its light is left.
+pub const DARK: f32 = 1e-4;
+/// Weight of the distortion.
+pub const DISTORTION: f32 = 0.001;
+/// The gradient of the density's exponential is held below e¹⁵.
+pub const STEEPEST: f32 = 3_269_017.25;
 /// Color channels as stored.
 const RGB: usize = 8;
 /// Samples a task handles: fixed, so that sums do not depend on the number of threads.
@@ -254,7 +261,7 @@ fn backward_body<const F: bool>(task: &mut BackwardTask, w: &DensityWeights) {
     for (s, (g, density)) in task.g_density.iter().zip(task.density).enumerate() {
         let row = &mut g_o[s * FEATURES..][..FEATURES];
         row.copy_from_slice(&g_c0[s * COLOR_INPUTS..][..FEATURES]);
-        row[0] += g * density.min(15f32.exp());
+        row[0] += g * density.min(STEEPEST);
     }
     task.g[1] = outer::<F>(&g_o, FEATURES, &t.h, HIDDEN);
     let g_h = back::<F>(&g_o, FEATURES, &w.m[1], HIDDEN, Some(&t.h));
@@ -365,6 +372,67 @@ pub fn weights_backward(density: &[f32], weight: &[f32], g: &[f32], dt: f32) -> 
         behind += weight[k] * g[k];
     }
     out
+}
+
+/// Keeps the samples of each ray up to where less than [`DARK`] of its light is left; `density` is that of all samples.
+pub fn cut(samples: &Samples, density: &[f32], dt: f32) -> Samples {
+    let mut kept = Samples { offsets: vec![0], t: Vec::new() };
+    for own in samples.offsets.windows(2) {
+        let mut thickness = 0f32;
+        for s in own[0] as usize..own[1] as usize {
+            if (-thickness).exp() < DARK {
+                break;
+            }
+            kept.t.push(samples.t[s]);
+            thickness += density[s] * dt;
+        }
+        kept.offsets.push(kept.t.len() as i32);
+    }
+    kept
+}
+
+/// Returns the squared error, smooth-L1 and distortion of rays of these `[rays, 3]` colors, and the gradients of
+/// `smooth + DISTORTION · distortion` by densities `[n]` and colors `[n, 3]` of the samples.
+pub fn losses(
+    samples: &Samples,
+    color: &[[f32; 3]],
+    found: &DensitySamples,
+    dt: f32,
+) -> ([f32; 3], Vec<f32>, Vec<[f32; 3]>) {
+    let rays = || samples.offsets.windows(2).map(|o| o[0] as usize..o[1] as usize).enumerate();
+    let met = rays().filter(|(_, own)| !own.is_empty()).count().max(1) as f32;
+    // nerfacc's mean is over the rays up to the last one that met something
+    let last = samples.offsets.windows(2).rposition(|o| o[1] > o[0]).map_or(1, |r| r + 1) as f32;
+    let (mut g_density, mut g_color) = (vec![0f32; samples.t.len()], vec![[0f32; 3]; samples.t.len()]);
+    let (mut smooth, mut square, mut spread) = (0f64, 0f64, 0f64);
+    for (r, own) in rays().filter(|(_, own)| !own.is_empty()) {
+        let weight = weights(&found.density[own.clone()], dt);
+        let colors = &found.color[own.clone()];
+        let mut composited = [0f32; 3];
+        for (w, c) in weight.iter().zip(colors) {
+            (0..3).for_each(|k| composited[k] += w * c[k]);
+        }
+        let error: [f32; 3] = std::array::from_fn(|k| composited[k] - color[r][k]);
+        for e in error.map(f64::from) {
+            square += e * e;
+            smooth += if e.abs() < 1.0 { 0.5 * e * e } else { e.abs() - 0.5 };
+        }
+        let g = error.map(|e| e.clamp(-1.0, 1.0) / (3.0 * met));
+        let (value, g_spread) = distortion(&weight, &samples.t[own.clone()], dt);
+        spread += f64::from(value / last);
+        let g_weight: Vec<f32> = g_spread
+            .iter()
+            .zip(colors)
+            .map(|(s, c)| DISTORTION / last * s + g[0] * c[0] + g[1] * c[1] + g[2] * c[2])
+            .collect();
+        for (g_color, w) in g_color[own.clone()].iter_mut().zip(&weight) {
+            *g_color = g.map(|g| w * g);
+        }
+        let by_density = weights_backward(&found.density[own.clone()], &weight, &g_weight, dt);
+        g_density[own].copy_from_slice(&by_density);
+    }
+    let n = f64::from(3.0 * met);
+    ([(square / n) as f32, (smooth / n) as f32, spread as f32], g_density, g_color)
 }
 
 #[cfg(test)]

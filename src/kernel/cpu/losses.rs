@@ -39,6 +39,9 @@ pub struct LossWeights {
     pub knee: f32,
 }
 
+/// Random numbers of a step's stereo points.
+pub const STEREO_STREAM: u64 = 12;
+
 /// Terms of a ray: squared and absolute error, each sample's own color, mask.
 pub const RAY_TERMS: usize = 4;
 /// Terms of a sample: eikonal, sparsity.

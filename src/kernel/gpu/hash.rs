@@ -3,7 +3,6 @@
 use super::device::{Atomics, Buffer, Device};
 use super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::cpu::hash::Level;
-use crate::kernel::cpu::sdf::FieldShape;
 use cubecl::prelude::*;
 
 /// Samples a group of threads handles.
@@ -132,18 +131,28 @@ fn scatter<S: Sum>(
     units: &[f32],
     capacity: u32,
     world: f32,
+    #[comptime] slopes: bool,
 ) {
     let capacity = capacity as usize;
     let s = ABSOLUTE_POS_X as usize;
     let level = CUBE_POS_Y as usize;
     if s < count[0] as usize {
         let cell = cell(levels, level, x, s, capacity, world);
-        let slope = f32::reinterpret(levels[level * LEVEL]) * world;
-        let nx = g_normal[s] * slope;
-        let ny = g_normal[capacity + s] * slope;
-        let nz = g_normal[2 * capacity + s] * slope;
         let plane = 2 * level * capacity + s;
-        let (g0, g1, q0, q1) = (g_value[plane], g_value[plane + capacity], q[plane], q[plane + capacity]);
+        let (g0, g1) = (g_value[plane], g_value[plane + capacity]);
+        let mut q0 = 0.0f32;
+        let mut q1 = 0.0f32;
+        let mut nx = 0.0f32;
+        let mut ny = 0.0f32;
+        let mut nz = 0.0f32;
+        if slopes {
+            let slope = f32::reinterpret(levels[level * LEVEL]) * world;
+            nx = g_normal[s] * slope;
+            ny = g_normal[capacity + s] * slope;
+            nz = g_normal[2 * capacity + s] * slope;
+            q0 = q[plane];
+            q1 = q[plane + capacity];
+        }
         let unit = units[level];
         #[unroll]
         for k in 0..8u32 {
@@ -170,6 +179,7 @@ fn bound(
     units: &mut [f32],
     capacity: u32,
     world: f32,
+    #[comptime] slopes: bool,
 ) {
     let capacity = capacity as usize;
     let level = CUBE_POS_X as usize;
@@ -177,10 +187,12 @@ fn bound(
     let slope = f32::reinterpret(levels[level * LEVEL]) * world;
     let mut own = 0.0f32;
     for s in range_stepped(unit, count[0] as usize, GROUP as usize) {
-        let n = g_normal[s].abs() + g_normal[capacity + s].abs() + g_normal[2 * capacity + s].abs();
         let plane = 2 * level * capacity + s;
-        let g = max(g_value[plane].abs(), g_value[plane + capacity].abs());
-        own += g + max(q[plane].abs(), q[plane + capacity].abs()) * n * slope;
+        own += max(g_value[plane].abs(), g_value[plane + capacity].abs());
+        if slopes {
+            let n = g_normal[s].abs() + g_normal[capacity + s].abs() + g_normal[2 * capacity + s].abs();
+            own += max(q[plane].abs(), q[plane + capacity].abs()) * n * slope;
+        }
     }
     let mut sums = Shared::<[f32]>::new_slice(GROUP as usize);
     sums[unit] = own;
@@ -219,9 +231,8 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// The grid of a field.
-    pub fn new(device: &Device, shape: &FieldShape) -> Grid {
-        let levels = &shape.levels;
+    /// The grid of these levels over `[-radius, radius]³`, of which the first `active` take part.
+    pub fn new(device: &Device, levels: &[Level], active: usize, radius: f32) -> Grid {
         let words = |l: &Level| {
             [l.scale.to_bits(), l.resolution, l.entries, l.offset as u32, u32::from(l.is_hashed())]
         };
@@ -229,9 +240,9 @@ impl Grid {
             levels: device.upload(&levels.iter().flat_map(words).collect::<Vec<u32>>()),
             units: device.zeros(levels.len()),
             count: levels.len(),
-            active: shape.active,
+            active,
             largest: levels.iter().map(|l| l.entries as usize).max().unwrap_or(0),
-            world: 0.5 / shape.radius,
+            world: 0.5 / radius,
         }
     }
 
@@ -280,7 +291,8 @@ impl Grid {
     ///
     /// # Shapes
     ///
-    /// - gradient: `[entries, 2]`; x, g_normal: planes `[3, capacity]`; g_value, q: planes `[2 · levels, capacity]`
+    /// - gradient: `[entries, 2]`; x: planes `[3, capacity]`; g_value: planes `[2 · levels, capacity]`
+    /// - slopes, where the Jacobian had a gradient: `q` as `g_value`, `g_normal` as `x`
     pub fn scatter(
         &self,
         device: &Device,
@@ -288,9 +300,9 @@ impl Grid {
         x: &Buffer,
         count: &Buffer,
         g_value: &Buffer,
-        q: &Buffer,
-        g_normal: &Buffer,
+        slopes: Option<[&Buffer; 2]>,
     ) {
+        let [q, g_normal] = slopes.unwrap_or([g_value, x]);
         let capacity = x.words() / 3;
         let dim = CubeDim::new_1d(GROUP);
         let fixed = device.atomics() == Atomics::Fixed;
@@ -307,6 +319,7 @@ impl Grid {
                 self.units.arg(),
                 capacity as u32,
                 self.world,
+                slopes.is_some(),
             );
         }
         let launch = match device.atomics() {
@@ -328,6 +341,7 @@ impl Grid {
             self.units.arg(),
             capacity as u32,
             self.world,
+            slopes.is_some(),
         );
         if fixed {
             let count = CubeCount::Static((2 * self.largest as u32).div_ceil(GROUP), self.active as u32, 1);
@@ -358,16 +372,6 @@ mod tests {
         (levels, table, (0..SAMPLES).map(|i| [at(3 * i), at(3 * i + 1), at(3 * i + 2)]).collect())
     }
 
-    fn shape(levels: &[hash::Level]) -> FieldShape {
-        FieldShape {
-            levels: levels.to_vec(),
-            radius: RADIUS,
-            active: levels.len(),
-            color_skip: false,
-            soften: 0.0,
-        }
-    }
-
     fn inside(x: &[[f32; 3]]) -> Vec<[f32; 3]> {
         x.iter().map(|p| p.map(|c| c * (0.5 / RADIUS) + 0.5)).collect()
     }
@@ -390,7 +394,7 @@ mod tests {
         let slopes: Vec<f32> =
             (0..n).flat_map(|l| planes(&jacobian[l * SAMPLES..][..SAMPLES], CAPACITY)).collect();
 
-        let on = Grid::new(&device, &shape(&levels));
+        let on = Grid::new(&device, &levels, levels.len(), RADIUS);
         let (table, x) = (device.upload(&table), device.upload(&planes(&x, CAPACITY)));
         let (v, j) = (device.scratch(want.len()), device.scratch(slopes.len()));
         let count = device.upload(&[SAMPLES as u32]);
@@ -413,10 +417,15 @@ mod tests {
             (0..n as u64).flat_map(|l| filled::<2>(100 * stream + l)).collect()
         };
         let (g, q, normal) = (pair(1), pair(2), filled::<3>(5));
-        let mut want = vec![[0f32; 2]; table.len()];
-        hash::scatter(&levels, &mut want, &inside(&x), 0.5 / RADIUS, &g, &q, &normal);
+        let wanted = |q: &[[f32; 2]], normal: &[[f32; 3]]| {
+            let mut want = vec![[0f32; 2]; table.len()];
+            hash::scatter(&levels, &mut want, &inside(&x), 0.5 / RADIUS, &g, q, normal);
+            want
+        };
+        let none = (vec![[0.0; 2]; q.len()], vec![[0.0; 3]; normal.len()]);
+        let [want, want_values] = [wanted(&q, &normal), wanted(&none.0, &none.1)];
         for device in devices() {
-            let on = Grid::new(&device, &shape(&levels));
+            let on = Grid::new(&device, &levels, levels.len(), RADIUS);
             let x = device.upload(&planes(&x, CAPACITY));
             let count = device.upload(&[SAMPLES as u32]);
             let level_planes = |v: &[[f32; 2]]| -> Vec<f32> {
@@ -424,19 +433,21 @@ mod tests {
             };
             let (g, q) = (device.upload(&level_planes(&g)), device.upload(&level_planes(&q)));
             let normal = device.upload(&planes(&normal, CAPACITY));
-            let once = || {
-                let gradient = device.zeros(2 * table.len());
-                on.scatter(&device, &gradient, &x, &count, &g, &q, &normal);
-                device.read::<f32>(&gradient)
-            };
-            let got = once();
-            for l in &levels {
-                let span = 2 * l.offset..2 * (l.offset + l.entries as usize);
-                let want = want[l.offset..][..l.entries as usize].as_flattened();
-                agree(&format!("{:?} scatter", device.atomics()), &got[span], want, 1e-5);
-            }
-            if device.atomics() == Atomics::Fixed {
-                assert_eq!(got, once(), "whole numbers add to the same in any order");
+            for (slopes, want) in [(Some([&q, &normal]), &want), (None, &want_values)] {
+                let once = || {
+                    let gradient = device.zeros(2 * table.len());
+                    on.scatter(&device, &gradient, &x, &count, &g, slopes);
+                    device.read::<f32>(&gradient)
+                };
+                let got = once();
+                for l in &levels {
+                    let span = 2 * l.offset..2 * (l.offset + l.entries as usize);
+                    let want = want[l.offset..][..l.entries as usize].as_flattened();
+                    agree(&format!("{:?} scatter", device.atomics()), &got[span], want, 1e-5);
+                }
+                if device.atomics() == Atomics::Fixed {
+                    assert_eq!(got, once(), "whole numbers add to the same in any order");
+                }
             }
         }
     }

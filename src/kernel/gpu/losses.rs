@@ -131,7 +131,7 @@ fn of_samples(
 
 /// Sums of the terms, in a fixed order. One group of threads a term.
 #[cube(launch)]
-fn sum(of_rays: &[f32], of_samples: &[f32], of_points: &[f32], count: &[u32], out: &mut [f32]) {
+pub(super) fn sum(of_rays: &[f32], of_samples: &[f32], of_points: &[f32], count: &[u32], out: &mut [f32]) {
     let unit = UNIT_POS as usize;
     let term = CUBE_POS_X as usize;
     let mut own = 0.0f32;

@@ -222,7 +222,8 @@ pub struct Samples {
     pub x: Buffer,
     /// Planes `[3, capacity]`, directions of their rays; finite behind the last.
     pub direction: Buffer,
-    counts: Buffer,
+    /// `[rays]`: how many samples each has.
+    pub(super) counts: Buffer,
 }
 
 impl Samples {

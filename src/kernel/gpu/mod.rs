@@ -9,6 +9,7 @@
 
 mod adam;
 pub mod cost;
+mod density;
 mod device;
 mod draw;
 mod evaluate;
@@ -28,6 +29,7 @@ mod vm;
 mod weight_norm;
 
 pub use adam::{Gate, adam};
+pub use density::Density;
 pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits};
 pub use draw::{Batch, DrawnView, Photographs, SamplingOptions};
 pub use evaluate::Evaluator;

@@ -39,14 +39,17 @@ fn between(previous: f32, next: f32) -> f32 {
     (previous - next + EPSILON) / (previous + EPSILON)
 }
 
-/// How opaque a cell of half size `half` may be: see [`neus::occupancy`].
-#[cube]
-pub(super) fn occupancy(sdf: f32, half: f32, inv_s: f32) -> f32 {
-    let sharp = clamp(inv_s, 1e-6f32, 1e6f32);
-    // seen head on, where the signed distance falls
-    let previous = sigmoid((sdf + half) * sharp);
-    let next = sigmoid((sdf - half) * sharp);
-    clamp(between(previous, next), 0.0f32, 1.0f32)
+/// Opacity of a march step head on at points, `[capacity]`: see [`neus::occupancy`](crate::kernel::cpu::neus::occupancy).
+#[cube(launch)]
+fn opacities(field: &[f32], inv_s: &[f32], count: &[u32], out: &mut [f32], step: f32) {
+    let s = ABSOLUTE_POS;
+    if s < count[0] as usize {
+        let sharp = clamp(inv_s[0] * field[7 * out.len() + s].exp(), 1e-6f32, 1e6f32);
+        // seen head on, where the signed distance falls
+        let previous = sigmoid((field[s] + 0.5f32 * step) * sharp);
+        let next = sigmoid((field[s] - 0.5f32 * step) * sharp);
+        out[s] = clamp(between(previous, next), 0.0f32, 1.0f32);
+    }
 }
 
 /// Sample `s` of a ray along `d`.
@@ -278,6 +281,30 @@ impl Neus {
     /// What the last forward composited, planes `[9, rays]`.
     pub fn output(&self) -> &Buffer {
         &self.out
+    }
+
+    /// Opacities of march steps of length `step` head on at the first `count` points of a field's output, `[capacity]`; written
+    /// over by the next forward.
+    pub fn opacities(
+        &self,
+        device: &Device,
+        field: &Buffer,
+        inv_s: &Buffer,
+        count: &Buffer,
+        step: f32,
+    ) -> &Buffer {
+        let out = &self.light;
+        opacities::launch(
+            device.launch(),
+            groups(out.words().div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            field.arg(),
+            inv_s.arg(),
+            count.arg(),
+            out.arg(),
+            step,
+        );
+        out
     }
 
     /// What the last backward wrote, planes `[8, capacity]`.

@@ -7,7 +7,7 @@
 use super::device::{Buffer, Device, groups};
 use super::march::Samples;
 use super::rng::{below, stream};
-use crate::kernel::cpu::losses::LossWeights;
+use crate::kernel::cpu::losses::{LossWeights, STEREO_STREAM};
 use crate::kernel::cpu::sdf::WIDTH;
 use cubecl::prelude::*;
 
@@ -126,7 +126,7 @@ impl SurfacePoints {
 
     /// Draws some by seed and step, behind a step's samples, and returns how many there are with them, `[1]`.
     pub fn append(&self, device: &Device, (seed, step): (u64, u64), samples: &Samples) -> &Buffer {
-        let [high, low] = stream(seed, step << 4 | 12);
+        let [high, low] = stream(seed, step << 4 | STEREO_STREAM);
         append::launch(
             device.launch(),
             groups(self.most().div_ceil(UNITS as usize)),
@@ -196,7 +196,8 @@ mod tests {
         assert_eq!(device.read::<u32>(points.append(&device, (3, 9), &samples)), [40]);
         points.put(&device, &rows);
         assert_eq!(device.read::<u32>(points.append(&device, (3, 9), &samples)), [60]);
-        let which: Vec<usize> = (0..20).map(|i| rng::below(3, 9 << 4 | 12, i, 7) as usize).collect();
+        let which: Vec<usize> =
+            (0..20).map(|i| rng::below(3, 9 << 4 | STEREO_STREAM, i, 7) as usize).collect();
         let x = device.read::<f32>(&samples.x);
         let d = device.read::<f32>(&samples.direction);
         for (i, &w) in which.iter().enumerate() {

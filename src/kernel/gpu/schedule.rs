@@ -115,6 +115,13 @@ impl Schedule {
         );
     }
 
+    /// Waits for the device and returns the rays of the next step, after one of these samples where one was made.
+    pub fn next_rays(&self, device: &Device, count: Option<&Buffer>) -> Result<usize> {
+        let rays = device.fetch::<u32>(&self.rays)?[0] as usize;
+        let wanted = count.map(|count| device.fetch::<u32>(count)).transpose()?;
+        Ok(wanted.map_or(rays, |wanted| self.budget.next(rays, wanted[1] as usize)))
+    }
+
     /// Waits for the device; what the last step came to, in one readback.
     pub fn figures(
         &self,

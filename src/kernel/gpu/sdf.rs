@@ -7,7 +7,7 @@
 //! of weights are summed by group, then over the groups in their order. The backward is two kernels, one a network:
 //! as one, a software driver takes ten times as long to compile it.
 
-mod kernels;
+pub(super) mod kernels;
 
 use super::device::{Buffer, Device, groups};
 use super::hash::Grid;
@@ -18,7 +18,7 @@ use cubecl::prelude::*;
 use kernels::{color_backward, forward, geometry_backward, prepare, reduce};
 
 /// Groups that sum gradients of weights, each over its own tiles.
-const SUMMING: usize = 256;
+pub(super) const SUMMING: usize = 256;
 
 /// The first channel of the normal among the inputs of the color network.
 const NORMAL: usize = OUTPUTS + 16;
@@ -95,7 +95,7 @@ impl Plan {
 }
 
 /// Running sums, from 0.
-fn ends<const N: usize, const M: usize>(counts: [usize; N]) -> [usize; M] {
+pub(super) fn ends<const N: usize, const M: usize>(counts: [usize; N]) -> [usize; M] {
     std::array::from_fn(|i| counts[..i].iter().sum())
 }
 
@@ -138,7 +138,7 @@ impl Sdf {
         let planes = |count: usize| device.scratch(count * capacity);
         Sdf {
             plan,
-            grid: Grid::new(device, shape),
+            grid: Grid::new(device, &shape.levels, shape.active, shape.radius),
             inv_radius: 1.0 / shape.radius,
             soften: shape.soften,
             capacity,
@@ -318,7 +318,8 @@ impl Sdf {
             (self.plan.gradients()[7] * CHANNELS) as u32,
             SUMMING.min(self.capacity / TILE),
         );
-        self.grid.scatter(device, g_table, x, count, &self.g_value, &self.q, &self.g_normal);
+        let slopes = Some([&self.q, &self.g_normal]);
+        self.grid.scatter(device, g_table, x, count, &self.g_value, slopes);
     }
 }
 

@@ -2,8 +2,7 @@
 
 use super::super::device::{Buffer, Device, groups};
 use super::super::march::prefix_sum;
-use super::super::sdf::Sdf;
-use super::super::{neus, rng};
+use super::super::rng;
 use super::{Occupancy, UNITS};
 use crate::Result;
 use crate::kernel::cpu::march::nerfacc;
@@ -135,26 +134,23 @@ fn scatter(
     }
 }
 
-/// What a cell was lessens; what is seen of it now may be more.
+/// Decays the history of each cell drawn, and takes its opacity where that is more.
 #[cube(launch)]
-fn remember(
-    field: &[f32],
-    inv_s: &[f32],
+fn decay(
+    opacity: &[f32],
     drawn: &[u32],
     last: &[u32],
     history: &mut [f32],
     first: u32,
     here: u32,
-    step: f32,
+    scale: f32,
     #[comptime] all: bool,
 ) {
     let s = ABSOLUTE_POS;
     if s < here as usize {
-        let plane = field.len() / 8;
         let cell = drawn[s] as usize;
         if cell < history.len() && (all || last[cell] == first + u32::cast_from(s) + 1) {
-            let sharp = inv_s[0] * field[7 * plane + s].exp();
-            history[cell] = max(DECAY * history[cell], neus::occupancy(field[s], 0.5f32 * step, sharp));
+            history[cell] = max(DECAY * history[cell], scale * opacity[s]);
         }
     }
 }
@@ -181,7 +177,7 @@ fn partial_sums(history: &[f32], sums: &mut [f32]) {
     }
 }
 
-/// The mean of what is remembered, or `most` where that is less.
+/// The mean of the history, or `most` where that is less.
 #[cube(launch)]
 fn mean(sums: &[f32], least: &mut [f32], cells: u32, most: f32) {
     if ABSOLUTE_POS == 0 {
@@ -193,7 +189,7 @@ fn mean(sums: &[f32], least: &mut [f32], cells: u32, most: f32) {
     }
 }
 
-/// Decides about 32 cells a thread: those of which more is remembered than `least`, `[1]`.
+/// Decides about 32 cells a thread: those with a history above `least`, `[1]`, are kept.
 #[cube(launch)]
 fn decide_by_history(history: &[f32], least: &[f32], last: &mut [u32], mask: &mut [u32]) {
     let word = ABSOLUTE_POS;
@@ -213,7 +209,7 @@ fn decide_by_history(history: &[f32], least: &[f32], last: &mut [u32], mask: &mu
     }
 }
 
-/// nerfacc's rule for a signed distance: see the `look` of `iface`'s occupancy on the CPU.
+/// nerfacc's rule for any opacity of a cell: see the `look` of `iface`'s occupancy on the CPU.
 pub struct Nerfacc {
     history: Buffer,
     /// Cells of each word of the mask, and how many lie before it.
@@ -228,17 +224,17 @@ pub struct Nerfacc {
     sums: Buffer,
     least: Buffer,
     count: Buffer,
-    step: f32,
+    threshold: f32,
 }
 
 impl Nerfacc {
-    /// With what was remembered of the cells, `[cells]`; `step` is the march step, `capacity` how many cells are
-    /// evaluated together.
+    /// With the history of the cells, `[cells]`; what is above `threshold`, or above the mean where that is less, is marched
+    /// through, and `capacity` cells are evaluated together.
     pub fn new(
         device: &Device,
         occupancy: &Occupancy,
         history: &[f32],
-        step: f32,
+        threshold: f32,
         capacity: usize,
     ) -> Nerfacc {
         let (cells, words) = (history.len(), occupancy.mask.words());
@@ -253,25 +249,24 @@ impl Nerfacc {
             sums: device.zeros(cells.div_ceil(32 * UNITS as usize)),
             least: device.zeros(1),
             count: device.zeros(2),
-            step,
+            threshold,
         }
     }
 
-    /// Waits for the device; what is remembered of the cells.
+    /// Waits for the device and returns the history of the cells.
     pub fn read(&self, device: &Device) -> Result<Vec<f32>> {
         device.fetch(&self.history)
     }
 
-    /// Looks at the field again before step `n`. Of `x` and `direction`, planes `[3, capacity]`, the first is written over; `inv_s`
-    /// is `[1]`.
-    pub fn update(
+    /// Evaluates cells again before step `n`: their positions are written to `x`, planes `[3, capacity]`; `opacity` returns
+    /// those of as many as its argument counts, `[capacity]`, and what they are scaled by.
+    pub fn update<'a>(
         &self,
         device: &Device,
         (seed, n): (u64, u64),
         occupancy: &Occupancy,
-        field: &Sdf,
-        [table, flat, inv_s]: [&Buffer; 3],
-        [x, direction]: [&Buffer; 2],
+        x: &Buffer,
+        mut opacity: impl FnMut(&Buffer) -> (&'a Buffer, f32),
     ) {
         let cells = self.history.words();
         let all = n < nerfacc::ALL_BELOW;
@@ -321,19 +316,18 @@ impl Nerfacc {
                 draws(jitter),
                 all,
             );
-            let out = field.forward(device, table, flat, x, direction, &self.count);
-            remember::launch(
+            let (values, scale) = opacity(&self.count);
+            decay::launch(
                 device.launch(),
                 over(here),
                 dim,
-                out.arg(),
-                inv_s.arg(),
+                values.arg(),
                 self.drawn.arg(),
                 self.last.arg(),
                 self.history.arg(),
                 first as u32,
                 here as u32,
-                self.step,
+                scale,
                 all,
             );
         }
@@ -346,7 +340,7 @@ impl Nerfacc {
             sums.arg(),
             self.least.arg(),
             cells as u32,
-            nerfacc::OPAQUE,
+            self.threshold,
         );
         decide_by_history::launch(
             device.launch(),

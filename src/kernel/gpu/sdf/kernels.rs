@@ -12,7 +12,7 @@ type F4 = Vector<f32, Const<4>>;
 
 /// Weights in the orders in which they are read.
 #[cube(launch)]
-pub(super) fn prepare(flat: &[f32], map: &[u32], out: &mut [f32]) {
+pub(in super::super) fn prepare(flat: &[f32], map: &[u32], out: &mut [f32]) {
     let i = ABSOLUTE_POS;
     if i < out.len() {
         let from = map[i] as usize;
@@ -22,7 +22,7 @@ pub(super) fn prepare(flat: &[f32], map: &[u32], out: &mut [f32]) {
 
 /// Sums of the groups' gradients, in the order of the groups.
 #[cube(launch)]
-pub(super) fn reduce(
+pub(in super::super) fn reduce(
     partial: &[f32],
     map: &[u32],
     count: &[u32],
@@ -101,7 +101,7 @@ fn color_inputs(
     }
     if column == 13 {
         let (x, y, z) = (direction[here], direction[plane + here], direction[2 * plane + here]);
-        harmonics(a, x, y, z, row);
+        harmonics(a, OUTPUTS, x, y, z, row);
     }
     if column == 14 {
         a[at(NORMAL, row, LANES)] = normal.x;
@@ -122,29 +122,29 @@ fn color_inputs(
     }
 }
 
-/// [`crate::kernel::cpu::sphharm::sh16`].
+/// Writes [`crate::kernel::cpu::sphharm::sh16`] to 16 channels of a tile, from `first` on.
 #[cube]
-fn harmonics(a: &mut [F4], x: F4, y: F4, z: F4, row: usize) {
+pub(in super::super) fn harmonics(a: &mut [F4], #[comptime] first: usize, x: F4, y: F4, z: F4, row: usize) {
     let (xy, yz, xz) = (x * y, y * z, x * z);
     let (x2, y2, z2) = (x * x, y * y, z * z);
     let one = F4::new(1.0f32);
     let five = one - F4::new(5.0f32) * z2;
-    a[at(13, row, LANES)] = F4::new(0.282_094_79f32);
-    a[at(14, row, LANES)] = y * F4::new(-0.488_602_51f32);
-    a[at(15, row, LANES)] = z * F4::new(0.488_602_51f32);
-    a[at(16, row, LANES)] = x * F4::new(-0.488_602_51f32);
-    a[at(17, row, LANES)] = xy * F4::new(1.092_548_4f32);
-    a[at(18, row, LANES)] = yz * F4::new(-1.092_548_4f32);
-    a[at(19, row, LANES)] = z2 * F4::new(0.946_174_7f32) - F4::new(0.315_391_57f32);
-    a[at(20, row, LANES)] = xz * F4::new(-1.092_548_4f32);
-    a[at(21, row, LANES)] = (x2 - y2) * F4::new(0.546_274_2f32);
-    a[at(22, row, LANES)] = y * (y2 - x2 * F4::new(3.0f32)) * F4::new(0.590_043_6f32);
-    a[at(23, row, LANES)] = xy * z * F4::new(2.890_611_4f32);
-    a[at(24, row, LANES)] = y * five * F4::new(0.457_045_8f32);
-    a[at(25, row, LANES)] = z * (F4::new(5.0f32) * z2 - F4::new(3.0f32)) * F4::new(0.373_176_34f32);
-    a[at(26, row, LANES)] = x * five * F4::new(0.457_045_8f32);
-    a[at(27, row, LANES)] = z * (x2 - y2) * F4::new(1.445_305_7f32);
-    a[at(28, row, LANES)] = x * (y2 * F4::new(3.0f32) - x2) * F4::new(0.590_043_6f32);
+    a[at(first, row, LANES)] = F4::new(0.282_094_79f32);
+    a[at(first + 1, row, LANES)] = y * F4::new(-0.488_602_51f32);
+    a[at(first + 2, row, LANES)] = z * F4::new(0.488_602_51f32);
+    a[at(first + 3, row, LANES)] = x * F4::new(-0.488_602_51f32);
+    a[at(first + 4, row, LANES)] = xy * F4::new(1.092_548_4f32);
+    a[at(first + 5, row, LANES)] = yz * F4::new(-1.092_548_4f32);
+    a[at(first + 6, row, LANES)] = z2 * F4::new(0.946_174_7f32) - F4::new(0.315_391_57f32);
+    a[at(first + 7, row, LANES)] = xz * F4::new(-1.092_548_4f32);
+    a[at(first + 8, row, LANES)] = (x2 - y2) * F4::new(0.546_274_2f32);
+    a[at(first + 9, row, LANES)] = y * (y2 - x2 * F4::new(3.0f32)) * F4::new(0.590_043_6f32);
+    a[at(first + 10, row, LANES)] = xy * z * F4::new(2.890_611_4f32);
+    a[at(first + 11, row, LANES)] = y * five * F4::new(0.457_045_8f32);
+    a[at(first + 12, row, LANES)] = z * (F4::new(5.0f32) * z2 - F4::new(3.0f32)) * F4::new(0.373_176_34f32);
+    a[at(first + 13, row, LANES)] = x * five * F4::new(0.457_045_8f32);
+    a[at(first + 14, row, LANES)] = z * (x2 - y2) * F4::new(1.445_305_7f32);
+    a[at(first + 15, row, LANES)] = x * (y2 * F4::new(3.0f32) - x2) * F4::new(0.590_043_6f32);
 }
 
 /// Writes sdf, ∇sdf, color and local sharpness, planes `[8, capacity]`, and what the backward needs; where normals are
@@ -265,7 +265,7 @@ pub(super) fn forward(
 
 /// Samples from `samples` on count nothing.
 #[cube]
-fn masked(v: F4, first: usize, samples: usize) -> F4 {
+pub(in super::super) fn masked(v: F4, first: usize, samples: usize) -> F4 {
     let mut own = v;
     #[unroll]
     for i in 0..4usize {

@@ -1,0 +1,158 @@
+//! A training step of the density on the processor.
+
+use super::ops::{DensityGroups, DensityOps, OCCUPIED};
+use super::shape;
+use crate::Result;
+use crate::config::iface::IfaceConfig;
+use crate::field::ops::{Cpu, Ops, slice, slice_mut};
+use crate::field::pixels::{Batch, Pixels};
+use crate::field::training::StepAt;
+use crate::iface::occupancy::Occupancy;
+use crate::iface::schedule;
+use crate::kernel::cpu::density::{self, DensitySamples, DensityShape, DensityWeights};
+use crate::kernel::cpu::losses::TERMS;
+use crate::kernel::cpu::march::{MarchRay, Samples};
+use crate::kernel::cpu::schedule::Figures;
+
+/// Returns the samples along rays in marked cells, up to where the light is gone.
+pub fn march(
+    config: &IfaceConfig,
+    occupancy: &Occupancy,
+    (shape, table, weights): (&DensityShape, &[[f32; 2]], &DensityWeights),
+    rays: &[MarchRay],
+) -> Samples {
+    let dt = schedule::step_length(config).at(0.0);
+    let all = occupancy.march(config, dt, rays);
+    let (x, _) = all.points(rays, 0);
+    density::cut(&all, &density::evaluate(shape, table, weights, &x, None).density, dt)
+}
+
+/// The operations of [`DensityOps`] on the processor.
+pub struct CpuDensity<'a> {
+    config: &'a IfaceConfig,
+    pixels: &'a Pixels<'a>,
+    shape: DensityShape,
+    occupancy: Occupancy,
+    rays: usize,
+    /// Samples of the last step; none before the first one.
+    last_samples: Option<usize>,
+    batch: Batch,
+    samples: Samples,
+    weights: Option<DensityWeights>,
+    found: Option<DensitySamples>,
+    terms: [f32; 3],
+    /// By densities and colors of the samples.
+    gradients: (Vec<f32>, Vec<[f32; 3]>),
+    broken: bool,
+}
+
+impl<'a> CpuDensity<'a> {
+    /// The operations of a training with these settings and photographs.
+    pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>) -> CpuDensity<'a> {
+        CpuDensity {
+            config,
+            pixels,
+            shape: shape(config),
+            occupancy: Occupancy::new(config, None),
+            rays: config.rays,
+            last_samples: None,
+            batch: Batch::default(),
+            samples: Samples::default(),
+            weights: None,
+            found: None,
+            terms: [0.0; 3],
+            gradients: Default::default(),
+            broken: false,
+        }
+    }
+
+    fn next_rays(&self) -> usize {
+        self.last_samples.map_or(self.rays, |n| schedule::ray_budget(self.config).next(self.rays, n))
+    }
+
+    fn field<'g>(&self, [table, network]: &'g DensityGroups<Self>) -> (&'g [[f32; 2]], DensityWeights) {
+        let table = bytemuck::cast_slice(slice(table.value()));
+        (table, DensityWeights::new(&self.shape, slice(network.value())))
+    }
+}
+
+impl Ops for CpuDensity<'_> {
+    type Device = Cpu;
+
+    fn device(&self) -> &Cpu {
+        &Cpu
+    }
+
+    fn gate(&self) -> bool {
+        !self.samples.t.is_empty() && !self.broken
+    }
+}
+
+impl DensityOps for CpuDensity<'_> {
+    fn load(&mut self, occupancy: &Occupancy, rays: usize) {
+        self.occupancy = occupancy.clone();
+        (self.rays, self.last_samples, self.broken) = (rays, None, false);
+    }
+
+    fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {
+        *occupancy = self.occupancy.clone();
+        Ok(self.next_rays())
+    }
+
+    fn is_broken(&self) -> Result<bool> {
+        Ok(self.broken)
+    }
+
+    fn update_occupancy(&mut self, groups: &DensityGroups<Self>, at: StepAt) {
+        let (table, weights) = self.field(groups);
+        let (shape, dt) = (&self.shape, schedule::step_length(self.config).at(0.0));
+        let opacity = |x: &[[f32; 3]]| {
+            let found = density::evaluate(shape, table, &weights, x, None);
+            found.density.into_iter().map(|s| s * dt).collect()
+        };
+        self.occupancy.look((at.seed, at.step), self.config.radius, OCCUPIED, opacity);
+    }
+
+    fn draw(&mut self, at: StepAt) {
+        self.rays = self.next_rays();
+        self.batch = self.pixels.draw(at.seed, at.step, self.rays, self.config.jitter, 0.0);
+    }
+
+    fn march(&mut self, groups: &DensityGroups<Self>) {
+        let (table, weights) = self.field(groups);
+        let field = (&self.shape, table, &weights);
+        self.samples = march(self.config, &self.occupancy, field, &self.batch.rays);
+        self.last_samples = Some(self.samples.t.len());
+        self.weights = Some(weights);
+    }
+
+    fn density_field(&mut self, [table, _]: &DensityGroups<Self>) {
+        let Some(weights) = self.weights.as_ref().filter(|_| !self.samples.t.is_empty()) else { return };
+        let (x, d) = self.samples.points(&self.batch.rays, 0);
+        let table = bytemuck::cast_slice(slice(table.value()));
+        self.found = Some(density::evaluate(&self.shape, table, weights, &x, Some(&d)));
+    }
+
+    fn losses(&mut self) {
+        let Some(found) = &self.found else { return };
+        let dt = schedule::step_length(self.config).at(0.0);
+        let (terms, g_density, g_color) = density::losses(&self.samples, &self.batch.color, found, dt);
+        (self.terms, self.gradients) = (terms, (g_density, g_color));
+    }
+
+    fn backward(&mut self, [table, network]: &mut DensityGroups<Self>) {
+        let (Some(weights), Some(found)) = (self.weights.take(), self.found.take()) else { return };
+        let g_table = bytemuck::cast_slice_mut(slice_mut(&mut table.gradient));
+        let by = (&self.gradients.0[..], &self.gradients.1[..]);
+        let g_network = density::backward(&self.shape, &weights, &found, by, g_table);
+        self.broken |= !g_network.iter().chain(&self.terms).all(|g| g.is_finite());
+        slice_mut(&mut network.gradient).copy_from_slice(&g_network);
+    }
+
+    fn figures(&mut self) -> Result<Figures> {
+        let mut losses = [0.0; TERMS];
+        losses[..3].copy_from_slice(&self.terms);
+        let (samples, rays) = (self.samples.t.len(), self.next_rays());
+        Ok(Figures { losses, variance: 0.0, samples, rays, blind: 0, broken: self.broken })
+    }
+}

@@ -1,0 +1,120 @@
+//! A trained density: values, colors, volume renders.
+
+use super::cpu::march;
+use super::{DensityState, FORMAT, shape};
+use crate::Result;
+use crate::config::iface::IfaceConfig;
+use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
+use crate::geom::{Ray, RayResult};
+use crate::iface::occupancy::Occupancy;
+use crate::iface::schedule::step_length;
+use crate::kernel::cpu::density::{self, DensityShape, DensityWeights};
+use crate::kernel::cpu::march::MarchRay;
+use glam::Vec3;
+use std::path::Path;
+
+/// The density that the surface has.
+const LEVEL: f32 = 5.0;
+
+/// The trained field. Positions are in scene units, the box is [-1, 1]³.
+pub struct DensityField {
+    config: IfaceConfig,
+    shape: DensityShape,
+    table: Vec<f32>,
+    weights: DensityWeights,
+    occupancy: Occupancy,
+}
+
+impl DensityField {
+    pub(super) fn new(config: &IfaceConfig, state: DensityState) -> DensityField {
+        let shape = shape(config);
+        let DensityState { groups: [table, network], occupancy, .. } = state;
+        let [table, ..] = table.state;
+        let weights = DensityWeights::new(&shape, network.values());
+        DensityField { config: config.clone(), shape, table, weights, occupancy }
+    }
+
+    /// Loads the field from the checkpoint in a stage folder. `config` is what it was trained with.
+    pub fn load(dir: &Path, config: &IfaceConfig) -> Result<DensityField> {
+        let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
+        TrainingProgress::restore(&file, config.steps)?;
+        Ok(DensityField::new(config, DensityState::restore(config, &mut file)?))
+    }
+
+    fn table(&self) -> &[[f32; 2]] {
+        bytemuck::cast_slice(&self.table)
+    }
+
+    fn scaled(&self, points: &[Vec3]) -> Vec<[f32; 3]> {
+        points.iter().map(|p| (*p * self.config.radius).to_array()).collect()
+    }
+
+    fn density(&self, points: &[Vec3]) -> Vec<f32> {
+        let look = |points: &[Vec3]| {
+            density::evaluate(&self.shape, self.table(), &self.weights, &self.scaled(points), None).density
+        };
+        points.chunks(1 << 16).flat_map(look).collect()
+    }
+
+    /// What is left to the surface's density: negative inside. `[n]` points → `[n]`.
+    pub fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+        self.density(points).into_iter().map(|s| LEVEL - s).collect()
+    }
+
+    /// The same and its gradient, by differences over a thousandth of the box.
+    pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        const STEP: f32 = 2e-3;
+        let along = |axis: Vec3| -> Vec<f32> {
+            let moved =
+                |sign: f32| self.density(&points.iter().map(|p| *p + sign * STEP * axis).collect::<Vec<_>>());
+            let difference = |(a, b): (f32, f32)| (a - b) / (2.0 * STEP);
+            moved(-1.0).into_iter().zip(moved(1.0)).map(difference).collect()
+        };
+        let [x, y, z] = [Vec3::X, Vec3::Y, Vec3::Z].map(along);
+        (self.sdf(points), (0..points.len()).map(|i| Vec3::new(x[i], y[i], z[i])).collect())
+    }
+
+    /// sRGB-coded colors of points, point `i` seen along `counts[i]` unit `directions`, all in one list.
+    pub fn colors(&self, points: &[Vec3], counts: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        let places = self.scaled(points).into_iter().zip(counts);
+        let x: Vec<[f32; 3]> = places.flat_map(|(p, n)| std::iter::repeat_n(p, *n as usize)).collect();
+        let d: Vec<[f32; 3]> = directions.iter().map(|d| d.to_array()).collect();
+        let look = |(x, d): (&[[f32; 3]], &[[f32; 3]])| {
+            density::evaluate(&self.shape, self.table(), &self.weights, x, Some(d)).color
+        };
+        x.chunks(1 << 16).zip(d.chunks(1 << 16)).flat_map(look).collect()
+    }
+
+    /// Volume render of rays in scene coordinates.
+    pub fn render(&self, rays: &[Ray]) -> Vec<RayResult> {
+        const PASS: usize = 1 << 10;
+        rays.chunks(PASS).flat_map(|rays| self.pass(rays)).collect()
+    }
+
+    fn pass(&self, rays: &[Ray]) -> Vec<RayResult> {
+        let radius = self.config.radius;
+        let marched = |r: &Ray| MarchRay {
+            origin: (r.origin * radius).to_array(),
+            direction: r.direction.to_array(),
+            jitter: 0.0,
+        };
+        let rays: Vec<MarchRay> = rays.iter().map(marched).collect();
+        let field = (&self.shape, self.table(), &self.weights);
+        let samples = march(&self.config, &self.occupancy, field, &rays);
+        let (x, d) = samples.points(&rays, 0);
+        let found = density::evaluate(&self.shape, self.table(), &self.weights, &x, Some(&d));
+        let dt = step_length(&self.config).at(0.0);
+        let seen = |own: &[i32]| {
+            let own = own[0] as usize..own[1] as usize;
+            let weight = density::weights(&found.density[own.clone()], dt);
+            let (mut color, mut opacity, mut depth) = ([0f32; 3], 0f32, 0f32);
+            for ((w, c), t) in weight.iter().zip(&found.color[own.clone()]).zip(&samples.t[own]) {
+                (0..3).for_each(|k| color[k] += w * c[k]);
+                (opacity, depth) = (opacity + w, depth + w * t);
+            }
+            let depth = if opacity > 0.0 { depth / opacity / radius } else { 0.0 };
+            RayResult { color, opacity: opacity.min(1.0), depth, normal: Vec3::ZERO }
+        };
+        samples.offsets.windows(2).map(seen).collect()
+    }
+}

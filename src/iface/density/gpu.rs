@@ -1,0 +1,175 @@
+//! A training step of the density on a GPU, with the host waiting for nothing.
+
+use super::ops::{DensityGroups, DensityOps, OCCUPIED};
+use super::shape;
+use crate::config::iface::IfaceConfig;
+use crate::field::drawing::DeviceRays;
+use crate::field::ops::Ops;
+use crate::field::pixels::Pixels;
+use crate::field::training::StepAt;
+use crate::iface::gpu::samples_that_fit;
+use crate::iface::occupancy::Occupancy;
+use crate::iface::schedule;
+use crate::kernel::cpu::schedule::Figures;
+use crate::kernel::gpu::{
+    self, Batch, Buffer, Density, Device, Gate, Nerfacc, Samples, SamplingOptions, Schedule,
+};
+use crate::{Error, Result};
+
+/// The operations of [`DensityOps`] on a GPU, and its memory for them.
+pub struct GpuDensity<'a> {
+    config: &'a IfaceConfig,
+    pixels: &'a Pixels<'a>,
+    device: Device,
+    photographs: DeviceRays,
+    batch: Batch,
+    /// In all marked cells, and those up to where the light is gone.
+    marched: Samples,
+    samples: Samples,
+    density: Density,
+    /// `[1]`: a density has no sharpness.
+    no_sharpness: Buffer,
+    /// `[1]`: not 0 once a gradient was not finite.
+    broken: Buffer,
+    schedule: Schedule,
+    occupancy: gpu::Occupancy,
+    cells: Nerfacc,
+    /// Has a step been made since the state was loaded?
+    stepped: bool,
+}
+
+impl<'a> GpuDensity<'a> {
+    /// Refuses a training that a device cannot take: it knows no such field, or has too little memory.
+    pub fn fits(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<()> {
+        if !Density::supports(&shape(config)) {
+            let problem = format!("a device has no room for {} levels in a tile", config.levels);
+            return Err(Error::usage(problem, "lower iface.levels, or train with `--device cpu`"));
+        }
+        max_samples(config, pixels, device).map(drop)
+    }
+
+    /// The operations of a training that [`fits`](GpuDensity::fits) a device.
+    ///
+    /// # Errors
+    ///
+    /// Where the device has too little memory.
+    pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>, device: Device) -> Result<GpuDensity<'a>> {
+        let rays = config.rays.max(config.max_rays);
+        let (capacity, resident) = max_samples(config, pixels, &device)?;
+        let every = pixels.uses_reference_sampling();
+        let drawing = SamplingOptions { every, jitter: config.jitter, background: false, behind: 0 };
+        let (occupancy, cells) = cells(&device, config, &Occupancy::new(config, None), capacity);
+        let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
+        Ok(GpuDensity {
+            config,
+            pixels,
+            photographs: DeviceRays::new(pixels, &device, drawing, resident),
+            batch: Batch::new(&device, rays),
+            marched: Samples::new(&device, rays, capacity),
+            samples: Samples::new(&device, rays, capacity),
+            density: Density::new(&device, &shape(config), length.at(0.0), rays, capacity),
+            no_sharpness: device.zeros(1),
+            broken: device.zeros(1),
+            schedule: Schedule::new(&device, length, budget, config.rays),
+            occupancy,
+            cells,
+            stepped: false,
+            device,
+        })
+    }
+}
+
+/// Samples that a step has room for, and whether photographs lie on the device, too.
+fn max_samples(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<(usize, bool)> {
+    samples_that_fit(config, Density::words_per_sample(&shape(config)), 0, pixels, device)
+}
+
+/// The cells to march through, and how they are updated.
+fn cells(
+    device: &Device,
+    config: &IfaceConfig,
+    start: &Occupancy,
+    capacity: usize,
+) -> (gpu::Occupancy, Nerfacc) {
+    let cells = gpu::Occupancy::new(device, &start.occupied, None, config.radius);
+    let rule = Nerfacc::new(device, &cells, &start.history, OCCUPIED, capacity);
+    (cells, rule)
+}
+
+impl Ops for GpuDensity<'_> {
+    type Device = Device;
+
+    fn device(&self) -> &Device {
+        &self.device
+    }
+
+    fn gate(&self) -> Gate<'_> {
+        Gate { count: &self.samples.count, broken: &self.broken }
+    }
+}
+
+impl DensityOps for GpuDensity<'_> {
+    fn load(&mut self, occupancy: &Occupancy, rays: usize) {
+        let (device, config) = (&self.device, self.config);
+        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.words());
+        let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
+        self.schedule = Schedule::new(device, length, budget, rays);
+        self.broken = device.zeros(1);
+        self.stepped = false;
+    }
+
+    fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {
+        [occupancy.occupied, _] = self.occupancy.read(&self.device)?;
+        occupancy.history = self.cells.read(&self.device)?;
+        self.schedule.next_rays(&self.device, self.stepped.then_some(&self.samples.count))
+    }
+
+    fn is_broken(&self) -> Result<bool> {
+        Ok(self.device.fetch::<u32>(&self.broken)?[0] != 0)
+    }
+
+    fn update_occupancy(&mut self, [table, network]: &DensityGroups<Self>, at: StepAt) {
+        let (device, x) = (&self.device, &self.samples.x);
+        let dt = schedule::step_length(self.config).at(0.0);
+        self.density.prepare(device, network.value());
+        self.cells.update(device, (at.seed, at.step), &self.occupancy, x, |count| {
+            // a plane of densities comes first
+            (self.density.evaluate(device, table.value(), x, None, count), dt)
+        });
+    }
+
+    fn draw(&mut self, at: StepAt) {
+        let (device, at) = (&self.device, (at.seed, at.step));
+        self.schedule.advance(device, &self.no_sharpness, &self.samples.count, !self.stepped);
+        self.stepped = true;
+        self.photographs.draw(device, self.pixels, at, &self.schedule.rays, &mut self.batch, 0.0);
+    }
+
+    fn march(&mut self, [table, network]: &DensityGroups<Self>) {
+        let (device, all, step) = (&self.device, &self.marched, &self.schedule.step_length);
+        all.march(device, &self.occupancy, &self.batch, step, usize::MAX, 0);
+        self.density.prepare(device, network.value());
+        self.density.evaluate(device, table.value(), &all.x, None, &all.count);
+        self.density.cut(device, all, &self.samples);
+    }
+
+    fn density_field(&mut self, [table, _]: &DensityGroups<Self>) {
+        let Samples { x, direction, count, .. } = &self.samples;
+        self.density.evaluate(&self.device, table.value(), x, Some(direction), count);
+    }
+
+    fn losses(&mut self) {
+        self.density.losses(&self.device, &self.samples, &self.batch);
+    }
+
+    fn backward(&mut self, [table, network]: &mut DensityGroups<Self>) {
+        let into = [&table.gradient, &network.gradient];
+        self.density.backward(&self.device, &self.samples, into, &self.broken);
+    }
+
+    fn figures(&mut self) -> Result<Figures> {
+        let (device, count) = (&self.device, &self.samples.count);
+        let sums = self.density.sums(device);
+        self.schedule.figures(device, sums, &self.no_sharpness, count, &self.broken)
+    }
+}

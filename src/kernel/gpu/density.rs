@@ -1,0 +1,622 @@
+//! The density field of [`crate::kernel::cpu::density`], whose module holds the formulas: its networks forward and backward,
+//! rays that end where they are dark, and compositing with the losses.
+
+use super::device::{Buffer, Device, groups};
+use super::draw::Batch;
+use super::hash::Grid;
+use super::losses::sum;
+use super::march::{Samples, prefix_sum};
+use super::sdf::kernels::{harmonics, masked, prepare, reduce};
+use super::sdf::{SUMMING, ends};
+use super::tile::{CHANNELS, LANES, UNITS, at, gate, load, narrow, outer, product, put, relu, save, sigmoid};
+use super::weight_norm::finite;
+use crate::kernel::cpu::density::{COLOR_INPUTS, DARK, DISTORTION, DensityShape, FEATURES, HIDDEN, STEEPEST};
+use crate::kernel::cpu::losses::{RAY_TERMS, SAMPLE_TERMS, TERMS};
+use crate::kernel::cpu::mlp::TILE;
+use cubecl::prelude::*;
+
+type F4 = Vector<f32, Const<4>>;
+
+/// Planes of the field's output: density and color.
+const WIDTH: usize = 4;
+
+/// Where the matrices stand, in rows of 64 floats: weights in the orders in which they are read, and gradients row-major
+/// as the CPU's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+struct Plan {
+    /// Hash features: two a level.
+    features: usize,
+}
+
+impl Plan {
+    /// First rows of W1ᵀ, W1, W2, C1ᵀ, C1, C2ᵀ, C2, C3, and the end.
+    fn rows(&self) -> [usize; 9] {
+        ends([self.features, HIDDEN, FEATURES, COLOR_INPUTS, HIDDEN, HIDDEN, HIDDEN, 3])
+    }
+
+    /// First rows of the gradients of W1, W2, C1, C2, C3, and the end.
+    fn gradients(&self) -> [usize; 6] {
+        ends([HIDDEN, FEATURES, HIDDEN, HIDDEN, 3])
+    }
+
+    /// For each float of the prepared weights the one of the flat vector, and for each of the flat vector the one of
+    /// the gradients: `u32::MAX` where there is none.
+    fn maps(&self, shape: &DensityShape) -> (Vec<u32>, Vec<u32>) {
+        let (rows, gradients) = (self.rows(), self.gradients());
+        let mut prepared = vec![u32::MAX; rows[8] * CHANNELS];
+        let mut summed = Vec::with_capacity(shape.len());
+        for (part, (outputs, inputs)) in shape.shapes().into_iter().enumerate() {
+            let [own, transposed] = [[1, 2, 4, 6, 7][part], [0, 8, 3, 5, 8][part]];
+            for (o, i) in (0..outputs).flat_map(|o| (0..inputs).map(move |i| (o, i))) {
+                prepared[(rows[own] + o) * CHANNELS + i] = summed.len() as u32;
+                if transposed < 8 {
+                    prepared[(rows[transposed] + i) * CHANNELS + o] = summed.len() as u32;
+                }
+                summed.push(((gradients[part] + o) * CHANNELS + i) as u32);
+            }
+        }
+        (prepared, summed)
+    }
+}
+
+/// Writes densities and, where asked for, colors, planes `[4, capacity]`, with what the backward needs.
+#[cube(launch_unchecked)]
+fn forward(
+    w: &[F4],
+    value: &[F4],
+    direction: &[F4],
+    count: &[u32],
+    h: &mut [F4],
+    o: &mut [F4],
+    c1: &mut [F4],
+    c2: &mut [F4],
+    out: &mut [F4],
+    #[comptime] plan: Plan,
+    #[comptime] colors: bool,
+) {
+    let rows = comptime!(plan.rows());
+    let plane = direction.len() / 3;
+    let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
+    let tile = CUBE_POS;
+    let here = tile * LANES + row;
+    let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    if tile * TILE < count[0] as usize {
+        features(&mut a, value, plane, here, row, column, comptime!(plan.features));
+        sync_cube();
+        let first =
+            relu(&product(&a, 0usize, w, comptime!(rows[0]), comptime!(plan.features), row, column, LANES));
+        put(&mut b, &first, row, column, LANES);
+        sync_cube();
+        let own = narrow(&b, w, comptime!(rows[2]), row, column, FEATURES, LANES);
+        if column == 0 {
+            out[here] = (own - F4::new(1.0f32)).exp();
+        }
+        if colors {
+            save(h, &first, plane, here, column, HIDDEN);
+            o[column * plane + here] = own;
+            a[at(column, row, LANES)] = own;
+            if column == 13 {
+                let (x, y, z) = (direction[here], direction[plane + here], direction[2 * plane + here]);
+                harmonics(&mut a, FEATURES, x, y, z, row);
+            }
+            sync_cube();
+            let first = relu(&product(&a, 0usize, w, comptime!(rows[3]), COLOR_INPUTS, row, column, LANES));
+            save(c1, &first, plane, here, column, HIDDEN);
+            put(&mut b, &first, row, column, LANES);
+            sync_cube();
+            let second = relu(&product(&b, 0usize, w, comptime!(rows[5]), HIDDEN, row, column, LANES));
+            save(c2, &second, plane, here, column, HIDDEN);
+            put(&mut a, &second, row, column, LANES);
+            sync_cube();
+            let rgb = narrow(&a, w, comptime!(rows[7]), row, column, 3usize, LANES);
+            if column < 3 {
+                out[(1 + column) * plane + here] = sigmoid(rgb);
+            }
+        }
+    }
+}
+
+/// Writes hash features to a tile, and zeros behind them.
+#[cube]
+fn features(
+    a: &mut [F4],
+    value: &[F4],
+    plane: usize,
+    here: usize,
+    row: usize,
+    column: usize,
+    #[comptime] count: usize,
+) {
+    for j in 0..4usize {
+        let c = column + 16 * j;
+        let mut v = F4::new(0.0f32);
+        if c < count {
+            v = value[c * plane + here];
+        }
+        a[at(c, row, LANES)] = v;
+    }
+}
+
+/// Gradients of the features by sample, and of the weights by group.
+#[cube(launch_unchecked)]
+fn backward(
+    w: &[F4],
+    value: &[F4],
+    direction: &[F4],
+    count: &[u32],
+    h: &[F4],
+    o: &[F4],
+    c1: &[F4],
+    c2: &[F4],
+    out: &[F4],
+    g_out: &[F4],
+    g_value: &mut [F4],
+    partial: &mut [f32],
+    #[comptime] plan: Plan,
+) {
+    let rows = comptime!(plan.rows());
+    let own = comptime!(plan.gradients());
+    let inputs = comptime!(plan.features);
+    let plane = direction.len() / 3;
+    let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
+    let samples = count[0] as usize;
+    let group = CUBE_POS;
+    let sum = group * comptime!(own[5] * CHANNELS);
+    let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
+        let here = tile * LANES + row;
+        let first = 4 * here;
+        let fresh = tile == group;
+        if column < 3 {
+            let y = out[(1 + column) * plane + here];
+            let g = masked(g_out[(1 + column) * plane + here], first, samples);
+            a[at(column, row, LANES)] = g * y * (F4::new(1.0f32) - y);
+        }
+        load(&mut b, c2, plane, here, row, column);
+        sync_cube();
+        let start = sum + comptime!(own[4] * CHANNELS);
+        outer(&a, 0usize, &b, 3usize, HIDDEN, partial, start, fresh, row, column, LANES);
+        let g_c2 = product(&a, 0usize, w, comptime!(rows[7]), 3usize, row, column, LANES);
+        let g_c2 = gate(&g_c2, &b, row, column, LANES);
+        sync_cube();
+        put(&mut a, &g_c2, row, column, LANES);
+        load(&mut b, c1, plane, here, row, column);
+        sync_cube();
+        let start = sum + comptime!(own[3] * CHANNELS);
+        outer(&a, 0usize, &b, HIDDEN, HIDDEN, partial, start, fresh, row, column, LANES);
+        let g_c1 = product(&a, 0usize, w, comptime!(rows[6]), HIDDEN, row, column, LANES);
+        let g_c1 = gate(&g_c1, &b, row, column, LANES);
+        sync_cube();
+        put(&mut a, &g_c1, row, column, LANES);
+        b[at(column, row, LANES)] = o[column * plane + here];
+        if column == 13 {
+            let (x, y, z) = (direction[here], direction[plane + here], direction[2 * plane + here]);
+            harmonics(&mut b, FEATURES, x, y, z, row);
+        }
+        sync_cube();
+        let start = sum + comptime!(own[2] * CHANNELS);
+        outer(&a, 0usize, &b, HIDDEN, COLOR_INPUTS, partial, start, fresh, row, column, LANES);
+        let g_c0 = product(&a, 0usize, w, comptime!(rows[4]), HIDDEN, row, column, LANES);
+        sync_cube();
+        put(&mut a, &g_c0, row, column, LANES);
+        load(&mut b, h, plane, here, row, column);
+        sync_cube();
+        if column == 0 {
+            let steep = min(out[here], F4::new(STEEPEST));
+            a[at(0usize, row, LANES)] += masked(g_out[here], first, samples) * steep;
+        }
+        sync_cube();
+        let start = sum + comptime!(own[1] * CHANNELS);
+        outer(&a, 0usize, &b, FEATURES, HIDDEN, partial, start, fresh, row, column, LANES);
+        let g_h = product(&a, 0usize, w, comptime!(rows[2]), FEATURES, row, column, LANES);
+        let g_h = gate(&g_h, &b, row, column, LANES);
+        sync_cube();
+        put(&mut a, &g_h, row, column, LANES);
+        features(&mut b, value, plane, here, row, column, inputs);
+        sync_cube();
+        outer(&a, 0usize, &b, HIDDEN, inputs, partial, sum, fresh, row, column, LANES);
+        let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
+        save(g_value, &g_u, plane, here, column, inputs);
+        sync_cube();
+    }
+}
+
+/// Says where a gradient is not finite.
+#[cube(launch)]
+fn check(gradient: &[f32], broken: &mut [u32]) {
+    let i = ABSOLUTE_POS;
+    if i < gradient.len() && !finite(gradient[i]) {
+        broken[0] = 1;
+    }
+}
+
+/// Counts the samples of a ray up to where it is dark or, once it is known where they lie, copies them.
+#[cube(launch)]
+fn cut(
+    density: &[f32],
+    offsets: &[u32],
+    kept: &[u32],
+    counts: &mut [u32],
+    t: &[f32],
+    x: &[f32],
+    direction: &[f32],
+    kept_t: &mut [f32],
+    kept_x: &mut [f32],
+    kept_direction: &mut [f32],
+    dt: f32,
+    #[comptime] writes: bool,
+) {
+    let r = ABSOLUTE_POS;
+    let plane = t.len();
+    if r < counts.len() {
+        let first = offsets[r] as usize;
+        if writes {
+            let to = kept[r] as usize;
+            for k in 0..counts[r] as usize {
+                kept_t[to + k] = t[first + k];
+                for axis in 0..3usize {
+                    kept_x[axis * plane + to + k] = x[axis * plane + first + k];
+                    kept_direction[axis * plane + to + k] = direction[axis * plane + first + k];
+                }
+            }
+        } else {
+            let end = offsets[r + 1] as usize;
+            let mut thickness = 0.0f32;
+            let mut s = first;
+            while s < end && (-thickness).exp() >= DARK {
+                thickness += density[s] * dt;
+                s += 1;
+            }
+            counts[r] = u32::cast_from(s - first);
+        }
+    }
+}
+
+/// How many rays met a sample, and the number of the last one of them, from 1; neither below 1. One group of threads.
+#[cube(launch)]
+fn tally(offsets: &[u32], out: &mut [u32]) {
+    let unit = UNIT_POS as usize;
+    let mut met = 0u32;
+    let mut last = 0u32;
+    for r in range_stepped(unit, offsets.len() - 1, UNITS as usize) {
+        if offsets[r + 1] > offsets[r] {
+            met += 1;
+            last = u32::cast_from(r) + 1;
+        }
+    }
+    let mut mets = Shared::<[u32]>::new_slice(UNITS as usize);
+    let mut lasts = Shared::<[u32]>::new_slice(UNITS as usize);
+    mets[unit] = met;
+    lasts[unit] = last;
+    sync_cube();
+    if unit == 0 {
+        for i in 1..UNITS as usize {
+            met += mets[i];
+            last = max(last, lasts[i]);
+        }
+        out[0] = max(met, 1u32);
+        out[1] = max(last, 1u32);
+    }
+}
+
+/// `1 − e⁻ˣ` of a number that is not negative.
+#[cube]
+fn opacity(x: f32) -> f32 {
+    // what is left of a difference close to 1 has few digits
+    let series =
+        x * (1.0f32 - x / 2.0f32 * (1.0f32 - x / 3.0f32 * (1.0f32 - x / 4.0f32 * (1.0f32 - x / 5.0f32))));
+    select(x < 0.1f32, series, 1.0f32 - (-x).exp())
+}
+
+/// Composites; terms of rays, planes `[4, rays]`, and gradients by the field's output, planes `[4, capacity]`. `light` is
+/// scratch, planes `[2, capacity]`.
+#[cube(launch)]
+fn of_rays(
+    field: &[f32],
+    offsets: &[u32],
+    t: &[f32],
+    color: &[f32],
+    tally: &[u32],
+    light: &mut [f32],
+    g_out: &mut [f32],
+    terms: &mut [f32],
+    dt: f32,
+) {
+    let rays = color.len() / 3;
+    let plane = t.len();
+    let r = ABSOLUTE_POS;
+    if r < rays {
+        let (first, end) = (offsets[r] as usize, offsets[r + 1] as usize);
+        let (met, last) = (f32::cast_from(tally[0]), f32::cast_from(tally[1]));
+        let mut thickness = 0.0f32;
+        let mut red = 0.0f32;
+        let mut green = 0.0f32;
+        let mut blue = 0.0f32;
+        let mut sum = 0.0f32;
+        let mut moment = 0.0f32;
+        let mut spread = 0.0f32;
+        for s in first..end {
+            let own = field[s] * dt;
+            let w = (-thickness).exp() * opacity(own);
+            thickness += own;
+            red += w * field[plane + s];
+            green += w * field[2 * plane + s];
+            blue += w * field[3 * plane + s];
+            let before = t[s] * sum - moment;
+            spread += dt * w * w / 3.0f32 + 2.0f32 * w * before;
+            sum += w;
+            moment += w * t[s];
+            light[s] = w;
+            light[plane + s] = before;
+        }
+        let met_any = select(end > first, 1.0f32, 0.0f32);
+        let (e0, e1, e2) = (red - color[r], green - color[rays + r], blue - color[2 * rays + r]);
+        let share = met_any / (3.0f32 * met);
+        terms[r] = (e0 * e0 + e1 * e1 + e2 * e2) * share;
+        terms[rays + r] = (smooth(e0) + smooth(e1) + smooth(e2)) * share;
+        terms[2 * rays + r] = spread / last;
+        terms[3 * rays + r] = 0.0f32;
+        let g0 = clamp(e0, -1.0f32, 1.0f32) * share;
+        let g1 = clamp(e1, -1.0f32, 1.0f32) * share;
+        let g2 = clamp(e2, -1.0f32, 1.0f32) * share;
+        let mut after = 0.0f32;
+        let mut after_moment = 0.0f32;
+        let mut light_after = 0.0f32;
+        for k in 0..end - first {
+            let s = end - 1 - k;
+            let w = light[s];
+            let by_spread =
+                2.0f32 / 3.0f32 * dt * w + 2.0f32 * light[plane + s] + 2.0f32 * (after_moment - t[s] * after);
+            after += w;
+            after_moment += w * t[s];
+            let by_color = g0 * field[plane + s] + g1 * field[2 * plane + s] + g2 * field[3 * plane + s];
+            let g = DISTORTION / last * by_spread + by_color;
+            g_out[s] = dt * ((-thickness).exp() * g - light_after);
+            thickness -= field[s] * dt;
+            light_after += w * g;
+            g_out[plane + s] = g0 * w;
+            g_out[2 * plane + s] = g1 * w;
+            g_out[3 * plane + s] = g2 * w;
+        }
+    }
+}
+
+/// Smooth-L1 of an error.
+#[cube]
+fn smooth(e: f32) -> f32 {
+    select(e.abs() < 1.0f32, 0.5f32 * e * e, e.abs() - 0.5f32)
+}
+
+/// A density field on a device, and what a training step of it leaves between operations, for up to so many rays and
+/// `capacity` samples.
+pub struct Density {
+    plan: Plan,
+    grid: Grid,
+    dt: f32,
+    capacity: usize,
+    prepared_map: Buffer,
+    summed_map: Buffer,
+    weights: Buffer,
+    value: Buffer,
+    h: Buffer,
+    o: Buffer,
+    c1: Buffer,
+    c2: Buffer,
+    out: Buffer,
+    light: Buffer,
+    g_out: Buffer,
+    g_value: Buffer,
+    partial: Buffer,
+    tally: Buffer,
+    ray_terms: Buffer,
+    no_terms: Buffer,
+    sums: Buffer,
+}
+
+impl Density {
+    /// For marching in steps of `dt`; `capacity` is a multiple of [`TILE`].
+    pub fn new(device: &Device, shape: &DensityShape, dt: f32, rays: usize, capacity: usize) -> Density {
+        assert!(capacity.is_multiple_of(TILE) && capacity > 0 && Density::supports(shape));
+        let plan = Plan { features: 2 * shape.levels.len() };
+        let (prepared, summed) = plan.maps(shape);
+        let planes = |count: usize| device.scratch(count * capacity);
+        Density {
+            plan,
+            grid: Grid::new(device, &shape.levels, shape.levels.len(), shape.radius),
+            dt,
+            capacity,
+            weights: device.scratch(prepared.len()),
+            prepared_map: device.upload(&prepared),
+            summed_map: device.upload(&summed),
+            value: planes(plan.features),
+            h: planes(HIDDEN),
+            o: planes(FEATURES),
+            c1: planes(HIDDEN),
+            c2: planes(HIDDEN),
+            out: planes(WIDTH),
+            light: planes(2),
+            g_out: planes(WIDTH),
+            g_value: planes(plan.features),
+            partial: device.scratch(SUMMING * plan.gradients()[5] * CHANNELS),
+            tally: device.scratch(2),
+            ray_terms: device.scratch(RAY_TERMS * rays),
+            no_terms: device.zeros(SAMPLE_TERMS),
+            sums: device.scratch(TERMS),
+        }
+    }
+
+    /// Is there room for the features of its levels in a tile?
+    pub fn supports(shape: &DensityShape) -> bool {
+        2 * shape.levels.len() <= CHANNELS
+    }
+
+    /// Words of memory that a sample takes, with its march before and after it is cut: all of them, and of the largest
+    /// buffer.
+    pub fn words_per_sample(shape: &DensityShape) -> [usize; 2] {
+        let features = 2 * shape.levels.len();
+        [2 * features + 3 * HIDDEN + FEATURES + 2 * WIDTH + 2 + 2 * (3 + 3 + 2), HIDDEN.max(features)]
+    }
+
+    /// Takes up new network weights.
+    pub fn prepare(&self, device: &Device, flat: &Buffer) {
+        prepare::launch(
+            device.launch(),
+            groups(self.weights.words().div_ceil(UNITS as usize)),
+            CubeDim::new_1d(UNITS),
+            flat.arg(),
+            self.prepared_map.arg(),
+            self.weights.arg(),
+        );
+    }
+
+    /// Densities and, where there are directions, colors of samples: see [`crate::kernel::cpu::density::evaluate`].
+    ///
+    /// # Shapes
+    ///
+    /// - table: `[entries, 2]`; x, direction: planes `[3, capacity]`, finite behind the last sample; count: `[1]`, the
+    ///   samples there are
+    /// - output: planes `[4, capacity]`
+    pub fn evaluate(
+        &self,
+        device: &Device,
+        table: &Buffer,
+        x: &Buffer,
+        direction: Option<&Buffer>,
+        count: &Buffer,
+    ) -> &Buffer {
+        assert!(x.words() == 3 * self.capacity && direction.is_none_or(|d| d.words() == x.words()));
+        self.grid.gather(device, table, x, count, &self.value, None);
+        // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
+        unsafe {
+            forward::launch_unchecked(
+                device.launch(),
+                groups(self.capacity / TILE),
+                CubeDim::new_1d(UNITS),
+                self.weights.arg(),
+                self.value.arg(),
+                direction.unwrap_or(x).arg(),
+                count.arg(),
+                self.h.arg(),
+                self.o.arg(),
+                self.c1.arg(),
+                self.c2.arg(),
+                self.out.arg(),
+                self.plan,
+                direction.is_some(),
+            );
+        }
+        &self.out
+    }
+
+    /// Copies the samples of each ray up to where less than [`DARK`] of its light is left, by the densities that were
+    /// evaluated last.
+    pub fn cut(&self, device: &Device, samples: &Samples, kept: &Samples) {
+        let pass = |writes: bool| {
+            cut::launch(
+                device.launch(),
+                groups(kept.counts.words().div_ceil(UNITS as usize)),
+                CubeDim::new_1d(UNITS),
+                self.out.arg(),
+                samples.offsets.arg(),
+                kept.offsets.arg(),
+                kept.counts.arg(),
+                samples.t.arg(),
+                samples.x.arg(),
+                samples.direction.arg(),
+                kept.t.arg(),
+                kept.x.arg(),
+                kept.direction.arg(),
+                self.dt,
+                writes,
+            );
+        };
+        pass(false);
+        prefix_sum(device, &kept.counts, &kept.offsets, &kept.count, self.capacity);
+        pass(true);
+    }
+
+    /// Composites the samples that were evaluated last; their losses' gradients are for [`backward`](Density::backward).
+    pub fn losses(&self, device: &Device, samples: &Samples, batch: &Batch) {
+        let (dim, offsets) = (CubeDim::new_1d(UNITS), &samples.offsets);
+        tally::launch(device.launch(), CubeCount::new_single(), dim, offsets.arg(), self.tally.arg());
+        of_rays::launch(
+            device.launch(),
+            groups(batch.rays().div_ceil(UNITS as usize)),
+            dim,
+            self.out.arg(),
+            offsets.arg(),
+            samples.t.arg(),
+            batch.color.arg(),
+            self.tally.arg(),
+            self.light.arg(),
+            self.g_out.arg(),
+            self.ray_terms.arg(),
+            self.dt,
+        );
+    }
+
+    /// Adds the gradient of the table, zero before, writes that of the weights, and says where it is not finite.
+    pub fn backward(
+        &self,
+        device: &Device,
+        samples: &Samples,
+        [g_table, g_flat]: [&Buffer; 2],
+        broken: &Buffer,
+    ) {
+        let (dim, count) = (CubeDim::new_1d(UNITS), &samples.count);
+        let summing = SUMMING.min(self.capacity / TILE);
+        // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
+        unsafe {
+            backward::launch_unchecked(
+                device.launch(),
+                groups(summing),
+                dim,
+                self.weights.arg(),
+                self.value.arg(),
+                samples.direction.arg(),
+                count.arg(),
+                self.h.arg(),
+                self.o.arg(),
+                self.c1.arg(),
+                self.c2.arg(),
+                self.out.arg(),
+                self.g_out.arg(),
+                self.g_value.arg(),
+                self.partial.arg(),
+                self.plan,
+            );
+        }
+        let over = groups(g_flat.words().div_ceil(UNITS as usize));
+        reduce::launch(
+            device.launch(),
+            over.clone(),
+            dim,
+            self.partial.arg(),
+            self.summed_map.arg(),
+            count.arg(),
+            g_flat.arg(),
+            (self.plan.gradients()[5] * CHANNELS) as u32,
+            summing,
+        );
+        check::launch(device.launch(), over, dim, g_flat.arg(), broken.arg());
+        self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);
+    }
+
+    /// Squared error, smooth-L1 and distortion of the last step, then zeros, `[7]`; for steps whose losses are read.
+    pub fn sums(&self, device: &Device) -> &Buffer {
+        let none = &self.no_terms;
+        sum::launch(
+            device.launch(),
+            CubeCount::new_1d(TERMS as u32),
+            CubeDim::new_1d(UNITS),
+            self.ray_terms.arg(),
+            none.arg(),
+            none.arg(),
+            none.arg(),
+            self.sums.arg(),
+        );
+        &self.sums
+    }
+}
