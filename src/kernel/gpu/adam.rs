@@ -2,7 +2,7 @@
 
 use super::device::{Buffer, Device, groups};
 use crate::kernel::cpu::adam::AdamStep;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 

@@ -1,12 +1,13 @@
 //! A device, its memory, and what it was asked to do.
 
 use crate::{Error, Result};
+use burn::backend::{CubeDevice, WgpuBackend, WgpuDevice, WgpuDeviceKind};
+use burn::cubecl::device::CudaDevice;
+use burn::cubecl::features::AtomicUsage;
+use burn::cubecl::ir::{ElemType, FloatKind, Type};
+use burn::cubecl::prelude::{BufferArg, Client, CubeCount};
+use burn::cubecl::server::Handle;
 use bytemuck::Pod;
-use cubecl::device::{CudaDevice, WgpuBackend, WgpuDevice, WgpuDeviceKind};
-use cubecl::features::AtomicUsage;
-use cubecl::ir::{ElemType, FloatKind, Type};
-use cubecl::prelude::{BufferArg, Client, CubeCount};
-use cubecl::server::Handle;
 use std::fmt::Display;
 use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -64,7 +65,7 @@ pub struct DeviceLimits {
 
 /// A way to a GPU: an adapter as one API offers it.
 pub struct Adapter {
-    device: cubecl::Device,
+    device: CubeDevice,
     /// `vulkan`, `metal`, `dx12` or `cuda`.
     pub api: &'static str,
     /// `discrete`, `integrated`, `virtual` or `software`.
@@ -88,8 +89,8 @@ impl Adapter {
         let mut all = Vec::new();
         for (like, kind) in kinds {
             for (backend, api) in apis {
-                let id = cubecl::Device::from(WgpuDevice::new(like.clone()).on(backend)).to_id();
-                let found = cubecl::Device::enumerate(id).into_iter().map(cubecl::Device::from_id);
+                let id = CubeDevice::from(WgpuDevice::new(like.clone()).on(backend)).to_id();
+                let found = CubeDevice::enumerate(id).into_iter().map(CubeDevice::from_id);
                 all.extend(found.map(|device| Adapter { device, api, kind, software: like == Cpu }));
             }
         }
@@ -102,8 +103,8 @@ impl Adapter {
         if !cfg!(feature = "cuda") {
             return Vec::new();
         }
-        let id = cubecl::Device::Cuda(CudaDevice::default()).to_id();
-        let found = cubecl::Device::enumerate(id).into_iter().map(cubecl::Device::from_id);
+        let id = CubeDevice::Cuda(CudaDevice::default()).to_id();
+        let found = CubeDevice::enumerate(id).into_iter().map(CubeDevice::from_id);
         found.map(|device| Adapter { device, api: "cuda", kind: "discrete", software: false }).collect()
     }
 }

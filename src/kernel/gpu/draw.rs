@@ -6,7 +6,7 @@ use super::device::{Buffer, Device, groups};
 use super::rng::{below, stream, uniform};
 use crate::geom::{Camera, Projection};
 use crate::kernel::cpu::march::MarchRay;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 

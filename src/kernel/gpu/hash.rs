@@ -4,7 +4,7 @@ use super::device::{Atomics, Buffer, Device};
 use super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::cpu::hash::Level;
 use crate::kernel::cpu::sdf::FieldShape;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 /// Samples a group of threads handles.
 const GROUP: u32 = 256;

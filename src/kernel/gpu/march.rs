@@ -4,7 +4,7 @@
 use super::device::{Buffer, Device, groups};
 use super::draw::Batch;
 use super::occupancy::Occupancy;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 

@@ -3,7 +3,7 @@
 use super::device::{Buffer, Device, groups};
 use crate::kernel::cpu::neus::SHORTEST;
 use crate::kernel::cpu::sdf::WIDTH;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 

@@ -4,7 +4,7 @@ use super::device::{Buffer, Device, groups};
 use super::sdf::Sdf;
 use crate::Result;
 use crate::kernel::cpu::march::Bitmask;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 mod nerfacc;
 

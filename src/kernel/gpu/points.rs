@@ -9,7 +9,7 @@ use super::march::Samples;
 use super::rng::{below, stream};
 use crate::kernel::cpu::losses::LossWeights;
 use crate::kernel::cpu::sdf::WIDTH;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 

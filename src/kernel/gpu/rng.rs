@@ -2,7 +2,7 @@
 //! has.
 
 use crate::kernel::cpu::rng;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 /// A word of 64 bits.
 #[derive(CubeType, Clone, Copy)]

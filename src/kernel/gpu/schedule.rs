@@ -4,7 +4,7 @@ use super::device::{Buffer, Device};
 use crate::Result;
 use crate::kernel::cpu::losses::TERMS;
 use crate::kernel::cpu::schedule::{Figures, RayBudget, StepLength};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 #[cube(launch)]
 fn advance(

@@ -14,7 +14,7 @@ use super::hash::Grid;
 use super::tile::{CHANNELS, UNITS};
 use crate::kernel::cpu::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
 use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
-use cubecl::prelude::*;
+use burn::cubecl::prelude::*;
 use kernels::{color_backward, forward, geometry_backward, prepare, reduce};
 
 /// Groups that sum gradients of weights, each over its own tiles.

@@ -9,7 +9,7 @@
 use super::device::{Buffer, Device, groups};
 use crate::kernel::cpu::mlp::Layout;
 use crate::kernel::cpu::weight_norm::{self, Row};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 

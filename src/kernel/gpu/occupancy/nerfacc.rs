@@ -7,7 +7,7 @@ use super::super::{neus, rng};
 use super::{Occupancy, UNITS};
 use crate::Result;
 use crate::kernel::cpu::march::nerfacc;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const DECAY: f32 = nerfacc::DECAY;
 

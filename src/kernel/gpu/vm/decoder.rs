@@ -19,6 +19,7 @@ use super::grid::{DeviceGrid, NONE};
 use super::march::VmSamples;
 use super::rays::Along;
 use crate::kernel::cpu::vm::DecoderShape;
+use burn::cubecl::prelude::CubeDim;
 use kernels::{backward, chain, forward, prepare, reduce};
 
 /// Groups that take tiles, one after the other, and sum gradients of weights, each over its own.
@@ -159,7 +160,7 @@ impl DeviceDecoder {
         prepare::launch(
             device.launch(),
             groups(self.weights.words().div_ceil(tile::UNITS as usize)),
-            cubecl::prelude::CubeDim::new_1d(tile::UNITS),
+            CubeDim::new_1d(tile::UNITS),
             flat.arg(),
             self.real.arg(),
             self.weights.arg(),
@@ -183,7 +184,7 @@ impl DeviceDecoder {
             forward::launch_unchecked(
                 device.launch(),
                 groups(self.capacity.div_ceil(4 * self.plan.lanes).min(8 * GROUPS)),
-                cubecl::prelude::CubeDim::new_1d(tile::UNITS),
+                CubeDim::new_1d(tile::UNITS),
                 self.weights.arg(),
                 values.arg(),
                 grid.words().arg(),
@@ -214,7 +215,7 @@ impl DeviceDecoder {
         broken: &Buffer,
     ) {
         assert!(along.index.words() == self.capacity && values.words() == grid.len());
-        let dim = cubecl::prelude::CubeDim::new_1d(tile::UNITS);
+        let dim = CubeDim::new_1d(tile::UNITS);
         for from in (0..self.capacity).step_by(self.chunk) {
             // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
             unsafe {

@@ -3,7 +3,7 @@
 use super::super::device::{Atomics, Buffer, Device, groups};
 use super::super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::cpu::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, Penalty, tv_factors};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 

@@ -6,7 +6,7 @@ use super::Vm;
 use crate::Result;
 use crate::kernel::cpu::vm::RAY_WIDTH;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm, TERMS, VmFigures};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 

@@ -6,7 +6,7 @@ use super::super::march::{bit, prefix_sum};
 use super::super::occupancy::words;
 use crate::kernel::cpu::vm::VmField;
 use crate::kernel::cpu::vm::mask::BLOCK;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 

@@ -5,7 +5,7 @@ use super::super::device::{Buffer, Device, groups};
 use super::super::march::prefix_sum;
 use super::march::VmSamples;
 use crate::kernel::cpu::vm::{RAY_WIDTH, VmField};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 
