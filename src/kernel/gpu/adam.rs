@@ -1,6 +1,6 @@
 //! The optimizer of [`crate::kernel::cpu::adam`].
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups};
 use crate::kernel::cpu::adam::AdamStep;
 use burn::cubecl::{self, prelude::*};
 

@@ -2,7 +2,7 @@
 //!
 //! Which pixel a ray is drawn from is a function of seed, step and its number alone, the same as on the CPU.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups};
 use super::rng::{below, stream, uniform};
 use crate::geom::{Camera, Projection};
 use crate::kernel::cpu::march::MarchRay;
@@ -372,13 +372,13 @@ impl Batch {
     /// Room for so many rays, none of them there.
     pub fn new(device: &Device, rays: usize) -> Batch {
         Batch {
-            origin: device.zeros(3 * rays),
-            direction: device.zeros(3 * rays),
-            jitter: device.zeros(rays),
-            color: device.zeros(3 * rays),
-            alpha: device.zeros(rays),
-            background: device.zeros(3 * rays),
-            alive: device.zeros(rays),
+            origin: device.zeros::<f32>(3 * rays),
+            direction: device.zeros::<f32>(3 * rays),
+            jitter: device.zeros::<f32>(rays),
+            color: device.zeros::<f32>(3 * rays),
+            alpha: device.zeros::<f32>(rays),
+            background: device.zeros::<f32>(3 * rays),
+            alive: device.zeros::<u32>(rays),
         }
     }
 

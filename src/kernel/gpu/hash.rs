@@ -1,6 +1,6 @@
 //! The hash encoding of [`crate::kernel::cpu::hash`]: features with Jacobian, and their scatter.
 
-use super::device::{Atomics, Buffer, Device};
+use super::device::{Atomics, Buffer, Device, Words};
 use super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::cpu::hash::Level;
 use crate::kernel::cpu::sdf::FieldShape;
@@ -227,7 +227,7 @@ impl Grid {
         };
         Grid {
             levels: device.upload(&levels.iter().flat_map(words).collect::<Vec<u32>>()),
-            units: device.zeros(levels.len()),
+            units: device.zeros::<f32>(levels.len()),
             count: levels.len(),
             active: shape.active,
             largest: levels.iter().map(|l| l.entries as usize).max().unwrap_or(0),
@@ -391,8 +391,8 @@ mod tests {
             (0..n).flat_map(|l| planes(&jacobian[l * SAMPLES..][..SAMPLES], CAPACITY)).collect();
 
         let on = Grid::new(&device, &shape(&levels));
-        let (table, x) = (device.upload(&table), device.upload(&planes(&x, CAPACITY)));
-        let (v, j) = (device.scratch(want.len()), device.scratch(slopes.len()));
+        let (table, x) = (device.upload(table.as_flattened()), device.upload(&planes(&x, CAPACITY)));
+        let (v, j) = (device.scratch::<f32>(want.len()), device.scratch::<f32>(slopes.len()));
         let count = device.upload(&[SAMPLES as u32]);
         on.gather(&device, &table, &x, &count, &v, Some(&j));
         let (value, jacobian) = (device.read::<f32>(&v), device.read::<f32>(&j));
@@ -425,7 +425,7 @@ mod tests {
             let (g, q) = (device.upload(&level_planes(&g)), device.upload(&level_planes(&q)));
             let normal = device.upload(&planes(&normal, CAPACITY));
             let once = || {
-                let gradient = device.zeros(2 * table.len());
+                let gradient = device.zeros::<f32>(2 * table.len());
                 on.scatter(&device, &gradient, &x, &count, &g, &q, &normal);
                 device.read::<f32>(&gradient)
             };

@@ -1,6 +1,6 @@
 //! What a training step of the signed-distance field minimizes, and its gradients: see [`crate::kernel::cpu::losses`].
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups};
 use super::draw::Batch;
 use crate::kernel::cpu::losses::{LossWeights, RAY_TERMS, SAMPLE_TERMS, TERMS};
 use crate::kernel::cpu::neus::RAY_WIDTH;
@@ -177,11 +177,11 @@ impl Losses {
     pub fn new(device: &Device, weights: LossWeights, rays: usize, capacity: usize) -> Losses {
         Losses {
             weights,
-            tally: device.scratch(3),
-            g_out: device.scratch(RAY_WIDTH * rays),
-            ray_terms: device.scratch(RAY_TERMS * rays),
-            sample_terms: device.scratch(SAMPLE_TERMS * capacity),
-            sums: device.scratch(TERMS),
+            tally: device.scratch::<u32>(3),
+            g_out: device.scratch::<f32>(RAY_WIDTH * rays),
+            ray_terms: device.scratch::<f32>(RAY_TERMS * rays),
+            sample_terms: device.scratch::<f32>(SAMPLE_TERMS * capacity),
+            sums: device.scratch::<f32>(TERMS),
         }
     }
 
@@ -374,7 +374,7 @@ mod tests {
             ..Batch::new(&device, 6)
         };
         let (neus, losses) = (Neus::new(&device, 6, 24), Losses::new(&device, WEIGHTS, 6, 24));
-        let (count, g_s) = (device.upload(&[24u32]), device.zeros(1));
+        let (count, g_s) = (device.upload(&[24u32]), device.zeros::<f32>(1));
         let composed = neus.forward(&device, rays, &field, &sharp, ANNEAL as f32);
         let g_out = losses.of_rays(&device, composed, &batch, &offsets);
         let g_field = neus.backward(&device, rays, &field, &sharp, ANNEAL as f32, g_out, &g_s);

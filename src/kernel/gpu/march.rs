@@ -1,7 +1,7 @@
 //! Marching through the occupancy bitmask of [`crate::kernel::cpu::march`], without the host knowing how many samples there
 //! are: a pass counts them, a prefix sum says where each ray's lie, a second pass writes them.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups};
 use super::draw::Batch;
 use super::occupancy::Occupancy;
 use burn::cubecl::{self, prelude::*};
@@ -229,13 +229,13 @@ impl Samples {
     /// Room for so many rays and `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> Samples {
         Samples {
-            offsets: device.zeros(rays + 1),
-            count: device.zeros(2),
-            t: device.zeros(capacity),
-            dt: device.zeros(capacity),
-            x: device.zeros(3 * capacity),
-            direction: device.zeros(3 * capacity),
-            counts: device.zeros(rays),
+            offsets: device.zeros::<u32>(rays + 1),
+            count: device.zeros::<u32>(2),
+            t: device.zeros::<f32>(capacity),
+            dt: device.zeros::<f32>(capacity),
+            x: device.zeros::<f32>(3 * capacity),
+            direction: device.zeros::<f32>(3 * capacity),
+            counts: device.zeros::<u32>(rays),
         }
     }
 

@@ -28,7 +28,7 @@ mod vm;
 mod weight_norm;
 
 pub use adam::{Gate, adam};
-pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits};
+pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits, Words};
 pub use draw::{Batch, DrawnView, Photographs, SamplingOptions};
 pub use evaluate::Evaluator;
 pub use hash::Grid;

@@ -1,6 +1,6 @@
 //! NeuS compositing of ragged rays: see [`crate::kernel::cpu::neus`]. A thread takes a ray.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups};
 use crate::kernel::cpu::neus::SHORTEST;
 use crate::kernel::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
@@ -268,10 +268,10 @@ impl Neus {
     /// For so many rays and up to `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> Neus {
         Neus {
-            out: device.scratch(RAY_WIDTH * rays),
-            light: device.scratch(capacity),
-            g_field: device.scratch(WIDTH * capacity),
-            g_ln: device.scratch(rays),
+            out: device.scratch::<f32>(RAY_WIDTH * rays),
+            light: device.scratch::<f32>(capacity),
+            g_field: device.scratch::<f32>(WIDTH * capacity),
+            g_ln: device.scratch::<f32>(rays),
         }
     }
 
@@ -371,7 +371,7 @@ mod tests {
         let there = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
         let (on_field, on_s) = (device.upload(&planes(field, n)), device.upload(&[inv_s]));
         let out = device.read(on.forward(device, there, &on_field, &on_s, anneal));
-        let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros(1));
+        let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros::<f32>(1));
         let g_field = device.read(on.backward(device, there, &on_field, &on_s, anneal, &g_out, &g_s));
         let flat = field.as_flattened();
         let want = neus::forward(rays, flat, inv_s, anneal);

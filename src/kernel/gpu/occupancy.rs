@@ -1,6 +1,6 @@
 //! Which cells may hold surface, looked at again on the device: the rule of a band around the zero set, and nerfacc's.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups};
 use super::sdf::Sdf;
 use crate::Result;
 use crate::kernel::cpu::march::Bitmask;
@@ -183,9 +183,9 @@ impl Band {
             cells: device.upload(&cells),
             allowed: device.upload(&words(&allowed.bits)),
             // no sign where nothing is asked
-            value: device.zeros(total),
-            reach: device.zeros(total),
-            count: device.zeros(2),
+            value: device.zeros::<f32>(total),
+            reach: device.zeros::<f32>(total),
+            count: device.zeros::<u32>(2),
             units,
             soften,
         }

@@ -4,7 +4,7 @@
 //! With `f` the distance at a point, `p` the length of a pixel there and `w` its weight, the mean over the points of a
 //! step of `w (√((f / p)² + k²) − k)`.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups};
 use super::march::Samples;
 use super::rng::{below, stream};
 use crate::kernel::cpu::losses::LossWeights;
@@ -101,21 +101,21 @@ impl SurfacePoints {
     /// No points yet; up to `most` a step.
     pub fn new(device: &Device, most: usize, weights: &LossWeights) -> SurfacePoints {
         SurfacePoints {
-            rows: device.zeros(ROW),
+            rows: device.zeros::<f32>(ROW),
             count: 0,
             weights: *weights,
-            drawn: device.zeros(most),
-            terms: device.zeros(most),
-            both: device.zeros(1),
+            drawn: device.zeros::<u32>(most),
+            terms: device.zeros::<f32>(most),
+            both: device.zeros::<u32>(1),
         }
     }
 
     /// These from now on: positions in field coordinates, length of a pixel there, weight.
     pub fn put(&mut self, device: &Device, rows: &[[f32; ROW]]) {
         self.count = rows.len();
-        self.terms = device.zeros(self.most());
+        self.terms = device.zeros::<f32>(self.most());
         if self.count > 0 {
-            self.rows = device.upload(rows);
+            self.rows = device.upload(rows.as_flattened());
         }
     }
 

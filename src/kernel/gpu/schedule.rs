@@ -1,6 +1,6 @@
 //! What a step takes from the one before it, without asking the host: how many rays, and how long a march step is.
 
-use super::device::{Buffer, Device};
+use super::device::{Buffer, Device, Words};
 use crate::Result;
 use crate::kernel::cpu::losses::TERMS;
 use crate::kernel::cpu::schedule::{Figures, RayBudget, StepLength};
@@ -82,9 +82,9 @@ impl Schedule {
             rule,
             budget,
             rays: device.upload(&[rays as u32]),
-            step_length: device.zeros(1),
-            blind: device.zeros(1),
-            figures: device.zeros(TERMS + 5),
+            step_length: device.zeros::<f32>(1),
+            blind: device.zeros::<u32>(1),
+            figures: device.zeros::<u32>(TERMS + 5),
         }
     }
 

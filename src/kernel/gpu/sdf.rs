@@ -9,7 +9,7 @@
 
 mod kernels;
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups};
 use super::hash::Grid;
 use super::tile::{CHANNELS, UNITS};
 use crate::kernel::cpu::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
@@ -135,14 +135,14 @@ impl Sdf {
         let layout = shape.layout();
         let plan = Plan::new(layout);
         let (prepared, summed) = plan.maps(layout);
-        let planes = |count: usize| device.scratch(count * capacity);
+        let planes = |count: usize| device.scratch::<f32>(count * capacity);
         Sdf {
             plan,
             grid: Grid::new(device, shape),
             inv_radius: 1.0 / shape.radius,
             soften: shape.soften,
             capacity,
-            weights: device.scratch(prepared.len()),
+            weights: device.scratch::<f32>(prepared.len()),
             prepared_map: device.upload(&prepared),
             summed_map: device.upload(&summed),
             value: planes(plan.features),
@@ -156,7 +156,7 @@ impl Sdf {
             g_o: planes(OUTPUTS),
             g_value: planes(plan.features),
             g_normal: planes(3),
-            partial: device.scratch(SUMMING * plan.gradients()[7] * CHANNELS),
+            partial: device.scratch::<f32>(SUMMING * plan.gradients()[7] * CHANNELS),
         }
     }
 

@@ -1,6 +1,6 @@
 //! nerfacc's rule: a decaying maximum of the opacity of each cell, looked at again at random.
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups};
 use super::super::march::prefix_sum;
 use super::super::sdf::Sdf;
 use super::super::{neus, rng};
@@ -245,14 +245,14 @@ impl Nerfacc {
         assert_eq!(cells, occupancy.resolution.pow(3));
         Nerfacc {
             history: device.upload(history),
-            counts: device.zeros(words),
-            before: device.zeros(words + 1),
-            kept: device.zeros(2),
-            last: device.zeros(cells),
-            drawn: device.zeros(capacity),
-            sums: device.zeros(cells.div_ceil(32 * UNITS as usize)),
-            least: device.zeros(1),
-            count: device.zeros(2),
+            counts: device.zeros::<u32>(words),
+            before: device.zeros::<u32>(words + 1),
+            kept: device.zeros::<u32>(2),
+            last: device.zeros::<u32>(cells),
+            drawn: device.zeros::<u32>(capacity),
+            sums: device.zeros::<f32>(cells.div_ceil(32 * UNITS as usize)),
+            least: device.zeros::<f32>(1),
+            count: device.zeros::<u32>(2),
             step,
         }
     }

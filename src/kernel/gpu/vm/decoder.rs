@@ -12,7 +12,7 @@
 
 mod kernels;
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups};
 use super::super::draw::Batch;
 use super::super::tile;
 use super::grid::{DeviceGrid, NONE};
@@ -139,13 +139,13 @@ impl DeviceDecoder {
         // a power of two, so that pieces are whole tiles
         let fits = (device.limits().largest_buffer as usize / (16 * plan.products()).max(1)).max(super::TILE);
         let chunk = capacity.min(Self::CHUNK).min(1 << fits.ilog2());
-        let learned = |words: usize| device.scratch(if learns { words } else { 1 });
+        let learned = |words: usize| device.scratch::<f32>(if learns { words } else { 1 });
         let gradients = plan.gradients()[6] * plan.width();
         DeviceDecoder {
             plan,
             real: device.upload(&real),
             padded: device.upload(&padded),
-            weights: device.scratch(plan.rows()[8] * plan.width()),
+            weights: device.scratch::<f32>(plan.rows()[8] * plan.width()),
             g_products: learned(chunk * 4 * plan.products()),
             chunk,
             capacity,

@@ -1,6 +1,6 @@
 //! Planes and lines on a device: lookups, gradients back onto them, and what is asked of them besides the photographs.
 
-use super::super::device::{Atomics, Buffer, Device, groups};
+use super::super::device::{Atomics, Buffer, Device, Words, groups};
 use super::super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::cpu::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, Penalty, tv_factors};
 use burn::cubecl::{self, prelude::*};
@@ -336,9 +336,9 @@ impl DeviceGrid {
             padded,
             words: device.upload(&words),
             factors: device.upload(&factors),
-            units: device.zeros(2),
-            partial: device.scratch(3 * BOUNDING),
-            whole: fixed.then(|| device.zeros(padded.len())),
+            units: device.zeros::<f32>(2),
+            partial: device.scratch::<f32>(3 * BOUNDING),
+            whole: fixed.then(|| device.zeros::<i32>(padded.len())),
         }
     }
 

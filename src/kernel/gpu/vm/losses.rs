@@ -1,6 +1,6 @@
 //! What a training step of TensoRF's field minimizes, and its gradients: see [`crate::kernel::cpu::vm::losses`].
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups};
 use super::super::draw::Batch;
 use super::Vm;
 use crate::Result;
@@ -159,10 +159,10 @@ impl VmLosses {
     pub fn new(device: &Device, rays: usize, term: MaskTerm) -> VmLosses {
         VmLosses {
             term,
-            tally: device.scratch(2),
-            g_out: device.scratch(RAY_WIDTH * rays),
-            terms: device.scratch(TERMS * rays),
-            totals: device.zeros(TOTALS),
+            tally: device.scratch::<u32>(2),
+            g_out: device.scratch::<f32>(RAY_WIDTH * rays),
+            terms: device.scratch::<f32>(TERMS * rays),
+            totals: device.zeros::<u32>(TOTALS),
         }
     }
 
@@ -233,13 +233,13 @@ impl VmLosses {
 
     /// Forgets what steps came to since the last time.
     pub fn forget(&mut self, device: &Device) {
-        self.totals = device.zeros(TOTALS);
+        self.totals = device.zeros::<u32>(TOTALS);
     }
 
     /// Waits for the device; what the steps since the last time came to.
     pub fn fetch(&mut self, device: &Device) -> Result<VmFigures> {
         let t = device.fetch::<u32>(&self.totals)?;
-        self.totals = device.zeros(TOTALS);
+        self.totals = device.zeros::<u32>(TOTALS);
         let [lattice, density, color, rays] = [3, 4, 5, 6].map(|i| t[i] as u64);
         let terms = [t[0], t[1], t[2]].map(f32::from_bits);
         Ok(VmFigures { terms, lattice, density, color, rays, broken: t[7] != 0 })

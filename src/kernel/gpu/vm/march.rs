@@ -1,6 +1,6 @@
 //! The lattice points of rays inside a box and a mask: see [`crate::kernel::cpu::vm::mask::Walk`], whose rule this is.
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups};
 use super::super::draw::Batch;
 use super::super::march::{bit, prefix_sum};
 use super::super::occupancy::words;
@@ -240,13 +240,13 @@ impl VmSamples {
     /// Room for so many rays and `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> VmSamples {
         VmSamples {
-            offsets: device.zeros(rays + 1),
-            count: device.zeros(2),
-            t: device.scratch(capacity),
-            ray: device.scratch(capacity),
-            place: device.scratch(3 * capacity),
-            points: device.zeros(rays),
-            counts: device.zeros(rays),
+            offsets: device.zeros::<u32>(rays + 1),
+            count: device.zeros::<u32>(2),
+            t: device.scratch::<f32>(capacity),
+            ray: device.scratch::<u32>(capacity),
+            place: device.scratch::<f32>(3 * capacity),
+            points: device.zeros::<u32>(rays),
+            counts: device.zeros::<u32>(rays),
         }
     }
 

@@ -1,7 +1,7 @@
 //! From features to weights, and compositing: see `render` of [`crate::kernel::cpu::vm`], whose module holds the formulas. A
 //! thread takes a ray.
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups};
 use super::super::march::prefix_sum;
 use super::march::VmSamples;
 use crate::kernel::cpu::vm::{RAY_WIDTH, VmField};
@@ -211,22 +211,22 @@ impl Along {
     /// Of so many rays and up to `capacity` samples of a field; with room for gradients where it learns.
     pub fn new(device: &Device, field: &VmField, rays: usize, capacity: usize, learns: bool) -> Along {
         let s = &field.shading;
-        let samples = |planes: usize| device.scratch(planes * capacity);
-        let gradients = |planes: usize| device.scratch(if learns { planes * capacity } else { 1 });
+        let samples = |planes: usize| device.scratch::<f32>(planes * capacity);
+        let gradients = |planes: usize| device.scratch::<f32>(if learns { planes * capacity } else { 1 });
         Along {
             feature: samples(1),
             g_feature: gradients(1),
-            count: device.zeros(2),
-            index: samples(1),
+            count: device.zeros::<u32>(2),
+            index: device.scratch::<u32>(capacity),
             rgb: samples(3),
             g_pre: gradients(3),
-            out: device.scratch(RAY_WIDTH * rays),
+            out: device.scratch::<f32>(RAY_WIDTH * rays),
             alpha: samples(1),
             light: samples(1),
             weight: samples(1),
-            ends: device.scratch(rays),
-            counts: device.scratch(rays),
-            firsts: device.scratch(rays + 1),
+            ends: device.scratch::<u32>(rays),
+            counts: device.scratch::<u32>(rays),
+            firsts: device.scratch::<u32>(rays + 1),
             shift: s.shift,
             length: field.lattice.step * s.distance_scale,
             threshold: s.weight_threshold,
