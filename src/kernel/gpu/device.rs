@@ -259,6 +259,21 @@ impl Device {
     }
 }
 
+/// Launches a kernel and counts it: `launch!(device, kernel::launch, groups, threads; buffers; scalars)`, with the threads
+/// of one group. Unsafe with `kernel::launch_unchecked`.
+macro_rules! launch {
+    ($device:expr, $launch:expr, $groups:expr, $threads:expr; $($buffer:expr),+ $(; $($scalar:expr),+)?) => {
+        $launch(
+            $device.launch(),
+            $groups,
+            burn::cubecl::prelude::CubeDim::new_1d($threads),
+            $($buffer.arg(),)+
+            $($($scalar,)+)?
+        )
+    };
+}
+pub(super) use launch;
+
 /// So many groups of threads, beyond 65,535 in two dimensions: a kernel uses its position among all and ignores
 /// those that are too many.
 pub(super) fn groups(count: usize) -> CubeCount {

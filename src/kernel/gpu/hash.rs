@@ -1,6 +1,6 @@
 //! The hash encoding of [`crate::kernel::cpu::hash`]: features with Jacobian, and their scatter.
 
-use super::device::{Atomics, Buffer, Device, Words};
+use super::device::{Atomics, Buffer, Device, Words, launch};
 use super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::cpu::hash::Level;
 use crate::kernel::cpu::sdf::FieldShape;
@@ -258,20 +258,10 @@ impl Grid {
         jacobian: Option<&Buffer>,
     ) {
         let capacity = x.words() / 3;
-        gather::launch(
-            device.launch(),
-            CubeCount::Static((capacity as u32).div_ceil(GROUP), self.count as u32, 1),
-            CubeDim::new_1d(GROUP),
-            table.arg(),
-            self.levels.arg(),
-            x.arg(),
-            count.arg(),
-            value.arg(),
-            jacobian.unwrap_or(value).arg(),
-            capacity as u32,
-            self.active as u32,
-            self.world,
-            jacobian.is_some(),
+        let groups = CubeCount::Static((capacity as u32).div_ceil(GROUP), self.count as u32, 1);
+        launch!(device, gather::launch, groups, GROUP;
+            table, self.levels, x, count, value, jacobian.unwrap_or(value);
+            capacity as u32, self.active as u32, self.world, jacobian.is_some()
         );
     }
 
@@ -292,46 +282,24 @@ impl Grid {
         g_normal: &Buffer,
     ) {
         let capacity = x.words() / 3;
-        let dim = CubeDim::new_1d(GROUP);
         let fixed = device.atomics() == Atomics::Fixed;
         if fixed {
-            bound::launch(
-                device.launch(),
-                CubeCount::new_1d(self.active as u32),
-                dim,
-                self.levels.arg(),
-                count.arg(),
-                g_value.arg(),
-                q.arg(),
-                g_normal.arg(),
-                self.units.arg(),
-                capacity as u32,
-                self.world,
+            launch!(device, bound::launch, CubeCount::new_1d(self.active as u32), GROUP;
+                self.levels, count, g_value, q, g_normal, self.units; capacity as u32, self.world
             );
         }
-        let launch = match device.atomics() {
+        let scatter = match device.atomics() {
             Atomics::Native => scatter::launch::<Native>,
             Atomics::Exchange => scatter::launch::<Exchange>,
             Atomics::Fixed => scatter::launch::<Fixed>,
         };
-        launch(
-            device.launch(),
-            CubeCount::Static((capacity as u32).div_ceil(GROUP), self.active as u32, 1),
-            dim,
-            gradient.arg(),
-            self.levels.arg(),
-            x.arg(),
-            count.arg(),
-            g_value.arg(),
-            q.arg(),
-            g_normal.arg(),
-            self.units.arg(),
-            capacity as u32,
-            self.world,
+        let groups = CubeCount::Static((capacity as u32).div_ceil(GROUP), self.active as u32, 1);
+        launch!(device, scatter, groups, GROUP;
+            gradient, self.levels, x, count, g_value, q, g_normal, self.units; capacity as u32, self.world
         );
         if fixed {
             let count = CubeCount::Static((2 * self.largest as u32).div_ceil(GROUP), self.active as u32, 1);
-            settle::launch(device.launch(), count, dim, gradient.arg(), self.levels.arg(), self.units.arg());
+            launch!(device, settle::launch, count, GROUP; gradient, self.levels, self.units);
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Marching through the occupancy bitmask of [`crate::kernel::cpu::march`], without the host knowing how many samples there
 //! are: a pass counts them, a prefix sum says where each ray's lie, a second pass writes them.
 
-use super::device::{Buffer, Device, Words, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::Batch;
 use super::occupancy::Occupancy;
 use burn::cubecl::{self, prelude::*};
@@ -197,15 +197,7 @@ pub(super) fn prefix_sum(
     capacity: usize,
 ) {
     assert_eq!(offsets.words(), counts.words() + 1);
-    scan::launch(
-        device.launch(),
-        CubeCount::new_single(),
-        CubeDim::new_1d(UNITS),
-        counts.arg(),
-        offsets.arg(),
-        total.arg(),
-        capacity as u32,
-    );
+    launch!(device, scan::launch, CubeCount::new_single(), UNITS; counts, offsets, total; capacity as u32);
 }
 
 /// The samples of a batch of rays on a device.
@@ -252,28 +244,12 @@ impl Samples {
     ) {
         assert!(rays.rays() == self.counts.words() && apart < self.t.words());
         let both = |writes: bool| {
-            pass::launch(
-                device.launch(),
-                groups(rays.rays().div_ceil(UNITS as usize)),
-                CubeDim::new_1d(UNITS),
-                occupancy.mask.arg(),
-                occupancy.solid.as_ref().unwrap_or(&occupancy.mask).arg(),
-                rays.origin.arg(),
-                rays.direction.arg(),
-                rays.jitter.arg(),
-                rays.alive.arg(),
-                self.offsets.arg(),
-                self.counts.arg(),
-                pitch.arg(),
-                self.t.arg(),
-                self.dt.arg(),
-                self.x.arg(),
-                self.direction.arg(),
-                occupancy.resolution as u32,
-                occupancy.radius,
-                limit.min(u32::MAX as usize) as u32,
-                writes,
-                occupancy.solid.is_some(),
+            launch!(device, pass::launch, groups(rays.rays().div_ceil(UNITS as usize)), UNITS;
+                occupancy.mask, occupancy.solid.as_ref().unwrap_or(&occupancy.mask), rays.origin,
+                rays.direction, rays.jitter, rays.alive, self.offsets, self.counts, pitch, self.t, self.dt,
+                self.x, self.direction;
+                occupancy.resolution as u32, occupancy.radius, limit.min(u32::MAX as usize) as u32, writes,
+                occupancy.solid.is_some()
             );
         };
         both(false);

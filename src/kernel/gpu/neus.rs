@@ -1,6 +1,6 @@
 //! NeuS compositing of ragged rays: see [`crate::kernel::cpu::neus`]. A thread takes a ray.
 
-use super::device::{Buffer, Device, Words, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use crate::kernel::cpu::neus::SHORTEST;
 use crate::kernel::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
@@ -294,19 +294,8 @@ impl Neus {
         inv_s: &Buffer,
         anneal: f32,
     ) -> &Buffer {
-        forward::launch(
-            device.launch(),
-            groups(self.g_ln.words().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            rays.offsets.arg(),
-            rays.direction.arg(),
-            rays.t.arg(),
-            rays.dt.arg(),
-            field.arg(),
-            inv_s.arg(),
-            self.out.arg(),
-            self.light.arg(),
-            anneal,
+        launch!(device, forward::launch, groups(self.g_ln.words().div_ceil(UNITS as usize)), UNITS;
+            rays.offsets, rays.direction, rays.t, rays.dt, field, inv_s, self.out, self.light; anneal
         );
         &self.out
     }
@@ -323,25 +312,13 @@ impl Neus {
         g_out: &Buffer,
         g_inv_s: &Buffer,
     ) -> &Buffer {
-        let dim = CubeDim::new_1d(UNITS);
-        backward::launch(
-            device.launch(),
-            groups(self.g_ln.words().div_ceil(UNITS as usize)),
-            dim,
-            rays.offsets.arg(),
-            rays.direction.arg(),
-            rays.t.arg(),
-            rays.dt.arg(),
-            field.arg(),
-            inv_s.arg(),
-            self.light.arg(),
-            g_out.arg(),
-            self.g_field.arg(),
-            self.g_ln.arg(),
-            anneal,
+        launch!(device, backward::launch, groups(self.g_ln.words().div_ceil(UNITS as usize)), UNITS;
+            rays.offsets, rays.direction, rays.t, rays.dt, field, inv_s, self.light, g_out, self.g_field,
+            self.g_ln;
+            anneal
         );
         let one = CubeCount::new_single();
-        sharpness::launch(device.launch(), one, dim, self.g_ln.arg(), inv_s.arg(), g_inv_s.arg());
+        launch!(device, sharpness::launch, one, UNITS; self.g_ln, inv_s, g_inv_s);
         &self.g_field
     }
 }

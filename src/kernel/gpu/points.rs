@@ -4,7 +4,7 @@
 //! With `f` the distance at a point, `p` the length of a pixel there and `w` its weight, the mean over the points of a
 //! step of `w (√((f / p)² + k²) − k)`.
 
-use super::device::{Buffer, Device, Words, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use super::march::Samples;
 use super::rng::{below, stream};
 use crate::kernel::cpu::losses::LossWeights;
@@ -127,20 +127,9 @@ impl SurfacePoints {
     /// Draws some by seed and step, behind a step's samples, and returns how many there are with them, `[1]`.
     pub fn append(&self, device: &Device, (seed, step): (u64, u64), samples: &Samples) -> &Buffer {
         let [high, low] = stream(seed, step << 4 | 12);
-        append::launch(
-            device.launch(),
-            groups(self.most().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            self.rows.arg(),
-            samples.count.arg(),
-            self.both.arg(),
-            self.drawn.arg(),
-            samples.x.arg(),
-            samples.direction.arg(),
-            self.count as u32,
-            if self.count > 0 { self.most() as u32 } else { 0 },
-            high,
-            low,
+        launch!(device, append::launch, groups(self.most().div_ceil(UNITS as usize)), UNITS;
+            self.rows, samples.count, self.both, self.drawn, samples.x, samples.direction;
+            self.count as u32, if self.count > 0 { self.most() as u32 } else { 0 }, high, low
         );
         &self.both
     }
@@ -151,19 +140,9 @@ impl SurfacePoints {
         if self.count == 0 {
             return;
         }
-        of_points::launch(
-            device.launch(),
-            groups(self.most().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            self.rows.arg(),
-            self.drawn.arg(),
-            count.arg(),
-            self.both.arg(),
-            field.arg(),
-            g_field.arg(),
-            self.terms.arg(),
-            self.weights.stereo,
-            self.weights.knee,
+        launch!(device, of_points::launch, groups(self.most().div_ceil(UNITS as usize)), UNITS;
+            self.rows, self.drawn, count, self.both, field, g_field, self.terms;
+            self.weights.stereo, self.weights.knee
         );
     }
 

@@ -6,7 +6,7 @@
 //! inv_s = exp(10 s)         g_s = 10 inv_s g_inv_s
 //! ```
 
-use super::device::{Buffer, Device, Words, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use crate::kernel::cpu::mlp::Layout;
 use crate::kernel::cpu::weight_norm::{self, Row};
 use burn::cubecl::{self, prelude::*};
@@ -158,17 +158,8 @@ impl WeightNorm {
         inv_s: &Buffer,
     ) {
         assert_eq!(raw.words(), self.parameters);
-        forward::launch(
-            device.launch(),
-            groups(self.count.div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            raw.arg(),
-            self.pieces.arg(),
-            variance.arg(),
-            flat.arg(),
-            inv_s.arg(),
-            range[0],
-            range[1],
+        launch!(device, forward::launch, groups(self.count.div_ceil(UNITS as usize)), UNITS;
+            raw, self.pieces, variance, flat, inv_s; range[0], range[1]
         );
     }
 
@@ -183,18 +174,8 @@ impl WeightNorm {
         [g_raw, g_variance]: [&Buffer; 2],
         broken: &Buffer,
     ) {
-        backward::launch(
-            device.launch(),
-            groups(self.count.div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            raw.arg(),
-            self.pieces.arg(),
-            inv_s.arg(),
-            g_flat.arg(),
-            g_inv_s.arg(),
-            g_raw.arg(),
-            g_variance.arg(),
-            broken.arg(),
+        launch!(device, backward::launch, groups(self.count.div_ceil(UNITS as usize)), UNITS;
+            raw, self.pieces, inv_s, g_flat, g_inv_s, g_raw, g_variance, broken
         );
     }
 }

@@ -1,6 +1,6 @@
 //! nerfacc's rule: a decaying maximum of the opacity of each cell, looked at again at random.
 
-use super::super::device::{Buffer, Device, Words, groups};
+use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
 use super::super::sdf::Sdf;
 use super::super::{neus, rng};
@@ -276,7 +276,6 @@ impl Nerfacc {
         let cells = self.history.words();
         let all = n < nerfacc::ALL_BELOW;
         let [any, some, jitter] = nerfacc::DRAWS;
-        let dim = CubeDim::new_1d(UNITS);
         let over = |count: usize| groups(count.div_ceil(UNITS as usize));
         let draws = |purpose: u64| {
             let [high, low] = rng::stream(seed, n << 4 | purpose);
@@ -285,77 +284,33 @@ impl Nerfacc {
         let draw_count = if all { cells } else { cells / 4 * 2 };
         if !all {
             let mask = &occupancy.mask;
-            tally::launch(device.launch(), over(mask.words()), dim, mask.arg(), self.counts.arg());
+            launch!(device, tally::launch, over(mask.words()), UNITS; mask, self.counts);
             prefix_sum(device, &self.counts, &self.before, &self.kept, cells);
-            claim::launch(
-                device.launch(),
-                over(draw_count),
-                dim,
-                mask.arg(),
-                self.before.arg(),
-                self.last.arg(),
-                cells as u32,
-                draws(any),
-                draws(some),
+            launch!(device, claim::launch, over(draw_count), UNITS;
+                mask, self.before, self.last; cells as u32, draws(any), draws(some)
             );
         }
         let capacity = self.drawn.words();
         assert!(capacity <= x.words() / 3);
         for first in (0..draw_count).step_by(capacity) {
             let here = capacity.min(draw_count - first);
-            scatter::launch(
-                device.launch(),
-                over(here),
-                dim,
-                occupancy.mask.arg(),
-                self.before.arg(),
-                x.arg(),
-                self.drawn.arg(),
-                self.count.arg(),
-                first as u32,
-                here as u32,
-                occupancy.resolution as u32,
-                occupancy.radius,
-                draws(any),
-                draws(some),
-                draws(jitter),
-                all,
+            launch!(device, scatter::launch, over(here), UNITS;
+                occupancy.mask, self.before, x, self.drawn, self.count;
+                first as u32, here as u32, occupancy.resolution as u32, occupancy.radius, draws(any),
+                draws(some), draws(jitter), all
             );
             let out = field.forward(device, table, flat, x, direction, &self.count);
-            remember::launch(
-                device.launch(),
-                over(here),
-                dim,
-                out.arg(),
-                inv_s.arg(),
-                self.drawn.arg(),
-                self.last.arg(),
-                self.history.arg(),
-                first as u32,
-                here as u32,
-                self.step,
-                all,
+            launch!(device, remember::launch, over(here), UNITS;
+                out, inv_s, self.drawn, self.last, self.history; first as u32, here as u32, self.step, all
             );
         }
         let sums = &self.sums;
-        partial_sums::launch(device.launch(), groups(sums.words()), dim, self.history.arg(), sums.arg());
-        mean::launch(
-            device.launch(),
-            CubeCount::new_single(),
-            CubeDim::new_1d(1),
-            sums.arg(),
-            self.least.arg(),
-            cells as u32,
-            nerfacc::OPAQUE,
+        launch!(device, partial_sums::launch, groups(sums.words()), UNITS; self.history, sums);
+        launch!(device, mean::launch, CubeCount::new_single(), 1;
+            sums, self.least; cells as u32, nerfacc::OPAQUE
         );
-        decide_by_history::launch(
-            device.launch(),
-            over(occupancy.mask.words()),
-            dim,
-            self.history.arg(),
-            self.least.arg(),
-            self.last.arg(),
-            occupancy.mask.arg(),
+        launch!(device, decide_by_history::launch, over(occupancy.mask.words()), UNITS;
+            self.history, self.least, self.last, occupancy.mask
         );
     }
 }

@@ -1,6 +1,6 @@
 //! What a training step of TensoRF's field minimizes, and its gradients: see [`crate::kernel::cpu::vm::losses`].
 
-use super::super::device::{Buffer, Device, Words, groups};
+use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
 use super::Vm;
 use crate::Result;
@@ -174,7 +174,6 @@ impl VmLosses {
         batch: &Batch,
         mode: BackgroundMode,
     ) -> &Buffer {
-        let dim = CubeDim::new_1d(UNITS);
         let (weight, l2, ce) = match self.term {
             MaskTerm::None => (0.0, false, false),
             MaskTerm::L2(weight) => (weight, true, false),
@@ -182,24 +181,10 @@ impl VmLosses {
         };
         let Batch { color, alpha, background, alive, .. } = batch;
         let one = CubeCount::new_single();
-        tally::launch(device.launch(), one, dim, alpha.arg(), alive.arg(), self.tally.arg());
-        of_rays::launch(
-            device.launch(),
-            groups(alpha.words().div_ceil(UNITS as usize)),
-            dim,
-            composed.arg(),
-            color.arg(),
-            alpha.arg(),
-            background.arg(),
-            alive.arg(),
-            self.tally.arg(),
-            self.g_out.arg(),
-            self.terms.arg(),
-            mode.lift,
-            f32::from(mode.target),
-            weight,
-            l2,
-            ce,
+        launch!(device, tally::launch, one, UNITS; alpha, alive, self.tally);
+        launch!(device, of_rays::launch, groups(alpha.words().div_ceil(UNITS as usize)), UNITS;
+            composed, color, alpha, background, alive, self.tally, self.g_out, self.terms;
+            mode.lift, f32::from(mode.target), weight, l2, ce
         );
         &self.g_out
     }
@@ -217,17 +202,8 @@ impl VmLosses {
     /// Adds the last step to what is read.
     pub fn add(&self, device: &Device, vm: &Vm, broken: &Buffer) {
         let [looked_up, decoded, points] = vm.counts();
-        add::launch(
-            device.launch(),
-            CubeCount::new_1d(TERMS as u32 + 1),
-            CubeDim::new_1d(UNITS),
-            self.terms.arg(),
-            points.arg(),
-            looked_up.arg(),
-            decoded.arg(),
-            self.tally.arg(),
-            broken.arg(),
-            self.totals.arg(),
+        launch!(device, add::launch, CubeCount::new_1d(TERMS as u32 + 1), UNITS;
+            self.terms, points, looked_up, decoded, self.tally, broken, self.totals
         );
     }
 

@@ -1,7 +1,7 @@
 //! From features to weights, and compositing: see `render` of [`crate::kernel::cpu::vm`], whose module holds the formulas. A
 //! thread takes a ray.
 
-use super::super::device::{Buffer, Device, Words, groups};
+use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
 use super::march::VmSamples;
 use crate::kernel::cpu::vm::{RAY_WIDTH, VmField};
@@ -241,77 +241,31 @@ impl Along {
 
     /// Weights of samples from their features, and the list of those worth a color.
     pub fn weigh(&self, device: &Device, samples: &VmSamples) {
-        weigh::launch(
-            device.launch(),
-            self.groups(),
-            CubeDim::new_1d(UNITS),
-            samples.offsets.arg(),
-            self.feature.arg(),
-            self.alpha.arg(),
-            self.light.arg(),
-            self.weight.arg(),
-            self.ends.arg(),
-            self.counts.arg(),
-            self.shift,
-            self.length,
-            self.threshold,
-            self.stop,
-            self.softplus,
+        launch!(device, weigh::launch, self.groups(), UNITS;
+            samples.offsets, self.feature, self.alpha, self.light, self.weight, self.ends, self.counts;
+            self.shift, self.length, self.threshold, self.stop, self.softplus
         );
         prefix_sum(device, &self.counts, &self.firsts, &self.count, self.index.words());
-        list::launch(
-            device.launch(),
-            self.groups(),
-            CubeDim::new_1d(UNITS),
-            samples.offsets.arg(),
-            self.ends.arg(),
-            self.weight.arg(),
-            self.firsts.arg(),
-            self.index.arg(),
-            self.threshold,
+        launch!(device, list::launch, self.groups(), UNITS;
+            samples.offsets, self.ends, self.weight, self.firsts, self.index; self.threshold
         );
     }
 
     /// Composites colors.
     pub fn composite(&self, device: &Device, samples: &VmSamples) {
-        composite::launch(
-            device.launch(),
-            self.groups(),
-            CubeDim::new_1d(UNITS),
-            samples.offsets.arg(),
-            self.ends.arg(),
-            self.firsts.arg(),
-            samples.t.arg(),
-            self.weight.arg(),
-            self.rgb.arg(),
-            self.out.arg(),
-            self.threshold,
+        launch!(device, composite::launch, self.groups(), UNITS;
+            samples.offsets, self.ends, self.firsts, samples.t, self.weight, self.rgb, self.out;
+            self.threshold
         );
     }
 
     /// Gradients of samples from those by what was composited, planes `[5, rays]`.
     pub fn backward(&self, device: &Device, samples: &VmSamples, g_out: &Buffer) {
         assert!(g_out.words() == self.out.words() && self.g_feature.words() == self.feature.words());
-        backward::launch(
-            device.launch(),
-            self.groups(),
-            CubeDim::new_1d(UNITS),
-            samples.offsets.arg(),
-            self.ends.arg(),
-            self.firsts.arg(),
-            samples.t.arg(),
-            self.feature.arg(),
-            self.alpha.arg(),
-            self.light.arg(),
-            self.weight.arg(),
-            self.rgb.arg(),
-            g_out.arg(),
-            self.g_feature.arg(),
-            self.g_pre.arg(),
-            self.shift,
-            self.length,
-            self.threshold,
-            self.softplus,
+        launch!(device, backward::launch, self.groups(), UNITS;
+            samples.offsets, self.ends, self.firsts, samples.t, self.feature, self.alpha, self.light,
+            self.weight, self.rgb, g_out, self.g_feature, self.g_pre;
+            self.shift, self.length, self.threshold, self.softplus
         );
     }
 }
