@@ -1,13 +1,15 @@
 //! What every field asks of the device that trains it.
 //!
 //! A model's training step is written once, over a trait of operations ([`Ops`] and one for each model); a device
-//! implements it with kernels of its own. The processor computes on burn's Flex tensors, each step to its end; a GPU is
-//! given the launches of many steps and is read once in [`ArrayDevice::READ_EVERY`].
+//! implements it with kernels of its own. The processor computes on burn's Flex tensors, each step to its end; a GPU, on
+//! burn's tensors of CubeCL, is given the launches of many steps and is read once in [`ArrayDevice::READ_EVERY`].
 
 use crate::Result;
 use crate::kernel::cpu::adam::{self, AdamStep};
 #[cfg(feature = "wgpu")]
 use crate::kernel::gpu;
+#[cfg(feature = "wgpu")]
+use burn::backend::Cube;
 use burn::backend::Flex;
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::TensorData;
@@ -99,22 +101,22 @@ impl ArrayDevice for Cpu {
 
 #[cfg(feature = "wgpu")]
 impl ArrayDevice for gpu::Device {
-    type Array = gpu::Buffer;
+    type Array = FloatTensor<Cube>;
     type Gate<'a> = gpu::Gate<'a>;
     const READ_EVERY: u64 = 50;
 
-    fn upload(&self, values: Vec<f32>) -> gpu::Buffer {
+    fn upload(&self, values: Vec<f32>) -> FloatTensor<Cube> {
         self.upload(&values)
     }
 
-    fn download(&self, array: &gpu::Buffer) -> Result<Vec<f32>> {
+    fn download(&self, array: &FloatTensor<Cube>) -> Result<Vec<f32>> {
         self.fetch(array)
     }
 
     fn adam(
         &self,
-        state: [&mut gpu::Buffer; 3],
-        gradient: &mut gpu::Buffer,
+        state: [&mut FloatTensor<Cube>; 3],
+        gradient: &mut FloatTensor<Cube>,
         step: &AdamStep,
         gate: gpu::Gate,
     ) {

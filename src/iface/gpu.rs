@@ -22,7 +22,7 @@ use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::cpu::sdf::FieldShape;
 use crate::kernel::gpu::{
     self, Band, Batch, Buffer, Device, Gate, Losses, Nerfacc, Neus, Rays, Samples, SamplingOptions, Schedule,
-    Sdf, SurfacePoints, WeightNorm,
+    Sdf, SurfacePoints, WeightNorm, Words,
 };
 use crate::{Error, Result};
 
@@ -97,16 +97,16 @@ impl<'a> GpuSdf<'a> {
             batch: Batch::new(&device, rays),
             samples: Samples::new(&device, rays, capacity),
             points: SurfacePoints::new(&device, stereo_points(config), &weights),
-            total_count: device.zeros(1),
+            total_count: device.zeros::<u32>(1),
             norm: WeightNorm::new(&device, shape.layout()),
             sdf: Sdf::new(&device, &shape, capacity),
             neus: Neus::new(&device, rays, capacity),
             losses: Losses::new(&device, weights, rays, capacity),
-            flat: device.zeros(flat),
-            g_flat: device.zeros(flat),
-            inv_s: device.zeros(1),
-            g_inv_s: device.zeros(1),
-            broken: device.zeros(1),
+            flat: device.zeros::<f32>(flat),
+            g_flat: device.zeros::<f32>(flat),
+            inv_s: device.zeros::<f32>(1),
+            g_inv_s: device.zeros::<f32>(1),
+            broken: device.zeros::<u32>(1),
             schedule: Schedule::new(
                 &device,
                 schedule::step_length(config),
@@ -225,7 +225,7 @@ impl SdfOps for GpuSdf<'_> {
         (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.words());
         let budget = schedule::ray_budget(config);
         self.schedule = Schedule::new(device, schedule::step_length(config), budget, rays);
-        self.broken = device.zeros(1);
+        self.broken = device.zeros::<u32>(1);
         self.stepped = false;
         self.set_points(points);
     }

@@ -92,7 +92,7 @@ impl<'a> GpuVm<'a> {
             batch: Batch::new(&device, config.rays),
             losses: VmLosses::new(&device, config.rays, mask_term(config, pixels)),
             vm: None,
-            broken: device.zeros(1),
+            broken: device.zeros::<u32>(1),
             device,
         }
     }
@@ -126,7 +126,7 @@ impl Ops for GpuVm<'_> {
 impl VmOps for GpuVm<'_> {
     fn load(&mut self, field: &Arc<VmField>, groups: [HostGroup; 3]) -> VmGroups<Self> {
         self.vm = Some(Vm::new(&self.device, field, self.batch.rays(), true));
-        self.broken = self.device.zeros(1);
+        self.broken = self.device.zeros::<u32>(1);
         let [density, color, network] = groups;
         let pad = |mut group: HostGroup, grid: &gpu::DeviceGrid| {
             group.state = group.state.map(|values| grid.pad(values));

@@ -12,7 +12,7 @@ use crate::iface::occupancy::Occupancy;
 use crate::iface::schedule;
 use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::gpu::{
-    self, Batch, Buffer, Density, Device, Gate, Nerfacc, Samples, SamplingOptions, Schedule,
+    self, Batch, Buffer, Density, Device, Gate, Nerfacc, Samples, SamplingOptions, Schedule, Words,
 };
 use crate::{Error, Result};
 
@@ -68,8 +68,8 @@ impl<'a> GpuDensity<'a> {
             marched: Samples::new(&device, rays, capacity),
             samples: Samples::new(&device, rays, capacity),
             density: Density::new(&device, &shape(config), length.at(0.0), rays, capacity),
-            no_sharpness: device.zeros(1),
-            broken: device.zeros(1),
+            no_sharpness: device.zeros::<f32>(1),
+            broken: device.zeros::<u32>(1),
             schedule: Schedule::new(&device, length, budget, config.rays),
             occupancy,
             cells,
@@ -114,7 +114,7 @@ impl DensityOps for GpuDensity<'_> {
         (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.words());
         let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         self.schedule = Schedule::new(device, length, budget, rays);
-        self.broken = device.zeros(1);
+        self.broken = device.zeros::<u32>(1);
         self.stepped = false;
     }
 

@@ -1,8 +1,8 @@
 //! The optimizer of [`crate::kernel::cpu::adam`].
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use crate::kernel::cpu::adam::AdamStep;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
@@ -50,24 +50,10 @@ pub struct Gate<'a> {
 pub fn adam(device: &Device, [p, m, v]: [&Buffer; 3], g: &Buffer, step: &AdamStep, gate: Gate) {
     assert!([m, v, g].iter().all(|b| b.words() == p.words()));
     let correction = |beta: f32| (1.0 / (1.0 - (beta as f64).powf(step.step as f64))) as f32;
-    adam_kernel::launch(
-        device.launch(),
-        groups(p.words().div_ceil(UNITS as usize)),
-        CubeDim::new_1d(UNITS),
-        p.arg(),
-        m.arg(),
-        v.arg(),
-        g.arg(),
-        gate.count.arg(),
-        gate.broken.arg(),
-        step.lr,
-        step.beta1,
-        step.beta2,
-        step.epsilon,
-        1.0 - step.lr * step.weight_decay,
-        correction(step.beta1),
-        correction(step.beta2),
-        step.skip_zero,
+    launch!(device, adam_kernel::launch, groups(p.words().div_ceil(UNITS as usize)), UNITS;
+        p, m, v, g, gate.count, gate.broken;
+        step.lr, step.beta1, step.beta2, step.epsilon, 1.0 - step.lr * step.weight_decay,
+        correction(step.beta1), correction(step.beta2), step.skip_zero
     );
 }
 

@@ -1,7 +1,7 @@
 //! The density field of [`crate::kernel::cpu::density`], whose module holds the formulas: its networks forward and backward,
 //! rays that end where they are dark, and compositing with the losses.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::Batch;
 use super::hash::Grid;
 use super::losses::sum;
@@ -13,7 +13,7 @@ use super::weight_norm::finite;
 use crate::kernel::cpu::density::{COLOR_INPUTS, DARK, DISTORTION, DensityShape, FEATURES, HIDDEN, STEEPEST};
 use crate::kernel::cpu::losses::{RAY_TERMS, SAMPLE_TERMS, TERMS};
 use crate::kernel::cpu::mlp::TILE;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 
@@ -421,13 +421,13 @@ impl Density {
         assert!(capacity.is_multiple_of(TILE) && capacity > 0 && Density::supports(shape));
         let plan = Plan { features: 2 * shape.levels.len() };
         let (prepared, summed) = plan.maps(shape);
-        let planes = |count: usize| device.scratch(count * capacity);
+        let planes = |count: usize| device.scratch::<f32>(count * capacity);
         Density {
             plan,
             grid: Grid::new(device, &shape.levels, shape.levels.len(), shape.radius),
             dt,
             capacity,
-            weights: device.scratch(prepared.len()),
+            weights: device.scratch::<f32>(prepared.len()),
             prepared_map: device.upload(&prepared),
             summed_map: device.upload(&summed),
             value: planes(plan.features),
@@ -439,11 +439,11 @@ impl Density {
             light: planes(2),
             g_out: planes(WIDTH),
             g_value: planes(plan.features),
-            partial: device.scratch(SUMMING * plan.gradients()[5] * CHANNELS),
-            tally: device.scratch(2),
-            ray_terms: device.scratch(RAY_TERMS * rays),
-            no_terms: device.zeros(SAMPLE_TERMS),
-            sums: device.scratch(TERMS),
+            partial: device.scratch::<f32>(SUMMING * plan.gradients()[5] * CHANNELS),
+            tally: device.scratch::<u32>(2),
+            ray_terms: device.scratch::<f32>(RAY_TERMS * rays),
+            no_terms: device.zeros::<f32>(SAMPLE_TERMS),
+            sums: device.scratch::<f32>(TERMS),
         }
     }
 
@@ -461,13 +461,8 @@ impl Density {
 
     /// Takes up new network weights.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
-        prepare::launch(
-            device.launch(),
-            groups(self.weights.words().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            flat.arg(),
-            self.prepared_map.arg(),
-            self.weights.arg(),
+        launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
+            flat, self.prepared_map, self.weights
         );
     }
 
@@ -490,21 +485,10 @@ impl Density {
         self.grid.gather(device, table, x, count, &self.value, None);
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
-            forward::launch_unchecked(
-                device.launch(),
-                groups(self.capacity / TILE),
-                CubeDim::new_1d(UNITS),
-                self.weights.arg(),
-                self.value.arg(),
-                direction.unwrap_or(x).arg(),
-                count.arg(),
-                self.h.arg(),
-                self.o.arg(),
-                self.c1.arg(),
-                self.c2.arg(),
-                self.out.arg(),
-                self.plan,
-                direction.is_some(),
+            launch!(device, forward::launch_unchecked, groups(self.capacity / TILE), UNITS;
+                self.weights, self.value, direction.unwrap_or(x), count, self.h, self.o, self.c1, self.c2,
+                self.out;
+                self.plan, direction.is_some()
             );
         }
         &self.out
@@ -514,22 +498,10 @@ impl Density {
     /// evaluated last.
     pub fn cut(&self, device: &Device, samples: &Samples, kept: &Samples) {
         let pass = |writes: bool| {
-            cut::launch(
-                device.launch(),
-                groups(kept.counts.words().div_ceil(UNITS as usize)),
-                CubeDim::new_1d(UNITS),
-                self.out.arg(),
-                samples.offsets.arg(),
-                kept.offsets.arg(),
-                kept.counts.arg(),
-                samples.t.arg(),
-                samples.x.arg(),
-                samples.direction.arg(),
-                kept.t.arg(),
-                kept.x.arg(),
-                kept.direction.arg(),
-                self.dt,
-                writes,
+            launch!(device, cut::launch, groups(kept.counts.words().div_ceil(UNITS as usize)), UNITS;
+                self.out, samples.offsets, kept.offsets, kept.counts, samples.t, samples.x, samples.direction,
+                kept.t, kept.x, kept.direction;
+                self.dt, writes
             );
         };
         pass(false);
@@ -539,21 +511,11 @@ impl Density {
 
     /// Composites the samples that were evaluated last; their losses' gradients are for [`backward`](Density::backward).
     pub fn losses(&self, device: &Device, samples: &Samples, batch: &Batch) {
-        let (dim, offsets) = (CubeDim::new_1d(UNITS), &samples.offsets);
-        tally::launch(device.launch(), CubeCount::new_single(), dim, offsets.arg(), self.tally.arg());
-        of_rays::launch(
-            device.launch(),
-            groups(batch.rays().div_ceil(UNITS as usize)),
-            dim,
-            self.out.arg(),
-            offsets.arg(),
-            samples.t.arg(),
-            batch.color.arg(),
-            self.tally.arg(),
-            self.light.arg(),
-            self.g_out.arg(),
-            self.ray_terms.arg(),
-            self.dt,
+        let offsets = &samples.offsets;
+        launch!(device, tally::launch, CubeCount::new_single(), UNITS; offsets, self.tally);
+        launch!(device, of_rays::launch, groups(batch.rays().div_ceil(UNITS as usize)), UNITS;
+            self.out, offsets, samples.t, batch.color, self.tally, self.light, self.g_out, self.ray_terms;
+            self.dt
         );
     }
 
@@ -565,57 +527,30 @@ impl Density {
         [g_table, g_flat]: [&Buffer; 2],
         broken: &Buffer,
     ) {
-        let (dim, count) = (CubeDim::new_1d(UNITS), &samples.count);
+        let count = &samples.count;
         let summing = SUMMING.min(self.capacity / TILE);
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
-            backward::launch_unchecked(
-                device.launch(),
-                groups(summing),
-                dim,
-                self.weights.arg(),
-                self.value.arg(),
-                samples.direction.arg(),
-                count.arg(),
-                self.h.arg(),
-                self.o.arg(),
-                self.c1.arg(),
-                self.c2.arg(),
-                self.out.arg(),
-                self.g_out.arg(),
-                self.g_value.arg(),
-                self.partial.arg(),
-                self.plan,
+            launch!(device, backward::launch_unchecked, groups(summing), UNITS;
+                self.weights, self.value, samples.direction, count, self.h, self.o, self.c1, self.c2, self.out,
+                self.g_out, self.g_value, self.partial;
+                self.plan
             );
         }
         let over = groups(g_flat.words().div_ceil(UNITS as usize));
-        reduce::launch(
-            device.launch(),
-            over.clone(),
-            dim,
-            self.partial.arg(),
-            self.summed_map.arg(),
-            count.arg(),
-            g_flat.arg(),
-            (self.plan.gradients()[5] * CHANNELS) as u32,
-            summing,
+        launch!(device, reduce::launch, over.clone(), UNITS;
+            self.partial, self.summed_map, count, g_flat;
+            (self.plan.gradients()[5] * CHANNELS) as u32, summing
         );
-        check::launch(device.launch(), over, dim, g_flat.arg(), broken.arg());
+        launch!(device, check::launch, over, UNITS; g_flat, broken);
         self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);
     }
 
     /// Squared error, smooth-L1 and distortion of the last step, then zeros, `[7]`; for steps whose losses are read.
     pub fn sums(&self, device: &Device) -> &Buffer {
         let none = &self.no_terms;
-        sum::launch(
-            device.launch(),
-            CubeCount::new_1d(TERMS as u32),
-            CubeDim::new_1d(UNITS),
-            self.ray_terms.arg(),
-            none.arg(),
-            none.arg(),
-            none.arg(),
-            self.sums.arg(),
+        launch!(device, sum::launch, CubeCount::new_1d(TERMS as u32), UNITS;
+            self.ray_terms, none, none, none, self.sums
         );
         &self.sums
     }

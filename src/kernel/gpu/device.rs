@@ -1,12 +1,15 @@
 //! A device, its memory, and what it was asked to do.
 
 use crate::{Error, Result};
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{Cube, CubeDevice, WgpuBackend, WgpuDevice, WgpuDeviceKind};
+use burn::cubecl::device::CudaDevice;
+use burn::cubecl::features::AtomicUsage;
+use burn::cubecl::ir::{ElemType, FloatKind, Type};
+use burn::cubecl::prelude::{BufferArg, Client, CubeCount};
+use burn::cubecl::server::Handle;
+use burn::tensor::{DType, Element};
 use bytemuck::Pod;
-use cubecl::device::{CudaDevice, WgpuBackend, WgpuDevice, WgpuDeviceKind};
-use cubecl::features::AtomicUsage;
-use cubecl::ir::{ElemType, FloatKind, Type};
-use cubecl::prelude::{BufferArg, Client, CubeCount};
-use cubecl::server::Handle;
 use std::fmt::Display;
 use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -24,6 +27,7 @@ pub enum Atomics {
 
 /// A device that runs kernels.
 pub struct Device {
+    device: CubeDevice,
     client: Client,
     atomics: Atomics,
     memory: Option<u64>,
@@ -31,23 +35,26 @@ pub struct Device {
     readbacks: AtomicUsize,
 }
 
-/// Memory of a device, in words of 32 bits.
-#[derive(Clone)]
-pub struct Buffer {
-    handle: Handle,
-    words: usize,
+/// Memory of a device: burn's tensor there, which is one type for floats and words. Of one dimension, and of 32 bits an element.
+pub type Buffer = FloatTensor<Cube>;
+
+/// A tensor as kernels see it.
+pub trait Words {
+    /// How many words of 32 bits it holds.
+    fn words(&self) -> usize;
+
+    /// As an argument of a kernel.
+    fn arg(&self) -> BufferArg;
 }
 
-impl Buffer {
-    /// As an argument of a kernel.
-    pub(super) fn arg(&self) -> BufferArg {
-        // SAFETY: the handle was allocated with this length.
-        unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.words) }
+impl Words for Buffer {
+    fn words(&self) -> usize {
+        self.meta.num_elements()
     }
 
-    /// How many words it holds.
-    pub fn words(&self) -> usize {
-        self.words
+    fn arg(&self) -> BufferArg {
+        // SAFETY: the handle was allocated with this length.
+        unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.words()) }
     }
 }
 
@@ -64,7 +71,7 @@ pub struct DeviceLimits {
 
 /// A way to a GPU: an adapter as one API offers it.
 pub struct Adapter {
-    device: cubecl::Device,
+    device: CubeDevice,
     /// `vulkan`, `metal`, `dx12` or `cuda`.
     pub api: &'static str,
     /// `discrete`, `integrated`, `virtual` or `software`.
@@ -88,8 +95,8 @@ impl Adapter {
         let mut all = Vec::new();
         for (like, kind) in kinds {
             for (backend, api) in apis {
-                let id = cubecl::Device::from(WgpuDevice::new(like.clone()).on(backend)).to_id();
-                let found = cubecl::Device::enumerate(id).into_iter().map(cubecl::Device::from_id);
+                let id = CubeDevice::from(WgpuDevice::new(like.clone()).on(backend)).to_id();
+                let found = CubeDevice::enumerate(id).into_iter().map(CubeDevice::from_id);
                 all.extend(found.map(|device| Adapter { device, api, kind, software: like == Cpu }));
             }
         }
@@ -102,8 +109,8 @@ impl Adapter {
         if !cfg!(feature = "cuda") {
             return Vec::new();
         }
-        let id = cubecl::Device::Cuda(CudaDevice::default()).to_id();
-        let found = cubecl::Device::enumerate(id).into_iter().map(cubecl::Device::from_id);
+        let id = CubeDevice::Cuda(CudaDevice::default()).to_id();
+        let found = CubeDevice::enumerate(id).into_iter().map(CubeDevice::from_id);
         found.map(|device| Adapter { device, api: "cuda", kind: "discrete", software: false }).collect()
     }
 }
@@ -111,12 +118,14 @@ impl Adapter {
 impl Device {
     /// Opens an adapter, with the atomics it does best.
     pub fn open(adapter: &Adapter) -> Device {
-        let client = adapter.device.client();
+        let device = adapter.device.clone();
+        let client = device.client();
         let float = Type::atomic(ElemType::Float(FloatKind::F32));
         let native = client.properties().atomic_type_usage(float).contains(AtomicUsage::Add);
         let atomics = if native { Atomics::Native } else { Atomics::Exchange };
         let memory = client.properties().memory.max_memory();
-        Device { client, atomics, memory, launches: AtomicUsize::new(0), readbacks: AtomicUsize::new(0) }
+        let (launches, readbacks) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        Device { device, client, atomics, memory, launches, readbacks }
     }
 
     /// As the adapter names itself.
@@ -178,19 +187,24 @@ impl Device {
     }
 
     /// Copies values to the device.
-    pub fn upload<T: Pod>(&self, values: &[T]) -> Buffer {
-        let bytes: &[u8] = bytemuck::cast_slice(values);
-        Buffer { handle: self.client.create_from_slice(bytes), words: bytes.len() / 4 }
+    pub fn upload<T: Element>(&self, values: &[T]) -> Buffer {
+        let handle = self.client.create_from_slice(bytemuck::cast_slice(values));
+        self.tensor(handle, values.len(), T::dtype())
     }
 
     /// Memory of **arbitrary contents**: a kernel writes it before another reads it.
-    pub fn scratch(&self, words: usize) -> Buffer {
-        Buffer { handle: self.client.empty(words.max(1) * 4), words }
+    pub fn scratch<T: Element>(&self, words: usize) -> Buffer {
+        self.tensor(self.client.empty(words.max(1) * 4), words, T::dtype())
     }
 
     /// Memory of zeros.
-    pub fn zeros(&self, words: usize) -> Buffer {
-        self.upload(&vec![0u32; words.max(1)])
+    pub fn zeros<T: Element>(&self, words: usize) -> Buffer {
+        self.upload(&vec![T::zeroed(); words.max(1)])
+    }
+
+    fn tensor(&self, handle: Handle, words: usize, dtype: DType) -> Buffer {
+        assert_eq!(dtype.size(), 4, "kernels know elements of 32 bits");
+        Buffer::new_contiguous(self.client.clone(), self.device.clone(), [words].into(), handle, dtype)
     }
 
     /// Waits for the device and copies values back.
@@ -205,14 +219,14 @@ impl Device {
         tests::answer().map_err(|e| self.failed(e))?;
         let read = self.client.read_one(buffer.handle.clone());
         let bytes = read.map_err(|e| self.failed(e))?;
-        Ok(bytemuck::pod_collect_to_vec(&bytes[..buffer.words * 4]))
+        Ok(bytemuck::pod_collect_to_vec(&bytes[..buffer.words() * 4]))
     }
 
     /// As [`Device::fetch`], some of a buffer's floats.
     pub(super) fn fetch_part(&self, buffer: &Buffer, part: Range<usize>) -> Result<Vec<f32>> {
-        let behind = buffer.words - part.end;
+        let behind = buffer.words() - part.end;
         let handle = buffer.handle.clone().offset_start(4 * part.start as u64).offset_end(4 * behind as u64);
-        self.fetch(&Buffer { handle, words: part.len() })
+        self.fetch(&self.tensor(handle, part.len(), buffer.dtype))
     }
 
     /// As [`Device::fetch`].
@@ -244,6 +258,21 @@ impl Device {
         (self.launches.load(Ordering::Relaxed), self.readbacks.load(Ordering::Relaxed))
     }
 }
+
+/// Launches a kernel and counts it: `launch!(device, kernel::launch, groups, threads; buffers; scalars)`, with the threads
+/// of one group. Unsafe with `kernel::launch_unchecked`.
+macro_rules! launch {
+    ($device:expr, $launch:expr, $groups:expr, $threads:expr; $($buffer:expr),+ $(; $($scalar:expr),+)?) => {
+        $launch(
+            $device.launch(),
+            $groups,
+            burn::cubecl::prelude::CubeDim::new_1d($threads),
+            $($buffer.arg(),)+
+            $($($scalar,)+)?
+        )
+    };
+}
+pub(super) use launch;
 
 /// So many groups of threads, beyond 65,535 in two dimensions: a kernel uses its position among all and ignores
 /// those that are too many.
@@ -309,7 +338,7 @@ pub(crate) mod tests {
         let Some(device) = device() else { return };
         let there = device.upload(&[1.5f32, -2.0, 3.0]);
         assert_eq!(device.read::<f32>(&there), [1.5, -2.0, 3.0]);
-        assert_eq!(device.read::<u32>(&device.zeros(5)), [0; 5]);
+        assert_eq!(device.read::<u32>(&device.zeros::<u32>(5)), [0; 5]);
         assert_eq!(device.counts(), (0, 2));
         println!("{} adds floats: {:?}", device.name(), device.atomics());
     }

@@ -2,11 +2,11 @@
 //!
 //! Which pixel a ray is drawn from is a function of seed, step and its number alone, the same as on the CPU.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use super::rng::{below, stream, uniform};
 use crate::geom::{Camera, Projection};
 use crate::kernel::cpu::march::MarchRay;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
@@ -372,13 +372,13 @@ impl Batch {
     /// Room for so many rays, none of them there.
     pub fn new(device: &Device, rays: usize) -> Batch {
         Batch {
-            origin: device.zeros(3 * rays),
-            direction: device.zeros(3 * rays),
-            jitter: device.zeros(rays),
-            color: device.zeros(3 * rays),
-            alpha: device.zeros(rays),
-            background: device.zeros(3 * rays),
-            alive: device.zeros(rays),
+            origin: device.zeros::<f32>(3 * rays),
+            direction: device.zeros::<f32>(3 * rays),
+            jitter: device.zeros::<f32>(rays),
+            color: device.zeros::<f32>(3 * rays),
+            alpha: device.zeros::<f32>(rays),
+            background: device.zeros::<f32>(3 * rays),
+            alive: device.zeros::<u32>(rays),
         }
     }
 
@@ -411,7 +411,7 @@ impl Batch {
     /// Keeps so many of them, `[1]`: those behind are none.
     pub fn keep(&self, device: &Device, wanted: &Buffer) {
         let count = groups(self.rays().div_ceil(UNITS as usize));
-        keep::launch(device.launch(), count, CubeDim::new_1d(UNITS), wanted.arg(), self.alive.arg());
+        launch!(device, keep::launch, count, UNITS; wanted, self.alive);
     }
 }
 
@@ -479,33 +479,11 @@ impl Photographs {
         let [view, pixel, shift, behind] =
             [0, 1, 2, self.drawing.behind].map(|k| stream(seed, step << 4 | k));
         assert!(into.rays() < 1 << 22, "the number of a try has 32 bits");
-        draw_rays::launch(
-            device.launch(),
-            groups(into.rays().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            self.views.arg(),
-            self.pixels.arg(),
-            self.drawable.arg(),
-            wanted.arg(),
-            into.origin.arg(),
-            into.direction.arg(),
-            into.jitter.arg(),
-            into.color.arg(),
-            into.alpha.arg(),
-            into.background.arg(),
-            into.alive.arg(),
-            view[0],
-            view[1],
-            pixel[0],
-            pixel[1],
-            shift[0],
-            shift[1],
-            behind[0],
-            behind[1],
-            detail,
-            self.drawing.every,
-            self.drawing.jitter,
-            self.drawing.background,
+        launch!(device, draw_rays::launch, groups(into.rays().div_ceil(UNITS as usize)), UNITS;
+            self.views, self.pixels, self.drawable, wanted, into.origin, into.direction, into.jitter,
+            into.color, into.alpha, into.background, into.alive;
+            view[0], view[1], pixel[0], pixel[1], shift[0], shift[1], behind[0], behind[1], detail,
+            self.drawing.every, self.drawing.jitter, self.drawing.background
         );
     }
 }

@@ -1,9 +1,9 @@
 //! The hash encoding of [`crate::kernel::cpu::hash`]: features with Jacobian, and their scatter.
 
-use super::device::{Atomics, Buffer, Device};
+use super::device::{Atomics, Buffer, Device, Words, launch};
 use super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::cpu::hash::Level;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 /// Samples a group of threads handles.
 const GROUP: u32 = 256;
@@ -238,7 +238,7 @@ impl Grid {
         };
         Grid {
             levels: device.upload(&levels.iter().flat_map(words).collect::<Vec<u32>>()),
-            units: device.zeros(levels.len()),
+            units: device.zeros::<f32>(levels.len()),
             count: levels.len(),
             active,
             largest: levels.iter().map(|l| l.entries as usize).max().unwrap_or(0),
@@ -269,20 +269,10 @@ impl Grid {
         jacobian: Option<&Buffer>,
     ) {
         let capacity = x.words() / 3;
-        gather::launch(
-            device.launch(),
-            CubeCount::Static((capacity as u32).div_ceil(GROUP), self.count as u32, 1),
-            CubeDim::new_1d(GROUP),
-            table.arg(),
-            self.levels.arg(),
-            x.arg(),
-            count.arg(),
-            value.arg(),
-            jacobian.unwrap_or(value).arg(),
-            capacity as u32,
-            self.active as u32,
-            self.world,
-            jacobian.is_some(),
+        let groups = CubeCount::Static((capacity as u32).div_ceil(GROUP), self.count as u32, 1);
+        launch!(device, gather::launch, groups, GROUP;
+            table, self.levels, x, count, value, jacobian.unwrap_or(value);
+            capacity as u32, self.active as u32, self.world, jacobian.is_some()
         );
     }
 
@@ -304,48 +294,26 @@ impl Grid {
     ) {
         let [q, g_normal] = slopes.unwrap_or([g_value, x]);
         let capacity = x.words() / 3;
-        let dim = CubeDim::new_1d(GROUP);
         let fixed = device.atomics() == Atomics::Fixed;
         if fixed {
-            bound::launch(
-                device.launch(),
-                CubeCount::new_1d(self.active as u32),
-                dim,
-                self.levels.arg(),
-                count.arg(),
-                g_value.arg(),
-                q.arg(),
-                g_normal.arg(),
-                self.units.arg(),
-                capacity as u32,
-                self.world,
-                slopes.is_some(),
+            launch!(device, bound::launch, CubeCount::new_1d(self.active as u32), GROUP;
+                self.levels, count, g_value, q, g_normal, self.units;
+                capacity as u32, self.world, slopes.is_some()
             );
         }
-        let launch = match device.atomics() {
+        let scatter = match device.atomics() {
             Atomics::Native => scatter::launch::<Native>,
             Atomics::Exchange => scatter::launch::<Exchange>,
             Atomics::Fixed => scatter::launch::<Fixed>,
         };
-        launch(
-            device.launch(),
-            CubeCount::Static((capacity as u32).div_ceil(GROUP), self.active as u32, 1),
-            dim,
-            gradient.arg(),
-            self.levels.arg(),
-            x.arg(),
-            count.arg(),
-            g_value.arg(),
-            q.arg(),
-            g_normal.arg(),
-            self.units.arg(),
-            capacity as u32,
-            self.world,
-            slopes.is_some(),
+        let groups = CubeCount::Static((capacity as u32).div_ceil(GROUP), self.active as u32, 1);
+        launch!(device, scatter, groups, GROUP;
+            gradient, self.levels, x, count, g_value, q, g_normal, self.units;
+            capacity as u32, self.world, slopes.is_some()
         );
         if fixed {
             let count = CubeCount::Static((2 * self.largest as u32).div_ceil(GROUP), self.active as u32, 1);
-            settle::launch(device.launch(), count, dim, gradient.arg(), self.levels.arg(), self.units.arg());
+            launch!(device, settle::launch, count, GROUP; gradient, self.levels, self.units);
         }
     }
 }
@@ -395,8 +363,8 @@ mod tests {
             (0..n).flat_map(|l| planes(&jacobian[l * SAMPLES..][..SAMPLES], CAPACITY)).collect();
 
         let on = Grid::new(&device, &levels, levels.len(), RADIUS);
-        let (table, x) = (device.upload(&table), device.upload(&planes(&x, CAPACITY)));
-        let (v, j) = (device.scratch(want.len()), device.scratch(slopes.len()));
+        let (table, x) = (device.upload(table.as_flattened()), device.upload(&planes(&x, CAPACITY)));
+        let (v, j) = (device.scratch::<f32>(want.len()), device.scratch::<f32>(slopes.len()));
         let count = device.upload(&[SAMPLES as u32]);
         on.gather(&device, &table, &x, &count, &v, Some(&j));
         let (value, jacobian) = (device.read::<f32>(&v), device.read::<f32>(&j));
@@ -435,7 +403,7 @@ mod tests {
             let normal = device.upload(&planes(&normal, CAPACITY));
             for (slopes, want) in [(Some([&q, &normal]), &want), (None, &want_values)] {
                 let once = || {
-                    let gradient = device.zeros(2 * table.len());
+                    let gradient = device.zeros::<f32>(2 * table.len());
                     on.scatter(&device, &gradient, &x, &count, &g, slopes);
                     device.read::<f32>(&gradient)
                 };

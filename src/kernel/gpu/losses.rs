@@ -1,10 +1,10 @@
 //! What a training step of the signed-distance field minimizes, and its gradients: see [`crate::kernel::cpu::losses`].
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::Batch;
 use crate::kernel::cpu::losses::{LossWeights, RAY_TERMS, SAMPLE_TERMS, TERMS};
 use crate::kernel::cpu::neus::RAY_WIDTH;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
@@ -177,38 +177,24 @@ impl Losses {
     pub fn new(device: &Device, weights: LossWeights, rays: usize, capacity: usize) -> Losses {
         Losses {
             weights,
-            tally: device.scratch(3),
-            g_out: device.scratch(RAY_WIDTH * rays),
-            ray_terms: device.scratch(RAY_TERMS * rays),
-            sample_terms: device.scratch(SAMPLE_TERMS * capacity),
-            sums: device.scratch(TERMS),
+            tally: device.scratch::<u32>(3),
+            g_out: device.scratch::<f32>(RAY_WIDTH * rays),
+            ray_terms: device.scratch::<f32>(RAY_TERMS * rays),
+            sample_terms: device.scratch::<f32>(SAMPLE_TERMS * capacity),
+            sums: device.scratch::<f32>(TERMS),
         }
     }
 
     /// Gradients by what [`Neus::forward`](super::Neus::forward) composited, planes `[9, rays]`; offsets: `[rays + 1]`.
     pub fn of_rays(&self, device: &Device, composed: &Buffer, batch: &Batch, offsets: &Buffer) -> &Buffer {
-        let (w, dim) = (&self.weights, CubeDim::new_1d(UNITS));
+        let w = &self.weights;
         let Batch { color, alpha, background, alive, .. } = batch;
         let tally = &self.tally;
         let one = CubeCount::new_single();
-        tally::launch(device.launch(), one, dim, offsets.arg(), alpha.arg(), alive.arg(), tally.arg());
-        of_rays::launch(
-            device.launch(),
-            groups(alpha.words().div_ceil(UNITS as usize)),
-            dim,
-            composed.arg(),
-            color.arg(),
-            alpha.arg(),
-            background.arg(),
-            alive.arg(),
-            offsets.arg(),
-            tally.arg(),
-            self.g_out.arg(),
-            self.ray_terms.arg(),
-            w.rgb_mse,
-            w.rgb_l1,
-            w.rgb_sample,
-            w.mask,
+        launch!(device, tally::launch, one, UNITS; offsets, alpha, alive, tally);
+        launch!(device, of_rays::launch, groups(alpha.words().div_ceil(UNITS as usize)), UNITS;
+            composed, color, alpha, background, alive, offsets, tally, self.g_out, self.ray_terms;
+            w.rgb_mse, w.rgb_l1, w.rgb_sample, w.mask
         );
         &self.g_out
     }
@@ -216,32 +202,17 @@ impl Losses {
     /// Adds the gradients of what is asked of each sample to those by the field's output, planes `[8, capacity]`.
     pub fn of_samples(&self, device: &Device, field: &Buffer, count: &Buffer, g_field: &Buffer) {
         let w = &self.weights;
-        of_samples::launch(
-            device.launch(),
-            groups((self.sample_terms.words() / SAMPLE_TERMS).div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            field.arg(),
-            count.arg(),
-            g_field.arg(),
-            self.sample_terms.arg(),
-            w.eikonal,
-            w.sparsity,
-            w.sparsity_scale,
+        let capacity = self.sample_terms.words() / SAMPLE_TERMS;
+        launch!(device, of_samples::launch, groups(capacity.div_ceil(UNITS as usize)), UNITS;
+            field, count, g_field, self.sample_terms; w.eikonal, w.sparsity, w.sparsity_scale
         );
     }
 
     /// The terms of the last step, `[7]`, unweighted: in the order of [`LossWeights`], then those of points; for steps
     /// whose losses are read.
     pub fn sums(&self, device: &Device, count: &Buffer, of_points: &Buffer) -> &Buffer {
-        sum::launch(
-            device.launch(),
-            CubeCount::new_1d(TERMS as u32),
-            CubeDim::new_1d(UNITS),
-            self.ray_terms.arg(),
-            self.sample_terms.arg(),
-            of_points.arg(),
-            count.arg(),
-            self.sums.arg(),
+        launch!(device, sum::launch, CubeCount::new_1d(TERMS as u32), UNITS;
+            self.ray_terms, self.sample_terms, of_points, count, self.sums
         );
         &self.sums
     }
@@ -374,7 +345,7 @@ mod tests {
             ..Batch::new(&device, 6)
         };
         let (neus, losses) = (Neus::new(&device, 6, 24), Losses::new(&device, WEIGHTS, 6, 24));
-        let (count, g_s) = (device.upload(&[24u32]), device.zeros(1));
+        let (count, g_s) = (device.upload(&[24u32]), device.zeros::<f32>(1));
         let composed = neus.forward(&device, rays, &field, &sharp, ANNEAL as f32);
         let g_out = losses.of_rays(&device, composed, &batch, &offsets);
         let g_field = neus.backward(&device, rays, &field, &sharp, ANNEAL as f32, g_out, &g_s);

@@ -1,10 +1,10 @@
 //! Marching through the occupancy bitmask of [`crate::kernel::cpu::march`], without the host knowing how many samples there
 //! are: a pass counts them, a prefix sum says where each ray's lie, a second pass writes them.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::Batch;
 use super::occupancy::Occupancy;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
@@ -197,15 +197,7 @@ pub(super) fn prefix_sum(
     capacity: usize,
 ) {
     assert_eq!(offsets.words(), counts.words() + 1);
-    scan::launch(
-        device.launch(),
-        CubeCount::new_single(),
-        CubeDim::new_1d(UNITS),
-        counts.arg(),
-        offsets.arg(),
-        total.arg(),
-        capacity as u32,
-    );
+    launch!(device, scan::launch, CubeCount::new_single(), UNITS; counts, offsets, total; capacity as u32);
 }
 
 /// The samples of a batch of rays on a device.
@@ -230,13 +222,13 @@ impl Samples {
     /// Room for so many rays and `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> Samples {
         Samples {
-            offsets: device.zeros(rays + 1),
-            count: device.zeros(2),
-            t: device.zeros(capacity),
-            dt: device.zeros(capacity),
-            x: device.zeros(3 * capacity),
-            direction: device.zeros(3 * capacity),
-            counts: device.zeros(rays),
+            offsets: device.zeros::<u32>(rays + 1),
+            count: device.zeros::<u32>(2),
+            t: device.zeros::<f32>(capacity),
+            dt: device.zeros::<f32>(capacity),
+            x: device.zeros::<f32>(3 * capacity),
+            direction: device.zeros::<f32>(3 * capacity),
+            counts: device.zeros::<u32>(rays),
         }
     }
 
@@ -253,28 +245,12 @@ impl Samples {
     ) {
         assert!(rays.rays() == self.counts.words() && apart < self.t.words());
         let both = |writes: bool| {
-            pass::launch(
-                device.launch(),
-                groups(rays.rays().div_ceil(UNITS as usize)),
-                CubeDim::new_1d(UNITS),
-                occupancy.mask.arg(),
-                occupancy.solid.as_ref().unwrap_or(&occupancy.mask).arg(),
-                rays.origin.arg(),
-                rays.direction.arg(),
-                rays.jitter.arg(),
-                rays.alive.arg(),
-                self.offsets.arg(),
-                self.counts.arg(),
-                pitch.arg(),
-                self.t.arg(),
-                self.dt.arg(),
-                self.x.arg(),
-                self.direction.arg(),
-                occupancy.resolution as u32,
-                occupancy.radius,
-                limit.min(u32::MAX as usize) as u32,
-                writes,
-                occupancy.solid.is_some(),
+            launch!(device, pass::launch, groups(rays.rays().div_ceil(UNITS as usize)), UNITS;
+                occupancy.mask, occupancy.solid.as_ref().unwrap_or(&occupancy.mask), rays.origin,
+                rays.direction, rays.jitter, rays.alive, self.offsets, self.counts, pitch, self.t, self.dt,
+                self.x, self.direction;
+                occupancy.resolution as u32, occupancy.radius, limit.min(u32::MAX as usize) as u32, writes,
+                occupancy.solid.is_some()
             );
         };
         both(false);

@@ -1,9 +1,9 @@
 //! NeuS compositing of ragged rays: see [`crate::kernel::cpu::neus`]. A thread takes a ray.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use crate::kernel::cpu::neus::SHORTEST;
 use crate::kernel::cpu::sdf::WIDTH;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 
@@ -271,10 +271,10 @@ impl Neus {
     /// For so many rays and up to `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> Neus {
         Neus {
-            out: device.scratch(RAY_WIDTH * rays),
-            light: device.scratch(capacity),
-            g_field: device.scratch(WIDTH * capacity),
-            g_ln: device.scratch(rays),
+            out: device.scratch::<f32>(RAY_WIDTH * rays),
+            light: device.scratch::<f32>(capacity),
+            g_field: device.scratch::<f32>(WIDTH * capacity),
+            g_ln: device.scratch::<f32>(rays),
         }
     }
 
@@ -294,15 +294,8 @@ impl Neus {
         step: f32,
     ) -> &Buffer {
         let out = &self.light;
-        opacities::launch(
-            device.launch(),
-            groups(out.words().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            field.arg(),
-            inv_s.arg(),
-            count.arg(),
-            out.arg(),
-            step,
+        launch!(device, opacities::launch, groups(out.words().div_ceil(UNITS as usize)), UNITS;
+            field, inv_s, count, out; step
         );
         out
     }
@@ -321,19 +314,8 @@ impl Neus {
         inv_s: &Buffer,
         anneal: f32,
     ) -> &Buffer {
-        forward::launch(
-            device.launch(),
-            groups(self.g_ln.words().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            rays.offsets.arg(),
-            rays.direction.arg(),
-            rays.t.arg(),
-            rays.dt.arg(),
-            field.arg(),
-            inv_s.arg(),
-            self.out.arg(),
-            self.light.arg(),
-            anneal,
+        launch!(device, forward::launch, groups(self.g_ln.words().div_ceil(UNITS as usize)), UNITS;
+            rays.offsets, rays.direction, rays.t, rays.dt, field, inv_s, self.out, self.light; anneal
         );
         &self.out
     }
@@ -350,25 +332,13 @@ impl Neus {
         g_out: &Buffer,
         g_inv_s: &Buffer,
     ) -> &Buffer {
-        let dim = CubeDim::new_1d(UNITS);
-        backward::launch(
-            device.launch(),
-            groups(self.g_ln.words().div_ceil(UNITS as usize)),
-            dim,
-            rays.offsets.arg(),
-            rays.direction.arg(),
-            rays.t.arg(),
-            rays.dt.arg(),
-            field.arg(),
-            inv_s.arg(),
-            self.light.arg(),
-            g_out.arg(),
-            self.g_field.arg(),
-            self.g_ln.arg(),
-            anneal,
+        launch!(device, backward::launch, groups(self.g_ln.words().div_ceil(UNITS as usize)), UNITS;
+            rays.offsets, rays.direction, rays.t, rays.dt, field, inv_s, self.light, g_out, self.g_field,
+            self.g_ln;
+            anneal
         );
         let one = CubeCount::new_single();
-        sharpness::launch(device.launch(), one, dim, self.g_ln.arg(), inv_s.arg(), g_inv_s.arg());
+        launch!(device, sharpness::launch, one, UNITS; self.g_ln, inv_s, g_inv_s);
         &self.g_field
     }
 }
@@ -398,7 +368,7 @@ mod tests {
         let there = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
         let (on_field, on_s) = (device.upload(&planes(field, n)), device.upload(&[inv_s]));
         let out = device.read(on.forward(device, there, &on_field, &on_s, anneal));
-        let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros(1));
+        let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros::<f32>(1));
         let g_field = device.read(on.backward(device, there, &on_field, &on_s, anneal, &g_out, &g_s));
         let flat = field.as_flattened();
         let want = neus::forward(rays, flat, inv_s, anneal);

@@ -1,10 +1,10 @@
 //! Which cells may hold surface, looked at again on the device: the rule of a band around the zero set, and nerfacc's.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use super::sdf::Sdf;
 use crate::Result;
 use crate::kernel::cpu::march::Bitmask;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 mod nerfacc;
 
@@ -183,9 +183,9 @@ impl Band {
             cells: device.upload(&cells),
             allowed: device.upload(&words(&allowed.bits)),
             // no sign where nothing is asked
-            value: device.zeros(total),
-            reach: device.zeros(total),
-            count: device.zeros(2),
+            value: device.zeros::<f32>(total),
+            reach: device.zeros::<f32>(total),
+            count: device.zeros::<u32>(2),
             units,
             soften,
         }
@@ -202,54 +202,22 @@ impl Band {
     ) {
         let (resolution, radius) = (occupancy.resolution as u32, occupancy.radius);
         let half = 0.5 * 3f32.sqrt() * 2.0 * radius / resolution as f32;
-        let dim = CubeDim::new_1d(UNITS);
         let capacity = x.words() / 3;
         let solid = occupancy.solid.as_ref().expect("the rule of a band knows the inside");
         for first in (0..self.cells.words()).step_by(capacity) {
             let here = capacity.min(self.cells.words() - first);
             let over = groups(here.div_ceil(UNITS as usize));
-            centers::launch(
-                device.launch(),
-                over.clone(),
-                dim,
-                self.cells.arg(),
-                x.arg(),
-                self.count.arg(),
-                first as u32,
-                here as u32,
-                resolution,
-                radius,
+            launch!(device, centers::launch, over.clone(), UNITS;
+                self.cells, x, self.count; first as u32, here as u32, resolution, radius
             );
             let out = field.forward(device, table, flat, x, direction, &self.count);
-            keep::launch(
-                device.launch(),
-                over,
-                dim,
-                self.cells.arg(),
-                out.arg(),
-                inv_s.arg(),
-                self.value.arg(),
-                self.reach.arg(),
-                first as u32,
-                here as u32,
-                self.units,
-                self.soften,
-                half,
+            launch!(device, keep::launch, over, UNITS;
+                self.cells, out, inv_s, self.value, self.reach;
+                first as u32, here as u32, self.units, self.soften, half
             );
         }
-        decide::launch(
-            device.launch(),
-            groups(occupancy.mask.words().div_ceil(UNITS as usize)),
-            dim,
-            self.allowed.arg(),
-            self.value.arg(),
-            self.reach.arg(),
-            inv_s.arg(),
-            occupancy.mask.arg(),
-            solid.arg(),
-            resolution,
-            self.units,
-            half,
+        launch!(device, decide::launch, groups(occupancy.mask.words().div_ceil(UNITS as usize)), UNITS;
+            self.allowed, self.value, self.reach, inv_s, occupancy.mask, solid; resolution, self.units, half
         );
     }
 }

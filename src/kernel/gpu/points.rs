@@ -4,12 +4,12 @@
 //! With `f` the distance at a point, `p` the length of a pixel there and `w` its weight, the mean over the points of a
 //! step of `w (√((f / p)² + k²) − k)`.
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use super::march::Samples;
 use super::rng::{below, stream};
 use crate::kernel::cpu::losses::{LossWeights, STEREO_STREAM};
 use crate::kernel::cpu::sdf::WIDTH;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
@@ -101,21 +101,21 @@ impl SurfacePoints {
     /// No points yet; up to `most` a step.
     pub fn new(device: &Device, most: usize, weights: &LossWeights) -> SurfacePoints {
         SurfacePoints {
-            rows: device.zeros(ROW),
+            rows: device.zeros::<f32>(ROW),
             count: 0,
             weights: *weights,
-            drawn: device.zeros(most),
-            terms: device.zeros(most),
-            both: device.zeros(1),
+            drawn: device.zeros::<u32>(most),
+            terms: device.zeros::<f32>(most),
+            both: device.zeros::<u32>(1),
         }
     }
 
     /// These from now on: positions in field coordinates, length of a pixel there, weight.
     pub fn put(&mut self, device: &Device, rows: &[[f32; ROW]]) {
         self.count = rows.len();
-        self.terms = device.zeros(self.most());
+        self.terms = device.zeros::<f32>(self.most());
         if self.count > 0 {
-            self.rows = device.upload(rows);
+            self.rows = device.upload(rows.as_flattened());
         }
     }
 
@@ -127,20 +127,9 @@ impl SurfacePoints {
     /// Draws some by seed and step, behind a step's samples, and returns how many there are with them, `[1]`.
     pub fn append(&self, device: &Device, (seed, step): (u64, u64), samples: &Samples) -> &Buffer {
         let [high, low] = stream(seed, step << 4 | STEREO_STREAM);
-        append::launch(
-            device.launch(),
-            groups(self.most().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            self.rows.arg(),
-            samples.count.arg(),
-            self.both.arg(),
-            self.drawn.arg(),
-            samples.x.arg(),
-            samples.direction.arg(),
-            self.count as u32,
-            if self.count > 0 { self.most() as u32 } else { 0 },
-            high,
-            low,
+        launch!(device, append::launch, groups(self.most().div_ceil(UNITS as usize)), UNITS;
+            self.rows, samples.count, self.both, self.drawn, samples.x, samples.direction;
+            self.count as u32, if self.count > 0 { self.most() as u32 } else { 0 }, high, low
         );
         &self.both
     }
@@ -151,19 +140,9 @@ impl SurfacePoints {
         if self.count == 0 {
             return;
         }
-        of_points::launch(
-            device.launch(),
-            groups(self.most().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            self.rows.arg(),
-            self.drawn.arg(),
-            count.arg(),
-            self.both.arg(),
-            field.arg(),
-            g_field.arg(),
-            self.terms.arg(),
-            self.weights.stereo,
-            self.weights.knee,
+        launch!(device, of_points::launch, groups(self.most().div_ceil(UNITS as usize)), UNITS;
+            self.rows, self.drawn, count, self.both, field, g_field, self.terms;
+            self.weights.stereo, self.weights.knee
         );
     }
 

@@ -2,7 +2,7 @@
 //! has.
 
 use crate::kernel::cpu::rng;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 /// A word of 64 bits.
 #[derive(CubeType, Clone, Copy)]
@@ -60,8 +60,8 @@ pub(super) fn stream(seed: u64, stream: u64) -> [u32; 2] {
 
 #[cfg(test)]
 mod tests {
-    use super::super::device::groups;
     use super::super::device::tests::device;
+    use super::super::device::{Words, groups, launch};
     use super::*;
 
     #[cube(launch)]
@@ -83,10 +83,9 @@ mod tests {
         let Some(device) = device() else { return };
         const COUNT: usize = 1 << 12;
         for (seed, of, n) in [(0, 0, 1), (42, 1 << 40 | 3, 289_123_456), (u64::MAX, u64::MAX, u32::MAX)] {
-            let out = device.scratch(4 * COUNT);
+            let out = device.scratch::<u32>(4 * COUNT);
             let [high, low] = stream(seed, of);
-            let dim = CubeDim::new_1d(256);
-            draws::launch(device.launch(), groups(COUNT / 256), dim, out.arg(), high, low, n);
+            launch!(device, draws::launch, groups(COUNT / 256), 256; out; high, low, n);
             let out = device.read::<u32>(&out);
             for i in 0..COUNT {
                 let index = 7_919 * i as u64;

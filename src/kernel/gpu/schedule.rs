@@ -1,10 +1,10 @@
 //! What a step takes from the one before it, without asking the host: how many rays, and how long a march step is.
 
-use super::device::{Buffer, Device};
+use super::device::{Buffer, Device, Words, launch};
 use crate::Result;
 use crate::kernel::cpu::losses::TERMS;
 use crate::kernel::cpu::schedule::{Figures, RayBudget, StepLength};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 #[cube(launch)]
 fn advance(
@@ -82,9 +82,9 @@ impl Schedule {
             rule,
             budget,
             rays: device.upload(&[rays as u32]),
-            step_length: device.zeros(1),
-            blind: device.zeros(1),
-            figures: device.zeros(TERMS + 5),
+            step_length: device.zeros::<f32>(1),
+            blind: device.zeros::<u32>(1),
+            figures: device.zeros::<u32>(TERMS + 5),
         }
     }
 
@@ -96,22 +96,9 @@ impl Schedule {
             StepLength::Constant(step) => [0.0, step, step],
             StepLength::OfSharpness { units, min, max } => [units, min, max],
         };
-        advance::launch(
-            device.launch(),
-            CubeCount::new_single(),
-            CubeDim::new_1d(1),
-            inv_s.arg(),
-            count.arg(),
-            self.rays.arg(),
-            self.step_length.arg(),
-            self.blind.arg(),
-            units,
-            shortest,
-            longest,
-            samples as f32,
-            min.min(max) as u32,
-            max as u32,
-            u32::from(first),
+        launch!(device, advance::launch, CubeCount::new_single(), 1;
+            inv_s, count, self.rays, self.step_length, self.blind;
+            units, shortest, longest, samples as f32, min.min(max) as u32, max as u32, u32::from(first)
         );
     }
 
@@ -132,17 +119,8 @@ impl Schedule {
         broken: &Buffer,
     ) -> Result<Figures> {
         assert_eq!(losses.words(), TERMS);
-        collect::launch(
-            device.launch(),
-            CubeCount::new_single(),
-            CubeDim::new_1d(16),
-            losses.arg(),
-            variance.arg(),
-            count.arg(),
-            self.rays.arg(),
-            self.blind.arg(),
-            broken.arg(),
-            self.figures.arg(),
+        launch!(device, collect::launch, CubeCount::new_single(), 16;
+            losses, variance, count, self.rays, self.blind, broken, self.figures
         );
         let words = device.fetch::<u32>(&self.figures)?;
         let (samples, rays) = (words[TERMS + 1] as usize, words[TERMS + 2] as usize);

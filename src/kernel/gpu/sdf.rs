@@ -9,12 +9,11 @@
 
 pub(super) mod kernels;
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use super::hash::Grid;
 use super::tile::{CHANNELS, UNITS};
 use crate::kernel::cpu::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
 use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
-use cubecl::prelude::*;
 use kernels::{color_backward, forward, geometry_backward, prepare, reduce};
 
 /// Groups that sum gradients of weights, each over its own tiles.
@@ -135,14 +134,14 @@ impl Sdf {
         let layout = shape.layout();
         let plan = Plan::new(layout);
         let (prepared, summed) = plan.maps(layout);
-        let planes = |count: usize| device.scratch(count * capacity);
+        let planes = |count: usize| device.scratch::<f32>(count * capacity);
         Sdf {
             plan,
             grid: Grid::new(device, &shape.levels, shape.active, shape.radius),
             inv_radius: 1.0 / shape.radius,
             soften: shape.soften,
             capacity,
-            weights: device.scratch(prepared.len()),
+            weights: device.scratch::<f32>(prepared.len()),
             prepared_map: device.upload(&prepared),
             summed_map: device.upload(&summed),
             value: planes(plan.features),
@@ -156,7 +155,7 @@ impl Sdf {
             g_o: planes(OUTPUTS),
             g_value: planes(plan.features),
             g_normal: planes(3),
-            partial: device.scratch(SUMMING * plan.gradients()[7] * CHANNELS),
+            partial: device.scratch::<f32>(SUMMING * plan.gradients()[7] * CHANNELS),
         }
     }
 
@@ -206,41 +205,18 @@ impl Sdf {
         normals: Option<&Buffer>,
         count: &Buffer,
     ) -> &Buffer {
-        let dim = CubeDim::new_1d(UNITS);
-        prepare::launch(
-            device.launch(),
-            groups(self.weights.words().div_ceil(UNITS as usize)),
-            dim,
-            flat.arg(),
-            self.prepared_map.arg(),
-            self.weights.arg(),
+        launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
+            flat, self.prepared_map, self.weights
         );
         self.grid.gather(device, table, x, count, &self.value, Some(&self.jacobian));
         assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
         assert!(normals.is_none_or(|n| n.words() == x.words()));
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
-            forward::launch_unchecked(
-                device.launch(),
-                groups(self.capacity / TILE),
-                dim,
-                self.weights.arg(),
-                self.value.arg(),
-                self.jacobian.arg(),
-                x.arg(),
-                direction.arg(),
-                normals.unwrap_or(x).arg(),
-                count.arg(),
-                self.q.arg(),
-                self.h.arg(),
-                self.o.arg(),
-                self.c1.arg(),
-                self.c2.arg(),
-                self.out.arg(),
-                self.inv_radius,
-                self.soften,
-                self.plan,
-                normals.is_some(),
+            launch!(device, forward::launch_unchecked, groups(self.capacity / TILE), UNITS;
+                self.weights, self.value, self.jacobian, x, direction, normals.unwrap_or(x), count, self.q,
+                self.h, self.o, self.c1, self.c2, self.out;
+                self.inv_radius, self.soften, self.plan, normals.is_some()
             );
         }
         &self.out
@@ -263,60 +239,25 @@ impl Sdf {
         g_table: &Buffer,
         g_flat: &Buffer,
     ) {
-        let dim = CubeDim::new_1d(UNITS);
         assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
         assert!(g_out.words() == WIDTH * self.capacity);
         let groups_of = groups(SUMMING.min(self.capacity / TILE));
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
-            color_backward::launch_unchecked(
-                device.launch(),
-                groups_of.clone(),
-                dim,
-                self.weights.arg(),
-                self.value.arg(),
-                direction.arg(),
-                count.arg(),
-                self.o.arg(),
-                self.c1.arg(),
-                self.c2.arg(),
-                self.out.arg(),
-                g_out.arg(),
-                self.g_o.arg(),
-                self.g_normal.arg(),
-                self.g_value.arg(),
-                self.partial.arg(),
-                self.soften,
-                self.plan,
+            launch!(device, color_backward::launch_unchecked, groups_of.clone(), UNITS;
+                self.weights, self.value, direction, count, self.o, self.c1, self.c2, self.out, g_out,
+                self.g_o, self.g_normal, self.g_value, self.partial;
+                self.soften, self.plan
             );
-            geometry_backward::launch_unchecked(
-                device.launch(),
-                groups_of,
-                dim,
-                self.weights.arg(),
-                self.value.arg(),
-                self.jacobian.arg(),
-                x.arg(),
-                count.arg(),
-                self.h.arg(),
-                self.g_o.arg(),
-                self.g_normal.arg(),
-                self.g_value.arg(),
-                self.partial.arg(),
-                self.inv_radius,
-                self.plan,
+            launch!(device, geometry_backward::launch_unchecked, groups_of, UNITS;
+                self.weights, self.value, self.jacobian, x, count, self.h, self.g_o, self.g_normal,
+                self.g_value, self.partial;
+                self.inv_radius, self.plan
             );
         }
-        reduce::launch(
-            device.launch(),
-            groups(g_flat.words().div_ceil(UNITS as usize)),
-            dim,
-            self.partial.arg(),
-            self.summed_map.arg(),
-            count.arg(),
-            g_flat.arg(),
-            (self.plan.gradients()[7] * CHANNELS) as u32,
-            SUMMING.min(self.capacity / TILE),
+        launch!(device, reduce::launch, groups(g_flat.words().div_ceil(UNITS as usize)), UNITS;
+            self.partial, self.summed_map, count, g_flat;
+            (self.plan.gradients()[7] * CHANNELS) as u32, SUMMING.min(self.capacity / TILE)
         );
         let slopes = Some([&self.q, &self.g_normal]);
         self.grid.scatter(device, g_table, x, count, &self.g_value, slopes);

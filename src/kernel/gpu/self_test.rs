@@ -104,12 +104,12 @@ pub fn self_test(device: &Device) -> Result<Vec<Check>> {
     let mut field = Sdf::new(device, &shape, SAMPLES);
     field.activate(shape.active);
     let [at, toward] = [&x, &direction].map(|v| device.upload(&planes(v, SAMPLES)));
-    let there = [device.upload(&table), device.upload(&flat)];
+    let there = [device.upload(table.as_flattened()), device.upload(&flat)];
     let count = device.upload(&[SAMPLES as u32]);
     let out = field.forward(device, &there[0], &there[1], &at, &toward, &count);
     let rows: &[[f32; WIDTH]] = a.output().as_chunks().0;
     check("field", &device.fetch(out)?, &planes(rows, SAMPLES), 1e-4);
-    let (got_table, got_flat) = (device.zeros(2 * table.len()), device.zeros(flat.len()));
+    let (got_table, got_flat) = (device.zeros::<f32>(2 * table.len()), device.zeros::<f32>(flat.len()));
     let g = device.upload(&planes(&g_out, SAMPLES));
     field.backward(device, &at, &toward, &count, &g, &got_table, &got_flat);
     check("gradient of the networks", &device.fetch(&got_flat)?, &g_flat, 1e-4);
@@ -160,7 +160,7 @@ pub fn self_test(device: &Device) -> Result<Vec<Check>> {
     };
     let mut want = [flat.clone(), vec![0.1; flat.len()], vec![0.2; flat.len()]];
     let there: [Buffer; 3] = want.each_ref().map(|v| device.upload(v));
-    let gate = Gate { count: &count, broken: &device.zeros(1) };
+    let gate = Gate { count: &count, broken: &device.zeros::<u32>(1) };
     let gradient = device.upload(&g_flat);
     adam(device, there.each_ref(), &gradient, &step, gate);
     let [p, m, v] = &mut want;

@@ -1,6 +1,6 @@
 //! Sums of many threads into one place: see [`Atomics`](super::Atomics).
 
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 /// Steps that the bound on a sum is counted in: what is left up to 2³¹ takes the rounding of 10⁸ terms.
 pub const MOST: f32 = 2e9;

@@ -4,7 +4,7 @@
 //! channels, or 32 times 128. Thread `(row, column)` owns vector `row` of channels `4 column .. 4 column + 4`: a
 //! [`Block`]. Weights lie in rows of as many floats as a tile has channels, `[inputs, channels]`.
 
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 

@@ -6,10 +6,10 @@
 //! inv_s = exp(10 s)         g_s = 10 inv_s g_inv_s
 //! ```
 
-use super::device::{Buffer, Device, groups};
+use super::device::{Buffer, Device, Words, groups, launch};
 use crate::kernel::cpu::mlp::Layout;
 use crate::kernel::cpu::weight_norm::{self, Row};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 
@@ -158,17 +158,8 @@ impl WeightNorm {
         inv_s: &Buffer,
     ) {
         assert_eq!(raw.words(), self.parameters);
-        forward::launch(
-            device.launch(),
-            groups(self.count.div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            raw.arg(),
-            self.pieces.arg(),
-            variance.arg(),
-            flat.arg(),
-            inv_s.arg(),
-            range[0],
-            range[1],
+        launch!(device, forward::launch, groups(self.count.div_ceil(UNITS as usize)), UNITS;
+            raw, self.pieces, variance, flat, inv_s; range[0], range[1]
         );
     }
 
@@ -183,18 +174,8 @@ impl WeightNorm {
         [g_raw, g_variance]: [&Buffer; 2],
         broken: &Buffer,
     ) {
-        backward::launch(
-            device.launch(),
-            groups(self.count.div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            raw.arg(),
-            self.pieces.arg(),
-            inv_s.arg(),
-            g_flat.arg(),
-            g_inv_s.arg(),
-            g_raw.arg(),
-            g_variance.arg(),
-            broken.arg(),
+        launch!(device, backward::launch, groups(self.count.div_ceil(UNITS as usize)), UNITS;
+            raw, self.pieces, inv_s, g_flat, g_inv_s, g_raw, g_variance, broken
         );
     }
 }
@@ -242,7 +223,7 @@ mod tests {
         let (raw, g) = (normal(1, norm.parameters()), normal(2, layout.len()));
         let [there, g_flat] = [&raw, &g].map(|v| device.upload(v));
         let (variance, g_inv_s) = (device.upload(&[0.3f32]), device.upload(&[0.7f32]));
-        let (flat, inv_s) = (device.scratch(layout.len()), device.scratch(1));
+        let (flat, inv_s) = (device.scratch::<f32>(layout.len()), device.scratch::<f32>(1));
         norm.forward(&device, &there, &variance, [-1.0, 0.25], &flat, &inv_s);
         let wide: Vec<f64> = raw.iter().map(|&v| v as f64).collect();
         let want: Vec<f32> = weights(layout, &wide).iter().map(|&v| v as f32).collect();
@@ -250,8 +231,8 @@ mod tests {
         // 0.3 is kept to 0.25: inv_s = exp(2.5), and its gradient 0.7 becomes 7 exp(2.5)
         assert_eq!(device.read::<f32>(&variance), [0.25]);
         agree("sharpness", &device.read::<f32>(&inv_s), &[2.5f32.exp()], 1e-5);
-        let (g_raw, g_variance) = (device.scratch(raw.len()), device.scratch(1));
-        let broken = device.zeros(1);
+        let (g_raw, g_variance) = (device.scratch::<f32>(raw.len()), device.scratch::<f32>(1));
+        let broken = device.zeros::<u32>(1);
         let into = [&g_raw, &g_variance];
         norm.backward(&device, &there, &inv_s, [&g_flat, &g_inv_s], into, &broken);
         assert_eq!(device.read::<u32>(&broken), [0]);
@@ -275,7 +256,7 @@ mod tests {
         for (value, at) in [(f32::NAN, 0), (f32::INFINITY, layout.len() - 1)] {
             let mut g = g.clone();
             g[at] = value;
-            let broken = device.zeros(1);
+            let broken = device.zeros::<u32>(1);
             norm.backward(&device, &there, &inv_s, [&device.upload(&g), &g_inv_s], into, &broken);
             assert_eq!(device.read::<u32>(&broken), [1]);
         }

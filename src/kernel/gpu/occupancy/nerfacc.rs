@@ -1,12 +1,12 @@
 //! nerfacc's rule: a decaying maximum of the opacity of each cell, looked at again at random.
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
 use super::super::rng;
 use super::{Occupancy, UNITS};
 use crate::Result;
 use crate::kernel::cpu::march::nerfacc;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const DECAY: f32 = nerfacc::DECAY;
 
@@ -241,14 +241,14 @@ impl Nerfacc {
         assert_eq!(cells, occupancy.resolution.pow(3));
         Nerfacc {
             history: device.upload(history),
-            counts: device.zeros(words),
-            before: device.zeros(words + 1),
-            kept: device.zeros(2),
-            last: device.zeros(cells),
-            drawn: device.zeros(capacity),
-            sums: device.zeros(cells.div_ceil(32 * UNITS as usize)),
-            least: device.zeros(1),
-            count: device.zeros(2),
+            counts: device.zeros::<u32>(words),
+            before: device.zeros::<u32>(words + 1),
+            kept: device.zeros::<u32>(2),
+            last: device.zeros::<u32>(cells),
+            drawn: device.zeros::<u32>(capacity),
+            sums: device.zeros::<f32>(cells.div_ceil(32 * UNITS as usize)),
+            least: device.zeros::<f32>(1),
+            count: device.zeros::<u32>(2),
             threshold,
         }
     }
@@ -271,7 +271,6 @@ impl Nerfacc {
         let cells = self.history.words();
         let all = n < nerfacc::ALL_BELOW;
         let [any, some, jitter] = nerfacc::DRAWS;
-        let dim = CubeDim::new_1d(UNITS);
         let over = |count: usize| groups(count.div_ceil(UNITS as usize));
         let draws = |purpose: u64| {
             let [high, low] = rng::stream(seed, n << 4 | purpose);
@@ -280,76 +279,33 @@ impl Nerfacc {
         let draw_count = if all { cells } else { cells / 4 * 2 };
         if !all {
             let mask = &occupancy.mask;
-            tally::launch(device.launch(), over(mask.words()), dim, mask.arg(), self.counts.arg());
+            launch!(device, tally::launch, over(mask.words()), UNITS; mask, self.counts);
             prefix_sum(device, &self.counts, &self.before, &self.kept, cells);
-            claim::launch(
-                device.launch(),
-                over(draw_count),
-                dim,
-                mask.arg(),
-                self.before.arg(),
-                self.last.arg(),
-                cells as u32,
-                draws(any),
-                draws(some),
+            launch!(device, claim::launch, over(draw_count), UNITS;
+                mask, self.before, self.last; cells as u32, draws(any), draws(some)
             );
         }
         let capacity = self.drawn.words();
         assert!(capacity <= x.words() / 3);
         for first in (0..draw_count).step_by(capacity) {
             let here = capacity.min(draw_count - first);
-            scatter::launch(
-                device.launch(),
-                over(here),
-                dim,
-                occupancy.mask.arg(),
-                self.before.arg(),
-                x.arg(),
-                self.drawn.arg(),
-                self.count.arg(),
-                first as u32,
-                here as u32,
-                occupancy.resolution as u32,
-                occupancy.radius,
-                draws(any),
-                draws(some),
-                draws(jitter),
-                all,
+            launch!(device, scatter::launch, over(here), UNITS;
+                occupancy.mask, self.before, x, self.drawn, self.count;
+                first as u32, here as u32, occupancy.resolution as u32, occupancy.radius, draws(any),
+                draws(some), draws(jitter), all
             );
             let (values, scale) = opacity(&self.count);
-            decay::launch(
-                device.launch(),
-                over(here),
-                dim,
-                values.arg(),
-                self.drawn.arg(),
-                self.last.arg(),
-                self.history.arg(),
-                first as u32,
-                here as u32,
-                scale,
-                all,
+            launch!(device, decay::launch, over(here), UNITS;
+                values, self.drawn, self.last, self.history; first as u32, here as u32, scale, all
             );
         }
         let sums = &self.sums;
-        partial_sums::launch(device.launch(), groups(sums.words()), dim, self.history.arg(), sums.arg());
-        mean::launch(
-            device.launch(),
-            CubeCount::new_single(),
-            CubeDim::new_1d(1),
-            sums.arg(),
-            self.least.arg(),
-            cells as u32,
-            self.threshold,
+        launch!(device, partial_sums::launch, groups(sums.words()), UNITS; self.history, sums);
+        launch!(device, mean::launch, CubeCount::new_single(), 1;
+            sums, self.least; cells as u32, self.threshold
         );
-        decide_by_history::launch(
-            device.launch(),
-            over(occupancy.mask.words()),
-            dim,
-            self.history.arg(),
-            self.least.arg(),
-            self.last.arg(),
-            occupancy.mask.arg(),
+        launch!(device, decide_by_history::launch, over(occupancy.mask.words()), UNITS;
+            self.history, self.least, self.last, occupancy.mask
         );
     }
 }

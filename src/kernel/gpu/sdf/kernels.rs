@@ -6,7 +6,7 @@ use super::super::tile::{
 use super::{NORMAL, Plan};
 use crate::kernel::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, SOFTNESS, TILE};
 use crate::kernel::cpu::neus::SHORTEST;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 

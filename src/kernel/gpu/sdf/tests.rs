@@ -24,7 +24,7 @@ fn the_field_and_its_gradients_are_those_of_the_cpu() {
             let mut on = Sdf::new(&device, &shape, CAPACITY);
             on.activate(active);
             let [x, direction] = [&x, &direction].map(|v| device.upload(&planes(v, CAPACITY)));
-            let (table, flat) = (device.upload(&table), device.upload(&flat));
+            let (table, flat) = (device.upload(table.as_flattened()), device.upload(&flat));
             let count = device.upload(&[SAMPLES as u32]);
             let out = device.read::<f32>(on.forward(&device, &table, &flat, &x, &direction, &count));
             let rows: &[[f32; WIDTH]] = a.output().as_chunks().0;
@@ -35,8 +35,8 @@ fn the_field_and_its_gradients_are_those_of_the_cpu() {
             let mut g_planes = planes(&g_out, CAPACITY);
             // behind the last sample nothing counts
             (0..WIDTH).for_each(|k| g_planes[k * CAPACITY + SAMPLES] = f32::NAN);
-            let got_table = device.zeros(2 * g_table.len());
-            let got_flat = device.zeros(g_flat.len());
+            let got_table = device.zeros::<f32>(2 * g_table.len());
+            let got_flat = device.zeros::<f32>(g_flat.len());
             on.backward(&device, &x, &direction, &count, &device.upload(&g_planes), &got_table, &got_flat);
             let mut start = 0;
             for (o, i) in shape.layout().shapes() {
@@ -57,12 +57,12 @@ fn the_gradients_agree_with_f64_finite_differences_second_order_included() {
             let capacity = case.x.len().next_multiple_of(TILE);
             let on = Sdf::new(&device, case.shape, capacity);
             let [x, direction] = [case.x, case.direction].map(|v| device.upload(&planes(v, capacity)));
-            let (table, flat) = (device.upload(case.table), device.upload(case.flat));
+            let (table, flat) = (device.upload(case.table.as_flattened()), device.upload(case.flat));
             let count = device.upload(&[case.x.len() as u32]);
             on.forward(&device, &table, &flat, &x, &direction, &count);
             let g_out = device.upload(&planes(case.g_out.as_chunks::<WIDTH>().0, capacity));
-            let g_table = device.zeros(2 * case.table.len());
-            let g_flat = device.zeros(case.flat.len());
+            let g_table = device.zeros::<f32>(2 * case.table.len());
+            let g_flat = device.zeros::<f32>(case.flat.len());
             on.backward(&device, &x, &direction, &count, &g_out, &g_table, &g_flat);
             (device.read(&g_flat), device.read::<f32>(&g_table).as_chunks().0.to_vec())
         });
@@ -76,9 +76,10 @@ fn no_samples_give_no_gradient() {
     let on = Sdf::new(&device, &shape, CAPACITY);
     let [x, direction] = [&x, &direction].map(|v| device.upload(&planes(v, CAPACITY)));
     let (entries, floats) = (table.len(), flat.len());
-    let (table, flat, count) = (device.upload(&table), device.upload(&flat), device.upload(&[0u32]));
+    let (table, flat, count) =
+        (device.upload(table.as_flattened()), device.upload(&flat), device.upload(&[0u32]));
     on.forward(&device, &table, &flat, &x, &direction, &count);
-    let (g_table, g_flat) = (device.zeros(2 * entries), device.upload(&vec![1f32; floats]));
+    let (g_table, g_flat) = (device.zeros::<f32>(2 * entries), device.upload(&vec![1f32; floats]));
     let g_out = device.upload(&planes(&g_out, CAPACITY));
     on.backward(&device, &x, &direction, &count, &g_out, &g_table, &g_flat);
     let zero = |b: &Buffer| device.read::<f32>(b).iter().all(|&v| v == 0.0);

@@ -12,9 +12,9 @@
 
 mod kernels;
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
-use super::super::tile;
+use super::super::tile::{self, UNITS};
 use super::grid::{DeviceGrid, NONE};
 use super::march::VmSamples;
 use super::rays::Along;
@@ -138,13 +138,13 @@ impl DeviceDecoder {
         // a power of two, so that pieces are whole tiles
         let fits = (device.limits().largest_buffer as usize / (16 * plan.products()).max(1)).max(super::TILE);
         let chunk = capacity.min(Self::CHUNK).min(1 << fits.ilog2());
-        let learned = |words: usize| device.scratch(if learns { words } else { 1 });
+        let learned = |words: usize| device.scratch::<f32>(if learns { words } else { 1 });
         let gradients = plan.gradients()[6] * plan.width();
         DeviceDecoder {
             plan,
             real: device.upload(&real),
             padded: device.upload(&padded),
-            weights: device.scratch(plan.rows()[8] * plan.width()),
+            weights: device.scratch::<f32>(plan.rows()[8] * plan.width()),
             g_products: learned(chunk * 4 * plan.products()),
             chunk,
             capacity,
@@ -156,14 +156,8 @@ impl DeviceDecoder {
     /// Makes the weights ready, as the CPU has them.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
         assert_eq!(flat.words(), self.plan.parts()[7]);
-        prepare::launch(
-            device.launch(),
-            groups(self.weights.words().div_ceil(tile::UNITS as usize)),
-            cubecl::prelude::CubeDim::new_1d(tile::UNITS),
-            flat.arg(),
-            self.real.arg(),
-            self.weights.arg(),
-            self.plan,
+        launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
+            flat, self.real, self.weights; self.plan
         );
     }
 
@@ -178,22 +172,13 @@ impl DeviceDecoder {
         along: &Along,
     ) {
         assert!(along.index.words() == self.capacity && values.words() == grid.len());
+        let tiles = self.capacity.div_ceil(4 * self.plan.lanes);
         // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
         unsafe {
-            forward::launch_unchecked(
-                device.launch(),
-                groups(self.capacity.div_ceil(4 * self.plan.lanes).min(8 * GROUPS)),
-                cubecl::prelude::CubeDim::new_1d(tile::UNITS),
-                self.weights.arg(),
-                values.arg(),
-                grid.words().arg(),
-                samples.place.arg(),
-                samples.ray.arg(),
-                rays.direction.arg(),
-                along.index.arg(),
-                along.count.arg(),
-                along.rgb.arg(),
-                self.plan,
+            launch!(device, forward::launch_unchecked, groups(tiles.min(8 * GROUPS)), UNITS;
+                self.weights, values, grid.words(), samples.place, samples.ray, rays.direction, along.index,
+                along.count, along.rgb;
+                self.plan
             );
         }
     }
@@ -214,55 +199,24 @@ impl DeviceDecoder {
         broken: &Buffer,
     ) {
         assert!(along.index.words() == self.capacity && values.words() == grid.len());
-        let dim = cubecl::prelude::CubeDim::new_1d(tile::UNITS);
         for from in (0..self.capacity).step_by(self.chunk) {
             // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
             unsafe {
-                backward::launch_unchecked(
-                    device.launch(),
-                    groups(self.summing()),
-                    dim,
-                    self.weights.arg(),
-                    values.arg(),
-                    grid.words().arg(),
-                    samples.place.arg(),
-                    samples.ray.arg(),
-                    rays.direction.arg(),
-                    along.index.arg(),
-                    along.count.arg(),
-                    along.g_pre.arg(),
-                    self.g_products.arg(),
-                    self.partial.arg(),
-                    from as u32,
-                    self.chunk as u32,
-                    self.plan,
+                launch!(device, backward::launch_unchecked, groups(self.summing()), UNITS;
+                    self.weights, values, grid.words(), samples.place, samples.ray, rays.direction,
+                    along.index, along.count, along.g_pre, self.g_products, self.partial;
+                    from as u32, self.chunk as u32, self.plan
                 );
             }
             let part = Some((&along.index, from, self.chunk));
             let (place, count) = (&samples.place, &along.count);
             grid.scatter(device, g_values, values, place, part, count, &self.g_products);
         }
-        reduce::launch(
-            device.launch(),
-            groups(self.summed.words().div_ceil(tile::UNITS as usize)),
-            dim,
-            self.partial.arg(),
-            along.count.arg(),
-            self.summed.arg(),
-            4 * self.plan.lanes as u32,
-            self.summing() as u32,
+        launch!(device, reduce::launch, groups(self.summed.words().div_ceil(UNITS as usize)), UNITS;
+            self.partial, along.count, self.summed; 4 * self.plan.lanes as u32, self.summing() as u32
         );
-        chain::launch(
-            device.launch(),
-            groups(flat.words().div_ceil(tile::UNITS as usize)),
-            dim,
-            flat.arg(),
-            self.real.arg(),
-            self.padded.arg(),
-            self.summed.arg(),
-            g_flat.arg(),
-            broken.arg(),
-            self.plan,
+        launch!(device, chain::launch, groups(flat.words().div_ceil(UNITS as usize)), UNITS;
+            flat, self.real, self.padded, self.summed, g_flat, broken; self.plan
         );
     }
 

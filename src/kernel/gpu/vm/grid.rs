@@ -1,9 +1,9 @@
 //! Planes and lines on a device: lookups, gradients back onto them, and what is asked of them besides the photographs.
 
-use super::super::device::{Atomics, Buffer, Device, groups};
+use super::super::device::{Atomics, Buffer, Device, Words, groups, launch};
 use super::super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::cpu::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, Penalty, tv_factors};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 
@@ -336,9 +336,9 @@ impl DeviceGrid {
             padded,
             words: device.upload(&words),
             factors: device.upload(&factors),
-            units: device.zeros(2),
-            partial: device.scratch(3 * BOUNDING),
-            whole: fixed.then(|| device.zeros(padded.len())),
+            units: device.zeros::<f32>(2),
+            partial: device.scratch::<f32>(3 * BOUNDING),
+            whole: fixed.then(|| device.zeros::<i32>(padded.len())),
         }
     }
 
@@ -419,16 +419,8 @@ impl DeviceGrid {
     /// Features of samples, `[capacity]`: the sum over terms and channels. place: planes `[3, capacity]`.
     pub fn gather(&self, device: &Device, values: &Buffer, place: &Buffer, count: &Buffer, feature: &Buffer) {
         assert!(values.words() == self.len() && place.words() == 3 * feature.words());
-        gather::launch(
-            device.launch(),
-            groups(feature.words().div_ceil(UNITS as usize).min(GROUPS)),
-            CubeDim::new_1d(UNITS),
-            values.arg(),
-            self.words.arg(),
-            place.arg(),
-            count.arg(),
-            feature.arg(),
-            self.quads(),
+        launch!(device, gather::launch, groups(feature.words().div_ceil(UNITS as usize).min(GROUPS)), UNITS;
+            values, self.words, place, count, feature; self.quads()
         );
     }
 
@@ -448,50 +440,26 @@ impl DeviceGrid {
         assert!(gradient.words() == self.len() && values.words() == self.len());
         let channels = self.padded.channels();
         let (list, from, limit) = index.unwrap_or((count, 0, g.words()));
-        let dim = CubeDim::new_1d(UNITS);
         if self.whole.is_some() {
-            bound::launch(
-                device.launch(),
-                groups(BOUNDING),
-                dim,
-                values.arg(),
-                self.words.arg(),
-                count.arg(),
-                g.arg(),
-                self.partial.arg(),
-                from as u32,
-                limit as u32,
-                if index.is_some() { channels } else { 1 },
+            launch!(device, bound::launch, groups(BOUNDING), UNITS;
+                values, self.words, count, g, self.partial;
+                from as u32, limit as u32, if index.is_some() { channels } else { 1 }
             );
             let one = CubeCount::new_single();
-            units_of::launch(device.launch(), one, CubeDim::new_1d(1), self.partial.arg(), self.units.arg());
+            launch!(device, units_of::launch, one, 1; self.partial, self.units);
         }
-        let launch = match device.atomics() {
+        let scatter = match device.atomics() {
             Atomics::Native => scatter::launch::<Native>,
             Atomics::Exchange => scatter::launch::<Exchange>,
             Atomics::Fixed => scatter::launch::<Fixed>,
         };
-        launch(
-            device.launch(),
-            groups((limit * channels).div_ceil(UNITS as usize).min(GROUPS)),
-            dim,
-            self.whole.as_ref().unwrap_or(gradient).arg(),
-            values.arg(),
-            self.words.arg(),
-            place.arg(),
-            list.arg(),
-            count.arg(),
-            g.arg(),
-            self.units.arg(),
-            from as u32,
-            limit as u32,
-            self.quads(),
-            index.is_some(),
+        launch!(device, scatter, groups((limit * channels).div_ceil(UNITS as usize).min(GROUPS)), UNITS;
+            self.whole.as_ref().unwrap_or(gradient), values, self.words, place, list, count, g, self.units;
+            from as u32, limit as u32, self.quads(), index.is_some()
         );
         if let Some(whole) = &self.whole {
             let count = groups(self.len().div_ceil(UNITS as usize));
-            let (words, units) = (self.words.arg(), self.units.arg());
-            settle::launch(device.launch(), count, dim, whole.arg(), words, units, gradient.arg());
+            launch!(device, settle::launch, count, UNITS; whole, self.words, self.units, gradient);
         }
     }
 
@@ -501,17 +469,8 @@ impl DeviceGrid {
         if penalty.is_zero() {
             return;
         }
-        penalize::launch(
-            device.launch(),
-            groups(self.len().div_ceil(UNITS as usize)),
-            CubeDim::new_1d(UNITS),
-            values.arg(),
-            self.words.arg(),
-            self.factors.arg(),
-            gradient.arg(),
-            penalty.tv,
-            penalty.l1,
-            self.quads(),
+        launch!(device, penalize::launch, groups(self.len().div_ceil(UNITS as usize)), UNITS;
+            values, self.words, self.factors, gradient; penalty.tv, penalty.l1, self.quads()
         );
     }
 }

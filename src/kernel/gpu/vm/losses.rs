@@ -1,12 +1,12 @@
 //! What a training step of TensoRF's field minimizes, and its gradients: see [`crate::kernel::cpu::vm::losses`].
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
 use super::Vm;
 use crate::Result;
 use crate::kernel::cpu::vm::RAY_WIDTH;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm, TERMS, VmFigures};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
@@ -159,10 +159,10 @@ impl VmLosses {
     pub fn new(device: &Device, rays: usize, term: MaskTerm) -> VmLosses {
         VmLosses {
             term,
-            tally: device.scratch(2),
-            g_out: device.scratch(RAY_WIDTH * rays),
-            terms: device.scratch(TERMS * rays),
-            totals: device.zeros(TOTALS),
+            tally: device.scratch::<u32>(2),
+            g_out: device.scratch::<f32>(RAY_WIDTH * rays),
+            terms: device.scratch::<f32>(TERMS * rays),
+            totals: device.zeros::<u32>(TOTALS),
         }
     }
 
@@ -174,7 +174,6 @@ impl VmLosses {
         batch: &Batch,
         mode: BackgroundMode,
     ) -> &Buffer {
-        let dim = CubeDim::new_1d(UNITS);
         let (weight, l2, ce) = match self.term {
             MaskTerm::None => (0.0, false, false),
             MaskTerm::L2(weight) => (weight, true, false),
@@ -182,24 +181,10 @@ impl VmLosses {
         };
         let Batch { color, alpha, background, alive, .. } = batch;
         let one = CubeCount::new_single();
-        tally::launch(device.launch(), one, dim, alpha.arg(), alive.arg(), self.tally.arg());
-        of_rays::launch(
-            device.launch(),
-            groups(alpha.words().div_ceil(UNITS as usize)),
-            dim,
-            composed.arg(),
-            color.arg(),
-            alpha.arg(),
-            background.arg(),
-            alive.arg(),
-            self.tally.arg(),
-            self.g_out.arg(),
-            self.terms.arg(),
-            mode.lift,
-            f32::from(mode.target),
-            weight,
-            l2,
-            ce,
+        launch!(device, tally::launch, one, UNITS; alpha, alive, self.tally);
+        launch!(device, of_rays::launch, groups(alpha.words().div_ceil(UNITS as usize)), UNITS;
+            composed, color, alpha, background, alive, self.tally, self.g_out, self.terms;
+            mode.lift, f32::from(mode.target), weight, l2, ce
         );
         &self.g_out
     }
@@ -217,29 +202,20 @@ impl VmLosses {
     /// Adds the last step to what is read.
     pub fn add(&self, device: &Device, vm: &Vm, broken: &Buffer) {
         let [looked_up, decoded, points] = vm.counts();
-        add::launch(
-            device.launch(),
-            CubeCount::new_1d(TERMS as u32 + 1),
-            CubeDim::new_1d(UNITS),
-            self.terms.arg(),
-            points.arg(),
-            looked_up.arg(),
-            decoded.arg(),
-            self.tally.arg(),
-            broken.arg(),
-            self.totals.arg(),
+        launch!(device, add::launch, CubeCount::new_1d(TERMS as u32 + 1), UNITS;
+            self.terms, points, looked_up, decoded, self.tally, broken, self.totals
         );
     }
 
     /// Forgets what steps came to since the last time.
     pub fn forget(&mut self, device: &Device) {
-        self.totals = device.zeros(TOTALS);
+        self.totals = device.zeros::<u32>(TOTALS);
     }
 
     /// Waits for the device; what the steps since the last time came to.
     pub fn fetch(&mut self, device: &Device) -> Result<VmFigures> {
         let t = device.fetch::<u32>(&self.totals)?;
-        self.totals = device.zeros(TOTALS);
+        self.totals = device.zeros::<u32>(TOTALS);
         let [lattice, density, color, rays] = [3, 4, 5, 6].map(|i| t[i] as u64);
         let terms = [t[0], t[1], t[2]].map(f32::from_bits);
         Ok(VmFigures { terms, lattice, density, color, rays, broken: t[7] != 0 })

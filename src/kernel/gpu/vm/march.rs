@@ -1,12 +1,12 @@
 //! The lattice points of rays inside a box and a mask: see [`crate::kernel::cpu::vm::mask::Walk`], whose rule this is.
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
 use super::super::march::{bit, prefix_sum};
 use super::super::occupancy::words;
 use crate::kernel::cpu::vm::VmField;
 use crate::kernel::cpu::vm::mask::BLOCK;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
@@ -240,13 +240,13 @@ impl VmSamples {
     /// Room for so many rays and `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> VmSamples {
         VmSamples {
-            offsets: device.zeros(rays + 1),
-            count: device.zeros(2),
-            t: device.scratch(capacity),
-            ray: device.scratch(capacity),
-            place: device.scratch(3 * capacity),
-            points: device.zeros(rays),
-            counts: device.zeros(rays),
+            offsets: device.zeros::<u32>(rays + 1),
+            count: device.zeros::<u32>(2),
+            t: device.scratch::<f32>(capacity),
+            ray: device.scratch::<u32>(capacity),
+            place: device.scratch::<f32>(3 * capacity),
+            points: device.zeros::<u32>(rays),
+            counts: device.zeros::<u32>(rays),
         }
     }
 
@@ -258,26 +258,10 @@ impl VmSamples {
             None => [&lattice.sizes; 2],
         };
         let both = |writes: bool| {
-            pass::launch(
-                device.launch(),
-                groups(rays.jitter.words().div_ceil(UNITS as usize)),
-                CubeDim::new_1d(UNITS),
-                lattice.lattice.arg(),
-                lattice.sizes.arg(),
-                bits.arg(),
-                blocks.arg(),
-                rays.origin.arg(),
-                rays.direction.arg(),
-                rays.jitter.arg(),
-                rays.alive.arg(),
-                self.offsets.arg(),
-                self.counts.arg(),
-                self.points.arg(),
-                self.t.arg(),
-                self.ray.arg(),
-                self.place.arg(),
-                lattice.mask.is_some(),
-                writes,
+            launch!(device, pass::launch, groups(rays.jitter.words().div_ceil(UNITS as usize)), UNITS;
+                lattice.lattice, lattice.sizes, bits, blocks, rays.origin, rays.direction, rays.jitter,
+                rays.alive, self.offsets, self.counts, self.points, self.t, self.ray, self.place;
+                lattice.mask.is_some(), writes
             );
         };
         both(false);

@@ -1,11 +1,11 @@
 //! From features to weights, and compositing: see `render` of [`crate::kernel::cpu::vm`], whose module holds the formulas. A
 //! thread takes a ray.
 
-use super::super::device::{Buffer, Device, groups};
+use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
 use super::march::VmSamples;
 use crate::kernel::cpu::vm::{RAY_WIDTH, VmField};
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 
@@ -211,22 +211,22 @@ impl Along {
     /// Of so many rays and up to `capacity` samples of a field; with room for gradients where it learns.
     pub fn new(device: &Device, field: &VmField, rays: usize, capacity: usize, learns: bool) -> Along {
         let s = &field.shading;
-        let samples = |planes: usize| device.scratch(planes * capacity);
-        let gradients = |planes: usize| device.scratch(if learns { planes * capacity } else { 1 });
+        let samples = |planes: usize| device.scratch::<f32>(planes * capacity);
+        let gradients = |planes: usize| device.scratch::<f32>(if learns { planes * capacity } else { 1 });
         Along {
             feature: samples(1),
             g_feature: gradients(1),
-            count: device.zeros(2),
-            index: samples(1),
+            count: device.zeros::<u32>(2),
+            index: device.scratch::<u32>(capacity),
             rgb: samples(3),
             g_pre: gradients(3),
-            out: device.scratch(RAY_WIDTH * rays),
+            out: device.scratch::<f32>(RAY_WIDTH * rays),
             alpha: samples(1),
             light: samples(1),
             weight: samples(1),
-            ends: device.scratch(rays),
-            counts: device.scratch(rays),
-            firsts: device.scratch(rays + 1),
+            ends: device.scratch::<u32>(rays),
+            counts: device.scratch::<u32>(rays),
+            firsts: device.scratch::<u32>(rays + 1),
             shift: s.shift,
             length: field.lattice.step * s.distance_scale,
             threshold: s.weight_threshold,
@@ -241,77 +241,31 @@ impl Along {
 
     /// Weights of samples from their features, and the list of those worth a color.
     pub fn weigh(&self, device: &Device, samples: &VmSamples) {
-        weigh::launch(
-            device.launch(),
-            self.groups(),
-            CubeDim::new_1d(UNITS),
-            samples.offsets.arg(),
-            self.feature.arg(),
-            self.alpha.arg(),
-            self.light.arg(),
-            self.weight.arg(),
-            self.ends.arg(),
-            self.counts.arg(),
-            self.shift,
-            self.length,
-            self.threshold,
-            self.stop,
-            self.softplus,
+        launch!(device, weigh::launch, self.groups(), UNITS;
+            samples.offsets, self.feature, self.alpha, self.light, self.weight, self.ends, self.counts;
+            self.shift, self.length, self.threshold, self.stop, self.softplus
         );
         prefix_sum(device, &self.counts, &self.firsts, &self.count, self.index.words());
-        list::launch(
-            device.launch(),
-            self.groups(),
-            CubeDim::new_1d(UNITS),
-            samples.offsets.arg(),
-            self.ends.arg(),
-            self.weight.arg(),
-            self.firsts.arg(),
-            self.index.arg(),
-            self.threshold,
+        launch!(device, list::launch, self.groups(), UNITS;
+            samples.offsets, self.ends, self.weight, self.firsts, self.index; self.threshold
         );
     }
 
     /// Composites colors.
     pub fn composite(&self, device: &Device, samples: &VmSamples) {
-        composite::launch(
-            device.launch(),
-            self.groups(),
-            CubeDim::new_1d(UNITS),
-            samples.offsets.arg(),
-            self.ends.arg(),
-            self.firsts.arg(),
-            samples.t.arg(),
-            self.weight.arg(),
-            self.rgb.arg(),
-            self.out.arg(),
-            self.threshold,
+        launch!(device, composite::launch, self.groups(), UNITS;
+            samples.offsets, self.ends, self.firsts, samples.t, self.weight, self.rgb, self.out;
+            self.threshold
         );
     }
 
     /// Gradients of samples from those by what was composited, planes `[5, rays]`.
     pub fn backward(&self, device: &Device, samples: &VmSamples, g_out: &Buffer) {
         assert!(g_out.words() == self.out.words() && self.g_feature.words() == self.feature.words());
-        backward::launch(
-            device.launch(),
-            self.groups(),
-            CubeDim::new_1d(UNITS),
-            samples.offsets.arg(),
-            self.ends.arg(),
-            self.firsts.arg(),
-            samples.t.arg(),
-            self.feature.arg(),
-            self.alpha.arg(),
-            self.light.arg(),
-            self.weight.arg(),
-            self.rgb.arg(),
-            g_out.arg(),
-            self.g_feature.arg(),
-            self.g_pre.arg(),
-            self.shift,
-            self.length,
-            self.threshold,
-            self.softplus,
+        launch!(device, backward::launch, self.groups(), UNITS;
+            samples.offsets, self.ends, self.firsts, samples.t, self.feature, self.alpha, self.light,
+            self.weight, self.rgb, g_out, self.g_feature, self.g_pre;
+            self.shift, self.length, self.threshold, self.softplus
         );
     }
 }

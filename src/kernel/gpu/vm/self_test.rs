@@ -1,6 +1,6 @@
 //! Does a device render TensoRF's field as the CPU does? On a tiny batch, which the tests of the kernels share.
 
-use super::super::device::{Buffer, Device};
+use super::super::device::{Buffer, Device, Words};
 use super::super::draw::Batch;
 use super::super::self_test::{Check, planes, worst};
 use super::{Vm, VmValues};
@@ -127,9 +127,9 @@ impl There {
 
     /// Of density, appearance and decoder, after a render.
     pub fn gradients(&self, device: &Device) -> Result<[Vec<f32>; 3]> {
-        let [d, c, n] = self.values.each_ref().map(|v| device.zeros(v.words()));
+        let [d, c, n] = self.values.each_ref().map(|v| device.zeros::<f32>(v.words()));
         let gradients = VmValues { density: &d, color: &c, network: &n };
-        let broken = device.zeros(1);
+        let broken = device.zeros::<u32>(1);
         self.vm.backward(device, self.values(), &self.rays, &self.g_out, gradients, &broken);
         assert_eq!(device.fetch::<u32>(&broken)?, [0]);
         let (density, color) = (&self.vm.density, &self.vm.color);

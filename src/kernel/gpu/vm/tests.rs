@@ -1,4 +1,5 @@
 use super::super::Atomics;
+use super::super::device::Words;
 use super::super::device::tests::{agree, device, devices, planes};
 use super::self_test::{NARROW, Shape, There, case, on_cpu, room};
 use super::*;

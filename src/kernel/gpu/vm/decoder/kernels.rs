@@ -4,7 +4,7 @@ use super::super::super::tile::{self, Block, at, gate, narrow, outer, product, p
 use super::super::super::weight_norm::finite;
 use super::super::grid::{NONE, looked_up, term};
 use super::Plan;
-use cubecl::prelude::*;
+use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 
