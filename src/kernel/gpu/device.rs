@@ -12,7 +12,32 @@ use burn::tensor::{DType, Element};
 use bytemuck::Pod;
 use std::fmt::Display;
 use std::ops::Range;
+use std::panic::{self, AssertUnwindSafe};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, Once};
+
+/// The first error of wgpu since a device was read. CubeCL turns such an error into a panic on a thread of its own, whose
+/// launches are lost while reads go on answering.
+static WGPU_ERROR: Mutex<Option<String>> = Mutex::new(None);
+
+/// Notes errors of wgpu from now on, rather than printing them.
+fn note_errors() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        let others = panic::take_hook();
+        panic::set_hook(Box::new(move |info| {
+            let message = info.payload_as_str().and_then(|text| text.strip_prefix("wgpu error: "));
+            let Some(message) = message else { return others(info) };
+            let mut noted = WGPU_ERROR.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+            noted.get_or_insert_with(|| message.to_owned());
+        }));
+    });
+}
+
+/// Takes the error of wgpu that was noted since the last call.
+fn noted_error() -> Option<String> {
+    WGPU_ERROR.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).take()
+}
 
 /// How threads add to one float.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -118,6 +143,7 @@ impl Adapter {
 impl Device {
     /// Opens an adapter, with the atomics it does best.
     pub fn open(adapter: &Adapter) -> Device {
+        note_errors();
         let device = adapter.device.clone();
         let client = device.client();
         let float = Type::atomic(ElemType::Float(FloatKind::F32));
@@ -211,14 +237,21 @@ impl Device {
     ///
     /// # Errors
     ///
-    /// Where the device does not answer, or could not do what was asked of it since the last call: it is lost, or has
-    /// no memory left. Of kind [`NotNow`](crate::ErrorKind::NotNow): nothing on the host is harmed.
+    /// Where the device does not answer, or could not do what was asked of it since the last call. Of kind
+    /// [`NotNow`](crate::ErrorKind::NotNow) where it is lost or has no memory left; of kind
+    /// [`Cannot`](crate::ErrorKind::Cannot) where its driver refuses a kernel or a launch. Nothing on the host is harmed.
     pub fn fetch<T: Pod>(&self, buffer: &Buffer) -> Result<Vec<T>> {
         self.readbacks.fetch_add(1, Ordering::Relaxed);
         #[cfg(test)]
         tests::answer().map_err(|e| self.failed(e))?;
-        let read = self.client.read_one(buffer.handle.clone());
-        let bytes = read.map_err(|e| self.failed(e))?;
+        let read = panic::catch_unwind(AssertUnwindSafe(|| self.client.read_one(buffer.handle.clone())));
+        if let Some(error) = noted_error() {
+            return Err(self.failed(error));
+        }
+        let bytes = match read {
+            Ok(read) => read.map_err(|e| self.failed(format!("{e:?}")))?,
+            Err(panic) => panic::resume_unwind(panic),
+        };
         Ok(bytemuck::pod_collect_to_vec(&bytes[..buffer.words() * 4]))
     }
 
@@ -241,10 +274,21 @@ impl Device {
 
     fn failed(&self, why: impl Display) -> Error {
         let why = why.to_string();
-        let first = why.lines().next().unwrap_or_default();
-        let hint =
-            "repeat the command: it goes on from the last checkpoint; with less memory if that was short";
-        Error::not_now(format!("the device `{}` failed: {first}", self.name()), hint)
+        let words: Vec<&str> = why.split_whitespace().collect();
+        let why: String = words.join(" ").chars().take(600).collect();
+        let problem = format!("the device `{}` failed: {why}", self.name());
+        let has = |all: &[&str]| all.iter().any(|word| why.to_lowercase().contains(word));
+        if has(&["out of memory", "outofmemory"]) {
+            let hint = "close what else uses the device, or give less with `--memory`; then repeat the command: it goes \
+                        on from the last checkpoint";
+            return Error::not_now(problem, hint);
+        }
+        if has(&["validation", "compil", "shader", "pipeline"]) {
+            let hint = "use another driver or device (`tiface doctor` tries them), or `--device cpu`; the last checkpoint \
+                        is whole";
+            return Error::cannot(problem, hint);
+        }
+        Error::not_now(problem, "repeat the command: it goes on from the last checkpoint")
     }
 
     /// What the next launch runs on; counts it.
@@ -274,11 +318,13 @@ macro_rules! launch {
 }
 pub(super) use launch;
 
+/// Groups of threads in one dimension that every adapter launches.
+pub(super) const MOST_GROUPS: u32 = 65_535;
+
 /// So many groups of threads, beyond 65,535 in two dimensions: a kernel uses its position among all and ignores
 /// those that are too many.
 pub(super) fn groups(count: usize) -> CubeCount {
-    const MOST: usize = 65_535;
-    let rows = count.div_ceil(MOST).max(1);
+    let rows = count.div_ceil(MOST_GROUPS as usize).max(1);
     CubeCount::Static(count.div_ceil(rows) as u32, rows as u32, 1)
 }
 
@@ -286,6 +332,7 @@ pub(super) fn groups(count: usize) -> CubeCount {
 pub(crate) mod tests {
     use super::super::self_test::worst;
     use super::*;
+    use burn::cubecl::{self, prelude::*};
     use std::cell::Cell;
 
     pub(crate) use super::super::self_test::planes;
@@ -341,6 +388,66 @@ pub(crate) mod tests {
         assert_eq!(device.read::<u32>(&device.zeros::<u32>(5)), [0; 5]);
         assert_eq!(device.counts(), (0, 2));
         println!("{} adds floats: {:?}", device.name(), device.atomics());
+    }
+
+    /// In a process of its own: what is noted of one device fails the next read of any.
+    fn fails_alone(test: &str) {
+        let this = std::env::current_exe().unwrap();
+        let name = format!("kernel::gpu::device::tests::{test}");
+        let run = std::process::Command::new(this).args(["--ignored", "--exact", &name]).output().unwrap();
+        let text = String::from_utf8_lossy(&run.stdout).into_owned() + &String::from_utf8_lossy(&run.stderr);
+        assert!(run.status.success() && text.contains("1 passed"), "{text}");
+    }
+
+    #[test]
+    fn what_a_driver_refuses_is_an_error_and_nothing_read_after_it_is_trusted() {
+        if device().is_some() {
+            fails_alone("a_launch_of_too_many_groups");
+            fails_alone("a_buffer_larger_than_memory");
+        }
+    }
+
+    #[cube(launch)]
+    fn set(out: &mut [f32]) {
+        if ABSOLUTE_POS < out.len() {
+            out[ABSOLUTE_POS] = 1.0f32;
+        }
+    }
+
+    #[test]
+    #[ignore = "run by the test above, in a process of its own"]
+    fn a_launch_of_too_many_groups() {
+        let device = device().unwrap();
+        let out = device.zeros::<f32>(64);
+        let set = |groups: u32| launch!(device, set::launch, CubeCount::new_1d(groups), 64; out);
+        (0..8).for_each(|_| set(1));
+        set(70_000);
+        (0..8).for_each(|_| set(1));
+        let e = device.fetch::<f32>(&out).err().expect("a launch was lost");
+        println!("{e}: {}", e.hint());
+        assert!(e.kind() as i32 == 1 && e.to_string().contains("65535"), "{e}");
+        // what comes after it is done
+        set(1);
+        assert_eq!(device.fetch::<f32>(&out).unwrap(), [1.0; 64]);
+    }
+
+    #[test]
+    #[ignore = "run by the test above, in a process of its own"]
+    fn a_buffer_larger_than_memory() {
+        let device = device().unwrap();
+        let pages = std::fs::read_to_string("/proc/self/statm").unwrap();
+        let pages: u64 = pages.split(' ').next().unwrap().parse().unwrap();
+        let most = Some(4096 * pages + (1 << 30));
+        let limit = rustix::process::Rlimit { current: most, maximum: most };
+        rustix::process::setrlimit(rustix::process::Resource::As, limit).unwrap();
+        let words = device.limits().largest_buffer as usize / 4;
+        let all: Vec<Buffer> = (0..64).map(|_| device.scratch::<f32>(words)).collect();
+        for out in &all {
+            launch!(device, set::launch, CubeCount::new_1d(1), 64; out);
+        }
+        let e = device.fetch::<f32>(&all[63]).err().expect("64 of the largest buffers do not fit in a GiB");
+        println!("{e}: {}", e.hint());
+        assert!(e.kind() as i32 == 75 && e.hint().contains("--memory"), "{e}");
     }
 
     #[test]

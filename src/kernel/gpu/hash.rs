@@ -1,12 +1,16 @@
 //! The hash encoding of [`crate::kernel::cpu::hash`]: features with Jacobian, and their scatter.
 
-use super::device::{Atomics, Buffer, Device, Words, launch};
+use super::device::{Atomics, Buffer, Device, MOST_GROUPS, Words, launch};
 use super::sum::{Exchange, Fixed, MOST, Native, Sum};
 use crate::kernel::cpu::hash::Level;
+use crate::kernel::cpu::mlp::TILE;
 use burn::cubecl::{self, prelude::*};
 
 /// Samples a group of threads handles.
 const GROUP: u32 = 256;
+
+/// Groups of threads that bound the sums of a level.
+const BOUNDING: usize = 64;
 
 /// Words that describe a level: scale, resolution, entries, offset, whether it is hashed.
 const LEVEL: usize = 5;
@@ -66,8 +70,8 @@ fn signed(v: f32, #[comptime] up: bool) -> f32 {
     if up { v } else { -v }
 }
 
-/// Features of all levels, planes `[2 · levels, capacity]`, and their slopes `[2 · levels · 3, capacity]`. Samples
-/// from `count[0]` on and levels from `active` on read zero.
+/// Features of all levels, planes `[2 · levels, capacity]`, and their slopes `[2 · levels · 3, capacity]`. Levels from
+/// `active` on read zero, and so do samples from `count[0]` to the end of the last tile.
 #[cube(launch)]
 fn gather(
     table: &[Vector<f32, Const<2>>],
@@ -84,7 +88,8 @@ fn gather(
     let capacity = capacity as usize;
     let s = ABSOLUTE_POS_X as usize;
     let level = CUBE_POS_Y as usize;
-    if s < capacity {
+    let end = (count[0] as usize).div_ceil(TILE) * TILE;
+    if s < min(end, capacity) {
         let mut v = Vector::<f32, Const<2>>::new(0.0f32);
         let mut jx = Vector::<f32, Const<2>>::new(0.0f32);
         let mut jy = Vector::<f32, Const<2>>::new(0.0f32);
@@ -167,8 +172,8 @@ fn scatter<S: Sum>(
     }
 }
 
-/// Steps per 1 in which a level's sums are counted, from a bound on them: the sum of all that is added, as if it
-/// went to one entry. One group of threads a level; in a fixed order.
+/// A bound on the sums of a level, `[levels, BOUNDING]`: all that is added, as if it went to one entry. [`BOUNDING`]
+/// groups of threads a level, each over its own samples; in a fixed order.
 #[cube(launch)]
 fn bound(
     levels: &[u32],
@@ -176,17 +181,17 @@ fn bound(
     g_value: &[f32],
     q: &[f32],
     g_normal: &[f32],
-    units: &mut [f32],
+    partial: &mut [f32],
     capacity: u32,
     world: f32,
     #[comptime] slopes: bool,
 ) {
     let capacity = capacity as usize;
-    let level = CUBE_POS_X as usize;
+    let level = CUBE_POS_Y as usize;
     let unit = UNIT_POS as usize;
     let slope = f32::reinterpret(levels[level * LEVEL]) * world;
     let mut own = 0.0f32;
-    for s in range_stepped(unit, count[0] as usize, GROUP as usize) {
+    for s in range_stepped(ABSOLUTE_POS_X as usize, count[0] as usize, BOUNDING * GROUP as usize) {
         let plane = 2 * level * capacity + s;
         own += max(g_value[plane].abs(), g_value[plane + capacity].abs());
         if slopes {
@@ -202,7 +207,21 @@ fn bound(
         for i in 0..GROUP as usize {
             all += sums[i];
         }
-        units[level] = MOST / max(all, 1e-30f32);
+        partial[level * BOUNDING + CUBE_POS_X as usize] = all;
+    }
+}
+
+/// Steps per 1 in which the sums of a level are counted.
+#[cube(launch)]
+fn units_of(partial: &[f32], units: &mut [f32]) {
+    let level = ABSOLUTE_POS;
+    if level < units.len() {
+        let mut all = 0.0f32;
+        for i in 0..BOUNDING {
+            all += partial[level * BOUNDING + i];
+        }
+        // finite where nothing is added, too
+        units[level] = MOST / max(all, 1e-28f32);
     }
 }
 
@@ -212,8 +231,7 @@ fn settle(gradient: &mut [u32], levels: &[u32], units: &[f32]) {
     let level = CUBE_POS_Y as usize;
     let first = 2 * levels[level * LEVEL + 3] as usize;
     let end = first + 2 * levels[level * LEVEL + 2] as usize;
-    let i = first + ABSOLUTE_POS_X as usize;
-    if i < end {
+    for i in range_stepped(first + ABSOLUTE_POS_X as usize, end, CUBE_COUNT_X as usize * GROUP as usize) {
         gradient[i] = u32::reinterpret(f32::cast_from(i32::reinterpret(gradient[i])) / units[level]);
     }
 }
@@ -221,6 +239,7 @@ fn settle(gradient: &mut [u32], levels: &[u32], units: &[f32]) {
 /// A hash grid on a device.
 pub struct Grid {
     levels: Buffer,
+    partial: Buffer,
     units: Buffer,
     count: usize,
     active: usize,
@@ -238,6 +257,7 @@ impl Grid {
         };
         Grid {
             levels: device.upload(&levels.iter().flat_map(words).collect::<Vec<u32>>()),
+            partial: device.zeros::<f32>(BOUNDING * levels.len()),
             units: device.zeros::<f32>(levels.len()),
             count: levels.len(),
             active,
@@ -296,10 +316,13 @@ impl Grid {
         let capacity = x.words() / 3;
         let fixed = device.atomics() == Atomics::Fixed;
         if fixed {
-            launch!(device, bound::launch, CubeCount::new_1d(self.active as u32), GROUP;
-                self.levels, count, g_value, q, g_normal, self.units;
+            let groups = CubeCount::Static(BOUNDING as u32, self.active as u32, 1);
+            launch!(device, bound::launch, groups, GROUP;
+                self.levels, count, g_value, q, g_normal, self.partial;
                 capacity as u32, self.world, slopes.is_some()
             );
+            let groups = CubeCount::new_1d((self.count as u32).div_ceil(GROUP));
+            launch!(device, units_of::launch, groups, GROUP; self.partial, self.units);
         }
         let scatter = match device.atomics() {
             Atomics::Native => scatter::launch::<Native>,
@@ -312,7 +335,8 @@ impl Grid {
             capacity as u32, self.world, slopes.is_some()
         );
         if fixed {
-            let count = CubeCount::Static((2 * self.largest as u32).div_ceil(GROUP), self.active as u32, 1);
+            let groups = (2 * self.largest as u32).div_ceil(GROUP).min(MOST_GROUPS);
+            let count = CubeCount::Static(groups, self.active as u32, 1);
             launch!(device, settle::launch, count, GROUP; gradient, self.levels, self.units);
         }
     }

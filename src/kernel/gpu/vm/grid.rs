@@ -233,8 +233,9 @@ fn units_of(partial: &[f32], units: &mut [f32]) {
             plane = max(plane, partial[BOUNDING + i]);
             line = max(line, partial[2 * BOUNDING + i]);
         }
-        units[0] = MOST / max(sum * line, 1e-30f32);
-        units[1] = MOST / max(sum * plane, 1e-30f32);
+        // finite where nothing is added, too
+        units[0] = MOST / max(sum * line, 1e-28f32);
+        units[1] = MOST / max(sum * plane, 1e-28f32);
     }
 }
 
