@@ -43,7 +43,7 @@ pub struct StepAt {
 
 /// What a step came to, on the host.
 pub struct StepReport {
-    /// Mean squared error of the colors; none where the step met nothing.
+    /// Mean squared error of the colors of all steps since the last report; none where they met nothing.
     pub square_error: Option<f32>,
     /// Named figures, for people.
     pub figures: Vec<(&'static str, f64)>,
@@ -184,9 +184,8 @@ pub fn train<M: Model>(
             progress.step = done;
             let report = report.unwrap_or(StepReport { square_error: None, figures: Vec::new() });
             if let Some(error) = report.square_error {
-                let kept = 0.98f64.powi(M::READ_EVERY as i32);
-                let keep = if progress.mean_square == 0.0 { 0.0 } else { kept };
-                progress.mean_square = keep * progress.mean_square + (1.0 - keep) * error as f64;
+                let new = (done - 1) % M::READ_EVERY + 1;
+                progress.mean_square = running_mean(progress.mean_square, done - new, error.into(), new);
             }
             // none before the first error is known, which a device tells once in many steps
             let psnr = (progress.mean_square > 0.0).then(|| ("psnr", progress.psnr()));
@@ -222,6 +221,14 @@ pub fn train<M: Model>(
     Ok((progress, warnings))
 }
 
+/// Returns the mean of all steps, of which each counts 2 % less than the one after it: from that of the first `old` ones
+/// and the mean of the `new` ones behind them.
+fn running_mean(mean: f64, old: u64, of_new: f64, new: u64) -> f64 {
+    let weight = |steps: u64| 1.0 - 0.98f64.powf(steps as f64);
+    let keep = (1.0 - weight(new)) * weight(old) / weight(old + new);
+    if mean == 0.0 { of_new } else { keep * mean + (1.0 - keep) * of_new }
+}
+
 /// Returns the error of a training that was asked to stop; what was done is saved.
 pub fn stopped(step: u64, steps: u64) -> Error {
     Error::stopped(format!("saved at step {step} of {steps}"))
@@ -247,5 +254,29 @@ fn failure<M: Model>(model: &M, e: StepError, stage: &str, step: u64, went_back:
                 format!("lower {stage}.{a} and {stage}.{b}, or start again with another --seed"),
             )
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_running_error_is_the_same_read_each_step_or_every_fiftieth() {
+        let error = |step: u64| 0.2 / (1.0 + 0.1 * step as f64);
+        let (mut each, mut some) = (0.0, 0.0);
+        for step in 0..600 {
+            each = running_mean(each, step, error(step), 1);
+            if (step + 1) % 50 == 0 {
+                let mean = (step - 49..=step).map(error).sum::<f64>() / 50.0;
+                some = running_mean(some, step - 49, mean, 50);
+                let apart: f64 = 10.0 * (some / each).log10();
+                assert!(apart.abs() < if step < 100 { 0.7 } else { 0.2 }, "step {step}: {apart:.2} dB");
+            }
+        }
+        // the weights by hand: 0.98 and 1 of two steps
+        assert!(
+            (running_mean(running_mean(0.0, 0, 3.0, 1), 1, 1.0, 1) - (0.98 * 3.0 + 1.0) / 1.98).abs() < 1e-12
+        );
     }
 }

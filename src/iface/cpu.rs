@@ -256,6 +256,7 @@ impl SdfOps for CpuSdf<'_> {
     fn figures(&mut self, [.., variance]: &SdfGroups<Self>) -> Result<Figures> {
         Ok(Figures {
             losses: self.step.terms,
+            mean_square: self.samples_wanted.is_some_and(|n| n > 0).then_some(self.step.terms[0]),
             variance: slice(variance.value())[0],
             samples: self.samples_wanted.unwrap_or(0),
             rays: self.next_rays(),

@@ -218,7 +218,7 @@ impl<O: DensityOps> Model for DensityModel<'_, O> {
     }
 
     fn report(&mut self, _: u64) -> Result<StepReport, StepError> {
-        let Figures { losses, samples, rays, broken, .. } = self.ops.figures()?;
+        let Figures { losses, mean_square, samples, rays, broken, .. } = self.ops.figures()?;
         let [square, smooth, distortion, ..] = if samples > 0 { losses } else { [0.0; TERMS] };
         let terms = ["rgb", "smooth", "distortion"].into_iter().zip([square, smooth, distortion]);
         StepError::check(terms.clone())?;
@@ -227,8 +227,7 @@ impl<O: DensityOps> Model for DensityModel<'_, O> {
         }
         let mut figures: Vec<_> = terms.map(|(name, value)| (name, f64::from(value))).collect();
         figures.extend([("rays", rays as f64), ("samples", samples as f64)]);
-        let square_error = (samples > 0).then_some(figures[0].1 as f32);
-        Ok(StepReport { square_error, figures })
+        Ok(StepReport { square_error: mean_square, figures })
     }
 
     fn save(&self, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {

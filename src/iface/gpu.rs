@@ -226,6 +226,7 @@ impl SdfOps for GpuSdf<'_> {
         let budget = schedule::ray_budget(config);
         self.schedule = Schedule::new(device, schedule::step_length(config), budget, rays);
         self.broken = device.zeros::<u32>(1);
+        self.losses.forget(device);
         self.stepped = false;
         self.set_points(points);
     }
@@ -308,6 +309,7 @@ impl SdfOps for GpuSdf<'_> {
         let g_field = self.neus.backward(device, self.rays(), field, inv_s, anneal, g_out, g_inv_s);
         self.losses.of_samples(device, field, count, g_field);
         self.points.losses(device, field, count, g_field);
+        self.losses.add(device, count, self.points.terms());
     }
 
     fn backward(&mut self, [table, network, variance]: &mut SdfGroups<Self>) {
@@ -322,8 +324,10 @@ impl SdfOps for GpuSdf<'_> {
 
     fn figures(&mut self, [.., variance]: &SdfGroups<Self>) -> Result<Figures> {
         let (device, count) = (&self.device, &self.samples.count);
-        let sums = self.losses.sums(device, count, self.points.terms());
-        self.schedule.figures(device, sums, variance.value(), count, &self.broken)
+        let sums = self.losses.sums();
+        let figures = self.schedule.figures(device, sums, variance.value(), count, &self.broken);
+        self.losses.forget(device);
+        figures
     }
 }
 

@@ -221,7 +221,8 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
     }
 
     fn report(&mut self, step: u64) -> Result<StepReport, StepError> {
-        let Figures { losses, variance, samples, rays, blind, broken } = self.ops.figures(&self.groups)?;
+        let Figures { losses, mean_square, variance, samples, rays, blind, broken } =
+            self.ops.figures(&self.groups)?;
         let [rgb, _, _, mask, eikonal, sparsity, stereo] = losses;
         if blind >= LOST_AFTER {
             return Err(StepError::Failed(Error::cannot(
@@ -248,7 +249,7 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
             ("rays", rays as f64),
             ("samples", samples as f64),
         ]);
-        Ok(StepReport { square_error: (samples > 0).then_some(rgb), figures })
+        Ok(StepReport { square_error: mean_square, figures })
     }
 
     fn save(&self, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {

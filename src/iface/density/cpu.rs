@@ -153,6 +153,7 @@ impl DensityOps for CpuDensity<'_> {
         let mut losses = [0.0; TERMS];
         losses[..3].copy_from_slice(&self.terms);
         let (samples, rays) = (self.samples.t.len(), self.next_rays());
-        Ok(Figures { losses, variance: 0.0, samples, rays, blind: 0, broken: self.broken })
+        let mean_square = (samples > 0).then_some(losses[0]);
+        Ok(Figures { losses, mean_square, variance: 0.0, samples, rays, blind: 0, broken: self.broken })
     }
 }

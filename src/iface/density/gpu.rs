@@ -115,6 +115,7 @@ impl DensityOps for GpuDensity<'_> {
         let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         self.schedule = Schedule::new(device, length, budget, rays);
         self.broken = device.zeros::<u32>(1);
+        self.density.forget(device);
         self.stepped = false;
     }
 
@@ -169,7 +170,9 @@ impl DensityOps for GpuDensity<'_> {
 
     fn figures(&mut self) -> Result<Figures> {
         let (device, count) = (&self.device, &self.samples.count);
-        let sums = self.density.sums(device);
-        self.schedule.figures(device, sums, &self.no_sharpness, count, &self.broken)
+        let sums = self.density.sums();
+        let figures = self.schedule.figures(device, sums, &self.no_sharpness, count, &self.broken);
+        self.density.forget(device);
+        figures
     }
 }

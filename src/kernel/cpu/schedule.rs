@@ -56,6 +56,8 @@ impl RayBudget {
 pub struct Figures {
     /// Its losses, unweighted, in the order of [`super::losses`].
     pub losses: [f32; TERMS],
+    /// Mean squared error of the colors of all steps since the last ones that were reported, none where none met a sample.
+    pub mean_square: Option<f32>,
     /// NeuS' variance v behind it: the sharpness is exp(10 v).
     pub variance: f32,
     /// Samples, as many as there would have been with room for all.

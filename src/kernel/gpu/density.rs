@@ -443,7 +443,7 @@ impl Density {
             tally: device.scratch::<u32>(2),
             ray_terms: device.scratch::<f32>(RAY_TERMS * rays),
             no_terms: device.zeros::<f32>(SAMPLE_TERMS),
-            sums: device.scratch::<f32>(TERMS),
+            sums: device.zeros::<f32>(TERMS + 2),
         }
     }
 
@@ -517,6 +517,10 @@ impl Density {
             self.out, offsets, samples.t, batch.color, self.tally, self.light, self.g_out, self.ray_terms;
             self.dt
         );
+        let none = &self.no_terms;
+        launch!(device, sum::launch, CubeCount::new_1d(TERMS as u32), UNITS;
+            self.ray_terms, none, none, none, samples.count, self.sums
+        );
     }
 
     /// Adds the gradient of the table, zero before, writes that of the weights, and says where it is not finite.
@@ -546,12 +550,13 @@ impl Density {
         self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);
     }
 
-    /// Squared error, smooth-L1 and distortion of the last step, then zeros, `[7]`; for steps whose losses are read.
-    pub fn sums(&self, device: &Device) -> &Buffer {
-        let none = &self.no_terms;
-        launch!(device, sum::launch, CubeCount::new_1d(TERMS as u32), UNITS;
-            self.ray_terms, none, none, none, self.sums
-        );
+    /// Squared error, smooth-L1 and distortion of the last step and what [`Losses::sums`](super::Losses::sums) has behind.
+    pub fn sums(&self) -> &Buffer {
         &self.sums
+    }
+
+    /// Forgets the squared errors of the steps so far.
+    pub fn forget(&mut self, device: &Device) {
+        self.sums = device.zeros::<f32>(TERMS + 2);
     }
 }

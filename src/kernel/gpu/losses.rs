@@ -129,9 +129,17 @@ fn of_samples(
     }
 }
 
-/// Sums of the terms, in a fixed order. One group of threads a term.
+/// Sums of the terms, in a fixed order, then the squared errors of all steps since zeros lay there, and how many of those
+/// met a sample. One group of threads a term; `met` counts the samples of the step.
 #[cube(launch)]
-pub(super) fn sum(of_rays: &[f32], of_samples: &[f32], of_points: &[f32], count: &[u32], out: &mut [f32]) {
+pub(super) fn sum(
+    of_rays: &[f32],
+    of_samples: &[f32],
+    of_points: &[f32],
+    count: &[u32],
+    met: &[u32],
+    out: &mut [f32],
+) {
     let unit = UNIT_POS as usize;
     let term = CUBE_POS_X as usize;
     let mut own = 0.0f32;
@@ -159,6 +167,10 @@ pub(super) fn sum(of_rays: &[f32], of_samples: &[f32], of_points: &[f32], count:
             all += sums[i];
         }
         out[term] = all;
+        if term == 0 && met[0] > 0 {
+            out[TERMS] += all;
+            out[TERMS + 1] += 1.0f32;
+        }
     }
 }
 
@@ -181,7 +193,7 @@ impl Losses {
             g_out: device.scratch::<f32>(RAY_WIDTH * rays),
             ray_terms: device.scratch::<f32>(RAY_TERMS * rays),
             sample_terms: device.scratch::<f32>(SAMPLE_TERMS * capacity),
-            sums: device.scratch::<f32>(TERMS),
+            sums: device.zeros::<f32>(TERMS + 2),
         }
     }
 
@@ -208,13 +220,22 @@ impl Losses {
         );
     }
 
-    /// The terms of the last step, `[7]`, unweighted: in the order of [`LossWeights`], then those of points; for steps
-    /// whose losses are read.
-    pub fn sums(&self, device: &Device, count: &Buffer, of_points: &Buffer) -> &Buffer {
+    /// Sums the terms of a step: see [`sums`](Losses::sums).
+    pub fn add(&self, device: &Device, count: &Buffer, of_points: &Buffer) {
         launch!(device, sum::launch, CubeCount::new_1d(TERMS as u32), UNITS;
-            self.ray_terms, self.sample_terms, of_points, count, self.sums
+            self.ray_terms, self.sample_terms, of_points, count, count, self.sums
         );
+    }
+
+    /// The terms of the last step, unweighted: in the order of [`LossWeights`], then those of points; then the squared errors
+    /// of all steps since [`forget`](Losses::forget), and how many of those met a sample: `[9]`.
+    pub fn sums(&self) -> &Buffer {
         &self.sums
+    }
+
+    /// Forgets the squared errors of the steps so far.
+    pub fn forget(&mut self, device: &Device) {
+        self.sums = device.zeros::<f32>(TERMS + 2);
     }
 }
 
@@ -350,7 +371,8 @@ mod tests {
         let g_out = losses.of_rays(&device, composed, &batch, &offsets);
         let g_field = neus.backward(&device, rays, &field, &sharp, ANNEAL as f32, g_out, &g_s);
         losses.of_samples(&device, &field, &count, g_field);
-        let sums = losses.sums(&device, &count, &up(&[0.25, 0.5]));
+        (0..2).for_each(|_| losses.add(&device, &count, &up(&[0.25, 0.5])));
+        let sums = losses.sums();
         let (launches, readbacks) = device.counts();
         println!(
             "{launches} launches and {readbacks} readbacks of compositing and losses, forward and backward"
@@ -359,6 +381,8 @@ mod tests {
         let wide: Vec<f64> = case.field.as_flattened().iter().map(|&v| v as f64).collect();
         let mut want = terms(&case, &wide, inv_s as f64).0.map(|t| t as f32).to_vec();
         want.push(0.75);
+        // two steps with samples
+        want.extend([2.0 * want[0], 2.0]);
         agree("losses", &device.read::<f32>(sums), &want, 1e-5);
         let at = |i: usize, h: f64| {
             let mut f = wide.clone();

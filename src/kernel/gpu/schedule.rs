@@ -62,6 +62,9 @@ fn collect(
     }
 }
 
+/// What [`Losses`](super::Losses) sums up.
+const SUMS: usize = TERMS + 2;
+
 /// What a step takes from the one before it.
 pub struct Schedule {
     rule: StepLength,
@@ -84,7 +87,7 @@ impl Schedule {
             rays: device.upload(&[rays as u32]),
             step_length: device.zeros::<f32>(1),
             blind: device.zeros::<u32>(1),
-            figures: device.zeros::<u32>(TERMS + 5),
+            figures: device.zeros::<u32>(SUMS + 5),
         }
     }
 
@@ -118,20 +121,22 @@ impl Schedule {
         count: &Buffer,
         broken: &Buffer,
     ) -> Result<Figures> {
-        assert_eq!(losses.words(), TERMS);
+        assert_eq!(losses.words(), SUMS);
         launch!(device, collect::launch, CubeCount::new_single(), 16;
             losses, variance, count, self.rays, self.blind, broken, self.figures
         );
         let words = device.fetch::<u32>(&self.figures)?;
-        let (samples, rays) = (words[TERMS + 1] as usize, words[TERMS + 2] as usize);
+        let (samples, rays) = (words[SUMS + 1] as usize, words[SUMS + 2] as usize);
+        let [squares, steps] = [0, 1].map(|i| f32::from_bits(words[TERMS + i]));
         Ok(Figures {
             losses: std::array::from_fn(|i| f32::from_bits(words[i])),
-            variance: f32::from_bits(words[TERMS]),
+            mean_square: (steps > 0.0).then_some(squares / steps),
+            variance: f32::from_bits(words[SUMS]),
             samples,
             rays: self.budget.next(rays, samples),
             // counted on the device when the next step begins
-            blind: if samples == 0 { u64::from(words[TERMS + 3]) + 1 } else { 0 },
-            broken: words[TERMS + 4] != 0,
+            blind: if samples == 0 { u64::from(words[SUMS + 3]) + 1 } else { 0 },
+            broken: words[SUMS + 4] != 0,
         })
     }
 }
@@ -161,12 +166,13 @@ mod tests {
         let none = device.upload(&[0u32, 0]);
         (0..3).for_each(|_| schedule.advance(&device, &device.upload(&[1e-3f32]), &none, false));
         let losses: [f32; TERMS] = std::array::from_fn(|i| i as f32);
-        let there = device.upload(&losses);
+        let there = device.upload(&[&losses[..], &[0.5, 2.0]].concat());
         let figures = |count: &Buffer, broken: u32| {
             schedule.figures(&device, &there, &inv_s, count, &device.upload(&[broken])).unwrap()
         };
         let (samples, rays, blind) = (0, rays as usize, 4);
-        let want = Figures { losses, variance: 100.0, samples, rays, blind, broken: true };
+        let want =
+            Figures { losses, mean_square: Some(0.25), variance: 100.0, samples, rays, blind, broken: true };
         assert_eq!(figures(&none, 1), want);
         assert_eq!(device.read::<f32>(&schedule.step_length), [0.05]);
         // few and many samples stay within the bounds
