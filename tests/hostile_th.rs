@@ -6,7 +6,8 @@ mod zips;
 use std::path::Path;
 use std::time::Instant;
 use tiface::io::{self, Limits, ReadError, TorchValue};
-use tiface::tface::th::{self, Activation, VmCheckpoint, VmMask};
+use tiface::kernel::cpu::vm::{DecoderShape, Grid, Shading};
+use tiface::tface::th::{self, VmCheckpoint, VmMask};
 use zips::Entry;
 
 fn parse(bytes: &[u8]) -> Result<TorchValue, ReadError> {
@@ -84,29 +85,26 @@ fn floats(shape: &[i64], values: &[f32]) -> Vec<u8> {
 /// The smallest field: two nodes along each axis, one component, one feature.
 fn small() -> VmCheckpoint {
     let numbers = |n: usize| (0..n).map(|i| i as f32 * 0.25 - 1.0).collect::<Vec<f32>>();
+    let grid = Grid { size: [2; 3], rank: [1; 3] };
+    let shift = -10.0;
     VmCheckpoint {
         aabb: [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]],
-        grid_size: [2, 2, 2],
-        density_rank: [1, 1, 1],
-        color_rank: [1, 1, 1],
-        app_dim: 1,
-        density_shift: -10.0,
+        density_grid: grid,
+        color_grid: grid,
+        decoder: DecoderShape {
+            channels: 3,
+            features: 1,
+            hidden: 2,
+            view_frequencies: 0,
+            feature_frequencies: 0,
+        },
+        shading: Shading { softplus: true, shift, distance_scale: 25.0, weight_threshold: 1e-4, stop: 0.0 },
         alpha_mask_threshold: 1e-4,
-        distance_scale: 25.0,
-        weight_threshold: 1e-4,
-        activation: Activation::Softplus,
         near_far: [2.0, 6.0],
         step_ratio: 0.5,
-        position_frequencies: 6,
-        view_frequencies: 0,
-        feature_frequencies: 0,
-        hidden: 2,
-        density_planes: [numbers(4), numbers(4), numbers(4)],
-        density_lines: [numbers(2), numbers(2), numbers(2)],
-        color_planes: [numbers(4), numbers(4), numbers(4)],
-        color_lines: [numbers(2), numbers(2), numbers(2)],
-        basis: numbers(3),
-        mlp: [(numbers(8), numbers(2)), (numbers(4), numbers(2)), (numbers(6), numbers(3))],
+        density: [4, 4, 4, 2, 2, 2].map(numbers),
+        color: [4, 4, 4, 2, 2, 2].map(numbers),
+        network: [3, 8, 2, 4, 2, 6, 3].map(numbers).concat(),
         mask: Some(VmMask {
             shape: [2, 2, 3],
             occupied: (0..12).map(|i| i % 5 == 0).collect(),
@@ -133,38 +131,39 @@ fn parts() -> (Vec<Part>, Vec<Vec<f32>>) {
     let near_far = [b"](", &vm.near_far.map(|x| float(x.into())).concat()[..], b"e"].concat();
     for (key, value) in [
         ("aabb", stored(&[2, 3], vm.aabb.as_flattened())),
-        ("gridSize", counts(vm.grid_size)),
-        ("density_n_comp", counts(vm.density_rank)),
-        ("appearance_n_comp", counts(vm.color_rank)),
-        ("app_dim", int(vm.app_dim as i64)),
-        ("density_shift", float(vm.density_shift.into())),
+        ("gridSize", counts(vm.density_grid.size)),
+        ("density_n_comp", counts(vm.density_grid.rank)),
+        ("appearance_n_comp", counts(vm.color_grid.rank)),
+        ("app_dim", int(vm.decoder.features as i64)),
+        ("density_shift", float(vm.shading.shift.into())),
         ("alphaMask_thres", float(vm.alpha_mask_threshold.into())),
-        ("distance_scale", float(vm.distance_scale.into())),
-        ("rayMarch_weight_thres", float(vm.weight_threshold.into())),
+        ("distance_scale", float(vm.shading.distance_scale.into())),
+        ("rayMarch_weight_thres", float(vm.shading.weight_threshold.into())),
         ("fea2denseAct", text("softplus")),
         ("near_far", near_far),
         ("step_ratio", float(vm.step_ratio.into())),
         ("shadingMode", text("MLP_Fea")),
-        ("pos_pe", int(vm.position_frequencies as i64)),
-        ("view_pe", int(vm.view_frequencies as i64)),
-        ("fea_pe", int(vm.feature_frequencies as i64)),
-        ("featureC", int(vm.hidden as i64)),
+        ("pos_pe", int(6)),
+        ("view_pe", int(vm.decoder.view_frequencies as i64)),
+        ("fea_pe", int(vm.decoder.feature_frequencies as i64)),
+        ("featureC", int(vm.decoder.hidden as i64)),
     ] {
         parts.push(("kwargs", key.into(), value));
     }
+    let mut network = &vm.network[..];
+    let mut next = |count: i64| network.split_off(..count as usize).unwrap();
+    let basis = next(3);
     for i in 0..3 {
-        for (name, planes, lines) in
-            [("density", &vm.density_planes, &vm.density_lines), ("app", &vm.color_planes, &vm.color_lines)]
-        {
-            parts.push(("state_dict", format!("{name}_plane.{i}"), stored(&[1, 1, 2, 2], &planes[i])));
-            parts.push(("state_dict", format!("{name}_line.{i}"), stored(&[1, 1, 2, 1], &lines[i])));
+        for (name, factors) in [("density", &vm.density), ("app", &vm.color)] {
+            parts.push(("state_dict", format!("{name}_plane.{i}"), stored(&[1, 1, 2, 2], &factors[i])));
+            parts.push(("state_dict", format!("{name}_line.{i}"), stored(&[1, 1, 2, 1], &factors[3 + i])));
         }
         let (rows, columns) = [(2, 4), (2, 2), (3, 2)][i];
         let layer = format!("renderModule.mlp.{}", 2 * i);
-        parts.push(("state_dict", format!("{layer}.weight"), stored(&[rows, columns], &vm.mlp[i].0)));
-        parts.push(("state_dict", format!("{layer}.bias"), stored(&[rows], &vm.mlp[i].1)));
+        parts.push(("state_dict", format!("{layer}.weight"), stored(&[rows, columns], next(rows * columns))));
+        parts.push(("state_dict", format!("{layer}.bias"), stored(&[rows], next(rows))));
     }
-    parts.push(("state_dict", "basis_mat.weight".into(), stored(&[1, 3], &vm.basis)));
+    parts.push(("state_dict", "basis_mat.weight".into(), stored(&[1, 3], basis)));
     // bits 0, 5 and 10 of twelve, the highest first
     parts.push(("", "alphaMask.shape".into(), sizes(&[1, 1, 2, 2, 3])));
     parts.push(("", "alphaMask.mask".into(), array("u1", &[2], &[0b1000_0100, 0b0010_0000])));

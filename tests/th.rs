@@ -6,7 +6,7 @@ mod zips;
 use std::path::Path;
 use std::sync::Arc;
 use tiface::io::{self, Limits, TorchNumbers, TorchTensor, TorchValue};
-use tiface::tface::th::{self, Activation, VmCheckpoint};
+use tiface::tface::th::{self, VmCheckpoint};
 
 fn reference(name: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference").join(name)
@@ -29,12 +29,14 @@ fn same(found: &[f32], expected: impl Fn(usize) -> f64, count: usize, name: &str
 fn a_file_written_by_torch_holds_what_the_formulas_say() {
     let vm = fixture();
     assert_eq!(vm.aabb, [[-1.5, -1.67, -1.0], [1.5, 1.67, 1.0]]);
-    assert_eq!((vm.grid_size, vm.density_rank, vm.color_rank), ([5, 6, 7], [2, 1, 1], [2, 1, 1]));
-    assert_eq!((vm.app_dim, vm.hidden, vm.inputs()), (27, 128, 30));
-    assert_eq!((vm.density_shift, vm.alpha_mask_threshold, vm.weight_threshold), (-10.0, 1e-4, 1e-4));
-    assert_eq!((vm.distance_scale, vm.step_ratio, vm.near_far), (25.0, 0.5, [3.5, 7.0]));
-    assert_eq!(vm.activation, Activation::Relu);
-    assert_eq!((vm.position_frequencies, vm.view_frequencies, vm.feature_frequencies), (0, 0, 0));
+    assert_eq!((vm.density_grid.size, vm.color_grid.size), ([5, 6, 7], [5, 6, 7]));
+    assert_eq!((vm.density_grid.rank, vm.color_grid.rank), ([2, 1, 1], [2, 1, 1]));
+    assert_eq!((vm.decoder.features, vm.decoder.hidden, vm.decoder.inputs()), (27, 128, 30));
+    let shading = vm.shading;
+    assert_eq!((shading.shift, vm.alpha_mask_threshold, shading.weight_threshold), (-10.0, 1e-4, 1e-4));
+    assert_eq!((shading.distance_scale, vm.step_ratio, vm.near_far), (25.0, 0.5, [3.5, 7.0]));
+    assert!(!shading.softplus);
+    assert_eq!((vm.decoder.view_frequencies, vm.decoder.feature_frequencies), (0, 0));
     for i in 0..3 {
         let (rank, i1) = ([2, 1, 1][i], i as f64 + 1.0);
         // widths x x y, heights y z z, lines z y x
@@ -49,22 +51,25 @@ fn a_file_written_by_torch_holds_what_the_formulas_say() {
             let (c, h, w) = chw(n);
             0.1 * c * i1 + 0.03 * h + 0.01 * w
         };
-        same(&vm.density_planes[i], plane, count, "density plane");
+        same(&vm.density[i], plane, count, "density plane");
         let plane = |n| {
             let (c, h, w) = chw(n);
             0.2 * c * i1 - 0.02 * h + 0.05 * w
         };
-        same(&vm.color_planes[i], plane, count, "color plane");
-        same(&vm.density_lines[i], |n| 0.2 * ck(n).0 - 0.02 * ck(n).1 * i1, rank * line, "density line");
-        same(&vm.color_lines[i], |n| 0.3 * ck(n).0 - 0.01 * ck(n).1 * i1, rank * line, "color line");
+        same(&vm.color[i], plane, count, "color plane");
+        same(&vm.density[3 + i], |n| 0.2 * ck(n).0 - 0.02 * ck(n).1 * i1, rank * line, "density line");
+        same(&vm.color[3 + i], |n| 0.3 * ck(n).0 - 0.01 * ck(n).1 * i1, rank * line, "color line");
     }
     let sine =
         |n: usize, columns: usize| (0.7 * (n / columns) as f64 + 1.3 * (n % columns) as f64 + 1.0).sin();
-    same(&vm.basis, |n| 2.0 * sine(n, 4), 27 * 4, "basis, a sine");
-    for (layer, (rows, columns)) in [(128, 30), (128, 128), (3, 128)].into_iter().enumerate() {
-        same(&vm.mlp[layer].0, |n| 0.4 * sine(n, columns), rows * columns, "weight, a sine");
-        same(&vm.mlp[layer].1, |n| 0.01 * (n as f64).cos(), rows, "bias, a sine");
+    let mut rest = &vm.network[..];
+    let mut next = |count: usize| rest.split_off(..count).unwrap();
+    same(next(27 * 4), |n| 2.0 * sine(n, 4), 27 * 4, "basis, a sine");
+    for (rows, columns) in [(128, 30), (128, 128), (3, 128)] {
+        same(next(rows * columns), |n| 0.4 * sine(n, columns), rows * columns, "weight, a sine");
+        same(next(rows), |n| 0.01 * (n as f64).cos(), rows, "bias, a sine");
     }
+    assert!(rest.is_empty());
     let mask = vm.mask.unwrap();
     assert_eq!((mask.shape, mask.aabb), ([4, 3, 5], [[-1.2, -1.4, -0.9], [1.4, 1.5, 0.8]]));
     for (i, &occupied) in mask.occupied.iter().enumerate() {
@@ -76,23 +81,23 @@ fn a_file_written_by_torch_holds_what_the_formulas_say() {
 /// Σ plane · line at `u`, from the layout the checkpoint documents.
 fn density_feature(vm: &VmCheckpoint, u: [f64; 3]) -> f64 {
     let nodes = |axis: usize| {
-        let n = vm.grid_size[axis];
+        let n = vm.density_grid.size[axis];
         let x = (u[axis] + 1.0) / 2.0 * (n - 1) as f64;
         let low = (x as usize).min(n - 2);
         [(low, 1.0 - (x - low as f64)), (low + 1, x - low as f64)]
     };
     let mut sum = 0.0;
     for (i, [width, height, line]) in [[0, 1, 2], [0, 2, 1], [1, 2, 0]].into_iter().enumerate() {
-        let [w, h, n] = [width, height, line].map(|axis| vm.grid_size[axis]);
-        for c in 0..vm.density_rank[i] {
+        let [w, h, n] = [width, height, line].map(|axis| vm.density_grid.size[axis]);
+        for c in 0..vm.density_grid.rank[i] {
             let mut on_plane = 0.0;
             for (y, wy) in nodes(height) {
                 for (x, wx) in nodes(width) {
-                    on_plane += wy * wx * vm.density_planes[i][(c * h + y) * w + x] as f64;
+                    on_plane += wy * wx * vm.density[i][(c * h + y) * w + x] as f64;
                 }
             }
             let on_line: f64 =
-                nodes(line).iter().map(|&(k, wk)| wk * vm.density_lines[i][c * n + k] as f64).sum();
+                nodes(line).iter().map(|&(k, wk)| wk * vm.density[3 + i][c * n + k] as f64).sum();
             sum += on_plane * on_line;
         }
     }

@@ -159,17 +159,13 @@ table! {
         lr_grid: f64 => 0.02;
         /// Learning rate of the basis matrix and the decoder.
         lr_network: f64 => 0.001;
-        /// Learning rate after `steps` steps without a reset, as a share of the first; exponential in between. Rates
-        /// that end low take the noise of single batches out of the result.
+        /// Learning rate after `steps` steps without a reset, as a share of the first; exponential in between. Every
+        /// upsampling starts the rates again. Rates that end low take the noise of single batches out of the result.
         lr_final: f64 => 0.01, 0.003, 0.1;
-        /// Does every upsampling start the learning rates again?
-        lr_reset: bool => true;
         /// Weight of the density's L1 norm until the alpha mask's first update.
         l1_start: f64 => 0.0;
         /// The same afterwards.
         l1_rest: f64 => 0.0;
-        /// Weight of the lines' orthogonality.
-        ortho: f64 => 0.0;
     }
 }
 

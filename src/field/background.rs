@@ -1,11 +1,20 @@
-//! Foreground estimation: the photograph as it would be over black.
+//! What is behind the head in training: random colors, and the photograph as it would be over black.
 //!
 //! Where the mask is soft, a photograph mixes head and background: `photo = α F + (1 − α) B` in linear light. The
 //! published target `α · photo` darkens the head twice there and keeps part of the background's light. Here the
 //! background `B` is estimated from the pixels nearby that are all background, and taken away:
 //! `target over black = coded(α F) = coded(photo − (1 − α) B)`, which is what a render over black shows.
 
+use super::training::StepAt;
 use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
+use crate::kernel::cpu::rng;
+
+/// One color a ray for target and render, which numbers of this stream give; black without one.
+pub fn ray_backgrounds(at: StepAt, stream: Option<u64>, rays: usize) -> Vec<[f32; 3]> {
+    let Some(stream) = stream else { return vec![[0.0; 3]; rays] };
+    let channel = |i: u64| rng::uniform(at.seed, at.step << 4 | stream, i);
+    (0..rays as u64).map(|r| std::array::from_fn(|c| channel(3 * r + c as u64))).collect()
+}
 
 /// Half edge of the window that collects background pixels, as a share of the picture's height.
 const WINDOW: f32 = 0.02;

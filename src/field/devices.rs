@@ -8,7 +8,7 @@ use crate::config::DeviceChoice;
 use crate::io::{self, Limits, Lock, LockError};
 use crate::kernel::gpu::{self, Adapter, Check, Device};
 use crate::{Error, Result};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -139,10 +139,7 @@ fn lock_file(device: &Device) -> PathBuf {
     std::env::temp_dir().join(format!("tiface-{plain}.lock"))
 }
 
-/// What self-tests found, by adapter and program.
-#[derive(Default, Serialize, Deserialize)]
-struct Kept(BTreeMap<String, bool>);
-
+/// The file of what self-tests found, by adapter and program.
 fn kept_file() -> Option<PathBuf> {
     let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
     let base = set("XDG_CACHE_HOME").or_else(|| set("HOME").map(|h| h.join(".cache")))?;
@@ -156,14 +153,14 @@ fn trusted(device: &Device, adapter: &Adapter) -> std::result::Result<(), String
     let key = format!("{} | {} | {} | {release} {built:?}", device.name(), device.driver(), adapter.api);
     let file = kept_file();
     // a file that cannot be read is as good as none
-    let mut kept: Kept =
+    let mut kept: BTreeMap<String, bool> =
         file.as_ref().and_then(|file| io::read_typed(file, &Limits::default()).ok()).unwrap_or_default();
-    let passed = match kept.0.get(&key) {
+    let passed = match kept.get(&key) {
         Some(&passed) => passed,
         None => {
             let checks = gpu::self_test(device).map_err(|e| e.to_string())?;
             let passed = checks.iter().all(Check::passed);
-            kept.0.insert(key, passed);
+            kept.insert(key, passed);
             if let (Some(file), Ok(text)) = (file, serde_json::to_vec_pretty(&kept))
                 && let Some(folder) = file.parent()
                 && io::create_folder(folder).is_ok()

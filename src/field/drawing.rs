@@ -4,8 +4,9 @@
 //! rays from its own memory while the device is busy with the step before, and sends what their pixels show: some half
 //! a megabyte a step.
 
-use super::pixels::Pixels;
-use crate::kernel::cpu::rng;
+use super::background::ray_backgrounds;
+use super::pixels::{Pixels, SampledRay};
+use super::training::StepAt;
 use crate::kernel::gpu::{Batch, Buffer, Device, Photographs, SamplingOptions};
 
 /// Where rays of a training on a device come from.
@@ -15,11 +16,11 @@ pub struct DeviceRays {
     drawing: SamplingOptions,
 }
 
-/// Bytes of photographs that fit in `room` bytes of a device; none where they do not, or where the device knows no such
+/// Bytes of photographs that fit in `available` bytes of a device; none where they do not, or where the device knows no such
 /// order of pixels.
-pub fn resident(pixels: &Pixels, device: &Device, room: u64) -> Option<u64> {
+pub fn resident(pixels: &Pixels, device: &Device, available: u64) -> Option<u64> {
     let bytes = pixels.bytes_on_device();
-    let fits = bytes <= device.limits().largest_buffer && bytes * 33 / 32 <= room;
+    let fits = bytes <= device.limits().largest_buffer && bytes * 33 / 32 <= available;
     (fits && pixels.count() <= u32::MAX as u64 && !pixels.is_ordered()).then_some(bytes * 33 / 32)
 }
 
@@ -48,28 +49,23 @@ impl DeviceRays {
         }
         let rays = batch.rays();
         let drawn = pixels.draw_each(seed, step, rays, self.drawing.jitter, detail);
-        let mut planes =
-            [vec![0f32; 3 * rays], vec![0f32; 3 * rays], vec![0f32; 3 * rays], vec![0f32; 3 * rays]];
-        let (mut jitter, mut alpha, mut alive) = (vec![0f32; rays], vec![0f32; rays], vec![0u32; rays]);
-        for (r, ray) in drawn.into_iter().enumerate() {
-            for c in 0..3 {
-                let i = (3 * r + c) as u64;
-                if self.drawing.background {
-                    planes[3][c * rays + r] = rng::uniform(seed, step << 4 | self.drawing.behind, i);
-                }
-                if let Some((ray, color, _)) = &ray {
-                    planes[0][c * rays + r] = ray.origin[c];
-                    planes[1][c * rays + r] = ray.direction[c];
-                    planes[2][c * rays + r] = color[c];
-                }
-            }
-            if let Some((ray, _, a)) = ray {
-                (jitter[r], alpha[r], alive[r]) = (ray.jitter, a, 1);
-            }
-        }
-        let [origin, direction, color, background] = planes.map(|values| device.upload(&values));
-        let [jitter, alpha] = [jitter, alpha].map(|values| device.upload(&values));
-        *batch = Batch { origin, direction, jitter, color, alpha, background, alive: device.upload(&alive) };
+        let stream = self.drawing.background.then_some(self.drawing.behind);
+        let background = ray_backgrounds(StepAt { seed, step }, stream, rays);
+        let planes = |of: &dyn Fn(usize) -> [f32; 3]| -> Buffer {
+            device.upload(&(0..3 * rays).map(|i| of(i % rays)[i / rays]).collect::<Vec<f32>>())
+        };
+        let floats = |of: fn(SampledRay) -> f32| -> Buffer {
+            device.upload(&drawn.iter().map(|ray| ray.map_or(0.0, of)).collect::<Vec<f32>>())
+        };
+        *batch = Batch {
+            origin: planes(&|r| drawn[r].map_or([0.0; 3], |(ray, ..)| ray.origin)),
+            direction: planes(&|r| drawn[r].map_or([0.0; 3], |(ray, ..)| ray.direction)),
+            jitter: floats(|(ray, ..)| ray.jitter),
+            color: planes(&|r| drawn[r].map_or([0.0; 3], |(_, color, _)| color)),
+            alpha: floats(|(.., alpha)| alpha),
+            background: planes(&|r| background[r]),
+            alive: device.upload(&drawn.iter().map(|ray| u32::from(ray.is_some())).collect::<Vec<u32>>()),
+        };
         batch.keep(device, wanted);
     }
 }
@@ -90,20 +86,20 @@ mod tests {
         assert!(resident(&pixels, &device, 0).is_none() && resident(&pixels, &device, 1 << 30).is_some());
         let wanted = device.upload(&[900u32]);
         for detail in [0.0, 0.2] {
-            let [there, here] = [true, false].map(|resident| {
+            let [resident, sent] = [true, false].map(|on_device| {
                 let mut batch = Batch::new(&device, 1000);
-                let rays = DeviceRays::new(&pixels, &device, drawing, resident);
+                let rays = DeviceRays::new(&pixels, &device, drawing, on_device);
                 rays.draw(&device, &pixels, (5, 7), &wanted, &mut batch, detail);
                 batch
             });
-            assert_eq!(device.read::<u32>(&there.alive), device.read::<u32>(&here.alive));
+            assert_eq!(device.read::<u32>(&resident.alive), device.read::<u32>(&sent.alive));
             let planes =
                 |b: &Batch| [&b.origin, &b.direction, &b.color, &b.background].map(|p| device.read(p));
-            for (got, want) in planes(&here).iter().zip(&planes(&there)) {
+            for (got, want) in planes(&sent).iter().zip(&planes(&resident)) {
                 let alive = |all: &Vec<f32>| -> Vec<f32> { (0..900).map(|r| all[r]).collect() };
                 agree("rays drawn by the host", &alive(got), &alive(want), 1e-5);
             }
-            for (got, want) in [(&here.alpha, &there.alpha), (&here.jitter, &there.jitter)] {
+            for (got, want) in [(&sent.alpha, &resident.alpha), (&sent.jitter, &resident.jitter)] {
                 assert_eq!(device.read::<f32>(got)[..900], device.read::<f32>(want)[..900]);
             }
         }

@@ -3,7 +3,7 @@
 //! A model ([`training::Model`]) says what differs between fields; its step is written once, over operations
 //! ([`ops::Ops`]) that each device implements with its own kernels.
 
-mod background;
+pub mod background;
 pub mod checkpoint;
 #[cfg(feature = "wgpu")]
 pub mod devices;
@@ -18,6 +18,8 @@ pub mod training;
 
 use crate::config::DeviceChoice;
 use crate::{Error, Result};
+#[cfg(feature = "wgpu")]
+use std::sync::Mutex;
 
 /// Where a field is learned.
 pub enum ComputeDevice {
@@ -82,6 +84,29 @@ pub fn compute_device(name: &str) -> Result<ComputeDevice> {
             let feature = if other == "cuda" { "cuda" } else { "wgpu" };
             Err(Error::usage(problem, format!("build with `--features {feature}`, or leave `--device` out")))
         }
+    }
+}
+
+/// A field on a GPU, which answers instead of the processor until it fails.
+#[cfg(feature = "wgpu")]
+pub struct GpuField<T>(Mutex<Option<T>>);
+
+#[cfg(feature = "wgpu")]
+impl<T> GpuField<T> {
+    /// Takes the field; without one there is never an answer.
+    pub fn new(field: Option<T>) -> GpuField<T> {
+        GpuField(Mutex::new(field))
+    }
+
+    /// Returns the answer; none where there is no field, or where it failed: then the processor answers.
+    pub fn ask<A>(&self, question: impl FnOnce(&mut T) -> Result<A>) -> Option<A> {
+        let mut field = self.0.lock().ok()?;
+        let answer = question(field.as_mut()?);
+        if let Err(e) = &answer {
+            tracing::warn!("{e}; the processor goes on");
+            *field = None;
+        }
+        answer.ok()
     }
 }
 

@@ -71,9 +71,8 @@ impl HostGroup {
         for (kind, values) in kinds {
             let mut rest = &values[..];
             for part in &self.parts {
-                let (own, tail) = rest.split_at(part.count());
+                let own = rest.split_off(..part.count()).expect("a value for each of the parts'");
                 into.put_floats(&format!("{kind}.{}", part.name), &part.shape, own.to_vec());
-                rest = tail;
             }
         }
     }

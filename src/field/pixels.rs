@@ -13,6 +13,7 @@ use crate::geom::{Camera, Ray};
 use crate::image::{Gray, Photo};
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::rng;
+use crate::kernel::cpu::vm::mask::crossing;
 #[cfg(feature = "wgpu")]
 use crate::kernel::gpu;
 use glam::Vec2;
@@ -44,6 +45,9 @@ pub struct Batch {
 /// A ray, the color over black that its pixel shows, and the pixel's alpha.
 pub type SampledRay = (MarchRay, [f32; 3], f32);
 
+/// Inclusive box of drawable pixels and one bit per pixel.
+type Drawable = (u32, u32, u32, u32, Vec<u64>);
+
 /// The drawable pixels of all views.
 pub struct Pixels<'a> {
     views: &'a [TrainView],
@@ -51,8 +55,8 @@ pub struct Pixels<'a> {
     soft: Vec<Option<SoftPixels>>,
     /// Per view: the width of a pixel at the scene's middle, scene units; infinite where photographs are not large.
     pixel: Vec<f32>,
-    /// Per view: inclusive box of drawable pixels and one bit per pixel.
-    drawable: Vec<(u32, u32, u32, u32, Vec<u64>)>,
+    /// Per view.
+    drawable: Vec<Drawable>,
     /// Running count of drawable pixels.
     cumulative: Vec<u64>,
     radius: f32,
@@ -77,7 +81,7 @@ impl<'a> Pixels<'a> {
     /// `foreground` says what a soft pixel's target is. Where some views have a mask, those without one
     /// (or with one that is white all over) are not drawn from: they would teach that all of it is head.
     ///
-    /// `published` draws as the published code does: every view as often, any pixel of its frame.
+    /// `reference_sampling` draws as the published code does: every view as often, any pixel of its frame.
     pub fn new(
         views: &'a [TrainView],
         reach: f32,
@@ -98,27 +102,11 @@ impl<'a> Pixels<'a> {
         let pixel = vec![f32::INFINITY; views.len()];
         let drawable: Vec<_> = views
             .par_iter()
-            .map(|v| drawable(v, if has_masks && !usable(v) { Reach::Nothing } else { Reach::Within(reach) }))
+            .map(|v| drawable(v, if has_masks && !usable(v) { None } else { Some(reach) }))
             .collect();
-        let mut sum = 0;
-        let cumulative = drawable
-            .iter()
-            .map(|(.., bits)| {
-                sum += bits.iter().map(|b| b.count_ones() as u64).sum::<u64>();
-                sum
-            })
-            .collect();
-        Pixels {
-            views,
-            soft,
-            pixel,
-            drawable,
-            cumulative,
-            radius,
-            has_masks,
-            reference_sampling,
-            order: None,
-        }
+        let cumulative = cumulative(&drawable);
+        let order = None;
+        Pixels { views, soft, pixel, drawable, cumulative, radius, has_masks, reference_sampling, order }
     }
 
     /// Pixels as TensoRF's code draws them: all valid ones whose ray meets the box `bounds` at any distance, in a random
@@ -137,31 +125,29 @@ impl<'a> Pixels<'a> {
         pixels.drawable.par_iter_mut().zip(views).for_each(|((.., bits), view)| {
             let width = view.photo.width as usize;
             for (i, word) in bits.iter_mut().enumerate() {
-                let (mut rest, mut kept) = (*word, 0);
-                while rest != 0 {
-                    let bit = rest.trailing_zeros() as usize;
-                    rest &= rest - 1;
-                    let p = 64 * i + bit;
-                    let at = Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);
-                    let ray = view.camera.ray(at);
-                    kept |= u64::from(ray.is_some_and(|ray| meets(bounds, &ray))) << bit;
+                let valid = *word;
+                for bit in (0..64).filter(|bit| valid >> bit & 1 == 1) {
+                    let ray = view.camera.ray(center(64 * i + bit, width));
+                    let meets = |ray: Ray| {
+                        let (enter, leave) = crossing(bounds, ray.origin.into(), ray.direction.into());
+                        leave > enter
+                    };
+                    if !ray.is_some_and(meets) {
+                        *word &= !(1 << bit);
+                    }
                 }
-                *word = kept;
             }
         });
-        let mut sum = 0;
-        let mut before = Vec::with_capacity(views.len());
-        for (total, (.., bits)) in pixels.cumulative.iter_mut().zip(&pixels.drawable) {
-            let mut own = 0u32;
-            let counted = |b: &u64| {
-                own += b.count_ones();
-                own - b.count_ones()
+        pixels.cumulative = cumulative(&pixels.drawable);
+        let before = |(.., bits): &Drawable| {
+            let mut sum = 0;
+            let count = |word: &u64| {
+                sum += word.count_ones();
+                sum - word.count_ones()
             };
-            before.push(bits.iter().map(counted).collect());
-            sum += u64::from(own);
-            *total = sum;
-        }
-        pixels.order = Some(Order { before, depth_directions });
+            bits.iter().map(count).collect()
+        };
+        pixels.order = Some(Order { before: pixels.drawable.iter().map(before).collect(), depth_directions });
         pixels
     }
 
@@ -189,26 +175,12 @@ impl<'a> Pixels<'a> {
     /// `count` random rays of a step: a function of seed and step alone. Of large photographs each stands for a square of
     /// pixels, the widest of [`SIDES`] that is no wider than `detail`, in scene units.
     pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool, detail: f32) -> Batch {
-        let drawn: Vec<SampledRay> = (0..count)
-            .into_par_iter()
-            .with_min_len(256)
-            .filter_map(|i| self.drawn((seed, step), (i as u64, count as u64), jitter, detail))
-            .collect();
-        let mut batch = Batch {
-            rays: Vec::with_capacity(drawn.len()),
-            color: Vec::with_capacity(drawn.len()),
-            alpha: Vec::with_capacity(drawn.len()),
-        };
-        for (ray, color, alpha) in drawn {
-            batch.rays.push(ray);
-            batch.color.push(color);
-            batch.alpha.push(alpha);
-        }
-        batch
+        let drawn = self.draw_each(seed, step, count, jitter, detail).into_iter().flatten();
+        let (rays, color, alpha) = drawn.collect();
+        Batch { rays, color, alpha }
     }
 
-    /// The same, each in its place: none where a pixel has no ray.
-    #[cfg(feature = "wgpu")]
+    /// The same, each at its index: none where a pixel has no ray.
     pub fn draw_each(
         &self,
         seed: u64,
@@ -217,16 +189,11 @@ impl<'a> Pixels<'a> {
         jitter: bool,
         detail: f32,
     ) -> Vec<Option<SampledRay>> {
-        let one = |i| self.drawn((seed, step), (i as u64, count as u64), jitter, detail);
-        (0..count).into_par_iter().with_min_len(256).map(one).collect()
-    }
-
-    /// Ray `i` of a batch of `count`.
-    fn drawn(&self, at: (u64, u64), (i, count): (u64, u64), jitter: bool, detail: f32) -> Option<SampledRay> {
-        match &self.order {
-            Some(order) => self.draw_next(order, at, (i, count), jitter),
-            None => self.draw_one(at, i, jitter, detail),
-        }
+        let draw = |i: usize| match &self.order {
+            Some(order) => self.draw_next(order, (seed, step), (i as u64, count as u64), jitter),
+            None => self.draw_one((seed, step), i as u64, jitter, detail),
+        };
+        (0..count).into_par_iter().with_min_len(256).map(draw).collect()
     }
 
     /// Are pixels gone through in an order?
@@ -252,10 +219,7 @@ impl<'a> Pixels<'a> {
     /// Bytes that the photographs take on a device.
     #[cfg(feature = "wgpu")]
     pub fn bytes_on_device(&self) -> u64 {
-        let area = |(x0, y0, x1, y1, _): &(u32, u32, u32, u32, Vec<u64>)| match x0 > x1 {
-            true => 0,
-            false => (x1 - x0 + 1) as u64 * (y1 - y0 + 1) as u64,
-        };
+        let area = |view| part(view)[2] as u64 * part(view)[3] as u64;
         self.drawable.iter().map(|view| 4 * area(view).next_multiple_of(32)).sum()
     }
 
@@ -263,8 +227,8 @@ impl<'a> Pixels<'a> {
     #[cfg(feature = "wgpu")]
     fn drawn_view(&self, v: usize) -> gpu::DrawnView {
         let view = &self.views[v];
-        let (x0, y0, x1, y1, bits) = &self.drawable[v];
-        let [x, y, width, height] = if x0 > x1 { [0; 4] } else { [*x0, *y0, x1 - x0 + 1, y1 - y0 + 1] };
+        let (.., bits) = &self.drawable[v];
+        let [x, y, width, height] = part(&self.drawable[v]);
         let mut pixels = Vec::with_capacity((width * height) as usize);
         let mut drawable = vec![0u32; (width * height).div_ceil(32) as usize];
         for row in y..y + height {
@@ -295,11 +259,11 @@ impl<'a> Pixels<'a> {
     ) -> Option<SampledRay> {
         let all = self.count();
         let batches = (all / count).max(1);
-        let place = step % batches * count + i;
-        if place >= all {
+        let position = step % batches * count + i;
+        if position >= all {
             return None; // a batch of more than there are
         }
-        let which = permuted(rng::bits(seed, 13, step / batches), place, all);
+        let which = permuted(rng::bits(seed, 13, step / batches), position, all);
         let v = self.cumulative.partition_point(|&c| c <= which);
         let rank = (which - if v > 0 { self.cumulative[v - 1] } else { 0 }) as u32;
         let word = order.before[v].partition_point(|&b| b <= rank) - 1;
@@ -307,8 +271,7 @@ impl<'a> Pixels<'a> {
         (order.before[v][word]..rank).for_each(|_| bits &= bits - 1);
         let p = 64 * word + bits.trailing_zeros() as usize;
         let view = &self.views[v];
-        let width = view.photo.width as usize;
-        let ray = view.camera.ray(Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5))?;
+        let ray = view.camera.ray(center(p, view.photo.width as usize))?;
         let jitter = if jitter { rng::uniform(seed, (step << 4) + 2, i) } else { 0.0 };
         let depth = if order.depth_directions { ray.direction.dot(view.camera.forward()) } else { 1.0 };
         let (origin, direction) = (ray.origin.to_array(), (ray.direction / depth).to_array());
@@ -389,13 +352,8 @@ impl<'a> Pixels<'a> {
                 self.square(v, [x, y].map(|at| at / side * side), side)
             };
             let Some(ray) = view.camera.ray(at) else { continue };
-            let shift = if jitter { rng::uniform(seed, stream + 2, i) } else { 0.0 };
-            let march = MarchRay {
-                origin: (ray.origin * self.radius).to_array(),
-                direction: ray.direction.to_array(),
-                jitter: shift,
-            };
-            return Some((march, color, alpha));
+            let jitter = if jitter { rng::uniform(seed, stream + 2, i) } else { 0.0 };
+            return Some((MarchRay::new(&ray, self.radius, jitter), color, alpha));
         }
         None
     }
@@ -411,17 +369,6 @@ pub const SIDES: [u32; 4] = [1, 2, 4, 8];
 /// The widest square of pixels of this width that is no wider than `detail`; a pixel where none is.
 fn side(pixel: f32, detail: f32) -> u32 {
     SIDES.into_iter().rfind(|&side| side as f32 * pixel <= detail).unwrap_or(1)
-}
-
-/// Does the line of a ray meet a box? Zero components of its direction count as 1e-6, as published.
-fn meets([low, high]: [[f32; 3]; 2], ray: &Ray) -> bool {
-    let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
-    for a in 0..3 {
-        let d = if ray.direction[a] == 0.0 { 1e-6 } else { ray.direction[a] };
-        let (p, q) = ((low[a] - ray.origin[a]) / d, (high[a] - ray.origin[a]) / d);
-        (enter, leave) = (enter.max(p.min(q)), leave.min(p.max(q)));
-    }
-    leave > enter
 }
 
 /// Where `i` of `0..n` goes in a random order that `key` names: four rounds of a Feistel network over the next power of
@@ -442,20 +389,33 @@ fn permuted(key: u64, i: u64, n: u64) -> u64 {
     }
 }
 
-/// Which pixels of a view are drawn.
-#[derive(Clone, Copy)]
-enum Reach {
-    /// None.
-    Nothing,
-    /// Those within so many scene units of the mask; all where there is no mask.
-    Within(f32),
+/// Drawable pixels of the views up to and with each.
+fn cumulative(drawable: &[Drawable]) -> Vec<u64> {
+    let mut sum = 0;
+    let count = |(.., bits): &Drawable| {
+        sum += bits.iter().map(|word| u64::from(word.count_ones())).sum::<u64>();
+        sum
+    };
+    drawable.iter().map(count).collect()
 }
 
-/// Box and bits of the pixels worth drawing in one view.
-fn drawable(view: &TrainView, reach: Reach) -> (u32, u32, u32, u32, Vec<u64>) {
+/// Corner and size of the box of drawable pixels.
+#[cfg(feature = "wgpu")]
+fn part(&(x0, y0, x1, y1, _): &Drawable) -> [u32; 4] {
+    if x0 > x1 { [0; 4] } else { [x0, y0, x1 - x0 + 1, y1 - y0 + 1] }
+}
+
+/// The middle of pixel `p`.
+fn center(p: usize, width: usize) -> Vec2 {
+    Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5)
+}
+
+/// Box and bits of the pixels worth drawing in one view: those within `reach` scene units of the mask, all where there is
+/// no mask; none without a reach.
+fn drawable(view: &TrainView, reach: Option<f32>) -> Drawable {
     let (w, h) = (view.photo.width as usize, view.photo.height as usize);
-    let mut near = vec![!matches!(reach, Reach::Nothing); w * h];
-    if let (Some(mask), Reach::Within(reach)) = (&view.mask, reach)
+    let mut near = vec![reach.is_some(); w * h];
+    if let (Some(mask), Some(reach)) = (&view.mask, reach)
         && reach.is_finite()
     {
         // reach in pixels at the box's distance; the nearest part of the box is at most one unit closer

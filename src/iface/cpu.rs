@@ -10,6 +10,7 @@ use super::schedule;
 use super::stereo::SurfacePoint;
 use crate::Result;
 use crate::config::iface::IfaceConfig;
+use crate::field::background::ray_backgrounds;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
 use crate::field::pixels::{Batch, Pixels};
 use crate::field::training::StepAt;
@@ -167,14 +168,8 @@ impl SdfOps for CpuSdf<'_> {
 
     fn draw(&mut self, at: StepAt, detail: f32) {
         self.step.batch = self.pixels.draw(at.seed, at.step, self.rays, self.config.jitter, detail);
-        let random = random_background(self.config);
-        let color = |r: u64| match random {
-            true => std::array::from_fn(|c| {
-                rng::uniform(at.seed, at.step << 4 | BACKGROUND_STREAM, 3 * r + c as u64)
-            }),
-            false => [0.0; 3],
-        };
-        self.step.background = (0..self.step.batch.rays.len() as u64).map(color).collect();
+        let stream = random_background(self.config).then_some(BACKGROUND_STREAM);
+        self.step.background = ray_backgrounds(at, stream, self.step.batch.rays.len());
     }
 
     fn march(&mut self) {

@@ -65,7 +65,7 @@ impl<'a> GpuSdf<'a> {
     pub fn fits(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<()> {
         let shape = shape(config);
         if !Sdf::supports(&shape) {
-            let problem = format!("a device has no room for {} levels in a tile", config.levels);
+            let problem = format!("a tile on a GPU cannot hold {} levels", config.levels);
             return Err(Error::usage(problem, "lower iface.levels, or train with `--device cpu`"));
         }
         max_samples(config, &shape, pixels, device).map(drop)
@@ -232,8 +232,7 @@ impl SdfOps for GpuSdf<'_> {
     }
 
     fn set_points(&mut self, points: &[SurfacePoint]) {
-        let rows: Vec<[f32; 5]> = points.iter().map(|p| p.row()).collect();
-        self.points.put(&self.device, &rows);
+        self.points.put(&self.device, bytemuck::cast_slice(points));
     }
 
     fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {

@@ -12,6 +12,7 @@ use crate::config::iface::IfaceConfig;
 use crate::field::parameters::Part;
 use crate::field::training::{StepError, TrainingSession};
 use crate::kernel::cpu::adam::adam;
+use crate::kernel::cpu::distance::LowerEnvelope;
 use crate::kernel::cpu::losses::{self, LossWeights};
 use crate::kernel::cpu::march::Bitmask;
 use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
@@ -24,66 +25,28 @@ pub struct HullDistance {
     values: Vec<f32>,
 }
 
-/// Squared distance transform of one line (Felzenszwalb, Huttenlocher 2012), in cells.
-fn transform_line(f: &mut [f32], v: &mut [usize], z: &mut [f32], out: &mut [f32]) {
-    let n = f.len();
-    let mut k = 0;
-    v[0] = 0;
-    z[0] = f32::NEG_INFINITY;
-    z[1] = f32::INFINITY;
-    let meet = |f: &[f32], q: usize, p: usize| {
-        ((f[q] + (q * q) as f32) - (f[p] + (p * p) as f32)) / (2.0 * (q as f32 - p as f32))
-    };
-    for q in 1..n {
-        let mut s = meet(f, q, v[k]);
-        while s <= z[k] {
-            k -= 1;
-            s = meet(f, q, v[k]);
-        }
-        k += 1;
-        v[k] = q;
-        z[k] = s;
-        z[k + 1] = f32::INFINITY;
-    }
-    k = 0;
-    for q in 0..n {
-        while z[k + 1] < q as f32 {
-            k += 1;
-        }
-        let d = q as f32 - v[k] as f32;
-        out[q] = d * d + f[v[k]];
-    }
-    f.copy_from_slice(out);
-}
-
 /// Distance in cells from each cell's centre to the nearest centre of a cell in `seeds`.
 fn distance(resolution: usize, seeds: impl Fn(usize) -> bool + Sync) -> Vec<f32> {
     let r = resolution;
     /// Larger than any squared distance on the grid, small enough to stay exact in f32.
     const FAR: f32 = 1e6;
     let mut d: Vec<f32> = (0..r * r * r).map(|i| if seeds(i) { 0.0 } else { FAR }).collect();
-    let scratch = || (vec![0f32; r], vec![0usize; r], vec![0f32; r + 1], vec![0f32; r]);
     // z lines are contiguous; y and x lines within and across slabs of constant x
     d.par_chunks_mut(r * r).for_each(|slab| {
-        let (mut line, mut v, mut z, mut out) = scratch();
-        for row in slab.chunks_mut(r) {
-            transform_line(row, &mut v, &mut z, &mut out);
-        }
+        let (mut envelope, mut line) = (LowerEnvelope::new(r), vec![0f32; r]);
+        slab.chunks_mut(r).for_each(|row| envelope.transform(row));
         for c in 0..r {
             (0..r).for_each(|y| line[y] = slab[y * r + c]);
-            transform_line(&mut line, &mut v, &mut z, &mut out);
+            envelope.transform(&mut line);
             (0..r).for_each(|y| slab[y * r + c] = line[y]);
         }
     });
-    let columns: Vec<Vec<f32>> = (0..r * r)
-        .into_par_iter()
-        .map(|c| {
-            let (mut line, mut v, mut z, mut out) = scratch();
-            (0..r).for_each(|x| line[x] = d[x * r * r + c]);
-            transform_line(&mut line, &mut v, &mut z, &mut out);
-            line
-        })
-        .collect();
+    let along_x = |c: usize| {
+        let mut line: Vec<f32> = (0..r).map(|x| d[x * r * r + c]).collect();
+        LowerEnvelope::new(r).transform(&mut line);
+        line
+    };
+    let columns: Vec<Vec<f32>> = (0..r * r).into_par_iter().map(along_x).collect();
     for (c, column) in columns.iter().enumerate() {
         (0..r).for_each(|x| d[x * r * r + c] = column[x].sqrt());
     }
@@ -100,16 +63,11 @@ impl HullDistance {
         let to_outside = distance(r, |i| !inside(i));
         let cell = 2.0 / r as f32;
         // the boundary runs half a cell before the nearest centre of the other kind
-        let values = (0..r * r * r)
-            .map(|i| {
-                if inside(i) {
-                    -(to_outside[i] - 0.5).max(0.0) * cell
-                } else {
-                    (to_inside[i] - 0.5).max(0.0) * cell
-                }
-            })
-            .collect();
-        HullDistance { resolution: r, values }
+        let value = |i: usize| match inside(i) {
+            true => -(to_outside[i] - 0.5).max(0.0) * cell,
+            false => (to_inside[i] - 0.5).max(0.0) * cell,
+        };
+        HullDistance { resolution: r, values: (0..r * r * r).map(value).collect() }
     }
 
     /// Trilinear value at a point of [-1, 1]³.

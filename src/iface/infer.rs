@@ -8,23 +8,20 @@ use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
 #[cfg(feature = "wgpu")]
-use crate::field::{ComputeDevice, devices::Gpu};
+use crate::field::{ComputeDevice, GpuField, devices::Gpu};
 use crate::geom::{Ray, RayResult};
 #[cfg(feature = "wgpu")]
 use crate::io::Lock;
 use crate::kernel::cpu::march::{Bitmask, MarchRay, Samples};
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::neus::{self, Rays};
-use crate::kernel::cpu::sdf::{self, FieldShape};
+use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
 #[cfg(feature = "wgpu")]
 use crate::kernel::gpu::Evaluator;
 use glam::Vec3;
 use std::path::Path;
 #[cfg(feature = "wgpu")]
-use std::sync::{
-    Arc, Mutex,
-    atomic::{AtomicBool, Ordering},
-};
+use std::sync::Arc;
 
 /// Samples evaluated together in a volume render.
 const SAMPLES: usize = 1 << 16;
@@ -41,16 +38,10 @@ pub struct IFace {
     #[cfg(feature = "wgpu")]
     flat: Vec<f32>,
     #[cfg(feature = "wgpu")]
-    on_gpu: Option<OnGpu>,
-}
-
-/// The field on a device, which answers instead of the processor until it fails.
-#[cfg(feature = "wgpu")]
-struct OnGpu {
-    evaluator: Mutex<Evaluator>,
+    on_gpu: GpuField<Evaluator>,
     /// Held while the field is.
+    #[cfg(feature = "wgpu")]
     _lock: Option<Arc<Lock>>,
-    failed: AtomicBool,
 }
 
 impl IFace {
@@ -70,7 +61,9 @@ impl IFace {
             #[cfg(feature = "wgpu")]
             flat: _flat,
             #[cfg(feature = "wgpu")]
-            on_gpu: None,
+            on_gpu: GpuField::new(None),
+            #[cfg(feature = "wgpu")]
+            _lock: None,
         };
         if config.occupancy == OccupancyRule::Band {
             // the surface moved since the last update
@@ -90,32 +83,17 @@ impl IFace {
         Ok(IFace::new(config, state))
     }
 
-    /// Lets the GPU of a place answer, if it is one.
+    /// Lets a GPU answer, if `device` is one.
     #[cfg(feature = "wgpu")]
-    pub fn on(mut self, place: ComputeDevice) -> IFace {
-        let ComputeDevice::Gpu(Gpu { device, lock, .. }) = place else { return self };
-        if !Evaluator::supports(&self.shape) {
-            return self;
+    pub fn on(mut self, device: ComputeDevice) -> IFace {
+        let ComputeDevice::Gpu(Gpu { device, lock, .. }) = device else { return self };
+        if Evaluator::supports(&self.shape) {
+            let band = self.config.occupancy == OccupancyRule::Band;
+            let masks = [Some(&self.occupancy.occupied), band.then_some(&self.occupancy.solid)];
+            let evaluator = Evaluator::new(device, &self.shape, &self.table, &self.flat, self.inv_s, masks);
+            (self.on_gpu, self._lock) = (GpuField::new(Some(evaluator)), lock);
         }
-        let band = self.config.occupancy == OccupancyRule::Band;
-        let masks = [Some(&self.occupancy.occupied), band.then_some(&self.occupancy.solid)];
-        let evaluator = Evaluator::new(device, &self.shape, &self.table, &self.flat, self.inv_s, masks);
-        let failed = AtomicBool::new(false);
-        self.on_gpu = Some(OnGpu { evaluator: Mutex::new(evaluator), _lock: lock, failed });
         self
-    }
-
-    /// What the device answers; none where there is none, or where it failed: then the processor answers.
-    #[cfg(feature = "wgpu")]
-    fn ask<T>(&self, question: impl FnOnce(&mut Evaluator) -> Result<T>) -> Option<T> {
-        let gpu = self.on_gpu.as_ref().filter(|gpu| !gpu.failed.load(Ordering::Relaxed))?;
-        let mut evaluator = gpu.evaluator.lock().ok()?;
-        let answer = question(&mut evaluator);
-        if let Err(e) = &answer {
-            gpu.failed.store(true, Ordering::Relaxed);
-            tracing::warn!("{e}; the processor goes on");
-        }
-        answer.ok()
     }
 
     /// Sharpness of the trained surface where it is sharpest, per scene unit.
@@ -127,12 +105,23 @@ impl IFace {
         bytemuck::cast_slice(&self.table)
     }
 
-    fn raw_sdf(&self, x: &[[f32; 3]]) -> Vec<f32> {
+    /// Column `column` of the field's output, which `on_cpu` gives on the processor.
+    fn output(
+        &self,
+        x: &[[f32; 3]],
+        column: usize,
+        on_cpu: fn(&FieldShape, &[[f32; 2]], &Weights, &[[f32; 3]]) -> Vec<f32>,
+    ) -> Vec<f32> {
         #[cfg(feature = "wgpu")]
-        if let Some(mut planes) = self.ask(|field| field.evaluate(x, None, None, 0..1)) {
+        if let Some(mut planes) = self.on_gpu.ask(|field| field.evaluate(x, None, None, column..column + 1)) {
             return planes.swap_remove(0);
         }
-        sdf::values(&self.shape, self.table(), &self.weights, x)
+        let _ = column; // only a GPU selects by it
+        on_cpu(&self.shape, self.table(), &self.weights, x)
+    }
+
+    fn raw_sdf(&self, x: &[[f32; 3]]) -> Vec<f32> {
+        self.output(x, 0, sdf::values)
     }
 
     fn scaled(&self, points: &[Vec3]) -> Vec<[f32; 3]> {
@@ -151,12 +140,7 @@ impl IFace {
     /// Local sharpness of the surface, per scene unit: opacity at a distance `f` outside is σ(−f · sharpness). `[n]`
     /// points → `[n]`.
     pub fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
-        let x = self.scaled(points);
-        #[cfg(feature = "wgpu")]
-        if let Some(planes) = self.ask(|field| field.evaluate(&x, None, None, 7..8)) {
-            return planes[0].iter().map(|soft| self.inv_s() * soft.exp()).collect();
-        }
-        let soft = sdf::softness(&self.shape, self.table(), &self.weights, &x);
+        let soft = self.output(&self.scaled(points), WIDTH - 1, sdf::softness);
         soft.iter().map(|soft| self.inv_s() * soft.exp()).collect()
     }
 
@@ -164,7 +148,7 @@ impl IFace {
     pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let x = self.scaled(points);
         #[cfg(feature = "wgpu")]
-        if let Some(planes) = self.ask(|field| field.evaluate(&x, None, None, 0..4)) {
+        if let Some(planes) = self.on_gpu.ask(|field| field.evaluate(&x, None, None, 0..4)) {
             let [f, nx, ny, nz] = [0, 1, 2, 3].map(|k| &planes[k]);
             let normal = |i: usize| Vec3::new(nx[i], ny[i], nz[i]);
             return (f.iter().map(|f| f / self.config.radius).collect(), (0..x.len()).map(normal).collect());
@@ -185,16 +169,15 @@ impl IFace {
         let arrays = |v: &[Vec3]| -> Vec<[f32; 3]> { v.iter().map(|v| v.to_array()).collect() };
         let (x, normals, directions) = (self.scaled(points), arrays(normals), arrays(directions));
         #[cfg(feature = "wgpu")]
-        if self.on_gpu.is_some() {
+        if let Some(rgb) = self.on_gpu.ask(|field| {
             // a point with several directions is evaluated for each
-            let each: Vec<usize> =
-                (0..x.len()).flat_map(|i| std::iter::repeat_n(i, counts[i] as usize)).collect();
-            let [x, normals]: [Vec<[f32; 3]>; 2] =
-                [&x, &normals].map(|rows| each.iter().map(|&i| rows[i]).collect());
-            let colors = self.ask(|field| field.evaluate(&x, Some(&directions), Some(&normals), 4..7));
-            if let Some(rgb) = colors {
-                return (0..each.len()).map(|i| [rgb[0][i], rgb[1][i], rgb[2][i]]).collect();
-            }
+            let each = |rows: &[[f32; 3]]| -> Vec<[f32; 3]> {
+                let own = |(row, &n): (&[f32; 3], &u32)| std::iter::repeat_n(*row, n as usize);
+                rows.iter().zip(counts).flat_map(own).collect()
+            };
+            field.evaluate(&each(&x), Some(&directions), Some(&each(&normals)), 4..7)
+        }) {
+            return (0..directions.len()).map(|i| [rgb[0][i], rgb[1][i], rgb[2][i]]).collect();
         }
         sdf::colors(&self.shape, self.table(), &self.weights, &x, &normals, Some(counts), &directions)
     }
@@ -208,19 +191,11 @@ impl IFace {
 
     fn render_pass(&self, rays: &[Ray]) -> Vec<RayResult> {
         let config = &self.config;
-        let radius = config.radius;
         let dt = step_length(config).at(self.inv_s);
-        let marched: Vec<MarchRay> = rays
-            .iter()
-            .map(|r| MarchRay {
-                origin: (r.origin * radius).to_array(),
-                direction: r.direction.to_array(),
-                jitter: 0.0,
-            })
-            .collect();
+        let marched: Vec<MarchRay> = rays.iter().map(|r| MarchRay::new(r, config.radius, 0.0)).collect();
         #[cfg(feature = "wgpu")]
-        if let Some(seen) = self.ask(|field| field.render(&marched, dt)) {
-            return seen.iter().map(|o| self.result(o)).collect();
+        if let Some(composited) = self.on_gpu.ask(|field| field.render(&marched, dt)) {
+            return composited.iter().map(|o| self.result(o)).collect();
         }
         let samples = self.occupancy.march(config, dt, &marched);
         // pieces of whole rays with a bounded number of samples: a sample costs some two kilobytes

@@ -17,23 +17,13 @@ pub fn learning_rate(config: &IfaceConfig, n: u64) -> f64 {
 
 /// AdamW of the three groups at step number `step`, from 1, where learning rates are `factor` of their peak.
 pub fn adam_steps(config: &IfaceConfig, factor: f64, step: u64) -> [AdamStep; 3] {
-    let network = AdamStep {
-        lr: (config.lr_network * factor) as f32,
-        beta1: 0.9,
-        beta2: 0.99,
-        epsilon: 1e-15,
-        weight_decay: config.weight_decay as f32,
-        step,
-        skip_zero: false,
+    let rate = |lr: f64, decay: f64| AdamStep {
+        weight_decay: decay as f32,
+        ..AdamStep::new(lr * factor, 1e-15, step)
     };
-    let table = AdamStep {
-        lr: (config.lr_table * factor) as f32,
-        weight_decay: config.table_decay as f32,
-        skip_zero: config.touched_rows,
-        ..network
-    };
-    let variance = AdamStep { lr: (config.lr_variance * factor) as f32, ..network };
-    [table, network, variance]
+    let table = rate(config.lr_table, config.table_decay);
+    let [network, variance] = [config.lr_network, config.lr_variance].map(|lr| rate(lr, config.weight_decay));
+    [AdamStep { skip_zero: config.touched_rows, ..table }, network, variance]
 }
 
 /// How the rays of a step follow the samples of the one before it.

@@ -43,8 +43,7 @@ impl SdfState {
         self.groups.iter().for_each(|group| group.save(into, true));
         self.occupancy.save(into);
         if !self.stereo.is_empty() {
-            let rows = self.stereo.iter().flat_map(|p| p.row()).collect();
-            into.put_floats("stereo", &[self.stereo.len(), SurfacePoint::WIDTH], rows);
+            into.put_floats("stereo", &[self.stereo.len(), 5], bytemuck::cast_slice(&self.stereo).to_vec());
             into.set("stereo", self.stereo.len());
         }
         into.set("rays", self.rays);
@@ -60,8 +59,7 @@ impl SdfState {
         let mut stereo = Vec::new();
         if from.has("stereo") {
             let count = from.number("stereo", 1..=1 << 32)? as usize;
-            let rows = from.floats("stereo", &[count, SurfacePoint::WIDTH])?;
-            stereo.extend(rows.chunks_exact(SurfacePoint::WIDTH).map(SurfacePoint::of_row));
+            stereo = bytemuck::cast_slice(&from.floats("stereo", &[count, 5])?).to_vec();
         }
         Ok(SdfState { groups, occupancy, rays: from.number("rays", 1..=most)? as usize, stereo })
     }

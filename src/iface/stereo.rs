@@ -22,8 +22,9 @@ const STRIDE: usize = 4;
 /// Softest place that is looked at, the logarithm of its sharpness as a share of the sharpest: half as sharp.
 const SOFTEST: f32 = -std::f32::consts::LN_2;
 
-/// A point that the surface should pass through, in field coordinates.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// A point that the surface should pass through, in field coordinates; in checkpoints and on GPUs a row of its numbers.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct SurfacePoint {
     /// Where.
     pub position: [f32; 3],
@@ -31,22 +32,6 @@ pub struct SurfacePoint {
     pub footprint: f32,
     /// How much it counts, at most 1.
     pub weight: f32,
-}
-
-impl SurfacePoint {
-    /// Numbers of a point in a checkpoint.
-    pub const WIDTH: usize = 5;
-
-    /// Returns its numbers.
-    pub fn row(&self) -> [f32; Self::WIDTH] {
-        let [x, y, z] = self.position;
-        [x, y, z, self.footprint, self.weight]
-    }
-
-    /// Returns the point of these [`SurfacePoint::WIDTH`] numbers.
-    pub fn of_row(row: &[f32]) -> SurfacePoint {
-        SurfacePoint { position: [row[0], row[1], row[2]], footprint: row[3], weight: row[4] }
-    }
 }
 
 /// The field on the host.
@@ -91,7 +76,7 @@ fn surface(
     field: &HostField,
     occupancy: &Occupancy,
 ) -> (Vec<StereoView>, Vec<Surfel>) {
-    let (seen, found): (Vec<StereoView>, Vec<Vec<[f32; 3]>>) =
+    let (stereo_views, found): (Vec<StereoView>, Vec<Vec<[f32; 3]>>) =
         views.iter().map(|view| first_crossings(view, config, field, occupancy)).unzip();
     let radius = config.radius;
     let mut spread = Vec::new();
@@ -103,7 +88,7 @@ fn surface(
         let own = |(x, (_, n)): (&[f32; 3], &(f32, [f32; 3]))| {
             let normal = Vec3::from(*n).try_normalize()?;
             let surfel = Surfel { position: Vec3::from(*x) / radius, normal };
-            let footprint = stereo::owned(&seen, v, &surfel)?;
+            let footprint = stereo::owned(&stereo_views, v, &surfel)?;
             // four in the place of one, two pixels apart
             let axis = normal.any_orthonormal_vector();
             let other = normal.cross(axis);
@@ -118,7 +103,7 @@ fn surface(
         .project(spread)
         .into_iter()
         .filter_map(|(x, normal)| Some(Surfel { position: x / radius, normal: normal? }));
-    (seen, surfels.collect())
+    (stereo_views, surfels.collect())
 }
 
 /// A view for stereo with its depths, and where its rays meet the zero set first, in field coordinates.
@@ -147,8 +132,7 @@ fn first_crossings(
                 return None;
             }
             let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
-            let origin = (ray.origin * config.radius).to_array();
-            Some((i, MarchRay { origin, direction: ray.direction.to_array(), jitter: 0.0 }))
+            Some((i, MarchRay::new(&ray, config.radius, 0.0)))
         })
         .collect();
     let rays: Vec<MarchRay> = pixels.iter().map(|p| p.1).collect();
@@ -239,8 +223,8 @@ pub fn points(
     field: &HostField,
     occupancy: &Occupancy,
 ) -> Vec<SurfacePoint> {
-    let (seen, surfels) = surface(views, config, field, occupancy);
-    let found = stereo::matches(&seen, &surfels);
+    let (stereo_views, surfels) = surface(views, config, field, occupancy);
+    let found = stereo::matches(&stereo_views, &surfels);
     // the middle one: a few photographs may be taken from near by
     let mut footprints: Vec<f32> = found.iter().map(|p| p.footprint).collect();
     let middle = footprints.len() / 2;

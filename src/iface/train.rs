@@ -96,13 +96,13 @@ pub fn train(
 ) -> Result<(IFace, IfaceReport)> {
     let began = Instant::now();
     let pixels = pixels(views, hull, config)?;
-    let place = field::compute_device(session.device)?.fallback_to_cpu(|place| match place {
+    let device = field::compute_device(session.device)?.fallback_to_cpu(|device| match device {
         ComputeDevice::Cpu(_) => Ok(()),
         #[cfg(feature = "wgpu")]
         ComputeDevice::Gpu(gpu) => GpuSdf::fits(config, &pixels, &gpu.device),
     })?;
-    let device = place.description();
-    let (state, progress, warnings) = match place {
+    let description = device.description();
+    let (state, progress, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuSdf::new(config, &pixels), &pixels, hull, config, session)?,
         #[cfg(feature = "wgpu")]
         ComputeDevice::Gpu(gpu) => {
@@ -115,7 +115,7 @@ pub fn train(
         inv_s: state.inv_s(),
         train_psnr: progress.psnr(),
         occupied: state.occupancy.share(),
-        device,
+        device: description,
         warnings,
     };
     Ok((IFace::new(config, state), report))

@@ -1,6 +1,7 @@
 //! Exact Euclidean distance to the nearest marked pixel (Felzenszwalb & Huttenlocher 2012), and what
 //! follows from it: growing and shrinking by discs, nearest of two sets.
 
+use crate::kernel::cpu::distance::LowerEnvelope;
 use rayon::prelude::*;
 
 /// Far away: no pixel is marked. Larger than any squared distance in a picture, finite in arithmetic.
@@ -31,57 +32,14 @@ pub fn squared_distance(marked: &[bool], width: usize, height: usize) -> Vec<f32
             field[i] = field[i].min(squared(steps[x]));
         }
     }
-    field.par_chunks_mut(width).for_each_init(|| Lower::new(width), |lower, row| lower.transform(row));
+    field
+        .par_chunks_mut(width)
+        .for_each_init(|| LowerEnvelope::new(width), |lower, row| lower.transform(row));
     field
 }
 
 fn squared(steps: u32) -> f32 {
     if steps == u32::MAX { FAR } else { (steps as f32) * (steps as f32) }
-}
-
-/// The lower envelope of parabolas of one row.
-struct Lower {
-    apex: Vec<usize>,
-    /// Where the parabola before ends and this one begins.
-    from: Vec<f64>,
-    out: Vec<f32>,
-}
-
-impl Lower {
-    fn new(width: usize) -> Lower {
-        Lower { apex: vec![0; width], from: vec![0.0; width + 1], out: vec![0.0; width] }
-    }
-
-    fn transform(&mut self, row: &mut [f32]) {
-        let mut k = 0;
-        self.apex[0] = 0;
-        self.from[0] = f64::NEG_INFINITY;
-        for q in 1..row.len() {
-            let f = |x: usize| row[x] as f64 + (x * x) as f64;
-            loop {
-                let p = self.apex[k];
-                let meet = (f(q) - f(p)) / (2 * (q - p)) as f64;
-                if meet > self.from[k] {
-                    k += 1;
-                    self.apex[k] = q;
-                    self.from[k] = meet;
-                    break;
-                }
-                // the parabola at p is nowhere the lowest; the first one begins at minus infinity and stays
-                k -= 1;
-            }
-        }
-        self.from[k + 1] = f64::INFINITY;
-        let mut k = 0;
-        for x in 0..row.len() {
-            while self.from[k + 1] < x as f64 {
-                k += 1;
-            }
-            let d = x.abs_diff(self.apex[k]) as f32;
-            self.out[x] = d * d + row[self.apex[k]];
-        }
-        row.copy_from_slice(&self.out);
-    }
 }
 
 /// Pixels within `radius` pixels of a marked one.

@@ -3,11 +3,11 @@
 use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_background};
 use crate::Result;
 use crate::config::VmConfig;
+use crate::field::background::ray_backgrounds;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
 use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::{Batch, Pixels};
 use crate::field::training::StepAt;
-use crate::kernel::cpu::rng;
 use crate::kernel::cpu::vm::losses::{self, BackgroundMode, Targets, VmFigures};
 use crate::kernel::cpu::vm::{self, DecoderWeights, Penalty, Rendered, VmField};
 use std::sync::Arc;
@@ -78,14 +78,8 @@ impl VmOps for CpuVm<'_> {
 
     fn draw(&mut self, at: StepAt, detail: f32) {
         self.batch = self.pixels.draw(at.seed, at.step, self.config.rays, true, detail);
-        let random = random_background(self.config);
-        let color = |r: u64| match random {
-            true => std::array::from_fn(|c| {
-                rng::uniform(at.seed, at.step << 4 | BACKGROUND_STREAM, 3 * r + c as u64)
-            }),
-            false => [0.0; 3],
-        };
-        self.background = (0..self.batch.rays.len() as u64).map(color).collect();
+        let stream = random_background(self.config).then_some(BACKGROUND_STREAM);
+        self.background = ray_backgrounds(at, stream, self.batch.rays.len());
         let lattice = &self.field().lattice;
         let points = self.batch.rays.iter().map(|ray| lattice.points(ray)).sum::<u64>();
         self.figures.lattice += points;

@@ -5,13 +5,13 @@
 
 use super::infer::TFace;
 use super::record::{FORMAT, FieldRecord, NAMES, Placement};
-use super::th::{self, Activation, VmCheckpoint};
+use super::th::{self, VmCheckpoint};
 use crate::field::checkpoint::{self, Checkpoint};
 use crate::field::training::TrainingSession;
 use crate::geom::Similarity;
 use crate::io::Limits;
 use crate::kernel::cpu::vm::mask::BoxMask;
-use crate::kernel::cpu::vm::{DecoderShape, Factor, Grid, Shading};
+use crate::kernel::cpu::vm::{Factor, Grid};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -21,31 +21,17 @@ fn channel_last(f: &Factor, values: &[f32]) -> Vec<f32> {
     (0..f.len()).map(|i| values[i % f.channels * n + i / f.channels]).collect()
 }
 
-fn flat(grid: &Grid, planes: &[Vec<f32>; 3], lines: &[Vec<f32>; 3]) -> Vec<f32> {
-    let planes = planes.iter().enumerate().map(|(i, p)| channel_last(&grid.plane(i), p));
-    let lines = lines.iter().enumerate().map(|(i, l)| channel_last(&grid.line(i), l));
-    planes.chain(lines).flatten().collect()
+fn flat(grid: &Grid, factors: &[Vec<f32>; 6]) -> Vec<f32> {
+    grid.factors().iter().zip(factors).flat_map(|(f, values)| channel_last(f, values)).collect()
 }
 
 /// What a published checkpoint is, rendered where `placement` says; without one its coordinates are the scene's.
 fn record_of(c: &VmCheckpoint, placement: Option<Placement>) -> FieldRecord {
     FieldRecord {
-        density_rank: c.density_rank,
-        color_rank: c.color_rank,
-        decoder: DecoderShape {
-            channels: c.color_rank.iter().sum(),
-            features: c.app_dim,
-            hidden: c.hidden,
-            view_frequencies: c.view_frequencies,
-            feature_frequencies: c.feature_frequencies,
-        },
-        shading: Shading {
-            softplus: c.activation == Activation::Softplus,
-            shift: c.density_shift,
-            distance_scale: c.distance_scale,
-            weight_threshold: c.weight_threshold,
-            stop: 0.0,
-        },
+        density_rank: c.density_grid.rank,
+        color_rank: c.color_grid.rank,
+        decoder: c.decoder,
+        shading: c.shading,
         step_ratio: c.step_ratio,
         near: c.near_far[0],
         far: c.near_far[1],
@@ -62,12 +48,9 @@ fn field_of(c: &VmCheckpoint, record: &FieldRecord) -> TFace {
             (0..nx * ny * nz).map(|i| m.occupied[(i % nz * ny + i / nz % ny) * nx + i / (nz * ny)]).collect();
         BoxMask::from_vertices(m.aabb[0], m.aabb[1], [nx, ny, nz], &vertices)
     });
-    let field = record.field(c.aabb, c.grid_size, mask);
-    let density = flat(&field.density, &c.density_planes, &c.density_lines);
-    let color = flat(&field.color, &c.color_planes, &c.color_lines);
-    let [(w1, b1), (w2, b2), (w3, b3)] = &c.mlp;
-    let network = [&c.basis, w1, b1, w2, b2, w3, b3].map(|m| m.as_slice()).concat();
-    TFace::from_parts(field, [density, color, network], record.placement)
+    let field = record.field(c.aabb, c.density_grid.size, mask);
+    let values = [flat(&field.density, &c.density), flat(&field.color, &c.color), c.network.clone()];
+    TFace::from_parts(field, values, record.placement)
 }
 
 /// Takes a published checkpoint as the result of a stage: reads it, places it in the scene and writes it into
@@ -88,7 +71,7 @@ pub fn import_th(
         depth_directions: true,
     };
     let unsound = |why: &str| Error::cannot(format!("the field cannot be exchanged: {why}"), "");
-    if c.grid_size.iter().any(|&n| n > 1 << 16) {
+    if c.density_grid.size.iter().any(|&n| n > 1 << 16) {
         return Err(unsound("its grid has more than 65536 nodes along an axis"));
     }
     let record = record_of(&c, Some(placement));

@@ -79,18 +79,18 @@ fn our_own_file_holds_the_published_arrays_where_the_page_says() {
     let dir = tempfile::tempdir().unwrap();
     let path = reference("vm_g5.th");
     import_th(&path, 1.0 / 0.3, &Similarity::IDENTITY, &session("tface", dir.path(), "x", &Quiet)).unwrap();
-    let there = th::read_th(&path, &Limits::default()).unwrap();
+    let published = th::read_th(&path, &Limits::default()).unwrap();
     let (tensors, metadata) = read_tensors(&checkpoint::newest(dir.path()), &Limits::default()).unwrap();
     let ours = |name: &str| match tensors.iter().find(|(n, ..)| *n == name).map(|(_, (_, v))| v) {
         Some(TensorValues::F32(values)) => values.as_slice(),
         other => panic!("{name}: {other:?}"),
     };
-    for (name, planes, lines, rank) in [
-        ("model.density", &there.density_planes, &there.density_lines, there.density_rank),
-        ("model.color", &there.color_planes, &there.color_lines, there.color_rank),
+    for (name, factors, rank) in [
+        ("model.density", &published.density, published.density_grid.rank),
+        ("model.color", &published.color, published.color_grid.rank),
     ] {
         let mut rest = ours(name);
-        for (factor, channels) in planes.iter().chain(lines).zip(rank.iter().cycle()) {
+        for (factor, channels) in factors.iter().zip(rank.iter().cycle()) {
             let (own, tail) = rest.split_at(factor.len());
             rest = tail;
             let places = factor.len() / channels;
@@ -102,9 +102,10 @@ fn our_own_file_holds_the_published_arrays_where_the_page_says() {
         }
         assert!(rest.is_empty());
     }
-    let [(w1, b1), (w2, b2), (w3, b3)] = &there.mlp;
-    let network = [&there.basis, w1, b1, w2, b2, w3, b3].map(|m| m.as_slice()).concat();
-    assert_eq!((ours("model.network"), ours("bounds")), (&network[..], there.aabb.as_flattened()));
+    assert_eq!(
+        (ours("model.network"), ours("bounds")),
+        (&published.network[..], published.aabb.as_flattened())
+    );
     let field: Value = serde_json::from_str(&metadata["field"]).unwrap();
     assert_eq!(
         (&field["features"], &field["hidden"], &field["softplus"]),

@@ -44,11 +44,7 @@ impl<'a> GpuVm<'a> {
         start: &VmState,
         device: &Device,
     ) -> Result<bool> {
-        let known = match config.ortho > 0.0 {
-            true => Err("lines that are orthogonal"),
-            false => DeviceDecoder::supports(&decoder(config)),
-        };
-        known.map_err(|what| {
+        DeviceDecoder::supports(&decoder(config)).map_err(|what| {
             let problem = format!("the device `{}` knows no {what}", device.name());
             Error::usage(problem, "train with `--device cpu`")
         })?;

@@ -2,6 +2,8 @@
 
 use super::record::{FORMAT, FieldRecord, NAMES, Placement, geometry};
 use crate::Result;
+#[cfg(feature = "wgpu")]
+use crate::field::GpuField;
 use crate::field::checkpoint::{self, Checkpoint};
 use crate::geom::{Ray, RayResult};
 use crate::kernel::cpu::march::MarchRay;
@@ -11,7 +13,7 @@ use crate::kernel::gpu;
 use glam::Vec3;
 use std::path::Path;
 #[cfg(feature = "wgpu")]
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 /// The trained field on the host. Positions and distances are in scene units.
 pub struct TFace {
@@ -20,9 +22,8 @@ pub struct TFace {
     pub(super) values: [Vec<f32>; 3],
     weights: DecoderWeights,
     pub(super) placement: Option<Placement>,
-    /// The field on a device, which answers instead of the processor.
     #[cfg(feature = "wgpu")]
-    on_gpu: Mutex<Option<gpu::VmRenderer>>,
+    on_gpu: GpuField<gpu::VmRenderer>,
 }
 
 /// Rays rendered together: what they keep stays in the low hundreds of megabytes.
@@ -37,7 +38,7 @@ impl TFace {
             weights,
             placement,
             #[cfg(feature = "wgpu")]
-            on_gpu: Mutex::new(None),
+            on_gpu: GpuField::new(None),
         }
     }
 
@@ -61,20 +62,8 @@ impl TFace {
         if gpu::DeviceDecoder::supports(&self.field.decoder).is_ok() {
             let renderer =
                 gpu::VmRenderer::new(device, &self.field, self.values.each_ref().map(|v| v.as_slice()));
-            self.on_gpu = Mutex::new(Some(renderer));
+            self.on_gpu = GpuField::new(Some(renderer));
         }
-    }
-
-    /// What the device answers; none where there is none, or where it failed: then the processor answers.
-    #[cfg(feature = "wgpu")]
-    fn ask(&self, rays: impl Fn() -> Vec<MarchRay>) -> Option<Vec<[f32; RAY_WIDTH]>> {
-        let mut renderer = self.on_gpu.lock().ok()?;
-        let answer = renderer.as_mut()?.render(&rays());
-        if let Err(e) = &answer {
-            tracing::warn!("{e}; the processor goes on");
-            *renderer = None;
-        }
-        answer.ok()
     }
 
     /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
@@ -85,13 +74,13 @@ impl TFace {
         let stretch = |r: &Ray| {
             if p.depth_directions { 1.0 / r.direction.dot(forward).max(1e-3) } else { 1.0 }
         };
-        let placed = |rays: &[Ray]| -> Vec<MarchRay> {
-            let place = |r: &Ray| MarchRay {
+        let in_field = |rays: &[Ray]| -> Vec<MarchRay> {
+            let to_field = |r: &Ray| MarchRay {
                 origin: std::array::from_fn(|a| p.scale * r.origin[a] + p.offset[a]),
                 direction: (r.direction * stretch(r)).to_array(),
                 jitter: 0.0,
             };
-            rays.iter().map(place).collect()
+            rays.iter().map(to_field).collect()
         };
         let result = |(o, r): (&[f32; RAY_WIDTH], &Ray)| RayResult {
             color: [o[0], o[1], o[2]].map(|c| c.clamp(0.0, 1.0)),
@@ -100,13 +89,13 @@ impl TFace {
             normal: Vec3::ZERO,
         };
         #[cfg(feature = "wgpu")]
-        if let Some(seen) = self.ask(|| placed(rays)) {
-            return seen.iter().zip(rays).map(result).collect();
+        if let Some(composited) = self.on_gpu.ask(|renderer| renderer.render(&in_field(rays))) {
+            return composited.iter().zip(rays).map(result).collect();
         }
         let [density, color, _] = &self.values;
         let pass = |rays: &[Ray]| -> Vec<RayResult> {
-            let seen = vm::render(&self.field, density, color, &self.weights, &placed(rays)).out;
-            seen.as_chunks().0.iter().zip(rays).map(result).collect()
+            let composited = vm::render(&self.field, density, color, &self.weights, &in_field(rays)).out;
+            composited.as_chunks().0.iter().zip(rays).map(result).collect()
         };
         rays.chunks(PASS).flat_map(pass).collect()
     }

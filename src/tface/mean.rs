@@ -50,10 +50,10 @@ impl FieldMean {
         })
     }
 
-    /// Lets the GPU of a place answer, if it is one.
+    /// Lets a GPU answer, if `device` is one.
     #[cfg(feature = "wgpu")]
-    pub fn on(mut self, place: ComputeDevice) -> FieldMean {
-        let ComputeDevice::Gpu(gpu) = place else { return self };
+    pub fn on(mut self, device: ComputeDevice) -> FieldMean {
+        let ComputeDevice::Gpu(gpu) = device else { return self };
         let device = Arc::new(gpu.device);
         self.fields.iter_mut().for_each(|field| field.on(device.clone()));
         FieldMean { _lock: gpu.lock, ..self }
@@ -63,25 +63,25 @@ impl FieldMean {
     /// vector `forward`: mean color (premultiplied, coded) and opacity; depth by opacity.
     pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         let Some((first, others)) = self.fields.split_first() else { return Vec::new() };
-        let mut seen = first.render(rays, forward);
+        let mut mean = first.render(rays, forward);
         if others.is_empty() {
-            return seen;
+            return mean;
         }
-        seen.iter_mut().for_each(|p| p.depth *= p.opacity);
+        mean.iter_mut().for_each(|p| p.depth *= p.opacity);
         for other in others {
-            for (sum, p) in seen.iter_mut().zip(other.render(rays, forward)) {
+            for (sum, p) in mean.iter_mut().zip(other.render(rays, forward)) {
                 (0..3).for_each(|c| sum.color[c] += p.color[c]);
                 sum.opacity += p.opacity;
                 sum.depth += p.depth * p.opacity;
             }
         }
         let share = 1.0 / self.fields.len() as f32;
-        for p in &mut seen {
+        for p in &mut mean {
             p.depth = if p.opacity > 0.0 { p.depth / p.opacity } else { 0.0 };
             p.color = p.color.map(|c| c * share);
             p.opacity *= share;
         }
-        seen
+        mean
     }
 }
 
@@ -150,10 +150,10 @@ pub fn train(
         if let Some(which) = several {
             report.warnings.iter_mut().for_each(|w| *w = format!("{which}: {w}"));
         }
-        whole = Some(match whole {
-            None => report,
-            Some(sum) => sum.and(report),
-        });
+        match &mut whole {
+            None => whole = Some(report),
+            Some(whole) => whole.add(report),
+        }
     }
     Ok(whole.expect("at least one field is learned"))
 }

@@ -45,17 +45,6 @@ pub fn decoder(config: &VmConfig) -> DecoderShape {
     }
 }
 
-/// From features to weights, as configured.
-fn shading(config: &VmConfig) -> Shading {
-    Shading {
-        softplus: config.activation == DensityActivation::Softplus,
-        shift: config.density_shift as f32,
-        distance_scale: config.distance_scale as f32,
-        weight_threshold: config.weight_threshold as f32,
-        stop: config.stop as f32,
-    }
-}
-
 /// What a field is besides its values: enough to render it without the settings it was made with.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FieldRecord {
@@ -89,7 +78,13 @@ impl FieldRecord {
             density_rank: density.rank,
             color_rank: color.rank,
             decoder: decoder(config),
-            shading: shading(config),
+            shading: Shading {
+                softplus: config.activation == DensityActivation::Softplus,
+                shift: config.density_shift as f32,
+                distance_scale: config.distance_scale as f32,
+                weight_threshold: config.weight_threshold as f32,
+                stop: config.stop as f32,
+            },
             step_ratio: config.step_ratio as f32,
             near: config.near as f32,
             far: config.far as f32,

@@ -1,11 +1,12 @@
 //! Between steps: the alpha mask is rebuilt, the box shrinks, the grids become finer.
 
 use super::record::{NAMES, grids};
-use super::state::{VmState, upsampled_voxels};
+use super::state::VmState;
 use crate::config::VmConfig;
 use crate::field::parameters::HostGroup;
+use crate::kernel::cpu::march::dilated;
 use crate::kernel::cpu::vm::mask::BoxMask;
-use crate::kernel::cpu::vm::{cropped, density_at, resized, size_for};
+use crate::kernel::cpu::vm::{cropped, density_at, resized, size_for, voxel_schedule};
 use rayon::prelude::*;
 
 /// Most vertices of an alpha mask; a finer grid keeps the mask's size (published).
@@ -60,25 +61,6 @@ fn occupied_vertices(state: &VmState, config: &VmConfig, size: [usize; 3]) -> Ve
     dilated(&alive, size)
 }
 
-/// Each vertex or one of its 26 neighbours, one axis after the other.
-fn dilated(alive: &[bool], size: [usize; 3]) -> Vec<bool> {
-    let strides = [size[1] * size[2], size[2], 1];
-    let mut now = alive.to_vec();
-    for a in 0..3 {
-        let before = now.clone();
-        now.par_chunks_mut(strides[0]).enumerate().for_each(|(x, out)| {
-            for (i, v) in out.iter_mut().enumerate() {
-                let at = x * strides[0] + i;
-                let k = [x, i / size[2], i % size[2]][a];
-                *v = before[at]
-                    || k > 0 && before[at - strides[a]]
-                    || k + 1 < size[a] && before[at + strides[a]];
-            }
-        });
-    }
-    now
-}
-
 fn extent(kept: &[bool], size: [usize; 3]) -> Option<([usize; 3], [usize; 3])> {
     let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
     for (i, _) in kept.iter().enumerate().filter(|(_, k)| **k) {
@@ -127,7 +109,8 @@ fn shrink(
 
 /// Makes the grids finer where, after `step` steps, upsampling `which` (from 0) is due.
 pub fn upsample(state: &mut VmState, config: &VmConfig, which: usize, step: u64) {
-    let voxels = upsampled_voxels(config)[which];
+    let VmConfig { voxels_start, voxels_final, upsample_steps, .. } = config;
+    let voxels = voxel_schedule(*voxels_start, *voxels_final, upsample_steps.len().max(1))[which];
     let extent = std::array::from_fn(|a| state.bounds[1][a] - state.bounds[0][a]);
     let size = size_for(extent, voxels);
     let (old_density, old_color) = grids(config, state.size);
@@ -136,9 +119,7 @@ pub fn upsample(state: &mut VmState, config: &VmConfig, which: usize, step: u64)
     let color = resized(&old_color, state.groups[1].values(), &new_color);
     state.size = size;
     replace(state, density, color, step);
-    if config.lr_reset {
-        state.reset = step;
-    }
+    state.reset = step;
 }
 
 fn replace(state: &mut VmState, density: Vec<f32>, color: Vec<f32>, step: u64) {

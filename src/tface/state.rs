@@ -8,7 +8,7 @@ use crate::field::parameters::{HostGroup, Part};
 use crate::kernel::cpu::march::Bitmask;
 use crate::kernel::cpu::rng;
 use crate::kernel::cpu::vm::mask::BoxMask;
-use crate::kernel::cpu::vm::{VmField, size_for, voxel_schedule};
+use crate::kernel::cpu::vm::{VmField, size_for};
 use std::sync::Arc;
 
 /// Training between two steps.
@@ -129,9 +129,4 @@ impl VmState {
         }
         Ok(())
     }
-}
-
-/// Voxels after each upsampling.
-pub fn upsampled_voxels(config: &VmConfig) -> Vec<u64> {
-    voxel_schedule(config.voxels_start, config.voxels_final, config.upsample_steps.len().max(1))
 }

@@ -27,7 +27,6 @@ fn paper() -> VmConfig {
         features: 6,
         hidden: 8,
         l1_start: 1e-3,
-        ortho: 1e-3,
         // the published weight would hardly be seen beside the color's
         mask_weight: 0.1,
         ..VmConfig::preset(Preset::Paper)
@@ -70,19 +69,6 @@ fn total_variation(grid: &Grid, x: &[Var]) -> Var {
 fn size(grid: &Grid, x: &[Var]) -> Var {
     let parts = (0..3).flat_map(|i| [grid.plane(i), grid.line(i)]);
     parts.map(|f| x[f.range()].iter().map(|v| v.abs()).sum::<Var>() / Var::of(f.len() as f64)).sum()
-}
-
-/// Σ over lines of the mean of |L Lᵀ| off the diagonal.
-fn orthogonality(grid: &Grid, x: &[Var]) -> Var {
-    let mut sum = Var::of(0.0);
-    for f in (0..3).map(|i| grid.line(i)).filter(|f| f.channels > 1) {
-        let c = f.channels;
-        for (a, b) in (0..c).flat_map(|a| (0..c).map(move |b| (a, b))).filter(|(a, b)| a != b) {
-            let dot: Var = (0..f.width).map(|k| x[f.start + k * c + a] * x[f.start + k * c + b]).sum();
-            sum += dot.abs() / Var::of((c * (c - 1)) as f64);
-        }
-    }
-    sum
 }
 
 /// Color loss, mask loss and all together, by the formulas.
@@ -128,8 +114,7 @@ fn formulas((config, pixels, state): (&VmConfig, &Pixels, &VmState), x: &[Var], 
         + mask * of(config.mask_weight)
         + total_variation(&field.density, density) * of(0.01 * config.tv_density * fade)
         + total_variation(&field.color, color) * of(0.01 * config.tv_color * fade)
-        + size(&field.density, density) * of(config.l1_start)
-        + (orthogonality(&field.density, density) + orthogonality(&field.color, color)) * of(config.ortho);
+        + size(&field.density, density) * of(config.l1_start);
     [rgb, mask, total]
 }
 

@@ -8,8 +8,8 @@
 //! # Where our own files hold the same
 //!
 //! No `.th` is written. `checkpoint.safetensors` of a stage folder, one per field, holds one field with all that a
-//! script needs to make one: arrays are little-endian and row-major, `C` channels are [`VmCheckpoint::density_rank`]
-//! or [`VmCheckpoint::color_rank`] of plane i, and `field` is the JSON text of that name in `__metadata__`.
+//! script needs to make one: arrays are little-endian and row-major, `C` channels are
+//! `density_rank` or `color_rank` of plane i, and `field` is the JSON text of that name in `__metadata__`.
 //!
 //! | ours | published |
 //! |---|---|
@@ -33,62 +33,46 @@ mod table;
 
 use self::table::{MAX_COUNT, Table, about, about_tensor, integer};
 use crate::io::{self, Limits, TorchNumbers, TorchValue};
+use crate::kernel::cpu::vm::{DecoderShape, Grid, Shading};
 use crate::{Error, Result};
 use std::path::Path;
 
-/// Width and height of plane i.
-const PLANE_AXES: [[usize; 2]; 3] = [[0, 1], [0, 2], [1, 2]];
-/// The axis of line i.
-const LINE_AXIS: [usize; 3] = [2, 1, 0];
-const LAYERS: [usize; 3] = [0, 2, 4];
+/// Entries of the color network, in the order of [`DecoderShape::shapes`].
+const NETWORK: [&str; 7] = [
+    "basis_mat.weight",
+    "renderModule.mlp.0.weight",
+    "renderModule.mlp.0.bias",
+    "renderModule.mlp.2.weight",
+    "renderModule.mlp.2.bias",
+    "renderModule.mlp.4.weight",
+    "renderModule.mlp.4.bias",
+];
 
 /// A vector–matrix field as published checkpoints hold it; lengths are in the units of its box.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VmCheckpoint {
     /// Lowest and highest corner of the box.
     pub aabb: [[f32; 3]; 2],
-    /// Nodes along x, y, z; at least 2.
-    pub grid_size: [usize; 3],
-    /// Components of each density plane and its line.
-    pub density_rank: [usize; 3],
-    /// Components of each appearance plane and its line.
-    pub color_rank: [usize; 3],
-    /// Appearance features.
-    pub app_dim: usize,
-    /// Added before [`Activation::Softplus`].
-    pub density_shift: f32,
+    /// Nodes and components of the density's planes and lines.
+    pub density_grid: Grid,
+    /// The same of the appearance.
+    pub color_grid: Grid,
+    /// Sizes of the color network.
+    pub decoder: DecoderShape,
+    /// From features to weights.
+    pub shading: Shading,
     /// Alpha from which a node counts as occupied.
     pub alpha_mask_threshold: f32,
-    /// Factor on the length of a step.
-    pub distance_scale: f32,
-    /// Weight above which a sample gets a color.
-    pub weight_threshold: f32,
-    /// From density feature to density.
-    pub activation: Activation,
     /// Where rays begin and, for their beginning only, end.
     pub near_far: [f32; 2],
     /// Step over the mean distance of nodes.
     pub step_ratio: f32,
-    /// Frequencies of positions; unused by the color network that is read.
-    pub position_frequencies: usize,
-    /// Frequencies of view directions.
-    pub view_frequencies: usize,
-    /// Frequencies of appearance features.
-    pub feature_frequencies: usize,
-    /// Width of the color network.
-    pub hidden: usize,
-    /// `[C, H, W]`: `[rank, nodes of the second axis, nodes of the first]`.
-    pub density_planes: [Vec<f32>; 3],
-    /// `[C, N]`: `[rank, nodes of the third axis]`.
-    pub density_lines: [Vec<f32>; 3],
-    /// As the planes of density.
-    pub color_planes: [Vec<f32>; 3],
-    /// As the lines of density.
-    pub color_lines: [Vec<f32>; 3],
-    /// `[app_dim, sum of color_rank]`.
-    pub basis: Vec<f32>,
-    /// Weight `[outputs, inputs]` and bias of each layer: [`VmCheckpoint::inputs`] → hidden → hidden → 3.
-    pub mlp: [(Vec<f32>, Vec<f32>); 3],
+    /// Three planes `[C, H, W]`, `[rank, nodes of the second axis, nodes of the first]`, then three lines `[C, N]`.
+    pub density: [Vec<f32>; 6],
+    /// As those of the density.
+    pub color: [Vec<f32>; 6],
+    /// Matrices of the color network one after the other, as [`DecoderShape::shapes`] lists them.
+    pub network: Vec<f32>,
     /// Where anything may be, if that was ever found out.
     pub mask: Option<VmMask>,
 }
@@ -104,46 +88,18 @@ pub struct VmMask {
     pub aabb: [[f32; 3]; 2],
 }
 
-/// From density feature f to density.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Activation {
-    /// max(f, 0)
-    Relu,
-    /// ln(1 + exp(f + shift))
-    Softplus,
-}
-
-impl VmCheckpoint {
-    /// Width of the color network's input: features, direction, and sine and cosine of both.
-    pub fn inputs(&self) -> usize {
-        self.app_dim * (1 + 2 * self.feature_frequencies) + 3 * (1 + 2 * self.view_frequencies)
-    }
-
-    /// Shapes of the planes and lines of components `rank`, as they are in the file.
-    fn factor_shapes(&self, rank: [usize; 3]) -> [([usize; 4], [usize; 4]); 3] {
-        std::array::from_fn(|i| {
-            let [width, height] = PLANE_AXES[i].map(|axis| self.grid_size[axis]);
-            ([1, rank[i], height, width], [1, rank[i], self.grid_size[LINE_AXIS[i]], 1])
-        })
-    }
-
-    fn layer_shapes(&self) -> [[usize; 2]; 3] {
-        [[self.hidden, self.inputs()], [self.hidden, self.hidden], [3, self.hidden]]
-    }
-}
-
 /// Reads a published checkpoint; nothing in it is executed ([`io::parse_torch`]). Every shape is compared
 /// with the sizes in `kwargs`, every number must be finite, and an entry without a meaning is an error.
 pub fn read_th(path: &Path, limits: &Limits) -> Result<VmCheckpoint> {
-    understand(path, &io::read_torch(path, limits)?)
+    parse(path, &io::read_torch(path, limits)?)
 }
 
 /// [`read_th`] on bytes; `path` is only for messages.
 pub fn from_bytes(bytes: &[u8], path: &Path, limits: &Limits) -> Result<VmCheckpoint> {
-    understand(path, &io::parse_torch(path, bytes, limits)?)
+    parse(path, &io::parse_torch(path, bytes, limits)?)
 }
 
-fn understand(path: &Path, root: &TorchValue) -> Result<VmCheckpoint> {
+fn parse(path: &Path, root: &TorchValue) -> Result<VmCheckpoint> {
     let root = Table { path, name: "", values: root };
     let kwargs = root.table("kwargs")?;
     let state = root.table("state_dict")?;
@@ -160,66 +116,75 @@ fn understand(path: &Path, root: &TorchValue) -> Result<VmCheckpoint> {
             "train again with `--shadingMode MLP_Fea`, as T-Face does",
         ));
     }
-    let activation = match kwargs.text("fea2denseAct")? {
-        "relu" => Activation::Relu,
-        "softplus" => Activation::Softplus,
+    let softplus = match kwargs.text("fea2denseAct")? {
+        "relu" => false,
+        "softplus" => true,
         other => {
             let other = format!("`{}`", other.escape_debug().take(80).collect::<String>());
             return Err(kwargs.wrong("fea2denseAct", other, "`relu` or `softplus`"));
         }
     };
-    let mut vm = VmCheckpoint {
-        aabb: kwargs.aabb("aabb")?,
-        grid_size: kwargs.counts("gridSize", 2)?,
-        density_rank: kwargs.counts("density_n_comp", 1)?,
-        color_rank: kwargs.counts("appearance_n_comp", 1)?,
-        app_dim: kwargs.count("app_dim", 1)?,
-        density_shift: kwargs.number("density_shift", f32::MIN)?,
-        alpha_mask_threshold: kwargs.number("alphaMask_thres", 0.0)?,
-        distance_scale: kwargs.number("distance_scale", f32::MIN_POSITIVE)?,
-        weight_threshold: kwargs.number("rayMarch_weight_thres", 0.0)?,
-        activation,
-        near_far: kwargs.near_far("near_far")?,
-        step_ratio: kwargs.number("step_ratio", f32::MIN_POSITIVE)?,
-        position_frequencies: kwargs.count("pos_pe", 0)?,
+    let size = kwargs.counts("gridSize", 2)?;
+    let density_grid = Grid { size, rank: kwargs.counts("density_n_comp", 1)? };
+    let color_grid = Grid { size, rank: kwargs.counts("appearance_n_comp", 1)? };
+    let decoder = DecoderShape {
+        channels: color_grid.channels(),
+        features: kwargs.count("app_dim", 1)?,
+        hidden: kwargs.count("featureC", 1)?,
         view_frequencies: kwargs.count("view_pe", 0)?,
         feature_frequencies: kwargs.count("fea_pe", 0)?,
-        hidden: kwargs.count("featureC", 1)?,
-        density_planes: Default::default(),
-        density_lines: Default::default(),
-        color_planes: Default::default(),
-        color_lines: Default::default(),
-        basis: Vec::new(),
-        mlp: Default::default(),
-        mask: None,
     };
-    let mut known = vec!["basis_mat.weight".to_string()];
+    // positions are no input of this color network
+    kwargs.count("pos_pe", 0)?;
+    let shading = Shading {
+        softplus,
+        shift: kwargs.number("density_shift", f32::MIN)?,
+        distance_scale: kwargs.number("distance_scale", f32::MIN_POSITIVE)?,
+        weight_threshold: kwargs.number("rayMarch_weight_thres", 0.0)?,
+        stop: 0.0,
+    };
+    let mut known = Vec::new();
     let mut take = |key: String, shape: &[usize]| {
         let values = state.floats(&key, shape);
         known.push(key);
         values
     };
-    let (density, color) = (vm.factor_shapes(vm.density_rank), vm.factor_shapes(vm.color_rank));
-    for i in 0..3 {
-        vm.density_planes[i] = take(format!("density_plane.{i}"), &density[i].0)?;
-        vm.density_lines[i] = take(format!("density_line.{i}"), &density[i].1)?;
-        vm.color_planes[i] = take(format!("app_plane.{i}"), &color[i].0)?;
-        vm.color_lines[i] = take(format!("app_line.{i}"), &color[i].1)?;
+    let mut factors = |name: &str, grid: &Grid| -> Result<[Vec<f32>; 6]> {
+        let mut all = [const { Vec::new() }; 6];
+        for (k, (f, values)) in grid.factors().iter().zip(&mut all).enumerate() {
+            let (kind, shape) = match k < 3 {
+                true => ("plane", [1, f.channels, f.height, f.width]),
+                false => ("line", [1, f.channels, f.width, 1]),
+            };
+            *values = take(format!("{name}_{kind}.{}", k % 3), &shape)?;
+        }
+        Ok(all)
+    };
+    let (density, color) = (factors("density", &density_grid)?, factors("app", &color_grid)?);
+    let mut network = Vec::new();
+    for (name, (rows, columns)) in NETWORK.into_iter().zip(decoder.shapes()) {
+        let dimensions = if name.ends_with("bias") { 1 } else { 2 };
+        network.extend(take(name.into(), &[rows, columns][..dimensions])?);
     }
-    for (layer, shape) in vm.layer_shapes().iter().enumerate() {
-        let name = LAYERS[layer];
-        let weight = take(format!("renderModule.mlp.{name}.weight"), shape)?;
-        vm.mlp[layer] = (weight, take(format!("renderModule.mlp.{name}.bias"), &shape[..1])?);
-    }
-    vm.basis = state.floats("basis_mat.weight", &[vm.app_dim, vm.color_rank.iter().sum()])?;
     if let Some(key) = state.keys().find(|key| !known.iter().any(|k| k == key)) {
         let key: String = key.escape_debug().take(80).collect();
         return Err(state.wrong(&key, "there".into(), "only planes, lines, basis and three layers"));
     }
-    if root.keys().any(|key| key.starts_with("alphaMask.")) {
-        vm.mask = Some(mask(&root)?);
-    }
-    Ok(vm)
+    let has_mask = root.keys().any(|key| key.starts_with("alphaMask."));
+    Ok(VmCheckpoint {
+        aabb: kwargs.aabb("aabb")?,
+        density_grid,
+        color_grid,
+        decoder,
+        shading,
+        alpha_mask_threshold: kwargs.number("alphaMask_thres", 0.0)?,
+        near_far: kwargs.near_far("near_far")?,
+        step_ratio: kwargs.number("step_ratio", f32::MIN_POSITIVE)?,
+        density,
+        color,
+        network,
+        mask: if has_mask { Some(mask(&root)?) } else { None },
+    })
 }
 
 fn mask(root: &Table) -> Result<VmMask> {

@@ -51,24 +51,19 @@ pub struct TfaceReport {
 }
 
 impl TfaceReport {
-    /// With what another field's training did.
-    pub(super) fn and(self, other: TfaceReport) -> TfaceReport {
-        let fields = self.fields + other.fields;
-        let mean = |a: f64, b: f64| (a * self.fields as f64 + b * other.fields as f64) / fields as f64;
-        TfaceReport {
-            fields,
-            steps: self.steps,
-            seconds: self.seconds + other.seconds,
-            train_psnr: mean(self.train_psnr, other.train_psnr),
-            occupied: mean(self.occupied, other.occupied),
-            size: self.size,
-            rays: self.rays + other.rays,
-            lattice_samples: self.lattice_samples + other.lattice_samples,
-            density_samples: self.density_samples + other.density_samples,
-            color_samples: self.color_samples + other.color_samples,
-            device: self.device,
-            warnings: [self.warnings, other.warnings].concat(),
-        }
+    /// Adds what the training of one more field did.
+    pub(super) fn add(&mut self, one: TfaceReport) {
+        let fields = self.fields as f64;
+        let mean = |all: f64, one: f64| (all * fields + one) / (fields + 1.0);
+        self.train_psnr = mean(self.train_psnr, one.train_psnr);
+        self.occupied = mean(self.occupied, one.occupied);
+        self.fields += 1;
+        self.seconds += one.seconds;
+        self.rays += one.rays;
+        self.lattice_samples += one.lattice_samples;
+        self.density_samples += one.density_samples;
+        self.color_samples += one.color_samples;
+        self.warnings.extend(one.warnings);
     }
 }
 
@@ -98,37 +93,24 @@ pub(super) fn train_one(
 ) -> Result<TfaceReport> {
     let began = Instant::now();
     let state = VmState::new(config, session.seed, bounds, hull);
-    let place = field::compute_device(session.device)?.fallback_to_cpu(|place| match place {
+    let device = field::compute_device(session.device)?.fallback_to_cpu(|device| match device {
         ComputeDevice::Cpu(_) => Ok(()),
         #[cfg(feature = "wgpu")]
         ComputeDevice::Gpu(gpu) => GpuVm::fits(session.stage, config, pixels, &state, &gpu.device).map(drop),
     })?;
-    let device = place.description();
-    let report = match place {
+    let description = device.description();
+    let (state, progress, counts, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuVm::new(config, pixels), state, config, session)?,
         #[cfg(feature = "wgpu")]
         ComputeDevice::Gpu(gpu) => {
             let resident = GpuVm::fits(session.stage, config, pixels, &state, &gpu.device)?;
-            let ops = GpuVm::new(config, pixels, gpu.device, resident);
-            train_on(ops, state, config, session)?
+            train_on(GpuVm::new(config, pixels, gpu.device, resident), state, config, session)?
         }
     };
-    Ok(TfaceReport { seconds: began.elapsed().as_secs_f64(), device, ..report })
-}
-
-fn train_on<O: VmOps>(
-    ops: O,
-    state: VmState,
-    config: &VmConfig,
-    session: &TrainingSession,
-) -> Result<TfaceReport> {
-    let mut model = VmModel::new(ops, state, config, session);
-    let (progress, warnings) = training::train(&mut model, session, config.steps, config.checkpoint_s)?;
-    let VmModel { state, counts, .. } = model;
     Ok(TfaceReport {
         fields: 1,
         steps: config.steps,
-        seconds: 0.0,
+        seconds: began.elapsed().as_secs_f64(),
         train_psnr: progress.psnr(),
         occupied: state.mask.as_ref().map_or(1.0, |m| m.share()),
         size: state.size,
@@ -136,9 +118,20 @@ fn train_on<O: VmOps>(
         lattice_samples: counts.lattice,
         density_samples: counts.density,
         color_samples: counts.color,
-        device: String::new(),
+        device: description,
         warnings,
     })
+}
+
+fn train_on<O: VmOps>(
+    ops: O,
+    state: VmState,
+    config: &VmConfig,
+    session: &TrainingSession,
+) -> Result<(VmState, TrainingProgress, VmFigures, Vec<String>)> {
+    let mut model = VmModel::new(ops, state, config, session);
+    let (progress, warnings) = training::train(&mut model, session, config.steps, config.checkpoint_s)?;
+    Ok((model.state, progress, model.counts, warnings))
 }
 
 /// What ranges of single keys cannot say.
@@ -248,11 +241,7 @@ impl<'a, O: VmOps> VmModel<'a, O> {
         let faded = tv_fade(config, step);
         let tv = |weight: f64| (0.01 * weight * faded) as f32;
         let l1 = if self.state.masked { config.l1_rest } else { config.l1_start } as f32;
-        let ortho = config.ortho as f32;
-        [
-            Penalty { tv: tv(config.tv_density), l1, ortho },
-            Penalty { tv: tv(config.tv_color), l1: 0.0, ortho },
-        ]
+        [Penalty { tv: tv(config.tv_density), l1 }, Penalty { tv: tv(config.tv_color), l1: 0.0 }]
     }
 }
 
@@ -280,16 +269,8 @@ impl<O: VmOps> Model for VmModel<'_, O> {
     fn optimize(&mut self, step: u64) {
         let config = self.config;
         let factor = learning_rate(config, step - self.state.reset);
-        let grid = AdamStep {
-            lr: (config.lr_grid * factor) as f32,
-            beta1: 0.9,
-            beta2: 0.99,
-            epsilon: 1e-8,
-            weight_decay: 0.0,
-            step: step - self.state.moments_from + 1,
-            skip_zero: false,
-        };
-        let network = AdamStep { lr: (config.lr_network * factor) as f32, ..grid };
+        let rate = |lr: f64| AdamStep::new(lr * factor, 1e-8, step - self.state.moments_from + 1);
+        let (grid, network) = (rate(config.lr_grid), rate(config.lr_network));
         let groups = self.groups.as_mut().expect("parameters are loaded before the first step");
         for (group, step) in groups.iter_mut().zip([grid, grid, network]) {
             group.step(self.ops.device(), &step, self.ops.gate());

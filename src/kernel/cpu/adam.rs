@@ -27,6 +27,15 @@ pub struct AdamStep {
     pub skip_zero: bool,
 }
 
+impl AdamStep {
+    /// Returns a step with the decays of both moments as published for hash grids and TensoRF, without weight decay, of
+    /// all weights.
+    pub fn new(lr: f64, epsilon: f32, step: u64) -> AdamStep {
+        let (beta1, beta2) = (0.9, 0.99);
+        AdamStep { lr: lr as f32, beta1, beta2, epsilon, weight_decay: 0.0, step, skip_zero: false }
+    }
+}
+
 #[inline(always)]
 fn adam_body<const F: bool>(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &mut [f32], s: &AdamStep) {
     let c1 = (1.0 / (1.0 - (s.beta1 as f64).powf(s.step as f64))) as f32;
@@ -81,22 +90,16 @@ pub fn adam(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &mut [f32], step: &A
 mod tests {
     use super::*;
 
-    const STEP: AdamStep = AdamStep {
-        lr: 0.1,
-        beta1: 0.9,
-        beta2: 0.99,
-        epsilon: 1e-15,
-        weight_decay: 0.0,
-        step: 1,
-        skip_zero: true,
-    };
+    fn step() -> AdamStep {
+        AdamStep { skip_zero: true, ..AdamStep::new(0.1, 1e-15, 1) }
+    }
 
     #[test]
     fn the_first_step_moves_by_the_learning_rate_against_the_sign() {
         // m̂ = g, v̂ = g², so m̂/√v̂ = sign(g): 1 − 0.1 and 1 + 0.1; zero gradient stays
         let (mut p, mut m, mut v) = ([1.0; 3], [0.0; 3], [0.0; 3]);
         let mut g = [0.3, -5.0, 0.0];
-        adam(&mut p, &mut m, &mut v, &mut g, &STEP);
+        adam(&mut p, &mut m, &mut v, &mut g, &step());
         assert!((p[0] - 0.9).abs() < 1e-6 && (p[1] - 1.1).abs() < 1e-6 && p[2] == 1.0);
         assert_eq!(g, [0.0; 3]);
     }
@@ -106,7 +109,7 @@ mod tests {
         let (mut p, mut m, mut v) = ([1.0; 20], [0.5; 20], [0.5; 20]);
         let mut g = [0.0; 20];
         g[3] = 1.0;
-        adam(&mut p, &mut m, &mut v, &mut g, &AdamStep { step: 7, ..STEP });
+        adam(&mut p, &mut m, &mut v, &mut g, &AdamStep { step: 7, ..step() });
         assert!(p[3] != 1.0);
         assert!((0..20).filter(|&i| i != 3).all(|i| p[i] == 1.0 && m[i] == 0.5 && v[i] == 0.5));
     }
@@ -115,7 +118,7 @@ mod tests {
     fn dense_steps_decay_weights_that_have_no_gradient() {
         // p = 1 · (1 − 0.1 · 0.01) = 0.999
         let (mut p, mut m, mut v, mut g) = ([1.0], [0.0], [0.0], [0.0]);
-        let step = AdamStep { weight_decay: 0.01, skip_zero: false, epsilon: 1e-8, ..STEP };
+        let step = AdamStep { weight_decay: 0.01, ..AdamStep::new(0.1, 1e-8, 1) };
         adam(&mut p, &mut m, &mut v, &mut g, &step);
         assert!((p[0] - 0.999).abs() < 1e-7);
     }

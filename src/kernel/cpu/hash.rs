@@ -198,7 +198,7 @@ pub fn gather(
     x01: &[[f32; 3]],
     world: f32,
     value: &mut [[f32; 2]],
-    jacobian: Option<&mut [[f32; 6]]>,
+    mut jacobian: Option<&mut [[f32; 6]]>,
 ) {
     let n = x01.len();
     assert_eq!(value.len(), levels.len() * n);
@@ -206,26 +206,16 @@ pub fn gather(
     if n == 0 {
         return;
     }
-    let own = |l: usize| &table[levels[l].offset..][..levels[l].entries as usize];
-    match jacobian {
-        None => value.par_chunks_mut(n).enumerate().for_each(|(l, value)| {
-            value.par_chunks_mut(GATHER_CHUNK).zip(x01.par_chunks(GATHER_CHUNK)).for_each(|(v, x)| {
-                gather_level(&levels[l], own(l), x, world, v, None);
-            });
-        }),
-        Some(jacobian) => {
-            assert_eq!(jacobian.len(), levels.len() * n);
-            value.par_chunks_mut(n).zip(jacobian.par_chunks_mut(n)).enumerate().for_each(
-                |(l, (value, jacobian))| {
-                    value
-                        .par_chunks_mut(GATHER_CHUNK)
-                        .zip(jacobian.par_chunks_mut(GATHER_CHUNK))
-                        .zip(x01.par_chunks(GATHER_CHUNK))
-                        .for_each(|((v, j), x)| gather_level(&levels[l], own(l), x, world, v, Some(j)));
-                },
-            );
+    assert!(jacobian.as_ref().is_none_or(|jacobian| jacobian.len() == value.len()));
+    let mut tasks = Vec::new();
+    for (level, value) in levels.iter().zip(value.chunks_mut(n)) {
+        let own = &table[level.offset..][..level.entries as usize];
+        for (x, v) in x01.chunks(GATHER_CHUNK).zip(value.chunks_mut(GATHER_CHUNK)) {
+            let j = jacobian.as_mut().and_then(|jacobian| jacobian.split_off_mut(..x.len()));
+            tasks.push((level, own, x, v, j));
         }
     }
+    tasks.into_par_iter().for_each(|(level, own, x, v, j)| gather_level(level, own, x, world, v, j));
 }
 
 #[inline(always)]
@@ -293,16 +283,14 @@ pub fn scatter(
     let n = x01.len();
     assert!(g_value.len() == levels.len() * n && q.len() == levels.len() * n);
     let mut rest = gradient;
-    let mut tasks = Vec::with_capacity(levels.len());
-    for (l, level) in levels.iter().enumerate() {
-        let (own, tail) = rest.split_at_mut(level.entries as usize);
-        rest = tail;
-        tasks.push((l, level, own));
-    }
+    let tables: Vec<&mut [[f32; 2]]> = levels
+        .iter()
+        .map(|level| rest.split_off_mut(..level.entries as usize).expect("an entry for each of the levels'"))
+        .collect();
     // the finest levels cost most (cache misses): start them first
-    tasks.into_par_iter().rev().with_max_len(1).for_each(|(l, level, own)| {
+    tables.into_par_iter().enumerate().rev().with_max_len(1).for_each(|(l, own)| {
         let span = l * n..(l + 1) * n;
-        scatter_level(level, own, x01, world, &g_value[span.clone()], &q[span], g_normal);
+        scatter_level(&levels[l], own, x01, world, &g_value[span.clone()], &q[span], g_normal);
     });
 }
 

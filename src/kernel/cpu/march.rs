@@ -3,6 +3,7 @@
 //! All samples of a ray lie on one lattice of pitch `step` (as in nerfacc 0.3.3): empty cells are
 //! skipped by whole steps, so that positions do not depend on which cells happen to be empty.
 
+use crate::geom::Ray;
 use rayon::prelude::*;
 
 /// What the processor and GPUs share of nerfacc's look at the cells again (`OccupancyGrid` of its release 0.3.3, with
@@ -69,17 +70,9 @@ impl Bitmask {
     /// These cells and every cell that touches one of them.
     pub fn grown(&self) -> Bitmask {
         let n = self.resolution;
+        let cells: Vec<bool> = (0..n * n * n).map(|i| self.get(i)).collect();
         let mut out = self.clone();
-        // one axis after the other: together all 26 neighbors
-        for stride in [1, n, n * n] {
-            let before = out.clone();
-            for i in 0..n * n * n {
-                let at = i / stride % n;
-                if (at > 0 && before.get(i - stride)) || (at + 1 < n && before.get(i + stride)) {
-                    out.set(i, true);
-                }
-            }
-        }
+        dilated(&cells, [n; 3]).into_iter().enumerate().for_each(|(i, marked)| out.set(i, marked));
         out
     }
 
@@ -87,6 +80,26 @@ impl Bitmask {
     pub fn count(&self) -> usize {
         self.bits.iter().map(|word| word.count_ones() as usize).sum()
     }
+}
+
+/// Marks every cell that is marked or has a marked one among its 26 neighbors: one axis after the other. Cell
+/// `(x · ny + y) · nz + z`.
+pub fn dilated(cells: &[bool], size: [usize; 3]) -> Vec<bool> {
+    let strides = [size[1] * size[2], size[2], 1];
+    let mut now = cells.to_vec();
+    for a in 0..3 {
+        let before = now.clone();
+        now.par_chunks_mut(strides[0]).enumerate().for_each(|(x, out)| {
+            for (i, v) in out.iter_mut().enumerate() {
+                let at = x * strides[0] + i;
+                let k = [x, i / size[2], i % size[2]][a];
+                *v = before[at]
+                    || k > 0 && before[at - strides[a]]
+                    || k + 1 < size[a] && before[at + strides[a]];
+            }
+        });
+    }
+    now
 }
 
 /// A ray in a field's coordinates, as training and rendering march it.
@@ -98,6 +111,13 @@ pub struct MarchRay {
     pub direction: [f32; 3],
     /// Offset of the lattice in 0..1 steps (0 without jitter).
     pub jitter: f32,
+}
+
+impl MarchRay {
+    /// Returns a ray of the scene in the coordinates of a field whose box is `radius` times the scene's.
+    pub fn new(ray: &Ray, radius: f32, jitter: f32) -> MarchRay {
+        MarchRay { origin: (ray.origin * radius).to_array(), direction: ray.direction.to_array(), jitter }
+    }
 }
 
 /// The samples of many rays.

@@ -32,21 +32,15 @@ pub fn padded(values: &[f32], len: usize) -> Vec<f32> {
 }
 
 /// Cuts the flat vector of a network's weights into matrices of these shapes.
-pub fn split<const N: usize>(flat: &[f32], shapes: [(usize, usize); N]) -> [&[f32]; N] {
-    let mut rest = flat;
-    shapes.map(|(rows, columns)| {
-        let (own, tail) = rest.split_at(rows * columns);
-        rest = tail;
-        own
-    })
+pub fn split<const N: usize>(mut flat: &[f32], shapes: [(usize, usize); N]) -> [&[f32]; N] {
+    shapes
+        .map(|(rows, columns)| flat.split_off(..rows * columns).expect("a weight for each of the network's"))
 }
 
 /// Adds matrices, whose rows are `stride` floats apart, to those of a flat vector.
-pub fn add_to(flat: &mut [f32], shapes: &[(usize, usize)], parts: &[(&[f32], usize)]) {
-    let mut rest = flat;
+pub fn add_to(mut flat: &mut [f32], shapes: &[(usize, usize)], parts: &[(&[f32], usize)]) {
     for (&(rows, columns), &(part, stride)) in shapes.iter().zip(parts) {
-        let (own, tail) = rest.split_at_mut(rows * columns);
-        rest = tail;
+        let own = flat.split_off_mut(..rows * columns).expect("a gradient for each weight");
         for (row, g) in own.chunks_exact_mut(columns).zip(part.chunks(stride)) {
             row.iter_mut().zip(g).for_each(|(a, b)| *a += b);
         }

@@ -8,7 +8,7 @@
 //! With the color skip (not published) the color network reads the hash features themselves too: twelve numbers
 //! behind a layer that is shaped by the surface are a narrow way for all that is seen on a head.
 
-use super::matrix::{Matrix, add_to, padded, split};
+use super::matrix::{Matrix, padded, split};
 
 /// Width of every hidden layer.
 pub const HIDDEN: usize = 64;
@@ -68,9 +68,19 @@ impl Layout {
         self.shapes().iter().map(|(o, i)| o * i).sum()
     }
 
-    /// Never: a network has weights. (Beside `len` by convention.)
-    pub fn is_empty(&self) -> bool {
-        false
+    /// Shapes in which tiles sum gradients: padded, three color channels as four, geometry columns as in [`Weights`].
+    pub(super) fn gradient_shapes(&self) -> [(usize, usize); 7] {
+        let (inputs, color_inputs) = (self.padded(), self.color_padded());
+        let padded = OUTPUTS_PADDED;
+        [
+            (HIDDEN, inputs),
+            (HIDDEN, 1),
+            (padded, HIDDEN),
+            (padded, 1),
+            (HIDDEN, color_inputs),
+            (HIDDEN, HIDDEN),
+            (4, HIDDEN),
+        ]
     }
 
     /// Columns of a tile of geometry inputs: `[hash 2L, x 3, zeros]` up to a multiple of 8.
@@ -110,50 +120,5 @@ impl Weights {
             c2: Matrix::new(c2, (HIDDEN, HIDDEN), (HIDDEN, HIDDEN)),
             c3: Matrix::new(c3, (3, HIDDEN), (RGB_PADDED, HIDDEN)),
         }
-    }
-}
-
-/// Gradients of the matrices as tiles accumulate them (padded, geometry columns `[hash, x]`).
-#[derive(Clone)]
-pub struct SdfGradients {
-    pub(super) w1: Vec<f32>, // [64, kp]
-    pub(super) b1: Vec<f32>, // [64]
-    pub(super) w2: Vec<f32>, // [16, 64]
-    pub(super) b2: Vec<f32>, // [16]
-    pub(super) c1: Vec<f32>, // [64, cp]
-    pub(super) c2: Vec<f32>, // [64, 64]
-    pub(super) c3: Vec<f32>, // [4, 64]
-}
-
-impl SdfGradients {
-    /// All zero.
-    pub fn zeros(layout: Layout) -> SdfGradients {
-        SdfGradients {
-            w1: vec![0.0; HIDDEN * layout.padded()],
-            b1: vec![0.0; HIDDEN],
-            w2: vec![0.0; OUTPUTS_PADDED * HIDDEN],
-            b2: vec![0.0; OUTPUTS_PADDED],
-            c1: vec![0.0; HIDDEN * layout.color_padded()],
-            c2: vec![0.0; HIDDEN * HIDDEN],
-            c3: vec![0.0; 4 * HIDDEN],
-        }
-    }
-
-    /// Adds this to the flat gradient that [`Layout`] describes.
-    pub fn add_to(&self, layout: Layout, flat: &mut [f32]) {
-        let k = layout.inputs;
-        let (w1, others) = flat.split_at_mut(HIDDEN * k);
-        for (row, g) in w1.chunks_exact_mut(k).zip(self.w1.chunks_exact(layout.padded())) {
-            (0..k).for_each(|i| row[i] += g[(i + k - 3) % k]);
-        }
-        let parts: [(&[f32], usize); 6] = [
-            (&self.b1, 1),
-            (&self.w2, HIDDEN),
-            (&self.b2, 1),
-            (&self.c1, layout.color_padded()),
-            (&self.c2, HIDDEN),
-            (&self.c3, HIDDEN),
-        ];
-        add_to(others, &layout.shapes()[1..], &parts);
     }
 }

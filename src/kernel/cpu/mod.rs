@@ -6,6 +6,7 @@
 pub mod adam;
 pub mod cg;
 pub mod density;
+pub mod distance;
 pub mod hash;
 pub mod losses;
 pub mod march;

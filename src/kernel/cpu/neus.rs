@@ -85,9 +85,11 @@ fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Squared color of a sample.
-fn square_of(field: &[f32]) -> f32 {
-    field[4] * field[4] + field[5] * field[5] + field[6] * field[6]
+/// What a sample adds to its ray, times its weight.
+#[inline]
+fn values_of(field: &[f32], n: [f32; 3], t: f32) -> [f32; RAY_WIDTH] {
+    let [r, g, b] = [field[4], field[5], field[6]];
+    [r, g, b, 1.0, t, n[0], n[1], n[2], r * r + g * g + b * b]
 }
 
 /// Sharpness at a sample.
@@ -112,13 +114,7 @@ pub fn forward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
             let (n, _) = normal_of(f);
             let a = alpha_of(f[0], dot(rays.direction[r], n), rays.dt[s], local(inv_s, f), anneal).alpha;
             let w = transmittance * a;
-            for c in 0..3 {
-                out[c] += w * f[4 + c];
-                out[5 + c] += w * n[c];
-            }
-            out[3] += w;
-            out[4] += w * rays.t[s];
-            out[8] += w * square_of(f);
+            out.iter_mut().zip(values_of(f, n, rays.t[s])).for_each(|(out, value)| *out += w * value);
             transmittance *= 1.0 - a;
         }
     });
@@ -136,15 +132,14 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
     let mut g_field = vec![0f32; field.len()];
     // each ray owns a contiguous piece of the samples
     let mut rest = &mut g_field[..];
-    let mut tasks = Vec::with_capacity(count);
-    for r in 0..count {
+    let own = |r: usize| {
         let n = (rays.offsets[r + 1] - rays.offsets[r]) as usize;
-        let (own, tail) = rest.split_at_mut(n * WIDTH);
-        rest = tail;
-        tasks.push((r, own));
-    }
+        rest.split_off_mut(..n * WIDTH).expect("a row for each sample")
+    };
+    let tasks: Vec<&mut [f32]> = (0..count).map(own).collect();
     let g_inv_s: Vec<f64> = tasks
         .into_par_iter()
+        .enumerate()
         .with_min_len(64)
         .map(|(r, own)| {
             let first = rays.offsets[r] as usize;
@@ -159,15 +154,8 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
                 let cos = dot(rays.direction[r], normal);
                 let sharp = local(clamped, f);
                 let a = alpha_of(f[0], cos, rays.dt[s], sharp, anneal);
-                let worth = g[0] * f[4]
-                    + g[1] * f[5]
-                    + g[2] * f[6]
-                    + g[3]
-                    + g[4] * rays.t[s]
-                    + g[5] * normal[0]
-                    + g[6] * normal[1]
-                    + g[7] * normal[2]
-                    + g[8] * square_of(f);
+                let worth: f32 =
+                    g.iter().zip(values_of(f, normal, rays.t[s])).map(|(g, value)| g * value).sum();
                 let next = transmittance * (1.0 - a.alpha);
                 samples.push((a, normal, length, transmittance, worth, sharp));
                 transmittance = next;

@@ -1,10 +1,12 @@
 //! The formulas of the kernels once more, in f64, one sample after the other: what the fast ones are held against.
 
 #[cfg(test)]
+#[path = "reference/density_tests.rs"]
 pub(crate) mod density;
 pub(crate) mod neus;
 pub(crate) mod sdf;
 #[cfg(test)]
+#[path = "reference/tape_tests.rs"]
 pub(crate) mod tape;
 pub(crate) mod vm;
 

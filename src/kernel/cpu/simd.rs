@@ -5,25 +5,6 @@
 //! that [`crate::dispatch!`] chooses at run time. `f32::mul_add` without hardware FMA is a library
 //! call, hence [`fma`].
 
-use std::sync::OnceLock;
-
-/// Does this CPU have AVX2, FMA and BMI2? Asked once.
-pub fn has_avx2_fma() -> bool {
-    static ANSWER: OnceLock<bool> = OnceLock::new();
-    *ANSWER.get_or_init(|| {
-        #[cfg(target_arch = "x86_64")]
-        {
-            std::is_x86_feature_detected!("avx2")
-                && std::is_x86_feature_detected!("fma")
-                && std::is_x86_feature_detected!("bmi2")
-        }
-        #[cfg(not(target_arch = "x86_64"))]
-        {
-            false
-        }
-    })
-}
-
 /// Declares `fn name(args)` that runs `body::<HAS_FMA>(args)` compiled for the best level this CPU has.
 #[macro_export]
 macro_rules! dispatch {
@@ -34,7 +15,10 @@ macro_rules! dispatch {
             {
                 #[target_feature(enable = "avx2,fma,bmi2")]
                 fn v3($($a: $t),*) { $body::<true>($($a),*) }
-                if $crate::kernel::cpu::simd::has_avx2_fma() {
+                if std::is_x86_feature_detected!("avx2")
+                    && std::is_x86_feature_detected!("fma")
+                    && std::is_x86_feature_detected!("bmi2")
+                {
                     // SAFETY: the features were found on this CPU at run time.
                     return unsafe { v3($($a),*) };
                 }

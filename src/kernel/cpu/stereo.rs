@@ -115,8 +115,8 @@ struct Projected {
 }
 
 /// Displacement of a patch in footprints, and its slope along both axes.
-#[derive(Clone, Copy, Default)]
-struct Place {
+#[derive(Clone, Copy)]
+struct Displacement {
     shift: f32,
     tilt: Vec2,
 }
@@ -144,9 +144,9 @@ impl Projected {
 
     /// Looks the patch up: brightness with mean 0 and length 1. False, and zeros, where it leaves the picture or its
     /// usable part, or shows nothing.
-    fn look_up(&self, view: &StereoView, place: Place, patch: &mut [f32; PATCH]) -> bool {
-        let center = self.center + place.shift * (self.slope + place.shift * self.bend) - 0.5;
-        let [a, b] = [0, 1].map(|k| self.axes[k] + place.tilt[k] * self.slope);
+    fn look_up(&self, view: &StereoView, at: Displacement, patch: &mut [f32; PATCH]) -> bool {
+        let center = self.center + at.shift * (self.slope + at.shift * self.bend) - 0.5;
+        let [a, b] = [0, 1].map(|k| self.axes[k] + at.tilt[k] * self.slope);
         let (w, h) = (view.camera.width as usize, view.camera.height as usize);
         let extent = HALF as f32 * (a.abs() + b.abs());
         let (low, high) = (center - extent, center + extent);
@@ -165,8 +165,8 @@ impl Projected {
                 let (x, y) = (row.x + i as f32 * a.x, row.y + i as f32 * a.y);
                 let (cx, cy) = (x as usize, y as usize);
                 let (fx, fy) = (x - cx as f32, y - cy as f32);
-                let at = cy * w + cx;
-                let (top, bottom) = (&view.gray[at..at + 2], &view.gray[at + w..at + w + 2]);
+                let corner = cy * w + cx;
+                let (top, bottom) = (&view.gray[corner..][..2], &view.gray[corner + w..][..2]);
                 let (t, u) = (top[0] + fx * (top[1] - top[0]), bottom[0] + fx * (bottom[1] - bottom[0]));
                 patch[k] = t + fy * (u - t);
                 sum += patch[k];
@@ -189,28 +189,28 @@ impl Projected {
 /// A surfel in the photographs that see it.
 struct Matching<'a> {
     views: &'a [StereoView],
-    seen: Vec<Projected>,
+    visible: Vec<Projected>,
     patches: Vec<[f32; PATCH]>,
 }
 
 impl Matching<'_> {
     /// Mean correlation of all pairs.
-    fn score(&mut self, place: Place) -> f32 {
+    fn score(&mut self, displacement: Displacement) -> f32 {
         let mut sum = [0f32; PATCH];
         let mut shown = 0;
-        for (p, patch) in self.seen.iter().zip(&mut self.patches) {
-            shown += i32::from(p.look_up(&self.views[p.view], place, patch));
+        for (p, patch) in self.visible.iter().zip(&mut self.patches) {
+            shown += i32::from(p.look_up(&self.views[p.view], displacement, patch));
             (0..PATCH).for_each(|k| sum[k] += patch[k]);
         }
-        let n = self.seen.len() as f32;
+        let n = self.visible.len() as f32;
         let square: f32 = sum.iter().map(|s| s * s).sum();
         (square - shown as f32) / (n * (n - 1.0))
     }
 
-    /// Leaves photographs out that do not fit the others at a place. Returns whether all fitted.
-    fn keep_fitting(&mut self, place: Place) -> bool {
-        self.score(place);
-        let n = self.seen.len();
+    /// Leaves photographs out that do not fit the others at a displacement. Returns whether all fitted.
+    fn keep_fitting(&mut self, displacement: Displacement) -> bool {
+        self.score(displacement);
+        let n = self.visible.len();
         let fits = |v: usize| {
             let with = |w: usize| (0..PATCH).map(|k| self.patches[v][k] * self.patches[w][k]).sum::<f32>();
             // the better half of the others: an outlier among them should not condemn this one
@@ -219,18 +219,18 @@ impl Matching<'_> {
             let best = &others[..others.len().div_ceil(2)];
             best.iter().sum::<f32>() / best.len() as f32 >= LEAST_FIT
         };
-        let kept: Vec<Projected> = (0..n).filter(|&v| fits(v)).map(|v| self.seen[v]).collect();
+        let kept: Vec<Projected> = (0..n).filter(|&v| fits(v)).map(|v| self.visible[v]).collect();
         self.patches.truncate(kept.len());
-        self.seen = kept;
-        self.seen.len() == n
+        self.visible = kept;
+        self.visible.len() == n
     }
 
     /// The shift of the highest peak over the range, and the step between shifts. `None` where it is not inside or not
     /// alone, or where the views are too much alike to tell.
     fn search(&mut self) -> Option<(f32, f32)> {
         let mut widest = 0f32;
-        for (i, a) in self.seen.iter().enumerate() {
-            for b in &self.seen[..i] {
+        for (i, a) in self.visible.iter().enumerate() {
+            for b in &self.visible[..i] {
                 widest = widest.max(a.slope.distance(b.slope));
             }
         }
@@ -240,7 +240,7 @@ impl Matching<'_> {
         }
         let (n, step) = (steps as i32, REACH / steps);
         let scores: Vec<f32> =
-            (-n..=n).map(|k| self.score(Place { shift: k as f32 * step, ..Place::default() })).collect();
+            (-n..=n).map(|k| self.score(Displacement { shift: k as f32 * step, tilt: Vec2::ZERO })).collect();
         let best = (0..scores.len()).max_by(|&a, &b| scores[a].total_cmp(&scores[b]))?;
         if best == 0 || best + 1 == scores.len() {
             return None;
@@ -253,33 +253,35 @@ impl Matching<'_> {
     }
 
     /// The peak near a shift, with its score and second derivative.
-    fn refine(&mut self, shift: f32, mut step: f32) -> Option<(Place, f32, f32)> {
-        let mut place = Place { shift, ..Place::default() };
+    fn refine(&mut self, shift: f32, mut step: f32) -> Option<(Displacement, f32, f32)> {
+        let mut at = Displacement { shift, tilt: Vec2::ZERO };
         for _ in 0..ROUNDS {
-            let around = [-step, 0.0, step].map(|d| self.score(Place { shift: place.shift + d, ..place }));
-            place.shift += step * toward(around);
+            at.shift += step * steps_to_peak(self.scores_around(at, step));
             step = (0.6 * step).max(0.1);
             for k in 0..2 {
                 let around = [-TILT, 0.0, TILT].map(|d| {
-                    let mut tilt = place.tilt;
+                    let mut tilt = at.tilt;
                     tilt[k] += d;
-                    self.score(Place { tilt, ..place })
+                    self.score(Displacement { tilt, ..at })
                 });
-                place.tilt[k] = (place.tilt[k] + TILT * toward(around)).clamp(-MOST_TILT, MOST_TILT);
+                at.tilt[k] = (at.tilt[k] + TILT * steps_to_peak(around)).clamp(-MOST_TILT, MOST_TILT);
             }
         }
         // the tilt moved the peak a little
-        let around = [-step, 0.0, step].map(|d| self.score(Place { shift: place.shift + d, ..place }));
-        place.shift += step * toward(around);
-        let around = [-step, 0.0, step].map(|d| self.score(Place { shift: place.shift + d, ..place }));
-        let (offset, score, curvature) = parabola(around, step)?;
-        place.shift += offset;
-        Some((place, score, curvature))
+        at.shift += step * steps_to_peak(self.scores_around(at, step));
+        let (offset, score, curvature) = parabola(self.scores_around(at, step), step)?;
+        at.shift += offset;
+        Some((at, score, curvature))
+    }
+
+    /// Scores with the shift one `step` less, as it is, and one more.
+    fn scores_around(&mut self, at: Displacement, step: f32) -> [f32; 3] {
+        [-step, 0.0, step].map(|d| self.score(Displacement { shift: at.shift + d, ..at }))
     }
 }
 
 /// How many steps to go from the middle of three values towards their peak, one at most.
-fn toward([before, middle, after]: [f32; 3]) -> f32 {
+fn steps_to_peak([before, middle, after]: [f32; 3]) -> f32 {
     let (slope, curvature) = (0.5 * (after - before), 2.0 * middle - before - after);
     if curvature > 1e-6 { (slope / curvature).clamp(-1.0, 1.0) } else { slope.signum() }
 }
@@ -296,7 +298,7 @@ fn parabola([before, middle, after]: [f32; 3], step: f32) -> Option<(f32, f32, f
 }
 
 /// Views that see a surfel, most frontal first.
-fn seen_by(views: &[StereoView], s: &Surfel) -> Vec<usize> {
+fn visible_in(views: &[StereoView], s: &Surfel) -> Vec<usize> {
     let sees = |view: &StereoView| {
         let way = view.camera.position.as_vec3() - s.position;
         let cosine = way.normalize().dot(s.normal);
@@ -311,59 +313,54 @@ fn seen_by(views: &[StereoView], s: &Surfel) -> Vec<usize> {
         let reach = (REACH + 1.5 * view.cell as f32) * depth / view.camera.fx as f32;
         (view.usable[y * w + x] && depth <= nearest + reach).then_some(cosine)
     };
-    let mut seen: Vec<(f32, usize)> =
+    let mut visible: Vec<(f32, usize)> =
         views.iter().enumerate().filter_map(|(v, view)| Some((sees(view)?, v))).collect();
-    seen.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-    seen.into_iter().map(|(_, v)| v).collect()
+    visible.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    visible.into_iter().map(|(_, v)| v).collect()
 }
 
-/// Length of a pixel of a camera at a point.
-fn footprint(camera: &Camera, point: Vec3) -> Option<f32> {
-    camera.project(point).map(|(_, depth)| depth / camera.fx as f32)
+/// Views that see a surfel, where enough of them do, most frontal first, and the length of a pixel of the first there.
+fn frontal(views: &[StereoView], s: &Surfel) -> Option<(Vec<usize>, f32)> {
+    let visible = Some(visible_in(views, s)).filter(|visible| visible.len() >= LEAST_VIEWS)?;
+    let camera = &views[visible[0]].camera;
+    let (_, depth) = camera.project(s.position)?;
+    Some((visible, depth / camera.fx as f32))
 }
 
 /// Length of a pixel at a surfel, where `view` is the most frontal of the views that see it and enough of them do:
-/// of all views that find a place one keeps it.
+/// of all views that find a point one keeps it.
 pub fn owned(views: &[StereoView], view: usize, s: &Surfel) -> Option<f32> {
-    let seen = seen_by(views, s);
-    if seen.len() < LEAST_VIEWS || seen[0] != view {
-        return None;
-    }
-    footprint(&views[view].camera, s.position)
+    frontal(views, s).filter(|(visible, _)| visible[0] == view).map(|(_, footprint)| footprint)
 }
 
 fn match_one(views: &[StereoView], s: &Surfel) -> Option<StereoPoint> {
-    let seen = seen_by(views, s);
-    if seen.len() < LEAST_VIEWS {
-        return None;
-    }
-    let footprint = footprint(&views[seen[0]].camera, s.position)?;
+    let (visible, footprint) = frontal(views, s)?;
     let first = s.normal.any_orthonormal_vector();
     let axes = [first, s.normal.cross(first)];
-    let seen: Vec<Projected> = seen
+    let visible: Vec<Projected> = visible
         .into_iter()
         .take(MOST_VIEWS)
         .filter_map(|v| Projected::new(v, &views[v].camera, s, axes, footprint))
         .collect();
-    if seen.len() < LEAST_VIEWS {
+    if visible.len() < LEAST_VIEWS {
         return None;
     }
-    let mut matching = Matching { views, patches: vec![[0f32; PATCH]; seen.len()], seen };
+    let mut matching = Matching { views, patches: vec![[0f32; PATCH]; visible.len()], visible };
     let (mut shift, mut step) = matching.search()?;
-    if !matching.keep_fitting(Place { shift, ..Place::default() }) {
-        if matching.seen.len() < LEAST_VIEWS {
+    if !matching.keep_fitting(Displacement { shift, tilt: Vec2::ZERO }) {
+        if matching.visible.len() < LEAST_VIEWS {
             return None;
         }
         (shift, step) = matching.search()?;
     }
-    let (place, score, curvature) = matching.refine(shift, step)?;
+    let (at, score, curvature) = matching.refine(shift, step)?;
     let sigma = ((1.0 - score).max(0.0) / curvature).sqrt();
-    if score < LEAST_SCORE || sigma > MOST_SIGMA || place.shift.abs() > REACH {
+    if score < LEAST_SCORE || sigma > MOST_SIGMA || at.shift.abs() > REACH {
         return None;
     }
     Some(StereoPoint {
-        position: s.position + place.shift * footprint * s.normal,
-        normal: (s.normal - place.tilt.x * axes[0] - place.tilt.y * axes[1]).normalize(),
+        position: s.position + at.shift * footprint * s.normal,
+        normal: (s.normal - at.tilt.x * axes[0] - at.tilt.y * axes[1]).normalize(),
         footprint,
         sigma,
     })

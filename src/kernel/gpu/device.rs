@@ -423,7 +423,7 @@ pub(crate) mod tests {
         (0..8).for_each(|_| set(1));
         set(70_000);
         (0..8).for_each(|_| set(1));
-        let e = device.fetch::<f32>(&out).err().expect("a launch was lost");
+        let e = device.fetch::<f32>(&out).expect_err("a launch was lost");
         println!("{e}: {}", e.hint());
         assert!(e.kind() as i32 == 1 && e.to_string().contains("65535"), "{e}");
         // what comes after it is done
@@ -445,7 +445,7 @@ pub(crate) mod tests {
         for out in &all {
             launch!(device, set::launch, CubeCount::new_1d(1), 64; out);
         }
-        let e = device.fetch::<f32>(&all[63]).err().expect("64 of the largest buffers do not fit in a GiB");
+        let e = device.fetch::<f32>(&all[63]).expect_err("64 of the largest buffers do not fit in a GiB");
         println!("{e}: {}", e.hint());
         assert!(e.kind() as i32 == 75 && e.hint().contains("--memory"), "{e}");
     }

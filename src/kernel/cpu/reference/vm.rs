@@ -9,7 +9,7 @@ use std::array::from_fn;
 /// Plane times line of every channel at a point.
 pub(crate) fn products<R: Real>(f: &VmField, grid: &Grid, values: &[R], p: [f64; 3]) -> Vec<R> {
     let l = &f.lattice;
-    let place = |a: usize| {
+    let cell = |a: usize| {
         let last = (grid.size[a] - 1) as f64;
         let u = (p[a] - l.min[a] as f64) / (l.max[a] as f64 - l.min[a] as f64) * last;
         let u = u.clamp(0.0, last);
@@ -19,8 +19,8 @@ pub(crate) fn products<R: Real>(f: &VmField, grid: &Grid, values: &[R], p: [f64;
     let mut out = Vec::new();
     for i in 0..3 {
         let (pl, li) = (grid.plane(i), grid.line(i));
-        let ((x0, fx), (y0, fy)) = (place(PLANE_AXES[i].0), place(PLANE_AXES[i].1));
-        let (z0, fz) = place(LINE_AXIS[i]);
+        let ((x0, fx), (y0, fy)) = (cell(PLANE_AXES[i].0), cell(PLANE_AXES[i].1));
+        let (z0, fz) = cell(LINE_AXIS[i]);
         for c in 0..grid.rank[i] {
             let at = |y: usize, x: usize| values[pl.start + (y * pl.width + x) * pl.channels + c];
             let mix = |a: R, b: R, t: f64| R::of(1.0 - t) * a + R::of(t) * b;

@@ -3,8 +3,9 @@
 use super::{Activations, CHUNK, WIDTH};
 use crate::dispatch;
 use crate::kernel::cpu::hash;
+use crate::kernel::cpu::matrix::add_to;
 use crate::kernel::cpu::mlp::{
-    COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, SdfGradients, TILE, Weights,
+    COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
 };
 use crate::kernel::cpu::neus::SHORTEST;
 use crate::kernel::cpu::pool::Buffer;
@@ -14,11 +15,11 @@ use rayon::prelude::*;
 /// A piece of the backward.
 struct SdfBackwardTask<'a> {
     start: usize,
-    n: usize,
     g_out: &'a [f32],
     g_value: &'a mut [f32],       // [n, 2L], row-major, turned afterwards
     g_normal: &'a mut [[f32; 3]], // [n, 3]
-    gradients: SdfGradients,
+    /// Of the matrices, in [`Layout::gradient_shapes`](crate::kernel::cpu::mlp::Layout::gradient_shapes).
+    gradients: [Vec<f32>; 7],
 }
 
 #[inline(always)]
@@ -29,7 +30,7 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
     let features_padded = features.next_multiple_of(8);
     let inv_radius = 1.0 / a.shape.radius;
     let total = a.samples;
-    let g = &mut t.gradients;
+    let [g_w1, g_b1, g_w2, g_b2, g_c1_weights, g_c2_weights, g_c3_weights] = &mut t.gradients;
     let mut g_pre = [0f32; TILE * RGB_PADDED];
     let mut g_c2 = [0f32; TILE * HIDDEN];
     let mut g_c1 = [0f32; TILE * HIDDEN];
@@ -41,9 +42,9 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
     let mut weighted = [0f32; TILE * HIDDEN]; // a = w ⊙ s
     let mut g_a = [0f32; TILE * HIDDEN];
     let mut g_z = [0f32; TILE * HIDDEN];
-    for tile in 0..t.n.div_ceil(TILE) {
+    for tile in 0..t.g_normal.len().div_ceil(TILE) {
         let base = t.start + tile * TILE;
-        let rows = TILE.min(t.n - tile * TILE);
+        let rows = TILE.min(t.g_normal.len() - tile * TILE);
         let h = &a.h[base * HIDDEN..][..TILE * HIDDEN];
         let u = &a.u[base * kp..][..TILE * kp];
         let c0 = &a.c0[base * ci..][..TILE * ci];
@@ -60,17 +61,17 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
                 g_pre[r * RGB_PADDED + c] = g_out[r * WIDTH + 4 + c] * y * (1.0 - y);
             }
         }
-        gemm::<F>((4, HIDDEN, TILE), &g_pre, (1, RGB_PADDED), c2, HIDDEN, &mut g.c3, HIDDEN, true);
+        gemm::<F>((4, HIDDEN, TILE), &g_pre, (1, RGB_PADDED), c2, HIDDEN, g_c3_weights, HIDDEN, true);
         gemm::<F>((TILE, HIDDEN, 3), &g_pre, (RGB_PADDED, 1), &w.c3.m, HIDDEN, &mut g_c2, HIDDEN, false);
         for i in 0..TILE * HIDDEN {
             g_c2[i] = if c2[i] > 0.0 { g_c2[i] } else { 0.0 };
         }
-        gemm::<F>((HIDDEN, HIDDEN, TILE), &g_c2, (1, HIDDEN), c1, HIDDEN, &mut g.c2, HIDDEN, true);
+        gemm::<F>((HIDDEN, HIDDEN, TILE), &g_c2, (1, HIDDEN), c1, HIDDEN, g_c2_weights, HIDDEN, true);
         gemm::<F>((TILE, HIDDEN, HIDDEN), &g_c2, (HIDDEN, 1), &w.c2.m, HIDDEN, &mut g_c1, HIDDEN, false);
         for i in 0..TILE * HIDDEN {
             g_c1[i] = if c1[i] > 0.0 { g_c1[i] } else { 0.0 };
         }
-        gemm::<F>((HIDDEN, ci, TILE), &g_c1, (1, HIDDEN), c0, ci, &mut g.c1, ci, true);
+        gemm::<F>((HIDDEN, ci, TILE), &g_c1, (1, HIDDEN), c0, ci, g_c1_weights, ci, true);
         gemm::<F>((TILE, ci, HIDDEN), &g_c1, (HIDDEN, 1), &w.c1.m, ci, &mut g_c0, ci, false);
 
         // outputs of the geometry network and the spatial gradient
@@ -120,22 +121,22 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
         gemm::<F>((TILE, HIDDEN, kp), &g_q, (kp, 1), &w.w1.t, HIDDEN, &mut g_a, HIDDEN, false);
         let (go, op) = (&g_o, OUTPUTS_PADDED);
         gemm::<F>((TILE, HIDDEN, OUTPUTS), go, (op, 1), &w.w2.m, HIDDEN, &mut g_z, HIDDEN, false);
-        gemm::<F>((op, HIDDEN, TILE), go, (1, op), h, HIDDEN, &mut g.w2, HIDDEN, true);
+        gemm::<F>((op, HIDDEN, TILE), go, (1, op), h, HIDDEN, g_w2, HIDDEN, true);
         for r in 0..rows {
             for j in 0..op {
-                g.b2[j] += g_o[r * op + j];
+                g_b2[j] += g_o[r * op + j];
             }
             let row = r * HIDDEN..(r + 1) * HIDDEN;
             let (s, g_a, g_z) = (&s[row.clone()], &g_a[row.clone()], &mut g_z[row]);
             for j in 0..HIDDEN {
-                g.w2[j] += g_a[j] * s[j];
+                g_w2[j] += g_a[j] * s[j];
                 g_z[j] = s[j] * (g_z[j] + 100.0 * g_a[j] * w.w2.m[j] * (1.0 - s[j]));
-                g.b1[j] += g_z[j];
+                g_b1[j] += g_z[j];
             }
         }
         g_z[rows * HIDDEN..].fill(0.0);
-        gemm::<F>((HIDDEN, kp, TILE), &weighted, (1, HIDDEN), &g_q, kp, &mut g.w1, kp, true);
-        gemm::<F>((HIDDEN, kp, TILE), &g_z, (1, HIDDEN), u, kp, &mut g.w1, kp, true);
+        gemm::<F>((HIDDEN, kp, TILE), &weighted, (1, HIDDEN), &g_q, kp, g_w1, kp, true);
+        gemm::<F>((HIDDEN, kp, TILE), &g_z, (1, HIDDEN), u, kp, g_w1, kp, true);
         let wide = (TILE, features_padded, HIDDEN);
         gemm::<F>(wide, &g_z, (HIDDEN, 1), &w.w1.m, kp, &mut g_u, kp, false);
         for r in 0..rows {
@@ -162,6 +163,7 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
     let n = a.samples;
     assert_eq!(g_out.len(), n * WIDTH);
     let layout = w.layout;
+    let padded = layout.gradient_shapes();
     let mut flat = vec![0.0; layout.len()];
     if n == 0 {
         return flat;
@@ -177,16 +179,20 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
         .enumerate()
         .map(|(i, ((g_value, g_normal), g_out))| SdfBackwardTask {
             start: i * CHUNK,
-            n: g_normal.len(),
             g_out,
             g_value,
             g_normal,
-            gradients: SdfGradients::zeros(layout),
+            gradients: padded.map(|(rows, columns)| vec![0.0; rows * columns]),
         })
         .collect();
     tasks.par_iter_mut().for_each(|t| backward_task(t, a, w));
-    for t in &tasks {
-        t.gradients.add_to(layout, &mut flat);
+    for t in &mut tasks {
+        // columns of the first layer are `[hash, x]` in tiles
+        for row in t.gradients[0].chunks_exact_mut(layout.padded()) {
+            row[..layout.inputs].rotate_right(3);
+        }
+        let parts: [_; 7] = std::array::from_fn(|k| (&t.gradients[k][..], padded[k].1));
+        add_to(&mut flat, &layout.shapes(), &parts);
     }
     drop(tasks);
     let active = &a.shape.levels[..a.shape.active];

@@ -186,7 +186,7 @@ pub fn colors(
     assert_eq!(direction.len(), all(counts, x.len()));
     let mut rgb = vec![[0f32; 3]; direction.len()];
     let active = &shape.levels[..shape.active];
-    let (mut rest, mut ahead) = (&mut rgb[..], direction);
+    let (mut rgb_left, mut directions_left) = (&mut rgb[..], direction);
     for first in (0..x.len()).step_by(PASS) {
         let span = first..(first + PASS).min(x.len());
         let (x, normal, counts) = (&x[span.clone()], &normal[span.clone()], counts.map(|c| &c[span]));
@@ -199,17 +199,10 @@ pub fn colors(
             let own = start..(start + CHUNK).min(n);
             let counts = counts.map(|c| &c[own.clone()]);
             let colors = all(counts, own.len());
-            let (rgb, after) = rest.split_at_mut(colors);
-            let (direction, later) = ahead.split_at(colors);
-            (rest, ahead) = (after, later);
-            let normal = &normal[own.clone()];
-            tasks.push(ColorTask {
-                inputs: Inputs::new(shape, x, value, own),
-                normal,
-                counts,
-                direction,
-                rgb,
-            });
+            let rgb = rgb_left.split_off_mut(..colors).expect("a color for each direction");
+            let direction = directions_left.split_off(..colors).expect("as many as were counted");
+            let (normal, inputs) = (&normal[own.clone()], Inputs::new(shape, x, value, own));
+            tasks.push(ColorTask { inputs, normal, counts, direction, rgb });
         }
         tasks.par_iter_mut().for_each(|task| color_task(task, weights));
     }

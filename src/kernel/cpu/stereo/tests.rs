@@ -136,19 +136,19 @@ fn a_point_is_seen_where_nothing_lies_before_it_and_owned_by_the_most_frontal_vi
     let cameras = cameras();
     let mut views = photographs(&cameras, |_, _| 0.0, |_, p| texture(1, p));
     let s = Surfel { position: Vec3::ZERO, normal: Vec3::Z };
-    assert_eq!(seen_by(&views, &s).len(), 7);
-    assert_eq!(seen_by(&views, &s)[0], 6);
+    assert_eq!(visible_in(&views, &s).len(), 7);
+    assert_eq!(visible_in(&views, &s)[0], 6);
     // a pixel is 3 / 150
     assert!((owned(&views, 6, &s).unwrap() - 0.02).abs() < 1e-4);
     assert_eq!(owned(&views, 0, &s), None);
     // something 0.5 before it; the tolerance is 5 + 6 pixels, 0.22
     views[6].depth.iter_mut().for_each(|d| *d -= 0.5);
-    assert!(!seen_by(&views, &s).contains(&6));
+    assert!(!visible_in(&views, &s).contains(&6));
     // a pixel that may not be used
     views[3].usable.fill(false);
-    assert_eq!(seen_by(&views, &s).len(), 5);
+    assert_eq!(visible_in(&views, &s).len(), 5);
     // turned away
-    assert!(seen_by(&views, &Surfel { normal: -Vec3::Z, ..s }).is_empty());
+    assert!(visible_in(&views, &Surfel { normal: -Vec3::Z, ..s }).is_empty());
 }
 
 #[test]
@@ -170,8 +170,8 @@ fn a_point_that_its_neighbors_contradict_is_dropped() {
 #[test]
 fn the_peak_of_a_parabola() {
     // 1 − (x − 0.25)² at −1, 0, 1
-    assert_eq!(toward([-0.5625, 0.9375, 0.4375]), 0.25);
-    assert_eq!(toward([0.0, 0.5, 0.9]), 1.0);
+    assert_eq!(steps_to_peak([-0.5625, 0.9375, 0.4375]), 0.25);
+    assert_eq!(steps_to_peak([0.0, 0.5, 0.9]), 1.0);
     let (offset, value, curvature) = parabola([-0.5625, 0.9375, 0.4375], 1.0).unwrap();
     assert_eq!((offset, value, curvature), (0.25, 1.0, 2.0));
     assert_eq!(parabola([0.0, 0.5, 0.6], 1.0), None);

@@ -55,21 +55,15 @@ impl DecoderShape {
         self.shapes().iter().map(|(o, i)| o * i).sum()
     }
 
-    /// Never: a network has weights. (Beside `len` by convention.)
-    pub fn is_empty(&self) -> bool {
-        false
+    /// Widths of hidden layers, products, features and inputs as stored in tiles.
+    fn padded(&self) -> [usize; 4] {
+        [self.hidden, self.channels, self.features, self.inputs()].map(|n| n.next_multiple_of(8))
     }
 
-    fn products_padded(&self) -> usize {
-        self.channels.next_multiple_of(8)
-    }
-
-    fn features_padded(&self) -> usize {
-        self.features.next_multiple_of(8)
-    }
-
-    fn inputs_padded(&self) -> usize {
-        self.inputs().next_multiple_of(8)
+    /// Shapes in which tiles sum gradients: padded, three color channels as four.
+    fn gradient_shapes(&self) -> [(usize, usize); 7] {
+        let [h, products, features, inputs] = self.padded();
+        [(features, products), (h, inputs), (h, 1), (h, h), (h, 1), (4, h), (3, 1)]
     }
 }
 
@@ -93,11 +87,11 @@ impl DecoderWeights {
         assert!(shape.hidden.is_multiple_of(8), "hidden layers are a multiple of 8 wide");
         let shapes = shape.shapes();
         let [basis, w1, b1, w2, b2, w3, b3] = split(flat, shapes);
-        let h = shape.hidden;
+        let [h, cp, fp, ip] = shape.padded();
         DecoderWeights {
             shape,
-            basis: Matrix::new(basis, shapes[0], (shape.features_padded(), shape.products_padded())),
-            w1: Matrix::new(w1, shapes[1], (h, shape.inputs_padded())),
+            basis: Matrix::new(basis, shapes[0], (fp, cp)),
+            w1: Matrix::new(w1, shapes[1], (h, ip)),
             b1: b1.to_vec(),
             w2: Matrix::new(w2, shapes[3], (h, h)),
             b2: b2.to_vec(),
@@ -169,7 +163,7 @@ fn relu(rows: &mut [f32], bias: &[f32]) {
 #[inline(always)]
 fn forward_body<const F: bool>(t: &mut DecodeTask, w: &DecoderWeights, lookup: &super::gather::Lookup) {
     let s = &w.shape;
-    let (h, cp, fp, ip) = (s.hidden, s.products_padded(), s.features_padded(), s.inputs_padded());
+    let [h, cp, fp, ip] = s.padded();
     let n = t.cells.len();
     let mut products = vec![0f32; TILE * cp];
     let mut features = vec![0f32; TILE * fp];
@@ -223,7 +217,7 @@ pub(super) fn decode(
     assert_eq!(s.channels, grid.channels());
     let n = cells.len();
     let np = n.next_multiple_of(TILE);
-    let (h, cp, ip) = (s.hidden, s.products_padded(), s.inputs_padded());
+    let [h, cp, _, ip] = s.padded();
     let lookup = super::gather::Lookup::new(grid, values);
     let mut planes = Buffer::scratch(n * cp);
     let mut lines = Buffer::scratch(n * cp);
@@ -246,49 +240,7 @@ pub(super) fn decode(
     Decoded { cells, planes, lines, inputs, h1, h2, rgb }
 }
 
-/// Gradients of the matrices as tiles accumulate them (padded).
-struct DecoderGradients {
-    basis: Vec<f32>, // [fp, cp]
-    w1: Vec<f32>,    // [h, ip]
-    b1: Vec<f32>,
-    w2: Vec<f32>,
-    b2: Vec<f32>,
-    w3: Vec<f32>, // [4, h]
-    b3: [f32; 3],
-}
-
-impl DecoderGradients {
-    fn zeros(s: &DecoderShape) -> DecoderGradients {
-        let h = s.hidden;
-        DecoderGradients {
-            basis: vec![0.0; s.features_padded() * s.products_padded()],
-            w1: vec![0.0; h * s.inputs_padded()],
-            b1: vec![0.0; h],
-            w2: vec![0.0; h * h],
-            b2: vec![0.0; h],
-            w3: vec![0.0; 4 * h],
-            b3: [0.0; 3],
-        }
-    }
-
-    fn add_to(&self, s: &DecoderShape, flat: &mut [f32]) {
-        let h = s.hidden;
-        let parts: [(&[f32], usize); 7] = [
-            (&self.basis, s.products_padded()),
-            (&self.w1, s.inputs_padded()),
-            (&self.b1, 1),
-            (&self.w2, h),
-            (&self.b2, 1),
-            (&self.w3, h),
-            (&self.b3, 1),
-        ];
-        add_to(flat, &s.shapes(), &parts);
-    }
-}
-
 struct DecodeBackwardTask<'a> {
-    start: usize,
-    n: usize,
     g_rgb: &'a [[f32; 3]],
     planes: &'a mut [f32],
     lines: &'a mut [f32],
@@ -296,7 +248,8 @@ struct DecodeBackwardTask<'a> {
     h1: &'a [f32],
     h2: &'a [f32],
     rgb: &'a [[f32; 3]],
-    gradients: DecoderGradients,
+    /// Of the matrices, in [`DecoderShape::gradient_shapes`].
+    gradients: [Vec<f32>; 7],
 }
 
 /// g where the activation let something through; adds the column sums to `bias`.
@@ -313,8 +266,8 @@ fn through_relu(g: &mut [f32], h: &[f32], bias: &mut [f32]) {
 #[inline(always)]
 fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) {
     let s = &w.shape;
-    let (h, cp, fp, ip) = (s.hidden, s.products_padded(), s.features_padded(), s.inputs_padded());
-    let g = &mut t.gradients;
+    let [h, cp, fp, ip] = s.padded();
+    let [g_basis, g_w1, g_b1, g_w2, g_b2, g_w3, g_b3] = &mut t.gradients;
     let mut g_pre = [0f32; TILE * RGB];
     let mut g_h2 = vec![0f32; TILE * h];
     let mut g_h1 = vec![0f32; TILE * h];
@@ -322,8 +275,8 @@ fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) 
     let mut g_features = vec![0f32; TILE * fp];
     let mut products = vec![0f32; TILE * cp];
     let mut g_products = vec![0f32; TILE * cp];
-    for base in (0..t.n).step_by(TILE) {
-        let rows = TILE.min(t.n - base);
+    for base in (0..t.rgb.len()).step_by(TILE) {
+        let rows = TILE.min(t.rgb.len() - base);
         let (h1, h2) = (&t.h1[base * h..][..TILE * h], &t.h2[base * h..][..TILE * h]);
         let inputs = &t.inputs[base * ip..][..TILE * ip];
         // rows beyond the last sample carry zero gradients and vanish
@@ -333,16 +286,16 @@ fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) 
                 let y = t.rgb[base + r][c];
                 let v = t.g_rgb[base + r][c] * y * (1.0 - y);
                 g_pre[r * RGB + c] = v;
-                g.b3[c] += v;
+                g_b3[c] += v;
             }
         }
-        gemm::<F>((4, h, TILE), &g_pre, (1, RGB), h2, h, &mut g.w3, h, true);
+        gemm::<F>((4, h, TILE), &g_pre, (1, RGB), h2, h, g_w3, h, true);
         gemm::<F>((TILE, h, 3), &g_pre, (RGB, 1), &w.w3.m, h, &mut g_h2, h, false);
-        through_relu(&mut g_h2, h2, &mut g.b2);
-        gemm::<F>((h, h, TILE), &g_h2, (1, h), h1, h, &mut g.w2, h, true);
+        through_relu(&mut g_h2, h2, g_b2);
+        gemm::<F>((h, h, TILE), &g_h2, (1, h), h1, h, g_w2, h, true);
         gemm::<F>((TILE, h, h), &g_h2, (h, 1), &w.w2.m, h, &mut g_h1, h, false);
-        through_relu(&mut g_h1, h1, &mut g.b1);
-        gemm::<F>((h, ip, TILE), &g_h1, (1, h), inputs, ip, &mut g.w1, ip, true);
+        through_relu(&mut g_h1, h1, g_b1);
+        gemm::<F>((h, ip, TILE), &g_h1, (1, h), inputs, ip, g_w1, ip, true);
         gemm::<F>((TILE, ip, h), &g_h1, (h, 1), &w.w1.m, ip, &mut g_in, ip, false);
         // back through the features' encoding; nothing asks for the direction's gradient
         g_features.fill(0.0);
@@ -367,7 +320,7 @@ fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) 
             }
         }
         products[rows * cp..].fill(0.0);
-        gemm::<F>((fp, cp, TILE), &g_features, (1, fp), &products, cp, &mut g.basis, cp, true);
+        gemm::<F>((fp, cp, TILE), &g_features, (1, fp), &products, cp, g_basis, cp, true);
         gemm::<F>((TILE, cp, fp), &g_features, (fp, 1), &w.basis.m, cp, &mut g_products, cp, false);
         for r in 0..rows {
             let (p, l) = (&mut t.planes[(base + r) * cp..][..cp], &mut t.lines[(base + r) * cp..][..cp]);
@@ -392,7 +345,8 @@ pub(super) fn decode_backward(
 ) -> Vec<f32> {
     let s = &w.shape;
     let n = decoded.cells.len();
-    let (h, cp, ip) = (s.hidden, s.products_padded(), s.inputs_padded());
+    let [h, cp, _, ip] = s.padded();
+    let padded_shapes = s.gradient_shapes();
     let d = &mut decoded;
     let mut tasks: Vec<DecodeBackwardTask> = d
         .planes
@@ -401,27 +355,24 @@ pub(super) fn decode_backward(
         .enumerate()
         .map(|(i, (planes, lines))| {
             let start = i * CHUNK;
-            let count = CHUNK.min(n - start);
-            let all = count.next_multiple_of(TILE);
+            let own = start..(start + CHUNK).min(n);
             DecodeBackwardTask {
-                start,
-                n: count,
-                g_rgb: &g_rgb[start..start + count],
+                g_rgb: &g_rgb[own.clone()],
                 planes,
                 lines,
-                inputs: &d.inputs[start * ip..(start + all) * ip],
-                h1: &d.h1[start * h..(start + all) * h],
-                h2: &d.h2[start * h..(start + all) * h],
-                rgb: &d.rgb[start..start + count],
-                gradients: DecoderGradients::zeros(s),
+                inputs: &d.inputs[start * ip..],
+                h1: &d.h1[start * h..],
+                h2: &d.h2[start * h..],
+                rgb: &d.rgb[own],
+                gradients: padded_shapes.map(|(rows, columns)| vec![0.0; rows * columns]),
             }
         })
         .collect();
     tasks.par_iter_mut().for_each(|t| backward_task(t, w));
     let mut flat = vec![0f32; s.len()];
     for task in &tasks {
-        debug_assert!(task.start < n);
-        task.gradients.add_to(s, &mut flat);
+        let parts: [_; 7] = std::array::from_fn(|k| (&task.gradients[k][..], padded_shapes[k].1));
+        add_to(&mut flat, &s.shapes(), &parts);
     }
     drop(tasks);
     let spread = Spread { cells: &decoded.cells, planes: &decoded.planes, lines: &decoded.lines, stride: cp };

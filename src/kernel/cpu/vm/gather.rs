@@ -1,6 +1,6 @@
 //! Looking up planes and lines, and spreading gradients back onto them.
 
-use super::{Grid, LINE_AXIS, PLANE_AXES};
+use super::{Factor, Grid, LINE_AXIS, PLANE_AXES};
 use crate::dispatch;
 use crate::kernel::cpu::simd::fma;
 use rayon::prelude::*;
@@ -42,18 +42,6 @@ struct Term<'a> {
     line: &'a [f32],
     width: usize,
     channels: usize,
-}
-
-fn terms<'a>(grid: &Grid, values: &'a [f32]) -> [Term<'a>; 3] {
-    std::array::from_fn(|i| {
-        let plane = grid.plane(i);
-        Term {
-            plane: &values[plane.range()],
-            line: &values[grid.line(i).range()],
-            width: plane.width,
-            channels: plane.channels,
-        }
-    })
 }
 
 #[inline(always)]
@@ -98,28 +86,16 @@ fn look_up<const F: bool, const W: usize>(
 
 /// Runs `body` over the channels of a term in the widest pieces that fit.
 macro_rules! in_pieces {
-    ($channels:expr, $c:ident, $width:ident, $body:block) => {{
+    ($channels:expr, $c:ident, $width:ident, $body:block) => {
+        in_pieces!([16, 8, 4, 1] $channels, $c, $width, $body)
+    };
+    ([$($widest:literal),+] $channels:expr, $c:ident, $width:ident, $body:block) => {{
         let mut $c = 0;
-        while $c + 16 <= $channels {
-            const $width: usize = 16;
+        $(while $channels - $c >= $widest {
+            const $width: usize = $widest;
             $body
-            $c += 16;
-        }
-        while $c + 8 <= $channels {
-            const $width: usize = 8;
-            $body
-            $c += 8;
-        }
-        while $c + 4 <= $channels {
-            const $width: usize = 4;
-            $body
-            $c += 4;
-        }
-        while $c < $channels {
-            const $width: usize = 1;
-            $body
-            $c += 1;
-        }
+            $c += $width;
+        })+
     }};
 }
 
@@ -132,7 +108,12 @@ pub(super) struct Lookup<'a> {
 impl<'a> Lookup<'a> {
     pub fn new(grid: &Grid, values: &'a [f32]) -> Lookup<'a> {
         assert_eq!(values.len(), grid.len(), "planes and lines do not fit their grid");
-        Lookup { terms: terms(grid, values), size: grid.size }
+        let terms = std::array::from_fn(|i| {
+            let (plane, line) = (grid.plane(i), grid.line(i));
+            let (width, channels) = (plane.width, plane.channels);
+            Term { plane: &values[plane.range()], line: &values[line.range()], width, channels }
+        });
+        Lookup { terms, size: grid.size }
     }
 
     pub fn size(&self) -> [usize; 3] {
@@ -270,25 +251,13 @@ const BANDS: usize = 6;
 pub(super) fn scatter(grid: &Grid, spread: &Spread, gradient: &mut [f32]) {
     assert_eq!(gradient.len(), grid.len());
     let mut bands = Vec::new();
-    let mut rest = gradient;
-    for line in [false, true] {
-        let mut first = 0;
-        for term in 0..3 {
-            let factor = if line { grid.line(term) } else { grid.plane(term) };
-            let (mut own, tail) = std::mem::take(&mut rest).split_at_mut(factor.len());
-            rest = tail;
-            let pitch = factor.width * factor.channels;
-            let rows = if line { 1 } else { factor.height.div_ceil(BANDS) };
-            let mut row = 0;
-            while factor.channels > 0 && row < factor.height {
-                let take = rows.min(factor.height - row);
-                let (values, more) = own.split_at_mut(take * pitch);
-                own = more;
-                let (channels, width) = (factor.channels, factor.width);
-                bands.push(Band { term, line, row, channels, first, width, values });
-                row += take;
-            }
-            first += grid.rank[term];
+    for (k, (factor, own)) in grid.split_mut(gradient).into_iter().enumerate() {
+        let (term, line) = (k % 3, k >= 3);
+        let Factor { height, width, channels, .. } = factor;
+        let first = grid.rank[..term].iter().sum();
+        let rows = if line { 1 } else { height.div_ceil(BANDS) };
+        for (i, values) in own.chunks_mut((rows * width * channels).max(1)).enumerate() {
+            bands.push(Band { term, line, row: i * rows, channels, first, width, values });
         }
     }
     bands.par_iter_mut().with_max_len(1).for_each(|band| spread_band(band, spread));

@@ -25,6 +25,11 @@ fn bit(bits: &[u64], i: usize) -> bool {
     bits[i >> 6] >> (i & 63) & 1 == 1
 }
 
+/// All cells of a box in their order.
+fn cells([nx, ny, nz]: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
+    (0..nx).flat_map(move |x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])))
+}
+
 impl BoxMask {
     /// From cells evaluated one by one.
     pub fn new(
@@ -33,31 +38,26 @@ impl BoxMask {
         size: [usize; 3],
         occupied: impl Fn([usize; 3]) -> bool,
     ) -> BoxMask {
-        let cells: usize = size.iter().product();
-        let mut mask = BoxMask { min, max, size, bits: vec![0; cells.div_ceil(64)], blocks: Vec::new() };
-        for x in 0..size[0] {
-            for y in 0..size[1] {
-                for z in 0..size[2] {
-                    if occupied([x, y, z]) {
-                        let i = mask.cell([x, y, z]);
-                        mask.bits[i >> 6] |= 1 << (i & 63);
-                    }
-                }
-            }
+        let mut bits = vec![0u64; size.iter().product::<usize>().div_ceil(64)];
+        for i in cells(size).enumerate().filter(|(_, c)| occupied(*c)).map(|(i, _)| i) {
+            bits[i >> 6] |= 1 << (i & 63);
         }
-        mask.group();
-        mask
+        BoxMask::from_bits(min, max, size, bits).expect("a bit for each cell")
     }
 
     /// From its bits, as [`BoxMask::bits`] gives them; `None` if they are not as many as the cells need.
     pub fn from_bits(min: [f32; 3], max: [f32; 3], size: [usize; 3], bits: Vec<u64>) -> Option<BoxMask> {
-        let cells = size.iter().try_fold(1usize, |n, &s| n.checked_mul(s))?;
-        if bits.len() != cells.div_ceil(64) {
+        let count = size.iter().try_fold(1usize, |n, &s| n.checked_mul(s))?;
+        if bits.len() != count.div_ceil(64) {
             return None;
         }
-        let mut mask = BoxMask { min, max, size, bits, blocks: Vec::new() };
-        mask.group();
-        Some(mask)
+        let b = size.map(|n| n.div_ceil(BLOCK));
+        let mut blocks = vec![0; (b[0] * b[1] * b[2]).div_ceil(64)];
+        for [x, y, z] in cells(size).enumerate().filter(|(i, _)| bit(&bits, *i)).map(|(_, c)| c) {
+            let i = ((x / BLOCK) * b[1] + y / BLOCK) * b[2] + z / BLOCK;
+            blocks[i >> 6] |= 1 << (i & 63);
+        }
+        Some(BoxMask { min, max, size, bits, blocks })
     }
 
     /// Cells around vertices: a cell is occupied if one of its eight corners is. `vertices` are
@@ -77,21 +77,6 @@ impl BoxMask {
                     && vertices[((v[0] - 1) * size[1] + v[1] - 1) * size[2] + v[2] - 1]
             })
         })
-    }
-
-    fn group(&mut self) {
-        let b = self.size.map(|n| n.div_ceil(BLOCK));
-        self.blocks = vec![0; (b[0] * b[1] * b[2]).div_ceil(64)];
-        for x in 0..self.size[0] {
-            for y in 0..self.size[1] {
-                for z in 0..self.size[2] {
-                    if bit(&self.bits, self.cell([x, y, z])) {
-                        let i = ((x / BLOCK) * b[1] + y / BLOCK) * b[2] + z / BLOCK;
-                        self.blocks[i >> 6] |= 1 << (i & 63);
-                    }
-                }
-            }
-        }
     }
 
     fn cell(&self, c: [usize; 3]) -> usize {
@@ -170,19 +155,27 @@ impl Lattice {
         }
     }
 
-    /// Where a ray enters and leaves the box; zero components of its direction count as 1e-6, as published.
+    /// Where a ray enters and leaves the box.
     #[inline(always)]
     fn crossing(&self, ray: &MarchRay) -> Option<(f32, f32)> {
-        let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
-        for a in 0..3 {
-            let d = if ray.direction[a] == 0.0 { 1e-6 } else { ray.direction[a] };
-            let (p, q) = ((self.min[a] - ray.origin[a]) / d, (self.max[a] - ray.origin[a]) / d);
-            enter = enter.max(p.min(q));
-            leave = leave.min(p.max(q));
-        }
+        let (enter, leave) = crossing([self.min, self.max], ray.origin, ray.direction);
         // also refuses NaN
         (enter <= leave).then_some((enter, leave))
     }
+}
+
+/// Where a line enters and leaves a box, the first behind the second where it misses; zero components of its direction
+/// count as 1e-6, as published.
+#[inline(always)]
+pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3]) -> (f32, f32) {
+    let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
+    for a in 0..3 {
+        let d = if direction[a] == 0.0 { 1e-6 } else { direction[a] };
+        let (p, q) = ((low[a] - origin[a]) / d, (high[a] - origin[a]) / d);
+        enter = enter.max(p.min(q));
+        leave = leave.min(p.max(q));
+    }
+    (enter, leave)
 }
 
 /// The lattice points of a ray inside the box and inside a mask, one after the other.

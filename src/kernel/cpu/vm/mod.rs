@@ -73,34 +73,39 @@ impl Factor {
 }
 
 impl Grid {
+    /// The three planes, then the three lines, as they follow each other.
+    pub fn factors(&self) -> [Factor; 6] {
+        let mut start = 0;
+        std::array::from_fn(|k| {
+            let (term, is_plane) = (k % 3, k < 3);
+            let (w, h) = PLANE_AXES[term];
+            let width = self.size[if is_plane { w } else { LINE_AXIS[term] }];
+            let height = if is_plane { self.size[h] } else { 1 };
+            let factor = Factor { start, height, width, channels: self.rank[term] };
+            start += factor.len();
+            factor
+        })
+    }
+
     /// The plane of term `i`.
     pub fn plane(&self, i: usize) -> Factor {
-        let before: usize = (0..i).map(|j| self.plane_len(j)).sum();
-        let (w, h) = PLANE_AXES[i];
-        Factor { start: before, height: self.size[h], width: self.size[w], channels: self.rank[i] }
+        self.factors()[i]
     }
 
     /// The line of term `i`.
     pub fn line(&self, i: usize) -> Factor {
-        let planes: usize = (0..3).map(|j| self.plane_len(j)).sum();
-        let before: usize = (0..i).map(|j| self.size[LINE_AXIS[j]] * self.rank[j]).sum();
-        Factor { start: planes + before, height: 1, width: self.size[LINE_AXIS[i]], channels: self.rank[i] }
+        self.factors()[3 + i]
     }
 
-    fn plane_len(&self, i: usize) -> usize {
-        let (w, h) = PLANE_AXES[i];
-        self.size[w] * self.size[h] * self.rank[i]
+    /// Cuts a flat array into its planes and lines.
+    fn split_mut<'a>(&self, mut flat: &'a mut [f32]) -> [(Factor, &'a mut [f32]); 6] {
+        self.factors().map(|f| (f, flat.split_off_mut(..f.len()).expect("a float for each of the grid's")))
     }
 
     /// Floats of all planes and lines.
     pub fn len(&self) -> usize {
         let last = self.line(2);
         last.start + last.len()
-    }
-
-    /// Has it no channel at all?
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 
     /// Channels of all terms together.

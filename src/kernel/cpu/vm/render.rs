@@ -186,12 +186,12 @@ pub fn render(
     let total = tasks.iter().map(|t| t.kept.len()).sum();
     let mut kept = Vec::with_capacity(total);
     let mut cells = Vec::with_capacity(total);
-    let mut offsets = Vec::with_capacity(rays.len() + 1);
-    let mut density_samples = 0;
-    offsets.push(0u32);
+    let mut offsets = vec![0u32];
+    let (mut end, mut density_samples) = (0, 0);
     for task in tasks {
         for count in task.counts {
-            offsets.push(offsets.last().copied().unwrap_or(0) + count);
+            end += count;
+            offsets.push(end);
         }
         kept.extend_from_slice(&task.kept);
         cells.extend_from_slice(&task.cells);

@@ -8,20 +8,14 @@ use rayon::prelude::*;
 pub fn resized(from: &Grid, values: &[f32], to: &Grid) -> Vec<f32> {
     assert!(values.len() == from.len() && from.rank == to.rank);
     let mut out = vec![0f32; to.len()];
-    let mut rest = out.as_mut_slice();
-    for line in [false, true] {
-        for i in 0..3 {
-            let (a, b) = if line { (from.line(i), to.line(i)) } else { (from.plane(i), to.plane(i)) };
-            let (own, tail) = std::mem::take(&mut rest).split_at_mut(b.len());
-            rest = tail;
-            resize(&a, &values[a.range()], &b, own);
-        }
+    for (a, (b, own)) in from.factors().iter().zip(to.split_mut(&mut out)) {
+        resize(a, &values[a.range()], &b, own);
     }
     out
 }
 
 /// Vertex below and way to the one above, of vertex `i` of `to` between those of `from`.
-fn place(i: usize, from: usize, to: usize) -> (usize, f32) {
+fn interpolation(i: usize, from: usize, to: usize) -> (usize, f32) {
     if from < 2 || to < 2 {
         return (0, 0.0);
     }
@@ -36,10 +30,10 @@ fn resize(a: &Factor, x: &[f32], b: &Factor, out: &mut [f32]) {
         return;
     }
     out.par_chunks_mut(b.width * n).enumerate().for_each(|(y, row)| {
-        let (y0, fy) = place(y, a.height, b.height);
+        let (y0, fy) = interpolation(y, a.height, b.height);
         let y1 = (y0 + 1).min(a.height - 1);
         for (k, out) in row.chunks_exact_mut(n).enumerate() {
-            let (x0, fx) = place(k, a.width, b.width);
+            let (x0, fx) = interpolation(k, a.width, b.width);
             let x1 = (x0 + 1).min(a.width - 1);
             let at = |y: usize, k: usize| &x[(y * a.width + k) * n..][..n];
             let (p, q, r, s) = (at(y0, x0), at(y0, x1), at(y1, x0), at(y1, x1));
@@ -55,15 +49,12 @@ fn resize(a: &Factor, x: &[f32], b: &Factor, out: &mut [f32]) {
 pub fn cropped(from: &Grid, values: &[f32], low: [usize; 3], high: [usize; 3]) -> (Grid, Vec<f32>) {
     let to = Grid { size: std::array::from_fn(|a| high[a] - low[a]), rank: from.rank };
     let mut out = Vec::with_capacity(to.len());
-    for line in [false, true] {
-        for i in 0..3 {
-            let f = if line { from.line(i) } else { from.plane(i) };
-            let (w, h) = if line { (LINE_AXIS[i], usize::MAX) } else { PLANE_AXES[i] };
-            let rows = if line { 0..1 } else { low[h]..high[h] };
-            for y in rows {
-                let row = &values[f.start + y * f.width * f.channels..][..f.width * f.channels];
-                out.extend_from_slice(&row[low[w] * f.channels..high[w] * f.channels]);
-            }
+    for (k, f) in from.factors().iter().enumerate() {
+        let (w, h) = if k < 3 { PLANE_AXES[k] } else { (LINE_AXIS[k - 3], usize::MAX) };
+        let rows = if k < 3 { low[h]..high[h] } else { 0..1 };
+        for y in rows {
+            let row = &values[f.start + y * f.width * f.channels..][..f.width * f.channels];
+            out.extend_from_slice(&row[low[w] * f.channels..high[w] * f.channels]);
         }
     }
     debug_assert_eq!(out.len(), to.len());

@@ -1,6 +1,6 @@
 use super::fixture::{color, decoder, density, field, grid, network};
 use super::mask::{BoxMask, Lattice, Walk};
-use super::penalty::{gram, tv_factors};
+use super::penalty::tv_factors;
 use super::*;
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::{reference, rng};
@@ -34,18 +34,6 @@ fn total_variation(grid: &Grid, values: &[f32]) -> f64 {
             sums[0] * kh + sums[1] * kw
         })
         .sum()
-}
-
-/// Orthogonality of one line.
-fn ortho(grid: &Grid, values: &[f32], term: usize) -> f64 {
-    let f = grid.line(term);
-    let c = f.channels;
-    if c < 2 {
-        return 0.0;
-    }
-    let gram = gram(&f, &values[f.range()]);
-    let off: f64 = (0..c * c).filter(|i| i / c != i % c).map(|i| gram[i].abs()).sum();
-    off / (c * (c - 1)) as f64
 }
 
 #[test]
@@ -101,7 +89,6 @@ fn dense_alpha_has_the_published_values() {
 #[test]
 fn penalties_have_the_published_values() {
     assert!((total_variation(&grid(), &density()) * 1e-2 - 6.0e-5).abs() < 1e-9);
-    assert!((ortho(&grid(), &density(), 0) - 0.3444).abs() < 1e-5);
     let (g, x) = (grid(), density());
     let l1: f64 = (0..3)
         .flat_map(|i| [g.plane(i), g.line(i)])
@@ -216,7 +203,7 @@ fn gradients_agree_with_finite_differences_of_the_plain_formulas() {
 fn penalty_gradients_agree_with_finite_differences() {
     let grid = Grid { size: [5, 4, 6], rank: [3, 2, 1] };
     let x: Vec<f32> = (0..grid.len()).map(|i| rng::normal(7, 1, i as u64)).collect();
-    let penalty = Penalty { tv: 0.7, l1: 0.3, ortho: 0.2 };
+    let penalty = Penalty { tv: 0.7, l1: 0.3 };
     let mut g = vec![0.0; grid.len()];
     penalize(&grid, &penalty, &x, &mut g);
     let value = |x: &[f32]| -> f64 {
@@ -224,8 +211,7 @@ fn penalty_gradients_agree_with_finite_differences() {
             .flat_map(|i| [grid.plane(i), grid.line(i)])
             .map(|f| x[f.range()].iter().map(|v| v.abs() as f64).sum::<f64>() / f.len() as f64)
             .sum();
-        let o: f64 = (0..3).map(|i| ortho(&grid, x, i)).sum();
-        0.7 * total_variation(&grid, x) + 0.3 * l1 + 0.2 * o
+        0.7 * total_variation(&grid, x) + 0.3 * l1
     };
     for i in (0..grid.len()).step_by(3) {
         let h = 1e-3f32;
@@ -235,11 +221,6 @@ fn penalty_gradients_agree_with_finite_differences() {
         let want = (value(&up) - value(&down)) / (up[i] - down[i]) as f64;
         assert!((g[i] as f64 - want).abs() < 1e-4 * want.abs().max(0.1), "{i}: {} {want}", g[i]);
     }
-    // alone, too
-    let mut only = vec![0.0; grid.len()];
-    penalize(&grid, &Penalty { ortho: 0.2, ..Penalty::default() }, &x, &mut only);
-    let f = grid.line(0);
-    assert!(only[..f.start].iter().all(|&g| g == 0.0) && only[f.range()].iter().any(|&g| g != 0.0));
 }
 
 #[test]

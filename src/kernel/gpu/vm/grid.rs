@@ -464,9 +464,8 @@ impl DeviceGrid {
         }
     }
 
-    /// Adds the gradients of total variation and L1; lines are not asked to be orthogonal.
+    /// Adds the gradients of total variation and L1.
     pub fn penalize(&self, device: &Device, values: &Buffer, penalty: &Penalty, gradient: &Buffer) {
-        assert_eq!(penalty.ortho, 0.0, "a device knows no orthogonality");
         if penalty.is_zero() {
             return;
         }
