@@ -4,6 +4,7 @@
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use proptest::collection::{btree_map, vec};
 use proptest::prelude::*;
+use proptest::test_runner::RngSeed;
 use std::path::Path;
 use tiface::capture::convert::{CameraFormat, convert};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
@@ -14,8 +15,14 @@ use tiface::io::{self, Limits, NpyValues, TensorValues};
 use tiface::mask::prompts::{PhotoPrompts, Prompts, parse_point, parse_prompts};
 use tiface::mesh::files::{ExportOptions, ExtractedSurface, ReadOptions, read_with, to_glb, to_obj, to_ply};
 
+/// The same cases each time; `PROPTEST_RNG_SEED` gives others.
 fn config(cases: u32) -> ProptestConfig {
-    ProptestConfig { cases, failure_persistence: None, ..ProptestConfig::default() }
+    let default = ProptestConfig::default();
+    let rng_seed = match default.rng_seed {
+        RngSeed::Random => RngSeed::Fixed(1),
+        fixed => fixed,
+    };
+    ProptestConfig { cases, failure_persistence: None, rng_seed, ..default }
 }
 
 fn finite() -> impl Strategy<Value = f32> {

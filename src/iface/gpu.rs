@@ -2,7 +2,7 @@
 //! shaded, compared and applied there.
 
 use super::model::shape;
-use super::occupancy::Occupancy;
+use super::occupancy::{Occupancy, band};
 use super::ops::{
     BACKGROUND_STREAM, MOST_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, loss_weights,
     random_background,
@@ -16,8 +16,8 @@ use crate::field::ops::Ops;
 use crate::field::pixels::Pixels;
 use crate::field::training::StepAt;
 use crate::kernel::cpu::hash;
-use crate::kernel::cpu::march::nerfacc;
 use crate::kernel::cpu::mlp::TILE;
+use crate::kernel::cpu::occupancy::OPAQUE;
 use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::cpu::sdf::FieldShape;
 use crate::kernel::gpu::{
@@ -196,11 +196,9 @@ fn cells(
     let solid = (config.occupancy == OccupancyRule::Band).then_some(&start.solid);
     let cells = gpu::Occupancy::new(device, &start.occupied, solid, config.radius);
     let rule = match config.occupancy {
-        OccupancyRule::Band => {
-            CellRule::Band(Box::new(Band::new(device, start.allowed(), config.band, config.soften as f32)))
-        }
+        OccupancyRule::Band => CellRule::Band(Box::new(Band::new(device, start.allowed(), band(config)))),
         OccupancyRule::Nerfacc => {
-            let rule = Nerfacc::new(device, &cells, &start.history, nerfacc::OPAQUE, capacity);
+            let rule = Nerfacc::new(device, &cells, &start.history, OPAQUE, capacity);
             CellRule::Nerfacc(Box::new(rule))
         }
     };

@@ -3,8 +3,9 @@
 use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::Checkpoint;
-use crate::kernel::cpu::march::{self, Bitmask, MarchRay, Samples, nerfacc};
-use crate::kernel::cpu::{neus, rng};
+use crate::kernel::cpu::march::{self, Bitmask, MarchRay, Samples};
+use crate::kernel::cpu::neus;
+use crate::kernel::cpu::occupancy::{self, BandRule};
 use rayon::prelude::*;
 
 /// Cells to march through, cells known to be deep inside, and the history the nerfacc rule keeps.
@@ -18,6 +19,11 @@ pub struct Occupancy {
     allowed: Bitmask,
     /// Decaying maximum of the opacity (`nerfacc` rule), `[cells]`.
     pub history: Vec<f32>,
+}
+
+/// How wide the band around the zero set is.
+pub fn band(config: &IfaceConfig) -> BandRule {
+    BandRule { width: config.band, soften: config.soften as f32 }
 }
 
 /// `hull` seen at another resolution: a cell is kept when it overlaps a kept cell.
@@ -106,142 +112,32 @@ impl Occupancy {
         soft: impl Fn(&[[f32; 3]]) -> Vec<f32>,
     ) {
         match config.occupancy {
-            OccupancyRule::Band => self.update_band(config, inv_s, sdf, soft),
-            OccupancyRule::Nerfacc => self.update_nerfacc(config, (seed, n), inv_s, step, sdf, soft),
-        }
-    }
-
-    /// A cell stays when the zero set's band (`band` over the local sharpness) may reach it, for gradients up to about
-    /// one, or when a neighbour's centre lies on the other side, however steep the field is there; what is
-    /// left of the inside is solid.
-    fn update_band(
-        &mut self,
-        config: &IfaceConfig,
-        inv_s: f32,
-        sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
-        soft: impl Fn(&[[f32; 3]]) -> Vec<f32>,
-    ) {
-        let r = config.occupancy_resolution;
-        let cell = 2.0 * config.radius / r as f32;
-        let half_diagonal = 0.5 * 3f32.sqrt() * cell;
-        let widest = config.band * config.soften as f32 / inv_s + half_diagonal;
-        let cells: Vec<usize> = (0..r * r * r).filter(|&i| self.allowed.get(i)).collect();
-        let center =
-            |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - config.radius);
-        // NaN where nothing was asked: no sign, no neighbour
-        let mut f = vec![f32::NAN; r * r * r];
-        for cells in cells.chunks(1 << 17) {
-            let points: Vec<[f32; 3]> = cells.par_iter().map(|&i| center(i)).collect();
-            for (&i, value) in cells.iter().zip(sdf(&points)) {
-                f[i] = value;
+            OccupancyRule::Band => {
+                let cells = [&mut self.occupied, &mut self.solid];
+                occupancy::update_band(cells, &self.allowed, config.radius, band(config), inv_s, sdf, soft);
             }
-        }
-        // sharpness is evaluated only where the softest surface would reach
-        let mut band = vec![config.band / inv_s + half_diagonal; r * r * r];
-        if config.soften > 1.0 {
-            let near: Vec<usize> = cells.iter().copied().filter(|&i| f[i].abs() < widest).collect();
-            for near in near.chunks(1 << 17) {
-                let points: Vec<[f32; 3]> = near.par_iter().map(|&i| center(i)).collect();
-                for (&i, soft) in near.iter().zip(soft(&points)) {
-                    band[i] = config.band / (inv_s * soft.exp()) + half_diagonal;
-                }
-            }
-        }
-        // softness changes within a cell: the softest of a cell and its neighbours counts, or rays would end in hair
-        let widest_near = |i: usize| {
-            [1, r, r * r].into_iter().fold(band[i], |most, stride| {
-                let at = i / stride % r;
-                let before = if at > 0 { band[i - stride] } else { 0.0 };
-                let after = if at + 1 < r { band[i + stride] } else { 0.0 };
-                most.max(before).max(after)
-            })
-        };
-        self.occupied.bits.fill(0);
-        self.solid.bits.fill(0);
-        for &i in &cells {
-            let crossed = [1, r, r * r].into_iter().any(|stride| {
-                let at = i / stride % r;
-                let other = |j: usize| f[j] * f[i] < 0.0;
-                (at > 0 && other(i - stride)) || (at + 1 < r && other(i + stride))
-            });
-            if f[i].abs() < widest_near(i) || crossed {
-                self.occupied.set(i, true);
-            } else if f[i] < 0.0 {
-                self.solid.set(i, true);
+            OccupancyRule::Nerfacc => {
+                let opacity = |points: &[[f32; 3]]| -> Vec<f32> {
+                    let local = if config.soften > 1.0 { soft(points) } else { vec![0.0; points.len()] };
+                    let each = sdf(points).into_par_iter().zip(local);
+                    each.map(|(f, soft)| neus::occupancy(f, 0.5 * step, inv_s * soft.exp())).collect()
+                };
+                self.update_nerfacc((seed, n), config.radius, occupancy::OPAQUE, opacity);
             }
         }
     }
 
-    /// nerfacc 0.3.3: all cells below step 256, later a quarter of them at random plus the occupied ones.
-    fn update_nerfacc(
-        &mut self,
-        config: &IfaceConfig,
-        (seed, n): (u64, u64),
-        inv_s: f32,
-        step: f32,
-        sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
-        soft: impl Fn(&[[f32; 3]]) -> Vec<f32>,
-    ) {
-        let opacity = |points: &[[f32; 3]]| -> Vec<f32> {
-            let local = if config.soften > 1.0 { soft(points) } else { vec![0.0; points.len()] };
-            let each = sdf(points).into_par_iter().zip(local);
-            each.map(|(f, soft)| neus::occupancy(f, 0.5 * step, inv_s * soft.exp())).collect()
-        };
-        self.look((seed, n), config.radius, nerfacc::OPAQUE, opacity);
-    }
-
-    /// nerfacc's rule for any opacity of a cell: what is above `threshold`, or above the mean where that is less, is
+    /// Evaluates the field again by nerfacc's rule: cells above `threshold`, or above the mean where that is less, are
     /// marched through.
-    pub fn look(
+    pub fn update_nerfacc(
         &mut self,
-        (seed, n): (u64, u64),
+        at: (u64, u64),
         radius: f32,
         threshold: f32,
         opacity: impl Fn(&[[f32; 3]]) -> Vec<f32>,
     ) {
-        let r = self.occupied.resolution;
-        let total = r * r * r;
-        let [any, some, jitter] = nerfacc::DRAWS;
-        let cells: Vec<usize> = if n < nerfacc::ALL_BELOW {
-            (0..total).collect()
-        } else {
-            let quarter = total as u64 / 4;
-            let random = (0..quarter).map(|k| rng::below(seed, n << 4 | any, k, total as u64) as usize);
-            let occupied: Vec<usize> = (0..total).filter(|&i| self.occupied.get(i)).collect();
-            let kept = occupied.len() as u64;
-            let again: Vec<usize> = if kept > quarter {
-                (0..quarter).map(|k| occupied[rng::below(seed, n << 4 | some, k, kept) as usize]).collect()
-            } else {
-                occupied
-            };
-            random.chain(again).collect()
-        };
-        let cell = 2.0 * radius / r as f32;
-        let points: Vec<[f32; 3]> = cells
-            .par_iter()
-            .enumerate()
-            .map(|(k, &i)| {
-                let corner = [i / (r * r), i / r % r, i % r];
-                std::array::from_fn(|a| {
-                    let within = rng::uniform(seed, n << 4 | jitter, (3 * k + a) as u64);
-                    (corner[a] as f32 + within) * cell - radius
-                })
-            })
-            .collect();
-        let opacity = opacity(&points);
-        let decayed: Vec<(usize, f32)> = cells
-            .iter()
-            .zip(&opacity)
-            .map(|(&i, &o)| (i, (nerfacc::DECAY * self.history[i]).max(o)))
-            .collect();
-        for (i, o) in decayed {
-            self.history[i] = o;
-        }
-        let mean = self.history.iter().map(|&v| v as f64).sum::<f64>() / total as f64;
-        let threshold = (mean as f32).min(threshold);
-        for i in 0..total {
-            self.occupied.set(i, self.allowed.get(i) && self.history[i] > threshold);
-        }
+        let cells = (&mut self.occupied, &mut self.history[..]);
+        occupancy::update_nerfacc(cells, &self.allowed, radius, at, threshold, opacity);
     }
 
     /// Marches rays through the cells that may hold surface, with steps of `dt`.

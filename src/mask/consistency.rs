@@ -130,7 +130,7 @@ fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String
     let percent =
         |v: f64| if v < 0.02 { format!("{:.1} %", 100.0 * v) } else { format!("{:.0} %", 100.0 * v) };
     let parts = if much > 0.9 {
-        "contradicts its camera: no other view has anything where the mask shows the head".into()
+        "contradicts its camera or the other masks: no other view has anything where it shows the head".into()
     } else if much > 3.0 * taken {
         format!("shows too much: no other view has anything for {} of it", percent(much))
     } else if much < 0.01 && taken > 3.0 * much {

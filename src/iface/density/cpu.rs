@@ -110,7 +110,7 @@ impl DensityOps for CpuDensity<'_> {
             let found = density::evaluate(shape, table, &weights, x, None);
             found.density.into_iter().map(|s| s * dt).collect()
         };
-        self.occupancy.look((at.seed, at.step), self.config.radius, OCCUPIED, opacity);
+        self.occupancy.update_nerfacc((at.seed, at.step), self.config.radius, OCCUPIED, opacity);
     }
 
     fn draw(&mut self, at: StepAt) {

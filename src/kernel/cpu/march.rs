@@ -6,20 +6,6 @@
 use crate::geom::Ray;
 use rayon::prelude::*;
 
-/// What the processor and GPUs share of nerfacc's look at the cells again (`OccupancyGrid` of its release 0.3.3, with
-/// instant-nsr-pl's numbers).
-pub mod nerfacc {
-    /// Every cell is looked at before this step; from it on a quarter of them anywhere, and at most as many of those
-    /// marched through.
-    pub const ALL_BELOW: u64 = 256;
-    /// What is left of a cell's opacity at the next look.
-    pub const DECAY: f32 = 0.95;
-    /// Our streams of random numbers: cells anywhere, cells marched through, points in cells.
-    pub const DRAWS: [u64; 3] = [5, 6, 7];
-    /// Opacity of a cell of a signed distance that is marched through, unless the mean is less.
-    pub const OPAQUE: f32 = 1e-3;
-}
-
 /// Which cells of a cubic grid over `[-radius, radius]³` may hold surface; `(ix · R + iy) · R + iz`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bitmask {

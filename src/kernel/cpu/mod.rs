@@ -13,6 +13,7 @@ pub mod march;
 pub mod matrix;
 pub mod mlp;
 pub mod neus;
+pub mod occupancy;
 pub mod pool;
 pub(crate) mod reference;
 pub mod rng;

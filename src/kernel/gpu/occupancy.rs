@@ -4,6 +4,7 @@ use super::device::{Buffer, Device, Words, groups, launch};
 use super::sdf::Sdf;
 use crate::Result;
 use crate::kernel::cpu::march::Bitmask;
+use crate::kernel::cpu::occupancy::BandRule;
 use burn::cubecl::{self, prelude::*};
 
 mod nerfacc;
@@ -162,21 +163,19 @@ impl Occupancy {
     }
 }
 
-/// The rule of a band around the zero set: see the update of `iface`'s occupancy on the CPU.
+/// The rule of a band around the zero set: see [`crate::kernel::cpu::occupancy::update_band`].
 pub struct Band {
     cells: Buffer,
     allowed: Buffer,
     value: Buffer,
     reach: Buffer,
     count: Buffer,
-    units: f32,
-    soften: f32,
+    rule: BandRule,
 }
 
 impl Band {
-    /// Never beyond `allowed`; `units` is the half width in units of 1 / sharpness, which may be `soften` times lower
-    /// than the sharpest.
-    pub fn new(device: &Device, allowed: &Bitmask, units: f32, soften: f32) -> Band {
+    /// Never beyond `allowed`.
+    pub fn new(device: &Device, allowed: &Bitmask, rule: BandRule) -> Band {
         let total = allowed.resolution.pow(3);
         let cells: Vec<u32> = (0..total).filter(|&i| allowed.get(i)).map(|i| i as u32).collect();
         Band {
@@ -186,8 +185,7 @@ impl Band {
             value: device.zeros::<f32>(total),
             reach: device.zeros::<f32>(total),
             count: device.zeros::<u32>(2),
-            units,
-            soften,
+            rule,
         }
     }
 
@@ -213,11 +211,11 @@ impl Band {
             let out = field.forward(device, table, flat, x, direction, &self.count);
             launch!(device, keep::launch, over, UNITS;
                 self.cells, out, inv_s, self.value, self.reach;
-                first as u32, here as u32, self.units, self.soften, half
+                first as u32, here as u32, self.rule.width, self.rule.soften, half
             );
         }
         launch!(device, decide::launch, groups(occupancy.mask.words().div_ceil(UNITS as usize)), UNITS;
-            self.allowed, self.value, self.reach, inv_s, occupancy.mask, solid; resolution, self.units, half
+            self.allowed, self.value, self.reach, inv_s, occupancy.mask, solid; resolution, self.rule.width, half
         );
     }
 }

@@ -5,10 +5,8 @@ use super::super::march::prefix_sum;
 use super::super::rng;
 use super::{Occupancy, UNITS};
 use crate::Result;
-use crate::kernel::cpu::march::nerfacc;
+use crate::kernel::cpu::occupancy::{ALL_BELOW, DECAY, DRAWS};
 use burn::cubecl::{self, prelude::*};
-
-const DECAY: f32 = nerfacc::DECAY;
 
 /// Counts the cells of each word of a mask.
 #[cube(launch)]
@@ -41,7 +39,7 @@ fn of_rank(mask: &[u32], before: &[u32], rank: u32) -> u32 {
     low * 32 + left.trailing_zeros()
 }
 
-/// The cell of a draw, none of the grid's where nothing is drawn: see `look` on the CPU.
+/// The cell of a draw, none of the grid's where nothing is drawn: see [`update_nerfacc`](crate::kernel::cpu::occupancy::update_nerfacc).
 #[cube]
 fn drawn_cell(
     mask: &[u32],
@@ -209,7 +207,7 @@ fn decide_by_history(history: &[f32], least: &[f32], last: &mut [u32], mask: &mu
     }
 }
 
-/// nerfacc's rule for any opacity of a cell: see the `look` of `iface`'s occupancy on the CPU.
+/// nerfacc's rule for any opacity of a cell: see [`crate::kernel::cpu::occupancy::update_nerfacc`].
 pub struct Nerfacc {
     history: Buffer,
     /// Cells of each word of the mask, and how many lie before it.
@@ -269,8 +267,8 @@ impl Nerfacc {
         mut opacity: impl FnMut(&Buffer) -> (&'a Buffer, f32),
     ) {
         let cells = self.history.words();
-        let all = n < nerfacc::ALL_BELOW;
-        let [any, some, jitter] = nerfacc::DRAWS;
+        let all = n < ALL_BELOW;
+        let [any, some, jitter] = DRAWS;
         let over = |count: usize| groups(count.div_ceil(UNITS as usize));
         let draws = |purpose: u64| {
             let [high, low] = rng::stream(seed, n << 4 | purpose);
