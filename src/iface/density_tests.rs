@@ -240,29 +240,28 @@ mod on_gpus {
         let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
         let dir = temporary();
         let session = session("iface", dir.path(), "ball", &Quiet);
-        let trained = |device: Device| {
+        let trained = |device: Device, steps: u64| {
             let ops = GpuDensity::new(&config, &pixels, device).unwrap();
             let mut model = DensityModel::new(ops, &config, &session);
             model.restore(None).ok().unwrap();
             let before = model.ops.device().counts();
-            for step in 250..250 + Device::READ_EVERY {
+            for step in 250..250 + steps {
                 let progress = TrainingProgress { step, ..TrainingProgress::default() };
                 let read = (step + 1).is_multiple_of(Device::READ_EVERY);
                 training::step(&mut model, session.seed, &progress, read).ok().unwrap();
             }
             let after = model.ops.device().counts();
-            println!("{} launches, {} readbacks", after.0 - before.0, after.1 - before.1);
-            assert!(after.0 - before.0 <= 40 * 50 && after.1 - before.1 <= 1);
-            model.state().unwrap().groups[0].values().to_vec()
+            let table = model.state().unwrap().groups[0].values().to_vec();
+            assert!(table.iter().all(|v| v.is_finite()));
+            (after.0 - before.0, after.1 - before.1, table)
         };
-        for device in devices() {
-            let (way, before) = (device.atomics(), trained(device));
-            assert!(before.iter().all(|v| v.is_finite()));
-            if way == Atomics::Fixed {
-                let again = devices().pop().unwrap();
-                assert!(trained(again) == before, "the same steps give the same bytes");
-            }
-        }
+        let Some(device) = device() else { return };
+        let (launches, readbacks, _) = trained(device, Device::READ_EVERY);
+        println!("{launches} launches and {readbacks} readbacks in {} steps", Device::READ_EVERY);
+        assert!(launches as u64 <= 40 * Device::READ_EVERY && readbacks <= 1);
+        // with a look at cells that are drawn
+        let fixed = || devices().pop().filter(|device| device.atomics() == Atomics::Fixed).unwrap();
+        assert!(trained(fixed(), 8) == trained(fixed(), 8), "the same steps give the same bytes");
     }
 
     #[test]
