@@ -7,7 +7,7 @@
 use super::background::ray_backgrounds;
 use super::pixels::{Pixels, SampledRay};
 use super::training::StepAt;
-use crate::kernel::gpu::{Batch, Buffer, Device, Photographs, SamplingOptions};
+use crate::kernel::gpu::{BUFFERS, Batch, Buffer, Device, Photographs, SamplingOptions};
 
 /// Where rays of a training on a device come from.
 pub struct DeviceRays {
@@ -16,18 +16,18 @@ pub struct DeviceRays {
     drawing: SamplingOptions,
 }
 
-/// Bytes of photographs that fit in `available` bytes of a device; none where they do not, or where the device knows no such
-/// order of pixels.
+/// Bytes of photographs that fit in `available` bytes of a device; none where they do not.
 pub fn resident(pixels: &Pixels, device: &Device, available: u64) -> Option<u64> {
-    let bytes = pixels.bytes_on_device();
-    let fits = bytes <= device.limits().largest_buffer && bytes * 33 / 32 <= available;
-    (fits && pixels.count() <= u32::MAX as u64 && !pixels.is_ordered()).then_some(bytes * 33 / 32)
+    let (bytes, buffers) = pixels.bytes_on_device(device.limits().largest_buffer);
+    let fits = buffers <= BUFFERS && bytes <= available;
+    (fits && pixels.count() <= u32::MAX as u64).then_some(bytes)
 }
 
 impl DeviceRays {
     /// From photographs that lie on the device where that is said.
     pub fn new(pixels: &Pixels, device: &Device, drawing: SamplingOptions, resident: bool) -> DeviceRays {
-        DeviceRays { resident: resident.then(|| pixels.on_device(device, drawing)), drawing }
+        let largest = device.limits().largest_buffer;
+        DeviceRays { resident: resident.then(|| pixels.on_device(device, drawing, largest)), drawing }
     }
 
     /// Draws the rays of a step into `batch`: a function of seed and step alone. See [`Pixels::draw`].
@@ -82,7 +82,7 @@ mod tests {
         let Some(device) = device() else { return };
         let views = ball::textured_views();
         let pixels = Pixels::new(&views, 0.25, 1.0, Foreground::Estimated, false).with_large(1.0);
-        let drawing = SamplingOptions { every: false, jitter: true, background: true, behind: 8 };
+        let drawing = SamplingOptions { jitter: true, background: true, behind: 8 };
         assert!(resident(&pixels, &device, 0).is_none() && resident(&pixels, &device, 1 << 30).is_some());
         let wanted = device.upload(&[900u32]);
         for detail in [0.0, 0.2] {

@@ -196,31 +196,35 @@ impl<'a> Pixels<'a> {
         (0..count).into_par_iter().with_min_len(256).map(draw).collect()
     }
 
-    /// Are pixels gone through in an order?
+    /// Copies the photographs to a device, where the same rays are drawn from them, in buffers of `largest` bytes at most.
     #[cfg(feature = "wgpu")]
-    pub fn is_ordered(&self) -> bool {
-        self.order.is_some()
+    pub fn on_device(
+        &self,
+        device: &gpu::Device,
+        drawing: gpu::SamplingOptions,
+        largest: u64,
+    ) -> gpu::Photographs {
+        let order = match &self.order {
+            Some(order) => gpu::PixelOrder::Permuted { depth_directions: order.depth_directions },
+            None if self.reference_sampling => gpu::PixelOrder::EachView,
+            None => gpu::PixelOrder::Random,
+        };
+        let views = (0..self.views.len()).map(|v| self.drawn_view(v));
+        gpu::Photographs::new(device, views, self.radius, order, drawing, largest)
     }
 
-    /// Does every view come as often, with any pixel of its frame?
+    /// Bytes that the photographs take on a device with their bits and what counts these, and how many buffers of
+    /// `largest` bytes at most.
     #[cfg(feature = "wgpu")]
-    pub fn uses_reference_sampling(&self) -> bool {
-        self.reference_sampling
-    }
-
-    /// Copies the photographs to a device, where the same rays are drawn from them.
-    #[cfg(feature = "wgpu")]
-    pub fn on_device(&self, device: &gpu::Device, drawing: gpu::SamplingOptions) -> gpu::Photographs {
-        let views: Vec<gpu::DrawnView> =
-            (0..self.views.len()).into_par_iter().map(|v| self.drawn_view(v)).collect();
-        gpu::Photographs::new(device, &views, self.radius, drawing)
-    }
-
-    /// Bytes that the photographs take on a device.
-    #[cfg(feature = "wgpu")]
-    pub fn bytes_on_device(&self) -> u64 {
-        let area = |view| part(view)[2] as u64 * part(view)[3] as u64;
-        self.drawable.iter().map(|view| 4 * area(view).next_multiple_of(32)).sum()
+    pub fn bytes_on_device(&self, largest: u64) -> (u64, usize) {
+        let (mut bytes, mut buffers, mut last) = (0, 1, 0);
+        for view in &self.drawable {
+            let area = part(view)[2] as u64 * part(view)[3] as u64;
+            (buffers, last) =
+                if last + 4 * area > largest { (buffers + 1, 4 * area) } else { (buffers, last + 4 * area) };
+            bytes += 4 * area + if self.order.is_some() { 8 } else { 4 } * area.div_ceil(32);
+        }
+        (bytes, buffers)
     }
 
     /// The drawable part of a view, packed.
@@ -257,13 +261,7 @@ impl<'a> Pixels<'a> {
         (i, count): (u64, u64),
         jitter: bool,
     ) -> Option<SampledRay> {
-        let all = self.count();
-        let batches = (all / count).max(1);
-        let position = step % batches * count + i;
-        if position >= all {
-            return None; // a batch of more than there are
-        }
-        let which = permuted(rng::bits(seed, 13, step / batches), position, all);
+        let which = rng::Permutation::of_step((seed, step), count, self.count()).get(i)?;
         let v = self.cumulative.partition_point(|&c| c <= which);
         let rank = (which - if v > 0 { self.cumulative[v - 1] } else { 0 }) as u32;
         let word = order.before[v].partition_point(|&b| b <= rank) - 1;
@@ -369,24 +367,6 @@ pub const SIDES: [u32; 4] = [1, 2, 4, 8];
 /// The widest square of pixels of this width that is no wider than `detail`; a pixel where none is.
 fn side(pixel: f32, detail: f32) -> u32 {
     SIDES.into_iter().rfind(|&side| side as f32 * pixel <= detail).unwrap_or(1)
-}
-
-/// Where `i` of `0..n` goes in a random order that `key` names: four rounds of a Feistel network over the next power of
-/// four, gone round again until it is within (Black and Rogaway 2002, "Ciphers with arbitrary finite domains").
-fn permuted(key: u64, i: u64, n: u64) -> u64 {
-    let half = (64 - (n - 1).leading_zeros()).div_ceil(2).max(1);
-    let low = (1u64 << half) - 1;
-    let mut x = i;
-    loop {
-        let (mut left, mut right) = (x >> half, x & low);
-        for round in 0..4 {
-            (left, right) = (right, left ^ (rng::bits(key, round, right) & low));
-        }
-        x = left << half | right;
-        if x < n {
-            return x;
-        }
-    }
 }
 
 /// Drawable pixels of the views up to and with each.

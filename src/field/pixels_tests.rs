@@ -87,21 +87,6 @@ fn a_view_without_a_mask_teaches_nothing_beside_views_with_one() {
 }
 
 #[test]
-fn a_permutation_has_every_number_once_and_another_order_for_every_key() {
-    for n in [1, 2, 3, 64, 65, 1000] {
-        let all = |key: u64| (0..n).map(|i| permuted(key, i, n)).collect::<Vec<u64>>();
-        let mut sorted = all(7);
-        sorted.sort_unstable();
-        assert_eq!(sorted, (0..n).collect::<Vec<u64>>());
-        assert!(n < 64 || all(7) != all(8));
-    }
-    // no order to be seen: neighbors are a third of 1000 apart on average
-    let all: Vec<u64> = (0..1000).map(|i| permuted(3, i, 1000)).collect();
-    let apart = all.windows(2).map(|w| w[0].abs_diff(w[1])).sum::<u64>() as f64 / 999.0;
-    assert!((apart - 333.0).abs() < 30.0, "{apart}");
-}
-
-#[test]
 fn an_epoch_has_every_valid_pixel_that_meets_the_box_once_with_directions_of_depth_one() {
     let mut one = view();
     let mut valid = vec![255; 200];
@@ -172,30 +157,39 @@ fn a_device_draws_the_same_rays() {
     let fov = Distortion { omega: 0.9, projection: Projection::Fov, ..Distortion::default() };
     let empty = TrainView { mask: None, ..view() };
     let views = [view(), bent(perspective), empty, bent(fisheye), bent(fov)];
-    // the last with squares of two pixels for a ray, a twentieth of the distance 4 wide each
-    for (foreground, published, detail) in [
-        (Foreground::Estimated, false, 0.0),
-        (Foreground::Photo, true, 0.0),
-        (Foreground::Estimated, false, 0.5),
+    // the last but one with squares of two pixels for a ray, a twentieth of the distance 4 wide each
+    let new = |foreground, published| Pixels::new(&views, 0.1, 0.3, foreground, published).with_large(0.3);
+    let all = [[-1.0f32; 3], [1.0; 3]];
+    let permuted = |depth| Pixels::permuted(&views, Foreground::Photo, all, depth);
+    for (pixels, published, detail, largest) in [
+        (new(Foreground::Estimated, false), false, 0.0, u64::MAX),
+        (new(Foreground::Photo, true), true, 0.0, u64::MAX),
+        (new(Foreground::Estimated, false), false, 0.5, u64::MAX),
+        // a buffer holds two photographs of 200 pixels
+        (new(Foreground::Estimated, false), false, 0.5, 1600),
+        (permuted(false), false, 0.0, 1600),
+        (permuted(true), false, 0.0, u64::MAX),
     ] {
-        let pixels = Pixels::new(&views, 0.1, 0.3, foreground, published).with_large(0.3);
-        let drawing =
-            gpu::SamplingOptions { every: published, jitter: !published, background: true, behind: 3 };
-        let there = pixels.on_device(&device, drawing);
-        let batch = gpu::Batch::new(&device, 2050);
+        let drawing = gpu::SamplingOptions { jitter: !published, background: true, behind: 3 };
+        let photographs = pixels.on_device(&device, drawing, largest);
         let (seed, step) = (77, 1 << 33);
-        there.draw(&device, (seed, step), &device.upload(&[2000u32]), &batch, detail);
-        let want = pixels.draw(seed, step, 2000, !published, detail);
+        // a batch of more pixels than there are has each once
+        let wanted = 2000;
+        let batch = gpu::Batch::new(&device, if pixels.order.is_some() { wanted } else { 2050 });
+        let rays = batch.rays();
+        photographs.draw(&device, (seed, step), &device.upload(&[wanted as u32]), &batch, detail);
+        let want = pixels.draw(seed, step, wanted, !published, detail);
         let alive = device.read::<u32>(&batch.alive);
-        assert!(alive[2000..].iter().all(|&a| a == 0));
-        let kept: Vec<usize> = (0..2050).filter(|&r| alive[r] == 1).collect();
+        assert!(alive[wanted..].iter().all(|&a| a == 0));
+        let kept: Vec<usize> = (0..rays).filter(|&r| alive[r] == 1).collect();
         // published: pixels that are not valid leave a gap
-        assert_eq!((kept.len(), kept.len() < 2000), (want.rays.len(), published));
+        let gaps = published || pixels.order.is_some();
+        assert_eq!((kept.len(), kept.len() < wanted), (want.rays.len(), gaps));
         let take = |buffer: &gpu::Buffer, planes: usize| -> Vec<f32> {
             let all = device.read::<f32>(buffer);
             (0..planes)
                 .flat_map(|k| kept.iter().map(move |r| (k, *r)))
-                .map(|(k, r)| all[k * 2050 + r])
+                .map(|(k, r)| all[k * rays + r])
                 .collect()
         };
         let n = want.rays.len();
@@ -206,6 +200,6 @@ fn a_device_draws_the_same_rays() {
         assert_eq!(take(&batch.alpha, 1), want.alpha);
         assert_eq!(take(&batch.jitter, 1), want.rays.iter().map(|r| r.jitter).collect::<Vec<_>>());
         let behind = device.read::<f32>(&batch.background);
-        assert_eq!(behind[2050 + 9], rng::uniform(seed, step << 4 | 3, 3 * 9 + 1));
+        assert_eq!(behind[rays + 9], rng::uniform(seed, step << 4 | 3, 3 * 9 + 1));
     }
 }

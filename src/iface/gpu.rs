@@ -82,7 +82,6 @@ impl<'a> GpuSdf<'a> {
         let (capacity, resident) = max_samples(config, &shape, pixels, &device)?;
         let weights = loss_weights(config, pixels.has_masks);
         let drawing = SamplingOptions {
-            every: pixels.uses_reference_sampling(),
             jitter: config.jitter,
             background: random_background(config),
             behind: BACKGROUND_STREAM,

@@ -76,7 +76,6 @@ impl<'a> GpuVm<'a> {
     /// they are `resident`.
     pub fn new(config: &'a VmConfig, pixels: &'a Pixels<'a>, device: Device, resident: bool) -> GpuVm<'a> {
         let drawing = SamplingOptions {
-            every: false,
             jitter: true,
             background: random_background(config),
             behind: BACKGROUND_STREAM,

@@ -56,8 +56,7 @@ impl<'a> GpuDensity<'a> {
     pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>, device: Device) -> Result<GpuDensity<'a>> {
         let rays = config.rays.max(config.max_rays);
         let (capacity, resident) = max_samples(config, pixels, &device)?;
-        let every = pixels.uses_reference_sampling();
-        let drawing = SamplingOptions { every, jitter: config.jitter, background: false, behind: 0 };
+        let drawing = SamplingOptions { jitter: config.jitter, background: false, behind: 0 };
         let (occupancy, cells) = cells(&device, config, &Occupancy::new(config, None), capacity);
         let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         Ok(GpuDensity {

@@ -35,6 +35,52 @@ pub fn below(seed: u64, stream: u64, index: u64, n: u64) -> u64 {
     ((bits(seed, stream, index) as u128 * n as u128) >> 64) as u64
 }
 
+/// A random order of `0..n` that is computed, not stored: four rounds of a Feistel network over the next power of four, gone
+/// round again until the result is below n (Black and Rogaway 2002, "Ciphers with arbitrary finite domains").
+#[derive(Clone, Copy, Debug)]
+pub struct Permutation {
+    /// What the streams of all rounds share.
+    pub(crate) key: u64,
+    /// Bits of half a number.
+    pub(crate) half_bits: u32,
+    /// Position of a step's first number.
+    pub(crate) first: u64,
+    n: u64,
+}
+
+impl Permutation {
+    /// The order of `0..n`, n > 0, that `key` names.
+    pub fn new(key: u64, n: u64) -> Permutation {
+        let half_bits = (64 - (n - 1).leading_zeros()).div_ceil(2).max(1);
+        Permutation { key: mix(key ^ 0x9e37_79b9_7f4a_7c15), half_bits, first: 0, n }
+    }
+
+    /// The order that a step takes `count` numbers of, of which none comes twice until fewer than `count` are left.
+    pub fn of_step((seed, step): (u64, u64), count: u64, n: u64) -> Permutation {
+        let steps = (n / count).max(1);
+        let first = step % steps * count;
+        Permutation { first, ..Permutation::new(bits(seed, 13, step / steps), n) }
+    }
+
+    /// Number `i` of a step; none beyond the last of all.
+    pub fn get(&self, i: u64) -> Option<u64> {
+        let mut x = Some(self.first + i).filter(|&x| x < self.n)?;
+        let lower = (1u64 << self.half_bits) - 1;
+        loop {
+            let (mut left, mut right) = (x >> self.half_bits, x & lower);
+            for round in 0..4 {
+                let mixed =
+                    mix(mix(self.key ^ round).wrapping_add(right.wrapping_mul(0x9e37_79b9_7f4a_7c15)));
+                (left, right) = (right, left ^ (mixed & lower));
+            }
+            x = left << self.half_bits | right;
+            if x < self.n {
+                return Some(x);
+            }
+        }
+    }
+}
+
 /// A normal number (Box, Muller 1958).
 pub fn normal(seed: u64, stream: u64, index: u64) -> f32 {
     let (u, v) = (uniform(seed, stream, 2 * index), uniform(seed, stream, 2 * index + 1));
@@ -59,5 +105,21 @@ mod tests {
         assert!((sum / n as f64).abs() < 0.02 && (square / n as f64 - 1.0).abs() < 0.03);
         assert!((0..1000).all(|i| below(5, 6, i, 7) < 7));
         assert_ne!(bits(1, 2, 3), bits(1, 3, 2));
+    }
+
+    #[test]
+    fn a_permutation_has_every_number_once_and_another_order_for_every_key() {
+        for n in [1, 2, 3, 64, 65, 1000] {
+            let all =
+                |key: u64| (0..n).map(|i| Permutation::new(key, n).get(i).unwrap()).collect::<Vec<u64>>();
+            let mut sorted = all(7);
+            sorted.sort_unstable();
+            assert_eq!(sorted, (0..n).collect::<Vec<u64>>());
+            assert!(n < 64 || all(7) != all(8));
+        }
+        // no order to be seen: neighbors are a third of 1000 apart on average
+        let all: Vec<u64> = (0..1000).map(|i| Permutation::new(3, 1000).get(i).unwrap()).collect();
+        let apart = all.windows(2).map(|w| w[0].abs_diff(w[1])).sum::<u64>() as f64 / 999.0;
+        assert!((apart - 333.0).abs() < 30.0, "{apart}");
     }
 }

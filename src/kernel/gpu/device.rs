@@ -8,7 +8,7 @@ use burn::cubecl::features::AtomicUsage;
 use burn::cubecl::ir::{ElemType, FloatKind, Type};
 use burn::cubecl::prelude::{BufferArg, Client, CubeCount};
 use burn::cubecl::server::Handle;
-use burn::tensor::{DType, Element};
+use burn::tensor::{Bytes, DType, Element};
 use bytemuck::Pod;
 use std::fmt::Display;
 use std::ops::Range;
@@ -216,6 +216,12 @@ impl Device {
     pub fn upload<T: Element>(&self, values: &[T]) -> Buffer {
         let handle = self.client.create_from_slice(bytemuck::cast_slice(values));
         self.tensor(handle, values.len(), T::dtype())
+    }
+
+    /// The same of values that nobody needs any more: without a copy of them on the host.
+    pub fn upload_vec<T: Element>(&self, values: Vec<T>) -> Buffer {
+        let words = values.len();
+        self.tensor(self.client.create(Bytes::from_elems(values)), words, T::dtype())
     }
 
     /// Memory of **arbitrary contents**: a kernel writes it before another reads it.

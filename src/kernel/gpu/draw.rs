@@ -3,18 +3,24 @@
 //! Which pixel a ray is drawn from is a function of seed, step and its number alone, the same as on the CPU.
 
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::rng::{below, stream, uniform};
+use super::rng::{Wide, below, permuted, stream, uniform};
 use crate::geom::{Camera, Projection};
 use crate::kernel::cpu::march::MarchRay;
+use crate::kernel::cpu::rng;
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Words that describe a photograph: pixels drawable up to and with it, box, its first pixel, whether color is over
-/// black already, focal lengths, principal point, lens, rotation by columns, position, width of a pixel.
-const VIEW: usize = 37;
+/// Words that describe a photograph: pixels drawable up to and with it, box, its first pixel and the buffer that holds
+/// it, its first word of drawable bits, whether color is over black already, focal lengths, principal point, lens,
+/// rotation by columns, position, width of a pixel.
+const VIEW: usize = 39;
+const FIRST_PIXEL: usize = 5;
+const BUFFER: usize = 6;
+const FIRST_WORD: usize = 7;
+const OVER_BLACK: usize = 8;
 /// Where its camera's begin.
-const CAMERA: usize = 7;
+const CAMERA: usize = 9;
 const LENS: usize = CAMERA + 4;
 const ROTATION: usize = LENS + 13;
 const POSITION: usize = ROTATION + 9;
@@ -22,6 +28,9 @@ const PIXEL: usize = POSITION + 3;
 
 /// Tries to meet a pixel worth drawing in its box.
 const TRIES: u32 = 256;
+
+/// Buffers of pixels: no adapter binds more than 2³¹ bytes at once, however much memory it has.
+pub const BUFFERS: usize = 4;
 
 /// A photograph to draw from.
 pub struct DrawnView {
@@ -40,7 +49,7 @@ pub struct DrawnView {
 }
 
 impl DrawnView {
-    fn words(&self, cumulative: u32, first: u32, radius: f32) -> [u32; VIEW] {
+    fn words(&self, cumulative: u32, [pixel, buffer, word]: [usize; 3], radius: f32) -> [u32; VIEW] {
         let (c, d) = (&self.camera, &self.camera.distortion);
         let projection = match d.projection {
             Projection::Perspective => 0u32,
@@ -51,7 +60,8 @@ impl DrawnView {
         let bends = [d.k1, d.k2, d.k3, d.k4, d.k5, d.k6, d.p1, d.p2, d.sx1, d.sy1, d.omega];
         let mut words = vec![cumulative];
         words.extend(self.part);
-        words.extend([first, u32::from(self.over_black)]);
+        words.extend([pixel, buffer, word].map(|at| u32::try_from(at).expect("fewer than 2³² pixels")));
+        words.push(u32::from(self.over_black));
         words.extend(camera.map(f32::to_bits));
         words.extend([projection, u32::from(d.is_none())]);
         words.extend(bends.map(|v| (v as f32).to_bits()));
@@ -172,11 +182,20 @@ struct Square {
     count: u32,
 }
 
+/// Is pixel `at` of a view's box drawable?
+#[cube]
+fn is_drawable(views: &[u32], drawable: &[u32], view: usize, at: u32) -> bool {
+    (drawable[(views[view + FIRST_WORD] + (at >> 5)) as usize] >> (at & 31)) & 1 == 1
+}
+
 /// The square around a pixel of a view's box, as wide as `detail` says; columns and rows count within the box.
 #[cube]
 fn square(
     views: &[u32],
-    pixels: &[u32],
+    pixels0: &[u32],
+    pixels1: &[u32],
+    pixels2: &[u32],
+    pixels3: &[u32],
     drawable: &[u32],
     view: usize,
     column: u32,
@@ -194,11 +213,21 @@ fn square(
     let mut sums = Square { x: 0u32, y: 0u32, red: 0u32, green: 0u32, blue: 0u32, alpha: 0u32, count: 0u32 };
     for y in max(top, y0)..min(top + side, y0 + height) {
         for x in max(left, x0)..min(left + side, x0 + width) {
-            let at = (views[view + 5] + (y - y0) * width + x - x0) as usize;
-            if (drawable[at >> 5] >> u32::cast_from(at & 31)) & 1 == 1 {
-                let pixel = pixels[at];
+            let at = (y - y0) * width + x - x0;
+            if is_drawable(views, drawable, view, at) {
+                let at = (views[view + FIRST_PIXEL] + at) as usize;
+                let buffer = views[view + BUFFER];
+                let pixel = if buffer == 0 {
+                    pixels0[at]
+                } else if buffer == 1 {
+                    pixels1[at]
+                } else if buffer == 2 {
+                    pixels2[at]
+                } else {
+                    pixels3[at]
+                };
                 let alpha = pixel >> 24;
-                let share = select(views[view + 6] == 1, 255u32, alpha);
+                let share = select(views[view + OVER_BLACK] == 1, 255u32, alpha);
                 sums.x += x;
                 sums.y += y;
                 sums.red += share * (pixel & 255);
@@ -228,11 +257,36 @@ fn view_of(views: &[u32], which: u32) -> usize {
     low
 }
 
+/// The drawable pixel of a view's box that so many come before, which `before` counts by words of `drawable`.
+#[cube]
+fn ranked(before: &[u32], drawable: &[u32], first: usize, words: usize, rank: u32) -> u32 {
+    let mut low = first;
+    let mut high = first + words;
+    while low < high {
+        let middle = (low + high) / 2;
+        if before[middle] <= rank {
+            low = middle + 1;
+        } else {
+            high = middle;
+        }
+    }
+    let word = low - 1;
+    let mut bits = drawable[word];
+    for _ in before[word]..rank {
+        bits &= bits - 1;
+    }
+    32 * u32::cast_from(word - first) + bits.trailing_zeros()
+}
+
 #[cube(launch)]
 fn draw_rays(
     views: &[u32],
-    pixels: &[u32],
+    pixels0: &[u32],
+    pixels1: &[u32],
+    pixels2: &[u32],
+    pixels3: &[u32],
     drawable: &[u32],
+    before: &[u32],
     wanted: &[u32],
     origin: &mut [f32],
     direction: &mut [f32],
@@ -249,8 +303,12 @@ fn draw_rays(
     shift_low: u32,
     behind_high: u32,
     behind_low: u32,
+    key_high: u32,
+    key_low: u32,
+    half_bits: u32,
+    position: u32,
     detail: f32,
-    #[comptime] every: bool,
+    #[comptime] order: PixelOrder,
     #[comptime] shifted: bool,
     #[comptime] random: bool,
 ) {
@@ -259,10 +317,22 @@ fn draw_rays(
     if r < rays {
         let i = u32::cast_from(r);
         let all = views.len() / VIEW;
-        let view = if every {
+        let count = views[(all - 1) * VIEW];
+        // the pixel's number among all drawable ones, where these are counted
+        let mut which = 0u32;
+        let mut wanted = i < wanted[0];
+        let view = if comptime!(order == PixelOrder::EachView) {
             below(view_high, view_low, i, u32::cast_from(all)) as usize
         } else {
-            view_of(views, below(view_high, view_low, i, views[(all - 1) * VIEW]))
+            if comptime!(order.is_permuted()) {
+                // a batch of more than there are
+                wanted = wanted && position + i < count;
+                which =
+                    permuted(Wide { high: key_high, low: key_low }, half_bits, (position + i) % count, count);
+            } else {
+                which = below(view_high, view_low, i, count);
+            }
+            view_of(views, which)
         };
         let view = view * VIEW;
         let (width, height) = (views[view + 3], views[view + 4]);
@@ -270,12 +340,8 @@ fn draw_rays(
         // rejection inside the box: a head fills most of it
         let mut attempt = 0u32;
         let mut last = 0u32;
-        if i < wanted[0] && width > 0 {
-            if every {
-                last = 1u32;
-            } else {
-                last = u32::cast_from(TRIES);
-            }
+        if wanted && width > 0 {
+            last = comptime!(if order == PixelOrder::Random { TRIES } else { 1u32 }).runtime();
         }
         let mut x = 0.0f32;
         let mut y = 0.0f32;
@@ -285,13 +351,32 @@ fn draw_rays(
         let mut opaque = 0u32;
         let mut count = 1u32;
         while attempt < last {
-            let k = (i << 9) | (attempt << 1);
-            let column = below(pixel_high, pixel_low, k, width);
-            let row = below(pixel_high, pixel_low, k | 1, height);
+            let at = if comptime!(order.is_permuted()) {
+                let mut rank = which;
+                if view > 0 {
+                    rank = which - views[view - VIEW];
+                }
+                let words = (width * height).div_ceil(32u32) as usize;
+                ranked(before, drawable, views[view + FIRST_WORD] as usize, words, rank)
+            } else {
+                let k = (i << 9) | (attempt << 1);
+                let column = below(pixel_high, pixel_low, k, width);
+                below(pixel_high, pixel_low, k | 1, height) * width + column
+            };
             attempt += 1;
-            let at = (views[view + 5] + row * width + column) as usize;
-            if (drawable[at >> 5] >> u32::cast_from(at & 31)) & 1 == 1 {
-                let seen = square(views, pixels, drawable, view, column, row, detail);
+            if is_drawable(views, drawable, view, at) {
+                let seen = square(
+                    views,
+                    pixels0,
+                    pixels1,
+                    pixels2,
+                    pixels3,
+                    drawable,
+                    view,
+                    at % width,
+                    at / width,
+                    detail,
+                );
                 red = seen.red;
                 green = seen.green;
                 blue = seen.blue;
@@ -309,15 +394,18 @@ fn draw_rays(
                 last = select(found, 0u32, last);
             }
         }
-        let there = select(found, 1u32, 0u32);
+        let kept = select(found, 1u32, 0u32);
         let most = f32::cast_from(255 * count);
-        alive[r] = there;
-        alpha[r] = f32::cast_from(there * opaque) / most;
-        color[r] = f32::cast_from(there * red) / (255.0f32 * most);
-        color[rays + r] = f32::cast_from(there * green) / (255.0f32 * most);
-        color[2 * rays + r] = f32::cast_from(there * blue) / (255.0f32 * most);
+        alive[r] = kept;
+        alpha[r] = f32::cast_from(kept * opaque) / most;
+        color[r] = f32::cast_from(kept * red) / (255.0f32 * most);
+        color[rays + r] = f32::cast_from(kept * green) / (255.0f32 * most);
+        color[2 * rays + r] = f32::cast_from(kept * blue) / (255.0f32 * most);
         // cameras look along −Z
-        let over = 1.0f32 / (x * x + y * y + 1.0f32).sqrt();
+        let mut over = 1.0f32;
+        if comptime!(order != PixelOrder::Permuted { depth_directions: true }) {
+            over = 1.0f32 / (x * x + y * y + 1.0f32).sqrt();
+        }
         #[unroll]
         for axis in 0..3usize {
             let (right, up) =
@@ -415,11 +503,30 @@ impl Batch {
     }
 }
 
+/// Which pixels follow each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum PixelOrder {
+    /// Any drawable pixel, each as likely.
+    Random,
+    /// Every photograph as often, any pixel of its box once: without a ray where that is not drawable.
+    EachView,
+    /// Every drawable pixel once, then again in another order.
+    Permuted {
+        /// Directions have depth 1 in front of the camera, not length 1.
+        depth_directions: bool,
+    },
+}
+
+impl PixelOrder {
+    /// Is every pixel drawn once before any is drawn again?
+    pub fn is_permuted(self) -> bool {
+        matches!(self, PixelOrder::Permuted { .. })
+    }
+}
+
 /// How rays are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SamplingOptions {
-    /// Every photograph as often, any pixel of its box once: without a ray where that is not worth drawing.
-    pub every: bool,
     /// Is each ray's first sample shifted by a random part of a step?
     pub jitter: bool,
     /// A random color behind each ray, else black.
@@ -431,35 +538,64 @@ pub struct SamplingOptions {
 /// Photographs on a device.
 pub struct Photographs {
     views: Buffer,
-    pixels: Buffer,
+    pixels: [Buffer; BUFFERS],
     drawable: Buffer,
+    /// Drawable pixels of the view before each word of `drawable`; of one word where pixels are not permuted.
+    before: Buffer,
+    /// Drawable pixels of all views.
+    count: u32,
+    order: PixelOrder,
     drawing: SamplingOptions,
 }
 
 impl Photographs {
-    /// Copies photographs there; the field's coordinates are the scene's times `radius`.
+    /// Copies photographs to the device, one after the other, into buffers of `largest` bytes at most; the field's
+    /// coordinates are the scene's times `radius`.
     ///
     /// # Panics
     ///
-    /// Where no pixel is drawable, or 2³² pixels are.
-    pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: SamplingOptions) -> Photographs {
-        let (mut views, mut pixels, mut drawable) = (Vec::new(), Vec::new(), Vec::new());
+    /// Where no pixel is drawable, 2³² pixels are, or [`BUFFERS`] buffers do not hold them.
+    pub fn new(
+        device: &Device,
+        seen: impl Iterator<Item = DrawnView>,
+        radius: f32,
+        order: PixelOrder,
+        drawing: SamplingOptions,
+        largest: u64,
+    ) -> Photographs {
+        let (mut views, mut drawable, mut before) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut pixels, mut full) = (Vec::new(), Vec::new());
         let mut cumulative = 0u32;
         for view in seen {
-            let count = (view.part[2] * view.part[3]) as usize;
-            assert!(view.pixels.len() == count && view.drawable.len() == count.div_ceil(32));
-            let own: u32 = view.drawable.iter().map(|w| w.count_ones()).sum();
+            let area = (view.part[2] * view.part[3]) as usize;
+            assert!(view.pixels.len() == area && view.drawable.len() == area.div_ceil(32));
+            if 4 * (pixels.len() + area) as u64 > largest {
+                full.push(device.upload_vec(std::mem::take(&mut pixels)));
+            }
+            let mut own = 0;
+            for word in &view.drawable {
+                before.push(own);
+                own += word.count_ones();
+            }
             cumulative = cumulative.checked_add(own).expect("fewer than 2³² pixels");
-            let first = u32::try_from(pixels.len()).expect("fewer than 2³² pixels");
-            views.extend(view.words(cumulative, first, radius));
-            pixels.extend(&view.pixels);
-            drawable.extend(&view.drawable);
-            // bits of the next one begin with a word
-            pixels.resize(32 * drawable.len(), 0);
+            views.extend(view.words(cumulative, [pixels.len(), full.len(), drawable.len()], radius));
+            pixels.extend(view.pixels);
+            drawable.extend(view.drawable);
         }
         assert!(cumulative > 0, "no pixel is drawable");
-        let [views, pixels, drawable] = [views, pixels, drawable].map(|words| device.upload(&words));
-        Photographs { views, pixels, drawable, drawing }
+        full.push(device.upload_vec(pixels));
+        assert!(full.len() <= BUFFERS, "{} buffers of pixels", full.len());
+        full.resize_with(BUFFERS, || device.zeros::<u32>(1));
+        before.truncate(if order.is_permuted() { usize::MAX } else { 1 });
+        Photographs {
+            views: device.upload_vec(views),
+            pixels: full.try_into().unwrap_or_else(|_| unreachable!("as many as were made")),
+            drawable: device.upload_vec(drawable),
+            before: device.upload_vec(before),
+            count: cumulative,
+            order,
+            drawing,
+        }
     }
 
     /// Draws the rays of a step: a function of seed and step alone. Of large photographs each stands for a square of
@@ -479,11 +615,14 @@ impl Photographs {
         let [view, pixel, shift, behind] =
             [0, 1, 2, self.drawing.behind].map(|k| stream(seed, step << 4 | k));
         assert!(into.rays() < 1 << 22, "the number of a try has 32 bits");
+        let permutation = rng::Permutation::of_step((seed, step), into.rays() as u64, self.count as u64);
+        let [pixels0, pixels1, pixels2, pixels3] = &self.pixels;
         launch!(device, draw_rays::launch, groups(into.rays().div_ceil(UNITS as usize)), UNITS;
-            self.views, self.pixels, self.drawable, wanted, into.origin, into.direction, into.jitter,
-            into.color, into.alpha, into.background, into.alive;
-            view[0], view[1], pixel[0], pixel[1], shift[0], shift[1], behind[0], behind[1], detail,
-            self.drawing.every, self.drawing.jitter, self.drawing.background
+            self.views, pixels0, pixels1, pixels2, pixels3, self.drawable, self.before, wanted, into.origin,
+            into.direction, into.jitter, into.color, into.alpha, into.background, into.alive;
+            view[0], view[1], pixel[0], pixel[1], shift[0], shift[1], behind[0], behind[1],
+            (permutation.key >> 32) as u32, permutation.key as u32, permutation.half_bits,
+            permutation.first as u32, detail, self.order, self.drawing.jitter, self.drawing.background
         );
     }
 }

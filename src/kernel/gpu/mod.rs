@@ -31,7 +31,7 @@ mod weight_norm;
 pub use adam::{Gate, adam};
 pub use density::Density;
 pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits, Words};
-pub use draw::{Batch, DrawnView, Photographs, SamplingOptions};
+pub use draw::{BUFFERS, Batch, DrawnView, Photographs, PixelOrder, SamplingOptions};
 pub use evaluate::Evaluator;
 pub use hash::Grid;
 pub use losses::Losses;

@@ -32,9 +32,38 @@ pub(super) fn bits(high: u32, low: u32, index: u32) -> Wide {
     let step = times(Wide { high: 0u32, low: index }, 0x9e37_79b9u32, 0x7f4a_7c15u32);
     let sum = low + step.low;
     let carry = select(sum < low, 1u32, 0u32);
-    let z = folded(Wide { high: high + step.high + carry, low: sum }, 30u32);
+    mix(Wide { high: high + step.high + carry, low: sum })
+}
+
+/// SplitMix64's finalizer.
+#[cube]
+fn mix(z: Wide) -> Wide {
+    let z = folded(z, 30u32);
     let z = folded(times(z, 0xbf58_476du32, 0x1ce4_e5b9u32), 27u32);
     folded(times(z, 0x94d0_49bbu32, 0x1331_11ebu32), 31u32)
+}
+
+/// Where `i` of `0..n`, n > 0, goes in the order of [`rng::Permutation`].
+#[cube]
+pub(super) fn permuted(key: Wide, half_bits: u32, i: u32, n: u32) -> u32 {
+    let lower = (1u32 << half_bits) - 1;
+    let mut x = i;
+    let mut inside = false;
+    while !inside {
+        let mut left = x >> half_bits;
+        let mut right = x & lower;
+        #[unroll]
+        for round in 0..4u32 {
+            let stream = mix(Wide { high: key.high, low: key.low ^ round });
+            let mixed = bits(stream.high, stream.low, right).low & lower;
+            let next = left ^ mixed;
+            left = right;
+            right = next;
+        }
+        x = (left << half_bits) | right;
+        inside = x < n;
+    }
+    x
 }
 
 /// A uniform number in [0, 1).

@@ -195,7 +195,8 @@ fn bound(
     #[comptime] width: usize,
 ) {
     let mut sum = 0.0f32;
-    for n in range_stepped(ABSOLUTE_POS, rest(count, from, limit), CUBE_COUNT * UNITS as usize) {
+    let samples = rest(count, from, limit);
+    for n in range_stepped(ABSOLUTE_POS, samples, CUBE_COUNT * UNITS as usize) {
         let mut most = 0.0f32;
         for c in 0..width {
             most = max(most, g[n * width + c].abs());
@@ -205,7 +206,9 @@ fn bound(
     let mut plane = 0.0f32;
     let mut line = 0.0f32;
     let lines = 4 * words[LINES] as usize;
-    for i in range_stepped(ABSOLUTE_POS, values.len(), CUBE_COUNT * UNITS as usize) {
+    // most parts of a list with room for all samples are empty
+    let end = select(samples > 0, values.len(), 0usize);
+    for i in range_stepped(ABSOLUTE_POS, end, CUBE_COUNT * UNITS as usize) {
         let v = values[i].abs();
         plane = max(plane, select(i < lines, v, 0.0f32));
         line = max(line, select(i < lines, 0.0f32, v));
@@ -239,11 +242,18 @@ fn units_of(partial: &[f32], units: &mut [f32]) {
     }
 }
 
-/// Whole numbers become floats, added to the gradient, and zero.
+/// Whole numbers become floats, added to the gradient, and zero, where there was a sample from `from` on.
 #[cube(launch)]
-fn settle(whole: &mut [i32], words: &[u32], units: &[f32], gradient: &mut [f32]) {
+fn settle(
+    whole: &mut [i32],
+    words: &[u32],
+    units: &[f32],
+    count: &[u32],
+    gradient: &mut [f32],
+    from: u32,
+) {
     let i = ABSOLUTE_POS;
-    if i < whole.len() {
+    if i < whole.len() && count[0] > from {
         let unit = select(i < 4 * words[LINES] as usize, units[0], units[1]);
         gradient[i] += f32::cast_from(whole[i]) / unit;
         whole[i] = 0;
@@ -459,8 +469,9 @@ impl DeviceGrid {
             from as u32, limit as u32, self.quads(), index.is_some()
         );
         if let Some(whole) = &self.whole {
-            let count = groups(self.len().div_ceil(UNITS as usize));
-            launch!(device, settle::launch, count, UNITS; whole, self.words, self.units, gradient);
+            launch!(device, settle::launch, groups(self.len().div_ceil(UNITS as usize)), UNITS;
+                whole, self.words, self.units, count, gradient; from as u32
+            );
         }
     }
 
