@@ -236,7 +236,7 @@ from different sides. The other views follow from the cameras.")]
   tiface tface runs/002_00                      go on after a stop
   tiface tface captures/002_00 --run runs/ce --set tface.mask_loss=ce
   tiface tface captures/002_00 --set tface.fields=3    the mean of three fields
-  tiface tface captures/002_00 --set tface.import=official.th")]
+  tiface tface captures/002_00 --set tface.import=official.safetensors")]
     Tface(CaptureOrRun),
     /// Stage: learn one such field from whole photographs, to compare T-Face with
     #[command(after_long_help = "Examples:
