@@ -116,7 +116,8 @@ fn a_finished_run_needs_its_imported_checkpoint_no_more() {
     let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
     write_capture(&dir.path().join("head"), &options).unwrap();
     let import = dir.path().join("official.safetensors");
-    std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.safetensors"), &import).unwrap();
+    std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.safetensors"), &import)
+        .unwrap();
     let import = format!("tface.import={}", import.display());
     // the evaluation of a new run is as `--set` has it, whatever the first command renders
     let words = ["render", "head", "--preset", "draft", "--cameras", "train", "--with", "tface"];

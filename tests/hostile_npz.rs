@@ -16,7 +16,8 @@ fn read(bytes: &[u8]) -> Result<usize, ReadError> {
 }
 
 fn npy() -> Vec<u8> {
-    let mut bytes = b"\x93NUMPY\x01\x00\x3f\x00{'descr': '<f8', 'fortran_order': False, 'shape': (3,), }     \n".to_vec();
+    let mut bytes =
+        b"\x93NUMPY\x01\x00\x3f\x00{'descr': '<f8', 'fortran_order': False, 'shape': (3,), }     \n".to_vec();
     bytes.extend([0; 24]);
     bytes
 }

@@ -359,8 +359,7 @@ learned from (capture.tiles): the blend follows the better members.")]
   tiface bench runs/002_00 --sweep extraction,triangles,texture --truth truth.ply
   tiface bench --out bench/new/ --compare bench/demo/bench.json    what got slower or worse since then
 
-Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep. It exits with 3 if a hard
-case (stability) is not within its bound.")]
+Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep.")]
     Bench(BenchOptions),
     /// The paper's tables and ablations over captures, beside the published figures
     #[cfg(feature = "cpu")]
