@@ -163,10 +163,6 @@ table! {
         /// Learning rate after `steps` steps without a reset, as a share of the first; exponential in between. Every
         /// upsampling starts the rates again. Rates that end low take the noise of single batches out of the result.
         lr_final: f64 => 0.01, 0.003, 0.1;
-        /// Weight of the density's L1 norm until the alpha mask's first update.
-        l1_start: f64 => 0.0;
-        /// The same afterwards.
-        l1_rest: f64 => 0.0;
     }
 }
 

@@ -223,7 +223,7 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
     fn report(&mut self, step: u64) -> Result<StepReport, StepError> {
         let Figures { losses, mean_square, variance, samples, rays, blind, broken } =
             self.ops.figures(&self.groups)?;
-        let [rgb, _, _, mask, eikonal, sparsity, stereo] = losses;
+        let [rgb, _, mask, eikonal, sparsity, stereo] = losses;
         if blind >= LOST_AFTER {
             return Err(StepError::Failed(Error::cannot(
                 format!("the surface is lost at step {step}: no ray of {LOST_AFTER} steps met a sample"),
