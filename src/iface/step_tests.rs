@@ -61,7 +61,7 @@ fn model<'a, O: SdfOps>(
 ) -> SdfModel<'a, O> {
     let session = session("iface", dir, "step", &Quiet);
     let mut model = SdfModel::new(ops, pixels, None, config, &session);
-    let mut state = SdfState::new(config, session.seed, None);
+    let mut state = SdfState::start(initial(config, session.seed), config, None);
     let point = |i: u64| SurfacePoint {
         position: std::array::from_fn(|a| 0.2 * rng::uniform(9, a as u64, i) - 0.1),
         footprint: 0.01 + 0.02 * rng::uniform(9, 4, i),
