@@ -118,7 +118,6 @@ fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 5]) {
 
 const WEIGHTS: LossWeights = LossWeights {
     rgb_mse: 10.0,
-    rgb_l1: 0.0,
     rgb_sample: 1.0,
     mask: 0.1,
     eikonal: 0.1,

@@ -21,7 +21,7 @@ use process::{cpu_s, peak_gib};
 use scene::{Scene, scene};
 use tiface::kernel::cpu::adam::{AdamStep, adam};
 use tiface::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm, Targets, of_rays};
-use tiface::kernel::cpu::vm::{self, DecoderWeights, Penalty, VmField};
+use tiface::kernel::cpu::vm::{self, DecoderWeights, VmField};
 
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
@@ -84,9 +84,8 @@ impl Training {
         lap(1);
         *g_network = vm::backward(&self.field, density, &weights, rendered, &g_out, g_density, g_color);
         lap(2);
-        let penalty = Penalty { tv: TV, ..Penalty::default() };
-        vm::penalize(&self.field.density, &penalty, density, g_density);
-        vm::penalize(&self.field.color, &penalty, color, g_color);
+        vm::penalize(&self.field.density, TV, density, g_density);
+        vm::penalize(&self.field.color, TV, color, g_color);
         lap(3);
         for ([p, m, v, g], step) in self.arrays.iter_mut().zip([GRID, GRID, NETWORK]) {
             adam(p, m, v, g, &step);

@@ -38,6 +38,10 @@
 //! file within limits. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file and
 //! place, and a suggested fix.
 
+// The reference arithmetic of tests names the crate as its other users do.
+#[cfg(test)]
+extern crate self as tiface;
+
 pub mod error;
 pub mod geom;
 pub mod image;

@@ -43,7 +43,6 @@ mod plan;
 mod preview;
 mod render;
 mod scene_file;
-mod stability;
 mod surface;
 mod tiles;
 mod truth;
@@ -59,7 +58,6 @@ pub use mask::{click_page, inspect_capture};
 pub use mesh::export_head;
 pub use page::{head_page, renew_report, viewer_of_file};
 pub use preview::{Preview, PreviewPicture, PreviewRenderer};
-pub use stability::{StabilityCase, stability};
 pub use surface::{Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
 

@@ -743,7 +743,6 @@ fn what_only_gpus_have_is_refused_with_the_feature_that_it_needs() {
         &["iface", "head", "--memory", "2", "--dry-run"],
         &["iface", "head", "--set", "device=cpu+2GiB"],
         &["demo", "--memory", "2"],
-        &["doctor", "--model"],
     ] {
         let o = tiface(dir.path(), words);
         assert_eq!(code(&o), 2, "{words:?}: {}{}", out(&o), err(&o));

@@ -21,7 +21,7 @@ fn worked(output: &Output) -> String {
 fn finished(folder: &Path) {
     let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
     write_capture(&folder.join("head"), &options).unwrap();
-    let import = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.th");
+    let import = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.safetensors");
     let import = format!("tface.import={}", import.display());
     let mut words = vec!["run", "head", "--preset", "draft"];
     let settings = [
@@ -115,8 +115,9 @@ fn a_finished_run_needs_its_imported_checkpoint_no_more() {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
     write_capture(&dir.path().join("head"), &options).unwrap();
-    let import = dir.path().join("official.th");
-    std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.th"), &import).unwrap();
+    let import = dir.path().join("official.safetensors");
+    std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.safetensors"), &import)
+        .unwrap();
     let import = format!("tface.import={}", import.display());
     // the evaluation of a new run is as `--set` has it, whatever the first command renders
     let words = ["render", "head", "--preset", "draft", "--cameras", "train", "--with", "tface"];
@@ -126,16 +127,16 @@ fn a_finished_run_needs_its_imported_checkpoint_no_more() {
     let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
     assert!(config.contains("background = \"white\"") && config.contains("cameras = \"test\""), "{config}");
 
-    std::fs::rename(dir.path().join("official.th"), dir.path().join("moved.th")).unwrap();
+    std::fs::rename(dir.path().join("official.safetensors"), dir.path().join("moved.safetensors")).unwrap();
     let again = worked(&tiface(dir.path(), &["tface", "runs/head"]));
     assert!(again.contains("tface: already done"), "{again}");
     let before = files(&run);
     // another file that does not exist is not what the stage took
-    let typo = tiface(dir.path(), &["tface", "runs/head", "--set", "tface.import=typo.th"]);
-    assert!(typo.status.code() == Some(1) && text(&typo).contains("typo.th"), "{}", text(&typo));
+    let typo = tiface(dir.path(), &["tface", "runs/head", "--set", "tface.import=typo.safetensors"]);
+    assert!(typo.status.code() == Some(1) && text(&typo).contains("typo.safetensors"), "{}", text(&typo));
     assert!(before == files(&run), "the wrong path was written");
     let anew = tiface(dir.path(), &["tface", "runs/head", "--fresh", "tface"]);
-    assert!(anew.status.code() == Some(1) && text(&anew).contains("official.th"), "{}", text(&anew));
+    assert!(anew.status.code() == Some(1) && text(&anew).contains("official.safetensors"), "{}", text(&anew));
     assert!(before == files(&run), "something was removed");
 }
 

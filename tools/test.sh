@@ -212,6 +212,7 @@ step "three.js agrees on the soft globe" node tools/readers/check_three.mjs "$sc
 if [ $blender = yes ]; then
   step "Blender agrees on the soft globe" .venv-blender/bin/python tools/readers/check_blender.py "$scratch/globe/globe_soft.glb" --up 0 0 1
 fi
+step "a published checkpoint is converted" .venv/bin/python tools/reference/tensorf_checkpoint.py --check tests/reference
 step "the engine of many heads is here" .venv/bin/python -m pip install --quiet --disable-pip-version-check \
   -r tools/fleet/requirements.txt
 step "many heads outlive kills" check tools/fleet/check_fleet.py

@@ -123,7 +123,7 @@ pub fn write_capture(dir: &Path, options: &SyntheticOptions) -> Result<()> {
 
 /// Photographs the head with these cameras (all of the intrinsics of the first) and writes the capture folder `dir`,
 /// as [`write_capture`] does, in another world than the head's.
-pub(crate) fn write_photographs(
+pub fn write_photographs(
     dir: &Path,
     cameras: &[(Camera, bool)],
     world_from_head: &Similarity,

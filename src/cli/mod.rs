@@ -236,7 +236,7 @@ from different sides. The other views follow from the cameras.")]
   tiface tface runs/002_00                      go on after a stop
   tiface tface captures/002_00 --run runs/ce --set tface.mask_loss=ce
   tiface tface captures/002_00 --set tface.fields=3    the mean of three fields
-  tiface tface captures/002_00 --set tface.import=official.th")]
+  tiface tface captures/002_00 --set tface.import=official.safetensors")]
     Tface(CaptureOrRun),
     /// Stage: learn one such field from whole photographs, to compare T-Face with
     #[command(after_long_help = "Examples:
@@ -359,8 +359,7 @@ learned from (capture.tiles): the blend follows the better members.")]
   tiface bench runs/002_00 --sweep extraction,triangles,texture --truth truth.ply
   tiface bench --out bench/new/ --compare bench/demo/bench.json    what got slower or worse since then
 
-Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep. It exits with 3 if a hard
-case (stability) is not within its bound.")]
+Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep.")]
     Bench(BenchOptions),
     /// The paper's tables and ablations over captures, beside the published figures
     #[cfg(feature = "cpu")]
@@ -434,15 +433,10 @@ those that are done or not begun share lines; -v gives each its own.")]
     #[command(after_long_help = "Examples:
   tiface doctor                 drivers, memory, and a self-test of each device; what to paste into a bug report
   tiface doctor --json          the same for programs
-  tiface doctor --model         what training steps would take on GPUs by their data sheets
 
 It exits with 1 if a device computes something else than the processor does. A build without the feature `wgpu` knows
-the processor alone, and refuses --model.")]
-    Doctor {
-        /// What a training step would take on GPUs by their data sheets: a prediction, not a measurement
-        #[arg(long)]
-        model: bool,
-    },
+the processor alone.")]
+    Doctor,
     /// Completions for a shell, on stdout, or manual pages
     #[command(after_long_help = "Examples:
   tiface completions bash > /etc/bash_completion.d/tiface
@@ -501,8 +495,7 @@ pub fn main() -> ExitCode {
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),
         #[cfg(feature = "cpu")]
-        Command::Doctor { model } => makes_nothing("doctor")
-            .and_then(|()| if *model { doctor::model(&common) } else { doctor::run(&common) }),
+        Command::Doctor => makes_nothing("doctor").and_then(|()| doctor::run(&common)),
         Command::Completions { form } => Out::find(common.out.as_deref(), "completions")
             .and_then(|out| completions::run(*form, Cli::command(), out.as_ref())),
         stages => run::run(&invocation, &stages.on_line(&common)?),

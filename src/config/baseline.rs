@@ -7,7 +7,8 @@ table! {
     /// Settings of the stage `baseline`: T-Face's but for these, one field, and no masks.
     pub struct BaselineConfig;
     keys {
-        /// A published .th checkpoint to take instead of training; empty to train.
+        /// A published checkpoint to take instead of training, converted by tools/reference/th_to_safetensors.py; empty
+        /// to train.
         import: String => String::new();
         /// Optimizer steps.
         steps: u64, 1.0..=1e7 => 1500, 2000, 50_000;

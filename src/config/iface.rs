@@ -127,8 +127,6 @@ table! {
         touched_rows: bool => true, true, false;
         /// Weight of the squared color error.
         rgb_mse: f64 => 10.0;
-        /// Weight of the absolute color error.
-        rgb_l1: f64 => 0.0;
         /// Weight of the squared color error of single samples, Σ w ‖c − target‖² on rays that are all head. The
         /// blend alone leaves each sample's color free, and a mesh shows a single one.
         rgb_sample: f64 => 3.0, 3.0, 0.0;
@@ -198,6 +196,6 @@ mod tests {
         // inv_s starts at 20.0855
         assert!(((10.0 * p.variance).exp() - 20.0855).abs() < 1e-4);
         // nothing of what is not published
-        assert_eq!((p.stereo, p.rgb_sample, p.rgb_l1, p.soften, p.jitter), (0.0, 0.0, 0.0, 1.0, false));
+        assert_eq!((p.stereo, p.rgb_sample, p.soften, p.jitter), (0.0, 0.0, 1.0, false));
     }
 }

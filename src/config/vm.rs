@@ -70,7 +70,8 @@ table! {
     /// Settings of a vector-matrix field. Lengths are in scene units: the head's box is within [-1, 1]³.
     pub struct VmConfig;
     keys {
-        /// A published .th checkpoint to take instead of training; empty to train.
+        /// A published checkpoint to take instead of training, converted by tools/reference/th_to_safetensors.py; empty
+        /// to train.
         import: String => String::new();
         /// Length of a dataset unit in the imported checkpoint's world (published: 1 / 0.3).
         import_scale: f64, 1e-6..=1e6 => 1.0 / 0.3;
@@ -162,10 +163,6 @@ table! {
         /// Learning rate after `steps` steps without a reset, as a share of the first; exponential in between. Every
         /// upsampling starts the rates again. Rates that end low take the noise of single batches out of the result.
         lr_final: f64 => 0.01, 0.003, 0.1;
-        /// Weight of the density's L1 norm until the alpha mask's first update.
-        l1_start: f64 => 0.0;
-        /// The same afterwards.
-        l1_rest: f64 => 0.0;
     }
 }
 
@@ -248,7 +245,7 @@ mod tests {
     fn what_comes_from_a_file_is_one_field() {
         let standard = Config::preset(Preset::Standard);
         let learned = standard.tface.clone();
-        let imported = VmConfig { import: "official.th".into(), ..learned.clone() };
+        let imported = VmConfig { import: "official.safetensors".into(), ..learned.clone() };
         assert_eq!((learned.learned(), imported.learned()), (2, 1));
         for one in [standard.baseline.field(&standard.tface), VmConfig::preset(Preset::Paper)] {
             assert_eq!(one.learned(), 1);

@@ -13,11 +13,12 @@ mod ops;
 pub use field::DensityField;
 
 use super::occupancy::Occupancy;
+use super::state::FieldState;
 use super::train::IfaceReport;
 use crate::config::iface::{Foreground, IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::ops::ArrayDevice;
-use crate::field::parameters::{HostGroup, ParameterGroup};
+use crate::field::parameters::{HostGroup, ParameterGroup, Part};
 use crate::field::pixels::{Pixels, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self as fields, ComputeDevice};
@@ -39,14 +40,8 @@ const FORMAT: &str = "tiface-density-1";
 /// Milestones of the learning rate, as shares of the steps (10, 15 and 18 of 20 thousand), and what each leaves of it.
 const MILESTONES: ([f64; 3], f64) = ([0.5, 0.75, 0.9], 0.33);
 
-/// Training between two steps.
-struct DensityState {
-    /// Hash table and networks.
-    groups: [HostGroup; 2],
-    occupancy: Occupancy,
-    /// Rays of the next step.
-    rays: usize,
-}
+/// Training between two steps: hash table and networks.
+type DensityState = FieldState<2>;
 
 const NAMES: [&str; 2] = ["table", "network"];
 
@@ -55,38 +50,25 @@ fn shape(config: &IfaceConfig) -> DensityShape {
     DensityShape { levels, radius: config.radius }
 }
 
-impl DensityState {
-    /// U(±1e-4) for the table, Xavier's bounds for the networks, the last layer's as if it had 16 outputs: tiny-cuda-nn.
-    fn new(config: &IfaceConfig, seed: u64) -> DensityState {
-        let shape = shape(config);
-        let entries = hash::entries(&shape.levels) as u64;
-        let table: Vec<f32> = (0..2 * entries).map(|i| 2e-4 * rng::uniform(seed, 121, i) - 1e-4).collect();
-        let mut network = Vec::new();
-        for (k, (rows, columns)) in shape.shapes().into_iter().enumerate() {
-            let bound = (6.0 / (rows.max(16) + columns) as f32).sqrt();
-            let uniform = |i| bound * (2.0 * rng::uniform(seed, 122 + k as u64, i) - 1.0);
-            network.extend((0..(rows * columns) as u64).map(uniform));
-        }
-        let groups = [HostGroup::flat(NAMES[0], table), HostGroup::flat(NAMES[1], network)];
-        DensityState { groups, occupancy: Occupancy::new(config, None), rays: config.rays }
+/// U(±1e-4) for the table, Xavier's bounds for the networks, the last layer's as if it had 16 outputs: tiny-cuda-nn.
+fn initial(config: &IfaceConfig, seed: u64) -> [HostGroup; 2] {
+    let shape = shape(config);
+    let entries = hash::entries(&shape.levels) as u64;
+    let table: Vec<f32> = (0..2 * entries).map(|i| 2e-4 * rng::uniform(seed, 121, i) - 1e-4).collect();
+    let mut network = Vec::new();
+    for (k, (rows, columns)) in shape.shapes().into_iter().enumerate() {
+        let bound = (6.0 / (rows.max(16) + columns) as f32).sqrt();
+        let uniform = |i| bound * (2.0 * rng::uniform(seed, 122 + k as u64, i) - 1.0);
+        network.extend((0..(rows * columns) as u64).map(uniform));
     }
+    [HostGroup::flat(NAMES[0], table), HostGroup::flat(NAMES[1], network)]
+}
 
-    fn save(&self, into: &mut Checkpoint) {
-        self.groups.iter().for_each(|group| group.save(into, true));
-        self.occupancy.save(into);
-        into.set("rays", self.rays);
-    }
-
-    fn restore(config: &IfaceConfig, from: &mut Checkpoint) -> Result<DensityState> {
-        let mut state = DensityState::new(config, 0);
-        for group in &mut state.groups {
-            *group = HostGroup::restore(group.parts.clone(), from, true)?;
-        }
-        state.occupancy.restore(from)?;
-        let most = config.rays.max(config.max_rays) as u64;
-        state.rays = from.number("rays", 1..=most)? as usize;
-        Ok(state)
-    }
+/// Both groups as they lie in a checkpoint.
+fn parts(config: &IfaceConfig) -> [Vec<Part>; 2] {
+    let shape = shape(config);
+    let lengths = [2 * hash::entries(&shape.levels), shape.len()];
+    std::array::from_fn(|k| vec![Part { name: NAMES[k], shape: vec![lengths[k]] }])
 }
 
 /// A density in training on a device.
@@ -166,9 +148,9 @@ fn learning_rate(config: &IfaceConfig, step: u64) -> f64 {
 impl<'a, O: DensityOps> DensityModel<'a, O> {
     /// Before the first step; a checkpoint is not looked for yet.
     fn new(ops: O, config: &'a IfaceConfig, session: &TrainingSession<'a>) -> DensityModel<'a, O> {
-        let DensityState { groups, occupancy, .. } = DensityState::new(config, session.seed);
-        let groups = groups.map(|group| ParameterGroup::upload(ops.device(), group));
-        DensityModel { config, session: *session, ops, groups, occupancy }
+        let state = DensityState::start(initial(config, session.seed), config, None);
+        let groups = state.groups.map(|group| ParameterGroup::upload(ops.device(), group));
+        DensityModel { config, session: *session, ops, groups, occupancy: state.occupancy }
     }
 
     /// Waits for the device; the state as it is there.
@@ -176,7 +158,7 @@ impl<'a, O: DensityOps> DensityModel<'a, O> {
         let [table, network] = self.groups.each_ref().map(|group| group.download(self.ops.device()));
         let mut occupancy = self.occupancy.clone();
         let rays = self.ops.read(&mut occupancy)?;
-        Ok(DensityState { groups: [table?, network?], occupancy, rays })
+        Ok(DensityState { groups: [table?, network?], occupancy, rays, stereo: Vec::new() })
     }
 }
 
@@ -240,8 +222,8 @@ impl<O: DensityOps> Model for DensityModel<'_, O> {
 
     fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
         let state = match from {
-            Some((from, ..)) => DensityState::restore(self.config, from)?,
-            None => DensityState::new(self.config, self.session.seed),
+            Some((from, ..)) => DensityState::restore(parts(self.config), self.config, None, from)?,
+            None => DensityState::start(initial(self.config, self.session.seed), self.config, None),
         };
         self.ops.load(&state.occupancy, state.rays);
         self.groups = state.groups.map(|group| ParameterGroup::upload(self.ops.device(), group));

@@ -46,7 +46,7 @@ fn a_step_is_the_one_of_its_formulas() {
 fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, pixels: &Pixels, [close, near]: [f64; 2]) {
     let dir = temporary();
     let session = session("iface", dir.path(), "step", &Quiet);
-    let mut state = DensityState::new(config, session.seed);
+    let mut state = DensityState::start(initial(config, session.seed), config, None);
     // as if it had learned for a while: something to be seen, and not the same everywhere
     let [table, network] = &mut state.groups;
     table.state[0].iter_mut().enumerate().for_each(|(i, v)| *v = rng::normal(5, 1, i as u64));

@@ -1,6 +1,6 @@
 //! A trained field, evaluated: distances, normals, colors, volume renders.
 
-use super::model::shape;
+use super::model::{parts, shape};
 use super::occupancy::Occupancy;
 use super::schedule::step_length;
 use super::state::{FORMAT, SdfState};
@@ -79,7 +79,7 @@ impl IFace {
     pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&Bitmask>) -> Result<IFace> {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
         TrainingProgress::restore(&file, config.steps)?;
-        let state = SdfState::restore(config, hull, &mut file)?;
+        let state = SdfState::restore(parts(config), config, hull, &mut file)?;
         Ok(IFace::new(config, state))
     }
 

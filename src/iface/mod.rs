@@ -24,5 +24,4 @@ mod train;
 
 pub use density::{DensityField, train_density};
 pub use infer::IFace;
-pub use model::shape as field_shape;
 pub use train::{IfaceReport, train};

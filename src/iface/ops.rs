@@ -31,7 +31,6 @@ pub const VARIANCE: [f32; 2] = [-1.38, 1.38];
 pub fn loss_weights(config: &IfaceConfig, masked: bool) -> LossWeights {
     LossWeights {
         rgb_mse: config.rgb_mse as f32,
-        rgb_l1: config.rgb_l1 as f32,
         rgb_sample: config.rgb_sample as f32,
         mask: if masked { config.mask as f32 } else { 0.0 },
         eikonal: config.eikonal as f32,

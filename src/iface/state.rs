@@ -1,12 +1,11 @@
 //! What a training of I-Face keeps between steps, and how it lies in a checkpoint.
 
-use super::model::{initial, parts};
 use super::occupancy::Occupancy;
 use super::stereo::SurfacePoint;
 use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::checkpoint::Checkpoint;
-use crate::field::parameters::HostGroup;
+use crate::field::parameters::{HostGroup, Part};
 use crate::kernel::cpu::march::Bitmask;
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::sdf::FieldShape;
@@ -15,10 +14,10 @@ use crate::kernel::cpu::weight_norm;
 /// Version of the checkpoints' layout.
 pub const FORMAT: &str = "tiface-iface-1";
 
-/// Training between two steps.
-pub struct SdfState {
-    /// Hash table, networks and variance.
-    pub groups: [HostGroup; 3],
+/// Training between two steps, of a field of so many groups.
+pub struct FieldState<const GROUPS: usize> {
+    /// Hash table, networks and, of a signed distance, variance.
+    pub groups: [HostGroup; GROUPS],
     /// Cells to march through.
     pub occupancy: Occupancy,
     /// Rays of the next step.
@@ -27,15 +26,14 @@ pub struct SdfState {
     pub stereo: Vec<SurfacePoint>,
 }
 
-impl SdfState {
-    /// Returns the state before the first step.
-    pub fn new(config: &IfaceConfig, seed: u64, hull: Option<&Bitmask>) -> SdfState {
-        SdfState {
-            groups: initial(config, seed),
-            occupancy: Occupancy::new(config, hull),
-            rays: config.rays,
-            stereo: Vec::new(),
-        }
+/// Of a signed distance.
+pub type SdfState = FieldState<3>;
+
+impl<const GROUPS: usize> FieldState<GROUPS> {
+    /// Returns the state before the first step, of these groups.
+    pub fn start(groups: [HostGroup; GROUPS], config: &IfaceConfig, hull: Option<&Bitmask>) -> Self {
+        let occupancy = Occupancy::new(config, hull);
+        FieldState { groups, occupancy, rays: config.rays, stereo: Vec::new() }
     }
 
     /// Puts the state into a checkpoint.
@@ -49,21 +47,29 @@ impl SdfState {
         into.set("rays", self.rays);
     }
 
-    /// Takes the state out of a checkpoint; names, shapes and types must be exactly the configured model's.
-    pub fn restore(config: &IfaceConfig, hull: Option<&Bitmask>, from: &mut Checkpoint) -> Result<SdfState> {
-        let [table, network, variance] = parts(config).map(|parts| HostGroup::restore(parts, from, true));
-        let groups = [table?, network?, variance?];
-        let mut occupancy = Occupancy::new(config, hull);
-        occupancy.restore(from)?;
-        let most = config.rays.max(config.max_rays) as u64;
-        let mut stereo = Vec::new();
+    /// Takes the state out of a checkpoint; names, shapes and types must be exactly those of the parts.
+    pub fn restore(
+        parts: [Vec<Part>; GROUPS],
+        config: &IfaceConfig,
+        hull: Option<&Bitmask>,
+        from: &mut Checkpoint,
+    ) -> Result<Self> {
+        let mut state =
+            FieldState::start(parts.map(|parts| HostGroup { parts, ..HostGroup::default() }), config, hull);
+        for group in &mut state.groups {
+            *group = HostGroup::restore(std::mem::take(&mut group.parts), from, true)?;
+        }
+        state.occupancy.restore(from)?;
         if from.has("stereo") {
             let count = from.number("stereo", 1..=1 << 32)? as usize;
-            stereo = bytemuck::cast_slice(&from.floats("stereo", &[count, 5])?).to_vec();
+            state.stereo = bytemuck::cast_slice(&from.floats("stereo", &[count, 5])?).to_vec();
         }
-        Ok(SdfState { groups, occupancy, rays: from.number("rays", 1..=most)? as usize, stereo })
+        state.rays = from.number("rays", 1..=config.rays.max(config.max_rays) as u64)? as usize;
+        Ok(state)
     }
+}
 
+impl SdfState {
     /// Returns the hash table, `[entries, 2]`.
     pub fn table(&self) -> &[[f32; 2]] {
         bytemuck::cast_slice(self.groups[0].values())

@@ -44,7 +44,6 @@ fn ours() -> IfaceConfig {
         spread_features: true,
         jitter: true,
         rgb_sample: 3.0,
-        rgb_l1: 0.4,
         stereo: 0.3,
         sparsity: 0.2,
         sparsity_scale: 50.0,
@@ -62,7 +61,7 @@ fn model<'a, O: SdfOps>(
 ) -> SdfModel<'a, O> {
     let session = session("iface", dir, "step", &Quiet);
     let mut model = SdfModel::new(ops, pixels, None, config, &session);
-    let mut state = SdfState::new(config, session.seed, None);
+    let mut state = SdfState::start(initial(config, session.seed), config, None);
     let point = |i: u64| SurfacePoint {
         position: std::array::from_fn(|a| 0.2 * rng::uniform(9, a as u64, i) - 0.1),
         footprint: 0.01 + 0.02 * rng::uniform(9, 4, i),
@@ -174,7 +173,7 @@ fn formulas(
     }
     let single = neus::composite(rays, &off, inv_s, anneal);
 
-    let (mut squares, mut sizes, mut of_samples, mut cross) = (of(0.0), of(0.0), of(0.0), of(0.0));
+    let (mut squares, mut of_samples, mut cross) = (of(0.0), of(0.0), of(0.0));
     let (mut met, mut full) = (0.0, 0.0);
     for r in 0..batch.rays.len() {
         let (out, a) = (&seen[9 * r..][..9], f64::from(batch.alpha[r]));
@@ -188,7 +187,6 @@ fn formulas(
                 let target = f64::from(batch.color[r][c]) + (1.0 - a) * behind(c);
                 let e = out[c] + of(behind(c)) * (of(1.0) - out[3]) - of(target);
                 squares += e * e;
-                sizes += e.abs();
             }
         }
         if a > 0.999 {
@@ -216,7 +214,6 @@ fn formulas(
             ((e * e + of(0.15 * 0.15)).sqrt() - of(0.15)) * of(f64::from(p.weight) / STEREO_POINTS as f64);
     }
     let total = rgb * of(config.rgb_mse)
-        + sizes / of(3.0 * met) * of(config.rgb_l1)
         + of_samples / of(3.0 * full) * of(config.rgb_sample)
         + mask * of(config.mask)
         + eikonal * of(config.eikonal)

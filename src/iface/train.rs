@@ -5,7 +5,7 @@ use super::cpu::CpuSdf;
 use super::gpu::GpuSdf;
 use super::hull_start::fit_hull;
 use super::infer::IFace;
-use super::model::shape;
+use super::model::{initial, parts, shape};
 use super::occupancy::Occupancy;
 use super::ops::{SdfGroups, SdfOps, VARIANCE};
 use super::schedule;
@@ -142,7 +142,8 @@ impl<'a, O: SdfOps> SdfModel<'a, O> {
         config: &'a IfaceConfig,
         session: &TrainingSession<'a>,
     ) -> SdfModel<'a, O> {
-        let SdfState { groups, occupancy, stereo, .. } = SdfState::new(config, session.seed, hull);
+        let SdfState { groups, occupancy, stereo, .. } =
+            SdfState::start(initial(config, session.seed), config, hull);
         let groups = groups.map(|group| ParameterGroup::upload(ops.device(), group));
         SdfModel { config, session: *session, hull, pixels, ops, groups, occupancy, stereo }
     }
@@ -223,7 +224,7 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
     fn report(&mut self, step: u64) -> Result<StepReport, StepError> {
         let Figures { losses, mean_square, variance, samples, rays, blind, broken } =
             self.ops.figures(&self.groups)?;
-        let [rgb, _, _, mask, eikonal, sparsity, stereo] = losses;
+        let [rgb, _, mask, eikonal, sparsity, stereo] = losses;
         if blind >= LOST_AFTER {
             return Err(StepError::Failed(Error::cannot(
                 format!("the surface is lost at step {step}: no ray of {LOST_AFTER} steps met a sample"),
@@ -262,9 +263,10 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
 
     fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
         let state = match from {
-            Some((from, ..)) => SdfState::restore(self.config, self.hull, from)?,
+            Some((from, ..)) => SdfState::restore(parts(self.config), self.config, self.hull, from)?,
             None => {
-                let mut state = SdfState::new(self.config, self.session.seed, self.hull);
+                let groups = initial(self.config, self.session.seed);
+                let mut state = SdfState::start(groups, self.config, self.hull);
                 if let (Start::Hull, Some(hull)) = (self.config.start, self.hull) {
                     fit_hull(&mut state, hull, self.config, &self.session)?;
                 }

@@ -71,7 +71,7 @@ fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
     let dir = resumes(&run, 5);
     let state = |config: &IfaceConfig, dir: &Path| {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT).unwrap();
-        SdfState::restore(config, Some(&hull), &mut file).unwrap()
+        SdfState::restore(parts(config), config, Some(&hull), &mut file).unwrap()
     };
     // a pixel is 2.4 / 120 = 0.02, and a flat patch of 9 on a ball of 25 lies some 0.2 of one inside
     let off = |p: &SurfacePoint| (Vec3::from(p.position).length() - BALL).abs();

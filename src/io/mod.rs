@@ -5,7 +5,6 @@
 //! name, decides the format; only regular files are opened. Writers go through [`write_atomic`].
 
 mod animation;
-mod archive;
 mod error;
 mod exr;
 mod folder;
@@ -17,7 +16,6 @@ mod pictures;
 mod process;
 mod read;
 mod tensors;
-mod torch;
 mod write;
 
 pub use self::exr::{ExrImage, read_exr, write_exr};
@@ -38,5 +36,4 @@ pub use pictures::{
 pub use process::{cpu_seconds, forget_peak_memory, has_ended, has_open, peak_memory, processor};
 pub use read::{read_bytes, read_maybe_empty};
 pub use tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
-pub use torch::{TorchNumbers, TorchTensor, TorchValue, parse_torch, read_torch};
 pub use write::{WriteError, copy, hard_link, remove, remove_leftovers, rename, write_atomic};

@@ -20,24 +20,14 @@ use crate::config::{Config, MeshConfig};
 use crate::geom::{Camera, Mesh};
 use crate::io;
 use crate::mesh::{Cap, MeshReport, Patches};
-use crate::report::bench::{BenchResult, Machine, Measure, StabilityRow, Sweep};
+use crate::report::bench::{BenchResult, Machine, Measure, Sweep};
 use crate::run::Fingerprint;
 use crate::{Error, Monitor, Result};
 use judge::Judge;
 
-/// What can be swept, in order; the last finds hard cases and has no times.
-pub const SWEEPS: [&str; 10] = [
-    "steps",
-    "photographs",
-    "hash",
-    "devices",
-    "extraction",
-    "triangles",
-    "texture",
-    "render",
-    "masks",
-    "stability",
-];
+/// What can be swept, in order.
+pub const SWEEPS: [&str; 9] =
+    ["steps", "photographs", "hash", "devices", "extraction", "triangles", "texture", "render", "masks"];
 
 /// A capture whose decisions are measured.
 pub struct Bench<'l> {
@@ -97,10 +87,6 @@ impl<'l> Bench<'l> {
                 Some(sweep) => sweep,
                 None => return Ok(Some("this capture has no masks to compare with".into())),
             },
-            "stability" => {
-                into.stability = self.stability()?;
-                return Ok(None);
-            }
             other => {
                 let hint = format!("choose among {}", SWEEPS.join(", "));
                 return Err(Error::usage(format!("there is no sweep `{other}`"), hint));
@@ -108,19 +94,6 @@ impl<'l> Bench<'l> {
         };
         into.sweeps.push(sweep);
         Ok(None)
-    }
-
-    fn stability(&self) -> Result<Vec<StabilityRow>> {
-        let scratch = self.line.run.path("stability");
-        let cases = super::stability(&scratch, self.monitor())?;
-        let row = |c: super::StabilityCase| StabilityRow {
-            group: c.group.into(),
-            case: c.case,
-            error: Some(c.error).filter(|e| e.is_finite()),
-            unit: c.unit.into(),
-            bound: c.bound,
-        };
-        Ok(cases.into_iter().map(row).collect())
     }
 
     fn config(&self) -> &Config {

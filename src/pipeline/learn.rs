@@ -74,7 +74,7 @@ pub(super) fn train(
     // `baseline` and `tface` are the same learning with other settings
     let c = config.radiance(stage);
     if !c.import.is_empty() {
-        tface::import_th(Path::new(&c.import), c.import_scale, &scene.scene_from_world, session)?;
+        tface::import(Path::new(&c.import), c.import_scale, &scene.scene_from_world, session)?;
         return Ok((json!({"imported": c.import}), Vec::new()));
     }
     // without masks nothing may know the head's outline nor what that carves; only the box stays

@@ -478,7 +478,7 @@ fn a_command_runs_what_its_stage_needs_and_nothing_else() {
 fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
     let dir = tempfile::tempdir().unwrap();
     capture(dir.path(), 8, 1);
-    std::fs::write(dir.path().join("a.th"), b"weights").unwrap();
+    std::fs::write(dir.path().join("a.safetensors"), b"weights").unwrap();
     let run = quiet(dir.path());
     let digests = |change: &dyn Fn(&mut Config)| -> Vec<String> {
         let mut config = draft(dir.path());
@@ -507,13 +507,13 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
         let path = dir.path().join(name).to_str().unwrap().to_string();
         digests(&|c| c.tface.import = path.clone())
     };
-    let first = import("a.th");
+    let first = import("a.safetensors");
     assert_ne!(first[2], base[2]);
     assert_eq!(Stage::ALL[2], Stage::Tface);
-    std::fs::copy(dir.path().join("a.th"), dir.path().join("b.th")).unwrap();
-    assert_eq!(import("b.th"), first);
-    std::fs::write(dir.path().join("a.th"), b"other").unwrap();
-    assert_ne!(import("a.th"), first);
+    std::fs::copy(dir.path().join("a.safetensors"), dir.path().join("b.safetensors")).unwrap();
+    assert_eq!(import("b.safetensors"), first);
+    std::fs::write(dir.path().join("a.safetensors"), b"other").unwrap();
+    assert_ne!(import("a.safetensors"), first);
 }
 
 #[test]

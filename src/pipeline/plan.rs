@@ -290,18 +290,6 @@ impl Line<'_> {
                     settings.insert(if settings.contains_key(&own) { own } else { key }, value);
                 }
                 settings.remove("tface.checkpoint_s");
-                // follows from the box
-                settings.remove("tface.alpha_unit");
-                // as in runs from before there was anything else
-                let own = &learned.tface;
-                let published = own.near > 0.0 || own.far < 1e6;
-                for (key, told) in
-                    [("depth_directions", own.depth_directions), ("near", published), ("far", published)]
-                {
-                    if !told {
-                        settings.remove(&format!("tface.{key}"));
-                    }
-                }
                 if stage == Stage::Baseline {
                     settings.remove("tface.mask_weight"); // of a loss that it has not
                 }

@@ -123,9 +123,6 @@ pub struct Sweep {
     pub rows: Vec<Row>,
 }
 
-/// Headings of the table of hard cases.
-const STABILITY: [&str; 5] = ["", "case", "error", "bound", "unit"];
-
 /// Heading of the choices.
 const CHOICE: &str = "choice";
 
@@ -191,28 +188,6 @@ fn short_time(seconds: f64) -> String {
     }
 }
 
-/// A hard case, the largest error met there, and what it must stay below.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct StabilityRow {
-    /// Cases of one kind.
-    pub group: String,
-    /// The case.
-    pub case: String,
-    /// The largest error; `None` where it is not finite.
-    pub error: Option<f64>,
-    /// Of error and bound.
-    pub unit: String,
-    /// What it must stay below.
-    pub bound: f64,
-}
-
-impl StabilityRow {
-    /// Is the error finite and within its bound?
-    pub fn holds(&self) -> bool {
-        self.error.is_some_and(|e| e.is_finite() && e <= self.bound)
-    }
-}
-
 /// Where something was measured.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Machine {
@@ -238,23 +213,13 @@ pub struct BenchResult {
     pub identity: String,
     /// The sweeps, in order.
     pub sweeps: Vec<Sweep>,
-    /// Hard cases.
-    pub stability: Vec<StabilityRow>,
 }
 
 impl BenchResult {
     /// Nothing measured yet.
     pub fn new(machine: Machine, capture: String, identity: String) -> BenchResult {
         let version = env!("CARGO_PKG_VERSION").into();
-        BenchResult {
-            format: FORMAT,
-            version,
-            machine,
-            capture,
-            identity,
-            sweeps: Vec::new(),
-            stability: Vec::new(),
-        }
+        BenchResult { format: FORMAT, version, machine, capture, identity, sweeps: Vec::new() }
     }
 
     /// Reads the text of a `bench.json`; `name` is for messages.
@@ -328,20 +293,6 @@ impl BenchResult {
                 let _ = writeln!(out, "{star} {line}");
             }
         }
-        if !self.stability.is_empty() {
-            let _ = writeln!(
-                out,
-                "\nNumerical stability (stability)\nThe largest error of each hard case, and its bound."
-            );
-            let rows: Vec<Vec<String>> = [STABILITY.map(String::from).to_vec()]
-                .into_iter()
-                .chain(self.stability.iter().map(StabilityRow::cells))
-                .collect();
-            for (i, line) in aligned(&rows, 2).into_iter().enumerate() {
-                let fails = i > 0 && !self.stability[i - 1].holds();
-                let _ = writeln!(out, "{} {line}", if fails { '!' } else { ' ' });
-            }
-        }
         out
     }
 
@@ -363,12 +314,6 @@ impl BenchResult {
                 }
                 out += &line(&cells);
             }
-        }
-        if !self.stability.is_empty() {
-            out += "\n**Numerical stability** The largest error of each hard case, and its bound.\n\n";
-            out += &line(&STABILITY.map(String::from));
-            out += &line(&STABILITY.map(|_| "---".into()));
-            self.stability.iter().for_each(|row| out += &line(&row.cells()));
         }
         out.trim_start().into()
     }
@@ -401,21 +346,13 @@ impl BenchResult {
                 context! { title => sweep.title, note => sweep.note, headings, rows, plot, words }
             })
             .collect();
-        let stability: Vec<_> = self.stability.iter().map(|row| (row.holds(), row.cells())).collect();
         fill(
             include_str!("bench/page.html"),
             context! {
                 style => STYLE, title => format!("{}: speed against error", self.capture), machine => self.machine,
-                version => self.version, sweeps, stability, comparison => comparison.map(Comparison::lines),
+                version => self.version, sweeps, comparison => comparison.map(Comparison::lines),
             },
         )
-    }
-}
-
-impl StabilityRow {
-    fn cells(&self) -> Vec<String> {
-        let error = self.error.map_or("not finite".into(), |e| format!("{e:.2e}"));
-        vec![self.group.clone(), self.case.clone(), error, format!("{:.0e}", self.bound), self.unit.clone()]
     }
 }
 
@@ -504,14 +441,7 @@ pub(super) mod tests {
 
     #[test]
     fn what_is_written_is_read_back_and_nothing_else() {
-        let mut result = result(vec![row("a", &[1.0, 0.1 + 0.2], 30.123_456_789)]);
-        result.stability.push(StabilityRow {
-            group: "g".into(),
-            case: "c".into(),
-            error: None,
-            unit: "cells".into(),
-            bound: 1.0,
-        });
+        let result = result(vec![row("a", &[1.0, 0.1 + 0.2], 30.123_456_789)]);
         assert_eq!(BenchResult::parse(&result.json(), "b").unwrap(), result);
         let wrong = |text: &str| BenchResult::parse(text, "b.json").unwrap_err().to_string();
         assert!(wrong("{}").contains("`b.json` is no result"));
@@ -521,18 +451,10 @@ pub(super) mod tests {
 
     #[test]
     fn tables_page_and_plots_hold_every_row_and_escape_names() {
-        let mut result = result(vec![row("<b>", &[1.5], 30.0), row("c", &[100.0], 33.333)]);
-        result.stability.push(StabilityRow {
-            group: "g".into(),
-            case: "c".into(),
-            error: Some(2.0),
-            unit: "cells".into(),
-            bound: 1.0,
-        });
+        let result = result(vec![row("<b>", &[1.5], 30.0), row("c", &[100.0], 33.333)]);
         let text = result.text();
         assert!(text.contains("* field  c       1 min 40 s"), "{text}");
-        assert!(text.contains("33.33") && text.contains("! g"), "{text}");
-        assert!(result.markdown().contains("| g | c | 2.00e0 | 1e0 | cells |"), "{}", result.markdown());
+        assert!(text.contains("33.33"), "{text}");
         assert!(result.markdown().contains("| field | **c** | 1 min 40 s | 50 s | – | 33.33 |"));
         let page = result.html(None).unwrap();
         assert!(page.contains("&lt;b&gt;") && !page.contains("<b>") && page.contains("data:image/svg+xml"));

@@ -9,7 +9,7 @@ use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::{Batch, Pixels};
 use crate::field::training::StepAt;
 use crate::kernel::cpu::vm::losses::{self, BackgroundMode, Targets, VmFigures};
-use crate::kernel::cpu::vm::{self, DecoderWeights, Penalty, Rendered, VmField};
+use crate::kernel::cpu::vm::{self, DecoderWeights, Rendered, VmField};
 use std::sync::Arc;
 
 /// The operations of [`VmOps`] on the processor.
@@ -121,15 +121,15 @@ impl VmOps for CpuVm<'_> {
         slice_mut(&mut network.gradient).copy_from_slice(&flat);
     }
 
-    fn penalize(&mut self, groups: &mut VmGroups<Self>, penalties: &[Penalty; 2]) {
+    fn penalize(&mut self, groups: &mut VmGroups<Self>, weights: [f32; 2]) {
         if !self.gate() {
             return;
         }
         let field = self.field();
-        for ((grid, penalty), group) in [field.density, field.color].iter().zip(penalties).zip(groups) {
-            if !penalty.is_zero() {
+        for ((grid, weight), group) in [field.density, field.color].iter().zip(weights).zip(groups) {
+            if weight != 0.0 {
                 let (values, gradient) = group.value_and_gradient();
-                vm::penalize(grid, penalty, slice(values), slice_mut(gradient));
+                vm::penalize(grid, weight, slice(values), slice_mut(gradient));
             }
         }
     }

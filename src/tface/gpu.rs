@@ -11,8 +11,8 @@ use crate::field::ops::{ArrayDevice, Ops};
 use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::Pixels;
 use crate::field::training::StepAt;
+use crate::kernel::cpu::vm::VmField;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, VmFigures};
-use crate::kernel::cpu::vm::{Penalty, VmField};
 use crate::kernel::gpu::{
     self, Batch, Buffer, Device, DeviceDecoder, Gate, SamplingOptions, Vm, VmLosses, VmValues,
 };
@@ -173,10 +173,10 @@ impl VmOps for GpuVm<'_> {
         self.losses.add(device, vm, &self.broken);
     }
 
-    fn penalize(&mut self, groups: &mut VmGroups<Self>, penalties: &[Penalty; 2]) {
+    fn penalize(&mut self, groups: &mut VmGroups<Self>, weights: [f32; 2]) {
         let (device, vm) = (&self.device, self.vm());
-        for ((grid, penalty), group) in [&vm.density, &vm.color].into_iter().zip(penalties).zip(groups) {
-            grid.penalize(device, group.value(), penalty, &group.gradient);
+        for ((grid, weight), group) in [&vm.density, &vm.color].into_iter().zip(weights).zip(groups) {
+            grid.penalize(device, group.value(), weight, &group.gradient);
         }
     }
 

@@ -44,7 +44,11 @@ impl TFace {
 
     /// Loads the field from the checkpoint in a folder of `stage`.
     pub fn load(stage: &'static str, dir: &Path) -> Result<TFace> {
-        let mut file = Checkpoint::read(&checkpoint::newest(dir), stage, FORMAT)?;
+        TFace::restore(Checkpoint::read(&checkpoint::newest(dir), stage, FORMAT)?)
+    }
+
+    /// Takes the field out of a checkpoint.
+    pub(super) fn restore(mut file: Checkpoint) -> Result<TFace> {
         let record = FieldRecord::restore(&file)?;
         let (bounds, size, mask) = geometry(&mut file)?;
         let field = record.field(bounds, size, mask);

@@ -6,10 +6,10 @@
 
 #[cfg(feature = "cpu")]
 mod cpu;
-#[cfg(feature = "cpu")]
-mod exchange;
 #[cfg(feature = "wgpu")]
 mod gpu;
+#[cfg(feature = "cpu")]
+mod import;
 #[cfg(feature = "cpu")]
 mod infer;
 #[cfg(feature = "cpu")]
@@ -22,12 +22,11 @@ mod record;
 mod refine;
 #[cfg(feature = "cpu")]
 mod state;
-pub mod th;
 #[cfg(feature = "cpu")]
 mod train;
 
 #[cfg(feature = "cpu")]
-pub use exchange::import_th;
+pub use import::import;
 #[cfg(feature = "cpu")]
 pub use infer::TFace;
 #[cfg(feature = "cpu")]

@@ -7,8 +7,8 @@ use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::Pixels;
 use crate::field::training::StepAt;
 use crate::kernel::cpu::rng;
+use crate::kernel::cpu::vm::VmField;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm, VmFigures};
-use crate::kernel::cpu::vm::{Penalty, VmField};
 use std::sync::Arc;
 
 /// Random numbers of a step's backgrounds.
@@ -69,7 +69,7 @@ pub trait VmOps: Ops {
     fn backward(&mut self, groups: &mut VmGroups<Self>);
 
     /// Adds the gradients of the regularizers of both grids.
-    fn penalize(&mut self, groups: &mut VmGroups<Self>, penalties: &[Penalty; 2]);
+    fn penalize(&mut self, groups: &mut VmGroups<Self>, weights: [f32; 2]);
 
     /// Forgets what steps came to since the last time.
     fn forget(&mut self);

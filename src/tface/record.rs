@@ -147,6 +147,11 @@ impl FieldRecord {
         }
     }
 
+    /// Puts the record alone into a checkpoint.
+    pub fn write(&self, into: &mut Checkpoint) {
+        into.set("field", serde_json::to_string(self).expect("plain numbers become JSON"));
+    }
+
     /// Puts the record into a checkpoint, and where its grid lies.
     pub fn save(
         &self,
@@ -156,7 +161,7 @@ impl FieldRecord {
         into: &mut Checkpoint,
     ) {
         let words = |s: [usize; 3]| s.map(|n| n as u64).to_vec();
-        into.set("field", serde_json::to_string(self).expect("plain numbers become JSON"));
+        self.write(into);
         into.put_floats("bounds", &[2, 3], bounds.concat());
         into.put_words("size", words(size));
         if let Some(mask) = mask {

@@ -16,7 +16,7 @@ use std::path::Path;
 
 const BOX: [[f32; 3]; 2] = [[-0.8, -0.7, -0.75], [0.8, 0.7, 0.75]];
 
-/// As published, but for the sizes; a regularizer that the paper leaves out is there, too.
+/// As published, but for the sizes.
 fn paper() -> VmConfig {
     VmConfig {
         rays: 40,
@@ -26,7 +26,6 @@ fn paper() -> VmConfig {
         color_rank: vec![4, 2, 3],
         features: 6,
         hidden: 8,
-        l1_start: 1e-3,
         // the published weight would hardly be seen beside the color's
         mask_weight: 0.1,
         ..VmConfig::preset(Preset::Paper)
@@ -63,12 +62,6 @@ fn total_variation(grid: &Grid, x: &[Var]) -> Var {
             * Var::of(2.0);
     }
     sum
-}
-
-/// Σ over planes and lines of the mean of |x|.
-fn size(grid: &Grid, x: &[Var]) -> Var {
-    let parts = (0..3).flat_map(|i| [grid.plane(i), grid.line(i)]);
-    parts.map(|f| x[f.range()].iter().map(|v| v.abs()).sum::<Var>() / Var::of(f.len() as f64)).sum()
 }
 
 /// Color loss, mask loss and all together, by the formulas.
@@ -113,8 +106,7 @@ fn formulas((config, pixels, state): (&VmConfig, &Pixels, &VmState), x: &[Var], 
     let total = rgb
         + mask * of(config.mask_weight)
         + total_variation(&field.density, density) * of(0.01 * config.tv_density * fade)
-        + total_variation(&field.color, color) * of(0.01 * config.tv_color * fade)
-        + size(&field.density, density) * of(config.l1_start);
+        + total_variation(&field.color, color) * of(0.01 * config.tv_color * fade);
     [rgb, mask, total]
 }
 

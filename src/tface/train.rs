@@ -15,7 +15,6 @@ use crate::field::training::{self, Model, StepAt, StepError, StepReport, Trainin
 use crate::field::{self, ComputeDevice};
 use crate::kernel::cpu::adam::AdamStep;
 use crate::kernel::cpu::march::Bitmask;
-use crate::kernel::cpu::vm::Penalty;
 use crate::kernel::cpu::vm::losses::VmFigures;
 use crate::{Error, Result};
 use serde::Serialize;
@@ -235,13 +234,10 @@ impl<'a, O: VmOps> VmModel<'a, O> {
         if 2 * step < self.config.steps { DETAIL * cell } else { 0.0 }
     }
 
-    /// What is asked of both grids at a step besides the photographs.
-    fn penalties(&self, step: u64) -> [Penalty; 2] {
-        let config = self.config;
-        let faded = tv_fade(config, step);
-        let tv = |weight: f64| (0.01 * weight * faded) as f32;
-        let l1 = if self.state.masked { config.l1_rest } else { config.l1_start } as f32;
-        [Penalty { tv: tv(config.tv_density), l1 }, Penalty { tv: tv(config.tv_color), l1: 0.0 }]
+    /// Weights of both grids' total variation at a step.
+    fn penalties(&self, step: u64) -> [f32; 2] {
+        let faded = tv_fade(self.config, step);
+        [self.config.tv_density, self.config.tv_color].map(|weight| (0.01 * weight * faded) as f32)
     }
 }
 
@@ -262,7 +258,7 @@ impl<O: VmOps> Model for VmModel<'_, O> {
         ops.vm_render(groups);
         ops.losses(background_mode(self.config, at));
         ops.backward(groups);
-        ops.penalize(groups, &penalties);
+        ops.penalize(groups, penalties);
         self.unread += 1;
     }
 

@@ -26,7 +26,7 @@ use tiface::tface::TFace;
 pub type Reader = fn(&Path, &[u8]) -> String;
 
 /// By the name of their seeds.
-pub const READERS: [(&str, Reader); 25] = [
+pub const READERS: [(&str, Reader); 24] = [
     ("bench", |_, bytes| told(BenchResult::parse(&text(bytes), "bench.json"))),
     ("camera_path", camera_path),
     ("cameras", cameras),
@@ -50,7 +50,6 @@ pub const READERS: [(&str, Reader); 25] = [
     ("run", run),
     ("surface", surface),
     ("tface", tface),
-    ("torch", torch),
     ("transforms", |dir, bytes| open(dir, "transforms.json", bytes)),
 ];
 
@@ -237,12 +236,6 @@ fn replaced(bytes: &[u8], word: &[u8], by: &[u8]) -> Vec<u8> {
         Some(at) => [&bytes[..at], by, &bytes[at + word.len()..]].concat(),
         None => bytes.to_vec(),
     }
-}
-
-fn torch(dir: &Path, bytes: &[u8]) -> String {
-    put(dir, "a.th", bytes);
-    told(io::parse_torch(dir, bytes, &limits()))
-        + &told(tiface::tface::th::read_th(&dir.join("a.th"), &limits()))
 }
 
 fn config(_: &Path, bytes: &[u8]) -> String {

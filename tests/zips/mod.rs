@@ -1,5 +1,4 @@
 //! Zip archives made and taken apart for tests, without zip64 and without the reader under test.
-#![allow(dead_code)]
 
 /// One entry as it will stand in an archive, true or not.
 #[derive(Clone)]
@@ -63,32 +62,5 @@ pub fn archive(entries: &[Entry], offset: impl Fn(usize, u32) -> u32) -> Vec<u8>
     [count, count].iter().for_each(|w| out.extend(w.to_le_bytes()));
     [list.len() as u32, start].iter().for_each(|w| out.extend(w.to_le_bytes()));
     out.extend([0; 2]);
-    out
-}
-
-pub fn stored(entries: &[(String, Vec<u8>)]) -> Vec<u8> {
-    let entries: Vec<_> = entries.iter().map(|(name, content)| Entry::stored(name, content)).collect();
-    archive(&entries, |_, at| at)
-}
-
-pub fn deflated(entries: &[(String, Vec<u8>)]) -> Vec<u8> {
-    let entries: Vec<_> = entries.iter().map(|(name, content)| Entry::deflated(name, content)).collect();
-    archive(&entries, |_, at| at)
-}
-
-/// Names and contents of an archive that torch stored, by walking its list.
-pub fn entries(bytes: &[u8]) -> Vec<(String, Vec<u8>)> {
-    let u16_at = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]) as usize;
-    let u32_at = |at: usize| u16_at(at) | u16_at(at + 2) << 16;
-    let end = bytes.len() - 22;
-    let mut at = u32_at(end + 16);
-    let mut out = Vec::new();
-    for _ in 0..u16_at(end + 10) {
-        let (size, offset) = (u32_at(at + 20), u32_at(at + 42));
-        let name = String::from_utf8(bytes[at + 46..at + 46 + u16_at(at + 28)].to_vec()).unwrap();
-        let start = offset + 30 + u16_at(offset + 26) + u16_at(offset + 28);
-        out.push((name, bytes[start..start + size].to_vec()));
-        at += 46 + u16_at(at + 28) + u16_at(at + 30) + u16_at(at + 32);
-    }
     out
 }

@@ -1,7 +1,7 @@
 //! A trained density: values, colors, volume renders.
 
 use super::cpu::march;
-use super::{DensityState, FORMAT, shape};
+use super::{DensityState, FORMAT, parts, shape};
 use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
@@ -38,7 +38,8 @@ impl DensityField {
     pub fn load(dir: &Path, config: &IfaceConfig) -> Result<DensityField> {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
         TrainingProgress::restore(&file, config.steps)?;
-        Ok(DensityField::new(config, DensityState::restore(config, &mut file)?))
+        let state = DensityState::restore(parts(config), config, None, &mut file)?;
+        Ok(DensityField::new(config, state))
     }
 
     fn table(&self) -> &[[f32; 2]] {

@@ -6,7 +6,7 @@
 //! distance `f` is counted in pixels of length `p`:
 //!
 //! ```text
-//! rgb_mse · ⟨e²⟩ + rgb_l1 · ⟨|e|⟩ + rgb_sample · ⟨Σ w (c − h)²⟩ + mask · ⟨−a ln O − (1 − a) ln(1 − O)⟩
+//! rgb_mse · ⟨e²⟩ + rgb_sample · ⟨Σ w (c − h)²⟩ + mask · ⟨−a ln O − (1 − a) ln(1 − O)⟩
 //!   + eikonal · ⟨(‖∇f‖ − 1)²⟩ + sparsity · ⟨exp(−β |f|)⟩ + stereo · ⟨w (√((f / p)² + k²) − k)⟩
 //! ```
 //!
@@ -21,8 +21,6 @@ use rayon::prelude::*;
 pub struct LossWeights {
     /// Of the squared error of the color.
     pub rgb_mse: f32,
-    /// Of its absolute error.
-    pub rgb_l1: f32,
     /// Of the squared error of each sample's own color.
     pub rgb_sample: f32,
     /// Of the cross entropy of opacity and alpha.
@@ -42,8 +40,8 @@ pub struct LossWeights {
 /// Random numbers of a step's stereo points.
 pub const STEREO_STREAM: u64 = 12;
 
-/// Terms of a ray: squared and absolute error, each sample's own color, mask.
-pub const RAY_TERMS: usize = 4;
+/// Terms of a ray: squared error, each sample's own color, mask.
+pub const RAY_TERMS: usize = 3;
 /// Terms of a sample: eikonal, sparsity.
 pub const SAMPLE_TERMS: usize = 2;
 /// All terms, in the order of the formula.
@@ -84,15 +82,13 @@ pub fn of_rays(composed: &[f32], targets: Targets, w: &LossWeights) -> ([f32; RA
         let (opacity, a) = (out[3], alpha[r]);
         let share = if has_samples(r) { share } else { 0.0 };
         let head = if a > ALL_HEAD { head_share } else { 0.0 };
-        let (mut square, mut absolute, mut own) = (0f32, 0f32, out[8]);
+        let (mut square, mut own) = (0f32, out[8]);
         for c in 0..3 {
             let (h, b) = (color[r][c], background[r][c]);
             let e = out[c] + (1.0 - opacity) * b - (h + (1.0 - a) * b);
             square += e * e;
-            absolute += e.abs();
             own += h * h * opacity - 2.0 * h * out[c];
-            let sign = if e == 0.0 { 0.0 } else { e.signum() };
-            let by_error = (2.0 * e * w.rgb_mse + sign * w.rgb_l1) * share;
+            let by_error = 2.0 * e * w.rgb_mse * share;
             g[c] = by_error - 2.0 * h * w.rgb_sample * head;
             g[3] += h * h * w.rgb_sample * head - b * by_error;
         }
@@ -102,8 +98,7 @@ pub fn of_rays(composed: &[f32], targets: Targets, w: &LossWeights) -> ([f32; RA
             g[3] += ((1.0 - a) / (1.0 - p) - a / p) * even * w.mask;
         }
         let cross = -(a * p.ln() + (1.0 - a) * (1.0 - p).ln());
-        for (sum, term) in terms.iter_mut().zip([square * share, absolute * share, own * head, cross * even])
-        {
+        for (sum, term) in terms.iter_mut().zip([square * share, own * head, cross * even]) {
             *sum += f64::from(term);
         }
     }

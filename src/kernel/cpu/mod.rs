@@ -15,6 +15,8 @@ pub mod mlp;
 pub mod neus;
 pub mod occupancy;
 pub mod pool;
+#[cfg(test)]
+#[path = "../../../tests/support/reference/mod.rs"]
 pub(crate) mod reference;
 pub mod rng;
 pub mod schedule;

@@ -310,7 +310,7 @@ fn opacity(x: f32) -> f32 {
     select(x < 0.1f32, series, 1.0f32 - (-x).exp())
 }
 
-/// Composites; terms of rays, planes `[4, rays]`, and gradients by the field's output, planes `[4, capacity]`. `light` is
+/// Composites; terms of rays, planes `[3, rays]`, and gradients by the field's output, planes `[4, capacity]`. `light` is
 /// scratch, planes `[2, capacity]`.
 #[cube(launch)]
 fn of_rays(
@@ -357,7 +357,6 @@ fn of_rays(
         terms[r] = (e0 * e0 + e1 * e1 + e2 * e2) * share;
         terms[rays + r] = (smooth(e0) + smooth(e1) + smooth(e2)) * share;
         terms[2 * rays + r] = spread / last;
-        terms[3 * rays + r] = 0.0f32;
         let g0 = clamp(e0, -1.0f32, 1.0f32) * share;
         let g1 = clamp(e1, -1.0f32, 1.0f32) * share;
         let g2 = clamp(e2, -1.0f32, 1.0f32) * share;

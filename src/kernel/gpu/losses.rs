@@ -42,7 +42,7 @@ fn tally(offsets: &[u32], alpha: &[f32], alive: &[u32], out: &mut [u32]) {
     }
 }
 
-/// Terms of rays, planes `[4, rays]`, and gradients by what was composited, planes `[9, rays]`.
+/// Terms of rays, planes `[3, rays]`, and gradients by what was composited, planes `[9, rays]`.
 #[cube(launch)]
 fn of_rays(
     composed: &[f32],
@@ -55,7 +55,6 @@ fn of_rays(
     g_out: &mut [f32],
     terms: &mut [f32],
     rgb_mse: f32,
-    rgb_l1: f32,
     rgb_sample: f32,
     mask: f32,
 ) {
@@ -68,17 +67,14 @@ fn of_rays(
         let share = met / (3.0f32 * max(f32::cast_from(tally[0]), 1.0f32));
         let head = select(a > 0.999f32, there, 0.0f32) / (3.0f32 * max(f32::cast_from(tally[1]), 1.0f32));
         let mut square = 0.0f32;
-        let mut absolute = 0.0f32;
         let mut own = composed[8 * rays + r];
         let mut g_opacity = 0.0f32;
         for c in 0..3usize {
             let (h, b, seen) = (color[c * rays + r], background[c * rays + r], composed[c * rays + r]);
             let e = seen + (1.0f32 - opacity) * b - (h + (1.0f32 - a) * b);
             square += e * e;
-            absolute += e.abs();
             own += h * h * opacity - 2.0f32 * h * seen;
-            let sign = select(e > 0.0f32, 1.0f32, select(e < 0.0f32, -1.0f32, 0.0f32));
-            let g = (2.0f32 * e * rgb_mse + sign * rgb_l1) * share;
+            let g = 2.0f32 * e * rgb_mse * share;
             g_out[c * rays + r] = g - 2.0f32 * h * rgb_sample * head;
             g_opacity += h * h * rgb_sample * head - b * g;
         }
@@ -92,9 +88,8 @@ fn of_rays(
         }
         g_out[8 * rays + r] = rgb_sample * head;
         terms[r] = square * share;
-        terms[rays + r] = absolute * share;
-        terms[2 * rays + r] = own * head;
-        terms[3 * rays + r] = cross;
+        terms[rays + r] = own * head;
+        terms[2 * rays + r] = cross;
     }
 }
 
@@ -206,7 +201,7 @@ impl Losses {
         launch!(device, tally::launch, one, UNITS; offsets, alpha, alive, tally);
         launch!(device, of_rays::launch, groups(alpha.words().div_ceil(UNITS as usize)), UNITS;
             composed, color, alpha, background, alive, offsets, tally, self.g_out, self.ray_terms;
-            w.rgb_mse, w.rgb_l1, w.rgb_sample, w.mask
+            w.rgb_mse, w.rgb_sample, w.mask
         );
         &self.g_out
     }
@@ -228,7 +223,7 @@ impl Losses {
     }
 
     /// The terms of the last step, unweighted: in the order of [`LossWeights`], then those of points; then the squared errors
-    /// of all steps since [`forget`](Losses::forget), and how many of those met a sample: `[9]`.
+    /// of all steps since [`forget`](Losses::forget), and how many of those met a sample: `[8]`.
     pub fn sums(&self) -> &Buffer {
         &self.sums
     }
@@ -248,7 +243,6 @@ mod tests {
 
     const WEIGHTS: LossWeights = LossWeights {
         rgb_mse: 10.0,
-        rgb_l1: 0.7,
         rgb_sample: 3.0,
         mask: 0.5,
         eikonal: 0.2,
@@ -299,9 +293,9 @@ mod tests {
     }
 
     /// The terms in f64, and their weighted sum.
-    fn terms(case: &Case, field: &[f64], inv_s: f64) -> ([f64; 6], f64) {
+    fn terms(case: &Case, field: &[f64], inv_s: f64) -> ([f64; 5], f64) {
         let sigmoid = |x: f64| 1.0 / (1.0 + (-x).exp());
-        let mut t = [0f64; 6];
+        let mut t = [0f64; 5];
         let (met, heads, n) = (4.0, 3.0, 24.0);
         for r in 0..5 {
             let mut transmittance = 1.0;
@@ -320,8 +314,8 @@ mod tests {
                 own += w * (0..3).map(|c| (f[4 + c] - h[c]).powi(2)).sum::<f64>();
                 opacity += w;
                 transmittance *= 1.0 - alpha;
-                t[4] += (length - 1.0).powi(2) / n;
-                t[5] += (-WEIGHTS.sparsity_scale as f64 * f[0].abs()).exp() / n;
+                t[3] += (length - 1.0).powi(2) / n;
+                t[4] += (-WEIGHTS.sparsity_scale as f64 * f[0].abs()).exp() / n;
             }
             let a = case.alpha[r] as f64;
             if case.offsets[r + 1] > case.offsets[r] {
@@ -329,17 +323,16 @@ mod tests {
                     let b = case.background[r][c] as f64;
                     let e = seen[c] + (1.0 - opacity) * b - h[c] - (1.0 - a) * b;
                     t[0] += e * e / (3.0 * met);
-                    t[1] += e.abs() / (3.0 * met);
                 }
             }
             if a == 1.0 {
-                t[2] += own / (3.0 * heads);
+                t[1] += own / (3.0 * heads);
             }
             let p = opacity.clamp(1e-3, 1.0 - 1e-3);
-            t[3] -= (a * p.ln() + (1.0 - a) * (1.0 - p).ln()) / 5.0;
+            t[2] -= (a * p.ln() + (1.0 - a) * (1.0 - p).ln()) / 5.0;
         }
         let w = WEIGHTS;
-        let weights = [w.rgb_mse, w.rgb_l1, w.rgb_sample, w.mask, w.eikonal, w.sparsity];
+        let weights = [w.rgb_mse, w.rgb_sample, w.mask, w.eikonal, w.sparsity];
         (t, t.iter().zip(weights).map(|(t, w)| t * w as f64).sum())
     }
 

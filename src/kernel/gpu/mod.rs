@@ -8,7 +8,6 @@
 //! Sums of many threads into one place are atomic, and [`Atomics`] says how. All else is summed in a fixed order.
 
 mod adam;
-pub mod cost;
 mod density;
 mod device;
 mod draw;

@@ -4,7 +4,7 @@
 //! `i` of the old result and round `i` of the new one give a ratio of ratios, which a slower or busier machine leaves
 //! where it is. The median of those pairs is the change; their spread says how far it can be trusted.
 
-use super::{BenchResult, Measure, Round, Row, StabilityRow, median};
+use super::{BenchResult, Measure, Round, Row, median};
 use serde::Serialize;
 use std::fmt::Write;
 
@@ -131,28 +131,6 @@ impl BenchResult {
                 out.unmatched.push(format!("{}, {} {} (old)", sweep.name, row.series, row.choice));
             }
         }
-        let named = |row: &StabilityRow| format!("{}: {}", row.group, row.case);
-        for now in &self.stability {
-            let Some(was) = old.stability.iter().find(|r| named(r) == named(now)) else {
-                out.unmatched.push(format!("stability, {} (new)", named(now)));
-                continue;
-            };
-            let [old, new] = [was, now].map(|r| r.error.unwrap_or(f64::INFINITY));
-            // an error of rounding is what it is; a tenth of its bound is worth a word, and so is what no longer holds
-            let (change, noise) = (if old == new { 0.0 } else { new - old }, 0.1 * now.bound);
-            let worse = match (was.holds(), now.holds()) {
-                (true, false) => Some(true),
-                (false, true) => Some(false),
-                _ => (change.abs() > noise).then_some(change > 0.0),
-            };
-            let (row, what) = (named(now), format!("error, {}", now.unit));
-            out.changes.push(Change { sweep: "stability".into(), row, what, old, new, change, noise, worse });
-        }
-        let gone = |r: &&StabilityRow| self.stability.iter().all(|now| named(now) != named(r));
-        if !self.stability.is_empty() {
-            let lost = old.stability.iter().filter(gone).map(|r| format!("stability, {} (old)", named(r)));
-            out.unmatched.extend(lost);
-        }
         out
     }
 }
@@ -215,22 +193,6 @@ mod tests {
         assert_eq!(changes(&old, &wild)[0].1, None);
         let [one, other] = [1.0, 1.15].map(|t| result(vec![row("a", &[t], 30.0)]));
         assert_eq!(changes(&one, &other)[0].1, None);
-    }
-
-    #[test]
-    fn a_hard_case_that_no_longer_holds_is_worse_however_near_its_bound() {
-        let with = |error: Option<f64>| {
-            let mut result = result(Vec::new());
-            let (group, case, unit) = ("g".into(), "c".into(), "cells".into());
-            result.stability.push(StabilityRow { group, case, error, unit, bound: 1.0 });
-            result
-        };
-        let worse = |old, new| with(new).against(&with(old)).changes[0].worse;
-        assert_eq!(worse(Some(0.98), Some(1.01)), Some(true));
-        assert_eq!(worse(Some(0.5), None), Some(true));
-        assert_eq!(worse(None, Some(0.5)), Some(false));
-        assert_eq!((worse(None, None), worse(Some(0.5), Some(0.55))), (None, None));
-        assert_eq!(with(None).against(&result(Vec::new())).unmatched, ["stability, g: c (new)"]);
     }
 
     #[test]

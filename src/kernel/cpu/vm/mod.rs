@@ -21,9 +21,9 @@ mod resize;
 
 pub use decoder::{DecoderShape, DecoderWeights};
 pub use gather::Cell;
+pub use penalty::penalize;
 #[cfg(feature = "wgpu")]
 pub(in crate::kernel) use penalty::tv_factors;
-pub use penalty::{Penalty, penalize};
 pub use render::{RAY_WIDTH, Rendered, Shading, VmField, backward, density_at, render};
 pub use resize::{cropped, resized};
 

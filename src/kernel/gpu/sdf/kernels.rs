@@ -1,7 +1,7 @@
 //! What runs on the device: weights made ready, the networks forward, and backward one kernel a network.
 
 use super::super::tile::{
-    self, CHANNELS, LANES, at, gate, load, narrow, outer, product, put, save, sigmoid, sums,
+    self, CHANNELS, LANES, at, gate, load, narrow, outer, product, put, relu, save, sigmoid, sums,
 };
 use super::{NORMAL, Plan};
 use crate::kernel::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, SOFTNESS, TILE};
@@ -239,20 +239,12 @@ pub(super) fn forward(
             out[7 * plane + here] = sigmoid(own - F4::new(2.0f32)) * F4::new(-soften);
         }
         sync_cube();
-        let first = tile::relu(&product(
-            &a,
-            0usize,
-            w,
-            comptime!(rows[5]),
-            comptime!(plan.color),
-            row,
-            column,
-            LANES,
-        ));
+        let first = product(&a, 0usize, w, comptime!(rows[5]), comptime!(plan.color), row, column, LANES);
+        let first = relu(&first);
         save(c1, &first, plane, here, column, HIDDEN);
         put(&mut b, &first, row, column, LANES);
         sync_cube();
-        let second = tile::relu(&product(&b, 0usize, w, comptime!(rows[7]), HIDDEN, row, column, LANES));
+        let second = relu(&product(&b, 0usize, w, comptime!(rows[7]), HIDDEN, row, column, LANES));
         save(c2, &second, plane, here, column, HIDDEN);
         put(&mut a, &second, row, column, LANES);
         sync_cube();
@@ -318,26 +310,16 @@ pub(super) fn color_backward(
         sync_cube();
         let start = sum + comptime!(own[6] * CHANNELS);
         outer(&a, 0usize, &b, 3usize, HIDDEN, partial, start, fresh, row, column, LANES);
-        let g_c2 = gate(
-            &product(&a, 0usize, w, comptime!(rows[9]), 3usize, row, column, LANES),
-            &b,
-            row,
-            column,
-            LANES,
-        );
+        let g_c2 = product(&a, 0usize, w, comptime!(rows[9]), 3usize, row, column, LANES);
+        let g_c2 = gate(&g_c2, &b, row, column, LANES);
         sync_cube();
         put(&mut a, &g_c2, row, column, LANES);
         load(&mut b, c1, plane, here, row, column);
         sync_cube();
         let start = sum + comptime!(own[5] * CHANNELS);
         outer(&a, 0usize, &b, HIDDEN, HIDDEN, partial, start, fresh, row, column, LANES);
-        let g_c1 = gate(
-            &product(&a, 0usize, w, comptime!(rows[8]), HIDDEN, row, column, LANES),
-            &b,
-            row,
-            column,
-            LANES,
-        );
+        let g_c1 = product(&a, 0usize, w, comptime!(rows[8]), HIDDEN, row, column, LANES);
+        let g_c1 = gate(&g_c1, &b, row, column, LANES);
         sync_cube();
         put(&mut a, &g_c1, row, column, LANES);
         let n = unit(out[plane + here], out[2 * plane + here], out[3 * plane + here]);

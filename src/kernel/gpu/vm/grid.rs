@@ -2,7 +2,7 @@
 
 use super::super::device::{Atomics, Buffer, Device, Words, groups, launch};
 use super::super::sum::{Exchange, Fixed, MOST, Native, Sum};
-use crate::kernel::cpu::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, Penalty, tv_factors};
+use crate::kernel::cpu::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, tv_factors};
 use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
@@ -260,22 +260,14 @@ fn settle(
     }
 }
 
-/// −1, 0 or 1.
-#[cube]
-fn sign(x: f32) -> f32 {
-    select(x > 0.0f32, 1.0f32, select(x < 0.0f32, -1.0f32, 0.0f32))
-}
-
-/// Adds the gradients of total variation and L1; factors are those of each plane's rows and columns, and of each plane's
-/// and line's L1.
+/// Adds the gradient of the planes' total variation; factors are those of each plane's rows and columns.
 #[cube(launch)]
 fn penalize(
     values: &[f32],
     words: &[u32],
     factors: &[f32],
     gradient: &mut [f32],
-    tv: f32,
-    l1: f32,
+    weight: f32,
     #[comptime] quads: [usize; 3],
 ) {
     let at = ABSOLUTE_POS;
@@ -305,12 +297,7 @@ fn penalize(
                 if column + n < pitch {
                     columns += x - values[at + n];
                 }
-                g = (factors[i] * rows + factors[3 + i] * columns) * tv + factors[6 + i] * l1 * sign(x);
-            }
-            let first = 4 * words[comptime!(LINES + i)] as usize;
-            let vertices = words[comptime!(LINE_AXIS[i])] as usize;
-            if comptime!(n > 0) && at >= first && at < first + vertices * n {
-                g = factors[9 + i] * l1 * sign(x);
+                g = (factors[i] * rows + factors[3 + i] * columns) * weight;
             }
         }
         gradient[at] += g;
@@ -338,9 +325,7 @@ impl DeviceGrid {
         words.extend((0..3).map(|i| vectors(padded.plane(i))));
         words.extend((0..3).map(|i| vectors(padded.line(i))));
         let tv = [0, 1, 2].map(|i| tv_factors(&grid.plane(i)).map(|k| (2.0 * k) as f32));
-        let one = |f: Factor| 1.0 / f.len().max(1) as f32;
-        let mut factors = [tv.map(|k| k[0]), tv.map(|k| k[1])].concat();
-        factors.extend((0..3).map(|i| one(grid.plane(i))).chain((0..3).map(|i| one(grid.line(i)))));
+        let factors = [tv.map(|k| k[0]), tv.map(|k| k[1])].concat();
         let fixed = device.atomics() == Atomics::Fixed;
         DeviceGrid {
             grid,
@@ -475,13 +460,13 @@ impl DeviceGrid {
         }
     }
 
-    /// Adds the gradients of total variation and L1.
-    pub fn penalize(&self, device: &Device, values: &Buffer, penalty: &Penalty, gradient: &Buffer) {
-        if penalty.is_zero() {
+    /// Adds the gradient of the planes' weighted total variation.
+    pub fn penalize(&self, device: &Device, values: &Buffer, weight: f32, gradient: &Buffer) {
+        if weight == 0.0 {
             return;
         }
         launch!(device, penalize::launch, groups(self.len().div_ceil(UNITS as usize)), UNITS;
-            values, self.words, self.factors, gradient; penalty.tv, penalty.l1, self.quads()
+            values, self.words, self.factors, gradient; weight, self.quads()
         );
     }
 }

@@ -1,9 +1,9 @@
-//! NeuS compositing: see [`crate::kernel::cpu::neus`].
+//! NeuS compositing: see [`tiface::kernel::cpu::neus`].
 
 use super::{Real, sigmoid};
-use crate::kernel::cpu::neus::{RAY_WIDTH, Rays};
-use crate::kernel::cpu::sdf::WIDTH;
 use std::array::from_fn;
+use tiface::kernel::cpu::neus::{RAY_WIDTH, Rays};
+use tiface::kernel::cpu::sdf::WIDTH;
 
 /// `[rays, 9]` of a field `[samples, 8]`, of any sharpness.
 pub(crate) fn composite<R: Real>(rays: Rays, field: &[R], inv_s: R, anneal: f64) -> Vec<R> {

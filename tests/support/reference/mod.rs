@@ -1,12 +1,11 @@
-//! The formulas of the kernels once more, in f64, one sample after the other: what the fast ones are held against.
+//! The formulas of the kernels in f64, one sample after the other: what the fast ones are compared with.
+//!
+//! Tests of the crate's own modules and the stability cases include this module by its path.
+#![allow(dead_code)]
 
-#[cfg(test)]
-#[path = "reference/density_tests.rs"]
 pub(crate) mod density;
 pub(crate) mod neus;
 pub(crate) mod sdf;
-#[cfg(test)]
-#[path = "reference/tape_tests.rs"]
 pub(crate) mod tape;
 pub(crate) mod vm;
 
@@ -36,7 +35,6 @@ pub(crate) trait Real:
         self.map(e, e)
     }
 
-    #[cfg(test)]
     fn ln(self) -> Self {
         self.map(self.value().ln(), 1.0 / self.value())
     }
@@ -86,7 +84,7 @@ impl Real for f64 {
     }
 }
 
-/// The sixteen functions of [`sh16`](super::sphharm::sh16), their factors from the definition.
+/// The sixteen functions of [`sh16`](tiface::kernel::cpu::sphharm::sh16), their factors from the definition.
 pub(crate) fn harmonics([x, y, z]: [f64; 3]) -> [f64; 16] {
     let root = |n: f64, d: f64| (n / (d * std::f64::consts::PI)).sqrt();
     let (r2, s2) = (x * x - y * y, 5.0 * z * z);

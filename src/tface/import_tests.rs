@@ -1,10 +1,9 @@
-//! Published checkpoints rendered by our kernels, and where our own files hold their arrays.
+//! A converted checkpoint rendered by our kernels, compared with the published arithmetic.
 
 use super::*;
 use crate::Quiet;
 use crate::field::ball::session;
 use crate::geom::Ray;
-use crate::io::{TensorValues, read_tensors};
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::vm::{DecoderWeights, RAY_WIDTH, render};
 use glam::{DVec3, Vec3};
@@ -19,11 +18,17 @@ fn three(v: &Value) -> [f32; 3] {
     std::array::from_fn(|i| v[i].as_f64().unwrap() as f32)
 }
 
-/// `vm_g5.json` holds what plain torch computed from the published formulas.
+fn imported(scene: &Similarity) -> TFace {
+    let dir = tempfile::tempdir().unwrap();
+    import(&reference("vm_g5.safetensors"), 1.0 / 0.3, scene, &session("tface", dir.path(), "x", &Quiet))
+        .unwrap();
+    TFace::load("tface", dir.path()).unwrap()
+}
+
+/// `vm_g5.json` holds what plain numpy computed from the published formulas.
 #[test]
 fn an_imported_checkpoint_renders_as_the_published_arithmetic_does() {
-    let checkpoint = th::read_th(&reference("vm_g5.th"), &Limits::default()).unwrap();
-    let face = field_of(&checkpoint, &record_of(&checkpoint, None));
+    let face = imported(&Similarity::IDENTITY);
     let want: Value = serde_json::from_slice(&std::fs::read(reference("vm_g5.json")).unwrap()).unwrap();
     let weights = DecoderWeights::new(face.field.decoder, &face.values[2]);
     assert_eq!(face.field.lattice.samples, 17);
@@ -52,11 +57,8 @@ fn an_imported_checkpoint_renders_as_the_published_arithmetic_does() {
 
 #[test]
 fn an_imported_field_renders_in_the_scene_as_in_its_own_world() {
-    let dir = tempfile::tempdir().unwrap();
     let scene = Similarity::scale_translate(2.5, DVec3::new(0.3, -0.2, 0.1));
-    let face =
-        import_th(&reference("vm_g5.th"), 1.0 / 0.3, &scene, &session("tface", dir.path(), "x", &Quiet))
-            .unwrap();
+    let face = imported(&scene);
     // a ray of the published loader, written in the scene: world = field · 0.3, directions of depth 1
     let (origin, direction) = (Vec3::new(0.1, -0.2, 4.5), Vec3::new(0.02, 0.05, -1.0));
     let in_scene = |p: Vec3| scene.point(p * 0.3);
@@ -75,44 +77,19 @@ fn an_imported_field_renders_in_the_scene_as_in_its_own_world() {
 }
 
 #[test]
-fn our_own_file_holds_the_published_arrays_where_the_page_says() {
+fn what_was_not_converted_is_refused_with_the_way_to_convert_it() {
     let dir = tempfile::tempdir().unwrap();
-    let path = reference("vm_g5.th");
-    import_th(&path, 1.0 / 0.3, &Similarity::IDENTITY, &session("tface", dir.path(), "x", &Quiet)).unwrap();
-    let published = th::read_th(&path, &Limits::default()).unwrap();
-    let (tensors, metadata) = read_tensors(&checkpoint::newest(dir.path()), &Limits::default()).unwrap();
-    let ours = |name: &str| match tensors.iter().find(|(n, ..)| *n == name).map(|(_, (_, v))| v) {
-        Some(TensorValues::F32(values)) => values.as_slice(),
-        other => panic!("{name}: {other:?}"),
-    };
-    for (name, factors, rank) in [
-        ("model.density", &published.density, published.density_grid.rank),
-        ("model.color", &published.color, published.color_grid.rank),
-    ] {
-        let mut rest = ours(name);
-        for (factor, channels) in factors.iter().zip(rank.iter().cycle()) {
-            let (own, tail) = rest.split_at(factor.len());
-            rest = tail;
-            let places = factor.len() / channels;
-            // [C, H, W] there, [H, W, C] here
-            assert!(
-                (0..factor.len()).all(|i| own[i] == factor[i % channels * places + i / channels]),
-                "{name}"
-            );
-        }
-        assert!(rest.is_empty());
+    let session = session("tface", dir.path(), "x", &Quiet);
+    import(&reference("vm_g5.safetensors"), 1.0 / 0.3, &Similarity::IDENTITY, &session).unwrap();
+    let own = checkpoint::newest(dir.path());
+    let before = std::fs::read(&own).unwrap();
+    let th = dir.path().join("official.th");
+    std::fs::write(&th, b"PK\x03\x04and what torch packs").unwrap();
+    // nor is the result of an import, which lies in its scene
+    for path in [&th, &own, Path::new("/nowhere/x.safetensors")] {
+        let e = import(path, 1.0, &Similarity::IDENTITY, &session).err().unwrap();
+        assert!(e.to_string().contains(path.file_name().unwrap().to_str().unwrap()), "{e}");
+        assert!(e.hint().contains("th_to_safetensors.py"), "{}", e.hint());
     }
-    assert_eq!(
-        (ours("model.network"), ours("bounds")),
-        (&published.network[..], published.aabb.as_flattened())
-    );
-    let field: Value = serde_json::from_str(&metadata["field"]).unwrap();
-    assert_eq!(
-        (&field["features"], &field["hidden"], &field["softplus"]),
-        (&27.into(), &128.into(), &false.into())
-    );
-    assert_eq!(
-        (&field["near"], &field["far"], &field["step_ratio"]),
-        (&3.5.into(), &7.0.into(), &0.5.into())
-    );
+    assert!(std::fs::read(&own).unwrap() == before, "a refused import has changed the folder");
 }

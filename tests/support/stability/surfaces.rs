@@ -1,12 +1,12 @@
 //! Hard volumes and fields through the extraction, and a mesh at hard scales through the simplification.
 
 use super::case::{Cases, StabilityCase, worst};
-use crate::Quiet;
-use crate::geom::{Aabb, Mesh, topology};
-use crate::kernel::cpu::rng;
-use crate::mesh::{ExtractOptions, SimplifyConfig, Volume, extract, marching, simplify};
 use glam::{DVec3, Vec3};
 use std::collections::BTreeMap;
+use tiface::Quiet;
+use tiface::geom::{Aabb, Mesh, topology};
+use tiface::kernel::cpu::rng;
+use tiface::mesh::{ExtractOptions, SimplifyConfig, Volume, extract, marching, simplify};
 
 pub(super) fn cases() -> Vec<StabilityCase> {
     let mut cases = Cases::new("surfaces");

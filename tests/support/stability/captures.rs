@@ -2,21 +2,22 @@
 //! odd, beside the same of plain ones; or the error that names what is wrong.
 
 use super::case::{Cases, StabilityCase};
-use crate::Result;
-use crate::capture::Split;
-use crate::capture::synthetic::{SyntheticHead, SyntheticOptions, cameras, write_photographs};
-use crate::config::{Config, Preset, Stage, iface::Start};
-use crate::geom::{Camera, Similarity};
-use crate::io::Limits;
-use crate::pipeline::line::Line;
-use crate::pipeline::surface::Fields;
-use crate::pipeline::{learn, march, reconstruct};
-use crate::run::Run;
-use glam::{DMat3, DVec3, Vec3};
+use glam::{DMat3, DVec3, Vec2, Vec3};
 use std::path::Path;
+use tiface::Result;
+use tiface::capture::Split;
+use tiface::capture::synthetic::{SyntheticHead, SyntheticOptions, cameras, write_photographs};
+use tiface::config::{Config, Preset, Stage, iface::Start};
+use tiface::geom::{Camera, Ray, Similarity};
+use tiface::iface::IFace;
+use tiface::io::Limits;
+use tiface::kernel::cpu::march::Bitmask;
+use tiface::pipeline::{Line, reconstruct};
+use tiface::run::Run;
+use tiface::tface::FieldMean;
 
 /// A capture and what may come of it.
-pub(super) struct Hard {
+struct Hard {
     name: &'static str,
     cameras: Vec<(Camera, bool)>,
     world: Similarity,
@@ -25,15 +26,11 @@ pub(super) struct Hard {
     expected: Result<[f64; 2], &'static str>,
 }
 
-/// Learns from these captures, the plain one first; `done` is told how many are done, and asks to stop.
-pub(super) fn cases(
-    all: Vec<Hard>,
-    scratch: &Path,
-    done: &dyn Fn(u64) -> Result<()>,
-) -> Result<Vec<StabilityCase>> {
+/// Learns from the captures, the plain one first.
+pub(super) fn cases(scratch: &Path) -> Result<Vec<StabilityCase>> {
     let mut cases = Cases::new("captures");
     let mut plain = None;
-    for (i, hard) in all.into_iter().enumerate() {
+    for (i, hard) in captures().into_iter().enumerate() {
         let folder = scratch.join(format!("{i}"));
         write_photographs(&folder, &hard.cameras, &hard.world, 1, hard.name)?;
         let learned = learn(&folder, &hard.world, config(&folder));
@@ -44,11 +41,7 @@ pub(super) fn cases(
                 cases.add(format!("{}: named in an error", hard.name), f64::from(!named), 0.0, "missing");
             }
             (Ok(worse), learned) => {
-                let [db, mm] = match learned {
-                    Ok(found) => found,
-                    Err(e) if e.kind().is_stop() => return Err(e),
-                    Err(_) => [f64::NAN; 2],
-                };
+                let [db, mm] = learned.unwrap_or([f64::NAN; 2]);
                 // the plain one beside a perfect one of 40 dB
                 let [plain_db, plain_mm] = plain.unwrap_or([40.0, 0.0]);
                 plain.get_or_insert([db, mm]);
@@ -57,7 +50,6 @@ pub(super) fn cases(
                 cases.add(of("surface, farther off than a plain one"), mm - plain_mm, worse[1], "mm");
             }
         }
-        done(i as u64 + 1)?;
     }
     variances(&mut cases, scratch)?;
     Ok(cases.done)
@@ -67,7 +59,7 @@ pub(super) fn cases(
 const SIZE: (u32, u32) = (40, 50);
 
 /// The captures, the plain one first.
-pub(super) fn captures() -> Vec<Hard> {
+fn captures() -> Vec<Hard> {
     let options = SyntheticOptions { width: SIZE.0, height: SIZE.1, train: 10, test: 1, seed: 3 };
     let plain = cameras(&options);
     let train: Vec<_> = plain.iter().filter(|(_, train)| *train).cloned().collect();
@@ -139,17 +131,23 @@ fn learn(folder: &Path, world: &Similarity, config: Config) -> Result<[f64; 2]> 
     let line = Line::open(&config, &run)?;
     reconstruct(&line, Stage::Tface)?;
     reconstruct(&line, Stage::Iface)?;
-    let (scene, fields) = (line.scene()?, learn::trained_fields(&line));
+    let scene = line.scene()?;
+    let radiance = FieldMean::load("tface", &run.path(Stage::Tface), config.tface.learned())?;
+    let hull = scene.hull.as_ref().and_then(|h| Bitmask::of(h.resolution, h.bits.clone()));
+    let surface = IFace::load(&run.path(Stage::Iface), &config.iface, hull.as_ref())?;
     let (mut error, mut count) = (0.0, 0.0);
     for view in line.capture().split(Split::Test) {
         let loaded = view.load(&Limits::default())?;
         let camera = view.camera.transformed(&scene.scene_from_world);
-        let radiance = fields.radiance(Stage::Tface)?;
-        let world_from_scene = scene.scene_from_world.inverse();
-        let seen = march::march(&camera, &world_from_scene, false, |r| radiance.see(r, camera.forward()));
         let mask = loaded.mask.map(|m| m.values).unwrap_or_default();
-        for i in (0..mask.len()).filter(|&i| mask[i] == 255) {
-            let off = |k: usize| (seen.color.data[4 * i + k] - loaded.photo.rgb[i][k] as f32 / 255.0) as f64;
+        let pixel =
+            |i: usize| Vec2::new((i % SIZE.0 as usize) as f32 + 0.5, (i / SIZE.0 as usize) as f32 + 0.5);
+        let (at, rays): (Vec<usize>, Vec<Ray>) = (0..mask.len())
+            .filter(|&i| mask[i] == 255)
+            .filter_map(|i| Some((i, Ray { t_min: 0.0, t_max: f32::INFINITY, ..camera.ray(pixel(i))? })))
+            .unzip();
+        for (i, seen) in at.iter().zip(radiance.render(&rays, camera.forward())) {
+            let off = |k: usize| (seen.color[k] - loaded.photo.rgb[*i][k] as f32 / 255.0) as f64;
             error += (0..3).map(|k| off(k).powi(2)).sum::<f64>();
             count += 3.0;
         }
@@ -161,7 +159,7 @@ fn learn(folder: &Path, world: &Similarity, config: Config) -> Result<[f64; 2]> 
         .filter(|&p| SyntheticHead.is_head(p))
         .map(|p| scene_from_head.point(p))
         .collect();
-    let (values, slopes) = fields.surface()?.sdf_gradient(&points);
+    let (values, slopes) = surface.sdf_gradient(&points);
     let off = |(f, g): (&f32, &Vec3)| (f.abs() / g.length().max(0.1)) as f64;
     let mean = values.iter().zip(&slopes).map(off).sum::<f64>() / points.len() as f64;
     Ok([-10.0 * (error / count).log10(), 1e3 * mean / scene_from_head.scale])

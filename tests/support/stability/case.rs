@@ -1,9 +1,9 @@
 //! What a hard case came to.
 
-use serde::Serialize;
+use std::fmt::{self, Display};
 
 /// One hard case: the largest error met, and what it must stay below.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug)]
 pub struct StabilityCase {
     /// What it is about: `surfaces`, `rays`, `sharpness`, `kernels` or `captures`.
     pub group: &'static str,
@@ -24,6 +24,13 @@ impl StabilityCase {
     }
 }
 
+impl Display for StabilityCase {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let StabilityCase { group, case, error, unit, bound } = self;
+        write!(f, "{group:10} {case:64} {error:10.2e} {bound:8.0e} {unit}")
+    }
+}
+
 /// The cases of a group, in the making.
 pub(super) struct Cases {
     group: &'static str,
@@ -41,7 +48,7 @@ impl Cases {
 }
 
 /// The largest of some errors; NaN if one is.
-pub(super) fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
+pub fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
     errors.into_iter().fold(0.0, |a: f64, b: f64| if a.is_nan() || b.is_nan() { f64::NAN } else { a.max(b) })
 }
 

@@ -1,10 +1,10 @@
-//! TensoRF's field and its rays: see [`crate::kernel::cpu::vm`].
+//! TensoRF's field and its rays: see [`tiface::kernel::cpu::vm`].
 
 use super::{Real, sigmoid};
-use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::vm::mask::Walk;
-use crate::kernel::cpu::vm::{Grid, LINE_AXIS, PLANE_AXES, RAY_WIDTH, VmField};
 use std::array::from_fn;
+use tiface::kernel::cpu::march::MarchRay;
+use tiface::kernel::cpu::vm::mask::Walk;
+use tiface::kernel::cpu::vm::{Grid, LINE_AXIS, PLANE_AXES, RAY_WIDTH, VmField};
 
 /// Plane times line of every channel at a point.
 pub(crate) fn products<R: Real>(f: &VmField, grid: &Grid, values: &[R], p: [f64; 3]) -> Vec<R> {

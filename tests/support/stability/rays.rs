@@ -2,14 +2,14 @@
 //! the ray caster, and marching through boxes and surfaces.
 
 use super::case::{Cases, StabilityCase, worst};
-use crate::geom::{Bvh, Camera, Distortion, Mesh, Ray};
-use crate::kernel::cpu::march::{Bitmask, MarchRay, march};
-use crate::kernel::cpu::neus::{self, Rays};
-use crate::kernel::cpu::vm::mask::{Lattice, Walk};
-use crate::kernel::cpu::{hash, rng};
-use crate::mesh::{Volume, marching};
-use crate::render::{RasterOptions, RasterView, raster};
 use glam::{DMat3, DVec3, Vec2, Vec3};
+use tiface::geom::{Bvh, Camera, Distortion, Mesh, Ray};
+use tiface::kernel::cpu::march::{Bitmask, MarchRay, march};
+use tiface::kernel::cpu::neus::{self, Rays};
+use tiface::kernel::cpu::vm::mask::{Lattice, Walk};
+use tiface::kernel::cpu::{hash, rng};
+use tiface::mesh::{Volume, marching};
+use tiface::render::{RasterOptions, RasterView, raster};
 
 pub(super) fn cases() -> Vec<StabilityCase> {
     let mut cases = Cases::new("rays");

@@ -1,21 +1,21 @@
 //! The kernels in f32 against the same formulas in f64, with ordinary and extreme numbers.
 
 use super::case::{Cases, StabilityCase, relative, worst};
-use crate::geom::{Camera, Distortion};
-use crate::image::{Image, linear_from_srgb, srgb_from_linear};
-use crate::kernel::cpu::adam::{AdamStep, adam};
-use crate::kernel::cpu::hash::{self, Level};
-use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::mlp::Weights;
-use crate::kernel::cpu::reference::{self, wide};
-use crate::kernel::cpu::sdf::{self, FieldShape};
-use crate::kernel::cpu::sphharm::sh16;
-use crate::kernel::cpu::vm::mask::Lattice;
-use crate::kernel::cpu::vm::{self, DecoderShape, DecoderWeights, Grid, Shading, VmField};
-use crate::kernel::cpu::{rng, simd};
-use crate::metrics::{ssim_reflect_map, ssim_valid};
+use super::reference::{self, wide};
 use glam::{DMat3, DVec3, Vec2};
 use std::array::from_fn;
+use tiface::geom::{Camera, Distortion};
+use tiface::image::{Image, linear_from_srgb, srgb_from_linear};
+use tiface::kernel::cpu::adam::{AdamStep, adam};
+use tiface::kernel::cpu::hash::{self, Level};
+use tiface::kernel::cpu::march::MarchRay;
+use tiface::kernel::cpu::mlp::Weights;
+use tiface::kernel::cpu::sdf::{self, FieldShape};
+use tiface::kernel::cpu::sphharm::sh16;
+use tiface::kernel::cpu::vm::mask::Lattice;
+use tiface::kernel::cpu::vm::{self, DecoderShape, DecoderWeights, Grid, Shading, VmField};
+use tiface::kernel::cpu::{rng, simd};
+use tiface::metrics::{ssim_reflect_map, ssim_valid};
 
 pub(super) fn cases() -> Vec<StabilityCase> {
     let mut cases = Cases::new("kernels");

@@ -1,11 +1,11 @@
 //! NeuS from the softest to the sharpest surface, forward and backward, against f64; and fields without a direction.
 
 use super::case::{Cases, StabilityCase, relative, worst};
-use crate::kernel::cpu::neus::{self, Rays};
-use crate::kernel::cpu::reference::{neus::composite, wide};
-use crate::kernel::cpu::rng;
-use crate::kernel::cpu::sdf::WIDTH;
+use super::reference::{neus::composite, wide};
 use std::array::from_fn;
+use tiface::kernel::cpu::neus::{self, Rays};
+use tiface::kernel::cpu::rng;
+use tiface::kernel::cpu::sdf::WIDTH;
 
 pub(super) fn cases() -> Vec<StabilityCase> {
     let mut cases = Cases::new("sharpness");
