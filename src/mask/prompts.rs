@@ -26,7 +26,7 @@ const CONVENTION: &str =
 const MOST_POINTS: usize = 500;
 /// Longer names fit no file system.
 const LONGEST_NAME: usize = 4096;
-/// Hundred thousand views with ten points each stay below this.
+/// As many views as a capture may have, with ten points each, stay below this.
 const MOST_BYTES: u64 = 64 << 20;
 
 /// The suggested fix for a file of another shape.
