@@ -203,6 +203,7 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
             Err(problem) => listing.problems.push(problem),
         }
     }
+    ignored.sort();
     ignored.dedup();
     for model in ignored {
         listing.warnings.push(format!(
@@ -329,6 +330,24 @@ mod tests {
         ] {
             assert!(intrinsics_of(top, "{}").unwrap_err().contains(word), "{top}");
         }
+    }
+
+    #[test]
+    fn a_camera_model_without_distortion_is_warned_of_once() {
+        use crate::capture::synthetic::{SyntheticOptions, write_capture};
+        let dir = tempfile::tempdir().unwrap();
+        let options = SyntheticOptions { width: 24, height: 30, train: 3, test: 1, seed: 1 };
+        write_capture(dir.path(), &options).unwrap();
+        let file = dir.path().join("transforms.json");
+        let mut json: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+        for (i, frame) in json["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
+            frame["k1"] = 0.1.into();
+            frame["camera_model"] = ["PINHOLE", "PERSPECTIVE"][i % 2].into();
+        }
+        std::fs::write(&file, json.to_string()).unwrap();
+        let capture = crate::capture::open(dir.path(), &Default::default()).unwrap();
+        let warned = capture.warnings.iter().filter(|w| w.contains("it is not used"));
+        assert_eq!(warned.count(), 2, "{:?}", capture.warnings);
     }
 
     #[test]
