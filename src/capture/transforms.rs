@@ -338,6 +338,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let options = SyntheticOptions { width: 24, height: 30, train: 3, test: 1, seed: 1 };
         write_capture(dir.path(), &options).unwrap();
+        std::fs::remove_file(dir.path().join("transforms_train.json")).unwrap();
         let file = dir.path().join("transforms.json");
         let mut json: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
         for (i, frame) in json["frames"].as_array_mut().unwrap().iter_mut().enumerate() {

@@ -287,8 +287,7 @@ impl Prompts {
             }
             let photo = &photos[view];
             let (w, h) = photo.size;
-            let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;
-            if let Some(j) = frame.points.iter().position(|c| !(inside(c.x, w) && inside(c.y, h))) {
+            if let Some(j) = frame.points.iter().position(|c| !c.is_inside((w, h))) {
                 let Click { x, y, .. } = frame.points[j];
                 let place = format!("`frames[{i}].points[{j}]`");
                 let problem = format!("({x}, {y}) lies outside `{name}`, which is {w} × {h} pixels");
