@@ -78,6 +78,24 @@ fn draft(root: &Path) -> Config {
     config
 }
 
+#[test]
+fn views_held_out_for_validation_cost_what_test_views_cost() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root, 6, 3);
+    let (config, run) = (draft(&root), quiet(dir.path()));
+    let costs = || {
+        let line = Line::open(&config, &run).unwrap();
+        [Stage::Render, Stage::Ensemble, Stage::Metrics].map(|stage| line.cost(stage).cpu_s)
+    };
+    let of_test = costs();
+    let test = root.join("transforms_test.json");
+    let text = std::fs::read_to_string(&test).unwrap().replace("\"test\"", "\"val\"");
+    std::fs::write(root.join("transforms_val.json"), text).unwrap();
+    std::fs::remove_file(test).unwrap();
+    assert_eq!(costs(), of_test);
+}
+
 /// The line with its own formula in the place of a learned field: whatever is wrong then is not the
 /// learning.
 #[test]
