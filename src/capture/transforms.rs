@@ -11,9 +11,9 @@ use super::names::CaptureFolder;
 use super::pose;
 use super::view::Split;
 use crate::Result;
-use crate::geom::Distortion;
+use crate::geom::{Camera, Distortion};
 use crate::io::{self, ReadError};
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 use std::collections::HashSet;
@@ -91,6 +91,15 @@ struct FrameKeys {
 impl FrameKeys {
     fn read(top: &Object, entry: &Value) -> Result<FrameKeys, String> {
         let own = entry.as_object().ok_or("it is not a JSON object")?;
+        for key in ["file_path", "transform_matrix"] {
+            if own.get(key).is_none_or(Value::is_null) {
+                return Err(format!("it has no `{key}`"));
+            }
+        }
+        FrameKeys::merged(top, own)
+    }
+
+    fn merged(top: &Object, own: &Object) -> Result<FrameKeys, String> {
         let own_focal = FOCAL.iter().any(|key| own.contains_key(*key));
         let shared = SHARED.split(' ').chain(FOCAL.into_iter().filter(|_| !own_focal));
         let shared = shared.filter_map(|key| top.get_key_value(key));
@@ -101,11 +110,6 @@ impl FrameKeys {
         let merged: Object = (shared.filter(is_given).chain(own.iter().filter(is_given)))
             .map(|(key, value)| (key.clone(), value.clone()))
             .collect();
-        if !merged.contains_key("file_path") {
-            return Err("it has no `file_path`".into());
-        } else if !merged.contains_key("transform_matrix") {
-            return Err("it has no `transform_matrix`".into());
-        }
         io::typed(&Value::Object(merged))
             .map_err(|[key, found, expected]| format!("its `{key}` is {found}, expected {expected}"))
     }
@@ -211,6 +215,24 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
         ));
     }
     Ok(())
+}
+
+/// The camera of a frame, whose pose is known. What neither it nor the top of its file says of the lens is as `like` has it.
+pub(crate) fn camera_like(
+    top: &Object,
+    own: &Object,
+    like: &Camera,
+    (rotation, position): (DMat3, DVec3),
+) -> Result<Camera, String> {
+    let lens = intrinsics(&FrameKeys::merged(top, own)?, &mut Vec::new())?;
+    let size = lens.size.unwrap_or((like.width, like.height));
+    if lens.focal.iter().chain(&lens.angle).any(Option::is_some) {
+        return lens.camera(size, rotation, position);
+    }
+    let like = like.resized(size.0, size.1);
+    let [cx, cy] = [lens.center[0].unwrap_or(like.cx), lens.center[1].unwrap_or(like.cy)];
+    let distortion = if lens.distortion.is_none() { like.distortion } else { lens.distortion };
+    Ok(Camera { cx, cy, distortion, rotation, position, ..like })
 }
 
 /// The split a frame names, else the one it is in otherwise.
