@@ -279,7 +279,10 @@ mod tests {
         fs::write(at("other"), b"old").unwrap();
         std::os::unix::fs::symlink(at("other"), at(&aside_name("b"))).unwrap();
         copy(&at("a"), &at("b")).unwrap();
-        assert_eq!((fs::read(at("other")).unwrap(), fs::read(at("b")).unwrap()), (b"old".into(), b"new".into()));
+        assert_eq!(
+            (fs::read(at("other")).unwrap(), fs::read(at("b")).unwrap()),
+            (b"old".into(), b"new".into())
+        );
         assert!(!fs::symlink_metadata(at("b")).unwrap().is_symlink());
     }
 

@@ -112,7 +112,9 @@ mod tests {
         };
         refused(&[], "view `007` has no clicks");
         refused(&[click(1.0, 1.0, false)], "view `007`: all 1 clicks are on the background");
-        for (x, y) in [(39.5, 3.0), (40.0, 3.0), (3.0, 30.0), (-1.0, 3.0), (f32::NAN, 3.0), (f32::INFINITY, 3.0)] {
+        for (x, y) in
+            [(39.5, 3.0), (40.0, 3.0), (3.0, 30.0), (-1.0, 3.0), (f32::NAN, 3.0), (f32::INFINITY, 3.0)]
+        {
             refused(&[click(1.0, 1.0, true), click(x, y, false)], "click 2 at");
         }
         let clicks = [click(4.2, 5.0, true), click(9.0, 9.0, true), click(4.0, 5.3, false)];

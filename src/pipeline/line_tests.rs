@@ -12,7 +12,7 @@ use crate::geom::{Camera, Similarity};
 use crate::io::{self, Limits};
 use crate::metrics::compare;
 use crate::render::RenderedView;
-use crate::run::{Run, Stop};
+use crate::run::{Run, Stop, read_record};
 use crate::{ErrorKind, Result};
 use glam::Vec3;
 use serde_json::json;
@@ -64,6 +64,10 @@ impl Fields for Formula {
 
     fn radiance(&self, _: Stage) -> Result<&dyn Radiance> {
         panic!("no radiance field is asked for")
+    }
+
+    fn warnings(&self) -> Vec<&str> {
+        vec!["the GPU failed"]
     }
 }
 
@@ -120,6 +124,8 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     let exact = Formula(Exact { world_from_scene: scene.scene_from_world.inverse() });
     let mesh = complete(&line, Stage::Mesh, &exact).unwrap();
     assert_eq!(mesh.summary["closed"], true);
+    let record = read_record(&run.path(Stage::Mesh)).unwrap().unwrap();
+    assert!(record.warnings.iter().any(|w| w == "the GPU failed"), "{:?}", record.warnings);
     complete(&line, Stage::Render, &exact).unwrap();
     complete(&line, Stage::Ensemble, &NoFields).unwrap();
     let metrics = complete(&line, Stage::Metrics, &NoFields).unwrap();
