@@ -32,6 +32,7 @@ mod finish;
 #[cfg_attr(not(feature = "cpu"), path = "pipeline/learn_nothing.rs")]
 mod learn;
 mod line;
+mod lpips;
 mod march;
 mod mask;
 mod mesh;

@@ -1,6 +1,7 @@
 //! The kernels in f32 against the same formulas in f64, with ordinary and extreme numbers.
 
 use super::case::{Cases, StabilityCase, relative, worst};
+use crate::geom::sphharm::sh16;
 use crate::geom::{Camera, Distortion};
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::kernel::cpu::adam::{AdamStep, adam};
@@ -9,7 +10,6 @@ use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::reference::{self, wide};
 use crate::kernel::cpu::sdf::{self, FieldShape};
-use crate::kernel::cpu::sphharm::sh16;
 use crate::kernel::cpu::vm::mask::Lattice;
 use crate::kernel::cpu::vm::{self, DecoderShape, DecoderWeights, Grid, Shading, VmField};
 use crate::kernel::cpu::{rng, simd};
