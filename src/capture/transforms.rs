@@ -122,12 +122,6 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
             listing.problems.push(problem);
         }
     }
-    let (found, limit) = (listing.frames.len() as u64, folder.options.limits.views as u64);
-    if found > limit {
-        let problem = ReadError::too_large(folder.root, "the number of views", found, limit);
-        listing.problems.push(problem.into());
-        listing.frames.clear();
-    }
 }
 
 fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
