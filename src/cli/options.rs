@@ -103,8 +103,6 @@ impl Common {
         fallback: Option<(Preset, &str)>,
         options: &[KeyOption],
     ) -> Result<Config> {
-        // another preset starts over: the values a run remembers would all win against it
-        let saved = saved.filter(|_| self.preset.is_none());
         let mut sources = Sources {
             preset: self.preset,
             fallback: fallback.map(|(preset, text)| (preset, text.into())),
@@ -113,7 +111,17 @@ impl Common {
         };
         let own = own_file().filter(|f| io::is_file(f));
         let has_own = usize::from(own.is_some());
-        for file in own.into_iter().chain(saved.map(Path::to_path_buf)).chain(self.config.iter().cloned()) {
+        let mut files = Vec::from_iter(own);
+        match saved {
+            Some(saved) if self.preset.is_some() => {
+                // another preset starts over, for all values of a run would win against it; on the same photographs
+                let path = Common::default().resolve(Some(saved), None, &[])?.capture.path;
+                let text = format!("capture.path = {}", toml::Value::from(path));
+                sources.files.push((saved.display().to_string(), text));
+            }
+            saved => files.extend(saved.map(Path::to_path_buf)),
+        }
+        for file in files.into_iter().chain(self.config.iter().cloned()) {
             let limits = Limits { file_bytes: 1 << 20, ..Limits::default() };
             let bytes = io::read_maybe_empty(&file, &limits).map_err(|e| Error::usage(&e, e.hint()))?;
             let name = file.display().to_string();
@@ -156,4 +164,26 @@ fn own_file() -> Option<PathBuf> {
     let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
     let base = set("XDG_CONFIG_HOME").or_else(|| set("HOME").map(|h| h.join(".config")))?;
     Some(base.join("tiface/config.toml"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_preset_starts_a_run_over_on_the_same_photographs() {
+        let dir = tempfile::tempdir().unwrap();
+        let saved = dir.path().join("config.toml");
+        let mut config = Config::preset(Preset::Standard);
+        (config.mesh.resolution, config.capture.path) = (77, "/photos/a \"b\"".into());
+        std::fs::write(&saved, config.to_toml()).unwrap();
+        let mut common = Common { preset: Some(Preset::Draft), ..Common::default() };
+        let found = common.resolve(Some(&saved), None, &[]).unwrap();
+        let draft = Config::preset(Preset::Draft);
+        assert_eq!((found.preset, found.mesh.resolution), (Preset::Draft, draft.mesh.resolution));
+        assert_eq!(found.capture.path, config.capture.path);
+        // they may have been moved
+        common.set = vec!["capture.path=/elsewhere".into()];
+        assert_eq!(common.resolve(Some(&saved), None, &[]).unwrap().capture.path, "/elsewhere");
+    }
 }
