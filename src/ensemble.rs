@@ -17,8 +17,9 @@ mod simplex;
 mod tiles;
 
 pub use blend::blend;
-pub use fit::{Fit, MAX_MEMBERS, weigh};
+pub use fit::{Fit, weigh};
 pub use members::{BlendTarget, Member, Members, shares_hint};
+pub use simplex::MAX_MEMBERS;
 pub use tiles::{Tile, tiles};
 
 /// The paper's §5: baseline, T-Face, I-Face.

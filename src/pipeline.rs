@@ -32,6 +32,7 @@ mod finish;
 #[cfg_attr(not(feature = "cpu"), path = "pipeline/learn_nothing.rs")]
 mod learn;
 mod line;
+mod lpips;
 mod march;
 mod mask;
 mod mesh;
@@ -62,7 +63,7 @@ pub use surface::{Fields, Radiance, Surface};
 pub use truth::{Truth, against_truth};
 
 use crate::Result;
-use crate::run::Done;
+use crate::run::{Done, StageDir};
 
 /// Completes every stage that `until` needs, and itself, and writes the report.
 pub fn reconstruct(line: &Line, until: Stage) -> Result<Vec<(Stage, Done)>> {
@@ -89,7 +90,7 @@ pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> 
     if stage == Stage::Ensemble {
         ensemble::can_blend(config)?;
     }
-    let done = run.stage(line.plan(stage), |dir| match stage {
+    let work = |dir: &StageDir| match stage {
         Stage::Mask => {
             line.write_inputs(dir.folder())?;
             mask::mask(capture, line.clicks.as_ref(), config, dir)
@@ -101,6 +102,13 @@ pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> 
         Stage::Render => render::render(line, &line.scene()?, fields, dir),
         Stage::Ensemble => ensemble::ensemble(line, &line.scene()?, fields, dir),
         Stage::Metrics => metrics::metrics(line, dir),
+    };
+    let done = run.stage(line.plan(stage), |dir| {
+        let summary = work(dir)?;
+        if matches!(stage, Stage::Mesh | Stage::Render | Stage::Ensemble) {
+            fields.warnings().into_iter().for_each(|text| dir.warn(text));
+        }
+        Ok(summary)
     })?;
     if stage == Stage::Mask {
         line.write_cameras(done.skipped)?;

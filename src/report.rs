@@ -17,11 +17,14 @@ pub use runs::{RunRow, runs_csv, runs_html};
 pub use serve::{Answer, Server};
 
 use crate::config::{Stage, called};
+use crate::image::{Photo, over_black, quantize, reduce_photo, srgb_from_linear, working_size};
+use crate::io::{self, Limits};
 use crate::{Error, ErrorKind, Result};
 use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::{Environment, context};
 use serde::Serialize;
 use serde_json::{Value, json};
+use std::path::Path;
 
 /// Of the page: what all of them share.
 const STYLE: &str = include_str!("report/style.css");
@@ -39,6 +42,34 @@ pub const MOST_ERROR: f32 = 0.2;
 /// Colors of errors from none to [`MOST_ERROR`], even steps: dark to bright, also in gray.
 pub const HEAT: [[u8; 3]; 6] =
     [[0, 0, 4], [66, 10, 104], [147, 38, 103], [221, 81, 58], [252, 165, 10], [252, 255, 164]];
+
+/// Returns the files of a run's views of one kind, a word of [`NAMES`](crate::config::NAMES), relative to the run and in
+/// name order; not the depth and the float views beside them.
+fn views(run: &Path, word: &str) -> Vec<String> {
+    let folder = if word == "ensemble" { word.to_owned() } else { format!("render/{word}") };
+    let root = run.join(&folder);
+    let is_beside = |path: &Path| ["depth", "float"].iter().any(|name| path == root.join(name));
+    let files = io::file_sizes(&root, &is_beside).unwrap_or_default().into_keys();
+    files.filter(|f| f.ends_with(".png") || f.ends_with(".exr")).map(|f| format!("{folder}/{f}")).collect()
+}
+
+/// Returns a view over black as a JPEG file of at most `side` pixels; `None` where it cannot be read.
+fn small_view(file: &Path, side: u32, quality: u8) -> Option<Vec<u8>> {
+    let limits = Limits::default();
+    let photo = if file.extension().is_some_and(|ending| ending == "exr") {
+        let image = io::read_exr(file, &[&["R", "G", "B"]], &limits).ok()?.image;
+        let coded = |p: &[f32; 3]| p.map(|v| quantize(srgb_from_linear(v)));
+        let rgb = image.data.as_chunks::<3>().0.iter().map(coded).collect();
+        Photo { width: image.width, height: image.height, rgb, alpha: None }
+    } else {
+        io::read_photo(file, None, &limits).ok()?
+    };
+    let mut small = reduce_photo(&photo, working_size(photo.width, photo.height, side));
+    for (c, a) in small.rgb.iter_mut().zip(small.alpha.take().unwrap_or_default()) {
+        *c = over_black([c[0], c[1], c[2], a]);
+    }
+    io::jpeg_bytes(&small, quality, file).ok()
+}
 
 /// What a report shows.
 #[derive(Clone, Debug, Default, Serialize)]

@@ -165,6 +165,6 @@ fn few_open_files_and_little_memory_end_in_a_product_or_a_sentence() {
         limited(&gib(2), run("large").args(["--set", "iface.levels=16", "--set", "iface.log2_table=24"]));
     let text = said(&large);
     assert_eq!(large.status.code(), Some(75), "{text}");
-    assert!(text.contains("error: out of memory: ") && text.contains("hint: "), "{text}");
+    assert!(text.contains("error: out of memory: ") && text.contains("raise `capture.downscale`"), "{text}");
     done(&limited(&gib(2), run("large").args(["--fresh", "iface"])));
 }

@@ -263,6 +263,20 @@ fn hostile_metashape_files_are_refused_by_name() {
 
 // ------------------------------------------------------------------------------------------------ RealityCapture
 
+#[test]
+fn more_views_than_are_allowed_are_refused_whatever_lists_them() {
+    let (neus, _) = neus();
+    let table = tempfile::tempdir().unwrap();
+    photographs(table.path(), "images", 5);
+    put(&table, "registration.csv", csv(5));
+    for dir in [neus, table] {
+        let limits = io::Limits { views: 4, ..io::Limits::default() };
+        let options = CaptureOptions { limits, ..CaptureOptions::default() };
+        let e = capture::open(dir.path(), &options).unwrap_err().to_string();
+        assert!(e.contains("the number of views is 5, the limit is 4"), "{e}");
+    }
+}
+
 /// Heading, pitch and roll of a camera: Rz(−heading) Rx(pitch) Ry(roll) in OpenGL axes.
 fn angles(i: usize) -> [f64; 3] {
     let (rotation, _) = pose(i);

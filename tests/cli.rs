@@ -51,6 +51,26 @@ fn a_wrong_key_is_refused_with_2_before_anything_is_written() {
 }
 
 #[test]
+fn the_preset_of_the_environment_is_a_default_that_a_run_wins_over() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir(dir.path().join("run")).unwrap();
+    let saved = tiface(dir.path(), &["config", "--preset", "draft", "--set", "mesh.resolution=77"]);
+    std::fs::write(dir.path().join("run/config.toml"), &saved.stdout).unwrap();
+    let with = |preset: &str, words: &[&str]| {
+        let program = env!("CARGO_BIN_EXE_tiface");
+        let mut command = Command::new(program);
+        command.args(words).current_dir(dir.path()).env("XDG_CONFIG_HOME", dir.path());
+        command.env("TIFACE_PRESET", preset).output().unwrap()
+    };
+    assert_eq!(out(&with("paper", &["config", "run"])), out(&saved));
+    let paper = tiface(dir.path(), &["config", "--preset", "paper"]);
+    assert_eq!(out(&with("paper", &["config"])), out(&paper));
+    assert_eq!(out(&with("draft", &["config", "run", "--preset", "paper"])), out(&paper));
+    let o = with("papper", &["config"]);
+    assert!(code(&o) == 2 && err(&o).contains("`TIFACE_PRESET`"), "{}", err(&o));
+}
+
+#[test]
 fn the_effective_configuration_is_printed_and_accepted_again() {
     let dir = tempfile::tempdir().unwrap();
     let first = tiface(dir.path(), &["config", "--preset", "draft", "--set", "mesh.resolution=77"]);

@@ -1,11 +1,13 @@
-//! The house rules that can be read from the source: who may know whom, who opens files, who prints.
+//! The house rules that can be read from the source: who may know whom, in no circle, who opens files, who prints.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Layers from the ground up; a module may know those below its own layer.
 const LAYERS: &[(&str, &[&str])] = &[
-    ("ground", &["error", "monitor", "geom", "image", "io", "config", "kernel"]),
+    ("vocabulary", &["error", "monitor", "geom", "image"]),
+    ("ground", &["io", "config", "kernel"]),
     ("shared", &["capture", "field", "onnx", "run", "report"]),
     ("stages", &["mask", "tface", "iface", "mesh", "render", "ensemble", "metrics"]),
     ("pipeline", &["pipeline"]),
@@ -13,7 +15,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 ];
 
 /// Modules of these layers may know each other; stages never.
-const SOCIABLE: &[&str] = &["ground", "shared", "pipeline", "cli"];
+const SOCIABLE: &[&str] = &["vocabulary", "ground", "shared", "pipeline", "cli"];
 
 struct Source {
     module: String,
@@ -79,37 +81,49 @@ fn without_tests(text: &str) -> Vec<(usize, &str)> {
     kept
 }
 
-/// Modules of this crate named on a line: `crate::geom::Ray`, `use crate::{geom, image::Photo}`.
-fn named(line: &str) -> Vec<String> {
-    let word = |text: &str| -> String {
-        text.trim_start().chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect()
-    };
+/// Paths that begin with one of `roots` in a piece of code: `crate::geom::Ray`, `use super::{tile::Tile, Bins}`.
+fn paths(code: &str, roots: &[&str]) -> Vec<Vec<String>> {
     let mut found = Vec::new();
-    for rest in line.split("crate::").skip(1) {
-        match rest.strip_prefix('{') {
-            None => found.push(word(rest)),
-            Some(list) => {
-                let mut depth = 0;
-                let mut start = true;
-                for (i, c) in list.char_indices() {
-                    if start && !c.is_whitespace() {
-                        found.push(word(&list[i..]));
-                        start = false;
-                    }
-                    match c {
-                        '{' => depth += 1,
-                        '}' => depth -= 1,
-                        ',' if depth == 0 => start = true,
-                        _ => {}
-                    }
-                    if depth < 0 {
-                        break;
-                    }
-                }
-            }
+    for root in roots {
+        let start = format!("{root}::");
+        for (at, _) in code.match_indices(&start).filter(|(at, _)| stands_at(code, *at)) {
+            branches(&code[at + start.len()..], &[root.to_string()], &mut found);
         }
     }
-    found.retain(|w| !w.is_empty());
+    found
+}
+
+/// The paths of a tree behind `stem::`, and what is left behind it.
+fn branches<'c>(code: &'c str, stem: &[String], found: &mut Vec<Vec<String>>) -> &'c str {
+    let code = code.trim_start();
+    if let Some(mut rest) = code.strip_prefix('{') {
+        loop {
+            rest = rest.trim_start().trim_start_matches(',').trim_start();
+            match rest.strip_prefix('}') {
+                Some(behind) => return behind,
+                None if rest.is_empty() => return rest,
+                None => {}
+            }
+            let behind = branches(rest, stem, found);
+            // `as name`, or no tree of paths at all
+            rest = behind.trim_start_matches(|c: char| c != ',' && c != '}');
+        }
+    }
+    let end = code.find(|c: char| !(c.is_alphanumeric() || c == '_')).unwrap_or(code.len());
+    let path = [stem, &[code[..end].to_string()]].concat();
+    match code[end..].strip_prefix("::") {
+        Some(rest) if end > 0 => branches(rest, &path, found),
+        _ => {
+            found.push(path);
+            &code[end..]
+        }
+    }
+}
+
+/// Modules of this crate that a line names.
+fn named(line: &str) -> Vec<String> {
+    let mut found: Vec<String> = paths(line, &["crate"]).into_iter().map(|path| path[1].clone()).collect();
+    found.dedup();
     found
 }
 
@@ -136,6 +150,77 @@ fn arrows_point_down_only() {
     assert!(wrong.is_empty(), "\n{}", wrong.join("\n"));
 }
 
+/// A module of the crate: what it names of others, and what it hands on (`pub use`), as paths from the root.
+struct Module {
+    names: Vec<Vec<String>>,
+    hands_on: Vec<Vec<String>>,
+}
+
+fn modules() -> BTreeMap<Vec<String>, Module> {
+    let place = |source: &Source| -> Vec<String> {
+        let parts = source.path.with_extension("");
+        let parts: Vec<String> = parts.iter().map(|p| p.to_str().unwrap().into()).collect();
+        if parts.last().is_some_and(|p| p == "mod") { parts[..parts.len() - 1].to_vec() } else { parts }
+    };
+    let sources = sources();
+    let all: Vec<Vec<String>> = sources.iter().map(place).collect();
+    let of = |source: &Source| {
+        let module = place(source);
+        let children = all.iter().filter(|m| m[..m.len() - 1] == module).map(|m| m[m.len() - 1].as_str());
+        let roots: Vec<&str> = ["crate", "super", "self"].into_iter().chain(children).collect();
+        let absolute = |path: Vec<String>| -> Option<Vec<String>> {
+            let ups = path.iter().take_while(|part| *part == "super").count();
+            let from = if ["crate", "self"].contains(&path[0].as_str()) { 1 } else { ups };
+            let up = if path[0] == "crate" { module.len() } else { ups };
+            Some([&module[..module.len().checked_sub(up)?], &path[from..]].concat())
+        };
+        let [mut names, mut hands_on] = [String::new(), String::new()];
+        let mut is_handed_on = false;
+        for (_, line) in &source.lines {
+            is_handed_on |= line.trim_start().starts_with("pub") && line.contains(" use ");
+            *(if is_handed_on { &mut hands_on } else { &mut names }) += &format!("{line}\n");
+            is_handed_on &= !line.contains(';');
+        }
+        let [names, hands_on] =
+            [names, hands_on].map(|code| paths(&code, &roots).into_iter().filter_map(absolute).collect());
+        (module, Module { names, hands_on })
+    };
+    sources.iter().map(of).collect()
+}
+
+/// The module that defines what a path names.
+fn definer(path: &[String], modules: &BTreeMap<Vec<String>, Module>) -> Option<Vec<String>> {
+    let place = (1..=path.len()).rev().map(|n| &path[..n]).find(|m| modules.contains_key(*m))?;
+    let name = path.get(place.len());
+    let handed = modules[place].hands_on.iter().find(|p| p.last() == name && p.len() > 1);
+    handed.and_then(|p| definer(p, modules)).or_else(|| Some(place.to_vec()))
+}
+
+#[test]
+fn no_files_know_each_other_in_a_circle() {
+    let modules = modules();
+    let knows = |module: &Vec<String>| -> BTreeSet<Vec<String>> {
+        let others = modules[module].names.iter().filter_map(|path| definer(path, &modules));
+        // a part of a file may know the whole
+        others.filter(|other| !module.starts_with(other)).collect()
+    };
+    let knows: BTreeMap<_, _> = modules.keys().map(|module| (module.clone(), knows(module))).collect();
+    let reached = |(from, _)| -> (&Vec<String>, BTreeSet<&Vec<String>>) {
+        let (mut reached, mut next) = (BTreeSet::new(), vec![from]);
+        while let Some(module) = next.pop() {
+            next.extend(knows[module].iter().filter(|other| reached.insert(*other)));
+        }
+        (from, reached)
+    };
+    let reached: BTreeMap<_, _> = knows.iter().map(reached).collect();
+    let circle = |m: &Vec<String>| -> BTreeSet<String> {
+        reached[m].iter().filter(|other| reached[*other].contains(m)).map(|m| m.join("::")).collect()
+    };
+    let circles: BTreeSet<_> = modules.keys().map(circle).filter(|c| !c.is_empty()).collect();
+    let rows: Vec<String> = circles.iter().map(|c| Vec::from_iter(c.clone()).join(", ")).collect();
+    assert!(rows.is_empty(), "\n{}", rows.join("\n"));
+}
+
 fn nobody_else(module: &str, words: &[&str]) {
     let mut wrong = Vec::new();
     for source in sources().iter().filter(|s| s.module != module) {
@@ -150,8 +235,12 @@ fn nobody_else(module: &str, words: &[&str]) {
 
 /// Does a word stand in a line, not as the end of a longer one (`NetworkFile::` is not `File::`)?
 fn stands_in(line: &str, word: &str) -> bool {
-    let part = |c: char| c.is_alphanumeric() || c == '_';
-    line.match_indices(word).any(|(at, _)| !line[..at].ends_with(part))
+    line.match_indices(word).any(|(at, _)| stands_at(line, at))
+}
+
+/// Does a word or a path begin here?
+fn stands_at(line: &str, at: usize) -> bool {
+    !line[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_' || c == ':')
 }
 
 #[test]
@@ -180,6 +269,11 @@ fn names_are_found_in_every_way_to_write_them() {
     assert_eq!(named("use crate::{geom::{Aabb, Ray}, image::Photo, run};"), ["geom", "image", "run"]);
     assert_eq!(named("    let x = crate::io::read(crate::run::Quiet);"), ["io", "run"]);
     assert!(named("use super::geom;").is_empty());
+    let found = |code: &str| paths(code, &["super", "tile"]).iter().map(|p| p.join("::")).collect::<Vec<_>>();
+    let tree = found("use super::{\n    Bins, paint::{self, Sheet as S},\n};");
+    assert_eq!(tree, ["super::Bins", "super::paint::self", "super::paint::Sheet"]);
+    let inline = found("use super::super::a; tile::put(my_tile::x, super::b!(1))");
+    assert_eq!(inline, ["super::super::a", "super::b", "tile::put"]);
 }
 
 #[test]

@@ -4,7 +4,7 @@ use super::colmap::{self, ModelFiles};
 use super::frame::Listing;
 use super::names::CaptureFolder;
 use super::{entries::FolderEntries, llff, metashape, neus, realitycapture, transforms};
-use crate::io;
+use crate::io::{self, ReadError};
 use std::path::{Path, PathBuf};
 
 /// The files that describe the cameras.
@@ -112,5 +112,11 @@ impl CameraFiles {
             CameraFiles::Xmp(inside) => realitycapture::list_xmp(folder, inside, listing),
         };
         listing.problems.extend(listed.err());
+        let (found, limit) = (listing.frames.len() as u64, folder.options.limits.views as u64);
+        if found > limit {
+            let problem = ReadError::too_large(folder.root, "the number of views", found, limit);
+            listing.problems.push(problem.into());
+            listing.frames.clear();
+        }
     }
 }

@@ -50,5 +50,6 @@ pub use crate::config::{MaskMeaning, MaskSource};
 pub use gather::{has_cameras, open};
 pub use load::LoadedView;
 pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
+pub(crate) use transforms::camera_like;
 pub use view::{Capture, CaptureOptions, Split, View, ViewMask};
 pub use well_seen::well_seen;

@@ -100,12 +100,13 @@ pub(super) fn list_csv(folder: &CaptureFolder, file: &str, listing: &mut Listing
     Ok(())
 }
 
-/// The values of a line, without the quotes around those that hold commas.
+/// The values of a line, without the quotes around those that hold commas; `""` inside is a quote (RFC 4180).
 fn fields(line: &str) -> Vec<String> {
     let (mut all, mut quoted) = (vec![String::new()], false);
-    for c in line.chars() {
+    let mut chars = line.chars().peekable();
+    while let Some(c) = chars.next() {
         match c {
-            '"' => quoted = !quoted,
+            '"' if !quoted || chars.next_if_eq(&'"').is_none() => quoted = !quoted,
             ',' if !quoted => all.push(String::new()),
             c => all.last_mut().into_iter().for_each(|field| field.push(c)),
         }
@@ -250,5 +251,15 @@ fn frame(folder: &CaptureFolder, file: &str, name: &str, entry: Entry, listing: 
     match framed() {
         Ok(frame) => listing.frames.push(frame),
         Err(problem) => listing.problems.push(problem),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quoted_fields_hold_commas_and_doubled_quotes() {
+        assert_eq!(fields(r#""a ""b"", c.png",1,"", 2"#), [r#"a "b", c.png"#, "1", "", "2"]);
     }
 }

@@ -11,9 +11,9 @@ use super::names::CaptureFolder;
 use super::pose;
 use super::view::Split;
 use crate::Result;
-use crate::geom::Distortion;
+use crate::geom::{Camera, Distortion};
 use crate::io::{self, ReadError};
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 use std::collections::HashSet;
@@ -91,6 +91,15 @@ struct FrameKeys {
 impl FrameKeys {
     fn read(top: &Object, entry: &Value) -> Result<FrameKeys, String> {
         let own = entry.as_object().ok_or("it is not a JSON object")?;
+        for key in ["file_path", "transform_matrix"] {
+            if own.get(key).is_none_or(Value::is_null) {
+                return Err(format!("it has no `{key}`"));
+            }
+        }
+        FrameKeys::merged(top, own)
+    }
+
+    fn merged(top: &Object, own: &Object) -> Result<FrameKeys, String> {
         let own_focal = FOCAL.iter().any(|key| own.contains_key(*key));
         let shared = SHARED.split(' ').chain(FOCAL.into_iter().filter(|_| !own_focal));
         let shared = shared.filter_map(|key| top.get_key_value(key));
@@ -101,11 +110,6 @@ impl FrameKeys {
         let merged: Object = (shared.filter(is_given).chain(own.iter().filter(is_given)))
             .map(|(key, value)| (key.clone(), value.clone()))
             .collect();
-        if !merged.contains_key("file_path") {
-            return Err("it has no `file_path`".into());
-        } else if !merged.contains_key("transform_matrix") {
-            return Err("it has no `transform_matrix`".into());
-        }
         io::typed(&Value::Object(merged))
             .map_err(|[key, found, expected]| format!("its `{key}` is {found}, expected {expected}"))
     }
@@ -117,12 +121,6 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
         if let Err(problem) = list_file(folder, file, listing) {
             listing.problems.push(problem);
         }
-    }
-    let (found, limit) = (listing.frames.len() as u64, folder.options.limits.views as u64);
-    if found > limit {
-        let problem = ReadError::too_large(folder.root, "the number of views", found, limit);
-        listing.problems.push(problem.into());
-        listing.frames.clear();
     }
 }
 
@@ -203,6 +201,7 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
             Err(problem) => listing.problems.push(problem),
         }
     }
+    ignored.sort();
     ignored.dedup();
     for model in ignored {
         listing.warnings.push(format!(
@@ -210,6 +209,24 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
         ));
     }
     Ok(())
+}
+
+/// The camera of a frame, whose pose is known. What neither it nor the top of its file says of the lens is as `like` has it.
+pub(crate) fn camera_like(
+    top: &Object,
+    own: &Object,
+    like: &Camera,
+    (rotation, position): (DMat3, DVec3),
+) -> Result<Camera, String> {
+    let lens = intrinsics(&FrameKeys::merged(top, own)?, &mut Vec::new())?;
+    let size = lens.size.unwrap_or((like.width, like.height));
+    if lens.focal.iter().chain(&lens.angle).any(Option::is_some) {
+        return lens.camera(size, rotation, position);
+    }
+    let like = like.resized(size.0, size.1);
+    let [cx, cy] = [lens.center[0].unwrap_or(like.cx), lens.center[1].unwrap_or(like.cy)];
+    let distortion = if lens.distortion.is_none() { like.distortion } else { lens.distortion };
+    Ok(Camera { cx, cy, distortion, rotation, position, ..like })
 }
 
 /// The split a frame names, else the one it is in otherwise.
@@ -329,6 +346,25 @@ mod tests {
         ] {
             assert!(intrinsics_of(top, "{}").unwrap_err().contains(word), "{top}");
         }
+    }
+
+    #[test]
+    fn a_camera_model_without_distortion_is_warned_of_once() {
+        use crate::capture::synthetic::{SyntheticOptions, write_capture};
+        let dir = tempfile::tempdir().unwrap();
+        let options = SyntheticOptions { width: 24, height: 30, train: 3, test: 1, seed: 1 };
+        write_capture(dir.path(), &options).unwrap();
+        std::fs::remove_file(dir.path().join("transforms_train.json")).unwrap();
+        let file = dir.path().join("transforms.json");
+        let mut json: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+        for (i, frame) in json["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
+            frame["k1"] = 0.1.into();
+            frame["camera_model"] = ["PINHOLE", "PERSPECTIVE"][i % 2].into();
+        }
+        std::fs::write(&file, json.to_string()).unwrap();
+        let capture = crate::capture::open(dir.path(), &Default::default()).unwrap();
+        let warned = capture.warnings.iter().filter(|w| w.contains("it is not used"));
+        assert_eq!(warned.count(), 2, "{:?}", capture.warnings);
     }
 
     #[test]

@@ -455,8 +455,8 @@ pub fn out_of_memory(bytes: usize) -> ! {
     let _ = writeln!(
         std::io::stderr(),
         "error: out of memory: {bytes} bytes more cannot be had\n\n\
-         hint: free memory, or lower `capture.downscale`, `mesh.resolution` or the `rays` of a field; what is complete \
-         is kept: repeat the command to continue"
+         hint: free memory, raise `capture.downscale`, or lower `mesh.resolution` or the `rays` of a field; what is \
+         complete is kept: repeat the command to continue"
     );
     signal_hook::low_level::exit(crate::ErrorKind::NotNow.code().into())
 }

@@ -24,7 +24,7 @@ pub(super) struct Common {
     #[arg(short, long, global = true, value_name = "FILE", env = "TIFACE_CONFIG", hide_env = true)]
     pub config: Vec<PathBuf>,
     /// Starting values
-    #[arg(long, global = true, env = "TIFACE_PRESET", hide_env = true)]
+    #[arg(long, global = true)]
     #[arg(value_parser = PossibleValuesParser::new(Preset::ALL.map(Preset::name)).try_map(|word| word.parse::<Preset>()))]
     pub preset: Option<Preset>,
     /// Set a key of the configuration; repeatable
@@ -94,7 +94,7 @@ impl Common {
         }
     }
 
-    /// The configuration: the user's own file, the run's (`saved`), `--config`, `--set`, options.
+    /// The configuration: the user's own file, `TIFACE_PRESET`, the run's (`saved`), `--config`, `--set`, options.
     ///
     /// `fallback` is the preset where nothing names one, and what it starts with on top of that, as TOML.
     pub fn resolve(
@@ -103,29 +103,35 @@ impl Common {
         fallback: Option<(Preset, &str)>,
         options: &[KeyOption],
     ) -> Result<Config> {
-        let mut files = Vec::new();
-        if let Some(own) = own_file().filter(|f| io::is_file(f)) {
-            files.push(own);
+        let mut sources = Sources {
+            preset: self.preset,
+            fallback: fallback.map(|(preset, text)| (preset, text.into())),
+            set: self.set.clone(),
+            ..Sources::default()
+        };
+        let own = own_file().filter(|f| io::is_file(f));
+        let has_own = usize::from(own.is_some());
+        let mut files = Vec::from_iter(own);
+        match saved {
+            Some(saved) if self.preset.is_some() => {
+                // another preset starts over, for all values of a run would win against it; on the same photographs
+                let path = Common::default().resolve(Some(saved), None, &[])?.capture.path;
+                let text = format!("capture.path = {}", toml::Value::from(path));
+                sources.files.push((saved.display().to_string(), text));
+            }
+            saved => files.extend(saved.map(Path::to_path_buf)),
         }
-        // another preset starts over: the values a run remembers would all win against it
-        let saved = saved.filter(|_| self.preset.is_none());
-        files.extend(saved.map(Path::to_path_buf));
-        files.extend(self.config.iter().cloned());
-        let nothing_names_one = files.is_empty() && !self.set.iter().any(|s| s.starts_with("preset"));
-        let mut sources = Sources { set: self.set.clone(), ..Sources::default() };
-        if let Some((preset, text)) = fallback.filter(|_| nothing_names_one && self.preset.is_none()) {
-            sources.preset = Some(preset);
-            sources.files.push(("built in".into(), text.into()));
-        } else {
-            sources.preset = self.preset;
-        }
-        for file in files {
+        for file in files.into_iter().chain(self.config.iter().cloned()) {
             let limits = Limits { file_bytes: 1 << 20, ..Limits::default() };
             let bytes = io::read_maybe_empty(&file, &limits).map_err(|e| Error::usage(&e, e.hint()))?;
             let name = file.display().to_string();
             let text = String::from_utf8(bytes)
                 .map_err(|_| Error::usage(format!("`{name}` is not UTF-8"), "save it as UTF-8"))?;
             sources.files.push((name, text));
+        }
+        if let Some(word) = std::env::var("TIFACE_PRESET").ok().filter(|word| !word.is_empty()) {
+            // only `--preset` starts a run over: this one is weaker than what the run remembers
+            sources.files.insert(has_own, ("TIFACE_PRESET".into(), format!("preset = {word:?}")));
         }
         if let Some(word) = self.device_word() {
             sources.options.push((format!("--device {word}"), "device".into(), word));
@@ -158,4 +164,26 @@ fn own_file() -> Option<PathBuf> {
     let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
     let base = set("XDG_CONFIG_HOME").or_else(|| set("HOME").map(|h| h.join(".config")))?;
     Some(base.join("tiface/config.toml"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_preset_starts_a_run_over_on_the_same_photographs() {
+        let dir = tempfile::tempdir().unwrap();
+        let saved = dir.path().join("config.toml");
+        let mut config = Config::preset(Preset::Standard);
+        (config.mesh.resolution, config.capture.path) = (77, "/photos/a \"b\"".into());
+        std::fs::write(&saved, config.to_toml()).unwrap();
+        let mut common = Common { preset: Some(Preset::Draft), ..Common::default() };
+        let found = common.resolve(Some(&saved), None, &[]).unwrap();
+        let draft = Config::preset(Preset::Draft);
+        assert_eq!((found.preset, found.mesh.resolution), (Preset::Draft, draft.mesh.resolution));
+        assert_eq!(found.capture.path, config.capture.path);
+        // they may have been moved
+        common.set = vec!["capture.path=/elsewhere".into()];
+        assert_eq!(common.resolve(Some(&saved), None, &[]).unwrap().capture.path, "/elsewhere");
+    }
 }

@@ -174,18 +174,12 @@ pub(super) fn in_words(cost: Cost) -> String {
 fn configure(common: &Common, command: &LineCommand) -> Result<Config> {
     let LineCommand { target, fallback, keys, .. } = command;
     let mut keys = keys.clone();
-    let mut remember = |path: &str| {
-        keys.push((format!("CAPTURE {path}"), "capture.path".into(), path.into()));
-    };
     if let Some(capture) = &target.capture {
         let path = capture.to_str().ok_or_else(|| {
             let shown = capture.display();
             Error::cannot(format!("the path of the capture is not UTF-8: `{shown}`"), "rename the folder")
         })?;
-        remember(path);
-    } else if let Some(saved) = target.saved.as_deref().filter(|_| common.preset.is_some()) {
-        // a new preset starts over, but on the same photographs
-        remember(&Common::default().resolve(Some(saved), None, &[])?.capture.path);
+        keys.push((format!("CAPTURE {path}"), "capture.path".into(), path.into()));
     }
     let mut config = common.resolve(target.saved.as_deref(), *fallback, &keys)?;
     // the run remembers it from anywhere

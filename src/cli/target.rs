@@ -118,6 +118,24 @@ mod tests {
     }
 
     #[test]
+    fn a_run_that_holds_a_transforms_json_stays_a_run() {
+        let dir = tempfile::tempdir().unwrap();
+        let put = |file: &str| {
+            let path = dir.path().join(file);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "x").unwrap();
+        };
+        // the demo's own photographs lie in its run
+        ["config.toml", "capture/transforms.json", "capture/images/000.png"].map(put);
+        assert!(is_run(dir.path()));
+        // beside the settings it is a capture, until a stage was done there
+        put("transforms.json");
+        assert!(!is_run(dir.path()));
+        put("mask/done.json");
+        assert!(is_run(dir.path()));
+    }
+
+    #[test]
     fn the_newest_run_is_guessed_and_none_is_a_usage_error() {
         let dir = tempfile::tempdir().unwrap();
         assert_eq!(guess(dir.path()).unwrap_err().kind().code(), 2);

@@ -11,6 +11,8 @@ use toml::{Table, Value};
 pub struct Sources {
     /// `--preset`; beats the `preset` of any file.
     pub preset: Option<Preset>,
+    /// The preset where no other source names one, and settings that go with it, as TOML.
+    pub fallback: Option<(Preset, String)>,
     /// Configuration files: name for messages, text.
     pub files: Vec<(String, String)>,
     /// `--set`: each `key=value`.
@@ -53,7 +55,14 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config> {
         };
         word.parse().ok()
     });
-    let preset = sources.preset.or(named).unwrap_or_default();
+    let mut preset = sources.preset.or(named);
+    if let (None, Some((fallback, text))) = (preset, &sources.fallback) {
+        preset = Some(*fallback);
+        let mut weakest = Vec::new();
+        read_file("built in", text, &mut weakest)?;
+        given.splice(0..0, weakest);
+    }
+    let preset = preset.unwrap_or_default();
     let mut config = Config::preset(preset);
     for (key, value, place) in given {
         config = assign(&config, &key, value).map_err(|e| e.within(place))?;

@@ -40,6 +40,24 @@ fn later_wins_default_preset_file_set() {
 }
 
 #[test]
+fn a_fallback_holds_until_a_source_names_a_preset() {
+    let with = |file: &str, set: &[&str]| {
+        let fallback = Some((Preset::Draft, "mesh.resolution = 99\niface.steps = 7".to_string()));
+        let set = set.iter().map(|s| s.to_string()).collect();
+        let files = vec![("f".into(), file.into())];
+        let c = Config::resolve(&Sources { fallback, files, set, ..Sources::default() }).unwrap();
+        (c.preset, c.mesh.resolution, c.iface.steps)
+    };
+    let standard = Config::preset(Preset::Standard);
+    // a file that names other keys leaves the preset, and wins over what goes with it
+    assert_eq!(with("mesh.resolution = 300", &[]), (Preset::Draft, 300, 7));
+    assert_eq!(with("", &["seed=1"]), (Preset::Draft, 99, 7));
+    let named = (Preset::Standard, standard.mesh.resolution, standard.iface.steps);
+    assert_eq!(with("preset = \"standard\"", &[]), named);
+    assert_eq!(with("", &["preset=standard"]), named);
+}
+
+#[test]
 fn an_unknown_key_names_its_line_and_the_nearest_known_one() {
     let e = from("seed = 1\n\n[iface]\nstep = 5\n", &[]).unwrap_err();
     assert_eq!(e.to_string(), "`tiface.toml`, line 4: there is no key `iface.step`");

@@ -5,11 +5,9 @@
 //! each) and channels: the squared error is `wᵀDw`, and no large numbers cancel in it.
 
 use super::members::{in_bands, no_members, normalized};
-use super::{BlendTarget, Members, simplex};
+use super::simplex::{self, MAX_MEMBERS};
+use super::{BlendTarget, Members};
 use crate::{Error, Result};
-
-/// The most members a fit can weigh.
-pub const MAX_MEMBERS: usize = 8;
 
 /// Sums over the pixels seen so far: `members²` numbers, so each view may keep its own.
 ///

@@ -1,6 +1,7 @@
 //! Small dense least squares: Cholesky, and the quadratic of least value on the simplex.
 
-use super::MAX_MEMBERS;
+/// The most members a fit can weigh.
+pub const MAX_MEMBERS: usize = 8;
 
 /// Factors the symmetric positive definite `a` (`[n · n]`, its lower half is read) in place, A = LLᵀ.
 /// False where it is not positive definite.

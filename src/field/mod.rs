@@ -19,7 +19,7 @@ pub mod training;
 use crate::config::DeviceChoice;
 use crate::{Error, Result};
 #[cfg(feature = "wgpu")]
-use std::sync::Mutex;
+use std::sync::{Mutex, OnceLock};
 
 /// Where a field is learned.
 pub enum ComputeDevice {
@@ -89,21 +89,30 @@ pub fn compute_device(name: &str) -> Result<ComputeDevice> {
 
 /// A field on a GPU, which answers instead of the processor until it fails.
 #[cfg(feature = "wgpu")]
-pub struct GpuField<T>(Mutex<Option<T>>);
+pub struct GpuField<T> {
+    field: Mutex<Option<T>>,
+    failure: OnceLock<String>,
+}
 
 #[cfg(feature = "wgpu")]
 impl<T> GpuField<T> {
     /// Takes the field; without one there is never an answer.
     pub fn new(field: Option<T>) -> GpuField<T> {
-        GpuField(Mutex::new(field))
+        GpuField { field: Mutex::new(field), failure: OnceLock::new() }
+    }
+
+    /// Returns why the processor answers in its place, once it failed.
+    pub fn failure(&self) -> Option<&str> {
+        self.failure.get().map(String::as_str)
     }
 
     /// Returns the answer; none where there is no field, or where it failed: then the processor answers.
     pub fn ask<A>(&self, question: impl FnOnce(&mut T) -> Result<A>) -> Option<A> {
-        let mut field = self.0.lock().ok()?;
+        let mut field = self.field.lock().ok()?;
         let answer = question(field.as_mut()?);
         if let Err(e) = &answer {
-            tracing::warn!("{e}; the processor goes on");
+            let text = self.failure.get_or_init(|| format!("{e}; the processor goes on"));
+            tracing::warn!("{text}");
             *field = None;
         }
         answer.ok()
@@ -113,3 +122,17 @@ impl<T> GpuField<T> {
 #[cfg(test)]
 #[path = "ball_tests.rs"]
 pub(crate) mod ball;
+
+#[cfg(all(test, feature = "wgpu"))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gpu_that_failed_is_asked_no_more_and_says_why() {
+        let field = GpuField::new(Some(1));
+        assert_eq!((field.ask(|f| Ok(*f)), field.failure()), (Some(1), None));
+        assert_eq!(field.ask(|_| Err::<i32, _>(Error::cannot("it is lost", ""))), None);
+        assert_eq!(field.ask(|_| -> Result<i32> { panic!("asked again") }), None);
+        assert_eq!(field.failure(), Some("it is lost; the processor goes on"));
+    }
+}

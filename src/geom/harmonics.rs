@@ -1,7 +1,7 @@
 //! Color at the vertices of a mesh that changes with the direction of view.
 
 use super::ray::Hit;
-use crate::kernel::cpu::sphharm;
+use super::sphharm;
 use glam::{Mat3, Vec3};
 
 /// Spherical harmonics of the direction to the viewer at the vertices of a mesh, to be added to its base color.

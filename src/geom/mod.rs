@@ -13,6 +13,7 @@ mod overlap;
 mod ray;
 mod shells;
 mod similarity;
+pub mod sphharm;
 mod symmetric;
 mod topology;
 

@@ -96,6 +96,12 @@ impl IFace {
         self
     }
 
+    /// Returns why a GPU no longer answers, where one failed.
+    #[cfg(feature = "wgpu")]
+    pub fn gpu_failure(&self) -> Option<&str> {
+        self.on_gpu.failure()
+    }
+
     /// Sharpness of the trained surface where it is sharpest, per scene unit.
     pub fn inv_s(&self) -> f32 {
         self.inv_s * self.config.radius

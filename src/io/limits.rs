@@ -18,7 +18,7 @@ pub struct Limits {
     pub json_depth: usize,
     /// Numbers, strings, arrays and objects in one JSON file; bounds the memory of the parsed tree.
     pub json_values: usize,
-    /// Views of one capture.
+    /// Views of one capture; votes of views are counted in 16 bits.
     pub views: usize,
 }
 
@@ -31,7 +31,7 @@ impl Default for Limits {
             json_bytes: 64 << 20,
             json_depth: 64,
             json_values: 8 << 20,
-            views: 100_000,
+            views: u16::MAX as usize,
         }
     }
 }

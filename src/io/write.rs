@@ -82,7 +82,7 @@ pub fn copy(from: &Path, to: &Path) -> Result<(), WriteError> {
     let aside = to.with_file_name(aside_name(&to.file_name().unwrap_or_default().to_string_lossy()));
     let result = (|| {
         // where the disk can, the bytes are shared instead of copied
-        let mut copied = File::create(&aside)?;
+        let mut copied = create(&aside)?;
         std::io::copy(&mut File::open(from)?, &mut copied)?;
         copied.sync_all()?;
         fs::rename(&aside, to)
@@ -268,6 +268,22 @@ mod tests {
         }
         assert!(copy(&at("none"), &at("d")).is_err());
         assert_eq!(names(dir.path()), ["a", "b", "c"]);
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn a_link_by_the_name_of_a_file_in_progress_is_replaced_not_followed() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        fs::write(at("a"), b"new").unwrap();
+        fs::write(at("other"), b"old").unwrap();
+        std::os::unix::fs::symlink(at("other"), at(&aside_name("b"))).unwrap();
+        copy(&at("a"), &at("b")).unwrap();
+        assert_eq!(
+            (fs::read(at("other")).unwrap(), fs::read(at("b")).unwrap()),
+            (b"old".into(), b"new".into())
+        );
+        assert!(!fs::symlink_metadata(at("b")).unwrap().is_symlink());
     }
 
     #[test]

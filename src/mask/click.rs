@@ -14,6 +14,13 @@ pub struct Click {
 }
 
 impl Click {
+    /// Is it on a photograph of this size? Index 0 is a pixel's center, so a picture reaches from −½ to just before
+    /// `side` − ½, which rounds to the pixel behind the last.
+    pub fn is_inside(&self, (width, height): (u32, u32)) -> bool {
+        let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;
+        inside(self.x, width) && inside(self.y, height)
+    }
+
     /// The same point of the photograph on a picture of it at another size; sizes are width and height.
     pub fn moved(&self, from: (u32, u32), to: (u32, u32)) -> Click {
         let moved = |v: f32, from: u32, to: u32| ((v as f64 + 0.5) * to as f64 / from as f64 - 0.5) as f32;
@@ -52,9 +59,7 @@ pub(super) fn check_places(subject: &str, clicks: &[Click], width: u32, height: 
     if clicks.is_empty() {
         return Err(no_clicks(subject));
     }
-    // a pixel index of 0 is the pixel's center, so the picture reaches half a pixel farther
-    let inside = |v: f32, size: u32| v >= -0.5 && v <= size as f32 - 0.5;
-    if let Some(i) = clicks.iter().position(|c| !(inside(c.x, width) && inside(c.y, height))) {
+    if let Some(i) = clicks.iter().position(|c| !c.is_inside((width, height))) {
         let (n, Click { x, y, .. }) = (i + 1, clicks[i]);
         return Err(Error::cannot(
             format!(
@@ -107,7 +112,9 @@ mod tests {
         };
         refused(&[], "view `007` has no clicks");
         refused(&[click(1.0, 1.0, false)], "view `007`: all 1 clicks are on the background");
-        for (x, y) in [(40.0, 3.0), (3.0, 30.0), (-1.0, 3.0), (f32::NAN, 3.0), (f32::INFINITY, 3.0)] {
+        for (x, y) in
+            [(39.5, 3.0), (40.0, 3.0), (3.0, 30.0), (-1.0, 3.0), (f32::NAN, 3.0), (f32::INFINITY, 3.0)]
+        {
             refused(&[click(1.0, 1.0, true), click(x, y, false)], "click 2 at");
         }
         let clicks = [click(4.2, 5.0, true), click(9.0, 9.0, true), click(4.0, 5.3, false)];

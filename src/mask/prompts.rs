@@ -26,7 +26,7 @@ const CONVENTION: &str =
 const MOST_POINTS: usize = 500;
 /// Longer names fit no file system.
 const LONGEST_NAME: usize = 4096;
-/// Hundred thousand views with ten points each stay below this.
+/// As many views as a capture may have, with ten points each, stay below this.
 const MOST_BYTES: u64 = 64 << 20;
 
 /// The suggested fix for a file of another shape.
@@ -287,8 +287,7 @@ impl Prompts {
             }
             let photo = &photos[view];
             let (w, h) = photo.size;
-            let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;
-            if let Some(j) = frame.points.iter().position(|c| !(inside(c.x, w) && inside(c.y, h))) {
+            if let Some(j) = frame.points.iter().position(|c| !c.is_inside((w, h))) {
                 let Click { x, y, .. } = frame.points[j];
                 let place = format!("`frames[{i}].points[{j}]`");
                 let problem = format!("({x}, {y}) lies outside `{name}`, which is {w} × {h} pixels");

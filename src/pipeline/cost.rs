@@ -3,8 +3,8 @@
 
 use super::line::Line;
 use super::path::CameraPath;
+use super::render::held_out;
 use crate::Result;
-use crate::capture::Split;
 use crate::config::{Config, MaskSource, Method, Preset, Stage, VmBackground, VmConfig};
 use crate::run::{Cost, ESTIMATE, Estimate};
 
@@ -38,7 +38,7 @@ impl Line<'_> {
         let shell = |c: &VmConfig| c.background == VmBackground::Reference;
         let all = self.pixels() as f64;
         let each = all / self.capture.views.len().max(1) as f64;
-        let held_out = each * self.capture.split(Split::Test).count().max(1) as f64;
+        let held_out = each * held_out(&self.capture).len() as f64;
         let shown = match &self.path {
             Some(CameraPath { cameras: Some(cameras), .. }) => each * cameras.len() as f64,
             Some(CameraPath { render, .. }) => each * f64::from(render.orbit_views),

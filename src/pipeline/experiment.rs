@@ -104,7 +104,6 @@ fn has_surface(run: &str) -> bool {
 ///
 /// A scale of 1 is the publication. Below, rays, voxels, samples and steps of I-Face are that share, steps of T-Face and
 /// the baseline its square (each costs more rays and samples, too), and warm-up and annealing follow the steps.
-/// Instant-NeRF learns on the processor, whatever device is set.
 ///
 /// # Errors
 ///
@@ -169,12 +168,7 @@ pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
         set: set.to_vec(),
         ..Sources::default()
     };
-    let mut resolved = Config::resolve(&sources)?;
-    if run == "iface-nerf" {
-        // there are no kernels of that field for another, and a device that is set is meant for the other runs
-        resolved.device = "cpu".into();
-    }
-    Ok(resolved)
+    Config::resolve(&sources)
 }
 
 /// The settings of a run for a capture that has no masks, where the run needs none; as they are for every other.
@@ -445,10 +439,9 @@ mod tests {
     }
 
     #[test]
-    fn instant_nerf_learns_on_the_processor_whatever_device_is_set() {
+    fn a_device_that_is_set_is_that_of_every_run() {
         let device = |run: &str| config(run, 1.0, &["device=wgpu:1".into()]).unwrap().device;
-        assert_eq!(["iface-nerf", "iface-bare", "paper"].map(device), ["cpu", "wgpu:1", "wgpu:1"]);
-        // a word that names none is refused all the same
+        assert_eq!(["iface-nerf", "iface-bare", "paper"].map(device), ["wgpu:1"; 3]);
         assert!(config("iface-nerf", 1.0, &["device=gpu".into()]).is_err());
     }
 

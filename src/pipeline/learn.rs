@@ -148,6 +148,12 @@ impl Fields for TrainedFields<'_> {
         let cell = if stage == Stage::Baseline { &self.baseline } else { &self.tface };
         once(cell, load).map(|f| f as &dyn Radiance)
     }
+
+    #[cfg(feature = "wgpu")]
+    fn warnings(&self) -> Vec<&str> {
+        let radiance = [&self.baseline, &self.tface].into_iter().filter_map(|f| f.get()?.gpu_failure());
+        radiance.chain(self.iface.get().and_then(|f| f.warning())).collect()
+    }
 }
 
 /// What a camera in the scene sees of a field.

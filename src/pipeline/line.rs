@@ -1,7 +1,7 @@
 //! A capture, its configuration and its run: what every stage works on.
 
 use super::clicks::MaskPrompts;
-use super::metrics::measure;
+use super::lpips::measure;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::Scene;

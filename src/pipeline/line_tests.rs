@@ -12,7 +12,7 @@ use crate::geom::{Camera, Similarity};
 use crate::io::{self, Limits};
 use crate::metrics::compare;
 use crate::render::RenderedView;
-use crate::run::{Run, Stop};
+use crate::run::{Run, Stop, read_record};
 use crate::{ErrorKind, Result};
 use glam::Vec3;
 use serde_json::json;
@@ -65,6 +65,10 @@ impl Fields for Formula {
     fn radiance(&self, _: Stage) -> Result<&dyn Radiance> {
         panic!("no radiance field is asked for")
     }
+
+    fn warnings(&self) -> Vec<&str> {
+        vec!["the GPU failed"]
+    }
 }
 
 fn capture(root: &Path, train: usize, test: usize) {
@@ -76,6 +80,24 @@ fn draft(root: &Path) -> Config {
     let mut config = Config::preset(Preset::Draft);
     config.capture.path = root.to_str().unwrap().into();
     config
+}
+
+#[test]
+fn views_held_out_for_validation_cost_what_test_views_cost() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root, 6, 3);
+    let (config, run) = (draft(&root), quiet(dir.path()));
+    let costs = || {
+        let line = Line::open(&config, &run).unwrap();
+        [Stage::Render, Stage::Ensemble, Stage::Metrics].map(|stage| line.cost(stage).cpu_s)
+    };
+    let of_test = costs();
+    let test = root.join("transforms_test.json");
+    let text = std::fs::read_to_string(&test).unwrap().replace("\"test\"", "\"val\"");
+    std::fs::write(root.join("transforms_val.json"), text).unwrap();
+    std::fs::remove_file(test).unwrap();
+    assert_eq!(costs(), of_test);
 }
 
 /// The line with its own formula in the place of a learned field: whatever is wrong then is not the
@@ -102,6 +124,8 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     let exact = Formula(Exact { world_from_scene: scene.scene_from_world.inverse() });
     let mesh = complete(&line, Stage::Mesh, &exact).unwrap();
     assert_eq!(mesh.summary["closed"], true);
+    let record = read_record(&run.path(Stage::Mesh)).unwrap().unwrap();
+    assert!(record.warnings.iter().any(|w| w == "the GPU failed"), "{:?}", record.warnings);
     complete(&line, Stage::Render, &exact).unwrap();
     complete(&line, Stage::Ensemble, &NoFields).unwrap();
     let metrics = complete(&line, Stage::Metrics, &NoFields).unwrap();

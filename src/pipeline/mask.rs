@@ -79,9 +79,9 @@ pub(super) fn mask(
         );
     }
     let silhouettes = config.meaning == MaskMeaning::Empty;
-    let (conflicts, mut wrong) =
-        if silhouettes { (conflicts(capture, &masks), refused) } else { (Vec::new(), Vec::new()) };
-    let (contradicting, warnings) = judged(&conflicts, coverage.len());
+    let (conflicts, compared) = if silhouettes { conflicts(capture, &masks) } else { (Vec::new(), 0) };
+    let mut wrong = if silhouettes { refused } else { Vec::new() };
+    let (contradicting, warnings) = judged(&conflicts, compared);
     wrong.extend(contradicting);
     for (_, view) in views.iter_mut().filter(|(i, _)| conflicts.iter().any(|(view, ..)| view == i)) {
         view.suspicions.push("disagrees with the others".into());
@@ -213,8 +213,8 @@ fn place(
 /// A view whose mask does not fit the others: its number, how large a share of the masks that concerns, and a sentence.
 type MaskConflict = (usize, f64, String);
 
-/// The views whose masks do not fit the others; none where the cameras cannot tell.
-fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<MaskConflict> {
+/// The views whose masks do not fit the others, none where the cameras cannot tell; and how many masks were compared.
+fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> (Vec<MaskConflict>, usize) {
     // evenly spread ones, where there are very many: the check keeps bits of every cell for each
     let every = capture.views.len().div_ceil(MOST_COMPARED);
     let views: Vec<ConsistencyView> = (capture.views.iter().zip(masks).enumerate())
@@ -224,21 +224,21 @@ fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> Vec<MaskConflict> {
             mask: mask.as_ref().filter(|_| i.is_multiple_of(every)),
         })
         .collect();
-    let found = check_consistency(&views).map_or(Vec::new(), |found| found.conflicts);
-    let conflicts = found.into_iter().map(|d| (d.view, d.too_much.max(d.too_little), d.text));
+    let found = check_consistency(&views).unwrap_or_default();
+    let conflicts = found.conflicts.into_iter().map(|d| (d.view, d.too_much.max(d.too_little), d.text));
     // less than that is a matter of pixels
-    conflicts.filter(|(_, share, _)| *share >= 0.005).collect()
+    (conflicts.filter(|(_, share, _)| *share >= 0.005).collect(), found.masks)
 }
 
 /// The conflicts as sentences: masks that cannot be right, and those that a person should look at. When most masks are
 /// doubted it is not single masks that are wrong.
-fn judged(conflicts: &[MaskConflict], masks: usize) -> (Vec<Error>, Vec<String>) {
+fn judged(conflicts: &[MaskConflict], compared: usize) -> (Vec<Error>, Vec<String>) {
     let mut found: Vec<(bool, String)> =
         conflicts.iter().map(|(_, share, text)| (*share >= WRONG_SHARE, text.clone())).collect();
     let n = found.len();
-    if n > 3 && 2 * n > masks {
+    if n > 3 && 2 * n > compared {
         let text = format!(
-            "{n} of {masks} masks contradict each other: they, or the cameras, belong to other photographs ({}, and so \
+            "{n} of {compared} masks contradict each other: they, or the cameras, belong to other photographs ({}, and so \
              on)",
             found[0].1
         );
@@ -264,7 +264,8 @@ pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     let Ok(capture) = capture::open(root, options) else { return found };
     let load = |v: &View| Some(for_placing(&v.load_mask(&options.limits).ok().flatten()?));
     let masks: Vec<Option<Gray>> = capture.views.par_iter().map(load).collect();
-    let (wrong, warnings) = judged(&conflicts(&capture, &masks), masks.iter().flatten().count());
+    let (conflicts, compared) = conflicts(&capture, &masks);
+    let (wrong, warnings) = judged(&conflicts, compared);
     found.add_refused_masks(&wrong, options);
     found.warnings.extend(warnings);
     found

@@ -1,15 +1,14 @@
 //! Stage `metrics`: every view, of every member and of the blends, against its photograph.
 
 use super::line::Line;
+use super::lpips::{Lpips, measure};
 use super::mesh::surface_in_world;
 use super::pictures;
 use super::truth::against_truth;
 use crate::capture::{LoadedView, View};
-use crate::config::{Config, Method, Stage, TruthPhoto, ViewBackground};
+use crate::config::{Method, Stage, TruthPhoto, ViewBackground};
 use crate::image::Gray;
 use crate::io::{self, Limits};
-#[cfg(feature = "matting")]
-use crate::metrics::Lpips;
 use crate::metrics::{Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, parts};
 use crate::run::StageDir;
 use crate::{Error, Result};
@@ -116,42 +115,6 @@ fn blend_gain(sets: &Map<String, Value>, members: &[Method]) -> Option<Value> {
     let each = members.iter().filter_map(|member| Some((member.folder(), psnr(member.folder())?)));
     let (best, alone) = each.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|_| members.len() > 1)?;
     Some(json!({"best_member": best, "gain_db": psnr("ensemble")? - alone}))
-}
-
-/// The network for LPIPS, if one is named.
-#[cfg(feature = "matting")]
-pub(super) fn measure(config: &Config) -> Result<Option<Lpips>> {
-    let file = &config.metrics.lpips;
-    if file.is_empty() {
-        return Ok(None);
-    }
-    Lpips::open(file.as_ref(), &config.mask.onnxruntime, config.mask.memory_gib).map(Some)
-}
-
-/// What stands for LPIPS in a build that runs no networks.
-#[cfg(not(feature = "matting"))]
-pub(super) enum Lpips {}
-
-#[cfg(not(feature = "matting"))]
-impl Lpips {
-    fn file(&self) -> std::convert::Infallible {
-        match *self {}
-    }
-
-    fn distance(&self, _: &crate::image::Image, _: &crate::image::Photo) -> Result<f64> {
-        match *self {}
-    }
-}
-
-#[cfg(not(feature = "matting"))]
-pub(super) fn measure(config: &Config) -> Result<Option<Lpips>> {
-    match config.metrics.lpips.is_empty() {
-        true => Ok(None),
-        false => Err(Error::cannot(
-            "this build cannot run networks, but `metrics.lpips` names one",
-            "build with `--features matting`, or leave the file out",
-        )),
-    }
 }
 
 fn figures(

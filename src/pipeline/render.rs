@@ -14,8 +14,8 @@ use super::mesh::{extracted_surface, head_mesh};
 use super::path::{CameraPath, cameras_of};
 use super::pictures;
 use super::surface::Fields;
-use crate::capture::Split;
 use crate::capture::scene::{self, Scene};
+use crate::capture::{Capture, Split};
 use crate::config::{ColorSource, Config, Method};
 use crate::geom::{Bvh, Camera, Ray, ShellCaster, Similarity};
 use crate::io;
@@ -75,15 +75,17 @@ pub(super) fn render(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &Stag
     Ok(json!({"cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds}))
 }
 
+/// The cameras of the evaluation: held out from training, else all there are.
+pub(super) fn held_out(capture: &Capture) -> Vec<NamedCamera> {
+    let mut splits = [Split::Test, Split::Val, Split::Train].map(|s| cameras_of(capture, s)).into_iter();
+    splits.find(|cameras| !cameras.is_empty()).unwrap_or_default()
+}
+
 /// The cameras to render: named like photographs where they have one.
 pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
     let capture = &line.capture;
     match &line.path {
-        None => {
-            let mut splits =
-                [Split::Test, Split::Val, Split::Train].map(|s| cameras_of(capture, s)).into_iter();
-            Ok(splits.find(|cameras| !cameras.is_empty()).unwrap_or_default())
-        }
+        None => Ok(held_out(capture)),
         Some(CameraPath { cameras: Some(cameras), .. }) => Ok(cameras.clone()),
         Some(CameraPath { render, .. }) => {
             let all: Vec<Camera> = capture.views.iter().map(|v| v.camera.clone()).collect();

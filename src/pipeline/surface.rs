@@ -32,6 +32,11 @@ pub trait Surface: Sync {
     /// The view of a camera in scene coordinates by marching through the field itself; depth and
     /// normals in the world. `None` for what is only a surface.
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView>;
+
+    /// What a person should know of its answers so far: a GPU that failed.
+    fn warning(&self) -> Option<&str> {
+        None
+    }
 }
 
 /// A surface with what closes it where the field's own zero does not.
@@ -94,6 +99,11 @@ pub trait Fields {
 
     /// The field of the stage `baseline` or `tface`.
     fn radiance(&self, stage: Stage) -> Result<&dyn Radiance>;
+
+    /// What a person should know of their answers so far.
+    fn warnings(&self) -> Vec<&str> {
+        Vec::new()
+    }
 }
 
 #[cfg(feature = "cpu")]
@@ -122,6 +132,11 @@ impl Surface for crate::iface::IFace {
 
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView> {
         Some(super::march::march(camera, world_from_scene, true, |rays| self.render(rays)))
+    }
+
+    #[cfg(feature = "wgpu")]
+    fn warning(&self) -> Option<&str> {
+        self.gpu_failure()
     }
 }
 

@@ -5,6 +5,7 @@
 //! must be in the dataset's own world. A path from nerfstudio's viewer is only if training there ran
 //! with `--orientation-method none --center-method none --auto-scale-poses False`.
 
+use crate::capture::camera_like;
 use crate::geom::{Aabb, Camera, Distortion};
 use crate::{Error, Result};
 use glam::{BVec3, DMat3, DVec3, Vec3};
@@ -201,8 +202,8 @@ fn from_key(file: &PathFile, key: &PathKey, like: &Camera) -> Result<Camera, Str
     if let Some(kind) = file.camera_type.as_deref().filter(|k| *k != "perspective") {
         return Err(format!("is of type `{kind}`, expected `perspective`"));
     }
-    let width = side(&[&file.numbers], "render_width", like.width)?;
-    let height = side(&[&file.numbers], "render_height", like.height)?;
+    let width = side(&file.numbers, "render_width", like.width)?;
+    let height = side(&file.numbers, "render_height", like.height)?;
     let m = &key.camera_to_world;
     if m.len() != 16 && m.len() != 12 {
         return Err(format!("`camera_to_world` has {} numbers, expected 16", m.len()));
@@ -228,52 +229,20 @@ fn from_key(file: &PathFile, key: &PathKey, like: &Camera) -> Result<Camera, Str
 }
 
 fn from_frame(shared: &Map<String, Value>, frame: &TransformsFrame, like: &Camera) -> Result<Camera, String> {
-    let objects = [&frame.numbers, shared];
-    let width = side(&objects, "w", like.width)?;
-    let height = side(&objects, "h", like.height)?;
-    let focal =
-        |length: &str, angle: &str, size: u32| match (number(&objects, length)?, number(&objects, angle)?) {
-            (Some(length), _) => Ok(Some(length)),
-            (None, Some(a)) if a > 0.0 && a < 3.1 => Ok(Some(size as f64 / 2.0 / (a / 2.0).tan())),
-            (None, Some(a)) => Err(format!("`{angle}` is {a}, expected radians between 0 and π")),
-            (None, None) => Ok(None),
-        };
-    let (fx, fy) = (focal("fl_x", "camera_angle_x", width)?, focal("fl_y", "camera_angle_y", height)?);
-    let mut camera = like.resized(width, height);
-    if fx.or(fy).is_some() {
-        // a lens of its own: what it does not say is in the middle and without distortion
-        (camera.cx, camera.cy) = (width as f64 / 2.0, height as f64 / 2.0);
-        camera.distortion = Distortion::default();
-    }
-    (camera.fx, camera.fy) = (fx.or(fy).unwrap_or(camera.fx), fy.or(fx).unwrap_or(camera.fy));
-    if !(camera.fx > 0.0 && camera.fy > 0.0) {
-        return Err(format!("focal lengths {} and {}, expected pixels above 0", camera.fx, camera.fy));
-    }
-    let Camera { cx, cy, distortion: Distortion { k1, k2, k3, p1, p2, .. }, .. } = &mut camera;
-    for (name, value) in [("cx", cx), ("cy", cy), ("k1", k1), ("k2", k2), ("k3", k3), ("p1", p1), ("p2", p2)]
-    {
-        *value = number(&objects, name)?.unwrap_or(*value);
-    }
-    let (rotation, position) = pose(&frame.transform_matrix)?;
-    Ok(Camera { rotation, position, ..camera })
-}
-
-/// The number of this name in the first object that has one.
-fn number(objects: &[&Map<String, Value>], name: &str) -> Result<Option<f64>, String> {
-    match objects.iter().filter_map(|o| o.get(name)).find(|v| !v.is_null()) {
-        None => Ok(None),
-        Some(v) => {
-            let number = v.as_f64().filter(|v| v.is_finite());
-            number.map(Some).ok_or_else(|| format!("`{name}` is {v}, expected a finite number"))
-        }
+    let camera = camera_like(shared, &frame.numbers, like, pose(&frame.transform_matrix)?)?;
+    match camera.width.max(camera.height) {
+        ..=MAX_SIDE => Ok(camera),
+        side => Err(format!("its picture has {side} pixels on a side, expected 1 to {MAX_SIDE}")),
     }
 }
 
-fn side(objects: &[&Map<String, Value>], name: &str, other: u32) -> Result<u32, String> {
-    match number(objects, name)? {
+fn side(object: &Map<String, Value>, name: &str, other: u32) -> Result<u32, String> {
+    match object.get(name).filter(|v| !v.is_null()) {
         None => Ok(other),
-        Some(v) if v.fract() == 0.0 && (1.0..=MAX_SIDE as f64).contains(&v) => Ok(v as u32),
-        Some(v) => Err(format!("`{name}` is {v}, expected 1 to {MAX_SIDE} pixels")),
+        Some(v) => match v.as_f64() {
+            Some(v) if v.fract() == 0.0 && (1.0..=MAX_SIDE as f64).contains(&v) => Ok(v as u32),
+            _ => Err(format!("`{name}` is {v}, expected 1 to {MAX_SIDE} pixels")),
+        },
     }
 }
 
@@ -301,6 +270,7 @@ fn pose(rows: &[Vec<f64>]) -> Result<(DMat3, DVec3), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geom::Projection;
 
     fn like() -> Camera {
         Camera {
@@ -398,6 +368,16 @@ mod tests {
         let (a, b) = (&path[0].camera, &path[1].camera);
         assert!((a.fx - 50.0).abs() < 1e-9 && a.fy == a.fx && a.cx == 50.0 && a.distortion.k1 == 0.2);
         assert_eq!((b.fx, b.fy, b.cx, b.cy), (70.0, 80.0, 40.5, 25.0));
+        // a frame's own angle wins over the file's focal length: 50 / tan 45°
+        let angle = text.replacen("\"w\"", "\"fl_x\": 10, \"w\"", 1).replace(
+            "\"file_path\": \"b\", \"fl_x\": 70, \"fl_y\": 80",
+            "\"camera_angle_x\": 1.5707963267948966",
+        );
+        assert!((from_json(&angle, &like()).unwrap()[1].camera.fx - 50.0).abs() < 1e-9);
+        // every lens that captures may have
+        let fisheye = text.replacen("\"w\"", "\"camera_model\": \"OPENCV_FISHEYE\", \"k4\": 0.3, \"w\"", 1);
+        let lens = from_json(&fisheye, &like()).unwrap()[0].camera.distortion;
+        assert_eq!((lens.projection, lens.k1, lens.k4), (Projection::Fisheye, 0.2, 0.3));
         // a file without a lens takes ours
         let bare = format!(r#"{{"frames": [{{"transform_matrix": {eye}}}]}}"#);
         let c = &from_json(&bare, &like()).unwrap()[0].camera;

@@ -23,9 +23,9 @@ use crate::geom::{Camera, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Image;
 use glam::Vec3;
 use paint::{Band, Batch, Painter, Part, Queue, Sheet, straight_rays};
-use project::{Bins, Faces, Lens};
+use project::{Bins, Faces, Lens, TILE};
 use rayon::prelude::*;
-use tile::{NOTHING, SAMPLES, TILE, Tile};
+use tile::{NOTHING, SAMPLES, Tile};
 
 /// Depth change over one pixel, in pixel footprints, from which on a surface ends: tan 84°, as for rays.
 const JUMP: f32 = 10.0;

@@ -8,9 +8,9 @@
 //! computed once a place, after the filter.
 
 use super::raycast::RayHits;
+use crate::geom::sphharm;
 use crate::geom::{Atlas, Camera, Hit, Mesh};
 use crate::image::{Photo, linear_from_srgb, srgb_from_linear};
-use crate::kernel::cpu::sphharm;
 use glam::{Mat3, Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 use std::array::from_fn;

@@ -1,7 +1,7 @@
 //! A run while it works: its stages, curves and newest views, as a page that renews itself.
 
 use super::serve::{Answer, Server};
-use super::{LEARNED, STYLE, charts, duration, fill, link};
+use super::{LEARNED, STYLE, charts, duration, fill, link, small_view, views};
 use crate::Result;
 use crate::config::{NAMES, Stage};
 use crate::io::{self, Limits};
@@ -13,6 +13,8 @@ use std::time::SystemTime;
 
 /// Views on the page.
 const NEWEST: usize = 12;
+/// Longest side of a picture that is made of an EXR file.
+const EXR_PX: u32 = 1024;
 /// The files of a run that may be looked at, beside its pictures.
 const PAGES: [&str; 2] = ["report.html", "mask/sheet.html"];
 
@@ -65,6 +67,10 @@ fn answer(run: &Path, view: FieldView, path: &str) -> Option<Answer> {
             if linked || !io::is_file(&file) {
                 return None;
             }
+            if named.ends_with(".exr") {
+                // browsers show none
+                return Some(Answer { kind: "image/jpeg", body: small_view(&file, EXR_PX, 85)? });
+            }
             let kind = if named.ends_with(".png") { "image/png" } else { "text/html; charset=utf-8" };
             Some(Answer { kind, body: io::read_bytes(&file, &Limits::default()).ok()? })
         }
@@ -73,15 +79,7 @@ fn answer(run: &Path, view: FieldView, path: &str) -> Option<Answer> {
 
 /// The pictures of a run, relative to it.
 fn pictures(run: &Path) -> Vec<String> {
-    let folders = NAMES.iter().map(|(word, _)| match *word {
-        "ensemble" => "ensemble".to_owned(),
-        word => format!("render/{word}"),
-    });
-    let inside = |folder: String| {
-        let names = io::list_files(&run.join(&folder)).unwrap_or_default();
-        names.into_iter().filter(|n| n.ends_with(".png")).map(move |n| format!("{folder}/{n}"))
-    };
-    folders.flat_map(inside).collect()
+    NAMES.iter().flat_map(|(word, _)| views(run, word)).collect()
 }
 
 fn page(run: &Path) -> Result<String> {
@@ -155,6 +153,19 @@ mod tests {
         let address = link(&format!("render/tface/{name}.png"));
         assert_eq!(get(&address), Some(("image/png", "p".into())));
         assert_eq!(get("report.html").unwrap().1, "r");
+        // views in folders of their own, and EXR as what browsers show; not the depth beside them
+        let exr = |name: &str| {
+            std::fs::create_dir_all(run.join(name).parent().unwrap()).unwrap();
+            let half = [0.5; 2];
+            let channels: Vec<(&str, &[f32])> = ["A", "B", "G", "R", "Z"].map(|c| (c, &half[..])).into();
+            io::write_exr(&run.join(name), 2, 1, &channels).unwrap();
+        };
+        exr("render/tface/left/a.exr");
+        exr("render/tface/float/left/a.exr");
+        let shown = answer(&run, &|_| None, "render/tface/left/a.exr").unwrap();
+        assert!(shown.kind == "image/jpeg" && shown.body.starts_with(&[0xff, 0xd8]));
+        assert!(get("live").unwrap().1.contains("left&#x2f;a.exr"));
+        assert_eq!(get("render/tface/float/left/a.exr"), None);
         for path in
             ["config.toml", "iface/log.jsonl", "render/tface/", "render/../report.html", "mask/sheet.html"]
         {

@@ -1,11 +1,10 @@
 //! One page of many runs: a row each, sorted by whatever one likes.
 
-use super::{STYLE, fill, link, picture_url};
+use super::{STYLE, fill, link, picture_url, small_view, views};
 use crate::Result;
 use crate::capture::synthetic::SyntheticHead;
 use crate::config::{Config, NAMES, Stage, called};
-use crate::image::{over_black, reduce_photo, working_size};
-use crate::io::{self, Limits};
+use crate::io;
 use crate::run::{Phase, Record, Standing};
 use minijinja::context;
 use serde::Serialize;
@@ -133,21 +132,8 @@ fn state(run: &Standing) -> String {
 
 /// The first view of the best that a run shows, over black.
 fn picture(run: &Path) -> Option<String> {
-    let folders = NAMES.iter().rev().map(|(word, _)| match *word {
-        "ensemble" => run.join("ensemble"),
-        word => run.join("render").join(word),
-    });
-    let first = |folder: PathBuf| {
-        let names = io::list_files(&folder).ok()?;
-        Some(folder.join(names.into_iter().find(|name| name.ends_with(".png"))?))
-    };
-    let file = folders.filter_map(first).next()?;
-    let photo = io::read_photo(&file, None, &Limits::default()).ok()?;
-    let mut small = reduce_photo(&photo, working_size(photo.width, photo.height, PICTURE_PX));
-    for (c, a) in small.rgb.iter_mut().zip(small.alpha.take().unwrap_or_default()) {
-        *c = over_black([c[0], c[1], c[2], a]);
-    }
-    Some(picture_url(&io::jpeg_bytes(&small, 78, &file).ok()?))
+    let file = NAMES.iter().rev().find_map(|(word, _)| views(run, word).into_iter().next())?;
+    Some(picture_url(&small_view(&run.join(file), PICTURE_PX, 78)?))
 }
 
 /// The way from a folder to a file; the file itself where one of them is not there.
@@ -258,6 +244,12 @@ mod tests {
         assert!(row.state.starts_with("iface cannot be read: "), "{}", row.state);
         assert_eq!(row.link, "%3Cimg%20src%3Dx%20onerror%3Dalert%281%29%3E/report.html");
         assert!(row.picture.starts_with("data:image/jpeg;base64,") && row.psnr.is_none());
+        // so have runs whose views are EXR files in folders of their own
+        std::fs::remove_file(run.join("ensemble/a.png")).unwrap();
+        std::fs::create_dir_all(run.join("render/raster/left")).unwrap();
+        let channels: Vec<(&str, &[f32])> = ["B", "G", "R"].map(|c| (c, &[0.5][..])).into();
+        io::write_exr(&run.join("render/raster/left/a.exr"), 1, 1, &channels).unwrap();
+        assert!(RunRow::read(&run, dir.path()).picture.starts_with("data:image/jpeg;base64,"));
         let page = runs_html(&[row.clone(), RunRow { psnr: Some(31.25), ..row }]).unwrap();
         assert!(!page.contains("<img src=x") && page.contains("&lt;img src=x") && page.contains("31.25"));
         assert_eq!(page.matches("<tr>").count(), 3);

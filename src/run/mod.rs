@@ -25,15 +25,13 @@ mod progress;
 mod stage;
 mod standing;
 mod status;
-mod stop;
 
 pub use estimate::{Cost, ESTIMATE, Estimate, read_estimate};
 pub use fingerprint::Fingerprint;
-pub use progress::{Event, Observer};
+pub use progress::{Event, Observer, Stop};
 pub use stage::{Done, Plan, StageDir};
 pub use standing::{FAILED, Failure, Phase, StageStanding, Standing, read_failure};
 pub use status::{Record, State, Status, read_record, read_status};
-pub use stop::Stop;
 
 use crate::io::{self, Lock, LockError};
 use std::path::{Path, PathBuf};

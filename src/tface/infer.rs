@@ -70,6 +70,12 @@ impl TFace {
         }
     }
 
+    /// Returns why a GPU no longer answers.
+    #[cfg(feature = "wgpu")]
+    pub(super) fn gpu_failure(&self) -> Option<&str> {
+        self.on_gpu.failure()
+    }
+
     /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
     /// vector `forward`.
     pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {

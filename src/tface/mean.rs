@@ -59,6 +59,12 @@ impl FieldMean {
         FieldMean { _lock: gpu.lock, ..self }
     }
 
+    /// Returns why a GPU no longer answers, where one failed.
+    #[cfg(feature = "wgpu")]
+    pub fn gpu_failure(&self) -> Option<&str> {
+        self.fields.iter().find_map(TFace::gpu_failure)
+    }
+
     /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
     /// vector `forward`: mean color (premultiplied, coded) and opacity; depth by opacity.
     pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {

@@ -16,8 +16,8 @@ use super::hash::{self, Level};
 use super::march::Samples;
 use super::matrix::{Matrix, add_to, split};
 use super::simd::{exp, gemm, sigmoid};
-use super::sphharm::sh16;
 use crate::dispatch;
+use crate::geom::sphharm::sh16;
 use rayon::prelude::*;
 
 /// Width of all hidden layers.

@@ -22,7 +22,6 @@ pub mod rng;
 pub mod schedule;
 pub mod sdf;
 pub mod simd;
-pub mod sphharm;
 pub mod stereo;
 pub mod vm;
 pub mod weight_norm;

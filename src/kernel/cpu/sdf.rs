@@ -28,8 +28,8 @@ use super::mlp::{
 };
 use super::pool::{Buffer, pieces};
 use super::simd::{exp, gemm, ln_1p, sigmoid};
-use super::sphharm::sh16;
 use crate::dispatch;
+use crate::geom::sphharm::sh16;
 use rayon::prelude::*;
 use std::ops::Range;
 

@@ -1,12 +1,12 @@
 //! A trained signed-distance field on a device: what it is evaluated for after training, in batches that fill the device.
 
+use super::check::planes;
 use super::device::{Buffer, Device};
 use super::draw::Batch;
 use super::march::Samples;
 use super::neus::{Neus, Rays};
 use super::occupancy::Occupancy;
 use super::sdf::Sdf;
-use super::self_test::planes;
 use crate::Result;
 use crate::kernel::cpu::march::{Bitmask, MarchRay};
 use crate::kernel::cpu::neus::RAY_WIDTH;

@@ -35,7 +35,7 @@ pub(super) fn rows(line: &Line, most: usize) -> Result<(Vec<ViewRow>, Vec<String
     let judged = all.iter().any(|(_, p)| !p.is_empty());
     let shown: Vec<_> = all
         .into_iter()
-        .filter(|(v, p)| if judged { !p.is_empty() } else { v.split == Split::Test })
+        .filter(|(v, p)| if judged { !p.is_empty() } else { v.split != Split::Train })
         .collect();
     let side = if shown.len() > FEW { SIDE_PX.1 } else { SIDE_PX.0 };
     let figures =

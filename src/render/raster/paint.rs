@@ -2,7 +2,8 @@
 //! each of these places has.
 
 use super::super::raycast::RayHits;
-use super::tile::{CENTER, GRID, NOTHING, SAMPLES, TILE, Tile, UNIT};
+use super::project::{TILE, UNIT};
+use super::tile::{CENTER, GRID, NOTHING, SAMPLES, Tile};
 use crate::geom::{Camera, Hit, Mesh, ShellLayer};
 use glam::{DVec3, Mat3, Vec2, Vec3};
 

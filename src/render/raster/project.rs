@@ -1,10 +1,19 @@
 //! Triangles on a picture: moved into the camera, cut to what it can see, snapped to 1/256 of a pixel, and sorted into
 //! tiles.
 
-use super::tile::{FIRST, LAST, TILE, UNIT};
 use crate::geom::{Camera, Mesh};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
+
+/// Pixels along each side of a tile.
+pub(super) const TILE: usize = 32;
+
+/// Parts of a pixel.
+pub(super) const UNIT: i32 = 256;
+
+/// The first and the last place of a sample in a row.
+const FIRST: i32 = 32;
+const LAST: i32 = 224;
 
 /// Triangles that are binned together: what comes out does not depend on how many threads there are.
 const CHUNK: usize = 4096;

@@ -1,5 +1,5 @@
+use super::project::UNIT;
 use super::project::{Corner, Face, area};
-use super::tile::UNIT;
 use super::*;
 use crate::geom::{Bvh, Distortion, ShellCaster};
 use crate::kernel::cpu::rng;

@@ -4,13 +4,10 @@
 //! left or a top one (Pineda, *A Parallel Algorithm for Polygon Rasterization*, 1988). All of it is in whole numbers, so
 //! triangles that share an edge leave no sample between them out and hit none twice.
 
-use super::project::{Corner, Face, area, reach};
+use super::project::{Corner, Face, TILE, UNIT, area, reach};
 use std::array::from_fn;
 use std::hint::black_box;
 use std::ops::{Add, BitOr, Mul, Sub};
-
-/// Pixels along each side of a tile.
-pub(super) const TILE: usize = 32;
 
 /// Places in a pixel that are worked on at once.
 const LANES: usize = 8;
@@ -23,9 +20,6 @@ const BLOCKS: usize = TILE / BLOCK;
 /// After so many faces the farthest depths are looked up again.
 const REFRESH: usize = 256;
 
-/// Parts of a pixel.
-pub(super) const UNIT: i32 = 256;
-
 /// Samples of a pixel's coverage.
 pub(super) const SAMPLES: usize = 4;
 
@@ -36,10 +30,6 @@ pub(super) const GRID: [(i32, i32); LANES] =
 
 /// The center in [`GRID`].
 pub(super) const CENTER: usize = SAMPLES;
-
-/// The first and the last place of a sample in a row.
-pub(super) const FIRST: i32 = 32;
-pub(super) const LAST: i32 = 224;
 
 /// No triangle.
 pub(super) const NOTHING: u32 = u32::MAX;

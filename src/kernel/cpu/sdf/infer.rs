@@ -2,13 +2,13 @@
 
 use super::{CHUNK, FieldShape, Inputs, WIDTH, color_layers, run, skip, softened};
 use crate::dispatch;
+use crate::geom::sphharm::sh16;
 use crate::kernel::cpu::hash;
 use crate::kernel::cpu::mlp::{
     COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
 };
 use crate::kernel::cpu::pool::Buffer;
 use crate::kernel::cpu::simd::{exp, gemm, ln_1p, sigmoid};
-use crate::kernel::cpu::sphharm::sh16;
 use rayon::prelude::*;
 
 /// softplus₁₀₀.

@@ -122,7 +122,7 @@ fn color_inputs(
     }
 }
 
-/// Writes [`crate::kernel::cpu::sphharm::sh16`] to 16 channels of a tile, from `first` on.
+/// Writes [`crate::geom::sphharm::sh16`] to 16 channels of a tile, from `first` on.
 #[cube]
 pub(in super::super) fn harmonics(a: &mut [F4], #[comptime] first: usize, x: F4, y: F4, z: F4, row: usize) {
     let (xy, yz, xz) = (x * y, y * z, x * z);

@@ -244,14 +244,7 @@ fn units_of(partial: &[f32], units: &mut [f32]) {
 
 /// Whole numbers become floats, added to the gradient, and zero, where there was a sample from `from` on.
 #[cube(launch)]
-fn settle(
-    whole: &mut [i32],
-    words: &[u32],
-    units: &[f32],
-    count: &[u32],
-    gradient: &mut [f32],
-    from: u32,
-) {
+fn settle(whole: &mut [i32], words: &[u32], units: &[f32], count: &[u32], gradient: &mut [f32], from: u32) {
     let i = ABSOLUTE_POS;
     if i < whole.len() && count[0] > from {
         let unit = select(i < 4 * words[LINES] as usize, units[0], units[1]);

@@ -1,8 +1,8 @@
 //! Does a device render TensoRF's field as the CPU does? On a tiny batch, which the tests of the kernels share.
 
+use super::super::check::{Check, planes, worst};
 use super::super::device::{Buffer, Device, Words};
 use super::super::draw::Batch;
-use super::super::self_test::{Check, planes, worst};
 use super::{Vm, VmValues};
 use crate::Result;
 use crate::kernel::cpu::march::MarchRay;

@@ -24,9 +24,9 @@ mod solve;
 pub(super) use nodes::Nodes;
 pub use rows::Photograph;
 
+use crate::geom::sphharm::{Y0, functions};
 use crate::geom::{Atlas, Bvh, Harmonics, Mesh};
 use crate::image::Image;
-use crate::kernel::cpu::sphharm::{Y0, functions};
 use crate::{Monitor, Result};
 use glam::Mat3;
 use rayon::prelude::*;

@@ -2,8 +2,8 @@
 
 use super::nodes::Nodes;
 use super::rows::{Matrix, Rows};
+use crate::geom::sphharm::{MOST_OF_DEGREE_2, sh16};
 use crate::kernel::cpu::cg::{conjugate_gradients, dot};
-use crate::kernel::cpu::sphharm::{MOST_OF_DEGREE_2, sh16};
 use rayon::prelude::*;
 
 /// The sum of squares left at which a fit ends, of that at its start.

@@ -326,8 +326,7 @@ mod tests {
         // the second is looked at by a stand-in at +x: away from it x is negative
         assert_eq!(shades.linear[1][0], 1.0);
         // towards +x it is brighter than towards −x
-        let towards =
-            |x: f32| crate::kernel::cpu::sphharm::combine(&shades.lobes[..4], side(x).to_array())[0];
+        let towards = |x: f32| crate::geom::sphharm::combine(&shades.lobes[..4], side(x).to_array())[0];
         assert!(towards(1.0) > 0.1 && towards(-1.0) < -0.3, "{} {}", towards(1.0), towards(-1.0));
         assert_eq!(shades.lobes[4..], [[0.0; 3]; 4]);
         let bvh = Bvh::new(&Mesh::default());

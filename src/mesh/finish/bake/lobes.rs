@@ -1,7 +1,7 @@
 //! View-dependent color in a few numbers a texel: real spherical harmonics of the direction to the viewer.
 //!
 //! A texel's color seen from direction `d` is `base + Σ_k L_k Y_k(d)`, sRGB-coded, with `Y` up to degree 1 (4
-//! functions) or 2 (9) in the order and signs of [`sh16`]; [`crate::kernel::cpu::sphharm::combine`] sums them. `base` is what an ordinary viewer shows. The
+//! functions) or 2 (9) in the order and signs of [`sh16`]; [`crate::geom::sphharm::combine`] sums them. `base` is what an ordinary viewer shows. The
 //! coefficients minimize, over the cameras that see the point,
 //!
 //! ```text
@@ -11,7 +11,7 @@
 //! Cameras see a point from one side only, so that without the ridge term λ the functions would be free to grow
 //! where nobody looks.
 
-use crate::kernel::cpu::sphharm::{MOST_OF_DEGREE_2 as MOST, sh16};
+use crate::geom::sphharm::{MOST_OF_DEGREE_2 as MOST, sh16};
 use glam::Vec3;
 
 /// Weight of the ridge term: colors of a light stage change by a few percent of their range over a quarter of a
@@ -75,8 +75,8 @@ pub fn fit(base: [f32; 3], directions: &[Vec3], weights: &[f32], colors: &[[f32;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geom::sphharm::{combine, functions};
     use crate::kernel::cpu::rng;
-    use crate::kernel::cpu::sphharm::{combine, functions};
 
     fn add(coefficients: &[[f32; 3]], d: Vec3) -> [f32; 3] {
         combine(coefficients, d.to_array())

@@ -20,9 +20,9 @@ pub use detail::tangent_space;
 pub use light::{Learned, seen_colors};
 pub use seams::Seams;
 
+use crate::geom::sphharm::functions;
 use crate::geom::{Atlas, Bvh, Camera, Harmonics, Mesh, area_vector};
 use crate::image::{Image, linear_from_srgb, srgb_from_linear};
-use crate::kernel::cpu::sphharm::functions;
 use crate::mesh::input::setting;
 use crate::{Monitor, Result};
 use cover::{Bands, ROWS, Sample};
@@ -399,7 +399,7 @@ mod tests {
         for side in [-0.6f32, 0.0, 0.6] {
             let d = Vec3::new(side, 0.0, 1.0).normalize();
             let truth = 0.5 + 0.2 * d.x;
-            let with = base + crate::kernel::cpu::sphharm::combine(&l, d.to_array())[0];
+            let with = base + crate::geom::sphharm::combine(&l, d.to_array())[0];
             assert!(
                 (with - truth).abs() <= 0.3 * (base - truth).abs() + 0.01,
                 "{side}: {with} {base} {truth}"
