@@ -1,11 +1,10 @@
 //! `tiface preview`: pictures of a mesh to look at.
 
 mod label;
-mod terminal;
 
 use super::invocation::Invocation;
 use super::out::Out;
-use super::stdout::{print, print_as_is};
+use super::stdout::print;
 use super::target::RunTarget;
 use super::viewer;
 use crate::config::ViewBackground;
@@ -20,7 +19,6 @@ use glam::Vec3;
 use rayon::prelude::*;
 use serde_json::json;
 use std::f64::consts::{FRAC_PI_2, PI};
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 /// How a preview is made.
@@ -63,7 +61,7 @@ pub(super) struct PreviewOptions {
     /// Write a page to turn it in a browser: one file, no program or network needed
     #[arg(long, conflicts_with_all = ["turntable", "sheet", "cameras", "light", "size", "background", "frames"])]
     page: bool,
-    /// Serve a run on this machine while it works: stages, curves, newest views; until Ctrl-C
+    /// Keep RUN/watch.html up to date while the run works: stages, curves, newest views; until Ctrl-C
     #[arg(long, conflicts_with_all = ["turntable", "sheet", "cameras", "light", "size", "background", "frames"])]
     #[arg(conflicts_with_all = ["page", "up"])]
     watch: bool,
@@ -192,24 +190,17 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
         return Ok(());
     }
     place.prepare()?;
-    let mut first = None;
-    let files = make(&preview, &place, kind, &names, &shots, options.background, invocation, &mut first)?;
+    let files = make(&preview, &place, kind, &names, &shots, options.background, invocation)?;
     if common.json {
         print(&format!("{}\n", json!({"event": "result", "preview": files})))?;
     } else if !common.quiet {
-        if std::io::stdout().is_terminal()
-            && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
-            && let Some(picture) = &first
-        {
-            print_as_is(&terminal::shown(picture)?)?;
-        }
         print(&format!("preview   {}\n", shown.display()))?;
     }
     Ok(())
 }
 
 /// Makes the pictures and writes them, few at once: as one, an animation, or a folder of pictures of these names. Returns
-/// the files, and the first picture in `first`.
+/// the files.
 fn make(
     preview: &Preview,
     place: &Out,
@@ -218,19 +209,17 @@ fn make(
     shots: &[(Camera, Look)],
     background: ViewBackground,
     invocation: &Invocation,
-    first: &mut Option<PreviewPicture>,
 ) -> Result<Vec<PathBuf>> {
     let is_stopped = || invocation.stop.requested().is_some();
     let renderer = preview.renderer();
     let size = |(camera, _): &(Camera, Look)| (camera.width, camera.height);
     let (width, height) = size(&shots[0]);
     let largest = shots.iter().map(size).map(|(w, h)| u64::from(w) * u64::from(h)).max().unwrap_or(1);
-    let mut some = |shots: &[(Camera, Look)]| {
+    let some = |shots: &[(Camera, Look)]| {
         let pictures = renderer.pictures(shots, background, is_stopped);
         if is_stopped() {
             return Err(invocation.stop.error("nothing was finished"));
         }
-        first.get_or_insert_with(|| pictures[0].clone());
         Ok(pictures)
     };
     let at_once = (AT_ONCE_PX / largest.max(1)).clamp(1, 32) as usize;
@@ -249,7 +238,6 @@ fn make(
             pictures.iter_mut().zip(&names).for_each(|(picture, name)| label::write(picture, name));
             let sheet = PreviewPicture::sheet(&pictures, columns);
             io::write_png_rgba(file, sheet.width, sheet.height, &sheet.rgba)?;
-            *first = Some(sheet);
             Ok(vec![file.clone()])
         }
         Out::File(file, ending) if shots.len() > 1 || ending != "png" => {

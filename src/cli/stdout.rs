@@ -6,13 +6,8 @@ use std::io::{self, Write};
 
 /// Prints data to stdout, as [`plain`] text. A reader that has gone away (`| head`) is not an error.
 pub(super) fn print(text: &str) -> Result<()> {
-    print_as_is(&plain(text))
-}
-
-/// Prints what is made for the terminal itself: a picture of our own.
-pub(super) fn print_as_is(text: &str) -> Result<()> {
     let mut out = std::io::stdout().lock();
-    let written = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    let written = out.write_all(plain(text).as_bytes()).and_then(|()| out.flush());
     match written {
         Err(e) if e.kind() != io::ErrorKind::BrokenPipe => {
             Err(Error::cannot(format!("stdout cannot be written: {e}"), "check where it leads"))
