@@ -49,12 +49,13 @@ pub struct Error {
     kind: ErrorKind,
     message: String,
     hint: String,
+    no_surface: bool,
 }
 
 impl Error {
     /// Returns an error of this kind without a suggested fix.
     pub fn new(kind: ErrorKind, message: impl Display) -> Error {
-        Error { kind, message: message.to_string(), hint: String::new() }
+        Error { kind, message: message.to_string(), hint: String::new(), no_surface: false }
     }
 
     /// Returns an error of kind [`ErrorKind::Cannot`]; `hint` may be empty.
@@ -75,6 +76,16 @@ impl Error {
     /// Returns an error of kind [`ErrorKind::BelowBar`]; `hint` may be empty.
     pub fn below(message: impl Display, hint: impl Into<String>) -> Error {
         Error { hint: hint.into(), ..Error::new(ErrorKind::BelowBar, message) }
+    }
+
+    /// Returns the error of kind [`ErrorKind::Cannot`] that says that a field has no surface, and how that shows.
+    pub fn no_surface(how: impl Display, hint: impl Into<String>) -> Error {
+        Error { no_surface: true, ..Error::cannot(format!("no surface: {how}"), hint) }
+    }
+
+    /// Returns whether this is [`Error::no_surface`], wherever it happened.
+    pub fn is_no_surface(&self) -> bool {
+        self.no_surface
     }
 
     /// Returns the error that ends work on request, with what became of the work. It counts as

@@ -205,7 +205,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         print(&format!(
             "{}\nexperiment {}\n",
             experiment.markdown(),
-            folder.join("experiment.html").display()
+            folder.join("experiment.md").display()
         ))?;
     }
     failed.map_or(Ok(()), Err)
@@ -231,7 +231,7 @@ fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> 
 
 /// What some rows came to in their run; one that was not worked on is opened here, and only looked at.
 fn found(folder: &Path, task: &Task, line: Option<&Line>, rows: &[&ExperimentRow]) -> Vec<Measured> {
-    let of = |line: &Line| rows.iter().map(|row| measured(line, row, &task.name)).collect();
+    let of = |line: &Line| rows.iter().map(|row| measured(line, row)).collect();
     if let Some(line) = line {
         return of(line);
     }
@@ -247,16 +247,9 @@ fn found(folder: &Path, task: &Task, line: Option<&Line>, rows: &[&ExperimentRow
     vec![Measured { problem: Some(problem), ..Measured::default() }; rows.len()]
 }
 
-/// The tables in all forms; the JSON last, for whoever waits for it.
+/// Writes the tables in both forms, the JSON last: a program may wait for it.
 fn write(folder: &Path, experiment: &Experiment) -> Result<()> {
     io::create_folder(folder)?;
-    for (name, text) in [
-        ("experiment.md", experiment.markdown()),
-        ("experiment.csv", experiment.csv()),
-        ("experiment.html", experiment.html()),
-        ("experiment.json", experiment.json()),
-    ] {
-        io::write_atomic(&folder.join(name), text.as_bytes())?;
-    }
-    Ok(())
+    io::write_atomic(&folder.join("experiment.md"), experiment.markdown().as_bytes())?;
+    Ok(io::write_atomic(&folder.join("experiment.json"), experiment.json().as_bytes())?)
 }

@@ -11,7 +11,7 @@ use crate::config::{
 use crate::io::{self, Limits};
 use crate::report::experiment::{ExperimentRow, Measured, Ordering};
 use crate::run::{Cost, read_record, read_status};
-use crate::{Error, ErrorKind, Result};
+use crate::{Error, Result};
 use serde_json::Value;
 use std::path::Path;
 
@@ -229,17 +229,11 @@ pub fn work(line: &Line, run: &str) -> Result<()> {
     if has_surface(run) {
         let fields = learn::trained_fields(line);
         match complete(line, Stage::Mesh, &fields) {
-            Err(e) if !is_no_surface(&e) => return Err(e),
+            Err(e) if !e.is_no_surface() => return Err(e),
             _ => {}
         }
     }
     Ok(())
-}
-
-/// Does an error of the stage `mesh` say that there is no surface? It has no kind of its own: that an extraction met none
-/// is said by how its message begins, and other settings or a full disk are of the same kind.
-fn is_no_surface(e: &Error) -> bool {
-    e.kind() == ErrorKind::Cannot && e.to_string().starts_with("stage `mesh`: no surface")
 }
 
 /// The stages that a run is made of.
@@ -268,14 +262,14 @@ fn problems(line: &Line, run: &str) -> Vec<String> {
     out.iter().map(|text| text.replace(":\n  ", ": ").replace("\n  ", ", ")).collect()
 }
 
-/// What a row came to in its run; `beside` is the path of the run's folder from the page. Figures count where the run's
-/// stages are done with the line's configuration: what others left in the same folder has none.
-pub fn measured(line: &Line, row: &ExperimentRow, beside: &str) -> Measured {
+/// What a row came to in its run. Figures count where the run's stages are done with the line's configuration: what others
+/// left in the same folder has none.
+pub fn measured(line: &Line, row: &ExperimentRow) -> Measured {
     let mut out = Measured::default();
     let mut problems = problems(line, row.run);
     if line.order(Stage::Metrics).into_iter().all(|stage| line.run.is_done(&line.plan(stage))) {
         match io::read_json(&line.run.path("metrics/metrics.json"), &Limits::default()) {
-            Ok(value) => out = figures(line, row, &value, beside),
+            Ok(value) => out = figures(line, row, &value),
             Err(e) => problems.push(e.to_string()),
         }
     }
@@ -284,7 +278,7 @@ pub fn measured(line: &Line, row: &ExperimentRow, beside: &str) -> Measured {
 }
 
 /// Figures of a row whose stages are done; `value` is what `metrics.json` holds.
-fn figures(line: &Line, row: &ExperimentRow, value: &Value, beside: &str) -> Measured {
+fn figures(line: &Line, row: &ExperimentRow, value: &Value) -> Measured {
     let mut out = Measured::default();
     let set = &value[row.pictures];
     let list = |part: &str| set[part]["views"].as_array().cloned().unwrap_or_default();
@@ -314,11 +308,6 @@ fn figures(line: &Line, row: &ExperimentRow, value: &Value, beside: &str) -> Mea
     };
     if row.table == "iface" && has_surface(row.run) && line.run.is_done(&line.plan(Stage::Mesh)) {
         out.pieces = summary(Stage::Mesh)["report"]["topology"]["pieces"].as_u64();
-    }
-    if let Some(first) = out.views.first() {
-        let folder =
-            if row.pictures == "ensemble" { "ensemble".into() } else { format!("render/{}", row.pictures) };
-        out.picture = Some(format!("{beside}/{folder}/{first}.png"));
     }
     out
 }
@@ -480,7 +469,7 @@ mod tests {
         let told = |m: &Measured| m.problem.clone().unwrap_or_default();
 
         // a surface is asked for, too; that there is none is a result, and said
-        let found = measured(&line, &surface, "x");
+        let found = measured(&line, &surface);
         assert_eq!((found.figures.len(), told(&found).as_str()), (1, "stage `mesh` is not done yet"));
         let positive = |points: &[Vec3]| vec![1.0; points.len()];
         let slopes = |points: &[Vec3]| (vec![1.0; points.len()], vec![Vec3::X; points.len()]);
@@ -489,33 +478,33 @@ mod tests {
             extract_dense(positive, slopes, colors, Aabb::SCENE, (9, 100), &Quiet)?;
             Ok(Value::Null)
         });
-        assert!(is_no_surface(&none.unwrap_err()));
-        let found = measured(&line, &surface, "x");
+        assert!(none.unwrap_err().is_no_surface());
+        let found = measured(&line, &surface);
         assert!(found.figures.len() == 1 && found.pieces.is_none(), "{found:?}");
         assert!(told(&found).starts_with("stage `mesh`: no surface"), "{found:?}");
         // of every row of the run
-        assert_eq!(told(&measured(&line, &blend, "x")), told(&found));
+        assert_eq!(told(&measured(&line, &blend)), told(&found));
         run.stage(line.plan(Stage::Mesh), |_| Ok(json!({"report": {"topology": {"pieces": 3}}}))).unwrap();
-        let found = measured(&line, &surface, "x");
+        let found = measured(&line, &surface);
         assert_eq!((found.pieces, found.seconds, found.problem), (Some(3), Some(4.0), None));
         assert_eq!(found.masks.as_deref(), Some("run"));
         // its members' 1.5, 2 and 4, and 0.5 of the blend
-        assert_eq!(measured(&line, &blend, "x").seconds, Some(8.0));
+        assert_eq!(measured(&line, &blend).seconds, Some(8.0));
 
         // another mesh: figures of the views are those, the pieces are not
         let mut finer = c.clone();
         finer.mesh.resolution += 1;
-        let found = measured(&Line::open(&finer, &run).unwrap(), &surface, "x");
+        let found = measured(&Line::open(&finer, &run).unwrap(), &surface);
         assert!(found.figures.len() == 1 && found.pieces.is_none(), "{found:?}");
         assert!(told(&found).contains("stage `mesh` was done with other settings: mesh.resolution: was"));
 
         // another scale: nothing is
         let line = Line::open(&other, &run).unwrap();
         let refused = work(&line, "paper").unwrap_err();
-        assert!(refused.to_string().contains("was done with other settings") && !is_no_surface(&refused));
+        assert!(refused.to_string().contains("was done with other settings") && !refused.is_no_surface());
         for row in [surface, blend] {
-            let found = measured(&line, &row, "x");
-            assert!(found.views.is_empty() && found.figures.is_empty() && found.picture.is_none());
+            let found = measured(&line, &row);
+            assert!(found.views.is_empty() && found.figures.is_empty());
             assert_eq!((found.seconds, found.pieces, found.masks.clone()), (None, None, None));
             let told = told(&found);
             assert!(told.contains("was done with other settings: ") && !told.contains('\n'), "{told}");
@@ -538,15 +527,13 @@ mod tests {
         let run = Run::quiet(&dir.path().join("run"));
         let row = row_of("tface", "ce-one");
         let line = Line::open(&c, &run).unwrap();
-        assert_eq!(measured(&line, &row, "x").problem.as_deref(), Some("stage `mask` is not done yet"));
+        assert_eq!(measured(&line, &row).problem.as_deref(), Some("stage `mask` is not done yet"));
         work(&line, row.run).unwrap();
         assert!(ahead(&line, row.run).is_none());
-        let found = measured(&line, &row, "head/run");
+        let found = measured(&line, &row);
         assert_eq!((found.views.len(), found.problem.clone()), (2, None));
         assert_eq!(found.masks.as_deref(), Some("capture"));
         assert!(found.figures.iter().all(|f| f[0].is_some() && f[1].is_some()) && found.seconds.is_some());
-        let picture = found.picture.unwrap();
-        assert!(run.dir().join(picture.strip_prefix("head/run/").unwrap()).is_file(), "{picture}");
         let when = |file: &str| std::fs::metadata(run.path(file)).unwrap().modified().unwrap();
         let before = when("tface/checkpoint.safetensors");
         work(&line, row.run).unwrap();

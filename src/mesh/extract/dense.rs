@@ -62,8 +62,8 @@ pub fn extract_dense(
         let found = marching(&volume, false)?;
         if found.triangles.is_empty() {
             let (nodes, size) = (values.len(), inside.size());
-            return Err(Error::cannot(
-                format!("no surface: the field does not change its sign at {nodes} nodes of {size:.3}"),
+            return Err(Error::no_surface(
+                format!("the field does not change its sign at {nodes} nodes of {size:.3}"),
                 "train longer, or check that the box holds the head (`capture.box`)",
             ));
         }

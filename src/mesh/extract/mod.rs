@@ -306,8 +306,7 @@ pub fn extract(
 fn check_surface(found: &Sparse) -> Result<()> {
     let nodes = found.evaluated;
     let (smallest, largest) = found.range;
-    let none =
-        |what: String, hint: &str| Err(Error::cannot(format!("no surface: the field is {what}"), hint));
+    let none = |what: String, hint: &str| Err(Error::no_surface(format!("the field is {what}"), hint));
     if smallest > largest && nodes > 0 {
         return none(
             format!("NaN or infinite at all {nodes} nodes evaluated"),

@@ -1,7 +1,6 @@
-//! The tables of an experiment as people and programs read them: Markdown, CSV, JSON and a page.
+//! The tables of an experiment as people and programs read them: Markdown and JSON.
 
 use super::{DRAWS, Experiment, MEASURES, Ordering, Verdict, bootstrap};
-use crate::report::{STYLE, escape, link};
 use std::fmt::Write;
 
 impl Experiment {
@@ -143,30 +142,6 @@ impl Experiment {
         out
     }
 
-    /// Every figure of every photograph, as comma-separated values.
-    pub fn csv(&self) -> String {
-        let quoted = |text: &str| {
-            let plain = !text.contains([',', '"', '\n']);
-            if plain { text.to_owned() } else { format!("\"{}\"", text.replace('"', "\"\"")) }
-        };
-        let mut out = String::from(
-            "table,row,capture,photograph,masked,full,region,masked_ssim,full_ssim,lpips,seconds,masks\n",
-        );
-        for (row, measured) in self.rows.iter().zip(&self.measured) {
-            for (capture, m) in self.captures.iter().zip(measured) {
-                for (view, figures) in m.views.iter().zip(&m.figures) {
-                    let numbers = figures.iter().chain([&m.seconds]);
-                    let numbers: Vec<String> =
-                        numbers.map(|v| v.map_or(String::new(), |v| v.to_string())).collect();
-                    let (capture, view) = (quoted(capture), quoted(view));
-                    let (numbers, masks) = (numbers.join(","), m.masks.as_deref().unwrap_or_default());
-                    let _ = writeln!(out, "{},{},{capture},{view},{numbers},{masks}", row.table, row.row);
-                }
-            }
-        }
-        out
-    }
-
     /// All of it, as JSON, with intervals and verdicts.
     pub fn json(&self) -> String {
         let mut value = serde_json::json!(self);
@@ -192,61 +167,5 @@ impl Experiment {
         value["means"] = rows.into();
         value["verdicts"] = verdicts.into();
         format!("{value:#}\n")
-    }
-
-    /// As a page, with a picture of every row and capture; pictures are named by their paths from the page.
-    pub fn html(&self) -> String {
-        let table = |cells: &[Vec<String>]| {
-            let mut out = String::from("<div class=\"wide\"><table>");
-            for (i, line) in cells.iter().enumerate() {
-                let cell = |(k, c): (usize, &String)| {
-                    let tag = if i == 0 || k == 0 { "th" } else { "td" };
-                    format!("<{tag}>{}</{tag}>", escape(c))
-                };
-                let cells: String = line.iter().enumerate().map(cell).collect();
-                let _ = write!(out, "<tr>{cells}</tr>");
-            }
-            out + "</table></div>"
-        };
-        let mut out = format!(
-            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><link rel=\"icon\" href=\"data:,\">\
-             <title>experiment · tiface</title><style>\n{}\n.wide {{ overflow-x: auto }}\n.wide th {{ white-space: normal; \
-             overflow-wrap: normal; vertical-align: bottom; font-weight: 500 }}\n.wide th:first-child {{ white-space: nowrap \
-             }}\n.wide tr:first-child th {{ min-width: 4.5rem }}\n.wide th, .wide td {{ \
-             padding-inline: .5rem }}\n\
-             .rows {{ display: flex; flex-wrap: wrap; gap: 1rem; margin-top: 1rem }}\n.rows figure {{ margin: 0; \
-             max-width: 12rem }}\n.rows img {{ max-width: 100%; max-height: 14rem }}\n</style></head><body>\n<h1>The paper's experiment</h1><p>{}</p>\n",
-            STYLE,
-            escape(&self.about())
-        );
-        for (word, title) in &self.tables {
-            let _ = writeln!(out, "<h2>{}</h2>{}", escape(title), table(&self.cells(word)));
-            // a line of pictures for each capture: rows are compared on one photograph
-            for (k, capture) in self.captures.iter().enumerate() {
-                let rows = self.rows.iter().zip(&self.measured).filter(|(row, _)| row.table == *word);
-                let pictures: String = rows
-                    .filter_map(|(row, measured)| {
-                        let address = escape(&link(measured.get(k)?.picture.as_ref()?));
-                        let (capture, title) = (escape(capture), escape(row.title));
-                        Some(format!(
-                            "<figure><img src=\"{address}\" alt=\"{capture} {title}\"><figcaption>{capture}: \
-                             {title}</figcaption></figure>"
-                        ))
-                    })
-                    .collect();
-                if !pictures.is_empty() {
-                    let _ = writeln!(out, "<div class=\"rows\">{pictures}</div>");
-                }
-            }
-        }
-        let _ = writeln!(out, "<h2>Orderings</h2>{}", table(&self.verdicts()));
-        let problems = self.problems();
-        if !problems.is_empty() {
-            out += "<h2>What is missing</h2>\n";
-        }
-        for problem in problems {
-            let _ = writeln!(out, "<p>{}</p>", escape(&problem));
-        }
-        out + "</body></html>\n"
     }
 }
