@@ -8,13 +8,20 @@
 //!
 //! A head of 50,000 triangles, 1,024² texels and four lobes (`draft`): 4.3 MB become 0.9.
 
+use super::glb::{extras, mesh, primitive};
+use super::glb_document::{GlbDocument, info};
 use super::glb_json::GlbRoot;
-use super::glb_read::{GlbReader, Primitives, chunks};
+use super::glb_read::{GlbReader, Primitives, QUANTIZED, chunks};
 use super::source::{PictureSource, ReadOptions, Source};
 use crate::image::{Photo, linear_from_srgb, reduce_photo, working_size};
 use crate::io::{self, Limits};
-use crate::{Error, ErrorKind, Result};
-use glam::DVec3;
+use crate::{Error, Result};
+use glam::{DVec3, Vec3};
+use gltf::json::accessor::{ComponentType, Type};
+use gltf::json::material::{AlphaCutoff, AlphaMode, PbrBaseColorFactor};
+use gltf::json::mesh::{Primitive, Semantic};
+use gltf::json::validation::Checked::Valid;
+use gltf::json::{self, Index, Material};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -62,27 +69,16 @@ pub fn compact_glb(bytes: &[u8], path: &Path) -> Result<Vec<u8>> {
     let mut primitives = Vec::new();
     for (part, material) in &parts {
         let material = material.map(|m| file.material(m, &looks, &reader)).transpose()?;
-        primitives.push(file.primitive(part, material, low, size));
+        primitives.push(Primitive { material, ..file.primitive(part, low, size) });
     }
-    let mut document = json!({
-        "asset": {"version": "2.0", "generator": concat!("tiface ", env!("CARGO_PKG_VERSION"))},
-        "extensionsUsed": ["KHR_mesh_quantization"], "extensionsRequired": ["KHR_mesh_quantization"],
-        "scene": 0, "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "translation": low.to_array(), "scale": [size, size, size]}],
-        "meshes": [{"primitives": primitives}],
-        "accessors": file.accessors, "bufferViews": file.views, "buffers": [{"byteLength": file.bin.len()}],
-    });
-    for (key, list) in [("materials", file.materials), ("textures", file.textures), ("images", file.images)] {
-        if !list.is_empty() {
-            document[key] = list.into();
-        }
-    }
-    let mut json = document.to_string().into_bytes();
-    json.resize(json.len().next_multiple_of(4), b' ');
-    let header = gltf::binary::Header { magic: *b"glTF", version: 2, length: 0 };
-    gltf::Glb { header, json: json.into(), bin: Some(file.bin.into()) }
-        .to_vec()
-        .map_err(|e| Error::new(ErrorKind::Bug, e))
+    let Packed { mut document, .. } = file;
+    let mesh = Some(document.root.push(mesh(primitives, None)));
+    let node = document.root.push(json::Node { mesh, ..Default::default() });
+    document.show(node);
+    document.placed = Some((node, low, size));
+    document.root.extensions_used = vec![QUANTIZED.into()];
+    document.root.extensions_required = vec![QUANTIZED.into()];
+    document.pack()
 }
 
 /// How the parts of a file look.
@@ -95,139 +91,87 @@ struct Looks {
 /// A file as it grows.
 #[derive(Default)]
 struct Packed {
-    bin: Vec<u8>,
-    views: Vec<Value>,
-    accessors: Vec<Value>,
-    images: Vec<Value>,
-    textures: Vec<Value>,
-    materials: Vec<Value>,
+    document: GlbDocument,
     /// New numbers of the file's textures, with the side they were made for, and of its materials.
-    known: (BTreeMap<(u32, u32), usize>, BTreeMap<u32, usize>),
+    known: (BTreeMap<(u32, u32), Index<json::Texture>>, BTreeMap<u32, Index<Material>>),
 }
 
 impl Packed {
-    /// A view of bytes; the same bytes lie in the file once: layers around a mesh have its corners.
-    fn view(&mut self, bytes: &[u8], stride: Option<usize>) -> usize {
-        let is_same = |view: &Value| {
-            let at = view["byteOffset"].as_u64().unwrap_or_default() as usize;
-            view["byteLength"] == bytes.len()
-                && view["byteStride"].as_u64() == stride.map(|s| s as u64)
-                && self.bin[at..].starts_with(bytes)
-        };
-        if let Some(known) = self.views.iter().position(is_same) {
-            return known;
-        }
-        let mut view = json!({"buffer": 0, "byteOffset": self.bin.len(), "byteLength": bytes.len()});
-        if let Some(stride) = stride {
-            view["byteStride"] = stride.into();
-        }
-        self.bin.extend_from_slice(bytes);
-        self.bin.resize(self.bin.len().next_multiple_of(4), 0);
-        self.views.push(view);
-        self.views.len() - 1
-    }
-
-    /// Numbers, `stride` bytes for each element.
-    fn accessor(&mut self, bytes: &[u8], stride: usize, component: u32, kind: &str) -> usize {
-        let attribute = kind != "SCALAR";
-        let view = self.view(bytes, attribute.then_some(stride));
-        self.accessors.push(json!({
-            "bufferView": view, "componentType": component, "type": kind, "count": bytes.len() / stride,
-            "normalized": attribute,
-        }));
-        self.accessors.len() - 1
-    }
-
-    fn primitive(&mut self, part: &Primitives, material: Option<usize>, low: DVec3, size: f64) -> Value {
+    fn primitive(&mut self, part: &Primitives, low: DVec3, size: f64) -> Primitive {
+        let document = &mut self.document;
+        let short = |v: f32| (v * 65535.0).round() as u16;
         let place = |p: &DVec3| ((*p - low) / size * 65535.0).to_array().map(|v| v.round() as u16);
-        let places: Vec<[u16; 3]> = part.positions.iter().map(place).collect();
-        let wide: Vec<[u16; 4]> = places.iter().map(|&[x, y, z]| [x, y, z, 0]).collect();
-        let position = self.accessor(bytemuck::cast_slice(&wide), 8, 5123, "VEC3");
+        let places: Vec<[u16; 4]> = part.positions.iter().map(place).map(|[x, y, z]| [x, y, z, 0]).collect();
+        let position = document.normalized(&places, ComponentType::U16, Type::Vec3);
         let bound = |pick: fn(u16, u16) -> u16| {
-            places.iter().copied().reduce(|a, b| [0, 1, 2].map(|k| pick(a[k], b[k]))).unwrap_or_default()
+            (0..3).map(|k| places.iter().map(|p| p[k]).reduce(pick)).collect::<Vec<_>>()
         };
-        self.accessors[position]["min"] = json!(bound(u16::min));
-        self.accessors[position]["max"] = json!(bound(u16::max));
-        let mut attributes = json!({"POSITION": position});
+        document.bound(position, [bound(u16::min), bound(u16::max)]);
+        let mut attributes = BTreeMap::from([(Valid(Semantic::Positions), position)]);
         let (vertices, mesh) = (places.len(), &part.mesh);
         if mesh.normals.len() == vertices {
-            let normal = |n: &glam::Vec3| {
+            let normal = |n: &Vec3| {
                 let [x, y, z] = (*n * 127.0).round().to_array().map(|v| v as i8);
                 [x, y, z, 0]
             };
             let normals: Vec<[i8; 4]> = mesh.normals.iter().map(normal).collect();
-            attributes["NORMAL"] = self.accessor(bytemuck::cast_slice(&normals), 4, 5120, "VEC3").into();
+            let normals = document.normalized(&normals, ComponentType::I8, Type::Vec3);
+            attributes.insert(Valid(Semantic::Normals), normals);
         }
         if part.uvs.len() == vertices {
             let inside = part.uvs.iter().all(|uv| (0.0..=1.0).contains(&uv.x) && (0.0..=1.0).contains(&uv.y));
-            attributes["TEXCOORD_0"] = if inside {
-                let uv = |uv: &glam::Vec2| uv.to_array().map(|v| (v * 65535.0).round() as u16);
-                let uvs: Vec<[u16; 2]> = part.uvs.iter().map(uv).collect();
-                self.accessor(bytemuck::cast_slice(&uvs), 4, 5123, "VEC2").into()
+            let uvs = if inside {
+                let uvs: Vec<[u16; 2]> = part.uvs.iter().map(|uv| uv.to_array().map(short)).collect();
+                document.normalized(&uvs, ComponentType::U16, Type::Vec2)
             } else {
-                let at = self.accessor(bytemuck::cast_slice(&part.uvs), 8, 5126, "VEC2");
-                self.accessors[at]["normalized"] = false.into();
-                at.into()
+                document.floats(&part.uvs)
             };
+            attributes.insert(Valid(Semantic::TexCoords(0)), uvs);
         }
         if part.is_colored() {
-            let short = |v: f32| (v * 65535.0).round() as u16;
             let alpha = |i: usize| *part.alphas.get(i).unwrap_or(&1.0);
             let color = |(i, c): (usize, &[f32; 3])| {
                 let [r, g, b] = c.map(|v| short(linear_from_srgb(v)));
                 [r, g, b, short(alpha(i))]
             };
-            attributes["COLOR_0"] = if mesh.colors.iter().all(|c| *c == [1.0; 3]) {
+            let colors = if mesh.colors.iter().all(|c| *c == [1.0; 3]) {
                 // alpha alone: a byte is enough
                 let white = |i| [255, 255, 255, (alpha(i) * 255.0).round() as u8];
                 let colors: Vec<[u8; 4]> = (0..vertices).map(white).collect();
-                self.accessor(bytemuck::cast_slice(&colors), 4, 5121, "VEC4").into()
+                document.normalized(&colors, ComponentType::U8, Type::Vec4)
             } else {
                 let colors: Vec<[u16; 4]> = mesh.colors.iter().enumerate().map(color).collect();
-                self.accessor(bytemuck::cast_slice(&colors), 8, 5123, "VEC4").into()
+                document.normalized(&colors, ComponentType::U16, Type::Vec4)
             };
+            attributes.insert(Valid(Semantic::Colors(0)), colors);
         }
-        let corners = mesh.triangles.as_flattened();
-        let indices = if vertices <= 65_535 {
-            let short: Vec<u16> = corners.iter().map(|&i| i as u16).collect();
-            self.accessor(bytemuck::cast_slice(&short), 2, 5123, "SCALAR")
-        } else {
-            self.accessor(bytemuck::cast_slice(corners), 4, 5125, "SCALAR")
-        };
-        let mut primitive = json!({"attributes": attributes, "indices": indices});
-        if let Some(material) = material {
-            primitive["material"] = material.into();
-        }
-        primitive
+        primitive(attributes, document.indices(&mesh.triangles, vertices))
     }
 
     /// The new number of a material.
-    fn material(&mut self, index: u32, looks: &Looks, reader: &GlbReader) -> Result<usize> {
+    fn material(&mut self, index: u32, looks: &Looks, reader: &GlbReader) -> Result<Index<Material>> {
         if let Some(&known) = self.known.1.get(&index) {
             return Ok(known);
         }
         let texture = reader.base_color(Some(index))?.map(|texture| texture.index);
         let old = looks.materials.get(index as usize).unwrap_or(&Value::Null);
-        let mut new = json!({"pbrMetallicRoughness": {}});
-        for key in ["alphaMode", "alphaCutoff"] {
-            if let Some(value) = old.get(key) {
-                new[key] = value.clone();
-            }
-        }
-        let pbr = &mut new["pbrMetallicRoughness"];
-        if let Some(factor) = old.pointer("/pbrMetallicRoughness/baseColorFactor") {
-            pbr["baseColorFactor"] = factor.clone();
-        }
-        match texture {
-            Some(texture) => {
-                pbr["baseColorTexture"] = json!({"index": self.texture(texture, COLOR_PX, reader)?});
-            }
+        let mut new = Material::default();
+        new.alpha_mode = Valid(match old["alphaMode"].as_str() {
+            Some("BLEND") => AlphaMode::Blend,
+            Some("MASK") => AlphaMode::Mask,
+            _ => AlphaMode::Opaque,
+        });
+        new.alpha_cutoff = old["alphaCutoff"].as_f64().map(|cutoff| AlphaCutoff(cutoff as f32));
+        let pbr = &mut new.pbr_metallic_roughness;
+        let factor =
+            |k: usize| old["pbrMetallicRoughness"]["baseColorFactor"][k].as_f64().unwrap_or(1.0) as f32;
+        pbr.base_color_factor = PbrBaseColorFactor(match texture {
+            Some(_) => [0, 1, 2, 3].map(factor),
             // the vertices have been multiplied with it
-            None => {
-                let alpha = pbr["baseColorFactor"][3].as_f64().unwrap_or(1.0);
-                pbr["baseColorFactor"] = json!([1.0, 1.0, 1.0, alpha]);
-            }
-        }
+            None => [1.0, 1.0, 1.0, factor(3)],
+        });
+        let texture = texture.map(|texture| self.texture(texture, COLOR_PX, reader)).transpose()?;
+        pbr.base_color_texture = texture.map(info);
         if let Some(notes) = old.pointer("/extras/tiface").filter(|notes| notes["lobes"].is_array()) {
             let mut notes = notes.clone();
             for lobe in notes["lobes"].as_array_mut().into_iter().flatten() {
@@ -237,17 +181,17 @@ impl Packed {
                         .source
                         .broken(format!("material {index}"), "a lobe without a texture"));
                 };
-                *lobe = json!({"texture": self.texture(texture, LOBE_PX, reader)?});
+                *lobe = json!({"texture": self.texture(texture, LOBE_PX, reader)?.value()});
             }
-            new["extras"] = json!({ "tiface": notes });
+            new.extras = extras(notes);
         }
-        self.materials.push(new);
-        self.known.1.insert(index, self.materials.len() - 1);
-        Ok(self.materials.len() - 1)
+        let new = self.document.root.push(new);
+        self.known.1.insert(index, new);
+        Ok(new)
     }
 
     /// The new number of a texture with at most `side` texels along a side.
-    fn texture(&mut self, index: u32, side: u32, reader: &GlbReader) -> Result<usize> {
+    fn texture(&mut self, index: u32, side: u32, reader: &GlbReader) -> Result<Index<json::Texture>> {
         if let Some(&known) = self.known.0.get(&(index, side)) {
             return Ok(known);
         }
@@ -258,11 +202,9 @@ impl Packed {
         let photo = io::parse_photo(&bytes, path, &Limits::default())?;
         let clear = photo.alpha.as_ref().is_some_and(|alpha| alpha.iter().any(|&a| a < 255));
         let (bytes, mime) = if clear { (bytes, "image/png") } else { smaller(bytes, &photo, side, path)? };
-        let view = self.view(&bytes, None);
-        self.images.push(json!({"bufferView": view, "mimeType": mime}));
-        self.textures.push(json!({"source": self.images.len() - 1}));
-        self.known.0.insert((index, side), self.textures.len() - 1);
-        Ok(self.textures.len() - 1)
+        let texture = self.document.texture(None, &bytes, mime);
+        self.known.0.insert((index, side), texture);
+        Ok(texture)
     }
 }
 
@@ -306,7 +248,7 @@ mod tests {
         let normals = back.mesh.normals.iter().zip(&whole.mesh.normals);
         assert!(normals.into_iter().all(|(a, b)| near(*a, *b, 0.01)));
         let text = String::from_utf8_lossy(&small).into_owned();
-        assert_eq!(text.matches("{\"source\":").count(), 5); // base color and lobes: no normal map
+        assert_eq!(text.matches("\"source\":").count(), 5); // base color and lobes: no normal map
         assert!(text.contains("\"scale\":[0.5,0.25,0.1") && !text.contains("KHR_materials_variants"));
         // a second time it stays what it is
         assert_eq!(read(&compact_glb(&small, path).unwrap(), path).unwrap(), read(&small, path).unwrap());

@@ -36,6 +36,7 @@ use crate::Result;
 use crate::geom::{Mesh, Shells};
 use crate::image::{Photo, linear_from_srgb, quantize};
 use glam::Vec3;
+use gltf::json::accessor::{ComponentType, Type};
 use gltf::json::extensions::{material, mesh, root, scene::khr_materials_variants::Variant};
 use gltf::json::material::{NormalTexture, PbrMetallicRoughness, StrengthFactor};
 use gltf::json::mesh::{Mode, Primitive, Semantic};
@@ -92,7 +93,8 @@ pub fn to_glb(
         file.colors = Vec::new(); // viewers would multiply them into the texture
         let mut picture = |name: &str, picture: &Photo, quality| -> Result<Index<json::Texture>> {
             let (bytes, ending) = encode(name, picture, quality)?;
-            Ok(document.texture(name, &bytes, ending))
+            let mime = if ending == "png" { "image/png" } else { "image/jpeg" };
+            Ok(document.texture(Some(name.into()), &bytes, mime))
         };
         let color = picture("base color", &texture.color, options.jpeg_quality)?;
         main.pbr_metallic_roughness.base_color_texture = Some(info(color));
@@ -152,7 +154,7 @@ fn soft_layers(
         let colors: Vec<[u8; 4]> = part.source.iter().enumerate().map(color).collect();
         let mut attributes = BTreeMap::from([
             (Valid(Semantic::Positions), document.positions(&part.moved(layer, scale))),
-            (Valid(Semantic::Colors(0)), document.bytes(&colors)),
+            (Valid(Semantic::Colors(0)), document.normalized(&colors, ComponentType::U8, Type::Vec4)),
         ]);
         attributes.extend(uvs.map(|uvs| (Valid(Semantic::TexCoords(0)), uvs)));
         attributes.extend(normals.map(|normals| (Valid(Semantic::Normals), normals)));
@@ -160,14 +162,14 @@ fn soft_layers(
     }
     let material = document.root.push(soft);
     primitives.iter_mut().for_each(|p| p.material = Some(material));
-    Some(mesh(primitives, name))
+    Some(mesh(primitives, Some(name)))
 }
 
-fn mesh(primitives: Vec<Primitive>, name: String) -> json::Mesh {
-    json::Mesh { primitives, name: Some(name), weights: None, extensions: None, extras: Default::default() }
+pub(super) fn mesh(primitives: Vec<Primitive>, name: Option<String>) -> json::Mesh {
+    json::Mesh { primitives, name, weights: None, extensions: None, extras: Default::default() }
 }
 
-fn primitive(attributes: Attributes, indices: Index<json::Accessor>) -> Primitive {
+pub(super) fn primitive(attributes: Attributes, indices: Index<json::Accessor>) -> Primitive {
     Primitive {
         attributes,
         indices: Some(indices),
@@ -222,7 +224,7 @@ fn lobe_notes(lobes: &Lobes, textures: &[Index<json::Texture>]) -> json::Extras 
 }
 
 /// Notes of ours on a material.
-fn extras(notes: Value) -> json::Extras {
+pub(super) fn extras(notes: Value) -> json::Extras {
     let text = json!({ "tiface": notes }).to_string();
     Some(json::extras::RawValue::from_string(text).expect("a value is valid JSON"))
 }
@@ -255,13 +257,12 @@ fn finish(
     let attributes = attributes(&mut document, file);
     let indices = document.indices(&file.triangles, file.positions.len());
     let root = &mut document.root;
-    root.asset.generator = Some(concat!("tiface ", env!("CARGO_PKG_VERSION")).into());
     let primitive = Primitive {
         material: Some(material),
         extensions: variants.map(|v| mesh::Primitive { khr_materials_variants: Some(v) }),
         ..primitive(attributes, indices)
     };
-    let mesh = root.push(mesh(vec![primitive], options.name.clone()));
+    let mesh = root.push(mesh(vec![primitive], Some(options.name.clone())));
     let node = root.push(json::Node { name, translation, mesh: Some(mesh), ..Default::default() });
     if let Some(layers) = layers {
         let name = layers.name.clone();
@@ -269,21 +270,16 @@ fn finish(
         let child = root.push(json::Node { name, mesh, ..Default::default() });
         root.nodes[node.value()].children = Some(vec![child]);
     }
-    root.scene = Some(root.push(json::Scene {
-        nodes: vec![node],
-        name: None,
-        extensions: None,
-        extras: Default::default(),
-    }));
+    document.show(node);
     if options.unlit {
-        root.extensions_used.push("KHR_materials_unlit".into());
+        document.root.extensions_used.push("KHR_materials_unlit".into());
     }
     // within f32's reach its shortest digits will do
-    document.far = file.is_far().then_some((node, file.translation));
+    document.placed = file.is_far().then_some((node, file.translation, 1.0));
     document.pack()
 }
 
-type Attributes = BTreeMap<json::validation::Checked<Semantic>, Index<json::Accessor>>;
+pub(super) type Attributes = BTreeMap<json::validation::Checked<Semantic>, Index<json::Accessor>>;
 
 fn attributes(document: &mut GlbDocument, file: &FileMesh) -> Attributes {
     let mut attributes = BTreeMap::from([(Valid(Semantic::Positions), document.positions(&file.positions))]);

@@ -1,13 +1,13 @@
 //! A glTF document as it grows, with the bytes it speaks of: accessors, pictures, the GLB around them.
 //!
-//! Every accessor has a view of its own, at a multiple of four bytes; `min` and `max` are the stored
+//! Views begin at multiples of four bytes, and accessors of the same bytes share one; `min` and `max` are the stored
 //! numbers themselves. Views of pictures carry neither target nor stride.
 
 use crate::geom::Aabb;
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use gltf::json::accessor::{ComponentType, GenericComponentType, Type};
-use gltf::json::buffer::Target;
+use gltf::json::buffer::{Stride, Target};
 use gltf::json::image::MimeType;
 use gltf::json::texture::{Info, MagFilter, MinFilter, Sampler, WrappingMode};
 use gltf::json::validation::{Checked::Valid, USize64};
@@ -20,21 +20,36 @@ const SHORT_INDICES: usize = 65_535;
 pub(super) struct GlbDocument {
     pub root: Root,
     pub bin: Vec<u8>,
-    /// A node, and where it stands in f64: gltf-json's own translations are f32, and print as numbers that read
-    /// as others in f64.
-    pub far: Option<(Index<gltf::json::Node>, DVec3)>,
+    /// A node with its translation and scale in f64: gltf-json's own are f32, and print as numbers that read as others
+    /// in f64.
+    pub placed: Option<(Index<gltf::json::Node>, DVec3, f64)>,
 }
 
 impl GlbDocument {
     /// A view of bytes at a multiple of four.
-    fn view(&mut self, bytes: &[u8], target: Option<Target>) -> Index<gltf::json::buffer::View> {
+    fn view(
+        &mut self,
+        bytes: &[u8],
+        stride: Option<usize>,
+        target: Option<Target>,
+    ) -> Index<gltf::json::buffer::View> {
+        let (byte_stride, target) = (stride.map(Stride), target.map(Valid));
+        let is_same = |view: &gltf::json::buffer::View| {
+            let at = view.byte_offset.map_or(0, |at| at.0 as usize);
+            view.byte_length.0 == bytes.len() as u64
+                && (view.byte_stride, view.target) == (byte_stride, target)
+                && self.bin[at..].starts_with(bytes)
+        };
+        if let Some(known) = self.root.buffer_views.iter().position(is_same) {
+            return Index::new(known as u32);
+        }
         let view = self.root.push(gltf::json::buffer::View {
             buffer: Index::new(0),
             byte_length: USize64(bytes.len() as u64),
             byte_offset: Some(USize64(self.bin.len() as u64)),
-            byte_stride: None,
+            byte_stride,
             name: None,
-            target: target.map(Valid),
+            target,
             extensions: None,
             extras: Default::default(),
         });
@@ -68,25 +83,37 @@ impl GlbDocument {
 
     /// Vectors of f32: [`glam::Vec2`], `Vec3`, `Vec4` or arrays.
     pub fn floats<T: bytemuck::NoUninit>(&mut self, values: &[T]) -> Index<Accessor> {
-        let view = self.view(bytes_of(values), Some(Target::ArrayBuffer));
+        let view = self.view(bytes_of(values), None, Some(Target::ArrayBuffer));
         self.accessor(view, values.len(), ComponentType::F32, vector(size_of::<T>() / 4))
     }
 
-    /// Vectors of four bytes, 0..=255 for 0..=1.
-    pub fn bytes(&mut self, values: &[[u8; 4]]) -> Index<Accessor> {
-        let view = self.view(bytes_of(values), Some(Target::ArrayBuffer));
-        let accessor = self.accessor(view, values.len(), ComponentType::U8, Type::Vec4);
-        self.root.accessors.last_mut().expect("it was added just now").normalized = true;
+    /// Vectors of integers that stand for 0..=1, or −1..=1 where they have a sign, a multiple of four bytes each; those of
+    /// three have a fourth component that is not read.
+    pub fn normalized<T: bytemuck::NoUninit>(
+        &mut self,
+        values: &[T],
+        component: ComponentType,
+        type_: Type,
+    ) -> Index<Accessor> {
+        let padded = size_of::<T>() > component.size() * type_.multiplicity();
+        let view = self.view(bytes_of(values), padded.then_some(size_of::<T>()), Some(Target::ArrayBuffer));
+        let accessor = self.accessor(view, values.len(), component, type_);
+        self.root.accessors[accessor.value()].normalized = true;
         accessor
     }
 
-    /// Positions, which must say their bounds.
+    /// Says the bounds of an accessor, which positions must do.
+    pub fn bound(&mut self, accessor: Index<Accessor>, bounds: [impl Into<Value>; 2]) {
+        let [min, max] = bounds.map(|bound| Some(bound.into()));
+        let accessor = &mut self.root.accessors[accessor.value()];
+        (accessor.min, accessor.max) = (min, max);
+    }
+
+    /// Positions with their bounds.
     pub fn positions(&mut self, values: &[Vec3]) -> Index<Accessor> {
         let bounds = Aabb::around(values.iter().copied());
         let accessor = self.floats(values);
-        let last = self.root.accessors.last_mut().expect("it was added just now");
-        last.min = Some(Value::from(bounds.min.to_array().to_vec()));
-        last.max = Some(Value::from(bounds.max.to_array().to_vec()));
+        self.bound(accessor, [bounds.min, bounds.max].map(|corner| corner.to_array().to_vec()));
         accessor
     }
 
@@ -96,15 +123,15 @@ impl GlbDocument {
         let target = Some(Target::ElementArrayBuffer);
         let (view, component) = if vertices < SHORT_INDICES {
             let short: Vec<u16> = flat.iter().map(|&i| i as u16).collect();
-            (self.view(bytes_of(&short), target), ComponentType::U16)
+            (self.view(bytes_of(&short), None, target), ComponentType::U16)
         } else {
-            (self.view(bytes_of(flat), target), ComponentType::U32)
+            (self.view(bytes_of(flat), None, target), ComponentType::U32)
         };
         self.accessor(view, flat.len(), component, Type::Scalar)
     }
 
     /// A picture inside the file: filtered smoothly, not repeated.
-    pub fn texture(&mut self, name: &str, bytes: &[u8], ending: &str) -> Index<Texture> {
+    pub fn texture(&mut self, name: Option<String>, bytes: &[u8], mime: &str) -> Index<Texture> {
         if self.root.samplers.is_empty() {
             self.root.push(Sampler {
                 mag_filter: Some(Valid(MagFilter::Linear)),
@@ -114,12 +141,11 @@ impl GlbDocument {
                 ..Default::default()
             });
         }
-        let view = self.view(bytes, None);
-        let mime = if ending == "png" { "image/png" } else { "image/jpeg" };
+        let view = self.view(bytes, None, None);
         let source = self.root.push(Image {
             buffer_view: Some(view),
             mime_type: Some(MimeType(mime.into())),
-            name: Some(name.into()),
+            name,
             uri: None,
             extensions: None,
             extras: Default::default(),
@@ -133,8 +159,16 @@ impl GlbDocument {
         })
     }
 
+    /// Makes a scene of a node, which is the one that viewers show.
+    pub fn show(&mut self, node: Index<gltf::json::Node>) {
+        let (extensions, extras) = Default::default();
+        let scene = gltf::json::Scene { nodes: vec![node], name: None, extensions, extras };
+        self.root.scene = Some(self.root.push(scene));
+    }
+
     /// The document and its bytes as one file.
     pub fn pack(mut self) -> Result<Vec<u8>> {
+        self.root.asset.generator = Some(concat!("tiface ", env!("CARGO_PKG_VERSION")).into());
         self.root.push(gltf::json::Buffer {
             byte_length: USize64(self.bin.len() as u64),
             name: None,
@@ -142,11 +176,15 @@ impl GlbDocument {
             extensions: None,
             extras: Default::default(),
         });
-        let GlbDocument { root, bin, far } = self;
-        let json = match far {
+        let GlbDocument { root, bin, placed } = self;
+        let json = match placed {
             None => root.to_vec(),
-            Some((node, at)) => serde_json::to_value(&root).and_then(|mut json| {
-                json["nodes"][node.value()]["translation"] = at.to_array().to_vec().into();
+            Some((node, at, scale)) => serde_json::to_value(&root).and_then(|mut json| {
+                let node = &mut json["nodes"][node.value()];
+                node["translation"] = at.to_array().to_vec().into();
+                if scale != 1.0 {
+                    node["scale"] = vec![scale; 3].into();
+                }
                 serde_json::to_vec(&json)
             }),
         };

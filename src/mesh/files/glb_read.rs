@@ -16,7 +16,7 @@ use gltf::json::validation::Checked::{Invalid, Valid};
 use std::collections::BTreeSet;
 
 /// What allows 8 and 16 bits in more attributes.
-const QUANTIZED: &str = "KHR_mesh_quantization";
+pub(super) const QUANTIZED: &str = "KHR_mesh_quantization";
 const SHORTENED: [C; 5] = [C::F32, C::I8, C::U8, C::I16, C::U16];
 
 /// Extensions that leave shape and color attributes alone, or that are read.
