@@ -9,12 +9,10 @@ mod chart;
 pub mod experiment;
 mod live;
 mod runs;
-mod serve;
 
 pub use chart::{Chart, Curve, charts};
-pub use live::{FieldView, serve_run};
+pub use live::live_html;
 pub use runs::{RunRow, runs_csv, runs_html};
-pub use serve::{Answer, Server};
 
 use crate::config::{Stage, called};
 use crate::image::{Photo, over_black, quantize, reduce_photo, srgb_from_linear, working_size};

@@ -1,4 +1,4 @@
-//! `tiface preview --page` and `--watch`: a head to turn in a browser, and a run to look at while it works.
+//! `tiface preview --page` and `--watch`: a head to turn in a browser, and the page of a run while it works.
 
 use super::invocation::Invocation;
 use super::out::Out;
@@ -7,15 +7,14 @@ use super::stdout::print;
 use super::target::RunTarget;
 use crate::io;
 use crate::pipeline::{Line, Stage, field_view, head_page, viewer_of_file};
-use crate::report::{Server, serve_run};
+use crate::report::live_html;
 use crate::run::Run;
 use crate::{Error, Result};
 use glam::Vec3;
 use serde_json::json;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 /// Writes the page of a mesh file whose up is `up`, or of the head of a run with its photographs.
 pub(super) fn page(
@@ -73,26 +72,24 @@ pub(super) fn no_up(up: Option<Vec3>) -> Result<()> {
     }
 }
 
-/// Serves the page of a run until somebody stops it.
+/// The page of a run at work, in its folder.
+const WATCHED: &str = "watch.html";
+
+/// How often that is written.
+const EVERY: Duration = Duration::from_secs(2);
+
+/// Writes the page of a run again and again until somebody stops it.
 pub(super) fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
-    let common = invocation.common;
+    let (common, stop) = (invocation.common, &invocation.stop);
     let (target, config) = target(invocation, path)?;
+    let page = target.run.join(WATCHED);
     if common.dry_run {
-        invocation.screen.note("preview", &format!("would serve `{}` on this machine", target.run.display()));
+        invocation.screen.note("preview", &format!("would keep a page up to date in `{}`", page.display()));
         return Ok(());
     }
-    let server = Server::open()?;
-    let url = server.url();
-    if common.json {
-        print(&format!("{}\n", json!({"event": "serving", "run": target.run, "url": url})))?;
-    } else {
-        print(&format!("watch     {url}\n          of `{}`, until Ctrl-C\n", target.run.display()))?;
-    }
-    // made once for each checkpoint, however many look and whether or not it can be read
-    let made: Mutex<HashMap<Stage, (Option<SystemTime>, Option<Vec<u8>>)>> = Mutex::default();
-    let view = |stage: Stage| -> Option<Vec<u8>> {
-        let saved = io::modified(&target.run.join(stage).join("checkpoint.safetensors"));
-        let mut made = made.lock().unwrap_or_else(PoisonError::into_inner);
+    // each view is made once for a checkpoint, whether or not that can be read
+    let mut made: HashMap<Stage, (SystemTime, Option<Vec<u8>>)> = HashMap::new();
+    let mut view = |stage: Stage, saved: SystemTime| -> Option<Vec<u8>> {
         if let Some((_, picture)) = made.get(&stage).filter(|(time, _)| *time == saved) {
             return picture.clone();
         }
@@ -104,8 +101,20 @@ pub(super) fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> 
         made.insert(stage, (saved, picture.clone()));
         picture
     };
-    serve_run(&server, &target.run, &view, &|| invocation.stop.requested().is_some());
-    Err(invocation.stop.error("nothing was changed"))
+    let mut write = |renewed| {
+        io::write_atomic(&page, live_html(&target.run, &mut view, renewed)?.as_bytes()).map_err(Error::from)
+    };
+    write(true)?;
+    if common.json {
+        print(&format!("{}\n", json!({"event": "watching", "run": target.run, "page": page})))?;
+    } else {
+        print(&format!("watch     {} (open it in a browser), until Ctrl-C\n", page.display()))?;
+    }
+    while stop.requested().is_none() {
+        std::thread::park_timeout(EVERY);
+        write(stop.requested().is_none())?;
+    }
+    Err(stop.error("the page stays as it is"))
 }
 
 /// The run that is meant, and its configuration.

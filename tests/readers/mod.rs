@@ -4,10 +4,7 @@
 
 use glam::{DMat3, DVec3};
 use std::fs;
-use std::io::{Read, Write};
-use std::net::{Shutdown, TcpStream};
 use std::path::Path;
-use std::sync::LazyLock;
 use tiface::capture::{self, CaptureOptions};
 use tiface::config::{Config, Preset, Sources};
 use tiface::geom::{Camera, Distortion};
@@ -15,9 +12,9 @@ use tiface::iface::IFace;
 use tiface::io::{self, Limits};
 use tiface::mesh::files::{ExtractedSurface, HeadMesh, ReadOptions, check_around, open_mesh, read_with};
 use tiface::pipeline::Line;
+use tiface::report::RunRow;
 use tiface::report::bench::BenchResult;
 use tiface::report::experiment::{ExperimentRow, read_published};
-use tiface::report::{Answer, RunRow, Server};
 use tiface::run::{Run, Standing, read_estimate, read_record, read_status};
 use tiface::tface::TFace;
 
@@ -34,7 +31,6 @@ pub const READERS: [(&str, Reader); 24] = [
     ("colmap_text", |dir, bytes| model(dir, bytes, "txt")),
     ("config", config),
     ("exr", exr),
-    ("http", http),
     ("iface", iface),
     ("llff", |dir, bytes| open(dir, "poses_bounds.npy", bytes)),
     ("mask", mask),
@@ -107,11 +103,11 @@ fn parts(bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
     })
 }
 
-/// Cameras, images, points, rigs and frames of COLMAP.
+/// Cameras, images and points of COLMAP.
 fn model(dir: &Path, bytes: &[u8], ending: &str) -> String {
     fs::create_dir_all(dir.join("sparse/0")).unwrap();
     let mut parts = parts(bytes);
-    for name in ["cameras", "images", "points3D", "rigs", "frames"] {
+    for name in ["cameras", "images", "points3D"] {
         let path = dir.join(format!("sparse/0/{name}.{ending}"));
         match parts.next() {
             Some(part) => fs::write(path, part).unwrap(),
@@ -194,48 +190,10 @@ fn iface(dir: &Path, bytes: &[u8]) -> String {
     told(IFace::load(&dir.join("head"), &config, None))
 }
 
-/// A request to the page of a run, whose port and token are not known before: `PORT` and `TOKEN` stand for them.
-fn http(_: &Path, bytes: &[u8]) -> String {
-    static SERVER: LazyLock<&Server> = LazyLock::new(|| {
-        let server: &Server = Box::leak(Box::new(Server::open().unwrap()));
-        let answer =
-            |path: &str| (path == "page").then(|| Answer { kind: "text/plain", body: b"page".into() });
-        std::thread::spawn(move || server.run(&|| false, &answer));
-        server
-    });
-    let url = SERVER.url();
-    let (port, token) =
-        url.trim_start_matches("http://127.0.0.1:").trim_end_matches('/').split_once('/').unwrap();
-    let request = replaced(&replaced(bytes, b"PORT", port.as_bytes()), b"TOKEN", token.as_bytes());
-    // a system that has no port left tells nothing about the server
-    let Ok(mut stream) = TcpStream::connect(("127.0.0.1", port.parse().unwrap())) else {
-        return String::new();
-    };
-    // a server that has heard enough may close before all is said
-    let _ = stream.write_all(&request).and_then(|()| stream.shutdown(Shutdown::Write));
-    let mut heard = Vec::new();
-    match stream.read_to_end(&mut heard) {
-        Ok(_) => {
-            let text = text(&heard);
-            assert!(text.starts_with("HTTP/1.1 "), "no answer: {text}");
-            match text.strip_prefix("HTTP/1.1 200 OK") {
-                Some(rest) => {
-                    assert!(rest.ends_with("\r\n\r\npage"), "what nobody offered: {text}");
-                    String::new()
-                }
-                None => text.lines().next().unwrap_or_default().into(),
-            }
-        }
-        Err(e) => e.kind().to_string(),
-    }
-}
-
-/// The first place of a word taken by another.
-fn replaced(bytes: &[u8], word: &[u8], by: &[u8]) -> Vec<u8> {
-    match bytes.windows(word.len()).position(|w| w == word) {
-        Some(at) => [&bytes[..at], by, &bytes[at + word.len()..]].concat(),
-        None => bytes.to_vec(),
-    }
+fn torch(dir: &Path, bytes: &[u8]) -> String {
+    put(dir, "a.th", bytes);
+    told(io::parse_torch(dir, bytes, &limits()))
+        + &told(tiface::tface::th::read_th(&dir.join("a.th"), &limits()))
 }
 
 fn config(_: &Path, bytes: &[u8]) -> String {
