@@ -586,21 +586,14 @@ fn a_capture_is_converted_into_a_new_folder_only() {
     write_capture(&dir.path().join("head"), &small).unwrap();
     let o = tiface(dir.path(), &["convert", "head", "--to", "colmap"]);
     assert_eq!((code(&o), out(&o).trim()), (0, "head_colmap"), "{}", err(&o));
-    let o = tiface(
-        dir.path(),
-        &["convert", "head_colmap", "--to", "transforms", "--out", "back", "--json", "--link"],
-    );
+    let o = tiface(dir.path(), &["convert", "head_colmap", "--to", "transforms", "--out", "back", "--json"]);
     assert!(code(&o) == 0 && out(&o).contains("\"views\":5"), "{} {}", out(&o), err(&o));
-    let o = tiface(dir.path(), &["convert", "back", "--to", "llff", "--dry-run"]);
-    assert!(code(&o) == 0 && !dir.path().join("back_llff").exists(), "{}", err(&o));
+    let o = tiface(dir.path(), &["convert", "back", "--to", "colmap", "--dry-run"]);
+    assert!(code(&o) == 0 && !dir.path().join("back_colmap").exists(), "{}", err(&o));
     for (words, expected, text) in [
-        (
-            &["convert", "head", "--to", "transforms", "--out", "head_colmap"][..],
-            1,
-            "is there and another file",
-        ),
+        (&["convert", "head", "--to", "transforms", "--out", "head_colmap"][..], 1, "is there already"),
         (&["convert", "head", "--to", "nerf"], 2, "`--to nerf` is no format of cameras"),
-        (&["convert", "absent", "--to", "llff"], 1, "absent"),
+        (&["convert", "absent", "--to", "colmap"], 1, "absent"),
         (&["demo", "--size", "large"], 2, "`--size large` is no size in pixels"),
         (&["demo", "--size", "9x9", "--run", "tiny"], 1, "9 × 9 pixels"),
     ] {

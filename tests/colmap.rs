@@ -290,47 +290,6 @@ fn masks_splits_points_rigs_and_models_in_other_places_are_found() {
     assert_eq!(open(&beside).unwrap().views.len(), MODELS.len());
 }
 
-/// Rigs of two cameras each: the second one is where `second` puts it.
-fn rigs(second: impl Fn(usize) -> ([f64; 4], DVec3)) -> (Vec<u8>, Vec<u8>, String, String) {
-    let put = |b: &mut Vec<u8>, (q, t): ([f64; 4], DVec3)| {
-        q.iter().chain(&t.to_array()).for_each(|v| b.extend(v.to_le_bytes()));
-    };
-    let shown =
-        |(q, t): ([f64; 4], DVec3)| format!("{} {} {} {} {} {} {}", q[0], q[1], q[2], q[3], t.x, t.y, t.z);
-    let (mut rigs, mut frames) = (5u64.to_le_bytes().to_vec(), 5u64.to_le_bytes().to_vec());
-    let (mut rigs_text, mut frames_text) = (String::from("# rigs\n"), String::from("# frames\n"));
-    for k in 0..5u32 {
-        let (a, b) = (2 * k + 10, 2 * k + 11);
-        [k, 2, 0, a, 0, b].iter().for_each(|v| rigs.extend(v.to_le_bytes()));
-        rigs.push(1);
-        put(&mut rigs, second(k as usize));
-        rigs_text += &format!("{k} 2 CAMERA {a} CAMERA {b} 1 {}\n", shown(second(k as usize)));
-        [k, k].iter().for_each(|v| frames.extend(v.to_le_bytes()));
-        put(&mut frames, pose(2 * k as usize));
-        frames.extend(2u32.to_le_bytes());
-        for (camera, image) in [(a, 2 * k as u64 + 1), (b, 2 * k as u64 + 2)] {
-            frames.extend(0u32.to_le_bytes());
-            frames.extend(camera.to_le_bytes());
-            frames.extend(image.to_le_bytes());
-        }
-        let ids = (2 * k + 1, 2 * k + 2);
-        frames_text +=
-            &format!("{k} {k} {} 2 CAMERA {a} {} CAMERA {b} {}\n", shown(pose(2 * k as usize)), ids.0, ids.1);
-    }
-    (rigs, frames, rigs_text, frames_text)
-}
-
-/// The second camera of rig k from the first: both stand where `pose` says.
-fn between(k: usize) -> ([f64; 4], DVec3) {
-    let of = |i: usize| {
-        let (q, t) = pose(i);
-        (DQuat::from_xyzw(q[1], q[2], q[3], q[0]), t)
-    };
-    let ((qa, ta), (qb, tb)) = (of(2 * k), of(2 * k + 1));
-    let q = qb * qa.inverse();
-    ([q.w, q.x, q.y, q.z], tb - q * ta)
-}
-
 #[test]
 #[cfg(unix)]
 fn a_model_that_is_a_link_into_a_store_is_read() {
@@ -339,46 +298,6 @@ fn a_model_that_is_a_link_into_a_store_is_read() {
         std::os::unix::fs::symlink(store.path().join(folder), dir.path().join(folder)).unwrap();
     }
     assert_eq!(open(&dir).unwrap().views.len(), open(&store).unwrap().views.len());
-}
-
-#[test]
-fn rigs_and_frames_must_say_what_the_images_say() {
-    let dir = capture_of(&rows());
-    let (binary, frames, text, frames_text) = rigs(between);
-    put(&dir, "sparse/0/rigs.bin", &binary);
-    put(&dir, "sparse/0/frames.bin", &frames);
-    let c = open(&dir).unwrap();
-    assert!(
-        c.reasons.iter().any(|r| r.contains("5 frames of 5 rigs agree with 10 images")),
-        "{:?}",
-        c.reasons
-    );
-    let (moved, ..) = rigs(|k| (between(k).0, between(k).1 + DVec3::X * 0.1));
-    put(&dir, "sparse/0/rigs.bin", moved);
-    refused(&dir, &["sparse/0/frames.bin", "disagree about `cam 1/01.png`"]);
-    for cut in 0..binary.len() {
-        put(&dir, "sparse/0/rigs.bin", &binary[..cut]);
-        refused(&dir, &["rigs.bin"]);
-    }
-    put(&dir, "sparse/0/rigs.bin", &binary);
-    for cut in 0..frames.len() {
-        put(&dir, "sparse/0/frames.bin", &frames[..cut]);
-        refused(&dir, &["frames.bin"]);
-    }
-    let plain = capture_of(&rows());
-    fs::remove_dir_all(plain.path().join("sparse")).unwrap();
-    let (cameras, images) = as_text("\n");
-    for (name, text) in
-        [("cameras", &cameras), ("images", &images), ("rigs", &text), ("frames", &frames_text)]
-    {
-        put(&plain, &format!("sparse/0/{name}.txt"), text);
-    }
-    let c = open(&plain).unwrap();
-    assert!(c.reasons.iter().any(|r| r.contains("agree with 10 images")), "{:?}", c.reasons);
-    put(&plain, "sparse/0/frames.txt", frames_text.replacen("0 0 ", "0 9 ", 1));
-    refused(&plain, &["frames.txt", "rig 9, which is not there"]);
-    put(&plain, "sparse/0/rigs.txt", "1 99999999999999999999 CAMERA 1\n");
-    refused(&plain, &["sparse/0/rigs.txt", "line 1", "number of sensors"]);
 }
 
 #[test]
@@ -452,7 +371,7 @@ fn hostile_numbers_and_names_are_refused_by_name() {
     let dir = capture_of(&rows());
     let huge = |count: u64, rest: &[u8]| [&count.to_le_bytes()[..], rest].concat();
     for count in [1 << 63, u64::MAX, 1 << 40] {
-        for name in ["cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"] {
+        for name in ["cameras.bin", "images.bin", "points3D.bin"] {
             let own = fs::read(dir.path().join("sparse/0").join(name));
             put(&dir, &format!("sparse/0/{name}"), huge(count, &[1; 200]));
             refused(&dir, &[name, &format!("it says {count}")]);
@@ -557,35 +476,20 @@ fn every_format_is_written_and_read_again() {
     write_capture(&at("head"), &small).unwrap();
     let head = capture::open(&at("head"), &options).unwrap();
     let mut last = head.clone();
-    for (step, format) in
-        [CameraFormat::Colmap, CameraFormat::Transforms, CameraFormat::Llff].into_iter().enumerate()
-    {
+    for (step, format) in [CameraFormat::Colmap, CameraFormat::Transforms].into_iter().enumerate() {
         let folder = at(&format!("step {step}"));
         let from = last;
-        let done = convert(&from, format, &folder, step == 0).unwrap();
+        let done = convert(&from, format, &folder).unwrap();
         assert_eq!((done.views, done.masks, &done.folder), (9, 9, &folder));
         last = capture::open(&folder, &options).unwrap();
         let warned = done.warnings.iter().any(|w| w.contains("does not say where up is"));
         let up = if warned { head.up } else { last.up };
         same(&head, &Capture { up, ..last.clone() }, true);
-        // an interrupted conversion goes on, and anything else that is there is never touched
-        let photo = std::fs::read_dir(folder.join("images")).unwrap().next().unwrap().unwrap().path();
-        std::fs::remove_file(&photo).unwrap();
-        assert_eq!(convert(&from, format, &folder, false).unwrap(), done);
-        assert!(photo.is_file());
-        let stranger = folder.join("images/notes.txt");
-        std::fs::write(&stranger, "kept").unwrap();
-        let e = convert(&from, format, &folder, false).unwrap_err();
-        assert!(e.to_string().contains("`images/notes.txt` is there and another file"), "{e}");
-        std::fs::remove_file(stranger).unwrap();
-        std::fs::write(&photo, "another").unwrap();
-        let e = convert(&from, format, &folder, false).unwrap_err();
-        assert!(e.to_string().contains("is there and another file"), "{e}");
-        assert_eq!(std::fs::read(&photo).unwrap(), b"another");
-        std::fs::remove_file(photo).unwrap();
-        convert(&from, format, &folder, false).unwrap();
+        // what is there is never touched
+        let e = convert(&from, format, &folder).unwrap_err();
+        assert!(e.to_string().contains("is there already"), "{e}");
     }
-    assert!(last.format.starts_with("LLFF"));
+    assert!(last.format.starts_with("transforms"), "{}", last.format);
 }
 
 /// The head with one photograph under another name.
@@ -611,10 +515,10 @@ fn a_held_out_name_that_a_format_cannot_carry_is_refused_not_learned() {
     let names = ["#a.png", "#d/a.png", " a.png", "a.png ", "a\nb.png", "a\rb.png", "c:a.png"];
     for (i, name) in names.into_iter().enumerate() {
         let from = renamed(&head, held_out, name, &at("names"));
-        let e = convert(&from, CameraFormat::Colmap, &at("c"), false).unwrap_err();
+        let e = convert(&from, CameraFormat::Colmap, &at("c")).unwrap_err();
         assert!(e.to_string().contains(name) && !at("c").exists(), "{e}");
         let folder = at(&format!("t{i}"));
-        convert(&from, CameraFormat::Transforms, &folder, false).unwrap();
+        convert(&from, CameraFormat::Transforms, &folder).unwrap();
         let again = capture::open(&folder, &options).unwrap();
         let splits = |c: &Capture| c.views.iter().map(|v| v.split).collect::<Vec<_>>();
         assert_eq!(splits(&again), splits(&from), "{name:?}");
@@ -623,14 +527,8 @@ fn a_held_out_name_that_a_format_cannot_carry_is_refused_not_learned() {
     for name in ["#a.png", "a.png "] {
         let from = renamed(&head, 0, name, &at("names"));
         let folder = at(&format!("learned{name}"));
-        convert(&from, CameraFormat::Colmap, &folder, false).unwrap();
+        convert(&from, CameraFormat::Colmap, &folder).unwrap();
         assert_eq!(capture::open(&folder, &options).unwrap().split(Split::Test).count(), 2, "{name:?}");
-    }
-    // LLFF lists its photographs by their endings
-    for name in ["z.png ", ".z.png"] {
-        let from = renamed(&head, 0, name, &at("names"));
-        let e = convert(&from, CameraFormat::Llff, &at("l"), false).unwrap_err();
-        assert!(e.to_string().contains(name) && !at("l").exists(), "{e}");
     }
 }
 
@@ -666,7 +564,7 @@ fn splits_that_only_look_like_every_eighth_survive_every_format() {
     fn check(from: &Capture, folder: &Path) {
         for (name, format) in [("t", CameraFormat::Transforms), ("c", CameraFormat::Colmap)] {
             let folder = folder.join(name);
-            convert(from, format, &folder, false).unwrap();
+            convert(from, format, &folder).unwrap();
             let again = capture::open(&folder, &CaptureOptions::default()).unwrap();
             let held_out = |c: &Capture| c.split(Split::Test).map(|v| v.name.clone()).collect::<Vec<_>>();
             assert_eq!(held_out(&again), held_out(from));
@@ -683,7 +581,7 @@ fn text_files_of_a_model_may_be_empty_and_binary_ones_not() {
     }
     put(&dir, "sparse/0/cameras.txt", &cameras);
     put(&dir, "sparse/0/images.txt", &images);
-    for name in ["points3D", "rigs", "frames", "test"] {
+    for name in ["points3D", "test"] {
         put(&dir, &format!("sparse/0/{name}.txt"), "");
     }
     // COLMAP's manual makes `points3D.txt` empty for known poses; `test.txt` then holds nothing out
@@ -700,18 +598,16 @@ fn text_files_of_a_model_may_be_empty_and_binary_ones_not() {
 }
 
 #[test]
-fn all_lenses_survive_transforms_and_llff_refuses_what_it_cannot_say() {
+fn all_lenses_survive_and_a_reduced_capture_is_refused() {
     let dir = capture_of(&rows());
     let from = open(&dir).unwrap();
     for (name, format) in [("t", CameraFormat::Transforms), ("c", CameraFormat::Colmap)] {
         let folder = dir.path().join(name);
-        convert(&from, format, &folder, false).unwrap();
+        convert(&from, format, &folder).unwrap();
         same(&from, &capture::open(&folder, &CaptureOptions::default()).unwrap(), false);
     }
-    let e = convert(&from, CameraFormat::Llff, &dir.path().join("l"), false).unwrap_err();
-    assert!(e.to_string().contains("LLFF cannot say") && !dir.path().join("l").exists(), "{e}");
     let reduced = CaptureOptions { downscale: 2, ..CaptureOptions::default() };
     let reduced = capture::open(dir.path(), &reduced).unwrap();
-    let e = convert(&reduced, CameraFormat::Colmap, &dir.path().join("r"), false).unwrap_err();
+    let e = convert(&reduced, CameraFormat::Colmap, &dir.path().join("r")).unwrap_err();
     assert!(e.to_string().contains("reduced in size"), "{e}");
 }

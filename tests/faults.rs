@@ -136,13 +136,11 @@ fn a_fault_in_any_write_of_any_stage_loses_nothing_and_the_repeated_command_comp
         let (after, count) = bench.try_faults(&place, &[stage.word(), capture, "--run", "HERE/run"]);
         (place, tried) = (after, tried + count);
     }
-    let head = capture.to_str().unwrap();
-    let words: [&[&str]; 6] = [
+    let words: [&[&str]; 5] = [
         &["report", "HERE/run", "--out", "HERE/page.html"],
         &["mesh", "HERE/run", "--out", "HERE/head.obj"],
         &["render", "HERE/run", "--out", "HERE/views/"],
         &["preview", "HERE/run", "--size", "64", "--out", "HERE/turn.png"],
-        &["convert", head, "--to", "colmap", "--out", "HERE/colmap"],
         &["run", "HERE/run", "--fresh", "mesh"],
     ];
     for words in words {

@@ -2,7 +2,7 @@
 //!
 //! A pose takes the world to a camera whose axes point right, down and ahead, as a quaternion (w, x, y, z) and a
 //! translation; a pixel's center is at +0.5. The binary files are preferred to the text. Poses are complete in the
-//! images file, of rigs as well; where `rigs` and `frames` lie beside it (COLMAP 3.12), they must say the same.
+//! images file, of rigs as well: `rigs` and `frames` beside it (COLMAP 3.12) are not read.
 //! Points are optional, and say where the head is if no masks do.
 
 mod binary;
@@ -18,7 +18,7 @@ use super::view::Split;
 use crate::io::{self, ReadError};
 use crate::{Error, Result};
 use glam::{DMat3, DQuat, DVec3};
-use model::{CAMERA, Image, Model, Rigid};
+use model::{Image, Model, Rigid};
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
@@ -26,9 +26,6 @@ pub(super) use write::files;
 
 /// Where models lie.
 pub(super) const FOLDERS: [&str; 5] = ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ""];
-
-/// How far rigs and frames may be from the images file, radians and the largest translation.
-const TOLERANCE: f64 = 1e-4;
 
 /// A model's folder below the capture, and how its files end.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -69,9 +66,9 @@ impl ModelFiles {
             bytes(kind)?.ok_or_else(missing)
         };
         let (cameras, images) = (needed("cameras")?, needed("images")?);
-        let (rigs, frames, points) = (bytes("rigs")?, bytes("frames")?, bytes("points3D")?);
+        let points = bytes("points3D")?;
         if self.ending == "bin" {
-            return binary::read(&cameras, &images, [&rigs, &frames, &points], limits);
+            return binary::read(&cameras, &images, points.as_ref(), limits);
         }
         let as_text = |kind: &str, (path, bytes): (PathBuf, Vec<u8>)| -> Result<(String, String)> {
             let text = String::from_utf8(bytes).map_err(|e| {
@@ -80,21 +77,14 @@ impl ModelFiles {
             })?;
             Ok((self.name(kind), text))
         };
-        let optional = |kind, file: Option<_>| file.map(|file| as_text(kind, file)).transpose();
-        let (rigs, frames, points) =
-            (optional("rigs", rigs)?, optional("frames", frames)?, optional("points3D", points)?);
-        text::read(
-            &as_text("cameras", cameras)?,
-            &as_text("images", images)?,
-            [&rigs, &frames, &points],
-            limits,
-        )
+        let points = points.map(|file| as_text("points3D", file)).transpose()?;
+        text::read(&as_text("cameras", cameras)?, &as_text("images", images)?, points.as_ref(), limits)
     }
 }
 
 /// Lists the images of a model, in the order of their numbers.
 pub(super) fn list(folder: &CaptureFolder, files: &ModelFiles, listing: &mut Listing) -> Result<()> {
-    let Model { cameras, mut images, rigs, frames, points } = files.read(folder)?;
+    let Model { cameras, mut images, points } = files.read(folder)?;
     let name_of = files.name("images");
     if images.is_empty() {
         return Err(in_file(
@@ -123,7 +113,6 @@ pub(super) fn list(folder: &CaptureFolder, files: &ModelFiles, listing: &mut Lis
         let text = "only the first of several models is read; COLMAP made pieces that it could not join";
         listing.warnings.push(format!("{text}: {} also lie there", few(others)));
     }
-    check_rigs(files, &images, &rigs, &frames, listing)?;
     let held_out = held_out(folder, files)?;
     let base = folder.image_folder(images.iter().map(|image| image.name.as_str()));
     for image in &images {
@@ -228,73 +217,6 @@ impl Rigid {
         let q = if (length - 1.0).abs() < 1e-15 { q } else { q / length };
         Ok(DMat3::from_quat(q))
     }
-
-    /// This one after `other`.
-    fn after(&self, other: &Rigid) -> Result<(DMat3, DVec3), &'static str> {
-        let (a, b) = (self.matrix()?, other.matrix()?);
-        Ok((a * b, a * other.translation + self.translation))
-    }
-}
-
-/// Rigs and frames, where they are given, must put each camera where its image is.
-fn check_rigs(
-    files: &ModelFiles,
-    images: &[Image],
-    rigs: &[model::Rig],
-    frames: &[model::Frame],
-    listing: &mut Listing,
-) -> Result<()> {
-    if rigs.is_empty() || frames.is_empty() {
-        return Ok(());
-    }
-    let file = files.name("frames");
-    let wrong = |text: String| {
-        in_file(&file, text, "remove the rigs and frames files: the images file says the same")
-    };
-    let known: HashMap<u32, &Image> = images.iter().map(|i| (i.id, i)).collect();
-    let by_id: HashMap<u32, &model::Rig> = rigs.iter().map(|r| (r.id, r)).collect();
-    let spread =
-        images.iter().map(|i| i.pose.translation.length()).filter(|l| l.is_finite()).fold(1e-9, f64::max);
-    let mut compared = 0;
-    for frame in frames {
-        let rig = by_id.get(&frame.rig);
-        let rig = rig.ok_or_else(|| {
-            wrong(format!("frame {} is of rig {}, which is not there", frame.id, frame.rig))
-        })?;
-        for &(kind, sensor, data) in &frame.data {
-            let Some(image) = known.get(&data).filter(|_| kind == CAMERA) else { continue };
-            let sensor_from_rig = match rig.sensors.iter().find(|s| (s.0, s.1) == (kind, sensor)) {
-                Some((_, _, Some(pose))) => *pose,
-                Some((_, _, None)) if (rig.sensors[0].0, rig.sensors[0].1) == (kind, sensor) => {
-                    Rigid::default()
-                }
-                Some(_) => continue, // a sensor whose place in the rig is not known yet
-                None => {
-                    return Err(wrong(format!(
-                        "frame {} has sensor {sensor}, which rig {} has not",
-                        frame.id, rig.id
-                    )));
-                }
-            };
-            let named = |text: &str| wrong(format!("frame {}: {text}", frame.id));
-            let (rotation, translation) = sensor_from_rig.after(&frame.pose).map_err(named)?;
-            let own =
-                image.pose.matrix().map_err(|text| in_frame(&files.name("images"), &image.name, text))?;
-            let turned = (rotation - own).to_cols_array().iter().fold(0.0f64, |a, v| a.max(v.abs()));
-            let moved = translation.distance(image.pose.translation) / spread;
-            if !(turned <= TOLERANCE && moved <= TOLERANCE) {
-                return Err(wrong(format!(
-                    "frame {} and the images file disagree about `{}`: by {turned:.1e} in rotation, {moved:.1e} of the \
-                     largest translation",
-                    frame.id, image.name
-                )));
-            }
-            compared += 1;
-        }
-    }
-    let (n, all) = (rigs.len(), frames.len());
-    listing.reasons.push(format!("{all} frames of {n} rigs agree with {compared} images"));
-    Ok(())
 }
 
 /// A rotation and position of ours as COLMAP's quaternion (w, x, y, z) and translation.

@@ -5,13 +5,12 @@
 //! (column 1, −column 0, column 2). The published loader divides positions by 0.3; here the world stays
 //! as the dataset has it.
 
-use super::entries::{self, has_ending};
+use super::entries;
 use super::error::{in_file, in_frame};
 use super::frame::{Agreement, CameraFrame, Intrinsics, Listing};
 use super::names::CaptureFolder;
 use super::pose;
 use super::view::Split;
-use crate::geom::Camera;
 use crate::io::{self, NpyValues};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
@@ -21,7 +20,7 @@ const POSITION_TOLERANCE: f64 = 1e-3;
 /// Radians; 0.1°.
 const ROTATION_TOLERANCE: f64 = 1.75e-3;
 /// Relative.
-pub(super) const FOCAL_TOLERANCE: f64 = 1e-3;
+const FOCAL_TOLERANCE: f64 = 1e-3;
 
 #[derive(Clone, Copy, Debug)]
 struct PoseRow {
@@ -241,26 +240,6 @@ fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String
     Ok(Some(
         entries::photographs(&folder.root.join(&name))?.into_iter().map(|n| format!("{name}/{n}")).collect(),
     ))
-}
-
-/// Is a file of this name, in the folder of photographs, one of those that rows are paired with?
-pub(super) fn is_photograph(name: &str) -> bool {
-    !name.starts_with('.') && has_ending(name, &["png", "jpg", "jpeg"])
-}
-
-/// An LLFF file of cameras with one focal length each, and near and far.
-pub(super) fn write<'c>(cameras: impl ExactSizeIterator<Item = (&'c Camera, [f64; 2])>) -> Vec<u8> {
-    let (count, mut values) = (cameras.len(), Vec::new());
-    for (camera, bounds) in cameras {
-        let r = camera.rotation;
-        let size = [camera.height as f64, camera.width as f64, (camera.fx * camera.fy).sqrt()];
-        for k in 0..3 {
-            let line = [-r.y_axis[k], r.x_axis[k], r.z_axis[k], camera.position[k], size[k]];
-            line.iter().for_each(|v| values.extend(v.to_le_bytes()));
-        }
-        bounds.iter().for_each(|v| values.extend(v.to_le_bytes()));
-    }
-    io::npy_bytes("<f8", &[count, 17], &values)
 }
 
 #[cfg(test)]

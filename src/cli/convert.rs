@@ -8,10 +8,10 @@ use crate::pipeline::capture_options;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-pub(super) fn run(invocation: &Invocation, from: &Path, to: &str, link: bool) -> Result<()> {
+pub(super) fn run(invocation: &Invocation, from: &Path, to: &str) -> Result<()> {
     let common = invocation.common;
     let format = CameraFormat::named(to).ok_or_else(|| {
-        Error::usage(format_args!("`--to {to}` is no format of cameras"), "choose transforms, colmap or llff")
+        Error::usage(format_args!("`--to {to}` is no format of cameras"), "choose transforms or colmap")
     })?;
     let options = capture_options(&common.resolve(None, None, &[])?);
     let capture = capture::open(from, &options)?;
@@ -23,7 +23,7 @@ pub(super) fn run(invocation: &Invocation, from: &Path, to: &str, link: bool) ->
         invocation.screen.note("convert", &format!("would write {views} views into `{}`", folder.display()));
         return Ok(());
     }
-    let done = convert(&capture, format, &folder, link)?;
+    let done = convert(&capture, format, &folder)?;
     done.warnings.iter().for_each(|text| invocation.screen.note("convert: warning", text));
     if common.json {
         return print(&format!("{}\n", serde_json::to_string(&done).unwrap_or_default()));

@@ -190,24 +190,18 @@ enum Command {
         /// A folder of photographs with cameras
         capture: PathBuf,
     },
-    /// Write a capture's cameras in another format: transforms.json, COLMAP or LLFF
+    /// Write a capture's cameras in another format: transforms.json or COLMAP
     #[command(after_long_help = "Examples:
   tiface convert captures/002_00 --to colmap
   tiface convert scan --to transforms --out captures/scan
-  tiface convert captures/002_00 --to llff --link
 
-Photographs and masks are copied as they are; --link gives them a second name on the same disk instead, which
-takes no space: whoever changes one then changes both. The new folder must not be there, or be empty, or hold what the
-same command wrote before it was stopped.")]
+Photographs and masks are copied as they are. The new folder must not be there, or be empty.")]
     Convert {
         /// A folder of photographs with cameras
         capture: PathBuf,
-        /// transforms, colmap or llff
+        /// transforms or colmap
         #[arg(long, value_name = "FORMAT")]
         to: String,
-        /// Link photographs and masks instead of copying them
-        #[arg(long)]
-        link: bool,
     },
     /// Stage: which pixels are the head, and where that puts it
     #[command(after_long_help = "Examples:
@@ -349,7 +343,7 @@ learned from (capture.tiles): the blend follows the better members.")]
   tiface preview runs/002_00 --turntable --out turn.gif     .png is animated, too; .mp4 needs ffmpeg
   tiface preview runs/002_00 --cameras test --out views/    as the held-out photographs
   tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
-  tiface preview runs/002_00 --watch            a run while it works, in a browser on this machine")]
+  tiface preview runs/002_00 --watch            a page of a run while it works, in watch.html there")]
     Preview(PreviewOptions),
     /// Speed against error of each decision, measured on this machine: tables, plots, a page
     #[cfg(feature = "cpu")]
@@ -482,7 +476,7 @@ pub fn main() -> ExitCode {
         Command::Inspect { capture } => {
             makes_nothing("inspect").and_then(|()| inspect::run(&common, capture))
         }
-        Command::Convert { capture, to, link } => convert::run(&invocation, capture, to, *link),
+        Command::Convert { capture, to } => convert::run(&invocation, capture, to),
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
         Command::Preview(options) => preview::run(&invocation, options),

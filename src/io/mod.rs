@@ -36,4 +36,4 @@ pub use pictures::{
 pub use process::{cpu_seconds, forget_peak_memory, has_ended, has_open, peak_memory, processor};
 pub use read::{read_bytes, read_maybe_empty};
 pub use tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
-pub use write::{WriteError, copy, hard_link, remove, remove_leftovers, rename, write_atomic};
+pub use write::{WriteError, copy, remove, remove_leftovers, rename, write_atomic};

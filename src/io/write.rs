@@ -48,7 +48,6 @@ impl WriteError {
                 ErrorKind::NotFound => "create the folder first".into(),
                 ErrorKind::PermissionDenied => "choose a folder you may write to".into(),
                 ErrorKind::AlreadyExists => "name another file, or remove that one".into(),
-                ErrorKind::CrossesDevices => "links stay on one disk: copy instead, without `--link`".into(),
                 _ => "check the disk".into(),
             },
             WriteError::Content { .. } => "check the values that should be stored".into(),
@@ -91,12 +90,6 @@ pub fn copy(from: &Path, to: &Path) -> Result<(), WriteError> {
         let _ = fs::remove_file(&aside); // the first error is the one to tell
         WriteError::from_io(to, bytes, e)
     })
-}
-
-/// Gives a file a second name that nothing has, on the same disk; where `from` is a link, what it leads to.
-pub fn hard_link(from: &Path, to: &Path) -> Result<(), WriteError> {
-    let linked = || fs::hard_link(fs::canonicalize(from)?, to);
-    linked().map_err(|source| WriteError::Io { path: to.into(), source })
 }
 
 fn absent(path: &Path) -> std::io::Result<()> {

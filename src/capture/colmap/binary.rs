@@ -2,7 +2,7 @@
 //! are left before anything is reserved.
 
 use super::super::lens::LensModel;
-use super::model::{Camera, Frame, Image, Model, Rig, Rigid};
+use super::model::{Camera, Image, Model, Rigid};
 use crate::Result;
 use crate::io::{Limits, ReadError};
 use glam::DVec3;
@@ -15,24 +15,16 @@ type Source = (PathBuf, Vec<u8>);
 /// COLMAP's own limit is that of the file system.
 const LONGEST_NAME: usize = 4096;
 
-/// Reads a model; the optional files are rigs, frames and points.
+/// Reads a model; the points are optional.
 pub(super) fn read(
     cameras: &Source,
     images: &Source,
-    [rigs, frames, points]: [&Option<Source>; 3],
+    points: Option<&Source>,
     limits: &Limits,
 ) -> Result<Model> {
     let mut model = Model { cameras: read_cameras(cameras)?, ..Model::default() };
     model.images = read_images(images, limits)?;
-    if let Some(source) = rigs {
-        model.rigs = read_rigs(source)?;
-    }
-    if let Some(source) = frames {
-        model.frames = read_frames(source)?;
-    }
-    if let Some(source) = points {
-        model.points = Some(read_points(source)?);
-    }
+    model.points = points.map(read_points).transpose()?;
     Ok(model)
 }
 
@@ -164,44 +156,6 @@ fn read_images(source: &Source, limits: &Limits) -> Result<Vec<Image>, ReadError
     }
     c.end()?;
     Ok(images)
-}
-
-fn read_rigs(source: &Source) -> Result<Vec<Rig>, ReadError> {
-    let mut c = Cursor::of(source);
-    let n = c.counted(8, "rigs")?;
-    let mut rigs = Vec::with_capacity(n);
-    for _ in 0..n {
-        let (id, count) = (c.u32()?, c.u32()?);
-        let count = c.fits(count.into(), 8, "sensors of a rig")?;
-        let mut sensors = Vec::with_capacity(count);
-        for k in 0..count {
-            let (kind, sensor) = (c.i32()?, c.u32()?);
-            // the first one is where the rig is
-            let pose = if k > 0 && c.u8()? != 0 { Some(c.rigid()?) } else { None };
-            sensors.push((kind, sensor, pose));
-        }
-        rigs.push(Rig { id, sensors });
-    }
-    c.end()?;
-    Ok(rigs)
-}
-
-fn read_frames(source: &Source) -> Result<Vec<Frame>, ReadError> {
-    let mut c = Cursor::of(source);
-    let n = c.counted(4 + 4 + 56 + 4, "frames")?;
-    let mut frames = Vec::with_capacity(n);
-    for _ in 0..n {
-        let (id, rig, pose, count) = (c.u32()?, c.u32()?, c.rigid()?, c.u32()?);
-        let count = c.fits(count.into(), 16, "images of a frame")?;
-        let mut data = Vec::with_capacity(count);
-        for _ in 0..count {
-            let (kind, sensor, image) = (c.i32()?, c.u32()?, c.u64()?);
-            data.push((kind, sensor, u32::try_from(image).unwrap_or(u32::MAX)));
-        }
-        frames.push(Frame { id, rig, pose, data });
-    }
-    c.end()?;
-    Ok(frames)
 }
 
 fn read_points(source: &Source) -> Result<Vec<DVec3>, ReadError> {

@@ -2,7 +2,7 @@
 
 use super::super::error::in_file;
 use super::super::lens::LensModel;
-use super::model::{CAMERA, Camera, Frame, Image, Model, Rig, Rigid};
+use super::model::{Camera, Image, Model, Rigid};
 use crate::io::{Limits, ReadError};
 use crate::{Error, Result};
 use glam::DVec3;
@@ -13,21 +13,15 @@ use std::str::{FromStr, SplitWhitespace};
 /// A file's name for messages, with its text.
 type Source = (String, String);
 
-/// Reads a model; the optional files are rigs, frames and points.
+/// Reads a model; the points are optional.
 pub(super) fn read(
     cameras: &Source,
     images: &Source,
-    [rigs, frames, points]: [&Option<Source>; 3],
+    points: Option<&Source>,
     limits: &Limits,
 ) -> Result<Model> {
     let mut model = Model { cameras: read_cameras(cameras)?, ..Model::default() };
     model.images = read_images(images, limits)?;
-    if let Some(source) = rigs {
-        model.rigs = entries(source).map(|line| rig(line?)).collect::<Result<_>>()?;
-    }
-    if let Some(source) = frames {
-        model.frames = entries(source).map(|line| frame(line?)).collect::<Result<_>>()?;
-    }
     if let Some(source) = points {
         model.points = Some(entries(source).map(|line| point(line?)).collect::<Result<_>>()?);
     }
@@ -68,11 +62,6 @@ impl<'s> Line<'s> {
             *value = self.number("a number of a pose")?;
         }
         Ok(values.into())
-    }
-
-    /// A sensor's kind.
-    fn kind(&mut self) -> Result<i32> {
-        Ok(if self.word("the kind of a sensor")? == "CAMERA" { CAMERA } else { -1 })
     }
 
     fn end(&mut self) -> Result<()> {
@@ -150,33 +139,4 @@ fn point(mut line: Line) -> Result<DVec3> {
     line.number::<u64>("the number of a point")?;
     let mut coordinate = || line.number("a coordinate of a point");
     Ok(DVec3::new(coordinate()?, coordinate()?, coordinate()?))
-}
-
-fn rig(mut line: Line) -> Result<Rig> {
-    let id = line.number("the number of a rig")?;
-    let count: usize = line.number("a number of sensors")?;
-    let mut sensors = Vec::new();
-    for k in 0..count {
-        let (kind, sensor) = (line.kind()?, line.number("the number of a sensor")?);
-        let pose = if k > 0 && line.number::<u8>("0 or 1")? != 0 { Some(line.rigid()?) } else { None };
-        sensors.push((kind, sensor, pose));
-    }
-    line.end()?;
-    Ok(Rig { id, sensors })
-}
-
-fn frame(mut line: Line) -> Result<Frame> {
-    let (id, rig) = (line.number("the number of a frame")?, line.number("the number of a rig")?);
-    let pose = line.rigid()?;
-    let count: usize = line.number("a number of images")?;
-    let mut data = Vec::new();
-    for _ in 0..count {
-        data.push((
-            line.kind()?,
-            line.number("the number of a sensor")?,
-            line.number("the number of an image")?,
-        ));
-    }
-    line.end()?;
-    Ok(Frame { id, rig, pose, data })
 }
