@@ -274,19 +274,6 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_again() {
-        let f = frame("a", 0.3);
-        let camera = f.intrinsics.camera((4, 2), f.rotation, f.position).unwrap();
-        let bytes = write([(&camera, [0.5, 2.0]), (&camera, [0.5, 2.0])].into_iter());
-        let npy = io::parse_npy("p.npy".as_ref(), &bytes, &io::Limits::default()).unwrap();
-        assert_eq!(npy.shape, [2, 17]);
-        let NpyValues::Number(values) = npy.values else { panic!() };
-        assert_eq!(values[17..32], llff(&f)[..15]);
-        assert_eq!(values[32..], [0.5, 2.0]);
-        assert_eq!((bytes.len() - 2 * 17 * 8) % 64, 0);
-    }
-
-    #[test]
     fn rows_agree_with_their_frames_in_either_order() {
         let frames = [frame("b", 0.1), frame("a", 0.7)];
         let rows: Vec<PoseRow> = frames.iter().map(|f| row(&llff(f)).unwrap()).collect();

@@ -23,7 +23,7 @@ use tiface::tface::TFace;
 pub type Reader = fn(&Path, &[u8]) -> String;
 
 /// By the name of their seeds.
-pub const READERS: [(&str, Reader); 24] = [
+pub const READERS: [(&str, Reader); 23] = [
     ("bench", |_, bytes| told(BenchResult::parse(&text(bytes), "bench.json"))),
     ("camera_path", camera_path),
     ("cameras", cameras),
@@ -188,12 +188,6 @@ fn iface(dir: &Path, bytes: &[u8]) -> String {
     let mut config = Config::preset(Preset::Draft).iface;
     (config.steps, config.levels, config.log2_table, config.occupancy_resolution) = (2, 1, 4, 16);
     told(IFace::load(&dir.join("head"), &config, None))
-}
-
-fn torch(dir: &Path, bytes: &[u8]) -> String {
-    put(dir, "a.th", bytes);
-    told(io::parse_torch(dir, bytes, &limits()))
-        + &told(tiface::tface::th::read_th(&dir.join("a.th"), &limits()))
 }
 
 fn config(_: &Path, bytes: &[u8]) -> String {

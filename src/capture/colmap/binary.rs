@@ -55,10 +55,6 @@ impl<'b> Cursor<'b> {
         Ok(found)
     }
 
-    fn u8(&mut self) -> Result<u8, ReadError> {
-        Ok(self.take::<1>()?[0])
-    }
-
     fn u32(&mut self) -> Result<u32, ReadError> {
         self.take().map(u32::from_le_bytes)
     }
