@@ -211,9 +211,13 @@ impl<'a> Pixels<'a> {
     /// Copies the photographs to a device, where the same rays are drawn from them.
     #[cfg(feature = "wgpu")]
     pub fn on_device(&self, device: &gpu::Device, drawing: gpu::SamplingOptions) -> gpu::Photographs {
-        let views: Vec<gpu::DrawnView> =
-            (0..self.views.len()).into_par_iter().map(|v| self.drawn_view(v)).collect();
-        gpu::Photographs::new(device, &views, self.radius, drawing)
+        // packed as many at a time as there are threads, for packed photographs are as large as these
+        let (count, threads) = (self.views.len(), rayon::current_num_threads());
+        let some = |first: usize| -> Vec<gpu::DrawnView> {
+            (first..count.min(first + threads)).into_par_iter().map(|v| self.drawn_view(v)).collect()
+        };
+        let views = (0..count).step_by(threads).flat_map(some);
+        gpu::Photographs::new(device, views, self.bytes_on_device() as usize / 4, self.radius, drawing)
     }
 
     /// Bytes that the photographs take on a device.

@@ -3,6 +3,7 @@
 use crate::{Error, Result};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Cube, CubeDevice, WgpuBackend, WgpuDevice, WgpuDeviceKind};
+use burn::cubecl::bytes::Bytes;
 use burn::cubecl::device::CudaDevice;
 use burn::cubecl::features::AtomicUsage;
 use burn::cubecl::future;
@@ -261,8 +262,22 @@ impl Device {
 
     /// Copies values to the device.
     pub fn upload<T: Element>(&self, values: &[T]) -> Buffer {
-        let handle = self.client.create_from_slice(bytemuck::cast_slice(values));
-        self.tensor(handle, values.len(), T::dtype())
+        self.upload_vec(values.to_vec())
+    }
+
+    /// As [`Device::upload`], without another copy on the host.
+    pub fn upload_vec<T: Element>(&self, values: Vec<T>) -> Buffer {
+        let words = values.len();
+        self.tensor(self.client.create(Bytes::from_elems(values)), words, T::dtype())
+    }
+
+    /// Copies values into a buffer, from its word `first` on. They are sent at once: the driver keeps a copy until then.
+    pub(super) fn write<T: Element>(&self, into: &Buffer, first: usize, values: Vec<T>) {
+        let behind = into.words() - first - values.len();
+        let handle = into.handle.clone().offset_start(4 * first as u64).offset_end(4 * behind as u64);
+        self.client.write(&handle, Bytes::from_elems(values));
+        // what fails here fails the next read, too
+        let _ = self.client.flush();
     }
 
     /// Memory of **arbitrary contents**: a kernel writes it before another reads it.
@@ -272,7 +287,7 @@ impl Device {
 
     /// Memory of zeros.
     pub fn zeros<T: Element>(&self, words: usize) -> Buffer {
-        self.upload(&vec![T::zeroed(); words.max(1)])
+        self.upload_vec(vec![T::zeroed(); words.max(1)])
     }
 
     fn tensor(&self, handle: Handle, words: usize, dtype: DType) -> Buffer {

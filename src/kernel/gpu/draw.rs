@@ -437,28 +437,41 @@ pub struct Photographs {
 }
 
 impl Photographs {
-    /// Copies photographs there; the field's coordinates are the scene's times `radius`.
+    /// Copies photographs to the device, one after the other; the field's coordinates are the scene's times `radius`.
+    /// `room` is the number of their pixels, each photograph's rounded up to a multiple of 32.
     ///
     /// # Panics
     ///
     /// Where no pixel is drawable, or 2³² pixels are.
-    pub fn new(device: &Device, seen: &[DrawnView], radius: f32, drawing: SamplingOptions) -> Photographs {
-        let (mut views, mut pixels, mut drawable) = (Vec::new(), Vec::new(), Vec::new());
+    pub fn new(
+        device: &Device,
+        seen: impl Iterator<Item = DrawnView>,
+        room: usize,
+        radius: f32,
+        drawing: SamplingOptions,
+    ) -> Photographs {
+        let pixels = device.scratch::<u32>(room);
+        let (mut views, mut drawable) = (Vec::new(), Vec::new());
         let mut cumulative = 0u32;
         for view in seen {
             let count = (view.part[2] * view.part[3]) as usize;
             assert!(view.pixels.len() == count && view.drawable.len() == count.div_ceil(32));
             let own: u32 = view.drawable.iter().map(|w| w.count_ones()).sum();
             cumulative = cumulative.checked_add(own).expect("fewer than 2³² pixels");
-            let first = u32::try_from(pixels.len()).expect("fewer than 2³² pixels");
-            views.extend(view.words(cumulative, first, radius));
-            pixels.extend(&view.pixels);
-            drawable.extend(&view.drawable);
-            // bits of the next one begin with a word
-            pixels.resize(32 * drawable.len(), 0);
+            // bits of each begin with a word
+            let first = 32 * drawable.len();
+            views.extend(view.words(
+                cumulative,
+                u32::try_from(first).expect("fewer than 2³² pixels"),
+                radius,
+            ));
+            drawable.extend(view.drawable);
+            if count > 0 {
+                device.write(&pixels, first, view.pixels);
+            }
         }
         assert!(cumulative > 0, "no pixel is drawable");
-        let [views, pixels, drawable] = [views, pixels, drawable].map(|words| device.upload(&words));
+        let [views, drawable] = [views, drawable].map(|words| device.upload_vec(words));
         Photographs { views, pixels, drawable, drawing }
     }
 
