@@ -34,11 +34,11 @@ pub struct Gpu {
 pub fn open(choice: &DeviceChoice) -> Result<Gpu> {
     let (api, number) = (choice.name.as_str(), choice.number);
     let name = number.map_or(api.to_string(), |number| format!("{api}:{number}"));
-    let adapters: Vec<Adapter> =
-        Adapter::all().into_iter().filter(|a| a.api == api || (api == "wgpu" && a.api != "cuda")).collect();
+    let adapters: Vec<&Adapter> =
+        Adapter::all().iter().filter(|a| a.api == api || (api == "wgpu" && a.api != "cuda")).collect();
     let chosen: Vec<&Adapter> = match number {
-        Some(number) => adapters.get(number).into_iter().collect(),
-        None => adapters.iter().filter(|adapter| !adapter.software).collect(),
+        Some(number) => adapters.get(number).copied().into_iter().collect(),
+        None => adapters.iter().copied().filter(|adapter| !adapter.software).collect(),
     };
     let mut in_use = Vec::new();
     for adapter in chosen {
@@ -72,7 +72,7 @@ fn opened(adapter: &Adapter, choice: &DeviceChoice) -> Device {
     device
 }
 
-fn missing(name: &str, api: &str, adapters: &[Adapter]) -> Error {
+fn missing(name: &str, api: &str, adapters: &[&Adapter]) -> Error {
     let problem = match adapters {
         [] if api == "cuda" && !cfg!(feature = "cuda") => {
             let problem = format!("device `{name}`: this build knows no CUDA");
@@ -181,9 +181,9 @@ pub struct Found {
     pub name: String,
     /// As the adapter names itself.
     pub adapter: String,
-    /// `discrete`, `integrated`, `virtual` or `software`.
+    /// `discrete`, `integrated`, `virtual`, `other` or `software`.
     pub kind: &'static str,
-    /// The driver and what it compiles for.
+    /// The driver and its version.
     pub driver: String,
     /// Where it is plugged in, if it is.
     pub card: Option<String>,

@@ -18,8 +18,10 @@ pub struct DeviceRays {
 
 /// Bytes of photographs that fit in `available` bytes of a device; none where they do not.
 pub fn resident(pixels: &Pixels, device: &Device, available: u64) -> Option<u64> {
-    let (bytes, buffers) = pixels.bytes_on_device(device.limits().largest_buffer);
-    let fits = buffers <= BUFFERS && bytes <= available;
+    let buffers = pixels.buffers_on_device(device.limits().largest_buffer);
+    // beside a pixel's four bytes its bit, and what counts these
+    let bytes = buffers.iter().sum::<u64>() * 17 / 4;
+    let fits = buffers.len() <= BUFFERS && bytes <= available;
     (fits && pixels.count() <= u32::MAX as u64).then_some(bytes)
 }
 

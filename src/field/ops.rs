@@ -106,7 +106,7 @@ impl ArrayDevice for gpu::Device {
     const READ_EVERY: u64 = 50;
 
     fn upload(&self, values: Vec<f32>) -> FloatTensor<Cube> {
-        self.upload(&values)
+        self.upload_vec(values)
     }
 
     fn download(&self, array: &FloatTensor<Cube>) -> Result<Vec<f32>> {

@@ -209,22 +209,26 @@ impl<'a> Pixels<'a> {
             None if self.reference_sampling => gpu::PixelOrder::EachView,
             None => gpu::PixelOrder::Random,
         };
-        let views = (0..self.views.len()).map(|v| self.drawn_view(v));
-        gpu::Photographs::new(device, views, self.radius, order, drawing, largest)
+        // packed as many at a time as there are threads, for packed photographs are as large as these
+        let (count, threads) = (self.views.len(), rayon::current_num_threads());
+        let some = |first: usize| -> Vec<gpu::DrawnView> {
+            (first..count.min(first + threads)).into_par_iter().map(|v| self.drawn_view(v)).collect()
+        };
+        let views = (0..count).step_by(threads).flat_map(some);
+        gpu::Photographs::new(device, views, &self.buffers_on_device(largest), self.radius, order, drawing)
     }
 
-    /// Bytes that the photographs take on a device with their bits and what counts these, and how many buffers of
-    /// `largest` bytes at most.
+    /// Pixels in each buffer of the photographs on a device where a buffer has `largest` bytes at most.
     #[cfg(feature = "wgpu")]
-    pub fn bytes_on_device(&self, largest: u64) -> (u64, usize) {
-        let (mut bytes, mut buffers, mut last) = (0, 1, 0);
-        for view in &self.drawable {
-            let area = part(view)[2] as u64 * part(view)[3] as u64;
-            (buffers, last) =
-                if last + 4 * area > largest { (buffers + 1, 4 * area) } else { (buffers, last + 4 * area) };
-            bytes += 4 * area + if self.order.is_some() { 8 } else { 4 } * area.div_ceil(32);
+    pub fn buffers_on_device(&self, largest: u64) -> Vec<u64> {
+        let mut buffers = vec![0];
+        for area in self.drawable.iter().map(|view| part(view)[2] as u64 * part(view)[3] as u64) {
+            match buffers.last_mut() {
+                Some(last) if 4 * (*last + area) <= largest => *last += area,
+                _ => buffers.push(area),
+            }
         }
-        (bytes, buffers)
+        buffers
     }
 
     /// The drawable part of a view, packed.

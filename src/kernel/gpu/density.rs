@@ -8,7 +8,9 @@ use super::losses::sum;
 use super::march::{Samples, prefix_sum};
 use super::sdf::kernels::{harmonics, masked, prepare, reduce};
 use super::sdf::{SUMMING, ends};
-use super::tile::{CHANNELS, LANES, UNITS, at, gate, load, narrow, outer, product, put, relu, save, sigmoid};
+use super::tile::{
+    CHANNELS, LANES, UNITS, at, gate, load, narrow, outer, product, put, relu, save, sigmoid, uniform_count,
+};
 use super::weight_norm::finite;
 use crate::kernel::cpu::density::{COLOR_INPUTS, DARK, DISTORTION, DensityShape, FEATURES, HIDDEN, STEEPEST};
 use crate::kernel::cpu::losses::{RAY_TERMS, SAMPLE_TERMS, TERMS};
@@ -81,7 +83,7 @@ fn forward(
     let here = tile * LANES + row;
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
-    if tile * TILE < count[0] as usize {
+    if tile * TILE < uniform_count(count, &mut a) {
         features(&mut a, value, plane, here, row, column, comptime!(plan.features));
         sync_cube();
         let first =
@@ -160,11 +162,11 @@ fn backward(
     let inputs = comptime!(plan.features);
     let plane = direction.len() / 3;
     let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
-    let samples = count[0] as usize;
     let group = CUBE_POS;
     let sum = group * comptime!(own[5] * CHANNELS);
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    let samples = uniform_count(count, &mut a);
     for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
         let here = tile * LANES + row;
         let first = 4 * here;

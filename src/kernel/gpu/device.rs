@@ -3,18 +3,22 @@
 use crate::{Error, Result};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Cube, CubeDevice, WgpuBackend, WgpuDevice, WgpuDeviceKind};
+use burn::cubecl::bytes::Bytes;
 use burn::cubecl::device::CudaDevice;
 use burn::cubecl::features::AtomicUsage;
+use burn::cubecl::future;
 use burn::cubecl::ir::{ElemType, FloatKind, Type};
 use burn::cubecl::prelude::{BufferArg, Client, CubeCount};
 use burn::cubecl::server::Handle;
-use burn::tensor::{Bytes, DType, Element};
+use burn::cubecl::wgpu::wgpu;
+use burn::tensor::{DType, Element};
 use bytemuck::Pod;
+use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::ops::Range;
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, Once};
+use std::sync::{Mutex, Once, OnceLock};
 
 /// The first error of wgpu since a device was read. CubeCL turns such an error into a panic on a thread of its own, whose
 /// launches are lost while reads go on answering.
@@ -54,6 +58,7 @@ pub enum Atomics {
 pub struct Device {
     device: CubeDevice,
     client: Client,
+    driver: String,
     atomics: Atomics,
     memory: Option<u64>,
     launches: AtomicUsize,
@@ -99,44 +104,84 @@ pub struct Adapter {
     device: CubeDevice,
     /// `vulkan`, `metal`, `dx12` or `cuda`.
     pub api: &'static str,
-    /// `discrete`, `integrated`, `virtual` or `software`.
+    /// `discrete`, `integrated`, `virtual`, `other` (some virtual machines say no more) or `software`.
     pub kind: &'static str,
     /// Does the processor do the work?
     pub software: bool,
+    /// The driver and its version; empty where it does not say.
+    pub driver: String,
 }
 
+/// What the adapters of a machine are called, the fastest kind first.
+const KINDS: [&str; 5] = ["discrete", "integrated", "virtual", "other", "software"];
+
 impl Adapter {
-    /// All of this machine, the fastest kind first, CUDA's behind all others. A card that has several APIs is there once for each.
-    pub fn all() -> Vec<Adapter> {
-        use WgpuDeviceKind::{Cpu, DiscreteGpu, IntegratedGpu, VirtualGpu};
-        let kinds = [
-            (DiscreteGpu(0), "discrete"),
-            (IntegratedGpu(0), "integrated"),
-            (VirtualGpu(0), "virtual"),
-            (Cpu, "software"),
-        ];
-        let apis =
-            [(WgpuBackend::Vulkan, "vulkan"), (WgpuBackend::Metal, "metal"), (WgpuBackend::Dx12, "dx12")];
-        let mut all = Vec::new();
-        for (like, kind) in kinds {
-            for (backend, api) in apis {
-                let id = CubeDevice::from(WgpuDevice::new(like.clone()).on(backend)).to_id();
-                let found = CubeDevice::enumerate(id).into_iter().map(CubeDevice::from_id);
-                all.extend(found.map(|device| Adapter { device, api, kind, software: like == Cpu }));
-            }
-        }
-        all.extend(Adapter::of_cuda());
-        all
+    /// Returns every adapter of this machine, the fastest kind first, those of CUDA behind all others. A card that several
+    /// APIs reach is listed once for each. The drivers are asked by the first call of a process alone.
+    pub fn all() -> &'static [Adapter] {
+        static ALL: OnceLock<Vec<Adapter>> = OnceLock::new();
+        ALL.get_or_init(|| Adapter::of_wgpu().into_iter().chain(Adapter::of_cuda()).collect())
     }
 
-    /// Those that CUDA reaches, where it is built in: none without NVIDIA's driver.
+    /// Returns those that wgpu reaches, from one instance of all APIs.
+    fn of_wgpu() -> Vec<Adapter> {
+        use WgpuDeviceKind::{Cpu, DiscreteGpu, IntegratedGpu, Other, VirtualGpu};
+        const APIS: [(wgpu::Backend, WgpuBackend, &str); 3] = [
+            (wgpu::Backend::Vulkan, WgpuBackend::Vulkan, "vulkan"),
+            (wgpu::Backend::Metal, WgpuBackend::Metal, "metal"),
+            (wgpu::Backend::Dx12, WgpuBackend::Dx12, "dx12"),
+        ];
+        let backends = APIS.iter().fold(wgpu::Backends::empty(), |all, &(api, ..)| all | api.into());
+        let descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
+        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor { backends, ..descriptor });
+        let mut found = Vec::new();
+        // CubeCL numbers the adapters of an API and kind in the order of this list
+        let mut numbers = BTreeMap::new();
+        for adapter in future::block_on(instance.enumerate_adapters(backends)) {
+            let info = adapter.get_info();
+            let Some(api) = APIS.iter().position(|&(api, ..)| api == info.backend) else { continue };
+            let (_, backend, word) = APIS[api];
+            let kind = match info.device_type {
+                wgpu::DeviceType::DiscreteGpu => 0,
+                wgpu::DeviceType::IntegratedGpu => 1,
+                wgpu::DeviceType::VirtualGpu => 2,
+                wgpu::DeviceType::Other => 3,
+                wgpu::DeviceType::Cpu => 4,
+            };
+            let next = numbers.entry((kind, api)).or_insert(0);
+            let number = std::mem::replace(next, *next + 1);
+            let like = match kind {
+                0 => DiscreteGpu(number),
+                1 => IntegratedGpu(number),
+                2 => VirtualGpu(number),
+                3 => Other(number),
+                // CubeCL opens the first one alone
+                _ if number > 0 => continue,
+                _ => Cpu,
+            };
+            let adapter = Adapter {
+                device: CubeDevice::from(WgpuDevice::new(like).on(backend)),
+                api: word,
+                kind: KINDS[kind],
+                software: kind == 4,
+                driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+            };
+            found.push(((kind, api, number), adapter));
+        }
+        found.sort_by_key(|(order, _)| *order);
+        found.into_iter().map(|(_, adapter)| adapter).collect()
+    }
+
+    /// Returns those that CUDA reaches, where it is built in: none without NVIDIA's driver.
     fn of_cuda() -> Vec<Adapter> {
         if !cfg!(feature = "cuda") {
             return Vec::new();
         }
         let id = CubeDevice::Cuda(CudaDevice::default()).to_id();
         let found = CubeDevice::enumerate(id).into_iter().map(CubeDevice::from_id);
-        found.map(|device| Adapter { device, api: "cuda", kind: "discrete", software: false }).collect()
+        let adapter =
+            |device| Adapter { device, api: "cuda", kind: KINDS[0], software: false, driver: String::new() };
+        found.map(adapter).collect()
     }
 }
 
@@ -150,8 +195,11 @@ impl Device {
         let native = client.properties().atomic_type_usage(float).contains(AtomicUsage::Add);
         let atomics = if native { Atomics::Native } else { Atomics::Exchange };
         let memory = client.properties().memory.max_memory();
+        let compiles_for = &client.properties().identity.fingerprint;
+        let driver = [adapter.driver.as_str(), compiles_for].into_iter().find(|text| !text.is_empty());
+        let driver = driver.unwrap_or_default().to_owned();
         let (launches, readbacks) = (AtomicUsize::new(0), AtomicUsize::new(0));
-        Device { device, client, atomics, memory, launches, readbacks }
+        Device { device, client, driver, atomics, memory, launches, readbacks }
     }
 
     /// As the adapter names itself.
@@ -159,9 +207,9 @@ impl Device {
         &self.client.properties().identity.name
     }
 
-    /// What the driver compiles for.
+    /// The driver and its version; what it compiles for where it does not say.
     pub fn driver(&self) -> &str {
-        &self.client.properties().identity.fingerprint
+        &self.driver
     }
 
     /// Where the card is plugged in; none where there is no card.
@@ -214,14 +262,22 @@ impl Device {
 
     /// Copies values to the device.
     pub fn upload<T: Element>(&self, values: &[T]) -> Buffer {
-        let handle = self.client.create_from_slice(bytemuck::cast_slice(values));
-        self.tensor(handle, values.len(), T::dtype())
+        self.upload_vec(values.to_vec())
     }
 
-    /// The same of values that nobody needs any more: without a copy of them on the host.
+    /// As [`Device::upload`], without another copy on the host.
     pub fn upload_vec<T: Element>(&self, values: Vec<T>) -> Buffer {
         let words = values.len();
         self.tensor(self.client.create(Bytes::from_elems(values)), words, T::dtype())
+    }
+
+    /// Copies values into a buffer, from its word `first` on. They are sent at once: the driver keeps a copy until then.
+    pub(super) fn write<T: Element>(&self, into: &Buffer, first: usize, values: Vec<T>) {
+        let behind = into.words() - first - values.len();
+        let handle = into.handle.clone().offset_start(4 * first as u64).offset_end(4 * behind as u64);
+        self.client.write(&handle, Bytes::from_elems(values));
+        // what fails here fails the next read, too
+        let _ = self.client.flush();
     }
 
     /// Memory of **arbitrary contents**: a kernel writes it before another reads it.
@@ -231,7 +287,7 @@ impl Device {
 
     /// Memory of zeros.
     pub fn zeros<T: Element>(&self, words: usize) -> Buffer {
-        self.upload(&vec![T::zeroed(); words.max(1)])
+        self.upload_vec(vec![T::zeroed(); words.max(1)])
     }
 
     fn tensor(&self, handle: Handle, words: usize, dtype: DType) -> Buffer {

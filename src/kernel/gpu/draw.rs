@@ -549,28 +549,30 @@ pub struct Photographs {
 }
 
 impl Photographs {
-    /// Copies photographs to the device, one after the other, into buffers of `largest` bytes at most; the field's
-    /// coordinates are the scene's times `radius`.
+    /// Copies photographs to the device, one after the other, into buffers of so many pixels, each photograph into the first
+    /// that has room; the field's coordinates are the scene's times `radius`.
     ///
     /// # Panics
     ///
-    /// Where no pixel is drawable, 2³² pixels are, or [`BUFFERS`] buffers do not hold them.
+    /// Where no pixel is drawable, 2³² pixels are, or there are more than [`BUFFERS`] buffers.
     pub fn new(
         device: &Device,
         seen: impl Iterator<Item = DrawnView>,
+        buffers: &[u64],
         radius: f32,
         order: PixelOrder,
         drawing: SamplingOptions,
-        largest: u64,
     ) -> Photographs {
+        assert!(buffers.len() <= BUFFERS, "{} buffers of pixels", buffers.len());
+        let pixels: [Buffer; BUFFERS] =
+            std::array::from_fn(|b| device.scratch::<u32>(buffers.get(b).map_or(1, |&n| n as usize)));
         let (mut views, mut drawable, mut before) = (Vec::new(), Vec::new(), Vec::new());
-        let (mut pixels, mut full) = (Vec::new(), Vec::new());
-        let mut cumulative = 0u32;
+        let (mut cumulative, mut buffer, mut first) = (0u32, 0, 0);
         for view in seen {
             let area = (view.part[2] * view.part[3]) as usize;
             assert!(view.pixels.len() == area && view.drawable.len() == area.div_ceil(32));
-            if 4 * (pixels.len() + area) as u64 > largest {
-                full.push(device.upload_vec(std::mem::take(&mut pixels)));
+            if (first + area) as u64 > buffers[buffer] {
+                (buffer, first) = (buffer + 1, 0);
             }
             let mut own = 0;
             for word in &view.drawable {
@@ -578,24 +580,17 @@ impl Photographs {
                 own += word.count_ones();
             }
             cumulative = cumulative.checked_add(own).expect("fewer than 2³² pixels");
-            views.extend(view.words(cumulative, [pixels.len(), full.len(), drawable.len()], radius));
-            pixels.extend(view.pixels);
+            views.extend(view.words(cumulative, [first, buffer, drawable.len()], radius));
             drawable.extend(view.drawable);
+            if area > 0 {
+                device.write(&pixels[buffer], first, view.pixels);
+            }
+            first += area;
         }
         assert!(cumulative > 0, "no pixel is drawable");
-        full.push(device.upload_vec(pixels));
-        assert!(full.len() <= BUFFERS, "{} buffers of pixels", full.len());
-        full.resize_with(BUFFERS, || device.zeros::<u32>(1));
         before.truncate(if order.is_permuted() { usize::MAX } else { 1 });
-        Photographs {
-            views: device.upload_vec(views),
-            pixels: full.try_into().unwrap_or_else(|_| unreachable!("as many as were made")),
-            drawable: device.upload_vec(drawable),
-            before: device.upload_vec(before),
-            count: cumulative,
-            order,
-            drawing,
-        }
+        let [views, drawable, before] = [views, drawable, before].map(|words| device.upload_vec(words));
+        Photographs { views, pixels, drawable, before, count: cumulative, order, drawing }
     }
 
     /// Draws the rays of a step: a function of seed and step alone. Of large photographs each stands for a square of

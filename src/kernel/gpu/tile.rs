@@ -31,6 +31,25 @@ pub fn at(channel: usize, row: usize, #[comptime] lanes: usize) -> usize {
     channel * lanes + (row ^ (channel % lanes))
 }
 
+/// The first word of `count`, through a tile that nothing lies in yet. All threads read it there behind a barrier: FXC,
+/// the older compiler of DX12, refuses barriers in loops and branches whose condition it reads from a buffer. Tiles
+/// take all the memory that a group has on some adapters, so the word is two whole numbers in floats.
+#[cube]
+pub fn uniform_count(count: &[u32], tile: &mut [F4]) -> usize {
+    if UNIT_POS == 0 {
+        let n = count[0];
+        let mut halves = F4::new(0.0f32);
+        halves.insert(0usize, f32::cast_from(n >> 16u32));
+        halves.insert(1usize, f32::cast_from(n & 65_535u32));
+        tile[0] = halves;
+    }
+    sync_cube();
+    let halves = tile[0];
+    sync_cube();
+    let n = (u32::cast_from(halves.extract(0usize)) << 16u32) | u32::cast_from(halves.extract(1usize));
+    n as usize
+}
+
 /// Four channels of a thread's vector of samples.
 #[derive(CubeType, Clone, Copy)]
 pub struct Block {

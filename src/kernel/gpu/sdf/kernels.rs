@@ -177,7 +177,8 @@ pub(super) fn forward(
     let here = tile * LANES + row;
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
-    if tile * TILE < count[0] as usize {
+    let samples = tile::uniform_count(count, &mut a);
+    if tile * TILE < samples {
         geometry_inputs(&mut a, value, x, inv_radius, plane, here, row, column, features);
         sync_cube();
         let z = product(&a, 0usize, w, comptime!(rows[0]), comptime!(plan.padded), row, column, LANES);
@@ -292,11 +293,11 @@ pub(super) fn color_backward(
     let own = comptime!(plan.gradients());
     let plane = direction.len() / 3;
     let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
-    let samples = count[0] as usize;
     let group = CUBE_POS;
     let sum = group * comptime!(own[7] * CHANNELS);
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
+    let samples = tile::uniform_count(count, &mut a);
     for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
         let here = tile * LANES + row;
         let first = 4 * here;
@@ -400,7 +401,8 @@ pub(super) fn geometry_backward(
     let sum = group * comptime!(own[7] * CHANNELS);
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
-    for tile in range_stepped(group, (count[0] as usize).div_ceil(TILE), CUBE_COUNT) {
+    let samples = tile::uniform_count(count, &mut a);
+    for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
         let here = tile * LANES + row;
         let fresh = tile == group;
         // g_q in the first channels, g_o behind them

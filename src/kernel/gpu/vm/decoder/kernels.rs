@@ -223,9 +223,9 @@ pub(super) fn forward(
     let rows = comptime!(plan.rows());
     let columns = comptime!(tile::columns(lanes));
     let (row, column) = (UNIT_POS as usize / columns, UNIT_POS as usize % columns);
-    let samples = count[0] as usize;
     let mut a = Shared::<[F4]>::new_slice(comptime!(width * lanes));
     let mut b = Shared::<[F4]>::new_slice(comptime!(width * lanes));
+    let samples = tile::uniform_count(count, &mut a);
     for tile in range_stepped(CUBE_POS, samples.div_ceil(comptime!(4 * lanes)), CUBE_COUNT) {
         let h1 =
             first(&mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan);
@@ -291,10 +291,10 @@ pub(super) fn backward(
     let (rows, own) = comptime!((plan.rows(), plan.gradients()));
     let columns = comptime!(tile::columns(lanes));
     let (row, column) = (UNIT_POS as usize / columns, UNIT_POS as usize % columns);
-    let samples = count[0] as usize;
     let sum = CUBE_POS * comptime!(own[6] * width);
     let mut a = Shared::<[F4]>::new_slice(comptime!(width * lanes));
     let mut b = Shared::<[F4]>::new_slice(comptime!(width * lanes));
+    let samples = tile::uniform_count(count, &mut a);
     let start = from as usize / comptime!(4 * lanes);
     let end = min(samples, from as usize + limit as usize).div_ceil(comptime!(4 * lanes));
     for tile in range_stepped(start + CUBE_POS, end, CUBE_COUNT) {
