@@ -126,7 +126,7 @@ mod tests {
             fs::write(path, "x").unwrap();
         };
         // the demo's own photographs lie in its run
-        ["config.toml", "capture/transforms.json", "capture/images/000.png"].map(put);
+        ["config.toml", "capture/transforms.json", "capture/images/000.png"].into_iter().for_each(put);
         assert!(is_run(dir.path()));
         // beside the settings it is a capture, until a stage was done there
         put("transforms.json");
