@@ -345,15 +345,13 @@ learned from (capture.tiles): the blend follows the better members.")]
   tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
   tiface preview runs/002_00 --watch            a page of a run while it works, in watch.html there")]
     Preview(PreviewOptions),
-    /// Speed against error of each decision, measured on this machine: tables, plots, a page
+    /// Speed against error of each decision, measured on this machine: tables, a page
     #[cfg(feature = "cpu")]
     #[command(after_long_help = "Examples:
-  tiface bench                                  all of it on the demo head, a quarter of an hour on two cores
-  tiface bench captures/002_00 --sweep steps,render
-  tiface bench runs/002_00 --sweep extraction,triangles,texture --truth truth.ply
-  tiface bench --out bench/new/ --compare bench/demo/bench.json    what got slower or worse since then
+  tiface bench captures/002_00 --sweep steps,hash
+  tiface bench runs/002_00 --sweep triangles,texture      with the fields of a run
 
-Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep.")]
+Results lie in bench/NAME/: bench.json and bench.html.")]
     Bench(BenchOptions),
     /// The paper's tables and ablations over captures, beside the published figures
     #[cfg(feature = "cpu")]
@@ -364,7 +362,7 @@ Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for e
   tiface experiment captures/* --only 002_00/tface-ce    one of them, for a cluster; tables fill as they come
   tiface experiment captures/* --published figures.csv   a line is: tface,l2-reference,masked,30.1
 
-Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md, .csv, .json and .html.")]
+Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md and experiment.json.")]
     Experiment(ExperimentOptions),
     /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates
     #[command(after_long_help = "Examples:
