@@ -24,7 +24,6 @@ pub(super) fn run(common: &Common) -> Result<()> {
     let features = [
         ("cpu", cfg!(feature = "cpu")),
         ("wgpu", cfg!(feature = "wgpu")),
-        ("cuda", cfg!(feature = "cuda")),
         ("matting", cfg!(feature = "matting")),
     ];
     #[cfg(feature = "wgpu")]
