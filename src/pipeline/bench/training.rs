@@ -2,7 +2,6 @@
 
 use super::judge::Judge;
 use super::{Bench, PSNR, timed};
-use crate::capture::scene::Scene;
 use crate::config::{Config, Method};
 use crate::field::training::TrainingSession;
 use crate::io;
