@@ -1,5 +1,4 @@
 //! `tiface bench` as a user sees it, on a capture of a few small photographs.
-#![cfg(feature = "cpu")]
 
 mod command;
 
