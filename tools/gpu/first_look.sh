@@ -87,31 +87,37 @@ train() {
     per_step "$name" "$work/$name/$stage/log.jsonl" || wrong "$name did not train, see $name.txt"
 }
 
-# The capture: the one that is named, or photographs of the demo head.
+# The capture: the one that is named, or photographs of the demo head, whose fields are hardly trained here.
 capture() {
-  if [ -n "${CAPTURE:-}" ]; then echo "$CAPTURE"; return; fi
-  [ -d "$work/demo/capture" ] || "$program" demo --run "$work/demo" --until mask --quiet > "$out/capture.txt" 2>&1
+  if [ -n "${CAPTURE:-}" ]; then (cd "$CAPTURE" && pwd); return; fi
+  [ -d "$work/demo/capture" ] ||
+    "$program" demo --run "$work/demo" --device cpu --quiet "${photographs[@]}" "${tiny[@]}" > "$out/capture.txt" 2>&1
   echo "$work/demo/capture"
 }
 
+photographs=(--size 256x320 --views 32)
+# Settings under which every stage takes seconds
+tiny=(--preset draft --set iface.steps=4 --set iface.samples=4096 --set iface.levels=6 --set iface.log2_table=12
+  --set tface.steps=4 --set tface.fields=1 --set tface.rays=256 --set tface.voxels_start=4096 --set tface.voxels_final=13824
+  --set tface.upsample_steps=2 --set tface.mask_steps=2 --set baseline.steps=4 --set mesh.resolution=48
+  --set mesh.texture_px=256 --set mesh.triangles=4000)
 # The paper's preset expects a box that fits the head.
 paper=(--preset paper --set capture.box=head)
-# So long a demo as the share allows
-demo=(--preset draft --quiet --set "iface.steps=$(some 1500)" --set "tface.steps=$(some 400)" --set "baseline.steps=$(some 200)")
+standard=(--preset standard)
+demo=(--preset draft --quiet)
+small=(--preset draft)
 if [ "$share" -lt 100 ]; then
-  demo+=(--set tface.fields=1 --set tface.voxels_start=4096 --set tface.voxels_final=13824 --set tface.upsample_steps=2
-    --set tface.mask_steps=2 --set mesh.resolution=48 --set mesh.texture_px=256 --set mesh.triangles=4000)
-  paper=(--preset draft --set tface.voxels_start=4096 --set tface.voxels_final=13824 --set tface.upsample_steps=2
-    --set tface.mask_steps=2 --set tface.rays=256)
+  photographs=(--size 64x80 --views 12)
+  paper=("${tiny[@]}") standard=("${tiny[@]}") demo=("${tiny[@]}" --quiet) small=("${tiny[@]}")
 fi
-# samples N: as many samples of a step, a tenth of them with a small share
+# samples N: as many samples of a step, fewer of them with a small share
 samples() { [ "$share" -ge 100 ] && echo "$1" || echo $(($1 / 64)); }
 
 part_doctor() {
   timed doctor_cold "$program" doctor --json || wrong "the self-test failed, see doctor_cold.txt"
   timed doctor_warm "$program" doctor --json
-  timed demo_gpu "$program" demo --run "$work/demo_gpu" --device "$device" "${demo[@]}" || wrong "no demo on $device, see demo_gpu.txt"
-  timed demo_cpu "$program" demo --run "$work/demo_cpu" --device cpu "${demo[@]}" || wrong "no demo on the CPU, see demo_cpu.txt"
+  timed demo_gpu "$program" demo --run "$work/demo_gpu" --device "$device" "${photographs[@]}" "${demo[@]}" || wrong "no demo on $device, see demo_gpu.txt"
+  timed demo_cpu "$program" demo --run "$work/demo_cpu" --device cpu "${photographs[@]}" "${demo[@]}" || wrong "no demo on the CPU, see demo_cpu.txt"
   local of stage
   for of in gpu cpu; do
     for stage in iface tface; do per_step "demo_$of $stage" "$work/demo_$of/$stage/log.jsonl"; done
@@ -150,7 +156,7 @@ part_steps() {
     train "samples_$n" iface 3000 "${paper[@]}" --set "iface.samples=$(samples $n)"
   done
   for tasks in 4 32 128; do
-    CUBECL_WGPU_MAX_TASKS=$tasks train "tasks_$tasks" iface 3000 --preset standard --set "iface.samples=$(samples 24576)"
+    CUBECL_WGPU_MAX_TASKS=$tasks train "tasks_$tasks" iface 3000 "${standard[@]}" --set "iface.samples=$(samples 24576)"
   done
   for n in 1 2; do
     train "deterministic_$n" iface 1000 "${paper[@]}" --deterministic --set "iface.samples=$(samples 262144)"
@@ -165,9 +171,7 @@ part_steps() {
 }
 
 part_product() {
-  local small=()
-  [ "$share" -ge 100 ] || small=("${demo[@]}")
-  timed product "$program" run "$(capture)" --run "$work/product" --device "$device" --preset standard --quiet "${small[@]}" ||
+  timed product "$program" run "$(capture)" --run "$work/product" --device "$device" --quiet "${standard[@]}" ||
     wrong "the capture was not reconstructed, see product.txt"
   "$program" status "$work/product" --json > "$out/product_status.json" 2>&1
   for stage in "$work"/product/*/done.json; do
@@ -177,7 +181,7 @@ part_product() {
 }
 
 part_resume() {
-  local steps half size=(--preset draft --set "iface.samples=$(samples 262144)")
+  local steps half size=("${small[@]}" --set "iface.samples=$(samples 262144)")
   steps=$(some 2000)
   half=$((steps / 2))
   local moved=("$program" iface "$(capture)" --run "$work/moved" --quiet "${size[@]}" --set iface.checkpoint_s=0.05 --set "iface.steps=$steps")
