@@ -2,7 +2,7 @@
 //! texture of 2048², 1024 × 1024 pixels.
 //!
 //! ```text
-//! cargo bench --no-default-features --bench raster
+//! cargo bench --bench raster
 //! ```
 //!
 //! CPU time (user + system of the process) does not depend on what else the machine does, nor on the number of threads.

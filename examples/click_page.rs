@@ -1,6 +1,6 @@
 //! Writes the page to click on, for a capture or, without one, for a small analytic head.
 //!
-//! `cargo run --release --no-default-features --example click_page -- PAGE.html [CAPTURE]`
+//! `cargo run --release --example click_page -- PAGE.html [CAPTURE]`
 //!
 //! Clicks that lie in the capture already (`prompts.json`) are shown.
 

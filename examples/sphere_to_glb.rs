@@ -1,6 +1,6 @@
 //! Writes a colored ball, 20 cm across, as sphere.glb, sphere.obj and sphere.ply.
 //!
-//! `cargo run --no-default-features --example sphere_to_glb -- FOLDER`
+//! `cargo run --example sphere_to_glb -- FOLDER`
 //!
 //! Its world is +Z up, as many captures' are: GLB and OBJ stand it upright, PLY leaves it as it is.
 //! `tools/readers` opens all three with other people's programs and compares.

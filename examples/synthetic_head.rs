@@ -1,6 +1,6 @@
 //! Makes a small capture of an analytic head: known cameras, masks and surface.
 //!
-//! `cargo run --release --no-default-features --example synthetic_head -- FOLDER`
+//! `cargo run --release --example synthetic_head -- FOLDER`
 
 use std::{path::PathBuf, time::Instant};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};

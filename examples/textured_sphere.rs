@@ -1,6 +1,6 @@
 //! Writes a textured ball, 20 cm across, as a GLB, an OBJ and a PLY, and as GLBs with everything else.
 //!
-//! `cargo run --no-default-features --example textured_sphere -- FOLDER`
+//! `cargo run --example textured_sphere -- FOLDER`
 //!
 //! A map of the world: u runs around, v from pole to pole, so one meridian is a seam. `tools/readers`
 //! opens all of them with other people's programs.

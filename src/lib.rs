@@ -58,7 +58,6 @@ pub mod config;
 pub mod run;
 
 pub mod capture;
-#[cfg(feature = "cpu")]
 pub mod field;
 #[cfg(feature = "matting")]
 mod onnx;
@@ -68,7 +67,6 @@ pub mod mask;
 
 pub mod tface;
 
-#[cfg(feature = "cpu")]
 pub mod iface;
 pub mod mesh;
 

@@ -1,5 +1,4 @@
 //! The command line as a user sees it: exit codes, messages, streams.
-#![cfg(feature = "cpu")]
 
 mod command;
 

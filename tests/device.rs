@@ -1,6 +1,6 @@
 //! A whole run on a device, killed on the way and finished on the processor; on a software driver where nothing better
 //! is here.
-#![cfg(all(feature = "wgpu", feature = "cpu", unix))]
+#![cfg(all(feature = "wgpu", unix))]
 
 mod command;
 

@@ -3,7 +3,7 @@
 //!
 //! The program is the real one; a library in front of the C library (`fault/fault.c`) lets the n-th change of a file
 //! fail. Of every command some n are tried, spread evenly; `TIFACE_FAULTS=all` tries all of them.
-#![cfg(all(feature = "cpu", target_os = "linux"))]
+#![cfg(target_os = "linux")]
 
 mod tiny;
 

@@ -1,5 +1,4 @@
 //! A finished run in its user's hands: turntables, single stages, a capture that has moved.
-#![cfg(feature = "cpu")]
 
 mod command;
 

@@ -1,5 +1,4 @@
 //! `tiface preview` as a user sees it, of files that others write.
-#![cfg(feature = "cpu")]
 
 mod command;
 

@@ -1,5 +1,5 @@
 //! Stop and kill at any moment, repeat the command: the result is the one of an undisturbed run.
-#![cfg(all(feature = "cpu", unix))]
+#![cfg(unix)]
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};

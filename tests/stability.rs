@@ -1,5 +1,4 @@
 //! Every hard case stays below its bound.
-#![cfg(feature = "cpu")]
 
 #[path = "support/stability/mod.rs"]
 mod stability;

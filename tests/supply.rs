@@ -8,7 +8,7 @@ fn read(name: &str) -> String {
     std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).unwrap()
 }
 
-/// Name, what stands behind the version, and license of every crate in the program, without the feature `cuda`.
+/// Name, what stands behind the version, and license of every crate in the program.
 fn crates() -> Vec<(String, String, String)> {
     let output = Command::new(env!("CARGO"))
         .args([

@@ -1,6 +1,5 @@
 //! Short trainings from one end of the line to the other: from photographs without masks to closed meshes at several
 //! resolutions, of one capture in two formats, and of photographs at full size.
-#![cfg(feature = "cpu")]
 
 mod command;
 

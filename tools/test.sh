@@ -165,11 +165,9 @@ demo_pages() {
 
 step "independent readers are here" readers
 step "format" cargo fmt --all -- --check
-# Everything is checked once with all features (but for `cuda`, which adds no code of ours and downloads LLVM), and the
-# default ones and the core alone (no burn) by themselves; then built once.
-step "lints, all features but cuda" cargo clippy --release --all-targets --features matting,wgpu -- -D warnings
-step "lints, default features" cargo clippy --release -- -D warnings
-step "lints, without the learned fields" cargo clippy --release --no-default-features --lib -- -D warnings
+# Everything is checked once with all features, and once without any; then built once.
+step "lints, all features" cargo clippy --release --all-targets --features matting,wgpu -- -D warnings
+step "lints, no features" cargo clippy --release -- -D warnings
 step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting,wgpu --no-deps
 step "build" cargo build --release --features matting,wgpu --bins --examples
 step "ONNX Runtime is here" onnx_runtime

@@ -6,6 +6,7 @@ use super::masks::{self, few};
 use super::scene::{self, SceneOptions};
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::Error;
+use crate::config::MaskMeaning;
 use crate::geom::Aabb;
 use crate::image::Gray;
 use glam::{DVec3, Vec3};
@@ -172,7 +173,10 @@ pub fn inspect(root: &Path, options: &CaptureOptions) -> Inspection {
     out.warnings = capture.warnings.clone();
     out.up = Some(capture.up);
     cameras(&capture, &mut out);
-    let masks = pixels(&capture, options, &mut out);
+    let mut masks = pixels(&capture, options, &mut out);
+    if options.mask_meaning == MaskMeaning::Ignore {
+        masks.fill(None); // what a mask calls "not looked at" may still hold head
+    }
     place(&capture, masks, &mut out);
     out.problems.extend(grouped(masks::require_masks(&capture, options).err().as_slice()));
     out
@@ -339,5 +343,24 @@ impl fmt::Display for Inspection {
             writeln!(f, "  sound     nothing stands in the way")?;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::synthetic::{SyntheticOptions, write_capture};
+    use crate::config::MaskSource;
+
+    #[test]
+    fn masks_that_say_what_was_not_looked_at_carve_no_head() {
+        let dir = tempfile::tempdir().unwrap();
+        let options = SyntheticOptions { width: 48, height: 60, train: 8, test: 1, seed: 1 };
+        write_capture(dir.path(), &options).unwrap();
+        let scene = |options: CaptureOptions| inspect(dir.path(), &options).scene.unwrap();
+        let bare = scene(CaptureOptions { masks: MaskSource::None, ..CaptureOptions::default() });
+        let ignore = CaptureOptions { mask_meaning: MaskMeaning::Ignore, ..CaptureOptions::default() };
+        assert_eq!(scene(ignore), bare);
+        assert_ne!(scene(CaptureOptions::default()), bare);
     }
 }

@@ -21,12 +21,7 @@ struct Examination {
 }
 
 pub(super) fn run(common: &Common) -> Result<()> {
-    let features = [
-        ("cpu", cfg!(feature = "cpu")),
-        ("wgpu", cfg!(feature = "wgpu")),
-        ("cuda", cfg!(feature = "cuda")),
-        ("matting", cfg!(feature = "matting")),
-    ];
+    let features = [("wgpu", cfg!(feature = "wgpu")), ("matting", cfg!(feature = "matting"))];
     #[cfg(feature = "wgpu")]
     let (devices, auto) = {
         use crate::field::devices::{best, examine};

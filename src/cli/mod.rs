@@ -4,16 +4,13 @@
 //! ([`crate::ErrorKind`]).
 
 mod bar;
-#[cfg(feature = "cpu")]
 mod bench;
 mod check;
 mod completions;
 mod config;
 mod convert;
 mod demo;
-#[cfg(feature = "cpu")]
 mod doctor;
-#[cfg(feature = "cpu")]
 mod experiment;
 mod inspect;
 mod invocation;
@@ -35,11 +32,9 @@ mod viewer;
 use crate::pipeline::Stage;
 use crate::run::Stop;
 use crate::{Error, Result};
-#[cfg(feature = "cpu")]
 use bench::BenchOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
 use completions::Form;
-#[cfg(feature = "cpu")]
 use experiment::ExperimentOptions;
 use invocation::Invocation;
 use options::{Common, KeyOption};
@@ -345,18 +340,14 @@ learned from (capture.tiles): the blend follows the better members.")]
   tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
   tiface preview runs/002_00 --watch            a page of a run while it works, in watch.html there")]
     Preview(PreviewOptions),
-    /// Speed against error of each decision, measured on this machine: tables, plots, a page
-    #[cfg(feature = "cpu")]
+    /// Speed against error of each decision, measured on this machine: tables, a page
     #[command(after_long_help = "Examples:
-  tiface bench                                  all of it on the demo head, a quarter of an hour on two cores
-  tiface bench captures/002_00 --sweep steps,render
-  tiface bench runs/002_00 --sweep extraction,triangles,texture --truth truth.ply
-  tiface bench --out bench/new/ --compare bench/demo/bench.json    what got slower or worse since then
+  tiface bench captures/002_00 --sweep steps,hash
+  tiface bench runs/002_00 --sweep triangles,texture      with the fields of a run
 
-Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for each sweep.")]
+Results lie in bench/NAME/: bench.json and bench.html.")]
     Bench(BenchOptions),
     /// The paper's tables and ablations over captures, beside the published figures
-    #[cfg(feature = "cpu")]
     #[command(after_long_help = "Examples:
   tiface experiment captures/* --scale 0.1      all tables at a tenth of the effort
   tiface experiment captures/002_00 --tables components,iface --out tables/
@@ -364,7 +355,7 @@ Results lie in bench/NAME/: bench.json, bench.html, bench.md and a drawing for e
   tiface experiment captures/* --only 002_00/tface-ce    one of them, for a cluster; tables fill as they come
   tiface experiment captures/* --published figures.csv   a line is: tface,l2-reference,masked,30.1
 
-Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md, .csv, .json and .html.")]
+Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md and experiment.json.")]
     Experiment(ExperimentOptions),
     /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates
     #[command(after_long_help = "Examples:
@@ -423,7 +414,6 @@ those that are done or not begun share lines; -v gives each its own.")]
         explain: Option<String>,
     },
     /// The GPUs here, whether they compute right, and which one `auto` takes
-    #[cfg(feature = "cpu")]
     #[command(after_long_help = "Examples:
   tiface doctor                 drivers, memory, and a self-test of each device; what to paste into a bug report
   tiface doctor --json          the same for programs
@@ -480,15 +470,12 @@ pub fn main() -> ExitCode {
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
         Command::Preview(options) => preview::run(&invocation, options),
-        #[cfg(feature = "cpu")]
         Command::Bench(options) => bench::run(&invocation, options),
-        #[cfg(feature = "cpu")]
         Command::Experiment(options) => experiment::run(&invocation, options),
         Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
         Command::Report { runs, table } => report::run(&invocation, runs, *table),
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),
-        #[cfg(feature = "cpu")]
         Command::Doctor => makes_nothing("doctor").and_then(|()| doctor::run(&common)),
         Command::Completions { form } => Out::find(common.out.as_deref(), "completions")
             .and_then(|out| completions::run(*form, Cli::command(), out.as_ref())),

@@ -30,7 +30,7 @@ pub(super) struct Common {
     /// Set a key of the configuration; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// auto, cpu, wgpu, vulkan, metal, dx12 or cuda, with :N a numbered one
+    /// auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one
     #[arg(long, global = true, env = "TIFACE_DEVICE", hide_env = true)]
     pub device: Option<String>,
     /// On a GPU, sum in whole numbers: the same bytes every time, as on the processor

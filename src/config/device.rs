@@ -1,12 +1,12 @@
 //! The word that names a device: `NAME[:NUMBER][+deterministic][+MEMORYGiB]`.
 
 /// Names of devices.
-const NAMES: [&str; 7] = ["auto", "cpu", "wgpu", "vulkan", "metal", "dx12", "cuda"];
+const NAMES: [&str; 6] = ["auto", "cpu", "wgpu", "vulkan", "metal", "dx12"];
 
 /// A device, and how it is to be used.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DeviceChoice {
-    /// `auto`, `cpu`, `wgpu` (Vulkan, Metal or DX12), `vulkan`, `metal`, `dx12` or `cuda`.
+    /// `auto`, `cpu`, `wgpu` (Vulkan, Metal or DX12), `vulkan`, `metal` or `dx12`.
     pub name: String,
     /// Which of its adapters, from 0.
     pub number: Option<usize>,
@@ -60,7 +60,7 @@ mod tests {
             memory_gib: Some(7.5),
         };
         assert_eq!(all, want);
-        assert_eq!(parsed("cuda:1").unwrap().number, Some(1));
+        assert_eq!(parsed("dx12:1").unwrap().number, Some(1));
         for wrong in [
             "",
             "gpu",
@@ -72,7 +72,7 @@ mod tests {
             "wgpu+fast",
             "wgpu+0GiB",
             "wgpu+NaNGiB",
-            "cuda:",
+            "cuda",
         ] {
             assert_eq!(parsed(wrong), None, "{wrong}");
         }

@@ -160,7 +160,7 @@ const ROOT_KEYS: &[Key] = &[
     ),
     Key::word(
         "device",
-        "Where fields are learned: auto, cpu, wgpu, vulkan, metal, dx12 or cuda, with :N a numbered one; +deterministic and +8GiB \
+        "Where fields are learned: auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one; +deterministic and +8GiB \
          say how.",
     ),
 ];

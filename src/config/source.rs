@@ -142,7 +142,7 @@ fn assign(config: &Config, key: &str, given: RawValue) -> Result<Config> {
         }
         Some(word) if key == "device" && DeviceChoice::parse(word).is_none() => {
             let problem = format!(
-                ": unknown device `{word}`, expected auto, cpu, wgpu, vulkan, metal, dx12 or cuda, with :N a numbered one"
+                ": unknown device `{word}`, expected auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one"
             );
             return Err(wrong(key, &problem));
         }

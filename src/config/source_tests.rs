@@ -90,7 +90,7 @@ fn a_wrong_type_and_a_wrong_word_say_what_is_expected() {
     let e = from("", &["capture.mask_dir=~/masks"]).unwrap_err();
     assert!(e.to_string().contains("write the whole path"), "{e}");
     let e = from("", &["device=gpu"]).unwrap_err();
-    assert!(e.to_string().contains("expected auto, cpu, wgpu, vulkan, metal, dx12 or cuda"), "{e}");
+    assert!(e.to_string().contains("expected auto, cpu, wgpu, vulkan, metal or dx12"), "{e}");
     assert!(from("", &["device=wgpu:1"]).is_ok());
     assert!(from("preset = \"best\"", &[]).is_err());
     let e = from("", &["mesh.resolution"]).unwrap_err();

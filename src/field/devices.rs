@@ -25,7 +25,7 @@ pub struct Gpu {
     pub auto_selected: bool,
 }
 
-/// Opens the GPU that is named: an API (`wgpu` is any but CUDA) and a number among its adapters. Without a number it is the
+/// Opens the GPU that is named: an API (`wgpu` is any) and a number among its adapters. Without a number it is the
 /// first one that is no software.
 ///
 /// # Errors
@@ -34,8 +34,7 @@ pub struct Gpu {
 pub fn open(choice: &DeviceChoice) -> Result<Gpu> {
     let (api, number) = (choice.name.as_str(), choice.number);
     let name = number.map_or(api.to_string(), |number| format!("{api}:{number}"));
-    let adapters: Vec<&Adapter> =
-        Adapter::all().iter().filter(|a| a.api == api || (api == "wgpu" && a.api != "cuda")).collect();
+    let adapters: Vec<&Adapter> = Adapter::all().iter().filter(|a| a.api == api || api == "wgpu").collect();
     let chosen: Vec<&Adapter> = match number {
         Some(number) => adapters.get(number).copied().into_iter().collect(),
         None => adapters.iter().copied().filter(|adapter| !adapter.software).collect(),
@@ -74,10 +73,6 @@ fn opened(adapter: &Adapter, choice: &DeviceChoice) -> Device {
 
 fn missing(name: &str, api: &str, adapters: &[&Adapter]) -> Error {
     let problem = match adapters {
-        [] if api == "cuda" && !cfg!(feature = "cuda") => {
-            let problem = format!("device `{name}`: this build knows no CUDA");
-            return Error::usage(problem, "build with `--features cuda`, or choose `--device vulkan`");
-        }
         [] => format!("device `{name}`: no adapter is here for `{api}`"),
         [only] if only.software => {
             format!("device `{name}`: the only adapter is software, `{api}:0`, slower than `cpu`")
@@ -90,11 +85,11 @@ fn missing(name: &str, api: &str, adapters: &[&Adapter]) -> Error {
     )
 }
 
-/// Opens the first GPU that is no software, that nobody uses and that passes the self-test, but none through CUDA, which
-/// nobody has tried; says why not where there is none.
+/// Opens the first GPU that is no software, that nobody uses and that passes the self-test; says why not where there is
+/// none.
 pub fn best(choice: &DeviceChoice) -> std::result::Result<Gpu, String> {
     let mut passed_over = Vec::new();
-    for adapter in Adapter::all().iter().filter(|a| !a.software && a.api != "cuda") {
+    for adapter in Adapter::all().iter().filter(|a| !a.software) {
         let device = opened(adapter, choice);
         let name = device.name().to_string();
         let lock = match taken(lock_file(&device)) {
@@ -270,10 +265,6 @@ mod tests {
             assert!(e.to_string().contains(name) && e.hint().contains("tiface doctor"), "{e}");
             assert_eq!(e.kind(), crate::ErrorKind::Usage);
         }
-        if !cfg!(feature = "cuda") {
-            let e = open(&named("cuda")).err().unwrap();
-            assert!(e.to_string().contains("knows no CUDA") && e.hint().contains("--features cuda"), "{e}");
-        }
         let all = Adapter::all();
         if all.iter().all(|a| a.software) {
             // software is taken only where it is named, with its number
@@ -285,7 +276,7 @@ mod tests {
 
     #[test]
     fn a_device_is_held_while_it_is_used() {
-        if Adapter::all().iter().all(|a| a.api == "cuda") {
+        if Adapter::all().is_empty() {
             println!("skipped: locks of devices, for no adapter is here");
             return;
         }

@@ -81,8 +81,7 @@ pub fn compute_device(name: &str) -> Result<ComputeDevice> {
         #[cfg(not(feature = "wgpu"))]
         other => {
             let problem = format!("device `{other}`: this build learns on the processor alone");
-            let feature = if other == "cuda" { "cuda" } else { "wgpu" };
-            Err(Error::usage(problem, format!("build with `--features {feature}`, or leave `--device` out")))
+            Err(Error::usage(problem, "build with `--features wgpu`, or leave `--device` out"))
         }
     }
 }

@@ -27,10 +27,7 @@ pub mod agreement;
 pub mod consistency;
 
 pub mod matting;
-#[cfg(feature = "matting")]
-pub mod networks;
-#[cfg(not(feature = "matting"))]
-#[path = "no_networks.rs"]
+#[cfg_attr(not(feature = "matting"), path = "no_networks.rs")]
 pub mod networks;
 
 pub mod sheet;

@@ -19,13 +19,12 @@
 //! ```
 
 pub mod distance;
-#[cfg(feature = "matting")]
+#[cfg_attr(not(feature = "matting"), path = "no_lpips.rs")]
 mod lpips;
 mod parts;
 mod psnr;
 mod ssim;
 
-#[cfg(feature = "matting")]
 pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr::psnr;

@@ -147,7 +147,7 @@ fn any_single_byte_may_be_wrong_without_a_crash() {
     }
 }
 
-/// Minutes long, for changes here: `cargo test --release --no-default-features --features matting --lib damage -- --ignored`.
+/// Minutes long, for changes here: `cargo test --release --features matting --lib damage -- --ignored`.
 #[test]
 #[ignore = "300 damaged networks on each engine take minutes; run with --ignored after changes here"]
 fn random_damage_to_a_whole_network_ends_in_a_result_or_an_error() {

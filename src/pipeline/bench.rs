@@ -1,15 +1,11 @@
 //! Speed against error of each decision, measured on a capture: what `tiface bench` does.
 //!
 //! Every sweep runs the code of the stages themselves on the same photographs and changes one thing. Errors are taken
-//! where nothing was learned from: masked PSNR of some held-out views, and the distance to the true surface where it
-//! is known. Times stand beside those of a fixed piece of arithmetic (`meter`).
+//! where nothing was learned from: masked PSNR of some held-out views.
 
 mod judge;
-mod masks;
-mod meter;
 mod surface;
 mod training;
-mod views;
 
 use super::line::Line;
 use super::surface::Fields;
@@ -20,14 +16,13 @@ use crate::config::{Config, MeshConfig};
 use crate::geom::{Camera, Mesh};
 use crate::io;
 use crate::mesh::{Cap, MeshReport, Patches};
-use crate::report::bench::{BenchResult, Machine, Measure, Sweep};
-use crate::run::Fingerprint;
+use crate::report::bench::{BenchResult, Measure, Sweep, WorkCost};
 use crate::{Error, Monitor, Result};
 use judge::Judge;
+use std::time::Instant;
 
 /// What can be swept, in order.
-pub const SWEEPS: [&str; 9] =
-    ["steps", "photographs", "hash", "devices", "extraction", "triangles", "texture", "render", "masks"];
+pub const SWEEPS: [&str; 5] = ["steps", "photographs", "hash", "triangles", "texture"];
 
 /// A capture whose decisions are measured.
 pub struct Bench<'l> {
@@ -43,57 +38,43 @@ pub struct Bench<'l> {
 
 impl<'l> Bench<'l> {
     /// On a line whose run is thrown away. The finished fields of another one of the same capture are taken instead of
-    /// training some where that is not what is measured. `truth` is the true surface in the dataset's world.
+    /// training some where that is not what is measured.
     ///
     /// # Errors
     ///
     /// The photographs cannot be read, or there is no held-out view.
-    pub fn new(
-        line: &'l Line<'l>,
-        finished: Option<&'l Line<'l>>,
-        truth: Option<&Mesh>,
-    ) -> Result<Bench<'l>> {
+    pub fn new(line: &'l Line<'l>, finished: Option<&'l Line<'l>>) -> Result<Bench<'l>> {
         complete(line, Stage::Mask, &learn::trained_fields(line))?;
-        let (scene, judge) = (line.scene()?, Judge::new(line, truth)?);
+        let (scene, judge) = (line.scene()?, Judge::new(line)?);
         let watch = training::StopAt::new(u64::MAX, line.run.stop());
         Ok(Bench { line, finished, scene, judge, watch })
     }
 
-    /// Nothing measured yet: machine, capture, and what shapes the figures.
+    /// Nothing measured yet: program, machine and capture.
     pub fn begin(&self) -> BenchResult {
-        let machine = Machine {
+        BenchResult {
+            version: env!("CARGO_PKG_VERSION"),
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
             processor: io::processor(),
             threads: rayon::current_num_threads(),
-        };
-        let mut all = self.line.config.clone();
-        all.capture.path.clear();
-        let identity = Fingerprint::of_bytes(format!("{} {}", self.line.digest, all.to_toml()).as_bytes());
-        BenchResult::new(machine, self.line.capture.name.clone(), identity)
+            capture: self.line.capture.name.clone(),
+            sweeps: Vec::new(),
+        }
     }
 
-    /// Measures one of [`SWEEPS`] into a result; `None` and a sentence if this capture does not allow it.
-    pub fn measure(&self, name: &str, into: &mut BenchResult) -> Result<Option<String>> {
-        let sweep = match name {
-            "steps" => self.steps()?,
-            "photographs" => self.photographs()?,
-            "hash" => self.hash()?,
-            "devices" => self.devices()?,
-            "extraction" => self.extraction()?,
-            "triangles" => self.triangles()?,
-            "texture" => self.texture()?,
-            "render" => self.render()?,
-            "masks" => match self.masks()? {
-                Some(sweep) => sweep,
-                None => return Ok(Some("this capture has no masks to compare with".into())),
-            },
+    /// Measures one of [`SWEEPS`].
+    pub fn measure(&self, name: &str) -> Result<Sweep> {
+        match name {
+            "steps" => self.steps(),
+            "photographs" => self.photographs(),
+            "hash" => self.hash(),
+            "triangles" => self.triangles(),
+            "texture" => self.texture(),
             other => {
                 let hint = format!("choose among {}", SWEEPS.join(", "));
-                return Err(Error::usage(format!("there is no sweep `{other}`"), hint));
+                Err(Error::usage(format!("there is no sweep `{other}`"), hint))
             }
-        };
-        into.sweeps.push(sweep);
-        Ok(None)
+        }
     }
 
     fn config(&self) -> &Config {
@@ -156,18 +137,16 @@ struct Extracted {
     patches: Option<Patches>,
 }
 
-/// The figure that views are judged by.
-fn psnr() -> Measure {
-    // fields of the same settings and other random numbers differ by as much
-    Measure::more("PSNR, dB", 2, 0.2)
-}
+/// The figure that views of fields are judged by: those of the same settings and other random numbers differ by as much
+/// as its noise.
+const PSNR: Measure = Measure { name: "PSNR, dB", digits: 2, more_is_better: Some(true), noise: (0.2, 0.0) };
 
-/// The figure that surfaces are judged by.
-fn off_truth() -> Measure {
-    Measure::less("off the truth, mm", 3, 0.03)
-}
-
-/// One line per place where a sweep's words come together.
-fn sweep(name: &str, title: &str, note: String, measures: Vec<Measure>) -> Sweep {
-    Sweep { name: name.into(), title: title.into(), note, measures, by_wall: false, rows: Vec::new() }
+/// Returns what `work` returns, and what it took.
+fn timed<T>(work: impl FnOnce() -> Result<T>) -> Result<(T, WorkCost)> {
+    io::forget_peak_memory();
+    let (start, cpu) = (Instant::now(), io::cpu_seconds());
+    let result = work()?;
+    let (wall_s, cpu_s) = (start.elapsed().as_secs_f64(), io::cpu_seconds() - cpu);
+    let memory_mib = io::peak_memory().map(|bytes| bytes as f64 / f64::from(1 << 20));
+    Ok((result, WorkCost { wall_s, cpu_s, memory_mib }))
 }

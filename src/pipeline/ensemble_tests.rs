@@ -175,7 +175,6 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
     }
 }
 
-#[cfg(feature = "cpu")]
 #[test]
 fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
     let dir = tempfile::tempdir().unwrap();

@@ -9,8 +9,6 @@ use crate::capture::scene_box::SceneBox;
 use crate::capture::{self, Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{Config, MaskSource, RenderConfig, Stage};
 use crate::io::{self, Limits};
-#[cfg(not(feature = "matting"))]
-use crate::mask::networks::Networks;
 use crate::run::{Fingerprint, Run, read_record};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -212,7 +210,7 @@ impl<'a> Line<'a> {
         }
         #[cfg(not(feature = "matting"))]
         if self.clicks.is_some() && stages.contains(&Stage::Mask) {
-            Networks::open(&self.config.mask)?;
+            crate::mask::networks::Networks::open(&self.config.mask)?;
         }
         match stages.iter().any(|stage| stage.uses_device()) {
             true => require_device(self.config),
@@ -244,15 +242,8 @@ pub fn feasible(config: &Config) -> Result<()> {
 
 /// Refuses a device that this build or this machine does not have, or that somebody else uses. What is done needs none:
 /// so this is asked where a stage is to do that computes on it.
-#[cfg(feature = "cpu")]
 pub fn require_device(config: &Config) -> Result<()> {
     crate::field::compute_device(&config.device).map(drop)
-}
-
-/// No fields, no device.
-#[cfg(not(feature = "cpu"))]
-pub fn require_device(_: &Config) -> Result<()> {
-    Ok(())
 }
 
 /// How the configuration opens a capture.

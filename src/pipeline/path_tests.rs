@@ -309,7 +309,6 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
 }
 
 #[test]
-#[cfg(feature = "cpu")]
 fn a_finished_run_that_cannot_be_written_is_still_done() {
     let dir = tempfile::tempdir().unwrap();
     let mut config = config(&dir.path().join("head"));

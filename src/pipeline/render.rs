@@ -128,7 +128,6 @@ impl Meshes {
     }
 
     /// A head mesh, to be shown as a viewer shows it and with all that is known of its color.
-    #[cfg(feature = "cpu")]
     pub fn of_head(head: HeadMesh, shown: [bool; 2]) -> Meshes {
         Meshes { extracted: None, head: Some(head), shown }
     }

@@ -106,7 +106,6 @@ pub trait Fields {
     }
 }
 
-#[cfg(feature = "cpu")]
 impl Surface for crate::iface::IFace {
     fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
         self.sdf(points)
@@ -140,7 +139,6 @@ impl Surface for crate::iface::IFace {
     }
 }
 
-#[cfg(feature = "cpu")]
 impl Surface for crate::iface::DensityField {
     fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
         self.sdf(points)
@@ -164,7 +162,6 @@ impl Surface for crate::iface::DensityField {
     }
 }
 
-#[cfg(feature = "cpu")]
 impl Radiance for crate::tface::FieldMean {
     fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         self.render(rays, forward)

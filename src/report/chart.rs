@@ -1,4 +1,4 @@
-//! Lines over training steps, as SVG inside a page.
+//! Lines over training steps, or over what else has numbers, as SVG inside a page.
 
 use super::escape;
 use serde_json::Value;
@@ -84,7 +84,7 @@ impl Chart {
         let end = short(self.curves.first().map_or(0.0, last));
         let mut out = format!(
             "<figure class=\"chart\"><figcaption><b>{}</b> {}</figcaption><svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" \
-             role=\"img\" aria-label=\"{} over steps, {} at the end\">",
+             role=\"img\" aria-label=\"{}, {} at the end\">",
             escape(&self.title),
             end,
             escape(&self.title),

@@ -4,32 +4,19 @@
 //! Human Heads): the opacity that background rays collect is pushed to zero. The baseline is the same code
 //! on photographs as they are; only its box still comes from the masks.
 
-#[cfg(feature = "cpu")]
 mod cpu;
 #[cfg(feature = "wgpu")]
 mod gpu;
-#[cfg(feature = "cpu")]
 mod import;
-#[cfg(feature = "cpu")]
 mod infer;
-#[cfg(feature = "cpu")]
 mod mean;
-#[cfg(feature = "cpu")]
 mod ops;
-#[cfg(feature = "cpu")]
 mod record;
-#[cfg(feature = "cpu")]
 mod refine;
-#[cfg(feature = "cpu")]
 mod state;
-#[cfg(feature = "cpu")]
 mod train;
 
-#[cfg(feature = "cpu")]
 pub use import::import;
-#[cfg(feature = "cpu")]
 pub use infer::TFace;
-#[cfg(feature = "cpu")]
 pub use mean::{FieldMean, train};
-#[cfg(feature = "cpu")]
 pub use train::TfaceReport;

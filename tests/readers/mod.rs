@@ -13,7 +13,6 @@ use tiface::io::{self, Limits};
 use tiface::mesh::files::{ExtractedSurface, HeadMesh, ReadOptions, check_around, open_mesh, read_with};
 use tiface::pipeline::Line;
 use tiface::report::RunRow;
-use tiface::report::bench::BenchResult;
 use tiface::report::experiment::{ExperimentRow, read_published};
 use tiface::run::{Run, Standing, read_estimate, read_record, read_status};
 use tiface::tface::TFace;
@@ -23,8 +22,7 @@ use tiface::tface::TFace;
 pub type Reader = fn(&Path, &[u8]) -> String;
 
 /// By the name of their seeds.
-pub const READERS: [(&str, Reader); 23] = [
-    ("bench", |_, bytes| told(BenchResult::parse(&text(bytes), "bench.json"))),
+pub const READERS: [(&str, Reader); 22] = [
     ("camera_path", camera_path),
     ("cameras", cameras),
     ("colmap_binary", |dir, bytes| model(dir, bytes, "bin")),

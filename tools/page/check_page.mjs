@@ -1,6 +1,6 @@
 // Clicks on the page of `tiface mask --page` as a person would, in Chromium without a window.
 //
-//     cargo run --release --no-default-features --example click_page -- DIR/page.html
+//     cargo run --release --example click_page -- DIR/page.html
 //     npm ci --prefix tools/readers
 //     node tools/page/check_page.mjs DIR/page.html
 //

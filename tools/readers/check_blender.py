@@ -1,6 +1,6 @@
 """Opens one mesh as GLB, OBJ and PLY in Blender, without a window, and compares what it sees.
 
-    cargo run --no-default-features --example textured_sphere -- DIR
+    cargo run --example textured_sphere -- DIR
     python3.11 -m venv .venv-blender && .venv-blender/bin/pip install -r tools/readers/requirements-blender.txt
     .venv-blender/bin/python tools/readers/check_blender.py DIR/globe.glb [--up 0 0 1] [--unit-m 1]
 

@@ -1,6 +1,6 @@
 """Opens one mesh as GLB, OBJ and PLY in trimesh and open3d and compares what they see.
 
-    cargo run --no-default-features --example textured_sphere -- DIR
+    cargo run --example textured_sphere -- DIR
     python tools/readers/check_export.py DIR/globe.glb [--up 0 0 1]
 
 The .obj and .ply are looked for beside the .glb. GLB and OBJ are +Y up; PLY is in the dataset's world,

@@ -1,6 +1,6 @@
 // Opens textured exports in three.js, without a browser: its loaders for GLB, OBJ, MTL and PLY.
 //
-//     cargo run --no-default-features --example textured_sphere -- DIR
+//     cargo run --example textured_sphere -- DIR
 //     npm ci --prefix tools/readers
 //     node tools/readers/check_three.mjs DIR/globe.glb
 //

@@ -1,6 +1,6 @@
 """Embree (through open3d) on the mesh and rays that `benches/raycast.rs -- --dump DIR` wrote.
 
-    cargo bench --no-default-features --bench raycast -- --dump DIR
+    cargo bench --bench raycast -- --dump DIR
     python tools/reference/embree.py DIR
 
 Prints Mrays/s on one thread and how many rays hit, to compare with the bench's own lines.

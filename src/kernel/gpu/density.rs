@@ -8,6 +8,7 @@ use super::losses::sum;
 use super::march::{Samples, prefix_sum};
 use super::sdf::kernels::{harmonics, masked, prepare, reduce};
 use super::sdf::{SUMMING, ends};
+use super::sum::group_sum;
 use super::tile::{
     CHANNELS, LANES, UNITS, at, gate, load, narrow, outer, product, put, relu, save, sigmoid, uniform_count,
 };
@@ -288,14 +289,11 @@ fn tally(offsets: &[u32], out: &mut [u32]) {
             last = u32::cast_from(r) + 1;
         }
     }
-    let mut mets = Shared::<[u32]>::new_slice(UNITS as usize);
     let mut lasts = Shared::<[u32]>::new_slice(UNITS as usize);
-    mets[unit] = met;
     lasts[unit] = last;
-    sync_cube();
+    let met = group_sum::<u32>(met, UNITS as usize);
     if unit == 0 {
         for i in 1..UNITS as usize {
-            met += mets[i];
             last = max(last, lasts[i]);
         }
         out[0] = max(met, 1u32);

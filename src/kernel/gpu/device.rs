@@ -4,7 +4,6 @@ use crate::{Error, Result};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Cube, CubeDevice, WgpuBackend, WgpuDevice, WgpuDeviceKind};
 use burn::cubecl::bytes::Bytes;
-use burn::cubecl::device::CudaDevice;
 use burn::cubecl::features::AtomicUsage;
 use burn::cubecl::future;
 use burn::cubecl::ir::{ElemType, FloatKind, Type};
@@ -102,7 +101,7 @@ pub struct DeviceLimits {
 /// A way to a GPU: an adapter as one API offers it.
 pub struct Adapter {
     device: CubeDevice,
-    /// `vulkan`, `metal`, `dx12` or `cuda`.
+    /// `vulkan`, `metal` or `dx12`.
     pub api: &'static str,
     /// `discrete`, `integrated`, `virtual`, `other` (some virtual machines say no more) or `software`.
     pub kind: &'static str,
@@ -116,15 +115,15 @@ pub struct Adapter {
 const KINDS: [&str; 5] = ["discrete", "integrated", "virtual", "other", "software"];
 
 impl Adapter {
-    /// Returns every adapter of this machine, the fastest kind first, those of CUDA behind all others. A card that several
-    /// APIs reach is listed once for each. The drivers are asked by the first call of a process alone.
+    /// Returns every adapter of this machine, the fastest kind first. A card that several APIs reach is listed once for
+    /// each. The drivers are asked by the first call of a process alone.
     pub fn all() -> &'static [Adapter] {
         static ALL: OnceLock<Vec<Adapter>> = OnceLock::new();
-        ALL.get_or_init(|| Adapter::of_wgpu().into_iter().chain(Adapter::of_cuda()).collect())
+        ALL.get_or_init(Adapter::find)
     }
 
-    /// Returns those that wgpu reaches, from one instance of all APIs.
-    fn of_wgpu() -> Vec<Adapter> {
+    /// Asks one instance of all APIs.
+    fn find() -> Vec<Adapter> {
         use WgpuDeviceKind::{Cpu, DiscreteGpu, IntegratedGpu, Other, VirtualGpu};
         const APIS: [(wgpu::Backend, WgpuBackend, &str); 3] = [
             (wgpu::Backend::Vulkan, WgpuBackend::Vulkan, "vulkan"),
@@ -170,18 +169,6 @@ impl Adapter {
         }
         found.sort_by_key(|(order, _)| *order);
         found.into_iter().map(|(_, adapter)| adapter).collect()
-    }
-
-    /// Returns those that CUDA reaches, where it is built in: none without NVIDIA's driver.
-    fn of_cuda() -> Vec<Adapter> {
-        if !cfg!(feature = "cuda") {
-            return Vec::new();
-        }
-        let id = CubeDevice::Cuda(CudaDevice::default()).to_id();
-        let found = CubeDevice::enumerate(id).into_iter().map(CubeDevice::from_id);
-        let adapter =
-            |device| Adapter { device, api: "cuda", kind: KINDS[0], software: false, driver: String::new() };
-        found.map(adapter).collect()
     }
 }
 
@@ -401,7 +388,7 @@ pub(crate) mod tests {
 
     /// A device to test on, a software one too; without any, says so.
     pub fn device() -> Option<Device> {
-        let found = Adapter::all().first().filter(|a| a.api != "cuda").map(Device::open);
+        let found = Adapter::all().first().map(Device::open);
         if found.is_none() {
             println!("skipped: kernels on a GPU, for no adapter is here (Mesa's lavapipe would do)");
         }

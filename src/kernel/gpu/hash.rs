@@ -1,7 +1,7 @@
 //! The hash encoding of [`crate::kernel::cpu::hash`]: features with Jacobian, and their scatter.
 
 use super::device::{Atomics, Buffer, Device, MOST_GROUPS, Words, launch};
-use super::sum::{Exchange, Fixed, MOST, Native, Sum};
+use super::sum::{Exchange, Fixed, MOST, Native, Sum, group_sum};
 use crate::kernel::cpu::hash::Level;
 use crate::kernel::cpu::mlp::TILE;
 use burn::cubecl::{self, prelude::*};
@@ -188,7 +188,6 @@ fn bound(
 ) {
     let capacity = capacity as usize;
     let level = CUBE_POS_Y as usize;
-    let unit = UNIT_POS as usize;
     let slope = f32::reinterpret(levels[level * LEVEL]) * world;
     let mut own = 0.0f32;
     for s in range_stepped(ABSOLUTE_POS_X as usize, count[0] as usize, BOUNDING * GROUP as usize) {
@@ -199,14 +198,8 @@ fn bound(
             own += max(q[plane].abs(), q[plane + capacity].abs()) * n * slope;
         }
     }
-    let mut sums = Shared::<[f32]>::new_slice(GROUP as usize);
-    sums[unit] = own;
-    sync_cube();
-    if unit == 0 {
-        let mut all = 0.0f32;
-        for i in 0..GROUP as usize {
-            all += sums[i];
-        }
+    let all = group_sum::<f32>(own, GROUP as usize);
+    if UNIT_POS == 0 {
         partial[level * BOUNDING + CUBE_POS_X as usize] = all;
     }
 }

@@ -2,6 +2,7 @@
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::Batch;
+use super::sum::group_sum;
 use crate::kernel::cpu::losses::{LossWeights, RAY_TERMS, SAMPLE_TERMS, TERMS};
 use crate::kernel::cpu::neus::RAY_WIDTH;
 use burn::cubecl::{self, prelude::*};
@@ -20,22 +21,10 @@ fn tally(offsets: &[u32], alpha: &[f32], alive: &[u32], out: &mut [u32]) {
         met += select(offsets[r + 1] > offsets[r], 1u32, 0u32);
         heads += select(alpha[r] > 0.999f32, alive[r], 0u32);
     }
-    let mut mets = Shared::<[u32]>::new_slice(UNITS as usize);
-    let mut full = Shared::<[u32]>::new_slice(UNITS as usize);
-    let mut all = Shared::<[u32]>::new_slice(UNITS as usize);
-    mets[unit] = met;
-    full[unit] = heads;
-    all[unit] = rays;
-    sync_cube();
+    let met = group_sum::<u32>(met, UNITS as usize);
+    let heads = group_sum::<u32>(heads, UNITS as usize);
+    let rays = group_sum::<u32>(rays, UNITS as usize);
     if unit == 0 {
-        met = 0;
-        heads = 0;
-        rays = 0;
-        for i in 0..UNITS as usize {
-            met += mets[i];
-            heads += full[i];
-            rays += all[i];
-        }
         out[0] = met;
         out[1] = heads;
         out[2] = rays;
@@ -153,14 +142,8 @@ pub(super) fn sum(
             own += of_samples[(term - RAY_TERMS) * plane + s];
         }
     }
-    let mut sums = Shared::<[f32]>::new_slice(UNITS as usize);
-    sums[unit] = own;
-    sync_cube();
+    let all = group_sum::<f32>(own, UNITS as usize);
     if unit == 0 {
-        let mut all = 0.0f32;
-        for i in 0..UNITS as usize {
-            all += sums[i];
-        }
         out[term] = all;
         if term == 0 && met[0] > 0 {
             out[TERMS] += all;

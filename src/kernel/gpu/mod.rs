@@ -1,4 +1,4 @@
-//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal, DX12 and CUDA. Each is the twin of a kernel of [`super::cpu`].
+//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal and DX12. Each is the twin of a kernel of [`super::cpu`].
 //!
 //! Values of samples lie plane by plane, `[channels, capacity]`: neighboring threads read neighboring words, and a
 //! plane is read four samples at a time. `capacity` is a multiple of [`mlp::TILE`](super::cpu::mlp::TILE); how many samples

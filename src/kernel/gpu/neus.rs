@@ -1,6 +1,7 @@
 //! NeuS compositing of ragged rays: see [`crate::kernel::cpu::neus`]. A thread takes a ray.
 
 use super::device::{Buffer, Device, Words, groups, launch};
+use super::sum::group_sum;
 use crate::kernel::cpu::neus::SHORTEST;
 use crate::kernel::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
@@ -233,14 +234,8 @@ fn sharpness(g_ln: &[f32], inv_s: &[f32], g_inv_s: &mut [f32]) {
     for r in range_stepped(unit, g_ln.len(), UNITS as usize) {
         own += g_ln[r];
     }
-    let mut sums = Shared::<[f32]>::new_slice(UNITS as usize);
-    sums[unit] = own;
-    sync_cube();
+    let all = group_sum::<f32>(own, UNITS as usize);
     if unit == 0 {
-        let mut all = 0.0f32;
-        for i in 0..UNITS as usize {
-            all += sums[i];
-        }
         let s = inv_s[0];
         g_inv_s[0] = select(clamp(s, 1e-6f32, 1e6f32) == s, all / s, 0.0f32);
     }

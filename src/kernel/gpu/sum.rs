@@ -1,9 +1,24 @@
-//! Sums of many threads into one place: see [`Atomics`](super::Atomics).
+//! Sums of many threads: into one place by [`Atomics`](super::Atomics), and of a group in a fixed order.
 
 use burn::cubecl::{self, prelude::*};
 
 /// Steps that the bound on a sum is counted in: what is left up to 2³¹ takes the rounding of 10⁸ terms.
 pub const MOST: f32 = 2e9;
+
+/// Returns the sum over the threads of a group, in their order, to the first of them.
+#[cube]
+pub fn group_sum<N: Numeric>(own: N, #[comptime] units: usize) -> N {
+    let mut all = Shared::<[N]>::new_slice(units);
+    all[UNIT_POS as usize] = own;
+    sync_cube();
+    let mut sum = N::from_int(0);
+    if UNIT_POS == 0 {
+        for i in 0..units {
+            sum += all[i];
+        }
+    }
+    sum
+}
 
 /// A word that threads add floats to.
 #[cube]

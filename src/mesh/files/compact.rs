@@ -155,13 +155,15 @@ impl Packed {
         }
         let texture = reader.base_color(Some(index))?.map(|texture| texture.index);
         let old = looks.materials.get(index as usize).unwrap_or(&Value::Null);
-        let mut new = Material::default();
-        new.alpha_mode = Valid(match old["alphaMode"].as_str() {
-            Some("BLEND") => AlphaMode::Blend,
-            Some("MASK") => AlphaMode::Mask,
-            _ => AlphaMode::Opaque,
-        });
-        new.alpha_cutoff = old["alphaCutoff"].as_f64().map(|cutoff| AlphaCutoff(cutoff as f32));
+        let mut new = Material {
+            alpha_mode: Valid(match old["alphaMode"].as_str() {
+                Some("BLEND") => AlphaMode::Blend,
+                Some("MASK") => AlphaMode::Mask,
+                _ => AlphaMode::Opaque,
+            }),
+            alpha_cutoff: old["alphaCutoff"].as_f64().map(|cutoff| AlphaCutoff(cutoff as f32)),
+            ..Material::default()
+        };
         let pbr = &mut new.pbr_metallic_roughness;
         let factor =
             |k: usize| old["pbrMetallicRoughness"]["baseColorFactor"][k].as_f64().unwrap_or(1.0) as f32;

@@ -1,6 +1,6 @@
 //! A glTF document as it grows, with the bytes it speaks of: accessors, pictures, the GLB around them.
 //!
-//! Views begin at multiples of four bytes, and accessors of the same bytes share one; `min` and `max` are the stored
+//! Every accessor has a view of its own, at a multiple of four bytes; `min` and `max` are the stored
 //! numbers themselves. Views of pictures carry neither target nor stride.
 
 use crate::geom::Aabb;
@@ -33,23 +33,13 @@ impl GlbDocument {
         stride: Option<usize>,
         target: Option<Target>,
     ) -> Index<gltf::json::buffer::View> {
-        let (byte_stride, target) = (stride.map(Stride), target.map(Valid));
-        let is_same = |view: &gltf::json::buffer::View| {
-            let at = view.byte_offset.map_or(0, |at| at.0 as usize);
-            view.byte_length.0 == bytes.len() as u64
-                && (view.byte_stride, view.target) == (byte_stride, target)
-                && self.bin[at..].starts_with(bytes)
-        };
-        if let Some(known) = self.root.buffer_views.iter().position(is_same) {
-            return Index::new(known as u32);
-        }
         let view = self.root.push(gltf::json::buffer::View {
             buffer: Index::new(0),
             byte_length: USize64(bytes.len() as u64),
             byte_offset: Some(USize64(self.bin.len() as u64)),
-            byte_stride,
+            byte_stride: stride.map(Stride),
             name: None,
-            target,
+            target: target.map(Valid),
             extensions: None,
             extras: Default::default(),
         });
@@ -58,23 +48,39 @@ impl GlbDocument {
         view
     }
 
+    /// Elements of so many bytes each, or the accessor that has the same already: layers around a mesh have its corners.
     fn accessor(
         &mut self,
-        view: Index<gltf::json::buffer::View>,
-        count: usize,
-        component: ComponentType,
-        type_: Type,
+        bytes: &[u8],
+        element: usize,
+        (component, type_): (ComponentType, Type),
+        normalized: bool,
     ) -> Index<Accessor> {
+        let is_same = |a: &Accessor| {
+            let view = a.buffer_view.map(|view| &self.root.buffer_views[view.value()]);
+            let offset = view.and_then(|view| view.byte_offset).map_or(0, |offset| offset.0 as usize);
+            matches!(a.component_type, Valid(GenericComponentType(known)) if known == component)
+                && (a.type_, a.normalized) == (Valid(type_), normalized)
+                && view.is_some_and(|view| view.byte_length.0 == bytes.len() as u64)
+                && self.bin[offset..].starts_with(bytes)
+        };
+        if let Some(known) = self.root.accessors.iter().position(is_same) {
+            return Index::new(known as u32);
+        }
+        let is_index = matches!(type_, Type::Scalar);
+        let target = if is_index { Target::ElementArrayBuffer } else { Target::ArrayBuffer };
+        let is_padded = element > component.size() * type_.multiplicity();
+        let view = self.view(bytes, is_padded.then_some(element), Some(target));
         self.root.push(Accessor {
             buffer_view: Some(view),
             byte_offset: None,
-            count: USize64(count as u64),
+            count: USize64((bytes.len() / element.max(1)) as u64),
             component_type: Valid(GenericComponentType(component)),
             type_: Valid(type_),
             min: None,
             max: None,
             name: None,
-            normalized: false,
+            normalized,
             sparse: None,
             extensions: None,
             extras: Default::default(),
@@ -83,8 +89,8 @@ impl GlbDocument {
 
     /// Vectors of f32: [`glam::Vec2`], `Vec3`, `Vec4` or arrays.
     pub fn floats<T: bytemuck::NoUninit>(&mut self, values: &[T]) -> Index<Accessor> {
-        let view = self.view(bytes_of(values), None, Some(Target::ArrayBuffer));
-        self.accessor(view, values.len(), ComponentType::F32, vector(size_of::<T>() / 4))
+        let kind = (ComponentType::F32, vector(size_of::<T>() / 4));
+        self.accessor(bytes_of(values), size_of::<T>(), kind, false)
     }
 
     /// Vectors of integers that stand for 0..=1, or −1..=1 where they have a sign, a multiple of four bytes each; those of
@@ -95,11 +101,7 @@ impl GlbDocument {
         component: ComponentType,
         type_: Type,
     ) -> Index<Accessor> {
-        let padded = size_of::<T>() > component.size() * type_.multiplicity();
-        let view = self.view(bytes_of(values), padded.then_some(size_of::<T>()), Some(Target::ArrayBuffer));
-        let accessor = self.accessor(view, values.len(), component, type_);
-        self.root.accessors[accessor.value()].normalized = true;
-        accessor
+        self.accessor(bytes_of(values), size_of::<T>(), (component, type_), true)
     }
 
     /// Says the bounds of an accessor, which positions must do.
@@ -120,14 +122,11 @@ impl GlbDocument {
     /// Corners of triangles among `vertices` vertices.
     pub fn indices(&mut self, triangles: &[[u32; 3]], vertices: usize) -> Index<Accessor> {
         let flat = triangles.as_flattened();
-        let target = Some(Target::ElementArrayBuffer);
-        let (view, component) = if vertices < SHORT_INDICES {
+        if vertices < SHORT_INDICES {
             let short: Vec<u16> = flat.iter().map(|&i| i as u16).collect();
-            (self.view(bytes_of(&short), None, target), ComponentType::U16)
-        } else {
-            (self.view(bytes_of(flat), None, target), ComponentType::U32)
-        };
-        self.accessor(view, flat.len(), component, Type::Scalar)
+            return self.accessor(bytes_of(&short), 2, (ComponentType::U16, Type::Scalar), false);
+        }
+        self.accessor(bytes_of(flat), 4, (ComponentType::U32, Type::Scalar), false)
     }
 
     /// A picture inside the file: filtered smoothly, not repeated.

@@ -3,6 +3,7 @@
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
 use super::super::rng;
+use super::super::sum::group_sum;
 use super::{Occupancy, UNITS};
 use crate::Result;
 use crate::kernel::cpu::occupancy::{ALL_BELOW, DECAY, DRAWS};
@@ -163,14 +164,8 @@ fn partial_sums(history: &[f32], sums: &mut [f32]) {
             own += history[i];
         }
     }
-    let mut all = Shared::<[f32]>::new_slice(UNITS as usize);
-    all[UNIT_POS as usize] = own;
-    sync_cube();
+    let sum = group_sum::<f32>(own, UNITS as usize);
     if UNIT_POS == 0 && CUBE_POS < sums.len() {
-        let mut sum = 0.0f32;
-        for k in 0..UNITS as usize {
-            sum += all[k];
-        }
         sums[CUBE_POS] = sum;
     }
 }

@@ -2,6 +2,7 @@
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
+use super::super::sum::group_sum;
 use super::Vm;
 use crate::Result;
 use crate::kernel::cpu::vm::RAY_WIDTH;
@@ -23,18 +24,9 @@ fn tally(alpha: &[f32], alive: &[u32], out: &mut [u32]) {
         rays += alive[r];
         outside += select(alpha[r] == 0.0f32, alive[r], 0u32);
     }
-    let mut all = Shared::<[u32]>::new_slice(UNITS as usize);
-    let mut empty = Shared::<[u32]>::new_slice(UNITS as usize);
-    all[unit] = rays;
-    empty[unit] = outside;
-    sync_cube();
+    let rays = group_sum::<u32>(rays, UNITS as usize);
+    let outside = group_sum::<u32>(outside, UNITS as usize);
     if unit == 0 {
-        rays = 0;
-        outside = 0;
-        for i in 0..UNITS as usize {
-            rays += all[i];
-            outside += empty[i];
-        }
         out[0] = rays;
         out[1] = outside;
     }
@@ -121,18 +113,9 @@ fn add(
             crossed += points[r];
         }
     }
-    let mut sums = Shared::<[f32]>::new_slice(UNITS as usize);
-    let mut counts = Shared::<[u32]>::new_slice(UNITS as usize);
-    sums[unit] = own;
-    counts[unit] = crossed;
-    sync_cube();
+    let own = group_sum::<f32>(own, UNITS as usize);
+    let crossed = group_sum::<u32>(crossed, UNITS as usize);
     if unit == 0 {
-        own = 0.0f32;
-        crossed = 0u32;
-        for i in 0..UNITS as usize {
-            own += sums[i];
-            crossed += counts[i];
-        }
         if term < TERMS {
             totals[term] = u32::reinterpret(f32::reinterpret(totals[term]) + own);
         } else {
