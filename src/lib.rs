@@ -37,6 +37,8 @@
 //! [`mesh`] meshes any signed distance and needs no field, [`capture`] reads `transforms*.json` and LLFF and says of other datasets what they are, [`io`] opens every
 //! file within limits. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file and
 //! place, and a suggested fix.
+//!
+//! [ARCHITECTURE.md](../../../ARCHITECTURE.md) shows components, data flow, coordinate frames and tensor layouts on one page.
 
 // The reference arithmetic of tests names the crate as its other users do.
 #[cfg(test)]
