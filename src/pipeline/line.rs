@@ -246,7 +246,7 @@ pub fn feasible(config: &Config) -> Result<()> {
 /// so this is asked where a stage is to do that computes on it.
 #[cfg(feature = "cpu")]
 pub fn require_device(config: &Config) -> Result<()> {
-    crate::field::compute_device(&config.device).map(drop)
+    crate::field::require_device(&config.device)
 }
 
 /// No fields, no device.

@@ -20,6 +20,8 @@ mod ops;
 mod record;
 #[cfg(feature = "cpu")]
 mod refine;
+#[cfg(feature = "wgpu")]
+mod self_test;
 #[cfg(feature = "cpu")]
 mod state;
 pub mod th;
@@ -34,3 +36,11 @@ pub use infer::TFace;
 pub use mean::{FieldMean, train};
 #[cfg(feature = "cpu")]
 pub use train::TfaceReport;
+
+/// Whether a GPU learns a vector-matrix field as the processor does.
+#[cfg(feature = "cpu")]
+pub const VM_TEST: crate::field::SelfTest = crate::field::SelfTest {
+    field: "vector-matrix",
+    #[cfg(feature = "wgpu")]
+    run: self_test::vm,
+};

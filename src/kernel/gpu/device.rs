@@ -392,12 +392,12 @@ pub(super) fn groups(count: usize) -> CubeCount {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use super::super::self_test::worst;
+    use super::super::test_case::worst;
     use super::*;
     use burn::cubecl::{self, prelude::*};
     use std::cell::Cell;
 
-    pub(crate) use super::super::self_test::planes;
+    pub(crate) use super::super::evaluate::planes;
 
     /// A device to test on, a software one too; without any, says so.
     pub fn device() -> Option<Device> {

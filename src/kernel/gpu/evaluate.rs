@@ -6,7 +6,6 @@ use super::march::Samples;
 use super::neus::{Neus, Rays};
 use super::occupancy::Occupancy;
 use super::sdf::Sdf;
-use super::self_test::planes;
 use crate::Result;
 use crate::kernel::cpu::march::{Bitmask, MarchRay};
 use crate::kernel::cpu::neus::RAY_WIDTH;
@@ -21,6 +20,15 @@ const FEWER: [usize; 2] = [1 << 10, 1 << 14];
 
 /// Rays marched together.
 const RAYS: usize = 1 << 14;
+
+/// Rows `[n, W]` as planes `[W, capacity]`.
+pub(crate) fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<f32> {
+    let mut out = vec![0.0; W * capacity];
+    for (i, row) in rows.iter().enumerate() {
+        (0..W).for_each(|k| out[k * capacity + i] = row[k]);
+    }
+    out
+}
 
 /// A field and what its evaluation needs.
 pub struct Evaluator {
@@ -145,7 +153,7 @@ impl Evaluator {
 #[cfg(test)]
 mod tests {
     use super::super::device::tests::{agree, device};
-    use super::super::self_test::Case;
+    use super::super::test_case::Case;
     use super::*;
     use crate::kernel::cpu::mlp::Weights;
     use crate::kernel::cpu::{march, rng, sdf};

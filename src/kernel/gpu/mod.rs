@@ -22,8 +22,9 @@ mod points;
 mod rng;
 mod schedule;
 mod sdf;
-mod self_test;
 mod sum;
+#[cfg(test)]
+mod test_case;
 mod tile;
 mod vm;
 mod weight_norm;
@@ -41,7 +42,6 @@ pub use occupancy::{Band, Nerfacc, Occupancy};
 pub use points::SurfacePoints;
 pub use schedule::Schedule;
 pub use sdf::Sdf;
-pub use self_test::{Check, self_test};
 pub use vm::{DeviceDecoder, DeviceGrid, Vm, VmLosses, VmRenderer, VmValues};
 pub use weight_norm::WeightNorm;
 
