@@ -25,12 +25,14 @@ pub(super) fn run(common: &Common) -> Result<()> {
     #[cfg(feature = "wgpu")]
     let (devices, auto) = {
         use crate::field::devices::{best, examine};
+        let tests = [crate::iface::SDF_TEST, crate::tface::VM_TEST, crate::iface::DENSITY_TEST];
+        let devices = examine(&tests);
         let choice = crate::config::DeviceChoice::parse("auto").expect("a device's name");
-        let auto = match best(&choice) {
+        let auto = match best(&choice, &tests) {
             Ok(gpu) => format!("{}: {}", gpu.device.name(), gpu.why),
             Err(why) => format!("the processor: {why}"),
         };
-        (examine(), auto)
+        (devices, auto)
     };
     #[cfg(not(feature = "wgpu"))]
     let auto = "the processor: this build knows no GPU (`--features wgpu`)".to_string();
@@ -93,7 +95,7 @@ impl Display for Examination {
             }
             for c in &d.checks {
                 let mark = if c.passed { "" } else { "  <- WRONG" };
-                writeln!(f, "    {:<24} {:.1e} of {:.0e}{mark}", c.kernel, c.error, c.allowed)?;
+                writeln!(f, "    {:<48} {:.1e} of {:.0e}{mark}", c.name, c.error, c.allowed)?;
             }
         }
         write!(f, "--device auto is {}", self.auto)

@@ -4,6 +4,8 @@
 //! ([`ops::Ops`]) that each device implements with its own kernels.
 
 pub mod background;
+#[cfg(any(test, feature = "wgpu"))]
+pub(crate) mod ball;
 pub mod checkpoint;
 #[cfg(feature = "wgpu")]
 pub mod devices;
@@ -14,6 +16,8 @@ pub mod memory;
 pub mod ops;
 pub mod parameters;
 pub mod pixels;
+#[cfg(feature = "wgpu")]
+pub(crate) mod self_test;
 pub mod training;
 
 use crate::config::DeviceChoice;
@@ -54,12 +58,43 @@ impl ComputeDevice {
     }
 }
 
-/// Returns the device that a word names: see [`DeviceChoice`].
+/// A comparison of a GPU with the processor: one training step of a field.
+#[derive(Clone, Copy)]
+pub struct SelfTest {
+    /// The name of the field.
+    pub field: &'static str,
+    /// Makes the step on an adapter and on the processor.
+    #[cfg(feature = "wgpu")]
+    pub run: fn(&crate::kernel::gpu::Adapter) -> Result<Vec<devices::Check>>,
+}
+
+/// Returns the device that a word names: see [`DeviceChoice`]. `auto` takes a GPU only where it passes the test of the
+/// field that is to be computed there.
 ///
 /// # Errors
 ///
 /// Where this build or this machine does not have it.
-pub fn compute_device(name: &str) -> Result<ComputeDevice> {
+pub fn compute_device(name: &str, test: &SelfTest) -> Result<ComputeDevice> {
+    let choice = parsed(name)?;
+    if choice.name == "auto" {
+        #[cfg(feature = "wgpu")]
+        return Ok(devices::best(&choice, &[*test]).map_or_else(ComputeDevice::Cpu, ComputeDevice::Gpu));
+    }
+    let _ = test;
+    named(&choice)
+}
+
+/// Refuses a device that [`compute_device`] would refuse. Nothing is asked of any GPU where none is named.
+///
+/// # Errors
+///
+/// Where this build or this machine does not have it.
+pub fn require_device(name: &str) -> Result<()> {
+    let choice = parsed(name)?;
+    if choice.name == "auto" { Ok(()) } else { named(&choice).map(drop) }
+}
+
+fn parsed(name: &str) -> Result<DeviceChoice> {
     let choice = DeviceChoice::parse(name).ok_or_else(|| {
         Error::usage(format!("unknown device `{name}`"), "`tiface config --explain device` says which")
     })?;
@@ -70,14 +105,16 @@ pub fn compute_device(name: &str) -> Result<ComputeDevice> {
             "leave `--memory` out, or use a GPU: `--device wgpu`, in a build with `--features wgpu`",
         ));
     }
+    Ok(choice)
+}
+
+fn named(choice: &DeviceChoice) -> Result<ComputeDevice> {
     match choice.name.as_str() {
         "cpu" => Ok(ComputeDevice::Cpu(String::new())),
         #[cfg(feature = "wgpu")]
-        "auto" => Ok(devices::best(&choice).map_or_else(ComputeDevice::Cpu, ComputeDevice::Gpu)),
+        _ => Ok(ComputeDevice::Gpu(devices::open(choice)?)),
         #[cfg(not(feature = "wgpu"))]
         "auto" => Ok(ComputeDevice::Cpu(String::new())),
-        #[cfg(feature = "wgpu")]
-        _ => Ok(ComputeDevice::Gpu(devices::open(&choice)?)),
         #[cfg(not(feature = "wgpu"))]
         other => {
             let problem = format!("device `{other}`: this build learns on the processor alone");
@@ -117,10 +154,6 @@ impl<T> GpuField<T> {
         answer.ok()
     }
 }
-
-#[cfg(test)]
-#[path = "ball_tests.rs"]
-pub(crate) mod ball;
 
 #[cfg(all(test, feature = "wgpu"))]
 mod tests {

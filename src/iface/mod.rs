@@ -18,6 +18,8 @@ mod model;
 mod occupancy;
 mod ops;
 mod schedule;
+#[cfg(feature = "wgpu")]
+mod self_test;
 mod state;
 mod stereo;
 mod train;
@@ -25,3 +27,19 @@ mod train;
 pub use density::{DensityField, train_density};
 pub use infer::IFace;
 pub use train::{IfaceReport, train};
+
+use crate::field::SelfTest;
+
+/// Whether a GPU learns a signed distance as the processor does.
+pub const SDF_TEST: SelfTest = SelfTest {
+    field: "signed distance",
+    #[cfg(feature = "wgpu")]
+    run: self_test::sdf,
+};
+
+/// Whether a GPU learns a density as the processor does.
+pub const DENSITY_TEST: SelfTest = SelfTest {
+    field: "density",
+    #[cfg(feature = "wgpu")]
+    run: self_test::density,
+};

@@ -13,10 +13,14 @@ use crate::field::compute_device;
 use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
 use crate::geom::Camera;
+#[cfg(feature = "wgpu")]
+use crate::iface::SDF_TEST;
 use crate::iface::{self, DensityField, IFace};
 use crate::kernel::cpu::march::Bitmask;
 use crate::render::RenderedView;
 use crate::run::StageDir;
+#[cfg(feature = "wgpu")]
+use crate::tface::VM_TEST;
 use crate::tface::{self, FieldMean};
 use crate::{Error, Result};
 use serde_json::{Value, json};
@@ -130,7 +134,7 @@ impl Fields for TrainedFields<'_> {
             let hull = bitmask(&self.line.scene()?);
             let field = IFace::load(&folder, &config.iface, hull.as_ref())?;
             #[cfg(feature = "wgpu")]
-            let field = field.on(compute_device(&config.device)?);
+            let field = field.on(compute_device(&config.device, &SDF_TEST)?);
             Ok(Box::new(field))
         };
         once(&self.iface, load).map(|f| &**f)
@@ -142,7 +146,7 @@ impl Fields for TrainedFields<'_> {
             let count = config.radiance(stage).learned();
             let field = FieldMean::load(stage.word(), &run.path(stage), count)?;
             #[cfg(feature = "wgpu")]
-            let field = field.on(compute_device(&config.device)?);
+            let field = field.on(compute_device(&config.device, &VM_TEST)?);
             Ok(field)
         };
         let cell = if stage == Stage::Baseline { &self.baseline } else { &self.tface };

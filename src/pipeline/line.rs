@@ -243,7 +243,7 @@ pub fn feasible(config: &Config) -> Result<()> {
 /// Refuses a device that this build or this machine does not have, or that somebody else uses. What is done needs none:
 /// so this is asked where a stage is to do that computes on it.
 pub fn require_device(config: &Config) -> Result<()> {
-    crate::field::compute_device(&config.device).map(drop)
+    crate::field::require_device(&config.device)
 }
 
 /// How the configuration opens a capture.

@@ -13,6 +13,8 @@ mod mean;
 mod ops;
 mod record;
 mod refine;
+#[cfg(feature = "wgpu")]
+mod self_test;
 mod state;
 mod train;
 
@@ -20,3 +22,10 @@ pub use import::import;
 pub use infer::TFace;
 pub use mean::{FieldMean, train};
 pub use train::TfaceReport;
+
+/// Whether a GPU learns a vector-matrix field as the processor does.
+pub const VM_TEST: crate::field::SelfTest = crate::field::SelfTest {
+    field: "vector-matrix",
+    #[cfg(feature = "wgpu")]
+    run: self_test::vm,
+};

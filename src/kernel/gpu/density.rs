@@ -458,6 +458,11 @@ impl Density {
         [2 * features + 3 * HIDDEN + FEATURES + 2 * WIDTH + 2 + 2 * (3 + 3 + 2), HIDDEN.max(features)]
     }
 
+    /// Words of memory that sums of groups take, however many samples there are.
+    pub fn words_of_sums(shape: &DensityShape) -> usize {
+        SUMMING * Plan { features: 2 * shape.levels.len() }.gradients()[5] * CHANNELS
+    }
+
     /// Takes up new network weights.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
         launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;

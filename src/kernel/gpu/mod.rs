@@ -8,7 +8,6 @@
 //! Sums of many threads into one place are atomic, and [`Atomics`] says how. All else is summed in a fixed order.
 
 mod adam;
-mod check;
 mod density;
 mod device;
 mod draw;
@@ -22,14 +21,14 @@ mod points;
 mod rng;
 mod schedule;
 mod sdf;
-mod self_test;
 mod sum;
+#[cfg(test)]
+mod test_case;
 mod tile;
 mod vm;
 mod weight_norm;
 
 pub use adam::{Gate, adam};
-pub use check::Check;
 pub use density::Density;
 pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits, Words};
 pub use draw::{BUFFERS, Batch, DrawnView, Photographs, PixelOrder, SamplingOptions};
@@ -42,7 +41,6 @@ pub use occupancy::{Band, Nerfacc, Occupancy};
 pub use points::SurfacePoints;
 pub use schedule::Schedule;
 pub use sdf::Sdf;
-pub use self_test::self_test;
 pub use vm::{DeviceDecoder, DeviceGrid, Vm, VmLosses, VmRenderer, VmValues};
 pub use weight_norm::WeightNorm;
 

@@ -165,6 +165,11 @@ impl Sdf {
         [6 * features + 3 * HIDDEN + 2 * OUTPUTS + WIDTH + 3, HIDDEN.max(3 * features)]
     }
 
+    /// Words of memory that sums of groups take, however many samples there are.
+    pub fn words_of_sums(shape: &FieldShape) -> usize {
+        SUMMING * Plan::new(shape.layout()).gradients()[7] * CHANNELS
+    }
+
     /// What the last forward computed, planes `[8, capacity]`.
     pub fn output(&self) -> &Buffer {
         &self.out

@@ -1,8 +1,8 @@
-//! Does a device render TensoRF's field as the CPU does? On a tiny batch, which the tests of the kernels share.
+//! A vector-matrix field and rays to test kernels on.
 
-use super::super::check::{Check, planes, worst};
 use super::super::device::{Buffer, Device, Words};
 use super::super::draw::Batch;
+use super::super::evaluate::planes;
 use super::{Vm, VmValues};
 use crate::Result;
 use crate::kernel::cpu::march::MarchRay;
@@ -144,19 +144,4 @@ pub(super) fn on_cpu(case: &Case) -> (Rendered, [Vec<f32>; 3]) {
     let (mut d, mut c) = (vec![0.0; case.density.len()], vec![0.0; case.color.len()]);
     let n = vm::backward(&case.field, &case.density, &weights, rendered.clone(), &case.g, &mut d, &mut c);
     (rendered, [d, c, n])
-}
-
-/// Renders rays and their gradients on a device and on the CPU.
-pub(in super::super) fn checks(device: &Device) -> Result<Vec<Check>> {
-    let case = case(NARROW, 32);
-    let (rendered, gradients) = on_cpu(&case);
-    let there = There::new(device, &case);
-    let want = planes::<RAY_WIDTH>(rendered.out.as_chunks().0, room(&case));
-    let check = |name, got: &[f32], want: &[f32]| Check { name, error: worst(got, want), allowed: 1e-4 };
-    let mut checks = vec![check("rendered planes and lines", &there.render(device)?, &want)];
-    let names = ["gradient of the density", "gradient of the appearance", "gradient of the decoder"];
-    for ((name, got), want) in names.into_iter().zip(there.gradients(device)?).zip(&gradients) {
-        checks.push(check(name, &got, want));
-    }
-    Ok(checks)
 }
