@@ -22,10 +22,6 @@ pub const CELLS_AT: u64 = STEP - 1;
 /// another order, or a sample more or less at the border of a cell, is not.
 const ALLOWED: f32 = 2e-3;
 
-/// The same of the gradient of a vector-matrix density, which is 4e-3 apart between the processor and devices whose other
-/// gradients agree to 1e-6, whatever the way of adding.
-const ALLOWED_OF_DENSITY: f32 = 1e-2;
-
 /// A training that saves nothing.
 pub fn session(stage: &'static str) -> TrainingSession<'static> {
     TrainingSession { stage, seed: SEED, device: "", dir: Path::new(""), identity: "", monitor: &Quiet }
@@ -87,8 +83,7 @@ pub fn compare(field: &str, got: &Outcome, want: &Outcome) -> Vec<Check> {
             let own = first..first + part.count();
             first = own.end;
             let pairs = own.map(|i| (slopes[i].into(), wanted[i].into()));
-            let allowed = if part.name == "density" { ALLOWED_OF_DENSITY } else { ALLOWED };
-            checks.push(Check::new(format!("{field}: gradient of {}", part.name), error(pairs), allowed));
+            checks.push(Check::new(format!("{field}: gradient of {}", part.name), error(pairs), ALLOWED));
         }
         // a first step goes by signs: of next to no gradient it says next to nothing
         let moved = |of: &Outcome, i: usize| {
