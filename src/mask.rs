@@ -27,7 +27,7 @@ pub mod agreement;
 pub mod consistency;
 
 pub mod matting;
-#[cfg_attr(not(feature = "matting"), path = "no_networks.rs")]
+#[cfg_attr(not(feature = "matting"), path = "mask/no_networks.rs")]
 pub mod networks;
 
 pub mod sheet;
