@@ -4,7 +4,7 @@
 //! so that every intrinsic is divided by exactly `d`. Color is averaged in linear light, as a sensor
 //! with larger pixels would, weighted by alpha where there is one.
 
-use super::error::wrong_size;
+use super::folder::wrong_size;
 use super::view::{View, ViewMask};
 use crate::Result;
 use crate::config::MaskMeaning;

@@ -3,8 +3,7 @@
 use super::clicks::{MaskPrompts, make_masks};
 use super::scene_file;
 use crate::capture::inspect::{Inspection, Problem, grouped, inspect};
-use crate::capture::scene::{self, Scene, SceneOptions};
-use crate::capture::scene_box::{SceneBox, in_box};
+use crate::capture::scene::{self, Scene, SceneBox, SceneOptions, in_box};
 use crate::capture::{self, Capture, CaptureOptions, MASK_HINT, Split, View};
 use crate::config::{Config, MaskConfig, MaskMeaning, Preset};
 use crate::image::{Gray, Photo, working_size};
