@@ -51,7 +51,7 @@ pub fn renew_report(line: &Line) -> Result<()> {
 
 fn page(line: &Line) -> Result<String> {
     let sheet = text(&line.run.path(Stage::Mask).join(super::mask::SHEET))?;
-    let masks = crate::mask::sheet::part(&sheet, MASK_BYTES).unwrap_or_default();
+    let masks = crate::mask::pages::part(&sheet, MASK_BYTES).unwrap_or_default();
     let found = viewer::viewer(line)?;
     let glb = found.as_ref().map_or(0, |(v, _)| v.glb.len().div_ceil(3) * 4);
     let (views, left_out) = views::rows(line, MOST_BYTES.saturating_sub(masks.len() + glb))?;
