@@ -3,22 +3,23 @@
 //! Every sweep runs the code of the stages themselves on the same photographs and changes one thing. Errors are taken
 //! where nothing was learned from: masked PSNR of some held-out views.
 
-mod judge;
 mod surface;
 mod training;
 
 use super::line::Line;
+use super::render::Renderer;
 use super::surface::Fields;
-use super::{Stage, complete, learn};
-use crate::capture::Split;
+use super::{Stage, complete, learn, pictures};
 use crate::capture::scene::Scene;
-use crate::config::{Config, MeshConfig};
+use crate::capture::{LoadedView, Split, View};
+use crate::config::{Config, MeshConfig, Method, ViewBackground};
 use crate::geom::{Camera, Mesh};
-use crate::io;
+use crate::image::Photo;
+use crate::io::{self, Limits};
 use crate::mesh::{Cap, MeshReport, Patches};
+use crate::metrics::compare;
 use crate::report::bench::{BenchResult, Measure, Sweep, WorkCost};
 use crate::{Error, Monitor, Result};
-use judge::Judge;
 use std::time::Instant;
 
 /// What can be swept, in order.
@@ -149,4 +150,53 @@ fn timed<T>(work: impl FnOnce() -> Result<T>) -> Result<(T, WorkCost)> {
     let (wall_s, cpu_s) = (start.elapsed().as_secs_f64(), io::cpu_seconds() - cpu);
     let memory_mib = io::peak_memory().map(|bytes| bytes as f64 / f64::from(1 << 20));
     Ok((result, WorkCost { wall_s, cpu_s, memory_mib }))
+}
+
+/// Held-out views that are looked at: each costs seconds in each choice of a sweep.
+const VIEWS: usize = 4;
+
+/// Some held-out photographs.
+struct Judge<'l> {
+    views: Vec<(&'l View, LoadedView, Photo)>,
+    background: ViewBackground,
+}
+
+impl<'l> Judge<'l> {
+    /// Those of a line.
+    pub fn new(line: &'l Line<'l>) -> Result<Judge<'l>> {
+        let held_out = [Split::Test, Split::Val].map(|s| line.capture.split(s).collect::<Vec<_>>());
+        let Some(all) = held_out.into_iter().find(|views| !views.is_empty()) else {
+            return Err(Error::cannot(
+                "no view of this capture is held out: there is nothing to judge by",
+                "name some as `test` in its transforms.json",
+            ));
+        };
+        let count = all.len().min(VIEWS);
+        let background = line.config.render.background;
+        let views = (0..count).map(|i| {
+            let view = all[i * all.len() / count];
+            let loaded = line.judged(view).load(&Limits::default())?;
+            let expected = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
+            Ok((view, loaded, expected))
+        });
+        Ok(Judge { views: views.collect::<Result<_>>()?, background })
+    }
+
+    /// Mean PSNR of the views by a method, inside the mask (of the frame without one), dB.
+    pub fn psnr(&self, scene: &Scene, renderer: &Renderer, method: Method) -> Result<Option<f64>> {
+        let mut found = Vec::new();
+        for (view, loaded, expected) in &self.views {
+            let camera = view.camera.transformed(&scene.scene_from_world);
+            let mut rendered = renderer.view(method, &camera)?.ok_or_else(|| {
+                Error::cannot(format!("there is nothing to show for `{}`", method.folder()), "")
+            })?;
+            if let Some(background) = pictures::behind(self.background) {
+                pictures::over(&mut rendered, background);
+            }
+            let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
+            let figures = compare(&view.name, &rendered.color, expected, mask, valid)?;
+            found.extend(if mask.is_some() { figures.psnr_masked } else { figures.psnr });
+        }
+        Ok((!found.is_empty()).then(|| found.iter().sum::<f64>() / found.len() as f64))
+    }
 }

@@ -8,12 +8,11 @@ use crate::geom::{Camera, Mesh};
 use crate::mesh::files::HeadMesh;
 use crate::mesh::{SimplifyConfig, simplify};
 use crate::metrics::distance;
-use crate::pipeline::export::Export;
-use crate::pipeline::finish::finish;
+use crate::pipeline::finish::{Export, finish};
+use crate::pipeline::learn;
 use crate::pipeline::mesh::photographs;
 use crate::pipeline::render::{Meshes, Renderer};
 use crate::pipeline::surface::{ClosedSurface, Fields, Surface};
-use crate::pipeline::tiles;
 use crate::report::bench::{Measure, Row, Sweep};
 use glam::Vec3;
 
@@ -128,7 +127,7 @@ impl<'f> Finisher<'f> {
             let config = SimplifyConfig { triangles: c.triangles as usize, ..SimplifyConfig::default() };
             simplify(&mut mesh, Some(&|p: &[Vec3]| closed.sdf_gradient(p)), &config, bench.monitor())?;
         }
-        let views = tiles::training_views(&bench.line.capture, &bench.scene, bench.config())?;
+        let views = learn::training_views(&bench.line.capture, &bench.scene, bench.config())?;
         Ok(Finisher { mesh, extracted, fields, views })
     }
 

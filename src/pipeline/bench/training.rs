@@ -1,7 +1,6 @@
 //! What training costs and brings: steps, photographs' size, the hash grid.
 
-use super::judge::Judge;
-use super::{Bench, PSNR, timed};
+use super::{Bench, Judge, PSNR, timed};
 use crate::config::{Config, Method};
 use crate::field::training::TrainingSession;
 use crate::io;
