@@ -30,7 +30,6 @@ mod gather;
 pub mod inspect;
 mod lens;
 mod llff;
-mod load;
 mod masks;
 mod metashape;
 mod neus;
@@ -42,8 +41,7 @@ mod view;
 
 pub use crate::config::{MaskMeaning, MaskSource};
 pub use gather::{has_cameras, open};
-pub use load::LoadedView;
 pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
 pub use scene::well_seen;
 pub(crate) use transforms::camera_like;
-pub use view::{Capture, CaptureOptions, Split, View, ViewMask};
+pub use view::{Capture, CaptureOptions, LoadedView, Split, View, ViewMask};

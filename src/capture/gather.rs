@@ -1,11 +1,11 @@
 //! From camera files to views: everything is checked but the pixels.
 
-use super::folder::{CaptureFolder, in_frame, no_views, wrong_size};
+use super::folder::{CaptureFolder, in_frame, no_views};
 use super::format::CameraFiles;
 use super::frame::{CameraFrame, Listing};
 use super::masks::few;
-use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
-use super::{folder, format, load, masks, scene};
+use super::view::{Capture, CaptureOptions, Split, View, ViewMask, downscaled, wrong_size};
+use super::{folder, format, masks, scene};
 use crate::io::{self, PictureInfo};
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
@@ -162,7 +162,7 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
     let photo = frame.photo.clone().unwrap_or_default();
     let full = frame.intrinsics.camera(declared, frame.rotation, frame.position).map_err(problem)?;
     let (camera, photo_size) = if info.size(Some(declared)) == declared {
-        (load::downscaled(&full, d), declared)
+        (downscaled(&full, d), declared)
     } else if info.size(Some(target)) == target {
         (full.resized(target.0, target.1), target) // the photographs are already smaller
     } else {
