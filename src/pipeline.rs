@@ -21,7 +21,6 @@
 
 mod bench;
 mod clicks;
-mod cost;
 mod ensemble;
 pub mod experiment;
 mod finish;
