@@ -8,32 +8,27 @@
 //! stand once, on its field. Everything here works on what serde says about them. What no user has a reason to
 //! change is no key but a constant of the preset, in the same place.
 
-mod baseline;
-mod capture;
-mod device;
-mod ensemble;
 pub mod iface;
 mod mask;
 mod mesh;
-mod metrics;
 mod render;
 mod source;
 mod stage;
 mod table;
 mod vm;
 
-pub use baseline::BaselineConfig;
-pub use capture::CaptureConfig;
-pub use device::DeviceChoice;
-pub use ensemble::EnsembleConfig;
 pub use iface::IfaceConfig;
-pub use mask::{CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors};
+pub use mask::{
+    CaptureConfig, CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors,
+};
 pub use mesh::{ColorSource, Genus, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
-pub use metrics::{MetricsConfig, TruthPhoto};
-pub use render::{Method, NAMES, PictureFormat, RenderConfig, ViewBackground, called};
+pub use render::{
+    EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,
+    called,
+};
 pub use source::Sources;
 pub use stage::Stage;
-pub use vm::{DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
+pub use vm::{BaselineConfig, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
 use crate::io::{self, Limits};
 use crate::{Error, Result};
@@ -168,15 +163,15 @@ const ROOT_KEYS: &[Key] = &[
 /// Every table with its keys, in the order of the line; the first has no name.
 const TABLES: &[(&str, &[Key])] = &[
     ("", ROOT_KEYS),
-    ("capture", capture::KEYS),
-    ("mask", mask::KEYS),
-    ("baseline", baseline::KEYS),
-    ("tface", vm::KEYS),
-    ("iface", iface::KEYS),
-    ("mesh", mesh::KEYS),
-    ("render", render::KEYS),
-    ("ensemble", ensemble::KEYS),
-    ("metrics", metrics::KEYS),
+    ("capture", CaptureConfig::KEYS),
+    ("mask", MaskConfig::KEYS),
+    ("baseline", BaselineConfig::KEYS),
+    ("tface", VmConfig::KEYS),
+    ("iface", IfaceConfig::KEYS),
+    ("mesh", MeshConfig::KEYS),
+    ("render", RenderConfig::KEYS),
+    ("ensemble", EnsembleConfig::KEYS),
+    ("metrics", MetricsConfig::KEYS),
 ];
 
 /// Every key with its full, dotted name.
@@ -357,6 +352,49 @@ fn show(value: &Value) -> String {
     }
 }
 
+/// Names of devices.
+const DEVICES: [&str; 6] = ["auto", "cpu", "wgpu", "vulkan", "metal", "dx12"];
+
+/// A device, and how it is to be used.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DeviceChoice {
+    /// `auto`, `cpu`, `wgpu` (Vulkan, Metal or DX12), `vulkan`, `metal` or `dx12`.
+    pub name: String,
+    /// Which of its adapters, from 0.
+    pub number: Option<usize>,
+    /// Are sums of many threads made in whole numbers, so that they are the same bytes every time? The processor's are.
+    pub deterministic: bool,
+    /// GiB of its memory that a training may take; all of it where nothing is said.
+    pub memory_gib: Option<f64>,
+}
+
+impl DeviceChoice {
+    /// Returns the choice of a word; none where it is no such word.
+    pub fn parse(word: &str) -> Option<DeviceChoice> {
+        let mut parts = word.split('+');
+        let device = parts.next()?;
+        let (name, number) = match device.split_once(':') {
+            Some((name, number)) => (name, Some(number.parse().ok()?)),
+            None => (device, None),
+        };
+        if !DEVICES.contains(&name) || (number.is_some() && ["auto", "cpu"].contains(&name)) {
+            return None;
+        }
+        let mut choice = DeviceChoice { name: name.into(), number, deterministic: false, memory_gib: None };
+        for part in parts {
+            match part.strip_suffix("GiB") {
+                Some(gib) => {
+                    let gib = gib.parse().ok().filter(|gib: &f64| gib.is_finite() && *gib > 0.0);
+                    choice.memory_gib = Some(gib?);
+                }
+                None if part == "deterministic" => choice.deterministic = true,
+                None => return None,
+            }
+        }
+        Some(choice)
+    }
+}
+
 #[cfg(test)]
 mod source_tests;
 #[cfg(test)]
@@ -422,5 +460,36 @@ mod tests {
         assert_eq!(show(&Value::Float(2.0)), "2.0");
         let tiny = show(&Value::Float(1e-12f32 as f64));
         assert_eq!(tiny.parse::<f32>().unwrap(), 1e-12f32);
+    }
+
+    #[test]
+    fn words_are_taken_apart_and_others_are_none() {
+        let parsed = |word| DeviceChoice::parse(word);
+        let plain = parsed("auto").unwrap();
+        assert_eq!((plain.name.as_str(), plain.number, plain.deterministic), ("auto", None, false));
+        let all = parsed("vulkan:3+deterministic+7.5GiB").unwrap();
+        let want = DeviceChoice {
+            name: "vulkan".into(),
+            number: Some(3),
+            deterministic: true,
+            memory_gib: Some(7.5),
+        };
+        assert_eq!(all, want);
+        assert_eq!(parsed("dx12:1").unwrap().number, Some(1));
+        for wrong in [
+            "",
+            "gpu",
+            "cpu:0",
+            "auto:1",
+            "wgpu:",
+            "wgpu:-1",
+            "wgpu+",
+            "wgpu+fast",
+            "wgpu+0GiB",
+            "wgpu+NaNGiB",
+            "cuda",
+        ] {
+            assert_eq!(parsed(wrong), None, "{wrong}");
+        }
     }
 }

@@ -19,19 +19,17 @@
 //! things happened, and so differ from run to run.
 
 use crate::{Error, ErrorKind, Quiet, Result};
-mod estimate;
 mod fingerprint;
 mod progress;
 mod stage;
 mod standing;
 mod status;
 
-pub use estimate::{Cost, ESTIMATE, Estimate, read_estimate};
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer, Stop};
 pub use stage::{Done, Plan, StageDir};
 pub use standing::{FAILED, Failure, Phase, StageStanding, Standing, read_failure};
-pub use status::{Record, State, Status, read_record, read_status};
+pub use status::{Cost, ESTIMATE, Estimate, Record, State, Status, read_estimate, read_record, read_status};
 
 use crate::io::{self, Lock, LockError};
 use std::path::{Path, PathBuf};

@@ -1,10 +1,32 @@
-//! `tiface doctor`: what this machine and this build can do, to choose a device and to paste into a bug report.
+//! What the program says of itself: `tiface config`, the effective configuration or what a key means; `tiface doctor`, what
+//! this machine and this build can do, to choose a device and to paste into a bug report; `tiface completions`, what a shell
+//! needs to complete commands and options, and the manual pages.
 
-use super::options::Common;
-use super::stdout::print;
+use super::options::{Common, RunTarget};
+use super::out::Out;
+use super::screen::print;
+use crate::config::explain;
 use crate::{Error, ErrorKind, Result, io};
+use clap::{Command, ValueEnum};
+use clap_complete::{Shell, generate};
+use clap_mangen::Man;
 use serde::Serialize;
 use std::fmt::{self, Display};
+use std::path::Path;
+
+pub(super) fn config(common: &Common, path: Option<&Path>, key: Option<&str>) -> Result<()> {
+    if let Some(key) = key {
+        print(&explain(key)?)?;
+        return Ok(());
+    }
+    // without a capture or run it is the configuration of a run that is yet to be
+    let saved = match path.or(common.run.as_deref()) {
+        Some(path) => RunTarget::find(common, Some(path))?.saved,
+        None => None,
+    };
+    print(&common.resolve(saved.as_deref(), None, &[])?.to_toml())?;
+    Ok(())
+}
 
 /// What is said of a machine.
 #[derive(Serialize)]
@@ -20,7 +42,7 @@ struct Examination {
     auto: String,
 }
 
-pub(super) fn run(common: &Common) -> Result<()> {
+pub(super) fn doctor(common: &Common) -> Result<()> {
     let features = [("wgpu", cfg!(feature = "wgpu")), ("matting", cfg!(feature = "matting"))];
     #[cfg(feature = "wgpu")]
     let (devices, auto) = {
@@ -100,4 +122,69 @@ impl Display for Examination {
         }
         write!(f, "--device auto is {}", self.auto)
     }
+}
+
+/// What `completions` writes.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Form {
+    Shell(Shell),
+    Man,
+}
+
+impl ValueEnum for Form {
+    fn value_variants<'a>() -> &'a [Form] {
+        use Form::{Man, Shell as For};
+        &[
+            For(Shell::Bash),
+            For(Shell::Zsh),
+            For(Shell::Fish),
+            For(Shell::PowerShell),
+            For(Shell::Elvish),
+            Man,
+        ]
+    }
+
+    fn to_possible_value(&self) -> Option<clap::builder::PossibleValue> {
+        match self {
+            Form::Shell(shell) => shell.to_possible_value(),
+            Form::Man => Some(clap::builder::PossibleValue::new("man")),
+        }
+    }
+}
+
+pub(super) fn completions(form: Form, mut command: Command, out: Option<&Out>) -> Result<()> {
+    let pages = match (form, out) {
+        (Form::Shell(_), Some(_)) => {
+            return Err(Error::usage("the script of a shell goes to stdout", "send it on with `> FILE`"));
+        }
+        (Form::Shell(shell), None) => {
+            let mut script = Vec::new();
+            generate(shell, &mut command, "tiface", &mut script);
+            return print(&String::from_utf8_lossy(&script));
+        }
+        (Form::Man, None) => vec![page(command)?],
+        (Form::Man, Some(_)) => {
+            command.build();
+            let of_commands: Vec<Command> =
+                command.get_subcommands().filter(|c| c.get_name() != "help").cloned().collect();
+            let named = of_commands.into_iter().map(|c| {
+                // a command's name lives as long as the program
+                let name: &'static str = format!("tiface-{}", c.get_name()).leak();
+                c.name(name).display_name(name)
+            });
+            let all: Vec<Command> = named.collect();
+            std::iter::once(command).chain(all).map(page).collect::<Result<_>>()?
+        }
+    };
+    let Some(out) = out else { return print(&String::from_utf8_lossy(&pages[0].1)) };
+    out.prepare()?;
+    pages.iter().try_for_each(|(name, text)| Ok(io::write_atomic(&out.file(name), text)?))
+}
+
+/// A manual page and the name of its file.
+fn page(command: Command) -> Result<(String, Vec<u8>)> {
+    let man = Man::new(command);
+    let mut text = Vec::new();
+    man.render(&mut text).map_err(|e| Error::new(crate::ErrorKind::Bug, e))?;
+    Ok((man.get_filename(), text))
 }

@@ -144,7 +144,7 @@ pub fn voxel_schedule(first: u64, last: u64, steps: usize) -> Vec<u64> {
 }
 
 #[cfg(test)]
-#[path = "fixture_tests.rs"]
+#[path = "vm/fixture_tests.rs"]
 pub(crate) mod fixture;
 #[cfg(test)]
 mod tests;

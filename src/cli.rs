@@ -1,43 +1,32 @@
-//! The command line: one file per command, named as it is typed. The only module that prints.
+//! The command line: a file per command, named as it is typed, but that small ones share `about` and `capture`. The only
+//! module that prints.
 //!
 //! Data goes to stdout, everything else to stderr; the exit code says whether to try again
 //! ([`crate::ErrorKind`]).
 
-mod bar;
+mod about;
 mod bench;
+mod capture;
 mod check;
-mod completions;
-mod config;
-mod convert;
 mod demo;
-mod doctor;
 mod experiment;
-mod inspect;
-mod invocation;
 mod options;
 mod out;
-mod page;
-mod plain;
 mod preview;
 mod report;
 mod run;
 mod screen;
 mod signals;
 mod status;
-mod stdout;
-mod summary;
-mod target;
-mod viewer;
 
 use crate::pipeline::Stage;
 use crate::run::Stop;
 use crate::{Error, Result};
+use about::Form;
 use bench::BenchOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
-use completions::Form;
 use experiment::ExperimentOptions;
-use invocation::Invocation;
-use options::{Common, KeyOption};
+use options::{Common, KeyOption, RunTarget};
 use out::Out;
 use preview::PreviewOptions;
 use run::LineCommand;
@@ -46,7 +35,7 @@ use status::StatusOptions;
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use target::RunTarget;
+use std::sync::Arc;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -461,12 +450,12 @@ pub fn main() -> ExitCode {
     let ended = signals::listen(&invocation).and_then(|()| match &command {
         Command::Demo { size, views, border } => demo::run(&invocation, size.as_deref(), *views, *border),
         Command::Mask { place, clicks, page: true } => {
-            page::run(&invocation, place.path.as_deref(), clicks.prompts.as_deref())
+            capture::page(&invocation, place.path.as_deref(), clicks.prompts.as_deref())
         }
         Command::Inspect { capture } => {
-            makes_nothing("inspect").and_then(|()| inspect::run(&common, capture))
+            makes_nothing("inspect").and_then(|()| capture::inspect(&common, capture))
         }
-        Command::Convert { capture, to } => convert::run(&invocation, capture, to),
+        Command::Convert { capture, to } => capture::convert(&invocation, capture, to),
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
         Command::Preview(options) => preview::run(&invocation, options),
@@ -475,10 +464,10 @@ pub fn main() -> ExitCode {
         Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
         Command::Report { runs, table } => report::run(&invocation, runs, *table),
         Command::Config { place, explain } => makes_nothing("config")
-            .and_then(|()| config::run(&common, place.path.as_deref(), explain.as_deref())),
-        Command::Doctor => makes_nothing("doctor").and_then(|()| doctor::run(&common)),
+            .and_then(|()| about::config(&common, place.path.as_deref(), explain.as_deref())),
+        Command::Doctor => makes_nothing("doctor").and_then(|()| about::doctor(&common)),
         Command::Completions { form } => Out::find(common.out.as_deref(), "completions")
-            .and_then(|out| completions::run(*form, Cli::command(), out.as_ref())),
+            .and_then(|out| about::completions(*form, Cli::command(), out.as_ref())),
         stages => run::run(&invocation, &stages.on_line(&common)?),
     });
     ExitCode::from(match ended {
@@ -560,6 +549,16 @@ fn key_options<const N: usize>(options: [(&str, &str, Option<&str>); N]) -> Vec<
         value.map(|v| (format!("{option} {v}"), key.to_string(), v.to_string()))
     });
     given.collect()
+}
+
+/// One command at work.
+struct Invocation<'a> {
+    /// The options that every command shares.
+    pub common: &'a Common,
+    /// Where people see what happens.
+    pub screen: Arc<Screen>,
+    /// Set when somebody asks to stop.
+    pub stop: Stop,
 }
 
 #[cfg(test)]

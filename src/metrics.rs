@@ -19,7 +19,7 @@
 //! ```
 
 pub mod distance;
-#[cfg_attr(not(feature = "matting"), path = "no_lpips.rs")]
+#[cfg_attr(not(feature = "matting"), path = "metrics/no_lpips.rs")]
 mod lpips;
 mod parts;
 mod psnr;

@@ -16,7 +16,7 @@ pub mod neus;
 pub mod occupancy;
 pub mod pool;
 #[cfg(test)]
-#[path = "../../../tests/support/reference/mod.rs"]
+#[path = "../../tests/support/reference/mod.rs"]
 pub(crate) mod reference;
 pub mod rng;
 pub mod schedule;

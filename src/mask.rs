@@ -9,15 +9,13 @@
 //!
 //! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unknown in a trimap.
 
-mod click;
-mod components;
-pub mod distance;
 mod hull;
+pub mod morphology;
 pub mod scale;
 
 pub mod prompts;
 
-pub mod annotation;
+pub mod pages;
 
 pub mod grabcut;
 
@@ -27,9 +25,7 @@ pub mod agreement;
 pub mod consistency;
 
 pub mod matting;
-#[cfg_attr(not(feature = "matting"), path = "no_networks.rs")]
+#[cfg_attr(not(feature = "matting"), path = "mask/no_networks.rs")]
 pub mod networks;
 
-pub mod sheet;
-
-pub use click::Click;
+pub use prompts::Click;
