@@ -6,14 +6,14 @@
 //!
 //! Did the sparse extraction lose anything? The dense grid knows.
 
-use crate::{Error, Monitor, Result};
+use super::marching::{Volume, marching};
+use super::{MeshReport, NodeGrid, off_surface};
 use crate::geom::{Aabb, Mesh, topology};
 use crate::mesh::input::{answered, setting};
+use crate::{Error, Monitor, Result};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
-use super::{MeshReport, NodeGrid, off_surface};
-use super::marching::{Volume, marching};
 
 /// How much the surface's box grows on each side, as a share of its size.
 const MARGIN: f32 = 0.1;
@@ -146,11 +146,11 @@ pub(super) fn dense_triangles(
 
 #[cfg(test)]
 mod tests {
+    use super::*;
     use crate::Quiet;
     use crate::geom::Aabb;
     use crate::mesh::{ExtractOptions, extract};
     use glam::Vec3;
-    use super::*;
 
     /// A ball of 0.3 at (0.2, 0, 0), and a crumb of 0.03 far from it.
     fn sdf(points: &[Vec3]) -> Vec<f32> {

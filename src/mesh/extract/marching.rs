@@ -8,13 +8,13 @@
 //!
 //! An exact zero is outside, `-0.0` too.
 
-use crate::{Error, Result};
+use super::marching_cell::{CASES, CellSurface, INNER, crossing, resolve};
 use crate::geom::Mesh;
 use crate::mesh::input::few_enough;
+use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::borrow::Cow;
-use super::marching_cell::{CASES, CellSurface, INNER, crossing, resolve};
 
 /// A dense grid of field values, negative inside.
 #[derive(Clone, Copy, Debug)]
@@ -334,7 +334,7 @@ pub(super) struct Bits {
 
 impl Bits {
     /// Reads all values once; also says whether all of them are finite.
-    pub(super) fn scan(values: &[f32], dims: [usize; 3]) -> (Bits, bool) {
+    fn scan(values: &[f32], dims: [usize; 3]) -> (Bits, bool) {
         let [nx, ny, nz] = dims;
         let per_row = nx.div_ceil(64);
         let mut words = vec![0u64; per_row * ny * nz];
@@ -373,7 +373,7 @@ impl Bits {
     }
 
     /// Takes the nodes on the six outer faces as outside; how many were inside.
-    pub(super) fn clear_border(&mut self) -> usize {
+    fn clear_border(&mut self) -> usize {
         let [nx, ny, nz] = self.dims;
         let mut cleared = 0;
         for k in 0..nz {
@@ -435,7 +435,7 @@ fn below(end: usize, w: usize) -> u64 {
 
 /// Calls `visit(i, case)` for every cell (i, j, k) of a row that the surface crosses.
 #[inline]
-pub(super) fn for_each_active(bits: &Bits, j: usize, k: usize, mut visit: impl FnMut(usize, u8)) {
+fn for_each_active(bits: &Bits, j: usize, k: usize, mut visit: impl FnMut(usize, u8)) {
     let rows = [bits.row(j, k), bits.row(j + 1, k), bits.row(j, k + 1), bits.row(j + 1, k + 1)];
     let words = bits.per_row;
     let [r0, r1, r2, r3] = rows.map(|r| &r[..words]);

@@ -18,16 +18,15 @@ pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};
 pub use sparse::{Sparse, sparse};
 
-use crate::{Error, Monitor, Result};
+use super::input::{answered, evaluate, setting};
+use super::moves::Polish;
 use crate::geom::{Aabb, Mesh, Topology, topology};
-use crate::mesh::input::setting;
+use crate::{Error, Monitor, Result};
 use dense::dense_triangles;
 use glam::{DVec3, Vec3};
 use handles::cut_handles;
-use polish::Polish;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
-use super::input::{answered, evaluate, setting};
 
 /// How the surface is extracted.
 #[derive(Clone, Debug, PartialEq)]
@@ -334,9 +333,6 @@ fn off_surface(values: &[f32], gradients: &[Vec3], capped: &[bool], cell: f32) -
     if n > 0 { sum / n as f64 } else { 0.0 }
 }
 
-#[cfg(test)]
-mod handles_tests;
-
 /// Cubic cells over a box.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NodeGrid {
@@ -384,15 +380,18 @@ impl NodeGrid {
     }
 
     /// Returns whether a node lies on the outer faces.
-    pub(super) fn on_border(&self, node: [usize; 3]) -> bool {
+    fn on_border(&self, node: [usize; 3]) -> bool {
         (0..3).any(|a| node[a] == 0 || node[a] + 1 == self.dims[a])
     }
 }
 
 #[cfg(test)]
+mod handles_tests;
+
+#[cfg(test)]
 mod tests {
-    use crate::Quiet;
     use super::*;
+    use crate::Quiet;
 
     fn mesh_of(f: impl Fn(Vec3) -> f32 + Sync, config: &ExtractOptions) -> Result<(Mesh, MeshReport)> {
         let gradient = |p: Vec3| {
