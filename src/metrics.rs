@@ -22,13 +22,11 @@ pub mod distance;
 #[cfg_attr(not(feature = "matting"), path = "metrics/no_lpips.rs")]
 mod lpips;
 mod parts;
-mod psnr;
-mod ssim;
+mod psnr_ssim;
 
 pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
-pub use psnr::psnr;
-pub use ssim::{ssim_reflect_map, ssim_valid};
+pub use psnr_ssim::{psnr, ssim_reflect_map, ssim_valid};
 
 use crate::image::{Gray, Image, Photo, quantize};
 use crate::{Error, Result};

@@ -3,36 +3,30 @@
 mod cap;
 mod clean;
 mod dense;
-mod grid;
 mod handles;
 mod holes;
 mod loops;
 mod marching;
-mod marching_bits;
 mod marching_cell;
-mod polish;
 mod sparse;
 mod sparse_blocks;
-mod verify;
 
 pub use cap::{Cap, Skin};
 pub use clean::{CleanReport, clean};
-pub use dense::extract_dense;
-pub use grid::NodeGrid;
+pub use dense::{Verified, extract_dense};
 pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};
 pub use sparse::{Sparse, sparse};
-pub use verify::Verified;
 
 use super::input::{answered, evaluate, setting};
+use super::moves::Polish;
 use crate::geom::{Aabb, Mesh, Topology, topology};
 use crate::{Error, Monitor, Result};
-use glam::Vec3;
+use dense::dense_triangles;
+use glam::{DVec3, Vec3};
 use handles::cut_handles;
-use polish::Polish;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
-use verify::dense_triangles;
 
 /// How the surface is extracted.
 #[derive(Clone, Debug, PartialEq)]
@@ -337,6 +331,58 @@ fn off_surface(values: &[f32], gradients: &[Vec3], capped: &[bool], cell: f32) -
         .filter(|d| d.is_finite());
     let (sum, n) = distances.fold((0.0, 0usize), |(s, n), d| (s + d, n + 1));
     if n > 0 { sum / n as f64 } else { 0.0 }
+}
+
+/// Cubic cells over a box.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NodeGrid {
+    /// Nodes along x, y, z.
+    pub dims: [usize; 3],
+    /// Node (0, 0, 0).
+    pub origin: Vec3,
+    /// Cell edge.
+    pub spacing: f32,
+}
+
+impl NodeGrid {
+    /// `resolution` cells along the longest side; along the others as many as cover the box, the
+    /// surplus split between both ends.
+    ///
+    /// # Errors
+    ///
+    /// An empty or unbounded box, a resolution outside 2..=8192.
+    pub fn fit(bounds: Aabb, resolution: usize) -> Result<NodeGrid> {
+        let size = bounds.size();
+        if bounds.is_empty() || !size.is_finite() || !bounds.center().is_finite() || size.min_element() <= 0.0
+        {
+            let Aabb { min, max } = bounds;
+            let message = format!("the box to mesh in, {min} to {max}, is empty or not finite");
+            return Err(Error::cannot(message, "check the scene box of the capture"));
+        }
+        setting((2..=8192).contains(&resolution), "mesh.resolution", "2..=8192", resolution)?;
+        let spacing = size.max_element() / resolution as f32;
+        // A side a rounding error longer than n cells is n cells long.
+        let cells = size.to_array().map(|s| ((s / spacing - 1e-3).ceil() as usize).max(2));
+        let half = DVec3::from(cells.map(|c| 0.5 * c as f64 * f64::from(spacing)));
+        let origin = (bounds.center().as_dvec3() - half).as_vec3();
+        Ok(NodeGrid { dims: cells.map(|c| c + 1), origin, spacing })
+    }
+
+    /// Where a node lies.
+    pub fn point(&self, node: [usize; 3]) -> Vec3 {
+        let n = DVec3::new(node[0] as f64, node[1] as f64, node[2] as f64);
+        (self.origin.as_dvec3() + n * f64::from(self.spacing)).as_vec3()
+    }
+
+    /// Number of nodes.
+    pub fn nodes(&self) -> usize {
+        self.dims.iter().product()
+    }
+
+    /// Returns whether a node lies on the outer faces.
+    fn on_border(&self, node: [usize; 3]) -> bool {
+        (0..3).any(|a| node[a] == 0 || node[a] + 1 == self.dims[a])
+    }
 }
 
 #[cfg(test)]

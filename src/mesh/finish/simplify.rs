@@ -1,14 +1,14 @@
 //! Fewer triangles for the same surface: edge collapse by quadrics, checked against the field itself.
 //!
-//! Garland, Heckbert 1997 with the memoryless quadrics of Lindstrom, Turk 1998; see `quadric`. Every
+//! Garland, Heckbert 1997 with the memoryless quadrics of Lindstrom, Turk 1998; see `rings`. Every
 //! collapse keeps the link condition, turns no triangle by more than 60° and leaves none thinner than
 //! the thinnest it found (`collapse`), so a closed manifold stays one, of the same genus.
 //!
 //! The field is a network: thousands of points a call are cheap, single ones are not. So it is evaluated
-//! between rounds of collapses: at the vertices and in the middles of triangles, in one batch each (`fit`).
+//! between rounds of collapses: at the vertices and in the middles of triangles, in one batch each (`rounds`).
 //! Vertices go to its zero, or where their triangles lie nearest to it, and from there the next round
 //! measures its planes. With an error to keep, a batch at the middles of triangles and edges tells how
-//! much each place may still give (`bounded`).
+//! much each place may still give.
 //!
 //! Nearest is the default, since it is what accuracy means: a head of 202,276 triangles, itself 0.0155
 //! 512ths of the cube off, has a mean error of 0.0199 in 40,000 triangles without the field, 0.0257 with
@@ -20,26 +20,18 @@
 //! last attempt looks everywhere, at seven times the cost. So none is made, and those of the input do not
 //! become more.
 
-mod bounded;
 mod collapse;
 mod crossing;
-mod fit;
-mod hold;
-mod options;
-mod quadric;
-mod queue;
 mod rings;
-mod round;
-
-pub use options::{SimplifyConfig, SimplifyReport, VertexPlacement};
+mod rounds;
 
 use crate::geom::Mesh;
-use crate::mesh::input::{Field, few_enough, finite, sound};
+use crate::mesh::input::{Field, few_enough, finite, setting, sound};
 use crate::{Monitor, Result};
-use bounded::bounded;
 use crossing::crossings;
 use glam::Vec3;
-use round::{CrossingSearch, Task, counted};
+use rounds::{CrossingSearch, Task, bounded, counted};
+use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
 /// A first attempt without looking, two that look near what was found, one that looks everywhere.
@@ -136,6 +128,110 @@ pub fn simplify(
     report.after = mesh.triangles.len();
     report.seconds = begin.elapsed().as_secs_f64();
     Ok(report)
+}
+
+/// Where vertices lie in the end, when there is a field.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum VertexPlacement {
+    /// On the field's zero. Between them the triangles are chords.
+    OnSurface,
+    /// Where the triangles are nearest to the zero, in the least-squares sense.
+    #[default]
+    Nearest,
+}
+
+/// How far to simplify.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SimplifyConfig {
+    /// Triangles to keep; 0 goes as far as `error` lets it.
+    pub triangles: usize,
+    /// Most distance from the surface, in units of the positions; 0 goes as far as `triangles` says.
+    pub error: f32,
+    /// Where vertices lie in the end; with an `error` always on the zero.
+    pub placement: VertexPlacement,
+    /// Most points in one call of the field; at least 1.
+    pub batch: usize,
+}
+
+impl Default for SimplifyConfig {
+    fn default() -> SimplifyConfig {
+        SimplifyConfig {
+            triangles: 200_000,
+            error: 0.0,
+            placement: VertexPlacement::default(),
+            batch: 1 << 16,
+        }
+    }
+}
+
+impl SimplifyConfig {
+    fn check(&self) -> Result<()> {
+        setting(
+            self.error >= 0.0 && self.error.is_finite(),
+            "SimplifyConfig::error",
+            "0 or more",
+            self.error,
+        )?;
+        setting(
+            self.triangles > 0 || self.error > 0.0,
+            "SimplifyConfig::triangles",
+            "at least 1, or an `error`",
+            0,
+        )?;
+        setting(self.batch > 0, "SimplifyConfig::batch", "at least 1", 0)
+    }
+}
+
+/// What [`simplify`](super::simplify) did.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct SimplifyReport {
+    /// Triangles given.
+    pub before: usize,
+    /// Triangles left.
+    pub after: usize,
+    /// Edges collapsed in the attempt that counts.
+    pub collapses: usize,
+    /// Collapses refused because of topology, turned or thin triangles.
+    pub refused: usize,
+    /// Collapses refused because triangles would have met.
+    pub crossing: usize,
+    /// Vertices where the input is not a manifold; they stayed.
+    pub held: usize,
+    /// Triangles with a repeated vertex, left out.
+    pub degenerate: usize,
+    /// Vertices that moved less than the field wanted, because a triangle would have been spoiled.
+    pub held_back: usize,
+    /// Points at which the field was evaluated.
+    pub asked: usize,
+    /// How often the work began anew because of self-intersections.
+    pub again: usize,
+    /// Triangles that meet others in the result; not more than in the input.
+    pub self_intersections: usize,
+    /// Largest distance from the surface at corners, middles of edges and triangles; measured only with
+    /// a field and an `error`, in units of the positions.
+    pub worst: Option<f32>,
+    /// Wall time.
+    pub seconds: f64,
+}
+
+impl SimplifyReport {
+    /// Returns what a person should know, one sentence each.
+    pub fn warnings(&self, config: &SimplifyConfig) -> Vec<String> {
+        let mut out = Vec::new();
+        if config.triangles > 0 && self.after > config.triangles && config.error == 0.0 {
+            out.push(format!(
+                "{} triangles are left instead of {}: fewer would change the topology, fold the surface or make it cross itself",
+                self.after, config.triangles
+            ));
+        }
+        if self.held > 0 {
+            out.push(format!("{} vertices are not manifold and stayed as they are", self.held));
+        }
+        if self.self_intersections > 0 {
+            out.push(format!("{} triangles cross others, as in the input", self.self_intersections));
+        }
+        out
+    }
 }
 
 #[cfg(test)]
