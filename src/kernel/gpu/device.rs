@@ -116,6 +116,8 @@ pub struct Adapter {
     pub software: bool,
     /// The driver and its version; empty where it does not say.
     pub driver: String,
+    /// Bytes of its memory; none where the API does not say.
+    memory: Option<u64>,
     ready: Once,
 }
 
@@ -172,6 +174,7 @@ impl Adapter {
                 kind: KINDS[kind],
                 software: kind == 4,
                 driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+                memory: memory_of(&adapter),
                 ready: Once::new(),
             };
             found.push(((kind, api, number), adapter));
@@ -195,6 +198,27 @@ impl Adapter {
     }
 }
 
+/// Returns the bytes of an adapter's largest heap of device-local memory, which Vulkan states. WebGPU, whose shaders CubeCL
+/// compiles here, does not.
+#[cfg(not(target_vendor = "apple"))]
+fn memory_of(adapter: &wgpu::Adapter) -> Option<u64> {
+    const DEVICE_LOCAL: u32 = 1;
+    // SAFETY: nothing is created or destroyed through the handles, which the adapter outlives.
+    let properties = unsafe {
+        let vulkan = adapter.as_hal::<wgpu::hal::api::Vulkan>()?;
+        let instance = vulkan.shared_instance().raw_instance();
+        instance.get_physical_device_memory_properties(vulkan.raw_physical_device())
+    };
+    let heaps = &properties.memory_heaps[..properties.memory_heap_count as usize];
+    heaps.iter().filter(|heap| heap.flags.as_raw() & DEVICE_LOCAL != 0).map(|heap| heap.size).max()
+}
+
+/// Returns nothing: Metal states no size, but one that it recommends.
+#[cfg(target_vendor = "apple")]
+fn memory_of(_: &wgpu::Adapter) -> Option<u64> {
+    None
+}
+
 impl Device {
     /// Opens an adapter, with the atomics it does best.
     pub fn open(adapter: &Adapter) -> Device {
@@ -203,7 +227,7 @@ impl Device {
         let float = Type::atomic(ElemType::Float(FloatKind::F32));
         let native = client.properties().atomic_type_usage(float).contains(AtomicUsage::Add);
         let atomics = if native { Atomics::Native } else { Atomics::Exchange };
-        let memory = client.properties().memory.max_memory();
+        let memory = client.properties().memory.max_memory().or(adapter.memory);
         let compiles_for = &client.properties().identity.fingerprint;
         let driver = [adapter.driver.as_str(), compiles_for].into_iter().find(|text| !text.is_empty());
         let driver = driver.unwrap_or_default().to_owned();
