@@ -13,7 +13,9 @@ use super::tile::{
     CHANNELS, LANES, UNITS, at, gate, load, narrow, outer, product, put, relu, save, sigmoid, uniform_count,
 };
 use super::weight_norm::finite;
-use crate::kernel::cpu::density::{COLOR_INPUTS, DARK, DISTORTION, DensityShape, FEATURES, HIDDEN, STEEPEST};
+use crate::kernel::cpu::density::{
+    COLOR_INPUTS, DISTORTION, DensityShape, FEATURES, HIDDEN, MAX_EXP_GRADIENT, MIN_TRANSMITTANCE,
+};
 use crate::kernel::cpu::losses::{RAY_TERMS, SAMPLE_TERMS, TERMS};
 use crate::kernel::cpu::mlp::TILE;
 use burn::cubecl::{self, prelude::*};
@@ -207,7 +209,7 @@ fn backward(
         load(&mut b, h, plane, here, row, column);
         sync_cube();
         if column == 0 {
-            let steep = min(out[here], F4::new(STEEPEST));
+            let steep = min(out[here], F4::new(MAX_EXP_GRADIENT));
             a[at(0usize, row, LANES)] += masked(g_out[here], first, samples) * steep;
         }
         sync_cube();
@@ -268,7 +270,7 @@ fn cut(
             let end = offsets[r + 1] as usize;
             let mut thickness = 0.0f32;
             let mut s = first;
-            while s < end && (-thickness).exp() >= DARK {
+            while s < end && (-thickness).exp() >= MIN_TRANSMITTANCE {
                 thickness += density[s] * dt;
                 s += 1;
             }
@@ -493,7 +495,7 @@ impl Density {
         &self.out
     }
 
-    /// Copies the samples of each ray up to where less than [`DARK`] of its light is left, by the densities that were
+    /// Copies the samples of each ray up to where less than [`MIN_TRANSMITTANCE`] of its light is left, by the densities that were
     /// evaluated last.
     pub fn cut(&self, device: &Device, samples: &Samples, kept: &Samples) {
         let pass = |writes: bool| {

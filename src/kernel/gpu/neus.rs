@@ -2,7 +2,7 @@
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::sum::group_sum;
-use crate::kernel::cpu::neus::SHORTEST;
+use crate::kernel::cpu::neus::MIN_GRADIENT_NORM;
 use crate::kernel::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
 
@@ -217,7 +217,7 @@ fn backward(
             sum += ln;
             let (nx, ny, nz) = (w * g5 + g_cos * dx, w * g6 + g_cos * dy, w * g7 + g_cos * dz);
             let along = a.nx * nx + a.ny * ny + a.nz * nz;
-            let share = select(a.length > SHORTEST, 1.0f32 / a.length, 0.0f32);
+            let share = select(a.length > MIN_GRADIENT_NORM, 1.0f32 / a.length, 0.0f32);
             g_field[plane + s] = (nx - a.nx * along) * share;
             g_field[2 * plane + s] = (ny - a.ny * along) * share;
             g_field[3 * plane + s] = (nz - a.nz * along) * share;

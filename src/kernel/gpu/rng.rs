@@ -83,7 +83,7 @@ pub(super) fn below(high: u32, low: u32, index: u32, n: u32) -> u32 {
 
 /// What all draws of a stream share, mixed once: high and low word.
 pub(super) fn stream(seed: u64, stream: u64) -> [u32; 2] {
-    let mixed = rng::of_stream(seed, stream);
+    let mixed = rng::stream_key(seed, stream);
     [(mixed >> 32) as u32, mixed as u32]
 }
 

@@ -6,7 +6,7 @@ use super::super::rng;
 use super::super::sum::group_sum;
 use super::{Occupancy, UNITS};
 use crate::Result;
-use crate::kernel::cpu::occupancy::{ALL_BELOW, DECAY, DRAWS};
+use crate::kernel::cpu::occupancy::{DECAY, STREAMS, WARMUP_STEPS};
 use burn::cubecl::{self, prelude::*};
 
 /// Counts the cells of each word of a mask.
@@ -262,8 +262,8 @@ impl Nerfacc {
         mut opacity: impl FnMut(&Buffer) -> (&'a Buffer, f32),
     ) {
         let cells = self.history.words();
-        let all = n < ALL_BELOW;
-        let [any, some, jitter] = DRAWS;
+        let all = n < WARMUP_STEPS;
+        let [any, some, jitter] = STREAMS;
         let over = |count: usize| groups(count.div_ceil(UNITS as usize));
         let draws = |purpose: u64| {
             let [high, low] = rng::stream(seed, n << 4 | purpose);

@@ -5,7 +5,7 @@ use super::super::tile::{
 };
 use super::{NORMAL, Plan};
 use crate::kernel::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, SOFTNESS, TILE};
-use crate::kernel::cpu::neus::SHORTEST;
+use crate::kernel::cpu::neus::MIN_GRADIENT_NORM;
 use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
@@ -356,7 +356,7 @@ pub(super) fn color_backward(
             let along = n.x * gx + n.y * gy + n.z * gz;
             let zero = F4::new(0.0f32);
             let one = F4::new(1.0f32);
-            let share = select_many(n.length.greater_than(&F4::new(SHORTEST)), one / n.length, zero);
+            let share = select_many(n.length.greater_than(&F4::new(MIN_GRADIENT_NORM)), one / n.length, zero);
             g_normal[here] = masked(g_out[plane + here], first, samples) + (gx - n.x * along) * share;
             g_normal[plane + here] =
                 masked(g_out[2 * plane + here], first, samples) + (gy - n.y * along) * share;
