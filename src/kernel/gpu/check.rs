@@ -1,31 +1,31 @@
-//! What a device computed beside what the processor did.
+//! Comparison of results from a device with those from the CPU.
 
-/// A kernel, or some that work together, and how far it was from the CPU.
+/// Result of comparing a kernel, or a group of kernels, with the CPU.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Check {
-    /// What was computed.
+    /// Name of what was computed.
     pub name: &'static str,
-    /// The largest error, of the larger of a value and the mean magnitude; NaN where a value was not a number.
+    /// Largest error, relative to the larger of a value and the mean magnitude; NaN if a value was not a number.
     pub error: f32,
-    /// What it may be.
+    /// Largest error that is accepted.
     pub allowed: f32,
 }
 
 impl Check {
-    /// Is it as near as it has to be?
+    /// Returns whether the error is small enough.
     pub fn passed(&self) -> bool {
         self.error <= self.allowed
     }
 }
 
-/// The largest error of an array, of the larger of a value and the mean magnitude.
+/// Returns the largest error of an array, relative to the larger of a value and the mean magnitude.
 pub(super) fn worst(got: &[f32], want: &[f32]) -> f32 {
     let mean = want.iter().map(|v| v.abs()).sum::<f32>() / want.len().max(1) as f32;
     let error = |(g, w): (&f32, &f32)| (g - w).abs() / w.abs().max(mean).max(f32::MIN_POSITIVE);
     got.iter().zip(want).map(error).fold(0f32, |a, b| if b > a || b.is_nan() { b } else { a })
 }
 
-/// Rows `[n, W]` as planes `[W, capacity]`.
+/// Converts rows `[n, W]` to planes `[W, capacity]`, padded with zeros.
 pub(crate) fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<f32> {
     let mut out = vec![0.0; W * capacity];
     for (i, row) in rows.iter().enumerate() {
