@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 use tiface::capture::{self, CaptureOptions};
 use tiface::io::{self, Limits};
-use tiface::mask::annotation::page_of;
+use tiface::mask::pages::page_of;
 use tiface::mask::prompts::{Prompts, read_prompts};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {

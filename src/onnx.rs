@@ -12,18 +12,15 @@
 //! panic inside becomes an error that names the file. (The process's panic hook still shows its line, and
 //! an engine that runs out of memory ends the process; the built-in one is kept from arrays beyond a limit.)
 
-mod contract;
+mod network;
 mod ort;
-mod seam;
 mod tract;
 
-pub(crate) use self::contract::{Contract, Role};
+pub use self::network::NetworkFile;
+pub(crate) use self::network::{Contract, NetworkArray, Role, file_error};
 pub(crate) use self::ort::Runtime;
-pub use self::seam::NetworkFile;
-pub(crate) use self::seam::{NetworkArray, file_error};
 
-use self::contract::{Port, in_words};
-use self::seam::{guarded, one_line};
+use self::network::{Port, guarded, in_words, one_line};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
 use std::path::Path;
@@ -83,7 +80,7 @@ impl NetworkSession {
         let inputs = graph.input.iter().filter(|p| !weights.contains(&p.name));
         let inputs: Vec<Port> = inputs.map(Port::new).collect();
         let outputs: Vec<Port> = graph.output.iter().map(Port::new).collect();
-        let contract = contract::recognize(&inputs, &outputs).map_err(|why| {
+        let contract = network::recognize(&inputs, &outputs).map_err(|why| {
             file_error(
                 path,
                 &format!("is no network that is known: {}", one_line(&why)),

@@ -21,16 +21,12 @@
 
 mod bench;
 mod clicks;
-mod cost;
 mod ensemble;
 pub mod experiment;
-mod export;
-mod field_view;
 mod finish;
 mod learn;
 mod line;
 mod lpips;
-mod march;
 mod mask;
 mod mesh;
 mod metrics;
@@ -42,21 +38,18 @@ mod preview;
 mod render;
 mod scene_file;
 mod surface;
-mod tiles;
-mod truth;
 
 pub use crate::config::Stage;
 pub use crate::geom::RayResult;
 pub use bench::{Bench, SWEEPS};
-pub use export::Export;
-pub use field_view::field_view;
+pub use finish::Export;
 pub use line::{Line, capture_options, feasible, require_device};
 pub use mask::{click_page, inspect_capture};
 pub use mesh::export_head;
+pub use metrics::{Truth, against_truth};
 pub use page::{head_page, renew_report, viewer_of_file};
-pub use preview::{Preview, PreviewPicture, PreviewRenderer};
+pub use preview::{Preview, PreviewPicture, PreviewRenderer, field_view};
 pub use surface::{Fields, Radiance, Surface};
-pub use truth::{Truth, against_truth};
 
 use crate::Result;
 use crate::run::{Done, StageDir};

@@ -12,7 +12,7 @@ use tiface::capture::synthetic::{SyntheticOptions, write_borders, write_capture}
 use tiface::image::Gray;
 use tiface::io::{Limits, read_gray, read_photo, write_png_gray, write_png_rgb};
 use tiface::mask::Click;
-use tiface::mask::distance::squared_distance;
+use tiface::mask::morphology::squared_distance;
 use tiface::mask::prompts::{PhotoPrompts, Prompts};
 
 fn worked(output: &Output) {

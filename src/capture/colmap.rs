@@ -4,28 +4,25 @@
 //! translation; a pixel's center is at +0.5. The binary files are preferred to the text. Poses are complete in the
 //! images file, of rigs as well: `rigs` and `frames` beside it (COLMAP 3.12) are not read.
 //! Points are optional, and say where the head is if no masks do.
+//!
+//! A model is written back as binary files: one camera for each lens that differs, no points.
 
 mod binary;
-mod model;
 mod text;
-mod write;
 
-use super::error::{in_file, in_frame};
+use super::folder::{CaptureFolder, FLIP, in_file, in_frame, join};
 use super::frame::{CameraFrame, Listing};
+use super::lens::LensModel;
 use super::masks::few;
-use super::names::{CaptureFolder, FLIP, join};
 use super::view::Split;
 use crate::io::{self, ReadError};
-use crate::{Error, Result};
+use crate::{Error, Result, geom};
 use glam::{DMat3, DQuat, DVec3};
-use model::{Image, Model, Rigid};
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-pub(super) use write::files;
-
 /// Where models lie.
-pub(super) const FOLDERS: [&str; 5] = ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ""];
+const FOLDERS: [&str; 5] = ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ""];
 
 /// A model's folder below the capture, and how its files end.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -169,7 +166,7 @@ fn frame(
     file: &str,
     base: &str,
     image: &Image,
-    cameras: &HashMap<u32, model::Camera>,
+    cameras: &HashMap<u32, Camera>,
     held_out: Option<&HashSet<String>>,
 ) -> Result<CameraFrame> {
     let problem = |text: String| in_frame(file, &image.name, text);
@@ -220,9 +217,81 @@ impl Rigid {
 }
 
 /// A rotation and position of ours as COLMAP's quaternion (w, x, y, z) and translation.
-pub(super) fn pose_of(rotation: DMat3, position: DVec3) -> ([f64; 4], DVec3) {
+fn pose_of(rotation: DMat3, position: DVec3) -> ([f64; 4], DVec3) {
     let camera_from_world = (rotation * FLIP).transpose();
     let q = DQuat::from_mat3(&camera_from_world).normalize();
     let q = if q.w < 0.0 { -q } else { q };
     ([q.w, q.x, q.y, q.z], -(camera_from_world * position))
+}
+
+/// Every file of a model.
+#[derive(Debug, Default)]
+struct Model {
+    pub cameras: HashMap<u32, Camera>,
+    pub images: Vec<Image>,
+    /// Those that were found, where they are given.
+    pub points: Option<Vec<DVec3>>,
+}
+
+/// One lens, shared by images.
+#[derive(Clone, Debug)]
+struct Camera {
+    pub model: &'static LensModel,
+    pub width: u64,
+    pub height: u64,
+    pub values: Vec<f64>,
+}
+
+/// One registered photograph.
+#[derive(Clone, Debug)]
+struct Image {
+    pub id: u32,
+    /// Camera from world.
+    pub pose: Rigid,
+    pub camera: u32,
+    pub name: String,
+}
+
+/// A rotation (w, x, y, z) and a translation.
+#[derive(Clone, Copy, Debug)]
+struct Rigid {
+    pub quaternion: [f64; 4],
+    pub translation: DVec3,
+}
+
+impl From<[f64; 7]> for Rigid {
+    fn from([w, qx, qy, qz, x, y, z]: [f64; 7]) -> Rigid {
+        Rigid { quaternion: [w, qx, qy, qz], translation: DVec3::new(x, y, z) }
+    }
+}
+
+/// The files of a model as (name, bytes), or which lens COLMAP has no model for.
+pub(super) fn files(images: &[(String, &geom::Camera)]) -> Result<[(&'static str, Vec<u8>); 3], String> {
+    let mut lenses: Vec<(i32, u64, u64, Vec<f64>)> = Vec::new();
+    let mut listed = (images.len() as u64).to_le_bytes().to_vec();
+    for (i, (name, camera)) in images.iter().enumerate() {
+        let (model, values) =
+            LensModel::of(camera).ok_or_else(|| format!("no model of COLMAP's has the lens of `{name}`"))?;
+        let lens = (model.id, camera.width.into(), camera.height.into(), values);
+        let number = lenses.iter().position(|known| *known == lens).unwrap_or(lenses.len());
+        if number == lenses.len() {
+            lenses.push(lens);
+        }
+        let (quaternion, t) = pose_of(camera.rotation, camera.position);
+        listed.extend((i as u32 + 1).to_le_bytes());
+        quaternion.iter().chain(&t.to_array()).for_each(|v| listed.extend(v.to_le_bytes()));
+        listed.extend((number as u32 + 1).to_le_bytes());
+        listed.extend(name.as_bytes());
+        listed.push(0);
+        listed.extend(0u64.to_le_bytes()); // no points are seen
+    }
+    let mut cameras = (lenses.len() as u64).to_le_bytes().to_vec();
+    for (i, (model, width, height, values)) in lenses.iter().enumerate() {
+        cameras.extend((i as u32 + 1).to_le_bytes());
+        cameras.extend(model.to_le_bytes());
+        cameras.extend([*width, *height].iter().flat_map(|side| side.to_le_bytes()));
+        cameras.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+    }
+    let none = 0u64.to_le_bytes().to_vec();
+    Ok([("points3D.bin", none), ("images.bin", listed), ("cameras.bin", cameras)])
 }

@@ -1,10 +1,16 @@
-//! Which camera files a folder has. Where there are several kinds, the first of this list is read.
+//! Which camera files a folder has. Where there are several kinds, the first of [`CameraFiles`] is read.
+//!
+//! Formats that are recognized but not read are explained, each by its telltale files, with the way from there to
+//! `transforms.json`.
 
 use super::colmap::{self, ModelFiles};
+use super::folder::{CaptureFolder, FolderEntries, PHOTOGRAPHS, has_ending};
 use super::frame::Listing;
-use super::names::CaptureFolder;
-use super::{entries::FolderEntries, llff, metashape, neus, realitycapture, transforms};
+use super::{llff, metashape, neus, realitycapture, transforms};
+use crate::Error;
+use crate::config::Config;
 use crate::io::{self, ReadError};
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 /// The files that describe the cameras.
@@ -119,4 +125,189 @@ impl CameraFiles {
             listing.frames.clear();
         }
     }
+}
+
+/// What a capture needs, one of them.
+const READ: [&str; 4] =
+    ["transforms.json", "transforms_train.json", "poses_bounds.npy", "poses_bounds_train.npy"];
+
+const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
+
+/// For datasets with cameras that no common tool converts.
+const BY_HAND: &str = "no common tool converts it: write `transforms.json` with `file_path`, `w`, `h`, `fl_x`, `fl_y`, \
+                       `cx`, `cy` and `transform_matrix` for each photograph (camera to world, +Y up and looking along \
+                       -Z: the second and third column of an OpenCV pose, negated)";
+
+/// A command of nerfstudio, and what to do with what it writes.
+fn nerfstudio(kind: &str, data: impl Display, more: &str) -> String {
+    format!(
+        "nerfstudio converts it: `ns-process-data {kind} --data {data}{more} --output-dir NEW`, then `tiface inspect NEW`"
+    )
+}
+
+/// What else becomes of cameras that another program brought into COLMAP's form.
+fn through_colmap(command: &str) -> String {
+    format!(
+        "{command} writes its cameras as COLMAP's: put `cameras`, `images` and `points3D` (`.bin` or `.txt`) into \
+         `sparse/0`, the photographs beside it into `images/`"
+    )
+}
+
+fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> Error {
+    Error::cannot(format_args!("`{}` is not a capture: {found}", root.display()), hint)
+}
+
+/// Why a folder is no capture: what it looks like instead, and the way from there.
+pub(super) fn explain(root: &Path) -> Error {
+    let found = FolderEntries::of(root);
+    if let Some(run) = Config::of_run(root).filter(|run| !run.capture.path.is_empty()) {
+        let hint =
+            format!("inspect its capture, `{}`; `tiface status` says how far the run is", run.capture.path);
+        return not_a_capture(root, "it is the folder of a run", hint);
+    }
+    if let Some((inner, file)) = nested(&found) {
+        let what = format!("`{file}` lies in its folder `{inner}`");
+        return not_a_capture(root, what, format!("give that folder: `{}`", found.at(inner)));
+    }
+    match recognized(&found) {
+        Some((what, telltale, hint)) => {
+            not_a_capture(root, format!("it looks like {what} (`{telltale}`); that is not read"), hint)
+        }
+        None => {
+            let nearest = nearest(&found).map_or(String::new(), |n| format!("; nearest is {n}"));
+            let others = "Meshroom, OpenSfM, OpenMVG, Bundler, NVM, MVSNet, Polycam, NeRSemble, Multiface, FaceScape, \
+                          photographs alone or a video are named with the way from there";
+            not_a_capture(
+                root,
+                format!("it holds none of the camera files that are read: {LOOKED_FOR}{nearest}"),
+                format!("give the folder that holds one of them; {others}"),
+            )
+        }
+    }
+}
+
+/// What is read, for who has none of it.
+const LOOKED_FOR: &str = "`transforms.json`, `transforms_train.json`, `poses_bounds*.npy` (LLFF), `cameras` and `images` as \
+                          `.bin` or `.txt` in `sparse/0`, `sparse` or here (COLMAP), `cameras_sphere.npz` or `cameras.npz` \
+                          (NeuS, IDR, H3DS), an `.xml` with `<chunk` (Metashape), a `.csv` that begins with `#name,x,y,alt` \
+                          or `.xmp` files with a pose (RealityCapture)";
+
+/// The file that looks most like one of those, and what it lacks.
+fn nearest(found: &FolderEntries) -> Option<String> {
+    let like = |ending: &str, word: &str| {
+        found.files.iter().find(|f| has_ending(f, &[ending]) && f.to_lowercase().contains(word))
+    };
+    let rename = |file: &String, to: &str| format!("`{file}`: if it is one, call it `{to}`");
+    like("json", "transform")
+        .or_else(|| found.holding("json", "transform_matrix"))
+        .map(|f| rename(f, "transforms.json"))
+        .or_else(|| like("npy", "poses").map(|f| rename(f, "poses_bounds.npy")))
+        .or_else(|| like("npz", "").map(|f| rename(f, "cameras_sphere.npz")))
+        .or_else(|| {
+            like("xml", "").map(|f| format!("`{f}`, which has no `<chunk` as Metashape's cameras have"))
+        })
+        .or_else(|| {
+            like("csv", "").map(|f| format!("`{f}`, which does not begin with `{}`", realitycapture::HEADER))
+        })
+        .or_else(|| like("xmp", "").map(|f| format!("`{f}`, which has nothing of RealityCapture's")))
+}
+
+/// Why a file is no capture.
+pub(super) fn explain_file(file: &Path) -> Error {
+    let name = file.file_name().and_then(|n| n.to_str()).unwrap_or_default();
+    let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if has_ending(name, &VIDEOS) {
+        not_a_capture(file, "it is a video", from_video(file))
+    } else if READ.contains(&name) || name.starts_with("transforms_") || name.starts_with("poses_bounds") {
+        not_a_capture(file, "it is a file", format!("give the folder it lies in: `{}`", folder.display()))
+    } else {
+        not_a_capture(file, "it is a file", "give the folder that holds the photographs and cameras")
+    }
+}
+
+fn from_video(file: &Path) -> String {
+    nerfstudio("video", file.display(), "")
+        + " (it needs COLMAP; a head must hold still while the camera moves)"
+}
+
+/// A folder inside that is a capture, with its first camera file.
+fn nested(found: &FolderEntries) -> Option<(&str, String)> {
+    let of = |name: &String| CameraFiles::find(&found.root.join(name)).map(|files| files.first());
+    found.folders.iter().take(1000).find_map(|name| Some((name.as_str(), of(name)?)))
+}
+
+/// What it looks like, by which file, and the way to `transforms.json`.
+fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
+    let photographs = found.photographs();
+    let one = |what, telltale: &str, way| Some((what, telltale.to_owned(), way));
+    let by_hand = |what, telltale, more: &str| one(what, telltale, format!("{BY_HAND}; {more}"));
+    if let Some(t) = found.any(&["KRT"]) {
+        let moment =
+            "it holds K, distortion and [R|t] of each camera; take one frame of one expression of `images/`";
+        return by_hand("a Multiface recording", t, moment);
+    }
+    if let Some(t) = found.any(&["calibration/camera_params.json", "camera_params.json"]) {
+        let moment = "it holds `world_2_cam` of each camera and one `intrinsics`; take one moment of one sequence, \
+                      its `alpha_maps` are masks";
+        return by_hand("a NeRSemble participant", t, moment);
+    }
+    if let Some(t) = found.any(&["params.json"]).filter(|_| photographs.is_some()) {
+        let keys = "it holds `I_K`, `I_Rt` (world to camera), `I_distortion` and `I_valid` of photograph I.jpg: \
+                    leave out what is not valid";
+        return by_hand("a FaceScape tuple", t, keys);
+    }
+    if let Some(t) = found.any(&["keyframes"]) {
+        return one("a Polycam raw export", t, nerfstudio("polycam", found.root.display(), ""));
+    }
+    if let Some(t) = found.ending(&["psx", "psz"]) {
+        let way = "export its cameras as XML into this folder: File, Export, Export Cameras";
+        return one("a Metashape project", t, way.into());
+    }
+    if let Some(t) = found.ending(&["rcproj", "rsproj"]) {
+        let way = "export its registration as CSV (`Internal/External camera parameters`) into this folder, or its \
+                   metadata as XMP beside the photographs";
+        return one("a RealityCapture project", t, way.into());
+    }
+    let meshroom = found.any(&["MeshroomCache"]).or_else(|| found.ending(&["mg", "sfm"]).map(String::as_str));
+    if let Some(t) = meshroom {
+        let way = "its node `ExportColmap` (or `aliceVision_exportColmap --input cameras.sfm --output NEW`)";
+        return one("a Meshroom project", t, through_colmap(way));
+    }
+    if let Some(t) = found.any(&["reconstruction.json"]) {
+        let way = format!("`opensfm export_colmap {}`", found.root.display());
+        return one("an OpenSfM project", t, through_colmap(&way));
+    }
+    if let Some(t) = found.any(&["sfm_data.json", "sfm_data.bin"]) {
+        let way = format!("`openMVG_main_openMVG2Colmap -i {} -o NEW`", found.at(t));
+        return one("an OpenMVG scene", t, through_colmap(&way));
+    }
+    let openmvs = |import: &str, from: String| {
+        let way = format!(
+            "OpenMVS (`{import} -i {from} -o scene.mvs`, then `InterfaceCOLMAP -i scene.mvs -o NEW`)"
+        );
+        through_colmap(&way)
+    };
+    let nvm = found.ending(&["nvm"]).map(|t| ("a VisualSFM scene", t.as_str()));
+    let bundler = || found.any(&["bundle.out", "bundle/bundle.out"]).map(|t| ("a Bundler scene", t));
+    if let Some((what, t)) = nvm.or_else(bundler) {
+        return one(what, t, openmvs("InterfaceVisualSFM", found.at(t)));
+    }
+    let mvsnet = ["cams/00000000_cam.txt", "Cameras/00000000_cam.txt", "pair.txt"];
+    if let Some(t) = found.any(&mvsnet) {
+        return one("an MVSNet scene", t, openmvs("InterfaceMVSNet", found.root.display().to_string()));
+    }
+    let colmap =
+        ["sparse", "colmap", "cameras.bin", "cameras.txt", "images.bin", "images.txt", "database.db"];
+    if let Some(t) = found.any(&colmap) {
+        let way = "its cameras and images files are missing: run `colmap mapper`, or copy `cameras.bin` and `images.bin` \
+                   (or `.txt`) into `sparse/0`";
+        return one("an incomplete COLMAP project", t, way.into());
+    }
+    if let Some(folder) = photographs {
+        let first = FolderEntries::of(&folder).ending(&PHOTOGRAPHS).cloned().unwrap_or_default();
+        let way = nerfstudio("images", folder.display(), "");
+        return one("photographs without cameras", &first, format!("{way} (it needs COLMAP)"));
+    }
+    let video = found.ending(&VIDEOS)?;
+    one("a video", video, from_video(&found.root.join(video)))
 }

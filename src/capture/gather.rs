@@ -1,12 +1,11 @@
 //! From camera files to views: everything is checked but the pixels.
 
-use super::error::{in_frame, no_views, wrong_size};
+use super::folder::{CaptureFolder, in_frame, no_views};
 use super::format::CameraFiles;
 use super::frame::{CameraFrame, Listing};
 use super::masks::few;
-use super::names::CaptureFolder;
-use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
-use super::{foreign, load, masks, names, scene};
+use super::view::{Capture, CaptureOptions, Split, View, ViewMask, downscaled, wrong_size};
+use super::{folder, format, masks, scene};
 use crate::io::{self, PictureInfo};
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
@@ -55,14 +54,14 @@ fn open_folder<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<(Captu
         ));
     }
     if io::is_file(root) {
-        return Err(foreign::explain_file(root));
+        return Err(format::explain_file(root));
     } else if !io::exists(root) {
         let hint = "check the path: a capture is a folder of photographs and cameras";
         return Err(Error::cannot(format_args!("`{}` does not exist", root.display()), hint));
     } else if !io::is_folder(root) {
         io::read_bytes(root, &options.limits)?; // names what it is instead
     }
-    let files = CameraFiles::find(root).ok_or_else(|| foreign::explain(root))?;
+    let files = CameraFiles::find(root).ok_or_else(|| format::explain(root))?;
     Ok((CaptureFolder::new(root, options)?, files))
 }
 
@@ -86,7 +85,7 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         listing.warnings.push(format!("{found}; their views are left out"));
     }
 
-    let (common, names) = names::view_names(&frames);
+    let (common, names) = folder::view_names(&frames);
     check_names(&frames, &names, listing);
     let infos: Vec<_> = frames
         .par_iter()
@@ -163,7 +162,7 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
     let photo = frame.photo.clone().unwrap_or_default();
     let full = frame.intrinsics.camera(declared, frame.rotation, frame.position).map_err(problem)?;
     let (camera, photo_size) = if info.size(Some(declared)) == declared {
-        (load::downscaled(&full, d), declared)
+        (downscaled(&full, d), declared)
     } else if info.size(Some(target)) == target {
         (full.resized(target.0, target.1), target) // the photographs are already smaller
     } else {

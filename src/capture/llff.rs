@@ -5,11 +5,9 @@
 //! (column 1, −column 0, column 2). The published loader divides positions by 0.3; here the world stays
 //! as the dataset has it.
 
-use super::entries;
-use super::error::{in_file, in_frame};
-use super::frame::{Agreement, CameraFrame, Intrinsics, Listing};
-use super::names::CaptureFolder;
-use super::pose;
+use super::folder;
+use super::folder::{CaptureFolder, in_file, in_frame};
+use super::frame::{self, Agreement, CameraFrame, Intrinsics, Listing};
 use super::view::Split;
 use crate::io::{self, NpyValues};
 use crate::{Error, Result};
@@ -49,7 +47,7 @@ fn row(v: &[f64; 17]) -> Result<PoseRow, String> {
     let column = |k: usize| [v[k], v[k + 5], v[k + 10]];
     let (down, right, back, position) = (column(0), column(1), column(2), column(3));
     let rows = [0, 1, 2].map(|r| [right[r], -down[r], back[r], position[r]]);
-    let (rotation, position) = pose::pose(&rows)?;
+    let (rotation, position) = frame::pose(&rows)?;
     let [h, w, focal] = column(4);
     let whole = |x: f64| x.is_finite() && x.fract() == 0.0 && (1.0..=1e6).contains(&x);
     if !(whole(h) && whole(w) && focal.is_finite() && focal > 0.0) {
@@ -238,7 +236,7 @@ fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String
         return Ok(None);
     };
     Ok(Some(
-        entries::photographs(&folder.root.join(&name))?.into_iter().map(|n| format!("{name}/{n}")).collect(),
+        folder::photographs(&folder.root.join(&name))?.into_iter().map(|n| format!("{name}/{n}")).collect(),
     ))
 }
 

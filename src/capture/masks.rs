@@ -1,7 +1,7 @@
 //! Which masks lie beside the photographs, and whether they look like masks of a head.
 
+use super::folder::CaptureFolder;
 use super::frame::{CameraFrame, Listing};
-use super::names::CaptureFolder;
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{MaskMeaning, MaskSource};
 use crate::image::{Gray, Photo};

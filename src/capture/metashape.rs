@@ -4,11 +4,9 @@
 //! P1 and P2 are OpenCV's p2 and p1, B1 is added to the horizontal focal length, and K4 multiplies r⁸ (Metashape
 //! manual, appendix D). Of a perspective lens that coefficient is refused, as is skew that could be seen.
 
-use super::error::{in_file, in_frame};
-use super::frame::{CameraFrame, Intrinsics, Listing};
+use super::folder::{CaptureFolder, FLIP, in_file, in_frame};
+use super::frame::{self, CameraFrame, Intrinsics, Listing};
 use super::masks::few;
-use super::names::{CaptureFolder, FLIP};
-use super::pose;
 use crate::Result;
 use crate::geom::{Distortion, Projection};
 use crate::io::{self, ReadError};
@@ -86,14 +84,14 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
             .and_then(|v| v.try_into().ok())
             .ok_or_else(|| problem("its `transform` is not 16 numbers".into()))?;
         let rows = [0, 1, 2].map(|r| [m[4 * r], m[4 * r + 1], m[4 * r + 2], m[4 * r + 3]]);
-        let (rotation, position) = pose::pose(&rows).map_err(problem)?;
+        let (rotation, position) = frame::pose(&rows).map_err(problem)?;
         let component = camera.attribute("component_id").and_then(|id| components.get(id)).copied().flatten();
         let frame = component.or(whole).unwrap_or(Frame::IDENTITY);
         let origin = if frame.translation.length() > GEOCENTRIC { DVec3::ZERO } else { frame.translation };
         far |= origin != frame.translation;
         let position = frame.scale * (frame.rotation * position) + origin;
         let rotation = frame.rotation * rotation * FLIP;
-        let (relative, photo) = folder.photo(file, &super::names::join(base, name))?;
+        let (relative, photo) = folder.photo(file, &super::folder::join(base, name))?;
         let mask = folder.mask_of(file, name)?;
         listing.frames.push(CameraFrame {
             file: file.into(),
@@ -146,7 +144,7 @@ impl Frame {
         };
         let rotation = match part("rotation", 9)? {
             // rows in the file, columns here
-            Some(v) => pose::orthonormal(DMat3::from_cols_slice(&v).transpose())?,
+            Some(v) => frame::orthonormal(DMat3::from_cols_slice(&v).transpose())?,
             None => DMat3::IDENTITY,
         };
         let translation = part("translation", 3)?.map_or(DVec3::ZERO, |v| DVec3::from_slice(&v));

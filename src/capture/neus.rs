@@ -5,10 +5,9 @@
 //! dataset's own do. NeuS sends its rays through whole numbers as the centers of pixels, so principal points move
 //! by half a pixel (NeuS, `models/dataset.py`, `gen_rays_at`).
 
-use super::entries;
-use super::error::{in_file, in_frame};
+use super::folder;
+use super::folder::{CaptureFolder, FLIP, in_file, in_frame};
 use super::frame::{CameraFrame, Intrinsics, Listing};
-use super::names::{CaptureFolder, FLIP};
 use crate::Result;
 use crate::geom::Aabb;
 use crate::io::{self, Npy, NpyValues};
@@ -79,7 +78,7 @@ fn pictures(folder: &CaptureFolder, names: &[&str]) -> Result<Vec<String>> {
     let Some(name) = names.iter().find(|n| io::is_folder(&folder.root.join(n))) else {
         return Ok(Vec::new());
     };
-    Ok(entries::photographs(&folder.root.join(name))?.into_iter().map(|f| format!("{name}/{f}")).collect())
+    Ok(folder::photographs(&folder.root.join(name))?.into_iter().map(|f| format!("{name}/{f}")).collect())
 }
 
 /// The upper three rows of a 4×4 or 3×4 array, finite.

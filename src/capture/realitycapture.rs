@@ -6,11 +6,8 @@
 //! t2 as OpenCV's p1 and p2; k4 and the division model are refused. (Capturing Reality, "XMP camera math"; nerfstudio,
 //! `realitycapture_utils.py`.)
 
-use super::entries::{FolderEntries, PHOTOGRAPHS, has_ending};
-use super::error::{in_file, in_frame};
-use super::frame::{CameraFrame, Intrinsics, Listing};
-use super::names::{CaptureFolder, FLIP, join};
-use super::pose;
+use super::folder::{CaptureFolder, FLIP, FolderEntries, PHOTOGRAPHS, has_ending, in_file, in_frame, join};
+use super::frame::{self, CameraFrame, Intrinsics, Listing};
 use crate::geom::Distortion;
 use crate::io::{self, ReadError};
 use crate::{Error, Result};
@@ -196,7 +193,7 @@ fn read_xmp(folder: &CaptureFolder, file: &str, name: &str) -> Result<Option<Ent
         )));
     }
     let camera_from_world = DMat3::from_cols_slice(&r).transpose(); // rows in the file
-    let rotation = pose::orthonormal(camera_from_world).map_err(wrong)?.transpose() * FLIP;
+    let rotation = frame::orthonormal(camera_from_world).map_err(wrong)?.transpose() * FLIP;
     let focal = numbers("FocalLength35mm", 1)?.ok_or_else(|| wrong("it has no `FocalLength35mm`".into()))?[0];
     Ok(Some(Entry {
         name: name.into(),

@@ -6,8 +6,6 @@
 //!
 //! Same options, same bytes.
 
-mod look;
-mod noise;
 mod photograph;
 mod shape;
 
@@ -54,7 +52,7 @@ pub fn cameras(options: &SyntheticOptions) -> Vec<(Camera, bool)> {
             .map(|i| {
                 let row = i * rows / count;
                 let (first, end) = ((row * count).div_ceil(rows), ((row + 1) * count).div_ceil(rows));
-                let draw = |k| noise::unit(options.seed ^ salt, i as u32, k) as f64 - 0.5;
+                let draw = |k| shape::unit(options.seed ^ salt, i as u32, k) as f64 - 0.5;
                 let across = (i - first) as f64 + 0.5 + 0.4 * draw(0);
                 let azimuth = -110.0 + 220.0 * across / (end - first) as f64;
                 let elevation = -20.0 + 70.0 * (row as f64 + 0.5 + 0.55 * draw(1)) / rows as f64;

@@ -4,11 +4,9 @@
 //! frame; a frame's own win. Unknown keys are ignored, `null` counts as absent; known ones of the wrong type are
 //! errors, but for [`LENIENT`] and `up`, which count as absent as well.
 
-use super::error::{in_file, in_frame};
-use super::frame::{CameraFrame, Intrinsics, Listing};
+use super::folder::{CaptureFolder, in_file, in_frame};
+use super::frame::{self, CameraFrame, Intrinsics, Listing};
 use super::lens::{self, LensModel};
-use super::names::CaptureFolder;
-use super::pose;
 use super::view::Split;
 use crate::Result;
 use crate::geom::{Camera, Distortion};
@@ -170,7 +168,7 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
         let frame = FrameKeys::read(top, entry).map_err(problem).and_then(|keys| {
             let split = split_of_file.or(about.split(&keys.file_path));
             let (rotation, position) =
-                upper_rows(&keys.transform_matrix).and_then(|rows| pose::pose(&rows)).map_err(problem)?;
+                upper_rows(&keys.transform_matrix).and_then(|rows| frame::pose(&rows)).map_err(problem)?;
             let split = named_split(keys.split.as_deref(), split).map_err(problem)?;
             let intrinsics = intrinsics(&keys, &mut ignored).map_err(problem)?;
             let (relative, photo) = folder.photo(file, &keys.file_path)?;

@@ -1,11 +1,18 @@
-//! A capture and its views, as they are used from here on.
+//! A capture and its views, as they are used from here on; and one view's pixels: photograph and
+//! masks at the camera's size.
+//!
+//! Downscaling by `d` averages `d × d` blocks and drops the last columns and rows that fill no block,
+//! so that every intrinsic is divided by exactly `d`. Color is averaged in linear light, as a sensor
+//! with larger pixels would, weighted by alpha where there is one.
 
 use crate::config::{MaskMeaning, MaskSource};
 use crate::geom::{Aabb, Camera};
-use crate::io::Limits;
+use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
+use crate::io::{self, Limits, NpyValues};
+use crate::{Error, Result};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// What a view is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -130,5 +137,277 @@ impl Capture {
     /// The views of one split.
     pub fn split(&self, split: Split) -> impl Iterator<Item = &View> {
         self.views.iter().filter(move |v| v.split == split)
+    }
+}
+
+/// The pixels of a [`View`], all at the size of its camera.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LoadedView {
+    /// The photograph; its alpha is kept even when it is also the mask.
+    pub photo: Photo,
+    /// Soft head alpha: 0 = empty space. `None` without a mask, or when it means "not looked at".
+    pub mask: Option<Gray>,
+    /// 255 where the photograph is usable, else 0.
+    pub valid: Option<Gray>,
+    /// The region that metrics look at.
+    pub region: Option<Gray>,
+}
+
+impl View {
+    /// Reads the photograph alone, at the size of its camera.
+    pub fn load_photo(&self, limits: &Limits) -> Result<Photo> {
+        let photo = io::read_photo(&self.photo, Some(self.photo_size), limits)?;
+        let found = (photo.width, photo.height);
+        if found != self.photo_size {
+            return Err(self.size_error(&self.photo, found)); // it was replaced since the capture was opened
+        }
+        if found == (self.camera.width, self.camera.height) {
+            return Ok(photo);
+        }
+        Ok(average_photo(&photo, self.downscale))
+    }
+
+    /// Reads the photograph, mask, valid mask and region of this view.
+    pub fn load(&self, limits: &Limits) -> Result<LoadedView> {
+        let photo = self.load_photo(limits)?;
+        let mask = self.head_mask(photo.alpha.as_deref(), limits)?;
+        let valid = self
+            .valid
+            .as_deref()
+            .map(|path| self.reduced(path, self.read_valid(path, limits)?, Average::Least));
+        let mut valid = valid.transpose()?;
+        let mask = match (mask, self.mask_meaning) {
+            (Some(mask), MaskMeaning::Ignore) => {
+                let looked_at = |m: u8, v: u8| if m >= 128 && v != 0 { 255 } else { 0 };
+                let old = valid.take().map_or_else(|| vec![255; mask.values.len()], |v| v.values);
+                let values = mask.values.iter().zip(old).map(|(&m, v)| looked_at(m, v)).collect();
+                valid = Some(Gray { values, ..mask });
+                None
+            }
+            (mask, _) => mask,
+        };
+        let region = self.region.as_deref().map(|path| self.read_mask(path, limits)).transpose()?;
+        Ok(LoadedView { photo, mask, valid, region })
+    }
+
+    /// Only the mask of this view, at the camera's size, whatever it means; `None` without one.
+    pub fn load_mask(&self, limits: &Limits) -> Result<Option<Gray>> {
+        let alpha = match self.mask {
+            ViewMask::Alpha => self.load_photo(limits)?.alpha,
+            _ => None,
+        };
+        self.head_mask(alpha.as_deref(), limits)
+    }
+
+    fn head_mask(&self, alpha: Option<&[u8]>, limits: &Limits) -> Result<Option<Gray>> {
+        let (width, height) = (self.camera.width, self.camera.height);
+        match &self.mask {
+            ViewMask::None => Ok(None),
+            ViewMask::Alpha => Ok(alpha.map(|a| Gray { width, height, values: a.to_vec() })),
+            ViewMask::File(path) => self.read_mask(path, limits).map(Some),
+        }
+    }
+
+    /// A soft mask at the camera's size.
+    fn read_mask(&self, path: &Path, limits: &Limits) -> Result<Gray> {
+        self.reduced(path, io::read_gray(path, Some(self.photo_size), limits)?, Average::Mean)
+    }
+
+    /// A valid mask as 0 or 255; `.npy` of shape (h, w) or (h, w, 1), or a picture.
+    fn read_valid(&self, path: &Path, limits: &Limits) -> Result<Gray> {
+        if path.extension().is_none_or(|e| e != "npy") {
+            let mut gray = io::read_gray(path, Some(self.photo_size), limits)?;
+            gray.values.iter_mut().for_each(|v| *v = if *v >= 128 { 255 } else { 0 });
+            return Ok(gray);
+        }
+        let npy = io::read_npy(path, limits)?;
+        let (height, width) = match npy.shape[..] {
+            [h, w] | [h, w, 1] if h > 0 && w > 0 && h.max(w) <= limits.side_px as usize => (h, w),
+            _ => {
+                let what = format!("a valid mask of shape {:?}", npy.shape);
+                let hint = "its shape must be (height, width) or (height, width, 1)";
+                return Err(io::ReadError::unsupported(path, what, hint).into());
+            }
+        };
+        let values = match npy.values {
+            NpyValues::Bool(v) => v.into_iter().map(|b| if b { 255 } else { 0 }).collect(),
+            NpyValues::Number(v) => v.into_iter().map(|x| if x != 0.0 { 255 } else { 0 }).collect(),
+        };
+        Ok(Gray { width: width as u32, height: height as u32, values })
+    }
+
+    fn reduced(&self, path: &Path, gray: Gray, average: Average) -> Result<Gray> {
+        let found = (gray.width, gray.height);
+        if found == (self.camera.width, self.camera.height) {
+            Ok(gray)
+        } else if found == self.declared {
+            Ok(average_gray(&gray, self.downscale, average))
+        } else {
+            Err(self.size_error(path, found))
+        }
+    }
+
+    fn size_error(&self, path: &Path, found: (u32, u32)) -> Error {
+        wrong_size(&path.to_string_lossy(), found, self.declared, &self.declared_by, self.downscale)
+    }
+}
+
+/// The camera of a picture averaged down by `d`.
+pub(super) fn downscaled(camera: &Camera, d: u32) -> Camera {
+    let s = 1.0 / d as f64;
+    Camera {
+        width: camera.width / d,
+        height: camera.height / d,
+        fx: camera.fx * s,
+        fy: camera.fy * s,
+        cx: camera.cx * s,
+        cy: camera.cy * s,
+        ..camera.clone()
+    }
+}
+
+/// How a block of a mask becomes one value.
+#[derive(Clone, Copy)]
+enum Average {
+    /// Coverage.
+    Mean,
+    /// A block with one unusable pixel is unusable.
+    Least,
+}
+
+fn average_gray(gray: &Gray, d: u32, average: Average) -> Gray {
+    let (width, height) = (gray.width / d, gray.height / d);
+    let mut values = Vec::with_capacity(width as usize * height as usize);
+    let n = d * d;
+    for y in 0..height {
+        for x in 0..width {
+            let block = block(x, y, d, gray.width).map(|i| gray.values[i]);
+            values.push(match average {
+                Average::Mean => ((block.map(u32::from).sum::<u32>() + n / 2) / n) as u8,
+                Average::Least => block.min().unwrap_or(0),
+            });
+        }
+    }
+    Gray { width, height, values }
+}
+
+/// Indices of the pixels of one block, row by row.
+fn block(x: u32, y: u32, d: u32, row: u32) -> impl Iterator<Item = usize> {
+    (y * d..(y + 1) * d)
+        .flat_map(move |v| (x * d..(x + 1) * d).map(move |u| v as usize * row as usize + u as usize))
+}
+
+fn average_photo(photo: &Photo, d: u32) -> Photo {
+    let linear: Vec<f32> = (0..=255u8).map(|b| linear_from_srgb(b as f32 / 255.0)).collect();
+    let (width, height) = (photo.width / d, photo.height / d);
+    let mut rgb = Vec::with_capacity(width as usize * height as usize);
+    let mut alpha = photo.alpha.as_ref().map(|_| Vec::with_capacity(rgb.capacity()));
+    let n = (d * d) as f32;
+    for y in 0..height {
+        for x in 0..width {
+            let (mut sum, mut plain, mut weight) = ([0f32; 3], [0f32; 3], 0u32);
+            for i in block(x, y, d, photo.width) {
+                let a = photo.alpha.as_ref().map_or(255, |a| a[i]) as u32;
+                weight += a;
+                for k in 0..3 {
+                    let c = linear[photo.rgb[i][k] as usize];
+                    sum[k] += a as f32 * c;
+                    plain[k] += c;
+                }
+            }
+            // where nothing is opaque the color cannot be seen; its plain mean keeps edges clean
+            let mean = |k: usize| if weight > 0 { sum[k] / weight as f32 } else { plain[k] / n };
+            rgb.push([0, 1, 2].map(|k| quantize(srgb_from_linear(mean(k)))));
+            if let Some(alpha) = &mut alpha {
+                alpha.push((weight as f32 / n + 0.5) as u8);
+            }
+        }
+    }
+    Photo { width, height, rgb, alpha }
+}
+
+/// A picture's size is not the one that `file` declares; the factor between the two is the suggested fix.
+pub(super) fn wrong_size(
+    picture: &str,
+    found: (u32, u32),
+    declared: (u32, u32),
+    file: &str,
+    downscale: u32,
+) -> Error {
+    let factor = declared.0 / found.0.max(1);
+    let hint = if factor > 1 && (declared.0 / factor, declared.1 / factor) == found {
+        format!("use the full-size photographs, or set `capture.downscale = {factor}`")
+    } else if downscale > 1 {
+        format!("use photographs of that size, or smaller by exactly `capture.downscale = {downscale}`")
+    } else if (found.1, found.0) == declared {
+        "the photograph lies on its side: store it upright, without an EXIF turn".into()
+    } else {
+        format!("use photographs of that size, or correct `w` and `h` in `{file}`")
+    };
+    let ((w, h), (dw, dh)) = (found, declared);
+    Error::cannot(format_args!("`{picture}` is {w} × {h} pixels, but `{file}` says {dw} × {dh}"), hint)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_block_of_black_and_white_becomes_the_gray_of_half_the_light() {
+        // linear mean of 0, 1, 0, 1 is 0.5; sRGB of 0.5 is 0.7354 → 188
+        let rgb = vec![[0; 3], [255; 3], [0; 3], [255; 3]];
+        let half = average_photo(&Photo { width: 2, height: 2, rgb, alpha: None }, 2);
+        assert_eq!((half.width, half.height, half.rgb[0]), (1, 1, [188; 3]));
+    }
+
+    #[test]
+    fn transparent_pixels_do_not_bleed_into_the_average() {
+        let rgb = vec![[255, 0, 0], [0, 255, 0], [0, 255, 0], [0, 255, 0]];
+        let alpha = Some(vec![255, 0, 0, 0]);
+        let half = average_photo(&Photo { width: 2, height: 2, rgb, alpha }, 2);
+        assert_eq!(half.rgb, [[255, 0, 0]]);
+        assert_eq!(half.alpha, Some(vec![64])); // 255 / 4 = 63.75
+    }
+
+    #[test]
+    fn columns_that_fill_no_block_are_dropped() {
+        let values = (0..5).map(|v| v * 10).collect();
+        let half = average_gray(&Gray { width: 5, height: 1, values }, 1, Average::Mean);
+        assert_eq!(half.values.len(), 5);
+        let values = vec![0, 10, 20, 30, 99, 0, 10, 20, 30, 99];
+        let gray = Gray { width: 5, height: 2, values };
+        assert_eq!(average_gray(&gray, 2, Average::Mean).values, [5, 25]);
+        assert_eq!(average_gray(&gray, 2, Average::Least).values, [0, 20]);
+    }
+
+    #[test]
+    fn a_downscaled_camera_sees_the_same_direction_through_the_same_place() {
+        use glam::{DMat3, DVec3, Vec2};
+        let c = Camera {
+            width: 7,
+            height: 5,
+            fx: 9.0,
+            fy: 8.0,
+            cx: 3.2,
+            cy: 2.6,
+            distortion: Default::default(),
+            rotation: DMat3::IDENTITY,
+            position: DVec3::ZERO,
+        };
+        let half = downscaled(&c, 2);
+        assert_eq!((half.width, half.height), (3, 2));
+        // the centre of the first block is (1, 1) before and (0.5, 0.5) after
+        let (a, b) = (c.ray(Vec2::ONE).unwrap(), half.ray(Vec2::splat(0.5)).unwrap());
+        assert!(a.direction.distance(b.direction) < 1e-6);
+    }
+
+    #[test]
+    fn a_photograph_four_times_too_small_is_told_how_to_be_used() {
+        let e = wrong_size("images/cam_07.jpg", (750, 1024), (3000, 4096), "transforms_train.json", 1);
+        assert_eq!(
+            e.to_string(),
+            "`images/cam_07.jpg` is 750 × 1024 pixels, but `transforms_train.json` says 3000 × 4096"
+        );
+        assert_eq!(e.hint(), "use the full-size photographs, or set `capture.downscale = 4`");
     }
 }

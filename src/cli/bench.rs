@@ -1,10 +1,9 @@
 //! `tiface bench`: speed against error of each decision, measured on this machine.
 
-use super::invocation::Invocation;
-use super::options::Common;
+use super::Invocation;
+use super::options::{Common, RunTarget};
 use super::out::Out;
-use super::stdout::print;
-use super::target::RunTarget;
+use super::screen::print;
 use crate::config::{Config, Preset};
 use crate::io;
 use crate::pipeline::{Bench, Line, SWEEPS, feasible, require_device};

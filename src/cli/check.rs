@@ -1,13 +1,14 @@
 //! `tiface check`: is a mesh sound, and how far is it from another?
 
 use super::options::Common;
-use super::plain::one_line;
-use super::stdout::print;
+use super::screen::{one_line, print};
 use crate::capture::{self, CaptureOptions, Split, View};
 use crate::geom::{Bvh, Camera};
 use crate::io::{self, Limits};
-use crate::mesh::files::{CheckReport, UvReport, check_around, uv_check};
-use crate::mesh::files::{PictureSource, ReadMesh, ReadOptions, picture_beside, read_with, weld};
+use crate::mesh::files::{
+    CheckReport, PictureSource, ReadMesh, ReadOptions, UvReport, check_around, picture_beside, read_with,
+    uv_check, weld,
+};
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
 use crate::{Error, ErrorKind, Result};

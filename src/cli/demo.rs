@@ -1,9 +1,9 @@
 //! `tiface demo`: the line on a synthetic head made on the spot.
 
-use super::invocation::Invocation;
+use super::Invocation;
+use super::options::{DEMO_CAPTURE, RunTarget};
 use super::out::Out;
 use super::run::{LineCommand, run as run_line};
-use super::target::{DEMO_CAPTURE, RunTarget};
 use crate::capture::synthetic::{SyntheticOptions, check, write_borders, write_capture};
 use crate::config::Preset;
 use crate::io;

@@ -1,10 +1,10 @@
 //! `tiface experiment`: the paper's tables over captures, beside what was published.
 
+use super::Invocation;
 use super::demo::photograph;
-use super::invocation::Invocation;
 use super::out::Out;
 use super::run::in_words;
-use super::stdout::print;
+use super::screen::print;
 use crate::capture::synthetic::SyntheticOptions;
 use crate::config::Config;
 use crate::io::{self, Limits};

@@ -3,7 +3,7 @@
 //! An ending that the product has is a file of that kind; a folder, there already or named with a `/` at its end,
 //! takes the product under its own names; all else is refused.
 
-use super::target::DEMO_CAPTURE;
+use super::options::DEMO_CAPTURE;
 use crate::config::MeshFormat;
 use crate::io;
 use crate::pipeline::{Line, Stage, export_head};

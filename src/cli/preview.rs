@@ -1,25 +1,28 @@
-//! `tiface preview`: pictures of a mesh to look at.
+//! `tiface preview`: pictures of a mesh to look at, on a sheet with their names in letters of 5 × 7 dots; `--page`: a head to
+//! turn in a browser; `--watch`: the page of a run while it works.
 
-mod label;
-
-use super::invocation::Invocation;
+use super::Invocation;
+use super::options::RunTarget;
 use super::out::Out;
-use super::stdout::print;
-use super::target::RunTarget;
-use super::viewer;
+use super::run::is_demo;
+use super::screen::print;
 use crate::config::ViewBackground;
 use crate::geom::Camera;
 use crate::io::{self, Animation};
-use crate::pipeline::{Preview, PreviewPicture};
+use crate::pipeline::{Line, Preview, PreviewPicture, Stage, field_view, head_page, viewer_of_file};
 use crate::render::Look;
+use crate::report::live_html;
+use crate::run::Run;
 use crate::{Error, Result};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use glam::Vec3;
 use rayon::prelude::*;
 use serde_json::json;
+use std::collections::HashMap;
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
 
 /// How a preview is made.
 #[derive(Args, Debug)]
@@ -162,11 +165,11 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
     let (common, screen) = (invocation.common, &invocation.screen);
     if options.watch {
         Out::none(common.out.as_deref(), "preview --watch")?;
-        return viewer::watch(invocation, options.path.as_deref());
+        return watch(invocation, options.path.as_deref());
     }
     if options.page {
         let asked = Out::find(common.out.as_deref(), "page")?;
-        return viewer::page(invocation, options.path.as_deref(), options.up, asked.as_ref());
+        return page(invocation, options.path.as_deref(), options.up, asked.as_ref());
     }
     let kind = Kind::of(options);
     if kind == Kind::Sheet && options.size.is_some_and(|size| size > MOST_OF_SHEET) {
@@ -235,7 +238,7 @@ fn make(
                 Ok(None) => {}
                 Err(e) => invocation.screen.note("preview", &format!("no errors against a photograph: {e}")),
             }
-            pictures.iter_mut().zip(&names).for_each(|(picture, name)| label::write(picture, name));
+            pictures.iter_mut().zip(&names).for_each(|(picture, name)| write_name(picture, name));
             let sheet = PreviewPicture::sheet(&pictures, columns);
             io::write_png_rgba(file, sheet.width, sheet.height, &sheet.rgba)?;
             Ok(vec![file.clone()])
@@ -317,7 +320,7 @@ fn open(invocation: &Invocation, options: &PreviewOptions) -> Result<(Preview, S
     match options.path.as_deref().filter(|path| !io::is_folder(path)) {
         Some(file) => Ok((Preview::of_file(file, options.up.unwrap_or(Vec3::Y))?, named(file))),
         None => {
-            viewer::no_up(options.up)?;
+            no_up(options.up)?;
             let target = RunTarget::find(invocation.common, options.path.as_deref())?;
             if target.guessed {
                 invocation.screen.note("run", &format!("using `{}`", target.run.display()));
@@ -325,5 +328,178 @@ fn open(invocation: &Invocation, options: &PreviewOptions) -> Result<(Preview, S
             let name = io::real_path(&target.run).map_or_else(|_| "run".into(), |run| named(&run));
             Ok((Preview::of_run(&target.run)?, name))
         }
+    }
+}
+
+/// Rows of a letter, five bits each, the left one first.
+fn rows(letter: char) -> [u8; 7] {
+    match letter {
+        'A' => [0x0e, 0x11, 0x11, 0x1f, 0x11, 0x11, 0x11],
+        'B' => [0x1e, 0x11, 0x11, 0x1e, 0x11, 0x11, 0x1e],
+        'C' => [0x0e, 0x11, 0x10, 0x10, 0x10, 0x11, 0x0e],
+        'E' => [0x1f, 0x10, 0x10, 0x1e, 0x10, 0x10, 0x1f],
+        'F' => [0x1f, 0x10, 0x10, 0x1e, 0x10, 0x10, 0x10],
+        'G' => [0x0e, 0x11, 0x10, 0x17, 0x11, 0x11, 0x0f],
+        'H' => [0x11, 0x11, 0x11, 0x1f, 0x11, 0x11, 0x11],
+        'I' => [0x0e, 0x04, 0x04, 0x04, 0x04, 0x04, 0x0e],
+        'K' => [0x11, 0x12, 0x14, 0x18, 0x14, 0x12, 0x11],
+        'L' => [0x10, 0x10, 0x10, 0x10, 0x10, 0x10, 0x1f],
+        'M' => [0x11, 0x1b, 0x15, 0x15, 0x11, 0x11, 0x11],
+        'N' => [0x11, 0x19, 0x15, 0x13, 0x11, 0x11, 0x11],
+        'O' => [0x0e, 0x11, 0x11, 0x11, 0x11, 0x11, 0x0e],
+        'P' => [0x1e, 0x11, 0x11, 0x1e, 0x10, 0x10, 0x10],
+        'R' => [0x1e, 0x11, 0x11, 0x1e, 0x14, 0x12, 0x11],
+        'S' => [0x0f, 0x10, 0x10, 0x0e, 0x01, 0x01, 0x1e],
+        'T' => [0x1f, 0x04, 0x04, 0x04, 0x04, 0x04, 0x04],
+        'U' => [0x11, 0x11, 0x11, 0x11, 0x11, 0x11, 0x0e],
+        'V' => [0x11, 0x11, 0x11, 0x11, 0x0a, 0x0a, 0x04],
+        'W' => [0x11, 0x11, 0x11, 0x15, 0x15, 0x1b, 0x11],
+        _ => [0; 7],
+    }
+}
+
+/// A letter with the space behind it, dots.
+const STEP: u32 = 6;
+
+/// Writes a name of capital letters into the upper left corner of a picture: white on a dark field, so that it can be read
+/// over anything.
+fn write_name(picture: &mut PreviewPicture, name: &str) {
+    let dot = (picture.width / 256).max(1);
+    let (across, down) = (STEP * name.len() as u32 + 3, 11);
+    let letters: Vec<[u8; 7]> = name.chars().map(rows).collect();
+    for y in 0..(down * dot).min(picture.height) {
+        for x in 0..(across * dot).min(picture.width) {
+            let (column, row) = ((x / dot).wrapping_sub(2), (y / dot).wrapping_sub(2));
+            let letter = letters.get((column / STEP) as usize).filter(|_| row < 7 && column % STEP < 5);
+            let is_on = letter.is_some_and(|rows| rows[row as usize] >> (4 - column % STEP) & 1 == 1);
+            let shade = if is_on { 255 } else { 32 };
+            picture.rgba[(y * picture.width + x) as usize] = [shade, shade, shade, 255];
+        }
+    }
+}
+
+/// Writes the page of a mesh file whose up is `up`, or of the head of a run with its photographs.
+fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, asked: Option<&Out>) -> Result<()> {
+    let (common, screen) = (invocation.common, &invocation.screen);
+    let named = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let (name, html): (String, Box<dyn FnOnce() -> Result<String>>) =
+        match path.filter(|path| !io::is_folder(path)) {
+            Some(file) => {
+                let html = move || {
+                    let (html, warnings) = viewer_of_file(file, up.unwrap_or(Vec3::Y))?;
+                    warnings.iter().for_each(|w| screen.note("preview: warning", w));
+                    Ok(html)
+                };
+                (named(file), Box::new(html))
+            }
+            None => {
+                no_up(up)?;
+                let (target, config) = target(invocation, path)?;
+                let name = io::real_path(&target.run).map_or_else(|_| "run".into(), |run| named(&run));
+                let html = move || {
+                    let run = Run::open(&target.run, invocation.stop.clone(), screen.clone());
+                    let line = Line::open(&config, &run)?;
+                    head_page(&if is_demo(&config, &run) { line.of_demo() } else { line })
+                };
+                (name, Box::new(html))
+            }
+        };
+    let file = format!("{name}_preview.html");
+    let file = asked.map_or_else(|| PathBuf::from(&file), |out| out.file(&file));
+    if common.dry_run {
+        screen.note("preview", &format!("would write a page to `{}`", file.display()));
+        return Ok(());
+    }
+    let html = html()?;
+    asked.into_iter().try_for_each(Out::prepare)?;
+    io::write_atomic(&file, html.as_bytes())?;
+    if common.json {
+        print(&format!("{}\n", json!({"event": "result", "preview": [file]})))?;
+    } else if !common.quiet {
+        print(&format!("preview   {} (open it in a browser)\n", file.display()))?;
+    }
+    Ok(())
+}
+
+/// Refuses an axis for a run, which knows where up is.
+fn no_up(up: Option<Vec3>) -> Result<()> {
+    match up {
+        Some(_) => Err(Error::usage("`--up` is of files: a run knows where up is", "leave it out")),
+        None => Ok(()),
+    }
+}
+
+/// The page of a run at work, in its folder.
+const WATCHED: &str = "watch.html";
+
+/// How often that is written.
+const EVERY: Duration = Duration::from_secs(2);
+
+/// Writes the page of a run again and again until somebody stops it.
+fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
+    let (common, stop) = (invocation.common, &invocation.stop);
+    let (target, config) = target(invocation, path)?;
+    let page = target.run.join(WATCHED);
+    if common.dry_run {
+        invocation.screen.note("preview", &format!("would keep a page up to date in `{}`", page.display()));
+        return Ok(());
+    }
+    // each view is made once for a checkpoint, whether or not that can be read
+    let mut made: HashMap<Stage, (SystemTime, Option<Vec<u8>>)> = HashMap::new();
+    let mut view = |stage: Stage, saved: SystemTime| -> Option<Vec<u8>> {
+        if let Some((_, picture)) = made.get(&stage).filter(|(time, _)| *time == saved) {
+            return picture.clone();
+        }
+        let picture = field_view(&target.run, &config, stage);
+        if let Err(e) = &picture {
+            invocation.screen.note("watch", &format!("no view of `{stage}`: {e}"));
+        }
+        let picture = picture.ok();
+        made.insert(stage, (saved, picture.clone()));
+        picture
+    };
+    let mut write = |renewed| {
+        io::write_atomic(&page, live_html(&target.run, &mut view, renewed)?.as_bytes()).map_err(Error::from)
+    };
+    write(true)?;
+    if common.json {
+        print(&format!("{}\n", json!({"event": "watching", "run": target.run, "page": page})))?;
+    } else {
+        print(&format!("watch     {} (open it in a browser), until Ctrl-C\n", page.display()))?;
+    }
+    while stop.requested().is_none() {
+        std::thread::park_timeout(EVERY);
+        write(stop.requested().is_none())?;
+    }
+    Err(stop.error("the page stays as it is"))
+}
+
+/// The run that is meant, and its configuration.
+fn target(invocation: &Invocation, path: Option<&Path>) -> Result<(RunTarget, crate::config::Config)> {
+    let target = RunTarget::find(invocation.common, path)?;
+    let Some(saved) = &target.saved else {
+        let what = format!("`{}` is no run", path.unwrap_or(Path::new(".")).display());
+        return Err(Error::usage(what, "name the folder of a run, or a .glb, .obj or .ply file"));
+    };
+    if target.guessed {
+        invocation.screen.note("run", &format!("using `{}`", target.run.display()));
+    }
+    let config = invocation.common.resolve(Some(saved), None, &[])?;
+    Ok((target, config))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_letter_stands_in_the_corner() {
+        let mut picture = PreviewPicture { width: 20, height: 20, rgba: vec![[9; 4]; 400] };
+        write_name(&mut picture, "L");
+        let at = |x: usize, y: usize| picture.rgba[y * 20 + x];
+        // seven dots down, five along its foot; a field of 9 × 11 around it
+        assert!((2..9).all(|y| at(2, y) == [255; 4]) && (2..7).all(|x| at(x, 8) == [255; 4]));
+        assert!(at(3, 7) == [32, 32, 32, 255] && at(8, 10) == [32, 32, 32, 255]);
+        assert!(at(9, 5) == [9; 4] && at(5, 11) == [9; 4]);
     }
 }

@@ -1,10 +1,10 @@
 //! `tiface report`: the page of a run made anew, or one page of many runs.
 
-use super::invocation::Invocation;
+use super::Invocation;
+use super::options::RunTarget;
 use super::out::Out;
 use super::run::is_demo;
-use super::stdout::print;
-use super::target::RunTarget;
+use super::screen::print;
 use crate::io;
 use crate::pipeline::{Line, renew_report};
 use crate::report::{RunRow, runs_csv, runs_html};

@@ -3,7 +3,7 @@
 //! The first signal asks to stop. What comes within a second of it is the same request, made twice as GNU `timeout`
 //! does; a later one ends the process at once.
 
-use super::invocation::Invocation;
+use super::Invocation;
 use crate::{Error, ErrorKind, Result};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::{flag, low_level};

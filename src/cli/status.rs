@@ -1,9 +1,7 @@
 //! `tiface status`: where runs stand; reads only what stages say of themselves.
 
-use super::invocation::Invocation;
-use super::plain::one_line;
-use super::screen::figure;
-use super::stdout::print;
+use super::Invocation;
+use super::screen::{figure, one_line, print};
 use crate::config::Stage;
 use crate::io;
 use crate::report::duration;

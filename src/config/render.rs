@@ -1,4 +1,5 @@
-//! `[render]`: the views made of the result.
+//! `[render]`: the views made of the result; `[ensemble]`: how several views of one camera become one; `[metrics]`: how
+//! the result is judged.
 
 use super::stage::Stage;
 use super::table::table;
@@ -117,9 +118,52 @@ impl RenderConfig {
     }
 }
 
+table! {
+    /// Which views are blended, and how.
+    pub struct EnsembleConfig;
+    keys {
+        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb); an empty list
+        /// for no blend.
+        members: Vec<Method>
+            => vec![Method::Tface, Method::Volume, Method::Raycast],
+            vec![Method::Tface, Method::Volume, Method::Raycast],
+            vec![Method::Baseline, Method::Tface, Method::Volume];
+        /// The share of each member, in their order, together 1; an empty list fits them on capture.tiles.
+        weights: Vec<f64>, 0.0..=1.0 => Vec::new(), Vec::new(), vec![0.1, 0.6, 0.3];
+        /// Cut members trained without masks to the head, true or false; else the background shows.
+        cut: bool => true, true, false;
+    }
+}
+
+/// What a photograph looks like that views are compared with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TruthPhoto {
+    /// As it was taken, background and all.
+    Photo,
+    /// Cut out by its mask and laid over the views' background.
+    Masked,
+}
+
+table! {
+    /// How views and surface are compared with what is known.
+    pub struct MetricsConfig;
+    keys {
+        /// What views are compared with: photo (as it was taken; figures of the whole frame count the background) or
+        /// masked (cut out by its mask, over render.background).
+        truth: TruthPhoto => TruthPhoto::Masked, TruthPhoto::Masked, TruthPhoto::Photo;
+        /// LPIPS as an ONNX file that takes two pictures (needs a build with the feature `matting`); without one there are no
+        /// such figures. `mask.onnxruntime` runs it, if it is named.
+        lpips: String => String::new();
+        /// Points drawn on a surface when it is compared with a known one.
+        surface_points: u32, 100.0..=10_000_000.0 => 20_000, 100_000, 100_000;
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::{Config, Sources};
 
     #[test]
     fn every_picture_has_one_word_and_one_name() {
@@ -131,5 +175,25 @@ mod tests {
         }
         assert_eq!(called("volume"), "I-Face (volume)");
         assert_eq!((called("baseline"), called("truth")), ("baseline".into(), "truth".into()));
+    }
+
+    fn set(set: &[&str]) -> Config {
+        let set = set.iter().map(|s| s.to_string()).collect();
+        Config::resolve(&Sources { set, ..Sources::default() }).unwrap()
+    }
+
+    #[test]
+    fn weights_are_fitted_unless_they_are_given_and_iface_is_a_word_for_volume() {
+        let c = set(&[]);
+        assert_eq!(c.ensemble.members, [Method::Tface, Method::Volume, Method::Raycast]);
+        assert!(c.ensemble.weights.is_empty() && c.capture.tiles > 0.0);
+        assert!(!c.render.method.contains(&Method::Baseline));
+        let c = set(&["preset=paper"]);
+        assert_eq!(c.ensemble.members, [Method::Baseline, Method::Tface, Method::Volume]);
+        assert_eq!((c.ensemble.weights.iter().sum::<f64>(), c.capture.tiles), (1.0, 0.0));
+        assert!(c.render.method.contains(&Method::Baseline));
+        let c = set(&["ensemble.members=tface,iface", "ensemble.weights=1,0"]).ensemble;
+        assert_eq!((c.members[1], c.weights.as_slice()), (Method::Volume, &[1.0, 0.0][..]));
+        assert!(set(&["preset=paper", "ensemble.weights="]).ensemble.weights.is_empty());
     }
 }

@@ -42,16 +42,16 @@ macro_rules! table {
             $($($(#[doc = $constant_doc])+ #[serde(skip)] pub $constant: $constant_ty,)+)?
         }
 
-        pub(super) const KEYS: &[super::Key] = &[
-            $(super::Key {
-                name: $crate::config::table::plain(stringify!($key)),
-                doc: concat!($($doc),+).trim_ascii_start(),
-                min: $crate::config::table::bound!(f64::NEG_INFINITY $(, $min)?),
-                max: $crate::config::table::bound!(f64::INFINITY $(, $max)?),
-            },)+
-        ];
-
         impl $name {
+            pub(super) const KEYS: &[super::Key] = &[
+                $(super::Key {
+                    name: $crate::config::table::plain(stringify!($key)),
+                    doc: concat!($($doc),+).trim_ascii_start(),
+                    min: $crate::config::table::bound!(f64::NEG_INFINITY $(, $min)?),
+                    max: $crate::config::table::bound!(f64::INFINITY $(, $max)?),
+                },)+
+            ];
+
             /// The values a preset starts with.
             pub fn preset(preset: super::Preset) -> $name {
                 $name {

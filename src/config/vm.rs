@@ -1,5 +1,6 @@
 //! `[baseline]` and `[tface]`: TensoRF's vector-matrix radiance field and its training. Both stages are the
-//! same code; they differ in what masks do, and T-Face may be the mean of several fields.
+//! same code; they differ in what masks do, and T-Face may be the mean of several fields. `[baseline]` has only what
+//! differs from `[tface]`.
 
 use super::iface::Foreground;
 use super::table::table;
@@ -197,6 +198,43 @@ impl VmConfig {
     /// How many fields there are in the end: at least one, and no more where it comes from a file.
     pub fn learned(&self) -> usize {
         if self.import.is_empty() { self.fields.max(1) } else { 1 }
+    }
+}
+
+table! {
+    /// Settings of the stage `baseline`: T-Face's but for these, one field, and no masks.
+    pub struct BaselineConfig;
+    keys {
+        /// A published checkpoint to take instead of training, converted by tools/reference/th_to_safetensors.py; empty
+        /// to train.
+        import: String => String::new();
+        /// Optimizer steps.
+        steps: u64, 1.0..=1e7 => 1500, 2000, 50_000;
+        /// Rays per step: fewer than T-Face has, for whole frames cost several times a head.
+        rays: usize, 1.0..=1_048_576.0 => 4096, 8192, 4096;
+    }
+}
+
+impl BaselineConfig {
+    /// `tface` without masks, of one field.
+    ///
+    /// Over black, where T-Face is over random colors: without a mask a target has no hole, and any color behind the
+    /// head but the photographs' own asks for matter in front of it (19.8 instead of 23.6 dB inside the mask in a
+    /// light stage all around the head).
+    pub fn field(&self, tface: &VmConfig) -> VmConfig {
+        VmConfig {
+            import: self.import.clone(),
+            steps: self.steps,
+            rays: self.rays,
+            fields: 1,
+            masks: MaskUse::None,
+            mask_loss: MaskLoss::None,
+            background: match tface.background {
+                VmBackground::Random => VmBackground::Black,
+                other => other,
+            },
+            ..tface.clone()
+        }
     }
 }
 

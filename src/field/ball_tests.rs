@@ -1,28 +1,15 @@
-//! An analytic ball to train on: what the tests of learned fields share.
+//! What the tests of learned fields share beside the ball.
 
-use super::checkpoint::newest;
-use super::pixels::TrainView;
-use super::training::TrainingSession;
-use crate::geom::{Camera, Distortion};
-use crate::image::{Gray, Photo};
+use super::view;
+use crate::field::checkpoint::newest;
+use crate::field::pixels::TrainView;
+use crate::field::training::TrainingSession;
 use crate::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
-use crate::kernel::cpu::march::Bitmask;
 use crate::kernel::cpu::rng;
 use crate::{Monitor, Quiet, Result};
-use glam::{DMat3, DVec3, Vec2, Vec3};
+use glam::Vec3;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
-
-/// Its radius.
-pub const BALL: f32 = 0.6;
-
-/// A red and green ball in front of a blue wall, seen from eight sides.
-pub fn views() -> Vec<TrainView> {
-    let color = |p: Vec3| if p.y > 0.0 { [200, 40, 30] } else { [40, 180, 60] };
-    (0..8)
-        .map(|i| view(40, i as f64 * std::f64::consts::TAU / 8.0, if i % 2 == 0 { 0.4 } else { -0.4 }, color))
-        .collect()
-}
 
 /// A ball with waves of some pixels all over it, seen from twelve sides, nine of them from before it.
 pub fn textured_views() -> Vec<TrainView> {
@@ -36,54 +23,6 @@ pub fn textured_views() -> Vec<TrainView> {
     let before = (0..9).map(|i| (0.4 * (i % 3) as f64 - 0.4, 0.4 * (i / 3) as f64 - 0.4));
     let behind = (2..5).map(|i| (i as f64 * std::f64::consts::TAU / 6.0, 0.3));
     before.chain(behind).map(|(azimuth, elevation)| view(80, azimuth, elevation, waves)).collect()
-}
-
-fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8; 3]) -> TrainView {
-    let rotation = DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-elevation);
-    let camera = Camera {
-        width: size,
-        height: size,
-        fx: 1.5 * size as f64,
-        fy: 1.5 * size as f64,
-        cx: 0.5 * size as f64,
-        cy: 0.5 * size as f64,
-        distortion: Distortion::default(),
-        rotation,
-        position: rotation * DVec3::new(0.0, 0.0, 3.0),
-    };
-    let mut rgb = Vec::new();
-    let mut alpha = Vec::new();
-    for y in 0..size {
-        for x in 0..size {
-            let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).unwrap();
-            let b = ray.origin.dot(ray.direction);
-            let discriminant = b * b - ray.origin.length_squared() + BALL * BALL;
-            if discriminant > 0.0 {
-                let p = ray.at(-b - discriminant.sqrt());
-                rgb.push(color(p));
-                alpha.push(255);
-            } else {
-                rgb.push([30, 30, 220]);
-                alpha.push(0);
-            }
-        }
-    }
-    TrainView {
-        camera,
-        photo: Photo { width: size, height: size, rgb, alpha: None },
-        mask: Some(Gray { width: size, height: size, values: alpha }),
-        valid: None,
-    }
-}
-
-pub fn hull() -> Bitmask {
-    let r = 32;
-    let mut hull = Bitmask::filled(r, false);
-    for i in 0..r * r * r {
-        let c = Vec3::from_array([i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) / 16.0 - 1.0));
-        hull.set(i, c.length() < BALL + 0.1);
-    }
-    hull
 }
 
 pub fn temporary() -> tempfile::TempDir {

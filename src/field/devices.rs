@@ -1,16 +1,17 @@
 //! The GPUs of this machine: which are there, which is chosen, and whether it can be trusted.
 //!
 //! A device is used by one training at a time: it has a lock, a file in the folder for temporary files. Before `auto`
-//! takes a device it compares its kernels with the processor's, once for each adapter and program: what was
-//! found is kept in the user's cache.
+//! takes a device it compares a training step there with the processor's, once for each adapter, driver, program and
+//! field: the verdict is kept in the user's cache.
 
+use super::SelfTest;
 use crate::config::DeviceChoice;
 use crate::io::{self, Limits, Lock, LockError};
-use crate::kernel::gpu::{self, Adapter, Check, Device};
+use crate::kernel::gpu::{self, Adapter, Device};
 use crate::{Error, Result};
 use serde::Serialize;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 /// A device that was opened for a training.
@@ -85,9 +86,9 @@ fn missing(name: &str, api: &str, adapters: &[&Adapter]) -> Error {
     )
 }
 
-/// Opens the first GPU that is no software, that nobody uses and that passes the self-test; says why not where there is
-/// none.
-pub fn best(choice: &DeviceChoice) -> std::result::Result<Gpu, String> {
+/// Opens the first GPU that is no software, that nobody uses and that passes the tests; says why not where there is none.
+pub fn best(choice: &DeviceChoice, tests: &[SelfTest]) -> std::result::Result<Gpu, String> {
+    let file = kept_file();
     let mut passed_over = Vec::new();
     for adapter in Adapter::all().iter().filter(|a| !a.software) {
         let device = opened(adapter, choice);
@@ -101,7 +102,7 @@ pub fn best(choice: &DeviceChoice) -> std::result::Result<Gpu, String> {
             // where no lock can be made nobody else has one either
             Err(LockError::Io { .. }) => None,
         };
-        match trusted(&device, adapter) {
+        match tests.iter().try_for_each(|test| trusted(&device, adapter, test, file.as_deref())) {
             Ok(()) => {
                 let why = format!(
                     "the first GPU that is free and computes what the processor does ({})",
@@ -141,29 +142,72 @@ fn kept_file() -> Option<PathBuf> {
     Some(base.join("tiface/devices.json"))
 }
 
-fn trusted(device: &Device, adapter: &Adapter) -> std::result::Result<(), String> {
-    // another program may have other kernels
+/// What was computed of a step, and how far it was from the processor.
+#[derive(Debug, Serialize)]
+pub struct Check {
+    /// Which field, and what of it.
+    pub name: String,
+    /// Error, relative; not a number where the device computed none.
+    pub error: f32,
+    /// What it may be.
+    pub allowed: f32,
+    /// Is it as near as it has to be?
+    pub passed: bool,
+}
+
+impl Check {
+    /// Returns the verdict on an error.
+    pub fn new(name: String, error: f32, allowed: f32) -> Check {
+        Check { name, error, allowed, passed: error <= allowed }
+    }
+}
+
+/// What verdicts are kept under: another adapter, driver, API or program is tested afresh.
+fn verdict_key(device: &Device, adapter: &Adapter, test: &SelfTest) -> String {
     let built = std::env::current_exe().ok().and_then(|exe| io::modified(&exe));
     let release = env!("CARGO_PKG_VERSION");
-    let key = format!("{} | {} | {} | {release} {built:?}", device.name(), device.driver(), adapter.api);
-    let file = kept_file();
+    let (name, driver) = (device.name(), device.driver());
+    format!("{name} | {driver} | {} | {release} {built:?} | {}", adapter.api, test.field)
+}
+
+/// Returns the verdict that is kept in a file.
+fn kept_verdict(file: Option<&Path>, key: &str) -> Option<bool> {
     // a file that cannot be read is as good as none
-    let mut kept: BTreeMap<String, bool> =
-        file.as_ref().and_then(|file| io::read_typed(file, &Limits::default()).ok()).unwrap_or_default();
-    let passed = match kept.get(&key) {
-        Some(&passed) => passed,
+    let kept: BTreeMap<String, bool> = io::read_typed(file?, &Limits::default()).ok()?;
+    kept.get(key).copied()
+}
+
+/// Keeps a verdict. Where that fails the device is tested again next time.
+fn keep_verdict(file: Option<&Path>, key: String, passed: bool) {
+    let Some(file) = file else { return };
+    let mut kept: BTreeMap<String, bool> = io::read_typed(file, &Limits::default()).unwrap_or_default();
+    kept.insert(key, passed);
+    if let (Ok(text), Some(folder)) = (serde_json::to_vec_pretty(&kept), file.parent())
+        && io::create_folder(folder).is_ok()
+    {
+        let _ = io::write_atomic(file, &text);
+    }
+}
+
+/// Tests a device, whatever is known of it, and keeps the verdict.
+fn tested(device: &Device, adapter: &Adapter, test: &SelfTest, file: Option<&Path>) -> Result<Vec<Check>> {
+    let checks = (test.run)(adapter)?;
+    keep_verdict(file, verdict_key(device, adapter, test), checks.iter().all(|check| check.passed));
+    Ok(checks)
+}
+
+/// Refuses a device that fails a test, which is made where no verdict is kept.
+fn trusted(
+    device: &Device,
+    adapter: &Adapter,
+    test: &SelfTest,
+    file: Option<&Path>,
+) -> std::result::Result<(), String> {
+    let passed = match kept_verdict(file, &verdict_key(device, adapter, test)) {
+        Some(passed) => passed,
         None => {
-            let checks = gpu::self_test(device).map_err(|e| e.to_string())?;
-            let passed = checks.iter().all(Check::passed);
-            kept.insert(key, passed);
-            if let (Some(file), Ok(text)) = (file, serde_json::to_vec_pretty(&kept))
-                && let Some(folder) = file.parent()
-                && io::create_folder(folder).is_ok()
-            {
-                // tested again next time
-                let _ = io::write_atomic(&file, &text);
-            }
-            passed
+            let checks = tested(device, adapter, test, file).map_err(|e| e.to_string())?;
+            checks.iter().all(|check| check.passed)
         }
     };
     if passed { Ok(()) } else { Err("failed the self-test (`tiface doctor` shows it)".into()) }
@@ -192,44 +236,31 @@ pub struct Found {
     pub shared: usize,
     /// Does another training use it?
     pub in_use: bool,
-    /// Kernels against the processor's.
-    pub checks: Vec<Checked>,
+    /// Training steps against the processor's.
+    pub checks: Vec<Check>,
     /// Why that could not be done.
     pub error: Option<String>,
     /// Seconds the self-test took, with the time the driver took to compile.
     pub seconds: f64,
 }
 
-/// A kernel of the self-test.
-#[derive(Debug, Serialize)]
-pub struct Checked {
-    /// Which.
-    pub kernel: &'static str,
-    /// Largest error, relative; not a number where the device computed none.
-    pub error: f32,
-    /// What it may be.
-    pub allowed: f32,
-    /// Is it as near as it has to be?
-    pub passed: bool,
-}
-
 /// Looks at every adapter of this machine, software ones too, and tests it.
-pub fn examine() -> Vec<Found> {
+pub fn examine(tests: &[SelfTest]) -> Vec<Found> {
     let all = Adapter::all();
     let number = |i: usize| all[..i].iter().filter(|a| a.api == all[i].api).count();
-    (0..all.len()).map(|i| examined(&all[i], number(i))).collect()
+    (0..all.len()).map(|i| examined(&all[i], number(i), tests)).collect()
 }
 
-fn examined(adapter: &Adapter, number: usize) -> Found {
+fn examined(adapter: &Adapter, number: usize, tests: &[SelfTest]) -> Found {
     let device = Device::open(adapter);
     let limits = device.limits();
     let in_use = matches!(Lock::take(&lock_file(&device)), Err(LockError::Held { .. }));
     let began = std::time::Instant::now();
-    let tested = gpu::self_test(&device);
+    let file = kept_file();
+    let all: Result<Vec<Vec<Check>>> =
+        tests.iter().map(|test| tested(&device, adapter, test, file.as_deref())).collect();
     let seconds = began.elapsed().as_secs_f64();
-    let error = tested.as_ref().err().map(|e| e.to_string());
-    let checked =
-        |c: Check| Checked { kernel: c.name, error: c.error, allowed: c.allowed, passed: c.passed() };
+    let error = all.as_ref().err().map(|e| e.to_string());
     Found {
         name: format!("{}:{number}", adapter.api),
         adapter: device.name().into(),
@@ -244,7 +275,7 @@ fn examined(adapter: &Adapter, number: usize) -> Found {
         largest_buffer: limits.largest_buffer,
         shared: limits.shared,
         in_use,
-        checks: tested.unwrap_or_default().into_iter().map(checked).collect(),
+        checks: all.unwrap_or_default().into_iter().flatten().collect(),
         error,
         seconds,
     }
@@ -270,7 +301,7 @@ mod tests {
             // software is taken only where it is named, with its number
             let e = open(&named("wgpu")).err().unwrap();
             assert!(e.to_string().contains(if all.is_empty() { "no adapter" } else { "software" }), "{e}");
-            assert_eq!(best(&named("auto")).err().unwrap(), "no GPU is here");
+            assert_eq!(best(&named("auto"), &[]).err().unwrap(), "no GPU is here");
         }
     }
 
@@ -289,5 +320,40 @@ mod tests {
         // used as it is asked to be
         let asked = open(&named("wgpu:0+deterministic+0.5GiB")).unwrap().device;
         assert_eq!((asked.atomics(), asked.limits().memory), (gpu::Atomics::Fixed, Some(1 << 29)));
+    }
+
+    /// The program of the tests counts how often a device is tested.
+    #[test]
+    fn a_verdict_is_kept_until_driver_or_program_change() {
+        use std::sync::atomic::{AtomicUsize, Ordering};
+        static TESTS: AtomicUsize = AtomicUsize::new(0);
+        let Some(adapter) = Adapter::all().first() else { return };
+        let test = SelfTest {
+            field: "counted",
+            run: |_| {
+                let passed = TESTS.fetch_add(1, Ordering::SeqCst) == 0;
+                Ok(vec![Check::new(String::new(), if passed { 0.0 } else { f32::NAN }, 1.0)])
+            },
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("cache/devices.json");
+        let device = Device::open(adapter);
+        let began = std::time::Instant::now();
+        for _ in 0..3 {
+            assert!(trusted(&device, adapter, &test, Some(&file)).is_ok());
+        }
+        assert!(TESTS.load(Ordering::SeqCst) == 1 && began.elapsed().as_secs_f64() < 2.0);
+        // another field, or a driver or program that the key names otherwise
+        let key = verdict_key(&device, adapter, &test);
+        assert!(key.contains(device.driver()) && key.contains(env!("CARGO_PKG_VERSION")));
+        assert_eq!(kept_verdict(Some(&file), &key), Some(true));
+        assert_eq!(kept_verdict(Some(&file), &key.replace(device.driver(), "a newer one")), None);
+        std::fs::write(&file, key.replace(device.driver(), "an older one")).unwrap();
+        for _ in 0..2 {
+            assert!(trusted(&device, adapter, &test, Some(&file)).unwrap_err().contains("self-test"));
+        }
+        // failed, and that is kept, too
+        assert_eq!(TESTS.load(Ordering::SeqCst), 2);
+        assert_ne!(key, verdict_key(&device, adapter, &SelfTest { field: "other", ..test }));
     }
 }

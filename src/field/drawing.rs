@@ -106,4 +106,43 @@ mod tests {
             }
         }
     }
+
+    /// Kilobytes of memory of this process: now, or at most since this was last asked.
+    fn resident_memory(most: bool) -> u64 {
+        let status = std::fs::read_to_string("/proc/self/status").unwrap();
+        let name = if most { "VmHWM:" } else { "VmRSS:" };
+        let line = status.lines().find(|line| line.starts_with(name)).unwrap();
+        let kilobytes = line.split_whitespace().nth(1).unwrap().parse().unwrap();
+        std::fs::write("/proc/self/clear_refs", "5").unwrap();
+        kilobytes
+    }
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn photographs_are_not_copied_whole_on_their_way() {
+        if device().is_some() {
+            crate::kernel::gpu::tests::alone("field::drawing::tests::memory_of_photographs");
+        }
+    }
+
+    /// `cargo test --release --features wgpu --lib memory_of_photographs -- --ignored --nocapture`
+    #[test]
+    #[cfg(target_os = "linux")]
+    #[ignore = "run by the test above, in a process of its own"]
+    fn memory_of_photographs() {
+        let device = device().unwrap();
+        let mut views: Vec<_> = (0..5).map(|i| ball::view(2000, i as f64, 0.0, |_| [90; 3])).collect();
+        views.iter_mut().for_each(|view| view.mask = None);
+        let pixels = Pixels::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false);
+        let drawing = SamplingOptions { jitter: true, background: true, behind: 8 };
+        let bytes = resident(&pixels, &device, u64::MAX).unwrap();
+        let before = resident_memory(false);
+        let _rays = DeviceRays::new(&pixels, &device, drawing, true);
+        device.read::<f32>(&device.zeros::<f32>(1));
+        let more = 1024 * (resident_memory(true) - before);
+        let share = more as f64 / bytes as f64;
+        println!("{bytes} bytes of photographs: {more} bytes at most, {share:.2} times as much");
+        // a software device holds them in the same memory, once
+        assert!(bytes > 75 << 20 && share < 3.2, "{share}");
+    }
 }

@@ -1,4 +1,9 @@
 //! Real spherical harmonics up to degree 3 (16 values): the view-direction encoding of Instant-NGP.
+//!
+//! [`Harmonics`]: color at the vertices of a mesh that changes with the direction of view.
+
+use super::ray::Hit;
+use glam::{Mat3, Vec3};
 
 /// The first function: it is the same in every direction.
 pub const Y0: f32 = 0.282_094_79;
@@ -46,6 +51,33 @@ pub fn combine(coefficients: &[[f32; 3]], d: [f32; 3]) -> [f32; 3] {
     out
 }
 
+/// Spherical harmonics of the direction to the viewer at the vertices of a mesh, to be added to its base color.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Harmonics {
+    /// Functions a vertex, 1, 4 or 9: those of [`sh16`] up to a degree.
+    pub functions: usize,
+    /// `[vertices, functions]` coefficients, sRGB-coded.
+    pub coefficients: Vec<[f32; 3]>,
+    /// Turns directions of the mesh's coordinates into those of the harmonics.
+    pub turned: Mat3,
+}
+
+impl Harmonics {
+    /// Returns what is added where a ray along the unit `direction`, away from the camera, met the triangle of these
+    /// vertices.
+    pub fn seen_along(&self, direction: Vec3, hit: &Hit, triangle: [u32; 3]) -> [f32; 3] {
+        let d = (self.turned * -direction).to_array();
+        let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
+        let mut out = [0f32; 3];
+        for (vertex, w) in triangle.into_iter().zip(weights) {
+            let own = &self.coefficients[vertex as usize * self.functions..][..self.functions];
+            let color = combine(own, d);
+            (0..3).for_each(|k| out[k] += w * color[k]);
+        }
+        out
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -61,5 +93,21 @@ mod tests {
         for (g, w) in got.iter().zip(golden) {
             assert!((g - w as f32).abs() < 2e-7, "{g} {w}");
         }
+    }
+
+    #[test]
+    fn a_corner_shows_its_own_color_in_the_direction_it_is_seen_from() {
+        // -0.4886 x is the fourth function: red towards -x at the second vertex, nothing at the others
+        let mut coefficients = vec![[0.0; 3]; 12];
+        coefficients[4 + 3] = [1.0, 0.0, 0.0];
+        let quarter = Mat3::from_rotation_z(std::f32::consts::FRAC_PI_2); // y -> -x
+        let harmonics = Harmonics { functions: 4, coefficients, turned: quarter };
+        let hit = |u: f32, v: f32| Hit { t: 1.0, triangle: 0, u, v };
+        // seen along -y: the viewer is at +y, turned to -x
+        let at = |u: f32, v: f32, d: Vec3| harmonics.seen_along(d, &hit(u, v), [0, 1, 2])[0];
+        assert!((at(1.0, 0.0, Vec3::NEG_Y) - 0.488_602_5).abs() < 1e-6);
+        assert!((at(0.25, 0.5, Vec3::NEG_Y) - 0.25 * 0.488_602_5).abs() < 1e-6);
+        assert!((at(1.0, 0.0, Vec3::Y) + 0.488_602_5).abs() < 1e-6);
+        assert_eq!(at(0.0, 1.0, Vec3::NEG_Y), 0.0);
     }
 }

@@ -22,11 +22,15 @@ use crate::field::parameters::{HostGroup, ParameterGroup, Part};
 use crate::field::pixels::{Pixels, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self as fields, ComputeDevice};
+#[cfg(feature = "wgpu")]
+use crate::field::{devices::Check, self_test::TestedModel};
 use crate::kernel::cpu::adam::AdamStep;
 use crate::kernel::cpu::density::DensityShape;
 use crate::kernel::cpu::losses::TERMS;
 use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::cpu::{hash, rng};
+#[cfg(feature = "wgpu")]
+use crate::kernel::gpu::Adapter;
 use crate::{Error, Result};
 use cpu::CpuDensity;
 #[cfg(feature = "wgpu")]
@@ -93,11 +97,14 @@ pub fn train_density(
     if pixels.count() == 0 {
         return Err(training::no_pixels());
     }
-    let device = fields::compute_device(session.device)?.fallback_to_cpu(|device| match device {
-        ComputeDevice::Cpu(_) => Ok(()),
-        #[cfg(feature = "wgpu")]
-        ComputeDevice::Gpu(gpu) => GpuDensity::fits(config, &pixels, &gpu.device),
-    })?;
+    let device =
+        fields::compute_device(session.device, &super::DENSITY_TEST)?.fallback_to_cpu(
+            |device| match device {
+                ComputeDevice::Cpu(_) => Ok(()),
+                #[cfg(feature = "wgpu")]
+                ComputeDevice::Gpu(gpu) => GpuDensity::fits(config, &pixels, &gpu.device),
+            },
+        )?;
     let description = device.description();
     let (state, progress, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuDensity::new(config, &pixels), config, session)?,
@@ -151,6 +158,13 @@ impl<'a, O: DensityOps> DensityModel<'a, O> {
         let state = DensityState::start(initial(config, session.seed), config, None);
         let groups = state.groups.map(|group| ParameterGroup::upload(ops.device(), group));
         DensityModel { config, session: *session, ops, groups, occupancy: state.occupancy }
+    }
+
+    /// Copies a state to the device.
+    fn load(&mut self, state: DensityState) {
+        self.ops.load(&state.occupancy, state.rays);
+        self.groups = state.groups.map(|group| ParameterGroup::upload(self.ops.device(), group));
+        self.occupancy = state.occupancy;
     }
 
     /// Waits for the device; the state as it is there.
@@ -225,11 +239,47 @@ impl<O: DensityOps> Model for DensityModel<'_, O> {
             Some((from, ..)) => DensityState::restore(parts(self.config), self.config, None, from)?,
             None => DensityState::start(initial(self.config, self.session.seed), self.config, None),
         };
-        self.ops.load(&state.occupancy, state.rays);
-        self.groups = state.groups.map(|group| ParameterGroup::upload(self.ops.device(), group));
-        self.occupancy = state.occupancy;
+        self.load(state);
         Ok(())
     }
+}
+
+#[cfg(feature = "wgpu")]
+impl<O: DensityOps> TestedModel for DensityModel<'_, O> {
+    fn host_groups(&self) -> Result<Vec<HostGroup>> {
+        Ok(self.state()?.groups.into())
+    }
+}
+
+/// Compares a training step on a GPU with one on the processor.
+#[cfg(feature = "wgpu")]
+pub(super) fn self_test(adapter: &Adapter, config: &IfaceConfig) -> Result<Vec<Check>> {
+    use crate::field::self_test::{CELLS_AT, SEED, compare, compare_cells, outcome, session};
+    const FIELD: &str = "density";
+    let (views, session) = (fields::ball::views(), session("iface"));
+    let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+    // as if it had learned for a while: something to be seen, and not the same everywhere
+    let start = || {
+        let mut state = DensityState::start(initial(config, SEED), config, None);
+        let [table, network] = &mut state.groups;
+        table.state[0].iter_mut().enumerate().for_each(|(i, v)| *v = rng::normal(SEED, 1, i as u64));
+        network.state[0].iter_mut().for_each(|v| *v *= 1.5);
+        state
+    };
+    fn cells<O: DensityOps>(model: &mut DensityModel<O>, start: DensityState) -> Result<Occupancy> {
+        model.load(start);
+        model.ops.update_occupancy(&model.groups, StepAt { seed: SEED, step: CELLS_AT });
+        Ok(model.state()?.occupancy)
+    }
+    let mut on_cpu = DensityModel::new(CpuDensity::new(config, &pixels), config, &session);
+    let device = crate::kernel::gpu::Device::open(adapter);
+    let mut on_gpu = DensityModel::new(GpuDensity::new(config, &pixels, device)?, config, &session);
+    let [want, got] = [cells(&mut on_cpu, start())?, cells(&mut on_gpu, start())?];
+    let mut checks = vec![compare_cells(FIELD, &got.occupied.bits, &want.occupied.bits)];
+    on_cpu.load(DensityState { occupancy: want.clone(), ..start() });
+    on_gpu.load(DensityState { occupancy: want, ..start() });
+    checks.extend(compare(FIELD, &outcome(&mut on_gpu)?, &outcome(&mut on_cpu)?));
+    Ok(checks)
 }
 
 #[cfg(test)]

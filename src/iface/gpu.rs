@@ -141,14 +141,16 @@ pub(super) fn max_samples(
     /// Samples with their rays, compositing and losses, and the cells that are looked at in their place.
     const BESIDE: usize = 3 + 3 + 2 + 9 + 2 + 1;
     let [words, widest] = Sdf::words_per_sample(shape);
-    samples_that_fit(config, [words + BESIDE, widest], stereo_points(config), pixels, device)
+    let sums = Sdf::words_of_sums(shape);
+    samples_that_fit(config, [words + BESIDE, widest], sums, stereo_points(config), pixels, device)
 }
 
-/// As [`max_samples`], of a field on a hash grid that takes so many words a sample, and of the largest buffer, and
-/// evaluates so many points beside the samples of a step.
+/// As [`max_samples`], of a field on a hash grid that takes so many words a sample, and of the largest buffer, so many for
+/// sums, and evaluates so many points beside the samples of a step.
 pub(super) fn samples_that_fit(
     config: &IfaceConfig,
     [words, widest]: [usize; 2],
+    sums: usize,
     points: usize,
     pixels: &Pixels,
     device: &Device,
@@ -158,12 +160,12 @@ pub(super) fn samples_that_fit(
     let cells = config.occupancy_resolution.pow(3) as u64;
     let fixed = |log2_table: u32| {
         let levels = hash::levels(config.levels, config.base_resolution, config.growth, log2_table);
-        32 * hash::entries(&levels) as u64 + 13 * cells
+        32 * hash::entries(&levels) as u64 + 13 * cells + 4 * sums as u64
     };
     let least = (config.samples + points) as u64;
     let wanted = (MOST_BUDGETS * config.samples + points) as u64;
     let need = MemoryNeed {
-        fixed: (fixed(config.log2_table), "hash tables and cells"),
+        fixed: (fixed(config.log2_table), "hash tables, cells and sums"),
         unit: "samples",
         each: [bytes, 4 * widest as u64],
         wanted,

@@ -96,11 +96,12 @@ pub fn train(
 ) -> Result<(IFace, IfaceReport)> {
     let began = Instant::now();
     let pixels = pixels(views, hull, config)?;
-    let device = field::compute_device(session.device)?.fallback_to_cpu(|device| match device {
-        ComputeDevice::Cpu(_) => Ok(()),
-        #[cfg(feature = "wgpu")]
-        ComputeDevice::Gpu(gpu) => GpuSdf::fits(config, &pixels, &gpu.device),
-    })?;
+    let device =
+        field::compute_device(session.device, &super::SDF_TEST)?.fallback_to_cpu(|device| match device {
+            ComputeDevice::Cpu(_) => Ok(()),
+            #[cfg(feature = "wgpu")]
+            ComputeDevice::Gpu(gpu) => GpuSdf::fits(config, &pixels, &gpu.device),
+        })?;
     let description = device.description();
     let (state, progress, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuSdf::new(config, &pixels), &pixels, hull, config, session)?,
@@ -160,7 +161,7 @@ impl<'a, O: SdfOps> SdfModel<'a, O> {
     }
 
     /// Copies a state to the device.
-    fn load(&mut self, state: SdfState) {
+    pub fn load(&mut self, state: SdfState) {
         self.ops.load(&state.occupancy, state.rays, &state.stereo);
         self.groups = state.groups.map(|group| ParameterGroup::upload(self.ops.device(), group));
         (self.occupancy, self.stereo) = (state.occupancy, state.stereo);

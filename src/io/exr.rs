@@ -3,9 +3,7 @@
 //! The data window is placed inside the display window; what lies outside it is dropped and what it
 //! leaves open is 0. Only the first layer that holds all channels asked for is used.
 
-use super::error::ReadError;
-use super::limits::Limits;
-use super::read::read_bytes;
+use super::read::{Limits, ReadError, read_bytes};
 use super::write::{WriteError, write_atomic};
 use crate::image::Image;
 use ::exr::meta::MetaData;

@@ -1,6 +1,6 @@
 //! Folders: making, clearing, listing and locking them, and how much room is left.
 
-use super::error::ReadError;
+use super::read::ReadError;
 use super::write::WriteError;
 use std::collections::BTreeMap;
 use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};

@@ -1,8 +1,6 @@
 //! JSON as untrusted input: bounded in bytes, depth and values, every key once, every number finite.
 
-use super::error::ReadError;
-use super::limits::Limits;
-use super::read::read_capped;
+use super::read::{Limits, ReadError, read_capped};
 use serde::de::{Deserialize, DeserializeOwned, DeserializeSeed, Error, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 use std::cell::Cell;

@@ -5,9 +5,7 @@
 //! fill it with gray, which would then be learned as a face. One damage passes: a baseline JPEG whose scan was
 //! cut and closed again with a proper end marker, since only decoding each code could tell.
 
-use super::error::ReadError;
-use super::limits::Limits;
-use super::read::{open, read_bytes};
+use super::read::{Limits, ReadError, open, read_bytes};
 use super::write::{WriteError, write_atomic};
 use crate::image::{Gray, Photo};
 use image::codecs::jpeg::JpegEncoder;

@@ -1,13 +1,13 @@
-//! The bytes of a file: only regular ones, and no more than the limit.
+//! The bytes of a file: only regular ones, and no more than the limit; what readers refuse for its size; and why a file
+//! could not be read: the file, the place in it, and a suggested fix.
 
-use super::error::ReadError;
-use super::limits::Limits;
+use crate::error::error_from;
 use std::fs::{self, File};
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Opens a regular file; looks before opening, since opening a pipe would wait for its writer.
-pub(crate) fn open(path: &Path) -> Result<(File, u64), ReadError> {
+pub(super) fn open(path: &Path) -> Result<(File, u64), ReadError> {
     let about = fs::metadata(path).map_err(|e| ReadError::io(path, e))?;
     regular(path, &about)?;
     let file = File::open(path).map_err(|e| ReadError::io(path, e))?;
@@ -72,6 +72,198 @@ pub(super) fn read_capped(path: &Path, limit: u64, what: &'static str) -> Result
         return Err(ReadError::Empty { path: path.into() });
     }
     Ok(bytes)
+}
+
+/// What a reader refuses to exceed, whatever a file says about itself.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// Longest side of a picture, pixels.
+    pub side_px: u32,
+    /// Bytes of one decoded picture or array.
+    pub decoded_bytes: u64,
+    /// Bytes of any file.
+    pub file_bytes: u64,
+    /// Bytes of a JSON file.
+    pub json_bytes: u64,
+    /// Nesting of arrays and objects in JSON.
+    pub json_depth: usize,
+    /// Numbers, strings, arrays and objects in one JSON file; bounds the memory of the parsed tree.
+    pub json_values: usize,
+    /// Views of one capture; votes of views are counted in 16 bits.
+    pub views: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits {
+            side_px: 16_384,
+            decoded_bytes: 4 << 30,
+            file_bytes: 4 << 30,
+            json_bytes: 64 << 20,
+            json_depth: 64,
+            json_values: 8 << 20,
+            views: u16::MAX as usize,
+        }
+    }
+}
+
+impl Limits {
+    pub(super) fn check_side(&self, path: &Path, side: u64) -> Result<(), ReadError> {
+        let (what, limit) = ("the picture's longest side in pixels", self.side_px.into());
+        if side > limit { Err(ReadError::too_large(path, what, side, limit)) } else { Ok(()) }
+    }
+
+    pub(super) fn check_decoded(&self, path: &Path, bytes: u64) -> Result<(), ReadError> {
+        let (what, limit) = ("the decoded picture's size in bytes", self.decoded_bytes);
+        if bytes > limit { Err(ReadError::too_large(path, what, bytes, limit)) } else { Ok(()) }
+    }
+}
+
+/// Why a file could not be read.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReadError {
+    /// The operating system refused.
+    #[error("`{}` cannot be read: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A folder, a pipe, a device: nothing that holds a file's bytes.
+    #[error("`{}` is {kind}, not a regular file", path.display())]
+    NotAFile {
+        /// The file.
+        path: PathBuf,
+        /// What it is, with its article.
+        kind: &'static str,
+    },
+    /// No bytes at all.
+    #[error("`{}` is empty (0 bytes)", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A size over a limit.
+    #[error("`{}`: {what} is {found}, the limit is {limit}", path.display())]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// What was measured, with its unit.
+        what: &'static str,
+        /// Its size.
+        found: u64,
+        /// The limit.
+        limit: u64,
+    },
+    /// The bytes are not what the format demands.
+    #[error("`{}` is not a sound {format} file: {problem}{}", path.display(), at(*offset))]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// The format found or expected.
+        format: &'static str,
+        /// Byte offset of the damage, where known.
+        offset: Option<u64>,
+        /// What is wrong there.
+        problem: String,
+    },
+    /// A sound file of a kind that is not read.
+    #[error("`{}`: {what} cannot be used", path.display())]
+    Unsupported {
+        /// The file.
+        path: PathBuf,
+        /// What was found.
+        what: String,
+        /// The suggested fix.
+        hint: String,
+    },
+    /// JSON text that does not hold.
+    #[error("`{}`, line {line}, column {column}: {problem}", path.display())]
+    Json {
+        /// The file.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// Column, from 1.
+        column: usize,
+        /// What is wrong there.
+        problem: String,
+    },
+    /// A value that whoever wrote the file cannot have written.
+    #[error("`{}`: `{key}` is {found}, expected {expected}", path.display())]
+    Value {
+        /// The file.
+        path: PathBuf,
+        /// Where in it.
+        key: String,
+        /// What stands there.
+        found: String,
+        /// What could.
+        expected: String,
+    },
+}
+
+fn at(offset: Option<u64>) -> String {
+    offset.map(|o| format!(" (at byte {o})")).unwrap_or_default()
+}
+
+error_from!(ReadError, Cannot);
+
+impl ReadError {
+    /// The suggested fix.
+    pub fn hint(&self) -> String {
+        match self {
+            ReadError::Io { source, .. } => match source.kind() {
+                std::io::ErrorKind::NotFound => "check the path; was the file moved or renamed?".into(),
+                std::io::ErrorKind::PermissionDenied => "allow reading it: `chmod u+r FILE`".into(),
+                _ => "check the disk and the links on the way to the file".into(),
+            },
+            ReadError::NotAFile { .. } => "give the path of a file".into(),
+            ReadError::Empty { .. } => "copy it again; an interrupted copy leaves such a file".into(),
+            ReadError::TooLarge { .. } => "make it smaller, or check that it is the file you meant".into(),
+            ReadError::Damaged { .. } => "copy or export it again from its source".into(),
+            ReadError::Unsupported { hint, .. } => hint.clone(),
+            ReadError::Json { .. } => "correct the file at that place".into(),
+            ReadError::Value { .. } => "the file was damaged, or changed by hand: make it again".into(),
+        }
+    }
+
+    pub(crate) fn value(
+        path: &Path,
+        key: impl Into<String>,
+        found: impl ToString,
+        expected: impl Into<String>,
+    ) -> ReadError {
+        ReadError::Value {
+            path: path.into(),
+            key: key.into(),
+            found: found.to_string(),
+            expected: expected.into(),
+        }
+    }
+
+    pub(crate) fn io(path: &Path, source: std::io::Error) -> ReadError {
+        ReadError::Io { path: path.into(), source }
+    }
+
+    pub(crate) fn damaged(
+        path: &Path,
+        format: &'static str,
+        offset: impl Into<Option<u64>>,
+        problem: impl Into<String>,
+    ) -> ReadError {
+        ReadError::Damaged { path: path.into(), format, offset: offset.into(), problem: problem.into() }
+    }
+
+    pub(crate) fn too_large(path: &Path, what: &'static str, found: u64, limit: u64) -> ReadError {
+        ReadError::TooLarge { path: path.into(), what, found, limit }
+    }
+
+    pub(crate) fn unsupported(path: &Path, what: impl Into<String>, hint: impl Into<String>) -> ReadError {
+        ReadError::Unsupported { path: path.into(), what: what.into(), hint: hint.into() }
+    }
 }
 
 #[cfg(test)]

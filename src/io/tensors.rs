@@ -5,10 +5,8 @@
 //! and so gives other bytes each time; on reading, the crate checks offsets and we check what it accepts:
 //! duplicate names, NaN, and headers that take seconds.
 
-use super::error::ReadError;
 use super::json::parse_json;
-use super::limits::Limits;
-use super::read::read_bytes;
+use super::read::{Limits, ReadError, read_bytes};
 use super::write::{WriteError, write_atomic};
 use safetensors::{Dtype, SafeTensors};
 use std::collections::BTreeMap;

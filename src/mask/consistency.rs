@@ -8,8 +8,8 @@
 //!
 //! Nothing but masks and cameras is needed, so masks a person brought are checked the same way.
 
-use super::distance::squared_distance;
 use super::hull::{self, ViewFrame};
+use super::morphology::squared_distance;
 use super::scale::resize_hard;
 use crate::Result;
 use crate::capture::carve::Cube;

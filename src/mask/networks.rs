@@ -12,14 +12,12 @@
 mod alpha;
 mod processor;
 mod sam;
-mod vitmatte;
 
 pub use crate::onnx::NetworkFile;
 
-use self::alpha::AlphaNet;
+use self::alpha::{AlphaNet, VitMatte};
 use self::sam::Sam;
-use self::vitmatte::VitMatte;
-use super::click::Click;
+use super::prompts::Click;
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
 use crate::onnx::{Contract, Engines, Runtime};

@@ -1,6 +1,6 @@
 //! What stands for networks in a build without the feature `matting`: none can be opened.
 
-use super::click::Click;
+use super::prompts::Click;
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
 use crate::{Error, Result};

@@ -1,7 +1,6 @@
 //! The engine that the user brings: an ONNX Runtime library, loaded from the path named and nowhere else.
 
-use super::contract::I64;
-use super::seam::{Fed, NetworkArray, NetworkFile, file_error, guarded, one_line};
+use super::network::{Fed, I64, NetworkArray, NetworkFile, file_error, guarded, one_line};
 use crate::Result;
 use crate::io::{self, Limits};
 use ort::environment::Environment;

@@ -3,8 +3,7 @@
 //! It wants every shape fixed. The file is parsed once; for each set of input shapes a plan is made from it
 //! (0.2 to 1 s for public networks) and kept, since the photographs of a capture share their size.
 
-use super::contract::{I64, Port};
-use super::seam::{Fed, NetworkArray};
+use super::network::{Fed, I64, NetworkArray, Port};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use tract_onnx::pb;

@@ -1,24 +1,31 @@
 //! Speed against error of each decision, measured on a capture: what `tiface bench` does.
 //!
 //! Every sweep runs the code of the stages themselves on the same photographs and changes one thing. Errors are taken
-//! where nothing was learned from: masked PSNR of some held-out views.
+//! where nothing was learned from: masked PSNR of some held-out views. Some sweep what training
+//! costs and brings (steps, photographs' size, the hash grid), others the way from a surface to what an artist opens
+//! (simplification, texture).
 
-mod judge;
-mod surface;
-mod training;
-
+use super::finish::{Export, finish};
 use super::line::Line;
-use super::surface::Fields;
-use super::{Stage, complete, learn};
-use crate::capture::Split;
+use super::mesh::photographs;
+use super::render::{Meshes, Renderer};
+use super::surface::{ClosedSurface, Fields, Surface};
+use super::{complete, learn, pictures};
 use crate::capture::scene::Scene;
-use crate::config::{Config, MeshConfig};
+use crate::capture::{LoadedView, Split, View};
+use crate::config::{ColorSource, Config, Hair, MeshConfig, Method, Stage, ViewBackground};
+use crate::field::training::TrainingSession;
 use crate::geom::{Camera, Mesh};
-use crate::io;
-use crate::mesh::{Cap, MeshReport, Patches};
-use crate::report::bench::{BenchResult, Measure, Sweep, WorkCost};
-use crate::{Error, Monitor, Result};
-use judge::Judge;
+use crate::image::Photo;
+use crate::io::{self, Limits};
+use crate::mesh::files::HeadMesh;
+use crate::mesh::{Cap, MeshReport, Patches, SimplifyConfig, simplify};
+use crate::metrics::{compare, distance};
+use crate::report::bench::{BenchResult, Measure, Row, Sweep, WorkCost};
+use crate::run::{Run, Stop};
+use crate::{Error, Monitor, Quiet, Result};
+use glam::Vec3;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 /// What can be swept, in order.
@@ -33,7 +40,7 @@ pub struct Bench<'l> {
     scene: Scene,
     judge: Judge<'l>,
     /// Asks to stop when the user does.
-    watch: training::StopAt<'l>,
+    watch: StopAt<'l>,
 }
 
 impl<'l> Bench<'l> {
@@ -46,7 +53,7 @@ impl<'l> Bench<'l> {
     pub fn new(line: &'l Line<'l>, finished: Option<&'l Line<'l>>) -> Result<Bench<'l>> {
         complete(line, Stage::Mask, &learn::trained_fields(line))?;
         let (scene, judge) = (line.scene()?, Judge::new(line)?);
-        let watch = training::StopAt::new(u64::MAX, line.run.stop());
+        let watch = StopAt::new(u64::MAX, line.run.stop());
         Ok(Bench { line, finished, scene, judge, watch })
     }
 
@@ -98,7 +105,7 @@ impl<'l> Bench<'l> {
         let line: &'l Line<'l> = match self.finished.as_ref().filter(done) {
             Some(line) => line,
             None => {
-                stages.iter().try_for_each(|stage| training::finish(self.line, *stage))?;
+                stages.iter().try_for_each(|stage| train_to_end(self.line, *stage))?;
                 self.line
             }
         };
@@ -149,4 +156,339 @@ fn timed<T>(work: impl FnOnce() -> Result<T>) -> Result<(T, WorkCost)> {
     let (wall_s, cpu_s) = (start.elapsed().as_secs_f64(), io::cpu_seconds() - cpu);
     let memory_mib = io::peak_memory().map(|bytes| bytes as f64 / f64::from(1 << 20));
     Ok((result, WorkCost { wall_s, cpu_s, memory_mib }))
+}
+
+/// Held-out views that are looked at: each costs seconds in each choice of a sweep.
+const VIEWS: usize = 4;
+
+/// Some held-out photographs.
+struct Judge<'l> {
+    views: Vec<(&'l View, LoadedView, Photo)>,
+    background: ViewBackground,
+}
+
+impl<'l> Judge<'l> {
+    /// Those of a line.
+    pub fn new(line: &'l Line<'l>) -> Result<Judge<'l>> {
+        let held_out = [Split::Test, Split::Val].map(|s| line.capture.split(s).collect::<Vec<_>>());
+        let Some(all) = held_out.into_iter().find(|views| !views.is_empty()) else {
+            return Err(Error::cannot(
+                "no view of this capture is held out: there is nothing to judge by",
+                "name some as `test` in its transforms.json",
+            ));
+        };
+        let count = all.len().min(VIEWS);
+        let background = line.config.render.background;
+        let views = (0..count).map(|i| {
+            let view = all[i * all.len() / count];
+            let loaded = line.judged(view).load(&Limits::default())?;
+            let expected = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
+            Ok((view, loaded, expected))
+        });
+        Ok(Judge { views: views.collect::<Result<_>>()?, background })
+    }
+
+    /// Mean PSNR of the views by a method, inside the mask (of the frame without one), dB.
+    pub fn psnr(&self, scene: &Scene, renderer: &Renderer, method: Method) -> Result<Option<f64>> {
+        let mut found = Vec::new();
+        for (view, loaded, expected) in &self.views {
+            let camera = view.camera.transformed(&scene.scene_from_world);
+            let mut rendered = renderer.view(method, &camera)?.ok_or_else(|| {
+                Error::cannot(format!("there is nothing to show for `{}`", method.folder()), "")
+            })?;
+            if let Some(background) = pictures::behind(self.background) {
+                pictures::over(&mut rendered, background);
+            }
+            let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
+            let figures = compare(&view.name, &rendered.color, expected, mask, valid)?;
+            found.extend(if mask.is_some() { figures.psnr_masked } else { figures.psnr });
+        }
+        Ok((!found.is_empty()).then(|| found.iter().sum::<f64>() / found.len() as f64))
+    }
+}
+
+/// Shares of the training after which a field is looked at.
+const SHARES: [f64; 5] = [0.125, 0.25, 0.5, 0.75, 1.0];
+
+/// Of the steps of a whole training, where trainings of other settings are compared: what is ahead after so many
+/// steps is ahead at the end in most cases, and all sweeps are to end while somebody waits.
+const SHORT: f64 = 0.2;
+
+/// Asks a training to stop at a step, or when the user asks.
+struct StopAt<'a> {
+    at: u64,
+    reached: AtomicU64,
+    stop: &'a Stop,
+}
+
+impl<'a> StopAt<'a> {
+    /// No step is done yet.
+    pub fn new(at: u64, stop: &'a Stop) -> StopAt<'a> {
+        StopAt { at, reached: AtomicU64::new(0), stop }
+    }
+}
+
+impl Monitor for StopAt<'_> {
+    fn step(&self, step: u64, _: u64, _: &[(&str, f64)]) {
+        self.reached.store(step, Ordering::Relaxed);
+    }
+
+    fn stop(&self) -> bool {
+        self.reached.load(Ordering::Relaxed) >= self.at || self.stop.requested().is_some()
+    }
+}
+
+/// Steps of a stage's whole training.
+fn steps(config: &Config, stage: Stage) -> u64 {
+    match stage {
+        Stage::Iface => config.iface.steps,
+        _ => {
+            let c = config.radiance(stage);
+            c.steps * c.learned() as u64
+        }
+    }
+}
+
+/// Trains a field of a line up to a step; goes on from where it is.
+fn train_until(line: &Line, stage: Stage, step: u64) -> Result<()> {
+    let monitor = StopAt::new(step, line.run.stop());
+    let folder = line.run.path(stage);
+    io::create_folder(&folder)?;
+    let session = TrainingSession {
+        stage: stage.word(),
+        seed: learn::seed(stage, line.config),
+        device: &line.config.device,
+        dir: &folder,
+        identity: "bench",
+        monitor: &monitor,
+    };
+    match learn::train(stage, &line.capture, &line.scene()?, line.config, &session) {
+        Ok(_) => Ok(()),
+        Err(e) if e.kind().is_stop() => match line.run.stop().requested() {
+            Some(kind) => Err(Error::stopped("what was measured is kept").with_kind(kind)),
+            None => Ok(()),
+        },
+        Err(e) => Err(e),
+    }
+}
+
+/// Trains a field of a line to its end.
+fn train_to_end(line: &Line, stage: Stage) -> Result<()> {
+    train_until(line, stage, u64::MAX)
+}
+
+/// What views of a line's field are worth.
+fn judged(line: &Line, stage: Stage, judge: &Judge) -> Result<Vec<Option<f64>>> {
+    let (fields, scene, meshes) = (learn::trained_fields(line), line.scene()?, Meshes::load(line, &[])?);
+    let method = if stage == Stage::Iface { Method::Volume } else { Method::Tface };
+    let renderer = Renderer::new(&scene, &fields, &meshes, 1, &Quiet);
+    Ok(vec![judge.psnr(&scene, &renderer, method)?])
+}
+
+impl Bench<'_> {
+    /// Both fields after shares of their training.
+    fn steps(&self) -> Result<Sweep> {
+        let line = self.line;
+        let mut rows = Vec::new();
+        for (series, stage) in [("I-Face", Stage::Iface), ("T-Face", Stage::Tface)] {
+            let all = steps(line.config, stage);
+            let mut cost = WorkCost::default();
+            for share in SHARES {
+                let step = ((all as f64 * share) as u64).max(1);
+                cost = cost + timed(|| train_until(line, stage, step))?.1;
+                let figures = judged(line, stage, &self.judge)?;
+                rows.push(Row { series, choice: format!("{step} steps"), cost, figures });
+            }
+        }
+        let note = "One training of each field, looked at on its way; a time is that of all steps so far, with opening photographs and \
+                    checkpoint once for each look.";
+        Ok(Sweep { name: "steps", title: "Training steps", note: note.into(), measures: vec![PSNR], rows })
+    }
+
+    /// I-Face trained from smaller photographs, judged on whole ones.
+    fn photographs(&self) -> Result<Sweep> {
+        let mut rows = Vec::new();
+        for times in [4, 2, 1] {
+            let mut config = self.short();
+            config.capture.downscale *= times;
+            let camera = &self.line.capture.views[0].camera;
+            rows.push(self.row(format!("{} × {}", camera.width / times, camera.height / times), &config)?);
+        }
+        let (note, measures) = (self.note("Judged on photographs of full size."), vec![PSNR]);
+        Ok(Sweep { name: "photographs", title: "Size of the photographs", note, measures, rows })
+    }
+
+    /// I-Face trained with other hash grids.
+    fn hash(&self) -> Result<Sweep> {
+        let mut rows = Vec::new();
+        let whole = (self.config().iface.levels, self.config().iface.log2_table);
+        let fewer =
+            |n: usize, log2: u32| (whole.0.saturating_sub(n).max(1), whole.1.saturating_sub(log2).max(4));
+        for (levels, log2_table) in [fewer(6, 4), fewer(0, 4), fewer(0, 2), whole, (whole.0, whole.1 + 2)] {
+            let mut config = self.short();
+            (config.iface.levels, config.iface.log2_table) = (levels, log2_table.min(24));
+            rows.push(self.row(format!("{levels} levels, 2^{}", config.iface.log2_table), &config)?);
+        }
+        let note = self.note("Levels, and entries of the largest table.");
+        Ok(Sweep { name: "hash", title: "Hash grid", note, measures: vec![PSNR], rows })
+    }
+
+    /// The configuration for a share of its steps.
+    fn short(&self) -> Config {
+        let mut config = self.config().clone();
+        config.iface.steps = ((config.iface.steps as f64 * SHORT) as u64).max(1);
+        config
+    }
+
+    fn note(&self, more: &str) -> String {
+        format!("I-Face, {} steps. {more}", self.short().iface.steps)
+    }
+
+    /// Trains and judges I-Face of other settings.
+    fn row(&self, choice: String, config: &Config) -> Result<Row> {
+        self.check_stop()?;
+        let scratch = tempfile::tempdir_in(self.line.run.dir()).map_err(|e| {
+            Error::cannot(format!("no scratch folder: {e}"), "free space, or name another place in TMPDIR")
+        })?;
+        let run = Run::open(scratch.path(), self.line.run.stop().clone(), std::sync::Arc::new(Quiet));
+        let line = Line::open(config, &run)?;
+        complete(&line, Stage::Mask, &learn::trained_fields(&line))?;
+        let ((), cost) = timed(|| train_until(&line, Stage::Iface, config.iface.steps))?;
+        Ok(Row { series: "I-Face", choice, cost, figures: judged(&line, Stage::Iface, &self.judge)? })
+    }
+}
+
+/// Points of a mesh that are compared with the field.
+const POINTS: usize = 20_000;
+
+/// Triangles of a simplified mesh.
+const TRIANGLES: [usize; 6] = [2000, 5000, 10_000, 20_000, 50_000, 100_000];
+
+impl Bench<'_> {
+    /// Median distance of a mesh to the zero of a field, to first order, mm.
+    fn off_field(&self, mesh: &Mesh, gradient: &dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>)) -> Option<f64> {
+        let (values, gradients) = gradient(&distance::sample(mesh, POINTS));
+        let mut off: Vec<f32> =
+            values.iter().zip(&gradients).map(|(f, g)| f.abs() / g.length().max(0.05)).collect();
+        off.sort_by(f32::total_cmp);
+        off.get(off.len() / 2).map(|d| f64::from(*d) * self.mm())
+    }
+
+    /// Fewer and fewer triangles.
+    fn triangles(&self) -> Result<Sweep> {
+        let fields = self.fields(&[Stage::Iface])?;
+        let c = &self.config().mesh;
+        let extracted = self.extracted(&fields, c)?;
+        let (mesh, closed) = (&extracted.mesh, extracted.closed(fields.surface()?));
+        let note = format!(
+            "From {} triangles, extracted at {} cells; distances are medians.",
+            mesh.triangles.len(),
+            c.resolution
+        );
+        let mut rows = Vec::new();
+        for triangles in TRIANGLES.into_iter().filter(|n| *n < mesh.triangles.len()) {
+            self.check_stop()?;
+            let mut mesh = mesh.clone();
+            let config = SimplifyConfig { triangles, ..SimplifyConfig::default() };
+            let gradient = |points: &[Vec3]| closed.sdf_gradient(points);
+            let (_, cost) = timed(|| simplify(&mut mesh, Some(&gradient), &config, self.monitor()))?;
+            let figures = vec![self.off_field(&mesh, &gradient)];
+            rows.push(Row { series: "", choice: triangles.to_string(), cost, figures });
+        }
+        let measures = vec![Measure {
+            name: "off the field, mm",
+            digits: 4,
+            more_is_better: Some(false),
+            noise: (0.0, 0.03),
+        }];
+        Ok(Sweep { name: "triangles", title: "Triangles after simplification", note, measures, rows })
+    }
+
+    /// Size of the texture, where its colors come from, and how they change with the view.
+    fn texture(&self) -> Result<Sweep> {
+        let fields = self.fields(&[Stage::Iface])?;
+        let base = &self.config().mesh;
+        let finisher = Finisher::new(self, &fields, base)?;
+        let note = format!(
+            "`head.glb` of {} triangles as a viewer shows it, without soft layers; the time is that of laying out, baking and \
+             fitting.",
+            finisher.mesh.triangles.len()
+        );
+        let plain =
+            MeshConfig { lobes: 0, hair: Hair::None, color: ColorSource::Photographs, ..base.clone() };
+        let mut choices: Vec<(&'static str, String, MeshConfig)> = Vec::new();
+        for texture_px in [256, 512, 1024, 2048] {
+            choices.push((
+                "from photographs",
+                format!("{texture_px}²"),
+                MeshConfig { texture_px, ..plain.clone() },
+            ));
+        }
+        for lobes in [1, 2] {
+            let word = format!("1024², degree {lobes}");
+            choices.push(("view-dependent", word, MeshConfig { texture_px: 1024, lobes, ..plain.clone() }));
+        }
+        for samples in [1, 2] {
+            let word = format!("1024², {} samples", samples * samples);
+            let color = ColorSource::Network;
+            let c = MeshConfig { texture_px: 1024, texture_samples: samples, color, ..plain.clone() };
+            choices.push(("from the network", word, c));
+        }
+        let mut rows = Vec::new();
+        for (series, choice, c) in choices {
+            self.check_stop()?;
+            let (head, cost) = timed(|| finisher.finish(self, &c))?;
+            let triangles = head.mesh.triangles.len() as f64;
+            let meshes = Meshes::of_head(head, [true, false]);
+            let renderer = Renderer::new(&self.scene, &fields, &meshes, 2, self.monitor());
+            let psnr = self.judge.psnr(&self.scene, &renderer, Method::Textured)?;
+            let figures = vec![psnr, Some(triangles)];
+            rows.push(Row { series, choice, cost, figures });
+        }
+        let count = Measure { name: "triangles", digits: 0, more_is_better: None, noise: (0.0, 0.0) };
+        let measures = vec![Measure { noise: (0.05, 0.0), ..PSNR }, count];
+        Ok(Sweep { name: "texture", title: "Texture", note, measures, rows })
+    }
+}
+
+/// A simplified surface that is finished again and again.
+struct Finisher<'f> {
+    mesh: Mesh,
+    extracted: Extracted,
+    fields: &'f dyn Fields,
+    views: Vec<(Camera, LoadedView)>,
+}
+
+impl<'f> Finisher<'f> {
+    /// Extracts and simplifies as `c` says.
+    pub fn new(bench: &Bench, fields: &'f dyn Fields, c: &MeshConfig) -> Result<Finisher<'f>> {
+        let mut extracted = bench.extracted(fields, c)?;
+        let mut mesh = std::mem::take(&mut extracted.mesh);
+        if c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len() {
+            let closed = extracted.closed(fields.surface()?);
+            let config = SimplifyConfig { triangles: c.triangles as usize, ..SimplifyConfig::default() };
+            simplify(&mut mesh, Some(&|p: &[Vec3]| closed.sdf_gradient(p)), &config, bench.monitor())?;
+        }
+        let views = learn::training_views(&bench.line.capture, &bench.scene, bench.config())?;
+        Ok(Finisher { mesh, extracted, fields, views })
+    }
+
+    /// Lays out, bakes and fits as `c` says.
+    pub fn finish(&self, bench: &Bench, c: &MeshConfig) -> Result<HeadMesh> {
+        let (capture, config) = (&bench.line.capture, bench.config());
+        let (export, cell) = (Export::new(capture, config), self.extracted.report.cell_size);
+        let (closed, cameras) = (self.extracted.closed(self.fields.surface()?), bench.cameras());
+        let photographs = photographs(&self.views);
+        let c = MeshConfig { triangles: 0, max_error: 0.0, ..c.clone() };
+        let scene = &bench.scene;
+        let done =
+            finish(&self.mesh, cell, &closed, &cameras, &photographs, scene, &export, &c, bench.monitor())?;
+        Ok(done.head)
+    }
+}
+
+impl Extracted {
+    fn closed<'a>(&'a self, field: &'a dyn Surface) -> ClosedSurface<'a> {
+        ClosedSurface { field, cap: self.cap.as_ref(), patches: self.patches.as_ref() }
+    }
 }

@@ -11,12 +11,11 @@ use crate::config::MaskConfig;
 use crate::image::{Gray, Photo, reduce_photo, working_size};
 use crate::io::{self, Limits};
 use crate::mask::grabcut::grabcut;
-use crate::mask::matting::trimap::UnknownBand;
-use crate::mask::matting::{SoftMask, SoftenOptions, soften_with};
+use crate::mask::matting::{SoftMask, SoftenOptions, UnknownBand, soften_with};
 use crate::mask::networks::Networks;
 use crate::mask::prompts::{self, PhotoPrompts, Prompts};
 use crate::mask::propagate::{PropagateView, propagate, propagate_proposals, rows_size};
-use crate::mask::{Click, distance};
+use crate::mask::{Click, morphology};
 use crate::run::{Fingerprint, StageDir};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -290,7 +289,7 @@ pub(super) fn propagated_clicks(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
     let mut out = Vec::new();
     for (head, count) in [(true, 3), (false, 2)] {
         let outside: Vec<bool> = mask.values.iter().map(|&v| (v >= 128) != head).collect();
-        let mut deep = distance::squared_distance(&outside, w, h);
+        let mut deep = morphology::squared_distance(&outside, w, h);
         for _ in 0..count {
             let Some((best, &d)) = deep.iter().enumerate().rev().max_by(|a, b| a.1.total_cmp(b.1)) else {
                 break;

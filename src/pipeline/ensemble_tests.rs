@@ -186,7 +186,7 @@ fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
             complete(&line, Stage::Mask, &NoFields).unwrap();
         }
         let views = learn::train_views(&line.capture, &line.scene().unwrap(), config, true).unwrap();
-        let tiles = tiles::held_out_tiles(&line.capture, config);
+        let tiles = learn::held_out_tiles(&line.capture, config);
         for (view, (_, tiles)) in views.iter().zip(&tiles) {
             let Some(valid) = &view.valid else { continue };
             assert!(tiles.iter().flat_map(|t| t.pixels(SIZE.0)).all(|i| valid.values[i] == 0));

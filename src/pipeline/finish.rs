@@ -1,18 +1,23 @@
 //! From the whole extraction to what an artist opens: simplified, laid out, baked.
+//!
+//! The files of a head mesh are in the dataset's coordinates or turned so that the face looks at the viewer ([`Export`]).
 
-use super::export::{Export, center};
 use super::surface::ClosedSurface;
+use crate::capture::Capture;
 use crate::capture::scene::Scene;
-use crate::config::{ColorSource, Hair, MeshConfig, MeshFrame};
-use crate::geom::{Camera, Mesh};
+use crate::config::{ColorSource, Config, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
+use crate::geom::{Camera, Mesh, Similarity};
 use crate::image::{Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::mesh::bake::{BakeConfig, Learned, Seams, bake, bake_harmonics, complete, tangent_space};
-use crate::mesh::files::{HeadMesh, HeadTexture, Lobes, tangents};
+use crate::mesh::files::{
+    ExportOptions, ExportedFiles, HeadMesh, HeadTexture, Lobes, tangents, to_glb, to_obj, to_ply,
+    turn_to_y_up,
+};
 use crate::mesh::{
     AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
 };
 use crate::{Monitor, Result};
-use glam::{Mat3, Vec3};
+use glam::{DMat3, DVec3, Mat3, Vec3};
 use serde_json::{Map, Value, json};
 
 /// How far the true surface may lie from a triangle, in cells: the chords of large triangles and half a cell.
@@ -174,4 +179,335 @@ fn lobes(images: &[Image], asset_from_world: Mat3) -> Option<Lobes> {
         scale.push(most);
     }
     Some(Lobes { pictures, scale, asset_from_world })
+}
+
+/// The quality of textures that are stored as JPEG.
+const JPEG_QUALITY: u8 = 92;
+
+/// How a mesh is exported from the dataset's world.
+#[derive(Clone, Debug)]
+pub struct Export {
+    /// What viewers call it.
+    pub name: String,
+    /// Up in the world.
+    pub up: Vec3,
+    /// Metres per dataset unit.
+    pub unit_m: f64,
+    /// Whose coordinates.
+    pub frame: MeshFrame,
+    /// How pictures are stored with the mesh.
+    pub texture_format: TextureFormat,
+    /// What light does to the GLB.
+    pub material: Material,
+    /// Where the cameras stood, world: faces look at cameras.
+    pub cameras: Vec<DVec3>,
+}
+
+impl Export {
+    /// Returns how the mesh of a capture is exported.
+    pub fn new(capture: &Capture, config: &Config) -> Export {
+        Export {
+            name: capture.name.clone(),
+            up: capture.up,
+            unit_m: config.capture.unit_m,
+            frame: config.mesh.frame,
+            material: config.mesh.material,
+            texture_format: config.mesh.texture_format,
+            cameras: capture.views.iter().map(|v| v.camera.position).collect(),
+        }
+    }
+
+    /// Returns a head mesh as the files of a format, the mesh first. `stem` names them.
+    pub(super) fn files(&self, head: &HeadMesh, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
+        let HeadMesh { mesh, world_from_scene, texture, shells, .. } = head;
+        let (up, world_from_mesh) = match self.frame {
+            MeshFrame::Dataset => (self.up, *world_from_scene),
+            MeshFrame::Head => (Vec3::Y, self.head_from_mesh(mesh, world_from_scene)),
+        };
+        let options = ExportOptions {
+            name: self.name.clone(),
+            stem: stem.into(),
+            up,
+            unit_m: self.unit_m,
+            // an unlit material shows no normal map: who asks for one wants light
+            unlit: self.material == Material::Unlit && texture.as_ref().is_none_or(|t| t.normal.is_none()),
+            world_from_mesh,
+            jpeg_quality: (self.texture_format == TextureFormat::Jpeg).then_some(JPEG_QUALITY),
+        };
+        match format {
+            MeshFormat::Glb => {
+                let bytes = to_glb(mesh, texture.as_ref(), shells.as_ref(), &options)?;
+                Ok(ExportedFiles { files: vec![(format!("{stem}.glb"), bytes)], warnings: Vec::new() })
+            }
+            MeshFormat::Obj => to_obj(mesh, texture.as_ref(), &options),
+            // the dataset's world whatever the frame, and colors at the vertices: one index, so the surface stays
+            // closed for whoever reads it
+            MeshFormat::Ply => {
+                to_ply(mesh, None, &ExportOptions { world_from_mesh: *world_from_scene, ..options })
+            }
+        }
+    }
+
+    /// Where the face of a head at `center` looks: see `front`.
+    pub fn front(&self, center: DVec3) -> Option<Vec3> {
+        front(self.up, &self.cameras, center)
+    }
+
+    /// The turn that brings up to +Y and the face of a head at `center` towards +Z.
+    fn head_from_world(&self, center: DVec3) -> DMat3 {
+        let up = self.up.as_dvec3().normalize_or(DVec3::Y);
+        // cameras all around say nothing: any direction across `up` will do
+        let front = self.front(center).map_or_else(|| up.any_orthonormal_vector(), |f| f.as_dvec3());
+        let front = front.reject_from_normalized(up).normalize_or(up.any_orthonormal_vector());
+        DMat3::from_cols(up.cross(front), up, front).transpose()
+    }
+
+    /// +Y up through the crown, the face towards +Z, the origin at the middle of the box.
+    pub(super) fn head_from_mesh(&self, mesh: &Mesh, world_from_mesh: &Similarity) -> Similarity {
+        let rotation = self.head_from_world(center(mesh, world_from_mesh));
+        let turned = Similarity { rotation, ..Similarity::IDENTITY }.after(world_from_mesh);
+        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        for p in &mesh.positions {
+            let q = turned.point_f64(p.as_dvec3());
+            (low, high) = (low.min(q), high.max(q));
+        }
+        Similarity { translation: turned.translation - 0.5 * (low + high), ..turned }
+    }
+
+    /// From the dataset's world to the coordinates of GLB and OBJ files, metres.
+    pub(super) fn file_from_world(&self, head: &HeadMesh) -> Result<Similarity> {
+        let HeadMesh { mesh, world_from_scene, .. } = head;
+        let turned = match self.frame {
+            MeshFrame::Dataset => Similarity { rotation: turn_to_y_up(self.up)?, ..Similarity::IDENTITY },
+            MeshFrame::Head => self.head_from_mesh(mesh, world_from_scene).after(&world_from_scene.inverse()),
+        };
+        Ok(Similarity { scale: self.unit_m, ..Similarity::IDENTITY }.after(&turned))
+    }
+
+    /// The turn from the dataset's world to the coordinates of GLB and OBJ files.
+    pub(super) fn asset_from_world(&self, mesh: &Mesh, world_from_mesh: &Similarity) -> Mat3 {
+        match self.frame {
+            MeshFrame::Dataset => turn_to_y_up(self.up).unwrap_or(DMat3::IDENTITY).as_mat3(),
+            MeshFrame::Head => self.head_from_world(center(mesh, world_from_mesh)).as_mat3(),
+        }
+    }
+}
+
+/// Where the face of a head at `center` looks, a unit vector of the world across `up`: taken to be where most `cameras`
+/// stand. `None` where they stand all around.
+pub(super) fn front(up: Vec3, cameras: &[DVec3], center: DVec3) -> Option<Vec3> {
+    let up = up.as_dvec3().normalize_or(DVec3::Y);
+    let across = |c: &DVec3| (c - center).reject_from_normalized(up).normalize_or_zero();
+    let towards: DVec3 = cameras.iter().map(across).sum();
+    (towards.length() > 1e-3).then(|| towards.normalize().as_vec3())
+}
+
+/// The middle of a mesh's box, in the world.
+pub(super) fn center(mesh: &Mesh, world_from_mesh: &Similarity) -> DVec3 {
+    world_from_mesh.point_f64(mesh.bounds().center().as_dvec3())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::files::test_head;
+    use std::f32::consts::PI;
+
+    #[test]
+    fn in_the_head_frame_the_face_looks_along_z_and_the_crown_is_up() {
+        // Z-up world, cameras at −Y: the corner of the box nearest to the cameras, at the top
+        let corners: Vec<Vec3> = (0..8)
+            .map(|i| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32 * 2.0, (i >> 2) as f32 * 3.0))
+            .collect();
+        let mesh = Mesh { positions: corners.clone(), ..Mesh::default() };
+        let export = Export {
+            name: "x".into(),
+            up: Vec3::Z,
+            unit_m: 1.0,
+            frame: MeshFrame::Head,
+            material: Material::Unlit,
+            texture_format: TextureFormat::Png,
+            cameras: vec![DVec3::new(0.5, -9.0, 4.0)],
+        };
+        let head_from_world = export.head_from_mesh(&mesh, &Similarity::IDENTITY);
+        // (0, 0, 3): x = 0.5 left of the middle, y = 1 towards the cameras, z = 1.5 above
+        let p = head_from_world.point(Vec3::new(0.0, 0.0, 3.0));
+        assert!(p.distance(Vec3::new(-0.5, 1.5, 1.0)) < 1e-5, "{p}");
+    }
+
+    /// A wrinkled ball, closed, a scene of its own.
+    fn ball() -> Mesh {
+        let (across, down) = (40u32, 20u32);
+        let at = |i: u32, j: u32| {
+            let (a, b) = (i as f32 / across as f32 * 2.0 * PI, j as f32 / down as f32 * PI);
+            let r = 0.95 + 0.05 * (7.0 * a).sin() * b.sin();
+            r * Vec3::new(b.sin() * a.cos(), b.sin() * a.sin(), b.cos())
+        };
+        let mut mesh = Mesh { positions: vec![at(0, 0), at(0, down)], ..Mesh::default() };
+        mesh.positions.extend((0..across * (down - 1)).map(|k| at(k % across, 1 + k / across)));
+        let ring = |i: u32, j: u32| 2 + (j - 1) * across + i % across;
+        for i in 0..across {
+            mesh.triangles.push([0, ring(i, 1), ring(i + 1, 1)]);
+            mesh.triangles.push([1, ring(i + 1, down - 1), ring(i, down - 1)]);
+            for j in 1..down - 1 {
+                let [a, b] = [ring(i, j), ring(i + 1, j)];
+                let [c, d] = [ring(i + 1, j + 1), ring(i, j + 1)];
+                mesh.triangles.extend([[a, d, c], [a, c, b]]);
+            }
+        }
+        mesh.normals = mesh.positions.iter().map(|p| p.normalize()).collect();
+        mesh.colors = vec![[0.5; 3]; mesh.positions.len()];
+        mesh
+    }
+
+    /// Corners of the triangles of a GLB, relative to the node, and the node's translation.
+    fn corners_of(glb: &[u8]) -> (Vec<[Vec3; 3]>, DVec3) {
+        let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
+        let json: serde_json::Value = serde_json::from_slice(&glb[20..20 + length]).unwrap();
+        let bin = &glb[28 + length..];
+        let primitive = &json["meshes"][0]["primitives"][0];
+        let bytes = |accessor: &serde_json::Value| {
+            let accessor = &json["accessors"][accessor.as_u64().unwrap() as usize];
+            let view = &json["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
+            let at = view["byteOffset"].as_u64().unwrap() as usize;
+            &bin[at..at + view["byteLength"].as_u64().unwrap() as usize]
+        };
+        let number = |b: &[u8; 4]| f32::from_le_bytes(*b);
+        let positions = bytes(&primitive["attributes"]["POSITION"]).as_chunks::<4>().0;
+        let positions: Vec<Vec3> =
+            positions.as_chunks::<3>().0.iter().map(|p| Vec3::from(p.each_ref().map(number))).collect();
+        let indices = bytes(&primitive["indices"]).as_chunks::<2>().0; // fewer than 65 535
+        let index = |b: &[u8; 2]| positions[u16::from_le_bytes(*b) as usize];
+        let corners = indices.as_chunks::<3>().0.iter().map(|t| t.each_ref().map(index)).collect();
+        let translation = &json["nodes"][0]["translation"];
+        let k = |k: usize| translation[k].as_f64().unwrap_or(0.0);
+        (corners, DVec3::new(k(0), k(1), k(2)))
+    }
+
+    /// A head of a quarter of a metre, six thousand kilometres from the origin: where f32 has steps of half a metre.
+    #[test]
+    fn a_head_at_the_end_of_the_world_keeps_its_shape_in_every_file() {
+        let mesh = ball();
+        assert!(mesh.is_closed());
+        let mut far = test_head();
+        far.texture.as_mut().unwrap().atlas.triangles = vec![[0, 1, 2]; mesh.triangles.len()];
+        (far.mesh, far.harmonics, far.shells) = (mesh.clone(), None, None);
+        // as it is when it has been kept for a while
+        let dir = tempfile::tempdir().unwrap();
+        far.save(dir.path()).unwrap();
+        let far = HeadMesh::load(dir.path()).unwrap();
+        let place = far.world_from_scene;
+        let exact = |p: Vec3| place.point_f64(p.as_dvec3());
+        let mut export = Export {
+            name: "x".into(),
+            up: Vec3::Z,
+            unit_m: 1.0,
+            frame: MeshFrame::Dataset,
+            material: Material::Unlit,
+            texture_format: TextureFormat::Png,
+            cameras: vec![place.translation + DVec3::new(0.3, -0.6, 0.1)],
+        };
+        let bare = HeadMesh { texture: None, ..far.clone() };
+        let close = 1e-6 * 0.25;
+        for head in [&far, &bare] {
+            export.frame = MeshFrame::Dataset;
+            let glb = export.files(head, MeshFormat::Glb, "head").unwrap();
+            assert_eq!(glb.warnings, Vec::<String>::new());
+            let (corners, translation) = corners_of(&glb.files[0].1);
+            // a document that is put together by hand for its node keeps what readers of lobes must know
+            let notes =
+                String::from_utf8_lossy(&glb.files[0].1).contains("\"extras\":{\"tiface\":{\"lobes\":[{");
+            assert_eq!(notes, head.texture.is_some());
+            let file_from_world = export.file_from_world(head).unwrap();
+            for (found, t) in corners.iter().zip(0..) {
+                let expected = mesh.corners(t).map(exact);
+                // whoever looks at the file finds the world there
+                let there = file_from_world.point_f64(expected[0]) - translation;
+                assert!(there.distance(found[0].as_dvec3()) < close, "{there}");
+                for (p, e) in found.iter().zip(expected) {
+                    // z up: (x, y, z) becomes (x, z, −y)
+                    let e = DVec3::new(e.x, e.z, -e.y) - translation;
+                    assert!(p.as_dvec3().distance(e) < close, "{p} {e}");
+                }
+                let area = |[a, b, c]: [DVec3; 3]| (b - a).cross(c - a).length();
+                let ratio = area(found.map(|p| p.as_dvec3())) / area(expected);
+                assert!((ratio - 1.0).abs() < 1e-3, "triangle {t}: {ratio}");
+            }
+            // around the middle, looking at the camera
+            export.frame = MeshFrame::Head;
+            let glb = export.files(head, MeshFormat::Glb, "head").unwrap();
+            let (corners, translation) = corners_of(&glb.files[0].1);
+            assert_eq!(translation, DVec3::ZERO);
+            let centre = exact(mesh.bounds().center());
+            let front = ((export.cameras[0] - centre) * DVec3::new(1.0, 1.0, 0.0)).normalize();
+            let axes = [DVec3::Z.cross(front), DVec3::Z, front];
+            let turned = |p: Vec3| DVec3::from(axes.map(|a| a.dot(exact(p) - place.translation)));
+            let file_from_world = export.file_from_world(head).unwrap();
+            let all = || mesh.positions.iter().map(|&p| turned(p));
+            let middle = 0.5 * (all().reduce(DVec3::min).unwrap() + all().reduce(DVec3::max).unwrap());
+            for (found, t) in corners.iter().zip(0..) {
+                for (p, e) in found.iter().zip(mesh.corners(t)) {
+                    assert!(p.as_dvec3().distance(turned(e) - middle) < close, "{p}");
+                    assert!(file_from_world.point_f64(exact(e)).distance(p.as_dvec3()) < close, "{p}");
+                }
+            }
+            assert!(
+                export
+                    .files(head, MeshFormat::Obj, "head")
+                    .unwrap()
+                    .warnings
+                    .iter()
+                    .all(|w| !w.contains("origin"))
+            );
+
+            export.frame = MeshFrame::Dataset;
+            let obj = export.files(head, MeshFormat::Obj, "head").unwrap();
+            assert!(
+                obj.warnings.last().unwrap().contains("round its vertices to 5.0e-1"),
+                "{:?}",
+                obj.warnings
+            );
+            let text = String::from_utf8(obj.files[0].1.clone()).unwrap();
+            let lines: Vec<&str> = text.lines().filter(|l| l.starts_with("v ")).collect();
+            assert_eq!(lines.len(), mesh.positions.len());
+            for (line, &p) in lines.iter().zip(&mesh.positions) {
+                let v: Vec<f64> = line[2..].split(' ').map(|v| v.parse().unwrap()).collect();
+                let e = exact(p);
+                assert!(DVec3::new(v[0], v[1], v[2]).distance(DVec3::new(e.x, e.z, -e.y)) < close, "{line}");
+            }
+
+            let ply = export.files(head, MeshFormat::Ply, "head").unwrap();
+            assert!(ply.warnings.last().unwrap().contains("the .ply lies"), "{:?}", ply.warnings);
+            let bytes = &ply.files[0].1;
+            let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+            assert!(String::from_utf8_lossy(&bytes[..end]).contains("property double x\n"));
+            // three doubles, a normal, a color
+            for (row, &p) in bytes[end..].chunks(24 + 12 + 3).zip(&mesh.positions) {
+                let v = row.as_chunks::<8>().0;
+                let found =
+                    DVec3::new(f64::from_le_bytes(v[0]), f64::from_le_bytes(v[1]), f64::from_le_bytes(v[2]));
+                assert!(found.distance(exact(p)) < close);
+            }
+        }
+    }
+
+    #[test]
+    fn every_format_has_its_files() {
+        let export = Export {
+            name: "x".into(),
+            up: Vec3::Z,
+            unit_m: 1.0,
+            frame: MeshFrame::Dataset,
+            material: Material::Unlit,
+            texture_format: TextureFormat::Png,
+            cameras: vec![DVec3::new(0.0, -3.0, 0.0)],
+        };
+        let names = |format| {
+            let files = export.files(&test_head(), format, "head").unwrap().files;
+            files.into_iter().map(|(name, _)| name).collect::<Vec<_>>()
+        };
+        assert_eq!(names(MeshFormat::Glb), ["head.glb"]);
+        assert_eq!(names(MeshFormat::Obj), ["head.obj", "head.mtl", "head.png"]);
+        assert_eq!(names(MeshFormat::Ply), ["head.ply"]);
+    }
 }

@@ -1,24 +1,33 @@
 //! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
+//!
+//! The squares of the training photographs that nothing learns from are chosen here too: the weights of the blend are
+//! fitted there.
 
 use super::line::Line;
-use super::march::march;
-use super::surface::{Fields, Radiance, Surface};
-use super::tiles;
+use super::surface::{Fields, Radiance, Surface, march};
 use crate::capture::scene::Scene;
-use crate::capture::{Capture, LoadedView};
+use crate::capture::{Capture, LoadedView, Split, View};
 use crate::config::iface::FieldKind;
 use crate::config::{Config, MaskUse, Preset, Stage};
+use crate::ensemble::{self, Tile};
 #[cfg(feature = "wgpu")]
 use crate::field::compute_device;
 use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
 use crate::geom::Camera;
+#[cfg(feature = "wgpu")]
+use crate::iface::SDF_TEST;
 use crate::iface::{self, DensityField, IFace};
+use crate::image::Gray;
+use crate::io::Limits;
 use crate::kernel::cpu::march::Bitmask;
 use crate::render::RenderedView;
 use crate::run::StageDir;
+#[cfg(feature = "wgpu")]
+use crate::tface::VM_TEST;
 use crate::tface::{self, FieldMean};
 use crate::{Error, Result};
+use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::cell::OnceCell;
 use std::path::Path;
@@ -91,7 +100,7 @@ pub(super) fn train_views(
     config: &Config,
     masked: bool,
 ) -> Result<Vec<TrainView>> {
-    let views = tiles::training_views(capture, scene, config)?.into_iter();
+    let views = training_views(capture, scene, config)?.into_iter();
     let view = |(camera, loaded): (Camera, LoadedView)| TrainView {
         camera,
         photo: loaded.photo,
@@ -130,7 +139,7 @@ impl Fields for TrainedFields<'_> {
             let hull = bitmask(&self.line.scene()?);
             let field = IFace::load(&folder, &config.iface, hull.as_ref())?;
             #[cfg(feature = "wgpu")]
-            let field = field.on(compute_device(&config.device)?);
+            let field = field.on(compute_device(&config.device, &SDF_TEST)?);
             Ok(Box::new(field))
         };
         once(&self.iface, load).map(|f| &**f)
@@ -142,7 +151,7 @@ impl Fields for TrainedFields<'_> {
             let count = config.radiance(stage).learned();
             let field = FieldMean::load(stage.word(), &run.path(stage), count)?;
             #[cfg(feature = "wgpu")]
-            let field = field.on(compute_device(&config.device)?);
+            let field = field.on(compute_device(&config.device, &VM_TEST)?);
             Ok(field)
         };
         let cell = if stage == Stage::Baseline { &self.baseline } else { &self.tface };
@@ -186,6 +195,35 @@ fn once<T>(cell: &OnceCell<T>, load: impl FnOnce() -> Result<T>) -> Result<&T> {
         let _ = cell.set(load()?);
     }
     cell.get().ok_or_else(|| Error::cannot("no field", ""))
+}
+
+/// The training views, each with its squares.
+pub(super) fn held_out_tiles<'c>(capture: &'c Capture, config: &Config) -> Vec<(&'c View, Vec<Tile>)> {
+    let (share, seed) = (config.capture.tiles, config.seed);
+    let tiles = |(i, v): (usize, &'c View)| {
+        (v, ensemble::tiles(v.camera.width, v.camera.height, share, seed, i as u64))
+    };
+    capture.split(Split::Train).enumerate().map(tiles).collect()
+}
+
+/// The photographs that are learned from, with their cameras in the scene. Pixels of `capture.tiles` count as not
+/// valid.
+pub(super) fn training_views(
+    capture: &Capture,
+    scene: &Scene,
+    config: &Config,
+) -> Result<Vec<(Camera, LoadedView)>> {
+    let view = |(view, tiles): &(&View, Vec<Tile>)| {
+        let mut loaded = view.load(&Limits::default())?;
+        let (width, height) = (loaded.photo.width, loaded.photo.height);
+        for tile in tiles {
+            let all = || Gray { width, height, values: vec![255; loaded.photo.rgb.len()] };
+            let values = &mut loaded.valid.get_or_insert_with(all).values;
+            tile.pixels(width).for_each(|i| values[i] = 0);
+        }
+        Ok((view.camera.transformed(&scene.scene_from_world), loaded))
+    };
+    held_out_tiles(capture, config).par_iter().map(view).collect()
 }
 
 #[cfg(test)]

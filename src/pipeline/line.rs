@@ -4,8 +4,7 @@ use super::clicks::MaskPrompts;
 use super::lpips::measure;
 use super::path::CameraPath;
 use super::{mask, scene_file};
-use crate::capture::scene::Scene;
-use crate::capture::scene_box::SceneBox;
+use crate::capture::scene::{Scene, SceneBox};
 use crate::capture::{self, Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{Config, MaskSource, RenderConfig, Stage};
 use crate::io::{self, Limits};
@@ -243,7 +242,7 @@ pub fn feasible(config: &Config) -> Result<()> {
 /// Refuses a device that this build or this machine does not have, or that somebody else uses. What is done needs none:
 /// so this is asked where a stage is to do that computes on it.
 pub fn require_device(config: &Config) -> Result<()> {
-    crate::field::compute_device(&config.device).map(drop)
+    crate::field::require_device(&config.device)
 }
 
 /// How the configuration opens a capture.

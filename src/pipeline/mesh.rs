@@ -6,11 +6,10 @@
 //!      head.glb …    the head mesh as files
 //! ```
 
-use super::export::Export;
-use super::finish::{FinishedHead, REACH, finish};
+use super::finish::{Export, FinishedHead, REACH, finish};
+use super::learn;
 use super::line::Line;
 use super::surface::{ClosedSurface, Surface};
-use super::tiles;
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, LoadedView, Split};
 use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, MeshFormat, Stage};
@@ -64,7 +63,7 @@ pub(super) fn mesh(
     let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
     let views = match c.color {
         ColorSource::Network if c.hair == Hair::None => Vec::new(),
-        _ => tiles::training_views(capture, scene, config)?,
+        _ => learn::training_views(capture, scene, config)?,
     };
     if let Some(cap) = cap.as_mut() {
         let learned = Learned {

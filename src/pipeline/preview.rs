@@ -1,15 +1,19 @@
 //! Pictures of a mesh to look at: of a run's head, or of a file that anybody wrote.
+//!
+//! A small view of a field while it is learned is made from its newest checkpoint ([`field_view`]). Whoever looks makes it:
+//! the training knows nothing of it, and no byte of it changes.
 
-use super::export::{center as center_of, front as front_of};
+use super::finish::{center as center_of, front as front_of};
+use super::learn::load_field;
 use super::mesh::finished_mesh;
 use super::page::views::{error, heat};
 use super::path::cameras_of_file;
-use super::pictures::{behind, expected, over, straight};
-use super::scene_file::read_capture;
+use super::pictures::{self, behind, expected, over, straight};
+use super::scene_file::{read_capture, read_scene};
 use crate::capture::{Split, View};
-use crate::config::{Stage, ViewBackground};
+use crate::config::{Config, Stage, ViewBackground};
 use crate::geom::{Atlas, Camera, Distortion, Similarity};
-use crate::image::{Image, quantize, reduce_photo, working_size};
+use crate::image::{Image, Photo, quantize, reduce_photo, working_size};
 use crate::io::{self, Limits};
 use crate::mesh::files::{HeadMesh, OpenedMesh, open_mesh};
 use crate::render::path::{NamedCamera, orbit};
@@ -300,4 +304,31 @@ fn at_hand(head: &mut HeadMesh, path: &Path) -> Result<()> {
         head.world_from_scene = Similarity { scale: own.scale * size, translation, ..*own };
     }
     Ok(())
+}
+
+/// Pixels along the longest side.
+const SIDE: u32 = 240;
+
+/// Returns what the first held-out camera sees of the field that a stage of a run has learned so far, over black, as a
+/// JPEG file.
+///
+/// # Errors
+///
+/// There is no checkpoint yet, or a file of the run is damaged.
+pub fn field_view(run: &Path, config: &Config, stage: Stage) -> Result<Vec<u8>> {
+    let scene = read_scene(&run.join("mask/scene.json"))?;
+    let capture = read_capture(&run.join("cameras.json"), Path::new(""))?;
+    let mut views = [Split::Test, Split::Val, Split::Train].into_iter().flat_map(|s| capture.split(s));
+    let camera = views.next().map(|view| view.camera.clone());
+    let camera = camera.ok_or_else(|| Error::cannot("the run has no camera", ""))?;
+    let share = f64::from(SIDE) / f64::from(camera.width.max(camera.height));
+    let side = |pixels: u32| (f64::from(pixels) * share.min(1.0)).round().max(1.0) as u32;
+    let camera = camera.resized(side(camera.width), side(camera.height)).transformed(&scene.scene_from_world);
+    let mut view = load_field(run, config, &scene, stage)?(&camera);
+    if let Some(black) = pictures::behind(ViewBackground::Black) {
+        pictures::over(&mut view, black);
+    }
+    let rgb = view.color.data.as_chunks::<4>().0.iter().map(|p| [p[0], p[1], p[2]].map(quantize)).collect();
+    let photo = Photo { width: view.color.width, height: view.color.height, rgb, alpha: None };
+    Ok(io::jpeg_bytes(&photo, 85, run)?)
 }

@@ -9,11 +9,10 @@
 //! These are the held-out views. Those of other cameras lie in a folder of their own, `render/paths/`.
 
 use super::line::Line;
-use super::march::march;
 use super::mesh::{extracted_surface, head_mesh};
 use super::path::{CameraPath, cameras_of};
 use super::pictures;
-use super::surface::Fields;
+use super::surface::{Fields, march};
 use crate::capture::scene::{self, Scene};
 use crate::capture::{Capture, Split};
 use crate::config::{ColorSource, Config, Method};

@@ -1,4 +1,5 @@
-//! `status.json` and `done.json`: what a stage says of itself.
+//! `status.json` and `done.json`: what a stage says of itself; and `estimate.json`: what the stages of a run may cost,
+//! told before they are worked on.
 
 use super::Fingerprint;
 use crate::io::{self, Limits, ReadError};
@@ -6,6 +7,7 @@ use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
+use std::ops::Add;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -207,6 +209,58 @@ pub(super) fn host() -> String {
     }
 }
 
+/// Its name in a run.
+pub const ESTIMATE: &str = "estimate.json";
+
+/// What a stage may cost. No more than an estimate: whoever shows it corrects it by what is measured meanwhile.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Cost {
+    /// Seconds of one processor core; the clock shows them divided by the cores at work.
+    pub cpu_s: f64,
+    /// The most memory, bytes.
+    pub memory_bytes: u64,
+    /// Room for its files, checkpoints that are being written included, bytes.
+    pub disk_bytes: u64,
+}
+
+impl Cost {
+    /// Returns the seconds by the clock on this machine, with nothing else at work on it.
+    pub fn seconds(&self) -> f64 {
+        self.cpu_s / rayon::current_num_threads().max(1) as f64
+    }
+}
+
+/// One after the other: times and files add up, memory is given back in between.
+impl Add for Cost {
+    type Output = Cost;
+
+    fn add(self, other: Cost) -> Cost {
+        Cost {
+            cpu_s: self.cpu_s + other.cpu_s,
+            memory_bytes: self.memory_bytes.max(other.memory_bytes),
+            disk_bytes: self.disk_bytes.saturating_add(other.disk_bytes),
+        }
+    }
+}
+
+/// Stages that a run is to have, by their words, with what each may cost.
+pub type Estimate = BTreeMap<String, Cost>;
+
+/// The `estimate.json` of a run; `None` if there is none.
+pub fn read_estimate(run: &Path) -> Result<Option<Estimate>, ReadError> {
+    let path = run.join(ESTIMATE);
+    if !io::is_file(&path) {
+        return Ok(None);
+    }
+    let estimate: Estimate = io::read_typed(&path, &Limits::default())?;
+    match estimate.iter().find(|(_, cost)| !(0.0..=1e12).contains(&cost.cpu_s)) {
+        Some((stage, c)) => {
+            Err(ReadError::value(&path, format!("{stage}.cpu_s"), c.cpu_s, "a number from 0 to 1e12"))
+        }
+        None => Ok(Some(estimate)),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -264,5 +318,29 @@ mod tests {
         );
         let other = |v: &mut Value| v["fingerprint"]["settings"]["iface.steps"] = json!("6");
         assert!(after("done.json", &other).unwrap().to_string().contains("`digest`"));
+    }
+
+    #[test]
+    fn stages_one_after_the_other_need_the_memory_of_the_greediest() {
+        let [a, b] = [(2.0, 7, 10), (3.0, 5, 20)].map(|(cpu_s, memory_bytes, disk_bytes)| Cost {
+            cpu_s,
+            memory_bytes,
+            disk_bytes,
+        });
+        assert_eq!(a + b, Cost { cpu_s: 5.0, memory_bytes: 7, disk_bytes: 30 });
+    }
+
+    #[test]
+    fn a_foreign_estimate_is_read_or_refused_by_its_key() {
+        let dir = tempfile::tempdir().unwrap();
+        assert_eq!(read_estimate(dir.path()).unwrap(), None);
+        let read = |text: &str| {
+            std::fs::write(dir.path().join(ESTIMATE), text).unwrap();
+            read_estimate(dir.path())
+        };
+        let one = r#"{"mask": {"cpu_s": 2.5, "memory_bytes": 3, "disk_bytes": 4}}"#;
+        assert_eq!(read(one).unwrap().unwrap()["mask"].cpu_s, 2.5);
+        assert!(read(&one.replace("2.5", "-1")).unwrap_err().to_string().contains("mask.cpu_s"));
+        assert!(read(&one.replace("3", "-3")).unwrap_err().to_string().contains("mask.memory_bytes"));
     }
 }

@@ -89,7 +89,10 @@ fn losses_follow_those_of_the_cpu_and_nobody_waits() {
 /// PSNR of two photographs; a device sees the same.
 fn psnr(views: &[TrainView], dir: &Path) -> f64 {
     let face = TFace::load("tface", dir).unwrap();
-    let there = FieldMean::load("tface", dir, 1).unwrap().on(field::compute_device("wgpu:0").unwrap());
+    let there =
+        FieldMean::load("tface", dir, 1)
+            .unwrap()
+            .on(field::compute_device("wgpu:0", &crate::tface::VM_TEST).unwrap());
     let mut sum = 0f64;
     for view in &views[..2] {
         let rays: Vec<_> = (0..1600)

@@ -92,11 +92,14 @@ pub(super) fn train_one(
 ) -> Result<TfaceReport> {
     let began = Instant::now();
     let state = VmState::new(config, session.seed, bounds, hull);
-    let device = field::compute_device(session.device)?.fallback_to_cpu(|device| match device {
-        ComputeDevice::Cpu(_) => Ok(()),
-        #[cfg(feature = "wgpu")]
-        ComputeDevice::Gpu(gpu) => GpuVm::fits(session.stage, config, pixels, &state, &gpu.device).map(drop),
-    })?;
+    let device =
+        field::compute_device(session.device, &super::VM_TEST)?.fallback_to_cpu(|device| match device {
+            ComputeDevice::Cpu(_) => Ok(()),
+            #[cfg(feature = "wgpu")]
+            ComputeDevice::Gpu(gpu) => {
+                GpuVm::fits(session.stage, config, pixels, &state, &gpu.device).map(drop)
+            }
+        })?;
     let description = device.description();
     let (state, progress, counts, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuVm::new(config, pixels), state, config, session)?,
@@ -201,12 +204,13 @@ impl<'a, O: VmOps> VmModel<'a, O> {
         VmModel { config, session: *session, ops, groups: None, state, unread: 0, counts }
     }
 
-    fn groups(&self) -> &VmGroups<O> {
+    /// The parameters on the device.
+    pub fn groups(&self) -> &VmGroups<O> {
         self.groups.as_ref().expect("parameters are loaded before the first step")
     }
 
     /// Copies the state to the device.
-    fn load(&mut self) {
+    pub fn load(&mut self) {
         // what lies there goes first, or there would have to be room for both
         self.ops.unload(self.groups.take());
         let groups = std::mem::take(&mut self.state.groups);

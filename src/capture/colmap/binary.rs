@@ -2,7 +2,7 @@
 //! are left before anything is reserved.
 
 use super::super::lens::LensModel;
-use super::model::{Camera, Image, Model, Rigid};
+use super::{Camera, Image, Model, Rigid};
 use crate::Result;
 use crate::io::{Limits, ReadError};
 use glam::DVec3;

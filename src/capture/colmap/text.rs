@@ -1,8 +1,8 @@
 //! The text files: a line of numbers for each entry, two for an image, `#` before comments.
 
-use super::super::error::in_file;
+use super::super::folder::in_file;
 use super::super::lens::LensModel;
-use super::model::{Camera, Image, Model, Rigid};
+use super::{Camera, Image, Model, Rigid};
 use crate::io::{Limits, ReadError};
 use crate::{Error, Result};
 use glam::DVec3;

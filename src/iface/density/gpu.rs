@@ -80,7 +80,9 @@ impl<'a> GpuDensity<'a> {
 
 /// Samples that a step has room for, and whether photographs lie on the device, too.
 fn max_samples(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<(usize, bool)> {
-    samples_that_fit(config, Density::words_per_sample(&shape(config)), 0, pixels, device)
+    let shape = shape(config);
+    let (words, sums) = (Density::words_per_sample(&shape), Density::words_of_sums(&shape));
+    samples_that_fit(config, words, sums, 0, pixels, device)
 }
 
 /// The cells to march through, and how they are updated.

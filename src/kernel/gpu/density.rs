@@ -465,6 +465,11 @@ impl Density {
         [2 * features + 3 * HIDDEN + FEATURES + 2 * WIDTH + 2 + 2 * (3 + 3 + 2), HIDDEN.max(features)]
     }
 
+    /// Returns the memory of the groups' partial gradient sums in words, which does not depend on the number of samples.
+    pub fn words_of_sums(shape: &DensityShape) -> usize {
+        SUMMING * Plan { features: 2 * shape.levels.len() }.gradients()[5] * CHANNELS
+    }
+
     /// Converts new network weights to the layout of the kernels.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
         launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;

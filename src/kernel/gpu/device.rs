@@ -9,17 +9,17 @@ use burn::cubecl::future;
 use burn::cubecl::ir::{ElemType, FloatKind, Type};
 use burn::cubecl::prelude::{BufferArg, Client, CubeCount};
 use burn::cubecl::server::Handle;
-use burn::cubecl::wgpu::wgpu;
+use burn::cubecl::wgpu::{AutoGraphicsApi, MemoryConfiguration, RuntimeOptions, try_init_setup, wgpu};
 use burn::tensor::{DType, Element};
 use bytemuck::Pod;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Display;
 use std::ops::Range;
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, Once, OnceLock};
 
-/// The first error of wgpu since a device was read. CubeCL turns such an error into a panic on a thread of its own, whose
+/// The first error of wgpu, or the first launch refused, since a device was read. CubeCL turns such an error into a panic on a thread of its own, whose
 /// launches are lost while reads go on answering.
 static WGPU_ERROR: Mutex<Option<String>> = Mutex::new(None);
 
@@ -31,10 +31,15 @@ fn note_errors() {
         panic::set_hook(Box::new(move |info| {
             let message = info.payload_as_str().and_then(|text| text.strip_prefix("wgpu error: "));
             let Some(message) = message else { return others(info) };
-            let mut noted = WGPU_ERROR.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-            noted.get_or_insert_with(|| message.to_owned());
+            note(message.to_owned());
         }));
     });
+}
+
+/// Notes an error, if it is the first since a device was read.
+fn note(message: String) {
+    let mut noted = WGPU_ERROR.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    noted.get_or_insert(message);
 }
 
 /// Takes the error of wgpu that was noted since the last call.
@@ -62,6 +67,8 @@ pub struct Device {
     memory: Option<u64>,
     launches: AtomicUsize,
     readbacks: AtomicUsize,
+    /// Names of the kernels that were launched.
+    kernels: Mutex<BTreeSet<&'static str>>,
 }
 
 /// Memory of a device: burn's tensor there, which is one type for floats and words. Of one dimension, and of 32 bits an element.
@@ -109,6 +116,7 @@ pub struct Adapter {
     pub software: bool,
     /// The driver and its version; empty where it does not say.
     pub driver: String,
+    ready: Once,
 }
 
 /// What the adapters of a machine are called, the fastest kind first.
@@ -164,11 +172,26 @@ impl Adapter {
                 kind: KINDS[kind],
                 software: kind == 4,
                 driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+                ready: Once::new(),
             };
             found.push(((kind, api, number), adapter));
         }
         found.sort_by_key(|(order, _)| *order);
         found.into_iter().map(|(_, adapter)| adapter).collect()
+    }
+
+    /// The client of the adapter. wgpu's gives each large buffer memory of its own: by itself CubeCL carves all buffers
+    /// from pages as large as the largest of them, and takes up to such a page more than was asked for.
+    fn client(&self) -> Client {
+        self.ready.call_once(|| {
+            if let (CubeDevice::Wgpu(device), Ok(options)) = (&self.device, RuntimeOptions::try_default()) {
+                let memory_config = MemoryConfiguration::ExclusivePages;
+                // opened by its defaults where this fails, which says why
+                let _ =
+                    try_init_setup::<AutoGraphicsApi>(device, RuntimeOptions { memory_config, ..options });
+            }
+        });
+        self.device.client()
     }
 }
 
@@ -176,8 +199,7 @@ impl Device {
     /// Opens an adapter, with the atomics it does best.
     pub fn open(adapter: &Adapter) -> Device {
         note_errors();
-        let device = adapter.device.clone();
-        let client = device.client();
+        let (device, client) = (adapter.device.clone(), adapter.client());
         let float = Type::atomic(ElemType::Float(FloatKind::F32));
         let native = client.properties().atomic_type_usage(float).contains(AtomicUsage::Add);
         let atomics = if native { Atomics::Native } else { Atomics::Exchange };
@@ -186,7 +208,8 @@ impl Device {
         let driver = [adapter.driver.as_str(), compiles_for].into_iter().find(|text| !text.is_empty());
         let driver = driver.unwrap_or_default().to_owned();
         let (launches, readbacks) = (AtomicUsize::new(0), AtomicUsize::new(0));
-        Device { device, client, driver, atomics, memory, launches, readbacks }
+        let kernels = Mutex::default();
+        Device { device, client, driver, atomics, memory, launches, readbacks, kernels }
     }
 
     /// As the adapter names itself.
@@ -239,6 +262,12 @@ impl Device {
     /// The same device of which no more than so many bytes are to be taken.
     pub fn with_memory(self, bytes: u64) -> Device {
         Device { memory: Some(self.memory.map_or(bytes, |all| all.min(bytes))), ..self }
+    }
+
+    /// Bytes that are taken of the device's memory, by all that is open there.
+    #[cfg(test)]
+    pub fn reserved_memory(&self) -> u64 {
+        self.client.memory_report(burn::cubecl::MemoryScope::Device).usage().bytes_reserved
     }
 
     /// Gives memory back that nobody uses any more.
@@ -332,7 +361,7 @@ impl Device {
                         on from the last checkpoint";
             return Error::not_now(problem, hint);
         }
-        if has(&["validation", "compil", "shader", "pipeline"]) {
+        if has(&["validation", "compil", "shader", "pipeline", "launch error", "was refused"]) {
             let hint = "use another driver or device (`tiface doctor` tries them), or `--device cpu`; the last checkpoint \
                         is whole";
             return Error::cannot(problem, hint);
@@ -346,6 +375,19 @@ impl Device {
         &self.client
     }
 
+    /// Notes where a kernel's first launch was refused: the error of a later read does not always name the kernel.
+    pub(super) fn launched<'h>(&self, kernel: &'static str, buffers: impl IntoIterator<Item = &'h Handle>) {
+        let mut kernels = self.kernels.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        if kernels.insert(kernel)
+            && let Err(e) = self.client.check(buffers)
+        {
+            note(format!(
+                "the launch of `{}` was refused: {e:?}",
+                kernel.trim_start_matches("tiface::kernel::gpu::")
+            ));
+        }
+    }
+
     /// Launches and readbacks so far.
     pub fn counts(&self) -> (usize, usize) {
         (self.launches.load(Ordering::Relaxed), self.readbacks.load(Ordering::Relaxed))
@@ -355,15 +397,17 @@ impl Device {
 /// Launches a kernel and counts it: `launch!(device, kernel::launch, groups, threads; buffers; scalars)`, with the threads
 /// of one group. Unsafe with `kernel::launch_unchecked`.
 macro_rules! launch {
-    ($device:expr, $launch:expr, $groups:expr, $threads:expr; $($buffer:expr),+ $(; $($scalar:expr),+)?) => {
+    ($device:expr, $launch:expr, $groups:expr, $threads:expr; $($buffer:expr),+ $(; $($scalar:expr),+)?) => {{
+        let device = &$device;
         $launch(
-            $device.launch(),
+            device.launch(),
             $groups,
             burn::cubecl::prelude::CubeDim::new_1d($threads),
             $($buffer.arg(),)+
             $($($scalar,)+)?
-        )
-    };
+        );
+        device.launched(concat!(module_path!(), "::", stringify!($launch)), [$(&$buffer.handle),+]);
+    }};
 }
 pub(super) use launch;
 
@@ -379,12 +423,12 @@ pub(super) fn groups(count: usize) -> CubeCount {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use super::super::check::worst;
+    use super::super::test_case::worst;
     use super::*;
     use burn::cubecl::{self, prelude::*};
     use std::cell::Cell;
 
-    pub(crate) use super::super::check::planes;
+    pub(crate) use super::super::evaluate::planes;
 
     /// A device to test on, a software one too; without any, says so.
     pub fn device() -> Option<Device> {
@@ -439,20 +483,27 @@ pub(crate) mod tests {
         println!("{} adds floats: {:?}", device.name(), device.atomics());
     }
 
-    /// In a process of its own: what is noted of one device fails the next read of any.
-    fn fails_alone(test: &str) {
+    /// Runs an ignored test in a process of its own: what is noted of one device fails the next read of any, and all take
+    /// of the same memory.
+    pub fn alone(name: &str) {
         let this = std::env::current_exe().unwrap();
-        let name = format!("kernel::gpu::device::tests::{test}");
-        let run = std::process::Command::new(this).args(["--ignored", "--exact", &name]).output().unwrap();
+        let run = std::process::Command::new(this).args(["--ignored", "--exact", name]).output().unwrap();
         let text = String::from_utf8_lossy(&run.stdout).into_owned() + &String::from_utf8_lossy(&run.stderr);
         assert!(run.status.success() && text.contains("1 passed"), "{text}");
+        println!("{text}");
     }
 
     #[test]
     fn what_a_driver_refuses_is_an_error_and_nothing_read_after_it_is_trusted() {
         if device().is_some() {
-            fails_alone("a_launch_of_too_many_groups");
-            fails_alone("a_buffer_larger_than_memory");
+            for test in [
+                "a_launch_of_too_many_groups",
+                "a_buffer_larger_than_memory",
+                "a_kernel_that_does_not_compile",
+                "a_group_of_too_many_threads",
+            ] {
+                alone(&format!("kernel::gpu::device::tests::{test}"));
+            }
         }
     }
 
@@ -497,6 +548,62 @@ pub(crate) mod tests {
         let e = device.fetch::<f32>(&all[63]).expect_err("64 of the largest buffers do not fit in a GiB");
         println!("{e}: {}", e.hint());
         assert!(e.kind() as i32 == 75 && e.hint().contains("--memory"), "{e}");
+    }
+
+    #[cube(launch)]
+    fn crowded(out: &mut [f32], #[comptime] words: usize) {
+        let mut all = Shared::<[f32]>::new_slice(words);
+        all[UNIT_POS as usize] = 1.0f32;
+        sync_cube();
+        out[ABSOLUTE_POS] = all[words - 1 - UNIT_POS as usize];
+    }
+
+    /// A kernel that is refused is an error that names it, and no reason to repeat the command.
+    fn is_refused(device: &Device, out: &Buffer, kernel: &str) {
+        let e = device.fetch::<f32>(out).expect_err("the kernel cannot run");
+        println!("{e}: {}", e.hint());
+        assert!(e.kind() as i32 == 1 && e.to_string().to_lowercase().contains(kernel), "{e}");
+    }
+
+    #[test]
+    #[ignore = "run by the test above, in a process of its own"]
+    fn a_kernel_that_does_not_compile() {
+        let device = device().unwrap();
+        let out = device.zeros::<f32>(64);
+        let words = device.limits().shared;
+        launch!(device, crowded::launch, CubeCount::new_single(), 64; out; words);
+        is_refused(&device, &out, "crowded");
+    }
+
+    #[test]
+    #[ignore = "run by the test above, in a process of its own"]
+    fn a_group_of_too_many_threads() {
+        let device = device().unwrap();
+        let out = device.zeros::<f32>(64);
+        launch!(device, set::launch, CubeCount::new_single(), 1 << 20; out);
+        is_refused(&device, &out, "set");
+    }
+
+    #[test]
+    fn buffers_take_what_they_are_asked_for() {
+        if device().is_some() {
+            alone("kernel::gpu::device::tests::memory_of_buffers");
+        }
+    }
+
+    #[test]
+    #[ignore = "run by the test above, in a process of its own"]
+    fn memory_of_buffers() {
+        let device = device().unwrap();
+        const MIB: usize = 1 << 18;
+        let before = device.reserved_memory();
+        let sizes = std::iter::once(30).chain([7; 20]).chain([1; 8]);
+        let all: Vec<Buffer> = sizes.map(|mib| device.zeros::<f32>(mib * MIB)).collect();
+        device.read::<f32>(&all[all.len() - 1]);
+        let asked: usize = all.iter().map(|buffer| 4 * buffer.words()).sum();
+        let taken = device.reserved_memory() - before;
+        println!("{asked} bytes of buffers take {taken}");
+        assert!(taken as f64 <= 1.05 * asked as f64, "{taken} of {asked}");
     }
 
     #[test]

@@ -1,6 +1,5 @@
 //! A trained signed-distance field on a device: what it is evaluated for after training, in batches that fill the device.
 
-use super::check::planes;
 use super::device::{Buffer, Device};
 use super::draw::Batch;
 use super::march::Samples;
@@ -21,6 +20,15 @@ const FEWER: [usize; 2] = [1 << 10, 1 << 14];
 
 /// Rays marched together.
 const RAYS: usize = 1 << 14;
+
+/// Rows `[n, W]` as planes `[W, capacity]`.
+pub(crate) fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<f32> {
+    let mut out = vec![0.0; W * capacity];
+    for (i, row) in rows.iter().enumerate() {
+        (0..W).for_each(|k| out[k * capacity + i] = row[k]);
+    }
+    out
+}
 
 /// A field and what its evaluation needs.
 pub struct Evaluator {
@@ -145,7 +153,7 @@ impl Evaluator {
 #[cfg(test)]
 mod tests {
     use super::super::device::tests::{agree, device};
-    use super::super::self_test::Case;
+    use super::super::test_case::Case;
     use super::*;
     use crate::kernel::cpu::mlp::Weights;
     use crate::kernel::cpu::{march, rng, sdf};

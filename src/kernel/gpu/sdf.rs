@@ -167,6 +167,11 @@ impl Sdf {
         [6 * features + 3 * HIDDEN + 2 * OUTPUTS + WIDTH + 3, HIDDEN.max(3 * features)]
     }
 
+    /// Returns the memory of the groups' partial gradient sums in words, which does not depend on the number of samples.
+    pub fn words_of_sums(shape: &FieldShape) -> usize {
+        SUMMING * Plan::new(shape.layout()).gradients()[7] * CHANNELS
+    }
+
     /// Returns the output of the last forward pass, planes `[8, capacity]`.
     pub fn output(&self) -> &Buffer {
         &self.out

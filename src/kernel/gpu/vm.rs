@@ -10,13 +10,13 @@ mod losses;
 mod march;
 mod rays;
 mod renderer;
-mod self_test;
+#[cfg(test)]
+mod test_case;
 
 pub use decoder::DeviceDecoder;
 pub use grid::DeviceGrid;
 pub use losses::VmLosses;
 pub use renderer::VmRenderer;
-pub(super) use self_test::checks;
 
 use super::device::Atomics;
 use super::device::{Buffer, Device};

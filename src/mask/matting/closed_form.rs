@@ -23,7 +23,7 @@
 //! symmetric, 12 before the diagonal are kept. A sparse direct factorization (`faer`) was tried in their place: it is no
 //! faster, and for 750 × 1024 unknown pixels it takes 1.9 GB where this takes 0.25.
 
-use super::trimap::{HEAD, UNKNOWN};
+use super::{HEAD, UNKNOWN};
 use crate::geom::cofactors;
 use crate::image::{Gray, Photo};
 use crate::kernel::cpu::cg::{self, dot};

@@ -11,7 +11,7 @@
 
 use super::processor::{self, IMAGENET, Normal};
 use crate::image::{Gray, Photo};
-use crate::mask::click::{self, Click};
+use crate::mask::prompts::{self, Click};
 use crate::mask::scale::bilinear;
 use crate::onnx::{Contract, Engines, NetworkArray, NetworkSession, Role, file_error};
 use crate::{Error, Result};
@@ -211,7 +211,7 @@ impl Sam {
 
     fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<()> {
         // contradictions are looked for at the size that was clicked on: reduced, two clicks may share a pixel
-        click::check_places("the photograph", clicks, width as u32, height as u32)?;
+        prompts::check_places("the photograph", clicks, width as u32, height as u32)?;
         if clicks.len() > MAX_CLICKS {
             return Err(Error::cannot(
                 format!("the photograph has {} clicks, the limit is {MAX_CLICKS}", clicks.len()),

@@ -4,9 +4,9 @@
 //! and alphas, 1e-6 for normalized pixels, 2 of 255 and a mean of 0.3 for resized pictures, 1 % of mask pixels.
 
 use super::Networks;
+use super::alpha::VitMatte;
 use super::processor::IMAGENET;
 use super::sam::{Sam, enlarged, normalized, resized};
-use super::vitmatte::VitMatte;
 use crate::Result;
 use crate::config::{MaskConfig, VitmatteColors};
 use crate::image::{Gray, Photo};

@@ -14,7 +14,7 @@
 //! outside the hull, without evaluating the field. Waves of a flood that starts everywhere are few
 //! and large, so that the field is evaluated at thousands of points at a time.
 
-use super::grid::NodeGrid;
+use super::NodeGrid;
 use super::marching::LevelSet;
 use super::sparse_blocks::Blocks;
 use crate::mesh::input::{answered, setting};

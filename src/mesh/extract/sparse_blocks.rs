@@ -5,7 +5,7 @@
 //! vertex on a block's border has one owner and one index: the block's first plus a count of bits before
 //! it. Nothing is merged by distance.
 
-use super::grid::NodeGrid;
+use super::NodeGrid;
 use super::marching::{LevelSet, cell_point, edge_point, largest_neighbour, sided};
 use super::marching_cell::{CASES, CellSurface, EDGES, INNER, crossed, crossing, resolve};
 use crate::Result;

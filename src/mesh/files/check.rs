@@ -9,8 +9,8 @@
 //!   Shewchuk's error bound (1997); what the bound cannot tell from zero counts as touching.
 //! - sliver: quality `4 √3 · area / Σ edge²` below 0.05 (1 for an equilateral triangle).
 
+use super::file_mesh::places;
 use super::uv_check::{UvReport, bound};
-use super::weld::places;
 use crate::geom::{Aabb, Boxes, DBox, EFFORT, Mesh, intersect, share_out, topology};
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};

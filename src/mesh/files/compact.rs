@@ -8,8 +8,7 @@
 //!
 //! A head of 50,000 triangles, 1,024² texels and four lobes (`draft`): 4.3 MB become 0.9.
 
-use super::glb::{extras, mesh, primitive};
-use super::glb_document::{GlbDocument, info};
+use super::glb::{GlbDocument, extras, info, mesh, primitive};
 use super::glb_json::GlbRoot;
 use super::glb_read::{GlbReader, Primitives, QUANTIZED, chunks};
 use super::source::{PictureSource, ReadOptions, Source};

@@ -11,14 +11,23 @@
 //! several texture coordinates, and the surface stays closed. GLB and textured PLY have one index for
 //! everything, so there vertices are split where corners disagree. The copies are bit-identical in
 //! position and normal: welding equal positions closes the surface again.
+//!
+//! What is wrong with a mesh or a texture that cannot become a file is found before there are any bytes.
+//!
+//! # Tangents
+//!
+//! Tangents for normal maps, as Mikkelsen's program gives them to Blender, Unreal and every baker:
+//! *Simulation of Wrinkled Surfaces Revisited*, 2008, chapter 3.
+//!
+//! A normal map means nothing without the tangents it was baked for. Bake with these, and the file
+//! carries the same ones: `TANGENT` holds the direction of growing u and a sign w, and the bitangent
+//! `w · (n × t)` points up the picture (towards smaller v, since our v runs down).
 
-use super::faults::{check_atlas, check_indices, not_finite, wrong_length, wrong_option};
-use super::tangents;
-use super::texture::HeadTexture;
-use crate::geom::{Mesh, ShellLayer, Shells, Similarity};
+use crate::geom::{Atlas, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Photo;
 use crate::{Error, Result, io};
-use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
+use bevy_mikktspace::{Geometry, TangentSpace, generate_tangents};
+use glam::{DMat3, DVec3, Mat3, Vec2, Vec3, Vec4};
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -184,7 +193,7 @@ impl FileMesh {
             return self;
         }
         let tangents = with_tangents
-            .then(|| tangents::of(&self.positions, &self.normals, &self.triangles, &self.uvs, &self.corners));
+            .then(|| tangents_of(&self.positions, &self.normals, &self.triangles, &self.uvs, &self.corners));
         let mut out = FileMesh::empty(self.translation);
         let mut known: HashMap<(u32, [u32; 2], [u32; 4]), u32> = HashMap::with_capacity(self.positions.len());
         for (t, (vertices, corner)) in self.triangles.iter().zip(&self.corners).enumerate() {
@@ -349,6 +358,261 @@ pub(super) fn left_out(texture: Option<&HeadTexture>, ending: &str) -> Vec<Strin
         ));
     }
     warnings
+}
+
+/// The texture of a mesh: where its triangles lie, and the pictures they lie in.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeadTexture {
+    /// Where the triangles lie in the pictures.
+    pub atlas: Atlas,
+    /// Base color, sRGB-coded; its alpha is not written.
+    pub color: Photo,
+    /// Normals in tangent space: linear, +X along u, +Y up the picture (OpenGL), for the tangents of
+    /// [`tangents()`]. GLB only.
+    pub normal: Option<Photo>,
+    /// What depends on the view. GLB only.
+    pub lobes: Option<Lobes>,
+}
+
+/// View-dependent color of a texture: spherical harmonics of the direction to the viewer.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Lobes {
+    /// One picture a spherical-harmonic function; a byte `b` is `(b − 128) / 127 · scale`.
+    pub pictures: Vec<Photo>,
+    /// Scale of each, sRGB-coded.
+    pub scale: Vec<f32>,
+    /// From directions of the dataset's world to those of the exported files.
+    pub asset_from_world: Mat3,
+}
+
+impl HeadTexture {
+    /// Returns a texture of a base color alone.
+    pub fn new(atlas: Atlas, color: Photo) -> HeadTexture {
+        HeadTexture { atlas, color, normal: None, lobes: None }
+    }
+
+    /// The pictures of the lobes, if there are any.
+    pub(super) fn lobe_pictures(&self) -> &[Photo] {
+        self.lobes.as_ref().map_or(&[], |l| &l.pictures)
+    }
+
+    /// Every picture is whole, and of the atlas's shape; its scale is free.
+    fn check_pictures(&self) -> Result<()> {
+        self.check("base color", &self.color)?;
+        self.normal.as_ref().map_or(Ok(()), |normal| self.check("normal map", normal))?;
+        let mut lobes = self.lobe_pictures().iter().enumerate();
+        lobes.try_for_each(|(k, picture)| self.check(&format!("texture `lobe {k}`"), picture))
+    }
+
+    fn check(&self, what: &str, picture: &Photo) -> Result<()> {
+        let (w, h) = (u64::from(picture.width), u64::from(picture.height));
+        if w * h == 0 || w * h != picture.rgb.len() as u64 {
+            let found = format!("{} pixels for {w} × {h}", picture.rgb.len());
+            return Err(wrong_picture(what, found, "one for each, and at least one"));
+        }
+        if w * u64::from(self.atlas.height) != h * u64::from(self.atlas.width) {
+            let expected = format!("the shape of its atlas, {} × {}", self.atlas.width, self.atlas.height);
+            return Err(wrong_picture(what, format!("{w} × {h} pixels"), &expected));
+        }
+        Ok(())
+    }
+}
+
+const DAMAGED: &str = "the mesh is damaged; extract it again";
+
+/// Every triangle names vertices that are there.
+fn check_indices(mesh: &Mesh) -> Result<()> {
+    let vertices = mesh.positions.len();
+    for (triangle, t) in mesh.triangles.iter().enumerate() {
+        if let Some(index) = t.iter().find(|&&i| i as usize >= vertices) {
+            let what = format!("triangle {triangle} uses vertex {index}, but there are only {vertices}");
+            return Err(Error::cannot(what, DAMAGED));
+        }
+    }
+    Ok(())
+}
+
+/// The atlas belongs to this mesh, and stays on its texture.
+fn check_atlas(mesh: &Mesh, atlas: &Atlas) -> Result<()> {
+    let wrong = |what: String| {
+        Err(Error::cannot(what, "the atlas is damaged or belongs to another mesh; unwrap it again"))
+    };
+    let (found, expected) = (atlas.triangles.len(), mesh.triangles.len());
+    if found != expected {
+        return wrong(format!("the atlas has {found} triangles, the mesh {expected}"));
+    }
+    let uvs = atlas.uvs.len();
+    for (triangle, t) in atlas.triangles.iter().enumerate() {
+        if let Some(index) = t.iter().find(|&&i| i as usize >= uvs) {
+            return wrong(format!(
+                "triangle {triangle} uses texture coordinate {index}, but there are only {uvs}"
+            ));
+        }
+    }
+    let outside = |v: &f32| !(0.0..=1.0).contains(v);
+    match atlas.uvs.iter().position(|uv| uv.to_array().iter().any(outside)) {
+        Some(index) => wrong(format!(
+            "texture coordinate {index} is {}, expected 0 to 1 in both directions",
+            atlas.uvs[index]
+        )),
+        None => Ok(()),
+    }
+}
+
+/// Normals or colors for some vertices only.
+pub(super) fn wrong_length(found: usize, what: &str, vertices: usize) -> Error {
+    Error::cannot(format!("{found} {what} for {vertices} vertices"), DAMAGED)
+}
+
+/// A coordinate that is NaN or infinite, as it is or after turning and scaling.
+fn not_finite(vertex: usize, what: &str, found: String) -> Error {
+    let what = format!("vertex {vertex} has the {what} {found}, which is not finite in single precision");
+    Error::cannot(what, DAMAGED)
+}
+
+/// An up direction without direction, or a unit without size.
+fn wrong_option(what: &str, found: impl ToString, expected: &str) -> Error {
+    let hint = "set it in the configuration, or leave it to the capture";
+    Error::cannot(format!("`{what}` is {}, expected {expected}", found.to_string()), hint)
+}
+
+/// A picture that does not fit its own size or the atlas.
+fn wrong_picture(what: &str, found: String, expected: &str) -> Error {
+    let hint = "bake it again, for this atlas";
+    Error::cannot(format!("the {what} is {found}, expected {expected}"), hint)
+}
+
+/// Returns the tangent at each corner of each triangle: `xyz` unit, `w` ±1. Corners of a vertex agree within
+/// a chart.
+///
+/// # Errors
+///
+/// The atlas does not belong to the mesh, or the mesh has no normals.
+pub fn tangents(mesh: &Mesh, atlas: &Atlas) -> Result<Vec<[Vec4; 3]>> {
+    check_atlas(mesh, atlas)?;
+    let (found, vertices) = (mesh.normals.len(), mesh.positions.len());
+    if found != vertices {
+        return Err(wrong_length(found, "normals", vertices));
+    }
+    check_indices(mesh)?;
+    Ok(tangents_of(&mesh.positions, &mesh.normals, &mesh.triangles, &atlas.uvs, &atlas.triangles))
+}
+
+/// [`tangents`] of parts whose indices are known to be right.
+fn tangents_of(
+    positions: &[Vec3],
+    normals: &[Vec3],
+    triangles: &[[u32; 3]],
+    uvs: &[Vec2],
+    corners: &[[u32; 3]],
+) -> Vec<[Vec4; 3]> {
+    let found = vec![[Vec4::ZERO; 3]; triangles.len()];
+    let mut input = TangentInput { positions, normals, triangles, uvs, corners, found };
+    // it fails only for a mesh where no triangle has an area; what stays 0 is repaired below
+    let _ = generate_tangents(&mut input);
+    let mut found = input.found;
+    for (tangents, vertices) in found.iter_mut().zip(triangles) {
+        for (tangent, &vertex) in tangents.iter_mut().zip(vertices) {
+            *tangent = repaired(*tangent, normals[vertex as usize]);
+        }
+    }
+    found
+}
+
+/// Unit and across the normal, whatever came: triangles without area in the texture have no
+/// direction of their own.
+fn repaired(tangent: Vec4, normal: Vec3) -> Vec4 {
+    let across = tangent.truncate().reject_from(normal);
+    let unit = if tangent.is_finite() && across.length() > 1e-4 {
+        // twice: the first leaves rounding of the f32 that `reject_from` divides by
+        across.normalize().reject_from(normal).normalize()
+    } else {
+        normal.try_normalize().unwrap_or(Vec3::Y).any_orthonormal_vector()
+    };
+    (unit + Vec3::ZERO).extend(if tangent.w < 0.0 { -1.0 } else { 1.0 })
+}
+
+struct TangentInput<'a> {
+    positions: &'a [Vec3],
+    normals: &'a [Vec3],
+    triangles: &'a [[u32; 3]],
+    uvs: &'a [Vec2],
+    corners: &'a [[u32; 3]],
+    found: Vec<[Vec4; 3]>,
+}
+
+impl Geometry for TangentInput<'_> {
+    fn num_faces(&self) -> usize {
+        self.triangles.len()
+    }
+
+    fn num_vertices_of_face(&self, _: usize) -> usize {
+        3
+    }
+
+    fn position(&self, face: usize, corner: usize) -> [f32; 3] {
+        self.positions[self.triangles[face][corner] as usize].to_array()
+    }
+
+    fn normal(&self, face: usize, corner: usize) -> [f32; 3] {
+        self.normals[self.triangles[face][corner] as usize].to_array()
+    }
+
+    /// With v up, as Mikkelsen's program and OpenGL normal maps take it.
+    fn tex_coord(&self, face: usize, corner: usize) -> [f32; 2] {
+        let uv = self.uvs[self.corners[face][corner] as usize];
+        [uv.x, 1.0 - uv.y]
+    }
+
+    fn set_tangent(&mut self, tangent: Option<TangentSpace>, face: usize, corner: usize) {
+        self.found[face][corner] = tangent.map_or(Vec4::ZERO, |t| Vec4::from_array(t.tangent_encoded()));
+    }
+}
+
+/// Returns for each vertex the number of its position, in order of first use, and those positions: files with a
+/// texture repeat vertices at seams. −0 is 0.
+pub(super) fn places(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
+    let mut numbers: HashMap<[u32; 3], u32> = HashMap::with_capacity(mesh.positions.len());
+    let mut welded = Vec::new();
+    let place = |p: &Vec3| {
+        let p = p + Vec3::ZERO; // −0 + 0 is 0
+        *numbers.entry(p.to_array().map(f32::to_bits)).or_insert_with(|| {
+            welded.push(p);
+            welded.len() as u32 - 1
+        })
+    };
+    let places = mesh.positions.iter().map(place).collect();
+    (places, welded)
+}
+
+/// Returns the mesh with equal positions merged, −0 being 0. Triangles keep their number and order, so an atlas
+/// stays parallel to them; those that fold are kept too.
+///
+/// A merged vertex has the color of its first copy, and their common normal; copies that disagree, as
+/// on creases, get the unit of their sum.
+pub fn weld(mesh: &Mesh) -> Mesh {
+    let (new, positions) = places(mesh);
+    let mut creased = vec![false; positions.len()];
+    let mut out = Mesh { positions, ..Mesh::default() };
+    let mut first = 0;
+    for (i, &number) in new.iter().enumerate() {
+        let number = number as usize;
+        if number == first {
+            first += 1;
+            out.colors.extend(mesh.colors.get(i));
+            out.normals.extend(mesh.normals.get(i));
+        } else if let Some(&n) = mesh.normals.get(i)
+            && (creased[number] || out.normals[number] != n)
+        {
+            out.normals[number] += n;
+            creased[number] = true;
+        }
+    }
+    for (normal, _) in out.normals.iter_mut().zip(creased).filter(|(_, creased)| *creased) {
+        *normal = normal.normalize_or_zero();
+    }
+    out.triangles = mesh.triangles.iter().map(|t| t.map(|i| new[i as usize])).collect();
+    out
 }
 
 #[cfg(test)]
@@ -542,5 +806,64 @@ pub(super) mod tests {
         assert_eq!(ending, "jpg");
         assert_eq!(crate::io::parse_photo(&jpeg, path, &limits).unwrap().width, 8);
         assert!(encode("x", &color, Some(0)).is_err());
+    }
+
+    /// A square in the plane z = 0 that looks along +Z, with the picture upright or mirrored.
+    fn square(mirrored: bool) -> (Mesh, Atlas) {
+        let positions = vec![Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y];
+        // v runs down: the top of the picture, v = 0, is at y = 1
+        let uv = |p: &Vec3| Vec2::new(if mirrored { 1.0 - p.x } else { p.x }, 1.0 - p.y);
+        let uvs = positions.iter().map(uv).collect();
+        let triangles = vec![[0, 1, 2], [0, 2, 3]];
+        let atlas = Atlas { uvs, triangles: triangles.clone(), width: 4, height: 4 };
+        (Mesh { normals: vec![Vec3::Z; 4], positions, triangles, colors: vec![] }, atlas)
+    }
+
+    #[test]
+    fn an_upright_picture_has_its_tangent_right_and_its_bitangent_up() {
+        for (mirrored, right, w) in [(false, Vec3::X, 1.0), (true, -Vec3::X, -1.0)] {
+            let (mesh, atlas) = square(mirrored);
+            for tangent in tangents(&mesh, &atlas).unwrap().into_iter().flatten() {
+                assert_eq!(tangent, right.extend(w));
+                // up the picture is +Y of the square
+                assert_eq!(w * Vec3::Z.cross(tangent.truncate()), Vec3::Y);
+            }
+        }
+    }
+
+    #[test]
+    fn a_chart_without_area_still_gets_unit_tangents() {
+        let (mesh, mut atlas) = square(false);
+        atlas.uvs = vec![Vec2::splat(0.5); 4];
+        for tangent in tangents(&mesh, &atlas).unwrap().into_iter().flatten() {
+            assert!((tangent.truncate().length() - 1.0).abs() < 1e-6 && tangent.w.abs() == 1.0);
+            assert!(tangent.truncate().dot(Vec3::Z).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn a_mesh_without_normals_has_no_tangents() {
+        let (mut mesh, atlas) = square(false);
+        mesh.normals.clear();
+        assert_eq!(tangents(&mesh, &atlas).unwrap_err().to_string(), "0 normals for 4 vertices");
+    }
+
+    #[test]
+    fn copies_become_one_and_creases_share_a_normal() {
+        let mesh = Mesh {
+            positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y, -Vec3::ZERO, Vec3::Y, Vec3::X],
+            normals: vec![Vec3::Z, Vec3::Z, Vec3::X, Vec3::Z, Vec3::Y, Vec3::Z],
+            colors: (0..6).map(|i| [i as f32; 3]).collect(),
+            triangles: vec![[0, 1, 2], [3, 4, 5]],
+        };
+        let welded = weld(&mesh);
+        assert_eq!(welded.positions, [Vec3::ZERO, Vec3::X, Vec3::Y]);
+        assert_eq!(welded.triangles, [[0, 1, 2], [0, 2, 1]]);
+        assert_eq!(welded.colors, [[0.0; 3], [1.0; 3], [2.0; 3]]);
+        // x + y, normalized
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        assert_eq!(&welded.normals[..2], [Vec3::Z; 2]);
+        assert!(welded.normals[2].distance(Vec3::new(half, half, 0.0)) < 1e-6);
+        assert!(welded.is_closed());
     }
 }

@@ -1,10 +1,21 @@
 //! Meshes as tensors, for the stages after this one: in scene coordinates, since the world may lie so far away that
 //! f32 could not hold a head in it.
+//!
+//! - The extracted surface, as the stages after this one find it: what rays are cast at.
+//! - The head mesh: what an artist opens, and what the stages after this one find of it.
+//!
+//! ```text
+//! geometry.safetensors             the mesh, and where it lies in its texture
+//! color.png normal.png lobe_K.png  the pictures of its texture
+//! ```
 
-use crate::geom::{Mesh, Similarity};
+use super::file_mesh::{HeadTexture, Lobes};
+use crate::geom::{Aabb, Atlas, Harmonics, Mesh, ShellLayer, Shells, Similarity};
+use crate::image::Photo;
 use crate::io::{self, Limits, ReadError, TensorValues};
+use crate::mesh::extract::{Cap, Skin};
 use crate::{Error, Result};
-use glam::{DMat3, DVec3, Vec3};
+use glam::{DMat3, DVec3, Mat3, Vec2, Vec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -13,7 +24,7 @@ pub(crate) const FORMAT: &str = "tiface-mesh-2";
 
 const MAKE_AGAIN: &str = "make the mesh again: `tiface mesh RUN --fresh mesh`";
 
-pub(super) type Tensor = (String, Vec<usize>, TensorValues);
+type Tensor = (String, Vec<usize>, TensorValues);
 
 /// `[n, N]` numbers.
 pub(super) fn floats<const N: usize>(name: &str, values: &[[f32; N]]) -> Tensor {
@@ -26,7 +37,7 @@ pub(super) fn indices(name: &str, values: &[[u32; 3]]) -> Tensor {
 }
 
 /// The tensors of a mesh.
-pub(super) fn geometry(mesh: &Mesh) -> Vec<Tensor> {
+fn geometry(mesh: &Mesh) -> Vec<Tensor> {
     vec![
         floats::<3>("positions", bytemuck::cast_slice(&mesh.positions)),
         floats::<3>("normals", bytemuck::cast_slice(&mesh.normals)),
@@ -49,14 +60,14 @@ pub(super) fn damaged(e: ReadError) -> Error {
 }
 
 /// Tensors that have been read, and where.
-pub(super) struct StoredTensors {
+struct StoredTensors {
     path: PathBuf,
     tensors: BTreeMap<String, (Vec<usize>, TensorValues)>,
-    pub metadata: BTreeMap<String, String>,
+    metadata: BTreeMap<String, String>,
 }
 
 impl StoredTensors {
-    pub fn open(path: &Path) -> Result<StoredTensors> {
+    fn open(path: &Path) -> Result<StoredTensors> {
         let wrong = |what: &str| Err(Error::cannot(format!("`{}`: {what}", path.display()), MAKE_AGAIN));
         if !io::is_file(path) {
             return wrong("it is not there");
@@ -71,21 +82,21 @@ impl StoredTensors {
         }
     }
 
-    pub fn contains(&self, name: &str) -> bool {
+    fn contains(&self, name: &str) -> bool {
         self.tensors.contains_key(name)
     }
 
-    pub fn missing(&self, name: &str) -> Error {
+    fn missing(&self, name: &str) -> Error {
         let what = format!("`{}`: `{name}` is missing or of another shape", self.path.display());
         Error::cannot(what, MAKE_AGAIN)
     }
 
-    pub fn wrong(&self, key: &str, found: impl ToString, expected: &str) -> Error {
+    fn wrong(&self, key: &str, found: impl ToString, expected: &str) -> Error {
         damaged(ReadError::value(&self.path, key, found, expected))
     }
 
     /// `[n, N]` numbers.
-    pub fn rows<const N: usize>(&mut self, name: &str) -> Result<Vec<[f32; N]>> {
+    fn rows<const N: usize>(&mut self, name: &str) -> Result<Vec<[f32; N]>> {
         match self.tensors.remove(name) {
             Some((shape, TensorValues::F32(v))) if shape.len() == 2 && shape[1] == N => {
                 Ok(v.as_chunks::<N>().0.to_vec())
@@ -95,7 +106,7 @@ impl StoredTensors {
     }
 
     /// `[vertices, n, 3]` numbers, and `n`.
-    pub fn per_vertex(&mut self, name: &str, vertices: usize) -> Result<(usize, Vec<[f32; 3]>)> {
+    fn per_vertex(&mut self, name: &str, vertices: usize) -> Result<(usize, Vec<[f32; 3]>)> {
         match self.tensors.remove(name) {
             Some((shape, TensorValues::F32(v)))
                 if shape.len() == 3 && shape[0] == vertices && shape[1] > 0 && shape[2] == 3 =>
@@ -107,7 +118,7 @@ impl StoredTensors {
     }
 
     /// `[n, count]` numbers, a list for each of the `n`.
-    pub fn each_of(&mut self, count: usize, name: &str) -> Result<Vec<Vec<f32>>> {
+    fn each_of(&mut self, count: usize, name: &str) -> Result<Vec<Vec<f32>>> {
         match self.tensors.remove(name) {
             Some((shape, TensorValues::F32(v))) if shape.len() == 2 && shape[1] == count && count > 0 => {
                 Ok(v.chunks_exact(count).map(<[f32]>::to_vec).collect())
@@ -117,12 +128,12 @@ impl StoredTensors {
     }
 
     /// `[n, 3]` numbers.
-    pub fn vectors(&mut self, name: &str) -> Result<Vec<Vec3>> {
+    fn vectors(&mut self, name: &str) -> Result<Vec<Vec3>> {
         Ok(self.rows(name)?.into_iter().map(Vec3::from).collect())
     }
 
     /// `[n, 3]` indices below a bound.
-    pub fn indices(&mut self, name: &str, below: usize) -> Result<Vec<[u32; 3]>> {
+    fn indices(&mut self, name: &str, below: usize) -> Result<Vec<[u32; 3]>> {
         match self.tensors.remove(name) {
             Some((shape, TensorValues::U32(v)))
                 if shape.len() == 2 && shape[1] == 3 && v.iter().all(|&i| (i as usize) < below) =>
@@ -133,7 +144,7 @@ impl StoredTensors {
         }
     }
 
-    pub fn mesh(&mut self) -> Result<Mesh> {
+    fn mesh(&mut self) -> Result<Mesh> {
         let (positions, normals) = (self.vectors("positions")?, self.vectors("normals")?);
         let colors = self.rows("colors")?;
         for (name, found) in [("normals", normals.len()), ("colors", colors.len())] {
@@ -149,7 +160,7 @@ impl StoredTensors {
     }
 
     /// Scale, rotation by columns, translation.
-    pub fn similarity(&mut self, name: &str) -> Result<Similarity> {
+    fn similarity(&mut self, name: &str) -> Result<Similarity> {
         let Some((_, TensorValues::F64(v))) = self.tensors.remove(name) else {
             return Err(self.missing(name));
         };
@@ -160,5 +171,350 @@ impl StoredTensors {
             None => Ok(found),
             Some((part, found, expected)) => Err(self.wrong(&format!("{name}.{part}"), found, expected)),
         }
+    }
+}
+
+const SURFACE_FILE: &str = "surface.safetensors";
+
+/// The whole zero level set of a field, in scene coordinates.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ExtractedSurface {
+    /// Without colors: those of rays are the field's.
+    pub mesh: Mesh,
+    /// What closes it where the box ends.
+    pub cap: Option<Cap>,
+}
+
+impl ExtractedSurface {
+    /// Writes it into a folder, which is made if need be.
+    ///
+    /// # Errors
+    ///
+    /// The folder cannot be written to.
+    pub fn save(&self, folder: &Path) -> Result<()> {
+        io::create_folder(folder)?;
+        let mut tensors = geometry(&self.mesh);
+        if let Some(cap) = &self.cap {
+            let of = |value: &dyn Fn(&Skin) -> [f32; 3]| cap.ring.iter().map(value).collect::<Vec<_>>();
+            tensors.push(floats("cap_box", &[cap.bounds.min.to_array(), cap.bounds.max.to_array()]));
+            tensors.push(floats("cap_near", &[[cap.near]]));
+            tensors.push(floats("cap_ring", &of(&|s| s.position.to_array())));
+            tensors.push(floats("cap_ring_normals", &of(&|s| s.normal.to_array())));
+            tensors.push(floats("cap_ring_colors", &of(&|s| s.color)));
+        }
+        Ok(io::write_tensors(&folder.join(SURFACE_FILE), &tensors, &format())?)
+    }
+
+    /// Reads it back.
+    ///
+    /// # Errors
+    ///
+    /// The file is missing, damaged or of another version; the suggested fix is to make it again.
+    pub fn load(folder: &Path) -> Result<ExtractedSurface> {
+        let mut stored = StoredTensors::open(&folder.join(SURFACE_FILE))?;
+        let mesh = stored.mesh()?;
+        if !stored.contains("cap_box") {
+            return Ok(ExtractedSurface { mesh, cap: None });
+        }
+        let near = stored.rows::<1>("cap_near")?;
+        let (corners, ring) = (stored.vectors("cap_box")?, stored.vectors("cap_ring")?);
+        let (normals, colors) = (stored.vectors("cap_ring_normals")?, stored.rows("cap_ring_colors")?);
+        let (&[min, max], &[[near]]) = (&corners[..], &near[..]) else {
+            return Err(stored.missing("cap_box"));
+        };
+        if normals.len() != ring.len() || colors.len() != ring.len() {
+            return Err(stored.missing("cap_ring"));
+        }
+        let ring = ring.into_iter().zip(normals).zip(colors);
+        let ring = ring.map(|((position, normal), color)| Skin { position, normal, color }).collect();
+        if min.cmpge(max).any() {
+            return Err(stored.wrong("cap_box", format!("{min} to {max}"), "a box, its lowest corner first"));
+        }
+        if near < 0.0 {
+            return Err(stored.wrong("cap_near", near, "0 or more"));
+        }
+        Ok(ExtractedSurface { mesh, cap: Some(Cap { bounds: Aabb { min, max }, near, ring }) })
+    }
+}
+
+const HEAD_FILE: &str = "geometry.safetensors";
+
+/// Most functions of a spherical-harmonic color.
+const MOST_LOBES: usize = 16;
+
+/// A simplified mesh with its texture.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeadMesh {
+    /// The surface in scene coordinates; without a texture it has colors at its vertices.
+    pub mesh: Mesh,
+    /// Where the scene sits in the dataset's world.
+    pub world_from_scene: Similarity,
+    /// Its texture, if it has one.
+    pub texture: Option<HeadTexture>,
+    /// What views of it add to its base color, if photographs told.
+    pub harmonics: Option<Harmonics>,
+    /// Soft layers around it, if they show more of the head.
+    pub shells: Option<Shells>,
+}
+
+impl HeadMesh {
+    /// Writes it into a folder, which is made if need be.
+    ///
+    /// # Errors
+    ///
+    /// The folder cannot be written to.
+    pub fn save(&self, folder: &Path) -> Result<()> {
+        io::create_folder(folder)?;
+        let mut tensors = geometry(&self.mesh);
+        let Similarity { scale, rotation, translation } = self.world_from_scene;
+        let mut place = vec![scale];
+        place.extend(rotation.to_cols_array());
+        place.extend(translation.to_array());
+        tensors.push(("world_from_scene".into(), vec![place.len()], TensorValues::F64(place)));
+        if let Some(harmonics) = &self.harmonics {
+            let count = harmonics.functions;
+            let values = harmonics.coefficients.as_flattened().to_vec();
+            let shape = vec![harmonics.coefficients.len() / count, count, 3];
+            tensors.push(("harmonics".into(), shape, TensorValues::F32(values)));
+            tensors.push(floats("harmonics_from_scene", &harmonics.turned.to_cols_array_2d()));
+        }
+        if let Some(Shells { layers }) = &self.shells {
+            let tensor = |name: &str, values: &dyn Fn(&ShellLayer) -> Vec<f32>| {
+                let all: Vec<f32> = layers.iter().flat_map(values).collect();
+                (name.into(), vec![layers.len(), self.mesh.positions.len()], TensorValues::F32(all))
+            };
+            tensors.push(tensor("shell_offsets", &|layer| layer.offsets.clone()));
+            tensors.push(tensor("shell_alphas", &|layer| layer.alphas.clone()));
+        }
+        let mut metadata = format();
+        if let Some(texture) = &self.texture {
+            tensors.push(floats::<2>("uvs", bytemuck::cast_slice(&texture.atlas.uvs)));
+            tensors.push(indices("uv_triangles", &texture.atlas.triangles));
+            let write = |name: &str, photo: &Photo| {
+                io::write_png_rgb(&folder.join(name), photo.width, photo.height, &photo.rgb)
+            };
+            write("color.png", &texture.color)?;
+            if let Some(normal) = &texture.normal {
+                write("normal.png", normal)?;
+                metadata.insert("normal".into(), "normal.png".into());
+            }
+            if let Some(lobes) = &texture.lobes {
+                for (k, picture) in lobes.pictures.iter().enumerate() {
+                    write(&format!("lobe_{k}.png"), picture)?;
+                }
+                tensors.push(floats::<1>("lobe_scale", bytemuck::cast_slice(&lobes.scale)));
+                tensors.push(floats("asset_from_world", &lobes.asset_from_world.to_cols_array_2d()));
+            }
+        }
+        Ok(io::write_tensors(&folder.join(HEAD_FILE), &tensors, &metadata)?)
+    }
+
+    /// Reads it back.
+    ///
+    /// # Errors
+    ///
+    /// Files are missing, damaged or of another version; the suggested fix is to make them again.
+    pub fn load(folder: &Path) -> Result<HeadMesh> {
+        let mut stored = StoredTensors::open(&folder.join(HEAD_FILE))?;
+        let (mesh, world_from_scene) = (stored.mesh()?, stored.similarity("world_from_scene")?);
+        let texture = stored.contains("uvs").then(|| load_texture(folder, &mut stored, &mesh)).transpose()?;
+        let harmonics =
+            stored.contains("harmonics").then(|| load_harmonics(&mut stored, &mesh)).transpose()?;
+        let shells = stored.contains("shell_alphas").then(|| load_shells(&mut stored, &mesh)).transpose()?;
+        Ok(HeadMesh { mesh, world_from_scene, texture, harmonics, shells })
+    }
+}
+
+fn load_texture(folder: &Path, stored: &mut StoredTensors, mesh: &Mesh) -> Result<HeadTexture> {
+    let color = load_photo(folder, "color.png", None)?;
+    let (width, height) = (color.width, color.height);
+    let uvs: Vec<Vec2> = stored.rows::<2>("uvs")?.into_iter().map(Vec2::from).collect();
+    let triangles = stored.indices("uv_triangles", uvs.len())?;
+    if triangles.len() != mesh.triangles.len() {
+        return Err(stored.missing("uv_triangles"));
+    }
+    let mut texture = HeadTexture::new(Atlas { uvs, triangles, width, height }, color);
+    let size = Some((width, height));
+    if stored.metadata.contains_key("normal") {
+        texture.normal = Some(load_photo(folder, "normal.png", size)?);
+    }
+    if stored.contains("lobe_scale") {
+        let scale = stored.rows::<1>("lobe_scale")?.into_flattened();
+        let turned = stored.rows::<3>("asset_from_world")?;
+        let &[x, y, z] = &turned[..] else { return Err(stored.missing("asset_from_world")) };
+        if scale.len() > MOST_LOBES {
+            return Err(stored.missing("lobe_scale"));
+        }
+        let pictures = (0..scale.len()).map(|k| load_photo(folder, &format!("lobe_{k}.png"), size));
+        let (pictures, asset_from_world) =
+            (pictures.collect::<Result<_>>()?, Mat3::from_cols(x.into(), y.into(), z.into()));
+        texture.lobes = Some(Lobes { pictures, scale, asset_from_world });
+    }
+    Ok(texture)
+}
+
+fn load_harmonics(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Harmonics> {
+    let (functions, coefficients) = stored.per_vertex("harmonics", mesh.positions.len())?;
+    let &[x, y, z] = &stored.rows::<3>("harmonics_from_scene")?[..] else {
+        return Err(stored.missing("harmonics_from_scene"));
+    };
+    if functions > MOST_LOBES {
+        return Err(stored.missing("harmonics"));
+    }
+    Ok(Harmonics { functions, coefficients, turned: Mat3::from_cols(x.into(), y.into(), z.into()) })
+}
+
+fn load_shells(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Shells> {
+    let vertices = mesh.positions.len();
+    if mesh.normals.len() != vertices {
+        return Err(stored.missing("normals"));
+    }
+    let (offsets, alphas) =
+        (stored.each_of(vertices, "shell_offsets")?, stored.each_of(vertices, "shell_alphas")?);
+    if offsets.len() != alphas.len() || !alphas.iter().flatten().all(|a| (0.0..=1.0).contains(a)) {
+        return Err(stored.missing("shell_alphas"));
+    }
+    let layer = |(offsets, alphas)| ShellLayer { offsets, alphas };
+    Ok(Shells { layers: offsets.into_iter().zip(alphas).map(layer).collect() })
+}
+
+/// A picture of the texture; all have the size of the first.
+fn load_photo(folder: &Path, name: &str, size: Option<(u32, u32)>) -> Result<Photo> {
+    let path = folder.join(name);
+    let photo = io::read_photo(&path, size, &Limits::default()).map_err(damaged)?;
+    let (w, h) = (photo.width, photo.height);
+    match size.filter(|size| *size != (w, h)) {
+        None => Ok(photo),
+        Some(size) => {
+            let expected = format!("{} × {}, as `color.png`", size.0, size.1);
+            Err(damaged(ReadError::value(&path, "size", format!("{w} × {h} pixels"), expected)))
+        }
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use glam::{DMat3, DVec3, Vec3};
+
+    #[test]
+    fn a_surface_comes_back_with_its_cap() {
+        let dir = tempfile::tempdir().unwrap();
+        let skin = |x: f32| Skin { position: Vec3::splat(x), normal: Vec3::Y, color: [x, 0.5, 0.25] };
+        let cap = Cap { bounds: Aabb::SCENE, near: 1e-5, ring: vec![skin(0.1), skin(0.2)] };
+        let mesh = Mesh { colors: Vec::new(), ..head().mesh };
+        for cap in [Some(Cap { ring: Vec::new(), ..cap.clone() }), Some(cap), None] {
+            let whole = ExtractedSurface { mesh: mesh.clone(), cap };
+            whole.save(dir.path()).unwrap();
+            assert_eq!(ExtractedSurface::load(dir.path()).unwrap(), whole);
+        }
+    }
+
+    #[test]
+    fn a_hostile_cap_is_refused_with_its_key() {
+        let dir = tempfile::tempdir().unwrap();
+        let error = |bounds: Aabb, near: f32| {
+            let mesh = Mesh { colors: Vec::new(), ..head().mesh };
+            ExtractedSurface { mesh, cap: Some(Cap { bounds, near, ring: Vec::new() }) }
+                .save(dir.path())
+                .unwrap();
+            let error = ExtractedSurface::load(dir.path()).unwrap_err();
+            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+            error.to_string()
+        };
+        let swapped = Aabb { min: Vec3::ONE, max: Vec3::NEG_ONE };
+        assert!(error(swapped, 1e-5).contains("`cap_box`"));
+        assert!(error(Aabb::SCENE, -1.0).contains("`cap_near` is -1, expected 0 or more"));
+        std::fs::write(dir.path().join("surface.safetensors"), b"torn").unwrap();
+        assert!(ExtractedSurface::load(dir.path()).unwrap_err().hint().contains("--fresh mesh"));
+        let missing = ExtractedSurface::load(&dir.path().join("nothing")).unwrap_err();
+        assert!(missing.hint().contains("--fresh mesh"), "{missing:?}");
+    }
+
+    /// A tetrahedron far away, with everything.
+    pub fn head() -> HeadMesh {
+        let at = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)];
+        let mesh = Mesh {
+            positions: at.map(|(x, y, z)| Vec3::new(x, y, z)).to_vec(),
+            normals: vec![Vec3::Z; 4],
+            colors: vec![[0.5; 3]; 4],
+            triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+        };
+        let photo = |b: u8| Photo { width: 8, height: 8, rgb: vec![[b, 1, 2]; 64], alpha: None };
+        let atlas = Atlas {
+            uvs: vec![Vec2::ZERO, Vec2::X, Vec2::ONE],
+            triangles: vec![[0, 1, 2]; 4],
+            width: 8,
+            height: 8,
+        };
+        let lobes = Lobes {
+            pictures: (0..4).map(|k| photo(100 + k)).collect(),
+            scale: vec![0.1, 0.2, 0.3, 0.4],
+            asset_from_world: Mat3::from_rotation_x(0.5),
+        };
+        let texture = HeadTexture { atlas, color: photo(9), normal: Some(photo(128)), lobes: Some(lobes) };
+        let world_from_scene = Similarity {
+            scale: 0.125,
+            rotation: DMat3::from_rotation_x(0.3),
+            translation: DVec3::new(5e6, -3e6, 2e5),
+        };
+        let coefficients = (0..16).map(|i| [0.1 * i as f32, -0.2, 0.3]).collect();
+        let harmonics = Some(Harmonics { functions: 4, coefficients, turned: Mat3::from_rotation_y(0.2) });
+        let layer = ShellLayer { offsets: vec![0.1, 0.2, 0.3, 0.0], alphas: vec![0.5, 0.25, 1.0, 0.0] };
+        let shells =
+            Some(Shells { layers: vec![layer.clone(), ShellLayer { offsets: vec![0.5; 4], ..layer }] });
+        HeadMesh { mesh, world_from_scene, texture: Some(texture), harmonics, shells }
+    }
+
+    #[test]
+    fn parts_are_read_back_as_they_were() {
+        let dir = tempfile::tempdir().unwrap();
+        let whole = head();
+        whole.save(dir.path()).unwrap();
+        assert_eq!(HeadMesh::load(dir.path()).unwrap(), whole);
+        let bare = HeadMesh { texture: None, harmonics: None, shells: None, ..whole };
+        bare.save(dir.path()).unwrap();
+        assert_eq!(HeadMesh::load(dir.path()).unwrap(), bare);
+    }
+
+    /// A picture of another size than the texture.
+    fn odd() -> Photo {
+        Photo { width: 3, height: 1, rgb: vec![[1, 2, 3]; 3], alpha: None }
+    }
+
+    #[test]
+    fn damaged_and_older_parts_are_named_with_a_fix() {
+        let dir = tempfile::tempdir().unwrap();
+        let error = |change: &dyn Fn(&mut HeadMesh)| {
+            let mut head = head();
+            change(&mut head);
+            head.save(dir.path()).unwrap();
+            let error = HeadMesh::load(dir.path()).unwrap_err();
+            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+            error.to_string()
+        };
+        assert!(error(&|p| p.mesh.triangles[2] = [0, 1, 9]).contains("`triangles`"));
+        assert!(error(&|p| p.mesh.normals.truncate(2)).contains("`normals`"));
+        assert!(error(&|p| p.mesh.triangles.clear()).contains("`triangles`"));
+        assert!(error(&|p| p.world_from_scene.scale = -1.0).contains("`world_from_scene.scale` is -1"));
+        assert!(error(&|p| p.world_from_scene.scale = 0.0).contains("`world_from_scene.scale`"));
+        assert!(
+            error(&|p| p.world_from_scene.rotation.x_axis *= -1.0).contains("`world_from_scene.rotation`")
+        );
+        assert!(error(&|p| p.texture.as_mut().unwrap().normal = Some(odd())).contains("`size`"));
+        assert!(error(&|p| p.texture.as_mut().unwrap().atlas.triangles.truncate(1)).contains("uv_triangles"));
+        let cut = |p: &mut HeadMesh| p.harmonics.as_mut().unwrap().coefficients.truncate(12);
+        assert!(error(&cut).contains("`harmonics`"));
+        let opaque = |p: &mut HeadMesh| p.shells.as_mut().unwrap().layers[1].alphas[2] = 1.5;
+        assert!(error(&opaque).contains("`shell_alphas`"));
+        let old = std::collections::BTreeMap::from([("format".to_owned(), "tiface-mesh-1".to_owned())]);
+        io::write_tensors(&dir.path().join("geometry.safetensors"), &geometry(&head().mesh), &old).unwrap();
+        for error in [
+            HeadMesh::load(dir.path()).unwrap_err(),
+            HeadMesh::load(&dir.path().join("nothing")).unwrap_err(),
+        ] {
+            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+        }
+        assert!(HeadMesh::load(dir.path()).unwrap_err().to_string().contains("`tiface-mesh-1`"));
     }
 }

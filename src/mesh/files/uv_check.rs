@@ -11,7 +11,7 @@
 //!
 //! Texels are square even where the texture is not: all of it is measured in texels.
 
-use super::weld::places;
+use super::file_mesh::places;
 use crate::geom::{
     Atlas, EFFORT, Mesh, OutlineSide, Sets, nearest_charts, overlaps, shared_area, side_ends, sorted_sides,
     turn,

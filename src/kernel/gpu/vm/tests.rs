@@ -1,7 +1,7 @@
 use super::super::Atomics;
 use super::super::device::Words;
 use super::super::device::tests::{agree, device, devices, planes};
-use super::self_test::{NARROW, Shape, There, case, on_cpu, room};
+use super::test_case::{NARROW, Shape, There, case, on_cpu, room};
 use super::*;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm};
 use crate::kernel::cpu::vm::mask::Walk;

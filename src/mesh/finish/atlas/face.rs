@@ -5,11 +5,9 @@
 //! flattened in one piece by a smooth copy, and relaxed to its true sizes; the rim is the plane's contour, short and
 //! out of the way. The rest is divided as any surface.
 
+use super::chart::{NONE, neighbours, part, straighten, stretch};
 use super::divide::divide;
-use super::library::{ChartSet, STRETCHED, flatten};
-use super::patch::{NONE, neighbours, part, straighten, stretch};
-use super::relax::relax;
-use super::smooth::smoothed;
+use super::flatten::{ChartSet, STRETCHED, flatten, relax, smoothed};
 use crate::geom::Mesh;
 use crate::{Monitor, Result};
 use glam::Vec3;

@@ -4,12 +4,22 @@
 //! charts come closer than twice that. Each is turned to where its upper end is lowest. Drawing the shapes is what
 //! costs, placing them takes a millisecond: so they are drawn once, and many orders are tried, each a change to the
 //! best one so far, on squares that get smaller cell by cell.
+//!
+//! Shapes of charts on a grid of cells: every cell that a chart grown by its gutter touches.
+//!
+//! # Half squares
+//!
+//! The plain way to lay a mesh into a texture: every triangle the half of a square, in rows.
+//!
+//! Works for any triangles, at the price of a seam along every edge. Two halves share a square: right angles
+//! in opposite corners, `gap` to the square's sides and 2 gap between the long sides.
 
-use super::flat::Flat;
-use super::raster::{Mask, Page};
+use super::chart::{Flat, widest};
+use super::{AtlasConfig, AtlasLayout};
+use crate::geom::{Atlas, Mesh};
 use crate::kernel::cpu::rng::mix;
 use crate::{Error, Monitor, Result};
-use glam::DVec2;
+use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
 /// Cells along the texture, about: between four and five texels each of 2048.
@@ -207,10 +217,271 @@ fn too_small() -> Error {
     Error::cannot("the charts do not fit into the texture", "")
 }
 
+/// A chart's shape: its width and height in cells and, row by row, which of them are taken.
+#[derive(Clone, Debug, Default)]
+struct Mask {
+    width: usize,
+    height: usize,
+    /// Taken cells `[from, to)`, all rows one after the other.
+    spans: Vec<[u32; 2]>,
+    /// Where each row's spans begin, and the end of the last.
+    starts: Vec<u32>,
+    /// The longest span of each row.
+    longest: Vec<u32>,
+    /// Rows in an order that finds a collision early: ends, middle, quarters.
+    order: Vec<u32>,
+}
+
+impl Mask {
+    fn row(&self, y: usize) -> &[[u32; 2]] {
+        &self.spans[self.starts[y] as usize..self.starts[y + 1] as usize]
+    }
+
+    /// The shape within an outline whose lowest coordinates are 0, grown by `reach`, so that the outline's
+    /// lowest corner lies at (`reach`, `reach`). Cells are squares of one unit.
+    fn of(outline: &[[DVec2; 2]], high: DVec2, reach: f64) -> Mask {
+        let [width, height] = (high + 2.0 * reach).to_array().map(|v| (v.ceil() as usize).max(1));
+        let words = width.div_ceil(64);
+        let (mut near, mut within) = (vec![0u64; words * height], vec![0u64; words * height]);
+        for &[a, b] in outline {
+            let (a, b) = (a + reach, b + reach);
+            grown_side(&mut near, a, b, reach, [width, height]);
+            // even-odd filling at the cells' centres: a side turns over all that is right of it
+            let (low, high) = if a.y < b.y { (a, b) } else { (b, a) };
+            let (from, to) =
+                ((low.y - 0.5).ceil().max(0.0) as usize, (high.y - 0.5).ceil().max(0.0) as usize);
+            let slope = (high.x - low.x) / (high.y - low.y);
+            for y in from..to.min(height) {
+                let x = (low.x + slope * (y as f64 + 0.5 - low.y) - 0.5).ceil().max(0.0) as usize;
+                let row = &mut within[y * words..(y + 1) * words];
+                if x < width {
+                    row[x / 64] ^= !0 << (x % 64);
+                    row[x / 64 + 1..].iter_mut().for_each(|w| *w = !*w);
+                }
+            }
+        }
+        let mut mask = Mask { width, height, ..Mask::default() };
+        mask.starts.push(0);
+        for y in 0..height {
+            let rows = y * words..(y + 1) * words;
+            let row: &mut [u64] = &mut near[rows.clone()];
+            row.iter_mut().zip(&within[rows]).for_each(|(n, w)| *n |= w);
+            let (mut at, mut longest) = (0, 0);
+            loop {
+                let from = next(row, at, width, true);
+                if from == width {
+                    break;
+                }
+                at = next(row, from, width, false);
+                longest = longest.max(at - from);
+                mask.spans.push([from as u32, at as u32]);
+            }
+            mask.longest.push(longest as u32);
+            mask.starts.push(mask.spans.len() as u32);
+        }
+        mask.order = coarse_to_fine(height);
+        mask
+    }
+}
+
+/// Takes the cells that come within `reach` of a side: per row of cells the interval of two discs and the
+/// rectangle between them, which together are convex.
+fn grown_side(bits: &mut [u64], a: DVec2, b: DVec2, reach: f64, [width, height]: [usize; 2]) {
+    let words = width.div_ceil(64);
+    let (low, high) = (a.y.min(b.y) - reach, a.y.max(b.y) + reach);
+    let normal = (b - a).perp().normalize_or_zero() * reach;
+    let quad = [a + normal, b + normal, b - normal, a - normal];
+    let last = (high.floor().max(0.0) as usize).min(height - 1);
+    for y in low.floor().max(0.0) as usize..=last {
+        let (top, bottom) = (y as f64, y as f64 + 1.0);
+        let (mut from, mut to) = (f64::INFINITY, f64::NEG_INFINITY);
+        for center in [a, b] {
+            let away = (top - center.y).max(center.y - bottom).max(0.0);
+            if away <= reach {
+                let half = (reach * reach - away * away).sqrt();
+                (from, to) = (from.min(center.x - half), to.max(center.x + half));
+            }
+        }
+        for k in 0..4 {
+            let (p, q) = (quad[k], quad[(k + 1) % 4]);
+            let (p, q) = if p.y <= q.y { (p, q) } else { (q, p) };
+            let (begin, end) = (p.y.max(top), q.y.min(bottom));
+            if begin <= end {
+                let slope = if q.y > p.y { (q.x - p.x) / (q.y - p.y) } else { 0.0 };
+                let (x, z) = (p.x + slope * (begin - p.y), p.x + slope * (end - p.y));
+                (from, to) = (from.min(x).min(z), to.max(x).max(z));
+                if p.y == q.y {
+                    (from, to) = (from.min(q.x), to.max(q.x));
+                }
+            }
+        }
+        let (from, to) = (from.floor().max(0.0), to.ceil());
+        if from < to && from < width as f64 {
+            fill(&mut bits[y * words..(y + 1) * words], from as usize, (to as usize).min(width));
+        }
+    }
+}
+
+/// Sets the bits `from..to` of a row.
+fn fill(row: &mut [u64], from: usize, to: usize) {
+    for w in from / 64..to.div_ceil(64) {
+        let (first, last) = (from.max(w * 64), to.min(w * 64 + 64));
+        row[w] |= !0u64 >> (64 - (last - first)) << (first - w * 64);
+    }
+}
+
+/// The first bit of a row from x on that is set (or clear); `end` if there is none before it.
+fn next(row: &[u64], x: usize, end: usize, set: bool) -> usize {
+    if x >= end {
+        return end;
+    }
+    let flip = if set { 0 } else { !0 };
+    let mut w = x / 64;
+    let mut word = (row[w] ^ flip) & (!0 << (x % 64));
+    while word == 0 {
+        w += 1;
+        if w == row.len() {
+            return end;
+        }
+        word = row[w] ^ flip;
+    }
+    (w * 64 + word.trailing_zeros() as usize).min(end)
+}
+
+/// `0..n` by halving: 0, n − 1, the middle, the quarters, ...
+fn coarse_to_fine(n: usize) -> Vec<u32> {
+    let mut order: Vec<u32> = (0..n as u32).collect();
+    // more trailing zeros come first; the sort is stable
+    order.sort_by_key(|&i| if i == 0 || i as usize + 1 == n { 0 } else { 32 - i.trailing_zeros() });
+    order
+}
+
+/// The texture as a grid of cells, taken or free.
+struct Page {
+    side: usize,
+    words: usize,
+    bits: Vec<u64>,
+    /// Longest run of free cells in each row.
+    free: Vec<u32>,
+}
+
+impl Page {
+    fn new(side: usize) -> Page {
+        let words = side.div_ceil(64);
+        Page { side, words, bits: vec![0; words * side], free: vec![side as u32; side] }
+    }
+
+    /// The first cell of a row from x on that is taken (or free); `side` if there is none.
+    fn next(&self, y: usize, x: usize, taken: bool) -> usize {
+        next(&self.bits[y * self.words..(y + 1) * self.words], x, self.side, taken)
+    }
+
+    /// The lowest and then leftmost place for a mask whose upper end stays below `limit`.
+    fn find(&self, mask: &Mask, limit: usize) -> Option<(usize, usize)> {
+        if mask.width > self.side || mask.height > self.side {
+            return None;
+        }
+        let (mut stuck, mut narrow) = (0, 0);
+        for y in 0..=self.side - mask.height {
+            if y + mask.height >= limit {
+                return None;
+            }
+            let too_narrow = |r: usize| self.free[y + r] < mask.longest[r];
+            if too_narrow(narrow) {
+                continue;
+            }
+            if let Some(r) = (0..mask.height).find(|&r| too_narrow(r)) {
+                narrow = r;
+                continue;
+            }
+            let mut x = 0;
+            'x: while x + mask.width <= self.side {
+                // the row that was in the way before most likely is again
+                let rows = std::iter::once(stuck).chain(mask.order.iter().map(|&r| r as usize));
+                for r in rows {
+                    for &[from, to] in mask.row(r) {
+                        let (from, to) = (from as usize, to as usize);
+                        let hit = self.next(y + r, x + from, true);
+                        if hit < x + to {
+                            stuck = r;
+                            x = self.next(y + r, hit, false) - from;
+                            continue 'x;
+                        }
+                    }
+                }
+                return Some((x, y));
+            }
+        }
+        None
+    }
+
+    fn take(&mut self, mask: &Mask, x: usize, y: usize) {
+        for r in 0..mask.height {
+            let row = y + r;
+            for &[from, to] in mask.row(r) {
+                let cells = &mut self.bits[row * self.words..(row + 1) * self.words];
+                fill(cells, x + from as usize, x + to as usize);
+            }
+            let (mut at, mut longest) = (0, 0);
+            while at < self.side {
+                let from = self.next(row, at, false);
+                at = self.next(row, from, true);
+                longest = longest.max(at - from);
+            }
+            self.free[row] = longest as u32;
+        }
+    }
+}
+
+/// The shortest leg worth having, in texels.
+const LEAST_LEG_PX: f64 = 1.0;
+
+/// Gives each triangle a half square; the gutter becomes as wide as leaves a third of each square to its triangles.
+pub(super) fn half_squares(mesh: &Mesh, config: &AtlasConfig) -> Result<AtlasLayout> {
+    let (count, size) = (mesh.triangles.len(), f64::from(config.size_px));
+    let squares = count.div_ceil(2);
+    let rows = (1..).find(|r| r * r >= squares).unwrap_or(1);
+    // leg = side − 2 gap − √2 gap, see the module; the texture's border is another gap away
+    let spent = 2.0 + 2f64.sqrt();
+    let side_with = |gap: f64| (size - 2.0 * gap) / rows as f64;
+    let mut gap = f64::from(config.gutter_px);
+    let leg_with = |gap: f64| side_with(gap) - spent * gap;
+    let least = (side_with(0.0) / 3.0).max(LEAST_LEG_PX);
+    if leg_with(gap) < least {
+        // linear in the gap: leg_with(gap) = size / rows − gap (2 / rows + spent)
+        gap = ((size / rows as f64 - least) / (2.0 / rows as f64 + spent)).max(0.0);
+    }
+    let (side, leg) = (side_with(gap), leg_with(gap));
+    if leg < LEAST_LEG_PX {
+        let px = config.size_px;
+        let message = format!("{count} triangles do not fit into a texture of {px} × {px} texels");
+        return Err(Error::cannot(message, "a larger texture, or a mesh simplified to fewer triangles"));
+    }
+    let mut atlas = Atlas { width: config.size_px, height: config.size_px, ..Atlas::default() };
+    for t in 0..count as u32 {
+        let square = t as usize / 2;
+        let low = DVec2::new((square % rows) as f64, (square / rows) as f64) * side + gap;
+        // v runs down: right, then up the image, is counter-clockwise as seen
+        let (corner, along) = match t % 2 {
+            0 => (low + DVec2::new(gap, side - gap), [DVec2::X, -DVec2::Y]),
+            _ => (low + DVec2::new(side - gap, gap), [-DVec2::X, DVec2::Y]),
+        };
+        let first = atlas.uvs.len() as u32;
+        let points = [corner, corner + leg * along[0], corner + leg * along[1]];
+        atlas.uvs.extend(points.map(|p| -> Vec2 { (p / size).as_vec2().clamp(Vec2::ZERO, Vec2::ONE) }));
+        let mut triangle = [first, first + 1, first + 2];
+        triangle.rotate_right(widest(mesh, t));
+        atlas.triangles.push(triangle);
+    }
+    Ok(AtlasLayout { atlas, repaired: 0, gutter_px: gap })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mesh::files::uv_check;
     use crate::monitor::{Quiet, Stopping};
+    use glam::Vec3;
 
     /// A rectangle of two triangles.
     fn rectangle(width: f64, height: f64) -> Flat {
@@ -249,5 +520,104 @@ mod tests {
         assert!((112.0..118.1).contains(&scale), "{scale}");
         assert!(pack(&charts, &[None; 4], 512.0, 4.0, &Stopping).unwrap_err().kind().is_stop());
         assert!(pack(&charts, &[None; 4], 16.0, 8.0, &Quiet).unwrap_err().to_string().contains("do not fit"));
+    }
+
+    fn square(side: f64) -> Vec<[DVec2; 2]> {
+        let p = [DVec2::ZERO, side * DVec2::X, DVec2::splat(side), side * DVec2::Y];
+        (0..4).map(|k| [p[k], p[(k + 1) % 4]]).collect()
+    }
+
+    #[test]
+    fn a_square_grown_by_two_loses_its_corners() {
+        let mask = Mask::of(&square(6.0), DVec2::splat(6.0), 2.0);
+        // rows 0..10; the corner cell (0, 0) is √2 away from the point (2, 2) at its nearest: taken
+        assert_eq!((mask.width, mask.height), (10, 10));
+        assert!((2..8).all(|y| mask.row(y) == [[0, 10]]));
+        assert_eq!(mask.row(0), [[0, 10]]);
+        let mask = Mask::of(&square(6.0), DVec2::splat(6.0), 4.0);
+        // grown by 4, cell (0, 0) reaches to (1, 1), 3 √2 = 4.24 away from (4, 4): free; (1, 0) is √13 = 3.6
+        assert_eq!(mask.row(0), [[1, 13]]);
+        assert_eq!(mask.row(7), [[0, 14]]);
+    }
+
+    #[test]
+    fn an_outline_with_a_hole_keeps_it_free() {
+        let mut outline = square(20.0);
+        outline.extend(square(10.0).iter().map(|s| s.map(|p| p + 5.0)));
+        let mask = Mask::of(&outline, DVec2::splat(20.0), 1.0);
+        // the hole is 6..16, less one on each side
+        assert_eq!(mask.row(11), [[0, 7], [15, 22]]);
+        let mut page = Page::new(70);
+        page.take(&mask, 0, 0);
+        let small = Mask::of(&square(6.0), DVec2::splat(6.0), 1.0);
+        assert_eq!(page.find(&small, usize::MAX), Some((22, 0)));
+        let tall = Mask::of(&square(68.0), DVec2::splat(68.0), 1.0);
+        assert_eq!(page.find(&tall, usize::MAX), None);
+        page.take(&small, 22, 0);
+        page.take(&small, 30, 0);
+        assert_eq!(page.find(&small, usize::MAX), Some((38, 0)));
+        assert_eq!(page.find(&small, 8), None);
+    }
+
+    #[test]
+    fn what_a_page_finds_free_is_free_and_the_first_such_place() {
+        let l_shape = |s: f64| -> Vec<[DVec2; 2]> {
+            let p = [(0., 0.), (3., 0.), (3., 1.), (1., 1.), (1., 4.), (0., 4.)]
+                .map(|(x, y)| s * DVec2::new(x, y));
+            (0..6).map(|k| [p[k], p[(k + 1) % 6]]).collect()
+        };
+        let mut page = Page::new(100);
+        let mut taken = vec![[false; 100]; 100];
+        for i in 0..14 {
+            let s = 3.0 + f64::from(i * 5 % 7);
+            let mask = Mask::of(&l_shape(s), s * DVec2::new(3.0, 4.0), 1.5);
+            let fits = |x: usize, y: usize| {
+                (0..mask.height)
+                    .all(|r| mask.row(r).iter().all(|s| (s[0]..s[1]).all(|c| !taken[y + r][x + c as usize])))
+            };
+            let mut places =
+                (0..=100 - mask.height).flat_map(|y| (0..=100 - mask.width).map(move |x| (x, y)));
+            let first = places.find(|&(x, y)| fits(x, y));
+            assert_eq!(page.find(&mask, usize::MAX), first, "{i}");
+            if let Some((x, y)) = first {
+                page.take(&mask, x, y);
+                for r in 0..mask.height {
+                    mask.row(r)
+                        .iter()
+                        .for_each(|s| (s[0]..s[1]).for_each(|c| taken[y + r][x + c as usize] = true));
+                }
+            }
+        }
+    }
+
+    fn heap(count: u32) -> Mesh {
+        let positions =
+            (0..3 * count).map(|i| Vec3::new((i * 7 % 11) as f32, (i * 5 % 13) as f32, i as f32)).collect();
+        Mesh {
+            positions,
+            triangles: (0..count).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect(),
+            ..Mesh::default()
+        }
+    }
+
+    #[test]
+    fn halves_keep_the_gutter_or_say_what_is_left_of_it() {
+        for (count, size_px, full) in [(1, 128, true), (2, 128, true), (7, 256, true), (3000, 512, false)] {
+            let config = AtlasConfig { size_px, ..AtlasConfig::default() };
+            let mesh = heap(count);
+            let laid = half_squares(&mesh, &config).unwrap();
+            let r = uv_check(&mesh, &laid.atlas);
+            assert!(r.is_sound() && r.mirrored_charts == 0, "{count}: {r}");
+            assert_eq!(laid.gutter_px == 8.0, full, "{count}");
+            assert!(r.border_distance_px > 2.0 * laid.gutter_px - 1e-3, "{count}: {r}");
+            let apart = r.chart_distance_px.unwrap_or(f64::INFINITY);
+            assert!(apart > 2.0 * laid.gutter_px - 1e-3, "{count}: {r}");
+        }
+    }
+
+    #[test]
+    fn a_texture_without_room_is_refused() {
+        let config = AtlasConfig { size_px: 16, ..AtlasConfig::default() };
+        assert!(half_squares(&heap(3000), &config).is_err());
     }
 }

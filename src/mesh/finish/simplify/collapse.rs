@@ -5,9 +5,7 @@
 //! with a border taken as joined to one vertex more, the same holds of edges. The triangles that stay
 //! may not turn by more than 60° nor become worse than a quality of 0.05, unless they were worse.
 
-use super::hold::{BORDER, HELD};
-use super::quadric::{Freedom, PlaneQuadric, best, lean};
-use super::rings::{NONE, Rings};
+use super::rings::{BORDER, Freedom, HELD, NONE, PlaneQuadric, Rings, best, lean};
 use crate::geom::shape;
 use glam::Vec3;
 

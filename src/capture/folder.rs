@@ -1,0 +1,308 @@
+//! A capture's folder: what lies directly in it, what the names in camera files mean, and the errors that several parts
+//! of a capture can have. Only what lies inside the capture is ever opened.
+
+use super::frame::CameraFrame;
+use super::view::CaptureOptions;
+use crate::io::{self, Limits, ReadError};
+use crate::{Error, Result};
+use glam::DMat3;
+use std::fmt::Display;
+use std::path::{Component, Path, PathBuf};
+
+/// What may be missing at the end of a photograph's name: endings of files that are read, and of those that are found to
+/// be refused by name.
+const ENDINGS: [&[&str]; 2] = [
+    &["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"],
+    &[".tif", ".tiff", ".webp", ".heic", ".TIF", ".TIFF"],
+];
+
+/// OpenCV's camera axes to ours: right, down, ahead to right, up, back.
+pub(super) const FLIP: DMat3 = DMat3::from_cols_array(&[1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0]);
+
+/// A photograph's name below its folder; absolute names stay as they are.
+pub(super) fn join(base: &str, name: &str) -> String {
+    let is_absolute = name.starts_with(['/', '\\']) || name.as_bytes().get(1) == Some(&b':');
+    if base.is_empty() || is_absolute { name.into() } else { format!("{base}/{name}") }
+}
+
+/// The folder of a capture that is being opened.
+pub(super) struct CaptureFolder<'a> {
+    /// As given.
+    pub root: &'a Path,
+    /// Without links.
+    real: PathBuf,
+    pub options: &'a CaptureOptions,
+}
+
+impl CaptureFolder<'_> {
+    pub fn new<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<CaptureFolder<'a>> {
+        Ok(CaptureFolder { root, real: io::real_path(root)?, options })
+    }
+
+    /// A path relative to the capture, for messages.
+    pub fn shown(&self, path: &Path) -> String {
+        path.strip_prefix(self.root).unwrap_or(path).to_string_lossy().into_owned()
+    }
+
+    /// The path below the capture that `name` means. `\` counts as a separator, since tools on Windows
+    /// write it; an absolute name is taken if it points into the capture.
+    pub fn relative(&self, file: &str, name: &str) -> Result<PathBuf> {
+        let outside = || outside(file, name);
+        if name.is_empty() || name.contains('\0') {
+            return Err(outside());
+        }
+        let text = name.replace('\\', "/");
+        let mut path = Path::new(&text);
+        if path.is_absolute() {
+            path = path
+                .strip_prefix(self.root)
+                .or_else(|_| path.strip_prefix(&self.real))
+                .map_err(|_| outside())?;
+        } else if text.as_bytes().get(1) == Some(&b':') {
+            return Err(outside()); // a Windows drive
+        }
+        let mut relative = PathBuf::new();
+        for part in path.components() {
+            match part {
+                Component::Normal(p) => relative.push(p),
+                Component::CurDir => {}
+                Component::ParentDir if relative.pop() => {}
+                _ => return Err(outside()),
+            }
+        }
+        Ok(relative)
+    }
+
+    /// The regular file at a relative path, if it exists. Links are followed: data sets are kept as links into a store,
+    /// and the paths that [`CaptureFolder::relative`] returns cannot climb out of the capture.
+    pub fn file(&self, relative: &Path) -> Option<PathBuf> {
+        Some(self.root.join(relative)).filter(|path| io::is_file(path))
+    }
+
+    /// The folder that photographs' names start from, where the format does not say: the one that has most of the
+    /// first of them.
+    pub fn image_folder<'n>(&self, names: impl Iterator<Item = &'n str>) -> &'static str {
+        let names: Vec<&str> = names.take(64).collect();
+        let there = |base: &str, name: &str| {
+            self.photo("", &join(base, name)).is_ok_and(|(_, photo)| photo.is_some())
+        };
+        let bases = IMAGE_FOLDERS.into_iter().chain([""]);
+        let counted = bases.map(|base| (base, names.iter().filter(|name| there(base, name)).count()));
+        counted.fold(("images", 0), |best, next| if next.1 > best.1 { next } else { best }).0
+    }
+
+    /// A mask that COLMAP itself would take (`masks/NAME.jpg.png`), or of the photograph's name without its ending.
+    pub fn mask_of(&self, file: &str, name: &str) -> Result<Option<PathBuf>> {
+        let stem =
+            if has_ending(name, &PHOTOGRAPHS) { Path::new(name).with_extension("") } else { name.into() };
+        for name in [format!("masks/{name}.png"), format!("masks/{}.png", stem.to_string_lossy())] {
+            if let Some(path) = self.file(&self.relative(file, &name)?) {
+                return Ok(Some(path));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The photograph that `name` means, with its path below the capture: the very name, else with a
+    /// usual ending, else in the folder of pictures already reduced by `options.downscale`
+    /// (`images_4/`, `images_4x/`).
+    pub fn photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
+        let downscale = self.options.downscale;
+        let wanted = self.relative(file, name)?;
+        let mut candidates = vec![wanted.clone()];
+        let mut parts = wanted.components();
+        if let Some(first) = parts.next().map(|c| c.as_os_str().to_string_lossy())
+            && downscale > 1
+            && !parts.as_path().as_os_str().is_empty()
+        {
+            let reduced = [format!("{first}_{downscale}"), format!("{first}_{downscale}x")];
+            candidates.extend(reduced.map(|folder| Path::new(&folder).join(parts.as_path())));
+        }
+        let all = ENDINGS.iter().flat_map(|endings| candidates.iter().map(move |c| (c, endings)));
+        for (candidate, ending) in all.flat_map(|(c, endings)| endings.iter().map(move |e| (c, e))) {
+            let mut with = candidate.clone().into_os_string();
+            with.push(ending);
+            if let Some(path) = self.file(Path::new(&with)) {
+                return Ok((with.into(), Some(path)));
+            }
+        }
+        Ok((wanted, None))
+    }
+}
+
+/// The folder common to all photographs, and each one's path below it without ending, `/` between.
+pub(super) fn view_names(frames: &[CameraFrame]) -> (PathBuf, Vec<String>) {
+    let mut folder: Option<PathBuf> = None;
+    for frame in frames {
+        let parent = frame.relative.parent().unwrap_or(Path::new(""));
+        folder = Some(match folder {
+            None => parent.into(),
+            Some(f) => {
+                f.components().zip(parent.components()).take_while(|(a, b)| a == b).map(|(a, _)| a).collect()
+            }
+        });
+    }
+    let folder = folder.unwrap_or_default();
+    let names = frames
+        .iter()
+        .map(|frame| {
+            let below = frame.relative.strip_prefix(&folder).unwrap_or(&frame.relative).with_extension("");
+            let parts: Vec<_> = below.components().map(|c| c.as_os_str().to_string_lossy()).collect();
+            parts.join("/")
+        })
+        .collect();
+    (folder, names)
+}
+
+/// Endings of photographs, those that are not read among them.
+pub(super) const PHOTOGRAPHS: [&str; 8] = ["png", "jpg", "jpeg", "tif", "tiff", "heic", "webp", "bmp"];
+
+/// How many of them, from the first, are those of files that are read.
+const READ: usize = 3;
+
+/// Where photographs lie, if not beside the cameras.
+const IMAGE_FOLDERS: [&str; 5] = ["images", "image", "input", "rgb", "photos"];
+
+/// Names of what lies directly in a folder.
+pub(super) struct FolderEntries {
+    pub root: PathBuf,
+    pub files: Vec<String>,
+    pub folders: Vec<String>,
+}
+
+impl FolderEntries {
+    /// Names that are not UTF-8 tell nothing, nor do those that cannot be listed.
+    pub fn of(root: &Path) -> FolderEntries {
+        let name = |p: &PathBuf| Some(p.file_name()?.to_str()?.to_owned());
+        let folders = io::list_folders(root).unwrap_or_default();
+        FolderEntries {
+            root: root.into(),
+            files: io::list_files(root).unwrap_or_default(),
+            folders: folders.iter().filter_map(name).collect(),
+        }
+    }
+
+    /// The first of these files or folders that exists, `/` between a folder and what it holds.
+    pub fn any<'a>(&self, names: &[&'a str]) -> Option<&'a str> {
+        names.iter().copied().find(|n| io::exists(&self.root.join(n)))
+    }
+
+    /// The first file with one of these endings.
+    pub fn ending(&self, endings: &[&str]) -> Option<&String> {
+        self.files.iter().find(|f| has_ending(f, endings))
+    }
+
+    /// The first file with this ending whose beginning holds `words`.
+    pub fn holding(&self, ending: &str, words: &str) -> Option<&String> {
+        let limits = Limits { file_bytes: 64 << 20, ..Limits::default() };
+        let holds = |name: &&String| {
+            let bytes = io::read_bytes(&self.root.join(name), &limits).unwrap_or_default();
+            String::from_utf8_lossy(&bytes[..bytes.len().min(1 << 16)]).contains(words)
+        };
+        self.files.iter().filter(|f| has_ending(f, &[ending])).take(16).find(holds)
+    }
+
+    pub fn at(&self, name: &str) -> String {
+        self.root.join(name).display().to_string()
+    }
+
+    /// The folder of photographs, as far as one can tell.
+    pub fn photographs(&self) -> Option<PathBuf> {
+        let folders = IMAGE_FOLDERS.into_iter().filter(|n| self.any(&[n]).is_some());
+        let folders = folders.map(|n| self.root.join(n));
+        [self.root.clone()]
+            .into_iter()
+            .chain(folders)
+            .find(|f| FolderEntries::of(f).ending(&PHOTOGRAPHS).is_some())
+    }
+}
+
+/// The photographs in a folder, in name order; only where none can be read those of other formats, to be refused by
+/// name.
+pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
+    let mut files = io::list_files(folder)?;
+    let can_be_read = files.iter().any(|f| has_ending(f, &PHOTOGRAPHS[..READ]));
+    let endings = if can_be_read { &PHOTOGRAPHS[..READ] } else { &PHOTOGRAPHS };
+    files.retain(|f| has_ending(f, endings));
+    Ok(files)
+}
+
+/// Does a name end so, in any case?
+pub(super) fn has_ending(name: &str, endings: &[&str]) -> bool {
+    let found = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
+    endings.iter().any(|e| e.eq_ignore_ascii_case(found))
+}
+
+/// A camera file lacks what it must have.
+pub(super) fn in_file(file: &str, problem: impl Display, hint: impl Into<String>) -> Error {
+    Error::cannot(problem, hint).within(format_args!("`{file}`"))
+}
+
+/// One frame of a camera file is wrong; it is named by its photograph, or its number if it has none.
+pub(super) fn in_frame(file: &str, frame: &str, problem: impl Display) -> Error {
+    let place = format_args!("`{file}`, frame `{frame}`");
+    Error::cannot(problem, "correct that frame, or remove it").within(place)
+}
+
+/// A name leads out of the capture.
+fn outside(file: &str, name: &str) -> Error {
+    Error::cannot(
+        format_args!("`{file}` names `{name}`, which is outside the capture"),
+        "copy the file into the capture, or give the folder that holds both",
+    )
+}
+
+/// There is nothing to learn from.
+pub(super) fn no_views(root: &Path, found: &str) -> Error {
+    Error::cannot(
+        format_args!("`{}` has no usable view: {found}", root.display()),
+        "put the photographs where the camera file says they are, relative to the capture",
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_stay_inside_the_capture_however_they_are_written() {
+        let dir = tempfile::tempdir().unwrap();
+        let options = CaptureOptions::default();
+        let folder = CaptureFolder::new(dir.path(), &options).unwrap();
+        let good = [
+            ("./images/a.png", "images/a.png"),
+            ("images/../b/./c", "b/c"),
+            ("images\\a.png", "images/a.png"),
+            ("a b/ü.png", "a b/ü.png"),
+        ];
+        for (name, path) in good {
+            assert_eq!(folder.relative("t.json", name).unwrap(), Path::new(path));
+        }
+        let inside = dir.path().join("x/y.png");
+        assert_eq!(folder.relative("t.json", inside.to_str().unwrap()).unwrap(), Path::new("x/y.png"));
+        for name in ["../a.png", "a/../../b", "/etc/passwd", "", "C:\\a.png", "a\0b", "..\\a"] {
+            let error = folder.relative("t.json", name).unwrap_err().to_string();
+            assert!(error.contains("outside the capture"), "{name:?}: {error}");
+        }
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn a_link_is_followed_and_a_name_that_climbs_out_beside_it_is_not() {
+        let (dir, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        std::fs::create_dir(other.path().join("store")).unwrap();
+        for name in ["store/a.png", "b.png"] {
+            std::fs::write(other.path().join(name), b"x").unwrap();
+        }
+        std::os::unix::fs::symlink(other.path().join("store"), dir.path().join("images")).unwrap();
+        let options = CaptureOptions::default();
+        let folder = CaptureFolder::new(dir.path(), &options).unwrap();
+        let (relative, photo) = folder.photo("t.json", "images/a.png").unwrap();
+        assert_eq!(
+            (relative.as_path(), photo),
+            (Path::new("images/a.png"), Some(dir.path().join("images/a.png")))
+        );
+        // `images/..` is the capture, wherever the link leads
+        assert_eq!(folder.photo("t.json", "images/../b.png").unwrap().1, None);
+    }
+}

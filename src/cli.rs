@@ -1,0 +1,612 @@
+//! The command line: a file per command, named as it is typed, but that small ones share `about` and `capture`. The only
+//! module that prints.
+//!
+//! Data goes to stdout, everything else to stderr; the exit code says whether to try again
+//! ([`crate::ErrorKind`]).
+
+mod about;
+mod bench;
+mod capture;
+mod check;
+mod demo;
+mod experiment;
+mod options;
+mod out;
+mod preview;
+mod report;
+mod run;
+mod screen;
+mod signals;
+mod status;
+
+use crate::pipeline::Stage;
+use crate::run::Stop;
+use crate::{Error, Result};
+use about::Form;
+use bench::BenchOptions;
+use clap::{Args, CommandFactory, Parser, Subcommand};
+use experiment::ExperimentOptions;
+use options::{Common, KeyOption, RunTarget};
+use out::Out;
+use preview::PreviewOptions;
+use run::LineCommand;
+use screen::Screen;
+use status::StatusOptions;
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+const EXAMPLES: &str = "\
+Examples:
+  tiface demo                                   a head made on the spot, from pictures to mesh
+  tiface inspect captures/002_00                what is in a folder of photographs, and what is wrong
+  tiface run captures/002_00 --preset draft     a first look at your own head, into runs/002_00
+  tiface mesh --format glb,ply --out head.glb   the mesh of the newest run, once more, as a file
+
+Exit codes:
+  0         done
+  1         cannot be done as asked
+  2         wrong command line or configuration
+  3         below a bar you set
+  75        not now, try again
+  101       a bug
+  130, 143  stopped: repeat to continue";
+
+/// Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel views.
+#[derive(Parser, Debug)]
+#[command(name = "tiface", version, max_term_width = 100, after_long_help = EXAMPLES)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    common: Common,
+}
+
+/// What a stage command works on.
+#[derive(Args, Debug)]
+struct CaptureOrRun {
+    /// A capture (a folder of photographs with cameras) or a run; without one, the run in this
+    /// folder, else the newest under runs/
+    #[arg(value_name = "CAPTURE|RUN")]
+    path: Option<PathBuf>,
+}
+
+/// Masks from clicks.
+#[derive(Args, Debug, Default)]
+struct ClickOptions {
+    /// Make masks from the clicks in this prompts.json
+    #[arg(long, alias = "points", value_name = "FILE")]
+    prompts: Option<PathBuf>,
+    /// A click on one photograph, label 1 for the head, 0 for what is not; repeatable
+    #[arg(long, value_name = "X,Y,LABEL", conflicts_with = "prompts", allow_hyphen_values = true)]
+    point: Vec<String>,
+    /// The view that --point is on [default: the first that is trained on]
+    #[arg(long, value_name = "NAME", requires = "point")]
+    view: Option<String>,
+    /// SAM's image encoder, ONNX; needs --sam-decoder
+    #[arg(long, value_name = "FILE")]
+    sam: Option<PathBuf>,
+    /// SAM's prompt encoder and mask decoder, ONNX
+    #[arg(long, value_name = "FILE")]
+    sam_decoder: Option<PathBuf>,
+    /// ViTMatte, ONNX
+    #[arg(long, value_name = "FILE")]
+    vitmatte: Option<PathBuf>,
+    /// Make masks without any click: a network from a picture to its alpha (U²-Net, ISNet, MODNet, BiRefNet), ONNX
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["prompts", "point"])]
+    alpha_net: Option<PathBuf>,
+    /// An ONNX Runtime library to run them with, instead of the built-in engine
+    #[arg(long, value_name = "FILE")]
+    onnxruntime: Option<PathBuf>,
+}
+
+impl ClickOptions {
+    /// As keys of the configuration; files by their absolute path, so that the run remembers them from anywhere.
+    fn keys(&self) -> Result<Vec<KeyOption>> {
+        let file = |option: &str, key: &str, file: &Option<PathBuf>| -> Result<Option<KeyOption>> {
+            let Some(file) = file else { return Ok(None) };
+            let path = crate::io::real_path(file)?;
+            let text = path.to_str().ok_or_else(|| {
+                Error::cannot(format!("the path `{}` is not UTF-8", path.display()), "rename the file")
+            })?;
+            Ok(Some((format!("{option} {}", file.display()), key.into(), text.into())))
+        };
+        let files = [
+            file("--prompts", "mask.prompts", &self.prompts)?,
+            file("--sam", "mask.sam", &self.sam)?,
+            file("--sam-decoder", "mask.sam_decoder", &self.sam_decoder)?,
+            file("--vitmatte", "mask.vitmatte", &self.vitmatte)?,
+            file("--alpha-net", "mask.alpha_net", &self.alpha_net)?,
+            file("--onnxruntime", "mask.onnxruntime", &self.onnxruntime)?,
+        ];
+        let mut keys: Vec<KeyOption> = files.into_iter().flatten().collect();
+        if !self.point.is_empty() {
+            let list = serde_json::json!(self.point).to_string();
+            keys.push((format!("--point {}", self.point.join(" --point ")), "mask.point".into(), list));
+        }
+        keys.extend(key_options([("--view", "mask.view", self.view.as_deref())]));
+        Ok(keys)
+    }
+}
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Every stage in order, going on where the last command stopped
+    #[command(after_long_help = "Examples:
+  tiface run captures/002_00
+  tiface run captures/002_00 --run /data/002_00 --preset paper --seed 7
+  tiface run captures/002_00 --prompts prompts.json  masks from clicks on a few photographs
+  tiface run runs/002_00 --fresh mesh --set mesh.resolution=1024
+  tiface run captures/002_00 --require psnr=28      exit code 3 if the views are worse than that")]
+    Run {
+        #[command(flatten)]
+        place: CaptureOrRun,
+        #[command(flatten)]
+        clicks: ClickOptions,
+        /// Exit with 3 below this bar: watertight, psnr=DB (masked, the best of all); repeatable
+        #[arg(long, value_name = "BAR")]
+        require: Vec<String>,
+    },
+    /// The same on a synthetic head made on the spot: no data, weights or network needed
+    #[command(after_long_help = "Examples:
+  tiface demo
+  tiface demo --set iface.steps=500 --set tface.steps=500    a rougher head, sooner
+  tiface demo --run /tmp/demo --out head.glb    somewhere else, and the mesh beside it
+  tiface demo --size 3000x4096 --views 24 --border 60 --run /tmp/full    as large as the ILSH dataset")]
+    Demo {
+        /// Pixels of each photograph [default: 256x320]
+        #[arg(long, value_name = "WxH")]
+        size: Option<String>,
+        /// Photographs, a quarter of them held out [default: 32]
+        #[arg(long, value_name = "N")]
+        views: Option<usize>,
+        /// Pixels along the edges that are marked as not usable [default: none]
+        #[arg(long, value_name = "PX")]
+        border: Option<u32>,
+    },
+    /// What was found: format, cameras, masks, splits, problems; writes nothing
+    #[command(after_long_help = "Examples:
+  tiface inspect captures/002_00
+  tiface inspect captures/002_00 --set capture.mask_dir=vit_mask
+  tiface inspect captures/002_00 --json | jq .problems")]
+    Inspect {
+        /// A folder of photographs with cameras
+        capture: PathBuf,
+    },
+    /// Write a capture's cameras in another format: transforms.json or COLMAP
+    #[command(after_long_help = "Examples:
+  tiface convert captures/002_00 --to colmap
+  tiface convert scan --to transforms --out captures/scan
+
+Photographs and masks are copied as they are. The new folder must not be there, or be empty.")]
+    Convert {
+        /// A folder of photographs with cameras
+        capture: PathBuf,
+        /// transforms or colmap
+        #[arg(long, value_name = "FORMAT")]
+        to: String,
+    },
+    /// Stage: which pixels are the head, and where that puts it
+    #[command(after_long_help = "Examples:
+  tiface mask captures/002_00                   the masks that lie there; a sheet of them in the run's mask/
+  tiface mask captures/002_00 --page            an annotation page, which saves prompts.json
+  tiface mask captures/002_00 --prompts prompts.json
+  tiface mask captures/002_00 --view 010 --point 181,288,1 --point 32,51,0
+  tiface mask captures/002_00 --prompts prompts.json --sam encoder.onnx --sam-decoder decoder.onnx \\
+      --vitmatte vitmatte.onnx
+  tiface mask captures/002_00 --alpha-net isnet.onnx    no click at all
+
+Click the face, the hair and every garment of another color, and the background twice; on three photographs
+from different sides. The other views follow from the cameras.")]
+    Mask {
+        #[command(flatten)]
+        place: CaptureOrRun,
+        #[command(flatten)]
+        clicks: ClickOptions,
+        /// Write an annotation page to click on instead, to --out or <capture>_clicks.html
+        #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "alpha_net", "onnxruntime"])]
+        page: bool,
+    },
+    /// Stage: learn T-Face, a radiance field, from the masked photographs
+    #[command(after_long_help = "Examples:
+  tiface tface captures/002_00
+  tiface tface runs/002_00                      go on after a stop
+  tiface tface captures/002_00 --run runs/ce --set tface.mask_loss=ce
+  tiface tface captures/002_00 --set tface.fields=3    the mean of three fields
+  tiface tface captures/002_00 --set tface.import=official.safetensors")]
+    Tface(CaptureOrRun),
+    /// Stage: learn one such field from whole photographs, to compare T-Face with
+    #[command(after_long_help = "Examples:
+  tiface baseline captures/002_00
+  tiface baseline runs/002_00                   go on after a stop
+  tiface baseline runs/002_00 --fresh baseline --set baseline.steps=20000")]
+    Baseline(CaptureOrRun),
+    /// Stage: learn I-Face, a signed-distance field
+    #[command(after_long_help = "Examples:
+  tiface iface captures/002_00
+  tiface iface runs/002_00                      go on after a stop
+  tiface iface runs/002_00 --fresh iface --set iface.steps=30000")]
+    Iface(CaptureOrRun),
+    /// Stage: extract the watertight mesh, simplify it, bake its texture
+    #[command(after_long_help = "Examples:
+  tiface mesh runs/002_00
+  tiface mesh runs/002_00 --out head.glb        the ending picks the format
+  tiface mesh runs/002_00 --fresh mesh --format glb,obj,ply --frame head
+  tiface mesh runs/002_00 --fresh mesh --triangles 20000 --texture 4096 --lobes 1 --normal-map")]
+    Mesh {
+        #[command(flatten)]
+        place: CaptureOrRun,
+        /// Files to write: glb, obj, ply
+        #[arg(long, value_name = "LIST")]
+        format: Option<String>,
+        /// Coordinates: dataset, or head (+Y up, face towards +Z)
+        #[arg(long, value_name = "FRAME")]
+        frame: Option<String>,
+        /// Triangles of the product; 0 keeps all
+        #[arg(long, value_name = "N")]
+        triangles: Option<String>,
+        /// Texels along each side of the texture; 0: colors at the vertices
+        #[arg(long, value_name = "PX")]
+        texture: Option<String>,
+        /// Degree of view-dependent color in the GLB: 0, 1 or 2
+        #[arg(long, value_name = "DEGREE")]
+        lobes: Option<String>,
+        /// Around soft outlines: shells (translucent layers, where they help) or none
+        #[arg(long, value_name = "KIND")]
+        hair: Option<String>,
+        /// In other programs: unlit (colors as photographed, light included) or lit (lamps shade them once more)
+        #[arg(long, value_name = "KIND")]
+        material: Option<String>,
+        /// Put the detail that simplification takes into a normal map; the GLB's material is lit then
+        #[arg(long)]
+        normal_map: bool,
+        /// Leave the surface open where the frames cut the body
+        #[arg(long)]
+        no_cap: bool,
+    },
+    /// Stage: make views of the fields and of the mesh
+    #[command(after_long_help = "Examples:
+  tiface render runs/002_00
+  tiface render captures/002_00 --with tface    T-Face alone: no other field is learned for it
+  tiface render runs/002_00 --cameras orbit --with tface --background white --out turn/
+  tiface render runs/002_00 --cameras path.json --format exr
+
+Views of other cameras than the held-out ones lie in render/paths/, one folder for each path. They leave
+the held-out views, their blend and the metrics alone; --fresh render then makes only that path anew.")]
+    Render {
+        #[command(flatten)]
+        place: CaptureOrRun,
+        /// test (the held-out views); train, orbit or a file (a nerfstudio camera path or a
+        /// transforms.json), into a folder of their own
+        #[arg(long, value_name = "WHICH")]
+        cameras: Option<String>,
+        /// Any of baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
+        /// (head.glb, as a viewer shows it) and raster (the same, rasterized), with commas
+        #[arg(long = "with", value_name = "LIST")]
+        method: Option<String>,
+        /// png or exr
+        #[arg(long)]
+        format: Option<String>,
+        /// black, white or none
+        #[arg(long)]
+        background: Option<String>,
+    },
+    /// Stage: blend the views of T-Face, I-Face and its mesh, or of others
+    #[command(after_long_help = "Examples:
+  tiface ensemble runs/002_00
+  tiface ensemble runs/002_00 --fresh ensemble --members tface,volume --weights 0.6,0.4
+  tiface ensemble captures/002_00 --members tface,raycast
+
+Without --weights, they are fitted on small squares of the training photographs that nothing
+learned from (capture.tiles): the blend follows the better members.")]
+    Ensemble {
+        #[command(flatten)]
+        place: CaptureOrRun,
+        /// Whose views: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured and raster
+        /// (head.glb)
+        #[arg(long, value_name = "LIST")]
+        members: Option<String>,
+        /// Their shares, in that order, together 1 [default: fitted]
+        #[arg(long, value_name = "LIST")]
+        weights: Option<String>,
+    },
+    /// Stage: compare views and blends with held-out photographs
+    Metrics {
+        #[command(flatten)]
+        place: CaptureOrRun,
+        /// Exit with 3 below this bar: watertight, psnr=DB (masked, the best of all); repeatable
+        #[arg(long, value_name = "BAR")]
+        require: Vec<String>,
+    },
+    /// A picture of a run's mesh, or of any .glb, .obj or .ply
+    #[command(after_long_help = "Examples:
+  tiface preview runs/002_00                    three quarters of the head, 1024 pixels, as a PNG
+  tiface preview scan.ply --light matcap --up z --out scan.png
+  tiface preview runs/002_00 --sheet            from all sides, as wireframe, normals, texture coordinates, errors
+  tiface preview runs/002_00 --turntable --out turn.gif     .png is animated, too; .mp4 needs ffmpeg
+  tiface preview runs/002_00 --cameras test --out views/    as the held-out photographs
+  tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
+  tiface preview runs/002_00 --watch            a page of a run while it works, in watch.html there")]
+    Preview(PreviewOptions),
+    /// Speed against error of each decision, measured on this machine: tables, a page
+    #[command(after_long_help = "Examples:
+  tiface bench captures/002_00 --sweep steps,hash
+  tiface bench runs/002_00 --sweep triangles,texture      with the fields of a run
+
+Results lie in bench/NAME/: bench.json and bench.html.")]
+    Bench(BenchOptions),
+    /// The paper's tables and ablations over captures, beside the published figures
+    #[command(after_long_help = "Examples:
+  tiface experiment captures/* --scale 0.1      all tables at a tenth of the effort
+  tiface experiment captures/002_00 --tables components,iface --out tables/
+  tiface experiment captures/* --dry-run        the runs that tables are made of, and which are done
+  tiface experiment captures/* --only 002_00/tface-ce    one of them, for a cluster; tables fill as they come
+  tiface experiment captures/* --published figures.csv   a line is: tface,l2-reference,masked,30.1
+
+Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md and experiment.json.")]
+    Experiment(ExperimentOptions),
+    /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates
+    #[command(after_long_help = "Examples:
+  tiface check head.glb
+  tiface check scan.obj --require watertight --require one-piece
+  tiface check head.ply --json
+  tiface check runs/lps/mesh/surface.ply --against captures/lps/gt.ply --seen-by captures/lps")]
+    Check {
+        /// A .glb, .obj or .ply file
+        mesh: PathBuf,
+        /// Exit with 3 if it is not: watertight, manifold, one-piece, no-self-intersections, sound-uv;
+        /// repeatable
+        #[arg(long, value_name = "BAR")]
+        require: Vec<String>,
+        /// Also the distance to this surface, in the same coordinates (so a PLY: a GLB is turned +Y up)
+        #[arg(long, value_name = "MESH")]
+        against: Option<PathBuf>,
+        /// ... and the distance over the part that three or more of this capture's training cameras see, by how many
+        /// see it, and back from skin and hair
+        #[arg(long, value_name = "CAPTURE", requires = "against")]
+        seen_by: Option<PathBuf>,
+    },
+    /// The page of a run made anew, or one page of many runs
+    #[command(after_long_help = "Examples:
+  tiface report runs/002_00                     its report.html, from what lies there
+  tiface report runs/* --out fleet.html         all of them in a table, with links to each; fleet.csv beside it
+  tiface report runs/* --json                   the same figures, an object for each run")]
+    Report {
+        /// Run folders; without any, all under runs/
+        runs: Vec<PathBuf>,
+        /// In a table, also where there is only one run
+        #[arg(long)]
+        table: bool,
+    },
+    /// Stages, progress, time left and last error of one or many runs
+    #[command(after_long_help = "Examples:
+  tiface status
+  tiface status runs/002_00                     a row for each stage
+  tiface status runs/*                          a line for each run, and one for all
+  tiface status runs/* --failed                 those to look after; exit code 3 if any run failed
+  tiface status runs/* --json                   an object for each run
+
+A sign for each stage: # done, > running, x failed, ! killed, = stopped, ? not readable, . to do. Of more than 40 runs,
+those that are done or not begun share lines; -v gives each its own.")]
+    Status(StatusOptions),
+    /// Print the effective configuration, or explain a key
+    #[command(after_long_help = "Examples:
+  tiface config --preset paper
+  tiface config runs/002_00 --set mesh.resolution=1024
+  tiface config --explain iface.steps           a whole table: --explain mesh")]
+    Config {
+        #[command(flatten)]
+        place: CaptureOrRun,
+        /// Say what a key or a table means, its range and its value in every preset
+        #[arg(long, value_name = "KEY")]
+        explain: Option<String>,
+    },
+    /// The GPUs here, whether they compute right, and which one `auto` takes
+    #[command(after_long_help = "Examples:
+  tiface doctor                 drivers, memory, and a self-test of each device; what to paste into a bug report
+  tiface doctor --json          the same for programs
+
+It exits with 1 if a device computes something else than the processor does. A build without the feature `wgpu` knows
+the processor alone.")]
+    Doctor,
+    /// Completions for a shell, on stdout, or manual pages
+    #[command(after_long_help = "Examples:
+  tiface completions bash > /etc/bash_completion.d/tiface
+  tiface completions man | man -l -             the manual page
+  tiface completions man --out man1/            a page for each command, tiface.1, tiface-run.1 and so on")]
+    Completions {
+        /// What for
+        form: Form,
+    },
+}
+
+/// Ends the process where memory for so many bytes cannot be had. Nothing is allocated on the way, and nothing is lost
+/// that a kill would have kept.
+#[cold]
+pub fn out_of_memory(bytes: usize) -> ! {
+    let _ = writeln!(
+        std::io::stderr(),
+        "error: out of memory: {bytes} bytes more cannot be had\n\n\
+         hint: free memory, raise `capture.downscale`, or lower `mesh.resolution` or the `rays` of a field; what is \
+         complete is kept: repeat the command to continue"
+    );
+    signal_hook::low_level::exit(crate::ErrorKind::NotNow.code().into())
+}
+
+/// Parses the command line, does what it says, and gives the exit code.
+pub fn main() -> ExitCode {
+    let Cli { command, common } = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => {
+            // help and version end here too, with 0; a closed stdout is no error
+            let _ = e.print();
+            return ExitCode::from(e.exit_code() as u8);
+        }
+    };
+    let invocation = Invocation { common: &common, screen: Screen::new(&common), stop: Stop::new() };
+    common.log();
+    let makes_nothing = |command: &str| Out::none(common.out.as_deref(), command);
+    let ended = signals::listen(&invocation).and_then(|()| match &command {
+        Command::Demo { size, views, border } => demo::run(&invocation, size.as_deref(), *views, *border),
+        Command::Mask { place, clicks, page: true } => {
+            capture::page(&invocation, place.path.as_deref(), clicks.prompts.as_deref())
+        }
+        Command::Inspect { capture } => {
+            makes_nothing("inspect").and_then(|()| capture::inspect(&common, capture))
+        }
+        Command::Convert { capture, to } => capture::convert(&invocation, capture, to),
+        Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
+            .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
+        Command::Preview(options) => preview::run(&invocation, options),
+        Command::Bench(options) => bench::run(&invocation, options),
+        Command::Experiment(options) => experiment::run(&invocation, options),
+        Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
+        Command::Report { runs, table } => report::run(&invocation, runs, *table),
+        Command::Config { place, explain } => makes_nothing("config")
+            .and_then(|()| about::config(&common, place.path.as_deref(), explain.as_deref())),
+        Command::Doctor => makes_nothing("doctor").and_then(|()| about::doctor(&common)),
+        Command::Completions { form } => Out::find(common.out.as_deref(), "completions")
+            .and_then(|out| about::completions(*form, Cli::command(), out.as_ref())),
+        stages => run::run(&invocation, &stages.on_line(&common)?),
+    });
+    ExitCode::from(match ended {
+        Ok(()) => 0,
+        Err(error) => {
+            invocation.screen.error(&error);
+            error.kind().code()
+        }
+    })
+}
+
+impl Command {
+    /// What a command on stages does on the line.
+    fn on_line(&self, common: &Common) -> Result<LineCommand<'_>> {
+        let on = |flag: bool, value: &'static str| flag.then_some(value);
+        let (place, until, keys) = match self {
+            Command::Run { place, clicks, .. } => (place, Stage::Metrics, clicks.keys()?),
+            Command::Mask { place, clicks, .. } => (place, Stage::Mask, clicks.keys()?),
+            Command::Baseline(place) => (place, Stage::Baseline, Vec::new()),
+            Command::Tface(place) => (place, Stage::Tface, Vec::new()),
+            Command::Iface(place) => (place, Stage::Iface, Vec::new()),
+            Command::Mesh {
+                place,
+                format,
+                frame,
+                triangles,
+                texture,
+                lobes,
+                hair,
+                material,
+                normal_map,
+                no_cap,
+            } => {
+                let keys = key_options([
+                    ("--format", "mesh.format", format.as_deref()),
+                    ("--frame", "mesh.frame", frame.as_deref()),
+                    ("--triangles", "mesh.triangles", triangles.as_deref()),
+                    ("--texture", "mesh.texture_px", texture.as_deref()),
+                    ("--lobes", "mesh.lobes", lobes.as_deref()),
+                    ("--hair", "mesh.hair", hair.as_deref()),
+                    ("--material", "mesh.material", material.as_deref()),
+                    ("--normal-map", "mesh.normal_map", on(*normal_map, "true")),
+                    ("--no-cap", "mesh.cap", on(*no_cap, "false")),
+                ]);
+                (place, Stage::Mesh, keys)
+            }
+            Command::Render { place, cameras, method, format, background } => {
+                let keys = key_options([
+                    ("--cameras", "render.cameras", cameras.as_deref()),
+                    ("--with", "render.method", method.as_deref()),
+                    ("--format", "render.format", format.as_deref()),
+                    ("--background", "render.background", background.as_deref()),
+                ]);
+                (place, Stage::Render, keys)
+            }
+            Command::Ensemble { place, members, weights } => {
+                let keys = key_options([
+                    ("--members", "ensemble.members", members.as_deref()),
+                    ("--weights", "ensemble.weights", weights.as_deref()),
+                ]);
+                (place, Stage::Ensemble, keys)
+            }
+            Command::Metrics { place, .. } => (place, Stage::Metrics, Vec::new()),
+            other => unreachable!("{other:?} does not work on the line"),
+        };
+        let (product, require) = match self {
+            Command::Run { require, .. } => ("run", &require[..]),
+            Command::Metrics { require, .. } => ("metrics", &require[..]),
+            _ => (until.word(), &[][..]),
+        };
+        let target = RunTarget::find(common, place.path.as_deref())?;
+        Ok(LineCommand { product, until, target, require, keys, fallback: None })
+    }
+}
+
+/// Options of one command that are keys of the configuration under a shorter name: those that were given.
+fn key_options<const N: usize>(options: [(&str, &str, Option<&str>); N]) -> Vec<KeyOption> {
+    let given = options.into_iter().filter_map(|(option, key, value)| {
+        value.map(|v| (format!("{option} {v}"), key.to_string(), v.to_string()))
+    });
+    given.collect()
+}
+
+/// One command at work.
+struct Invocation<'a> {
+    /// The options that every command shares.
+    pub common: &'a Common,
+    /// Where people see what happens.
+    pub screen: Arc<Screen>,
+    /// Set when somebody asks to stop.
+    pub stop: Stop,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn options_may_stand_before_and_after_paths() {
+        for words in [
+            ["tiface", "--seed", "7", "run", "captures/a"],
+            ["tiface", "run", "--seed", "7", "captures/a"],
+            ["tiface", "run", "captures/a", "--seed", "7"],
+        ] {
+            let cli = Cli::try_parse_from(words).unwrap();
+            assert_eq!(cli.common.seed, Some(7));
+            assert!(matches!(cli.command, Command::Run { place, .. } if place.path.is_some()));
+        }
+    }
+
+    #[test]
+    fn every_exit_code_has_a_line_of_its_own_on_any_terminal() {
+        let (_, codes) = EXAMPLES.split_once("Exit codes:\n").unwrap();
+        assert_eq!(codes.lines().count(), 7);
+        for columns in [50, 60, 80, 100, 200] {
+            let help = Cli::command().term_width(columns).render_long_help().to_string();
+            for row in codes.lines() {
+                assert!(help.lines().any(|l| l == row), "{columns} columns break `{row}`:\n{help}");
+            }
+        }
+    }
+
+    #[test]
+    fn short_help_fits_one_screen() {
+        let help = Cli::command().render_help().to_string();
+        assert!(help.lines().count() <= 50, "{} lines", help.lines().count());
+    }
+
+    #[test]
+    fn every_command_with_something_to_choose_shows_worked_examples() {
+        for command in Cli::command().get_subcommands() {
+            let shown = command.get_after_long_help().map(|h| h.to_string()).unwrap_or_default();
+            let plain = ["metrics"].contains(&command.get_name());
+            assert!(plain || shown.matches("tiface ").count() >= 3, "{}", command.get_name());
+        }
+    }
+}

@@ -1,0 +1,190 @@
+//! What the program says of itself: `tiface config`, the effective configuration or what a key means; `tiface doctor`, what
+//! this machine and this build can do, to choose a device and to paste into a bug report; `tiface completions`, what a shell
+//! needs to complete commands and options, and the manual pages.
+
+use super::options::{Common, RunTarget};
+use super::out::Out;
+use super::screen::print;
+use crate::config::explain;
+use crate::{Error, ErrorKind, Result, io};
+use clap::{Command, ValueEnum};
+use clap_complete::{Shell, generate};
+use clap_mangen::Man;
+use serde::Serialize;
+use std::fmt::{self, Display};
+use std::path::Path;
+
+pub(super) fn config(common: &Common, path: Option<&Path>, key: Option<&str>) -> Result<()> {
+    if let Some(key) = key {
+        print(&explain(key)?)?;
+        return Ok(());
+    }
+    // without a capture or run it is the configuration of a run that is yet to be
+    let saved = match path.or(common.run.as_deref()) {
+        Some(path) => RunTarget::find(common, Some(path))?.saved,
+        None => None,
+    };
+    print(&common.resolve(saved.as_deref(), None, &[])?.to_toml())?;
+    Ok(())
+}
+
+/// What is said of a machine.
+#[derive(Serialize)]
+struct Examination {
+    version: &'static str,
+    features: Vec<&'static str>,
+    system: String,
+    processor: String,
+    threads: usize,
+    #[cfg(feature = "wgpu")]
+    devices: Vec<crate::field::devices::Found>,
+    /// What `--device auto` takes.
+    auto: String,
+}
+
+pub(super) fn doctor(common: &Common) -> Result<()> {
+    let features = [("wgpu", cfg!(feature = "wgpu")), ("matting", cfg!(feature = "matting"))];
+    #[cfg(feature = "wgpu")]
+    let (devices, auto) = {
+        use crate::field::devices::{best, examine};
+        let tests = [crate::iface::SDF_TEST, crate::tface::VM_TEST, crate::iface::DENSITY_TEST];
+        let devices = examine(&tests);
+        let choice = crate::config::DeviceChoice::parse("auto").expect("a device's name");
+        let auto = match best(&choice, &tests) {
+            Ok(gpu) => format!("{}: {}", gpu.device.name(), gpu.why),
+            Err(why) => format!("the processor: {why}"),
+        };
+        (devices, auto)
+    };
+    #[cfg(not(feature = "wgpu"))]
+    let auto = "the processor: this build knows no GPU (`--features wgpu`)".to_string();
+    let found = Examination {
+        version: env!("CARGO_PKG_VERSION"),
+        features: features.into_iter().filter(|(_, there)| *there).map(|(name, _)| name).collect(),
+        system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
+        processor: io::processor(),
+        threads: rayon::current_num_threads(),
+        #[cfg(feature = "wgpu")]
+        devices,
+        auto,
+    };
+    let text = match common.json {
+        true => serde_json::to_string(&found).unwrap_or_default(),
+        false => found.to_string(),
+    };
+    print(&format!("{text}\n"))?;
+    if found.is_sound() { Ok(()) } else { Err(Error::already_printed(ErrorKind::Cannot)) }
+}
+
+impl Examination {
+    /// Does every device that is here compute what the processor does?
+    fn is_sound(&self) -> bool {
+        #[cfg(feature = "wgpu")]
+        return self.devices.iter().all(|d| d.error.is_none() && d.checks.iter().all(|c| c.passed));
+        #[cfg(not(feature = "wgpu"))]
+        true
+    }
+}
+
+impl Display for Examination {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        writeln!(f, "tiface {} ({}), {}", self.version, self.features.join(", "), self.system)?;
+        writeln!(f, "cpu           {}, {} threads", self.processor, self.threads)?;
+        #[cfg(feature = "wgpu")]
+        for d in &self.devices {
+            let gib = |bytes: u64| format!("{:.1} GiB", bytes as f64 / (1u64 << 30) as f64);
+            let memory = d.memory.map_or("unknown".into(), gib);
+            let used = if d.in_use { ", in use" } else { "" };
+            writeln!(f, "{:<13} {}, {}{used}", d.name, d.adapter, d.kind)?;
+            writeln!(f, "  driver      {}", d.driver)?;
+            if let Some(card) = &d.card {
+                writeln!(f, "  card        {card}")?;
+            }
+            let buffer = gib(d.largest_buffer);
+            writeln!(f, "  memory      {memory}; buffers up to {buffer}; {} KiB a group", d.shared / 1024)?;
+            writeln!(f, "  atomic adds {}", d.atomics)?;
+            match &d.error {
+                Some(error) => writeln!(f, "  self-test   FAILED: {error}")?,
+                None => {
+                    let failed = d.checks.iter().filter(|c| !c.passed).count();
+                    let verdict = if failed == 0 { "passed".into() } else { format!("FAILED ({failed})") };
+                    writeln!(
+                        f,
+                        "  self-test   {verdict} in {:.1} s; errors, and what they may be:",
+                        d.seconds
+                    )?;
+                }
+            }
+            for c in &d.checks {
+                let mark = if c.passed { "" } else { "  <- WRONG" };
+                writeln!(f, "    {:<48} {:.1e} of {:.0e}{mark}", c.name, c.error, c.allowed)?;
+            }
+        }
+        write!(f, "--device auto is {}", self.auto)
+    }
+}
+
+/// What `completions` writes.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Form {
+    Shell(Shell),
+    Man,
+}
+
+impl ValueEnum for Form {
+    fn value_variants<'a>() -> &'a [Form] {
+        use Form::{Man, Shell as For};
+        &[
+            For(Shell::Bash),
+            For(Shell::Zsh),
+            For(Shell::Fish),
+            For(Shell::PowerShell),
+            For(Shell::Elvish),
+            Man,
+        ]
+    }
+
+    fn to_possible_value(&self) -> Option<clap::builder::PossibleValue> {
+        match self {
+            Form::Shell(shell) => shell.to_possible_value(),
+            Form::Man => Some(clap::builder::PossibleValue::new("man")),
+        }
+    }
+}
+
+pub(super) fn completions(form: Form, mut command: Command, out: Option<&Out>) -> Result<()> {
+    let pages = match (form, out) {
+        (Form::Shell(_), Some(_)) => {
+            return Err(Error::usage("the script of a shell goes to stdout", "send it on with `> FILE`"));
+        }
+        (Form::Shell(shell), None) => {
+            let mut script = Vec::new();
+            generate(shell, &mut command, "tiface", &mut script);
+            return print(&String::from_utf8_lossy(&script));
+        }
+        (Form::Man, None) => vec![page(command)?],
+        (Form::Man, Some(_)) => {
+            command.build();
+            let of_commands: Vec<Command> =
+                command.get_subcommands().filter(|c| c.get_name() != "help").cloned().collect();
+            let named = of_commands.into_iter().map(|c| {
+                // a command's name lives as long as the program
+                let name: &'static str = format!("tiface-{}", c.get_name()).leak();
+                c.name(name).display_name(name)
+            });
+            let all: Vec<Command> = named.collect();
+            std::iter::once(command).chain(all).map(page).collect::<Result<_>>()?
+        }
+    };
+    let Some(out) = out else { return print(&String::from_utf8_lossy(&pages[0].1)) };
+    out.prepare()?;
+    pages.iter().try_for_each(|(name, text)| Ok(io::write_atomic(&out.file(name), text)?))
+}
+
+/// A manual page and the name of its file.
+fn page(command: Command) -> Result<(String, Vec<u8>)> {
+    let man = Man::new(command);
+    let mut text = Vec::new();
+    man.render(&mut text).map_err(|e| Error::new(crate::ErrorKind::Bug, e))?;
+    Ok((man.get_filename(), text))
+}

@@ -1,0 +1,495 @@
+//! Every knob: defaults, presets, files, `--set`; checked before anything is computed.
+//!
+//! Later wins: defaults, then the preset, then each file, then `--set`. A key that is not known, of
+//! the wrong type or out of range is an error that names the line, the key and a suggested fix. The
+//! complete result ([`Config::to_toml`]) passed back as a file gives the same configuration.
+//!
+//! Each stage owns its table, declared by `table!`: a key, its documentation, range and the values of the presets
+//! stand once, on its field. Everything here works on what serde says about them. What no user has a reason to
+//! change is no key but a constant of the preset, in the same place.
+
+pub mod iface;
+mod mask;
+mod mesh;
+mod render;
+mod source;
+mod stage;
+mod table;
+mod vm;
+
+pub use iface::IfaceConfig;
+pub use mask::{
+    CaptureConfig, CutMethod, MaskConfig, MaskMeaning, MaskSource, MattingMethod, VitmatteColors,
+};
+pub use mesh::{ColorSource, Genus, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
+pub use render::{
+    EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,
+    called,
+};
+pub use source::Sources;
+pub use stage::Stage;
+pub use vm::{BaselineConfig, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
+
+use crate::io::{self, Limits};
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::Path;
+use std::str::FromStr;
+use toml::{Table, Value};
+
+/// A key of the configuration: what it means and what a number may be.
+#[derive(Clone, Copy, Debug)]
+pub struct Key {
+    /// Name inside its table.
+    pub name: &'static str,
+    /// What it means, with its unit.
+    pub doc: &'static str,
+    /// Least number allowed; `f64::NEG_INFINITY` where any is, and for what is no number.
+    pub min: f64,
+    /// Largest number allowed; `f64::INFINITY` where any is, and for what is no number.
+    pub max: f64,
+}
+
+impl Key {
+    /// A number between `min` and `max`, both allowed.
+    pub const fn number(name: &'static str, doc: &'static str, min: f64, max: f64) -> Key {
+        Key { name, doc, min, max }
+    }
+
+    /// A word, text, switch or list.
+    pub const fn word(name: &'static str, doc: &'static str) -> Key {
+        Key { name, doc, min: f64::NEG_INFINITY, max: f64::INFINITY }
+    }
+
+    /// `1 to 64`, `at least 1`; empty where every value is allowed.
+    pub fn range(&self) -> String {
+        match (self.min.is_finite(), self.max.is_finite()) {
+            (true, true) => format!("{} to {}", self.min, self.max),
+            (true, false) => format!("at least {}", self.min),
+            (false, true) => format!("at most {}", self.max),
+            (false, false) => String::new(),
+        }
+    }
+}
+
+/// How much effort: the starting values of every table.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// A first look in minutes.
+    Draft,
+    /// What to use.
+    #[default]
+    Standard,
+    /// The published recipe; changes only to be corrected.
+    Paper,
+}
+
+impl Preset {
+    /// All presets, from the least effort to the most.
+    pub const ALL: [Preset; 3] = [Preset::Draft, Preset::Standard, Preset::Paper];
+
+    /// Its word in the configuration.
+    pub fn name(self) -> &'static str {
+        match self {
+            Preset::Draft => "draft",
+            Preset::Standard => "standard",
+            Preset::Paper => "paper",
+        }
+    }
+}
+
+impl FromStr for Preset {
+    type Err = Error;
+
+    fn from_str(word: &str) -> Result<Preset> {
+        let found = Preset::ALL.into_iter().find(|preset| preset.name() == word);
+        found.ok_or_else(|| {
+            Error::usage(format!("there is no preset `{word}`"), "use draft, standard or paper")
+        })
+    }
+}
+
+/// The whole configuration, complete and valid.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// The preset it started from.
+    pub preset: Preset,
+    /// Start of every random sequence.
+    pub seed: u64,
+    /// A [`DeviceChoice`] as a word.
+    pub device: String,
+    /// What was photographed.
+    pub capture: CaptureConfig,
+    /// Which pixels are the head.
+    pub mask: MaskConfig,
+    /// The radiance field without masks that T-Face is compared with.
+    pub baseline: BaselineConfig,
+    /// T-Face.
+    pub tface: VmConfig,
+    /// The learned signed-distance field.
+    pub iface: IfaceConfig,
+    /// The extracted surface.
+    pub mesh: MeshConfig,
+    /// The views made of it.
+    pub render: RenderConfig,
+    /// How they are blended.
+    pub ensemble: EnsembleConfig,
+    /// How all of them are judged.
+    pub metrics: MetricsConfig,
+}
+
+const ROOT_KEYS: &[Key] = &[
+    Key::word(
+        "preset",
+        "Starting values of every other key: draft (a first look), standard, paper (the published recipe).",
+    ),
+    Key::number(
+        "seed",
+        "Start of every random sequence; same seed and device, same result.",
+        0.0,
+        i64::MAX as f64,
+    ),
+    Key::word(
+        "device",
+        "Where fields are learned: auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one; +deterministic and +8GiB \
+         say how.",
+    ),
+];
+
+/// Every table with its keys, in the order of the line; the first has no name.
+const TABLES: &[(&str, &[Key])] = &[
+    ("", ROOT_KEYS),
+    ("capture", CaptureConfig::KEYS),
+    ("mask", MaskConfig::KEYS),
+    ("baseline", BaselineConfig::KEYS),
+    ("tface", VmConfig::KEYS),
+    ("iface", IfaceConfig::KEYS),
+    ("mesh", MeshConfig::KEYS),
+    ("render", RenderConfig::KEYS),
+    ("ensemble", EnsembleConfig::KEYS),
+    ("metrics", MetricsConfig::KEYS),
+];
+
+/// Every key with its full, dotted name.
+fn all_keys() -> impl Iterator<Item = (String, &'static Key)> {
+    TABLES.iter().flat_map(|(table, keys)| keys.iter().map(|k| (dotted(table, k.name), k)))
+}
+
+fn dotted(table: &str, name: &str) -> String {
+    if table.is_empty() { name.into() } else { format!("{table}.{name}") }
+}
+
+impl Config {
+    /// The values a preset starts with.
+    pub fn preset(preset: Preset) -> Config {
+        Config {
+            preset,
+            seed: 42,
+            device: "auto".into(),
+            capture: CaptureConfig::preset(preset),
+            mask: MaskConfig::preset(preset),
+            baseline: BaselineConfig::preset(preset),
+            tface: VmConfig::preset(preset),
+            iface: IfaceConfig::preset(preset),
+            mesh: MeshConfig::preset(preset),
+            render: RenderConfig::preset(preset),
+            ensemble: EnsembleConfig::preset(preset),
+            metrics: MetricsConfig::preset(preset),
+        }
+    }
+
+    /// Returns the configuration that the run in `folder` was last worked on with; none where it has no `config.toml`, or
+    /// one that is not understood any more.
+    pub fn of_run(folder: &Path) -> Option<Config> {
+        Config::read(&folder.join("config.toml")).ok()
+    }
+
+    /// Reads a configuration that stands alone in a file.
+    ///
+    /// # Errors
+    ///
+    /// The first thing wrong with it, with its line.
+    pub fn read(file: &Path) -> Result<Config> {
+        let text = String::from_utf8_lossy(&io::read_bytes(file, &Limits::default())?).into_owned();
+        Config::resolve(&Sources { files: vec![(file.display().to_string(), text)], ..Sources::default() })
+    }
+
+    /// Settings of the radiance field that the stage `baseline` or `tface` learns.
+    pub fn radiance(&self, stage: Stage) -> VmConfig {
+        if stage == Stage::Baseline { self.baseline.field(&self.tface) } else { self.tface.clone() }
+    }
+
+    /// With the constants of its preset, which are not read from text.
+    fn keep_constants(self) -> Config {
+        let mut iface = self.iface.keep_constants(self.preset);
+        if self.preset == Preset::Paper {
+            // the published shares of the steps, so that less of everything is learned by the same schedule
+            (iface.warmup, iface.anneal_end) = ((iface.steps / 40).max(1), iface.steps);
+        }
+        Config {
+            tface: self.tface.keep_constants(self.preset),
+            iface,
+            mesh: self.mesh.keep_constants(self.preset),
+            ..self
+        }
+    }
+
+    /// The configuration that `sources` describe, or the first thing wrong with them.
+    ///
+    /// ```
+    /// use tiface::config::{Config, Preset, Sources};
+    ///
+    /// let set = |text: &str| Sources { set: vec![text.into()], ..Sources::default() };
+    /// let config = Config::resolve(&set("mesh.resolution=300"))?;
+    /// assert_eq!((config.preset, config.mesh.resolution), (Preset::Standard, 300));
+    ///
+    /// let error = Config::resolve(&set("mesh.resolutoin=300")).unwrap_err();
+    /// assert_eq!(error.to_string(), "`--set mesh.resolutoin=300`: there is no key `mesh.resolutoin`");
+    /// assert!(error.hint().starts_with("did you mean `mesh.resolution`?"));
+    /// # Ok::<(), tiface::Error>(())
+    /// ```
+    pub fn resolve(sources: &Sources) -> Result<Config> {
+        source::resolve(sources)
+    }
+
+    /// As TOML, complete, every key with its documentation above it.
+    pub fn to_toml(&self) -> String {
+        let root = self.to_table();
+        let mut out =
+            String::from("# tiface configuration: `tiface run CAPTURE --config THIS` repeats the run\n");
+        for (table, keys) in TABLES {
+            if !table.is_empty() {
+                let _ = writeln!(out, "\n[{table}]");
+            }
+            for key in *keys {
+                if let Some(value) = lookup(&root, &dotted(table, key.name)) {
+                    let _ = writeln!(out, "# {}\n{} = {}", key.doc, key.name, show(value));
+                }
+            }
+        }
+        out
+    }
+
+    /// The values of one table (`iface`), by full name (`iface.steps`), as they are written in TOML:
+    /// what a stage's fingerprint is made of.
+    pub fn values(&self, table: &str) -> BTreeMap<String, String> {
+        let root = self.to_table();
+        all_keys()
+            .filter(|(name, _)| name.split('.').next() == Some(table) && name.contains('.'))
+            .filter_map(|(name, _)| lookup(&root, &name).map(|v| (name, show(v))))
+            .collect()
+    }
+
+    /// The keys whose values are not those of the preset: full name, value, the preset's value, as in TOML.
+    pub fn changes(&self) -> Vec<[String; 3]> {
+        let (own, preset) = (self.to_table(), Config::preset(self.preset).to_table());
+        let change = |(name, _): (String, &Key)| {
+            let [own, preset] = [&own, &preset].map(|t| lookup(t, &name).map(show).unwrap_or_default());
+            (own != preset).then_some([name, own, preset])
+        };
+        all_keys().filter_map(change).collect()
+    }
+
+    fn to_table(&self) -> Table {
+        match Value::try_from(self) {
+            Ok(Value::Table(table)) => table,
+            // a struct of numbers, words and lists always is a table; a test serialises every preset
+            _ => Table::new(),
+        }
+    }
+}
+
+/// What a key or a whole table means, its range and its value in every preset; an unknown name is an
+/// error that knows the nearest one.
+pub fn explain(name: &str) -> Result<String> {
+    let wanted: Vec<_> =
+        all_keys().filter(|(full, _)| full == name || full.starts_with(&format!("{name}."))).collect();
+    if wanted.is_empty() {
+        return Err(source::unknown(name).within("`--explain`"));
+    }
+    let tables = Preset::ALL.map(|p| Config::preset(p).to_table());
+    let mut out = String::new();
+    for (i, (full, key)) in wanted.into_iter().enumerate() {
+        if i > 0 {
+            out.push('\n');
+        }
+        let _ = writeln!(out, "{full}\n  {}", key.doc);
+        if !key.range().is_empty() {
+            let _ = writeln!(out, "  allowed: {}", key.range());
+        }
+        let [draft, standard, paper] =
+            tables.each_ref().map(|t| lookup(t, &full).map(show).unwrap_or_default());
+        if full == "preset" || (draft == standard && standard == paper) {
+            let _ = writeln!(out, "  default: {standard}");
+        } else {
+            let _ = writeln!(out, "  draft: {draft}   standard: {standard}   paper: {paper}");
+        }
+    }
+    Ok(out)
+}
+
+fn lookup<'a>(root: &'a Table, dotted: &str) -> Option<&'a Value> {
+    let mut parts = dotted.split('.');
+    let mut value = root.get(parts.next()?)?;
+    for part in parts {
+        value = value.as_table()?.get(part)?;
+    }
+    Some(value)
+}
+
+/// A value as it is written in TOML. A number that came from an f32 is written with an f32's digits
+/// (0.1, not 0.10000000149011612): read back, it is the same f32.
+fn show(value: &Value) -> String {
+    match value {
+        Value::Float(f) if f.is_finite() && (*f as f32) as f64 == *f => {
+            format!("{:?}", *f as f32) // `1e-5` and `2.0` are TOML as they stand
+        }
+        other => other.to_string(),
+    }
+}
+
+/// Names of devices.
+const DEVICES: [&str; 6] = ["auto", "cpu", "wgpu", "vulkan", "metal", "dx12"];
+
+/// A device, and how it is to be used.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DeviceChoice {
+    /// `auto`, `cpu`, `wgpu` (Vulkan, Metal or DX12), `vulkan`, `metal` or `dx12`.
+    pub name: String,
+    /// Which of its adapters, from 0.
+    pub number: Option<usize>,
+    /// Are sums of many threads made in whole numbers, so that they are the same bytes every time? The processor's are.
+    pub deterministic: bool,
+    /// GiB of its memory that a training may take; all of it where nothing is said.
+    pub memory_gib: Option<f64>,
+}
+
+impl DeviceChoice {
+    /// Returns the choice of a word; none where it is no such word.
+    pub fn parse(word: &str) -> Option<DeviceChoice> {
+        let mut parts = word.split('+');
+        let device = parts.next()?;
+        let (name, number) = match device.split_once(':') {
+            Some((name, number)) => (name, Some(number.parse().ok()?)),
+            None => (device, None),
+        };
+        if !DEVICES.contains(&name) || (number.is_some() && ["auto", "cpu"].contains(&name)) {
+            return None;
+        }
+        let mut choice = DeviceChoice { name: name.into(), number, deterministic: false, memory_gib: None };
+        for part in parts {
+            match part.strip_suffix("GiB") {
+                Some(gib) => {
+                    let gib = gib.parse().ok().filter(|gib: &f64| gib.is_finite() && *gib > 0.0);
+                    choice.memory_gib = Some(gib?);
+                }
+                None if part == "deterministic" => choice.deterministic = true,
+                None => return None,
+            }
+        }
+        Some(choice)
+    }
+}
+
+#[cfg(test)]
+mod source_tests;
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_differs_from_the_preset_is_listed() {
+        let mut config = Config::preset(Preset::Draft);
+        assert!(config.changes().is_empty());
+        (config.seed, config.iface.lr_table) = (7, 0.1);
+        let expected = [["seed", "7", "42"], ["iface.lr_table", "0.1", "0.01"]].map(|c| c.map(String::from));
+        assert_eq!(config.changes(), expected);
+    }
+
+    #[test]
+    fn every_field_has_a_documented_key_and_every_key_a_field() {
+        for preset in Preset::ALL {
+            let root = Config::preset(preset).to_table();
+            let mut fields = Vec::new();
+            for (name, value) in &root {
+                match value {
+                    Value::Table(t) => fields.extend(t.keys().map(|k| format!("{name}.{k}"))),
+                    _ => fields.push(name.clone()),
+                }
+            }
+            let mut keys: Vec<String> = all_keys().map(|(name, _)| name).collect();
+            keys.sort();
+            fields.sort();
+            assert_eq!(fields, keys);
+        }
+        for (name, key) in all_keys() {
+            assert!(key.doc.ends_with('.') && key.min <= key.max, "{name}");
+        }
+    }
+
+    #[test]
+    fn every_preset_lies_in_its_own_ranges_and_comes_back_from_its_own_file() {
+        for preset in Preset::ALL {
+            let config = Config::preset(preset);
+            let text = config.to_toml();
+            let sources = Sources { files: vec![("saved.toml".into(), text.clone())], ..Sources::default() };
+            let back = Config::resolve(&sources).unwrap_or_else(|e| panic!("{e}\n{text}"));
+            assert_eq!(back, config);
+        }
+    }
+
+    #[test]
+    fn explaining_a_key_gives_its_range_and_its_value_in_every_preset() {
+        let text = explain("mesh.resolution").unwrap();
+        assert!(
+            text.contains("allowed: 16 to 4096") && text.contains("draft: 256   standard: 512"),
+            "{text}"
+        );
+        assert!(explain("mesh").unwrap().matches("mesh.").count() > 3);
+        assert!(explain("mesh.resolutoin").unwrap_err().hint().contains("mesh.resolution"));
+    }
+
+    #[test]
+    fn a_number_from_an_f32_is_written_with_the_digits_of_an_f32() {
+        assert_eq!(show(&Value::Float(0.1f32 as f64)), "0.1");
+        assert_eq!(show(&Value::Float(0.1)), "0.1");
+        assert_eq!(show(&Value::Float(2.0)), "2.0");
+        let tiny = show(&Value::Float(1e-12f32 as f64));
+        assert_eq!(tiny.parse::<f32>().unwrap(), 1e-12f32);
+    }
+
+    #[test]
+    fn words_are_taken_apart_and_others_are_none() {
+        let parsed = |word| DeviceChoice::parse(word);
+        let plain = parsed("auto").unwrap();
+        assert_eq!((plain.name.as_str(), plain.number, plain.deterministic), ("auto", None, false));
+        let all = parsed("vulkan:3+deterministic+7.5GiB").unwrap();
+        let want = DeviceChoice {
+            name: "vulkan".into(),
+            number: Some(3),
+            deterministic: true,
+            memory_gib: Some(7.5),
+        };
+        assert_eq!(all, want);
+        assert_eq!(parsed("dx12:1").unwrap().number, Some(1));
+        for wrong in [
+            "",
+            "gpu",
+            "cpu:0",
+            "auto:1",
+            "wgpu:",
+            "wgpu:-1",
+            "wgpu+",
+            "wgpu+fast",
+            "wgpu+0GiB",
+            "wgpu+NaNGiB",
+            "cuda",
+        ] {
+            assert_eq!(parsed(wrong), None, "{wrong}");
+        }
+    }
+}

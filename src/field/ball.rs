@@ -1,0 +1,76 @@
+//! Photographs of an analytic ball: what self-tests and tests train on.
+
+use super::pixels::TrainView;
+use crate::geom::{Camera, Distortion};
+use crate::image::{Gray, Photo};
+use crate::kernel::cpu::march::Bitmask;
+use glam::{DMat3, DVec3, Vec2, Vec3};
+
+/// Its radius.
+pub const BALL: f32 = 0.6;
+
+/// A red and green ball in front of a blue wall, seen from eight sides.
+pub fn views() -> Vec<TrainView> {
+    let color = |p: Vec3| if p.y > 0.0 { [200, 40, 30] } else { [40, 180, 60] };
+    (0..8)
+        .map(|i| view(40, i as f64 * std::f64::consts::TAU / 8.0, if i % 2 == 0 { 0.4 } else { -0.4 }, color))
+        .collect()
+}
+
+/// A photograph of the ball with its mask.
+pub fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8; 3]) -> TrainView {
+    let rotation = DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-elevation);
+    let camera = Camera {
+        width: size,
+        height: size,
+        fx: 1.5 * size as f64,
+        fy: 1.5 * size as f64,
+        cx: 0.5 * size as f64,
+        cy: 0.5 * size as f64,
+        distortion: Distortion::default(),
+        rotation,
+        position: rotation * DVec3::new(0.0, 0.0, 3.0),
+    };
+    let mut rgb = Vec::new();
+    let mut alpha = Vec::new();
+    for y in 0..size {
+        for x in 0..size {
+            let ray = camera
+                .ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))
+                .expect("a camera without a lens has a ray for every pixel");
+            let b = ray.origin.dot(ray.direction);
+            let discriminant = b * b - ray.origin.length_squared() + BALL * BALL;
+            if discriminant > 0.0 {
+                let p = ray.at(-b - discriminant.sqrt());
+                rgb.push(color(p));
+                alpha.push(255);
+            } else {
+                rgb.push([30, 30, 220]);
+                alpha.push(0);
+            }
+        }
+    }
+    TrainView {
+        camera,
+        photo: Photo { width: size, height: size, rgb, alpha: None },
+        mask: Some(Gray { width: size, height: size, values: alpha }),
+        valid: None,
+    }
+}
+
+/// Cells that the ball lies in, and some around them.
+pub fn hull() -> Bitmask {
+    let r = 32;
+    let mut hull = Bitmask::filled(r, false);
+    for i in 0..r * r * r {
+        let c = Vec3::from_array([i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) / 16.0 - 1.0));
+        hull.set(i, c.length() < BALL + 0.1);
+    }
+    hull
+}
+
+#[cfg(test)]
+#[path = "ball_tests.rs"]
+mod tests;
+#[cfg(test)]
+pub use tests::*;

@@ -1,0 +1,45 @@
+//! Stage `iface`: a signed-distance field learned from masked photographs.
+//!
+//! Instant-NGP's hash grid (Müller et al. 2022) under a small network gives a signed distance; NeuS
+//! (Wang et al. 2021) renders it; color, mask, eikonal and sparsity losses train it (I-Face of
+//! TI-Face, ICCV 2023 View Synthesis Challenge for Human Heads). The `paper` preset follows the
+//! published system; the others start from the masks' visual hull, sample only a band around the
+//! surface, let the surface be softer in hair than on skin (Wang et al. 2023, "Adaptive Shells"), show the color
+//! network the hash features themselves, and hold the surface to points that stereo finds on it half-way (Fu et al.
+//! 2022, "Geo-NeuS", use points of a reconstruction as zero set).
+
+mod cpu;
+mod density;
+#[cfg(feature = "wgpu")]
+mod gpu;
+mod hull_start;
+mod infer;
+mod model;
+mod occupancy;
+mod ops;
+mod schedule;
+#[cfg(feature = "wgpu")]
+mod self_test;
+mod state;
+mod stereo;
+mod train;
+
+pub use density::{DensityField, train_density};
+pub use infer::IFace;
+pub use train::{IfaceReport, train};
+
+use crate::field::SelfTest;
+
+/// Whether a GPU learns a signed distance as the processor does.
+pub const SDF_TEST: SelfTest = SelfTest {
+    field: "signed distance",
+    #[cfg(feature = "wgpu")]
+    run: self_test::sdf,
+};
+
+/// Whether a GPU learns a density as the processor does.
+pub const DENSITY_TEST: SelfTest = SelfTest {
+    field: "density",
+    #[cfg(feature = "wgpu")]
+    run: self_test::density,
+};

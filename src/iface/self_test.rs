@@ -1,0 +1,114 @@
+//! One training step of a signed distance and of a density on a GPU and on the processor.
+
+use super::cpu::CpuSdf;
+use super::density;
+use super::gpu::GpuSdf;
+use super::model::initial;
+use super::occupancy::Occupancy;
+use super::ops::SdfOps;
+use super::schedule;
+use super::state::SdfState;
+use super::stereo::SurfacePoint;
+use super::train::{SdfModel, pixels};
+use crate::Result;
+use crate::config::Preset;
+use crate::config::iface::IfaceConfig;
+use crate::field::ball::{self, BALL};
+use crate::field::devices::Check;
+use crate::field::parameters::HostGroup;
+use crate::field::self_test::{CELLS_AT, SEED, TestedModel, compare, compare_cells, outcome, session, ways};
+use crate::field::training::StepAt;
+use crate::kernel::cpu::rng;
+use crate::kernel::gpu::Adapter;
+
+impl<O: SdfOps> TestedModel for SdfModel<'_, O> {
+    fn host_groups(&self) -> Result<Vec<HostGroup>> {
+        Ok(self.state()?.groups.into())
+    }
+}
+
+/// Some 20,000 samples: several tiles for each group of threads.
+pub(super) fn config(preset: Preset) -> IfaceConfig {
+    IfaceConfig {
+        steps: 1000,
+        rays: 1024,
+        max_rays: 1024,
+        samples: 8192,
+        levels: 12,
+        log2_table: 12,
+        growth: 1.3,
+        occupancy_resolution: 24,
+        samples_per_ray: 40,
+        ..IfaceConfig::preset(preset)
+    }
+}
+
+/// A field that is not the same everywhere, and points that its surface should pass through.
+fn start(config: &IfaceConfig) -> SdfState {
+    let mut state = SdfState::start(initial(config, SEED), config, None);
+    state.groups[0].state[0].iter_mut().for_each(|v| *v *= 100.0);
+    state.stereo = (0..100)
+        .map(|i| {
+            let p: [f32; 3] = std::array::from_fn(|a| rng::normal(SEED, 9, 3 * i + a as u64));
+            let length = p.iter().map(|c| c * c).sum::<f32>().sqrt();
+            SurfacePoint { position: p.map(|c| c * BALL / length), footprint: 0.02, weight: 0.5 }
+        })
+        .collect();
+    state
+}
+
+/// The cells that a field as it starts keeps.
+fn cells<O: SdfOps>(model: &mut SdfModel<O>) -> Result<Occupancy> {
+    model.load(start(model.config));
+    let at = StepAt { seed: SEED, step: CELLS_AT };
+    model.ops.weights(&mut model.groups);
+    model.ops.update_occupancy(&model.groups, schedule::active_levels(model.config, at.step), at);
+    Ok(model.state()?.occupancy)
+}
+
+/// Compares a step of the signed distance.
+pub(super) fn sdf(adapter: &Adapter) -> Result<Vec<Check>> {
+    const FIELD: &str = "signed distance";
+    let config = IfaceConfig { sparsity: 0.1, stereo: 0.1, ..config(Preset::Draft) };
+    let (views, session) = (ball::views(), session("iface"));
+    let pixels = pixels(&views, None, &config)?;
+    let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &pixels), &pixels, None, &config, &session);
+    let occupancy = cells(&mut on_cpu)?;
+    // rounding apart both keep the same cells: the step goes through the processor's
+    let start = || SdfState { occupancy: occupancy.clone(), ..start(&config) };
+    on_cpu.load(start());
+    let want = outcome(&mut on_cpu)?;
+    let mut checks = Vec::new();
+    for (way, device) in [FIELD, "signed distance in fixed point"].into_iter().zip(ways(adapter)) {
+        let mut on_gpu =
+            SdfModel::new(GpuSdf::new(&config, &pixels, device)?, &pixels, None, &config, &session);
+        if way == FIELD {
+            let got = cells(&mut on_gpu)?;
+            checks.push(compare_cells(way, &got.occupied.bits, &occupancy.occupied.bits));
+        }
+        on_gpu.load(start());
+        checks.extend(compare(way, &outcome(&mut on_gpu)?, &want));
+    }
+    Ok(checks)
+}
+
+/// Compares a step of the density.
+pub(super) fn density(adapter: &Adapter) -> Result<Vec<Check>> {
+    density::self_test(adapter, &config(Preset::Paper))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_that_computes_right_passes() {
+        let Some(adapter) = Adapter::all().first() else { return };
+        for test in [sdf, density] {
+            let began = std::time::Instant::now();
+            let checks = test(adapter).unwrap();
+            println!("{:.1?}: {checks:#?}", began.elapsed());
+            assert!(!checks.is_empty() && checks.iter().all(|check| check.passed));
+        }
+    }
+}

@@ -1,0 +1,48 @@
+//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal and DX12. Each is the twin of a kernel of [`super::cpu`].
+//!
+//! Values of samples lie plane by plane, `[channels, capacity]`: neighboring threads read neighboring words, and a
+//! plane is read four samples at a time. `capacity` is a multiple of [`mlp::TILE`](super::cpu::mlp::TILE); how many samples
+//! there really are is a count in a buffer that a kernel before wrote, so that nobody waits to read it back. Weights
+//! and tables lie as on the CPU.
+//!
+//! Sums of many threads into one place are atomic, and [`Atomics`] says how. All else is summed in a fixed order.
+
+mod adam;
+mod density;
+mod device;
+mod draw;
+mod evaluate;
+mod hash;
+mod losses;
+mod march;
+mod neus;
+mod occupancy;
+mod points;
+mod rng;
+mod schedule;
+mod sdf;
+mod sum;
+#[cfg(test)]
+mod test_case;
+mod tile;
+mod vm;
+mod weight_norm;
+
+pub use adam::{Gate, adam};
+pub use density::Density;
+pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits, Words};
+pub use draw::{BUFFERS, Batch, DrawnView, Photographs, PixelOrder, SamplingOptions};
+pub use evaluate::Evaluator;
+pub use hash::Grid;
+pub use losses::Losses;
+pub use march::Samples;
+pub use neus::{Neus, Rays};
+pub use occupancy::{Band, Nerfacc, Occupancy};
+pub use points::SurfacePoints;
+pub use schedule::Schedule;
+pub use sdf::Sdf;
+pub use vm::{DeviceDecoder, DeviceGrid, Vm, VmLosses, VmRenderer, VmValues};
+pub use weight_norm::WeightNorm;
+
+#[cfg(test)]
+pub(crate) use device::tests;

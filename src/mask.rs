@@ -1,0 +1,31 @@
+//! Stage `mask`: which pixels are the head, from a few clicks.
+//!
+//! A click says "this is head" or "this is not". From clicks a hard mask is cut, a band around its
+//! outline is unknown (the trimap), and the band's opacity is estimated from the photograph:
+//!
+//! ```text
+//! photograph + clicks → hard mask → trimap → soft alpha
+//! ```
+//!
+//! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unknown in a trimap.
+
+mod hull;
+pub mod morphology;
+pub mod scale;
+
+pub mod prompts;
+
+pub mod pages;
+
+pub mod grabcut;
+
+pub mod propagate;
+
+pub mod agreement;
+pub mod consistency;
+
+pub mod matting;
+#[cfg_attr(not(feature = "matting"), path = "mask/no_networks.rs")]
+pub mod networks;
+
+pub use prompts::Click;

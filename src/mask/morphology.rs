@@ -1,0 +1,238 @@
+//! Binary pictures: the exact Euclidean distance to the nearest marked pixel (Felzenszwalb & Huttenlocher 2012) and what
+//! follows from it, growing and shrinking by discs, nearest of two sets; and connected pieces: keeping some, filling holes,
+//! smoothing with a 3 × 3 square.
+
+use crate::image::Gray;
+use crate::kernel::cpu::distance::LowerEnvelope;
+use rayon::prelude::*;
+
+/// Far away: no pixel is marked. Larger than any squared distance in a picture, finite in arithmetic.
+const FAR: f32 = 1e12;
+
+/// Squared distance in pixels from every pixel to the nearest one that `marked` names; `f32::INFINITY`
+/// everywhere when none is. `marked`: `[height · width]`.
+pub fn squared_distance(marked: &[bool], width: usize, height: usize) -> Vec<f32> {
+    assert_eq!(marked.len(), width * height);
+    if !marked.contains(&true) {
+        return vec![f32::INFINITY; marked.len()];
+    }
+    // along columns first: a plain two-pass scan is exact there
+    let mut field: Vec<f32> = marked.iter().map(|&m| if m { 0.0 } else { FAR }).collect();
+    let mut steps = vec![u32::MAX; width];
+    for y in 0..height {
+        for x in 0..width {
+            let i = y * width + x;
+            steps[x] = if marked[i] { 0 } else { steps[x].saturating_add(1) };
+            field[i] = squared(steps[x]);
+        }
+    }
+    steps.fill(u32::MAX);
+    for y in (0..height).rev() {
+        for x in 0..width {
+            let i = y * width + x;
+            steps[x] = if marked[i] { 0 } else { steps[x].saturating_add(1) };
+            field[i] = field[i].min(squared(steps[x]));
+        }
+    }
+    field
+        .par_chunks_mut(width)
+        .for_each_init(|| LowerEnvelope::new(width), |lower, row| lower.transform(row));
+    field
+}
+
+fn squared(steps: u32) -> f32 {
+    if steps == u32::MAX { FAR } else { (steps as f32) * (steps as f32) }
+}
+
+/// Pixels within `radius` pixels of a marked one.
+pub fn grow(marked: &[bool], width: usize, height: usize, radius: f32) -> Vec<bool> {
+    squared_distance(marked, width, height).iter().map(|&d| d <= radius * radius).collect()
+}
+
+/// Marked pixels farther than `radius` pixels from every pixel that is not; beyond the border nothing is known,
+/// so the border does not shrink them.
+pub fn shrink(marked: &[bool], width: usize, height: usize, radius: f32) -> Vec<bool> {
+    let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
+    squared_distance(&outside, width, height).iter().map(|&d| d > radius * radius).collect()
+}
+
+/// Pieces that hang together, numbered from 1 in the order of their first pixel; 0 where `marked` is not.
+struct Pieces {
+    /// `[height · width]`.
+    label: Vec<u32>,
+    /// Pixels of each piece; entry 0 counts the rest.
+    size: Vec<usize>,
+}
+
+/// Finds pieces, over edges only (`corners` false) or over corners too.
+fn pieces(marked: &[bool], width: usize, height: usize, corners: bool) -> Pieces {
+    let mut label = vec![0u32; marked.len()];
+    let mut size = vec![marked.iter().filter(|m| !**m).count()];
+    let mut stack = Vec::new();
+    for start in 0..marked.len() {
+        if !marked[start] || label[start] != 0 {
+            continue;
+        }
+        let id = size.len() as u32;
+        size.push(0);
+        label[start] = id;
+        stack.push(start);
+        while let Some(i) = stack.pop() {
+            size[id as usize] += 1;
+            let (x, y) = (i % width, i / width);
+            for v in y.saturating_sub(1)..(y + 2).min(height) {
+                for u in x.saturating_sub(1)..(x + 2).min(width) {
+                    let j = v * width + u;
+                    if marked[j] && label[j] == 0 && (corners || u == x || v == y) {
+                        label[j] = id;
+                        stack.push(j);
+                    }
+                }
+            }
+        }
+    }
+    Pieces { label, size }
+}
+
+/// Takes away every piece of less than `least` pixels without one of `seeds`.
+pub(super) fn keep_pieces(marked: &mut [bool], seeds: &[bool], least: f64, width: usize, height: usize) {
+    let found = pieces(marked, width, height, true);
+    let mut wanted: Vec<bool> = found.size.iter().map(|&s| s as f64 >= least).collect();
+    for (i, &seed) in seeds.iter().enumerate() {
+        wanted[found.label[i] as usize] |= seed;
+    }
+    wanted[0] = false;
+    marked.iter_mut().zip(&found.label).for_each(|(m, &l)| *m = wanted[l as usize]);
+}
+
+/// Labels as a picture: 255 where marked.
+pub(super) fn gray(marked: &[bool], width: usize, height: usize) -> Gray {
+    let values = marked.iter().map(|&m| if m { 255 } else { 0 }).collect();
+    Gray { width: width as u32, height: height as u32, values }
+}
+
+/// Fills what is enclosed, does not touch the border, has at most `largest` pixels and none of `never`.
+pub(super) fn fill_holes(marked: &mut [bool], never: &[bool], width: usize, height: usize, largest: usize) {
+    let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
+    let found = pieces(&outside, width, height, false);
+    let mut fill: Vec<bool> = found.size.iter().map(|&s| s <= largest).collect();
+    fill[0] = false;
+    for (i, &l) in found.label.iter().enumerate() {
+        let (x, y) = (i % width, i / width);
+        if never[i] || x == 0 || y == 0 || x + 1 == width || y + 1 == height {
+            fill[l as usize] = false;
+        }
+    }
+    marked.iter_mut().zip(&found.label).for_each(|(m, &l)| *m |= l != 0 && fill[l as usize]);
+}
+
+/// Takes away what no 3 × 3 square of marked pixels covers; pixels outside the picture are ignored.
+pub(super) fn open(marked: &[bool], width: usize, height: usize) -> Vec<bool> {
+    let inner = square(marked, width, height, true);
+    square(&inner, width, height, false)
+}
+
+/// Over each 3 × 3 square: are all marked (`all`), or is any?
+fn square(marked: &[bool], width: usize, height: usize, all: bool) -> Vec<bool> {
+    (0..marked.len())
+        .map(|i| {
+            let (x, y) = (i % width, i / width);
+            let hit = (y.saturating_sub(1)..(y + 2).min(height)).any(|v| {
+                let row = &marked[v * width + x.saturating_sub(1)..v * width + (x + 2).min(width)];
+                row.iter().any(|&m| m != all)
+            });
+            hit != all
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn brute(marked: &[bool], w: usize, h: usize) -> Vec<f32> {
+        (0..w * h)
+            .map(|i| {
+                (0..w * h)
+                    .filter(|&j| marked[j])
+                    .map(|j| {
+                        let (dx, dy) = ((i % w).abs_diff(j % w), (i / w).abs_diff(j / w));
+                        (dx * dx + dy * dy) as f32
+                    })
+                    .fold(f32::INFINITY, f32::min)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn distances_equal_those_of_a_search_over_all_pixels() {
+        let mut state = 7u64;
+        for (w, h, every) in [(17, 11, 9), (1, 13, 4), (23, 1, 6), (31, 29, 200), (8, 8, 1)] {
+            let marked: Vec<bool> = (0..w * h)
+                .map(|_| {
+                    state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+                    (state >> 33).is_multiple_of(every)
+                })
+                .collect();
+            assert_eq!(squared_distance(&marked, w, h), brute(&marked, w, h), "{w} x {h}, one in {every}");
+        }
+    }
+
+    #[test]
+    fn nothing_marked_is_infinitely_far() {
+        assert!(squared_distance(&[false; 6], 3, 2).iter().all(|d| d.is_infinite()));
+    }
+
+    #[test]
+    fn growing_makes_discs_and_shrinking_takes_the_rim_but_not_at_the_border() {
+        let mut one = vec![false; 49];
+        one[24] = true;
+        // within 2 pixels of the center: 13 lattice points
+        assert_eq!(grow(&one, 7, 7, 2.0).iter().filter(|&&m| m).count(), 13);
+        // the left half of 6 x 4 loses its right column only
+        let half: Vec<bool> = (0..24).map(|i| i % 6 < 3).collect();
+        let less = shrink(&half, 6, 4, 1.0);
+        assert!((0..24).all(|i| less[i] == (i % 6 < 2)));
+    }
+
+    fn picture(rows: &[&str]) -> (Vec<bool>, usize, usize) {
+        let marked = rows.iter().flat_map(|r| r.bytes().map(|b| b == b'#')).collect();
+        (marked, rows[0].len(), rows.len())
+    }
+
+    #[test]
+    fn corners_join_pieces_only_when_asked() {
+        let (m, w, h) = picture(&["#..", ".#.", "..#"]);
+        assert_eq!(pieces(&m, w, h, true).size, [6, 3]);
+        assert_eq!(pieces(&m, w, h, false).size, [6, 1, 1, 1]);
+    }
+
+    #[test]
+    fn only_pieces_with_a_seed_stay() {
+        let (mut m, w, h) = picture(&["##..#", "##..#", "....."]);
+        let (seeds, ..) = picture(&["#....", ".....", "..#.."]);
+        keep_pieces(&mut m, &seeds, f64::INFINITY, w, h);
+        assert_eq!(m, picture(&["##...", "##...", "....."]).0);
+    }
+
+    #[test]
+    fn small_enclosed_holes_are_filled_but_not_large_open_or_forbidden_ones() {
+        let rows = ["#######", "#.#..##", "####.#.", "#.#####", "#######"];
+        let (m, w, h) = picture(&rows);
+        let none = vec![false; m.len()];
+        let (mut two, mut forbidden) = (m.clone(), m.clone());
+        fill_holes(&mut two, &none, w, h, 2);
+        // the hole of three and the notch in the border stay
+        assert_eq!(two, picture(&["#######", "###..##", "####.#.", "#######", "#######"]).0);
+        let mut never = none;
+        never[8] = true;
+        fill_holes(&mut forbidden, &never, w, h, 9);
+        assert_eq!(forbidden, picture(&["#######", "#.#####", "######.", "#######", "#######"]).0);
+    }
+
+    #[test]
+    fn opening_takes_threads_and_keeps_blocks_at_the_border() {
+        let (m, w, h) = picture(&["###....", "###.#..", "######.", "....#..", "....#.."]);
+        assert_eq!(open(&m, w, h), picture(&["###....", "###....", "###....", ".......", "......."]).0);
+    }
+}

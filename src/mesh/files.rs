@@ -1,0 +1,34 @@
+//! Meshes as files: GLB, OBJ and PLY, written and read, and whether what is in them is sound.
+//!
+//! [`to_glb`], [`to_obj`] and [`to_ply`] write; [`read()`] reads all three, whoever wrote them. [`check()`] examines
+//! a surface, [`uv_check()`] its texture coordinates. [`ExtractedSurface`] and [`HeadMesh`] are what the stages after
+//! this one read.
+
+mod check;
+mod compact;
+mod file_mesh;
+mod glb;
+mod glb_json;
+mod glb_read;
+mod obj;
+mod ply;
+mod read;
+mod source;
+mod stored;
+mod uv_check;
+
+pub use check::{BARS, CheckReport, check, check_around};
+pub use compact::compact_glb;
+pub(crate) use file_mesh::turn_to_y_up;
+pub use file_mesh::{ExportOptions, ExportedFiles, HeadTexture, Lobes, tangents, weld};
+pub use glb::to_glb;
+pub use obj::{picture_of_mtl, to_obj};
+pub use ply::to_ply;
+pub use read::{OpenedMesh, ReadMesh, open_mesh, picture_beside, read, read_with};
+pub use source::{PictureSource, ReadOptions};
+pub(crate) use stored::FORMAT;
+pub use stored::{ExtractedSurface, HeadMesh};
+pub use uv_check::{NO_AREA_PX, UvReport, seams_facing, uv_check};
+
+#[cfg(test)]
+pub(crate) use stored::tests::head as test_head;

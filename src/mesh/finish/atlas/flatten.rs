@@ -1,0 +1,586 @@
+//! Flattening by the crate `uvunwrap`: least squares conformal maps (Lévy, Petitjean, Ray, Maillot 2002), halved
+//! until none folds.
+//!
+//! # Smoothing
+//!
+//! A smoothed copy of a surface: every vertex moves to the mean of its neighbours (uniform Laplacian; Taubin 1995
+//! without the step back, since here the shrinking is wanted).
+//!
+//! A chart is a way to number the corners of triangles: coordinates that fold nowhere on the smooth copy fold
+//! nowhere on the surface. The copy has no creases and pores, divides along short lines, and lies flat in large pieces.
+//!
+//! # Relaxing
+//!
+//! Makes a flat chart keep the sizes and angles of its surface: symmetric Dirichlet energy (Smith & Schaefer 2015,
+//! "Bijective parameterization with free boundaries"), minimized by L-BFGS from a chart without folds.
+//!
+//! Of a triangle with area `A`, and `a` in the chart, whose map has the singular values `σ₁`, `σ₂`:
+//!
+//! ```text
+//! E = A · (σ₁² + σ₂²) · (1 + A² / a²) = A · (σ₁² + σ₂² + σ₁⁻² + σ₂⁻²),   4 A for an isometry
+//! ```
+//!
+//! It grows without bound as a triangle becomes thin, and no step is longer than 0.9 of the way to the first triangle
+//! without area: what starts without folds ends without.
+
+use super::chart::Flat;
+use crate::error::COMPLETE_IS_KEPT;
+use crate::geom::{Mesh, side_ends, sorted_sides};
+use crate::{Error, Monitor, Result};
+use glam::{DVec2, Vec3};
+use std::collections::{HashMap, VecDeque};
+use std::fmt::Display;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+/// Degrees between a triangle and the mean of its chart. Lower than the library's own 70: rims come out straighter, so
+/// that seams are hardly longer and stretch is less, and small charts fill the texture better.
+const MOST_TILTED: f32 = 55.0;
+
+/// How many times smaller or larger than the rest a triangle may be: the library's own.
+pub(super) const STRETCHED: f32 = 4.0;
+
+/// The charts of a mesh, and the triangles that got none because they have no area.
+#[derive(Default)]
+pub(super) struct ChartSet {
+    pub charts: Vec<Flat>,
+    pub without: Vec<u32>,
+}
+
+impl ChartSet {
+    /// The same for a mesh in which triangle `t` is `number[t]`.
+    pub fn renumbered(mut self, number: &[u32]) -> ChartSet {
+        let triangles = self.charts.iter_mut().flat_map(|c| &mut c.triangles).chain(&mut self.without);
+        triangles.for_each(|t| *t = number[*t as usize]);
+        self
+    }
+}
+
+/// Flattens the regions of `labels`, one number a triangle: a region becomes one chart, or several where it
+/// cannot be flat without a triangle's area changing more than `most_stretched` times against the others'. Without
+/// labels the library divides the surface by itself.
+pub(super) fn flatten(
+    mesh: &Mesh,
+    labels: Option<&[u32]>,
+    most_stretched: f32,
+    monitor: &dyn Monitor,
+) -> Result<ChartSet> {
+    let (positions, indices, uvs) = divided(mesh, labels);
+    let area: f64 = (0..mesh.triangles.len() as u32).map(|t| mesh.area(t)).sum();
+    if !(area > 0.0 && area.is_finite()) {
+        return Err(unusable("the mesh has no area"));
+    }
+    let texels_per_unit = (256.0 / area.sqrt()) as f32;
+    if !(texels_per_unit > 0.0 && texels_per_unit.is_finite()) {
+        return Err(unusable("the mesh is too large or too small for 32-bit texture coordinates"));
+    }
+    let input = uvunwrap::MeshInput {
+        existing_uvs: uvs.as_deref(),
+        ..uvunwrap::MeshInput::new(&positions, &indices)
+    };
+    // Its packing is thrown away, so the fastest of them.
+    let options = uvunwrap::Options {
+        density: uvunwrap::Density::Fixed { texels_per_unit, page_size: None },
+        packing: uvunwrap::Packing::Fast,
+        padding: 0,
+        max_area_distortion: most_stretched,
+        max_chart_angle: MOST_TILTED,
+        ..uvunwrap::Options::default()
+    };
+    let call = || uvunwrap::generate_with_progress(&[input], &options, |_| !monitor.stop());
+    let answer = match catch_unwind(AssertUnwindSafe(call)) {
+        Ok(Ok(answer)) => answer,
+        Ok(Err(uvunwrap::Error::Cancelled)) => return Err(Error::stopped(COMPLETE_IS_KEPT)),
+        Ok(Err(error)) => return Err(unusable(format!("uvunwrap: {error}"))),
+        Err(panic) => return Err(unusable(format!("uvunwrap panicked: {}", words(&*panic)))),
+    };
+    let out = match &answer.meshes[..] {
+        [one] if one.indices.len() == indices.len() => one,
+        _ => return Err(unusable("uvunwrap answered with other triangles than it was given")),
+    };
+    collect(out, DVec2::new(answer.width.into(), answer.height.into()) / f64::from(answer.texels_per_unit))
+}
+
+/// Vertices repeated between regions. Regions are handed over as texture coordinates that are one point a
+/// region: the library then takes each region as an island, finds the coordinates of no use, and flattens it.
+fn divided(mesh: &Mesh, labels: Option<&[u32]>) -> (Vec<[f32; 3]>, Vec<u32>, Option<Vec<[f32; 2]>>) {
+    let Some(labels) = labels else {
+        let positions = mesh.positions.iter().map(|p| p.to_array()).collect();
+        return (positions, mesh.triangles.as_flattened().to_vec(), None);
+    };
+    let (mut positions, mut uvs) = (Vec::new(), Vec::new());
+    let mut numbers: HashMap<(u32, u32), u32> = HashMap::with_capacity(mesh.positions.len());
+    let corners = mesh.triangles.iter().zip(labels).flat_map(|(t, &label)| t.map(|v| (v, label)));
+    let indices = corners
+        .map(|(v, label)| {
+            *numbers.entry((v, label)).or_insert_with(|| {
+                positions.push(mesh.positions[v as usize].to_array());
+                uvs.push([label as f32, 0.0]);
+                positions.len() as u32 - 1
+            })
+        })
+        .collect();
+    (positions, indices, Some(uvs))
+}
+
+fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<ChartSet> {
+    let mut charts: Vec<Flat> = Vec::new();
+    let mut without = Vec::new();
+    let mut number_of: HashMap<u32, u32> = HashMap::new();
+    let mut local = vec![u32::MAX; out.vertices.len()];
+    for (t, corners) in out.indices.chunks_exact(3).enumerate() {
+        let at = |k: usize| out.vertices.get(corners[k] as usize);
+        let (Some(a), Some(b), Some(c)) = (at(0), at(1), at(2)) else {
+            return Err(unusable("uvunwrap left a corner without coordinates"));
+        };
+        let chart = match a.chart {
+            Some(chart) if b.chart == a.chart && c.chart == a.chart && a.uv != b.uv && b.uv != c.uv => chart,
+            _ => {
+                without.push(t as u32);
+                continue;
+            }
+        };
+        let next = charts.len() as u32;
+        let number = *number_of.entry(chart).or_insert(next);
+        if number == next {
+            charts.push(Flat::default());
+        }
+        let flat = &mut charts[number as usize];
+        let mut corner = [0; 3];
+        for (k, vertex) in [a, b, c].into_iter().enumerate() {
+            let point = DVec2::new(vertex.uv[0].into(), vertex.uv[1].into()) * page;
+            if !point.is_finite() {
+                return Err(unusable("uvunwrap gave a coordinate that is not finite"));
+            }
+            let slot = &mut local[corners[k] as usize];
+            if *slot == u32::MAX {
+                *slot = flat.points.len() as u32;
+                flat.points.push(point);
+            }
+            corner[k] = *slot;
+        }
+        flat.triangles.push(t as u32);
+        flat.corners.push(corner);
+    }
+    Ok(ChartSet { charts, without })
+}
+
+/// Why there will be no charts.
+fn unusable(reason: impl Display) -> Error {
+    Error::cannot(reason, "")
+}
+
+fn words(panic: &(dyn std::any::Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().copied();
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("without a word").into()
+}
+
+/// The same triangles after `rounds` of smoothing; a border is smoothed along itself.
+pub(super) fn smoothed(mesh: &Mesh, rounds: usize) -> Mesh {
+    let (mut inner, mut rim) = (Vec::new(), Vec::new());
+    let mut on_rim = vec![false; mesh.positions.len()];
+    for run in sorted_sides(&mesh.triangles).chunk_by(|a, b| a.0 == b.0) {
+        let ends = side_ends(&mesh.triangles, run[0].1);
+        if run.len() == 2 {
+            inner.push(ends);
+        } else {
+            on_rim[ends.0 as usize] = true;
+            on_rim[ends.1 as usize] = true;
+            rim.push(ends);
+        }
+    }
+    let mut out = mesh.clone();
+    let mut sum = vec![Vec3::ZERO; out.positions.len()];
+    let mut weight = vec![0f32; out.positions.len()];
+    for _ in 0..rounds {
+        sum.fill(Vec3::ZERO);
+        weight.fill(0.0);
+        let mut add = |to: u32, from: u32| {
+            sum[to as usize] += out.positions[from as usize];
+            weight[to as usize] += 1.0;
+        };
+        // a vertex of a border listens to the border alone
+        for &(a, b) in &inner {
+            if !on_rim[a as usize] {
+                add(a, b);
+            }
+            if !on_rim[b as usize] {
+                add(b, a);
+            }
+        }
+        for &(a, b) in &rim {
+            add(a, b);
+            add(b, a);
+        }
+        for v in 0..out.positions.len() {
+            if weight[v] > 0.0 {
+                // halfway, else the two sides of a border swap for ever
+                let mean = sum[v] / weight[v];
+                out.positions[v] = if on_rim[v] { 0.5 * (out.positions[v] + mean) } else { mean };
+            }
+        }
+    }
+    out
+}
+
+/// Steps that L-BFGS remembers.
+const MEMORY: usize = 5;
+
+/// Energy over area at which a chart is good enough: 4 is an isometry, and 0.01 more a mean area stretch below half a
+/// percent.
+const REST: f64 = 4.01;
+
+/// The surface's side of a triangle, as the energy needs it.
+struct RestTriangle {
+    /// Its corners, into the chart's points.
+    corners: [u32; 3],
+    area: f64,
+    /// Squared lengths of the sides at corner 0 and their scalar product, over 2 · area.
+    g11: f64,
+    g22: f64,
+    g12: f64,
+}
+
+/// Relaxes a chart for at most `rounds` steps; one that holds a fold is left as it is.
+pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
+    let mut whole = 0.0;
+    let mut rest = Vec::with_capacity(flat.triangles.len());
+    for (&t, &corners) in flat.triangles.iter().zip(&flat.corners) {
+        let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
+        let (u, v) = (b - a, c - a);
+        // a triangle that is a line would have endless energy; as thin as one part in a million it has little say
+        let area = (0.5 * u.cross(v).length()).max(5e-7 * u.length_squared().max(v.length_squared()));
+        whole += area;
+        let half = 0.5 / area;
+        rest.push(RestTriangle {
+            corners,
+            area,
+            g11: half * u.length_squared(),
+            g22: half * v.length_squared(),
+            g12: half * u.dot(v),
+        });
+    }
+    let scale = (whole / flat.area()).sqrt();
+    if !(scale.is_finite() && scale > 0.0) {
+        return;
+    }
+    flat.points.iter_mut().for_each(|p| *p *= scale);
+    if (0..flat.corners.len()).any(|k| super::chart::twice_area(flat.at(k)) <= 0.0) {
+        return;
+    }
+    descend(&rest, &mut flat.points, rounds, whole);
+}
+
+fn energy(rest: &[RestTriangle], points: &[DVec2], slope: Option<&mut [DVec2]>) -> f64 {
+    let mut sum = 0.0;
+    let mut slope = slope;
+    if let Some(s) = slope.as_deref_mut() {
+        s.fill(DVec2::ZERO);
+    }
+    for r in rest {
+        let [i, j, k] = r.corners.map(|c| c as usize);
+        let (u, v) = (points[j] - points[i], points[k] - points[i]);
+        let a = 0.5 * u.perp_dot(v);
+        if a <= 0.0 {
+            return f64::INFINITY;
+        }
+        // σ₁² + σ₂² times the area is the Dirichlet energy
+        let d = 0.5 * (u.length_squared() * r.g22 + v.length_squared() * r.g11 - 2.0 * u.dot(v) * r.g12);
+        let ratio = r.area * r.area / (a * a);
+        sum += d * (1.0 + ratio);
+        if let Some(s) = slope.as_deref_mut() {
+            let (du, dv) = (u * r.g22 - v * r.g12, v * r.g11 - u * r.g12);
+            // of the area: ∂a/∂u = ½ (v.y, −v.x), ∂a/∂v = ½ (−u.y, u.x)
+            let c = -d * ratio / a;
+            let gu = (1.0 + ratio) * du + c * DVec2::new(v.y, -v.x);
+            let gv = (1.0 + ratio) * dv + c * DVec2::new(-u.y, u.x);
+            s[j] += gu;
+            s[k] += gv;
+            s[i] -= gu + gv;
+        }
+    }
+    sum
+}
+
+/// How far along `step` the first triangle loses its area.
+fn reach(rest: &[RestTriangle], points: &[DVec2], step: &[DVec2]) -> f64 {
+    let mut nearest = f64::INFINITY;
+    for r in rest {
+        let [i, j, k] = r.corners.map(|c| c as usize);
+        let (u, v) = (points[j] - points[i], points[k] - points[i]);
+        let (du, dv) = (step[j] - step[i], step[k] - step[i]);
+        // the area along the way: c + b t + a t²
+        let (a, b, c) = (du.perp_dot(dv), u.perp_dot(dv) + du.perp_dot(v), u.perp_dot(v));
+        let root = if a.abs() < 1e-14 * b.abs() {
+            -c / b
+        } else {
+            let under = b * b - 4.0 * a * c;
+            if under < 0.0 {
+                continue;
+            }
+            // the stable pair of roots, of which the smaller positive one
+            let q = -0.5 * (b + under.sqrt().copysign(b));
+            let (x, y) = (q / a, c / q);
+            match (x > 0.0, y > 0.0) {
+                (true, true) => x.min(y),
+                (true, false) => x,
+                (false, true) => y,
+                _ => continue,
+            }
+        };
+        if root > 0.0 {
+            nearest = nearest.min(root);
+        }
+    }
+    nearest
+}
+
+fn dot(a: &[DVec2], b: &[DVec2]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a.dot(*b)).sum()
+}
+
+/// L-BFGS (Nocedal & Wright, algorithm 7.4) with steps that halve until the energy falls enough (Armijo).
+fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: f64) {
+    let n = points.len();
+    let mut slope = vec![DVec2::ZERO; n];
+    let mut now = energy(rest, points, Some(&mut slope));
+    let mut past: VecDeque<(Vec<DVec2>, Vec<DVec2>, f64)> = VecDeque::with_capacity(MEMORY);
+    let mut fallen = 0.0;
+    for round in 0..rounds {
+        if now <= REST * area {
+            return;
+        }
+        let mut step: Vec<DVec2> = slope.iter().map(|g| -*g).collect();
+        let mut along = [0.0; MEMORY];
+        for (m, (s, y, rho)) in past.iter().enumerate().rev() {
+            along[m] = rho * dot(s, &step);
+            step.iter_mut().zip(y).for_each(|(p, y)| *p -= along[m] * *y);
+        }
+        if let Some((s, y, _)) = past.back() {
+            let scale = dot(s, y) / dot(y, y);
+            step.iter_mut().for_each(|p| *p *= scale);
+        }
+        for (m, (s, y, rho)) in past.iter().enumerate() {
+            let back = rho * dot(y, &step);
+            step.iter_mut().zip(s).for_each(|(p, s)| *p += (along[m] - back) * *s);
+        }
+        let downhill = dot(&step, &slope);
+        if downhill >= 0.0 {
+            if past.is_empty() {
+                return;
+            }
+            past.clear();
+            continue;
+        }
+        let mut length = (0.9 * reach(rest, points, &step)).min(1.0);
+        let (next, new_slope, value) = loop {
+            let next: Vec<DVec2> = points.iter().zip(&step).map(|(p, s)| *p + length * *s).collect();
+            let mut new_slope = vec![DVec2::ZERO; n];
+            let value = energy(rest, &next, Some(&mut new_slope));
+            if value <= now + 1e-4 * length * downhill {
+                break (next, new_slope, value);
+            }
+            length *= 0.5;
+            if length < 1e-12 {
+                return;
+            }
+        };
+        let s: Vec<DVec2> = next.iter().zip(&*points).map(|(a, b)| *a - *b).collect();
+        let y: Vec<DVec2> = new_slope.iter().zip(&slope).map(|(a, b)| *a - *b).collect();
+        let sy = dot(&s, &y);
+        if sy > 1e-12 * dot(&y, &y).sqrt() * dot(&s, &s).sqrt() {
+            if past.len() == MEMORY {
+                past.pop_front();
+            }
+            past.push_back((s, y, 1.0 / sy));
+        }
+        fallen += now - value;
+        *points = next;
+        slope = new_slope;
+        now = value;
+        // ten steps that gain a thousandth of a percent of the area each are at the end
+        if round % 10 == 9 {
+            if fallen < 1e-4 * area {
+                return;
+            }
+            fallen = 0.0;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::chart::twice_area;
+    use super::*;
+    use crate::Quiet;
+    use glam::Vec3;
+
+    /// Four unit squares in a row, folded up by a little each.
+    fn steps() -> Mesh {
+        let heights = [0.0, 0.1, 0.3, 0.6, 1.0];
+        let positions = (0..5).flat_map(|i| [0.0, 1.0].map(|y| Vec3::new(i as f32, y, heights[i]))).collect();
+        let triangles = (0..4).flat_map(|i| [[2 * i, 2 * i + 2, 2 * i + 3], [2 * i, 2 * i + 3, 2 * i + 1]]);
+        Mesh { positions, triangles: triangles.collect(), ..Mesh::default() }
+    }
+
+    #[test]
+    fn regions_become_charts_of_their_own_size() {
+        let mesh = steps();
+        let whole = flatten(&mesh, Some(&[0; 8]), STRETCHED, &Quiet).unwrap();
+        assert_eq!((whole.charts.len(), whole.without.len()), (1, 0));
+        let halves = flatten(&mesh, Some(&[0, 0, 0, 0, 7, 7, 7, 7]), STRETCHED, &Quiet).unwrap();
+        let triangles: Vec<_> = halves.charts.iter().map(|c| c.triangles.clone()).collect();
+        assert_eq!(triangles, [vec![0, 1, 2, 3], vec![4, 5, 6, 7]]);
+        // √(1 + 0.1²) + √(1 + 0.2²)
+        let area = 1.01f64.sqrt() + 1.04f64.sqrt();
+        assert!((halves.charts[0].area() - area).abs() < 1e-4 * area);
+        assert!((0..4).all(|k| super::super::chart::twice_area(halves.charts[0].at(k)) > 0.0));
+    }
+
+    #[test]
+    fn triangles_without_area_get_no_chart() {
+        let mut mesh = steps();
+        mesh.triangles.push([0, 0, 1]);
+        assert_eq!(flatten(&mesh, None, STRETCHED, &Quiet).unwrap().without, [8]);
+        mesh.triangles = vec![[0, 0, 1]];
+        assert!(flatten(&mesh, None, STRETCHED, &Quiet).is_err());
+    }
+
+    /// Five by five vertices in a plane, the middle one and one of the border pulled out.
+    fn sheet() -> Mesh {
+        let mut positions: Vec<Vec3> =
+            (0..25).map(|i| Vec3::new((i % 5) as f32, (i / 5) as f32, 0.0)).collect();
+        positions[12].z = 8.0;
+        positions[2].y = -1.0;
+        let quads = (0..16).map(|q| (q % 4) + 5 * (q / 4));
+        let triangles = quads.flat_map(|a: u32| [[a, a + 1, a + 6], [a, a + 6, a + 5]]).collect();
+        Mesh { positions, triangles, ..Mesh::default() }
+    }
+
+    #[test]
+    fn a_spike_becomes_the_mean_of_its_neighbours() {
+        let smooth = smoothed(&sheet(), 1);
+        // its six neighbours lie in the plane, and each has six of which it is one
+        assert_eq!(smooth.positions[12].z, 0.0);
+        assert!((smooth.positions[7].z - 8.0 / 6.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_border_is_smoothed_along_itself() {
+        let smooth = smoothed(&sheet(), 1);
+        // halfway from y = -1 to the mean of its two neighbours on the border, 0; the inside has no say
+        assert_eq!(smooth.positions[2], Vec3::new(2.0, -0.5, 0.0));
+        let long = smoothed(&sheet(), 50);
+        assert!(long.positions.iter().all(|p| p.is_finite() && p.z.abs() < 0.01));
+    }
+
+    #[test]
+    fn no_rounds_change_nothing() {
+        assert_eq!(smoothed(&sheet(), 0), sheet());
+    }
+
+    /// A cylinder's quarter, 12 × 8 squares, and its coordinates seen from the front.
+    fn quarter() -> (Mesh, Flat) {
+        let mut mesh = Mesh::default();
+        let mut flat = Flat::default();
+        for y in 0..=8 {
+            for x in 0..=12 {
+                let turn = (x as f32 / 12.0 - 0.5) * std::f32::consts::FRAC_PI_2;
+                mesh.positions.push(Vec3::new(turn.sin(), y as f32 / 6.0, turn.cos()));
+                flat.points.push(DVec2::new(turn.sin() as f64, y as f64 / 6.0));
+            }
+        }
+        for q in 0..96u32 {
+            let a = q % 12 + 13 * (q / 12);
+            mesh.triangles.extend([[a, a + 1, a + 14], [a, a + 14, a + 13]]);
+        }
+        flat.triangles = (0..192).collect();
+        flat.corners.clone_from(&mesh.triangles);
+        (mesh, flat)
+    }
+
+    fn rest_of(mesh: &Mesh, flat: &Flat) -> Vec<RestTriangle> {
+        let mut alone = flat.clone();
+        relax(mesh, &mut alone, 0);
+        flat.triangles
+            .iter()
+            .zip(&flat.corners)
+            .map(|(&t, &corners)| {
+                let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
+                let (u, v) = (b - a, c - a);
+                let area = 0.5 * u.cross(v).length();
+                let g = |x: f64| 0.5 * x / area;
+                RestTriangle {
+                    corners,
+                    area,
+                    g11: g(u.length_squared()),
+                    g22: g(v.length_squared()),
+                    g12: g(u.dot(v)),
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn what_can_be_unrolled_becomes_its_own_size() {
+        let (mesh, mut flat) = quarter();
+        relax(&mesh, &mut flat, 400);
+        for (k, &t) in flat.triangles.iter().enumerate() {
+            let corners = mesh.corners(t);
+            for i in 0..3 {
+                let length = f64::from(corners[i].distance(corners[(i + 1) % 3]));
+                let found = flat.at(k)[i].distance(flat.at(k)[(i + 1) % 3]);
+                assert!((found / length - 1.0).abs() < 0.08, "{found} for {length}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_energy_is_four_times_the_area_of_an_isometry_and_its_slope_is_that_of_differences() {
+        let (mesh, flat) = quarter();
+        let rest = rest_of(&mesh, &flat);
+        // one triangle mapped by singular values 2 and ½: ½ · (4 + ¼) · 2 = 4.25 with area ½
+        let one = RestTriangle { corners: [0, 1, 2], area: 0.5, g11: 1.0, g22: 1.0, g12: 0.0 };
+        let points = [DVec2::ZERO, DVec2::new(2.0, 0.0), DVec2::new(0.0, 0.5)];
+        assert!((energy(&[one], &points, None) - 4.25).abs() < 1e-12);
+        let mut slope = vec![DVec2::ZERO; flat.points.len()];
+        energy(&rest, &flat.points, Some(&mut slope));
+        for v in [0, 6, 20, 58, 116] {
+            for axis in [DVec2::X, DVec2::Y] {
+                let shifted = |by: f64| {
+                    let mut p = flat.points.clone();
+                    p[v] += by * axis;
+                    energy(&rest, &p, None)
+                };
+                let difference = (shifted(1e-6) - shifted(-1e-6)) / 2e-6;
+                assert!((difference - slope[v].dot(axis)).abs() < 1e-6 * (1.0 + difference.abs()));
+            }
+        }
+    }
+
+    #[test]
+    fn no_step_folds_and_folds_are_left_alone() {
+        let (mesh, mut flat) = quarter();
+        // nearly folded: one inner vertex almost on the far side of its ring
+        flat.points[45] = flat.points[46] + DVec2::new(-1e-4, 1e-5);
+        let folded = (0..192).any(|k| twice_area(flat.at(k)) <= 0.0);
+        relax(&mesh, &mut flat, 200);
+        if !folded {
+            assert!((0..192).all(|k| twice_area(flat.at(k)) > 0.0));
+        }
+        flat.points[45] = flat.points[46] + DVec2::new(0.5, 0.0);
+        let before = flat.clone();
+        relax(&mesh, &mut flat, 200);
+        // its size is right all the same
+        let scale = flat.points[1].x / before.points[1].x;
+        assert!(flat.points.iter().zip(&before.points).all(|(a, b)| a.abs_diff_eq(scale * *b, 1e-12)));
+    }
+
+    #[test]
+    fn the_reach_ends_where_the_first_triangle_has_no_area() {
+        let one = RestTriangle { corners: [0, 1, 2], area: 0.5, g11: 1.0, g22: 1.0, g12: 0.0 };
+        let points = [DVec2::ZERO, DVec2::X, DVec2::Y];
+        let step = [DVec2::ZERO, DVec2::ZERO, DVec2::new(0.0, -0.25)];
+        // the height falls by a quarter a unit
+        assert!((reach(&[one], &points, &step) - 4.0).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,547 @@
+//! Learned color becomes texels: all of it, or what photographs are to improve on.
+//!
+//! Every texel that a chart covers is looked at through several samples (`cover`); each sample moves onto the
+//! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
+//! they see in linear light (`light`), or those of them that look most directly. What the cameras see differently can be kept as a few lobes a texel
+//! (see below), and the field's normal as a picture of normals
+//! ([`tangent_space`]). Gaps are filled by `fill`; color and lobes are then made to agree along seams by [`Seams`].
+//!
+//! The picture is baked in bands of rows, so that samples never lie in memory together: twelve bytes a texel for
+//! color, normals and each lobe are what it takes.
+//!
+//! # Lobes
+//!
+//! View-dependent color in a few numbers a texel: real spherical harmonics of the direction to the viewer.
+//!
+//! A texel's color seen from direction `d` is `base + Σ_k L_k Y_k(d)`, sRGB-coded, with `Y` up to degree 1 (4
+//! functions) or 2 (9) in the order and signs of [`crate::geom::sphharm::sh16`]; [`crate::geom::sphharm::combine`] sums them. `base` is what an ordinary viewer shows. The
+//! coefficients minimize, over the cameras that see the point,
+//!
+//! ```text
+//! Σ_i w_i ‖base + Σ_k L_k Y_k(d_i) − c_i‖² + λ Σ_i w_i Σ_k ‖L_k‖²
+//! ```
+//!
+//! Cameras see a point from one side only, so that without the ridge term λ the functions would be free to grow
+//! where nobody looks.
+//!
+//! # Normals
+//!
+//! Normals of the true surface as a tangent-space picture: the detail that simplification took.
+//!
+//! A texel holds `(x, y, z)` with `n = x t + y b + z m`, where `m` is the mesh's interpolated normal, `t` its
+//! tangent along u and `b = w · m × t` its bitangent up the picture (MikkTSpace, Mikkelsen 2008; OpenGL's +Y).
+
+mod cover;
+mod fill;
+mod light;
+mod seams;
+
+pub use light::{Learned, seen_colors};
+pub use seams::Seams;
+
+use crate::geom::sphharm::functions;
+use crate::geom::{Atlas, Bvh, Camera, Harmonics, Mesh, area_vector};
+use crate::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
+use crate::mesh::input::setting;
+use crate::{Monitor, Result};
+use cover::{Bands, ROWS, Sample};
+use fill::fill;
+use glam::{Mat3, Vec3, Vec4};
+use light::{SurfacePoints, Visibility, settle, shade};
+use serde::{Deserialize, Serialize};
+use std::time::Instant;
+
+/// How a texture is baked. Lengths are in the mesh's units.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BakeConfig {
+    /// Samples along each side of a texel, 1..=8.
+    pub side: u32,
+    /// Texels that repeat a chart's border around it.
+    pub gutter_px: u32,
+    /// How far a sample may lie from the true surface: the simplification's error and half a cell.
+    pub reach: f32,
+    /// Cameras that a sample is seen by at most: those that look at it most directly.
+    pub views: usize,
+    /// Degree of the lobes, 1 or 2; 0 for none.
+    pub lobes: u32,
+    /// Also bake the field's normals.
+    pub normals: bool,
+    /// Turns directions of the mesh's coordinates into the coordinates that the lobes are kept in.
+    pub turned: Mat3,
+}
+
+/// A baked texture; every picture has the atlas's size.
+#[derive(Clone, Debug)]
+pub struct Baked {
+    /// Linear color, 3 channels.
+    pub color: Image,
+    /// Lobes, 3 channels each, sRGB-coded differences; one picture a function.
+    pub lobes: Vec<Image>,
+    /// Unit normals of the field in the mesh's coordinates, 3 channels.
+    pub normal: Option<Image>,
+    /// What was done.
+    pub report: BakeReport,
+}
+
+/// What baking did.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct BakeReport {
+    /// Texels across and down.
+    pub size: [u32; 2],
+    /// Share of texels that a chart covers, 0..=1.
+    pub covered: f64,
+    /// Points of the surface that were looked at.
+    pub samples: usize,
+    /// Share of the samples that at least one camera sees.
+    pub seen: f64,
+    /// Cameras that see a sample, on average over those that one sees.
+    pub views: f64,
+    /// How far samples moved onto the true surface: mean, mesh units.
+    pub moved: f64,
+    /// How long it took.
+    pub seconds: f64,
+}
+
+/// Points handed to the field at once.
+const BATCH: usize = 1 << 17;
+
+/// Bakes a texture for `mesh` with normals, laid out by `atlas`, from the field it was extracted from.
+///
+/// ```
+/// use glam::{Mat3, Vec3};
+/// use tiface::geom::Mesh;
+/// use tiface::mesh::bake::{BakeConfig, Learned, bake};
+/// use tiface::mesh::{AtlasConfig, atlas};
+///
+/// let mesh = Mesh {
+///     positions: vec![Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z],
+///     normals: vec![Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z],
+///     triangles: vec![
+///         [0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5],
+///     ],
+///     ..Mesh::default()
+/// };
+/// let (atlas, _) = atlas(&mesh, &AtlasConfig { size_px: 64, gutter_px: 2, ..AtlasConfig::default() }, &tiface::Quiet)?;
+/// // a ball that shows sRGB-coded 0.5 from everywhere
+/// let gradient = |points: &[Vec3]| points.iter().map(|p| (p.length() - 1.0, p.normalize_or_zero())).unzip();
+/// let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]| vec![[0.5; 3]; directions.len()];
+/// let learned = Learned { gradient: &gradient, colors: &colors };
+/// let config =
+///     BakeConfig { side: 2, gutter_px: 2, reach: 0.5, views: 8, lobes: 0, normals: false, turned: Mat3::IDENTITY };
+/// let baked = bake(&mesh, &atlas, &learned, &[], &config, &tiface::Quiet)?;
+/// assert!(baked.color.data.iter().all(|v| (v - 0.2140).abs() < 1e-3)); // linear
+/// # Ok::<(), tiface::Error>(())
+/// ```
+///
+/// # Errors
+///
+/// A side of no or too many samples, a request to stop.
+pub fn bake(
+    mesh: &Mesh,
+    atlas: &Atlas,
+    learned: &Learned,
+    cameras: &[Camera],
+    config: &BakeConfig,
+    monitor: &dyn Monitor,
+) -> Result<Baked> {
+    let begin = Instant::now();
+    setting((1..=8).contains(&config.side), "BakeConfig::side", "1..=8", config.side)?;
+    let (width, height) = (atlas.width, atlas.height);
+    let count = if config.lobes == 0 { 0 } else { functions(config.lobes.min(2)) };
+    let mut color = Image::new(width, height, 3);
+    let mut lobes = vec![Image::new(width, height, 3); count];
+    let mut normal = config.normals.then(|| Image::new(width, height, 3));
+    let mut covered = vec![false; width as usize * height as usize];
+    let (mut samples, mut visible, mut views, mut moved) = (0, 0, 0, 0.0);
+    let bvh = Bvh::new(mesh);
+    let eyes = Visibility { cameras, bvh: &bvh, clearance: 0.5 * config.reach, most: config.views };
+    let bands = Bands::new(atlas, ROWS);
+    for band in 0..bands.len() {
+        let all = bands.samples(atlas, band, config.side);
+        for own in whole_texels(&all) {
+            monitor.check_stop()?;
+            let flat = on_triangles(mesh, own);
+            let points = settle(&flat, config.reach, learned);
+            let seen = eyes.directions(&points, &flat);
+            samples += own.len();
+            for (_, &count) in seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known) {
+                visible += 1;
+                views += count as usize;
+            }
+            let ways = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
+            moved += ways.sum::<f64>();
+            let shades = shade(&points, seen, learned, count, config.turned);
+            let mut i = 0;
+            for texel in own.chunk_by(|a, b| a.texel == b.texel) {
+                let at = texel[0].texel as usize;
+                covered[at] = true;
+                let all = i..i + texel.len();
+                // where some samples are seen, the unseen say nothing
+                let any = shades.seen[all.clone()].contains(&true);
+                let counts = |s: usize| if any && !shades.seen[s] { 0.0 } else { 1.0 };
+                let total: f32 = all.clone().map(counts).sum();
+                let mean = |value: &dyn Fn(usize) -> [f32; 3]| -> [f32; 3] {
+                    let mut sum = [0f32; 3];
+                    for s in all.clone() {
+                        let w = counts(s) / total;
+                        value(s).iter().zip(&mut sum).for_each(|(v, sum)| *sum += w * v);
+                    }
+                    sum
+                };
+                let put = |image: &mut Image, v: [f32; 3]| image.data[3 * at..3 * at + 3].copy_from_slice(&v);
+                put(&mut color, mean(&|s| shades.linear[s]));
+                for (k, image) in lobes.iter_mut().enumerate() {
+                    put(image, mean(&|s| shades.lobes[s * count + k]));
+                }
+                if let Some(image) = &mut normal {
+                    let n = Vec3::from(mean(&|s| points.normals[s].to_array()));
+                    put(image, n.normalize_or(points.normals[all.start]).to_array());
+                }
+                i = all.end;
+            }
+        }
+        monitor.step(band as u64 + 1, bands.len() as u64, &[("texels", samples as f64)]);
+    }
+    let seams = Seams::new(mesh, atlas);
+    fill::fill(&mut color, &covered, config.gutter_px);
+    seams.even(&mut color, srgb_from_linear, linear_from_srgb);
+    lobes.iter_mut().for_each(|l| complete(l, &covered, config.gutter_px, &seams));
+    if let Some(normal) = &mut normal {
+        fill::fill(normal, &covered, config.gutter_px);
+    }
+    let share = |a: f64, b: usize| if b > 0 { a / b as f64 } else { 0.0 };
+    let report = BakeReport {
+        size: [width, height],
+        covered: share(covered.iter().filter(|&&c| c).count() as f64, covered.len()),
+        samples,
+        seen: share(visible as f64, samples),
+        views: share(views as f64, visible),
+        moved: share(moved, samples),
+        seconds: begin.elapsed().as_secs_f64(),
+    };
+    Ok(Baked { color, lobes, normal, report })
+}
+
+/// Fills a picture of 3 channels between its charts, of which the `known` texels lie in one, and makes it agree along
+/// seams.
+pub fn complete(image: &mut Image, known: &[bool], gutter_px: u32, seams: &Seams) {
+    fill::fill(image, known, gutter_px);
+    seams.even(image, |v| v, |v| v);
+}
+
+/// Draws harmonics at the vertices of a mesh into the texels of its atlas: a picture a function, complete.
+pub fn bake_harmonics(mesh: &Mesh, atlas: &Atlas, harmonics: &Harmonics, gutter_px: u32) -> Vec<Image> {
+    let (width, height, count) = (atlas.width, atlas.height, harmonics.functions);
+    let mut pictures = vec![Image::new(width, height, 3); count];
+    let mut known = vec![false; width as usize * height as usize];
+    let bands = Bands::new(atlas, ROWS);
+    for sample in (0..bands.len()).flat_map(|band| bands.samples(atlas, band, 1)) {
+        let at = sample.texel as usize;
+        let weights = [1.0 - sample.u - sample.v, sample.u, sample.v];
+        known[at] = true;
+        for (k, picture) in pictures.iter_mut().enumerate() {
+            let mut sum = [0f32; 3];
+            for (&vertex, w) in mesh.triangles[sample.triangle as usize].iter().zip(weights) {
+                let own = harmonics.coefficients[vertex as usize * count + k];
+                (0..3).for_each(|c| sum[c] += w * own[c]);
+            }
+            picture.data[3 * at..3 * at + 3].copy_from_slice(&sum);
+        }
+    }
+    let seams = Seams::new(mesh, atlas);
+    pictures.iter_mut().for_each(|p| complete(p, &known, gutter_px, &seams));
+    pictures
+}
+
+/// Pieces of at most [`BATCH`] samples (or one texel) that end between texels.
+fn whole_texels(samples: &[Sample]) -> impl Iterator<Item = &[Sample]> {
+    let mut rest = samples;
+    std::iter::from_fn(move || {
+        if rest.is_empty() {
+            return None;
+        }
+        let mut end = rest.len().min(BATCH);
+        if end < rest.len() {
+            let last = rest[end].texel;
+            let texel = rest.partition_point(|s| s.texel < last);
+            end = if texel > 0 { texel } else { rest.partition_point(|s| s.texel <= last) };
+        }
+        let (own, after) = rest.split_at(end);
+        rest = after;
+        Some(own)
+    })
+}
+
+/// Positions and interpolated normals of samples.
+fn on_triangles(mesh: &Mesh, samples: &[Sample]) -> SurfacePoints {
+    let mix = |values: &[Vec3], s: &Sample| {
+        let [a, b, c] = mesh.triangles[s.triangle as usize].map(|i| values[i as usize]);
+        (1.0 - s.u - s.v) * a + s.u * b + s.v * c
+    };
+    let face = |s: &Sample| area_vector(mesh.corners(s.triangle)).normalize_or(Vec3::Z);
+    let normal = |s: &Sample| mix(&mesh.normals, s).normalize_or(face(s));
+    SurfacePoints {
+        positions: samples.iter().map(|s| mix(&mesh.positions, s)).collect(),
+        normals: samples.iter().map(normal).collect(),
+    }
+}
+
+/// Turns a picture of normals in the mesh's coordinates into one in tangent space.
+///
+/// `tangents` has one per corner of each triangle, w = ±1; `normals` three channels of the atlas's size, unit.
+pub fn tangent_space(
+    mesh: &Mesh,
+    atlas: &Atlas,
+    tangents: &[[Vec4; 3]],
+    normals: &Image,
+    gutter_px: u32,
+) -> Photo {
+    let (width, height) = (atlas.width, atlas.height);
+    let mut out = Image::new(width, height, 3);
+    let mut covered = vec![false; width as usize * height as usize];
+    let bands = Bands::new(atlas, ROWS);
+    for band in 0..bands.len() {
+        for group in bands.samples(atlas, band, 1).chunk_by(|a, b| a.texel == b.texel) {
+            let s = group[0];
+            let corners = mesh.triangles[s.triangle as usize].map(|i| mesh.normals[i as usize]);
+            let weights = [1.0 - s.u - s.v, s.u, s.v];
+            let m: Vec3 = (0..3).map(|k| weights[k] * corners[k]).sum::<Vec3>().normalize_or(Vec3::Z);
+            let tangent = tangents[s.triangle as usize];
+            let t: Vec3 = (0..3).map(|k| weights[k] * tangent[k].truncate()).sum();
+            // what a renderer does: tangent across the normal, bitangent from both
+            let t = (t - m * m.dot(t)).normalize_or(m.any_orthonormal_vector());
+            let b = tangent[0].w * m.cross(t);
+            let at = s.texel as usize;
+            let n = Vec3::from_slice(&normals.data[3 * at..3 * at + 3]);
+            let local = (Mat3::from_cols(t, b, m).transpose() * n).normalize_or(Vec3::Z);
+            covered[at] = true;
+            // a renderer lights nothing from behind
+            let local = local.with_z(local.z.max(0.05)).normalize();
+            out.data[3 * at..3 * at + 3].copy_from_slice(&local.to_array());
+        }
+    }
+    fill(&mut out, &covered, gutter_px);
+    let byte = |v: f32| (127.5 * v.clamp(-1.0, 1.0) + 128.0) as u8;
+    let rgb = out.data.as_chunks::<3>().0.iter().map(|n| {
+        let n = Vec3::from(*n).normalize_or(Vec3::Z);
+        [byte(n.x), byte(n.y), byte(n.z)]
+    });
+    Photo { width, height, rgb: rgb.collect(), alpha: None }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Quiet;
+    use glam::Vec2;
+
+    /// A latitude-longitude sphere of radius 0.5 (coarse), with a seam.
+    fn sphere(width: u32, height: u32) -> (Mesh, Atlas) {
+        let (nu, nv) = (24u32, 12u32);
+        let mut mesh = Mesh::default();
+        let mut atlas = Atlas { width, height, ..Atlas::default() };
+        for j in 0..=nv {
+            for i in 0..=nu {
+                let (lon, lat) = (i as f32 / nu as f32 * std::f32::consts::TAU, j as f32 / nv as f32);
+                let theta = (0.02 + 0.96 * lat) * std::f32::consts::PI;
+                let n = Vec3::new(theta.sin() * lon.cos(), theta.cos(), theta.sin() * lon.sin());
+                mesh.positions.push(0.5 * n);
+                mesh.normals.push(n);
+                let margin = 2.0 / width as f32;
+                let x = margin + (1.0 - 2.0 * margin) * i as f32 / nu as f32;
+                atlas.uvs.push(Vec2::new(x, margin + (1.0 - 2.0 * margin) * lat));
+            }
+        }
+        for j in 0..nv {
+            for i in 0..nu {
+                let at = |i: u32, j: u32| j * (nu + 1) + i;
+                mesh.triangles.push([at(i, j), at(i + 1, j), at(i + 1, j + 1)]);
+                mesh.triangles.push([at(i, j), at(i + 1, j + 1), at(i, j + 1)]);
+            }
+        }
+        atlas.triangles = mesh.triangles.clone();
+        (mesh, atlas)
+    }
+
+    fn gradient(p: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        p.iter().map(|p| (p.length() - 0.5, p.normalize_or_zero())).unzip()
+    }
+
+    fn ring() -> Vec<Camera> {
+        let mut cameras = Vec::new();
+        for k in 0..8 {
+            let a = k as f64 / 8.0 * std::f64::consts::TAU;
+            let rotation = glam::DMat3::from_rotation_y(a);
+            let position = rotation * glam::DVec3::new(0.0, 0.0, 3.0);
+            cameras.push(Camera { rotation, position, ..Camera::above(200, 200, 300.0, 0.0) });
+        }
+        cameras
+    }
+
+    fn config() -> BakeConfig {
+        BakeConfig {
+            side: 2,
+            gutter_px: 4,
+            reach: 0.02,
+            views: usize::MAX,
+            lobes: 0,
+            normals: false,
+            turned: Mat3::IDENTITY,
+        }
+    }
+
+    #[test]
+    fn every_texel_has_the_color_of_its_point_on_the_true_surface() {
+        let (mesh, atlas) = sphere(128, 64);
+        let paint = |p: Vec3| (0.5 + 0.8 * p).to_array();
+        let colors = |p: &[Vec3], _: &[Vec3], counts: &[u32], _: &[Vec3]| -> Vec<[f32; 3]> {
+            p.iter().zip(counts).flat_map(|(p, &n)| std::iter::repeat_n(paint(*p), n as usize)).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        let config = BakeConfig { normals: true, ..config() };
+        let baked = bake(&mesh, &atlas, &learned, &ring(), &config, &Quiet).unwrap();
+        assert!(baked.report.covered > 0.9 && baked.report.seen > 0.7, "{:?}", baked.report);
+        assert!(baked.report.moved > 1e-4 && baked.report.views > 1.5);
+        let normal = baked.normal.unwrap();
+        for y in 4..60 {
+            for x in 4..124 {
+                let n = Vec3::from_slice(normal.pixel(x, y));
+                // painted at the sphere's own point, not at the flat triangle's: 0.5 n
+                let want = paint(0.5 * n).map(linear_from_srgb);
+                let got = baked.color.pixel(x, y);
+                assert!((0..3).all(|k| (got[k] - want[k]).abs() < 4e-3), "{x} {y} {got:?} {want:?}");
+                let lon = (x as f32 + 0.5) / 128.0 * std::f32::consts::TAU;
+                assert!(n.x * lon.cos() + n.z * lon.sin() > 0.97 * n.x.hypot(n.z));
+            }
+        }
+    }
+
+    #[test]
+    fn both_sides_of_a_seam_show_the_same_edge_of_paint() {
+        let (mut mesh, mut atlas) = sphere(256, 128);
+        // longitude 0 has vertices at both ends of a row: as one, it is a seam of two sides
+        for j in 0..=12 {
+            let (first, last) = (j * 25, j * 25 + 24);
+            mesh.triangles.iter_mut().flatten().filter(|i| **i == last).for_each(|i| *i = first);
+        }
+        // and the two sides lie apart by a part of a texel, too
+        atlas.uvs.iter_mut().filter(|uv| uv.x < 0.5).for_each(|uv| uv.y += 0.3 / 128.0);
+        let colors = |p: &[Vec3], _: &[Vec3], counts: &[u32], _: &[Vec3]| -> Vec<[f32; 3]> {
+            let paint = |p: &Vec3| if (20.0 * p.y).rem_euclid(2.0) < 1.0 { [0.1; 3] } else { [0.9; 3] };
+            p.iter().zip(counts).flat_map(|(p, &n)| std::iter::repeat_n(paint(p), n as usize)).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        let baked = bake(&mesh, &atlas, &learned, &ring(), &config(), &Quiet).unwrap();
+        let rgb = baked.color.data.as_chunks::<3>().0.iter();
+        let rgb = rgb.map(|c| c.map(|v| crate::image::quantize(srgb_from_linear(v)))).collect();
+        let step = Seams::new(&mesh, &atlas).step(&crate::image::Photo {
+            width: 256,
+            height: 128,
+            rgb,
+            alpha: None,
+        });
+        // the hardest paint there is; 12.7 without
+        assert!(step < 4.0, "{step}");
+    }
+
+    #[test]
+    fn lobes_keep_what_the_mean_loses() {
+        let (mesh, atlas) = sphere(64, 32);
+        // brighter towards +x
+        let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], away: &[Vec3]| -> Vec<[f32; 3]> {
+            away.iter().map(|d| [0.5 - 0.2 * d.x, 0.5, 0.5]).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        let config = BakeConfig { lobes: 1, ..config() };
+        let baked = bake(&mesh, &atlas, &learned, &ring(), &config, &Quiet).unwrap();
+        assert_eq!(baked.lobes.len(), 4);
+        // at longitude 90° (+z), seen by three cameras from −45° to 45°
+        let (x, y) = (16, 16);
+        let base = crate::image::srgb_from_linear(baked.color.pixel(x, y)[0]);
+        let l: Vec<[f32; 3]> = baked.lobes.iter().map(|i| i.pixel(x, y).try_into().unwrap()).collect();
+        for side in [-0.6f32, 0.0, 0.6] {
+            let d = Vec3::new(side, 0.0, 1.0).normalize();
+            let truth = 0.5 + 0.2 * d.x;
+            let with = base + crate::geom::sphharm::combine(&l, d.to_array())[0];
+            assert!(
+                (with - truth).abs() <= 0.3 * (base - truth).abs() + 0.01,
+                "{side}: {with} {base} {truth}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_mirrored_atlas_gives_the_mirrored_picture_and_charts_may_end_at_the_border() {
+        let (width, height) = (64u32, 32u32);
+        let (mesh, mut atlas) = sphere(width, height);
+        let margin = 2.0 / width as f32;
+        for uv in &mut atlas.uvs {
+            *uv = ((*uv - margin) / (1.0 - 2.0 * margin)).clamp(Vec2::ZERO, Vec2::ONE);
+        }
+        let colors = |p: &[Vec3], _: &[Vec3], counts: &[u32], _: &[Vec3]| -> Vec<[f32; 3]> {
+            p.iter().zip(counts).flat_map(|(p, &n)| vec![(0.5 + 0.8 * *p).to_array(); n as usize]).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        let mut turned = atlas.clone();
+        turned.uvs.iter_mut().for_each(|uv| uv.x = 1.0 - uv.x);
+        let [plain, mirrored] =
+            [&atlas, &turned].map(|a| bake(&mesh, a, &learned, &ring(), &config(), &Quiet).unwrap());
+        assert_eq!((plain.report.covered, mirrored.report.covered), (1.0, 1.0));
+        for y in 0..height {
+            for x in 0..width {
+                let (a, b) = (plain.color.pixel(x, y), mirrored.color.pixel(width - 1 - x, y));
+                assert!((0..3).all(|k| (a[k] - b[k]).abs() < 0.01), "{x} {y}: {a:?} {b:?}");
+            }
+        }
+        // the first texel of a row half way down: longitude half a texel, latitude 16.5 of 32 rows
+        let (lon, theta) =
+            (std::f32::consts::TAU * 0.5 / 64.0, std::f32::consts::PI * (0.02 + 0.96 * 16.5 / 32.0));
+        let p = 0.5 * Vec3::new(theta.sin() * lon.cos(), theta.cos(), theta.sin() * lon.sin());
+        for (found, coded) in plain.color.pixel(0, 16).iter().zip((0.5 + 0.8 * p).to_array()) {
+            assert!((found - crate::image::linear_from_srgb(coded)).abs() < 0.02, "{found} {coded}");
+        }
+    }
+
+    #[test]
+    fn without_cameras_views_are_straight_and_texel_sized_textures_work() {
+        let (mesh, mut atlas) = sphere(8, 4);
+        atlas.uvs.iter_mut().for_each(|uv| *uv = uv.clamp(Vec2::ZERO, Vec2::ONE));
+        let colors = |_: &[Vec3], n: &[Vec3], counts: &[u32], away: &[Vec3]| -> Vec<[f32; 3]> {
+            assert!(counts.iter().all(|&c| c == 1));
+            n.iter().zip(away).map(|(n, d)| [n.dot(-*d), 0.0, 0.0]).collect()
+        };
+        let learned = Learned { gradient: &gradient, colors: &colors };
+        for (width, height) in [(8, 4), (1, 1)] {
+            let atlas = Atlas { width, height, ..atlas.clone() };
+            let baked = bake(&mesh, &atlas, &learned, &[], &config(), &Quiet).unwrap();
+            assert!(baked.color.data.chunks(3).all(|c| (c[0] - 1.0).abs() < 1e-4));
+            assert_eq!(baked.report.seen, 0.0);
+        }
+        let bad = BakeConfig { side: 0, ..config() };
+        assert!(bake(&mesh, &atlas, &learned, &[], &bad, &Quiet).is_err());
+    }
+
+    #[test]
+    fn a_normal_that_leans_along_u_is_red_and_one_up_the_picture_is_green() {
+        // a square in the xy plane, u along +x, v down along −y
+        let at = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)];
+        let mesh = Mesh {
+            positions: at.map(|(x, y)| Vec3::new(x, y, 0.0)).to_vec(),
+            normals: vec![Vec3::Z; 4],
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            ..Mesh::default()
+        };
+        let uvs = at.map(|(x, y)| Vec2::new(x, 1.0 - y)).to_vec();
+        let atlas = Atlas { uvs, triangles: mesh.triangles.clone(), width: 4, height: 4 };
+        let tangents = crate::mesh::files::tangents(&mesh, &atlas).unwrap();
+        let picture = |n: Vec3| {
+            let data = (0..16).flat_map(|_| n.normalize().to_array()).collect();
+            let normals = Image { width: 4, height: 4, channels: 3, data };
+            tangent_space(&mesh, &atlas, &tangents, &normals, 1).rgb[5]
+        };
+        assert_eq!(picture(Vec3::Z), [128, 128, 255]);
+        // (0.6, 0, 0.8): 127.5 · 0.6 + 128 = 204.5
+        assert_eq!(picture(Vec3::new(0.6, 0.0, 0.8)), [204, 128, 230]);
+        assert_eq!(picture(Vec3::new(0.0, 0.6, 0.8)), [128, 204, 230]);
+    }
+}

@@ -1,0 +1,193 @@
+//! A run directory: one folder per stage, and how a stage reports from inside it.
+//!
+//! ```text
+//! runs/002_00/iface/.lock        held while a process works on the stage
+//!                   status.json  live: state, step, rate, time left, error
+//!                   log.jsonl    one object per logged step
+//!                   …            the stage's own files
+//!                   done.json    last: what shaped the result, and its figures
+//! runs/002_00/estimate.json      what stages may cost, told before they are worked on
+//!             failed.json        what a command ended with before any stage could say so
+//! ```
+//!
+//! A stage whose `done.json` has the same fingerprint is skipped without touching a file; one with
+//! another fingerprint is an error that prints the difference, since neither retraining nor reusing
+//! should happen in silence.
+//!
+//! Repeating a command after any accident gives the same bytes in the stage's own files (on one
+//! device and for one seed). `status.json`, `log.jsonl` and `done.json` tell when and how fast
+//! things happened, and so differ from run to run.
+
+use crate::{Error, ErrorKind, Quiet, Result};
+mod fingerprint;
+mod progress;
+mod stage;
+mod standing;
+mod status;
+
+pub use fingerprint::Fingerprint;
+pub use progress::{Event, Observer, Stop};
+pub use stage::{Done, Plan, StageDir};
+pub use standing::{FAILED, Failure, Phase, StageStanding, Standing, read_failure};
+pub use status::{Cost, ESTIMATE, Estimate, Record, State, Status, read_estimate, read_record, read_status};
+
+use crate::io::{self, Lock, LockError};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+impl Observer for Quiet {
+    fn event(&self, _: &Event) {}
+}
+
+/// A run directory.
+pub struct Run {
+    dir: PathBuf,
+    stop: Stop,
+    observer: Arc<dyn Observer>,
+}
+
+const LOCK: &str = ".lock";
+
+/// Is this the folder of a stage, or of a product of its own below one? It has a lock from the first moment;
+/// a copy may have lost that.
+fn has_record(folder: &Path) -> bool {
+    let lock = folder.join(LOCK);
+    (io::is_file(&lock) && !io::is_link(&lock))
+        || matches!(read_record(folder), Ok(Some(_)))
+        || matches!(read_status(folder), Ok(Some(_)))
+}
+
+impl Run {
+    /// The run in `dir`; the folder is made with the first file that is written. Events go to
+    /// `observer`; every stage stops when `stop` says so.
+    pub fn open(dir: &Path, stop: Stop, observer: Arc<dyn Observer>) -> Run {
+        Run { dir: dir.into(), stop, observer }
+    }
+
+    /// The run in `dir`, which reports nothing and never stops.
+    pub fn quiet(dir: &Path) -> Run {
+        Run::open(dir, Stop::new(), Arc::new(Quiet))
+    }
+
+    /// The folder of the run.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// A file or folder of the run.
+    pub fn path(&self, name: impl AsRef<Path>) -> PathBuf {
+        self.dir.join(name)
+    }
+
+    /// Writes a file of the run itself (`config.toml`, `cameras.json`, `report.html`); one that
+    /// holds the same bytes already is left alone, so that its time of modification stays honest.
+    pub fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
+        let path = self.path(name);
+        if io::is_file(&path) && io::read_bytes(&path, &io::Limits::default()).is_ok_and(|old| old == bytes) {
+            return Ok(());
+        }
+        io::create_folder(&self.dir)?;
+        // one process at a time: what else of this file looks half-written was left by one that is gone
+        let lock = Lock::wait(&self.path(LOCK));
+        if lock.is_ok() {
+            let _ = io::remove_leftovers(&self.dir, |of, _| of == name); // the next one tries again
+        }
+        Ok(io::write_atomic(&path, bytes)?)
+    }
+
+    /// Removes what stages have made, so that they start anew; `names` in the order of the line. All their
+    /// locks are held meanwhile. What has a lock or a record of its own below a stage's folder stays.
+    ///
+    /// # Errors
+    ///
+    /// A folder that is a link, or that holds what no stage has made, and then nothing is removed at all.
+    pub fn fresh(&self, names: &[String]) -> Result<()> {
+        let there: Vec<&String> = names.iter().filter(|n| io::is_folder(&self.path(n))).collect();
+        for name in &there {
+            if let Some(link) = self.link(name) {
+                return Err(Error::cannot(
+                    format!("`{}` is a link, and what lies behind a link is not removed", link.display()),
+                    "remove the link, then repeat the command",
+                ));
+            }
+            self.is_ours(name)?;
+        }
+        let mut locks = Vec::new();
+        for name in there {
+            locks.push((self.path(name), self.lock(name)?));
+        }
+        // the last stage first: stopped halfway, no stage is left whose input is gone
+        for (folder, _lock) in locks.iter().rev() {
+            io::remove(&folder.join("done.json"))?;
+            io::clear_folder(folder, LOCK, &has_record)?;
+        }
+        Ok(())
+    }
+
+    /// An error if a stage's folder holds something, and nothing says that a stage has made it.
+    fn is_ours(&self, name: &str) -> Result<()> {
+        let folder = self.path(name);
+        if has_record(&folder) {
+            return Ok(());
+        }
+        match io::any_file(&folder, &has_record)? {
+            // another process began the stage between the two looks
+            Some(_) if has_record(&folder) => Ok(()),
+            Some(file) => Err(Error::cannot(
+                format!(
+                    "`{}` is in the way: it is no folder of a run, and holds `{}`",
+                    folder.display(),
+                    file.display()
+                ),
+                "choose another folder for the run with `--run DIR`, or move what lies there somewhere else",
+            )),
+            None => Ok(()),
+        }
+    }
+
+    /// The link, if there is one, on the way from the run's folder to that of a stage.
+    fn link(&self, name: &str) -> Option<PathBuf> {
+        let below = self.path(name);
+        let inside = below.ancestors().take_while(|path| *path != self.dir);
+        inside.filter(|path| io::is_link(path)).last().map(Path::to_path_buf)
+    }
+
+    /// Tells the observer something that went differently than hoped.
+    pub fn warn(&self, stage: &str, text: &str) {
+        self.observer.event(&Event::Warning { stage, text });
+    }
+
+    /// The stop request this run listens to.
+    pub fn stop(&self) -> &Stop {
+        &self.stop
+    }
+
+    /// Leaves word of what a command ended with before any stage could say so; whether that succeeds is no matter. In a
+    /// folder that holds other things than a run, nothing is left.
+    pub fn failed(&self, error: &Error) {
+        let is_run = ["config.toml", FAILED].iter().any(|name| io::is_file(&self.path(name)));
+        if !is_run && !matches!(io::any_file(&self.dir, &|_| false), Ok(None)) {
+            return;
+        }
+        let failure =
+            Failure { error: error.to_string(), hint: error.hint().into(), exit: error.kind().code() };
+        let _ = self.write(FAILED, format!("{}\n", serde_json::json!(failure)).as_bytes());
+    }
+
+    /// Takes back what [`Run::failed`] said.
+    pub fn not_failed(&self) {
+        let _ = io::remove(&self.path(FAILED));
+    }
+
+    fn lock(&self, stage: &str) -> Result<Lock> {
+        Lock::take(&self.path(stage).join(LOCK)).map_err(|e| match e {
+            LockError::Held { .. } => {
+                let run = self.dir.display();
+                let problem = format!("stage `{stage}` of `{run}` is locked: another process works on it");
+                Error::new(ErrorKind::NotNow, problem)
+                    .with_hint("wait for it, or stop it, then repeat the command")
+            }
+            other => Error::cannot(other, "check that you may write in the run folder"),
+        })
+    }
+}
