@@ -231,7 +231,7 @@ impl SdfOps for GpuSdf<'_> {
     }
 
     fn set_points(&mut self, points: &[SurfacePoint]) {
-        self.points.put(&self.device, bytemuck::cast_slice(points));
+        self.points.set(&self.device, bytemuck::cast_slice(points));
     }
 
     fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {
@@ -281,7 +281,7 @@ impl SdfOps for GpuSdf<'_> {
     }
 
     fn march(&mut self) {
-        let apart = self.points.most();
+        let apart = self.points.max_per_step();
         let (device, step) = (&self.device, &self.schedule.step_length);
         self.samples.march(device, &self.occupancy, &self.batch, step, usize::MAX, apart);
     }

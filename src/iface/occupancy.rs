@@ -88,7 +88,7 @@ impl Occupancy {
                 continue;
             }
             let bits = from.words(name)?;
-            *mask = Bitmask::of(mask.resolution, bits)
+            *mask = Bitmask::from_words(mask.resolution, bits)
                 .ok_or_else(|| from.wrong(format!("tensor `{name}` has another size")))?;
         }
         Ok(())

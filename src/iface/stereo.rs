@@ -88,7 +88,7 @@ fn surface(
         let own = |(x, (_, n)): (&[f32; 3], &(f32, [f32; 3]))| {
             let normal = Vec3::from(*n).try_normalize()?;
             let surfel = Surfel { position: Vec3::from(*x) / radius, normal };
-            let footprint = stereo::owned(&stereo_views, v, &surfel)?;
+            let footprint = stereo::owned_footprint(&stereo_views, v, &surfel)?;
             // four in the place of one, two pixels apart
             let axis = normal.any_orthonormal_vector();
             let other = normal.cross(axis);

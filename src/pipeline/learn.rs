@@ -112,7 +112,7 @@ pub(super) fn train_views(
 
 fn bitmask(scene: &Scene) -> Option<Bitmask> {
     let hull = scene.hull.as_ref()?;
-    Bitmask::of(hull.resolution, hull.bits.clone())
+    Bitmask::from_words(hull.resolution, hull.bits.clone())
 }
 
 /// The fields as they lie in the run, each loaded when it is first asked for.

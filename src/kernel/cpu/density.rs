@@ -9,8 +9,8 @@
 //! distortion = Σ_k ⅓ δ w_k² + 2 w_k (m_k Σ_{j<k} w_j − Σ_{j<k} w_j m_j)     m: midpoints
 //! ```
 //!
-//! Distortion: Barron et al. 2022 ("Mip-NeRF 360", eq. 15). The gradient of the exponential is held below exp(15), as
-//! there.
+//! Distortion: Barron et al. 2022 ("Mip-NeRF 360", eq. 15). As in instant-nsr-pl, the gradient of the
+//! exponential is clamped to exp(15).
 
 use super::hash::{self, Level};
 use super::march::Samples;
@@ -22,22 +22,23 @@ use rayon::prelude::*;
 
 /// Width of all hidden layers.
 pub const HIDDEN: usize = 64;
-/// Outputs of the geometry network, the density's logarithm first; all go to the color network.
+/// Outputs of the geometry network: the logarithm of the density comes first, and all of them are inputs of the color
+/// network.
 pub const FEATURES: usize = 16;
-/// Inputs of the color network: features and harmonics.
+/// Inputs of the color network: the geometry network's outputs and 16 spherical harmonics of the direction.
 pub const COLOR_INPUTS: usize = FEATURES + 16;
-/// A ray ends where less of its light is left.
-pub const DARK: f32 = 1e-4;
-/// Weight of the distortion.
+/// A ray is truncated where its transmittance falls below this.
+pub const MIN_TRANSMITTANCE: f32 = 1e-4;
+/// Weight of the distortion loss.
 pub const DISTORTION: f32 = 0.001;
-/// The gradient of the density's exponential is held below e¹⁵.
-pub const STEEPEST: f32 = 3_269_017.25;
-/// Color channels as stored.
+/// The gradient of the density's exponential is clamped to e¹⁵.
+pub const MAX_EXP_GRADIENT: f32 = 3_269_017.25;
+/// Color channels as stored in tiles, padded for the matrix blocks.
 const RGB: usize = 8;
-/// Samples a task handles: fixed, so that sums do not depend on the number of threads.
+/// Number of samples per task. It is fixed, so that sums do not depend on the number of threads.
 const CHUNK: usize = 64;
 
-/// Grid and box of the field.
+/// Hash grid and bounding box of the field.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DensityShape {
     /// Levels of the hash grid; a multiple of 4.
@@ -53,12 +54,12 @@ impl DensityShape {
         [(HIDDEN, u), (FEATURES, HIDDEN), (HIDDEN, COLOR_INPUTS), (HIDDEN, HIDDEN), (3, HIDDEN)]
     }
 
-    /// Floats of all matrices.
+    /// Returns the number of floats of all matrices.
     pub fn len(&self) -> usize {
         self.shapes().iter().map(|(o, i)| o * i).sum()
     }
 
-    /// Never: a network has weights. (Beside `len` by convention.)
+    /// Returns false: a network always has weights. Clippy asks for this method next to `len`.
     pub fn is_empty(&self) -> bool {
         false
     }
@@ -68,14 +69,14 @@ impl DensityShape {
     }
 }
 
-/// The networks' matrices in both orders.
+/// The networks' matrices, each stored with its transpose.
 #[derive(Debug)]
 pub struct DensityWeights {
     m: [Matrix; 5],
 }
 
 impl DensityWeights {
-    /// From the flat vector that [`DensityShape::shapes`] describes.
+    /// Creates the weights from the flat vector that [`DensityShape::shapes`] describes.
     pub fn new(shape: &DensityShape, flat: &[f32]) -> DensityWeights {
         let shapes = shape.shapes();
         let mut parts = split(flat, shapes).into_iter().zip(shapes);
@@ -87,7 +88,7 @@ impl DensityWeights {
     }
 }
 
-/// What evaluating samples leaves behind, rows of a sample together.
+/// Activations of a tile of samples, kept for the backward pass; all arrays are row-major, one row per sample.
 #[derive(Clone, Debug, Default)]
 struct Tile {
     u: Vec<f32>,
@@ -99,12 +100,12 @@ struct Tile {
     rgb: Vec<f32>,
 }
 
-/// Samples evaluated, with what the backward needs.
+/// Evaluated samples, with the activations that the backward pass needs.
 #[derive(Clone, Debug)]
 pub struct DensitySamples {
     /// `[n]` densities.
     pub density: Vec<f32>,
-    /// `[n, 3]` colors; empty where they were not asked for.
+    /// `[n, 3]` colors, sigmoid outputs in 0..=1; empty if [`evaluate`] got no directions.
     pub color: Vec<[f32; 3]>,
     tiles: Vec<Tile>,
     x01: Vec<[f32; 3]>,
@@ -115,10 +116,11 @@ fn relu(v: &mut [f32]) {
 }
 
 struct ForwardTask<'a> {
-    /// First sample, and how many there are in all.
+    /// Index of the first sample of this task.
     first: usize,
-    all: usize,
-    /// `[levels, all]`
+    /// Number of samples of all tasks.
+    total: usize,
+    /// `[levels, total]`
     features: &'a [[f32; 2]],
     levels: usize,
     direction: Option<&'a [[f32; 3]]>,
@@ -134,7 +136,7 @@ fn forward_body<const F: bool>(task: &mut ForwardTask, w: &DensityWeights) {
     t.u = vec![0.0; CHUNK * inputs];
     for l in 0..task.levels {
         for s in 0..n {
-            let f = task.features[l * task.all + task.first + s];
+            let f = task.features[l * task.total + task.first + s];
             t.u[s * inputs + 2 * l..][..2].copy_from_slice(&f);
         }
     }
@@ -169,7 +171,7 @@ fn forward_body<const F: bool>(task: &mut ForwardTask, w: &DensityWeights) {
 
 dispatch! { fn forward_task / forward_body(task: &mut ForwardTask, w: &DensityWeights) }
 
-/// Evaluates samples; colors only where there are directions.
+/// Evaluates densities at samples, and colors if directions are given.
 ///
 /// # Shapes
 ///
@@ -195,7 +197,7 @@ pub fn evaluate(
         .enumerate()
         .map(|(i, (density, tile))| ForwardTask {
             first: i * CHUNK,
-            all: n,
+            total: n,
             features: &features,
             levels,
             direction: direction.map(|d| &d[i * CHUNK..][..density.len()]),
@@ -207,7 +209,7 @@ pub fn evaluate(
     tasks.into_par_iter().for_each(|mut task| {
         forward_task(&mut task, weights);
         if task.direction.is_none() {
-            *task.tile = Tile::default(); // nobody asks for gradients of a look
+            *task.tile = Tile::default(); // a density-only evaluation has no backward pass
         }
     });
     DensitySamples { density, color, tiles, x01 }
@@ -219,12 +221,13 @@ struct BackwardTask<'a> {
     g_color: &'a [[f32; 3]],
     density: &'a [f32],
     color: &'a [[f32; 3]],
-    /// Gradients of the five matrices, and of the features.
+    /// Gradients with respect to the five matrices.
     g: [Vec<f32>; 5],
+    /// Gradient with respect to the hash features.
     g_u: Vec<f32>,
 }
 
-/// `G[out, in] = gᵀ v` over the samples of a tile.
+/// Returns `G[out, in] = gᵀ v`, summed over the samples of a tile.
 #[inline(always)]
 fn outer<const F: bool>(g: &[f32], out: usize, v: &[f32], inputs: usize) -> Vec<f32> {
     let mut sum = vec![0f32; out * inputs];
@@ -232,15 +235,15 @@ fn outer<const F: bool>(g: &[f32], out: usize, v: &[f32], inputs: usize) -> Vec<
     sum
 }
 
-/// `g W`, zero where the layer before gave nothing.
+/// Returns `g W`, set to zero where the activation of the previous layer is not positive (the relu's gradient).
 #[inline(always)]
 fn back<const F: bool>(g: &[f32], out: usize, w: &Matrix, inputs: usize, layer: Option<&[f32]>) -> Vec<f32> {
-    let mut before = vec![0f32; CHUNK * inputs];
-    gemm::<F>((CHUNK, inputs, out), g, (out, 1), &w.m, inputs, &mut before, inputs, false);
+    let mut g_input = vec![0f32; CHUNK * inputs];
+    gemm::<F>((CHUNK, inputs, out), g, (out, 1), &w.m, inputs, &mut g_input, inputs, false);
     if let Some(layer) = layer {
-        before.iter_mut().zip(layer).for_each(|(g, v)| *g = if *v > 0.0 { *g } else { 0.0 });
+        g_input.iter_mut().zip(layer).for_each(|(g, v)| *g = if *v > 0.0 { *g } else { 0.0 });
     }
-    before
+    g_input
 }
 
 #[inline(always)]
@@ -261,7 +264,7 @@ fn backward_body<const F: bool>(task: &mut BackwardTask, w: &DensityWeights) {
     for (s, (g, density)) in task.g_density.iter().zip(task.density).enumerate() {
         let row = &mut g_o[s * FEATURES..][..FEATURES];
         row.copy_from_slice(&g_c0[s * COLOR_INPUTS..][..FEATURES]);
-        row[0] += g * density.min(STEEPEST);
+        row[0] += g * density.min(MAX_EXP_GRADIENT);
     }
     task.g[1] = outer::<F>(&g_o, FEATURES, &t.h, HIDDEN);
     let g_h = back::<F>(&g_o, FEATURES, &w.m[1], HIDDEN, Some(&t.h));
@@ -271,11 +274,14 @@ fn backward_body<const F: bool>(task: &mut BackwardTask, w: &DensityWeights) {
 
 dispatch! { fn backward_task / backward_body(task: &mut BackwardTask, w: &DensityWeights) }
 
-/// Gradients by the flat weights, returned, and by the table, added to `g_table`.
+/// Returns the gradient with respect to the flat weights, and adds the gradient with respect to the table to
+/// `g_table`.
 ///
 /// # Shapes
 ///
-/// - g_density: `[n]`; g_color: `[n, 3]`, by what [`evaluate`] gave with directions
+/// - g_density: `[n]` and g_color: `[n, 3]`, gradients of the loss with respect to what [`evaluate`] returned with
+///   directions
+/// - g_table: `[entries, 2]`
 pub fn backward(
     shape: &DensityShape,
     weights: &DensityWeights,
@@ -287,21 +293,21 @@ pub fn backward(
     let mut flat = vec![0f32; shape.len()];
     let mut g_value = vec![[0f32; 2]; levels * n];
     let shapes = shape.shapes();
-    // some tiles at a time: each holds a gradient of all matrices
+    // tiles are processed in passes to bound the memory: each task holds a gradient of all matrices
     const PASS: usize = 64;
     for (pass, tiles) in samples.tiles.chunks(PASS).enumerate() {
-        let done: Vec<BackwardTask> = tiles
+        let finished: Vec<BackwardTask> = tiles
             .par_iter()
             .enumerate()
             .map(|(i, tile)| {
                 let first = (pass * PASS + i) * CHUNK;
-                let own = first..(first + CHUNK).min(n);
+                let range = first..(first + CHUNK).min(n);
                 let mut task = BackwardTask {
                     tile,
-                    g_density: &g_density[own.clone()],
-                    g_color: &g_color[own.clone()],
-                    density: &samples.density[own.clone()],
-                    color: &samples.color[own],
+                    g_density: &g_density[range.clone()],
+                    g_color: &g_color[range.clone()],
+                    density: &samples.density[range.clone()],
+                    color: &samples.color[range],
                     g: Default::default(),
                     g_u: Vec::new(),
                 };
@@ -309,7 +315,7 @@ pub fn backward(
                 task
             })
             .collect();
-        for (i, task) in done.iter().enumerate() {
+        for (i, task) in finished.iter().enumerate() {
             let strides = shapes.map(|(_, inputs)| inputs);
             let parts: Vec<(&[f32], usize)> = task.g.iter().zip(strides).map(|(g, s)| (&g[..], s)).collect();
             add_to(&mut flat, &shapes, &parts);
@@ -322,24 +328,24 @@ pub fn backward(
             }
         }
     }
-    let nothing = vec![[0f32; 2]; levels * n];
+    let no_q = vec![[0f32; 2]; levels * n];
     let no_normals = vec![[0f32; 3]; n];
-    hash::scatter(&shape.levels, g_table, &samples.x01, 1.0, &g_value, &nothing, &no_normals);
+    hash::scatter(&shape.levels, g_table, &samples.x01, 1.0, &g_value, &no_q, &no_normals);
     flat
 }
 
-/// A ray's weights: `[samples]`, of intervals of length `dt`.
+/// Returns the compositing weights `[samples]` of a ray with densities `[samples]`, for intervals of length `dt`.
 pub fn weights(density: &[f32], dt: f32) -> Vec<f32> {
     let mut thickness = 0f32;
     let weight = |sigma: &f32| {
-        let before = (-thickness).exp();
+        let transmittance = (-thickness).exp();
         thickness += sigma * dt;
-        before * -(-sigma * dt).exp_m1()
+        transmittance * -(-sigma * dt).exp_m1()
     };
     density.iter().map(weight).collect()
 }
 
-/// The distortion of a ray's weights at midpoints `t`, and its gradient by each weight.
+/// Returns the distortion loss of a ray's weights at midpoints `t`, and its gradient with respect to each weight.
 pub fn distortion(weight: &[f32], t: &[f32], dt: f32) -> (f32, Vec<f32>) {
     let (mut sum, mut moment) = (0f32, 0f32);
     let mut value = 0f32;
@@ -351,36 +357,38 @@ pub fn distortion(weight: &[f32], t: &[f32], dt: f32) -> (f32, Vec<f32>) {
         sum += w;
         moment += w * m;
     }
-    let (mut behind, mut behind_moment) = (0f32, 0f32);
+    let (mut farther, mut farther_moment) = (0f32, 0f32);
     for ((g, &w), &m) in g.iter_mut().zip(weight).zip(t).rev() {
-        *g += 2.0 * (behind_moment - m * behind);
-        behind += w;
-        behind_moment += w * m;
+        *g += 2.0 * (farther_moment - m * farther);
+        farther += w;
+        farther_moment += w * m;
     }
     (value, g)
 }
 
-/// Gradient by a ray's densities of a loss whose gradient by its weights is `g`.
+/// Returns the gradient with respect to a ray's densities of a loss whose gradient with respect to the ray's weights is
+/// `g`. All arrays are `[samples]`.
 pub fn weights_backward(density: &[f32], weight: &[f32], g: &[f32], dt: f32) -> Vec<f32> {
     let mut thickness: f32 = density.iter().map(|s| s * dt).sum();
-    let mut behind = 0f32; // Σ w_j g_j of the samples behind
+    let mut farther = 0f32; // Σ w_j g_j over the farther samples, j > k
     let mut out = vec![0f32; density.len()];
     for k in (0..density.len()).rev() {
-        // d w_k / d σ_k = δ T_k exp(−σ_k δ), and all light behind loses δ of itself
-        out[k] = dt * ((-thickness).exp() * g[k] - behind);
+        // ∂w_k/∂σ_k = δ T_k exp(−σ_k δ), and ∂w_j/∂σ_k = −δ w_j for all j > k
+        out[k] = dt * ((-thickness).exp() * g[k] - farther);
         thickness -= density[k] * dt;
-        behind += weight[k] * g[k];
+        farther += weight[k] * g[k];
     }
     out
 }
 
-/// Keeps the samples of each ray up to where less than [`DARK`] of its light is left; `density` is that of all samples.
+/// Truncates each ray where its transmittance falls below [`MIN_TRANSMITTANCE`], and returns the remaining samples.
+/// `density` is `[samples]`, in the order of `samples`.
 pub fn cut(samples: &Samples, density: &[f32], dt: f32) -> Samples {
     let mut kept = Samples { offsets: vec![0], t: Vec::new() };
-    for own in samples.offsets.windows(2) {
+    for range in samples.offsets.windows(2) {
         let mut thickness = 0f32;
-        for s in own[0] as usize..own[1] as usize {
-            if (-thickness).exp() < DARK {
+        for s in range[0] as usize..range[1] as usize {
+            if (-thickness).exp() < MIN_TRANSMITTANCE {
                 break;
             }
             kept.t.push(samples.t[s]);
@@ -391,23 +399,29 @@ pub fn cut(samples: &Samples, density: &[f32], dt: f32) -> Samples {
     kept
 }
 
-/// Returns the squared error, smooth-L1 and distortion of rays of these `[rays, 3]` colors, and the gradients of
-/// `smooth + DISTORTION · distortion` by densities `[n]` and colors `[n, 3]` of the samples.
+/// Returns the mean squared error, the smooth-L1 loss and the distortion of a batch of rays, and the gradients of
+/// `smooth + DISTORTION · distortion` with respect to the densities `[n]` and colors `[n, 3]` of the samples.
+///
+/// # Shapes
+///
+/// - color: `[rays, 3]`, the photographed colors
+/// - evaluated: densities and colors of `samples`
+/// - dt: length of the intervals
 pub fn losses(
     samples: &Samples,
     color: &[[f32; 3]],
-    found: &DensitySamples,
+    evaluated: &DensitySamples,
     dt: f32,
 ) -> ([f32; 3], Vec<f32>, Vec<[f32; 3]>) {
     let rays = || samples.offsets.windows(2).map(|o| o[0] as usize..o[1] as usize).enumerate();
-    let met = rays().filter(|(_, own)| !own.is_empty()).count().max(1) as f32;
-    // nerfacc's mean is over the rays up to the last one that met something
+    let hit_rays = rays().filter(|(_, span)| !span.is_empty()).count().max(1) as f32;
+    // nerfacc's mean is over the rays up to the last one with samples
     let last = samples.offsets.windows(2).rposition(|o| o[1] > o[0]).map_or(1, |r| r + 1) as f32;
     let (mut g_density, mut g_color) = (vec![0f32; samples.t.len()], vec![[0f32; 3]; samples.t.len()]);
     let (mut smooth, mut square, mut spread) = (0f64, 0f64, 0f64);
-    for (r, own) in rays().filter(|(_, own)| !own.is_empty()) {
-        let weight = weights(&found.density[own.clone()], dt);
-        let colors = &found.color[own.clone()];
+    for (r, span) in rays().filter(|(_, span)| !span.is_empty()) {
+        let weight = weights(&evaluated.density[span.clone()], dt);
+        let colors = &evaluated.color[span.clone()];
         let mut composited = [0f32; 3];
         for (w, c) in weight.iter().zip(colors) {
             (0..3).for_each(|k| composited[k] += w * c[k]);
@@ -417,21 +431,21 @@ pub fn losses(
             square += e * e;
             smooth += if e.abs() < 1.0 { 0.5 * e * e } else { e.abs() - 0.5 };
         }
-        let g = error.map(|e| e.clamp(-1.0, 1.0) / (3.0 * met));
-        let (value, g_spread) = distortion(&weight, &samples.t[own.clone()], dt);
+        let g = error.map(|e| e.clamp(-1.0, 1.0) / (3.0 * hit_rays));
+        let (value, g_spread) = distortion(&weight, &samples.t[span.clone()], dt);
         spread += f64::from(value / last);
         let g_weight: Vec<f32> = g_spread
             .iter()
             .zip(colors)
             .map(|(s, c)| DISTORTION / last * s + g[0] * c[0] + g[1] * c[1] + g[2] * c[2])
             .collect();
-        for (g_color, w) in g_color[own.clone()].iter_mut().zip(&weight) {
+        for (g_color, w) in g_color[span.clone()].iter_mut().zip(&weight) {
             *g_color = g.map(|g| w * g);
         }
-        let by_density = weights_backward(&found.density[own.clone()], &weight, &g_weight, dt);
-        g_density[own].copy_from_slice(&by_density);
+        let by_density = weights_backward(&evaluated.density[span.clone()], &weight, &g_weight, dt);
+        g_density[span].copy_from_slice(&by_density);
     }
-    let n = f64::from(3.0 * met);
+    let n = f64::from(3.0 * hit_rays);
     ([(square / n) as f32, (smooth / n) as f32, spread as f32], g_density, g_color)
 }
 
@@ -443,7 +457,7 @@ mod tests {
 
     #[test]
     fn weights_and_distortion_have_the_published_values() {
-        // σ = (0, 2, 5) over δ = 0.01 · 25, the last without length
+        // σ = (0, 2) over δ = 0.25
         let w = weights(&[0.0, 2.0], 0.25);
         assert!(w[0] == 0.0 && (w[1] - 0.393_469_34).abs() < 1e-7, "{w:?}");
         let (value, _) = distortion(&[0.1, 0.3, 0.4], &[1.0, 1.2, 1.5], 0.1);

@@ -1,21 +1,22 @@
 //! Squared distances along a line: the step that exact distance transforms of pictures and volumes make along each axis
 //! (Felzenszwalb & Huttenlocher 2012).
 
-/// The lower envelope of one parabola over each value of a line, with its memory.
+/// Scratch memory for the lower envelope of the parabolas that stand over the values of a line, one for each value.
 pub struct LowerEnvelope {
+    /// Position of each parabola of the envelope.
     apex: Vec<usize>,
-    /// Where the parabola before ends and this one begins.
+    /// Where each parabola of the envelope takes over from the previous one.
     from: Vec<f64>,
     out: Vec<f32>,
 }
 
 impl LowerEnvelope {
-    /// Returns the memory for lines of so many values.
+    /// Allocates memory for lines of up to `width` values.
     pub fn new(width: usize) -> LowerEnvelope {
         LowerEnvelope { apex: vec![0; width], from: vec![0.0; width + 1], out: vec![0.0; width] }
     }
 
-    /// Replaces each value of a line by the least of `value + distance²` over all of them.
+    /// Replaces each value of a line by the minimum over all positions of `value + distance²`.
     pub fn transform(&mut self, row: &mut [f32]) {
         let mut k = 0;
         self.apex[0] = 0;
@@ -31,7 +32,7 @@ impl LowerEnvelope {
                     self.from[k] = meet;
                     break;
                 }
-                // the parabola at p is nowhere the lowest; the first one begins at minus infinity and stays
+                // the parabola at p is never the lowest, so it is dropped; the first one starts at −∞ and always stays
                 k -= 1;
             }
         }

@@ -1,12 +1,13 @@
-//! Multiresolution hash encoding: value, Jacobian, and the scatter that is both their backwards.
+//! Multiresolution hash encoding: the value, its Jacobian, and the scatter, which is the
+//! backward pass of both.
 //!
 //! Müller, Evans, Schied, Keller 2022, "Instant Neural Graphics Primitives"; cell indexing as in
 //! tiny-cuda-nn (half-cell stagger, coherent-prime hash, dense levels while they fit).
 //!
 //! Features lie level-major, `[level][sample][2]`: one level's table is at most a few megabytes and
 //! stays in the cache while all samples pass; a random read from the whole table costs seven times as
-//! much. For the scatter one task owns one level's gradient, so no atomics and the same bytes for any
-//! thread count.
+//! much. In the scatter one task owns the gradient of one level, so it needs no atomics and its result does not depend
+//! on the number of threads.
 
 use super::simd::fma;
 use crate::dispatch;
@@ -19,20 +20,20 @@ pub struct Level {
     pub scale: f32,
     /// Vertices per axis: `⌈scale⌉ + 1`.
     pub resolution: u32,
-    /// Entries of this level's table.
+    /// Number of entries in this level's table.
     pub entries: u32,
-    /// Where its table starts, in entries.
+    /// Index of the first entry of this level's table.
     pub offset: usize,
 }
 
 impl Level {
-    /// Are vertices hashed, rather than stored one by one?
+    /// Returns whether vertices are hashed, rather than stored one by one.
     pub fn is_hashed(&self) -> bool {
         (self.resolution as u64).saturating_pow(3) > self.entries as u64
     }
 }
 
-/// The levels of a grid: `scale_l = 2^(l · log₂ growth) · base − 1` in f32, tables of at most
+/// Returns the levels of a grid: `scale_l = 2^(l · log₂ growth) · base − 1` in f32, tables of at most
 /// `2^log2_entries` entries, dense ones rounded up to a multiple of 8.
 pub fn levels(count: usize, base: u32, growth: f64, log2_entries: u32) -> Vec<Level> {
     let log2_growth = (growth as f32).log2();
@@ -50,14 +51,14 @@ pub fn levels(count: usize, base: u32, growth: f64, log2_entries: u32) -> Vec<Le
         .collect()
 }
 
-/// Entries of all levels together.
+/// Returns the number of entries of all levels together.
 pub fn entries(levels: &[Level]) -> usize {
     levels.last().map_or(0, |l| l.offset + l.entries as usize)
 }
 
 const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861];
 
-/// The eight table entries of the cell around `x01` and the position inside it, each in 0..1.
+/// Returns the eight table entries of the cell around `x01`, and the position inside it, with coordinates in 0..1.
 ///
 /// Corner `k` lies at +1 along x when bit 0 of `k` is set, y with bit 1, z with bit 2.
 #[inline(always)]
@@ -68,7 +69,7 @@ pub fn cell<const F: bool>(level: &Level, x01: [f32; 3]) -> ([u32; 8], [f32; 3])
         let position = fma::<F>(level.scale, x01[a], 0.5);
         let floor = position.floor();
         fraction[a] = position - floor;
-        // saturating: positions far outside the box must not wrap into undefined cells
+        // the cast saturates: positions far outside the box must not wrap into undefined cells
         low[a] = floor as i32 as u32;
     }
     let mut index = [0u32; 8];
@@ -90,7 +91,7 @@ pub fn cell<const F: bool>(level: &Level, x01: [f32; 3]) -> ([u32; 8], [f32; 3])
                 low[2].wrapping_add((k >> 2) as u32),
             );
             let i = cx.wrapping_add(r.wrapping_mul(cy.wrapping_add(r.wrapping_mul(cz))));
-            // the stagger lets cell + 1 equal the resolution at the border: it wraps
+            // because of the half-cell stagger, cell + 1 can equal the resolution at the border, and wraps
             index[k] = if i >= level.entries { i % level.entries } else { i };
         }
     }
@@ -101,7 +102,7 @@ const SX: [f32; 8] = [-1., 1., -1., 1., -1., 1., -1., 1.];
 const SY: [f32; 8] = [-1., -1., 1., 1., -1., -1., 1., 1.];
 const SZ: [f32; 8] = [-1., -1., -1., -1., 1., 1., 1., 1.];
 
-/// Per-axis corner weights: `w[axis][corner]` is the fraction or its complement.
+/// Returns the corner weights of each axis: `w[axis][corner]` is the fraction or its complement.
 #[inline(always)]
 fn axis_weights<const F: bool>(f: [f32; 3]) -> [[f32; 8]; 3] {
     let mut w = [[0f32; 8]; 3];
@@ -113,7 +114,7 @@ fn axis_weights<const F: bool>(f: [f32; 3]) -> [[f32; 8]; 3] {
     w
 }
 
-/// Features of samples; with `J` their derivatives too.
+/// Writes the features of samples and, if `J` is set, their derivatives.
 #[inline(always)]
 fn gather_samples<const F: bool, const J: bool>(
     level: &Level,
@@ -180,10 +181,10 @@ dispatch! {
     )
 }
 
-/// Samples per task of a gather.
+/// Number of samples per task of a gather.
 const GATHER_CHUNK: usize = 8192;
 
-/// Features, and their derivatives if asked for.
+/// Writes the features of samples and, if `jacobian` is given, their derivatives.
 ///
 /// # Shapes
 ///
@@ -209,13 +210,15 @@ pub fn gather(
     assert!(jacobian.as_ref().is_none_or(|jacobian| jacobian.len() == value.len()));
     let mut tasks = Vec::new();
     for (level, value) in levels.iter().zip(value.chunks_mut(n)) {
-        let own = &table[level.offset..][..level.entries as usize];
+        let level_table = &table[level.offset..][..level.entries as usize];
         for (x, v) in x01.chunks(GATHER_CHUNK).zip(value.chunks_mut(GATHER_CHUNK)) {
             let j = jacobian.as_mut().and_then(|jacobian| jacobian.split_off_mut(..x.len()));
-            tasks.push((level, own, x, v, j));
+            tasks.push((level, level_table, x, v, j));
         }
     }
-    tasks.into_par_iter().for_each(|(level, own, x, v, j)| gather_level(level, own, x, world, v, j));
+    tasks
+        .into_par_iter()
+        .for_each(|(level, level_table, x, v, j)| gather_level(level, level_table, x, world, v, j));
 }
 
 #[inline(always)]
@@ -260,8 +263,9 @@ dispatch! {
     )
 }
 
-/// Adds the gradient of the table: of a loss through the features (`g_value`) and through the spatial
-/// gradient of a scalar whose derivative by the features is `q` (`g_normal`): the second-order path.
+/// Adds the gradient of a loss with respect to the table. The loss depends on the table through the features
+/// (`g_value`) and through the spatial gradient (`g_normal`) of a scalar whose derivative with respect to the features is
+/// `q`: the second-order path.
 ///
 /// `table[corner k] += g_value · w_k + q · (g_normal · ∇w_k)`
 ///
@@ -285,12 +289,14 @@ pub fn scatter(
     let mut rest = gradient;
     let tables: Vec<&mut [[f32; 2]]> = levels
         .iter()
-        .map(|level| rest.split_off_mut(..level.entries as usize).expect("an entry for each of the levels'"))
+        .map(|level| {
+            rest.split_off_mut(..level.entries as usize).expect("the gradient has the entries of all levels")
+        })
         .collect();
-    // the finest levels cost most (cache misses): start them first
-    tables.into_par_iter().enumerate().rev().with_max_len(1).for_each(|(l, own)| {
+    // the finest levels take longest because of cache misses, so they start first
+    tables.into_par_iter().enumerate().rev().with_max_len(1).for_each(|(l, level_gradient)| {
         let span = l * n..(l + 1) * n;
-        scatter_level(&levels[l], own, x01, world, &g_value[span.clone()], &q[span], g_normal);
+        scatter_level(&levels[l], level_gradient, x01, world, &g_value[span.clone()], &q[span], g_normal);
     });
 }
 

@@ -6,44 +6,45 @@
 use crate::geom::Ray;
 use rayon::prelude::*;
 
-/// Which cells of a cubic grid over `[-radius, radius]³` may hold surface; `(ix · R + iy) · R + iz`.
+/// The cells of a cubic grid over `[-radius, radius]³` that may contain surface, one bit per cell. Cell
+/// `(ix, iy, iz)` of a grid of `R³` cells has index `(ix · R + iy) · R + iz`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bitmask {
     /// Cells per axis.
     pub resolution: usize,
-    /// One bit a cell.
+    /// `⌈R³ / 64⌉` words; bits after the last cell are zero.
     pub bits: Vec<u64>,
 }
 
 impl Bitmask {
-    /// All cells alike.
+    /// Returns a mask whose cells are all occupied or all empty.
     pub fn filled(resolution: usize, occupied: bool) -> Bitmask {
         let words = resolution.pow(3).div_ceil(64);
-        Bitmask { resolution, bits: vec![if occupied { u64::MAX } else { 0 }; words] }.whole()
+        Bitmask { resolution, bits: vec![if occupied { u64::MAX } else { 0 }; words] }.with_padding_cleared()
     }
 
-    /// Of these words, one bit a cell; none where there are too few or too many.
-    pub fn of(resolution: usize, bits: Vec<u64>) -> Option<Bitmask> {
+    /// Creates a mask from its words, one bit per cell. Returns `None` if their number does not fit the resolution.
+    pub fn from_words(resolution: usize, bits: Vec<u64>) -> Option<Bitmask> {
         let fits = bits.len() == resolution.pow(3).div_ceil(64);
-        fits.then(|| Bitmask { resolution, bits }.whole())
+        fits.then(|| Bitmask { resolution, bits }.with_padding_cleared())
     }
 
-    /// Clears what is behind the last cell.
-    fn whole(mut self) -> Bitmask {
-        let over = self.resolution.pow(3) % 64;
-        if let (Some(last), 1..) = (self.bits.last_mut(), over) {
-            *last &= (1 << over) - 1;
+    /// Clears the bits after the last cell.
+    fn with_padding_cleared(mut self) -> Bitmask {
+        let used_bits = self.resolution.pow(3) % 64;
+        if let (Some(last), 1..) = (self.bits.last_mut(), used_bits) {
+            *last &= (1 << used_bits) - 1;
         }
         self
     }
 
-    /// Is cell `i` occupied?
+    /// Returns whether cell `i` is occupied.
     #[inline(always)]
     pub fn get(&self, i: usize) -> bool {
         self.bits[i >> 6] >> (i & 63) & 1 == 1
     }
 
-    /// Marks cell `i`.
+    /// Sets whether cell `i` is occupied.
     pub fn set(&mut self, i: usize, occupied: bool) {
         let bit = 1 << (i & 63);
         if occupied {
@@ -53,7 +54,7 @@ impl Bitmask {
         }
     }
 
-    /// These cells and every cell that touches one of them.
+    /// Returns a mask in which every cell that touches an occupied one, at a face, edge or corner, is occupied too.
     pub fn grown(&self) -> Bitmask {
         let n = self.resolution;
         let cells: Vec<bool> = (0..n * n * n).map(|i| self.get(i)).collect();
@@ -62,73 +63,75 @@ impl Bitmask {
         out
     }
 
-    /// How many cells are occupied.
+    /// Returns the number of occupied cells.
     pub fn count(&self) -> usize {
         self.bits.iter().map(|word| word.count_ones() as usize).sum()
     }
 }
 
-/// Marks every cell that is marked or has a marked one among its 26 neighbors: one axis after the other. Cell
-/// `(x · ny + y) · nz + z`.
+/// Returns a copy in which every cell with a marked cell among its 26 neighbors is marked too. Cell `(x, y, z)` has
+/// index `(x · ny + y) · nz + z`. The axes are dilated one after the other, which is equivalent.
 pub fn dilated(cells: &[bool], size: [usize; 3]) -> Vec<bool> {
     let strides = [size[1] * size[2], size[2], 1];
-    let mut now = cells.to_vec();
+    let mut marked = cells.to_vec();
     for a in 0..3 {
-        let before = now.clone();
-        now.par_chunks_mut(strides[0]).enumerate().for_each(|(x, out)| {
+        let previous = marked.clone();
+        marked.par_chunks_mut(strides[0]).enumerate().for_each(|(x, out)| {
             for (i, v) in out.iter_mut().enumerate() {
                 let at = x * strides[0] + i;
                 let k = [x, i / size[2], i % size[2]][a];
-                *v = before[at]
-                    || k > 0 && before[at - strides[a]]
-                    || k + 1 < size[a] && before[at + strides[a]];
+                *v = previous[at]
+                    || k > 0 && previous[at - strides[a]]
+                    || k + 1 < size[a] && previous[at + strides[a]];
             }
         });
     }
-    now
+    marked
 }
 
-/// A ray in a field's coordinates, as training and rendering march it.
+/// A ray in a field's coordinates, for marching.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MarchRay {
-    /// Start.
+    /// Origin, in field units.
     pub origin: [f32; 3],
-    /// Direction, unit here; a vector-matrix field takes any length, and its `t` counts in it.
+    /// Direction. It has unit length in this module; a vector-matrix field accepts any length, and its `t` is then a
+    /// multiple of that length.
     pub direction: [f32; 3],
-    /// Offset of the lattice in 0..1 steps (0 without jitter).
+    /// Offset of the sample lattice, as a fraction of a step in 0..1 (0 without jitter).
     pub jitter: f32,
 }
 
 impl MarchRay {
-    /// Returns a ray of the scene in the coordinates of a field whose box is `radius` times the scene's.
+    /// Converts a ray from scene coordinates to those of a field whose box is `radius` times the scene's.
     pub fn new(ray: &Ray, radius: f32, jitter: f32) -> MarchRay {
         MarchRay { origin: (ray.origin * radius).to_array(), direction: ray.direction.to_array(), jitter }
     }
 }
 
-/// The samples of many rays.
+/// The samples of a batch of rays, sorted by ray and then by `t`.
 #[derive(Clone, Debug, Default)]
 pub struct Samples {
-    /// `[rays + 1]`.
+    /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Vec<i32>,
     /// `[samples]` midpoints.
     pub t: Vec<f32>,
 }
 
 impl Samples {
-    /// Positions of the samples of `rays`, which start at ray `first` of all, and their directions.
+    /// Returns positions and directions of the samples of `rays`, where `rays[0]` is ray number `first` of the batch.
     pub fn points(&self, rays: &[MarchRay], first: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
-        let own = |(r, ray): (usize, &MarchRay)| {
+        let ray_points = |(r, ray): (usize, &MarchRay)| {
             let MarchRay { origin: o, direction: d, .. } = *ray;
             let span = self.offsets[first + r] as usize..self.offsets[first + r + 1] as usize;
             self.t[span].iter().map(move |t| (std::array::from_fn(|a| o[a] + t * d[a]), d))
         };
-        rays.iter().enumerate().flat_map(own).unzip()
+        rays.iter().enumerate().flat_map(ray_points).unzip()
     }
 }
 
 /// Marches one ray, calling `emit` with the midpoint of every step whose cell is occupied, until
-/// `emit` returns false or the ray reaches a cell of `solid`: deep inside, where nothing behind is seen.
+/// `emit` returns false or the ray reaches a cell of `solid`. Solid cells lie so deep inside that nothing beyond them is
+/// visible.
 #[inline]
 pub fn march_one(
     mask: &Bitmask,
@@ -179,7 +182,7 @@ pub fn march_one(
         if solid.is_some_and(|solid| solid.get(cell)) {
             return;
         }
-        // distance to the border of this cell, then on by whole steps
+        // skip to the border of this cell, by a whole number of steps
         let mut border = f32::INFINITY;
         for a in 0..3 {
             if ray.direction[a] != 0.0 {
@@ -192,8 +195,8 @@ pub fn march_one(
     }
 }
 
-/// Marches many rays. Each ray keeps at most `limit` samples (the nearest). `solid` has the resolution
-/// of `mask`.
+/// Marches a batch of rays and keeps the nearest `limit` samples of each. `solid` must have the resolution of `mask`;
+/// `radius` and `step` are in field units.
 pub fn march(
     mask: &Bitmask,
     solid: Option<&Bitmask>,
@@ -210,8 +213,8 @@ pub fn march(
             let mut t = Vec::with_capacity(rays.len() * 32);
             for ray in rays {
                 let before = t.len();
-                march_one(mask, solid, radius, step, ray, |m| {
-                    t.push(m);
+                march_one(mask, solid, radius, step, ray, |t_mid| {
+                    t.push(t_mid);
                     t.len() - before < limit
                 });
                 counts.push((t.len() - before) as i32);
@@ -236,13 +239,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn masks_have_no_cells_behind_the_last() {
+    fn masks_have_no_bits_after_the_last_cell() {
         // 27 cells in a word of 64
         let full = Bitmask::filled(3, true);
         assert_eq!((full.count(), full.bits[0]), (27, (1 << 27) - 1));
-        assert_eq!(Bitmask::of(3, vec![u64::MAX]), Some(full));
-        assert_eq!(Bitmask::of(4, vec![u64::MAX]).unwrap().count(), 64);
-        assert!(Bitmask::of(3, vec![0; 2]).is_none() && Bitmask::of(5, vec![0]).is_none());
+        assert_eq!(Bitmask::from_words(3, vec![u64::MAX]), Some(full));
+        assert_eq!(Bitmask::from_words(4, vec![u64::MAX]).unwrap().count(), 64);
+        assert!(Bitmask::from_words(3, vec![0; 2]).is_none() && Bitmask::from_words(5, vec![0]).is_none());
     }
 
     const RAY: MarchRay = MarchRay { origin: [0.03, 0.01, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
@@ -271,7 +274,7 @@ mod tests {
         for t in &some {
             assert!(all.iter().any(|u| u == t));
         }
-        // and every sample of the full march in an occupied cell is there
+        // and no sample of the full march in an occupied cell is missing
         let kept = all.iter().filter(|&&t| {
             let c = |a: usize| {
                 (((ray.origin[a] + t * ray.direction[a] + 1.0) * 4.0).floor() as i32).clamp(0, 7) as usize
@@ -297,7 +300,7 @@ mod tests {
     fn rays_that_miss_own_nothing() {
         let mask = Bitmask::filled(8, true);
         let miss = MarchRay { origin: [0.0, 0.0, 2.0], direction: [0.0, 0.0, 1.0], jitter: 0.0 };
-        let beside = MarchRay { origin: [1.5, 0.0, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
-        assert_eq!(march(&mask, None, 1.0, 0.1, &[miss, RAY, beside], 5).offsets, [0, 0, 5, 5]);
+        let outside = MarchRay { origin: [1.5, 0.0, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
+        assert_eq!(march(&mask, None, 1.0, 0.1, &[miss, RAY, outside], 5).offsets, [0, 0, 5, 5]);
     }
 }

@@ -1,6 +1,6 @@
-//! Matrices of small networks as the matrix blocks of a tile read them: in both orders, padded.
+//! Matrices of small networks, zero-padded to the size of the matrix blocks and stored with their transpose.
 
-/// A matrix and its transpose, with zeros around.
+/// A zero-padded matrix and its transpose.
 #[derive(Debug)]
 pub struct Matrix {
     /// `[rows, columns]` of the padded sizes.
@@ -10,7 +10,7 @@ pub struct Matrix {
 }
 
 impl Matrix {
-    /// From row-major `values` of shape `[rows, columns]`, grown to the padded shape.
+    /// Creates a matrix from row-major `values` of shape `[rows, columns]`, zero-padded to the shape `padded`.
     pub fn new(values: &[f32], (rows, columns): (usize, usize), padded: (usize, usize)) -> Matrix {
         let mut m = vec![0.0; padded.0 * padded.1];
         let mut t = m.clone();
@@ -24,24 +24,25 @@ impl Matrix {
     }
 }
 
-/// Returns `values` with zeros behind, `len` in all.
+/// Returns `values`, zero-padded to length `len`.
 pub fn padded(values: &[f32], len: usize) -> Vec<f32> {
     let mut p = values.to_vec();
     p.resize(len, 0.0);
     p
 }
 
-/// Cuts the flat vector of a network's weights into matrices of these shapes.
+/// Splits the flat vector of a network's weights into row-major matrices of the given shapes.
 pub fn split<const N: usize>(mut flat: &[f32], shapes: [(usize, usize); N]) -> [&[f32]; N] {
-    shapes
-        .map(|(rows, columns)| flat.split_off(..rows * columns).expect("a weight for each of the network's"))
+    shapes.map(|(rows, columns)| {
+        flat.split_off(..rows * columns).expect("the vector has the weights of all matrices")
+    })
 }
 
-/// Adds matrices, whose rows are `stride` floats apart, to those of a flat vector.
+/// Adds matrices to those of a flat vector. Each part is a matrix with the distance of its rows, in floats.
 pub fn add_to(mut flat: &mut [f32], shapes: &[(usize, usize)], parts: &[(&[f32], usize)]) {
     for (&(rows, columns), &(part, stride)) in shapes.iter().zip(parts) {
-        let own = flat.split_off_mut(..rows * columns).expect("a gradient for each weight");
-        for (row, g) in own.chunks_exact_mut(columns).zip(part.chunks(stride)) {
+        let matrix = flat.split_off_mut(..rows * columns).expect("a gradient for each weight");
+        for (row, g) in matrix.chunks_exact_mut(columns).zip(part.chunks(stride)) {
             row.iter_mut().zip(g).for_each(|(a, b)| *a += b);
         }
     }

@@ -1,12 +1,13 @@
-//! The two small networks of the signed-distance field: layout of their weights, prepared for tiles.
+//! The two small networks of the signed-distance field: the layout of their weights, and
+//! the weights as the tiles read them.
 //!
 //! ```text
 //! geometry  [x 3, hash 2L] ─ 64 ─ softplus₁₀₀ ─ 13     out[0] is the sdf, all 13 go to the color
 //! color     [13, SH 16, normal 3 (, hash 2L)] ─ 64 ─ relu ─ 64 ─ relu ─ 3 ─ sigmoid      no biases
 //! ```
 //!
-//! With the color skip (not published) the color network reads the hash features themselves too: twelve numbers
-//! behind a layer that is shaped by the surface are a narrow way for all that is seen on a head.
+//! With the color skip (not published) the color network also reads the hash features: twelve outputs of a layer
+//! that is trained to represent the surface are a bottleneck for the appearance of a head.
 
 use super::matrix::{Matrix, padded, split};
 
@@ -16,41 +17,41 @@ pub const HIDDEN: usize = 64;
 pub const OUTPUTS: usize = 13;
 /// Inputs of the color network without the skip: 13 features, 16 harmonics, 3 of the normal.
 pub const COLOR_INPUTS: usize = 32;
-/// The output that says how soft the surface is, where a field's sharpness is local.
+/// Index of the output that controls the softness of the surface, if the field's sharpness is local.
 pub const SOFTNESS: usize = OUTPUTS - 1;
-/// [`OUTPUTS`] as stored in tiles.
+/// [`OUTPUTS`] as stored in tiles, zero-padded.
 pub const OUTPUTS_PADDED: usize = 16;
-/// Color channels as stored in tiles.
+/// Color channels as stored in tiles, zero-padded.
 pub const RGB_PADDED: usize = 8;
-/// Samples a tile: activations of one tile stay in the first-level cache.
+/// Number of samples per tile. Activations of one tile stay in the first-level cache.
 pub const TILE: usize = 64;
 
-/// Where each matrix starts in the flat vector of network weights, all row-major `[out, in]`.
+/// Layout of the flat vector of network weights; all matrices are row-major `[out, in]`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Layout {
     /// Inputs of the geometry network: 3 + 2 · levels.
     pub inputs: usize,
-    /// Does the color network read the hash features too?
+    /// Whether the color network also reads the hash features.
     pub color_skip: bool,
 }
 
 impl Layout {
-    /// For a hash grid of so many levels.
+    /// Returns the layout for a hash grid with the given number of levels.
     pub fn new(levels: usize, color_skip: bool) -> Layout {
         Layout { inputs: 3 + 2 * levels, color_skip }
     }
 
-    /// Inputs of the color network.
+    /// Returns the number of inputs of the color network.
     pub fn color_inputs(&self) -> usize {
         COLOR_INPUTS + if self.color_skip { self.inputs - 3 } else { 0 }
     }
 
-    /// Columns of a tile of color inputs: zeros up to a multiple of 8.
+    /// Returns the number of columns of a tile of color inputs, zero-padded to a multiple of 8.
     pub fn color_padded(&self) -> usize {
         self.color_inputs().next_multiple_of(8)
     }
 
-    /// Shapes `[out, in]` in storage order: W1, b1, W2, b2, C1, C2, C3 (biases as `[n, 1]`).
+    /// Returns the shapes `[out, in]` in storage order: W1, b1, W2, b2, C1, C2, C3 (biases as `[n, 1]`).
     pub fn shapes(&self) -> [(usize, usize); 7] {
         [
             (HIDDEN, self.inputs),
@@ -63,12 +64,13 @@ impl Layout {
         ]
     }
 
-    /// Floats of all matrices together.
+    /// Returns the number of floats of all matrices together.
     pub fn len(&self) -> usize {
         self.shapes().iter().map(|(o, i)| o * i).sum()
     }
 
-    /// Shapes in which tiles sum gradients: padded, three color channels as four, geometry columns as in [`Weights`].
+    /// Returns the shapes in which tiles accumulate gradients: padded, with three color channels stored as four and
+    /// geometry columns ordered as in [`Weights`].
     pub(super) fn gradient_shapes(&self) -> [(usize, usize); 7] {
         let (inputs, color_inputs) = (self.padded(), self.color_padded());
         let padded = OUTPUTS_PADDED;
@@ -83,14 +85,14 @@ impl Layout {
         ]
     }
 
-    /// Columns of a tile of geometry inputs: `[hash 2L, x 3, zeros]` up to a multiple of 8.
+    /// Returns the number of columns of a tile of geometry inputs: `[hash 2L, x 3, zeros]`, padded to a multiple of 8.
     pub fn padded(&self) -> usize {
         self.inputs.next_multiple_of(8)
     }
 }
 
-/// Network weights in both orders, padded for the matrix blocks. About ten thousand floats, rebuilt
-/// once a step. Geometry columns are turned to `[hash, x]` so that hash features start aligned.
+/// Network weights, padded for the matrix blocks and stored with their transpose. They are about ten thousand floats and
+/// are rebuilt once per step. Geometry columns are reordered to `[hash, x]`, so that hash features start aligned.
 #[derive(Debug)]
 pub struct Weights {
     pub(super) layout: Layout,
@@ -104,15 +106,16 @@ pub struct Weights {
 }
 
 impl Weights {
-    /// From the flat vector that [`Layout`] describes.
+    /// Creates the weights from the flat vector that [`Layout`] describes.
     pub fn new(layout: Layout, flat: &[f32]) -> Weights {
         assert_eq!(flat.len(), layout.len(), "network weights do not fit the layout");
         let [w1, b1, w2, b2, c1, c2, c3] = split(flat, layout.shapes());
         let [k, ci] = [layout.inputs, layout.color_inputs()];
-        let turned: Vec<f32> = w1.chunks_exact(k).flat_map(|row| [&row[3..], &row[..3]].concat()).collect();
+        let reordered: Vec<f32> =
+            w1.chunks_exact(k).flat_map(|row| [&row[3..], &row[..3]].concat()).collect();
         Weights {
             layout,
-            w1: Matrix::new(&turned, (HIDDEN, k), (HIDDEN, layout.padded())),
+            w1: Matrix::new(&reordered, (HIDDEN, k), (HIDDEN, layout.padded())),
             b1: b1.to_vec(),
             w2: Matrix::new(w2, (OUTPUTS, HIDDEN), (OUTPUTS_PADDED, HIDDEN)),
             b2: padded(b2, OUTPUTS_PADDED),

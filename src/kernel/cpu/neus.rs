@@ -9,12 +9,12 @@
 //! T_i = Π_{j<i} (1 − α_j)     w = T α     out = Σ w · (rgb, 1, t, n̂, ‖rgb‖²)
 //! ```
 //!
-//! The last column of the field's output is `ln(s / inv_s)` of its sample: 0 everywhere in NeuS.
+//! The last column of the field's output is `ln(s / inv_s)` of the sample; in NeuS it is 0 everywhere.
 
 use super::sdf::WIDTH;
 use rayon::prelude::*;
 
-/// Values per ray: rgb (3), opacity, depth (Σ w t), normal (3, Σ w n̂), squared color (Σ w ‖rgb‖²).
+/// Number of values per ray: rgb (3), opacity, depth (Σ w t), normal (3, Σ w n̂), squared color (Σ w ‖rgb‖²).
 pub const RAY_WIDTH: usize = 9;
 
 /// The ragged samples of a batch of rays, sorted by ray and then by `t`.
@@ -41,7 +41,7 @@ fn sigmoid(x: f32) -> f32 {
     }
 }
 
-/// Opacity of one sample, and what its derivative needs.
+/// Opacity of one sample, with the intermediate values that its derivative needs.
 struct Alpha {
     alpha: f32,
     clipped: bool,
@@ -61,19 +61,20 @@ fn alpha_of(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32) -> Alpha {
     Alpha { alpha: raw.clamp(0.0, 1.0), clipped: !(0.0..=1.0).contains(&raw), previous, next, ic, ic_by_cos }
 }
 
-/// Opacity of one interval: see the module. `inv_s` is clamped to [1e-6, 1e6].
+/// Returns the opacity of one interval by the formula of this module. `inv_s` is clamped to [1e-6, 1e6].
 pub fn alpha(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32) -> f32 {
     alpha_of(sdf, cos, dt, inv_s.clamp(1e-6, 1e6), anneal).alpha
 }
 
-/// How opaque a cell of half size `half` may be: [`alpha`] seen head on, for the occupancy grid.
+/// Returns the opacity of a cell of half size `half` for the occupancy grid: [`alpha`] of a ray that meets the surface
+/// head-on.
 pub fn occupancy(sdf: f32, half: f32, inv_s: f32) -> f32 {
     alpha_of(sdf, -1.0, 2.0 * half, inv_s.clamp(1e-6, 1e6), 1.0).alpha
 }
 
-/// Gradients of the field up to this length have no direction that could be learned: what comes back through their unit
-/// normal would be of no size that means anything, up to 1e12.
-pub const SHORTEST: f32 = 1e-6;
+/// A field gradient that is not longer than this has no meaningful direction, so nothing is propagated back through its
+/// unit normal: that gradient would be scaled by the inverse length, up to 1e12.
+pub const MIN_GRADIENT_NORM: f32 = 1e-6;
 
 fn normal_of(field: &[f32]) -> ([f32; 3], f32) {
     let n = [field[1], field[2], field[3]];
@@ -85,23 +86,23 @@ fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// What a sample adds to its ray, times its weight.
+/// Returns the values of a sample that are composited, before they are multiplied by its weight.
 #[inline]
 fn values_of(field: &[f32], n: [f32; 3], t: f32) -> [f32; RAY_WIDTH] {
     let [r, g, b] = [field[4], field[5], field[6]];
     [r, g, b, 1.0, t, n[0], n[1], n[2], r * r + g * g + b * b]
 }
 
-/// Sharpness at a sample.
-fn local(inv_s: f32, field: &[f32]) -> f32 {
+/// Returns the sharpness at a sample, clamped to [1e-6, 1e6].
+fn local_sharpness(inv_s: f32, field: &[f32]) -> f32 {
     (inv_s * field[7].exp()).clamp(1e-6, 1e6)
 }
 
-/// Composites. A ray without samples gives zeros.
+/// Composites the samples of each ray. The values of a ray without samples are zero.
 ///
 /// # Shapes
 ///
-/// - field: `[samples, 8]` as the field gives it
+/// - field: `[samples, 8]`, the output of the field
 /// - output: `[rays, 9]` = rgb, opacity, Σ w t, Σ w n̂, Σ w ‖rgb‖²
 pub fn forward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
     let inv_s = inv_s.clamp(1e-6, 1e6);
@@ -112,7 +113,8 @@ pub fn forward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
         for s in rays.offsets[r] as usize..rays.offsets[r + 1] as usize {
             let f = &field[s * WIDTH..][..WIDTH];
             let (n, _) = normal_of(f);
-            let a = alpha_of(f[0], dot(rays.direction[r], n), rays.dt[s], local(inv_s, f), anneal).alpha;
+            let a = alpha_of(f[0], dot(rays.direction[r], n), rays.dt[s], local_sharpness(inv_s, f), anneal)
+                .alpha;
             let w = transmittance * a;
             out.iter_mut().zip(values_of(f, n, rays.t[s])).for_each(|(out, value)| *out += w * value);
             transmittance *= 1.0 - a;
@@ -121,58 +123,58 @@ pub fn forward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
     out
 }
 
-/// Gradients by the field's output `[samples, 8]` and by `inv_s`.
+/// Returns the gradients with respect to the field's output, `[samples, 8]`, and with respect to `inv_s`.
 ///
 /// # Shapes
 ///
-/// - g_out: `[rays, 9]`
+/// - g_out: `[rays, 9]`, the gradient of the loss with respect to the output of [`forward`]
 pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32]) -> (Vec<f32>, f32) {
     let clamped = inv_s.clamp(1e-6, 1e6);
     let count = rays.offsets.len() - 1;
     let mut g_field = vec![0f32; field.len()];
     // each ray owns a contiguous piece of the samples
     let mut rest = &mut g_field[..];
-    let own = |r: usize| {
+    let split_ray = |r: usize| {
         let n = (rays.offsets[r + 1] - rays.offsets[r]) as usize;
         rest.split_off_mut(..n * WIDTH).expect("a row for each sample")
     };
-    let tasks: Vec<&mut [f32]> = (0..count).map(own).collect();
+    let tasks: Vec<&mut [f32]> = (0..count).map(split_ray).collect();
     let g_inv_s: Vec<f64> = tasks
         .into_par_iter()
         .enumerate()
         .with_min_len(64)
-        .map(|(r, own)| {
+        .map(|(r, g_samples)| {
             let first = rays.offsets[r] as usize;
-            let n = own.len() / WIDTH;
+            let n = g_samples.len() / WIDTH;
             let g = &g_out[r * RAY_WIDTH..][..RAY_WIDTH];
-            // forward again: alphas, transmittances and what each weight is worth
+            // recompute the forward pass: alphas, transmittances and the loss gradient g_w by each weight
             let mut samples = Vec::with_capacity(n);
             let mut transmittance = 1f32;
             for s in first..first + n {
                 let f = &field[s * WIDTH..][..WIDTH];
                 let (normal, length) = normal_of(f);
                 let cos = dot(rays.direction[r], normal);
-                let sharp = local(clamped, f);
+                let sharp = local_sharpness(clamped, f);
                 let a = alpha_of(f[0], cos, rays.dt[s], sharp, anneal);
-                let worth: f32 =
+                let g_w: f32 =
                     g.iter().zip(values_of(f, normal, rays.t[s])).map(|(g, value)| g * value).sum();
                 let next = transmittance * (1.0 - a.alpha);
-                samples.push((a, normal, length, transmittance, worth, sharp));
+                samples.push((a, normal, length, transmittance, g_w, sharp));
                 transmittance = next;
             }
-            let mut behind = 0f32; // Σ_{j>k} w_j worth_j
+            let mut farther = 0f32; // Σ_{j>k} w_j g_w_j
             let mut g_s = 0f64;
             for k in (0..n).rev() {
-                let (a, normal, length, transmittance, worth, sharp) = &samples[k];
+                let (a, normal, length, transmittance, g_w, sharp) = &samples[k];
                 let s = first + k;
                 let w = transmittance * a.alpha;
-                let out = &mut own[k * WIDTH..][..WIDTH];
+                let out = &mut g_samples[k * WIDTH..][..WIDTH];
                 for c in 0..3 {
                     out[4 + c] = w * (g[c] + 2.0 * g[8] * field[s * WIDTH + 4 + c]);
                 }
-                let g_alpha = transmittance * worth - behind / (1.0 - a.alpha).max(1e-10);
-                behind += w * worth;
-                // by the unit normal: as composited, and through the cosine
+                let g_alpha = transmittance * g_w - farther / (1.0 - a.alpha).max(1e-10);
+                farther += w * g_w;
+                // the gradient by the unit normal has two parts: as composited, and through the cosine
                 let mut g_normal = [w * g[5], w * g[6], w * g[7]];
                 if !a.clipped {
                     let (p, q) = (a.previous, a.next);
@@ -183,7 +185,7 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
                     out[0] = (g_p + g_q) * sharp;
                     let half = 0.5 * a.ic * rays.dt[s];
                     let sdf = field[s * WIDTH];
-                    // by ln s: the same for the sample's own offset and, divided by inv_s, for inv_s
+                    // the gradient by ln s is that by the sample's offset and, divided by inv_s, that by inv_s
                     let g_ln = (g_p * (sdf - half) + g_q * (sdf + half)) * sharp;
                     out[7] = g_ln;
                     g_s += g_ln as f64;
@@ -193,10 +195,10 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
                         g_normal[c] += g_cos * rays.direction[r][c];
                     }
                 }
-                let along = dot(*normal, g_normal);
-                if *length > SHORTEST {
+                let radial = dot(*normal, g_normal);
+                if *length > MIN_GRADIENT_NORM {
                     for c in 0..3 {
-                        out[1 + c] = (g_normal[c] - normal[c] * along) / length;
+                        out[1 + c] = (g_normal[c] - normal[c] * radial) / length;
                     }
                 }
             }
@@ -244,17 +246,17 @@ mod tests {
                 for slope in [0.0, 1e-30, 1e-12, 2e-6, 1.0, 1e6] {
                     let sample = |k: usize| [sdf, slope, -0.5 * slope, 0.0, 0.5, 0.5, 0.5, -(k as f32)];
                     let field: Vec<f32> = (0..4).flat_map(sample).collect();
-                    let seen = forward(rays, &field, inv_s, 1.0);
+                    let composited = forward(rays, &field, inv_s, 1.0);
                     assert!(
-                        seen.iter().all(|v| v.is_finite() && v.abs() < 2.0),
-                        "{inv_s} {sdf} {slope} {seen:?}"
+                        composited.iter().all(|v| v.is_finite() && v.abs() < 2.0),
+                        "{inv_s} {sdf} {slope} {composited:?}"
                     );
                     let (g_field, g_s) = backward(rays, &field, inv_s, 1.0, &g);
-                    let all = || g_field.iter().chain([&g_s]);
-                    assert!(all().all(|v| v.is_finite()), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
-                    // 3 · 1e6, the unit normal's 1 / SHORTEST, and 1e3 · 1e6 by the length of an interval
-                    assert!(all().all(|v| v.abs() < 1e10), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
-                    if slope < SHORTEST {
+                    let gradients = || g_field.iter().chain([&g_s]);
+                    assert!(gradients().all(|v| v.is_finite()), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
+                    // 3 · 1e6, the unit normal's 1 / MIN_GRADIENT_NORM, and 1e3 · 1e6 by the length of an interval
+                    assert!(gradients().all(|v| v.abs() < 1e10), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
+                    if slope < MIN_GRADIENT_NORM {
                         assert!(g_field.as_chunks::<8>().0.iter().all(|g| g[1..4] == [0.0; 3]));
                     }
                 }
@@ -262,7 +264,7 @@ mod tests {
         }
     }
 
-    /// Σ g · out of the formulas in f64.
+    /// Returns Σ g · out, by the formulas in f64.
     fn loss(rays: Rays, field: &[f64], inv_s: f64, anneal: f64, g: &[f32]) -> f64 {
         let out = reference::neus::composite(rays, field, inv_s, anneal);
         out.iter().zip(g).map(|(o, g)| o * *g as f64).sum()

@@ -1,34 +1,37 @@
-//! Which cells may hold surface: the rule of a band around the zero set, and nerfacc's. A rule is a function of cells and of
-//! an evaluation at points.
+//! Updates of the occupancy grid, by a band around the zero level set or by nerfacc's rule. The update functions take the
+//! field as a function of points.
 
 use super::march::Bitmask;
 use super::rng;
 use rayon::prelude::*;
 
-/// Every cell is looked at before this step; from it on a quarter of them anywhere, and at most as many of those
-/// marched through.
-pub const ALL_BELOW: u64 = 256;
-/// What is left of a cell's opacity at the next look.
+/// Number of warm-up steps, in which nerfacc's rule evaluates every cell. Later updates evaluate a random quarter of all
+/// cells, and at most as many of the occupied ones.
+pub const WARMUP_STEPS: u64 = 256;
+/// Factor by which a cell's stored opacity decays at each evaluation of the cell.
 pub const DECAY: f32 = 0.95;
-/// Our streams of random numbers: cells anywhere, cells marched through, points in cells.
-pub const DRAWS: [u64; 3] = [5, 6, 7];
-/// Opacity of a cell of a signed distance that is marched through, unless the mean is less.
+/// Random streams of nerfacc's rule: any cells, occupied cells, points within cells.
+pub const STREAMS: [u64; 3] = [5, 6, 7];
+/// Opacity above which a cell of a signed-distance field is occupied, unless the mean opacity is less.
 pub const OPAQUE: f32 = 1e-3;
 
-/// How wide the band around the zero set is.
+/// Width of the band around the zero level set.
 #[derive(Clone, Copy, Debug)]
 pub struct BandRule {
-    /// Half of it, in units of 1 / sharpness.
+    /// Half width, in units of 1 / sharpness.
     pub width: f32,
-    /// How many times lower than the sharpest the sharpness may be.
+    /// Maximum ratio of the global sharpness to a local one; 1 if the sharpness is global.
     pub soften: f32,
 }
 
-/// A cell stays when the zero set's band (`width` over the local sharpness) may reach it, for gradients up to about
-/// one, or when a neighbour's centre lies on the other side, however steep the field is there; what is
-/// left of the inside is solid.
+/// Updates the occupied and solid cells by a band around the zero level set.
 ///
-/// `sdf` evaluates points of `[-radius, radius]³`, `soft` the logarithm of the local sharpness as a share of `inv_s`.
+/// A cell of `allowed` is occupied if the band (`width` over the local sharpness) may reach it, for gradients up to
+/// about one, or if the sdf has the other sign at the center of a neighbor, however steep the field is there. All other
+/// cells with a negative sdf are solid.
+///
+/// `sdf` evaluates signed distances at points of `[-radius, radius]³`, and `soft` the logarithm of the local sharpness
+/// divided by `inv_s`.
 pub fn update_band(
     [occupied, solid]: [&mut Bitmask; 2],
     allowed: &Bitmask,
@@ -44,7 +47,7 @@ pub fn update_band(
     let widest = rule.width * rule.soften / inv_s + half_diagonal;
     let cells: Vec<usize> = (0..r * r * r).filter(|&i| allowed.get(i)).collect();
     let center = |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - radius);
-    // NaN where nothing was asked: no sign, no neighbour
+    // cells that are not evaluated are NaN, which has no sign and never differs in sign from a neighbor
     let mut f = vec![f32::NAN; r * r * r];
     for cells in cells.chunks(1 << 17) {
         let points: Vec<[f32; 3]> = cells.par_iter().map(|&i| center(i)).collect();
@@ -63,22 +66,23 @@ pub fn update_band(
             }
         }
     }
-    // softness changes within a cell: the softest of a cell and its neighbours counts, or rays would end in hair
+    // softness varies within a cell, so the widest band of a cell and its neighbors counts; otherwise rays would end
+    // inside hair
     let widest_near = |i: usize| {
-        [1, r, r * r].into_iter().fold(band[i], |most, stride| {
-            let at = i / stride % r;
-            let before = if at > 0 { band[i - stride] } else { 0.0 };
-            let after = if at + 1 < r { band[i + stride] } else { 0.0 };
-            most.max(before).max(after)
+        [1, r, r * r].into_iter().fold(band[i], |widest, stride| {
+            let position = i / stride % r;
+            let before = if position > 0 { band[i - stride] } else { 0.0 };
+            let after = if position + 1 < r { band[i + stride] } else { 0.0 };
+            widest.max(before).max(after)
         })
     };
     occupied.bits.fill(0);
     solid.bits.fill(0);
     for &i in &cells {
         let crossed = [1, r, r * r].into_iter().any(|stride| {
-            let at = i / stride % r;
-            let other = |j: usize| f[j] * f[i] < 0.0;
-            (at > 0 && other(i - stride)) || (at + 1 < r && other(i + stride))
+            let position = i / stride % r;
+            let is_opposite = |j: usize| f[j] * f[i] < 0.0;
+            (position > 0 && is_opposite(i - stride)) || (position + 1 < r && is_opposite(i + stride))
         });
         if f[i].abs() < widest_near(i) || crossed {
             occupied.set(i, true);
@@ -88,10 +92,12 @@ pub fn update_band(
     }
 }
 
-/// nerfacc's rule (its release 0.3.3) for any opacity of a cell: what is above `threshold`, or above the mean where that is less, is
-/// marched through.
+/// Updates the occupied cells by the rule of nerfacc 0.3.3: a cell of `allowed` is occupied if its decaying maximum of
+/// the opacity is above `threshold`, or above the mean if that is less.
 ///
-/// All cells are evaluated below step 256, later a quarter of them at random and at most as many of the occupied ones.
+/// Before step [`WARMUP_STEPS`] all cells are evaluated, later a random quarter of them and at most as many of the
+/// occupied ones. `history` holds the maximum of each cell, `[cells]`; `seed` and the step `n` determine the draws, and
+/// `opacity` evaluates points of `[-radius, radius]³`.
 pub fn update_nerfacc(
     (occupied, history): (&mut Bitmask, &mut [f32]),
     allowed: &Bitmask,
@@ -102,20 +108,24 @@ pub fn update_nerfacc(
 ) {
     let r = occupied.resolution;
     let total = r * r * r;
-    let [any, some, jitter] = DRAWS;
-    let cells: Vec<usize> = if n < ALL_BELOW {
+    let [any_stream, occupied_stream, jitter_stream] = STREAMS;
+    let cells: Vec<usize> = if n < WARMUP_STEPS {
         (0..total).collect()
     } else {
         let quarter = total as u64 / 4;
-        let random = (0..quarter).map(|k| rng::below(seed, n << 4 | any, k, total as u64) as usize);
-        let kept_before: Vec<usize> = (0..total).filter(|&i| occupied.get(i)).collect();
-        let kept = kept_before.len() as u64;
-        let again: Vec<usize> = if kept > quarter {
-            (0..quarter).map(|k| kept_before[rng::below(seed, n << 4 | some, k, kept) as usize]).collect()
+        let random = (0..quarter).map(|k| rng::below(seed, n << 4 | any_stream, k, total as u64) as usize);
+        let occupied_cells: Vec<usize> = (0..total).filter(|&i| occupied.get(i)).collect();
+        let occupied_count = occupied_cells.len() as u64;
+        let redrawn: Vec<usize> = if occupied_count > quarter {
+            (0..quarter)
+                .map(|k| {
+                    occupied_cells[rng::below(seed, n << 4 | occupied_stream, k, occupied_count) as usize]
+                })
+                .collect()
         } else {
-            kept_before
+            occupied_cells
         };
-        random.chain(again).collect()
+        random.chain(redrawn).collect()
     };
     let cell = 2.0 * radius / r as f32;
     let points: Vec<[f32; 3]> = cells
@@ -124,7 +134,7 @@ pub fn update_nerfacc(
         .map(|(k, &i)| {
             let corner = [i / (r * r), i / r % r, i % r];
             std::array::from_fn(|a| {
-                let within = rng::uniform(seed, n << 4 | jitter, (3 * k + a) as u64);
+                let within = rng::uniform(seed, n << 4 | jitter_stream, (3 * k + a) as u64);
                 (corner[a] as f32 + within) * cell - radius
             })
         })

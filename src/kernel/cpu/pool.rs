@@ -1,25 +1,25 @@
-//! Buffers that are used again.
+//! A pool of reusable buffers.
 //!
-//! A training step needs tens of megabytes of scratch. Fresh memory from the system is paged in
-//! again each time, which costs more than the arithmetic; a buffer that comes back does not.
+//! A training step needs tens of megabytes of scratch memory. Memory that is newly allocated is paged in by the system
+//! each time, which costs more than the arithmetic; reused buffers avoid that.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::Mutex;
 
 static FREE: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
 
-/// Most buffers kept for later.
-const KEPT: usize = 64;
+/// Maximum number of free buffers that the pool keeps.
+const MAX_FREE: usize = 64;
 
 /// A float buffer that returns to the pool when dropped.
 #[derive(Debug, Default)]
 pub struct Buffer(Vec<f32>);
 
 impl Buffer {
-    /// A buffer of `len` floats with **arbitrary contents**: the caller writes before it reads.
+    /// Returns a buffer of `len` floats with **arbitrary contents**: the caller must write before it reads.
     pub fn scratch(len: usize) -> Buffer {
         let mut free = FREE.lock().expect("no panic while the pool is locked");
-        // the smallest one that fits and is not wastefully large
+        // take the smallest buffer that fits and is not wastefully large
         let best = (0..free.len())
             .filter(|&i| free[i].capacity() >= len && free[i].capacity() <= 4 * len.max(1024))
             .min_by_key(|&i| free[i].capacity());
@@ -27,7 +27,7 @@ impl Buffer {
             Some(i) => free.swap_remove(i),
             None => {
                 drop(free);
-                // rounded up, so that a batch a little larger finds it fitting
+                // the capacity is rounded up, so that the buffer fits a slightly larger batch, too
                 let grain = (len.next_power_of_two() / 8).max(1024);
                 Vec::with_capacity(len.next_multiple_of(grain))
             }
@@ -36,7 +36,7 @@ impl Buffer {
         Buffer(v)
     }
 
-    /// A buffer of `len` zeros.
+    /// Returns a buffer of `len` zeros.
     pub fn zeros(len: usize) -> Buffer {
         let mut b = Buffer::scratch(len);
         b.fill(0.0);
@@ -44,8 +44,8 @@ impl Buffer {
     }
 }
 
-/// Cuts buffers, whose rows are `widths` floats, into pieces of so many rows: each call gives the next piece of
-/// every buffer, an empty one behind a buffer's end.
+/// Splits buffers into pieces of `rows` rows; `widths` are the floats per row of each buffer. Each call of the returned
+/// function gives the next piece of every buffer, an empty one once a buffer is exhausted.
 pub fn pieces<'a, const N: usize>(
     buffers: [&'a mut Buffer; N],
     widths: [usize; N],
@@ -63,7 +63,7 @@ impl Drop for Buffer {
             return;
         }
         if let Ok(mut free) = FREE.lock() {
-            if free.len() < KEPT {
+            if free.len() < MAX_FREE {
                 free.push(v);
             } else if let Some(smallest) = free.iter_mut().min_by_key(|v| v.capacity())
                 && smallest.capacity() < v.capacity()

@@ -3,19 +3,19 @@
 //! A step's draws depend on the step's number alone, so resuming needs no generator state and any
 //! number of threads draws the same numbers. SplitMix64's finaliser (Steele, Lea, Flood 2014).
 
-/// 64 random bits for a draw.
+/// Returns 64 random bits for number `index` of a stream.
 #[inline]
 pub fn bits(seed: u64, stream: u64, index: u64) -> u64 {
-    mix(of_stream(seed, stream).wrapping_add(index.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
+    mix(stream_key(seed, stream).wrapping_add(index.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
 }
 
-/// What all draws of a stream share.
+/// Returns the key of a stream, which all of its numbers share.
 #[inline]
-pub(crate) fn of_stream(seed: u64, stream: u64) -> u64 {
+pub(crate) fn stream_key(seed: u64, stream: u64) -> u64 {
     mix(mix(seed ^ 0x9e37_79b9_7f4a_7c15) ^ stream)
 }
 
-/// SplitMix64's finalizer: words that look random, the same every time.
+/// Returns SplitMix64's finalizer of a word, a bijective hash.
 #[inline]
 pub(crate) fn mix(mut z: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -23,46 +23,48 @@ pub(crate) fn mix(mut z: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// A uniform number in [0, 1).
+/// Returns a uniform number in [0, 1).
 #[inline]
 pub fn uniform(seed: u64, stream: u64, index: u64) -> f32 {
     (bits(seed, stream, index) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// A uniform integer in `0..n`, n > 0.
+/// Returns a uniform integer in `0..n`, n > 0.
 #[inline]
 pub fn below(seed: u64, stream: u64, index: u64, n: u64) -> u64 {
     ((bits(seed, stream, index) as u128 * n as u128) >> 64) as u64
 }
 
-/// A random order of `0..n` that is computed, not stored: four rounds of a Feistel network over the next power of four, gone
-/// round again until the result is below n (Black and Rogaway 2002, "Ciphers with arbitrary finite domains").
+/// A random permutation of `0..n` that is computed, not stored: four rounds of a Feistel network over the next power of
+/// four, repeated until the result is below n (cycle walking; Black and Rogaway 2002, "Ciphers with arbitrary finite
+/// domains").
 #[derive(Clone, Copy, Debug)]
 pub struct Permutation {
-    /// What the streams of all rounds share.
+    /// Key that the streams of all rounds are derived from.
     pub(crate) key: u64,
-    /// Bits of half a number.
+    /// Number of bits of each half of the Feistel network.
     pub(crate) half_bits: u32,
-    /// Position of a step's first number.
+    /// Position of the first number of the current step.
     pub(crate) first: u64,
     n: u64,
 }
 
 impl Permutation {
-    /// The order of `0..n`, n > 0, that `key` names.
+    /// Returns the permutation of `0..n`, n > 0, for a key.
     pub fn new(key: u64, n: u64) -> Permutation {
         let half_bits = (64 - (n - 1).leading_zeros()).div_ceil(2).max(1);
         Permutation { key: mix(key ^ 0x9e37_79b9_7f4a_7c15), half_bits, first: 0, n }
     }
 
-    /// The order that a step takes `count` numbers of, of which none comes twice until fewer than `count` are left.
+    /// Returns the permutation whose first `count` numbers a step uses. Successive steps use successive numbers, so no
+    /// number repeats until fewer than `count` are left; then a new permutation begins.
     pub fn of_step((seed, step): (u64, u64), count: u64, n: u64) -> Permutation {
         let steps = (n / count).max(1);
         let first = step % steps * count;
         Permutation { first, ..Permutation::new(bits(seed, 13, step / steps), n) }
     }
 
-    /// Number `i` of a step; none beyond the last of all.
+    /// Returns number `i` of the step, or `None` past the end of the permutation.
     pub fn get(&self, i: u64) -> Option<u64> {
         let mut x = Some(self.first + i).filter(|&x| x < self.n)?;
         let lower = (1u64 << self.half_bits) - 1;
@@ -81,7 +83,7 @@ impl Permutation {
     }
 }
 
-/// A normal number (Box, Muller 1958).
+/// Returns a standard normal number (Box, Muller 1958).
 pub fn normal(seed: u64, stream: u64, index: u64) -> f32 {
     let (u, v) = (uniform(seed, stream, 2 * index), uniform(seed, stream, 2 * index + 1));
     (-2.0 * (1.0 - u as f64).ln()).sqrt() as f32 * (std::f32::consts::TAU * v).cos()
@@ -110,16 +112,16 @@ mod tests {
     #[test]
     fn a_permutation_has_every_number_once_and_another_order_for_every_key() {
         for n in [1, 2, 3, 64, 65, 1000] {
-            let all =
+            let permuted =
                 |key: u64| (0..n).map(|i| Permutation::new(key, n).get(i).unwrap()).collect::<Vec<u64>>();
-            let mut sorted = all(7);
+            let mut sorted = permuted(7);
             sorted.sort_unstable();
             assert_eq!(sorted, (0..n).collect::<Vec<u64>>());
-            assert!(n < 64 || all(7) != all(8));
+            assert!(n < 64 || permuted(7) != permuted(8));
         }
-        // no order to be seen: neighbors are a third of 1000 apart on average
-        let all: Vec<u64> = (0..1000).map(|i| Permutation::new(3, 1000).get(i).unwrap()).collect();
-        let apart = all.windows(2).map(|w| w[0].abs_diff(w[1])).sum::<u64>() as f64 / 999.0;
-        assert!((apart - 333.0).abs() < 30.0, "{apart}");
+        // consecutive numbers are uncorrelated: on average they are a third of 1000 apart
+        let permuted: Vec<u64> = (0..1000).map(|i| Permutation::new(3, 1000).get(i).unwrap()).collect();
+        let distance = permuted.windows(2).map(|w| w[0].abs_diff(w[1])).sum::<u64>() as f64 / 999.0;
+        assert!((distance - 333.0).abs() < 30.0, "{distance}");
     }
 }

@@ -1,15 +1,15 @@
-//! What a training step takes from the one before it: how many rays, and how long a march step is.
+//! State that a training step takes from the previous one: the number of rays and the length of a march step.
 
 use super::losses::TERMS;
 
-/// How long a march step is.
+/// Rule for the length of a march step, in field units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum StepLength {
-    /// Always this.
+    /// A constant length.
     Constant(f32),
-    /// So many units of the surface's width, `1 / inv_s`, but within these.
+    /// A multiple of the surface's width `1 / inv_s`, clamped to a range.
     OfSharpness {
-        /// Units.
+        /// Multiple of the surface's width.
         units: f32,
         /// Shortest step.
         min: f32,
@@ -19,7 +19,7 @@ pub enum StepLength {
 }
 
 impl StepLength {
-    /// Returns the step at a sharpness.
+    /// Returns the length of a march step at a sharpness.
     pub fn at(self, inv_s: f32) -> f32 {
         match self {
             StepLength::Constant(step) => step,
@@ -28,20 +28,21 @@ impl StepLength {
     }
 }
 
-/// How many rays a step draws: nine tenths of the last one's and a tenth of what would have met the budget.
+/// Rule for the number of rays of a step: 0.9 times that of the previous step plus 0.1 times the number that would have
+/// met the budget of samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RayBudget {
-    /// Samples of a step.
+    /// Target number of samples per step.
     pub samples: usize,
-    /// Fewest rays.
+    /// Minimum number of rays.
     pub min: usize,
-    /// Most rays.
+    /// Maximum number of rays.
     pub max: usize,
 }
 
 impl RayBudget {
-    /// Returns the rays of the step after one of `rays` rays that met `samples` samples. The published code has no floor
-    /// and divides by zero when no ray met a sample; here a step without samples keeps its count.
+    /// Returns the number of rays of the next step, after a step of `rays` rays with `samples` samples in total. The
+    /// published code has no minimum and divides by zero if no ray has a sample; here the number is then kept.
     pub fn next(&self, rays: usize, samples: usize) -> usize {
         if samples == 0 {
             return rays;
@@ -51,22 +52,22 @@ impl RayBudget {
     }
 }
 
-/// What the last step came to.
+/// Results of the last training step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Figures {
-    /// Its losses, unweighted, in the order of [`super::losses`].
+    /// Unweighted losses of the step, in the order of [`super::losses`].
     pub losses: [f32; TERMS],
-    /// Mean squared error of the colors of all steps since the last ones that were reported, none where none met a sample.
+    /// Mean squared color error over all steps since the last report; `None` if none of them had a sample.
     pub mean_square: Option<f32>,
-    /// NeuS' variance v behind it: the sharpness is exp(10 v).
+    /// NeuS's variance parameter v after the step; the sharpness is exp(10 v).
     pub variance: f32,
-    /// Samples, as many as there would have been with room for all.
+    /// Number of samples that the step would have had with unlimited capacity.
     pub samples: usize,
-    /// Rays of the next step.
+    /// Number of rays of the next step.
     pub rays: usize,
-    /// Steps in a row, with it, that met no sample.
+    /// Number of consecutive steps without a sample, up to and including this one.
     pub blind: u64,
-    /// Was a gradient not finite, in this step or before?
+    /// Whether a gradient was not finite, in this step or an earlier one.
     pub broken: bool,
 }
 
@@ -75,17 +76,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_ray_count_follows_the_published_sequence_and_stalls_where_it_does() {
+    fn the_ray_count_follows_the_published_sequence_to_its_fixed_point() {
         // 100 samples per ray from 256 rays, budget 262,144
         let budget = RayBudget { samples: 262_144, min: 1, max: 8192 };
         let mut rays = 256;
-        let mut seen = Vec::new();
+        let mut counts = Vec::new();
         for _ in 0..200 {
             rays = budget.next(rays, rays * 100);
-            seen.push(rays);
+            counts.push(rays);
         }
-        assert_eq!(&seen[..6], [492, 704, 895, 1067, 1222, 1361]);
-        assert_eq!(seen[199], 2612);
+        assert_eq!(&counts[..6], [492, 704, 895, 1067, 1222, 1361]);
+        assert_eq!(counts[199], 2612);
     }
 
     #[test]

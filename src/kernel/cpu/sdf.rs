@@ -16,11 +16,11 @@
 //! table[corner] += g_F w + q_F (g_n · ∇w)
 //! ```
 //!
-//! Where sharpness is local, the last of the thirteen outputs also says by how much the surface is softer there
-//! than at its sharpest: `ln(s / s_max) = −L σ(o₁₂ − 2)`, after Wang et al. 2023, "Adaptive Shells", who learn a
-//! kernel size at each place: hair is soft where skin is sharp.
+//! If the sharpness is local, the last of the thirteen outputs also gives the ratio of the local to the maximum
+//! sharpness: `ln(s / s_max) = −L σ(o₁₂ − 2)`, after Wang et al. 2023, "Adaptive Shells", who learn a kernel size per
+//! position. Hair can then be soft while skin is sharp.
 //!
-//! Only `h` is kept of `z`, `h`, `s`: `s = 1 − e^{−100 h}`.
+//! Of `z`, `h` and `s` only `h` is kept for the backward pass, because `s = 1 − e^{−100 h}`.
 
 use super::hash::{self, Level};
 use super::mlp::{
@@ -39,38 +39,39 @@ mod infer;
 pub use backward::backward;
 pub use infer::{colors, gradients, softness, values};
 
-/// Values per sample of the field's output: sdf, gradient (3), color (3), logarithm of the local sharpness as a
-/// share of the sharpest (0 where it is global).
+/// Number of values per sample of the field's output: sdf, gradient (3), color (3), logarithm of the ratio of the local
+/// to the maximum sharpness (0 if the sharpness is global).
 pub const WIDTH: usize = 8;
 
-/// Shape of the field: its grid and the half edge of its box.
+/// Shape of the field: its hash grid, its box and the variants of its networks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldShape {
     /// Levels of the hash grid.
     pub levels: Vec<Level>,
     /// The field lives in `[-radius, radius]³`; the networks see positions divided by it.
     pub radius: f32,
-    /// Hash levels that take part (the rest read as zero): coarse-to-fine training.
+    /// Number of active hash levels, for coarse-to-fine training; features of the other levels are zero.
     pub active: usize,
-    /// Does the color network read the hash features too?
+    /// Whether the color network also reads the hash features.
     pub color_skip: bool,
-    /// ln of how many times softer than its sharpest the surface may be; 0: one sharpness everywhere.
+    /// L: ln of the largest ratio of the maximum to the local sharpness; 0 if the sharpness is global.
     pub soften: f32,
 }
 
-/// ln of the local sharpness as a share of the sharpest, from the network's output. At the start most of it is left.
+/// Returns ln of the ratio of the local to the maximum sharpness, from the network's output. The offset of −2 lets
+/// training start close to the maximum.
 #[inline(always)]
 fn softened<const F: bool>(soften: f32, output: f32) -> f32 {
     -soften * sigmoid::<F>(output - 2.0)
 }
 
 impl FieldShape {
-    /// Layout of the network weights.
+    /// Returns the layout of the network weights.
     pub fn layout(&self) -> Layout {
         Layout::new(self.levels.len(), self.color_skip)
     }
 
-    /// d x01 / d position.
+    /// Returns d x01 / d position.
     fn world(&self) -> f32 {
         0.5 / self.radius
     }
@@ -81,7 +82,7 @@ impl FieldShape {
     }
 }
 
-/// What the backward needs of a forward.
+/// Output of a forward pass, with the activations that the backward pass needs.
 #[derive(Clone, Debug)]
 pub struct Activations {
     shape: FieldShape,
@@ -97,38 +98,38 @@ pub struct Activations {
     out: Buffer,      // [n, 8]
 }
 
-/// Samples a task handles: fixed, so that sums do not depend on the number of threads.
+/// Number of samples per task. It is fixed, so that sums do not depend on the number of threads.
 const CHUNK: usize = 16 * TILE;
 
-/// What the first layer of some samples reads: hash features level by level, then the position.
+/// Inputs of the first layer for a range of samples: the hash features of each level, then the position.
 struct Inputs<'a> {
-    /// Index of the first of these samples among all.
+    /// Index of the first sample of the range.
     start: usize,
-    /// All samples: the stride of `value` from level to level.
+    /// Number of samples of all ranges, which is the stride of `value` from level to level.
     total: usize,
     levels: usize,
     active: usize,
     inv_radius: f32,
-    x: &'a [[f32; 3]], // [n, 3], these samples alone
+    x: &'a [[f32; 3]], // [n, 3], samples of the range only
     value: &'a [f32],  // [active, total, 2]
 }
 
 impl<'a> Inputs<'a> {
-    /// Those of the samples in `own` out of `x`, whose gathered features are `value`.
-    fn new(shape: &FieldShape, x: &'a [[f32; 3]], value: &'a [f32], own: Range<usize>) -> Inputs<'a> {
+    /// Creates the inputs of the samples `range` of `x`, whose gathered features are `value`.
+    fn new(shape: &FieldShape, x: &'a [[f32; 3]], value: &'a [f32], range: Range<usize>) -> Inputs<'a> {
         Inputs {
-            start: own.start,
+            start: range.start,
             total: x.len(),
             levels: shape.levels.len(),
             active: shape.active,
             inv_radius: 1.0 / shape.radius,
-            x: &x[own],
+            x: &x[range],
             value,
         }
     }
 
-    /// Writes the rows of a tile that starts at sample `base`; columns of levels that take no part and of
-    /// padding stay as they are.
+    /// Writes the rows of a tile that starts at sample `base`. Columns of inactive levels and of padding are not
+    /// written.
     #[inline(always)]
     fn fill(&self, u: &mut [f32], kp: usize, base: usize, rows: usize) {
         for l in 0..self.active {
@@ -147,7 +148,7 @@ impl<'a> Inputs<'a> {
     }
 }
 
-/// A piece of the forward: `n` samples starting at `start` of all, storage already cut to it.
+/// The forward pass of a range of samples; all slices are cut to that range.
 struct SdfForwardTask<'a> {
     inputs: Inputs<'a>,
     direction: Option<&'a [[f32; 3]]>,
@@ -162,7 +163,8 @@ struct SdfForwardTask<'a> {
     out: &'a mut [f32],
 }
 
-/// h = softplus(z + b), s = sigmoid(100 (z + b)), sharing one exponential. Rows of 64.
+/// Replaces `z` by h = softplus₁₀₀(z + b) and writes s = sigmoid(100 (z + b)), sharing one exponential. Rows have 64
+/// columns.
 #[inline(always)]
 fn activate<const F: bool>(z: &mut [f32], s: &mut [f32], b: &[f32]) {
     for (z, s) in z.chunks_exact_mut(HIDDEN).zip(s.chunks_exact_mut(HIDDEN)) {
@@ -230,7 +232,7 @@ fn forward_body<const F: bool>(t: &mut SdfForwardTask, w: &Weights) {
                 row[..OUTPUTS].copy_from_slice(&o[r * out16..][..OUTPUTS]);
                 row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(direction[base + r]));
                 row[OUTPUTS + 16..COLOR_INPUTS].copy_from_slice(&unit(n[r]));
-                skip(w.layout, &u[r * kp..], row);
+                write_skip(w.layout, &u[r * kp..], row);
             }
             c0[rows * ci..].fill(0.0);
             let c1 = &mut t.c1[base * HIDDEN..][..TILE * HIDDEN];
@@ -248,7 +250,7 @@ fn forward_body<const F: bool>(t: &mut SdfForwardTask, w: &Weights) {
 
 dispatch! { fn forward_task / forward_body(t: &mut SdfForwardTask, w: &Weights) }
 
-/// The color network on a tile of inputs, before its last activation.
+/// Evaluates the color network on a tile of inputs, up to its last activation.
 #[inline(always)]
 fn color_layers<const F: bool>(w: &Weights, c0: &[f32], c1: &mut [f32], c2: &mut [f32], rgb: &mut [f32]) {
     let ci = w.layout.color_padded();
@@ -259,22 +261,23 @@ fn color_layers<const F: bool>(w: &Weights, c0: &[f32], c1: &mut [f32], c2: &mut
     gemm::<F>((TILE, RGB_PADDED, HIDDEN), c2, (HIDDEN, 1), &w.c3.t, RGB_PADDED, rgb, RGB_PADDED, false);
 }
 
-/// What follows the first [`COLOR_INPUTS`] of a row: the hash features, if the color network reads them, and zeros.
+/// Writes the columns of a row after the first [`COLOR_INPUTS`]: the hash features, if the color network reads them, and
+/// zero padding.
 #[inline(always)]
-fn skip(layout: Layout, u: &[f32], row: &mut [f32]) {
+fn write_skip(layout: Layout, u: &[f32], row: &mut [f32]) {
     let count = layout.color_inputs() - COLOR_INPUTS;
     row[COLOR_INPUTS..COLOR_INPUTS + count].copy_from_slice(&u[..count]);
     row[COLOR_INPUTS + count..].fill(0.0);
 }
 
-/// v / ‖v‖, zero for a (nearly) zero vector: torch's `normalize` with ε = 1e-12.
+/// Returns v / ‖v‖ with the norm clamped to at least 1e-12, like torch's `normalize`.
 #[inline(always)]
 fn unit(v: [f32; 3]) -> [f32; 3] {
     let length = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt().max(1e-12);
     v.map(|c| c / length)
 }
 
-/// Sdf, gradient and color at points, and what the backward needs.
+/// Evaluates sdf, gradient and color at points, and keeps the activations that the backward pass needs.
 ///
 /// # Shapes
 ///
@@ -328,9 +331,9 @@ fn run(
     let mut tasks: Vec<SdfForwardTask> = (0..n)
         .step_by(CHUNK)
         .map(|start| {
-            let own = start..(start + CHUNK).min(n);
-            let direction = direction.map(|d| &d[own.clone()]);
-            let inputs = Inputs::new(shape, x, &value, own);
+            let range = start..(start + CHUNK).min(n);
+            let direction = direction.map(|d| &d[range.clone()]);
+            let inputs = Inputs::new(shape, x, &value, range);
             let [u, q, h, c0, c1, c2, out] = cut();
             let soften = shape.soften;
             SdfForwardTask { inputs, direction, jacobian: &jacobian, soften, u, h, q, c0, c1, c2, out }
@@ -351,7 +354,7 @@ fn run(
 }
 
 impl Activations {
-    /// `[n, 8]`: see [`forward`].
+    /// Returns the output of the field, `[n, 8]`: see [`forward`].
     pub fn output(&self) -> &[f32] {
         &self.out
     }

@@ -8,8 +8,8 @@
 //! feature(p) = Σ_i Σ_c plane_i,c(p) · line_i,c(p)       bilinear and linear, vertices on the box's border
 //! ```
 //!
-//! Values of one vertex lie together (channel last): a corner is then one or a few cache lines, which
-//! makes lookups seven times faster than the channel-first storage of the published code.
+//! The channels of a vertex are adjacent in memory (channel last). A corner is then one or a few cache lines, which makes
+//! lookups seven times faster than with the channel-first storage of the published code.
 
 mod decoder;
 mod gather;
@@ -32,8 +32,8 @@ pub const PLANE_AXES: [(usize, usize); 3] = [(0, 1), (0, 2), (1, 2)];
 /// Axis of each term's line.
 pub const LINE_AXIS: [usize; 3] = [2, 1, 0];
 
-/// Where the planes and lines of one set lie in their flat array: plane 0, 1, 2, line 0, 1, 2, each
-/// `[height, width, channels]` or `[n, channels]`.
+/// Layout of planes and lines in a flat array: plane 0, 1, 2, each `[height, width, channels]`, then line 0, 1, 2, each
+/// `[n, channels]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grid {
     /// Vertices along x, y, z; at least 2 each.
@@ -45,35 +45,35 @@ pub struct Grid {
 /// One plane or line inside the flat array.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Factor {
-    /// First float.
+    /// Index of the first float.
     pub start: usize,
     /// Vertices along the plane's second axis; 1 for a line.
     pub height: usize,
     /// Vertices along the plane's first axis, or of the line.
     pub width: usize,
-    /// Floats of a vertex.
+    /// Number of floats of a vertex.
     pub channels: usize,
 }
 
 impl Factor {
-    /// How many floats it has.
+    /// Returns the number of floats.
     pub fn len(&self) -> usize {
         self.height * self.width * self.channels
     }
 
-    /// Does it have no channel?
+    /// Returns whether the plane or line has no channels.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Its part of the flat array.
+    /// Returns the range of the plane or line in the flat array.
     pub fn range(&self) -> std::ops::Range<usize> {
         self.start..self.start + self.len()
     }
 }
 
 impl Grid {
-    /// The three planes, then the three lines, as they follow each other.
+    /// Returns the three planes, then the three lines, in storage order.
     pub fn factors(&self) -> [Factor; 6] {
         let mut start = 0;
         std::array::from_fn(|k| {
@@ -87,53 +87,55 @@ impl Grid {
         })
     }
 
-    /// The plane of term `i`.
+    /// Returns the plane of term `i`.
     pub fn plane(&self, i: usize) -> Factor {
         self.factors()[i]
     }
 
-    /// The line of term `i`.
+    /// Returns the line of term `i`.
     pub fn line(&self, i: usize) -> Factor {
         self.factors()[3 + i]
     }
 
-    /// Cuts a flat array into its planes and lines.
+    /// Splits a flat array into its planes and lines.
     fn split_mut<'a>(&self, mut flat: &'a mut [f32]) -> [(Factor, &'a mut [f32]); 6] {
-        self.factors().map(|f| (f, flat.split_off_mut(..f.len()).expect("a float for each of the grid's")))
+        self.factors().map(|f| {
+            (f, flat.split_off_mut(..f.len()).expect("the array has the floats of all planes and lines"))
+        })
     }
 
-    /// Floats of all planes and lines.
+    /// Returns the number of floats of all planes and lines.
     pub fn len(&self) -> usize {
         let last = self.line(2);
         last.start + last.len()
     }
 
-    /// Channels of all terms together.
+    /// Returns the number of channels of all terms together.
     pub fn channels(&self) -> usize {
         self.rank.iter().sum()
     }
 }
 
-/// Vertices along each axis for about so many voxels in a box: `floor(extent / (Π extent / V)^(1/3))`, two at
-/// least.
+/// Returns the number of vertices along each axis for about `voxels` voxels in a box:
+/// `floor(extent / (Π extent / V)^(1/3))`, at least 2.
 pub fn size_for(extent: [f32; 3], voxels: u64) -> [usize; 3] {
     let product: f32 = extent.iter().product();
     let edge = (product / voxels as f32).cbrt();
     extent.map(|e| ((e / edge) as usize).max(2))
 }
 
-/// Length of a march step: `ratio` times the mean distance of vertices over the three axes.
+/// Returns the length of a march step: `ratio` times the mean distance of vertices over the three axes.
 pub fn step_size(extent: [f32; 3], size: [usize; 3], ratio: f32) -> f32 {
     (0..3).map(|a| extent[a] / (size[a] - 1) as f32).sum::<f32>() / 3.0 * ratio
 }
 
-/// Samples of a ray outside training: as many as the box's diagonal needs, a million at most.
+/// Returns the number of samples of a ray for inference: enough for the box's diagonal, at most a million.
 pub fn samples_across(extent: [f32; 3], step: f32) -> usize {
     let diagonal = extent.iter().map(|e| e * e).sum::<f32>().sqrt();
     ((diagonal / step) as usize).saturating_add(1).min(1_000_000)
 }
 
-/// The voxel counts of `steps` upsamplings: equal ratios from `first` to `last`, computed in f32 as published.
+/// Returns the voxel counts of `steps` upsamplings, with equal ratios from `first` to `last`, computed in f32 as published.
 pub fn voxel_schedule(first: u64, last: u64, steps: usize) -> Vec<u64> {
     let (a, b) = ((first as f64).ln() as f32, (last as f64).ln() as f32);
     let at = |k: usize| {

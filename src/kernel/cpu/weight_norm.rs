@@ -1,29 +1,28 @@
-//! Weight norm of the geometry network (Salimans, Kingma 2016): from trained parameters to the weights of a
-//! [`Layout`], and back.
+//! Weight normalization of the geometry network (Salimans, Kingma 2016): it converts trained parameters to the weights of
+//! a [`Layout`], and gradients back.
 //!
 //! ```text
 //! W = g v / ‖v‖ by rows     g_g = ĝ · v / ‖v‖     g_v = g / ‖v‖ (ĝ − (ĝ · v̂) v̂),  ĝ the gradient by W
 //! ```
 //!
-//! Parameters are one vector: v1, g1, b1, v2, g2, b2, c1, c2, c3.
+//! Parameters are stored in one vector: v1, g1, b1, v2, g2, b2, c1, c2, c3.
 
 use super::mlp::Layout;
 
-/// A row of weights: where its parameters, the parameter that is its length, and its weights begin, and how many they
-/// are. A row without a length parameter is copied.
+/// Offsets of a row of weights and of its parameters. A row without a length parameter is copied.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Row {
-    /// First of its parameters.
+    /// Index of the row's first parameter.
     pub from: usize,
-    /// The parameter that is its length.
+    /// Index of the parameter that is the row's length, g.
     pub length: Option<usize>,
-    /// First of its weights.
+    /// Index of the row's first weight.
     pub to: usize,
-    /// Weights.
+    /// Number of weights of the row.
     pub count: usize,
 }
 
-/// Returns the rows of a network and how many parameters it has.
+/// Returns the rows of a network and its number of parameters.
 pub fn rows(layout: Layout) -> (Vec<Row>, usize) {
     let mut rows = Vec::new();
     let (mut from, mut to) = (0, 0);
@@ -44,12 +43,12 @@ pub fn rows(layout: Layout) -> (Vec<Row>, usize) {
     (rows, from)
 }
 
-/// ‖v‖ of a row, which no division by it can break.
+/// Returns ‖v‖ of a row, clamped to at least 1e-12, so that it can be a divisor.
 fn length(v: &[f32]) -> f32 {
     v.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-12)
 }
 
-/// Returns the flat weights of these parameters.
+/// Returns the flat weights of the parameters.
 pub fn forward(layout: Layout, parameters: &[f32]) -> Vec<f32> {
     let mut flat = Vec::with_capacity(layout.len());
     for Row { from, length: g, count, .. } in rows(layout).0 {
@@ -65,7 +64,7 @@ pub fn forward(layout: Layout, parameters: &[f32]) -> Vec<f32> {
     flat
 }
 
-/// Writes the gradient by the parameters, from that by the flat weights.
+/// Writes the gradient with respect to the parameters, given that with respect to the flat weights.
 pub fn backward(layout: Layout, parameters: &[f32], g_flat: &[f32], gradient: &mut [f32]) {
     for Row { from, length: g, to, count } in rows(layout).0 {
         let (v, by_weights) = (&parameters[from..from + count], &g_flat[to..to + count]);
@@ -74,11 +73,11 @@ pub fn backward(layout: Layout, parameters: &[f32], g_flat: &[f32], gradient: &m
             continue;
         };
         let length = length(v);
-        let along = by_weights.iter().zip(v).map(|(g, v)| g * v).sum::<f32>() / length;
-        gradient[g] = along;
+        let radial = by_weights.iter().zip(v).map(|(g, v)| g * v).sum::<f32>() / length;
+        gradient[g] = radial;
         let share = parameters[g] / length;
         for (k, (by_weight, v)) in by_weights.iter().zip(v).enumerate() {
-            gradient[from + k] = share * (by_weight - along * v / length);
+            gradient[from + k] = share * (by_weight - radial * v / length);
         }
     }
 }

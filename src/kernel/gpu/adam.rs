@@ -25,10 +25,10 @@ fn adam_kernel(
 ) {
     let i = ABSOLUTE_POS;
     if i < p.len() && count[0] > 0 && broken[0] == 0 {
-        let own = g[i];
-        if !skip_zero || own != 0.0f32 {
-            let m1 = fma(beta1, m[i], (1.0f32 - beta1) * own);
-            let v1 = fma(beta2, v[i], (1.0f32 - beta2) * own * own);
+        let gradient = g[i];
+        if !skip_zero || gradient != 0.0f32 {
+            let m1 = fma(beta1, m[i], (1.0f32 - beta1) * gradient);
+            let v1 = fma(beta2, v[i], (1.0f32 - beta2) * gradient * gradient);
             p[i] = fma(p[i], keep, -lr * (m1 * c1) / ((v1 * c2).sqrt() + epsilon));
             m[i] = m1;
             v[i] = v1;
@@ -37,16 +37,16 @@ fn adam_kernel(
     }
 }
 
-/// Whether there is anything to step along.
+/// Condition under which parameters are updated.
 #[derive(Clone, Copy)]
 pub struct Gate<'a> {
-    /// `[1]` or more: how many samples there were; none: nothing is updated.
+    /// `[1]` or more: number of samples of the step in the first word. Nothing is updated if it is 0.
     pub count: &'a Buffer,
-    /// `[1]`: not 0 once a gradient was not finite; nothing is updated from then on.
+    /// `[1]`: not 0 once a gradient was not finite. Nothing is updated from then on.
     pub broken: &'a Buffer,
 }
 
-/// One AdamW step in place, all four `[n]`; the gradient is left zero.
+/// Takes one AdamW step in place; the gradient is left zero. All four buffers are `[n]`.
 pub fn adam(device: &Device, [p, m, v]: [&Buffer; 3], g: &Buffer, step: &AdamStep, gate: Gate) {
     assert!([m, v, g].iter().all(|b| b.words() == p.words()));
     let correction = |beta: f32| (1.0 / (1.0 - (beta as f64).powf(step.step as f64))) as f32;
@@ -79,24 +79,24 @@ mod tests {
             };
             let mut p: Vec<f32> = (0..n).map(|i| rng::normal(1, 1, i)).collect();
             let (mut m, mut v) = (vec![0f32; p.len()], vec![0f32; p.len()]);
-            let there = [&p, &m, &v].map(|b| device.upload(b));
+            let device_state = [&p, &m, &v].map(|b| device.upload(b));
             for k in 0..5 {
                 step.step += 1;
-                // a third of the weights rests in each step, others have gradients of any size
+                // in each step a third of the gradients are zero, and the others have very different magnitudes
                 let size = |i: u64| 10f32.powi(i as i32 % 12 - 8) * rng::normal(2, k, i);
                 let mut g: Vec<f32> = (0..n).map(|i| if (i + k) % 3 == 0 { 0.0 } else { size(i) }).collect();
-                let own = device.upload(&g);
-                let [p_there, m_there, v_there] = &there;
+                let device_g = device.upload(&g);
+                let [device_p, device_m, device_v] = &device_state;
                 for (count, broken) in [(0, 0), (7, 1), (7, 0)] {
-                    // without samples, and behind a broken gradient, nothing happens
+                    // nothing is updated without samples, or after a gradient that was not finite
                     let (count, broken) = (device.upload::<u32>(&[count]), device.upload::<u32>(&[broken]));
                     let gate = Gate { count: &count, broken: &broken };
-                    super::adam(&device, [p_there, m_there, v_there], &own, &step, gate);
+                    super::adam(&device, [device_p, device_m, device_v], &device_g, &step, gate);
                 }
                 adam::adam(&mut p, &mut m, &mut v, &mut g, &step);
-                assert_eq!(device.read::<f32>(&own), g);
+                assert_eq!(device.read::<f32>(&device_g), g);
             }
-            for (what, (got, want)) in ["p", "m", "v"].iter().zip(there.iter().zip([&p, &m, &v])) {
+            for (what, (got, want)) in ["p", "m", "v"].iter().zip(device_state.iter().zip([&p, &m, &v])) {
                 agree(&format!("adam {what}"), &device.read::<f32>(got), want, 1e-5);
             }
         }

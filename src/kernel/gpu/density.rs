@@ -1,5 +1,5 @@
 //! The density field of [`crate::kernel::cpu::density`], whose module holds the formulas: its networks forward and backward,
-//! rays that end where they are dark, and compositing with the losses.
+//! truncation of rays by transmittance, and compositing with the losses.
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::Batch;
@@ -10,48 +10,51 @@ use super::sdf::kernels::{harmonics, masked, prepare, reduce};
 use super::sdf::{SUMMING, ends};
 use super::sum::group_sum;
 use super::tile::{
-    CHANNELS, LANES, UNITS, at, gate, load, narrow, outer, product, put, relu, save, sigmoid, uniform_count,
+    CHANNELS, LANES, UNITS, at, load_planes, outer, output_layer, product, relu, relu_backward, sigmoid,
+    store_block, store_planes, uniform_count,
 };
 use super::weight_norm::finite;
-use crate::kernel::cpu::density::{COLOR_INPUTS, DARK, DISTORTION, DensityShape, FEATURES, HIDDEN, STEEPEST};
+use crate::kernel::cpu::density::{
+    COLOR_INPUTS, DISTORTION, DensityShape, FEATURES, HIDDEN, MAX_EXP_GRADIENT, MIN_TRANSMITTANCE,
+};
 use crate::kernel::cpu::losses::{RAY_TERMS, SAMPLE_TERMS, TERMS};
 use crate::kernel::cpu::mlp::TILE;
 use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 
-/// Planes of the field's output: density and color.
+/// Number of planes of the field's output: density and color.
 const WIDTH: usize = 4;
 
-/// Where the matrices stand, in rows of 64 floats: weights in the orders in which they are read, and gradients row-major
-/// as the CPU's.
+/// Offsets of the matrices in rows of 64 floats. Weights are stored in the orders in which they are read, gradients
+/// row-major like on the CPU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct Plan {
-    /// Hash features: two a level.
+    /// Number of hash features: two per level.
     features: usize,
 }
 
 impl Plan {
-    /// First rows of W1ᵀ, W1, W2, C1ᵀ, C1, C2ᵀ, C2, C3, and the end.
+    /// Returns the first rows of W1ᵀ, W1, W2, C1ᵀ, C1, C2ᵀ, C2, C3, and the end.
     fn rows(&self) -> [usize; 9] {
         ends([self.features, HIDDEN, FEATURES, COLOR_INPUTS, HIDDEN, HIDDEN, HIDDEN, 3])
     }
 
-    /// First rows of the gradients of W1, W2, C1, C2, C3, and the end.
+    /// Returns the first rows of the gradients of W1, W2, C1, C2, C3, and the end.
     fn gradients(&self) -> [usize; 6] {
         ends([HIDDEN, FEATURES, HIDDEN, HIDDEN, 3])
     }
 
-    /// For each float of the prepared weights the one of the flat vector, and for each of the flat vector the one of
-    /// the gradients: `u32::MAX` where there is none.
+    /// Returns two index maps: for each float of the prepared weights its index in the flat vector, or `u32::MAX` for
+    /// padding; and for each float of the flat vector its index in the gradients.
     fn maps(&self, shape: &DensityShape) -> (Vec<u32>, Vec<u32>) {
         let (rows, gradients) = (self.rows(), self.gradients());
         let mut prepared = vec![u32::MAX; rows[8] * CHANNELS];
         let mut summed = Vec::with_capacity(shape.len());
         for (part, (outputs, inputs)) in shape.shapes().into_iter().enumerate() {
-            let [own, transposed] = [[1, 2, 4, 6, 7][part], [0, 8, 3, 5, 8][part]];
+            let [original, transposed] = [[1, 2, 4, 6, 7][part], [0, 8, 3, 5, 8][part]];
             for (o, i) in (0..outputs).flat_map(|o| (0..inputs).map(move |i| (o, i))) {
-                prepared[(rows[own] + o) * CHANNELS + i] = summed.len() as u32;
+                prepared[(rows[original] + o) * CHANNELS + i] = summed.len() as u32;
                 if transposed < 8 {
                     prepared[(rows[transposed] + i) * CHANNELS + o] = summed.len() as u32;
                 }
@@ -62,7 +65,8 @@ impl Plan {
     }
 }
 
-/// Writes densities and, where asked for, colors, planes `[4, capacity]`, with what the backward needs.
+/// Writes densities and, if `colors` is set, colors to planes `[4, capacity]`, and the activations that the backward pass
+/// needs.
 #[cube(launch_unchecked)]
 fn forward(
     w: &[F4],
@@ -89,30 +93,30 @@ fn forward(
         sync_cube();
         let first =
             relu(&product(&a, 0usize, w, comptime!(rows[0]), comptime!(plan.features), row, column, LANES));
-        put(&mut b, &first, row, column, LANES);
+        store_block(&mut b, &first, row, column, LANES);
         sync_cube();
-        let own = narrow(&b, w, comptime!(rows[2]), row, column, FEATURES, LANES);
+        let output = output_layer(&b, w, comptime!(rows[2]), row, column, FEATURES, LANES);
         if column == 0 {
-            out[here] = (own - F4::new(1.0f32)).exp();
+            out[here] = (output - F4::new(1.0f32)).exp();
         }
         if colors {
-            save(h, &first, plane, here, column, HIDDEN);
-            o[column * plane + here] = own;
-            a[at(column, row, LANES)] = own;
+            store_planes(h, &first, plane, here, column, HIDDEN);
+            o[column * plane + here] = output;
+            a[at(column, row, LANES)] = output;
             if column == 13 {
                 let (x, y, z) = (direction[here], direction[plane + here], direction[2 * plane + here]);
                 harmonics(&mut a, FEATURES, x, y, z, row);
             }
             sync_cube();
             let first = relu(&product(&a, 0usize, w, comptime!(rows[3]), COLOR_INPUTS, row, column, LANES));
-            save(c1, &first, plane, here, column, HIDDEN);
-            put(&mut b, &first, row, column, LANES);
+            store_planes(c1, &first, plane, here, column, HIDDEN);
+            store_block(&mut b, &first, row, column, LANES);
             sync_cube();
             let second = relu(&product(&b, 0usize, w, comptime!(rows[5]), HIDDEN, row, column, LANES));
-            save(c2, &second, plane, here, column, HIDDEN);
-            put(&mut a, &second, row, column, LANES);
+            store_planes(c2, &second, plane, here, column, HIDDEN);
+            store_block(&mut a, &second, row, column, LANES);
             sync_cube();
-            let rgb = narrow(&a, w, comptime!(rows[7]), row, column, 3usize, LANES);
+            let rgb = output_layer(&a, w, comptime!(rows[7]), row, column, 3usize, LANES);
             if column < 3 {
                 out[(1 + column) * plane + here] = sigmoid(rgb);
             }
@@ -120,7 +124,7 @@ fn forward(
     }
 }
 
-/// Writes hash features to a tile, and zeros behind them.
+/// Writes hash features to a tile, padded with zeros.
 #[cube]
 fn features(
     a: &mut [F4],
@@ -141,7 +145,8 @@ fn features(
     }
 }
 
-/// Gradients of the features by sample, and of the weights by group.
+/// Writes the gradients with respect to the features of each sample, and partial sums by group of those with respect to
+/// the weights.
 #[cube(launch_unchecked)]
 fn backward(
     w: &[F4],
@@ -159,12 +164,12 @@ fn backward(
     #[comptime] plan: Plan,
 ) {
     let rows = comptime!(plan.rows());
-    let own = comptime!(plan.gradients());
+    let gradient_rows = comptime!(plan.gradients());
     let inputs = comptime!(plan.features);
     let plane = direction.len() / 3;
     let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
     let group = CUBE_POS;
-    let sum = group * comptime!(own[5] * CHANNELS);
+    let sum = group * comptime!(gradient_rows[5] * CHANNELS);
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let samples = uniform_count(count, &mut a);
@@ -177,56 +182,56 @@ fn backward(
             let g = masked(g_out[(1 + column) * plane + here], first, samples);
             a[at(column, row, LANES)] = g * y * (F4::new(1.0f32) - y);
         }
-        load(&mut b, c2, plane, here, row, column);
+        load_planes(&mut b, c2, plane, here, row, column);
         sync_cube();
-        let start = sum + comptime!(own[4] * CHANNELS);
+        let start = sum + comptime!(gradient_rows[4] * CHANNELS);
         outer(&a, 0usize, &b, 3usize, HIDDEN, partial, start, fresh, row, column, LANES);
         let g_c2 = product(&a, 0usize, w, comptime!(rows[7]), 3usize, row, column, LANES);
-        let g_c2 = gate(&g_c2, &b, row, column, LANES);
+        let g_c2 = relu_backward(&g_c2, &b, row, column, LANES);
         sync_cube();
-        put(&mut a, &g_c2, row, column, LANES);
-        load(&mut b, c1, plane, here, row, column);
+        store_block(&mut a, &g_c2, row, column, LANES);
+        load_planes(&mut b, c1, plane, here, row, column);
         sync_cube();
-        let start = sum + comptime!(own[3] * CHANNELS);
+        let start = sum + comptime!(gradient_rows[3] * CHANNELS);
         outer(&a, 0usize, &b, HIDDEN, HIDDEN, partial, start, fresh, row, column, LANES);
         let g_c1 = product(&a, 0usize, w, comptime!(rows[6]), HIDDEN, row, column, LANES);
-        let g_c1 = gate(&g_c1, &b, row, column, LANES);
+        let g_c1 = relu_backward(&g_c1, &b, row, column, LANES);
         sync_cube();
-        put(&mut a, &g_c1, row, column, LANES);
+        store_block(&mut a, &g_c1, row, column, LANES);
         b[at(column, row, LANES)] = o[column * plane + here];
         if column == 13 {
             let (x, y, z) = (direction[here], direction[plane + here], direction[2 * plane + here]);
             harmonics(&mut b, FEATURES, x, y, z, row);
         }
         sync_cube();
-        let start = sum + comptime!(own[2] * CHANNELS);
+        let start = sum + comptime!(gradient_rows[2] * CHANNELS);
         outer(&a, 0usize, &b, HIDDEN, COLOR_INPUTS, partial, start, fresh, row, column, LANES);
         let g_c0 = product(&a, 0usize, w, comptime!(rows[4]), HIDDEN, row, column, LANES);
         sync_cube();
-        put(&mut a, &g_c0, row, column, LANES);
-        load(&mut b, h, plane, here, row, column);
+        store_block(&mut a, &g_c0, row, column, LANES);
+        load_planes(&mut b, h, plane, here, row, column);
         sync_cube();
         if column == 0 {
-            let steep = min(out[here], F4::new(STEEPEST));
+            let steep = min(out[here], F4::new(MAX_EXP_GRADIENT));
             a[at(0usize, row, LANES)] += masked(g_out[here], first, samples) * steep;
         }
         sync_cube();
-        let start = sum + comptime!(own[1] * CHANNELS);
+        let start = sum + comptime!(gradient_rows[1] * CHANNELS);
         outer(&a, 0usize, &b, FEATURES, HIDDEN, partial, start, fresh, row, column, LANES);
         let g_h = product(&a, 0usize, w, comptime!(rows[2]), FEATURES, row, column, LANES);
-        let g_h = gate(&g_h, &b, row, column, LANES);
+        let g_h = relu_backward(&g_h, &b, row, column, LANES);
         sync_cube();
-        put(&mut a, &g_h, row, column, LANES);
+        store_block(&mut a, &g_h, row, column, LANES);
         features(&mut b, value, plane, here, row, column, inputs);
         sync_cube();
         outer(&a, 0usize, &b, HIDDEN, inputs, partial, sum, fresh, row, column, LANES);
         let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
-        save(g_value, &g_u, plane, here, column, inputs);
+        store_planes(g_value, &g_u, plane, here, column, inputs);
         sync_cube();
     }
 }
 
-/// Says where a gradient is not finite.
+/// Sets `broken` if a value of the gradient is not finite.
 #[cube(launch)]
 fn check(gradient: &[f32], broken: &mut [u32]) {
     let i = ABSOLUTE_POS;
@@ -235,7 +240,8 @@ fn check(gradient: &[f32], broken: &mut [u32]) {
     }
 }
 
-/// Counts the samples of a ray up to where it is dark or, once it is known where they lie, copies them.
+/// Truncates rays by transmittance. A first pass counts the remaining samples of each ray; a second pass, after a prefix
+/// sum of the counts, copies them.
 #[cube(launch)]
 fn cut(
     density: &[f32],
@@ -268,7 +274,7 @@ fn cut(
             let end = offsets[r + 1] as usize;
             let mut thickness = 0.0f32;
             let mut s = first;
-            while s < end && (-thickness).exp() >= DARK {
+            while s < end && (-thickness).exp() >= MIN_TRANSMITTANCE {
                 thickness += density[s] * dt;
                 s += 1;
             }
@@ -277,41 +283,42 @@ fn cut(
     }
 }
 
-/// How many rays met a sample, and the number of the last one of them, from 1; neither below 1. One group of threads.
+/// Counts the rays with samples, and finds the number of the last one of them, counted from 1; both results are at least
+/// 1. Runs as one group of threads.
 #[cube(launch)]
 fn tally(offsets: &[u32], out: &mut [u32]) {
     let unit = UNIT_POS as usize;
-    let mut met = 0u32;
+    let mut hit_rays = 0u32;
     let mut last = 0u32;
     for r in range_stepped(unit, offsets.len() - 1, UNITS as usize) {
         if offsets[r + 1] > offsets[r] {
-            met += 1;
+            hit_rays += 1;
             last = u32::cast_from(r) + 1;
         }
     }
     let mut lasts = Shared::<[u32]>::new_slice(UNITS as usize);
     lasts[unit] = last;
-    let met = group_sum::<u32>(met, UNITS as usize);
+    let hit_rays = group_sum::<u32>(hit_rays, UNITS as usize);
     if unit == 0 {
         for i in 1..UNITS as usize {
             last = max(last, lasts[i]);
         }
-        out[0] = max(met, 1u32);
+        out[0] = max(hit_rays, 1u32);
         out[1] = max(last, 1u32);
     }
 }
 
-/// `1 − e⁻ˣ` of a number that is not negative.
+/// Returns `1 − e⁻ˣ` for x ≥ 0.
 #[cube]
 fn opacity(x: f32) -> f32 {
-    // what is left of a difference close to 1 has few digits
+    // the difference cancels for small x, so a series is used
     let series =
         x * (1.0f32 - x / 2.0f32 * (1.0f32 - x / 3.0f32 * (1.0f32 - x / 4.0f32 * (1.0f32 - x / 5.0f32))));
     select(x < 0.1f32, series, 1.0f32 - (-x).exp())
 }
 
-/// Composites; terms of rays, planes `[3, rays]`, and gradients by the field's output, planes `[4, capacity]`. `light` is
-/// scratch, planes `[2, capacity]`.
+/// Composites rays. Writes their loss terms, planes `[3, rays]`, and the gradients with respect to the field's output,
+/// planes `[4, capacity]`. `light` is scratch memory, planes `[2, capacity]`.
 #[cube(launch)]
 fn of_rays(
     field: &[f32],
@@ -329,7 +336,7 @@ fn of_rays(
     let r = ABSOLUTE_POS;
     if r < rays {
         let (first, end) = (offsets[r] as usize, offsets[r + 1] as usize);
-        let (met, last) = (f32::cast_from(tally[0]), f32::cast_from(tally[1]));
+        let (hit_rays, last) = (f32::cast_from(tally[0]), f32::cast_from(tally[1]));
         let mut thickness = 0.0f32;
         let mut red = 0.0f32;
         let mut green = 0.0f32;
@@ -338,9 +345,9 @@ fn of_rays(
         let mut moment = 0.0f32;
         let mut spread = 0.0f32;
         for s in first..end {
-            let own = field[s] * dt;
-            let w = (-thickness).exp() * opacity(own);
-            thickness += own;
+            let thickness_here = field[s] * dt;
+            let w = (-thickness).exp() * opacity(thickness_here);
+            thickness += thickness_here;
             red += w * field[plane + s];
             green += w * field[2 * plane + s];
             blue += w * field[3 * plane + s];
@@ -351,30 +358,31 @@ fn of_rays(
             light[s] = w;
             light[plane + s] = before;
         }
-        let met_any = select(end > first, 1.0f32, 0.0f32);
+        let is_hit = select(end > first, 1.0f32, 0.0f32);
         let (e0, e1, e2) = (red - color[r], green - color[rays + r], blue - color[2 * rays + r]);
-        let share = met_any / (3.0f32 * met);
+        let share = is_hit / (3.0f32 * hit_rays);
         terms[r] = (e0 * e0 + e1 * e1 + e2 * e2) * share;
         terms[rays + r] = (smooth(e0) + smooth(e1) + smooth(e2)) * share;
         terms[2 * rays + r] = spread / last;
         let g0 = clamp(e0, -1.0f32, 1.0f32) * share;
         let g1 = clamp(e1, -1.0f32, 1.0f32) * share;
         let g2 = clamp(e2, -1.0f32, 1.0f32) * share;
-        let mut after = 0.0f32;
-        let mut after_moment = 0.0f32;
-        let mut light_after = 0.0f32;
+        let mut farther = 0.0f32;
+        let mut farther_moment = 0.0f32;
+        let mut farther_sum = 0.0f32;
         for k in 0..end - first {
             let s = end - 1 - k;
             let w = light[s];
-            let by_spread =
-                2.0f32 / 3.0f32 * dt * w + 2.0f32 * light[plane + s] + 2.0f32 * (after_moment - t[s] * after);
-            after += w;
-            after_moment += w * t[s];
-            let by_color = g0 * field[plane + s] + g1 * field[2 * plane + s] + g2 * field[3 * plane + s];
-            let g = DISTORTION / last * by_spread + by_color;
-            g_out[s] = dt * ((-thickness).exp() * g - light_after);
+            let g_spread = 2.0f32 / 3.0f32 * dt * w
+                + 2.0f32 * light[plane + s]
+                + 2.0f32 * (farther_moment - t[s] * farther);
+            farther += w;
+            farther_moment += w * t[s];
+            let g_color = g0 * field[plane + s] + g1 * field[2 * plane + s] + g2 * field[3 * plane + s];
+            let g = DISTORTION / last * g_spread + g_color;
+            g_out[s] = dt * ((-thickness).exp() * g - farther_sum);
             thickness -= field[s] * dt;
-            light_after += w * g;
+            farther_sum += w * g;
             g_out[plane + s] = g0 * w;
             g_out[2 * plane + s] = g1 * w;
             g_out[3 * plane + s] = g2 * w;
@@ -382,14 +390,13 @@ fn of_rays(
     }
 }
 
-/// Smooth-L1 of an error.
+/// Returns the smooth-L1 loss of an error.
 #[cube]
 fn smooth(e: f32) -> f32 {
     select(e.abs() < 1.0f32, 0.5f32 * e * e, e.abs() - 0.5f32)
 }
 
-/// A density field on a device, and what a training step of it leaves between operations, for up to so many rays and
-/// `capacity` samples.
+/// A density field on a device, with the buffers of a training step for up to `rays` rays and `capacity` samples.
 pub struct Density {
     plan: Plan,
     grid: Grid,
@@ -415,7 +422,7 @@ pub struct Density {
 }
 
 impl Density {
-    /// For marching in steps of `dt`; `capacity` is a multiple of [`TILE`].
+    /// Creates a field that is marched in steps of `dt`; `capacity` must be a multiple of [`TILE`].
     pub fn new(device: &Device, shape: &DensityShape, dt: f32, rays: usize, capacity: usize) -> Density {
         assert!(capacity.is_multiple_of(TILE) && capacity > 0 && Density::supports(shape));
         let plan = Plan { features: 2 * shape.levels.len() };
@@ -446,36 +453,36 @@ impl Density {
         }
     }
 
-    /// Is there room for the features of its levels in a tile?
+    /// Returns whether a tile can hold the features of all levels.
     pub fn supports(shape: &DensityShape) -> bool {
         2 * shape.levels.len() <= CHANNELS
     }
 
-    /// Words of memory that a sample takes, with its march before and after it is cut: all of them, and of the largest
-    /// buffer.
+    /// Returns the memory per sample in words, including its marched samples before and after truncation: the total, and
+    /// that of the largest buffer.
     pub fn words_per_sample(shape: &DensityShape) -> [usize; 2] {
         let features = 2 * shape.levels.len();
         [2 * features + 3 * HIDDEN + FEATURES + 2 * WIDTH + 2 + 2 * (3 + 3 + 2), HIDDEN.max(features)]
     }
 
-    /// Words of memory that sums of groups take, however many samples there are.
+    /// Returns the memory of the groups' partial gradient sums in words, which does not depend on the number of samples.
     pub fn words_of_sums(shape: &DensityShape) -> usize {
         SUMMING * Plan { features: 2 * shape.levels.len() }.gradients()[5] * CHANNELS
     }
 
-    /// Takes up new network weights.
+    /// Converts new network weights to the layout of the kernels.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
         launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
             flat, self.prepared_map, self.weights
         );
     }
 
-    /// Densities and, where there are directions, colors of samples: see [`crate::kernel::cpu::density::evaluate`].
+    /// Evaluates densities of samples and, if directions are given, colors: see [`crate::kernel::cpu::density::evaluate`].
     ///
     /// # Shapes
     ///
-    /// - table: `[entries, 2]`; x, direction: planes `[3, capacity]`, finite behind the last sample; count: `[1]`, the
-    ///   samples there are
+    /// - table: `[entries, 2]`; x, direction: planes `[3, capacity]`, finite after the last sample; count: `[1]`, the
+    ///   number of samples
     /// - output: planes `[4, capacity]`
     pub fn evaluate(
         &self,
@@ -498,8 +505,8 @@ impl Density {
         &self.out
     }
 
-    /// Copies the samples of each ray up to where less than [`DARK`] of its light is left, by the densities that were
-    /// evaluated last.
+    /// Truncates each ray where its transmittance falls below [`MIN_TRANSMITTANCE`], by the densities of the last
+    /// evaluation, and copies the remaining samples to `kept`.
     pub fn cut(&self, device: &Device, samples: &Samples, kept: &Samples) {
         let pass = |writes: bool| {
             launch!(device, cut::launch, groups(kept.counts.words().div_ceil(UNITS as usize)), UNITS;
@@ -513,7 +520,8 @@ impl Density {
         pass(true);
     }
 
-    /// Composites the samples that were evaluated last; their losses' gradients are for [`backward`](Density::backward).
+    /// Composites the samples of the last evaluation, and keeps the gradients of their losses for
+    /// [`backward`](Density::backward).
     pub fn losses(&self, device: &Device, samples: &Samples, batch: &Batch) {
         let offsets = &samples.offsets;
         launch!(device, tally::launch, CubeCount::new_single(), UNITS; offsets, self.tally);
@@ -527,7 +535,8 @@ impl Density {
         );
     }
 
-    /// Adds the gradient of the table, zero before, writes that of the weights, and says where it is not finite.
+    /// Adds the gradient with respect to the table, which must be zero before, writes that with respect to the weights, and
+    /// sets `broken` if the latter is not finite.
     pub fn backward(
         &self,
         device: &Device,
@@ -554,12 +563,13 @@ impl Density {
         self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);
     }
 
-    /// Squared error, smooth-L1 and distortion of the last step and what [`Losses::sums`](super::Losses::sums) has behind.
+    /// Returns squared error, smooth-L1 loss and distortion of the last step, followed by the sums over steps as in
+    /// [`Losses::sums`](super::Losses::sums).
     pub fn sums(&self) -> &Buffer {
         &self.sums
     }
 
-    /// Forgets the squared errors of the steps so far.
+    /// Resets the squared errors that are summed over steps.
     pub fn forget(&mut self, device: &Device) {
         self.sums = device.zeros::<f32>(TERMS + 2);
     }

@@ -1,18 +1,19 @@
-//! The hash encoding of [`crate::kernel::cpu::hash`]: features with Jacobian, and their scatter.
+//! The hash encoding of [`crate::kernel::cpu::hash`]: features with their Jacobian, and the scatter of
+//! their gradients.
 
 use super::device::{Atomics, Buffer, Device, MOST_GROUPS, Words, launch};
-use super::sum::{Exchange, Fixed, MOST, Native, Sum, group_sum};
+use super::sum::{Exchange, FIXED_POINT_RANGE, Fixed, Native, Sum, group_sum};
 use crate::kernel::cpu::hash::Level;
 use crate::kernel::cpu::mlp::TILE;
 use burn::cubecl::{self, prelude::*};
 
-/// Samples a group of threads handles.
+/// Number of samples per group of threads.
 const GROUP: u32 = 256;
 
-/// Groups of threads that bound the sums of a level.
+/// Number of groups of threads that compute the bound on the sums of a level.
 const BOUNDING: usize = 64;
 
-/// Words that describe a level: scale, resolution, entries, offset, whether it is hashed.
+/// Number of words that describe a level: scale, resolution, entries, offset, whether it is hashed.
 const LEVEL: usize = 5;
 
 /// The cell of a position at a level: its lowest corner and the position inside it.
@@ -26,7 +27,7 @@ struct Cell {
     fz: f32,
 }
 
-/// The cell of sample `s`.
+/// Returns the cell of sample `s`.
 #[cube]
 fn cell(levels: &[u32], level: usize, x: &[f32], s: usize, capacity: usize, world: f32) -> Cell {
     let scale = f32::reinterpret(levels[level * LEVEL]);
@@ -44,34 +45,35 @@ fn cell(levels: &[u32], level: usize, x: &[f32], s: usize, capacity: usize, worl
     }
 }
 
-/// The entry of a corner: bit 0 of `k` says +1 along x, bit 1 along y, bit 2 along z.
+/// Returns the entry of corner `k`, which lies at +1 along x if bit 0 is set, along y for bit 1 and along z for bit 2.
 #[cube]
 fn entry(levels: &[u32], level: usize, cell: &Cell, #[comptime] k: u32) -> usize {
     let (x, y, z) = (cell.low_x + (k & 1), cell.low_y + ((k >> 1) & 1), cell.low_z + (k >> 2));
     let entries = levels[level * LEVEL + 2];
     let r = levels[level * LEVEL + 1];
-    let own = if levels[level * LEVEL + 4] == 1 {
+    let index = if levels[level * LEVEL + 4] == 1 {
         (x ^ (y * 2_654_435_761u32) ^ (z * 805_459_861u32)) & (entries - 1)
     } else {
         (x + r * (y + r * z)) % entries
     };
-    (levels[level * LEVEL + 3] + own) as usize
+    (levels[level * LEVEL + 3] + index) as usize
 }
 
-/// The weight of a corner along one axis.
+/// Returns the weight of a corner along one axis.
 #[cube]
 fn along(f: f32, #[comptime] up: bool) -> f32 {
     if up { 0.5f32 + (f - 0.5f32) } else { 0.5f32 - (f - 0.5f32) }
 }
 
-/// The slope of that weight, times `v`.
+/// Returns `v` times the slope of that weight.
 #[cube]
 fn signed(v: f32, #[comptime] up: bool) -> f32 {
     if up { v } else { -v }
 }
 
-/// Features of all levels, planes `[2 · levels, capacity]`, and their slopes `[2 · levels · 3, capacity]`. Levels from
-/// `active` on read zero, and so do samples from `count[0]` to the end of the last tile.
+/// Writes features of all levels, planes `[2 · levels, capacity]`, and their slopes, planes
+/// `[2 · levels · 3, capacity]`. Levels from `active` on are zero, and so are samples from `count[0]` to the end of the
+/// last tile.
 #[cube(launch)]
 fn gather(
     table: &[Vector<f32, Const<2>>],
@@ -123,7 +125,7 @@ fn gather(
     }
 }
 
-/// Adds to the table what [`crate::kernel::cpu::hash::scatter`] adds.
+/// Adds the gradient with respect to the table: see [`crate::kernel::cpu::hash::scatter`].
 #[cube(launch)]
 fn scatter<S: Sum>(
     gradient: &[Atomic<S::Word>],
@@ -172,8 +174,9 @@ fn scatter<S: Sum>(
     }
 }
 
-/// A bound on the sums of a level, `[levels, BOUNDING]`: all that is added, as if it went to one entry. [`BOUNDING`]
-/// groups of threads a level, each over its own samples; in a fixed order.
+/// Writes partial sums of a bound on the sums of each level, `[levels, BOUNDING]`. The bound is the sum of all
+/// contributions, as if they went to one entry. Each level has [`BOUNDING`] groups of threads, each of which sums its own
+/// samples in a fixed order.
 #[cube(launch)]
 fn bound(
     levels: &[u32],
@@ -189,38 +192,38 @@ fn bound(
     let capacity = capacity as usize;
     let level = CUBE_POS_Y as usize;
     let slope = f32::reinterpret(levels[level * LEVEL]) * world;
-    let mut own = 0.0f32;
+    let mut sum = 0.0f32;
     for s in range_stepped(ABSOLUTE_POS_X as usize, count[0] as usize, BOUNDING * GROUP as usize) {
         let plane = 2 * level * capacity + s;
-        own += max(g_value[plane].abs(), g_value[plane + capacity].abs());
+        sum += max(g_value[plane].abs(), g_value[plane + capacity].abs());
         if slopes {
             let n = g_normal[s].abs() + g_normal[capacity + s].abs() + g_normal[2 * capacity + s].abs();
-            own += max(q[plane].abs(), q[plane + capacity].abs()) * n * slope;
+            sum += max(q[plane].abs(), q[plane + capacity].abs()) * n * slope;
         }
     }
-    let all = group_sum::<f32>(own, GROUP as usize);
+    let total = group_sum::<f32>(sum, GROUP as usize);
     if UNIT_POS == 0 {
-        partial[level * BOUNDING + CUBE_POS_X as usize] = all;
+        partial[level * BOUNDING + CUBE_POS_X as usize] = total;
     }
 }
 
-/// Steps per 1 in which the sums of a level are counted.
+/// Writes the scale of the fixed-point sums of each level: the number of integer steps per 1.
 #[cube(launch)]
-fn units_of(partial: &[f32], units: &mut [f32]) {
+fn fixed_point_scales(partial: &[f32], units: &mut [f32]) {
     let level = ABSOLUTE_POS;
     if level < units.len() {
-        let mut all = 0.0f32;
+        let mut total = 0.0f32;
         for i in 0..BOUNDING {
-            all += partial[level * BOUNDING + i];
+            total += partial[level * BOUNDING + i];
         }
-        // finite where nothing is added, too
-        units[level] = MOST / max(all, 1e-28f32);
+        // the lower bound keeps the scale finite if nothing is added
+        units[level] = FIXED_POINT_RANGE / max(total, 1e-28f32);
     }
 }
 
-/// Whole numbers become floats, in place.
+/// Converts the fixed-point sums to floats, in place.
 #[cube(launch)]
-fn settle(gradient: &mut [u32], levels: &[u32], units: &[f32]) {
+fn fixed_point_to_float(gradient: &mut [u32], levels: &[u32], units: &[f32]) {
     let level = CUBE_POS_Y as usize;
     let first = 2 * levels[level * LEVEL + 3] as usize;
     let end = first + 2 * levels[level * LEVEL + 2] as usize;
@@ -243,7 +246,7 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// The grid of these levels over `[-radius, radius]³`, of which the first `active` take part.
+    /// Creates a grid over `[-radius, radius]³`, of whose levels the first `active` are used.
     pub fn new(device: &Device, levels: &[Level], active: usize, radius: f32) -> Grid {
         let words = |l: &Level| {
             [l.scale.to_bits(), l.resolution, l.entries, l.offset as u32, u32::from(l.is_hashed())]
@@ -259,18 +262,18 @@ impl Grid {
         }
     }
 
-    /// How many of the levels take part from now on.
+    /// Sets the number of active levels.
     pub fn activate(&mut self, levels: usize) {
         assert!(levels <= self.count);
         self.active = levels;
     }
 
-    /// Writes features and, where asked for, their Jacobian by position.
+    /// Writes features and, if `jacobian` is given, their Jacobian with respect to position.
     ///
     /// # Shapes
     ///
-    /// - table: `[entries, 2]`; x: planes `[3, capacity]`; count: `[1]`, the samples there are
-    /// - value: planes `[2 · levels, capacity]`; jacobian: planes `[2 · levels · 3, capacity]`, zeros behind the last
+    /// - table: `[entries, 2]`; x: planes `[3, capacity]`; count: `[1]`, the number of samples
+    /// - value: planes `[2 · levels, capacity]`; jacobian: planes `[2 · levels · 3, capacity]`, zeros after the last
     ///   sample
     pub fn gather(
         &self,
@@ -289,13 +292,13 @@ impl Grid {
         );
     }
 
-    /// Adds the gradient of the table, zero before: see [`crate::kernel::cpu::hash::scatter`]. With [`Atomics::Fixed`] once
-    /// a step.
+    /// Adds the gradient with respect to the table, which must be zero before: see
+    /// [`crate::kernel::cpu::hash::scatter`]. With [`Atomics::Fixed`] it may be called only once per step.
     ///
     /// # Shapes
     ///
     /// - gradient: `[entries, 2]`; x: planes `[3, capacity]`; g_value: planes `[2 · levels, capacity]`
-    /// - slopes, where the Jacobian had a gradient: `q` as `g_value`, `g_normal` as `x`
+    /// - slopes, if the Jacobian has a gradient: `q`, shaped like `g_value`, and `g_normal`, shaped like `x`
     pub fn scatter(
         &self,
         device: &Device,
@@ -315,7 +318,7 @@ impl Grid {
                 capacity as u32, self.world, slopes.is_some()
             );
             let groups = CubeCount::new_1d((self.count as u32).div_ceil(GROUP));
-            launch!(device, units_of::launch, groups, GROUP; self.partial, self.units);
+            launch!(device, fixed_point_scales::launch, groups, GROUP; self.partial, self.units);
         }
         let scatter = match device.atomics() {
             Atomics::Native => scatter::launch::<Native>,
@@ -330,7 +333,7 @@ impl Grid {
         if fixed {
             let groups = (2 * self.largest as u32).div_ceil(GROUP).min(MOST_GROUPS);
             let count = CubeCount::Static(groups, self.active as u32, 1);
-            launch!(device, settle::launch, count, GROUP; gradient, self.levels, self.units);
+            launch!(device, fixed_point_to_float::launch, count, GROUP; gradient, self.levels, self.units);
         }
     }
 }
@@ -346,8 +349,8 @@ mod tests {
     const CAPACITY: usize = 1024;
     const RADIUS: f32 = 2.0;
 
-    /// The published grid but for its size, and samples anywhere in the box. Positions and scales have few digits, so
-    /// that their products are the same whether fused with what is added or not.
+    /// Returns the published grid with smaller tables, and samples anywhere in the box. Positions and scales have few
+    /// digits, so that multiply-add gives the same result whether it is fused or not.
     fn grid() -> (Vec<hash::Level>, Vec<[f32; 2]>, Vec<[f32; 3]>) {
         let mut levels = hash::levels(16, 16, 1.447, 12);
         levels.iter_mut().for_each(|l| l.scale = l.scale.round());
@@ -379,23 +382,23 @@ mod tests {
         let slopes: Vec<f32> =
             (0..n).flat_map(|l| planes(&jacobian[l * SAMPLES..][..SAMPLES], CAPACITY)).collect();
 
-        let on = Grid::new(&device, &levels, levels.len(), RADIUS);
+        let device_grid = Grid::new(&device, &levels, levels.len(), RADIUS);
         let (table, x) = (device.upload(table.as_flattened()), device.upload(&planes(&x, CAPACITY)));
         let (v, j) = (device.scratch::<f32>(want.len()), device.scratch::<f32>(slopes.len()));
         let count = device.upload(&[SAMPLES as u32]);
-        on.gather(&device, &table, &x, &count, &v, Some(&j));
+        device_grid.gather(&device, &table, &x, &count, &v, Some(&j));
         let (value, jacobian) = (device.read::<f32>(&v), device.read::<f32>(&j));
         for l in 0..n {
             let span = |planes: usize| l * planes * CAPACITY..(l + 1) * planes * CAPACITY;
             agree("hash features", &value[span(2)], &want[span(2)], 1e-5);
             agree("hash slopes", &jacobian[span(6)], &slopes[span(6)], 1e-5);
         }
-        on.gather(&device, &table, &x, &count, &v, None);
+        device_grid.gather(&device, &table, &x, &count, &v, None);
         assert_eq!(device.read::<f32>(&v), value);
     }
 
     #[test]
-    fn the_scatter_is_that_of_the_cpu_however_it_adds() {
+    fn the_scatter_is_that_of_the_cpu_with_all_atomics() {
         let (levels, table, x) = grid();
         let n = levels.len();
         let pair = |stream: u64| -> Vec<[f32; 2]> {
@@ -410,7 +413,7 @@ mod tests {
         let none = (vec![[0.0; 2]; q.len()], vec![[0.0; 3]; normal.len()]);
         let [want, want_values] = [wanted(&q, &normal), wanted(&none.0, &none.1)];
         for device in devices() {
-            let on = Grid::new(&device, &levels, levels.len(), RADIUS);
+            let device_grid = Grid::new(&device, &levels, levels.len(), RADIUS);
             let x = device.upload(&planes(&x, CAPACITY));
             let count = device.upload(&[SAMPLES as u32]);
             let level_planes = |v: &[[f32; 2]]| -> Vec<f32> {
@@ -421,7 +424,7 @@ mod tests {
             for (slopes, want) in [(Some([&q, &normal]), &want), (None, &want_values)] {
                 let once = || {
                     let gradient = device.zeros::<f32>(2 * table.len());
-                    on.scatter(&device, &gradient, &x, &count, &g, slopes);
+                    device_grid.scatter(&device, &gradient, &x, &count, &g, slopes);
                     device.read::<f32>(&gradient)
                 };
                 let got = once();
@@ -431,7 +434,7 @@ mod tests {
                     agree(&format!("{:?} scatter", device.atomics()), &got[span], want, 1e-5);
                 }
                 if device.atomics() == Atomics::Fixed {
-                    assert_eq!(got, once(), "whole numbers add to the same in any order");
+                    assert_eq!(got, once(), "fixed-point sums do not depend device_grid the order");
                 }
             }
         }

@@ -1,4 +1,4 @@
-//! What a training step of the signed-distance field minimizes, and its gradients: see [`crate::kernel::cpu::losses`].
+//! The training loss of the signed-distance field and its gradients: see [`crate::kernel::cpu::losses`].
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::Batch;
@@ -9,29 +9,30 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// How many rays met a sample, how many are all head, and how many there are. One group of threads.
+/// Counts the rays with samples, the rays whose pixel is entirely head, and all rays. Runs as one group of threads.
 #[cube(launch)]
 fn tally(offsets: &[u32], alpha: &[f32], alive: &[u32], out: &mut [u32]) {
     let unit = UNIT_POS as usize;
-    let mut met = 0u32;
-    let mut heads = 0u32;
+    let mut hit_rays = 0u32;
+    let mut head_rays = 0u32;
     let mut rays = 0u32;
     for r in range_stepped(unit, alpha.len(), UNITS as usize) {
         rays += alive[r];
-        met += select(offsets[r + 1] > offsets[r], 1u32, 0u32);
-        heads += select(alpha[r] > 0.999f32, alive[r], 0u32);
+        hit_rays += select(offsets[r + 1] > offsets[r], 1u32, 0u32);
+        head_rays += select(alpha[r] > 0.999f32, alive[r], 0u32);
     }
-    let met = group_sum::<u32>(met, UNITS as usize);
-    let heads = group_sum::<u32>(heads, UNITS as usize);
+    let hit_rays = group_sum::<u32>(hit_rays, UNITS as usize);
+    let head_rays = group_sum::<u32>(head_rays, UNITS as usize);
     let rays = group_sum::<u32>(rays, UNITS as usize);
     if unit == 0 {
-        out[0] = met;
-        out[1] = heads;
+        out[0] = hit_rays;
+        out[1] = head_rays;
         out[2] = rays;
     }
 }
 
-/// Terms of rays, planes `[3, rays]`, and gradients by what was composited, planes `[9, rays]`.
+/// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the composited values, planes
+/// `[9, rays]`.
 #[cube(launch)]
 fn of_rays(
     composed: &[f32],
@@ -51,38 +52,38 @@ fn of_rays(
     let r = ABSOLUTE_POS;
     if r < rays {
         let (opacity, a) = (composed[3 * rays + r], alpha[r]);
-        let there = f32::cast_from(alive[r]);
-        let met = select(offsets[r + 1] > offsets[r], 1.0f32, 0.0f32);
-        let share = met / (3.0f32 * max(f32::cast_from(tally[0]), 1.0f32));
-        let head = select(a > 0.999f32, there, 0.0f32) / (3.0f32 * max(f32::cast_from(tally[1]), 1.0f32));
+        let is_alive = f32::cast_from(alive[r]);
+        let is_hit = select(offsets[r + 1] > offsets[r], 1.0f32, 0.0f32);
+        let share = is_hit / (3.0f32 * max(f32::cast_from(tally[0]), 1.0f32));
+        let head = select(a > 0.999f32, is_alive, 0.0f32) / (3.0f32 * max(f32::cast_from(tally[1]), 1.0f32));
         let mut square = 0.0f32;
-        let mut own = composed[8 * rays + r];
+        let mut sample_error = composed[8 * rays + r];
         let mut g_opacity = 0.0f32;
         for c in 0..3usize {
-            let (h, b, seen) = (color[c * rays + r], background[c * rays + r], composed[c * rays + r]);
-            let e = seen + (1.0f32 - opacity) * b - (h + (1.0f32 - a) * b);
+            let (h, b, composited) = (color[c * rays + r], background[c * rays + r], composed[c * rays + r]);
+            let e = composited + (1.0f32 - opacity) * b - (h + (1.0f32 - a) * b);
             square += e * e;
-            own += h * h * opacity - 2.0f32 * h * seen;
+            sample_error += h * h * opacity - 2.0f32 * h * composited;
             let g = 2.0f32 * e * rgb_mse * share;
             g_out[c * rays + r] = g - 2.0f32 * h * rgb_sample * head;
             g_opacity += h * h * rgb_sample * head - b * g;
         }
         let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
-        let even = there / max(f32::cast_from(tally[2]), 1.0f32);
-        let cross = -(a * p.ln() + (1.0f32 - a) * (1.0f32 - p).ln()) * even;
-        let by_p = ((1.0f32 - a) / (1.0f32 - p) - a / p) * even * mask;
+        let ray_share = is_alive / max(f32::cast_from(tally[2]), 1.0f32);
+        let cross = -(a * p.ln() + (1.0f32 - a) * (1.0f32 - p).ln()) * ray_share;
+        let by_p = ((1.0f32 - a) / (1.0f32 - p) - a / p) * ray_share * mask;
         g_out[3 * rays + r] = g_opacity + select(p == opacity, by_p, 0.0f32);
         for k in 4..8usize {
             g_out[k * rays + r] = 0.0f32;
         }
         g_out[8 * rays + r] = rgb_sample * head;
         terms[r] = square * share;
-        terms[rays + r] = own * head;
+        terms[rays + r] = sample_error * head;
         terms[2 * rays + r] = cross;
     }
 }
 
-/// Terms of samples, planes `[2, capacity]`; adds their gradients by the field's output.
+/// Writes the loss terms of samples, planes `[2, capacity]`, and adds their gradients with respect to the field's output.
 #[cube(launch)]
 fn of_samples(
     field: &[f32],
@@ -96,25 +97,26 @@ fn of_samples(
     let plane = terms.len() / SAMPLE_TERMS;
     let s = ABSOLUTE_POS;
     if s < count[0] as usize {
-        let even = 1.0f32 / f32::cast_from(count[0]);
+        let share = 1.0f32 / f32::cast_from(count[0]);
         let f = field[s];
         let (x, y, z) = (field[plane + s], field[2 * plane + s], field[3 * plane + s]);
         let length = (x * x + y * y + z * z + 1e-12f32).sqrt();
-        let off = length - 1.0f32;
-        let g = 2.0f32 * off / length * even * eikonal;
+        let excess = length - 1.0f32;
+        let g = 2.0f32 * excess / length * share * eikonal;
         g_field[plane + s] += g * x;
         g_field[2 * plane + s] += g * y;
         g_field[3 * plane + s] += g * z;
-        let near = (-scale * f.abs()).exp() * even;
+        let closeness = (-scale * f.abs()).exp() * share;
         let sign = select(f > 0.0f32, 1.0f32, select(f < 0.0f32, -1.0f32, 0.0f32));
-        g_field[s] -= scale * sign * near * sparsity;
-        terms[s] = off * off * even;
-        terms[plane + s] = near;
+        g_field[s] -= scale * sign * closeness * sparsity;
+        terms[s] = excess * excess * share;
+        terms[plane + s] = closeness;
     }
 }
 
-/// Sums of the terms, in a fixed order, then the squared errors of all steps since zeros lay there, and how many of those
-/// met a sample. One group of threads a term; `met` counts the samples of the step.
+/// Sums the loss terms in a fixed order, one group of threads per term. Also adds the squared error of a step with samples
+/// to a sum over steps, and counts such steps. `count` is the number of rows of `of_samples`, `met` that of samples of
+/// the step.
 #[cube(launch)]
 pub(super) fn sum(
     of_rays: &[f32],
@@ -126,33 +128,33 @@ pub(super) fn sum(
 ) {
     let unit = UNIT_POS as usize;
     let term = CUBE_POS_X as usize;
-    let mut own = 0.0f32;
+    let mut sum = 0.0f32;
     if term < RAY_TERMS {
         let rays = of_rays.len() / RAY_TERMS;
         for r in range_stepped(unit, rays, UNITS as usize) {
-            own += of_rays[term * rays + r];
+            sum += of_rays[term * rays + r];
         }
     } else if term == RAY_TERMS + SAMPLE_TERMS {
         for p in range_stepped(unit, of_points.len(), UNITS as usize) {
-            own += of_points[p];
+            sum += of_points[p];
         }
     } else {
         let plane = of_samples.len() / SAMPLE_TERMS;
         for s in range_stepped(unit, count[0] as usize, UNITS as usize) {
-            own += of_samples[(term - RAY_TERMS) * plane + s];
+            sum += of_samples[(term - RAY_TERMS) * plane + s];
         }
     }
-    let all = group_sum::<f32>(own, UNITS as usize);
+    let total = group_sum::<f32>(sum, UNITS as usize);
     if unit == 0 {
-        out[term] = all;
+        out[term] = total;
         if term == 0 && met[0] > 0 {
-            out[TERMS] += all;
+            out[TERMS] += total;
             out[TERMS + 1] += 1.0f32;
         }
     }
 }
 
-/// The losses of up to so many rays and samples.
+/// The losses of a batch of rays and their samples, with the buffers for them.
 pub struct Losses {
     weights: LossWeights,
     tally: Buffer,
@@ -163,7 +165,7 @@ pub struct Losses {
 }
 
 impl Losses {
-    /// For so many rays and up to `capacity` samples.
+    /// Allocates buffers for `rays` rays and up to `capacity` samples.
     pub fn new(device: &Device, weights: LossWeights, rays: usize, capacity: usize) -> Losses {
         Losses {
             weights,
@@ -175,7 +177,8 @@ impl Losses {
         }
     }
 
-    /// Gradients by what [`Neus::forward`](super::Neus::forward) composited, planes `[9, rays]`; offsets: `[rays + 1]`.
+    /// Computes the losses of rays, and returns the gradients with respect to the output of
+    /// [`Neus::forward`](super::Neus::forward), planes `[9, rays]`. offsets: `[rays + 1]`.
     pub fn of_rays(&self, device: &Device, composed: &Buffer, batch: &Batch, offsets: &Buffer) -> &Buffer {
         let w = &self.weights;
         let Batch { color, alpha, background, alive, .. } = batch;
@@ -189,7 +192,8 @@ impl Losses {
         &self.g_out
     }
 
-    /// Adds the gradients of what is asked of each sample to those by the field's output, planes `[8, capacity]`.
+    /// Computes the losses of samples, and adds their gradients with respect to the field's output to `g_field`, planes
+    /// `[8, capacity]`.
     pub fn of_samples(&self, device: &Device, field: &Buffer, count: &Buffer, g_field: &Buffer) {
         let w = &self.weights;
         let capacity = self.sample_terms.words() / SAMPLE_TERMS;
@@ -198,20 +202,21 @@ impl Losses {
         );
     }
 
-    /// Sums the terms of a step: see [`sums`](Losses::sums).
+    /// Sums the loss terms of a step: see [`sums`](Losses::sums).
     pub fn add(&self, device: &Device, count: &Buffer, of_points: &Buffer) {
         launch!(device, sum::launch, CubeCount::new_1d(TERMS as u32), UNITS;
             self.ray_terms, self.sample_terms, of_points, count, count, self.sums
         );
     }
 
-    /// The terms of the last step, unweighted: in the order of [`LossWeights`], then those of points; then the squared errors
-    /// of all steps since [`forget`](Losses::forget), and how many of those met a sample: `[8]`.
+    /// Returns the sums, `[8]`: the unweighted loss terms of the last step in the order of [`LossWeights`], with that of
+    /// stereo points last; then the sum of the squared errors of all steps with samples since
+    /// [`forget`](Losses::forget), and the number of these steps.
     pub fn sums(&self) -> &Buffer {
         &self.sums
     }
 
-    /// Forgets the squared errors of the steps so far.
+    /// Resets the squared errors that are summed over steps.
     pub fn forget(&mut self, device: &Device) {
         self.sums = device.zeros::<f32>(TERMS + 2);
     }
@@ -246,7 +251,7 @@ mod tests {
         field: Vec<[f32; 8]>,
     }
 
-    /// Five rays, one without samples; of pixels that are head, background and between.
+    /// Returns five rays, one of them without samples, whose pixels are head, background and partly head.
     fn case() -> Case {
         let uniform = |stream: u64, i: usize| rng::uniform(9, stream, i as u64);
         let rows =
@@ -275,14 +280,14 @@ mod tests {
         }
     }
 
-    /// The terms in f64, and their weighted sum.
+    /// Returns the loss terms in f64, and their weighted sum.
     fn terms(case: &Case, field: &[f64], inv_s: f64) -> ([f64; 5], f64) {
         let sigmoid = |x: f64| 1.0 / (1.0 + (-x).exp());
         let mut t = [0f64; 5];
         let (met, heads, n) = (4.0, 3.0, 24.0);
         for r in 0..5 {
             let mut transmittance = 1.0;
-            let (mut seen, mut opacity, mut own) = ([0f64; 3], 0.0, 0.0);
+            let (mut composited, mut opacity, mut sample_error) = ([0f64; 3], 0.0, 0.0);
             let h = case.color[r].map(f64::from);
             for s in case.offsets[r] as usize..case.offsets[r + 1] as usize {
                 let f = &field[s * 8..][..8];
@@ -293,8 +298,8 @@ mod tests {
                 let (p, q) = (sigmoid((f[0] - half) * sharp), sigmoid((f[0] + half) * sharp));
                 let alpha = ((p - q + 1e-5) / (p + 1e-5)).clamp(0.0, 1.0);
                 let w = transmittance * alpha;
-                (0..3).for_each(|c| seen[c] += w * f[4 + c]);
-                own += w * (0..3).map(|c| (f[4 + c] - h[c]).powi(2)).sum::<f64>();
+                (0..3).for_each(|c| composited[c] += w * f[4 + c]);
+                sample_error += w * (0..3).map(|c| (f[4 + c] - h[c]).powi(2)).sum::<f64>();
                 opacity += w;
                 transmittance *= 1.0 - alpha;
                 t[3] += (length - 1.0).powi(2) / n;
@@ -304,12 +309,12 @@ mod tests {
             if case.offsets[r + 1] > case.offsets[r] {
                 for c in 0..3 {
                     let b = case.background[r][c] as f64;
-                    let e = seen[c] + (1.0 - opacity) * b - h[c] - (1.0 - a) * b;
+                    let e = composited[c] + (1.0 - opacity) * b - h[c] - (1.0 - a) * b;
                     t[0] += e * e / (3.0 * met);
                 }
             }
             if a == 1.0 {
-                t[1] += own / (3.0 * heads);
+                t[1] += sample_error / (3.0 * heads);
             }
             let p = opacity.clamp(1e-3, 1.0 - 1e-3);
             t[2] -= (a * p.ln() + (1.0 - a) * (1.0 - p).ln()) / 5.0;
@@ -323,7 +328,7 @@ mod tests {
     fn losses_and_gradients_agree_with_f64_finite_differences() {
         let Some(device) = device() else { return };
         let mut case = case();
-        // there is room for one ray more
+        // the buffers have capacity for one more ray, which is not alive
         case.direction.push([0.0; 3]);
         case.color.push([9.0; 3]);
         case.background.push([9.0; 3]);

@@ -1,5 +1,6 @@
-//! Marching through the occupancy bitmask of [`crate::kernel::cpu::march`], without the host knowing how many samples there
-//! are: a pass counts them, a prefix sum says where each ray's lie, a second pass writes them.
+//! Marching through the occupancy bitmask of [`crate::kernel::cpu::march`], without a readback of the number of samples: a
+//! first pass counts the samples of each ray, a prefix sum gives the offset of each ray, and a second pass writes the
+//! samples.
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::Batch;
@@ -8,28 +9,29 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Further than anything.
+/// A distance beyond any sample.
 const FAR: f32 = 1e30;
 
-/// A bit of a mask.
+/// Returns bit `i` of a mask.
 #[cube]
 pub(super) fn bit(mask: &[u32], i: u32) -> bool {
     (mask[(i >> 5) as usize] >> (i & 31)) & 1 == 1
 }
 
-/// The cell of a coordinate that counts cells.
+/// Returns the cell of a coordinate in units of cells, clamped to the grid.
 #[cube]
 fn cell(g: f32, top: i32) -> i32 {
     clamp(i32::cast_from(g.floor()), 0i32, top)
 }
 
-/// Where a ray enters and leaves the box along one axis.
+/// Interval of `t` in which a ray lies inside the box.
 #[derive(CubeType)]
 struct Span {
     enter: f32,
     leave: f32,
 }
 
+/// Intersects the interval with the extent of the box along one axis.
 #[cube]
 fn clipped(span: Span, o: f32, d: f32, radius: f32) -> Span {
     let mut enter = span.enter;
@@ -44,14 +46,14 @@ fn clipped(span: Span, o: f32, d: f32, radius: f32) -> Span {
     Span { enter, leave }
 }
 
-/// How far it is to the border of a cell along one axis, in cells along the ray.
+/// Returns the distance along the ray to the border of a cell along one axis, in units of cells.
 #[cube]
 fn border(g: f32, cell: i32, d: f32) -> f32 {
     let wall = f32::cast_from(cell + select(d > 0.0f32, 1i32, 0i32));
     select(d == 0.0f32, FAR, (wall - g) * (1.0f32 / d))
 }
 
-/// Counts a ray's samples or, once it is known where they lie, writes them.
+/// Counts the samples of rays or, if `writes` is set, writes them at the given offsets.
 #[cube(launch)]
 fn pass(
     mask: &[u32],
@@ -62,11 +64,11 @@ fn pass(
     alive: &mut [u32],
     offsets: &[u32],
     counts: &mut [u32],
-    pitch: &[f32],
+    step_length: &[f32],
     t: &mut [f32],
     dt: &mut [f32],
     x: &mut [f32],
-    toward: &mut [f32],
+    view_dir: &mut [f32],
     resolution: u32,
     radius: f32,
     limit: u32,
@@ -84,20 +86,20 @@ fn pass(
         let span = clipped(span, oz, dz, radius);
         let top = i32::cast_from(resolution) - 1;
         let scale = 0.5f32 * f32::cast_from(resolution) / radius;
-        let step = pitch[0];
+        let step = step_length[0];
         let start = span.enter + jitter[r] * step;
         let mut first = 0usize;
-        let mut most = limit;
+        let mut max_count = limit;
         if writes {
             first = offsets[r] as usize;
-            most = offsets[r + 1] - offsets[r];
-            if most < counts[r] {
+            max_count = offsets[r + 1] - offsets[r];
+            if max_count < counts[r] {
                 alive[r] = 0;
             }
         }
         let mut found = 0u32;
         let mut k = 0u32;
-        let mut marching = span.enter < span.leave && found < most && alive[r] == 1;
+        let mut marching = span.enter < span.leave && found < max_count && alive[r] == 1;
         while marching {
             // t = start + (k + ½) · step for integer k: computed, never accumulated
             let at = start + (f32::cast_from(k) + 0.5f32) * step;
@@ -117,13 +119,13 @@ fn pass(
                         x[s] = px;
                         x[plane + s] = py;
                         x[2 * plane + s] = pz;
-                        toward[s] = dx;
-                        toward[plane + s] = dy;
-                        toward[2 * plane + s] = dz;
+                        view_dir[s] = dx;
+                        view_dir[plane + s] = dy;
+                        view_dir[2 * plane + s] = dz;
                     }
                     found += 1;
                     k += 1;
-                    marching = found < most;
+                    marching = found < max_count;
                 } else {
                     let far = min(border(gx, cx, dx), min(border(gy, cy, dy), border(gz, cz, dz)));
                     let skip = max((max(far, 0.0f32) / (scale * step)).ceil(), 1.0f32);
@@ -140,7 +142,7 @@ fn pass(
     }
 }
 
-/// See [`prefix_sum`]. One group of threads.
+/// Computes [`prefix_sum`] with one group of threads.
 #[cube(launch)]
 fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
     let unit = UNIT_POS as usize;
@@ -148,19 +150,19 @@ fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
     let share = rays.div_ceil(UNITS as usize);
     let begin = min(unit * share, rays);
     let end = min(begin + share, rays);
-    let mut own = 0u32;
+    let mut sum = 0u32;
     for r in begin..end {
-        own += counts[r];
+        sum += counts[r];
     }
     let mut sums = Shared::<[u32]>::new_slice(UNITS as usize);
     let mut fit = Shared::<[u32]>::new_slice(UNITS as usize);
-    sums[unit] = own;
+    sums[unit] = sum;
     sync_cube();
     let mut before = 0u32;
     for i in 0..unit {
         before += sums[i];
     }
-    // the last border that fits, of this thread's rays and then of all
+    // the largest end of a ray that fits the capacity, over this thread's rays and then over all rays
     let mut last = 0u32;
     let mut at = before;
     for r in begin..end {
@@ -169,26 +171,27 @@ fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
     }
     fit[unit] = last;
     sync_cube();
-    let mut most = 0u32;
+    let mut fitting = 0u32;
     let mut wanted = 0u32;
     for i in 0..UNITS as usize {
-        most = max(most, fit[i]);
+        fitting = max(fitting, fit[i]);
         wanted += sums[i];
     }
     at = before;
     for r in begin..end {
-        offsets[r] = min(at, most);
+        offsets[r] = min(at, fitting);
         at += counts[r];
     }
     if unit == 0 {
-        offsets[rays] = most;
-        total[0] = most;
+        offsets[rays] = fitting;
+        total[0] = fitting;
         total[1] = wanted;
     }
 }
 
-/// Where each ray's samples begin, `[rays + 1]`, of their counts `[rays]`; and how many there are and would be with more
-/// room, `[2]`. A ray whose samples, with those before, are more than `capacity` gets none, and none behind it.
+/// Writes the offsets of each ray's samples, `[rays + 1]`, from their counts `[rays]`, and two totals, `[2]`: the number of
+/// samples, and the number with unlimited capacity. The first ray whose samples exceed the capacity, and all rays after
+/// it, get no samples.
 pub(super) fn prefix_sum(
     device: &Device,
     counts: &Buffer,
@@ -204,22 +207,22 @@ pub(super) fn prefix_sum(
 pub struct Samples {
     /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Buffer,
-    /// `[2]`: how many there are, and how many there would be with more room.
+    /// `[2]`: number of samples, and number of samples with unlimited capacity.
     pub count: Buffer,
     /// `[capacity]` midpoints.
     pub t: Buffer,
     /// `[capacity]` lengths.
     pub dt: Buffer,
-    /// Planes `[3, capacity]`, positions; finite behind the last.
+    /// Planes `[3, capacity]`, positions; finite after the last sample.
     pub x: Buffer,
-    /// Planes `[3, capacity]`, directions of their rays; finite behind the last.
+    /// Planes `[3, capacity]`, directions of the samples' rays; finite after the last sample.
     pub direction: Buffer,
-    /// `[rays]`: how many samples each has.
+    /// `[rays]`: number of samples of each ray.
     pub(super) counts: Buffer,
 }
 
 impl Samples {
-    /// Room for so many rays and `capacity` samples.
+    /// Allocates buffers for `rays` rays and `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> Samples {
         Samples {
             offsets: device.zeros::<u32>(rays + 1),
@@ -232,30 +235,31 @@ impl Samples {
         }
     }
 
-    /// Marches rays with steps of `pitch`, `[1]`: see [`crate::kernel::cpu::march::march`]. Rays beyond the room there is are
-    /// none from then on. The last `apart` places are left free.
+    /// Marches rays with steps of length `step_length`, `[1]`: see [`crate::kernel::cpu::march::march`]. Each ray keeps at
+    /// most `limit` samples. Rays whose samples exceed the capacity are marked as not alive. The last `reserved` places
+    /// of the buffers stay free.
     pub fn march(
         &self,
         device: &Device,
         occupancy: &Occupancy,
         rays: &Batch,
-        pitch: &Buffer,
+        step_length: &Buffer,
         limit: usize,
-        apart: usize,
+        reserved: usize,
     ) {
-        assert!(rays.rays() == self.counts.words() && apart < self.t.words());
-        let both = |writes: bool| {
+        assert!(rays.rays() == self.counts.words() && reserved < self.t.words());
+        let run_pass = |writes: bool| {
             launch!(device, pass::launch, groups(rays.rays().div_ceil(UNITS as usize)), UNITS;
                 occupancy.mask, occupancy.solid.as_ref().unwrap_or(&occupancy.mask), rays.origin,
-                rays.direction, rays.jitter, rays.alive, self.offsets, self.counts, pitch, self.t, self.dt,
+                rays.direction, rays.jitter, rays.alive, self.offsets, self.counts, step_length, self.t, self.dt,
                 self.x, self.direction;
                 occupancy.resolution as u32, occupancy.radius, limit.min(u32::MAX as usize) as u32, writes,
                 occupancy.solid.is_some()
             );
         };
-        both(false);
-        prefix_sum(device, &self.counts, &self.offsets, &self.count, self.t.words() - apart);
-        both(true);
+        run_pass(false);
+        prefix_sum(device, &self.counts, &self.offsets, &self.count, self.t.words() - reserved);
+        run_pass(true);
     }
 }
 
@@ -269,7 +273,8 @@ mod tests {
     const RADIUS: f32 = 1.1;
     const STEP: f32 = 0.02;
 
-    /// Rays from all around towards the middle, one along an axis and one that misses; a mask with holes.
+    /// Returns a mask with holes, solid cells, and rays from all around towards the center, one along an axis and one that
+    /// misses.
     fn scene() -> (Bitmask, Bitmask, Vec<MarchRay>) {
         let resolution = 24;
         let mut mask = Bitmask::filled(resolution, false);
@@ -302,7 +307,7 @@ mod tests {
         capacity: usize,
         limit: usize,
     ) -> (Samples, Vec<u32>) {
-        // room for some that are not there
+        // the buffers have capacity for more rays and samples than are used
         let samples = Samples::new(device, rays.len() + 5, capacity + 3);
         let batch = Batch::of_rays(device, rays, rays.len() + 5);
         samples.march(device, occupancy, &batch, &device.upload(&[STEP]), limit, 3);
@@ -330,18 +335,18 @@ mod tests {
     }
 
     #[test]
-    fn rays_beyond_the_room_get_no_samples() {
+    fn rays_beyond_the_capacity_get_no_samples() {
         let Some(device) = device() else { return };
         let (mask, _, rays) = scene();
         let whole = march(&mask, None, RADIUS, STEP, &rays, 1000).offsets;
         let occupancy = Occupancy::new(&device, &mask, None, RADIUS);
-        let room = whole[300] + 1; // the rays from 300 on, but for empty ones right there, do not fit
-        let (got, alive) = on_device(&device, &occupancy, &rays, room as usize, 1000);
-        let fits = *whole.iter().filter(|&&o| o <= room).max().unwrap();
+        let capacity = whole[300] + 1; // rays from 300 on do not fit, except empty ones that directly follow
+        let (got, alive) = on_device(&device, &occupancy, &rays, capacity as usize, 1000);
+        let fits = *whole.iter().filter(|&&o| o <= capacity).max().unwrap();
         let want: Vec<i32> = whole.iter().map(|&o| o.min(fits)).collect();
         assert_eq!(device.read::<i32>(&got.offsets)[..=rays.len()], want);
         assert_eq!(device.read::<i32>(&got.count), [fits, whole[rays.len()]]);
-        // those that did not fit are no rays any more, those that meet nothing are
+        // rays that did not fit are not alive any more, but rays without samples are
         assert!(
             (0..rays.len()).all(|r| (alive[r] == 1) == (whole[r + 1] <= fits || whole[r + 1] == whole[r]))
         );

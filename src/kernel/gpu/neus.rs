@@ -1,8 +1,8 @@
-//! NeuS compositing of ragged rays: see [`crate::kernel::cpu::neus`]. A thread takes a ray.
+//! NeuS compositing of ragged rays, one thread per ray: see [`crate::kernel::cpu::neus`].
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::sum::group_sum;
-use crate::kernel::cpu::neus::SHORTEST;
+use crate::kernel::cpu::neus::MIN_GRADIENT_NORM;
 use crate::kernel::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
 
@@ -10,10 +10,10 @@ const UNITS: u32 = 64;
 
 pub use crate::kernel::cpu::neus::RAY_WIDTH;
 
-/// ε of the opacity.
+/// ε in the formula of the opacity.
 const EPSILON: f32 = 1e-5;
 
-/// Opacity of one sample, and what its derivative needs.
+/// Opacity of one sample, with the intermediate values that its derivative needs.
 #[derive(CubeType)]
 struct Sample {
     alpha: f32,
@@ -34,26 +34,26 @@ fn sigmoid(v: f32) -> f32 {
     1.0f32 / (1.0f32 + (-v).exp())
 }
 
-/// Opacity between two sigmoids, not clipped yet.
+/// Returns the opacity between two sigmoids before it is clipped.
 #[cube]
 fn between(previous: f32, next: f32) -> f32 {
     (previous - next + EPSILON) / (previous + EPSILON)
 }
 
-/// Opacity of a march step head on at points, `[capacity]`: see [`neus::occupancy`](crate::kernel::cpu::neus::occupancy).
+/// Writes the opacity at points of a march step that meets the surface head-on, `[capacity]`: see [`neus::occupancy`](crate::kernel::cpu::neus::occupancy).
 #[cube(launch)]
 fn opacities(field: &[f32], inv_s: &[f32], count: &[u32], out: &mut [f32], step: f32) {
     let s = ABSOLUTE_POS;
     if s < count[0] as usize {
         let sharp = clamp(inv_s[0] * field[7 * out.len() + s].exp(), 1e-6f32, 1e6f32);
-        // seen head on, where the signed distance falls
+        // head-on the signed distance decreases along the ray
         let previous = sigmoid((field[s] + 0.5f32 * step) * sharp);
         let next = sigmoid((field[s] - 0.5f32 * step) * sharp);
         out[s] = clamp(between(previous, next), 0.0f32, 1.0f32);
     }
 }
 
-/// Sample `s` of a ray along `d`.
+/// Evaluates sample `s` of a ray in direction `(dx, dy, dz)`.
 #[cube]
 fn sample(
     field: &[f32],
@@ -95,7 +95,7 @@ fn sample(
     }
 }
 
-/// Composites; writes too how much light each sample receives.
+/// Composites rays, and writes the transmittance at each sample to `light`.
 #[cube(launch)]
 fn forward(
     offsets: &[u32],
@@ -152,7 +152,8 @@ fn forward(
     }
 }
 
-/// Gradients by the field's output, and by `ln inv_s` of each ray.
+/// Writes the gradients with respect to the field's output, and the contribution of each ray to that with respect to
+/// `ln inv_s`.
 #[cube(launch)]
 fn backward(
     offsets: &[u32],
@@ -177,13 +178,13 @@ fn backward(
         let (g4, g5) = (g_out[4 * rays + r], g_out[5 * rays + r]);
         let (g6, g7, g8) = (g_out[6 * rays + r], g_out[7 * rays + r], g_out[8 * rays + r]);
         let (begin, end) = (offsets[r] as usize, offsets[r + 1] as usize);
-        let mut behind = 0.0f32; // Σ_{j>k} w_j worth_j
+        let mut farther = 0.0f32; // Σ_{j>k} w_j g_w_j
         let mut sum = 0.0f32;
         for k in 0..end - begin {
             let s = end - 1 - k;
             let a = sample(field, plane, s, dt[s], dx, dy, dz, inv_s, anneal);
             let (c0, c1, c2) = (field[4 * plane + s], field[5 * plane + s], field[6 * plane + s]);
-            let worth = g0 * c0
+            let g_w = g0 * c0
                 + g1 * c1
                 + g2 * c2
                 + g8 * (c0 * c0 + c1 * c1 + c2 * c2)
@@ -197,9 +198,9 @@ fn backward(
             g_field[4 * plane + s] = w * (g0 + 2.0f32 * g8 * c0);
             g_field[5 * plane + s] = w * (g1 + 2.0f32 * g8 * c1);
             g_field[6 * plane + s] = w * (g2 + 2.0f32 * g8 * c2);
-            let g_alpha = transmittance * worth - behind / max(1.0f32 - a.alpha, 1e-10f32);
-            behind += w * worth;
-            // by the unit normal: as composited, and through the cosine
+            let g_alpha = transmittance * g_w - farther / max(1.0f32 - a.alpha, 1e-10f32);
+            farther += w * g_w;
+            // the gradient by the unit normal has two parts: as composited, and through the cosine
             let mut g_cos = 0.0f32;
             let mut g_sdf = 0.0f32;
             let mut ln = 0.0f32;
@@ -216,28 +217,29 @@ fn backward(
             g_field[7 * plane + s] = ln;
             sum += ln;
             let (nx, ny, nz) = (w * g5 + g_cos * dx, w * g6 + g_cos * dy, w * g7 + g_cos * dz);
-            let along = a.nx * nx + a.ny * ny + a.nz * nz;
-            let share = select(a.length > SHORTEST, 1.0f32 / a.length, 0.0f32);
-            g_field[plane + s] = (nx - a.nx * along) * share;
-            g_field[2 * plane + s] = (ny - a.ny * along) * share;
-            g_field[3 * plane + s] = (nz - a.nz * along) * share;
+            let radial = a.nx * nx + a.ny * ny + a.nz * nz;
+            let share = select(a.length > MIN_GRADIENT_NORM, 1.0f32 / a.length, 0.0f32);
+            g_field[plane + s] = (nx - a.nx * radial) * share;
+            g_field[2 * plane + s] = (ny - a.ny * radial) * share;
+            g_field[3 * plane + s] = (nz - a.nz * radial) * share;
         }
         g_ln[r] = sum;
     }
 }
 
-/// The gradient by `inv_s` from that of the rays by its logarithm, in a fixed order; zero where it was clamped.
+/// Sums the rays' gradients with respect to `ln inv_s` in a fixed order, and writes the gradient with respect to `inv_s`;
+/// it is zero if `inv_s` was clamped.
 #[cube(launch)]
 fn sharpness(g_ln: &[f32], inv_s: &[f32], g_inv_s: &mut [f32]) {
     let unit = UNIT_POS as usize;
-    let mut own = 0.0f32;
+    let mut sum = 0.0f32;
     for r in range_stepped(unit, g_ln.len(), UNITS as usize) {
-        own += g_ln[r];
+        sum += g_ln[r];
     }
-    let all = group_sum::<f32>(own, UNITS as usize);
+    let total = group_sum::<f32>(sum, UNITS as usize);
     if unit == 0 {
         let s = inv_s[0];
-        g_inv_s[0] = select(clamp(s, 1e-6f32, 1e6f32) == s, all / s, 0.0f32);
+        g_inv_s[0] = select(clamp(s, 1e-6f32, 1e6f32) == s, total / s, 0.0f32);
     }
 }
 
@@ -254,7 +256,7 @@ pub struct Rays<'a> {
     pub dt: &'a Buffer,
 }
 
-/// Compositing of up to so many rays and samples.
+/// Buffers of compositing and its gradients.
 pub struct Neus {
     out: Buffer,
     light: Buffer,
@@ -263,7 +265,7 @@ pub struct Neus {
 }
 
 impl Neus {
-    /// For so many rays and up to `capacity` samples.
+    /// Allocates buffers for `rays` rays and up to `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> Neus {
         Neus {
             out: device.scratch::<f32>(RAY_WIDTH * rays),
@@ -273,13 +275,13 @@ impl Neus {
         }
     }
 
-    /// What the last forward composited, planes `[9, rays]`.
+    /// Returns the output of the last forward pass, planes `[9, rays]`.
     pub fn output(&self) -> &Buffer {
         &self.out
     }
 
-    /// Opacities of march steps of length `step` head on at the first `count` points of a field's output, `[capacity]`; written
-    /// over by the next forward.
+    /// Returns the opacities, `[capacity]`, of march steps of length `step` that meet the surface head-on at the first
+    /// `count` points of a field's output. The next forward pass overwrites them.
     pub fn opacities(
         &self,
         device: &Device,
@@ -295,12 +297,12 @@ impl Neus {
         out
     }
 
-    /// What the last backward wrote, planes `[8, capacity]`.
+    /// Returns the gradients with respect to the field's output of the last backward pass, planes `[8, capacity]`.
     pub fn gradient(&self) -> &Buffer {
         &self.g_field
     }
 
-    /// Composites: planes `[9, rays]` of the field's planes `[8, capacity]`; inv_s: `[1]`.
+    /// Composites the field's output, planes `[8, capacity]`, and returns planes `[9, rays]`; inv_s: `[1]`.
     pub fn forward(
         &self,
         device: &Device,
@@ -315,8 +317,8 @@ impl Neus {
         &self.out
     }
 
-    /// Gradients by the field's output, planes `[8, capacity]` that count only where samples are, and by `inv_s`, of the
-    /// last forward.
+    /// Computes the gradients of the last forward pass. Returns those with respect to the field's output, planes
+    /// `[8, capacity]`, which are valid for existing samples only, and writes that with respect to `inv_s` to `g_inv_s`.
     pub fn backward(
         &self,
         device: &Device,
@@ -344,27 +346,36 @@ mod tests {
     use super::*;
     use crate::kernel::cpu::{neus, rng};
 
-    /// Runs both and returns (device, CPU): rays' values, gradients by field, by inv_s.
-    type Found = (Vec<f32>, Vec<f32>, f32);
+    /// Composited values, gradient by the field's output, gradient by `inv_s`.
+    type Results = (Vec<f32>, Vec<f32>, f32);
 
-    fn both(
+    /// Runs forward and backward pass, and returns the results of the device and of the CPU.
+    fn device_and_cpu(
         device: &Device,
         rays: neus::Rays,
         field: &[[f32; WIDTH]],
         inv_s: f32,
         anneal: f32,
         g: &[[f32; RAY_WIDTH]],
-    ) -> [Found; 2] {
+    ) -> [Results; 2] {
         let (n, count) = (field.len(), rays.direction.len());
-        let on = Neus::new(device, count, n);
+        let device_neus = Neus::new(device, count, n);
         let (offsets, direction) =
             (device.upload(rays.offsets), device.upload(&planes(rays.direction, count)));
         let (t, dt) = (device.upload(rays.t), device.upload(rays.dt));
-        let there = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
-        let (on_field, on_s) = (device.upload(&planes(field, n)), device.upload(&[inv_s]));
-        let out = device.read(on.forward(device, there, &on_field, &on_s, anneal));
+        let device_rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let (device_field, device_inv_s) = (device.upload(&planes(field, n)), device.upload(&[inv_s]));
+        let out = device.read(device_neus.forward(device, device_rays, &device_field, &device_inv_s, anneal));
         let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros::<f32>(1));
-        let g_field = device.read(on.backward(device, there, &on_field, &on_s, anneal, &g_out, &g_s));
+        let g_field = device.read(device_neus.backward(
+            device,
+            device_rays,
+            &device_field,
+            &device_inv_s,
+            anneal,
+            &g_out,
+            &g_s,
+        ));
         let flat = field.as_flattened();
         let want = neus::forward(rays, flat, inv_s, anneal);
         let (want_field, want_s) = neus::backward(rays, flat, inv_s, anneal, g.as_flattened());
@@ -408,10 +419,10 @@ mod tests {
         let g: Vec<[f32; RAY_WIDTH]> =
             (0..200).map(|r| std::array::from_fn(|k| normal(5, RAY_WIDTH * r + k))).collect();
         for (inv_s, anneal) in [(20.0, 0.0), (60.0, 0.4), (200.0, 1.0)] {
-            let [got, want] = both(&device, rays, &field, inv_s, anneal, &g);
+            let [got, want] = device_and_cpu(&device, rays, &field, inv_s, anneal, &g);
             agree("rays", &got.0, &want.0, 1e-4);
             for k in 0..8 {
-                // that by the sdf is a difference of nearly equal numbers, no better known on the CPU
+                // the gradient by the sdf is a difference of nearly equal numbers, which is no more accurate on the CPU
                 let tolerance = if k == 0 { 2e-4 } else { 1e-4 };
                 let (got, want) = (&got.1[k * n..][..n], &want.1[k * n..][..n]);
                 agree(&format!("gradient by output {k}"), got, want, tolerance);
@@ -432,7 +443,7 @@ mod tests {
                 for slope in [0.0, 1e-12, 2e-6, 1.0, 1e6] {
                     let sample = |k: usize| [sdf, slope, -0.5 * slope, 0.0, 0.5, 0.5, 0.5, -(k as f32)];
                     let field: Vec<[f32; 8]> = (0..4).map(sample).collect();
-                    let [(out, g_field, g_s), _] = both(&device, rays, &field, inv_s, 1.0, &g);
+                    let [(out, g_field, g_s), _] = device_and_cpu(&device, rays, &field, inv_s, 1.0, &g);
                     assert!(
                         out.iter().all(|v| v.is_finite() && v.abs() < 2.0),
                         "{inv_s} {sdf} {slope} {out:?}"

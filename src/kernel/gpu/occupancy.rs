@@ -1,4 +1,4 @@
-//! Which cells may hold surface, looked at again on the device: the rule of a band around the zero set, and nerfacc's.
+//! Updates of the occupancy grid on the device, by a band around the zero level set or by nerfacc's rule.
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::sdf::Sdf;
@@ -18,20 +18,20 @@ fn center(index: u32, cell: f32, radius: f32) -> f32 {
     (f32::cast_from(index) + 0.5f32) * cell - radius
 }
 
-/// Centers of some of the cells.
+/// Writes the centers of `batch` cells, starting at cell number `first` of the list.
 #[cube(launch)]
 fn centers(
     cells: &[u32],
     x: &mut [f32],
     count: &mut [u32],
     first: u32,
-    here: u32,
+    batch: u32,
     resolution: u32,
     radius: f32,
 ) {
     let s = ABSOLUTE_POS;
     let plane = x.len() / 3;
-    if s < here as usize {
+    if s < batch as usize {
         let i = cells[first as usize + s];
         let cell = 2.0f32 * radius / f32::cast_from(resolution);
         x[s] = center(i / (resolution * resolution), cell, radius);
@@ -39,46 +39,47 @@ fn centers(
         x[2 * plane + s] = center(i % resolution, cell, radius);
     }
     if s == 0 {
-        count[0] = here;
+        count[0] = batch;
     }
 }
 
-/// How far from a cell's center the band reaches where the surface is as soft as `share` of the sharpest.
+/// Returns the reach of the band around a cell's center, where the local sharpness is `share` times the maximum.
 #[cube]
 fn reach_at(band: f32, inv_s: f32, share: f32, half: f32) -> f32 {
     band / (clamp(inv_s, 1e-6f32, 1e6f32) * share) + half
 }
 
-/// Keeps distance and reach of the cells that were evaluated; no reach but the least where softness does not matter.
+/// Stores the signed distance and the reach of the evaluated cells. The reach is 0 where even the softest surface would
+/// be too far away.
 #[cube(launch)]
-fn keep(
+fn store(
     cells: &[u32],
     field: &[f32],
     inv_s: &[f32],
     value: &mut [f32],
     reach: &mut [f32],
     first: u32,
-    here: u32,
+    batch: u32,
     band: f32,
     soften: f32,
     half: f32,
 ) {
     let s = ABSOLUTE_POS;
-    if s < here as usize {
+    if s < batch as usize {
         let plane = field.len() / 8;
         let i = cells[first as usize + s] as usize;
         let f = field[s];
         let widest = reach_at(band, inv_s[0], 1.0f32 / soften, half);
-        let mut own = 0.0f32;
+        let mut cell_reach = 0.0f32;
         if soften > 1.0f32 && f.abs() < widest {
-            own = reach_at(band, inv_s[0], field[7 * plane + s].exp(), half);
+            cell_reach = reach_at(band, inv_s[0], field[7 * plane + s].exp(), half);
         }
         value[i] = f;
-        reach[i] = own;
+        reach[i] = cell_reach;
     }
 }
 
-/// Decides about 32 cells a thread.
+/// Writes the occupied and solid cells; each thread handles 32 cells, one word of the masks.
 #[cube(launch)]
 fn decide(
     allowed: &[u32],
@@ -96,7 +97,7 @@ fn decide(
         let least = reach_at(band, inv_s[0], 1.0f32, half);
         let cells = resolution * resolution * resolution;
         let mut kept = 0u32;
-        let mut deep = 0u32;
+        let mut inside = 0u32;
         for bit in 0..32u32 {
             let i = u32::cast_from(word) * 32 + bit;
             if i < cells && (allowed[word] >> bit) & 1 == 1 {
@@ -121,16 +122,17 @@ fn decide(
                 if f.abs() < widest || crossed {
                     kept |= 1u32 << bit;
                 } else if f < 0.0f32 {
-                    deep |= 1u32 << bit;
+                    inside |= 1u32 << bit;
                 }
             }
         }
         mask[word] = kept;
-        solid[word] = deep;
+        solid[word] = inside;
     }
 }
 
-/// Which cells of a cubic grid over `[-radius, radius]³` may hold surface, and which are solid, on a device.
+/// Masks on a device of the cells of a cubic grid over `[-radius, radius]³` that may contain surface, and of those that
+/// are solid.
 pub struct Occupancy {
     pub(super) mask: Buffer,
     pub(super) solid: Option<Buffer>,
@@ -138,32 +140,33 @@ pub struct Occupancy {
     pub(super) radius: f32,
 }
 
-/// Bits as words of a device.
+/// Converts 64-bit words to the 32-bit words of a device.
 pub(super) fn words(bits: &[u64]) -> Vec<u32> {
     bits.iter().flat_map(|&w| [w as u32, (w >> 32) as u32]).collect()
 }
 
 impl Occupancy {
-    /// Of these masks.
+    /// Uploads masks.
     pub fn new(device: &Device, mask: &Bitmask, solid: Option<&Bitmask>, radius: f32) -> Occupancy {
         assert!(solid.is_none_or(|s| s.resolution == mask.resolution));
-        let there = |mask: &Bitmask| device.upload(&words(&mask.bits));
-        Occupancy { mask: there(mask), solid: solid.map(there), resolution: mask.resolution, radius }
+        let upload = |mask: &Bitmask| device.upload(&words(&mask.bits));
+        Occupancy { mask: upload(mask), solid: solid.map(upload), resolution: mask.resolution, radius }
     }
 
-    /// Waits for the device and reads both: the one to march through and the solid one, empty where there is none.
+    /// Waits for the device and returns both masks: the occupied cells and the solid ones; the latter mask is empty if
+    /// there is none on the device.
     pub fn read(&self, device: &Device) -> Result<[Bitmask; 2]> {
         let mut masks = [Bitmask::filled(self.resolution, false), Bitmask::filled(self.resolution, false)];
-        for (mask, there) in masks.iter_mut().zip([Some(&self.mask), self.solid.as_ref()]) {
-            let Some(there) = there else { continue };
-            let words = device.fetch::<u32>(there)?;
+        for (mask, buffer) in masks.iter_mut().zip([Some(&self.mask), self.solid.as_ref()]) {
+            let Some(buffer) = buffer else { continue };
+            let words = device.fetch::<u32>(buffer)?;
             mask.bits = words.as_chunks().0.iter().map(|[a, b]| *a as u64 | (*b as u64) << 32).collect();
         }
         Ok(masks)
     }
 }
 
-/// The rule of a band around the zero set: see [`crate::kernel::cpu::occupancy::update_band`].
+/// Update rule of a band around the zero level set: see [`crate::kernel::cpu::occupancy::update_band`].
 pub struct Band {
     cells: Buffer,
     allowed: Buffer,
@@ -174,14 +177,14 @@ pub struct Band {
 }
 
 impl Band {
-    /// Never beyond `allowed`.
+    /// Creates the rule; cells outside `allowed` are never occupied.
     pub fn new(device: &Device, allowed: &Bitmask, rule: BandRule) -> Band {
         let total = allowed.resolution.pow(3);
         let cells: Vec<u32> = (0..total).filter(|&i| allowed.get(i)).map(|i| i as u32).collect();
         Band {
             cells: device.upload(&cells),
             allowed: device.upload(&words(&allowed.bits)),
-            // no sign where nothing is asked
+            // cells that are not evaluated stay 0, which has no sign
             value: device.zeros::<f32>(total),
             reach: device.zeros::<f32>(total),
             count: device.zeros::<u32>(2),
@@ -189,7 +192,8 @@ impl Band {
         }
     }
 
-    /// Looks at the field again. Of `x` and `direction`, planes `[3, capacity]`, the first is written over; `inv_s` is `[1]`.
+    /// Evaluates the field at all allowed cells and updates the masks. `x` and `direction` are planes `[3, capacity]`, of
+    /// which `x` is overwritten; `inv_s` is `[1]`.
     pub fn update(
         &self,
         device: &Device,
@@ -201,17 +205,17 @@ impl Band {
         let (resolution, radius) = (occupancy.resolution as u32, occupancy.radius);
         let half = 0.5 * 3f32.sqrt() * 2.0 * radius / resolution as f32;
         let capacity = x.words() / 3;
-        let solid = occupancy.solid.as_ref().expect("the rule of a band knows the inside");
+        let solid = occupancy.solid.as_ref().expect("the rule of a band needs a solid mask");
         for first in (0..self.cells.words()).step_by(capacity) {
-            let here = capacity.min(self.cells.words() - first);
-            let over = groups(here.div_ceil(UNITS as usize));
-            launch!(device, centers::launch, over.clone(), UNITS;
-                self.cells, x, self.count; first as u32, here as u32, resolution, radius
+            let batch = capacity.min(self.cells.words() - first);
+            let group_count = groups(batch.div_ceil(UNITS as usize));
+            launch!(device, centers::launch, group_count.clone(), UNITS;
+                self.cells, x, self.count; first as u32, batch as u32, resolution, radius
             );
             let out = field.forward(device, table, flat, x, direction, &self.count);
-            launch!(device, keep::launch, over, UNITS;
+            launch!(device, store::launch, group_count, UNITS;
                 self.cells, out, inv_s, self.value, self.reach;
-                first as u32, here as u32, self.rule.width, self.rule.soften, half
+                first as u32, batch as u32, self.rule.width, self.rule.soften, half
             );
         }
         launch!(device, decide::launch, groups(occupancy.mask.words().div_ceil(UNITS as usize)), UNITS;

@@ -1,7 +1,7 @@
-//! Points that the surface should pass through, found by stereo: some of them are evaluated with the samples of each
-//! step, behind them.
+//! Stereo points, which the surface should pass through. Each step draws some of them and evaluates them together with its
+//! samples, after which they are stored.
 //!
-//! With `f` the distance at a point, `p` the length of a pixel there and `w` its weight, the mean over the points of a
+//! With `f` the distance at a point, `p` the length of a pixel at the point, and `w` its weight, the mean over the points of a
 //! step of `w (√((f / p)² + k²) − k)`.
 
 use super::device::{Buffer, Device, Words, groups, launch};
@@ -13,51 +13,53 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Numbers of a point: position, length of a pixel, weight.
+/// Number of floats of a point: position (3), length of a pixel, weight.
 const ROW: usize = 5;
 
+/// Draws points and writes them after the samples of a step; the total number goes to `total`.
 #[cube(launch)]
 fn append(
     rows: &[f32],
     count: &[u32],
-    both: &mut [u32],
+    total: &mut [u32],
     drawn: &mut [u32],
     x: &mut [f32],
-    toward: &mut [f32],
-    of: u32,
-    points: u32,
+    view_dir: &mut [f32],
+    available: u32,
+    per_step: u32,
     high: u32,
     low: u32,
 ) {
     let i = ABSOLUTE_POS;
     let plane = x.len() / 3;
     let first = count[0];
-    // a step without samples is none
-    let there = select(first > 0, points, 0u32);
-    if i < there as usize {
-        let which = below(high, low, u32::cast_from(i), of);
+    // a step without samples gets no points either
+    let points = select(first > 0, per_step, 0u32);
+    if i < points as usize {
+        let which = below(high, low, u32::cast_from(i), available);
         drawn[i] = which;
         let s = first as usize + i;
         #[unroll]
         for axis in 0..3usize {
             x[axis * plane + s] = rows[which as usize * ROW + axis];
         }
-        // nobody looks at their color
-        toward[s] = 0.0f32;
-        toward[plane + s] = 0.0f32;
-        toward[2 * plane + s] = 1.0f32;
+        // any direction will do, because the color of points is not used
+        view_dir[s] = 0.0f32;
+        view_dir[plane + s] = 0.0f32;
+        view_dir[2 * plane + s] = 1.0f32;
     }
     if i == 0 {
-        both[0] = first + there;
+        total[0] = first + points;
     }
 }
 
+/// Writes the loss terms of points, `[points]`, and the gradients with respect to the field's output at the points.
 #[cube(launch)]
 fn of_points(
     rows: &[f32],
     drawn: &[u32],
     count: &[u32],
-    both: &[u32],
+    total: &[u32],
     field: &[f32],
     g_field: &mut [f32],
     terms: &mut [f32],
@@ -66,18 +68,18 @@ fn of_points(
 ) {
     let i = ABSOLUTE_POS;
     let plane = field.len() / comptime!(WIDTH);
-    let there = (both[0] - count[0]) as usize;
+    let points = (total[0] - count[0]) as usize;
     if i < terms.len() {
         let mut term = 0.0f32;
-        if i < there {
+        if i < points {
             let s = count[0] as usize + i;
             let row = drawn[i] as usize * ROW;
-            let even = rows[row + 4] / f32::cast_from(there);
+            let share = rows[row + 4] / f32::cast_from(points);
             let pixel = 1.0f32 / rows[row + 3];
-            let off = field[s] * pixel;
-            let root = (off * off + knee * knee).sqrt();
-            term = even * (root - knee);
-            g_field[s] = weight * even * off / root * pixel;
+            let offset = field[s] * pixel;
+            let root = (offset * offset + knee * knee).sqrt();
+            term = share * (root - knee);
+            g_field[s] = weight * share * offset / root * pixel;
             #[unroll]
             for k in 1..8usize {
                 g_field[k * plane + s] = 0.0f32;
@@ -87,66 +89,68 @@ fn of_points(
     }
 }
 
-/// Points on a device, of which each step draws some.
+/// Stereo points on a device, of which each step draws some.
 pub struct SurfacePoints {
     rows: Buffer,
     count: usize,
     weights: LossWeights,
     drawn: Buffer,
     terms: Buffer,
-    both: Buffer,
+    total: Buffer,
 }
 
 impl SurfacePoints {
-    /// No points yet; up to `most` a step.
-    pub fn new(device: &Device, most: usize, weights: &LossWeights) -> SurfacePoints {
+    /// Creates an empty set of points, of which each step draws `max_per_step`.
+    pub fn new(device: &Device, max_per_step: usize, weights: &LossWeights) -> SurfacePoints {
         SurfacePoints {
             rows: device.zeros::<f32>(ROW),
             count: 0,
             weights: *weights,
-            drawn: device.zeros::<u32>(most),
-            terms: device.zeros::<f32>(most),
-            both: device.zeros::<u32>(1),
+            drawn: device.zeros::<u32>(max_per_step),
+            terms: device.zeros::<f32>(max_per_step),
+            total: device.zeros::<u32>(1),
         }
     }
 
-    /// These from now on: positions in field coordinates, length of a pixel there, weight.
-    pub fn put(&mut self, device: &Device, rows: &[[f32; ROW]]) {
+    /// Replaces the points. Each row holds the position in field coordinates, the length of a pixel at the point, and the
+    /// weight.
+    pub fn set(&mut self, device: &Device, rows: &[[f32; ROW]]) {
         self.count = rows.len();
-        self.terms = device.zeros::<f32>(self.most());
+        self.terms = device.zeros::<f32>(self.max_per_step());
         if self.count > 0 {
             self.rows = device.upload(rows.as_flattened());
         }
     }
 
-    /// How many samples of a step they may be.
-    pub fn most(&self) -> usize {
+    /// Returns the number of points that a step draws.
+    pub fn max_per_step(&self) -> usize {
         self.terms.words()
     }
 
-    /// Draws some by seed and step, behind a step's samples, and returns how many there are with them, `[1]`.
+    /// Draws points by seed and step, writes them after the step's samples, and returns the number of samples and points,
+    /// `[1]`.
     pub fn append(&self, device: &Device, (seed, step): (u64, u64), samples: &Samples) -> &Buffer {
         let [high, low] = stream(seed, step << 4 | STEREO_STREAM);
-        launch!(device, append::launch, groups(self.most().div_ceil(UNITS as usize)), UNITS;
-            self.rows, samples.count, self.both, self.drawn, samples.x, samples.direction;
-            self.count as u32, if self.count > 0 { self.most() as u32 } else { 0 }, high, low
+        launch!(device, append::launch, groups(self.max_per_step().div_ceil(UNITS as usize)), UNITS;
+            self.rows, samples.count, self.total, self.drawn, samples.x, samples.direction;
+            self.count as u32, if self.count > 0 { self.max_per_step() as u32 } else { 0 }, high, low
         );
-        &self.both
+        &self.total
     }
 
-    /// Writes the gradients of a step's points by the field's output behind those of its samples, planes
-    /// `[8, capacity]`.
+    /// Writes the gradients with respect to the field's output at a step's points, after those of its samples, planes
+    /// `[8, capacity]`. `count` is the number of samples without points.
     pub fn losses(&self, device: &Device, field: &Buffer, count: &Buffer, g_field: &Buffer) {
         if self.count == 0 {
             return;
         }
-        launch!(device, of_points::launch, groups(self.most().div_ceil(UNITS as usize)), UNITS;
-            self.rows, self.drawn, count, self.both, field, g_field, self.terms;
+        launch!(device, of_points::launch, groups(self.max_per_step().div_ceil(UNITS as usize)), UNITS;
+            self.rows, self.drawn, count, self.total, field, g_field, self.terms;
             self.weights.stereo, self.weights.knee
         );
     }
 
-    /// What each point of the last step adds to the loss, unweighted.
+    /// Returns the unweighted contribution of each point of the last step to the loss, `[max_per_step]`.
     pub fn terms(&self) -> &Buffer {
         &self.terms
     }
@@ -159,7 +163,7 @@ mod tests {
     use crate::kernel::cpu::rng;
 
     #[test]
-    fn points_stand_behind_the_samples_and_pull_the_surface() {
+    fn points_follow_the_samples_and_have_the_gradients_of_their_loss() {
         let Some(device) = device() else { return };
         const PLANE: usize = 64;
         let rows: Vec<[f32; 5]> =
@@ -171,9 +175,9 @@ mod tests {
         );
         let mut samples = Samples::new(&device, 4, PLANE);
         samples.count = device.upload(&[40u32, 40]);
-        // none are there yet
+        // the set is empty at first
         assert_eq!(device.read::<u32>(points.append(&device, (3, 9), &samples)), [40]);
-        points.put(&device, &rows);
+        points.set(&device, &rows);
         assert_eq!(device.read::<u32>(points.append(&device, (3, 9), &samples)), [60]);
         let which: Vec<usize> =
             (0..20).map(|i| rng::below(3, 9 << 4 | STEREO_STREAM, i, 7) as usize).collect();
@@ -198,7 +202,7 @@ mod tests {
         let slope = |i: usize| (3.0 * (each(i, 1e-7) - each(i, -1e-7)) / 2e-7) as f32;
         let g = device.read::<f32>(&g);
         agree("points' gradients", &g[40..60], &(0..20).map(slope).collect::<Vec<_>>(), 1e-5);
-        // those of samples stay, the others' are none
+        // gradients of samples do not change, and those by a point's other outputs are zero
         assert!(g[..40].iter().all(|&g| g == 7.0) && g[PLANE + 40..PLANE + 60].iter().all(|&g| g == 0.0));
         // a step without samples has no points
         samples.count = device.upload(&[0u32, 0]);

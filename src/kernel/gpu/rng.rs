@@ -1,5 +1,5 @@
-//! The random numbers of [`crate::kernel::cpu::rng`], bit by bit: 64-bit words as two of 32 bits, which is what every adapter
-//! has.
+//! The random numbers of [`crate::kernel::cpu::rng`], with the same bits. 64-bit words are pairs of 32-bit words, because not
+//! every adapter has 64-bit integers.
 
 use crate::kernel::cpu::rng;
 use burn::cubecl::{self, prelude::*};
@@ -11,22 +11,22 @@ pub(super) struct Wide {
     pub low: u32,
 }
 
-/// The lower 64 bits of a product.
+/// Returns the lower 64 bits of a product.
 #[cube]
 fn times(a: Wide, #[comptime] high: u32, #[comptime] low: u32) -> Wide {
     Wide { high: u32::mul_hi(a.low, low) + a.low * high + a.high * low, low: a.low * low }
 }
 
-/// A word and itself, moved to the right by less than 32 bits, bit by bit exclusive.
+/// Returns `a ^ (a >> bits)`, for `bits` below 32.
 #[cube]
-fn folded(a: Wide, #[comptime] bits: u32) -> Wide {
+fn xor_shifted(a: Wide, #[comptime] bits: u32) -> Wide {
     Wide {
         high: a.high ^ (a.high >> bits),
         low: a.low ^ ((a.low >> bits) | (a.high << comptime!(32 - bits))),
     }
 }
 
-/// 64 random bits for a draw of a stream that [`stream`] prepared.
+/// Returns 64 random bits for number `index` of a stream, whose key [`stream`] returns.
 #[cube]
 pub(super) fn bits(high: u32, low: u32, index: u32) -> Wide {
     let step = times(Wide { high: 0u32, low: index }, 0x9e37_79b9u32, 0x7f4a_7c15u32);
@@ -35,15 +35,15 @@ pub(super) fn bits(high: u32, low: u32, index: u32) -> Wide {
     mix(Wide { high: high + step.high + carry, low: sum })
 }
 
-/// SplitMix64's finalizer.
+/// Returns SplitMix64's finalizer of a word.
 #[cube]
 fn mix(z: Wide) -> Wide {
-    let z = folded(z, 30u32);
-    let z = folded(times(z, 0xbf58_476du32, 0x1ce4_e5b9u32), 27u32);
-    folded(times(z, 0x94d0_49bbu32, 0x1331_11ebu32), 31u32)
+    let z = xor_shifted(z, 30u32);
+    let z = xor_shifted(times(z, 0xbf58_476du32, 0x1ce4_e5b9u32), 27u32);
+    xor_shifted(times(z, 0x94d0_49bbu32, 0x1331_11ebu32), 31u32)
 }
 
-/// Where `i` of `0..n`, n > 0, goes in the order of [`rng::Permutation`].
+/// Returns number `i` of the permutation of `0..n`, n > 0, of [`rng::Permutation`].
 #[cube]
 pub(super) fn permuted(key: Wide, half_bits: u32, i: u32, n: u32) -> u32 {
     let lower = (1u32 << half_bits) - 1;
@@ -66,13 +66,13 @@ pub(super) fn permuted(key: Wide, half_bits: u32, i: u32, n: u32) -> u32 {
     x
 }
 
-/// A uniform number in [0, 1).
+/// Returns a uniform number in [0, 1).
 #[cube]
 pub(super) fn uniform(high: u32, low: u32, index: u32) -> f32 {
     f32::cast_from(bits(high, low, index).high >> 8) / 16_777_216.0f32
 }
 
-/// A uniform integer in `0..n`, n > 0.
+/// Returns a uniform integer in `0..n`, n > 0.
 #[cube]
 pub(super) fn below(high: u32, low: u32, index: u32, n: u32) -> u32 {
     let drawn = bits(high, low, index);
@@ -81,9 +81,9 @@ pub(super) fn below(high: u32, low: u32, index: u32, n: u32) -> u32 {
     u32::mul_hi(drawn.high, n) + select(sum < middle, 1u32, 0u32)
 }
 
-/// What all draws of a stream share, mixed once: high and low word.
+/// Returns the key of a stream, which all of its numbers share: high and low word.
 pub(super) fn stream(seed: u64, stream: u64) -> [u32; 2] {
-    let mixed = rng::of_stream(seed, stream);
+    let mixed = rng::stream_key(seed, stream);
     [(mixed >> 32) as u32, mixed as u32]
 }
 
@@ -99,9 +99,9 @@ mod tests {
         let count = out.len() / 4;
         if i < count {
             let index = u32::cast_from(i) * 7_919;
-            let all = bits(high, low, index);
-            out[i] = all.high;
-            out[count + i] = all.low;
+            let random = bits(high, low, index);
+            out[i] = random.high;
+            out[count + i] = random.low;
             out[2 * count + i] = below(high, low, index, n);
             out[3 * count + i] = u32::reinterpret(uniform(high, low, index));
         }

@@ -1,4 +1,5 @@
-//! What a step takes from the one before it, without asking the host: how many rays, and how long a march step is.
+//! State that a training step takes from the previous one, without a readback: the number of rays and the length of a
+//! march step.
 
 use super::device::{Buffer, Device, Words, launch};
 use crate::Result;
@@ -6,6 +7,7 @@ use crate::kernel::cpu::losses::TERMS;
 use crate::kernel::cpu::schedule::{Figures, RayBudget, StepLength};
 use burn::cubecl::{self, prelude::*};
 
+/// Computes the number of rays and the length of a march step for the next training step.
 #[cube(launch)]
 fn advance(
     inv_s: &[f32],
@@ -17,8 +19,8 @@ fn advance(
     shortest: f32,
     longest: f32,
     budget: f32,
-    least: u32,
-    most: u32,
+    min_rays: u32,
+    max_rays: u32,
     first: u32,
 ) {
     if ABSOLUTE_POS == 0 {
@@ -32,13 +34,13 @@ fn advance(
                 blind[0] = 0;
                 let fitting =
                     u32::cast_from((f32::cast_from(rays[0]) * (budget / f32::cast_from(wanted))).floor());
-                rays[0] = clamp((9 * rays[0] + min(fitting, most * 10)) / 10, least, most);
+                rays[0] = clamp((9 * rays[0] + min(fitting, max_rays * 10)) / 10, min_rays, max_rays);
             }
         }
     }
 }
 
-/// Everything that the host asks for at once.
+/// Collects all results of a step in one buffer, so that one readback is enough.
 #[cube(launch)]
 fn collect(
     losses: &[f32],
@@ -62,24 +64,24 @@ fn collect(
     }
 }
 
-/// What [`Losses`](super::Losses) sums up.
+/// Number of sums of [`Losses`](super::Losses).
 const SUMS: usize = TERMS + 2;
 
-/// What a step takes from the one before it.
+/// The number of rays and the length of a march step, updated on the device.
 pub struct Schedule {
     rule: StepLength,
     budget: RayBudget,
-    /// `[1]`: rays of this step.
+    /// `[1]`: number of rays of the current step.
     pub rays: Buffer,
-    /// `[1]`: length of its march step.
+    /// `[1]`: length of a march step in the current step, in field units.
     pub step_length: Buffer,
-    /// `[1]`: steps in a row before it that met no sample.
+    /// `[1]`: number of consecutive steps without a sample, before the current one.
     blind: Buffer,
     figures: Buffer,
 }
 
 impl Schedule {
-    /// Starts with so many rays.
+    /// Creates a schedule whose first step has `rays` rays.
     pub fn new(device: &Device, rule: StepLength, budget: RayBudget, rays: usize) -> Schedule {
         Schedule {
             rule,
@@ -91,8 +93,8 @@ impl Schedule {
         }
     }
 
-    /// Looks at the sharpness and, unless it is the first one, at the samples of the last step: how many there were and
-    /// how many there would have been with more room, `[2]`.
+    /// Prepares the next step, from the sharpness and, unless it is the first step, from `count`, `[2]`: the number of
+    /// samples of the last step, and the number with unlimited capacity.
     pub fn advance(&self, device: &Device, inv_s: &Buffer, count: &Buffer, first: bool) {
         let RayBudget { samples, min, max } = self.budget;
         let [units, shortest, longest] = match self.rule {
@@ -105,14 +107,15 @@ impl Schedule {
         );
     }
 
-    /// Waits for the device and returns the rays of the next step, after one of these samples where one was made.
+    /// Waits for the device and returns the number of rays of the next step. `count` is the number of samples of the last
+    /// step, `[2]`, or `None` before the first one.
     pub fn next_rays(&self, device: &Device, count: Option<&Buffer>) -> Result<usize> {
         let rays = device.fetch::<u32>(&self.rays)?[0] as usize;
         let wanted = count.map(|count| device.fetch::<u32>(count)).transpose()?;
         Ok(wanted.map_or(rays, |wanted| self.budget.next(rays, wanted[1] as usize)))
     }
 
-    /// Waits for the device; what the last step came to, in one readback.
+    /// Waits for the device and returns the results of the last step, in one readback.
     pub fn figures(
         &self,
         device: &Device,
@@ -134,7 +137,7 @@ impl Schedule {
             variance: f32::from_bits(words[SUMS]),
             samples,
             rays: self.budget.next(rays, samples),
-            // counted on the device when the next step begins
+            // the device counts the last step only when the next one begins
             blind: if samples == 0 { u64::from(words[SUMS + 3]) + 1 } else { 0 },
             broken: words[SUMS + 4] != 0,
         })
@@ -153,7 +156,7 @@ mod tests {
         let rule = StepLength::OfSharpness { units: 1.0, min: 0.004, max: 0.05 };
         let schedule = Schedule::new(&device, rule, budget, 256);
         let inv_s = device.upload(&[100f32]);
-        // 100 samples a ray, worked out by hand in `kernel::cpu::schedule`
+        // 100 samples per ray; the sequence is worked out by hand in `kernel::cpu::schedule`
         let mut rays = 256;
         for (k, want) in [256, 492, 704, 895, 1067, 1222, 1361].into_iter().enumerate() {
             let count = device.upload(&[0, 100 * rays]);
@@ -162,13 +165,13 @@ mod tests {
             assert!(rays.abs_diff(want) <= 1, "{rays} {want}");
         }
         assert_eq!(device.read::<f32>(&schedule.step_length), [0.01]);
-        // without samples nothing changes, but is counted
+        // steps without samples keep the number of rays, and are counted
         let none = device.upload(&[0u32, 0]);
         (0..3).for_each(|_| schedule.advance(&device, &device.upload(&[1e-3f32]), &none, false));
         let losses: [f32; TERMS] = std::array::from_fn(|i| i as f32);
-        let there = device.upload(&[&losses[..], &[0.5, 2.0]].concat());
+        let device_losses = device.upload(&[&losses[..], &[0.5, 2.0]].concat());
         let figures = |count: &Buffer, broken: u32| {
-            schedule.figures(&device, &there, &inv_s, count, &device.upload(&[broken])).unwrap()
+            schedule.figures(&device, &device_losses, &inv_s, count, &device.upload(&[broken])).unwrap()
         };
         let (samples, rays, blind) = (0, rays as usize, 4);
         let want =

@@ -1,11 +1,11 @@
-//! The signed-distance field of [`crate::kernel::cpu::sdf`], whose module holds the formulas: forward with normals, and the
-//! backward with its second-order path.
+//! The signed-distance field of [`crate::kernel::cpu::sdf`], whose module holds the formulas: the forward pass with
+//! normals, and the backward pass with its second-order path.
 //!
-//! A group of 256 threads takes 64 samples through all layers. Activations stand in workgroup memory, channel by
-//! channel; a thread holds four samples of four channels. Weights, 90 kB, are read where they lie: all groups read the
-//! same, so they stay in the nearest cache and leave workgroup memory to two tiles of activations (32 KiB). Gradients
-//! of weights are summed by group, then over the groups in their order. The backward is two kernels, one a network:
-//! as one, a software driver takes ten times as long to compile it.
+//! A group of 256 threads evaluates all layers for 64 samples. Activations are kept in workgroup memory, channel by
+//! channel; a thread holds four samples of four channels. Weights, 90 kB, are read from global memory: all groups read
+//! the same ones, so they stay in the nearest cache, and workgroup memory is free for two tiles of activations (32 KiB).
+//! Gradients of weights are summed by group, then over the groups in a fixed order. The backward pass is two kernels, one
+//! per network, because a software driver takes ten times as long to compile a single one.
 
 pub(super) mod kernels;
 
@@ -16,50 +16,51 @@ use crate::kernel::cpu::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
 use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
 use kernels::{color_backward, forward, geometry_backward, prepare, reduce};
 
-/// Groups that sum gradients of weights, each over its own tiles.
+/// Maximum number of groups that sum gradients of weights, each over its own tiles.
 pub(super) const SUMMING: usize = 256;
 
-/// The first channel of the normal among the inputs of the color network.
+/// First channel of the normal among the inputs of the color network.
 const NORMAL: usize = OUTPUTS + 16;
 
-/// Where the matrices of a field stand, in rows of 64 floats: weights in the orders in which they are read, and
-/// gradients row-major as the CPU's. Geometry columns are `[hash, x]`.
+/// Offsets of the matrices of a field, in rows of 64 floats. Weights are stored in the orders in which they are read,
+/// gradients row-major like on the CPU. Geometry columns are `[hash, x]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct Plan {
-    /// Hash features: two a level.
+    /// Number of hash features: two per level.
     features: usize,
-    /// Inputs of the geometry network, padded.
+    /// Number of inputs of the geometry network, padded.
     padded: usize,
-    /// Inputs of the color network, padded.
+    /// Number of inputs of the color network, padded.
     color: usize,
+    /// Whether the color network also reads the hash features.
     skip: bool,
 }
 
 impl Plan {
-    /// Is there room for the inputs of both networks in a tile?
+    /// Returns whether a tile can hold the inputs of each network.
     fn fits(layout: Layout) -> bool {
         layout.padded() + OUTPUTS <= CHANNELS && layout.color_padded() <= CHANNELS
     }
 
     fn new(layout: Layout) -> Plan {
         let (padded, color) = (layout.padded(), layout.color_padded());
-        assert!(Plan::fits(layout), "the field has more levels than a tile has room");
+        assert!(Plan::fits(layout), "the field has more levels than a tile can hold");
         Plan { features: layout.inputs - 3, padded, color, skip: layout.color_skip }
     }
 
-    /// First rows of W1ᵀ, W1, b1, W2, b2 (each four times), C1ᵀ, C1, C2ᵀ, C2, C3, and the end.
+    /// Returns the first rows of W1ᵀ, W1, b1, W2, b2 (each value four times), C1ᵀ, C1, C2ᵀ, C2, C3, and the end.
     fn rows(&self) -> [usize; 11] {
         let counts = [self.padded, HIDDEN, 1, OUTPUTS, 1, self.color, HIDDEN, HIDDEN, HIDDEN, 3];
         ends(counts)
     }
 
-    /// First rows of the gradients of W1, b1, W2, b2, C1, C2, C3, and the end.
+    /// Returns the first rows of the gradients of W1, b1, W2, b2, C1, C2, C3, and the end.
     fn gradients(&self) -> [usize; 8] {
         ends([HIDDEN, 1, OUTPUTS, 1, HIDDEN, HIDDEN, 3])
     }
 
-    /// For each float of the prepared weights the one of the flat vector, and for each of the flat vector the one of
-    /// the gradients: `u32::MAX` where there is none.
+    /// Returns two index maps: for each float of the prepared weights its index in the flat vector, or `u32::MAX` for
+    /// padding; and for each float of the flat vector its index in the gradients.
     fn maps(&self, layout: Layout) -> (Vec<u32>, Vec<u32>) {
         let (rows, gradients) = (self.rows(), self.gradients());
         let mut prepared = vec![u32::MAX; rows[10] * CHANNELS];
@@ -67,10 +68,10 @@ impl Plan {
         let mut flat = 0;
         for (part, (outputs, inputs)) in layout.shapes().into_iter().enumerate() {
             for (o, i) in (0..outputs).flat_map(|o| (0..inputs).map(move |i| (o, i))) {
-                // the geometry network reads [hash, x], its weights say [x, hash]
+                // the kernels read [hash, x], but the flat weights are ordered [x, hash]
                 let c = if part == 0 { (i + inputs - 3) % inputs } else { i };
                 let float = |row: usize, column: usize| row * CHANNELS + column;
-                let [own, turned] = match part {
+                let [original, transposed] = match part {
                     0 => [Some(float(rows[1] + o, c)), Some(float(rows[0] + c, o))],
                     1 => [Some(float(rows[2], o)), None],
                     2 => [Some(float(rows[3] + o, c)), None],
@@ -79,7 +80,7 @@ impl Plan {
                     5 => [Some(float(rows[8] + o, c)), Some(float(rows[7] + c, o))],
                     _ => [Some(float(rows[9] + o, c)), None],
                 };
-                own.into_iter().chain(turned).for_each(|at| prepared[at] = flat);
+                original.into_iter().chain(transposed).for_each(|at| prepared[at] = flat);
                 if part == 3 {
                     (0..4).for_each(|k| prepared[float(rows[4], 4 * o + k)] = flat);
                 }
@@ -93,12 +94,12 @@ impl Plan {
     }
 }
 
-/// Running sums, from 0.
+/// Returns running sums of `counts`, from 0.
 pub(super) fn ends<const N: usize, const M: usize>(counts: [usize; N]) -> [usize; M] {
     std::array::from_fn(|i| counts[..i].iter().sum())
 }
 
-/// A signed-distance field on a device, and what its forward keeps for its backward, for up to `capacity` samples.
+/// A signed-distance field on a device, with the activations and gradients of up to `capacity` samples.
 pub struct Sdf {
     plan: Plan,
     grid: Grid,
@@ -123,12 +124,13 @@ pub struct Sdf {
 }
 
 impl Sdf {
-    /// Can a device compute a field of this shape? Not one of some twenty levels.
+    /// Returns whether a device can compute a field of this shape; about twenty levels are too many.
     pub fn supports(shape: &FieldShape) -> bool {
         Plan::fits(shape.layout())
     }
 
-    /// For up to `capacity` samples, a multiple of [`TILE`], of a field that it [`supports`](Sdf::supports).
+    /// Allocates buffers for up to `capacity` samples, a multiple of [`TILE`], of a shape that it
+    /// [`supports`](Sdf::supports).
     pub fn new(device: &Device, shape: &FieldShape, capacity: usize) -> Sdf {
         assert!(capacity.is_multiple_of(TILE) && capacity > 0);
         let layout = shape.layout();
@@ -159,33 +161,34 @@ impl Sdf {
         }
     }
 
-    /// Words of memory that a sample takes: all of them, and of the largest buffer.
+    /// Returns the memory per sample in words: the total, and that of the largest buffer.
     pub fn words_per_sample(shape: &FieldShape) -> [usize; 2] {
         let features = 2 * shape.levels.len();
         [6 * features + 3 * HIDDEN + 2 * OUTPUTS + WIDTH + 3, HIDDEN.max(3 * features)]
     }
 
-    /// Words of memory that sums of groups take, however many samples there are.
+    /// Returns the memory of the groups' partial gradient sums in words, which does not depend on the number of samples.
     pub fn words_of_sums(shape: &FieldShape) -> usize {
         SUMMING * Plan::new(shape.layout()).gradients()[7] * CHANNELS
     }
 
-    /// What the last forward computed, planes `[8, capacity]`.
+    /// Returns the output of the last forward pass, planes `[8, capacity]`.
     pub fn output(&self) -> &Buffer {
         &self.out
     }
 
-    /// How many of the levels take part from now on.
+    /// Sets the number of active levels.
     pub fn activate(&mut self, levels: usize) {
         self.grid.activate(levels);
     }
 
-    /// Sdf, gradient and color of samples, and what the backward needs: see [`crate::kernel::cpu::sdf::forward`].
+    /// Evaluates sdf, gradient and color of samples, and keeps the activations that the backward pass needs: see
+    /// [`crate::kernel::cpu::sdf::forward`].
     ///
     /// # Shapes
     ///
     /// - table: `[entries, 2]`; flat: the weights as [`Layout`] describes
-    /// - x, direction: planes `[3, capacity]`, finite behind the last sample; count: `[1]`, the samples there are
+    /// - x, direction: planes `[3, capacity]`, finite after the last sample; count: `[1]`, the number of samples
     /// - output: planes `[8, capacity]`
     pub fn forward(
         &self,
@@ -199,8 +202,8 @@ impl Sdf {
         self.shade(device, [table, flat], x, direction, None, count)
     }
 
-    /// As [`Sdf::forward`]; where normals are given, planes `[3, capacity]`, color sees those, and the output has them in
-    /// place of the gradient.
+    /// Evaluates samples like [`Sdf::forward`]. If normals are given, planes `[3, capacity]`, they replace the gradient both
+    /// as inputs of the color network and in the output.
     pub fn shade(
         &self,
         device: &Device,
@@ -227,13 +230,13 @@ impl Sdf {
         &self.out
     }
 
-    /// Adds the gradient of the table, zero before, and writes that of the weights: see
-    /// [`crate::kernel::cpu::sdf::backward`]. Of the samples of the last forward.
+    /// Adds the gradient with respect to the table, which must be zero before, and writes that with respect to the weights,
+    /// for the samples of the last forward pass: see [`crate::kernel::cpu::sdf::backward`].
     ///
     /// # Shapes
     ///
     /// - g_out: planes `[8, capacity]`
-    /// - g_table: `[entries, 2]`; g_flat: as the weights
+    /// - g_table: `[entries, 2]`; g_flat: shaped like the weights
     pub fn backward(
         &self,
         device: &Device,
@@ -246,15 +249,15 @@ impl Sdf {
     ) {
         assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
         assert!(g_out.words() == WIDTH * self.capacity);
-        let groups_of = groups(SUMMING.min(self.capacity / TILE));
+        let summing_groups = groups(SUMMING.min(self.capacity / TILE));
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
-            launch!(device, color_backward::launch_unchecked, groups_of.clone(), UNITS;
+            launch!(device, color_backward::launch_unchecked, summing_groups.clone(), UNITS;
                 self.weights, self.value, direction, count, self.o, self.c1, self.c2, self.out, g_out,
                 self.g_o, self.g_normal, self.g_value, self.partial;
                 self.soften, self.plan
             );
-            launch!(device, geometry_backward::launch_unchecked, groups_of, UNITS;
+            launch!(device, geometry_backward::launch_unchecked, summing_groups, UNITS;
                 self.weights, self.value, self.jacobian, x, count, self.h, self.g_o, self.g_normal,
                 self.g_value, self.partial;
                 self.inv_radius, self.plan

@@ -1,40 +1,40 @@
-//! Sums of many threads: into one place by [`Atomics`](super::Atomics), and of a group in a fixed order.
+//! Sums over threads: atomic addition to one word, by [`Atomics`](super::Atomics), and sums over a group in a fixed order.
 
 use burn::cubecl::{self, prelude::*};
 
-/// Steps that the bound on a sum is counted in: what is left up to 2³¹ takes the rounding of 10⁸ terms.
-pub const MOST: f32 = 2e9;
+/// Integer to which the bound on a fixed-point sum is scaled. The margin up to 2³¹ allows for the rounding of 10⁸ terms.
+pub const FIXED_POINT_RANGE: f32 = 2e9;
 
-/// Returns the sum over the threads of a group, in their order, to the first of them.
+/// Returns the sum over the threads of a group, in their order, to the first thread; the others get 0.
 #[cube]
-pub fn group_sum<N: Numeric>(own: N, #[comptime] units: usize) -> N {
-    let mut all = Shared::<[N]>::new_slice(units);
-    all[UNIT_POS as usize] = own;
+pub fn group_sum<N: Numeric>(value: N, #[comptime] units: usize) -> N {
+    let mut values = Shared::<[N]>::new_slice(units);
+    values[UNIT_POS as usize] = value;
     sync_cube();
     let mut sum = N::from_int(0);
     if UNIT_POS == 0 {
         for i in 0..units {
-            sum += all[i];
+            sum += values[i];
         }
     }
     sum
 }
 
-/// A word that threads add floats to.
+/// A way to add floats to one word from many threads.
 #[cube]
 pub trait Sum: Send + Sync + 'static {
-    /// What lies in memory.
+    /// Type of the word in memory.
     type Word: CubePrimitive;
 
-    /// Adds `v`, where words count it in steps of `1 / unit`.
+    /// Adds `v`; fixed-point words count steps of `1 / unit`.
     fn add(word: &Atomic<Self::Word>, v: f32, unit: f32);
 }
 
-/// [`Atomics::Native`](super::Atomics::Native).
+/// Addition by [`Atomics::Native`](super::Atomics::Native).
 pub struct Native;
-/// [`Atomics::Exchange`](super::Atomics::Exchange).
+/// Addition by [`Atomics::Exchange`](super::Atomics::Exchange).
 pub struct Exchange;
-/// [`Atomics::Fixed`](super::Atomics::Fixed).
+/// Fixed-point addition by [`Atomics::Fixed`](super::Atomics::Fixed).
 pub struct Fixed;
 
 #[cube]
@@ -51,12 +51,12 @@ impl Sum for Exchange {
     type Word = u32;
 
     fn add(word: &Atomic<u32>, v: f32, _unit: f32) {
-        // takes what lies there, puts it back with its own, and goes on with what came between: a weak comparison may
-        // fail without telling so
-        let mut own = v;
-        while own != 0.0f32 {
+        // Each iteration takes the value of the word and leaves 0, writes back the sum, and continues with whatever other
+        // threads wrote in between. A weak compare-exchange could fail spuriously without reporting it.
+        let mut pending = v;
+        while pending != 0.0f32 {
             let found = f32::reinterpret(word.exchange(0u32));
-            own = f32::reinterpret(word.exchange(u32::reinterpret(found + own)));
+            pending = f32::reinterpret(word.exchange(u32::reinterpret(found + pending)));
         }
     }
 }

@@ -1,39 +1,40 @@
-//! Products of tiles in workgroup memory, by 256 threads.
+//! Matrix products of tiles in workgroup memory, by 256 threads.
 //!
-//! Four samples are a vector, and a tile is so many `lanes` of vectors times [`channels`] of them: 64 samples times 64
-//! channels, or 32 times 128. Thread `(row, column)` owns vector `row` of channels `4 column .. 4 column + 4`: a
-//! [`Block`]. Weights lie in rows of as many floats as a tile has channels, `[inputs, channels]`.
+//! A vector holds four samples of a channel. A tile has `lanes` vectors for each of its [`channels`]: it is 64 samples
+//! times 64 channels, or 32 times 128. Thread `(row, column)` owns vector `row` of channels `4 column .. 4 column + 4`, a
+//! [`Block`]. Weights are stored in rows with as many floats as a tile has channels, `[inputs, channels]`.
 
 use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 
-/// Channels of a tile of [`LANES`].
+/// Number of channels of a tile with [`LANES`] vectors per channel.
 pub const CHANNELS: usize = channels(LANES);
-/// Vectors of a channel in a tile of 64 samples.
+/// Number of vectors per channel in a tile of 64 samples.
 pub const LANES: usize = 16;
-/// Threads that share a tile.
+/// Number of threads that work on a tile.
 pub const UNITS: u32 = 256;
 
-/// Threads that share a row, and vectors in a row of weights.
+/// Returns the number of threads per row of a tile, which is also the number of vectors in a row of weights.
 pub const fn columns(lanes: usize) -> usize {
     UNITS as usize / lanes
 }
 
-/// Channels of a tile.
+/// Returns the number of channels of a tile.
 pub const fn channels(lanes: usize) -> usize {
     4 * columns(lanes)
 }
 
-/// Where a channel's vector lies: neighboring channels in different banks, read along channels or along samples.
+/// Returns the index of a channel's vector in a tile. The layout puts neighboring channels in different banks, whether a
+/// tile is read along channels or along samples.
 #[cube]
 pub fn at(channel: usize, row: usize, #[comptime] lanes: usize) -> usize {
     channel * lanes + (row ^ (channel % lanes))
 }
 
-/// The first word of `count`, through a tile that nothing lies in yet. All threads read it there behind a barrier: FXC,
-/// the older compiler of DX12, refuses barriers in loops and branches whose condition it reads from a buffer. Tiles
-/// take all the memory that a group has on some adapters, so the word is two whole numbers in floats.
+/// Returns the first word of `count`, which all threads read from a tile that is not in use yet, after a barrier. FXC, the
+/// older compiler of DX12, rejects barriers in loops and branches whose condition comes from a buffer. On some adapters
+/// tiles take all of the workgroup memory, so the word is passed as two integers in the floats of a tile.
 #[cube]
 pub fn uniform_count(count: &[u32], tile: &mut [F4]) -> usize {
     if UNIT_POS == 0 {
@@ -61,12 +62,12 @@ pub struct Block {
 
 #[cube]
 impl Block {
-    /// Of four channels' vectors.
+    /// Creates a block from the vectors of four channels.
     pub fn of(c0: F4, c1: F4, c2: F4, c3: F4) -> Block {
         Block { c0, c1, c2, c3 }
     }
 
-    /// One channel.
+    /// Returns the vector of channel `j`, 0..4.
     pub fn channel(&self, #[comptime] j: usize) -> F4 {
         match j {
             0 => self.c0,
@@ -77,7 +78,7 @@ impl Block {
     }
 }
 
-/// `Σ_k a[first + k] · w[k]` over `k` channels.
+/// Returns a thread's block of `Σ_p a[first + p] · w[from + p]` over `k` channels.
 #[cube]
 pub fn product(
     a: &[F4],
@@ -104,10 +105,10 @@ pub fn product(
     Block::of(c0, c1, c2, c3)
 }
 
-/// Output `column` of a layer of few outputs from all channels; its weights are `[outputs, channels]`. Beyond the last,
-/// zero.
+/// Returns output `column` of a layer with few outputs, whose inputs are all channels; its weights are
+/// `[outputs, channels]`. Columns after the last output get zero.
 #[cube]
-pub fn narrow(
+pub fn output_layer(
     a: &[F4],
     w: &[F4],
     #[comptime] from: usize,
@@ -129,14 +130,16 @@ pub fn narrow(
     sum
 }
 
-/// Four vectors, one of each of four samples' four channels, as channels' vectors of samples; and back.
+/// Returns the transpose of a block: four samples' vectors of channels become four channels' vectors of samples, and
+/// vice versa.
 #[cube]
-pub fn turned(b: &Block) -> Block {
-    Block::of(across(b, 0usize), across(b, 1usize), across(b, 2usize), across(b, 3usize))
+pub fn transposed(b: &Block) -> Block {
+    Block::of(component(b, 0usize), component(b, 1usize), component(b, 2usize), component(b, 3usize))
 }
 
+/// Returns component `k` of all four vectors.
 #[cube]
-fn across(b: &Block, #[comptime] k: usize) -> F4 {
+fn component(b: &Block, #[comptime] k: usize) -> F4 {
     let mut v = F4::new(b.c0.extract(k));
     v.insert(1usize, b.c1.extract(k));
     v.insert(2usize, b.c2.extract(k));
@@ -146,16 +149,16 @@ fn across(b: &Block, #[comptime] k: usize) -> F4 {
 
 /// Writes a thread's block to a tile.
 #[cube]
-pub fn put(a: &mut [F4], block: &Block, row: usize, column: usize, #[comptime] lanes: usize) {
+pub fn store_block(a: &mut [F4], block: &Block, row: usize, column: usize, #[comptime] lanes: usize) {
     #[unroll]
     for j in 0..4usize {
         a[at(4 * column + j, row, lanes)] = block.channel(j);
     }
 }
 
-/// A thread's block of a tile.
+/// Reads a thread's block of a tile.
 #[cube]
-pub fn take(a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> Block {
+pub fn load_block(a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> Block {
     let c = 4 * column;
     Block::of(
         a[at(c, row, lanes)],
@@ -165,9 +168,16 @@ pub fn take(a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> Bl
     )
 }
 
-/// Writes a thread's block to planes, its channels below `end`.
+/// Writes the channels below `end` of a thread's block to planes.
 #[cube]
-pub fn save(to: &mut [F4], block: &Block, plane: usize, here: usize, column: usize, #[comptime] end: usize) {
+pub fn store_planes(
+    to: &mut [F4],
+    block: &Block,
+    plane: usize,
+    here: usize,
+    column: usize,
+    #[comptime] end: usize,
+) {
     #[unroll]
     for j in 0..4usize {
         let c = 4 * column + j;
@@ -179,15 +189,15 @@ pub fn save(to: &mut [F4], block: &Block, plane: usize, here: usize, column: usi
 
 /// Fills a tile from 64 planes.
 #[cube]
-pub fn load(a: &mut [F4], from: &[F4], plane: usize, here: usize, row: usize, column: usize) {
+pub fn load_planes(a: &mut [F4], from: &[F4], plane: usize, here: usize, row: usize, column: usize) {
     for j in 0..4usize {
         let c = column + 16 * j;
         a[at(c, row, LANES)] = from[c * plane + here];
     }
 }
 
-/// Adds to a matrix of gradients, in rows of all channels, `Σ_samples a[first + i] · b[j]`, `i < m` and `j < n`; the first time
-/// writes it.
+/// Adds `Σ_samples a[first + i] · b[j]`, for `i < m` and `j < n`, to a matrix of gradients whose rows have all channels. If
+/// `fresh` is set, it overwrites the matrix instead.
 #[cube]
 pub fn outer(
     a: &[F4],
@@ -217,24 +227,25 @@ pub fn outer(
                 s2 += v.dot(b[at(column + 2 * columns, r, lanes)]);
                 s3 += v.dot(b[at(column + 3 * columns, r, lanes)]);
             }
-            let here = start + i * comptime!(channels(lanes)) + column;
-            add(gradient, here, s0, fresh);
+            let target = start + i * comptime!(channels(lanes)) + column;
+            add(gradient, target, s0, fresh);
             if comptime!(n > columns) {
-                add(gradient, here + columns, s1, fresh);
+                add(gradient, target + columns, s1, fresh);
             }
             if comptime!(n > 2 * columns) {
-                add(gradient, here + 2 * columns, s2, fresh);
+                add(gradient, target + 2 * columns, s2, fresh);
             }
             if comptime!(n > 3 * columns) {
-                add(gradient, here + 3 * columns, s3, fresh);
+                add(gradient, target + 3 * columns, s3, fresh);
             }
         }
     }
 }
 
-/// Adds `Σ_samples a[first + j]`, `j < n`, to a row of gradients; by the threads that own the first row of [`outer`].
+/// Adds `Σ_samples a[first + j]`, for `j < n`, to a row of gradients, or overwrites it if `fresh` is set. The threads of
+/// the first row do this, which in [`outer`] own the first row of the matrix.
 #[cube]
-pub fn sums(
+pub fn sample_sums(
     a: &[F4],
     #[comptime] first: usize,
     #[comptime] n: usize,
@@ -254,58 +265,64 @@ pub fn sums(
                 for r in 0..lanes {
                     sum += a[at(first + j, r, lanes)];
                 }
-                let all =
+                let total =
                     sum.extract(0usize) + sum.extract(1usize) + (sum.extract(2usize) + sum.extract(3usize));
-                add(gradient, start + j, all, fresh);
+                add(gradient, start + j, total, fresh);
             }
         }
     }
 }
 
+/// Adds `v` to a gradient, or overwrites it if `fresh` is set.
 #[cube]
 fn add(gradient: &mut [f32], i: usize, v: f32, fresh: bool) {
     gradient[i] = if fresh { v } else { gradient[i] + v };
 }
 
-/// 1 / (1 + e⁻ˣ).
+/// Returns 1 / (1 + e⁻ᵛ).
 #[cube]
 pub fn sigmoid(v: F4) -> F4 {
     let one = F4::new(1.0f32);
     one / (one + (-v).exp())
 }
 
-/// `max(v, 0)`.
+/// Returns `max(v, 0)`.
 #[cube]
 fn positive(v: F4) -> F4 {
     max(v, F4::new(0.0f32))
 }
 
-/// `max(v, 0)` of each.
+/// Returns `max(v, 0)` of all values of a block.
 #[cube]
 pub fn relu(b: &Block) -> Block {
     Block::of(positive(b.c0), positive(b.c1), positive(b.c2), positive(b.c3))
 }
 
-/// `g` where the tile's own channels are above zero.
+/// Returns `g` where the activations of tile `a` are positive, else zero: the gradient of the relu.
 #[cube]
-pub fn gate(g: &Block, a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> Block {
-    let v = take(a, row, column, lanes);
-    Block::of(gated(g.c0, v.c0), gated(g.c1, v.c1), gated(g.c2, v.c2), gated(g.c3, v.c3))
+pub fn relu_backward(g: &Block, a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> Block {
+    let v = load_block(a, row, column, lanes);
+    Block::of(
+        relu_backward_channel(g.c0, v.c0),
+        relu_backward_channel(g.c1, v.c1),
+        relu_backward_channel(g.c2, v.c2),
+        relu_backward_channel(g.c3, v.c3),
+    )
 }
 
 #[cube]
-fn gated(g: F4, v: F4) -> F4 {
+fn relu_backward_channel(g: F4, v: F4) -> F4 {
     let zero = F4::new(0.0f32);
     select_many(v.greater_than(&zero), g, zero)
 }
 
-/// Product of two blocks, channel by channel.
+/// Returns the elementwise product of two blocks.
 #[cube]
 pub fn times(a: &Block, b: &Block) -> Block {
     Block::of(a.c0 * b.c0, a.c1 * b.c1, a.c2 * b.c2, a.c3 * b.c3)
 }
 
-/// A block times one weight per channel.
+/// Returns a block times one weight per channel.
 #[cube]
 pub fn weighted(a: &Block, w: F4) -> Block {
     let w = Block::of(
@@ -317,14 +334,14 @@ pub fn weighted(a: &Block, w: F4) -> Block {
     times(a, &w)
 }
 
-/// `softplus₁₀₀` and its slope.
+/// Values of `softplus₁₀₀` and of its slope.
 #[derive(CubeType)]
 pub struct Active {
     pub h: Block,
     pub s: Block,
 }
 
-/// h = softplus(z + b), s = sigmoid(100 (z + b)), as the CPU takes them.
+/// Returns h = softplus₁₀₀(z + b) and s = sigmoid(100 (z + b)), by the same formulas as the CPU.
 #[cube]
 pub fn activate(z: &Block, bias: F4) -> Active {
     let a0 = activated(z.c0, bias.extract(0usize));
@@ -359,29 +376,29 @@ fn activated(z: F4, bias: f32) -> ActiveChannel {
     ActiveChannel { h: max(v, zero) + t * p * F4::new(0.02f32), s }
 }
 
-/// s of h: `1 − e^{−100 h}`.
+/// Returns s for given h: `1 − e^{−100 h}`.
 #[cube]
 pub fn slope(h: &Block) -> Block {
-    Block::of(sloped(h.c0), sloped(h.c1), sloped(h.c2), sloped(h.c3))
+    Block::of(slope_channel(h.c0), slope_channel(h.c1), slope_channel(h.c2), slope_channel(h.c3))
 }
 
 #[cube]
-fn sloped(h: F4) -> F4 {
+fn slope_channel(h: F4) -> F4 {
     F4::new(1.0f32) - (h * F4::new(-100.0f32)).exp()
 }
 
-/// `g_z = s (g_h + 100 g_a w (1 − s))`.
+/// Returns the gradient `g_z = s (g_h + 100 g_a w (1 − s))`.
 #[cube]
-pub fn curved(s: &Block, g_h: &Block, g_a: &Block, w: F4) -> Block {
+pub fn softplus_backward(s: &Block, g_h: &Block, g_a: &Block, w: F4) -> Block {
     Block::of(
-        curve(s.c0, g_h.c0, g_a.c0, w.extract(0usize)),
-        curve(s.c1, g_h.c1, g_a.c1, w.extract(1usize)),
-        curve(s.c2, g_h.c2, g_a.c2, w.extract(2usize)),
-        curve(s.c3, g_h.c3, g_a.c3, w.extract(3usize)),
+        softplus_backward_channel(s.c0, g_h.c0, g_a.c0, w.extract(0usize)),
+        softplus_backward_channel(s.c1, g_h.c1, g_a.c1, w.extract(1usize)),
+        softplus_backward_channel(s.c2, g_h.c2, g_a.c2, w.extract(2usize)),
+        softplus_backward_channel(s.c3, g_h.c3, g_a.c3, w.extract(3usize)),
     )
 }
 
 #[cube]
-fn curve(s: F4, g_h: F4, g_a: F4, w: f32) -> F4 {
+fn softplus_backward_channel(s: F4, g_h: F4, g_a: F4, w: f32) -> F4 {
     s * (g_h + g_a * F4::new(100.0f32 * w) * (F4::new(1.0f32) - s))
 }

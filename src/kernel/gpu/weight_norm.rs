@@ -1,5 +1,5 @@
-//! From trained parameters to what the field computes with, and back: weight norm of the geometry network (Salimans,
-//! Kingma 2016) and the sharpness of NeuS.
+//! Conversion of trained parameters to the weights and the sharpness of the field, and of gradients back: weight
+//! normalization of the geometry network (Salimans, Kingma 2016) and the sharpness of NeuS.
 //!
 //! ```text
 //! W = g v / ‖v‖ by rows     g_g = ĝ · v / ‖v‖     g_v = g / ‖v‖ (ĝ − (ĝ · v̂) v̂),  ĝ the gradient by W
@@ -13,14 +13,14 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 
-/// Words that describe a piece: where its parameters, its length parameter and its weights begin, and how many they
-/// are. A piece without a length parameter is copied.
+/// Number of words that describe a row of weights, a piece: offsets of its parameters, of its length parameter and of its
+/// weights, and their number. A piece without a length parameter is copied.
 const PIECE: usize = 4;
 
-/// No length parameter.
+/// Offset of a piece without a length parameter.
 const NONE: u32 = u32::MAX;
 
-/// ‖v‖ of a piece, 1 where it has no length parameter.
+/// Returns ‖v‖ of a piece, or 1 if it has no length parameter.
 #[cube]
 fn length(raw: &[f32], pieces: &[u32], i: usize) -> f32 {
     let from = pieces[i * PIECE] as usize;
@@ -31,13 +31,13 @@ fn length(raw: &[f32], pieces: &[u32], i: usize) -> f32 {
     select(pieces[i * PIECE + 1] == NONE, 1.0f32, max(sum.sqrt(), 1e-12f32))
 }
 
-/// By its bits: compilers may take for granted that floats are finite.
+/// Returns whether a float is finite. Its bits are tested, because compilers may assume that floats are finite.
 #[cube]
 pub(super) fn finite(v: f32) -> bool {
     (u32::reinterpret(v) & 0x7f80_0000u32) != 0x7f80_0000u32
 }
 
-/// g of a piece, 1 where it has none.
+/// Returns the length parameter g of a piece, or 1 if it has none.
 #[cube]
 fn scale(raw: &[f32], pieces: &[u32], i: usize) -> f32 {
     let at = pieces[i * PIECE + 1];
@@ -55,8 +55,8 @@ fn forward(
     variance: &mut [f32],
     flat: &mut [f32],
     inv_s: &mut [f32],
-    least: f32,
-    most: f32,
+    min_variance: f32,
+    max_variance: f32,
 ) {
     let i = ABSOLUTE_POS;
     if i < pieces.len() / PIECE {
@@ -67,7 +67,7 @@ fn forward(
         }
     }
     if i == 0 {
-        let v = clamp(variance[0], least, most);
+        let v = clamp(variance[0], min_variance, max_variance);
         variance[0] = v;
         inv_s[0] = (10.0f32 * v).exp();
     }
@@ -91,38 +91,38 @@ fn backward(
         let at = pieces[i * PIECE + 1];
         let length = length(raw, pieces, i);
         let share = scale(raw, pieces, i) / length;
-        let mut along = 0.0f32;
+        let mut radial = 0.0f32;
         if at != NONE {
             for k in 0..count {
-                along += g_flat[to + k] * raw[from + k];
+                radial += g_flat[to + k] * raw[from + k];
             }
-            along /= length;
-            g_raw[at as usize] = along;
-            if !finite(along) {
+            radial /= length;
+            g_raw[at as usize] = radial;
+            if !finite(radial) {
                 broken[0] = 1;
             }
         }
         for k in 0..count {
-            let own = share * (g_flat[to + k] - along * raw[from + k] / length);
-            g_raw[from + k] = own;
-            // all who write, write the same
-            if !finite(own) {
+            let gradient = share * (g_flat[to + k] - radial * raw[from + k] / length);
+            g_raw[from + k] = gradient;
+            // all threads that write, write the same value
+            if !finite(gradient) {
                 broken[0] = 1;
             }
         }
     }
     if i == 0 {
-        let own = 10.0f32 * inv_s[0] * g_inv_s[0];
-        g_variance[0] = own;
-        if !finite(own) {
+        let gradient = 10.0f32 * inv_s[0] * g_inv_s[0];
+        g_variance[0] = gradient;
+        if !finite(gradient) {
             broken[0] = 1;
         }
     }
 }
 
-/// Where the trained parameters of a network stand among its weights.
+/// Weight normalization of a network on a device.
 ///
-/// Parameters are one vector: v1, g1, b1, v2, g2, b2, c1, c2, c3; weights are as [`Layout`] describes them.
+/// Parameters are stored in one vector: v1, g1, b1, v2, g2, b2, c1, c2, c3; weights are as [`Layout`] describes them.
 pub struct WeightNorm {
     pieces: Buffer,
     count: usize,
@@ -130,7 +130,7 @@ pub struct WeightNorm {
 }
 
 impl WeightNorm {
-    /// Of a network.
+    /// Creates the weight normalization of a network.
     pub fn new(device: &Device, layout: Layout) -> WeightNorm {
         let (rows, parameters) = weight_norm::rows(layout);
         let piece = |row: &Row| {
@@ -142,12 +142,13 @@ impl WeightNorm {
         WeightNorm { pieces: device.upload(&pieces), count, parameters }
     }
 
-    /// How many parameters there are.
+    /// Returns the number of parameters.
     pub fn parameters(&self) -> usize {
         self.parameters
     }
 
-    /// Weights and sharpness, `[1]`, of parameters and variance, `[1]`, which is first kept in a range.
+    /// Computes the weights `flat` and the sharpness `inv_s`, `[1]`, from the parameters `raw` and the variance, `[1]`, which
+    /// is first clamped to `range`.
     pub fn forward(
         &self,
         device: &Device,
@@ -163,8 +164,9 @@ impl WeightNorm {
         );
     }
 
-    /// Gradients by parameters and variance of those by weights and sharpness; makes `broken`, `[1]`, 1 where one is not
-    /// finite. What breaks the gradient of the table passes through the layers above it.
+    /// Writes the gradients with respect to parameters and variance, given those with respect to weights and sharpness.
+    /// Sets `broken`, `[1]`, to 1 if one of them is not finite. The table needs no check of its own: a value that is not
+    /// finite reaches it through the layers checked here.
     pub fn backward(
         &self,
         device: &Device,
@@ -187,14 +189,14 @@ mod tests {
     use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS};
     use crate::kernel::cpu::rng;
 
-    /// Weights of parameters in f64, by the shapes alone.
+    /// Returns the weights of parameters in f64, derived from the shapes alone.
     fn weights(layout: Layout, raw: &[f64]) -> Vec<f64> {
         let mut rest = raw;
         let mut flat = Vec::new();
         let take = |rest: &mut &[f64], n: usize| -> Vec<f64> {
-            let (own, tail) = rest.split_at(n);
+            let (head, tail) = rest.split_at(n);
             *rest = tail;
-            own.to_vec()
+            head.to_vec()
         };
         for (part, (outputs, inputs)) in layout.shapes().into_iter().enumerate() {
             let v = take(&mut rest, outputs * inputs);
@@ -221,20 +223,20 @@ mod tests {
             (0..n as u64).map(|i| rng::normal(3, stream, i)).collect()
         };
         let (raw, g) = (normal(1, norm.parameters()), normal(2, layout.len()));
-        let [there, g_flat] = [&raw, &g].map(|v| device.upload(v));
+        let [device_raw, g_flat] = [&raw, &g].map(|v| device.upload(v));
         let (variance, g_inv_s) = (device.upload(&[0.3f32]), device.upload(&[0.7f32]));
         let (flat, inv_s) = (device.scratch::<f32>(layout.len()), device.scratch::<f32>(1));
-        norm.forward(&device, &there, &variance, [-1.0, 0.25], &flat, &inv_s);
+        norm.forward(&device, &device_raw, &variance, [-1.0, 0.25], &flat, &inv_s);
         let wide: Vec<f64> = raw.iter().map(|&v| v as f64).collect();
         let want: Vec<f32> = weights(layout, &wide).iter().map(|&v| v as f32).collect();
         agree("weights", &device.read::<f32>(&flat), &want, 1e-5);
-        // 0.3 is kept to 0.25: inv_s = exp(2.5), and its gradient 0.7 becomes 7 exp(2.5)
+        // 0.3 is clamped to 0.25: inv_s = exp(2.5), and its gradient 0.7 becomes 7 exp(2.5)
         assert_eq!(device.read::<f32>(&variance), [0.25]);
         agree("sharpness", &device.read::<f32>(&inv_s), &[2.5f32.exp()], 1e-5);
         let (g_raw, g_variance) = (device.scratch::<f32>(raw.len()), device.scratch::<f32>(1));
         let broken = device.zeros::<u32>(1);
-        let into = [&g_raw, &g_variance];
-        norm.backward(&device, &there, &inv_s, [&g_flat, &g_inv_s], into, &broken);
+        let outputs = [&g_raw, &g_variance];
+        norm.backward(&device, &device_raw, &inv_s, [&g_flat, &g_inv_s], outputs, &broken);
         assert_eq!(device.read::<u32>(&broken), [0]);
         agree("gradient by the variance", &device.read::<f32>(&g_variance), &[7.0 * 2.5f32.exp()], 1e-5);
         let loss =
@@ -257,7 +259,7 @@ mod tests {
             let mut g = g.clone();
             g[at] = value;
             let broken = device.zeros::<u32>(1);
-            norm.backward(&device, &there, &inv_s, [&device.upload(&g), &g_inv_s], into, &broken);
+            norm.backward(&device, &device_raw, &inv_s, [&device.upload(&g), &g_inv_s], outputs, &broken);
             assert_eq!(device.read::<u32>(&broken), [1]);
         }
     }

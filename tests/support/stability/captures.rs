@@ -133,7 +133,7 @@ fn learn(folder: &Path, world: &Similarity, config: Config) -> Result<[f64; 2]> 
     reconstruct(&line, Stage::Iface)?;
     let scene = line.scene()?;
     let radiance = FieldMean::load("tface", &run.path(Stage::Tface), config.tface.learned())?;
-    let hull = scene.hull.as_ref().and_then(|h| Bitmask::of(h.resolution, h.bits.clone()));
+    let hull = scene.hull.as_ref().and_then(|h| Bitmask::from_words(h.resolution, h.bits.clone()));
     let surface = IFace::load(&run.path(Stage::Iface), &config.iface, hull.as_ref())?;
     let (mut error, mut count) = (0.0, 0.0);
     for view in line.capture().split(Split::Test) {

@@ -1,4 +1,4 @@
-//! The backward of the fused signed-distance field, written by hand; its formulas stand in [`super`].
+//! The hand-written backward pass of the fused signed-distance field; [`super`] has its formulas.
 
 use super::{Activations, CHUNK, WIDTH};
 use crate::dispatch;
@@ -7,18 +7,18 @@ use crate::kernel::cpu::matrix::add_to;
 use crate::kernel::cpu::mlp::{
     COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
 };
-use crate::kernel::cpu::neus::SHORTEST;
+use crate::kernel::cpu::neus::MIN_GRADIENT_NORM;
 use crate::kernel::cpu::pool::Buffer;
 use crate::kernel::cpu::simd::{exp, gemm};
 use rayon::prelude::*;
 
-/// A piece of the backward.
+/// The backward pass of a range of samples.
 struct SdfBackwardTask<'a> {
     start: usize,
     g_out: &'a [f32],
-    g_value: &'a mut [f32],       // [n, 2L], row-major, turned afterwards
+    g_value: &'a mut [f32],       // [n, 2L], row-major, transposed afterwards
     g_normal: &'a mut [[f32; 3]], // [n, 3]
-    /// Of the matrices, in [`Layout::gradient_shapes`](crate::kernel::cpu::mlp::Layout::gradient_shapes).
+    /// Gradients with respect to the matrices, in the shapes of [`Layout::gradient_shapes`](crate::kernel::cpu::mlp::Layout::gradient_shapes).
     gradients: [Vec<f32>; 7],
 }
 
@@ -81,7 +81,7 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
             let from_color = &g_c0[r * ci..][..ci];
             g_o[r * OUTPUTS_PADDED..][..OUTPUTS].copy_from_slice(&from_color[..OUTPUTS]);
             g_o[r * OUTPUTS_PADDED] += g_out[r * WIDTH];
-            // through −L σ: its slope is y (1 + y / L)
+            // through y = −L σ, whose slope is y (1 + y / L)
             if a.shape.soften > 0.0 {
                 let y = out[r * WIDTH + 7];
                 g_o[r * OUTPUTS_PADDED + SOFTNESS] += g_out[r * WIDTH + 7] * y * (1.0 + y / a.shape.soften);
@@ -91,10 +91,11 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
             let length = (raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2]).sqrt().max(1e-12);
             let unit: [f32; 3] = std::array::from_fn(|k| raw[k] / length);
             let gn = &from_color[OUTPUTS + 16..COLOR_INPUTS];
-            let along = unit[0] * gn[0] + unit[1] * gn[1] + unit[2] * gn[2];
+            let radial = unit[0] * gn[0] + unit[1] * gn[1] + unit[2] * gn[2];
             let n: [f32; 3] = std::array::from_fn(|k| {
-                let turned = if length > SHORTEST { (gn[k] - unit[k] * along) / length } else { 0.0 };
-                g_out[r * WIDTH + 1 + k] + turned
+                let through_normal =
+                    if length > MIN_GRADIENT_NORM { (gn[k] - unit[k] * radial) / length } else { 0.0 };
+                g_out[r * WIDTH + 1 + k] + through_normal
             });
             t.g_normal[tile * TILE + r] = n;
             for k in 0..3 {
@@ -140,11 +141,11 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
         let wide = (TILE, features_padded, HIDDEN);
         gemm::<F>(wide, &g_z, (HIDDEN, 1), &w.w1.m, kp, &mut g_u, kp, false);
         for r in 0..rows {
-            let own = &mut t.g_value[(tile * TILE + r) * features..][..features];
-            own.copy_from_slice(&g_u[r * kp..][..features]);
+            let g_features_row = &mut t.g_value[(tile * TILE + r) * features..][..features];
+            g_features_row.copy_from_slice(&g_u[r * kp..][..features]);
             if w.layout.color_skip {
                 let skipped = &g_c0[r * ci + COLOR_INPUTS..][..features];
-                own.iter_mut().zip(skipped).for_each(|(g, s)| *g += s);
+                g_features_row.iter_mut().zip(skipped).for_each(|(g, s)| *g += s);
             }
         }
     }
@@ -152,11 +153,12 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
 
 dispatch! { fn backward_task / backward_body(t: &mut SdfBackwardTask, a: &Activations, w: &Weights) }
 
-/// Gradients of a loss with respect to table and network weights.
+/// Adds the gradient of a loss with respect to the table to `g_table`, and returns that with respect to the network
+/// weights.
 ///
 /// # Shapes
 ///
-/// - g_out: `[n, 8]`, the loss's gradient by the output (the last column counts where sharpness is local)
+/// - g_out: `[n, 8]`, the loss's gradient by the output (the last column is used only if the sharpness is local)
 /// - g_table: `[entries, 2]`, added to
 /// - output: `[P]`, flat as [`Layout`](crate::kernel::cpu::mlp::Layout) describes
 pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32; 2]]) -> Vec<f32> {
@@ -196,8 +198,8 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
     }
     drop(tasks);
     let active = &a.shape.levels[..a.shape.active];
-    let mut turned = Buffer::scratch(active.len() * n * 2);
-    turned.par_chunks_mut(n * 2).enumerate().for_each(|(l, out)| {
+    let mut transposed = Buffer::scratch(active.len() * n * 2);
+    transposed.par_chunks_mut(n * 2).enumerate().for_each(|(l, out)| {
         for s in 0..n {
             out[2 * s] = g_value[s * features + 2 * l];
             out[2 * s + 1] = g_value[s * features + 2 * l + 1];
@@ -208,7 +210,7 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
         g_table,
         &a.x01,
         a.shape.world(),
-        bytemuck::cast_slice(&turned),
+        bytemuck::cast_slice(&transposed),
         bytemuck::cast_slice(&a.q[..active.len() * n * 2]),
         &g_normal,
     );

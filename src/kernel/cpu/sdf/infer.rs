@@ -1,6 +1,6 @@
-//! The signed-distance field evaluated, not trained: nothing is kept for a backward.
+//! Inference of the signed-distance field: no activations are kept for a backward pass.
 
-use super::{CHUNK, FieldShape, Inputs, WIDTH, color_layers, run, skip, softened};
+use super::{CHUNK, FieldShape, Inputs, WIDTH, color_layers, run, softened, write_skip};
 use crate::dispatch;
 use crate::geom::sphharm::sh16;
 use crate::kernel::cpu::hash;
@@ -11,13 +11,13 @@ use crate::kernel::cpu::pool::Buffer;
 use crate::kernel::cpu::simd::{exp, gemm, ln_1p, sigmoid};
 use rayon::prelude::*;
 
-/// softplus₁₀₀.
+/// Returns softplus₁₀₀(v).
 #[inline(always)]
 fn softplus<const F: bool>(v: f32) -> f32 {
     v.max(0.0) + 0.01 * ln_1p::<F>(exp::<F>(-(100.0 * v).abs()))
 }
 
-/// One of the geometry network's outputs.
+/// Evaluates one output of the geometry network for the samples of a task.
 #[inline(always)]
 fn value_body<const F: bool>(inputs: &Inputs, output: usize, values: &mut [f32], w: &Weights) {
     let kp = w.layout.padded();
@@ -45,23 +45,23 @@ dispatch! {
     fn value_task / value_body(inputs: &Inputs, output: usize, values: &mut [f32], w: &Weights)
 }
 
-/// Signed distance alone: a quarter of the work of [`super::forward`]. `[n, 3]` → `[n]`.
+/// Returns the signed distances at points, `[n, 3]` → `[n]`, in a quarter of the time of [`super::forward`].
 pub fn values(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
     output(shape, table, weights, x, 0)
 }
 
-/// ln of the local sharpness as a share of the sharpest, `-soften..=0`. `[n, 3]` → `[n]`.
+/// Returns ln of the ratio of the local to the maximum sharpness at points, `[n, 3]` → `[n]`, in `-soften..=0`.
 pub fn softness(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
     if shape.soften == 0.0 {
         return vec![0.0; x.len()];
     }
     let mut soft = output(shape, table, weights, x, SOFTNESS);
-    // fused products outside of a dispatched function would be calls of the C library
+    // no fused multiply-add: outside of a dispatched function it would be a call into the C library
     soft.iter_mut().for_each(|v| *v = softened::<false>(shape.soften, *v));
     soft
 }
 
-/// One of the geometry network's outputs.
+/// Returns one output of the geometry network at points, `[n, 3]` → `[n]`.
 fn output(
     shape: &FieldShape,
     table: &[[f32; 2]],
@@ -69,7 +69,7 @@ fn output(
     x: &[[f32; 3]],
     output: usize,
 ) -> Vec<f32> {
-    /// Points per pass: bounds the scratch memory whatever the caller asks for.
+    /// Points per pass, which bounds the scratch memory for any number of points.
     const PASS: usize = 1 << 16;
     let mut values = vec![0.0; x.len()];
     let active = &shape.levels[..shape.active];
@@ -79,8 +79,8 @@ fn output(
         hash::gather(active, table, &shape.x01(x), 1.0, bytemuck::cast_slice_mut(&mut value), None);
         let value = &value[..];
         values.par_chunks_mut(CHUNK).enumerate().for_each(|(i, values)| {
-            let own = i * CHUNK..i * CHUNK + values.len();
-            value_task(&Inputs::new(shape, x, value, own), output, values, weights);
+            let range = i * CHUNK..i * CHUNK + values.len();
+            value_task(&Inputs::new(shape, x, value, range), output, values, weights);
         });
     }
     values
@@ -89,13 +89,13 @@ fn output(
 struct ColorTask<'a> {
     inputs: Inputs<'a>,
     normal: &'a [[f32; 3]],
-    /// Directions of each point; one each where there is no list.
+    /// Number of directions of each point; `None` if each point has one.
     counts: Option<&'a [u32]>,
     direction: &'a [[f32; 3]],
     rgb: &'a mut [[f32; 3]],
 }
 
-/// The color network on a tile whose inputs are filled; colors in the first `rows` of `out`.
+/// Scratch memory to evaluate the color network on one tile.
 struct Shader {
     c0: Vec<f32>, // [TILE, cp]
     c1: [f32; TILE * HIDDEN],
@@ -104,6 +104,7 @@ struct Shader {
 }
 
 impl Shader {
+    /// Evaluates the first `out.len()` rows of the tile, whose inputs `c0` are filled.
     #[inline(always)]
     fn run<const F: bool>(&mut self, w: &Weights, out: &mut [[f32; 3]]) {
         let Shader { c0, c1, c2, rgb } = self;
@@ -127,8 +128,8 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
         c2: [0.0; TILE * HIDDEN],
         rgb: [0.0; TILE * RGB_PADDED],
     };
-    // directions that wait in the shader's tile, and those that are done
-    let (mut waiting, mut done) = (0, 0);
+    // number of directions that fill the shader's tile so far, and of those already evaluated
+    let (mut filled, mut done) = (0, 0);
     for tile in 0..samples.div_ceil(TILE) {
         let base = tile * TILE;
         let rows = TILE.min(samples - base);
@@ -143,33 +144,36 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
         gemm::<F>((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2.t, op, &mut o, op, false);
         for r in 0..rows {
             for _ in 0..task.counts.map_or(1, |c| c[base + r]) {
-                let row = &mut shader.c0[waiting * ci..][..ci];
+                let row = &mut shader.c0[filled * ci..][..ci];
                 (0..OUTPUTS).for_each(|j| row[j] = o[r * op + j] + w.b2[j]);
-                row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(task.direction[done + waiting]));
+                row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(task.direction[done + filled]));
                 row[OUTPUTS + 16..COLOR_INPUTS].copy_from_slice(&task.normal[base + r]);
-                skip(w.layout, &u[r * kp..], row);
-                waiting += 1;
-                if waiting == TILE {
+                write_skip(w.layout, &u[r * kp..], row);
+                filled += 1;
+                if filled == TILE {
                     shader.run::<F>(w, &mut task.rgb[done..done + TILE]);
-                    (waiting, done) = (0, done + TILE);
+                    (filled, done) = (0, done + TILE);
                 }
             }
         }
     }
-    if waiting > 0 {
-        shader.run::<F>(w, &mut task.rgb[done..done + waiting]);
+    if filled > 0 {
+        shader.run::<F>(w, &mut task.rgb[done..done + filled]);
     }
 }
 
 dispatch! { fn color_task / color_body(task: &mut ColorTask, w: &Weights) }
 
-/// Color of points whose unit normals are known (of a mesh's surface), point `i` seen along `counts[i]` unit
-/// directions (one each without a list): no gradient is computed, a third of the work of [`super::forward`], and
-/// the geometry network is evaluated once a point.
+/// Returns colors of points whose unit normals are known, such as points of a mesh. Point `i` is viewed along
+/// `counts[i]` directions, or along one if `counts` is `None`.
+///
+/// No gradient is computed, which takes a third of the time of [`super::forward`], and the geometry network is evaluated
+/// once per point.
 ///
 /// # Shapes
 ///
-/// - x, normal: `[n, 3]`; direction: `[sum of counts, 3]`, away from the camera, point by point
+/// - x, normal: `[n, 3]`; counts: `[n]`
+/// - direction: `[sum of counts, 3]` unit vectors away from the camera, ordered by point
 /// - output: `[sum of counts, 3]`
 pub fn colors(
     shape: &FieldShape,
@@ -181,9 +185,9 @@ pub fn colors(
     direction: &[[f32; 3]],
 ) -> Vec<[f32; 3]> {
     const PASS: usize = 1 << 15;
-    let all = |counts: Option<&[u32]>, n: usize| counts.map_or(n, |c| c.iter().map(|&c| c as usize).sum());
+    let total = |counts: Option<&[u32]>, n: usize| counts.map_or(n, |c| c.iter().map(|&c| c as usize).sum());
     assert!(normal.len() == x.len() && counts.is_none_or(|c| c.len() == x.len()));
-    assert_eq!(direction.len(), all(counts, x.len()));
+    assert_eq!(direction.len(), total(counts, x.len()));
     let mut rgb = vec![[0f32; 3]; direction.len()];
     let active = &shape.levels[..shape.active];
     let (mut rgb_left, mut directions_left) = (&mut rgb[..], direction);
@@ -196,12 +200,12 @@ pub fn colors(
         let value = &value[..];
         let mut tasks = Vec::with_capacity(n.div_ceil(CHUNK));
         for start in (0..n).step_by(CHUNK) {
-            let own = start..(start + CHUNK).min(n);
-            let counts = counts.map(|c| &c[own.clone()]);
-            let colors = all(counts, own.len());
+            let range = start..(start + CHUNK).min(n);
+            let counts = counts.map(|c| &c[range.clone()]);
+            let colors = total(counts, range.len());
             let rgb = rgb_left.split_off_mut(..colors).expect("a color for each direction");
-            let direction = directions_left.split_off(..colors).expect("as many as were counted");
-            let (normal, inputs) = (&normal[own.clone()], Inputs::new(shape, x, value, own));
+            let direction = directions_left.split_off(..colors).expect("a direction for each count");
+            let (normal, inputs) = (&normal[range.clone()], Inputs::new(shape, x, value, range));
             tasks.push(ColorTask { inputs, normal, counts, direction, rgb });
         }
         tasks.par_iter_mut().for_each(|task| color_task(task, weights));
@@ -209,7 +213,7 @@ pub fn colors(
     rgb
 }
 
-/// Signed distance and gradient, no color: `[n, 3]` → `[n]` pairs.
+/// Returns signed distances and gradients at points, `[n, 3]` → `[n]` pairs, without colors.
 pub fn gradients(
     shape: &FieldShape,
     table: &[[f32; 2]],

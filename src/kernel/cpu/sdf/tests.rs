@@ -1,16 +1,16 @@
-//! The fused field against the f64 model of its formulas and its finite differences.
+//! Tests of the fused field against a model of its formulas in f64, and against the model's finite differences.
 
 use super::*;
 use crate::kernel::cpu::reference::sdf::field as model;
 use crate::kernel::cpu::reference::wide;
 
-/// A small field with lively weights.
+/// Returns shape, table and weights of a small field, with weights that vary strongly.
 fn field() -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
-    shaped(false)
+    small_field(false)
 }
 
-/// The same, with or without the color skip.
-fn shaped(color_skip: bool) -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
+/// Returns the small field with or without the color skip; with it, the sharpness is local.
+fn small_field(color_skip: bool) -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
     let levels = hash::levels(5, 4, 1.8, 9);
     let shape =
         FieldShape { levels, radius: 1.3, active: 5, color_skip, soften: if color_skip { 1.5 } else { 0.0 } };
@@ -50,7 +50,7 @@ fn the_forward_agrees_with_an_f64_model() {
 }
 
 fn forward_agrees(color_skip: bool) {
-    let (shape, table, flat) = shaped(color_skip);
+    let (shape, table, flat) = small_field(color_skip);
     let (x, d) = points(150); // two full tiles and a part
     let w = Weights::new(shape.layout(), &flat);
     let a = forward(&shape, &table, &w, &x, &d);
@@ -100,7 +100,8 @@ fn the_backward_agrees_with_f64_finite_differences_second_order_included() {
     }
 }
 
-/// What a backward is asked for: gradients by weights and table of a loss whose gradient by the output is `g_out`.
+/// Arguments of a backward pass: it returns the gradients by weights and table of a loss whose gradient by the output is
+/// `g_out`.
 pub(in crate::kernel) struct BackwardCase<'a> {
     pub shape: &'a FieldShape,
     pub table: &'a [[f32; 2]],
@@ -110,12 +111,12 @@ pub(in crate::kernel) struct BackwardCase<'a> {
     pub g_out: &'a [f32],
 }
 
-/// Asserts the worst and median relative error of the gradients by a selection of parameters.
+/// Asserts that worst and median relative errors of the gradients by a selection of parameters are small.
 pub(in crate::kernel) fn backward_agrees(
     color_skip: bool,
     gradients: impl FnOnce(BackwardCase) -> (Vec<f32>, Vec<[f32; 2]>),
 ) {
-    let (shape, table, flat) = shaped(color_skip);
+    let (shape, table, flat) = small_field(color_skip);
     let (x, d) = points(90);
     let w = Weights::new(shape.layout(), &flat);
     let a = forward(&shape, &table, &w, &x, &d);

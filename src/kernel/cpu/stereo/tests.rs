@@ -5,8 +5,8 @@ use std::f32::consts::TAU;
 
 const SIZE: usize = 96;
 
-/// Looks at the origin from a direction, 3 away: a pixel there is 3 / 150 = 0.02 long.
-fn looking(from: DVec3) -> Camera {
+/// Returns a camera that looks at the origin from a direction, at distance 3: a pixel there is 3 / 150 = 0.02 long.
+fn camera_from(from: DVec3) -> Camera {
     let back = from.normalize();
     let right = DVec3::Y.cross(back).normalize();
     let rotation = DMat3::from_cols(right, back.cross(right), back);
@@ -16,12 +16,12 @@ fn looking(from: DVec3) -> Camera {
 fn cameras() -> Vec<Camera> {
     let at = |i: usize| {
         let a = i as f64 * f64::from(TAU) / 6.0;
-        looking(DVec3::new(0.5 * a.cos(), 0.5 * a.sin(), 1.0))
+        camera_from(DVec3::new(0.5 * a.cos(), 0.5 * a.sin(), 1.0))
     };
-    (0..6).map(at).chain([looking(DVec3::new(0.05, 0.0, 1.0))]).collect()
+    (0..6).map(at).chain([camera_from(DVec3::new(0.05, 0.0, 1.0))]).collect()
 }
 
-/// Waves of four to twelve pixels in all directions.
+/// Returns the brightness of a texture of waves with lengths of four to twelve pixels in all directions.
 fn texture(seed: u64, p: Vec3) -> f32 {
     let wave = |i: u64| {
         let (angle, phase) = (TAU * rng::uniform(seed, 1, i), TAU * rng::uniform(seed, 2, i));
@@ -31,7 +31,7 @@ fn texture(seed: u64, p: Vec3) -> f32 {
     0.4 + 0.03 * (0..12).map(wave).sum::<f32>()
 }
 
-/// Photographs of `color` on the surface whose height over (x, y) is `height`, with noise, gain and offset.
+/// Renders photographs of `color` on the surface with the given height over (x, y), with noise, gain and offset.
 fn photographs(
     cameras: &[Camera],
     height: impl Fn(f32, f32) -> f32,
@@ -43,7 +43,7 @@ fn photographs(
             .map(|i| {
                 let (x, y) = (i % SIZE, i / SIZE);
                 let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).unwrap();
-                // the surface is flat enough to find by going up and down
+                // the surface is flat enough for a fixed-point iteration to find the hit
                 let mut p = ray.at(-ray.origin.z / ray.direction.z);
                 for _ in 0..20 {
                     p = ray.at((height(p.x, p.y) - ray.origin.z) / ray.direction.z);
@@ -60,14 +60,14 @@ fn photographs(
     cameras.iter().enumerate().map(view).collect()
 }
 
-/// Points two pixels apart on a sheet that lies `off` pixels above the plane and is tilted against it.
+/// Returns surfels two pixels apart, `off` pixels above the plane, with normals that are tilted against it.
 fn surfels(off: f32) -> Vec<Surfel> {
     let normal = Vec3::new(0.1, -0.08, 1.0).normalize();
     let at = |i: usize| Vec3::new((i % 15) as f32 * 0.04 - 0.28, (i / 15) as f32 * 0.04 - 0.28, off * 0.02);
     (0..225).map(|i| Surfel { position: at(i), normal }).collect()
 }
 
-/// Half of the errors in pixels are at most this, and so many points there are.
+/// Returns the median error in pixels, and the number of points.
 fn median(points: &[StereoPoint], height: impl Fn(f32, f32) -> f32) -> (f32, usize) {
     let off = |p: &StereoPoint| ((p.position.z - height(p.position.x, p.position.y)) / 0.02).abs();
     let mut off: Vec<f32> = points.iter().map(off).collect();
@@ -83,7 +83,7 @@ fn a_plane_is_found_to_a_tenth_of_a_pixel_whatever_gain_and_offset() {
         let found = matches(&views, &surfels(off));
         let (error, count) = median(&found, |_, _| 0.0);
         assert!(count > 200 && error < 0.05, "{count} points, {error} px");
-        // tilted onto the plane: the start is 7 degrees off
+        // normals become those of the plane: the initial ones are 7 degrees off
         let upright = found.iter().filter(|p| p.normal.z > 0.9986).count();
         assert!(upright > 180, "{upright} within 3 degrees");
         let kept = confirmed(&found, 0.04);
@@ -125,29 +125,29 @@ fn a_photograph_of_something_else_is_left_out() {
     let views = photographs(&cameras, |_, _| 0.0, |v, p| texture(if v == 2 { 7 } else { 1 }, p));
     let (error, count) = median(&matches(&views, &surfels(1.5)), |_, _| 0.0);
     assert!(count > 150 && error < 0.06, "{count} points, {error} px");
-    // with four of seven too few are left, but where one fits by chance
+    // without four of seven photographs too few remain, except where another fits by chance
     let views = photographs(&cameras, |_, _| 0.0, |v, p| texture(if v > 2 { 7 + v as u64 } else { 1 }, p));
     let left = confirmed(&matches(&views, &surfels(1.5)), 0.04).len();
     assert!(left < 22, "{left} of 225");
 }
 
 #[test]
-fn a_point_is_seen_where_nothing_lies_before_it_and_owned_by_the_most_frontal_view() {
+fn an_unoccluded_point_is_visible_and_owned_by_its_most_frontal_view() {
     let cameras = cameras();
     let mut views = photographs(&cameras, |_, _| 0.0, |_, p| texture(1, p));
     let s = Surfel { position: Vec3::ZERO, normal: Vec3::Z };
     assert_eq!(visible_in(&views, &s).len(), 7);
     assert_eq!(visible_in(&views, &s)[0], 6);
     // a pixel is 3 / 150
-    assert!((owned(&views, 6, &s).unwrap() - 0.02).abs() < 1e-4);
-    assert_eq!(owned(&views, 0, &s), None);
-    // something 0.5 before it; the tolerance is 5 + 6 pixels, 0.22
+    assert!((owned_footprint(&views, 6, &s).unwrap() - 0.02).abs() < 1e-4);
+    assert_eq!(owned_footprint(&views, 0, &s), None);
+    // an occluder lies 0.5 before the point; the tolerance is 5 + 6 pixels, 0.22
     views[6].depth.iter_mut().for_each(|d| *d -= 0.5);
     assert!(!visible_in(&views, &s).contains(&6));
-    // a pixel that may not be used
+    // a pixel that is not usable
     views[3].usable.fill(false);
     assert_eq!(visible_in(&views, &s).len(), 5);
-    // turned away
+    // a surfel that faces away
     assert!(visible_in(&views, &Surfel { normal: -Vec3::Z, ..s }).is_empty());
 }
 
@@ -159,12 +159,12 @@ fn a_point_that_its_neighbors_contradict_is_dropped() {
         footprint: 0.5,
         sigma: 0.5,
     };
-    let all: Vec<StereoPoint> = (0..25).map(point).collect();
-    let kept = confirmed(&all, 1.0);
+    let points: Vec<StereoPoint> = (0..25).map(point).collect();
+    let kept = confirmed(&points, 1.0);
     assert_eq!(kept.len(), 24);
     assert!(kept.iter().all(|p| p.position.z == 0.0));
-    // alone nothing is confirmed
-    assert_eq!(confirmed(&all[..3], 1.0), []);
+    // points with too few neighbors are not confirmed
+    assert_eq!(confirmed(&points[..3], 1.0), []);
 }
 
 #[test]

@@ -6,7 +6,7 @@
 //! rgb = sigmoid(W3 relu(W2 relu(W1 in + b1) + b2) + b3)
 //! ```
 
-use super::gather::Spread;
+use super::gather::FactorGradients;
 use super::{Cell, Grid};
 use crate::dispatch;
 use crate::kernel::cpu::matrix::{Matrix, add_to, padded, split};
@@ -15,17 +15,17 @@ use crate::kernel::cpu::simd::{gemm, sigmoid};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Samples a tile: its activations stay in the second-level cache.
+/// Number of samples per tile. Activations of one tile stay in the second-level cache.
 const TILE: usize = 64;
-/// Samples a task handles: fixed, so that sums do not depend on the number of threads.
+/// Number of samples per task. It is fixed, so that sums do not depend on the number of threads.
 const CHUNK: usize = 16 * TILE;
-/// Color channels as stored in tiles.
+/// Color channels as stored in tiles, zero-padded.
 const RGB: usize = 8;
 
 /// Sizes of the decoder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DecoderShape {
-    /// Channels of the appearance grid, which says them.
+    /// Channels of the appearance grid; not stored, because the grid determines them.
     #[serde(skip)]
     pub channels: usize,
     /// Outputs of the basis matrix (published: 27).
@@ -39,35 +39,35 @@ pub struct DecoderShape {
 }
 
 impl DecoderShape {
-    /// Inputs of the first layer.
+    /// Returns the number of inputs of the first layer.
     pub fn inputs(&self) -> usize {
         self.features * (1 + 2 * self.feature_frequencies) + 3 * (1 + 2 * self.view_frequencies)
     }
 
-    /// Shapes `[out, in]` in storage order: B, W1, b1, W2, b2, W3, b3 (biases as `[n, 1]`), all row-major.
+    /// Returns the shapes `[out, in]` in storage order: B, W1, b1, W2, b2, W3, b3 (biases as `[n, 1]`), all row-major.
     pub fn shapes(&self) -> [(usize, usize); 7] {
         let h = self.hidden;
         [(self.features, self.channels), (h, self.inputs()), (h, 1), (h, h), (h, 1), (3, h), (3, 1)]
     }
 
-    /// Floats of all matrices together.
+    /// Returns the number of floats of all matrices together.
     pub fn len(&self) -> usize {
         self.shapes().iter().map(|(o, i)| o * i).sum()
     }
 
-    /// Widths of hidden layers, products, features and inputs as stored in tiles.
+    /// Returns the widths of hidden layers, products, features and inputs as stored in tiles.
     fn padded(&self) -> [usize; 4] {
         [self.hidden, self.channels, self.features, self.inputs()].map(|n| n.next_multiple_of(8))
     }
 
-    /// Shapes in which tiles sum gradients: padded, three color channels as four.
+    /// Returns the shapes in which tiles accumulate gradients: padded, with three color channels stored as four.
     fn gradient_shapes(&self) -> [(usize, usize); 7] {
         let [h, products, features, inputs] = self.padded();
         [(features, products), (h, inputs), (h, 1), (h, h), (h, 1), (4, h), (3, 1)]
     }
 }
 
-/// The decoder's matrices in both orders, padded for the matrix blocks.
+/// The decoder's matrices, padded for the matrix blocks and stored with their transpose.
 #[derive(Debug)]
 pub struct DecoderWeights {
     shape: DecoderShape,
@@ -81,7 +81,7 @@ pub struct DecoderWeights {
 }
 
 impl DecoderWeights {
-    /// From the flat vector that [`DecoderShape::shapes`] describes.
+    /// Creates the weights from the flat vector that [`DecoderShape::shapes`] describes.
     pub fn new(shape: DecoderShape, flat: &[f32]) -> DecoderWeights {
         assert_eq!(flat.len(), shape.len(), "network weights do not fit the decoder");
         assert!(shape.hidden.is_multiple_of(8), "hidden layers are a multiple of 8 wide");
@@ -100,13 +100,13 @@ impl DecoderWeights {
         }
     }
 
-    /// The sizes these weights have.
+    /// Returns the sizes of the decoder.
     pub fn shape(&self) -> DecoderShape {
         self.shape
     }
 }
 
-/// What the backward needs of decoded samples.
+/// Decoded samples, with the activations that the backward pass needs.
 #[derive(Clone, Debug)]
 pub(super) struct Decoded {
     pub cells: Vec<Cell>,
@@ -130,7 +130,7 @@ struct DecodeTask<'a> {
     rgb: &'a mut [[f32; 3]],
 }
 
-/// Features and direction with their encodings into a row of inputs.
+/// Writes features and direction with their encodings to a row of inputs.
 #[inline(always)]
 fn encode(shape: &DecoderShape, features: &[f32], d: [f32; 3], row: &mut [f32]) {
     let f = shape.features;
@@ -205,7 +205,7 @@ dispatch! {
     fn forward_task / forward_body(t: &mut DecodeTask, w: &DecoderWeights, lookup: &super::gather::Lookup)
 }
 
-/// Colors of samples in the appearance grid `values`, seen along `direction`.
+/// Decodes the colors of samples in the appearance grid `values`, viewed along `direction`.
 pub(super) fn decode(
     grid: &Grid,
     values: &[f32],
@@ -248,13 +248,13 @@ struct DecodeBackwardTask<'a> {
     h1: &'a [f32],
     h2: &'a [f32],
     rgb: &'a [[f32; 3]],
-    /// Of the matrices, in [`DecoderShape::gradient_shapes`].
+    /// Gradients with respect to the matrices, in the shapes of [`DecoderShape::gradient_shapes`].
     gradients: [Vec<f32>; 7],
 }
 
-/// g where the activation let something through; adds the column sums to `bias`.
+/// Sets `g` to zero where the activation `h` is not positive (the relu's gradient), and adds the column sums to `bias`.
 #[inline(always)]
-fn through_relu(g: &mut [f32], h: &[f32], bias: &mut [f32]) {
+fn relu_backward(g: &mut [f32], h: &[f32], bias: &mut [f32]) {
     for (g, h) in g.chunks_exact_mut(bias.len()).zip(h.chunks_exact(bias.len())) {
         for ((g, h), b) in g.iter_mut().zip(h).zip(bias.iter_mut()) {
             *g = if *h > 0.0 { *g } else { 0.0 };
@@ -291,13 +291,13 @@ fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) 
         }
         gemm::<F>((4, h, TILE), &g_pre, (1, RGB), h2, h, g_w3, h, true);
         gemm::<F>((TILE, h, 3), &g_pre, (RGB, 1), &w.w3.m, h, &mut g_h2, h, false);
-        through_relu(&mut g_h2, h2, g_b2);
+        relu_backward(&mut g_h2, h2, g_b2);
         gemm::<F>((h, h, TILE), &g_h2, (1, h), h1, h, g_w2, h, true);
         gemm::<F>((TILE, h, h), &g_h2, (h, 1), &w.w2.m, h, &mut g_h1, h, false);
-        through_relu(&mut g_h1, h1, g_b1);
+        relu_backward(&mut g_h1, h1, g_b1);
         gemm::<F>((h, ip, TILE), &g_h1, (1, h), inputs, ip, g_w1, ip, true);
         gemm::<F>((TILE, ip, h), &g_h1, (h, 1), &w.w1.m, ip, &mut g_in, ip, false);
-        // back through the features' encoding; nothing asks for the direction's gradient
+        // back through the features' encoding; the direction's gradient is not needed
         g_features.fill(0.0);
         let (f, k) = (s.features, s.feature_frequencies);
         for r in 0..rows {
@@ -335,7 +335,8 @@ fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) 
 
 dispatch! { fn backward_task / backward_body(t: &mut DecodeBackwardTask, w: &DecoderWeights) }
 
-/// Adds the gradients by the appearance grid to `g_values` and returns those of the flat weights.
+/// Adds the gradient with respect to the appearance grid to `g_values`, and returns that with respect to the flat
+/// weights.
 pub(super) fn decode_backward(
     grid: &Grid,
     w: &DecoderWeights,
@@ -355,15 +356,15 @@ pub(super) fn decode_backward(
         .enumerate()
         .map(|(i, (planes, lines))| {
             let start = i * CHUNK;
-            let own = start..(start + CHUNK).min(n);
+            let range = start..(start + CHUNK).min(n);
             DecodeBackwardTask {
-                g_rgb: &g_rgb[own.clone()],
+                g_rgb: &g_rgb[range.clone()],
                 planes,
                 lines,
                 inputs: &d.inputs[start * ip..],
                 h1: &d.h1[start * h..],
                 h2: &d.h2[start * h..],
-                rgb: &d.rgb[own],
+                rgb: &d.rgb[range],
                 gradients: padded_shapes.map(|(rows, columns)| vec![0.0; rows * columns]),
             }
         })
@@ -375,7 +376,8 @@ pub(super) fn decode_backward(
         add_to(&mut flat, &s.shapes(), &parts);
     }
     drop(tasks);
-    let spread = Spread { cells: &decoded.cells, planes: &decoded.planes, lines: &decoded.lines, stride: cp };
-    super::gather::scatter(grid, &spread, g_values);
+    let gradients =
+        FactorGradients { cells: &decoded.cells, planes: &decoded.planes, lines: &decoded.lines, stride: cp };
+    super::gather::scatter(grid, &gradients, g_values);
     flat
 }

@@ -1,4 +1,4 @@
-//! A small field given by formulas, whose values independent code has computed.
+//! A small field that is defined by formulas. Its expected values were computed by independent code.
 
 use super::mask::Lattice;
 use super::*;
@@ -7,7 +7,7 @@ pub fn grid() -> Grid {
     Grid { size: [5, 6, 7], rank: [2, 1, 1] }
 }
 
-/// The published scene box, step ratio ½: step 0.2918889, 17 samples.
+/// Returns a field over the published scene box, with step ratio ½: step 0.2918889, 17 samples.
 pub fn field() -> VmField {
     let (min, max) = ([-1.5, -1.67, -1.0], [1.5, 1.67, 1.0]);
     let extent = [3.0, 3.34, 2.0];
@@ -72,7 +72,7 @@ pub fn color() -> Vec<f32> {
     )
 }
 
-/// Flat decoder weights.
+/// Returns flat decoder weights.
 pub fn network() -> Vec<f32> {
     let mut flat = Vec::new();
     for (p, (out, inputs)) in decoder().shapes().into_iter().enumerate() {

@@ -1,21 +1,21 @@
-//! Looking up planes and lines, and spreading gradients back onto them.
+//! Interpolation in planes and lines, and the scatter of gradients, which is its backward pass.
 
 use super::{Factor, Grid, LINE_AXIS, PLANE_AXES};
 use crate::dispatch;
 use crate::kernel::cpu::simd::fma;
 use rayon::prelude::*;
 
-/// Where a point lies between the vertices of a grid.
+/// Position of a point between the vertices of a grid.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Cell {
-    /// Vertex below, per axis; the one above exists.
+    /// Index of the vertex below the point along each axis; the vertex above always exists.
     pub index: [u32; 3],
-    /// 0..=1 on the way to the one above.
+    /// Position between the two vertices along each axis, 0..=1.
     pub frac: [f32; 3],
 }
 
 impl Cell {
-    /// The cell of a point given as 0..=1 along each axis of the box (the border's vertices are at 0 and 1).
+    /// Returns the cell of a point with coordinates 0..=1 along each axis of the box; outer vertices are at 0 and 1.
     #[inline(always)]
     pub fn new(size: [usize; 3], unit: [f32; 3]) -> Cell {
         let mut cell = Cell::default();
@@ -29,7 +29,7 @@ impl Cell {
     }
 }
 
-/// The four corners of a cell in plane `i`: offsets of the two rows, and their weights.
+/// The four corners of a cell in a plane: offsets of the two rows, and the weights of the corners.
 #[derive(Clone, Copy)]
 struct Corners {
     rows: [usize; 2],
@@ -60,7 +60,7 @@ fn lanes<const W: usize>(values: &[f32], start: usize) -> &[f32; W] {
     values[start..start + W].try_into().expect("a slice of W floats")
 }
 
-/// Plane and line values of `W` channels from `c` on.
+/// Interpolates plane and line values of `W` channels, starting at channel `c`.
 #[inline(always)]
 fn look_up<const F: bool, const W: usize>(
     term: &Term,
@@ -84,7 +84,7 @@ fn look_up<const F: bool, const W: usize>(
     (plane, value)
 }
 
-/// Runs `body` over the channels of a term in the widest pieces that fit.
+/// Runs `body` over the channels of a term, in pieces of the largest width that fits.
 macro_rules! in_pieces {
     ($channels:expr, $c:ident, $width:ident, $body:block) => {
         in_pieces!([16, 8, 4, 1] $channels, $c, $width, $body)
@@ -120,7 +120,7 @@ impl<'a> Lookup<'a> {
         self.size
     }
 
-    /// Σ over terms and channels of plane times line.
+    /// Returns the sum over terms and channels of plane times line.
     #[inline(always)]
     pub fn sum<const F: bool>(&self, cell: &Cell) -> f32 {
         let mut total = 0f32;
@@ -141,7 +141,7 @@ impl<'a> Lookup<'a> {
         total
     }
 
-    /// Plane and line values of all channels, terms one after the other. Both `[channels]` or longer.
+    /// Writes plane and line values of all channels, term by term. Both slices are `[channels]` or longer.
     #[inline(always)]
     pub fn factors<const F: bool>(&self, cell: &Cell, planes: &mut [f32], lines: &mut [f32]) {
         let mut first = 0;
@@ -160,17 +160,18 @@ impl<'a> Lookup<'a> {
     }
 }
 
-/// Gradients of many lookups: what each sample says about its plane and line values.
-pub(super) struct Spread<'a> {
+/// Gradients of a loss with respect to the interpolated plane and line values of samples.
+pub(super) struct FactorGradients<'a> {
     pub cells: &'a [Cell],
     /// `[samples, stride]`, the first `channels` of a row are used.
     pub planes: &'a [f32],
-    /// As `planes`.
+    /// Shaped like `planes`.
     pub lines: &'a [f32],
+    /// Number of floats per row.
     pub stride: usize,
 }
 
-/// Part of a plane or a line that one task owns.
+/// The part of a plane or line that one task owns in the scatter.
 struct Band<'a> {
     term: usize,
     line: bool,
@@ -183,12 +184,12 @@ struct Band<'a> {
     values: &'a mut [f32],
 }
 
-/// `into += weight · g`, n channels.
+/// Adds `weight · g` to `into`, for `n` channels.
 #[inline(always)]
 fn add<const F: bool>(into: &mut [f32], g: &[f32], weight: f32, n: usize) {
     let (into, g) = (&mut into[..n], &g[..n]);
     in_pieces!(n, c, W, {
-        // a copy, so that nothing is written while there is something to read: this is what vectorises
+        // the copy separates reads from writes, which is what allows vectorization
         let mut sum: [f32; W] = *lanes::<W>(into, c);
         let g: &[f32; W] = lanes::<W>(g, c);
         for k in 0..W {
@@ -198,7 +199,7 @@ fn add<const F: bool>(into: &mut [f32], g: &[f32], weight: f32, n: usize) {
     });
 }
 
-/// Two neighbours along a row at once: they lie one after the other.
+/// Adds `a · g` and `b · g` to two neighbors along a row, which are adjacent in memory.
 #[inline(always)]
 fn add_pair<const F: bool>(into: &mut [f32], g: &[f32], a: f32, b: f32, n: usize) {
     add::<F>(into, g, a, n);
@@ -206,12 +207,12 @@ fn add_pair<const F: bool>(into: &mut [f32], g: &[f32], a: f32, b: f32, n: usize
 }
 
 #[inline(always)]
-fn band_body<const F: bool>(band: &mut Band, spread: &Spread) {
+fn band_body<const F: bool>(band: &mut Band, gradients: &FactorGradients) {
     let n = band.channels;
     if band.line {
         let axis = LINE_AXIS[band.term];
-        for (s, cell) in spread.cells.iter().enumerate() {
-            let g = &spread.lines[s * spread.stride + band.first..][..n];
+        for (s, cell) in gradients.cells.iter().enumerate() {
+            let g = &gradients.lines[s * gradients.stride + band.first..][..n];
             let z = cell.frac[axis];
             let at = cell.index[axis] as usize * n;
             add_pair::<F>(&mut band.values[at..at + 2 * n], g, 1.0 - z, z, n);
@@ -221,13 +222,13 @@ fn band_body<const F: bool>(band: &mut Band, spread: &Spread) {
     let (a, b) = PLANE_AXES[band.term];
     let pitch = band.width * n;
     let rows = band.values.len() / pitch;
-    for (s, cell) in spread.cells.iter().enumerate() {
-        // this row and the next; those of other bands are somebody else's
+    for (s, cell) in gradients.cells.iter().enumerate() {
+        // a sample contributes to this row and the next, either of which may belong to another band
         let row = (cell.index[b] as usize).wrapping_sub(band.row);
         if row >= rows && row.wrapping_add(1) >= rows {
             continue;
         }
-        let g = &spread.planes[s * spread.stride + band.first..][..n];
+        let g = &gradients.planes[s * gradients.stride + band.first..][..n];
         let (x, y) = (cell.frac[a], cell.frac[b]);
         let at = cell.index[a] as usize * n;
         if row < rows {
@@ -241,24 +242,24 @@ fn band_body<const F: bool>(band: &mut Band, spread: &Spread) {
     }
 }
 
-dispatch! { fn spread_band / band_body(band: &mut Band, spread: &Spread) }
+dispatch! { fn scatter_band / band_body(band: &mut Band, gradients: &FactorGradients) }
 
-/// Bands a plane is cut into: fixed, so that the order of sums does not depend on the number of threads.
+/// Number of bands of a plane. It is fixed, so that the order of sums does not depend on the number of threads.
 const BANDS: usize = 6;
 
-/// Adds the gradients of all samples to `gradient` (laid out as `grid`). Every vertex is summed in the order
-/// of the samples, whatever the number of threads.
-pub(super) fn scatter(grid: &Grid, spread: &Spread, gradient: &mut [f32]) {
+/// Adds the gradients of all samples to `gradient`, which is laid out as `grid`. Every vertex is summed in the order of
+/// the samples, for any number of threads.
+pub(super) fn scatter(grid: &Grid, gradients: &FactorGradients, gradient: &mut [f32]) {
     assert_eq!(gradient.len(), grid.len());
     let mut bands = Vec::new();
-    for (k, (factor, own)) in grid.split_mut(gradient).into_iter().enumerate() {
+    for (k, (factor, factor_gradient)) in grid.split_mut(gradient).into_iter().enumerate() {
         let (term, line) = (k % 3, k >= 3);
         let Factor { height, width, channels, .. } = factor;
         let first = grid.rank[..term].iter().sum();
         let rows = if line { 1 } else { height.div_ceil(BANDS) };
-        for (i, values) in own.chunks_mut((rows * width * channels).max(1)).enumerate() {
+        for (i, values) in factor_gradient.chunks_mut((rows * width * channels).max(1)).enumerate() {
             bands.push(Band { term, line, row: i * rows, channels, first, width, values });
         }
     }
-    bands.par_iter_mut().with_max_len(1).for_each(|band| spread_band(band, spread));
+    bands.par_iter_mut().with_max_len(1).for_each(|band| scatter_band(band, gradients));
 }

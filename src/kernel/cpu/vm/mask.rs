@@ -1,37 +1,38 @@
-//! Which cells of a box may hold anything, and marching through them on a fixed lattice of steps.
+//! The occupied cells of a box, and marching through them on a fixed lattice of steps.
 //!
 //! TensoRF's alpha mask (Chen et al. 2022, §4.3; `alphaMask` of the published code) marks vertices and is
-//! looked up trilinearly: a point is kept if any vertex around it is. That is the same as cells whose
-//! corners are evaluated once, so here cells are stored, and a ray steps over empty ones *before* the field is
-//! touched. Sample positions `t = entry + step · (k + jitter)` do not depend on the mask.
+//! looked up trilinearly: a point is kept if any vertex around it is marked. A cell is therefore either kept
+//! as a whole or empty, so cells are stored here, and a ray skips empty ones *before* the field is evaluated. Sample
+//! positions `t = entry + step · (k + jitter)` do not depend on the mask.
 
 use crate::kernel::cpu::march::MarchRay;
 
-/// Cells of a box, one bit each, cell `(x · ny + y) · nz + z`; and blocks of cells that are all empty.
+/// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`. A second bitmask holds
+/// the blocks with an occupied cell, so that rays can skip empty blocks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BoxMask {
     min: [f32; 3],
     max: [f32; 3],
     size: [usize; 3],
     bits: Vec<u64>,
-    /// Bits of blocks of `BLOCK`³ cells that hold an occupied cell.
+    /// One bit per block of `BLOCK`³ cells, set if the block contains an occupied cell.
     blocks: Vec<u64>,
 }
 
-/// Cells along the edge of a block.
+/// Number of cells along the edge of a block.
 pub(in crate::kernel) const BLOCK: usize = 8;
 
 fn bit(bits: &[u64], i: usize) -> bool {
     bits[i >> 6] >> (i & 63) & 1 == 1
 }
 
-/// All cells of a box in their order.
+/// Iterates over the cells of a box in the order of their bits.
 fn cells([nx, ny, nz]: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
     (0..nx).flat_map(move |x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])))
 }
 
 impl BoxMask {
-    /// From cells evaluated one by one.
+    /// Creates a mask by evaluating `occupied` for every cell.
     pub fn new(
         min: [f32; 3],
         max: [f32; 3],
@@ -45,7 +46,7 @@ impl BoxMask {
         BoxMask::from_bits(min, max, size, bits).expect("a bit for each cell")
     }
 
-    /// From its bits, as [`BoxMask::bits`] gives them; `None` if they are not as many as the cells need.
+    /// Creates a mask from its bits, as [`BoxMask::bits`] returns them; `None` if their number does not fit the cells.
     pub fn from_bits(min: [f32; 3], max: [f32; 3], size: [usize; 3], bits: Vec<u64>) -> Option<BoxMask> {
         let count = size.iter().try_fold(1usize, |n, &s| n.checked_mul(s))?;
         if bits.len() != count.div_ceil(64) {
@@ -60,18 +61,19 @@ impl BoxMask {
         Some(BoxMask { min, max, size, bits, blocks })
     }
 
-    /// Cells around vertices: a cell is occupied if one of its eight corners is. `vertices` are
-    /// `(x · ny + y) · nz + z`, at least 2 along each axis, the outer ones on the border of `min..max`.
+    /// Creates a mask from marked vertices: a cell is occupied if one of its eight corners is marked. Vertex `(x, y, z)`
+    /// has index `(x · ny + y) · nz + z`; there are at least 2 along each axis, and the outer ones lie on the border of
+    /// `min..max`.
     ///
-    /// The cells go one further than the vertices on every side, as the published lookup does: it pads with
-    /// zeros, and a point less than a cell outside still has some of the vertex on the border.
+    /// The cells extend beyond the vertices by one on every side. The published lookup pads with zeros, so a vertex on the
+    /// border still contributes to points that lie less than a cell outside.
     pub fn from_vertices(min: [f32; 3], max: [f32; 3], size: [usize; 3], vertices: &[bool]) -> BoxMask {
         assert_eq!(vertices.len(), size.iter().product::<usize>());
         let unit: [f32; 3] = std::array::from_fn(|a| (max[a] - min[a]) / (size[a] - 1) as f32);
         let grown = |corner: [f32; 3], sign: f32| std::array::from_fn(|a| corner[a] + sign * unit[a]);
         BoxMask::new(grown(min, -1.0), grown(max, 1.0), size.map(|n| n + 1), |[x, y, z]| {
             (0..8).any(|k| {
-                // cell 0 lies before vertex 0: its upper corner
+                // cell 0 lies before vertex 0, which is its upper corner
                 let v = [x + (k & 1), y + (k >> 1 & 1), z + (k >> 2)];
                 (0..3).all(|a| v[a] > 0 && v[a] <= size[a])
                     && vertices[((v[0] - 1) * size[1] + v[1] - 1) * size[2] + v[2] - 1]
@@ -83,39 +85,39 @@ impl BoxMask {
         (c[0] * self.size[1] + c[1]) * self.size[2] + c[2]
     }
 
-    /// Lower and upper corner.
+    /// Returns the lower and upper corner of the mask's box.
     pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
         (self.min, self.max)
     }
 
-    /// Cells along each axis.
+    /// Returns the number of cells along each axis.
     pub fn size(&self) -> [usize; 3] {
         self.size
     }
 
-    /// The cells' bits.
+    /// Returns the cells' bits.
     pub fn bits(&self) -> &[u64] {
         &self.bits
     }
 
-    /// Bits of blocks of 8³ cells that hold an occupied cell, in the order of cells.
+    /// Returns one bit per block of 8³ cells, set if the block contains an occupied cell, in the order of cells.
     #[cfg(feature = "wgpu")]
     pub(in crate::kernel) fn blocks(&self) -> &[u64] {
         &self.blocks
     }
 
-    /// Share of cells that are occupied, 0..=1.
+    /// Returns the fraction of cells that are occupied, 0..=1.
     pub fn share(&self) -> f64 {
         let cells: usize = self.size.iter().product();
         let set: u64 = self.bits.iter().map(|b| b.count_ones() as u64).sum();
         set as f64 / cells.max(1) as f64
     }
 
-    /// Is a point in an occupied cell? Outside the box nothing is.
+    /// Returns whether a point lies in an occupied cell; false outside the box.
     pub fn contains(&self, p: [f32; 3]) -> bool {
         let mut c = [0; 3];
         for a in 0..3 {
-            // also refuses NaN
+            // this form of the comparison also rejects NaN
             if !(p[a] >= self.min[a] && p[a] <= self.max[a]) {
                 return false;
             }
@@ -126,25 +128,25 @@ impl BoxMask {
     }
 }
 
-/// The lattice of a box: entry, step and how many samples a ray has.
+/// The lattice of samples on a ray through a box.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lattice {
     /// Lower corner of the field's box.
     pub min: [f32; 3],
     /// Upper corner.
     pub max: [f32; 3],
-    /// Distance of samples, in units of `t`.
+    /// Distance between samples, in units of `t`.
     pub step: f32,
-    /// Samples of a ray; the last has no length and so no weight.
+    /// Number of samples of a ray; the last one has length 0 and therefore no weight.
     pub samples: usize,
-    /// The entry is kept within these.
+    /// Minimum of `t` at the first sample.
     pub near: f32,
-    /// See `near`.
+    /// Maximum of `t` at the first sample.
     pub far: f32,
 }
 
 impl Lattice {
-    /// Lattice points of a ray inside the box: what a renderer that skips nothing evaluates.
+    /// Returns the number of lattice points of a ray inside the box, which a renderer without a mask evaluates.
     pub fn points(&self, ray: &MarchRay) -> u64 {
         match self.crossing(ray) {
             Some((enter, leave)) => {
@@ -155,7 +157,7 @@ impl Lattice {
         }
     }
 
-    /// Where a ray enters and leaves the box.
+    /// Returns `t` where a ray enters and leaves the box; `None` if it misses.
     #[inline(always)]
     fn crossing(&self, ray: &MarchRay) -> Option<(f32, f32)> {
         let (enter, leave) = crossing([self.min, self.max], ray.origin, ray.direction);
@@ -164,8 +166,8 @@ impl Lattice {
     }
 }
 
-/// Where a line enters and leaves a box, the first behind the second where it misses; zero components of its direction
-/// count as 1e-6, as published.
+/// Returns `t` where a line enters and leaves a box; the first is greater than the second if the line misses. Zero
+/// components of the direction are replaced by 1e-6, as in the published code.
 #[inline(always)]
 pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3]) -> (f32, f32) {
     let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
@@ -178,9 +180,9 @@ pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3
     (enter, leave)
 }
 
-/// The lattice points of a ray inside the box and inside a mask, one after the other.
+/// Walks over the lattice points of a ray inside the box and inside a mask.
 ///
-/// A state and not a closure: a closure handed down would be compiled without the vector instructions of the
+/// This is a state rather than a closure, because a closure would be compiled without the vector instructions of the
 /// kernel that calls it.
 pub struct Walk<'a> {
     lattice: &'a Lattice,
@@ -188,17 +190,18 @@ pub struct Walk<'a> {
     ray: MarchRay,
     start: f32,
     leave: f32,
-    /// Next point.
+    /// Index of the next lattice point.
     k: i64,
     end: i64,
-    /// Mask cells in a unit of length, and the inverse of how many a ray crosses in a unit of t.
+    /// Mask cells per unit of length.
     scale: [f32; 3],
+    /// Inverse of the number of mask cells that the ray crosses per unit of `t`.
     inverse: [f32; 3],
     blocks: [usize; 3],
 }
 
 impl<'a> Walk<'a> {
-    /// Before the first point; without any for a ray that misses.
+    /// Creates a walk that starts before the first lattice point; it has no points if the ray misses the box.
     #[inline(always)]
     pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &MarchRay) -> Walk<'a> {
         let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
@@ -219,7 +222,7 @@ impl<'a> Walk<'a> {
         Walk { lattice, mask, ray: *ray, start, leave, k: 0, end, scale, inverse, blocks }
     }
 
-    /// The next `t`.
+    /// Returns `t` of the next lattice point.
     #[inline(always)]
     pub fn advance(&mut self) -> Option<f32> {
         let l = self.lattice;
@@ -260,7 +263,7 @@ impl<'a> Walk<'a> {
                 self.k += 1;
                 return Some(t);
             }
-            // on to the border of the empty cell, or of its block if that is empty too; by whole steps
+            // skip to the border of the empty cell, or of its block if that is empty too, by a whole number of steps
             let block = [c[0] / BLOCK, c[1] / BLOCK, c[2] / BLOCK];
             let at = (block[0] * self.blocks[1] + block[1]) * self.blocks[2] + block[2];
             let empty = !bit(&mask.blocks, at);
@@ -273,7 +276,7 @@ impl<'a> Walk<'a> {
                     border = border.min((wall as f32 - g[a]) * self.inverse[a]);
                 }
             }
-            // a hair less, so that rounding cannot jump over a sample in the next cell
+            // slightly less than that, so that rounding cannot skip a sample in the next cell
             self.k += ((border.max(0.0) / l.step - 1e-3).ceil() as i64).max(1);
         }
         None

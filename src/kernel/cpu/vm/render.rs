@@ -1,4 +1,4 @@
-//! Rays through the field, front to back, and their gradients.
+//! Volume rendering of the field, front to back, and its gradients.
 //!
 //! ```text
 //! σ_k = activation(feature(p_k))          α_k = 1 − exp(−σ_k δ s)      δ the step, s the distance scale
@@ -6,10 +6,10 @@
 //! C = Σ w_k c_k  over w_k > threshold     opacity = Σ w_k              depth = Σ w_k t_k
 //! ```
 //!
-//! A ray is marched, evaluated and composited in one go, so it can end where nothing behind it is seen.
+//! A ray is marched, evaluated and composited in one pass, so it can end where its transmittance is used up.
 
 use super::decoder::{self, Decoded, DecoderWeights};
-use super::gather::{self, Cell, Lookup, Spread};
+use super::gather::{self, Cell, FactorGradients, Lookup};
 use super::mask::{BoxMask, Lattice, Walk};
 use super::{DecoderShape, Grid};
 use crate::dispatch;
@@ -19,26 +19,26 @@ use crate::kernel::cpu::simd::{exp, ln_1p};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Values of a rendered ray: rgb over black (3), opacity, Σ w t.
+/// Number of values of a rendered ray: rgb over black (3), opacity, Σ w t.
 pub const RAY_WIDTH: usize = 5;
 
-/// From features to densities and on to weights.
+/// Conversion of features to densities and weights.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Shading {
-    /// Softplus of `feature + shift`, else relu of the feature.
+    /// Whether the density is the softplus of `feature + shift`, else the relu of the feature.
     pub softplus: bool,
-    /// Only used with softplus.
+    /// Offset of the feature, used with softplus only.
     pub shift: f32,
-    /// Optical lengths are steps times this.
+    /// Factor from the length of a step to its optical length.
     pub distance_scale: f32,
     /// Color is evaluated only where the weight is above this.
     pub weight_threshold: f32,
-    /// A ray ends where less than this of its light is left; 0 never does.
+    /// A ray ends where its transmittance is at most this; at 0 it does not end early.
     pub stop: f32,
 }
 
 impl Shading {
-    /// Density of a feature.
+    /// Returns the density of a feature.
     #[inline(always)]
     pub fn density<const F: bool>(&self, feature: f32) -> f32 {
         if self.softplus {
@@ -59,7 +59,7 @@ impl Shading {
     }
 }
 
-/// Everything about a field but its weights.
+/// All properties of a field except its weights.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VmField {
     /// Planes and lines of the density.
@@ -70,9 +70,9 @@ pub struct VmField {
     pub decoder: DecoderShape,
     /// Box, step and number of samples.
     pub lattice: Lattice,
-    /// Feature to weight.
+    /// Conversion of features to weights.
     pub shading: Shading,
-    /// Cells that may hold anything; everywhere without.
+    /// Occupied cells; `None` if all of the box is occupied.
     pub mask: Option<BoxMask>,
 }
 
@@ -88,7 +88,7 @@ impl VmField {
     }
 }
 
-/// A density sample that has a say.
+/// A sample that contributes to its ray or its gradient.
 #[derive(Clone, Copy, Debug)]
 struct Kept {
     t: f32,
@@ -97,25 +97,25 @@ struct Kept {
     transmittance: f32,
 }
 
-/// A rendered batch, with what its backward needs.
+/// A rendered batch of rays, with the intermediate values that its backward pass needs.
 #[derive(Clone, Debug)]
 pub struct Rendered {
     /// `[rays, 5]`: see [`RAY_WIDTH`].
     pub out: Vec<f32>,
-    /// Samples whose density was looked up.
+    /// Number of samples whose density was evaluated.
     pub density_samples: u64,
-    /// Samples whose color was decoded.
+    /// Number of samples whose color was decoded.
     pub color_samples: u64,
     kept: Vec<Kept>,
     cells: Vec<Cell>,
     /// `[rays + 1]` into `kept`.
     offsets: Vec<u32>,
-    /// Indices into `kept`, rising.
+    /// Indices into `kept`, in increasing order.
     colored: Vec<u32>,
     decoded: Decoded,
 }
 
-/// Rays a task handles.
+/// Number of rays per task.
 const RAYS: usize = 32;
 
 struct MarchTask<'a> {
@@ -140,7 +140,7 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
             task.looked_up += 1;
             if !s.softplus && feature <= 0.0 {
                 transmittance *= 1.0 + 1e-10;
-                continue; // neither weight nor gradient
+                continue; // the sample has neither weight nor gradient
             }
             let alpha = 1.0 - exp::<F>(-s.density::<F>(feature) * length);
             task.kept.push(Kept { t, feature, alpha, transmittance });
@@ -156,7 +156,7 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
 
 dispatch! { fn march_rays / march_body(task: &mut MarchTask, field: &VmField, lookup: &Lookup) }
 
-/// Renders rays.
+/// Renders a batch of rays.
 ///
 /// # Shapes
 ///
@@ -200,8 +200,8 @@ pub fn render(
     let threshold = field.shading.weight_threshold;
     let mut colored = Vec::with_capacity(total);
     let mut directions = Vec::with_capacity(total);
-    for (ray, own) in rays.iter().zip(offsets.windows(2)) {
-        for i in own[0]..own[1] {
+    for (ray, range) in rays.iter().zip(offsets.windows(2)) {
+        for i in range[0]..range[1] {
             let k = &kept[i as usize];
             if k.alpha * k.transmittance > threshold {
                 colored.push(i);
@@ -254,8 +254,9 @@ dispatch! {
     )
 }
 
-/// Gradients of a rendered batch: adds those of the grids to `g_density` and `g_color`, returns those of
-/// the decoder's flat weights. `g` is `[rays, 5]`, by [`Rendered::out`].
+/// Computes the gradients of a rendered batch: adds those with respect to the grids to `g_density` and `g_color`, and
+/// returns those with respect to the decoder's flat weights. `g` is the gradient with respect to [`Rendered::out`],
+/// `[rays, 5]`.
 pub fn backward(
     field: &VmField,
     density: &[f32],
@@ -272,7 +273,7 @@ pub fn backward(
     let mut end = colored.len();
     for r in (0..offsets.len() - 1).rev() {
         let g = &g[r * RAY_WIDTH..][..RAY_WIDTH];
-        let mut behind = 0f32; // Σ w_j dL/dw_j of the samples behind
+        let mut farther = 0f32; // Σ w_j dL/dw_j over the farther samples
         for i in (offsets[r]..offsets[r + 1]).rev() {
             let k = &kept[i as usize];
             let w = k.alpha * k.transmittance;
@@ -284,14 +285,14 @@ pub fn backward(
                 g_rgb[end] = [w * g[0], w * g[1], w * g[2]];
             }
             let open = 1.0 - k.alpha;
-            let g_alpha = k.transmittance * g_w - behind / (open + 1e-10);
+            let g_alpha = k.transmittance * g_w - farther / (open + 1e-10);
             // dα/dσ = (1 − α) δ s
             let slope = field.shading.slope::<true>(k.feature);
             g_feature[i as usize] = g_alpha * open * length * slope;
-            behind += w * g_w;
+            farther += w * g_w;
         }
     }
-    // no need to spread what is exactly nothing
+    // samples with a gradient of exactly zero need no scatter
     let (cells, g_feature): (Vec<Cell>, Vec<f32>) =
         cells.into_iter().zip(g_feature).filter(|(_, g)| *g != 0.0).unzip();
     let lookup = Lookup::new(&field.density, density);
@@ -304,8 +305,8 @@ pub fn backward(
         .zip(lines.par_chunks_mut(CHUNK * n))
         .zip(cells.par_chunks(CHUNK).zip(g_feature.par_chunks(CHUNK)))
         .for_each(|((p, l), (cells, g))| factor_gradients(cells, g, p, l, n, &lookup));
-    let spread = Spread { cells: &cells, planes: &planes, lines: &lines, stride: n };
-    gather::scatter(&field.density, &spread, g_density);
+    let gradients = FactorGradients { cells: &cells, planes: &planes, lines: &lines, stride: n };
+    gather::scatter(&field.density, &gradients, g_density);
     decoder::decode_backward(&field.color, decoder, decoded, &g_rgb, g_color)
 }
 
@@ -320,7 +321,7 @@ dispatch! {
     fn density_points / density_body(points: &[[f32; 3]], out: &mut [f32], field: &VmField, lookup: &Lookup)
 }
 
-/// Densities at points of the field's box, without the mask. `[n, 3]` → `[n]`.
+/// Returns densities at points of the field's box, ignoring the mask. `[n, 3]` → `[n]`.
 pub fn density_at(field: &VmField, density: &[f32], points: &[[f32; 3]]) -> Vec<f32> {
     let lookup = Lookup::new(&field.density, density);
     let mut out = vec![0f32; points.len()];

@@ -1,20 +1,21 @@
-//! Finer planes and lines, and parts of them.
+//! Resampling and cropping of planes and lines.
 
 use super::{Factor, Grid, LINE_AXIS, PLANE_AXES};
 use rayon::prelude::*;
 
-/// Planes and lines on another number of vertices over the same box: linear between vertices, corners stay
-/// corners (torch's `interpolate` with `align_corners`).
+/// Returns planes and lines, resampled to another number of vertices over the same box: interpolation is linear and
+/// corners keep their values (torch's `interpolate` with `align_corners`).
 pub fn resized(from: &Grid, values: &[f32], to: &Grid) -> Vec<f32> {
     assert!(values.len() == from.len() && from.rank == to.rank);
     let mut out = vec![0f32; to.len()];
-    for (a, (b, own)) in from.factors().iter().zip(to.split_mut(&mut out)) {
-        resize(a, &values[a.range()], &b, own);
+    for (a, (b, factor)) in from.factors().iter().zip(to.split_mut(&mut out)) {
+        resize(a, &values[a.range()], &b, factor);
     }
     out
 }
 
-/// Vertex below and way to the one above, of vertex `i` of `to` between those of `from`.
+/// Returns the position of vertex `i` of `to` vertices among `from` vertices: the index of the vertex below, and the
+/// fraction of the way to the next.
 fn interpolation(i: usize, from: usize, to: usize) -> (usize, f32) {
     if from < 2 || to < 2 {
         return (0, 0.0);
@@ -45,7 +46,7 @@ fn resize(a: &Factor, x: &[f32], b: &Factor, out: &mut [f32]) {
     });
 }
 
-/// The vertices `low..high` of each axis.
+/// Returns the grid of the vertices `low..high` along each axis, and its planes and lines.
 pub fn cropped(from: &Grid, values: &[f32], low: [usize; 3], high: [usize; 3]) -> (Grid, Vec<f32>) {
     let to = Grid { size: std::array::from_fn(|a| high[a] - low[a]), rank: from.rank };
     let mut out = Vec::with_capacity(to.len());

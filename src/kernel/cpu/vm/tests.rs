@@ -5,12 +5,12 @@ use super::*;
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::{reference, rng};
 
-/// A point given as -1..=1 along each axis of the fixture's box.
+/// Returns the position of a point with coordinates -1..=1 along each axis of the fixture's box.
 fn at(u: [f32; 3]) -> [f32; 3] {
     [u[0] * 1.5, u[1] * 1.67, u[2]]
 }
 
-/// Σ over the three planes of TV.
+/// Returns the sum of TV over the three planes.
 fn total_variation(grid: &Grid, values: &[f32]) -> f64 {
     (0..3)
         .map(|i| {
@@ -116,8 +116,8 @@ fn voxel_counts_and_sizes_are_the_published_ones() {
     assert!((step_size(extent, [331, 368, 220], 0.5) - 0.004554).abs() < 1e-6);
 }
 
-/// Σ g · out of the formulas in f64.
-fn plain(f: &VmField, x: &[f64], rays: &[MarchRay], g: &[f32]) -> f64 {
+/// Returns Σ g · out, by the formulas in f64.
+fn reference_loss(f: &VmField, x: &[f64], rays: &[MarchRay], g: &[f32]) -> f64 {
     reference::vm::render(f, x, rays).iter().zip(g).map(|(o, g)| o * *g as f64).sum()
 }
 
@@ -169,13 +169,12 @@ fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
         let i = rng::below(seed, 6, k, x.len() as u64) as usize;
         let (old, h) = (x[i], 1e-6);
         x[i] = old + h;
-        let up = plain(&f, &x, &rays, &g);
+        let up = reference_loss(&f, &x, &rays, &g);
         x[i] = old - h;
-        let down = plain(&f, &x, &rays, &g);
+        let down = reference_loss(&f, &x, &rays, &g);
         x[i] = old;
         let want = (up - down) / (2.0 * h);
         let error = (analytic[i] as f64 - want).abs() / want.abs().max(1e-2 * largest);
-        // a kink of relu inside the difference is no error of the gradient
         errors.push(error);
     }
     errors
@@ -183,13 +182,13 @@ fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
 
 #[test]
 fn gradients_agree_with_finite_differences_of_the_plain_formulas() {
-    let mut all = Vec::new();
+    let mut errors = Vec::new();
     for (softplus, encodings, seed) in [(false, 0, 1), (false, 2, 2), (true, 0, 3), (true, 2, 4)] {
-        all.extend(check_gradients(softplus, encodings, seed));
+        errors.extend(check_gradients(softplus, encodings, seed));
     }
-    all.sort_by(f64::total_cmp);
-    let (median, worst) = (all[all.len() / 2], all[all.len() - 1]);
-    println!("{} gradients: worst {worst:.2e}, median {median:.2e}", all.len());
+    errors.sort_by(f64::total_cmp);
+    let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
+    println!("{} gradients: worst {worst:.2e}, median {median:.2e}", errors.len());
     assert!(worst <= 1e-3 && median <= 1e-4, "worst {worst:.2e}, median {median:.2e}");
 }
 
@@ -223,7 +222,7 @@ fn a_mask_removes_samples_and_moves_none() {
     // the mask's box is smaller than the field's, as after an update before the box shrinks again
     let hit = |c: [usize; 3]| (c[0] * 7 + c[1] * 3 + c[2]).is_multiple_of(11) && c[0] < 30;
     let mask = BoxMask::new([-0.9, -0.8, -1.2], [1.0, 0.7, 1.1], [37, 20, 29], hit);
-    let mut met = 0;
+    let mut hit_rays = 0;
     for i in 0..50 {
         let u = |k: u64| rng::uniform(9, 1, 8 * i + k) - 0.5;
         let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(0), 0.8 * u(1), -1.0] };
@@ -238,13 +237,13 @@ fn a_mask_removes_samples_and_moves_none() {
             .copied()
             .filter(|t| mask.contains(std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a])))
             .collect();
-        met += usize::from(!all.is_empty());
+        hit_rays += usize::from(!all.is_empty());
         // a sample on the very border of a cell may fall on either side
-        let odd = want.iter().filter(|t| !some.contains(t)).count()
+        let differing = want.iter().filter(|t| !some.contains(t)).count()
             + some.iter().filter(|t| !want.contains(t)).count();
-        assert!(odd <= 1, "ray {i}: {odd} of {}", want.len());
+        assert!(differing <= 1, "ray {i}: {differing} of {}", want.len());
     }
-    assert!(met > 30, "{met}");
+    assert!(hit_rays > 30, "{hit_rays}");
 }
 
 #[test]
@@ -252,7 +251,7 @@ fn vertices_occupy_the_cells_around_them() {
     let mut vertices = vec![false; 4 * 5 * 6];
     vertices[(2 * 5 + 1) * 6 + 5] = true;
     let mask = BoxMask::from_vertices([0.0; 3], [3.0, 4.0, 5.0], [4, 5, 6], &vertices);
-    // vertex (2, 1, 5) touches what is less than one away along every axis, the border's outside too
+    // vertex (2, 1, 5) occupies all cells less than one away along every axis, also outside the border
     for (p, inside) in
         [([1.5, 0.5, 4.5], true), ([2.9, 1.9, 5.9], true), ([0.9, 1.0, 5.0], false), ([2.0, 1.0, 3.9], false)]
     {
@@ -286,7 +285,7 @@ fn finer_grids_keep_corners_and_straight_lines() {
 }
 
 #[test]
-fn hidden_samples_change_a_ray_by_less_than_what_is_left_of_its_light() {
+fn early_termination_changes_a_ray_by_less_than_its_transmittance() {
     let mut f = field();
     f.lattice.step = 0.02;
     f.lattice.samples = 300;

@@ -1,16 +1,18 @@
-//! What runs on the device: weights made ready, the networks forward, and backward one kernel a network.
+//! Kernels of the signed-distance field: preparation of the weights, the forward pass, and the backward pass in one kernel
+//! per network.
 
 use super::super::tile::{
-    self, CHANNELS, LANES, at, gate, load, narrow, outer, product, put, relu, save, sigmoid, sums,
+    self, CHANNELS, LANES, at, load_planes, outer, output_layer, product, relu, relu_backward, sample_sums,
+    sigmoid, store_block, store_planes,
 };
 use super::{NORMAL, Plan};
 use crate::kernel::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, SOFTNESS, TILE};
-use crate::kernel::cpu::neus::SHORTEST;
+use crate::kernel::cpu::neus::MIN_GRADIENT_NORM;
 use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 
-/// Weights in the orders in which they are read.
+/// Copies the weights to the orders in which they are read.
 #[cube(launch)]
 pub(in super::super) fn prepare(flat: &[f32], map: &[u32], out: &mut [f32]) {
     let i = ABSOLUTE_POS;
@@ -20,7 +22,7 @@ pub(in super::super) fn prepare(flat: &[f32], map: &[u32], out: &mut [f32]) {
     }
 }
 
-/// Sums of the groups' gradients, in the order of the groups.
+/// Sums the partial gradients of the groups, in the order of the groups.
 #[cube(launch)]
 pub(in super::super) fn reduce(
     partial: &[f32],
@@ -66,7 +68,7 @@ fn geometry_inputs(
     }
 }
 
-/// v / ‖v‖ and ‖v‖, as the CPU takes them.
+/// v / ‖v‖ and ‖v‖, by the same formulas as the CPU.
 #[derive(CubeType)]
 struct Unit {
     x: F4,
@@ -81,8 +83,8 @@ fn unit(x: F4, y: F4, z: F4) -> Unit {
     Unit { x: x / length, y: y / length, z: z / length, length }
 }
 
-/// Writes the inputs of the color network to a tile, after a thread's own output `o` of the geometry network and, for
-/// the one that writes it, the normal.
+/// Writes the inputs of the color network to a tile. `o` is the thread's output of the geometry network; `normal` is read
+/// by one thread of each row only.
 #[cube]
 fn color_inputs(
     a: &mut [F4],
@@ -147,8 +149,8 @@ pub(in super::super) fn harmonics(a: &mut [F4], #[comptime] first: usize, x: F4,
     a[at(first + 15, row, LANES)] = x * (y2 * F4::new(3.0f32) - x2) * F4::new(0.590_043_6f32);
 }
 
-/// Writes sdf, ∇sdf, color and local sharpness, planes `[8, capacity]`, and what the backward needs; where normals are
-/// given, those in place of ∇sdf.
+/// Writes sdf, ∇sdf, color and local sharpness, planes `[8, capacity]`, and the activations that the backward pass needs.
+/// If `given` is set, `normals` replace ∇sdf.
 #[cube(launch_unchecked)]
 pub(super) fn forward(
     w: &[F4],
@@ -183,20 +185,20 @@ pub(super) fn forward(
         sync_cube();
         let z = product(&a, 0usize, w, comptime!(rows[0]), comptime!(plan.padded), row, column, LANES);
         let active = tile::activate(&z, w[comptime!(rows[2] * LANES) + column]);
-        save(h, &active.h, plane, here, column, HIDDEN);
-        put(&mut b, &active.h, row, column, LANES);
+        store_planes(h, &active.h, plane, here, column, HIDDEN);
+        store_block(&mut b, &active.h, row, column, LANES);
         sync_cube();
-        let own = narrow(&b, w, comptime!(rows[3]), row, column, OUTPUTS, LANES)
+        let output = output_layer(&b, w, comptime!(rows[3]), row, column, OUTPUTS, LANES)
             + w[comptime!(rows[4] * LANES) + column];
         if column < OUTPUTS {
-            o[column * plane + here] = own;
+            o[column * plane + here] = output;
         }
         let weighted = tile::weighted(&active.s, w[comptime!(rows[3] * LANES) + column]);
-        put(&mut a, &weighted, row, column, LANES);
+        store_block(&mut a, &weighted, row, column, LANES);
         sync_cube();
-        // q = a W1, and this thread's share of n = q_x + Jᵀ q_F
+        // q = a W1, and this thread's part of n = q_x + Jᵀ q_F
         let own_q = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
-        save(q, &own_q, plane, here, column, features);
+        store_planes(q, &own_q, plane, here, column, features);
         #[unroll]
         for axis in 0..3usize {
             let mut sum = F4::new(0.0f32);
@@ -232,45 +234,46 @@ pub(super) fn forward(
             out[2 * plane + here] = ny;
             out[3 * plane + here] = nz;
         }
-        color_inputs(&mut a, own, &unit(nx, ny, nz), direction, value, plane, here, row, column, plan);
+        color_inputs(&mut a, output, &unit(nx, ny, nz), direction, value, plane, here, row, column, plan);
         if column == 0 {
-            out[here] = own;
+            out[here] = output;
         }
         if column == SOFTNESS {
-            out[7 * plane + here] = sigmoid(own - F4::new(2.0f32)) * F4::new(-soften);
+            out[7 * plane + here] = sigmoid(output - F4::new(2.0f32)) * F4::new(-soften);
         }
         sync_cube();
         let first = product(&a, 0usize, w, comptime!(rows[5]), comptime!(plan.color), row, column, LANES);
         let first = relu(&first);
-        save(c1, &first, plane, here, column, HIDDEN);
-        put(&mut b, &first, row, column, LANES);
+        store_planes(c1, &first, plane, here, column, HIDDEN);
+        store_block(&mut b, &first, row, column, LANES);
         sync_cube();
         let second = relu(&product(&b, 0usize, w, comptime!(rows[7]), HIDDEN, row, column, LANES));
-        save(c2, &second, plane, here, column, HIDDEN);
-        put(&mut a, &second, row, column, LANES);
+        store_planes(c2, &second, plane, here, column, HIDDEN);
+        store_block(&mut a, &second, row, column, LANES);
         sync_cube();
-        let rgb = narrow(&a, w, comptime!(rows[9]), row, column, 3usize, LANES);
+        let rgb = output_layer(&a, w, comptime!(rows[9]), row, column, 3usize, LANES);
         if column < 3 {
             out[(4 + column) * plane + here] = sigmoid(rgb);
         }
     }
 }
 
-/// Samples from `samples` on count nothing.
+/// Returns four samples' values, set to zero from sample number `samples` on; `first` is the number of the first one.
 #[cube]
 pub(in super::super) fn masked(v: F4, first: usize, samples: usize) -> F4 {
-    let mut own = v;
+    let mut masked_v = v;
     #[unroll]
     for i in 0..4usize {
         if first + i >= samples {
-            own.insert(i, 0.0f32);
+            masked_v.insert(i, 0.0f32);
         }
     }
-    own
+    masked_v
 }
 
-/// Backward of the color network: gradients of the geometry network's outputs and of the normal by sample, of the
-/// features that the color network reads itself, and of the weights by group.
+/// Backward pass of the color network. Writes, for each sample, the gradients with respect to the geometry network's
+/// outputs, the normal, and the features that the color network reads; and partial sums by group of the gradients with
+/// respect to the weights.
 #[cube(launch_unchecked)]
 pub(super) fn color_backward(
     w: &[F4],
@@ -290,11 +293,11 @@ pub(super) fn color_backward(
     #[comptime] plan: Plan,
 ) {
     let rows = comptime!(plan.rows());
-    let own = comptime!(plan.gradients());
+    let gradient_rows = comptime!(plan.gradients());
     let plane = direction.len() / 3;
     let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
     let group = CUBE_POS;
-    let sum = group * comptime!(own[7] * CHANNELS);
+    let sum = group * comptime!(gradient_rows[7] * CHANNELS);
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let samples = tile::uniform_count(count, &mut a);
@@ -307,22 +310,22 @@ pub(super) fn color_backward(
             let g = masked(g_out[(4 + column) * plane + here], first, samples);
             a[at(column, row, LANES)] = g * y * (F4::new(1.0f32) - y);
         }
-        load(&mut b, c2, plane, here, row, column);
+        load_planes(&mut b, c2, plane, here, row, column);
         sync_cube();
-        let start = sum + comptime!(own[6] * CHANNELS);
+        let start = sum + comptime!(gradient_rows[6] * CHANNELS);
         outer(&a, 0usize, &b, 3usize, HIDDEN, partial, start, fresh, row, column, LANES);
         let g_c2 = product(&a, 0usize, w, comptime!(rows[9]), 3usize, row, column, LANES);
-        let g_c2 = gate(&g_c2, &b, row, column, LANES);
+        let g_c2 = relu_backward(&g_c2, &b, row, column, LANES);
         sync_cube();
-        put(&mut a, &g_c2, row, column, LANES);
-        load(&mut b, c1, plane, here, row, column);
+        store_block(&mut a, &g_c2, row, column, LANES);
+        load_planes(&mut b, c1, plane, here, row, column);
         sync_cube();
-        let start = sum + comptime!(own[5] * CHANNELS);
+        let start = sum + comptime!(gradient_rows[5] * CHANNELS);
         outer(&a, 0usize, &b, HIDDEN, HIDDEN, partial, start, fresh, row, column, LANES);
         let g_c1 = product(&a, 0usize, w, comptime!(rows[8]), HIDDEN, row, column, LANES);
-        let g_c1 = gate(&g_c1, &b, row, column, LANES);
+        let g_c1 = relu_backward(&g_c1, &b, row, column, LANES);
         sync_cube();
-        put(&mut a, &g_c1, row, column, LANES);
+        store_block(&mut a, &g_c1, row, column, LANES);
         let n = unit(out[plane + here], out[2 * plane + here], out[3 * plane + here]);
         let mut output = F4::new(0.0f32);
         if column < OUTPUTS {
@@ -330,11 +333,11 @@ pub(super) fn color_backward(
         }
         color_inputs(&mut b, output, &n, direction, value, plane, here, row, column, plan);
         sync_cube();
-        let start = sum + comptime!(own[4] * CHANNELS);
+        let start = sum + comptime!(gradient_rows[4] * CHANNELS);
         outer(&a, 0usize, &b, HIDDEN, comptime!(plan.color), partial, start, fresh, row, column, LANES);
         let g_c0 = product(&a, 0usize, w, comptime!(rows[6]), HIDDEN, row, column, LANES);
         sync_cube();
-        put(&mut a, &g_c0, row, column, LANES);
+        store_block(&mut a, &g_c0, row, column, LANES);
         sync_cube();
         if column < OUTPUTS {
             let mut g = a[at(column, row, LANES)];
@@ -342,26 +345,26 @@ pub(super) fn color_backward(
                 g += masked(g_out[here], first, samples);
             }
             if column == SOFTNESS && soften > 0.0f32 {
-                // through −L σ: its slope is y (1 + y / L)
+                // through y = −L σ, whose slope is y (1 + y / L)
                 let y = out[7 * plane + here];
-                let own = masked(g_out[7 * plane + here], first, samples);
-                g += own * y * (F4::new(1.0f32) + y / F4::new(soften));
+                let g_soft = masked(g_out[7 * plane + here], first, samples);
+                g += g_soft * y * (F4::new(1.0f32) + y / F4::new(soften));
             }
             g_o[column * plane + here] = g;
         }
         if column == 14 {
-            // through n̂ = n / ‖n‖ too: (g − n̂ (n̂ · g)) / ‖n‖
+            // also through n̂ = n / ‖n‖: (g − n̂ (n̂ · g)) / ‖n‖
             let (gx, gy, gz) =
                 (a[at(NORMAL, row, LANES)], a[at(NORMAL + 1, row, LANES)], a[at(NORMAL + 2, row, LANES)]);
-            let along = n.x * gx + n.y * gy + n.z * gz;
+            let radial = n.x * gx + n.y * gy + n.z * gz;
             let zero = F4::new(0.0f32);
             let one = F4::new(1.0f32);
-            let share = select_many(n.length.greater_than(&F4::new(SHORTEST)), one / n.length, zero);
-            g_normal[here] = masked(g_out[plane + here], first, samples) + (gx - n.x * along) * share;
+            let share = select_many(n.length.greater_than(&F4::new(MIN_GRADIENT_NORM)), one / n.length, zero);
+            g_normal[here] = masked(g_out[plane + here], first, samples) + (gx - n.x * radial) * share;
             g_normal[plane + here] =
-                masked(g_out[2 * plane + here], first, samples) + (gy - n.y * along) * share;
+                masked(g_out[2 * plane + here], first, samples) + (gy - n.y * radial) * share;
             g_normal[2 * plane + here] =
-                masked(g_out[3 * plane + here], first, samples) + (gz - n.z * along) * share;
+                masked(g_out[3 * plane + here], first, samples) + (gz - n.z * radial) * share;
         }
         if comptime!(plan.skip) {
             for j in 0..2usize {
@@ -375,7 +378,8 @@ pub(super) fn color_backward(
     }
 }
 
-/// Backward of the geometry network, both orders: gradients of the features by sample, and of the weights by group.
+/// Backward pass of the geometry network, with first and second order. Writes the gradients with respect to the features
+/// of each sample, and partial sums by group of those with respect to the weights.
 #[cube(launch_unchecked)]
 pub(super) fn geometry_backward(
     w: &[F4],
@@ -392,20 +396,20 @@ pub(super) fn geometry_backward(
     #[comptime] plan: Plan,
 ) {
     let rows = comptime!(plan.rows());
-    let own = comptime!(plan.gradients());
+    let gradient_rows = comptime!(plan.gradients());
     let features = comptime!(plan.features);
     let padded = comptime!(plan.padded);
     let plane = x.len() / 3;
     let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
     let group = CUBE_POS;
-    let sum = group * comptime!(own[7] * CHANNELS);
+    let sum = group * comptime!(gradient_rows[7] * CHANNELS);
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let samples = tile::uniform_count(count, &mut a);
     for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
         let here = tile * LANES + row;
         let fresh = tile == group;
-        // g_q in the first channels, g_o behind them
+        // g_q goes to the first channels, g_o to the channels after them
         for j in 0..4usize {
             let c = column + 16 * j;
             let mut v = F4::new(0.0f32);
@@ -420,29 +424,49 @@ pub(super) fn geometry_backward(
             }
             b[at(c, row, LANES)] = v;
         }
-        load(&mut a, h, plane, here, row, column);
+        load_planes(&mut a, h, plane, here, row, column);
         sync_cube();
         let g_a = product(&b, 0usize, w, comptime!(rows[0]), padded, row, column, LANES);
         let from_o = product(&b, padded, w, comptime!(rows[3]), OUTPUTS, row, column, LANES);
         let w0 = w[comptime!(rows[3] * LANES) + column];
-        let s = tile::slope(&tile::take(&a, row, column, LANES));
-        let start = sum + comptime!(own[2] * CHANNELS);
+        let s = tile::slope(&tile::load_block(&a, row, column, LANES));
+        let start = sum + comptime!(gradient_rows[2] * CHANNELS);
         outer(&b, padded, &a, OUTPUTS, HIDDEN, partial, start, fresh, row, column, LANES);
-        sums(&b, padded, OUTPUTS, partial, sum + comptime!(own[3] * CHANNELS), fresh, row, column, LANES);
+        sample_sums(
+            &b,
+            padded,
+            OUTPUTS,
+            partial,
+            sum + comptime!(gradient_rows[3] * CHANNELS),
+            fresh,
+            row,
+            column,
+            LANES,
+        );
         sync_cube();
-        put(&mut a, &tile::times(&g_a, &s), row, column, LANES);
+        store_block(&mut a, &tile::times(&g_a, &s), row, column, LANES);
         sync_cube();
-        sums(&a, 0usize, HIDDEN, partial, start, false, row, column, LANES);
+        sample_sums(&a, 0usize, HIDDEN, partial, start, false, row, column, LANES);
         sync_cube();
-        put(&mut a, &tile::weighted(&s, w0), row, column, LANES);
+        store_block(&mut a, &tile::weighted(&s, w0), row, column, LANES);
         sync_cube();
         outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, fresh, row, column, LANES);
         sync_cube();
-        put(&mut a, &tile::curved(&s, &from_o, &g_a, w0), row, column, LANES);
+        store_block(&mut a, &tile::softplus_backward(&s, &from_o, &g_a, w0), row, column, LANES);
         geometry_inputs(&mut b, value, x, inv_radius, plane, here, row, column, features);
         sync_cube();
         outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, false, row, column, LANES);
-        sums(&a, 0usize, HIDDEN, partial, sum + comptime!(own[1] * CHANNELS), fresh, row, column, LANES);
+        sample_sums(
+            &a,
+            0usize,
+            HIDDEN,
+            partial,
+            sum + comptime!(gradient_rows[1] * CHANNELS),
+            fresh,
+            row,
+            column,
+            LANES,
+        );
         let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
         #[unroll]
         for j in 0..4usize {

@@ -1,14 +1,14 @@
-//! The color decoder of [`crate::kernel::cpu::vm`] without encodings, which is what is published.
+//! The color decoder of [`crate::kernel::cpu::vm`] without encodings, like the published one.
 //!
-//! Between products and first layer lies nothing but two matrices; here they are one:
+//! Only two matrices lie between the products and the first activation; here they are merged into one:
 //!
 //! ```text
 //! M = W1_features B     h1 = relu(M products + W1_direction d + b1)     h2 = relu(W2 h1 + b2)     rgb = sigmoid(W3 h2 + b3)
 //! g_B = W1_featuresᵀ g_M     g_W1_features = g_M Bᵀ
 //! ```
 //!
-//! A group of 256 threads takes 64 samples through all layers, or 32 where hidden layers are wider than 64. The backward
-//! takes them through once more: that costs less than to write down and read what lies between.
+//! A group of 256 threads evaluates all layers for 64 samples, or for 32 if hidden layers are wider than 64. The backward
+//! pass recomputes the activations, which costs less than storing and loading them.
 
 mod kernels;
 
@@ -21,15 +21,15 @@ use super::rays::Along;
 use crate::kernel::cpu::vm::DecoderShape;
 use kernels::{backward, chain, forward, prepare, reduce};
 
-/// Groups that take tiles, one after the other, and sum gradients of weights, each over its own.
+/// Maximum number of groups that sum gradients of weights, each over its own tiles.
 const GROUPS: usize = 256;
 
-/// Where the matrices of a decoder stand, in rows of as many floats as a tile has channels.
+/// Sizes and offsets of the matrices of a decoder, in rows with as many floats as a tile has channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct Plan {
-    /// Vectors of each term's channels.
+    /// Number of vectors of four channels of each term.
     quads: [usize; 3],
-    /// Channels of the CPU.
+    /// Number of channels on the CPU, without padding.
     channels: usize,
     features: usize,
     hidden: usize,
@@ -37,47 +37,48 @@ struct Plan {
 }
 
 impl Plan {
-    /// Vectors of products.
+    /// Returns the number of vectors of products.
     fn products(&self) -> usize {
         self.quads.iter().sum()
     }
 
-    /// Inputs of the first layer: products, direction, 0.
+    /// Returns the number of inputs of the first layer: products, direction, 0.
     fn inputs(&self) -> usize {
         4 * self.products() + 4
     }
 
-    /// Floats of a row.
+    /// Returns the number of floats of a row.
     fn width(&self) -> usize {
         tile::channels(self.lanes)
     }
 
-    /// Tiles that hold the inputs.
+    /// Returns the number of pieces of the inputs, each of which fills a tile.
     fn pieces(&self) -> usize {
         self.inputs().div_ceil(self.width())
     }
 
-    /// Inputs in a piece.
+    /// Returns the number of inputs in piece `p`.
     fn piece(&self, p: usize) -> usize {
         (self.inputs() - p * self.width()).min(self.width())
     }
 
-    /// First rows of `[M, W1_direction]ᵀ`, b1, W2ᵀ, b2, W3, b3, `[M, W1_direction]` (one piece after the other), W2, and
-    /// the end.
+    /// Returns the first rows of `[M, W1_direction]ᵀ`, b1, W2ᵀ, b2, W3, b3, `[M, W1_direction]` (one piece after the
+    /// other), W2, and the end.
     fn rows(&self) -> [usize; 9] {
         let w = self.width();
         let counts = [self.inputs(), 1, w, 1, 3, 1, self.pieces() * w, w];
         std::array::from_fn(|i| counts[..i].iter().sum())
     }
 
-    /// First rows of the gradients of `[M, W1_direction]` (one piece after the other), b1, W2, b2, W3, b3, and the end.
+    /// Returns the first rows of the gradients of `[M, W1_direction]` (one piece after the other), b1, W2,
+    /// b2, W3, b3, and the end.
     fn gradients(&self) -> [usize; 7] {
         let w = self.width();
         let counts = [self.pieces() * w, 1, w, 1, 3, 1];
         std::array::from_fn(|i| counts[..i].iter().sum())
     }
 
-    /// Where B, W1, b1, W2, b2, W3, b3 begin among the flat weights, and the end.
+    /// Returns the offsets of B, W1, b1, W2, b2, W3, b3 in the flat weights, and the end.
     fn parts(&self) -> [usize; 8] {
         let shape = DecoderShape {
             channels: self.channels,
@@ -94,11 +95,12 @@ impl Plan {
 /// A decoder on a device.
 pub struct DeviceDecoder {
     plan: Plan,
-    /// The CPU's channel of each on the device, and the other way round.
+    /// Channel on the CPU of each channel on the device.
     real: Buffer,
+    /// Channel on the device of each channel on the CPU.
     padded: Buffer,
     weights: Buffer,
-    /// Gradients by products, `[chunk, channels]`.
+    /// Gradients with respect to products, `[chunk, channels]`.
     g_products: Buffer,
     pub(super) chunk: usize,
     capacity: usize,
@@ -107,10 +109,10 @@ pub struct DeviceDecoder {
 }
 
 impl DeviceDecoder {
-    /// Samples whose gradients by products are there at once.
+    /// Maximum number of samples whose gradients with respect to products are stored at once.
     pub const CHUNK: usize = 1 << 20;
 
-    /// Can a device decode this? Else what it cannot.
+    /// Checks whether a device can decode this shape. The error names the unsupported property.
     pub fn supports(shape: &DecoderShape) -> Result<(), &'static str> {
         if shape.view_frequencies > 0 || shape.feature_frequencies > 0 {
             return Err("encodings of directions or features");
@@ -118,7 +120,8 @@ impl DeviceDecoder {
         if shape.hidden > 128 { Err("hidden layers wider than 128") } else { Ok(()) }
     }
 
-    /// Of the products of a grid, for up to `capacity` samples; with room for gradients where it learns.
+    /// Creates a decoder of the products of a grid, for up to `capacity` samples; buffers for gradients are allocated only if
+    /// `learns` is set.
     pub fn new(
         device: &Device,
         shape: &DecoderShape,
@@ -132,10 +135,10 @@ impl DeviceDecoder {
         let plan = Plan { quads, channels: shape.channels, features, hidden, lanes };
         let real = grid.channels();
         let mut padded = vec![0u32; shape.channels];
-        for (c, &own) in real.iter().enumerate().filter(|(_, own)| **own != NONE) {
-            padded[own as usize] = c as u32;
+        for (c, &cpu_channel) in real.iter().enumerate().filter(|(_, real)| **real != NONE) {
+            padded[cpu_channel as usize] = c as u32;
         }
-        // a power of two, so that pieces are whole tiles
+        // a power of two, so that chunks consist of whole tiles
         let fits = (device.limits().largest_buffer as usize / (16 * plan.products()).max(1)).max(super::TILE);
         let chunk = capacity.min(Self::CHUNK).min(1 << fits.ilog2());
         let learned = |words: usize| device.scratch::<f32>(if learns { words } else { 1 });
@@ -153,7 +156,7 @@ impl DeviceDecoder {
         }
     }
 
-    /// Makes the weights ready, as the CPU has them.
+    /// Converts the flat weights, as on the CPU, to the layout of the kernels.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
         assert_eq!(flat.words(), self.plan.parts()[7]);
         launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
@@ -161,7 +164,7 @@ impl DeviceDecoder {
         );
     }
 
-    /// Colors of the samples worth one.
+    /// Computes the colors of all samples whose weight is above the threshold.
     pub fn forward(
         &self,
         device: &Device,
@@ -183,8 +186,8 @@ impl DeviceDecoder {
         }
     }
 
-    /// Adds the gradient of planes and lines and writes that of the flat weights; `broken`, `[1]`, becomes 1 where one of
-    /// these is not finite.
+    /// Adds the gradient with respect to planes and lines, and writes that with respect to the flat weights. Sets `broken`,
+    /// `[1]`, to 1 if a value of the latter is not finite.
     pub fn backward(
         &self,
         device: &Device,

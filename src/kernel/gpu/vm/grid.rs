@@ -1,7 +1,7 @@
-//! Planes and lines on a device: lookups, gradients back onto them, and what is asked of them besides the photographs.
+//! Planes and lines on a device: interpolation, the scatter of gradients, and the total variation.
 
 use super::super::device::{Atomics, Buffer, Device, Words, groups, launch};
-use super::super::sum::{Exchange, Fixed, MOST, Native, Sum};
+use super::super::sum::{Exchange, FIXED_POINT_RANGE, Fixed, Native, Sum};
 use crate::kernel::cpu::vm::{Factor, Grid, LINE_AXIS, PLANE_AXES, tv_factors};
 use burn::cubecl::{self, prelude::*};
 
@@ -9,20 +9,20 @@ type F4 = Vector<f32, Const<4>>;
 
 const UNITS: u32 = 256;
 
-/// Groups of a launch whose threads take one item after the other.
+/// Maximum number of groups of a launch whose threads loop over items.
 const GROUPS: usize = 4096;
 
-/// Groups that look for a bound.
+/// Number of groups that compute the bound on fixed-point sums.
 const BOUNDING: usize = 64;
 
-/// Words of a grid: vertices (3), where planes (3) and lines (3) begin, in vectors.
+/// Offsets in the words of a grid: number of vertices (3), first vector of each plane (3) and of each line (3).
 const PLANES: usize = 3;
 const LINES: usize = 6;
 
-/// No channel of the CPU's.
+/// Marks a channel on the device that is padding, with no channel on the CPU.
 pub(super) const NONE: u32 = u32::MAX;
 
-/// Where a sample lies in a term's plane and line; vectors of four channels are counted.
+/// Position of a sample in a term's plane and line; offsets count vectors of four channels.
 #[derive(CubeType)]
 pub(super) struct Term {
     plane: usize,
@@ -33,21 +33,22 @@ pub(super) struct Term {
     z: f32,
 }
 
-/// A coordinate between two vertices.
+/// Position of a coordinate between two vertices.
 #[derive(CubeType)]
-struct Along {
+struct Interval {
     below: usize,
     frac: f32,
 }
 
+/// Returns the position of sample `s` between the vertices of an axis.
 #[cube]
-fn along(words: &[u32], place: &[f32], plane: usize, s: usize, #[comptime] axis: usize) -> Along {
+fn interval(words: &[u32], place: &[f32], plane: usize, s: usize, #[comptime] axis: usize) -> Interval {
     let v = place[axis * plane + s];
     let below = min(u32::cast_from(v), words[axis] - 2);
-    Along { below: below as usize, frac: v - f32::cast_from(below) }
+    Interval { below: below as usize, frac: v - f32::cast_from(below) }
 }
 
-/// Sample `s` in term `i`.
+/// Returns the position of sample `s` in term `i`.
 #[cube]
 pub(super) fn term(
     words: &[u32],
@@ -57,9 +58,9 @@ pub(super) fn term(
     #[comptime] quads: usize,
 ) -> Term {
     let plane = place.len() / 3;
-    let x = along(words, place, plane, s, comptime!(PLANE_AXES[i].0));
-    let y = along(words, place, plane, s, comptime!(PLANE_AXES[i].1));
-    let z = along(words, place, plane, s, comptime!(LINE_AXIS[i]));
+    let x = interval(words, place, plane, s, comptime!(PLANE_AXES[i].0));
+    let y = interval(words, place, plane, s, comptime!(PLANE_AXES[i].1));
+    let z = interval(words, place, plane, s, comptime!(LINE_AXIS[i]));
     let width = words[comptime!(PLANE_AXES[i].0)] as usize;
     Term {
         plane: words[comptime!(PLANES + i)] as usize + (y.below * width + x.below) * quads,
@@ -71,7 +72,7 @@ pub(super) fn term(
     }
 }
 
-/// Plane times line of four channels.
+/// Interpolates the product of plane and line for four channels.
 #[cube]
 pub(super) fn looked_up(values: &[F4], t: &Term, q: usize, #[comptime] quads: usize) -> F4 {
     let p = t.plane + q;
@@ -83,7 +84,7 @@ pub(super) fn looked_up(values: &[F4], t: &Term, q: usize, #[comptime] quads: us
     (below + above) * (low + (values[t.line + quads + q] - low) * F4::new(t.z))
 }
 
-/// Σ over terms and channels.
+/// Writes the feature of each sample: the sum of products over terms and channels.
 #[cube(launch)]
 fn gather(
     values: &[F4],
@@ -109,13 +110,13 @@ fn gather(
     }
 }
 
-/// How many samples from `from` on there are, at most `limit`.
+/// Returns the number of samples from `from` on, at most `limit`.
 #[cube]
-fn rest(count: &[u32], from: u32, limit: u32) -> usize {
+fn remaining(count: &[u32], from: u32, limit: u32) -> usize {
     min(max(count[0], from) - from, limit) as usize
 }
 
-/// Adds gradients of samples to planes and lines. A thread takes a sample's channel.
+/// Adds gradients of samples to planes and lines. Each thread handles one channel of a sample at a time.
 #[cube(launch)]
 fn scatter<S: Sum>(
     gradient: &[Atomic<S::Word>],
@@ -132,13 +133,13 @@ fn scatter<S: Sum>(
     #[comptime] by_channel: bool,
 ) {
     let channels = comptime!(4 * (quads[0] + quads[1] + quads[2]));
-    let all = rest(count, from, limit) * channels;
-    for item in range_stepped(ABSOLUTE_POS, all, CUBE_COUNT * UNITS as usize) {
+    let items = remaining(count, from, limit) * channels;
+    for item in range_stepped(ABSOLUTE_POS, items, CUBE_COUNT * UNITS as usize) {
         let (n, c) = (item / channels, item % channels);
         let s = if by_channel { index[from as usize + n] as usize } else { n };
-        let own = if by_channel { g[item] } else { g[n] };
-        // no need to spread what is exactly nothing
-        if own != 0.0f32 {
+        let g_sample = if by_channel { g[item] } else { g[n] };
+        // a gradient of exactly zero needs no scatter
+        if g_sample != 0.0f32 {
             #[unroll]
             for i in 0..3usize {
                 let first = comptime!(4 * quads[..i].iter().sum::<usize>());
@@ -153,8 +154,8 @@ fn scatter<S: Sum>(
                     let plane =
                         values[p] * w0 + values[p + next] * w1 + values[q] * w2 + values[q + next] * w3;
                     let low = values[l];
-                    let line = (low + (values[l + next] - low) * t.z) * own;
-                    let plane = plane * own;
+                    let line = (low + (values[l + next] - low) * t.z) * g_sample;
+                    let plane = plane * g_sample;
                     S::add(&gradient[p], line * w0, units[0]);
                     S::add(&gradient[p + next], line * w1, units[0]);
                     S::add(&gradient[q], line * w2, units[0]);
@@ -167,22 +168,23 @@ fn scatter<S: Sum>(
     }
 }
 
-/// The largest of 256 and their sum, at unit 0.
+/// Returns the maximum of 256 values if `largest` is set, else their sum, to thread 0.
 #[cube]
-fn reduced(shared: &mut [f32], own: f32, #[comptime] largest: bool) -> f32 {
+fn reduced(shared: &mut [f32], value: f32, #[comptime] largest: bool) -> f32 {
     sync_cube();
-    shared[UNIT_POS as usize] = own;
+    shared[UNIT_POS as usize] = value;
     sync_cube();
-    let mut all = 0.0f32;
+    let mut result = 0.0f32;
     if UNIT_POS == 0 {
         for i in 0..UNITS as usize {
-            all = if largest { max(all, shared[i]) } else { all + shared[i] };
+            result = if largest { max(result, shared[i]) } else { result + shared[i] };
         }
     }
-    all
+    result
 }
 
-/// By group: the sum of samples' largest gradients, the largest value of the planes and that of the lines.
+/// Writes for each group the sum of its samples' largest gradients, and the largest value of its part of planes and of
+/// lines.
 #[cube(launch)]
 fn bound(
     values: &[f32],
@@ -195,18 +197,18 @@ fn bound(
     #[comptime] width: usize,
 ) {
     let mut sum = 0.0f32;
-    let samples = rest(count, from, limit);
+    let samples = remaining(count, from, limit);
     for n in range_stepped(ABSOLUTE_POS, samples, CUBE_COUNT * UNITS as usize) {
-        let mut most = 0.0f32;
+        let mut largest = 0.0f32;
         for c in 0..width {
-            most = max(most, g[n * width + c].abs());
+            largest = max(largest, g[n * width + c].abs());
         }
-        sum += most;
+        sum += largest;
     }
     let mut plane = 0.0f32;
     let mut line = 0.0f32;
     let lines = 4 * words[LINES] as usize;
-    // most parts of a list with room for all samples are empty
+    // most chunks of a list with capacity for all samples are empty, and need no bound
     let end = select(samples > 0, values.len(), 0usize);
     for i in range_stepped(ABSOLUTE_POS, end, CUBE_COUNT * UNITS as usize) {
         let v = values[i].abs();
@@ -224,9 +226,10 @@ fn bound(
     }
 }
 
-/// Steps per 1 in which sums are counted: of planes, whose gradients are times lines, and of lines.
+/// Writes the scale of the fixed-point sums, the number of integer steps per 1: of planes, whose gradients are multiplied
+/// by lines, and of lines.
 #[cube(launch)]
-fn units_of(partial: &[f32], units: &mut [f32]) {
+fn fixed_point_scales(partial: &[f32], units: &mut [f32]) {
     if ABSOLUTE_POS == 0 {
         let mut sum = 0.0f32;
         let mut plane = 0.0f32;
@@ -236,24 +239,32 @@ fn units_of(partial: &[f32], units: &mut [f32]) {
             plane = max(plane, partial[BOUNDING + i]);
             line = max(line, partial[2 * BOUNDING + i]);
         }
-        // finite where nothing is added, too
-        units[0] = MOST / max(sum * line, 1e-28f32);
-        units[1] = MOST / max(sum * plane, 1e-28f32);
+        // the lower bound keeps the scale finite if nothing is added
+        units[0] = FIXED_POINT_RANGE / max(sum * line, 1e-28f32);
+        units[1] = FIXED_POINT_RANGE / max(sum * plane, 1e-28f32);
     }
 }
 
-/// Whole numbers become floats, added to the gradient, and zero, where there was a sample from `from` on.
+/// Adds the fixed-point sums as floats to the gradient and resets them to zero, if there were samples from `from` on.
 #[cube(launch)]
-fn settle(whole: &mut [i32], words: &[u32], units: &[f32], count: &[u32], gradient: &mut [f32], from: u32) {
+fn flush_fixed_point(
+    fixed_sums: &mut [i32],
+    words: &[u32],
+    units: &[f32],
+    count: &[u32],
+    gradient: &mut [f32],
+    from: u32,
+) {
     let i = ABSOLUTE_POS;
-    if i < whole.len() && count[0] > from {
+    if i < fixed_sums.len() && count[0] > from {
         let unit = select(i < 4 * words[LINES] as usize, units[0], units[1]);
-        gradient[i] += f32::cast_from(whole[i]) / unit;
-        whole[i] = 0;
+        gradient[i] += f32::cast_from(fixed_sums[i]) / unit;
+        fixed_sums[i] = 0;
     }
 }
 
-/// Adds the gradient of the planes' total variation; factors are those of each plane's rows and columns.
+/// Adds the gradient of the planes' total variation; `factors` are those of the rows (3) and columns (3) of
+/// each plane.
 #[cube(launch)]
 fn penalize(
     values: &[f32],
@@ -297,7 +308,7 @@ fn penalize(
     }
 }
 
-/// Planes and lines of a grid on a device. Channels of each term are filled up with zeros to vectors of four; they stay
+/// Layout of a grid's planes and lines on a device. The channels of each term are padded to vectors of four; padding stays
 /// zero.
 pub struct DeviceGrid {
     grid: Grid,
@@ -306,11 +317,12 @@ pub struct DeviceGrid {
     factors: Buffer,
     units: Buffer,
     partial: Buffer,
-    whole: Option<Buffer>,
+    /// Fixed-point sums of the gradient.
+    fixed_sums: Option<Buffer>,
 }
 
 impl DeviceGrid {
-    /// Of a grid.
+    /// Creates the layout of a grid.
     pub fn new(device: &Device, grid: Grid) -> DeviceGrid {
         let padded = DeviceGrid::padded(grid);
         let vectors = |f: Factor| (f.start / 4) as u32;
@@ -327,54 +339,54 @@ impl DeviceGrid {
             factors: device.upload(&factors),
             units: device.zeros::<f32>(2),
             partial: device.scratch::<f32>(3 * BOUNDING),
-            whole: fixed.then(|| device.zeros::<i32>(padded.len())),
+            fixed_sums: fixed.then(|| device.zeros::<i32>(padded.len())),
         }
     }
 
-    /// The grid with every term filled up.
+    /// Returns the grid with the rank of every term padded to a multiple of four.
     pub fn padded(grid: Grid) -> Grid {
         Grid { rank: grid.rank.map(|r| r.next_multiple_of(4)), ..grid }
     }
 
-    /// Floats on the device.
+    /// Returns the number of floats on the device.
     pub fn len(&self) -> usize {
         self.padded.len()
     }
 
-    /// Has it no channel at all?
+    /// Returns whether the grid has no channels.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Vectors of each term.
+    /// Returns the number of vectors of each term.
     pub(super) fn quads(&self) -> [usize; 3] {
         self.padded.rank.map(|r| r / 4)
     }
 
-    /// Where things lie: an argument of kernels that look up.
+    /// Returns the sizes and offsets that kernels need for interpolation.
     pub(super) fn words(&self) -> &Buffer {
         &self.words
     }
 
-    /// The CPU's channel of each on the device, [`NONE`] for those that fill up.
+    /// Returns the channel on the CPU of each channel on the device, [`NONE`] for padding.
     pub(super) fn channels(&self) -> Vec<u32> {
         let mut before = 0;
         let mut out = Vec::new();
-        for (own, all) in self.grid.rank.into_iter().zip(self.padded.rank) {
-            out.extend((0..all).map(|c| if c < own { (before + c) as u32 } else { NONE }));
-            before += own;
+        for (rank, padded_rank) in self.grid.rank.into_iter().zip(self.padded.rank) {
+            out.extend((0..padded_rank).map(|c| if c < rank { (before + c) as u32 } else { NONE }));
+            before += rank;
         }
         out
     }
 
-    /// Pairs of factors: the CPU's, the device's.
+    /// Iterates over planes and lines as pairs: on the CPU, on the device.
     fn pairs(&self) -> impl Iterator<Item = (Factor, Factor)> {
         let (a, b) = (self.grid, self.padded);
         let planes = (0..3).map(move |i| (a.plane(i), b.plane(i)));
         planes.chain((0..3).map(move |i| (a.line(i), b.line(i))))
     }
 
-    /// Returns planes and lines, as the processor has them, as they lie on the device: with zeros in channels that fill up.
+    /// Converts planes and lines from the layout of the CPU to that of the device, with zeros as padding.
     pub fn pad(&self, values: Vec<f32>) -> Vec<f32> {
         assert_eq!(values.len(), self.grid.len());
         if self.grid == self.padded {
@@ -388,7 +400,8 @@ impl DeviceGrid {
         out
     }
 
-    /// Returns planes and lines without what [`pad`](DeviceGrid::pad) added.
+    /// Converts planes and lines from the layout of the device to that of the CPU: the inverse of
+    /// [`pad`](DeviceGrid::pad).
     pub fn cut(&self, values: Vec<f32>) -> Vec<f32> {
         if self.grid == self.padded {
             return values;
@@ -400,12 +413,13 @@ impl DeviceGrid {
         out
     }
 
-    /// Copies planes and lines as the processor has them to the device.
+    /// Copies planes and lines from the layout of the CPU to the device.
     pub fn upload(&self, device: &Device, values: &[f32]) -> Buffer {
         device.upload(&self.pad(values.to_vec()))
     }
 
-    /// Features of samples, `[capacity]`: the sum over terms and channels. place: planes `[3, capacity]`.
+    /// Writes the features of samples, `[capacity]`: the sum over terms and channels. place: planes `[3, capacity]`, in
+    /// units of vertices.
     pub fn gather(&self, device: &Device, values: &Buffer, place: &Buffer, count: &Buffer, feature: &Buffer) {
         assert!(values.words() == self.len() && place.words() == 3 * feature.words());
         launch!(device, gather::launch, groups(feature.words().div_ceil(UNITS as usize).min(GROUPS)), UNITS;
@@ -413,8 +427,8 @@ impl DeviceGrid {
         );
     }
 
-    /// Adds to the gradient what samples say. Without `index`, `g` is `[capacity]`, by the features of
-    /// [`DeviceGrid::gather`]. With it, `g` is `[limit, channels]`, by the products of plane and line of samples
+    /// Adds the gradients of samples to `gradient`. Without `index`, `g` is `[capacity]`, with respect to the features of
+    /// [`DeviceGrid::gather`]. With it, `g` is `[limit, channels]`, with respect to the products of plane and line of samples
     /// `index[from..from + limit]`.
     pub fn scatter(
         &self,
@@ -429,13 +443,13 @@ impl DeviceGrid {
         assert!(gradient.words() == self.len() && values.words() == self.len());
         let channels = self.padded.channels();
         let (list, from, limit) = index.unwrap_or((count, 0, g.words()));
-        if self.whole.is_some() {
+        if self.fixed_sums.is_some() {
             launch!(device, bound::launch, groups(BOUNDING), UNITS;
                 values, self.words, count, g, self.partial;
                 from as u32, limit as u32, if index.is_some() { channels } else { 1 }
             );
             let one = CubeCount::new_single();
-            launch!(device, units_of::launch, one, 1; self.partial, self.units);
+            launch!(device, fixed_point_scales::launch, one, 1; self.partial, self.units);
         }
         let scatter = match device.atomics() {
             Atomics::Native => scatter::launch::<Native>,
@@ -443,17 +457,17 @@ impl DeviceGrid {
             Atomics::Fixed => scatter::launch::<Fixed>,
         };
         launch!(device, scatter, groups((limit * channels).div_ceil(UNITS as usize).min(GROUPS)), UNITS;
-            self.whole.as_ref().unwrap_or(gradient), values, self.words, place, list, count, g, self.units;
+            self.fixed_sums.as_ref().unwrap_or(gradient), values, self.words, place, list, count, g, self.units;
             from as u32, limit as u32, self.quads(), index.is_some()
         );
-        if let Some(whole) = &self.whole {
-            launch!(device, settle::launch, groups(self.len().div_ceil(UNITS as usize)), UNITS;
-                whole, self.words, self.units, count, gradient; from as u32
+        if let Some(fixed_sums) = &self.fixed_sums {
+            launch!(device, flush_fixed_point::launch, groups(self.len().div_ceil(UNITS as usize)), UNITS;
+                fixed_sums, self.words, self.units, count, gradient; from as u32
             );
         }
     }
 
-    /// Adds the gradient of the planes' weighted total variation.
+    /// Adds the gradient of the planes' total variation, times `weight`.
     pub fn penalize(&self, device: &Device, values: &Buffer, weight: f32, gradient: &Buffer) {
         if weight == 0.0 {
             return;

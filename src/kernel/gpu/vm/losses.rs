@@ -1,4 +1,4 @@
-//! What a training step of TensoRF's field minimizes, and its gradients: see [`crate::kernel::cpu::vm::losses`].
+//! The training loss of TensoRF's field and its gradients: see [`crate::kernel::cpu::vm::losses`].
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
@@ -11,28 +11,29 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Words of what steps came to: terms, lattice points, samples looked up, samples decoded, rays, broken.
+/// Number of words of the results of steps: loss terms, lattice points, evaluated samples, decoded samples, rays, broken.
 const TOTALS: usize = TERMS + 5;
 
-/// How many rays there are, and how many of them show background. One group of threads.
+/// Counts the rays, and those of them whose pixel is background. Runs as one group of threads.
 #[cube(launch)]
 fn tally(alpha: &[f32], alive: &[u32], out: &mut [u32]) {
     let unit = UNIT_POS as usize;
     let mut rays = 0u32;
-    let mut outside = 0u32;
+    let mut background_rays = 0u32;
     for r in range_stepped(unit, alpha.len(), UNITS as usize) {
         rays += alive[r];
-        outside += select(alpha[r] == 0.0f32, alive[r], 0u32);
+        background_rays += select(alpha[r] == 0.0f32, alive[r], 0u32);
     }
     let rays = group_sum::<u32>(rays, UNITS as usize);
-    let outside = group_sum::<u32>(outside, UNITS as usize);
+    let background_rays = group_sum::<u32>(background_rays, UNITS as usize);
     if unit == 0 {
         out[0] = rays;
-        out[1] = outside;
+        out[1] = background_rays;
     }
 }
 
-/// Terms of rays, planes `[3, rays]`, and gradients by what was composited, planes `[5, rays]`.
+/// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the composited values, planes
+/// `[5, rays]`.
 #[cube(launch)]
 fn of_rays(
     composed: &[f32],
@@ -44,7 +45,7 @@ fn of_rays(
     g_out: &mut [f32],
     terms: &mut [f32],
     lift: f32,
-    over: f32,
+    target_background: f32,
     weight: f32,
     #[comptime] l2: bool,
     #[comptime] ce: bool,
@@ -52,8 +53,8 @@ fn of_rays(
     let rays = alpha.len();
     let r = ABSOLUTE_POS;
     if r < rays {
-        let there = f32::cast_from(alive[r]);
-        let even = there / max(f32::cast_from(tally[0]), 1.0f32);
+        let is_alive = f32::cast_from(alive[r]);
+        let ray_share = is_alive / max(f32::cast_from(tally[0]), 1.0f32);
         let (opacity, a) = (composed[3 * rays + r], alpha[r]);
         let mut square = 0.0f32;
         let mut g_opacity = 0.0f32;
@@ -61,36 +62,36 @@ fn of_rays(
         for c in 0..3usize {
             let b = background[c * rays + r];
             let raw = composed[c * rays + r] + (1.0f32 - opacity) * (b + lift);
-            let seen = clamp(raw, 0.0f32, 1.0f32);
-            let e = seen - (color[c * rays + r] + over * (1.0f32 - a) * b);
+            let clamped = clamp(raw, 0.0f32, 1.0f32);
+            let e = clamped - (color[c * rays + r] + target_background * (1.0f32 - a) * b);
             square += e * e;
-            let g = select(raw == seen, 2.0f32 * e * even / 3.0f32, 0.0f32);
+            let g = select(raw == clamped, 2.0f32 * e * ray_share / 3.0f32, 0.0f32);
             g_out[c * rays + r] = g;
             g_opacity -= g * (b + lift);
         }
-        let outside = select(a == 0.0f32, there, 0.0f32) / max(f32::cast_from(tally[1]), 1.0f32);
-        let empty = opacity * opacity * outside;
+        let background_share = select(a == 0.0f32, is_alive, 0.0f32) / max(f32::cast_from(tally[1]), 1.0f32);
+        let empty = opacity * opacity * background_share;
         let mut mask = 0.0f32;
         if l2 {
             mask = empty;
-            g_opacity += 2.0f32 * weight * opacity * outside;
+            g_opacity += 2.0f32 * weight * opacity * background_share;
         }
         if ce {
             let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
             let m = select(a == 0.0f32, 0.0f32, 1.0f32);
-            mask = -(m * p.ln() + (1.0f32 - m) * (1.0f32 - p).ln()) * even;
-            let by_p = ((1.0f32 - m) / (1.0f32 - p) - m / p) * even * weight;
+            mask = -(m * p.ln() + (1.0f32 - m) * (1.0f32 - p).ln()) * ray_share;
+            let by_p = ((1.0f32 - m) / (1.0f32 - p) - m / p) * ray_share * weight;
             g_opacity += select(p == opacity, by_p, 0.0f32);
         }
         g_out[3 * rays + r] = g_opacity;
         g_out[4 * rays + r] = 0.0f32;
-        terms[r] = square * even / 3.0f32;
+        terms[r] = square * ray_share / 3.0f32;
         terms[rays + r] = mask;
         terms[2 * rays + r] = empty;
     }
 }
 
-/// Adds a step to what the steps before came to: a group of threads for each term, and one for lattice points.
+/// Adds the results of a step to the totals, with one group of threads for each loss term, and one for all counts.
 #[cube(launch)]
 fn add(
     terms: &[f32],
@@ -104,22 +105,22 @@ fn add(
     let unit = UNIT_POS as usize;
     let term = CUBE_POS_X as usize;
     let rays = points.len();
-    let mut own = 0.0f32;
-    let mut crossed = 0u32;
+    let mut sum = 0.0f32;
+    let mut lattice_points = 0u32;
     for r in range_stepped(unit, rays, UNITS as usize) {
         if term < TERMS {
-            own += terms[term * rays + r];
+            sum += terms[term * rays + r];
         } else {
-            crossed += points[r];
+            lattice_points += points[r];
         }
     }
-    let own = group_sum::<f32>(own, UNITS as usize);
-    let crossed = group_sum::<u32>(crossed, UNITS as usize);
+    let sum = group_sum::<f32>(sum, UNITS as usize);
+    let lattice_points = group_sum::<u32>(lattice_points, UNITS as usize);
     if unit == 0 {
         if term < TERMS {
-            totals[term] = u32::reinterpret(f32::reinterpret(totals[term]) + own);
+            totals[term] = u32::reinterpret(f32::reinterpret(totals[term]) + sum);
         } else {
-            totals[TERMS] += crossed;
+            totals[TERMS] += lattice_points;
             totals[comptime!(TERMS + 1)] += looked_up[0];
             totals[comptime!(TERMS + 2)] += decoded[0];
             totals[comptime!(TERMS + 3)] += tally[0];
@@ -128,7 +129,7 @@ fn add(
     }
 }
 
-/// The losses of so many rays.
+/// The losses of a batch of rays, with the buffers for them.
 pub struct VmLosses {
     term: MaskTerm,
     tally: Buffer,
@@ -138,7 +139,7 @@ pub struct VmLosses {
 }
 
 impl VmLosses {
-    /// For so many rays.
+    /// Allocates buffers for `rays` rays.
     pub fn new(device: &Device, rays: usize, term: MaskTerm) -> VmLosses {
         VmLosses {
             term,
@@ -149,7 +150,8 @@ impl VmLosses {
         }
     }
 
-    /// Gradients by what [`Vm::render`] composited, planes `[5, rays]`.
+    /// Computes the losses of rays, and returns the gradients with respect to the output of [`Vm::render`], planes
+    /// `[5, rays]`.
     pub fn of_rays(
         &self,
         device: &Device,
@@ -172,17 +174,17 @@ impl VmLosses {
         &self.g_out
     }
 
-    /// What the last [`of_rays`](VmLosses::of_rays) wrote, planes `[5, rays]`.
+    /// Returns the gradients of the last call of [`of_rays`](VmLosses::of_rays), planes `[5, rays]`.
     pub fn gradient(&self) -> &Buffer {
         &self.g_out
     }
 
-    /// How many rays the last batch had and how many of them showed background, `[2]`.
+    /// Returns the number of rays of the last batch, and of those whose pixel is background, `[2]`.
     pub fn rays(&self) -> &Buffer {
         &self.tally
     }
 
-    /// Adds the last step to what is read.
+    /// Adds the results of the last step to the totals that [`fetch`](VmLosses::fetch) returns.
     pub fn add(&self, device: &Device, vm: &Vm, broken: &Buffer) {
         let [looked_up, decoded, points] = vm.counts();
         launch!(device, add::launch, CubeCount::new_1d(TERMS as u32 + 1), UNITS;
@@ -190,12 +192,12 @@ impl VmLosses {
         );
     }
 
-    /// Forgets what steps came to since the last time.
+    /// Resets the totals.
     pub fn forget(&mut self, device: &Device) {
         self.totals = device.zeros::<u32>(TOTALS);
     }
 
-    /// Waits for the device; what the steps since the last time came to.
+    /// Waits for the device, returns the totals of the steps since the last call, and resets them.
     pub fn fetch(&mut self, device: &Device) -> Result<VmFigures> {
         let t = device.fetch::<u32>(&self.totals)?;
         self.totals = device.zeros::<u32>(TOTALS);

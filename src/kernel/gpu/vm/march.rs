@@ -1,4 +1,5 @@
-//! The lattice points of rays inside a box and a mask: see [`crate::kernel::cpu::vm::mask::Walk`], whose rule this is.
+//! The lattice points of rays inside a box and a mask: the same rule as
+//! [`crate::kernel::cpu::vm::mask::Walk`].
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
@@ -10,27 +11,28 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Further than anything.
+/// A distance beyond any sample.
 const FAR: f32 = 1e30;
 
-/// Numbers of a lattice: box (6), step, near, far; corner of the mask (3), its cells in a unit of length (3).
+/// Offsets in the floats of a lattice: box (6), step, near, far; corner of the mask (3), its cells per unit of length (3).
 const STEP: usize = 6;
 const MASK: usize = 9;
 const SCALE: usize = 12;
 
-/// Whole numbers of a lattice: samples of a ray; vertices (3); cells of the mask (3); blocks (3).
+/// Offsets in the integers of a lattice: samples of a ray; vertices (3); cells of the mask (3); blocks (3).
 const VERTICES: usize = 1;
 const CELLS: usize = 4;
 const BLOCKS: usize = 7;
 
-/// Where a ray enters and leaves the box.
+/// Interval of `t` in which a ray lies inside the box.
 #[derive(CubeType)]
 struct Span {
     enter: f32,
     leave: f32,
 }
 
-/// Along one more axis; a direction of zero counts as 1e-6, as published.
+/// Intersects the interval with the extent of the box along one axis. A zero component of the direction is replaced by
+/// 1e-6, as in the published code.
 #[cube]
 fn crossed(span: Span, o: f32, d: f32, low: f32, high: f32) -> Span {
     let d = select(d == 0.0f32, 1e-6f32, d);
@@ -38,19 +40,19 @@ fn crossed(span: Span, o: f32, d: f32, low: f32, high: f32) -> Span {
     Span { enter: max(span.enter, min(p, q)), leave: min(span.leave, max(p, q)) }
 }
 
-/// Is `v` further outside than rounding may put it?
+/// Returns whether `v` lies outside `low..=high` by more than `slack`, which allows for rounding.
 #[cube]
 fn outside(v: f32, low: f32, high: f32, slack: f32) -> bool {
     !(v >= low - slack && v <= high + slack)
 }
 
-/// The cell of a coordinate that counts cells.
+/// Returns the cell of a coordinate in units of cells, clamped to the mask.
 #[cube]
 fn cell(g: f32, cells: u32) -> u32 {
     min(u32::cast_from(max(g, 0.0f32)), cells - 1)
 }
 
-/// How far it is to the border of a cell, or of its block, in `t`.
+/// Returns the distance to the border of a cell, or of its block if that is empty, in units of `t`.
 #[cube]
 fn border(g: f32, cell: u32, cells: u32, d: f32, scale: f32, empty: bool) -> f32 {
     let ahead = select(d > 0.0f32, 1u32, 0u32);
@@ -59,14 +61,14 @@ fn border(g: f32, cell: u32, cells: u32, d: f32, scale: f32, empty: bool) -> f32
     select(d == 0.0f32, FAR, (f32::cast_from(wall) - g) * (1.0f32 / (d * scale)))
 }
 
-/// Where a coordinate lies among the vertices of the grid.
+/// Returns a coordinate in units of vertices of the grid, clamped to the outer ones.
 #[cube]
 fn place_of(p: f32, low: f32, high: f32, vertices: u32) -> f32 {
     let last = f32::cast_from(vertices - 1);
     clamp((p - low) / (high - low) * last, 0.0f32, last)
 }
 
-/// Counts a ray's samples or, once it is known where they lie, writes them.
+/// Counts the samples of rays or, if `writes` is set, writes them at the given offsets.
 #[cube(launch)]
 fn pass(
     lattice: &[f32],
@@ -104,12 +106,12 @@ fn pass(
         let end = select(meets, sizes[0] - 1, 0u32);
         let (sx, sy, sz) = (1e-6f32 * (hx - lx), 1e-6f32 * (hy - ly), 1e-6f32 * (hz - lz));
         let mut first = 0usize;
-        let mut most = end;
+        let mut max_count = end;
         if writes {
             first = offsets[r] as usize;
-            most = offsets[r + 1] - offsets[r];
-            // no room: no ray
-            if most < counts[r] {
+            max_count = offsets[r + 1] - offsets[r];
+            // a ray whose samples exceed the capacity is not alive
+            if max_count < counts[r] {
                 alive[r] = 0;
             }
         } else {
@@ -118,14 +120,14 @@ fn pass(
         }
         let mut found = 0u32;
         let mut k = 0u32;
-        let mut marching = k < end && found < most;
+        let mut marching = k < end && found < max_count;
         while marching {
-            // computed, never accumulated
+            // t is computed for each k, never accumulated
             let at = start + step * f32::cast_from(k);
             let (px, py, pz) = (ox + at * dx, oy + at * dy, oz + at * dz);
             // the border itself belongs to the box, and rounding may put a sample just outside
-            let beside = outside(px, lx, hx, sx) || outside(py, ly, hy, sy) || outside(pz, lz, hz, sz);
-            let mut kept = !beside;
+            let outside_box = outside(px, lx, hx, sx) || outside(py, ly, hy, sy) || outside(pz, lz, hz, sz);
+            let mut kept = !outside_box;
             let mut skip = 1u32;
             if masked {
                 let (nx, ny, nz) = (sizes[CELLS], sizes[CELLS + 1], sizes[CELLS + 2]);
@@ -133,15 +135,16 @@ fn pass(
                 let gx = (px - lattice[MASK]) * ux;
                 let gy = (py - lattice[MASK + 1]) * uy;
                 let gz = (pz - lattice[MASK + 2]) * uz;
-                let beyond = outside(gx, 0.0f32, f32::cast_from(nx), 1e-3f32)
+                let outside_mask = outside(gx, 0.0f32, f32::cast_from(nx), 1e-3f32)
                     || outside(gy, 0.0f32, f32::cast_from(ny), 1e-3f32)
                     || outside(gz, 0.0f32, f32::cast_from(nz), 1e-3f32);
-                kept = !beside && !beyond;
+                kept = !outside_box && !outside_mask;
                 if kept {
                     let (cx, cy, cz) = (cell(gx, nx), cell(gy, ny), cell(gz, nz));
                     if !bit(bits, (cx * ny + cy) * nz + cz) {
                         kept = false;
-                        // on to the border of the empty cell, or of its block if that is empty too; by whole steps
+                        // skip to the border of the empty cell, or of its block if that is empty too, by a whole
+                        // number of steps
                         let size = comptime!(BLOCK as u32);
                         let b = (cx / size * sizes[BLOCKS + 1] + cy / size) * sizes[BLOCKS + 2] + cz / size;
                         let empty = !bit(blocks, b);
@@ -149,7 +152,7 @@ fn pass(
                             border(gx, cx, nx, dx, ux, empty),
                             min(border(gy, cy, ny, dy, uy, empty), border(gz, cz, nz, dz, uz, empty)),
                         );
-                        // a hair less, so that rounding cannot jump over a sample in the next cell
+                        // slightly less than that, so that rounding cannot skip a sample in the next cell
                         let whole = (max(far, 0.0f32) / step - 1e-3f32).ceil();
                         skip = u32::cast_from(clamp(whole, 1.0f32, 1e9f32));
                     }
@@ -170,7 +173,7 @@ fn pass(
                     found += 1;
                 }
                 k += skip;
-                marching = k < end && found < most;
+                marching = k < end && found < max_count;
             }
         }
         if !writes {
@@ -184,12 +187,12 @@ pub struct DeviceLattice {
     lattice: Buffer,
     sizes: Buffer,
     mask: Option<[Buffer; 2]>,
-    /// The most samples that a ray can have.
+    /// Maximum number of samples of a ray.
     pub most: usize,
 }
 
 impl DeviceLattice {
-    /// Of a field.
+    /// Uploads the lattice of a field.
     pub fn new(device: &Device, field: &VmField) -> DeviceLattice {
         let l = &field.lattice;
         assert!(l.step.is_finite() && l.step > 0.0);
@@ -208,7 +211,7 @@ impl DeviceLattice {
         DeviceLattice { lattice: device.upload(&numbers), sizes: device.upload(&sizes), mask, most }
     }
 
-    /// The most samples that a ray of a field can have: as many as the diagonal has, and those that rounding adds.
+    /// Returns the maximum number of samples of a ray: those of the box's diagonal, and a few more for rounding.
     pub fn most(field: &VmField) -> usize {
         let l = &field.lattice;
         let diagonal = (0..3).map(|a| (l.max[a] - l.min[a]).powi(2)).sum::<f32>().sqrt();
@@ -220,24 +223,24 @@ impl DeviceLattice {
 pub struct VmSamples {
     /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Buffer,
-    /// `[2]`: how many there are, twice.
+    /// `[2]`: number of samples, in both words.
     pub count: Buffer,
-    /// `[capacity]`, lattice points in `t`.
+    /// `[capacity]`: `t` of each sample.
     pub t: Buffer,
-    /// `[capacity]`, their rays.
+    /// `[capacity]`: ray of each sample.
     pub ray: Buffer,
-    /// Planes `[3, capacity]`: where they lie among the vertices of the grid, within the outer ones.
+    /// Planes `[3, capacity]`: positions in units of vertices of the grid, clamped to the outer ones.
     pub place: Buffer,
-    /// `[rays]`: lattice points inside the box, were nothing skipped.
+    /// `[rays]`: number of lattice points inside the box, including those that the mask skips.
     pub points: Buffer,
     counts: Buffer,
 }
 
 impl VmSamples {
-    /// Words of a sample.
+    /// Memory per sample, in words.
     pub const WORDS: usize = 5;
 
-    /// Room for so many rays and `capacity` samples.
+    /// Allocates buffers for `rays` rays and `capacity` samples.
     pub fn new(device: &Device, rays: usize, capacity: usize) -> VmSamples {
         VmSamples {
             offsets: device.zeros::<u32>(rays + 1),
@@ -250,22 +253,22 @@ impl VmSamples {
         }
     }
 
-    /// Finds the samples of rays.
+    /// Marches a batch of rays. Rays whose samples exceed the capacity are marked as not alive.
     pub fn march(&self, device: &Device, lattice: &DeviceLattice, rays: &Batch) {
         assert_eq!(rays.rays(), self.counts.words());
         let [bits, blocks] = match &lattice.mask {
-            Some(own) => own.each_ref(),
+            Some(masks) => masks.each_ref(),
             None => [&lattice.sizes; 2],
         };
-        let both = |writes: bool| {
+        let run_pass = |writes: bool| {
             launch!(device, pass::launch, groups(rays.jitter.words().div_ceil(UNITS as usize)), UNITS;
                 lattice.lattice, lattice.sizes, bits, blocks, rays.origin, rays.direction, rays.jitter,
                 rays.alive, self.offsets, self.counts, self.points, self.t, self.ray, self.place;
                 lattice.mask.is_some(), writes
             );
         };
-        both(false);
+        run_pass(false);
         prefix_sum(device, &self.counts, &self.offsets, &self.count, self.t.words());
-        both(true);
+        run_pass(true);
     }
 }

@@ -1,5 +1,5 @@
-//! From features to weights, and compositing: see `render` of [`crate::kernel::cpu::vm`], whose module holds the formulas. A
-//! thread takes a ray.
+//! Conversion of features to weights, and compositing, with one thread per ray: see `render` of
+//! [`crate::kernel::cpu::vm`], whose module has the formulas.
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
@@ -14,9 +14,10 @@ fn sigmoid(v: f32) -> f32 {
     1.0f32 / (1.0f32 + (-v).exp())
 }
 
-/// Weights of samples until a ray's light is used up, and how many of them are worth a color.
+/// Computes the weights of samples up to where a ray's transmittance is used up, and counts the samples whose weight is
+/// above the threshold, which need a color.
 #[cube(launch)]
-fn weigh(
+fn compute_weights(
     offsets: &[u32],
     feature: &[f32],
     alpha: &mut [f32],
@@ -33,34 +34,34 @@ fn weigh(
     let r = ABSOLUTE_POS;
     if r < ends.len() {
         let mut transmittance = 1.0f32;
-        let mut worth = 0u32;
+        let mut colored = 0u32;
         let mut s = offsets[r] as usize;
         let end = offsets[r + 1] as usize;
-        let mut seen = s < end;
-        while seen {
+        let mut marching = s < end;
+        while marching {
             let x = feature[s] + shift;
             let density = if softplus {
                 max(x, 0.0f32) + (1.0f32 + (-x.abs()).exp()).ln()
             } else {
                 max(feature[s], 0.0f32)
             };
-            let own = 1.0f32 - (-density * length).exp();
-            let w = own * transmittance;
-            alpha[s] = own;
+            let a = 1.0f32 - (-density * length).exp();
+            let w = a * transmittance;
+            alpha[s] = a;
             light[s] = transmittance;
             weight[s] = w;
-            worth += select(w > threshold, 1u32, 0u32);
-            transmittance *= 1.0f32 - own + 1e-10f32;
+            colored += select(w > threshold, 1u32, 0u32);
+            transmittance *= 1.0f32 - a + 1e-10f32;
             s += 1;
-            let dark = own > 0.0f32 && transmittance <= stop;
-            seen = s < end && !dark;
+            let dark = a > 0.0f32 && transmittance <= stop;
+            marching = s < end && !dark;
         }
         ends[r] = s as u32;
-        counts[r] = worth;
+        counts[r] = colored;
     }
 }
 
-/// The samples worth a color, one after the other.
+/// Lists the samples whose weight is above the threshold.
 #[cube(launch)]
 fn list(offsets: &[u32], ends: &[u32], weight: &[f32], firsts: &[u32], index: &mut [u32], threshold: f32) {
     let r = ABSOLUTE_POS;
@@ -75,7 +76,7 @@ fn list(offsets: &[u32], ends: &[u32], weight: &[f32], firsts: &[u32], index: &m
     }
 }
 
-/// Composites.
+/// Composites the colors of samples along rays.
 #[cube(launch)]
 fn composite(
     offsets: &[u32],
@@ -116,7 +117,7 @@ fn composite(
     }
 }
 
-/// Gradients by features, and by what goes into the colors' sigmoids.
+/// Writes the gradients with respect to features, and with respect to the inputs of the colors' sigmoids.
 #[cube(launch)]
 fn backward(
     offsets: &[u32],
@@ -147,7 +148,7 @@ fn backward(
             g_feature[s] = 0.0f32;
         }
         let mut next = firsts[r + 1] as usize;
-        let mut behind = 0.0f32; // Σ_{j>k} w_j dL/dw_j
+        let mut farther = 0.0f32; // Σ_{j>k} w_j dL/dw_j
         for k in 0..end - begin {
             let s = end - 1 - k;
             let w = weight[s];
@@ -161,31 +162,31 @@ fn backward(
                 g_pre[2 * plane + next] = w * g2 * c2 * (1.0f32 - c2);
             }
             let open = 1.0f32 - alpha[s];
-            let g_alpha = light[s] * g_w - behind / (open + 1e-10f32);
+            let g_alpha = light[s] * g_w - farther / (open + 1e-10f32);
             // dα/dσ = (1 − α) δ s
             let mut slope = select(feature[s] > 0.0f32, 1.0f32, 0.0f32);
             if softplus {
                 slope = sigmoid(feature[s] + shift);
             }
             g_feature[s] = g_alpha * open * length * slope;
-            behind += w * g_w;
+            farther += w * g_w;
         }
     }
 }
 
-/// What lies along the rays of a batch.
+/// Values of samples along the rays of a batch, and the composited rays.
 pub struct Along {
-    /// `[capacity]`, samples' features.
+    /// `[capacity]`: features of samples.
     pub feature: Buffer,
-    /// `[capacity]`, gradients by them.
+    /// `[capacity]`: gradients with respect to features.
     pub g_feature: Buffer,
-    /// `[2]`, samples worth a color, twice.
+    /// `[2]`: number of samples with a color, in both words.
     pub count: Buffer,
-    /// `[capacity]`, which they are.
+    /// `[capacity]`: list of the samples with a color.
     pub index: Buffer,
-    /// Planes `[3, capacity]`, their colors.
+    /// Planes `[3, capacity]`: colors of the listed samples.
     pub rgb: Buffer,
-    /// Planes `[3, capacity]`, gradients by what goes into their sigmoids.
+    /// Planes `[3, capacity]`: gradients with respect to the inputs of the colors' sigmoids.
     pub g_pre: Buffer,
     /// Planes `[5, rays]`: see [`RAY_WIDTH`].
     pub out: Buffer,
@@ -203,12 +204,13 @@ pub struct Along {
 }
 
 impl Along {
-    /// Words of a sample of a field that learns.
+    /// Memory per sample of a field that is trained, in words.
     pub const WORDS: usize = 12;
-    /// Words of a ray: what is composited with gradients and terms, offsets, counts, and the ray itself.
+    /// Memory per ray, in words: composited values, their gradients and loss terms, offsets, counts, and the ray itself.
     pub const OF_RAY: usize = 2 * RAY_WIDTH + 24;
 
-    /// Of so many rays and up to `capacity` samples of a field; with room for gradients where it learns.
+    /// Allocates buffers for `rays` rays and up to `capacity` samples of a field; buffers for gradients only if `learns` is
+    /// set.
     pub fn new(device: &Device, field: &VmField, rays: usize, capacity: usize, learns: bool) -> Along {
         let s = &field.shading;
         let samples = |planes: usize| device.scratch::<f32>(planes * capacity);
@@ -239,9 +241,9 @@ impl Along {
         groups(self.ends.words().div_ceil(UNITS as usize))
     }
 
-    /// Weights of samples from their features, and the list of those worth a color.
+    /// Computes the weights of samples from their features, and lists the samples that need a color.
     pub fn weigh(&self, device: &Device, samples: &VmSamples) {
-        launch!(device, weigh::launch, self.groups(), UNITS;
+        launch!(device, compute_weights::launch, self.groups(), UNITS;
             samples.offsets, self.feature, self.alpha, self.light, self.weight, self.ends, self.counts;
             self.shift, self.length, self.threshold, self.stop, self.softplus
         );
@@ -251,7 +253,7 @@ impl Along {
         );
     }
 
-    /// Composites colors.
+    /// Composites the colors of samples.
     pub fn composite(&self, device: &Device, samples: &VmSamples) {
         launch!(device, composite::launch, self.groups(), UNITS;
             samples.offsets, self.ends, self.firsts, samples.t, self.weight, self.rgb, self.out;
@@ -259,7 +261,7 @@ impl Along {
         );
     }
 
-    /// Gradients of samples from those by what was composited, planes `[5, rays]`.
+    /// Computes the gradients of samples from those with respect to the composited rays, planes `[5, rays]`.
     pub fn backward(&self, device: &Device, samples: &VmSamples, g_out: &Buffer) {
         assert!(g_out.words() == self.out.words() && self.g_feature.words() == self.feature.words());
         launch!(device, backward::launch, self.groups(), UNITS;

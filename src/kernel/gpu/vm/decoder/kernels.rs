@@ -1,6 +1,9 @@
-//! What runs on the device: weights made ready, the layers forward and backward, gradients of the weights.
+//! Kernels of the color decoder: preparation of the weights, forward and backward pass of the layers, and gradients of the
+//! weights.
 
-use super::super::super::tile::{self, Block, at, gate, narrow, outer, product, put, sums, turned};
+use super::super::super::tile::{
+    self, Block, at, outer, output_layer, product, relu_backward, sample_sums, store_block, transposed,
+};
 use super::super::super::weight_norm::finite;
 use super::super::grid::{NONE, looked_up, term};
 use super::Plan;
@@ -8,7 +11,7 @@ use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 
-/// `[M, W1_direction]` of hidden channel `h` and input `c`.
+/// Returns `[M, W1_direction]` for hidden channel `h` and input `c`.
 #[cube]
 fn merged(flat: &[f32], real: &[u32], h: usize, c: usize, #[comptime] plan: Plan) -> f32 {
     let parts = comptime!(plan.parts());
@@ -17,10 +20,10 @@ fn merged(flat: &[f32], real: &[u32], h: usize, c: usize, #[comptime] plan: Plan
     let mut sum = 0.0f32;
     if h < comptime!(plan.hidden) {
         if c < products {
-            let own = real[c];
-            if own != NONE {
+            let cpu_channel = real[c];
+            if cpu_channel != NONE {
                 for f in 0..features {
-                    sum += flat[row + f] * flat[f * comptime!(plan.channels) + own as usize];
+                    sum += flat[row + f] * flat[f * comptime!(plan.channels) + cpu_channel as usize];
                 }
             }
         } else if c < comptime!(products + 3) {
@@ -30,9 +33,9 @@ fn merged(flat: &[f32], real: &[u32], h: usize, c: usize, #[comptime] plan: Plan
     sum
 }
 
-/// A float of a matrix of `rows` times `columns` that begins at `start`, zero beside it.
+/// Returns a value of a matrix of `rows` times `columns` that begins at `start`; zero outside of the matrix.
 #[cube]
-fn beside(
+fn zero_padded(
     flat: &[f32],
     #[comptime] start: usize,
     row: usize,
@@ -47,7 +50,7 @@ fn beside(
     v
 }
 
-/// Weights in the orders in which they are read.
+/// Copies the weights to the orders in which they are read.
 #[cube(launch)]
 pub(super) fn prepare(flat: &[f32], real: &[u32], out: &mut [f32], #[comptime] plan: Plan) {
     let i = ABSOLUTE_POS;
@@ -59,25 +62,26 @@ pub(super) fn prepare(flat: &[f32], real: &[u32], out: &mut [f32], #[comptime] p
         out[i] = if row < comptime!(rows[1]) {
             merged(flat, real, column, row, plan)
         } else if row < comptime!(rows[2]) {
-            beside(flat, comptime!(parts[2]), 0usize, column, 1usize, hidden)
+            zero_padded(flat, comptime!(parts[2]), 0usize, column, 1usize, hidden)
         } else if row < comptime!(rows[3]) {
-            beside(flat, comptime!(parts[3]), column, row - comptime!(rows[2]), hidden, hidden)
+            zero_padded(flat, comptime!(parts[3]), column, row - comptime!(rows[2]), hidden, hidden)
         } else if row < comptime!(rows[4]) {
-            beside(flat, comptime!(parts[4]), 0usize, column, 1usize, hidden)
+            zero_padded(flat, comptime!(parts[4]), 0usize, column, 1usize, hidden)
         } else if row < comptime!(rows[5]) {
-            beside(flat, comptime!(parts[5]), row - comptime!(rows[4]), column, 3usize, hidden)
+            zero_padded(flat, comptime!(parts[5]), row - comptime!(rows[4]), column, 3usize, hidden)
         } else if row < comptime!(rows[6]) {
-            beside(flat, comptime!(parts[6]), 0usize, column, 1usize, 3usize)
+            zero_padded(flat, comptime!(parts[6]), 0usize, column, 1usize, 3usize)
         } else if row < comptime!(rows[7]) {
-            let own = row - comptime!(rows[6]);
-            merged(flat, real, own % width, own / width * width + column, plan)
+            let merged_row = row - comptime!(rows[6]);
+            merged(flat, real, merged_row % width, merged_row / width * width + column, plan)
         } else {
-            beside(flat, comptime!(parts[3]), row - comptime!(rows[7]), column, hidden, hidden)
+            zero_padded(flat, comptime!(parts[3]), row - comptime!(rows[7]), column, hidden, hidden)
         };
     }
 }
 
-/// Four inputs of a sample worth a color: of a term's channels, or its direction.
+/// Returns four inputs of a sample: products of a term's channels, or the direction. `k` is the sample's position in the
+/// list `index` of samples with a color.
 #[cube]
 fn input(
     values: &[F4],
@@ -97,10 +101,10 @@ fn input(
         #[unroll]
         for i in 0..3usize {
             let first = comptime!(plan.quads[..i].iter().sum::<usize>());
-            let own = comptime!(plan.quads[i]);
-            if comptime!(own > 0) && quad >= first && quad < comptime!(first + own) {
-                let t = term(words, place, s, i, own);
-                v = looked_up(values, &t, quad - first, own);
+            let quads = comptime!(plan.quads[i]);
+            if comptime!(quads > 0) && quad >= first && quad < comptime!(first + quads) {
+                let t = term(words, place, s, i, quads);
+                v = looked_up(values, &t, quad - first, quads);
             }
         }
         if quad == comptime!(plan.products()) {
@@ -114,7 +118,7 @@ fn input(
     v
 }
 
-/// Fills a tile with a piece of the inputs of the samples of `tile`.
+/// Fills a tile with one piece of the inputs of the samples of tile number `tile`.
 #[cube]
 fn inputs(
     a: &mut [F4],
@@ -135,25 +139,25 @@ fn inputs(
     let quad = comptime!(piece * tile::columns(lanes)) + column;
     if quad < comptime!(plan.inputs() / 4) {
         let k = 4 * (tile * lanes + row);
-        let own = Block::of(
+        let block = Block::of(
             input(values, words, place, ray, direction, index, k, samples, quad, plan),
             input(values, words, place, ray, direction, index, k + 1, samples, quad, plan),
             input(values, words, place, ray, direction, index, k + 2, samples, quad, plan),
             input(values, words, place, ray, direction, index, k + 3, samples, quad, plan),
         );
-        put(a, &turned(&own), row, column, lanes);
+        store_block(a, &transposed(&block), row, column, lanes);
     }
 }
 
-/// One channel of the bias of a thread's block.
+/// Returns channel `j` of a bias in all components of a vector.
 #[cube]
-fn spread(bias: F4, #[comptime] j: usize) -> F4 {
+fn broadcast(bias: F4, #[comptime] j: usize) -> F4 {
     F4::new(bias.extract(j))
 }
 
-/// The first hidden layer; the tile is free afterwards.
+/// Returns a thread's block of the first hidden layer. Tile `a` is scratch memory, free afterwards.
 #[cube]
-fn first(
+fn first_layer(
     a: &mut [F4],
     w: &[F4],
     values: &[F4],
@@ -171,41 +175,41 @@ fn first(
     let lanes = comptime!(plan.lanes);
     let rows = comptime!(plan.rows());
     let bias = w[comptime!(rows[1] * tile::columns(lanes)) + column];
-    let mut c0 = spread(bias, 0usize);
-    let mut c1 = spread(bias, 1usize);
-    let mut c2 = spread(bias, 2usize);
-    let mut c3 = spread(bias, 3usize);
+    let mut c0 = broadcast(bias, 0usize);
+    let mut c1 = broadcast(bias, 1usize);
+    let mut c2 = broadcast(bias, 2usize);
+    let mut c3 = broadcast(bias, 3usize);
     #[unroll]
     for p in 0..comptime!(plan.pieces()) {
         inputs(a, values, words, place, ray, direction, index, tile, samples, row, column, p, plan);
         sync_cube();
         let from = comptime!(p * plan.width());
-        let own = product(&*a, 0usize, w, from, comptime!(plan.piece(p)), row, column, lanes);
-        c0 += own.channel(0usize);
-        c1 += own.channel(1usize);
-        c2 += own.channel(2usize);
-        c3 += own.channel(3usize);
+        let z = product(&*a, 0usize, w, from, comptime!(plan.piece(p)), row, column, lanes);
+        c0 += z.channel(0usize);
+        c1 += z.channel(1usize);
+        c2 += z.channel(2usize);
+        c3 += z.channel(3usize);
         sync_cube();
     }
     tile::relu(&Block::of(c0, c1, c2, c3))
 }
 
-/// The second hidden layer of the first, a tile.
+/// Returns a thread's block of the second hidden layer, computed from the first one in tile `b`.
 #[cube]
-fn second(b: &[F4], w: &[F4], row: usize, column: usize, #[comptime] plan: Plan) -> Block {
+fn second_layer(b: &[F4], w: &[F4], row: usize, column: usize, #[comptime] plan: Plan) -> Block {
     let lanes = comptime!(plan.lanes);
     let rows = comptime!(plan.rows());
     let bias = w[comptime!(rows[3] * tile::columns(lanes)) + column];
     let z = product(b, 0usize, w, comptime!(rows[2]), comptime!(plan.hidden), row, column, lanes);
     tile::relu(&Block::of(
-        z.channel(0usize) + spread(bias, 0usize),
-        z.channel(1usize) + spread(bias, 1usize),
-        z.channel(2usize) + spread(bias, 2usize),
-        z.channel(3usize) + spread(bias, 3usize),
+        z.channel(0usize) + broadcast(bias, 0usize),
+        z.channel(1usize) + broadcast(bias, 1usize),
+        z.channel(2usize) + broadcast(bias, 2usize),
+        z.channel(3usize) + broadcast(bias, 3usize),
     ))
 }
 
-/// Colors, planes `[3, capacity]`.
+/// Writes colors, planes `[3, capacity]`.
 #[cube(launch_unchecked)]
 pub(super) fn forward(
     w: &[F4],
@@ -227,25 +231,27 @@ pub(super) fn forward(
     let mut b = Shared::<[F4]>::new_slice(comptime!(width * lanes));
     let samples = tile::uniform_count(count, &mut a);
     for tile in range_stepped(CUBE_POS, samples.div_ceil(comptime!(4 * lanes)), CUBE_COUNT) {
-        let h1 =
-            first(&mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan);
-        put(&mut b, &h1, row, column, lanes);
+        let h1 = first_layer(
+            &mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
+        );
+        store_block(&mut b, &h1, row, column, lanes);
         sync_cube();
-        let h2 = second(&b, w, row, column, plan);
-        put(&mut a, &h2, row, column, lanes);
+        let h2 = second_layer(&b, w, row, column, plan);
+        store_block(&mut a, &h2, row, column, lanes);
         sync_cube();
-        let v = narrow(&a, w, comptime!(rows[4]), row, column, 3usize, lanes);
+        let v = output_layer(&a, w, comptime!(rows[4]), row, column, 3usize, lanes);
         if column < 3 {
             let bias = w[comptime!(rows[5] * columns)];
-            let own = select(column == 0, bias.extract(0usize), bias.extract(1usize));
-            let own = select(column == 2, bias.extract(2usize), own);
-            rgb[column * (rgb.len() / 3) + tile * lanes + row] = tile::sigmoid(v + F4::new(own));
+            let channel_bias = select(column == 0, bias.extract(0usize), bias.extract(1usize));
+            let channel_bias = select(column == 2, bias.extract(2usize), channel_bias);
+            rgb[column * (rgb.len() / 3) + tile * lanes + row] = tile::sigmoid(v + F4::new(channel_bias));
         }
         sync_cube();
     }
 }
 
-/// What goes into the sigmoid of four samples' color `o`, as a gradient; 0 behind the last.
+/// Returns the gradient with respect to the input of the sigmoid of color channel `o`, for four samples; zero after the
+/// last sample.
 #[cube]
 fn g_color(g_pre: &[F4], o: usize, here: usize, samples: usize) -> F4 {
     let mut v = g_pre[o * (g_pre.len() / 3) + here];
@@ -258,18 +264,20 @@ fn g_color(g_pre: &[F4], o: usize, here: usize, samples: usize) -> F4 {
     v
 }
 
-/// One channel of the gradient by the second hidden layer.
+/// Returns channel `j` of the gradient with respect to the second hidden layer.
 #[cube]
 fn from_colors(g0: F4, g1: F4, g2: F4, w0: F4, w1: F4, w2: F4, #[comptime] j: usize) -> F4 {
-    g0 * spread(w0, j) + g1 * spread(w1, j) + g2 * spread(w2, j)
+    g0 * broadcast(w0, j) + g1 * broadcast(w1, j) + g2 * broadcast(w2, j)
 }
 
+/// Adds `v` to a gradient, or overwrites it if `fresh` is set.
 #[cube]
 fn add(gradient: &mut [f32], i: usize, v: f32, fresh: bool) {
     gradient[i] = if fresh { v } else { gradient[i] + v };
 }
 
-/// Gradients by products of samples `from..from + limit`, `[limit, channels]`, and of the weights by group.
+/// Writes the gradients with respect to products of samples `from..from + limit`, `[limit, channels]`, and partial sums by
+/// group of those with respect to the weights.
 #[cube(launch_unchecked)]
 pub(super) fn backward(
     w: &[F4],
@@ -288,10 +296,10 @@ pub(super) fn backward(
     #[comptime] plan: Plan,
 ) {
     let (lanes, width, hidden) = comptime!((plan.lanes, plan.width(), plan.hidden));
-    let (rows, own) = comptime!((plan.rows(), plan.gradients()));
+    let (rows, gradient_rows) = comptime!((plan.rows(), plan.gradients()));
     let columns = comptime!(tile::columns(lanes));
     let (row, column) = (UNIT_POS as usize / columns, UNIT_POS as usize % columns);
-    let sum = CUBE_POS * comptime!(own[6] * width);
+    let sum = CUBE_POS * comptime!(gradient_rows[6] * width);
     let mut a = Shared::<[F4]>::new_slice(comptime!(width * lanes));
     let mut b = Shared::<[F4]>::new_slice(comptime!(width * lanes));
     let samples = tile::uniform_count(count, &mut a);
@@ -300,12 +308,13 @@ pub(super) fn backward(
     for tile in range_stepped(start + CUBE_POS, end, CUBE_COUNT) {
         let fresh = tile == CUBE_POS;
         let here = tile * lanes + row;
-        let h1 =
-            first(&mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan);
-        put(&mut b, &h1, row, column, lanes);
+        let h1 = first_layer(
+            &mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
+        );
+        store_block(&mut b, &h1, row, column, lanes);
         sync_cube();
-        let h2 = second(&b, w, row, column, plan);
-        put(&mut a, &h2, row, column, lanes);
+        let h2 = second_layer(&b, w, row, column, plan);
+        store_block(&mut a, &h2, row, column, lanes);
         sync_cube();
         // W3 and b3
         let c = UNIT_POS as usize;
@@ -316,7 +325,7 @@ pub(super) fn backward(
                 for r in 0..lanes {
                     s += a[at(c, r, lanes)].dot(g_color(g_pre, o, tile * lanes + r, samples));
                 }
-                add(partial, sum + comptime!((own[4] + o) * width) + c, s, fresh);
+                add(partial, sum + comptime!((gradient_rows[4] + o) * width) + c, s, fresh);
             }
         }
         if c < 3 {
@@ -324,8 +333,8 @@ pub(super) fn backward(
             for r in 0..lanes {
                 s += g_color(g_pre, c, tile * lanes + r, samples);
             }
-            let all = s.extract(0usize) + s.extract(1usize) + (s.extract(2usize) + s.extract(3usize));
-            add(partial, sum + comptime!(own[5] * width) + c, all, fresh);
+            let total = s.extract(0usize) + s.extract(1usize) + (s.extract(2usize) + s.extract(3usize));
+            add(partial, sum + comptime!(gradient_rows[5] * width) + c, total, fresh);
         }
         let g0 = g_color(g_pre, 0usize, here, samples);
         let g1 = g_color(g_pre, 1usize, here, samples);
@@ -339,19 +348,39 @@ pub(super) fn backward(
             from_colors(g0, g1, g2, w0, w1, w2, 2usize),
             from_colors(g0, g1, g2, w0, w1, w2, 3usize),
         );
-        let g_z2 = gate(&g_h2, &a, row, column, lanes);
+        let g_z2 = relu_backward(&g_h2, &a, row, column, lanes);
         sync_cube();
-        put(&mut a, &g_z2, row, column, lanes);
+        store_block(&mut a, &g_z2, row, column, lanes);
         sync_cube();
-        let at_w2 = sum + comptime!(own[2] * width);
+        let at_w2 = sum + comptime!(gradient_rows[2] * width);
         outer(&a, 0usize, &b, hidden, hidden, partial, at_w2, fresh, row, column, lanes);
-        sums(&a, 0usize, hidden, partial, sum + comptime!(own[3] * width), fresh, row, column, lanes);
+        sample_sums(
+            &a,
+            0usize,
+            hidden,
+            partial,
+            sum + comptime!(gradient_rows[3] * width),
+            fresh,
+            row,
+            column,
+            lanes,
+        );
         let g_h1 = product(&a, 0usize, w, comptime!(rows[7]), hidden, row, column, lanes);
-        let g_z1 = gate(&g_h1, &b, row, column, lanes);
+        let g_z1 = relu_backward(&g_h1, &b, row, column, lanes);
         sync_cube();
-        put(&mut b, &g_z1, row, column, lanes);
+        store_block(&mut b, &g_z1, row, column, lanes);
         sync_cube();
-        sums(&b, 0usize, hidden, partial, sum + comptime!(own[1] * width), fresh, row, column, lanes);
+        sample_sums(
+            &b,
+            0usize,
+            hidden,
+            partial,
+            sum + comptime!(gradient_rows[1] * width),
+            fresh,
+            row,
+            column,
+            lanes,
+        );
         #[unroll]
         for p in 0..comptime!(plan.pieces()) {
             inputs(&mut a, values, words, place, ray, direction, index, tile, samples, row, column, p, plan);
@@ -361,7 +390,7 @@ pub(super) fn backward(
             outer(&b, 0usize, &a, hidden, n, partial, at_m, fresh, row, column, lanes);
             if comptime!(p * columns < plan.products()) {
                 let from_m = comptime!(rows[6] + p * width);
-                let g = turned(&product(&b, 0usize, w, from_m, hidden, row, column, lanes));
+                let g = transposed(&product(&b, 0usize, w, from_m, hidden, row, column, lanes));
                 let quad = comptime!(p * columns) + column;
                 let products = comptime!(plan.products());
                 if quad < products {
@@ -377,7 +406,7 @@ pub(super) fn backward(
     }
 }
 
-/// Sums of the groups' gradients, in the order of the groups.
+/// Sums the partial gradients of the groups, in the order of the groups.
 #[cube(launch)]
 pub(super) fn reduce(partial: &[f32], count: &[u32], summed: &mut [f32], tile: u32, groups: u32) {
     let i = ABSOLUTE_POS;
@@ -392,13 +421,13 @@ pub(super) fn reduce(partial: &[f32], count: &[u32], summed: &mut [f32], tile: u
     }
 }
 
-/// The gradient by `[M, W1_direction]` of hidden channel `h` and input `c`.
+/// Returns the gradient with respect to `[M, W1_direction]` for hidden channel `h` and input `c`.
 #[cube]
 fn g_merged(summed: &[f32], h: usize, c: usize, #[comptime] width: usize) -> f32 {
     summed[(c / width * width + h) * width + c % width]
 }
 
-/// Gradients of the flat weights.
+/// Writes the gradients with respect to the flat weights, by the chain rule through `M`.
 #[cube(launch)]
 pub(super) fn chain(
     flat: &[f32],
@@ -411,7 +440,7 @@ pub(super) fn chain(
 ) {
     let i = ABSOLUTE_POS;
     if i < g_flat.len() {
-        let (parts, own) = comptime!((plan.parts(), plan.gradients()));
+        let (parts, gradient_rows) = comptime!((plan.parts(), plan.gradients()));
         let (width, hidden, features) = comptime!((plan.width(), plan.hidden, plan.features));
         let (channels, products) = comptime!((plan.channels, 4 * plan.products()));
         let inputs = comptime!(features + 3);
@@ -433,20 +462,20 @@ pub(super) fn chain(
                 g = g_merged(summed, h, products + f - features, width);
             }
         } else if i < comptime!(parts[3]) {
-            g = summed[comptime!(own[1] * width) + i - comptime!(parts[2])];
+            g = summed[comptime!(gradient_rows[1] * width) + i - comptime!(parts[2])];
         } else if i < comptime!(parts[4]) {
             let k = i - comptime!(parts[3]);
-            g = summed[(comptime!(own[2]) + k / hidden) * width + k % hidden];
+            g = summed[(comptime!(gradient_rows[2]) + k / hidden) * width + k % hidden];
         } else if i < comptime!(parts[5]) {
-            g = summed[comptime!(own[3] * width) + i - comptime!(parts[4])];
+            g = summed[comptime!(gradient_rows[3] * width) + i - comptime!(parts[4])];
         } else if i < comptime!(parts[6]) {
             let k = i - comptime!(parts[5]);
-            g = summed[(comptime!(own[4]) + k / hidden) * width + k % hidden];
+            g = summed[(comptime!(gradient_rows[4]) + k / hidden) * width + k % hidden];
         } else {
-            g = summed[comptime!(own[5] * width) + i - comptime!(parts[6])];
+            g = summed[comptime!(gradient_rows[5] * width) + i - comptime!(parts[6])];
         }
         g_flat[i] = g;
-        // all who write, write the same
+        // all threads that write, write the same value
         if !finite(g) {
             broken[0] = 1;
         }
