@@ -26,6 +26,8 @@ use crate::{Error, Result};
 use std::sync::{Mutex, OnceLock};
 
 /// Where a field is learned.
+// a process has one, or two
+#[allow(clippy::large_enum_variant)]
 pub enum ComputeDevice {
     /// The processor, with the reason where `auto` found nothing else.
     Cpu(String),

@@ -213,6 +213,9 @@ fi
 step "a published checkpoint is converted" .venv/bin/python tools/reference/tensorf_checkpoint.py --check tests/reference
 step "the engine of many heads is here" .venv/bin/python -m pip install --quiet --disable-pip-version-check \
   -r tools/fleet/requirements.txt
+if [ -n "${VK_DRIVER_FILES:-}" ]; then
+  step "a first look at a GPU runs" env SHARE=1 CARGO_TARGET_DIR="$target" tools/gpu/first_look.sh vulkan:0 "$scratch/look"
+fi
 step "many heads outlive kills" check tools/fleet/check_fleet.py
 step "the commands of the guides work" check tools/guides/check_guides.py
 if [ $demo = yes ]; then

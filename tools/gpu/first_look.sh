@@ -106,8 +106,10 @@ paper=(--preset paper --set capture.box=head)
 standard=(--preset standard)
 demo=(--preset draft --quiet)
 small=(--preset draft)
+sizes=(24576 65536 262144 1048576)
+most_tasks=(4 32 128)
 if [ "$share" -lt 100 ]; then
-  photographs=(--size 64x80 --views 12)
+  photographs=(--size 64x80 --views 12) sizes=(24576) most_tasks=(32)
   paper=("${tiny[@]}") standard=("${tiny[@]}") demo=("${tiny[@]}" --quiet) small=("${tiny[@]}")
 fi
 # samples N: as many samples of a step, fewer of them with a small share
@@ -130,7 +132,8 @@ part_doctor() {
 part_kernels() {
   local n log=$work/kernels.log
   capture > /dev/null
-  for n in 24576 262144 1048576; do
+  for n in "${sizes[@]}"; do
+    [ "$n" != 65536 ] || continue
     mkdir -p "$work/profile"
     rm -f "$log"
     printf '[profiling]\nlogger = { level = "basic", file = "%s", append = false }\n' "$log" > "$work/profile/cubecl.toml"
@@ -152,10 +155,10 @@ part_kernels() {
 
 part_steps() {
   local n tasks
-  for n in 24576 65536 262144 1048576; do
+  for n in "${sizes[@]}"; do
     train "samples_$n" iface 3000 "${paper[@]}" --set "iface.samples=$(samples $n)"
   done
-  for tasks in 4 32 128; do
+  for tasks in "${most_tasks[@]}"; do
     CUBECL_WGPU_MAX_TASKS=$tasks train "tasks_$tasks" iface 3000 "${standard[@]}" --set "iface.samples=$(samples 24576)"
   done
   for n in 1 2; do
