@@ -39,21 +39,21 @@ use std::sync::Arc;
 
 const EXAMPLES: &str = "\
 Examples:
-  tiface demo                                   a head made on the spot, from pictures to mesh
-  tiface inspect captures/002_00                what is in a folder of photographs, and what is wrong
-  tiface run captures/002_00 --preset draft     a first look at your own head, into runs/002_00
-  tiface mesh --format glb,ply --out head.glb   the mesh of the newest run, once more, as a file
+  tiface demo                                   reconstruct a synthetic head, from photographs to mesh
+  tiface inspect captures/002_00                list what is in a folder of photographs, and what is wrong
+  tiface run captures/002_00 --preset draft     reconstruct your own head quickly, into runs/002_00
+  tiface mesh --format glb,ply --out head.glb   write the mesh of the newest run to a file
 
 Exit codes:
-  0         done
-  1         cannot be done as asked
+  0         success
+  1         failure: the command cannot be done as given
   2         wrong command line or configuration
-  3         below a bar you set
-  75        not now, try again
+  3         a required quality was not met
+  75        temporary failure: try again
   101       a bug
-  130, 143  stopped: repeat to continue";
+  130, 143  stopped by a signal: repeat to continue";
 
-/// Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel views.
+/// Reconstruct a human head from photographs by calibrated cameras: a watertight mesh and novel views.
 #[derive(Parser, Debug)]
 #[command(name = "tiface", version, max_term_width = 100, after_long_help = EXAMPLES)]
 struct Cli {
@@ -66,8 +66,8 @@ struct Cli {
 /// What a stage command works on.
 #[derive(Args, Debug)]
 struct CaptureOrRun {
-    /// A capture (a folder of photographs with cameras) or a run; without one, the run in this
-    /// folder, else the newest under runs/
+    /// Capture (a folder of photographs with cameras) or run [default: the run in this folder, else the newest under
+    /// runs/]
     #[arg(value_name = "CAPTURE|RUN")]
     path: Option<PathBuf>,
 }
@@ -75,28 +75,28 @@ struct CaptureOrRun {
 /// Masks from clicks.
 #[derive(Args, Debug, Default)]
 struct ClickOptions {
-    /// Make masks from the clicks in this prompts.json
+    /// Make masks from the clicks in a prompts.json
     #[arg(long, alias = "points", value_name = "FILE")]
     prompts: Option<PathBuf>,
-    /// A click on one photograph, label 1 for the head, 0 for what is not; repeatable
+    /// Click on one photograph: 1 for the head, 0 for background; repeatable
     #[arg(long, value_name = "X,Y,LABEL", conflicts_with = "prompts", allow_hyphen_values = true)]
     point: Vec<String>,
-    /// The view that --point is on [default: the first that is trained on]
+    /// View of --point [default: the first training view]
     #[arg(long, value_name = "NAME", requires = "point")]
     view: Option<String>,
-    /// SAM's image encoder, ONNX; needs --sam-decoder
+    /// Image encoder of SAM, an ONNX file; needs --sam-decoder
     #[arg(long, value_name = "FILE")]
     sam: Option<PathBuf>,
-    /// SAM's prompt encoder and mask decoder, ONNX
+    /// Prompt encoder and mask decoder of SAM, an ONNX file
     #[arg(long, value_name = "FILE")]
     sam_decoder: Option<PathBuf>,
-    /// ViTMatte, ONNX
+    /// ViTMatte, an ONNX file
     #[arg(long, value_name = "FILE")]
     vitmatte: Option<PathBuf>,
-    /// Make masks without any click: a network from a picture to its alpha (U²-Net, ISNet, MODNet, BiRefNet), ONNX
+    /// Make masks without clicks, by a network that predicts alpha (U²-Net, ISNet, MODNet, BiRefNet), an ONNX file
     #[arg(long, value_name = "FILE", conflicts_with_all = ["prompts", "point"])]
     alpha_net: Option<PathBuf>,
-    /// An ONNX Runtime library to run them with, instead of the built-in engine
+    /// Run networks with this ONNX Runtime library instead of the built-in engine
     #[arg(long, value_name = "FILE")]
     onnxruntime: Option<PathBuf>,
 }
@@ -132,7 +132,7 @@ impl ClickOptions {
 
 #[derive(Subcommand, Debug)]
 enum Command {
-    /// Every stage in order, going on where the last command stopped
+    /// Run all stages, continuing where the last command stopped
     #[command(after_long_help = "Examples:
   tiface run captures/002_00
   tiface run captures/002_00 --run /data/002_00 --preset paper --seed 7
@@ -144,34 +144,34 @@ enum Command {
         place: CaptureOrRun,
         #[command(flatten)]
         clicks: ClickOptions,
-        /// Exit with 3 below this bar: watertight, psnr=DB (masked, the best of all); repeatable
+        /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
-    /// The same on a synthetic head made on the spot: no data, weights or network needed
+    /// Run all stages on a synthetic head; needs no data
     #[command(after_long_help = "Examples:
   tiface demo
   tiface demo --set iface.steps=500 --set tface.steps=500    a rougher head, sooner
   tiface demo --run /tmp/demo --out head.glb    somewhere else, and the mesh beside it
   tiface demo --size 3000x4096 --views 24 --border 60 --run /tmp/full    as large as the ILSH dataset")]
     Demo {
-        /// Pixels of each photograph [default: 256x320]
+        /// Size of each photograph, pixels [default: 256x320]
         #[arg(long, value_name = "WxH")]
         size: Option<String>,
-        /// Photographs, a quarter of them held out [default: 32]
+        /// Number of photographs, a quarter of them held out [default: 32]
         #[arg(long, value_name = "N")]
         views: Option<usize>,
-        /// Pixels along the edges that are marked as not usable [default: none]
+        /// Width of the border to mark as invalid, pixels [default: none]
         #[arg(long, value_name = "PX")]
         border: Option<u32>,
     },
-    /// What was found: format, cameras, masks, splits, problems; writes nothing
+    /// Check a capture: format, cameras, masks, splits, problems; writes nothing
     #[command(after_long_help = "Examples:
   tiface inspect captures/002_00
   tiface inspect captures/002_00 --set capture.mask_dir=vit_mask
   tiface inspect captures/002_00 --json | jq .problems")]
     Inspect {
-        /// A folder of photographs with cameras
+        /// Folder of photographs with cameras
         capture: PathBuf,
     },
     /// Write a capture's cameras in another format: transforms.json or COLMAP
@@ -181,13 +181,13 @@ enum Command {
 
 Photographs and masks are copied as they are. The new folder must not be there, or be empty.")]
     Convert {
-        /// A folder of photographs with cameras
+        /// Folder of photographs with cameras
         capture: PathBuf,
-        /// transforms or colmap
+        /// Format to write: transforms or colmap
         #[arg(long, value_name = "FORMAT")]
         to: String,
     },
-    /// Stage: which pixels are the head, and where that puts it
+    /// Stage: make or read head masks, and find the head's bounding box
     #[command(after_long_help = "Examples:
   tiface mask captures/002_00                   the masks that lie there; a sheet of them in the run's mask/
   tiface mask captures/002_00 --page            an annotation page, which saves prompts.json
@@ -204,11 +204,11 @@ from different sides. The other views follow from the cameras.")]
         place: CaptureOrRun,
         #[command(flatten)]
         clicks: ClickOptions,
-        /// Write an annotation page to click on instead, to --out or <capture>_clicks.html
+        /// Write a page to click on instead, to --out or <capture>_clicks.html
         #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "alpha_net", "onnxruntime"])]
         page: bool,
     },
-    /// Stage: learn T-Face, a radiance field, from the masked photographs
+    /// Stage: train T-Face, a radiance field of the masked photographs
     #[command(after_long_help = "Examples:
   tiface tface captures/002_00
   tiface tface runs/002_00                      go on after a stop
@@ -216,19 +216,19 @@ from different sides. The other views follow from the cameras.")]
   tiface tface captures/002_00 --set tface.fields=3    the mean of three fields
   tiface tface captures/002_00 --set tface.import=official.safetensors")]
     Tface(CaptureOrRun),
-    /// Stage: learn one such field from whole photographs, to compare T-Face with
+    /// Stage: train the same field on whole photographs, as a baseline for T-Face
     #[command(after_long_help = "Examples:
   tiface baseline captures/002_00
   tiface baseline runs/002_00                   go on after a stop
   tiface baseline runs/002_00 --fresh baseline --set baseline.steps=20000")]
     Baseline(CaptureOrRun),
-    /// Stage: learn I-Face, a signed-distance field
+    /// Stage: train I-Face, a signed distance field
     #[command(after_long_help = "Examples:
   tiface iface captures/002_00
   tiface iface runs/002_00                      go on after a stop
   tiface iface runs/002_00 --fresh iface --set iface.steps=30000")]
     Iface(CaptureOrRun),
-    /// Stage: extract the watertight mesh, simplify it, bake its texture
+    /// Stage: extract, simplify and texture the watertight mesh
     #[command(after_long_help = "Examples:
   tiface mesh runs/002_00
   tiface mesh runs/002_00 --out head.glb        the ending picks the format
@@ -237,35 +237,35 @@ from different sides. The other views follow from the cameras.")]
     Mesh {
         #[command(flatten)]
         place: CaptureOrRun,
-        /// Files to write: glb, obj, ply
+        /// Formats to write: glb, obj, ply
         #[arg(long, value_name = "LIST")]
         format: Option<String>,
-        /// Coordinates: dataset, or head (+Y up, face towards +Z)
+        /// Coordinate frame: dataset, or head (+Y up, face towards +Z)
         #[arg(long, value_name = "FRAME")]
         frame: Option<String>,
-        /// Triangles of the product; 0 keeps all
+        /// Number of triangles after simplification; 0 keeps all
         #[arg(long, value_name = "N")]
         triangles: Option<String>,
-        /// Texels along each side of the texture; 0: colors at the vertices
+        /// Side of the texture, texels; 0 stores colors at the vertices
         #[arg(long, value_name = "PX")]
         texture: Option<String>,
-        /// Degree of view-dependent color in the GLB: 0, 1 or 2
+        /// Degree of the view-dependent spherical harmonics in the GLB: 0, 1 or 2
         #[arg(long, value_name = "DEGREE")]
         lobes: Option<String>,
-        /// Around soft outlines: shells (translucent layers, where they help) or none
+        /// Hair and other soft outlines: shells (translucent layers, where they help) or none
         #[arg(long, value_name = "KIND")]
         hair: Option<String>,
-        /// In other programs: unlit (colors as photographed, light included) or lit (lamps shade them once more)
+        /// Material in other programs: unlit (colors as photographed) or lit (shaded by lamps)
         #[arg(long, value_name = "KIND")]
         material: Option<String>,
-        /// Put the detail that simplification takes into a normal map; the GLB's material is lit then
+        /// Store the detail that simplification removes in a normal map; makes the material lit
         #[arg(long)]
         normal_map: bool,
-        /// Leave the surface open where the frames cut the body
+        /// Leave the mesh open where the frames cut the body
         #[arg(long)]
         no_cap: bool,
     },
-    /// Stage: make views of the fields and of the mesh
+    /// Stage: render views of the fields and of the mesh
     #[command(after_long_help = "Examples:
   tiface render runs/002_00
   tiface render captures/002_00 --with tface    T-Face alone: no other field is learned for it
@@ -277,22 +277,22 @@ the held-out views, their blend and the metrics alone; --fresh render then makes
     Render {
         #[command(flatten)]
         place: CaptureOrRun,
-        /// test (the held-out views); train, orbit or a file (a nerfstudio camera path or a
-        /// transforms.json), into a folder of their own
+        /// Cameras: test (the held-out views), train, orbit or a file (a nerfstudio camera path or a
+        /// transforms.json)
         #[arg(long, value_name = "WHICH")]
         cameras: Option<String>,
-        /// Any of baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
-        /// (head.glb, as a viewer shows it) and raster (the same, rasterized), with commas
+        /// Methods, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
+        /// (head.glb, as a viewer shows it) and raster (the same, rasterized)
         #[arg(long = "with", value_name = "LIST")]
         method: Option<String>,
-        /// png or exr
+        /// Picture format: png or exr
         #[arg(long)]
         format: Option<String>,
-        /// black, white or none
+        /// Background: black, white or none
         #[arg(long)]
         background: Option<String>,
     },
-    /// Stage: blend the views of T-Face, I-Face and its mesh, or of others
+    /// Stage: blend the views of several methods
     #[command(after_long_help = "Examples:
   tiface ensemble runs/002_00
   tiface ensemble runs/002_00 --fresh ensemble --members tface,volume --weights 0.6,0.4
@@ -303,11 +303,11 @@ learned from (capture.tiles): the blend follows the better members.")]
     Ensemble {
         #[command(flatten)]
         place: CaptureOrRun,
-        /// Whose views: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured and raster
-        /// (head.glb)
+        /// Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
+        /// and raster (head.glb)
         #[arg(long, value_name = "LIST")]
         members: Option<String>,
-        /// Their shares, in that order, together 1 [default: fitted]
+        /// Weights of the methods, in that order, with sum 1 [default: fitted]
         #[arg(long, value_name = "LIST")]
         weights: Option<String>,
     },
@@ -315,11 +315,11 @@ learned from (capture.tiles): the blend follows the better members.")]
     Metrics {
         #[command(flatten)]
         place: CaptureOrRun,
-        /// Exit with 3 below this bar: watertight, psnr=DB (masked, the best of all); repeatable
+        /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
-    /// A picture of a run's mesh, or of any .glb, .obj or .ply
+    /// Draw a run's mesh, or any .glb, .obj or .ply
     #[command(after_long_help = "Examples:
   tiface preview runs/002_00                    three quarters of the head, 1024 pixels, as a PNG
   tiface preview scan.ply --light matcap --up z --out scan.png
@@ -329,14 +329,14 @@ learned from (capture.tiles): the blend follows the better members.")]
   tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
   tiface preview runs/002_00 --watch            a page of a run while it works, in watch.html there")]
     Preview(PreviewOptions),
-    /// Speed against error of each decision, measured on this machine: tables, a page
+    /// Measure speed against error of settings on this machine
     #[command(after_long_help = "Examples:
   tiface bench captures/002_00 --sweep steps,hash
   tiface bench runs/002_00 --sweep triangles,texture      with the fields of a run
 
 Results lie in bench/NAME/: bench.json and bench.html.")]
     Bench(BenchOptions),
-    /// The paper's tables and ablations over captures, beside the published figures
+    /// Reproduce the paper's tables and ablations on captures
     #[command(after_long_help = "Examples:
   tiface experiment captures/* --scale 0.1      all tables at a tenth of the effort
   tiface experiment captures/002_00 --tables components,iface --out tables/
@@ -346,40 +346,40 @@ Results lie in bench/NAME/: bench.json and bench.html.")]
 
 Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md and experiment.json.")]
     Experiment(ExperimentOptions),
-    /// Is this mesh sound: watertight, manifold, self-intersections, texture coordinates
+    /// Validate a mesh: watertight, manifold, self-intersections, texture coordinates
     #[command(after_long_help = "Examples:
   tiface check head.glb
   tiface check scan.obj --require watertight --require one-piece
   tiface check head.ply --json
   tiface check runs/lps/mesh/surface.ply --against captures/lps/gt.ply --seen-by captures/lps")]
     Check {
-        /// A .glb, .obj or .ply file
+        /// .glb, .obj or .ply file
         mesh: PathBuf,
-        /// Exit with 3 if it is not: watertight, manifold, one-piece, no-self-intersections, sound-uv;
+        /// Exit with 3 if not met: watertight, manifold, one-piece, no-self-intersections, sound-uv;
         /// repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
-        /// Also the distance to this surface, in the same coordinates (so a PLY: a GLB is turned +Y up)
+        /// Measure the distance to this surface, in the same coordinates (use a PLY: a GLB is rotated to +Y up)
         #[arg(long, value_name = "MESH")]
         against: Option<PathBuf>,
-        /// ... and the distance over the part that three or more of this capture's training cameras see, by how many
-        /// see it, and back from skin and hair
+        /// Measure it also where three or more training cameras of this capture see the surface, by the number of
+        /// cameras, and back from skin and hair
         #[arg(long, value_name = "CAPTURE", requires = "against")]
         seen_by: Option<PathBuf>,
     },
-    /// The page of a run made anew, or one page of many runs
+    /// Write the page of a run again, or one page of many runs
     #[command(after_long_help = "Examples:
   tiface report runs/002_00                     its report.html, from what lies there
   tiface report runs/* --out fleet.html         all of them in a table, with links to each; fleet.csv beside it
   tiface report runs/* --json                   the same figures, an object for each run")]
     Report {
-        /// Run folders; without any, all under runs/
+        /// Run folders [default: all under runs/]
         runs: Vec<PathBuf>,
-        /// In a table, also where there is only one run
+        /// Write a table even of one run
         #[arg(long)]
         table: bool,
     },
-    /// Stages, progress, time left and last error of one or many runs
+    /// Show stages, progress, time left and last error of runs
     #[command(after_long_help = "Examples:
   tiface status
   tiface status runs/002_00                     a row for each stage
@@ -398,25 +398,24 @@ those that are done or not begun share lines; -v gives each its own.")]
     Config {
         #[command(flatten)]
         place: CaptureOrRun,
-        /// Say what a key or a table means, its range and its value in every preset
+        /// Explain a key or a table: meaning, range and value in every preset
         #[arg(long, value_name = "KEY")]
         explain: Option<String>,
     },
-    /// The GPUs here, whether they compute right, and which one `auto` takes
+    /// List GPUs, test them, and show which one `auto` uses
     #[command(after_long_help = "Examples:
-  tiface doctor                 drivers, memory, and a self-test of each device; what to paste into a bug report
+  tiface doctor                 show drivers, memory and a self-test of each device, for a bug report
   tiface doctor --json          the same for programs
 
-It exits with 1 if a device computes something else than the processor does. A build without the feature `wgpu` knows
-the processor alone.")]
+It exits with 1 if a device fails its self-test against the CPU. A build without the feature `wgpu` has no GPUs.")]
     Doctor,
-    /// Completions for a shell, on stdout, or manual pages
+    /// Print shell completions, or write manual pages
     #[command(after_long_help = "Examples:
   tiface completions bash > /etc/bash_completion.d/tiface
   tiface completions man | man -l -             the manual page
   tiface completions man --out man1/            a page for each command, tiface.1, tiface-run.1 and so on")]
     Completions {
-        /// What for
+        /// Shell, or `man` for manual pages
         form: Form,
     },
 }

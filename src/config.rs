@@ -118,13 +118,13 @@ impl FromStr for Preset {
 pub struct Config {
     /// The preset it started from.
     pub preset: Preset,
-    /// Start of every random sequence.
+    /// Random seed.
     pub seed: u64,
     /// A [`DeviceChoice`] as a word.
     pub device: String,
-    /// What was photographed.
+    /// The capture.
     pub capture: CaptureConfig,
-    /// Which pixels are the head.
+    /// Head masks.
     pub mask: MaskConfig,
     /// The radiance field without masks that T-Face is compared with.
     pub baseline: BaselineConfig,
@@ -134,29 +134,29 @@ pub struct Config {
     pub iface: IfaceConfig,
     /// The extracted surface.
     pub mesh: MeshConfig,
-    /// The views made of it.
+    /// Rendered views.
     pub render: RenderConfig,
-    /// How they are blended.
+    /// The blend of views.
     pub ensemble: EnsembleConfig,
-    /// How all of them are judged.
+    /// Metrics of views and surface.
     pub metrics: MetricsConfig,
 }
 
 const ROOT_KEYS: &[Key] = &[
     Key::word(
         "preset",
-        "Starting values of every other key: draft (a first look), standard, paper (the published recipe).",
+        "Preset that all other keys default to: draft (a first look), standard, paper (the published recipe).",
     ),
     Key::number(
         "seed",
-        "Start of every random sequence; same seed and device, same result.",
+        "Random seed; the same seed on the same device gives the same result.",
         0.0,
         i64::MAX as f64,
     ),
     Key::word(
         "device",
-        "Where fields are learned: auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one; +deterministic and +8GiB \
-         say how.",
+        "Device that fields are trained on: auto, cpu, wgpu, vulkan, metal or dx12, :N for an adapter by number; \
+         +deterministic accumulates in fixed point, +8GiB limits the memory.",
     ),
 ];
 
@@ -184,7 +184,7 @@ fn dotted(table: &str, name: &str) -> String {
 }
 
 impl Config {
-    /// The values a preset starts with.
+    /// Returns the values of a preset.
     pub fn preset(preset: Preset) -> Config {
         Config {
             preset,

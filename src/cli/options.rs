@@ -14,52 +14,52 @@ pub(super) type KeyOption = (String, String, String);
 #[derive(Args, Debug, Default)]
 #[command(next_help_heading = "Options of all commands")]
 pub(super) struct Common {
-    /// The run folder [default: runs/<capture name>]
+    /// Run folder [default: runs/<capture name>]
     #[arg(short, long, global = true, value_name = "DIR", env = "TIFACE_RUN", hide_env = true)]
     pub run: Option<PathBuf>,
-    /// Where the product of this command goes as well: a file whose ending says what it is to be (.glb,
-    /// .obj, .ply; .json of metrics), or a folder, there already or with / at its end
+    /// Also write the result to PATH: a file with the ending of its format (.glb, .obj, .ply; .json for metrics), or
+    /// a folder, which exists or ends with /
     #[arg(short, long, global = true, value_name = "PATH")]
     pub out: Option<PathBuf>,
-    /// A configuration file; later ones win
+    /// Read a configuration file; repeatable, later files win
     #[arg(short, long, global = true, value_name = "FILE", env = "TIFACE_CONFIG", hide_env = true)]
     pub config: Vec<PathBuf>,
-    /// Starting values
+    /// Configuration preset
     #[arg(long, global = true)]
     #[arg(value_parser = PossibleValuesParser::new(Preset::ALL.map(Preset::name)).try_map(|word| word.parse::<Preset>()))]
     pub preset: Option<Preset>,
-    /// Set a key of the configuration; repeatable
+    /// Set a configuration key; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one
+    /// Device to learn and render on: auto, cpu, wgpu, vulkan, metal or dx12; :N selects an adapter by number
     #[arg(long, global = true, env = "TIFACE_DEVICE", hide_env = true)]
     pub device: Option<String>,
-    /// On a GPU, sum in whole numbers: the same bytes every time, as on the processor
+    /// Make training on a GPU bitwise reproducible, by fixed-point accumulation; on the CPU it always is
     #[arg(long, global = true, hide_short_help = true)]
     pub deterministic: bool,
-    /// Memory of a GPU that a training may take, GiB [default: all of it]
+    /// Limit the GPU memory of a training, GiB [default: all of it]
     #[arg(long, global = true, value_name = "GIB", hide_short_help = true)]
     pub memory: Option<f64>,
-    /// Start of every random sequence
+    /// Random seed
     #[arg(long, global = true, env = "TIFACE_SEED", hide_env = true)]
     pub seed: Option<u64>,
-    /// Recompute a stage and what follows
+    /// Recompute a stage and all stages that depend on it
     #[arg(long, global = true, value_name = "STAGE")]
     #[arg(value_parser = PossibleValuesParser::new(Stage::ALL.map(Stage::word)).try_map(|word| word.parse::<Stage>()))]
     pub fresh: Option<Stage>,
-    /// Say what would be done, and do nothing
+    /// Print the plan without running it
     #[arg(long, global = true)]
     pub dry_run: bool,
-    /// One JSON object per event on stdout
+    /// Print one JSON object per event to stdout
     #[arg(long, global = true)]
     pub json: bool,
-    /// Only errors
+    /// Print only errors
     #[arg(short, long, global = true)]
     pub quiet: bool,
-    /// More about what happens; twice for all
+    /// Increase verbosity; repeatable
     #[arg(short, long, global = true, action = clap::ArgAction::Count)]
     pub verbose: u8,
-    /// Color in messages
+    /// Color messages
     #[arg(long, global = true, value_enum, default_value_t, value_name = "WHEN")]
     pub color: ColorChoice,
 }

@@ -14,7 +14,7 @@ pub enum OccupancyRule {
     Nerfacc,
 }
 
-/// What is behind the head while training.
+/// Background while training.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Background {
@@ -25,7 +25,7 @@ pub enum Background {
     Random,
 }
 
-/// What a pixel with a soft mask should look like over black.
+/// Target color over black of a pixel with a soft mask.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Foreground {
@@ -36,7 +36,7 @@ pub enum Foreground {
     Estimated,
 }
 
-/// What the hash grid holds.
+/// Kind of field.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FieldKind {
@@ -47,7 +47,7 @@ pub enum FieldKind {
     Density,
 }
 
-/// Where the surface starts.
+/// Initial surface.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Start {
@@ -62,26 +62,26 @@ table! {
     /// Settings of the stage `iface`. Lengths are in field units: the scene's box is `[-radius, radius]³`.
     pub struct IfaceConfig;
     keys {
-        /// What is learned: sdf (a signed distance, as NeuS) or density (Instant-NeRF, in preset paper).
+        /// Kind of field: sdf (signed distance, as in NeuS) or density (Instant-NeRF, in preset paper).
         field: FieldKind => FieldKind::Sdf;
         /// Optimizer steps.
         steps: u64, 1.0..=1e7 => 3000, 8000, 20_000;
         /// Rays per step at the start.
         rays: usize, 1.0..=1_048_576.0 => 1024, 1024, 256;
-        /// Upper bound of rays per step; the count adapts to the sample budget.
+        /// Largest number of rays per step; the number adapts to `samples`.
         max_rays: usize, 1.0..=1_048_576.0 => 8192;
-        /// Samples along rays that a step aims for.
+        /// Target number of samples per step, over all rays.
         samples: usize, 64.0..=1e8 => 24_576, 24_576, 262_144;
         /// Levels of the hash grid.
         levels: usize, 1.0..=32.0 => 14, 14, 16;
         /// Cells per axis of the coarsest level.
         base_resolution: u32, 2.0..=1024.0 => 16, 16, 32;
-        /// Growth of the resolution from level to level.
+        /// Ratio of the resolutions of consecutive levels.
         growth: f64, 1.0..=4.0 => 1.4, 1.4, 1.319_507_910_772_894_2;
         /// Binary logarithm of a level's largest table.
         log2_table: u32, 4.0..=24.0 => 18, 19, 19;
-        /// How many times softer than its sharpest the surface may be where that pays, as in hair; 1 is one
-        /// sharpness everywhere (published).
+        /// Largest ratio of the local to the smallest width of the surface, for hair (spatially varying sharpness, after
+        /// Adaptive Shells, Wang et al. 2023); 1: one sharpness everywhere (published).
         soften: f64, 1.0..=1e3 => 8.0, 8.0, 1.0;
         /// Learning rate of the hash table at its peak.
         lr_table: f64, 0.0..=1.0 => 1e-2;
@@ -89,12 +89,12 @@ table! {
         lr_network: f64, 0.0..=1.0 => 5e-3, 5e-3, 1e-2;
         /// Weight of the mask's binary cross entropy.
         mask: f64, 0.0..=1e6 => 0.1;
-        /// Weight of the loss that keeps the gradient's length at 1.
+        /// Weight of the eikonal loss, mean (‖∇sdf‖ − 1)².
         eikonal: f64, 0.0..=1e6 => 0.1;
         /// Weight of the sparsity term, the mean of exp(-scale * |sdf|).
         sparsity: f64, 0.0..=1e6 => 0.0, 0.0, 0.5;
-        /// Weight of the distance to points on which several photographs agree, found by stereo on the surface after 0.6
-        /// of the steps; 0: none (published).
+        /// Weight of the distance to multi-view stereo points, which are found on the surface after 0.6 of the steps; 0:
+        /// none (published).
         stereo: f64, 0.0..=1e6 => 0.02, 0.02, 0.0;
         /// Cells per axis of the occupancy grid.
         occupancy_resolution: usize, 8.0..=1024.0 => 160, 160, 128;
@@ -102,18 +102,18 @@ table! {
         checkpoint_s: f64, 0.05..=86_400.0 => 60.0;
     }
     constants {
-        /// Levels that take part from the first step.
+        /// Levels that are active at the first step.
         start_levels: usize => 6, 6, 16;
-        /// One more level every so many steps (0: all at once).
+        /// Steps between the activation of two levels (0: all at once).
         level_every: u64 => 100, 250, 0;
         /// Does the color network read the hash features beside the geometry network's outputs?
         color_skip: bool => true, true, false;
         /// Half edge of the field's box.
         radius: f32 => 1.0, 1.0, 0.3;
-        /// Where the surface starts.
+        /// Initial surface.
         start: Start => Start::Hull, Start::Hull, Start::Sphere;
-        /// Learning rate of the variance at its peak. Four times as published: where softness is local, skin may
-        /// become as sharp as it is.
+        /// Learning rate of the variance at its peak. Four times the published one: with local softness, skin may become
+        /// as sharp as it is.
         lr_variance: f64 => 4e-3, 4e-3, 1e-3;
         /// Steps of linear warm-up from 1 % of the peak.
         warmup: u64 => 100, 100, 500;
@@ -136,13 +136,13 @@ table! {
         variance: f64 => 0.3;
         /// Steps over which NeuS' cosine is annealed; 0 does not.
         anneal_end: u64 => 1000, 3000, 20_000;
-        /// How cells are kept.
+        /// Rule that selects occupied cells.
         occupancy: OccupancyRule => OccupancyRule::Band, OccupancyRule::Band, OccupancyRule::Nerfacc;
         /// Steps between updates of the occupancy grid.
         occupancy_every: u64 => 50, 50, 16;
         /// Half width of the band in units of 1 / local sharpness.
         band: f32 => 4.0, 4.0, 6.0;
-        /// When stereo is looked for, as a share of the steps: the surface is good to a pixel or two by then.
+        /// Share of the steps after which stereo points are searched for: the surface is accurate to a pixel or two by then.
         stereo_at: f64 => 0.6;
         /// March step in units of 1 / inv_s, the sharpest (`band` rule).
         march: f32 => 1.0;
@@ -152,9 +152,9 @@ table! {
         max_step: f32 => 0.05;
         /// Steps across the box's diagonal (`nerfacc` rule).
         samples_per_ray: usize => 1024;
-        /// Shift each ray's samples by a random part of a step.
+        /// Shift the samples of each ray by a random fraction of a step.
         jitter: bool => true, true, false;
-        /// What is behind the head while training.
+        /// Background while training.
         background: Background => Background::Random, Background::Random, Background::Black;
         /// Start with a gradient of length one. The published start is a unit sphere of the networks' own
         /// coordinates, and so has gradients of 1 / radius.
@@ -162,7 +162,7 @@ table! {
         /// Start the features that go to the color network apart from each other. The published start gives
         /// all thirteen the sdf's own weights, and color is learned late.
         spread_features: bool => true, true, false;
-        /// What a pixel with a soft mask should look like.
+        /// Target color of a pixel with a soft mask.
         foreground: Foreground => Foreground::Estimated, Foreground::Estimated, Foreground::Photo;
     }
 }

@@ -1,4 +1,4 @@
-//! `[capture]`: what was photographed; `[mask]`: which pixels are the head.
+//! `[capture]`: how a capture is read; `[mask]`: where head masks come from.
 
 use super::table::table;
 use serde::{Deserialize, Serialize};
@@ -7,20 +7,19 @@ table! {
     /// How a capture is read.
     pub struct CaptureConfig;
     keys {
-        /// Folder of photographs; the run remembers it.
+        /// Folder of the capture; stored in the run.
         path: String => String::new();
-        /// Photographs are made this many times smaller, by averaging; an integer.
+        /// Integer factor by which photographs are reduced, by averaging.
         downscale: u32, 1.0..=64.0 => 1;
-        /// Where fields are learned: head (found from cameras and masks), ilsh (published: ±0.45, ±0.501, ±0.3 dataset
-        /// units for radiance, ±0.3 for I-Face; head where the head is not there) or six numbers in dataset units,
-        /// lowest corner first.
+        /// Bounding box of the fields: head (found from cameras and masks), ilsh (published: ±0.45, ±0.501, ±0.3 dataset
+        /// units for radiance, ±0.3 for I-Face; falls back to head if the head is elsewhere) or six numbers in dataset
+        /// units, lowest corner first.
         r#box: String => "head".into(), "head".into(), "ilsh".into();
-        /// Metres in one unit of the dataset.
+        /// Length of one dataset unit, metres.
         unit_m: f64, 1e-6..=1e6 => 1.0;
-        /// Folder of masks inside the capture, named like the photographs; empty to look for one.
+        /// Folder of masks inside the capture, named like the photographs; empty: search for one.
         mask_dir: String => String::new();
-        /// Share of the training photographs' pixels that nothing learns from, in small squares, so that the weights
-        /// of the blend can be fitted there; 0: none.
+        /// Share of the training pixels that is held out, in small squares, to fit the weights of the blend; 0: none.
         tiles: f64, 0.0..=0.25 => 0.04, 0.04, 0.0;
     }
 }
@@ -44,7 +43,7 @@ pub enum MaskSource {
     None,
 }
 
-/// What the pixels outside a mask are.
+/// Meaning of the pixels outside a mask.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MaskMeaning {
@@ -54,7 +53,7 @@ pub enum MaskMeaning {
     Ignore,
 }
 
-/// How a hard mask comes from clicks.
+/// Method that makes a hard mask from clicks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CutMethod {
@@ -66,7 +65,7 @@ pub enum CutMethod {
     Sam,
 }
 
-/// How the opacity of the unknown band is found.
+/// Method that finds the opacity of the unknown band.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MattingMethod {
@@ -78,7 +77,7 @@ pub enum MattingMethod {
     Vitmatte,
 }
 
-/// What ViTMatte is shown.
+/// Normalization of the input of ViTMatte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VitmatteColors {
@@ -94,49 +93,48 @@ table! {
     /// Where masks come from, what they mean, and how they are made from clicks.
     pub struct MaskConfig;
     keys {
-        /// Where masks come from: auto (clicks or an alpha network if given, else what the capture has), alpha, folder
-        /// (capture.mask_dir), clicks, network or none (go on without: whatever the cameras see is learned).
+        /// Where masks come from: auto (clicks or an alpha network if given, else those of the capture), alpha, folder
+        /// (capture.mask_dir), clicks, network or none (no masks: everything the cameras see is reconstructed).
         source: MaskSource => MaskSource::Auto;
-        /// Go on with masks that were found and cannot be right: inverted ones, and those that contradict the others.
+        /// Train even with masks that look wrong: inverted ones, and those that contradict the others.
         trust: bool => false;
-        /// What lies outside a mask: empty (nothing of the head) or ignore (not looked at).
+        /// Meaning of pixels outside a mask: empty (no head) or ignore (unknown).
         meaning: MaskMeaning => MaskMeaning::Empty;
-        /// Clicks to make masks from: a prompts.json, as `tiface mask --page` saves it.
+        /// File of clicks to make masks from: a prompts.json, as `tiface mask --page` saves it.
         prompts: String => String::new();
-        /// A list of clicks x,y,label on one photograph (label 1: head, 0: not), for a quick try.
+        /// List of clicks x,y,label on one photograph (label 1: head, 0: background), for a quick try.
         point: Vec<String> => Vec::new();
-        /// The view that `mask.point` is on; empty for the first that is trained on.
+        /// View of `mask.point`; empty: the first training view.
         view: String => String::new();
-        /// From clicks to a hard mask: auto (sam if its files are named), grabcut (built in) or sam.
+        /// Method for a hard mask: auto (sam if its files are given), grabcut (built in) or sam.
         cut: CutMethod => CutMethod::Auto;
-        /// From a hard mask to an alpha: auto (vitmatte if its file is named), closed (closed form, built in) or
-        /// vitmatte.
+        /// Method for the alpha: auto (vitmatte if its file is given), closed (closed form, built in) or vitmatte.
         matting: MattingMethod => MattingMethod::Auto;
-        /// SAM's image encoder as an ONNX file (needs a build with the feature `matting`).
+        /// Image encoder of SAM, an ONNX file (needs a build with the feature `matting`).
         sam: String => String::new();
-        /// SAM's prompt encoder and mask decoder as an ONNX file.
+        /// Prompt encoder and mask decoder of SAM, an ONNX file.
         sam_decoder: String => String::new();
-        /// ViTMatte as an ONNX file (needs a build with the feature `matting`).
+        /// ViTMatte, an ONNX file (needs a build with the feature `matting`).
         vitmatte: String => String::new();
-        /// A network from a picture to its alpha as an ONNX file (U²-Net, ISNet, MODNet, BiRefNet): masks without any
-        /// click (needs a build with the feature `matting`).
+        /// Network that predicts alpha without clicks (U²-Net, ISNet, MODNet, BiRefNet), an ONNX file (needs a build
+        /// with the feature `matting`).
         alpha_net: String => String::new();
-        /// What it is shown: auto (as the file beside it says, else by its name), or SIDE,MEAN,SCALE as 1024,0.5,1, or
-        /// SIDE,imagenet.
+        /// Size and normalization of its input: auto (from the file beside it, else by its name), SIDE,MEAN,SCALE as
+        /// 1024,0.5,1, or SIDE,imagenet.
         alpha_input: String => "auto".into();
-        /// The ONNX Runtime library to run networks with; empty for the built-in engine.
+        /// ONNX Runtime library to run networks with; empty: the built-in engine.
         onnxruntime: String => String::new();
-        /// What ViTMatte is shown: auto (as the file beside it says, else imagenet), imagenet or half.
+        /// Normalization of the input of ViTMatte: auto (from the file beside it, else imagenet), imagenet or half.
         vitmatte_colors: VitmatteColors => VitmatteColors::Auto;
-        /// Memory that running networks may take, GiB.
+        /// Largest memory for running networks, GiB.
         memory_gib: f64, 0.25..=1024.0 => 12.0;
-        /// Longest side that SAM and matting see, pixels.
+        /// Longest side of the input of SAM and matting, pixels.
         side_px: u32, 64.0..=8192.0 => 1024;
-        /// Radius of the unknown band to both sides of the outline, share of the height.
+        /// Half width of the unknown band around the outline, as a share of the height.
         band: f32, 0.0..=0.5 => 0.023;
-        /// Side of a square of ones for the band instead, pixels (the paper: 10); 0 for `band`.
+        /// Side of the square structuring element that makes the band, pixels (published: 10); 0: use `band`.
         kernel: u32, 0.0..=1000.0 => 0, 0, 10;
-        /// How often the square is applied each way (the paper: 5).
+        /// Number of erosions and dilations with that square (published: 5).
         iterations: u32, 0.0..=1000.0 => 5;
     }
 }

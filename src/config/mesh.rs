@@ -79,40 +79,40 @@ table! {
     /// How the surface is extracted and exported.
     pub struct MeshConfig;
     keys {
-        /// Samples along the longest side of the box.
+        /// Grid samples along the longest side of the box.
         resolution: u32, 16.0..=4096.0 => 256, 512, 512;
-        /// Handles, such as loops of hair: keep, or simple (cut or filled, up to a loop of 0.15 of the surface's
-        /// longest side: about 45 mm on a head).
+        /// Topological handles, such as loops of hair: keep, or simple (cut or filled, up to a loop of 0.15 of the
+        /// surface's longest side, about 45 mm on a head).
         genus: Genus => Genus::Simple, Genus::Simple, Genus::Keep;
-        /// Also evaluate the whole grid and report what the sparse extraction lost: slow.
+        /// Evaluate the whole grid too, and report what the sparse extraction missed: slow.
         verify: bool => false;
         /// Close the surface where the frames cut the body: true or false.
         cap: bool => true, true, false;
-        /// Triangles of the product; 0 keeps all of the extraction.
+        /// Number of triangles after simplification; 0 keeps all.
         triangles: u32, 0.0..=1e8 => 50_000, 50_000, 0;
-        /// Largest distance of the product from the field's surface, in cells; 0 sets no limit.
+        /// Largest distance of the simplified mesh from the field's surface, cells; 0: no limit.
         max_error: f32, 0.0..=100.0 => 0.0;
-        /// Where colors come from: photographs (fitted to them, as good as they are) or network (published).
+        /// Source of the colors: photographs (fitted to them) or network (published).
         color: ColorSource => ColorSource::Photographs, ColorSource::Photographs, ColorSource::Network;
-        /// Texels along each side of the texture; 0: colors at the vertices.
+        /// Side of the texture, texels; 0: colors at the vertices.
         texture_px: u32, 0.0..=16384.0 => 1024, 2048, 0;
-        /// Degree of view-dependent lobes in the GLB, 0 (none), 1 or 2; no view of the mesh has more then.
+        /// Degree of the view-dependent spherical harmonics in the GLB: 0 (none), 1 or 2; limits all views of the mesh.
         lobes: u32, 0.0..=2.0 => 0;
-        /// Around soft outlines, as of hair: shells (translucent layers in the GLB, where they help) or none. raycast
-        /// shows them with `mesh.color=photographs`.
+        /// Hair and other soft outlines: shells (translucent layers in the GLB, where they help) or none. raycast
+        /// renders them with `mesh.color=photographs`.
         hair: Hair => Hair::Shells, Hair::Shells, Hair::None;
-        /// A tangent-space map of the field's normals in the GLB: true or false.
+        /// Write a tangent-space map of the field's normals to the GLB: true or false.
         normal_map: bool => false;
-        /// Material of the GLB: unlit (colors as in the photographs, whose light is in them), or lit (lamps shade it once
-        /// more, as they do with a normal map in any case).
+        /// Material of the GLB: unlit (colors as photographed, light included) or lit (shaded by lamps, as a normal map
+        /// needs).
         material: Material => Material::Unlit;
-        /// How pictures are stored with the mesh: png or jpeg.
+        /// Format of the texture: png or jpeg.
         texture_format: TextureFormat => TextureFormat::Png;
-        /// Also keep the baked color as head.exr, scene-linear: true or false.
+        /// Write the baked color to head.exr too, scene-linear: true or false.
         exr: bool => false;
-        /// Files to write, a list of glb, obj, ply.
+        /// Formats to write, a list of glb, obj, ply.
         format: Vec<MeshFormat> => vec![MeshFormat::Glb];
-        /// Coordinates of the files: dataset, or head (+Y up, face towards +Z, centered).
+        /// Coordinate frame of the files: dataset, or head (+Y up, face towards +Z, centered).
         frame: MeshFrame => MeshFrame::Dataset;
     }
     constants {

@@ -85,27 +85,27 @@ pub enum ViewBackground {
 }
 
 table! {
-    /// Which views are made, and how.
+    /// Cameras, methods and format of the rendered views.
     pub struct RenderConfig;
     keys {
-        /// Cameras of `tiface render`: test (held-out views); train, orbit or a file (transforms.json or a nerfstudio
-        /// camera path) into a folder of their own. Blend and metrics are always of test.
+        /// Cameras of `tiface render`: test (held-out views), train, orbit or a file (transforms.json or a nerfstudio
+        /// camera path). Blend and metrics always use test.
         cameras: String => "test".into();
-        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with all that is known of its color),
+        /// Methods, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with view-dependent color),
         /// textured (head.glb, as a viewer shows it) and raster (the same, rasterized, without soft layers).
         method: Vec<Method>
             => vec![Method::Tface, Method::Volume, Method::Raycast],
             vec![Method::Tface, Method::Volume, Method::Raycast],
             vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast];
-        /// Views of an orbit around the head.
+        /// Number of views of an orbit around the head.
         orbit_views: u32, 1.0..=10_000.0 => 36;
-        /// Rays along each side of a pixel that shows the mesh; twice as many on its edges.
+        /// Rays along each side of a pixel of the mesh; twice as many at its edges.
         samples: u32, 1.0..=8.0 => 2;
-        /// png (8-bit sRGB) or exr (float, with depth and normals).
+        /// Picture format: png (8-bit sRGB) or exr (float, with depth and normals).
         format: PictureFormat => PictureFormat::Png;
-        /// Behind the head: black, white or none (real alpha).
+        /// Background: black, white or none (alpha channel).
         background: ViewBackground => ViewBackground::None;
-        /// Keep every view in float, too, in METHOD/float: what is blended. true or false.
+        /// Store every view in float too, in METHOD/float, for the blend: true or false.
         float: bool => true;
     }
 }
@@ -119,18 +119,18 @@ impl RenderConfig {
 }
 
 table! {
-    /// Which views are blended, and how.
+    /// Members and weights of the blend.
     pub struct EnsembleConfig;
     keys {
-        /// A list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb); an empty list
-        /// for no blend.
+        /// Methods to blend, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb);
+        /// empty: no blend.
         members: Vec<Method>
             => vec![Method::Tface, Method::Volume, Method::Raycast],
             vec![Method::Tface, Method::Volume, Method::Raycast],
             vec![Method::Baseline, Method::Tface, Method::Volume];
-        /// The share of each member, in their order, together 1; an empty list fits them on capture.tiles.
+        /// Weights of the members, in their order, with sum 1; empty: fit them on capture.tiles.
         weights: Vec<f64>, 0.0..=1.0 => Vec::new(), Vec::new(), vec![0.1, 0.6, 0.3];
-        /// Cut members trained without masks to the head, true or false; else the background shows.
+        /// Cut members that were trained without masks to the head: true or false.
         cut: bool => true, true, false;
     }
 }
@@ -146,16 +146,16 @@ pub enum TruthPhoto {
 }
 
 table! {
-    /// How views and surface are compared with what is known.
+    /// Comparison of views with photographs, and of the surface with a known one.
     pub struct MetricsConfig;
     keys {
-        /// What views are compared with: photo (as it was taken; figures of the whole frame count the background) or
-        /// masked (cut out by its mask, over render.background).
+        /// Reference of the views: photo (as taken; whole-frame figures include the background) or masked (cut out by its
+        /// mask, over render.background).
         truth: TruthPhoto => TruthPhoto::Masked, TruthPhoto::Masked, TruthPhoto::Photo;
-        /// LPIPS as an ONNX file that takes two pictures (needs a build with the feature `matting`); without one there are no
-        /// such figures. `mask.onnxruntime` runs it, if it is named.
+        /// LPIPS network, an ONNX file that takes two pictures (needs a build with the feature `matting`); empty: no LPIPS.
+        /// Run by `mask.onnxruntime` if that is given.
         lpips: String => String::new();
-        /// Points drawn on a surface when it is compared with a known one.
+        /// Number of points sampled on a surface to compare it with a known one.
         surface_points: u32, 100.0..=10_000_000.0 => 20_000, 100_000, 100_000;
     }
 }

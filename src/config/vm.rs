@@ -6,7 +6,7 @@ use super::iface::Foreground;
 use super::table::table;
 use serde::{Deserialize, Serialize};
 
-/// What masks do to the photographs.
+/// How masks are applied to the photographs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MaskUse {
@@ -20,11 +20,11 @@ pub enum MaskUse {
     Soft,
 }
 
-/// How the accumulated opacity is held to the mask.
+/// Loss between the accumulated opacity and the mask.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MaskLoss {
-    /// Not at all.
+    /// No mask loss.
     None,
     /// Mean of opacity² over rays that are all background (T-Face).
     L2,
@@ -33,7 +33,7 @@ pub enum MaskLoss {
     Ce,
 }
 
-/// What is behind the head while training.
+/// Background while training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VmBackground {
@@ -45,7 +45,7 @@ pub enum VmBackground {
     Random,
 }
 
-/// Which cells may hold anything at the start.
+/// Cells that are occupied at the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VmStart {
@@ -71,35 +71,35 @@ table! {
     /// Settings of a vector-matrix field. Lengths are in scene units: the head's box is within [-1, 1]³.
     pub struct VmConfig;
     keys {
-        /// A published checkpoint to take instead of training, converted by tools/reference/th_to_safetensors.py; empty
-        /// to train.
+        /// A published checkpoint to use instead of training, converted by tools/reference/th_to_safetensors.py; empty:
+        /// train.
         import: String => String::new();
         /// Length of a dataset unit in the imported checkpoint's world (published: 1 / 0.3).
         import_scale: f64, 1e-6..=1e6 => 1.0 / 0.3;
-        /// Fields learned one after the other from different random numbers; their mean is what is seen. Only one
-        /// where import names a file. Two are worth more than one of twice the rays, in the same time.
+        /// Number of fields, trained one after the other with different seeds; views are their mean. Always one with
+        /// `import`. Two fields are better than one with twice the rays, which takes the same time.
         fields: usize, 1.0..=16.0 => 1, 2, 1;
-        /// Optimizer steps of each field. Few steps of many rays are worth more than many of few.
+        /// Optimizer steps of each field. Few steps of many rays are better than many steps of few.
         steps: u64, 1.0..=1e7 => 1500, 2000, 50_000;
         /// Rays per step.
         rays: usize, 1.0..=1_048_576.0 => 8192, 8192, 4096;
-        /// What masks do to the photographs: none, binary (a little head is head), hard (half a head is) or soft.
+        /// How masks are applied to the photographs: none, binary (alpha > 0 is head), hard (alpha ≥ 0.5 is head) or soft.
         masks: MaskUse => MaskUse::Soft, MaskUse::Soft, MaskUse::Binary;
-        /// How opacity is held to the mask: none, l2 (opacity² of background rays) or ce (cross entropy).
+        /// Mask loss: none, l2 (opacity² of background rays) or ce (cross entropy).
         mask_loss: MaskLoss => MaskLoss::L2;
         /// Weight of the mask loss.
         mask_weight: f64, 0.0..=1e6 => 0.01;
-        /// Behind the head while training: random, black, or reference (published: white in half of the batches,
-        /// against a black target).
+        /// Background while training: random, black, or reference (published: white in half of the batches, against a
+        /// black target).
         background: VmBackground => VmBackground::Random, VmBackground::Random, VmBackground::Reference;
-        /// Voxels of the box at the start.
+        /// Number of voxels at the start.
         voxels_start: u64, 8.0..=1e12 => 96 * 96 * 96, 128 * 128 * 128, 2_097_156;
-        /// Voxels of the box after the last upsampling.
+        /// Number of voxels after the last upsampling.
         voxels_final: u64, 8.0..=1e12 => 192 * 192 * 192, 256 * 256 * 256, 27_000_000;
-        /// Steps after which the grids are made finer, a rising list.
+        /// Steps after which the grids are upsampled, an increasing list.
         upsample_steps: Vec<u64>, 0.0..=1e7
             => vec![150, 300, 500], vec![200, 400, 650, 1000], vec![2000, 3000, 4000, 5500, 7000];
-        /// Steps after which the alpha mask is rebuilt, a rising list.
+        /// Steps after which the alpha mask is rebuilt, an increasing list.
         mask_steps: Vec<u64>, 0.0..=1e7 => vec![150, 500], vec![200, 650], vec![2000, 4000];
         /// Channels of the density's planes xy, xz, yz. The published ranks favour one axis of one light stage; a
         /// head may face any way.
@@ -205,8 +205,8 @@ table! {
     /// Settings of the stage `baseline`: T-Face's but for these, one field, and no masks.
     pub struct BaselineConfig;
     keys {
-        /// A published checkpoint to take instead of training, converted by tools/reference/th_to_safetensors.py; empty
-        /// to train.
+        /// A published checkpoint to use instead of training, converted by tools/reference/th_to_safetensors.py; empty:
+        /// train.
         import: String => String::new();
         /// Optimizer steps.
         steps: u64, 1.0..=1e7 => 1500, 2000, 50_000;
