@@ -13,7 +13,7 @@
 mod fit;
 mod members;
 
-pub use fit::{Fit, MAX_MEMBERS, Tile, tiles, weigh};
+pub use fit::{Fit, MAX_MEMBERS, Tile, fit_weights, tiles};
 pub use members::{BlendTarget, Member, Members, shares_hint};
 
 use crate::Result;

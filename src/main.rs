@@ -14,17 +14,17 @@ static ALLOCATOR: Allocator = Allocator;
 unsafe impl GlobalAlloc for Allocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         // SAFETY: as the caller promises.
-        there(unsafe { MiMalloc.alloc(layout) }, layout.size())
+        check_alloc(unsafe { MiMalloc.alloc(layout) }, layout.size())
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         // SAFETY: as the caller promises.
-        there(unsafe { MiMalloc.alloc_zeroed(layout) }, layout.size())
+        check_alloc(unsafe { MiMalloc.alloc_zeroed(layout) }, layout.size())
     }
 
     unsafe fn realloc(&self, place: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         // SAFETY: as the caller promises.
-        there(unsafe { MiMalloc.realloc(place, layout, size) }, size)
+        check_alloc(unsafe { MiMalloc.realloc(place, layout, size) }, size)
     }
 
     unsafe fn dealloc(&self, place: *mut u8, layout: Layout) {
@@ -34,7 +34,7 @@ unsafe impl GlobalAlloc for Allocator {
 }
 
 #[inline]
-fn there(place: *mut u8, bytes: usize) -> *mut u8 {
+fn check_alloc(place: *mut u8, bytes: usize) -> *mut u8 {
     if place.is_null() {
         tiface::cli::out_of_memory(bytes);
     }

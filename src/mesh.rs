@@ -14,7 +14,7 @@ mod moves;
 
 pub use extract::{
     Cap, CleanReport, ExtractOptions, HandleReport, LONGEST_HANDLE, LevelSet, MeshReport, NodeGrid, Patches,
-    Skin, Sparse, Verified, Volume, clean, extract, extract_dense, marching, sparse,
+    RimVertex, Sparse, Verified, Volume, clean, extract, extract_dense, marching, sparse,
 };
 pub use finish::{
     Appearance, AppearanceReport, AtlasConfig, AtlasReport, Colors, Photograph, ShellsReport, SimplifyConfig,

@@ -11,7 +11,7 @@
 //! metrics   all of them against the photographs
 //! ```
 //!
-//! Views from other cameras, a turntable for example, are a product beside the line ([`Line::along`]).
+//! Views from other cameras, a turntable for example, are a product beside the line ([`Line::with_camera_path`]).
 //!
 //! Each stage names those it reads from ([`Stage::needs`]); a command runs what its stage needs and
 //! nothing else. What shapes a stage is known before it runs: its settings, and the same of the stages
@@ -43,7 +43,7 @@ pub use crate::config::Stage;
 pub use crate::geom::RayResult;
 pub use bench::{Bench, SWEEPS};
 pub use finish::Export;
-pub use line::{Line, capture_options, feasible, require_device};
+pub use line::{Line, capture_options, check_feasible, require_device};
 pub use mask::{click_page, inspect_capture};
 pub use mesh::export_head;
 pub use metrics::{Truth, against_truth};

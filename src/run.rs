@@ -21,14 +21,14 @@
 use crate::{Error, ErrorKind, Quiet, Result};
 mod fingerprint;
 mod progress;
+mod run_status;
 mod stage;
-mod standing;
 mod status;
 
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer, Stop};
+pub use run_status::{FAILED, Failure, Phase, RunStatus, StageStatus, read_failure};
 pub use stage::{Done, Plan, StageDir};
-pub use standing::{FAILED, Failure, Phase, StageStanding, Standing, read_failure};
 pub use status::{Cost, ESTIMATE, Estimate, Record, State, Status, read_estimate, read_record, read_status};
 
 use crate::io::{self, Lock, LockError};
@@ -102,8 +102,8 @@ impl Run {
     ///
     /// A folder that is a link, or that holds what no stage has made, and then nothing is removed at all.
     pub fn fresh(&self, names: &[String]) -> Result<()> {
-        let there: Vec<&String> = names.iter().filter(|n| io::is_folder(&self.path(n))).collect();
-        for name in &there {
+        let folders: Vec<&String> = names.iter().filter(|n| io::is_folder(&self.path(n))).collect();
+        for name in &folders {
             if let Some(link) = self.link(name) {
                 return Err(Error::cannot(
                     format!("`{}` is a link, and what lies behind a link is not removed", link.display()),
@@ -113,7 +113,7 @@ impl Run {
             self.is_ours(name)?;
         }
         let mut locks = Vec::new();
-        for name in there {
+        for name in folders {
             locks.push((self.path(name), self.lock(name)?));
         }
         // the last stage first: stopped halfway, no stage is left whose input is gone

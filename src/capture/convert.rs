@@ -50,7 +50,7 @@ pub struct Conversion {
 }
 
 /// Where a view's pictures go, relative to the new capture.
-struct Place<'v> {
+struct ViewFiles<'v> {
     view: &'v View,
     camera: Camera,
     /// Without its ending, `/` between, below the folder of photographs.
@@ -109,7 +109,7 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
         return Err(Error::cannot(message, "name a new folder: nothing that is there is overwritten"));
     }
     let mut out = Conversion { folder: folder.into(), views: capture.views.len(), ..Conversion::default() };
-    let places: Vec<Place> = capture.views.iter().map(|v| place(v, to)).collect();
+    let places: Vec<ViewFiles> = capture.views.iter().map(|v| place(v, to)).collect();
     let mut names: Vec<&str> = places.iter().map(|p| p.photo.as_str()).collect();
     names.sort_unstable();
     if let Some(twice) = names.windows(2).find(|n| n[0] == n[1]) {
@@ -120,7 +120,7 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
     let splits: Vec<Split> = capture.views.iter().map(|v| v.split).collect();
     let named_splits = every_eighth(places.iter().map(|p| p.name.as_str())) != splits
         || every_eighth(places.iter().map(|p| p.stem.as_str())) != splits;
-    let can_name = |p: &Place| match to {
+    let can_name = |p: &ViewFiles| match to {
         CameraFormat::Transforms => true,
         CameraFormat::Colmap => colmap::can_name(&p.name, named_splits && p.view.split != Split::Train),
     };
@@ -164,7 +164,7 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
     Ok(out)
 }
 
-fn place(view: &View, to: CameraFormat) -> Place<'_> {
+fn place(view: &View, to: CameraFormat) -> ViewFiles<'_> {
     let ending =
         |path: &Path| path.extension().map_or(String::new(), |e| format!(".{}", e.to_string_lossy()));
     let stem = view.name.clone();
@@ -175,7 +175,7 @@ fn place(view: &View, to: CameraFormat) -> Place<'_> {
     });
     let beside =
         |folder: &str, file: &Option<PathBuf>| file.as_ref().map(|f| format!("{folder}/{stem}{}", ending(f)));
-    Place {
+    ViewFiles {
         view,
         // of the photograph as it lies there: the check above has seen to that
         camera: view.camera.clone(),
@@ -191,7 +191,7 @@ fn place(view: &View, to: CameraFormat) -> Place<'_> {
 type Files = Vec<(String, Vec<u8>)>;
 
 /// What COLMAP's names call the lens, and all its numbers.
-fn lens(place: &Place) -> Result<Map<String, Value>> {
+fn lens(place: &ViewFiles) -> Result<Map<String, Value>> {
     let camera = &place.camera;
     let unknown = || {
         let message = format!("no camera model has the lens of `{}`", place.view.name);
@@ -209,11 +209,11 @@ fn lens(place: &Place) -> Result<Map<String, Value>> {
     Ok(keys)
 }
 
-fn transforms(capture: &Capture, places: &[Place], named_splits: bool) -> Result<Files> {
+fn transforms(capture: &Capture, places: &[ViewFiles], named_splits: bool) -> Result<Files> {
     let lenses: Vec<Map<String, Value>> = places.iter().map(lens).collect::<Result<_>>()?;
     // readers that know one lens for all look for it at the top
     let shared = lenses.iter().all(|l| *l == lenses[0]);
-    let frame = |(place, lens): (&Place, &Map<String, Value>)| {
+    let frame = |(place, lens): (&ViewFiles, &Map<String, Value>)| {
         let (r, p) = (place.camera.rotation, place.camera.position);
         let row = |k: usize| json!([r.x_axis[k], r.y_axis[k], r.z_axis[k], p[k]]);
         let mut frame = Map::new();
@@ -242,7 +242,7 @@ fn transforms(capture: &Capture, places: &[Place], named_splits: bool) -> Result
 
 fn sparse(
     capture: &Capture,
-    places: &[Place],
+    places: &[ViewFiles],
     named_splits: bool,
     warnings: &mut Vec<String>,
 ) -> Result<Files> {

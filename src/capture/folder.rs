@@ -83,11 +83,11 @@ impl CaptureFolder<'_> {
     /// first of them.
     pub fn image_folder<'n>(&self, names: impl Iterator<Item = &'n str>) -> &'static str {
         let names: Vec<&str> = names.take(64).collect();
-        let there = |base: &str, name: &str| {
+        let is_in = |base: &str, name: &str| {
             self.photo("", &join(base, name)).is_ok_and(|(_, photo)| photo.is_some())
         };
         let bases = IMAGE_FOLDERS.into_iter().chain([""]);
-        let counted = bases.map(|base| (base, names.iter().filter(|name| there(base, name)).count()));
+        let counted = bases.map(|base| (base, names.iter().filter(|name| is_in(base, name)).count()));
         counted.fold(("images", 0), |best, next| if next.1 > best.1 { next } else { best }).0
     }
 

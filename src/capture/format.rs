@@ -33,16 +33,16 @@ pub(super) enum CameraFiles {
 
 impl CameraFiles {
     pub fn find(root: &Path) -> Option<CameraFiles> {
-        let there = |names: &[&'static str]| -> Vec<&'static str> {
+        let found_of = |names: &[&'static str]| -> Vec<&'static str> {
             names.iter().copied().filter(|n| io::is_file(&root.join(n))).collect()
         };
-        let mut json = there(&["transforms_train.json", "transforms_val.json", "transforms_test.json"]);
+        let mut json = found_of(&["transforms_train.json", "transforms_val.json", "transforms_test.json"]);
         if !json.contains(&"transforms_train.json") {
-            json = there(&["transforms.json"]);
+            json = found_of(&["transforms.json"]);
         }
-        let mut poses = there(&["poses_bounds_train.npy", "poses_bounds_test.npy"]);
+        let mut poses = found_of(&["poses_bounds_train.npy", "poses_bounds_test.npy"]);
         if poses.is_empty() {
-            poses = there(&["poses_bounds.npy"]);
+            poses = found_of(&["poses_bounds.npy"]);
         }
         if !json.is_empty() {
             return Some(CameraFiles::Transforms { json, poses });
@@ -53,7 +53,7 @@ impl CameraFiles {
         if let Some(files) = ModelFiles::find(root) {
             return Some(CameraFiles::Colmap(files));
         }
-        if let Some(file) = there(&neus::FILES).first() {
+        if let Some(file) = found_of(&neus::FILES).first() {
             return Some(CameraFiles::Neus(file));
         }
         let found = FolderEntries::of(root);
@@ -176,7 +176,7 @@ pub(super) fn explain(root: &Path) -> Error {
         None => {
             let nearest = nearest(&found).map_or(String::new(), |n| format!("; nearest is {n}"));
             let others = "Meshroom, OpenSfM, OpenMVG, Bundler, NVM, MVSNet, Polycam, NeRSemble, Multiface, FaceScape, \
-                          photographs alone or a video are named with the way from there";
+                          photographs alone or a video are named with the way from found_of";
             not_a_capture(
                 root,
                 format!("it holds none of the camera files that are read: {LOOKED_FOR}{nearest}"),

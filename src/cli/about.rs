@@ -60,7 +60,7 @@ pub(super) fn doctor(common: &Common) -> Result<()> {
     let auto = "the processor: this build knows no GPU (`--features wgpu`)".to_string();
     let found = Examination {
         version: env!("CARGO_PKG_VERSION"),
-        features: features.into_iter().filter(|(_, there)| *there).map(|(name, _)| name).collect(),
+        features: features.into_iter().filter(|(_, is_on)| *is_on).map(|(name, _)| name).collect(),
         system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
         processor: io::processor(),
         threads: rayon::current_num_threads(),

@@ -6,7 +6,7 @@ use super::out::Out;
 use super::screen::print;
 use crate::config::{Config, Preset};
 use crate::io;
-use crate::pipeline::{Bench, Line, SWEEPS, feasible, require_device};
+use crate::pipeline::{Bench, Line, SWEEPS, check_feasible, require_device};
 use crate::report::duration;
 use crate::run::{Event, Observer, Run};
 use crate::{Error, Result};
@@ -47,7 +47,7 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
     let asked = Out::find(common.out.as_deref(), "bench")?;
     let target = RunTarget::find(common, Some(&options.path))?;
     let config = configure(common, &target)?;
-    feasible(&config)?;
+    check_feasible(&config)?;
     require_device(&config)?;
     let name = target.run.file_name().map_or("run".into(), |n| n.to_string_lossy().into_owned());
     let folder = asked.map_or_else(|| Path::new("bench").join(name), |out| out.file(""));

@@ -7,7 +7,7 @@ use super::run::{LineCommand, run as run_line};
 use crate::capture::synthetic::{SyntheticOptions, check, write_borders, write_capture};
 use crate::config::Preset;
 use crate::io;
-use crate::pipeline::{Stage, feasible, require_device};
+use crate::pipeline::{Stage, check_feasible, require_device};
 use crate::report::duration;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -39,7 +39,7 @@ pub(super) fn run(
     // what is wrong with the command line is reported before the head is photographed
     Out::find(common.out.as_deref(), "run")?;
     let config = common.resolve(saved.as_deref(), fallback, &[])?;
-    feasible(&config)?;
+    check_feasible(&config)?;
     // the cameras are written last: where they are, everything is
     if io::is_file(&capture.join("transforms.json")) {
         if size.is_some() || views.is_some() || border.is_some() {

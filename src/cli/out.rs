@@ -85,11 +85,11 @@ impl Out {
     /// Refuses a folder inside the run that would be copied into it.
     fn is_outside(&self, run: &Path) -> Result<()> {
         let Out::Folder(folder) = self else { return Ok(()) };
-        let there = folder
+        let target = folder
             .ancestors()
             .find_map(|f| io::real_path(if f.as_os_str().is_empty() { Path::new(".") } else { f }).ok());
-        match (there, io::real_path(run)) {
-            (Some(there), Ok(run)) if there.starts_with(&run) => {
+        match (target, io::real_path(run)) {
+            (Some(target), Ok(run)) if target.starts_with(&run) => {
                 let text = format!("`--out {}` lies in the run itself", folder.display());
                 Err(Error::usage(text, "choose a folder beside the run"))
             }

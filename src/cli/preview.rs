@@ -399,7 +399,7 @@ fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, asked: O
                 let html = move || {
                     let run = Run::open(&target.run, invocation.stop.clone(), screen.clone());
                     let line = Line::open(&config, &run)?;
-                    head_page(&if is_demo(&config, &run) { line.of_demo() } else { line })
+                    head_page(&if is_demo(&config, &run) { line.with_synthetic_truth() } else { line })
                 };
                 (name, Box::new(html))
             }

@@ -40,7 +40,7 @@ fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()
     let run = Run::open(&target.run, invocation.stop.clone(), invocation.screen.clone());
     let mut line = Line::open(&config, &run)?;
     if is_demo(&config, &run) {
-        line = line.of_demo();
+        line = line.with_synthetic_truth();
     }
     let mut page = run.path("report.html");
     if common.dry_run {

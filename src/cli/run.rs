@@ -8,7 +8,7 @@ use super::screen::{figure, print};
 use crate::config::{Config, NAMES, Preset, RenderConfig, called};
 use crate::pipeline::{Line, Stage, reconstruct};
 use crate::report::{blend_verdict, duration, judged_by};
-use crate::run::{Cost, Done, Phase, Run, Standing};
+use crate::run::{Cost, Done, Phase, Run, RunStatus};
 use crate::{Error, ErrorKind, Result, io};
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
@@ -49,12 +49,12 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
         // who runs many heads looks for what went wrong in their folders, not in logs; a run that is done stays as it is,
         // what was asked for otherwise than before is no fault of one that has begun, and a wrong command makes no folder
         let is_named = io::is_folder(run.dir()) || common.run.is_some() && e.kind() == ErrorKind::Cannot;
-        let tells = match (e.kind(), begun_with(&run)) {
+        let tells = match (e.kind(), saved_config(&run)) {
             (ErrorKind::Cannot | ErrorKind::Usage, None) => true,
             (ErrorKind::Cannot, Some(before)) => {
                 common.fresh.is_none()
-                    && before == but_for_device(&config.to_toml())
-                    && Standing::read(run.dir()).phase != Phase::Done
+                    && before == without_device(&config.to_toml())
+                    && RunStatus::read(run.dir()).phase != Phase::Done
             }
             _ => false,
         };
@@ -63,7 +63,7 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
         }
     })?;
     if common.dry_run {
-        print(&outlook(&line, *until, common)?)?;
+        print(&plan_summary(&line, *until, common)?)?;
         return line.require(*until, common.fresh).map(|_| ());
     }
     run.not_failed();
@@ -82,13 +82,13 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
 }
 
 /// The settings that a run was last worked on with, as text; none if it has not begun.
-fn begun_with(run: &Run) -> Option<String> {
+fn saved_config(run: &Run) -> Option<String> {
     let bytes = io::read_bytes(&run.path("config.toml"), &io::Limits::default()).ok()?;
-    Some(but_for_device(&String::from_utf8_lossy(&bytes)))
+    Some(without_device(&String::from_utf8_lossy(&bytes)))
 }
 
 /// Stages of one run may be made on several devices.
-fn but_for_device(settings: &str) -> String {
+fn without_device(settings: &str) -> String {
     settings.lines().filter(|line| !line.starts_with("device = ")).map(|line| format!("{line}\n")).collect()
 }
 
@@ -103,10 +103,10 @@ fn ready<'a>(
 ) -> Result<Line<'a>> {
     let mut line = Line::open(config, run)?;
     if is_demo(config, run) {
-        line = line.of_demo();
+        line = line.with_synthetic_truth();
     }
     if let Some(path) = path {
-        line = line.along(path)?;
+        line = line.with_camera_path(path)?;
     }
     if let Some(out) = out {
         out.check(run.dir(), &line.order(command.until))?;
@@ -121,11 +121,11 @@ fn ready<'a>(
 }
 
 /// What would be done for `until`, a row for each stage, with what each may cost, and all together.
-fn outlook(line: &Line, until: Stage, common: &Common) -> Result<String> {
+fn plan_summary(line: &Line, until: Stage, common: &Common) -> Result<String> {
     let mut removed = common.fresh.map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
     let mut text = String::new();
     let mut sum = Cost::default();
-    for (of, (stage, found)) in line.order(until).into_iter().zip(line.outlook(until)?) {
+    for (of, (stage, found)) in line.order(until).into_iter().zip(line.stage_states(until)?) {
         let anew = removed.contains(&stage);
         removed.retain(|name| *name != stage);
         let (outlook, differences) = match found {

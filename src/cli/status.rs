@@ -5,7 +5,7 @@ use super::screen::{figure, one_line, print};
 use crate::config::Stage;
 use crate::io;
 use crate::report::duration;
-use crate::run::{Phase, Record, StageStanding, Standing, Status};
+use crate::run::{Phase, Record, RunStatus, StageStatus, Status};
 use crate::{Error, Result};
 use clap::Args;
 use rayon::prelude::*;
@@ -44,7 +44,7 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
             (true, Some(run)) => vec![run.clone()],
             (true, None) => io::list_folders(Path::new("runs"))?,
         };
-        let found: Vec<(&Path, Result<Standing>)> =
+        let found: Vec<(&Path, Result<RunStatus>)> =
             all.par_iter().map(|run| (run.as_path(), look(run))).collect();
         let text = match &found[..] {
             [] => return Err(Error::cannot("there are no runs under `runs/`", "name a run folder")),
@@ -55,7 +55,7 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
         let clear = if options.watch && std::io::stdout().is_terminal() { "\x1b[H\x1b[2J" } else { "" };
         print(&format!("{clear}{text}"))?;
         let is = |phases: &[Phase]| {
-            let phase = |run: &Result<Standing>| run.as_ref().map_or(Phase::Unreadable, |s| s.phase);
+            let phase = |run: &Result<RunStatus>| run.as_ref().map_or(Phase::Unreadable, |s| s.phase);
             found.iter().filter(|(_, run)| phases.contains(&phase(run))).count()
         };
         let may_change = [Phase::Waiting, Phase::Running, Phase::Begun, Phase::Killed, Phase::Stopped];
@@ -81,15 +81,15 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
 }
 
 /// Where a run stands, if it is a folder at all.
-fn look(run: &Path) -> Result<Standing> {
+fn look(run: &Path) -> Result<RunStatus> {
     if !io::is_folder(run) {
         return Err(Error::cannot(format!("`{}` is not a folder", run.display()), ""));
     }
-    Ok(Standing::read(run))
+    Ok(RunStatus::read(run))
 }
 
 /// Is this one that somebody has to look after?
-fn has_failed(run: &Result<Standing>) -> bool {
+fn has_failed(run: &Result<RunStatus>) -> bool {
     let wrong = [Phase::Failed, Phase::Killed, Phase::Unreadable];
     run.as_ref().map_or(true, |s| wrong.contains(&s.phase))
 }
@@ -99,7 +99,7 @@ fn name(run: &Path) -> String {
 }
 
 /// A line for each run, and one for all.
-fn heads(runs: &[(&Path, Result<Standing>)], failed: bool, each: bool) -> String {
+fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> String {
     let mut text = String::new();
     let shown: Vec<_> = runs.iter().filter(|(_, run)| !failed || has_failed(run)).collect();
     let width = shown.iter().map(|(run, _)| name(run).chars().count()).max().unwrap_or(0).clamp(8, 32);
@@ -173,7 +173,7 @@ fn sign(phase: Phase) -> char {
 }
 
 /// Where a run stands, after its bar.
-fn told(run: &Standing) -> String {
+fn told(run: &RunStatus) -> String {
     let at = run.stages.iter().find(|s| Some(s.stage) == run.at);
     let percent = at.and_then(|s| s.status.as_ref()?.percent());
     let share = percent.map_or(String::new(), |p| format!(" {p} %"));
@@ -189,8 +189,8 @@ fn told(run: &Standing) -> String {
 }
 
 /// A JSON object for each run, without settings.
-fn objects(runs: &[(&Path, Result<Standing>)], failed: bool) -> String {
-    let object = |(run, standing): &&(&Path, Result<Standing>)| {
+fn objects(runs: &[(&Path, Result<RunStatus>)], failed: bool) -> String {
+    let object = |(run, standing): &&(&Path, Result<RunStatus>)| {
         let value = match standing {
             Err(e) => json!({"run": run, "state": Phase::Unreadable, "error": e.to_string()}),
             Ok(s) => {
@@ -204,7 +204,7 @@ fn objects(runs: &[(&Path, Result<Standing>)], failed: bool) -> String {
     runs.iter().filter(|(_, run)| !failed || has_failed(run)).collect::<Vec<_>>().iter().map(object).collect()
 }
 
-fn stage_object(s: &crate::run::StageStanding) -> Value {
+fn stage_object(s: &crate::run::StageStatus) -> Value {
     let mut value = json!({"stage": s.stage.word(), "state": s.phase, "left_s": s.left_s, "error": s.error});
     if let Some(status) = &s.status {
         value["step"] = json!(status.step);
@@ -227,7 +227,7 @@ fn stage_object(s: &crate::run::StageStanding) -> Value {
 }
 
 /// A row for each stage of one run, views of paths included, and what is left of all.
-fn stages(run: &Path, standing: &Standing) -> String {
+fn stages(run: &Path, standing: &RunStatus) -> String {
     let mut text = String::new();
     let mut row = |stage: &str, words: &str| {
         let _ = writeln!(text, "{:<24} {stage:<8} {}", one_line(&run.display().to_string()), one_line(words));
@@ -237,7 +237,7 @@ fn stages(run: &Path, standing: &Standing) -> String {
     }
     for path in io::list_folders(&run.join("render/paths")).unwrap_or_default() {
         let name = format!("render/paths/{}", path.file_name().unwrap_or_default().to_string_lossy());
-        row(&name, &of_stage(&StageStanding::read(&path, Stage::Render)));
+        row(&name, &of_stage(&StageStatus::read(&path, Stage::Render)));
     }
     if standing.at.is_none() && standing.error.is_some() {
         row("–", &told(standing));
@@ -249,7 +249,7 @@ fn stages(run: &Path, standing: &Standing) -> String {
 }
 
 /// Where a stage stands, in words.
-fn of_stage(s: &StageStanding) -> String {
+fn of_stage(s: &StageStatus) -> String {
     match &s.error {
         Some(error) if s.phase == Phase::Unreadable => format!("UNREADABLE: {error}"),
         _ => words(s.phase, s.status.as_ref(), s.record.as_ref()),

@@ -133,7 +133,7 @@ impl Fit {
 
 /// The weights of least squared error over several views; all of one member where that member alone is no
 /// worse on views that had no say, each judged with the weights of the others. `None` where no pixel counts.
-pub fn weigh(views: &[Fit]) -> Result<Option<Vec<f32>>> {
+pub fn fit_weights(views: &[Fit]) -> Result<Option<Vec<f32>>> {
     let Some(first) = views.first() else { return Ok(None) };
     let merged = |left_out: Option<usize>| -> Result<Fit> {
         let mut all = Fit::empty(first.members);

@@ -141,7 +141,7 @@ fn the_blend_of_a_capture_follows_its_better_member() {
     // independent errors a and b: weights as 1/a² and 1/b²
     for (sigmas, first) in [([0.02, 0.02], 0.5), ([0.02, 0.04], 0.8), ([0.04, 0.02], 0.2)] {
         let views: Vec<Fit> = (1..4).map(|seed| noisy(seed, sigmas, PIXELS)).collect();
-        let w = weigh(&views).unwrap().unwrap();
+        let w = fit_weights(&views).unwrap().unwrap();
         assert!((w[0] - first).abs() < 0.02 && (w[0] + w[1] - 1.0).abs() < 1e-6, "{sigmas:?} → {w:?}");
     }
 }
@@ -156,12 +156,12 @@ fn where_no_weights_hold_on_other_views_the_best_member_stands_alone() {
     let mut both = views[0].clone();
     both.merge(&views[1]).unwrap();
     assert!((both.solve().unwrap()[0] - 0.7).abs() < 0.01);
-    assert_eq!(weigh(&views).unwrap().unwrap(), [1.0, 0.0]);
+    assert_eq!(fit_weights(&views).unwrap().unwrap(), [1.0, 0.0]);
     // one view has no other to judge it, and one without a pixel is none
     let one = noisy(1, [0.02, 0.04], PIXELS);
-    assert_eq!(weigh(&[one.clone(), Fit::new(2).unwrap()]).unwrap(), one.solve());
-    assert_eq!(weigh(&[]), Ok(None));
-    assert_eq!(weigh(&[Fit::new(2).unwrap()]), Ok(None));
+    assert_eq!(fit_weights(&[one.clone(), Fit::new(2).unwrap()]).unwrap(), one.solve());
+    assert_eq!(fit_weights(&[]), Ok(None));
+    assert_eq!(fit_weights(&[Fit::new(2).unwrap()]), Ok(None));
 }
 
 #[test]

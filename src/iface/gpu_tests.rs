@@ -102,9 +102,9 @@ fn losses_and_views_are_those_of_the_cpu() {
         assert_eq!(report.warnings, Vec::<String>::new());
         (psnr(&face, &views[4]), figures.0.into_inner().unwrap(), report)
     });
-    let [(cpu, want, _), (there, got, _)] = both;
-    println!("{cpu:.2} dB on the CPU, {there:.2} dB on the device");
-    assert!((cpu - there).abs() < 0.2, "{cpu} {there}");
+    let [(cpu, want, _), (gpu, got, _)] = both;
+    println!("{cpu:.2} dB on the CPU, {gpu:.2} dB on the device");
+    assert!((cpu - gpu).abs() < 0.2, "{cpu} {gpu}");
     // what is minimized; single terms of single batches drift apart sooner, as they do between any two orders of sums
     let total = |figures: &[(String, f64)]| -> f64 {
         let weights = [
@@ -338,7 +338,7 @@ fn the_paper_waits_for_nothing_either_and_learns_what_the_cpu_does() {
     all.push((psnr(&face, &views[4]), report.occupied));
     println!("dB and share of the cells, on the CPU, on the device, on both in turn: {all:.3?}");
     assert!(all[0].0 > 17.0 && all[0].1 < 0.9, "{all:?}");
-    assert!(all.iter().all(|there| (all[0].0 - there.0).abs() < 0.2 && (all[0].1 - there.1).abs() < 0.02));
+    assert!(all.iter().all(|way| (all[0].0 - way.0).abs() < 0.2 && (all[0].1 - way.1).abs() < 0.02));
     // 50 steps with three looks at cells that are drawn: one readback
     let dir = temporary();
     let session = on("wgpu:0", dir.path(), &Quiet);

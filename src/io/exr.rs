@@ -43,10 +43,10 @@ pub fn read_exr(path: &Path, sets: &[&[&str]], limits: &Limits) -> Result<ExrIma
             }
         }
     }
-    let there: Vec<String> =
+    let present: Vec<String> =
         read.layer_data.iter().flat_map(|l| l.channel_data.list.iter().map(|c| c.name.to_string())).collect();
     let wanted: Vec<String> = sets.iter().map(|s| format!("`{}`", s.join(" "))).collect();
-    let what = format!("an OpenEXR picture with the channels `{}`", there.join(" "));
+    let what = format!("an OpenEXR picture with the channels `{}`", present.join(" "));
     Err(ReadError::unsupported(path, what, format!("it must hold {}", wanted.join(" or "))))
 }
 

@@ -12,7 +12,7 @@
 //! most of is set aside, and the rest is asked again, until nobody takes much away and nobody claims much alone. (A
 //! third: how much less an open claim weighs than what is left out.)
 
-use super::consistency::{Claims, ConsistencyView, Votes, cells_on_ray, claims_of};
+use super::consistency::{ConsistencyView, SilhouetteConstraints, Votes, cells_on_ray, claims_of};
 use crate::Result;
 use rayon::prelude::*;
 
@@ -33,7 +33,7 @@ const MOST_OPEN: f64 = 0.05;
 
 /// What is to be made of a mask.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Belief {
+pub enum MaskVerdict {
     /// It agrees with the others.
     Agrees,
     /// It leaves out what others show; what it shows may be believed.
@@ -44,7 +44,7 @@ pub enum Belief {
 
 /// Who stands against whom among the views still believed.
 #[derive(Default)]
-struct Blame {
+struct Disagreement {
     /// Open share of its own claims.
     open: f64,
     /// Shares of the others' claims that it rules out, each divided among all who do.
@@ -53,15 +53,15 @@ struct Blame {
     ruled_out: f64,
 }
 
-/// Judges masks against each other; a view without one, or with an empty one, is [`Belief::Unlike`] the others.
+/// Judges masks against each other; a view without one, or with an empty one, is [`MaskVerdict::Unlike`] the others.
 ///
 /// # Errors
 /// When the cameras stand at one place or look in one direction.
-pub fn beliefs(views: &[ConsistencyView]) -> Result<Vec<Belief>> {
-    let mut out = vec![Belief::Unlike; views.len()];
+pub fn beliefs(views: &[ConsistencyView]) -> Result<Vec<MaskVerdict>> {
+    let mut out = vec![MaskVerdict::Unlike; views.len()];
     let shows = |v: &ConsistencyView| v.mask.is_some_and(|m| m.values.iter().any(|&v| v > 127));
     let used: Vec<usize> = (0..views.len()).filter(|&i| shows(&views[i])).collect();
-    used.iter().for_each(|&i| out[i] = Belief::Agrees);
+    used.iter().for_each(|&i| out[i] = MaskVerdict::Agrees);
     if used.len() < 2 {
         return Ok(out);
     }
@@ -71,8 +71,8 @@ pub fn beliefs(views: &[ConsistencyView]) -> Result<Vec<Belief>> {
     loop {
         let left = active.iter().filter(|a| **a).count();
         let blame = blame(&votes, &claims, &active);
-        let weight = |b: &Blame| OWN * b.open + b.taken;
-        let mean = |b: &Blame| b.ruled_out / (left.max(2) - 1) as f64;
+        let weight = |b: &Disagreement| OWN * b.open + b.taken;
+        let mean = |b: &Disagreement| b.ruled_out / (left.max(2) - 1) as f64;
         // of equals the first
         let worst = (0..claims.len())
             .filter(|&i| active[i] && (blame[i].open > MOST_OPEN || mean(&blame[i]) > MOST_RULED_OUT))
@@ -81,17 +81,17 @@ pub fn beliefs(views: &[ConsistencyView]) -> Result<Vec<Belief>> {
         let Some(worst) = worst else { break };
         if left <= 2 {
             // two that contradict each other say nothing of who is right
-            active.iter().zip(&used).filter(|(a, _)| **a).for_each(|(_, &i)| out[i] = Belief::Unlike);
+            active.iter().zip(&used).filter(|(a, _)| **a).for_each(|(_, &i)| out[i] = MaskVerdict::Unlike);
             break;
         }
         active[worst] = false;
         let much = OWN * blame[worst].open > blame[worst].taken;
-        out[used[worst]] = if much { Belief::Unlike } else { Belief::LeavesOut };
+        out[used[worst]] = if much { MaskVerdict::Unlike } else { MaskVerdict::LeavesOut };
     }
     Ok(out)
 }
 
-fn blame(votes: &Votes, claims: &[Claims], active: &[bool]) -> Vec<Blame> {
+fn blame(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Vec<Disagreement> {
     let costs = votes.costs(active);
     let least_seen = SEEN * active.iter().filter(|a| **a).count() as f64;
     let found: Vec<(f64, Vec<[f64; 2]>)> = (0..claims.len())
@@ -127,8 +127,8 @@ fn blame(votes: &Votes, claims: &[Claims], active: &[bool]) -> Vec<Blame> {
             (open as f64 / asked, takers)
         })
         .collect();
-    let mut out: Vec<Blame> =
-        found.iter().map(|(open, _)| Blame { open: *open, ..Blame::default() }).collect();
+    let mut out: Vec<Disagreement> =
+        found.iter().map(|(open, _)| Disagreement { open: *open, ..Disagreement::default() }).collect();
     for (_, takers) in &found {
         for (blame, [taken, ruled_out]) in out.iter_mut().zip(takers) {
             blame.taken += taken;
@@ -178,7 +178,7 @@ mod tests {
         Gray { width: 96, height: 128, values: (0..96 * 128).map(|i| 255 * hit(i) as u8).collect() }
     }
 
-    fn judged(masks: &[Gray]) -> Vec<Belief> {
+    fn judged(masks: &[Gray]) -> Vec<MaskVerdict> {
         let cameras = ring();
         let views: Vec<ConsistencyView> = cameras
             .iter()
@@ -207,19 +207,19 @@ mod tests {
         let (high, low) = (at(1.0, 0), at(-1.0, 3));
         let view = |i: usize, mask| ConsistencyView { name: "v", camera: &cameras[i], mask: Some(mask) };
         let found = beliefs(&[view(0, &high), view(3, &low)]).unwrap();
-        assert!(!found.contains(&Belief::Agrees), "{found:?}");
+        assert!(!found.contains(&MaskVerdict::Agrees), "{found:?}");
         let same = at(1.0, 3);
-        assert_eq!(beliefs(&[view(0, &high), view(3, &same)]).unwrap(), [Belief::Agrees; 2]);
+        assert_eq!(beliefs(&[view(0, &high), view(3, &same)]).unwrap(), [MaskVerdict::Agrees; 2]);
     }
 
     #[test]
     fn what_many_views_leave_out_is_missed_in_each_of_them() {
-        assert_eq!(judged(&masks(&[])), [Belief::Agrees; 12]);
+        assert_eq!(judged(&masks(&[])), [MaskVerdict::Agrees; 12]);
         // even if it is seven of twelve
         let without = [0, 1, 3, 5, 6, 8, 10];
         let found = judged(&masks(&without));
         for (i, belief) in found.into_iter().enumerate() {
-            let expected = if without.contains(&i) { Belief::LeavesOut } else { Belief::Agrees };
+            let expected = if without.contains(&i) { MaskVerdict::LeavesOut } else { MaskVerdict::Agrees };
             assert_eq!(belief, expected, "view {i}");
         }
     }
@@ -233,7 +233,7 @@ mod tests {
         (0..96 * 128).filter(|i| i % 96 < 24 && i / 96 > 32).for_each(|i| all[9].values[i] = 255);
         let found = judged(&all);
         for (i, belief) in found.into_iter().enumerate() {
-            let expected = if [2, 7, 9].contains(&i) { Belief::Unlike } else { Belief::Agrees };
+            let expected = if [2, 7, 9].contains(&i) { MaskVerdict::Unlike } else { MaskVerdict::Agrees };
             assert_eq!(belief, expected, "view {i}");
         }
     }
@@ -243,6 +243,6 @@ mod tests {
         let mut all = masks(&[]);
         all[1..].iter_mut().for_each(|m| m.values.fill(0));
         let found = judged(&all);
-        assert!(found[0] == Belief::Agrees && found[1..].iter().all(|b| *b == Belief::Unlike));
+        assert!(found[0] == MaskVerdict::Agrees && found[1..].iter().all(|b| *b == MaskVerdict::Unlike));
     }
 }

@@ -116,12 +116,12 @@ pub(super) fn claims_of(
     used: &[usize],
     cells: usize,
     rows: u32,
-) -> Result<(Cube, Vec<Claims>)> {
+) -> Result<(Cube, Vec<SilhouetteConstraints>)> {
     let cameras: Vec<Camera> = used.iter().map(|&i| views[i].camera.clone()).collect();
     let cube = hull::cube(&cameras, cells, CUBE)?;
     let claims = used
         .par_iter()
-        .filter_map(|&i| Some(Claims::new(views[i].camera, views[i].mask?, &cube, rows)))
+        .filter_map(|&i| Some(SilhouetteConstraints::new(views[i].camera, views[i].mask?, &cube, rows)))
         .collect();
     Ok((cube, claims))
 }
@@ -147,7 +147,7 @@ fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String
 }
 
 /// What a reduced mask claims: where the head is, and where it cannot be.
-pub(super) struct Claims {
+pub(super) struct SilhouetteConstraints {
     camera: Camera,
     frame: ViewFrame,
     /// Pixels so far beside the mask that a cell there is ruled out.
@@ -157,8 +157,8 @@ pub(super) struct Claims {
     pub(super) inner: Vec<usize>,
 }
 
-impl Claims {
-    fn new(camera: &Camera, mask: &Gray, cube: &Cube, rows: u32) -> Claims {
+impl SilhouetteConstraints {
+    fn new(camera: &Camera, mask: &Gray, cube: &Cube, rows: u32) -> SilhouetteConstraints {
         let height = rows.clamp(16, mask.height.max(16));
         let width = ((mask.width as f64 * height as f64 / mask.height as f64).round() as u32).max(1);
         let camera = camera.resized(width, height);
@@ -172,7 +172,7 @@ impl Claims {
         // an all-white mask is infinitely far from its outside
         let depth = squared_distance(&off, w, h);
         let inner = (0..w * h).filter(|&i| depth[i] > SLACK_PX * SLACK_PX).collect();
-        Claims { frame: ViewFrame::new(&camera), camera, beside, on, inner }
+        SilhouetteConstraints { frame: ViewFrame::new(&camera), camera, beside, on, inner }
     }
 }
 
@@ -184,7 +184,7 @@ pub(super) struct Votes {
 }
 
 impl Votes {
-    pub(super) fn count(cube: Cube, claims: &[Claims]) -> Votes {
+    pub(super) fn count(cube: Cube, claims: &[SilhouetteConstraints]) -> Votes {
         let words = claims.len().div_ceil(64);
         let frames: Vec<&ViewFrame> = claims.iter().map(|c| &c.frame).collect();
         let bits = hull::vote(&cube, &frames, 2 * words, |cell: &mut [u64], k, pixel| {
@@ -223,7 +223,7 @@ struct Conflicts {
 }
 
 impl Conflicts {
-    fn of(votes: &Votes, claims: &[Claims], active: &[bool]) -> Conflicts {
+    fn of(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Conflicts {
         let count = claims.len();
         let costs = votes.costs(active);
         let found: Vec<Option<(f64, Vec<f64>)>> = (0..count)
@@ -262,7 +262,12 @@ impl Conflicts {
 
 /// The share of a view's claims that nothing explains, and the views that rule out the best point of each such
 /// ray: `k` of them share a claim in equal parts.
-fn open_claims(votes: &Votes, claims: &Claims, costs: &[(u16, u16)], active: &[bool]) -> (f64, Vec<f64>) {
+fn open_claims(
+    votes: &Votes,
+    claims: &SilhouetteConstraints,
+    costs: &[(u16, u16)],
+    active: &[bool],
+) -> (f64, Vec<f64>) {
     let mut takers = vec![0.0; active.len()];
     let (mut open, mut asked) = (0usize, 0usize);
     for &pixel in &claims.inner {
@@ -288,7 +293,7 @@ fn open_claims(votes: &Votes, claims: &Claims, costs: &[(u16, u16)], active: &[b
 /// The cells on a pixel's ray, from the camera on, each half a cell from the last.
 pub(super) fn cells_on_ray<'a>(
     cube: &'a Cube,
-    claims: &Claims,
+    claims: &SilhouetteConstraints,
     pixel: usize,
 ) -> impl Iterator<Item = usize> + use<'a> {
     let (n, cell) = (cube.n, cube.cell());
@@ -331,7 +336,12 @@ pub(super) fn cells_on_ray<'a>(
 
 /// The cell on a pixel's ray that fewest views rule out, of those that another view has on the head if there are
 /// any; of equals the one that most have there. Nothing when no other view looks at the ray within the cube.
-fn best_on_ray(cube: &Cube, claims: &Claims, pixel: usize, costs: &[(u16, u16)]) -> Option<(u16, usize)> {
+fn best_on_ray(
+    cube: &Cube,
+    claims: &SilhouetteConstraints,
+    pixel: usize,
+    costs: &[(u16, u16)],
+) -> Option<(u16, usize)> {
     // whom the ray's own view has on its side comes first, then who is against
     let mut best: Option<(bool, u16, u16, usize)> = None;
     for i in cells_on_ray(cube, claims, pixel) {

@@ -12,7 +12,7 @@
 //! Where a network has proposed a mask for every view ([`propagate_proposals`]), those that agree
 //! ([`agreement`](super::agreement)) stand for the clicked ones: they teach the colors and carve the hull. What lies well inside a proposal that is not unlike the others is definite head.
 
-use super::agreement::{Belief, beliefs};
+use super::agreement::{MaskVerdict, beliefs};
 use super::consistency::ConsistencyView;
 use super::grabcut::mixture::Rgb;
 use super::grabcut::{self, Grabcut, Models, Seed};
@@ -371,7 +371,7 @@ pub fn rows_size(photo: &Photo) -> (u32, u32) {
 
 impl Propagation<'_> {
     /// Takes the proposed masks of the views that agree, and learns the common colors from them.
-    fn proposed(&mut self, proposals: &[Gray], beliefs: &[Belief]) -> Result<StartViews> {
+    fn proposed(&mut self, proposals: &[Gray], beliefs: &[MaskVerdict]) -> Result<StartViews> {
         let (mut inside, mut outside): (Vec<Rgb>, Vec<Rgb>) = Default::default();
         let mut heads: Vec<Option<Vec<bool>>> = vec![None; self.views.len()];
         let mut others = Vec::new();
@@ -389,10 +389,10 @@ impl Propagation<'_> {
             }
             let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
             // nobody judged a held-out view, and only its own mask comes from it
-            if !view.votes || *belief != Belief::Unlike {
+            if !view.votes || *belief != MaskVerdict::Unlike {
                 self.inside[i] = shrink(&head, w, h, INSIDE * h as f32);
             }
-            if *belief != Belief::Agrees || !view.votes {
+            if *belief != MaskVerdict::Agrees || !view.votes {
                 others.extend(view.votes.then_some(view.name));
                 continue;
             }

@@ -11,14 +11,14 @@ mod marching_cell;
 mod sparse;
 mod sparse_blocks;
 
-pub use cap::{Cap, Skin};
+pub use cap::{Cap, RimVertex};
 pub use clean::{CleanReport, clean};
 pub use dense::{Verified, extract_dense};
 pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};
 pub use sparse::{Sparse, sparse};
 
-use super::input::{answered, evaluate, setting};
+use super::input::{check_len, evaluate, setting};
 use super::moves::Polish;
 use crate::geom::{Aabb, Mesh, Topology, topology};
 use crate::{Error, Monitor, Result};
@@ -262,7 +262,7 @@ pub fn extract(
     if longest > 0.0 {
         let values = |points: &[Vec3]| {
             let values: Vec<f32> = points.chunks(options.batch).flat_map(&sdf).collect();
-            answered("signed distance", points.len(), values.len()).map(|()| values)
+            check_len("signed distance", points.len(), values.len()).map(|()| values)
         };
         report.handles = cut_handles(&mut mesh, longest, &values, monitor)?;
     }
@@ -282,7 +282,7 @@ pub fn extract(
     }
     for (points, normals) in mesh.positions.chunks(options.batch).zip(mesh.normals.chunks(options.batch)) {
         let colors = color(points, normals);
-        answered("color", points.len(), colors.len())?;
+        check_len("color", points.len(), colors.len())?;
         let tame = |c: f32| if c.is_finite() { c.clamp(0.0, 1.0) } else { 0.0 };
         mesh.colors.extend(colors.iter().map(|c| c.map(tame)));
     }

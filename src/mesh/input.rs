@@ -29,7 +29,7 @@ fn not_finite(mesh: &Mesh, first: usize) -> Error {
 }
 
 /// Refuses triangles over vertices that are not there or not finite.
-pub(super) fn sound(mesh: &Mesh) -> Result<()> {
+pub(super) fn check_indices(mesh: &Mesh) -> Result<()> {
     let vertices = mesh.positions.len();
     for (i, &v) in mesh.triangles.as_flattened().iter().enumerate() {
         match mesh.positions.get(v as usize) {
@@ -45,7 +45,7 @@ pub(super) fn sound(mesh: &Mesh) -> Result<()> {
 }
 
 /// Refuses more vertices than 32-bit indices can name.
-pub(super) fn few_enough(vertices: u64, triangles: u64) -> Result<()> {
+pub(super) fn check_count(vertices: u64, triangles: u64) -> Result<()> {
     if vertices.max(triangles) <= u64::from(u32::MAX) {
         return Ok(());
     }
@@ -54,7 +54,7 @@ pub(super) fn few_enough(vertices: u64, triangles: u64) -> Result<()> {
 }
 
 /// Refuses answers of another number than the points.
-pub(super) fn answered(what: &str, points: usize, answers: usize) -> Result<()> {
+pub(super) fn check_len(what: &str, points: usize, answers: usize) -> Result<()> {
     if points == answers {
         return Ok(());
     }
@@ -76,7 +76,7 @@ pub(super) fn evaluate(
     for points in points.chunks(batch) {
         monitor.check_stop()?;
         let (f, g) = field(points);
-        answered("gradient", points.len(), f.len().min(g.len()))?;
+        check_len("gradient", points.len(), f.len().min(g.len()))?;
         values.extend(f);
         gradients.extend(g);
     }

@@ -82,14 +82,14 @@ const LEAST_COSINE: f32 = 0.26;
 
 /// How many cameras see a point, and what they take it for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Sight {
+pub struct SurfaceVisibility {
     /// So many cameras see it: inside the frame, not steeper than 75°, nothing in between.
     pub cameras: u32,
     /// So many of those take it for the first kind, and for the second.
     pub kinds: [u32; 2],
 }
 
-impl Sight {
+impl SurfaceVisibility {
     /// Three or more cameras see the point, and more than half of them take it for this kind.
     pub fn is(&self, kind: usize) -> bool {
         self.cameras >= 3 && 2 * self.kinds[kind] > self.cameras
@@ -107,7 +107,7 @@ pub fn sights(
     cameras: &[Camera],
     points: &[(Vec3, u32)],
     kind: impl Fn(usize, [u32; 2]) -> Option<usize> + Sync,
-) -> Vec<Sight> {
+) -> Vec<SurfaceVisibility> {
     let lift = 1e-4 * mesh.bounds().size().max_element();
     let pixel = |camera: &Camera, p: Vec3, normal: Vec3| {
         let (q, _) = camera.project(p)?;
@@ -122,7 +122,7 @@ pub fn sights(
         sees.then(|| [(q.x as u32).min(last[0]), (q.y as u32).min(last[1])])
     };
     let sight = |&(p, t): &(Vec3, u32)| {
-        let mut sight = Sight::default();
+        let mut sight = SurfaceVisibility::default();
         for (i, camera) in cameras.iter().enumerate() {
             let Some(pixel) = pixel(camera, p, normal(mesh, t)) else { continue };
             sight.cameras += 1;
@@ -140,7 +140,7 @@ fn normal(mesh: &Mesh, triangle: u32) -> Vec3 {
     (b - a).cross(c - a).normalize_or_zero()
 }
 
-/// Distances from `from` to `to` over the parts that the cameras take for either kind ([`Sight::is`]), with the
+/// Distances from `from` to `to` over the parts that the cameras take for either kind ([`SurfaceVisibility::is`]), with the
 /// median of the signed ones: positive where `to` is outside. `None` for a part that is empty.
 pub fn kinds_one_way(
     from: &Mesh,
@@ -223,8 +223,8 @@ mod tests {
             positions: whole.positions.iter().map(|p| Vec3::new(p.x * 0.5, p.y, p.z)).collect(),
             ..whole.clone()
         };
-        let [there, back] = both_ways(&half, &whole, 20_000).unwrap();
-        assert!(there.max < 1e-6);
+        let [forth, back] = both_ways(&half, &whole, 20_000).unwrap();
+        assert!(forth.max < 1e-6);
         // half of the points are at 0, the rest at x − 1: mean ∫₀¹ x dx / 2 = 0.25, 90 % at 0.8
         assert!((back.mean - 0.25).abs() < 1e-3, "{back:?}");
         assert!((back.p90 - 0.8).abs() < 1e-2 && back.max <= 1.0, "{back:?}");

@@ -181,7 +181,7 @@ impl<'l> Judge<'l> {
         let background = line.config.render.background;
         let views = (0..count).map(|i| {
             let view = all[i * all.len() / count];
-            let loaded = line.judged(view).load(&Limits::default())?;
+            let loaded = line.evaluation_view(view).load(&Limits::default())?;
             let expected = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
             Ok((view, loaded, expected))
         });

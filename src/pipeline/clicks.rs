@@ -97,7 +97,7 @@ impl MaskPrompts {
     }
 
     /// What a stage's record holds of clicks that are no longer there: their digests.
-    pub fn remembered(inputs: &BTreeMap<String, String>) -> MaskPrompts {
+    pub fn from_inputs(inputs: &BTreeMap<String, String>) -> MaskPrompts {
         let input = |name: &'static str| Some((name, inputs.get(name)?.clone()));
         let inputs = INPUTS.into_iter().filter_map(input).collect();
         MaskPrompts { clicks: Vec::new(), file: Vec::new(), inputs }

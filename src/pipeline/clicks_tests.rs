@@ -89,9 +89,9 @@ fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_ma
     let run = run(dir.path(), "run");
     let line = Line::open(&config, &run).unwrap();
     complete(&line, Stage::Mask, &NoFields).unwrap();
-    assert_eq!(line.judges(), "capture");
+    assert_eq!(line.mask_source(), "capture");
     for (view, truth) in line.capture().views.iter().zip(&truth) {
-        let judged = line.judged(view).load_mask(&Limits::default()).unwrap();
+        let judged = line.evaluation_view(view).load_mask(&Limits::default()).unwrap();
         assert!(judged.as_ref() == Some(truth) && view.load_mask(&Limits::default()).unwrap() != judged);
     }
     let plan = line.plan(Stage::Metrics).fingerprint;
@@ -111,7 +111,7 @@ fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_ma
     }
     let bare = Line::open(&config, &run).unwrap();
     let view = &bare.capture().views[0];
-    assert_eq!((bare.judges(), bare.judged(view).mask), ("run", view.mask.clone()));
+    assert_eq!((bare.mask_source(), bare.evaluation_view(view).mask), ("run", view.mask.clone()));
 }
 
 #[test]

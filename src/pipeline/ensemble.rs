@@ -151,15 +151,18 @@ fn member_views(line: &Line, name: &str) -> Result<Vec<Image>> {
 /// Never by fitted weights: so a fit sees the members as they will be blended.
 fn members<'i>(line: &Line, views: &'i [Image]) -> Result<Members<'i>> {
     let c = &line.config.ensemble;
-    let member =
-        |(m, image): (&Method, &'i Image)| Member { name: m.folder(), image, masked: knows_masks(line, *m) };
+    let member = |(m, image): (&Method, &'i Image)| Member {
+        name: m.folder(),
+        image,
+        masked: trained_with_masks(line, *m),
+    };
     let list: Vec<Member<'i>> = c.members.iter().zip(views).map(member).collect();
     let members = Members::new(&list)?;
     if c.cut { Ok(members.cut(&shares(c))?) } else { Ok(members) }
 }
 
 /// Was the field learned with masks?
-fn knows_masks(line: &Line, method: Method) -> bool {
+fn trained_with_masks(line: &Line, method: Method) -> bool {
     let has_mask = |v: &View| v.mask != ViewMask::None && v.mask_meaning == MaskMeaning::Empty;
     let used = match method {
         Method::Baseline | Method::Tface => line.config.radiance(method.stage()).masks != MaskUse::None,
@@ -204,7 +207,7 @@ fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Resul
         }
         sums.push(sum);
     }
-    let Some(weights) = ensemble::weigh(&sums)? else {
+    let Some(weights) = ensemble::fit_weights(&sums)? else {
         dir.warn("no square of capture.tiles shows the head: the members are blended alike");
         return Ok((shares(c), Value::Null));
     };

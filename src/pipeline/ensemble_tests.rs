@@ -108,7 +108,7 @@ impl ByHeart {
 }
 
 impl Radiance for ByHeart {
-    fn see(&self, rays: &[Ray], _: Vec3) -> Vec<RayResult> {
+    fn render_rays(&self, rays: &[Ray], _: Vec3) -> Vec<RayResult> {
         self.asked.fetch_add(rays.len(), std::sync::atomic::Ordering::Relaxed);
         let see = |ray: &Ray| {
             let own = |(camera, _): &&(Camera, Image)| camera.position.as_vec3().distance(ray.origin) < 1e-5;

@@ -422,8 +422,8 @@ mod tests {
             for (found, t) in corners.iter().zip(0..) {
                 let expected = mesh.corners(t).map(exact);
                 // whoever looks at the file finds the world there
-                let there = file_from_world.point_f64(expected[0]) - translation;
-                assert!(there.distance(found[0].as_dvec3()) < close, "{there}");
+                let wanted = file_from_world.point_f64(expected[0]) - translation;
+                assert!(wanted.distance(found[0].as_dvec3()) < close, "{wanted}");
                 for (p, e) in found.iter().zip(expected) {
                     // z up: (x, y, z) becomes (x, z, −y)
                     let e = DVec3::new(e.x, e.z, -e.y) - translation;

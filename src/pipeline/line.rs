@@ -69,11 +69,11 @@ impl<'a> Line<'a> {
     /// The capture of a run that is done may lie somewhere else by now: its cameras are then those that the run
     /// remembers, and nothing can be worked on ([`Line::remember`]).
     pub fn open(config: &'a Config, run: &'a Run) -> Result<Line<'a>> {
-        feasible(config)?;
+        check_feasible(config)?;
         let options = capture_options(config);
         let (mut capture, (digest, inputs), clicks, gone) =
             match capture::open(Path::new(&config.capture.path), &options) {
-                Err(e) => remembered(config, run, e)?,
+                Err(e) => restore_from_run(config, run, e)?,
                 Ok(capture) => {
                     capture::require_masks(&capture, &options)?;
                     let digest = capture_digest(&capture)?;
@@ -110,7 +110,7 @@ impl<'a> Line<'a> {
     }
 
     /// Returns the line of the demo head, whose surface is known: the metrics compare the mesh with it.
-    pub fn of_demo(mut self) -> Line<'a> {
+    pub fn with_synthetic_truth(mut self) -> Line<'a> {
         self.synthetic = true;
         self.capture.name = "demo".into(); // its folder is called after what it holds
         self
@@ -118,13 +118,13 @@ impl<'a> Line<'a> {
 
     /// Returns the line whose stage `render` makes views of `render.cameras` in a folder of their own, and not those
     /// of the evaluation; a file of cameras is read here. For `test` the line as it is.
-    pub fn along(self, render: RenderConfig) -> Result<Line<'a>> {
+    pub fn with_camera_path(self, render: RenderConfig) -> Result<Line<'a>> {
         let path = CameraPath::new(render, &self.capture)?;
         Ok(Line { path, ..self })
     }
 
     /// A view as it is judged: with the capture's own mask, if it has one.
-    pub(super) fn judged(&self, view: &View) -> View {
+    pub(super) fn evaluation_view(&self, view: &View) -> View {
         let place = self.capture.views.iter().position(|v| v.name == view.name);
         let own = self.own_masks.as_ref().zip(place).map(|(own, i)| own.masks[i].clone());
         View { mask: own.filter(|m| *m != ViewMask::None).unwrap_or(view.mask.clone()), ..view.clone() }
@@ -132,13 +132,13 @@ impl<'a> Line<'a> {
 
     /// Whose masks say where figures of held-out views count: `capture`, `run` (made by this run, for one of them at least:
     /// others may judge otherwise) or `none`.
-    pub(super) fn judges(&self) -> &'static str {
+    pub(super) fn mask_source(&self) -> &'static str {
         let held_out: Vec<&View> = self.capture.views.iter().filter(|v| v.split != Split::Train).collect();
         let all: Vec<&View> = self.capture.views.iter().collect();
         let judged = if held_out.is_empty() { all } else { held_out };
-        let is_own = |view: &&View| self.judged(view).mask != view.mask;
+        let is_own = |view: &&View| self.evaluation_view(view).mask != view.mask;
         match &self.own_masks {
-            _ if judged.iter().all(|v| self.judged(v).mask == ViewMask::None) => "none",
+            _ if judged.iter().all(|v| self.evaluation_view(v).mask == ViewMask::None) => "none",
             Some(_) if !judged.iter().all(is_own) => "run",
             _ => "capture",
         }
@@ -199,7 +199,7 @@ impl<'a> Line<'a> {
     /// device.
     pub(super) fn require_inputs(&self, stages: &[Stage]) -> Result<()> {
         if let Some(problem) = self.gone.as_ref().filter(|_| !stages.is_empty()) {
-            return Err(gone(problem));
+            return Err(missing_capture(problem));
         }
         let mut lost =
             self.imports.iter().filter(|i| stages.contains(&i.stage)).filter_map(|i| i.gone.clone());
@@ -231,7 +231,7 @@ impl<'a> Line<'a> {
 }
 
 /// Refuses settings that contradict each other, and a box that is none.
-pub fn feasible(config: &Config) -> Result<()> {
+pub fn check_feasible(config: &Config) -> Result<()> {
     if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
         return Err(Error::usage(format!("`{key}` {problem}"), hint));
     }
@@ -366,7 +366,7 @@ fn is_missing(e: &io::ReadError) -> bool {
 ///
 /// `error` itself if the capture is there, and it tells what is wrong with it, or if there is no run yet; else that the
 /// run has not come far enough to remember it.
-fn remembered(
+fn restore_from_run(
     config: &Config,
     run: &Run,
     error: Error,
@@ -376,16 +376,18 @@ fn remembered(
         return Err(error);
     }
     let problem = error.to_string();
-    let record = read_record(&run.path(Stage::Mask)).ok().flatten().ok_or_else(|| gone(&problem))?;
-    let capture = scene_file::read_capture(&run.path("cameras.json"), root).map_err(|_| gone(&problem))?;
+    let record =
+        read_record(&run.path(Stage::Mask)).ok().flatten().ok_or_else(|| missing_capture(&problem))?;
+    let capture =
+        scene_file::read_capture(&run.path("cameras.json"), root).map_err(|_| missing_capture(&problem))?;
     let mut inputs = record.fingerprint.inputs;
     let digest = inputs.remove("capture").unwrap_or_default();
-    let clicks = config.mask.made().then(|| MaskPrompts::remembered(&inputs));
+    let clicks = config.mask.made().then(|| MaskPrompts::from_inputs(&inputs));
     Ok((capture, (digest, BTreeMap::new()), clicks, Some(problem)))
 }
 
 /// The capture of a run that has work left is no longer where it was.
-fn gone(problem: &str) -> Error {
+fn missing_capture(problem: &str) -> Error {
     Error::cannot(
         format!("the capture of this run cannot be opened: {problem}"),
         "say where it lies now: `--set capture.path=FOLDER`; the same photographs give the same run",

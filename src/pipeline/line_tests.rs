@@ -117,7 +117,7 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     config.ensemble.members = vec![Method::Raycast];
     config.ensemble.weights = vec![1.0];
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
+    let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
     line.remember(Stage::Metrics).unwrap();
     assert_eq!(complete(&line, Stage::Mask, &NoFields).unwrap().summary["masks"], 14);
     let scene = line.scene().unwrap();
@@ -198,7 +198,7 @@ fn the_textured_head_looks_like_the_field_it_was_baked_from() {
         config.mesh.normal_map = lobes > 0;
         config.mesh.frame = frame;
         let run = quiet(&dir.path().join(errors.len().to_string()));
-        let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
+        let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
         line.remember(Stage::Render).unwrap();
         complete(&line, Stage::Mask, &NoFields).unwrap();
         let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
@@ -255,7 +255,7 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     config.render.method = vec![Method::Textured];
     config.ensemble.members = Vec::new();
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
+    let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
     line.remember(Stage::Render).unwrap();
     complete(&line, Stage::Mask, &NoFields).unwrap();
     let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
@@ -266,7 +266,7 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     let error = complete(&line, Stage::Render, &exact).unwrap_err();
     assert!(error.hint().contains("--texture"), "{error}");
     config.mesh.lobes = 1;
-    let error = Line::open(&config, &run).map(Line::of_demo).err().unwrap();
+    let error = Line::open(&config, &run).map(Line::with_synthetic_truth).err().unwrap();
     assert!(error.to_string().contains("mesh.lobes") && error.hint().contains("texture_px"), "{error}");
 }
 
@@ -334,7 +334,7 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
         config.mesh.texture_px = 0;
         config.mesh.genus = genus;
         let run = Run::quiet(&dir.path().join(format!("{genus:?}")));
-        let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
+        let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
         line.remember(Stage::Mesh).unwrap();
         complete(&line, Stage::Mask, &NoFields).unwrap();
         let world_from_scene = line.scene().unwrap().scene_from_world.inverse();
@@ -363,7 +363,7 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
 struct Fog(std::sync::atomic::AtomicUsize, Option<Stop>);
 
 impl Radiance for Fog {
-    fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
+    fn render_rays(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
         let views = self.0.fetch_add(1, std::sync::atomic::Ordering::SeqCst) + 1;
         if let Some(stop) = self.1.as_ref().filter(|_| views == 2) {
             stop.request(ErrorKind::Interrupted);
@@ -600,7 +600,7 @@ fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
         method: vec![Method::Raycast],
         ..config.render.clone()
     };
-    let line = Line::open(&config, &run).unwrap().along(orbit).unwrap();
+    let line = Line::open(&config, &run).unwrap().with_camera_path(orbit).unwrap();
     line.run.stage(line.plan(Stage::Render), |_| Ok(json!(null))).unwrap();
     for (material, triangles, expected) in [
         (Material::Unlit, config.mesh.triangles, &["mesh"][..]),
@@ -666,7 +666,7 @@ fn the_frame_of_a_file_shapes_nothing_that_views_show() {
         config.mesh.texture_px = 128;
         config.mesh.frame = frame;
         let run = Run::quiet(&dir.path().join(format!("{frame:?}")));
-        let line = Line::open(&config, &run).map(Line::of_demo).unwrap();
+        let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
         complete(&line, Stage::Mask, &NoFields).unwrap();
         let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
         complete(&line, Stage::Mesh, &exact).unwrap();

@@ -19,7 +19,7 @@ use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshReport, Patches, Photograph};
-use crate::run::{Phase, Record, StageDir, StageStanding, Status};
+use crate::run::{Phase, Record, StageDir, StageStatus, Status};
 use crate::{Error, Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
@@ -195,8 +195,7 @@ pub fn export_head(line: &Line, format: MeshFormat, stem: &str) -> Result<Export
 ///
 /// It is not done; the error says whether a process works on it.
 pub(super) fn finished_mesh(run: &Path) -> Result<Record> {
-    let StageStanding { phase, status, record, .. } =
-        StageStanding::read(&run.join(Stage::Mesh), Stage::Mesh);
+    let StageStatus { phase, status, record, .. } = StageStatus::read(&run.join(Stage::Mesh), Stage::Mesh);
     let shown = run.display();
     record.ok_or_else(|| match status.filter(|_| phase == Phase::Running) {
         Some(Status { pid, host, .. }) => Error::not_now(

@@ -78,7 +78,7 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     let mut out = Map::new();
     let sets = picture_sets(line);
     let judged: Vec<Vec<Comparable>> = sets.iter().map(|set| comparable(line, set)).collect();
-    let mut views: Vec<View> = judged.iter().flatten().map(|c| line.judged(c.view)).collect();
+    let mut views: Vec<View> = judged.iter().flatten().map(|c| line.evaluation_view(c.view)).collect();
     views.sort_by(|a, b| a.name.cmp(&b.name));
     views.dedup_by(|a, b| a.name == b.name);
     let lpips = measure(line.config)?;
@@ -104,7 +104,10 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
         out.insert("truth_percent_of_head".into(), json!(truth));
     }
     out.extend(blend_gain(&out, &line.config.ensemble.members).map(|gain| ("blend".into(), gain)));
-    out.insert("truth".into(), json!({"photographs": line.config.metrics.truth, "masks": line.judges()}));
+    out.insert(
+        "truth".into(),
+        json!({"photographs": line.config.metrics.truth, "masks": line.mask_source()}),
+    );
     let value = Value::Object(out);
     io::write_atomic(&dir.folder().join("metrics.json"), format!("{value:#}\n").as_bytes())?;
     Ok(means(&value))
@@ -129,7 +132,7 @@ fn figures(
 ) -> Result<ViewFigures> {
     let config = &line.config.render;
     let background = config.background;
-    let loaded = line.judged(picture.view).load(&Limits::default())?;
+    let loaded = line.evaluation_view(picture.view).load(&Limits::default())?;
     let render = pictures::read(&picture.file, config.format)?;
     let photo = match line.config.metrics.truth {
         TruthPhoto::Photo => loaded.photo.clone(),
@@ -229,15 +232,15 @@ pub fn against_truth(mesh: &Mesh, points: usize) -> Option<Truth> {
         .map(|p| SyntheticHead.distance(p))
         .collect();
     let bvh = Bvh::new(mesh);
-    let there: Vec<f32> = SyntheticHead
+    let to_mesh: Vec<f32> = SyntheticHead
         .surface_points(points, 1)
         .into_par_iter()
         .filter(|&p| SyntheticHead.is_head(p))
         .filter_map(|p| bvh.closest_point(p).map(|c| c.distance))
         .collect();
-    let count = here.len().min(there.len());
+    let count = here.len().min(to_mesh.len());
     let (accuracy_mean, accuracy_p90) = summary(here)?;
-    let (completeness_mean, completeness_p90) = summary(there)?;
+    let (completeness_mean, completeness_p90) = summary(to_mesh)?;
     Some(Truth { points: count, accuracy_mean, accuracy_p90, completeness_mean, completeness_p90 })
 }
 

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 struct Fog;
 
 impl Radiance for Fog {
-    fn see(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
+    fn render_rays(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
         vec![RayResult { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..RayResult::default() }; rays.len()]
     }
 }
@@ -98,7 +98,7 @@ fn camera_paths_never_touch_the_evaluations_views() {
     let eye = "[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]";
     std::fs::write(&flight, format!(r#"{{"frames": [{{"transform_matrix": {eye}}}]}}"#)).unwrap();
     for (cameras, views) in [("orbit", 3), ("train", 4), (flight.to_str().unwrap(), 1)] {
-        let line = open().along(turn(&config, cameras)).unwrap();
+        let line = open().with_camera_path(turn(&config, cameras)).unwrap();
         // nothing but what the views show, and nothing that builds on them
         assert_eq!(words(&line.order(Stage::Render)), "mask tface render");
         line.fresh(Stage::Render, Stage::Render).unwrap();
@@ -132,16 +132,21 @@ fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
     let line = || Line::open(&config, &run).unwrap();
     evaluate(&line());
     let orbit = turn(&config, "orbit");
-    complete(&line().along(orbit.clone()).unwrap(), Stage::Render, &Fog).unwrap();
-    complete(&line().along(turn(&config, "train")).unwrap(), Stage::Render, &Fog).unwrap();
-    let black = line().along(RenderConfig { background: ViewBackground::Black, ..orbit.clone() }).unwrap();
+    complete(&line().with_camera_path(orbit.clone()).unwrap(), Stage::Render, &Fog).unwrap();
+    complete(&line().with_camera_path(turn(&config, "train")).unwrap(), Stage::Render, &Fog).unwrap();
+    let black =
+        line().with_camera_path(RenderConfig { background: ViewBackground::Black, ..orbit.clone() }).unwrap();
     let e = black.remember(Stage::Render).unwrap_err();
     assert!(e.to_string().contains("render.background: was \"white\", is \"black\""), "{e}");
     assert!(e.hint().contains("`--fresh render`") && e.hint().contains("nothing else"), "{}", e.hint());
     black.fresh(Stage::Render, Stage::Render).unwrap();
     assert!(!complete(&black, Stage::Render, &Fog).unwrap().skipped);
     assert_eq!(evaluate(&line()), [true; 4]);
-    assert!(complete(&line().along(turn(&config, "train")).unwrap(), Stage::Render, &Fog).unwrap().skipped);
+    assert!(
+        complete(&line().with_camera_path(turn(&config, "train")).unwrap(), Stage::Render, &Fog)
+            .unwrap()
+            .skipped
+    );
     // the held-out views made anew are no reason to make others anew, another field is one
     line().fresh(Stage::Render, Stage::Metrics).unwrap();
     assert!(run.path("render/paths/orbit/done.json").is_file() && !run.path("render/done.json").is_file());
@@ -157,7 +162,7 @@ fn views_of_a_path_whose_records_cannot_be_read_are_made_anew_with_any_field() {
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
     evaluate(&Line::open(&config, &run).unwrap());
-    let line = Line::open(&config, &run).unwrap().along(turn(&config, "orbit")).unwrap();
+    let line = Line::open(&config, &run).unwrap().with_camera_path(turn(&config, "orbit")).unwrap();
     complete(&line, Stage::Render, &Fog).unwrap();
     let orbit = "render/paths/orbit".to_string();
     let is_out_of_date = |stage| line.out_of_date(stage).unwrap().contains(&orbit);
@@ -178,7 +183,7 @@ fn a_file_of_cameras_is_read_before_anything_is_learned() {
     let along = |text: &str| {
         std::fs::write(&path, text).unwrap();
         let line = Line::open(&config, &run).unwrap();
-        let line = line.along(turn(&config, path.to_str().unwrap()))?;
+        let line = line.with_camera_path(turn(&config, path.to_str().unwrap()))?;
         Ok::<_, crate::Error>(line.views().to_owned())
     };
     let e = along("{}").unwrap_err();
@@ -221,7 +226,7 @@ fn an_evaluation_of_other_cameras_than_the_held_out_ones_is_refused_with_the_way
         "{}",
         e.hint()
     );
-    assert!(line.outlook(Stage::Metrics).is_err() && !run.dir().exists());
+    assert!(line.stage_states(Stage::Metrics).is_err() && !run.dir().exists());
 }
 
 #[test]
@@ -276,7 +281,7 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
 
     let line = Line::open(&config, &run).unwrap();
     assert_eq!(evaluate(&line), [true; 4]);
-    assert!(line.outlook(Stage::Metrics).is_ok());
+    assert!(line.stage_states(Stage::Metrics).is_ok());
     assert!(before == files(run.dir()));
     let again = Export::new(line.capture(), &config);
     assert_eq!((again.name, again.up, again.cameras), (export.name, export.up, export.cameras));
@@ -286,7 +291,7 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
         line.fresh(Stage::Metrics, Stage::Metrics).unwrap_err(),
         Line::open(&config, &run)
             .unwrap()
-            .along(turn(&config, "orbit"))
+            .with_camera_path(turn(&config, "orbit"))
             .unwrap()
             .remember(Stage::Render)
             .unwrap_err(),

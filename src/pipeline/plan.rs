@@ -72,7 +72,7 @@ impl Line<'_> {
     /// What would be done for `until`: the folder of each stage with `None` if it has to be worked on, else what
     /// differs from the result that lies there (nothing, if it is done). An error if the settings contradict
     /// each other. Nothing is written.
-    pub fn outlook(&self, until: Stage) -> Result<Vec<(String, Option<Vec<String>>)>> {
+    pub fn stage_states(&self, until: Stage) -> Result<Vec<(String, Option<Vec<String>>)>> {
         self.can_make(until)?;
         let (mut found, mut missing) = (Vec::new(), Vec::new());
         for stage in self.order(until) {

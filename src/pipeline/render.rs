@@ -29,7 +29,7 @@ use crate::{Error, Monitor, Result};
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
 
-/// Makes one folder per method, one picture per camera, of the held-out views or along a path ([`Line::along`]). Only
+/// Makes one folder per method, one picture per camera, of the held-out views or along a path ([`Line::with_camera_path`]). Only
 /// those `fields` are asked for that the methods show.
 pub(super) fn render(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<Value> {
     let c = line.render_config();
@@ -229,7 +229,7 @@ impl<'a> Renderer<'a> {
                 // a large view takes minutes: nobody who asks to stop waits for the rest of it
                 let see = |rays: &[Ray]| match self.monitor.stop() {
                     true => Vec::new(),
-                    false => field.see(rays, camera.forward()),
+                    false => field.render_rays(rays, camera.forward()),
                 };
                 Some(march(camera, &self.world_from_scene, false, see))
             }
@@ -274,7 +274,7 @@ mod tests {
     use crate::Quiet;
     use crate::config::Stage;
     use crate::geom::{Aabb, Mesh};
-    use crate::mesh::{Cap, Skin};
+    use crate::mesh::{Cap, RimVertex};
     use glam::Vec3;
 
     /// A field that is red everywhere.
@@ -323,7 +323,8 @@ mod tests {
             triangles: vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]],
             ..Mesh::default()
         };
-        let skin = Skin { position: Vec3::new(-0.9, 0.0, 0.9), normal: -Vec3::X, color: [0.0, 1.0, 0.0] };
+        let skin =
+            RimVertex { position: Vec3::new(-0.9, 0.0, 0.9), normal: -Vec3::X, color: [0.0, 1.0, 0.0] };
         let cap = Cap { bounds: Aabb::SCENE, near: 1e-4, ring: vec![skin] };
         let camera = Camera::above(8, 8, 8.0, 4.0);
         let look = |cap: Option<Cap>| {

@@ -94,7 +94,7 @@ impl ClosedSurface<'_> {
 pub trait Radiance: Sync {
     /// What rays in scene coordinates see, of a camera that looks along the unit vector `forward`; normals
     /// are not asked for. `[n]` → `[n]`.
-    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult>;
+    fn render_rays(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult>;
 }
 
 /// The trained fields, each loaded when it is first asked for.
@@ -168,7 +168,7 @@ impl Surface for crate::iface::DensityField {
 }
 
 impl Radiance for crate::tface::FieldMean {
-    fn see(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
+    fn render_rays(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         self.render(rays, forward)
     }
 }

@@ -5,7 +5,7 @@ use crate::Result;
 use crate::capture::synthetic::SyntheticHead;
 use crate::config::{Config, NAMES, Stage, called};
 use crate::io;
-use crate::run::{Phase, Record, Standing};
+use crate::run::{Phase, Record, RunStatus};
 use minijinja::context;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -63,7 +63,7 @@ impl RunRow {
     /// Reads what the run in a folder says of itself; its page is linked from one in `beside`. A file that is missing or
     /// damaged leaves its figures out: one run must not hide the others.
     pub fn read(run: &Path, beside: &Path) -> RunRow {
-        let standing = Standing::read(run);
+        let standing = RunStatus::read(run);
         let records: Vec<(Stage, &Record)> =
             standing.stages.iter().filter_map(|s| Some((s.stage, s.record.as_ref()?))).collect();
         let of = |stage| records.iter().find(|(s, _)| *s == stage).map(|(_, r)| &r.summary);
@@ -110,7 +110,7 @@ impl RunRow {
 }
 
 /// Where a run stands, in words.
-fn state(run: &Standing) -> String {
+fn state(run: &RunStatus) -> String {
     let stage = run.stages.iter().find(|s| Some(s.stage) == run.at);
     let place = stage.map_or(String::new(), |s| format!("{} ", s.stage));
     let percent = stage.and_then(|s| s.status.as_ref()?.percent());

@@ -275,7 +275,7 @@ struct CurrentStage {
 }
 
 /// A stage is at work as long as this lives.
-pub(super) struct AtWork<'a>(&'a Stop);
+pub(super) struct ActiveGuard<'a>(&'a Stop);
 
 impl Stop {
     /// Not requested.
@@ -324,10 +324,10 @@ impl Stop {
         }
     }
 
-    pub(super) fn at_work(&self, progress: &Arc<Progress>, saves: bool) -> AtWork<'_> {
+    pub(super) fn at_work(&self, progress: &Arc<Progress>, saves: bool) -> ActiveGuard<'_> {
         *self.current() =
             CurrentStage { stage: Some((progress.clone(), saves)), since: Some(Instant::now()) };
-        AtWork(self)
+        ActiveGuard(self)
     }
 
     fn current(&self) -> std::sync::MutexGuard<'_, CurrentStage> {
@@ -335,7 +335,7 @@ impl Stop {
     }
 }
 
-impl Drop for AtWork<'_> {
+impl Drop for ActiveGuard<'_> {
     fn drop(&mut self) {
         *self.0.current() = CurrentStage { stage: None, since: Some(Instant::now()) };
     }

@@ -89,7 +89,7 @@ fn losses_follow_those_of_the_cpu_and_nobody_waits() {
 /// PSNR of two photographs; a device sees the same.
 fn psnr(views: &[TrainView], dir: &Path) -> f64 {
     let face = TFace::load("tface", dir).unwrap();
-    let there =
+    let on_gpu =
         FieldMean::load("tface", dir, 1)
             .unwrap()
             .on(field::compute_device("wgpu:0", &crate::tface::VM_TEST).unwrap());
@@ -100,12 +100,12 @@ fn psnr(views: &[TrainView], dir: &Path) -> f64 {
             .collect();
         let mask = &view.mask.as_ref().unwrap().values;
         let forward = view.camera.forward();
-        for (p, (seen, there)) in
-            face.render(&rays, forward).iter().zip(there.render(&rays, forward)).enumerate()
+        for (p, (seen, on_gpu)) in
+            face.render(&rays, forward).iter().zip(on_gpu.render(&rays, forward)).enumerate()
         {
             let close = |a: f32, b: f32| (a - b).abs() < 1e-4;
-            assert!((0..3).all(|c| close(seen.color[c], there.color[c])), "{seen:?} {there:?}");
-            assert!(close(seen.opacity, there.opacity) && close(seen.depth, there.depth));
+            assert!((0..3).all(|c| close(seen.color[c], on_gpu.color[c])), "{seen:?} {on_gpu:?}");
+            assert!(close(seen.opacity, on_gpu.opacity) && close(seen.depth, on_gpu.depth));
             let a = mask[p] as f64 / 255.0;
             let want = view.photo.rgb[p].map(|c| a * c as f64 / 255.0);
             sum += (0..3).map(|c| (seen.color[c] as f64 - want[c]).powi(2)).sum::<f64>();

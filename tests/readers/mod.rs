@@ -14,7 +14,7 @@ use tiface::mesh::files::{ExtractedSurface, HeadMesh, ReadOptions, check_around,
 use tiface::pipeline::Line;
 use tiface::report::RunRow;
 use tiface::report::experiment::{ExperimentRow, read_published};
-use tiface::run::{Run, Standing, read_estimate, read_record, read_status};
+use tiface::run::{Run, RunStatus, read_estimate, read_record, read_status};
 use tiface::tface::TFace;
 
 /// A reader gets a folder of its own, prepared by [`prepare`], and the bytes. It must come back, with whatever it
@@ -213,7 +213,7 @@ fn run(dir: &Path, bytes: &[u8]) -> String {
     put(&dir.join("run"), "estimate.json", parts.next().unwrap_or(b"{}"));
     put(&dir.join("run"), "failed.json", parts.next().unwrap_or_default());
     RunRow::read(&dir.join("run"), dir);
-    Standing::read(&dir.join("run"));
+    RunStatus::read(&dir.join("run"));
     told(read_record(&mask)) + &told(read_status(&mask)) + &told(read_estimate(&dir.join("run")))
 }
 

@@ -500,8 +500,8 @@ pub(crate) mod tests {
     #[test]
     fn what_is_copied_there_comes_back() {
         let Some(device) = device() else { return };
-        let there = device.upload(&[1.5f32, -2.0, 3.0]);
-        assert_eq!(device.read::<f32>(&there), [1.5, -2.0, 3.0]);
+        let uploaded = device.upload(&[1.5f32, -2.0, 3.0]);
+        assert_eq!(device.read::<f32>(&uploaded), [1.5, -2.0, 3.0]);
         assert_eq!(device.read::<u32>(&device.zeros::<u32>(5)), [0; 5]);
         assert_eq!(device.counts(), (0, 2));
         println!("{} adds floats: {:?}", device.name(), device.atomics());

@@ -99,10 +99,10 @@ impl Evaluator {
             let span = first..(first + CAPACITY).min(x.len());
             let mut sizes = FEWER.into_iter().zip(&self.fewer).chain([(CAPACITY, &self.sdf)]);
             let (capacity, sdf) = sizes.find(|(c, _)| *c >= span.len()).expect("no span is longer");
-            let there = |rows: &[[f32; 3]]| device.upload(&planes(&rows[span.clone()], capacity));
-            let at = there(x);
-            let toward = direction.map(there);
-            let normal = normal.map(there);
+            let upload = |rows: &[[f32; 3]]| device.upload(&planes(&rows[span.clone()], capacity));
+            let at = upload(x);
+            let toward = direction.map(upload);
+            let normal = normal.map(upload);
             let count = device.upload(&[span.len() as u32]);
             let seen = sdf.shade(
                 device,
@@ -166,28 +166,28 @@ mod tests {
         let flatten = |rows: Vec<[f32; 3]>| rows.into_flattened();
         let mut mask = Bitmask::filled(8, true);
         (0..512).step_by(3).for_each(|i| mask.set(i, false));
-        let mut there =
+        let mut evaluator =
             Evaluator::new(device, &shape, table.as_flattened(), &flat, 20.0, [Some(&mask), None]);
 
         // one point, some, and more than a small batch holds
         for n in [1, 700, 1100] {
             let some: Vec<[f32; 3]> = x.iter().copied().cycle().take(n).collect();
-            let got = there.evaluate(&some, None, None, 0..1).unwrap();
+            let got = evaluator.evaluate(&some, None, None, 0..1).unwrap();
             let want: Vec<f32> =
                 sdf::gradients(&shape, &table, &weights, &some).iter().map(|w| w.0).collect();
             agree("distances of a few", &got[0], &want, 1e-4);
         }
-        let got = there.evaluate(&x, None, None, 0..4).unwrap();
+        let got = evaluator.evaluate(&x, None, None, 0..4).unwrap();
         let want = sdf::gradients(&shape, &table, &weights, &x);
         agree("distances", &got[0], &want.iter().map(|w| w.0).collect::<Vec<_>>(), 1e-4);
         for axis in 0..3 {
             agree("slopes", &got[1 + axis], &want.iter().map(|w| w.1[axis]).collect::<Vec<_>>(), 1e-4);
         }
-        let soft = there.evaluate(&x, None, None, 7..8).unwrap();
+        let soft = evaluator.evaluate(&x, None, None, 7..8).unwrap();
         agree("softness", &soft[0], &sdf::softness(&shape, &table, &weights, &x), 1e-4);
         // any unit vectors as normals
         let normal: Vec<[f32; 3]> = direction.iter().rev().copied().collect();
-        let got = there.evaluate(&x, Some(&direction), Some(&normal), 4..7).unwrap();
+        let got = evaluator.evaluate(&x, Some(&direction), Some(&normal), 4..7).unwrap();
         let want = sdf::colors(&shape, &table, &weights, &x, &normal, None, &direction);
         agree("colors", &got.concat(), &planes(&want, x.len()), 1e-4);
 
@@ -199,7 +199,7 @@ mod tests {
                 MarchRay { origin, direction: d, jitter: 0.0 }
             })
             .collect();
-        let got = there.render(&rays, 0.04).unwrap();
+        let got = evaluator.render(&rays, 0.04).unwrap();
         assert_eq!(got.len(), rays.len());
         let some: Vec<usize> = (0..rays.len()).step_by(97).collect();
         let few: Vec<MarchRay> = some.iter().map(|&r| rays[r]).collect();

@@ -99,7 +99,7 @@ impl Vm {
         self.decoder.prepare(device, values.network);
         samples.march(device, &self.lattice, rays);
         self.density.gather(device, values.density, &samples.place, &samples.count, &along.feature);
-        along.weigh(device, samples);
+        along.compute_weights(device, samples);
         self.decoder.forward(device, &self.color, values.color, rays, samples, along);
         along.composite(device, samples);
         &along.out

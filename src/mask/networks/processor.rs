@@ -155,10 +155,10 @@ mod tests {
     fn the_folder_above_counts_only_from_a_folder_called_onnx() {
         let dir = tempfile::tempdir().unwrap();
         fs::write(dir.path().join("preprocessor_config.json"), "{}").unwrap();
-        for (folder, there) in [("onnx", true), ("weights", false)] {
+        for (folder, is_found) in [("onnx", true), ("weights", false)] {
             fs::create_dir(dir.path().join(folder)).unwrap();
             let found = beside(&dir.path().join(folder).join("model.onnx"), "sam").unwrap();
-            assert_eq!(found.is_some(), there);
+            assert_eq!(found.is_some(), is_found);
         }
     }
 }

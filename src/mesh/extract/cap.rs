@@ -20,12 +20,12 @@ pub struct Cap {
     /// How near to the box's face the cap lies.
     pub near: f32,
     /// Skin around the cap.
-    pub ring: Vec<Skin>,
+    pub ring: Vec<RimVertex>,
 }
 
 /// A point of the skin.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Skin {
+pub struct RimVertex {
     /// Where it is.
     pub position: Vec3,
     /// Unit normal, pointing out; zero where none is known.
@@ -58,7 +58,7 @@ impl Cap {
         }
         let all: Vec<usize> = (0..on_ring.len()).filter(|&i| on_ring[i]).collect();
         let step = all.len().div_ceil(RING).max(1);
-        let skin = |i: usize| Skin {
+        let skin = |i: usize| RimVertex {
             position: mesh.positions[i],
             normal: mesh.normals.get(i).copied().unwrap_or(Vec3::ZERO),
             color: mesh.colors.get(i).copied().unwrap_or([0.5; 3]),
@@ -75,7 +75,7 @@ impl Cap {
     /// The color of a point of the cap.
     pub fn color(&self, p: Vec3) -> [f32; 3] {
         let (mut sum, mut total) = ([0f64; 3], 0f64);
-        for Skin { position, color, .. } in &self.ring {
+        for RimVertex { position, color, .. } in &self.ring {
             // the fourth power keeps the middle from being gray of everything
             let w = 1.0 / f64::from(position.distance_squared(p)).max(1e-18).powi(2);
             total += w;

@@ -9,7 +9,7 @@
 use super::marching::{Volume, marching};
 use super::{MeshReport, NodeGrid, off_surface};
 use crate::geom::{Aabb, Mesh, topology};
-use crate::mesh::input::{answered, setting};
+use crate::mesh::input::{check_len, setting};
 use crate::{Error, Monitor, Result};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
@@ -49,7 +49,7 @@ pub fn extract_dense(
             points.extend((0..resolution * resolution).map(|i| inside.min + node(i) * spacing));
             for points in points.chunks(batch.max(1)) {
                 let found = sdf(points);
-                answered("signed distance", points.len(), found.len())?;
+                check_len("signed distance", points.len(), found.len())?;
                 values.extend(found);
             }
         }
@@ -86,12 +86,12 @@ pub fn extract_dense(
     let vertices = mesh.positions.chunks(batch.max(1)).zip(mesh.normals.chunks_mut(batch.max(1)));
     for (points, normals) in vertices {
         let (value, gradient) = sdf_gradient(points);
-        answered("gradient", points.len(), gradient.len())?;
+        check_len("gradient", points.len(), gradient.len())?;
         for (normal, g) in normals.iter_mut().zip(&gradient) {
             *normal = g.try_normalize().unwrap_or(*normal);
         }
         let colors = color(points, normals);
-        answered("color", points.len(), colors.len())?;
+        check_len("color", points.len(), colors.len())?;
         let tame = |c: f32| if c.is_finite() { c.clamp(0.0, 1.0) } else { 0.0 };
         mesh.colors.extend(colors.iter().map(|c| c.map(tame)));
         values.extend(value);

@@ -89,14 +89,14 @@ pub(super) fn cut_handles(
         let Some(loops) = LoopFinder::new(&mesh.positions, &mesh.triangles) else { break };
         let found = loops.short(longest, monitor)?;
         let discs = by_field(discs(&loops, found), |v| loops.place(v), sdf)?;
-        let mut work = Surgery::new(mesh, &loops);
+        let mut work = HandleCutter::new(mesh, &loops);
         for disc in &discs {
             if let Some(cut) = work.along(disc) {
                 let lengths = if cut { &mut report.cut } else { &mut report.filled };
                 lengths.push(disc.rim.length);
             }
         }
-        let Surgery { next, basis, .. } = work;
+        let HandleCutter { next, basis, .. } = work;
         if basis.is_empty() {
             let shortest = discs.iter().map(|d| d.rim.length).min_by(f32::total_cmp);
             report.left_length = shortest.or_else(|| loops.some_length());
@@ -162,7 +162,7 @@ fn by_field(
 }
 
 /// A surface on which several loops are cut, none of which touches another.
-struct Surgery<'a> {
+struct HandleCutter<'a> {
     mesh: &'a Mesh,
     loops: &'a LoopFinder<'a>,
     boxes: Boxes,
@@ -184,9 +184,9 @@ struct CutPlan {
     caps: Vec<[u32; 3]>,
 }
 
-impl<'a> Surgery<'a> {
-    fn new(mesh: &'a Mesh, loops: &'a LoopFinder<'a>) -> Surgery<'a> {
-        Surgery {
+impl<'a> HandleCutter<'a> {
+    fn new(mesh: &'a Mesh, loops: &'a LoopFinder<'a>) -> HandleCutter<'a> {
+        HandleCutter {
             mesh,
             loops,
             boxes: Boxes::new((0..mesh.triangles.len() as u32).map(|t| span(mesh.corners(t)))),

@@ -272,15 +272,15 @@ impl<'a> Ball<'a> {
             }
             for side in self.loops.at(v) {
                 let w = self.loops.end(side) as usize;
-                let there = here + self.loops.length(side);
-                if there <= radius && there < self.distance[w] {
+                let farther = here + self.loops.length(side);
+                if farther <= radius && farther < self.distance[w] {
                     if self.distance[w] == f32::INFINITY {
                         self.reached.push(w as u32);
                     }
-                    self.distance[w] = there;
+                    self.distance[w] = farther;
                     self.word[w] = self.word[v as usize] ^ self.loops.word[side as usize];
                     self.back[w] = side;
-                    queue.push(Reverse((there.to_bits(), w as u32)));
+                    queue.push(Reverse((farther.to_bits(), w as u32)));
                 }
             }
         }

@@ -10,7 +10,7 @@
 
 use super::marching_cell::{CASES, CellSurface, INNER, crossing, resolve};
 use crate::geom::Mesh;
-use crate::mesh::input::few_enough;
+use crate::mesh::input::check_count;
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -169,7 +169,7 @@ impl Passes<'_> {
             total.inner += p.inner;
             total.triangles += p.triangles;
         }
-        few_enough(total.vertices + total.inner, total.triangles)?;
+        check_count(total.vertices + total.inner, total.triangles)?;
         rows.par_chunks_mut(ny).zip(&starts).for_each(|(rows, start)| {
             rows.iter_mut().flatten().for_each(|r| *r += start.vertices as u32);
         });
@@ -402,7 +402,7 @@ impl Bits {
 pub(super) fn crossings(bits: &Bits, j: usize, k: usize, axis: usize, mut found: impl FnMut(usize, u64)) {
     let [nx, ny, nz] = bits.dims;
     let here = bits.row(j, k);
-    let there = match axis {
+    let next_layer = match axis {
         0 => {
             for w in 0..here.len() {
                 let next = here.get(w + 1).copied().unwrap_or(0);
@@ -417,7 +417,7 @@ pub(super) fn crossings(bits: &Bits, j: usize, k: usize, axis: usize, mut found:
         2 if k + 1 < nz => bits.row(j, k + 1),
         _ => return,
     };
-    for (w, (a, b)) in here.iter().zip(there).enumerate() {
+    for (w, (a, b)) in here.iter().zip(next_layer).enumerate() {
         if a != b {
             found(64 * w, a ^ b);
         }

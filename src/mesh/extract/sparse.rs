@@ -17,7 +17,7 @@
 use super::NodeGrid;
 use super::marching::LevelSet;
 use super::sparse_blocks::Blocks;
-use crate::mesh::input::{answered, setting};
+use crate::mesh::input::{check_len, setting};
 use crate::{Monitor, Result};
 use glam::Vec3;
 
@@ -123,7 +123,7 @@ impl Flood<'_> {
             let keep: Vec<usize> = (0..points.len()).filter(|&i| inside(points[i])).collect();
             let evaluated: Vec<Vec3> = keep.iter().map(|&i| points[i]).collect();
             let answer = if evaluated.is_empty() { Vec::new() } else { (self.field)(&evaluated) };
-            answered("signed distance", evaluated.len(), answer.len())?;
+            check_len("signed distance", evaluated.len(), answer.len())?;
             for (&i, &v) in keep.iter().zip(&answer) {
                 batch[i] = v;
                 if v.is_finite() {

@@ -9,7 +9,7 @@ use super::NodeGrid;
 use super::marching::{LevelSet, cell_point, edge_point, largest_neighbour, sided};
 use super::marching_cell::{CASES, CellSurface, EDGES, INNER, crossed, crossing, resolve};
 use crate::Result;
-use crate::mesh::input::few_enough;
+use crate::mesh::input::check_count;
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -180,7 +180,7 @@ impl Blocks {
         let counted: Vec<(u64, u64)> = order.par_iter().map(|&b| self.count(&self.blocks[b])).collect();
         let inner: u64 = counted.iter().map(|c| c.0).sum();
         let triangles: u64 = counted.iter().map(|c| c.1).sum();
-        few_enough(total + inner, triangles)?;
+        check_count(total + inner, triangles)?;
 
         out.positions = vec![Vec3::ZERO; (total + inner) as usize];
         out.triangles = vec![[0; 3]; triangles as usize];

@@ -43,7 +43,8 @@ pub fn compact_glb(bytes: &[u8], path: &Path) -> Result<Vec<u8>> {
     let source = Source { path, format: "GLB", options: &ReadOptions::DEFAULT };
     let glb = chunks(bytes, source)?;
     let root = GlbRoot::parse(&glb.json, source)?;
-    let looks: Looks = serde_json::from_slice(&glb.json).map_err(|e| source.broken("`materials`", e))?;
+    let looks: FileMaterials =
+        serde_json::from_slice(&glb.json).map_err(|e| source.broken("`materials`", e))?;
     let reader = GlbReader { root: &root, bin: glb.bin.as_deref().unwrap_or_default(), source };
     let (mut parts, mut file) = (Vec::new(), Packed::default());
     let (mut vertices, mut triangles) = (0, 0);
@@ -80,9 +81,9 @@ pub fn compact_glb(bytes: &[u8], path: &Path) -> Result<Vec<u8>> {
     document.pack()
 }
 
-/// How the parts of a file look.
+/// The materials of a file.
 #[derive(Deserialize)]
-struct Looks {
+struct FileMaterials {
     #[serde(default)]
     materials: Vec<Value>,
 }
@@ -148,7 +149,12 @@ impl Packed {
     }
 
     /// The new number of a material.
-    fn material(&mut self, index: u32, looks: &Looks, reader: &GlbReader) -> Result<Index<Material>> {
+    fn material(
+        &mut self,
+        index: u32,
+        looks: &FileMaterials,
+        reader: &GlbReader,
+    ) -> Result<Index<Material>> {
         if let Some(&known) = self.known.1.get(&index) {
             return Ok(known);
         }

@@ -13,7 +13,7 @@ use super::file_mesh::{HeadTexture, Lobes};
 use crate::geom::{Aabb, Atlas, Harmonics, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Photo;
 use crate::io::{self, Limits, ReadError, TensorValues};
-use crate::mesh::extract::{Cap, Skin};
+use crate::mesh::extract::{Cap, RimVertex};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3, Mat3, Vec2, Vec3};
 use std::collections::BTreeMap;
@@ -195,7 +195,7 @@ impl ExtractedSurface {
         io::create_folder(folder)?;
         let mut tensors = geometry(&self.mesh);
         if let Some(cap) = &self.cap {
-            let of = |value: &dyn Fn(&Skin) -> [f32; 3]| cap.ring.iter().map(value).collect::<Vec<_>>();
+            let of = |value: &dyn Fn(&RimVertex) -> [f32; 3]| cap.ring.iter().map(value).collect::<Vec<_>>();
             tensors.push(floats("cap_box", &[cap.bounds.min.to_array(), cap.bounds.max.to_array()]));
             tensors.push(floats("cap_near", &[[cap.near]]));
             tensors.push(floats("cap_ring", &of(&|s| s.position.to_array())));
@@ -226,7 +226,7 @@ impl ExtractedSurface {
             return Err(stored.missing("cap_ring"));
         }
         let ring = ring.into_iter().zip(normals).zip(colors);
-        let ring = ring.map(|((position, normal), color)| Skin { position, normal, color }).collect();
+        let ring = ring.map(|((position, normal), color)| RimVertex { position, normal, color }).collect();
         if min.cmpge(max).any() {
             return Err(stored.wrong("cap_box", format!("{min} to {max}"), "a box, its lowest corner first"));
         }
@@ -400,7 +400,7 @@ pub(super) mod tests {
     #[test]
     fn a_surface_comes_back_with_its_cap() {
         let dir = tempfile::tempdir().unwrap();
-        let skin = |x: f32| Skin { position: Vec3::splat(x), normal: Vec3::Y, color: [x, 0.5, 0.25] };
+        let skin = |x: f32| RimVertex { position: Vec3::splat(x), normal: Vec3::Y, color: [x, 0.5, 0.25] };
         let cap = Cap { bounds: Aabb::SCENE, near: 1e-5, ring: vec![skin(0.1), skin(0.2)] };
         let mesh = Mesh { colors: Vec::new(), ..head().mesh };
         for cap in [Some(Cap { ring: Vec::new(), ..cap.clone() }), Some(cap), None] {

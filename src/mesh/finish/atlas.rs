@@ -19,7 +19,7 @@ mod pack;
 
 use crate::geom::{Atlas, Mesh, THOROUGH, overlaps, turn};
 use crate::mesh::files::{UvReport, seams_facing, uv_check};
-use crate::mesh::input::{setting, sound};
+use crate::mesh::input::{check_indices, setting};
 use crate::{Error, Monitor, Result};
 use chart::{Flat, height, neighbours, part, upright};
 use divide::{divide, planar};
@@ -108,7 +108,7 @@ fn atlas_by(
     if mesh.triangles.is_empty() {
         return Err(Error::cannot("the mesh has no triangles", "check that `mesh` ended with a surface"));
     }
-    sound(mesh)?;
+    check_indices(mesh)?;
     let mut fallback = None;
     let mut layout = match charts(mesh, config, monitor) {
         Err(e) if !e.kind().is_stop() => {

@@ -26,7 +26,7 @@ mod rings;
 mod rounds;
 
 use crate::geom::Mesh;
-use crate::mesh::input::{Field, few_enough, finite, setting, sound};
+use crate::mesh::input::{Field, check_count, check_indices, finite, setting};
 use crate::{Monitor, Result};
 use crossing::crossings;
 use glam::Vec3;
@@ -80,9 +80,9 @@ pub fn simplify(
     let begin = Instant::now();
     config.check()?;
     finite(mesh)?;
-    sound(mesh)?;
+    check_indices(mesh)?;
     // corners are numbered by 32 bits, and rings grow in their pool
-    few_enough(mesh.positions.len() as u64, 16 * mesh.triangles.len() as u64)?;
+    check_count(mesh.positions.len() as u64, 16 * mesh.triangles.len() as u64)?;
     let before = mesh.triangles.len();
     let mut report = SimplifyReport { before, after: before, ..SimplifyReport::default() };
     if before == 0 || config.triangles >= before {

@@ -242,7 +242,7 @@ impl Along {
     }
 
     /// Computes the weights of samples from their features, and lists the samples that need a color.
-    pub fn weigh(&self, device: &Device, samples: &VmSamples) {
+    pub fn compute_weights(&self, device: &Device, samples: &VmSamples) {
         launch!(device, compute_weights::launch, self.groups(), UNITS;
             samples.offsets, self.feature, self.alpha, self.light, self.weight, self.ends, self.counts;
             self.shift, self.length, self.threshold, self.stop, self.softplus

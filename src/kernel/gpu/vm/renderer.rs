@@ -68,12 +68,12 @@ mod tests {
         let weights = DecoderWeights::new(case.field.decoder, &case.network);
         let want = render(&case.field, &case.density, &case.color, &weights, &case.rays).out;
         let values = [case.density.as_slice(), &case.color, &case.network];
-        let mut there = VmRenderer::new(Arc::new(device), &case.field, values);
-        agree("rendered", there.render(&case.rays).unwrap().as_flattened(), &want, 1e-4);
-        assert_eq!(there.pass, PASS);
+        let mut renderer = VmRenderer::new(Arc::new(device), &case.field, values);
+        agree("rendered", renderer.render(&case.rays).unwrap().as_flattened(), &want, 1e-4);
+        assert_eq!(renderer.pass, PASS);
         // room for a third of the samples
-        there.vm = Vm::with_room(&there.device, &case.field, PASS, 1600, false);
-        agree("rendered in passes", there.render(&case.rays).unwrap().as_flattened(), &want, 1e-4);
-        assert_eq!(there.pass, 125);
+        renderer.vm = Vm::with_room(&renderer.device, &case.field, PASS, 1600, false);
+        agree("rendered in passes", renderer.render(&case.rays).unwrap().as_flattened(), &want, 1e-4);
+        assert_eq!(renderer.pass, 125);
     }
 }

@@ -94,18 +94,18 @@ pub(super) fn room(case: &Case) -> usize {
 }
 
 /// Rays and values on a device.
-pub(super) struct There {
+pub(super) struct DeviceCase {
     pub vm: Vm,
     values: [Buffer; 3],
     pub rays: Batch,
     g_out: Buffer,
 }
 
-impl There {
-    pub fn new(device: &Device, case: &Case) -> There {
+impl DeviceCase {
+    pub fn new(device: &Device, case: &Case) -> DeviceCase {
         let n = room(case);
         let vm = Vm::new(device, &case.field, n, true);
-        There {
+        DeviceCase {
             values: [
                 vm.density.upload(device, &case.density),
                 vm.color.upload(device, &case.color),

@@ -1,7 +1,7 @@
 use super::super::Atomics;
 use super::super::device::Words;
 use super::super::device::tests::{agree, device, devices, planes};
-use super::test_case::{NARROW, Shape, There, case, on_cpu, room};
+use super::test_case::{DeviceCase, NARROW, Shape, case, on_cpu, room};
 use super::*;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm};
 use crate::kernel::cpu::vm::mask::Walk;
@@ -24,8 +24,8 @@ fn lattice_points_are_those_of_the_cpu_with_and_without_a_mask() {
     let Some(device) = device() else { return };
     for masked in [true, false] {
         let case = case(Shape { masked, ..NARROW }, 700);
-        let there = There::new(&device, &case);
-        there.vm.samples.march(&device, &there.vm.lattice, &there.rays);
+        let on_gpu = DeviceCase::new(&device, &case);
+        on_gpu.vm.samples.march(&device, &on_gpu.vm.lattice, &on_gpu.rays);
         let (mut t, mut offsets, mut points) = (vec![], vec![0u32], vec![]);
         for ray in &case.rays {
             let mut walk = Walk::new(&case.field.lattice, case.field.mask.as_ref(), ray);
@@ -35,11 +35,11 @@ fn lattice_points_are_those_of_the_cpu_with_and_without_a_mask() {
         }
         offsets.extend([t.len() as u32; 3]);
         points.extend([0; 3]);
-        println!("{} samples, {} at most", t.len(), there.vm.samples.t.words());
-        assert_eq!(device.read::<u32>(&there.vm.samples.count), [t.len() as u32; 2]);
-        assert_eq!(device.read::<u32>(&there.vm.samples.offsets), offsets);
-        assert_eq!(device.read::<u32>(&there.vm.samples.points), points);
-        agree("lattice points", &device.read::<f32>(&there.vm.samples.t)[..t.len()], &t, 1e-5);
+        println!("{} samples, {} at most", t.len(), on_gpu.vm.samples.t.words());
+        assert_eq!(device.read::<u32>(&on_gpu.vm.samples.count), [t.len() as u32; 2]);
+        assert_eq!(device.read::<u32>(&on_gpu.vm.samples.offsets), offsets);
+        assert_eq!(device.read::<u32>(&on_gpu.vm.samples.points), points);
+        agree("lattice points", &device.read::<f32>(&on_gpu.vm.samples.t)[..t.len()], &t, 1e-5);
     }
 }
 
@@ -50,9 +50,9 @@ fn rendered_rays_are_those_of_the_cpu() {
     {
         let case = case(shape, 300);
         let (want, _) = on_cpu(&case);
-        let there = There::new(&device, &case);
-        let got = there.render(&device).unwrap();
-        let [looked_up, colored, _] = there.vm.counts().map(|b| device.read::<u32>(b)[0] as u64);
+        let on_gpu = DeviceCase::new(&device, &case);
+        let got = on_gpu.render(&device).unwrap();
+        let [looked_up, colored, _] = on_gpu.vm.counts().map(|b| device.read::<u32>(b)[0] as u64);
         assert_eq!(colored, want.color_samples);
         assert!(looked_up >= want.density_samples && colored > 1000, "{looked_up} {colored}");
         agree("rendered", &got, &planes::<RAY_WIDTH>(want.out.as_chunks().0, room(&case)), 1e-4);
@@ -65,22 +65,22 @@ fn gradients_are_those_of_the_cpu_however_they_are_added() {
         let case = case(shape, 200);
         let (_, want) = on_cpu(&case);
         for device in devices() {
-            let mut there = There::new(&device, &case);
-            there.render(&device).unwrap();
-            let got = there.gradients(&device).unwrap();
+            let mut on_gpu = DeviceCase::new(&device, &case);
+            on_gpu.render(&device).unwrap();
+            let got = on_gpu.gradients(&device).unwrap();
             for (what, (got, want)) in ["density", "color", "decoder"].iter().zip(got.iter().zip(&want)) {
                 agree(&format!("{:?} gradient of the {what}", device.atomics()), got, want, 1e-4);
             }
             if device.atomics() == Atomics::Fixed {
                 assert_eq!(
-                    there.gradients(&device).unwrap(),
+                    on_gpu.gradients(&device).unwrap(),
                     got,
                     "whole numbers add to the same in any order"
                 );
             }
             // in pieces, the same
-            there.vm.decoder.chunk = 16 * TILE;
-            let pieces = there.gradients(&device).unwrap();
+            on_gpu.vm.decoder.chunk = 16 * TILE;
+            let pieces = on_gpu.gradients(&device).unwrap();
             agree("gradient of the color in pieces", &pieces[1], &got[1], 1e-4);
             agree("gradient of the decoder in pieces", &pieces[2], &got[2], 1e-4);
         }
@@ -93,9 +93,9 @@ fn gradients_agree_with_f64_finite_differences() {
     let mut errors = Vec::new();
     for shape in [WIDE, Shape { softplus: false, hidden: 32, ..WIDE }] {
         let case = case(shape, 24);
-        let there = There::new(&device, &case);
-        there.render(&device).unwrap();
-        let got = there.gradients(&device).unwrap().concat();
+        let on_gpu = DeviceCase::new(&device, &case);
+        on_gpu.render(&device).unwrap();
+        let got = on_gpu.gradients(&device).unwrap().concat();
         let mut x = reference::wide(&[case.density.as_slice(), &case.color, &case.network].concat());
         let loss = |x: &[f64]| -> f64 {
             let out = reference::vm::render(&case.field, x, &case.rays);

@@ -7,14 +7,14 @@ use rayon::prelude::*;
 
 /// Points of a surface that carry unknowns, between which a surface interpolates.
 pub struct Nodes {
-    place: Place,
+    place: NodeLayout,
     count: usize,
     /// Start of each node's neighbors in `near`; one more than there are nodes.
     near_start: Vec<u32>,
     near: Vec<u32>,
 }
 
-enum Place {
+enum NodeLayout {
     /// The vertices of these triangles.
     Vertices(Vec<[u32; 3]>),
     /// Texels: the corners of each triangle in texels, centers of texels at whole numbers; and the node of each
@@ -33,7 +33,7 @@ impl Nodes {
             .collect();
         edges.par_sort_unstable();
         edges.dedup();
-        Nodes::linked(Place::Vertices(mesh.triangles.clone()), mesh.positions.len(), &edges)
+        Nodes::linked(NodeLayout::Vertices(mesh.triangles.clone()), mesh.positions.len(), &edges)
     }
 
     /// Returns one node a texel that a bilinear look-up on a triangle can meet; neighbors beside and below.
@@ -69,10 +69,10 @@ impl Nodes {
             let below = node.get(i + width).copied();
             edges.extend([beside, below].into_iter().flatten().filter(|n| *n != u32::MAX).map(|n| [own, n]));
         }
-        Nodes::linked(Place::Texels { corners, width, height, node }, count as usize, &edges)
+        Nodes::linked(NodeLayout::Texels { corners, width, height, node }, count as usize, &edges)
     }
 
-    fn linked(place: Place, count: usize, edges: &[[u32; 2]]) -> Nodes {
+    fn linked(place: NodeLayout, count: usize, edges: &[[u32; 2]]) -> Nodes {
         let mut near_start = vec![0u32; count + 1];
         edges.iter().flatten().for_each(|&n| near_start[n as usize + 1] += 1);
         (0..count).for_each(|i| near_start[i + 1] += near_start[i]);
@@ -101,10 +101,10 @@ impl Nodes {
     pub fn under(&self, hit: &Hit, mut f: impl FnMut(u32, f32)) {
         let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
         match &self.place {
-            Place::Vertices(triangles) => {
+            NodeLayout::Vertices(triangles) => {
                 triangles[hit.triangle as usize].iter().zip(weights).for_each(|(&i, w)| f(i, w));
             }
-            Place::Texels { corners, width, height, node } => {
+            NodeLayout::Texels { corners, width, height, node } => {
                 let [a, b, c] = corners[hit.triangle as usize];
                 let p = weights[0] * a + weights[1] * b + weights[2] * c;
                 let (x, y) = (p.x.clamp(0.0, (width - 1) as f32), p.y.clamp(0.0, (height - 1) as f32));
@@ -126,7 +126,7 @@ impl Nodes {
 
     /// Returns the values of the texels of a picture of 3 channels, `[nodes]`; none of vertices.
     pub fn texels_of(&self, image: &Image) -> Vec<[f32; 3]> {
-        let Place::Texels { node, .. } = &self.place else { return Vec::new() };
+        let NodeLayout::Texels { node, .. } = &self.place else { return Vec::new() };
         let texels = image.data.as_chunks::<3>().0.iter().zip(node);
         texels.filter(|(_, n)| **n != u32::MAX).map(|(c, _)| *c).collect()
     }
@@ -148,7 +148,7 @@ impl Nodes {
 
     /// Returns the texels of `image` with the `values` `[nodes]` in their places, and which texels have one.
     pub fn onto(&self, values: &[[f32; 3]], image: &Image) -> (Vec<[f32; 3]>, Vec<bool>) {
-        let Place::Texels { node, .. } = &self.place else { return (values.to_vec(), Vec::new()) };
+        let NodeLayout::Texels { node, .. } = &self.place else { return (values.to_vec(), Vec::new()) };
         let texels = image.data.as_chunks::<3>().0.iter().zip(node);
         let texel = |(c, n): (&[f32; 3], &u32)| (*values.get(*n as usize).unwrap_or(c), *n != u32::MAX);
         texels.map(texel).unzip()

@@ -5,7 +5,7 @@
 //! with a border taken as joined to one vertex more, the same holds of edges. The triangles that stay
 //! may not turn by more than 60° nor become worse than a quality of 0.05, unless they were worse.
 
-use super::rings::{BORDER, Freedom, HELD, NONE, PlaneQuadric, Rings, best, lean};
+use super::rings::{BORDER, CollapseTarget, HELD, NONE, PlaneQuadric, Rings, best, lean};
 use crate::geom::shape;
 use glam::Vec3;
 
@@ -26,7 +26,7 @@ pub(super) struct FanTriangle {
 
 /// What is around an edge. Kept between collapses for its memory.
 #[derive(Default)]
-pub(super) struct Star {
+pub(super) struct EdgeLink {
     /// Triangles of a, then of b, that stay; the first `of_a` are a's.
     pub sides: Vec<FanTriangle>,
     of_a: usize,
@@ -40,9 +40,9 @@ pub(super) struct Star {
     epoch: u32,
 }
 
-impl Star {
-    pub(super) fn new(vertices: usize) -> Star {
-        Star { marks: vec![0; vertices], ..Star::default() }
+impl EdgeLink {
+    pub(super) fn new(vertices: usize) -> EdgeLink {
+        EdgeLink { marks: vec![0; vertices], ..EdgeLink::default() }
     }
 
     /// Looks around edge (a, b); false when its collapse would change the topology.
@@ -216,9 +216,9 @@ pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
         return None;
     }
     let freedom = match (fa & BORDER != 0, fb & BORDER != 0) {
-        (true, false) => Freedom::First,
-        (false, true) => Freedom::Second,
-        _ => Freedom::Free,
+        (true, false) => CollapseTarget::First,
+        (false, true) => CollapseTarget::Second,
+        _ => CollapseTarget::Free,
     };
     let [pa, pb] = [a, b].map(|v| rings.positions[v as usize]);
     Some(best(pa, &rings.spreads[a as usize], pb, &rings.spreads[b as usize], freedom))
@@ -234,7 +234,7 @@ mod tests {
         // on a parabola, so that nothing is degenerate
         let positions: Vec<Vec3> = (0..n).map(|i| i as f32).map(|x| Vec3::new(x, x * x, x * x * x)).collect();
         let rings = Rings::new(&Mesh { positions, triangles: triangles.to_vec(), ..Mesh::default() });
-        Star::new(n as usize).gather(&rings, a, b)
+        EdgeLink::new(n as usize).gather(&rings, a, b)
     }
 
     #[test]

@@ -338,7 +338,7 @@ fn times(m: &[f64; 6], v: DVec3) -> DVec3 {
 
 /// Where an edge may collapse to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Freedom {
+pub(super) enum CollapseTarget {
     /// Anywhere.
     Free,
     /// Only its first end.
@@ -351,7 +351,13 @@ pub(super) enum Freedom {
 ///
 /// Where the 3 × 3 system is worse than a condition of 1e6 or its solution lies far off, the better of
 /// the ends and the middle.
-pub(super) fn best(a: Vec3, qa: &PlaneQuadric, b: Vec3, qb: &PlaneQuadric, freedom: Freedom) -> (Vec3, f32) {
+pub(super) fn best(
+    a: Vec3,
+    qa: &PlaneQuadric,
+    b: Vec3,
+    qb: &PlaneQuadric,
+    freedom: CollapseTarget,
+) -> (Vec3, f32) {
     let (da, db) = (a.as_dvec3(), b.as_dvec3());
     let (middle, half) = (0.5 * (da + db), 0.5 * (db - da));
     // With y from the middle: (y + h)ᵀ A (y + h) + (y − h)ᵀ B (y − h)
@@ -364,9 +370,9 @@ pub(super) fn best(a: Vec3, qa: &PlaneQuadric, b: Vec3, qb: &PlaneQuadric, freed
     let least = half.dot(times(&sum, half)) + SHORT * trace * reach;
     let cost = |y: DVec3| (y.dot(times(&sum, y)) + 2.0 * y.dot(slope) + least).max(0.0) as f32;
     match freedom {
-        Freedom::First => return (a, cost(-half)),
-        Freedom::Second => return (b, cost(half)),
-        Freedom::Free => {}
+        CollapseTarget::First => return (a, cost(-half)),
+        CollapseTarget::Second => return (b, cost(half)),
+        CollapseTarget::Free => {}
     }
     if let Some(y) = solve([sum[0] + pull, sum[1], sum[2], sum[3] + pull, sum[4], sum[5] + pull], -slope)
         && y.length_squared() <= 4.0 * REACH * REACH * reach
@@ -442,7 +448,7 @@ mod tests {
     fn three_planes_meet_in_their_corner() {
         // The end a lies in the planes x = 0 and y = 0, the end b in z = 0: they meet in (0, 0, 0).
         let (a, b) = (Vec3::new(0.0, 0.0, 1.0), Vec3::new(0.3, 0.2, 0.0));
-        let (x, cost) = best(a, &spread(&[Vec3::X, Vec3::Y]), b, &spread(&[Vec3::Z]), Freedom::Free);
+        let (x, cost) = best(a, &spread(&[Vec3::X, Vec3::Y]), b, &spread(&[Vec3::Z]), CollapseTarget::Free);
         assert!(x.length() < 1e-4, "{x}");
         // shortness alone: 3e-5 · trace 3 · |h|² = 9e-5 · (0.09 + 0.04 + 1) / 4
         assert!((cost - 2.5425e-5).abs() < 5e-6, "{cost}");
@@ -452,27 +458,30 @@ mod tests {
     fn a_flat_edge_goes_to_its_middle_and_a_crease_along_itself() {
         let (a, b) = (Vec3::ZERO, Vec3::X);
         let flat = spread(&[Vec3::Z, Vec3::Z]);
-        let (x, cost) = best(a, &flat, b, &flat, Freedom::Free);
+        let (x, cost) = best(a, &flat, b, &flat, CollapseTarget::Free);
         assert_eq!(x, Vec3::new(0.5, 0.0, 0.0));
         assert!((cost - 3e-5).abs() < 1e-9); // 3e-5 · 4 · 0.25
         let crease = spread(&[Vec3::Z, Vec3::Y]);
-        assert_eq!(best(a, &crease, b, &flat, Freedom::Free).0, Vec3::new(0.5, 0.0, 0.0));
+        assert_eq!(best(a, &crease, b, &flat, CollapseTarget::Free).0, Vec3::new(0.5, 0.0, 0.0));
     }
 
     #[test]
     fn a_held_end_stays_and_says_what_it_costs() {
         // b leaves the plane x = 1 of its own by 1: cost 1 plus 3e-5 · 2 · 0.25.
         let (a, b) = (Vec3::ZERO, Vec3::X);
-        let (x, cost) = best(a, &spread(&[Vec3::Z]), b, &spread(&[Vec3::X]), Freedom::First);
+        let (x, cost) = best(a, &spread(&[Vec3::Z]), b, &spread(&[Vec3::X]), CollapseTarget::First);
         assert_eq!(x, a);
         assert!((cost - 1.000015).abs() < 1e-6);
-        assert_eq!(best(a, &spread(&[Vec3::Z]), b, &spread(&[Vec3::X]), Freedom::Second).0, b);
+        assert_eq!(best(a, &spread(&[Vec3::Z]), b, &spread(&[Vec3::X]), CollapseTarget::Second).0, b);
     }
 
     #[test]
     fn nothing_around_is_no_reason_to_divide_by_zero() {
         let none = PlaneQuadric::default();
-        assert_eq!(best(Vec3::ZERO, &none, Vec3::X, &none, Freedom::Free), (Vec3::new(0.5, 0.0, 0.0), 0.0));
+        assert_eq!(
+            best(Vec3::ZERO, &none, Vec3::X, &none, CollapseTarget::Free),
+            (Vec3::new(0.5, 0.0, 0.0), 0.0)
+        );
         assert_eq!(lean(Vec3::ZERO), Vec3::ZERO);
         assert_eq!(solve([1.0, 0.0, 0.0, 1e-3, 0.0, 1e-7], DVec3::ONE), None);
     }

@@ -30,7 +30,7 @@
 //! in, first out, which also visits neighbours in memory one after another. Outdated entries stay
 //! where they are: the caller recognises them by `stamp`.
 
-use super::collapse::{POOR, Star, TURN, place};
+use super::collapse::{EdgeLink, POOR, TURN, place};
 use super::crossing::{Sheets, crossings};
 use super::rings::{BORDER, CROWDED, HELD, Rings};
 use super::{SimplifyConfig, SimplifyReport, VertexPlacement};
@@ -120,7 +120,7 @@ pub(super) fn reduce(
     mut budgets: Option<&mut [f32]>,
     report: &mut SimplifyReport,
 ) -> Result<()> {
-    let mut star = Star::new(rings.positions.len());
+    let mut star = EdgeLink::new(rings.positions.len());
     let mut sheets = (!task.look.is_nowhere()).then(|| Sheets::new(rings));
     let mut breath = 0;
     let mut offers: Vec<(u32, u32)> = Vec::new();

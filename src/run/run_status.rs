@@ -30,7 +30,7 @@ pub enum Phase {
 
 /// A stage of a run.
 #[derive(Clone, Debug)]
-pub struct StageStanding {
+pub struct StageStatus {
     /// Which.
     pub stage: Stage,
     /// Where it stands.
@@ -47,9 +47,9 @@ pub struct StageStanding {
 
 /// A run.
 #[derive(Clone, Debug)]
-pub struct Standing {
+pub struct RunStatus {
     /// The stages that it is to have, in order; where it does not say, all of them.
-    pub stages: Vec<StageStanding>,
+    pub stages: Vec<StageStatus>,
     /// Where it stands.
     pub phase: Phase,
     /// The stage at work, else the one that ended last without being done.
@@ -77,14 +77,14 @@ pub struct Failure {
 /// Its name in a run.
 pub const FAILED: &str = "failed.json";
 
-impl Standing {
+impl RunStatus {
     /// Reads where the run in a folder stands; what is missing or damaged is part of the answer.
-    pub fn read(run: &Path) -> Standing {
+    pub fn read(run: &Path) -> RunStatus {
         let estimate = read_estimate(run).unwrap_or_default();
         let is_part = |stage: &Stage| estimate.as_ref().is_none_or(|e| e.contains_key(stage.word()));
-        let mut stages: Vec<StageStanding> =
-            Stage::ALL.into_iter().filter(is_part).map(|s| StageStanding::read(&run.join(s), s)).collect();
-        let cost = |s: &StageStanding| estimate.as_ref()?.get(s.stage.word()).map(|c| c.seconds());
+        let mut stages: Vec<StageStatus> =
+            Stage::ALL.into_iter().filter(is_part).map(|s| StageStatus::read(&run.join(s), s)).collect();
+        let cost = |s: &StageStatus| estimate.as_ref()?.get(s.stage.word()).map(|c| c.seconds());
         // the machine that works on it may be faster or slower, and do other things besides; what networks do for masks
         // says nothing about that
         let done = stages.iter().filter(|s| s.stage != Stage::Mask);
@@ -129,11 +129,11 @@ impl Standing {
             _ => None,
         };
         let error = of_stage.or(of_run);
-        let elapsed = |s: &StageStanding| {
+        let elapsed = |s: &StageStatus| {
             let kept = s.status.as_ref().map_or(0.0, |s| s.elapsed_s);
             s.record.as_ref().map_or(kept, |r| r.elapsed_s)
         };
-        Standing {
+        RunStatus {
             elapsed_s: stages.iter().map(elapsed).sum(),
             left_s: estimate.is_some().then(|| stages.iter().map(|s| s.left_s).sum()),
             stages,
@@ -144,9 +144,9 @@ impl Standing {
     }
 }
 
-impl StageStanding {
+impl StageStatus {
     /// Reads where a stage stands from what it left in its folder.
-    pub fn read(folder: &Path, stage: Stage) -> StageStanding {
+    pub fn read(folder: &Path, stage: Stage) -> StageStatus {
         let (record, status) = (read_record(folder), read_status(folder));
         let unreadable = record.as_ref().err().or(status.as_ref().err()).map(|e| e.to_string());
         let (record, status) = (record.unwrap_or_default(), status.unwrap_or_default());
@@ -167,7 +167,7 @@ impl StageStanding {
             Phase::Failed => Some(status.as_ref().and_then(|s| s.error.clone()).unwrap_or_default()),
             _ => None,
         };
-        StageStanding { stage, phase, status, record, error, left_s: 0.0 }
+        StageStatus { stage, phase, status, record, error, left_s: 0.0 }
     }
 }
 
@@ -210,7 +210,7 @@ mod tests {
     fn a_run_stands_where_its_stages_do_and_the_rest_takes_as_much_longer_as_what_is_done() {
         let dir = tempfile::tempdir().unwrap();
         let run = Run::quiet(dir.path());
-        let read = || Standing::read(dir.path());
+        let read = || RunStatus::read(dir.path());
         assert_eq!((read().phase, read().left_s, read().stages.len()), (Phase::Waiting, None, 8));
         expect(dir.path());
         assert_eq!((read().left_s, read().stages.len()), (Some(130.0), 3));
@@ -254,7 +254,7 @@ mod tests {
                 "elapsed_s": 1.0, "device": "cpu", "pid": pid, "host": host, "error": null, "updated": 0,
                 "fingerprint": Fingerprint::default()});
             std::fs::write(folder.join("status.json"), status.to_string()).unwrap();
-            Standing::read(dir.path()).phase
+            RunStatus::read(dir.path()).phase
         };
         let here = crate::run::status::host();
         // no process has this number, and ours, another one's before, has not opened the lock
@@ -271,10 +271,10 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let failure = Failure { error: "no cameras".into(), hint: "add them".into(), exit: 1 };
         std::fs::write(dir.path().join(FAILED), serde_json::to_string(&failure).unwrap()).unwrap();
-        let now = Standing::read(dir.path());
+        let now = RunStatus::read(dir.path());
         assert_eq!((now.phase, now.error.as_deref()), (Phase::Failed, Some("no cameras")));
         Run::quiet(dir.path()).stage(plan("metrics"), |_| Ok(Value::Null)).unwrap();
-        let now = Standing::read(dir.path());
+        let now = RunStatus::read(dir.path());
         assert_eq!((now.phase, now.error), (Phase::Done, None));
     }
 }
