@@ -46,12 +46,12 @@ Examples:
 
 Exit codes:
   0         success
-  1         failure: the command cannot be done as given
+  1         failure
   2         wrong command line or configuration
-  3         a required quality was not met
+  3         required quality not met
   75        temporary failure: try again
   101       a bug
-  130, 143  stopped by a signal: repeat to continue";
+  130, 143  stopped: repeat to continue";
 
 /// Reconstruct a human head from photographs by calibrated cameras: a watertight mesh and novel views.
 #[derive(Parser, Debug)]
@@ -136,9 +136,9 @@ enum Command {
     #[command(after_long_help = "Examples:
   tiface run captures/002_00
   tiface run captures/002_00 --run /data/002_00 --preset paper --seed 7
-  tiface run captures/002_00 --prompts prompts.json  masks from clicks on a few photographs
+  tiface run captures/002_00 --prompts prompts.json  make masks from clicks on a few photographs
   tiface run runs/002_00 --fresh mesh --set mesh.resolution=1024
-  tiface run captures/002_00 --require psnr=28      exit code 3 if the views are worse than that")]
+  tiface run captures/002_00 --require psnr=28      exit with 3 if the PSNR is lower")]
     Run {
         #[command(flatten)]
         place: CaptureOrRun,
@@ -151,9 +151,9 @@ enum Command {
     /// Run all stages on a synthetic head; needs no data
     #[command(after_long_help = "Examples:
   tiface demo
-  tiface demo --set iface.steps=500 --set tface.steps=500    a rougher head, sooner
-  tiface demo --run /tmp/demo --out head.glb    somewhere else, and the mesh beside it
-  tiface demo --size 3000x4096 --views 24 --border 60 --run /tmp/full    as large as the ILSH dataset")]
+  tiface demo --set iface.steps=500 --set tface.steps=500    train for fewer steps
+  tiface demo --run /tmp/demo --out head.glb    choose the run folder, and copy the mesh
+  tiface demo --size 3000x4096 --views 24 --border 60 --run /tmp/full    use the size of the ILSH dataset")]
     Demo {
         /// Size of each photograph, pixels [default: 256x320]
         #[arg(long, value_name = "WxH")]
@@ -177,9 +177,10 @@ enum Command {
     /// Write a capture's cameras in another format: transforms.json or COLMAP
     #[command(after_long_help = "Examples:
   tiface convert captures/002_00 --to colmap
+  tiface convert captures/002_00 --to transforms --set capture.mask_dir=vit_mask    name the masks to copy
   tiface convert scan --to transforms --out captures/scan
 
-Photographs and masks are copied as they are. The new folder must not be there, or be empty.")]
+Photographs and masks are copied unchanged. The output folder must not exist, or be empty.")]
     Convert {
         /// Folder of photographs with cameras
         capture: PathBuf,
@@ -189,16 +190,16 @@ Photographs and masks are copied as they are. The new folder must not be there, 
     },
     /// Stage: make or read head masks, and find the head's bounding box
     #[command(after_long_help = "Examples:
-  tiface mask captures/002_00                   the masks that lie there; a sheet of them in the run's mask/
-  tiface mask captures/002_00 --page            an annotation page, which saves prompts.json
+  tiface mask captures/002_00                   read the capture's masks; write a sheet of them to the run's mask/
+  tiface mask captures/002_00 --page            write a page to click on, which saves prompts.json
   tiface mask captures/002_00 --prompts prompts.json
   tiface mask captures/002_00 --view 010 --point 181,288,1 --point 32,51,0
   tiface mask captures/002_00 --prompts prompts.json --sam encoder.onnx --sam-decoder decoder.onnx \\
       --vitmatte vitmatte.onnx
-  tiface mask captures/002_00 --alpha-net isnet.onnx    no click at all
+  tiface mask captures/002_00 --alpha-net isnet.onnx    make masks without clicks
 
-Click the face, the hair and every garment of another color, and the background twice; on three photographs
-from different sides. The other views follow from the cameras.")]
+On three photographs from different sides, click the face, the hair, every garment of another color, and the
+background twice. The masks of the other views follow from the cameras.")]
     Mask {
         #[command(flatten)]
         place: CaptureOrRun,
@@ -211,27 +212,27 @@ from different sides. The other views follow from the cameras.")]
     /// Stage: train T-Face, a radiance field of the masked photographs
     #[command(after_long_help = "Examples:
   tiface tface captures/002_00
-  tiface tface runs/002_00                      go on after a stop
+  tiface tface runs/002_00                      continue after a stop
   tiface tface captures/002_00 --run runs/ce --set tface.mask_loss=ce
-  tiface tface captures/002_00 --set tface.fields=3    the mean of three fields
+  tiface tface captures/002_00 --set tface.fields=3    average three fields
   tiface tface captures/002_00 --set tface.import=official.safetensors")]
     Tface(CaptureOrRun),
     /// Stage: train the same field on whole photographs, as a baseline for T-Face
     #[command(after_long_help = "Examples:
   tiface baseline captures/002_00
-  tiface baseline runs/002_00                   go on after a stop
+  tiface baseline runs/002_00                   continue after a stop
   tiface baseline runs/002_00 --fresh baseline --set baseline.steps=20000")]
     Baseline(CaptureOrRun),
     /// Stage: train I-Face, a signed distance field
     #[command(after_long_help = "Examples:
   tiface iface captures/002_00
-  tiface iface runs/002_00                      go on after a stop
+  tiface iface runs/002_00                      continue after a stop
   tiface iface runs/002_00 --fresh iface --set iface.steps=30000")]
     Iface(CaptureOrRun),
     /// Stage: extract, simplify and texture the watertight mesh
     #[command(after_long_help = "Examples:
   tiface mesh runs/002_00
-  tiface mesh runs/002_00 --out head.glb        the ending picks the format
+  tiface mesh runs/002_00 --out head.glb        the ending selects the format
   tiface mesh runs/002_00 --fresh mesh --format glb,obj,ply --frame head
   tiface mesh runs/002_00 --fresh mesh --triangles 20000 --texture 4096 --lobes 1 --normal-map")]
     Mesh {
@@ -268,12 +269,12 @@ from different sides. The other views follow from the cameras.")]
     /// Stage: render views of the fields and of the mesh
     #[command(after_long_help = "Examples:
   tiface render runs/002_00
-  tiface render captures/002_00 --with tface    T-Face alone: no other field is learned for it
+  tiface render captures/002_00 --with tface    render T-Face only, and train nothing else
   tiface render runs/002_00 --cameras orbit --with tface --background white --out turn/
   tiface render runs/002_00 --cameras path.json --format exr
 
-Views of other cameras than the held-out ones lie in render/paths/, one folder for each path. They leave
-the held-out views, their blend and the metrics alone; --fresh render then makes only that path anew.")]
+Views of other cameras than the held-out ones are written to render/paths/, one folder for each path. The
+held-out views, their blend and the metrics do not change; --fresh render then renders only that path again.")]
     Render {
         #[command(flatten)]
         place: CaptureOrRun,
@@ -298,8 +299,8 @@ the held-out views, their blend and the metrics alone; --fresh render then makes
   tiface ensemble runs/002_00 --fresh ensemble --members tface,volume --weights 0.6,0.4
   tiface ensemble captures/002_00 --members tface,raycast
 
-Without --weights, they are fitted on small squares of the training photographs that nothing
-learned from (capture.tiles): the blend follows the better members.")]
+Without --weights, the weights are fitted on small squares of the training photographs that are held out of
+all trainings (capture.tiles).")]
     Ensemble {
         #[command(flatten)]
         place: CaptureOrRun,
@@ -321,30 +322,32 @@ learned from (capture.tiles): the blend follows the better members.")]
     },
     /// Draw a run's mesh, or any .glb, .obj or .ply
     #[command(after_long_help = "Examples:
-  tiface preview runs/002_00                    three quarters of the head, 1024 pixels, as a PNG
+  tiface preview runs/002_00                    draw a three-quarter view, 1024 pixels, as a PNG
   tiface preview scan.ply --light matcap --up z --out scan.png
-  tiface preview runs/002_00 --sheet            from all sides, as wireframe, normals, texture coordinates, errors
-  tiface preview runs/002_00 --turntable --out turn.gif     .png is animated, too; .mp4 needs ffmpeg
-  tiface preview runs/002_00 --cameras test --out views/    as the held-out photographs
-  tiface preview runs/002_00 --page             a page to turn it in a browser, with its photographs
-  tiface preview runs/002_00 --watch            a page of a run while it works, in watch.html there")]
+  tiface preview runs/002_00 --sheet            draw all sides, wireframe, normals, texture coordinates, errors
+  tiface preview runs/002_00 --turntable --out turn.gif     animate; also .png, and .mp4 with ffmpeg
+  tiface preview runs/002_00 --cameras test --out views/    draw from the held-out cameras
+  tiface preview runs/002_00 --page             write a page to turn it in a browser
+  tiface preview runs/002_00 --watch            write watch.html in the run, and update it while the run works")]
     Preview(PreviewOptions),
     /// Measure speed against error of settings on this machine
     #[command(after_long_help = "Examples:
   tiface bench captures/002_00 --sweep steps,hash
-  tiface bench runs/002_00 --sweep triangles,texture      with the fields of a run
+  tiface bench runs/002_00 --sweep triangles,texture      reuse the fields of a run
+  tiface bench captures/002_00 --out bench/new/           run all sweeps, into a folder
 
-Results lie in bench/NAME/: bench.json and bench.html.")]
+Writes bench.json and bench.html to bench/NAME/.")]
     Bench(BenchOptions),
     /// Reproduce the paper's tables and ablations on captures
     #[command(after_long_help = "Examples:
-  tiface experiment captures/* --scale 0.1      all tables at a tenth of the effort
+  tiface experiment captures/* --scale 0.1      make all tables with a tenth of the steps
   tiface experiment captures/002_00 --tables components,iface --out tables/
-  tiface experiment captures/* --dry-run        the runs that tables are made of, and which are done
-  tiface experiment captures/* --only 002_00/tface-ce    one of them, for a cluster; tables fill as they come
-  tiface experiment captures/* --published figures.csv   a line is: tface,l2-reference,masked,30.1
+  tiface experiment captures/* --dry-run        list the runs that the tables need, and which are done
+  tiface experiment captures/* --only 002_00/tface-ce    make one of these runs, as a task of a cluster
+  tiface experiment captures/* --published figures.csv   compare; a line is: tface,l2-reference,masked,30.1
 
-Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are experiment.md and experiment.json.")]
+Runs are folders experiment/CAPTURE/RUN, and continue where they stopped. Tables are experiment.md and
+experiment.json.")]
     Experiment(ExperimentOptions),
     /// Validate a mesh: watertight, manifold, self-intersections, texture coordinates
     #[command(after_long_help = "Examples:
@@ -369,9 +372,9 @@ Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are expe
     },
     /// Write the page of a run again, or one page of many runs
     #[command(after_long_help = "Examples:
-  tiface report runs/002_00                     its report.html, from what lies there
-  tiface report runs/* --out fleet.html         all of them in a table, with links to each; fleet.csv beside it
-  tiface report runs/* --json                   the same figures, an object for each run")]
+  tiface report runs/002_00                     write its report.html again
+  tiface report runs/* --out fleet.html         write a table of all runs with links, and fleet.csv
+  tiface report runs/* --json                   print the same figures, an object for each run")]
     Report {
         /// Run folders [default: all under runs/]
         runs: Vec<PathBuf>,
@@ -382,19 +385,19 @@ Runs lie in experiment/CAPTURE/RUN and go on where they stopped. Tables are expe
     /// Show stages, progress, time left and last error of runs
     #[command(after_long_help = "Examples:
   tiface status
-  tiface status runs/002_00                     a row for each stage
-  tiface status runs/*                          a line for each run, and one for all
-  tiface status runs/* --failed                 those to look after; exit code 3 if any run failed
-  tiface status runs/* --json                   an object for each run
+  tiface status runs/002_00                     print a row for each stage
+  tiface status runs/*                          print a line for each run, and one for all
+  tiface status runs/* --failed                 print only failed runs; exit with 3 if any failed
+  tiface status runs/* --json                   print an object for each run
 
-A sign for each stage: # done, > running, x failed, ! killed, = stopped, ? not readable, . to do. Of more than 40 runs,
-those that are done or not begun share lines; -v gives each its own.")]
+Signs of stages: # done, > running, x failed, ! killed, = stopped, ? not readable, . to do. Of more than 40 runs, those
+that are done or have not begun are summed up; -v prints a line for each.")]
     Status(StatusOptions),
     /// Print the effective configuration, or explain a key
     #[command(after_long_help = "Examples:
   tiface config --preset paper
   tiface config runs/002_00 --set mesh.resolution=1024
-  tiface config --explain iface.steps           a whole table: --explain mesh")]
+  tiface config --explain iface.steps           explain a key; --explain mesh explains a table")]
     Config {
         #[command(flatten)]
         place: CaptureOrRun,
@@ -405,15 +408,15 @@ those that are done or not begun share lines; -v gives each its own.")]
     /// List GPUs, test them, and show which one `auto` uses
     #[command(after_long_help = "Examples:
   tiface doctor                 show drivers, memory and a self-test of each device, for a bug report
-  tiface doctor --json          the same for programs
+  tiface doctor --json          print the same as JSON
 
 It exits with 1 if a device fails its self-test against the CPU. A build without the feature `wgpu` has no GPUs.")]
     Doctor,
     /// Print shell completions, or write manual pages
     #[command(after_long_help = "Examples:
   tiface completions bash > /etc/bash_completion.d/tiface
-  tiface completions man | man -l -             the manual page
-  tiface completions man --out man1/            a page for each command, tiface.1, tiface-run.1 and so on")]
+  tiface completions man | man -l -             show the manual page
+  tiface completions man --out man1/            write a page for each command: tiface.1, tiface-run.1, ...")]
     Completions {
         /// Shell, or `man` for manual pages
         form: Form,
@@ -604,7 +607,7 @@ mod tests {
     fn every_command_with_something_to_choose_shows_worked_examples() {
         for command in Cli::command().get_subcommands() {
             let shown = command.get_after_long_help().map(|h| h.to_string()).unwrap_or_default();
-            let plain = ["metrics"].contains(&command.get_name());
+            let plain = ["metrics", "doctor"].contains(&command.get_name());
             assert!(plain || shown.matches("tiface ").count() >= 3, "{}", command.get_name());
         }
     }

@@ -149,12 +149,7 @@ impl Packed {
     }
 
     /// The new number of a material.
-    fn material(
-        &mut self,
-        index: u32,
-        looks: &FileMaterials,
-        reader: &GlbReader,
-    ) -> Result<Index<Material>> {
+    fn material(&mut self, index: u32, looks: &FileMaterials, reader: &GlbReader) -> Result<Index<Material>> {
         if let Some(&known) = self.known.1.get(&index) {
             return Ok(known);
         }
