@@ -1,4 +1,4 @@
-//! The stage: from a signed distance to a closed mesh with normals and colors.
+//! The stage `mesh`, first part: from a signed distance to a closed mesh with normals and colors.
 
 mod cap;
 mod clean;

@@ -97,13 +97,13 @@ impl Cap {
         self.ring.iter_mut().zip(colors).for_each(|(skin, color)| skin.color = color);
     }
 
-    /// Gives those of the points that lie on the cap its color instead.
+    /// Gives the points that lie on the cap its color instead.
     pub fn recolor(&self, points: &[Vec3], colors: &mut [[f32; 3]]) {
         let on_cap = points.par_iter().zip(colors).filter(|(p, _)| self.holds(**p));
         on_cap.for_each(|(p, color)| *color = self.color(*p));
     }
 
-    /// Takes the cap off: an opening for those who fit something to it. Returns the triangles removed.
+    /// Removes the cap, for callers that fit something to the opening. Returns the triangles removed.
     pub fn open(&self, mesh: &mut Mesh) -> usize {
         let before = mesh.triangles.len();
         let capped: Vec<bool> = mesh.positions.iter().map(|&p| self.holds(p)).collect();

@@ -70,8 +70,8 @@ pub(super) fn pack(
     monitor: &dyn Monitor,
 ) -> Result<Vec<ChartPose>> {
     let area: f64 = charts.iter().map(Flat::area).sum();
-    let room = size_px - 2.0 * gutter_px;
-    if !(area > 0.0 && area.is_finite() && room >= 1.0) {
+    let inner_px = size_px - 2.0 * gutter_px;
+    if !(area > 0.0 && area.is_finite() && inner_px >= 1.0) {
         return Err(too_small());
     }
     let outlines: Vec<Vec<[DVec2; 2]>> = charts
@@ -87,17 +87,17 @@ pub(super) fn pack(
     let mut order: Vec<usize> = (0..charts.len()).collect();
     order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
     let turns = (16_000 / charts.len()).clamp(4, TURNS) / 4 * 4;
-    let cells = CELLS.min(room);
+    let cells = CELLS.min(inner_px);
     let mut used = USED;
     while used > 1e-3 {
         // Cells a unit, so that the texture is `cells` wide when `used` is right; it may become a fifth wider.
-        let scale = cells * (used / area).sqrt() * size_px / room;
+        let scale = cells * (used / area).sqrt() * size_px / inner_px;
         let mut most = (1.2 * cells) as usize;
         let mut start = cells as usize;
         let mut found = None;
         // The first time with the gutter that the widest needs, then with that of the size found.
         for _ in 0..2 {
-            let reach = gutter_px * most as f64 / room;
+            let reach = gutter_px * most as f64 / inner_px;
             let drawn = draw(&outlines, stands, scale, reach, turns);
             match smallest(&drawn, &mut order, start, most, monitor)? {
                 Some((side, layout)) => {
@@ -108,7 +108,7 @@ pub(super) fn pack(
             }
         }
         if let Some((drawn, layout, side, reach)) = found {
-            let cell = room / side as f64;
+            let cell = inner_px / side as f64;
             let place = |(chart, &(turn, x, y)): (usize, &(usize, usize, usize))| {
                 let TurnedMask { turn, low, .. } = drawn[chart][turn];
                 // The page begins a gutter from the border, the chart its reach from its shape's corner.

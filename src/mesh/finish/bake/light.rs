@@ -396,8 +396,8 @@ mod tests {
         assert!(towards(1.0) > 0.1 && towards(-1.0) < -0.3, "{} {}", towards(1.0), towards(-1.0));
         assert_eq!(shades.lobes[4..], [[0.0; 3]; 4]);
         let bvh = Bvh::new(&Mesh::default());
-        let nobody = Visibility { cameras: &[], bvh: &bvh, clearance: 0.0, most: 8 };
-        let straight = nobody.directions(&points, &points);
+        let no_cameras = Visibility { cameras: &[], bvh: &bvh, clearance: 0.0, most: 8 };
+        let straight = no_cameras.directions(&points, &points);
         let straight = shade(&points, straight, &learned, 0, glam::Mat3::IDENTITY);
         assert_eq!(straight.linear[0][0], 0.0);
     }

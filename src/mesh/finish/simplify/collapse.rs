@@ -31,7 +31,7 @@ pub(super) struct EdgeLink {
     pub sides: Vec<FanTriangle>,
     of_a: usize,
     /// Triangles that hold the edge, with the vertex opposite to it.
-    gone: Vec<(u32, u32)>,
+    dropped: Vec<(u32, u32)>,
     /// Neighbours of the vertex to be.
     pub around: Vec<u32>,
     leans: Vec<Vec3>,
@@ -55,7 +55,7 @@ impl EdgeLink {
         // neighbours of a, and those of b alone
         let (near_a, near_b) = (self.epoch, self.epoch + 1);
         self.sides.clear();
-        self.gone.clear();
+        self.dropped.clear();
         self.around.clear();
         let (va, vb) = (rings.valence(a), rings.valence(b));
         if va + vb > (CROWN + 4).max(va.max(vb) + 4) {
@@ -70,21 +70,21 @@ impl EdgeLink {
                 }
             }
             if from == b {
-                self.gone.push((t, to));
+                self.dropped.push((t, to));
             } else if to == b {
-                self.gone.push((t, from));
+                self.dropped.push((t, from));
             } else {
                 self.sides.push(FanTriangle { triangle: t, from, to });
             }
         }
         self.of_a = self.sides.len();
-        let opposite = match self.gone[..] {
+        let opposite = match self.dropped[..] {
             [(_, c)] => [c, c],
             [(_, c), (_, d)] if c != d => [c, d],
             _ => return false,
         };
         let borders = (rings.flags[a as usize] & BORDER, rings.flags[b as usize] & BORDER);
-        if borders.0 & borders.1 != 0 && self.gone.len() == 2 {
+        if borders.0 & borders.1 != 0 && self.dropped.len() == 2 {
             return false; // would pinch the surface between two borders
         }
         let spans = |s: &FanTriangle| [s.from, s.to] == opposite || [s.to, s.from] == opposite;
@@ -140,7 +140,7 @@ impl EdgeLink {
 
     /// The triangles of both ends, before the collapse.
     pub(super) fn triangles(&self) -> impl Iterator<Item = u32> {
-        self.sides.iter().map(|side| side.triangle).chain(self.gone.iter().map(|gone| gone.0))
+        self.sides.iter().map(|side| side.triangle).chain(self.dropped.iter().map(|dropped| dropped.0))
     }
 
     /// The largest distance of `x` from the planes of the triangles of both ends.
@@ -171,7 +171,7 @@ impl EdgeLink {
         rings.flags[a as usize] |= rings.flags[b as usize];
         rings.stamps[a as usize] += 1;
         rings.stamps[b as usize] += 1;
-        for &(t, opposite) in &self.gone {
+        for &(t, opposite) in &self.dropped {
             rings.triangles[t as usize] = [NONE; 3];
             rings.spreads[opposite as usize].subtract(rings.leans[t as usize]);
             rings.leave(opposite, t);

@@ -1,6 +1,6 @@
 //! The mesh while it shrinks: which triangles are around each vertex.
 //!
-//! Flat arrays only. The rings of all vertices lie in one pool; a ring that outgrows its place moves
+//! Flat arrays only. The rings of all vertices lie in one pool; a ring that outgrows its slot moves
 //! to the pool's end. A collapse of (a, b) gives b's triangles to a and drops the one or two that held
 //! the edge; nothing else in the mesh changes its number.
 //!
@@ -39,7 +39,7 @@ const BORDER_WEIGHT: f32 = 3.0;
 struct RingSlot {
     start: u32,
     len: u32,
-    room: u32,
+    capacity: u32,
 }
 
 /// A mesh under collapse.
@@ -58,7 +58,7 @@ pub(super) struct Rings {
     pub stamps: Vec<u32>,
     /// Triangles that are left.
     pub count: usize,
-    places: Vec<RingSlot>,
+    slots: Vec<RingSlot>,
     pool: Vec<u32>,
 }
 
@@ -78,23 +78,23 @@ impl Rings {
             flags: vec![0; n],
             stamps: vec![0; n],
             count: triangles.len(),
-            places: vec![RingSlot::default(); n],
+            slots: vec![RingSlot::default(); n],
             pool: vec![0; 3 * triangles.len()],
             triangles,
         };
         for &v in rings.triangles.as_flattened() {
-            rings.places[v as usize].room += 1;
+            rings.slots[v as usize].capacity += 1;
         }
         let mut start = 0;
-        for place in &mut rings.places {
-            place.start = start;
-            start += place.room;
+        for slot in &mut rings.slots {
+            slot.start = start;
+            start += slot.capacity;
         }
         for (t, triangle) in rings.triangles.iter().enumerate() {
             for &v in triangle {
-                let place = &mut rings.places[v as usize];
-                rings.pool[(place.start + place.len) as usize] = t as u32;
-                place.len += 1;
+                let slot = &mut rings.slots[v as usize];
+                rings.pool[(slot.start + slot.len) as usize] = t as u32;
+                slot.len += 1;
             }
         }
         rings.flags = (0..n as u32)
@@ -111,13 +111,13 @@ impl Rings {
 
     /// The triangles around a vertex.
     pub(super) fn ring(&self, v: u32) -> &[u32] {
-        let place = self.places[v as usize];
-        &self.pool[place.start as usize..(place.start + place.len) as usize]
+        let slot = self.slots[v as usize];
+        &self.pool[slot.start as usize..(slot.start + slot.len) as usize]
     }
 
     /// How many triangles are around a vertex; none when it is gone.
     pub(super) fn valence(&self, v: u32) -> usize {
-        self.places[v as usize].len as usize
+        self.slots[v as usize].len as usize
     }
 
     /// Changes with either end: stamps only grow, so their sum stays the same only if both do.
@@ -193,26 +193,26 @@ impl Rings {
         self.ring(v).iter().filter(|&&t| self.triangles[t as usize].contains(&w)).count()
     }
 
-    /// Gives the vertex this ring, in place when there is room.
+    /// Sets the ring of a vertex, in place if its slot has the capacity.
     pub(super) fn set_ring(&mut self, v: u32, ring: &[u32]) {
-        let place = &mut self.places[v as usize];
-        place.len = ring.len() as u32;
-        if place.len > place.room {
-            place.start = self.pool.len() as u32;
-            place.room = place.len;
+        let slot = &mut self.slots[v as usize];
+        slot.len = ring.len() as u32;
+        if slot.len > slot.capacity {
+            slot.start = self.pool.len() as u32;
+            slot.capacity = slot.len;
             self.pool.extend_from_slice(ring);
         } else {
-            self.pool[place.start as usize..][..ring.len()].copy_from_slice(ring);
+            self.pool[slot.start as usize..][..ring.len()].copy_from_slice(ring);
         }
     }
 
     /// Takes one triangle out of a vertex's ring.
     pub(super) fn leave(&mut self, v: u32, t: u32) {
-        let place = &mut self.places[v as usize];
-        let ring = &mut self.pool[place.start as usize..(place.start + place.len) as usize];
+        let slot = &mut self.slots[v as usize];
+        let ring = &mut self.pool[slot.start as usize..(slot.start + slot.len) as usize];
         if let Some(i) = ring.iter().position(|&other| other == t) {
             ring[i] = ring[ring.len() - 1];
-            place.len -= 1;
+            slot.len -= 1;
         }
     }
 
@@ -223,7 +223,7 @@ impl Rings {
         let mut number = vec![NONE; self.positions.len()];
         let mut mesh = Mesh::default();
         for v in 0..self.positions.len() {
-            if self.places[v].len > 0 {
+            if self.slots[v].len > 0 {
                 number[v] = mesh.positions.len() as u32;
                 mesh.positions.push(self.positions[v]);
                 fixed.push(self.flags[v] & (BORDER | HELD) != 0);
