@@ -135,7 +135,7 @@ impl<'l> Bench<'l> {
     }
 }
 
-/// Extracts the whole surface of a field.
+/// The whole surface of a field.
 struct Extracted {
     mesh: Mesh,
     report: MeshReport,

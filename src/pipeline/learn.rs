@@ -165,7 +165,7 @@ impl Fields for TrainedFields<'_> {
     }
 }
 
-/// Renders the view of a camera in the scene of a field.
+/// A function that renders a field as a camera in the scene sees it.
 pub(super) type FieldLook = Box<dyn Fn(&Camera) -> RenderedView>;
 
 /// Returns a renderer for the newest checkpoint of a stage's field in a run, finished or not. If several fields are

@@ -394,7 +394,7 @@ impl Line<'_> {
         Plan { name: folder, fingerprint, device: &self.config.device, needs_bytes, saves: false }
     }
 
-    /// Number of pixels of all photographs.
+    /// Returns the number of pixels of all photographs.
     pub(super) fn pixels(&self) -> u64 {
         let pixels = |v: &View| v.camera.width as u64 * v.camera.height as u64;
         self.capture.views.iter().map(pixels).sum()

@@ -35,12 +35,12 @@ pub struct RimVertex {
 }
 
 impl Cap {
-    /// A cap without a ring, for queries of where it lies.
+    /// Returns a cap without a ring, for queries of where it lies.
     pub(super) fn bare(bounds: Aabb, cell: f32) -> Cap {
         Cap { bounds, near: cell / 256.0, ring: Vec::new() }
     }
 
-    /// The cap of a mesh extracted within `bounds` with cells of `cell`, if it has one.
+    /// Returns the cap of a mesh extracted within `bounds` with cells of `cell`, if it has one.
     pub fn of(mesh: &Mesh, bounds: Aabb, cell: f32) -> Option<Cap> {
         let cap = Cap::bare(bounds, cell);
         let capped: Vec<bool> = mesh.positions.iter().map(|&p| cap.holds(p)).collect();
@@ -72,7 +72,7 @@ impl Cap {
         (p - self.bounds.min).min_element() < self.near || (self.bounds.max - p).min_element() < self.near
     }
 
-    /// The color of a point of the cap.
+    /// Returns the color of a point of the cap.
     pub fn color(&self, p: Vec3) -> [f32; 3] {
         let (mut sum, mut total) = ([0f64; 3], 0f64);
         for RimVertex { position, color, .. } in &self.ring {

@@ -115,7 +115,7 @@ struct Disc {
     triangles: Vec<[usize; 3]>,
 }
 
-/// A disc for each loop that has one, each loop once.
+/// Returns a disc for each loop that has one, each loop once.
 fn discs(loops: &LoopFinder, found: Vec<Loop>) -> Vec<Disc> {
     let mut seen = BTreeSet::new();
     let disc = |rim: Loop| {
@@ -309,7 +309,7 @@ pub struct Patches {
 }
 
 impl Patches {
-    /// The patches of a mesh as extracted; `None` if nothing was cut.
+    /// Returns the patches of a mesh as extracted; `None` if nothing was cut.
     pub fn of(mesh: &Mesh, report: &HandleReport) -> Option<Patches> {
         let first = mesh.triangles.len().checked_sub(report.triangles)?;
         let triangles = mesh.triangles[first..].to_vec();
@@ -317,7 +317,7 @@ impl Patches {
         (!mesh.triangles.is_empty()).then(|| Patches { bvh: Bvh::new(&mesh), mesh })
     }
 
-    /// The vertices of the mesh that patches use.
+    /// Returns the vertices of the mesh that patches use.
     pub(super) fn corners(&self) -> impl Iterator<Item = u32> + '_ {
         self.mesh.triangles.iter().flatten().copied()
     }

@@ -83,7 +83,7 @@ impl<'a> LoopFinder<'a> {
         side_ends(self.triangles, side).1
     }
 
-    /// The sides that start at a vertex, counter-clockwise from a given one.
+    /// Returns the sides that start at a vertex, counter-clockwise from a given one.
     pub(super) fn around(&self, from: u32) -> impl Iterator<Item = u32> + '_ {
         let next = move |&c: &u32| {
             let before = c / 3 * 3 + (c % 3 + 2) % 3;
@@ -92,7 +92,7 @@ impl<'a> LoopFinder<'a> {
         std::iter::successors(Some(from), next)
     }
 
-    /// The sides that start at a vertex.
+    /// Returns the sides that start at a vertex.
     pub(super) fn at(&self, vertex: u32) -> impl Iterator<Item = u32> + '_ {
         self.around(self.first[vertex as usize])
     }

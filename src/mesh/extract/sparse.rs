@@ -36,7 +36,7 @@ pub struct Sparse {
     pub range: (f32, f32),
 }
 
-/// The zero level set of `field` over `grid`, closed at its borders.
+/// Returns the zero level set of `field` over `grid`, closed at its borders.
 ///
 /// The first nodes evaluated lie `coarse_step` cells apart. `field` gets at most `batch` points a call and is called
 /// from one thread: it may well use all of them. Nodes for which `inside_hull` is false count as outside.
@@ -237,7 +237,7 @@ impl Flood<'_> {
         Ok(())
     }
 
-    /// The lattice's value of a node, where it has been evaluated.
+    /// Returns the lattice's value of a node, where it has been evaluated.
     fn lattice_value(&self, node: [usize; 3]) -> Option<f32> {
         let step = self.coarse_step;
         (node.iter().all(|c| c % step == 0) && !self.grid.on_border(node))

@@ -324,7 +324,7 @@ pub(crate) fn turn_to_y_up(up: Vec3) -> Result<DMat3> {
     Ok(DMat3::IDENTITY + skew + skew * skew * (1.0 / (1.0 + u.y)))
 }
 
-/// An encoded picture: its bytes and its file extension.
+/// Returns an encoded picture: its bytes and its file extension.
 pub(super) fn encode(
     what: &str,
     picture: &Photo,

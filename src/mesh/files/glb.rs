@@ -321,7 +321,7 @@ pub(super) struct GlbDocument {
 }
 
 impl GlbDocument {
-    /// A view of bytes at a multiple of four.
+    /// Adds a view of bytes at a multiple of four.
     fn view(
         &mut self,
         bytes: &[u8],
@@ -425,7 +425,7 @@ impl GlbDocument {
         self.accessor(bytes_of(flat), 4, (ComponentType::U32, Type::Scalar), false)
     }
 
-    /// A picture inside the file: filtered smoothly, not repeated.
+    /// Adds a picture as a texture that is filtered smoothly and not repeated.
     pub fn texture(&mut self, name: Option<String>, bytes: &[u8], mime: &str) -> Index<Texture> {
         if self.root.samplers.is_empty() {
             self.root.push(Sampler {
@@ -495,7 +495,7 @@ impl GlbDocument {
     }
 }
 
-/// A texture as a material names it.
+/// Returns a material's reference to a texture.
 pub(super) fn info(index: Index<Texture>) -> Info {
     Info { index, tex_coord: 0, extensions: None, extras: Default::default() }
 }

@@ -36,7 +36,7 @@ pub(super) struct GlbRoot {
 }
 
 impl GlbRoot {
-    /// The document, with memory bounded before it is parsed.
+    /// Parses the document, after bounding the memory that it may take.
     pub fn parse(json: &[u8], source: Source) -> Result<GlbRoot> {
         let at = "the JSON chunk";
         // brackets in strings count too, but a file has few unless it is an attack

@@ -46,7 +46,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     reader.finish(gathered)
 }
 
-/// The JSON chunk and the binary one.
+/// Returns the JSON chunk and the binary one.
 pub(super) fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
     let word = |at: usize| bytes.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
     let (Some(version), Some(total)) = (word(4), word(8)) else {
@@ -415,7 +415,7 @@ impl<'a> GlbReader<'a> {
         Ok((numbers, width))
     }
 
-    /// The bytes of a buffer view, and the stride it gives its elements.
+    /// Returns the bytes of a buffer view, and the stride it gives its elements.
     fn view(&self, index: u32) -> Result<(&'a [u8], Option<usize>)> {
         let source = self.source;
         let view = self.get("buffer view", &self.root.buffer_views, index)?;
@@ -437,7 +437,7 @@ impl<'a> GlbReader<'a> {
         }
     }
 
-    /// The base color texture of a material, if it has one.
+    /// Returns the base color texture of a material, if it has one.
     pub fn base_color(&self, material: Option<u32>) -> Result<Option<&'a GlbTextureUse>> {
         let Some(index) = material else { return Ok(None) };
         let material = self.get("material", &self.root.materials, index)?;
@@ -448,8 +448,8 @@ impl<'a> GlbReader<'a> {
         Ok(info)
     }
 
-    /// The picture behind a texture, and its size in the atlas. Its header is checked against the
-    /// limits for pictures; it is not decoded.
+    /// Returns the picture behind a texture, and its size in the atlas. Its header is checked against the limits for
+    /// pictures; it is not decoded.
     pub fn picture(&self, texture: u32, atlas: Option<&mut Atlas>) -> Result<PictureSource> {
         let source = self.source;
         let Some(index) = self.get("texture", &self.root.textures, texture)?.source else {

@@ -112,7 +112,7 @@ fn write_vertices(out: &mut Vec<u8>, mesh: &FileMesh) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Writes the shortest digits that give the same f32 back; with an exponent if zeros would fill the line.
+/// A number displayed by the shortest digits that give the same f32 back; with an exponent if zeros would fill the line.
 struct Short(f32);
 
 impl std::fmt::Display for Short {

@@ -141,7 +141,7 @@ impl Scalar {
         }
     }
 
-    /// The value of white, for colors.
+    /// Returns the value of white, for colors.
     fn white(self) -> f64 {
         match self {
             Scalar::U8 => 255.0,
@@ -275,7 +275,7 @@ fn header(bytes: &[u8], source: Source) -> Result<Header> {
     unreachable!("the loop over line numbers only returns")
 }
 
-/// Reads the body after the header, and tracks the position.
+/// The body after the header, with the reading position.
 struct Body<'a> {
     bytes: &'a [u8],
     at: usize,

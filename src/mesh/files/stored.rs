@@ -36,7 +36,7 @@ pub(super) fn indices(name: &str, values: &[[u32; 3]]) -> Tensor {
     (name.into(), vec![values.len(), 3], TensorValues::U32(values.as_flattened().to_vec()))
 }
 
-/// The tensors of a mesh.
+/// Returns the tensors of a mesh.
 fn geometry(mesh: &Mesh) -> Vec<Tensor> {
     vec![
         floats::<3>("positions", bytemuck::cast_slice(&mesh.positions)),
@@ -378,7 +378,7 @@ fn load_shells(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Shells> {
     Ok(Shells { layers: offsets.into_iter().zip(alphas).map(layer).collect() })
 }
 
-/// A picture of the texture; all have the size of the first.
+/// Loads a picture of the texture; all have the size of the first.
 fn load_photo(folder: &Path, name: &str, size: Option<(u32, u32)>) -> Result<Photo> {
     let path = folder.join(name);
     let photo = io::read_photo(&path, size, &Limits::default()).map_err(damaged)?;

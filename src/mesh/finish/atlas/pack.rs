@@ -25,7 +25,7 @@ use rayon::prelude::*;
 /// Cells along the texture, about: between four and five texels each of 2048.
 const CELLS: f64 = 448.0;
 
-/// Turns tried for each chart; fewer where there are many charts.
+/// Number of turns tried for each chart; smaller if there are many charts.
 const TURNS: usize = 16;
 
 /// Orders tried, times charts.
@@ -149,8 +149,8 @@ fn draw(
     outlines.par_iter().zip(stands).map(one).collect()
 }
 
-/// The smallest side found at which everything fits, from `start` on, at most `most`; `order` becomes the one that
-/// did it.
+/// Returns the smallest side found at which everything fits, from `start` on, at most `most`; `order` becomes the one
+/// that did it.
 fn smallest(
     drawn: &[Vec<TurnedMask>],
     order: &mut Vec<usize>,
@@ -224,7 +224,7 @@ struct Mask {
     height: usize,
     /// Taken cells `[from, to)`, all rows one after the other.
     spans: Vec<[u32; 2]>,
-    /// Where each row's spans begin, and the end of the last.
+    /// Start of each row's spans, and the end of the last.
     starts: Vec<u32>,
     /// The longest span of each row.
     longest: Vec<u32>,
@@ -237,7 +237,7 @@ impl Mask {
         &self.spans[self.starts[y] as usize..self.starts[y + 1] as usize]
     }
 
-    /// The shape within an outline whose lowest coordinates are 0, grown by `reach`, so that the outline's
+    /// Returns the shape within an outline whose lowest coordinates are 0, grown by `reach`, so that the outline's
     /// lowest corner lies at (`reach`, `reach`). Cells are squares of one unit.
     fn of(outline: &[[DVec2; 2]], high: DVec2, reach: f64) -> Mask {
         let [width, height] = (high + 2.0 * reach).to_array().map(|v| (v.ceil() as usize).max(1));
@@ -330,7 +330,7 @@ fn fill(row: &mut [u64], from: usize, to: usize) {
     }
 }
 
-/// The first bit of a row from x on that is set (or clear); `end` if there is none before it.
+/// Returns the first bit of a row from x on that is set (or clear); `end` if none is set before it.
 fn next(row: &[u64], x: usize, end: usize, set: bool) -> usize {
     if x >= end {
         return end;
@@ -371,12 +371,12 @@ impl Page {
         Page { side, words, bits: vec![0; words * side], free: vec![side as u32; side] }
     }
 
-    /// The first cell of a row from x on that is taken (or free); `side` if there is none.
+    /// Returns the first cell of a row from x on that is taken (or free); `side` if none is.
     fn next(&self, y: usize, x: usize, taken: bool) -> usize {
         next(&self.bits[y * self.words..(y + 1) * self.words], x, self.side, taken)
     }
 
-    /// The lowest and then leftmost place for a mask whose upper end stays below `limit`.
+    /// Returns the lowest and then leftmost place for a mask whose upper end stays below `limit`.
     fn find(&self, mask: &Mask, limit: usize) -> Option<(usize, usize)> {
         if mask.width > self.side || mask.height > self.side {
             return None;

@@ -24,7 +24,7 @@ pub(super) struct FanTriangle {
     pub to: u32,
 }
 
-/// What is around an edge. Kept between collapses for its memory.
+/// The neighborhood of an edge, reused between collapses to save allocations.
 #[derive(Default)]
 pub(super) struct EdgeLink {
     /// Triangles of a, then of b, that stay; the first `of_a` are a's.
@@ -52,7 +52,7 @@ impl EdgeLink {
             self.epoch = 0;
         }
         self.epoch += 2;
-        // neighbours of a, and those of b alone
+        // marks for neighbours of a, and for those of b alone
         let (near_a, near_b) = (self.epoch, self.epoch + 1);
         self.sides.clear();
         self.dropped.clear();
@@ -138,12 +138,12 @@ impl EdgeLink {
         true
     }
 
-    /// The triangles of both ends, before the collapse.
+    /// Returns the triangles of both ends, before the collapse.
     pub(super) fn triangles(&self) -> impl Iterator<Item = u32> {
         self.sides.iter().map(|side| side.triangle).chain(self.dropped.iter().map(|dropped| dropped.0))
     }
 
-    /// The largest distance of `x` from the planes of the triangles of both ends.
+    /// Returns the largest distance of `x` from the planes of the triangles of both ends.
     pub(super) fn strays(&self, rings: &Rings, x: Vec3) -> f32 {
         let far = |t: u32| {
             let at = rings.positions[rings.triangles[t as usize][0] as usize];
@@ -152,7 +152,7 @@ impl EdgeLink {
         self.triangles().map(far).fold(0.0, f32::max)
     }
 
-    /// The worst quality among all triangles of both ends.
+    /// Returns the worst quality among all triangles of both ends.
     fn worst(&self, rings: &Rings) -> f32 {
         self.triangles().map(|t| shape(rings.corners(t))).fold(f32::INFINITY, f32::min)
     }
@@ -208,7 +208,7 @@ impl EdgeLink {
     }
 }
 
-/// The best place for the collapse of (a, b), and its cost; `None` where an end is not to be touched.
+/// Returns the best place for the collapse of (a, b), and its cost; `None` where an end is not to be touched.
 #[inline]
 pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     let (fa, fb) = (rings.flags[a as usize], rings.flags[b as usize]);
